@@ -1,0 +1,1 @@
+"""Runnable studies and the main job: `python -m experiments.NAME`."""

@@ -1,0 +1,1 @@
+"""What a moving scene of Gaussians may call for, one file each."""

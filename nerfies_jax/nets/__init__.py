@@ -1,0 +1,1 @@
+"""Floor 2: small differentiable functions with explicit parameters."""

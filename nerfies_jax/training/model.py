@@ -1,0 +1,70 @@
+"""What a representation must offer the loop, the renderer and the report."""
+
+from collections.abc import Callable, Hashable
+from typing import Any, NamedTuple
+
+from jaxtyping import Array, Float, Int, Key
+
+from nerfies_jax.geometry.camera import Camera
+
+PyTree = Any
+
+
+class Frames(NamedTuple):
+    """The frames to learn from, on the device, one row each."""
+
+    images: Any  # [frames, height, width, 3] uint8
+    cameras: Camera
+    times: Float[Array, " frames"]
+    warp: Int[Array, " frames"]
+    appearance: Int[Array, " frames"]
+    valid: Any  # [frames, height, width] bool, or None
+
+
+class View(NamedTuple):
+    """What to render: from where, and when."""
+
+    camera: Camera
+    time: Float[Array, ""]
+    warp: Int[Array, ""]
+    appearance: Int[Array, ""]
+
+
+class Rendering(NamedTuple):
+    """One whole frame."""
+
+    colour: Float[Array, "height width 3"]  # sRGB; not clipped
+    alpha: Float[Array, "height width"]
+    depth: Float[Array, "height width"]  # expected z-depth, scene units
+
+
+class TrainState(NamedTuple):
+    """Everything a run needs to continue bit for bit; arrays only."""
+
+    params: PyTree
+    optimiser: PyTree
+    extra: PyTree  # what the representation carries beside: row statistics, ...
+    step: Int[Array, ""]
+    key: Key[Array, ""]  # of the run; step i uses fold_in(key, i)
+
+
+class Event(NamedTuple):
+    """Something that happens on the host between two chunks.
+
+    Only an event may change the shape of an array.
+    """
+
+    name: str
+    steps: tuple[int, ...]  # after this many completed steps, sorted
+    apply: Callable[[TrainState, Frames], TrainState]
+
+
+class Model(NamedTuple):
+    """A representation: pure functions closed over a static spec."""
+
+    spec: Hashable  # written into the checkpoint
+    init: Callable[[Any, Any], TrainState]  # (Capture, key) -> state; host
+    step: Callable[[TrainState, Frames], tuple[TrainState, dict[str, Array]]]
+    render: Callable[[PyTree, View, tuple[int, int]], Rendering]  # (params, view, size)
+    events: tuple[Event, ...]
+    counts: Callable[[TrainState], dict[str, int]]  # {"gaussians": n}, {"parameters": n}

@@ -1,0 +1,68 @@
+"""Both precisions, strict promotion, one compilation cache for the whole run."""
+
+import os
+import pathlib
+import tempfile
+
+# XLA:CPU splits the bodies of tight loops over all visible cores, which slows the
+# rasteriser about twofold and makes results depend on the core count; one core per
+# test process pins the bits. xdist workers then share the machine evenly.
+os.environ.setdefault("PJRT_NPROC", "1")
+os.environ.setdefault("NPROC", "1")
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+_CACHE = os.environ.get(
+    "JAX_COMPILATION_CACHE_DIR",
+    str(pathlib.Path(tempfile.gettempdir()) / "nerfies_jax_test_cache"),
+)
+jax.config.update("jax_compilation_cache_dir", _CACHE)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+SHARED = pathlib.Path(__file__).resolve().parents[2] / "shared"
+
+
+@pytest.fixture(params=["float32", "float64"])
+def dtype(request):
+    """The precision a test runs in.
+
+    float32 runs with x64 off, because x64 silently promotes float32 code through
+    Python-made constants and so hides its failures; float64 runs with x64 on.
+    """
+    with jax.enable_x64(request.param == "float64"):
+        yield request.param
+
+
+@pytest.fixture
+def float64():
+    """A test that runs in float64 only (gradient checks, parity)."""
+    with jax.enable_x64(True):
+        yield jnp.float64
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
+
+
+@pytest.fixture(scope="session")
+def oracle_dir():
+    """Reference values kept beside the checkout; skips where they are absent."""
+    return _shared("oracle")
+
+
+@pytest.fixture(scope="session")
+def data_dir():
+    """Real captures kept beside the checkout; skips where they are absent."""
+    return _shared("data")
+
+
+def _shared(name):
+    folder = SHARED / name
+    if not folder.is_dir():
+        pytest.skip(f"no reference {name} beside this checkout")
+    return folder
