@@ -1,0 +1,172 @@
+"""What a user asked for, and the run folder. The only file that reads the CLI library.
+
+JAX is not imported here, so `--help` is quick and `--device` can still choose the
+platform.
+"""
+
+import contextlib
+import dataclasses
+import json
+import os
+import pathlib
+import sys
+import tempfile
+import typing
+
+import tyro
+
+Positional = tyro.conf.Positional
+CACHE = (
+    pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache")
+    / "nerfies_jax"
+)
+
+
+def parse(settings_class, arguments=None):
+    """A frozen dataclass from the command line; its docstrings are the help text."""
+    return tyro.cli(settings_class, args=arguments)
+
+
+@contextlib.contextmanager
+def user_errors():
+    """Wrong input in one line and exit code 2; our own bugs keep their traceback.
+
+    Wraps the stages that read what the user gave (captures, settings, run folders),
+    which raise `ValueError` or `OSError` naming the value, the bound and the mend.
+    """
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        print("error: " + " ".join(str(error).split()), file=sys.stderr)
+        sys.exit(2)
+
+
+def start_jax(device):
+    """Choose the platform and the compilation cache; call before anything uses JAX."""
+    if device != "auto":
+        os.environ["JAX_PLATFORMS"] = {"gpu": "cuda"}.get(device, device)
+    import jax
+
+    try:
+        jax.devices()
+    except RuntimeError as error:
+        raise ValueError(
+            f"--device {device} cannot be used here ({str(error).splitlines()[0]}); "
+            "choose --device cpu, or install a JAX built for that device"
+        ) from error
+    jax.config.update("jax_numpy_dtype_promotion", "strict")
+    if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+        folder = CACHE / "compiled"
+        with contextlib.suppress(OSError):  # a cache that cannot be kept is no error
+            folder.mkdir(parents=True, exist_ok=True)
+            jax.config.update("jax_compilation_cache_dir", str(folder))
+
+
+def override(spec, assignments):
+    """`spec` with `path.to.field=value` applied, each value read by the field's type.
+
+    A field that holds another spec is set with a dotted path, or removed with `none`
+    where its type allows it. Raises ValueError for an unknown field or a wrong value.
+    """
+    for assignment in assignments:
+        path, equals, text = assignment.partition("=")
+        if not equals:
+            raise ValueError(f"--set {assignment}: expected path.to.field=value")
+        spec = _assign(spec, path.split("."), text, path)
+    return spec
+
+
+def _assign(spec, names, text, path):
+    fields = {field.name for field in dataclasses.fields(spec)}
+    name, rest = names[0], names[1:]
+    if name not in fields:
+        raise ValueError(
+            f"--set {path}: {type(spec).__name__} has no field {name!r}; "
+            f"it has {', '.join(sorted(fields))}"
+        )
+    if rest:
+        inner = getattr(spec, name)
+        if not dataclasses.is_dataclass(inner):
+            raise ValueError(f"--set {path}: {name!r} is {inner!r} and has no fields")
+        return dataclasses.replace(spec, **{name: _assign(inner, rest, text, path)})
+    kind = typing.get_type_hints(type(spec))[name]
+    return dataclasses.replace(spec, **{name: _read(kind, text, path)})
+
+
+def _read(kind, text, path):
+    options = typing.get_args(kind)
+    if type(None) in options:
+        if text.lower() == "none":
+            return None
+        kind = next(option for option in options if option is not type(None))
+    if kind is bool and text.lower() in {"true", "false"}:
+        return text.lower() == "true"
+    origin = typing.get_origin(kind)
+    try:
+        if kind in {int, float, str}:
+            return kind(text)
+        if origin is typing.Literal and text in typing.get_args(kind):
+            return text
+        if origin is tuple:
+            item = typing.get_args(kind)[0]
+            return tuple(item(part) for part in text.split(",") if part)
+    except ValueError:
+        pass
+    raise ValueError(f"--set {path}={text}: cannot be read as {kind}")
+
+
+def as_json(spec):
+    """A spec as plain data for `config.json`; nested specs keep their class name."""
+    if dataclasses.is_dataclass(spec):
+        values = {
+            field.name: as_json(getattr(spec, field.name))
+            for field in dataclasses.fields(spec)
+        }
+        return {"kind": type(spec).__name__, **values}
+    if isinstance(spec, (tuple, list)):
+        return [as_json(item) for item in spec]
+    if isinstance(spec, dict):
+        return {key: as_json(value) for key, value in spec.items()}
+    if isinstance(spec, pathlib.Path):
+        return str(spec)
+    return spec
+
+
+def new_run_folder(asked, stem):
+    """An empty writable folder for a run: the one asked for, or `runs/STEM[-n]`.
+
+    Raises ValueError if the folder asked for holds something already, OSError if it
+    cannot be written.
+    """
+    if asked is None:
+        number, folder = 1, pathlib.Path("runs", stem)
+        while folder.exists():
+            number += 1
+            folder = pathlib.Path("runs", f"{stem}-{number}")
+    else:
+        folder = asked
+        if folder.exists() and not folder.is_dir():
+            raise ValueError(f"{folder}: the run folder is a file; name another --out")
+        if folder.is_dir() and any(folder.iterdir()):
+            raise ValueError(
+                f"{folder}: the run folder is not empty; name another --out, or "
+                "continue the run in it with --resume"
+            )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise ValueError(
+            f"{folder}: the run folder cannot be written ({error.strerror}); "
+            "name another --out"
+        ) from error
+    return folder
+
+
+def write_json(path, value):
+    """Write JSON beside its target and rename: never a half-written file."""
+    path = pathlib.Path(path)
+    temporary = path.with_name(path.name + ".part")
+    temporary.write_text(json.dumps(value, indent=1, allow_nan=False) + "\n")
+    temporary.replace(path)
