@@ -1,0 +1,238 @@
+"""Rows: activation, first guesses, capacities, dead rows."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gaussians_jax import splats as rows
+from gaussians_jax.splats import Params, Splats
+from nerfies_jax.geometry.camera import Camera
+from tests import gradients
+
+
+def some_splats(rng, count=7, dtype="float64", degree=3):
+    rest = (degree + 1) ** 2 - 1
+    leaves = (
+        rng.normal(size=(count, 3)),
+        rng.normal(size=(count, 3)) - 2,
+        rng.normal(size=(count, 4)),
+        rng.normal(size=count),
+        rng.normal(size=(count, 1, 3)),
+        rng.normal(size=(count, rest, 3)),
+    )
+    return Splats(*(jnp.asarray(leaf, dtype) for leaf in leaves))
+
+
+def test_activation_is_exp_and_logistic(rng, dtype):
+    splats = some_splats(rng, dtype=dtype)
+    drawn = rows.activate(splats)
+    scale = np.exp(np.asarray(splats.log_scale, np.float64))
+    opacity = 1 / (1 + np.exp(-np.asarray(splats.opacity_logit, np.float64)))
+    tolerance = {"float32": 3e-7, "float64": 1e-15}[dtype]
+    np.testing.assert_allclose(drawn.scale, scale, rtol=tolerance)
+    np.testing.assert_allclose(drawn.opacity, opacity, rtol=tolerance)
+    assert {leaf.dtype.name for leaf in drawn} == {dtype}
+
+
+def test_activation_gradient(rng, float64):
+    def total(log_scale, logit):
+        splats = some_splats(np.random.default_rng(1))
+        splats = splats._replace(log_scale=log_scale, opacity_logit=logit)
+        drawn = rows.activate(splats)
+        return jnp.sum(drawn.scale**2) + jnp.sum(drawn.opacity**3)
+
+    splats = some_splats(rng)
+    error = gradients.directional_error(total, splats.log_scale, splats.opacity_logit)
+    assert error < 1e-8
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("raw", [-100.0, 100.0, -1e30, 1e30])
+def test_raw_values_far_out_stay_finite_with_their_slopes(raw, dtype):
+    splats = some_splats(np.random.default_rng(0), dtype=dtype)
+
+    def drawn(raw):
+        moved = splats._replace(
+            log_scale=jnp.full((7, 3), raw), opacity_logit=jnp.full(7, raw)
+        )
+        gaussians = rows.activate(moved)
+        return jnp.sum(gaussians.scale**2) + jnp.sum(gaussians.opacity)
+
+    value, slope = jax.value_and_grad(drawn)(jnp.asarray(raw, dtype))
+    assert np.isfinite(value)
+    assert np.isfinite(slope)
+
+
+def test_a_dead_row_has_no_opacity_and_no_way_back(dtype):
+    dead = jnp.asarray(rows.DEAD_LOGIT, dtype)
+    assert jax.nn.sigmoid(dead) == 0
+    assert jax.grad(jax.nn.sigmoid)(dead) == 0
+
+
+def test_padding_repeats_the_first_row_and_marks_it_dead(rng, dtype):
+    splats = some_splats(rng, dtype=dtype)
+    label = jnp.arange(7)
+    params = Params({"splats": splats, "label": label}, {"weight": jnp.ones((7, 2))})
+    padded = rows.pad_rows(params, 12)
+    assert list(rows.alive(padded.rows["splats"])) == [True] * 7 + [False] * 5
+    assert list(padded.rows["label"]) == [0, 1, 2, 3, 4, 5, 6, 0, 0, 0, 0, 0]
+    assert padded.nets["weight"].shape == (7, 2)  # as many rows by chance, yet no row
+    np.testing.assert_array_equal(padded.rows["splats"].mean[:7], splats.mean)
+    back = rows.take_rows(padded, jnp.arange(7))
+    jax.tree.map(np.testing.assert_array_equal, back, params)
+
+
+def test_padding_to_less_is_refused(rng):
+    params = Params({"splats": some_splats(rng, dtype="float32")}, {})
+    with pytest.raises(ValueError, match="7 rows cannot be padded to a capacity of 6"):
+        rows.pad_rows(params, 6)
+
+
+def test_capacities_grow_by_half_and_stop_at_the_cap():
+    sizes = sorted({rows.capacity_for(count) for count in range(1, 20_000, 37)})
+    assert sizes[:5] == [256, 512, 768, 1280, 2048]
+    assert all(b / a <= 2.0 for a, b in itertools.pairwise(sizes))
+    assert all(b / a <= 1.67 for a, b in itertools.pairwise(sizes[2:]))
+    assert rows.capacity_for(3073, most=3100) == 3100
+    with pytest.raises(ValueError, match="3101 Gaussians do not fit under the cap"):
+        rows.capacity_for(3101, most=3100)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_a_traced_degree_hides_the_bands_above_it(degree, rng, dtype):
+    splats = some_splats(rng, dtype=dtype)
+    shown = jax.jit(rows.active_harmonics)(splats, jnp.asarray(degree))
+    kept = (degree + 1) ** 2
+    every = np.concatenate([splats.sh_dc, splats.sh_rest], axis=1)
+    np.testing.assert_array_equal(shown[:, :kept], every[:, :kept])
+    assert not np.asarray(shown[:, kept:]).any()
+
+    def total(rest):
+        return jnp.sum(rows.active_harmonics(splats._replace(sh_rest=rest), degree))
+
+    slope = np.asarray(jax.grad(total)(splats.sh_rest))
+    assert (slope[:, : kept - 1] == 1).all()
+    assert not slope[:, kept - 1 :].any()
+
+
+def test_the_degree_grows_on_schedule():
+    degrees = [int(rows.active_degree(jnp.asarray(s), 1000, 3)) for s in (0, 999, 1000)]
+    assert degrees == [0, 0, 1]
+    assert int(rows.active_degree(jnp.asarray(90_000), 1000, 3)) == 3
+
+
+def test_first_scales_are_the_root_mean_square_of_three_distances(rng):
+    points = rng.normal(size=(40, 3)).astype(np.float32)
+    splats = rows.from_points(points, rng.uniform(size=(40, 3)), degree=2)
+    gap = np.linalg.norm(points[:, None].astype(float) - points[None], axis=-1)
+    nearest = np.sort(gap, axis=1)[:, 1:4]
+    expected = np.log(np.sqrt(np.mean(nearest**2, axis=1)))
+    np.testing.assert_allclose(splats.log_scale[:, 0], expected, atol=1e-6)
+    assert splats.sh_rest.shape == (40, 8, 3)
+    np.testing.assert_allclose(rows.activate(splats).opacity, 0.1, rtol=1e-6)
+
+
+def test_first_colours_come_back(rng):
+    colours = rng.uniform(size=(5, 3))
+    splats = rows.from_points(rng.normal(size=(5, 3)), colours)
+    seen = 0.5 + 0.28209479177387814 * np.asarray(splats.sh_dc[:, 0])
+    np.testing.assert_allclose(seen, colours, atol=1e-6)
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("distinct", [1, 2, 3, 4])
+def test_few_points_and_duplicates_have_finite_first_scales(distinct, rng):
+    points = np.repeat(rng.normal(size=(distinct, 3)), 4, axis=0)
+    splats = rows.from_points(points, np.full_like(points, 0.5), lone_scale=0.25)
+    scale = np.asarray(rows.activate(splats).scale)
+    assert (scale > 1e-3).all()
+    if distinct == 1:
+        np.testing.assert_allclose(scale, 0.25, rtol=1e-6)
+    if distinct == 2:
+        np.testing.assert_allclose(
+            scale, np.linalg.norm(points[0] - points[-1]), rtol=1e-6
+        )
+
+
+def test_bad_points_are_refused_by_row(rng):
+    points = rng.normal(size=(6, 3))
+    points[4, 1] = np.nan
+    with pytest.raises(ValueError, match="point 4 is not finite"):
+        rows.from_points(points, np.zeros((6, 3)))
+    with pytest.raises(ValueError, match="no points to start from"):
+        rows.from_points(np.zeros((0, 3)), np.zeros((0, 3)))
+    with pytest.raises(ValueError, match=r"\[n, 3\]"):
+        rows.from_points(np.zeros((4, 3)), np.zeros((4, 4)))
+
+
+def ring_of_cameras(count):
+    angle = np.linspace(0, 2, count)
+    forward = np.stack([np.sin(angle), np.zeros(count), np.cos(angle)], axis=-1)
+    down = np.tile([0.0, 1.0, 0.0], (count, 1))
+    right = np.cross(down, forward)
+    return Camera(
+        camera_from_world=np.stack([right, down, forward], axis=1),
+        position=-3 * forward,
+        focal_px=np.full(count, 80.0),
+        principal_point_px=np.tile([30.0, 26.0], (count, 1)),
+        skew_px=np.full(count, 4.0),
+        pixel_aspect=np.full(count, 1.25),
+        radial=np.zeros((count, 3)),
+        tangential=np.zeros((count, 2)),
+    )
+
+
+def test_random_points_lie_where_a_camera_sees_them(rng):
+    cameras = ring_of_cameras(5)
+    points = rows.random_in_views(rng, cameras, (48, 64), 1.0, 4.0, 2000)
+    seen = np.zeros(len(points), bool)
+    for turn, centre in zip(cameras.camera_from_world, cameras.position, strict=True):
+        x, y, z = turn @ (points - centre).T
+        u = 80 * x / z + 4 * y / z + 30
+        v = 100 * y / z + 26
+        inside = (u >= 0) & (u <= 64) & (v >= 0) & (v <= 48)
+        seen |= inside & (z >= 1 - 1e-9) & (z <= 4 + 1e-9)
+    assert seen.all()
+
+
+def test_one_camera_fills_its_picture_and_its_depth_evenly(rng):
+    camera = jax.tree.map(lambda leaf: leaf[0], ring_of_cameras(1))
+    points = rows.random_in_views(rng, camera, (48, 64), 1.0, 4.0, 20_000)
+    x, y, z = camera.camera_from_world @ (points - camera.position).T
+    u, v = 80 * x / z + 4 * y / z + 30, 100 * y / z + 26
+    for values, low, high in ((u, 0, 64), (v, 0, 48), (z, 1, 4)):
+        share, _ = np.histogram(values, bins=8, range=(low, high))
+        # 2500 expected, standard deviation 47.
+        assert abs(share - 2500).max() < 250
+
+
+def test_random_points_in_a_box(rng):
+    low, high = np.array([0, 1, 2]), np.array([1, 3, 6])
+    points = rows.random_in_box(rng, low, high, 5000)
+    np.testing.assert_allclose(points.mean(axis=0), [0.5, 2, 4], atol=0.1)
+    assert (points >= low).all()
+    assert (points <= high).all()
+    with pytest.raises(ValueError, match="low < high"):
+        rows.random_in_box(rng, low, np.array([1, 1, 6]), 5)
+
+
+@pytest.mark.parametrize(("near", "far"), [(0.0, 1.0), (2.0, 1.0), (1.0, np.inf)])
+def test_impossible_depth_ranges_are_refused(near, far, rng):
+    with pytest.raises(ValueError, match="0 < near < far"):
+        rows.random_in_views(rng, ring_of_cameras(2), (4, 4), near, far, 10)
+
+
+def test_extent_is_the_reach_of_the_cameras():
+    position = np.array([[0.0, 0, 0], [4, 0, 0], [2, 3, 0], [2, -3, 0]])
+    assert rows.scene_extent(position) == pytest.approx(1.1 * 3)
+
+
+@pytest.mark.hard_cases
+def test_a_tripod_has_no_extent_of_its_own():
+    position = np.tile([[1000.0, 2.0, 3.0]], (5, 1)) + np.float32(6e-5) * np.eye(5, 3)
+    with pytest.raises(ValueError, match="stand still"):
+        rows.scene_extent(position)
+    assert rows.scene_extent(position, still=2.5) == 2.5
