@@ -1,12 +1,20 @@
 """One record for what was filmed, whatever format it came in."""
 
+import collections
 import dataclasses
 import pathlib
 from typing import NamedTuple
 
 import numpy as np
 
+from nerfies_jax.geometry import camera
 from nerfies_jax.geometry.camera import Camera
+
+MAX_ID = 2**20  # a table of codes longer than this is a broken id, not a capture
+
+
+class CaptureError(ValueError):
+    """A capture that cannot be used as it is; one line, with the way out."""
 
 
 class PointCloud(NamedTuple):
@@ -21,6 +29,8 @@ class Capture:
     """A filmed scene on the host: NumPy only, one row per frame.
 
     Everything geometric is in scene units: `scene_units = (world - centre) * scale`.
+    Building one checks it: shapes agree, every number is finite, the rows to learn
+    from and to score on are disjoint.
     """
 
     name: str
@@ -38,15 +48,280 @@ class Capture:
     camera_ids: np.ndarray  # [frames] int32: which physical camera
     valid: np.ndarray | None = None  # [frames, height, width] bool: pixel was filmed
     moving: np.ndarray | None = None  # [frames, height, width] bool: moves by itself
-    depths: np.ndarray | None = None  # [frames, height, width] float32 z-depth; 0 unknown
+    depths: np.ndarray | None = (
+        None  # [frames, height, width] float32 z-depth; 0 unknown
+    )
     points: PointCloud | None = None
     background: tuple[float, float, float] | None = None  # what lies behind, if known
     scale: float = 1.0
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    up: tuple[float, float, float] | None = None  # unit, scene axes, if known
+    frames_per_second: float | None = None  # of the footage, if known
     path: pathlib.Path | None = None
     notes: tuple[str, ...] = ()  # what the reader found, repaired or left out
+
+    def __post_init__(self):
+        validate(self)
 
     @property
     def size(self) -> tuple[int, int]:
         """Width and height in pixels."""
         return self.images.shape[2], self.images.shape[1]
+
+
+def validate(capture: Capture):
+    """Raise a one-line `CaptureError` on the first thing that cannot be right."""
+    where = str(capture.path or capture.name)
+    frames = len(capture.ids)
+    if frames < 2:
+        raise CaptureError(
+            f"{where}: {frames} frame(s); a reconstruction needs at least 2 views, "
+            "so film or select more"
+        )
+    name, times = collections.Counter(capture.ids).most_common(1)[0]
+    if times > 1:
+        raise CaptureError(f"{where}: frame {name!r} appears {times} times; keep one")
+    _check_shapes(capture, where, frames)
+    check_cameras(capture.cameras, capture.ids, capture.size, where)
+    _check_numbers(capture, where)
+    _check_rows(capture, where, frames)
+
+
+def _check_shapes(capture, where, frames):
+    images = capture.images
+    if images.ndim != 4 or images.shape[3] != 3 or images.dtype != np.uint8:
+        raise CaptureError(
+            f"{where}: images are {images.dtype} of shape {images.shape}; "
+            "expected uint8 [frames, height, width, 3]"
+        )
+    pictures = images.shape[:3]
+    if pictures[0] != frames or min(pictures) < 1:
+        raise CaptureError(
+            f"{where}: {frames} ids but images of shape {images.shape}; "
+            "there must be one picture per id"
+        )
+    for name in ("valid", "moving", "depths"):
+        array = getattr(capture, name)
+        kind = np.float32 if name == "depths" else np.bool_
+        if array is not None and (array.shape != pictures or array.dtype != kind):
+            raise CaptureError(
+                f"{where}: {name} is {array.dtype} of shape {array.shape}; "
+                f"expected {np.dtype(kind)} of shape {pictures}, as the images"
+            )
+    for name in ("times", "warp_ids", "appearance_ids", "camera_ids"):
+        array = getattr(capture, name)
+        if array.shape != (frames,):
+            raise CaptureError(
+                f"{where}: {name} has shape {array.shape}; expected one per frame, "
+                f"({frames},)"
+            )
+    points = capture.points
+    if points is not None and (
+        points.position.shape != points.colour.shape
+        or points.position.ndim != 2
+        or points.position.shape[1] != 3
+    ):
+        raise CaptureError(
+            f"{where}: point positions {points.position.shape} and colours "
+            f"{points.colour.shape}; expected both [points, 3]"
+        )
+
+
+def check_cameras(
+    cameras: Camera, ids: tuple[str, ...], size: tuple[int, int], where: str
+):
+    """Raise, naming the frame, unless there is one usable camera for each id."""
+    leaf = next((leaf for leaf in cameras if leaf.shape[:1] != (len(ids),)), None)
+    if leaf is not None:
+        raise CaptureError(
+            f"{where}: {len(ids)} frames but cameras of shape {leaf.shape}; there must "
+            "be one per frame"
+        )
+    try:
+        camera.validate(cameras, size, where)
+    except ValueError as error:
+        for row, name in enumerate(ids):
+            try:
+                camera.validate(camera.take(cameras, [row]), size, f"camera {name!r}")
+            except ValueError as reason:
+                named = str(reason).replace(" (row 0)", "")  # one camera at a time
+                raise CaptureError(f"{where}: {named}") from None
+        raise CaptureError(str(error)) from None
+
+
+def _check_numbers(capture, where):
+    times = capture.times
+    bad = ~((times >= 0) & (times <= 1))  # also true for NaN
+    if bad.any():
+        row = int(np.argmax(bad))
+        raise CaptureError(
+            f"{where}: frame {capture.ids[row]!r} has time {times[row]:g}; times run "
+            "from 0 to 1 over the capture, so divide by the last one"
+        )
+    if not 0 < capture.near < capture.far < np.inf:
+        raise CaptureError(
+            f"{where}: near = {capture.near:g} and far = {capture.far:g}; "
+            "expected 0 < near < far"
+        )
+    if not (0 < capture.scale < np.inf and np.isfinite(capture.centre).all()):
+        raise CaptureError(
+            f"{where}: scale = {capture.scale:g} and centre = {capture.centre}; "
+            "expected a positive scale and a finite centre"
+        )
+    if capture.depths is not None:
+        bad = ~(capture.depths >= 0) | np.isinf(capture.depths)
+        if bad.any():
+            row = int(np.argmax(bad.any((1, 2))))
+            raise CaptureError(
+                f"{where}: the depth of frame {capture.ids[row]!r} has "
+                f"{bad[row].sum()} "
+                "negative, infinite or NaN pixels; write 0 where depth is unknown"
+            )
+    if capture.points is not None and not np.isfinite(capture.points.position).all():
+        count = (~np.isfinite(capture.points.position).all(1)).sum()
+        raise CaptureError(
+            f"{where}: {count} scene points are not finite; remove them from the cloud"
+        )
+
+
+def _check_rows(capture, where, frames):
+    for name in ("warp_ids", "appearance_ids", "camera_ids"):
+        ids = getattr(capture, name)
+        bad = (ids < 0) | (ids >= MAX_ID)
+        if bad.any():
+            row = int(np.argmax(bad))
+            raise CaptureError(
+                f"{where}: frame {capture.ids[row]!r} has {name[:-1]} {ids[row]}; "
+                f"expected 0 to {MAX_ID - 1}"
+            )
+    for name in ("train", "heldout"):
+        rows = getattr(capture, name)
+        if rows.ndim != 1 or (rows.size and not np.issubdtype(rows.dtype, np.integer)):
+            raise CaptureError(f"{where}: {name} must be a list of row numbers")
+        bad = rows[(rows < 0) | (rows >= frames)]
+        if bad.size:
+            raise CaptureError(
+                f"{where}: {name} names row {bad[0]}, but the {frames} frames are rows "
+                f"0 to {frames - 1}"
+            )
+        if np.unique(rows).size != rows.size:
+            raise CaptureError(f"{where}: {name} names a row twice")
+    if not capture.train.size:
+        raise CaptureError(f"{where}: no frame to learn from; hold fewer frames out")
+    shared = np.intersect1d(capture.train, capture.heldout)
+    if shared.size:
+        raise CaptureError(
+            f"{where}: frame {capture.ids[shared[0]]!r} is both learnt from and held "
+            "out "
+            f"({shared.size} such); a score on it would mean nothing"
+        )
+
+
+def select(capture: Capture, rows: np.ndarray) -> Capture:
+    """The capture with only these rows, in this order; ids keep their meaning."""
+    rows = np.asarray(rows, np.int64)
+    place = np.full(len(capture.ids), -1)
+    place[rows] = np.arange(rows.size)
+
+    def moved(old):
+        return np.sort(place[old][place[old] >= 0])
+
+    def take(array):
+        return None if array is None else array[rows]
+
+    return dataclasses.replace(
+        capture,
+        ids=tuple(capture.ids[row] for row in rows),
+        images=capture.images[rows],
+        cameras=camera.take(capture.cameras, rows),
+        times=capture.times[rows],
+        train=moved(capture.train),
+        heldout=moved(capture.heldout),
+        warp_ids=capture.warp_ids[rows],
+        appearance_ids=capture.appearance_ids[rows],
+        camera_ids=capture.camera_ids[rows],
+        valid=take(capture.valid),
+        moving=take(capture.moving),
+        depths=take(capture.depths),
+    )
+
+
+def downscale(capture: Capture, factor: int) -> Capture:
+    """The capture with pictures smaller by an integer factor, by area averaging.
+
+    What does not fill a block at the right and the bottom is trimmed. A block was
+    filmed if all its pixels were, moves if any of them does, and its depth is the mean
+    of those that are known. Colours are averaged as stored (sRGB), as every published
+    evaluation of these captures does.
+    """
+    width, height = capture.size
+    if not 1 <= factor <= min(width, height):
+        raise CaptureError(
+            f"{capture.path or capture.name}: cannot make {width}x{height} pictures "
+            f"smaller by {factor}; expected a whole number from 1 to "
+            f"{min(width, height)}"
+        )
+    if factor == 1:
+        return capture
+    valid, moving = capture.valid, capture.moving
+    return dataclasses.replace(
+        capture,
+        images=np.stack([shrink(image, factor) for image in capture.images]),
+        cameras=camera.resize(capture.cameras, (factor, factor), (1, 1)),
+        valid=None if valid is None else _blocks(valid, factor).all((-3, -1)),
+        moving=None if moving is None else _blocks(moving, factor).any((-3, -1)),
+        depths=None
+        if capture.depths is None
+        else np.stack([shrink_depth(depth, factor) for depth in capture.depths]),
+    )
+
+
+def _blocks(array, factor):
+    """[..., rows, factor, columns, factor] view of pictures [..., height, width]."""
+    rows, columns = array.shape[-2] // factor, array.shape[-1] // factor
+    trimmed = array[..., : rows * factor, : columns * factor]
+    return trimmed.reshape(*array.shape[:-2], rows, factor, columns, factor)
+
+
+def shrink(image: np.ndarray, factor: int) -> np.ndarray:
+    """Area average of one uint8 picture [height, width, 3], rounded half up."""
+    blocks = _blocks(np.moveaxis(image, -1, 0), factor)
+    total = blocks.sum((-3, -1), dtype=np.uint32)
+    area = factor * factor
+    return np.moveaxis((total + area // 2) // area, 0, -1).astype(np.uint8)
+
+
+def shrink_depth(depth: np.ndarray, factor: int) -> np.ndarray:
+    """Mean of the known depths of each block of [height, width]; 0 where none is."""
+    blocks = _blocks(depth, factor)
+    known = (blocks > 0).sum((-3, -1))
+    mean = blocks.sum((-3, -1), dtype=np.float64) / np.maximum(known, 1)
+    return mean.astype(np.float32)
+
+
+def describe(capture: Capture) -> tuple[str, ...]:
+    """What was found, in a few lines for a person."""
+    width, height = capture.size
+    cameras = np.unique(capture.camera_ids).size
+    lines = [
+        f"{capture.name}: {capture.source} capture, {len(capture.ids)} frames of "
+        f"{width}x{height}, {capture.train.size} to learn from, "
+        f"{capture.heldout.size} held out",
+        f"{np.unique(capture.warp_ids).size} moments, {cameras} camera(s), focal "
+        "length "
+        f"{np.median(capture.cameras.focal_px):.4g} px, depth {capture.near:.3g} to "
+        f"{capture.far:.3g} scene units (1 unit = {1 / capture.scale:.3g} of the "
+        "world)",
+    ]
+    extras = []
+    if capture.points is not None:
+        extras.append(f"{len(capture.points.position)} static points")
+    if capture.valid is not None:
+        extras.append(f"{1 - capture.valid.mean():.1%} of pixels not filmed")
+    if capture.moving is not None:
+        extras.append(f"{capture.moving.mean():.1%} of pixels marked moving")
+    if capture.depths is not None:
+        extras.append(f"depth on {(capture.depths > 0).mean():.1%} of pixels")
+    if extras:
+        lines.append("; ".join(extras))
+    return (*lines, *capture.notes)

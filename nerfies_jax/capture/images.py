@@ -1,0 +1,164 @@
+"""Pictures in and out: PNG and JPEG by scikit-image, EXR by OpenEXR.
+
+Sizes are bounded from the header, before anything is decoded. Colours are sRGB in 8
+bits on disk and in memory; EXR holds linear light and depth in floats.
+"""
+
+import pathlib
+import warnings
+from typing import NamedTuple
+
+import numpy as np
+import PIL.Image
+import skimage.io
+
+from nerfies_jax.capture.capture import CaptureError
+from nerfies_jax.capture.json_files import AnyPath, replaced_file
+
+# An 8K video frame has 33 million. Pillow itself only warns above 89 million, and at
+# 144 million a picture is 430 MB.
+MAX_PIXELS = 64_000_000
+MAX_EXR_FLOATS = 512_000_000
+_ORIENTATION = 0x0112  # the EXIF tag; 1 is upright
+_PILLOW_ERRORS = (OSError, SyntaxError, ValueError, EOFError, IndexError, TypeError)
+
+
+class Header(NamedTuple):
+    """What a picture says about itself before it is decoded."""
+
+    size: tuple[int, int]  # width, height as stored
+    mode: str  # Pillow's name: RGB, RGBA, L, LA, P, I;16, ...
+    orientation: int  # EXIF, 1 where absent
+
+
+def read_header(path: AnyPath) -> Header:
+    """Size and kind of a PNG or JPEG, checked against `MAX_PIXELS`."""
+    path = pathlib.Path(path)
+    if not path.is_file():
+        raise CaptureError(f"{path}: no such picture; restore it or drop its frame")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", PIL.Image.DecompressionBombWarning)
+            with PIL.Image.open(path) as image:
+                header = Header(
+                    image.size, image.mode, image.getexif().get(_ORIENTATION, 1)
+                )
+    except (PIL.Image.DecompressionBombWarning, PIL.Image.DecompressionBombError):
+        raise CaptureError(
+            f"{path}: more than {MAX_PIXELS} pixels; make the picture smaller first"
+        ) from None
+    except _PILLOW_ERRORS as error:
+        raise _unreadable(path, error) from None
+    width, height = header.size
+    if width * height > MAX_PIXELS:
+        raise CaptureError(
+            f"{path}: {width}x{height} pixels, more than {MAX_PIXELS}; make the "
+            "picture "
+            "smaller first"
+        )
+    return header
+
+
+def read_pixels(path: AnyPath, orientation: str = "refuse") -> np.ndarray:
+    """One picture as uint8 [height, width, 1 to 4]: grey, grey+alpha, RGB or RGBA.
+
+    A picture that a viewer would turn (EXIF) is refused, unless `orientation` is
+    "stored": then its pixels come as they lie in the file, which is what COLMAP's
+    cameras refer to. 16-bit grey is rounded to 8 bits; 16-bit colour is cut to them.
+    """
+    path = pathlib.Path(path)
+    header = read_header(path)
+    if header.orientation not in (0, 1) and orientation != "stored":
+        raise CaptureError(
+            f"{path}: its EXIF orientation is {header.orientation}, so a viewer turns "
+            "it "
+            "and a camera file may or may not; turn the pixels and remove the tag"
+        )
+    try:
+        if header.mode in {"RGB", "RGBA", "L", "1", "I;16", "I;16B"}:
+            pixels = skimage.io.imread(path)
+        elif header.mode in {"LA", "P", "PA"}:
+            # skimage.io.imread transposes LA ([height, width, 2] looks like channels
+            # first to it) and forgets the transparency of a palette.
+            with PIL.Image.open(path) as image:
+                opaque = header.mode == "P" and "transparency" not in image.info
+                pixels = np.asarray(image.convert("RGB" if opaque else "RGBA"))
+        else:
+            raise CaptureError(
+                f"{path}: colour mode {header.mode}; expected grey, RGB or RGBA, so "
+                "save "
+                "it as an RGB PNG"
+            )
+    except CaptureError:
+        raise
+    except _PILLOW_ERRORS as error:
+        raise _unreadable(path, error) from None
+    if pixels.dtype == np.bool_:
+        pixels = pixels.astype(np.uint8) * 255
+    elif pixels.dtype == np.uint16:
+        pixels = ((pixels.astype(np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
+    pixels = pixels if pixels.ndim == 3 else pixels[..., None]
+    if pixels.dtype != np.uint8 or pixels.shape[1::-1] != header.size:
+        raise CaptureError(
+            f"{path}: decoded to {pixels.dtype} of shape {pixels.shape}; save it as an "
+            "8-bit RGB PNG"
+        )
+    return pixels
+
+
+def read_image(
+    path: AnyPath, orientation: str = "refuse"
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Colour [height, width, 3] uint8 and alpha [height, width] uint8 where stored."""
+    pixels = read_pixels(path, orientation)
+    channels = pixels.shape[2]
+    alpha = pixels[..., -1] if channels in (2, 4) else None
+    colour = pixels[..., :3] if channels >= 3 else np.repeat(pixels[..., :1], 3, axis=2)
+    return np.ascontiguousarray(colour), alpha
+
+
+def read_mask(path: AnyPath, orientation: str = "refuse") -> np.ndarray:
+    """True where the stored grey (or the mean of the colours) is at least one half."""
+    colour, _ = read_image(path, orientation)
+    return colour.sum(-1, dtype=np.uint16) >= 3 * 128
+
+
+def over(colour: np.ndarray, alpha: np.ndarray, background: tuple) -> np.ndarray:
+    """uint8 colour with straight alpha laid over one colour, all as stored (sRGB)."""
+    cover = alpha[..., None].astype(np.float32) / 255
+    behind = np.asarray(background, np.float32) * 255
+    return np.round(colour * cover + behind * (1 - cover)).astype(np.uint8)
+
+
+def write_png(path: AnyPath, pixels: np.ndarray):
+    """uint8 or uint16 [height, width(, 1 to 4)], or a bool mask, written atomically."""
+    if pixels.dtype == np.bool_:
+        pixels = pixels.astype(np.uint8) * 255
+    if pixels.dtype not in (np.uint8, np.uint16):
+        raise ValueError(
+            f"{path}: PNG holds uint8 or uint16, got {pixels.dtype}; convert first, or "
+            "write an EXR"
+        )
+    with replaced_file(path) as partial:
+        skimage.io.imsave(partial, pixels, check_contrast=False)
+
+
+def srgb_from_linear(light: np.ndarray) -> np.ndarray:
+    """Display values in [0, 1] from linear light (IEC 61966-2-1); clipped to [0, 1]."""
+    light = np.clip(light, 0, 1)
+    power = 1.055 * np.maximum(light, 0.0031308) ** (1 / 2.4) - 0.055
+    return np.where(light <= 0.0031308, 12.92 * light, power)
+
+
+def linear_from_srgb(value: np.ndarray) -> np.ndarray:
+    """Linear light from display values in [0, 1]; values outside keep their slope."""
+    power = ((np.maximum(value, 0.04045) + 0.055) / 1.055) ** 2.4
+    return np.where(value <= 0.04045, value / 12.92, power)
+
+
+def _unreadable(path, error):
+    reason = " ".join(str(error).split()) or type(error).__name__
+    return CaptureError(
+        f"{path}: not a readable picture ({reason}); it may be cut short, so copy or "
+        "export it again"
+    )

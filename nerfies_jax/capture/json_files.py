@@ -1,0 +1,114 @@
+"""JSON and file names from strangers: bounded, typed, never outside their folder."""
+
+import contextlib
+import json
+import os
+import pathlib
+import re
+import shutil
+import tempfile
+from typing import Any, TypeVar
+
+import msgspec
+
+from nerfies_jax.capture.capture import CaptureError
+
+MAX_JSON_BYTES = 256 * 2**20  # 20 000 frames of transforms.json are 20 MB
+
+Type = TypeVar("Type")
+AnyPath = str | os.PathLike
+
+
+def read_json(path: AnyPath, kind: type[Type] = Any) -> Type:
+    """The file decoded as `kind`; a NaN, a wrong type or an absent key is an error."""
+    path = pathlib.Path(path)
+    try:
+        size = path.stat().st_size
+        if size > MAX_JSON_BYTES:
+            raise CaptureError(
+                f"{path}: {size} bytes of JSON; at most {MAX_JSON_BYTES} are read"
+            )
+        text = path.read_bytes()
+    except OSError as error:
+        raise CaptureError(
+            f"{path}: {error.strerror or error}; check the path"
+        ) from None
+    try:
+        return msgspec.json.decode(text, type=kind)
+    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
+        bad = re.search(rb"(?<![\w\"'])-?(NaN|Infinity|inf|nan)\b", text)
+        if bad:
+            line = text.count(b"\n", 0, bad.start()) + 1
+            raise CaptureError(
+                f"{path}: {bad.group().decode()} on line {line}; every number must be "
+                "finite, so mend that entry or leave the frame out"
+            ) from None
+        reason = str(error).replace("\n", " ")
+        raise CaptureError(
+            f"{path}: {reason}; mend the file or export it again"
+        ) from None
+
+
+def write_json(path: AnyPath, value: Any):
+    """Written beside and renamed, so a reader never sees half a file."""
+    with replaced_file(path) as partial:
+        partial.write_text(json.dumps(value, indent=1, allow_nan=False) + "\n")
+
+
+def inside(root: pathlib.Path, name: str, named_in: pathlib.Path) -> pathlib.Path:
+    """`root / name`, unless that leaves `root`, also through a symbolic link."""
+    target = root / name
+    if not target.resolve().is_relative_to(root.resolve()) or "\0" in name:
+        raise CaptureError(
+            f"{named_in}: the name {name!r} leads outside {root}; names must stay in "
+            "the "
+            "capture's folder, so copy the file there"
+        )
+    return target
+
+
+@contextlib.contextmanager
+def replaced_file(path: AnyPath):
+    """A path to write to; it takes the name `path` when the block ends well."""
+    path = pathlib.Path(path)
+    # The suffix stays last: image and video writers choose the format by it.
+    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+    try:
+        yield partial
+        os.replace(partial, path)
+    except OSError as error:
+        raise CaptureError(
+            f"{path}: cannot be written ({error.strerror or error}); choose another "
+            "place"
+        ) from None
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def new_folder(path: AnyPath):
+    """A temporary folder beside `path` that becomes `path` when the block ends well."""
+    path = pathlib.Path(path)
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise CaptureError(f"{path}: already there; choose another name or remove it")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = pathlib.Path(
+            tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent)
+        )
+    except OSError as error:
+        raise CaptureError(
+            f"{path}: cannot be written ({error.strerror or error}); choose another "
+            "place"
+        ) from None
+    try:
+        yield partial
+        partial.chmod(0o755)  # mkdtemp makes it private
+        os.replace(partial, path)
+    except OSError as error:
+        raise CaptureError(
+            f"{path}: cannot be written ({error.strerror or error}); choose another "
+            "place"
+        ) from None
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)

@@ -1,0 +1,112 @@
+"""Film in and out, by PyAV."""
+
+import itertools
+import pathlib
+from collections.abc import Iterable, Iterator
+from fractions import Fraction
+
+import av
+import numpy as np
+
+from nerfies_jax.capture.capture import CaptureError
+from nerfies_jax.capture.images import MAX_PIXELS
+from nerfies_jax.capture.json_files import AnyPath, replaced_file
+
+
+def write_video(
+    path: AnyPath,
+    frames: Iterable[np.ndarray],
+    frames_per_second: float = 30.0,
+    quality: int = 18,
+):
+    """uint8 sRGB frames [height, width, 3] as H.264, atomically.
+
+    `quality` is x264's constant rate factor: 0 keeps everything, 18 looks the same, 28
+    is rough. An odd width or height grows by one repeated line, since the chroma of
+    `yuv420p`, which every player shows, comes in pairs.
+    """
+    path = pathlib.Path(path)
+    frames = iter(frames)
+    first = next(frames, None)
+    if first is None:
+        raise ValueError(f"{path}: no frames to write; pass at least one")
+    try:
+        with replaced_file(path) as partial:
+            _encode(partial, path, first, frames, frames_per_second, quality)
+    except av.FFmpegError as error:
+        raise CaptureError(
+            f"{path}: cannot be written ({error.strerror}); end its name in .mp4 and "
+            "choose a folder that exists"
+        ) from None
+
+
+def _encode(partial, path, first, frames, frames_per_second, quality):
+    height, width = first.shape[:2]
+    with av.open(str(partial), "w") as container:
+        rate = Fraction(frames_per_second).limit_denominator(1001)
+        stream = container.add_stream("h264", rate=rate, options={"crf": str(quality)})
+        stream.width, stream.height = width + width % 2, height + height % 2
+        stream.pix_fmt = "yuv420p"
+        # Without these tags a player guesses the matrix from the height of the picture
+        # and shifts the colours of small films; BT.709 is what sRGB displays assume.
+        stream.codec_context.color_primaries = 1
+        stream.codec_context.color_trc = 13
+        stream.codec_context.colorspace = 1
+        stream.codec_context.color_range = 1
+        for number, frame in enumerate(itertools.chain([first], frames)):
+            if frame.shape != first.shape or frame.dtype != np.uint8:
+                raise ValueError(
+                    f"{path}: frame {number} is {frame.dtype} of shape {frame.shape}; "
+                    f"expected uint8 of shape {first.shape}, as the first"
+                )
+            padded = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), "edge")
+            picture = av.VideoFrame.from_ndarray(padded, format="rgb24").reformat(
+                format="yuv420p", dst_colorspace="ITU709", dst_color_range="MPEG"
+            )
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode())
+
+
+def read_video(
+    path: AnyPath, stride: int = 1, most: int = 2**31
+) -> Iterator[tuple[float, np.ndarray]]:
+    """Seconds and uint8 sRGB [height, width, 3] of every `stride`-th frame, upright.
+
+    Times are the film's own, so a variable frame rate stays true. A phone's rotation
+    tag is carried out. High dynamic range is not tone-mapped.
+    """
+    path = pathlib.Path(path)
+    if not path.is_file():
+        raise CaptureError(f"{path}: no such film; check the path")
+    shown = 0
+    try:
+        with av.open(str(path)) as container:
+            if not container.streams.video:
+                raise CaptureError(f"{path}: holds no pictures; pass a film")
+            stream = container.streams.video[0]
+            if stream.width * stream.height > MAX_PIXELS:
+                raise CaptureError(
+                    f"{path}: {stream.width}x{stream.height} frames, more than "
+                    f"{MAX_PIXELS} pixels; encode it smaller"
+                )
+            stream.thread_type = "AUTO"
+            for number, frame in enumerate(container.decode(stream)):
+                if number % stride:
+                    continue
+                if shown >= most:
+                    return
+                shown += 1
+                turns = round((frame.rotation or 0) / 90)
+                yield (
+                    float(frame.time or 0.0),
+                    np.ascontiguousarray(
+                        np.rot90(frame.to_ndarray(format="rgb24"), turns)
+                    ),
+                )
+    except (av.FFmpegError, OSError) as error:
+        reason = " ".join(str(error.strerror or error).split())
+        raise CaptureError(
+            f"{path}: not a readable film ({reason}); copy or encode it again"
+        ) from None
+    if not shown:
+        raise CaptureError(f"{path}: holds no frames; copy or encode it again")
