@@ -1,0 +1,338 @@
+"""Image metrics against scikit-image, reference values and slow float64 loops."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.ndimage
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+from nerfies_jax.measure import image_quality
+from tests import gradients
+
+SCIKIT = dict(
+    channel_axis=-1,
+    data_range=1,
+    gaussian_weights=True,
+    sigma=1.5,
+    use_sample_covariance=False,
+)
+
+
+def pair(rng, shape=(40, 33, 3), noise=0.1):
+    truth = scipy.ndimage.gaussian_filter(rng.random(shape), (2, 2, 0))
+    truth = (truth - truth.min()) / np.ptp(truth)
+    return np.clip(truth + noise * rng.normal(size=shape), 0, 1), truth
+
+
+def blob(shape):
+    rows, columns = np.mgrid[: shape[0], : shape[1]]
+    return np.hypot(rows - shape[0] / 2, columns - shape[1] / 3) < min(shape) / 3
+
+
+psnr = jax.jit(image_quality.psnr)
+ssim = jax.jit(image_quality.ssim, static_argnums=2)
+ms_ssim = jax.jit(image_quality.ms_ssim, static_argnums=2)
+masked = {
+    name: jax.jit(getattr(image_quality, name))
+    for name in ("masked_psnr", "masked_ssim", "partial_ssim")
+}
+
+
+def arrays(*values, dtype):
+    return [jnp.asarray(x, None if x.dtype == bool else dtype) for x in values]
+
+
+def test_psnr_is_scikit_images(dtype, rng):
+    image, truth = pair(rng)
+    value = psnr(*arrays(image, truth, dtype=dtype))
+    error = abs(value - peak_signal_noise_ratio(truth, image, data_range=1))
+    assert error < {"float32": 1e-4, "float64": 1e-12}[dtype]
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize(("offset", "decibels"), [(0.0, 100), (1e-6, 100), (1e-4, 80)])
+def test_psnr_is_capped_and_exact_below_the_cap(offset, decibels, dtype):
+    flat = jnp.zeros((8, 8, 3), dtype)
+    value, slope = jax.value_and_grad(psnr)(flat + offset, flat)
+    assert value == pytest.approx(decibels, abs=1e-4)
+    assert np.all(np.isfinite(slope))
+    assert np.all(slope == 0) == (decibels == 100)
+
+
+def test_quantised_scores_are_those_of_the_png(dtype, rng):
+    image, truth = pair(rng)
+    image = image * 1.2 - 0.1  # leaves [0, 1] on both sides
+    stored = [np.round(255 * np.clip(x, 0, 1)).astype(np.uint8) for x in (image, truth)]
+    quantised = [image_quality.quantise(x) for x in arrays(image, truth, dtype=dtype)]
+    exact = peak_signal_noise_ratio(stored[1], stored[0])
+    assert psnr(*quantised) == pytest.approx(exact, abs=1e-4)
+
+
+@pytest.mark.parametrize("shape", [(11, 11, 3), (40, 33, 1), (96, 130, 3)])
+def test_valid_ssim_is_scikit_images(shape, dtype, rng):
+    image, truth = pair(rng, shape)
+    value = ssim(*arrays(image, truth, dtype=dtype))
+    exact = structural_similarity(image, truth, **SCIKIT)
+    # The promise is 1e-4; measured 2e-7 in float32.
+    assert abs(value - exact) < {"float32": 2e-6, "float64": 1e-12}[dtype]
+
+
+@pytest.mark.parametrize("size", ["64x48", "480x270"])
+@pytest.mark.parametrize("padding", ["valid", "zero"])
+def test_ssim_has_the_reference_values(size, padding, dtype, oracle_dir):
+    with np.load(oracle_dir / "splatting" / f"ssim_{size}.npz") as reference:
+        pictures = [np.moveaxis(reference[f"img{i}"][0], 0, -1) for i in (1, 2)]
+        exact = reference[{"valid": "ssim_valid", "zero": "ssim_zero_pad"}[padding]]
+        slope = np.moveaxis(reference["grad_img1"][0], 0, -1)
+    image, truth = arrays(*pictures, dtype=dtype)
+    value, gradient = jax.jit(jax.value_and_grad(image_quality.ssim), static_argnums=2)(
+        image, truth, padding
+    )
+    # The reference made its window in float32: 2e-6 of its value.
+    assert abs(value - exact) < 5e-6
+    if padding == "zero":
+        error = np.linalg.norm(gradient - slope) / np.linalg.norm(slope)
+        assert error < 1e-5
+
+
+def test_zero_padded_ssim_is_a_slow_loop(float64, rng):
+    image, truth = pair(rng, (13, 12, 2))
+    exact = slow_ssim(*(np.pad(x, ((5, 5), (5, 5), (0, 0))) for x in (image, truth)))
+    value = ssim(*arrays(image, truth, dtype=float64), "zero")
+    assert value == pytest.approx(exact, abs=1e-12)
+
+
+def gaussian():
+    weights = np.exp(-(np.arange(-5, 6) ** 2) / 4.5)
+    return np.outer(weights, weights) / weights.sum() ** 2
+
+
+def slow_ssim(image, truth, mask=None):
+    """Textbook moments, window by window; weights are renormalised inside the mask."""
+    mask = np.ones(image.shape[:2], bool) if mask is None else mask
+    scores = []
+    for row in range(image.shape[0] - 10):
+        for column in range(image.shape[1] - 10):
+            if not mask[row + 5, column + 5]:
+                continue
+            here = np.s_[row : row + 11, column : column + 11]
+            weights = (gaussian() * mask[here])[..., None]
+            weights = weights / weights.sum()
+            x, y = image[here], truth[here]
+            mean_x, mean_y = (weights * x).sum((0, 1)), (weights * y).sum((0, 1))
+            var_x = (weights * (x - mean_x) ** 2).sum((0, 1))
+            var_y = (weights * (y - mean_y) ** 2).sum((0, 1))
+            cov = (weights * (x - mean_x) * (y - mean_y)).sum((0, 1))
+            scores.append(
+                (2 * mean_x * mean_y + 1e-4)
+                * (2 * cov + 9e-4)
+                / ((mean_x**2 + mean_y**2 + 1e-4) * (var_x + var_y + 9e-4))
+            )
+    return np.mean(scores)
+
+
+def slow_ms_ssim(image, truth, weights):
+    """By SciPy in float64, from the definitions in Wang et al. 2003."""
+    score = np.ones(image.shape[-1])
+    for scale, weight in enumerate(weights):
+
+        def mean(x):
+            return scipy.ndimage.correlate(x, gaussian()[..., None])[5:-5, 5:-5]
+
+        mean_x, mean_y = mean(image), mean(truth)
+        var_x, var_y = mean(image**2) - mean_x**2, mean(truth**2) - mean_y**2
+        cov = mean(image * truth) - mean_x * mean_y
+        term = (2 * cov + 9e-4) / (var_x + var_y + 9e-4)
+        if scale == len(weights) - 1:
+            term = term * (2 * mean_x * mean_y + 1e-4) / (mean_x**2 + mean_y**2 + 1e-4)
+        score *= np.maximum(term.mean((0, 1)), 0) ** weight
+        # An odd last row or column stands for itself.
+        odd = [(0, size % 2) for size in image.shape[:2]] + [(0, 0)]
+        image, truth = (np.pad(x, odd, mode="edge") for x in (image, truth))
+        image, truth = (
+            x.reshape(x.shape[0] // 2, 2, x.shape[1] // 2, 2, -1).mean((1, 3))
+            for x in (image, truth)
+        )
+    return score.mean()
+
+
+def test_ms_ssim_is_the_definition_over_five_scales(dtype, rng):
+    image, truth = pair(rng, (161, 170, 3), 0.3)
+    exact = slow_ms_ssim(image, truth, (0.0448, 0.2856, 0.3001, 0.2363, 0.1333))
+    value = ms_ssim(*arrays(image, truth, dtype=dtype))
+    assert abs(value - exact) < {"float32": 3e-6, "float64": 1e-12}[dtype]
+
+
+def test_ms_ssim_over_fewer_scales_renormalises_the_weights(float64, rng):
+    image, truth = pair(rng, (45, 52, 3), 0.3)
+    weights = np.array([0.0448, 0.2856, 0.3001])
+    exact = slow_ms_ssim(image, truth, weights / weights.sum())
+    value = ms_ssim(*arrays(image, truth, dtype=float64), 3)
+    assert value == pytest.approx(exact, abs=1e-12)
+
+
+def test_ms_ssim_of_a_small_picture_names_the_scales_that_fit():
+    image = jnp.zeros((160, 300, 3))
+    with pytest.raises(
+        ValueError, match=r"more than 160 pixels.*300x160; pass scales=4"
+    ):
+        ms_ssim(image, image)
+    with pytest.raises(ValueError, match="1 to 5 scales, got 6"):
+        ms_ssim(image, image, scales=6)
+
+
+@pytest.mark.hard_cases
+def test_ms_ssim_of_a_negative_picture_is_zero_with_a_finite_gradient(dtype, rng):
+    image, _ = arrays(*pair(rng, (24, 24, 3)), dtype=dtype)
+    value, slope = jax.jit(jax.value_and_grad(image_quality.ms_ssim), static_argnums=2)(
+        1 - image, image, 2
+    )
+    assert value == 0
+    assert np.all(np.isfinite(slope))
+
+
+def test_masked_psnr_is_the_psnr_of_the_masked_pixels(dtype, rng):
+    image, truth = pair(rng)
+    mask = blob(image.shape[:2])
+    value = masked["masked_psnr"](*arrays(image, truth, mask, dtype=dtype))
+    exact = peak_signal_noise_ratio(truth[mask], image[mask], data_range=1)
+    assert abs(value - exact) < {"float32": 1e-4, "float64": 1e-12}[dtype]
+
+
+def test_masked_ssim_is_a_slow_loop_over_masked_windows(dtype, rng):
+    image, truth = pair(rng, (26, 24, 3))
+    mask = blob(image.shape[:2])
+    value = masked["masked_ssim"](*arrays(image, truth, mask, dtype=dtype))
+    exact = slow_ssim(image, truth, mask)
+    assert abs(value - exact) < {"float32": 3e-6, "float64": 1e-12}[dtype]
+
+
+def test_masked_forms_with_a_full_mask_are_the_plain_ones(dtype, rng):
+    image, truth = arrays(*pair(rng), dtype=dtype)
+    mask = jnp.ones(image.shape[:2], bool)
+    tolerance = {"float32": 1e-5, "float64": 1e-12}[dtype]
+    plain = ssim(image, truth)
+    for name in ("masked_ssim", "partial_ssim"):
+        assert abs(masked[name](image, truth, mask) - plain) < tolerance
+    difference = masked["masked_psnr"](image, truth, mask) - psnr(image, truth)
+    assert abs(difference) < 10 * tolerance
+
+
+def slow_partial_ssim(image, truth, mask):
+    """Row windows, then column windows, each scaled by its share of masked pixels."""
+    weights = np.exp(-(np.arange(-5, 6) ** 2) / 4.5)
+    weights /= weights.sum()
+
+    def one_pass(values, mask):
+        out = np.zeros((values.shape[0], values.shape[1] - 10, values.shape[2]))
+        left = np.zeros(out.shape[:2])
+        for row, column in np.ndindex(left.shape):
+            inside = mask[row, column : column + 11]
+            if inside.sum() > 0:
+                window = values[row, column : column + 11] * inside[:, None]
+                out[row, column] = 11 / inside.sum() * (weights @ window)
+                left[row, column] = 1
+        return out, left
+
+    def mean(values):
+        values, left = one_pass(values, mask.astype(float))
+        values, _ = one_pass(values.swapaxes(0, 1), left.T)
+        return values.swapaxes(0, 1)
+
+    mean_x, mean_y = mean(image), mean(truth)
+    var_x = np.maximum(mean(image**2) - mean_x**2, 0)
+    var_y = np.maximum(mean(truth**2) - mean_y**2, 0)
+    cov = mean(image * truth) - mean_x * mean_y
+    cov = np.sign(cov) * np.minimum(np.sqrt(var_x * var_y), np.abs(cov))
+    numerator = (2 * mean_x * mean_y + 1e-4) * (2 * cov + 9e-4)
+    return np.mean(
+        numerator / ((mean_x**2 + mean_y**2 + 1e-4) * (var_x + var_y + 9e-4))
+    )
+
+
+def test_partial_ssim_is_the_published_protocol(dtype, rng):
+    image, truth = pair(rng, (36, 40, 3))
+    mask = blob(image.shape[:2]) & (rng.random(image.shape[:2]) > 0.3)
+    value = masked["partial_ssim"](*arrays(image, truth, mask, dtype=dtype))
+    exact = slow_partial_ssim(image, truth, mask)
+    # Variances that should be zero are clipped after rounding: 1e-7 against c2 = 9e-4.
+    assert abs(value - exact) < {"float32": 2e-5, "float64": 1e-12}[dtype]
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("name", ["masked_psnr", "masked_ssim", "partial_ssim"])
+def test_nothing_outside_the_mask_matters(name, dtype, rng):
+    image, truth = pair(rng)
+    mask = blob(image.shape[:2])
+    metric = jax.jit(jax.value_and_grad(getattr(image_quality, name)))
+    clean, clean_slope = metric(*arrays(image, truth, mask, dtype=dtype))
+    image[~mask], truth[~mask] = np.nan, np.inf
+    value, slope = metric(*arrays(image, truth, mask, dtype=dtype))
+    assert value == clean
+    assert np.array_equal(slope, clean_slope)
+    assert np.all(slope[~mask] == 0)
+
+
+@pytest.mark.parametrize("name", ["masked_psnr", "masked_ssim"])
+def test_an_empty_mask_scores_nan(name, dtype, rng):
+    image, truth = arrays(*pair(rng), dtype=dtype)
+    nothing = jnp.zeros(image.shape[:2], bool)
+    assert np.isnan(masked[name](image, truth, nothing))
+
+
+@pytest.mark.parametrize(
+    "name", ["psnr", "ssim", "ms_ssim", "masked_psnr", "masked_ssim"]
+)
+def test_gradients_agree_with_central_differences(name, float64, rng):
+    image, truth = arrays(*pair(rng, (22, 24, 3)), dtype=float64)
+    rest = {
+        "ms_ssim": (2,),
+        "masked_psnr": (jnp.asarray(blob((22, 24))),),
+        "masked_ssim": (jnp.asarray(blob((22, 24))),),
+    }.get(name, ())
+    metric = getattr(image_quality, name)
+
+    def score(image, truth):
+        return metric(image, truth, *rest)
+
+    assert gradients.directional_error(score, image, truth) < 1e-6
+
+
+def test_metrics_batch_and_compile(dtype, rng):
+    image, truth = arrays(*pair(rng), dtype=dtype)
+    frames = jnp.stack([image, truth]), jnp.stack([truth, truth])
+    scores = jax.jit(jax.vmap(image_quality.ssim))(*frames)
+    assert scores[0] == pytest.approx(float(ssim(image, truth)), abs=1e-6)
+    assert scores[1] == 1
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("level", [0.0, 0.5, 0.9, 1.0])
+@pytest.mark.parametrize("name", ["ssim", "ms_ssim", "masked_ssim"])
+def test_equal_constant_pictures_score_one_with_gradient_zero(name, level, dtype):
+    flat = jnp.full((24, 23, 3), level, dtype)
+    rest = {"ssim": ("valid",), "ms_ssim": (2,)}.get(name, (jnp.ones((24, 23), bool),))
+    score = jax.jit(lambda image: getattr(image_quality, name)(image, flat, *rest))
+    # The textbook form in float32: 4e-5 low, and a slope 1e5 times rounding.
+    assert score(flat) == 1.0
+    assert np.all(jax.jit(jax.grad(score))(flat) == 0.0)
+
+
+@pytest.mark.hard_cases
+def test_high_dynamic_range_loses_no_variance(dtype, rng):
+    image, truth = ((1000 + x).astype(dtype) for x in pair(rng, (24, 24, 3)))
+    value = ms_ssim(jnp.asarray(image), jnp.asarray(truth), 2)
+    exact = slow_ms_ssim(*(x.astype(float) for x in (image, truth)), (0.1356, 0.8644))
+    # Without the centring of `_terms` the float32 error is of order one.
+    assert abs(value - exact) < {"float32": 2e-3, "float64": 1e-4}[dtype]
+
+
+def test_pictures_smaller_than_the_window_are_refused():
+    small = jnp.zeros((12, 10, 3))
+    with pytest.raises(ValueError, match="10x12"):
+        image_quality.ssim(small, small)
+    with pytest.raises(ValueError, match="10x12"):
+        image_quality.masked_ssim(small, small, jnp.ones((12, 10), bool))
+    with pytest.raises(ValueError, match=r"10x12; use psnr"):
+        image_quality.ms_ssim(small, small, 1)
