@@ -1,0 +1,211 @@
+"""Which Gaussians touch which tiles, in depth order, one slab of pairs at a time.
+
+All (Gaussian, tile) pairs form one conceptual list: nearest Gaussian first, its tiles
+row by row. A slab is the next `capacity` entries of that list, sorted by tile. Each
+tile therefore meets its Gaussians in depth order whatever the capacity, and a Gaussian
+wider than a slab simply continues in the next one: nothing can overflow.
+"""
+
+import math
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+# Slack on the exact ellipse/tile test: it drops only what stays below the cut when the
+# exponent is rounded differently in the blending step.
+EXPONENT_SLACK = 1e-4
+
+
+class Grid(NamedTuple):
+    """The image cut into square tiles; static."""
+
+    height: int  # px
+    width: int
+    tile: int
+
+    @property
+    def rows(self) -> int:
+        return -(-self.height // self.tile)
+
+    @property
+    def columns(self) -> int:
+        return -(-self.width // self.tile)
+
+    @property
+    def tiles(self) -> int:
+        return self.rows * self.columns
+
+
+class Boxes(NamedTuple):
+    """Tiles that a Gaussian's box touches, one row per Gaussian, nearest first."""
+
+    left: Int[Array, " gaussians"]
+    top: Int[Array, " gaussians"]
+    columns: Int[Array, " gaussians"]
+    count: Int[Array, " gaussians"]  # columns times rows; zero where nothing is drawn
+
+
+class Cursor(NamedTuple):
+    """Where the next slab starts in the list of pairs."""
+
+    rank: Int[Array, ""]  # Gaussian, in depth order
+    skip: Int[Array, ""]  # its tiles that earlier slabs have already taken
+
+
+class Slab(NamedTuple):
+    """Pairs sorted by tile, then by depth."""
+
+    ranks: Int[Array, " capacity"]
+    starts: Int[Array, " tiles"]
+    ends: Int[Array, " tiles"]
+
+
+def tile_boxes(
+    mean_px: Float[Array, "gaussians 2"],
+    extent_px: Float[Array, "gaussians 2"],
+    grid: Grid,
+) -> Boxes:
+    """Tiles with a pixel centre inside mean +- extent; extent 0 means not drawn."""
+    eps = jnp.finfo(mean_px.dtype).eps
+    # Rounding of mean +- extent, so that a pixel on the edge is never lost.
+    reach = extent_px + 8 * eps * (jnp.abs(mean_px) + extent_px)
+    limit = jnp.asarray([grid.columns, grid.rows], mean_px.dtype)
+    # Tile t covers pixel centres t * tile + 0.5 ... (t + 1) * tile - 0.5.
+    low = jnp.ceil((mean_px - reach + 0.5) / grid.tile) - 1
+    high = jnp.floor((mean_px + reach - 0.5) / grid.tile) + 1
+    low = jnp.clip(low, 0, limit).astype(jnp.int32)
+    high = jnp.clip(high, 0, limit).astype(jnp.int32)
+    spans = jnp.maximum(high - low, 0)
+    count = jnp.where(extent_px[:, 0] > 0, spans[:, 0] * spans[:, 1], 0)
+    return Boxes(low[:, 0], low[:, 1], jnp.maximum(spans[:, 0], 1), count)
+
+
+def depth_order(
+    depth: Float[Array, " gaussians"], count: Int[Array, " gaussians"]
+) -> Int[Array, " gaussians"]:
+    """Indices from near to far, ties by index, Gaussians that touch no tile last."""
+    key = jnp.where(count > 0, depth, jnp.inf)
+    return jnp.argsort(key, stable=True).astype(jnp.int32)
+
+
+def next_slab(
+    cursor: Cursor,
+    boxes: Boxes,
+    table: Float[Array, "rows columns"],
+    open_tiles: Bool[Array, " tiles"],
+    log_cut: float,
+    grid: Grid,
+    capacity: int,
+) -> tuple[Slab, Cursor]:
+    """The pairs from `cursor` on, and where the slab after them starts.
+
+    `table` holds mean (px), p, k, r and log opacity in its first six columns, a row per
+    rank; `log_cut` is the log of the alpha below which nothing is drawn. Pairs of tiles
+    that are not in `open_tiles` (all pixels done) and pairs whose ellipse misses the
+    tile are left out.
+    """
+    rank, within, following = _expand(cursor, boxes.count, capacity)
+    in_use = rank >= 0
+    rank = jnp.maximum(rank, 0)
+    box_columns = boxes.columns[rank]
+    row = boxes.top[rank] + within // box_columns
+    column = boxes.left[rank] + within % box_columns
+    tile = row * grid.columns + column
+    keep = in_use & _ellipse_meets_tile(table[rank, :6], row, column, log_cut, grid)
+    keep &= open_tiles[jnp.where(in_use, tile, 0)]
+    tile = jnp.where(keep, tile, grid.tiles)
+    return _sort_pairs(tile, rank, cursor.rank, boxes.count.shape[0], grid), following
+
+
+def advance(cursor: Cursor, count: Int[Array, " gaussians"], capacity: int) -> Cursor:
+    """Where the slab after the one at `cursor` starts; `count` is that of `Boxes`."""
+    return _span(cursor, count, capacity)[2]
+
+
+def _span(cursor, count, capacity):
+    """First slot of each Gaussian in the slab (`capacity` if none), and what follows."""
+    gaussians = count.shape[0]
+    index = jnp.arange(gaussians, dtype=jnp.int32)
+    count = jnp.where(index < cursor.rank, 0, count)
+    count = count - jnp.where(index == cursor.rank, cursor.skip, 0)
+    # int32 sums may wrap far behind the slab, never before its end: the first total
+    # beyond the capacity is at most capacity + tiles. So only what precedes the first
+    # crossing is read.
+    total = lax.cumsum(count)
+    crossing = jnp.argmax(total >= capacity).astype(jnp.int32)
+    full = total[crossing] >= capacity
+    last = jnp.where(full, crossing, gaussians - 1)
+    before = total - count
+    begin = jnp.where((index <= last) & (count > 0), before, capacity)
+    skip = capacity - before[last]
+    skip += jnp.where(last == cursor.rank, cursor.skip, 0)
+    partly = total[last] > capacity
+    following = Cursor(
+        jnp.where(full, last + jnp.where(partly, 0, 1), gaussians),
+        jnp.where(full & partly, skip, 0),
+    )
+    return begin, jnp.minimum(total[last], capacity), following
+
+
+def _expand(cursor, count, capacity):
+    """Rank and number within its box for each of `capacity` slots; rank -1 beyond."""
+    begin, filled, following = _span(cursor, count, capacity)
+    index = jnp.arange(count.shape[0], dtype=jnp.int32)
+    marks = jnp.zeros(capacity + 1, jnp.int32).at[begin].max(index + 1)
+    rank = lax.cummax(marks[:capacity]) - 1
+    slot = jnp.arange(capacity, dtype=jnp.int32)
+    within = slot - begin[jnp.maximum(rank, 0)]
+    within += jnp.where(rank == cursor.rank, cursor.skip, 0)
+    return jnp.where(slot < filled, rank, -1), within, following
+
+
+def _ellipse_meets_tile(rows, row, column, log_cut, grid):
+    """Whether the smallest exponent over the tile's pixel centres reaches the cut.
+
+    The minimum of a convex form over a rectangle lies on an edge that faces the
+    centre, or is zero inside: the two lines x = clip(mean x) and y = clip(mean y) hold
+    it in every case.
+    """
+    mean_x, mean_y, p, k, r, log_opacity = (rows[:, i] for i in range(6))
+    half = (grid.tile - 1) / 2
+    dx = (column * grid.tile).astype(p.dtype) + (half + 0.5) - mean_x
+    dy = (row * grid.tile).astype(p.dtype) + (half + 0.5) - mean_y
+    rk = r * k
+    u0, v0 = p * dx, r * (dy - k * dx)
+    x = jnp.clip(-dx, -half, half)
+    v = v0 - rk * x
+    y = jnp.clip(-v / r, -half, half)
+    on_column = (u0 + p * x) ** 2 + (v + r * y) ** 2
+    y = jnp.clip(-dy, -half, half)
+    v = v0 + r * y
+    x = jnp.clip((rk * v - p * u0) / (p * p + rk * rk), -half, half)
+    on_row = (u0 + p * x) ** 2 + (v - rk * x) ** 2
+    smallest = jnp.minimum(on_column, on_row)
+    return smallest <= log_opacity - log_cut + EXPONENT_SLACK
+
+
+def _sort_pairs(tile, rank, first_rank, gaussians, grid):
+    """One unsigned sort of (tile, rank since the slab's first) where both fit 32 bits.
+
+    A sort with a payload costs five times as much on the CPU.
+    """
+    capacity = tile.shape[0]
+    # A Gaussian that touches no tile is last in depth order, so ranks within a slab
+    # span less than its capacity.
+    rank_bits = math.ceil(math.log2(min(capacity, gaussians) + 1))
+    tile_bits = math.ceil(math.log2(grid.tiles + 2))
+    if rank_bits + tile_bits <= 32:
+        since = (rank - first_rank).astype(jnp.uint32)
+        since = jnp.where(tile < grid.tiles, since, 0)
+        key = (tile.astype(jnp.uint32) << rank_bits) | since
+        key = lax.sort(key, is_stable=True)
+        tile = (key >> rank_bits).astype(jnp.int32)
+        ranks = (key & jnp.uint32((1 << rank_bits) - 1)).astype(jnp.int32) + first_rank
+    else:
+        # Slots are in depth order already, so a stable sort by tile is enough.
+        tile, ranks = lax.sort((tile, rank), num_keys=1, is_stable=True)
+    bounds = jnp.searchsorted(tile, jnp.arange(grid.tiles + 1, dtype=jnp.int32))
+    bounds = bounds.astype(jnp.int32)
+    return Slab(ranks, bounds[:-1], bounds[1:])

@@ -1,0 +1,278 @@
+"""Front-to-back compositing of sorted pairs, and its gradient, tiles in lockstep.
+
+State of a tile: one row of transmittance and one per channel over its pixels, pixels
+last. The transmittance of a pixel that is done is kept negative, so it needs no mask of
+its own. Both passes go front to back and recompute every alpha from the same rows.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from gaussians_jax.binning import Grid, Slab
+from gaussians_jax.raster_spec import RasterSpec
+
+SHAPE_COLUMNS = 6  # mean x, mean y (px), p, k, r, log opacity; then channels
+
+
+class Lockstep(NamedTuple):
+    """How many tiles and Gaussians one step takes; static."""
+
+    batch: int
+    chunk: int
+
+
+def blend(
+    state: Float[Array, "tiles rows pixels"],
+    slab: Slab,
+    table: Float[Array, "gaussians columns"],
+    spec: RasterSpec,
+    grid: Grid,
+    step: Lockstep,
+) -> tuple[Float[Array, "tiles rows pixels"], Int[Array, " tiles"]]:
+    """Composite a slab onto `state`; also how many pairs each tile looked at.
+
+    The last row of `table` must be transparent (log opacity minus infinity).
+    """
+    order, batches = _by_length(slab, step.batch)
+
+    def one_batch(carry):
+        number, state, used = carry
+        tiles = lax.dynamic_slice(order, (number * step.batch,), (step.batch,))
+        start, end, middle = _tile_rows(tiles, slab, grid, state.dtype)
+        longest = jnp.max(end - start)
+
+        def unfinished(inner):
+            position, _, alive = inner
+            return (position < longest) & jnp.any(alive)
+
+        def one_chunk(inner):
+            position, local, alive = inner
+            _, rows = _chunk(table, slab.ranks, start, end, position, step.chunk)
+            _, alpha = _alphas(rows, middle, spec, grid)
+            local = _composite(local, alpha, rows, spec)
+            alive = jnp.max(local[:, 0], axis=1) > 0
+            return position + step.chunk, local, alive
+
+        def count(inner):
+            return jnp.minimum(end - start, inner)
+
+        local = state.at[tiles].get(mode="clip")
+        alive = jnp.max(local[:, 0], axis=1) > 0
+        position, local, _ = lax.while_loop(
+            unfinished, one_chunk, (jnp.int32(0), local, alive)
+        )
+        state = state.at[tiles].set(local, mode="drop")
+        used = used.at[tiles].set(count(position), mode="drop")
+        return number + 1, state, used
+
+    used = jnp.zeros(grid.tiles, jnp.int32)
+    _, state, used = lax.while_loop(
+        lambda carry: carry[0] < batches, one_batch, (jnp.int32(0), state, used)
+    )
+    return state, used
+
+
+def blend_gradient(
+    state: Float[Array, "tiles rows pixels"],
+    gradient: Float[Array, "gaussians columns"],
+    slab: Slab,
+    table: Float[Array, "gaussians columns"],
+    cotangent: Float[Array, "tiles channels pixels"],
+    spec: RasterSpec,
+    grid: Grid,
+    step: Lockstep,
+) -> tuple[Float[Array, "tiles rows pixels"], Float[Array, "gaussians columns"]]:
+    """Add a slab's part of the gradient of every table entry.
+
+    `state` carries two rows: transmittance, and what is still to come of the loss
+    through this pixel, S = sum over the Gaussians not yet met of w (colour . g), plus
+    g_T times the final transmittance. With that, going front to back,
+
+        d loss / d alpha_i = T_i (colour_i . g) - S_i / (1 - alpha_i),
+
+    S_i being what remains behind Gaussian i. No image but the final one is needed.
+    """
+    order, batches = _by_length(slab, step.batch)
+
+    def one_batch(carry):
+        number, state, gradient = carry
+        tiles = lax.dynamic_slice(order, (number * step.batch,), (step.batch,))
+        start, end, middle = _tile_rows(tiles, slab, grid, state.dtype)
+        longest = jnp.max(end - start)
+        toward = cotangent.at[tiles].get(mode="clip")
+
+        def unfinished(inner):
+            position, _, alive, _ = inner
+            return (position < longest) & jnp.any(alive)
+
+        def one_chunk(inner):
+            position, local, _, gradient = inner
+            rank, rows = _chunk(table, slab.ranks, start, end, position, step.chunk)
+            raw, alpha = _alphas(rows, middle, spec, grid)
+            local, weight, slope = _trace_back(local, raw, alpha, rows, toward, spec)
+            update = _pair_gradients(rows, middle, weight, slope, toward, grid)
+            gradient = gradient.at[rank].add(update)
+            alive = jnp.max(local[:, 0], axis=1) > 0
+            return position + step.chunk, local, alive, gradient
+
+        local = state.at[tiles].get(mode="clip")
+        alive = jnp.max(local[:, 0], axis=1) > 0
+        _, local, _, gradient = lax.while_loop(
+            unfinished, one_chunk, (jnp.int32(0), local, alive, gradient)
+        )
+        return number + 1, state.at[tiles].set(local, mode="drop"), gradient
+
+    _, state, gradient = lax.while_loop(
+        lambda carry: carry[0] < batches, one_batch, (jnp.int32(0), state, gradient)
+    )
+    return state, gradient
+
+
+def _by_length(slab, batch):
+    """Tiles from most to fewest pairs, padded to whole batches, and how many batches.
+
+    Tiles of one batch run in lockstep, so they should be about equally long.
+    """
+    length = slab.ends - slab.starts
+    order = jnp.argsort(-length, stable=True).astype(jnp.int32)
+    tiles = length.shape[0]
+    padding = jnp.full(-tiles % batch, tiles, jnp.int32)
+    batches = -(-jnp.sum(length > 0, dtype=jnp.int32) // batch)
+    return jnp.concatenate([order, padding]), batches
+
+
+def _tile_rows(tiles, slab, grid, dtype):
+    """First pair, end, and centre (px) of each tile of a batch; padding is empty."""
+    start = slab.starts.at[tiles].get(mode="fill", fill_value=0)
+    end = slab.ends.at[tiles].get(mode="fill", fill_value=0)
+    corner = jnp.stack([tiles % grid.columns, tiles // grid.columns]) * grid.tile
+    return start, end, corner.astype(dtype) + grid.tile / 2
+
+
+def _chunk(table, ranks, start, end, position, chunk):
+    """Ranks [chunk, batch] and their columns; the transparent last row beyond the end."""
+    slot = start + position + jnp.arange(chunk, dtype=jnp.int32)[:, None]
+    transparent = table.shape[0] - 1
+    rank = ranks.at[slot].get(mode="clip")
+    rank = jnp.where(slot < end, rank, transparent)
+    rows = table.at[rank].get(mode="clip")
+    return rank, tuple(rows[..., i] for i in range(table.shape[1]))
+
+
+def _pixels(grid, dtype):
+    """Pixel centres relative to the tile's, x then y, flattened row by row."""
+    line = np.arange(grid.tile) - (grid.tile - 1) / 2
+    y, x = np.meshgrid(line, line, indexing="ij")
+    return jnp.asarray(x.ravel(), dtype), jnp.asarray(y.ravel(), dtype)
+
+
+def _whitened(rows, middle):
+    """u and v at the tile centres, and their slopes p (u in x), r, -r k (v in y, x)."""
+    mean_x, mean_y, p, k, r = rows[:5]
+    dx, dy = middle[0] - mean_x, middle[1] - mean_y
+    return p * dx, r * (dy - k * dx), p, r, -(r * k)
+
+
+def _alphas(rows, middle, spec, grid):
+    """opacity exp(-u^2 - v^2), and alpha with cut and clamp: [chunk, batch, pixels]."""
+    u0, v0, u_x, v_y, v_x = (c[..., None] for c in _whitened(rows, middle))
+    x, y = _pixels(grid, u0.dtype)
+    u = u0 + u_x * x
+    v = v0 + v_x * x + v_y * y
+    raw = jnp.exp(rows[5][..., None] - u * u - v * v)
+    return raw, jnp.where(raw >= spec.alpha_cut, jnp.minimum(raw, spec.alpha_max), 0)
+
+
+def _pass_through(transmittance, alpha, spec):
+    """Transmittance after one Gaussian, and whether it was drawn at each pixel."""
+    # A product, not T - alpha T: two alphas of 0.99 leave 0.99999e-4, and rounding the
+    # difference could put that above the stop.
+    passed = transmittance * (1 - alpha)
+    drawn = passed > spec.stop
+    return jnp.where(drawn, passed, -jnp.abs(transmittance)), drawn
+
+
+def _composite(local, alpha, rows, spec):
+    transmittance, channels = local[:, 0], local[:, 1:]
+    values = jnp.stack(rows[SHAPE_COLUMNS:], axis=-1)[..., None]
+    for i in range(alpha.shape[0]):
+        before = transmittance
+        transmittance, drawn = _pass_through(before, alpha[i], spec)
+        weight = jnp.where(drawn, before * alpha[i], 0)
+        channels = channels + weight[:, None] * values[i]
+    return jnp.concatenate([transmittance[:, None], channels], axis=1)
+
+
+def _trace_back(local, raw, alpha, rows, toward, spec):
+    """New state, compositing weights, and d loss / d exponent of every pair."""
+    transmittance, behind = local[:, 0], local[:, 1]
+    weights, slopes = [], []
+    for i in range(alpha.shape[0]):
+        before = transmittance
+        transmittance, drawn = _pass_through(before, alpha[i], spec)
+        weight = jnp.where(drawn, before * alpha[i], 0)
+        along = sum(
+            rows[SHAPE_COLUMNS + c][i][:, None] * toward[:, c]
+            for c in range(toward.shape[1])
+        )
+        behind = behind - weight * along
+        slope = before * along - behind / (1 - alpha[i])
+        moves = drawn & (alpha[i] > 0)
+        if spec.clamp_gradient == "zero":
+            moves &= raw[i] <= spec.alpha_max
+        weights.append(weight)
+        slopes.append(jnp.where(moves, slope * raw[i], 0))
+    state = jnp.stack([transmittance, behind], axis=1)
+    return state, jnp.stack(weights), jnp.stack(slopes)
+
+
+def _pair_gradients(rows, middle, weight, slope, toward, grid):
+    """Gradient of the table's columns, one row per pair: [chunk, batch, columns].
+
+    Moments are taken about the tile centre, where u and v of a Gaussian that is seen
+    are of order one; about a mean 1e4 px away they would cancel in float32.
+    """
+    moments = _moments(slope, grid)
+    total, x, y, xx, xy, yy = moments
+    u0, v0, u_x, v_y, v_x = _whitened(rows, middle)
+    along, lean = u_x * x, v_y * y + v_x * x
+    sum_u = u0 * total + along
+    sum_v = v0 * total + lean
+    sum_uu = u0 * (sum_u + along) + u_x * u_x * xx
+    sum_vv = v0 * (sum_v + lean) + (
+        v_y * v_y * yy + 2 * v_y * v_x * xy + v_x * v_x * xx
+    )
+    sum_uv = u0 * sum_v + v0 * along + u_x * (v_y * xy + v_x * xx)
+    columns = [
+        2 * (u_x * sum_u + v_x * sum_v),
+        2 * v_y * sum_v,
+        -2 * sum_uu / u_x,
+        2 * v_y * sum_uv / u_x,
+        -2 * sum_vv / v_y,
+        total,
+    ]
+    columns += [jnp.sum(weight * toward[:, c], axis=-1) for c in range(toward.shape[1])]
+    return jnp.stack(columns, axis=-1)
+
+
+def _moments(slope, grid):
+    """Sums of slope times 1, x, y, x^2, x y, y^2 over a tile: rows first, then columns."""
+    line = (np.arange(grid.tile) - (grid.tile - 1) / 2).tolist()
+    slope = slope.reshape(*slope.shape[:-1], grid.tile, grid.tile)
+    rows = [slope[..., j, :] for j in range(grid.tile)]
+    flat = sum(rows)
+    tilted = sum(y * row for y, row in zip(line, rows, strict=True))
+    curved = sum(y * y * row for y, row in zip(line, rows, strict=True))
+    x = jnp.asarray(line, slope.dtype)
+    return (
+        jnp.sum(flat, axis=-1),
+        jnp.sum(x * flat, axis=-1),
+        jnp.sum(tilted, axis=-1),
+        jnp.sum(x * x * flat, axis=-1),
+        jnp.sum(x * tilted, axis=-1),
+        jnp.sum(curved, axis=-1),
+    )

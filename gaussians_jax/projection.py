@@ -1,0 +1,203 @@
+"""A Gaussian's footprint on the image: EWA projection without cancellation.
+
+The footprint is kept as its whitening, not as a conic. With dx, dy the offset of a
+pixel from the mean,
+
+    u = p dx,   v = r (dy - k dx),   exponent = u^2 + v^2 >= 0,
+
+where p = 1/sqrt(2 a), k = b/a and r = 1/sqrt(2 (c - b^2/a)) for the dilated covariance
+[[a, b], [b, c]] in px^2. The sum of squares cannot turn negative; the quadratic form of
+an inverse matrix does so in float32 from needles of about 3000 px.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from gaussians_jax.raster_spec import RasterSpec
+from gaussians_jax.splats import Gaussians
+from nerfies_jax.geometry.camera import Camera
+
+# gsplat's MIN_COMPENSATION, squared: the antialiased opacity factor is at least 0.005.
+MIN_COMPENSATION_SQ = 0.005**2
+# px. Rows of the projected square root beyond this are treated as not finite, because
+# their squares would overflow float32 (1e38); no camera sees such a Gaussian as a shape.
+WIDEST_PX = 1e16
+
+
+class Footprints(NamedTuple):
+    """Gaussians as seen by one camera; rows match the Gaussians they came from.
+
+    A row that cannot be drawn (outside near and far, opacity below the cut, a zero
+    quaternion, a NaN or infinity anywhere) has `extent_px` zero, finite stand-ins in
+    the other fields and passes no gradient back.
+    """
+
+    mean_px: Float[Array, "gaussians 2"]  # x right, y down; pixel centres at +0.5
+    whitening: Float[Array, "gaussians 3"]  # p 1/px, k px/px, r 1/px
+    opacity: Float[Array, " gaussians"]  # compensated where antialiased
+    depth: Float[Array, " gaussians"]  # z, scene units
+    extent_px: Float[Array, "gaussians 2"]  # half box of alpha >= cut; no gradient
+
+    @property
+    def visible(self) -> Bool[Array, " gaussians"]:
+        """Drawn by this camera if its box meets the image."""
+        return self.extent_px[:, 0] > 0
+
+
+def project(
+    gaussians: Gaussians, camera: Camera, size: tuple[int, int], spec: RasterSpec
+) -> Footprints:
+    """Footprints in an image of `size` (height, width) for one undistorted camera.
+
+    Zwicker et al. 2002 (EWA splatting), equations 23-31: the covariance is T T^t +
+    dilation with T = J W R diag(scale); neither the 3D covariance nor its determinant
+    is formed. The tangents x/z and y/z are clamped in J alone, to the image widened by
+    `spec.tangent_margin` half images. Lens distortion is not modelled: undistort first.
+    """
+
+    def one(mean, quaternion, scale, opacity):
+        return _project_one(mean, quaternion, scale, opacity, camera, size, spec)
+
+    return jax.vmap(one)(*gaussians)
+
+
+def _project_one(mean, quaternion, scale, opacity, camera, size, spec):
+    offset = mean - camera.position  # R (x - c), not R x + t: exact far from origin
+    depth = _dot(camera.camera_from_world[2], offset)
+    drawn = (depth >= spec.near) & (depth <= spec.far) & (opacity >= spec.alpha_cut)
+    for part in (offset, quaternion, scale):
+        drawn &= jnp.all(jnp.isfinite(part))
+    drawn &= jnp.any(quaternion != 0) & jnp.isfinite(opacity)
+
+    # `where` differentiates both branches: what is not drawn becomes a unit sphere one
+    # unit ahead before anything is divided.
+    ahead = camera.camera_from_world[2]
+    offset = jnp.where(drawn, offset, ahead)
+    quaternion = jnp.where(drawn, quaternion, jnp.ones_like(quaternion))
+    scale = jnp.where(drawn, scale, 1)
+    opacity = jnp.where(drawn, opacity, 0.5)
+
+    mean_px, depth, rows = _project_frame(offset, camera, size, spec)
+    first, second = _footprint_rows(rows, quaternion, scale)
+    widest = jnp.max(jnp.abs(jnp.stack(first + second)))
+    drawn &= (widest < WIDEST_PX) & jnp.all(jnp.isfinite(mean_px))
+    mean_px = jnp.where(drawn, mean_px, 0)
+    first = [jnp.where(drawn, x, 0) for x in first]
+    second = [jnp.where(drawn, x, 0) for x in second]
+
+    whitening, compensation = _whiten(first, second, spec)
+    if spec.antialiased:
+        opacity = opacity * compensation
+        drawn &= opacity >= spec.alpha_cut
+    extent = jnp.where(drawn, _extent(whitening, opacity, spec), 0)
+    return Footprints(mean_px, whitening, opacity, depth, jax.lax.stop_gradient(extent))
+
+
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _project_frame(offset, camera, size, spec):
+    """Mean in px, z, and the rows of J W (pixels per scene unit)."""
+    height, width = size
+    world = camera.camera_from_world
+    x, y, z = _dot(world[0], offset), _dot(world[1], offset), _dot(world[2], offset)
+    focal_x = camera.focal_px
+    focal_y = camera.focal_px * camera.pixel_aspect
+    centre_x, centre_y = camera.principal_point_px
+    tan_x, tan_y = x / z, y / z
+    mean_px = jnp.stack(
+        [
+            focal_x * tan_x + camera.skew_px * tan_y + centre_x,
+            focal_y * tan_y + centre_y,
+        ]
+    )
+    tan_x = _clamp_tangent(tan_x, focal_x, centre_x, width, spec)
+    tan_y = _clamp_tangent(tan_y, focal_y, centre_y, height, spec)
+    across = -(focal_x * tan_x + camera.skew_px * tan_y)
+    down = -focal_y * tan_y
+    first = [
+        (focal_x * world[0, i] + camera.skew_px * world[1, i] + across * world[2, i])
+        / z
+        for i in range(3)
+    ]
+    second = [(focal_y * world[1, i] + down * world[2, i]) / z for i in range(3)]
+    return mean_px, z, (first, second)
+
+
+def _clamp_tangent(tangent, focal, centre, pixels, spec):
+    margin = spec.tangent_margin * 0.5 * pixels
+    return jnp.clip(
+        tangent, -(centre + margin) / focal, (pixels - centre + margin) / focal
+    )
+
+
+def _footprint_rows(rows, quaternion, scale):
+    """The two rows of T = J W R diag(scale), as component lists."""
+    # Scaling by the largest component keeps 1e-30 and 1e30 apart from 0 and infinity;
+    # a rotation does not depend on the length, so the scale carries no gradient.
+    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(quaternion)))
+    w, x, y, z = quaternion / largest
+    double = 2 / (w * w + x * x + y * y + z * z)
+    columns = (
+        (
+            1 - double * (y * y + z * z),
+            double * (x * y + w * z),
+            double * (x * z - w * y),
+        ),
+        (
+            double * (x * y - w * z),
+            1 - double * (x * x + z * z),
+            double * (y * z + w * x),
+        ),
+        (
+            double * (x * z + w * y),
+            double * (y * z - w * x),
+            1 - double * (x * x + y * y),
+        ),
+    )
+    return tuple([_dot(row, columns[i]) * scale[i] for i in range(3)] for row in rows)
+
+
+def _whiten(first, second, spec):
+    """(p, k, r) and the antialiasing factor, from the rows of T.
+
+    c - b^2/a as a sum of squares: |t1 x t2|^2/a + dilation (1 + |t2|^2/a), with t1
+    scaled by 1/sqrt(a) beforehand so that nothing of fourth order in px is formed.
+    """
+    dilation = spec.dilation_px2
+    variance_x = _dot(first, first) + dilation
+    inverse = jax.lax.rsqrt(variance_x)
+    n = [x * inverse for x in first]
+    cross = (
+        n[1] * second[2] - n[2] * second[1],
+        n[2] * second[0] - n[0] * second[2],
+        n[0] * second[1] - n[1] * second[0],
+    )
+    sharp = _dot(cross, cross)
+    blurred = sharp + dilation * (1 + _dot(second, second) / variance_x)
+    shear = _dot(n, second) * inverse
+    half = jnp.sqrt(jnp.asarray(0.5, variance_x.dtype))
+    whitening = jnp.stack([half * inverse, shear, half * jax.lax.rsqrt(blurred)])
+    ratio = sharp / blurred
+    small = ratio < MIN_COMPENSATION_SQ
+    # sqrt has no slope at 0, so the branch not taken gets a 1.
+    compensation = jnp.where(
+        small, MIN_COMPENSATION_SQ**0.5, jnp.sqrt(jnp.where(small, 1, ratio))
+    )
+    return whitening, compensation
+
+
+def _extent(whitening, opacity, spec):
+    """Half width and height (px) of the box around alpha >= cut."""
+    p, k, r = whitening
+    reach = jnp.sqrt(jnp.maximum(jnp.log(opacity / spec.alpha_cut), 0))
+    across = reach / p
+    # c = (c - b^2/a) + k^2 a
+    down = jnp.hypot(reach / r, k * across)
+    # At least a hair wide, so that "visible" does not depend on rounding at the cut.
+    tiny = jnp.finfo(whitening.dtype).tiny
+    return jnp.maximum(jnp.stack([across, down]), tiny)

@@ -1,0 +1,247 @@
+"""Footprints to pixels: exact, differentiable, in memory that does not grow with pairs.
+
+Front-to-back compositing over square tiles (Kerbl et al. 2023, arXiv:2308.04079,
+equation 3), streamed over depth slabs (`binning`), with a hand-written backward pass
+that recomputes every alpha (`blending`).
+"""
+
+import functools
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from gaussians_jax import binning, blending
+from gaussians_jax.binning import Cursor, Grid, Slab
+from gaussians_jax.blending import SHAPE_COLUMNS, Lockstep
+from gaussians_jax.projection import Footprints
+from gaussians_jax.raster_spec import RasterSpec
+
+# By backend: tiles in lockstep, Gaussians a step. Measured in experiments/raster_speed.
+LOCKSTEP = {"cpu": Lockstep(32, 8), "gpu": Lockstep(4096, 8)}
+SMALLEST_CAPACITY = 1 << 12
+LARGEST_CAPACITY = 1 << 18
+PAIRS_PER_GAUSSIAN = 4
+
+
+class Layout(NamedTuple):
+    """Everything static about one call."""
+
+    spec: RasterSpec
+    grid: Grid
+    step: Lockstep
+    capacity: int
+
+
+class Kept(NamedTuple):
+    """Slabs sorted in the forward pass, for the backward pass."""
+
+    slabs: Slab  # leading axis: the first `kept_slabs` slabs
+    count: Int[Array, ""]  # slabs there were
+
+
+def rasterise(
+    footprints: Footprints,
+    values: Float[Array, "gaussians channels"],
+    size: tuple[int, int],
+    spec: RasterSpec,
+) -> tuple[Float[Array, "height width channels"], Float[Array, "height width"]]:
+    """Composite any per-Gaussian `values`; also the transmittance left at each pixel.
+
+    Differentiable in the mean, whitening and opacity of `footprints` and in `values`;
+    the depth only orders. `size` is (height, width). A NaN in `values` shows in every
+    tile that its Gaussian touches.
+    """
+    layout = _layout(footprints, size, spec)
+    grid = layout.grid
+    if values.shape[0] == 0:
+        shape = (grid.height, grid.width)
+        return jnp.zeros((*shape, values.shape[1]), values.dtype), jnp.ones(
+            shape, values.dtype
+        )
+    boxes = binning.tile_boxes(
+        lax.stop_gradient(footprints.mean_px), footprints.extent_px, grid
+    )
+    order = binning.depth_order(lax.stop_gradient(footprints.depth), boxes.count)
+    boxes = binning.Boxes(*(x[order] for x in boxes))
+    log_opacity = jnp.log(jnp.where(boxes.count > 0, footprints.opacity[order], 1))
+    table = jnp.concatenate(
+        [
+            footprints.mean_px[order],
+            footprints.whitening[order],
+            log_opacity[:, None],
+            values[order],
+        ],
+        axis=1,
+    )
+    state = _raster(layout, boxes, table)
+    return _to_image(state[:, 1:], grid), _to_image(state[:, :1], grid)[..., 0]
+
+
+def _layout(footprints, size, spec):
+    height, width = size
+    if height < 1 or width < 1:
+        raise ValueError(f"an image needs at least one pixel, got size {size}")
+    grid = Grid(height, width, spec.tile)
+    step = LOCKSTEP.get(jax.default_backend(), LOCKSTEP["gpu"])
+    step = Lockstep(spec.batch or step.batch, spec.chunk or step.chunk)
+    step = Lockstep(min(step.batch, grid.tiles), step.chunk)
+    capacity = spec.capacity
+    if capacity is None:
+        wanted = PAIRS_PER_GAUSSIAN * footprints.depth.shape[0]
+        capacity = min(max(wanted, SMALLEST_CAPACITY), LARGEST_CAPACITY)
+        capacity = 1 << math.ceil(math.log2(capacity))
+    return Layout(spec, grid, step, capacity)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _raster(layout, boxes, table):
+    """State [tiles, 1 + channels, pixels]: transmittance, then channels."""
+    return _raster_forward(layout, boxes, table)[0]
+
+
+def _raster_forward(layout, boxes, table):
+    """One camera after another under vmap: lockstep over cameras would wait for all."""
+
+    @jax.custom_batching.sequential_vmap
+    def forward(boxes, table):
+        return _stream(layout, boxes, table)
+
+    state, kept = forward(boxes, table)
+    return jnp.abs(state), (boxes, table, state, kept)
+
+
+def _raster_backward(layout, residuals, cotangent):
+    @jax.custom_batching.sequential_vmap
+    def backward(boxes, table, state, kept, cotangent):
+        return _stream_back(layout, boxes, table, state, kept, cotangent)
+
+    boxes = residuals[0]
+    return jax.tree.map(lambda _: None, boxes), backward(*residuals, cotangent)
+
+
+_raster.defvjp(_raster_forward, _raster_backward)
+
+
+def _with_transparent_row(table):
+    """One more row that draws nothing, for the slots beyond a tile's last Gaussian."""
+    row = jnp.zeros((1, table.shape[1]), table.dtype)
+    row = row.at[0, SHAPE_COLUMNS - 1].set(-jnp.inf)
+    # Not zero: the gradient divides by p and r.
+    row = row.at[0, 2].set(1).at[0, 4].set(1)
+    return jnp.concatenate([table, row])
+
+
+def _blank(layout, channels, dtype):
+    """Transmittance 1 inside the image and -1, which is "done", beyond its edge."""
+    grid = layout.grid
+    inside = jnp.full((grid.height, grid.width, 1), 1, dtype)
+    transmittance = _to_tiles(inside, grid) * 2 - 1
+    zeros = jnp.zeros((grid.tiles, channels, grid.tile**2), dtype)
+    return jnp.concatenate([transmittance, zeros], axis=1)
+
+
+def _next_slab(layout, cursor, boxes, table, state):
+    open_tiles = jnp.max(state[:, 0], axis=1) > 0
+    log_cut = math.log(layout.spec.alpha_cut)
+    return binning.next_slab(
+        cursor, boxes, table, open_tiles, log_cut, layout.grid, layout.capacity
+    )
+
+
+def _more(cursor, state, boxes):
+    drawn = jnp.sum(boxes.count > 0, dtype=jnp.int32)
+    return (cursor.rank < drawn) & (jnp.max(state[:, 0]) > 0)
+
+
+def _stream(layout, boxes, table):
+    """Forward over all slabs."""
+    channels = table.shape[1] - SHAPE_COLUMNS
+    rows = _with_transparent_row(table)
+    spec, grid, step = layout.spec, layout.grid, layout.step
+
+    def body(carry):
+        cursor, state, kept = carry
+        slab, cursor = _next_slab(layout, cursor, boxes, table, state)
+        state, used = blending.blend(state, slab, rows, spec, grid, step)
+        # What early stopping left out is not looked at again in the backward pass.
+        slab = slab._replace(ends=slab.starts + used)
+        slabs = jax.tree.map(
+            lambda all_, one: all_.at[kept.count].set(one, mode="drop"),
+            kept.slabs,
+            slab,
+        )
+        return cursor, state, Kept(slabs, kept.count + 1)
+
+    keep = spec.kept_slabs
+    slabs = Slab(
+        jnp.zeros((keep, layout.capacity), jnp.int32),
+        jnp.zeros((keep, grid.tiles), jnp.int32),
+        jnp.zeros((keep, grid.tiles), jnp.int32),
+    )
+    start = (
+        Cursor(jnp.int32(0), jnp.int32(0)),
+        _blank(layout, channels, table.dtype),
+        Kept(slabs, jnp.int32(0)),
+    )
+    _, state, kept = lax.while_loop(
+        lambda carry: _more(carry[0], carry[1], boxes), body, start
+    )
+    return state, kept
+
+
+def _stream_back(layout, boxes, table, final, kept, cotangent):
+    """Backward over the same slabs; those not kept are sorted again."""
+    rows = _with_transparent_row(table)
+    spec, grid, step = layout.spec, layout.grid, layout.step
+    toward = cotangent[:, 1:]
+    behind = jnp.sum(final[:, 1:] * toward, axis=1)
+    behind += jnp.abs(final[:, 0]) * cotangent[:, 0]
+    blank = _blank(layout, 0, table.dtype)
+    state = jnp.concatenate([blank, behind[:, None]], axis=1)
+    keep = spec.kept_slabs
+
+    def body(carry):
+        number, cursor, state, gradient = carry
+        slab, cursor = lax.cond(
+            number < keep,
+            lambda: _kept_slab(layout, kept, number, cursor, boxes),
+            lambda: _next_slab(layout, cursor, boxes, table, state),
+        )
+        state, gradient = blending.blend_gradient(
+            state, gradient, slab, rows, toward, spec, grid, step
+        )
+        return number + 1, cursor, state, gradient
+
+    start = (
+        jnp.int32(0),
+        Cursor(jnp.int32(0), jnp.int32(0)),
+        state,
+        jnp.zeros_like(rows),
+    )
+    *_, gradient = lax.while_loop(lambda carry: carry[0] < kept.count, body, start)
+    return gradient[:-1]
+
+
+def _kept_slab(layout, kept, number, cursor, boxes):
+    slab = jax.tree.map(lambda x: x[number], kept.slabs)
+    return slab, binning.advance(cursor, boxes.count, layout.capacity)
+
+
+def _to_tiles(image, grid):
+    """[height, width, c] to [tiles, c, pixels], zero beyond the edge."""
+    height, width = grid.rows * grid.tile, grid.columns * grid.tile
+    image = jnp.pad(image, ((0, height - grid.height), (0, width - grid.width), (0, 0)))
+    image = image.reshape(grid.rows, grid.tile, grid.columns, grid.tile, -1)
+    return image.transpose(0, 2, 4, 1, 3).reshape(grid.tiles, -1, grid.tile**2)
+
+
+def _to_image(tiles, grid):
+    """Back to [height, width, c]."""
+    tiles = tiles.reshape(grid.rows, grid.columns, -1, grid.tile, grid.tile)
+    image = tiles.transpose(0, 3, 1, 4, 2)
+    image = image.reshape(grid.rows * grid.tile, grid.columns * grid.tile, -1)
+    return image[: grid.height, : grid.width]
