@@ -1,0 +1,346 @@
+"""Losses against float64 NumPy, scikit-image and reference values, and their edges."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.ndimage
+from skimage.metrics import structural_similarity
+
+from nerfies_jax.training import losses
+from tests import gradients
+
+# Compiled once per shape: uncompiled, each call traces and compiles its loop again.
+DSSIM = jax.jit(losses.dssim_map, static_argnames=("padding",))
+SSIM_SLOPE = jax.jit(jax.value_and_grad(losses.ssim))
+ULPS = {"float32": 4e-7, "float64": 1e-15}
+
+
+def images(rng, height=24, width=19, noise=0.2):
+    image = rng.random((height, width, 3))
+    return image, np.clip(image + noise * rng.normal(size=image.shape), 0, 1)
+
+
+def reference_dssim(image, target, padding, value_range=1.0):
+    """The five-window textbook form in float64 by scipy.ndimage."""
+    offsets = np.arange(-5, 6)
+    window = np.exp(-(offsets**2) / 4.5)
+    window /= window.sum()
+
+    def blur(x):
+        for axis in (0, 1):
+            x = scipy.ndimage.correlate1d(x, window, axis=axis, mode="constant")
+        return x
+
+    x, y = np.asarray(image, np.float64), np.asarray(target, np.float64)
+    c1, c2 = (0.01 * value_range) ** 2, (0.03 * value_range) ** 2
+    mx, my = blur(x), blur(y)
+    vx, vy, vxy = blur(x * x) - mx**2, blur(y * y) - my**2, blur(x * y) - mx * my
+    ssim = (2 * mx * my + c1) * (2 * vxy + c2)
+    ssim = ssim / ((mx**2 + my**2 + c1) * (vx + vy + c2))
+    return 1 - (ssim[5:-5, 5:-5] if padding == "valid" else ssim)
+
+
+@pytest.mark.parametrize("padding", ["zero", "valid"])
+def test_dssim_is_the_textbook_five_window_form(padding, rng, dtype):
+    image, target = images(rng)
+    found = DSSIM(
+        jnp.asarray(image, dtype), jnp.asarray(target, dtype), padding=padding
+    )
+    assert found.dtype == dtype
+    expected = reference_dssim(image, target, padding)
+    # float32: variances of 1e-3 from squares of 1, divided by C2 = 9e-4.
+    tolerance = {"float32": 2e-5, "float64": 1e-12}[dtype]
+    np.testing.assert_allclose(found, expected, atol=tolerance)
+
+
+def test_valid_ssim_is_scikit_images_gaussian_form(rng, float64):
+    image, target = images(rng)
+    expected = structural_similarity(
+        image,
+        target,
+        channel_axis=-1,
+        data_range=1.0,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+    )
+    found = losses.ssim(jnp.asarray(image), jnp.asarray(target), padding="valid")
+    assert abs(found - expected) < 1e-12
+
+
+@pytest.mark.parametrize("name", ["ssim_64x48", "ssim_480x270"])
+def test_ssim_and_its_gradient_match_the_reference(name, oracle_dir, dtype):
+    saved = np.load(oracle_dir / "splatting" / f"{name}.npz")
+    image, target = (
+        jnp.asarray(np.moveaxis(saved[key][0], 0, -1), dtype)
+        for key in ("img1", "img2")
+    )
+    value, slope = SSIM_SLOPE(image, target)
+    valid = jax.jit(lambda x, y: losses.ssim(x, y, padding="valid"))(image, target)
+    # The reference window was built in float32 and sums to 1 + 1e-7, which variances
+    # see as 1e-7 of the squares beside C2 = 9e-4: 2e-6 in the value, 6e-6 in the slope.
+    tolerance = 3e-6
+    assert abs(value - saved["ssim_zero_pad"]) < tolerance
+    assert abs(valid - saved["ssim_valid"]) < tolerance
+    assert abs(losses.l1(image, target) - saved["l1"]) < 1e-6
+    expected = np.moveaxis(saved["grad_img1"][0], 0, -1)
+    error = np.linalg.norm(slope - expected) / np.linalg.norm(expected)
+    assert error < 2e-5
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("level", [0.0, 0.5, 0.9, 1.0])
+def test_constant_equal_images_are_exactly_alike_without_a_slope(level, dtype):
+    image = jnp.full((16, 20, 3), level, dtype)
+    value, slope = SSIM_SLOPE(image, image)
+    assert value == 1
+    assert np.all(slope == 0)
+
+
+@pytest.mark.hard_cases
+def test_constant_images_a_little_apart_have_the_exact_slope(dtype):
+    image, target = (jnp.full((16, 20, 3), level, dtype) for level in (0.9, 0.89))
+
+    def loss(x):
+        return jnp.mean(losses.dssim_map(x, target, padding="valid"))
+
+    slope = np.asarray(jax.jit(jax.grad(loss))(image), np.float64)
+    x, y = float(image[0, 0, 0]), float(target[0, 0, 0])
+    luminance = x**2 + y**2 + 1e-4
+    exact = 2 * (x - y) / luminance - (x - y) ** 2 * 2 * x / luminance**2
+    # A uniform shift changes luminance alone; structure must add nothing.
+    assert abs(slope.sum() / exact - 1) < {"float32": 2e-4, "float64": 1e-10}[dtype]
+
+
+@pytest.mark.hard_cases
+def test_dssim_of_bright_low_contrast_images_keeps_its_digits(rng, dtype):
+    image = np.asarray(1000 + rng.normal(size=(24, 19, 3)), np.float32)
+    target = np.asarray(image + 0.5 * rng.normal(size=image.shape), np.float32)
+    found = DSSIM(
+        jnp.asarray(image, dtype), jnp.asarray(target, dtype), padding="valid"
+    )
+    expected = reference_dssim(image, target, "valid")
+    # In float64 the uncentred reference is the less exact of the two.
+    tolerance = {"float32": 1e-5, "float64": 1e-8}[dtype]
+    np.testing.assert_allclose(found, expected, atol=tolerance)
+
+
+@pytest.mark.hard_cases
+def test_dssim_of_half_precision_images_is_computed_in_float32(rng):
+    image, target = images(rng)
+    half = [jnp.asarray(x, jnp.bfloat16) for x in (image, target)]
+    found = DSSIM(*half)
+    assert found.dtype == jnp.float32
+    expected = reference_dssim(*(np.asarray(x, np.float64) for x in half), "zero")
+    np.testing.assert_allclose(found, expected, atol=2e-5)
+
+
+def test_dssim_of_other_ranges_is_the_scaled_one(rng, float64):
+    image, target = (jnp.asarray(x) for x in images(rng))
+    found = losses.ssim(255 * image, 255 * target, value_range=255.0)
+    assert abs(found - losses.ssim(image, target)) < 1e-12
+
+
+@pytest.mark.parametrize("padding", ["zero", "valid"])
+def test_dssim_gradient_is_the_slope(padding, rng, float64):
+    image, target = (jnp.asarray(x) for x in images(rng, 13, 12))
+    weight = jnp.asarray(rng.normal(size=reference_dssim(image, target, padding).shape))
+
+    def loss(x, y):
+        return jnp.sum(weight * losses.dssim_map(x, y, padding=padding))
+
+    assert gradients.directional_error(loss, image, target) < 1e-7
+
+
+def test_dssim_has_second_derivatives(rng, float64):
+    image, target = (jnp.asarray(x) for x in images(rng, 12, 11))
+    direction = jnp.asarray(rng.normal(size=image.shape))
+
+    def slope(x):
+        return jnp.vdot(jax.grad(losses.ssim)(x, target), direction)
+
+    assert gradients.directional_error(slope, image) < 1e-6
+
+
+def test_dssim_under_vmap_is_the_single_one(rng):
+    stack = jnp.asarray(rng.random((3, 2, 14, 13, 3)), jnp.float32)
+    mapped = jax.jit(jax.vmap(losses.dssim_map))(stack[:, 0], stack[:, 1])
+    for one, pair in zip(mapped, stack, strict=True):
+        np.testing.assert_allclose(one, DSSIM(*pair), atol=2e-6)
+
+
+@pytest.mark.parametrize(
+    ("padding", "words"), [("same", "'zero' or 'valid'"), ("valid", "no 11x11 window")]
+)
+def test_ssim_refuses_what_it_cannot_do(padding, words):
+    with pytest.raises(ValueError, match=words):
+        losses.ssim(jnp.zeros((10, 20, 3)), jnp.zeros((10, 20, 3)), padding=padding)
+
+
+ROBUST = {
+    "charbonnier": (losses.charbonnier, lambda s, w: np.sqrt(s + w**2) - w),
+    "huber": (
+        losses.huber,
+        lambda s, w: np.where(s < w**2, s / 2, w * (np.sqrt(s) - w / 2)),
+    ),
+    "geman_mcclure": (losses.geman_mcclure, lambda s, w: 2 * s / (s + 4 * w**2)),
+}
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("name", ROBUST)
+def test_robust_penalties_hold_from_nothing_to_the_largest_residual(name, dtype):
+    function, closed = ROBUST[name]
+    for width in (1e-3, 0.03, 1.0):
+        squares = np.float32([0, 1e-30, 1e-12, 1e-6, 1e-3, 0.5, 2, 1e3, 1e30])
+        extended = np.asarray(squares, np.longdouble)
+        expected = closed(extended, np.longdouble(width))
+        if name == "charbonnier":  # 80 bits still cancel at 1e-30
+            expected = extended / (np.sqrt(extended + width**2) + width)
+        found = function(jnp.asarray(squares, dtype), width)
+        np.testing.assert_allclose(
+            found, np.asarray(expected, np.float64), rtol=ULPS[dtype], atol=0
+        )
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("name", ROBUST)
+@pytest.mark.parametrize("square", [0.0, 1e-25, 0.03**2, 1.0, 1e4])
+def test_robust_penalties_keep_their_slopes(name, square, dtype):
+    function = ROBUST[name][0]
+    width = 0.03
+    slopes = {
+        "charbonnier": lambda s: 0.5 / np.sqrt(s + width**2),
+        "huber": lambda s: 0.5 if s < width**2 else 0.5 * width / np.sqrt(s),
+        "geman_mcclure": lambda s: 8 * width**2 / (s + 4 * width**2) ** 2,
+    }
+    s = jnp.asarray(square, dtype)
+    found = jax.grad(lambda s: function(s, width))(s)
+    np.testing.assert_allclose(found, slopes[name](float(s)), rtol=3 * ULPS[dtype])
+    curvature = jax.grad(jax.grad(lambda s: function(s, width)))(s)
+    assert np.isfinite(curvature)
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("name", ROBUST)
+def test_robust_penalties_of_a_vector_have_a_gradient_at_zero(name, dtype):
+    function = ROBUST[name][0]
+    zero = jnp.zeros(3, dtype)
+    assert np.all(jax.grad(lambda x: function(jnp.sum(x**2), 0.1))(zero) == 0)
+    assert np.all(
+        np.isfinite(jax.hessian(lambda x: function(jnp.sum(x**2), 0.1))(zero))
+    )
+
+
+@pytest.mark.hard_cases
+def test_geman_mcclure_saturates_at_infinity(dtype):
+    value, slope = jax.value_and_grad(losses.geman_mcclure)(
+        jnp.asarray(3e38, dtype), 1e-3
+    )
+    assert value == 2
+    assert np.isfinite(slope)
+    assert slope < 1e-30
+
+
+def test_official_geman_mcclure_is_width_times_the_papers():
+    s = jnp.asarray([0.0, 1e-3, 0.5])
+    official = losses.geman_mcclure(s, 0.03, "official")
+    np.testing.assert_allclose(
+        official, 0.03 * losses.geman_mcclure(s, 0.03), rtol=1e-6
+    )
+
+
+def test_robust_penalties_refuse_a_width_of_nothing():
+    for function, _ in ROBUST.values():
+        with pytest.raises(ValueError, match="width > 0, got 0"):
+            function(jnp.ones(2), 0.0)
+    with pytest.raises(ValueError, match="'paper' or 'official'"):
+        losses.geman_mcclure(jnp.ones(2), 1.0, "neat")
+
+
+LOSSES = {
+    "l1": losses.l1,
+    "mse": losses.mse,
+    "photometric": losses.photometric,
+}
+SLOPES = {name: jax.jit(jax.value_and_grad(loss)) for name, loss in LOSSES.items()}
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("name", LOSSES)
+@pytest.mark.parametrize("poison", [np.nan, np.inf])
+@pytest.mark.parametrize("where", ["image", "target"])
+def test_masked_pixels_teach_nothing_whatever_they_hold(
+    name, poison, where, rng, dtype
+):
+    image, target = images(rng, 14, 13)
+    valid = rng.random((14, 13)) > 0.3
+    clean = (jnp.asarray(image, dtype), jnp.asarray(target, dtype), jnp.asarray(valid))
+    {"image": image, "target": target}[where][~valid] = poison
+    dirty = (jnp.asarray(image, dtype), jnp.asarray(target, dtype), jnp.asarray(valid))
+    value, slope = SLOPES[name](*dirty)
+    expected, expected_slope = SLOPES[name](*clean)
+    assert value == expected
+    np.testing.assert_array_equal(slope, expected_slope)
+    assert np.all(slope[~valid] == 0)
+    assert np.any(slope[valid] != 0)
+
+
+def test_masked_losses_are_means_over_what_is_valid(rng, dtype):
+    image, target = images(rng)
+    valid = rng.random(image.shape[:2]) > 0.5
+    arrays = (jnp.asarray(image, dtype), jnp.asarray(target, dtype), jnp.asarray(valid))
+    difference = (image - target)[valid]
+    tolerance = {"float32": 1e-6, "float64": 1e-14}[dtype]
+    assert abs(losses.l1(*arrays) - np.abs(difference).mean()) < tolerance
+    assert abs(losses.mse(*arrays) - (difference**2).mean()) < tolerance
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_a_frame_without_a_valid_pixel_has_no_loss(name, dtype):
+    image = jnp.full((14, 13, 3), jnp.nan, dtype)
+    nothing = jnp.zeros((14, 13), bool)
+    value, slope = SLOPES[name](image, image, nothing)
+    assert value == 0
+    assert np.all(slope == 0)
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
+def test_photometric_loss_mixes_l1_and_dssim(weight, rng, float64):
+    image, target = images(rng)
+    expected = (1 - weight) * np.abs(image - target).mean()
+    expected += weight * reference_dssim(image, target, "zero").mean()
+    found = losses.photometric(
+        jnp.asarray(image), jnp.asarray(target), dssim_weight=weight
+    )
+    assert abs(found - expected) < 1e-12
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_loss_gradients_are_their_slopes(name, rng, float64):
+    image, target = (jnp.asarray(x) for x in images(rng, 12, 13))
+    valid = jnp.asarray(rng.random((12, 13)) > 0.3)
+
+    def loss(x, y):
+        return LOSSES[name](x, y, valid)
+
+    assert gradients.directional_error(loss, image, target, step=1e-7) < 1e-5
+
+
+def test_photometric_refuses_a_share_beyond_one():
+    with pytest.raises(ValueError, match=r"\[0, 1\], got 1.5"):
+        losses.photometric(jnp.ones((4, 4, 3)), jnp.ones((4, 4, 3)), dssim_weight=1.5)
+
+
+@pytest.mark.parametrize(
+    ("error", "expected"), [(1e-8, 80.0), (0.0, 100.0), (0.25, 6.0206)]
+)
+def test_psnr_is_finite_and_exact(error, expected, dtype):
+    value, slope = jax.value_and_grad(losses.psnr)(jnp.asarray(error, dtype))
+    assert abs(value - expected) < 5e-5
+    assert np.isfinite(slope)
+
+
+def test_psnr_counts_in_its_range():
+    assert abs(losses.psnr(jnp.asarray(0.01 * 255**2), 255.0) - 20) < 1e-5
