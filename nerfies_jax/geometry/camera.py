@@ -4,9 +4,21 @@ Frames and axes (docs/conventions.md): camera x points right, y down, z forward;
 centres lie at +0.5, so the centre of the top-left pixel is (0.5, 0.5).
 """
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
-from jaxtyping import Array, Float
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from nerfies_jax.geometry import distortion
+
+# Both keep what is at or behind the camera finite in float32, where 1/z² overflows
+# below 1e-19 and the seventh power of a slope above 1e5.
+MAX_SLOPE = 1e4  # lateral offset over depth: 0.006 degrees short of sideways
+MIN_DEPTH = 1e-12  # scene units
+Real = int | float | np.number
 
 
 class Camera(NamedTuple):
@@ -23,3 +35,234 @@ class Camera(NamedTuple):
     pixel_aspect: Float[Array, "*batch"]  # vertical over horizontal focal length
     radial: Float[Array, "*batch 3"]  # k1 k2 k3
     tangential: Float[Array, "*batch 2"]  # p1 p2
+
+
+def project(
+    camera: Camera, point: Float[Array, "3"]
+) -> tuple[Float[Array, "2"], Float[Array, ""]]:
+    """The pixel of one world point, and its z-depth in scene units.
+
+    A depth that is not positive means that the camera cannot see the point; its pixel
+    is then finite, far outside the picture on the side where the point lies, and so
+    are its derivatives. See `projectable` for points beyond the lens's own range.
+    """
+    lateral, depth = _in_camera(camera, point)
+    # A maximum, not a division under `where`: the quotient that is not wanted is never
+    # formed, so no 0 * inf reaches the gradient.
+    reach = jnp.max(jnp.abs(lateral))
+    divisor = jnp.maximum(depth, jnp.maximum(reach / MAX_SLOPE, MIN_DEPTH))
+    bent = distortion.distort(camera.radial, camera.tangential, lateral / divisor)
+    pixel = jnp.stack(
+        [
+            camera.focal_px * bent[0] + camera.skew_px * bent[1],
+            camera.focal_px * camera.pixel_aspect * bent[1],
+        ]
+    )
+    return pixel + camera.principal_point_px, depth
+
+
+def projectable(camera: Camera, point: Float[Array, "3"]) -> Bool[Array, ""]:
+    """Whether one world point is in front and where the lens model is one-to-one.
+
+    Beyond that a polynomial distortion folds back: a point far outside the field of
+    view would land inside the picture.
+    """
+    lateral, depth = _in_camera(camera, point)
+    in_front = depth > jnp.maximum(jnp.max(jnp.abs(lateral)) / MAX_SLOPE, MIN_DEPTH)
+    slopes = lateral / jnp.where(in_front, depth, 1)
+    return in_front & distortion.one_to_one(camera.radial, camera.tangential, slopes)
+
+
+def unproject(
+    camera: Camera, pixel: Float[Array, "2"]
+) -> tuple[Float[Array, "3"], Bool[Array, ""]]:
+    """The unit world direction that one pixel looks along, and whether it exists.
+
+    Where the lens model has no one-to-one solution the flag is False, and the direction
+    is finite, has zero gradient with respect to the pixel, and means nothing.
+    """
+    offset = pixel - camera.principal_point_px
+    bent_y = offset[1] / (camera.focal_px * camera.pixel_aspect)
+    bent_x = (offset[0] - camera.skew_px * bent_y) / camera.focal_px
+    slopes, converged = distortion.undistort(
+        camera.radial, camera.tangential, jnp.stack([bent_x, bent_y])
+    )
+    in_camera = jnp.concatenate([slopes, jnp.ones_like(slopes[:1])])
+    in_camera = in_camera / jnp.sqrt(jnp.sum(in_camera**2))  # at least 1: no zero here
+    # Full precision: on a GPU the default would round the rotation to ten bits.
+    direction = jnp.matmul(in_camera, camera.camera_from_world, precision="highest")
+    return direction, converged
+
+
+def forward_axis(camera: Camera) -> Float[Array, "*batch 3"]:
+    """The unit viewing axis in the world; z-depth is measured along it."""
+    return jnp.asarray(camera.camera_from_world)[..., 2, :]
+
+
+def camera_matrix(camera: Camera) -> Float[Array, "*batch 3 3"]:
+    """K of `pixel ~ K @ point_in_camera`; it does not contain the distortion."""
+    zero, one = jnp.zeros_like(camera.focal_px), jnp.ones_like(camera.focal_px)
+    centre = camera.principal_point_px
+    rows = [
+        [camera.focal_px, camera.skew_px, centre[..., 0]],
+        [zero, camera.focal_px * camera.pixel_aspect, centre[..., 1]],
+        [zero, zero, one],
+    ]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def world_from_camera(camera: Camera) -> Float[Array, "*batch 4 4"]:
+    """The pose as a 4×4 matrix; its last column is the camera's position."""
+    rotation = jnp.swapaxes(camera.camera_from_world, -1, -2)
+    upper = jnp.concatenate([rotation, camera.position[..., None]], axis=-1)
+    last = jnp.zeros_like(upper[..., :1, :]).at[..., 0, 3].set(1)
+    return jnp.concatenate([upper, last], axis=-2)
+
+
+def resize(
+    camera: Camera, old_size: tuple[int, int], new_size: tuple[int, int]
+) -> Camera:
+    """The same camera for its picture resampled from one (width, height) to another."""
+    for name, size in (("old_size", old_size), ("new_size", new_size)):
+        if min(size) < 1:
+            raise ValueError(
+                f"{name}={size} must be at least 1x1 pixels (width, height)"
+            )
+    across, down = new_size[0] / old_size[0], new_size[1] / old_size[1]
+    both = np.asarray([across, down], dtype=camera.principal_point_px.dtype)
+    return camera._replace(
+        focal_px=camera.focal_px * across,
+        principal_point_px=camera.principal_point_px * both,
+        skew_px=camera.skew_px * across,
+        pixel_aspect=camera.pixel_aspect * (down / across),
+    )
+
+
+def crop(camera: Camera, left_px: Real, top_px: Real) -> Camera:
+    """The same camera for its picture with columns and rows cut off left and top."""
+    corner = np.asarray([left_px, top_px], dtype=camera.principal_point_px.dtype)
+    return camera._replace(principal_point_px=camera.principal_point_px - corner)
+
+
+def pinhole(
+    camera_from_world: Any,
+    position: Any,
+    focal_px: Real,
+    size: tuple[int, int],
+    dtype: Any = np.float32,
+) -> Camera:
+    """A camera without skew or distortion, centred on its picture. NumPy leaves."""
+    return Camera(
+        camera_from_world=np.asarray(camera_from_world, dtype),
+        position=np.asarray(position, dtype),
+        focal_px=np.asarray(focal_px, dtype),
+        principal_point_px=np.asarray(size, dtype) / 2,
+        skew_px=np.zeros((), dtype),
+        pixel_aspect=np.ones((), dtype),
+        radial=np.zeros(3, dtype),
+        tangential=np.zeros(2, dtype),
+    )
+
+
+def look_at(
+    position: Any,
+    target: Any,
+    up: Any,
+    focal_px: Real,
+    size: tuple[int, int],
+    dtype: Any = np.float32,
+) -> Camera:
+    """A pinhole at `position` that looks at `target`; `up` points up in the picture."""
+    position, target, up = (np.asarray(x, np.float64) for x in (position, target, up))
+    forward = target - position
+    distance = np.linalg.norm(forward)
+    if not distance > 0:
+        raise ValueError(f"the camera at {position} looks at itself; move the target")
+    forward = forward / distance
+    right = np.cross(forward, up)
+    length = np.linalg.norm(right)
+    if not length > 1e-6 * np.linalg.norm(up):  # a roll of 1e-6 rad is still defined
+        raise ValueError(
+            f"up={up} is parallel to the viewing direction {forward}, so the roll is "
+            "undefined; choose another up"
+        )
+    right = right / length
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return pinhole(rotation, position, focal_px, size, dtype)
+
+
+def stack(cameras: Sequence[Camera]) -> Camera:
+    """Several cameras as one batch. NumPy leaves."""
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *cameras)
+
+
+def take(cameras: Camera, rows: Any) -> Camera:
+    """Rows of a batch: one index for one camera, several for a batch of them."""
+    return jax.tree.map(lambda leaf: leaf[rows], cameras)
+
+
+def validate(camera: Camera, size: tuple[int, int], name: str = "camera") -> None:
+    """Raise ValueError, with `name`, value and remedy, for what cannot be used.
+
+    On the host, where cameras are read; `size` is (width, height) of the picture.
+    """
+    shapes = Camera((3, 3), (3,), (), (2,), (), (), (3,), (2,))
+    for field, leaf, shape in zip(Camera._fields, camera, shapes, strict=True):
+        value = np.asarray(leaf)
+        if value.shape[value.ndim - len(shape) :] != shape:
+            raise ValueError(
+                f"{name}: {field} has shape {value.shape}, must end {shape}"
+            )
+        bad = ~np.isfinite(value)
+        if bad.any():
+            raise ValueError(
+                f"{name}: {field} is not finite{_row(bad, len(shape))}: leave the "
+                "frame out or estimate its camera again"
+            )
+    rotation = np.asarray(camera.camera_from_world, np.float64)
+    product = rotation @ np.swapaxes(rotation, -1, -2)
+    drift = np.abs(product - np.eye(3)).max(axis=(-1, -2))
+    # Poses printed with four digits come out at 2e-4; a scaled or sheared one does not.
+    if (drift > 1e-3).any():
+        raise ValueError(
+            f"{name}: orientation is not orthonormal{_row(drift > 1e-3, 0)}: "
+            f"|R Rᵀ - 1| = {drift.max():.2g} > 1e-3; take the scale out of the pose"
+        )
+    mirrored = np.linalg.det(rotation) < 0
+    if mirrored.any():
+        raise ValueError(
+            f"{name}: orientation is a reflection{_row(mirrored, 0)} (det = -1); axes "
+            "are x right, y down, z forward"
+        )
+    for field in ("focal_px", "pixel_aspect"):
+        value = np.asarray(getattr(camera, field))
+        if (value <= 0).any():
+            raise ValueError(
+                f"{name}: {field} must be positive, got {value.min():g}"
+                f"{_row(value <= 0, 0)}"
+            )
+    if min(size) < 1:
+        raise ValueError(f"{name}: picture size {size} must be at least 1x1 pixels")
+    # A wrong unit or a camera of another resolution; a crop may lie a picture aside.
+    centre = np.asarray(camera.principal_point_px, np.float64)
+    aside = (np.abs(centre / size - 0.5) > 1.5).any(axis=-1)
+    if aside.any():
+        raise ValueError(
+            f"{name}: the principal point {centre.reshape(-1, 2)[aside.ravel()][0]} is "
+            f"more than a picture outside {size[0]}x{size[1]}{_row(aside, 0)}; resize "
+            "the camera with its picture"
+        )
+
+
+def _in_camera(camera: Camera, point: Float[Array, "3"]):
+    """Lateral offset and depth. R (x - c), never R x + t: that cancels far from 0."""
+    offset = jnp.matmul(
+        camera.camera_from_world, point - camera.position, precision="highest"
+    )
+    return offset[:2], offset[2]
+
+
+def _row(bad: np.ndarray, inner: int) -> str:
+    """Where in a batch the first bad entry lies; empty for a single camera."""
+    rows = bad.reshape(*bad.shape[: bad.ndim - inner], -1).any(axis=-1)
+    return f" (row {int(np.flatnonzero(rows)[0])})" if rows.ndim else ""

@@ -1,0 +1,182 @@
+"""Brown-Conrady lens distortion of image-plane slopes, and its inverse.
+
+Slopes are (X/Z, Y/Z) of a point in the camera's frame. `radial` is k1 k2 k3 and
+`tangential` p1 p2, as in OpenCV and in Nerfies' camera files.
+"""
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+# A bracketed Newton: 5 steps for a phone lens; the rest is for strong lenses, close to
+# their fold, where the root is nearly double and each step only halves the distance.
+RADIAL_STEPS = 24
+PLANE_STEPS = 6  # tangential terms of 1e-2 need three; of 4e-2, near the fold, six
+INSIDE = 0.97
+MAX_RADIUS = 1e4  # slopes beyond 89.99 degrees overflow r⁷ in float32
+# Below this the plane is compressed a thousandfold: at the fold for any purpose.
+MIN_DETERMINANT = 1e-3
+RESIDUAL_ULPS = 32  # of 1 + |slopes|: 0.01 px in float32 at a focal length of 2700 px
+
+
+def distort(
+    radial: Float[Array, "3"], tangential: Float[Array, "2"], slopes: Float[Array, "2"]
+) -> Float[Array, "2"]:
+    """Where the lens moves one point of the image plane (Brown 1971)."""
+    x, y = slopes[0], slopes[1]
+    radius_sq = x * x + y * y
+    k1, k2, k3 = radial[0], radial[1], radial[2]
+    p1, p2 = tangential[0], tangential[1]
+    stretch = 1 + radius_sq * (k1 + radius_sq * (k2 + radius_sq * k3))
+    return jnp.stack(
+        [
+            x * stretch + 2 * p1 * x * y + p2 * (radius_sq + 2 * x * x),
+            y * stretch + 2 * p2 * x * y + p1 * (radius_sq + 2 * y * y),
+        ]
+    )
+
+
+def undistort(
+    radial: Float[Array, "3"], tangential: Float[Array, "2"], bent: Float[Array, "2"]
+) -> tuple[Float[Array, "2"], Bool[Array, ""]]:
+    """The slopes that `distort` sends to `bent`, and whether there are any.
+
+    The solution is sought on the branch that contains the optical axis. Beyond the
+    branch's edge there is none, and other roots (where Newton from the distorted point
+    happily lands) belong to no ray of light. Derivatives are those of the implicit
+    function, to any order; zero where there is no solution.
+    """
+    slopes = _undistorted(radial, tangential, bent)
+    return slopes, _solves(radial, tangential, bent, slopes)
+
+
+def one_to_one(
+    radial: Float[Array, "3"], tangential: Float[Array, "2"], slopes: Float[Array, "2"]
+) -> Bool[Array, ""]:
+    """Whether the lens has not folded anywhere between the axis and `slopes`.
+
+    Exact for the radial terms. With tangential ones it also asks that the plane is not
+    turned over at `slopes` itself.
+    """
+    return _unfolded(radial, jnp.sum(slopes**2)) & (
+        _determinant(_jacobian(radial, tangential, slopes)) > MIN_DETERMINANT
+    )
+
+
+@jax.custom_jvp
+def _undistorted(radial, tangential, bent):
+    start = _radial_root(radial, bent)
+
+    def newton(_, slopes):
+        jacobian = _jacobian(radial, tangential, slopes)
+        step = _solve(jacobian, distort(radial, tangential, slopes) - bent)
+        return slopes - step
+
+    slopes = lax.fori_loop(0, PLANE_STEPS, newton, start)
+    # Where there is no solution Newton wanders to other branches, or to infinity.
+    return jnp.where(_solves(radial, tangential, bent, slopes), slopes, start)
+
+
+@_undistorted.defjvp
+def _undistorted_jvp(primals, tangents):
+    """Implicit: J ds = d bent - ∂distort/∂(lens) d lens. Same rule at every order."""
+    radial, tangential, bent = primals
+    radial_dot, tangential_dot, bent_dot = tangents
+    slopes = _undistorted(radial, tangential, bent)
+    _, moved = jax.jvp(
+        lambda k, p: distort(k, p, slopes),
+        (radial, tangential),
+        (radial_dot, tangential_dot),
+    )
+    step = _solve(_jacobian(radial, tangential, slopes), bent_dot - moved)
+    return slopes, jnp.where(_solves(radial, tangential, bent, slopes), step, 0)
+
+
+def _solves(radial, tangential, bent, slopes):
+    """Whether `slopes` is the wanted root. False for NaN, as comparisons are."""
+    residual = jnp.max(jnp.abs(distort(radial, tangential, slopes) - bent))
+    bound = RESIDUAL_ULPS * jnp.finfo(bent.dtype).eps * (1 + jnp.max(jnp.abs(bent)))
+    return (residual <= bound) & one_to_one(radial, tangential, slopes)
+
+
+def _radial_root(radial, bent):
+    """The root without tangential terms: bisection that Newton shortens.
+
+    `beyond` tells on which side of the root (or of the fold, where there is no root) a
+    radius lies, so the bracket always holds the first of the two.
+    """
+    target = jnp.sqrt(jnp.sum(bent**2))
+    k1, k2, k3 = radial[0], radial[1], radial[2]
+
+    def narrow(_, state):
+        low, high, radius, last = state
+        radius_sq = radius * radius
+        stretch = 1 + radius_sq * (k1 + radius_sq * (k2 + radius_sq * k3))
+        excess = radius * stretch - target
+        unfolded = _unfolded(radial, radius_sq)
+        beyond = (excess > 0) | ~unfolded
+        low = jnp.where(beyond, low, radius)
+        high = jnp.where(beyond, radius, high)
+        slope = _radial_slope(radial, radius_sq)
+        newton = radius - excess / jnp.where(unfolded, slope, 1)
+        # Newton only while it at least halves its step; it would creep near an
+        # inflection. From an open bracket the search doubles instead of halving.
+        trusted = unfolded & (newton >= low) & (newton <= high)
+        trusted &= jnp.abs(newton - radius) < last / 2
+        middle = jnp.minimum((low + high) / 2, 2 * low + target)
+        chosen = jnp.where(trusted, newton, middle)
+        return low, high, chosen, jnp.abs(chosen - radius)
+
+    low = jnp.zeros_like(target)
+    high = jnp.full_like(target, MAX_RADIUS)
+    state = low, high, jnp.minimum(target, high), high
+    _, _, radius, _ = lax.fori_loop(0, RADIAL_STEPS, narrow, state)
+    # Where the tangential terms alone reach the target, the radial search ends at the
+    # fold, from where Newton has no way; it starts inside instead.
+    radius = jnp.where(
+        _unfolded(radial, (radius / INSIDE) ** 2), radius, INSIDE * radius
+    )
+    return bent * (radius / jnp.where(target > 0, target, 1))
+
+
+def _radial_slope(radial, radius_sq):
+    """d(distorted radius)/d(radius) as a cubic in the squared radius."""
+    k1, k2, k3 = radial[0], radial[1], radial[2]
+    return 1 + radius_sq * (3 * k1 + radius_sq * (5 * k2 + radius_sq * 7 * k3))
+
+
+def _unfolded(radial, radius_sq):
+    """Whether the radial slope is positive from 0 to `radius_sq`, without sampling.
+
+    A cubic's least value lies at an end or where its derivative 3k1 + 10k2 s + 21k3 s²
+    vanishes.
+    """
+    a, b, c = 21 * radial[2], 10 * radial[1], 3 * radial[0]
+    discriminant = b * b - 4 * a * c
+    root = jnp.sqrt(jnp.maximum(discriminant, 0))
+    half = -(b + jnp.where(b < 0, -root, root)) / 2  # the sum that does not cancel
+    ends = [radius_sq]
+    for numerator, denominator in ((half, a), (c, half)):
+        known = (denominator != 0) & (discriminant > 0)
+        at = numerator / jnp.where(known, denominator, 1)
+        ends.append(jnp.where(known & (at > 0) & (at < radius_sq), at, 0))
+    return jnp.min(_radial_slope(radial, jnp.stack(ends))) > 0
+
+
+def _jacobian(radial, tangential, slopes):
+    return jax.jacfwd(distort, argnums=2)(radial, tangential, slopes)
+
+
+def _determinant(matrix):
+    return matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
+
+
+def _solve(matrix, right):
+    """matrix⁻¹ right for 2×2; zero where the plane is folded or squeezed flat."""
+    determinant = _determinant(matrix)
+    regular = determinant > MIN_DETERMINANT
+    x = matrix[1, 1] * right[0] - matrix[0, 1] * right[1]
+    y = matrix[0, 0] * right[1] - matrix[1, 0] * right[0]
+    step = jnp.stack([x, y]) / jnp.where(regular, determinant, 1)
+    return jnp.where(regular, step, 0)

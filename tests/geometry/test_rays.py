@@ -1,0 +1,114 @@
+"""Pixels to rays and distances along them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from nerfies_jax.geometry import camera as cameras
+from nerfies_jax.geometry import rays
+
+SIZE = (8, 6)
+
+pixel_rays = jax.jit(lambda camera: rays.pixel_rays(camera, SIZE))
+box_span = jax.jit(rays.box_span)
+seen_at = jax.jit(
+    jax.vmap(jax.vmap(cameras.project, (None, 0)), (None, 0)),
+)
+
+
+def make_camera(dtype, **changes):
+    plain = cameras.look_at([0.3, 0.2, -4], [0, 0, 0], [0, 1, 0], 9.0, SIZE, dtype)
+    return jax.tree.map(jnp.asarray, plain._replace(**changes))
+
+
+def test_rays_go_through_pixel_centres(dtype):
+    camera = make_camera(dtype)
+    grid = pixel_rays(camera)
+    assert grid.direction.shape == (6, 8, 3)
+    assert grid.direction.dtype == dtype
+    assert np.all(grid.valid)
+    np.testing.assert_allclose(np.linalg.norm(grid.direction, axis=-1), 1, atol=1e-6)
+    back, _ = seen_at(camera, grid.origin + 2 * grid.direction)
+    columns, rows = np.meshgrid(np.arange(8) + 0.5, np.arange(6) + 0.5)
+    np.testing.assert_allclose(back, np.stack([columns, rows], axis=-1), atol=2e-5)
+
+
+def test_pixels_without_a_ray_are_marked(dtype):
+    """The corners of a strong barrel lens; no NaN and no made-up neighbour there."""
+    camera = make_camera(dtype, radial=np.asarray([-0.8, 0, 0], dtype))
+    grid = pixel_rays(camera)
+    valid = np.asarray(grid.valid)
+    assert valid[3, 4]
+    assert not valid[0, 0]
+    assert 0.5 < np.mean(valid) < 0.95
+    assert np.all(np.isfinite(grid.direction))
+    # r(1 - 0.8 r²) folds at r² = 1/2.4, where it has two thirds of r
+    radius = np.linalg.norm(
+        (np.asarray(rays.pixel_centres(SIZE)) - [4, 3]) / 9, axis=-1
+    )
+    assert np.array_equal(valid, radius < 2 / 3 * np.sqrt(1 / 2.4))
+
+
+def test_distance_and_depth_convert_both_ways(dtype):
+    camera = make_camera(dtype)
+    grid = pixel_rays(camera)
+    distance = jnp.full((6, 8), 3, dtype)
+    depth = rays.depth_of_distance(camera, grid.direction, distance)
+    _, projected = seen_at(camera, grid.origin + 3 * grid.direction)
+    np.testing.assert_allclose(depth, projected, rtol=1e-5)
+    again = rays.distance_of_depth(camera, grid.direction, depth)
+    np.testing.assert_allclose(again, distance, rtol=1e-6)
+
+
+def test_nerfies_points_at_depth(oracle_dir, float64):
+    """`pixels_to_points` of google/nerfies takes z-depth."""
+    values = np.load(oracle_dir / "nerfies.npz")
+    centres = rays.pixel_centres((3, 2), jnp.float32)
+    np.testing.assert_array_equal(centres, values["unit/camera/pixel_centers_tl"])
+
+
+def box_by_sampling(origin, direction, low, high):
+    distances = np.linspace(0, 10, 200_001)
+    points = origin + distances[:, None] * direction
+    inside = np.all((points >= low) & (points <= high), axis=-1)
+    return distances[inside]
+
+
+@pytest.mark.parametrize("start", [(-3.0, 0.1, 0.2), (0.1, 0.0, -0.3), (0.0, 1.0, 0.0)])
+def test_box_span_is_where_samples_are_inside(start, dtype, rng):
+    low, high = np.array([-1, -0.5, -1]), np.array([1, 1, 0.7])
+    for _ in range(20):
+        direction = rng.normal(size=3)
+        direction /= np.linalg.norm(direction)
+        inside = box_by_sampling(np.array(start), direction, low, high)
+        enter, leave = box_span(
+            *(jnp.asarray(x, dtype) for x in (start, direction, low, high))
+        )
+        if len(inside) > 1:
+            np.testing.assert_allclose([enter, leave], inside[[0, -1]], atol=2e-4)
+        else:
+            assert leave < enter + 2e-4
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize(
+    ("origin", "direction", "span"),
+    [
+        ((-3, 0, 0), (1, 0, 0), (2, 4)),
+        ((-3, 1, 0), (1, 0, 0), (2, 4)),  # slides along a face: 0/0 in the plain form
+        ((-3, 2, 0), (1, 0, 0), None),
+        ((0, 0, 0), (0, 0, 1), (0, 1)),
+        ((3, 0, 0), (1, 0, 0), None),
+    ],
+)
+def test_box_span_of_axis_parallel_rays(origin, direction, span, dtype):
+    low, high = jnp.full(3, -1, dtype), jnp.full(3, 1, dtype)
+    place, along = jnp.asarray(origin, dtype), jnp.asarray(direction, dtype)
+    enter, leave = box_span(place, along, low, high)
+    if span is None:
+        assert not enter < leave
+    else:
+        assert (enter, leave) == span
+    slope = jax.grad(lambda d: jnp.clip(rays.box_span(place, d, low, high)[1], 0, 9))
+    assert np.all(np.isfinite(slope(along)))
