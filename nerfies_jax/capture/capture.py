@@ -268,15 +268,15 @@ def downscale(capture: Capture, factor: int) -> Capture:
         capture,
         images=np.stack([shrink(image, factor) for image in capture.images]),
         cameras=camera.resize(capture.cameras, (factor, factor), (1, 1)),
-        valid=None if valid is None else _blocks(valid, factor).all((-3, -1)),
-        moving=None if moving is None else _blocks(moving, factor).any((-3, -1)),
+        valid=None if valid is None else blocks(valid, factor).all((-3, -1)),
+        moving=None if moving is None else blocks(moving, factor).any((-3, -1)),
         depths=None
         if capture.depths is None
         else np.stack([shrink_depth(depth, factor) for depth in capture.depths]),
     )
 
 
-def _blocks(array, factor):
+def blocks(array, factor):
     """[..., rows, factor, columns, factor] view of pictures [..., height, width]."""
     rows, columns = array.shape[-2] // factor, array.shape[-1] // factor
     trimmed = array[..., : rows * factor, : columns * factor]
@@ -285,17 +285,17 @@ def _blocks(array, factor):
 
 def shrink(image: np.ndarray, factor: int) -> np.ndarray:
     """Area average of one uint8 picture [height, width, 3], rounded half up."""
-    blocks = _blocks(np.moveaxis(image, -1, 0), factor)
-    total = blocks.sum((-3, -1), dtype=np.uint32)
+    parts = blocks(np.moveaxis(image, -1, 0), factor)
+    total = parts.sum((-3, -1), dtype=np.uint32)
     area = factor * factor
     return np.moveaxis((total + area // 2) // area, 0, -1).astype(np.uint8)
 
 
 def shrink_depth(depth: np.ndarray, factor: int) -> np.ndarray:
     """Mean of the known depths of each block of [height, width]; 0 where none is."""
-    blocks = _blocks(depth, factor)
-    known = (blocks > 0).sum((-3, -1))
-    mean = blocks.sum((-3, -1), dtype=np.float64) / np.maximum(known, 1)
+    parts = blocks(depth, factor)
+    known = (parts > 0).sum((-3, -1))
+    mean = parts.sum((-3, -1), dtype=np.float64) / np.maximum(known, 1)
     return mean.astype(np.float32)
 
 

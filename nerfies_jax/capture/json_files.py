@@ -7,7 +7,7 @@ import pathlib
 import re
 import shutil
 import tempfile
-from typing import Any, TypeVar
+from typing import Any
 
 import msgspec
 
@@ -15,11 +15,10 @@ from nerfies_jax.capture.capture import CaptureError
 
 MAX_JSON_BYTES = 256 * 2**20  # 20 000 frames of transforms.json are 20 MB
 
-Type = TypeVar("Type")
 AnyPath = str | os.PathLike
 
 
-def read_json(path: AnyPath, kind: type[Type] = Any) -> Type:
+def read_json(path: AnyPath, kind: Any = Any) -> Any:
     """The file decoded as `kind`; a NaN, a wrong type or an absent key is an error."""
     path = pathlib.Path(path)
     try:

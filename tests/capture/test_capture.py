@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import nerfies_jax.capture
 from nerfies_jax.capture import capture as capturing
 from nerfies_jax.capture.capture import Capture, CaptureError, PointCloud
 from nerfies_jax.geometry import camera
@@ -189,3 +190,9 @@ def test_describe_says_what_was_found():
         make(), valid=None, moving=None, depths=None, points=None
     )
     assert len(capturing.describe(bare)) == 2
+
+
+def test_the_room_offers_load_and_nothing_else_by_accident():
+    assert callable(nerfies_jax.capture.load)
+    with pytest.raises(AttributeError, match="nonsense"):
+        _ = nerfies_jax.capture.nonsense

@@ -1,0 +1,102 @@
+"""`load`: recognise what kind of capture a folder holds, and read it."""
+
+import importlib
+import pathlib
+from collections.abc import Callable
+from typing import NamedTuple
+
+from nerfies_jax.capture.capture import Capture, CaptureError
+from nerfies_jax.capture.json_files import AnyPath
+
+
+class Format(NamedTuple):
+    """One kind of capture and how to tell it."""
+
+    name: str
+    looks_for: str
+    recognise: Callable[[pathlib.Path], bool]
+    module: str  # imported only when needed: decoders and pycolmap are slow to load
+
+
+def _is_nerfies(path):
+    return (path / "scene.json").is_file() and (path / "camera").is_dir()
+
+
+def _is_blender(path):
+    return path.is_file() or any(path.glob("transforms*.json"))
+
+
+def _is_colmap(path):
+    places = ("", "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "colmap")
+    return any(
+        (path / place / f"cameras.{ending}").is_file()
+        for place in places
+        for ending in ("bin", "txt")
+    ) or any(path.glob("**/sparse/*/cameras.bin"))
+
+
+FORMATS = (
+    Format(
+        "nerfies",
+        "scene.json and camera/*.json (Nerfies, HyperNeRF, NeRF-DS, DyCheck)",
+        _is_nerfies,
+        "nerfies_jax.capture.nerfies_format",
+    ),
+    Format(
+        "blender",
+        "transforms*.json (Blender, D-NeRF, nerfstudio)",
+        _is_blender,
+        "nerfies_jax.capture.blender_format",
+    ),
+    Format(
+        "colmap",
+        "sparse/0/cameras.bin or .txt (COLMAP)",
+        _is_colmap,
+        "nerfies_jax.capture.colmap",
+    ),
+)
+
+
+def recognise(path: AnyPath) -> Format:
+    """The format of the capture at `path`; an error that lists what was looked for."""
+    path = pathlib.Path(path)
+    if not path.exists():
+        raise CaptureError(f"{path}: no such folder; check the path")
+    if path.is_file() and path.suffix != ".json":
+        raise CaptureError(
+            f"{path}: a file, not a capture; pass a capture's folder, or make one with "
+            "python -m experiments.prepare"
+        )
+    for each in FORMATS:
+        if each.recognise(path):
+            return each
+    wanted = "; ".join(each.looks_for for each in FORMATS)
+    raise CaptureError(f"{path}: no capture here; looked for {wanted}")
+
+
+def load(
+    path: AnyPath,
+    factor: int | None = None,
+    max_side: int | None = None,
+    heldout: int | str | None = None,
+    missing: str = "refuse",
+    **options,
+) -> Capture:
+    """The capture in a folder, whatever its format; `notes` says what was found.
+
+    Pictures are read at 1/`factor` of their full size, or with no side longer than
+    `max_side` pixels. `heldout`: None for the files' own split (every 8th frame where
+    they have none), n for every n-th frame, or the name of a split. `missing`: "refuse"
+    or "skip" frames whose picture is missing. `options` are the reader's own, such as
+    `background` for Blender's.
+    """
+    path = pathlib.Path(path)
+    reader = importlib.import_module(recognise(path).module)
+    return reader.read(
+        path,
+        factor=factor,
+        max_side=max_side,
+        heldout=heldout,
+        missing=missing,
+        **options,
+    )

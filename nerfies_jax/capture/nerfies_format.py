@@ -1,0 +1,317 @@
+"""Nerfies, HyperNeRF, NeRF-DS and DyCheck directories: read and write.
+
+All four are the layout of Park et al. 2021 (arXiv:2011.12948) with additions. The files
+and their meaning are listed in docs/formats.md.
+"""
+
+import pathlib
+
+import numpy as np
+
+from nerfies_jax.capture import frames
+from nerfies_jax.capture import images as pictures
+from nerfies_jax.capture.capture import (
+    Capture,
+    CaptureError,
+    PointCloud,
+    blocks,
+    shrink,
+    shrink_depth,
+)
+from nerfies_jax.capture.json_files import AnyPath, new_folder, write_json
+from nerfies_jax.capture.nerfies_views import only, read_cameras
+from nerfies_jax.geometry import camera
+
+MAX_POINTS = 50_000_000
+
+
+def read(
+    path: AnyPath,
+    factor: int | None = None,
+    max_side: int | None = None,
+    heldout: int | str | None = None,
+    missing: str = "refuse",
+) -> Capture:
+    """The capture in a Nerfies, HyperNeRF, NeRF-DS or DyCheck directory.
+
+    `factor` is relative to the full-size pictures; where `rgb/<factor>x` is not stored,
+    a larger one is averaged. Without it the largest stored pictures are read, or those
+    that DyCheck's extra.json asks for. `missing`: "refuse" or "skip" frames without
+    picture. `heldout` as in `read_cameras`.
+    """
+    path = pathlib.Path(path)
+    views = read_cameras(path, heldout)
+    available = {
+        int(folder.name[:-1]): folder
+        for folder in (path / "rgb").glob("*x")
+        if folder.name[:-1].isdecimal() and int(folder.name[:-1]) > 0
+    }
+    if not available:
+        raise CaptureError(
+            f"{path}: cameras but no pictures (looked for rgb/1x, rgb/2x, ...); fetch "
+            "them, or load the cameras alone with nerfies_format.read_cameras"
+        )
+    notes = []
+    if factor is None and max_side is None and views.extra.factor in available:
+        factor = views.extra.factor
+        notes.append(f"read at 1/{factor} of the full size, as extra.json asks")
+    source, shrink_by = frames.choose_source(
+        available, views.size, factor, max_side, str(path)
+    )
+    found = [frames.find_picture(available[source], name) for name in views.ids]
+    rows, lost = frames.keep_found(found, views.ids, missing, str(available[source]))
+    views = only(views, rows)
+    images, alpha = frames.read_frames([found[row] for row in rows], shrink_by)
+    total = source * shrink_by
+    _check_picture_size(found[rows[0]], views.size, source)
+    cameras = camera.resize(views.cameras, (total, total), (1, 1))
+    size = (images.shape[2], images.shape[1])
+    valid = _masks(path / "valid", views.ids, size, total)
+    static = _masks(path / "resized_mask", views.ids, size, total)
+    if alpha is not None:  # DyCheck: 255 where the sensor saw something
+        valid = (alpha == 255) & (True if valid is None else valid == 1)
+        notes.append("pictures have alpha: pixels below 255 count as not filmed")
+    elif valid is not None:
+        valid = valid == 1
+    moving = None if static is None else static < 1
+    points, more = _points(path, images, cameras, views, moving)
+    return Capture(
+        name=path.resolve().name,
+        source="nerfies",
+        ids=views.ids,
+        images=images,
+        cameras=cameras,
+        times=views.times,
+        train=views.train,
+        heldout=views.heldout,
+        near=views.scene.near,
+        far=views.scene.far,
+        warp_ids=views.warp_ids,
+        appearance_ids=views.appearance_ids,
+        camera_ids=views.camera_ids,
+        valid=None if valid is None or valid.all() else valid,
+        moving=moving,
+        depths=_depths(path, views, size, total),
+        points=points,
+        background=views.scene.background,
+        scale=views.scene.scale,
+        centre=views.scene.center,
+        up=_unit(views.extra.up) or frames.up_direction(cameras),
+        frames_per_second=views.extra.fps,
+        path=path,
+        notes=(*views.notes, *notes, *lost, *more),
+    )
+
+
+def write(capture: Capture, path: AnyPath, factors: tuple[int, ...] = (1,)):
+    """The capture as a Nerfies directory, all of it or nothing.
+
+    Pictures go to `rgb/<factor>x`, averaged for factors above 1. Beside what Nerfies
+    knows it keeps, in files and keys that other readers pass over: exact times, depth
+    (DyCheck's place), moving masks (NeRF-DS's), masks of filmed pixels, and the colours
+    of the points.
+    """
+    for name in capture.ids:
+        if (
+            not name
+            or name in (".", "..")
+            or "/" in name
+            or "\\" in name
+            or "\0" in name
+        ):
+            raise CaptureError(
+                f"{path}: frame {name!r} cannot be a file name; rename it without "
+                "slashes"
+            )
+    with new_folder(path) as folder:
+        _write_tables(capture, folder)
+        (folder / "camera").mkdir()
+        for row, name in enumerate(capture.ids):
+            write_json(folder / "camera" / f"{name}.json", _camera_entry(capture, row))
+        for factor in factors:
+            _write_pictures(capture, folder, factor)
+        if capture.points is not None:
+            world = capture.points.position.astype(np.float64) / capture.scale
+            np.save(folder / "points.npy", world + capture.centre, allow_pickle=False)
+            np.save(
+                folder / "points_colour.npy", capture.points.colour, allow_pickle=False
+            )
+
+
+def _write_tables(capture, folder):
+    scene = {
+        "scale": float(capture.scale),
+        "center": [float(x) for x in capture.centre],
+        "near": float(capture.near),
+        "far": float(capture.far),
+    }
+    if capture.background is not None:
+        scene["background"] = [float(x) for x in capture.background]
+    write_json(folder / "scene.json", scene)
+    train, val = (
+        [capture.ids[row] for row in rows] for rows in (capture.train, capture.heldout)
+    )
+    write_json(
+        folder / "dataset.json",
+        {
+            "count": len(capture.ids),
+            "num_exemplars": len(train),
+            "ids": list(capture.ids),
+            "train_ids": train,
+            "val_ids": val,
+        },
+    )
+    write_json(
+        folder / "metadata.json",
+        {
+            name: {
+                "warp_id": int(capture.warp_ids[row]),
+                "appearance_id": int(capture.appearance_ids[row]),
+                "camera_id": int(capture.camera_ids[row]),
+                "time": float(capture.times[row]),
+            }
+            for row, name in enumerate(capture.ids)
+        },
+    )
+    extra = {"up": capture.up, "fps": capture.frames_per_second}
+    if any(value is not None for value in extra.values()):
+        write_json(
+            folder / "extra.json", {k: v for k, v in extra.items() if v is not None}
+        )
+
+
+def _camera_entry(capture, row):
+    one = camera.take(capture.cameras, row)
+    position = one.position.astype(np.float64) / capture.scale + capture.centre
+    return {
+        "orientation": one.camera_from_world.tolist(),
+        "position": position.tolist(),
+        "focal_length": float(one.focal_px),
+        "principal_point": one.principal_point_px.tolist(),
+        "skew": float(one.skew_px),
+        "pixel_aspect_ratio": float(one.pixel_aspect),
+        "radial_distortion": one.radial.tolist(),
+        "tangential_distortion": one.tangential.tolist(),
+        "image_size": list(capture.size),
+    }
+
+
+def _write_pictures(capture, folder, factor):
+    """Colours, masks and depth at one reduction."""
+    depths, moving, valid = capture.depths, capture.moving, capture.valid
+
+    def place(kind):
+        target = folder / kind / f"{factor}x"
+        target.mkdir(parents=True, exist_ok=True)
+        return target
+
+    for row, name in enumerate(capture.ids):
+        image = shrink(capture.images[row], factor)
+        pictures.write_png(place("rgb") / f"{name}.png", image)
+        if moving is not None:  # NeRF-DS: black moves, and the ending is doubled
+            still = ~blocks(moving[row], factor).any((-3, -1))
+            pictures.write_png(place("resized_mask") / f"{name}.png.png", still)
+        if valid is not None:
+            filmed = blocks(valid[row], factor).all((-3, -1))
+            pictures.write_png(place("valid") / f"{name}.png", filmed)
+        if depths is not None:
+            depth = shrink_depth(depths[row], factor) / np.float32(capture.scale)
+            np.save(place("depth") / f"{name}.npy", depth, allow_pickle=False)
+
+
+def _check_picture_size(file, full_size, source):
+    """Stored pictures may be trimmed to whole blocks, by less than one pixel here."""
+    width, height = pictures.read_header(file).size
+    if (
+        abs(width - full_size[0] / source) >= 1
+        or abs(height - full_size[1] / source) >= 1
+    ):
+        raise CaptureError(
+            f"{file}: {width}x{height} pixels, but its camera says "
+            f"{full_size[0]}x{full_size[1]} at full size, so 1/{source} of that "
+            "belongs "
+            "here; mend image_size or move the pictures to the right rgb/<factor>x"
+        )
+
+
+def _reduced(folder, total):
+    """The stored reduction in `folder` to shrink to `total`, and by how much."""
+    for source in range(total, 0, -1):
+        if total % source == 0 and (folder / f"{source}x").is_dir():
+            return folder / f"{source}x", total // source
+    return None, 1
+
+
+def _masks(kind, ids, size, total):
+    """Share of white per pixel; NeRF-DS ends its names in .png.png."""
+    folder, shrink_by = _reduced(kind, total)
+    if folder is None:
+        return None
+    files = [folder / f"{name}.png.png" for name in ids]
+    plain = [folder / f"{name}.png" for name in ids]
+    found = [
+        double if double.is_file() else single if single.is_file() else None
+        for double, single in zip(files, plain, strict=True)
+    ]
+    return frames.read_masks(found, size, shrink_by) if any(found) else None
+
+
+def _depths(path, views, size, total):
+    """z-depth in scene units; files hold world units, 0 where unknown."""
+    folder, shrink_by = _reduced(path / "depth", total)
+    if folder is None or not any(folder.glob("*.npy")):
+        return None
+    width, height = size
+    depths = np.zeros((len(views.ids), height, width), np.float32)
+    for row, name in enumerate(views.ids):
+        file = folder / f"{name}.npy"
+        if not file.is_file():
+            continue  # DyCheck has depth for the moving camera only
+        depth = frames.load_array(file, pictures.MAX_PIXELS)
+        depth = depth[..., 0] if depth.ndim == 3 else depth
+        if depth.ndim != 2 or (
+            depth.shape[0] // shrink_by != height
+            or depth.shape[1] // shrink_by != width
+        ):
+            raise CaptureError(
+                f"{file}: depth of shape {depth.shape} for pictures of "
+                f"{width * shrink_by}x{height * shrink_by}; they must agree"
+            )
+        known = np.isfinite(depth) & (depth > 0)
+        depth = np.where(known, depth * views.scene.scale, 0).astype(np.float32)
+        depths[row] = shrink_depth(depth, shrink_by)
+    return depths
+
+
+def _points(path, images, cameras, views, moving):
+    file = path / "points.npy"
+    if not file.exists():
+        return None, ()
+    world = frames.load_array(file, 3 * MAX_POINTS)
+    if world.ndim != 2 or world.shape[1] != 3:
+        raise CaptureError(f"{file}: shape {world.shape}; expected [points, 3]")
+    finite = np.isfinite(world).all(1)
+    notes = (
+        () if finite.all() else (f"{(~finite).sum()} points are not finite: dropped",)
+    )
+    scene = views.scene
+    position = ((world - np.array(scene.center)) * scene.scale).astype(np.float32)[
+        finite
+    ]
+    colours = path / "points_colour.npy"  # ours
+    if colours.exists():
+        colour = frames.load_array(colours, 3 * MAX_POINTS)
+        if colour.shape != world.shape or colour.dtype != np.uint8:
+            raise CaptureError(
+                f"{colours}: {colour.dtype} of shape {colour.shape}; expected uint8 of "
+                f"{world.shape}, as points.npy"
+            )
+        return PointCloud(position, colour[finite]), notes
+    cloud = frames.coloured_points(position, images, cameras, views.train, moving)
+    return cloud, (*notes, "points.npy has no colours: sampled from the pictures")
+
+
+def _unit(up):
+    if up is None or not np.linalg.norm(up) > 0:
+        return None
+    return tuple((np.array(up) / np.linalg.norm(up)).tolist())

@@ -1,0 +1,286 @@
+"""The cameras, moments and splits of a Nerfies directory, without its pictures."""
+
+import pathlib
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from nerfies_jax.capture import frames
+from nerfies_jax.capture.capture import MAX_ID, CaptureError, check_cameras
+from nerfies_jax.capture.json_files import AnyPath, inside, read_json
+from nerfies_jax.geometry import camera
+from nerfies_jax.geometry.camera import Camera
+
+Pair = tuple[float, float]
+Triple = tuple[float, float, float]
+
+
+class CameraFile(msgspec.Struct):
+    """`camera/<id>.json`, in pixels of the full-size picture."""
+
+    orientation: tuple[Triple, Triple, Triple]  # camera from world
+    position: Triple
+    focal_length: float
+    principal_point: Pair
+    image_size: Pair
+    skew: float = 0.0
+    pixel_aspect_ratio: float = 1.0
+    radial_distortion: Triple = (0.0, 0.0, 0.0)
+    tangential_distortion: Pair | None = None
+    tangential: Pair | None = None  # the name that early files use
+
+
+class SceneFile(msgspec.Struct):
+    """`scene.json`: near and far are in scene units already, scale and centre are "
+    "not."""
+
+    scale: float
+    center: Triple
+    near: float
+    far: float
+    background: Triple | None = None  # ours
+
+
+class DatasetFile(msgspec.Struct):
+    """`dataset.json`; ids may be written as numbers."""
+
+    ids: list[str | int] = []
+    train_ids: list[str | int] = []
+    val_ids: list[str | int] = []
+
+
+class SplitFile(msgspec.Struct):
+    """DyCheck's `splits/<name>.json`."""
+
+    frame_names: list[str]
+
+
+class Moment(msgspec.Struct):
+    """One entry of `metadata.json`."""
+
+    warp_id: int | Triple = 0  # HyperNeRF's interpolation: left, right, progression
+    appearance_id: int | Triple = 0
+    camera_id: int = 0
+    time_id: float | None = None
+    time: float | None = None  # ours, in [0, 1]
+
+
+class ExtraFile(msgspec.Struct):
+    """DyCheck's `extra.json`, as far as we use it."""
+
+    factor: int | None = None
+    fps: float | None = None
+    up: Triple | None = None
+
+
+class Views(NamedTuple):
+    """The cameras of a directory and what is known of each, without any picture."""
+
+    ids: tuple[str, ...]
+    cameras: Camera  # scene units; pixels of the full-size picture
+    size: tuple[int, int]  # of the full-size picture
+    times: np.ndarray
+    train: np.ndarray
+    heldout: np.ndarray
+    warp_ids: np.ndarray
+    appearance_ids: np.ndarray
+    camera_ids: np.ndarray
+    scene: SceneFile
+    extra: ExtraFile
+    notes: tuple[str, ...]
+
+
+def read_cameras(path: AnyPath, heldout: int | str | None = None) -> Views:
+    """Cameras, times, ids and splits; needs no pictures.
+
+    `heldout`: None for what the files say, a number n for every n-th frame, "interp"
+    for HyperNeRF's interpolation protocol (learn from ids[::4], score on ids[2::4]), or
+    the name of one of DyCheck's splits ("val", "val_intl", ...).
+    """
+    path = pathlib.Path(path)
+    scene = read_json(path / "scene.json", SceneFile)
+    if not scene.scale > 0:
+        raise CaptureError(
+            f"{path / 'scene.json'}: scale = {scene.scale:g}; it must be positive"
+        )
+    extra_file = path / "extra.json"
+    extra = read_json(extra_file, ExtraFile) if extra_file.exists() else ExtraFile()
+    train, scored, notes = _splits(path, heldout)
+    chosen = set(train) | set(scored)
+    ids = tuple(sorted(chosen, key=frames.natural))
+    files = [_camera_file(path, name) for name in ids]
+    size = _common_size(path, ids, files)
+    cameras = _cameras(files, scene)
+    check_cameras(cameras, ids, size, str(path / "camera"))
+    moments, more = _moments(path, ids)
+    row = {name: number for number, name in enumerate(ids)}
+    return Views(
+        ids=ids,
+        cameras=cameras,
+        size=size,
+        times=_times(moments, path, ids),
+        train=np.sort([row[name] for name in train]).astype(int),
+        heldout=np.sort([row[name] for name in scored]).astype(int),
+        warp_ids=frames.dense([_when(m.warp_id) for m in moments]),
+        appearance_ids=frames.dense([_when(m.appearance_id) for m in moments]),
+        camera_ids=frames.dense([m.camera_id for m in moments]),
+        scene=scene,
+        extra=extra,
+        notes=(*notes, *more),
+    )
+
+
+def _splits(path, heldout):
+    """Names to learn from, names to score on, notes."""
+    file = path / "dataset.json"
+    notes = ()
+    if file.exists():
+        dataset = read_json(file, DatasetFile)
+        ids, train, val = (
+            [str(name) for name in names]
+            for names in (dataset.ids, dataset.train_ids, dataset.val_ids)
+        )
+    else:
+        ids, train, val = [], [], []
+        notes = ("no dataset.json: every camera file is a frame",)
+    if not ids and not train and not val:
+        ids = [file.stem for file in (path / "camera").glob("*.json")]
+    every = sorted({*ids, *train, *val}, key=frames.natural)
+    if not every:
+        raise CaptureError(f"{file}: names no frames; list them under ids or train_ids")
+    if heldout == "interp":
+        ordered = sorted(ids or every, key=frames.natural)
+        return ordered[::4], ordered[2::4], notes
+    if isinstance(heldout, str):
+        return *_named_split(path, heldout), notes
+    if isinstance(heldout, int) or not val:
+        step = heldout or frames.HELD_OUT
+        pool = every if isinstance(heldout, int) or not train else train
+        pool = sorted(pool, key=frames.natural)
+        kept, scored = frames.hold_out_every(len(pool), step, str(path))
+        if heldout is None:
+            notes += (f"no validation ids: every {step}th frame is held out",)
+        return [pool[row] for row in kept], [pool[row] for row in scored], notes
+    left_out = len(every) - len({*train, *val})
+    if train and left_out:
+        notes += (f"{left_out} frames in neither split are not read",)
+    return train or [name for name in every if name not in set(val)], val, notes
+
+
+def _named_split(path, heldout):
+    folder = path / "splits"
+    file = inside(folder, f"{heldout}.json", folder)
+    if not file.is_file():
+        known = sorted(f.stem for f in folder.glob("*.json"))
+        raise CaptureError(f"{file}: no such split; there are {known}")
+    # DyCheck pairs its splits: val_intl belongs to train_intl.
+    partner = folder / f"{heldout.replace('val', 'train', 1)}.json"
+    if partner == file or not partner.is_file():
+        partner = folder / "train.json"
+    return [read_json(each, SplitFile).frame_names for each in (partner, file)]
+
+
+def _camera_file(path, name):
+    folder = path / "camera"
+    return read_json(inside(folder, f"{name}.json", path / "dataset.json"), CameraFile)
+
+
+def _common_size(path, ids, files):
+    size = files[0].image_size
+    for name, file in zip(ids, files, strict=True):
+        if file.image_size != size or min(size) < 1:
+            raise CaptureError(
+                f"{path / 'camera' / name}.json: image_size {file.image_size}, but "
+                f"{ids[0]} has {size}; the frames of a capture share one positive size"
+            )
+    return round(size[0]), round(size[1])
+
+
+def _cameras(files, scene):
+    def column(values, dtype=np.float32):
+        return np.array(values, dtype)
+
+    world = column([file.position for file in files], np.float64)
+    tangential = [
+        file.tangential_distortion or file.tangential or (0.0, 0.0) for file in files
+    ]
+    return Camera(
+        camera_from_world=column([file.orientation for file in files]),
+        position=((world - scene.center) * scene.scale).astype(np.float32),
+        focal_px=column([file.focal_length for file in files]),
+        principal_point_px=column([file.principal_point for file in files]),
+        skew_px=column([file.skew for file in files]),
+        pixel_aspect=column([file.pixel_aspect_ratio for file in files]),
+        radial=column([file.radial_distortion for file in files]),
+        tangential=column(tangential),
+    )
+
+
+def _when(number):
+    """A moment between two others, as HyperNeRF's interpolation writes it, or one."""
+    if isinstance(number, tuple):
+        left, right, progress = number
+        return left + (right - left) * progress
+    return number
+
+
+def _moments(path, ids):
+    file = path / "metadata.json"
+    if not file.exists():
+        moments = [Moment(warp_id=row, appearance_id=row) for row in range(len(ids))]
+        return moments, ("no metadata.json: each frame is a moment of its own",)
+    table = read_json(file, dict[str, Moment])
+    absent = [name for name in ids if name not in table]
+    if absent:
+        raise CaptureError(
+            f"{file}: no entry for frame {absent[0]!r} ({len(absent)} such); add one "
+            "with "
+            "warp_id, appearance_id and camera_id"
+        )
+    moments = [table[name] for name in ids]
+    for name, moment in zip(ids, moments, strict=True):
+        for key in ("warp_id", "appearance_id", "camera_id"):
+            value = _when(getattr(moment, key))
+            if not 0 <= value < MAX_ID:
+                raise CaptureError(
+                    f"{file}: frame {name!r} has {key} {value}; expected 0 to "
+                    f"{MAX_ID - 1}"
+                )
+    between = sum(isinstance(moment.warp_id, tuple) for moment in moments)
+    if between:
+        return moments, (f"{between} frames lie between two moments (HyperNeRF)",)
+    return moments, ()
+
+
+def _times(moments, path, ids):
+    if all(moment.time is not None for moment in moments):
+        times = np.array([moment.time for moment in moments], np.float32)
+        bad = ~((times >= 0) & (times <= 1))
+        if bad.any():
+            row = int(np.argmax(bad))
+            raise CaptureError(
+                f"{path / 'metadata.json'}: frame {ids[row]!r} has time "
+                f"{times[row]:g}; "
+                "expected 0 to 1"
+            )
+        return times
+    if all(moment.time_id is not None for moment in moments):
+        return frames.spread([moment.time_id for moment in moments])
+    return frames.spread([_when(moment.warp_id) for moment in moments])
+
+
+def only(views, rows):
+    """The views of these rows."""
+    if len(rows) == len(views.ids):
+        return views
+    place = np.full(len(views.ids), -1)
+    place[rows] = np.arange(len(rows))
+    columns = ("times", "warp_ids", "appearance_ids", "camera_ids")
+    return views._replace(
+        ids=tuple(views.ids[row] for row in rows),
+        cameras=camera.take(views.cameras, rows),
+        train=place[views.train][place[views.train] >= 0],
+        heldout=place[views.heldout][place[views.heldout] >= 0],
+        **{name: getattr(views, name)[rows] for name in columns},
+    )

@@ -1,0 +1,564 @@
+"""Nerfies-like directories: what is read, what is refused, and the round trip."""
+
+import dataclasses
+import json
+
+import numpy as np
+import PIL.Image
+import pytest
+
+from nerfies_jax import capture as room
+from nerfies_jax.capture import frames, nerfies_format, nerfies_views
+from nerfies_jax.capture.capture import CaptureError, PointCloud
+from nerfies_jax.geometry import camera
+
+SIZE = (12, 8)
+SCENE = {"scale": 0.5, "center": [1.0, -2.0, 3.0], "near": 0.2, "far": 1.5}
+
+
+def dump(path, value):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(value))
+
+
+def save_picture(path, pixels):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    PIL.Image.fromarray(pixels).save(path, format=path.suffix[1:])
+
+
+def orientation(angle):
+    c, s = np.cos(angle), np.sin(angle)
+    return [[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]]
+
+
+def picture(row, size=SIZE, channels=3):
+    rng = np.random.default_rng(row)
+    return rng.integers(0, 256, (size[1], size[0], channels), np.uint8)
+
+
+def make(folder, count=6, factors=(1,), channels=3):
+    """A directory written by hand: ids 000 to 005, raw warp ids 10, 12, 14, ..."""
+    ids = [f"{row:03d}" for row in range(count)]
+    dump(folder / "scene.json", SCENE)
+    dump(
+        folder / "dataset.json",
+        {"count": count, "ids": ids, "train_ids": ids[::2], "val_ids": ids[1::2]},
+    )
+    moments = {
+        name: {"warp_id": 10 + 2 * row, "appearance_id": row, "camera_id": row % 2}
+        for row, name in enumerate(ids)
+    }
+    dump(folder / "metadata.json", moments)
+    for row, name in enumerate(ids):
+        entry = {
+            "orientation": orientation(0.1 * row),
+            "position": [1.0 + row, -2.0, 3.5],
+            "focal_length": 20.0,
+            "principal_point": [6.5, 4.25],
+            "skew": 0.5,
+            "pixel_aspect_ratio": 1.25,
+            "radial_distortion": [0.1, 0.01, 0.001],
+            "tangential": [0.02, 0.03],
+            "image_size": list(SIZE),
+        }
+        dump(folder / "camera" / f"{name}.json", entry)
+        for factor in factors:
+            size = (SIZE[0] // factor, SIZE[1] // factor)
+            save_picture(
+                folder / "rgb" / f"{factor}x" / f"{name}.png",
+                picture(row, size, channels),
+            )
+    return folder
+
+
+def edit(file, **changes):
+    dump(file, json.loads(file.read_text()) | changes)
+
+
+def test_everything_in_the_files_arrives(tmp_path):
+    found = nerfies_format.read(make(tmp_path / "scene"))
+    assert found.name == "scene"
+    assert found.ids == ("000", "001", "002", "003", "004", "005")
+    for row in range(6):
+        np.testing.assert_array_equal(found.images[row], picture(row))
+    assert found.train.tolist() == [0, 2, 4]
+    assert found.heldout.tolist() == [1, 3, 5]
+    assert found.warp_ids.tolist() == [0, 1, 2, 3, 4, 5]  # re-indexed from 10, 12, ...
+    assert found.camera_ids.tolist() == [0, 1, 0, 1, 0, 1]
+    np.testing.assert_allclose(found.times, [0, 0.2, 0.4, 0.6, 0.8, 1], atol=1e-7)
+    cameras = found.cameras
+    # (position - centre) * scale, by hand
+    np.testing.assert_allclose(
+        cameras.position, [[row * 0.5, 0, 0.25] for row in range(6)], atol=1e-7
+    )
+    np.testing.assert_allclose(
+        cameras.camera_from_world[3], orientation(0.3), atol=1e-7
+    )
+    assert (found.near, found.far) == (0.2, 1.5)  # already in scene units
+    np.testing.assert_array_equal(cameras.focal_px, np.float32([20] * 6))
+    np.testing.assert_array_equal(cameras.pixel_aspect, np.float32([1.25] * 6))
+    np.testing.assert_array_equal(cameras.skew_px, np.float32([0.5] * 6))
+    np.testing.assert_array_equal(cameras.radial[2], np.float32([0.1, 0.01, 0.001]))
+    np.testing.assert_array_equal(cameras.tangential[2], np.float32([0.02, 0.03]))
+    assert all(leaf.dtype == np.float32 for leaf in cameras)
+    np.testing.assert_allclose(found.up, [0, -1, 0], atol=1e-7)  # rows: right, down
+
+
+def test_load_recognises_it(tmp_path):
+    assert room.load(make(tmp_path)).source == "nerfies"
+
+
+@pytest.mark.parametrize(
+    ("stored", "options", "size"),
+    [
+        ((1,), {}, (12, 8)),
+        ((2, 4), {}, (6, 4)),
+        ((1, 2), {"factor": 2}, (6, 4)),
+        ((1,), {"factor": 4}, (3, 2)),
+        ((2,), {"factor": 4}, (3, 2)),
+        ((1, 2), {"max_side": 6}, (6, 4)),
+        ((1,), {"max_side": 7}, (6, 4)),
+        ((2,), {"max_side": 100}, (6, 4)),
+    ],
+)
+def test_a_factor_is_read_or_made_and_points_keep_their_place(
+    tmp_path, stored, options, size
+):
+    found = nerfies_format.read(make(tmp_path, factors=stored), **options)
+    assert found.size == size
+    full = nerfies_format.read_cameras(tmp_path)
+    ratio = size[0] / SIZE[0]
+    point = np.float32([[0.1, 0.2, 2.0]])
+    pixel, *_ = frames.pixels_of(found.cameras, 0, point, size)
+    whole, *_ = frames.pixels_of(full.cameras, 0, point, SIZE)
+    np.testing.assert_allclose(pixel, whole * ratio, rtol=1e-6)
+    if max(stored) == 1 and size != SIZE:
+        step = SIZE[0] // size[0]
+        block = picture(0)[:step, :step].reshape(-1, 3).mean(0)
+        assert (np.abs(found.images[0, 0, 0] - block) <= 0.5).all()
+
+
+def test_ids_written_as_numbers_are_names(tmp_path):
+    make(tmp_path)
+    dump(tmp_path / "dataset.json", {"ids": [0, 1], "train_ids": [0], "val_ids": [1]})
+    for row in (0, 1):
+        (tmp_path / "camera" / f"00{row}.json").rename(
+            tmp_path / "camera" / f"{row}.json"
+        )
+        (tmp_path / "rgb/1x" / f"00{row}.png").rename(
+            tmp_path / "rgb/1x" / f"{row}.png"
+        )
+    dump(tmp_path / "metadata.json", {"0": {"warp_id": 0}, "1": {"warp_id": 1}})
+    assert nerfies_format.read(tmp_path).ids == ("0", "1")
+
+
+@pytest.mark.parametrize(
+    ("dataset", "heldout", "train", "scored"),
+    [
+        ({"ids": 16}, None, 14, [4, 12]),  # the middle one of every eight
+        ({"ids": 16}, 4, 12, [2, 6, 10, 14]),
+        ({"ids": 16, "val_ids": []}, None, 14, [4, 12]),
+        ({"val_ids": [3, 5], "ids": 16}, None, 14, [3, 5]),
+        ({"ids": 16, "train_ids": [0, 1, 2], "val_ids": [15]}, None, 3, [3]),
+        ({"ids": 16}, "interp", 4, None),
+        (None, None, 14, [4, 12]),
+    ],
+)
+def test_splits(tmp_path, dataset, heldout, train, scored):
+    make(tmp_path, count=16)
+    if dataset is None:
+        (tmp_path / "dataset.json").unlink()
+    else:
+        names = {
+            key: [f"{row:03d}" for row in (range(rows) if key == "ids" else rows)]
+            for key, rows in dataset.items()
+        }
+        dump(tmp_path / "dataset.json", names)
+    found = nerfies_format.read(tmp_path, heldout=heldout)
+    assert found.train.size == train
+    if scored is not None:
+        assert found.heldout.tolist() == scored
+    else:  # HyperNeRF: every fourth is learnt from, those half-way are scored
+        assert [found.ids[row] for row in found.train] == ["000", "004", "008", "012"]
+        assert [found.ids[row] for row in found.heldout] == ["002", "006", "010", "014"]
+
+
+def test_dycheck_splits_come_in_pairs(tmp_path):
+    make(tmp_path)
+    for name, rows in {
+        "train_intl": [0, 3],
+        "val_intl": [4],
+        "train": [1],
+        "val": [2],
+    }.items():
+        dump(
+            tmp_path / "splits" / f"{name}.json",
+            {"frame_names": [f"00{r}" for r in rows]},
+        )
+    pairs = nerfies_format.read(tmp_path, heldout="val_intl")
+    assert [pairs.ids[row] for row in pairs.train] == ["000", "003"]
+    plain = nerfies_format.read(tmp_path, heldout="val")
+    assert [plain.ids[row] for row in plain.heldout] == ["002"]
+    with pytest.raises(CaptureError, match="no such split; there are"):
+        nerfies_format.read(tmp_path, heldout="test")
+
+
+def test_hypernerf_triples_and_time_ids(tmp_path):
+    make(tmp_path)
+    table = {f"00{row}": {"warp_id": row, "time_id": row**2} for row in range(6)}
+    table["003"]["warp_id"] = [2, 4, 0.25]
+    dump(tmp_path / "metadata.json", table)
+    found = nerfies_format.read(tmp_path)
+    np.testing.assert_allclose(found.times, np.arange(6) ** 2 / 25, atol=1e-7)
+    assert found.warp_ids.tolist() == [0, 1, 2, 3, 4, 5]
+    assert any("between two moments" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("ending", [".png.png", ".png"])
+def test_nerf_ds_masks_are_black_where_it_moves(tmp_path, ending):
+    make(tmp_path)
+    for row in range(6):
+        mask = np.full((8, 12), 255, np.uint8)
+        mask[2:4, 3:7] = 0
+        target = tmp_path / "resized_mask" / "1x" / f"00{row}{ending}"
+        save_picture(target, mask)
+    found = nerfies_format.read(tmp_path)
+    expected = np.zeros((8, 12), bool)
+    expected[2:4, 3:7] = True
+    np.testing.assert_array_equal(found.moving[5], expected)
+    small = nerfies_format.read(tmp_path, factor=2)
+    np.testing.assert_array_equal(
+        small.moving[5], expected.reshape(4, 2, 6, 2).any((1, 3))
+    )
+
+
+def test_dycheck_alpha_marks_pixels_that_were_filmed(tmp_path):
+    make(tmp_path, channels=4)
+    found = nerfies_format.read(tmp_path)
+    np.testing.assert_array_equal(found.valid[2], picture(2, channels=4)[..., 3] == 255)
+
+
+def test_dycheck_depth_is_scaled_and_may_be_absent(tmp_path):
+    make(tmp_path)
+    depth = np.random.default_rng(9).uniform(1, 2, (8, 12, 1)).astype(np.float32)
+    depth[0, 0], depth[0, 1], depth[0, 2] = 0, np.nan, -1
+    (tmp_path / "depth/1x").mkdir(parents=True)
+    np.save(tmp_path / "depth/1x/002.npy", depth)
+    found = nerfies_format.read(tmp_path)
+    expected = depth[..., 0] * np.float32(0.5)
+    expected[0, :3] = 0
+    np.testing.assert_array_equal(found.depths[2], expected)
+    assert not found.depths[[0, 1, 3, 4, 5]].any()
+    half = nerfies_format.read(tmp_path, factor=2).depths[2]
+    corner = expected[:2, :2]
+    assert half[0, 0] == pytest.approx(corner[corner > 0].mean())
+
+
+def test_points_are_scaled_and_coloured_from_the_pictures(tmp_path):
+    make(tmp_path)
+    for row in range(6):
+        save_picture(
+            tmp_path / "rgb/1x" / f"00{row}.png",
+            np.full((8, 12, 3), 40 + row, np.uint8),
+        )
+    world = np.array([[1.0, -2.0, 5.0], [1.0, -2.0, -9.0], [np.nan, 0, 0]])
+    np.save(tmp_path / "points.npy", world)
+    found = nerfies_format.read(tmp_path)
+    np.testing.assert_allclose(
+        found.points.position, [[0, 0, 1], [0, 0, -6]], atol=1e-7
+    )
+    assert found.points.colour[0, 0] in range(40, 46)
+    assert found.points.colour[1].tolist() == [frames.UNSEEN] * 3  # behind every camera
+    assert any("1 points are not finite" in note for note in found.notes)
+
+
+def test_no_pictures_is_an_error_that_offers_the_cameras(tmp_path):
+    make(tmp_path, factors=())
+    with pytest.raises(CaptureError, match="read_cameras"):
+        nerfies_format.read(tmp_path)
+    views = nerfies_format.read_cameras(tmp_path)
+    assert views.size == SIZE
+    assert views.cameras.focal_px.shape == (6,)
+
+
+def test_missing_pictures_are_listed_or_left_out(tmp_path):
+    make(tmp_path)
+    for name in ("001", "004"):
+        (tmp_path / f"rgb/1x/{name}.png").unlink()
+    with pytest.raises(CaptureError, match=r"2 of 6 pictures are missing \(001, 004\)"):
+        nerfies_format.read(tmp_path)
+    found = nerfies_format.read(tmp_path, missing="skip")
+    assert found.ids == ("000", "002", "003", "005")
+    assert found.train.tolist() == [0, 1]
+    assert found.heldout.tolist() == [2, 3]
+    assert any("001, 004" in note for note in found.notes)
+
+
+def truncate(path):
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+
+
+def pickled(folder):
+    np.save(folder / "points.npy", np.array([{"a": 1}]), allow_pickle=True)
+
+
+def nan_camera(folder):
+    file = folder / "camera/002.json"
+    file.write_text(file.read_text().replace("20.0", "NaN"))
+
+
+def huge_number(folder):
+    file = folder / "camera/002.json"
+    file.write_text(file.read_text().replace("20.0", "1e999"))
+
+
+BAD = {
+    "camera NaN": (nan_camera, "002.json: NaN on line 1"),
+    "camera overflow": (huge_number, "002.json"),
+    "camera word": (
+        lambda f: edit(f / "camera/002.json", focal_length="twenty"),
+        "$.focal_length",
+    ),
+    "camera short row": (
+        lambda f: edit(f / "camera/002.json", position=[1.0, 2.0]),
+        "$.position",
+    ),
+    "camera no rotation": (
+        lambda f: edit(f / "camera/002.json", orientation=(2 * np.eye(3)).tolist()),
+        "'002': orientation",
+    ),
+    "camera mirrored": (
+        lambda f: edit(
+            f / "camera/002.json", orientation=np.diag([1.0, 1.0, -1.0]).tolist()
+        ),
+        "'002': orientation is a reflection",
+    ),
+    "camera focal": (
+        lambda f: edit(f / "camera/002.json", focal_length=-1.0),
+        "'002': focal_px",
+    ),
+    "camera absent": (lambda f: (f / "camera/002.json").unlink(), "002.json"),
+    "camera of another size": (
+        lambda f: edit(f / "camera/002.json", image_size=[8, 12]),
+        "002.json: image_size",
+    ),
+    "picture not its camera's": (
+        lambda f: save_picture(f / "rgb/1x/000.png", picture(0, (6, 4))),
+        "6x4",
+    ),
+    "all pictures not their cameras'": (
+        lambda f: [
+            save_picture(f / f"rgb/1x/00{row}.png", picture(0, (6, 4)))
+            for row in range(6)
+        ],
+        "000.png: 6x4 pixels, but its camera says 12x8",
+    ),
+    "picture cut short": (lambda f: truncate(f / "rgb/1x/003.png"), "003.png"),
+    "picture empty": (lambda f: (f / "rgb/1x/003.png").write_bytes(b""), "003.png"),
+    "id without metadata": (
+        lambda f: dump(f / "metadata.json", {"000": {"warp_id": 0}}),
+        "no entry for frame '001'",
+    ),
+    "id negative": (
+        lambda f: edit(f / "metadata.json", **{"003": {"warp_id": -1}}),
+        "frame '003' has warp_id -1",
+    ),
+    "id huge": (
+        lambda f: edit(f / "metadata.json", **{"003": {"camera_id": 2**40}}),
+        "frame '003' has camera_id",
+    ),
+    "time outside": (
+        lambda f: dump(
+            f / "metadata.json",
+            {f"00{r}": {"warp_id": r, "time": 0.5 * r} for r in range(6)},
+        ),
+        "frame '003' has time 1.5",
+    ),
+    "id that climbs": (
+        lambda f: dump(
+            f / "dataset.json", {"train_ids": ["../../x"], "val_ids": ["001"]}
+        ),
+        "leads outside",
+    ),
+    "absolute id": (
+        lambda f: dump(
+            f / "dataset.json", {"train_ids": ["/etc/x"], "val_ids": ["001"]}
+        ),
+        "leads outside",
+    ),
+    "no ids": (
+        lambda f: [
+            dump(f / "dataset.json", {}),
+            [file.unlink() for file in (f / "camera").iterdir()],
+        ],
+        "names no frames",
+    ),
+    "single frame": (
+        lambda f: dump(f / "dataset.json", {"ids": ["000"], "train_ids": ["000"]}),
+        "at least 2 views",
+    ),
+    "frame in both splits": (
+        lambda f: edit(f / "dataset.json", val_ids=["000"]),
+        "both learnt from and held out",
+    ),
+    "scene scale": (lambda f: edit(f / "scene.json", scale=0.0), "scale = 0"),
+    "near and far": (lambda f: edit(f / "scene.json", near=3.0), "near = 3"),
+    "scene not JSON": (lambda f: (f / "scene.json").write_text("{"), "scene.json"),
+    "scene too deep": (
+        lambda f: (f / "metadata.json").write_text("[" * 100_000),
+        "metadata.json",
+    ),
+    "scene absent key": (lambda f: dump(f / "scene.json", {"scale": 1.0}), "`center`"),
+    "points pickled": (pickled, "points.npy"),
+    "points flat": (
+        lambda f: np.save(f / "points.npy", np.zeros(6)),
+        "expected [points, 3]",
+    ),
+    "points cut short": (
+        lambda f: [
+            np.save(f / "points.npy", np.zeros((100, 3))),
+            truncate(f / "points.npy"),
+        ],
+        "points.npy",
+    ),
+    "mask of another size": (
+        lambda f: save_picture(
+            f / "resized_mask/1x/000.png.png", np.zeros((4, 4), np.uint8)
+        ),
+        "000.png.png: a mask of 4x4",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_a_broken_directory_is_refused_in_one_line(tmp_path, case):
+    make(tmp_path)
+    spoil, said = BAD[case]
+    spoil(tmp_path)
+    with pytest.raises(CaptureError) as caught:
+        nerfies_format.read(tmp_path)
+    message = str(caught.value)
+    assert said in message
+    assert str(tmp_path) in message
+    assert "\n" not in message
+
+
+def test_a_symbolic_link_out_of_the_capture_is_refused(tmp_path):
+    make(tmp_path / "scene")
+    secret = tmp_path / "secret.json"
+    (tmp_path / "scene/camera/001.json").rename(secret)
+    (tmp_path / "scene/camera/001.json").symlink_to(secret)
+    with pytest.raises(CaptureError, match="leads outside"):
+        nerfies_format.read(tmp_path / "scene")
+
+
+def full_capture(tmp_path):
+    found = nerfies_format.read(make(tmp_path / "made", channels=4))
+    rng = np.random.default_rng(3)
+    moving = rng.random(found.valid.shape) < 0.3
+    return dataclasses.replace(
+        found,
+        times=np.sort(rng.random(6)).astype(np.float32),
+        moving=moving,
+        depths=np.where(moving, 0, rng.uniform(0.3, 1, moving.shape)).astype(
+            np.float32
+        ),
+        points=PointCloud(
+            rng.normal(size=(5, 3)).astype(np.float32),
+            rng.integers(0, 256, (5, 3), np.uint8),
+        ),
+        background=(1.0, 0.5, 0.0),
+        frames_per_second=29.97,
+    )
+
+
+def test_what_is_written_is_read_back(tmp_path):
+    first = full_capture(tmp_path)
+    nerfies_format.write(first, tmp_path / "copy")
+    second = nerfies_format.read(tmp_path / "copy")
+    assert second.ids == first.ids
+    for name in ("images", "times", "train", "heldout", "warp_ids", "appearance_ids"):
+        np.testing.assert_array_equal(getattr(second, name), getattr(first, name))
+    for name in ("camera_ids", "valid", "moving"):
+        np.testing.assert_array_equal(getattr(second, name), getattr(first, name))
+    for one, other in zip(first.cameras, second.cameras, strict=True):
+        # Positions pass through float64 world units: half an ulp of the centre, 3.
+        np.testing.assert_allclose(one, other, atol=2e-7)
+    np.testing.assert_allclose(second.depths, first.depths, rtol=3e-7)
+    np.testing.assert_allclose(second.points.position, first.points.position, atol=3e-7)
+    np.testing.assert_array_equal(second.points.colour, first.points.colour)
+    for name in ("near", "far", "scale", "centre", "background", "frames_per_second"):
+        assert getattr(second, name) == getattr(first, name)
+    np.testing.assert_allclose(second.up, first.up, atol=1e-7)
+
+
+def test_reductions_can_be_written_too(tmp_path):
+    first = full_capture(tmp_path)
+    nerfies_format.write(first, tmp_path / "copy", factors=(1, 2))
+    stored = nerfies_format.read(tmp_path / "copy", factor=2)
+    made = nerfies_format.read(tmp_path / "made", factor=2)
+    np.testing.assert_array_equal(stored.images, made.images)
+    assert sorted(p.name for p in (tmp_path / "copy/resized_mask").iterdir()) == [
+        "1x",
+        "2x",
+    ]
+
+
+def test_writing_leaves_all_or_nothing(tmp_path, monkeypatch):
+    first = full_capture(tmp_path)
+
+    def fail(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(nerfies_format.pictures, "write_png", fail)
+    with pytest.raises(CaptureError, match="No space left"):
+        nerfies_format.write(first, tmp_path / "copy")
+    assert [p.name for p in tmp_path.iterdir()] == ["made"]
+
+
+def test_writing_refuses_a_folder_in_use_and_names_that_climb(tmp_path):
+    first = full_capture(tmp_path)
+    with pytest.raises(CaptureError, match="already there"):
+        nerfies_format.write(first, tmp_path / "made")
+    climbing = dataclasses.replace(first, ids=("../x", *first.ids[1:]))
+    with pytest.raises(CaptureError, match="cannot be a file name"):
+        nerfies_format.write(climbing, tmp_path / "copy")
+    assert [p.name for p in tmp_path.iterdir()] == ["made"]
+
+
+def test_a_real_capture_projects_its_points_where_they_were_seen(data_dir):
+    scene = data_dir / "nrnerf_bookshelf"
+    found = nerfies_format.read(scene)
+    assert found.size == (512, 384)
+    assert (found.train.size, found.heldout.size) == (75, 11)
+    seen = np.load(scene / "points_tri.npz")
+    position = (seen["xyz"] - np.array(found.centre)) * found.scale
+    errors = []
+    for row in range(86):
+        pixel, *_ = frames.pixels_of(
+            found.cameras, row, position.astype(np.float32), found.size
+        )
+        here = seen["obs_image"] == row
+        errors.append(pixel[seen["obs_point"][here]] - seen["obs_xy"][here])
+    # The data's own card: median 0.42 px; with shuffled cameras 51 px.
+    assert np.median(np.linalg.norm(np.concatenate(errors), axis=1)) < 0.43
+
+
+def test_a_real_dycheck_capture_has_its_cameras_without_pictures(data_dir):
+    scene = data_dir / "dycheck_windmill_cameras"
+    views = nerfies_views.read_cameras(scene)
+    assert (len(views.ids), views.train.size, views.heldout.size) == (696, 277, 419)
+    assert views.camera_ids[views.train].max() == 0
+    assert np.unique(views.warp_ids).size == 277
+    assert (views.times.min(), views.times.max()) == (0, 1)
+    assert views.size == (720, 960)
+    lens = np.unique(views.cameras.focal_px)
+    assert lens.size == 3
+    # The card: scaled camera centres lie within [-0.06, 0.34].
+    assert -0.07 < views.cameras.position.min() < views.cameras.position.max() < 0.35
+    for fixed in (1, 2):
+        rows = views.camera_ids == fixed
+        assert np.ptp(camera.take(views.cameras, rows).position, axis=0).max() == 0
+    with pytest.raises(CaptureError, match="read_cameras"):
+        nerfies_format.read(scene)
