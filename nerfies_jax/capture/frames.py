@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from nerfies_jax.capture import images as pictures
 from nerfies_jax.capture.capture import CaptureError, PointCloud, blocks, shrink
@@ -181,12 +182,12 @@ def hold_out_every(count: int, every: int, where: str) -> tuple[np.ndarray, np.n
     return rows[~scored], rows[scored]
 
 
-def dense(values: Sequence) -> np.ndarray:
+def dense(values: ArrayLike) -> np.ndarray:
     """0..n-1 in the order of the values, equal for equal ones; int32."""
     return np.unique(np.asarray(values), return_inverse=True)[1].astype(np.int32)
 
 
-def spread(values: Sequence) -> np.ndarray:
+def spread(values: ArrayLike) -> np.ndarray:
     """Moments on any clock as float32 times in [0, 1]; zeros if they are all equal."""
     values = np.asarray(values, np.float64)
     first, last = values.min(), values.max()

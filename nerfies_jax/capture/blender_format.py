@@ -1,0 +1,269 @@
+"""transforms*.json: Blender's synthetic scenes, D-NeRF, nerfstudio and instant-ngp.
+
+Poses are camera-to-world with OpenGL axes (x right, y up, z back).
+"""
+
+import math
+import pathlib
+
+import numpy as np
+
+from nerfies_jax.capture import frames
+from nerfies_jax.capture import images as pictures
+from nerfies_jax.capture.capture import Capture, CaptureError
+from nerfies_jax.capture.json_files import AnyPath, inside
+from nerfies_jax.capture.points import (
+    Placement,
+    place_by_cameras,
+    place_by_points,
+    read_ply,
+)
+from nerfies_jax.capture.transforms import read_split
+from nerfies_jax.geometry import camera
+from nerfies_jax.geometry.camera import Camera
+
+WHITE = (1.0, 1.0, 1.0)
+# Blender's and D-NeRF's cameras sit 4 from the origin, and their readers use 2 and 6.
+USUAL_RADIUS, USUAL_NEAR, USUAL_FAR = 4.0, 2.0, 6.0
+PINHOLES = {"", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"}
+
+
+def read(
+    path: AnyPath,
+    factor: int | None = None,
+    max_side: int | None = None,
+    heldout: int | str | None = None,
+    missing: str = "refuse",
+    background: tuple[float, float, float] = WHITE,
+    near: float | None = None,
+    far: float | None = None,
+) -> Capture:
+    """The capture of transforms*.json; `path` is their folder or one of them.
+
+    Pictures with alpha are laid over `background` (sRGB). `heldout`: None for the test
+    split, else validation, else every 8th frame; "val" or "test" for that split; n for
+    every n-th training frame. `near` and `far`, in scene units, override the defaults:
+    2 and 6 for Blender's cameras 4 from the origin, from the points for nerfstudio.
+    """
+    path = pathlib.Path(path)
+    root = path if path.is_dir() else path.parent
+    split = read_split(path, heldout)
+    entries = [*split.train, *split.heldout]
+    where = str(split.file)
+    found = [_picture(root, entry, split.file) for entry in entries]
+    names = [_name(entry.file_path) for entry in entries]
+    rows, lost = frames.keep_found(found, names, missing, where)
+    entries, found = [entries[row] for row in rows], [found[row] for row in rows]
+    is_train = rows < len(split.train)
+    full = pictures.read_header(found[0]).size
+    _, shrink_by = frames.choose_source({1: root}, full, factor, max_side, where)
+    images, alpha = frames.read_frames(found, shrink_by, background)
+    cameras, notes = _cameras(entries, split.transforms, full, where)
+    cameras = camera.resize(cameras, (shrink_by, shrink_by), (1, 1))
+    points = None
+    if split.transforms.ply_file_path is not None:
+        points = read_ply(inside(root, split.transforms.ply_file_path, split.file))
+    placement, more = _place(cameras, points, split.transforms, images.shape[2:0:-1])
+    offset = cameras.position.astype(np.float64) - placement.centre
+    times, when = _times(entries, split, is_train)
+    return Capture(
+        name=root.resolve().name,
+        source="blender",
+        ids=tuple(names[row] for row in rows),
+        images=images,
+        cameras=cameras._replace(
+            position=(offset * placement.scale).astype(np.float32)
+        ),
+        times=times,
+        train=np.flatnonzero(is_train),
+        heldout=np.flatnonzero(~is_train),
+        near=placement.near if near is None else near,
+        far=placement.far if far is None else far,
+        warp_ids=frames.dense(times),
+        appearance_ids=np.zeros(len(rows), np.int32),
+        camera_ids=np.zeros(len(rows), np.int32),
+        valid=_valid(root, entries, split.file, images.shape[2:0:-1], shrink_by),
+        points=None
+        if points is None
+        else points._replace(
+            position=(
+                (points.position - np.array(placement.centre)) * placement.scale
+            ).astype(np.float32)
+        ),
+        background=background if alpha is not None else split.transforms.background,
+        scale=placement.scale,
+        centre=placement.centre,
+        up=(0.0, 0.0, 1.0),  # Blender's and nerfstudio's world
+        path=path,
+        notes=(*split.notes, *lost, *notes, *more, *when),
+    )
+
+
+def _name(file_path):
+    """One id, unique over the splits and fit for a file name: train_r_0."""
+    plain = pathlib.PurePosixPath(file_path)
+    stem = plain.with_suffix("") if plain.suffix in frames.SUFFIXES else plain
+    return "_".join(part for part in stem.parts if part not in (".", "/"))
+
+
+def _picture(root, entry, file):
+    inside(root, entry.file_path, file)
+    return frames.find_picture(root, entry.file_path)
+
+
+def _cameras(entries, transforms, size, where):
+    """World cameras for the pictures of this size, and what had to be assumed."""
+    if transforms.camera_model not in PINHOLES:
+        raise CaptureError(
+            f"{where}: camera_model {transforms.camera_model}; undistort the pictures "
+            "to "
+            "OPENCV or PINHOLE first (ns-process-data or COLMAP do it)"
+        )
+    single = [_one_camera(entry, transforms, size, where) for entry in entries]
+    cameras = camera.stack([one for one, _ in single])
+    sizes = {stated for _, stated in single if stated is not None and stated != size}
+    notes = ()
+    if sizes:
+        first = min(sizes)
+        notes = (
+            f"cameras for {first[0]:g}x{first[1]:g} scaled to pictures of "
+            f"{size[0]}x{size[1]}",
+        )
+    return cameras, notes
+
+
+def _one_camera(entry, transforms, size, where):
+    def lens(name, default=None):
+        own = getattr(entry, name)
+        value = own if own is not None else getattr(transforms, name)
+        return default if value is None else value
+
+    label = f"{where}: frame {entry.file_path!r}"
+    if lens("k4", 0.0) != 0:
+        raise CaptureError(
+            f"{label} has k4 = {lens('k4')}; undistort the pictures first"
+        )
+    width, height = lens("w", size[0]), lens("h", size[1])
+    if min(width, height) <= 0 or abs(size[0] * height / width - size[1]) > 1:
+        raise CaptureError(
+            f"{label} is {size[0]}x{size[1]} pixels but its camera says "
+            f"{width:g}x{height:g}; mend w and h or the picture"
+        )
+    angle, focal = lens("camera_angle_x"), lens("fl_x")
+    if focal is None:
+        if angle is None or not 0 < angle < math.pi:
+            raise CaptureError(
+                f"{label} has no fl_x and camera_angle_x = {angle}; give a focal "
+                "length in "
+                "pixels or a field of view between 0 and pi"
+            )
+        focal = 0.5 * width / math.tan(0.5 * angle)
+    if not focal > 0:
+        raise CaptureError(f"{label} has fl_x = {focal:g}; it must be positive")
+    rotation, position = _pose(entry.transform_matrix, label)
+    one = Camera(
+        camera_from_world=rotation.astype(np.float32),
+        position=position.astype(np.float32),
+        focal_px=np.float32(focal),
+        principal_point_px=np.float32([lens("cx", width / 2), lens("cy", height / 2)]),
+        skew_px=np.float32(0),
+        pixel_aspect=np.float32(lens("fl_y", focal) / focal),
+        radial=np.float32([lens("k1", 0), lens("k2", 0), lens("k3", 0)]),
+        tangential=np.float32([lens("p1", 0), lens("p2", 0)]),
+    )
+    one = one._replace(
+        **{k: np.asarray(v * np.float32(size[0] / width)) for k, v in _lengths(one)}
+    )
+    return one, (width, height)
+
+
+def _lengths(one):
+    return [(name, getattr(one, name)) for name in ("focal_px", "principal_point_px")]
+
+
+def _pose(matrix, label):
+    """Camera-from-world rotation and position from an OpenGL camera-to-world matrix."""
+    rows = [len(row) for row in matrix]
+    if rows not in ([4, 4, 4], [4, 4, 4, 4]):
+        raise CaptureError(
+            f"{label} has a transform_matrix of rows {rows}; expected 4x4 or 3x4"
+        )
+    matrix = np.array(matrix[:3], np.float64)
+    axes = matrix[:, :3].T  # rows: right, up, back
+    length = np.linalg.norm(axes, axis=1)
+    if not (length > 0).all() or np.ptp(length) > 1e-3 * length.mean():
+        raise CaptureError(
+            f"{label} has axes of lengths {length.round(4).tolist()} in "
+            "transform_matrix; "
+            "it must be a rotation"
+        )
+    # A uniform scale (a scaled parent in Blender) leaves the direction of the axes.
+    return axes / length[:, None] * [[1.0], [-1.0], [-1.0]], matrix[:, 3]
+
+
+def _place(cameras, points, transforms, size):
+    if points is not None and len(points.position) >= 3:
+        depths = []
+        for row in range(len(cameras.focal_px)):
+            _, depth, seen = frames.pixels_of(cameras, row, points.position, size)
+            depths.append(depth[seen])
+        depths = np.concatenate(depths)
+        if depths.size:
+            positions = cameras.position.astype(np.float64)
+            return place_by_points(points.position, positions, depths), ()
+    if transforms.camera_angle_x is not None and transforms.fl_x is None:
+        radius = float(np.median(np.linalg.norm(cameras.position, axis=1)))
+        usual = 0.75 * USUAL_RADIUS < radius < 1.25 * USUAL_RADIUS or radius == 0
+        ratio = 1.0 if usual else radius / USUAL_RADIUS
+        near, far = USUAL_NEAR * ratio, USUAL_FAR * ratio
+        note = (
+            f"near {near:.3g} and far {far:.3g} as usual for cameras {radius:.3g} away"
+        )
+        return Placement((0.0, 0.0, 0.0), 1.0, near, far), (note,)
+    note = "no points: near and far are guessed from where the cameras look"
+    return place_by_cameras(cameras), (note,)
+
+
+def _times(entries, split, is_train):
+    """Times as stored; what is missing is filled in by order, as D-NeRF does."""
+    stored = [entry.time for entry in entries]
+    count = len(entries)
+    if all(time is not None for time in stored):
+        times = np.array(stored, np.float32)
+        bad = ~((times >= 0) & (times <= 1))
+        if bad.any():
+            row = int(np.argmax(bad))
+            raise CaptureError(
+                f"{split.file}: frame {entries[row].file_path!r} has time "
+                f"{times[row]:g}; times run from 0 to 1, so divide by the last one"
+            )
+        return times, ()
+    if not any(time is not None for time in stored):
+        if split.file.name == "transforms_train.json":
+            return np.zeros(count, np.float32), ("no times: taken as a static scene",)
+        order = np.argsort(
+            np.array(sorted(range(count), key=lambda r: _order(entries[r])))
+        )
+        return frames.spread(order), (
+            "no times: frames are evenly spaced in name order",
+        )
+    times = np.zeros(count, np.float32)
+    for rows in (np.flatnonzero(is_train), np.flatnonzero(~is_train)):
+        for place, row in enumerate(rows):
+            own = stored[row]
+            times[row] = place / max(len(rows) - 1, 1) if own is None else own
+    lost = sum(time is None for time in stored)
+    return times, (f"{lost} frames have no time: filled in by their order",)
+
+
+def _order(entry):
+    return frames.natural(entry.file_path)
+
+
+def _valid(root, entries, file, size, shrink_by):
+    if not any(entry.mask_path for entry in entries):
+        return None
+    masks = [
+        entry.mask_path and inside(root, entry.mask_path, file) for entry in entries
+    ]
+    return frames.read_masks([mask or None for mask in masks], size, shrink_by) == 1

@@ -1,0 +1,105 @@
+"""Scene points: where they put the scene, and the colours they have."""
+
+import pathlib
+from typing import NamedTuple
+
+import numpy as np
+import plyfile
+
+from nerfies_jax.capture.capture import CaptureError, PointCloud
+from nerfies_jax.capture.frames import UNSEEN
+from nerfies_jax.geometry.camera import Camera
+
+MAX_POINTS = 50_000_000
+MAX_HEADER = 65_536  # bytes; plyfile hangs on a header line of 100 MB
+INLIERS = 0.95  # share of points nearest to their median that the scene must hold
+# Depths beyond these quantiles are outliers; the margins move the planes outwards.
+QUANTILES, NEAR_MARGIN, FAR_MARGIN = (0.001, 0.999), 0.8, 1.2
+
+
+class Placement(NamedTuple):
+    """How the world becomes the scene, and the depths it needs, in scene units."""
+
+    centre: tuple[float, float, float]
+    scale: float
+    near: float
+    far: float
+
+
+def place_by_points(
+    points: np.ndarray, positions: np.ndarray, depths: np.ndarray
+) -> Placement:
+    """The box of points and cameras gets a unit diagonal and lies around the origin.
+
+    As Nerfies does it, since its frequency bands are made for that size. `points` and
+    camera `positions` [n, 3] and observed `depths` are in world units. Nerfies moves
+    the near plane outwards by 25 % (it divides by 0.8); here it moves inwards.
+    """
+    distance = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    kept = points[distance <= np.quantile(distance, INLIERS)]
+    corners = np.concatenate([kept, positions])
+    low, high = corners.min(0), corners.max(0)
+    scale = 1 / np.linalg.norm(high - low)
+    near, far = np.quantile(depths, QUANTILES) * scale
+    return Placement(
+        tuple(((low + high) / 2).tolist()),
+        float(scale),
+        float(near * NEAR_MARGIN),
+        float(far * FAR_MARGIN),
+    )
+
+
+def place_by_cameras(cameras: Camera) -> Placement:
+    """A guess where no points are known: the cameras look at the scene.
+
+    The scene is centred on the point nearest to all viewing axes and as large as the
+    cameras' mean distance from it; near is a twentieth of that, far four times.
+    """
+    axes = cameras.camera_from_world[:, 2].astype(np.float64)
+    positions = cameras.position.astype(np.float64)
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # projects an axis away
+    matrix, right = across.sum(0), np.einsum("nij,nj->i", across, positions)
+    # Parallel axes meet nowhere; then the cameras' own spread sets the size.
+    meets = np.linalg.svd(matrix, compute_uv=False)[-1] > 1e-3 * len(axes)
+    spread = np.linalg.norm(positions - positions.mean(0), axis=1).max()
+    if meets:
+        centre = np.linalg.solve(matrix, right)
+        distance = np.linalg.norm(positions - centre, axis=1).mean()
+    else:
+        distance = 10 * spread
+        centre = positions.mean(0) + axes.mean(0) * distance
+    if not distance > 0:  # every camera at one place: any size is as good
+        distance, centre = 1.0, positions.mean(0) + axes.mean(0)
+    return Placement(tuple(centre.tolist()), float(1 / distance), 0.05, 4.0)
+
+
+def read_ply(path: pathlib.Path) -> PointCloud:
+    """Positions (as stored) and colours of a .ply point cloud; grey without colours."""
+    try:
+        with path.open("rb") as file:
+            if b"end_header" not in file.read(MAX_HEADER):
+                raise CaptureError(
+                    f"{path}: not a .ply file; no end of its header found"
+                )
+        vertex = plyfile.PlyData.read(str(path), mmap="r")["vertex"]
+        if vertex.count > MAX_POINTS:
+            raise CaptureError(
+                f"{path}: {vertex.count} points; at most {MAX_POINTS} are read"
+            )
+        position = np.stack([vertex[axis] for axis in "xyz"], axis=1)
+        names = {each.name for each in vertex.properties}
+        if {"red", "green", "blue"} <= names:
+            colour = np.stack([vertex[k] for k in ("red", "green", "blue")], axis=1)
+        else:
+            colour = np.full(position.shape, UNSEEN, np.uint8)
+    except CaptureError:
+        raise
+    except (OSError, ValueError, KeyError, plyfile.PlyParseError) as error:
+        reason = " ".join(str(error).split())
+        raise CaptureError(
+            f"{path}: not a readable point cloud ({reason}); export it again"
+        ) from None
+    finite = np.isfinite(position).all(1)
+    return PointCloud(
+        position[finite].astype(np.float32), colour[finite].astype(np.uint8)
+    )

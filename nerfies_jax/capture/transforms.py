@@ -1,0 +1,141 @@
+"""transforms*.json as they lie on disk, and which of their frames are held out."""
+
+import pathlib
+
+import msgspec
+
+from nerfies_jax.capture import frames
+from nerfies_jax.capture.capture import CaptureError
+from nerfies_jax.capture.json_files import read_json
+
+
+class Lens(msgspec.Struct, kw_only=True):
+    """Intrinsics, for the whole file or for one frame; in pixels of `w` by `h`."""
+
+    camera_angle_x: float | None = None  # whole horizontal field of view, rad
+    fl_x: float | None = None
+    fl_y: float | None = None
+    cx: float | None = None
+    cy: float | None = None
+    w: float | None = None
+    h: float | None = None
+    k1: float | None = None
+    k2: float | None = None
+    k3: float | None = None
+    k4: float | None = None
+    p1: float | None = None
+    p2: float | None = None
+
+
+class Frame(Lens, kw_only=True):
+    """One picture."""
+
+    file_path: str
+    transform_matrix: list[list[float]]
+    time: float | None = None
+    mask_path: str | None = None  # black: do not learn from
+
+
+class Transforms(Lens, kw_only=True):
+    """One file."""
+
+    frames: list[Frame] = []
+    camera_model: str = ""
+    ply_file_path: str | None = None
+    train_filenames: list[str] | None = None
+    val_filenames: list[str] | None = None
+    test_filenames: list[str] | None = None
+    background: tuple[float, float, float] | None = None  # ours: of opaque pictures
+
+
+class Split(msgspec.Struct):
+    """Frames to learn from and to score on."""
+
+    file: pathlib.Path
+    transforms: Transforms  # of the training file
+    train: list[Frame]
+    heldout: list[Frame]
+    notes: tuple[str, ...] = ()
+
+
+def read_split(path: pathlib.Path, heldout: int | str | None) -> Split:
+    """The frames of a folder or file; `heldout` as in `blender_format.read`."""
+    file = path if path.is_file() else path / "transforms_train.json"
+    if path.is_dir() and not file.is_file() and (path / "transforms.json").is_file():
+        file = path / "transforms.json"
+    transforms = read_json(file, Transforms)
+    if not transforms.frames:
+        raise CaptureError(f"{file}: no frames; list them under frames")
+    if isinstance(heldout, str) and heldout not in ("val", "test"):
+        raise CaptureError(
+            f'{file}: heldout={heldout!r}; expected "val", "test" or a number'
+        )
+    wanted = ("test", "val") if heldout is None else (heldout,)
+    if transforms.train_filenames is not None:  # nerfstudio's lists in one file
+        return _listed(file, transforms, wanted)
+    if not isinstance(heldout, int) and file.name == "transforms_train.json":
+        for name in wanted:
+            other = file.with_name(f"transforms_{name}.json")
+            if other.is_file():
+                scored = _own_lens(read_json(other, Transforms))
+                return Split(
+                    file,
+                    transforms,
+                    transforms.frames,
+                    scored,
+                    (f"the {name} split is held out",),
+                )
+    if isinstance(heldout, str):
+        raise CaptureError(
+            f"{file}: no {heldout} split beside it; pass a number n to hold out every "
+            "n-th frame"
+        )
+    # Files list frames in any order; a film is split in the order it was shot.
+    ordered = sorted(
+        transforms.frames,
+        key=lambda entry: (entry.time or 0.0, frames.natural(entry.file_path)),
+    )
+    every = heldout or frames.HELD_OUT
+    kept, scored = frames.hold_out_every(len(ordered), every, str(file))
+    return Split(
+        file,
+        transforms,
+        [ordered[row] for row in kept],
+        [ordered[row] for row in scored],
+        (f"no other split: every {every}th frame is held out",),
+    )
+
+
+def _own_lens(transforms):
+    """Frames that carry the intrinsics of their own file."""
+    for entry in transforms.frames:
+        for field in Lens.__struct_fields__:
+            if getattr(entry, field) is None:
+                setattr(entry, field, getattr(transforms, field))
+    return transforms.frames
+
+
+def _listed(file, transforms, wanted):
+    table = {entry.file_path: entry for entry in transforms.frames}
+    for name in wanted:
+        scored = getattr(transforms, f"{name}_filenames", None)
+        if scored:
+            break
+    else:
+        raise CaptureError(
+            f"{file}: lists no {' or '.join(map(str, wanted))}_filenames"
+        )
+    absent = [
+        each for each in (*transforms.train_filenames, *scored) if each not in table
+    ]
+    if absent:
+        raise CaptureError(
+            f"{file}: {absent[0]!r} is in a split but not in frames; add it"
+        )
+    return Split(
+        file,
+        transforms,
+        [table[each] for each in transforms.train_filenames],
+        [table[each] for each in scored],
+        (f"the {name} split is held out",),
+    )
