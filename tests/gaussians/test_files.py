@@ -1,0 +1,416 @@
+"""Gaussian files: round trips, other tools' files, and everything that can be wrong."""
+
+import gzip
+import os
+import struct
+
+import jax.numpy as jnp
+import numpy as np
+import plyfile
+import pytest
+
+from gaussians_jax import files, harmonics, spz
+from gaussians_jax.splats import DEAD_LOGIT, Splats
+
+
+def some_splats(count=20, degree=3, seed=0):
+    rng = np.random.default_rng(seed)
+    rest = (degree + 1) ** 2 - 1
+    quaternion = rng.normal(size=(count, 4))
+    leaves = (
+        rng.uniform(-3, 3, (count, 3)),
+        rng.uniform(-6, 1, (count, 3)),
+        quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True),
+        rng.normal(size=count) * 2,
+        rng.normal(size=(count, 1, 3)),
+        rng.uniform(-0.9, 0.9, (count, rest, 3)),
+    )
+    return Splats(*(jnp.asarray(leaf, jnp.float32) for leaf in leaves))
+
+
+def same_rotation(a, b):
+    """1 - |cos| of half the angle between two arrays of quaternions."""
+    a, b = (
+        q / np.linalg.norm(q, axis=1, keepdims=True) for q in map(np.asarray, (a, b))
+    )
+    return 1 - np.abs(np.sum(a * b, axis=1))
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_ply_keeps_every_bit(degree, tmp_path):
+    rows = some_splats(degree=degree)
+    assert files.save(tmp_path / "a.ply", rows) == 20
+    loaded = files.load(tmp_path / "a.ply")
+    assert loaded.dropped == 0
+    assert loaded.notes == ()
+    for name, now, before in zip(rows._fields, loaded.splats, rows, strict=True):
+        np.testing.assert_array_equal(now, before, err_msg=name)
+
+
+def test_ply_has_the_properties_that_viewers_read(tmp_path):
+    rows = some_splats(degree=3)
+    files.save(tmp_path / "a.ply", rows)
+    ply = plyfile.PlyData.read(tmp_path / "a.ply")
+    vertex = ply["vertex"]
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    names += [f"f_rest_{i}" for i in range(45)] + ["opacity"]
+    names += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    assert [prop.name for prop in vertex.properties] == names
+    assert not ply.text
+    assert ply.byte_order == "<"
+    # All of red comes first: coefficient 2 (of 15) of green is property 15 + 2.
+    np.testing.assert_array_equal(vertex["f_rest_17"], rows.sh_rest[:, 2, 1])
+    np.testing.assert_array_equal(vertex["rot_0"], rows.quaternion[:, 0])
+
+
+@pytest.mark.parametrize(
+    "name", ["gaussian_splatting_web_pc_short_100.ply", "splatapult_axes_16.ply"]
+)
+def test_a_file_of_another_tool_comes_back_bit_for_bit(name, data_dir, tmp_path):
+    theirs = data_dir / "splat_files" / name
+    loaded = files.load(theirs)
+    assert loaded.splats.sh_rest.shape[1:] == (15, 3)
+    files.save(tmp_path / "again.ply", loaded.splats)
+    again = files.load(tmp_path / "again.ply").splats
+    for now, before in zip(again, loaded.splats, strict=True):
+        np.testing.assert_array_equal(now, before)
+    # One of the two files has bytes behind its last row, and the reader says so.
+    data = (tmp_path / "again.ply").read_bytes()
+    assert theirs.read_bytes()[: len(data)] == data
+    behind = theirs.stat().st_size - len(data)
+    assert loaded.notes == (
+        (f"left out: {behind} bytes after the last row",) if behind else ()
+    )
+
+
+def test_dead_rows_stay_behind(tmp_path):
+    rows = some_splats()
+    rows = rows._replace(opacity_logit=rows.opacity_logit.at[3:].set(DEAD_LOGIT))
+    assert files.save(tmp_path / "a.ply", rows) == 3
+    assert files.load(tmp_path / "a.ply").splats.mean.shape == (3, 3)
+    dead = jnp.full(20, DEAD_LOGIT, jnp.float32)
+    with pytest.raises(ValueError, match="none of the 20 rows is alive"):
+        files.save(tmp_path / "b.ply", rows._replace(opacity_logit=dead))
+    assert not (tmp_path / "b.ply").exists()
+
+
+def edited_ply(path, **columns):
+    """A good file with some of its columns replaced; None takes a column out."""
+    files.save(path, some_splats())
+    table = plyfile.PlyData.read(path)["vertex"].data
+    kept = {name: table[name] for name in table.dtype.names} | columns
+    kept = {name: np.asarray(x) for name, x in kept.items() if x is not None}
+    data = np.empty(20, [(name, x.dtype.str) for name, x in kept.items()])
+    for name, x in kept.items():
+        data[name] = x
+    return data
+
+
+def test_the_other_two_byte_orders_and_float64_are_read(tmp_path):
+    path = tmp_path / "a.ply"
+    data = edited_ply(path, x=np.linspace(0, 1, 20))
+    element = plyfile.PlyElement.describe(data, "vertex")
+    expected = files.load(path).splats
+    for kind in ({"byte_order": ">"}, {"text": True}):
+        plyfile.PlyData([element], **kind).write(path)
+        rows = files.load(path).splats
+        np.testing.assert_allclose(rows.mean[:, 0], np.linspace(0, 1, 20), rtol=1e-6)
+        np.testing.assert_allclose(rows.sh_rest, expected.sh_rest, rtol=1e-6)
+
+
+def test_extra_properties_are_named_and_normals_may_be_missing(tmp_path):
+    path = tmp_path / "a.ply"
+    extra = {"label": np.arange(20, dtype=np.int32), "nx": None, "ny": None, "nz": None}
+    data = edited_ply(path, **extra)
+    plyfile.PlyData([plyfile.PlyElement.describe(data, "vertex")]).write(path)
+    assert files.load(path).notes == ("left out: label",)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_broken_row_is_named_or_dropped(value, tmp_path):
+    path = tmp_path / "a.ply"
+    scale = np.zeros(20, np.float32)
+    scale[[7, 9]] = value
+    data = edited_ply(path, scale_1=scale)
+    plyfile.PlyData([plyfile.PlyElement.describe(data, "vertex")]).write(path)
+    with pytest.raises(
+        ValueError, match=r"a\.ply: row 7 has a log_scale that is not fin"
+    ):
+        files.load(path)
+    loaded = files.load(path, drop_broken=True)
+    assert loaded.dropped == 2
+    assert loaded.splats.mean.shape == (18, 3)
+    rows = some_splats()
+    with pytest.raises(ValueError, match=r"row 4 has a mean .* not written"):
+        files.save(path, rows._replace(mean=rows.mean.at[4, 2].set(value)))
+    assert files.load(path, drop_broken=True).dropped == 2  # the old file still stands
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"rot_3": None}, "properties missing: rot_3"),
+        ({"f_rest_44": None}, "44 properties f_rest"),
+        ({"f_dc_0": None}, "points or a mesh, not Gaussians"),
+    ],
+)
+def test_properties_that_do_not_fit_are_named(change, message, tmp_path):
+    path = tmp_path / "a.ply"
+    data = edited_ply(path, **change)
+    plyfile.PlyData([plyfile.PlyElement.describe(data, "vertex")]).write(path)
+    with pytest.raises(ValueError, match=message):
+        files.load(path)
+
+
+def test_damaged_files_give_one_line_with_the_path(tmp_path):
+    path = tmp_path / "a.ply"
+    files.save(path, some_splats())
+    good = path.read_bytes()
+    header, body = good.split(b"end_header\n")
+    damaged = {
+        "truncated": good[:-10],
+        "no vertices": header.replace(b"vertex 20", b"vertex 0") + b"end_header\n",
+        "claims too many": good.replace(b"vertex 20", b"vertex 99999999999"),
+        "negative": good.replace(b"vertex 20", b"vertex -20"),
+        "endless header": header
+        + b"comment "
+        + b"x" * 200_000
+        + b"\nend_header\n"
+        + body,
+        "no end of header": header,
+        "twice": good.replace(b"float y\n", b"float x\n"),
+        "list": good.replace(b"float x\n", b"list uchar float x\n"),
+        "not a ply": b"solid teapot",
+        "nothing": b"",
+    }
+    for case, data in damaged.items():
+        path.write_bytes(data)
+        with pytest.raises(ValueError) as caught:  # noqa: PT011 (the loop checks it)
+            files.load(path)
+        message = str(caught.value)
+        assert message.startswith(f"{path}: "), case
+        assert "\n" not in message, case
+        assert len(message) < 300 + len(str(path)), case
+
+
+def test_splat_keeps_its_bytes_and_its_quantisation(tmp_path):
+    rows = some_splats(degree=0)
+    files.save(tmp_path / "a.splat", rows)
+    assert (tmp_path / "a.splat").stat().st_size == 20 * 32
+    back = files.load(tmp_path / "a.splat").splats
+    np.testing.assert_array_equal(back.mean, rows.mean)
+    np.testing.assert_allclose(back.log_scale, rows.log_scale, atol=2e-6)
+    assert same_rotation(back.quaternion, rows.quaternion).max() < 1e-4
+    opacity, before = (
+        1 / (1 + np.exp(-np.asarray(x.opacity_logit))) for x in (back, rows)
+    )
+    np.testing.assert_allclose(opacity, before, atol=0.51 / 255)
+    seen = np.clip(0.5 + 0.2820948 * np.asarray(rows.sh_dc), 0, 1)
+    np.testing.assert_allclose(
+        0.5 + 0.2820948 * np.asarray(back.sh_dc), seen, atol=0.51 / 255
+    )
+    files.save(tmp_path / "b.splat", back)
+    again = files.load(tmp_path / "b.splat").splats
+    np.testing.assert_array_equal(again.opacity_logit, back.opacity_logit)
+    np.testing.assert_array_equal(again.sh_dc, back.sh_dc)
+
+
+@pytest.mark.parametrize("version", [2, 3, 4])
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_spz_comes_back_within_its_steps(version, degree, tmp_path):
+    if version == 4:
+        pytest.importorskip("zstandard")
+    rows = some_splats(count=200, degree=degree)
+    files.save(tmp_path / "a.spz", rows, spz_version=version)
+    back = files.load(tmp_path / "a.spz").splats
+    np.testing.assert_allclose(back.mean, rows.mean, atol=0.5001 / 4096)
+    np.testing.assert_allclose(back.log_scale, rows.log_scale, atol=0.5001 / 16)
+    np.testing.assert_allclose(back.sh_dc, rows.sh_dc, atol=0.5001 / 255 / 0.15)
+    opacity, before = (
+        1 / (1 + np.exp(-np.asarray(x.opacity_logit))) for x in (back, rows)
+    )
+    np.testing.assert_allclose(opacity, before, atol=0.51 / 255)
+    # Half a step of 8/128 for degree 1 and of 16/128 above, and the half of 1/128.
+    np.testing.assert_allclose(
+        back.sh_rest[:, :3], rows.sh_rest[:, :3], atol=4.51 / 128
+    )
+    np.testing.assert_allclose(
+        back.sh_rest[:, 3:], rows.sh_rest[:, 3:], atol=8.51 / 128
+    )
+    # Version 2 derives w from three bytes: w near 0 is known to sqrt(2 * 3 / 255).
+    assert same_rotation(back.quaternion, rows.quaternion).max() < (
+        5e-3 if version == 2 else 1e-5
+    )
+    files.save(tmp_path / "b.spz", back, spz_version=version)
+    again = files.load(tmp_path / "b.spz").splats
+    for name in ("mean", "log_scale", "opacity_logit", "sh_dc", "sh_rest"):
+        np.testing.assert_array_equal(
+            getattr(again, name), getattr(back, name), err_msg=name
+        )
+
+
+def test_spz_turns_the_axes_of_means_rotations_and_harmonics():
+    flip = np.array([1.0, -1, -1])
+    rng = np.random.default_rng(0)
+    direction = rng.normal(size=(50, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    here = harmonics.basis(jnp.asarray(direction), 3)
+    there = harmonics.basis(jnp.asarray(direction * flip), 3)
+    for k in range(15):
+        np.testing.assert_allclose(
+            there[k + 1], spz._SH_SIGN[k] * here[k + 1], atol=1e-6
+        )
+
+    def matrix(q):
+        w, x, y, z = q
+        return np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+
+    q = np.array([0.1, 0.7, -0.5, 0.5])
+    turned = np.diag(flip) @ matrix(q) @ np.diag(flip)
+    np.testing.assert_allclose(matrix(q * spz._TURN_SIGN), turned, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["raw", "v2", "v3", "v4"])
+def test_spz_files_of_another_tool_hold_the_same_four_gaussians(kind, data_dir):
+    if kind == "v4":
+        pytest.importorskip("zstandard")
+    rows = files.load(data_dir / "splat_files" / f"minimal-{kind}.spz").splats
+    splat = files.load(data_dir / "splat_files" / "minimal.splat").splats
+    corners = {tuple(map(abs, row)) for row in np.asarray(rows.mean).tolist()}
+    assert corners == {
+        (1.0, 0.0, 1.0),
+        (0.0, 0.0, 1.0),
+        (1.0, 0.0, 0.0),
+        (0.0, 0.0, 0.0),
+    }
+    np.testing.assert_allclose(np.exp(rows.log_scale), 0.1, rtol=0.05)
+    np.testing.assert_allclose(np.exp(splat.log_scale), 0.1, rtol=1e-5)
+    np.testing.assert_allclose(1 / (1 + np.exp(-rows.opacity_logit)), 0.902, atol=2e-3)
+    np.testing.assert_allclose(1 / (1 + np.exp(-splat.opacity_logit)), 0.902, atol=2e-3)
+
+
+@pytest.mark.parametrize("largest", range(4))
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_smallest_three_for_every_largest_component(largest, sign):
+    q = np.full(4, 0.2)
+    q[largest] = sign * np.sqrt(1 - 3 * 0.04)
+    q[(largest + 1) % 4] *= -1
+    back = spz._smallest_three(spz._pack_smallest_three(q[None]))
+    assert same_rotation(back, q[None])[0] < 1e-5
+    np.testing.assert_allclose(np.linalg.norm(back), 1, atol=1e-6)
+
+
+def test_damaged_spz_files_are_refused(tmp_path):
+    path = tmp_path / "a.spz"
+    files.save(path, some_splats())
+    good = path.read_bytes()
+    inside = gzip.decompress(good)
+
+    def with_header(**fields):
+        names = ("version", "count", "degree", "bits", "flags", "spare")
+        values = dict(zip(names, struct.unpack("<IIBBBB", inside[4:16]), strict=True))
+        head = b"NGSP" + struct.pack("<IIBBBB", *(values | fields).values())
+        return gzip.compress(head + inside[16:])
+
+    damaged = {
+        "truncated": (good[:-40], "truncated|damaged"),
+        "short inside": (gzip.compress(inside[:-5]), "truncated: 20 Gaussians need"),
+        "garbage": (b"PK\x03\x04 not at all", "not an SPZ file"),
+        "bomb": (with_header(count=2**32 - 1), "more than .* bytes can hold"),
+        "empty": (with_header(count=0), "no Gaussians"),
+        "version": (with_header(version=1), "SPZ version 1"),
+        "future": (b"NGSP" + struct.pack("<I", 9) + bytes(40), "SPZ version 9"),
+        "degree": (with_header(degree=4), "degree 4"),
+        "bits": (with_header(bits=200), "200 fraction bits"),
+        "nothing": (b"", "not an SPZ file"),
+    }
+    for data, message in damaged.values():
+        path.write_bytes(data)
+        with pytest.raises(ValueError, match=message) as caught:
+            files.load(path)
+        assert str(caught.value).startswith(f"{path}: ")
+
+
+def test_damaged_zstd_streams_are_refused(tmp_path):
+    pytest.importorskip("zstandard")
+    path = tmp_path / "a.spz"
+    files.save(path, some_splats(), spz_version=4)
+    good = path.read_bytes()
+    for data in (
+        good[:20],
+        good[:-4],
+        good[:8] + struct.pack("<I", 10**9) + good[12:],
+        good[:15] + b"\x01" + good[16:],
+        good[:130] + b"\xff\xff" + good[132:],
+    ):
+        path.write_bytes(data)
+        with pytest.raises(ValueError, match=r"a\.spz: "):
+            files.load(path)
+
+
+def test_version_4_without_its_library_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "zstandard", None)
+    with pytest.raises(ValueError, match="pip install zstandard"):
+        files.save(tmp_path / "a.spz", some_splats(), spz_version=4)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_spz_cannot_hold_is_refused(tmp_path):
+    rows = some_splats()
+    far = rows._replace(mean=rows.mean.at[2, 0].set(3000.0))
+    with pytest.raises(ValueError, match="3000 scene units out and SPZ ends at 2048"):
+        files.save(tmp_path / "a.spz", far)
+
+
+def test_other_wrong_names_and_places(tmp_path):
+    rows = some_splats(2)
+    with pytest.raises(ValueError, match=r"no writer for \.obj"):
+        files.save(tmp_path / "a.obj", rows)
+    with pytest.raises(ValueError, match="no reader for a name without suffix"):
+        files.load(tmp_path / "a")
+    with pytest.raises(ValueError, match="no such file"):
+        files.load(tmp_path / "a.ply")
+    with pytest.raises(ValueError, match="folder does not exist"):
+        files.save(tmp_path / "nowhere" / "a.ply", rows)
+    (tmp_path / "odd.splat").write_bytes(bytes(33))
+    with pytest.raises(ValueError, match="33 bytes is no multiple of 32"):
+        files.load(tmp_path / "odd.splat")
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "a.ply"
+    files.save(path, some_splats(3))
+    before = path.read_bytes()
+
+    def full(handle):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(ValueError, match="No space left on device"):
+        files.save(path, some_splats(5))
+    assert path.read_bytes() == before
+    assert [entry.name for entry in tmp_path.iterdir()] == ["a.ply"]
+
+
+@pytest.mark.hard_cases
+def test_saturated_zero_and_extreme_rows_survive_every_format(tmp_path):
+    rows = some_splats(4, degree=1)
+    rows = rows._replace(
+        opacity_logit=jnp.asarray([100, -100, 0, 17], jnp.float32),
+        log_scale=jnp.full(
+            (4, 3), jnp.asarray([-100, 100, 0, 5])[:, None], jnp.float32
+        ),
+        quaternion=rows.quaternion.at[0].set(0),
+    )
+    for suffix in files.SUFFIXES:
+        files.save(tmp_path / f"a{suffix}", rows)
+        back = files.load(tmp_path / f"a{suffix}").splats
+        opacity = 1 / (1 + np.exp(-np.asarray(back.opacity_logit, np.float64)))
+        np.testing.assert_allclose(opacity, [1, 0, 0.5, 1], atol=2.1e-3)
+        assert all(np.isfinite(leaf).all() for leaf in back)
