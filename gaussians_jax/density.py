@@ -1,0 +1,285 @@
+"""Adaptive density: clone the small, split the large, prune the faint.
+
+Kerbl et al. 2023, arXiv:2308.04079, section 5.2, with the constants of its reference
+implementation. Statistics are gathered inside the step (`observe`, pure); the events
+run on the host between two chunks, because they may change the capacity. They decide in
+NumPy and move the rows in one compiled gather per pair of capacities.
+"""
+
+import dataclasses
+import functools
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from gaussians_jax import optimiser as row_optimiser
+from gaussians_jax import splats
+from gaussians_jax.splats import Params, Splats
+from nerfies_jax.geometry import quaternion
+
+PyTree = Any
+KEPT, CLONED, CLONE, CHILD = 0, 1, 2, 3  # what a row is after the event
+
+
+@dataclasses.dataclass(frozen=True)
+class DensitySpec:
+    """When and where Gaussians are added and removed."""
+
+    interval: int = 100  # steps
+    start: int = 500  # steps
+    stop: int = 15_000  # steps
+    gradient: float = 2e-4  # of the mean on the screen, in NDC units per view
+    clone_below: float = 0.01  # largest scale, of the scene extent
+    shrink: float = 1.6  # scale of a parent over that of its children
+    prune_opacity: float = 0.005
+    prune_scale: float = 0.1  # largest scale, of the scene extent
+    prune_radius_px: float | None = None  # 20 in the paper, where it had no effect
+    reset_interval: int = 3000  # steps; pruning by size starts after the first reset
+    reset_opacity: float = 0.01
+    most: int = 1_000_000  # Gaussians
+    revised_opacity: bool = False  # two halves together as opaque as the parent
+
+    def __post_init__(self):
+        if not 0 < self.prune_opacity < self.reset_opacity < 1:
+            raise ValueError(
+                "opacities must satisfy 0 < prune < reset < 1, or a reset prunes "
+                f"everything; got prune_opacity={self.prune_opacity} and "
+                f"reset_opacity={self.reset_opacity}"
+            )
+        for name in ("interval", "reset_interval", "most"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is at least 1, got {getattr(self, name)}")
+        if not self.shrink > 1:
+            raise ValueError(f"children are smaller: shrink > 1, got {self.shrink}")
+
+
+class RowStats(NamedTuple):
+    """What the rows did since the last event."""
+
+    alive: Bool[Array, " gaussians"]
+    gradient: Float[Array, " gaussians"]  # summed norms, NDC units
+    views: Int[Array, " gaussians"]  # in which the row was visible
+    radius_px: Float[Array, " gaussians"]  # the largest seen
+
+
+class Report(NamedTuple):
+    """What an event did, in Gaussians; nothing happens that is not counted here."""
+
+    cloned: int = 0
+    split: int = 0
+    pruned: int = 0  # faint or too large
+    broken: int = 0  # pruned because a value was not finite
+    refused: int = 0  # should have grown, but the cap is reached
+    relocated: int = 0
+    alive: int = 0
+    capacity: int = 0
+
+
+class Changed(NamedTuple):
+    """Everything that has rows, after an event."""
+
+    params: Params
+    moments: PyTree
+    stats: RowStats
+    report: Report
+
+
+def empty_stats(rows: Splats) -> RowStats:
+    """Nothing observed yet."""
+    zero = jnp.zeros_like(rows.opacity_logit)
+    return RowStats(
+        alive=splats.alive(rows),
+        gradient=zero,
+        views=jnp.zeros(zero.shape, jnp.int32),
+        radius_px=zero,
+    )
+
+
+def observe(
+    stats: RowStats,
+    mean2d_gradient_px: Float[Array, "gaussians 2"],
+    visible: Bool[Array, " gaussians"],
+    radius_px: Float[Array, " gaussians"],
+    size: tuple[int, int],
+) -> RowStats:
+    """One more view, whose picture is `size` = (height, width); pure.
+
+    `mean2d_gradient_px` is the slope of that view's own loss (not of a mean over a
+    batch) by the projected means in pixels; for the absolute variant, the sum of the
+    absolute slopes over the pixels. A pixel is 2/width of the NDC range, so the slope
+    per NDC unit is width/2 and height/2 times larger; the thresholds are in that unit.
+    """
+    height, width = size
+    per_ndc = jnp.asarray([width / 2, height / 2], mean2d_gradient_px.dtype)
+    slope = mean2d_gradient_px * per_ndc
+    # Summed squares underflow in float32 below 1e-19; hypot does not.
+    norm = jnp.hypot(slope[:, 0], slope[:, 1])
+    return RowStats(
+        alive=stats.alive,
+        gradient=stats.gradient + jnp.where(visible, norm, 0),
+        views=stats.views + visible.astype(jnp.int32),
+        radius_px=jnp.maximum(stats.radius_px, jnp.where(visible, radius_px, 0)),
+    )
+
+
+def densify(
+    optimiser: optax.GradientTransformation,
+    params: Params,
+    moments: PyTree,
+    stats: RowStats,
+    key: Key[Array, ""],
+    spec: DensitySpec,
+    *,
+    step: int,
+    extent: float,
+) -> Changed:
+    """Clone, split and prune after `step` updates; host side.
+
+    A row grows where its mean gradient per view reaches the threshold: a small one is
+    copied, a large one is replaced by two drawn from it. Where the cap leaves room for
+    some, those with the largest gradient grow. An effect that scores rows its own way
+    scales `stats.gradient` first. The clones and the children come back with zero
+    moments. `extent` is `splats.scene_extent`.
+    """
+    rows, kind, report = _plan(params.rows["splats"], stats, spec, step, extent)
+    count, capacity = len(rows), stats.alive.shape[0]
+    needed = splats.capacity_for(count, spec.most)
+    # Two buckets of slack before shrinking: a wavering count must not recompile.
+    if needed > capacity or count * 9 < capacity * 4:
+        capacity = needed
+    idle = capacity - count
+    params, moments = _rebuild(
+        optimiser,
+        params,
+        moments,
+        jnp.asarray(np.pad(rows, (0, idle)), jnp.int32),
+        jnp.asarray(np.pad(kind, (0, idle)), jnp.int32),
+        jnp.arange(capacity) >= count,
+        key,
+        spec,
+    )
+    report = report._replace(alive=count, capacity=capacity)
+    return Changed(params, moments, empty_stats(params.rows["splats"]), report)
+
+
+def _plan(rows, stats, spec, step, extent):
+    """Which old row each new row comes from, and what becomes of it."""
+    stats = jax.tree.map(np.asarray, stats)
+    whole = np.asarray(_finite_rows(rows))
+    drawn = splats.activate(rows)
+    opacity = np.asarray(drawn.opacity)
+    scale = np.asarray(drawn.scale).max(axis=1)
+    score = stats.gradient / np.maximum(stats.views, 1)
+
+    kept = stats.alive & whole & (opacity >= spec.prune_opacity)
+    grows = kept & (score >= spec.gradient)
+    splits = grows & (scale > spec.clone_below * extent)
+    if step > spec.reset_interval:
+        after = np.where(splits, scale / spec.shrink, scale)
+        kept &= after <= spec.prune_scale * extent
+        if spec.prune_radius_px is not None:
+            kept &= splits | (stats.radius_px <= spec.prune_radius_px)
+    grows &= kept
+    room = max(spec.most - int(kept.sum()), 0)
+    wanting = np.flatnonzero(grows)
+    best = wanting[np.argsort(-score[wanting], kind="stable")][:room]
+    chosen = np.zeros_like(grows)
+    chosen[best] = True
+    splits &= chosen
+
+    clones = np.flatnonzero(chosen & ~splits)
+    parents = np.flatnonzero(splits)
+    stay = np.flatnonzero(kept & ~splits)
+    source = np.concatenate([stay, clones, np.repeat(parents, 2)])
+    kind = np.concatenate(
+        [
+            np.where(np.isin(stay, clones), CLONED, KEPT),
+            np.full(len(clones), CLONE),
+            np.full(2 * len(parents), CHILD),
+        ]
+    )
+    broken = int((stats.alive & ~whole).sum())
+    report = Report(
+        cloned=len(clones),
+        split=len(parents),
+        pruned=int((stats.alive & ~kept).sum()) - broken,
+        broken=broken,
+        refused=len(wanting) - len(best),
+    )
+    return source, kind, report
+
+
+@jax.jit
+def _finite_rows(rows):
+    def finite(leaf):
+        return jnp.all(jnp.isfinite(leaf.reshape(leaf.shape[0], -1)), axis=1)
+
+    return functools.reduce(jnp.logical_and, map(finite, rows))
+
+
+@functools.partial(jax.jit, static_argnames=("optimiser", "spec"))
+def _rebuild(optimiser, params, moments, rows, kind, dead, key, spec):
+    fresh = (kind == CLONE) | (kind == CHILD)
+    params, moments = row_optimiser.gather_rows(
+        optimiser, params, moments, rows, fresh, dead
+    )
+    moved = split_rows(params.rows["splats"], kind == CHILD, key, spec.shrink)
+    if spec.revised_opacity:
+        halved = halve_opacity(moved.opacity_logit)
+        logit = jnp.where((kind == KEPT) | dead, moved.opacity_logit, halved)
+        moved = moved._replace(opacity_logit=logit)
+    return params._replace(rows=params.rows | {"splats": moved}), moments
+
+
+def split_rows(
+    rows: Splats,
+    child: Bool[Array, " gaussians"],
+    key: Key[Array, ""],
+    shrink: float,
+) -> Splats:
+    """The `child` rows drawn from the Gaussian they are a copy of, and shrunk."""
+    drawn = splats.activate(rows)
+    noise = jax.random.normal(key, rows.mean.shape, rows.mean.dtype)
+    offset = jax.vmap(quaternion.rotate)(rows.quaternion, drawn.scale * noise)
+    child = child[:, None]
+    return rows._replace(
+        mean=jnp.where(child, rows.mean + offset, rows.mean),
+        log_scale=jnp.where(child, rows.log_scale - math.log(shrink), rows.log_scale),
+    )
+
+
+def halve_opacity(logit: Float[Array, " n"]) -> Float[Array, " n"]:
+    """The logit of 1 - sqrt(1 - o): two such in a row hide as much as one of o.
+
+    Rota Bulò et al. 2024, arXiv:2404.06109, section 3.4.
+    """
+    # log sqrt(1 - o) without forming 1 - o, which is 0 from a logit of 17 in float32.
+    half = jax.nn.log_sigmoid(-logit) / 2
+    return jnp.log(-jnp.expm1(half)) - half
+
+
+def reset_opacity(
+    optimiser: optax.GradientTransformation,
+    params: Params,
+    moments: PyTree,
+    spec: DensitySpec,
+) -> tuple[Params, PyTree]:
+    """No opacity above `spec.reset_opacity`; the moments of the opacities start anew.
+
+    Dead rows stay dead. With the renderer's cut-off at 1/255 a Gaussian reset to 0.01
+    gets gradients only out to 1.37 standard deviations.
+    """
+    rows = params.rows["splats"]
+    bound = math.log(spec.reset_opacity / (1 - spec.reset_opacity))
+    lowered = rows._replace(opacity_logit=jnp.minimum(rows.opacity_logit, bound))
+    params = params._replace(rows=params.rows | {"splats": lowered})
+    chosen = jax.tree.map(lambda _: False, params)
+    only = chosen.rows["splats"]._replace(opacity_logit=True)
+    chosen = chosen._replace(rows=chosen.rows | {"splats": only})
+    moments = row_optimiser.map_moments(optimiser, jnp.zeros_like, moments, chosen)
+    return params, moments

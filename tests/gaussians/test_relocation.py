@@ -1,0 +1,224 @@
+"""Relocation: the closed form, who moves where, the noise and the penalties."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from gaussians_jax import density, optimiser, relocation
+from gaussians_jax import splats as rows
+from gaussians_jax.relocation import RelocationSpec
+from gaussians_jax.splats import Params, Splats
+from tests import gradients
+
+TX = optax.chain(optimiser.scale_by_row_adam(), optax.scale(-1e-2))
+KEY = jax.random.key(3)
+SPEC = RelocationSpec()
+
+
+@jax.jit
+def first_moments(params):
+    return TX.update(jax.tree.map(jnp.ones_like, params), TX.init(params))[1]
+
+
+def make(opacity, dtype="float32"):
+    rng = np.random.default_rng(0)
+    opacity = np.asarray(opacity, float)
+    count = len(opacity)
+    splats = Splats(
+        mean=jnp.asarray(rng.normal(size=(count, 3)), dtype),
+        log_scale=jnp.asarray(rng.normal(size=(count, 3)) - 2, dtype),
+        quaternion=jnp.asarray(rng.normal(size=(count, 4)), dtype),
+        opacity_logit=jnp.asarray(np.log(opacity) - np.log1p(-opacity), dtype),
+        sh_dc=jnp.asarray(rng.normal(size=(count, 1, 3)), dtype),
+        sh_rest=jnp.zeros((count, 0, 3), dtype),
+    )
+    params = Params({"splats": splats}, {})
+    return params, first_moments(params)
+
+
+def spread(opacity, copies, dtype, least=1e-12):
+    each, scale = relocation.spread_over(
+        jnp.asarray([opacity], dtype),
+        jnp.ones((1, 3), dtype),
+        jnp.asarray([copies]),
+        least,
+    )
+    return float(each[0]), float(scale[0, 0])
+
+
+def test_spreading_equals_the_reference_kernel(oracle_dir, dtype):
+    with np.load(oracle_dir / "splatting" / "mcmc_relocation.npz") as oracle:
+        each, scale = relocation.spread_over(
+            jnp.asarray(oracle["opacities"], dtype),
+            jnp.asarray(oracle["scales"], dtype),
+            jnp.asarray(oracle["ratios"], jnp.int32),
+            0.005,
+        )
+        tolerance = {"float32": 3e-6, "float64": 2e-13}[dtype]
+        np.testing.assert_allclose(each, oracle["new_opacities"], rtol=tolerance)
+        np.testing.assert_allclose(scale, oracle["new_scales"], rtol=tolerance)
+    assert each.dtype.name == scale.dtype.name == dtype
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("copies", [1, 2, 7, 51, 1000])
+@pytest.mark.parametrize("opacity", [1e-6, 0.006, 0.5, 0.999, 1 - 1e-6])
+def test_spreading_equals_the_alternating_sum_in_high_precision(opacity, copies, dtype):
+    mpmath = pytest.importorskip("mpmath")
+    opacity = float(np.asarray(opacity, dtype))
+    with mpmath.workdps(400):
+        share = 1 - mpmath.power(1 - mpmath.mpf(opacity), mpmath.mpf(1) / copies)
+        # The double sum of the paper, its inner index summed by the hockey-stick rule.
+        total = mpmath.fsum(
+            mpmath.binomial(copies, j) * (-1) ** (j - 1) * share**j / mpmath.sqrt(j)
+            for j in range(1, copies + 1)
+        )
+        exact_each, exact_scale = float(share), float(mpmath.mpf(opacity) / total)
+    each, scale = spread(opacity, copies, dtype)
+    # float32: 1 - o of 1e-6 is itself known to 6e-2 only once o is rounded, which the
+    # oracle shares; log1p and expm1 keep the rest.
+    tolerance = {"float32": 2e-6, "float64": 1e-12}[dtype]
+    assert abs(each / exact_each - 1) < tolerance
+    assert abs(scale / exact_scale - 1) < tolerance
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("opacity", [0.0, 1.0])
+def test_spreading_the_invisible_and_the_opaque_is_finite(opacity, dtype):
+    each, scale = spread(opacity, 3, dtype, least=0.005)
+    assert each * 1.000001 >= 0.005
+    assert each < 1
+    assert math.isfinite(scale)
+    assert math.isfinite(math.log(each) - math.log1p(-each))
+
+
+def test_spreading_gradient(float64):
+    def total(opacity, scale):
+        each, spread_scale = relocation.spread_over(
+            jax.nn.sigmoid(opacity), scale, jnp.asarray([2, 5, 9]), 1e-9
+        )
+        return jnp.sum(each**2) + jnp.sum(spread_scale**2)
+
+    rng = np.random.default_rng(0)
+    opacity = jnp.asarray(rng.normal(size=3))
+    scale = jnp.asarray(rng.uniform(0.1, 1, (3, 3)))
+    assert gradients.directional_error(total, opacity, scale) < 1e-8
+
+
+def test_a_copy_and_its_source_composite_to_the_opacity_there_was(dtype):
+    params, moments = make([0.9, 0.001, 0.002, 0.003], dtype)
+    moved, after, report = relocation.relocate(TX, params, moments, KEY, SPEC)
+    assert report == density.Report(relocated=3, alive=4, capacity=4)
+    splats = moved.rows["splats"]
+    np.testing.assert_array_equal(
+        splats.mean, np.tile(params.rows["splats"].mean[0], (4, 1))
+    )
+    opacity = np.asarray(rows.activate(splats).opacity, np.float64)
+    np.testing.assert_allclose(1 - np.prod(1 - opacity), 0.9, rtol=2e-6)
+    scale = np.exp(np.asarray(splats.log_scale - params.rows["splats"].log_scale[0]))
+    expected = spread(0.9, 4, "float32")[1]
+    np.testing.assert_allclose(scale, expected, rtol=1e-5)
+    assert not np.asarray(after[0].count.rows["splats"].mean).any()
+
+
+def test_sources_are_drawn_in_proportion_to_their_opacity():
+    params, moments = make([0.8, 0.4, 0.2] + [0.001] * 4000)
+    moved, _, report = relocation.relocate(TX, params, moments, KEY, SPEC)
+    assert report.relocated == 4000
+    mean = np.asarray(moved.rows["splats"].mean)
+    share = [(mean[3:] == mean[i]).all(axis=1).mean() for i in range(3)]
+    np.testing.assert_allclose(share, [4 / 7, 2 / 7, 1 / 7], atol=0.03)
+
+
+def test_untouched_rows_keep_their_bits_and_moments():
+    params, moments = make([0.9, 0.8, 0.7, 0.001])
+    moved, after, _ = relocation.relocate(TX, params, moments, KEY, SPEC)
+    kept = np.asarray(after[0].count.rows["splats"].mean) == 1
+    assert kept.sum() == 2
+    for now, before in zip(moved.rows["splats"], params.rows["splats"], strict=True):
+        np.testing.assert_array_equal(now[kept], before[kept])
+
+
+@pytest.mark.hard_cases
+def test_nothing_faint_and_nothing_visible():
+    params, moments = make([0.5, 0.6])
+    same, _, report = relocation.relocate(TX, params, moments, KEY, SPEC)
+    assert report.relocated == 0
+    assert same is params
+    params, moments = make([0.001, 0.002])
+    same, _, report = relocation.relocate(TX, params, moments, KEY, SPEC)
+    assert report.refused == 2
+    assert same is params
+
+
+def test_adding_grows_by_a_twentieth_into_the_dead_rows_and_stops_at_the_cap():
+    params, moments = make(np.full(100, 0.3))
+    params, moments, report = relocation.add(TX, params, moments, KEY, SPEC)
+    assert report == density.Report(cloned=5, alive=105, capacity=256)
+    splats = params.rows["splats"]
+    assert int(rows.alive(splats).sum()) == 105
+    opacity = np.asarray(rows.activate(splats).opacity, np.float64)
+    # However they were shared out, all of them together hide what 100 of 0.3 did.
+    np.testing.assert_allclose(np.log1p(-opacity).sum(), 100 * np.log(0.7), rtol=1e-5)
+    capped = RelocationSpec(most=107)
+    params, moments, report = relocation.add(TX, params, moments, KEY, capped)
+    assert report == density.Report(cloned=2, refused=3, alive=107, capacity=256)
+    _, _, report = relocation.add(TX, params, moments, KEY, capped)
+    assert report == density.Report(refused=5, alive=107, capacity=256)
+
+
+def test_noise_has_the_covariance_squared_and_spares_the_opaque(dtype):
+    params, _ = make([0.001] * 20_000, dtype)
+    splats = jax.tree.map(
+        lambda x: jnp.broadcast_to(x[:1], x.shape), params.rows["splats"]
+    )
+    noise = relocation.position_noise(KEY, splats, 1e-6, SPEC)
+    assert noise.dtype.name == dtype
+    w, x, y, z = np.asarray(splats.quaternion[0], np.float64) / np.linalg.norm(
+        splats.quaternion[0]
+    )
+    turn = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    variance = np.exp(2 * np.asarray(splats.log_scale[0], np.float64))
+    strength = 0.5 / (1 + math.exp(100 * (0.001 - 0.005)))
+    along = np.asarray(noise, np.float64) @ turn
+    np.testing.assert_allclose(along.std(axis=0), strength * variance, rtol=0.03)
+
+    params, _ = make([0.5, 0.3], dtype)
+    splats = rows.bury(params.rows["splats"], jnp.asarray([False, True]))
+    noise = np.asarray(relocation.position_noise(KEY, splats, 1e-6, SPEC))
+    assert np.abs(noise[0]).max() < 1e-20
+    assert not noise[1].any()
+
+
+def test_penalty_counts_living_rows_only(dtype):
+    params, _ = make([0.5, 0.25, 0.9], dtype)
+    splats = rows.bury(params.rows["splats"], jnp.asarray([False, False, True]))
+    expected = 0.01 * 0.375 + 0.01 * np.exp(np.asarray(splats.log_scale[:2])).mean()
+    np.testing.assert_allclose(relocation.penalty(splats, SPEC), expected, rtol=1e-6)
+    slopes = jax.grad(relocation.penalty)(splats, SPEC)
+    assert not any(np.asarray(leaf)[2].any() for leaf in slopes)
+    none = rows.bury(splats, jnp.ones(3, bool))
+    assert relocation.penalty(none, SPEC) == 0
+
+
+def test_penalty_gradient(float64):
+    splats = make([0.5, 0.25, 0.9], "float64")[0].rows["splats"]
+    error = gradients.directional_error(lambda s: relocation.penalty(s, SPEC), splats)
+    assert error < 1e-7
+
+
+def test_settings_that_cannot_work_are_refused():
+    with pytest.raises(ValueError, match="growth is at least 1"):
+        RelocationSpec(growth=0.9)
+    with pytest.raises(ValueError, match="dead_opacity"):
+        RelocationSpec(dead_opacity=0.0)
