@@ -308,7 +308,7 @@ def test_metrics_batch_and_compile(dtype, rng):
 
 
 @pytest.mark.hard_cases
-@pytest.mark.parametrize("level", [0.0, 0.5, 0.9, 1.0])
+@pytest.mark.parametrize("level", [0.0, 0.9])
 @pytest.mark.parametrize("name", ["ssim", "ms_ssim", "masked_ssim"])
 def test_equal_constant_pictures_score_one_with_gradient_zero(name, level, dtype):
     flat = jnp.full((24, 23, 3), level, dtype)

@@ -1,0 +1,325 @@
+"""How right depth, flow, tracks and camera paths are.
+
+Depth, flow and tracks are pure JAX. Camera paths are compared on the host in float64:
+an alignment decides by rank what can be determined at all, and is not for training.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+DELTA = 1.25  # ratio of depths that still counts as right, Eigen et al. 2014
+# KITTI 2015 calls a flow wrong beyond 3 px and 5 % of its length.
+OUTLIER_PX = 3.0
+OUTLIER_SHARE = 0.05
+# A direction in which points spread less than this share of their largest spread is
+# rounding: float32 positions carry 6e-8 of their distance from the origin.
+FLAT_BELOW = 1e-6
+
+
+class DepthErrors(NamedTuple):
+    """Over the pixels where both depths are known; NaN where there are none."""
+
+    abs_rel: Float[Array, ""]  # mean |d - truth| / truth
+    rmse: Float[Array, ""]  # scene units
+    within_delta: Float[Array, ""]  # share with max(d/truth, truth/d) < 1.25
+    pixels: Float[Array, ""]  # how many
+
+
+class Line(NamedTuple):
+    """`scale * depth + shift`; the scale is 0 where it is not determined."""
+
+    scale: Float[Array, ""]
+    shift: Float[Array, ""]
+    determined: Bool[Array, ""]  # false where the depth does not vary
+
+
+def known_depth(
+    depth: Float[Array, "*pixels"],
+    truth: Float[Array, "*pixels"],
+    mask: Bool[Array, "*pixels"] | None = None,
+) -> Bool[Array, "*pixels"]:
+    """Where two depths can be compared: finite, the truth positive (0 is unknown)."""
+    known = jnp.isfinite(depth) & jnp.isfinite(truth) & (truth > 0)
+    return known if mask is None else known & mask
+
+
+def depth_errors(
+    depth: Float[Array, "*pixels"],
+    truth: Float[Array, "*pixels"],
+    mask: Bool[Array, "*pixels"] | None = None,
+) -> DepthErrors:
+    """Errors of z-depth in scene units, Eigen et al. 2014, arXiv:1406.2283, section 4.
+
+    A depth that is not positive counts in full in the first two and as wrong in the
+    third. For monocular depth, pass `align_depth`'s result first.
+    """
+    known = known_depth(depth, truth, mask)
+    depth, truth = jnp.where(known, depth, 1.0), jnp.where(known, truth, 1.0)
+    error = depth - truth
+    right = (depth < DELTA * truth) & (truth < DELTA * depth)
+    error_sq = _mean(error**2, known)
+    nonzero = error_sq > 0  # the root has no slope at 0
+    root = jnp.sqrt(jnp.where(nonzero, error_sq, 1.0))
+    return DepthErrors(
+        abs_rel=_mean(jnp.abs(error) / truth, known),
+        rmse=jnp.where(nonzero, root, error_sq),  # NaN stays NaN
+        within_delta=_mean(right.astype(depth.dtype), known),
+        pixels=jnp.sum(known).astype(depth.dtype),
+    )
+
+
+def align_depth(
+    depth: Float[Array, "*pixels"],
+    truth: Float[Array, "*pixels"],
+    mask: Bool[Array, "*pixels"] | None = None,
+) -> Line:
+    """The scale and shift with the least squared error over the known pixels.
+
+    Ranftl et al. 2020 (MiDaS), arXiv:1907.01341, equation 4, who align inverse depths:
+    pass those for their protocol. Solved about the means, where the normal equations of
+    a depth of 1000 +- 1 would lose six digits.
+    """
+    known = known_depth(depth, truth, mask)
+    depth, truth = jnp.where(known, depth, 0.0), jnp.where(known, truth, 0.0)
+    mean_depth, mean_truth = _mean(depth, known), _mean(truth, known)
+    from_mean = jnp.where(known, depth - mean_depth, 0.0)
+    variance = _mean(from_mean**2, known)
+    covariance = _mean(from_mean * (truth - mean_truth), known)
+    # The mean is right to a few ulps, so a constant depth shows that much variance.
+    rounding = 4 * jnp.finfo(depth.dtype).eps * mean_depth
+    determined = variance > rounding**2
+    scale = jnp.where(
+        determined, covariance / jnp.where(determined, variance, 1.0), 0.0
+    )
+    return Line(scale, mean_truth - scale * mean_depth, determined)
+
+
+class FlowErrors(NamedTuple):
+    """Over the pixels whose true flow is known; NaN where there are none."""
+
+    endpoint: Float[Array, ""]  # mean distance, pixels
+    outliers: Float[Array, ""]  # share beyond 3 px and 5 % (KITTI's Fl)
+    pixels: Float[Array, ""]
+
+
+def flow_errors(
+    flow: Float[Array, "*pixels 2"],
+    truth: Float[Array, "*pixels 2"],
+    mask: Bool[Array, "*pixels"] | None = None,
+) -> FlowErrors:
+    """End-point error of optical flow in pixels; unknown true flow is not finite.
+
+    A flow that is not finite where the truth is known makes the mean infinite and
+    counts as an outlier: a missing answer is a wrong one.
+    """
+    known = jnp.all(jnp.isfinite(truth), axis=-1)
+    known = known if mask is None else known & mask
+    distance = _distance(flow, truth, known)
+    length = jnp.linalg.norm(jnp.where(known[..., None], truth, 0.0), axis=-1)
+    wrong = (distance > OUTLIER_PX) & (distance > OUTLIER_SHARE * length)
+    return FlowErrors(
+        endpoint=_mean(distance, known),
+        outliers=_mean(wrong.astype(flow.dtype), known),
+        pixels=jnp.sum(known).astype(flow.dtype),
+    )
+
+
+class TrackErrors(NamedTuple):
+    """Over the visible points; NaN where there are none."""
+
+    endpoint: Float[Array, ""]  # mean distance, in the points' unit
+    correct: Float[Array, ""]  # share of correct keypoints (PCK)
+    points: Float[Array, ""]
+
+
+def track_errors(
+    tracks: Float[Array, "*points axes"],
+    truth: Float[Array, "*points axes"],
+    visible: Bool[Array, "*points"],
+    threshold: float,
+) -> TrackErrors:
+    """Point tracks against the truth; a point is correct closer than `threshold`.
+
+    DyCheck's PCK-T (arXiv:2210.13445, section 3.3) takes 0.05 of the longer side of the
+    picture in pixels, 3-D tracks a length in scene units. A lost track is not finite
+    and counts as wrong.
+    """
+    if not threshold > 0:
+        raise ValueError(
+            f"the distance of a correct point is positive, got {threshold}"
+        )
+    distance = _distance(tracks, truth, visible)
+    return TrackErrors(
+        endpoint=_mean(distance, visible),
+        correct=_mean((distance < threshold).astype(tracks.dtype), visible),
+        points=jnp.sum(visible).astype(tracks.dtype),
+    )
+
+
+def _mean(values, where):
+    """NaN over nothing: no answer rather than a perfect one."""
+    count = jnp.sum(where).astype(values.dtype)
+    return jnp.sum(jnp.where(where, values, 0.0)) / count
+
+
+def _distance(a, b, where):
+    difference = jnp.where(where[..., None], a, 0.0) - jnp.where(
+        where[..., None], b, 0.0
+    )
+    finite = jnp.all(jnp.isfinite(difference), axis=-1)
+    squares = jnp.sum(jnp.where(finite[..., None], difference, 0.0) ** 2, axis=-1)
+    apart = squares > 0  # the root has no slope at 0
+    distance = jnp.where(apart, jnp.sqrt(jnp.where(apart, squares, 1.0)), 0.0)
+    return jnp.where(finite, distance, jnp.inf)
+
+
+class Similarity(NamedTuple):
+    """`scale * rotation @ point + translation`, float64 on the host."""
+
+    scale: float
+    rotation: np.ndarray  # [3, 3], determinant +1
+    translation: np.ndarray  # [3]
+    rank: int  # directions the paired points spread in: 0 a point, 1 a line, 2 a plane
+    determined: bool  # false where another rotation fits as well
+
+
+class PathErrors(NamedTuple):
+    """Camera positions after alignment, in units of the true path."""
+
+    rmse: float  # absolute trajectory error (ATE)
+    median: float
+    largest: float
+    alignment: Similarity
+
+
+class RelativeErrors(NamedTuple):
+    """Motion between frames that lie `stride` apart."""
+
+    translation_rmse: float  # units of the path
+    rotation_deg: float  # mean angle
+
+
+def align_points(points: np.ndarray, truth: np.ndarray, scaled: bool) -> Similarity:
+    """The similarity (`scaled`) or rigid motion that takes `points` closest to `truth`.
+
+    Both are [points, 3]. Umeyama 1991, equations 34-43. Points on a line leave a
+    rotation open, and the residual does not show it: `determined` does. Reflections are
+    never returned; a planar or mirrored set gets the best rotation.
+    """
+    points, truth = _positions(points, "points"), _positions(truth, "truth")
+    if points.shape != truth.shape:
+        raise ValueError(
+            f"an alignment pairs points, got {len(points)} and {len(truth)} of them"
+        )
+    # In float64 about the centres: 1e6 away, float32 gets the scale 1e-3 wrong.
+    centre, true_centre = points.mean(0), truth.mean(0)
+    offsets, true_offsets = points - centre, truth - true_centre
+    left, spread, right = np.linalg.svd(true_offsets.T @ offsets / len(points))
+    mirrored = np.linalg.det(left) * np.linalg.det(right) < 0
+    signs = np.array([1.0, 1.0, -1.0 if mirrored else 1.0])
+    rotation = left * signs @ right
+    variance = np.mean(np.sum(offsets**2, axis=1))
+    largest = max(np.abs(points).max(), np.finfo(float).tiny)
+    spread_out = variance > (FLAT_BELOW * largest) ** 2
+    rank = min(_rank(points), _rank(truth))
+    scale = float(spread @ signs / variance) if scaled and spread_out else 1.0
+    # Two equal smallest spreads under a mirror leave the axis of the flip open.
+    ambiguous = mirrored and spread[1] - spread[2] <= FLAT_BELOW * spread[0]
+    return Similarity(
+        scale=scale,
+        rotation=rotation,
+        translation=true_centre - scale * rotation @ centre,
+        rank=rank,
+        determined=rank >= 2 and not ambiguous,
+    )
+
+
+def _rank(points):
+    spread = np.linalg.svd(points - points.mean(0), compute_uv=False)
+    # Relative to the spread, and to the distance whose rounding the points carry.
+    floor = FLAT_BELOW * max(spread[0], np.abs(points).max())
+    return int(np.sum(spread > floor))
+
+
+def path_errors(
+    positions: np.ndarray, truth: np.ndarray, scaled: bool = True
+) -> PathErrors:
+    """Absolute trajectory error of camera positions [frames, 3] after alignment.
+
+    Sturm et al. 2012, section IV.B; `scaled` because a path from pictures alone has no
+    unit. Read `alignment.determined` before believing a small error.
+    """
+    alignment = align_points(positions, truth, scaled)
+    moved = alignment.scale * np.asarray(positions, float) @ alignment.rotation.T
+    distance = np.linalg.norm(moved + alignment.translation - truth, axis=1)
+    return PathErrors(
+        rmse=float(np.sqrt(np.mean(distance**2))),
+        median=float(np.median(distance)),
+        largest=float(distance.max()),
+        alignment=alignment,
+    )
+
+
+def relative_errors(
+    camera_from_world: np.ndarray,
+    positions: np.ndarray,
+    true_camera_from_world: np.ndarray,
+    true_positions: np.ndarray,
+    stride: int = 1,
+) -> RelativeErrors:
+    """Relative pose error between frames `stride` apart, Sturm et al. 2012, equation 1.
+
+    Rotations [frames, 3, 3], positions [frames, 3] of the camera in world coordinates.
+    Independent of where the world's origin lies, not of its scale: scale the positions
+    first (`align_points`).
+    """
+    frames = len(positions)
+    if not 1 <= stride < frames:
+        raise ValueError(
+            f"relative errors over {frames} frames need 1 <= stride < {frames}, "
+            f"got {stride}"
+        )
+    step, turn = _motions(camera_from_world, positions, stride)
+    true_step, true_turn = _motions(true_camera_from_world, true_positions, stride)
+    # The second camera as seen from the first, wrong by R_error = true^T found.
+    error = np.einsum("nji,njk->nik", true_turn, turn)
+    distance_sq = np.sum((step - true_step) ** 2, axis=1)
+    return RelativeErrors(
+        translation_rmse=float(np.sqrt(distance_sq.mean())),
+        rotation_deg=float(np.degrees(_angle(error)).mean()),
+    )
+
+
+def _motions(camera_from_world, positions, stride):
+    rotation = np.asarray(camera_from_world, float)
+    positions = _positions(positions, "positions")
+    if rotation.shape != (len(positions), 3, 3):
+        raise ValueError(
+            f"one rotation for each of {len(positions)} positions, got {rotation.shape}"
+        )
+    step = positions[stride:] - positions[:-stride]
+    turn = rotation[:-stride] @ rotation[stride:].swapaxes(-1, -2)
+    return np.einsum("nij,nj->ni", rotation[:-stride], step), turn
+
+
+def _angle(rotation):
+    """Of rotation matrices, in radians; exact near 0 and near pi, unlike arccos."""
+    skew = rotation - rotation.swapaxes(-1, -2)
+    axis = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=-1)
+    trace = np.trace(rotation, axis1=-2, axis2=-1)
+    return np.arctan2(np.linalg.norm(axis, axis=-1), trace - 1)
+
+
+def _positions(points, name):
+    points = np.asarray(points, float)
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
+        raise ValueError(
+            f"{name} are [points, 3] with at least one, got {points.shape}"
+        )
+    if not np.all(np.isfinite(points)):
+        row = int(np.argwhere(~np.isfinite(points))[0, 0])
+        raise ValueError(f"{name}[{row}] is {points[row]}; drop what was not found")
+    return points

@@ -1,0 +1,205 @@
+"""Tensors out of files that other tools wrote, without running anything in them.
+
+A `.pth` is a pickle, and unpickling may run code. Here the unpickler knows three names
+(an ordered dictionary, a tensor over a storage, a storage of numbers) and refuses every
+other, so PyTorch is not needed and nothing in the file is executed.
+"""
+
+import collections
+import functools
+import io
+import json
+import math
+import pathlib
+import pickle
+import struct
+import zipfile
+
+import ml_dtypes
+import numpy as np
+
+_SAFETENSORS = {
+    "F64": np.float64,
+    "F32": np.float32,
+    "F16": np.float16,
+    "BF16": ml_dtypes.bfloat16,
+    "I64": np.int64,
+    "I32": np.int32,
+    "U8": np.uint8,
+}
+_STORAGES = {
+    "DoubleStorage": np.float64,
+    "FloatStorage": np.float32,
+    "HalfStorage": np.float16,
+    "BFloat16Storage": ml_dtypes.bfloat16,
+    "LongStorage": np.int64,
+    "IntStorage": np.int32,
+    "ByteStorage": np.uint8,
+}
+_HEADER_LIMIT = 100_000_000  # bytes, safetensors' own
+_LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
+
+
+def read_tensors(path: str | pathlib.Path) -> dict[str, np.ndarray]:
+    """Name -> array of an `.npz`, `.safetensors`, `.pth` or `.pt` state dict.
+
+    Raises `ValueError` with the file's name where it is damaged, of another kind, or
+    asks for anything but tensors.
+    """
+    path = pathlib.Path(path)
+    readers = {
+        ".npz": _read_npz,
+        ".safetensors": _read_safetensors,
+        ".pth": _read_torch,
+        ".pt": _read_torch,
+    }
+    if path.suffix not in readers:
+        raise ValueError(
+            f"{path}: weights come as {', '.join(readers)}, not {path.suffix or 'this'}"
+        )
+    try:
+        return readers[path.suffix](path)
+    except FileNotFoundError:
+        raise ValueError(f"{path}: no such file") from None
+    except (
+        pickle.UnpicklingError,
+        zipfile.BadZipFile,
+        struct.error,
+        AttributeError,
+        EOFError,
+        IndexError,
+        KeyError,
+        TypeError,
+        ValueError,
+        OSError,
+    ) as error:
+        raise ValueError(
+            f"{path}: not a readable {path.suffix} of tensors ({error}); "
+            "download or export it again"
+        ) from error
+
+
+def _read_npz(path):
+    with np.load(path, allow_pickle=False) as archive:
+        return {name: archive[name] for name in archive.files}
+
+
+def _read_safetensors(path):
+    data = path.read_bytes()
+    (header_size,) = struct.unpack_from("<Q", data)
+    if header_size > min(_HEADER_LIMIT, len(data) - 8):
+        raise ValueError(f"its header claims {header_size} bytes")
+    header = json.loads(data[8 : 8 + header_size])
+    header.pop("__metadata__", None)
+    body = memoryview(data)[8 + header_size :]
+    tensors = {}
+    for name, entry in header.items():
+        start, stop = entry["data_offsets"]
+        dtype = np.dtype(_SAFETENSORS[entry["dtype"]])
+        size = math.prod(entry["shape"]) * dtype.itemsize
+        if not 0 <= start <= stop <= len(body) or stop - start != size:
+            raise ValueError(f"{name} claims bytes {start} to {stop} of {len(body)}")
+        tensors[name] = np.frombuffer(body[start:stop], dtype).reshape(entry["shape"])
+    return tensors
+
+
+def _read_torch(path):
+    if zipfile.is_zipfile(path):
+        state = _read_torch_zip(path)
+    else:
+        state = _read_torch_legacy(path)
+    if not isinstance(state, dict):
+        raise ValueError(f"it holds a {type(state).__name__}, not a state dict")
+    # Some tools wrap the tensors: {"state_dict": {...}, "epoch": 3}.
+    state = state.get("state_dict", state)
+    return {
+        name: value.array() for name, value in state.items() if isinstance(value, _View)
+    }
+
+
+def _read_torch_zip(path):
+    with zipfile.ZipFile(path) as archive:
+        (index,) = (name for name in archive.namelist() if name.endswith("/data.pkl"))
+        folder = index.removesuffix("data.pkl")
+        order = folder + "byteorder"
+        if order in archive.namelist() and archive.read(order) != b"little":
+            raise ValueError("big-endian tensors")
+        pickled = archive.read(index)
+
+    @functools.cache
+    def read(key):
+        with zipfile.ZipFile(path) as archive:
+            return archive.read(f"{folder}data/{key}")
+
+    return _Unpickler(io.BytesIO(pickled), read).load()
+
+
+def _read_torch_legacy(path):
+    """Before PyTorch 1.6: five pickles, then each storage behind its element count."""
+    with path.open("rb") as stream:
+        storages = {}
+        magic, _, system = (_Unpickler(stream, storages.get).load() for _ in range(3))
+        if magic != _LEGACY_MAGIC:
+            raise ValueError("neither a zip nor a legacy PyTorch file")
+        if not system["little_endian"]:
+            raise ValueError("big-endian tensors")
+        unpickler = _Unpickler(stream, storages.get)
+        state = unpickler.load()
+        for key in _Unpickler(stream, storages.get).load():
+            dtype = unpickler.dtypes[key]
+            (count,) = struct.unpack("<q", stream.read(8))
+            storages[key] = stream.read(count * np.dtype(dtype).itemsize)
+    return state
+
+
+class _View:
+    """A tensor over a storage that may not have been read yet."""
+
+    def __init__(self, storage, offset, shape, strides, *_):
+        self.storage, self.offset = storage, offset
+        self.shape, self.strides = shape, strides
+
+    def array(self):
+        read, key, dtype = self.storage
+        flat = np.frombuffer(read(key), dtype)
+        last = self.offset + sum(
+            (n - 1) * step for n, step in zip(self.shape, self.strides, strict=True)
+        )
+        numbers = (self.offset, *self.shape, *self.strides)
+        inside = math.prod(self.shape) <= flat.size and last < flat.size
+        if min(numbers) < 0 or not (inside or 0 in self.shape):
+            raise ValueError(f"a tensor reaches to element {last} of {flat.size}")
+        strides = [step * flat.itemsize for step in self.strides]
+        view = np.lib.stride_tricks.as_strided(flat[self.offset :], self.shape, strides)
+        return view.copy()
+
+
+class _Unpickler(pickle.Unpickler):
+    """Builds dictionaries and tensors, and nothing else."""
+
+    def __init__(self, stream, read):
+        # latin1: state dicts of Python 2, and torchvision's VGG16 is one.
+        super().__init__(stream, encoding="latin1")
+        self._read, self.dtypes = read, {}
+
+    def find_class(self, module, name):
+        if (module, name) == ("collections", "OrderedDict"):
+            return collections.OrderedDict
+        if (module, name) == ("torch._utils", "_rebuild_tensor_v2"):
+            return _View
+        if (module, name) == ("torch._utils", "_rebuild_parameter"):
+            return _same
+        if module == "torch" and name in _STORAGES:
+            return _STORAGES[name]
+        raise pickle.UnpicklingError(f"it asks for {module}.{name}")
+
+    def persistent_load(self, pid):
+        kind, dtype, key = pid[:3]
+        if kind != "storage":
+            raise pickle.UnpicklingError(f"it asks for a persistent {kind!r}")
+        self.dtypes[key] = dtype
+        return self._read, key, dtype
+
+
+def _same(tensor, *_):
+    return tensor

@@ -1,0 +1,249 @@
+"""LPIPS against a float64 SciPy implementation written from the papers' layer tables.
+
+PyTorch 2.13's own layers on the same random weights at 70x91, compared once by hand,
+both networks and both scalings: 2e-7 relative, and 1e-6 of the maximum for the map.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.interpolate
+import scipy.signal
+
+from nerfies_jax.measure import perceptual
+from tests import gradients
+
+NETWORKS = {"alex": perceptual.ALEX, "vgg": perceptual.VGG}
+# torchvision's `features`, as printed: C = convolution (index, in, out, width, stride,
+# padding), R = ReLU, P = max pooling (width) with stride 2. `!` is a compared map.
+LAYERS = {
+    "alex": "C0,3,64,11,4,2 R! P3 C3,64,192,5,1,2 R! P3 C6,192,384,3,1,1 R! "
+    "C8,384,256,3,1,1 R! C10,256,256,3,1,1 R!",
+    "vgg": "C0,3,64,3,1,1 R C2,64,64,3,1,1 R! P2 C5,64,128,3,1,1 R C7,128,128,3,1,1 R! "
+    "P2 C10,128,256,3,1,1 R C12,256,256,3,1,1 R C14,256,256,3,1,1 R! P2 "
+    "C17,256,512,3,1,1 R C19,512,512,3,1,1 R C21,512,512,3,1,1 R! P2 "
+    "C24,512,512,3,1,1 R C26,512,512,3,1,1 R C28,512,512,3,1,1 R!",
+}
+SIZES = {"alex": (47, 38), "vgg": (19, 17)}
+
+
+def state_dict(name, rng):
+    """Random weights under torchvision's and lpips' names, as their files hold them."""
+    state, channels = {}, []
+    for layer in LAYERS[name].split():
+        if layer[0] == "C":
+            index, inputs, outputs, width, _, _ = map(int, layer[1:].split(","))
+            spread = (2 / (inputs * width**2)) ** 0.5
+            kernel = spread * rng.normal(size=(outputs, inputs, width, width))
+            state[f"features.{index}.weight"] = kernel.astype(np.float32)
+            bias = 0.1 * rng.normal(size=outputs)
+            state[f"features.{index}.bias"] = bias.astype(np.float32)
+        if layer[-1] == "!":
+            channels.append(outputs)
+    for stage, count in enumerate(channels):
+        head = rng.random((1, count, 1, 1)).astype(np.float32)
+        state[f"lin{stage}.model.1.weight"] = head
+    return state
+
+
+def slow_features(state, name, picture):
+    shift, scale = np.array([-0.030, -0.088, -0.188]), np.array([0.458, 0.448, 0.450])
+    x = ((picture - shift) / scale).transpose(2, 0, 1)
+    for layer in LAYERS[name].split():
+        if layer[0] == "C":
+            index, _, _, _, stride, padding = map(int, layer[1:].split(","))
+            x = np.pad(x, ((0, 0), (padding, padding), (padding, padding)))
+            kernel = state[f"features.{index}.weight"].astype(np.float64)
+            windows = np.lib.stride_tricks.sliding_window_view(
+                x, kernel.shape[2:], (1, 2)
+            )
+            x = np.einsum("ihwyx,oiyx->ohw", windows, kernel, optimize=True)
+            x = x[:, ::stride, ::stride]
+            x = x + state[f"features.{index}.bias"].astype(np.float64)[:, None, None]
+        elif layer[0] == "P":
+            width = int(layer[1:])
+            windows = np.lib.stride_tricks.sliding_window_view(
+                x, (width, width), (1, 2)
+            )
+            x = windows.max((3, 4))[:, ::2, ::2]
+        else:
+            x = np.maximum(x, 0)
+        if layer[-1] == "!":
+            yield x
+
+
+def slow_lpips(state, name, image, truth):
+    total = 0
+    maps = (slow_features(state, name, x) for x in (image, truth))
+    for stage, (a, b) in enumerate(zip(*maps, strict=True)):
+        a, b = (x / (np.linalg.norm(x, axis=0) + 1e-10) for x in (a, b))
+        head = state[f"lin{stage}.model.1.weight"].astype(np.float64)
+        total += scipy.signal.correlate((a - b) ** 2, head[0], "valid").mean()
+    return total
+
+
+@pytest.fixture(scope="module", params=["alex", "vgg"])
+def trained(request, tmp_path_factory):
+    """A network, its loaded weights, the state dict and a file of it."""
+    state = state_dict(request.param, np.random.default_rng(3))
+    path = tmp_path_factory.mktemp("weights") / f"{request.param}.npz"
+    np.savez(path, **state)
+    network = NETWORKS[request.param]
+    return network, perceptual.load(network, [path]), state, path
+
+
+def pair(rng, size):
+    truth = rng.random((*size, 3))
+    return np.clip(truth + 0.2 * rng.normal(size=truth.shape), 0, 1), truth
+
+
+compiled = jax.jit(perceptual.lpips, static_argnums=(1, 4))
+
+
+@pytest.mark.parametrize("scaling", ["standard", "unscaled"])
+def test_lpips_is_the_reference_on_random_weights(trained, scaling, rng):
+    network, params, state, _ = trained
+    image, truth = pair(rng, SIZES[network.name])
+    value = compiled(
+        params, network, *(jnp.asarray(x, jnp.float32) for x in (image, truth)), scaling
+    )
+    if scaling == "standard":
+        image, truth = 2 * image - 1, 2 * truth - 1
+    exact = slow_lpips(state, network.name, image, truth)
+    # Thirteen float32 convolutions; measured 1e-7.
+    assert value == pytest.approx(exact, rel=3e-6)
+
+
+@pytest.mark.parametrize("trained", ["alex"], indirect=True)
+def test_lpips_is_zero_for_equal_pictures_and_its_gradient_is_finite(trained, rng):
+    network, params, _, _ = trained
+    _, truth = pair(rng, SIZES[network.name])
+    truth = jnp.asarray(truth, jnp.float32)
+    score = jax.jit(
+        jax.value_and_grad(lambda x: perceptual.lpips(params, network, x, truth))
+    )
+    value, slope = score(truth)
+    # The constant picture is folded at compile time, with its own rounding.
+    assert value < 1e-10
+    assert np.abs(slope).max() < 1e-5
+    # Every channel dead: a black picture under large negative biases.
+    dead = params._replace(
+        convolutions=tuple(c._replace(bias=c.bias - 1e3) for c in params.convolutions)
+    )
+    slope = jax.jit(jax.grad(lambda x: perceptual.lpips(dead, network, x, truth)))(
+        0 * truth
+    )
+    assert np.all(np.isfinite(slope))
+
+
+def test_gradients_agree_with_central_differences(float64, rng):
+    network = perceptual.ALEX
+    state = state_dict("alex", rng)
+    params = jax.tree.map(
+        lambda x: jnp.asarray(x, float64), perceptual._params(network, state)
+    )
+    image, truth = (jnp.asarray(x) for x in pair(rng, (31, 31)))
+
+    def score(image, truth):
+        return perceptual.lpips(params, network, image, truth)
+
+    # A ReLU or a maximum may switch within the step of 1e-5; none does here.
+    assert gradients.directional_error(score, image, truth, step=1e-6) < 1e-5
+
+
+def test_the_map_of_a_coarse_stage_is_enlarged_between_pixel_centres(rng):
+    small = jnp.asarray(rng.random((3, 2)), jnp.float32)
+    enlarged = np.asarray(jax.image.resize(small, (9, 8), "bilinear"))
+    rows = np.clip((np.arange(9) + 0.5) / 3 - 0.5, 0, 2)
+    columns = np.clip((np.arange(8) + 0.5) / 4 - 0.5, 0, 1)
+    exact = scipy.interpolate.RegularGridInterpolator(
+        (np.arange(3), np.arange(2)), np.asarray(small, float)
+    )(np.stack(np.meshgrid(rows, columns, indexing="ij"), -1))
+    np.testing.assert_allclose(enlarged, exact, atol=1e-6)
+
+
+@pytest.mark.parametrize("trained", ["alex"], indirect=True)
+def test_masked_lpips_ignores_what_is_outside_and_averages_inside(trained, rng):
+    network, params, _, _ = trained
+    size = SIZES[network.name]
+    image, truth = (jnp.asarray(x, jnp.float32) for x in pair(rng, size))
+    masked = jax.jit(perceptual.masked_lpips, static_argnums=1)
+    mask = jnp.zeros(size, bool).at[3:15, 4:12].set(True)
+    value = masked(params, network, image, truth, mask)
+    hidden = jnp.where(mask[..., None], image, jnp.nan)
+    assert masked(params, network, hidden, truth, mask) == value
+    everywhere = masked(params, network, image, truth, jnp.ones(size, bool))
+    mean = jnp.mean(perceptual.lpips_map(params, network, image, truth))
+    assert everywhere == pytest.approx(float(mean), rel=1e-5)
+    assert np.isnan(masked(params, network, image, truth, jnp.zeros(size, bool)))
+
+
+@pytest.mark.parametrize("trained", ["alex"], indirect=True)
+def test_a_saved_lpips_module_loads_as_its_two_parts_do(trained, tmp_path):
+    network, params, state, _ = trained
+    stages = iter(perceptual._classifier_names(network))
+    renamed = {name: value for name, value in state.items() if name.startswith("lin")}
+    for torchvision, module in stages:
+        for suffix in ("weight", "bias"):
+            renamed[f"{module}.{suffix}"] = state[f"{torchvision}.{suffix}"]
+    np.savez(tmp_path / "module.npz", **renamed)
+    loaded = perceptual.load(network, [tmp_path / "module.npz"])
+    assert jax.tree.all(jax.tree.map(np.array_equal, loaded, params))
+
+
+@pytest.mark.parametrize("trained", ["alex"], indirect=True)
+def test_weights_are_found_where_their_packages_keep_them(
+    trained, tmp_path, monkeypatch
+):
+    network, params, state, _ = trained
+    cache = tmp_path / "hub" / "checkpoints"
+    cache.mkdir(parents=True)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    cached = tmp_path / "hub" / "checkpoints" / "classifier.npz"
+    np.savez(cached, **{k: v for k, v in state.items() if k.startswith("features")})
+    network = perceptual.dataclasses.replace(network, files=("classifier.npz",))
+    heads = tmp_path / "heads.npz"
+    np.savez(heads, **{k: v for k, v in state.items() if k.startswith("lin")})
+    loaded = perceptual.load(network, [heads])
+    assert jax.tree.all(jax.tree.map(np.array_equal, loaded, params))
+    cached.unlink()
+    with pytest.raises(perceptual.WeightsMissing, match=r"classifier.*heads\.npz"):
+        perceptual.load(network, [heads])
+
+
+def test_without_weights_one_line_says_why_and_where(tmp_path, monkeypatch):
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    with pytest.raises(perceptual.WeightsMissing) as caught:
+        perceptual.load(perceptual.VGG)
+    message = str(caught.value)
+    assert "vgg16-397923af.pth" in message
+    assert str(tmp_path) in message
+    assert "\n" not in message
+
+
+def test_another_networks_file_is_refused(trained, tmp_path, monkeypatch):
+    network, _, state, path = trained
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    other = perceptual.VGG if network is perceptual.ALEX else perceptual.ALEX
+    with pytest.raises(perceptual.WeightsMissing, match="another network's file"):
+        perceptual.load(other, [path])
+    broken = {**state, "lin2.model.1.weight": state["lin2.model.1.weight"] * np.nan}
+    np.savez(tmp_path / "nan.npz", **broken)
+    with pytest.raises(
+        perceptual.WeightsMissing, match=r"lin2\.model\.1\.weight.*finite"
+    ):
+        perceptual.load(network, [tmp_path / "nan.npz"])
+
+
+@pytest.mark.parametrize("name", ["alex", "vgg"])
+def test_the_smallest_picture_is_the_smallest(name, rng):
+    network = NETWORKS[name]
+    params = perceptual._params(network, state_dict(name, rng))
+    size = network.smallest
+    shapes = jax.eval_shape(
+        lambda x: perceptual.features(params, network, x), jnp.zeros((size, size, 3))
+    )
+    assert min(shapes[-1].shape[:2]) == 1
+    with pytest.raises(ValueError, match=f"needs {size} pixels"):
+        perceptual.features(params, network, jnp.zeros((size, size - 1, 3)))
