@@ -1,0 +1,39 @@
+"""Black wedges at the rim of stabilised or undistorted film: pixels never filmed."""
+
+import numpy as np
+import skimage.measure
+import skimage.morphology
+
+BLACK = 2  # of 255; a reduced picture ramps at the wedge's edge, its inside stays below
+SMALLEST = 1e-3  # share of the picture; less is a shadow at the rim
+LARGEST = 0.25  # more is a dark scene
+
+
+def black_borders(images: np.ndarray) -> np.ndarray | None:
+    """Bool [frames, height, width] of black regions that touch the rim; None if none.
+
+    The region grows by two pixels: its edge was mixed with black when the picture
+    was resampled.
+    """
+    dark = images.max(-1) <= BLACK
+    found = np.zeros(dark.shape, bool)
+    for row in np.flatnonzero(_rim(dark).any(-1)):
+        labels = skimage.measure.label(dark[row], connectivity=1)
+        for label in np.unique(_rim(labels)[_rim(labels) > 0]):
+            region = labels == label
+            if SMALLEST <= region.mean() <= LARGEST:
+                found[row] |= region
+        if found[row].any():
+            found[row] = skimage.morphology.dilation(found[row], np.ones((5, 5), bool))
+    return found if found.any() else None
+
+
+def _rim(pictures):
+    """The outermost pixels of [..., height, width] along one axis."""
+    sides = (
+        pictures[..., 0, :],
+        pictures[..., -1, :],
+        pictures[..., 0],
+        pictures[..., -1],
+    )
+    return np.concatenate(sides, axis=-1)

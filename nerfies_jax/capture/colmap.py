@@ -1,0 +1,329 @@
+"""COLMAP reconstructions: read them through pycolmap."""
+
+import pathlib
+import re
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from nerfies_jax.capture import frames
+from nerfies_jax.capture import images as pictures
+from nerfies_jax.capture.borders import black_borders
+from nerfies_jax.capture.capture import Capture, CaptureError, PointCloud
+from nerfies_jax.capture.colmap_library import library
+from nerfies_jax.capture.json_files import AnyPath, inside
+from nerfies_jax.capture.points import place_by_points
+from nerfies_jax.capture.undistortion import undistort
+from nerfies_jax.geometry.camera import Camera
+
+MODELS = ("sparse", "colmap/sparse", "distorted/sparse", "colmap", "")
+PICTURES = ("images", "images_2", "images_4", "images_8", "input", "rgb", "")
+MIN_TRACK = 3  # frames that must have seen a point
+MAX_ERROR_PX = 2.0  # mean reprojection error of a point that is kept
+
+
+class Model(NamedTuple):
+    """What a reconstruction says, in world units and pixels of its own pictures."""
+
+    names: tuple[str, ...]  # of the pictures, in natural order
+    lenses: list[Any]  # one pycolmap.Camera per picture
+    camera_ids: np.ndarray
+    rotations: np.ndarray  # [frames, 3, 3] camera from world
+    positions: np.ndarray  # [frames, 3]
+    points: np.ndarray  # [points, 3]
+    colours: np.ndarray  # [points, 3] uint8
+    depths: np.ndarray  # z-depth of every kept observation
+
+
+def read(
+    path: AnyPath,
+    factor: int | None = None,
+    max_side: int | None = None,
+    heldout: int | str | None = None,
+    missing: str = "refuse",
+) -> Capture:
+    """The capture that a folder with pictures and a COLMAP model holds.
+
+    The pictures may be whole fractions of those the model was made from (images_2 and
+    so on); `factor` is relative to the model's. Lenses that are not ours are
+    undistorted to a pinhole. Times come from the numbers in the names, else from their
+    order; `heldout` is a number n for every n-th frame, 8 if not given. `masks/` (black
+    moves, COLMAP's polarity) are read where they are.
+    """
+    path = pathlib.Path(path)
+    folder, notes = _best_model(path)
+    model = read_model(folder)
+    if isinstance(heldout, str):
+        raise CaptureError(
+            f"{path}: COLMAP has no split {heldout!r}; pass a number n to hold out "
+            "every "
+            "n-th frame"
+        )
+    available, found = _find_pictures(path, model)
+    full = (model.lenses[0].width, model.lenses[0].height)
+    source, shrink_by = frames.choose_source(
+        available, full, factor, max_side, str(path)
+    )
+    rows, lost = frames.keep_found(found[source], model.names, missing, str(path))
+    model = _take(model, rows)
+    files = [found[source][row] for row in rows]
+    # COLMAP reads pixels as they lie in the file, whatever the EXIF orientation says.
+    images, alpha = frames.read_frames(files, shrink_by, orientation="stored")
+    size = (images.shape[2], images.shape[1])
+    valid = None if alpha is None else alpha == 255
+    moving = _masks(path, model.names, size, shrink_by)
+    blacked = black_borders(images)
+    if blacked is not None:
+        valid = ~blacked if valid is None else valid & ~blacked
+        touched = int(blacked.any((1, 2)).sum())
+        notes += (f"{touched} frames have black borders: taken as not filmed",)
+    stored = pictures.read_header(files[0]).size
+    lenses = [_scaled(lens, stored, size, path) for lens in model.lenses]
+    if not all(map(_is_ours, lenses)):
+        names = sorted({lens.model_name for lens in lenses})
+        notes += (f"pictures undistorted from {' and '.join(names)} to a pinhole",)
+        images, exists, (valid, moving), pinhole = undistort(
+            images, (valid, moving), lenses, str(path)
+        )
+        valid = exists if valid is None else valid
+        lenses = [pinhole] * len(lenses)
+    placement = place_by_points(model.points, model.positions, model.depths)
+    centre, scale = np.array(placement.centre), placement.scale
+    cameras = _cameras(lenses, model.rotations, (model.positions - centre) * scale)
+    times = frames.spread(_clock(model.names))
+    train, scored = frames.hold_out_every(
+        len(rows), heldout or frames.HELD_OUT, str(path)
+    )
+    notes += (f"every {heldout or frames.HELD_OUT}th frame is held out",)
+    return Capture(
+        name=path.resolve().name,
+        source="colmap",
+        ids=tuple(name_of(name) for name in model.names),
+        images=images,
+        cameras=cameras,
+        times=times,
+        train=train,
+        heldout=scored,
+        near=placement.near,
+        far=placement.far,
+        warp_ids=frames.dense(times),
+        appearance_ids=np.arange(len(rows), dtype=np.int32),
+        camera_ids=frames.dense(model.camera_ids),
+        valid=valid,
+        moving=moving,
+        points=PointCloud(
+            ((model.points - centre) * scale).astype(np.float32), model.colours
+        ),
+        scale=scale,
+        centre=placement.centre,
+        up=frames.up_direction(cameras),
+        path=path,
+        notes=(*notes, *lost),
+    )
+
+
+def name_of(picture: str) -> str:
+    """The id of a picture: its path without ending, fit for a file name."""
+    return pathlib.PurePosixPath(picture).with_suffix("").as_posix().replace("/", "_")
+
+
+def read_model(folder: pathlib.Path) -> Model:
+    """The registered pictures and reliable points of one sparse model."""
+    reconstruction = _reconstruction(folder)
+    posed = [image for image in reconstruction.images.values() if image.has_pose]
+    posed.sort(key=lambda image: frames.natural(image.name))
+    if len(posed) < 2:
+        raise CaptureError(
+            f"{folder}: {len(posed)} pictures have a pose; a reconstruction needs at "
+            "least 2, so run COLMAP with more overlap"
+        )
+    poses = [image.cam_from_world().matrix() for image in posed]
+    rotations = np.stack([pose[:, :3] for pose in poses])
+    positions = np.stack([image.projection_center() for image in posed])
+    row_of = {image.image_id: row for row, image in enumerate(posed)}
+    kept, depths = [], []
+    for point in reconstruction.points3D.values():
+        if point.track.length() < MIN_TRACK or not point.error <= MAX_ERROR_PX:
+            continue
+        rows = [
+            row_of[e.image_id] for e in point.track.elements if e.image_id in row_of
+        ]
+        kept.append((point.xyz, point.color))
+        depths.append(((point.xyz - positions[rows]) * rotations[rows, 2]).sum(1))
+    if len(kept) < 3:
+        raise CaptureError(
+            f"{folder}: {len(kept)} points seen in {MIN_TRACK} frames or more; the "
+            "scene "
+            "cannot be placed, so keep points3D or run COLMAP again"
+        )
+    depths = np.concatenate(depths)
+    return Model(
+        names=tuple(image.name for image in posed),
+        lenses=[reconstruction.cameras[image.camera_id] for image in posed],
+        camera_ids=np.array([image.camera_id for image in posed]),
+        rotations=rotations,
+        positions=positions,
+        points=np.array([xyz for xyz, _ in kept]),
+        colours=np.array([colour for _, colour in kept], np.uint8),
+        depths=depths[depths > 0],
+    )
+
+
+def _reconstruction(folder):
+    try:
+        return library().Reconstruction(str(folder))
+    except (ValueError, RuntimeError, IndexError, KeyError, MemoryError) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise CaptureError(
+            f"{folder}: not a readable COLMAP model ({reason}); export it again"
+        ) from None
+
+
+def _best_model(path):
+    """The folder of the model with most pictures: COLMAP numbers them as it found "
+    "them."""
+    places = []
+    for place in MODELS:
+        parent = path / place
+        numbered = [p for p in parent.glob("*") if p.is_dir() and p.name.isdecimal()]
+        for folder in (*sorted(numbered, key=lambda p: int(p.name)), parent):
+            if any(
+                (folder / f"images.{ending}").is_file() for ending in ("bin", "txt")
+            ):
+                places.append(folder)
+        if places:
+            break
+    if not places:
+        raise CaptureError(
+            f"{path}: no COLMAP model; looked for cameras, images and points3D (.bin "
+            "or "
+            ".txt) in sparse/0, sparse and here"
+        )
+    if len(places) == 1:
+        return places[0], ()
+    counts = [_reconstruction(folder).num_reg_images() for folder in places]
+    best = int(np.argmax(counts))
+    listed = ", ".join(f"{p.name}: {n}" for p, n in zip(places, counts, strict=True))
+    return places[best], (f"several models, the largest is read (pictures: {listed})",)
+
+
+def _find_pictures(path, model):
+    """For each reduction stored, its folder and the file of each picture or None."""
+    first = model.lenses[0]
+    available, found = {}, {}
+    for place in PICTURES:
+        folder = path / place
+        files = [_find(folder, name, path) for name in model.names]
+        present = next((file for file in files if file is not None), None)
+        if present is None:
+            continue
+        width, height = pictures.read_header(present).size
+        ratio = max(1, round(first.width / width))
+        if (
+            abs(first.width / ratio - width) >= 1
+            or abs(first.height / ratio - height) >= 1
+        ):
+            raise CaptureError(
+                f"{present}: {width}x{height} pixels, but its camera is for "
+                f"{first.width}x{first.height}; pictures must be a whole fraction of "
+                "that"
+            )
+        if ratio not in available:
+            available[ratio], found[ratio] = folder, files
+    if not available:
+        raise CaptureError(
+            f"{path}: a COLMAP model but none of its pictures ({model.names[0]}, ...); "
+            f"looked in {', '.join(place or 'the folder itself' for place in PICTURES)}"
+        )
+    return available, found
+
+
+def _find(folder, name, path):
+    """The picture, also under another ending: reductions are often saved as PNG."""
+    inside(folder, name, path)
+    stem = pathlib.PurePosixPath(name).with_suffix("").as_posix()
+    return frames.find_picture(folder, name) or frames.find_picture(folder, stem)
+
+
+def _take(model, rows):
+    return model._replace(
+        names=tuple(model.names[row] for row in rows),
+        lenses=[model.lenses[row] for row in rows],
+        camera_ids=model.camera_ids[rows],
+        rotations=model.rotations[rows],
+        positions=model.positions[rows],
+    )
+
+
+def _masks(path, names, size, shrink_by):
+    folder = path / "masks"
+    if not folder.is_dir():
+        return None
+    found = [
+        frames.find_picture(folder, f"{name}.png") or _find(folder, name, path)
+        for name in names
+    ]
+    if not any(found):
+        return None
+    return frames.read_masks(found, size, shrink_by) < 1
+
+
+def _scaled(lens, stored, size, path):
+    """The lens for pictures of `size`, made from stored ones by whole blocks."""
+    if lens.is_spherical():
+        raise CaptureError(
+            f"{path}: camera {lens.camera_id} is {lens.model_name}, a whole sphere; "
+            "cut "
+            "perspective pictures out of it first"
+        )
+    copy = library().Camera(lens.todict())
+    copy.rescale(*stored)
+    shrink_by = stored[0] // size[0]
+    # Trimming to whole blocks takes nothing from the left or the top.
+    copy.width, copy.height = size[0] * shrink_by, size[1] * shrink_by
+    copy.rescale(*size)
+    return copy
+
+
+def _is_ours(lens):
+    if lens.model_name == "FULL_OPENCV":
+        return not np.any(lens.params[9:])  # k4 to k6 divide; ours does not
+    return lens.model_name in {
+        "SIMPLE_PINHOLE",
+        "PINHOLE",
+        "SIMPLE_RADIAL",
+        "RADIAL",
+        "OPENCV",
+    }
+
+
+def _cameras(lenses, rotations, positions):
+    radial = np.zeros((len(lenses), 3), np.float32)
+    tangential = np.zeros((len(lenses), 2), np.float32)
+    for row, lens in enumerate(lenses):
+        bent = np.asarray(lens.params)[2 + len(lens.focal_length_idxs()) :]
+        radial[row, : min(2, len(bent))] = bent[:2]
+        if len(bent) >= 4:
+            tangential[row] = bent[2:4]
+        if len(bent) >= 5:
+            radial[row, 2] = bent[4]
+    focal = np.array([[lens.focal_length_x, lens.focal_length_y] for lens in lenses])
+    centre = [[lens.principal_point_x, lens.principal_point_y] for lens in lenses]
+    return Camera(
+        camera_from_world=rotations.astype(np.float32),
+        position=positions.astype(np.float32),
+        focal_px=focal[:, 0].astype(np.float32),
+        principal_point_px=np.array(centre, np.float32),
+        skew_px=np.zeros(len(lenses), np.float32),
+        pixel_aspect=(focal[:, 1] / focal[:, 0]).astype(np.float32),
+        radial=radial,
+        tangential=tangential,
+    )
+
+
+def _clock(names):
+    """The frame numbers at the end of the names, or their order if they have none."""
+    split = [re.fullmatch(r"(.*?)(\d+)", name_of(name)) for name in names]
+    if all(split) and len({match.group(1) for match in split}) == 1:
+        return [int(match.group(2)) for match in split]
+    return list(range(len(names)))

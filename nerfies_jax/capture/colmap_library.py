@@ -1,0 +1,15 @@
+"""The one place that imports pycolmap.
+
+Its wheel exports a zlib of its own (seen in 4.2.1). A libz loaded after it binds to
+half of that, and the next PNG, .npz or gzip ends the process with "free(): invalid
+pointer". Loaded before it, libz stays whole; hence the first import below.
+"""
+
+import zlib  # noqa: F401
+
+
+def library():
+    """The pycolmap module; imported on first use, because it takes 0.2 s."""
+    import pycolmap
+
+    return pycolmap

@@ -1,0 +1,79 @@
+"""Pictures of lenses that are not ours, resampled to a pinhole."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import scipy.ndimage
+
+from nerfies_jax.capture.capture import CaptureError
+from nerfies_jax.capture.colmap_library import library
+
+
+def undistort(
+    images: np.ndarray,
+    masks: Sequence[np.ndarray | None],
+    lenses: Sequence[Any],
+    where: str,
+) -> tuple[np.ndarray, np.ndarray, list[np.ndarray | None], Any]:
+    """Pictures, where they exist, masks, and the pinhole (pycolmap.Camera) of them all.
+
+    The pinhole is the one that COLMAP's own undistorter chooses for the first lens.
+    Bilinear between pixel centres; a pixel that looks past the source's outermost
+    centres does not exist and is black. Masks are sampled at the nearest pixel.
+    """
+    pycolmap = library()
+    pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), lenses[0])
+    width, height = pinhole.width, pinhole.height
+    y, x = np.mgrid[:height, :width] + 0.5
+    rays = np.stack(
+        [
+            (x.ravel() - pinhole.principal_point_x) / pinhole.focal_length_x,
+            (y.ravel() - pinhole.principal_point_y) / pinhole.focal_length_y,
+            np.ones(x.size),
+        ],
+        axis=1,
+    )
+    out = np.zeros((len(images), height, width, 3), np.uint8)
+    exists = np.zeros(out.shape[:3], bool)
+    bent = [None if mask is None else np.zeros(out.shape[:3], bool) for mask in masks]
+    maps = {}
+    for row, lens in enumerate(lenses):
+        key = (lens.model_name, *lens.params)
+        if key not in maps:
+            maps[key] = _source_pixels(lens, rays, images.shape[1:3], (height, width))
+        place, inside = maps[key]
+        if not inside.any():
+            raise CaptureError(
+                f"{where}: the {lens.model_name} lens of frame {row} covers none of "
+                "its "
+                "undistorted picture; calibrate it again"
+            )
+        exists[row] = inside
+        for channel in range(3):
+            source = images[row, ..., channel].astype(np.float32)
+            sampled = scipy.ndimage.map_coordinates(
+                source, place, order=1, mode="nearest"
+            )
+            out[row, ..., channel] = np.where(inside, np.round(sampled), 0)
+        for target, mask in zip(bent, masks, strict=True):
+            if target is not None:
+                nearest = np.round(place).astype(int)
+                nearest = np.clip(
+                    nearest, 0, np.array(mask.shape[1:])[:, None, None] - 1
+                )
+                target[row] = mask[row][tuple(nearest)] & inside
+    return out, exists, bent, pinhole
+
+
+def _source_pixels(lens, rays, source_shape, target_shape):
+    """Array coordinates [2, height, width] in the source, and whether they lie in "
+    "it."""
+    pixel = lens.img_from_cam(rays).reshape(*target_shape, 2)
+    place = (
+        np.moveaxis(pixel[..., ::-1], -1, 0) - 0.5
+    )  # centres at +0.5 to array indices
+    last = np.array(source_shape)[:, None, None] - 1
+    inside = np.isfinite(place).all(0)
+    place = np.where(inside, place, 0)
+    return place, inside & (place >= 0).all(0) & (place <= last).all(0)
