@@ -1,0 +1,142 @@
+"""Rotations as quaternions wxyz (scalar first, Hamilton product), one at a time.
+
+q and -q are the same rotation. Functions that need unit length make it themselves,
+since what an optimiser moves is never exactly of length one.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from nerfies_jax.geometry.stumpff import stumpff
+
+Quaternion = Float[Array, "4"]
+
+# tan²(θ/2), that is θ < 0.4 rad: below, the series of arctan. Fourteen terms leave
+# 3e-21.
+SERIES_BELOW = 0.04
+_ARCTAN = tuple((-1) ** n / (2 * n + 1) for n in range(14))
+
+
+def normalise(quaternion: Quaternion) -> Quaternion:
+    """The same rotation at unit length.
+
+    Zero, and lengths whose square leaves the floating-point range (2e-19 to 1.8e19 in
+    float32), give the identity with zero gradient: 0/0 would poison the whole batch,
+    and q / (|q| + small) would return something that is no rotation.
+    """
+    length_sq = jnp.sum(quaternion**2)
+    # XLA:CPU flushes denormals, so the guard starts at a multiple of the smallest
+    # normal number. NaN is neither small nor infinite and passes through.
+    tiny = 4 * jnp.finfo(quaternion.dtype).tiny
+    unusable = (length_sq < tiny) | (length_sq == jnp.inf)
+    # The whole quaternion is replaced, not its length: at 3e38 the square's slope 2q
+    # overflows, and inf times the zero of the branch not taken is NaN.
+    usable = jnp.where(unusable, identity(quaternion.dtype), quaternion)
+    return usable / jnp.sqrt(jnp.sum(usable**2))
+
+
+def identity(dtype=jnp.float32) -> Quaternion:
+    return jnp.asarray([1, 0, 0, 0], dtype)
+
+
+def multiply(second: Quaternion, first: Quaternion) -> Quaternion:
+    """The rotation `first`, then `second`: the matrices' order of reading."""
+    w, v = second[0], second[1:]
+    scalar = w * first[0] - jnp.sum(v * first[1:])
+    vector = w * first[1:] + first[0] * v + jnp.cross(v, first[1:])
+    return jnp.concatenate([scalar[None], vector])
+
+
+def conjugate(quaternion: Quaternion) -> Quaternion:
+    """The inverse rotation of a unit quaternion."""
+    return jnp.concatenate([quaternion[:1], -quaternion[1:]])
+
+
+def rotate(quaternion: Quaternion, vector: Float[Array, "3"]) -> Float[Array, "3"]:
+    """One vector, turned; the quaternion may have any length."""
+    unit = normalise(quaternion)
+    swept = jnp.cross(unit[1:], vector)
+    return vector + 2 * (unit[0] * swept + jnp.cross(unit[1:], swept))
+
+
+def to_matrix(quaternion: Quaternion) -> Float[Array, "3 3"]:
+    """The rotation matrix; the quaternion may have any length.
+
+    The polynomial in an unnormalised q is no rotation: |q| = 1.01 bends it by 0.057.
+    """
+    w, x, y, z = normalise(quaternion)
+    return jnp.stack(
+        [
+            jnp.stack(
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]
+            ),
+            jnp.stack(
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]
+            ),
+            jnp.stack(
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
+            ),
+        ]
+    )
+
+
+def from_matrix(rotation: Float[Array, "3 3"]) -> Quaternion:
+    """The unit quaternion of a rotation matrix, with w not negative.
+
+    Shepperd 1978: 4 q qᵀ is linear in the matrix, and its longest row is q up to
+    length. A formula with a fixed pivot loses all digits where that component is 0.
+    """
+    r = rotation
+    w = [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]]
+    xy, xz, yz = r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1]
+    diagonal = jnp.stack(
+        [
+            1 + r[0, 0] + r[1, 1] + r[2, 2],
+            1 + r[0, 0] - r[1, 1] - r[2, 2],
+            1 - r[0, 0] + r[1, 1] - r[2, 2],
+            1 - r[0, 0] - r[1, 1] + r[2, 2],
+        ]
+    )
+    rows = jnp.stack(
+        [
+            jnp.stack([diagonal[0], *w]),
+            jnp.stack([w[0], diagonal[1], xy, xz]),
+            jnp.stack([w[1], xy, diagonal[2], yz]),
+            jnp.stack([w[2], xz, yz, diagonal[3]]),
+        ]
+    )
+    return _upper(normalise(rows[jnp.argmax(diagonal)]))
+
+
+def exp(rotation_vector: Float[Array, "3"]) -> Quaternion:
+    """The unit quaternion of axis × angle, in rad."""
+    quarter_sq = jnp.sum(rotation_vector**2) / 4
+    scalar = stumpff(0, quarter_sq)
+    return jnp.concatenate([scalar[None], stumpff(1, quarter_sq) / 2 * rotation_vector])
+
+
+def log(quaternion: Quaternion) -> Float[Array, "3"]:
+    """Axis × angle, the short way round (at most π rad); any length but zero."""
+    upper = _upper(quaternion)
+    scalar, vector = upper[0], upper[1:]
+    sine_sq = jnp.sum(vector**2)
+    near = sine_sq < SERIES_BELOW * scalar**2
+    divisor = jnp.where(near, scalar, 1)
+    tangent_sq = jnp.where(near, sine_sq, 0) / divisor**2
+    series = jnp.zeros_like(sine_sq)
+    for coefficient in reversed(_ARCTAN):
+        series = series * tangent_sq + coefficient
+    sine = jnp.sqrt(jnp.where(near, 1, sine_sq))
+    far = jnp.arctan2(sine, scalar) / sine  # right up to π, where an arccos is not
+    return 2 * jnp.where(near, series / divisor, far) * vector
+
+
+def slerp(start: Quaternion, end: Quaternion, fraction: Float[Array, ""]) -> Quaternion:
+    """Between two unit quaternions at constant speed, the short way round."""
+    turn = log(multiply(end, conjugate(start)))
+    return multiply(exp(fraction * turn), start)
+
+
+def _upper(quaternion: Quaternion) -> Quaternion:
+    """Of q and -q the one with w not negative: the turn of at most π."""
+    return jnp.where(quaternion[0] < 0, -quaternion, quaternion)

@@ -1,0 +1,61 @@
+"""Stumpff functions: every coefficient of a rotation, smooth in the squared angle."""
+
+import functools
+import math
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+# rad²: below, the series; above, the closed form. At 3 rad the closed forms of the
+# orders used here (up to 7, in second derivatives of a screw) have stopped cancelling.
+SERIES_BELOW = 9.0
+_TERMS = {"float32": 9, "float64": 15}  # leave 3e-9 and 3e-20 of the first at 9 rad²
+
+
+def stumpff(order: int, angle_sq: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """c_k(s) = Σ (-s)ⁿ / (2n + k)! of s = θ² = `angle_sq`, in rad² (Stumpff 1947).
+
+    c0 = cos θ, c1 = sin θ / θ, c2 = (1 - cos θ) / θ², c3 = (θ - sin θ) / θ³. They take
+    θ², since θ = |w| has no derivative at w = 0, and near zero their derivatives are
+    Stumpff functions again, so no derivative of any order divides by θ there.
+    """
+    near = angle_sq < SERIES_BELOW
+    # `where` differentiates both branches, so the one not taken must stay finite.
+    series = _series(order, jnp.where(near, angle_sq, 0))
+    closed = _closed(order, jnp.where(near, SERIES_BELOW, angle_sq))
+    return jnp.where(near, series, closed)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _series(order, angle_sq):
+    terms = _TERMS[angle_sq.dtype.name]
+    total = jnp.full_like(angle_sq, 1 / math.factorial(2 * terms - 2 + order))
+    for n in reversed(range(terms - 1)):
+        total = 1 / math.factorial(2 * n + order) - angle_sq * total
+    return total
+
+
+@_series.defjvp
+def _series_jvp(order, primals, tangents):
+    """c_k' = (k c_{k+2} - c_{k+1}) / 2: shared between orders, never short a term."""
+    (angle_sq,), (angle_sq_dot,) = primals, tangents
+    slope = -_series(order + 1, angle_sq) / 2
+    if order:
+        slope = slope + order / 2 * _series(order + 2, angle_sq)
+    return _series(order, angle_sq), slope * angle_sq_dot
+
+
+def _closed(order, angle_sq):
+    """From cos θ or sin θ / θ upwards: c_k = (1/(k-2)! - c_{k-2}) / s."""
+    angle = jnp.sqrt(angle_sq)
+    if order % 2:
+        value, start = jnp.sin(angle) / angle, 3
+    elif order == 0:
+        return jnp.cos(angle)
+    else:
+        # 2 sin²(θ/2) = 1 - cos θ, uncancelled at whole turns
+        value, start = 2 * jnp.sin(angle / 2) ** 2 / angle_sq, 4
+    for k in range(start, order + 1, 2):
+        value = (1 / math.factorial(k - 2) - value) / angle_sq
+    return value

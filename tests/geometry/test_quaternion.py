@@ -1,0 +1,169 @@
+"""Quaternions against SciPy's rotations, at every length and angle."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.spatial.transform
+
+from nerfies_jax.geometry import quaternion
+from tests import gradients
+
+Rotation = scipy.spatial.transform.Rotation
+TOLERANCE = {"float32": 5e-7, "float64": 1e-15}
+
+to_matrix = jax.jit(jax.vmap(quaternion.to_matrix))
+from_matrix = jax.jit(jax.vmap(quaternion.from_matrix))
+log = jax.jit(jax.vmap(quaternion.log))
+exp = jax.jit(jax.vmap(quaternion.exp))
+normalise = jax.jit(quaternion.normalise)
+normalise_slope = jax.jit(jax.jacrev(quaternion.normalise))
+
+
+def drawn(rng, count=50):
+    """Random unit quaternions, wxyz, with w of both signs."""
+    values = rng.normal(size=(count, 4))
+    return values / np.linalg.norm(values, axis=-1, keepdims=True)
+
+
+def scipy_of(wxyz):
+    return Rotation.from_quat(np.roll(np.asarray(wxyz, np.float64), -1, axis=-1))
+
+
+def test_matrices_and_rotated_vectors_match_scipy(dtype, rng):
+    wxyz, vectors = drawn(rng), rng.normal(size=(50, 3))
+    truth = scipy_of(wxyz)
+    given = jnp.asarray(wxyz, dtype)
+    assert np.max(abs(to_matrix(given) - truth.as_matrix())) < TOLERANCE[dtype]
+    rotated = jax.vmap(quaternion.rotate)(given, jnp.asarray(vectors, dtype))
+    assert np.max(abs(rotated - truth.apply(vectors))) < 6 * TOLERANCE[dtype]
+
+
+def test_products_compose_like_matrices(dtype, rng):
+    second, first = drawn(rng), drawn(rng)
+    product = jax.vmap(quaternion.multiply)(
+        jnp.asarray(second, dtype), jnp.asarray(first, dtype)
+    )
+    truth = (scipy_of(second) * scipy_of(first)).as_matrix()
+    assert np.max(abs(to_matrix(product) - truth)) < 2 * TOLERANCE[dtype]
+    unit = jax.vmap(lambda q: quaternion.multiply(q, quaternion.conjugate(q)))(product)
+    assert np.max(abs(unit - np.eye(4)[0])) < 2 * TOLERANCE[dtype]
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("length", [1e-15, 0.1, 1.01, 10, 1e15])
+def test_any_length_is_the_same_rotation(length, dtype, rng):
+    """The unnormalised polynomial is bent by 0.057 at a length of 1.01."""
+    wxyz = drawn(rng)
+    scaled = to_matrix(jnp.asarray(length * wxyz, dtype))
+    assert np.max(abs(scaled - scipy_of(wxyz).as_matrix())) < 2 * TOLERANCE[dtype]
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("length", [0, 1e-38, 1e-30, 1e-20, 1e-19, 1e19, 1e25, 3e38])
+def test_normalising_never_makes_what_is_no_rotation(length, dtype):
+    given = jnp.asarray(length * np.array([0.5, -0.5, 0.1, 0.7]), dtype)
+    unit, slope = normalise(given), normalise_slope(given)
+    assert abs(np.linalg.norm(unit) - 1) < 1e-6
+    assert np.all(np.isfinite(slope))
+    if length == 0:
+        assert np.array_equal(unit, [1, 0, 0, 0])
+        assert np.all(slope == 0)
+
+
+def test_normalising_does_not_hide_nan():
+    assert np.isnan(normalise(jnp.asarray([jnp.nan, 0, 0, 1]))).any()
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("angle", [0, 1e-8, 1e-3, 1.0, 3.0, np.pi - 1e-6, np.pi])
+def test_matrix_to_quaternion_at_every_pivot(angle, dtype, rng):
+    axes = np.concatenate([np.eye(3), -np.eye(3), rng.normal(size=(20, 3))])
+    axes /= np.linalg.norm(axes, axis=-1, keepdims=True)
+    truth = Rotation.from_rotvec(angle * axes)
+    found = from_matrix(jnp.asarray(truth.as_matrix(), dtype))
+    assert np.all(found[:, 0] >= 0)
+    error = (scipy_of(found).inv() * truth).magnitude()
+    assert error.max() < {"float32": 6e-7, "float64": 2e-15}[dtype]
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize(
+    "angle",
+    [0, 1e-30, 1e-20, 1e-8, 1e-4, 0.39, 0.41, 1.0, 3.0, np.pi - 1e-5, np.pi - 1e-6],
+)
+def test_log_inverts_exp_below_pi_for_both_signs(angle, dtype, rng):
+    axes = rng.normal(size=(20, 3))
+    vectors = jnp.asarray(angle * axes / np.linalg.norm(axes, axis=-1)[:, None], dtype)
+    unit = exp(vectors)
+    truth = np.roll(
+        Rotation.from_rotvec(np.array(vectors, np.float64)).as_quat(), 1, axis=-1
+    )
+    assert np.max(abs(unit - truth)) < TOLERANCE[dtype]
+    # float32 keeps the angle near π through w = 5e-7, hence to an ulp of the sine: 1e-7
+    bound = {"float32": 1e-6, "float64": 2e-15}[dtype] * max(angle, 1e-8)
+    for sign in (1, -1):
+        assert np.max(abs(log(sign * unit) - vectors)) < bound
+    slopes = jax.vmap(jax.jacfwd(lambda w: quaternion.log(quaternion.exp(w))))(vectors)
+    assert np.max(abs(slopes - np.eye(3))) < {"float32": 1e-6, "float64": 2e-15}[dtype]
+
+
+def test_the_long_way_round_is_not_taken(dtype):
+    """A turn of 5 rad is one of 2π - 5 the other way."""
+    unit = exp(jnp.asarray([[0, 5.0, 0]], dtype))
+    np.testing.assert_allclose(log(unit)[0], [0, 5 - 2 * np.pi, 0], rtol=1e-6)
+
+
+def test_slerp_matches_scipy(dtype, rng):
+    ends = drawn(rng, 2)
+    line = scipy.spatial.transform.Slerp([0, 1], scipy_of(ends))
+    start, end = jnp.asarray(ends, dtype)
+    for fraction in (0.0, 0.2, 0.7, 1.0):
+        for sign in (1, -1):
+            found = quaternion.slerp(start, sign * end, jnp.asarray(fraction, dtype))
+            error = (scipy_of(found).inv() * line(fraction)).magnitude()
+            assert error < {"float32": 1e-6, "float64": 3e-15}[dtype]
+
+
+def test_slerp_between_equal_ends_has_a_gradient(dtype):
+    start = quaternion.identity(jnp.dtype(dtype))
+    slope = jax.jacrev(
+        lambda end: quaternion.slerp(start, end, jnp.asarray(0.5, dtype))
+    )
+    np.testing.assert_allclose(slope(start)[1:, 1:], np.eye(3) / 2, atol=1e-6)
+
+
+def test_gradients(float64, rng):
+    one, other = jnp.asarray(drawn(rng, 2))
+    weight, vector = (
+        jnp.asarray(rng.normal(size=(3, 3))),
+        jnp.asarray(rng.normal(size=3)),
+    )
+
+    def everything(one, other):
+        matrix = quaternion.to_matrix(
+            quaternion.slerp(one, 1.5 * other, jnp.asarray(0.3))
+        )
+        back = quaternion.log(quaternion.from_matrix(matrix))
+        turned = quaternion.rotate(one, vector)
+        return jnp.sum(matrix * weight) + back @ weight[0] + turned @ weight[1]
+
+    # slerp holds for unit quaternions only: stay on the sphere
+    def on_sphere(one, other):
+        return everything(quaternion.normalise(one), quaternion.normalise(other))
+
+    assert gradients.directional_error(on_sphere, one, other) < 1e-7
+
+
+def test_composition_drifts_slowly(rng):
+    """A thousand products in float32: the norm drifts, the rotation does not."""
+    step = exp(jnp.asarray([[0.01, -0.02, 0.015]]))[0]
+    total = jax.lax.fori_loop(
+        0,
+        1000,
+        lambda _, q: quaternion.normalise(quaternion.multiply(step, q)),
+        quaternion.identity(),
+    )
+    truth = Rotation.from_rotvec(1000 * np.array([0.01, -0.02, 0.015]))
+    assert abs(np.linalg.norm(total) - 1) < 3e-7
+    assert (scipy_of(total).inv() * truth).magnitude() < 5e-5
