@@ -19,7 +19,7 @@ from nerfies_jax.capture.json_files import AnyPath, replaced_file
 # 144 million a picture is 430 MB.
 MAX_PIXELS = 64_000_000
 MAX_EXR_FLOATS = 512_000_000
-_ORIENTATION = 0x0112  # the EXIF tag; 1 is upright
+_ORIENTATION = 0x0112  # the EXIF tag; 1 is upright, 0 unknown
 _PILLOW_ERRORS = (OSError, SyntaxError, ValueError, EOFError, IndexError, TypeError)
 
 
@@ -40,9 +40,7 @@ def read_header(path: AnyPath) -> Header:
         with warnings.catch_warnings():
             warnings.simplefilter("error", PIL.Image.DecompressionBombWarning)
             with PIL.Image.open(path) as image:
-                header = Header(
-                    image.size, image.mode, image.getexif().get(_ORIENTATION, 1)
-                )
+                header = Header(image.size, image.mode, _orientation(image))
     except (PIL.Image.DecompressionBombWarning, PIL.Image.DecompressionBombError):
         raise CaptureError(
             f"{path}: more than {MAX_PIXELS} pixels; make the picture smaller first"
@@ -57,6 +55,15 @@ def read_header(path: AnyPath) -> Header:
             "smaller first"
         )
     return header
+
+
+def _orientation(image):
+    """The EXIF orientation, without decoding: `getexif` of a PNG decodes all of it."""
+    if image.format != "PNG":
+        return image.getexif().get(_ORIENTATION, 1)
+    tags = PIL.Image.Exif()
+    tags.load(image.info.get("exif", b""))
+    return tags.get(_ORIENTATION, 1)
 
 
 def read_pixels(path: AnyPath, orientation: str = "refuse") -> np.ndarray:

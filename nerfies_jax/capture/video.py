@@ -16,7 +16,7 @@ from nerfies_jax.capture.json_files import AnyPath, replaced_file
 def write_video(
     path: AnyPath,
     frames: Iterable[np.ndarray],
-    frames_per_second: float = 30.0,
+    frames_per_second: float | int = 30,
     quality: int = 18,
 ):
     """uint8 sRGB frames [height, width, 3] as H.264, atomically.
@@ -26,6 +26,8 @@ def write_video(
     `yuv420p`, which every player shows, comes in pairs.
     """
     path = pathlib.Path(path)
+    if path.suffix not in (".mp4", ".mov", ".mkv"):
+        raise CaptureError(f"{path}: cannot be written; end its name in .mp4")
     frames = iter(frames)
     first = next(frames, None)
     if first is None:
@@ -35,8 +37,7 @@ def write_video(
             _encode(partial, path, first, frames, frames_per_second, quality)
     except av.FFmpegError as error:
         raise CaptureError(
-            f"{path}: cannot be written ({error.strerror}); end its name in .mp4 and "
-            "choose a folder that exists"
+            f"{path}: cannot be written ({error.strerror}); choose another place"
         ) from None
 
 

@@ -1,0 +1,118 @@
+"""EXR round trips, other people's files, and broken ones."""
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from nerfies_jax.capture import exr
+from nerfies_jax.capture.capture import CaptureError
+
+RNG = np.random.default_rng(0)
+COLOUR = RNG.uniform(0, 50, (5, 7, 3)).astype(np.float32)
+DEPTH = RNG.uniform(1, 1000, (5, 7)).astype(np.float32)
+
+
+def test_float_channels_come_back_bit_for_bit(tmp_path):
+    flow = RNG.normal(size=(5, 7)).astype(np.float32)
+    counts = RNG.integers(0, 2**32, (5, 7), np.uint32)
+    colour = COLOUR.copy()
+    exr.write_exr(
+        tmp_path / "a.exr", colour, DEPTH / 1000, DEPTH, {"flow.x": flow, "id": counts}
+    )
+    np.testing.assert_array_equal(colour, COLOUR)  # OpenEXR keeps hands off our arrays
+    found = exr.read_exr(tmp_path / "a.exr")
+    np.testing.assert_array_equal(found.colour, COLOUR)
+    np.testing.assert_array_equal(found.alpha, DEPTH / 1000)
+    np.testing.assert_array_equal(found.depth, DEPTH)
+    np.testing.assert_array_equal(found.extra["flow.x"], flow)
+    np.testing.assert_array_equal(found.extra["id"], counts)
+    assert found.finite.all()
+    assert [p.name for p in tmp_path.iterdir()] == ["a.exr"]
+
+
+def test_half_rounds_colour_but_not_depth(tmp_path):
+    exr.write_exr(tmp_path / "a.exr", COLOUR, depth=DEPTH, half=True)
+    found = exr.read_exr(tmp_path / "a.exr")
+    np.testing.assert_array_equal(found.colour, COLOUR.astype(np.float16))
+    np.testing.assert_array_equal(found.depth, DEPTH)
+    with pytest.raises(ValueError, match="half=False"):
+        exr.write_exr(tmp_path / "b.exr", COLOUR * 1e4, half=True)
+
+
+def test_nan_and_infinity_are_zeroed_and_marked(tmp_path):
+    depth = DEPTH.copy()
+    depth[1, 2], depth[3, 4] = np.nan, np.inf
+    exr.write_exr(tmp_path / "a.exr", COLOUR, depth=depth)
+    found = exr.read_exr(tmp_path / "a.exr")
+    bad = ~np.isfinite(depth)
+    np.testing.assert_array_equal(found.finite, ~bad)
+    np.testing.assert_array_equal(found.depth, np.where(bad, 0, DEPTH))
+
+
+def test_a_strided_view_is_written_as_it_looks(tmp_path):
+    exr.write_exr(tmp_path / "a.exr", COLOUR[::2, ::-1])
+    found = exr.read_exr(tmp_path / "a.exr")
+    np.testing.assert_array_equal(found.colour, COLOUR[::2, ::-1])
+
+
+def test_a_file_without_our_channels(tmp_path):
+    with OpenEXR.File({}, {"Y": DEPTH.copy(), "mask": DEPTH.copy()}) as file:
+        file.write(str(tmp_path / "a.exr"))
+    found = exr.read_exr(tmp_path / "a.exr")
+    np.testing.assert_array_equal(found.colour[..., 2], DEPTH)
+    assert (found.alpha, found.depth) == (None, None)
+    assert list(found.extra) == ["mask"]
+
+
+@pytest.mark.parametrize("kept", [0, 3, 4, 20, 300, 0.5, 0.9])
+def test_a_file_cut_short_is_refused(tmp_path, kept):
+    exr.write_exr(tmp_path / "a.exr", RNG.random((64, 64, 3), np.float32))
+    data = (tmp_path / "a.exr").read_bytes()
+    cut = int(kept * len(data)) if kept < 1 else int(kept)
+    (tmp_path / "a.exr").write_bytes(data[:cut])
+    with pytest.raises(CaptureError, match=r"a\.exr: not a readable EXR") as caught:
+        exr.read_exr(tmp_path / "a.exr")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_bomb_is_refused_before_it_is_decoded(tmp_path):
+    exr.write_exr(tmp_path / "a.exr", COLOUR)
+    data = (tmp_path / "a.exr").read_bytes()
+    window = np.array([0, 0, 6, 4], "<i4").tobytes()
+    wide = np.array([0, 0, 49_999, 49_999], "<i4").tobytes()
+    assert data.count(window) == 2  # data and display window
+    (tmp_path / "a.exr").write_bytes(data.replace(window, wide))
+    with pytest.raises(CaptureError, match=r"a\.exr: "):
+        exr.read_exr(tmp_path / "a.exr")
+
+
+def test_what_cannot_be_written_is_said(tmp_path):
+    with pytest.raises(ValueError, match="at least one"):
+        exr.write_exr(tmp_path / "a.exr")
+    with pytest.raises(ValueError, match="shapes"):
+        exr.write_exr(tmp_path / "a.exr", COLOUR, depth=DEPTH[1:])
+    with pytest.raises(CaptureError, match="cannot be written"):
+        exr.write_exr(tmp_path / "none/a.exr", COLOUR)
+    with pytest.raises(CaptureError, match="no such picture"):
+        exr.read_exr(tmp_path / "a.exr")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_other_peoples_files(data_dir):
+    folder = data_dir / "openexr_samples"
+    files = sorted(folder.glob("*/*.exr"))
+    assert len(files) >= 16
+    for file in files:
+        found = exr.read_exr(file)
+        assert found.colour is not None or found.extra, file
+        assert found.finite.any()
+    ball = exr.read_exr(folder / "Beachball/singlepart.0001.exr")
+    assert ball.origin == (654, 245)
+    assert ball.colour.shape == (876, 911, 3)
+    assert ball.depth is not None
+    assert "left.R" in ball.extra
+    rings = exr.read_exr(folder / "TestImages/BrightRingsNanInf.exr")
+    assert 0 < (~rings.finite).sum() < 100
+    # Of all 65536 half values, 2048 are NaN or infinite.
+    halves = exr.read_exr(folder / "TestImages/AllHalfValues.exr")
+    assert (~halves.finite).sum() == 2048
