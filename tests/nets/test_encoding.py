@@ -1,0 +1,169 @@
+"""Fourier features against 50-digit arithmetic and the Nerfies code's values."""
+
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+
+from nerfies_jax.nets import encoding
+from nerfies_jax.nets.encoding import EncodingSpec
+from tests import gradients
+
+sincospi = jax.jit(encoding.sincospi)
+
+
+def exact_features(spec, point, window):
+    """Band by band in Python, with 50 digits."""
+    features = list(point) if spec.identity else []
+    with mpmath.workdps(50):
+        factor = mpmath.pi if spec.times_pi else mpmath.mpf(1)
+        for band in range(spec.bands):
+            for function in (mpmath.sin, mpmath.cos):
+                for coordinate in point:
+                    angle = factor * 2**band * mpmath.mpf(float(coordinate))
+                    features.append(float(function(angle)) * window[band])
+    return np.array(features, np.float64)
+
+
+@pytest.mark.parametrize("times_pi", [False, True])
+@pytest.mark.parametrize("identity", [False, True])
+def test_features_band_by_band(identity, times_pi, dtype, rng):
+    spec = EncodingSpec(10, identity, times_pi)
+    point = jnp.asarray(rng.uniform(-1, 1, 3), dtype)
+    window = jnp.asarray(rng.uniform(0, 1, 10), dtype)
+    features = encoding.encode(spec, point, window)
+    assert features.dtype == dtype
+    assert features.shape == (spec.width(3),)
+    truth = exact_features(spec, np.asarray(point), np.asarray(window, np.float64))
+    np.testing.assert_allclose(
+        features, truth, atol={"float32": 2e-7, "float64": 5e-16}[dtype]
+    )
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("size", [1, 10, 1e3, 1e4])
+def test_half_turns_stay_exact_for_large_arguments(size, dtype, rng):
+    """sin(2^15 π x) rounded before the reduction is off by 6e-3, at 1e4 by 1."""
+    x = jnp.asarray(2.0**15 * size * rng.uniform(-1, 1, 200), dtype)
+    with mpmath.workdps(50):
+        exact = [mpmath.mpf(float(value)) for value in x]
+        truth = np.array(
+            [[mpmath.sinpi(v), mpmath.cospi(v)] for v in exact], np.float64
+        )
+    error = np.abs(np.stack(sincospi(x), axis=1) - truth)
+    assert error.max() < {"float32": 1.5e-7, "float64": 3e-16}[dtype]
+
+
+@pytest.mark.hard_cases
+def test_half_turns_are_exact_on_the_axes(dtype):
+    quarters = np.arange(-8, 9)
+    sine, cosine = sincospi(jnp.asarray(quarters / 2, dtype))
+    assert np.array_equal(sine, np.array([0, 1, 0, -1])[quarters % 4])
+    assert np.array_equal(cosine, np.array([1, 0, -1, 0])[quarters % 4])
+
+
+def test_half_turns_are_continuous_at_the_quadrant_seams(dtype):
+    seams = np.arange(-7, 8, 2) / 4
+    x = np.concatenate([seams * (1 - 1e-6), seams, seams * (1 + 1e-6)])
+    sine, cosine = sincospi(jnp.asarray(x, dtype))
+    rounded = np.asarray(x, dtype).astype(np.float64)
+    bound = {"float32": 1.5e-7, "float64": 3e-16}[dtype]
+    assert np.max(abs(sine - np.sin(np.pi * rounded))) < bound + 1e-15
+    assert np.max(abs(cosine - np.cos(np.pi * rounded))) < bound + 1e-15
+
+
+@pytest.mark.parametrize("times_pi", [False, True])
+def test_gradient_and_curvature(times_pi, float64, rng):
+    spec = EncodingSpec(4, times_pi=times_pi)
+    point, window = (
+        jnp.asarray(rng.uniform(-1, 1, 3)),
+        jnp.asarray(rng.uniform(0, 1, 4)),
+    )
+    weight = jnp.asarray(rng.normal(size=spec.width(3)))
+
+    def value(point, window):
+        return encoding.encode(spec, point, window) @ weight
+
+    def slope(point, window):
+        return jnp.sum(jax.grad(value)(point, window) * weight[:3])
+
+    assert gradients.directional_error(value, point, window) < 1e-7
+    assert gradients.directional_error(slope, point, window) < 1e-7
+
+
+@pytest.mark.hard_cases
+def test_the_gradient_of_a_high_band_keeps_its_digits(dtype):
+    """π 2⁹ cos(2⁹ π x): the naive product is 1e-4 off in float32."""
+    spec = EncodingSpec(10, identity=False, times_pi=True)
+    point = jnp.asarray([0.7371], dtype)
+    slopes = jax.jacfwd(lambda p: encoding.encode(spec, p, None))(point)[-2, 0]
+    with mpmath.workdps(50):
+        truth = 512 * mpmath.pi * mpmath.cospi(512 * mpmath.mpf(float(point[0])))
+    assert abs(slopes / (512 * np.pi) - float(truth) / (512 * np.pi)) < 3e-7
+
+
+def test_nerfies_features_and_windows(oracle_dir, dtype):
+    values = np.load(oracle_dir / "nerfies.npz")
+    name = {"float32": "unit", "float64": "unit64"}[dtype]
+    points = jnp.asarray(np.array(values["unit/posenc/x"]), dtype)
+    # the reference writes cos x as sin(x + π/2), which costs it digits in float32
+    bound = {"float32": 2e-5, "float64": 3e-14}[dtype]
+    for bands in (1, 4, 8):
+        spec = EncodingSpec(bands)
+        features = jax.vmap(lambda p, s=spec: encoding.encode(s, p, None))(points)
+        np.testing.assert_allclose(
+            features, values[f"{name}/posenc/F{bands}"], atol=bound
+        )
+    for alpha in (0.0, 0.5, 1.0, 3.3, 8.0):
+        window = encoding.anneal(8, jnp.asarray(alpha, dtype))
+        truth = values[f"{name}/window/F8_a{alpha}"]
+        np.testing.assert_allclose(window, truth, atol=min(bound, 2e-7))
+        features = jax.vmap(lambda p, w=window: encoding.encode(EncodingSpec(8), p, w))(
+            points
+        )
+        np.testing.assert_allclose(
+            features, values[f"{name}/annealed/F8_a{alpha}"], atol=bound
+        )
+
+
+@pytest.mark.hard_cases
+def test_the_window_is_exact_at_its_ends_and_opens_smoothly(dtype):
+    anneal = jax.jit(lambda alpha: encoding.anneal(6, alpha))
+    assert np.array_equal(anneal(jnp.asarray(0, dtype)), np.zeros(6))
+    assert np.array_equal(anneal(jnp.asarray(6, dtype)), np.ones(6))
+    opening = np.stack([anneal(jnp.asarray(a, dtype)) for a in np.linspace(-1, 7, 65)])
+    assert np.all(np.diff(opening, axis=0) >= 0)
+    # (1 - cos) / 2 is 20 % off here in float32
+    small = anneal(jnp.asarray(1e-4, dtype))[0]
+    assert abs(small / np.sin(np.pi * np.float64(np.float32(1e-4)) / 2) ** 2 - 1) < 1e-6
+    slope = jax.jacfwd(lambda alpha: encoding.anneal(6, alpha))
+    for alpha in (0, 1e-20, 2, 2.5, 6):
+        assert np.all(np.isfinite(slope(jnp.asarray(alpha, dtype))))
+    assert np.all(slope(jnp.asarray(0, dtype)) == 0)
+
+
+def test_a_shut_window_leaves_the_identity_alone():
+    point = jnp.asarray([0.3, -0.4])
+    features = encoding.encode(EncodingSpec(3), point, jnp.zeros(3))
+    assert np.array_equal(features[:2], point)
+    assert np.all(features[2:] == 0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"bands": -1}, "bands=-1"),
+        ({"bands": 25}, "bands=25"),
+        ({"bands": 0, "identity": False}, "no features"),
+    ],
+)
+def test_impossible_encodings_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        EncodingSpec(**arguments)
+
+
+def test_no_bands_is_the_identity():
+    assert np.array_equal(
+        encoding.encode(EncodingSpec(0), jnp.ones(3), None), np.ones(3)
+    )
