@@ -85,7 +85,7 @@ def _sway(filmed, target, up, phase):
     offset = centres - middle
     wide = np.quantile(np.abs(offset @ right), 0.7)
     high = np.quantile(np.abs(offset @ upward), 0.7)
-    # A camera that hardly moved still sways a little, or nothing would be seen in depth.
+    # A camera that hardly moved still sways a little, to show depth.
     least = 0.03 * np.linalg.norm(target - middle)
     wide, high = max(wide, least), max(high, least / 2)
     return (

@@ -91,12 +91,12 @@ class Changed(NamedTuple):
 
 def empty_stats(rows: Splats) -> RowStats:
     """Nothing observed yet."""
-    zero = jnp.zeros_like(rows.opacity_logit)
+    like = rows.opacity_logit
     return RowStats(
         alive=splats.alive(rows),
-        gradient=zero,
-        views=jnp.zeros(zero.shape, jnp.int32),
-        radius_px=zero,
+        gradient=jnp.zeros_like(like),
+        views=jnp.zeros(like.shape, jnp.int32),
+        radius_px=jnp.zeros_like(like),  # its own buffer: the loop donates them all
     )
 
 

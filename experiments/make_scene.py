@@ -1,0 +1,68 @@
+"""Film a built-in moving scene into a Nerfies directory, with its truth beside.
+
+python -m experiments.make_scene OUT [--preset NAME] [--frames N] [--set path=value]
+"""
+
+import dataclasses
+import pathlib
+from typing import Literal
+
+from experiments import settings
+
+Preset = Literal[
+    "default",
+    "static",
+    "rigid",
+    "non-rigid",
+    "articulated",
+    "exposure",
+    "transient",
+    "specular",
+]
+
+
+@dataclasses.dataclass(frozen=True)
+class MakeScene:
+    """Film a built-in moving scene into a Nerfies directory.
+
+    `truth.npz` beside it holds flow, point tracks, thing ids and transient masks.
+    """
+
+    out: settings.Positional[pathlib.Path]
+    """Folder to write; must not hold anything yet."""
+    preset: Preset = "default"
+    """Which scene."""
+    frames: int | None = None
+    """Instants to film; the preset's own number if not given."""
+    size: tuple[int, int] | None = None
+    """Width and height in pixels; the preset's own if not given."""
+    seed: int = 0
+    """Moves the hand and the exposure, and draws the points; not the things."""
+    set: tuple[str, ...] = ()
+    """Any other setting of the scene, as path.to.field=value."""
+    device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
+    """Where to trace the rays."""
+
+
+def main(arguments=None):
+    """Parse, film, write, and say where it is."""
+    asked = settings.parse(MakeScene, arguments)
+    with settings.user_errors():
+        settings.start_jax(asked.device)
+        from nerfies_jax.capture import synthetic
+
+        given = {"frames": asked.frames, "size": asked.size}
+        given = {name: value for name, value in given.items() if value is not None}
+        spec = dataclasses.replace(synthetic.PRESETS[asked.preset], **given)
+        spec = settings.override(spec, asked.set)
+        synthetic.write(spec, asked.out, asked.seed)
+    width, height = spec.size
+    print(
+        f"{asked.out}: {spec.name}, {spec.frames} instants at {width}x{height}, "
+        f"truth in {asked.out / synthetic.TRUTH_FILE}\n"
+        f"next: python -m experiments.reconstruct {asked.out}"
+    )
+
+
+if __name__ == "__main__":
+    main()

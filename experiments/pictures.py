@@ -1,0 +1,299 @@
+"""Pictures that let a person judge a run: comparisons, colour codes, sheets, a curve.
+
+Everything takes NumPy arrays and gives uint8 [height, width, 3], or writes one PNG.
+"""
+
+import functools
+import math
+import pathlib
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import matplotlib
+import matplotlib.colors
+import numpy as np
+import PIL.Image
+import PIL.ImageDraw
+import PIL.ImageFont
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from nerfies_jax.capture import images
+from nerfies_jax.capture.json_files import replaced_file
+
+PANEL_WIDTH = 256  # pixels at least: smaller pictures are enlarged so labels fit
+GAP = 6  # pixels between panels
+TEXT_HEIGHT = 15
+INK, PAPER, FADED = (32, 33, 36), (255, 255, 255), (110, 113, 120)
+UNKNOWN = (128, 128, 128)  # grey is in none of the colour maps
+ERROR_MAP, DEPTH_MAP = "inferno", "viridis"
+# The share of depths beyond each end of the shown range; one stray splat in front of
+# the camera would otherwise turn the whole picture into one colour.
+STRAY_SHARE = 0.01
+
+
+class Coloured(NamedTuple):
+    """A quantity as a picture, and the values its two ends stand for."""
+
+    picture: np.ndarray  # [..., height, width, 3] uint8
+    low: float
+    high: float
+
+
+class History(NamedTuple):
+    """How a run went, one entry for each evaluation."""
+
+    seconds: Sequence[float]  # of training, compilation included
+    psnr: Sequence[float]  # dB, held-out frames
+
+
+def colour_depth(
+    depth: np.ndarray,
+    known: np.ndarray | None = None,
+    limits: tuple[float, float] | None = None,
+) -> Coloured:
+    """Depth in the colours of viridis, near bright and far dark; unknown grey.
+
+    One range for all pictures given, `limits` or the 1st to 99th percentile of what is
+    known (finite, positive and `known`), so that frames can be compared.
+    """
+    depth = np.asarray(depth, np.float32)
+    shown = np.isfinite(depth) & (depth > 0)
+    shown = shown if known is None else shown & known
+    if limits is None:
+        limits = _limits(depth[shown])
+    low, high = limits
+    nearness = 1 - np.where(shown, depth - low, 0) / _span(low, high)
+    return Coloured(_mapped(nearness, shown, DEPTH_MAP), low, high)
+
+
+def colour_error(image: np.ndarray, truth: np.ndarray, largest: float) -> Coloured:
+    """Mean absolute difference over the channels of pictures in [0, 1].
+
+    Black is 0, light yellow `largest` and more; grey where either is not finite.
+    """
+    if not largest > 0:
+        raise ValueError(
+            f"the error that is drawn brightest is positive, got {largest}"
+        )
+    error = np.mean(np.abs(as_unit(image) - as_unit(truth)), axis=-1)
+    shown = np.isfinite(error)
+    return Coloured(
+        _mapped(np.where(shown, error, 0) / largest, shown, ERROR_MAP), 0, largest
+    )
+
+
+def colour_flow(flow: np.ndarray, largest: float | None = None) -> Coloured:
+    """Image motion [..., height, width, 2]: direction as hue, length as saturation.
+
+    Still is white, right is red, down yellow-green, left cyan and up violet; full
+    colour from `largest` pixels on (the 99th percentile of the lengths by default).
+    Unknown is grey.
+    """
+    flow = np.asarray(flow, np.float32)
+    shown = np.all(np.isfinite(flow), axis=-1)
+    flow = np.where(shown[..., None], flow, 0)
+    length = np.linalg.norm(flow, axis=-1)
+    if largest is None:
+        largest = (
+            float(np.quantile(length[shown], 1 - STRAY_SHARE)) if shown.any() else 1
+        )
+    hue = np.arctan2(flow[..., 1], flow[..., 0]) / (2 * np.pi) % 1
+    saturation = np.clip(length / (largest or 1), 0, 1)
+    colour = matplotlib.colors.hsv_to_rgb(
+        np.stack([hue, saturation, np.ones_like(hue)], axis=-1)
+    )
+    picture = np.where(shown[..., None], as_bytes(colour), np.uint8(UNKNOWN))
+    return Coloured(picture, 0.0, float(largest))
+
+
+def comparison(
+    truth: np.ndarray,
+    render: np.ndarray,
+    depth: np.ndarray,
+    captions: Sequence[str],
+    largest_error: float = 0.2,
+    known_depth: np.ndarray | None = None,
+) -> np.ndarray:
+    """Truth, render, error and depth side by side, one row for each frame.
+
+    Pictures [frames, height, width, 3] (uint8, or floats in [0, 1]), depth [frames,
+    height, width] in scene units with one colour range over all rows. `captions` stand
+    above the rows; the bars below say what the colours mean.
+    """
+    frames = len(truth)
+    if not (len(render) == len(depth) == len(captions) == frames > 0):
+        raise ValueError(
+            "a comparison pairs frames, got "
+            f"{frames} true, {len(render)} rendered, {len(depth)} depths and "
+            f"{len(captions)} captions; pass one of each for every row"
+        )
+    error = colour_error(render, truth, largest_error)
+    coloured_depth = colour_depth(depth, known_depth)
+    columns = [as_bytes(truth), as_bytes(render), error.picture, coloured_depth.picture]
+    columns = [_enlarged(column) for column in columns]
+    width = columns[0].shape[2]
+    titles = ("truth", "render", "error", "depth")
+    rows = [_beside([_text(title, width, bold=True) for title in titles])]
+    for frame, caption in enumerate(captions):
+        rows.append(_text(caption, 4 * width + 3 * GAP, colour=FADED))
+        rows.append(_beside([column[frame] for column in columns]))
+    blank = _paper(2 * TEXT_HEIGHT + 6, width)
+    far, near = coloured_depth.high, coloured_depth.low
+    rows.append(
+        _beside(
+            [
+                blank,
+                blank,
+                _bar(ERROR_MAP, f"{error.low:g}", f"{error.high:g} and more", width),
+                _bar(DEPTH_MAP, f"{far:.3g} far", f"near {near:.3g}", width),
+            ]
+        )
+    )
+    return _framed(_stacked(rows))
+
+
+def contact_sheet(
+    pictures: Sequence[np.ndarray], captions: Sequence[str], columns: int = 4
+) -> np.ndarray:
+    """Captioned pictures of one size in a grid, read row by row."""
+    if not len(pictures) == len(captions) > 0:
+        raise ValueError(
+            f"a contact sheet needs one caption for each picture, got {len(pictures)} "
+            f"pictures and {len(captions)} captions"
+        )
+    cells = _enlarged(np.stack([as_bytes(picture) for picture in pictures]))
+    cells = [
+        _stacked([cell, _text(caption, cell.shape[1], colour=FADED)])
+        for cell, caption in zip(cells, captions, strict=True)
+    ]
+    columns = min(columns, len(cells))
+    cells += [_paper(*cells[0].shape[:2])] * (-len(cells) % columns)
+    rows = [_beside(cells[i : i + columns]) for i in range(0, len(cells), columns)]
+    return _framed(_stacked(rows))
+
+
+def curve(histories: Mapping[str, History], path: str | pathlib.Path):
+    """PSNR of the held-out frames against seconds of training, as a PNG.
+
+    One line for each named history, with a mark at every evaluation; evaluations that
+    are not finite leave a gap.
+    """
+    if not any(len(history.seconds) for history in histories.values()):
+        raise ValueError(f"{path}: no evaluation to draw; evaluate at least once")
+    figure = Figure(figsize=(7.2, 4.2), dpi=130, layout="constrained")
+    FigureCanvasAgg(figure)  # no pyplot: it keeps every figure and a global state
+    axes = figure.add_subplot()
+    for name, history in histories.items():
+        (line,) = axes.plot(
+            history.seconds, history.psnr, marker="o", markersize=3.5, label=name
+        )
+        if len(history.psnr) and math.isfinite(history.psnr[-1]):
+            axes.annotate(
+                f"{history.psnr[-1]:.2f} dB",
+                (history.seconds[-1], history.psnr[-1]),
+                xytext=(0, 7),
+                textcoords="offset points",
+                ha="right",
+                color=line.get_color(),
+            )
+    axes.set_xlabel("seconds of training (compilation included)")
+    axes.set_ylabel("PSNR of held-out frames (dB)")
+    axes.margins(y=0.12)
+    axes.grid(alpha=0.3)
+    axes.spines[["top", "right"]].set_visible(False)
+    if len(histories) > 1:
+        axes.legend(frameon=False, loc="lower right")
+    with replaced_file(path) as partial:
+        figure.savefig(partial)
+
+
+def save(picture: np.ndarray, path: str | pathlib.Path):
+    """As a PNG, written atomically."""
+    images.write_png(path, picture)
+
+
+def as_bytes(picture: np.ndarray) -> np.ndarray:
+    """uint8 of a picture that is uint8 already or has floats in [0, 1]; NaN is black."""
+    if picture.dtype == np.uint8:
+        return picture
+    return np.round(np.clip(np.nan_to_num(picture, nan=0.0), 0, 1) * 255).astype(
+        np.uint8
+    )
+
+
+def as_unit(picture: np.ndarray) -> np.ndarray:
+    """float32 in [0, 1] of a picture that is uint8 or has floats already."""
+    if picture.dtype == np.uint8:
+        return picture.astype(np.float32) / 255
+    return np.clip(picture, 0, 1).astype(np.float32)
+
+
+def _limits(values):
+    if values.size == 0:
+        return 0.0, 1.0
+    low, high = np.quantile(values, [STRAY_SHARE, 1 - STRAY_SHARE])
+    return float(low), float(high)
+
+
+def _span(low, high):
+    return high - low if high > low else 1.0  # a flat depth has one colour
+
+
+def _mapped(unit, shown, name):
+    table = _table(name)
+    index = np.round(np.clip(unit, 0, 1) * 255).astype(np.uint8)
+    return np.where(shown[..., None], table[index], np.uint8(UNKNOWN))
+
+
+@functools.cache
+def _table(name):
+    return as_bytes(matplotlib.colormaps[name](np.arange(256))[:, :3])
+
+
+@functools.cache
+def _font(bold):
+    # The one font that is certainly installed: matplotlib brings it along.
+    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
+    path = pathlib.Path(matplotlib.get_data_path()) / "fonts" / "ttf" / name
+    return PIL.ImageFont.truetype(str(path), 12)
+
+
+def _text(words, width, colour=INK, bold=False, align="left"):
+    strip = PIL.Image.new("RGB", (width, TEXT_HEIGHT), PAPER)
+    draw = PIL.ImageDraw.Draw(strip)
+    at = 0 if align == "left" else width - draw.textlength(words, font=_font(bold))
+    draw.text((at, 0), words, fill=colour, font=_font(bold))
+    return np.asarray(strip)
+
+
+def _bar(name, left, right, width):
+    """The colour map from its low to its high end, with the two values below it."""
+    ramp = _table(name)[np.linspace(0, 255, width).astype(int)]
+    ends = np.minimum(_text(left, width), _text(right, width, align="right"))
+    return _stacked([np.repeat(ramp[None], TEXT_HEIGHT, 0), ends])
+
+
+def _enlarged(pictures):
+    """By a whole factor and without smoothing: what is seen is what was rendered."""
+    factor = max(1, math.ceil(PANEL_WIDTH / pictures.shape[2]))
+    return pictures.repeat(factor, 1).repeat(factor, 2)
+
+
+def _paper(height, width):
+    return np.full((height, width, 3), PAPER, np.uint8)
+
+
+def _beside(panels):
+    gap = _paper(panels[0].shape[0], GAP)
+    spaced = [part for panel in panels for part in (panel, gap)][:-1]
+    return np.concatenate(spaced, axis=1)
+
+
+def _stacked(rows):
+    gap = _paper(GAP, rows[0].shape[1])
+    return np.concatenate([part for row in rows for part in (row, gap)][:-1], axis=0)
+
+
+def _framed(picture):
+    return np.pad(picture, ((GAP, GAP), (GAP, GAP), (0, 0)), constant_values=255)

@@ -1,0 +1,128 @@
+"""A run: which capture, which scene, and the folder that holds what came of it."""
+
+import dataclasses
+import json
+import pathlib
+from typing import NamedTuple
+
+import jax
+
+from experiments import settings as run_settings
+from gaussians_jax import presets as splat_presets
+from gaussians_jax import scene as splat_scene
+from nerfies_jax import capture as captures
+from nerfies_jax.capture import undistort
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.capture.synthetic import make
+from nerfies_jax.capture.synthetic import presets as synthetic_presets
+from nerfies_jax.training import checkpoint
+from nerfies_jax.training.model import Model
+
+CONFIG = "config.json"
+CHECKPOINTS = "checkpoints"
+
+
+@dataclasses.dataclass(frozen=True)
+class Choices:
+    """What fixes a run: kept in its `config.json` and enough to open it again."""
+
+    capture: str | None  # folder; None for the built-in scene
+    scene: str  # which built-in scene, where there is no capture
+    preset: str
+    steps: int | None
+    overrides: tuple[str, ...]
+    factor: int | None
+    max_side: int | None
+    heldout: str | None
+    seed: int
+
+
+class Run(NamedTuple):
+    """Everything that a run is made of before its first step."""
+
+    choices: Choices
+    capture: Capture
+    spec: splat_scene.SplatScene
+    model: Model
+
+
+def open_run(choices: Choices) -> Run:
+    """Read the capture and build the model. ValueErrors name what the user can mend."""
+    spec = scene_spec(choices)
+    capture = read_capture(choices)
+    model = splat_scene.build(spec, splat_scene.facts_of(capture))
+    return Run(choices, capture, spec, model)
+
+
+def scene_spec(choices: Choices) -> splat_scene.SplatScene:
+    """The preset with its overrides."""
+    named = splat_presets.PRESETS
+    if choices.preset not in named:
+        raise ValueError(
+            f"--preset {choices.preset}: no such preset; there are "
+            + ", ".join(sorted(named))
+        )
+    spec = named[choices.preset]
+    if choices.steps is not None:
+        spec = splat_presets.with_steps(spec, choices.steps)
+    return run_settings.override(spec, choices.overrides)
+
+
+def read_capture(choices: Choices) -> Capture:
+    """The capture asked for, ready for a pinhole renderer."""
+    if choices.capture is None:
+        if choices.scene not in synthetic_presets.PRESETS:
+            raise ValueError(
+                f"--scene {choices.scene}: no such built-in scene; there are "
+                + ", ".join(synthetic_presets.PRESETS)
+            )
+        scene = synthetic_presets.PRESETS[choices.scene]
+        capture, _ = make.cached(scene, run_settings.CACHE / "scenes", choices.seed)
+        return capture
+    heldout = choices.heldout
+    if heldout is not None and heldout.isdigit():
+        heldout = int(heldout)
+    capture = captures.load(
+        choices.capture,
+        factor=choices.factor,
+        max_side=choices.max_side,
+        heldout=heldout,
+    )
+    return undistort.undistorted(capture)
+
+
+def save_choices(folder: pathlib.Path, run: Run) -> None:
+    """`config.json`: the choices, the whole spec they led to, and what made it."""
+    run_settings.write_json(
+        folder / CONFIG,
+        {
+            "choices": run_settings.as_json(run.choices),
+            "spec": run_settings.as_json(run.spec),
+            "made by": checkpoint.provenance(),
+        },
+    )
+
+
+def saved_choices(folder: pathlib.Path) -> Choices:
+    """The choices of the run in a folder."""
+    path = folder / CONFIG
+    if not path.is_file():
+        raise ValueError(
+            f"{folder}: no run here (there is no {CONFIG}); name the folder that "
+            "experiments.reconstruct printed"
+        )
+    try:
+        stored = json.loads(path.read_text())["choices"]
+        stored.pop("kind")
+        stored["overrides"] = tuple(stored["overrides"])
+        return Choices(**stored)
+    except (KeyError, TypeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{path}: not the settings of a run ({error})") from error
+
+
+def restore(folder: pathlib.Path, run: Run) -> checkpoint.Restored:
+    """The newest state saved in a run folder."""
+    example = jax.eval_shape(
+        lambda: run.model.init(run.capture, jax.random.key(run.choices.seed))
+    )
+    return checkpoint.restore(folder / CHECKPOINTS, example, run.model.spec)
