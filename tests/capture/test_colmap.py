@@ -226,13 +226,14 @@ def test_times_follow_the_numbers_when_frames_are_missing(tmp_path):
 
 
 def test_black_wedges_at_the_rim_are_not_filmed():
-    images = np.full((3, 40, 50, 3), 90, np.uint8)
-    images[1, :6, 10:40] = 1  # touches the rim
+    images = np.full((4, 40, 50, 3), 90, np.uint8)
+    images[1, :6, 10:40] = 0  # touches the rim
     images[1, 20:24, 20:24] = 0  # a dark thing inside
     images[2] = 0  # a dark scene
+    images[3, :6, 10:40] = np.random.default_rng(0).integers(0, 3, (6, 30, 3))  # cloth
     found = black_borders(images)
     assert not found[0].any()
-    assert not found[2].any()
+    assert not found[2:].any()
     expected = np.zeros((40, 50), bool)
     expected[:8, 8:42] = True  # and two pixels around
     np.testing.assert_array_equal(found[1], expected)

@@ -48,8 +48,11 @@ def test_every_other_frame_and_at_most_so_many(tmp_path):
     assert len(list(video.read_video(tmp_path / "a.mp4", most=2))) == 2
 
 
-@pytest.mark.parametrize(("turn", "expected"), [(90, (46, 32)), (180, (32, 46))])
-def test_a_phones_rotation_is_carried_out(tmp_path, turn, expected):
+@pytest.mark.parametrize(
+    ("turn", "expected", "mark"),
+    [(90, (46, 32), (-4, 4)), (180, (32, 46), (-4, -4)), (-90, (46, 32), (4, -4))],
+)
+def test_a_phones_rotation_is_carried_out(tmp_path, turn, expected, mark):
     frame = np.zeros((32, 46, 3), np.uint8)
     frame[:8, :8] = 255  # a mark in the top left corner of what is stored
     with av.open(str(tmp_path / "a.mp4"), "w") as container:
@@ -57,13 +60,15 @@ def test_a_phones_rotation_is_carried_out(tmp_path, turn, expected):
         stream.width, stream.height, stream.pix_fmt = 46, 32, "yuv420p"
         if not hasattr(stream, "set_display_rotation"):
             pytest.skip("this PyAV cannot write the tag")
-        stream.set_display_rotation(turn)
+        stream.set_display_rotation(turn)  # degrees against the clock
         for _ in range(3):
             picture = av.VideoFrame.from_ndarray(frame, format="rgb24")
             container.mux(stream.encode(picture))
         container.mux(stream.encode())
     _, found = next(iter(video.read_video(tmp_path / "a.mp4")))
     assert found.shape[:2] == expected
+    assert found[mark].min() > 200
+    assert found[-mark[0], mark[1]].max() < 60
 
 
 def test_what_is_no_film_is_refused(tmp_path):

@@ -1,0 +1,114 @@
+"""Cameras from pictures of a textured room, in a process of their own."""
+
+import numpy as np
+import PIL.Image
+import pytest
+import scipy.ndimage
+
+from nerfies_jax import capture as room
+from nerfies_jax.capture import structure_from_motion as mapping
+from nerfies_jax.capture.capture import CaptureError
+from nerfies_jax.geometry import camera
+
+SIZE = (240, 180)
+FOCAL = 220.0
+
+
+def render(one, textures):
+    """Two textured planes, z = 4 behind and z = 3 for x > 0, by intersecting rays."""
+    width, height = SIZE
+    y, x = np.mgrid[:height, :width] + 0.5
+    inner = np.stack([(x - width / 2) / FOCAL, (y - height / 2) / FOCAL, x * 0 + 1], -1)
+    ray = inner @ one.camera_from_world.astype(float)
+    picture = None
+    for depth, texture in zip((4.0, 3.0), textures, strict=True):
+        reach = (depth - one.position[2]) / ray[..., 2]
+        hit = one.position + reach[..., None] * ray
+        place = np.stack([hit[..., 1] * 90 + 400, hit[..., 0] * 90 + 400])
+        seen = scipy.ndimage.map_coordinates(texture, place, order=1, mode="mirror")
+        front = hit[..., 0] > 0
+        picture = seen if picture is None else np.where(front, seen, picture)
+    return np.repeat(np.clip(picture, 0, 255).astype(np.uint8)[..., None], 3, -1)
+
+
+def film(folder, count, plain=False):
+    rng = np.random.default_rng(0)
+    textures = [
+        np.full((800, 800), 128.0)
+        if plain
+        else 128
+        + 60 * scipy.ndimage.zoom(rng.normal(size=(200, 200)), 4, order=1).clip(-2, 2)
+        for _ in range(2)
+    ]
+    folder.mkdir(parents=True)
+    cameras = []
+    for row in range(count):
+        place = [0.9 * np.sin(0.5 * row), -0.4 * np.cos(0.7 * row), 0.1 * row]
+        one = camera.look_at(place, [0.1, 0, 3.5], [0, -1, 0], FOCAL, SIZE)
+        cameras.append(one)
+        PIL.Image.fromarray(render(one, textures)).save(folder / f"f{row:02d}.png")
+    return cameras
+
+
+def aligned(found, true):
+    """Error of camera centres after the best similarity, relative to their spread."""
+    found, true = found - found.mean(0), true - true.mean(0)
+    u, values, v = np.linalg.svd(true.T @ found)
+    scale = values.sum() / (found**2).sum()
+    return np.linalg.norm(true - scale * found @ (u @ v).T, axis=1).max() / np.ptp(true)
+
+
+@pytest.mark.slow
+def test_cameras_of_a_textured_room_are_found(tmp_path):
+    cameras = film(tmp_path / "pictures", 8)
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    for row in range(8):
+        mask = np.full((SIZE[1], SIZE[0]), 255, np.uint8)
+        mask[:20] = 0
+        PIL.Image.fromarray(mask).save(masks / f"f{row:02d}.png.png")
+    spec = mapping.MappingSpec(
+        camera_model="SIMPLE_PINHOLE", first_octave=-1, threads=2
+    )
+    out = mapping.run_sfm(tmp_path / "pictures", tmp_path / "out", masks, spec)
+    found = room.load(out)
+    assert len(found.ids) == 8
+    true = np.array([one.position for one in cameras], float)
+    assert aligned(found.cameras.position.astype(float), true) < 0.02
+    np.testing.assert_allclose(found.cameras.focal_px, FOCAL, rtol=0.05)
+    assert found.moving[:, :20].all()
+    assert not found.moving[:, 20:].any()
+    # No feature lies under a mask: every point projects below it where it was seen.
+    assert sorted(p.name for p in out.iterdir()) == ["images", "masks", "sparse"]
+
+
+@pytest.mark.slow
+def test_pictures_without_texture_are_refused_and_leave_nothing(tmp_path):
+    film(tmp_path / "pictures", 3, plain=True)
+    with pytest.raises(CaptureError, match="only 0 of 3 pictures"):
+        mapping.run_sfm(tmp_path / "pictures", tmp_path / "out")
+    assert [p.name for p in tmp_path.iterdir()] == ["pictures"]
+
+
+def test_what_cannot_work_is_said_before_it_starts(tmp_path):
+    with pytest.raises(CaptureError, match="no such folder"):
+        mapping.run_sfm(tmp_path / "pictures", tmp_path / "out")
+    film(tmp_path / "pictures", 1)
+    with pytest.raises(CaptureError, match="1 pictures"):
+        mapping.run_sfm(tmp_path / "pictures", tmp_path / "out")
+    film(tmp_path / "more", 2)
+    (tmp_path / "masks").mkdir()
+    with pytest.raises(CaptureError, match=r"no mask f00\.png\.png"):
+        mapping.run_sfm(tmp_path / "more", tmp_path / "out", tmp_path / "masks")
+    with pytest.raises(ValueError, match="features=1 "):
+        mapping.MappingSpec(features=1)
+    with pytest.raises(ValueError, match="at_least=2"):
+        mapping.MappingSpec(at_least=2.0)
+
+
+def test_a_child_that_dies_is_an_error_not_our_end(tmp_path, monkeypatch):
+    film(tmp_path / "pictures", 2)
+    monkeypatch.setattr(mapping.sys, "executable", "/bin/false")
+    with pytest.raises(CaptureError, match="ended with code 1"):
+        mapping.run_sfm(tmp_path / "pictures", tmp_path / "out")
+    assert [p.name for p in tmp_path.iterdir()] == ["pictures"]
