@@ -1,0 +1,177 @@
+"""How a synthetic scene is filmed: the hand-held arc, the schedule, the pictures."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from nerfies_jax.capture.synthetic import texture, trace
+from nerfies_jax.capture.synthetic.spec import SceneSpec
+from nerfies_jax.geometry import camera as cameras
+from nerfies_jax.geometry import rays
+from nerfies_jax.geometry.camera import Camera
+
+TILE = 16  # pixels
+SHAKE_HARMONICS = 6  # the fastest tremor takes a sixth of the capture
+
+
+class Schedule(NamedTuple):
+    """What is filmed when and from where, one row per frame. NumPy leaves."""
+
+    instant: np.ndarray  # int32
+    camera_id: np.ndarray  # int32: 0 in the hand, 1 beside it
+    time: np.ndarray  # float32 in [0, 1]
+    learn: np.ndarray  # bool: may be learnt from
+    cameras: Camera
+    light_gain: np.ndarray  # [frames, 3] float32, of linear light
+    transient_shown: np.ndarray  # bool
+
+
+class Picture(NamedTuple):
+    """One frame as filmed; what is not colour belongs to the pixel's centre."""
+
+    image: Float[Array, "height width 3"]  # sRGB-coded in [0, 1], not rounded
+    depth: Float[Array, "height width"]  # z-depth, scene units; 0 for nothing
+    hit: trace.Hit  # [height, width], of rays of z-depth one
+
+
+def schedule(spec: SceneSpec, seed: int) -> Schedule:
+    """All frames: the first camera's in order of time, then the second's."""
+    instants = np.arange(spec.frames)
+    looks = instants[spec.heldout_every // 2 :: spec.heldout_every]
+    instant = np.concatenate([instants, looks])
+    camera_id = np.repeat([0, 1], [len(instants), len(looks)])
+    times = instants / (spec.frames - 1)
+    learn = camera_id == 0
+    if spec.skip_every is not None:
+        learn &= instant % spec.skip_every != spec.skip_every // 2
+    both = [_arc(spec, times, seed, beside) for beside in (False, True)]
+    views = cameras.stack([both[c][i] for c, i in zip(camera_id, instant, strict=True)])
+    shown = np.zeros(len(instant), bool)
+    if spec.transient is not None:
+        for start, stop in spec.transient.windows:
+            here = times[instant]
+            shown |= (camera_id == 0) & (start <= here) & (here <= stop)
+    return Schedule(
+        instant.astype(np.int32),
+        camera_id.astype(np.int32),
+        times[instant].astype(np.float32),
+        learn,
+        views,
+        _light_gain(spec, times, seed)[instant],
+        shown,
+    )
+
+
+def picture(
+    spec: SceneSpec,
+    camera: Camera,
+    time: Float[Array, ""],
+    light_gain: Float[Array, "3"],
+    transient_shown: Bool[Array, ""],
+) -> Picture:
+    """One frame, in square tiles: the cloth costs only those tiles that may show it."""
+
+    def ray(pixel):
+        direction = view_direction(camera, pixel)
+        hit = trace.cast(spec, camera.position, direction, time, transient_shown)
+        # The sensor clips each sample: a highlight must not spill beyond its rim.
+        return jnp.clip(trace.shade(spec, hit, direction, light_gain), 0, 1), hit
+
+    # The centre goes along as a last sample: one program, not two to compile.
+    offsets = _sub_pixels(spec.supersampling, time.dtype)
+
+    def tile(pixels):
+        light, hit = jax.vmap(jax.vmap(ray))(pixels[:, None, :] + offsets)
+        image = texture.srgb(jnp.mean(light[:, :-1], axis=1))
+        return image, jax.tree.map(lambda leaf: leaf[:, -1], hit)
+
+    image, hit = _untiled(jax.lax.map(tile, _tiles(spec.size, time.dtype)), spec.size)
+    # Directions have z-depth one, so the distance along one is the z-depth.
+    depth = jnp.where(hit.thing == trace.NOTHING, 0, hit.distance)
+    return Picture(image, depth, hit)
+
+
+def view_direction(camera: Camera, pixel: Float[Array, "2"]) -> Float[Array, "3"]:
+    """The world direction of z-depth one through a pixel of a camera.
+
+    These cameras have no distortion, which spares each ray an iteration.
+    """
+    slopes = (pixel - camera.principal_point_px) / camera.focal_px
+    in_camera = jnp.concatenate([slopes, jnp.ones_like(slopes[:1])])
+    return jnp.matmul(in_camera, camera.camera_from_world, precision="highest")
+
+
+def _sub_pixels(count, dtype):
+    """Offsets of count x count equal cells from the pixel's centre, and zero."""
+    offsets = (np.arange(count) + 0.5) / count - 0.5
+    grid = np.stack(np.meshgrid(offsets, offsets), axis=-1).reshape(-1, 2)
+    return jnp.asarray(np.concatenate([grid, np.zeros((1, 2))]), dtype)
+
+
+def _tiles(size, dtype):
+    """Pixel centres [tiles, TILE², 2] that cover a picture, and a margin beyond it."""
+    down, across = (-(-length // TILE) for length in size[::-1])
+    centres = rays.pixel_centres((across * TILE, down * TILE), dtype)
+    tiles = centres.reshape(down, TILE, across, TILE, 2).swapaxes(1, 2)
+    return tiles.reshape(down * across, TILE**2, 2)
+
+
+def _untiled(tree, size):
+    """Arrays [tiles, TILE², ...] as [height, width, ...], without the margin."""
+    width, height = size
+    down, across = (-(-length // TILE) for length in (height, width))
+
+    def whole(leaf):
+        rest = leaf.shape[2:]
+        leaf = leaf.reshape(down, across, TILE, TILE, *rest).swapaxes(1, 2)
+        return leaf.reshape(down * TILE, across * TILE, *rest)[:height, :width]
+
+    return jax.tree.map(whole, tree)
+
+
+def _arc(spec, times, seed, beside):
+    """One camera for each time: `beside` shifts the second from the first."""
+    setting = spec.cameras
+    shaking = np.random.default_rng([seed, 1])
+    shake = setting.shake * _smooth_noise(shaking, times, 6)
+    sweep = 2 * np.pi * setting.sweeps * times
+    angle = setting.arc_rad * np.sin(sweep)
+    distance = setting.distance - setting.forward * np.sin(sweep / 2) ** 2
+    target = np.asarray(setting.target) + shake[:, 3:]
+    right = np.stack([np.cos(angle), 0 * angle, -np.sin(angle)], -1)
+    back = np.stack([np.sin(angle), 0 * angle, np.cos(angle)], -1)
+    up = np.array([0.0, 1.0, 0.0])
+    rise = (setting.height + 0.2 * setting.height * np.cos(sweep))[:, None] * up
+    position = setting.target + distance[:, None] * back + rise + shake[:, :3]
+    if beside:
+        across, above, behind = setting.beside
+        position = position + across * right + above * up + behind * back
+    focal_px = spec.size[0] / 2 / np.tan(setting.field_of_view_rad / 2)
+    return [
+        cameras.look_at(eye, aim, up, focal_px, spec.size)
+        for eye, aim in zip(position, target, strict=True)
+    ]
+
+
+def _light_gain(spec, times, seed):
+    gain = np.ones((len(times), 3), np.float32)
+    if spec.exposure is None:
+        return gain
+    drift = _smooth_noise(np.random.default_rng([seed, 2]), times, 3)
+    tint = spec.exposure.tint * drift[:, 1:]
+    channels = np.stack([1 + tint[:, 0], np.ones(len(times)), 1 + tint[:, 1]], -1)
+    return (gain * np.exp2(spec.exposure.stops * drift[:, :1]) * channels).astype(
+        np.float32
+    )
+
+
+def _smooth_noise(rng, times, columns):
+    """[times, columns] of random sums of sines; mean square one over all phases."""
+    harmonics = np.arange(1, SHAKE_HARMONICS + 1)
+    phase = rng.uniform(0, 2 * np.pi, (len(harmonics), columns))
+    weight = np.sqrt(2 / np.sum(1.0 / harmonics**2)) / harmonics
+    waves = np.sin(2 * np.pi * harmonics[:, None] * times[:, None, None] + phase)
+    return np.einsum("h,thc->tc", weight, waves)

@@ -1,0 +1,155 @@
+"""How the things of a synthetic scene move rigidly: closed forms of the time.
+
+World axes: x right, y up, z towards the camera; lengths in scene units. Time runs from
+0 to 1 over the capture. A body's own origin rests at `place` in the world.
+"""
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+Vector = tuple[float, float, float]
+
+
+class Pose(NamedTuple):
+    """Where a body is: `world = rotation @ body + position`."""
+
+    rotation: Float[Array, "3 3"]
+    position: Float[Array, "3"]
+
+
+def unit_axis(axis: Vector) -> Vector:
+    """The axis at length one; refuses one that has no direction."""
+    length = math.hypot(*axis)
+    if not 0 < length < math.inf:
+        raise ValueError(f"axis={axis} has no direction; give one that is not zero")
+    return tuple(float(part / length) for part in axis)
+
+
+@dataclasses.dataclass(frozen=True)
+class Path:
+    """Swings along a Lissajous path and turns about an axis through the body."""
+
+    sway: Vector = (0.0, 0.0, 0.0)  # scene units to either side of the place
+    cycles: Vector = (1.0, 1.0, 1.0)  # per capture, for each direction of sway
+    phase: Vector = (0.0, 0.0, 0.0)  # in cycles
+    axis: Vector = (0.0, 1.0, 0.0)
+    turns: float = 0.0  # per capture
+
+    def __post_init__(self):
+        unit_axis(self.axis)
+
+    def pose(self, place: Vector, time: Float[Array, ""]) -> Pose:
+        """Where the body is at one time."""
+        cycles, phase, sway, rest = (
+            jnp.asarray(value, time.dtype)
+            for value in (self.cycles, self.phase, self.sway, place)
+        )
+        shift = sway * jnp.sin(2 * jnp.pi * (cycles * time + phase))
+        turn = axis_rotation(self.axis, 2 * jnp.pi * self.turns * time)
+        return Pose(turn, rest + shift)
+
+
+@dataclasses.dataclass(frozen=True)
+class Hinge:
+    """One joint; pivot and axis are those of the rest pose, in the world."""
+
+    pivot: Vector
+    axis: Vector = (0.0, 0.0, 1.0)
+    rest_rad: float = 0.0
+    swing_rad: float = 0.5  # to either side of the rest angle
+    cycles: float = 1.0  # per capture
+    phase: float = 0.0  # in cycles
+
+    def __post_init__(self):
+        unit_axis(self.axis)
+
+
+@dataclasses.dataclass(frozen=True)
+class Arm:
+    """A body at the end of a chain of hinges, the one nearest to the ground first.
+
+    The product of exponentials of Brockett 1984: each joint moves everything after it
+    from its rest pose, so the joints apply last to first.
+    """
+
+    hinges: tuple[Hinge, ...]
+
+    def __post_init__(self):
+        if not self.hinges:
+            raise ValueError("an arm needs at least one hinge; use Path() for none")
+
+    def pose(self, place: Vector, time: Float[Array, ""]) -> Pose:
+        """Where the body is at one time."""
+        rotation = jnp.eye(3, dtype=time.dtype)
+        position = jnp.asarray(place, time.dtype)
+        for hinge in reversed(self.hinges):
+            swing = jnp.sin(2 * jnp.pi * (hinge.cycles * time + hinge.phase))
+            turn = axis_rotation(hinge.axis, hinge.rest_rad + hinge.swing_rad * swing)
+            pivot = jnp.asarray(hinge.pivot, time.dtype)
+            rotation = times(turn, rotation)
+            position = times(turn, position - pivot) + pivot
+        return Pose(rotation, position)
+
+
+@dataclasses.dataclass(frozen=True)
+class Glide:
+    """Straight on at constant speed between two times, at rest before and after."""
+
+    travel: Vector  # scene units
+    start: float = 0.0
+    stop: float = 1.0
+
+    def __post_init__(self):
+        if not 0 <= self.start < self.stop <= 1:
+            raise ValueError(
+                f"a glide needs 0 <= start < stop <= 1, got start={self.start} and "
+                f"stop={self.stop}; times run from 0 to 1 over the capture"
+            )
+
+    def pose(self, place: Vector, time: Float[Array, ""]) -> Pose:
+        """Where the body is at one time."""
+        share = jnp.clip((time - self.start) / (self.stop - self.start), 0, 1)
+        travel, rest = (jnp.asarray(x, time.dtype) for x in (self.travel, place))
+        return Pose(jnp.eye(3, dtype=time.dtype), rest + share * travel)
+
+
+Motion = Path | Arm | Glide
+
+
+def pose(motion: Motion | None, place: Vector, time: Float[Array, ""]) -> Pose:
+    """Where a body is at one time; without a motion it stays in its place."""
+    if motion is None:
+        return Pose(jnp.eye(3, dtype=time.dtype), jnp.asarray(place, time.dtype))
+    return motion.pose(place, time)
+
+
+def to_world(pose: Pose, point: Float[Array, "3"]) -> Float[Array, "3"]:
+    """A point of the body, in the world."""
+    return times(pose.rotation, point) + pose.position
+
+
+def to_body(pose: Pose, point: Float[Array, "3"]) -> Float[Array, "3"]:
+    """A point of the world, in the body's own axes."""
+    return times(pose.rotation.T, point - pose.position)
+
+
+def axis_rotation(axis: Vector, angle_rad: Float[Array, ""]) -> Float[Array, "3 3"]:
+    """Rotation about a fixed axis (Rodrigues); smooth in the angle everywhere."""
+    x, y, z = unit_axis(axis)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    first = jnp.asarray(cross, angle_rad.dtype)
+    second = jnp.asarray(cross @ cross, angle_rad.dtype)
+    # 2 sin²(a/2) = 1 - cos a, without its cancellation near zero.
+    versine = 2 * jnp.sin(angle_rad / 2) ** 2
+    eye = jnp.eye(3, dtype=angle_rad.dtype)
+    return eye + jnp.sin(angle_rad) * first + versine * second
+
+
+def times(matrix: Float[Array, "3 3"], other: Float[Array, "3 *n"]):
+    """A matrix product in full precision: a GPU's default keeps ten bits."""
+    return jnp.matmul(matrix, other, precision="highest")

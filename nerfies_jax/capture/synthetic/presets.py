@@ -1,0 +1,181 @@
+"""Named synthetic scenes. Lengths fit a box of unit diagonal, cameras included."""
+
+import dataclasses
+
+from nerfies_jax.capture.synthetic.motion import Arm, Glide, Hinge, Path
+from nerfies_jax.capture.synthetic.shapes import Box, Sheet, Sphere, Squash
+from nerfies_jax.capture.synthetic.spec import (
+    Exposure,
+    SceneSpec,
+    Specular,
+    Thing,
+    Transient,
+)
+from nerfies_jax.capture.synthetic.texture import Texture
+
+FLOOR_Y = -0.17
+
+WALL = Thing(
+    "wall",
+    Box((1.2, 0.7, 0.02)),
+    (0.0, 0.3, -0.3),
+    Texture(
+        dark=(0.36, 0.42, 0.50),
+        light=(0.82, 0.80, 0.72),
+        blot=(0.55, 0.36, 0.34),
+        checker=0.25,
+        checker_size=0.09,
+        stripes=0.3,
+        stripes_per_unit=(14.0, 6.0, 0.0),
+        noise=0.7,
+        noise_size=0.05,
+        blots=0.7,
+        blot_size=0.1,
+    ),
+)
+FLOOR = Thing(
+    "floor",
+    Box((1.2, 0.02, 0.9)),
+    (0.0, FLOOR_Y - 0.02, 0.4),
+    Texture(
+        dark=(0.30, 0.22, 0.17),
+        light=(0.86, 0.74, 0.56),
+        blot=(0.45, 0.42, 0.30),
+        checker=0.8,
+        checker_size=0.07,
+        noise=0.5,
+        noise_size=0.03,
+        blots=0.4,
+        blot_size=0.12,
+    ),
+)
+PLINTH = Thing(
+    "plinth",
+    Box((0.05, 0.07, 0.05)),
+    (-0.2, FLOOR_Y + 0.07, -0.12),
+    Texture(
+        dark=(0.20, 0.33, 0.36),
+        light=(0.70, 0.82, 0.76),
+        blot=(0.88, 0.72, 0.32),
+        checker=0.0,
+        stripes=0.6,
+        stripes_per_unit=(0.0, 45.0, 12.0),
+        noise=0.5,
+        noise_size=0.02,
+        blots=0.5,
+        blot_size=0.03,
+    ),
+)
+GLOBE = Thing(
+    "globe",
+    Sphere(0.055),
+    (-0.2, FLOOR_Y + 0.195, -0.12),
+    Texture(
+        dark=(0.10, 0.28, 0.52),
+        light=(0.35, 0.62, 0.80),
+        blot=(0.72, 0.74, 0.36),
+        checker=0.0,
+        noise=0.9,
+        noise_size=0.04,
+        blots=1.0,
+        blot_size=0.035,
+    ),
+)
+CLOTH = Thing(
+    "cloth",
+    Sheet(half_width=0.095, half_height=0.105),
+    (0.15, 0.045, -0.07),
+    Texture(
+        dark=(0.62, 0.10, 0.14),
+        light=(0.96, 0.88, 0.74),
+        blot=(0.14, 0.20, 0.42),
+        checker=1.0,
+        checker_size=0.038,
+        noise=0.35,
+        noise_size=0.02,
+        blots=0.8,
+        blot_size=0.045,
+    ),
+)
+CUBE = Thing(
+    "cube",
+    Box((0.042, 0.042, 0.042)),
+    (-0.02, -0.06, 0.08),
+    Texture(
+        dark=(0.12, 0.38, 0.22),
+        light=(0.95, 0.80, 0.25),
+        blot=(0.80, 0.30, 0.12),
+        checker=1.0,
+        checker_size=0.021,
+        noise=0.3,
+        noise_size=0.015,
+        blots=0.4,
+        blot_size=0.03,
+    ),
+    Path(
+        sway=(0.1, 0.03, 0.05),
+        cycles=(1.0, 2.0, 1.0),
+        phase=(0.0, 0.0, 0.25),
+        axis=(0.3, 1.0, 0.2),
+        turns=0.75,
+    ),
+)
+BALL = Thing(
+    "ball",
+    Sphere(0.055, Squash(amount=0.3, cycles=2.0)),
+    (0.02, FLOOR_Y + 0.055 + 0.06, 0.06),
+    dataclasses.replace(CUBE.texture, dark=(0.45, 0.10, 0.35), checker_size=0.03),
+    Path(sway=(0.06, 0.06, 0.0), cycles=(1.0, 2.0, 1.0)),
+)
+_SHOULDER = Hinge((0.12, 0.13, -0.02), swing_rad=0.6)
+_ELBOW = Hinge(
+    (0.12, 0.0, -0.02), axis=(0.2, 0.0, 1.0), rest_rad=-0.3, swing_rad=0.8, phase=0.2
+)
+UPPER_ARM = Thing(
+    "upper arm",
+    Box((0.022, 0.065, 0.022)),
+    (0.12, 0.065, -0.02),
+    PLINTH.texture,
+    Arm((_SHOULDER,)),
+)
+FOREARM = Thing(
+    "forearm",
+    Box((0.02, 0.055, 0.02)),
+    (0.12, -0.055, -0.02),
+    CUBE.texture,
+    Arm((_SHOULDER, _ELBOW)),
+)
+PASSER = Thing(
+    "passer",
+    Box((0.035, 0.25, 0.02)),
+    (-0.3, 0.0, 0.3),
+    Texture(dark=(0.1, 0.1, 0.14), light=(0.3, 0.3, 0.36), blot=(0.5, 0.2, 0.2)),
+    Glide((0.6, 0.0, 0.0)),
+)
+STAGE = (WALL, FLOOR, PLINTH, GLOBE)
+
+DEFAULT = SceneSpec("cloth and cube", (*STAGE, CLOTH, CUBE))
+STATIC = SceneSpec(
+    "still life", (*STAGE, dataclasses.replace(CUBE, name="still cube", motion=None))
+)
+RIGID = SceneSpec("cube", (*STAGE, CUBE))
+NON_RIGID = SceneSpec("cloth and ball", (*STAGE, CLOTH, BALL))
+ARTICULATED = SceneSpec("arm", (*STAGE, UPPER_ARM, FOREARM))
+EXPOSED = dataclasses.replace(DEFAULT, name="exposure", exposure=Exposure())
+PASSED = dataclasses.replace(
+    DEFAULT,
+    name="transient",
+    transient=Transient(PASSER, ((0.1, 0.25), (0.45, 0.6), (0.75, 0.9))),
+)
+SHINY = dataclasses.replace(STATIC, name="specular", specular=Specular("globe"))
+
+PRESETS = {
+    "default": DEFAULT,
+    "static": STATIC,
+    "rigid": RIGID,
+    "non-rigid": NON_RIGID,
+    "articulated": ARTICULATED,
+    "exposure": EXPOSED,
+    "transient": PASSED,
+    "specular": SHINY,
+}

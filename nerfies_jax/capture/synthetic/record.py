@@ -1,0 +1,154 @@
+"""A synthetic scene as a `Capture`, in memory, as a directory, or from a cache."""
+
+import dataclasses
+import functools
+import hashlib
+import pathlib
+
+import jax
+import numpy as np
+
+from nerfies_jax.capture import nerfies_format
+from nerfies_jax.capture.capture import Capture, PointCloud
+from nerfies_jax.capture.json_files import AnyPath, new_folder
+from nerfies_jax.capture.synthetic import film, trace, truth
+from nerfies_jax.capture.synthetic.spec import SceneSpec
+from nerfies_jax.capture.synthetic.truth import SceneTruth
+from nerfies_jax.geometry import camera as cameras
+
+VERSION = 1  # raise it when the same spec gives other pictures: caches then renew
+TRUTH_FILE = "truth.npz"  # beside the Nerfies files, which other readers pass over
+
+
+def make(spec: SceneSpec, seed: int = 0) -> tuple[Capture, SceneTruth]:
+    """Film a scene: what a camera would give, and what only the scene knows.
+
+    The first camera's frames are learnt from, the second's scored. The seed moves the
+    hand, the exposure, and which points are drawn; never the things. The same spec and
+    seed give the same bits on the same machine and number of cores.
+    """
+    plan = film.schedule(spec, seed)
+    images, depths, hits = _film(spec, plan)
+    moves = np.array([thing.moves() for thing in spec.all_things()] + [False])
+    moving = moves[hits.thing]  # nothing is id -1: the last row
+    capture = Capture(
+        name=f"synthetic {spec.name}",
+        source="synthetic",
+        ids=tuple(
+            f"{camera}_{instant:05d}"  # readers sort names: the rows stay in order
+            for instant, camera in zip(plan.instant, plan.camera_id, strict=True)
+        ),
+        images=images,
+        cameras=plan.cameras,
+        times=plan.time,
+        train=np.flatnonzero(plan.learn),
+        heldout=np.flatnonzero(~plan.learn),
+        near=float(0.9 * depths[depths > 0].min()),
+        far=float(1.1 * depths.max()),
+        warp_ids=plan.instant,
+        appearance_ids=plan.instant,
+        camera_ids=plan.camera_id,
+        moving=moving,
+        depths=depths,
+        points=_points(spec, plan, images, hits, moving, seed),
+        background=spec.background,
+        up=(0.0, 1.0, 0.0),
+    )
+    return capture, _truth(spec, plan, hits, capture.ids, seed)
+
+
+def write(spec: SceneSpec, path: AnyPath, seed: int = 0):
+    """Film a scene into a Nerfies directory with `truth.npz` beside; all or nothing."""
+    capture, answers = make(spec, seed)
+    with new_folder(path) as folder:
+        nerfies_format.write(capture, folder / "capture")
+        for part in (folder / "capture").iterdir():
+            part.rename(folder / part.name)
+        (folder / "capture").rmdir()
+        truth.save(answers, folder / TRUTH_FILE)
+
+
+def cached(
+    spec: SceneSpec, folder: AnyPath, seed: int = 0
+) -> tuple[Capture, SceneTruth]:
+    """The scene from a cache folder, filmed first where it is not there yet."""
+    path = pathlib.Path(folder) / f"{spec.name.replace(' ', '-')}-{digest(spec, seed)}"
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write(spec, path, seed)
+    capture = nerfies_format.read(path)
+    capture = dataclasses.replace(
+        capture, name=f"synthetic {spec.name}", source="synthetic"
+    )
+    return capture, truth.load(path / TRUTH_FILE)
+
+
+def digest(spec: SceneSpec, seed: int = 0) -> str:
+    """Twelve hex digits that name a spec, a seed and the version of this renderer."""
+    text = f"{VERSION} {seed} {spec!r}"
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _picture(spec, camera, time, light_gain, transient_shown):
+    return film.picture(spec, camera, time, light_gain, transient_shown)
+
+
+def _film(spec, plan):
+    images, depths, hits = [], [], []
+    for row in range(len(plan.time)):
+        picture = _picture(
+            spec,
+            cameras.take(plan.cameras, row),
+            plan.time[row],
+            plan.light_gain[row],
+            plan.transient_shown[row],
+        )
+        images.append(np.round(np.asarray(picture.image) * 255).astype(np.uint8))
+        depths.append(np.asarray(picture.depth))
+        hits.append(jax.tree.map(np.asarray, picture.hit))
+    hits = jax.tree.map(lambda *leaves: np.stack(leaves), *hits)
+    return np.stack(images), np.stack(depths), hits
+
+
+def _points(spec, plan, images, hits, moving, seed):
+    """Static points that the first camera sees, as structure from motion finds them.
+
+    A little off, with the colour of a pixel, evenly over its pictures.
+    """
+    rng = np.random.default_rng([seed, 4])
+    still = (hits.thing != trace.NOTHING) & ~moving
+    found = np.flatnonzero(still & plan.learn[:, None, None])
+    chosen = rng.choice(found, min(spec.points, len(found)), replace=False)
+    row = chosen // still[0].size
+    directions = jax.vmap(film.view_direction)(
+        cameras.take(plan.cameras, row), _centres_of(chosen, spec.size)
+    )
+    distance = hits.distance.reshape(-1)[chosen]
+    exact = plan.cameras.position[row] + distance[:, None] * np.asarray(directions)
+    noise = spec.point_noise * rng.normal(size=exact.shape)
+    position = (exact + noise).astype(np.float32)
+    return PointCloud(position, images.reshape(-1, 3)[chosen])
+
+
+def _centres_of(flat, size):
+    """Pixel centres of flat indices into [frames, height, width]."""
+    width, height = size
+    return np.stack([flat % width, flat // width % height], -1).astype(np.float32) + 0.5
+
+
+def _truth(spec, plan, hits, ids, seed):
+    forward = truth.flows(spec, plan, hits, 1)
+    backward = truth.flows(spec, plan, hits, -1)
+    return SceneTruth(
+        ids,
+        hits.thing.astype(np.int8),
+        tuple(thing.name for thing in spec.all_things()),
+        hits.thing == spec.transient_id,
+        forward.pixel,
+        forward.seen,
+        backward.pixel,
+        backward.seen,
+        plan.light_gain,
+        *truth.tracks(spec, plan, hits, seed),
+    )

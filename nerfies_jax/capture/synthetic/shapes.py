@@ -1,0 +1,275 @@
+"""The shapes of a synthetic scene: where a ray meets them, and how they bend.
+
+Each shape maps its *material* points (which carry the texture) to *body* points at a
+time, and back; both maps are exact, and defined off the surface too.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from nerfies_jax.capture.synthetic.motion import Vector
+from nerfies_jax.geometry import rays
+
+# A pair of crossings between two neighbouring probes is missed: a fold seen edge-on.
+PROBES = 16
+REFINEMENTS = 5  # Newton inside the bracket
+
+
+class Crossing(NamedTuple):
+    """Where a ray first enters a shape; infinitely far where it misses."""
+
+    distance: Float[Array, ""]  # in lengths of the direction
+    material: Float[Array, "3"]  # the point of the material that is met
+    normal: Float[Array, "3"]  # outwards, in the body's axes, unit length
+
+
+@dataclasses.dataclass(frozen=True)
+class Squash:
+    """Stretches along y and thins across, keeping the volume and the lowest point."""
+
+    amount: float = 0.25  # natural logarithm of the largest stretch
+    cycles: float = 2.0  # per capture
+    phase: float = 0.0  # in cycles
+
+
+@dataclasses.dataclass(frozen=True)
+class Sphere:
+    """A ball about the body's origin; an ellipsoid where it squashes."""
+
+    radius: float
+    squash: Squash | None = None
+
+    def __post_init__(self):
+        _positive(radius=self.radius)
+
+    def bends(self) -> bool:
+        """Whether the material moves within the body."""
+        return self.squash is not None
+
+    def deform(self, material: Float[Array, "3"], time: Float[Array, ""]):
+        """Body point of a material point."""
+        scale, base = self._stretch(time)
+        return base + scale * (material - base)
+
+    def undeform(self, point: Float[Array, "3"], time: Float[Array, ""]):
+        """Material point of a body point."""
+        scale, base = self._stretch(time)
+        return base + (point - base) / scale
+
+    def cross(self, origin, direction, time) -> Crossing:
+        """The ray's first entry, solved in material coordinates, where it is a ball."""
+        scale, _ = self._stretch(time)
+        start, along = self.undeform(origin, time), direction / scale
+        speed_sq = jnp.sum(along**2)
+        # From the point nearest to the centre, not from the origin: b² - ac would
+        # cancel for a small ball far away.
+        middle = -jnp.sum(start * along) / speed_sq
+        nearest = start + middle * along
+        half_chord_sq = (self.radius**2 - jnp.sum(nearest**2)) / speed_sq
+        met = half_chord_sq > 0
+        distance = middle - jnp.sqrt(jnp.where(met, half_chord_sq, 1))
+        material = start + distance * along
+        normal = material / scale
+        normal = normal / jnp.sqrt(jnp.sum(jnp.where(met, normal, 1) ** 2))
+        return Crossing(_or_infinite(met, distance), material, normal)
+
+    def _stretch(self, time):
+        if self.squash is None:
+            return jnp.ones(3, time.dtype), jnp.zeros(3, time.dtype)
+        squash = self.squash
+        log = squash.amount * jnp.sin(
+            2 * jnp.pi * (squash.cycles * time + squash.phase)
+        )
+        across = jnp.exp(-log / 2)
+        base = jnp.asarray((0, -self.radius, 0), time.dtype)
+        return jnp.stack([across, jnp.exp(log), across]), base
+
+
+@dataclasses.dataclass(frozen=True)
+class Box:
+    """A box about the body's origin."""
+
+    half: Vector
+
+    def __post_init__(self):
+        _positive(half=min(self.half))
+
+    def bends(self) -> bool:
+        """Whether the material moves within the body."""
+        return False
+
+    def deform(self, material: Float[Array, "3"], time: Float[Array, ""]):
+        """Body point of a material point: the same."""
+        return material
+
+    def undeform(self, point: Float[Array, "3"], time: Float[Array, ""]):
+        """Material point of a body point: the same."""
+        return point
+
+    def cross(self, origin, direction, time) -> Crossing:
+        """The ray's first entry; a ray that starts inside does not meet the box."""
+        half = jnp.asarray(self.half, time.dtype)
+        distance, leave = rays.box_span(origin, direction, -half, half)
+        met = (distance > 0) & (distance < leave)
+        material = origin + jnp.where(met, distance, 0) * direction
+        # The face is the one the point lies on, that is farthest out in half sizes.
+        face = jax.nn.one_hot(jnp.argmax(jnp.abs(material) / half), 3, dtype=time.dtype)
+        return Crossing(
+            _or_infinite(met, distance), material, face * jnp.sign(material)
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Sheet:
+    """A cloth in the body's xy plane that hangs from its upper edge and billows.
+
+    The material point (u, v, w) goes to (u + sway(v), v, w + billow(u, v)): a shear, so
+    its inverse is exact everywhere and its Jacobian determinant is one. The upper edge
+    stays where it is.
+    """
+
+    half_width: float
+    half_height: float
+    billow: float = 0.03  # scene units to either side at the lower edge
+    wavelength: float = 0.3  # of the wave that runs across, scene units
+    billow_cycles: float = 2.0  # per capture
+    sway: float = 0.04  # sideways, at the lower edge
+    sway_cycles: float = 1.0
+
+    def __post_init__(self):
+        _positive(
+            half_width=self.half_width,
+            half_height=self.half_height,
+            billow=self.billow,
+            wavelength=self.wavelength,
+        )
+        if self.sway < 0:
+            raise ValueError(f"sway={self.sway} must not be negative; 0 hangs straight")
+
+    def bends(self) -> bool:
+        """Whether the material moves within the body."""
+        return True
+
+    def deform(self, material: Float[Array, "3"], time: Float[Array, ""]):
+        """Body point of a material point."""
+        u, v, w = material
+        sway, billow = self._sway(v, time), self._billow(u, v, time)
+        return jnp.stack([u + sway, v, w + billow])
+
+    def undeform(self, point: Float[Array, "3"], time: Float[Array, ""]):
+        """Material point of a body point."""
+        x, y, z = point
+        u = x - self._sway(y, time)
+        return jnp.stack([u, y, z - self._billow(u, y, time)])
+
+    def cross(self, origin, direction, time) -> Crossing:
+        """The first crossing: bracketed by probes, refined by Newton in the bracket."""
+        distance, met = self._root(origin, direction, time)
+        material = self.undeform(origin + distance * direction, time)
+        normal = jax.grad(lambda point: self.undeform(point, time)[2])(
+            origin + distance * direction
+        )
+        normal = normal / jnp.sqrt(jnp.sum(normal**2))  # its z is one: never zero
+        return Crossing(_or_infinite(met, distance), material, normal)
+
+    def _root(self, origin, direction, time):
+        def height(distance):
+            return self.undeform(origin + distance * direction, time)[2]
+
+        def still(distance):  # the loop must see no derivatives: it has none to give
+            fixed = jax.lax.stop_gradient((origin, direction, time))
+            return self.undeform(fixed[0] + distance * fixed[1], fixed[2])[2]
+
+        low, high, found = self._bracket(
+            *jax.lax.stop_gradient((origin, direction, time))
+        )
+        sign_low = jnp.sign(still(low))
+
+        def searching(state):
+            return found & (state[0] < REFINEMENTS)
+
+        def refine(state):
+            index, low, high, at = state
+            value, slope = jax.jvp(still, (at,), (jnp.ones_like(at),))
+            before = jnp.sign(value) == sign_low
+            low, high = jnp.where(before, at, low), jnp.where(before, high, at)
+            newton = at - value / jnp.where(slope == 0, 1, slope)
+            inside = (newton >= low) & (newton <= high)
+            return index + 1, low, high, jnp.where(inside, newton, (low + high) / 2)
+
+        start = (jnp.int32(0), low, high, (low + high) / 2)
+        at = jax.lax.stop_gradient(jax.lax.while_loop(searching, refine, start)[3])
+        # One Newton step outside the loop carries the implicit derivative of the root.
+        value, slope = jax.jvp(height, (at,), (jnp.ones_like(at),))
+        slope = jax.lax.stop_gradient(slope)
+        distance = at - value / jnp.where(slope == 0, 1, slope)
+        u, v, _ = self.undeform(origin + at * direction, time)
+        inside = (jnp.abs(u) <= self.half_width) & (jnp.abs(v) <= self.half_height)
+        return jnp.where(found, distance, 0), found & inside & (at > 0)
+
+    def _bracket(self, origin, direction, time):
+        """The first interval between probes in which the ray crosses the cloth."""
+        reach = (self.half_width + self.sway, self.half_height, _CREST * self.billow)
+        # A touch beyond the crests: a probe on the border would see no change of sign.
+        high = jnp.asarray(reach, time.dtype) * 1.001
+        enter, leave = rays.box_span(origin, direction, -high, high)
+        hit = enter < leave
+        enter = jnp.where(hit, enter, 0)
+        step = jnp.where(hit, leave - enter, 1) / (PROBES - 1)
+
+        # A while loop: a batch of rays that all miss, or have all crossed, stops here.
+        def searching(state):
+            index, _, found, _, _ = state
+            return hit & ~found & (index < PROBES)
+
+        def probe(state):
+            index, _, _, u_low, height_low = state
+            at = enter + index.astype(time.dtype) * step
+            u, _, height = self.undeform(origin + at * direction, time)
+            # Beside the cloth (the sway widens the box) a crossing means nothing; where
+            # on the cloth it is is known to second order in the step from the chord.
+            fall = jnp.where(height_low == height, 1, height_low - height)
+            crossing = u_low + height_low / fall * (u - u_low)
+            on_cloth = jnp.abs(crossing) <= self.half_width
+            found = (height_low * height <= 0) & (height_low != height) & on_cloth
+            return index + 1, at - step, found, u, height
+
+        u, _, height = self.undeform(origin + enter * direction, time)
+        start = (jnp.int32(1), enter, jnp.zeros_like(hit), u, height)
+        _, low, found, _, _ = jax.lax.while_loop(searching, probe, start)
+        return low, low + step, found
+
+    def _hang(self, v):
+        """0 at the upper edge, 1 at the lower."""
+        return (self.half_height - v) / (2 * self.half_height)
+
+    def _sway(self, v, time):
+        swing = jnp.sin(2 * jnp.pi * self.sway_cycles * time)
+        return self.sway * self._hang(v) ** 2 * swing
+
+    def _billow(self, u, v, time):
+        turn = 2 * jnp.pi * self.billow_cycles * time
+        across = 2 * jnp.pi / self.wavelength
+        wave = jnp.sin(across * (u + 0.5 * v) - turn)
+        ripple = _RIPPLE * jnp.sin(across * (1.7 * v - 0.6 * u) - 2 * turn)
+        return self.billow * self._hang(v) * (wave + ripple)
+
+
+_RIPPLE = 0.35  # of the main wave
+_CREST = 1 + _RIPPLE  # no crest of both waves is higher
+
+Shape = Sphere | Box | Sheet
+
+
+def _or_infinite(met: Bool[Array, ""], distance: Float[Array, ""]):
+    return jnp.where(met & (distance > 0), distance, jnp.inf)
+
+
+def _positive(**values):
+    for name, value in values.items():
+        if not value > 0:
+            raise ValueError(f"{name}={value} must be positive, in scene units")

@@ -1,0 +1,152 @@
+"""Procedural solid textures with detail at several scales, fixed to the material.
+
+A texture is a function of the material point alone, so it travels with the thing and
+needs no unwrapping. All things share one formula, so that a ray evaluates it once,
+whatever it hits.
+"""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from nerfies_jax.capture.synthetic.motion import Vector
+
+OCTAVES = 3
+LATTICE_FACTORS = (0x8DA6B343, 0xD8163841, 0xCB1AB31F)  # odd, far apart
+EDGE = 6.0  # steepness of a checker edge: it takes about a tenth of a square
+
+
+@dataclasses.dataclass(frozen=True)
+class Texture:
+    """Two colours mixed by checker, stripes and noise, with blots of a third.
+
+    Colours are sRGB-coded in [0, 1]. The shares say how strongly each pattern mixes.
+    """
+
+    dark: Vector = (0.2, 0.2, 0.25)
+    light: Vector = (0.85, 0.8, 0.7)
+    blot: Vector = (0.6, 0.3, 0.2)
+    checker: float = 0.3
+    checker_size: float = 0.05  # edge of a square, scene units
+    stripes: float = 0.0
+    stripes_per_unit: Vector = (0.0, 0.0, 0.0)  # wave vector, cycles per scene unit
+    noise: float = 0.3
+    noise_size: float = 0.03  # of the largest lump, scene units
+    blots: float = 0.5
+    blot_size: float = 0.08
+
+    def __post_init__(self):
+        for name in ("checker_size", "noise_size", "blot_size"):
+            if not getattr(self, name) > 0:
+                raise ValueError(
+                    f"{name}={getattr(self, name)} must be positive; to switch a "
+                    "pattern off, set its share to 0"
+                )
+        for name in ("dark", "light", "blot"):
+            if min(getattr(self, name)) < 0 or max(getattr(self, name)) > 1:
+                raise ValueError(
+                    f"{name}={getattr(self, name)} must lie in [0, 1]; divide 8-bit "
+                    "values by 255"
+                )
+
+
+def albedo(
+    textures: Sequence[Texture], thing: Int[Array, ""], material: Float[Array, "3"]
+) -> Float[Array, "3"]:
+    """Share of light given back at one material point, linear, for each channel.
+
+    `thing` says whose texture it is, from 0.
+    """
+    # Scalars, not arrays of three, so that a batch of rays fills the vector registers:
+    # six times faster on a CPU. Choosing among numbers is cheaper than a gather, too.
+    x, y, z = material
+
+    def pick(number):
+        values = [number(one) for one in textures]
+        chosen = jnp.full_like(x, values[0])
+        for index, value in enumerate(values[1:], 1):
+            chosen = jnp.where(thing == index, jnp.asarray(value, x.dtype), chosen)
+        return chosen
+
+    # Cosines, so that a face through the body's origin lies inside a square, not on an
+    # edge.
+    turn = jnp.pi / pick(lambda t: t.checker_size)
+    squares = jnp.tanh(EDGE * jnp.cos(turn * x) * jnp.cos(turn * y) * jnp.cos(turn * z))
+    along_x, along_y, along_z = (
+        pick(lambda t, i=axis: 2 * math.pi * t.stripes_per_unit[i]) for axis in range(3)
+    )
+    bands = jnp.sin(along_x * x + along_y * y + along_z * z)
+    lumps = 1 / pick(lambda t: t.noise_size)
+    grain = sum(
+        value_noise(material * (lumps * 2**octave), 7 * octave + thing) / 2**octave
+        for octave in range(OCTAVES)
+    )
+    mix = 0.5 + 0.5 * (
+        pick(lambda t: t.checker) * squares
+        + pick(lambda t: t.stripes) * bands
+        + pick(lambda t: t.noise) * grain
+    )
+    mix = jnp.clip(mix, 0, 1)
+    spot = value_noise(material / pick(lambda t: t.blot_size), 101 + thing)
+    # Blots with soft rims.
+    spot = pick(lambda t: t.blots) / (1 + jnp.exp(-12 * (spot - 0.2)))
+    channels = []
+    for channel in range(3):
+        dark, light, blot = (
+            pick(lambda t, n=name, i=channel: float(linear(getattr(t, n)[i])))
+            for name in ("dark", "light", "blot")
+        )
+        ground = dark + mix * (light - dark)
+        channels.append(ground + spot * (blot * (0.6 + 0.4 * mix) - ground))
+    return jnp.stack(channels)
+
+
+def value_noise(
+    point: Float[Array, "3"], seed: Int[Array, ""] | int
+) -> Float[Array, ""]:
+    """Random values in [-1, 1] on the integer lattice, blended by smooth weights.
+
+    Twice differentiable; the same everywhere, since the lattice is hashed in integers.
+    """
+    start = jnp.asarray(seed).astype(jnp.uint32) * np.uint32(0x9E3779B9)
+    low_bits, high_bits, weights = [], [], []
+    for coordinate, factor in zip(point, LATTICE_FACTORS, strict=True):
+        cell = jnp.floor(coordinate)
+        part = coordinate - cell
+        weights.append(part**3 * (part * (part * 6 - 15) + 10))
+        low_bits.append(cell.astype(jnp.int32).astype(jnp.uint32) * np.uint32(factor))
+        high_bits.append(low_bits[-1] + np.uint32(factor))
+
+    def blend(axis, bits):
+        if axis == 3:
+            return _mixed(bits).astype(point.dtype)
+        low = blend(axis + 1, bits + low_bits[axis])
+        high = blend(axis + 1, bits + high_bits[axis])
+        return low + weights[axis] * (high - low)
+
+    return blend(0, start) * 2.0**-22 - 1
+
+
+def _mixed(bits):
+    """23 well-mixed bits: Murmur3's final mixer."""
+    bits = (bits ^ (bits >> 16)) * np.uint32(0x85EBCA6B)
+    bits = (bits ^ (bits >> 13)) * np.uint32(0xC2B2AE35)
+    return (bits ^ (bits >> 16)) >> 9
+
+
+def linear(coded):
+    """Linear light of sRGB-coded values (IEC 61966-2-1), on the host."""
+    coded = np.asarray(coded, np.float64)
+    return np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4)
+
+
+def srgb(light: Float[Array, "*any"]) -> Float[Array, "*any"]:
+    """sRGB-coded value of linear light in [0, 1]."""
+    low = light <= 0.0031308
+    # The power's slope is infinite at zero, where the other branch is taken.
+    above = jnp.where(low, 1, light)
+    return jnp.where(low, 12.92 * light, 1.055 * above ** (1 / 2.4) - 0.055)

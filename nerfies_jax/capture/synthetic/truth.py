@@ -1,0 +1,165 @@
+"""What is known of a synthetic scene beyond its pictures: ids, flow, point tracks."""
+
+import functools
+import pathlib
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from nerfies_jax.capture.synthetic import trace
+from nerfies_jax.capture.synthetic.film import Schedule
+from nerfies_jax.capture.synthetic.spec import SceneSpec
+from nerfies_jax.geometry import camera as cameras
+from nerfies_jax.geometry import rays
+
+
+class SceneTruth(NamedTuple):
+    """Exact answers, row for row beside the capture. NumPy leaves.
+
+    Flow leads from the centre of a pixel to where its point lies in the next (previous)
+    frame of the same camera, in pixels. It is known, and given, where that point is
+    hidden or outside, too: `seen` says where it can be compared with pictures. The last
+    (first) frame of a camera has none: zero, and nowhere seen.
+    """
+
+    ids: tuple[str, ...]  # of the capture's frames, one for each row
+    things: np.ndarray  # [frames, height, width] int8; -1 for nothing
+    thing_names: tuple[str, ...]  # by id
+    transient: np.ndarray  # [frames, height, width] bool
+    flow_forward: np.ndarray  # [frames, height, width, 2] float32, right and down
+    forward_seen: np.ndarray  # [frames, height, width] bool
+    flow_backward: np.ndarray
+    backward_seen: np.ndarray
+    light_gain: np.ndarray  # [frames, 3] float32: the exposure, of linear light
+    track_thing: np.ndarray  # [tracks] int32
+    track_canonical: np.ndarray  # [tracks, 3] float32: the point at time 0, world
+    track_world: np.ndarray  # [tracks, instants, 3] float32
+    track_pixel: np.ndarray  # [tracks, frames, 2] float32
+    track_seen: np.ndarray  # [tracks, frames] bool
+
+
+class Flow(NamedTuple):
+    """Where the points of one frame's pixels lie in another frame."""
+
+    pixel: Float[Array, "height width 2"]
+    seen: Bool[Array, "height width"]
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def flow(spec: SceneSpec, thing, material, camera, time, transient_shown) -> Flow:
+    """Pixels of material points, as another frame sees them.
+
+    `thing` [height, width] and `material` [height, width, 3] are what one frame's pixel
+    centres hit; camera, time and transient are those of the other.
+    """
+
+    def one(thing, material):
+        point = trace.place(spec, thing, material, time)
+        return trace.visible(spec, camera, thing, point, time, transient_shown)
+
+    pixel, seen = jax.lax.map(lambda row: jax.vmap(one)(*row), (thing, material))
+    known = thing != trace.NOTHING
+    centres = rays.pixel_centres(spec.size, pixel.dtype)
+    shift = jnp.where(known[..., None], pixel - centres, 0)
+    return Flow(shift, seen & known)
+
+
+def flows(spec: SceneSpec, plan: Schedule, hits: trace.Hit, step: int) -> Flow:
+    """Flow of every frame to the next (step 1) or previous (-1) of the same camera."""
+    count = len(plan.time)
+    width, height = spec.size
+    shift = np.zeros((count, height, width, 2), np.float32)
+    seen = np.zeros((count, height, width), bool)
+    for row in range(count):
+        other = row + step
+        same = 0 <= other < count and plan.camera_id[other] == plan.camera_id[row]
+        if not same:
+            continue
+        result = flow(
+            spec,
+            hits.thing[row],
+            hits.material[row],
+            cameras.take(plan.cameras, other),
+            plan.time[other],
+            plan.transient_shown[other],
+        )
+        shift[row], seen[row] = result
+    return Flow(shift, seen)
+
+
+def tracks(spec: SceneSpec, plan: Schedule, hits: trace.Hit, seed: int):
+    """Points of the moving scene, drawn where the first camera sees them.
+
+    Returns thing ids, canonical points, world points over the instants, pixels and
+    visibility over the frames; the transient is not tracked.
+    """
+    rng = np.random.default_rng([seed, 3])
+    moving = np.array([thing.moves() for thing in spec.things])
+    eligible = np.isin(hits.thing, np.flatnonzero(moving)) & plan.learn[:, None, None]
+    found = np.flatnonzero(eligible)
+    # Few moving pixels give few tracks, never the same one twice.
+    chosen = rng.choice(found, min(spec.tracks, len(found)), replace=False)
+    thing = hits.thing.reshape(-1)[chosen].astype(np.int32)
+    material = hits.material.reshape(-1, 3)[chosen]
+    times = np.linspace(0, 1, spec.frames).astype(np.float32)
+    if len(chosen) == 0:  # a still scene; an empty batch would not divide into rows
+        frames = len(plan.time)
+        return (
+            thing,
+            material,
+            np.zeros((0, spec.frames, 3), np.float32),
+            np.zeros((0, frames, 2), np.float32),
+            np.zeros((0, frames), bool),
+        )
+    world = np.asarray(_follow(spec, thing, material, times))
+    pixel, seen = _watch(spec, thing, world[:, plan.instant], plan)
+    return thing, world[:, 0], world, np.asarray(pixel), np.asarray(seen)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _follow(spec, thing, material, times):
+    over_time = jax.vmap(
+        lambda thing, material, time: trace.place(spec, thing, material, time),
+        (None, None, 0),
+    )
+    return jax.vmap(over_time, (0, 0, None))(thing, material, times)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _watch(spec, thing, points, plan):
+    def frame(row):
+        points, camera, time, shown = row
+        return jax.vmap(
+            lambda thing, point: trace.visible(spec, camera, thing, point, time, shown)
+        )(thing, points)
+
+    rows = (jnp.swapaxes(points, 0, 1), plan.cameras, plan.time, plan.transient_shown)
+    pixel, seen = jax.lax.map(frame, rows)
+    return jnp.swapaxes(pixel, 0, 1), jnp.swapaxes(seen, 0, 1)
+
+
+def save(truth: SceneTruth, path: pathlib.Path):
+    """Write a truth as one .npz file."""
+    fields = truth._asdict()
+    for name in ("ids", "thing_names"):
+        fields[name] = np.array(fields[name])
+    with open(path, "wb") as file:
+        np.savez_compressed(file, **fields)
+
+
+def load(path: pathlib.Path) -> SceneTruth:
+    """Read what `save` wrote."""
+    with np.load(path, allow_pickle=False) as stored:
+        missing = set(SceneTruth._fields) - set(stored.files)
+        if missing:
+            raise ValueError(
+                f"{path} holds no {sorted(missing)[0]!r}, so it is no scene truth of "
+                "this version; delete it and make the scene again"
+            )
+        fields = {name: stored[name] for name in SceneTruth._fields}
+    for name in ("ids", "thing_names"):
+        fields[name] = tuple(str(word) for word in fields[name])
+    return SceneTruth(**fields)
