@@ -88,6 +88,16 @@ def replaced_file(path: AnyPath):
 def new_folder(path: AnyPath):
     """A temporary folder beside `path` that becomes `path` when the block ends well."""
     path = pathlib.Path(path)
+    with scratch_folder(path) as partial:
+        yield partial
+        partial.chmod(0o755)  # mkdtemp makes it private
+        os.replace(partial, path)
+
+
+@contextlib.contextmanager
+def scratch_folder(path: AnyPath):
+    """A temporary folder beside the new folder `path`, gone when the block ends."""
+    path = pathlib.Path(path)
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise CaptureError(f"{path}: already there; choose another name or remove it")
     try:
@@ -102,8 +112,6 @@ def new_folder(path: AnyPath):
         ) from None
     try:
         yield partial
-        partial.chmod(0o755)  # mkdtemp makes it private
-        os.replace(partial, path)
     except OSError as error:
         raise CaptureError(
             f"{path}: cannot be written ({error.strerror or error}); choose another "
