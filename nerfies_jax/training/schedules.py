@@ -69,7 +69,7 @@ def cosine(start: float, end: float, steps: int, *, after: int = 0) -> Schedule:
 
     def schedule(step):
         share = _share(step, steps, after)
-        # Squares, not (1 + cos) / 2, which leaves 3e-8 of the start where nothing should
+        # Squares, not (1 + cos) / 2, which leaves 3e-8 of the start where none should
         # be left: as much as a small end.
         risen = jnp.sin(0.5 * jnp.pi * share) ** 2
         left = jnp.cos(0.5 * jnp.pi * share) ** 2

@@ -1,0 +1,276 @@
+"""Fit a model: compiled chunks of steps between events on the host."""
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import rich.console
+from jaxtyping import Array, Key
+
+from nerfies_jax.training.checkpoint import Checkpoints
+from nerfies_jax.training.chunk import compiled
+from nerfies_jax.training.guard import Snapshot, last_good
+from nerfies_jax.training.model import Event, Frames, Model, TrainState
+from nerfies_jax.training.progress import Progress, duration
+from nerfies_jax.training.stopping import StopRequests
+
+CHUNK_STEPS = 100  # longer ones gain nothing: scan(100) costs 0.96 of scan(1000)
+CHUNK_SECONDS = 0.5  # a chunk cannot be interrupted: Ctrl-C acts within this time
+
+
+class Hook(NamedTuple):
+    """Something to do now and then that changes nothing: an evaluation, a picture.
+
+    `call(state, step)` may return numbers, which are kept in the history. Its time does
+    not count as training, and it must not keep the state: the next chunk overwrites it.
+    It also runs once when the run is complete.
+    """
+
+    name: str
+    call: Callable[[TrainState, int], dict[str, float] | None]
+    every_steps: int | None = None
+    every_seconds: float | int | None = None  # of training
+
+
+class History(NamedTuple):
+    """What a run did so far; JSON values, and it travels with the checkpoints."""
+
+    rows: tuple[dict[str, float], ...] = ()  # per chunk: step, seconds, mean metrics
+    evaluations: tuple[dict[str, Any], ...] = ()  # hook, step, seconds, its numbers
+    seconds: float = 0.0  # training alone: chunks and events
+    compile_seconds: float = 0.0
+
+
+class FitResult(NamedTuple):
+    """Where a run ended and why."""
+
+    state: TrainState
+    history: History
+    steps: int  # completed
+    stopped_by: str  # "steps", "seconds", "SIGINT", "SIGTERM" or "non-finite"
+    message: str  # one line for the user
+
+    @property
+    def seconds(self) -> float:
+        """Seconds of training, of all sessions of the run."""
+        return self.history.seconds
+
+    @property
+    def compile_seconds(self) -> float:
+        """Seconds of tracing and compiling, of all sessions of the run."""
+        return self.history.compile_seconds
+
+
+def step_key(state: TrainState) -> Key[Array, ""]:
+    """The key of the coming step, a function of the run's key and the step alone."""
+    return jax.random.fold_in(state.key, state.step)
+
+
+def fit(
+    model: Model,
+    state: TrainState,
+    frames: Frames,
+    *,
+    steps: int,
+    events: Sequence[Event] = (),
+    hooks: Sequence[Hook] = (),
+    seconds: float | int | None = None,
+    checkpoints: Checkpoints | None = None,
+    checkpoint_seconds: float | int = 60.0,
+    history: History = History(),
+    console: rich.console.Console | None = None,
+) -> FitResult:
+    """Train until `steps` steps are completed in all, from wherever `state` is.
+
+    `seconds` bounds the wall time of this call. Ctrl-C, SIGTERM and a metric or
+    parameter that is not finite end it too; whatever ends it, the last good state is
+    saved to `checkpoints` and returned. An event happens when its step is completed,
+    before a checkpoint of that step, so a resumed run repeats the uninterrupted one bit
+    for bit (on XLA:CPU with the same PJRT_NPROC). Pass the restored history on.
+
+    One program with a traced number of steps serves every chunk of a shape.
+    """
+    run = _Run(model, state, frames, steps, (*model.events, *events), tuple(hooks))
+    run.history, run.checkpoints = history, checkpoints
+    run.limits = (math.inf if seconds is None else seconds, checkpoint_seconds)
+    with StopRequests() as requests, Progress(console, run.step, steps) as progress:
+        run.progress = progress
+        reason = run.go(requests)
+        return run.finish(reason)
+
+
+class _Run:
+    """The host side of one call of `fit`."""
+
+    def __init__(self, model, state, frames, steps, events, hooks):
+        self.model, self.steps, self.hooks = model, steps, hooks
+        self.step = int(state.step)
+        if steps < self.step:
+            raise ValueError(
+                f"the run has {self.step} steps behind it and was asked for {steps} in "
+                "all; ask for more steps, or start anew"
+            )
+        self.events = _by_step(events)
+        self.frames = jax.tree.map(jnp.asarray, frames)
+        self.began = time.monotonic()
+        self.saved_at = self.began
+        self.step_seconds = math.inf  # not known yet: the first chunk is one step
+        self.called = {hook.name: [self.step, None] for hook in hooks}
+        self.detail = ""
+        # A copy: the first chunk overwrites its input, which is the caller's.
+        self.snapshot = Snapshot(self.step, state)
+        self.state = self.snapshot.state()
+
+    def go(self, requests: StopRequests) -> str:
+        """Chunk after chunk until there is a reason to stop."""
+        while self.step < self.steps:
+            if requests.name is not None:
+                return requests.name
+            if time.monotonic() - self.began >= self.limits[0]:
+                return "seconds"
+            program, compile_seconds = compiled(
+                self.model.step, self.state, self.frames
+            )
+            self._add(compile_seconds=compile_seconds)
+            if not self._chunk(program):
+                return "non-finite"
+            self._after_chunk()
+        return "steps"
+
+    def _chunk(self, program) -> bool:
+        """Run one chunk and the events at its end; false where something blew up."""
+        count = self._count()
+        began = time.perf_counter()
+        self.state, outcome = program(self.state, self.frames, np.int32(count))
+        outcome = jax.device_get(outcome)  # waits
+        done = int(outcome.done)
+        if not (outcome.metrics_finite and outcome.params_finite):
+            self._fall_back(program, self.step + done)
+            return False
+        if int(outcome.step) != self.step + done:
+            raise ValueError(
+                f"Model.step left state.step at {int(outcome.step)} after step "
+                f"{self.step + done}; it must return it one higher each time"
+            )
+        self.step += done
+        elapsed = time.perf_counter() - began
+        self.step_seconds = elapsed / done
+        happening = self.events.get(self.step, ())
+        for event in happening:
+            self.state = event.apply(self.state, self.frames)
+            if int(self.state.step) != self.step:
+                raise ValueError(
+                    f"event {event.name!r} changed state.step; it must not"
+                )
+        self._add(seconds=time.perf_counter() - began)
+        metrics = {name: float(x) / done for name, x in outcome.metrics.items()}
+        row = {"step": self.step, "seconds": self.history.seconds, **metrics}
+        self.history = self.history._replace(rows=(*self.history.rows, row))
+        self.snapshot = self.snapshot.renewed(self.step, self.state, bool(happening))
+        return True
+
+    def _count(self) -> int:
+        """Steps of the next chunk: up to the next event, not too long to wait for."""
+        stops = [self.steps, self.step + CHUNK_STEPS]
+        stops += [step for step in self.events if step > self.step]
+        for hook in self.hooks:
+            if hook.every_steps is not None:
+                stops.append((self.step // hook.every_steps + 1) * hook.every_steps)
+        left = self.limits[0] - (time.monotonic() - self.began)
+        affordable = min(CHUNK_SECONDS, left) / self.step_seconds
+        return max(1, min(min(stops) - self.step, int(affordable)))
+
+    def _after_chunk(self) -> None:
+        """Hooks, checkpoint and display; none of it is training time."""
+        for hook in self.hooks:
+            if self._due(hook):
+                self._call(hook)
+        now = time.monotonic()
+        if self.checkpoints is not None and now - self.saved_at >= self.limits[1]:
+            self._save()
+        if self.progress.due():
+            row = self.history.rows[-1]
+            metrics = {k: v for k, v in row.items() if k not in ("step", "seconds")}
+            left = (self.steps - self.step) * self.step_seconds
+            left = min(left, self.limits[0] - (time.monotonic() - self.began))
+            counts = self.model.counts(self.state)
+            rate = 1 / self.step_seconds
+            self.progress.update(self.step, rate, metrics, counts, max(left, 0.0))
+
+    def _due(self, hook: Hook) -> bool:
+        last_step, last_seconds = self.called[hook.name]
+        if hook.every_steps is not None and self.step % hook.every_steps == 0:
+            return self.step != last_step
+        if hook.every_seconds is None:
+            return False
+        passed = self.history.seconds - (last_seconds or 0.0)
+        return last_seconds is None or passed >= hook.every_seconds
+
+    def _call(self, hook: Hook) -> None:
+        numbers = hook.call(self.state, self.step)
+        self.called[hook.name] = [self.step, self.history.seconds]
+        if numbers is not None:
+            row = {
+                "hook": hook.name,
+                "step": self.step,
+                "seconds": self.history.seconds,
+            }
+            row |= {name: float(value) for name, value in numbers.items()}
+            rows = (*self.history.evaluations, row)
+            self.history = self.history._replace(evaluations=rows)
+
+    def _save(self) -> None:
+        self.checkpoints.save(self.state, self.step, self.history._asdict())
+        self.saved_at = time.monotonic()
+
+    def _add(self, **more: float) -> None:
+        values = {name: getattr(self.history, name) + x for name, x in more.items()}
+        self.history = self.history._replace(**values)
+
+    def _fall_back(self, program, bad_step: int) -> None:
+        """Return to the last good step, by replaying from the last copy."""
+        self.state, self.step, self.detail = last_good(
+            program, self.snapshot, self.frames, bad_step
+        )
+
+    def finish(self, reason: str) -> FitResult:
+        """Last evaluations, last checkpoint, and the line that says how it ended."""
+        if reason in ("steps", "seconds"):
+            for hook in self.hooks:
+                if self.called[hook.name] != [self.step, self.history.seconds]:
+                    self._call(hook)
+        message = f"stopped at step {self.step:,} of {self.steps:,} by {reason}"
+        if reason == "steps":
+            message = f"completed {self.step:,} steps"
+        elif reason == "seconds":
+            message += f": the {duration(self.limits[0])} given are over"
+        elif reason == "non-finite":
+            message += f": {self.detail}"
+        if self.checkpoints is not None:
+            self._save()
+            message += f"; saved in {self.checkpoints.folder}"
+            if reason not in ("steps", "non-finite"):
+                message += ", resume from there to go on"
+            self.checkpoints.wait()
+        self.progress.say(message)
+        return FitResult(self.state, self.history, self.step, reason, message)
+
+
+def _by_step(events: Sequence[Event]) -> dict[int, list[Event]]:
+    schedule: dict[int, list[Event]] = {}
+    for event in events:
+        if (
+            list(event.steps) != sorted(set(event.steps))
+            or min(event.steps, default=1) < 1
+        ):
+            raise ValueError(
+                f"event {event.name!r} needs growing steps from 1 on, got "
+                f"{event.steps}; what comes before them belongs into Model.init"
+            )
+        for step in event.steps:
+            schedule.setdefault(step, []).append(event)
+    return schedule

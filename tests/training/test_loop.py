@@ -1,0 +1,312 @@
+"""The loop: the same bits however it is cut, and every way in which it can end."""
+
+import io
+import math
+import os
+import signal
+import threading
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import rich.console
+
+from nerfies_jax.training import chunk, loop
+from nerfies_jax.training.model import Event
+from nerfies_jax.training.progress import duration
+from tests.training import toy
+
+QUIET = rich.console.Console(quiet=True)
+MODEL = toy.model()
+
+
+@pytest.fixture(scope="module")
+def frames():
+    return toy.frames()
+
+
+@pytest.fixture(scope="module")
+def straight(frames):
+    return fit(frames, steps=20)
+
+
+def start():
+    return MODEL.init(None, jax.random.key(5))
+
+
+def fit(frames, state=None, model=MODEL, **settings):
+    state = start() if state is None else state
+    return loop.fit(model, state, frames, console=QUIET, **settings)
+
+
+def test_a_run_is_the_plain_loop_over_its_steps(frames, straight):
+    state = start()
+    step = jax.jit(toy.step)
+    for count in range(1, 21):
+        state, _ = step(state, frames)
+        if count == 7:
+            state = toy.grow(state, frames)
+    for ours, plain in zip(
+        jax.tree.leaves(straight.state), jax.tree.leaves(state), strict=True
+    ):
+        if not jnp.issubdtype(plain.dtype, jax.dtypes.prng_key):
+            # Another program: a few ulps, which Adam's normalisation may enlarge.
+            np.testing.assert_allclose(ours, plain, rtol=2e-4, atol=2e-6)
+    assert straight.state.extra["hits"].shape == (9,)
+    assert int(straight.state.step) == straight.steps == 20
+    assert straight.stopped_by == "steps"
+
+
+@pytest.mark.parametrize("cut", [1, 6, 7, 8, 19, 20])
+def test_a_run_cut_in_two_is_the_straight_run_bit_for_bit(cut, frames, straight):
+    first = fit(frames, steps=cut)
+    second = fit(frames, first.state, steps=20, history=first.history)
+    assert toy.same(second.state, straight.state)
+    assert second.history.rows[-1]["step"] == 20
+    assert second.seconds >= first.seconds
+
+
+@pytest.mark.parametrize("longest", [1, 3, 100])
+def test_chunk_length_does_not_change_a_bit(longest, frames, straight, monkeypatch):
+    monkeypatch.setattr(loop, "CHUNK_STEPS", longest)
+    result = fit(frames, steps=20)
+    assert toy.same(result.state, straight.state)
+    lengths = np.diff([0] + [row["step"] for row in result.history.rows])
+    assert lengths.max() <= longest
+    assert 7 in np.cumsum(lengths)  # a chunk ends where an event happens
+
+
+def test_the_same_seed_twice_is_the_same_run_and_another_is_not(frames, straight):
+    assert toy.same(fit(frames, steps=20).state, straight.state)
+    other = fit(frames, MODEL.init(None, jax.random.key(6)), steps=20)
+    assert not toy.same(other.state, straight.state)
+
+
+def test_one_program_serves_every_chunk_of_a_shape(frames):
+    model = toy.model(change=lambda state, frames: toy.step(state, frames))
+    result = fit(frames, model=model, steps=300)
+    assert len(chunk._programs(model.step)) == 2  # before and after growth
+    assert result.compile_seconds > 0
+    again = fit(frames, model=model, steps=300)
+    assert again.compile_seconds == 0
+    assert len(chunk._programs(model.step)) == 2
+
+
+def test_metrics_of_a_chunk_are_means_over_its_steps(frames, monkeypatch):
+    monkeypatch.setattr(loop, "CHUNK_STEPS", 1)
+    single = [row["loss"] for row in fit(frames, steps=6).history.rows]
+    monkeypatch.setattr(loop, "CHUNK_STEPS", 100)
+    rows = fit(frames, steps=6).history.rows
+    assert [row["step"] for row in rows] == [1, 6]
+    assert math.isclose(rows[1]["loss"], np.mean(single[1:]), rel_tol=1e-6)
+
+
+def test_the_state_given_is_left_alone(frames):
+    state = start()
+    before = jax.tree.map(toy.bits, state)
+    fit(frames, state, steps=9)
+    assert all(
+        np.array_equal(a, b)
+        for a, b in zip(
+            jax.tree.leaves(before), map(toy.bits, jax.tree.leaves(state)), strict=True
+        )
+    )
+
+
+def test_events_happen_in_order_after_their_steps(frames):
+    seen = []
+
+    def note(name):
+        def apply(state, frames):
+            seen.append((name, int(state.step)))
+            return state
+
+        return apply
+
+    extra = (Event("a", (2, 5), note("a")), Event("b", (5,), note("b")))
+    first = fit(frames, steps=5, events=extra)
+    assert seen == [("a", 2), ("a", 5), ("b", 5)]
+    fit(frames, first.state, steps=8, events=extra)
+    assert len(seen) == 3  # what has happened does not happen again
+
+
+def test_hooks_run_at_their_steps_and_at_the_end(frames):
+    hook = loop.Hook("score", lambda state, step: {"psnr": step / 2}, every_steps=4)
+    result = fit(frames, steps=10, hooks=[hook])
+    assert [row["step"] for row in result.history.evaluations] == [4, 8, 10]
+    assert result.history.evaluations[0]["psnr"] == 2.0
+    assert result.history.evaluations[0]["hook"] == "score"
+
+
+def test_time_in_hooks_is_not_training_time(frames, straight):
+    hook = loop.Hook("nap", lambda state, step: time.sleep(0.3), every_steps=5)
+    result = fit(frames, steps=20, hooks=[hook])
+    assert result.seconds < 0.9
+    assert toy.same(result.state, straight.state)
+    assert result.history.evaluations == ()
+
+
+def test_hooks_by_seconds_count_training_seconds(frames):
+    seen = []
+    hook = loop.Hook("often", lambda state, step: seen.append(step), every_seconds=0.0)
+    fit(frames, steps=10, hooks=[hook])
+    assert seen[0] == 1
+    assert seen[-1] == 10
+    seen.clear()
+    fit(frames, steps=10, hooks=[hook._replace(every_seconds=1e9)])
+    assert seen == [1, 10]
+
+
+def test_a_budget_of_seconds_ends_the_run_and_says_so(frames):
+    slow = loop.Hook("slow", lambda state, step: time.sleep(0.1), every_steps=1)
+    result = fit(frames, steps=10_000, hooks=[slow], seconds=0.5)
+    assert result.stopped_by == "seconds"
+    assert 1 <= result.steps <= 8
+    assert "of 10,000 by seconds: the 0:00 given are over" in result.message
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_run_after_its_chunk(number, frames, straight):
+    def send(state, step):
+        if step == 11:
+            os.kill(os.getpid(), number)
+
+    before = signal.getsignal(number)
+    hook = loop.Hook("send", send, every_steps=1)
+    result = fit(frames, steps=1000, hooks=[hook])
+    assert result.stopped_by == signal.Signals(number).name
+    assert result.steps == 11
+    assert signal.getsignal(number) is before
+    rest = fit(frames, result.state, steps=20)
+    assert toy.same(rest.state, straight.state)
+
+
+def test_a_second_interrupt_does_not_wait(frames):
+    def send(state, step):
+        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(5)
+
+    with pytest.raises(KeyboardInterrupt):
+        fit(frames, steps=1000, hooks=[loop.Hook("send", send, every_steps=3)])
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_run_outside_the_main_thread_leaves_signals_alone(frames):
+    results = []
+    thread = threading.Thread(target=lambda: results.append(fit(frames, steps=3)))
+    thread.start()
+    thread.join()
+    assert results[0].stopped_by == "steps"
+
+
+def poisoned(at, where):
+    """The toy step with a NaN in one place at one step."""
+
+    def step(state, frames):
+        bad = state.step + 1 == at
+        new, metrics = toy.step(state, frames)
+        poison = jnp.where(bad, jnp.nan, 0.0)
+        if where == "metric":
+            metrics["loss"] = metrics["loss"] + poison
+        elif where == "parameter":
+            rows = {"mean": new.params.rows["mean"].at[2, 1].add(poison)}
+            new = new._replace(params=new.params._replace(rows=rows))
+        return new, metrics
+
+    return step
+
+
+@pytest.mark.parametrize("where", ["metric", "parameter"])
+@pytest.mark.parametrize("at", [1, 6, 8, 15])
+def test_a_step_that_blows_up_is_named_and_undone(where, at, frames):
+    model = toy.model(change=poisoned(at, where))
+    result = fit(frames, model=model, steps=20)
+    assert result.stopped_by == "non-finite"
+    assert result.steps == at - 1
+    assert f"step {at} is not finite" in result.message
+    name = {"metric": "metric loss", "parameter": "params.rows.mean (1 of"}[where]
+    assert name in result.message
+    good = fit(frames, model=model, steps=at - 1) if at > 1 else None
+    assert toy.same(result.state, good.state if good else start())
+
+
+def test_what_a_step_gets_wrong_is_named(frames):
+    def wider(state, frames):
+        new, metrics = toy.step(state, frames)
+        extra = {**new.extra, "hits": jnp.zeros(7)}
+        return new._replace(extra=extra), metrics
+
+    def standing(state, frames):
+        new, metrics = toy.step(state, frames)
+        return new._replace(step=state.step), metrics
+
+    def stepping(state, frames):
+        return state._replace(step=state.step + 1)
+
+    with pytest.raises(
+        ValueError, match=r"extra.hits from float32\[6\] to float32\[7\]"
+    ):
+        fit(frames, model=toy.model(change=wider), steps=2)
+    with pytest.raises(ValueError, match=r"left state\.step at 0 after step 1"):
+        fit(frames, model=toy.model(change=standing), steps=2)
+    with pytest.raises(ValueError, match=r"event 'odd' changed state\.step"):
+        fit(frames, steps=2, events=[Event("odd", (1,), lambda s, f: stepping(s, f))])
+
+
+@pytest.mark.parametrize("steps", [(0, 3), (3, 3), (5, 2)])
+def test_events_out_of_order_are_refused(steps, frames):
+    with pytest.raises(ValueError, match="event 'x' needs growing steps from 1 on"):
+        fit(frames, steps=9, events=[Event("x", steps, lambda s, f: s)])
+
+
+def test_fewer_steps_than_done_are_refused(frames, straight):
+    with pytest.raises(ValueError, match="20 steps behind it and was asked for 10"):
+        fit(frames, straight.state, steps=10)
+    assert fit(frames, straight.state, steps=20).steps == 20
+
+
+def test_float64_states_stay_float64(frames):
+    with jax.enable_x64(True):
+        wide = jax.tree.map(
+            lambda x: x.astype(jnp.float64) if x.dtype == jnp.float32 else x, start()
+        )
+
+        def step(state, frames):
+            slope = jax.grad(lambda p: jnp.sum(p.nets["weight"] ** 2))(state.params)
+            params = jax.tree.map(lambda p, g: p - 0.1 * g, state.params, slope)
+            new = state._replace(params=params, step=state.step + 1)
+            return new, {"loss": jnp.sum(params.nets["weight"] ** 2)}
+
+        result = fit(frames, wide, toy.model(change=step), steps=5)
+        assert result.state.params.nets["weight"].dtype == jnp.float64
+        expected = wide.params.nets["weight"] * 0.8**5
+        np.testing.assert_allclose(
+            result.state.params.nets["weight"], expected, rtol=1e-14
+        )
+
+
+def test_a_log_file_gets_lines_and_a_terminal_a_bar(frames):
+    for terminal in (False, True):
+        text = io.StringIO()
+        console = rich.console.Console(
+            file=text, force_terminal=terminal, width=120, color_system=None
+        )
+        loop.fit(MODEL, start(), frames, steps=8, console=console)
+        shown = text.getvalue()
+        assert "completed 8 steps" in shown
+        assert "steps/s  loss" in shown
+        assert "dB" in shown
+        assert "rows" in shown
+        assert "left" in shown
+        assert ("\x1b" in shown) == terminal
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(0.0, "0:00"), (59.6, "1:00"), (125.0, "2:05"), (3723.0, "1:02:03")],
+)
+def test_durations_read_like_a_clock(seconds, text):
+    assert duration(seconds) == text
