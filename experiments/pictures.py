@@ -21,9 +21,9 @@ from matplotlib.figure import Figure
 from nerfies_jax.capture import images
 from nerfies_jax.capture.json_files import replaced_file
 
-PANEL_WIDTH = 256  # pixels at least: smaller pictures are enlarged so labels fit
+PANEL_WIDTH = 240  # pixels at least: smaller pictures are enlarged so labels fit
 GAP = 6  # pixels between panels
-TEXT_HEIGHT = 15
+TEXT_HEIGHT = 20
 INK, PAPER, FADED = (32, 33, 36), (255, 255, 255), (110, 113, 120)
 UNKNOWN = (128, 128, 128)  # grey is in none of the colour maps
 ERROR_MAP, DEPTH_MAP = "inferno", "viridis"
@@ -138,7 +138,7 @@ def comparison(
     for frame, caption in enumerate(captions):
         rows.append(_text(caption, 4 * width + 3 * GAP, colour=FADED))
         rows.append(_beside([column[frame] for column in columns]))
-    blank = _paper(2 * TEXT_HEIGHT + 6, width)
+    blank = _paper(2 * TEXT_HEIGHT + GAP, width)
     far, near = coloured_depth.high, coloured_depth.low
     rows.append(
         _beside(
@@ -214,7 +214,7 @@ def save(picture: np.ndarray, path: str | pathlib.Path):
 
 
 def as_bytes(picture: np.ndarray) -> np.ndarray:
-    """uint8 of a picture that is uint8 already or has floats in [0, 1]; NaN is black."""
+    """uint8 of a picture that is uint8 or has floats in [0, 1]; NaN is black."""
     if picture.dtype == np.uint8:
         return picture
     return np.round(np.clip(np.nan_to_num(picture, nan=0.0), 0, 1) * 255).astype(
@@ -256,7 +256,7 @@ def _font(bold):
     # The one font that is certainly installed: matplotlib brings it along.
     name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
     path = pathlib.Path(matplotlib.get_data_path()) / "fonts" / "ttf" / name
-    return PIL.ImageFont.truetype(str(path), 12)
+    return PIL.ImageFont.truetype(str(path), 16)
 
 
 def _text(words, width, colour=INK, bold=False, align="left"):
