@@ -1,0 +1,252 @@
+"""How long, how much memory, how many operations; and numbers as records."""
+
+import dataclasses
+import json
+import math
+import os
+import pathlib
+import platform
+import resource
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jaxlib
+import numpy as np
+
+DIRECTIONS = ("lower", "higher", "equal")
+
+
+@dataclasses.dataclass(frozen=True)
+class Metric:
+    """One measured number that a later run can be held against.
+
+    `direction` says which way is better: "lower", "higher" or "equal". `tolerance` is
+    how much worse it may become before that counts, in the metric's own unit.
+    """
+
+    key: str  # "heldout.psnr"
+    value: float
+    unit: str  # "dB", "ms", "bytes", "" for a share
+    direction: str
+    tolerance: float = 0.0
+
+    def __post_init__(self):
+        if not self.key or self.key != self.key.strip():
+            raise ValueError(
+                f"a metric needs a key like 'heldout.psnr', got {self.key!r}"
+            )
+        if self.direction not in DIRECTIONS:
+            raise ValueError(
+                f"metric {self.key}: direction is one of {', '.join(DIRECTIONS)}, got "
+                f"{self.direction!r}"
+            )
+        if not (math.isfinite(self.tolerance) and self.tolerance >= 0):
+            raise ValueError(
+                f"metric {self.key}: tolerance is finite and not negative, got "
+                f"{self.tolerance}"
+            )
+
+    def holds(self, before: float) -> bool:
+        """Whether the value is no worse than `before` by more than the tolerance.
+
+        A value that is not a number never holds.
+        """
+        change = self.value - before
+        if self.direction == "lower":
+            return change <= self.tolerance
+        if self.direction == "higher":
+            return -change <= self.tolerance
+        return abs(change) <= self.tolerance
+
+
+def write_metrics(
+    path, metrics: Iterable[Metric], about: Mapping[str, Any] = {}
+) -> None:
+    """All metrics as `{"about": ..., "metrics": {key: {value, unit, ...}}}`.
+
+    What is not finite is written as null, for JSON has no word for it. The file appears
+    whole or not at all.
+    """
+    path = pathlib.Path(path)
+    rows: dict[str, Any] = {}
+    for metric in metrics:
+        if metric.key in rows:
+            raise ValueError(
+                f"metric {metric.key} is there twice; each key is one number"
+            )
+        row = dataclasses.asdict(metric)
+        del row["key"]
+        row["value"] = float(metric.value) if math.isfinite(metric.value) else None
+        rows[metric.key] = row
+    text = json.dumps(
+        {"about": dict(about), "metrics": rows}, indent=1, allow_nan=False
+    )
+    with tempfile.NamedTemporaryFile("w", dir=path.parent, delete=False) as file:
+        file.write(text + "\n")
+    os.chmod(file.name, 0o644)
+    os.replace(file.name, path)
+
+
+def read_metrics(path) -> dict[str, Metric]:
+    """Metrics by key, as `write_metrics` wrote them; null is NaN."""
+    try:
+        rows = json.loads(pathlib.Path(path).read_text())["metrics"]
+        return {
+            key: Metric(key, **{**row, "value": _number(row["value"])})
+            for key, row in rows.items()
+        }
+    except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(
+            f"{path} is not a file of metrics ({error!r}); write it with write_metrics"
+        ) from error
+
+
+def _number(value):
+    return math.nan if value is None else float(value)
+
+
+class Timing(NamedTuple):
+    """Repeated warm calls of one function, in seconds."""
+
+    wall: np.ndarray  # [repeats]
+    cpu: np.ndarray  # [repeats] of all threads of this process
+
+    @property
+    def median(self) -> float:
+        """Median wall time."""
+        return float(np.median(self.wall))
+
+    @property
+    def median_cpu(self) -> float:
+        """Median processor time: what to compare on a machine shared with others."""
+        return float(np.median(self.cpu))
+
+    @property
+    def spread(self) -> float:
+        """Half the distance between the quartiles of the wall time."""
+        low, high = np.percentile(self.wall, (25, 75))
+        return float(high - low) / 2
+
+
+def measure(
+    function: Callable[[], Any], *, repeats: int = 10, warm_up: int = 2
+) -> Timing:
+    """Time warm calls of `function`, each until its results are there."""
+    return compare({"it": function}, repeats=repeats, warm_up=warm_up)["it"]
+
+
+def compare(
+    functions: Mapping[str, Callable[[], Any]], *, repeats: int = 10, warm_up: int = 2
+) -> dict[str, Timing]:
+    """Time several functions in turn, so that a busy minute hits all of them.
+
+    Compare `median_cpu` on a shared machine, and ratios within one run rather than
+    seconds of two: absolute times wander by a quarter.
+    """
+    if repeats < 1 or warm_up < 0:
+        raise ValueError(
+            f"timing needs repeats >= 1 and warm_up >= 0, got repeats={repeats}, "
+            f"warm_up={warm_up}; the first call compiles and should be warm-up"
+        )
+    for function in functions.values():
+        for _ in range(warm_up):
+            jax.block_until_ready(function())
+    wall = {name: [] for name in functions}
+    cpu = {name: [] for name in functions}
+    for _ in range(repeats):
+        for name, function in functions.items():
+            wall_began, cpu_began = time.perf_counter(), time.process_time()
+            jax.block_until_ready(function())
+            cpu[name].append(time.process_time() - cpu_began)
+            wall[name].append(time.perf_counter() - wall_began)
+    return {
+        name: Timing(np.array(wall[name]), np.array(cpu[name])) for name in functions
+    }
+
+
+class Cost(NamedTuple):
+    """What the compiler says of one program, per call."""
+
+    flops: float  # NaN where the backend does not count
+    bytes_accessed: float  # read and written; NaN where it does not count
+    temporary_bytes: int  # beside arguments and results
+    argument_bytes: int
+    output_bytes: int
+    compile_seconds: float
+
+
+def cost(function: Callable, *args, **kwargs) -> Cost:
+    """Compile `function` for these arguments and ask what a call takes.
+
+    A loop's body counts once, however often it runs: XLA does not know how often.
+    """
+    began = time.perf_counter()
+    lower = function.lower if hasattr(function, "lower") else jax.jit(function).lower
+    compiled = lower(*args, **kwargs).compile()
+    seconds = time.perf_counter() - began
+    counted = compiled.cost_analysis() or {}
+    if isinstance(counted, list):  # one per computation on some backends
+        counted = counted[0] if counted else {}
+    memory = compiled.memory_analysis()
+    return Cost(
+        float(counted.get("flops", math.nan)),
+        float(counted.get("bytes accessed", math.nan)),
+        int(memory.temp_size_in_bytes),
+        int(memory.argument_size_in_bytes),
+        int(memory.output_size_in_bytes),
+        seconds,
+    )
+
+
+def peak_bytes() -> int:
+    """Largest resident memory of this program so far."""
+    # On Linux getrusage also remembers the process that started this one, which for a
+    # small program under a large one reads the parent's memory.
+    try:
+        for line in pathlib.Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return 1024 * int(line.split()[1])
+    except OSError:
+        pass
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else 1024 * peak  # macOS counts bytes
+
+
+def device_peak_bytes() -> int | None:
+    """Largest memory of the first device so far, None where the backend keeps none."""
+    stats = jax.devices()[0].memory_stats() or {}
+    return stats.get("peak_bytes_in_use")
+
+
+def machine() -> dict[str, Any]:
+    """What a timing depends on, for the file it is written into."""
+    device = jax.devices()[0]
+    return {
+        "cpu": _cpu_model(),
+        "cores": len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else os.cpu_count(),
+        "xla_cores": os.environ.get("PJRT_NPROC") or os.environ.get("NPROC"),
+        "memory_bytes": os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
+        "system": f"{platform.system()} {platform.release()}",
+        "python": platform.python_version(),
+        "jax": jax.__version__,
+        "jaxlib": jaxlib.__version__,
+        "backend": device.platform,
+        "device": device.device_kind,
+        "x64": bool(jax.config.jax_enable_x64),
+    }
+
+
+def _cpu_model():
+    try:
+        for line in pathlib.Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
