@@ -16,7 +16,7 @@ from experiments import settings
 
 SAME_POSE = 1e-6  # of matrix entries; a camera on a tripod repeats its matrix exactly
 TRIPOD_ROWS = 5  # fewer rows of one pose are no validation sweep
-BLURRED = 0.4  # of the median sharpness around it; planted blurs came out below 0.2
+BLURRED = 0.4  # of the usual sharpness around it; planted blurs came out below 0.2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -248,11 +248,15 @@ def sharp_rows(scores: np.ndarray, count: int) -> tuple[np.ndarray, int]:
     """
     stretches = np.array_split(np.arange(len(scores)), min(count, len(scores)))
     best = np.array([rows[np.argmax(scores[rows])] for rows in stretches])
-    usual = np.array(
-        [np.median(scores[best[max(0, i - 5) : i + 6]]) for i in range(len(best))]
-    )
-    clear = scores[best] >= BLURRED * usual
+    own = scores[best]
+    clear = np.array([own[i] >= BLURRED * _usual(own, i) for i in range(len(own))])
     return best[clear], int((~clear).sum())
+
+
+def _usual(scores, row):
+    """The lower of the medians just before and just after; texture may jump between."""
+    sides = scores[max(0, row - 5) : row], scores[row + 1 : row + 6]
+    return min((np.median(side) for side in sides if side.size), default=0.0)
 
 
 def convert_pictures(asked: Pictures) -> list[str]:

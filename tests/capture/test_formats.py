@@ -1,0 +1,99 @@
+"""Recognising what a folder holds, and saying what was looked for."""
+
+import dataclasses
+import inspect
+import subprocess
+import sys
+
+import pytest
+
+from nerfies_jax import capture as room
+from nerfies_jax.capture import blender_format, colmap, formats, nerfies_format
+from nerfies_jax.capture.capture import CaptureError
+
+
+def test_a_folder_that_is_no_capture_lists_what_was_looked_for(tmp_path):
+    (tmp_path / "notes.txt").write_text("hello")
+    with pytest.raises(CaptureError) as caught:
+        room.load(tmp_path)
+    message = str(caught.value)
+    for said in (
+        str(tmp_path),
+        "scene.json",
+        "transforms*.json",
+        "sparse/0/cameras.bin",
+    ):
+        assert said in message
+    assert "\n" not in message
+
+
+def test_a_path_that_is_not_there_and_a_film_are_refused(tmp_path):
+    with pytest.raises(CaptureError, match="no such folder"):
+        room.load(tmp_path / "nowhere")
+    (tmp_path / "film.mp4").write_bytes(b"")
+    with pytest.raises(CaptureError, match=r"experiments\.prepare"):
+        room.load(tmp_path / "film.mp4")
+    assert issubclass(CaptureError, ValueError)
+
+
+@pytest.mark.parametrize(
+    ("files", "expected"),
+    [
+        (("scene.json", "camera/0.json"), "nerfies"),
+        # Nerfies' own folders may hold the COLMAP model they came from.
+        (("scene.json", "camera/0.json", "colmap/sparse/0/cameras.bin"), "nerfies"),
+        (("transforms.json",), "blender"),
+        (("transforms_train.json", "sparse/0/cameras.bin"), "blender"),
+        (("sparse/0/cameras.txt",), "colmap"),
+        (("colmap/sparse/0/cameras.bin",), "colmap"),
+        (("sparse/1/cameras.bin",), "colmap"),
+        (("cameras.bin",), "colmap"),
+    ],
+)
+def test_what_is_recognised(tmp_path, files, expected):
+    for name in files:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    assert formats.recognise(tmp_path).name == expected
+
+
+def test_every_reader_takes_the_common_options():
+    common = set(inspect.signature(formats.load).parameters) - {"options"}
+    for reader in (nerfies_format, blender_format, colmap):
+        assert common <= set(inspect.signature(reader.read).parameters)
+
+
+def test_load_passes_its_options_on(monkeypatch, tmp_path):
+    (tmp_path / "transforms.json").touch()
+    seen = {}
+
+    def record(path, **options):
+        seen.update(options)
+        raise CaptureError("seen")
+
+    monkeypatch.setattr(blender_format, "read", record)
+    with pytest.raises(CaptureError, match="seen"):
+        room.load(tmp_path, factor=2, heldout="val", background=(0.0, 0.0, 0.0))
+    assert seen == {
+        "factor": 2,
+        "max_side": None,
+        "heldout": "val",
+        "missing": "refuse",
+        "background": (0.0, 0.0, 0.0),
+    }
+
+
+def test_importing_the_room_loads_no_decoder():
+    code = (
+        "import sys, nerfies_jax.capture, nerfies_jax.capture.formats\n"
+        "heavy = {'skimage', 'av', 'OpenEXR', 'pycolmap', 'plyfile', 'scipy'}\n"
+        "print(sorted(heavy & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.strip() in ("[]", "['scipy']"), done.stderr  # jax may load scipy
+
+
+def test_formats_are_told_apart_by_name():
+    names = [each.name for each in formats.FORMATS]
+    assert len(set(names)) == len(names)
+    assert dataclasses.is_dataclass(room.load.__annotations__["return"])
