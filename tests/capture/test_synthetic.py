@@ -1,0 +1,398 @@
+"""What a synthetic scene says of itself, against NumPy, SciPy and its own pictures."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from nerfies_jax.capture import nerfies_format, synthetic
+from nerfies_jax.capture.synthetic import film, presets, record, truth
+from nerfies_jax.capture.synthetic.spec import Cameras, Exposure, Specular, Transient
+from nerfies_jax.geometry import camera as cameras
+from tests import scene_oracle
+
+SPEC = dataclasses.replace(
+    presets.NON_RIGID,
+    things=(presets.WALL, presets.FLOOR, presets.GLOBE, presets.CLOTH, presets.BALL),
+    size=(48, 36),
+    frames=7,
+    heldout_every=2,
+    points=300,
+    tracks=60,
+)
+# Two boxes compile in a fraction of the time; the switches need a program each.
+SMALL = dataclasses.replace(
+    SPEC, things=(presets.WALL, presets.CUBE), points=50, tracks=9
+)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return synthetic.make(SPEC)
+
+
+@pytest.fixture(scope="module")
+def small():
+    return synthetic.make(SMALL)
+
+
+def pixels_of(capture, truth, rng, count, among=None):
+    """Random (row, y, x), the world points seen there and the pixel centres."""
+    shown = truth.things >= 0 if among is None else among
+    found = rng.choice(np.flatnonzero(shown), count, replace=False)
+    row, y, x = np.unravel_index(found, shown.shape)
+    centres = np.stack([x, y], -1) + 0.5
+    points = np.empty((count, 3))
+    for i in range(count):
+        camera = cameras.take(capture.cameras, row[i])
+        along = scene_oracle.directions(camera, centres[i : i + 1])[0]
+        points[i] = camera.position + capture.depths[row[i], y[i], x[i]] * along
+    return (row, y, x), points, centres
+
+
+def linear(images):
+    coded = np.asarray(images, float) / 255
+    return np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4)
+
+
+def test_the_capture_has_the_frames_and_rows_that_were_asked_for(scene):
+    capture, truth = scene
+    assert capture.ids == truth.ids == tuple(sorted(capture.ids))
+    assert capture.images.shape == (7 + 3, 36, 48, 3)
+    assert capture.train.tolist() == list(range(7))
+    assert capture.camera_ids.tolist() == [0] * 7 + [1] * 3
+    assert capture.warp_ids.tolist() == [*range(7), 1, 3, 5]
+    assert np.allclose(capture.times, capture.warp_ids / 6)
+    assert (capture.near < capture.depths).all()
+    assert (capture.far > capture.depths).all()
+    assert (truth.things >= 0).all()  # the stage fills every picture
+    assert 0.05 < capture.moving.mean() < 0.4
+    gap = capture.cameras.position[7:] - capture.cameras.position[[1, 3, 5]]
+    assert np.allclose(np.linalg.norm(gap, axis=-1), np.hypot(0.09, 0.05), atol=1e-6)
+
+
+def test_depth_and_ids_are_numpy_s(scene, rng):
+    capture, truth = scene
+    (row, y, x), _, centres = pixels_of(capture, truth, rng, 200)
+    wrong = 0
+    for i in range(len(row)):
+        camera = cameras.take(capture.cameras, row[i])
+        along = scene_oracle.directions(camera, centres[i : i + 1])[0]
+        depth, thing = scene_oracle.first(
+            SPEC.things,
+            camera.position.astype(float),
+            along,
+            float(capture.times[row[i]]),
+        )
+        same = thing == truth.things[row[i], y[i], x[i]]
+        wrong += not (same and abs(depth - capture.depths[row[i], y[i], x[i]]) < 2e-5)
+    assert wrong <= 2  # pixel centres within rounding of a silhouette
+
+
+def test_moving_pixels_are_those_whose_points_move(scene, rng):
+    capture, truth = scene
+    (row, y, x), points, _ = pixels_of(capture, truth, rng, 120)
+    for i in range(len(row)):
+        thing = SPEC.things[truth.things[row[i], y[i], x[i]]]
+        at = float(capture.times[row[i]])
+        canonical = _canonical(thing, points[i : i + 1], at)
+        over_time = [
+            scene_oracle.observe(thing, canonical, t) for t in (0, 0.2, 0.45, 0.8)
+        ]
+        travel = np.ptp(np.concatenate(over_time), axis=0).max()
+        assert (travel > 1e-4) == capture.moving[row[i], y[i], x[i]]
+
+
+def _canonical(thing, points, time):
+    material = scene_oracle.undeform(
+        thing.shape, scene_oracle.to_body(thing, points, time), time
+    )
+    body = scene_oracle.deform(thing.shape, material, 0.0)
+    return (np.c_[body, np.ones(len(body))] @ scene_oracle.pose(thing, 0.0).T)[:, :3]
+
+
+@pytest.mark.parametrize("step", [1, -1])
+def test_flow_leads_to_where_numpy_sees_the_moved_point(scene, rng, step):
+    capture, truth = scene
+    flow, seen = (
+        (truth.flow_forward, truth.forward_seen)
+        if step == 1
+        else (truth.flow_backward, truth.backward_seen)
+    )
+    last = [6, 9] if step == 1 else [0, 7]
+    assert not seen[last].any()
+    assert not flow[last].any()
+    has_next = np.ones(truth.things.shape, bool)
+    has_next[last] = False
+    wrong_sight = 0
+    # Half of them where the point is lost, or the test would hardly look at occlusion.
+    for among in (has_next & seen, has_next & ~seen):
+        (row, y, x), points, centres = pixels_of(capture, truth, rng, 80, among)
+        for i in range(len(row)):
+            index = truth.things[row[i], y[i], x[i]]
+            other = row[i] + step
+            camera, time = (
+                cameras.take(capture.cameras, other),
+                float(capture.times[other]),
+            )
+            canonical = _canonical(
+                SPEC.things[index], points[i : i + 1], float(capture.times[row[i]])
+            )
+            moved = scene_oracle.observe(SPEC.things[index], canonical, time)
+            pixel = scene_oracle.project(camera, moved)[0]
+            # float32 depth of a grazing ray is the largest part: 3e-4 px measured.
+            assert np.abs(flow[row[i], y[i], x[i]] - (pixel - centres[i])).max() < 3e-3
+            eye = camera.position.astype(float)
+            distance, thing = scene_oracle.first(SPEC.things, eye, moved[0] - eye, time)
+            inside = np.all((pixel >= 0) & (pixel <= SPEC.size))
+            sees = inside and thing == index and abs(distance - 1) < 1e-3
+            wrong_sight += sees != seen[row[i], y[i], x[i]]
+    assert wrong_sight <= 2  # points within rounding of a border
+
+
+def test_tracks_follow_numpy_s_map_and_meet_their_own_material(scene):
+    capture, truth = scene
+    moving = [i for i, thing in enumerate(SPEC.things) if thing.moves()]
+    assert set(truth.track_thing) == set(moving)
+    times = np.linspace(0, 1, SPEC.frames)
+    for i, index in enumerate(truth.track_thing):
+        canonical = truth.track_canonical[i : i + 1].astype(float)
+        for instant, time in enumerate(times):
+            exact = scene_oracle.observe(SPEC.things[index], canonical, time)
+            assert np.abs(truth.track_world[i, instant] - exact).max() < 2e-6
+    for row in range(len(capture.ids)):
+        points = truth.track_world[:, capture.warp_ids[row]].astype(float)
+        pixel = scene_oracle.project(cameras.take(capture.cameras, row), points)
+        assert np.abs(truth.track_pixel[:, row] - pixel).max() < 1e-3
+    assert 0.3 < truth.track_seen.mean() < 1
+    row, found = 4, np.flatnonzero(truth.track_seen[:, 4])
+    x, y = truth.track_pixel[found, row].astype(int).T
+    assert np.mean(truth.things[row, y, x] == truth.track_thing[found]) > 0.9
+
+
+def test_static_points_have_the_same_colour_for_both_cameras(scene, rng):
+    capture, truth = scene
+    differences, shuffled = [], []
+    for row in (7, 8, 9):
+        twin = int(np.flatnonzero(capture.warp_ids[:7] == capture.warp_ids[row])[0])
+        among = np.zeros_like(truth.things, bool)
+        among[row] = ~capture.moving[row]
+        (_, y, x), points, _ = pixels_of(capture, truth, rng, 300, among)
+        camera = cameras.take(capture.cameras, twin)
+        pixel = scene_oracle.project(camera, points)
+        column, line = np.floor(pixel).astype(int).T
+        inside = (column >= 0) & (line >= 0) & (column < 48) & (line < 36)
+        depth = (points - camera.position) @ camera.camera_from_world[2]
+        seen = inside.copy()
+        there = capture.depths[twin, line[inside], column[inside]]
+        seen[inside] &= np.abs(there - depth[inside]) < 0.02
+        here = capture.images[row, y, x][seen].astype(float)
+        twin_colour = capture.images[twin, line[seen], column[seen]].astype(float)
+        differences.append(np.abs(here - twin_colour))
+        shuffled.append(np.abs(here - rng.permutation(twin_colour)))
+    # Half a pixel of misplacement remains, on a texture finer than these small pixels.
+    same, other = np.concatenate(differences), np.concatenate(shuffled)
+    assert len(same) > 300
+    assert np.median(same) < 0.5 * np.median(other)
+
+
+def test_points_lie_on_static_surfaces_with_little_noise(scene):
+    capture, _ = scene
+    assert len(capture.points.position) == SPEC.points
+    static = [thing for thing in SPEC.things if not thing.moves()]
+    eye = np.array([0.0, 0.1, 0.6])
+    for point, colour in zip(*capture.points, strict=True):
+        # Signed distance to a box or ball: outside plus inside parts.
+        gaps = []
+        for thing in static:
+            body = point - np.array(thing.place)
+            if hasattr(thing.shape, "half"):
+                outside = np.abs(body) - thing.shape.half
+                gap = np.linalg.norm(np.maximum(outside, 0)) + min(outside.max(), 0)
+            else:
+                gap = np.linalg.norm(body) - thing.shape.radius
+            gaps.append(abs(gap))
+        assert min(gaps) < 5 * SPEC.point_noise
+        assert np.linalg.norm(point - eye) < 2
+        assert colour.dtype == np.uint8
+
+
+def test_supersampling_is_the_mean_light_of_a_finer_picture(small):
+    capture, _ = small
+    fine = dataclasses.replace(SMALL, size=(96, 72), supersampling=1)
+    plan = film.schedule(fine, 0)
+    picture = jax.jit(film.picture, static_argnums=0)(
+        fine, cameras.take(plan.cameras, 2), plan.time[2], plan.light_gain[2], False
+    )
+    light = linear(np.asarray(picture.image) * 255)
+    mean = light.reshape(36, 2, 48, 2, 3).mean((1, 3))
+    # Eight-bit rounding, and one count where float32 rounds the other way.
+    assert np.abs(linear(capture.images[2]) - mean).max() < 1.2 * 0.5 * 0.0090
+
+
+def test_the_same_seed_repeats_and_another_moves_only_the_hand(small):
+    capture, truth = small
+    again, truth_again = synthetic.make(SMALL)
+    for one, two in zip(truth, truth_again, strict=True):
+        assert np.array_equal(one, two)
+    assert np.array_equal(capture.images, again.images)
+    assert np.array_equal(capture.points.position, again.points.position)
+    other = film.schedule(SMALL, 1)
+    assert np.array_equal(other.time, capture.times)
+    shift = np.linalg.norm(other.cameras.position - capture.cameras.position, axis=-1)
+    assert 0.001 < shift.mean() < 0.05
+
+
+def test_exposure_changes_the_light_alone(small):
+    capture, truth = small
+    spec = dataclasses.replace(SMALL, exposure=Exposure(stops=0.4))
+    lit, lit_truth = synthetic.make(spec)
+    assert np.array_equal(lit.depths, capture.depths)
+    assert np.array_equal(lit.moving, capture.moving)
+    assert np.array_equal(lit.cameras.position, capture.cameras.position)
+    assert np.array_equal(lit_truth.track_pixel, truth.track_pixel)
+    assert (truth.light_gain == 1).all()
+    gain = lit_truth.light_gain
+    assert 0.2 < np.std(np.log2(gain[:, 1])) < 0.8
+    assert np.array_equal(gain[7:], gain[[1, 3, 5]])  # an instant has one exposure
+    before, after = linear(capture.images), linear(lit.images)
+    expected = before * gain[:, None, None]
+    # Brighter than filmed without it, single samples of a pixel may be clipped.
+    clean = (gain[:, None, None] <= 1) & (expected > 0.05)
+    assert clean.mean() > 0.2
+    # 8 bits: half a count in either picture is 2% of light 0.05.
+    assert np.abs(after / np.maximum(expected, 1e-9) - 1)[clean].max() < 0.035
+
+
+def test_a_transient_changes_its_own_pixels_alone(small):
+    capture, _ = small
+    passer = dataclasses.replace(presets.PASSER, place=(-0.3, 0.0, 0.2))
+    spec = dataclasses.replace(SMALL, transient=Transient(passer, ((0.3, 0.7),)))
+    passed, passed_truth = synthetic.make(spec)
+    shown = passed_truth.transient.any((1, 2))
+    assert shown.tolist() == [
+        0.3 <= t <= 0.7 and c == 0
+        for t, c in zip(capture.times, capture.camera_ids, strict=True)
+    ]
+    assert np.array_equal(passed.images[~shown], capture.images[~shown])
+    assert np.array_equal(passed_truth.transient, passed_truth.things == 2)
+    assert (passed.moving >= passed_truth.transient).all()
+    changed = (passed.images != capture.images).any(-1)
+    grown = passed_truth.transient.copy()
+    grown[:, :, 1:] |= passed_truth.transient[:, :, :-1]
+    grown[:, :, :-1] |= passed_truth.transient[:, :, 1:]
+    assert not (changed & ~grown).any()  # a border pixel mixes both
+    assert (changed & passed_truth.transient).sum() > 0.9 * passed_truth.transient.sum()
+    assert not (passed_truth.track_thing == 2).any()
+    # Where it will be gone in the next frame, its pixels are seen no more.
+    leaves = shown[:-1] & ~shown[1:]
+    gone = np.flatnonzero(leaves)[0]
+    assert not passed_truth.forward_seen[gone][passed_truth.transient[gone]].any()
+
+
+def test_a_specular_surface_adds_light_to_its_own_thing_alone(small):
+    capture, truth = small
+    spec = dataclasses.replace(SMALL, specular=Specular("cube", 0.8, 8.0))
+    shiny, shiny_truth = synthetic.make(spec)
+    assert np.array_equal(shiny_truth.things, truth.things)
+    difference = shiny.images.astype(int) - capture.images
+    assert difference.min() >= 0
+    assert difference[truth.things == 1].max() > 20
+    inner = (truth.things == 0) & (np.roll(truth.things, 1, 2) == 0)
+    inner &= (np.roll(truth.things, -1, 2) == 0) & (np.roll(truth.things, 1, 1) == 0)
+    inner &= np.roll(truth.things, -1, 1) == 0
+    assert difference[inner].max() == 0
+
+
+def test_a_still_scene_has_no_moving_pixels_and_no_tracks():
+    still = dataclasses.replace(presets.CUBE, motion=None)
+    capture, truth = synthetic.make(
+        dataclasses.replace(SMALL, things=(presets.WALL, still), skip_every=3)
+    )
+    assert not capture.moving.any()
+    assert truth.track_world.shape == (0, 7, 3)
+    assert capture.heldout.tolist() == [1, 4, 7, 8, 9]  # and the skipped instants
+    # A still thing seen by a moving camera has flow all the same.
+    assert np.abs(truth.flow_forward[0]).max() > 0.5
+
+
+def test_the_written_directory_reads_back_row_for_row(small, tmp_path, monkeypatch):
+    capture, answers = small
+    first = synthetic.cached(SMALL, tmp_path)
+
+    def no_film(*_):
+        raise AssertionError("filmed again although cached")
+
+    monkeypatch.setattr(record, "make", no_film)
+    second, stored = synthetic.cached(SMALL, tmp_path)
+    for read in (first[0], second):
+        assert read.ids == capture.ids
+        for name in ("images", "moving", "depths", "times", "train", "heldout"):
+            assert np.array_equal(getattr(read, name), getattr(capture, name)), name
+        for one, two in zip(read.cameras, capture.cameras, strict=True):
+            assert np.allclose(one, two, atol=1e-7)
+        assert np.allclose(read.points.position, capture.points.position, atol=1e-7)
+        assert (read.near, read.far) == pytest.approx((capture.near, capture.far))
+    for one, two in zip(stored, answers, strict=True):
+        assert np.array_equal(one, two)
+    assert len(list(tmp_path.iterdir())) == 1
+    assert nerfies_format.read(next(tmp_path.iterdir())).source == "nerfies"
+
+
+def test_a_failed_write_leaves_nothing_behind(small, tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(record, "make", lambda *_: small)
+    monkeypatch.setattr(truth, "save", full)
+    with pytest.raises(ValueError, match="No space left"):
+        synthetic.write(SMALL, tmp_path / "scene")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_truth_of_another_version_is_refused(tmp_path):
+    np.savez(tmp_path / "truth.npz", ids=np.array(["a"]))
+    with pytest.raises(ValueError, match="make the scene again"):
+        truth.load(tmp_path / "truth.npz")
+
+
+def test_the_digest_knows_every_setting_and_the_seed():
+    specs = list(synthetic.PRESETS.values())
+    specs.append(dataclasses.replace(specs[0], point_noise=0.001))
+    assert len({synthetic.digest(spec) for spec in specs}) == len(specs)
+    assert synthetic.digest(specs[0], 1) != synthetic.digest(specs[0], 0)
+    assert synthetic.digest(specs[0]) == synthetic.digest(specs[0])
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"frames": 1}, "frames=1 must be at least 2"),
+        ({"size": (4, 40)}, "at least 8x8"),
+        ({"things": ()}, "at least one thing"),
+        ({"things": (presets.CUBE, presets.CUBE)}, "called 'cube'; rename"),
+        ({"specular": Specular("moon")}, "'moon' is not in the scene"),
+        ({"skip_every": 1}, "skip_every=1"),
+        ({"ambient": 2.0}, "ambient=2.0"),
+        ({"supersampling": 0}, "supersampling=0"),
+    ],
+)
+def test_a_wrong_scene_is_refused_by_name(change, words):
+    with pytest.raises(ValueError, match=words):
+        dataclasses.replace(SMALL, **change)
+
+
+@pytest.mark.parametrize(
+    ("build", "words"),
+    [
+        (lambda: Cameras(distance=0.1, forward=0.2), "forward=0.2"),
+        (lambda: Cameras(field_of_view_rad=4.0), "field_of_view_rad=4.0"),
+        (lambda: Cameras(shake=-1.0), "shake=-1.0"),
+        (lambda: Transient(presets.PASSER, ((0.5, 0.4),)), r"window \(0.5, 0.4\)"),
+        (lambda: SMALL.id_of("moon"), "no thing 'moon'"),
+    ],
+)
+def test_wrong_cameras_and_effects_are_refused_by_name(build, words):
+    with pytest.raises(ValueError, match=words):
+        build()
