@@ -1,0 +1,354 @@
+"""Checkpoints: whole or absent, refused when foreign, and resumed to the last bit."""
+
+import dataclasses
+import enum
+import json
+import os
+import pathlib
+import signal
+import subprocess
+import sys
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import rich.console
+
+from nerfies_jax.training import checkpoint, loop
+from nerfies_jax.training.settings_text import describe, differences
+from tests.training import run_toy, toy
+
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+QUIET = rich.console.Console(quiet=True)
+MODEL = toy.model()
+SPEC = toy.ToySpec()
+
+
+def start():
+    return MODEL.init(None, jax.random.key(5))
+
+
+def save(folder, *saved, spec=SPEC, keep=3, after=None):
+    with checkpoint.Checkpoints(folder, spec, keep=keep, after=after) as checkpoints:
+        for state, step in saved:
+            checkpoints.save(state, step, {"note": step})
+
+
+def fit(state, folder, steps, after=None, **settings):
+    with checkpoint.Checkpoints(folder, SPEC, after=after) as checkpoints:
+        return loop.fit(
+            MODEL,
+            state,
+            toy.frames(),
+            steps=steps,
+            console=QUIET,
+            checkpoints=checkpoints,
+            **settings,
+        )
+
+
+@pytest.fixture(scope="module")
+def straight():
+    return loop.fit(MODEL, start(), toy.frames(), steps=20, console=QUIET)
+
+
+def test_what_is_restored_is_what_was_saved(tmp_path, dtype):
+    state = {
+        "wide": jnp.asarray([[0.1, -0.0, 1e-30]], dtype),
+        "half": jnp.asarray([1.5, 2.0], jnp.bfloat16),
+        "empty": jnp.zeros((3, 0, 2), dtype),
+        "scalar": jnp.asarray(7, jnp.int32),
+        "flags": jnp.asarray([True, False]),
+        "bytes": jnp.asarray([0, 255], jnp.uint8),
+        "infinite": jnp.asarray([jnp.inf, jnp.nan], dtype),
+        "key": jax.random.key(3),
+        "other key": jax.random.key(3, impl="rbg"),
+        "several": jax.random.split(jax.random.key(1), 4),
+    }
+    save(tmp_path, (state, 12))
+    restored = checkpoint.restore(tmp_path, jax.eval_shape(lambda: state), SPEC)
+    assert toy.same(restored.state, state)
+    assert restored.state["other key"].dtype == state["other key"].dtype
+    assert restored.step == 12
+    assert restored.record == {"note": 12}
+    assert checkpoint.latest(tmp_path) == 12
+
+
+def test_a_checkpoint_says_what_made_it(tmp_path):
+    save(tmp_path, (start(), 0))
+    about = checkpoint.restore(tmp_path, start(), SPEC).about
+    assert about["jax"] == jax.__version__
+    assert about["spec"]["grow_at"] == [7]
+    commit = subprocess.run(
+        ["git", "-C", ROOT, "rev-parse", "HEAD"], capture_output=True, text=True
+    ).stdout.strip()
+    if commit:
+        assert about["revision"].removesuffix("+changes") == commit
+
+
+@pytest.mark.parametrize("cut", [1, 6, 7, 8, 19])
+def test_a_resumed_run_is_the_straight_run_bit_for_bit(cut, tmp_path, straight):
+    first = fit(start(), tmp_path, cut)
+    restored = checkpoint.restore(tmp_path, start(), SPEC)  # of the first capacity
+    assert toy.same(restored.state, first.state)
+    history = loop.History(**restored.record)
+    second = fit(restored.state, tmp_path, 20, after=restored.step, history=history)
+    assert toy.same(second.state, straight.state)
+    assert checkpoint.latest(tmp_path) == 20
+    assert second.seconds > first.seconds
+    assert second.history.rows[0]["step"] == 1
+
+
+def test_only_the_newest_checkpoints_stay(tmp_path):
+    state = start()
+    save(tmp_path, *((state, step) for step in (1, 5, 9, 12)), keep=2)
+    assert checkpoint.steps(tmp_path) == [9, 12]
+
+
+def test_a_checkpoint_of_another_spec_lists_what_differs(tmp_path):
+    save(tmp_path, (start(), 3))
+    other = toy.ToySpec(rows=9, grow_at=(7, 8))
+    with pytest.raises(ValueError, match="was made with other settings") as error:
+        checkpoint.restore(tmp_path, start(), other)
+    message = str(error.value)
+    assert "spec.rows: saved 6, now 9" in message
+    assert "spec.grow_at[1]: saved absent, now 8" in message
+    assert "rate" not in message
+
+
+def damage_truncate(folder):
+    for path in (folder / "state").rglob("*"):
+        if path.is_file() and path.stat().st_size > 200:
+            path.write_bytes(path.read_bytes()[:100])
+
+
+def damage_flip(folder):
+    files = [path for path in (folder / "state").rglob("d/*") if path.is_file()]
+    largest = max(files, key=lambda path: path.stat().st_size)
+    data = bytearray(largest.read_bytes())
+    data[len(data) // 2] ^= 0x10
+    largest.write_bytes(data)
+
+
+def damage_lose_arrays(folder):
+    for path in (folder / "state").rglob("d/*"):
+        path.unlink()
+
+
+def damage_lose_notes(folder):
+    for path in (folder / "about").rglob("*"):
+        path.unlink()
+
+
+# When one array cannot be read, orbax closes its event loop on the reads of the others.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize(
+    "damage", [damage_truncate, damage_flip, damage_lose_arrays, damage_lose_notes]
+)
+def test_a_damaged_newest_checkpoint_falls_back_to_the_one_before(damage, tmp_path):
+    older, newer = start(), MODEL.init(None, jax.random.key(6))
+    save(tmp_path, (older, 4), (newer, 8))
+    damage(tmp_path / "8")
+    with pytest.warns(
+        RuntimeWarning, match=r"8 cannot be read .* trying the one before"
+    ):
+        restored = checkpoint.restore(tmp_path, start(), SPEC)
+    assert restored.step == 4
+    assert toy.same(restored.state, older)
+    save(tmp_path, (newer, 6), after=4)  # going on drops the damaged future
+    assert checkpoint.steps(tmp_path) == [4, 6]
+    damage(tmp_path / "4")
+    with pytest.raises(ValueError, match=r"4 cannot be read"):
+        checkpoint.restore(tmp_path, start(), SPEC, step=4)
+    time.sleep(0.2)  # for those reads to complain here and not in another test
+
+
+def test_an_unfinished_checkpoint_is_none(tmp_path):
+    save(tmp_path, (start(), 4))
+    (tmp_path / "8.orbax-checkpoint-tmp-123" / "state").mkdir(parents=True)
+    assert checkpoint.latest(tmp_path) == 4
+    assert checkpoint.restore(tmp_path, start(), SPEC).step == 4
+
+
+def test_arrays_that_do_not_fit_are_named(tmp_path):
+    state = start()
+    save(tmp_path, (state, 1))
+    wide = state.params.nets | {"weight": jnp.zeros((3, 9))}
+    other = state._replace(params=state.params._replace(nets=wide))
+    with pytest.raises(ValueError, match=r"params\.nets\.weight as float32\[3, 8\]"):
+        checkpoint.restore(tmp_path, other, SPEC)
+    half = state._replace(extra=state.extra | {"hits": jnp.zeros(6, jnp.float16)})
+    with pytest.raises(ValueError, match=r"this run needs float16\[6\]"):
+        checkpoint.restore(tmp_path, half, SPEC)
+    more = state._replace(extra=state.extra | {"new": jnp.zeros(6)})
+    with pytest.raises(ValueError, match=r"without \['extra.new'\]"):
+        checkpoint.restore(tmp_path, more, SPEC)
+
+
+def test_an_unwritable_folder_is_an_error_before_training(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ValueError, match=r"cannot write checkpoints to .*file"):
+        checkpoint.Checkpoints(tmp_path / "file", SPEC)
+    with pytest.raises(ValueError, match="cannot write checkpoints to /proc/self/run"):
+        checkpoint.Checkpoints("/proc/self/run", SPEC)
+    with pytest.raises(ValueError, match="keep=0"):
+        checkpoint.Checkpoints(tmp_path / "run", SPEC, keep=0)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_a_folder_without_permission_is_an_error(tmp_path):
+    tmp_path.chmod(0o500)
+    with pytest.raises(ValueError, match="Permission denied"):
+        checkpoint.Checkpoints(tmp_path / "run", SPEC)
+    tmp_path.chmod(0o700)
+
+
+def test_a_folder_in_use_is_not_written_over(tmp_path):
+    save(tmp_path, (start(), 4))
+    with pytest.raises(ValueError, match="already holds a run, saved at step 4"):
+        checkpoint.Checkpoints(tmp_path, SPEC)
+
+
+def test_nothing_to_restore_is_an_error(tmp_path):
+    with pytest.raises(ValueError, match="holds no checkpoint"):
+        checkpoint.restore(tmp_path / "absent", start(), SPEC)
+    save(tmp_path, (start(), 4))
+    with pytest.raises(ValueError, match=r"no checkpoint of step 3, only of \[4\]"):
+        checkpoint.restore(tmp_path, start(), SPEC, step=3)
+
+
+def test_a_step_that_is_not_finite_is_never_saved(tmp_path):
+    def step(state, frames):
+        new, metrics = toy.step(state, frames)
+        bad = jnp.where(state.step + 1 == 11, jnp.nan, 0.0)
+        rows = {"mean": new.params.rows["mean"] + bad}
+        return new._replace(params=new.params._replace(rows=rows)), metrics
+
+    model = toy.model(change=step)
+    with checkpoint.Checkpoints(tmp_path, SPEC) as checkpoints:
+        result = loop.fit(
+            model,
+            start(),
+            toy.frames(),
+            steps=20,
+            console=QUIET,
+            checkpoints=checkpoints,
+            checkpoint_seconds=0.0,
+        )
+    assert result.stopped_by == "non-finite"
+    assert checkpoint.latest(tmp_path) == 10
+    restored = checkpoint.restore(tmp_path, start(), SPEC)
+    assert all(
+        np.isfinite(leaf).all() for leaf in jax.tree.leaves(restored.state.params)
+    )
+
+
+class Colour(enum.Enum):
+    RED = 1
+
+
+@dataclasses.dataclass(frozen=True)
+class Outer:
+    inner: object = SPEC
+    colour: Colour = Colour.RED
+    limits: tuple = (1, 2.0, None)
+
+
+def test_specs_become_text_and_compare_by_field():
+    text = describe(Outer())
+    assert json.loads(json.dumps(text)) == text
+    assert text["inner"]["type"].endswith("ToySpec")
+    assert differences(text, describe(Outer())) == []
+    nan = describe(Outer(limits=(float("nan"),)))
+    assert differences(nan, nan) == []
+    changed = Outer(inner=dataclasses.replace(SPEC, rate=0.5), limits=(1, 2, None))
+    assert differences(text, describe(changed)) == [
+        "spec.inner.rate: saved 0.01, now 0.5",
+        "spec.limits[1]: saved 2.0, now 2",
+    ]
+    assert differences(text, describe(Outer(inner=None)))[0].startswith(
+        "spec.inner.type"
+    )
+
+
+def test_a_spec_that_is_no_text_is_refused():
+    with pytest.raises(ValueError, match=r"spec\.inner holds a function"):
+        describe(Outer(inner=lambda: 1))
+
+
+def launch(folder, steps, *more):
+    environment = {
+        **os.environ,
+        "PJRT_NPROC": "1",
+        "PYTHONPATH": str(ROOT),
+        "JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir,
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+    }
+    return subprocess.Popen(
+        [
+            sys.executable,
+            "-m",
+            "tests.training.run_toy",
+            str(folder),
+            str(steps),
+            *more,
+        ],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+        cwd=ROOT,
+    )
+
+
+def report(process):
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 0, err
+    return json.loads(out.splitlines()[-1])
+
+
+def wait_for_checkpoint(folder, process):
+    for _ in range(600):
+        if checkpoint.latest(folder) is not None or process.poll() is not None:
+            return
+        time.sleep(0.1)
+
+
+def test_sigterm_saves_and_a_fresh_process_goes_on_bit_for_bit(tmp_path):
+    first = launch(tmp_path, 40, "0.05")
+    wait_for_checkpoint(tmp_path, first)
+    first.send_signal(signal.SIGTERM)
+    stopped = report(first)
+    assert stopped["stopped_by"] == "SIGTERM"
+    assert 1 <= stopped["steps"] < 40
+    assert checkpoint.latest(tmp_path) == stopped["steps"]
+    second = report(launch(tmp_path, 40))
+    assert second["from"] == stopped["steps"]
+    assert second["digest"] == straight_digest(40)
+
+
+def straight_digest(steps):
+    result = loop.fit(MODEL, start(), toy.frames(), steps=steps, console=QUIET)
+    return run_toy.digest(result.state)
+
+
+@pytest.mark.slow
+def test_killed_runs_resume_from_a_whole_checkpoint_bit_for_bit(tmp_path):
+    rng = np.random.default_rng(int.from_bytes(os.urandom(4)))
+    folder = tmp_path / "killed"
+    furthest = -1
+    for _ in range(8):
+        process = launch(folder, 400, "0.01")
+        wait_for_checkpoint(folder, process)
+        time.sleep(rng.uniform(0, 1.5))
+        process.kill()
+        process.communicate()
+        restored = checkpoint.restore(folder, start(), SPEC)  # no warning: it is whole
+        assert restored.step >= furthest
+        furthest = restored.step
+    assert furthest > 0
+    resumed = report(launch(folder, 400))
+    assert resumed["from"] == furthest
+    assert resumed["digest"] == straight_digest(400)
