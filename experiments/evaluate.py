@@ -14,8 +14,8 @@ from nerfies_jax.measure import image_quality
 from nerfies_jax.training.model import Frames, Model, Rendering, View
 
 
-class HeldOut(NamedTuple):
-    """Held-out frames as rendered, and their scores; NumPy, one row per frame."""
+class Scored(NamedTuple):
+    """Frames as rendered, and their scores; NumPy, one row per frame."""
 
     rows: np.ndarray  # of the capture
     colour: np.ndarray  # [frames, height, width, 3] float32, clipped to [0, 1]
@@ -23,7 +23,6 @@ class HeldOut(NamedTuple):
     depth: np.ndarray  # [frames, height, width] z-depth, scene units
     psnr: np.ndarray  # dB, of the 8-bit picture
     ssim: np.ndarray  # scikit-image's Gaussian form
-    ms_per_frame: float  # median after the first frame
 
 
 def frames_of(capture: Capture) -> Frames:
@@ -31,7 +30,7 @@ def frames_of(capture: Capture) -> Frames:
     rows = capture.train
     return Frames(
         images=jnp.asarray(capture.images[rows]),
-        cameras=jax.tree.map(lambda leaf: jnp.asarray(leaf[rows]), capture.cameras),
+        cameras=jax.tree.map(jnp.asarray, cameras.take(capture.cameras, rows)),
         times=jnp.asarray(capture.times[rows]),
         warp=jnp.asarray(capture.warp_ids[rows]),
         appearance=jnp.asarray(capture.appearance_ids[rows]),
@@ -39,21 +38,18 @@ def frames_of(capture: Capture) -> Frames:
     )
 
 
-def views_of(capture: Capture, rows: np.ndarray) -> list[View]:
-    """The views in which these frames were filmed."""
-    return [
-        View(
-            jax.tree.map(jnp.asarray, cameras.take(capture.cameras, row)),
-            jnp.asarray(capture.times[row]),
-            jnp.asarray(capture.warp_ids[row]),
-            jnp.asarray(capture.appearance_ids[row]),
-        )
-        for row in rows
-    ]
+def view_of(capture: Capture, row: int) -> View:
+    """The view in which a frame was filmed."""
+    return View(
+        jax.tree.map(jnp.asarray, cameras.take(capture.cameras, row)),
+        jnp.asarray(capture.times[row]),
+        jnp.asarray(capture.warp_ids[row]),
+        jnp.asarray(capture.appearance_ids[row]),
+    )
 
 
 def path_views(path: Camera, times: np.ndarray, like: View) -> list[View]:
-    """Views along a camera path; codes as in `like`."""
+    """Views along a camera path, one for each time; codes as in `like`."""
     return [
         like._replace(
             camera=jax.tree.map(jnp.asarray, cameras.take(path, row)),
@@ -64,11 +60,11 @@ def path_views(path: Camera, times: np.ndarray, like: View) -> list[View]:
 
 
 class Renderer:
-    """A model's whole-frame function, compiled once, and what each frame took."""
+    """A model's whole-frame function, compiled once for each number of rows."""
 
     def __init__(self, model: Model, size: tuple[int, int]):
         self._render = jax.jit(lambda params, view: model.render(params, view, size))
-        self.seconds = []
+        self.seconds: list[float] = []
 
     def __call__(self, params, view: View) -> Rendering:
         start = time.perf_counter()
@@ -76,36 +72,31 @@ class Renderer:
         self.seconds.append(time.perf_counter() - start)
         return rendering
 
-    @property
-    def ms_per_frame(self) -> float:
-        """Median over all frames but the first, which compiles."""
-        return 1e3 * float(np.median(self.seconds[1:] or self.seconds))
+    def ms_per_frame(self, frames: int) -> float:
+        """Median over the last `frames` frames, without the first of them."""
+        return 1e3 * float(np.median(self.seconds[-frames:][1:] or self.seconds[-1:]))
 
 
-def render_heldout(
-    model: Model, params, capture: Capture, rows: np.ndarray | None = None
-) -> HeldOut:
-    """Render `rows` (all held-out frames by default) and score them.
+def score(renderer: Renderer, params, capture: Capture, rows: np.ndarray) -> Scored:
+    """Render frames of a capture and compare them with what was filmed.
 
     Scores are of the picture as an 8-bit file would hold it, over the filmed pixels.
     """
-    rows = capture.heldout if rows is None else rows
-    renderer = Renderer(model, capture.size)
     renderings, scores = [], []
-    for row, view in zip(rows, views_of(capture, rows), strict=True):
-        rendering = renderer(params, view)
-        renderings.append(rendering)
+    for row in rows:
+        rendering = renderer(params, view_of(capture, row))
         truth = capture.images[row].astype(np.float32) / 255
         valid = None if capture.valid is None else capture.valid[row]
         scores.append(jax.device_get(_score(rendering.colour, truth, valid)))
-    return HeldOut(
-        rows=rows,
+        renderings.append(rendering)
+    psnr, ssim = np.asarray(scores).T
+    return Scored(
+        rows=np.asarray(rows),
         colour=np.clip(np.stack([r.colour for r in renderings]), 0, 1),
         alpha=np.stack([r.alpha for r in renderings]),
         depth=np.stack([r.depth for r in renderings]),
-        psnr=np.asarray([psnr for psnr, _ in scores]),
-        ssim=np.asarray([ssim for _, ssim in scores]),
-        ms_per_frame=renderer.ms_per_frame,
+        psnr=psnr,
+        ssim=ssim,
     )
 
 
@@ -118,3 +109,14 @@ def _score(colour, truth, valid):
         image_quality.masked_psnr(picture, truth, valid),
         image_quality.masked_ssim(picture, truth, valid),
     )
+
+
+def as_picture(colour: np.ndarray) -> np.ndarray:
+    """A rendered colour as 8 bits."""
+    return np.round(np.clip(colour, 0, 1) * 255).astype(np.uint8)
+
+
+def spread(rows: np.ndarray, most: int) -> np.ndarray:
+    """At most `most` of the rows, evenly spread."""
+    picked = np.linspace(0, len(rows) - 1, min(most, len(rows))).round().astype(int)
+    return rows[picked]

@@ -11,12 +11,10 @@ from experiments import settings as run_settings
 from gaussians_jax import presets as splat_presets
 from gaussians_jax import scene as splat_scene
 from nerfies_jax import capture as captures
-from nerfies_jax.capture import undistort
+from nerfies_jax.capture import synthetic, undistort
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.capture.synthetic import make
-from nerfies_jax.capture.synthetic import presets as synthetic_presets
 from nerfies_jax.training import checkpoint
-from nerfies_jax.training.model import Model
+from nerfies_jax.training.model import Model, TrainState
 
 CONFIG = "config.json"
 CHECKPOINTS = "checkpoints"
@@ -71,14 +69,14 @@ def scene_spec(choices: Choices) -> splat_scene.SplatScene:
 def read_capture(choices: Choices) -> Capture:
     """The capture asked for, ready for a pinhole renderer."""
     if choices.capture is None:
-        if choices.scene not in synthetic_presets.PRESETS:
+        if choices.scene not in synthetic.PRESETS:
             raise ValueError(
                 f"--scene {choices.scene}: no such built-in scene; there are "
-                + ", ".join(synthetic_presets.PRESETS)
+                + ", ".join(synthetic.PRESETS)
             )
-        scene = synthetic_presets.PRESETS[choices.scene]
-        capture, _ = make.cached(scene, run_settings.CACHE / "scenes", choices.seed)
-        return capture
+        scene = synthetic.PRESETS[choices.scene]
+        folder = run_settings.CACHE / "scenes"
+        return synthetic.cached(scene, folder, choices.seed)[0]
     heldout = choices.heldout
     if heldout is not None and heldout.isdigit():
         heldout = int(heldout)
@@ -120,9 +118,29 @@ def saved_choices(folder: pathlib.Path) -> Choices:
         raise ValueError(f"{path}: not the settings of a run ({error})") from error
 
 
+def first_state(run: Run) -> TrainState:
+    """The state before the first step; ValueError where it would not fit in memory."""
+    needed = splat_scene.first_bytes(run.spec, run.capture)
+    free = free_memory()
+    if free is not None and needed > free:
+        raise ValueError(
+            f"the first state needs about {needed / 2**30:.1f} GiB and "
+            f"{free / 2**30:.1f} GiB are free; lower start.points, start.random or "
+            "raster.capacity with --set, or read smaller pictures with --max-side"
+        )
+    return run.model.init(run.capture, jax.random.key(run.choices.seed))
+
+
+def free_memory() -> int | None:
+    """Bytes of memory that programs may still take; None where nothing tells."""
+    try:
+        lines = pathlib.Path("/proc/meminfo").read_text().splitlines()
+        row = next(line for line in lines if line.startswith("MemAvailable"))
+    except (OSError, StopIteration):
+        return None
+    return int(row.split()[1]) * 1024
+
+
 def restore(folder: pathlib.Path, run: Run) -> checkpoint.Restored:
     """The newest state saved in a run folder."""
-    example = jax.eval_shape(
-        lambda: run.model.init(run.capture, jax.random.key(run.choices.seed))
-    )
-    return checkpoint.restore(folder / CHECKPOINTS, example, run.model.spec)
+    return checkpoint.restore(folder / CHECKPOINTS, first_state(run), run.model.spec)

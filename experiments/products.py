@@ -1,0 +1,173 @@
+"""What a finished run leaves behind: scores, pictures, a film, depth, a report."""
+
+import json
+import pathlib
+import time
+
+import numpy as np
+
+from experiments import camera_paths, evaluate, pictures, report, runs, step_time
+from experiments.evaluate import Renderer, Scored
+from experiments.runs import Run
+from experiments.training import Outcome
+from gaussians_jax import files
+from nerfies_jax.capture import exr, video
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.measure import clock
+from nerfies_jax.measure.clock import Metric
+
+SHOWN = 4  # held-out frames in the comparison
+FILM_FRAMES = 96
+FILM_RATE = 24.0  # frames per second: four seconds
+
+
+def make(folder: pathlib.Path, run: Run, outcome: Outcome, began: float) -> None:
+    """Write everything into the run folder and say where it is."""
+    state, renderer = outcome.result.state, outcome.renderer
+    scored = evaluate.score(renderer, state.params, run.capture, run.capture.heldout)
+    ms_per_frame = renderer.ms_per_frame(len(scored.rows))
+    figures = [
+        report.Figure(
+            save_comparison(folder / "comparison.png", run.capture, scored),
+            "Held-out frames: what was filmed, what was rendered, how far they are "
+            "apart, and the depth.",
+        )
+    ]
+    curve = save_curve(folder / "psnr_over_time.png", run, outcome)
+    if curve is not None:
+        figures.append(
+            report.Figure(curve, "PSNR of a few held-out frames while it trained.")
+        )
+    film = save_film(folder / "scene.mp4", run, renderer, state.params)
+    save_depth(folder / "depth", run.capture, scored)
+    files.save(folder / "gaussians.ply", state.params.rows["splats"])
+    frames = evaluate.frames_of(run.capture)
+    metrics = measured(run, outcome, scored, ms_per_frame, began)
+    report.write_metrics(folder / "metrics.json", metrics)
+    notes = [outcome.result.message, *run.capture.notes]
+    if run.spec.motion is not None:
+        notes.append(
+            "gaussians.ply holds the canonical Gaussians, without their motion."
+        )
+    commands = _next(folder, run, outcome)
+    page = report.write(
+        folder,
+        f"{run.capture.name}: {run.choices.preset}",
+        metrics,
+        json.loads((folder / runs.CONFIG).read_text()),
+        figures,
+        film,
+        step_time.parts(run, state, frames),
+        notes,
+        commands,
+    )
+    _say(folder, page, metrics, commands)
+
+
+def measured(
+    run: Run, outcome: Outcome, scored: Scored, ms_per_frame: float, began: float
+) -> list[Metric]:
+    """The figures of a run."""
+    result = outcome.result
+    counts = run.model.counts(result.state)
+    return [
+        Metric("heldout.psnr", float(scored.psnr.mean()), "dB", "higher", 0.2),
+        Metric("heldout.ssim", float(scored.ssim.mean()), "", "higher", 0.01),
+        Metric("heldout.frames", len(scored.rows), "", "", 0),
+        Metric("train.seconds", result.seconds, "s", "lower", 0.2),
+        Metric("train.compile_seconds", result.compile_seconds, "s", "lower", 0.5),
+        Metric("train.steps", result.steps, "", "", 0),
+        Metric("render.ms_per_frame", ms_per_frame, "ms", "lower", 0.2),
+        Metric("memory.peak_bytes", clock.peak_memory_bytes(), "bytes", "lower", 0.2),
+        Metric("total.seconds", time.perf_counter() - began, "s", "lower", 0.2),
+        *(
+            Metric(name.replace(" ", "_"), count, "", "lower", 0.1)
+            for name, count in counts.items()
+        ),
+    ]
+
+
+def save_comparison(path: pathlib.Path, capture: Capture, scored: Scored):
+    """Truth, render, error and depth of a few held-out frames."""
+    shown = evaluate.spread(np.arange(len(scored.rows)), SHOWN)
+    captions = [
+        f"frame {capture.ids[scored.rows[i]]}   {scored.psnr[i]:.2f} dB   "
+        f"SSIM {scored.ssim[i]:.3f}"
+        for i in shown
+    ]
+    picture = pictures.comparison(
+        capture.images[scored.rows[shown]],
+        scored.colour[shown],
+        scored.depth[shown],
+        captions,
+        known_depth=scored.alpha[shown] > 0.5,
+    )
+    pictures.save(picture, path)
+    return path
+
+
+def save_curve(path: pathlib.Path, run: Run, outcome: Outcome):
+    """PSNR against seconds; None where the run ended before it was evaluated."""
+    history = outcome.result.history
+    if not history.evaluations:
+        return None
+    points = pictures.History(
+        [row["seconds"] for row in history.evaluations],
+        [row["psnr"] for row in history.evaluations],
+    )
+    pictures.curve({run.choices.preset: points}, path)
+    return path
+
+
+def save_film(path: pathlib.Path, run: Run, renderer: Renderer, params):
+    """The moving scene from a moving camera."""
+    path_cameras = camera_paths.path("sway", run.capture, FILM_FRAMES)
+    views = evaluate.path_views(
+        path_cameras,
+        camera_paths.times(FILM_FRAMES),
+        evaluate.view_of(run.capture, int(run.capture.train[0])),
+    )
+    frames = (evaluate.as_picture(renderer(params, view).colour) for view in views)
+    video.write_video(path, frames, FILM_RATE)
+    return path
+
+
+def save_depth(folder: pathlib.Path, capture: Capture, scored: Scored) -> None:
+    """Z-depth (scene units) and alpha of every held-out frame as EXR."""
+    folder.mkdir(exist_ok=True)
+    for row, depth, alpha in zip(scored.rows, scored.depth, scored.alpha, strict=True):
+        name = pathlib.PurePath(capture.ids[row]).name
+        exr.write_exr(folder / f"{name}.exr", alpha=alpha, depth=depth)
+
+
+def _next(folder, run, outcome):
+    commands = [
+        report.Command(
+            "Render it from other cameras, at other times:",
+            f"python -m experiments.render {folder} --path orbit",
+        )
+    ]
+    if outcome.result.steps < run.spec.steps:
+        line = f"python -m experiments.reconstruct --out {folder} --resume"
+        return [*commands, report.Command("Train it to the end:", line)]
+    capture = "" if run.choices.capture is None else f" {run.choices.capture}"
+    line = (
+        f"python -m experiments.reconstruct{capture} --preset {run.choices.preset} "
+        f"--steps {2 * run.spec.steps}"
+    )
+    return [*commands, report.Command("Train it twice as long:", line)]
+
+
+def _say(folder, page, metrics, commands):
+    value = {metric.key: metric.value for metric in metrics}
+    print(
+        f"held out: {value['heldout.psnr']:.2f} dB, SSIM {value['heldout.ssim']:.3f} "
+        f"over {value['heldout.frames']} frames; {value['train.seconds']:.0f} s of "
+        f"training and {value['train.compile_seconds']:.0f} s of compiling; "
+        f"{value['render.ms_per_frame']:.0f} ms a frame"
+    )
+    print(f"report:     {page}")
+    print(f"comparison: {folder / 'comparison.png'}")
+    print(f"film:       {folder / 'scene.mp4'}")
+    for command in commands:
+        print(f"{command.purpose}\n  {command.line}")

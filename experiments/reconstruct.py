@@ -1,0 +1,136 @@
+"""The main job: a filmed moving scene comes back as a model that can be looked at.
+
+    python -m experiments.reconstruct              # the built-in scene
+    python -m experiments.reconstruct CAPTURE      # your own
+
+Leaves a run folder with checkpoints, metrics, pictures, a video and a report.
+"""
+
+import dataclasses
+import pathlib
+import time
+from typing import Literal
+
+from experiments import settings as run_settings
+
+DEFAULT_PRESET = "splats-deformable-small"
+EVALUATED = 4  # held-out frames in the curve; all of them are scored at the end
+
+
+@dataclasses.dataclass(frozen=True)
+class Reconstruct:
+    """Reconstruct a filmed, moving scene; without a capture, the built-in one."""
+
+    capture: run_settings.Positional[pathlib.Path | None] = None
+    """Folder in Nerfies, HyperNeRF, Blender, D-NeRF or COLMAP layout."""
+    preset: str | None = None
+    """splats-static, splats-deformable, or either with -small for a CPU (default:
+    splats-deformable-small)."""
+    scene: str = "default"
+    """Which built-in scene, where no capture is given."""
+    steps: int | None = None
+    """Steps of training; schedules stretch with them."""
+    seconds: float | None = None
+    """Stop training after so many seconds, whatever the step."""
+    out: pathlib.Path | None = None
+    """Run folder (default: runs/CAPTURE-PRESET)."""
+    resume: bool = False
+    """Continue the run in --out from its last checkpoint."""
+    device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
+    """Where to compute."""
+    seed: int = 0
+    """Of everything random."""
+    factor: int | None = None
+    """Read the pictures at 1/FACTOR of their size."""
+    max_side: int | None = None
+    """Read the pictures with no side longer than this, in pixels."""
+    heldout: str | None = None
+    """Which frames to score: n for every n-th, or the name of a split."""
+    set: tuple[str, ...] = ()
+    """Fields of the preset, as density.most=20000 motion.width=128."""
+    evaluate_every: float = 20.0
+    """Seconds of training between two points of the PSNR curve."""
+
+
+def main(arguments=None):
+    """Run the job of the command line; exit code 2 where its input is wrong."""
+    asked = run_settings.parse(Reconstruct, arguments)
+    with run_settings.user_errors():
+        run_settings.start_jax(asked.device)
+        from experiments import runs
+        from nerfies_jax.capture.capture import describe
+
+        began = time.perf_counter()
+        choices, folder = _choices(asked, runs)
+        run = runs.open_run(choices)
+        for line in describe(run.capture):
+            print(line)
+        folder, state, history, after = _start(asked, folder, run, runs)
+    from experiments import training
+
+    with run_settings.user_errors():
+        checkpoints = training.open_checkpoints(folder, run, after)
+    outcome = training.train(
+        run,
+        state,
+        history,
+        checkpoints,
+        seconds=asked.seconds,
+        evaluate_every=asked.evaluate_every,
+        evaluated=EVALUATED,
+    )
+    if outcome.result.stopped_by in ("SIGINT", "SIGTERM"):
+        print(f"continue with: {_command(folder)}")
+        raise SystemExit(128 + (2 if outcome.result.stopped_by == "SIGINT" else 15))
+    from experiments import products
+
+    products.make(folder, run, outcome, began)
+    raise SystemExit(1 if outcome.result.stopped_by == "non-finite" else 0)
+
+
+def _choices(asked, runs):
+    """What fixes the run, and its folder where one was named."""
+    if asked.resume:
+        if asked.out is None:
+            raise ValueError(
+                "--resume continues the run in a folder: name it with --out"
+            )
+        choices = runs.saved_choices(asked.out)
+        # Other steps or settings make another spec, which the checkpoint refuses.
+        steps = choices.steps if asked.steps is None else asked.steps
+        overrides = (*choices.overrides, *asked.set)
+        changed = dataclasses.replace(choices, steps=steps, overrides=overrides)
+        return changed, asked.out
+    capture = None if asked.capture is None else str(asked.capture.absolute())
+    choices = runs.Choices(
+        capture=capture,
+        scene=asked.scene,
+        preset=asked.preset or DEFAULT_PRESET,
+        steps=asked.steps,
+        overrides=asked.set,
+        factor=asked.factor,
+        max_side=asked.max_side,
+        heldout=asked.heldout,
+        seed=asked.seed,
+    )
+    return choices, None
+
+
+def _start(asked, folder, run, runs):
+    """The run folder, the state to go on from and its history."""
+    if asked.resume:
+        restored = runs.restore(folder, run)
+        return folder, restored.state, restored.record, restored.step
+    state = runs.first_state(run)
+    stem = "-".join(run.capture.name.split()) + "-" + run.choices.preset
+    folder = run_settings.new_run_folder(asked.out, stem)
+    runs.save_choices(folder, run)
+    return folder, state, None, None
+
+
+def _command(folder):
+    return f"python -m experiments.reconstruct --out {folder} --resume"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,57 @@
+"""Train a run, with held-out scores along the way."""
+
+import pathlib
+from typing import Any, NamedTuple
+
+from experiments import evaluate, runs
+from experiments.evaluate import Renderer
+from experiments.runs import Run
+from nerfies_jax.training import loop
+from nerfies_jax.training.checkpoint import Checkpoints
+from nerfies_jax.training.loop import FitResult, History, Hook
+
+
+class Outcome(NamedTuple):
+    """A finished training, and the renderer that is compiled for it."""
+
+    result: FitResult
+    renderer: Renderer
+
+
+def open_checkpoints(folder: pathlib.Path, run: Run, after: int | None) -> Checkpoints:
+    """Where this run saves; ValueError where it cannot."""
+    return Checkpoints(folder / runs.CHECKPOINTS, run.model.spec, after=after)
+
+
+def train(
+    run: Run,
+    state: Any,
+    record: dict | None,
+    checkpoints: Checkpoints,
+    *,
+    seconds: float | None,
+    evaluate_every: float,
+    evaluated: int,
+) -> Outcome:
+    """Fit the model; its PSNR and SSIM on a few held-out frames go into the history."""
+    renderer = Renderer(run.model, run.capture.size)
+    few = evaluate.spread(run.capture.heldout, evaluated)
+
+    def held_out(state, step):
+        del step
+        scored = evaluate.score(renderer, state.params, run.capture, few)
+        return {"psnr": scored.psnr.mean(), "ssim": scored.ssim.mean()}
+
+    hooks = [Hook("held out", held_out, every_seconds=evaluate_every)]
+    with checkpoints:
+        result = loop.fit(
+            run.model,
+            state,
+            evaluate.frames_of(run.capture),
+            steps=run.spec.steps,
+            hooks=hooks if len(few) else [],
+            seconds=seconds,
+            checkpoints=checkpoints,
+            history=History() if record is None else History(**record),
+        )
+    return Outcome(result, renderer)
