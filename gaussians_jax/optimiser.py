@@ -31,8 +31,10 @@ def scale_by_row_adam(
     For parameters that all have one row per Gaussian. The moments of a row born late
     start at zero like everyone's, and so does its count. Under one shared count of 1000
     its first five updates are 2.5, 3.4, 3.9, 4.3 and 4.6 times too large for a steady
-    gradient, which is what reference implementations run. `eps` is that of 3D Gaussian
-    splatting: 1e-8 would halve the steps where gradients are 1e-8.
+    gradient, which is what reference implementations run. For the same reason a row
+    starts to count at its first slope that is not zero: harmonics that are switched on
+    late and networks that wait for a warm-up to end start like everyone else. `eps` is
+    that of 3D Gaussian splatting: 1e-8 would halve the steps where gradients are 1e-8.
     """
 
     def init(params):
@@ -44,14 +46,17 @@ def scale_by_row_adam(
 
     def update(updates, state, params=None):
         del params
-        count = jax.tree.map(lambda n: n + 1, state.count)
+        count = jax.tree.map(_count_once_started, state.count, updates)
         first = jax.tree.map(lambda g, m: b1 * m + (1 - b1) * g, updates, state.first)
         second = jax.tree.map(
             lambda g, v: b2 * v + (1 - b2) * g * g, updates, state.second
         )
 
         def step(n, m, v):
-            age = n.astype(m.dtype).reshape(n.shape + (1,) * (m.ndim - 1))
+            # A row that has not started has zero moments: any age will do but zero.
+            age = (
+                jnp.maximum(n, 1).astype(m.dtype).reshape(n.shape + (1,) * (m.ndim - 1))
+            )
             # 1 - b^n, which cancels in float32 for b = 0.999 and small n.
             seen = -jnp.expm1(age * math.log(b1))
             seen_sq = -jnp.expm1(age * math.log(b2))
@@ -62,6 +67,11 @@ def scale_by_row_adam(
         )
 
     return optax.GradientTransformation(init, update)
+
+
+def _count_once_started(count, slopes):
+    moved = jnp.any(slopes.reshape(*count.shape, -1) != 0, axis=-1)
+    return count + ((count > 0) | moved).astype(count.dtype)
 
 
 def row_leaves(params: Params) -> Params:
