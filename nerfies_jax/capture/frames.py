@@ -140,8 +140,9 @@ def read_frames(
     # Decoding releases the interpreter lock; four threads read 86 frames of 512x384 in
     # 0.25 s instead of 0.8.
     with ThreadPoolExecutor(4) as pool:
-        has_alpha = any(pool.map(decode, range(len(paths))))
-    return colours, alphas if has_alpha else None
+        # A list: `any` would stop at the first alpha and cancel what still waits.
+        has_alpha = list(pool.map(decode, range(len(paths))))
+    return colours, alphas if any(has_alpha) else None
 
 
 def read_masks(

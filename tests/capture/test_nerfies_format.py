@@ -294,6 +294,15 @@ def test_missing_pictures_are_listed_or_left_out(tmp_path):
     assert any("001, 004" in note for note in found.notes)
 
 
+def test_every_one_of_many_pictures_with_alpha_is_decoded(tmp_path):
+    make(tmp_path, count=60, channels=4)
+    found = nerfies_format.read(tmp_path)
+    for row in range(60):
+        np.testing.assert_array_equal(
+            found.images[row], picture(row, channels=4)[..., :3]
+        )
+
+
 def truncate(path):
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2])
