@@ -340,6 +340,18 @@ def test_the_written_directory_reads_back_row_for_row(small, tmp_path, monkeypat
     assert nerfies_format.read(next(tmp_path.iterdir())).source == "nerfies"
 
 
+def test_two_processes_may_fill_the_cache_at_once(small, tmp_path, monkeypatch):
+    def make_while_another_finishes(*_):
+        monkeypatch.setattr(record, "make", lambda *_: small)
+        synthetic.cached(SMALL, tmp_path)
+        return small
+
+    monkeypatch.setattr(record, "make", make_while_another_finishes)
+    capture, _ = synthetic.cached(SMALL, tmp_path)
+    assert capture.ids == small[0].ids
+    assert len(list(tmp_path.iterdir())) == 1
+
+
 def test_a_failed_write_leaves_nothing_behind(small, tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")

@@ -74,24 +74,30 @@ def picture(
 ) -> Picture:
     """One frame, in square tiles: the cloth costs only those tiles that may show it."""
 
-    def ray(pixel):
-        direction = view_direction(camera, pixel)
-        hit = trace.cast(spec, camera.position, direction, time, transient_shown)
+    def hit(direction):
+        return trace.cast(spec, camera.position, direction, time, transient_shown)
+
+    def colour(hit, direction):
         # The sensor clips each sample: a highlight must not spill beyond its rim.
-        return jnp.clip(trace.shade(spec, hit, direction, light_gain), 0, 1), hit
+        return jnp.clip(trace.shade(spec, hit, direction, light_gain), 0, 1)
 
     # The centre goes along as a last sample: one program, not two to compile.
     offsets = _sub_pixels(spec.supersampling, time.dtype)
 
     def tile(pixels):
-        light, hit = jax.vmap(jax.vmap(ray))(pixels[:, None, :] + offsets)
-        image = texture.srgb(jnp.mean(light[:, :-1], axis=1))
-        return image, jax.tree.map(lambda leaf: leaf[:, -1], hit)
+        samples = pixels[:, None, :] + offsets
+        directions = jax.vmap(jax.vmap(lambda p: view_direction(camera, p)))(samples)
+        hits = jax.vmap(jax.vmap(hit))(directions)
+        lit = jax.tree.map(lambda leaf: leaf[:, :-1], hits)
+        light = jax.vmap(jax.vmap(colour))(lit, directions[:, :-1])
+        centre = jax.tree.map(lambda leaf: leaf[:, -1], hits)
+        return texture.srgb(jnp.mean(light, axis=1)), centre
 
-    image, hit = _untiled(jax.lax.map(tile, _tiles(spec.size, time.dtype)), spec.size)
+    tiles = jax.lax.map(tile, _tiles(spec.size, time.dtype))
+    image, centre = _untiled(tiles, spec.size)
     # Directions have z-depth one, so the distance along one is the z-depth.
-    depth = jnp.where(hit.thing == trace.NOTHING, 0, hit.distance)
-    return Picture(image, depth, hit)
+    depth = jnp.where(centre.thing == trace.NOTHING, 0, centre.distance)
+    return Picture(image, depth, centre)
 
 
 def view_direction(camera: Camera, pixel: Float[Array, "2"]) -> Float[Array, "3"]:

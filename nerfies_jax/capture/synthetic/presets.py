@@ -127,21 +127,21 @@ BALL = Thing(
     dataclasses.replace(CUBE.texture, dark=(0.45, 0.10, 0.35), checker_size=0.03),
     Path(sway=(0.06, 0.06, 0.0), cycles=(1.0, 2.0, 1.0)),
 )
-_SHOULDER = Hinge((0.12, 0.13, -0.02), swing_rad=0.6)
+_SHOULDER = Hinge((0.09, 0.13, -0.02), swing_rad=0.6)
 _ELBOW = Hinge(
-    (0.12, 0.0, -0.02), axis=(0.2, 0.0, 1.0), rest_rad=-0.3, swing_rad=0.8, phase=0.2
+    (0.09, 0.0, -0.02), axis=(0.2, 0.0, 1.0), rest_rad=-0.3, swing_rad=0.8, phase=0.2
 )
 UPPER_ARM = Thing(
     "upper arm",
     Box((0.022, 0.065, 0.022)),
-    (0.12, 0.065, -0.02),
+    (0.09, 0.065, -0.02),
     PLINTH.texture,
     Arm((_SHOULDER,)),
 )
 FOREARM = Thing(
     "forearm",
     Box((0.02, 0.055, 0.02)),
-    (0.12, -0.055, -0.02),
+    (0.09, -0.055, -0.02),
     CUBE.texture,
     Arm((_SHOULDER, _ELBOW)),
 )
@@ -167,7 +167,9 @@ PASSED = dataclasses.replace(
     name="transient",
     transient=Transient(PASSER, ((0.1, 0.25), (0.45, 0.6), (0.75, 0.9))),
 )
-SHINY = dataclasses.replace(STATIC, name="specular", specular=Specular("globe"))
+SHINY = dataclasses.replace(
+    STATIC, name="specular", specular=Specular("globe", strength=0.8, sharpness=20.0)
+)
 
 PRESETS = {
     "default": DEFAULT,

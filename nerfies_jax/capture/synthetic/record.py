@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from nerfies_jax.capture import nerfies_format
-from nerfies_jax.capture.capture import Capture, PointCloud
+from nerfies_jax.capture.capture import Capture, CaptureError, PointCloud
 from nerfies_jax.capture.json_files import AnyPath, new_folder
 from nerfies_jax.capture.synthetic import film, trace, truth
 from nerfies_jax.capture.synthetic.spec import SceneSpec
@@ -59,8 +59,8 @@ def make(spec: SceneSpec, seed: int = 0) -> tuple[Capture, SceneTruth]:
 
 def write(spec: SceneSpec, path: AnyPath, seed: int = 0):
     """Film a scene into a Nerfies directory with `truth.npz` beside; all or nothing."""
-    capture, answers = make(spec, seed)
-    with new_folder(path) as folder:
+    with new_folder(path) as folder:  # refuses a path in use before it films
+        capture, answers = make(spec, seed)
         nerfies_format.write(capture, folder / "capture")
         for part in (folder / "capture").iterdir():
             part.rename(folder / part.name)
@@ -74,8 +74,11 @@ def cached(
     """The scene from a cache folder, filmed first where it is not there yet."""
     path = pathlib.Path(folder) / f"{spec.name.replace(' ', '-')}-{digest(spec, seed)}"
     if not path.exists():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write(spec, path, seed)
+        try:
+            write(spec, path, seed)
+        except CaptureError:
+            if not path.exists():  # else another process was quicker: use its files
+                raise
     capture = nerfies_format.read(path)
     capture = dataclasses.replace(
         capture, name=f"synthetic {spec.name}", source="synthetic"

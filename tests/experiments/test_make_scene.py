@@ -1,0 +1,61 @@
+"""The built-in scenes from the command line."""
+
+import typing
+
+import pytest
+
+from experiments import make_scene, settings
+from nerfies_jax import capture
+from nerfies_jax.capture import synthetic
+from nerfies_jax.capture.synthetic import truth
+
+
+@pytest.fixture(autouse=True)
+def no_global_settings(monkeypatch):
+    monkeypatch.setattr(settings, "start_jax", lambda device: None)
+
+
+def test_a_scene_is_written_and_loads_as_a_capture(tmp_path, capsys):
+    out = tmp_path / "scene"
+    arguments = "--preset rigid --frames 4 --size 24 18 --set supersampling=1 points=20"
+    make_scene.main([str(out), *arguments.split()])
+    read = capture.load(out)
+    assert read.images.shape == (5, 18, 24, 3)
+    assert len(read.points.position) == 20
+    assert truth.load(out / synthetic.TRUTH_FILE).ids == read.ids
+    assert str(out) in capsys.readouterr().out
+
+
+def test_every_preset_has_its_name_on_the_command_line():
+    assert typing.get_args(make_scene.Preset) == tuple(synthetic.PRESETS)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--frames", "1"], "frames=1 must be at least 2"),
+        (["--set", "colour=red"], "no field 'colour'"),
+    ],
+)
+def test_a_wrong_setting_is_one_line_and_exit_code_two(
+    tmp_path, capsys, arguments, words
+):
+    with pytest.raises(SystemExit) as stop:
+        make_scene.main([str(tmp_path / "scene"), *arguments])
+    assert stop.value.code == 2
+    error = capsys.readouterr().err
+    assert words in error
+    assert error.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_in_use_is_refused_before_anything_is_filmed(tmp_path, monkeypatch):
+    (tmp_path / "mine").write_text("kept")
+
+    def no_film(*_):
+        raise AssertionError("filmed for a folder that cannot be used")
+
+    monkeypatch.setattr("nerfies_jax.capture.synthetic.record.make", no_film)
+    with pytest.raises(SystemExit):
+        make_scene.main([str(tmp_path)])
+    assert (tmp_path / "mine").read_text() == "kept"
