@@ -49,8 +49,8 @@ def test_dssim_is_the_textbook_five_window_form(padding, rng, dtype):
     )
     assert found.dtype == dtype
     expected = reference_dssim(image, target, padding)
-    # float32: variances of 1e-3 from squares of 1, divided by C2 = 9e-4.
-    tolerance = {"float32": 2e-5, "float64": 1e-12}[dtype]
+    # The float64 images are rounded to float32 before: 6e-8 of noise beside C2 = 9e-4.
+    tolerance = {"float32": 5e-6, "float64": 1e-13}[dtype]
     np.testing.assert_allclose(found, expected, atol=tolerance)
 
 
@@ -122,7 +122,7 @@ def test_dssim_of_bright_low_contrast_images_keeps_its_digits(rng, dtype):
     )
     expected = reference_dssim(image, target, "valid")
     # In float64 the uncentred reference is the less exact of the two.
-    tolerance = {"float32": 1e-5, "float64": 1e-8}[dtype]
+    tolerance = {"float32": 1e-6, "float64": 1e-8}[dtype]
     np.testing.assert_allclose(found, expected, atol=tolerance)
 
 
