@@ -42,9 +42,9 @@ def test_depth_errors_are_those_of_a_slow_loop(dtype, rng):
 @pytest.mark.hard_cases
 def test_negative_depth_is_wrong_and_no_depth_is_no_answer(dtype):
     truth = jnp.asarray([2.0, 2.0], dtype)
-    errors = quality.depth_errors(jnp.asarray([-2.0, 2.0], dtype), truth)
+    errors = jax.jit(quality.depth_errors)(jnp.asarray([-2.0, 2.0], dtype), truth)
     assert (errors.abs_rel, errors.within_delta) == (1.0, 0.5)
-    empty = quality.depth_errors(truth, jnp.zeros_like(truth))
+    empty = jax.jit(quality.depth_errors)(truth, jnp.zeros_like(truth))
     assert np.all(np.isnan(empty[:3]))
     assert empty.pixels == 0
 
@@ -52,7 +52,7 @@ def test_negative_depth_is_wrong_and_no_depth_is_no_answer(dtype):
 @pytest.mark.hard_cases
 def test_exact_depth_has_a_finite_gradient(dtype):
     truth = jnp.asarray([2.0, 3.0, 0.0, jnp.nan], dtype)
-    slope = jax.grad(lambda d: sum(quality.depth_errors(d, truth)[:2]))(truth)
+    slope = jax.jit(jax.grad(lambda d: sum(quality.depth_errors(d, truth)[:2])))(truth)
     assert np.all(np.isfinite(slope))
     assert np.all(slope[2:] == 0)
 
@@ -74,11 +74,11 @@ def test_alignment_survives_a_large_offset_and_reports_a_constant(dtype, rng):
     truth = jnp.asarray(rng.uniform(1, 3, 200), dtype)
     # Steps of 2^-12, so that 1000 + offset is exact in float32.
     steps = jnp.asarray(np.round(np.asarray(truth) * 4096) / 4096, dtype)
-    line = quality.align_depth(1000 + steps, steps)
+    line = jax.jit(quality.align_depth)(1000 + steps, steps)
     # The mean of 1000 carries 6e-5 in float32; normal equations about 0 lose it all.
     assert abs(line.scale - 1) < {"float32": 1e-6, "float64": 1e-12}[dtype]
     assert line.determined
-    flat = quality.align_depth(jnp.full(200, 1000.1, dtype), truth)
+    flat = jax.jit(quality.align_depth)(jnp.full(200, 1000.1, dtype), truth)
     assert not flat.determined
     assert flat.scale == 0
     assert flat.shift == pytest.approx(float(jnp.mean(truth)))
@@ -103,7 +103,7 @@ def test_flow_errors_are_those_of_a_slow_loop(dtype, rng):
 @pytest.mark.hard_cases
 def test_missing_flow_is_wrong_and_equal_flow_has_gradient_zero(dtype):
     truth = jnp.asarray([[1.0, 0.0], [0.0, 2.0]], dtype)
-    errors = quality.flow_errors(truth.at[0, 0].set(jnp.nan), truth)
+    errors = jax.jit(quality.flow_errors)(truth.at[0, 0].set(jnp.nan), truth)
     assert np.isinf(errors.endpoint)
     assert errors.outliers == 0.5
     assert np.all(
