@@ -1,15 +1,13 @@
 """Where the time of a training step goes."""
 
-import time
-
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from experiments.runs import Run
 from gaussians_jax import render, splats
 from gaussians_jax import scene as splat_scene
 from gaussians_jax.effects.effect import Moment
+from nerfies_jax.measure import clock
 from nerfies_jax.training import losses
 from nerfies_jax.training.model import Frames, TrainState
 
@@ -60,9 +58,4 @@ def parts(run: Run, state: TrainState, frames: Frames) -> dict[str, float]:
 
 def _ms(function, *args):
     compiled = jax.jit(function).lower(*args).compile()
-    seconds = []
-    for _ in range(REPEATS):
-        start = time.perf_counter()
-        jax.block_until_ready(compiled(*args))
-        seconds.append(time.perf_counter() - start)
-    return 1e3 * float(np.median(seconds))
+    return 1e3 * clock.measure(lambda: compiled(*args), repeats=REPEATS).median

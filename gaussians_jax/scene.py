@@ -203,6 +203,21 @@ def first_points(spec: StartSpec, capture: Capture, seed: int):
     return position, rng.uniform(size=position.shape)
 
 
+def first_bytes(spec: SplatScene, capture: Capture) -> int:
+    """Roughly the memory of the first state and step; host side, nothing allocated."""
+    cloud = capture.points
+    if cloud is not None and len(cloud.position) >= spec.start.fewest:
+        count = min(len(cloud.position), spec.start.points)
+    else:
+        count = spec.start.random
+    harmonics = 3 * (spec.sh_degree + 1) ** 2
+    # Parameters, two moments, gradient, update; the tables of one projection.
+    numbers = count * (5 * (11 + harmonics) + 60)
+    # A slab holds keys, rows and blending inputs of every pair.
+    numbers += 16 * (spec.raster.capacity or 0)
+    return 4 * numbers + capture.images.nbytes
+
+
 def first_state(spec, effects, optimiser, capture, key) -> TrainState:
     """Parameters, moments and statistics before the first step; host side."""
     render.refuse_distortion(capture.cameras)
@@ -270,9 +285,11 @@ def _events(spec, facts, optimiser):
 
 
 def count_rows(state: TrainState) -> dict[str, int]:
-    """How many Gaussians are alive and how many numbers the networks have."""
+    """How many Gaussians are alive and how many numbers (`parameters`) there are in all."""
     counts = {"gaussians": int(splats.alive(state.params.rows["splats"]).sum())}
-    if state.params.nets:
-        leaves = jax.tree.leaves(state.params.nets)
-        counts["network parameters"] = sum(math.prod(leaf.shape) for leaf in leaves)
+    rows = jax.tree.leaves(state.params.rows)
+    nets = jax.tree.leaves(state.params.nets)
+    each = sum(math.prod(leaf.shape[1:]) for leaf in rows)
+    counts["parameters"] = counts["gaussians"] * each
+    counts["parameters"] += sum(math.prod(leaf.shape) for leaf in nets)
     return counts
