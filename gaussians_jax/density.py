@@ -153,27 +153,25 @@ def densify(
     if needed > capacity or count * 9 < capacity * 4:
         capacity = needed
     idle = capacity - count
-    params, moments = _rebuild(
+    params, moments, fresh = _rebuild(
         optimiser,
         params,
         moments,
-        jnp.asarray(np.pad(rows, (0, idle)), jnp.int32),
-        jnp.asarray(np.pad(kind, (0, idle)), jnp.int32),
-        jnp.arange(capacity) >= count,
+        np.pad(rows, (0, idle)).astype(np.int32),
+        np.pad(kind, (0, idle)).astype(np.int32),
+        np.arange(capacity) >= count,
         key,
-        spec,
+        spec.shrink,
+        spec.revised_opacity,
     )
     report = report._replace(alive=count, capacity=capacity)
-    return Changed(params, moments, empty_stats(params.rows["splats"]), report)
+    return Changed(params, moments, fresh, report)
 
 
 def _plan(rows, stats, spec, step, extent):
     """Which old row each new row comes from, and what becomes of it."""
     stats = jax.tree.map(np.asarray, stats)
-    whole = np.asarray(_finite_rows(rows))
-    drawn = splats.activate(rows)
-    opacity = np.asarray(drawn.opacity)
-    scale = np.asarray(drawn.scale).max(axis=1)
+    whole, opacity, scale = map(np.asarray, _facts(rows))
     score = stats.gradient / np.maximum(stats.views, 1)
 
     kept = stats.alive & whole & (opacity >= spec.prune_opacity)
@@ -215,25 +213,30 @@ def _plan(rows, stats, spec, step, extent):
 
 
 @jax.jit
-def _finite_rows(rows):
+def _facts(rows):
+    """Of each row: whether it is finite, its opacity, its largest scale."""
+
     def finite(leaf):
         return jnp.all(jnp.isfinite(leaf.reshape(leaf.shape[0], -1)), axis=1)
 
-    return functools.reduce(jnp.logical_and, map(finite, rows))
+    whole = functools.reduce(jnp.logical_and, map(finite, rows))
+    drawn = splats.activate(rows)
+    return whole, drawn.opacity, jnp.max(drawn.scale, axis=1)
 
 
-@functools.partial(jax.jit, static_argnames=("optimiser", "spec"))
-def _rebuild(optimiser, params, moments, rows, kind, dead, key, spec):
+@functools.partial(jax.jit, static_argnames=("optimiser", "shrink", "revised"))
+def _rebuild(optimiser, params, moments, rows, kind, dead, key, shrink, revised):
     fresh = (kind == CLONE) | (kind == CHILD)
     params, moments = row_optimiser.gather_rows(
         optimiser, params, moments, rows, fresh, dead
     )
-    moved = split_rows(params.rows["splats"], kind == CHILD, key, spec.shrink)
-    if spec.revised_opacity:
+    moved = split_rows(params.rows["splats"], kind == CHILD, key, shrink)
+    if revised:
         halved = halve_opacity(moved.opacity_logit)
         logit = jnp.where((kind == KEPT) | dead, moved.opacity_logit, halved)
         moved = moved._replace(opacity_logit=logit)
-    return params._replace(rows=params.rows | {"splats": moved}), moments
+    params = params._replace(rows=params.rows | {"splats": moved})
+    return params, moments, empty_stats(moved)
 
 
 def split_rows(

@@ -134,8 +134,13 @@ def add(
 
 
 def _opacities(rows):
-    drawn = splats.activate(rows)
-    return np.asarray(splats.alive(rows)), np.asarray(drawn.opacity, np.float64)
+    living, opacity = _facts(rows)
+    return np.asarray(living), np.asarray(opacity, np.float64)
+
+
+@jax.jit
+def _facts(rows):
+    return splats.alive(rows), splats.activate(rows).opacity
 
 
 def _draw(key, opacity, seen, count):
@@ -151,9 +156,9 @@ def _spread(optimiser, params, moments, source, dead, spec):
         optimiser,
         params,
         moments,
-        jnp.asarray(source, jnp.int32),
-        jnp.asarray(np.where(dead, 1, copies), jnp.int32),
-        jnp.asarray(dead),
+        source.astype(np.int32),
+        np.where(dead, 1, copies).astype(np.int32),
+        dead,
         spec.dead_opacity,
     )
 

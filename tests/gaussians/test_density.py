@@ -19,24 +19,26 @@ TX = optax.chain(optimiser.scale_by_row_adam(), optax.scale(-1e-2))
 
 
 @jax.jit
-def first_moments(params):
-    return TX.update(jax.tree.map(jnp.ones_like, params), TX.init(params))[1]
+def first_state(params):
+    _, moments = TX.update(jax.tree.map(jnp.ones_like, params), TX.init(params))
+    return params, moments, density.empty_stats(params.rows["splats"])
 
 
 def make(count, dtype="float32", scale=0.01, opacity=0.5):
     """`count` living rows, one tell-tale parameter each, with moments."""
     rng = np.random.default_rng(count)
     splats = Splats(
-        mean=jnp.asarray(rng.normal(size=(count, 3)), dtype),
-        log_scale=jnp.full((count, 3), math.log(scale), dtype),
-        quaternion=jnp.asarray(rng.normal(size=(count, 4)), dtype),
-        opacity_logit=jnp.full(count, math.log(opacity / (1 - opacity)), dtype),
-        sh_dc=jnp.zeros((count, 1, 3), dtype),
-        sh_rest=jnp.zeros((count, 3, 3), dtype),
+        mean=rng.normal(size=(count, 3)),
+        log_scale=np.full((count, 3), math.log(scale)),
+        quaternion=rng.normal(size=(count, 4)),
+        opacity_logit=np.full(count, math.log(opacity / (1 - opacity))),
+        sh_dc=np.zeros((count, 1, 3)),
+        sh_rest=np.zeros((count, 3, 3)),
     )
-    label = jnp.arange(count, dtype=dtype)[:, None]
-    params = Params({"splats": splats, "label": label}, {"w": jnp.ones((4, 4), dtype)})
-    return params, first_moments(params), density.empty_stats(splats)
+    label = np.arange(count)[:, None]
+    params = Params({"splats": splats, "label": label}, {"w": np.ones((4, 4))})
+    params = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), params)
+    return first_state(params)
 
 
 def hot(stats, which, gradient=1.0):

@@ -1,6 +1,7 @@
 """The deformation network: the reference's values, blocks, warm-up, smoothing."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +27,7 @@ SMALL = MotionSpec(
 )
 
 
+@functools.partial(jax.jit, static_argnums=(0, 1))
 def strong(spec, dtype="float64", seed=0):
     """A field that moves things by about their own size."""
     params = mlp_motion.init(jax.random.key(seed), spec, jnp.dtype(dtype))
@@ -90,7 +92,7 @@ def test_the_published_network_is_reproduced(name, oracle_dir, dtype):
         assert ours.dtype.name == dtype
 
 
-@pytest.mark.parametrize("count", [1, 8, 17])
+@pytest.mark.parametrize("count", [1, 17])
 def test_blocks_change_nothing_but_memory(count, dtype):
     params = strong(SMALL, dtype)
     mean = some_gaussians(count, dtype).mean
@@ -163,7 +165,7 @@ def test_no_living_row_and_no_row_at_all(dtype):
         return sum(jnp.sum(leaf) for leaf in offsets)
 
     mean = some_gaussians(9, dtype).mean
-    slopes = jax.grad(total)(params, mean, jnp.zeros(9, bool))
+    slopes = jax.jit(jax.grad(total))(params, mean, jnp.zeros(9, bool))
     assert not any(np.asarray(leaf).any() for leaf in jax.tree.leaves(slopes))
     assert mlp_motion.deform(params, SMALL, mean[:0], time).quaternion.shape == (0, 4)
 
@@ -312,12 +314,14 @@ def test_a_trained_scene_has_neither_warm_up_nor_noise():
 
 
 def test_motion_sets_in_smoothly(dtype):
-    params = mlp_motion.init(jax.random.key(0), MotionSpec(), jnp.dtype(dtype))
-    gaussians = some_gaussians(50, dtype)
-    offsets = mlp_motion.deform(
-        params, MotionSpec(), gaussians.mean, jnp.asarray(0.5, dtype)
-    )
-    assert max(float(jnp.abs(leaf).max()) for leaf in offsets) < 5e-3
+    @jax.jit
+    def first_offsets(mean, time):
+        params = mlp_motion.init(jax.random.key(0), MotionSpec(), jnp.dtype(dtype))
+        return mlp_motion.deform(params, MotionSpec(), mean, time)
+
+    mean = some_gaussians(50, dtype).mean
+    offsets = first_offsets(mean, jnp.asarray(0.5, dtype))
+    assert 0 < max(float(jnp.abs(leaf).max()) for leaf in offsets) < 5e-3
     assert {leaf.dtype.name for leaf in offsets} == {dtype}
 
 

@@ -172,11 +172,10 @@ def test_adding_grows_by_a_twentieth_into_the_dead_rows_and_stops_at_the_cap():
 
 
 def test_noise_has_the_covariance_squared_and_spares_the_opaque(dtype):
-    params, _ = make([0.001] * 20_000, dtype)
-    splats = jax.tree.map(
-        lambda x: jnp.broadcast_to(x[:1], x.shape), params.rows["splats"]
-    )
-    noise = relocation.position_noise(KEY, splats, 1e-6, SPEC)
+    splats = make([0.001], dtype)[0].rows["splats"]
+    splats = jax.tree.map(lambda x: jnp.asarray(np.repeat(x, 8000, axis=0)), splats)
+    shake = jax.jit(relocation.position_noise, static_argnums=3)
+    noise = shake(KEY, splats, 1e-6, SPEC)
     assert noise.dtype.name == dtype
     w, x, y, z = np.asarray(splats.quaternion[0], np.float64) / np.linalg.norm(
         splats.quaternion[0]
@@ -191,13 +190,16 @@ def test_noise_has_the_covariance_squared_and_spares_the_opaque(dtype):
     variance = np.exp(2 * np.asarray(splats.log_scale[0], np.float64))
     strength = 0.5 / (1 + math.exp(100 * (0.001 - 0.005)))
     along = np.asarray(noise, np.float64) @ turn
-    np.testing.assert_allclose(along.std(axis=0), strength * variance, rtol=0.03)
+    np.testing.assert_allclose(along.std(axis=0), strength * variance, rtol=0.04)
 
-    params, _ = make([0.5, 0.3], dtype)
-    splats = rows.bury(params.rows["splats"], jnp.asarray([False, True]))
-    noise = np.asarray(relocation.position_noise(KEY, splats, 1e-6, SPEC))
-    assert np.abs(noise[0]).max() < 1e-20
-    assert not noise[1].any()
+    number = np.arange(8000)
+    logit = jnp.asarray(np.where(number < 4000, 0.0, -6.0), dtype)
+    splats = splats._replace(opacity_logit=logit)
+    splats = rows.bury(splats, jnp.asarray(number >= 6000))
+    noise = np.abs(np.asarray(shake(KEY, splats, 1e-6, SPEC)))
+    assert noise[:4000].max() < 1e-18
+    assert noise[4000:6000].max() > 1e-5
+    assert not noise[6000:].any()
 
 
 def test_penalty_counts_living_rows_only(dtype):
@@ -205,7 +207,7 @@ def test_penalty_counts_living_rows_only(dtype):
     splats = rows.bury(params.rows["splats"], jnp.asarray([False, False, True]))
     expected = 0.01 * 0.375 + 0.01 * np.exp(np.asarray(splats.log_scale[:2])).mean()
     np.testing.assert_allclose(relocation.penalty(splats, SPEC), expected, rtol=1e-6)
-    slopes = jax.grad(relocation.penalty)(splats, SPEC)
+    slopes = jax.jit(jax.grad(relocation.penalty), static_argnums=1)(splats, SPEC)
     assert not any(np.asarray(leaf)[2].any() for leaf in slopes)
     none = rows.bury(splats, jnp.ones(3, bool))
     assert relocation.penalty(none, SPEC) == 0

@@ -76,7 +76,7 @@ def test_padding_repeats_the_first_row_and_marks_it_dead(rng, dtype):
     splats = some_splats(rng, dtype=dtype)
     label = jnp.arange(7)
     params = Params({"splats": splats, "label": label}, {"weight": jnp.ones((7, 2))})
-    padded = rows.pad_rows(params, 12)
+    padded = jax.jit(rows.pad_rows, static_argnums=1)(params, 12)
     assert list(rows.alive(padded.rows["splats"])) == [True] * 7 + [False] * 5
     assert list(padded.rows["label"]) == [0, 1, 2, 3, 4, 5, 6, 0, 0, 0, 0, 0]
     assert padded.nets["weight"].shape == (7, 2)  # as many rows by chance, yet no row
