@@ -117,24 +117,8 @@ def _without_broken(rows, drop):
 
 
 def _read_ply(path):
-    size = path.stat().st_size
-    with path.open("rb") as stream:
-        head = stream.read(MOST_HEADER_BYTES)
-    if not head.startswith(b"ply"):
-        raise ValueError("not a PLY file: it does not start with 'ply'")
-    end = re.search(rb"\nend_header\r?\n", head)
-    if end is None:
-        raise ValueError(
-            f"no end_header in its first {MOST_HEADER_BYTES} bytes: truncated, or "
-            "not the header of a Gaussian file"
-        )
-    for name, count in re.findall(rb"\nelement (\S+) (\S+)", head[: end.start()]):
-        # A row has at least a byte; plyfile trips over a negative count when it maps.
-        if not count.isdigit() or int(count) > size:
-            claim = f"{count[:20].decode(errors='replace')} of "
-            claim += name[:20].decode(errors="replace")
-            raise ValueError(f"its header claims {claim} in {size} bytes")
-    text = b"\nformat ascii" in head[: end.start()]
+    header = _ply_header(path)
+    text = b"\nformat ascii" in header
     try:
         # plyfile leaves the text wrapper it makes around a binary stream unclosed.
         with path.open(encoding="latin-1") if text else path.open("rb") as stream:
@@ -176,10 +160,32 @@ def _read_ply(path):
     extra = [name for name in names if name not in known]
     extra += [f"element {part.name}" for part in ply.elements if part.name != "vertex"]
     notes = (f"left out: {', '.join(extra)}",) if extra else ()
-    behind = size - end.end() - vertex.nbytes
+    behind = path.stat().st_size - len(header) - vertex.nbytes
     if behind > 0 and not text and len(ply.elements) == 1:
         notes += (f"left out: {behind} bytes after the last row",)
     return rows, notes
+
+
+def _ply_header(path):
+    """The header's bytes, once it is short and its counts can be true."""
+    size = path.stat().st_size
+    with path.open("rb") as stream:
+        head = stream.read(MOST_HEADER_BYTES)
+    if not head.startswith(b"ply"):
+        raise ValueError("not a PLY file: it does not start with 'ply'")
+    end = re.search(rb"\nend_header\r?\n", head)
+    if end is None:
+        raise ValueError(
+            f"no end_header in its first {MOST_HEADER_BYTES} bytes: truncated, or "
+            "not the header of a Gaussian file"
+        )
+    for name, count in re.findall(rb"\nelement (\S+) (\S+)", head[: end.start()]):
+        # A row has at least a byte; plyfile trips over a negative count when it maps.
+        if not count.isdigit() or int(count) > size:
+            claim = f"{count[:20].decode(errors='replace')} of "
+            claim += name[:20].decode(errors="replace")
+            raise ValueError(f"its header claims {claim} in {size} bytes")
+    return head[: end.end()]
 
 
 def _refuse_other_ply(ply, vertex):
