@@ -1,5 +1,6 @@
 """Save and restore a run: orbax directories that carry what they were made with."""
 
+import contextlib
 import pathlib
 import shutil
 import subprocess
@@ -69,25 +70,34 @@ class Checkpoints:
             return
         leaves, about = _encode(state)
         about = {**self._about, "step": step, "record": record, "leaves": about}
-        self._manager.save(
-            step,
-            args=ocp.args.Composite(
-                **{
-                    _STATE: ocp.args.StandardSave(leaves),
-                    _ABOUT: ocp.args.JsonSave(about),
-                }
-            ),
-            force=True,
-        )
+        items = {
+            _STATE: ocp.args.StandardSave(leaves),
+            _ABOUT: ocp.args.JsonSave(about),
+        }
+        with self._naming_the_folder():
+            self._manager.save(step, args=ocp.args.Composite(**items), force=True)
 
     def wait(self) -> None:
         """Until everything saved is on disk."""
-        self._manager.wait_until_finished()
+        with self._naming_the_folder():
+            self._manager.wait_until_finished()
 
     def close(self) -> None:
         """Wait, and let go of the folder."""
-        self._manager.wait_until_finished()
+        self.wait()
         self._manager.close()
+
+    @contextlib.contextmanager
+    def _naming_the_folder(self):
+        """A failed write, often of the save before: a full disk, a lost folder."""
+        try:
+            yield
+        except Exception as error:  # orbax and tensorstore raise whatever they meet
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise ValueError(
+                f"cannot write checkpoints to {self.folder}: {reason}; the newest that "
+                f"is whole is of step {latest(self.folder)}"
+            ) from error
 
     def __enter__(self):
         return self

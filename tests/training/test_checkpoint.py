@@ -5,6 +5,7 @@ import enum
 import json
 import os
 import pathlib
+import shutil
 import signal
 import subprocess
 import sys
@@ -195,6 +196,22 @@ def test_an_unwritable_folder_is_an_error_before_training(tmp_path):
         checkpoint.Checkpoints("/proc/self/run", SPEC)
     with pytest.raises(ValueError, match="keep=0"):
         checkpoint.Checkpoints(tmp_path / "run", SPEC, keep=0)
+
+
+def test_a_write_that_fails_later_names_the_folder(tmp_path):
+    folder = tmp_path / "run"
+    checkpoints = checkpoint.Checkpoints(folder, SPEC)
+    checkpoints.save(start(), 1)
+    checkpoints.wait()
+    shutil.rmtree(folder)
+    folder.write_text("in the way")
+
+    def write():
+        checkpoints.save(start(), 2)
+        checkpoints.wait()
+
+    with pytest.raises(ValueError, match=r"cannot write checkpoints to .*step None"):
+        write()
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")

@@ -8,6 +8,7 @@ import threading
 import time
 
 import jax
+import jax.experimental
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -165,6 +166,20 @@ def test_a_budget_of_seconds_ends_the_run_and_says_so(frames):
     assert result.stopped_by == "seconds"
     assert 1 <= result.steps <= 8
     assert "of 10,000 by seconds: the 0:00 given are over" in result.message
+
+
+def test_chunks_of_slow_steps_stay_short_enough_to_interrupt(frames, monkeypatch):
+    monkeypatch.setattr(loop, "CHUNK_SECONDS", 0.1)
+
+    def slow(state, frames):
+        jax.experimental.io_callback(lambda: time.sleep(0.02), None)
+        return toy.step(state, frames)
+
+    result = fit(frames, model=toy.model(change=slow), steps=30)
+    lengths = np.diff([0] + [row["step"] for row in result.history.rows])
+    assert lengths.max() <= 5
+    # Few steps after a first that may be slow to start, not one at a time for ever.
+    assert len(lengths) < 25
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
