@@ -23,10 +23,19 @@ def transform_point(angular: Vector, linear: Vector, point: Vector) -> Vector:
 
     Written w × (...) throughout. Formed as (1 + G W) x it would lose θ ulps.
     """
+    return point + displacement(angular, linear, point)
+
+
+def displacement(angular: Vector, linear: Vector, point: Vector) -> Vector:
+    """How far `transform_point` moves the point: (R - 1) x + G v, uncancelled.
+
+    Its Jacobian keeps strains that adding the identity would round away; see
+    `matrix3.displacement_log_energy`.
+    """
     angle_sq = jnp.sum(angular**2)
     c1, c2, c3 = (stumpff(k, angle_sq) for k in (1, 2, 3))
     inner = c1 * point + c2 * linear + _cross(angular, c2 * point + c3 * linear)
-    return point + linear + _cross(angular, inner)
+    return linear + _cross(angular, inner)
 
 
 def rotate_point(angular: Vector, point: Vector) -> Vector:
@@ -99,9 +108,7 @@ def hat(vector: Vector) -> Matrix:
     """[w], with [w] x = w × x."""
     x, y, z = vector
     zero = jnp.zeros_like(x)
-    return jnp.stack(
-        [jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])]
-    )
+    return jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
 
 
 def _cross(a, b):

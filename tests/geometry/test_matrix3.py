@@ -1,0 +1,241 @@
+"""Elastic energies against NumPy's and mpmath's decompositions."""
+
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+
+from nerfies_jax.geometry import lie, matrix3
+from tests import gradients
+
+ENERGIES = {False: matrix3.log_energy, True: matrix3.signed_log_energy}
+energy = {signed: jax.jit(jax.vmap(f)) for signed, f in ENERGIES.items()}
+slope = {signed: jax.jit(jax.vmap(jax.grad(f))) for signed, f in ENERGIES.items()}
+svd = jax.jit(jax.vmap(matrix3.svd))
+displaced = jax.jit(jax.vmap(jax.value_and_grad(matrix3.displacement_log_energy)))
+singular_values = jax.jit(jax.vmap(matrix3.singular_values))
+
+
+def turn_by_hand(function, matrix, direction):
+    """Hessian times a direction."""
+    return jax.jvp(jax.grad(function), (matrix,), (direction,))[1]
+
+
+hessian_product = {
+    signed: jax.jit(lambda m, d, f=f: turn_by_hand(f, m, d))
+    for signed, f in ENERGIES.items()
+}
+
+
+def exact(matrix, signed):
+    """Energy and gradient from NumPy's SVD in float64, one value at a time."""
+    left, values, right = np.linalg.svd(np.asarray(matrix, np.float64))
+    if signed and np.linalg.det(left) * np.linalg.det(right) < 0:
+        left, values = left * [1, 1, -1], values * [1, 1, -1]
+    total, gradient = 0.0, np.zeros((3, 3))
+    for k, value in enumerate(values):
+        if value >= 0.01:
+            log, rate = np.log(value), 1 / value
+        else:
+            log, rate = np.log(0.01) + (value - 0.01) / 0.01, 100
+        total += log**2
+        gradient += 2 * log * rate * np.outer(left[:, k], right[k])
+    return total, gradient
+
+
+def matrices(rng):
+    """Near rigid, moderate, wild, thin and mirrored; 20 each."""
+    drawn = rng.normal(size=(5, 20, 3, 3))
+    drawn[0] = np.eye(3) + 1e-2 * drawn[0]
+    drawn[1] = np.eye(3) + 0.3 * drawn[1]
+    drawn[3] = drawn[3] @ np.diag([1, 1, 1e-1])
+    drawn[4] = -(np.abs(np.linalg.det(drawn[4]))[:, None, None] ** -1) * drawn[4]
+    return drawn.reshape(-1, 3, 3)
+
+
+@pytest.mark.parametrize("size", [1e-25, 1e-10, 1.0, 1e15, 1e25])
+def test_decomposition_restores_the_matrix(size, dtype, rng):
+    given = jnp.asarray(size * matrices(rng), dtype)
+    left, values, right = (np.asarray(x, np.float64) for x in svd(given))
+    restored = (left * values[:, None]) @ np.swapaxes(right, 1, 2)
+    scale = np.abs(np.asarray(given, np.float64)).max(axis=(1, 2))
+    bound = {"float32": 2e-6, "float64": 5e-15}[dtype]
+    assert np.max(np.abs(restored - given).max(axis=(1, 2)) / scale) < bound
+    truth = np.linalg.svd(np.asarray(given, np.float64))[1]
+    assert np.max(np.abs(np.abs(values) - truth) / scale[:, None]) < bound
+    assert np.min(np.linalg.det(left)) > 0.99
+    assert np.min(np.linalg.det(right)) > 0.99
+    assert np.array_equal(np.sign(values[:, 2]), np.sign(np.linalg.det(given / size)))
+    found = singular_values(given)
+    np.testing.assert_allclose(found, np.abs(values), rtol=1e-6)
+
+
+@pytest.mark.parametrize("signed", [False, True])
+def test_energy_and_gradient(signed, dtype, rng):
+    given = jnp.asarray(matrices(rng), dtype)
+    truth = [exact(matrix, signed) for matrix in given]
+    values = np.array([value for value, _ in truth])
+    slopes = np.array([gradient for _, gradient in truth])
+    # relative to the conditioning: an ulp of the matrix moves σ by as much
+    bound = {"float32": 2e-5, "float64": 1e-13}[dtype]
+    np.testing.assert_allclose(energy[signed](given), values, rtol=bound, atol=bound)
+    error = np.abs(slope[signed](given) - slopes).max(axis=(1, 2))
+    conditions = np.linalg.cond(np.asarray(given, np.float64))
+    assert np.max(error / (1 + np.abs(slopes).max(axis=(1, 2)) * conditions)) < bound
+
+
+@pytest.mark.parametrize("signed", [False, True])
+def test_gradients_against_differences(signed, float64, rng):
+    weight = jnp.asarray(rng.normal(size=(3, 3)))
+    for matrix in (matrices(rng)[30], np.diag([1.3, 0.5, 4e-3]), np.diag([2, 1, -0.5])):
+        point = jnp.asarray(np.linalg.qr(rng.normal(size=(3, 3)))[0] @ matrix)
+
+        def along(m):
+            return jnp.sum(jax.grad(ENERGIES[signed])(m) * weight)
+
+        assert gradients.directional_error(ENERGIES[signed], point) < 1e-6
+        assert gradients.directional_error(along, point) < 1e-6
+
+    def lengths(m):
+        return matrix3.singular_values(m) @ weight[0]
+
+    assert gradients.directional_error(lengths, jnp.asarray(matrices(rng)[30])) < 1e-6
+
+
+def test_displacement_gradients_against_differences(float64, rng):
+    weight = jnp.asarray(rng.normal(size=(3, 3)))
+    function = matrix3.displacement_log_energy
+
+    def along(m):
+        return jnp.sum(jax.grad(function)(m) * weight)
+
+    for size in (1e-2, 0.5):
+        point = jnp.asarray(size * rng.normal(size=(3, 3)))
+        assert gradients.directional_error(function, point, step=1e-6) < 1e-6
+        assert gradients.directional_error(along, point, step=1e-6) < 1e-6
+
+
+HARD = {
+    "identity": np.eye(3),
+    "rotation": np.asarray([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]),
+    "two equal": np.diag([2, 2, 0.5]),
+    "three equal": 2 * np.eye(3),
+    "zero": np.zeros((3, 3)),
+    "rank one": np.outer([1, 2, 3], [0.5, -1, 0.2]),
+    "rank two": np.diag([1.0, 2, 0]),
+    "denormal": 1e-40 * np.eye(3),
+    "tiny": 1e-20 * np.eye(3),
+    "huge": 1e15 * np.eye(3),
+    "collapsing": np.diag([1, 1, 1e-5]),
+    "mirror": np.diag([1, 1, -1.0]),
+    "at the switch": np.diag([1, 0.01, 0.01]),
+    "nearly equal": np.diag([1, 1 + 1e-7, 1 - 1e-7]),
+}
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("signed", [False, True])
+@pytest.mark.parametrize("name", HARD)
+def test_hard_matrices_have_finite_energy_slope_and_curvature(name, signed, dtype, rng):
+    matrix = jnp.asarray(HARD[name], dtype)
+    direction = jnp.asarray(rng.normal(size=(3, 3)), dtype)
+    value, _ = exact(matrix, signed)
+    found = energy[signed](matrix[None])[0]
+    np.testing.assert_allclose(found, value, rtol=2e-6, atol=1e-12)
+    gradient = slope[signed](matrix[None])[0]
+    assert np.all(np.isfinite(gradient))
+    assert np.all(np.isfinite(hessian_product[signed](matrix, direction)))
+    if name in {"zero", "rank one", "rank two", "tiny", "collapsing"}:
+        assert np.max(abs(gradient)) > 100  # not the zero slope of a clamp
+
+
+@pytest.mark.hard_cases
+def test_curvature_at_the_identity_is_that_of_the_strain(dtype, rng):
+    """E = |sym D|² to second order; LAPACK's rule gives NaN here."""
+    direction = rng.normal(size=(3, 3))
+    truth = direction + direction.T
+    found = hessian_product[False](
+        jnp.eye(3, dtype=dtype), jnp.asarray(direction, dtype)
+    )
+    np.testing.assert_allclose(found, truth, atol=2e-6)
+    zero = jnp.zeros((3, 3), dtype)
+    small = turn_by_hand(
+        matrix3.displacement_log_energy, zero, jnp.asarray(direction, dtype)
+    )
+    np.testing.assert_allclose(small, truth, atol=2e-6)
+
+
+def test_a_reflection_is_free_only_without_the_sign(dtype):
+    """... and the signed energy pushes it back through the collapse."""
+    mirror, flat = (jnp.asarray(np.diag([1, 1, s]), dtype)[None] for s in (-1.0, 0.0))
+    assert energy[False](mirror)[0] == 0
+    assert energy[True](mirror)[0] > energy[True](flat)[0] > 0
+    assert slope[True](mirror)[0, 2, 2] < 0
+    assert slope[True](flat)[0, 2, 2] < 0
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("size", [1e-8, 1e-5, 1e-3, 3e-2])
+def test_displacements_far_below_an_ulp_keep_their_energy(size, dtype, rng):
+    """From J = 1 + D in float32 a strain of 1e-8 is 100 % wrong."""
+    drawn = jnp.asarray(size * rng.normal(size=(4, 3, 3)), dtype)
+    values, slopes = displaced(drawn)
+    for matrix, value, gradient in zip(drawn, values, slopes, strict=True):
+        with mpmath.workdps(60):
+            d = mpmath.matrix(np.asarray(matrix, np.float64).tolist())
+            truth = _mp_energy(d)
+            step = mpmath.mpf(size) * mpmath.mpf(10) ** -15
+            differences = np.zeros((3, 3))
+            for i, j in ((0, 0), (1, 2), (2, 1)):
+                moved = [d.copy(), d.copy()]
+                moved[0][i, j] += step
+                moved[1][i, j] -= step
+                ends = [_mp_energy(m) for m in moved]
+                differences[i, j] = float((ends[0] - ends[1]) / (2 * step))
+        bound = {"float32": 2e-6, "float64": 1e-13}[dtype]
+        assert abs(value / float(truth) - 1) < bound
+        chosen = differences != 0
+        error = np.abs(np.asarray(gradient, np.float64) - differences)[chosen]
+        assert np.max(error) < bound * np.linalg.norm(gradient)
+
+
+def _mp_energy(displacement):
+    singular = mpmath.svd_r(mpmath.eye(3) + displacement, compute_uv=False)
+    return sum(mpmath.log(value) ** 2 for value in singular)
+
+
+def test_both_forms_agree_around_the_switch(float64, rng):
+    drawn = rng.normal(size=(40, 3, 3))
+    drawn *= (0.1 * np.linspace(0.9, 1.1, 40) / np.linalg.norm(drawn, axis=(1, 2)))[
+        :, None, None
+    ]
+    values, _ = displaced(jnp.asarray(drawn))
+    np.testing.assert_allclose(
+        values, energy[False](jnp.asarray(np.eye(3) + drawn)), rtol=1e-12
+    )
+
+
+def test_strain_of_a_nearly_rigid_screw_survives_float32():
+    """Turning by 1e-3 and straining by 1e-5, like a warp at its start."""
+    strain = np.array([[1e-5, 0, 2e-5], [0, -1e-5, 0], [3e-5, 0, 1e-5]], np.float32)
+
+    def displacement(point):
+        rate = jnp.asarray(strain, point.dtype)
+        angular = jnp.asarray([1e-3, -5e-4, 2e-4], point.dtype) + rate @ point
+        return lie.displacement(angular, rate @ point, point)
+
+    def measured(point):
+        return matrix3.displacement_log_energy(jax.jacfwd(displacement)(point))
+
+    narrow = measured(jnp.asarray([0.3, -0.2, 0.4]))
+    with jax.enable_x64(True):
+        wide = measured(jnp.asarray(np.float32([0.3, -0.2, 0.4]), jnp.float64))
+    assert abs(float(narrow) / float(wide) - 1) < 1e-5
+    jacobian = jnp.eye(3) + jax.jacfwd(displacement)(jnp.asarray([0.3, -0.2, 0.4]))
+    assert abs(float(matrix3.log_energy(jacobian)) / float(wide) - 1) > 1e-3
+
+
+def test_singular_vectors_refuse_to_be_differentiated():
+    with pytest.raises(NotImplementedError, match="singular_values"):
+        jax.jacfwd(lambda m: matrix3.svd(m)[0])(jnp.eye(3))
