@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from gaussians_jax.raster_spec import RasterSpec
@@ -22,8 +23,8 @@ from nerfies_jax.geometry.camera import Camera
 
 # gsplat's MIN_COMPENSATION, squared: the antialiased opacity factor is at least 0.005.
 MIN_COMPENSATION_SQ = 0.005**2
-# px. Rows of the projected square root beyond this are treated as not finite, because
-# their squares would overflow float32 (1e38); no camera sees such a Gaussian as a shape.
+# px. Rows of the projected square root beyond this are treated as not finite: their
+# squares would overflow float32, and no camera sees such a Gaussian as a shape.
 WIDEST_PX = 1e16
 
 
@@ -93,7 +94,11 @@ def _project_one(mean, quaternion, scale, opacity, camera, size, spec):
         opacity = opacity * compensation
         drawn &= opacity >= spec.alpha_cut
     extent = jnp.where(drawn, _extent(whitening, opacity, spec), 0)
-    return Footprints(mean_px, whitening, opacity, depth, jax.lax.stop_gradient(extent))
+    fields = (
+        jnp.where(drawn, field, lax.stop_gradient(field))
+        for field in (mean_px, whitening, opacity, depth)
+    )
+    return Footprints(*fields, lax.stop_gradient(extent))
 
 
 def _dot(a, b):
@@ -139,7 +144,7 @@ def _footprint_rows(rows, quaternion, scale):
     """The two rows of T = J W R diag(scale), as component lists."""
     # Scaling by the largest component keeps 1e-30 and 1e30 apart from 0 and infinity;
     # a rotation does not depend on the length, so the scale carries no gradient.
-    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(quaternion)))
+    largest = lax.stop_gradient(jnp.max(jnp.abs(quaternion)))
     w, x, y, z = quaternion / largest
     double = 2 / (w * w + x * x + y * y + z * z)
     columns = (
@@ -170,7 +175,7 @@ def _whiten(first, second, spec):
     """
     dilation = spec.dilation_px2
     variance_x = _dot(first, first) + dilation
-    inverse = jax.lax.rsqrt(variance_x)
+    inverse = lax.rsqrt(variance_x)
     n = [x * inverse for x in first]
     cross = (
         n[1] * second[2] - n[2] * second[1],
@@ -181,7 +186,7 @@ def _whiten(first, second, spec):
     blurred = sharp + dilation * (1 + _dot(second, second) / variance_x)
     shear = _dot(n, second) * inverse
     half = jnp.sqrt(jnp.asarray(0.5, variance_x.dtype))
-    whitening = jnp.stack([half * inverse, shear, half * jax.lax.rsqrt(blurred)])
+    whitening = jnp.stack([half * inverse, shear, half * lax.rsqrt(blurred)])
     ratio = sharp / blurred
     small = ratio < MIN_COMPENSATION_SQ
     # sqrt has no slope at 0, so the branch not taken gets a 1.

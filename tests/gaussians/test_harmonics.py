@@ -1,0 +1,89 @@
+"""Spherical harmonics against SciPy's, and the zero direction."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.special
+
+from gaussians_jax import harmonics
+from tests import gradients
+
+
+def scipy_basis(direction, degree):
+    """Real harmonics with the Condon-Shortley phase, order m = -l .. l."""
+    x, y, z = direction.T
+    polar, azimuth = np.arccos(np.clip(z, -1, 1)), np.arctan2(y, x)
+    terms = []
+    for order in range(degree + 1):
+        for m in range(-order, order + 1):
+            value = scipy.special.sph_harm_y(order, abs(m), polar, azimuth)
+            part = value.real if m >= 0 else value.imag
+            terms.append(part * (1 if m == 0 else np.sqrt(2)))
+    return np.stack(terms, -1)
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_basis_equals_scipy(degree, dtype, rng):
+    direction = rng.normal(size=(200, 3))
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    found = jnp.stack(harmonics.basis(jnp.asarray(direction, dtype), degree), -1)
+    assert found.dtype == dtype
+    # Cubic terms of coefficients up to 2.9: ten ulps.
+    tolerance = {"float32": 2e-6, "float64": 5e-15}[dtype]
+    np.testing.assert_allclose(found, scipy_basis(direction, degree), atol=tolerance)
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("length", [1e-30, 1e-3, 1.0, 1e30])
+def test_unit_direction_keeps_its_digits_at_any_length(length, dtype):
+    direction = np.array([0.36, -0.48, 0.8])
+    offset = jnp.asarray(direction * length, dtype)
+    found, slope = jax.jvp(
+        harmonics.unit_direction, (offset,), (jnp.asarray([length, 0, 0], dtype),)
+    )
+    tolerance = {"float32": 3e-7, "float64": 1e-15}[dtype]
+    np.testing.assert_allclose(found, direction, atol=tolerance)
+    expected = np.array([1, 0, 0]) - direction * direction[0]  # (I - d d^t) e_x
+    np.testing.assert_allclose(slope, expected, atol=2 * tolerance)
+
+
+@pytest.mark.hard_cases
+def test_zero_direction_looks_along_z_and_has_no_gradient(dtype):
+    zero = jnp.zeros(3, dtype)
+    jacobian = jax.jacrev(harmonics.unit_direction)(zero)
+    np.testing.assert_array_equal(harmonics.unit_direction(zero), [0, 0, 1])
+    np.testing.assert_array_equal(jacobian, np.zeros((3, 3)))
+
+
+def test_colour_is_clamped_at_zero_from_below(dtype, rng):
+    coefficients = jnp.asarray(rng.normal(size=(50, 16, 3)), dtype)
+    mean = rng.normal(size=(50, 3))
+    position = np.array([0.5, -2.0, 1.0])
+    found = harmonics.colour_towards(
+        coefficients, jnp.asarray(mean, dtype), jnp.asarray(position, dtype)
+    )
+    direction = mean - position
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    expected = np.einsum(
+        "nk,nkc->nc", scipy_basis(direction, 3), np.asarray(coefficients, np.float64)
+    )
+    assert (expected < -0.5).any()
+    tolerance = {"float32": 1e-5, "float64": 1e-13}[dtype]
+    np.testing.assert_allclose(found, np.maximum(expected + 0.5, 0), atol=tolerance)
+
+
+def test_colour_gradient_equals_central_differences(float64, rng):
+    coefficients = jnp.asarray(0.1 * rng.normal(size=(5, 16, 3)))
+    mean, position = jnp.asarray(rng.normal(size=(5, 3))), jnp.asarray([3.0, 1.0, 2.0])
+    weights = jnp.asarray(rng.normal(size=(5, 3)))
+
+    def loss(*args):
+        return jnp.sum(harmonics.colour_towards(*args) * weights)
+
+    assert gradients.directional_error(loss, coefficients, mean, position) < 1e-8
+
+
+def test_a_wrong_number_of_coefficients_is_refused():
+    with pytest.raises(ValueError, match="1, 4, 9 or 16 coefficients, got 5"):
+        harmonics.degree_of(5)

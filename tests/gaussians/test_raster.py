@@ -1,0 +1,271 @@
+"""Slabs, ties, edges of the image, empty scenes, transformations, the CUDA lowering."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gaussians_jax import binning, raster
+from gaussians_jax.binning import Grid
+from gaussians_jax.projection import Footprints
+from gaussians_jax.raster_spec import GSPLAT, RasterSpec
+from tests.oracles import dense_splats
+
+QUICK = dataclasses.replace(GSPLAT, batch=8, chunk=2)
+
+
+def footprints_from(mean_px, sigma_px, angle, opacity, depth, dtype):
+    """Footprints, and the conics of the same ellipses for the dense renderer."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    one, two = np.square(sigma_px).T
+    a, c = cos**2 * one + sin**2 * two, sin**2 * one + cos**2 * two
+    b = cos * sin * (one - two)
+    whitening = np.stack([np.sqrt(0.5 / a), b / a, np.sqrt(0.5 / (c - b * b / a))], 1)
+    reach = 2 * np.log(np.maximum(opacity * 255, 1))[:, None]
+    extent = np.sqrt(reach * np.stack([a, c], 1))
+    fields = (mean_px, whitening, opacity, depth, extent)
+    covariance = np.stack([a, b, b, c], -1).reshape(-1, 2, 2)
+    return (
+        Footprints(*(jnp.asarray(x, dtype) for x in fields)),
+        jnp.asarray(np.linalg.inv(covariance), dtype),
+    )
+
+
+def some_footprints(rng, count, size, dtype, sigma=2.0):
+    height, width = size
+    return footprints_from(
+        rng.uniform(-0.1, 1.1, (count, 2)) * [width, height],
+        sigma * np.exp(rng.normal(0, 0.5, (count, 2))),
+        rng.uniform(0, np.pi, count),
+        rng.uniform(0.02, 1.0, count),
+        rng.uniform(1, 9, count),
+        dtype,
+    )
+
+
+@functools.partial(jax.jit, static_argnums=(2, 3))
+def picture_and_slopes(footprints, values, size, spec):
+    def loss(mean_px, whitening, opacity, values):
+        moved = footprints._replace(
+            mean_px=mean_px, whitening=whitening, opacity=opacity
+        )
+        image, left = raster.rasterise(moved, values, size, spec)
+        return jnp.sum(jnp.sin(3 * image)) + jnp.sum(left**2), (image, left)
+
+    slopes, picture = jax.grad(loss, argnums=(0, 1, 2, 3), has_aux=True)(
+        *footprints[:3], values
+    )
+    return picture, slopes
+
+
+def close(found, expected, tolerance):
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        scale = max(float(jnp.max(jnp.abs(b))), 1.0)
+        np.testing.assert_allclose(a, b, rtol=0, atol=tolerance * scale)
+
+
+def test_the_capacity_never_changes_picture_or_gradient(float64, rng):
+    size = (29, 43)
+    footprints, _ = some_footprints(rng, 150, size, float64)
+    # Three Gaussians cover every tile, 24 of them, more than a slab of 5 pairs holds.
+    footprints = footprints._replace(
+        whitening=footprints.whitening.at[:3].multiply(jnp.asarray([0.02, 1.0, 0.02])),
+        extent_px=footprints.extent_px.at[:3].multiply(50.0),
+    )
+    values = jnp.asarray(rng.uniform(size=(150, 3)))
+    whole = picture_and_slopes(footprints, values, size, QUICK)
+    spec = dataclasses.replace(QUICK, capacity=5, kept_slabs=3)
+    close(picture_and_slopes(footprints, values, size, spec), whole, 1e-12)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 17), (16, 8)])
+def test_odd_sizes_equal_the_dense_compositor(size, dtype, rng):
+    footprints, conics = some_footprints(rng, 60, size, dtype)
+    values = jnp.asarray(rng.uniform(size=(60, 2)), dtype)
+    image, left = jax.jit(lambda f, v: raster.rasterise(f, v, size, QUICK))(
+        footprints, values
+    )
+    expected = dense_splats.composite(
+        footprints.mean_px,
+        conics,
+        footprints.opacity,
+        footprints.depth,
+        values,
+        size,
+        QUICK,
+    )
+    assert image.shape == (*size, 2)
+    assert image.dtype == left.dtype == dtype
+    tolerance = {"float32": 1e-5, "float64": 1e-13}[dtype]
+    np.testing.assert_allclose(image, expected[0].reshape(*size, 2), atol=tolerance)
+    np.testing.assert_allclose(left, expected[1].reshape(size), atol=tolerance)
+
+
+@pytest.mark.hard_cases
+def test_equal_depths_are_drawn_in_order_of_index(dtype, rng):
+    size = (8, 8)
+    footprints, _ = footprints_from(
+        np.full((3, 2), 4.0), np.full((3, 2), 3.0), np.zeros(3), np.full(3, 0.9),
+        np.full(3, 2.0), dtype,
+    )  # fmt: skip
+    values = jnp.eye(3, dtype=dtype)
+    image, _ = raster.rasterise(footprints, values, size, QUICK)
+    front, middle, back = image[4, 4]
+    assert front > 5 * middle > 20 * back > 0
+
+
+@pytest.mark.hard_cases
+def test_two_opaque_gaussians_stop_a_pixel(dtype):
+    """0.99 twice leaves 1e-4: float32 rounds it below the stop, float64 above."""
+    footprints, _ = footprints_from(
+        np.full((3, 2), 4.5), np.full((3, 2), 100.0), np.zeros(3), np.ones(3),
+        np.arange(1.0, 4.0), dtype,
+    )  # fmt: skip
+    image, left = raster.rasterise(footprints, jnp.eye(3, dtype=dtype), (8, 8), QUICK)
+    drawn = {"float32": [0.99, 0, 0], "float64": [0.99, 0.0099, 0]}[dtype]
+    np.testing.assert_allclose(image[4, 4], drawn, atol=1e-6)
+    np.testing.assert_allclose(image.sum(-1) + left, np.ones((8, 8)), atol=1e-6)
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("count", [0, 5])
+def test_nothing_to_draw_leaves_the_background(count, dtype, rng):
+    footprints, _ = some_footprints(rng, count, (9, 9), dtype)
+    footprints = footprints._replace(extent_px=jnp.zeros((count, 2), dtype))
+    values = jnp.ones((count, 3), dtype)
+    (image, left), slopes = picture_and_slopes(footprints, values, (9, 9), QUICK)
+    np.testing.assert_array_equal(image, np.zeros((9, 9, 3)))
+    np.testing.assert_array_equal(left, np.ones((9, 9)))
+    for slope in slopes:
+        np.testing.assert_array_equal(slope, np.zeros_like(slope))
+
+
+@pytest.mark.hard_cases
+def test_a_nan_value_shows_where_its_gaussian_is(dtype):
+    footprints, _ = footprints_from(
+        np.array([[4.0, 4.0]]), np.full((1, 2), 0.8), np.zeros(1), np.ones(1),
+        np.ones(1), dtype,
+    )  # fmt: skip
+    values = jnp.full((1, 1), jnp.nan, dtype)
+    image, left = raster.rasterise(footprints, values, (8, 24), QUICK)
+    assert np.isnan(image[4, 4])
+    assert not np.isnan(image[:, 8:]).any()
+    assert not np.isnan(left).any()
+
+
+def test_cameras_under_vmap_and_scan_equal_single_renders(float64, rng):
+    size, cameras = (13, 21), 3
+    footprints, _ = some_footprints(rng, 40, size, float64)
+    values = jnp.asarray(rng.uniform(size=(40, 3)))
+    shifts = jnp.asarray(rng.normal(size=(cameras, 1, 2)))
+
+    def one(shift):
+        moved = footprints._replace(mean_px=footprints.mean_px + shift)
+        return picture_and_slopes(moved, values, size, QUICK)
+
+    single = [one(shift) for shift in shifts]
+    single = jax.tree.map(lambda *leaves: jnp.stack(leaves), *single)
+    close(jax.jit(jax.vmap(one))(shifts), single, 1e-13)
+    scanned = jax.jit(lambda s: jax.lax.scan(lambda _, x: (None, one(x)), None, s)[1])
+    close(scanned(shifts), single, 1e-13)
+
+
+@pytest.mark.parametrize("count", [1, 2, 1000, 70_000])
+def test_depth_order_is_a_stable_sort(count, dtype, rng):
+    """70000 rows leave 15 bits a pass, so wide ranges take three."""
+    order = jax.jit(binning.depth_order)
+    drawn = rng.random(count) < 0.8
+    for depth in (
+        rng.uniform(1, 9, count),
+        np.exp(rng.normal(0, 15, count)),
+        rng.integers(-3, 3, count),
+    ):
+        depth = depth.astype(dtype)
+        found = order(jnp.asarray(depth), jnp.asarray(drawn, jnp.int32))
+        expected = np.argsort(np.where(drawn, depth, np.inf), kind="stable")
+        np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("tiles_per_side", [16, 1024], ids=["packed", "two keys"])
+def test_pairs_are_sorted_by_tile_then_depth(tiles_per_side, dtype, rng):
+    """2^20 tiles and 5000 ranks need 33 bits, so they take the sort of two arrays."""
+    count, first = 5000, 7
+    grid = Grid(8 * tiles_per_side, 8 * tiles_per_side, 8)
+    rank = np.sort(rng.integers(first, first + count, count)).astype(np.int32)
+    tile = rng.integers(0, min(grid.tiles, 300) + 1, count).astype(np.int32)
+    tile = np.where(tile == 300, grid.tiles, tile)
+    slab = jax.jit(binning.sort_pairs, static_argnums=(3, 4))(
+        tile, rank, jnp.int32(first), 20_000, grid
+    )
+    order = np.lexsort((rank, tile))
+    kept = int((tile < grid.tiles).sum())
+    np.testing.assert_array_equal(slab.ranks[:kept], rank[order][:kept])
+    numbers = np.bincount(tile, minlength=grid.tiles + 1)[:-1]
+    np.testing.assert_array_equal(slab.ends - slab.starts, numbers)
+
+
+def test_the_ellipse_test_keeps_every_tile_that_shows_a_gaussian(float64, rng):
+    """And drops most of the others: needles' boxes are mostly empty."""
+    size = (64, 96)
+    footprints, conics = some_footprints(rng, 30, size, float64, sigma=1.0)
+    needles, sharp = footprints_from(
+        rng.uniform(0, 1, (30, 2)) * [96, 64],
+        np.tile([40.0, 0.6], (30, 1)),
+        rng.uniform(0, np.pi, 30),
+        rng.uniform(0.02, 1, 30),
+        np.arange(30.0) + 1,
+        float64,
+    )
+    footprints = jax.tree.map(lambda *x: jnp.concatenate(x), footprints, needles)
+    conics = jnp.concatenate([conics, sharp])
+    grid = Grid(*size, 8)
+    boxes = binning.tile_boxes(footprints.mean_px, footprints.extent_px, grid)
+    log_opacity = jnp.log(footprints.opacity)[:, None]
+    table = jnp.concatenate([footprints.mean_px, footprints.whitening, log_opacity], 1)
+    cursor = binning.Cursor(jnp.int32(0), jnp.int32(0))
+    every = jnp.ones(grid.tiles, bool)
+    slab, _ = binning.next_slab(
+        cursor, boxes, table, every, float(np.log(1 / 255)), grid, 8192
+    )
+    found = np.zeros((60, grid.tiles), bool)
+    for tile in range(grid.tiles):
+        found[slab.ranks[slab.starts[tile] : slab.ends[tile]], tile] = True
+    y, x = np.mgrid[: size[0], : size[1]] + 0.5
+    offset = np.stack([x, y], -1)[None] - np.asarray(footprints.mean_px)[:, None, None]
+    exponent = np.einsum("nhwi,nij,nhwj->nhw", offset, np.asarray(conics), offset) / 2
+    alpha = np.asarray(footprints.opacity)[:, None, None] * np.exp(-exponent)
+    shows = (alpha >= 1 / 255).reshape(60, 8, 8, 12, 8).any((2, 4)).reshape(60, -1)
+    np.testing.assert_array_equal(found, shows)
+    assert shows.sum() < 0.5 * int(boxes.count.sum())
+
+
+def test_forward_and_backward_lower_for_cuda(dtype, rng):
+    footprints, _ = some_footprints(rng, 50, (32, 48), dtype)
+    values = jnp.ones((50, 4), dtype)
+    traced = picture_and_slopes.trace(footprints, values, (32, 48), QUICK)
+    assert "stablehlo.while" in traced.lower(lowering_platforms=("cuda",)).as_text()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (dict(alpha_max=1.0), "alpha_cut < alpha_max < 1"),
+        (dict(near=0.0), "0 < near < far"),
+        (dict(tile=12), "tile must be one of"),
+        (dict(capacity=0), "capacity must be at least 1"),
+        (dict(dilation_px2=0.0), "dilation_px2 must be positive"),
+        (dict(stop=1.0), "0 <= stop < 1"),
+    ],
+)
+def test_wrong_settings_are_refused(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        RasterSpec(**wrong)
+
+
+def test_an_image_without_pixels_is_refused(dtype, rng):
+    footprints, _ = some_footprints(rng, 2, (4, 4), dtype)
+    with pytest.raises(ValueError, match="at least one pixel"):
+        raster.rasterise(footprints, jnp.ones((2, 3), dtype), (0, 5), QUICK)
