@@ -144,7 +144,7 @@ def _read_ply(path):
         if not which:
             return np.zeros((len(vertex), 0), np.float32)
         # A float64 or text column may hold what float32 cannot: inf, caught as broken.
-        with np.errstate(over="ignore"):
+        with np.errstate(over="ignore", invalid="ignore"):
             return np.stack([vertex[name] for name in which], -1).astype(np.float32)
 
     channels = columns(*rest).reshape(len(vertex), 3, -1)  # all red, then green, blue
@@ -244,7 +244,8 @@ def _read_splat(path):
             "not a .splat file"
         )
     table = np.frombuffer(data, _SPLAT_ROW)
-    scale = table["scale"].astype(np.float64)
+    with np.errstate(invalid="ignore"):  # a signalling NaN; caught as broken later
+        scale = table["scale"].astype(np.float64)
     bounds = np.exp(splats.LOG_SCALE_RANGE)
     # A flat Gaussian, of scale 0, is drawn at the smallest scale; NaN stays NaN.
     log_scale = np.where(scale >= 0, np.log(np.clip(scale, *bounds)), np.nan)

