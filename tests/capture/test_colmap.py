@@ -313,13 +313,10 @@ def test_a_named_split_and_a_single_pose_are_refused(tmp_path):
         colmap.read(tmp_path / "single")
 
 
-@pytest.mark.parametrize(
-    "first", ["nerfies_jax.capture.colmap", "nerfies_jax.capture.colmap_library"]
-)
-def test_pycolmap_leaves_zlib_whole(first):
+def test_pycolmap_leaves_zlib_whole():
     """In a fresh process: `import pycolmap, zlib; zlib.compress(...)` would abort."""
     code = (
-        f"import {first} as module\n"
+        "import nerfies_jax.capture.colmap_library\n"
         "from nerfies_jax.capture.colmap_library import library\n"
         "library()\n"
         "import gzip, zlib\n"
@@ -327,7 +324,9 @@ def test_pycolmap_leaves_zlib_whole(first):
         "assert gzip.decompress(gzip.compress(b'b' * 1000)) == b'b' * 1000\n"
         "print('whole')"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    # Where zlib is broken the process aborts, or hangs for ever.
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout.strip()) == (0, "whole"), done.stderr
 
 

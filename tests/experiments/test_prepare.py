@@ -131,6 +131,7 @@ def test_sharpness_falls_with_blur():
     assert values[3] < 0.01 * values[0]
 
 
+@pytest.mark.slow
 def test_a_film_without_texture_is_refused_and_leaves_nothing(tmp_path, capsys):
     frames = [np.full((64, 64, 3), 100 + k, np.uint8) for k in range(6)]
     video.write_video(tmp_path / "a.mp4", frames)
