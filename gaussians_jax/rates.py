@@ -5,11 +5,10 @@ import math
 
 import jax
 import jax.numpy as jnp
-import optax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Int
 
-from gaussians_jax.effects.effect import Effect
 from gaussians_jax.splats import Params, Splats
+from nerfies_jax.training import schedules
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,49 +41,27 @@ class RateSpec:
             )
 
 
-def log_linear(
-    step: Int[Array, ""], first: float, last: float, steps: int
-) -> Float[Array, ""]:
-    """From `first` to `last` in equal ratios over `steps` updates, then constant."""
-    schedule = optax.exponential_decay(
-        first, transition_steps=steps, decay_rate=last / first, end_value=last
-    )
-    return jnp.asarray(schedule(step))
-
-
 def learning_rates(
-    spec: RateSpec,
-    effects: tuple[Effect, ...],
-    extent: float,
-    steps: int,
-    step: Int[Array, ""],
-) -> Params:
-    """A prefix of `Params` with one rate for each kind of leaf, at a traced step."""
+    spec: RateSpec, extent: float, steps: int, step: Int[Array, ""]
+) -> Splats:
+    """One rate for each kind of row, at a traced step of a run of `steps`."""
     if spec.mean > 0:
-        mean = extent * log_linear(step, spec.mean, spec.mean_end, steps)
+        decay = schedules.log_linear(spec.mean, spec.mean_end, steps)
+        mean = extent * decay(step)
     else:
-        mean = 0.0
-    rows = {
-        "splats": Splats(
-            mean=mean,
-            log_scale=spec.log_scale,
-            quaternion=spec.quaternion,
-            opacity_logit=spec.opacity_logit,
-            sh_dc=spec.sh_dc,
-            sh_rest=spec.sh_rest,
-        )
-    }
-    nets = {}
-    for effect in effects:
-        if effect.init_rows is not None:
-            rows[effect.name] = effect.learning_rate(step)
-        if effect.init_nets is not None:
-            nets[effect.name] = effect.learning_rate(step)
-    return Params(rows, nets)
+        mean = jnp.zeros(())
+    return Splats(
+        mean=mean,
+        log_scale=spec.log_scale,
+        quaternion=spec.quaternion,
+        opacity_logit=spec.opacity_logit,
+        sh_dc=spec.sh_dc,
+        sh_rest=spec.sh_rest,
+    )
 
 
 def descend(params: Params, directions: Params, rates: Params) -> Params:
-    """`params - rate * direction`, each rate shared by the leaves below it."""
+    """`params - rate * direction`; `rates` is a prefix, a rate serves all below it."""
 
     def below(rate, parameters, along):
         def move(parameter, direction):

@@ -18,7 +18,7 @@ from gaussians_jax.raster_spec import RasterSpec
 from gaussians_jax.rates import RateSpec
 from gaussians_jax.splats import Params
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.training import losses
+from nerfies_jax.training import loop, losses
 from nerfies_jax.training.model import (
     Event,
     Frames,
@@ -124,7 +124,7 @@ def build(spec: SplatScene, facts: Facts) -> Model:
         return draw(params, view, size, moment, spec.sh_degree).rendering
 
     def step(state: TrainState, frames: Frames):
-        key = jax.random.fold_in(state.key, state.step)
+        key = loop.step_key(state)
         row = shuffled_row(state.key, state.step, len(frames.times))
         view = View(
             jax.tree.map(lambda leaf: leaf[row], frames.cameras),
@@ -151,9 +151,7 @@ def build(spec: SplatScene, facts: Facts) -> Model:
             loss, argnums=(0, 1), has_aux=True
         )(state.params, probe)
         directions, moments = optimiser.update(slopes, state.optimiser, state.params)
-        rate = rates.learning_rates(
-            spec.rates, effects, facts.extent, spec.steps, state.step
-        )
+        rate = _rates(spec, facts, effects, state.step)
         params = rates.descend(state.params, directions, rate)
         extra = state.extra
         if spec.density is not None:
@@ -175,6 +173,18 @@ def build(spec: SplatScene, facts: Facts) -> Model:
         events=_events(spec, facts, optimiser),
         counts=count_rows,
     )
+
+
+def _rates(spec, facts, effects, step):
+    """A prefix of `Params` with the learning rate of everything below each leaf."""
+    rows = {"splats": rates.learning_rates(spec.rates, facts.extent, spec.steps, step)}
+    nets = {}
+    for effect in effects:
+        if effect.init_rows is not None:
+            rows[effect.name] = effect.learning_rate(step)
+        if effect.init_nets is not None:
+            nets[effect.name] = effect.learning_rate(step)
+    return Params(rows, nets)
 
 
 def shuffled_row(
@@ -285,7 +295,7 @@ def _events(spec, facts, optimiser):
 
 
 def count_rows(state: TrainState) -> dict[str, int]:
-    """How many Gaussians are alive and how many numbers (`parameters`) there are in all."""
+    """Living Gaussians, and `parameters`: the numbers of them and the networks."""
     counts = {"gaussians": int(splats.alive(state.params.rows["splats"]).sum())}
     rows = jax.tree.leaves(state.params.rows)
     nets = jax.tree.leaves(state.params.nets)

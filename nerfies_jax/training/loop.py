@@ -161,7 +161,7 @@ class _Run:
         self.step_seconds = elapsed / done
         happening = self.events.get(self.step, ())
         for event in happening:
-            self.state = event.apply(self.state, self.frames)
+            self.state = _distinct(event.apply(self.state, self.frames))
             if int(self.state.step) != self.step:
                 raise ValueError(
                     f"event {event.name!r} changed state.step; it must not"
@@ -258,6 +258,19 @@ class _Run:
             self.checkpoints.wait()
         self.progress.say(message)
         return FitResult(self.state, self.history, self.step, reason, message)
+
+
+def _distinct(state: TrainState) -> TrainState:
+    """Copies of arrays that stand in several places: one buffer is donated once."""
+    seen: set[int] = set()
+
+    def own(leaf):
+        if id(leaf) in seen:
+            return jnp.copy(leaf)
+        seen.add(id(leaf))
+        return leaf
+
+    return jax.tree.map(own, state)
 
 
 def _by_step(events: Sequence[Event]) -> dict[int, list[Event]]:

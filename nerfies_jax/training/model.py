@@ -67,4 +67,4 @@ class Model(NamedTuple):
     step: Callable[[TrainState, Frames], tuple[TrainState, dict[str, Array]]]
     render: Callable[[PyTree, View, tuple[int, int]], Rendering]  # (params, view, size)
     events: tuple[Event, ...]
-    counts: Callable[[TrainState], dict[str, int]]  # {"gaussians": n}, {"parameters": n}
+    counts: Callable[[TrainState], dict[str, int]]  # {"gaussians": n, ...}

@@ -133,6 +133,17 @@ def test_events_happen_in_order_after_their_steps(frames):
     assert len(seen) == 3  # what has happened does not happen again
 
 
+def test_an_event_may_put_one_array_in_two_places(frames):
+    def share(state, _):
+        zero = jnp.zeros(6)
+        return state._replace(extra=state.extra | {"hits": zero, "more": zero})
+
+    state = start()
+    state = state._replace(extra=state.extra | {"more": jnp.ones(6)})
+    extra = (Event("share", (2,), share),)
+    assert fit(frames, state, steps=5, events=extra).steps == 5
+
+
 def test_hooks_run_at_their_steps_and_at_the_end(frames):
     hook = loop.Hook("score", lambda state, step: {"psnr": step / 2}, every_steps=4)
     result = fit(frames, steps=10, hooks=[hook])

@@ -1,0 +1,229 @@
+"""A spec becomes a model: its start, its step, its events."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from experiments import evaluate
+from gaussians_jax import presets, rates, scene, splats
+from gaussians_jax.rates import RateSpec
+from gaussians_jax.scene import Facts, SplatScene, StartSpec
+from gaussians_jax.splats import Params, Splats
+from tests import scenes
+
+KEY = 3
+
+
+@functools.cache
+def started(spec):
+    capture = scenes.tiny_capture()
+    model = scene.build(spec, scene.facts_of(capture))
+    return model, model.init(capture, jax.random.key(KEY)), evaluate.frames_of(capture)
+
+
+@functools.cache
+def stepped(spec, count):
+    model, state, frames = started(spec)
+    step = jax.jit(model.step)
+    trace = []
+    for _ in range(count):
+        state, metrics = step(state, frames)
+        trace.append({name: float(value) for name, value in metrics.items()})
+    return state, trace
+
+
+def test_training_lowers_the_loss():
+    _, trace = stepped(scenes.TINY_SPLATS, 25)
+    first = np.mean([row["loss"] for row in trace[:6]])  # an epoch each
+    last = np.mean([row["loss"] for row in trace[18:24]])
+    assert last < 0.95 * first, (first, last)
+
+
+def test_a_static_scene_has_no_network():
+    _, state, _ = started(scenes.TINY_SPLATS)
+    assert state.params.nets == {}
+    assert set(state.params.rows) == {"splats"}
+
+
+def test_before_the_warm_up_a_deformable_step_is_the_static_step():
+    static, deformable = (
+        stepped(spec, 2)[0].params.rows["splats"]
+        for spec in (scenes.TINY_SPLATS, scenes.TINY_DEFORMABLE)
+    )
+    for name, a, b in zip(Splats._fields, static, deformable, strict=True):
+        # The same operations inside another program: a few ulps after Adam.
+        np.testing.assert_allclose(a, b, rtol=2e-5, atol=1e-6, err_msg=name)
+
+
+def test_the_motion_learns_only_after_the_warm_up():
+    _, state, _ = started(scenes.TINY_DEFORMABLE)
+    warm, _ = stepped(scenes.TINY_DEFORMABLE, 3)
+    later, _ = stepped(scenes.TINY_DEFORMABLE, 6)
+    start = jax.tree.leaves(state.params.nets)
+    for before, after in zip(start, jax.tree.leaves(warm.params.nets), strict=True):
+        np.testing.assert_array_equal(before, after)
+    moved = [
+        np.abs(before - after).max()
+        for before, after in zip(start, jax.tree.leaves(later.params.nets), strict=True)
+    ]
+    assert max(moved) > 1e-4
+
+
+def test_every_epoch_shows_every_frame_once_in_its_own_order():
+    key, frames = jax.random.key(0), 7
+    rows = jax.vmap(lambda step: scene.shuffled_row(key, step, frames))(jnp.arange(21))
+    epochs = np.asarray(rows).reshape(3, frames)
+    assert (np.sort(epochs, axis=1) == np.arange(frames)).all()
+    assert len({tuple(epoch) for epoch in epochs}) == 3
+
+
+def test_descent_scales_each_kind_of_row_by_its_rate():
+    spec = RateSpec(mean=1e-2, mean_end=1e-4, log_scale=0.1, quaternion=0.2)
+    _, state, _ = started(scenes.TINY_SPLATS)
+    ones = jax.tree.map(jnp.ones_like, state.params)
+    rate = rates.learning_rates(spec, 2.0, 100, jnp.asarray(50))
+    after = rates.descend(state.params, ones, Params({"splats": rate}, {}))
+    before = state.params.rows["splats"]
+    step = jax.tree.map(lambda a, b: a - b, before, after.rows["splats"])
+    # Halfway in the logarithm between 1e-2 and 1e-4, times the extent of 2.
+    np.testing.assert_allclose(step.mean, 2e-3, rtol=2e-3)
+    np.testing.assert_allclose(step.log_scale, 0.1, rtol=1e-5)
+    np.testing.assert_allclose(step.quaternion, 0.2, rtol=1e-5)
+
+
+def test_one_adam_step_is_optax_adam_for_rows_and_networks():
+    _, state, _ = started(scenes.TINY_DEFORMABLE)
+    slopes = jax.tree.map(
+        lambda leaf: jax.random.normal(jax.random.key(1), leaf.shape), state.params
+    )
+    ours = scene.scale_by_row_adam()
+    directions, _ = ours.update(slopes, ours.init(state.params))
+    reference = optax.scale_by_adam(eps=1e-15)
+    with jax.numpy_dtype_promotion("standard"):  # optax mixes ints and floats
+        expected, _ = reference.update(slopes, reference.init(state.params))
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6),
+        directions,
+        expected,
+    )
+
+
+def test_events_grow_the_scene_and_keep_its_picture_learnable():
+    model, _, frames = started(scenes.TINY_SPLATS)
+    state, _ = stepped(scenes.TINY_SPLATS, 10)
+    grow = next(event for event in model.events if event.name == "densify")
+    assert grow.steps == (10, 20)
+    spec = dataclasses.replace(
+        scenes.TINY_SPLATS,
+        density=dataclasses.replace(scenes.TINY_SPLATS.density, gradient=1e-9),
+    )
+    eager = scene.build(spec, scene.facts_of(scenes.tiny_capture()))
+    after = eager.events[0].apply(state, frames)
+    assert model.counts(after)["gaussians"] > model.counts(state)["gaussians"]
+    assert int(after.step) == int(state.step)
+    again, metrics = jax.jit(eager.step)(after, frames)
+    assert np.isfinite(float(metrics["loss"]))
+    assert again.params.rows["splats"].mean.shape == (*after.extra.alive.shape, 3)
+
+
+def test_an_event_is_a_function_of_the_state():
+    model, _, frames = started(scenes.TINY_SPLATS)
+    state, _ = stepped(scenes.TINY_SPLATS, 10)
+    first, second = (model.events[0].apply(state, frames) for _ in range(2))
+    data = [jax.tree.leaves(s._replace(key=0)) for s in (first, second)]
+    for a, b in zip(*data, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_frame_is_rendered_without_a_step():
+    model, state, _ = started(scenes.TINY_DEFORMABLE)
+    capture = scenes.tiny_capture()
+    view = evaluate.view_of(capture, int(capture.heldout[0]))
+    rendering = model.render(state.params, view, (20, 15))
+    assert rendering.colour.shape == (15, 20, 3)
+    assert rendering.depth.shape == rendering.alpha.shape == (15, 20)
+    assert all(np.isfinite(leaf).all() for leaf in rendering)
+
+
+def test_few_points_start_from_random_ones_in_the_views():
+    capture = scenes.tiny_capture()
+    spec = StartSpec(random=50, fewest=10**6)
+    position, colour = scene.first_points(spec, capture, 0)
+    assert position.shape == colour.shape == (50, 3)
+    turn = capture.cameras.camera_from_world[capture.train]
+    offset = position[None] - capture.cameras.position[capture.train][:, None]
+    depth = np.einsum("fk,fnk->fn", turn[:, 2], offset)
+    seen = (depth > 0.99 * capture.near) & (depth < 1.01 * capture.far)
+    assert seen.any(axis=0).all()
+
+
+def test_more_points_than_asked_for_are_thinned_without_repeats():
+    position, _ = scene.first_points(StartSpec(points=120), scenes.tiny_capture(), 0)
+    assert len(np.unique(position, axis=0)) == len(position) == 120
+
+
+def test_facts_take_a_depth_for_the_extent_of_a_camera_that_stands_still():
+    capture = scenes.tiny_capture()
+    still = np.broadcast_to(capture.cameras.position[:1], (len(capture.ids), 3)).copy()
+    capture = dataclasses.replace(
+        capture, cameras=capture.cameras._replace(position=still)
+    )
+    assert capture.near < scene.facts_of(capture).extent < capture.far
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "words"),
+    [
+        ("steps", 0, "at least one step"),
+        ("sh_degree", 4, "0, 1, 2 or 3"),
+        ("dssim_weight", 1.5, r"\[0, 1\]"),
+    ],
+)
+def test_wrong_settings_are_refused_with_their_bound(field, value, words):
+    with pytest.raises(ValueError, match=words):
+        SplatScene(**{"steps": 10, field: value})
+
+
+def test_zero_gaussians_are_refused():
+    with pytest.raises(ValueError, match="at least one Gaussian"):
+        StartSpec(points=0)
+
+
+def test_a_rate_that_cannot_decay_is_refused():
+    with pytest.raises(ValueError, match="mean_end"):
+        RateSpec(mean_end=0.0)
+
+
+@pytest.mark.parametrize("name", sorted(presets.PRESETS))
+def test_presets_build_and_stretch_with_their_steps(name):
+    spec = presets.PRESETS[name]
+    facts = Facts(extent=1.0, background=(0.0, 0.0, 0.0), frames=10)
+    half = presets.with_steps(spec, spec.steps // 2)
+    assert half.steps == spec.steps // 2
+    assert half.density.stop == round(spec.density.stop / 2)
+    assert scene.build(half, facts).spec == (half, facts)
+    assert presets.with_steps(spec, spec.steps) == spec
+
+
+def test_first_bytes_counts_rows_and_capacity():
+    capture = scenes.tiny_capture()
+    small = scene.first_bytes(scenes.TINY_SPLATS, capture)
+    slab = dataclasses.replace(scenes.TINY_SPLATS.raster, capacity=10**12)
+    large = scene.first_bytes(
+        dataclasses.replace(scenes.TINY_SPLATS, raster=slab), capture
+    )
+    assert small < 10**7
+    assert large > 10**12
+
+
+def test_params_keep_rows_and_networks_apart():
+    _, state, _ = started(scenes.TINY_DEFORMABLE)
+    assert isinstance(state.params, Params)
+    capacity = splats.capacity_for(200, 600)
+    for leaf in jax.tree.leaves(state.params.rows):
+        assert leaf.shape[0] == capacity
