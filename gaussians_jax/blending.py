@@ -155,7 +155,7 @@ def _tile_rows(tiles, slab, grid, dtype):
 
 
 def _chunk(table, ranks, start, end, position, chunk):
-    """Ranks [chunk, batch] and their columns; past the end, the transparent last row."""
+    """Ranks [chunk, batch], and their columns; past the end those of the last row."""
     slot = start + position + jnp.arange(chunk, dtype=jnp.int32)[:, None]
     transparent = table.shape[0] - 1
     rank = ranks.at[slot].get(mode="clip")

@@ -41,6 +41,7 @@ class Kept(NamedTuple):
 
     slabs: Slab  # leading axis: the first `kept_slabs` slabs
     count: Int[Array, ""]  # slabs there were
+    pairs: Int[Array, ""]  # (tile, Gaussian) pairs blended in all of them
 
 
 def rasterise(
@@ -57,28 +58,41 @@ def rasterise(
     """
     layout = _layout(footprints, size, spec)
     grid = layout.grid
+    if values.shape[1] == 0:
+        raise ValueError("values need at least one channel, got shape [gaussians, 0]")
     if values.shape[0] == 0:
         shape = (grid.height, grid.width)
-        return jnp.zeros((*shape, values.shape[1]), values.dtype), jnp.ones(
-            shape, values.dtype
-        )
+        blank = jnp.zeros((*shape, values.shape[1]), values.dtype)
+        return blank, jnp.ones(shape, values.dtype)
+    state = _raster(layout, *_in_depth_order(footprints, values, grid))
+    return _to_image(state[:, 1:], grid), _to_image(state[:, :1], grid)[..., 0]
+
+
+def blended_pairs(
+    footprints: Footprints, size: tuple[int, int], spec: RasterSpec
+) -> Int[Array, ""]:
+    """How many (tile, Gaussian) pairs one picture takes; times tile^2 evaluations."""
+    layout = _layout(footprints, size, spec)
+    nothing = jnp.zeros((footprints.depth.shape[0], 1), footprints.depth.dtype)
+    boxes, table = _in_depth_order(footprints, nothing, layout.grid)
+    return _stream(layout, boxes, table)[1].pairs
+
+
+def _in_depth_order(footprints, values, grid):
+    """Boxes and table, a row per rank."""
     boxes = binning.tile_boxes(
         lax.stop_gradient(footprints.mean_px), footprints.extent_px, grid
     )
     order = binning.depth_order(lax.stop_gradient(footprints.depth), boxes.count)
     boxes = binning.Boxes(*(x[order] for x in boxes))
     log_opacity = jnp.log(jnp.where(boxes.count > 0, footprints.opacity[order], 1))
-    table = jnp.concatenate(
-        [
-            footprints.mean_px[order],
-            footprints.whitening[order],
-            log_opacity[:, None],
-            values[order],
-        ],
-        axis=1,
-    )
-    state = _raster(layout, boxes, table)
-    return _to_image(state[:, 1:], grid), _to_image(state[:, :1], grid)[..., 0]
+    table = [
+        footprints.mean_px[order],
+        footprints.whitening[order],
+        log_opacity[:, None],
+        values[order],
+    ]
+    return boxes, jnp.concatenate(table, axis=1)
 
 
 def _layout(footprints, size, spec):
@@ -174,7 +188,11 @@ def _stream(layout, boxes, table):
             kept.slabs,
             slab,
         )
-        return cursor, state, Kept(slabs, kept.count + 1)
+        return (
+            cursor,
+            state,
+            Kept(slabs, kept.count + 1, kept.pairs + jnp.sum(used, dtype=jnp.int32)),
+        )
 
     keep = spec.kept_slabs
     slabs = Slab(
@@ -185,7 +203,7 @@ def _stream(layout, boxes, table):
     start = (
         Cursor(jnp.int32(0), jnp.int32(0)),
         _blank(layout, channels, table.dtype),
-        Kept(slabs, jnp.int32(0)),
+        Kept(slabs, jnp.int32(0), jnp.int32(0)),
     )
     _, state, kept = lax.while_loop(
         lambda carry: _more(carry[0], carry[1], boxes), body, start
