@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from gaussians_jax import render
 from gaussians_jax import splats as rows
 from gaussians_jax.splats import Params, Splats
 from nerfies_jax.geometry.camera import Camera
@@ -236,3 +237,24 @@ def test_a_tripod_has_no_extent_of_its_own():
     with pytest.raises(ValueError, match="stand still"):
         rows.scene_extent(position)
     assert rows.scene_extent(position, still=2.5) == 2.5
+
+
+def test_dead_rows_change_neither_the_picture_nor_learn_anything(rng):
+    splats = some_splats(rng, dtype="float32", degree=1)
+    camera = jax.tree.map(
+        lambda leaf: jnp.asarray(leaf[0], jnp.float32), ring_of_cameras(1)
+    )
+
+    @jax.jit
+    def picture(splats):
+        return render.render_harmonics(
+            rows.activate(splats), rows.active_harmonics(splats, 1), camera, (64, 48)
+        ).rendering.colour
+
+    padded = rows.pad_rows(Params({"splats": splats}, {}), 12).rows["splats"]
+    seen = picture(splats)
+    assert float(seen.max()) > 0.1
+    np.testing.assert_allclose(picture(padded), seen, atol=1e-6)
+    slopes = jax.jit(jax.grad(lambda splats: jnp.sum(picture(splats) ** 2)))(padded)
+    assert any(np.asarray(leaf[:7]).any() for leaf in slopes)
+    assert not any(np.asarray(leaf[7:]).any() for leaf in slopes)
