@@ -66,11 +66,10 @@ def test_a_wrong_switch_would_be_seen(monkeypatch):
     assert abs(jax.grad(functools.partial(stumpff, 3))(squared) + 1 / 120) > 1e-4
 
 
-def test_derivatives_are_shared_by_forward_and_reverse_mode(float64):
-    for squared in (0.0, 1e-9, 4.0, 8.9, 9.1, 50.0):
-        for order in (1, 2, 3):
-            function = functools.partial(stumpff, order)
-            point = jnp.asarray(squared)
-            forward = jax.jacfwd(jax.jacfwd(function))(point)
-            reverse = jax.grad(jax.grad(function))(point)
-            np.testing.assert_allclose(forward, reverse, rtol=1e-13)
+def test_forward_and_reverse_mode_agree(float64):
+    points = jnp.asarray([0.0, 1e-9, 4.0, 8.9, 9.1, 50.0])
+    for order in (1, 3):
+        function = functools.partial(stumpff, order)
+        forward = jax.jit(jax.vmap(jax.jacfwd(jax.jacfwd(function))))(points)
+        reverse = compiled(order, 2)(points)
+        np.testing.assert_allclose(forward, reverse, rtol=1e-13)
