@@ -269,3 +269,18 @@ def test_an_image_without_pixels_is_refused(dtype, rng):
     footprints, _ = some_footprints(rng, 2, (4, 4), dtype)
     with pytest.raises(ValueError, match="at least one pixel"):
         raster.rasterise(footprints, jnp.ones((2, 3), dtype), (0, 5), QUICK)
+
+
+def test_more_pairs_than_an_int32_counts(dtype):
+    """Totals wrap behind the slab; the slab and the one after it must not notice."""
+    tiles, capacity = 1 << 14, 1 << 12
+    count = jnp.full(300_000, tiles, jnp.int32)  # 4.9e9 pairs
+    cursor = binning.Cursor(jnp.int32(0), jnp.int32(0))
+    advance = jax.jit(binning.advance, static_argnums=2)
+    for number in range(1, 7):
+        cursor = advance(cursor, count, capacity)
+        whole, part = divmod(number * capacity, tiles)
+        assert (int(cursor.rank), int(cursor.skip)) == (whole, part)
+    # From a cursor deep inside, too.
+    cursor = advance(binning.Cursor(jnp.int32(200_000), jnp.int32(9)), count, capacity)
+    assert (int(cursor.rank), int(cursor.skip)) == (200_000, 9 + capacity)
