@@ -222,11 +222,13 @@ def _trace_back(local, raw, alpha, rows, toward, spec):
         )
         behind = behind - weight * along
         slope = before * along - behind / (1 - alpha[i])
-        moves = drawn & (alpha[i] > 0)
+        # d alpha / d exponent is alpha itself, so below the cut it is zero already.
         if spec.clamp_gradient == "zero":
-            moves &= raw[i] <= spec.alpha_max
+            moves, along_exponent = drawn & (alpha[i] < spec.alpha_max), alpha[i]
+        else:
+            moves, along_exponent = drawn & (alpha[i] > 0), raw[i]
         weights.append(weight)
-        slopes.append(jnp.where(moves, slope * raw[i], 0))
+        slopes.append(jnp.where(moves, slope * along_exponent, 0))
     state = jnp.stack([transmittance, behind], axis=1)
     return state, jnp.stack(weights), jnp.stack(slopes)
 

@@ -23,7 +23,7 @@ from gaussians_jax.raster_spec import RasterSpec
 # By backend: tiles in lockstep, Gaussians a step. Measured in experiments/raster_speed.
 LOCKSTEP = {"cpu": Lockstep(32, 8), "gpu": Lockstep(4096, 8)}
 SMALLEST_CAPACITY = 1 << 12
-LARGEST_CAPACITY = 1 << 18
+LARGEST_CAPACITY = 1 << 19
 PAIRS_PER_GAUSSIAN = 4
 
 

@@ -29,7 +29,7 @@ class RasterSpec:
     capacity: int | None = None  # (tile, Gaussian) pairs sorted at a time; None: chosen
     batch: int | None = None  # tiles blended in lockstep; None: by backend
     chunk: int | None = None  # Gaussians blended in one step; None: by backend
-    kept_slabs: int = 8  # sorted slabs kept for the backward pass, 4 bytes a pair
+    kept_slabs: int = 4  # sorted slabs kept for the backward pass, 4 bytes a pair
 
     def __post_init__(self):
         if not 0 < self.alpha_cut < self.alpha_max < 1:

@@ -1,0 +1,64 @@
+"""Bands over devices equal the whole picture."""
+
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gaussians_jax import raster, raster_bands
+from gaussians_jax.raster_spec import GSPLAT
+from tests.gaussians import test_raster
+
+SIZE = (37, 29)
+
+
+def both(devices):
+    rng = np.random.default_rng(0)
+    footprints, _ = test_raster.some_footprints(rng, 80, SIZE, jnp.float64)
+    values = jnp.asarray(rng.uniform(size=(80, 3)))
+    row = jax.devices()[:devices]
+    assert len(row) == devices
+
+    def slopes(draw):
+        def loss(mean_px, opacity, values):
+            moved = footprints._replace(mean_px=mean_px, opacity=opacity)
+            image, left = draw(moved, values)
+            return jnp.sum(jnp.sin(3 * image)) + jnp.sum(left**2), image
+
+        differentiate = jax.grad(loss, argnums=(0, 1, 2), has_aux=True)
+        return jax.jit(differentiate)(footprints.mean_px, footprints.opacity, values)
+
+    whole = slopes(lambda f, v: raster.rasterise(f, v, SIZE, GSPLAT))
+    bands = slopes(lambda f, v: raster_bands.rasterise_bands(f, v, SIZE, GSPLAT, row))
+    test_raster.close(bands, whole, 1e-12)
+
+
+def test_one_device_draws_the_whole_picture(float64):
+    both(1)
+
+
+@pytest.mark.slow
+def test_three_devices_draw_the_whole_picture():
+    code = (
+        "import jax; jax.config.update('jax_enable_x64', True);"
+        "jax.config.update('jax_num_cpu_devices', 3);"
+        "from tests.gaussians import test_raster_bands; test_raster_bands.both(3)"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=dict(os.environ, JAX_PLATFORMS="cpu"),
+    )
+    assert result.returncode == 0, result.stderr[-2000:]
+
+
+def test_no_devices_are_refused(float64, rng):
+    footprints, _ = test_raster.some_footprints(rng, 2, SIZE, float64)
+    with pytest.raises(ValueError, match="at least one device"):
+        raster_bands.rasterise_bands(footprints, jnp.ones((2, 1)), SIZE, GSPLAT, ())
