@@ -38,13 +38,14 @@ class StartSpec:
     points: int = 100_000  # at most so many of the capture's own points
     random: int = 10_000  # drawn in the views where the capture has fewer than `fewest`
     fewest: int = 100
+    beside: int = 0  # drawn in the views beside the capture's own points
     opacity: float = 0.1
 
     def __post_init__(self):
-        if self.points < 1 or self.random < 1:
+        if self.points < 1 or self.random < 1 or self.beside < 0:
             raise ValueError(
-                f"a scene starts from at least one Gaussian, got points={self.points} "
-                f"and random={self.random}"
+                f"a scene starts from at least one Gaussian, got points={self.points}, "
+                f"random={self.random} and beside={self.beside}"
             )
 
 
@@ -196,19 +197,28 @@ def shuffled_row(
 
 
 def first_points(spec: StartSpec, capture: Capture, seed: int):
-    """Positions and colours in [0, 1] of the first Gaussians; host side."""
+    """Positions and colours in [0, 1] of the first Gaussians; host side.
+
+    Structure from motion finds what stands still, so what moves has no points of its
+    own; `spec.beside` random ones in the volume give it something to grow from.
+    """
     rng = np.random.default_rng(seed)
     cloud = capture.points
-    if cloud is not None and len(cloud.position) >= spec.fewest:
-        position, colour = cloud.position, cloud.colour / 255
-        if len(position) > spec.points:
-            kept = np.sort(rng.choice(len(position), spec.points, replace=False))
-            position, colour = position[kept], colour[kept]
-        return position, colour
+    if cloud is None or len(cloud.position) < spec.fewest:
+        return _random_points(rng, capture, spec.random)
+    position, colour = cloud.position, cloud.colour / 255
+    if len(position) > spec.points:
+        kept = np.sort(rng.choice(len(position), spec.points, replace=False))
+        position, colour = position[kept], colour[kept]
+    more, more_colour = _random_points(rng, capture, spec.beside)
+    return np.concatenate([position, more]), np.concatenate([colour, more_colour])
+
+
+def _random_points(rng, capture, count):
     filmed = jax.tree.map(lambda leaf: leaf[capture.train], capture.cameras)
     height, width = capture.images.shape[1:3]
     position = splats.random_in_views(
-        rng, filmed, (height, width), capture.near, capture.far, spec.random
+        rng, filmed, (height, width), capture.near, capture.far, count
     )
     return position, rng.uniform(size=position.shape)
 
@@ -217,7 +227,7 @@ def first_bytes(spec: SplatScene, capture: Capture) -> int:
     """Roughly the memory of the first state and step; host side, nothing allocated."""
     cloud = capture.points
     if cloud is not None and len(cloud.position) >= spec.start.fewest:
-        count = min(len(cloud.position), spec.start.points)
+        count = min(len(cloud.position), spec.start.points) + spec.start.beside
     else:
         count = spec.start.random
     harmonics = 3 * (spec.sh_degree + 1) ** 2

@@ -29,7 +29,7 @@ class Metric:
     """
 
     key: str  # "heldout.psnr"
-    value: float
+    value: float | int
     unit: str  # "dB", "ms", "bytes", "" for a share
     direction: str
     tolerance: float = 0.0

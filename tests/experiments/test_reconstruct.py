@@ -1,0 +1,249 @@
+"""The main job from the command line: wrong input first, then the whole of it."""
+
+import json
+import pathlib
+
+import numpy as np
+import pytest
+
+from experiments import reconstruct, render
+from nerfies_jax.capture import exr, images, nerfies_format, video
+from tests import scenes
+
+QUICK = (
+    "density.interval=4",
+    "density.start=4",
+    "density.stop=10",
+    "density.most=300",
+    "motion.width=8",
+    "motion.depth=2",
+    "motion.skips=",
+    "sh_degree=0",
+)
+
+
+@pytest.fixture
+def filmed(tmp_path):
+    """A Nerfies directory that a test may damage."""
+    nerfies_format.write(scenes.tiny_capture(), tmp_path / "filmed")
+    return tmp_path / "filmed"
+
+
+def refused(capsys, *arguments):
+    """The one line that the main job prints when it refuses; checks the exit code."""
+    with pytest.raises(SystemExit) as stop:
+        reconstruct.main([str(argument) for argument in arguments])
+    assert stop.value.code == 2
+    line = capsys.readouterr().err
+    assert line.startswith("error: ")
+    assert line.count("\n") == 1
+    return line
+
+
+def edit(path, **values):
+    stored = json.loads(path.read_text())
+    path.write_text(json.dumps(stored | values))
+
+
+def one_picture(filmed):
+    return sorted((filmed / "rgb").rglob("*.png"))[0]
+
+
+def damage(filmed, kind):
+    """Break a capture in one way; returns words that the error must hold."""
+    picture = one_picture(filmed)
+    camera = filmed / "camera" / f"{picture.stem}.json"
+    if kind == "missing picture":
+        picture.unlink()
+    elif kind == "truncated picture":
+        picture.write_bytes(picture.read_bytes()[:200])
+    elif kind == "picture of another size":
+        images.write_png(picture, np.zeros((20, 33, 3), np.uint8))
+    elif kind == "camera that is not a number":
+        camera.write_text(camera.read_text().replace("focal_length", "focal_lenght"))
+    elif kind == "camera with NaN":
+        edit(camera, position=[float("nan"), 0.0, 0.0])
+    elif kind == "id out of range":
+        path = filmed / "metadata.json"
+        table = json.loads(path.read_text())
+        table[picture.stem]["warp_id"] = -3
+        path.write_text(json.dumps(table))
+    elif kind == "a single frame":
+        edit(
+            filmed / "dataset.json",
+            ids=[picture.stem],
+            train_ids=[picture.stem],
+            val_ids=[],
+            count=1,
+            num_exemplars=1,
+        )
+    return picture.stem
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "missing picture",
+        "truncated picture",
+        "picture of another size",
+        "camera that is not a number",
+        "camera with NaN",
+        "id out of range",
+        "a single frame",
+    ],
+)
+def test_a_broken_capture_is_refused_by_name(kind, filmed, tmp_path, capsys):
+    stem = damage(filmed, kind)
+    line = refused(capsys, filmed, "--out", tmp_path / "run")
+    assert str(filmed) in line or stem in line
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_folder_that_is_no_capture_says_what_was_looked_for(tmp_path, capsys):
+    line = refused(capsys, tmp_path, "--out", tmp_path / "run")
+    assert "scene.json" in line
+    assert "transforms" in line
+    assert "cameras.bin" in line
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--set", "start.points=0"), "at least one Gaussian"),
+        (("--set", "raster.capacity=1000000000000"), "GiB are free"),
+        (("--preset", "splats-magic"), "splats-deformable-small"),
+        (("--steps", "0"), "at least one step"),
+        (("--resume",), "--out"),
+        (("--heldout", "1"), "held"),
+    ],
+)
+def test_wrong_settings_are_refused(arguments, words, filmed, capsys, tmp_path):
+    out = () if arguments == ("--resume",) else ("--out", tmp_path / "run")
+    assert words in refused(capsys, filmed, *out, *arguments)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_folder_that_cannot_be_written_is_refused(filmed, tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    assert "--out" in refused(capsys, filmed, "--out", tmp_path / "file" / "run")
+
+
+def test_a_folder_without_a_run_cannot_be_resumed(tmp_path, capsys):
+    assert "no run here" in refused(capsys, "--resume", "--out", tmp_path)
+
+
+def test_help_names_the_presets(capsys):
+    with pytest.raises(SystemExit) as stop:
+        reconstruct.main(["--help"])
+    assert stop.value.code == 0
+    assert "splats-deformable" in capsys.readouterr().out
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A short run on a tiny capture, from the command line to its files."""
+    folder = tmp_path_factory.mktemp("main job")
+    nerfies_format.write(scenes.tiny_capture(), folder / "filmed")
+    arguments = [str(folder / "filmed"), "--steps", "12", "--out", str(folder / "run")]
+    with pytest.raises(SystemExit) as stop:
+        reconstruct.main([*arguments, "--set", *QUICK])
+    assert stop.value.code == 0
+    return folder / "run"
+
+
+@pytest.mark.slow
+def test_a_run_leaves_all_its_files(run):
+    for name in (
+        "config.json",
+        "metrics.json",
+        "comparison.png",
+        "psnr_over_time.png",
+        "scene.mp4",
+        "gaussians.ply",
+        "report.html",
+        "checkpoints/12",
+    ):
+        assert (run / name).exists(), name
+    assert len(list((run / "depth").glob("*.exr"))) == 1
+
+
+@pytest.mark.slow
+def test_the_metrics_are_all_there_and_finite(run):
+    metrics = json.loads((run / "metrics.json").read_text())
+    quality = ["heldout.psnr", "heldout.ssim", "heldout.frames"]
+    cost = ["train.seconds", "train.steps", "train.compile_seconds"]
+    cost += ["render.ms_per_frame", "memory.peak_bytes", "gaussians", "parameters"]
+    wanted = [*quality, *cost]
+    assert set(wanted) <= set(metrics)
+    assert all(np.isfinite(metrics[key]) for key in wanted)
+    assert metrics["train.steps"] == 12
+    assert metrics["heldout.frames"] == 1
+
+
+@pytest.mark.slow
+def test_the_depth_is_in_scene_units(run):
+    capture = scenes.tiny_capture()
+    picture = exr.read_exr(sorted((run / "depth").glob("*.exr"))[0])
+    seen = picture.alpha > 0.05  # twelve steps leave it thin
+    assert seen.mean() > 0.5
+    inside = (picture.depth > 0.3 * capture.near) & (picture.depth < 3 * capture.far)
+    assert inside[seen].mean() > 0.95
+
+
+@pytest.mark.slow
+def test_the_report_needs_nothing_beside_itself(run):
+    page = (run / "report.html").read_text()
+    assert "data:image/png;base64" in page
+    assert "data:video/mp4;base64" in page
+    assert "http://" not in page.replace("http://www.w3.org", "")
+    assert "Where a training step" in page
+
+
+@pytest.mark.slow
+def test_a_checkpoint_of_another_spec_is_refused(run, capsys):
+    line = refused(capsys, "--out", run, "--resume", "--set", "dssim_weight=0.5")
+    assert "dssim_weight" in line
+
+
+@pytest.mark.slow
+def test_a_run_is_rendered_at_other_times_and_places(run, tmp_path):
+    arguments = [str(run), "--path", "orbit", "--frames", "3", "--freeze", "0.5"]
+    formats = ["--formats", "png", "mp4", "exr", "--max-side", "32"]
+    render.main([*arguments, *formats, "--out", str(tmp_path)])
+    assert sorted(path.name for path in tmp_path.glob("*.png")) == [
+        f"{number:04d}.png" for number in range(3)
+    ]
+    picture, _ = images.read_image(tmp_path / "0000.png")
+    assert picture.shape == (24, 32, 3)
+    assert len(list(video.read_video(tmp_path / "film.mp4"))) == 3
+    assert exr.read_exr(tmp_path / "0001.exr").depth.shape == (24, 32)
+
+
+@pytest.mark.slow
+def test_held_out_frames_are_rendered_under_their_names(run, tmp_path):
+    render.main([str(run), "--formats", "png", "--out", str(tmp_path)])
+    capture = scenes.tiny_capture()
+    names = {pathlib.Path(capture.ids[row]).name for row in capture.heldout}
+    assert {path.stem for path in tmp_path.glob("*.png")} == names
+
+
+@pytest.mark.slow
+def test_a_stopped_run_resumes_to_its_end(run, tmp_path, capsys):
+    folder = tmp_path / "stopped"
+    filmed = json.loads((run / "config.json").read_text())["choices"]["capture"]
+    common = [filmed, "--steps", "12", "--out", str(folder)]
+    with pytest.raises(SystemExit) as stop:
+        reconstruct.main([*common, "--seconds", "0.001", "--set", *QUICK])
+    assert stop.value.code == 0
+    stopped = json.loads((folder / "metrics.json").read_text())["train.steps"]
+    assert stopped < 12
+    assert "--resume" in capsys.readouterr().out
+    with pytest.raises(SystemExit) as stop:
+        reconstruct.main(["--out", str(folder), "--resume"])
+    assert stop.value.code == 0
+    whole, resumed = (
+        json.loads((path / "metrics.json").read_text()) for path in (run, folder)
+    )
+    assert resumed["train.steps"] == 12
+    assert resumed["heldout.psnr"] == whole["heldout.psnr"]
+    assert resumed["gaussians"] == whole["gaussians"]

@@ -1,0 +1,102 @@
+"""Overrides, run folders and one-line errors."""
+
+import dataclasses
+import json
+
+import pytest
+
+from experiments import settings
+from gaussians_jax import presets
+
+
+def test_an_override_reaches_a_nested_field_with_its_type():
+    spec = settings.override(
+        presets.SMALL_DEFORMABLE,
+        ("density.most=123", "motion.rate=1e-3", "raster.antialiased=true"),
+    )
+    assert spec.density.most == 123
+    assert spec.motion.rate == 1e-3
+    assert spec.raster.antialiased is True
+    assert spec.start == presets.SMALL_DEFORMABLE.start
+
+
+def test_an_effect_is_taken_out_with_none():
+    assert settings.override(presets.SMALL_DEFORMABLE, ("motion=none",)).motion is None
+
+
+def test_a_tuple_is_read_by_its_items():
+    spec = settings.override(presets.SMALL_DEFORMABLE, ("motion.skips=1,2",))
+    assert spec.motion.skips == (1, 2)
+
+
+@pytest.mark.parametrize(
+    ("assignment", "words"),
+    [
+        ("density.mots=3", "has no field 'mots'; it has .*most"),
+        ("density.most=many", "cannot be read as"),
+        ("steps", "expected path.to.field=value"),
+        ("steps.more=1", "has no fields"),
+        ("sh_degree=7", "0, 1, 2 or 3"),
+    ],
+)
+def test_a_wrong_override_names_itself_and_the_way_out(assignment, words):
+    with pytest.raises(ValueError, match=words):
+        settings.override(presets.SMALL_STATIC, (assignment,))
+
+
+def test_a_spec_is_written_as_plain_json():
+    text = json.dumps(settings.as_json(presets.DEFORMABLE))
+    stored = json.loads(text)
+    assert stored["kind"] == "SplatScene"
+    assert stored["motion"]["width"] == 256
+    assert set(stored) - {"kind"} == {
+        field.name for field in dataclasses.fields(presets.DEFORMABLE)
+    }
+
+
+def test_run_folders_are_numbered_and_never_shared(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    first, second = (settings.new_run_folder(None, "ball") for _ in range(2))
+    assert (first.name, second.name) == ("ball", "ball-2")
+    (first / "note").write_text("kept")
+    with pytest.raises(ValueError, match=r"not empty.*--resume"):
+        settings.new_run_folder(first, "ball")
+
+
+def test_a_run_folder_that_cannot_be_written_is_an_early_error(tmp_path):
+    (tmp_path / "file").write_text("")
+    for folder in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(ValueError, match=r"run folder .*--out"):
+            settings.new_run_folder(folder, "x")
+
+
+def test_user_errors_are_one_line_and_exit_code_two(capsys):
+    with pytest.raises(SystemExit) as stop, settings.user_errors():
+        raise ValueError("first\nsecond")
+    assert stop.value.code == 2
+    assert capsys.readouterr().err == "error: first second\n"
+
+
+def test_our_own_bugs_keep_their_traceback():
+    with pytest.raises(KeyError), settings.user_errors():
+        raise KeyError("bug")
+
+
+def test_json_is_written_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "a.json"
+    settings.write_json(path, {"a": 1})
+    with pytest.raises(ValueError, match="JSON"):
+        settings.write_json(path, {"a": float("nan")})
+    assert json.loads(path.read_text()) == {"a": 1}
+
+
+def test_an_unknown_device_is_refused():
+    with pytest.raises(SystemExit):
+        settings.parse(_Device, ["--device", "abacus"])
+
+
+@dataclasses.dataclass(frozen=True)
+class _Device:
+    """A device."""
+
+    device: settings.typing.Literal["cpu", "gpu"] = "cpu"
