@@ -18,6 +18,7 @@ def case():
     return raster_speed.Case(CASE, None)
 
 
+@pytest.mark.slow
 def test_dense_and_lockstep_draw_the_same_picture_and_slopes(case):
     longest, pairs = raster_speed.longest_tile(case)
     expected = case.gradient()(*case.arguments())

@@ -16,6 +16,7 @@ from tests.oracles import dense_splats
 
 SIZE = (48, 64)
 SHARP = dataclasses.replace(GSPLAT, antialiased=True)
+project = jax.jit(projection.project, static_argnums=(2, 3))
 
 
 def camera_at(position, dtype, turn=0.3, skew=2.0, focal=60.0):
@@ -54,7 +55,7 @@ def one(dtype, mean=(0, 0, 2), quaternion=(1, 0, 0, 0), scale=(0.1,) * 3, opacit
 def test_footprints_equal_the_textbook_with_skew_aspect_and_offset(spec, dtype, rng):
     gaussians = some_gaussians(rng, 300, dtype)
     camera = camera_at([0.2, 0.1, -2.0], dtype)
-    found = projection.project(gaussians, camera, SIZE, spec)
+    found = project(gaussians, camera, SIZE, spec)
     assert all(leaf.dtype == dtype for leaf in found)
     with jax.enable_x64(True):
         exact, exact_camera = jax.tree.map(
@@ -90,7 +91,7 @@ def test_projection_gradient_equals_central_differences(float64, rng):
     weights = jnp.asarray(rng.normal(size=(6, 7)))
 
     def loss(gaussians, camera):
-        found = projection.project(gaussians, camera, SIZE, SHARP)
+        found = project(gaussians, camera, SIZE, SHARP)
         fields = (found.mean_px, found.whitening, found.opacity[:, None])
         return jnp.sum(jnp.concatenate([*fields, found.depth[:, None]], 1) * weights)
 
@@ -107,7 +108,7 @@ def test_needles_keep_their_shape(length_px, angle, dtype, rng):
     camera = camera_at([0.0, 0.0, 0.0], dtype, turn=0.0, skew=0.0, focal=focal)
     camera = camera._replace(pixel_aspect=jnp.asarray(1.0, dtype))
     gaussians = one(dtype, (0, 0, depth), quaternion, scale)
-    found = projection.project(gaussians, camera, SIZE, GSPLAT)
+    found = project(gaussians, camera, SIZE, GSPLAT)
     # Pixels along the needle inside an image of 1000 px and up to 3 px beside it.
     along, across = rng.uniform(-500, 500, 500), rng.uniform(-3, 3, 500)
     # The exact axis of the stored quaternion, not of the angle it was made from.
@@ -197,7 +198,7 @@ def test_extreme_but_valid_gaussians_are_drawn_with_finite_gradient(name, dtype)
 @jax.jit
 def footprint_and_slopes(gaussians, camera):
     def loss(gaussians):
-        found = projection.project(gaussians, camera, SIZE, SHARP)
+        found = project(gaussians, camera, SIZE, SHARP)
         total = jnp.sum(found.mean_px) + jnp.sum(found.whitening)
         return total + jnp.sum(found.opacity + found.depth)
 
@@ -215,7 +216,7 @@ def test_means_far_from_the_origin_keep_their_pixels(dtype, rng):
         mean=jnp.asarray(mean, dtype)
     )
     camera = camera_at(position, dtype, turn=0.0, skew=0.0)
-    found = projection.project(gaussians, camera, SIZE, GSPLAT)
+    found = project(gaussians, camera, SIZE, GSPLAT)
     here = mean.astype(np.float64) - position  # exact in both: the inputs are float32
     expected = np.array([60.0, 72.0]) * here[:, :2] / here[:, 2:] + [29.0, 27.0]
     tolerance = {"float32": 1e-4, "float64": 1e-11}[dtype]
@@ -226,7 +227,7 @@ def test_means_far_from_the_origin_keep_their_pixels(dtype, rng):
 def test_edge_on_disc_keeps_the_least_compensation(dtype):
     gaussians = one(dtype, scale=(0.0, 1.0, 1.0), opacity=1.0)
     camera = camera_at([0.0, 0.0, 0.0], dtype, turn=0.0)
-    found = projection.project(gaussians, camera, SIZE, SHARP)
+    found = project(gaussians, camera, SIZE, SHARP)
     np.testing.assert_allclose(found.opacity, [0.005], rtol=1e-6)
 
 
@@ -234,7 +235,7 @@ def test_the_jacobian_is_clamped_beside_the_image(dtype):
     """Unclamped, a ball at 89 degrees would smear over 1e5 px."""
     gaussians = one(dtype, mean=(50.0, 0.0, 0.5))
     camera = camera_at([0.0, 0.0, 0.0], dtype, turn=0.0)
-    found = projection.project(gaussians, camera, SIZE, GSPLAT)
+    found = project(gaussians, camera, SIZE, GSPLAT)
     # sigma 0.1 at z 0.5, tangent at most (64 - 29)/60 + 0.3 * 32/60
     tangent = (64 - 29 + 0.3 * 32) / 60
     expected = np.sqrt((60 * 0.1 / 0.5) ** 2 * (1 + tangent**2) + 0.3)

@@ -15,6 +15,7 @@ from gaussians_jax.raster_spec import GSPLAT, RasterSpec
 from tests.oracles import dense_splats
 
 QUICK = dataclasses.replace(GSPLAT, batch=8, chunk=2)
+rasterise = jax.jit(raster.rasterise, static_argnums=(2, 3))
 
 
 def footprints_from(mean_px, sigma_px, angle, opacity, depth, dtype):
@@ -85,9 +86,7 @@ def test_the_capacity_never_changes_picture_or_gradient(float64, rng):
 def test_odd_sizes_equal_the_dense_compositor(size, dtype, rng):
     footprints, conics = some_footprints(rng, 60, size, dtype)
     values = jnp.asarray(rng.uniform(size=(60, 2)), dtype)
-    image, left = jax.jit(lambda f, v: raster.rasterise(f, v, size, QUICK))(
-        footprints, values
-    )
+    image, left = rasterise(footprints, values, size, QUICK)
     expected = dense_splats.composite(
         footprints.mean_px,
         conics,
@@ -112,7 +111,7 @@ def test_equal_depths_are_drawn_in_order_of_index(dtype, rng):
         np.full(3, 2.0), dtype,
     )  # fmt: skip
     values = jnp.eye(3, dtype=dtype)
-    image, _ = raster.rasterise(footprints, values, size, QUICK)
+    image, _ = rasterise(footprints, values, size, QUICK)
     front, middle, back = image[4, 4]
     assert front > 5 * middle > 20 * back > 0
 
@@ -124,7 +123,7 @@ def test_two_opaque_gaussians_stop_a_pixel(dtype):
         np.full((3, 2), 4.5), np.full((3, 2), 100.0), np.zeros(3), np.ones(3),
         np.arange(1.0, 4.0), dtype,
     )  # fmt: skip
-    image, left = raster.rasterise(footprints, jnp.eye(3, dtype=dtype), (8, 8), QUICK)
+    image, left = rasterise(footprints, jnp.eye(3, dtype=dtype), (8, 8), QUICK)
     drawn = {"float32": [0.99, 0, 0], "float64": [0.99, 0.0099, 0]}[dtype]
     np.testing.assert_allclose(image[4, 4], drawn, atol=1e-6)
     np.testing.assert_allclose(image.sum(-1) + left, np.ones((8, 8)), atol=1e-6)
@@ -150,7 +149,7 @@ def test_a_nan_value_shows_where_its_gaussian_is(dtype):
         np.ones(1), dtype,
     )  # fmt: skip
     values = jnp.full((1, 1), jnp.nan, dtype)
-    image, left = raster.rasterise(footprints, values, (8, 24), QUICK)
+    image, left = rasterise(footprints, values, (8, 24), QUICK)
     assert np.isnan(image[4, 4])
     assert not np.isnan(image[:, 8:]).any()
     assert not np.isnan(left).any()
