@@ -225,10 +225,10 @@ def sort_pairs(tile, rank, first_rank, gaussians, grid):
     A sort with a payload costs five times as much on the CPU.
     """
     capacity = tile.shape[0]
-    # A Gaussian that touches no tile is last in depth order, so ranks within a slab
-    # span less than its capacity.
-    rank_bits = math.ceil(math.log2(min(capacity, gaussians) + 1))
-    tile_bits = math.ceil(math.log2(grid.tiles + 2))
+    # Only Gaussians that touch no tile, and these come last, have no pair: so ranks
+    # within a slab span less than its capacity.
+    rank_bits = max(1, (min(capacity, gaussians) - 1).bit_length())
+    tile_bits = grid.tiles.bit_length()
     if rank_bits + tile_bits <= 32:
         since = (rank - first_rank).astype(jnp.uint32)
         since = jnp.where(tile < grid.tiles, since, 0)

@@ -82,12 +82,12 @@ def test_the_capacity_never_changes_picture_or_gradient(float64, rng):
     close(picture_and_slopes(footprints, values, size, spec), whole, 1e-12)
 
 
-@pytest.mark.parametrize("size", [(1, 1), (3, 17), (16, 8)])
+@pytest.mark.parametrize("size", [(1, 1), (11, 17)])
 def test_odd_sizes_equal_the_dense_compositor(size, dtype, rng):
     footprints, conics = some_footprints(rng, 60, size, dtype)
     values = jnp.asarray(rng.uniform(size=(60, 2)), dtype)
     image, left = rasterise(footprints, values, size, QUICK)
-    expected = dense_splats.composite(
+    expected = jax.jit(dense_splats.composite, static_argnums=(5, 6))(
         footprints.mean_px,
         conics,
         footprints.opacity,
