@@ -43,7 +43,7 @@ class Coloured(NamedTuple):
 class History(NamedTuple):
     """How a run went, one entry for each evaluation."""
 
-    seconds: Sequence[float]  # of training, compilation included
+    seconds: Sequence[float]  # of training, without compiling
     psnr: Sequence[float]  # dB, held-out frames
 
 
@@ -197,7 +197,7 @@ def curve(histories: Mapping[str, History], path: str | pathlib.Path):
                 ha="right",
                 color=line.get_color(),
             )
-    axes.set_xlabel("seconds of training (compilation included)")
+    axes.set_xlabel("seconds of training (without compiling)")
     axes.set_ylabel("PSNR of held-out frames (dB)")
     axes.margins(y=0.12)
     axes.grid(alpha=0.3)

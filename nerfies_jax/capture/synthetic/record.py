@@ -16,7 +16,7 @@ from nerfies_jax.capture.synthetic.spec import SceneSpec
 from nerfies_jax.capture.synthetic.truth import SceneTruth
 from nerfies_jax.geometry import camera as cameras
 
-VERSION = 1  # raise it when the same spec gives other pictures: caches then renew
+VERSION = 2  # raise it when the same spec gives other pictures: caches then renew
 TRUTH_FILE = "truth.npz"  # beside the Nerfies files, which other readers pass over
 
 

@@ -26,7 +26,9 @@ class Thing:
 class Cameras:
     """A casual hand-held arc, and a second camera held beside the first.
 
-    The hand sweeps to and fro about the target and leans forward, with smooth shake.
+    The hand sweeps to and fro about the target and leans forward, with smooth shake. It
+    does so at another pace than the things move: a thing that swings in step with the
+    camera has no depth that one camera could tell.
     The second camera looks at the same target; what it sees is never learnt from.
     """
 
@@ -34,7 +36,7 @@ class Cameras:
     target: Vector = (0.0, -0.02, 0.0)
     height: float = 0.07  # above the target
     arc_rad: float = 0.38  # to either side
-    sweeps: float = 1.0  # to and fro, per capture
+    sweeps: float = 2.5  # to and fro, per capture
     forward: float = 0.05  # how far the hand comes closer, scene units
     shake: float = 0.005  # root mean square, of position and of aim, scene units
     field_of_view_rad: float = 0.85  # across the width
