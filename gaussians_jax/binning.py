@@ -219,10 +219,17 @@ def _ellipse_meets_tile(rows, row, column, log_cut, grid):
     return smallest <= log_opacity - log_cut + EXPONENT_SLACK
 
 
-def sort_pairs(tile, rank, first_rank, gaussians, grid):
-    """One unsigned sort of (tile, rank since the slab's first) where both fit 32 bits.
+def sort_pairs(
+    tile: Int[Array, " capacity"],
+    rank: Int[Array, " capacity"],
+    first_rank: Int[Array, ""],
+    gaussians: int,
+    grid: Grid,
+) -> Slab:
+    """Pairs in order of rank, sorted by tile; tile `grid.tiles` marks an unused slot.
 
-    A sort with a payload costs five times as much on the CPU.
+    One unsigned sort of (tile, rank since the slab's first) where both fit 32 bits: a
+    sort with a payload costs five times as much on the CPU.
     """
     capacity = tile.shape[0]
     # Only Gaussians that touch no tile, and these come last, have no pair: so ranks

@@ -197,7 +197,7 @@ def test_pairs_are_sorted_by_tile_then_depth(tiles_per_side, dtype, rng):
     tile = rng.integers(0, min(grid.tiles, 300) + 1, count).astype(np.int32)
     tile = np.where(tile == 300, grid.tiles, tile)
     slab = jax.jit(binning.sort_pairs, static_argnums=(3, 4))(
-        tile, rank, jnp.int32(first), 20_000, grid
+        jnp.asarray(tile), jnp.asarray(rank), jnp.int32(first), 20_000, grid
     )
     order = np.lexsort((rank, tile))
     kept = int((tile < grid.tiles).sum())
