@@ -37,7 +37,7 @@ def dense(
     spec: RasterSpec,
 ) -> tuple[Float[Array, "height width channels"], Float[Array, "height width"]]:
     """Every Gaussian at every pixel, in blocks of pixels, by cumulative products."""
-    height, width = size
+    width, height = size
     order = jnp.argsort(footprints.depth)
     footprints = jax.tree.map(lambda leaf: leaf[order], footprints)
     values = values[order]

@@ -64,7 +64,7 @@ class Case:
                 f"a case is GAUSSIANS@WIDTHxHEIGHT, as 10000@256x256; got {text!r}"
             ) from None
         self.text = text
-        self.size = (self.height, self.width)
+        self.size = (self.width, self.height)
         scene = scene or make_scene(self.count, self.width, self.height)
         self.footprints = footprints_of(scene)
         self.values = jnp.asarray(scene["colors"], jnp.float32)

@@ -8,6 +8,7 @@ Leaves a run folder with checkpoints, metrics, pictures, a video and a report.
 
 import dataclasses
 import pathlib
+import sys
 import time
 from typing import Literal
 
@@ -54,7 +55,15 @@ class Reconstruct:
 
 def main(arguments=None):
     """Run the job of the command line; exit code 2 where its input is wrong."""
-    asked = run_settings.parse(Reconstruct, arguments)
+    try:
+        _main(run_settings.parse(Reconstruct, arguments))
+    except KeyboardInterrupt:
+        # While it trains, the loop takes the signal itself, saves and says so.
+        print("interrupted while no step was running", file=sys.stderr)
+        raise SystemExit(130) from None
+
+
+def _main(asked):
     with run_settings.user_errors():
         run_settings.start_jax(asked.device)
         from experiments import runs

@@ -21,7 +21,6 @@ def parts(run: Run, state: TrainState, frames: Frames) -> dict[str, float]:
     the optimiser and the statistics for the density control.
     """
     spec, facts = run.spec, splat_scene.facts_of(run.capture)
-    size = run.capture.size
     params = state.params
     camera = jax.tree.map(lambda leaf: leaf[0], frames.cameras)
     truth = frames.images[0].astype(jnp.float32) / 255
@@ -30,7 +29,7 @@ def parts(run: Run, state: TrainState, frames: Frames) -> dict[str, float]:
 
     def draw(gaussians, coefficients):
         frame = render.render_harmonics(
-            gaussians, coefficients, camera, (size[1], size[0]), spec.raster
+            gaussians, coefficients, camera, run.capture.size, spec.raster
         )
         return jnp.sum(frame.rendering.colour)
 

@@ -41,10 +41,10 @@ SMALL_DEFORMABLE = dataclasses.replace(
         depth=4,
         width=96,
         skips=(2,),
-        warm_up=1000,
+        warm_up=600,
         smoothing=None,
-        rate=1e-3,
-        rate_end=1e-5,
+        rate=5e-4,
+        rate_end=5e-6,
     ),
 )
 
