@@ -13,6 +13,7 @@ Preset = Literal[
     "default",
     "static",
     "rigid",
+    "fast",
     "non-rigid",
     "articulated",
     "exposure",

@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
+import scipy.ndimage
 
 from nerfies_jax.capture import nerfies_format, synthetic
 from nerfies_jax.capture.synthetic import film, presets, record, truth
@@ -299,9 +300,10 @@ def test_a_specular_surface_adds_light_to_its_own_thing_alone(small):
     difference = shiny.images.astype(int) - capture.images
     assert difference.min() >= 0
     assert difference[truth.things == 1].max() > 20
-    inner = (truth.things == 0) & (np.roll(truth.things, 1, 2) == 0)
-    inner &= (np.roll(truth.things, -1, 2) == 0) & (np.roll(truth.things, 1, 1) == 0)
-    inner &= np.roll(truth.things, -1, 1) == 0
+    # A corner of the cube may reach into a pixel whose centre, and four neighbours,
+    # show the wall; then a diagonal neighbour shows the cube.
+    inner = scipy.ndimage.binary_erosion(truth.things == 0, np.ones((1, 3, 3)))
+    assert inner.any()
     assert difference[inner].max() == 0
 
 
