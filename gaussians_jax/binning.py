@@ -21,8 +21,8 @@ EXPONENT_SLACK = 1e-4
 class Grid(NamedTuple):
     """The image cut into square tiles; static."""
 
-    height: int  # px
-    width: int
+    width: int  # px
+    height: int
     tile: int
 
     @property

@@ -107,14 +107,14 @@ def observe(
     radius_px: Float[Array, " gaussians"],
     size: tuple[int, int],
 ) -> RowStats:
-    """One more view, whose picture is `size` = (height, width); pure.
+    """One more view, whose picture is `size` = (width, height); pure.
 
     `mean2d_gradient_px` is the slope of that view's own loss (not of a mean over a
     batch) by the projected means in pixels; for the absolute variant, the sum of the
     absolute slopes over the pixels. A pixel is 2/width of the NDC range, so the slope
     per NDC unit is width/2 and height/2 times larger; the thresholds are in that unit.
     """
-    height, width = size
+    width, height = size
     per_ndc = jnp.asarray([width / 2, height / 2], mean2d_gradient_px.dtype)
     slope = mean2d_gradient_px * per_ndc
     # Summed squares underflow in float32 below 1e-19; hypot does not.

@@ -51,7 +51,7 @@ class Footprints(NamedTuple):
 def project(
     gaussians: Gaussians, camera: Camera, size: tuple[int, int], spec: RasterSpec
 ) -> Footprints:
-    """Footprints in an image of `size` (height, width) for one undistorted camera.
+    """Footprints in an image of `size` (width, height) for one undistorted camera.
 
     Zwicker et al. 2002 (EWA splatting), equations 23-31: the covariance is T T^t +
     dilation with T = J W R diag(scale); neither the 3D covariance nor its determinant
@@ -107,7 +107,7 @@ def _dot(a, b):
 
 def _project_frame(offset, camera, size, spec):
     """Mean in px, z, and the rows of J W (pixels per scene unit)."""
-    height, width = size
+    width, height = size
     world = camera.camera_from_world
     x, y, z = _dot(world[0], offset), _dot(world[1], offset), _dot(world[2], offset)
     focal_x = camera.focal_px

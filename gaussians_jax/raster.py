@@ -61,7 +61,7 @@ def rasterise(
     """Composite any per-Gaussian `values`; also the transmittance left at each pixel.
 
     Differentiable in the mean, whitening and opacity of `footprints` and in `values`;
-    the depth only orders. `size` is (height, width). A NaN in `values` shows in every
+    the depth only orders. `size` is (width, height). A NaN in `values` shows in every
     tile that its Gaussian touches.
     """
     layout = _layout(footprints, size, spec)
@@ -79,7 +79,10 @@ def rasterise(
 def blended_pairs(
     footprints: Footprints, size: tuple[int, int], spec: RasterSpec
 ) -> Int[Array, ""]:
-    """How many (tile, Gaussian) pairs one picture takes; times tile^2 evaluations."""
+    """How many (tile, Gaussian) pairs one picture takes; times tile^2 evaluations.
+
+    `size` is (width, height).
+    """
     layout = _layout(footprints, size, spec)
     nothing = jnp.zeros((footprints.depth.shape[0], 1), footprints.depth.dtype)
     boxes, table = _in_depth_order(footprints, nothing, layout.grid)
@@ -104,10 +107,11 @@ def _in_depth_order(footprints, values, grid):
 
 
 def _layout(footprints, size, spec):
-    height, width = size
-    if height < 1 or width < 1:
-        raise ValueError(f"an image needs at least one pixel, got size {size}")
-    grid = Grid(height, width, spec.tile)
+    if min(size) < 1:
+        raise ValueError(
+            f"an image needs at least one pixel, got size {size} (width, height)"
+        )
+    grid = Grid(*size, spec.tile)
     step = LOCKSTEP.get(jax.default_backend(), LOCKSTEP["gpu"])
     step = Lockstep(spec.batch or step.batch, spec.chunk or step.chunk)
     step = Lockstep(min(step.batch, grid.tiles), step.chunk)

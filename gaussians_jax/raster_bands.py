@@ -26,9 +26,9 @@ def rasterise_bands(
     """`raster.rasterise` with the rows of tiles split over `devices`.
 
     Every device sorts all Gaussians by depth but bins and blends only those that reach
-    its band; the gradients of the bands are summed.
+    its band; the gradients of the bands are summed. `size` is (width, height).
     """
-    height, width = size
+    width, height = size
     if not devices:
         raise ValueError("bands need at least one device, got none; try jax.devices()")
     mesh = Mesh(np.asarray(devices), (AXIS,))
@@ -39,7 +39,7 @@ def rasterise_bands(
         top = (lax.axis_index(AXIS) * band).astype(footprints.mean_px.dtype)
         down = jnp.stack([jnp.zeros_like(top), top])
         moved = footprints._replace(mean_px=footprints.mean_px - down)
-        return raster.rasterise(moved, values, (band, width), spec)
+        return raster.rasterise(moved, values, (width, band), spec)
 
     split = jax.shard_map(
         one_band,

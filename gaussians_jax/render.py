@@ -35,7 +35,7 @@ def render(
     features: Float[Array, "gaussians features"] | None = None,
     mean2d_offset: Float[Array, "gaussians 2"] | None = None,
 ) -> Frame:
-    """Composite `colours` and `features`; `size` is (height, width).
+    """Composite `colours` and `features`; `size` is (width, height).
 
     `background` is one colour or an image, black where absent. `mean2d_offset` (px)
     moves the footprints on the image: pass zeros, and its gradient is the gradient of

@@ -114,7 +114,7 @@ def build(spec: SplatScene, facts: Facts) -> Model:
             gaussians,
             splats.active_harmonics(params.rows["splats"], degree),
             view.camera,
-            (size[1], size[0]),
+            size,
             spec.raster,
             jnp.asarray(facts.background, gaussians.mean.dtype),
             mean2d_offset=probe,
@@ -161,7 +161,7 @@ def build(spec: SplatScene, facts: Facts) -> Model:
                 probe_slope,
                 footprints.visible,
                 jnp.max(footprints.extent_px, axis=1),
-                (size[1], size[0]),
+                size,
             )
         metrics = {"loss": value, "mse": mse}
         return TrainState(params, moments, extra, state.step + 1, state.key), metrics
@@ -216,9 +216,8 @@ def first_points(spec: StartSpec, capture: Capture, seed: int):
 
 def _random_points(rng, capture, count):
     filmed = jax.tree.map(lambda leaf: leaf[capture.train], capture.cameras)
-    height, width = capture.images.shape[1:3]
     position = splats.random_in_views(
-        rng, filmed, (height, width), capture.near, capture.far, count
+        rng, filmed, capture.size, capture.near, capture.far, count
     )
     return position, rng.uniform(size=position.shape)
 

@@ -232,7 +232,7 @@ def random_in_views(
 
     Camera, pixel and z-depth are drawn evenly, so every picture starts equally dense
     at every depth; drawn evenly over the volume, most points would lie at the far end.
-    Lens distortion is left out. `size` is (height, width); `near` and `far` are
+    Lens distortion is left out. `size` is (width, height); `near` and `far` are
     z-depths in scene units, one for all cameras or one each.
     """
     views = np.reshape(cameras.position, (-1, 3)).shape[0]
@@ -249,7 +249,7 @@ def random_in_views(
     def per_view(leaf, *shape):
         return np.asarray(leaf, np.float64).reshape(views, *shape)[view]
 
-    pixel = rng.uniform((0, 0), (size[1], size[0]), (count, 2))
+    pixel = rng.uniform((0, 0), size, (count, 2))
     z = rng.uniform(near[view], far[view])
     focal = per_view(cameras.focal_px)
     offset = pixel - per_view(cameras.principal_point_px, 2)

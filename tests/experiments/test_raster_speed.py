@@ -51,7 +51,7 @@ def test_blended_pairs_are_the_tiles_that_show_a_gaussian(case):
     shows = 0.02 * np.exp(-((p * dx) ** 2) - (r * (dy - k * dx)) ** 2) >= 1 / 255
     expected = shows.reshape(150, 3, 8, 5, 8).any((2, 4)).sum()
     spec = dataclasses.replace(raster_speed.SPEC, capacity=128)
-    found = jax.jit(lambda f: raster.blended_pairs(f, (24, 40), spec))(faint)
+    found = jax.jit(lambda f: raster.blended_pairs(f, (40, 24), spec))(faint)
     assert abs(int(found) - expected) <= 1  # a pixel on the cut itself
 
 

@@ -70,7 +70,7 @@ def test_observe_counts_visible_views_in_ndc_units(dtype):
     visible = jnp.asarray([True, True, False])
     radius = jnp.asarray([2, 9, 90], dtype)
     for _ in range(2):
-        stats = density.observe(stats, gradient, visible, radius, (48, 64))
+        stats = density.observe(stats, gradient, visible, radius, (64, 48))
     np.testing.assert_allclose(stats.gradient, [6e-4 * 32, 8e-4 * 24, 0], rtol=1e-6)
     assert list(stats.views) == [2, 2, 0]
     assert list(stats.radius_px) == [2, 9, 0]

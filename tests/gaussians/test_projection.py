@@ -14,7 +14,7 @@ from nerfies_jax.geometry.camera import Camera
 from tests import gradients
 from tests.oracles import dense_splats
 
-SIZE = (48, 64)
+SIZE = (64, 48)
 SHARP = dataclasses.replace(GSPLAT, antialiased=True)
 project = jax.jit(projection.project, static_argnums=(2, 3))
 

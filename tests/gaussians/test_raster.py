@@ -36,9 +36,8 @@ def footprints_from(mean_px, sigma_px, angle, opacity, depth, dtype):
 
 
 def some_footprints(rng, count, size, dtype, sigma=2.0):
-    height, width = size
     return footprints_from(
-        rng.uniform(-0.1, 1.1, (count, 2)) * [width, height],
+        rng.uniform(-0.1, 1.1, (count, 2)) * size,
         sigma * np.exp(rng.normal(0, 0.5, (count, 2))),
         rng.uniform(0, np.pi, count),
         rng.uniform(0.02, 1.0, count),
@@ -69,7 +68,7 @@ def close(found, expected, tolerance):
 
 
 def test_the_capacity_never_changes_picture_or_gradient(float64, rng):
-    size = (29, 43)
+    size = (43, 29)
     footprints, _ = some_footprints(rng, 150, size, float64)
     # Three Gaussians cover every tile, 24 of them, more than a slab of 5 pairs holds.
     footprints = footprints._replace(
@@ -82,7 +81,7 @@ def test_the_capacity_never_changes_picture_or_gradient(float64, rng):
     close(picture_and_slopes(footprints, values, size, spec), whole, 1e-12)
 
 
-@pytest.mark.parametrize("size", [(1, 1), (11, 17)])
+@pytest.mark.parametrize("size", [(1, 1), (17, 11)])
 def test_odd_sizes_equal_the_dense_compositor(size, dtype, rng):
     footprints, conics = some_footprints(rng, 60, size, dtype)
     values = jnp.asarray(rng.uniform(size=(60, 2)), dtype)
@@ -96,11 +95,12 @@ def test_odd_sizes_equal_the_dense_compositor(size, dtype, rng):
         size,
         QUICK,
     )
-    assert image.shape == (*size, 2)
+    width, height = size
+    assert image.shape == (height, width, 2)
     assert image.dtype == left.dtype == dtype
     tolerance = {"float32": 1e-5, "float64": 1e-13}[dtype]
-    np.testing.assert_allclose(image, expected[0].reshape(*size, 2), atol=tolerance)
-    np.testing.assert_allclose(left, expected[1].reshape(size), atol=tolerance)
+    np.testing.assert_allclose(image, expected[0].reshape(image.shape), atol=tolerance)
+    np.testing.assert_allclose(left, expected[1].reshape(left.shape), atol=tolerance)
 
 
 @pytest.mark.hard_cases
@@ -149,14 +149,14 @@ def test_a_nan_value_shows_where_its_gaussian_is(dtype):
         np.ones(1), dtype,
     )  # fmt: skip
     values = jnp.full((1, 1), jnp.nan, dtype)
-    image, left = rasterise(footprints, values, (8, 24), QUICK)
+    image, left = rasterise(footprints, values, (24, 8), QUICK)
     assert np.isnan(image[4, 4])
     assert not np.isnan(image[:, 8:]).any()
     assert not np.isnan(left).any()
 
 
 def test_cameras_under_vmap_and_scan_equal_single_renders(float64, rng):
-    size, cameras = (13, 21), 3
+    size, cameras = (21, 13), 3
     footprints, _ = some_footprints(rng, 40, size, float64)
     values = jnp.asarray(rng.uniform(size=(40, 3)))
     shifts = jnp.asarray(rng.normal(size=(cameras, 1, 2)))
@@ -208,10 +208,10 @@ def test_pairs_are_sorted_by_tile_then_depth(tiles_per_side, dtype, rng):
 
 def test_the_ellipse_test_keeps_every_tile_that_shows_a_gaussian(float64, rng):
     """And drops most of the others: needles' boxes are mostly empty."""
-    size = (64, 96)
+    size = (96, 64)
     footprints, conics = some_footprints(rng, 30, size, float64, sigma=1.0)
     needles, sharp = footprints_from(
-        rng.uniform(0, 1, (30, 2)) * [96, 64],
+        rng.uniform(0, 1, (30, 2)) * size,
         np.tile([40.0, 0.6], (30, 1)),
         rng.uniform(0, np.pi, 30),
         rng.uniform(0.02, 1, 30),
@@ -232,7 +232,7 @@ def test_the_ellipse_test_keeps_every_tile_that_shows_a_gaussian(float64, rng):
     found = np.zeros((60, grid.tiles), bool)
     for tile in range(grid.tiles):
         found[slab.ranks[slab.starts[tile] : slab.ends[tile]], tile] = True
-    y, x = np.mgrid[: size[0], : size[1]] + 0.5
+    y, x = np.mgrid[:64, :96] + 0.5
     offset = np.stack([x, y], -1)[None] - np.asarray(footprints.mean_px)[:, None, None]
     exponent = np.einsum("nhwi,nij,nhwj->nhw", offset, np.asarray(conics), offset) / 2
     alpha = np.asarray(footprints.opacity)[:, None, None] * np.exp(-exponent)
@@ -242,9 +242,9 @@ def test_the_ellipse_test_keeps_every_tile_that_shows_a_gaussian(float64, rng):
 
 
 def test_forward_and_backward_lower_for_cuda(dtype, rng):
-    footprints, _ = some_footprints(rng, 50, (32, 48), dtype)
+    footprints, _ = some_footprints(rng, 50, (48, 32), dtype)
     values = jnp.ones((50, 4), dtype)
-    traced = picture_and_slopes.trace(footprints, values, (32, 48), QUICK)
+    traced = picture_and_slopes.trace(footprints, values, (48, 32), QUICK)
     assert "stablehlo.while" in traced.lower(lowering_platforms=("cuda",)).as_text()
 
 
@@ -267,7 +267,7 @@ def test_wrong_settings_are_refused(wrong, message):
 def test_an_image_without_pixels_is_refused(dtype, rng):
     footprints, _ = some_footprints(rng, 2, (4, 4), dtype)
     with pytest.raises(ValueError, match="at least one pixel"):
-        raster.rasterise(footprints, jnp.ones((2, 3), dtype), (0, 5), QUICK)
+        raster.rasterise(footprints, jnp.ones((2, 3), dtype), (5, 0), QUICK)
 
 
 def test_more_pairs_than_an_int32_counts(dtype):

@@ -13,7 +13,7 @@ from gaussians_jax import raster, raster_bands
 from gaussians_jax.raster_spec import GSPLAT
 from tests.gaussians import test_raster
 
-SIZE = (37, 29)
+SIZE = (29, 37)
 
 
 def both(devices):

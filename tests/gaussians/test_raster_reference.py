@@ -40,7 +40,7 @@ class Case:
         self.stored = np.load(path, allow_pickle=False)
         self.dtype = jnp.dtype(dtype)
         get = self.stored.__getitem__
-        self.size = int(get("height")), int(get("width"))
+        self.size = int(get("width")), int(get("height"))
         self.spec = RasterSpec(
             alpha_cut=float(get("alpha_threshold")),
             alpha_max=float(get("max_alpha")),

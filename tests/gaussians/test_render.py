@@ -15,8 +15,8 @@ from tests import gradients
 from tests.oracles import dense_splats
 
 
-def make_camera(dtype, size=(37, 53), skew=3.0, turn=0.2):
-    height, width = size
+def make_camera(dtype, size=(53, 37), skew=3.0, turn=0.2):
+    width, height = size
     rotation = np.array(
         [[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]]
     )
@@ -49,7 +49,8 @@ def make_gaussians(rng, count, dtype):
 
 
 def weights_for(rng, size, channels):
-    return jnp.asarray(rng.normal(size=(*size, channels)))
+    width, height = size
+    return jnp.asarray(rng.normal(size=(height, width, channels)))
 
 
 CASES = {
@@ -75,7 +76,7 @@ SLOW_CASES = {
     ],
 )
 def test_render_and_all_gradients_equal_the_dense_renderer(spec, float64, rng):
-    size = (37, 53)
+    size = (53, 37)
     gaussians = make_gaussians(rng, 120, float64)
     camera = make_camera(float64, size)
     values = jnp.asarray(rng.uniform(size=(120, 5)))
@@ -136,7 +137,7 @@ def test_render_and_all_gradients_equal_the_dense_renderer(spec, float64, rng):
 def test_render_gradient_equals_central_differences(float64, rng):
     # Large and soft, so that no threshold is crossed within the step: alpha stays above
     # the cut everywhere on the image and far below the clamp.
-    size = (12, 14)
+    size = (14, 12)
     gaussians = make_gaussians(rng, 6, float64)
     gaussians = gaussians._replace(
         scale=gaussians.scale * 0 + jnp.asarray([2.0, 3.0, 2.5]),

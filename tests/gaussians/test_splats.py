@@ -188,7 +188,7 @@ def ring_of_cameras(count):
 
 def test_random_points_lie_where_a_camera_sees_them(rng):
     cameras = ring_of_cameras(5)
-    points = rows.random_in_views(rng, cameras, (48, 64), 1.0, 4.0, 2000)
+    points = rows.random_in_views(rng, cameras, (64, 48), 1.0, 4.0, 2000)
     seen = np.zeros(len(points), bool)
     for turn, centre in zip(cameras.camera_from_world, cameras.position, strict=True):
         x, y, z = turn @ (points - centre).T
@@ -201,7 +201,7 @@ def test_random_points_lie_where_a_camera_sees_them(rng):
 
 def test_one_camera_fills_its_picture_and_its_depth_evenly(rng):
     camera = jax.tree.map(lambda leaf: leaf[0], ring_of_cameras(1))
-    points = rows.random_in_views(rng, camera, (48, 64), 1.0, 4.0, 20_000)
+    points = rows.random_in_views(rng, camera, (64, 48), 1.0, 4.0, 20_000)
     x, y, z = camera.camera_from_world @ (points - camera.position).T
     u, v = 80 * x / z + 4 * y / z + 30, 100 * y / z + 26
     for values, low, high in ((u, 0, 64), (v, 0, 48), (z, 1, 4)):

@@ -30,7 +30,7 @@ def rotation(quaternion):
 
 def footprint(mean, quaternion, scale, camera, size, spec):
     """Mean (px), 2D covariance before dilation, z."""
-    height, width = size
+    width, height = size
     here = camera.camera_from_world @ (mean - camera.position)
     x, y, z = here
     intrinsics = jnp.array(
@@ -70,7 +70,7 @@ def opacities_and_conics(covariance, opacity, spec):
 
 def composite(mean_px, conic, opacity, depth, values, size, spec):
     """[pixels, channels] and transmittance [pixels] of already visible Gaussians."""
-    height, width = size
+    width, height = size
     rows, columns = jnp.arange(0.5, height), jnp.arange(0.5, width)
     y, x = jnp.meshgrid(rows, columns, indexing="ij")
     pixel = jnp.stack([x.ravel(), y.ravel()], axis=-1)
@@ -104,5 +104,7 @@ def render(gaussians, values, camera, size, spec, mean2d_offset=None):
     opacity = jnp.where(seen, opacity, 0)
     values = jnp.concatenate([values, depth[:, None]], axis=1)
     image, left = composite(mean_px, conic, opacity, depth, values, size, spec)
-    image = image.reshape(*size, -1)
-    return Picture(image[..., :-1], 1 - left.reshape(size), image[..., -1])
+    width, height = size
+    image = image.reshape(height, width, -1)
+    left = left.reshape(height, width)
+    return Picture(image[..., :-1], 1 - left, image[..., -1])
