@@ -70,11 +70,10 @@ def _main(asked):
         from nerfies_jax.capture.capture import describe
 
         began = time.perf_counter()
-        choices, folder = _choices(asked, runs)
-        run = runs.open_run(choices)
+        run = _resumed(asked, runs) if asked.resume else _new(asked, runs)
         for line in describe(run.capture):
             print(line)
-        folder, state, history, after = _start(asked, folder, run, runs)
+        folder, state, history, after = _start(asked, run, runs)
     from experiments import training
 
     with run_settings.user_errors():
@@ -97,39 +96,36 @@ def _main(asked):
     raise SystemExit(1 if outcome.result.stopped_by == "non-finite" else 0)
 
 
-def _choices(asked, runs):
-    """What fixes the run, and its folder where one was named."""
-    if asked.resume:
-        if asked.out is None:
-            raise ValueError(
-                "--resume continues the run in a folder: name it with --out"
-            )
-        choices = runs.saved_choices(asked.out)
-        # Other steps or settings make another spec, which the checkpoint refuses.
-        steps = choices.steps if asked.steps is None else asked.steps
-        overrides = (*choices.overrides, *asked.set)
-        changed = dataclasses.replace(choices, steps=steps, overrides=overrides)
-        return changed, asked.out
-    capture = None if asked.capture is None else str(asked.capture.absolute())
-    choices = runs.Choices(
-        capture=capture,
-        scene=asked.scene,
-        preset=asked.preset or DEFAULT_PRESET,
-        steps=asked.steps,
-        overrides=asked.set,
-        factor=asked.factor,
-        max_side=asked.max_side,
-        heldout=asked.heldout,
-        seed=asked.seed,
+def _resumed(asked, runs):
+    """The run in --out; other steps or settings make a spec its checkpoint refuses."""
+    if asked.out is None:
+        raise ValueError("--resume continues the run in a folder: name it with --out")
+    steps = () if asked.steps is None else (f"steps={asked.steps}",)
+    return runs.saved_run(asked.out, (*steps, *asked.set))
+
+
+def _new(asked, runs):
+    """The run that the command line asks for."""
+    return runs.open_run(
+        runs.Choices(
+            capture=None if asked.capture is None else str(asked.capture.absolute()),
+            scene=asked.scene,
+            preset=asked.preset or DEFAULT_PRESET,
+            steps=asked.steps,
+            overrides=asked.set,
+            factor=asked.factor,
+            max_side=asked.max_side,
+            heldout=asked.heldout,
+            seed=asked.seed,
+        )
     )
-    return choices, None
 
 
-def _start(asked, folder, run, runs):
+def _start(asked, run, runs):
     """The run folder, the state to go on from and its history."""
     if asked.resume:
-        restored = runs.restore(folder, run)
-        return folder, restored.state, restored.record, restored.step
+        restored = runs.restore(asked.out, run)
+        return asked.out, restored.state, restored.record, restored.step
     state = runs.first_state(run)
     stem = "-".join(run.capture.name.split()) + "-" + run.choices.preset
     folder = run_settings.new_run_folder(asked.out, stem)

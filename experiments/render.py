@@ -58,7 +58,7 @@ def main(arguments=None):
         run_settings.start_jax(asked.device)
         from experiments import runs
 
-        run = runs.open_run(runs.saved_choices(asked.run))
+        run = runs.saved_run(asked.run)
         params = runs.restore(asked.run, run).state.params
         out = asked.out or asked.run / "renders" / _name(asked)
         out.mkdir(parents=True, exist_ok=True)

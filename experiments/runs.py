@@ -44,9 +44,12 @@ class Run(NamedTuple):
     model: Model
 
 
-def open_run(choices: Choices) -> Run:
-    """Read the capture and build the model. ValueErrors name what the user can mend."""
-    spec = scene_spec(choices)
+def open_run(choices: Choices, spec: splat_scene.SplatScene | None = None) -> Run:
+    """Read the capture and build the model; `spec` where a run has one already.
+
+    ValueErrors name what the user can mend.
+    """
+    spec = scene_spec(choices) if spec is None else spec
     capture = read_capture(choices)
     model = splat_scene.build(spec, splat_scene.facts_of(capture))
     return Run(choices, capture, spec, model)
@@ -101,8 +104,11 @@ def save_choices(folder: pathlib.Path, run: Run) -> None:
     )
 
 
-def saved_choices(folder: pathlib.Path) -> Choices:
-    """The choices of the run in a folder."""
+def saved_run(folder: pathlib.Path, overrides: tuple[str, ...] = ()) -> Run:
+    """The run in a folder, with the settings it was made with.
+
+    They come from its `config.json`, not from the preset, which may have changed since.
+    """
     path = folder / CONFIG
     if not path.is_file():
         raise ValueError(
@@ -110,12 +116,12 @@ def saved_choices(folder: pathlib.Path) -> Choices:
             "experiments.reconstruct printed"
         )
     try:
-        stored = json.loads(path.read_text())["choices"]
-        stored.pop("kind")
-        stored["overrides"] = tuple(stored["overrides"])
-        return Choices(**stored)
-    except (KeyError, TypeError, json.JSONDecodeError) as error:
+        stored = json.loads(path.read_text())
+        choices = run_settings.from_json(Choices, stored["choices"])
+        spec = run_settings.from_json(splat_scene.SplatScene, stored["spec"])
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise ValueError(f"{path}: not the settings of a run ({error})") from error
+    return open_run(choices, run_settings.override(spec, overrides))
 
 
 def first_state(run: Run) -> TrainState:

@@ -7,6 +7,7 @@ platform.
 import contextlib
 import dataclasses
 import json
+import math
 import os
 import pathlib
 import sys
@@ -130,7 +131,34 @@ def as_json(spec):
         return {key: as_json(value) for key, value in spec.items()}
     if isinstance(spec, pathlib.Path):
         return str(spec)
+    if isinstance(spec, float) and not math.isfinite(spec):
+        return str(spec)  # JSON has no infinity
     return spec
+
+
+def from_json(spec_class, stored):
+    """The spec that `as_json` wrote; a preset may have changed since.
+
+    Raises ValueError where a field is unknown, missing or of another kind.
+    """
+    hints = typing.get_type_hints(spec_class)
+    names = [field.name for field in dataclasses.fields(spec_class)]
+    if stored.get("kind") != spec_class.__name__ or {*stored} != {"kind", *names}:
+        raise ValueError(
+            f"a stored {stored.get('kind')} with {', '.join(sorted(stored))} is no "
+            f"{spec_class.__name__} of this version; check out the one that made it"
+        )
+    return spec_class(**{name: _stored(hints[name], stored[name]) for name in names})
+
+
+def _stored(kind, value):
+    if isinstance(value, dict):
+        options = (kind, *typing.get_args(kind))
+        made_of = next(o for o in options if dataclasses.is_dataclass(o))
+        return from_json(made_of, value)
+    if kind is float and isinstance(value, str):
+        return float(value)
+    return tuple(value) if isinstance(value, list) else value
 
 
 def new_run_folder(asked, stem):

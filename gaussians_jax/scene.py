@@ -6,6 +6,7 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.spatial
 from jaxtyping import Array, Int, Key
 
 from gaussians_jax import density, rates, render, splats
@@ -40,6 +41,7 @@ class StartSpec:
     fewest: int = 100
     beside: int = 0  # drawn in the views beside the capture's own points
     opacity: float = 0.1
+    widest: float = 0.03  # first scale, over the distance to the nearest camera
 
     def __post_init__(self):
         if self.points < 1 or self.random < 1 or self.beside < 0:
@@ -205,21 +207,50 @@ def first_points(spec: StartSpec, capture: Capture, seed: int):
     rng = np.random.default_rng(seed)
     cloud = capture.points
     if cloud is None or len(cloud.position) < spec.fewest:
-        return _random_points(rng, capture, spec.random)
+        return _random_points(rng, capture, spec.random, (capture.near, capture.far))
     position, colour = cloud.position, cloud.colour / 255
     if len(position) > spec.points:
         kept = np.sort(rng.choice(len(position), spec.points, replace=False))
         position, colour = position[kept], colour[kept]
-    more, more_colour = _random_points(rng, capture, spec.beside)
+    span = _filmed_depths(capture)
+    more, more_colour = _random_points(rng, capture, spec.beside, span)
     return np.concatenate([position, more]), np.concatenate([colour, more_colour])
 
 
-def _random_points(rng, capture, count):
+def _random_points(rng, capture, count, span):
     filmed = jax.tree.map(lambda leaf: leaf[capture.train], capture.cameras)
-    position = splats.random_in_views(
-        rng, filmed, capture.size, capture.near, capture.far, count
-    )
+    position = splats.random_in_views(rng, filmed, capture.size, *span, count)
     return position, rng.uniform(size=position.shape)
+
+
+def _narrowed(rows, capture, widest):
+    """The rows, none wider than a share of its distance to the nearest camera.
+
+    A lone point gets the distance to its neighbours for a scale, and close to a camera
+    it covers the picture: the first steps on a capture with such points took 2 s each.
+    """
+    cameras = scipy.spatial.cKDTree(capture.cameras.position[capture.train])
+    distance, _ = cameras.query(np.asarray(rows.mean))
+    bound = np.log(np.maximum(widest * distance, 1e-8)).astype(np.float32)
+    return rows._replace(log_scale=jnp.minimum(rows.log_scale, bound[:, None]))
+
+
+def _filmed_depths(capture):
+    """The z-depths between which the capture's points lie, a little widened.
+
+    Its near plane is often much nearer than anything filmed (0.05 where the first point
+    is at 0.4), and a Gaussian there covers the whole picture: 20 times slower steps.
+    """
+    turn = capture.cameras.camera_from_world[capture.train, 2]
+    offset = (
+        capture.points.position[None] - capture.cameras.position[capture.train, None]
+    )
+    depth = np.einsum("fk,fnk->fn", turn, offset)
+    depth = depth[depth > capture.near]
+    if not depth.size:
+        return capture.near, capture.far
+    low, high = np.quantile(depth, (0.02, 0.98))
+    return max(capture.near, 0.7 * float(low)), min(capture.far, 1.1 * float(high))
 
 
 def first_bytes(spec: SplatScene, capture: Capture) -> int:
@@ -246,6 +277,7 @@ def first_state(spec, effects, optimiser, capture, key) -> TrainState:
     rows = splats.from_points(
         position, colour, degree=spec.sh_degree, opacity=spec.start.opacity
     )
+    rows = _narrowed(rows, capture, spec.start.widest)
     count = len(position)
     most = None if spec.density is None else spec.density.most
     params = Params({"splats": rows}, {})

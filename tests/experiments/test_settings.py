@@ -7,6 +7,7 @@ import pytest
 
 from experiments import settings
 from gaussians_jax import presets
+from gaussians_jax.raster_spec import INRIA
 
 
 def test_an_override_reaches_a_nested_field_with_its_type():
@@ -52,6 +53,26 @@ def test_a_spec_is_written_as_plain_json():
     assert set(stored) - {"kind"} == {
         field.name for field in dataclasses.fields(presets.DEFORMABLE)
     }
+
+
+@pytest.mark.parametrize("name", sorted(presets.PRESETS))
+def test_a_spec_comes_back_from_its_json(name):
+    spec = presets.PRESETS[name]
+    stored = json.loads(json.dumps(settings.as_json(spec)))
+    assert settings.from_json(type(spec), stored) == spec
+
+
+def test_an_infinite_setting_survives_json():
+    spec = dataclasses.replace(presets.STATIC, raster=INRIA)
+    stored = json.loads(json.dumps(settings.as_json(spec), allow_nan=False))
+    assert settings.from_json(type(spec), stored) == spec
+
+
+def test_a_spec_of_another_version_is_refused():
+    stored = settings.as_json(presets.STATIC)
+    del stored["sh_every"]
+    with pytest.raises(ValueError, match="no SplatScene of this version"):
+        settings.from_json(type(presets.STATIC), stored)
 
 
 def test_run_folders_are_numbered_and_never_shared(tmp_path, monkeypatch):
