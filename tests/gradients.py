@@ -23,9 +23,9 @@ def directional_error(function, *args, seed=0, directions=4, step=1e-5):
     for _ in range(directions):
         direction = rng.normal(size=flat.shape)
         direction /= np.linalg.norm(direction)
-        difference = (along(flat + step * direction) - along(flat - step * direction)) / (
-            2 * step
-        )
+        difference = (
+            along(flat + step * direction) - along(flat - step * direction)
+        ) / (2 * step)
         slope = gradient @ direction
         scale = max(abs(slope), np.linalg.norm(gradient) / np.sqrt(flat.size), 1e-12)
         worst = max(worst, abs(float(difference) - slope) / scale)

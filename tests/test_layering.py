@@ -4,7 +4,7 @@ import ast
 import pathlib
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
-# Longest prefix wins. gaussians_jax may read floors 1-5 of nerfies_jax, experiments all.
+# Longest prefix wins. gaussians_jax reads floors 1-5 of nerfies_jax, experiments all.
 FLOORS = {
     "nerfies_jax.geometry": 1,
     "nerfies_jax.nets": 2,
@@ -25,7 +25,9 @@ FLOORS = {
 
 
 def floor(module):
-    best = max((room for room in FLOORS if (module + ".").startswith(room + ".")), key=len)
+    best = max(
+        (room for room in FLOORS if (module + ".").startswith(room + ".")), key=len
+    )
     return FLOORS[best], best.split(".")[0], best
 
 
@@ -47,7 +49,11 @@ def violations(root):
         module = ".".join(part for part in parts if part != "__init__")
         level, package, _ = floor(module)
         for name in imports(path):
-            if name.split(".")[0] not in {"nerfies_jax", "gaussians_jax", "experiments"}:
+            if name.split(".")[0] not in {
+                "nerfies_jax",
+                "gaussians_jax",
+                "experiments",
+            }:
                 continue
             other_level, other_package, other_room = floor(name)
             across = package != other_package and package != "experiments"
