@@ -226,24 +226,23 @@ def test_moving_gaussians(rule, float64):
     assert gradients.directional_error(total, gaussians, offsets) < 1e-7
 
 
+@jax.jit
+@functools.partial(jax.grad, argnums=(0, 1), has_aux=True)
+def slopes_by_turn_and_scale(quaternion, scale, gaussians):
+    still = jnp.zeros_like(gaussians.mean), jnp.zeros_like(quaternion)
+    moved = mlp_motion.apply(
+        gaussians._replace(quaternion=quaternion), Offsets(*still, scale), "log"
+    )
+    return jnp.sum(moved.quaternion) + jnp.sum(moved.scale**2), moved
+
+
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("length", [0.0, 1e-30, 1e25])
 def test_unusable_quaternions_and_wild_scales_stay_finite(length, dtype):
     gaussians = some_gaussians(2, dtype)
     quaternion = jnp.full((2, 4), length, dtype)
-    gaussians = gaussians._replace(quaternion=quaternion)
     wild = jnp.asarray([[100.0] * 3, [-100.0] * 3], dtype)
-    offsets = Offsets(jnp.zeros((2, 3), dtype), jnp.zeros((2, 4), dtype), wild)
-
-    def total(quaternion, scale):
-        moved = mlp_motion.apply(
-            gaussians._replace(quaternion=quaternion),
-            offsets._replace(scale=scale),
-            "log",
-        )
-        return jnp.sum(moved.quaternion) + jnp.sum(moved.scale**2), moved
-
-    slopes, moved = jax.grad(total, argnums=(0, 1), has_aux=True)(quaternion, wild)
+    slopes, moved = slopes_by_turn_and_scale(quaternion, wild, gaussians)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((slopes, moved)))
     np.testing.assert_allclose(
         np.linalg.norm(np.asarray(moved.quaternion, np.float64), axis=1), 1, rtol=1e-5
@@ -313,9 +312,10 @@ def test_a_trained_scene_has_neither_warm_up_nor_noise():
     field = mlp_motion.effect(SMALL, steps=100, frames=20)
     params, gaussians = scene_at()
     time = jnp.asarray(0.25)
-    moved = field.deform(params, gaussians, Moment(time))
+    moved = jax.jit(field.deform)(params, gaussians, Moment(time))
     motion = params.nets[mlp_motion.NAME]
-    offsets = mlp_motion.deform(motion, SMALL, gaussians.mean, time)
+    deform = jax.jit(mlp_motion.deform, static_argnums=1)
+    offsets = deform(motion, SMALL, gaussians.mean, time)
     expected = mlp_motion.apply(gaussians, offsets, SMALL.scale_rule)
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6),

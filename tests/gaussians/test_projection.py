@@ -1,6 +1,7 @@
 """Footprints against the textbook covariance, and its hard cases."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -51,6 +52,17 @@ def one(dtype, mean=(0, 0, 2), quaternion=(1, 0, 0, 0), scale=(0.1,) * 3, opacit
     return Gaussians(*(jnp.asarray(x, dtype) for x in fields))
 
 
+@functools.partial(jax.jit, static_argnums=2)
+def textbook(gaussians, camera, spec):
+    mean_px, covariance, depth = jax.vmap(
+        lambda m, q, s: dense_splats.footprint(m, q, s, camera, SIZE, spec)
+    )(gaussians.mean, gaussians.quaternion, gaussians.scale)
+    opacity, _ = jax.vmap(lambda c, o: dense_splats.opacities_and_conics(c, o, spec))(
+        covariance, gaussians.opacity
+    )
+    return mean_px, covariance, depth, opacity
+
+
 @pytest.mark.parametrize("spec", [GSPLAT, SHARP], ids=["plain", "antialiased"])
 def test_footprints_equal_the_textbook_with_skew_aspect_and_offset(spec, dtype, rng):
     gaussians = some_gaussians(rng, 300, dtype)
@@ -61,12 +73,7 @@ def test_footprints_equal_the_textbook_with_skew_aspect_and_offset(spec, dtype, 
         exact, exact_camera = jax.tree.map(
             lambda x: jnp.asarray(np.asarray(x), jnp.float64), (gaussians, camera)
         )
-        mean_px, covariance, depth = jax.vmap(
-            lambda m, q, s: dense_splats.footprint(m, q, s, exact_camera, SIZE, spec)
-        )(exact.mean, exact.quaternion, exact.scale)
-        opacity, _ = jax.vmap(
-            lambda c, o: dense_splats.opacities_and_conics(c, o, spec)
-        )(covariance, exact.opacity)
+        mean_px, covariance, depth, opacity = textbook(exact, exact_camera, spec)
     drawn = (np.asarray(depth) > 0.02) & (np.asarray(opacity) > 1.01 / 255)
     np.testing.assert_array_equal(np.asarray(found.visible)[drawn], True)
     dilated = np.asarray(covariance) + spec.dilation_px2 * np.eye(2)

@@ -221,14 +221,21 @@ def test_the_ellipse_test_keeps_every_tile_that_shows_a_gaussian(float64, rng):
     footprints = jax.tree.map(lambda *x: jnp.concatenate(x), footprints, needles)
     conics = jnp.concatenate([conics, sharp])
     grid = Grid(*size, 8)
-    boxes = binning.tile_boxes(footprints.mean_px, footprints.extent_px, grid)
-    log_opacity = jnp.log(footprints.opacity)[:, None]
-    table = jnp.concatenate([footprints.mean_px, footprints.whitening, log_opacity], 1)
-    cursor = binning.Cursor(jnp.int32(0), jnp.int32(0))
-    every = jnp.ones(grid.tiles, bool)
-    slab, _ = binning.next_slab(
-        cursor, boxes, table, every, float(np.log(1 / 255)), grid, 8192
-    )
+
+    @jax.jit
+    def first_slab(footprints):
+        boxes = binning.tile_boxes(footprints.mean_px, footprints.extent_px, grid)
+        log_opacity = jnp.log(footprints.opacity)[:, None]
+        table = [footprints.mean_px, footprints.whitening, log_opacity]
+        cursor = binning.Cursor(jnp.int32(0), jnp.int32(0))
+        every = jnp.ones(grid.tiles, bool)
+        log_cut = float(np.log(1 / 255))
+        slab, _ = binning.next_slab(
+            cursor, boxes, jnp.concatenate(table, 1), every, log_cut, grid, 8192
+        )
+        return boxes, slab
+
+    boxes, slab = jax.tree.map(np.asarray, first_slab(footprints))
     found = np.zeros((60, grid.tiles), bool)
     for tile in range(grid.tiles):
         found[slab.ranks[slab.starts[tile] : slab.ends[tile]], tile] = True

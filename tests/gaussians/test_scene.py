@@ -27,9 +27,14 @@ def started(spec):
 
 
 @functools.cache
+def compiled_step(spec):
+    return jax.jit(started(spec)[0].step)
+
+
+@functools.cache
 def stepped(spec, count):
-    model, state, frames = started(spec)
-    step = jax.jit(model.step)
+    _, state, frames = started(spec)
+    step = compiled_step(spec)
     trace = []
     for _ in range(count):
         state, metrics = step(state, frames)
@@ -102,10 +107,10 @@ def test_one_adam_step_is_optax_adam_for_rows_and_networks():
         lambda leaf: jax.random.normal(jax.random.key(1), leaf.shape), state.params
     )
     ours = scene.scale_by_row_adam()
-    directions, _ = ours.update(slopes, ours.init(state.params))
+    directions, _ = jax.jit(ours.update)(slopes, ours.init(state.params))
     reference = optax.scale_by_adam(eps=1e-15)
     with jax.numpy_dtype_promotion("standard"):  # optax mixes ints and floats
-        expected, _ = reference.update(slopes, reference.init(state.params))
+        expected, _ = jax.jit(reference.update)(slopes, reference.init(state.params))
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6),
         directions,
@@ -144,7 +149,8 @@ def test_a_frame_is_rendered_without_a_step():
     model, state, _ = started(scenes.TINY_DEFORMABLE)
     capture = scenes.tiny_capture()
     view = evaluate.view_of(capture, int(capture.heldout[0]))
-    rendering = model.render(state.params, view, (20, 15))
+    render = jax.jit(model.render, static_argnums=2)
+    rendering = render(state.params, view, (20, 15))
     assert rendering.colour.shape == (15, 20, 3)
     assert rendering.depth.shape == rendering.alpha.shape == (15, 20)
     assert all(np.isfinite(leaf).all() for leaf in rendering)

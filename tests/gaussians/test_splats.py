@@ -50,19 +50,21 @@ def test_activation_gradient(rng, float64):
     assert error < 1e-8
 
 
+@jax.jit
+@jax.value_and_grad
+def total_and_slope(raw, splats):
+    moved = splats._replace(
+        log_scale=jnp.full((7, 3), raw), opacity_logit=jnp.full(7, raw)
+    )
+    gaussians = rows.activate(moved)
+    return jnp.sum(gaussians.scale**2) + jnp.sum(gaussians.opacity)
+
+
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("raw", [-100.0, 100.0, -1e30, 1e30])
 def test_raw_values_far_out_stay_finite_with_their_slopes(raw, dtype):
     splats = some_splats(np.random.default_rng(0), dtype=dtype)
-
-    def drawn(raw):
-        moved = splats._replace(
-            log_scale=jnp.full((7, 3), raw), opacity_logit=jnp.full(7, raw)
-        )
-        gaussians = rows.activate(moved)
-        return jnp.sum(gaussians.scale**2) + jnp.sum(gaussians.opacity)
-
-    value, slope = jax.value_and_grad(drawn)(jnp.asarray(raw, dtype))
+    value, slope = total_and_slope(jnp.asarray(raw, dtype), splats)
     assert np.isfinite(value)
     assert np.isfinite(slope)
 
@@ -82,7 +84,7 @@ def test_padding_repeats_the_first_row_and_marks_it_dead(rng, dtype):
     assert list(padded.rows["label"]) == [0, 1, 2, 3, 4, 5, 6, 0, 0, 0, 0, 0]
     assert padded.nets["weight"].shape == (7, 2)  # as many rows by chance, yet no row
     np.testing.assert_array_equal(padded.rows["splats"].mean[:7], splats.mean)
-    back = rows.take_rows(padded, jnp.arange(7))
+    back = jax.jit(rows.take_rows)(padded, jnp.arange(7))
     jax.tree.map(np.testing.assert_array_equal, back, params)
 
 
@@ -245,16 +247,19 @@ def test_dead_rows_change_neither_the_picture_nor_learn_anything(rng):
         lambda leaf: jnp.asarray(leaf[0], jnp.float32), ring_of_cameras(1)
     )
 
-    @jax.jit
     def picture(splats):
         return render.render_harmonics(
             rows.activate(splats), rows.active_harmonics(splats, 1), camera, (64, 48)
         ).rendering.colour
 
+    def loss(splats):
+        colour = picture(splats)
+        return jnp.sum(colour**2), colour
+
     padded = rows.pad_rows(Params({"splats": splats}, {}), 12).rows["splats"]
-    seen = picture(splats)
+    seen = jax.jit(picture)(splats)
     assert float(seen.max()) > 0.1
-    np.testing.assert_allclose(picture(padded), seen, atol=1e-6)
-    slopes = jax.jit(jax.grad(lambda splats: jnp.sum(picture(splats) ** 2)))(padded)
+    slopes, colour = jax.jit(jax.grad(loss, has_aux=True))(padded)
+    np.testing.assert_allclose(colour, seen, atol=1e-6)
     assert any(np.asarray(leaf[:7]).any() for leaf in slopes)
     assert not any(np.asarray(leaf[7:]).any() for leaf in slopes)
