@@ -27,6 +27,9 @@ SMALL = MotionSpec(
 )
 
 
+deform = jax.jit(mlp_motion.deform, static_argnums=1)
+
+
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def strong(spec, dtype="float64", seed=0):
     """A field that moves things by about their own size."""
@@ -149,7 +152,7 @@ def test_the_time_part_may_be_summed_once(float64):
         if index == 2:
             hidden = np.concatenate([hidden, inputs], axis=1)
         hidden = np.maximum(hidden @ layer.weight + layer.bias, 0)
-    offsets = mlp_motion.deform(params, spec, mean, jnp.asarray(time))
+    offsets = deform(params, spec, mean, jnp.asarray(time))
     for name, head in params.trunk.heads.items():
         expected = hidden @ head.weight + head.bias
         np.testing.assert_allclose(getattr(offsets, name), expected, atol=1e-13)
@@ -159,8 +162,8 @@ def test_rows_beyond_the_living_blocks_are_still(float64):
     params = strong(SMALL)
     mean = some_gaussians(24).mean
     alive = jnp.arange(24) < 9  # the last of three blocks of 8 is idle
-    offsets = mlp_motion.deform(params, SMALL, mean, jnp.asarray(0.5), alive)
-    full = mlp_motion.deform(params, SMALL, mean, jnp.asarray(0.5))
+    offsets = deform(params, SMALL, mean, jnp.asarray(0.5), alive)
+    full = deform(params, SMALL, mean, jnp.asarray(0.5))
     for ours, theirs in zip(offsets, full, strict=True):
         np.testing.assert_array_equal(ours[:16], theirs[:16])
         assert not np.asarray(ours[16:]).any()
@@ -201,7 +204,7 @@ def test_no_gradient_reaches_the_means_through_the_field(float64):
     def total(mean):
         return jnp.sum(mlp_motion.deform(params, SMALL, mean, jnp.asarray(0.4)).mean)
 
-    assert not np.asarray(jax.grad(total)(some_gaussians(5).mean)).any()
+    assert not np.asarray(jax.jit(jax.grad(total))(some_gaussians(5).mean)).any()
 
 
 @pytest.mark.parametrize("rule", mlp_motion.SCALE_RULES)
@@ -314,7 +317,6 @@ def test_a_trained_scene_has_neither_warm_up_nor_noise():
     time = jnp.asarray(0.25)
     moved = jax.jit(field.deform)(params, gaussians, Moment(time))
     motion = params.nets[mlp_motion.NAME]
-    deform = jax.jit(mlp_motion.deform, static_argnums=1)
     offsets = deform(motion, SMALL, gaussians.mean, time)
     expected = mlp_motion.apply(gaussians, offsets, SMALL.scale_rule)
     jax.tree.map(
