@@ -8,13 +8,13 @@ import time
 import numpy as np
 
 from experiments import camera_paths, evaluate, pictures, report, runs, step_time
-from experiments import settings as run_settings
 from experiments.evaluate import Renderer, Scored
 from experiments.runs import Run
 from experiments.training import Outcome
 from gaussians_jax import files
 from nerfies_jax.capture import exr, video
 from nerfies_jax.capture.capture import Capture
+from nerfies_jax.capture.json_files import write_json
 from nerfies_jax.measure import clock
 from nerfies_jax.measure.clock import Metric
 
@@ -45,7 +45,7 @@ def make(folder: pathlib.Path, run: Run, outcome: Outcome, began: float) -> None
     files.save(folder / "gaussians.ply", state.params.rows["splats"])
     frames = evaluate.frames_of(run.capture)
     metrics = measured(run, outcome, scored, ms_per_frame, began)
-    run_settings.write_json(
+    write_json(
         folder / "metrics.json",
         {m.key: m.value if math.isfinite(m.value) else None for m in metrics},
     )

@@ -11,8 +11,9 @@ from experiments import settings as run_settings
 from gaussians_jax import presets as splat_presets
 from gaussians_jax import scene as splat_scene
 from nerfies_jax import capture as captures
-from nerfies_jax.capture import synthetic, undistort
+from nerfies_jax.capture import pinholes, synthetic
 from nerfies_jax.capture.capture import Capture
+from nerfies_jax.capture.json_files import write_json
 from nerfies_jax.training import checkpoint
 from nerfies_jax.training.model import Model, TrainState
 
@@ -89,12 +90,12 @@ def read_capture(choices: Choices) -> Capture:
         max_side=choices.max_side,
         heldout=heldout,
     )
-    return undistort.undistorted(capture)
+    return pinholes.as_pinholes(capture)
 
 
 def save_choices(folder: pathlib.Path, run: Run) -> None:
     """`config.json`: the choices, the whole spec they led to, and what made it."""
-    run_settings.write_json(
+    write_json(
         folder / CONFIG,
         {
             "choices": run_settings.as_json(run.choices),

@@ -6,7 +6,6 @@ platform.
 
 import contextlib
 import dataclasses
-import json
 import math
 import os
 import pathlib
@@ -195,11 +194,3 @@ def new_run_folder(asked, stem):
             "name another --out"
         ) from error
     return folder
-
-
-def write_json(path, value):
-    """Write JSON beside its target and rename: never a half-written file."""
-    path = pathlib.Path(path)
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text(json.dumps(value, indent=1, allow_nan=False) + "\n")
-    temporary.replace(path)

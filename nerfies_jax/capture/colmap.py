@@ -10,10 +10,10 @@ from nerfies_jax.capture import frames
 from nerfies_jax.capture import images as pictures
 from nerfies_jax.capture.borders import black_borders
 from nerfies_jax.capture.capture import Capture, CaptureError, PointCloud
+from nerfies_jax.capture.colmap_lenses import undistort
 from nerfies_jax.capture.colmap_library import library
 from nerfies_jax.capture.json_files import AnyPath, inside
 from nerfies_jax.capture.points import place_by_points
-from nerfies_jax.capture.undistortion import undistort
 from nerfies_jax.geometry.camera import Camera
 
 MODELS = ("sparse", "colmap/sparse", "distorted/sparse", "colmap", "")
@@ -69,24 +69,10 @@ def read(
     files = [found[source][row] for row in rows]
     # COLMAP reads pixels as they lie in the file, whatever the EXIF orientation says.
     images, alpha = frames.read_frames(files, shrink_by, orientation="stored")
-    size = (images.shape[2], images.shape[1])
-    valid = None if alpha is None else alpha == 255
-    moving = _masks(path, model.names, size, shrink_by)
-    blacked = black_borders(images)
-    if blacked is not None:
-        valid = ~blacked if valid is None else valid & ~blacked
-        touched = int(blacked.any((1, 2)).sum())
-        notes += (f"{touched} frames have black borders: taken as not filmed",)
-    stored = pictures.read_header(files[0]).size
-    lenses = [_scaled(lens, stored, size, path) for lens in model.lenses]
-    if not all(map(_is_ours, lenses)):
-        names = sorted({lens.model_name for lens in lenses})
-        notes += (f"pictures undistorted from {' and '.join(names)} to a pinhole",)
-        images, exists, (valid, moving), pinhole = undistort(
-            images, (valid, moving), lenses, str(path)
-        )
-        valid = exists if valid is None else valid
-        lenses = [pinhole] * len(lenses)
+    images, valid, moving, lenses, more = _as_pinholes(
+        path, model, files, images, alpha, shrink_by
+    )
+    notes += more
     placement = place_by_points(model.points, model.positions, model.depths)
     centre, scale = np.array(placement.centre), placement.scale
     cameras = _cameras(lenses, model.rotations, (model.positions - centre) * scale)
@@ -120,6 +106,30 @@ def read(
         path=path,
         notes=(*notes, *lost),
     )
+
+
+def _as_pinholes(path, model, files, images, alpha, shrink_by):
+    """Pictures, masks and lenses as a capture holds them, and what was done to them."""
+    notes = ()
+    size = (images.shape[2], images.shape[1])
+    valid = None if alpha is None else alpha == 255
+    moving = _masks(path, model.names, size, shrink_by)
+    blacked = black_borders(images)
+    if blacked is not None:
+        valid = ~blacked if valid is None else valid & ~blacked
+        touched = int(blacked.any((1, 2)).sum())
+        notes += (f"{touched} frames have black borders: taken as not filmed",)
+    stored = pictures.read_header(files[0]).size
+    lenses = [_scaled(lens, stored, size, path) for lens in model.lenses]
+    if not all(map(_is_ours, lenses)):
+        names = sorted({lens.model_name for lens in lenses})
+        notes += (f"pictures undistorted from {' and '.join(names)} to a pinhole",)
+        images, exists, (valid, moving), pinhole = undistort(
+            images, (valid, moving), lenses, str(path)
+        )
+        valid = exists if valid is None else valid
+        lenses = [pinhole] * len(lenses)
+    return images, valid, moving, lenses, notes
 
 
 def name_of(picture: str) -> str:

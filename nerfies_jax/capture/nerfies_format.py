@@ -41,25 +41,9 @@ def read(
     """
     path = pathlib.Path(path)
     views = read_cameras(path, heldout)
-    available = {
-        int(folder.name[:-1]): folder
-        for folder in (path / "rgb").glob("*x")
-        if folder.name[:-1].isdecimal() and int(folder.name[:-1]) > 0
-    }
-    if not available:
-        raise CaptureError(
-            f"{path}: cameras but no pictures (looked for rgb/1x, rgb/2x, ...); fetch "
-            "them, or load the cameras alone with nerfies_format.read_cameras"
-        )
-    notes = []
-    if factor is None and max_side is None and views.extra.factor in available:
-        factor = views.extra.factor
-        notes.append(f"read at 1/{factor} of the full size, as extra.json asks")
-    source, shrink_by = frames.choose_source(
-        available, views.size, factor, max_side, str(path)
-    )
-    found = [frames.find_picture(available[source], name) for name in views.ids]
-    rows, lost = frames.keep_found(found, views.ids, missing, str(available[source]))
+    folder, source, shrink_by, notes = _stored_pictures(path, views, factor, max_side)
+    found = [frames.find_picture(folder, name) for name in views.ids]
+    rows, lost = frames.keep_found(found, views.ids, missing, str(folder))
     views = only(views, rows)
     images, alpha = frames.read_frames([found[row] for row in rows], shrink_by)
     total = source * shrink_by
@@ -101,6 +85,28 @@ def read(
         path=path,
         notes=(*views.notes, *notes, *lost, *more),
     )
+
+
+def _stored_pictures(path, views, factor, max_side):
+    """The folder to read, its factor, how much to average on top, and notes."""
+    available = {
+        int(folder.name[:-1]): folder
+        for folder in (path / "rgb").glob("*x")
+        if folder.name[:-1].isdecimal() and int(folder.name[:-1]) > 0
+    }
+    if not available:
+        raise CaptureError(
+            f"{path}: cameras but no pictures (looked for rgb/1x, rgb/2x, ...); fetch "
+            "them, or load the cameras alone with nerfies_format.read_cameras"
+        )
+    notes = []
+    if factor is None and max_side is None and views.extra.factor in available:
+        factor = views.extra.factor
+        notes.append(f"read at 1/{factor} of the full size, as extra.json asks")
+    source, shrink_by = frames.choose_source(
+        available, views.size, factor, max_side, str(path)
+    )
+    return available[source], source, shrink_by, notes
 
 
 def write(capture: Capture, path: AnyPath, factors: tuple[int, ...] = (1,)):

@@ -103,14 +103,6 @@ def test_our_own_bugs_keep_their_traceback():
         raise KeyError("bug")
 
 
-def test_json_is_written_whole_or_not_at_all(tmp_path):
-    path = tmp_path / "a.json"
-    settings.write_json(path, {"a": 1})
-    with pytest.raises(ValueError, match="JSON"):
-        settings.write_json(path, {"a": float("nan")})
-    assert json.loads(path.read_text()) == {"a": 1}
-
-
 def test_an_unknown_device_is_refused():
     with pytest.raises(SystemExit):
         settings.parse(_Device, ["--device", "abacus"])

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import scipy.ndimage
 
+from nerfies_jax.capture import resampling
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.colmap_library import library
 
@@ -50,30 +50,14 @@ def undistort(
                 "undistorted picture; calibrate it again"
             )
         exists[row] = inside
-        for channel in range(3):
-            source = images[row, ..., channel].astype(np.float32)
-            sampled = scipy.ndimage.map_coordinates(
-                source, place, order=1, mode="nearest"
-            )
-            out[row, ..., channel] = np.where(inside, np.round(sampled), 0)
+        out[row] = resampling.bilinear(images[row], place) * inside[..., None]
         for target, mask in zip(bent, masks, strict=True):
             if target is not None:
-                nearest = np.round(place).astype(int)
-                nearest = np.clip(
-                    nearest, 0, np.array(mask.shape[1:])[:, None, None] - 1
-                )
-                target[row] = mask[row][tuple(nearest)] & inside
+                target[row] = resampling.nearest(mask[row], place) & inside
     return out, exists, bent, pinhole
 
 
 def _source_pixels(lens, rays, source_shape, target_shape):
-    """Array coordinates [2, height, width] in the source, and whether they lie in "
-    "it."""
+    """Array coordinates [2, height, width] in the source, and whether they are in it."""
     pixel = lens.img_from_cam(rays).reshape(*target_shape, 2)
-    place = (
-        np.moveaxis(pixel[..., ::-1], -1, 0) - 0.5
-    )  # centres at +0.5 to array indices
-    last = np.array(source_shape)[:, None, None] - 1
-    inside = np.isfinite(place).all(0)
-    place = np.where(inside, place, 0)
-    return place, inside & (place >= 0).all(0) & (place <= last).all(0)
+    return resampling.array_places(pixel, source_shape[::-1])

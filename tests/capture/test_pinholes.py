@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nerfies_jax.capture import undistort
+from nerfies_jax.capture import pinholes
 from nerfies_jax.geometry import camera as cameras
 from tests import scenes
 
@@ -42,7 +42,7 @@ def pattern(camera, capture):
 def test_an_undistorted_picture_is_the_pinhole_s_own():
     capture = scenes.tiny_capture()
     bent = through_a_lens(capture, (-0.2, 0.05, 0.0), (0.003, -0.002))
-    flat = undistort.undistorted(bent)
+    flat = pinholes.as_pinholes(bent)
     assert not flat.cameras.radial.any()
     for row in range(len(flat.ids)):
         expected = pattern(cameras.take(flat.cameras, row), flat).astype(int)
@@ -57,7 +57,7 @@ def test_an_undistorted_picture_is_the_pinhole_s_own():
 def test_pixels_the_lens_did_not_film_are_marked():
     capture = scenes.tiny_capture()
     # Barrel distortion: the pinhole's corners lie outside the round picture.
-    flat = undistort.undistorted(through_a_lens(capture, (0.4, 0.0, 0.0)))
+    flat = pinholes.as_pinholes(through_a_lens(capture, (0.4, 0.0, 0.0)))
     assert flat.valid is not None
     assert not flat.valid[:, 0, 0].any()
     assert flat.valid[:, 15, 20].all()
@@ -66,12 +66,12 @@ def test_pixels_the_lens_did_not_film_are_marked():
 
 def test_pinholes_stay_as_they_are():
     capture = scenes.tiny_capture()
-    assert undistort.undistorted(capture) is capture
+    assert pinholes.as_pinholes(capture) is capture
 
 
 def test_masks_and_depth_move_with_the_picture():
     capture = scenes.tiny_capture()
-    flat = undistort.undistorted(through_a_lens(capture, (-0.1, 0.0, 0.0)))
+    flat = pinholes.as_pinholes(through_a_lens(capture, (-0.1, 0.0, 0.0)))
     assert flat.depths.shape == capture.depths.shape
     assert flat.moving.dtype == bool
     # The middle of the picture does not move.

@@ -5,14 +5,14 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.ndimage
 
+from nerfies_jax.capture import resampling
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry import distortion, rays
 
 
-def undistorted(capture: Capture) -> Capture:
+def as_pinholes(capture: Capture) -> Capture:
     """The same capture as pinholes would have filmed it; itself where they did.
 
     Focal length, principal point and size stay, so that nothing else changes; pixels
@@ -29,23 +29,23 @@ def undistorted(capture: Capture) -> Capture:
         name: None if array is None else np.empty_like(array)
         for name, array in (("moving", capture.moving), ("depths", capture.depths))
     }
-    maps: dict[bytes, np.ndarray] = {}
+    maps: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
     for row in range(len(images)):
         camera = cameras.take(capture.cameras, row)
         # Frames of one physical camera share one map; the pose does not enter it.
         key = b"".join(np.asarray(leaf).tobytes() for leaf in camera[2:])
         if key not in maps:
             maps[key] = _source_pixels(camera, capture.size)
-        places = maps[key]
-        inside = _inside(places, capture.size)
-        images[row] = _bilinear(capture.images[row], places)
-        valid = None if capture.valid is None else capture.valid[row]
-        filmed[row] = inside if valid is None else inside & _nearest(valid, places)
+        place, inside = maps[key]
+        images[row] = resampling.bilinear(capture.images[row], place)
         images[row][~inside] = 0
+        filmed[row] = inside
+        if capture.valid is not None:
+            filmed[row] &= resampling.nearest(capture.valid[row], place)
         for name, array in masks.items():
             if array is not None:
-                array[row] = _nearest(getattr(capture, name)[row], places)
-                array[row][~inside] = 0
+                source = getattr(capture, name)[row]
+                array[row] = np.where(inside, resampling.nearest(source, place), 0)
     note = (
         f"lens distortion taken out; {1 - filmed.mean():.1%} of the pixels are unseen"
     )
@@ -63,9 +63,9 @@ def undistorted(capture: Capture) -> Capture:
 
 
 def _source_pixels(camera, size):
-    """Where each pinhole pixel lies in the filmed picture: [height, width, 2], px.
+    """Where each pinhole pixel lies in the filmed picture, and whether it does.
 
-    NaN where the lens model folds back, which is no pixel at all.
+    Where the lens model folds back there is no pixel at all.
     """
     centre = np.asarray(camera.principal_point_px)
     focal = float(camera.focal_px)
@@ -83,36 +83,4 @@ def _source_pixels(camera, size):
     bent = bent.reshape(size[1], size[0], 2)
     across = focal * bent[..., 0] + skew * bent[..., 1]
     down = focal * aspect * bent[..., 1]
-    return np.stack([across, down], axis=-1) + centre
-
-
-def _inside(places, size):
-    width, height = size
-    across, down = places[..., 0], places[..., 1]
-    # Half a pixel short of the border: bilinear sampling needs four neighbours.
-    return (
-        (across >= 0.5)
-        & (across <= width - 0.5)
-        & (down >= 0.5)
-        & (down <= height - 0.5)
-    )
-
-
-def _bilinear(picture, places):
-    rows_columns = np.nan_to_num(np.moveaxis(places[..., ::-1] - 0.5, -1, 0), nan=-1e6)
-    sampled = [
-        scipy.ndimage.map_coordinates(
-            picture[..., channel].astype(np.float32),
-            rows_columns,
-            order=1,
-            mode="nearest",
-        )
-        for channel in range(picture.shape[-1])
-    ]
-    return np.round(np.stack(sampled, axis=-1)).astype(picture.dtype)
-
-
-def _nearest(picture, places):
-    height, width = picture.shape
-    column, row = (np.nan_to_num(places[..., i], nan=0.0).astype(int) for i in (0, 1))
-    return picture[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+    return resampling.array_places(np.stack([across, down], axis=-1) + centre, size)
