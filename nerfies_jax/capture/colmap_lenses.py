@@ -58,6 +58,6 @@ def undistort(
 
 
 def _source_pixels(lens, rays, source_shape, target_shape):
-    """Array coordinates [2, height, width] in the source, and whether they are in it."""
+    """Array coordinates [2, height, width] in the source, and whether inside it."""
     pixel = lens.img_from_cam(rays).reshape(*target_shape, 2)
     return resampling.array_places(pixel, source_shape[::-1])

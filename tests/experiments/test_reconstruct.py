@@ -19,6 +19,7 @@ QUICK = (
     "motion.depth=2",
     "motion.skips=",
     "sh_degree=0",
+    "start.beside=0",
 )
 
 
