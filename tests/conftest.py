@@ -1,5 +1,6 @@
 """Both precisions, strict promotion, one compilation cache for the whole run."""
 
+import gc
 import os
 import pathlib
 import tempfile
@@ -15,6 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+# CPython 3.11 keeps the depth of a syntax tree under construction in one place for all
+# threads, and a collection in the middle of it (JAX hangs Python code onto collections)
+# now and then ends an import with "AST constructor recursion depth mismatch". Imports
+# build such trees for the shape checks, so nothing is collected until they are done.
+gc.disable()
+
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 _CACHE = os.environ.get(
     "JAX_COMPILATION_CACHE_DIR",
@@ -24,6 +31,10 @@ jax.config.update("jax_compilation_cache_dir", _CACHE)
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
 SHARED = pathlib.Path(__file__).resolve().parents[2] / "shared"
+
+
+def pytest_collection_finish():
+    gc.enable()
 
 
 @pytest.fixture(params=["float32", "float64"])
