@@ -101,9 +101,13 @@ def save_comparison(path: pathlib.Path, capture: Capture, scored: Scored):
         f"SSIM {scored.ssim[i]:.3f}"
         for i in shown
     ]
+    truth, colour = capture.images[scored.rows[shown]], scored.colour[shown]
+    if capture.valid is not None:  # what was not filmed is black in both: no error
+        filmed = capture.valid[scored.rows[shown]][..., None]
+        truth, colour = np.where(filmed, truth, 0), np.where(filmed, colour, 0)
     picture = pictures.comparison(
-        capture.images[scored.rows[shown]],
-        scored.colour[shown],
+        truth,
+        colour,
         scored.depth[shown],
         captions,
         known_depth=scored.alpha[shown] > 0.5,
