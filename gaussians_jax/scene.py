@@ -129,12 +129,7 @@ def build(spec: SplatScene, facts: Facts) -> Model:
     def step(state: TrainState, frames: Frames):
         key = loop.step_key(state)
         row = shuffled_row(state.key, state.step, len(frames.times))
-        view = View(
-            jax.tree.map(lambda leaf: leaf[row], frames.cameras),
-            frames.times[row],
-            frames.warp[row],
-            frames.appearance[row],
-        )
+        view = _view(frames, row)
         size = frames.images.shape[2], frames.images.shape[1]
         truth = frames.images[row].astype(jnp.float32) / 255
         valid = None if frames.valid is None else frames.valid[row]
@@ -176,6 +171,11 @@ def build(spec: SplatScene, facts: Facts) -> Model:
         events=_events(spec, facts, optimiser),
         counts=count_rows,
     )
+
+
+def _view(frames, row):
+    camera = jax.tree.map(lambda leaf: leaf[row], frames.cameras)
+    return View(camera, frames.times[row], frames.warp[row], frames.appearance[row])
 
 
 def _rates(spec, facts, effects, step):

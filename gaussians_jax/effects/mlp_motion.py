@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from gaussians_jax import splats
@@ -21,6 +20,7 @@ from gaussians_jax.splats import Gaussians, Params
 from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import HeadSpec, Layer, MLPSpec
+from nerfies_jax.training import schedules
 
 NAME = "mlp_motion"
 SCALE_RULES = ("log", "linear")
@@ -261,9 +261,9 @@ def smooth_time(
     interval grows to 1 within every epoch: 26 times the intended noise in the root mean
     square at 400 frames. Here it is the paper's.
     """
-    left = jnp.maximum(1 - step.astype(time.dtype) / spec.steps, 0)
+    deviation = schedules.time_noise(frames, spec.steps, spec.first)(step)
     noise = jax.random.normal(key, (), time.dtype)
-    return time + noise * (spec.first / frames) * left
+    return time + noise * deviation.astype(time.dtype)
 
 
 def effect(spec: MotionSpec, steps: int, frames: int) -> Effect:
@@ -276,11 +276,7 @@ def effect(spec: MotionSpec, steps: int, frames: int) -> Effect:
     def init_nets(key):
         return init(key, spec)
 
-    def learning_rate(step):
-        schedule = optax.exponential_decay(
-            spec.rate, steps, spec.rate_end / spec.rate, end_value=spec.rate_end
-        )
-        return jnp.asarray(schedule(step))
+    learning_rate = schedules.log_linear(spec.rate, spec.rate_end, steps)
 
     def moved(params: Params, gaussians: Gaussians, moment: Moment) -> Gaussians:
         time = moment.time
