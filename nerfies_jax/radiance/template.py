@@ -1,0 +1,112 @@
+"""The template: a network from an encoded point to density and colour."""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key
+
+from nerfies_jax.nets import mlp
+from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.nets.mlp import HeadSpec, MLPSpec
+
+DENSITIES = ("softplus", "relu")
+
+
+@dataclasses.dataclass(frozen=True)
+class TemplateSpec:
+    """Size and activations of the network; the defaults are Mildenhall et al. 2020.
+
+    `direction` is None where colour does not depend on the view. "relu" densities are
+    the first paper's; a ray that starts with none of them positive never learns, and
+    under an interval at infinity the slope is 1e10 (softplus: at most 6e-3).
+    """
+
+    position: EncodingSpec = EncodingSpec(10)
+    direction: EncodingSpec | None = EncodingSpec(4)
+    depth: int = 8
+    width: int = 256
+    skips: tuple[int, ...] = (4,)  # layers that read the input again
+    colour_width: int = 128
+    density: str = "softplus"
+    density_bias: float = 0.0  # added before the activation; negative starts emptier
+
+    def __post_init__(self):
+        if self.density not in DENSITIES:
+            raise ValueError(
+                f"unknown density activation {self.density!r}; choose from {DENSITIES}"
+            )
+        if self.colour_width < 1:
+            raise ValueError(f"colour_width={self.colour_width} must be at least 1")
+
+
+class Template(NamedTuple):
+    """Parameters."""
+
+    trunk: mlp.MLP  # heads "density" and "bottleneck"
+    colour: mlp.MLP  # reads [bottleneck, condition]; head "colour"
+
+
+class Radiance(NamedTuple):
+    """What the field is at one point."""
+
+    density: Float[Array, ""]  # per unit of the field, not negative
+    colour: Float[Array, "3"]  # sRGB in (0, 1)
+    features: Float[Array, " width"]  # the trunk's last layer, for other media
+
+
+def trunk_spec(spec: TemplateSpec, inputs: int) -> MLPSpec:
+    """The network that reads `inputs` features of a point."""
+    heads = (("density", HeadSpec(1)), ("bottleneck", HeadSpec(spec.width)))
+    return MLPSpec(inputs, spec.depth, spec.width, heads, spec.skips)
+
+
+def colour_spec(spec: TemplateSpec, condition: int) -> MLPSpec:
+    """The branch that reads the bottleneck and `condition` features of the ray."""
+    inputs = spec.width + condition
+    return MLPSpec(inputs, 1, spec.colour_width, (("colour", HeadSpec(3)),))
+
+
+def init(
+    spec: TemplateSpec,
+    key: Key[Array, ""],
+    inputs: int,
+    condition: int,
+    dtype=jnp.float32,
+) -> Template:
+    """Glorot weights; `inputs` and `condition` are the widths that `apply` will get."""
+    trunk_key, colour_key = jax.random.split(key)
+    return Template(
+        mlp.init(trunk_spec(spec, inputs), trunk_key, dtype),
+        mlp.init(colour_spec(spec, condition), colour_key, dtype),
+    )
+
+
+def apply(
+    spec: TemplateSpec,
+    params: Template,
+    features: Float[Array, " inputs"],
+    condition: Float[Array, " condition"],
+    density_noise: Float[Array, ""] | None = None,
+) -> Radiance:
+    """Density and colour at one point (Mildenhall et al. 2020, figure 7).
+
+    `features` are the point's encoding and what effects add to it; `condition` is the
+    encoded view direction and codes, the same along a ray. `density_noise` is added
+    before the activation. The density never depends on `condition`.
+    """
+    trunk = trunk_spec(spec, features.shape[-1])
+    hidden = mlp.hidden_features(trunk, params.trunk, features)
+    raw = mlp.affine(params.trunk.heads["density"], hidden)[0] + spec.density_bias
+    if density_noise is not None:
+        raw = raw + density_noise
+    bottleneck = mlp.affine(params.trunk.heads["bottleneck"], hidden)
+    # Two products, not one of [bottleneck, condition]: under vmap over the samples of a
+    # ray the second is then computed once for the ray.
+    first = params.colour.hidden[0]
+    branch = bottleneck @ first.weight[: spec.width]
+    branch = branch + (condition @ first.weight[spec.width :] + first.bias)
+    colour = mlp.affine(params.colour.heads["colour"], jax.nn.relu(branch))
+    activation = jax.nn.softplus if spec.density == "softplus" else jax.nn.relu
+    return Radiance(activation(raw), jax.nn.sigmoid(colour), hidden)
