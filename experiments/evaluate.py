@@ -11,7 +11,7 @@ from nerfies_jax.capture.capture import Capture
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.measure import image_quality
-from nerfies_jax.training.model import Frames, Model, Rendering, View
+from nerfies_jax.training.model import Frames, Model, Rendering, TrainState, View
 
 
 class Scored(NamedTuple):
@@ -25,9 +25,14 @@ class Scored(NamedTuple):
     ssim: np.ndarray  # scikit-image's Gaussian form
 
 
-def frames_of(capture: Capture) -> Frames:
-    """The training frames on the device."""
+def frames_of(capture: Capture, wants: frozenset[str] = frozenset()) -> Frames:
+    """The training frames on the device, with what a model `wants` and there is."""
     rows = capture.train
+    beside = {}
+    if "depths" in wants and capture.depths is not None:
+        beside["depths"] = jnp.asarray(capture.depths[rows])
+    if "points" in wants and capture.points is not None:
+        beside["points"] = jnp.asarray(capture.points.position)
     return Frames(
         images=jnp.asarray(capture.images[rows]),
         cameras=jax.tree.map(jnp.asarray, cameras.take(capture.cameras, rows)),
@@ -35,6 +40,7 @@ def frames_of(capture: Capture) -> Frames:
         warp=jnp.asarray(capture.warp_ids[rows]),
         appearance=jnp.asarray(capture.appearance_ids[rows]),
         valid=None if capture.valid is None else jnp.asarray(capture.valid[rows]),
+        **beside,
     )
 
 
@@ -46,6 +52,13 @@ def view_of(capture: Capture, row: int) -> View:
         jnp.asarray(capture.warp_ids[row]),
         jnp.asarray(capture.appearance_ids[row]),
     )
+
+
+def resized(view: View, old: tuple[int, int], new: tuple[int, int]) -> View:
+    """The same view as a picture of another (width, height)."""
+    if old == new:
+        return view
+    return view._replace(camera=cameras.resize(view.camera, old, new))
 
 
 def path_views(path: Camera, times: np.ndarray, like: View) -> list[View]:
@@ -60,31 +73,41 @@ def path_views(path: Camera, times: np.ndarray, like: View) -> list[View]:
 
 
 class Renderer:
-    """A model's whole-frame function, compiled once for each number of rows."""
+    """A model's whole-frame function; compiled once for each shape of its state."""
 
     def __init__(self, model: Model, size: tuple[int, int]):
-        self._render = jax.jit(lambda params, view: model.render(params, view, size))
-        self.seconds: list[float] = []
+        self._render = jax.jit(
+            lambda params, view, step: model.render(params, view, size, step)
+        )
+        self._programs = {}
+        self.model, self.size = model, size
+        self.seconds: list[float] = []  # of every frame, without compiling
 
-    def __call__(self, params, view: View) -> Rendering:
+    def __call__(self, state: TrainState, view: View) -> Rendering:
+        inputs = state.params, view, state.step
+        shapes = tuple(jax.typeof(leaf) for leaf in jax.tree.leaves(inputs))
+        if shapes not in self._programs:
+            self._programs[shapes] = self._render.lower(*inputs).compile()
         start = time.perf_counter()
-        rendering = jax.device_get(self._render(params, view))
+        rendering = jax.device_get(self._programs[shapes](*inputs))
         self.seconds.append(time.perf_counter() - start)
         return rendering
 
     def ms_per_frame(self, frames: int) -> float:
-        """Median over the last `frames` frames, without the first of them."""
-        return 1e3 * float(np.median(self.seconds[-frames:][1:] or self.seconds[-1:]))
+        """Median over the last `frames` frames."""
+        return 1e3 * float(np.median(self.seconds[-frames:]))
 
 
-def score(renderer: Renderer, params, capture: Capture, rows: np.ndarray) -> Scored:
+def score(
+    renderer: Renderer, state: TrainState, capture: Capture, rows: np.ndarray
+) -> Scored:
     """Render frames of a capture and compare them with what was filmed.
 
     Scores are of the picture as an 8-bit file would hold it, over the filmed pixels.
     """
     renderings, scores = [], []
     for row in rows:
-        rendering = renderer(params, view_of(capture, row))
+        rendering = renderer(state, view_of(capture, row))
         truth = capture.images[row].astype(np.float32) / 255
         valid = None if capture.valid is None else capture.valid[row]
         scores.append(jax.device_get(_score(rendering.colour, truth, valid)))

@@ -7,26 +7,25 @@ import time
 
 import numpy as np
 
-from experiments import camera_paths, evaluate, pictures, report, runs, step_time
+from experiments import budget, camera_paths, evaluate, pictures, report, runs
 from experiments.evaluate import Renderer, Scored
 from experiments.runs import Run
 from experiments.training import Outcome
-from gaussians_jax import files
 from nerfies_jax.capture import exr, video
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.json_files import write_json
 from nerfies_jax.measure import clock
 from nerfies_jax.measure.clock import Metric
+from nerfies_jax.training.model import TrainState
 
 SHOWN = 4  # held-out frames in the comparison
-FILM_FRAMES = 96
-FILM_RATE = 24.0  # frames per second: four seconds
 
 
 def make(folder: pathlib.Path, run: Run, outcome: Outcome, began: float) -> None:
     """Write everything into the run folder and say where it is."""
     state, renderer = outcome.result.state, outcome.renderer
-    scored = evaluate.score(renderer, state.params, run.capture, run.capture.heldout)
+    rows, left_out = frames_to_score(run, outcome)
+    scored = evaluate.score(renderer, state, run.capture, rows)
     ms_per_frame = renderer.ms_per_frame(len(scored.rows))
     figures = [
         report.Figure(
@@ -40,20 +39,16 @@ def make(folder: pathlib.Path, run: Run, outcome: Outcome, began: float) -> None
         figures.append(
             report.Figure(curve, "PSNR of a few held-out frames while it trained.")
         )
-    film = save_film(folder / "scene.mp4", run, renderer, state.params)
+    film = save_film(folder / "scene.mp4", run, renderer, state, ms_per_frame / 1e3)
     save_depth(folder / "depth", run.capture, scored)
-    files.save(folder / "gaussians.ply", state.params.rows["splats"])
-    frames = evaluate.frames_of(run.capture)
+    saved = run.representation.save(folder, run.spec, state)
+    frames = evaluate.frames_of(run.capture, run.model.wants)
     metrics = measured(run, outcome, scored, ms_per_frame, began)
     write_json(
         folder / "metrics.json",
         {m.key: m.value if math.isfinite(m.value) else None for m in metrics},
     )
-    notes = [outcome.result.message, *run.capture.notes]
-    if run.spec.motion is not None:
-        notes.append(
-            "gaussians.ply holds the canonical Gaussians, without their motion."
-        )
+    notes = [outcome.result.message, *run.capture.notes, *left_out, *saved]
     commands = _next(folder, run, outcome)
     page = report.write(
         folder,
@@ -62,11 +57,25 @@ def make(folder: pathlib.Path, run: Run, outcome: Outcome, began: float) -> None
         json.loads((folder / runs.CONFIG).read_text()),
         figures,
         film,
-        step_time.parts(run, state, frames),
+        run.representation.time_parts(run.spec, run.facts, run.model, state, frames),
         notes,
         commands,
     )
     _say(folder, page, metrics, commands)
+
+
+def frames_to_score(run: Run, outcome: Outcome) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Rows of held-out frames, and a note where there is no time for all of them."""
+    heldout = run.capture.heldout
+    seconds = outcome.renderer.ms_per_frame(1) / 1e3
+    count = budget.scored(seconds, len(heldout))
+    if count == len(heldout):
+        return heldout, ()
+    note = (
+        f"Scores are of {count} of the {len(heldout)} held-out frames, evenly spread: "
+        f"one takes {seconds:.1f} s to render."
+    )
+    return evaluate.spread(heldout, count), (note,)
 
 
 def measured(
@@ -129,16 +138,30 @@ def save_curve(path: pathlib.Path, run: Run, outcome: Outcome):
     return path
 
 
-def save_film(path: pathlib.Path, run: Run, renderer: Renderer, params):
-    """The moving scene from a moving camera."""
-    path_cameras = camera_paths.path("sway", run.capture, FILM_FRAMES)
+def save_film(
+    path: pathlib.Path,
+    run: Run,
+    renderer: Renderer,
+    state: TrainState,
+    frame_seconds: float,
+) -> pathlib.Path:
+    """The moving scene from a moving camera, as long and large as time allows."""
+    size = run.capture.size
+    film = budget.film(frame_seconds, size)
+    if film.size != size:
+        renderer = Renderer(run.model, film.size)
     views = evaluate.path_views(
-        path_cameras,
-        camera_paths.times(FILM_FRAMES),
+        camera_paths.path("sway", run.capture, film.frames),
+        camera_paths.times(film.frames),
         evaluate.view_of(run.capture, int(run.capture.train[0])),
     )
-    frames = (evaluate.as_picture(renderer(params, view).colour) for view in views)
-    video.write_video(path, frames, FILM_RATE)
+    frames = (
+        evaluate.as_picture(
+            renderer(state, evaluate.resized(view, size, film.size)).colour
+        )
+        for view in views
+    )
+    video.write_video(path, frames, film.rate)
     return path
 
 

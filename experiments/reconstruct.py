@@ -65,7 +65,7 @@ def main(arguments=None):
 
 def _main(asked):
     with run_settings.user_errors():
-        run_settings.start_jax(asked.device)
+        run_settings.start_jax(asked.device, run_settings.threads_for(_preset(asked)))
         from experiments import runs
         from nerfies_jax.capture.capture import describe
 
@@ -96,6 +96,13 @@ def _main(asked):
     raise SystemExit(1 if outcome.result.stopped_by == "non-finite" else 0)
 
 
+def _preset(asked):
+    """The preset that the run has, or will have."""
+    if asked.resume and asked.out is not None:
+        return run_settings.stored_preset(asked.out)
+    return asked.preset or DEFAULT_PRESET
+
+
 def _resumed(asked, runs):
     """The run in --out; other steps or settings make a spec its checkpoint refuses."""
     if asked.out is None:
@@ -106,7 +113,7 @@ def _resumed(asked, runs):
 
 def _new(asked, runs):
     """The run that the command line asks for."""
-    return runs.open_run(
+    return runs.new_run(
         runs.Choices(
             capture=None if asked.capture is None else str(asked.capture.absolute()),
             scene=asked.scene,

@@ -55,15 +55,16 @@ def main(arguments=None):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with run_settings.user_errors():
         asked = run_settings.parse(Render, arguments)
-        run_settings.start_jax(asked.device)
+        threads = run_settings.threads_for(run_settings.stored_preset(asked.run))
+        run_settings.start_jax(asked.device, threads)
         from experiments import runs
 
         run = runs.saved_run(asked.run)
-        params = runs.restore(asked.run, run).state.params
+        state = runs.restore(asked.run, run).state
         out = asked.out or asked.run / "renders" / _name(asked)
         out.mkdir(parents=True, exist_ok=True)
         names, views = _views(asked, run)
-    _write(asked, out, run, params, names, views)
+    _write(asked, out, run, state, names, views)
 
 
 def _name(asked):
@@ -94,7 +95,7 @@ def _views(asked, run):
     return names, evaluate.path_views(path, times, like)
 
 
-def _write(asked, out, run, params, names, views):
+def _write(asked, out, run, state, names, views):
     """Render view after view and write each as it comes."""
     from experiments import evaluate
     from nerfies_jax.capture import exr, images, video
@@ -104,7 +105,7 @@ def _write(asked, out, run, params, names, views):
 
     def pictures():
         for name, view in zip(names, views, strict=True):
-            rendering = renderer(params, _resized(view, run.capture.size, size))
+            rendering = renderer(state, evaluate.resized(view, run.capture.size, size))
             picture = evaluate.as_picture(rendering.colour)
             if "png" in asked.formats:
                 images.write_png(out / f"{name}.png", picture)
@@ -133,14 +134,6 @@ def _size(size, max_side):
         return size
     factor = max_side / max(size)
     return max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
-
-
-def _resized(view, old, new):
-    from nerfies_jax.geometry import camera as cameras
-
-    if old == new:
-        return view
-    return view._replace(camera=cameras.resize(view.camera, old, new))
 
 
 if __name__ == "__main__":

@@ -3,13 +3,13 @@
 import dataclasses
 import json
 import pathlib
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 
+from experiments import representations
 from experiments import settings as run_settings
-from gaussians_jax import presets as splat_presets
-from gaussians_jax import scene as splat_scene
+from experiments.representations import Representation
 from nerfies_jax import capture as captures
 from nerfies_jax.capture import pinholes, synthetic
 from nerfies_jax.capture.capture import Capture
@@ -17,7 +17,7 @@ from nerfies_jax.capture.json_files import write_json
 from nerfies_jax.training import checkpoint
 from nerfies_jax.training.model import Model, TrainState
 
-CONFIG = "config.json"
+CONFIG = run_settings.CONFIG
 CHECKPOINTS = "checkpoints"
 
 
@@ -41,32 +41,32 @@ class Run(NamedTuple):
 
     choices: Choices
     capture: Capture
-    spec: splat_scene.SplatScene
+    representation: Representation
+    spec: Any  # of the representation's `spec_type`
+    facts: Any  # what the scene must know of the capture
     model: Model
 
 
-def open_run(choices: Choices, spec: splat_scene.SplatScene | None = None) -> Run:
-    """Read the capture and build the model; `spec` where a run has one already.
+def new_run(choices: Choices) -> Run:
+    """A run as it is asked for; ValueErrors name what the user can mend."""
+    representation = representations.of_preset(choices.preset)
+    return open_run(choices, representation, scene_spec(choices))
 
-    ValueErrors name what the user can mend.
-    """
-    spec = scene_spec(choices) if spec is None else spec
+
+def open_run(choices: Choices, representation: Representation, spec: Any) -> Run:
+    """Read the capture and build the model."""
     capture = read_capture(choices)
-    model = splat_scene.build(spec, splat_scene.facts_of(capture))
-    return Run(choices, capture, spec, model)
+    facts = representation.facts_of(capture)
+    model = representation.build(spec, facts)
+    return Run(choices, capture, representation, spec, facts, model)
 
 
-def scene_spec(choices: Choices) -> splat_scene.SplatScene:
+def scene_spec(choices: Choices) -> Any:
     """The preset with its overrides."""
-    named = splat_presets.PRESETS
-    if choices.preset not in named:
-        raise ValueError(
-            f"--preset {choices.preset}: no such preset; there are "
-            + ", ".join(sorted(named))
-        )
-    spec = named[choices.preset]
+    representation = representations.of_preset(choices.preset)
+    spec = representation.presets[choices.preset]
     if choices.steps is not None:
-        spec = splat_presets.with_steps(spec, choices.steps)
+        spec = representation.with_steps(spec, choices.steps)
     return run_settings.override(spec, choices.overrides)
 
 
@@ -99,6 +99,7 @@ def save_choices(folder: pathlib.Path, run: Run) -> None:
         folder / CONFIG,
         {
             "choices": run_settings.as_json(run.choices),
+            "representation": run.representation.name,
             "spec": run_settings.as_json(run.spec),
             "made by": checkpoint.provenance(),
         },
@@ -119,21 +120,23 @@ def saved_run(folder: pathlib.Path, overrides: tuple[str, ...] = ()) -> Run:
     try:
         stored = json.loads(path.read_text())
         choices = run_settings.from_json(Choices, stored["choices"])
-        spec = run_settings.from_json(splat_scene.SplatScene, stored["spec"])
+        # Runs from before there were two are splats.
+        kind = representations.named(stored.get("representation", "gaussians"))
+        spec = run_settings.from_json(kind.spec_type, stored["spec"])
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise ValueError(f"{path}: not the settings of a run ({error})") from error
-    return open_run(choices, run_settings.override(spec, overrides))
+    return open_run(choices, kind, run_settings.override(spec, overrides))
 
 
 def first_state(run: Run) -> TrainState:
     """The state before the first step; ValueError where it would not fit in memory."""
-    needed = splat_scene.first_bytes(run.spec, run.capture)
+    needed = run.representation.first_bytes(run.spec, run.capture)
     free = free_memory()
     if free is not None and needed > free:
         raise ValueError(
             f"the first state needs about {needed / 2**30:.1f} GiB and "
-            f"{free / 2**30:.1f} GiB are free; lower start.points, start.random or "
-            "raster.capacity with --set, or read smaller pictures with --max-side"
+            f"{free / 2**30:.1f} GiB are free; {run.representation.lighter}, or read "
+            "smaller pictures with --max-side"
         )
     return run.model.init(run.capture, jax.random.key(run.choices.seed))
 

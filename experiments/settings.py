@@ -6,6 +6,7 @@ platform.
 
 import contextlib
 import dataclasses
+import json
 import math
 import os
 import pathlib
@@ -16,6 +17,8 @@ import typing
 import tyro
 
 Positional = tyro.conf.Positional
+CONFIG = "config.json"  # of a run folder: its choices and its whole spec
+SPLATS = ("splats", "sonata", "moba")  # what the names of their presets start with
 CACHE = (
     pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache")
     / "nerfies_jax"
@@ -41,12 +44,33 @@ def user_errors():
         sys.exit(2)
 
 
-def start_jax(device):
-    """Choose the platform and the compilation cache; call before anything uses JAX."""
-    # XLA:CPU splits the bodies of tight loops over all cores it sees and gains nothing:
-    # 87 to 94 ms a training step with one, 94 to 109 with four (10,000 Gaussians,
-    # 176x132). With one, the bits do not depend on the machine's core count either.
-    os.environ.setdefault("PJRT_NPROC", "1")
+def threads_for(preset):
+    """Whether XLA:CPU should see "one" core or "all" for the scenes of a preset.
+
+    Splats are tight loops. XLA splits their bodies over all cores it sees and gains
+    nothing: 87 to 94 ms a training step with one, 94 to 109 with four (10,000
+    Gaussians, 176x132). With one, the bits do not depend on the machine's core count
+    either. Radiance fields are matrix products, which every core makes faster.
+    """
+    return "one" if preset.startswith(SPLATS) else "all"
+
+
+def stored_preset(folder):
+    """The preset of the run in a folder, "" where none can be read; without JAX."""
+    try:
+        return str(json.loads((folder / CONFIG).read_text())["choices"]["preset"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return ""  # reading it properly, later, says what is wrong
+
+
+def start_jax(device, threads="one"):
+    """Choose the platform, how many cores XLA:CPU sees, and the compilation cache.
+
+    Call it before anything uses JAX; it is too late afterwards. `PJRT_NPROC` in the
+    environment has the last word.
+    """
+    if threads == "one":
+        os.environ.setdefault("PJRT_NPROC", "1")
     if device != "auto":
         os.environ["JAX_PLATFORMS"] = {"gpu": "cuda"}.get(device, device)
     import jax

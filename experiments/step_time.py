@@ -3,25 +3,27 @@
 import jax
 import jax.numpy as jnp
 
-from experiments.runs import Run
 from gaussians_jax import render, splats
 from gaussians_jax import scene as splat_scene
 from gaussians_jax.effects.effect import Moment
+from gaussians_jax.scene import Facts, SplatScene
 from nerfies_jax.measure import clock
 from nerfies_jax.training import losses
-from nerfies_jax.training.model import Frames, TrainState
+from nerfies_jax.training.model import Frames, Model, TrainState
 
 REPEATS = 7
 
 
-def parts(run: Run, state: TrainState, frames: Frames) -> dict[str, float]:
+def of_splats(
+    spec: SplatScene, facts: Facts, model: Model, state: TrainState, frames: Frames
+) -> dict[str, float]:
     """Milliseconds of each part of one step, forward and backward; medians, warm.
 
     Each part is timed by itself on the first frame. What is left of the whole step is
     the optimiser and the statistics for the density control.
     """
-    spec, facts = run.spec, splat_scene.facts_of(run.capture)
     params = state.params
+    size = frames.images.shape[2], frames.images.shape[1]
     camera = jax.tree.map(lambda leaf: leaf[0], frames.cameras)
     truth = frames.images[0].astype(jnp.float32) / 255
     moment = Moment(frames.times[0], state.step, state.key)
@@ -29,7 +31,7 @@ def parts(run: Run, state: TrainState, frames: Frames) -> dict[str, float]:
 
     def draw(gaussians, coefficients):
         frame = render.render_harmonics(
-            gaussians, coefficients, camera, run.capture.size, spec.raster
+            gaussians, coefficients, camera, size, spec.raster
         )
         return jnp.sum(frame.rendering.colour)
 
@@ -50,7 +52,7 @@ def parts(run: Run, state: TrainState, frames: Frames) -> dict[str, float]:
             return sum(jnp.sum(leaf) for leaf in moved)
 
         timed[effect.name.replace("_", " ")] = _ms(jax.grad(deform), params)
-    whole = _ms(lambda state: run.model.step(state, frames), state)
+    whole = _ms(lambda state: model.step(state, frames), state)
     timed["optimiser and statistics"] = max(whole - sum(timed.values()), 0.0)
     return timed
 

@@ -3,7 +3,7 @@
 import pathlib
 from typing import Any, NamedTuple
 
-from experiments import evaluate, runs
+from experiments import budget, evaluate, runs
 from experiments.evaluate import Renderer
 from experiments.runs import Run
 from nerfies_jax.training import loop
@@ -35,11 +35,16 @@ def train(
 ) -> Outcome:
     """Fit the model; its PSNR and SSIM on a few held-out frames go into the history."""
     renderer = Renderer(run.model, run.capture.size)
-    few = evaluate.spread(run.capture.heldout, evaluated)
+    few = run.capture.heldout
+    if len(few):
+        renderer(state, evaluate.view_of(run.capture, int(few[0])))  # how long it takes
+        pace = budget.evaluations(renderer.seconds[-1], evaluate_every, evaluated)
+        few = evaluate.spread(run.capture.heldout, pace.frames)
+        evaluate_every = pace.every_seconds
 
     def held_out(state, step):
         del step
-        scored = evaluate.score(renderer, state.params, run.capture, few)
+        scored = evaluate.score(renderer, state, run.capture, few)
         return {"psnr": scored.psnr.mean(), "ssim": scored.ssim.mean()}
 
     hooks = [Hook("held out", held_out, every_seconds=evaluate_every)]
@@ -47,7 +52,7 @@ def train(
         result = loop.fit(
             run.model,
             state,
-            evaluate.frames_of(run.capture),
+            evaluate.frames_of(run.capture, run.model.wants),
             steps=run.spec.steps,
             hooks=hooks if len(few) else [],
             seconds=seconds,

@@ -122,9 +122,10 @@ def build(spec: SplatScene, facts: Facts) -> Model:
             mean2d_offset=probe,
         )
 
-    def whole_frame(params, view, size):
+    def whole_frame(params, view, size, step):
         moment = Moment(view.time)
-        return draw(params, view, size, moment, spec.sh_degree).rendering
+        degree = splats.active_degree(step, spec.sh_every, spec.sh_degree)
+        return draw(params, view, size, moment, degree).rendering
 
     def step(state: TrainState, frames: Frames):
         key = loop.step_key(state)

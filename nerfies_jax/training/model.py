@@ -19,6 +19,12 @@ class Frames(NamedTuple):
     warp: Int[Array, " frames"]
     appearance: Int[Array, " frames"]
     valid: Any  # [frames, height, width] bool, or None
+    # What a model reads only if it `wants` it:
+    depths: Any = (
+        None  # [frames, height, width] float32 z-depth, scene units; 0 unknown
+    )
+    points: Any = None  # [points, 3] float32 static scene points, scene units
+    flow: Any = None
 
 
 class View(NamedTuple):
@@ -65,6 +71,9 @@ class Model(NamedTuple):
     spec: Hashable  # written into the checkpoint
     init: Callable[[Any, Any], TrainState]  # (Capture, key) -> state; host
     step: Callable[[TrainState, Frames], tuple[TrainState, dict[str, Array]]]
-    render: Callable[[PyTree, View, tuple[int, int]], Rendering]  # (params, view, size)
+    # (params, view, size, step): `step` says how far the parameters are trained, since
+    # what is drawn follows its schedules (coarse-to-fine windows, harmonic degrees).
+    render: Callable[[PyTree, View, tuple[int, int], Int[Array, ""]], Rendering]
     events: tuple[Event, ...]
     counts: Callable[[TrainState], dict[str, int]]  # {"gaussians": n, ...}
+    wants: frozenset[str] = frozenset()  # which of "depths", "points", "flow" it reads

@@ -150,10 +150,27 @@ def test_a_frame_is_rendered_without_a_step():
     capture = scenes.tiny_capture()
     view = evaluate.view_of(capture, int(capture.heldout[0]))
     render = jax.jit(model.render, static_argnums=2)
-    rendering = render(state.params, view, (20, 15))
+    rendering = render(state.params, view, (20, 15), state.step)
     assert rendering.colour.shape == (15, 20, 3)
     assert rendering.depth.shape == rendering.alpha.shape == (15, 20)
     assert all(np.isfinite(leaf).all() for leaf in rendering)
+
+
+def test_a_frame_has_the_harmonics_of_its_step():
+    model, state, _ = started(scenes.TINY_SPLATS)
+    capture = scenes.tiny_capture()
+    view = evaluate.view_of(capture, int(capture.heldout[0]))
+    rows = state.params.rows["splats"]
+    plain = state.params
+    shaded = Params({"splats": rows._replace(sh_rest=rows.sh_rest + 0.3)}, {})
+    render = jax.jit(model.render, static_argnums=2)
+
+    def colour(params, step):
+        return render(params, view, (20, 15), jnp.asarray(step, jnp.int32)).colour
+
+    every = scenes.TINY_SPLATS.sh_every  # below it no band but the first has trained
+    np.testing.assert_array_equal(colour(shaded, every - 1), colour(plain, every))
+    assert np.abs(colour(shaded, every) - colour(plain, every)).max() > 0.05
 
 
 def test_few_points_start_from_random_ones_in_the_views():

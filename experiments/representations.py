@@ -1,0 +1,77 @@
+"""What the experiments know of each representation: splats, and radiance fields."""
+
+import functools
+import pathlib
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from experiments import step_time
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.training.model import Frames, Model, TrainState
+
+Spec = Any
+
+
+class Representation(NamedTuple):
+    """How its scenes are named, built, timed and saved."""
+
+    name: str
+    spec_type: type
+    presets: dict[str, Spec]
+    with_steps: Callable[[Spec, int], Spec]  # schedules stretch with the steps
+    facts_of: Callable[[Capture], Any]
+    build: Callable[[Spec, Any], Model]  # (spec, facts) -> model
+    first_bytes: Callable[[Spec, Capture], int]  # of the first state and step
+    lighter: str  # which settings make the first state smaller
+    # (spec, facts, model, state, frames) -> milliseconds of each part of a step
+    time_parts: Callable[[Spec, Any, Model, TrainState, Frames], dict[str, float]]
+    # (folder, spec, state) -> what the reader should know of the files it wrote
+    save: Callable[[pathlib.Path, Spec, TrainState], tuple[str, ...]]
+
+
+@functools.cache
+def gaussians() -> Representation:
+    """Gaussian splats, static or moving."""
+    from gaussians_jax import files, presets, scene
+
+    def save(folder, spec, state):
+        files.save(folder / "gaussians.ply", state.params.rows["splats"])
+        if spec.motion is None:
+            return ()
+        return ("gaussians.ply holds the canonical Gaussians, without their motion.",)
+
+    return Representation(
+        name="gaussians",
+        spec_type=scene.SplatScene,
+        presets=presets.PRESETS,
+        with_steps=presets.with_steps,
+        facts_of=scene.facts_of,
+        build=scene.build,
+        first_bytes=scene.first_bytes,
+        lighter="lower start.points, start.random or raster.capacity with --set",
+        time_parts=step_time.of_splats,
+        save=save,
+    )
+
+
+# By the name that `config.json` stores. Makers: what is not used is not imported.
+MAKERS = {"gaussians": gaussians}
+
+
+def named(name: str) -> Representation:
+    """The representation of that name; ValueError where there is none."""
+    if name not in MAKERS:
+        raise ValueError(f"no representation {name!r}; there are {', '.join(MAKERS)}")
+    return MAKERS[name]()
+
+
+def of_preset(preset: str) -> Representation:
+    """The representation that has a preset; ValueError names all there are."""
+    known = []
+    for make in MAKERS.values():
+        if preset in make().presets:
+            return make()
+        known += make().presets
+    raise ValueError(
+        f"--preset {preset}: no such preset; there are {', '.join(sorted(known))}"
+    )
