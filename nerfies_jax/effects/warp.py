@@ -1,0 +1,162 @@
+"""A warp: where in the template the point was that is observed here and now.
+
+Nerfies (Park et al. 2021, arXiv:2011.12948, equations 6-10) moves each point along its
+own screw; D-NeRF (Pumarola et al. 2020, arXiv:2011.13961, equation 1) shifts it. Both
+map the observation to the template, and both are written here as the displacement of
+one point, of which `matrix3.displacement_log_energy` makes an exact elastic energy.
+"""
+
+import dataclasses
+import math
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, Key
+
+from nerfies_jax.effects.effect import MOMENT, Effect, Moment, Table, Vector
+from nerfies_jax.geometry import lie
+from nerfies_jax.nets import encoding, mlp
+from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
+from nerfies_jax.training import schedules
+
+KINDS = ("se3", "translation")
+CONDITIONS = ("code", "time")
+
+
+@dataclasses.dataclass(frozen=True)
+class WarpSpec:
+    """Form and size of the warp; the defaults are Nerfies' (Park et al. 2021).
+
+    `condition="code"` reads a code of the frame, from the table `table`; "time" reads
+    the encoded time, and then time 0 is the template itself (D-NeRF). `anneal_steps`
+    opens the bands of `position` one by one over so many steps (equation 14); None has
+    them open from the start. Without identity in `position`, step 0 of an annealed warp
+    moves all points of a frame alike.
+    """
+
+    kind: str = "se3"
+    condition: str = "code"
+    position: EncodingSpec = EncodingSpec(8)
+    time: EncodingSpec = EncodingSpec(10)
+    code_width: int = 8
+    table: str = "motion"
+    depth: int = 6
+    width: int = 128
+    skips: tuple[int, ...] = (4,)
+    anneal_steps: int | None = None
+
+    def __post_init__(self):
+        if self.kind not in KINDS:
+            raise ValueError(f"unknown kind of warp {self.kind!r}; choose from {KINDS}")
+        if self.condition not in CONDITIONS:
+            raise ValueError(
+                f"unknown condition {self.condition!r} of a warp; choose from "
+                f"{CONDITIONS}"
+            )
+        if self.code_width < 1:
+            raise ValueError(
+                f"code_width={self.code_width} must be at least 1: all frames would "
+                "share one warp"
+            )
+        if self.anneal_steps is not None and self.anneal_steps < 1:
+            raise ValueError(
+                f"anneal_steps={self.anneal_steps} must be at least 1; None opens all "
+                "bands at once"
+            )
+        network(self)  # refuses wrong depths, widths and skips
+
+
+def network(spec: WarpSpec) -> MLPSpec:
+    """What reads [encoded point, condition] and answers the screw or the shift."""
+    condition = spec.code_width if spec.condition == "code" else spec.time.width(1)
+    names = ("angular", "linear") if spec.kind == "se3" else ("linear",)
+    return MLPSpec(
+        inputs=spec.position.width(3) + condition,
+        depth=spec.depth,
+        width=spec.width,
+        heads=tuple((name, HeadSpec(3, "small")) for name in names),
+        skips=spec.skips,
+    )
+
+
+def effect(spec: WarpSpec) -> Effect:
+    """The seams of `spec`."""
+    by_code = spec.condition == "code"
+    return Effect(
+        "warp",
+        tables=(Table(spec.table, MOMENT, spec.code_width),) if by_code else (),
+        init=lambda key: init(spec, key),
+        displace=lambda params, point, moment: displace(spec, params, point, moment),
+    )
+
+
+def init(spec: WarpSpec, key: Key[Array, ""], dtype=jnp.float32) -> MLP:
+    """Nearly the identity: no point of a box of side two moves by more than 1e-4.
+
+    Weights that read an annealed band start at zero. Until it opens they get no
+    gradient, and drawn at random they would then bend a trained warp.
+    """
+    params = mlp.init(network(spec), key, dtype)
+    # mlp.SMALL bounds what each feature adds; their sum has random signs.
+    heads = {
+        name: head._replace(weight=head.weight / math.sqrt(network(spec).features))
+        for name, head in params.heads.items()
+    }
+    hidden = list(params.hidden)
+    if spec.anneal_steps is not None:
+        first = 3 if spec.position.identity else 0
+        for index in ({0} | set(spec.skips)) & set(range(spec.depth)):
+            above = spec.width if index else 0  # rows that read the layer before
+            rows = slice(above + first, above + spec.position.width(3))
+            layer = hidden[index]
+            hidden[index] = layer._replace(weight=layer.weight.at[rows].set(0))
+    return MLP(tuple(hidden), heads)
+
+
+def displace(spec: WarpSpec, params: MLP, point: Vector, moment: Moment) -> Vector:
+    """Template point minus observed point, in units of the field."""
+    encoded = encoding.encode(spec.position, point, window(spec, moment.step, point))
+    if spec.condition == "code":
+        return _move(spec, params, point, encoded, moment.codes[spec.table])
+    time = encoding.encode(spec.time, moment.time[None], None)
+    moved = _move(spec, params, point, encoded, time)
+    return jnp.where(moment.time == 0, 0, moved)
+
+
+def window(
+    spec: WarpSpec, step: Int[Array, ""], like: Float[Array, "..."]
+) -> Float[Array, " bands"] | None:
+    """How far the bands of the point's encoding are open after `step` steps."""
+    if spec.anneal_steps is None or spec.position.bands == 0:
+        return None
+    bands = spec.position.bands
+    alpha = schedules.ramp(0.0, float(bands), spec.anneal_steps)(step)
+    return encoding.anneal(bands, alpha.astype(like.dtype))
+
+
+def _move(spec, params, point, encoded, condition):
+    hidden = _features(spec, params, encoded, condition)
+    screw = {name: mlp.affine(head, hidden) for name, head in params.heads.items()}
+    if spec.kind == "translation":
+        return screw["linear"]
+    return lie.displacement(screw["angular"], screw["linear"], point)
+
+
+def _features(spec, params, encoded, condition):
+    """`mlp.hidden_features` of [encoded, condition], the condition's product apart.
+
+    Under vmap over the samples of a ray it is then computed once for the ray, and under
+    forward mode not at all.
+    """
+    activation = mlp.ACTIVATIONS[network(spec).activation]
+    hidden = encoded
+    for index, layer in enumerate(params.hidden):
+        if index in spec.skips:
+            hidden = jnp.concatenate([hidden, encoded])
+        if index == 0 or index in spec.skips:
+            ours, theirs = jnp.split(layer.weight, [hidden.shape[-1]])
+            offset = condition @ theirs + layer.bias
+            hidden = activation(hidden @ ours + offset)
+        else:
+            hidden = activation(mlp.affine(layer, hidden))
+    return hidden
