@@ -1,0 +1,290 @@
+"""Samples along a ray against NumPy loops and the Nerfies code's values."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from nerfies_jax.radiance import compositing, sampling
+from nerfies_jax.radiance.sampling import NERF_FLOOR
+from tests import gradients
+
+KEY_COUNT = 200
+
+
+def bisect_inverse(edges, weights, shares):
+    """Inverse of the cumulated weights by bisection on its integral, in float64."""
+    edges, weights = np.asarray(edges, np.float64), np.asarray(weights, np.float64)
+    heights = weights / np.diff(edges)
+
+    def integral(x):
+        return np.sum(heights * np.clip(x - edges[:-1], 0, np.diff(edges)))
+
+    samples = []
+    for share in shares:
+        low, high = edges[0], edges[-1]
+        for _ in range(60):
+            middle = (low + high) / 2
+            if integral(middle) < share * weights.sum():
+                low = middle
+            else:
+                high = middle
+        samples.append(high)
+    return np.array(samples)
+
+
+def keys(count=KEY_COUNT):
+    return jax.random.split(jax.random.key(3), count)
+
+
+@pytest.mark.parametrize("spacing", sampling.SPACINGS)
+def test_even_distances_are_even(spacing, dtype):
+    near, far = jnp.asarray(0.3, dtype), jnp.asarray(7.0, dtype)
+    got = sampling.stratified(None, near, far, 9, spacing)
+    assert got.dtype == dtype
+    low, high = float(near), float(far)
+    steps = (
+        [low + (high - low) * i / 8 for i in range(9)]
+        if spacing == "linear"
+        else [8 / ((8 - i) / low + i / high) for i in range(9)]
+    )
+    np.testing.assert_allclose(got, steps, {"float32": 5e-7, "float64": 1e-15}[dtype])
+    assert got[0] == near
+    assert got[-1] == far
+
+
+@pytest.mark.parametrize("spacing", sampling.SPACINGS)
+def test_jittered_distances_fill_their_bins(spacing, dtype):
+    near, far = jnp.asarray(0.5, dtype), jnp.asarray(3.0, dtype)
+    even = np.asarray(sampling.stratified(None, near, far, 6, spacing))
+    halfway = (even[1:] + even[:-1]) / 2
+    lower, upper = np.append(near, halfway), np.append(halfway, far)
+    got = np.asarray(
+        jax.vmap(lambda key: sampling.stratified(key, near, far, 6, spacing))(keys())
+    )
+    ulp = 1e-6
+    assert np.all(got >= lower - ulp)
+    assert np.all(got <= upper + ulp)
+    assert np.all(np.diff(got, axis=1) >= 0)
+    within = (got - lower) / (upper - lower)
+    # uniform: mean 1/2 (5 standard errors of 0.29 / sqrt(200)), both ends visited
+    assert np.all(np.abs(within.mean(0) - 0.5) < 0.11)
+    assert np.all(within.min(0) < 0.1)
+    assert np.all(within.max(0) > 0.9)
+
+
+@pytest.mark.parametrize("gap", [0.0, 1e-7, 1e-6, 1e-3, -0.5])
+@pytest.mark.parametrize("spacing", sampling.SPACINGS)
+def test_distances_never_step_back_however_short_the_ray(spacing, gap, dtype):
+    near = jnp.asarray(0.7, dtype)
+    far = near * jnp.asarray(1 + gap, dtype)
+    for key in (None, jax.random.key(0), jax.random.key(1)):
+        got = np.asarray(sampling.stratified(key, near, far, 64, spacing))
+        assert np.all(np.diff(got) >= 0)
+        assert np.all(got <= float(far))
+        assert gap < 0 or np.all(got >= float(near))
+
+
+def test_distances_follow_near_and_far(float64):
+    near, far = jnp.asarray(0.3), jnp.asarray(1.7)
+    for spacing in sampling.SPACINGS:
+        error = gradients.directional_error(
+            lambda near, far, spacing=spacing: jnp.sum(
+                jnp.sin(
+                    3 * sampling.stratified(jax.random.key(2), near, far, 7, spacing)
+                )
+            ),
+            near,
+            far,
+        )
+        assert error < 1e-8
+
+
+def test_inverse_is_the_bisected_one(dtype, rng):
+    edges = np.sort(rng.uniform(1, 3, 13))
+    weights = rng.uniform(0.1, 1, 12)
+    got = sampling.from_weights(
+        None, jnp.asarray(edges, dtype), jnp.asarray(weights, dtype), 31
+    )
+    wanted = bisect_inverse(edges, weights, np.linspace(0, 1, 31))
+    tolerance = {"float32": 2e-6, "float64": 1e-14}[dtype]
+    np.testing.assert_allclose(got, wanted, atol=tolerance)
+
+
+HARD = {
+    "nothing": np.zeros(16),
+    "1e-31": np.full(16, 1e-31),
+    "1e-37 and less": np.append(np.full(8, 1e-37), np.full(8, 1e-40)),
+    "subnormal": np.full(16, 1e-42),
+    "one hot": np.eye(16)[5],
+    "faint one hot": np.eye(16)[5] * 1e-30,
+    "first": np.eye(16)[0],
+    "last": np.eye(16)[15],
+    "two peaks": np.eye(16)[2] + np.eye(16)[12],
+    "huge": np.full(16, 1e30),
+}
+
+
+@pytest.mark.parametrize("keyed", [False, True])
+@pytest.mark.parametrize("case", HARD)
+def test_hard_weights_give_sorted_samples_in_range(case, keyed, dtype):
+    edges = jnp.asarray(np.linspace(2, 4, 17), dtype)
+    weights = jnp.asarray(HARD[case], dtype)
+    key = jax.random.key(1) if keyed else None
+    got = np.asarray(sampling.from_weights(key, edges, weights, 40))
+    assert got.dtype == dtype
+    assert np.all(np.isfinite(got))
+    assert np.all(got >= 2)
+    assert np.all(got <= 4)
+    assert np.all(np.diff(got) >= 0)
+
+
+@pytest.mark.parametrize("case", ["nothing", "1e-31", "subnormal", "huge"])
+def test_equal_weights_of_any_size_share_alike(case, dtype):
+    edges = jnp.asarray(np.linspace(2, 4, 17), dtype)
+    got = sampling.from_weights(None, edges, jnp.asarray(HARD[case], dtype), 33)
+    np.testing.assert_allclose(
+        got, np.linspace(2, 4, 33), rtol={"float32": 5e-7, "float64": 1e-15}[dtype]
+    )
+
+
+@pytest.mark.parametrize(
+    "case", ["one hot", "faint one hot", "two peaks", "first", "last"]
+)
+def test_peaks_draw_all_samples_however_faint(case, dtype):
+    """But the ends u = 0 and 1 of the even shares, which are the ends of the range."""
+    weights = jnp.asarray(HARD[case], dtype)
+    edges = np.linspace(2, 4, 17)
+    got = np.asarray(
+        sampling.from_weights(None, jnp.asarray(edges, dtype), weights, 34)
+    )
+    wanted = bisect_inverse(edges, HARD[case], np.linspace(0, 1, 34))
+    # 16 floors of one rounding unit on a sum of one, on bins of 1/8
+    tolerance = {"float32": 3e-6, "float64": 1e-13}[dtype]
+    np.testing.assert_allclose(got[1:-1], wanted[1:-1], atol=tolerance)
+    keyed = np.asarray(
+        sampling.from_weights(
+            jax.random.key(0), jnp.asarray(edges, dtype), weights, 500
+        )
+    )
+    bins = np.clip(np.searchsorted(edges, keyed, side="right") - 1, 0, 15)
+    assert np.all(HARD[case][bins] > 0)
+
+
+def test_random_shares_are_stratified_and_unbiased(dtype, rng):
+    weights = rng.uniform(0, 1, 8)
+    edges = np.linspace(0, 1, 9)
+    got = np.asarray(
+        jax.vmap(
+            lambda key: sampling.from_weights(
+                key, jnp.asarray(edges, dtype), jnp.asarray(weights, dtype), 25
+            )
+        )(keys())
+    )
+    # back through the cumulated weights: one share in each 25th of [0, 1]
+    shares = np.interp(got, edges, np.append(0, np.cumsum(weights)) / weights.sum())
+    lower = np.arange(25) / 25
+    assert np.all(shares >= lower - 1e-5)
+    assert np.all(shares <= lower + 1 / 25 + 1e-5)
+    within = (shares - lower) * 25
+    assert np.all(np.abs(within.mean(0) - 0.5) < 0.11)
+
+
+def test_thousands_of_bins_stay_in_range(dtype, rng):
+    """cdf[-1] is 1 only to 1e-7 and sums in a tree may step back."""
+    weights = jnp.asarray(rng.uniform(0, 1, 4096) ** 8, dtype)
+    edges = jnp.asarray(np.linspace(0, 1, 4097), dtype)
+    for key in (None, jax.random.key(0)):
+        got = np.asarray(sampling.from_weights(key, edges, weights, 4096))
+        assert np.all(np.diff(got) >= 0)
+        assert got.min() >= 0
+        assert got.max() <= 1
+    assert got.max() > 0.99
+
+
+def test_no_gradient_passes_through_the_samples(dtype, rng):
+    edges = jnp.asarray(np.linspace(0, 1, 9), dtype)
+    weights = jnp.asarray(rng.uniform(0, 1, 8), dtype)
+    slopes = jax.grad(
+        lambda e, w: jnp.sum(sampling.from_weights(jax.random.key(0), e, w, 7)),
+        argnums=(0, 1),
+    )(edges, weights)
+    for slope in slopes:
+        np.testing.assert_array_equal(slope, 0)
+
+
+def test_refined_distances_carry_no_gradient_to_the_weights(dtype, rng):
+    distances = jnp.asarray(np.linspace(1, 2, 8), dtype)
+
+    def spread(optical_depth):
+        weights = compositing.weights(optical_depth)
+        return jnp.sum(sampling.refine(None, distances, weights, 6) ** 2)
+
+    np.testing.assert_array_equal(jax.grad(spread)(jnp.full(8, 0.3, dtype)), 0)
+
+
+def test_union_keeps_all_and_their_gradients(dtype):
+    coarse = jnp.asarray([1.0, 2.0, 3.0], dtype)
+    fine = jnp.asarray([2.5, 2.0, 0.5], dtype)  # one tie
+    np.testing.assert_array_equal(
+        sampling.union(coarse, fine), np.asarray([0.5, 1, 2, 2, 2.5, 3])
+    )
+    by_coarse, by_fine = jax.grad(
+        lambda c, f: jnp.sum(sampling.union(c, f) ** 2), argnums=(0, 1)
+    )(coarse, fine)
+    np.testing.assert_array_equal(by_coarse, 2 * coarse)
+    np.testing.assert_array_equal(by_fine, 2 * fine)
+
+
+def test_refine_asks_more_where_light_stops(dtype):
+    distances = jnp.asarray(np.linspace(1, 2, 11), dtype)
+    weights = jnp.zeros(11, dtype).at[4].set(0.7).at[10].set(0.3)  # the last: behind
+    got = np.asarray(sampling.refine(jax.random.key(0), distances, weights, 20))
+    assert got.shape == (31,)
+    assert np.all(np.diff(got) >= 0)
+    new = np.setdiff1d(got, np.asarray(distances))
+    assert new.size >= 19  # one may fall on a coarse one
+    assert np.all((new > 1.35 - 1e-6) & (new < 1.45 + 1e-6))
+
+
+def test_wrong_requests_are_refused():
+    near, far = jnp.asarray(0.1, jnp.float32), jnp.asarray(1.0, jnp.float32)
+    line = jnp.linspace(near, far, 5)
+    with pytest.raises(ValueError, match="count=1"):
+        sampling.stratified(None, near, far, 1)
+    with pytest.raises(ValueError, match="'log'"):
+        sampling.stratified(None, near, far, 4, "log")
+    with pytest.raises(ValueError, match="5 edges do not bound 5 bins"):
+        sampling.from_weights(None, line, line, 4)
+    with pytest.raises(ValueError, match="count=0"):
+        sampling.from_weights(None, line, line[1:], 0)
+    with pytest.raises(ValueError, match="2 distances"):
+        sampling.refine(None, line[:2], line[:2], 4)
+
+
+@pytest.mark.parametrize("spacing", sampling.SPACINGS)
+def test_nerfies_even_distances(spacing, oracle_dir, dtype):
+    values = np.load(oracle_dir / "nerfies.npz")
+    prefix = "unit" if dtype == "float32" else "unit64"
+    wanted = values[f"{prefix}/sample/{spacing}8"][0]
+    near, far = jnp.asarray(0.05, dtype), jnp.asarray(0.8, dtype)
+    got = sampling.stratified(None, near, far, 8, spacing)
+    np.testing.assert_allclose(got, wanted, {"float32": 5e-7, "float64": 1e-15}[dtype])
+
+
+def test_nerfies_inverse(oracle_dir, dtype):
+    values = np.load(oracle_dir / "nerfies.npz")
+    bins = jnp.asarray(values["unit/pdf/bins"], dtype)
+    weights = jnp.asarray(values["unit/pdf/weights"], dtype)
+    prefix = "unit" if dtype == "float32" else "unit64"
+    wanted = values[f"{prefix}/pdf/det16"]
+
+    def invert(floor):
+        return jax.vmap(
+            lambda b, w: sampling.from_weights(None, b, w, 16, floor=floor)
+        )(bins, weights)
+
+    tolerance = {"float32": 2e-6, "float64": 1e-14}[dtype]
+    np.testing.assert_allclose(invert(NERF_FLOOR), wanted, atol=tolerance)
+    # its floor against ours: 8 bins of 1e-5 beside weights that sum to about 4
+    np.testing.assert_allclose(invert(None), wanted, atol=5e-5)
