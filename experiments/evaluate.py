@@ -1,7 +1,8 @@
 """Render a trained model and score it on the frames it never learnt from."""
 
 import time
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -72,6 +73,14 @@ def path_views(path: Camera, times: np.ndarray, like: View) -> list[View]:
     ]
 
 
+class Halves(NamedTuple):
+    """Scores of the right halves of frames whose codes were fitted to the left ones."""
+
+    rows: np.ndarray  # of the capture
+    psnr: np.ndarray  # dB, of the 8-bit picture
+    ssim: np.ndarray
+
+
 class Renderer:
     """A model's whole-frame function; compiled once for each shape of its state."""
 
@@ -80,7 +89,7 @@ class Renderer:
             lambda params, view, step: model.render(params, view, size, step)
         )
         self._programs = {}
-        self.model, self.size = model, size
+        self.size = size  # width and height in pixels
         self.seconds: list[float] = []  # of every frame, without compiling
 
     def __call__(self, state: TrainState, view: View) -> Rendering:
@@ -121,6 +130,34 @@ def score(
         psnr=psnr,
         ssim=ssim,
     )
+
+
+def score_halves(
+    fit_code: Callable[[View, np.ndarray, np.ndarray | None], Any],
+    render: Callable[[View, Any], Rendering],
+    capture: Capture,
+    rows: np.ndarray,
+) -> Halves:
+    """Score frames whose appearance was never learnt, by NeRF-W's protocol.
+
+    `fit_code(view, left, valid)` finds the codes of a frame from its left half alone,
+    uint8 [height, width // 2, 3] and which of it was filmed (or None), with the network
+    frozen; `render(view, codes)` draws the whole frame with them, and its right half
+    is scored (Martin-Brualla et al. 2021, section 5).
+    """
+    scores = []
+    for row in rows:
+        view, picture = view_of(capture, row), capture.images[row]
+        valid = None if capture.valid is None else capture.valid[row]
+        half = picture.shape[1] // 2
+        left = None if valid is None else valid[:, :half]
+        codes = fit_code(view, picture[:, :half], left)
+        colour = np.asarray(render(view, codes).colour)[:, half:]
+        truth = picture[:, half:].astype(np.float32) / 255
+        right = None if valid is None else valid[:, half:]
+        scores.append(jax.device_get(_score(colour, truth, right)))
+    psnr, ssim = np.asarray(scores).T
+    return Halves(np.asarray(rows), psnr, ssim)
 
 
 @jax.jit

@@ -25,8 +25,9 @@ class Reconstruct:
     capture: run_settings.Positional[pathlib.Path | None] = None
     """Folder in Nerfies, HyperNeRF, Blender, D-NeRF or COLMAP layout."""
     preset: str | None = None
-    """splats-static, splats-deformable, or either with -small for a CPU (default:
-    splats-deformable-small)."""
+    """Gaussian splats: splats-static, splats-deformable. Radiance fields: nerf, nerf-w,
+    d-nerf, t-nerf, nerfies, hypernerf, nsff. Each with -small is made for a CPU
+    (default: splats-deformable-small)."""
     scene: str = "default"
     """Which built-in scene, where no capture is given."""
     steps: int | None = None
@@ -48,7 +49,7 @@ class Reconstruct:
     heldout: str | None = None
     """Which frames to score: n for every n-th, or the name of a split."""
     set: tuple[str, ...] = ()
-    """Fields of the preset, as density.most=20000 motion.width=128."""
+    """Fields of the preset, as density.most=20000 motion.width=128 warp=none."""
     evaluate_every: float = 20.0
     """Seconds of training between two points of the PSNR curve."""
 

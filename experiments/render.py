@@ -3,6 +3,9 @@
 python -m experiments.render RUN                         # the held-out frames
 python -m experiments.render RUN --path orbit            # mp4 of the moving scene
 python -m experiments.render RUN --path sway --freeze 0.5
+python -m experiments.render RUN --path sway --show depth
+python -m experiments.render RUN --without warp          # the canonical scene
+python -m experiments.render RUN --path sway --freeze 0 --appearance 0 7
 """
 
 import dataclasses
@@ -31,6 +34,14 @@ class Render:
     """Stop the scene at this time in [0, 1]; the camera goes on."""
     slow: float = 1.0
     """Play so many times slower: 4 shows a quarter of the scene in the same frames."""
+    without: tuple[str, ...] = ()
+    """Effects to leave out: warp or motion shows the canonical scene, transient or
+    scene_flow only what is static."""
+    appearance: tuple[str, str] | None = None
+    """Go from one appearance to another along the pictures: two frame names, or two
+    appearance ids."""
+    show: Literal["colour", "depth"] = "colour"
+    """What the png and mp4 pictures show; depth is bright near and dark far."""
     out: pathlib.Path | None = None
     """Folder for the pictures (default: RUN/renders/PATH)."""
     formats: tuple[Literal["png", "mp4", "exr"], ...] = ("png", "mp4")
@@ -61,16 +72,54 @@ def main(arguments=None):
 
         run = runs.saved_run(asked.run)
         state = runs.restore(asked.run, run).state
+        size = _size(run.capture.size, asked.max_side)
+        renderer = _renderer(asked, run, size)
+        names, views = _views(asked, run)
+        views = _seen(asked, run, size, views)
         out = asked.out or asked.run / "renders" / _name(asked)
         out.mkdir(parents=True, exist_ok=True)
-        names, views = _views(asked, run)
-    _write(asked, out, run, state, names, views)
+    _write(asked, out, renderer, state, names, views)
 
 
 def _name(asked):
     frozen = "" if asked.freeze is None else f"-at-{asked.freeze:g}"
     slow = "" if asked.slow == 1 else f"-slow-{asked.slow:g}"
-    return f"{asked.path}{frozen}{slow}"
+    without = "".join(f"-without-{name}" for name in asked.without)
+    named = [pathlib.PurePath(name).name for name in asked.appearance or ()]
+    blended = "" if not named else f"-from-{named[0]}-to-{named[1]}"
+    depth = "" if asked.show == "colour" else f"-{asked.show}"
+    return f"{asked.path}{frozen}{slow}{without}{blended}{depth}"
+
+
+def _renderer(asked, run, size):
+    """Of the model, or of a variant of it; ValueError where the run has none such."""
+    from experiments import evaluate
+
+    model, blended = run.model, asked.appearance is not None
+    if asked.without or blended:
+        make = run.representation.variant
+        model = model._replace(render=make(run.spec, run.facts, asked.without, blended))
+    return evaluate.Renderer(model, size)
+
+
+def _seen(asked, run, size, views):
+    """Views of the size asked for, each with its share of the two appearances."""
+    import jax.numpy as jnp
+
+    from experiments import evaluate, variants
+
+    views = [evaluate.resized(view, run.capture.size, size) for view in views]
+    if asked.appearance is None:
+        return views
+    start, end = (
+        jnp.asarray(variants.appearance_id(run.capture, name), jnp.int32)
+        for name in asked.appearance
+    )
+    shares = np.linspace(0, 1, len(views), dtype=np.float32)
+    return [
+        variants.Between(view._replace(appearance=start), end, jnp.asarray(share))
+        for view, share in zip(views, shares, strict=True)
+    ]
 
 
 def _views(asked, run):
@@ -95,18 +144,16 @@ def _views(asked, run):
     return names, evaluate.path_views(path, times, like)
 
 
-def _write(asked, out, run, state, names, views):
+def _write(asked, out, renderer, state, names, views):
     """Render view after view and write each as it comes."""
-    from experiments import evaluate
     from nerfies_jax.capture import exr, images, video
 
-    size = _size(run.capture.size, asked.max_side)
-    renderer = evaluate.Renderer(run.model, size)
+    picture_of = _Pictures(asked.show)
 
     def pictures():
         for name, view in zip(names, views, strict=True):
-            rendering = renderer(state, evaluate.resized(view, run.capture.size, size))
-            picture = evaluate.as_picture(rendering.colour)
+            rendering = renderer(state, view)
+            picture = picture_of(rendering)
             if "png" in asked.formats:
                 images.write_png(out / f"{name}.png", picture)
             if "exr" in asked.formats:
@@ -123,10 +170,29 @@ def _write(asked, out, run, state, names, views):
     else:
         for _ in pictures():
             pass
+    width, height = renderer.size
     print(
-        f"{len(names)} pictures of {size[0]}x{size[1]}, "
+        f"{len(names)} pictures of {width}x{height}, "
         f"{renderer.ms_per_frame(len(names)):.0f} ms each, in {out}"
     )
+
+
+class _Pictures:
+    """Renderings as 8-bit pictures; depths all over the range of the first."""
+
+    def __init__(self, show):
+        self.show, self.limits = show, None
+
+    def __call__(self, rendering):
+        from experiments import evaluate, pictures
+
+        if self.show == "colour":
+            return evaluate.as_picture(rendering.colour)
+        known = rendering.alpha > 0.5
+        coloured = pictures.colour_depth(rendering.depth, known, self.limits)
+        if known.any():
+            self.limits = coloured.low, coloured.high
+        return coloured.picture
 
 
 def _size(size, max_side):

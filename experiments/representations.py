@@ -5,7 +5,7 @@ import pathlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from experiments import step_time
+from experiments import step_time, variants
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.training.model import Frames, Model, TrainState
 
@@ -19,12 +19,15 @@ class Representation(NamedTuple):
     spec_type: type
     presets: dict[str, Spec]
     with_steps: Callable[[Spec, int], Spec]  # schedules stretch with the steps
-    facts_of: Callable[[Capture], Any]
+    facts_of: Callable[[Capture, Spec], Any]
     build: Callable[[Spec, Any], Model]  # (spec, facts) -> model
     first_bytes: Callable[[Spec, Capture], int]  # of the first state and step
     lighter: str  # which settings make the first state smaller
     # (spec, facts, model, state, frames) -> milliseconds of each part of a step
     time_parts: Callable[[Spec, Any, Model, TrainState, Frames], dict[str, float]]
+    # (spec, facts, effects left out, whether appearances are blended) -> like
+    # `Model.render`; of a `variants.Between` instead of a view where they are.
+    variant: Callable[[Spec, Any, tuple[str, ...], bool], Callable]
     # (folder, spec, state) -> what the reader should know of the files it wrote
     save: Callable[[pathlib.Path, Spec, TrainState], tuple[str, ...]]
 
@@ -45,12 +48,33 @@ def gaussians() -> Representation:
         spec_type=scene.SplatScene,
         presets=presets.PRESETS,
         with_steps=presets.with_steps,
-        facts_of=scene.facts_of,
+        facts_of=lambda capture, spec: scene.facts_of(capture),
         build=scene.build,
         first_bytes=scene.first_bytes,
         lighter="lower start.points, start.random or raster.capacity with --set",
         time_parts=step_time.of_splats,
+        variant=variants.of_splats,
         save=save,
+    )
+
+
+@functools.cache
+def radiance() -> Representation:
+    """Radiance fields of the NeRF family."""
+    from nerfies_jax import presets, scene
+
+    return Representation(
+        name="radiance",
+        spec_type=scene.RadianceScene,
+        presets=presets.PRESETS,
+        with_steps=presets.with_steps,
+        facts_of=scene.facts_of,
+        build=scene.build,
+        first_bytes=scene.first_bytes,
+        lighter="lower rays, sampling.coarse or sampling.fine with --set",
+        time_parts=step_time.of_fields,
+        variant=variants.of_fields,
+        save=lambda folder, spec, state: (),  # the checkpoint holds all there is
     )
 
 

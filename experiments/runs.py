@@ -56,7 +56,7 @@ def new_run(choices: Choices) -> Run:
 def open_run(choices: Choices, representation: Representation, spec: Any) -> Run:
     """Read the capture and build the model."""
     capture = read_capture(choices)
-    facts = representation.facts_of(capture)
+    facts = representation.facts_of(capture, spec)
     model = representation.build(spec, facts)
     return Run(choices, capture, representation, spec, facts, model)
 

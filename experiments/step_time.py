@@ -3,25 +3,24 @@
 import jax
 import jax.numpy as jnp
 
-from gaussians_jax import render, splats
-from gaussians_jax import scene as splat_scene
-from gaussians_jax.effects.effect import Moment
-from gaussians_jax.scene import Facts, SplatScene
 from nerfies_jax.measure import clock
-from nerfies_jax.training import losses
+from nerfies_jax.training import loop, losses
 from nerfies_jax.training.model import Frames, Model, TrainState
 
 REPEATS = 7
 
 
 def of_splats(
-    spec: SplatScene, facts: Facts, model: Model, state: TrainState, frames: Frames
+    spec, facts, model: Model, state: TrainState, frames: Frames
 ) -> dict[str, float]:
     """Milliseconds of each part of one step, forward and backward; medians, warm.
 
     Each part is timed by itself on the first frame. What is left of the whole step is
     the optimiser and the statistics for the density control.
     """
+    from gaussians_jax import render, scene, splats
+    from gaussians_jax.effects.effect import Moment
+
     params = state.params
     size = frames.images.shape[2], frames.images.shape[1]
     camera = jax.tree.map(lambda leaf: leaf[0], frames.cameras)
@@ -44,7 +43,7 @@ def of_splats(
         "project and blend": _ms(jax.grad(draw, (0, 1)), gaussians, coefficients),
         "loss": _ms(jax.grad(compare), truth),
     }
-    for effect in splat_scene.effects_of(spec, facts):
+    for effect in scene.effects_of(spec, facts):
 
         def deform(params, effect=effect):
             gaussians = splats.activate(params.rows["splats"])
@@ -55,6 +54,32 @@ def of_splats(
     whole = _ms(lambda state: model.step(state, frames), state)
     timed["optimiser and statistics"] = max(whole - sum(timed.values()), 0.0)
     return timed
+
+
+def of_fields(
+    spec, facts, model: Model, state: TrainState, frames: Frames
+) -> dict[str, float]:
+    """Milliseconds of each part of one step of a radiance field; medians, warm."""
+    from nerfies_jax import scene
+
+    made = scene.field(spec, facts)
+    batch_key, loss_key = jax.random.split(loop.step_key(state))
+    batch = jax.jit(scene.draw_batch, static_argnums=1)(frames, spec.rays, batch_key)
+
+    def loss(params, batch):
+        terms = scene.loss_terms(
+            spec, facts, made, params, frames, batch, state.step, loss_key
+        )
+        return sum(term.weight * term.value for term in terms.values())
+
+    forward = _ms(loss, state.params, batch)
+    both = _ms(jax.value_and_grad(loss), state.params, batch)
+    whole = _ms(lambda state: model.step(state, frames), state)
+    return {
+        "forward": forward,
+        "backward": max(both - forward, 0.0),
+        "rays and optimiser": max(whole - both, 0.0),
+    }
 
 
 def _ms(function, *args):

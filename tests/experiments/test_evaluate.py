@@ -100,3 +100,34 @@ def test_a_resized_view_shows_the_same_directions(new):
     there, same_depth = cameras.project(small.camera, point)
     assert depth == same_depth > 0
     np.testing.assert_allclose(there * (SIZE[0] / new[0]), here, rtol=1e-5)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_the_code_sees_the_left_half_and_the_score_the_right(masked):
+    capture = scenes.tiny_capture()
+    valid = np.ones(capture.images.shape[:3], bool)
+    valid[:, :, -4:] = False
+    capture = dataclasses.replace(capture, valid=valid if masked else None)
+    seen = []
+
+    def fit_code(view, left, filmed):
+        seen.append((float(view.time), left, filmed))
+        return left.mean() / 255
+
+    def render(view, code):
+        picture = np.full((30, 40, 3), code, np.float32)
+        picture[:, :20] = 5.0  # what is wrong on the left costs nothing
+        return Rendering(picture, None, None)
+
+    found = evaluate.score_halves(fit_code, render, capture, capture.heldout)
+    np.testing.assert_array_equal(found.rows, capture.heldout)
+    for place, row in enumerate(capture.heldout):
+        time, left, filmed = seen[place]
+        assert time == capture.times[row]
+        np.testing.assert_array_equal(left, capture.images[row, :, :20])
+        assert filmed.shape == (30, 20) if masked else filmed is None
+        level = np.round(left.mean()) / 255
+        right = capture.images[row, :, 20 : 36 if masked else 40] / 255
+        exact = -10 * np.log10(np.mean((right - level) ** 2))
+        np.testing.assert_allclose(found.psnr[place], exact, atol=1e-3)
+        assert 0 < found.ssim[place] < 1

@@ -2,11 +2,13 @@
 
 import json
 import pathlib
+import re
 
 import numpy as np
 import pytest
+from matplotlib import colormaps
 
-from experiments import reconstruct, render
+from experiments import reconstruct, render, representations
 from nerfies_jax.capture import exr, images, nerfies_format, video
 from tests import scenes
 
@@ -137,7 +139,10 @@ def test_help_names_the_presets(capsys):
     with pytest.raises(SystemExit) as stop:
         reconstruct.main(["--help"])
     assert stop.value.code == 0
-    assert "splats-deformable" in capsys.readouterr().out
+    page = re.sub(r"[\s│]", "", capsys.readouterr().out)  # as if it were one line
+    for make in representations.MAKERS.values():
+        for preset in make().presets:
+            assert preset.removesuffix("-small") in page
 
 
 @pytest.fixture(scope="module")
@@ -218,6 +223,35 @@ def test_a_run_is_rendered_at_other_times_and_places(run, tmp_path):
     assert picture.shape == (24, 32, 3)
     assert len(list(video.read_video(tmp_path / "film.mp4"))) == 3
     assert exr.read_exr(tmp_path / "0001.exr").depth.shape == (24, 32)
+
+
+@pytest.mark.slow
+def test_the_canonical_scene_and_its_depth_are_rendered(run, tmp_path):
+    arguments = [str(run), "--without", "motion", "--formats", "png"]
+    render.main([*arguments, "--show", "depth"])
+    (picture,) = (run / "renders" / "heldout-without-motion-depth").glob("*.png")
+    picture, _ = images.read_image(picture)
+    near, far = (255 * np.array(colormaps["viridis"](end)[:3]) for end in (1.0, 0.0))
+    known = picture[(picture != 128).any(axis=-1)].astype(float)
+    assert np.abs(known - near).max(axis=1).min() < 20
+    assert np.abs(known - far).max(axis=1).min() < 20
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--without", "warp"], "it has motion"),
+        (["--appearance", "0", "1"], "no appearance codes"),
+    ],
+)
+def test_a_render_that_a_run_cannot_give_is_refused(run, capsys, arguments, words):
+    with pytest.raises(SystemExit) as stop:
+        render.main([str(run), *arguments])
+    assert stop.value.code == 2
+    line = capsys.readouterr().err
+    assert words in line
+    assert line.count("\n") == 1
 
 
 @pytest.mark.slow

@@ -1,0 +1,86 @@
+"""A trained scene drawn otherwise: effects left out, appearances blended."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.training.model import View
+
+
+class Between(NamedTuple):
+    """A view whose appearance lies between those of two frames."""
+
+    view: View  # its own appearance is the one at share 0
+    towards: Int[Array, ""]  # appearance id at share 1
+    share: Float[Array, ""]  # in [0, 1]
+
+
+def of_splats(spec, facts, without: tuple[str, ...], blended: bool) -> Callable:
+    """Drawing as `Model.render` does, some effects left out."""
+    from gaussians_jax import scene
+
+    if blended:
+        raise ValueError(
+            "--appearance: splats have no appearance codes; reconstruct with a preset "
+            "that has them, as nerf-w or nerfies"
+        )
+    there = [name for name in ("motion",) if getattr(spec, name) is not None]
+    _check_there(without, there)
+    left = dataclasses.replace(spec, **dict.fromkeys(without))
+    return scene.build(left, facts).render
+
+
+def of_fields(spec, facts, without: tuple[str, ...], blended: bool) -> Callable:
+    """Drawing as `Model.render` does, some effects left out, or of a `Between`."""
+    from nerfies_jax import scene
+    from nerfies_jax.effects.effect import APPEARANCE
+
+    whole = scene.field(spec, facts)
+    _check_there(without, [effect.name for effect in whole.effects])
+    made = scene.field(spec, facts, without)
+    tables = [table for effect in made.effects for table in effect.tables]
+    if blended and all(table.by != APPEARANCE for table in tables):
+        raise ValueError(
+            "--appearance: this field has no appearance codes; reconstruct with a "
+            "preset that has them, as nerf-w or nerfies"
+        )
+
+    def plain(params, view, size, step):
+        codes = made.codes_at(params, view)
+        return made.render(params, view.camera, view.time, codes, size, step)
+
+    def blend(params, between, size, step):
+        view, share = between.view, between.share
+        start = made.codes_at(params, view)
+        end = made.codes_at(params, view._replace(appearance=between.towards))
+        # Codes of the moment are the same at both ends and stay as they are.
+        codes = {name: (1 - share) * start[name] + share * end[name] for name in start}
+        return made.render(params, view.camera, view.time, codes, size, step)
+
+    return blend if blended else plain
+
+
+def appearance_id(capture: Capture, name: str) -> int:
+    """The appearance of a frame, by its name, or an appearance id itself."""
+    if name in capture.ids:
+        return int(capture.appearance_ids[capture.ids.index(name)])
+    known = np.unique(capture.appearance_ids)
+    if name.isdigit() and int(name) in known:
+        return int(name)
+    raise ValueError(
+        f"--appearance {name}: neither a frame of {capture.name}, as "
+        f"{capture.ids[0]!r}, nor one of its appearance ids, {known[0]} to {known[-1]}"
+    )
+
+
+def _check_there(without, there):
+    for name in without:
+        if name not in there:
+            raise ValueError(
+                f"--without {name}: the run has no such effect; it has "
+                + (", ".join(there) or "none")
+            )
