@@ -12,6 +12,14 @@ from nerfies_jax.radiance import compositing
 from nerfies_jax.radiance.compositing import AT_INFINITY, EMPTY_BELOW
 from tests import gradients
 
+# Compiled once for each precision and shape, which is much quicker than by operation.
+weights_of = jax.jit(compositing.weights)
+media_weights_of = jax.jit(compositing.media_weights)
+composite = jax.jit(compositing.composite)
+composite_media = jax.jit(compositing.composite_media)
+thinned = jax.jit(compositing.thinned)
+
+
 # A few roundings of numbers up to one.
 ABSOLUTE = {"float32": 5e-7, "float64": 2e-15}
 RELATIVE = {"float32": 1e-6, "float64": 1e-14}
@@ -44,13 +52,13 @@ def test_weights_are_exact_from_thin_air_to_walls(level, dtype, rng):
     # relative where float32 can hold the number; depths add up errors of their own size
     tolerance = RELATIVE[dtype] * (1 + np.cumsum(depth))
     shown = exact > 1e-30
-    got = np.asarray(compositing.weights(depth), np.float64)
+    got = np.asarray(weights_of(depth), np.float64)
     assert np.all(np.abs(got / np.where(shown, exact, 1) - 1)[shown] < tolerance[shown])
     assert np.all(got[~shown] < 2e-30)
 
 
 def test_thin_air_keeps_its_weight(dtype):
-    weights = compositing.weights(jnp.full(128, 1e-8, dtype))
+    weights = weights_of(jnp.full(128, 1e-8, dtype))
     assert abs(float(jnp.sum(weights)) / 1.28e-6 - 1) < 1e-5
 
 
@@ -74,8 +82,8 @@ def test_weights_never_sum_to_more_than_one(case, dtype, rng):
 def test_a_last_sample_at_infinity_leaves_the_others_alone(dtype, rng):
     depth = jnp.asarray(rng.uniform(0, 0.3, 20), dtype)
     closed = depth.at[-1].set(AT_INFINITY)
-    weights = compositing.weights(closed)
-    np.testing.assert_array_equal(weights[:-1], compositing.weights(depth)[:-1])
+    weights = weights_of(closed)
+    np.testing.assert_array_equal(weights[:-1], weights_of(depth)[:-1])
     passed = np.exp(-np.sum(np.asarray(depth[:-1], np.float64)))
     assert abs(float(weights[-1]) - passed) < ABSOLUTE[dtype]
 
@@ -84,7 +92,7 @@ def test_a_last_sample_at_infinity_leaves_the_others_alone(dtype, rng):
 def test_density_at_infinity_has_finite_values_and_slopes(density, dtype):
     def seen(density):
         spacing = compositing.intervals(jnp.asarray([1.0, 2.0, 4.0], dtype), 1e10)
-        return compositing.weights(density * spacing)
+        return weights_of(density * spacing)
 
     constant = jnp.full(3, density, dtype)
     assert np.all(np.isfinite(seen(constant)))
@@ -93,7 +101,7 @@ def test_density_at_infinity_has_finite_values_and_slopes(density, dtype):
 
 def test_an_overflowing_depth_is_opaque(dtype):
     depth = jnp.asarray([0.1, np.inf, 1.0, np.inf], dtype)
-    weights, slopes = compositing.weights(depth), jax.jacrev(compositing.weights)(depth)
+    weights, slopes = weights_of(depth), jax.jacrev(compositing.weights)(depth)
     np.testing.assert_allclose(weights, [1 - np.exp(-0.1), np.exp(-0.1), 0, 0], 1e-6)
     assert np.all(np.isfinite(slopes))
 
@@ -102,7 +110,7 @@ def test_weights_have_the_slopes_of_central_differences(float64, rng):
     depth = jnp.asarray(rng.uniform(0, 1, 12))
     cotangent = jnp.asarray(rng.normal(size=12))
     error = gradients.directional_error(
-        lambda d: jnp.vdot(compositing.weights(d), cotangent), depth
+        lambda d: jnp.vdot(weights_of(d), cotangent), depth
     )
     assert error < 1e-8
 
@@ -111,26 +119,22 @@ def test_weights_have_the_slopes_of_central_differences(float64, rng):
 def test_media_share_their_transmittance(level, dtype, rng):
     depth = jnp.asarray(rng.uniform(0.1, 1, (3, 16)) * level, dtype)
     exact = exact_weights(depth)
-    got = np.asarray(compositing.media_weights(depth), np.float64)
+    got = np.asarray(media_weights_of(depth), np.float64)
     tolerance = RELATIVE[dtype] * (1 + np.cumsum(np.sum(depth, axis=0)))
     assert np.all(np.abs(got - exact) <= tolerance * exact + 1e-35)
 
 
 def test_one_medium_is_no_media(dtype, rng):
     depth = jnp.asarray(rng.uniform(0, 1, 16), dtype)
-    np.testing.assert_array_equal(
-        compositing.media_weights(depth[None])[0], compositing.weights(depth)
-    )
+    np.testing.assert_array_equal(media_weights_of(depth[None])[0], weights_of(depth))
 
 
 def test_overlapping_media_count_as_in_the_papers(dtype):
     """Both walls of one sample are seen whole; opacity stays that of the ray."""
     depth = jnp.full((2, 1), 50.0, dtype)
-    np.testing.assert_allclose(compositing.media_weights(depth), 1, rtol=1e-6)
+    np.testing.assert_allclose(media_weights_of(depth), 1, rtol=1e-6)
     colours = jnp.asarray([[[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]], dtype)
-    seen = compositing.composite_media(
-        depth, colours, jnp.ones(1, dtype), jnp.ones(3, dtype)
-    )
+    seen = composite_media(depth, colours, jnp.ones(1, dtype), jnp.ones(3, dtype))
     np.testing.assert_allclose(seen.colour, [1, 1, 0], atol=1e-6)
     assert abs(float(seen.alpha) - 1) < 1e-6
 
@@ -139,7 +143,7 @@ def test_media_composite_term_by_term(float64, rng):
     depth = rng.uniform(0, 0.3, (2, 9))
     colours, background = rng.uniform(size=(2, 9, 3)), rng.uniform(size=3)
     distances = np.sort(rng.uniform(1, 2, 9))
-    seen = compositing.composite_media(
+    seen = composite_media(
         *(jnp.asarray(x) for x in (depth, colours, distances, background))
     )
     passed = np.exp(-depth.sum())
@@ -157,24 +161,35 @@ LOGITS = [-100.0, -20.0, -1.0, 0.0, 3.0, 20.0, 100.0]
 DEPTHS = [0.0, 1e-8, 0.1, 1.0, 17.0, 50.0, 1e10]
 
 
+@functools.cache
+def thin_grid(dtype):
+    """Value and both slopes for all of `DEPTHS` and `LOGITS`, inside the precision."""
+    depth, logit = jnp.meshgrid(
+        jnp.asarray(DEPTHS, dtype), jnp.asarray(LOGITS, dtype), indexing="ij"
+    )
+    function = jax.value_and_grad(compositing.thinned, argnums=(0, 1))
+    value, slopes = jax.jit(jax.vmap(jax.vmap(function)))(depth, logit)
+    return np.asarray(value, np.float64), np.asarray(slopes, np.float64)
+
+
 @pytest.mark.parametrize("logit", LOGITS)
 @pytest.mark.parametrize("depth", DEPTHS)
 def test_thinned_is_exact_with_finite_slopes(depth, logit, dtype):
-    depth, logit = jnp.asarray(depth, dtype), jnp.asarray(logit, dtype)
+    values, slopes = thin_grid(dtype)
+    row, column = DEPTHS.index(depth), LOGITS.index(logit)
+    depth, logit = float(np.asarray(depth, dtype)), float(np.asarray(logit, dtype))
     exact = exact_thinned(depth, logit)
-    got = float(compositing.thinned(depth, logit))
     # float32 has no sigmoid(-100)
-    assert abs(got - exact) <= RELATIVE[dtype] * exact + 1e-38
-    slopes = jax.grad(compositing.thinned, argnums=(0, 1))(depth, logit)
+    assert abs(values[row, column] - exact) <= RELATIVE[dtype] * exact + 1e-38
     with mpmath.workdps(200):
-        share = 1 / (1 + mpmath.exp(-mpmath.mpf(float(logit))))
-        through = mpmath.exp(-mpmath.mpf(float(depth)))
+        share = 1 / (1 + mpmath.exp(-mpmath.mpf(logit)))
+        through = mpmath.exp(-mpmath.mpf(depth))
         left = 1 - share * (1 - through)
         by_depth = float(share * through / left)
         by_logit = float(share * (1 - share) * (1 - through) / left)
-    for slope, wanted in zip(slopes, (by_depth, by_logit), strict=True):
+    for slope, wanted in zip(slopes[:, row, column], (by_depth, by_logit), strict=True):
         assert np.isfinite(slope)
-        assert abs(float(slope) - wanted) < 3 * ABSOLUTE[dtype] * max(wanted, 1)
+        assert abs(slope - wanted) < 3 * ABSOLUTE[dtype] * max(wanted, 1)
 
 
 def test_thinned_meets_itself_at_the_switch(dtype):
@@ -183,13 +198,13 @@ def test_thinned_meets_itself_at_the_switch(dtype):
     for nudge in (-1e-6, 0.0, 1e-6):
         depth = jnp.asarray(np.log(3.0) * (1 + nudge), dtype)
         exact = exact_thinned(depth, logit)
-        got = float(compositing.thinned(depth, logit))
+        got = float(thinned(depth, logit))
         assert abs(got - exact) < ABSOLUTE[dtype]
 
 
 def test_thinned_multiplies_the_opacity(dtype, rng):
     depth, logit = rng.uniform(0, 3, 50), rng.normal(size=50)
-    thin = compositing.thinned(jnp.asarray(depth, dtype), jnp.asarray(logit, dtype))
+    thin = thinned(jnp.asarray(depth, dtype), jnp.asarray(logit, dtype))
     wanted = (1 - np.exp(-depth)) / (1 + np.exp(-logit))
     np.testing.assert_allclose(-np.expm1(-thin), wanted, rtol=2 * RELATIVE[dtype])
 
@@ -197,7 +212,7 @@ def test_thinned_multiplies_the_opacity(dtype, rng):
 def test_thinned_has_the_slopes_of_central_differences(float64, rng):
     depth, logit = jnp.asarray(rng.uniform(0, 5, 40)), jnp.asarray(rng.normal(size=40))
     error = gradients.directional_error(
-        lambda d, v: jnp.sum(jnp.sin(compositing.thinned(d, v))), depth, logit
+        lambda d, v: jnp.sum(jnp.sin(thinned(d, v))), depth, logit
     )
     assert error < 1e-7
 
@@ -210,7 +225,7 @@ def test_blended_media_composite_as_nsff_prints_it(float64, rng):
     passed = np.cumprod(np.prod(1 - opacity, axis=0))
     wanted = opacity * np.concatenate([[1], passed[:-1]])
     logits = jnp.asarray(np.stack([logit, -logit]))
-    got = compositing.media_weights(compositing.thinned(jnp.asarray(depth), logits))
+    got = media_weights_of(thinned(jnp.asarray(depth), logits))
     np.testing.assert_allclose(got, wanted, rtol=1e-12)
 
 
@@ -230,8 +245,8 @@ def test_a_ray_cut_in_two_is_the_ray(dtype, rng):
     background = jnp.asarray(rng.uniform(size=3), dtype)
 
     def part(samples, behind):
-        return compositing.composite(
-            compositing.weights(depth[samples]),
+        return composite(
+            weights_of(depth[samples]),
             colours[samples],
             distances[samples],
             behind,
@@ -260,9 +275,9 @@ def test_an_empty_ray_is_background_at_its_far_end(scale, dtype):
     weights = jnp.asarray([0.0, 1, 0, 2, 0, 0], dtype) * scale
 
     def depth_of(weights):
-        return compositing.composite(weights, colours, distances, background).depth
+        return composite(weights, colours, distances, background).depth
 
-    seen = compositing.composite(weights, colours, distances, background)
+    seen = composite(weights, colours, distances, background)
     np.testing.assert_allclose(seen.colour, background, atol=1e-7)
     assert abs(float(seen.depth) - 4.5) < 1e-4
     assert float(seen.median) == 4.5
@@ -273,7 +288,7 @@ def test_an_empty_ray_is_background_at_its_far_end(scale, dtype):
 def test_a_single_hit_is_where_it_is(dtype):
     colours, distances = scene(dtype)
     weights = jnp.zeros(6, dtype).at[2].set(1)
-    seen = compositing.composite(weights, colours, distances, jnp.ones(3, dtype))
+    seen = composite(weights, colours, distances, jnp.ones(3, dtype))
     np.testing.assert_array_equal(seen.colour, colours[2])
     assert seen.depth == distances[2] == seen.median
     assert seen.alpha == 1
@@ -318,9 +333,7 @@ def test_composite_has_the_slopes_of_central_differences(background, float64, rn
     behind = None if background is None else jnp.asarray(background)
 
     def loss(depth, colours, distances):
-        seen = compositing.composite(
-            compositing.weights(depth), colours, distances, behind
-        )
+        seen = composite(weights_of(depth), colours, distances, behind)
         return jnp.sum(jnp.sin(3 * seen.colour)) + seen.alpha**2 + seen.depth**2
 
     error = gradients.directional_error(loss, depth, colours, distances)
@@ -343,7 +356,7 @@ def test_no_light_is_lost_in_half_precision_products(dtype, rng):
     weights = rng.dirichlet(np.ones(64))
     colours, distances = rng.uniform(size=(64, 3)), np.sort(rng.uniform(1, 2, 64))
     to = functools.partial(jnp.asarray, dtype=dtype)
-    seen = compositing.composite(to(weights), to(colours), to(distances), None)
+    seen = composite(to(weights), to(colours), to(distances), None)
     np.testing.assert_allclose(
         seen.colour, sum(w * c for w, c in zip(weights, colours, strict=True)), 1e-6
     )
@@ -365,8 +378,8 @@ class TestNerfies:
         def ray(sigma, z, rgb, length):
             last = AT_INFINITY if infinite else 0.0
             spacing = compositing.intervals(z, last) * length
-            weights = compositing.weights(sigma * spacing)
-            return weights, compositing.composite(weights, rgb, z, background)
+            weights = weights_of(sigma * spacing)
+            return weights, composite(weights, rgb, z, background)
 
         prefix = "unit/render" if dtype == "float32" else "unit64/render"
         weights, seen = jax.vmap(ray)(
@@ -415,9 +428,7 @@ class TestNerfies:
             np.testing.assert_allclose, atol=self.TOLERANCE[dtype]
         )
         colours = jnp.asarray(rgb, dtype)
-        seen = jax.vmap(lambda w, c: compositing.composite(w, c, w, black))(
-            weights, colours
-        )
+        seen = jax.vmap(lambda w, c: composite(w, c, w, black))(weights, colours)
         close(seen.colour, wanted["rgb"])
         close(seen.alpha, wanted["acc"])
 
