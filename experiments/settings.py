@@ -18,6 +18,7 @@ import tyro
 
 Positional = tyro.conf.Positional
 CONFIG = "config.json"  # of a run folder: its choices and its whole spec
+CLASS = "class"  # a spec's, in that file; no field can have this name
 SPLATS = ("splats", "sonata", "moba")  # what the names of their presets start with
 CACHE = (
     pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache")
@@ -151,7 +152,7 @@ def as_json(spec):
             field.name: as_json(getattr(spec, field.name))
             for field in dataclasses.fields(spec)
         }
-        return {"kind": type(spec).__name__, **values}
+        return {CLASS: type(spec).__name__, **values}
     if isinstance(spec, (tuple, list)):
         return [as_json(item) for item in spec]
     if isinstance(spec, dict):
@@ -170,9 +171,11 @@ def from_json(spec_class, stored):
     """
     hints = typing.get_type_hints(spec_class)
     names = [field.name for field in dataclasses.fields(spec_class)]
-    if stored.get("kind") != spec_class.__name__ or {*stored} != {"kind", *names}:
+    if CLASS not in stored and "kind" in stored:  # written by an earlier version
+        stored = {CLASS if key == "kind" else key: x for key, x in stored.items()}
+    if stored.get(CLASS) != spec_class.__name__ or {*stored} != {CLASS, *names}:
         raise ValueError(
-            f"a stored {stored.get('kind')} with {', '.join(sorted(stored))} is no "
+            f"a stored {stored.get(CLASS)} with {', '.join(sorted(stored))} is no "
             f"{spec_class.__name__} of this version; check out the one that made it"
         )
     return spec_class(**{name: _stored(hints[name], stored[name]) for name in names})

@@ -48,9 +48,9 @@ def test_a_wrong_override_names_itself_and_the_way_out(assignment, words):
 def test_a_spec_is_written_as_plain_json():
     text = json.dumps(settings.as_json(presets.DEFORMABLE))
     stored = json.loads(text)
-    assert stored["kind"] == "SplatScene"
+    assert stored["class"] == "SplatScene"
     assert stored["motion"]["width"] == 256
-    assert set(stored) - {"kind"} == {
+    assert set(stored) - {"class"} == {
         field.name for field in dataclasses.fields(presets.DEFORMABLE)
     }
 
@@ -60,6 +60,26 @@ def test_a_spec_comes_back_from_its_json(name):
     spec = presets.PRESETS[name]
     stored = json.loads(json.dumps(settings.as_json(spec)))
     assert settings.from_json(type(spec), stored) == spec
+
+
+def test_a_field_called_kind_comes_back():
+    spec = _Warp()
+    stored = json.loads(json.dumps(settings.as_json(spec)))
+    assert settings.from_json(_Warp, stored) == spec
+
+
+def test_a_spec_of_the_first_run_folders_comes_back():
+    stored = settings.as_json(presets.DEFORMABLE)
+
+    def earlier(value):
+        if not isinstance(value, dict):
+            return value
+        return {
+            "kind" if key == "class" else key: earlier(x) for key, x in value.items()
+        }
+
+    found = settings.from_json(type(presets.DEFORMABLE), earlier(stored))
+    assert found == presets.DEFORMABLE
 
 
 def test_an_infinite_setting_survives_json():
@@ -113,3 +133,10 @@ class _Device:
     """A device."""
 
     device: settings.typing.Literal["cpu", "gpu"] = "cpu"
+
+
+@dataclasses.dataclass(frozen=True)
+class _Warp:
+    """A spec that tells its kinds apart."""
+
+    kind: str = "se3"
