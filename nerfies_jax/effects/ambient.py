@@ -1,0 +1,148 @@
+"""Ambient slicing: the template has more dimensions than space, and frames slice it.
+
+HyperNeRF (Park et al. 2021, arXiv:2106.13228, section 4): a topology that changes, a
+mouth that opens, is no warp of one template in space, but may be a slice of one in
+space and a few ambient dimensions. A *bent* surface lets each observed point have its
+own ambient coordinates (equation 8); the axis-aligned *plane* has one for the frame.
+"""
+
+import dataclasses
+import math
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, Key
+
+from nerfies_jax.effects.effect import MOMENT, Effect, Moment, Table, Vector
+from nerfies_jax.nets import encoding, mlp
+from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
+from nerfies_jax.training import schedules
+
+KINDS = ("bent", "plane")
+PLANE_TABLE = "ambient"
+# Standard deviation of the weights of the head, in ambient units per unit of feature:
+# the published code's. The surface starts as the plane through zero.
+HEAD_DEVIATION = 1e-5
+
+
+@dataclasses.dataclass(frozen=True)
+class AmbientSpec:
+    """Form of the slice; the defaults are HyperNeRF's (its section 5 and code).
+
+    `bent`: a network of the point, encoded by `position` with all bands open, and of
+    the frame's code in `table`, which the warp shares. `plane`: the ambient point is a
+    code of `dims` numbers of the frame itself, from its own table "ambient". (Under the
+    same name the published presets take the code of the warp, eight numbers.)
+
+    The template reads the ambient point encoded by `encoding`, whose bands are shut for
+    `closed_steps` and open over the next `anneal_steps`. Without identity the template
+    has no ambient dimensions until then.
+    """
+
+    kind: str = "bent"
+    dims: int = 2
+    position: EncodingSpec = EncodingSpec(6, identity=False)
+    depth: int = 6
+    width: int = 64
+    skips: tuple[int, ...] = (4,)
+    table: str = "motion"
+    code_width: int = 8
+    encoding: EncodingSpec = EncodingSpec(1, identity=False)
+    closed_steps: int = 1000
+    anneal_steps: int = 10_000
+
+    def __post_init__(self):
+        if self.kind not in KINDS:
+            raise ValueError(
+                f"unknown kind of slice {self.kind!r}; choose from {KINDS}"
+            )
+        if self.dims < 1:
+            raise ValueError(
+                f"dims={self.dims} must be at least 1; without ambient dimensions, set "
+                "the effect to none"
+            )
+        if self.code_width < 1:
+            raise ValueError(
+                f"code_width={self.code_width} must be at least 1: all frames would "
+                "share one slice"
+            )
+        if self.closed_steps < 0 or self.anneal_steps < 1:
+            raise ValueError(
+                "the window needs closed_steps >= 0 and anneal_steps >= 1, got "
+                f"closed_steps={self.closed_steps}, anneal_steps={self.anneal_steps}"
+            )
+        network(self)  # refuses wrong depths, widths and skips
+
+
+def network(spec: AmbientSpec) -> MLPSpec:
+    """What reads [encoded point, code] and answers a bent slice's ambient point."""
+    return MLPSpec(
+        inputs=spec.position.width(3) + spec.code_width,
+        depth=spec.depth,
+        width=spec.width,
+        heads=(("ambient", HeadSpec(spec.dims, "small")),),
+        skips=spec.skips,
+    )
+
+
+def effect(spec: AmbientSpec) -> Effect:
+    """The seams of `spec`; of the observed point, before any warp."""
+    bent = spec.kind == "bent"
+    table = (
+        Table(spec.table, MOMENT, spec.code_width)
+        if bent
+        else Table(PLANE_TABLE, MOMENT, spec.dims)
+    )
+    return Effect(
+        "ambient",
+        tables=(table,),
+        init=(lambda key: init(spec, key)) if bent else None,
+        lift=lambda params, point, moment: features(spec, params, point, moment),
+        lift_width=spec.encoding.width(spec.dims),
+    )
+
+
+def init(spec: AmbientSpec, key: Key[Array, ""], dtype=jnp.float32) -> MLP:
+    """A bent slice that is almost the plane through zero, for all codes."""
+    params = mlp.init(network(spec), key, dtype)
+    # mlp.SMALL is the half-width of a uniform draw: √3 of its standard deviation.
+    shrink = math.sqrt(3) * HEAD_DEVIATION / mlp.SMALL
+    head = params.heads["ambient"]
+    return params._replace(
+        heads={"ambient": head._replace(weight=shrink * head.weight)}
+    )
+
+
+def features(
+    spec: AmbientSpec, params: MLP | None, point: Vector, moment: Moment
+) -> Float[Array, " features"]:
+    """What the template reads: the encoded ambient point, as far as it is open."""
+    ambient = ambient_point(spec, params, point, moment)
+    opened = window(spec, moment.step, ambient)
+    return encoding.encode(spec.encoding, ambient, opened)
+
+
+def ambient_point(
+    spec: AmbientSpec, params: MLP | None, point: Vector, moment: Moment
+) -> Float[Array, " dims"]:
+    """Where in the ambient dimensions the slice of this moment is at an observed point.
+
+    Not encoded: for pictures of the slice, and for renders along a path in it. A plane
+    has no parameters.
+    """
+    if spec.kind == "plane":
+        return moment.codes[PLANE_TABLE]
+    encoded = encoding.encode(spec.position, point, None)
+    inputs = jnp.concatenate([encoded, moment.codes[spec.table]])
+    return mlp.apply(network(spec), params, inputs)["ambient"]
+
+
+def window(
+    spec: AmbientSpec, step: Int[Array, ""], like: Float[Array, "..."]
+) -> Float[Array, " bands"]:
+    """How far the bands of the ambient encoding are open after `step` steps."""
+    bands = spec.encoding.bands
+    alpha = schedules.ramp(
+        0.0, float(bands), spec.anneal_steps, after=spec.closed_steps
+    )(step)
+    return encoding.anneal(bands, alpha.astype(like.dtype))

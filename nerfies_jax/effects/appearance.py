@@ -1,0 +1,39 @@
+"""A learnt code for each exposure, which colour reads and density does not.
+
+NeRF-W (Martin-Brualla et al. 2021, arXiv:2008.02268, equation 7) gives each photograph
+a code (GLO, Bojanowski et al. 2018) that says how light, exposure and white balance
+were; Nerfies (Park et al. 2021, arXiv:2011.12948, section 3) takes it over. Geometry
+is the same under all codes, because only the colour branch gets them.
+
+In the official Nerfies code the codes are dead: its colour branch asks for another
+switch, and under the published presets their gradient is exactly zero.
+"""
+
+import dataclasses
+
+from nerfies_jax.effects.effect import APPEARANCE, Effect, Table
+
+
+@dataclasses.dataclass(frozen=True)
+class AppearanceSpec:
+    """Width of the code: 8 in Nerfies, 48 in NeRF-W; `table` names where it lives."""
+
+    width: int = 8
+    table: str = "appearance"
+
+    def __post_init__(self):
+        if self.width < 1:
+            raise ValueError(
+                f"an appearance code needs width >= 1, got width={self.width}; without "
+                "codes, set the effect to none"
+            )
+
+
+def effect(spec: AppearanceSpec) -> Effect:
+    """The seams of `spec`: the code joins what the colour branch reads."""
+    return Effect(
+        "appearance",
+        tables=(Table(spec.table, APPEARANCE, spec.width),),
+        condition=lambda _, moment: moment.codes[spec.table],
+        condition_width=spec.width,
+    )

@@ -1,0 +1,67 @@
+"""T-NeRF: the template reads the time itself, and nothing is warped.
+
+The baseline of D-NeRF (Pumarola et al. 2020, arXiv:2011.13961, section 5: a network of
+position, direction and time) and of DyCheck (Gao et al. 2022, arXiv:2210.13445, section
+5), where the time is a code of the frame. On DyCheck's captures of one moving camera it
+has a higher PSNR than Nerfies; what it lacks is correspondence between times.
+"""
+
+import dataclasses
+
+from jaxtyping import Array, Float
+
+from nerfies_jax.effects.effect import MOMENT, Effect, Moment, Table
+from nerfies_jax.nets import encoding
+from nerfies_jax.nets.encoding import EncodingSpec
+
+CONDITIONS = ("time", "code")
+
+
+@dataclasses.dataclass(frozen=True)
+class TimeSpec:
+    """What the template reads beside the point.
+
+    `condition="time"` is the time in [0, 1] under `encoding`; "code" is the code of the
+    frame from the table `table`, which warps may share.
+    """
+
+    encoding: EncodingSpec = EncodingSpec(4)
+    condition: str = "time"
+    table: str = "motion"
+    code_width: int = 8
+
+    def __post_init__(self):
+        if self.condition not in CONDITIONS:
+            raise ValueError(
+                f"unknown condition {self.condition!r} of a template in time; choose "
+                f"from {CONDITIONS}"
+            )
+        if self.code_width < 1:
+            raise ValueError(
+                f"code_width={self.code_width} must be at least 1: all frames would be "
+                "alike"
+            )
+
+    @property
+    def width(self) -> int:
+        """How many features it adds."""
+        by_code = self.condition == "code"
+        return self.code_width if by_code else self.encoding.width(1)
+
+
+def effect(spec: TimeSpec) -> Effect:
+    """The seams of `spec`; the same features at all points of a moment."""
+    by_code = spec.condition == "code"
+    return Effect(
+        "time",
+        tables=(Table(spec.table, MOMENT, spec.code_width),) if by_code else (),
+        lift=lambda _, point, moment: features(spec, moment),
+        lift_width=spec.width,
+    )
+
+
+def features(spec: TimeSpec, moment: Moment) -> Float[Array, " features"]:
+    """The encoded time, or the code of the frame."""
+    if spec.condition == "code":
+        return moment.codes[spec.table]
+    return encoding.encode(spec.encoding, moment.time[None], None)

@@ -1,0 +1,156 @@
+"""What passes through single exposures, and how far their colours can be trusted.
+
+NeRF-W (Martin-Brualla et al. 2021, arXiv:2008.02268, section 4.2): beside the static
+field each photograph has a medium of its own, with density, colour and an uncertainty
+`beta`. People and cars settle there; renders leave it out.
+"""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Key
+
+from nerfies_jax.effects.effect import (
+    APPEARANCE,
+    Context,
+    Effect,
+    Medium,
+    Moment,
+    Sample,
+    Table,
+    Term,
+)
+from nerfies_jax.nets import mlp
+from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
+from nerfies_jax.training import losses
+
+NAME = TABLE = "transient"
+
+
+@dataclasses.dataclass(frozen=True)
+class TransientSpec:
+    """The medium and its costs; defaults of the paper and of its reimplementation.
+
+    `beta_min` is the least standard deviation of a ray's colour, in units of colour. It
+    bounds the loss from below; without it a pixel that is met exactly would be worth
+    anything. `density_weight` is the paper's lambda_u: what keeps the static scene out
+    of the transient medium.
+    """
+
+    code_width: int = 16
+    depth: int = 4
+    width: int = 128
+    beta_min: float = 0.03
+    density_weight: float = 0.01
+
+    def __post_init__(self):
+        if self.code_width < 1:
+            raise ValueError(
+                f"code_width={self.code_width} must be at least 1: all exposures would "
+                "share one transient"
+            )
+        if not (math.isfinite(self.beta_min) and self.beta_min > 0):
+            raise ValueError(
+                f"beta_min={self.beta_min} must be positive: the logarithm of beta is "
+                "unbounded below; the paper has 0.03"
+            )
+        if not (math.isfinite(self.density_weight) and self.density_weight >= 0):
+            raise ValueError(
+                f"density_weight={self.density_weight} must be finite and not negative"
+            )
+        network(self, 1)  # refuses wrong depths and widths
+
+
+def network(spec: TransientSpec, features: int) -> MLPSpec:
+    """What reads [template features, code] and answers the medium before activation."""
+    heads = (("density", 1), ("colour", 3), ("beta", 1))
+    return MLPSpec(
+        inputs=features + spec.code_width,
+        depth=spec.depth,
+        width=spec.width,
+        heads=tuple((name, HeadSpec(width)) for name, width in heads),
+    )
+
+
+def effect(spec: TransientSpec, features: int) -> Effect:
+    """The seams of `spec` on a template whose trunk is `features` wide."""
+    return Effect(
+        NAME,
+        tables=(Table(TABLE, APPEARANCE, spec.code_width),),
+        init=lambda key: init(spec, key, features),
+        medium=lambda params, sample, moment: medium(spec, params, sample, moment),
+        penalty=lambda _, context: penalty(spec, context),
+    )
+
+
+def init(
+    spec: TransientSpec, key: Key[Array, ""], features: int, dtype=jnp.float32
+) -> MLP:
+    """Glorot weights: the medium starts about as dense as the static field."""
+    return mlp.init(network(spec, features), key, dtype)
+
+
+def medium(spec: TransientSpec, params: MLP, sample: Sample, moment: Moment) -> Medium:
+    """Density, colour and uncertainty of the medium at one sample.
+
+    The trunk is shared and learns from both media, as in the paper: nothing is stopped.
+    """
+    inputs = jnp.concatenate([sample.features, moment.codes[TABLE]])
+    raw = mlp.apply(network(spec, sample.features.shape[-1]), params, inputs)
+    return Medium(
+        density=jax.nn.softplus(raw["density"][0]),
+        colour=jax.nn.sigmoid(raw["colour"]),
+        beta=jax.nn.softplus(raw["beta"][0]),
+    )
+
+
+def uncertainty(
+    beta_min: float,
+    weights: Float[Array, "*rays samples"],
+    beta: Float[Array, "*rays samples"],
+) -> Float[Array, "*rays"]:
+    """Standard deviation of a ray's colour: beta_min + Σ w β over its samples.
+
+    `weights` are the transient medium's. The paper (section 4.2) composites β like a colour
+    with β_min inside, at each sample; where no transient is met that would be zero. Like the
+    public reimplementation this adds it outside: a ray through nothing has `beta_min`.
+    """
+    return beta_min + jnp.sum(weights * beta, axis=-1)
+
+
+def photometric(
+    colour: Float[Array, "*rays 3"],
+    truth: Float[Array, "*rays 3"],
+    beta: Float[Array, "*rays"],
+    valid: Bool[Array, "*rays"] | None,
+) -> Float[Array, ""]:
+    """Mean over the valid rays of |colour - truth|² / 2β² + log β.
+
+    The first two terms of equation 13, where the second reads log β² / 2. At a given
+    residual it is least at β = |colour - truth|, and never less than log beta_min: it
+    is negative for good fits. The public reimplementation adds 3 so that curves stay
+    above zero, which changes no gradient, and takes the mean over the channels, which
+    makes the first term a third.
+    """
+    if valid is not None:
+        # Selected before anything is squared or divided: unfilmed pixels may hold NaN.
+        colour = jnp.where(valid[..., None], colour, 0)
+        truth = jnp.where(valid[..., None], truth, 0)
+        beta = jnp.where(valid, beta, 1)
+    # Divided first: the square of a residual far below beta must not underflow alone.
+    scaled = (colour - truth) / beta[..., None]
+    each = jnp.sum(jnp.square(scaled), axis=-1) / 2 + jnp.log(beta)
+    return losses.masked_mean(each[..., None], valid)
+
+
+def penalty(spec: TransientSpec, context: Context) -> dict[str, Term]:
+    """The mean transient density of the finest samples of the valid rays.
+
+    The last term of equation 13. In units of the field: where the box is scaled by s,
+    the same picture has densities 1/s times as large.
+    """
+    density = context.levels[-1].media[NAME].density
+    value = losses.masked_mean(density, context.batch.valid)
+    return {"density": Term(value, spec.density_weight)}
