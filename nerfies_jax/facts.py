@@ -1,0 +1,151 @@
+"""What a radiance field must know of its capture before anything is compiled."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+
+from nerfies_jax.capture.capture import Capture
+
+FEWEST_POINTS = 100  # below, the capture's points do not say where the scene is
+# Share of points on either side that are taken for outliers of structure from motion.
+OUTLIERS = 0.02
+
+
+@dataclasses.dataclass(frozen=True)
+class Facts:
+    """Static, hashable facts; `facts_of` reads them from a capture."""
+
+    near: float  # z-depth, scene units
+    far: float
+    centre: tuple[float, float, float]  # of the filmed volume, scene units
+    scale: float  # field = (scene - centre) * scale
+    background: tuple[float, float, float] | None  # colour behind everything, if known
+    times: tuple[float, ...]  # distinct times that are learnt from, rising
+    # For each appearance id the rows of the table of codes it lies between, and where:
+    # (left, right, progress). An exposure that is not learnt from lies between those
+    # before and after it in time.
+    exposures: tuple[tuple[int, int, float], ...]
+    provides: frozenset[str] = frozenset()  # of "depths", "points", "flow"
+
+
+def facts_of(capture: Capture, extent: float | None) -> Facts:
+    """The facts of a capture; host side.
+
+    The filmed volume becomes a box whose longest half-side is `extent` units of the
+    field; None keeps the capture's own coordinates.
+    """
+    near, far = _span(capture)
+    centre, half_side = _box(capture, near, far)
+    if extent is None:
+        centre, scale = (0.0, 0.0, 0.0), 1.0
+    else:
+        scale = extent / half_side
+    times = np.unique(capture.times[capture.train])
+    provides = set()
+    if capture.points is not None and len(capture.points.position):
+        provides.add("points")
+    if capture.depths is not None:
+        provides.add("depths")
+    if getattr(capture, "flow", None) is not None:
+        provides.add("flow")
+    return Facts(
+        near=near,
+        far=far,
+        centre=tuple(float(x) for x in centre),
+        scale=float(scale),
+        background=capture.background,
+        times=tuple(float(time) for time in times),
+        exposures=_exposures(capture),
+        provides=frozenset(provides),
+    )
+
+
+def _span(capture):
+    """The z-depths to sample: the capture's, tightened to where its points lie.
+
+    The near plane of a Nerfies capture is often much nearer than anything filmed (0.05
+    where the first point is at 0.4), and samples there are lost.
+    """
+    depth = _point_depths(capture)
+    if depth.size < FEWEST_POINTS:
+        return float(capture.near), float(capture.far)
+    low, high = np.quantile(depth, (OUTLIERS, 1 - OUTLIERS))
+    near = max(capture.near, 0.6 * float(low))  # what moves is nearer than its wall
+    return float(near), float(min(capture.far, 1.2 * float(high)))
+
+
+def _point_depths(capture):
+    if capture.points is None:
+        return np.zeros(0)
+    turn = capture.cameras.camera_from_world[capture.train, 2]
+    position = capture.cameras.position[capture.train, None]
+    depth = np.einsum("fk,fnk->fn", turn, capture.points.position[None] - position)
+    return depth[depth > capture.near]
+
+
+def _box(capture, near, far):
+    """Centre and longest half-side of what is filmed."""
+    points = _frustum_points(capture, near, far)
+    if capture.points is not None and len(capture.points.position) >= FEWEST_POINTS:
+        found = capture.points.position
+        low, high = np.quantile(found, (OUTLIERS, 1 - OUTLIERS), axis=0)
+        # In front of what structure from motion finds there is what moves.
+        near_points = _frustum_points(capture, near, near)
+        low = np.minimum(low, np.quantile(near_points, 0.1, axis=0))
+        high = np.maximum(high, np.quantile(near_points, 0.9, axis=0))
+    else:
+        low, high = np.quantile(points, (0.1, 0.9), axis=0)
+    return (low + high) / 2, max(float(np.max(high - low)) / 2, 1e-6)
+
+
+def _frustum_points(capture, near, far, depths=8):
+    """Corners and centres of the pictures at some depths, in scene units.
+
+    Without skew and distortion: they say roughly where the scene is.
+    """
+    cameras = capture.cameras
+    rows = capture.train
+    width, height = capture.size
+    turn = cameras.camera_from_world[rows]
+    focal = cameras.focal_px[rows]
+    focal = np.stack([focal, focal * cameras.pixel_aspect[rows]], axis=1)
+    middle = cameras.principal_point_px[rows]
+    points = []
+    for x, y in itertools.product((0.0, width / 2, width), (0.0, height / 2, height)):
+        offset = (np.array([x, y]) - middle) / focal
+        ray = np.concatenate([offset, np.ones((len(rows), 1))], axis=1)
+        world = np.einsum("fki,fk->fi", turn, ray)
+        for depth in np.linspace(near, far, depths):
+            points.append(cameras.position[rows] + depth * world)
+    return np.concatenate(points)
+
+
+def _exposures(capture):
+    """Rows of the table for every id; one row for each id that is learnt from."""
+    ids = np.asarray(capture.appearance_ids)
+    learnt = np.unique(ids[capture.train])
+    row_of = {int(learnt_id): row for row, learnt_id in enumerate(learnt)}
+    when = {
+        int(one): float(np.mean(capture.times[ids == one])) for one in np.unique(ids)
+    }
+    by_time = sorted(row_of, key=lambda one: when[one])
+    places = []
+    for one in range(int(ids.max()) + 1):
+        if one in row_of:
+            places.append((row_of[one], row_of[one], 0.0))
+        elif one in when:
+            places.append(_between(when[one], by_time, when, row_of))
+        else:
+            places.append((0, 0, 0.0))  # no frame has this id
+    return tuple(places)
+
+
+def _between(time, by_time, when, row_of):
+    times = [when[one] for one in by_time]
+    right = int(np.searchsorted(times, time))
+    left = max(right - 1, 0)
+    right = min(right, len(times) - 1)
+    gap = times[right] - times[left]
+    progress = (time - times[left]) / gap if gap > 0 else 0.0
+    return row_of[by_time[left]], row_of[by_time[right]], float(progress)

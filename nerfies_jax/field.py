@@ -1,0 +1,173 @@
+"""A radiance field as pure functions: render it, ask its warp, look its codes up."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, Key
+
+from nerfies_jax import spec as specs
+from nerfies_jax import tracing
+from nerfies_jax.effects.effect import MOMENT, Effect, Level, Moment, Table
+from nerfies_jax.facts import Facts
+from nerfies_jax.geometry import rays
+from nerfies_jax.nets import codes
+from nerfies_jax.radiance import template
+from nerfies_jax.spec import RadianceScene
+from nerfies_jax.training.model import Rendering, View
+
+PyTree = Any
+Vector = Float[Array, "3"]
+Scalar = Float[Array, ""]
+Codes = dict[str, Float[Array, " code"]]
+
+
+class Field(NamedTuple):
+    """Pure functions of a field; `params` is what `init` returns."""
+
+    effects: tuple[Effect, ...]
+    init: Callable[[Key[Array, ""]], PyTree]
+    codes_at: Callable[[PyTree, View], Codes]  # of a view, by table
+    # (params, ray, moment, key) -> its levels, coarse to fine. Without a key nothing is
+    # random.
+    trace: Callable[..., tuple[Level, ...]]
+    # (params, point, moment) -> template point minus observed point, field units
+    displace: Callable[[PyTree, Vector, Moment], Vector]
+    # (params, camera, time, codes, size, step) -> whole frame
+    render: Callable[..., Rendering]
+
+
+def field(spec: RadianceScene, facts: Facts, without: tuple[str, ...] = ()) -> Field:
+    """The field of a spec, some effects left out by name.
+
+    Without "warp" a render shows the canonical scene; without "transient" or
+    "scene_flow" only what is static. The parameters stay those of the whole field.
+    """
+    effects = specs.effects_of(spec, facts)
+    tables = specs.tables_of(effects)
+    active = _active(effects, without)
+
+    def init(key):
+        return _init(spec, facts, effects, key)
+
+    def codes_at(params, view):
+        return look_up(tables, facts, params, view.time, view.appearance)
+
+    def displace(params, point, moment):
+        return tracing.displacement(active, params, point, moment)
+
+    def trace(params, ray, moment, key=None):
+        return tracing.trace(spec, facts, active, params, ray, moment, key)
+
+    def render(params, camera, time, codes, size, step):
+        moment = Moment(time, codes, step)
+
+        def pixel(position):
+            found = rays.pixel_ray(camera, position)
+            cosine = rays.depth_per_distance(camera, found.direction)
+            ray = tracing.field_ray(facts, found.origin, found.direction, cosine)
+            level = trace(params, ray, moment)[-1]
+            depth = level.depth * cosine / facts.scale
+            return Rendering(level.colour, level.alpha, depth)
+
+        width, height = size
+        centres = rays.pixel_centres(size, camera.position.dtype).reshape(-1, 2)
+        flat = jax.lax.map(
+            pixel, centres, batch_size=min(spec.sampling.block, width * height)
+        )
+        return jax.tree.map(lambda x: x.reshape(height, width, *x.shape[1:]), flat)
+
+    return Field(active, init, codes_at, trace, displace, render)
+
+
+def _active(effects, without):
+    names = [effect.name for effect in effects]
+    for name in without:
+        if name not in names:
+            raise ValueError(
+                f"there is no effect {name!r} to leave out; the field has "
+                f"{', '.join(names) or 'none'}"
+            )
+        lifts = effects[names.index(name)].lift is not None
+        if lifts:
+            raise ValueError(
+                f"{name!r} feeds the template and cannot be left out of a trained "
+                "field; train one without it"
+            )
+    return tuple(effect for effect in effects if effect.name not in without)
+
+
+def _init(spec, facts, effects, key):
+    names = (
+        ["fine"]
+        if spec.sampling.fine == 0 or spec.sampling.shared
+        else [
+            "coarse",
+            "fine",
+        ]
+    )
+    inputs = spec.template.position.width(3) + sum(e.lift_width for e in effects)
+    condition = sum(e.condition_width for e in effects)
+    nets = {}
+    keys = jax.random.split(key, 3)
+    for number, name in enumerate(names):
+        one = specs.template_of(spec, name)
+        beside = 0 if one.direction is None else one.direction.width(3)
+        lifted = inputs - spec.template.position.width(3) + one.position.width(3)
+        nets[name] = template.init(
+            one, jax.random.fold_in(keys[0], number), lifted, condition + beside
+        )
+    rows = {MOMENT: len(facts.times)}
+    learnt = 1 + max((max(left, right) for left, right, _ in facts.exposures))
+    params = {"template": nets, "codes": {}}
+    for number, table in enumerate(specs.tables_of(effects)):
+        count = rows.get(table.by, learnt)
+        params["codes"][table.name] = codes.init(
+            jax.random.fold_in(keys[1], number), count, table.width
+        )
+    for number, effect in enumerate(effects):
+        if effect.init is not None:
+            params[effect.name] = effect.init(jax.random.fold_in(keys[2], number))
+    return params
+
+
+def look_up(
+    tables: tuple[Table, ...],
+    facts: Facts,
+    params: PyTree,
+    time: Scalar,
+    appearance: Int[Array, ""],
+) -> Codes:
+    """The codes of one frame: between rows where its time was not learnt from."""
+    found = {}
+    for table in tables:
+        rows = params["codes"][table.name]
+        place = (
+            _place_in_time(facts, time)
+            if table.by == MOMENT
+            else _place_of_exposure(facts, appearance, rows.dtype)
+        )
+        found[table.name] = codes.blend(rows, *place)
+    return found
+
+
+def _place_in_time(facts, time):
+    """Rows before and after a time, and where between them; exact at a row's own."""
+    times = jnp.asarray(facts.times, time.dtype)
+    last = max(len(facts.times) - 2, 0)
+    left = jnp.clip(jnp.searchsorted(times, time, side="right") - 1, 0, last)
+    right = jnp.minimum(left + 1, len(facts.times) - 1)
+    gap = times[right] - times[left]
+    progress = (time - times[left]) / jnp.where(gap > 0, gap, 1)
+    return left, right, jnp.clip(progress, 0, 1)
+
+
+def _place_of_exposure(facts, appearance, dtype):
+    left, right, progress = zip(*facts.exposures, strict=True)
+    row = jnp.clip(appearance, 0, len(left) - 1)
+    return (
+        jnp.asarray(left, jnp.int32)[row],
+        jnp.asarray(right, jnp.int32)[row],
+        jnp.asarray(progress, dtype)[row],
+    )

@@ -1,0 +1,203 @@
+"""Named radiance fields: the papers' numbers, and variants for a CPU.
+
+Samples, networks, rates and weights are those of the paper or code cited at each;
+where the two differ, what differs is said. Numbers without a word are defaults of their
+specs, which cite their own source.
+"""
+
+import dataclasses
+
+from nerfies_jax.effects.ambient import AmbientSpec
+from nerfies_jax.effects.appearance import AppearanceSpec
+from nerfies_jax.effects.background import BackgroundSpec
+from nerfies_jax.effects.elastic import ElasticSpec
+from nerfies_jax.effects.scene_flow import SceneFlowSpec
+from nerfies_jax.effects.time_condition import TimeSpec
+from nerfies_jax.effects.transient import TransientSpec
+from nerfies_jax.effects.warp import WarpSpec
+from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.radiance.template import TemplateSpec
+from nerfies_jax.spec import RadianceScene, SamplingSpec
+
+# Mildenhall et al. 2020, arXiv:2003.08934. Densities pass a softplus, not their ReLU,
+# under which a ray that starts without any never learns.
+NERF = RadianceScene(
+    steps=200_000,  # "100-300k iterations"
+    rays=4096,  # section 5.3
+    sampling=SamplingSpec(64, 128),  # section 5.3
+    template=TemplateSpec(EncodingSpec(10), EncodingSpec(4)),  # section 5.1
+    rate=5e-4,  # section 5.3, and its end
+    rate_end=5e-5,
+)
+
+# Martin-Brualla et al. 2021, arXiv:2008.02268, with the sizes of its public
+# reimplementation; beta_min is the paper's.
+NERF_W = dataclasses.replace(
+    NERF,
+    appearance=AppearanceSpec(width=48),
+    transient=TransientSpec(
+        code_width=16, depth=4, width=128, beta_min=0.03, density_weight=0.01
+    ),
+)
+
+# Pumarola et al. 2020, arXiv:2011.13961, and its code: one network for both levels,
+# 500 rays, 800k steps at a rate that falls tenfold every 500k. Its curriculum, which
+# shows the frames one by one over the first 10k steps, is not there: rays come from
+# all frames in every step.
+D_NERF = dataclasses.replace(
+    NERF,
+    steps=800_000,
+    rays=500,
+    sampling=SamplingSpec(64, 128, shared=True),
+    rate_end=5e-4 * 10 ** (-8 / 5),
+    warp=WarpSpec(
+        kind="translation",
+        condition="time",
+        position=EncodingSpec(10),
+        time=EncodingSpec(10),
+        depth=8,
+        width=256,
+    ),
+)
+
+# The same paper's baseline: the NeRF reads the time, and nothing is warped.
+T_NERF = dataclasses.replace(D_NERF, warp=None, time=TimeSpec())
+
+# Park et al. 2021, arXiv:2011.12948, the code's configuration for quarter resolution.
+# Its penalties are scaled as in that code, whose weights these are.
+NERFIES = RadianceScene(
+    steps=250_000,
+    rays=6144,
+    sampling=SamplingSpec(128, 128),
+    template=TemplateSpec(EncodingSpec(8), EncodingSpec(4)),
+    extent=0.3,  # a box of diagonal one
+    rate=1e-3,
+    rate_end=1e-4,
+    appearance=AppearanceSpec(width=8),
+    warp=WarpSpec(anneal_steps=80_000),
+    elastic=ElasticSpec(
+        weight=1e-2, hold_steps=50_000, decay_steps=100_000, scaling="official"
+    ),
+    background=BackgroundSpec(),
+)
+
+# Park et al. 2021, arXiv:2106.13228: six bands of warp, a bent slicing surface, no
+# elastic penalty.
+HYPERNERF = dataclasses.replace(
+    NERFIES,
+    warp=WarpSpec(position=EncodingSpec(6), anneal_steps=80_000),
+    ambient=AmbientSpec(),
+    elastic=None,
+)
+
+# Li et al. 2021, arXiv:2011.13084, and its code: one level of 128 samples, 1024 rays.
+# Not in its normalised device coordinates, which fit forward-facing captures alone.
+NSFF = dataclasses.replace(
+    NERF,
+    steps=360_000,
+    rays=1024,
+    sampling=SamplingSpec(128, 0),
+    scene_flow=SceneFlowSpec(),
+)
+
+# For a CPU: a thin coarse level, a small network, few rays.
+SMALL_NERF = RadianceScene(
+    steps=3000,
+    rays=384,
+    sampling=SamplingSpec(24, 24),
+    template=TemplateSpec(
+        EncodingSpec(8), EncodingSpec(2), depth=4, width=96, skips=(), colour_width=48
+    ),
+    coarse=TemplateSpec(
+        EncodingSpec(6), None, depth=2, width=48, skips=(), colour_width=32
+    ),
+    rate=3e-3,
+    rate_end=1e-4,
+)
+SMALL_WARP = WarpSpec(
+    position=EncodingSpec(4), depth=4, width=64, skips=(), anneal_steps=1000
+)
+SMALL_NERF_W = dataclasses.replace(
+    SMALL_NERF,
+    appearance=AppearanceSpec(width=4),
+    transient=TransientSpec(code_width=8, depth=2, width=48),
+)
+SMALL_D_NERF = dataclasses.replace(
+    SMALL_NERF,
+    warp=dataclasses.replace(
+        SMALL_WARP,
+        kind="translation",
+        condition="time",
+        time=EncodingSpec(4),
+        anneal_steps=None,
+    ),
+)
+SMALL_T_NERF = dataclasses.replace(SMALL_NERF, time=TimeSpec(EncodingSpec(4)))
+SMALL_NERFIES = dataclasses.replace(
+    SMALL_NERF,
+    warp=SMALL_WARP,
+    elastic=ElasticSpec(weight=1e-3),
+    background=BackgroundSpec(points=512),
+)
+SMALL_HYPERNERF = dataclasses.replace(
+    SMALL_NERFIES,
+    ambient=AmbientSpec(
+        depth=3, width=32, skips=(), closed_steps=100, anneal_steps=900
+    ),
+    elastic=None,
+)
+SMALL_NSFF = dataclasses.replace(
+    SMALL_NERF,
+    sampling=SamplingSpec(48, 0),
+    scene_flow=SceneFlowSpec(
+        network=TemplateSpec(
+            EncodingSpec(8), EncodingSpec(2), depth=4, width=96, skips=()
+        ),
+        time=EncodingSpec(4),
+        decay_steps=500,
+    ),
+)
+
+PRESETS = {
+    "nerf": NERF,
+    "nerf-w": NERF_W,
+    "d-nerf": D_NERF,
+    "t-nerf": T_NERF,
+    "nerfies": NERFIES,
+    "hypernerf": HYPERNERF,
+    "nsff": NSFF,
+    "nerf-small": SMALL_NERF,
+    "nerf-w-small": SMALL_NERF_W,
+    "d-nerf-small": SMALL_D_NERF,
+    "t-nerf-small": SMALL_T_NERF,
+    "nerfies-small": SMALL_NERFIES,
+    "hypernerf-small": SMALL_HYPERNERF,
+    "nsff-small": SMALL_NSFF,
+}
+
+# Fields of the effects that count steps, beside those of the scene itself.
+COUNTED = {
+    "warp": ("anneal_steps",),
+    "ambient": ("closed_steps", "anneal_steps"),
+    "elastic": ("hold_steps", "decay_steps"),
+    "scene_flow": ("decay_steps",),
+}
+
+
+def with_steps(spec: RadianceScene, steps: int) -> RadianceScene:
+    """The same field over another number of steps, its schedules in proportion."""
+    if steps < 1:
+        raise ValueError(f"steps={steps}: train for at least one step")
+    share = steps / spec.steps
+    changed = {}
+    for name, fields in COUNTED.items():
+        effect = getattr(spec, name)
+        if effect is None:
+            continue
+        counts = {field: getattr(effect, field) for field in fields}
+        scaled = {
+            field: max(1, round(count * share)) if count else count
+            for field, count in counts.items()
+        }
+        changed[name] = dataclasses.replace(effect, **scaled)
+    return dataclasses.replace(spec, steps=steps, **changed)

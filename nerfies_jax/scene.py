@@ -1,0 +1,198 @@
+"""A radiance field put together: a spec becomes a `Model` the loop can train."""
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Key
+
+from nerfies_jax import facts as scene_facts
+from nerfies_jax import tracing
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.effects import transient
+from nerfies_jax.effects.effect import Batch, Box, Context, Level, Moment, Term
+from nerfies_jax.facts import Facts
+from nerfies_jax.field import Field, field
+from nerfies_jax.geometry import rays
+from nerfies_jax.nets import codes
+from nerfies_jax.spec import RadianceScene
+from nerfies_jax.training import loop, losses, schedules
+from nerfies_jax.training.model import Frames, Model, TrainState, View
+
+__all__ = ["Facts", "Field", "RadianceScene", "build", "facts_of", "field"]
+
+PyTree = Any
+
+
+def facts_of(capture: Capture, spec: RadianceScene) -> Facts:
+    """What the field must know of a capture; host side."""
+    return scene_facts.facts_of(capture, spec.extent)
+
+
+def build(spec: RadianceScene, facts: Facts) -> Model:
+    """Everything the loop, the renderer and the report need of this scene.
+
+    Raises ValueError where an effect needs what the capture does not have.
+    """
+    made = field(spec, facts)
+    if spec.background is not None and "points" not in facts.provides:
+        raise ValueError(
+            "the background effect holds static points still, and this capture has "
+            "none; leave it out with --set background=none"
+        )
+    optimiser = optax.scale_by_adam()
+    rate = schedules.log_linear(spec.rate, spec.rate_end, spec.steps)
+
+    def step(state: TrainState, frames: Frames):
+        batch_key, field_key = jax.random.split(loop.step_key(state))
+        batch = draw_batch(frames, spec.rays, batch_key)
+
+        def loss(params):
+            terms = loss_terms(
+                spec, facts, made, params, frames, batch, state.step, field_key
+            )
+            total = sum(term.weight * term.value for term in terms.values())
+            return total, {name: term.value for name, term in terms.items()}
+
+        (value, logged), slope = jax.value_and_grad(loss, has_aux=True)(state.params)
+        # optax counts in int32 and multiplies float32 by it.
+        with jax.numpy_dtype_promotion("standard"):
+            direction, moments = optimiser.update(slope, state.optimiser)
+        speed = rate(state.step)
+        params = jax.tree.map(
+            lambda x, d: x - (speed * d).astype(x.dtype), state.params, direction
+        )
+        metrics = {"loss": value, "mse": logged["fine"], **logged}
+        state = TrainState(params, moments, state.extra, state.step + 1, state.key)
+        return state, metrics
+
+    def whole_frame(params, view: View, size, step):
+        found = made.codes_at(params, view)
+        return made.render(params, view.camera, view.time, found, size, step)
+
+    def init(capture, key):
+        codes.check_ids(capture.appearance_ids, len(facts.exposures), "appearance_ids")
+        start_key, run_key = jax.random.split(key)
+        params = made.init(start_key)
+        return TrainState(
+            params, optimiser.init(params), (), jnp.zeros((), jnp.int32), run_key
+        )
+
+    wants = frozenset().union(*(effect.wants for effect in made.effects))
+    return Model(
+        spec=(spec, facts),
+        init=init,
+        step=step,
+        render=whole_frame,
+        events=(),
+        counts=count_parameters,
+        wants=wants & facts.provides,
+    )
+
+
+def draw_batch(frames: Frames, count: int, key: Key[Array, ""]) -> Batch:
+    """Rays through pixels drawn from all frames alike, and what was filmed there."""
+    row_key, column_key, line_key = jax.random.split(key, 3)
+    number, height, width = frames.images.shape[:3]
+    row = jax.random.randint(row_key, (count,), 0, number)
+    column = jax.random.randint(column_key, (count,), 0, width)
+    line = jax.random.randint(line_key, (count,), 0, height)
+    camera = jax.tree.map(lambda leaf: leaf[row], frames.cameras)
+    pixel = jnp.stack([column, line], axis=1).astype(camera.position.dtype) + 0.5
+    found = jax.vmap(rays.pixel_ray)(camera, pixel)
+    colour = frames.images[row, line, column].astype(pixel.dtype) / 255
+    valid = found.valid
+    if frames.valid is not None:
+        valid = valid & frames.valid[row, line, column]
+    cosine = jax.vmap(rays.depth_per_distance)(camera, found.direction)
+    return Batch(row, pixel, found.origin, found.direction, cosine, colour, valid)
+
+
+def loss_terms(
+    spec: RadianceScene,
+    facts: Facts,
+    made: Field,
+    params: PyTree,
+    frames: Frames,
+    batch: Batch,
+    step: Array,
+    key: Key[Array, ""],
+) -> dict[str, Term]:
+    """Every term of the loss of one batch, by name.
+
+    "coarse" and "fine" are mean squared errors of colour; "colour" is NeRF-W's negative
+    log-likelihood where a transient medium says how uncertain it is.
+    """
+    trace_key, penalty_key = jax.random.split(key)
+
+    def moment_of(row):
+        view = View(
+            jax.tree.map(lambda leaf: leaf[row], frames.cameras),
+            frames.times[row],
+            frames.warp[row],
+            frames.appearance[row],
+        )
+        return Moment(view.time, made.codes_at(params, view), step)
+
+    moments = jax.vmap(moment_of)(batch.row)
+    lines = jax.vmap(lambda *ray: tracing.field_ray(facts, *ray))(
+        batch.origin, batch.direction, batch.cosine
+    )
+    keys = jax.random.split(trace_key, len(batch.row))
+    levels = jax.vmap(lambda *ray: made.trace(params, *ray))(lines, moments, keys)
+    terms = _colour_terms(levels, batch)
+    centre = jnp.asarray(facts.centre, batch.origin.dtype)
+    context = Context(
+        displace=lambda point, moment: made.displace(params, point, moment),
+        moment_of=moment_of,
+        moments=moments,
+        batch=batch,
+        levels=levels,
+        frames=frames,
+        box=Box(centre, jnp.asarray(facts.scale, batch.origin.dtype)),
+        step=step,
+        key=penalty_key,
+    )
+    for number, effect in enumerate(made.effects):
+        if effect.penalty is None:
+            continue
+        own = context._replace(key=jax.random.fold_in(penalty_key, number))
+        found = effect.penalty(params.get(effect.name), own)
+        terms.update({f"{effect.name}/{name}": term for name, term in found.items()})
+    return terms
+
+
+def _colour_terms(levels: tuple[Level, ...], batch: Batch) -> dict[str, Term]:
+    last = levels[-1]
+    mse = losses.mse(last.colour, batch.colour, batch.valid)
+    terms = {"fine": Term(mse, 1.0)}
+    coarse_weight = 1.0
+    if last.beta is not None:
+        likelihood = transient.photometric(
+            last.colour, batch.colour, last.beta, batch.valid
+        )
+        terms = {"fine": Term(mse, 0.0), "colour": Term(likelihood, 1.0)}
+        coarse_weight = 0.5  # NeRF-W, equation 13
+    if len(levels) > 1:
+        coarse = losses.mse(levels[0].colour, batch.colour, batch.valid)
+        terms["coarse"] = Term(coarse, coarse_weight)
+    return terms
+
+
+def first_bytes(spec: RadianceScene, capture: Capture) -> int:
+    """Roughly the memory of the first state and step; host side, nothing allocated."""
+    samples = 2 * spec.sampling.coarse + spec.sampling.fine
+    widths = spec.template.depth * spec.template.width + spec.template.colour_width
+    if spec.warp is not None:
+        widths += spec.warp.depth * spec.warp.width
+    # Every layer's output is kept for the backward pass, beside its gradient.
+    activations = 3 * spec.rays * samples * widths
+    return 4 * activations + capture.images.nbytes
+
+
+def count_parameters(state: TrainState) -> dict[str, int]:
+    """`parameters`: the numbers of all networks and codes."""
+    leaves = jax.tree.leaves(state.params)
+    return {"parameters": sum(math.prod(leaf.shape) for leaf in leaves)}

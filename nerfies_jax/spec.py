@@ -1,0 +1,138 @@
+"""Which radiance field, and how it is trained: settings only."""
+
+import dataclasses
+
+from nerfies_jax.effects import (
+    ambient,
+    appearance,
+    background,
+    elastic,
+    scene_flow,
+    time_condition,
+    transient,
+    warp,
+)
+from nerfies_jax.effects.ambient import AmbientSpec
+from nerfies_jax.effects.appearance import AppearanceSpec
+from nerfies_jax.effects.background import BackgroundSpec
+from nerfies_jax.effects.effect import Effect, Table
+from nerfies_jax.effects.elastic import ElasticSpec
+from nerfies_jax.effects.scene_flow import SceneFlowSpec
+from nerfies_jax.effects.time_condition import TimeSpec
+from nerfies_jax.effects.transient import TransientSpec
+from nerfies_jax.effects.warp import WarpSpec
+from nerfies_jax.facts import Facts
+from nerfies_jax.radiance.template import TemplateSpec
+
+
+@dataclasses.dataclass(frozen=True)
+class SamplingSpec:
+    """Where along a ray the field is asked; the defaults are Mildenhall et al. 2020.
+
+    `fine` samples are drawn where the coarse level found weight, and the fine level
+    sees both; 0 leaves one level. `block` rays are rendered at a time when a whole
+    frame is: memory does not grow with the picture.
+    """
+
+    coarse: int = 64
+    fine: int = 128
+    spacing: str = "linear"  # or "disparity"
+    jitter: bool = True  # while training
+    shared: bool = False  # one network for both levels (D-NeRF)
+    block: int = 1024
+
+    def __post_init__(self):
+        if self.coarse < 3 or self.fine < 0 or self.block < 1:
+            raise ValueError(
+                "sampling needs coarse >= 3, fine >= 0 and block >= 1, got "
+                f"coarse={self.coarse}, fine={self.fine}, block={self.block}"
+            )
+        if self.spacing not in ("linear", "disparity"):
+            raise ValueError(
+                f"spacing={self.spacing!r} must be 'linear' or 'disparity'"
+            )
+
+
+@dataclasses.dataclass(frozen=True)
+class RadianceScene:
+    """Which field and how it is trained; `None` for an effect: it is not there."""
+
+    steps: int
+    template: TemplateSpec = TemplateSpec()
+    coarse: TemplateSpec | None = None  # of the coarse level; None is like the fine one
+    sampling: SamplingSpec = SamplingSpec()
+    rays: int = 1024  # in a step
+    # Longest half-side of the filmed volume in units of the field; None keeps the
+    # capture's own coordinates.
+    extent: float | None = 1.0
+    rate: float = 5e-4  # of Adam, falling to `rate_end` along a line in the logarithm
+    rate_end: float = 5e-5
+    density_noise: float = 0.0  # standard deviation, while training
+    appearance: AppearanceSpec | None = None
+    transient: TransientSpec | None = None
+    time: TimeSpec | None = None
+    warp: WarpSpec | None = None
+    ambient: AmbientSpec | None = None
+    elastic: ElasticSpec | None = None
+    background: BackgroundSpec | None = None
+    scene_flow: SceneFlowSpec | None = None
+
+    def __post_init__(self):
+        if self.steps < 1 or self.rays < 1:
+            raise ValueError(
+                f"train for at least one step of one ray, got steps={self.steps}, "
+                f"rays={self.rays}"
+            )
+        if self.extent is not None and not self.extent > 0:
+            raise ValueError(f"extent={self.extent} must be positive, or none")
+        if not 0 < self.rate_end <= self.rate:
+            raise ValueError(
+                f"the rate falls from rate={self.rate} to rate_end={self.rate_end}; "
+                "both are positive and the second is not larger"
+            )
+        for name in ("elastic", "background"):
+            if getattr(self, name) is not None and self.warp is None:
+                raise ValueError(
+                    f"{name} holds the warp in check, and there is none; set warp or "
+                    f"{name}=none"
+                )
+
+
+def effects_of(spec: RadianceScene, facts: Facts) -> tuple[Effect, ...]:
+    """The effects that the spec asks for, in the order in which they act."""
+
+    def flow(one):
+        return scene_flow.effect(one, len(facts.times), spec.template.width)
+
+    built = (
+        (spec.appearance, appearance.effect),
+        (
+            spec.transient,
+            lambda one: transient.effect(one, spec.template.width),
+        ),
+        (spec.time, time_condition.effect),
+        (spec.warp, warp.effect),
+        (spec.ambient, ambient.effect),
+        (spec.elastic, elastic.effect),
+        (spec.background, background.effect),
+        (spec.scene_flow, flow),
+    )
+    return tuple(make(one) for one, make in built if one is not None)
+
+
+def tables_of(effects: tuple[Effect, ...]) -> tuple[Table, ...]:
+    """The latent tables of all effects, each once."""
+    tables = {}
+    for effect in effects:
+        for table in effect.tables:
+            if tables.setdefault(table.name, table) != table:
+                raise ValueError(
+                    f"two effects share the codes {table.name!r} and disagree: "
+                    f"{tables[table.name]} and {table}; give them one code_width"
+                )
+    return tuple(tables.values())
+
+
+def template_of(spec: RadianceScene, level: str) -> TemplateSpec:
+    """The network of one level, "coarse" or "fine"."""
+    return spec.coarse if level == "coarse" and spec.coarse else spec.template
