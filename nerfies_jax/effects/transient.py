@@ -113,9 +113,9 @@ def uncertainty(
 ) -> Float[Array, "*rays"]:
     """Standard deviation of a ray's colour: beta_min + Σ w β over its samples.
 
-    `weights` are the transient medium's. The paper (section 4.2) composites β like a colour
-    with β_min inside, at each sample; where no transient is met that would be zero. Like the
-    public reimplementation this adds it outside: a ray through nothing has `beta_min`.
+    `weights` are the transient medium's. The paper (section 4.2) has β_min inside the
+    sum, so that a ray which meets no transient has a β of zero and an infinite loss.
+    Like the public reimplementation this adds it outside.
     """
     return beta_min + jnp.sum(weights * beta, axis=-1)
 

@@ -1,0 +1,300 @@
+"""The transient medium and its loss, against loops in NumPy and closed forms."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from nerfies_jax.effects import transient
+from nerfies_jax.effects.effect import (
+    APPEARANCE,
+    Batch,
+    Context,
+    Level,
+    Medium,
+    Moment,
+    Sample,
+    Table,
+)
+from nerfies_jax.effects.transient import TransientSpec
+from tests import gradients
+
+SPEC = TransientSpec(code_width=3, depth=2, width=8)
+FEATURES = 6
+
+
+def moment(dtype, seed=1):
+    code = np.random.default_rng(seed).normal(size=3)
+    return Moment(
+        jnp.asarray(0.4, dtype),
+        {"transient": jnp.asarray(code, dtype)},
+        jnp.int32(0),
+    )
+
+
+def sample(dtype, seed=2):
+    rng = np.random.default_rng(seed)
+    return Sample(
+        *(jnp.asarray(rng.normal(size=size), dtype) for size in (3, 3, FEATURES))
+    )
+
+
+def params_of(dtype):
+    params = transient.init(SPEC, jax.random.key(0), FEATURES, jnp.dtype(dtype))
+    rng = np.random.default_rng(0)
+    return jax.tree.map(
+        lambda x: x + jnp.asarray(0.1 * rng.normal(size=x.shape), dtype), params
+    )
+
+
+def medium_by_hand(params, found, when):
+    params = jax.tree.map(lambda x: np.asarray(x, np.float64), params)
+    hidden = np.concatenate([found.features, when.codes["transient"]])
+    hidden = np.asarray(hidden, np.float64)
+    for layer in params.hidden:
+        hidden = np.maximum(hidden @ layer.weight + layer.bias, 0)
+    raw = {name: hidden @ h.weight + h.bias for name, h in params.heads.items()}
+    return (
+        math.log1p(math.exp(raw["density"][0])),
+        1 / (1 + np.exp(-raw["colour"])),
+        math.log1p(math.exp(raw["beta"][0])),
+    )
+
+
+def loss_by_hand(colour, truth, beta, valid):
+    """One ray at a time, in Python floats."""
+    total, count = 0.0, 0
+    for ray in range(len(beta)):
+        if not valid[ray]:
+            continue
+        squared = sum(
+            (float(a) - float(b)) ** 2
+            for a, b in zip(colour[ray], truth[ray], strict=True)
+        )
+        b = float(beta[ray])
+        total += squared / (2 * b**2) + math.log(b)
+        count += 1
+    return total / max(count, 1)
+
+
+def test_the_medium_is_the_loop_over_its_layers(dtype):
+    params, found, when = params_of(dtype), sample(dtype), moment(dtype)
+    made = transient.effect(SPEC, FEATURES)
+    medium = jax.jit(made.medium)(params, found, when)
+    tolerance = {"float32": 2e-6, "float64": 1e-14}[dtype]
+    density, colour, beta = medium_by_hand(params, found, when)
+    np.testing.assert_allclose(medium.density, density, rtol=tolerance)
+    np.testing.assert_allclose(medium.colour, colour, rtol=tolerance)
+    np.testing.assert_allclose(medium.beta, beta, rtol=tolerance)
+    assert medium.share is None  # both media have all of their opacity
+    for leaf in (medium.density, medium.colour, medium.beta):
+        assert leaf.dtype == dtype
+
+
+def test_one_code_for_each_exposure_is_asked_for():
+    made = transient.effect(TransientSpec(), 256)
+    assert made.name == "transient"
+    assert made.tables == (Table("transient", APPEARANCE, 16),)
+    params = made.init(jax.random.key(0))
+    assert [layer.weight.shape for layer in params.hidden] == [
+        (256 + 16, 128),
+        (128, 128),
+        (128, 128),
+        (128, 128),
+    ]
+
+
+def test_the_trunk_learns_from_the_transient(float64, rng):
+    """The gradient is not stopped, and it is right, for features, code and weights."""
+    params, found, when = params_of(float64), sample(float64), moment(float64)
+    pull = jnp.asarray(rng.normal(size=5))
+
+    def read(params, features, code):
+        medium = transient.medium(
+            SPEC,
+            params,
+            found._replace(features=features),
+            when._replace(codes={"transient": code}),
+        )
+        values = [medium.density[None], medium.colour, medium.beta[None]]
+        return pull @ jnp.concatenate(values)
+
+    args = (params, found.features, when.codes["transient"])
+    assert gradients.directional_error(read, *args, step=1e-6) < 1e-7
+    slope = jax.grad(read, argnums=1)(*args)
+    assert np.all(np.abs(slope) > 1e-4)
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("size", [1e3, 1e30])
+def test_wild_features_leave_the_medium_finite_and_not_negative(size, dtype):
+    params, when = params_of(dtype), moment(dtype)
+    for sign in (-1, 1):
+        found = sample(dtype)._replace(
+            features=jnp.full(FEATURES, sign * size, jnp.dtype(dtype))
+        )
+        medium = transient.medium(SPEC, params, found, when)
+        for leaf in (medium.density, medium.colour, medium.beta):
+            assert np.all(np.isfinite(leaf))
+            assert np.all(leaf >= 0)
+        assert np.all(medium.colour <= 1)
+
+
+def test_uncertainty_is_the_least_plus_what_is_met(dtype, rng):
+    weights, beta = (jnp.asarray(rng.uniform(size=(4, 7)), dtype) for _ in range(2))
+    found = jax.jit(transient.uncertainty, static_argnums=0)(0.03, weights, beta)
+    assert found.dtype == dtype
+    exact = [
+        0.03 + math.fsum(float(w) * float(b) for w, b in zip(*row, strict=True))
+        for row in zip(weights, beta, strict=True)
+    ]
+    tolerance = {"float32": 1e-6, "float64": 1e-14}[dtype]
+    np.testing.assert_allclose(found, exact, rtol=tolerance)
+
+
+@pytest.mark.hard_cases
+def test_a_ray_that_meets_no_transient_has_the_least_uncertainty(dtype):
+    weights = jnp.zeros((2, 5), dtype)
+    beta = jnp.asarray([[0.1] * 5, [1e30] * 5], dtype)
+    found = transient.uncertainty(0.03, weights, beta)
+    np.testing.assert_array_equal(found, np.full(2, 0.03, dtype))
+
+    def loss(weights, beta):
+        rays = transient.uncertainty(0.03, weights, beta)
+        return transient.photometric(
+            jnp.full((2, 3), 0.5, dtype), jnp.full((2, 3), 0.4, dtype), rays, None
+        )
+
+    slopes = jax.grad(loss, argnums=(0, 1))(weights, beta)
+    assert np.all(np.isfinite(slopes[0]))
+    assert np.all(slopes[1] == 0)
+    # A residual above beta asks for more transient: the medium can come alive
+    assert np.all(slopes[0] < 0)
+
+
+def rays_of(dtype, rng, count=9):
+    colour, truth = (jnp.asarray(rng.uniform(size=(count, 3)), dtype) for _ in range(2))
+    beta = jnp.asarray(rng.uniform(0.03, 1, count), dtype)
+    return colour, truth, beta, jnp.asarray(rng.uniform(size=count) < 0.7)
+
+
+def test_photometric_is_the_mean_of_the_valid_rays_alone(dtype, rng):
+    colour, truth, beta, valid = rays_of(dtype, rng)
+    assert 0 < np.sum(valid) < len(valid)
+    found = jax.jit(transient.photometric)(colour, truth, beta, valid)
+    assert found.dtype == dtype
+    tolerance = {"float32": 2e-6, "float64": 1e-14}[dtype]
+    exact = loss_by_hand(colour, truth, beta, valid)
+    np.testing.assert_allclose(found, exact, rtol=tolerance)
+    everything = transient.photometric(colour, truth, beta, None)
+    exact = loss_by_hand(colour, truth, beta, [True] * len(beta))
+    np.testing.assert_allclose(everything, exact, rtol=tolerance)
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("offset", [0.0, 1e-30, 1e-7, 1e-3, 1.0, 1e4, 1e15])
+def test_photometric_holds_from_no_residual_to_a_huge_one(offset, dtype):
+    colour = jnp.full((1, 3), offset, dtype)
+    truth = jnp.zeros((1, 3), dtype)
+    beta = jnp.asarray([0.03], dtype)
+    value, slopes = jax.value_and_grad(transient.photometric, argnums=(0, 2))(
+        colour, truth, beta, jnp.asarray([True])
+    )
+    residual, b = float(colour[0, 0]), float(beta[0])
+    exact = 3 * residual**2 / (2 * b**2) + math.log(b)
+    tolerance = {"float32": 2e-6, "float64": 1e-14}[dtype]
+    np.testing.assert_allclose(value, exact, rtol=tolerance)
+    np.testing.assert_allclose(slopes[0], [[residual / b**2] * 3], rtol=tolerance)
+    exact = -3 * residual**2 / b**3 + 1 / b
+    np.testing.assert_allclose(slopes[1], [exact], rtol=2 * tolerance)
+
+
+@pytest.mark.hard_cases
+def test_beta_is_best_at_the_length_of_the_residual_and_the_loss_is_bounded(float64):
+    residual = jnp.asarray([[0.3, 0.0, 0.4]])  # of length 0.5
+    slope = jax.grad(transient.photometric, argnums=2)
+    zero = jnp.zeros((1, 3))
+    assert abs(slope(residual, zero, jnp.asarray([0.5]), None)[0]) < 1e-14
+    assert slope(residual, zero, jnp.asarray([0.4]), None)[0] < 0
+    assert slope(residual, zero, jnp.asarray([0.6]), None)[0] > 0
+    least = transient.photometric(zero, zero, jnp.asarray([0.03]), None)
+    assert abs(least - math.log(0.03)) < 1e-14
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("hole", [math.nan, math.inf, -math.inf])
+def test_unfilmed_pixels_teach_nothing_whatever_they_hold(hole, dtype, rng):
+    colour, truth, beta, _ = rays_of(dtype, rng, 3)
+    valid = jnp.asarray([True, False, True])
+    broken = (
+        colour.at[1].set(hole),
+        truth.at[1].set(hole),
+        beta.at[1].set(hole),
+    )
+    value, slopes = jax.value_and_grad(transient.photometric, argnums=(0, 1, 2))(
+        *broken, valid
+    )
+    np.testing.assert_allclose(
+        value, loss_by_hand(colour, truth, beta, valid), rtol=2e-6
+    )
+    for slope in slopes:
+        assert np.all(np.isfinite(slope))
+        assert np.all(slope[1] == 0)
+    nothing = transient.photometric(*broken, jnp.zeros(3, bool))
+    assert nothing == 0
+
+
+def test_photometric_has_its_slopes(float64, rng):
+    colour, truth, beta, valid = rays_of(float64, rng)
+    error = gradients.directional_error(
+        lambda *args: transient.photometric(*args, valid), colour, truth, beta
+    )
+    assert error < 1e-7
+
+    def of_samples(weights, beta):
+        rays = transient.uncertainty(0.03, weights, beta)
+        return transient.photometric(colour, truth, rays, valid)
+
+    samples = (jnp.asarray(rng.uniform(size=(9, 4))) for _ in range(2))
+    assert gradients.directional_error(of_samples, *samples) < 1e-7
+
+
+def context(dtype, density, valid):
+    medium = Medium(
+        jnp.asarray(density, dtype), jnp.zeros((*np.shape(density), 3), dtype)
+    )
+    nothing = Level(**dict.fromkeys(Level._fields))
+    batch = Batch(**dict.fromkeys(Batch._fields))
+    return Context(**dict.fromkeys(Context._fields))._replace(
+        levels=(nothing, nothing._replace(media={"transient": medium})),
+        batch=batch._replace(valid=jnp.asarray(valid)),
+    )
+
+
+def test_the_penalty_is_the_mean_density_of_the_fine_samples(dtype):
+    density = [[0.0, 1.0, 2.0], [5.0, 4.0, 0.0], [1e6, 1.0, 1.0]]
+    made = transient.effect(SPEC, FEATURES)
+    seen = context(dtype, density, [True, True, False])
+    (term,) = made.penalty(None, seen).values()
+    assert term.value == 2.0  # 12 over six samples; the third ray was not filmed
+    assert term.value.dtype == dtype
+    assert term.weight == 0.01
+    assert set(made.penalty(None, seen)) == {"density"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"code_width": 0}, "code_width=0"),
+        ({"beta_min": 0.0}, r"beta_min=0.0 must be positive.*0\.03"),
+        ({"beta_min": math.nan}, "beta_min=nan"),
+        ({"density_weight": -0.1}, "density_weight=-0.1"),
+        ({"density_weight": math.inf}, "density_weight=inf"),
+        ({"depth": -1}, "depth=-1"),
+    ],
+)
+def test_wrong_settings_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        TransientSpec(**changes)
