@@ -1,0 +1,82 @@
+"""Every named field can be built, stretched and traced; small ones take a step."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from experiments import evaluate
+from nerfies_jax import presets, scene
+from nerfies_jax.presets import PRESETS
+from tests import scenes
+
+PAPERS = ("nerf", "nerf-w", "d-nerf", "t-nerf", "nerfies", "hypernerf", "nsff")
+
+
+def test_every_paper_has_a_small_variant():
+    assert set(PRESETS) == {*PAPERS, *(f"{name}-small" for name in PAPERS)}
+
+
+@pytest.mark.parametrize("name", sorted(PRESETS))
+def test_a_step_of_every_preset_keeps_its_state(name):
+    # Traced, not compiled: shapes, dtypes and promotion of the whole step.
+    capture = scenes.tiny_capture()
+    spec = PRESETS[name]
+    model = scene.build(spec, scene.facts_of(capture, spec))
+    state = jax.eval_shape(lambda key: model.init(capture, key), jax.random.key(0))
+    frames = evaluate.frames_of(capture, model.wants)
+    after, metrics = jax.eval_shape(model.step, state, frames)
+    assert jax.tree.structure(after) == jax.tree.structure(state)
+    for before, now in zip(jax.tree.leaves(state), jax.tree.leaves(after), strict=True):
+        assert (before.shape, before.dtype) == (now.shape, now.dtype)
+    assert {"loss", "mse", "fine"} <= set(metrics)
+
+
+@pytest.mark.parametrize("name", sorted(PRESETS))
+def test_half_the_steps_halve_the_schedules(name):
+    spec = PRESETS[name]
+    half = presets.with_steps(spec, spec.steps // 2)
+    assert half.steps == spec.steps // 2
+    for effect, fields in presets.COUNTED.items():
+        whole = getattr(spec, effect)
+        for field in fields if whole is not None else ():
+            count = getattr(whole, field)
+            expected = max(1, count // 2) if count else count
+            assert getattr(getattr(half, effect), field) == expected
+
+
+def test_presets_differ_only_in_what_their_names_say():
+    effects = {
+        name: {
+            field.name
+            for field in dataclasses.fields(spec)
+            if dataclasses.is_dataclass(getattr(spec, field.name))
+            and field.name not in ("template", "coarse", "sampling")
+        }
+        for name, spec in PRESETS.items()
+    }
+    assert effects["nerf"] == set()
+    assert effects["nerf-w"] == {"appearance", "transient"}
+    assert effects["d-nerf"] == {"warp"}
+    assert effects["t-nerf"] == {"time"}
+    assert effects["nerfies"] == {"appearance", "warp", "elastic", "background"}
+    assert effects["hypernerf"] == {"appearance", "warp", "ambient", "background"}
+    assert effects["nsff"] == {"scene_flow"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [f"{name}-small" for name in PAPERS])
+def test_a_small_preset_learns(name):
+    capture = scenes.tiny_capture()
+    spec = presets.with_steps(PRESETS[name], 60)
+    spec = dataclasses.replace(spec, rays=128)
+    model = scene.build(spec, scene.facts_of(capture, spec))
+    frames = evaluate.frames_of(capture, model.wants)
+    state, step = model.init(capture, jax.random.key(0)), jax.jit(model.step)
+    errors = []
+    for _ in range(60):
+        state, metrics = step(state, frames)
+        errors.append(float(metrics["mse"]))
+    assert jnp.isfinite(jnp.asarray(errors)).all()
+    assert sum(errors[-10:]) < 0.6 * sum(errors[:10]), errors
