@@ -1,0 +1,294 @@
+"""Small solves around a trained field: cameras and latent codes; `tracks` for warps.
+
+Everything takes plain functions, runs under `jit`, and says by a flag, never by an
+exception, whether it got there. Flags are computed from the result: a solver's own word
+is about its last step only. jaxopt is imported in this file and nowhere else.
+"""
+
+import dataclasses
+import math
+import warnings
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+import optax
+import optimistix
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from nerfies_jax.geometry import lie
+from nerfies_jax.geometry.camera import Camera
+
+PyTree = Any
+Vector = Float[Array, "3"]
+Scalar = Float[Array, ""]
+
+
+class Fit(NamedTuple):
+    """The outcome of one solve; leading axes where it was vmapped."""
+
+    value: PyTree  # finite where the start is, whether or not it converged
+    converged: Bool[Array, "*batch"]
+    steps: Int[Array, "*batch"]
+    residual: Float[Array, "*batch"]  # what was to vanish, at `value`
+
+
+def check_positive(**values):
+    """Raise ValueError with name and value for what is not positive and finite."""
+    for name, value in values.items():
+        if not 0 < value < math.inf:
+            raise ValueError(f"{name}={value} must be positive and finite")
+
+
+def counted(steps) -> Int[Array, "*batch"]:
+    """Steps as int32: solvers count in whatever is the default."""
+    return jnp.asarray(steps, jnp.int32)
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraSpec:
+    """Which of a camera's numbers are refined, and when they count as found.
+
+    They do when one more Gauss-Newton step would turn the camera by less than
+    `tolerance` (rad; of other unknowns, what moves the residuals as much), when the
+    residuals tell all unknowns apart, and when their root mean square is at most
+    `max_residual`. Give that bound wherever wrong minima exist: photometric residuals
+    are flat there too.
+    """
+
+    unknowns: tuple[str, ...] = ("angular", "linear")  # and "focal"
+    tolerance: float = 1e-5  # rad
+    max_residual: float = math.inf  # in the residuals' own unit
+    max_steps: int = 64
+
+    def __post_init__(self):
+        check_positive(tolerance=self.tolerance, max_steps=self.max_steps)
+        if not self.max_residual > 0:
+            raise ValueError(f"max_residual={self.max_residual} must be positive")
+        unknown = set(self.unknowns) - set(_WIDTHS)
+        if unknown or not self.unknowns or len(set(self.unknowns)) < len(self.unknowns):
+            raise ValueError(
+                f"unknowns={self.unknowns} must be different names of {tuple(_WIDTHS)}"
+            )
+
+
+_WIDTHS = {"angular": 3, "linear": 3, "focal": 1}
+# Smallest over largest singular value of the Jacobian with columns of unit length. A
+# camera that sees a few degrees of a far scene has 1e-3; float32 alone makes 1e-6.
+DETERMINED = 1e-4
+
+
+def move_camera(camera: Camera, angular: Vector, linear: Vector) -> Camera:
+    """One camera with exp(angular, linear) applied on the left of camera_from_world.
+
+    A screw in the camera's own frame: `angular` in rad, `linear` in scene units.
+    """
+    rotation, shift = lie.exp_se3(angular, linear)
+    turned = jnp.matmul(rotation, camera.camera_from_world, precision="highest")
+    # t' = R t + V v with t = -R c; the centre moves by -R'ᵀ V v, and nothing cancels.
+    moved = camera.position - jnp.matmul(shift, turned, precision="highest")
+    return camera._replace(camera_from_world=turned, position=moved)
+
+
+def refine_camera(
+    residuals: Callable[[Camera], Float[Array, "..."]],
+    camera: Camera,
+    spec: CameraSpec = CameraSpec(),
+) -> Fit:
+    """The camera nearby with the least sum of squared `residuals`.
+
+    By Levenberg-Marquardt. `residual` is their root mean square. The result carries no
+    derivatives.
+    """
+    camera = jax.tree.map(lambda leaf: lax.stop_gradient(jnp.asarray(leaf)), camera)
+    start = jnp.zeros(
+        sum(_WIDTHS[name] for name in spec.unknowns), camera.position.dtype
+    )
+
+    def unscaled(step):
+        return residuals(_stepped(camera, step, spec.unknowns)).reshape(-1)
+
+    slopes = jax.jacfwd(unscaled)(start)
+    if slopes.shape[0] < start.size:
+        raise ValueError(
+            f"{slopes.shape[0]} residuals cannot determine {start.size} unknowns "
+            f"{spec.unknowns}; give more, or fewer unknowns"
+        )
+    # Damping treats all unknowns alike, so they get columns of equal length, and rad,
+    # scene units and logarithms of focal length become comparable.
+    lengths = jnp.sqrt(jnp.sum(slopes**2, axis=0))
+    largest = jnp.max(lengths)
+    unit = jnp.where(largest > 0, largest, 1)
+    scale = jnp.where(lengths > 0, unit / jnp.where(lengths > 0, lengths, 1), 1)
+
+    def scaled(step, _):
+        return unscaled(step * scale) / unit
+
+    solver = optimistix.LevenbergMarquardt(
+        rtol=spec.tolerance / 10, atol=spec.tolerance / 10
+    )
+    solution = optimistix.least_squares(
+        scaled, solver, start, max_steps=spec.max_steps, throw=False
+    )
+    step = lax.stop_gradient(solution.value)
+    rms = jnp.sqrt(jnp.mean(unscaled(step * scale) ** 2))
+    settled = _settled(lambda y: scaled(y, None), step, spec.tolerance)
+    converged = settled & (rms <= spec.max_residual)
+    step = jnp.where(jnp.all(jnp.isfinite(step)), step, start)
+    value = _stepped(camera, step * scale, spec.unknowns)
+    return Fit(value, converged, counted(solution.stats["num_steps"]), rms)
+
+
+def fit_code(
+    loss: Callable[[PyTree], Scalar],
+    start: PyTree,
+    solver: str = "lbfgs",
+    max_steps: int = 100,
+    tolerance: float = 1e-4,
+) -> Fit:
+    """A latent code (any pytree of floats of one dtype) that makes `loss` small.
+
+    `residual` is the length of the loss's gradient; at most `tolerance` (loss per unit
+    of code) counts as converged. The code returned is never worse than the start, which
+    is what comes back where the loss is not finite there. No derivatives. The solvers
+    are `CODE_SOLVERS`; experiments/solver_table.py measures them.
+    """
+    check_positive(max_steps=max_steps, tolerance=tolerance)
+    if solver not in CODE_SOLVERS:
+        raise ValueError(
+            f"unknown solver {solver!r}; choose from {sorted(CODE_SOLVERS)}"
+        )
+    leaves = [jnp.asarray(leaf) for leaf in jax.tree.leaves(start)]
+    kinds = {leaf.dtype.name for leaf in leaves}
+    if len(kinds) != 1 or not jnp.issubdtype(leaves[0].dtype, jnp.floating):
+        raise ValueError(f"a code is of one floating dtype, got {sorted(kinds)}")
+    flat, rebuild = jax.flatten_util.ravel_pytree(lax.stop_gradient(start))
+
+    def flat_loss(code):
+        return loss(rebuild(code))
+
+    # jaxopt and optax add steps to floats; the loss is also traced outside, strictly.
+    with jax.numpy_dtype_promotion("standard"):
+        found, steps = CODE_SOLVERS[solver](flat_loss, flat, max_steps, tolerance)
+    found = lax.stop_gradient(found)
+    reached = flat_loss(found)
+    better = jnp.isfinite(reached) & (reached <= flat_loss(flat))
+    code = jnp.where(better, found, flat)
+    value, slope = jax.value_and_grad(flat_loss)(code)
+    residual = _length(slope)
+    converged = jnp.isfinite(value) & (residual <= tolerance)
+    return Fit(rebuild(code), converged, counted(steps), residual)
+
+
+# (loss of a flat code, start, max_steps, tolerance) -> code, steps
+CodeSolver = Callable[[Callable, Array, int, float], tuple[Array, Array]]
+
+
+def _jaxopt_lbfgs(loss, start, max_steps, tolerance):
+    with warnings.catch_warnings():
+        warnings.filterwarnings(
+            "ignore", "JAXopt is no longer maintained", DeprecationWarning
+        )
+        import jaxopt
+    solver = jaxopt.LBFGS(
+        loss,
+        maxiter=max_steps,
+        tol=tolerance,
+        # Without, a search that fails at the rounding floor is repeated to max_steps.
+        stop_if_linesearch_fails=True,
+        # The loss closes over tracers, which its custom derivative refuses.
+        implicit_diff=False,
+        unroll=False,
+    )
+    code, state = solver.run(start)
+    return code, state.iter_num
+
+
+def _optimistix(solver):
+    def solve(loss, start, max_steps, tolerance):
+        # It stops on differences of code and loss, not on the gradient.
+        ulps = 4 * float(jnp.finfo(start.dtype).eps)
+        # Its L-BFGS keeps its history in the default precision and takes no other.
+        default = jnp.result_type(float)
+        solution = optimistix.minimise(
+            lambda code, _: loss(code.astype(start.dtype)).astype(default),
+            solver(rtol=ulps, atol=tolerance / 100, norm=optimistix.two_norm),
+            start.astype(default),
+            max_steps=max_steps,
+            throw=False,
+        )
+        return solution.value.astype(start.dtype), solution.stats["num_steps"]
+
+    return solve
+
+
+def _optax(transformation):
+    """Descent by an optax transformation; the best code of the way, not the last."""
+
+    def solve(loss, start, max_steps, tolerance):
+        rule = optax.with_extra_args_support(transformation(max_steps))
+
+        def unfinished(state):
+            _, _, _, slope, _, step = state
+            return (step < max_steps) & (_length(slope) > tolerance)
+
+        def descend(state):
+            code, memory, value, slope, best, step = state
+            updates, memory = rule.update(
+                slope, memory, code, value=value, grad=slope, value_fn=loss
+            )
+            code = optax.apply_updates(code, updates)
+            value, slope = jax.value_and_grad(loss)(code)
+            # At the rounding floor the loss no longer tells which code is better.
+            better = (value < best[1]) | (_length(slope) <= tolerance)
+            best = (
+                jnp.where(better, code, best[0]),
+                jnp.where(better, value, best[1]),
+            )
+            return code, memory, value, slope, best, step + 1
+
+        value, slope = jax.value_and_grad(loss)(start)
+        state = start, rule.init(start), value, slope, (start, value), jnp.int32(0)
+        *_, best, steps = lax.while_loop(unfinished, descend, state)
+        return best[0], steps
+
+    return solve
+
+
+CODE_SOLVERS: Mapping[str, CodeSolver] = {
+    "lbfgs": _jaxopt_lbfgs,
+    "bfgs": _optimistix(optimistix.BFGS),
+    "optimistix-lbfgs": _optimistix(optimistix.LBFGS),
+    "optax-lbfgs": _optax(lambda steps: optax.lbfgs()),
+    # Codes are drawn within 0.05 and end within about 1: a hundred steps get there.
+    "adam": _optax(lambda steps: optax.adam(optax.cosine_decay_schedule(0.03, steps))),
+}
+
+
+def _length(vector):
+    return jnp.sqrt(jnp.sum(vector**2))
+
+
+def _stepped(camera, step, unknowns):
+    parts, at = {}, 0
+    for name in unknowns:
+        parts[name] = step[at : at + _WIDTHS[name]]
+        at += _WIDTHS[name]
+    none = jnp.zeros(3, step.dtype)
+    camera = move_camera(camera, parts.get("angular", none), parts.get("linear", none))
+    if "focal" in parts:  # its logarithm: stays positive
+        camera = camera._replace(focal_px=camera.focal_px * jnp.exp(parts["focal"][0]))
+    return camera
+
+
+def _settled(residuals, step, tolerance):
+    """Whether the next Gauss-Newton step is small and well determined."""
+    slopes = jax.jacfwd(residuals)(step)
+    basis, triangle = jnp.linalg.qr(slopes)
+    values = jnp.linalg.svd(triangle, compute_uv=False)
+    determined = values[-1] > DETERMINED * values[0]
+    onward = jax.scipy.linalg.solve_triangular(triangle, basis.T @ residuals(step))
+    return determined & (jnp.max(jnp.abs(onward)) <= tolerance)

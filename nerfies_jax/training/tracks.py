@@ -1,0 +1,213 @@
+"""Inverse warps, and the tracks of points through time that they give.
+
+A warp sends observed points to canonical ones, x + d(x) = c. It has no inverse in
+closed form, and where it folds it has several or none; flags say so.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optimistix
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from nerfies_jax.training.fit import Fit, check_positive, counted
+
+PyTree = Any
+Vector = Float[Array, "3"]
+
+
+@dataclasses.dataclass(frozen=True)
+class InverseSpec:
+    """How an inverse warp is sought, and when it counts as found.
+
+    Found means |x + d(x) - c| <= atol + rtol max|c|, in units of the field, and that
+    the warp is not turned over at x (det J > 0). With a `reach`, six more solves start
+    that far away along the axes, and if one ends at another root the flag is taken
+    away: the point is seen in several places. That costs six solves, so it is off.
+    """
+
+    atol: float = 1e-5  # units of the field, as dycheck's Broyden iteration
+    rtol: float = 1e-6  # 8 ulps of a float32 coordinate
+    max_steps: int = 32  # of Newton
+    continuation: int = 8  # steps from the identity to the warp where no start is given
+    reach: float = 0.0  # units of the field
+
+    def __post_init__(self):
+        check_positive(atol=self.atol, max_steps=self.max_steps)
+        for name in ("rtol", "continuation", "reach"):
+            value = getattr(self, name)
+            if not 0 <= value < math.inf:
+                raise ValueError(f"{name}={value} must be finite and not negative")
+
+
+def inverse_warp(
+    displace: Callable[[PyTree, Vector], Vector],
+    params: PyTree,
+    canonical_point: Vector,
+    start: Vector | None = None,
+    spec: InverseSpec = InverseSpec(),
+) -> Fit:
+    """The observed point x with x + displace(params, x) = `canonical_point`.
+
+    Without a `start`, x + s d(x) = c is followed from s = 0, where x = c, to s = 1;
+    docs/numerics.md says what that finds that a solver started at c does not.
+    `residual` is |x + d(x) - c|. Derivatives with respect to `params` and
+    `canonical_point` are those of the implicit function; zero where the flag is False.
+    What else `displace` closes over is held constant.
+    """
+    frozen = lax.stop_gradient((params, canonical_point))
+    if start is None:
+        start = _continued(displace, *frozen, spec.continuation)
+    start = lax.stop_gradient(start)
+    root, steps = _newton(displace, *frozen, start, spec)
+    converged = _solves(displace, *frozen, root, spec)
+    if spec.reach:
+        ways = jnp.concatenate([jnp.eye(3), -jnp.eye(3)]).astype(root.dtype)
+        others = jax.vmap(
+            lambda way: _newton(displace, *frozen, root + spec.reach * way, spec)[0]
+        )(ways)
+        solved = jax.vmap(lambda x: _is_root(displace, *frozen, x, spec))(others)
+        apart = jnp.max(jnp.abs(others - root), axis=-1) > spec.reach / 100
+        converged &= ~jnp.any(solved & apart)
+    value = _implicit(displace, params, canonical_point, root, converged)
+    # Where there is no root the start is the better guess: Newton may have flown off.
+    # A root that is turned over or not the only one is told by its small residual.
+    root = jnp.where(_is_root(displace, *frozen, root, spec), root, start)
+    value = jnp.where(converged, value, root)
+    residual = _norm(_excess(displace, *frozen, lax.stop_gradient(value)))
+    return Fit(value, converged, steps, residual)
+
+
+class Tracks(NamedTuple):
+    """Points through time, in the coordinates of the warp."""
+
+    points: Float[Array, "points moments 3"]
+    converged: Bool[Array, "points moments"]
+
+
+def point_tracks(
+    displace: Callable[[PyTree, Vector, PyTree], Vector],
+    params: PyTree,
+    points: Float[Array, "points 3"],
+    moments: PyTree,
+    row: int | None = None,
+    spec: InverseSpec = InverseSpec(),
+) -> Tracks:
+    """Where points are at every moment; `moments` has these along its first axis.
+
+    `points` were observed at moment `row`, or are canonical where it is None. Going
+    outward from there, each is sought from where it was last found. Where it is lost,
+    its flag is False and its place that last one.
+    """
+    count = jax.tree.leaves(moments)[0].shape[0]
+    if row is not None and not 0 <= row < count:
+        raise ValueError(
+            f"row={row} is not in 0 .. {count - 1}; it is the moment at which the "
+            "points were observed, or None for canonical points"
+        )
+    first = row or 0
+    here = jax.tree.map(lambda leaf: leaf[first], moments)
+    before = jax.tree.map(lambda leaf: leaf[:first][::-1], moments)
+    after = jax.tree.map(lambda leaf: leaf[first + 1 :], moments)
+
+    def at_moment(inputs, point):
+        return displace(inputs[0], point, inputs[1])
+
+    def track(point):
+        if row is None:
+            canonical = point
+            fit = inverse_warp(at_moment, (params, here), canonical, spec=spec)
+            found, known = fit.value, fit.converged
+        else:
+            canonical = point + displace(params, point, here)
+            found, known = point, jnp.all(jnp.isfinite(canonical))
+
+        def onward(place, moment):
+            fit = inverse_warp(at_moment, (params, moment), canonical, place, spec)
+            place = jnp.where(fit.converged, fit.value, place)
+            return place, (place, fit.converged)
+
+        _, (back, back_known) = lax.scan(onward, found, before)
+        _, (ahead, ahead_known) = lax.scan(onward, found, after)
+        return Tracks(
+            jnp.concatenate([back[::-1], found[None], ahead]),
+            jnp.concatenate([back_known[::-1], known[None], ahead_known]),
+        )
+
+    return jax.vmap(track)(points)
+
+
+def _excess(displace, params, canonical_point, point):
+    return point + displace(params, point) - canonical_point
+
+
+def _norm(vector):
+    return jnp.sqrt(jnp.sum(vector**2))
+
+
+def _is_root(displace, params, canonical_point, point, spec):
+    """False for NaN, as comparisons are."""
+    bound = spec.atol + spec.rtol * jnp.max(jnp.abs(canonical_point))
+    return _norm(_excess(displace, params, canonical_point, point)) <= bound
+
+
+def _solves(displace, params, canonical_point, point, spec):
+    slopes = jnp.eye(3, dtype=point.dtype) + jax.jacfwd(displace, 1)(params, point)
+    upright = jnp.dot(slopes[0], jnp.cross(slopes[1], slopes[2])) > 0
+    return upright & _is_root(displace, params, canonical_point, point, spec)
+
+
+def _newton(displace, params, canonical_point, start, spec):
+    # Newton rather than dogleg or Levenberg-Marquardt: from a start this near it finds
+    # as many roots in fewer steps, and its derivative is J⁻¹ without second ones.
+    solution = optimistix.root_find(
+        lambda point, inputs: _excess(displace, *inputs, point),
+        optimistix.Newton(rtol=spec.rtol, atol=spec.atol),
+        start,
+        (params, canonical_point),
+        max_steps=spec.max_steps,
+        throw=False,
+    )
+    return lax.stop_gradient(solution.value), counted(solution.stats["num_steps"])
+
+
+def _continued(displace, params, canonical_point, steps):
+    """One Newton step on x + s d(x) = c for each of `steps` values of s up to 1."""
+
+    def step(point, share):
+        move, slopes = displace(params, point), jax.jacfwd(displace, 1)(params, point)
+        jacobian = jnp.eye(3, dtype=point.dtype) + share * slopes
+        excess = point + share * move - canonical_point
+        moved = point - jnp.linalg.solve(jacobian, excess)
+        # Singular on the way, as a half turn is at s = 1/2, and regular after it.
+        return jnp.where(jnp.all(jnp.isfinite(moved)), moved, point), None
+
+    shares = jnp.arange(1, steps + 1, dtype=canonical_point.dtype) / max(steps, 1)
+    return lax.scan(step, canonical_point, shares)[0]
+
+
+def _implicit(displace, params, canonical_point, root, converged):
+    """`root` after one more Newton step, with the derivatives of the inverse.
+
+    Where it did not converge the equation is replaced by x = root, whose Jacobian is
+    the identity, so that no singular matrix is ever inverted.
+    """
+    root = jnp.where(jnp.all(jnp.isfinite(root)), root, 0)
+
+    def equation(point, inputs):
+        excess = _excess(displace, *inputs, point)
+        return jnp.where(converged, excess, point - root)
+
+    return optimistix.root_find(
+        equation,
+        optimistix.Newton(rtol=0.0, atol=0.0),
+        root,
+        (params, canonical_point),
+        max_steps=1,
+        throw=False,
+    ).value

@@ -1,0 +1,301 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from scipy import optimize
+
+from nerfies_jax.geometry import camera as cameras
+from nerfies_jax.training import fit
+from nerfies_jax.training.fit import CODE_SOLVERS, CameraSpec, fit_code, refine_camera
+
+SIZE = (64, 48)
+ANGULAR, LINEAR = np.array([0.03, -0.05, 0.04]), np.array([0.1, -0.06, 0.08])
+
+
+def hat(angular):
+    """The matrix of w × (...)."""
+    return np.cross(np.eye(3), angular)
+
+
+def scene_camera(dtype, distorted=True):
+    camera = cameras.look_at((0.3, -0.4, -3), (0, 0, 0), (0, -1, 0), 80, SIZE, dtype)
+    if distorted:
+        camera = camera._replace(radial=np.array([-0.1, 0.02, 0], dtype))
+    return jax.tree.map(jnp.asarray, camera)
+
+
+def scene_points(rng, dtype, count=20):
+    return jnp.asarray(rng.uniform(-0.8, 0.8, (count, 3)), dtype)
+
+
+def pixels(camera, points):
+    return jax.vmap(cameras.project, (None, 0))(camera, points)[0]
+
+
+def pose_error(found, truth):
+    """Angle (rad) and distance (scene units) between two cameras."""
+    turn = (
+        np.asarray(found.camera_from_world, float)
+        @ np.asarray(truth.camera_from_world, float).T
+    )
+    away = np.asarray(found.position, float) - np.asarray(truth.position, float)
+    return np.linalg.norm(turn - np.eye(3)) / np.sqrt(2), np.linalg.norm(away)
+
+
+@pytest.mark.parametrize("far", [0, 1e4])
+def test_a_camera_moves_as_its_matrix_does(far, float64):
+    """Against the matrix exponential, also far out, where R x + t cancels."""
+    camera = scene_camera("float64")
+    camera = camera._replace(position=camera.position + far)
+    moved = fit.move_camera(camera, jnp.asarray(ANGULAR), jnp.asarray(LINEAR))
+    twist = np.zeros((4, 4))
+    twist[:3, :3], twist[:3, 3] = hat(ANGULAR), LINEAR
+    before = np.asarray(cameras.world_from_camera(camera))
+    exact = before @ np.linalg.inv(scipy.linalg.expm(twist))
+    # 1e-11: SciPy's side multiplies positions of 1e4
+    np.testing.assert_allclose(cameras.world_from_camera(moved), exact, atol=1e-11)
+
+
+@pytest.mark.parametrize(
+    "unknowns", [("angular", "linear"), ("focal", "angular", "linear")]
+)
+def test_a_disturbed_camera_is_found_again_from_its_pixels(unknowns, dtype, rng):
+    truth, points = scene_camera(dtype), scene_points(rng, dtype)
+    seen = pixels(truth, points)
+    start = fit.move_camera(
+        truth, jnp.asarray(ANGULAR, dtype), jnp.asarray(LINEAR, dtype)
+    )
+    if "focal" in unknowns:
+        start = start._replace(focal_px=start.focal_px * 1.2)
+    spec = CameraSpec(unknowns=unknowns)
+    found = jax.jit(
+        lambda c: refine_camera(lambda c: pixels(c, points) - seen, c, spec)
+    )(start)
+    assert found.converged
+    assert found.residual < {"float32": 1e-4, "float64": 1e-7}[dtype]
+    # float32: an ulp of a pixel, 4e-6 px, over 80 px per rad, times the conditioning
+    limit = {"float32": 2e-5, "float64": 1e-7}[dtype]
+    assert max(pose_error(found.value, truth)) < limit
+    assert abs(found.value.focal_px / truth.focal_px - 1) < limit
+    if "focal" not in unknowns:
+        assert found.value.focal_px == start.focal_px
+
+
+def test_noisy_pixels_give_the_least_squares_camera_of_scipy(float64, rng):
+    truth, points = scene_camera("float64"), scene_points(rng, "float64")
+    seen = np.asarray(pixels(truth, points)) + rng.normal(size=(20, 2))
+    start = fit.move_camera(truth, jnp.asarray(ANGULAR), jnp.asarray(LINEAR))
+    found = refine_camera(lambda c: pixels(c, points) - seen, start)
+    assert found.converged
+
+    def residuals(step):
+        rotation = scipy.linalg.expm(hat(step[:3])) @ np.asarray(
+            truth.camera_from_world
+        )
+        moved = start._replace(camera_from_world=rotation, position=step[3:])
+        return (np.asarray(projected(moved)) - seen).ravel()
+
+    projected = jax.jit(lambda camera: pixels(camera, points))
+    exact = optimize.least_squares(
+        residuals, [0, 0, 0, *start.position], xtol=1e-12, ftol=1e-12, gtol=1e-12
+    )
+    rms = np.sqrt(np.mean(exact.fun**2))
+    assert found.residual == pytest.approx(rms, rel=1e-9)
+    # SciPy's slopes are differences; the optimum is flat to their 1e-6
+    np.testing.assert_allclose(found.value.position, exact.x[3:], atol=1e-5)
+
+
+def texture(point):
+    """A smooth picture on the plane z = 0."""
+    x, y = point[0], point[1]
+    return jnp.stack(
+        [
+            jnp.sin(3 * x + y) * jnp.cos(2 * y),
+            jnp.cos(2 * x - 3 * y),
+            jnp.sin(x * y * 2 + x),
+        ]
+    )
+
+
+def photograph(camera):
+    """The textured plane as the camera sees it, on a coarse grid of pixels."""
+    across, down = np.meshgrid(np.arange(2, 64, 5) + 0.5, np.arange(2, 48, 5) + 0.5)
+    centres = jnp.asarray(
+        np.stack([across.ravel(), down.ravel()], -1), camera.position.dtype
+    )
+
+    def colour(pixel):
+        slopes = (pixel - camera.principal_point_px) / camera.focal_px
+        direction = jnp.append(slopes, 1) @ camera.camera_from_world
+        distance = -camera.position[2] / direction[2]
+        return texture(camera.position + distance * direction)
+
+    return jax.vmap(colour)(centres)
+
+
+def test_a_camera_is_found_from_colours_alone_and_wrong_minima_are_flagged(dtype):
+    """Eight starts as one batch: near ones come back, far ones are flagged."""
+    truth = scene_camera(dtype, distorted=False)
+    seen = photograph(truth)
+    sizes = jnp.asarray([0, 0.2, 0.5, 1, 4, 8, 16, 32], dtype)
+    spec = CameraSpec(max_residual=1e-3)
+
+    def refine(size):
+        start = fit.move_camera(
+            truth, size * jnp.asarray(ANGULAR, dtype), size * jnp.asarray(LINEAR, dtype)
+        )
+        return refine_camera(lambda c: photograph(c) - seen, start, spec)
+
+    found = jax.jit(jax.vmap(refine))(sizes)
+    right = []
+    for row in range(8):
+        error = max(pose_error(cameras.take(found.value, row), truth))
+        right.append(error < {"float32": 1e-4, "float64": 1e-6}[dtype])
+    assert all(right[:4])
+    assert not all(right)
+    np.testing.assert_array_equal(found.converged, right)
+
+
+def test_what_cannot_determine_a_camera_is_flagged(dtype, rng):
+    truth, points = scene_camera(dtype), scene_points(rng, dtype)
+    start = fit.move_camera(
+        truth, jnp.asarray(ANGULAR, dtype), jnp.asarray(LINEAR, dtype)
+    )
+
+    @jax.jit
+    def refine(points, start):
+        seen = pixels(truth, points)
+        return refine_camera(lambda c: pixels(c, points) - seen, start)
+
+    one_point = jnp.tile(points[:1], (8, 1))
+    a_line = jnp.linspace(-1, 1, 8, dtype=dtype)[:, None] * points[0]
+    for degenerate in (one_point, a_line):
+        found = refine(degenerate, start)
+        assert found.residual < 1e-3  # it fits, and means nothing
+        assert not found.converged
+        assert np.isfinite(found.value.position).all()
+    lost = start._replace(position=jnp.full(3, jnp.nan, dtype))
+    assert not refine(points[:8], lost).converged
+    with pytest.raises(ValueError, match="4 residuals cannot determine 6 unknowns"):
+        refine(points[:2], start)
+
+
+def test_a_camera_that_sees_nothing_or_has_no_time_is_flagged(dtype):
+    start = scene_camera(dtype)
+    still = refine_camera(lambda c: jnp.ones(8, dtype), start)
+    assert not still.converged
+    assert max(pose_error(still.value, start)) < 1e-6
+
+    def far_away(camera):
+        return jnp.concatenate([camera.position - 1, camera.camera_from_world[0]]) ** 3
+
+    assert not refine_camera(far_away, start, CameraSpec(max_steps=1)).converged
+
+
+def test_wrong_camera_settings_are_refused():
+    with pytest.raises(ValueError, match="tolerance=-1"):
+        CameraSpec(tolerance=-1.0)
+    with pytest.raises(ValueError, match="different names"):
+        CameraSpec(unknowns=("roll",))
+    with pytest.raises(ValueError, match="max_residual=0"):
+        CameraSpec(max_residual=0.0)
+
+
+# Steps and tolerance at which each solver has surely arrived. Adam only creeps there.
+GENEROUS = {name: (200, 1e-3) for name in CODE_SOLVERS} | {"adam": (1000, 1e-2)}
+
+
+@pytest.mark.parametrize("solver", CODE_SOLVERS)
+def test_every_solver_finds_the_ridge_regression(solver, dtype, rng):
+    """Against the normal equations, for a code of two arrays."""
+    matrix = rng.normal(size=(30, 8))
+    wanted = matrix @ rng.normal(size=8) * 0.3
+    exact = np.linalg.solve(matrix.T @ matrix + 0.1 * np.eye(8), matrix.T @ wanted)
+    rows, target = jnp.asarray(matrix, dtype), jnp.asarray(wanted, dtype)
+
+    def loss(code):
+        flat = jnp.concatenate([code["a"], code["b"].reshape(-1)])
+        return jnp.sum((rows @ flat - target) ** 2) + 0.1 * jnp.sum(flat**2)
+
+    start = {"a": jnp.zeros(2, dtype), "b": jnp.zeros((2, 3), dtype)}
+    steps, tolerance = GENEROUS[solver]
+    found = jax.jit(lambda start: fit_code(loss, start, solver, steps, tolerance))(
+        start
+    )
+    assert found.converged
+    assert 1 < found.steps <= steps
+    assert found.residual <= tolerance
+    assert found.value["b"].shape == (2, 3)
+    code = np.concatenate([found.value["a"], np.ravel(found.value["b"])])
+    # the gradient is the Hessian times the distance
+    curvature = 2 * np.linalg.eigvalsh(matrix.T @ matrix + 0.1 * np.eye(8))[0]
+    assert np.linalg.norm(code - exact) < tolerance / curvature + 1e-6
+
+
+@pytest.mark.parametrize("solver", sorted(set(CODE_SOLVERS) - {"adam"}))
+def test_second_order_solvers_follow_a_bent_valley(solver, float64):
+    """Rosenbrock's, against its known minimum; Adam needs thousands of steps."""
+
+    def loss(code):
+        return jnp.sum(100 * (code[1:] - code[:-1] ** 2) ** 2 + (1 - code[:-1]) ** 2)
+
+    found = fit_code(loss, jnp.zeros(4), solver, 300, 1e-6)
+    assert found.converged
+    np.testing.assert_allclose(found.value, 1, atol=1e-5)
+
+
+@pytest.mark.parametrize("solver", CODE_SOLVERS)
+def test_a_bad_start_comes_back_flagged(solver, dtype):
+    start = jnp.asarray([-1.0, 2.0], dtype)
+    found = jax.jit(
+        lambda start: fit_code(lambda c: jnp.sum(jnp.log(c)), start, solver, 20)
+    )(start)
+    assert not found.converged
+    np.testing.assert_array_equal(found.value, start)
+
+
+@pytest.mark.parametrize("solver", CODE_SOLVERS)
+def test_a_solve_cut_short_is_flagged_and_no_worse_than_its_start(solver, dtype):
+    """The loss is finite only left of 1, close to where the descent leads."""
+
+    def loss(code):
+        return jnp.sum(-jnp.log(1 - code) - 300 * code)
+
+    start = jnp.asarray([0.5, -3.0], dtype)
+    found = jax.jit(lambda start: fit_code(loss, start, solver, 3, 1e-6))(start)
+    assert not found.converged
+    assert np.isfinite(found.value).all()
+    assert loss(found.value) <= loss(start)
+
+
+@pytest.mark.parametrize("solver", CODE_SOLVERS)
+def test_many_codes_are_fitted_as_one_batch(solver, dtype):
+    """And the loss may close over what is mapped or traced."""
+    targets = jnp.asarray([[0.1, 0.2], [-0.3, 0.4], [0.0, 0.0]], dtype)
+
+    @jax.jit
+    def fit_all(targets):
+        def one(target):
+            def loss(code):
+                return jnp.sum((code - target) ** 2 * jnp.asarray([1, 4], dtype))
+
+            return fit_code(loss, jnp.zeros(2, dtype), solver, 400, 1e-3)
+
+        return jax.vmap(one)(targets)
+
+    found = fit_all(targets)
+    assert found.converged.all()
+    assert found.steps[2] <= found.steps[0]
+    np.testing.assert_allclose(found.value, targets, atol=1e-3)
+
+
+def test_wrong_codes_and_solvers_are_refused():
+    with pytest.raises(ValueError, match="unknown solver 'newton'; choose from"):
+        fit_code(jnp.sum, jnp.ones(2), "newton")
+    with pytest.raises(ValueError, match=r"one floating dtype, got \['int32'\]"):
+        fit_code(jnp.sum, jnp.ones(2, jnp.int32))
+    with pytest.raises(ValueError, match="float16"):
+        fit_code(jnp.sum, (jnp.ones(2), jnp.ones(2, jnp.float16)))
+    with pytest.raises(ValueError, match="max_steps=0"):
+        fit_code(jnp.sum, jnp.ones(2), max_steps=0)

@@ -1,0 +1,287 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+
+from nerfies_jax.geometry import lie
+from nerfies_jax.training.tracks import InverseSpec, inverse_warp, point_tracks
+from tests import gradients
+
+SPEC = InverseSpec()
+# (angular, linear): still, a nudge, ordinary, half a turn (where the way from the
+# identity is singular in the middle), nearly a full one.
+SCREWS = (
+    ((0, 0, 0), (0, 0, 0)),
+    ((1e-8, 0, 0), (0, 1e-8, 0)),
+    ((0.3, -0.8, 0.5), (0.1, 0.2, 0.3)),
+    ((np.pi, 0, 0), (0.5, 0, 0)),
+    ((0, 3.1, 0), (0, 0.2, 0.1)),
+    ((0, 0, 6.2), (-0.3, 0, 0)),
+)
+
+
+def screw(params, point):
+    return lie.displacement(params[0], params[1], point)
+
+
+def waves(params, point):
+    """Six plane waves in random directions."""
+    directions, phases, amplitudes = params
+    return amplitudes.T @ jnp.sin(directions @ point + phases)
+
+
+def wave_params(rng, slope, dtype="float64"):
+    """Waves whose displacement's Jacobian has spectral norms up to about `slope`."""
+    directions = 4 * rng.normal(size=(6, 3))
+    phases, amplitudes = rng.uniform(0, 6, 6), rng.normal(size=(6, 3))
+    places = rng.uniform(-1, 1, (2000, 3))
+    cosines = np.cos(places @ directions.T + phases)
+    slopes = np.einsum("fi,nf,fj->nij", amplitudes, cosines, directions)
+    amplitudes *= slope / np.linalg.norm(slopes, 2, axis=(1, 2)).max()
+    return tuple(jnp.asarray(x, dtype) for x in (directions, phases, amplitudes))
+
+
+def wave(params, point):
+    """A fold along x only: x + a sin(k x)."""
+    amplitude, wavenumber = params
+    return jnp.stack(
+        [amplitude * jnp.sin(wavenumber * point[0]), 0 * point[1], 0 * point[2]]
+    )
+
+
+def saturating(params, point):
+    """x + d(x) = a tanh(x): its image ends at a."""
+    return params * jnp.tanh(point) - point
+
+
+def hat(angular):
+    """The matrix of w × (...)."""
+    return np.cross(np.eye(3), angular)
+
+
+def test_rigid_motions_are_inverted_to_rounding(dtype, rng):
+    angular, linear = jnp.asarray(np.array(SCREWS), dtype).swapaxes(0, 1)
+    points = rng.uniform(-1, 1, (len(SCREWS), 3))
+    motions = []
+    for w, v in SCREWS:
+        twist = np.zeros((4, 4))
+        twist[:3, :3] = hat(w)
+        twist[:3, 3] = v
+        motions.append(scipy.linalg.expm(twist))
+    canonical = [m[:3, :3] @ p + m[:3, 3] for m, p in zip(motions, points, strict=True)]
+    fit = jax.jit(jax.vmap(lambda w, v, c: inverse_warp(screw, (w, v), c)))(
+        angular, linear, jnp.asarray(np.stack(canonical), dtype)
+    )
+    assert fit.converged.all()
+    assert fit.value.dtype == dtype
+    # coordinates of order one: some ulps of them, through the sine of a large angle
+    error = np.abs(np.asarray(fit.value) - points).max()
+    assert error < {"float32": 2e-6, "float64": 1e-14}[dtype]
+
+
+def test_a_strongly_non_rigid_warp_is_inverted(dtype, rng):
+    params = wave_params(rng, 0.95, dtype)
+    points = rng.uniform(-1, 1, (256, 3)).astype(dtype)
+
+    fit = _there_and_back(waves, params, points)
+    assert fit.converged.all()
+    # one ulp of c becomes 1 / (1 - 0.95) in x at worst
+    error = np.abs(np.asarray(fit.value) - points).max()
+    assert error < {"float32": 5e-6, "float64": 2e-14}[dtype]
+    assert (fit.residual <= {"float32": 5e-7, "float64": 1e-15}[dtype]).all()
+
+
+def _there_and_back(displace, params, points, spec=SPEC):
+    @jax.jit
+    def run(params, points):
+        def one(point):
+            canonical = point + displace(params, point)
+            return inverse_warp(displace, params, canonical, spec=spec)
+
+        return jax.vmap(one)(points)
+
+    return run(params, jnp.asarray(points))
+
+
+def test_a_flag_is_true_only_at_upright_roots_of_a_folding_warp(float64, rng):
+    params = wave_params(rng, 2.2)
+    points = rng.uniform(-1, 1, (512, 3))
+    fit = _there_and_back(waves, params, points)
+    directions, phases, amplitudes = (np.asarray(x) for x in params)
+    canonical = points + np.sin(points @ directions.T + phases) @ amplitudes
+    found = np.asarray(fit.value)
+    angles = found @ directions.T + phases
+    residual = np.linalg.norm(found + np.sin(angles) @ amplitudes - canonical, axis=1)
+    slopes = np.einsum("fi,nf,fj->nij", amplitudes, np.cos(angles), directions)
+    upright = np.linalg.det(np.eye(3) + slopes) > 0
+    np.testing.assert_array_equal(fit.converged, (residual < 1e-5) & upright)
+    np.testing.assert_allclose(fit.residual, residual, atol=1e-12)
+    # measured 0.98; a solver started at the canonical point flags 0.75 (Newton), 0.70
+    assert fit.converged.mean() > 0.95
+
+
+def test_a_fold_has_no_unique_inverse_and_is_flagged(dtype):
+    """Against the number of roots counted by sign changes on a fine grid."""
+    params = (jnp.asarray(0.1, dtype), jnp.asarray(20.0, dtype))  # slope 1 ± 2
+    canonical = np.linspace(-0.5, 0.49, 101)
+    grid = np.linspace(-1, 1, 200_001)
+    image = grid + 0.1 * np.sin(20 * grid)
+    roots = np.array([(np.diff(np.sign(image - c)) != 0).sum() for c in canonical])
+    # At the edge of a fold two roots merge, and rounding decides.
+    edges = image[1:-1][np.diff(np.sign(np.diff(image))) != 0]
+    clear = np.abs(canonical[:, None] - edges).min(1) > 2e-3
+    assert {1, 3} <= set(roots[clear])  # the test sees both
+    targets = np.stack([canonical, 0 * canonical, 0 * canonical], 1)
+    spec = InverseSpec(reach=0.2)  # the displacement's whole range
+    fit = jax.jit(jax.vmap(lambda c: inverse_warp(wave, params, c, spec=spec)))(
+        jnp.asarray(targets, dtype)
+    )
+    np.testing.assert_array_equal(fit.converged[clear], (roots == 1)[clear])
+
+
+def test_the_middle_of_a_fold_is_flagged_without_a_search(dtype):
+    """Newton stands on the root already; it is turned over (slope -1)."""
+    params = (jnp.asarray(0.1, dtype), jnp.asarray(20.0, dtype))
+    middle = jnp.asarray([np.pi / 20, 0, 0], dtype)
+    fit = inverse_warp(wave, params, middle, middle)
+    assert fit.residual < 1e-6
+    assert not fit.converged
+
+
+def test_outside_the_image_of_a_warp_there_is_nothing(dtype):
+    """Flagged, finite, and without any derivative; the lane beside it keeps its own."""
+    half = jnp.asarray(0.5, dtype)
+    targets = jnp.asarray([[0.9, 0, 0], [0.2, 0.1, -0.3]], dtype)
+
+    def places(targets):
+        return jax.vmap(lambda c: inverse_warp(saturating, half, c))(targets)
+
+    fit = jax.jit(places)(targets)
+    assert fit.converged.tolist() == [False, True]
+    assert np.isfinite(fit.value).all()
+    np.testing.assert_allclose(
+        fit.value[1], np.arctanh(2 * np.asarray(targets[1], float)), atol=2e-6
+    )
+    slopes = jax.jit(jax.jacrev(lambda c: places(c).value))(targets)
+    np.testing.assert_array_equal(slopes[0], 0)
+    exact = np.diag(2 / (1 - (2 * np.asarray(targets[1], float)) ** 2))
+    np.testing.assert_allclose(slopes[1, :, 1], exact, rtol=1e-5, atol=1e-6)
+    by_width = jax.grad(lambda a: inverse_warp(saturating, a, targets[0]).value.sum())(
+        half
+    )
+    assert by_width == 0
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_field_that_is_not_finite_is_flagged(bad, dtype):
+    point = jnp.asarray([0.1, 0.2, 0.3], dtype)
+    fit = inverse_warp(lambda p, x: p * x, jnp.asarray(bad, dtype), point)
+    assert not fit.converged
+    np.testing.assert_array_equal(fit.value, point)
+
+
+def test_gradients_are_those_of_the_implicit_function(float64, rng):
+    params = wave_params(rng, 0.9)
+    target = jnp.asarray([0.2, -0.5, 0.7])
+    weights = jnp.asarray([1.0, -2.0, 0.5])
+
+    def place(params, target):
+        return inverse_warp(waves, params, target).value
+
+    def total(params, target):
+        return weights @ place(params, target)
+
+    # 1e-9: the truncation of a central difference with steps of 1e-5
+    assert gradients.directional_error(total, params, target) < 1e-7
+    x = np.asarray(place(params, target))
+    directions, phases, amplitudes = (np.asarray(p) for p in params)
+    sine, cosine = (f(directions @ x + phases) for f in (np.sin, np.cos))
+    inverse = np.linalg.inv(np.eye(3) + amplitudes.T @ (cosine[:, None] * directions))
+    by_target = jax.jacrev(place, 1)(params, target)
+    np.testing.assert_allclose(by_target, inverse, rtol=1e-10, atol=1e-12)
+    by_amplitude = jax.jacfwd(place)(params, target)[2]
+    exact = -np.einsum("ij,f->ifj", inverse, sine)
+    np.testing.assert_allclose(by_amplitude, exact, rtol=1e-10, atol=1e-12)
+
+
+def test_float32_stays_float32_with_x64_on(float64, rng):
+    params = wave_params(rng, 0.5, "float32")
+    fit = _there_and_back(waves, params, np.float32([[0.1, 0.2, 0.3]]))
+    assert fit.value.dtype == fit.residual.dtype == jnp.float32
+    assert fit.converged.all()
+
+
+def test_wrong_settings_are_refused():
+    with pytest.raises(ValueError, match=r"atol=0\.0 must"):
+        InverseSpec(atol=0.0)
+    with pytest.raises(ValueError, match=r"reach=-1\.0 must"):
+        InverseSpec(reach=-1.0)
+    with pytest.raises(ValueError, match=r"row=3 is not in 0 \.\. 2"):
+        point_tracks(lambda p, x, t: t * x, None, jnp.ones((1, 3)), jnp.arange(3.0), 3)
+
+
+def moving(params, point, moment):
+    """Turns by `rate` rad per time about an axis through `centre`, and swells."""
+    rate, swell = params
+    centre = moment["centre"]
+    offset = point - centre
+    turned = lie.displacement(rate * moment["time"], 0 * rate, offset)
+    return turned + swell * jnp.sin(3 * moment["time"]) * offset
+
+
+def moving_truth(params, canonical, times, centre):
+    """The observed points, by rotation matrices."""
+    rate, swell = (np.asarray(p, np.float64) for p in params)
+    tracks = []
+    for time in times:
+        turn = scipy.linalg.expm(hat(rate * time))
+        matrix = turn + swell * np.sin(3 * time) * np.eye(3)
+        tracks.append((canonical - centre) @ np.linalg.inv(matrix).T + centre)
+    return np.stack(tracks, 1)
+
+
+@pytest.mark.parametrize("row", [None, 0, 4, 8])
+def test_tracks_follow_points_through_a_known_motion(row, dtype, rng):
+    params = (jnp.asarray([0.0, 2.5, 0.4], dtype), jnp.asarray(0.2, dtype))
+    times = np.linspace(0, 1, 9)
+    centre = np.array([0.2, 0.0, -0.1])
+    moments = {
+        "time": jnp.asarray(times, dtype),
+        "centre": jnp.tile(jnp.asarray(centre, dtype), (9, 1)),
+    }
+    canonical = rng.uniform(-1, 1, (5, 3))
+    truth = moving_truth(params, canonical, times, centre)
+    given = canonical if row is None else truth[:, row]
+    tracks = jax.jit(lambda p, x, m: point_tracks(moving, p, x, m, row))(
+        params, jnp.asarray(given, dtype), moments
+    )
+    assert tracks.converged.all()
+    error = np.abs(np.asarray(tracks.points) - truth).max()
+    assert error < {"float32": 3e-6, "float64": 1e-13}[dtype]
+
+
+def test_a_track_survives_a_moment_at_which_it_is_lost(dtype):
+    """At two moments the image of the warp ends before the point."""
+    widths = jnp.asarray([2, 2, 0.5, 0.5, 2, 1.9], dtype)
+
+    def field(params, point, width):
+        return saturating(width, point)
+
+    points = jnp.asarray([[0.9, 0.0, 0.0], [0.1, 0.2, -0.3]], dtype)
+    tracks = point_tracks(field, None, points, widths)
+    assert tracks.converged[0].tolist() == [True, True, False, False, True, True]
+    assert tracks.converged[1].all()
+    exact = np.arctanh(0.9 / np.array([2, 2, 2, 2, 2, 1.9]))
+    np.testing.assert_allclose(tracks.points[0, :, 0], exact, atol=1e-6)
+
+
+def test_gradients_of_tracks_equal_central_differences(float64):
+    params = (jnp.asarray([0.0, 2.5, 0.4]), jnp.asarray(0.2))
+    moments = {"time": jnp.linspace(0, 1, 5), "centre": jnp.zeros((5, 3)) + 0.1}
+
+    def total(params, points):
+        tracks = point_tracks(moving, params, points, moments, 2)
+        return jnp.sum(tracks.points * jnp.arange(15.0).reshape(5, 3))
+
+    assert gradients.directional_error(total, params, jnp.ones((2, 3)) / 3) < 1e-7
