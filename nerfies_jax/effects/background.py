@@ -1,0 +1,84 @@
+"""The background stays put: points known to be static must not be moved by the warp.
+
+Park et al. 2021 (Nerfies), arXiv:2011.12948, equation 14: without it the warp and the
+template may drift together, which no image tells.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from nerfies_jax.effects.effect import Context, Effect, Scalar, Term
+from nerfies_jax.training import losses
+
+
+@dataclasses.dataclass(frozen=True)
+class BackgroundSpec:
+    """How many points a step looks at, how they are jittered, and what moving costs.
+
+    `noise` (standard deviation) and `width` are in units of the field, whose box is the
+    filmed volume: the official code's scenes are scaled to fill one of diagonal one.
+    `width` is the displacement at which ρ leaves the parabola. The official scaling is
+    the default: its weight of one is 1e-3 of what equation 14 with ρ of `losses` says.
+
+    A scene of a capture without static points is refused when it is built.
+    """
+
+    points: int = 16_384
+    noise: float = 1e-3
+    width: float = 1e-3
+    scaling: str = "official"
+    weight: float = 1.0
+
+    def __post_init__(self):
+        if self.points < 1:
+            raise ValueError(f"points={self.points} of a step must be at least 1")
+        for name in ("noise", "weight"):
+            value = getattr(self, name)
+            if not 0 <= value < float("inf"):
+                raise ValueError(f"{name}={value} must be finite and not negative")
+        losses.geman_mcclure(jnp.zeros(()), self.width, self.scaling)  # refuses wrong
+
+
+def effect(spec: BackgroundSpec) -> Effect:
+    """The seams of `spec`; each random static point is seen in a random frame."""
+
+    def penalty(_, context):
+        return {"background": Term(drift(spec, context), spec.weight)}
+
+    return Effect("background", penalty=penalty, wants=frozenset({"points"}))
+
+
+def drift(spec: BackgroundSpec, context: Context) -> Scalar:
+    """Mean over static points of ρ(|displacement|²).
+
+    With no more points than `spec.points` all are taken, each once; of more, as many
+    are drawn with replacement.
+    """
+    # The official code draws frames and jitter with one key.
+    choice_key, frame_key, noise_key = jax.random.split(context.key, 3)
+    point = context.frames.points
+    if point.shape[0] > spec.points:
+        rows = jax.random.randint(choice_key, (spec.points,), 0, point.shape[0])
+        point = point[rows]
+    point = (point - context.box.centre) * context.box.scale
+    noise = jax.random.normal(noise_key, point.shape, point.dtype)
+    frames = context.frames.times.shape[0]
+    rows = jax.random.randint(frame_key, point.shape[:1], 0, frames)
+    return mean_drift(spec, context, point + spec.noise * noise, rows)
+
+
+def mean_drift(
+    spec: BackgroundSpec,
+    context: Context,
+    point: Float[Array, "points 3"],
+    rows: Int[Array, " points"],
+) -> Scalar:
+    """The same at given points, in units of the field, each in a given frame."""
+    moments = jax.vmap(context.moment_of)(rows)
+    moved = jax.vmap(context.displace)(point, moments)
+    # ρ takes the square: the length has no slope where nothing moves
+    costs = losses.geman_mcclure(jnp.sum(moved**2, axis=-1), spec.width, spec.scaling)
+    return jnp.mean(costs)

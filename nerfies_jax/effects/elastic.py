@@ -1,0 +1,167 @@
+"""Elastic regularisation: surfaces may move and turn, but stretching costs.
+
+Park et al. 2021 (Nerfies), arXiv:2011.12948, equations 11-13: Σ log²σ over the singular
+values of the warp's Jacobian, made robust, summed along each ray with the weights it is
+rendered with.
+"""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, Key
+
+from nerfies_jax.effects.effect import Context, Effect, Level, Scalar, Term
+from nerfies_jax.geometry import matrix3
+from nerfies_jax.training import losses, schedules
+
+Matrix = Float[Array, "3 3"]
+
+
+@dataclasses.dataclass(frozen=True)
+class ElasticSpec:
+    """Strength, form and sampling of the penalty, on the coarse samples.
+
+    `weight` holds for `hold_steps` and then falls along a cosine to `last_weight` over
+    `decay_steps` (None: it stays). The first official preset has 1e-3 throughout, the
+    others 1e-2 for 50_000 steps and 100_000 down to 1e-8.
+
+    `points` samples of each ray are drawn by their weights before anything is
+    differentiated (None: all of them, as the official code). `robust_width` is the
+    logarithmic strain at which ρ leaves the parabola (None: E itself); `scaling` is
+    that of `losses.geman_mcclure`.
+
+    `fold_cost` is what mirroring a unit volume costs beside ρ; 0 makes mirror images
+    free, as the official code does. See `cost`.
+    """
+
+    weight: float = 1e-3
+    hold_steps: int = 0
+    decay_steps: int | None = None
+    last_weight: float = 1e-8
+    points: int | None = 4
+    robust_width: float | None = 0.03
+    scaling: str = "paper"
+    fold_cost: float = 1.0
+
+    def __post_init__(self):
+        if self.points is not None and self.points < 1:
+            raise ValueError(
+                f"points={self.points} of each ray must be at least 1; None takes all"
+            )
+        for name in ("weight", "last_weight", "fold_cost"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0):
+                raise ValueError(f"{name}={value} must be finite and not negative")
+        schedule(self)  # refuses impossible steps
+        if self.robust_width is not None:  # refuses wrong widths and scalings
+            losses.geman_mcclure(jnp.zeros(()), self.robust_width, self.scaling)
+
+
+def schedule(spec: ElasticSpec) -> schedules.Schedule | float:
+    """The weight as a function of the completed steps, or a constant."""
+    if spec.decay_steps is None:
+        return spec.weight
+    return schedules.cosine(
+        spec.weight, spec.last_weight, spec.decay_steps, after=spec.hold_steps
+    )
+
+
+def effect(spec: ElasticSpec) -> Effect:
+    """The seams of `spec`."""
+
+    def penalty(_, context):
+        value, folded = energy(spec, context)
+        weight = schedule(spec)
+        if callable(weight):
+            weight = weight(context.step)
+        return {"elastic": Term(value, weight), "folded": Term(folded, 0.0)}
+
+    return Effect("elastic", penalty=penalty)
+
+
+def cost(spec: ElasticSpec, displacement: Matrix) -> Scalar:
+    """What the Jacobian `displacement` of a displacement field costs at one sample.
+
+    ρ(E) + `fold_cost` max(0, -det J), with J = 1 + `displacement` and E its log energy.
+    Two things are needed where J folds. E must be signed: unsigned, a mirror image is
+    at rest. And ρ must not have the last word: it saturates, and at diag(1, 1, -1) has
+    a slope of 1e-6, so nothing would unfold; the determinant pulls with slope one.
+    Without folds the second is zero and E is Nerfies'.
+    """
+    folds = spec.fold_cost > 0
+    form = matrix3.signed_log_energy if folds else matrix3.log_energy
+    strain = matrix3.displacement_log_energy(displacement, form)
+    if spec.robust_width is not None:
+        strain = losses.geman_mcclure(strain, spec.robust_width, spec.scaling)
+    if not folds:
+        return strain
+    return strain + spec.fold_cost * jax.nn.relu(-determinant(displacement))
+
+
+def determinant(displacement: Matrix) -> Scalar:
+    """det(1 + D), as a triple product."""
+    # Broadcast products: `jnp.linalg.det` is LU, whose slope at rank one is NaN.
+    x, y, z = displacement + jnp.eye(3, dtype=displacement.dtype)
+    return (
+        x[0] * (y[1] * z[2] - y[2] * z[1])
+        + x[1] * (y[2] * z[0] - y[0] * z[2])
+        + x[2] * (y[0] * z[1] - y[1] * z[0])
+    )
+
+
+def energy(spec: ElasticSpec, context: Context) -> tuple[Scalar, Scalar]:
+    """Mean over rays of Σ_s w_s cost_s on the coarse level, and the share of folds.
+
+    The weights are those of the static medium, which is what the warp deforms, and get
+    no gradient: space is to be stiffened, not emptied. The share is of weight as well:
+    how much of what is seen lies in folds.
+    """
+    level = context.levels[0]
+    point, weight = draw(spec.points, level, context.key)
+
+    def at(point, moment):
+        jacobian = jax.jacfwd(lambda x: context.displace(x, moment))(point)
+        folded = determinant(jax.lax.stop_gradient(jacobian)) < 0
+        return cost(spec, jacobian), folded.astype(point.dtype)
+
+    costs, folded = jax.vmap(jax.vmap(at, (0, None)))(point, context.moments)
+    seen = jnp.sum(weight)
+    share = jnp.sum(weight * folded) / jnp.where(seen > 0, seen, 1)
+    return jnp.mean(jnp.sum(weight * costs, axis=-1)), share
+
+
+def draw(
+    points: int | None, level: Level, key: Key[Array, ""]
+) -> tuple[Float[Array, "rays points 3"], Float[Array, "rays points"]]:
+    """Points of each ray and weights under which their sum is that over all samples.
+
+    The sum is unbiased: a sample is drawn in proportion to its weight, and all that
+    are drawn share the ray's total. With surface-like weights and ρ, systematic draws
+    of 1, 4 and 8 leave a deviation of 0.26, 0.08 and 0.04 of the gradient's length.
+    """
+    weight = jax.lax.stop_gradient(level.static_weight)
+    if points is None or points >= weight.shape[-1]:
+        return level.point, weight
+    start = jax.random.uniform(key, weight.shape[:1], weight.dtype)
+    chosen, share = jax.vmap(systematic, (0, 0, None))(weight, start, points)
+    return jnp.take_along_axis(level.point, chosen[..., None], axis=1), share
+
+
+def systematic(
+    weight: Float[Array, " samples"], start: Scalar, draws: int
+) -> tuple[Int[Array, " draws"], Float[Array, " draws"]]:
+    """Samples drawn in proportion to `weight`, and the weight each then stands for.
+
+    One uniform number in [0, 1), `start`, places `draws` equidistant marks on the
+    cumulated weight. A sample without weight is not drawn, except from an empty ray.
+    """
+    cumulated = jnp.cumsum(weight)
+    total = cumulated[-1]
+    marks = (start + jnp.arange(draws, dtype=weight.dtype)) * (total / draws)
+    # "right": a mark at zero passes the samples of no weight in front
+    chosen = jnp.searchsorted(cumulated, marks, side="right", method="compare_all")
+    # and one that rounding put at the end does not pass into the empty space behind
+    chosen = jnp.minimum(chosen, jnp.sum(cumulated < total, dtype=chosen.dtype))
+    return chosen, jnp.full(draws, total / draws, weight.dtype)

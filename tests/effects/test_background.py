@@ -1,0 +1,161 @@
+"""Static points stay put: against loops, counted draws and central differences."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from nerfies_jax.effects import background, warp
+from nerfies_jax.effects.background import BackgroundSpec
+from nerfies_jax.effects.effect import Box, Context, Moment
+from nerfies_jax.effects.warp import WarpSpec
+from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.training.model import Frames
+from tests import gradients
+
+CENTRE, SCALE = np.array([1.0, -2.0, 3.0]), 0.25
+
+
+def context(displace, points, frames, dtype, key=0):
+    """Frame k is at time k / 10."""
+    fields = dict.fromkeys(Context._fields)
+    times = jnp.arange(frames, dtype=dtype) / 10
+    seen = Frames(**dict.fromkeys(Frames._fields))
+    return Context(
+        **fields
+        | {
+            "displace": displace,
+            "moment_of": lambda row: Moment(times[row], {}, jnp.int32(0)),
+            "frames": seen._replace(points=jnp.asarray(points, dtype), times=times),
+            "box": Box(jnp.asarray(CENTRE, dtype), jnp.asarray(SCALE, dtype)),
+            "key": jax.random.key(key),
+        }
+    )
+
+
+def overheard(asked, x, time):
+    """x; the whole batch of both is appended to `asked`, in float64."""
+
+    def listen(x, time):
+        asked.append((np.array(x, np.float64), np.array(time, np.float64)))
+        return np.asarray(x)
+
+    return jax.pure_callback(listen, x, x, time, vmap_method="broadcast_all")
+
+
+def geman_mcclure(squared, width, scaling):
+    scale = {"paper": 1.0, "official": width}[scaling]
+    return scale * 2 * (squared / width**2) / (squared / width**2 + 4)
+
+
+@pytest.mark.parametrize("scaling", ["paper", "official"])
+def test_points_are_seen_in_the_field_in_all_frames(scaling, dtype, rng):
+    """Each point once where there are few; frames alike often; noise of its size."""
+    points = rng.normal(size=(6000, 3)) + CENTRE
+    spec = BackgroundSpec(points=6000, noise=0.5, width=0.2, scaling=scaling)
+    asked = []
+
+    def displace(x, moment):
+        x = overheard(asked, x, moment.time)
+        return 0.1 * x + moment.time
+
+    here = context(displace, points, 7, dtype)
+    value = background.effect(spec).penalty(None, here)["background"].value
+    jax.block_until_ready(value)
+    ((x, times),) = asked
+    assert x.shape == (6000, 3)
+    costs = geman_mcclure(
+        np.sum((0.1 * x + times[:, None]) ** 2, axis=-1), 0.2, scaling
+    )
+    bound = {"float32": 2e-6, "float64": 1e-12}[dtype]
+    np.testing.assert_allclose(value, costs.mean(), rtol=bound)
+    frames, counts = np.unique(np.round(times * 10), return_counts=True)
+    np.testing.assert_array_equal(frames, np.arange(7))
+    assert np.all(np.abs(counts - 6000 / 7) < 5 * np.sqrt(6000 / 7))
+    noise = x - (points - CENTRE) * SCALE
+    assert abs(noise.std() - 0.5) < 0.02
+    assert abs(noise.mean()) < 0.02
+    # frames and noise come of different keys: neither tells of the other
+    assert abs(np.corrcoef(times, noise[:, 0])[0, 1]) < 0.06
+
+
+def test_of_many_points_as_many_as_asked_are_drawn(float64, rng):
+    points = np.arange(3000.0).reshape(1000, 3)
+    spec = BackgroundSpec(points=400, noise=0.0)
+    seen = []
+    for key in range(2):
+        asked = []
+
+        def displace(x, moment, asked=asked):
+            return 0 * overheard(asked, x, moment.time)
+
+        assert background.drift(spec, context(displace, points, 3, "float64", key)) == 0
+        rows = asked[0][0] / SCALE + CENTRE
+        np.testing.assert_allclose(rows[:, 1] - rows[:, 0], 1, atol=1e-9)
+        seen.append(np.round(rows[:, 0] / 3).astype(int))
+        assert len(seen[-1]) == 400
+        assert len(np.unique(seen[-1])) > 290  # 1000 (1 - e^-0.4) = 330 are expected
+        assert seen[-1].min() < 50
+        assert seen[-1].max() > 950
+    assert not np.array_equal(*seen)
+
+
+def test_a_still_warp_costs_nothing_and_has_a_finite_slope(dtype, rng):
+    """Zero, and displacements whose square underflows."""
+    points = rng.normal(size=(20, 3))
+    for size in (0.0, 1e-25, 1e-15):
+
+        def drift(shift):
+            here = context(lambda x, _: shift + 0 * x, points, 2, dtype)
+            return background.drift(BackgroundSpec(), here)
+
+        shift = jnp.full(3, size, dtype)
+        value, slope = jax.jit(jax.value_and_grad(drift))(shift)
+        assert 0 <= value < 1e-25
+        assert np.all(np.isfinite(slope))
+        # ρ is 1e-3 s / (2e-6) there
+        np.testing.assert_allclose(slope, 1e3 * size, rtol=1e-5)
+
+
+def test_gradients(float64, rng):
+    spec = WarpSpec(
+        condition="time",
+        position=EncodingSpec(2),
+        time=EncodingSpec(2),
+        depth=2,
+        width=8,
+        skips=(),
+    )
+    params = warp.init(spec, jax.random.key(0), jnp.float64)
+    params = jax.tree.map(lambda x: x + 0.05 * rng.normal(size=x.shape), params)
+    points = rng.normal(size=(30, 3)) + CENTRE
+
+    def total(params):
+        displace = lambda x, moment: warp.displace(spec, params, x, moment)  # noqa: E731
+        here = context(displace, points, 4, "float64")
+        return background.drift(BackgroundSpec(width=0.1, scaling="paper"), here)
+
+    assert gradients.directional_error(total, params, step=1e-6) < 1e-6
+
+
+def test_seams_of_the_effect():
+    seams = background.effect(BackgroundSpec())
+    assert seams.name == "background"
+    assert seams.wants == {"points"}
+    assert seams.init is None
+    assert seams.tables == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"points": 0}, "points=0"),
+        ({"noise": -1.0}, "noise=-1"),
+        ({"weight": float("nan")}, "weight=nan"),
+        ({"width": 0.0}, "width > 0"),
+        ({"scaling": "twice"}, "'twice'"),
+    ],
+)
+def test_wrong_settings_are_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        BackgroundSpec(**change)
