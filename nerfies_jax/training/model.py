@@ -3,7 +3,7 @@
 from collections.abc import Callable, Hashable
 from typing import Any, NamedTuple
 
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from nerfies_jax.geometry.camera import Camera
 
@@ -25,6 +25,22 @@ class Frames(NamedTuple):
     )
     points: Any = None  # [points, 3] float32 static scene points, scene units
     flow: Any = None
+
+
+class FrameFlow(NamedTuple):
+    """Optical flow between frames learnt from that one camera filmed in turn.
+
+    From the centre of a pixel to where what it shows lies in the other frame, in pixels
+    right and down; `seen` where both frames show it. The row of a neighbour that is
+    not learnt from, or not there, is the frame's own, and nothing is seen.
+    """
+
+    forward: Float[Array, "frames height width 2"]
+    forward_seen: Bool[Array, "frames height width"]
+    next_row: Int[Array, " frames"]
+    backward: Float[Array, "frames height width 2"]
+    backward_seen: Bool[Array, "frames height width"]
+    previous_row: Int[Array, " frames"]
 
 
 class View(NamedTuple):

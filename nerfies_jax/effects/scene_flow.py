@@ -1,0 +1,385 @@
+"""A medium that changes with time, and where each of its points goes (NSFF).
+
+Li et al. 2021, arXiv:2011.13084: no canonical scene and no warp, but a second field of
+point and time, blended with the static one, which predicts its own flow to the moments
+before and after. The field of the next moment, read where the flow leads, must look
+like this one. Weights and sizes are those of the public code; chains over two moments
+(its last stage) and extra rays on what moves (its first) are left out.
+"""
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from nerfies_jax.effects import scene_flow_losses as flow_losses
+from nerfies_jax.effects.effect import (
+    Context,
+    Effect,
+    Level,
+    Medium,
+    Moment,
+    Sample,
+    Scalar,
+    Term,
+    Vector,
+)
+from nerfies_jax.geometry import camera as cameras
+from nerfies_jax.nets import encoding, mlp
+from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.radiance import compositing, template
+from nerfies_jax.radiance.template import Template, TemplateSpec
+
+NAME = "scene_flow"
+FORWARD, BACKWARD = 0, 1  # places in everything that has a side
+SIGNS = (1, -1)
+
+
+@dataclasses.dataclass(frozen=True)
+class FlowWeights:
+    """What each term counts for; a term of weight zero is not computed.
+
+    The last two need depth and optical flow of the capture, and fade: tenfold every
+    `SceneFlowSpec.decay_steps`.
+    """
+
+    dynamic: float = 1.0  # squared error of the medium alone
+    warped: float = 1.0  # of the neighbouring moments, brought here along the flow
+    disocclusion: float = 0.1
+    cycle: float = 1.0  # 0.1 in the code, 1 in its configurations
+    magnitude: float = 0.1
+    smoothness: float = 0.1
+    kinetic: float = 0.1  # the code adds it twice
+    entropy: float = 1e-3  # of the blending
+    depth: float = 0.04
+    flow: float = 0.02  # per pixel
+
+    def __post_init__(self):
+        for name, value in dataclasses.asdict(self).items():
+            if not (math.isfinite(value) and value >= 0):
+                raise ValueError(
+                    f"the weight {name}={value} must be finite and not negative"
+                )
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneFlowSpec:
+    """Size and losses of the medium; the defaults are the public code's.
+
+    `flow_bound` is how far a point can go along each axis between two moments, in units
+    of the field. After `decay_steps` the medium need no longer explain the whole
+    picture by itself, only what the blending gives it.
+    """
+
+    network: TemplateSpec = TemplateSpec()
+    time: EncodingSpec = EncodingSpec(10)
+    flow_bound: float = 1.0
+    weights: FlowWeights = FlowWeights()
+    decay_steps: int = 50_000
+
+    def __post_init__(self):
+        if not (math.isfinite(self.flow_bound) and self.flow_bound > 0):
+            raise ValueError(
+                f"flow_bound={self.flow_bound} must be positive and finite; the box of "
+                "a scene has sides of two"
+            )
+        if self.decay_steps < 1:
+            raise ValueError(f"decay_steps={self.decay_steps} must be at least 1")
+
+
+class SceneFlow(NamedTuple):
+    """Parameters."""
+
+    network: Template
+    flow: mlp.Layer  # to forward xyz, backward xyz, before the bound
+    disocclusion: mlp.Layer  # to two logits
+    blend: mlp.Layer  # from the static template's features to the logit of the share
+
+
+class Dynamic(NamedTuple):
+    """What the medium is at one point and time."""
+
+    density: Scalar  # per unit of the field
+    colour: Vector
+    flow: Float[Array, "2 3"]  # to the next moment and the previous one, field units
+    # Logits of how likely what is there then was hidden or not there now.
+    disocclusion: Float[Array, "2"]
+
+
+class Neighbour(NamedTuple):
+    """Samples of the rays, followed to the next or the previous moment."""
+
+    point: Float[Array, "rays samples 3"]  # where the flow leads
+    flow: Float[Array, "rays samples 3"]  # that led there
+    back: Float[Array, "rays samples 3"]  # the flow from there to here
+    visible: Float[Array, "rays samples"]  # 1 - disocclusion
+    disocclusion: Float[Array, "rays samples"]
+    colour: Float[Array, "rays 3"]  # of that moment along these rays
+    weight: Float[Array, "rays samples"]  # that it was composited with
+    present: Bool[Array, " rays"]  # whether the capture has that moment
+
+
+def interval(moments: int) -> float:
+    """Time from one of so many moments to the next; a single one has no neighbours."""
+    if moments < 1:
+        raise ValueError(f"a capture has at least one moment, got moments={moments}")
+    return 1 / (moments - 1) if moments > 1 else 2.0
+
+
+def effect(spec: SceneFlowSpec, moments: int, features: int) -> Effect:
+    """The seams of `spec` for a capture of so many evenly spaced moments.
+
+    `features` is the width of the static template's trunk.
+    """
+    gap = interval(moments)
+    wants = {"depths": spec.weights.depth, "flow": spec.weights.flow}
+    return Effect(
+        NAME,
+        init=lambda key: init(spec, key, features),
+        medium=lambda params, sample, moment: medium(spec, params, sample, moment),
+        penalty=lambda params, context: penalty(spec, gap, params, context),
+        wants=frozenset(name for name, weight in wants.items() if weight > 0),
+    )
+
+
+def init(
+    spec: SceneFlowSpec, key: Key[Array, ""], features: int, dtype=jnp.float32
+) -> SceneFlow:
+    """Flow next to nothing, disocclusion and blending undecided."""
+    network_key, flow_key, disocclusion_key, blend_key = jax.random.split(key, 4)
+    one = spec.network
+    inputs = one.position.width(3) + spec.time.width(1)
+    condition = 0 if one.direction is None else one.direction.width(3)
+    flow = mlp.init_layer(flow_key, one.width, 6, "small", dtype)
+    return SceneFlow(
+        template.init(one, network_key, inputs, condition, dtype),
+        # mlp.SMALL bounds what one feature adds; `width` of them have random signs
+        flow._replace(weight=flow.weight / math.sqrt(one.width)),
+        mlp.init_layer(disocclusion_key, one.width, 2, "small", dtype),
+        mlp.init_layer(blend_key, features, 1, "small", dtype),
+    )
+
+
+def dynamic(
+    spec: SceneFlowSpec,
+    params: SceneFlow,
+    point: Vector,
+    direction: Vector,
+    time: Scalar,
+) -> Dynamic:
+    """The medium at one point and time, seen along one direction."""
+    one = spec.network
+    features = [
+        encoding.encode(one.position, point, None),
+        # time runs from -1 to 1 like the axes of the box
+        encoding.encode(spec.time, 2 * time[None] - 1, None),
+    ]
+    condition = jnp.zeros(0, point.dtype)
+    if one.direction is not None:
+        condition = encoding.encode(one.direction, direction, None)
+    found = template.apply(one, params.network, jnp.concatenate(features), condition)
+    flow = spec.flow_bound * jnp.tanh(mlp.affine(params.flow, found.features))
+    logits = mlp.affine(params.disocclusion, found.features)
+    return Dynamic(found.density, found.colour, flow.reshape(2, 3), logits)
+
+
+def medium(
+    spec: SceneFlowSpec, params: SceneFlow, sample: Sample, moment: Moment
+) -> Medium:
+    """The medium at one sample, and its share of the opacity there."""
+    width = params.blend.weight.shape[0]
+    if sample.features.shape != (width,):
+        raise ValueError(
+            f"the blending reads {width} features of the template, whose trunk has "
+            f"{sample.features.shape[0]}; build the effect with the trunk's width"
+        )
+    found = dynamic(spec, params, sample.point, sample.direction, moment.time)
+    share = mlp.affine(params.blend, sample.features)[0]
+    extras = {
+        "flow_forward": found.flow[FORWARD],
+        "flow_backward": found.flow[BACKWARD],
+        "disocclusion": found.disocclusion,
+    }
+    return Medium(found.density, found.colour, share=share, extras=extras)
+
+
+def neighbour(
+    spec: SceneFlowSpec, gap: float, params: SceneFlow, context: Context, side: int
+) -> Neighbour:
+    """The samples of the last level at the moment after (FORWARD) or before them."""
+    level = context.levels[-1]
+    extras = level.media[NAME].extras
+    flow = extras[("flow_forward", "flow_backward")[side]]
+    point = level.point + flow
+    time = context.moments.time + SIGNS[side] * gap
+    # Half a gap of slack: times are rounded, and need not be quite even.
+    present = (time > -gap / 2) & (time < 1 + gap / 2)
+
+    def ask(point, direction, time):
+        return dynamic(spec, params, point, direction, time)
+
+    # A ray is asked for its samples, whose direction and time are one.
+    there = jax.vmap(jax.vmap(ask, (0, None, None)))(
+        point, context.batch.direction, time
+    )
+    weight = dynamic_weights(level.distance, there.density)
+    logit = extras["disocclusion"][..., side]
+    return Neighbour(
+        point=point,
+        flow=flow,
+        back=there.flow[..., 1 - side, :],
+        visible=jax.nn.sigmoid(-logit),  # 1 - sigmoid(logit) would round to 0
+        disocclusion=jax.nn.sigmoid(logit),
+        colour=jnp.sum(weight[..., None] * there.colour, axis=-2),
+        weight=weight,
+        present=present,
+    )
+
+
+def dynamic_weights(
+    distance: Float[Array, "rays samples"], density: Float[Array, "rays samples"]
+) -> Float[Array, "rays samples"]:
+    """Of the medium alone, unblended; the last sample stands for all behind it."""
+    spacing = jax.vmap(
+        lambda distance: compositing.intervals(distance, compositing.AT_INFINITY)
+    )(distance)
+    return jax.vmap(compositing.weights)(density * spacing)
+
+
+def fading(decay_steps: int, step: Int[Array, ""]) -> Scalar:
+    """A tenth every `decay_steps`: how much the capture's depth and flow still count.
+
+    They are guesses of other networks in NSFF, good for a start.
+    """
+    passed = (step // decay_steps).astype(jnp.result_type(float))
+    return jnp.exp(-math.log(10) * passed)
+
+
+def penalty(
+    spec: SceneFlowSpec, gap: float, params: SceneFlow, context: Context
+) -> dict[str, Term]:
+    """All losses beside that of the blended picture, as logged."""
+    batch, level = context.batch, context.levels[-1]
+    own = level.media[NAME]
+    weight = dynamic_weights(level.distance, own.density)
+    sides = [neighbour(spec, gap, params, context, side) for side in (0, 1)]
+    mask = jnp.where(batch.valid, picture_mask(spec, level, context.step), 0)
+    values = {
+        "dynamic": lambda: flow_losses.weighted_mean(
+            jnp.square(jnp.sum(weight[..., None] * own.colour, -2) - batch.colour),
+            mask,
+        ),
+        "warped": lambda: sum(
+            flow_losses.warped(
+                one.colour,
+                batch.colour,
+                one.weight,
+                one.visible,
+                jnp.where(one.present, mask, 0),
+            )
+            for one in sides
+        ),
+        "disocclusion": lambda: sum(
+            flow_losses.mean_where(one.disocclusion, one.present) for one in sides
+        ),
+        "cycle": lambda: sum(
+            flow_losses.cycle(one.flow, one.back, one.visible, one.present)
+            for one in sides
+        ),
+        "magnitude": lambda: sum(
+            flow_losses.magnitude(one.flow, weight, one.present) for one in sides
+        ),
+        "smoothness": lambda: sum(
+            flow_losses.smoothness(one.flow, one.present) for one in sides
+        ),
+        "kinetic": lambda: flow_losses.kinetic(
+            sides[0].flow, sides[1].flow, sides[0].present & sides[1].present
+        ),
+        "entropy": lambda: flow_losses.entropy(own.share),
+    }
+    fade = fading(spec.decay_steps, context.step)
+    terms = {}
+    for name, value in values.items():
+        if getattr(spec.weights, name) > 0:
+            terms[name] = Term(value(), getattr(spec.weights, name))
+    if spec.weights.depth > 0 and context.frames.depths is not None:
+        value = depth_term(context, weight)
+        terms["depth"] = Term(value, spec.weights.depth * fade)
+    if spec.weights.flow > 0 and context.frames.flow is not None:
+        value = flow_term(context, gap, weight, sides)
+        terms["flow"] = Term(value, spec.weights.flow * fade)
+    return terms
+
+
+def picture_mask(
+    spec: SceneFlowSpec, level: Level, step: Int[Array, ""]
+) -> Float[Array, " rays"]:
+    """How much the medium alone must look like the picture, in [0, 1] and fixed.
+
+    All of it up to `decay_steps`, so that it finds geometry to move; then as much as it
+    is seen in the blend.
+    """
+    share = jax.lax.stop_gradient(jnp.sum(level.media_weight[NAME], axis=-1))
+    return jnp.where(step < spec.decay_steps, 1, jnp.clip(share, 0, 1))
+
+
+def depth_term(context: Context, weight: Float[Array, "rays samples"]) -> Scalar:
+    """How far the medium's own depth is from the capture's, both normalised."""
+    batch, level = context.batch, context.levels[-1]
+    known = _pixels(context.frames.depths, batch.row, batch.pixel)
+    distance = flow_losses.settle(weight, level.distance[..., None])[..., 0]
+    predicted = distance * batch.cosine / context.box.scale
+    return flow_losses.normalised_depth(
+        predicted, known.astype(predicted.dtype), batch.valid & (known > 0)
+    )
+
+
+def flow_term(
+    context: Context,
+    gap: float,
+    weight: Float[Array, "rays samples"],
+    sides: list[Neighbour],
+) -> Scalar:
+    """Pixels between where the flow leads, as the neighbour sees it, and the capture's.
+
+    The neighbouring frame may be more or less than a `gap` away, where frames are held
+    out; the flow is then stretched as if points moved evenly.
+    """
+    batch, frames, level = context.batch, context.frames, context.levels[-1]
+    flow = frames.flow
+    pairs = (
+        (flow.forward, flow.forward_seen, flow.next_row),
+        (flow.backward, flow.backward_seen, flow.previous_row),
+    )
+    total = jnp.zeros((), level.point.dtype)
+    for sign, one, (shift, seen, rows) in zip(SIGNS, sides, pairs, strict=True):
+        other = rows[batch.row]
+        elapsed = sign * (frames.times[other] - context.moments.time) / gap
+        point = level.point + elapsed[:, None, None] * one.flow
+        place = flow_losses.settle(weight, point) / context.box.scale
+        camera = cameras.take(frames.cameras, other)
+        pixel, depth = jax.vmap(cameras.project)(camera, place + context.box.centre)
+        target = batch.pixel + _pixels(shift, batch.row, batch.pixel).astype(
+            pixel.dtype
+        )
+        counted = (
+            _pixels(seen, batch.row, batch.pixel)
+            & (other != batch.row)
+            & batch.valid
+            & one.present
+            & (depth > 0)
+        )
+        off = jnp.where(counted[:, None], pixel - target, 0)
+        total = total + flow_losses.mean_where(jnp.abs(off), counted)
+    return total
+
+
+def _pixels(
+    pictures: Array, row: Int[Array, " rays"], pixel: Float[Array, "rays 2"]
+) -> Array:
+    """What each ray's own pixel holds."""
+    column, line = jnp.floor(pixel).astype(jnp.int32).T
+    return pictures[row, line, column]
