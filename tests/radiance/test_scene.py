@@ -330,7 +330,9 @@ def test_gradient_of_a_whole_step(float64):
     batch = scene.draw_batch(frames, 6, jax.random.key(1))
     # Not the first state: zero displacements would leave terms without slope.
     params = jax.tree.map(
-        lambda x: x + 0.05 * jnp.sin(jnp.arange(x.size) * 1.0).reshape(x.shape),
+        lambda x: (
+            x + 0.05 * jnp.sin(jnp.arange(x.size, dtype=float64)).reshape(x.shape)
+        ),
         as_float64(state.params),
     )
 
