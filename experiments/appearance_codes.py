@@ -1,0 +1,193 @@
+"""Do appearance codes and a transient medium pay for themselves?
+
+    python -m experiments.appearance_codes --scene exposure
+    python -m experiments.appearance_codes --scene transient --steps 3000
+
+Trains the small static NeRF with and without the effect, for the same steps, on a still
+life of which the truth is known. `exposure`: brightness drifts; held-out instants have
+exposures never seen, so codes are fitted to the left half of a frame and the right half
+is scored (Martin-Brualla et al. 2021, section 5). `transient`: a post passes before the
+camera; frames it is in are rendered without it and compared with the same scene filmed
+without it, where it stood and elsewhere.
+"""
+
+import dataclasses
+import pathlib
+from typing import Literal
+
+import numpy as np
+
+from experiments import settings
+
+SHOWN = 4  # frames in the picture
+SCORED = 12  # frames with a transient in them
+
+
+@dataclasses.dataclass(frozen=True)
+class AppearanceCodes:
+    """Train with and without appearance codes, or a transient medium; compare."""
+
+    scene: Literal["exposure", "transient"] = "exposure"
+    """What varies between the frames."""
+    steps: int = 3000
+    """Of training, for each of the two."""
+    size: tuple[int, int] = (176, 132)
+    """Width and height of the frames in pixels."""
+    seed: int = 0
+    """Of the scene, the first parameters and the rays."""
+    out: pathlib.Path | None = None
+    """Folder for figures.json and picture.png (default: codes_SCENE)."""
+    device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
+    """Where to train."""
+
+
+def main(arguments=None):
+    """Run the job of the command line; exit code 2 where its input is wrong."""
+    asked = settings.parse(AppearanceCodes, arguments)
+    with settings.user_errors():
+        if asked.steps < 1:
+            raise ValueError(f"steps={asked.steps} must be at least 1")
+        settings.start_jax(asked.device, "all")
+        compare = {"exposure": compare_exposure, "transient": compare_transient}
+        film = filmed(asked.scene, asked.size)
+        figures, picture = compare[asked.scene](film, asked.steps, asked.seed)
+        _write(asked, figures, picture)
+
+
+def filmed(scene, size):
+    """The still life under drifting light, or with something passing by."""
+    from nerfies_jax.capture import synthetic
+
+    # Still, so that what a static field cannot explain is the effect's alone.
+    return dataclasses.replace(
+        synthetic.PRESETS[scene],
+        things=synthetic.PRESETS["static"].things,
+        size=size,
+        # Of the instants the second camera looks at, the first learns nothing.
+        skip_every=4 if scene == "exposure" else None,
+    )
+
+
+def compare_exposure(film, steps, seed):
+    """PSNR of the right halves of the second camera's frames, and a picture."""
+    from experiments import evaluate, held_out_codes
+    from nerfies_jax import presets
+    from nerfies_jax.capture import synthetic
+
+    capture, _ = synthetic.make(film, seed)
+    rows = capture.heldout[capture.camera_ids[capture.heldout] == 1]
+    plain_spec = dataclasses.replace(presets.SMALL_NERF, steps=steps)
+    codes = presets.SMALL_NERF_W.appearance
+    coded_spec = dataclasses.replace(plain_spec, appearance=codes)
+    drawn, figures = {}, {}
+    for name, spec in (("without codes", plain_spec), ("with codes", coded_spec)):
+        model, state, seconds = trained(spec, capture, seed)
+        renderer = evaluate.Renderer(model, capture.size)
+        drawn[name] = evaluate.score(renderer, state, capture, rows).colour
+        figures[f"{name}: seconds"] = seconds
+        key = "without codes" if name == "without codes" else "codes of neighbours"
+        figures[f"{key}: PSNR (dB)"] = _right_psnr(drawn[name], capture.images[rows])
+    halves = held_out_codes.score(*model.spec, state, capture, rows)
+    figures["codes fitted to the left half: PSNR (dB)"] = float(np.mean(halves.psnr))
+    shown = evaluate.spread(np.arange(len(rows)), SHOWN)
+    columns = {"truth": capture.images[rows], **drawn}
+    return figures, _sheet(columns, shown, [capture.ids[row] for row in rows])
+
+
+def compare_transient(film, steps, seed):
+    """PSNR against the scene without its transient, and a picture."""
+    from experiments import evaluate, variants
+    from nerfies_jax import presets
+    from nerfies_jax.capture import synthetic
+
+    capture, truth = synthetic.make(film, seed)
+    clean, _ = synthetic.make(dataclasses.replace(film, transient=None), seed)
+    passed = np.flatnonzero(truth.transient.any((1, 2)))
+    rows = evaluate.spread(passed, SCORED)
+    masks = truth.transient[rows]
+    plain = dataclasses.replace(presets.SMALL_NERF, steps=steps)
+    medium = dataclasses.replace(plain, transient=presets.SMALL_NERF_W.transient)
+    drawn, figures = {}, {}
+    for name, spec in (("without the effect", plain), ("static part", medium)):
+        model, state, seconds = trained(spec, capture, seed)
+        left_out = () if spec.transient is None else ("transient",)
+        static = model._replace(render=variants.of_fields(*model.spec, left_out, False))
+        renderer = evaluate.Renderer(static, capture.size)
+        drawn[name] = evaluate.score(renderer, state, clean, rows).colour
+        held_out = evaluate.score(renderer, state, clean, clean.heldout)
+        figures[f"{name}: seconds"] = seconds
+        for place, where in (("where it stood", masks), ("elsewhere", ~masks)):
+            psnr = _psnr(drawn[name], clean.images[rows], where)
+            figures[f"{name}: PSNR {place} (dB)"] = psnr
+        figures[f"{name}: PSNR held out (dB)"] = float(held_out.psnr.mean())
+    whole = evaluate.Renderer(model, capture.size)
+    drawn["with the transient"] = evaluate.score(whole, state, capture, rows).colour
+    figures["transient rendered: PSNR where it stood (dB)"] = _psnr(
+        drawn["with the transient"], capture.images[rows], masks
+    )
+    shown = evaluate.spread(np.arange(len(rows)), SHOWN)
+    columns = {"filmed": capture.images[rows], "truth": clean.images[rows], **drawn}
+    return figures, _sheet(columns, shown, [capture.ids[row] for row in rows])
+
+
+def trained(spec, capture, seed):
+    """(model, state, seconds) after all steps of a spec."""
+    import jax
+
+    from experiments import evaluate
+    from nerfies_jax import scene
+    from nerfies_jax.training import loop
+
+    model = scene.build(spec, scene.facts_of(capture, spec))
+    state = model.init(capture, jax.random.key(seed))
+    frames = evaluate.frames_of(capture, model.wants)
+    result = loop.fit(model, state, frames, steps=spec.steps)
+    if result.steps < spec.steps:
+        raise ValueError(f"training ended early: {result.message}")
+    return model, result.state, result.seconds
+
+
+def _psnr(colour, truth, where):
+    """Decibels over all chosen pixels together, not a mean over frames."""
+    error = np.round(colour * 255) - truth.astype(np.float32)
+    return float(-10 * np.log10(np.mean((error[where] / 255) ** 2)))
+
+
+def _right_psnr(colour, truth):
+    """Mean over the frames of the PSNR of their right halves."""
+    half = colour.shape[2] // 2
+    where = np.ones(colour[0, :, half:].shape[:2], bool)
+    pairs = zip(colour[:, :, half:], truth[:, :, half:], strict=True)
+    return float(np.mean([_psnr(one, true, where) for one, true in pairs]))
+
+
+def _sheet(columns, shown, ids):
+    """A row for each frame shown, a column for each way to see it."""
+    from experiments import pictures
+
+    cells, captions = [], []
+    for row in shown:
+        for name, frames in columns.items():
+            cells.append(pictures.as_bytes(frames[row]))
+            captions.append(f"{ids[row]} {name}")
+    return pictures.contact_sheet(cells, captions, columns=len(columns))
+
+
+def _write(asked, figures, picture):
+    from experiments import pictures
+    from nerfies_jax.capture.json_files import write_json
+    from nerfies_jax.measure import clock
+
+    folder = asked.out or pathlib.Path(f"codes_{asked.scene}")
+    folder.mkdir(parents=True, exist_ok=True)
+    settled = {"scene": asked.scene, "steps": asked.steps, "size": list(asked.size)}
+    record = {**settled, "machine": clock.machine(), "figures": figures}
+    write_json(folder / "figures.json", record)
+    pictures.save(picture, folder / "picture.png")
+    for name, value in figures.items():
+        print(f"{name:52} {value:8.2f}")
+    print(f"{folder / 'figures.json'}, {folder / 'picture.png'}")
+
+
+if __name__ == "__main__":
+    main()

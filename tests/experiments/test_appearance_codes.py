@@ -1,0 +1,86 @@
+"""The comparison with and without appearance codes or a transient."""
+
+import dataclasses
+import json
+
+import numpy as np
+import PIL.Image
+import pytest
+
+from experiments import appearance_codes
+from nerfies_jax.capture import synthetic
+
+
+def test_each_scene_varies_in_one_thing_only():
+    exposed = appearance_codes.filmed("exposure", (44, 33))
+    passed = appearance_codes.filmed("transient", (44, 33))
+    for film in (exposed, passed):
+        assert not any(thing.moves() for thing in film.things)
+        assert film.size == (44, 33)
+    assert exposed.exposure is not None
+    assert exposed.transient is None
+    assert passed.transient is not None
+    assert passed.exposure is None
+
+
+def test_scored_exposures_are_never_learnt_from():
+    film = appearance_codes.filmed("exposure", (16, 12))
+    small = dataclasses.replace(film, frames=9, supersampling=1)
+    capture, _ = synthetic.make(small, 0)
+    rows = capture.heldout[capture.camera_ids[capture.heldout] == 1]
+    learnt = set(capture.appearance_ids[capture.train])
+    assert len(rows) == 2
+    assert not learnt & set(capture.appearance_ids[rows])
+
+
+def test_psnr_is_of_the_chosen_pixels_of_all_frames():
+    truth = np.zeros((2, 4, 5, 3), np.uint8)
+    colour = np.zeros((2, 4, 5, 3), np.float32)
+    where = np.zeros((2, 4, 5), bool)
+    where[0, :2, 0] = True
+    colour[0, 0, 0] = 0.2  # one of two chosen pixels
+    colour[1] = 1.0  # not chosen
+    expected = -10 * np.log10(0.2**2 / 2)
+    assert abs(appearance_codes._psnr(colour, truth, where) - expected) < 1e-5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("scene", "keys"),
+    [
+        (
+            "exposure",
+            {
+                "without codes: PSNR (dB)",
+                "codes of neighbours: PSNR (dB)",
+                "codes fitted to the left half: PSNR (dB)",
+            },
+        ),
+        (
+            "transient",
+            {
+                "static part: PSNR where it stood (dB)",
+                "without the effect: PSNR elsewhere (dB)",
+                "static part: PSNR held out (dB)",
+            },
+        ),
+    ],
+)
+def test_a_short_run_writes_figures_and_a_picture(scene, keys, tmp_path):
+    out = tmp_path / "out"
+    arguments = ["--scene", scene, "--steps", "3", "--size", "16", "12"]
+    appearance_codes.main([*arguments, "--out", str(out)])
+    record = json.loads((out / "figures.json").read_text())
+    assert record["scene"] == scene
+    assert record["steps"] == 3
+    assert keys <= set(record["figures"])
+    assert all(np.isfinite(list(record["figures"].values())))
+    with PIL.Image.open(out / "picture.png") as picture:
+        assert min(picture.size) > 240
+
+
+def test_no_steps_are_refused(capsys):
+    with pytest.raises(SystemExit) as stop:
+        appearance_codes.main(["--steps", "0"])
+    assert stop.value.code == 2
+    assert "steps=0 must be at least 1" in capsys.readouterr().err
