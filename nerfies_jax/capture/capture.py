@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from nerfies_jax.capture import flow as flows
+from nerfies_jax.capture.flow import FrameFlow
 from nerfies_jax.geometry import camera
 from nerfies_jax.geometry.camera import Camera
 
@@ -51,6 +53,7 @@ class Capture:
     depths: np.ndarray | None = (
         None  # [frames, height, width] float32 z-depth; 0 unknown
     )
+    flow: FrameFlow | None = None  # to the next and previous frame, in pixels
     points: PointCloud | None = None
     background: tuple[float, float, float] | None = None  # what lies behind, if known
     scale: float = 1.0
@@ -83,6 +86,11 @@ def validate(capture: Capture):
         raise CaptureError(f"{where}: frame {name!r} appears {times} times; keep one")
     _check_shapes(capture, where, frames)
     check_cameras(capture.cameras, capture.ids, capture.size, where)
+    if capture.flow is not None:
+        try:
+            flows.validate(capture.flow, capture.ids, capture.size, capture.camera_ids)
+        except ValueError as error:
+            raise CaptureError(f"{where}: {error}") from None
     _check_numbers(capture, where)
     _check_rows(capture, where, frames)
 
@@ -243,6 +251,7 @@ def select(capture: Capture, rows: np.ndarray) -> Capture:
         valid=take(capture.valid),
         moving=take(capture.moving),
         depths=take(capture.depths),
+        flow=None if capture.flow is None else flows.take(capture.flow, rows),
     )
 
 
@@ -251,8 +260,8 @@ def downscale(capture: Capture, factor: int) -> Capture:
 
     What does not fill a block at the right and the bottom is trimmed. A block was
     filmed if all its pixels were, moves if any of them does, and its depth is the mean
-    of those that are known. Colours are averaged as stored (sRGB), as every published
-    evaluation of these captures does.
+    of those that are known; its flow is the mean, in the larger pixels. Colours are
+    averaged as stored (sRGB), as every published evaluation of these captures does.
     """
     width, height = capture.size
     if not 1 <= factor <= min(width, height):
@@ -273,6 +282,7 @@ def downscale(capture: Capture, factor: int) -> Capture:
         depths=None
         if capture.depths is None
         else np.stack([shrink_depth(depth, factor) for depth in capture.depths]),
+        flow=None if capture.flow is None else flows.shrink(capture.flow, factor),
     )
 
 
@@ -322,6 +332,8 @@ def describe(capture: Capture) -> tuple[str, ...]:
         extras.append(f"{capture.moving.mean():.1%} of pixels marked moving")
     if capture.depths is not None:
         extras.append(f"depth on {(capture.depths > 0).mean():.1%} of pixels")
+    if capture.flow is not None:
+        extras.append(f"flow on {capture.flow.forward_seen.mean():.1%} of pixels")
     if extras:
         lines.append("; ".join(extras))
     return (*lines, *capture.notes)

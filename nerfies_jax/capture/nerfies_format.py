@@ -8,7 +8,7 @@ import pathlib
 
 import numpy as np
 
-from nerfies_jax.capture import frames
+from nerfies_jax.capture import flow_files, frames
 from nerfies_jax.capture import images as pictures
 from nerfies_jax.capture.capture import (
     Capture,
@@ -76,6 +76,7 @@ def read(
         valid=None if valid is None or valid.all() else valid,
         moving=moving,
         depths=_depths(path, views, size, total),
+        flow=_flow(path / "flow", views, size, total),
         points=points,
         background=views.scene.background,
         scale=views.scene.scale,
@@ -114,8 +115,8 @@ def write(capture: Capture, path: AnyPath, factors: tuple[int, ...] = (1,)):
 
     Pictures go to `rgb/<factor>x`, averaged for factors above 1. Beside what Nerfies
     knows it keeps, in files and keys that other readers pass over: exact times, depth
-    (DyCheck's place), moving masks (NeRF-DS's), masks of filmed pixels, and the colours
-    of the points.
+    (DyCheck's place), moving masks (NeRF-DS's), masks of filmed pixels, optical flow,
+    and the colours of the points.
     """
     for name in capture.ids:
         if (
@@ -136,6 +137,8 @@ def write(capture: Capture, path: AnyPath, factors: tuple[int, ...] = (1,)):
             write_json(folder / "camera" / f"{name}.json", _camera_entry(capture, row))
         for factor in factors:
             _write_pictures(capture, folder, factor)
+            if capture.flow is not None:
+                flow_files.write(capture.flow, capture.ids, folder / "flow", factor)
         if capture.points is not None:
             world = capture.points.position.astype(np.float64) / capture.scale
             np.save(folder / "points.npy", world + capture.centre, allow_pickle=False)
@@ -287,6 +290,13 @@ def _depths(path, views, size, total):
         depth = np.where(known, depth * views.scene.scale, 0).astype(np.float32)
         depths[row] = shrink_depth(depth, shrink_by)
     return depths
+
+
+def _flow(path, views, size, total):
+    folder, shrink_by = _reduced(path, total)
+    if folder is None:
+        return None
+    return flow_files.read(path, total // shrink_by, shrink_by, views.ids, size)
 
 
 def _points(path, images, cameras, views, moving):

@@ -18,7 +18,7 @@ def as_pinholes(capture: Capture) -> Capture:
     Focal length, principal point and size stay, so that nothing else changes; pixels
     that the lens did not film are marked in `valid`. Colour is sampled bilinearly,
     masks and depth from the nearest pixel. Z-depth needs no change: a ray keeps its
-    points.
+    points. Flow is left out: both its ends would move.
     """
     lens = np.concatenate([capture.cameras.radial, capture.cameras.tangential], axis=1)
     if not lens.any():
@@ -57,6 +57,7 @@ def as_pinholes(capture: Capture) -> Capture:
             radial=np.zeros_like(capture.cameras.radial),
             tangential=np.zeros_like(capture.cameras.tangential),
         ),
+        flow=None,
         notes=(*capture.notes, note),
         **masks,
     )

@@ -3,8 +3,9 @@
 from collections.abc import Callable, Hashable
 from typing import Any, NamedTuple
 
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Float, Int, Key
 
+from nerfies_jax.capture.flow import FrameFlow
 from nerfies_jax.geometry.camera import Camera
 
 PyTree = Any
@@ -24,23 +25,7 @@ class Frames(NamedTuple):
         None  # [frames, height, width] float32 z-depth, scene units; 0 unknown
     )
     points: Any = None  # [points, 3] float32 static scene points, scene units
-    flow: Any = None
-
-
-class FrameFlow(NamedTuple):
-    """Optical flow between frames learnt from that one camera filmed in turn.
-
-    From the centre of a pixel to where what it shows lies in the other frame, in pixels
-    right and down; `seen` where both frames show it. The row of a neighbour that is
-    not learnt from, or not there, is the frame's own, and nothing is seen.
-    """
-
-    forward: Float[Array, "frames height width 2"]
-    forward_seen: Bool[Array, "frames height width"]
-    next_row: Int[Array, " frames"]
-    backward: Float[Array, "frames height width 2"]
-    backward_seen: Bool[Array, "frames height width"]
-    previous_row: Int[Array, " frames"]
+    flow: FrameFlow | None = None  # rows count the frames that are learnt from
 
 
 class View(NamedTuple):

@@ -8,13 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from nerfies_jax.capture.flow import FrameFlow
 from nerfies_jax.effects import scene_flow
 from nerfies_jax.effects.effect import Batch, Box, Context, Level, Moment, Sample
 from nerfies_jax.effects.scene_flow import FlowWeights, SceneFlowSpec
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.radiance.template import TemplateSpec
-from nerfies_jax.training.model import FrameFlow, Frames
+from nerfies_jax.training.model import Frames
 from tests import gradients
 
 TINY = SceneFlowSpec(
@@ -488,9 +489,14 @@ def wall_terms(monkeypatch, dtype, **motion):
     frames, batch, arrays = filmed_wall(dtype)
     params = scene_flow.init(TINY, jax.random.key(0), FEATURES, jnp.dtype(dtype))
     monkeypatch.setattr(scene_flow, "dynamic", wall(**motion))
-    context = context_of(TINY, params, frames, batch, *arrays, 0)
-    found = scene_flow.penalty(TINY, 1 / 3, params, context)
-    return {name: float(term.value) for name, term in found.items()}
+
+    @jax.jit  # of this call: the wall is looked up while it is traced
+    def values():
+        context = context_of(TINY, params, frames, batch, *arrays, 0)
+        found = scene_flow.penalty(TINY, 1 / 3, params, context)
+        return {name: term.value for name, term in found.items()}
+
+    return jax.tree.map(float, values())
 
 
 def test_the_true_flow_of_a_moving_wall_costs_nothing(monkeypatch, dtype):
@@ -527,6 +533,26 @@ def test_the_medium_starts_still_and_undecided(dtype):
     assert np.abs(found.extras["disocclusion"]).max() < 1e-2
     assert abs(found.share) < 1e-2
     assert found.density >= 0
+
+
+def test_what_is_surely_hidden_keeps_a_slope(dtype):
+    params, frames, batch, arrays = scenario(dtype)
+    sure = params._replace(
+        disocclusion=params.disocclusion._replace(
+            weight=jnp.zeros_like(params.disocclusion.weight),
+            bias=jnp.full(2, 40.0, jnp.dtype(dtype)),
+        )
+    )
+
+    @jax.jit
+    def visible(params):
+        context = context_of(TINY, params, frames, batch, *arrays, 0)
+        found = scene_flow.neighbour(TINY, 1 / 3, params, context, scene_flow.FORWARD)
+        return jnp.mean(found.visible)
+
+    value, slope = jax.value_and_grad(visible)(sure)
+    np.testing.assert_allclose(value, np.exp(-40.0), rtol=2e-5)
+    np.testing.assert_allclose(slope.disocclusion.bias, [-np.exp(-40.0), 0], rtol=2e-5)
 
 
 def test_flow_stays_within_its_bound(dtype):

@@ -10,13 +10,14 @@ import numpy as np
 
 from nerfies_jax.capture import nerfies_format
 from nerfies_jax.capture.capture import Capture, CaptureError, PointCloud
+from nerfies_jax.capture.flow import FrameFlow
 from nerfies_jax.capture.json_files import AnyPath, new_folder
 from nerfies_jax.capture.synthetic import film, trace, truth
 from nerfies_jax.capture.synthetic.spec import SceneSpec
 from nerfies_jax.capture.synthetic.truth import SceneTruth
 from nerfies_jax.geometry import camera as cameras
 
-VERSION = 2  # raise it when the same spec gives other pictures: caches then renew
+VERSION = 3  # raise it when the same spec gives other pictures: caches then renew
 TRUTH_FILE = "truth.npz"  # beside the Nerfies files, which other readers pass over
 
 
@@ -31,13 +32,15 @@ def make(spec: SceneSpec, seed: int = 0) -> tuple[Capture, SceneTruth]:
     images, depths, hits = _film(spec, plan)
     moves = np.array([thing.moves() for thing in spec.all_things()] + [False])
     moving = moves[hits.thing]  # nothing is id -1: the last row
+    ids = tuple(
+        f"{camera}_{instant:05d}"  # readers sort names: the rows stay in order
+        for instant, camera in zip(plan.instant, plan.camera_id, strict=True)
+    )
+    answers = _truth(spec, plan, hits, ids, seed)
     capture = Capture(
         name=f"synthetic {spec.name}",
         source="synthetic",
-        ids=tuple(
-            f"{camera}_{instant:05d}"  # readers sort names: the rows stay in order
-            for instant, camera in zip(plan.instant, plan.camera_id, strict=True)
-        ),
+        ids=ids,
         images=images,
         cameras=plan.cameras,
         times=plan.time,
@@ -50,11 +53,12 @@ def make(spec: SceneSpec, seed: int = 0) -> tuple[Capture, SceneTruth]:
         camera_ids=plan.camera_id,
         moving=moving,
         depths=depths,
+        flow=_flow(plan, answers),
         points=_points(spec, plan, images, hits, moving, seed),
         background=spec.background,
         up=(0.0, 1.0, 0.0),
     )
-    return capture, _truth(spec, plan, hits, capture.ids, seed)
+    return capture, answers
 
 
 def write(spec: SceneSpec, path: AnyPath, seed: int = 0):
@@ -138,6 +142,20 @@ def _centres_of(flat, size):
     """Pixel centres of flat indices into [frames, height, width]."""
     width, height = size
     return np.stack([flat % width, flat // width % height], -1).astype(np.float32) + 0.5
+
+
+def _flow(plan, answers):
+    """The exact flow, row by row as in `truth.flows`."""
+    rows = np.arange(len(plan.time))
+    leaves = []
+    for step, shift, seen in (
+        (1, answers.flow_forward, answers.forward_seen),
+        (-1, answers.flow_backward, answers.backward_seen),
+    ):
+        other = np.clip(rows + step, 0, len(rows) - 1)
+        same = plan.camera_id[other] == plan.camera_id[rows]
+        leaves += [shift, seen, np.where(same, other, rows).astype(np.int32)]
+    return FrameFlow(*leaves)
 
 
 def _truth(spec, plan, hits, ids, seed):

@@ -1,0 +1,82 @@
+"""Where optical flow is kept in a Nerfies directory; only we read it."""
+
+import pathlib
+from collections.abc import Sequence
+
+import numpy as np
+
+from nerfies_jax.capture import flow as flows
+from nerfies_jax.capture import frames, images
+from nerfies_jax.capture.capture import CaptureError
+from nerfies_jax.capture.flow import FrameFlow
+from nerfies_jax.capture.json_files import read_json, write_json
+
+NEIGHBOURS = "neighbours.json"  # {"forward": {id: id of the next frame}, "backward":
+
+
+def write(flow: FrameFlow, ids: Sequence[str], folder: pathlib.Path, factor: int):
+    """Flow of the pictures at one reduction, into a capture's folder `flow`.
+
+    `<factor>x/forward/ID.npy` is float32 [height, width, 3]: right and down in pixels
+    of that reduction, and 1 where seen. Frames without a neighbour have no file.
+    """
+    neighbours = {}
+    for name, shift, seen, rows in flows.sides(flows.shrink(flow, factor)):
+        target = folder / f"{factor}x" / name
+        target.mkdir(parents=True, exist_ok=True)
+        paired = np.flatnonzero(rows != np.arange(len(rows)))
+        neighbours[name] = {ids[row]: ids[rows[row]] for row in paired}
+        for row in paired:
+            both = np.concatenate([shift[row], seen[row, ..., None]], axis=-1)
+            array = both.astype(np.float32)
+            np.save(target / f"{ids[row]}.npy", array, allow_pickle=False)
+    write_json(folder / NEIGHBOURS, neighbours)
+
+
+def read(
+    folder: pathlib.Path,
+    source: int,
+    shrink_by: int,
+    ids: Sequence[str],
+    size: tuple[int, int],
+) -> FrameFlow | None:
+    """What `write` wrote for the frames `ids`, whose shrunk pictures have `size`.
+
+    None where the folder has no flow. Neighbours that are not among the frames are
+    passed over.
+    """
+    if not (folder / NEIGHBOURS).is_file():
+        return None
+    neighbours = read_json(folder / NEIGHBOURS, dict[str, dict[str, str]])
+    row_of = {name: row for row, name in enumerate(ids)}
+    width, height = size
+    leaves = []
+    for side in flows.SIDES:
+        shift = np.zeros((len(ids), height, width, 2), np.float32)
+        seen = np.zeros((len(ids), height, width), bool)
+        rows = np.arange(len(ids), dtype=np.int32)
+        for row, name in enumerate(ids):
+            other = row_of.get(neighbours.get(side, {}).get(name))
+            file = folder / f"{source}x" / side / f"{name}.npy"
+            if other is None or not file.is_file():
+                continue
+            shift[row], seen[row] = _one(file, shrink_by, size)
+            rows[row] = other
+        leaves += [shift, seen, rows]
+    return FrameFlow(*leaves)
+
+
+def _one(file, shrink_by, size):
+    array = frames.load_array(file, 3 * images.MAX_PIXELS)
+    width, height = size
+    fits = array.ndim == 3 and array.shape[2] == 3
+    if not fits or (
+        array.shape[0] // shrink_by != height or array.shape[1] // shrink_by != width
+    ):
+        raise CaptureError(
+            f"{file}: flow of shape {array.shape}; expected right, down and seen for "
+            f"pictures of {width * shrink_by}x{height * shrink_by}, "
+            f"[{height * shrink_by}, {width * shrink_by}, 3]"
+        )
+    shift, seen = array[..., :2].astype(np.float32), array[..., 2] > 0.5
+    return flows.shrink_one(shift, seen, shrink_by)
