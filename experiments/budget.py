@@ -9,6 +9,8 @@ from typing import NamedTuple
 EVALUATION_SHARE = 0.1  # of the training time, for the evaluations beside it
 SCORE_SECONDS = 240.0  # for the held-out frames at the end
 LEAST_SCORED = 8
+FIT_SECONDS = 60.0  # for fitting codes to held-out frames and drawing them again
+LEAST_FITTED = 2
 FILM_SECONDS = 45.0  # of rendering
 FILM_LENGTH = 4.0  # seconds that the film plays
 MOST_FILMED, LEAST_FILMED = 96, 24
@@ -43,6 +45,12 @@ def evaluations(frame_seconds: float, every_seconds: float, most: int) -> Evalua
 def scored(frame_seconds: float, heldout: int) -> int:
     """How many held-out frames to score at the end: all of them, where time allows."""
     return _clamped(SCORE_SECONDS, frame_seconds, min(LEAST_SCORED, heldout), heldout)
+
+
+def halves(frame_seconds: float, share: float, heldout: int) -> int:
+    """How many held-out frames to fit codes to; a fit costs `share` of a frame."""
+    least = min(LEAST_FITTED, heldout)
+    return _clamped(FIT_SECONDS, frame_seconds * (1 + share), least, heldout)
 
 
 def film(frame_seconds: float, size: tuple[int, int]) -> Film:

@@ -1,7 +1,7 @@
 """Render a trained model and score it on the frames it never learnt from."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from nerfies_jax.capture.capture import Capture
+from nerfies_jax.capture.flow import training_flow
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.measure import image_quality
@@ -34,6 +35,8 @@ def frames_of(capture: Capture, wants: frozenset[str] = frozenset()) -> Frames:
         beside["depths"] = jnp.asarray(capture.depths[rows])
     if "points" in wants and capture.points is not None:
         beside["points"] = jnp.asarray(capture.points.position)
+    if "flow" in wants and capture.flow is not None:
+        beside["flow"] = jax.tree.map(jnp.asarray, training_flow(capture))
     return Frames(
         images=jnp.asarray(capture.images[rows]),
         cameras=jax.tree.map(jnp.asarray, cameras.take(capture.cameras, rows)),
@@ -145,17 +148,26 @@ def score_halves(
     frozen; `render(view, codes)` draws the whole frame with them, and its right half
     is scored (Martin-Brualla et al. 2021, section 5).
     """
-    scores = []
+    colours = []
     for row in rows:
         view, picture = view_of(capture, row), capture.images[row]
-        valid = None if capture.valid is None else capture.valid[row]
         half = picture.shape[1] // 2
-        left = None if valid is None else valid[:, :half]
+        left = None if capture.valid is None else capture.valid[row, :, :half]
         codes = fit_code(view, picture[:, :half], left)
-        colour = np.asarray(render(view, codes).colour)[:, half:]
-        truth = picture[:, half:].astype(np.float32) / 255
-        right = None if valid is None else valid[:, half:]
-        scores.append(jax.device_get(_score(colour, truth, right)))
+        colours.append(np.asarray(render(view, codes).colour))
+    return score_right_halves(capture, rows, colours)
+
+
+def score_right_halves(
+    capture: Capture, rows: np.ndarray, colours: Sequence[np.ndarray]
+) -> Halves:
+    """Scores of the right halves of rendered frames [height, width, 3]."""
+    scores = []
+    for row, colour in zip(rows, colours, strict=True):
+        half = colour.shape[1] // 2
+        truth = capture.images[row, :, half:].astype(np.float32) / 255
+        valid = None if capture.valid is None else capture.valid[row, :, half:]
+        scores.append(jax.device_get(_score(colour[:, half:], truth, valid)))
     psnr, ssim = np.asarray(scores).T
     return Halves(np.asarray(rows), psnr, ssim)
 

@@ -43,12 +43,13 @@ def make(folder: pathlib.Path, run: Run, outcome: Outcome, began: float) -> None
     save_depth(folder / "depth", run.capture, scored)
     saved = run.representation.save(folder, run.spec, state)
     frames = evaluate.frames_of(run.capture, run.model.wants)
-    metrics = measured(run, outcome, scored, ms_per_frame, began)
+    fitted, gain = score_halves(run, state, scored, ms_per_frame / 1e3)
+    metrics = [*measured(run, outcome, scored, ms_per_frame, began), *fitted]
     write_json(
         folder / "metrics.json",
         {m.key: m.value if math.isfinite(m.value) else None for m in metrics},
     )
-    notes = [outcome.result.message, *run.capture.notes, *left_out, *saved]
+    notes = [outcome.result.message, *run.capture.notes, *left_out, *gain, *saved]
     commands = _next(folder, run, outcome)
     page = report.write(
         folder,
@@ -100,6 +101,35 @@ def measured(
             for name, count in counts.items()
         ),
     ]
+
+
+def score_halves(
+    run: Run, state: TrainState, scored: Scored, frame_seconds: float
+) -> tuple[list[Metric], tuple[str, ...]]:
+    """Metrics and a note where frames have codes of their own, else neither."""
+    width, height = run.capture.size
+    share = run.representation.fitted_rays / (width * height)
+    count = budget.halves(frame_seconds, share, len(scored.rows))
+    few = evaluate.spread(np.arange(len(scored.rows)), count)
+    halves = run.representation.score_halves(
+        run.spec, run.facts, state, run.capture, scored.rows[few]
+    )
+    if halves is None:
+        return [], ()
+    before = evaluate.score_right_halves(
+        run.capture, scored.rows[few], scored.colour[few]
+    )
+    psnr, ssim = float(halves.psnr.mean()), float(halves.ssim.mean())
+    note = (
+        f"Right halves of {count} held-out frames: {before.psnr.mean():.2f} dB with "
+        f"codes interpolated in time, {psnr:.2f} dB with codes fitted to the left "
+        "halves."
+    )
+    metrics = [
+        Metric("heldout.fitted_psnr", psnr, "dB", "higher", 0.2),
+        Metric("heldout.fitted_ssim", ssim, "", "higher", 0.01),
+    ]
+    return metrics, (note,)
 
 
 def save_comparison(path: pathlib.Path, capture: Capture, scored: Scored):

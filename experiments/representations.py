@@ -5,7 +5,7 @@ import pathlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from experiments import step_time, variants
+from experiments import evaluate, step_time, variants
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.training.model import Frames, Model, TrainState
 
@@ -28,6 +28,10 @@ class Representation(NamedTuple):
     # (spec, facts, effects left out, whether appearances are blended) -> like
     # `Model.render`; of a `variants.Between` instead of a view where they are.
     variant: Callable[[Spec, Any, tuple[str, ...], bool], Callable]
+    # (spec, facts, state, capture, rows) -> scores with codes fitted to half a frame;
+    # None where the scene has no codes of its own for each frame.
+    score_halves: Callable[..., evaluate.Halves | None]
+    fitted_rays: int  # rendered to fit the codes of one frame
     # (folder, spec, state) -> what the reader should know of the files it wrote
     save: Callable[[pathlib.Path, Spec, TrainState], tuple[str, ...]]
 
@@ -54,6 +58,8 @@ def gaussians() -> Representation:
         lighter="lower start.points, start.random or raster.capacity with --set",
         time_parts=step_time.of_splats,
         variant=variants.of_splats,
+        score_halves=lambda *_: None,
+        fitted_rays=0,
         save=save,
     )
 
@@ -61,6 +67,7 @@ def gaussians() -> Representation:
 @functools.cache
 def radiance() -> Representation:
     """Radiance fields of the NeRF family."""
+    from experiments import held_out_codes
     from nerfies_jax import presets, scene
 
     return Representation(
@@ -74,12 +81,14 @@ def radiance() -> Representation:
         lighter="lower rays, sampling.coarse or sampling.fine with --set",
         time_parts=step_time.of_fields,
         variant=variants.of_fields,
+        score_halves=held_out_codes.score,
+        fitted_rays=held_out_codes.RAYS * held_out_codes.EVALUATIONS,
         save=lambda folder, spec, state: (),  # the checkpoint holds all there is
     )
 
 
 # By the name that `config.json` stores. Makers: what is not used is not imported.
-MAKERS = {"gaussians": gaussians}
+MAKERS = {"gaussians": gaussians, "radiance": radiance}
 
 
 def named(name: str) -> Representation:

@@ -40,7 +40,15 @@ def of_fields(spec, facts, without: tuple[str, ...], blended: bool) -> Callable:
     from nerfies_jax.effects.effect import APPEARANCE
 
     whole = scene.field(spec, facts)
-    _check_there(without, [effect.name for effect in whole.effects])
+    # What feeds the network's inputs is part of it; a penalty draws nothing.
+    drawn = [
+        effect.name
+        for effect in whole.effects
+        if (effect.displace is not None or effect.medium is not None)
+        and effect.condition is None
+        and effect.lift is None
+    ]
+    _check_there(without, drawn)
     made = scene.field(spec, facts, without)
     tables = [table for effect in made.effects for table in effect.tables]
     if blended and all(table.by != APPEARANCE for table in tables):
@@ -81,6 +89,6 @@ def _check_there(without, there):
     for name in without:
         if name not in there:
             raise ValueError(
-                f"--without {name}: the run has no such effect; it has "
-                + (", ".join(there) or "none")
+                f"--without {name}: no effect that this run can be drawn without; "
+                f"those are: {', '.join(there) or 'none'}"
             )

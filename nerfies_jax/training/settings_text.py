@@ -42,6 +42,8 @@ def _plain(value, path):
         return {"type": _name(value), **content}
     if isinstance(value, tuple | list):
         return [_plain(item, f"{path}[{i}]") for i, item in enumerate(value)]
+    if isinstance(value, frozenset) and all(isinstance(item, str) for item in value):
+        return sorted(value)  # in one order, whatever the hashes of this process
     if isinstance(value, dict) and all(isinstance(key, str) for key in value):
         return {key: _plain(item, f"{path}.{key}") for key, item in value.items()}
     raise ValueError(

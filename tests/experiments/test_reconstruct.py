@@ -241,7 +241,7 @@ def test_the_canonical_scene_and_its_depth_are_rendered(run, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--without", "warp"], "it has motion"),
+        (["--without", "warp"], "those are: motion"),
         (["--appearance", "0", "1"], "no appearance codes"),
     ],
 )

@@ -291,6 +291,11 @@ def test_specs_become_text_and_compare_by_field():
     )
 
 
+def test_a_set_of_names_becomes_text_in_one_order():
+    names = frozenset({"points", "depths", "flow"})
+    assert describe(Outer(inner=names))["inner"] == ["depths", "flow", "points"]
+
+
 def test_a_spec_that_is_no_text_is_refused():
     with pytest.raises(ValueError, match=r"spec\.inner holds a function"):
         describe(Outer(inner=lambda: 1))
