@@ -86,7 +86,9 @@ def test_noisy_pixels_give_the_least_squares_camera_of_scipy(float64, rng):
     truth, points = scene_camera("float64"), scene_points(rng, "float64")
     seen = np.asarray(pixels(truth, points)) + rng.normal(size=(20, 2))
     start = fit.move_camera(truth, jnp.asarray(ANGULAR), jnp.asarray(LINEAR))
-    found = refine_camera(lambda c: pixels(c, points) - seen, start)
+    found = jax.jit(
+        lambda start: refine_camera(lambda c: pixels(c, points) - seen, start)
+    )(start)
     assert found.converged
 
     def residuals(step):
@@ -181,16 +183,17 @@ def test_what_cannot_determine_a_camera_is_flagged(dtype, rng):
         refine(points[:2], start)
 
 
-def test_a_camera_that_sees_nothing_or_has_no_time_is_flagged(dtype):
-    start = scene_camera(dtype)
-    still = refine_camera(lambda c: jnp.ones(8, dtype), start)
+def test_a_camera_that_sees_nothing_or_has_no_time_is_flagged(float64):
+    start = scene_camera("float64")
+    still = jax.jit(lambda c: refine_camera(lambda c: jnp.ones(8), c))(start)
     assert not still.converged
     assert max(pose_error(still.value, start)) < 1e-6
 
     def far_away(camera):
         return jnp.concatenate([camera.position - 1, camera.camera_from_world[0]]) ** 3
 
-    assert not refine_camera(far_away, start, CameraSpec(max_steps=1)).converged
+    hasty = CameraSpec(max_steps=1)
+    assert not jax.jit(lambda c: refine_camera(far_away, c, hasty))(start).converged
 
 
 def test_wrong_camera_settings_are_refused():
@@ -288,6 +291,16 @@ def test_many_codes_are_fitted_as_one_batch(solver, dtype):
     assert found.converged.all()
     assert found.steps[2] <= found.steps[0]
     np.testing.assert_allclose(found.value, targets, atol=1e-3)
+
+
+@pytest.mark.parametrize("solver", CODE_SOLVERS)
+def test_float32_codes_stay_float32_with_x64_on(solver, float64):
+    found = jax.jit(
+        lambda start: fit_code(lambda c: jnp.sum((c - 0.5) ** 2), start, solver, 300)
+    )(jnp.zeros(3, jnp.float32))
+    assert found.value.dtype == found.residual.dtype == jnp.float32
+    assert found.converged
+    np.testing.assert_allclose(found.value, 0.5, atol=1e-3)
 
 
 def test_wrong_codes_and_solvers_are_refused():

@@ -105,7 +105,7 @@ def _there_and_back(displace, params, points, spec=SPEC):
 
 
 def test_a_flag_is_true_only_at_upright_roots_of_a_folding_warp(float64, rng):
-    params = wave_params(rng, 2.2)
+    params = wave_params(rng, 4.0)
     points = rng.uniform(-1, 1, (512, 3))
     fit = _there_and_back(waves, params, points)
     directions, phases, amplitudes = (np.asarray(x) for x in params)
@@ -117,8 +117,13 @@ def test_a_flag_is_true_only_at_upright_roots_of_a_folding_warp(float64, rng):
     upright = np.linalg.det(np.eye(3) + slopes) > 0
     np.testing.assert_array_equal(fit.converged, (residual < 1e-5) & upright)
     np.testing.assert_allclose(fit.residual, residual, atol=1e-12)
-    # measured 0.98; a solver started at the canonical point flags 0.75 (Newton), 0.70
-    assert fit.converged.mean() > 0.95
+    before = np.einsum(
+        "fi,nf,fj->nij", amplitudes, np.cos(points @ directions.T + phases), directions
+    )
+    assert (np.linalg.det(np.eye(3) + before) < 0).mean() > 0.2  # it does fold
+    # measured 0.91; Newton started at the canonical point 0.57, dogleg 0.62
+    assert fit.converged.mean() > 0.85
+    assert not fit.converged.all()
 
 
 def test_a_fold_has_no_unique_inverse_and_is_flagged(dtype):
@@ -144,7 +149,7 @@ def test_the_middle_of_a_fold_is_flagged_without_a_search(dtype):
     """Newton stands on the root already; it is turned over (slope -1)."""
     params = (jnp.asarray(0.1, dtype), jnp.asarray(20.0, dtype))
     middle = jnp.asarray([np.pi / 20, 0, 0], dtype)
-    fit = inverse_warp(wave, params, middle, middle)
+    fit = jax.jit(lambda c: inverse_warp(wave, params, c, c))(middle)
     assert fit.residual < 1e-6
     assert not fit.converged
 
@@ -167,9 +172,9 @@ def test_outside_the_image_of_a_warp_there_is_nothing(dtype):
     np.testing.assert_array_equal(slopes[0], 0)
     exact = np.diag(2 / (1 - (2 * np.asarray(targets[1], float)) ** 2))
     np.testing.assert_allclose(slopes[1, :, 1], exact, rtol=1e-5, atol=1e-6)
-    by_width = jax.grad(lambda a: inverse_warp(saturating, a, targets[0]).value.sum())(
-        half
-    )
+    by_width = jax.jit(
+        jax.grad(lambda a: inverse_warp(saturating, a, targets[0]).value.sum())
+    )(half)
     assert by_width == 0
 
 
@@ -194,13 +199,13 @@ def test_gradients_are_those_of_the_implicit_function(float64, rng):
 
     # 1e-9: the truncation of a central difference with steps of 1e-5
     assert gradients.directional_error(total, params, target) < 1e-7
-    x = np.asarray(place(params, target))
+    x = np.asarray(jax.jit(place)(params, target))
     directions, phases, amplitudes = (np.asarray(p) for p in params)
     sine, cosine = (f(directions @ x + phases) for f in (np.sin, np.cos))
     inverse = np.linalg.inv(np.eye(3) + amplitudes.T @ (cosine[:, None] * directions))
-    by_target = jax.jacrev(place, 1)(params, target)
+    by_target = jax.jit(jax.jacrev(place, 1))(params, target)
     np.testing.assert_allclose(by_target, inverse, rtol=1e-10, atol=1e-12)
-    by_amplitude = jax.jacfwd(place)(params, target)[2]
+    by_amplitude = jax.jit(jax.jacfwd(place))(params, target)[2]
     exact = -np.einsum("ij,f->ifj", inverse, sine)
     np.testing.assert_allclose(by_amplitude, exact, rtol=1e-10, atol=1e-12)
 
@@ -241,7 +246,7 @@ def moving_truth(params, canonical, times, centre):
     return np.stack(tracks, 1)
 
 
-@pytest.mark.parametrize("row", [None, 0, 4, 8])
+@pytest.mark.parametrize("row", [None, 4, 8])
 def test_tracks_follow_points_through_a_known_motion(row, dtype, rng):
     params = (jnp.asarray([0.0, 2.5, 0.4], dtype), jnp.asarray(0.2, dtype))
     times = np.linspace(0, 1, 9)
@@ -269,7 +274,7 @@ def test_a_track_survives_a_moment_at_which_it_is_lost(dtype):
         return saturating(width, point)
 
     points = jnp.asarray([[0.9, 0.0, 0.0], [0.1, 0.2, -0.3]], dtype)
-    tracks = point_tracks(field, None, points, widths)
+    tracks = jax.jit(lambda x, w: point_tracks(field, None, x, w))(points, widths)
     assert tracks.converged[0].tolist() == [True, True, False, False, True, True]
     assert tracks.converged[1].all()
     exact = np.arctanh(0.9 / np.array([2, 2, 2, 2, 2, 1.9]))
