@@ -8,135 +8,28 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nerfies_jax.capture.flow import FrameFlow
+from experiments import evaluate
+from nerfies_jax import scene
 from nerfies_jax.effects import scene_flow
-from nerfies_jax.effects.effect import Batch, Box, Context, Level, Moment, Sample
+from nerfies_jax.effects.effect import Moment, Sample
 from nerfies_jax.effects.scene_flow import FlowWeights, SceneFlowSpec
-from nerfies_jax.geometry import camera as cameras
-from nerfies_jax.nets.encoding import EncodingSpec
-from nerfies_jax.radiance.template import TemplateSpec
-from nerfies_jax.training.model import Frames
-from tests import gradients
-
-TINY = SceneFlowSpec(
-    network=TemplateSpec(
-        EncodingSpec(2), EncodingSpec(1), depth=2, width=8, skips=(1,), colour_width=6
-    ),
-    time=EncodingSpec(1),
-    flow_bound=0.3,
-    decay_steps=100,
+from nerfies_jax.scene import RadianceScene
+from nerfies_jax.spec import SamplingSpec
+from tests import gradients, scenes
+from tests.scene_flow_rays import (
+    BOX_CENTRE,
+    BOX_SCALE,
+    FEATURES,
+    MOMENTS,
+    RAYS,
+    ROWS,
+    SIZE,
+    TINY,
+    context_of,
+    frames_and_batch,
+    oracle,
+    scenario,
 )
-MOMENTS, RAYS, SAMPLES, FEATURES = 4, 6, 5, 7
-SIZE = (8, 6)
-ROWS = [0, 3, 1, 2, 2, 1]  # of the rays; rows are moments here
-BOX_SCALE, BOX_CENTRE = 0.5, (0.2, -0.1, 2.0)
-
-
-def frames_and_batch(rng, dtype):
-    """Four frames of one camera that moves, with depth and flow, and six rays."""
-    width, height = SIZE
-    filmed = cameras.stack(
-        [
-            cameras.look_at([0.1 * k, 0, -2.0], [0, 0, 2.0], [0, 1, 0], 9.0, SIZE)
-            for k in range(MOMENTS)
-        ]
-    )
-    shape = (MOMENTS, height, width)
-    flow = FrameFlow(
-        forward=rng.normal(size=(*shape, 2)).astype(np.float32),
-        forward_seen=rng.uniform(size=shape) < 0.8,
-        next_row=np.minimum(np.arange(MOMENTS) + 1, MOMENTS - 1).astype(np.int32),
-        backward=rng.normal(size=(*shape, 2)).astype(np.float32),
-        backward_seen=rng.uniform(size=shape) < 0.8,
-        previous_row=np.maximum(np.arange(MOMENTS) - 1, 0).astype(np.int32),
-    )
-    depths = rng.uniform(2, 5, shape).astype(np.float32)
-    frames = Frames(
-        images=None,
-        cameras=jax.tree.map(lambda leaf: leaf.astype(dtype), filmed),
-        # the third is filmed a little late, and the flow stretched to it
-        times=np.array([0, 1 / 3, 0.7, 1], dtype),
-        warp=np.arange(MOMENTS, dtype=np.int32),
-        appearance=np.arange(MOMENTS, dtype=np.int32),
-        valid=None,
-        depths=np.where(depths < 2.3, 0, depths),
-        flow=flow,
-    )
-    row = np.array(ROWS, np.int32)
-    pixel = rng.integers(0, SIZE, (RAYS, 2)) + 0.5
-    offset = (pixel - np.array(SIZE) / 2) / 9.0
-    inside = np.concatenate([offset, np.ones((RAYS, 1))], 1)
-    cosine = 1 / np.linalg.norm(inside, axis=1)
-    turn = filmed.camera_from_world[row]
-    direction = np.einsum("rki,rk->ri", turn, inside) * cosine[:, None]
-    batch = Batch(
-        row=row,
-        pixel=pixel.astype(dtype),
-        origin=filmed.position[row].astype(dtype),
-        direction=direction.astype(dtype),
-        cosine=cosine.astype(dtype),
-        colour=rng.uniform(size=(RAYS, 3)).astype(dtype),
-        valid=np.array([True, True, True, False, True, True]),
-    )
-    return jax.tree.map(jnp.asarray, (frames, batch))
-
-
-def context_of(spec, params, frames, batch, distance, features, weight, step):
-    """The rays as the scene renders them, as far as the penalty reads it."""
-    centre = jnp.asarray(BOX_CENTRE, distance.dtype)
-    origin = (batch.origin - centre) * BOX_SCALE
-    point = origin[:, None] + distance[..., None] * batch.direction[:, None]
-    moments = Moment(frames.times[batch.row], {}, jnp.full(RAYS, step))
-
-    def at(point, features, direction, moment):
-        return scene_flow.medium(
-            spec, params, Sample(point, direction, features), moment
-        )
-
-    media = jax.vmap(jax.vmap(at, (0, 0, None, None)))(
-        point, features, batch.direction, moments
-    )
-    none = jnp.zeros(RAYS, distance.dtype)
-    level = Level(
-        distance=distance,
-        point=point,
-        warped=point,
-        static_weight=jnp.zeros_like(weight),
-        media={"scene_flow": media},
-        media_weight={"scene_flow": weight},
-        colour=batch.colour,
-        alpha=none,
-        depth=none,
-        median_depth=none,
-        beta=None,
-    )
-    return Context(
-        displace=None,
-        moment_of=None,
-        moments=moments,
-        batch=batch,
-        levels=(level,),
-        frames=frames,
-        box=Box(centre, jnp.asarray(BOX_SCALE, distance.dtype)),
-        step=jnp.asarray(step),
-        key=jax.random.key(0),
-    )
-
-
-@functools.cache
-def scenario(dtype):
-    """Parameters and the rest, with nothing next to zero."""
-    rng = np.random.default_rng(4)
-    frames, batch = frames_and_batch(rng, dtype)
-    params = scene_flow.init(TINY, jax.random.key(1), FEATURES, jnp.dtype(dtype))
-    params = jax.tree.map(
-        lambda x: x + jnp.asarray(0.4 * rng.normal(size=x.shape), dtype), params
-    )
-    distance = np.sort(rng.uniform(1.0, 3.0, (RAYS, SAMPLES)), 1)
-    features = rng.normal(size=(RAYS, SAMPLES, FEATURES))
-    weight = rng.uniform(0, 0.25, (RAYS, SAMPLES))
-    arrays = [jnp.asarray(x, dtype) for x in (distance, features, weight)]
-    return params, frames, batch, arrays
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -144,155 +37,6 @@ def terms_of(spec, params, frames, batch, arrays, step):
     context = context_of(spec, params, frames, batch, *arrays, step)
     gap = scene_flow.interval(MOMENTS)
     return scene_flow.penalty(spec, gap, params, context)
-
-
-# --- an oracle: NumPy, one ray and one sample at a time
-
-
-def encode(bands, x):
-    waves = [w(2.0**k * x) for k in range(bands) for w in (np.sin, np.cos)]
-    return np.concatenate([x, *waves])
-
-
-def sigmoid(x):
-    return 1 / (1 + np.exp(-x))
-
-
-def dynamic(params, point, direction, time):
-    """Density, colour, flow [2, 3], disocclusion [2] by the published network."""
-    features = np.concatenate([encode(2, point), encode(1, np.array([2 * time - 1]))])
-    first, second = params.network.trunk.hidden
-    hidden = np.maximum(features @ first.weight + first.bias, 0)
-    hidden = np.concatenate([hidden, features])
-    hidden = np.maximum(hidden @ second.weight + second.bias, 0)
-    heads = params.network.trunk.heads
-    raw = (hidden @ heads["density"].weight + heads["density"].bias)[0]
-    bottleneck = hidden @ heads["bottleneck"].weight + heads["bottleneck"].bias
-    branch = np.concatenate([bottleneck, encode(1, direction)])
-    layer, head = params.network.colour.hidden[0], params.network.colour.heads["colour"]
-    branch = np.maximum(branch @ layer.weight + layer.bias, 0)
-    colour = sigmoid(branch @ head.weight + head.bias)
-    flow = 0.3 * np.tanh(hidden @ params.flow.weight + params.flow.bias)
-    hidden_share = hidden @ params.disocclusion.weight + params.disocclusion.bias
-    return np.log1p(np.exp(raw)), colour, flow.reshape(2, 3), sigmoid(hidden_share)
-
-
-def composite(density, distance):
-    weights, light = [], 1.0
-    for s in range(SAMPLES):
-        length = distance[s + 1] - distance[s] if s + 1 < SAMPLES else 1e10
-        weights.append(light * (1 - np.exp(-density[s] * length)))
-        light *= np.exp(-density[s] * length)
-    return np.array(weights)
-
-
-def weighted(pairs):
-    """Mean of (value, weight) pairs."""
-    total = sum(weight for _, weight in pairs)
-    return sum(value * weight for value, weight in pairs) / total
-
-
-def oracle(params, frames, batch, arrays, step):
-    """All terms as sums over rays and samples."""
-    params, frames, batch = jax.tree.map(
-        lambda x: np.asarray(x, np.float64) if x.dtype.kind == "f" else np.asarray(x),
-        (params, frames, batch),
-    )
-    distances, features, blend_weight = (np.asarray(x, np.float64) for x in arrays)
-    sides = ("cycle", "warped", "hidden", "magnitude", "smooth", "flow")
-    names = ["dynamic", "kinetic", "entropy", *(f"{n}{k}" for n in sides for k in "01")]
-    lists = {name: [] for name in names}
-    depths = []
-    for r in range(RAYS):
-        row, distance = batch.row[r], distances[r]
-        time, direction = frames.times[row], batch.direction[r]
-        origin = (batch.origin[r] - BOX_CENTRE) * BOX_SCALE
-        points = [origin + d * direction for d in distance]
-        here = [dynamic(params, x, direction, time) for x in points]
-        weight = composite([h[0] for h in here], distance)
-        mask = float(batch.valid[r])
-        if step >= 100:
-            mask *= blend_weight[r].sum()
-        colour = sum(w * h[1] for w, h in zip(weight, here, strict=True))
-        lists["dynamic"].append((np.mean((colour - batch.colour[r]) ** 2), mask))
-        column, line = int(batch.pixel[r, 0]), int(batch.pixel[r, 1])
-        for s in range(SAMPLES):
-            logit = features[r, s] @ params.blend.weight[:, 0] + params.blend.bias[0]
-            share = sigmoid(logit)
-            lists["entropy"].append((-share * np.log(share), 1))
-        expected = weight @ distance * batch.cosine[r] / BOX_SCALE
-        known = frames.depths[row, line, column]
-        if known > 0 and batch.valid[r]:
-            depths.append((expected, known))
-        flows = np.array([h[2] for h in here])  # samples, sides, axes
-        for side in (0, 1):
-            later = time + (1, -1)[side] / 3
-            if not -1 / 6 < later < 1 + 1 / 6:
-                continue
-            moved = [x + f for x, f in zip(points, flows[:, side], strict=True)]
-            there = [dynamic(params, x, direction, later) for x in moved]
-            w = composite([t[0] for t in there], distance)
-            seen = 1 - np.array([h[3][side] for h in here])
-            colour = sum(a * t[1] for a, t in zip(w, there, strict=True))
-            error = np.mean((colour - batch.colour[r]) ** 2)
-            lists[f"warped{side}"].append((error, mask * (w @ seen)))
-            for s in range(SAMPLES):
-                around = np.abs(flows[s, side] + there[s][2][1 - side]).mean()
-                lists[f"cycle{side}"].append((around, seen[s]))
-                lists[f"hidden{side}"].append((1 - seen[s], 1))
-            for s in range(SAMPLES - 1):
-                change = np.abs(flows[s + 1, side] - flows[s, side]).mean()
-                lists[f"smooth{side}"].append((change, 1))
-            rendered = np.abs(weight @ flows[:, side]).mean()
-            lists[f"magnitude{side}"].append((rendered, 1))
-            _flow_pixel(lists, frames, batch, r, side, points, flows, weight)
-        if 1 / 6 < time < 1 - 1 / 6:
-            for s in range(SAMPLES):
-                acceleration = np.mean((flows[s, 0] + flows[s, 1]) ** 2) / 2
-                lists["kinetic"].append((acceleration, 1))
-    mean = {name: weighted(pairs) for name, pairs in lists.items() if pairs}
-    predicted, known = np.array(depths).T
-    return {
-        "dynamic": mean["dynamic"],
-        "warped": mean["warped0"] + mean["warped1"],
-        "disocclusion": mean["hidden0"] + mean["hidden1"],
-        "cycle": mean["cycle0"] + mean["cycle1"],
-        "magnitude": mean["magnitude0"] + mean["magnitude1"],
-        "smoothness": mean["smooth0"] + mean["smooth1"],
-        "kinetic": mean["kinetic"],
-        "entropy": mean["entropy"],
-        "depth": np.mean((standard(predicted) - standard(known)) ** 2),
-        "flow": mean["flow0"] + mean["flow1"],
-    }
-
-
-def standard(depth):
-    median = np.sort(depth)[(len(depth) - 1) // 2]
-    return (depth - median) / np.abs(depth - median).mean()
-
-
-def _flow_pixel(lists, frames, batch, r, side, points, flows, weight):
-    row = batch.row[r]
-    column, line = int(batch.pixel[r, 0]), int(batch.pixel[r, 1])
-    flow = frames.flow
-    other = (flow.next_row, flow.previous_row)[side][row]
-    shift = (flow.forward, flow.backward)[side][row, line, column]
-    seen = (flow.forward_seen, flow.backward_seen)[side][row, line, column]
-    if other == row or not seen or not batch.valid[r]:
-        return
-    stretch = abs(frames.times[other] - frames.times[row]) * 3
-    place = sum(
-        w * (x + stretch * f)
-        for w, x, f in zip(weight, points, flows[:, side], strict=True)
-    )
-    place = place / BOX_SCALE + np.array(BOX_CENTRE)
-    turn, position = (
-        frames.cameras.camera_from_world[other],
-        frames.cameras.position[other],
-    )
-    x, y, z = turn @ (place - position)
-    pixel = 9.0 * np.array([x, y]) / z + np.array(SIZE) / 2
-    lists[f"flow{side}"].append((np.abs(pixel - batch.pixel[r] - shift).mean(), 1))
 
 
 @pytest.mark.parametrize("step", [0, 250])
@@ -586,3 +330,47 @@ def test_the_blending_says_what_width_it_was_built_for(float64):
 def test_impossible_settings_are_refused(make):
     with pytest.raises(ValueError, match=r"=(-?\d|nan|inf)"):
         make()
+
+
+# --- in a scene
+
+
+@pytest.mark.slow  # 12 s of compilation
+def test_a_scene_with_it_learns_from_pictures_depth_and_flow():
+    capture = scenes.tiny_capture()
+    spec = RadianceScene(
+        steps=30,
+        template=TINY.network,
+        sampling=SamplingSpec(8, 0, block=100),
+        rays=64,
+        rate=5e-3,
+        rate_end=1e-3,
+        scene_flow=TINY,
+    )
+    facts = scene.facts_of(capture, spec)
+    model = scene.build(spec, facts)
+    assert model.wants == {"depths", "flow"}
+    state = model.init(capture, jax.random.key(0))
+    frames = evaluate.frames_of(capture, model.wants)
+    first, step, losses = state.params, jax.jit(model.step), []
+    for _ in range(30):
+        state, metrics = step(state, frames)
+        losses.append(float(metrics["loss"]))
+    assert {name for name in metrics if "/" in name} == {
+        f"scene_flow/{name}" for name in NAMES
+    }
+    assert np.mean(losses[-5:]) < 0.7 * losses[0]
+    moved = jax.tree.map(lambda a, b: bool((a != b).any()), first, state.params)
+    assert all(jax.tree.leaves(moved["scene_flow"]))
+    both, still = (
+        scene.field(spec, facts, without) for without in ((), ("scene_flow",))
+    )
+    view = evaluate.view_of(capture, 0)
+    pictures = [
+        jax.jit(one.render, static_argnums=4)(
+            state.params, view.camera, view.time, {}, (8, 6), state.step
+        )
+        for one in (both, still)
+    ]
+    assert all(np.isfinite(picture.colour).all() for picture in pictures)
+    assert np.abs(pictures[0].colour - pictures[1].colour).max() > 1e-3
