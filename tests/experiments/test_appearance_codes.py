@@ -68,7 +68,7 @@ def test_psnr_is_of_the_chosen_pixels_of_all_frames():
 )
 def test_a_short_run_writes_figures_and_a_picture(scene, keys, tmp_path):
     out = tmp_path / "out"
-    arguments = ["--scene", scene, "--steps", "3", "--size", "16", "12"]
+    arguments = ["--scene", scene, "--steps", "3", "--size", "32", "24"]
     appearance_codes.main([*arguments, "--out", str(out)])
     record = json.loads((out / "figures.json").read_text())
     assert record["scene"] == scene
