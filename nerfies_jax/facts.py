@@ -47,7 +47,7 @@ def facts_of(capture: Capture, extent: float | None) -> Facts:
         provides.add("points")
     if capture.depths is not None:
         provides.add("depths")
-    if getattr(capture, "flow", None) is not None:
+    if capture.flow is not None:
         provides.add("flow")
     return Facts(
         near=near,
