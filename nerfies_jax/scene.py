@@ -174,7 +174,7 @@ def _colour_terms(levels: tuple[Level, ...], batch: Batch) -> dict[str, Term]:
             last.colour, batch.colour, last.beta, batch.valid
         )
         terms = {"fine": Term(mse, 0.0), "colour": Term(likelihood, 1.0)}
-        coarse_weight = 0.5  # NeRF-W, equation 13
+        coarse_weight = 1.5  # NeRF-W, equation 13: half of the sum over channels
     if len(levels) > 1:
         coarse = losses.mse(levels[0].colour, batch.colour, batch.valid)
         terms["coarse"] = Term(coarse, coarse_weight)
