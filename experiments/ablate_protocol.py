@@ -1,0 +1,207 @@
+"""What a trained scene is measured by where the truth is known; one protocol for all.
+
+Pictures and depth of a held-out camera, and points followed through time by the learned
+warp. Everything that is reported is in scene units.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments import evaluate
+from experiments.evaluate import Renderer, Scored
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.capture.synthetic import SceneTruth
+from nerfies_jax.measure import geometry_quality, image_quality
+from nerfies_jax.training.model import TrainState
+
+CORRECT_WITHIN = 0.01  # scene units: a quarter of the default cube's half-side
+STILL_POINTS = 500  # of the capture's static points, to see whether they drift
+LEAST_STRETCH = 1e-6  # a collapsed direction has a logarithm, too
+
+
+class Known(NamedTuple):
+    """The truth that all arms are held against; NumPy."""
+
+    rows: np.ndarray  # held-out frames of the capture that are rendered
+    moments: np.ndarray  # frames learnt from, in time: when points are looked for
+    path: np.ndarray  # [tracks, moments, 3] where they are, scene units
+    seen: np.ndarray  # [tracks, moments] whether the camera that is learnt from sees it
+
+
+class Followed(NamedTuple):
+    """Points as a learned warp moves them."""
+
+    path: np.ndarray  # [tracks, moments, 3] scene units; the start where not found
+    found: np.ndarray  # [tracks, moments] bool
+    drift: float  # mean |displacement| of static points, scene units
+    strain: float  # root mean square of ||log Σ|| of the Jacobian at the true points
+
+
+def known(capture: Capture, truth: SceneTruth, frames: int, tracks: int) -> Known:
+    """At most `frames` held-out frames and `tracks` points seen at the first instant.
+
+    Raises ValueError where the truth is not that of the capture.
+    """
+    if truth.ids != capture.ids:
+        raise ValueError(
+            f"{capture.name}: the truth has other frames than the capture; make the "
+            "scene again"
+        )
+    moments = capture.train[np.argsort(capture.times[capture.train], kind="stable")]
+    last = truth.track_world.shape[1] - 1
+    instants = np.round(capture.times[moments] * last).astype(int)
+    if np.abs(instants - capture.times[moments] * last).max() > 1e-3:
+        raise ValueError(
+            f"{capture.name}: its frames lie between the {last + 1} instants of the "
+            "truth; make the scene again"
+        )
+    chosen = np.flatnonzero(truth.track_seen[:, moments[0]])
+    if len(chosen):
+        chosen = evaluate.spread(chosen, tracks)
+    world = (truth.track_world[chosen] - np.float32(capture.centre)) * capture.scale
+    return Known(
+        rows=evaluate.spread(capture.heldout, frames),
+        moments=moments,
+        path=world[:, instants].astype(np.float32),
+        seen=truth.track_seen[chosen][:, moments],
+    )
+
+
+def score_pictures(
+    renderer: Renderer, state: TrainState, capture: Capture, known: Known
+) -> tuple[Scored, dict[str, float]]:
+    """The held-out frames as rendered, and their scores, also of what moves alone."""
+    scored = evaluate.score(renderer, state, capture, known.rows)
+    truth, moving = capture.depths[known.rows], capture.moving[known.rows]
+    parts = [
+        jax.device_get(_score_moving(colour, capture.images[row], capture.moving[row]))
+        for row, colour in zip(known.rows, scored.colour, strict=True)
+        if capture.moving[row].any()
+    ]
+    psnr, ssim = np.mean(parts, axis=0) if parts else (np.nan, np.nan)
+    numbers = {
+        "psnr": scored.psnr.mean(),
+        "ssim": scored.ssim.mean(),
+        "moving_psnr": psnr,
+        "moving_ssim": ssim,
+    }
+    depth, truth = jnp.asarray(scored.depth), jnp.asarray(truth)
+    for name, mask in (("", np.ones_like(moving)), ("moving_", moving)):
+        mask = jnp.asarray(mask)
+        compared = geometry_quality.known_depth(depth, truth, mask)
+        error = np.abs(np.asarray(depth - truth))[np.asarray(compared)]
+        numbers[f"{name}depth_median"] = np.median(error) if error.size else np.nan
+        errors = geometry_quality.depth_errors(depth, truth, mask)
+        numbers[f"{name}depth_rmse"] = errors.rmse
+    return scored, {name: float(value) for name, value in numbers.items()}
+
+
+@jax.jit
+def _score_moving(colour, truth, moving):
+    picture = image_quality.quantise(colour)
+    truth = truth.astype(colour.dtype) / 255
+    return (
+        image_quality.masked_psnr(picture, truth, moving),
+        image_quality.masked_ssim(picture, truth, moving),
+    )
+
+
+def score_tracks(known: Known, followed: Followed | None) -> dict[str, float]:
+    """End-point errors over the seen points of all moments but the first.
+
+    Without anything followed, or anything to follow, all are NaN.
+    """
+    names = ("track_error", "track_correct", "track_lost", "drift", "strain")
+    if followed is None or not len(known.path):
+        return dict.fromkeys(names, float("nan"))
+    later = known.seen[:, 1:]
+    errors = _endpoints(followed.path, known)
+    lost = 1 - followed.found[:, 1:][later].mean()
+    values = (errors.endpoint, errors.correct, lost, followed.drift, followed.strain)
+    return {name: float(value) for name, value in zip(names, values, strict=True)}
+
+
+def still_error(known: Known) -> float:
+    """The end-point error of points that are said not to move."""
+    return float(
+        _endpoints(np.broadcast_to(known.path[:, :1], known.path.shape), known)[0]
+    )
+
+
+def _endpoints(path, known):
+    return geometry_quality.track_errors(
+        jnp.asarray(path[:, 1:]),
+        jnp.asarray(known.path[:, 1:]),
+        jnp.asarray(known.seen[:, 1:]),
+        CORRECT_WITHIN,
+    )
+
+
+# (spec, facts, state, capture, known) -> None where nothing is warped
+Follow = Callable[[Any, Any, TrainState, Capture, Known], Followed | None]
+
+
+def follow_fields(spec, facts, state, capture, known) -> Followed | None:
+    """Points of the first moment at all others, through the template of a field.
+
+    A point goes to the template by the warp of the first moment, and from there by the
+    inverse warp of every other.
+    """
+    from nerfies_jax import scene
+    from nerfies_jax.effects.effect import Moment
+    from nerfies_jax.training import tracks
+
+    made = scene.field(spec, facts)
+    if all(effect.displace is None for effect in made.effects) or not len(known.path):
+        return None
+    views = [evaluate.view_of(capture, int(row)) for row in known.moments]
+    views = jax.tree.map(lambda *leaves: jnp.stack(leaves), *views)
+    centre = np.asarray(facts.centre, np.float32)
+
+    def to_field(points):
+        return jnp.asarray((points - centre) * np.float32(facts.scale))
+
+    still = np.zeros((0, 3), np.float32)
+    if capture.points is not None:
+        still = capture.points.position[:STILL_POINTS]
+
+    @jax.jit
+    def solve(params, step, start, true, still):
+        def moment_of(view):
+            return Moment(view.time, made.codes_at(params, view), step)
+
+        moments = jax.vmap(moment_of)(views)
+        followed = tracks.point_tracks(made.displace, params, start, moments, 0)
+        each = jax.vmap(made.displace, (None, 0, None))  # point
+        moved = jax.vmap(each, (None, None, 0))(params, still, moments)
+        slope = jax.vmap(jax.jacfwd(made.displace, 1), (None, 0, None))
+        slopes = jax.vmap(slope, (None, 1, 0))(params, true, moments)
+        return followed, jnp.linalg.norm(moved, axis=-1), slopes
+
+    followed, moved, slopes = jax.device_get(
+        solve(
+            state.params,
+            state.step,
+            to_field(known.path[:, 0]),
+            to_field(known.path),
+            to_field(still),
+        )
+    )
+    path = followed.points / np.float32(facts.scale) + centre
+    path = np.where(followed.converged[..., None], path, known.path[:, :1])
+    stretch = np.linalg.svd(np.eye(3) + slopes.astype(float), compute_uv=False)
+    strain = np.log(np.maximum(stretch, LEAST_STRETCH))
+    return Followed(
+        path=path.astype(np.float32),
+        found=followed.converged,
+        drift=float(moved.mean() / facts.scale) if moved.size else float("nan"),
+        strain=float(np.sqrt(np.mean(np.sum(strain**2, axis=-1)))),
+    )
+
+
+# By the name of the representation; what is not here is not followed.
+FOLLOW: dict[str, Follow] = {"radiance": follow_fields}
