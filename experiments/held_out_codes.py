@@ -61,6 +61,8 @@ def score(
 
     def fit_code(view: View, left: np.ndarray, valid: np.ndarray | None) -> Any:
         place = np.argwhere(np.ones(left.shape[:2], bool) if valid is None else valid)
+        if not len(place):  # nothing to go by
+            return made.codes_at(params, view)
         # With repeats: one shape, however little of the half was filmed.
         line, column = place[np.random.default_rng(0).integers(len(place), size=RAYS)].T
         pixels = jnp.asarray(np.stack([column, line], axis=1) + 0.5, jnp.float32)

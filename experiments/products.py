@@ -16,6 +16,7 @@ from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.json_files import write_json
 from nerfies_jax.measure import clock
 from nerfies_jax.measure.clock import Metric
+from nerfies_jax.training import losses
 from nerfies_jax.training.model import TrainState
 
 SHOWN = 4  # held-out frames in the comparison
@@ -108,6 +109,8 @@ def score_halves(
 ) -> tuple[list[Metric], tuple[str, ...]]:
     """Metrics and a note where frames have codes of their own, else neither."""
     width, height = run.capture.size
+    if width // 2 < len(losses.WINDOW):
+        return [], ()  # too narrow for the window of the SSIM
     share = run.representation.fitted_rays / (width * height)
     count = budget.halves(frame_seconds, share, len(scored.rows))
     few = evaluate.spread(np.arange(len(scored.rows)), count)

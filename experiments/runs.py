@@ -78,6 +78,13 @@ def read_capture(choices: Choices) -> Capture:
                 f"--scene {choices.scene}: no such built-in scene; there are "
                 + ", ".join(synthetic.PRESETS)
             )
+        for name in ("factor", "max_side", "heldout"):
+            if getattr(choices, name) is not None:
+                raise ValueError(
+                    f"--{name.replace('_', '-')} is for captures; film the built-in "
+                    "scene as you want it with experiments.make_scene and name its "
+                    "folder"
+                )
         scene = synthetic.PRESETS[choices.scene]
         folder = run_settings.CACHE / "scenes"
         return synthetic.cached(scene, folder, choices.seed)[0]

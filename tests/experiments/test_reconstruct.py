@@ -126,6 +126,14 @@ def test_wrong_settings_are_refused(arguments, words, filmed, capsys, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize("option", ["--factor", "--max-side", "--heldout"])
+def test_the_built_in_scene_takes_no_options_of_captures(option, tmp_path, capsys):
+    line = refused(capsys, "--out", tmp_path / "run", option, "2")
+    assert option in line
+    assert "make_scene" in line
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_run_folder_that_cannot_be_written_is_refused(filmed, tmp_path, capsys):
     (tmp_path / "file").write_text("")
     assert "--out" in refused(capsys, filmed, "--out", tmp_path / "file" / "run")

@@ -176,6 +176,22 @@ def test_a_code_is_found_again_from_half_a_picture(field):
     assert found.ssim[0] > 0.99
 
 
+@pytest.mark.slow
+def test_a_half_that_was_not_filmed_keeps_the_code_it_had(field):
+    facts, params, _ = field
+    capture = scenes.tiny_capture()
+    rows = capture.heldout[:1]
+    valid = np.ones(capture.images.shape[:3], bool)
+    valid[:, :, :20] = False
+    capture = dataclasses.replace(repainted(capture, field, rows), valid=valid)
+    state = TrainState(params, (), (), jnp.asarray(10, jnp.int32), jax.random.key(0))
+    renderer = evaluate.Renderer(nerf_scene.build(TINY_FIELD, facts), capture.size)
+    colour = evaluate.score(renderer, state, capture, rows).colour
+    before = evaluate.score_right_halves(capture, rows, colour)
+    found = held_out_codes.score(TINY_FIELD, facts, state, capture, rows)
+    np.testing.assert_allclose(found.psnr, before.psnr, atol=1e-3)
+
+
 def test_a_field_without_codes_has_none_to_fit(field):
     plain = dataclasses.replace(TINY_FIELD, appearance=None)
     assert held_out_codes.score(plain, field[0], None, None, None) is None
