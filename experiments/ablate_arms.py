@@ -189,7 +189,10 @@ def table(numbers: Numbers, still: float) -> str:
             values = np.asarray([row[name] for row in rows], float)
             digits, width = measure.digits, widths[name]
             spread = values.std(ddof=1) if len(values) > 1 else math.nan
-            means.append(_cell(values.mean(), digits, width))
+            mean = _cell(values.mean(), digits, width)
+            if name == "track_error" and np.isnan(values).all():
+                mean = f"{'still':>{width}s}"
+            means.append(mean)
             spreads.append(_cell(spread, digits, width))
         lines.append(f"{arm:18s} " + " ".join(means))
         if len(rows) > 1:

@@ -222,7 +222,7 @@ def test_the_table_has_a_row_for_each_arm_and_says_what_still_points_score():
     assert "0.0200" in lines[1]
     assert "0.0141" in lines[2]  # the standard deviation
     assert lines[3].startswith("static")
-    assert " - " in lines[3]
+    assert " still " in lines[3]
     assert lines[-1] == "still: 0.0272 scene units"
 
 
