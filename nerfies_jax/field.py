@@ -89,8 +89,8 @@ def _active(effects, without):
                 f"there is no effect {name!r} to leave out; the field has "
                 f"{', '.join(names) or 'none'}"
             )
-        lifts = effects[names.index(name)].lift is not None
-        if lifts:
+        effect = effects[names.index(name)]
+        if effect.lift is not None or effect.condition is not None:
             raise ValueError(
                 f"{name!r} feeds the template and cannot be left out of a trained "
                 "field; train one without it"

@@ -287,11 +287,14 @@ def test_without_its_warp_a_field_shows_the_canonical_scene():
 
 
 def test_what_cannot_be_left_out_is_refused():
-    spec = dataclasses.replace(STATIC, warp=TINY_WARP, time=TimeSpec())
+    spec = dataclasses.replace(
+        STATIC, warp=TINY_WARP, time=TimeSpec(), appearance=AppearanceSpec()
+    )
     with pytest.raises(ValueError, match=r"no effect 'elastic'.*warp"):
         scene.field(spec, FACTS, without=("elastic",))
-    with pytest.raises(ValueError, match="feeds the template"):
-        scene.field(spec, FACTS, without=("time",))
+    for name in ("time", "appearance"):
+        with pytest.raises(ValueError, match="feeds the template"):
+            scene.field(spec, FACTS, without=(name,))
 
 
 def test_wrong_specs_are_refused_early():
