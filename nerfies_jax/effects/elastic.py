@@ -138,8 +138,9 @@ def draw(
     """Points of each ray and weights under which their sum is that over all samples.
 
     The sum is unbiased: a sample is drawn in proportion to its weight, and all that
-    are drawn share the ray's total. With surface-like weights and ρ, systematic draws
-    of 1, 4 and 8 leave a deviation of 0.26, 0.08 and 0.04 of the gradient's length.
+    are drawn share the ray's total. Deviation of the gradient of 24 rays of 16 samples
+    through surfaces, as a share of its length: 0.70 for one draw, 0.25 for four, 1.6
+    for four samples taken evenly (`experiments.elastic_points`).
     """
     weight = jax.lax.stop_gradient(level.static_weight)
     if points is None or points >= weight.shape[-1]:
