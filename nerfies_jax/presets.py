@@ -154,7 +154,10 @@ SMALL_NSFF = dataclasses.replace(
             EncodingSpec(8), EncodingSpec(2), depth=4, width=96, skips=()
         ),
         time=EncodingSpec(4),
-        decay_steps=500,
+        # After 600 steps of 192 rays, against a bound of 1 and a decay at a sixth:
+        # 19.49 for 19.34 dB, flow 0.54 for 0.95 px off (both sides), depth 9 for 12 %.
+        flow_bound=0.2,
+        decay_steps=3000,
     ),
 )
 
