@@ -242,6 +242,7 @@ class Job:
             "spec": run_settings.as_json(self.spec(ARMS[name])),
             "rows": self.known.rows.tolist(),
             "tracks": len(self.known.path),
+            "start": self.known.start,
         }
         return json.loads(json.dumps(identity))  # tuples come back as lists
 

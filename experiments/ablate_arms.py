@@ -63,10 +63,11 @@ MEASURES = {
 LEGEND = """\
 psnr, ssim: held-out camera; "moving" over the pixels that show moving things.
 depth: median and root mean square of the error, scene units; then of moving pixels.
-EPE: mean distance of points followed from the first instant to where they really are;
+EPE: mean distance of points followed from the middle instant to where they really are;
 <0.01: share nearer than that; lost: share that was not found and counts as not moved.
 still: the EPE of a point that does not move, all that a field without a warp can say.
-drift: how far the warp moves static points; strain: ||log S|| of its Jacobian (rms)."""
+drift: how far static points wander in the template; strain: ||log S|| of the warp's
+Jacobian (root mean square)."""
 
 
 class Claim(NamedTuple):

@@ -28,7 +28,9 @@ def shown_row(known: Known, capture: Capture) -> int:
     """
     if not len(known.path):
         return len(known.rows) // 2
-    away = np.linalg.norm(known.path - known.path[:, :1], axis=-1).mean(axis=0)
+    away = np.linalg.norm(known.path - known.start_points[:, None], axis=-1).mean(
+        axis=0
+    )
     return int(np.argmax([away[_moment(known, capture, row)] for row in known.rows]))
 
 
@@ -85,7 +87,7 @@ def _tracks(capture, known, path, row):
         few = few.round().astype(int)
         now = _moment(known, capture, row)
         if path is None:
-            path = np.broadcast_to(known.path[:, :1], known.path.shape)
+            path = np.broadcast_to(known.start_points[:, None], known.path.shape)
         camera = jax.tree.map(jnp.asarray, cameras.take(capture.cameras, row))
         true, found = (
             factor * np.asarray(_pixels(camera, points[few]))

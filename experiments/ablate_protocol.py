@@ -30,6 +30,14 @@ class Known(NamedTuple):
     moments: np.ndarray  # frames learnt from, in time: when points are looked for
     path: np.ndarray  # [tracks, moments, 3] where they are, scene units
     seen: np.ndarray  # [tracks, moments] whether the camera that is learnt from sees it
+    # The moment from which points are followed: the middle one. D-NeRF's template is
+    # what it sees at time 0, and its warp jumps there.
+    start: int
+
+    @property
+    def start_points(self) -> np.ndarray:
+        """[tracks, 3] where the points are known to be, scene units."""
+        return self.path[:, self.start]
 
 
 class Followed(NamedTuple):
@@ -37,12 +45,14 @@ class Followed(NamedTuple):
 
     path: np.ndarray  # [tracks, moments, 3] scene units; the start where not found
     found: np.ndarray  # [tracks, moments] bool
-    drift: float  # mean |displacement| of static points, scene units
+    # Mean distance of static points in the template from where they are on average;
+    # where that is does not matter: a template may lie anywhere. Scene units.
+    drift: float
     strain: float  # root mean square of ||log Σ|| of the Jacobian at the true points
 
 
 def known(capture: Capture, truth: SceneTruth, frames: int, tracks: int) -> Known:
-    """At most `frames` held-out frames and `tracks` points seen at the first instant.
+    """At most `frames` held-out frames and `tracks` points seen at the start.
 
     Raises ValueError where the truth is not that of the capture.
     """
@@ -59,7 +69,8 @@ def known(capture: Capture, truth: SceneTruth, frames: int, tracks: int) -> Know
             f"{capture.name}: its frames lie between the {last + 1} instants of the "
             "truth; make the scene again"
         )
-    chosen = np.flatnonzero(truth.track_seen[:, moments[0]])
+    start = len(moments) // 2
+    chosen = np.flatnonzero(truth.track_seen[:, moments[start]])
     if len(chosen):
         chosen = evaluate.spread(chosen, tracks)
     world = (truth.track_world[chosen] - np.float32(capture.centre)) * capture.scale
@@ -68,6 +79,7 @@ def known(capture: Capture, truth: SceneTruth, frames: int, tracks: int) -> Know
         moments=moments,
         path=world[:, instants].astype(np.float32),
         seen=truth.track_seen[chosen][:, moments],
+        start=start,
     )
 
 
@@ -111,16 +123,15 @@ def _score_moving(colour, truth, moving):
 
 
 def score_tracks(known: Known, followed: Followed | None) -> dict[str, float]:
-    """End-point errors over the seen points of all moments but the first.
+    """End-point errors over the seen points of all moments but the start.
 
     Without anything followed, or anything to follow, all are NaN.
     """
     names = ("track_error", "track_correct", "track_lost", "drift", "strain")
     if followed is None or not len(known.path):
         return dict.fromkeys(names, float("nan"))
-    later = known.seen[:, 1:]
     errors = _endpoints(followed.path, known)
-    lost = 1 - followed.found[:, 1:][later].mean()
+    lost = 1 - followed.found[_scored(known)].mean()
     values = (errors.endpoint, errors.correct, lost, followed.drift, followed.strain)
     return {name: float(value) for name, value in zip(names, values, strict=True)}
 
@@ -128,15 +139,24 @@ def score_tracks(known: Known, followed: Followed | None) -> dict[str, float]:
 def still_error(known: Known) -> float:
     """The end-point error of points that are said not to move."""
     return float(
-        _endpoints(np.broadcast_to(known.path[:, :1], known.path.shape), known)[0]
+        _endpoints(
+            np.broadcast_to(known.start_points[:, None], known.path.shape), known
+        )[0]
     )
+
+
+def _scored(known):
+    """Seen, and not given."""
+    scored = known.seen.copy()
+    scored[:, known.start] = False
+    return scored
 
 
 def _endpoints(path, known):
     return geometry_quality.track_errors(
-        jnp.asarray(path[:, 1:]),
-        jnp.asarray(known.path[:, 1:]),
-        jnp.asarray(known.seen[:, 1:]),
+        jnp.asarray(path),
+        jnp.asarray(known.path),
+        jnp.asarray(_scored(known)),
         CORRECT_WITHIN,
     )
 
@@ -146,10 +166,10 @@ Follow = Callable[[Any, Any, TrainState, Capture, Known], Followed | None]
 
 
 def follow_fields(spec, facts, state, capture, known) -> Followed | None:
-    """Points of the first moment at all others, through the template of a field.
+    """Points of the start at all other moments, through the template of a field.
 
-    A point goes to the template by the warp of the first moment, and from there by the
-    inverse warp of every other.
+    A point goes to the template by the warp of the start, and from there by the inverse
+    warp of every other moment.
     """
     from nerfies_jax import scene
     from nerfies_jax.effects.effect import Moment
@@ -175,30 +195,34 @@ def follow_fields(spec, facts, state, capture, known) -> Followed | None:
             return Moment(view.time, made.codes_at(params, view), step)
 
         moments = jax.vmap(moment_of)(views)
-        followed = tracks.point_tracks(made.displace, params, start, moments, 0)
+        followed = tracks.point_tracks(
+            made.displace, params, start, moments, known.start
+        )
         each = jax.vmap(made.displace, (None, 0, None))  # point
         moved = jax.vmap(each, (None, None, 0))(params, still, moments)
         slope = jax.vmap(jax.jacfwd(made.displace, 1), (None, 0, None))
         slopes = jax.vmap(slope, (None, 1, 0))(params, true, moments)
-        return followed, jnp.linalg.norm(moved, axis=-1), slopes
+        apart = jnp.linalg.norm(moved - jnp.mean(moved, axis=0), axis=-1)
+        return followed, apart, slopes
 
-    followed, moved, slopes = jax.device_get(
+    followed, apart, slopes = jax.device_get(
         solve(
             state.params,
             state.step,
-            to_field(known.path[:, 0]),
+            to_field(known.start_points),
             to_field(known.path),
             to_field(still),
         )
     )
     path = followed.points / np.float32(facts.scale) + centre
-    path = np.where(followed.converged[..., None], path, known.path[:, :1])
+    still_path = known.start_points[:, None]
+    path = np.where(followed.converged[..., None], path, still_path)
     stretch = np.linalg.svd(np.eye(3) + slopes.astype(float), compute_uv=False)
     strain = np.log(np.maximum(stretch, LEAST_STRETCH))
     return Followed(
         path=path.astype(np.float32),
         found=followed.converged,
-        drift=float(moved.mean() / facts.scale) if moved.size else float("nan"),
+        drift=float(apart.mean() / facts.scale) if apart.size else float("nan"),
         strain=float(np.sqrt(np.mean(np.sum(strain**2, axis=-1)))),
     )
 
