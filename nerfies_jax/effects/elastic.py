@@ -122,10 +122,7 @@ def energy(spec: ElasticSpec, context: Context) -> tuple[Scalar, Scalar]:
     point, weight = draw(spec.points, level, context.key)
 
     def at(point, moment):
-        # Row by row: under the gradient a step with all samples takes 0.95 of the time
-        # it takes with `jax.jacfwd`, for 0.3 % more flops (XLA:CPU).
-        _, pull = jax.vjp(lambda x: context.displace(x, moment), point)
-        jacobian = jnp.stack([pull(row)[0] for row in jnp.eye(3, dtype=point.dtype)])
+        jacobian = jax.jacfwd(lambda x: context.displace(x, moment))(point)
         folded = determinant(jax.lax.stop_gradient(jacobian)) < 0
         return cost(spec, jacobian), folded.astype(point.dtype)
 
