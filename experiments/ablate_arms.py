@@ -26,7 +26,7 @@ ARMS = {
     "nerfies": Arm("nerfies-small"),
     "no-elastic": Arm("nerfies-small", ("elastic=none",)),
     "no-background": Arm("nerfies-small", ("background=none",)),
-    "no-coarse-to-fine": Arm("nerfies-small", ("warp.anneal_steps=none",)),
+    "coarse-to-fine": Arm("nerfies-small", ("warp.anneal_steps=300",)),
     "translation": Arm("nerfies-small", ("warp.kind=translation",)),
 }
 
@@ -113,8 +113,8 @@ CLAIMS = (
     ),
     Claim(
         "Coarse-to-fine avoids poor local minima",
+        "coarse-to-fine",
         "nerfies",
-        "no-coarse-to-fine",
         ("track_error", "moving_psnr"),
     ),
 )

@@ -233,14 +233,12 @@ def test_arms_differ_from_nerfies_only_in_what_their_name_says():
     job = types.SimpleNamespace(asked=ablate.Ablate(steps=600))
     specs = {name: ablate.Job.spec(job, arm) for name, arm in ARMS.items()}
     whole = specs["nerfies"]
-    assert None not in (whole.elastic, whole.background, whole.warp.anneal_steps)
+    assert None not in (whole.elastic, whole.background, whole.warp)
     assert (specs["static"].warp, specs["t-nerf"].warp) == (None, None)
     changed = {
         "no-elastic": {"elastic": None},
         "no-background": {"background": None},
-        "no-coarse-to-fine": {
-            "warp": dataclasses.replace(whole.warp, anneal_steps=None)
-        },
+        "coarse-to-fine": {"warp": dataclasses.replace(whole.warp, anneal_steps=300)},
         "translation": {"warp": dataclasses.replace(whole.warp, kind="translation")},
     }
     for name, fields in changed.items():
