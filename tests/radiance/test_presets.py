@@ -3,7 +3,7 @@
 import dataclasses
 
 import jax
-import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from experiments import evaluate
@@ -67,16 +67,18 @@ def test_presets_differ_only_in_what_their_names_say():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [f"{name}-small" for name in PAPERS])
-def test_a_small_preset_learns(name):
+def test_a_small_preset_learns_more_than_one_colour(name):
     capture = scenes.tiny_capture()
-    spec = presets.with_steps(PRESETS[name], 60)
-    spec = dataclasses.replace(spec, rays=128)
+    spec = dataclasses.replace(presets.with_steps(PRESETS[name], 200), rays=128)
     model = scene.build(spec, scene.facts_of(capture, spec))
     frames = evaluate.frames_of(capture, model.wants)
     state, step = model.init(capture, jax.random.key(0)), jax.jit(model.step)
     errors = []
-    for _ in range(60):
+    for _ in range(120):
         state, metrics = step(state, frames)
         errors.append(float(metrics["mse"]))
-    assert jnp.isfinite(jnp.asarray(errors)).all()
-    assert sum(errors[-10:]) < 0.6 * sum(errors[:10]), errors
+    assert np.isfinite(errors).all()
+    # All reach 0.79 to 0.86 of it by step 100; a picture of one colour has all of it.
+    pictures = capture.images[capture.train] / 255
+    variance = np.mean((pictures - pictures.mean((0, 1, 2))) ** 2)
+    assert np.mean(errors[-20:]) < 0.9 * variance
