@@ -14,7 +14,6 @@ from experiments import evaluate
 from nerfies_jax import scene, tracing
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.effects.effect import APPEARANCE, Moment
-from nerfies_jax.geometry import rays
 from nerfies_jax.training import fit, losses
 from nerfies_jax.training.model import Rendering, TrainState, View
 
@@ -51,7 +50,11 @@ def score(
         def loss(fitted):
             moment = Moment(view.time, codes | fitted, step)
             seen = jax.vmap(
-                lambda pixel: _colour(made, facts, params, view, pixel, moment)
+                lambda pixel: (
+                    made.trace(
+                        params, tracing.pixel_ray(facts, view.camera, pixel)[0], moment
+                    )[-1].colour
+                )
             )
             return losses.mse(seen(pixels), colours)
 
@@ -78,10 +81,3 @@ def score(
 def _tables(made):
     tables = [table for effect in made.effects for table in effect.tables]
     return sorted({table.name for table in tables if table.by == APPEARANCE})
-
-
-def _colour(made, facts, params, view, pixel, moment):
-    found = rays.pixel_ray(view.camera, pixel)
-    cosine = rays.depth_per_distance(view.camera, found.direction)
-    line = tracing.field_ray(facts, found.origin, found.direction, cosine)
-    return made.trace(params, line, moment)[-1].colour

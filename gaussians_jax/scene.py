@@ -18,7 +18,7 @@ from gaussians_jax.optimiser import scale_by_row_adam
 from gaussians_jax.raster_spec import RasterSpec
 from gaussians_jax.rates import RateSpec
 from gaussians_jax.splats import Params
-from nerfies_jax.capture.capture import Capture
+from nerfies_jax.capture.capture import Capture, point_depths
 from nerfies_jax.training import loop, losses
 from nerfies_jax.training.model import (
     Event,
@@ -242,12 +242,7 @@ def _filmed_depths(capture):
     Its near plane is often much nearer than anything filmed (0.05 where the first point
     is at 0.4), and a Gaussian there covers the whole picture: 20 times slower steps.
     """
-    turn = capture.cameras.camera_from_world[capture.train, 2]
-    offset = (
-        capture.points.position[None] - capture.cameras.position[capture.train, None]
-    )
-    depth = np.einsum("fk,fnk->fn", turn, offset)
-    depth = depth[depth > capture.near]
+    depth = point_depths(capture)
     if not depth.size:
         return capture.near, capture.far
     low, high = np.quantile(depth, (0.02, 0.98))

@@ -5,7 +5,7 @@ import itertools
 
 import numpy as np
 
-from nerfies_jax.capture.capture import Capture
+from nerfies_jax.capture.capture import Capture, point_depths
 
 FEWEST_POINTS = 100  # below, the capture's points do not say where the scene is
 # Share of points on either side that are taken for outliers of structure from motion.
@@ -67,7 +67,7 @@ def _span(capture):
     The near plane of a Nerfies capture is often much nearer than anything filmed (0.05
     where the first point is at 0.4), and samples there are lost.
     """
-    depth = _point_depths(capture)
+    depth = point_depths(capture)
     if depth.size < FEWEST_POINTS:
         return float(capture.near), float(capture.far)
     low, high = np.quantile(depth, (OUTLIERS, 1 - OUTLIERS))
@@ -75,18 +75,8 @@ def _span(capture):
     return float(near), float(min(capture.far, 1.2 * float(high)))
 
 
-def _point_depths(capture):
-    if capture.points is None:
-        return np.zeros(0)
-    turn = capture.cameras.camera_from_world[capture.train, 2]
-    position = capture.cameras.position[capture.train, None]
-    depth = np.einsum("fk,fnk->fn", turn, capture.points.position[None] - position)
-    return depth[depth > capture.near]
-
-
 def _box(capture, near, far):
     """Centre and longest half-side of what is filmed."""
-    points = _frustum_points(capture, near, far)
     if capture.points is not None and len(capture.points.position) >= FEWEST_POINTS:
         found = capture.points.position
         low, high = np.quantile(found, (OUTLIERS, 1 - OUTLIERS), axis=0)
@@ -95,6 +85,7 @@ def _box(capture, near, far):
         low = np.minimum(low, np.quantile(near_points, 0.1, axis=0))
         high = np.maximum(high, np.quantile(near_points, 0.9, axis=0))
     else:
+        points = _frustum_points(capture, near, far)
         low, high = np.quantile(points, (0.1, 0.9), axis=0)
     return (low + high) / 2, max(float(np.max(high - low)) / 2, 1e-6)
 

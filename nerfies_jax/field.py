@@ -64,9 +64,7 @@ def field(spec: RadianceScene, facts: Facts, without: tuple[str, ...] = ()) -> F
         moment = Moment(time, codes, step)
 
         def pixel(position):
-            found = rays.pixel_ray(camera, position)
-            cosine = rays.depth_per_distance(camera, found.direction)
-            ray = tracing.field_ray(facts, found.origin, found.direction, cosine)
+            ray, cosine = tracing.pixel_ray(facts, camera, position)
             level = trace(params, ray, moment)[-1]
             depth = level.depth * cosine / facts.scale
             return Rendering(level.colour, level.alpha, depth)
@@ -99,24 +97,20 @@ def _active(effects, without):
 
 
 def _init(spec, facts, effects, key):
-    names = (
-        ["fine"]
-        if spec.sampling.fine == 0 or spec.sampling.shared
-        else [
-            "coarse",
-            "fine",
-        ]
-    )
-    inputs = spec.template.position.width(3) + sum(e.lift_width for e in effects)
-    condition = sum(e.condition_width for e in effects)
+    single = spec.sampling.fine == 0 or spec.sampling.shared
+    names = ("fine",) if single else ("coarse", "fine")
+    lifted = sum(effect.lift_width for effect in effects)
+    condition = sum(effect.condition_width for effect in effects)
     nets = {}
     keys = jax.random.split(key, 3)
     for number, name in enumerate(names):
         one = specs.template_of(spec, name)
         beside = 0 if one.direction is None else one.direction.width(3)
-        lifted = inputs - spec.template.position.width(3) + one.position.width(3)
         nets[name] = template.init(
-            one, jax.random.fold_in(keys[0], number), lifted, condition + beside
+            one,
+            jax.random.fold_in(keys[0], number),
+            one.position.width(3) + lifted,
+            condition + beside,
         )
     rows = {MOMENT: len(facts.times)}
     learnt = 1 + max((max(left, right) for left, right, _ in facts.exposures))

@@ -10,6 +10,7 @@ from nerfies_jax.effects import transient
 from nerfies_jax.effects.effect import Effect, Level, Medium, Moment, Sample
 from nerfies_jax.facts import Facts
 from nerfies_jax.geometry import rays
+from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.nets import encoding
 from nerfies_jax.radiance import compositing, sampling, template
 from nerfies_jax.spec import RadianceScene, template_of
@@ -38,6 +39,15 @@ def field_ray(facts: Facts, origin: Vector, direction: Vector, cosine: Scalar) -
     return Ray(
         (origin - centre) * facts.scale, direction, facts.near * span, facts.far * span
     )
+
+
+def pixel_ray(
+    facts: Facts, camera: Camera, pixel: Float[Array, "2"]
+) -> tuple[Ray, Scalar]:
+    """The field's ray through one pixel position, and its z-depth per distance."""
+    found = rays.pixel_ray(camera, pixel)
+    cosine = rays.depth_per_distance(camera, found.direction)
+    return field_ray(facts, found.origin, found.direction, cosine), cosine
 
 
 def displacement(

@@ -72,6 +72,19 @@ class Capture:
         return self.images.shape[2], self.images.shape[1]
 
 
+def point_depths(capture: Capture) -> np.ndarray:
+    """The z-depths of all points in all frames learnt from, beyond the near plane.
+
+    In scene units, in no order; empty where there are no points.
+    """
+    if capture.points is None:
+        return np.zeros(0)
+    turn = capture.cameras.camera_from_world[capture.train, 2]
+    position = capture.cameras.position[capture.train, None]
+    depth = np.einsum("fk,fnk->fn", turn, capture.points.position[None] - position)
+    return depth[depth > capture.near]
+
+
 def validate(capture: Capture):
     """Raise a one-line `CaptureError` on the first thing that cannot be right."""
     where = str(capture.path or capture.name)

@@ -11,6 +11,7 @@ import nerfies_jax.capture
 from nerfies_jax.capture import capture as capturing
 from nerfies_jax.capture.capture import Capture, CaptureError, PointCloud
 from nerfies_jax.geometry import camera
+from tests import scenes
 
 
 def make(frames=4, size=(6, 4), **changes):
@@ -196,3 +197,17 @@ def test_the_room_offers_load_and_nothing_else_by_accident():
     assert callable(nerfies_jax.capture.load)
     with pytest.raises(AttributeError, match="nonsense"):
         _ = nerfies_jax.capture.nonsense
+
+
+def test_depths_of_points_are_those_of_a_loop_over_the_filmed_views():
+    capture = scenes.tiny_capture()
+    expected = []
+    for row in capture.train:
+        turn = capture.cameras.camera_from_world[row].astype(float)
+        for point in capture.points.position:
+            depth = (turn @ (point - capture.cameras.position[row]))[2]
+            expected.extend([depth] if depth > capture.near else [])
+    found = capturing.point_depths(capture)
+    np.testing.assert_allclose(np.sort(found), np.sort(expected), rtol=1e-5)
+    without = dataclasses.replace(capture, points=None)
+    assert capturing.point_depths(without).size == 0
