@@ -184,8 +184,10 @@ def from_json(spec_class, stored):
 def _stored(kind, value):
     if isinstance(value, dict):
         options = (kind, *typing.get_args(kind))
-        made_of = next(o for o in options if dataclasses.is_dataclass(o))
-        return from_json(made_of, value)
+        specs = [option for option in options if dataclasses.is_dataclass(option)]
+        # One of the right name, or the first one, which then says what is wrong.
+        specs.sort(key=lambda spec: spec.__name__ != value.get(CLASS))
+        return from_json(specs[0], value)
     if kind is float and isinstance(value, str):
         return float(value)
     return tuple(value) if isinstance(value, list) else value

@@ -45,10 +45,13 @@ def of_splats(
         "loss": _ms(jax.grad(compare), truth),
     }
     for effect in scene.effects_of(spec, facts):
+        if effect.deform is None:
+            continue
 
         def deform(params, effect=effect):
             gaussians = splats.activate(params.rows["splats"])
-            moved = effect.deform(params, gaussians, moment)
+            ready = None if effect.prepare is None else effect.prepare(params)
+            moved = effect.deform(params, gaussians, moment, ready)
             return sum(jnp.sum(leaf) for leaf in moved)
 
         timed[effect.name.replace("_", " ")] = _ms(jax.grad(deform), params)

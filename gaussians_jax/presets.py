@@ -5,7 +5,8 @@ import dataclasses
 from gaussians_jax.density import DensitySpec
 from gaussians_jax.effects.mlp_motion import MotionSpec
 from gaussians_jax.rates import RateSpec
-from gaussians_jax.scene import SplatScene, StartSpec
+from gaussians_jax.scene import SplatScene
+from gaussians_jax.start import StartSpec
 from nerfies_jax.nets.encoding import EncodingSpec
 
 # Kerbl et al. 2023, arXiv:2308.04079: every other number is a default of its spec.

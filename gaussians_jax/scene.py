@@ -2,53 +2,38 @@
 
 import dataclasses
 import math
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.spatial
-from jaxtyping import Array, Int, Key
+from jaxtyping import Array, Float, Int, Key
 
-from gaussians_jax import density, rates, render, splats
+from gaussians_jax import density, rates, render, splats, start
 from gaussians_jax.density import DensitySpec
-from gaussians_jax.effects import mlp_motion
-from gaussians_jax.effects.effect import Effect, Moment
+from gaussians_jax.effects import deformation, mlp_motion
+from gaussians_jax.effects.effect import Around, Effect, Moment, Shot
 from gaussians_jax.effects.mlp_motion import MotionSpec
 from gaussians_jax.optimiser import scale_by_row_adam
 from gaussians_jax.raster_spec import RasterSpec
 from gaussians_jax.rates import RateSpec
 from gaussians_jax.splats import Params
-from nerfies_jax.capture.capture import Capture, point_depths
+from gaussians_jax.start import StartSpec
+from nerfies_jax.capture.capture import Capture
 from nerfies_jax.training import loop, losses
 from nerfies_jax.training.model import (
     Event,
     Frames,
     Model,
+    Stages,
     TrainState,
     View,
 )
 
+PyTree = Any
+
 # Streams of the run's key beside those of the steps, which are its 0, 1, 2, ...
 ORDER, EVENT = 2**32 - 1, 2**32 - 2
-
-
-@dataclasses.dataclass(frozen=True)
-class StartSpec:
-    """Where the first Gaussians come from."""
-
-    points: int = 100_000  # at most so many of the capture's own points
-    random: int = 10_000  # drawn in the views where the capture has fewer than `fewest`
-    fewest: int = 100
-    beside: int = 0  # drawn in the views beside the capture's own points
-    opacity: float = 0.1
-    widest: float = 0.03  # first scale, over the distance to the nearest camera
-
-    def __post_init__(self):
-        if self.points < 1 or self.random < 1 or self.beside < 0:
-            raise ValueError(
-                f"a scene starts from at least one Gaussian, got points={self.points}, "
-                f"random={self.random} and beside={self.beside}"
-            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,16 +87,29 @@ def effects_of(spec: SplatScene, facts: Facts) -> tuple[Effect, ...]:
     return tuple(effects)
 
 
+class Extra(NamedTuple):
+    """What a scene carries beside its parameters; everything in it has rows."""
+
+    stats: PyTree  # density.RowStats, or () without density control
+    carried: dict[str, PyTree]  # by the name of the effect
+
+
+def carried_by(effects: tuple[Effect, ...], params: Params) -> dict[str, PyTree]:
+    """What each effect carries from this change of the rows to the next; host side."""
+    return {
+        effect.name: effect.carry(params)
+        for effect in effects
+        if effect.carry is not None
+    }
+
+
 def build(spec: SplatScene, facts: Facts) -> Model:
     """Everything the loop, the renderer and the report need of this scene."""
     effects = effects_of(spec, facts)
     # Counts updates per row; for the networks, whose rows are never born, plain Adam.
     optimiser = scale_by_row_adam()
 
-    def draw(params, view, size, moment, degree, probe=None):
-        gaussians = splats.activate(params.rows["splats"])
-        for effect in effects:
-            gaussians = effect.deform(params, gaussians, moment)
+    def draw(params, gaussians, view, size, degree, probe=None):
         return render.render_harmonics(
             gaussians,
             splats.active_harmonics(params.rows["splats"], degree),
@@ -122,55 +120,115 @@ def build(spec: SplatScene, facts: Facts) -> Model:
             mean2d_offset=probe,
         )
 
-    def whole_frame(params, view, size, step):
-        moment = Moment(view.time)
+    def draw_trained(params, gaussians, view, size, step):
         degree = splats.active_degree(step, spec.sh_every, spec.sh_degree)
-        return draw(params, view, size, moment, degree).rendering
+        return draw(params, gaussians, view, size, degree).rendering
+
+    def pose(params, prepared, time):
+        return deformation.pose(effects, params, prepared, time)
+
+    def prepare(params):
+        return deformation.prepare(effects, params)
+
+    def whole_frame(params, view, size, step):
+        posed = pose(params, prepare(params), view.time)
+        return draw_trained(params, posed, view, size, step)
 
     def step(state: TrainState, frames: Frames):
         key = loop.step_key(state)
         row = shuffled_row(state.key, state.step, len(frames.times))
         view = _view(frames, row)
         size = frames.images.shape[2], frames.images.shape[1]
-        truth = frames.images[row].astype(jnp.float32) / 255
-        valid = None if frames.valid is None else frames.valid[row]
         degree = splats.active_degree(state.step, spec.sh_every, spec.sh_degree)
+        moment = Moment(view.time, state.step, key)
 
         def loss(params, probe):
-            moment = Moment(view.time, state.step, key)
-            frame = draw(params, view, size, moment, degree, probe)
-            colour = frame.rendering.colour
-            value = losses.photometric(
-                colour, truth, valid, dssim_weight=spec.dssim_weight
+            canonical = splats.activate(params.rows["splats"])
+            moved = deformation.pose_in_training(effects, params, canonical, moment)
+            frame = draw(params, moved, view, size, degree, probe)
+            shot = _shot(frames, row, frame.rendering)
+            value, metrics = loss_of(
+                spec, effects, params, shot, moment, state.extra.carried
             )
-            return value, (losses.mse(colour, truth, valid), frame.footprints)
+            return value, (metrics, frame.footprints, canonical, moved)
 
         probe = jnp.zeros_like(state.params.rows["splats"].mean[:, :2])
-        (value, (mse, footprints)), (slopes, probe_slope) = jax.value_and_grad(
-            loss, argnums=(0, 1), has_aux=True
-        )(state.params, probe)
+        (value, (metrics, footprints, canonical, moved)), (slopes, probe_slope) = (
+            jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)(state.params, probe)
+        )
         directions, moments = optimiser.update(slopes, state.optimiser, state.params)
         rate = _rates(spec, facts, effects, state.step)
         params = rates.descend(state.params, directions, rate)
-        extra = state.extra
+        stats, carried = state.extra
         if spec.density is not None:
-            extra = density.observe(
-                extra,
+            stats = density.observe(
+                stats,
                 probe_slope,
                 footprints.visible,
                 jnp.max(footprints.extent_px, axis=1),
                 size,
             )
-        metrics = {"loss": value, "mse": mse}
-        return TrainState(params, moments, extra, state.step + 1, state.key), metrics
+        for effect in effects:
+            if effect.observe is not None:
+                seen = effect.observe(carried[effect.name], canonical, moved, moment)
+                carried = carried | {effect.name: seen}
+        state = TrainState(
+            params, moments, Extra(stats, carried), state.step + 1, state.key
+        )
+        return state, {"loss": value, **metrics}
 
     return Model(
         spec=(spec, facts),
         init=lambda capture, key: first_state(spec, effects, optimiser, capture, key),
         step=step,
         render=whole_frame,
-        events=_events(spec, facts, optimiser),
+        events=_events(spec, facts, effects, optimiser),
         counts=count_rows,
+        wants=frozenset().union(*(effect.wants for effect in effects)),
+        stages=Stages(prepare, pose, draw_trained),
+    )
+
+
+def loss_of(
+    spec: SplatScene,
+    effects: tuple[Effect, ...],
+    params: Params,
+    shot: Shot,
+    moment: Moment,
+    carried: dict[str, PyTree],
+) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
+    """The loss of one frame with what every effect adds, and numbers to log."""
+    colour = shot.rendering.colour
+    value = losses.photometric(
+        colour, shot.truth, shot.valid, dssim_weight=spec.dssim_weight
+    )
+    metrics = {"mse": losses.mse(colour, shot.truth, shot.valid)}
+
+    def at_time(params, time):
+        gaussians = splats.activate(params.rows["splats"])
+        then = moment._replace(time=time)
+        return deformation.pose_in_training(effects, params, gaussians, then)
+
+    for effect in effects:
+        terms = []
+        if effect.image_loss is not None:
+            terms.append(effect.image_loss(params, shot, moment))
+        if effect.penalty is not None:
+            own = carried.get(effect.name)
+            terms.append(effect.penalty(Around(params, at_time, moment, own)))
+        for term in terms:
+            value = value + term.value
+            named = {f"{effect.name}.{key}": x for key, x in term.metrics.items()}
+            metrics |= {effect.name: term.value} | named
+    return value, metrics
+
+
+def _shot(frames, row, rendering):
+    return Shot(
+        rendering,
+        frames.images[row].astype(jnp.float32) / 255,
+        None if frames.valid is None else frames.valid[row],
+        None if frames.depths is None else frames.depths[row],
     )
 
 
@@ -185,9 +243,9 @@ def _rates(spec, facts, effects, step):
     nets = {}
     for effect in effects:
         if effect.init_rows is not None:
-            rows[effect.name] = effect.learning_rate(step)
+            rows[effect.name] = effect.row_rate(step)
         if effect.init_nets is not None:
-            nets[effect.name] = effect.learning_rate(step)
+            nets[effect.name] = effect.net_rate(step)
     return Params(rows, nets)
 
 
@@ -197,56 +255,6 @@ def shuffled_row(
     """The frame of a step: every epoch visits each frame once, in a new order."""
     epoch = jax.random.fold_in(jax.random.fold_in(key, ORDER), step // frames)
     return jax.random.permutation(epoch, frames)[step % frames]
-
-
-def first_points(spec: StartSpec, capture: Capture, seed: int):
-    """Positions and colours in [0, 1] of the first Gaussians; host side.
-
-    Structure from motion finds what stands still, so what moves has no points of its
-    own; `spec.beside` random ones in the volume give it something to grow from.
-    """
-    rng = np.random.default_rng(seed)
-    cloud = capture.points
-    if cloud is None or len(cloud.position) < spec.fewest:
-        return _random_points(rng, capture, spec.random, (capture.near, capture.far))
-    position, colour = cloud.position, cloud.colour / 255
-    if len(position) > spec.points:
-        kept = np.sort(rng.choice(len(position), spec.points, replace=False))
-        position, colour = position[kept], colour[kept]
-    span = _filmed_depths(capture)
-    more, more_colour = _random_points(rng, capture, spec.beside, span)
-    return np.concatenate([position, more]), np.concatenate([colour, more_colour])
-
-
-def _random_points(rng, capture, count, span):
-    filmed = jax.tree.map(lambda leaf: leaf[capture.train], capture.cameras)
-    position = splats.random_in_views(rng, filmed, capture.size, *span, count)
-    return position, rng.uniform(size=position.shape)
-
-
-def _narrowed(rows, capture, widest):
-    """The rows, none wider than a share of its distance to the nearest camera.
-
-    A lone point gets the distance to its neighbours for a scale, and close to a camera
-    it covers the picture: the first steps on a capture with such points took 2 s each.
-    """
-    cameras = scipy.spatial.cKDTree(capture.cameras.position[capture.train])
-    distance, _ = cameras.query(np.asarray(rows.mean))
-    bound = np.log(np.maximum(widest * distance, 1e-8)).astype(np.float32)
-    return rows._replace(log_scale=jnp.minimum(rows.log_scale, bound[:, None]))
-
-
-def _filmed_depths(capture):
-    """The z-depths between which the capture's points lie, a little widened.
-
-    Its near plane is often much nearer than anything filmed (0.05 where the first point
-    is at 0.4), and a Gaussian there covers the whole picture: 20 times slower steps.
-    """
-    depth = point_depths(capture)
-    if not depth.size:
-        return capture.near, capture.far
-    low, high = np.quantile(depth, (0.02, 0.98))
-    return max(capture.near, 0.7 * float(low)), min(capture.far, 1.1 * float(high))
 
 
 def first_bytes(spec: SplatScene, capture: Capture) -> int:
@@ -269,11 +277,11 @@ def first_state(spec, effects, optimiser, capture, key) -> TrainState:
     render.refuse_distortion(capture.cameras)
     start_key, run_key = jax.random.split(key)
     seed = int(jax.random.randint(start_key, (), 0, np.iinfo(np.int32).max))
-    position, colour = first_points(spec.start, capture, seed)
+    position, colour = start.first_points(spec.start, capture, seed)
     rows = splats.from_points(
         position, colour, degree=spec.sh_degree, opacity=spec.start.opacity
     )
-    rows = _narrowed(rows, capture, spec.start.widest)
+    rows = start.narrowed(rows, capture, spec.start.widest)
     count = len(position)
     most = None if spec.density is None else spec.density.most
     params = Params({"splats": rows}, {})
@@ -286,12 +294,13 @@ def first_state(spec, effects, optimiser, capture, key) -> TrainState:
             params.nets[effect.name] = effect.init_nets(nets_key)
     params = splats.pad_rows(params, splats.capacity_for(count, most))
     stats = () if spec.density is None else density.empty_stats(params.rows["splats"])
+    extra = Extra(stats, carried_by(effects, params))
     return TrainState(
-        params, optimiser.init(params), stats, jnp.zeros((), jnp.int32), run_key
+        params, optimiser.init(params), extra, jnp.zeros((), jnp.int32), run_key
     )
 
 
-def _events(spec, facts, optimiser):
+def _events(spec, facts, effects, optimiser):
     if spec.density is None:
         return ()
     plan = spec.density
@@ -299,18 +308,25 @@ def _events(spec, facts, optimiser):
 
     def densify(state, frames):
         del frames
+        stats, carried = state.extra
+        step = int(state.step)
+        for effect in effects:
+            if effect.grow_score is not None:
+                factor = effect.grow_score(carried[effect.name], step)
+                stats = stats._replace(gradient=stats.gradient * jnp.asarray(factor))
         changed = density.densify(
             optimiser,
             state.params,
             state.optimiser,
-            state.extra,
+            stats,
             jax.random.fold_in(jax.random.fold_in(state.key, EVENT), state.step),
             plan,
-            step=int(state.step),
+            step=step,
             extent=facts.extent,
         )
+        extra = Extra(changed.stats, carried_by(effects, changed.params))
         return state._replace(
-            params=changed.params, optimiser=changed.moments, extra=changed.stats
+            params=changed.params, optimiser=changed.moments, extra=extra
         )
 
     def reset(state, frames):

@@ -8,9 +8,11 @@ compiled step of a scene without effects is that of a static scene.
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from jaxtyping import Array, Float, Int, Key
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from gaussians_jax.splats import Gaussians, Params
+from nerfies_jax.training.model import Rendering
 
 PyTree = Any
 
@@ -23,11 +25,56 @@ class Moment(NamedTuple):
     key: Key[Array, ""] | None = None
 
 
+class Shot(NamedTuple):
+    """One frame as it was drawn and as it was filmed."""
+
+    rendering: Rendering
+    truth: Float[Array, "height width 3"]  # sRGB in [0, 1]
+    valid: Bool[Array, "height width"] | None  # None: everywhere
+    depth: Float[Array, "height width"] | None  # z-depth, scene units; 0 unknown
+
+
+class Around(NamedTuple):
+    """What a penalty may ask of the scene beside the frame that is drawn."""
+
+    params: Params
+    # Gaussians of any choice of rows (`splats.take_rows`) at any time.
+    at_time: Callable[[Params, Float[Array, ""]], Gaussians]
+    moment: Moment
+    carried: PyTree  # of this effect; None where it carries nothing
+
+
+class Term(NamedTuple):
+    """A summand of the loss, weighted, and numbers to log beside it."""
+
+    value: Float[Array, ""]
+    metrics: dict[str, Float[Array, ""]]
+
+
+Rate = Callable[[Int[Array, ""]], Float[Array, ""]]  # learning rate at a traced step
+
+
 class Effect(NamedTuple):
     """What one effect does, each seam optional."""
 
-    name: str  # its key in `Params.rows` and `Params.nets`
+    name: str  # its key in `Params.rows`, `Params.nets` and what is carried
     init_rows: Callable[[Any, int], PyTree] | None = None  # (key, rows) -> rows
     init_nets: Callable[[Any], PyTree] | None = None  # key -> nets
-    learning_rate: Callable[[Int[Array, ""]], Float[Array, ""]] | None = None
-    deform: Callable[[Params, Gaussians, Moment], Gaussians] | None = None
+    row_rate: Rate | None = None  # where there are rows
+    net_rate: Rate | None = None  # where there are nets
+    warm_up: int = 0  # steps before which it does not deform
+    # What stays as it is while the parameters do, whatever the time.
+    prepare: Callable[[Params], PyTree] | None = None
+    # The last argument is what `prepare` returned, None without it.
+    deform: Callable[[Params, Gaussians, Moment, PyTree], Gaussians] | None = None
+    image_loss: Callable[[Params, Shot, Moment], Term] | None = None
+    penalty: Callable[[Around], Term] | None = None
+    # Host side, at the start and after every change of the rows: what the steps up to
+    # the next change carry. Arrays only.
+    carry: Callable[[Params], PyTree] | None = None
+    # (carried, canonical, moved, moment) -> carried; pure, in every step
+    observe: Callable[[PyTree, Gaussians, Gaussians, Moment], PyTree] | None = None
+    # (carried, step) -> [rows] factor of the gradient that the density control
+    # compares with its threshold; host side
+    grow_score: Callable[[PyTree, int], np.ndarray] | None = None
+    wants: frozenset[str] = frozenset()  # of `Frames`, beside pictures and cameras

@@ -267,18 +267,12 @@ def smooth_time(
 
 
 def effect(spec: MotionSpec, steps: int, frames: int) -> Effect:
-    """The seams that this motion fills, for a run of `steps` over `frames`.
-
-    Before `spec.warm_up` the field is not evaluated: under the loop's scan the switch
-    is a branch, and a static step costs what it costs without motion.
-    """
+    """The seams that this motion fills, for a run of `steps` over `frames`."""
 
     def init_nets(key):
         return init(key, spec)
 
-    learning_rate = schedules.log_linear(spec.rate, spec.rate_end, steps)
-
-    def moved(params: Params, gaussians: Gaussians, moment: Moment) -> Gaussians:
+    def moved(params: Params, gaussians: Gaussians, moment: Moment, _) -> Gaussians:
         time = moment.time
         if spec.smoothing is not None and moment.step is not None:
             key = jax.random.fold_in(moment.key, _STREAM)
@@ -288,21 +282,10 @@ def effect(spec: MotionSpec, steps: int, frames: int) -> Effect:
         offsets = deform(motion, spec, gaussians.mean, time, living)
         return apply(gaussians, offsets, spec.scale_rule)
 
-    def deform_after_warm_up(params, gaussians, moment):
-        if moment.step is None:
-            return moved(params, gaussians, moment)
-        return jax.lax.cond(
-            moment.step < spec.warm_up,
-            lambda params, gaussians, moment: gaussians,
-            moved,
-            params,
-            gaussians,
-            moment,
-        )
-
     return Effect(
         name=NAME,
         init_nets=init_nets,
-        learning_rate=learning_rate,
-        deform=deform_after_warm_up,
+        net_rate=schedules.log_linear(spec.rate, spec.rate_end, steps),
+        warm_up=spec.warm_up,
+        deform=moved,
     )

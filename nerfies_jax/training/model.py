@@ -66,6 +66,18 @@ class Event(NamedTuple):
     apply: Callable[[TrainState, Frames], TrainState]
 
 
+class Stages(NamedTuple):
+    """`Model.render` in three parts, so that nothing is computed twice.
+
+    `draw(params, pose(params, prepare(params), time), view, size, step)` is the picture
+    that `render` gives, to rounding.
+    """
+
+    prepare: Callable[[PyTree], PyTree]  # once for trained parameters
+    pose: Callable[[PyTree, PyTree, Float[Array, ""]], PyTree]  # once for an instant
+    draw: Callable[[PyTree, PyTree, View, tuple[int, int], Int[Array, ""]], Rendering]
+
+
 class Model(NamedTuple):
     """A representation: pure functions closed over a static spec."""
 
@@ -78,3 +90,4 @@ class Model(NamedTuple):
     events: tuple[Event, ...]
     counts: Callable[[TrainState], dict[str, int]]  # {"gaussians": n, ...}
     wants: frozenset[str] = frozenset()  # which of "depths", "points", "flow" it reads
+    stages: Stages | None = None  # where rendering has parts worth keeping

@@ -10,10 +10,11 @@ import optax
 import pytest
 
 from experiments import evaluate
-from gaussians_jax import presets, rates, scene, splats
+from gaussians_jax import presets, rates, scene, splats, start
 from gaussians_jax.rates import RateSpec
-from gaussians_jax.scene import Facts, SplatScene, StartSpec
+from gaussians_jax.scene import Facts, SplatScene
 from gaussians_jax.splats import Params, Splats
+from gaussians_jax.start import StartSpec
 from tests import scenes
 
 KEY = 3
@@ -133,7 +134,7 @@ def test_events_grow_the_scene_and_keep_its_picture_learnable():
     assert int(after.step) == int(state.step)
     again, metrics = jax.jit(eager.step)(after, frames)
     assert np.isfinite(float(metrics["loss"]))
-    assert again.params.rows["splats"].mean.shape == (*after.extra.alive.shape, 3)
+    assert again.params.rows["splats"].mean.shape == (*after.extra.stats.alive.shape, 3)
 
 
 def test_an_event_is_a_function_of_the_state():
@@ -176,7 +177,7 @@ def test_a_frame_has_the_harmonics_of_its_step():
 def test_few_points_start_from_random_ones_in_the_views():
     capture = scenes.tiny_capture()
     spec = StartSpec(random=50, fewest=10**6)
-    position, colour = scene.first_points(spec, capture, 0)
+    position, colour = start.first_points(spec, capture, 0)
     assert position.shape == colour.shape == (50, 3)
     turn = capture.cameras.camera_from_world[capture.train]
     offset = position[None] - capture.cameras.position[capture.train][:, None]
@@ -186,7 +187,7 @@ def test_few_points_start_from_random_ones_in_the_views():
 
 
 def test_more_points_than_asked_for_are_thinned_without_repeats():
-    position, _ = scene.first_points(StartSpec(points=120), scenes.tiny_capture(), 0)
+    position, _ = start.first_points(StartSpec(points=120), scenes.tiny_capture(), 0)
     assert len(np.unique(position, axis=0)) == len(position) == 120
 
 

@@ -1,0 +1,66 @@
+"""The motion of a scene: every effect that deforms, one after the other."""
+
+import jax
+from jaxtyping import Array, Float
+
+from gaussians_jax import splats
+from gaussians_jax.effects.effect import Effect, Moment, PyTree
+from gaussians_jax.splats import Gaussians, Params
+
+Effects = tuple[Effect, ...]
+
+
+def prepare(effects: Effects, params: Params) -> dict[str, PyTree]:
+    """By the name of the effect, what depends on the parameters but not on the time.
+
+    A pure function: what it returned is right as long as `params` are the same arrays.
+    """
+    return {
+        effect.name: effect.prepare(params)
+        for effect in effects
+        if effect.prepare is not None
+    }
+
+
+def pose(
+    effects: Effects,
+    params: Params,
+    prepared: dict[str, PyTree],
+    time: Float[Array, ""],
+) -> Gaussians:
+    """The trained Gaussians as they are at one time, from what `prepare` returned."""
+    gaussians = splats.activate(params.rows["splats"])
+    for effect in effects:
+        if effect.deform is not None:
+            ready = prepared.get(effect.name)
+            gaussians = effect.deform(params, gaussians, Moment(time), ready)
+    return gaussians
+
+
+def pose_in_training(
+    effects: Effects, params: Params, gaussians: Gaussians, moment: Moment
+) -> Gaussians:
+    """`gaussians` as they are at a moment of training.
+
+    An effect is not evaluated before its warm-up is over: under the loop's scan the
+    switch is a branch, and such a step costs what it costs without the effect.
+    """
+    for effect in effects:
+        if effect.deform is None:
+            continue
+
+        def moved(params, gaussians, effect=effect):
+            ready = None if effect.prepare is None else effect.prepare(params)
+            return effect.deform(params, gaussians, moment, ready)
+
+        if not effect.warm_up:
+            gaussians = moved(params, gaussians)
+            continue
+        gaussians = jax.lax.cond(
+            moment.step < effect.warm_up,
+            lambda params, gaussians: gaussians,
+            moved,
+            params,
+            gaussians,
+        )
+    return gaussians

@@ -1,0 +1,81 @@
+"""Where the first Gaussians come from: the capture's own points, and random ones."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.spatial
+
+from gaussians_jax import splats
+from gaussians_jax.splats import Splats
+from nerfies_jax.capture.capture import Capture, point_depths
+
+
+@dataclasses.dataclass(frozen=True)
+class StartSpec:
+    """Where the first Gaussians come from."""
+
+    points: int = 100_000  # at most so many of the capture's own points
+    random: int = 10_000  # drawn in the views where the capture has fewer than `fewest`
+    fewest: int = 100
+    beside: int = 0  # drawn in the views beside the capture's own points
+    opacity: float = 0.1
+    widest: float = 0.03  # first scale, over the distance to the nearest camera
+
+    def __post_init__(self):
+        if self.points < 1 or self.random < 1 or self.beside < 0:
+            raise ValueError(
+                f"a scene starts from at least one Gaussian, got points={self.points}, "
+                f"random={self.random} and beside={self.beside}"
+            )
+
+
+def first_points(spec: StartSpec, capture: Capture, seed: int):
+    """Positions and colours in [0, 1] of the first Gaussians; host side.
+
+    Structure from motion finds what stands still, so what moves has no points of its
+    own; `spec.beside` random ones in the volume give it something to grow from.
+    """
+    rng = np.random.default_rng(seed)
+    cloud = capture.points
+    if cloud is None or len(cloud.position) < spec.fewest:
+        return _random_points(rng, capture, spec.random, (capture.near, capture.far))
+    position, colour = cloud.position, cloud.colour / 255
+    if len(position) > spec.points:
+        kept = np.sort(rng.choice(len(position), spec.points, replace=False))
+        position, colour = position[kept], colour[kept]
+    span = _filmed_depths(capture)
+    more, more_colour = _random_points(rng, capture, spec.beside, span)
+    return np.concatenate([position, more]), np.concatenate([colour, more_colour])
+
+
+def _random_points(rng, capture, count, span):
+    filmed = jax.tree.map(lambda leaf: leaf[capture.train], capture.cameras)
+    position = splats.random_in_views(rng, filmed, capture.size, *span, count)
+    return position, rng.uniform(size=position.shape)
+
+
+def narrowed(rows: Splats, capture: Capture, widest: float) -> Splats:
+    """The rows, none wider than a share of its distance to the nearest camera.
+
+    A lone point gets the distance to its neighbours for a scale, and close to a camera
+    it covers the picture: the first steps on a capture with such points took 2 s each.
+    """
+    cameras = scipy.spatial.cKDTree(capture.cameras.position[capture.train])
+    distance, _ = cameras.query(np.asarray(rows.mean))
+    bound = np.log(np.maximum(widest * distance, 1e-8)).astype(np.float32)
+    return rows._replace(log_scale=jnp.minimum(rows.log_scale, bound[:, None]))
+
+
+def _filmed_depths(capture):
+    """The z-depths between which the capture's points lie, a little widened.
+
+    Its near plane is often much nearer than anything filmed (0.05 where the first point
+    is at 0.4), and a Gaussian there covers the whole picture: 20 times slower steps.
+    """
+    depth = point_depths(capture)
+    if not depth.size:
+        return capture.near, capture.far
+    low, high = np.quantile(depth, (0.02, 0.98))
+    return max(capture.near, 0.7 * float(low)), min(capture.far, 1.1 * float(high))
