@@ -1,7 +1,8 @@
-"""Adam per row, and rows gathered together with their moments."""
+"""Adam and RAdam per row, and rows gathered together with their moments."""
 
 import jax
 import jax.numpy as jnp
+import mpmath
 import numpy as np
 import optax
 import pytest
@@ -32,14 +33,14 @@ def rows_and_nets(dtype="float32"):
     return Params({"splats": rows, "embedding": leaf(COUNT, 2)}, {"w": leaf(COUNT, 5)})
 
 
-def partitioned():
+def partitioned(scale_by_rows=optimiser.scale_by_row_adam):
     def label(params):
         del params
         kinds = Splats("mean", *["rest"] * 5)
         return Params({"splats": kinds, "embedding": "rest"}, {"w": "nets"})
 
     def rows(rate):
-        return optax.chain(optimiser.scale_by_row_adam(), optax.scale(-rate))
+        return optax.chain(scale_by_rows(), optax.scale(-rate))
 
     each = {"mean": rows(1e-2), "rest": rows(1e-3), "nets": optax.adam(1e-3)}
     return optax.chain(optax.clip_by_global_norm(10.0), optax.partition(each, label))
@@ -53,12 +54,19 @@ def first_moments(tx, slopes, params):
         return jax.jit(one_step)(slopes, params)
 
 
-def test_it_is_adam_while_all_rows_are_as_old(dtype):
+PAIRS = {
+    "adam": (optimiser.scale_by_row_adam, optax.scale_by_adam(eps=1e-15)),
+    "radam": (optimiser.scale_by_row_radam, optax.scale_by_radam(eps=1e-15)),
+}
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_it_is_optax_s_while_all_rows_are_as_old(name, dtype):
     params = rows_and_nets(dtype).rows
-    ours, theirs = optimiser.scale_by_row_adam(), optax.scale_by_adam(eps=1e-15)
+    ours, theirs = PAIRS[name][0](), PAIRS[name][1]
     state, reference = ours.init(params), theirs.init(params)
     step_ours, step_theirs = jax.jit(ours.update), jax.jit(theirs.update)
-    for seed in range(5):
+    for seed in range(8):  # RAdam's length passes the threshold at the sixth
         noise = np.random.default_rng(seed)
         slopes = jax.tree.map(
             lambda p, n=noise: jnp.asarray(n.normal(size=p.shape), p.dtype), params
@@ -66,13 +74,122 @@ def test_it_is_adam_while_all_rows_are_as_old(dtype):
         step, state = step_ours(slopes, state)
         with lenient("standard"):
             expected, reference = step_theirs(slopes, reference)
-        # optax forms 1 - 0.999^n in float32, which is good to 3e-5 at n = 1.
-        tolerance = {"float32": 1e-4, "float64": 1e-13}[dtype]
+        # optax forms 1 - 0.999^n in float32, which is good to 3e-5 at n = 1, and the
+        # length of RAdam to 0.03, so that its first rectified step is 1 % off.
+        far = {"adam": 1e-4, "radam": 2e-2}[name]
+        tolerance = {"float32": far, "float64": 1e-11}[dtype]
         for ours_leaf, leaf in zip(
             *map(jax.tree.leaves, (step, expected)), strict=True
         ):
             np.testing.assert_allclose(ours_leaf, leaf, rtol=tolerance)
     assert {leaf.dtype.name for leaf in jax.tree.leaves(step)} == {dtype}
+
+
+def exact_length(updates, b2):
+    with mpmath.workdps(60):
+        b2 = mpmath.mpf(b2)
+        seen = b2**updates
+        return 2 / (1 - b2) - 1 - 2 * updates * seen / (1 - seen)
+
+
+def exact_factor(length, b2):
+    with mpmath.workdps(60):
+        longest = 2 / (1 - mpmath.mpf(b2)) - 1
+        top = (length - 4) * (length - 2) * longest
+        return mpmath.sqrt(top / ((longest - 4) * (longest - 2) * length))
+
+
+AGES = [*range(1, 12), 100, 690, 999, 1000, 1001, 1002, 5000, 10**4, 10**5, 10**6]
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("b2", [0.7, 0.9, 0.99, 0.999, 0.9999])
+def test_the_moments_length_is_right_from_the_first_update_on(b2, dtype):
+    """The printed form is 0.03 off in float32 where RAdam takes its decision."""
+    length = jax.jit(optimiser.moment_length, static_argnums=1)(
+        jnp.asarray(AGES, dtype), b2
+    )
+    exact = [exact_length(age, b2) for age in AGES]
+    # Measured 1.4e-7 and 4.4e-16, beside the switch from the series at t = -1 / log b2.
+    tolerance = {"float32": 4e-7, "float64": 2e-15}[dtype]
+    np.testing.assert_allclose(length, np.array(exact, float), rtol=tolerance)
+    factor = jax.jit(optimiser.rectification, static_argnums=1)(length, b2)
+    expected = [float(exact_factor(x, b2)) if x > 4 else 0.0 for x in exact]
+    # One ulp of a length of 4.07 is 3e-6 of what it exceeds 4 by.
+    np.testing.assert_allclose(factor, expected, atol=4 * tolerance)
+    assert (np.diff(np.asarray(length[:-1], np.float64)) > -1e-4).all()
+    assert np.asarray(factor).max() <= 1
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("shift", [-1e-3, 1e-3])
+def test_radam_switches_exactly_where_its_length_passes_the_threshold(shift, dtype):
+    """Just above the length of the seventh update, the eighth is the first adapted."""
+    length = float(exact_length(7, 0.999))
+    ours = optimiser.scale_by_row_radam(threshold=length + shift)
+    slopes = jnp.full((1, 2), 1e-3, dtype)
+    state, update, steps = ours.init(slopes), jax.jit(ours.update), []
+    for _ in range(9):
+        step, state = update(slopes, state)
+        steps.append(float(step[0, 0]))
+    first = 7 if shift > 0 else 6
+    np.testing.assert_allclose(steps[:first], 1e-3, rtol=2e-5)
+    factors = [exact_factor(exact_length(age, 0.999), 0.999) for age in range(1, 10)]
+    np.testing.assert_allclose(
+        steps[first:], np.array(factors[first:], float), rtol=2e-5
+    )
+
+
+def radam_alone(slopes, b1=0.9, b2=0.999, eps=1e-15):
+    """RAdam of one number, algorithm 2 of the paper with the threshold of its code."""
+    first = second = 0.0
+    steps = []
+    for age, slope in enumerate(slopes, start=1):
+        first = b1 * first + (1 - b1) * slope
+        second = b2 * second + (1 - b2) * slope**2
+        mean, square = first / (1 - b1**age), second / (1 - b2**age)
+        length = exact_length(age, b2)
+        if length < 5:
+            steps.append(mean)
+        else:
+            factor = float(exact_factor(length, b2))
+            steps.append(factor * mean / (np.sqrt(square) + eps))
+    return np.array(steps)
+
+
+def test_rows_that_start_late_follow_radam_from_their_own_first_step(dtype):
+    starts, total = [0, 3, 12], 24
+    slopes = np.random.default_rng(3).normal(size=(total, len(starts)))
+    for row, start in enumerate(starts):
+        slopes[:start, row] = 0
+    ours = optimiser.scale_by_row_radam()
+    state = ours.init(jnp.zeros(len(starts), dtype))
+    steps, update = [], jax.jit(ours.update)
+    for slope in slopes:
+        step, state = update(jnp.asarray(slope, dtype), state)
+        steps.append(np.asarray(step))
+    for row, start in enumerate(starts):
+        mine = np.array(steps)[:, row]
+        assert not mine[:start].any()
+        expected = radam_alone(slopes[start:, row])
+        # A mean of slopes of both signs may cancel to a tenth of them.
+        tolerance = {"float32": 2e-6, "float64": 1e-12}[dtype]
+        np.testing.assert_allclose(mine[start:], expected, rtol=1e-4, atol=tolerance)
+    assert state.count.tolist() == [total - start for start in starts]
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ({"b2": 0.6}, r"longest length that b2=0.6 allows"),
+        ({"threshold": 3.0}, r"threshold=3.0 must lie in \[4, 1999\)"),
+        ({"b1": 1.0}, "strictly between 0 and 1"),
+        ({"b2": 1.0}, "strictly between 0 and 1"),
+    ],
+)
+def test_settings_under_which_radam_cannot_work_are_refused(setting, message):
+    with pytest.raises(ValueError, match=message):
+        optimiser.scale_by_row_radam(**setting)
 
 
 def test_a_late_row_steps_as_if_it_were_alone(dtype):
@@ -151,8 +268,9 @@ def test_no_slope_is_no_step(dtype):
     assert not np.asarray(step).any()
 
 
-def test_a_gather_moves_rows_with_their_moments_and_leaves_nets_alone():
-    params, tx = rows_and_nets(), partitioned()
+@pytest.mark.parametrize("name", PAIRS)
+def test_a_gather_moves_rows_with_their_moments_and_leaves_nets_alone(name):
+    params, tx = rows_and_nets(), partitioned(PAIRS[name][0])
     slopes = jax.tree.map(lambda p: p * 2, params)
     moments = first_moments(tx, slopes, params)
     rows = jnp.asarray([5, 0, 0, 2, 1, 0, 0, 0])
