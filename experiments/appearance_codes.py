@@ -111,7 +111,7 @@ def compare_transient(film, steps, seed):
     for name, spec in (("without the effect", plain), ("static part", medium)):
         model, state, seconds = trained(spec, capture, seed)
         left_out = () if spec.transient is None else ("transient",)
-        static = model._replace(render=variants.of_fields(*model.spec, left_out, False))
+        static = variants.of_fields(*model.spec, left_out, False)
         renderer = evaluate.Renderer(static, capture.size)
         drawn[name] = evaluate.score(renderer, state, clean, rows).colour
         held_out = evaluate.score(renderer, state, clean, clean.heldout)

@@ -98,7 +98,7 @@ def _renderer(asked, run, size):
     model, blended = run.model, asked.appearance is not None
     if asked.without or blended:
         make = run.representation.variant
-        model = model._replace(render=make(run.spec, run.facts, asked.without, blended))
+        model = make(run.spec, run.facts, asked.without, blended)
     return evaluate.Renderer(model, size)
 
 

@@ -25,9 +25,9 @@ class Representation(NamedTuple):
     lighter: str  # which settings make the first state smaller
     # (spec, facts, model, state, frames) -> milliseconds of each part of a step
     time_parts: Callable[[Spec, Any, Model, TrainState, Frames], dict[str, float]]
-    # (spec, facts, effects left out, whether appearances are blended) -> like
-    # `Model.render`; of a `variants.Between` instead of a view where they are.
-    variant: Callable[[Spec, Any, tuple[str, ...], bool], Callable]
+    # (spec, facts, effects left out, whether appearances are blended) -> model;
+    # it draws a `variants.Between` instead of a view where they are.
+    variant: Callable[[Spec, Any, tuple[str, ...], bool], Model]
     # (spec, facts, state, capture, rows) -> scores with codes fitted to half a frame;
     # None where the scene has no codes of its own for each frame.
     score_halves: Callable[..., evaluate.Halves | None]

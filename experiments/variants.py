@@ -1,14 +1,13 @@
 """A trained scene drawn otherwise: effects left out, appearances blended."""
 
 import dataclasses
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.training.model import View
+from nerfies_jax.training.model import Model, View
 
 
 class Between(NamedTuple):
@@ -19,8 +18,8 @@ class Between(NamedTuple):
     share: Float[Array, ""]  # in [0, 1]
 
 
-def of_splats(spec, facts, without: tuple[str, ...], blended: bool) -> Callable:
-    """Drawing as `Model.render` does, some effects left out."""
+def of_splats(spec, facts, without: tuple[str, ...], blended: bool) -> Model:
+    """The model with some effects left out."""
     from gaussians_jax import scene
 
     if blended:
@@ -31,11 +30,11 @@ def of_splats(spec, facts, without: tuple[str, ...], blended: bool) -> Callable:
     there = [name for name in ("motion",) if getattr(spec, name) is not None]
     _check_there(without, there)
     left = dataclasses.replace(spec, **dict.fromkeys(without))
-    return scene.build(left, facts).render
+    return scene.build(left, facts)
 
 
-def of_fields(spec, facts, without: tuple[str, ...], blended: bool) -> Callable:
-    """Drawing as `Model.render` does, some effects left out, or of a `Between`."""
+def of_fields(spec, facts, without: tuple[str, ...], blended: bool) -> Model:
+    """The model with some effects left out of its pictures, or drawing a `Between`."""
     from nerfies_jax import scene
     from nerfies_jax.effects.effect import APPEARANCE
 
@@ -69,7 +68,8 @@ def of_fields(spec, facts, without: tuple[str, ...], blended: bool) -> Callable:
         codes = {name: (1 - share) * start[name] + share * end[name] for name in start}
         return made.render(params, view.camera, view.time, codes, size, step)
 
-    return blend if blended else plain
+    render = blend if blended else plain
+    return scene.build(spec, facts)._replace(render=render, stages=None)
 
 
 def appearance_id(capture: Capture, name: str) -> int:

@@ -2,14 +2,16 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import skimage.metrics
 
 from experiments import evaluate
+from gaussians_jax import scene
 from nerfies_jax.geometry import camera as cameras
-from nerfies_jax.training.model import Model, Rendering, TrainState
+from nerfies_jax.training.model import Model, Rendering, Stages, TrainState
 from tests import scenes
 
 SIZE = (40, 30)
@@ -67,6 +69,128 @@ def test_a_renderer_sees_parameters_time_and_step_and_compiles_once_a_shape():
     renderer(state_at(0, [0.1, 0.2]), view)
     assert len(renderer.seconds) == 4
     assert len(traced) == 2
+
+
+class Counted:
+    """A model in stages that counts how often each of them really runs."""
+
+    def __init__(self):
+        self.calls = {"prepare": 0, "pose": 0, "draw": 0}
+
+        def prepare(params):
+            self._count("prepare")
+            return {"basis": 2 * params["weight"]}
+
+        def pose(params, prepared, time):
+            self._count("pose")
+            return params["mean"] + time * prepared["basis"]
+
+        def draw(params, posed, view, size, step):
+            self._count("draw")
+            return flat(jnp.sum(posed), view, size, step)
+
+        def render(params, view, size, step):
+            del params, view, size, step
+            raise AssertionError("a model with stages is drawn by them")
+
+        stages = Stages(prepare, pose, draw)
+        self.model = MODEL._replace(render=render, stages=stages)
+
+    def _count(self, name):
+        def add():
+            self.calls[name] += 1
+
+        jax.debug.callback(add)
+
+    def since(self, act):
+        """What ran in the meantime, as (prepare, pose, draw)."""
+        jax.effects_barrier()
+        before = dict(self.calls)
+        picture = act()
+        jax.effects_barrier()
+        ran = tuple(self.calls[name] - before[name] for name in before)
+        return ran, float(picture.colour[0, 0, 0])
+
+
+def test_a_renderer_keeps_what_stays_and_drops_what_changes():
+    counted, capture = Counted(), scenes.tiny_capture()
+    renderer = evaluate.Renderer(counted.model, SIZE)
+    here, later = (evaluate.view_of(capture, row) for row in (1, 3))
+    aside = later._replace(time=here.time)  # another view of the same instant
+    assert here.time != later.time
+    params = {"mean": jnp.asarray(0.1), "weight": jnp.asarray(0.2)}
+
+    def drawn(params, view):
+        state = TrainState(params, (), (), jnp.zeros((), jnp.int32), None)
+        ran, grey = counted.since(lambda: renderer(state, view))
+        time = float(view.time)
+        exact = float(params["mean"]) + time * 2 * float(params["weight"]) + time / 10
+        np.testing.assert_allclose(grey, exact, atol=1e-6)
+        return ran
+
+    assert drawn(params, here) == (1, 1, 1)
+    assert drawn(params, here) == (0, 0, 1)
+    assert drawn(dict(params), aside) == (0, 0, 1)  # another dict, the same arrays
+    assert drawn(params, later) == (0, 1, 1)
+    assert drawn(params, here) == (0, 1, 1)
+    for name in params:
+        params = params | {name: params[name] + 0.3}
+        assert drawn(params, here) == (1, 1, 1)
+        equal = params | {name: params[name] + 0.0}  # of equal value, but another array
+        assert drawn(equal, here) == (1, 1, 1)
+        assert drawn(params, later) == (1, 1, 1)
+    assert renderer.posed_anew == [True, False, False, *[True] * 8]
+
+
+def test_nothing_is_kept_of_arrays_that_can_be_written_into():
+    counted = Counted()
+    renderer = evaluate.Renderer(counted.model, SIZE)
+    view = evaluate.view_of(scenes.tiny_capture(), 0)
+    params = {"mean": np.float32(0.1) + np.zeros((), np.float32), "weight": np.ones(1)}
+    params = {name: np.asarray(x, np.float32) for name, x in params.items()}
+    state = TrainState(params, (), (), jnp.zeros((), jnp.int32), None)
+    _, before = counted.since(lambda: renderer(state, view))
+    params["mean"][...] = 0.5
+    ran, after = counted.since(lambda: renderer(state, view))
+    assert ran == (1, 1, 1)
+    np.testing.assert_allclose(after - before, 0.4, atol=1e-6)
+
+
+def test_a_frame_costs_what_it_costs_with_its_share_of_the_poses():
+    renderer = evaluate.Renderer(MODEL, SIZE)
+    renderer.seconds = [9.0, 0.010, 0.002, 0.030, 0.004, 0.010, 0.003]
+    renderer.posed_anew = [True, True, False, True, False, True, False]
+    # Medians 0.010 of the three new instants and 0.003 of the other three.
+    np.testing.assert_allclose(renderer.ms_per_frame(6), (3 * 10 + 3 * 3) / 6)
+    np.testing.assert_allclose(renderer.ms_per_frame(1), 3)
+    np.testing.assert_allclose(renderer.ms_per_frame(2), (10 + 3) / 2)
+
+
+@pytest.fixture(scope="module")
+def moving():
+    """A deformable scene that moves, its state at the last step."""
+    capture = scenes.tiny_capture()
+    model = scene.build(scenes.TINY_DEFORMABLE, scene.facts_of(capture))
+    state = model.init(capture, jax.random.key(0))
+    nets = jax.tree.map(lambda leaf: leaf + 0.02, state.params.nets)
+    params = state.params._replace(nets=nets)
+    return model, state._replace(params=params, step=jnp.asarray(20, jnp.int32))
+
+
+def test_a_scene_in_stages_is_drawn_as_in_one(moving):
+    model, state = moving
+    capture = scenes.tiny_capture()
+    staged = evaluate.Renderer(model, capture.size)
+    whole = evaluate.Renderer(model._replace(stages=None), capture.size)
+    views = [evaluate.view_of(capture, row) for row in (0, 3, 5)]
+    first, last = (whole(state, view).colour for view in (views[0], views[-1]))
+    assert np.abs(first - last).max() > 0.05
+    for view in views:
+        found, expected = staged(state, view), whole(state, view)
+        for name in Rendering._fields:
+            np.testing.assert_allclose(
+                getattr(found, name), getattr(expected, name), atol=3e-6, err_msg=name
+            )
 
 
 def test_scores_are_those_of_the_picture_as_eight_bits():

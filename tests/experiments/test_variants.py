@@ -40,7 +40,7 @@ def test_splats_without_motion_are_the_canonical_ones(moving):
     still = scene.build(scenes.TINY_SPLATS, facts).render
     found, expected, moved = (
         jax.jit(each, static_argnums=2)(params, view, SIZE, step).colour
-        for each in (draw, still, model.render)
+        for each in (draw.render, still, model.render)
     )
     np.testing.assert_array_equal(found, expected)
     assert np.abs(found - moved).max() > 0.02
@@ -97,7 +97,7 @@ def drawn(field, seen, without=(), blended=False):
     facts, params, _ = field
     draw = variants.of_fields(TINY_FIELD, facts, without, blended)
     step = jnp.asarray(10, jnp.int32)
-    return jax.jit(draw, static_argnums=2)(params, seen, SIZE, step).colour
+    return jax.jit(draw.render, static_argnums=2)(params, seen, SIZE, step).colour
 
 
 def test_a_field_without_its_warp_is_the_template(field):
