@@ -1,0 +1,359 @@
+"""Losses on the spectrum of a frame, and gates that weigh them.
+
+Sonata, section "frequency-guided learning", equations 12 to 17: the high bands of a
+wavelet pyramid, the amplitudes of the Fourier transform, and a learnt gate for each.
+"""
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from gaussians_jax.effects.effect import Effect, Moment, Shot, Term
+from gaussians_jax.splats import Params
+from nerfies_jax.training import schedules
+
+NAME = "spectral"
+GATES = ("learned", "floor", "fixed", "schedule")
+LEARNED = ("learned", "floor")  # the gates that have parameters
+# A learned gate is held here. It has no slope there and stays; as it can only fall,
+# it would never come back from below anyway.
+LEAST_OPENING = 1e-4
+
+
+def _positive(what, **values):
+    for name, value in values.items():
+        if not (math.isfinite(value) and value > 0):
+            raise ValueError(
+                f"the {what} {name} must be positive and finite, got {name}={value}; "
+                "leave a loss out with None"
+            )
+
+
+@dataclasses.dataclass(frozen=True)
+class WaveletSpec:
+    """Mean squared differences of the high bands of `levels` levels, finest first.
+
+    Level l counts `level_factor`**l times. Equation 13 has equal weights; natural
+    errors grow 2 to 10 times from level to level, so it sees mostly the coarsest.
+    1/4 takes out what orthonormal coefficients of a smooth error gain each level.
+    """
+
+    most: float = 0.1  # weight where the gate is fully open
+    levels: int = 3
+    level_factor: float = 1.0
+
+    def __post_init__(self):
+        _positive("wavelet", most=self.most, level_factor=self.level_factor)
+        if self.levels < 1:
+            raise ValueError(
+                f"a wavelet loss needs levels >= 1, got levels={self.levels}; "
+                "leave it out with wavelet=None"
+            )
+
+
+@dataclasses.dataclass(frozen=True)
+class FourierSpec:
+    """Mean squared differences of amplitudes; the mean colour counts `dc_weight`."""
+
+    most: float = 0.1  # weight where the gate is fully open
+    dc_weight: float = 1.0
+
+    def __post_init__(self):
+        _positive("Fourier", most=self.most)
+        if not (math.isfinite(self.dc_weight) and self.dc_weight >= 0):
+            raise ValueError(
+                f"dc_weight={self.dc_weight} must be finite and not negative; "
+                "0 leaves the mean colour to the other losses"
+            )
+
+
+@dataclasses.dataclass(frozen=True)
+class SpectralSpec:
+    """Which losses, and what becomes of their weights; each starts at opening * most.
+
+    `gate` "learned" is equation 16. The loss grows with the gate, so descent can only
+    shut it: it acts as an annealing that paces itself by `rate`, whatever the losses
+    are. "floor" stops at `floor` of `most`, "fixed" stays at its opening, "schedule"
+    falls to zero along half a cosine. `experiments.frequency_gates` compares them.
+    """
+
+    wavelet: WaveletSpec | None = WaveletSpec()
+    fourier: FourierSpec | None = FourierSpec()
+    gate: str = "learned"
+    opening: float = 0.5  # equation 16 at g = 0
+    rate: float = 1e-2  # Adam's, of the logits g
+    floor: float = 0.05
+    after: int = 0  # steps without these losses
+
+    def __post_init__(self):
+        if self.gate not in GATES:
+            raise ValueError(f"unknown gate {self.gate!r}; choose from {GATES}")
+        if self.wavelet is None and self.fourier is None:
+            raise ValueError(
+                "wavelet and fourier are both None: a spectral effect needs one of "
+                "them; without any, leave the effect out"
+            )
+        if not LEAST_OPENING <= self.opening < 1:
+            raise ValueError(f"opening={self.opening} must lie in [{LEAST_OPENING}, 1)")
+        if not 0 <= self.floor < self.opening:
+            raise ValueError(
+                f"floor={self.floor} must lie in [0, opening={self.opening}): a gate "
+                "falls from its opening"
+            )
+        _positive("gates'", rate=self.rate)
+        if self.after < 0:
+            raise ValueError(f"after={self.after} counts steps; it is not negative")
+
+
+class Bands(NamedTuple):
+    """The high bands of one level; the first letter is along the width."""
+
+    hl: Float[Array, "height width channels"]  # across upright edges
+    lh: Float[Array, "height width channels"]  # across level edges
+    hh: Float[Array, "height width channels"]  # diagonals
+
+
+class Pyramid(NamedTuple):
+    """A picture in the orthonormal Haar basis."""
+
+    high: tuple[Bands, ...]  # finest first
+    low: Float[Array, "height width channels"]
+
+
+class Gates(NamedTuple):
+    """Logits, or weights, of the two losses; None for one that is not there."""
+
+    wavelet: Float[Array, ""] | None
+    fourier: Float[Array, ""] | None
+
+
+def haar_pyramid(image: Float[Array, "height width channels"], levels: int) -> Pyramid:
+    """Split a picture of any size `levels` times; orthonormal.
+
+    An odd last row or column is repeated (half-sample symmetric extension), so that a
+    constant has no high bands. The energy kept is that of the extended picture. From
+    one pixel on, further levels have zero bands.
+    """
+    high, low = [], image
+    for _ in range(levels):
+        low, bands = _split(low)
+        high.append(bands)
+    return Pyramid(tuple(high), low)
+
+
+def haar_image(
+    pyramid: Pyramid, height: int, width: int
+) -> Float[Array, "{height} {width} channels"]:
+    """The picture of which `haar_pyramid` made this."""
+    sizes = [(height, width)]
+    for _ in pyramid.high[1:]:
+        sizes.append(((sizes[-1][0] + 1) // 2, (sizes[-1][1] + 1) // 2))
+    image = pyramid.low
+    for bands, (rows, columns) in zip(
+        reversed(pyramid.high), reversed(sizes), strict=True
+    ):
+        image = _join(image, bands)[:rows, :columns]
+    return image
+
+
+def _split(image):
+    height, width, channels = image.shape
+    odd = ((0, height % 2), (0, width % 2), (0, 0))
+    even = jnp.pad(image, odd, mode="edge")
+    quads = even.reshape((height + 1) // 2, 2, (width + 1) // 2, 2, channels)
+    a, b = quads[:, 0, :, 0], quads[:, 0, :, 1]
+    c, d = quads[:, 1, :, 0], quads[:, 1, :, 1]
+    # Differences first: exactly zero on a constant.
+    bands = Bands(
+        hl=((a - b) + (c - d)) / 2,
+        lh=((a - c) + (b - d)) / 2,
+        hh=((a - b) - (c - d)) / 2,
+    )
+    return ((a + b) + (c + d)) / 2, bands
+
+
+def _join(low, bands):
+    height, width, channels = low.shape
+    top = jnp.stack(
+        [low + bands.hl + bands.lh + bands.hh, low - bands.hl + bands.lh - bands.hh], 2
+    )
+    bottom = jnp.stack(
+        [low + bands.hl - bands.lh - bands.hh, low - bands.hl - bands.lh + bands.hh], 2
+    )
+    quads = jnp.stack([top, bottom], 1) / 2  # [height, 2, width, 2, channels]
+    return quads.reshape(2 * height, 2 * width, channels)
+
+
+def filled(
+    render: Float[Array, "height width channels"],
+    truth: Float[Array, "height width channels"],
+    valid: Bool[Array, "height width"] | None,
+) -> tuple[
+    Float[Array, "height width channels"], Float[Array, "height width channels"]
+]:
+    """Both pictures, with the truth in place of the render where it is not valid.
+
+    A spectrum needs whole pictures. Pixels that are not valid then add no difference
+    and have no slope; a truth that is not finite there counts as black in both.
+    """
+    if valid is None:
+        return render, truth
+    keep = valid[..., None]
+    truth = jnp.where(keep | jnp.isfinite(truth), truth, 0)
+    return jnp.where(keep, render, truth), truth
+
+
+def wavelet_loss(
+    spec: WaveletSpec,
+    render: Float[Array, "height width channels"],
+    truth: Float[Array, "height width channels"],
+    valid: Bool[Array, "height width"] | None = None,
+) -> Float[Array, ""]:
+    """Equations 12 and 13: the mean squares of every high band, summed over bands."""
+    render, truth = filled(render, truth, valid)
+    # The transform is linear: one pyramid, of the difference, instead of two.
+    pyramid = haar_pyramid(render - truth, spec.levels)
+    factors = [spec.level_factor**level for level in range(spec.levels)]
+    return sum(
+        factor * jnp.mean(jnp.square(band))
+        for factor, bands in zip(factors, pyramid.high, strict=True)
+        for band in bands
+    )
+
+
+def fourier_loss(
+    spec: FourierSpec,
+    render: Float[Array, "height width channels"],
+    truth: Float[Array, "height width channels"],
+    valid: Bool[Array, "height width"] | None = None,
+) -> Float[Array, ""]:
+    """Equations 14 and 15: the mean squared difference of all Fourier amplitudes.
+
+    The transform is orthonormal; unscaled it would be height * width times as much.
+    Amplitudes are blind to phase: a picture that is shifted around its edges costs
+    nothing. Never use it alone. An amplitude of the render that is exactly zero has no
+    slope, so a constant picture learns nothing from it but its mean.
+    """
+    render, truth = filled(render, truth, valid)
+    width = truth.shape[1]
+    difference = amplitudes(render) - amplitudes(truth)
+    twice = _times_in_whole_spectrum(width, truth.dtype)
+    squares = jnp.square(difference) * twice[:, None]
+    squares = squares.at[0, 0].multiply(spec.dc_weight)
+    return jnp.sum(squares) / truth.size
+
+
+def amplitudes(
+    image: Float[Array, "height width channels"],
+) -> Float[Array, "height half channels"]:
+    """|F| of each channel, orthonormal: width // 2 + 1 columns of the whole spectrum.
+
+    The slope of an amplitude is taken as zero where it vanishes.
+    """
+    spectrum = jnp.fft.rfft2(image, axes=(0, 1), norm="ortho")
+    # abs, not a root of squares, whose slope at zero is NaN.
+    return jnp.abs(spectrum)
+
+
+def _times_in_whole_spectrum(width, dtype):
+    """How often a column of the half spectrum stands in the whole one: 1 or 2."""
+    columns = jnp.arange(width // 2 + 1)
+    alone = (columns == 0) | (2 * columns == width)
+    return jnp.where(alone, 1, 2).astype(dtype)
+
+
+def init(spec: SpectralSpec, dtype=jnp.float32) -> Gates:
+    """Logits at the opening: g = 0 for one half, as the paper."""
+    share = _start_of_sigmoid(spec)
+    logit = jnp.asarray(math.log(share) - math.log1p(-share), dtype)
+    return Gates(
+        None if spec.wavelet is None else logit,
+        None if spec.fourier is None else logit,
+    )
+
+
+def _start_of_sigmoid(spec):
+    if spec.gate == "floor":
+        return (spec.opening - spec.floor) / (1 - spec.floor)
+    return spec.opening
+
+
+def weights(
+    spec: SpectralSpec, gates: Gates | None, step: Int[Array, ""], steps: int
+) -> Gates:
+    """The weights of the losses at one step of `steps`; equation 16 for "learned".
+
+    `gates` are the logits, None where the gate has none.
+    """
+    begun = jnp.where(step < spec.after, 0.0, 1.0)
+
+    def weight(most, logit):
+        return begun * most * _opening(spec, logit, step, steps)
+
+    return Gates(
+        *(
+            None if loss is None else weight(loss.most, logit)
+            for loss, logit in zip(
+                (spec.wavelet, spec.fourier), gates or (None, None), strict=True
+            )
+        )
+    )
+
+
+def _opening(spec, logit, step, steps):
+    if spec.gate == "learned":
+        return jnp.maximum(jax.nn.sigmoid(logit), LEAST_OPENING)
+    if spec.gate == "floor":
+        return spec.floor + (1 - spec.floor) * jax.nn.sigmoid(logit)
+    if spec.gate == "schedule":
+        fall = schedules.cosine(spec.opening, 0.0, steps - spec.after, after=spec.after)
+        return fall(step)
+    return spec.opening
+
+
+def loss(
+    spec: SpectralSpec,
+    weight: Gates,
+    render: Float[Array, "height width channels"],
+    truth: Float[Array, "height width channels"],
+    valid: Bool[Array, "height width"] | None = None,
+) -> Term:
+    """Equation 17, and the weights and unweighted losses to log."""
+    value, metrics = jnp.zeros((), truth.dtype), {}
+    terms = (
+        ("wavelet", wavelet_loss, spec.wavelet, weight.wavelet),
+        ("fourier", fourier_loss, spec.fourier, weight.fourier),
+    )
+    for name, unweighted, part, factor in terms:
+        if part is None:
+            continue
+        size = unweighted(part, render, truth, valid)
+        value = value + factor.astype(size.dtype) * size
+        metrics |= {name: size, f"{name}_weight": factor}
+    return Term(value, metrics)
+
+
+def effect(spec: SpectralSpec, steps: int) -> Effect:
+    """The seams that these losses fill, for a run of `steps`."""
+    if spec.after >= steps:
+        raise ValueError(
+            f"after={spec.after} leaves none of the run's {steps} steps to the "
+            "spectral losses; start them earlier or leave them out"
+        )
+    learned = spec.gate in LEARNED
+
+    def image_loss(params: Params, shot: Shot, moment: Moment) -> Term:
+        gates = params.nets[NAME] if learned else None
+        weight = weights(spec, gates, moment.step, steps)
+        return loss(spec, weight, shot.rendering.colour, shot.truth, shot.valid)
+
+    return Effect(
+        name=NAME,
+        init_nets=(lambda key: init(spec)) if learned else None,
+        net_rate=(lambda step: jnp.asarray(spec.rate)) if learned else None,
+        image_loss=image_loss,
+    )
