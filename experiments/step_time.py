@@ -5,7 +5,7 @@ import jax.numpy as jnp
 
 from nerfies_jax.measure import clock
 from nerfies_jax.training import loop, losses
-from nerfies_jax.training.model import Frames, Model, TrainState
+from nerfies_jax.training.model import Frames, Model, Rendering, TrainState
 
 REPEATS = 7
 PART_SECONDS = 5.0  # for the repeats of one part: a step of a large field takes longer
@@ -25,9 +25,9 @@ def of_splats(
     params = state.params
     size = frames.images.shape[2], frames.images.shape[1]
     camera = jax.tree.map(lambda leaf: leaf[0], frames.cameras)
-    truth = frames.images[0].astype(jnp.float32) / 255
+    shot = scene.shot(frames, 0, None)
     moment = Moment(frames.times[0], state.step, state.key)
-    degree = spec.sh_degree
+    effects = scene.effects_of(spec, facts)
 
     def draw(gaussians, coefficients):
         frame = render.render_harmonics(
@@ -36,28 +36,55 @@ def of_splats(
         return jnp.sum(frame.rendering.colour)
 
     def compare(colour):
-        return losses.photometric(colour, truth, dssim_weight=spec.dssim_weight)
+        return losses.photometric(
+            colour, shot.truth, shot.valid, dssim_weight=spec.dssim_weight
+        )
 
     gaussians = splats.activate(params.rows["splats"])
-    coefficients = splats.active_harmonics(params.rows["splats"], degree)
+    coefficients = splats.active_harmonics(params.rows["splats"], spec.sh_degree)
     timed = {
         "project and blend": _ms(jax.grad(draw, (0, 1)), gaussians, coefficients),
-        "loss": _ms(jax.grad(compare), truth),
+        "loss": _ms(jax.grad(compare), shot.truth),
     }
-    for effect in scene.effects_of(spec, facts):
-        if effect.deform is None:
-            continue
+    for effect in effects:
 
-        def deform(params, effect=effect):
-            gaussians = splats.activate(params.rows["splats"])
-            ready = None if effect.prepare is None else effect.prepare(params)
-            moved = effect.deform(params, gaussians, moment, ready)
-            return sum(jnp.sum(leaf) for leaf in moved)
+        def one(params, rendering, carried, effect=effect):
+            return _sum_of_effect(
+                effect,
+                effects,
+                params,
+                shot._replace(rendering=rendering),
+                moment,
+                carried,
+            )
 
-        timed[effect.name.replace("_", " ")] = _ms(jax.grad(deform), params)
+        carried = state.extra.carried.get(effect.name)
+        drawn = Rendering(shot.truth, *(jnp.ones(shot.truth.shape[:2]) for _ in "ad"))
+        if {effect.deform, effect.image_loss, effect.penalty} != {None}:
+            slope = jax.grad(one, (0, 1))
+            timed[effect.name.replace("_", " ")] = _ms(slope, params, drawn, carried)
     whole = _ms(model.step, state, frames)
     timed["optimiser and statistics"] = max(whole - sum(timed.values()), 0.0)
     return timed
+
+
+def _sum_of_effect(effect, effects, params, shot, moment, carried):
+    """A scalar whose gradient takes the work of one effect in a step."""
+    from gaussians_jax import splats
+    from gaussians_jax.effects import deformation
+    from gaussians_jax.effects.effect import Around
+
+    total = jnp.zeros(())
+    if effect.deform is not None:
+        gaussians = splats.activate(params.rows["splats"])
+        moved = deformation.pose_in_training((effect,), params, gaussians, moment)
+        total += sum(jnp.sum(leaf) for leaf in moved)
+    if effect.image_loss is not None:
+        total += effect.image_loss(params, shot, moment).value
+    if effect.penalty is not None:
+        at_time = deformation.poser(effects, moment)
+        total += effect.penalty(Around(params, at_time, moment, carried)).value
+    return total
 
 
 def of_fields(

@@ -25,6 +25,7 @@ from nerfies_jax.training.model import (
     Event,
     Frames,
     Model,
+    Rendering,
     Stages,
     TrainState,
     View,
@@ -146,9 +147,9 @@ def build(spec: SplatScene, facts: Facts) -> Model:
             canonical = splats.activate(params.rows["splats"])
             moved = deformation.pose_in_training(effects, params, canonical, moment)
             frame = draw(params, moved, view, size, degree, probe)
-            shot = _shot(frames, row, frame.rendering)
+            seen = shot(frames, row, frame.rendering)
             value, metrics = loss_of(
-                spec, effects, params, shot, moment, state.extra.carried
+                spec, effects, params, seen, moment, state.extra.carried
             )
             return value, (metrics, frame.footprints, canonical, moved)
 
@@ -170,8 +171,8 @@ def build(spec: SplatScene, facts: Facts) -> Model:
             )
         for effect in effects:
             if effect.observe is not None:
-                seen = effect.observe(carried[effect.name], canonical, moved, moment)
-                carried = carried | {effect.name: seen}
+                own = effect.observe(carried[effect.name], canonical, moved, moment)
+                carried = carried | {effect.name: own}
         state = TrainState(
             params, moments, Extra(stats, carried), state.step + 1, state.key
         )
@@ -193,26 +194,22 @@ def loss_of(
     spec: SplatScene,
     effects: tuple[Effect, ...],
     params: Params,
-    shot: Shot,
+    seen: Shot,
     moment: Moment,
     carried: dict[str, PyTree],
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
     """The loss of one frame with what every effect adds, and numbers to log."""
-    colour = shot.rendering.colour
+    colour = seen.rendering.colour
     value = losses.photometric(
-        colour, shot.truth, shot.valid, dssim_weight=spec.dssim_weight
+        colour, seen.truth, seen.valid, dssim_weight=spec.dssim_weight
     )
-    metrics = {"mse": losses.mse(colour, shot.truth, shot.valid)}
+    metrics = {"mse": losses.mse(colour, seen.truth, seen.valid)}
 
-    def at_time(params, time):
-        gaussians = splats.activate(params.rows["splats"])
-        then = moment._replace(time=time)
-        return deformation.pose_in_training(effects, params, gaussians, then)
-
+    at_time = deformation.poser(effects, moment)
     for effect in effects:
         terms = []
         if effect.image_loss is not None:
-            terms.append(effect.image_loss(params, shot, moment))
+            terms.append(effect.image_loss(params, seen, moment))
         if effect.penalty is not None:
             own = carried.get(effect.name)
             terms.append(effect.penalty(Around(params, at_time, moment, own)))
@@ -223,7 +220,8 @@ def loss_of(
     return value, metrics
 
 
-def _shot(frames, row, rendering):
+def shot(frames: Frames, row: Int[Array, ""] | int, rendering: Rendering) -> Shot:
+    """What the losses compare: a frame that was drawn with the one that was filmed."""
     return Shot(
         rendering,
         frames.images[row].astype(jnp.float32) / 255,

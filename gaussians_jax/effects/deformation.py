@@ -1,5 +1,7 @@
 """The motion of a scene: every effect that deforms, one after the other."""
 
+from collections.abc import Callable
+
 import jax
 from jaxtyping import Array, Float
 
@@ -64,3 +66,16 @@ def pose_in_training(
             gaussians,
         )
     return gaussians
+
+
+def poser(
+    effects: Effects, moment: Moment
+) -> Callable[[Params, Float[Array, ""]], Gaussians]:
+    """A function of rows and of a time near `moment`, for `effect.Around`."""
+
+    def at_time(params, time):
+        gaussians = splats.activate(params.rows["splats"])
+        then = moment._replace(time=time)
+        return pose_in_training(effects, params, gaussians, then)
+
+    return at_time
