@@ -1,0 +1,193 @@
+"""A trained motion as a table: Gaussians at knots in time, interpolated in between.
+
+The deformation is evaluated once for each knot and never again; an instant then costs
+reading two or four rows of a table, whatever the network that made it. The error falls
+with the knots, as experiments/deformation_cost.py measures, and the table takes 40
+bytes (ten float32) for each knot and each Gaussian that moves: 10 000 of them at 32
+knots are 13 MB, while a Gaussian that stands still is stored once.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from gaussians_jax import splats, still_rows
+from gaussians_jax.splats import Gaussians
+from gaussians_jax.still_rows import Where
+from nerfies_jax.geometry import quaternion
+
+FEWEST = {"linear": 2, "cubic": 4}  # knots that an interpolation reads at once
+BYTES = 40  # of a moving Gaussian at a knot, in float32
+
+
+class Track(NamedTuple):
+    """Where rows are at every knot."""
+
+    mean: Float[Array, "knots moving 3"]  # scene units
+    log_scale: Float[Array, "knots moving 3"]
+    # Unit length; of q and -q the one nearer to the knot before.
+    quaternion: Float[Array, "knots moving 4"]
+
+
+class Knots(NamedTuple):
+    """A motion over [0, 1] as a table."""
+
+    times: Float[Array, " knots"]  # evenly over [0, 1]
+    track: Track  # of the rows that move
+    where: Where
+    still: Gaussians  # all rows, as they are at the middle knot
+
+    @property
+    def bytes(self) -> int:
+        """Memory of the table, without what every scene has."""
+        return sum(leaf.nbytes for leaf in self.track)
+
+
+def bake(
+    pose: Callable[[Float[Array, ""]], Gaussians],
+    knots: int,
+    still_below: float = 0.0,
+    dtype=jnp.float32,
+) -> Knots:
+    """The table of a motion; host side.
+
+    Rows of which no point moves farther than `still_below` (scene units, from where
+    it is at the middle knot) at any knot are still and stored once.
+    """
+    if knots < FEWEST["linear"]:
+        raise ValueError(
+            f"knots={knots}: a motion needs at least {FEWEST['linear']}, its first "
+            "and its last instant"
+        )
+    times = jnp.linspace(0, 1, knots, dtype=dtype)
+    posed = jax.jit(pose)
+    poses = [jax.device_get(posed(time)) for time in times]
+    still = poses[knots // 2]
+    moves = np.zeros(len(still.mean), bool)
+    for time, now in zip(times, poses, strict=True):
+        if not np.array_equal(now.opacity, still.opacity):
+            raise ValueError(
+                f"the opacities at time {float(time):g} are not those at "
+                f"{float(times[knots // 2]):g}; a table of knots keeps them fixed, so "
+                "draw this motion without one"
+            )
+        moves |= still_rows.moving(still, now, still_below)
+    rows = np.flatnonzero(moves)
+    tracks = [_track(jax.tree.map(lambda leaf: leaf[rows], now)) for now in poses]
+    track = Track(*(jnp.stack(leaves) for leaves in zip(*tracks, strict=True)))
+    track = track._replace(quaternion=_aligned(track.quaternion))
+    still = jax.tree.map(jnp.asarray, still)
+    return Knots(times, track, still_rows.where(moves), still)
+
+
+def at(
+    knots: Knots, time: Float[Array, ""], interpolation: str = "linear"
+) -> Gaussians:
+    """The Gaussians at one time in [0, 1]; outside it, at its nearer end.
+
+    "linear" is continuous, its error falls as the square of the knots' distance;
+    "cubic" (Catmull-Rom) has a continuous velocity as well, and its error falls as the
+    third power. Both are exact at the knots, to rounding. Scales are interpolated in
+    the logarithm and stay positive. Quaternions are interpolated as vectors of one
+    sign and normalised: neighbours are at most 90 degrees apart as vectors, so what
+    lies between them is never short.
+    """
+    if not knots.track.mean.shape[1]:
+        return knots.still
+    start, weights = _window(knots.times, time, interpolation)
+
+    def between(leaf):
+        rows = [leaf[start + k] * weight for k, weight in enumerate(weights)]
+        return sum(rows[1:], rows[0])
+
+    mean, log_scale, turn = (between(leaf) for leaf in knots.track)
+    moved = Gaussians(
+        mean=mean,
+        quaternion=jax.vmap(quaternion.normalise)(turn),
+        scale=jnp.exp(log_scale),
+        # Not interpolated; merged from here only to be overwritten.
+        opacity=jnp.zeros_like(mean[:, 0]),
+    )
+    merged = still_rows.merge(knots.still, moved, knots.where)
+    return merged._replace(opacity=knots.still.opacity)
+
+
+def check(knots: int, interpolation: str) -> None:
+    """Refuse a table too short for its interpolation; host side."""
+    if interpolation not in FEWEST:
+        raise ValueError(
+            f"unknown interpolation {interpolation!r}; choose from {', '.join(FEWEST)}"
+        )
+    if knots < FEWEST[interpolation]:
+        raise ValueError(
+            f"{interpolation} interpolation reads {FEWEST[interpolation]} knots at "
+            f"once, got {knots}; take more, or linear"
+        )
+
+
+def _window(
+    times: Float[Array, " knots"], time: Float[Array, ""], interpolation: str
+) -> tuple[Int[Array, ""], list[Float[Array, ""]]]:
+    """The first of the knots to read, and the weight of each."""
+    count = times.shape[0]
+    check(count, interpolation)
+    held = jnp.clip(time, times[0], times[-1])
+    # Searched for, not floor(time * (count - 1)): at a knot the share is exactly 0 or
+    # 1 whatever the rounding of the product.
+    left = jnp.searchsorted(times, held, side="right") - 1
+    left = jnp.clip(left, 0, count - 2).astype(jnp.int32)
+    u = (held - times[left]) / (times[left + 1] - times[left])
+    if interpolation == "linear":
+        return left, [1 - u, u]
+    before, here, there, after = _catmull_rom(u)
+    # In the first and the last interval the missing neighbour is the continuation of
+    # the parabola through three knots, 3a - 3b + c: its weight goes to those three.
+    first, last = left == 0, left == count - 2
+    start = jnp.clip(left - 1, 0, count - 4)
+    zero = jnp.zeros_like(u)
+    at_first = here + 3 * before, there - 3 * before, after + before, zero
+    at_last = zero, before + after, here - 3 * after, there + 3 * after
+    inside = before, here, there, after
+    weights = [
+        jnp.where(first, a, jnp.where(last, b, c))
+        for a, b, c in zip(at_first, at_last, inside, strict=True)
+    ]
+    return start, weights
+
+
+def _catmull_rom(u):
+    """Weights of four even knots at the share `u` between the middle two."""
+    return (
+        u * (u * (2 - u) - 1) / 2,
+        (u * u * (3 * u - 5) + 2) / 2,
+        u * (u * (4 - 3 * u) + 1) / 2,
+        u * u * (u - 1) / 2,
+    )
+
+
+@jax.jit
+def _track(gaussians):
+    """Gaussians as rows of the table."""
+    # A scale that the motion took through zero is drawn by its size.
+    scale = jnp.clip(jnp.abs(gaussians.scale), *np.exp(splats.LOG_SCALE_RANGE).tolist())
+    return Track(
+        gaussians.mean,
+        jnp.log(scale),
+        jax.vmap(quaternion.normalise)(gaussians.quaternion),
+    )
+
+
+@jax.jit
+def _aligned(turns):
+    """The same rotations, each quaternion of the sign nearer to the knot before."""
+
+    def step(before, turn):
+        same = jnp.sum(before * turn, axis=-1, keepdims=True) >= 0
+        turn = jnp.where(same, turn, -turn)
+        return turn, turn
+
+    return jax.lax.scan(step, turns[0], turns)[1]

@@ -1,0 +1,171 @@
+"""What does not move is not evaluated, and stays where it is to the tolerance."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.spatial.transform
+
+from gaussians_jax import splats, still_rows
+from gaussians_jax.splats import Gaussians, Params
+from tests import gradients
+
+TIMES = np.linspace(0, 1, 9)
+
+
+def some_gaussians(rng, count, dtype):
+    return Gaussians(
+        mean=jnp.asarray(rng.normal(size=(count, 3)), dtype),
+        quaternion=jnp.asarray(rng.normal(size=(count, 4)), dtype),
+        scale=jnp.asarray(rng.uniform(0.1, 1, (count, 3)), dtype),
+        opacity=jnp.asarray(rng.uniform(0.1, 1, count), dtype),
+    )
+
+
+def surface_points(gaussians, directions):
+    """Points of the one-sigma ellipsoids [gaussians, directions, 3], in float64."""
+    wxyz = np.asarray(gaussians.quaternion, np.float64)
+    turn = scipy.spatial.transform.Rotation.from_quat(wxyz[:, [1, 2, 3, 0]])
+    scaled = np.asarray(gaussians.scale, np.float64)[:, None] * directions
+    turned = np.einsum("nij,nkj->nki", turn.as_matrix(), scaled)
+    return turned + np.asarray(gaussians.mean, np.float64)[:, None]
+
+
+def test_no_point_of_a_gaussian_moves_farther_than_its_reach(dtype, rng):
+    before = some_gaussians(rng, 200, dtype)
+    after = jax.tree.map(
+        lambda x: (
+            x + jnp.asarray(rng.uniform(0, 0.2) * rng.normal(size=x.shape), dtype)
+        ),
+        before,
+    )
+    after = after._replace(scale=jnp.abs(after.scale))
+    directions = rng.normal(size=(500, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    moved = surface_points(after, directions) - surface_points(before, directions)
+    farthest = np.linalg.norm(moved, axis=-1).max(axis=1)
+    found = np.asarray(still_rows.reach(before, after))
+    assert (found >= farthest * (1 - 1e-5)).all()
+    assert np.median(found / farthest) < 2  # a bound that says something
+
+
+@pytest.mark.parametrize(
+    ("change", "exact"),
+    [
+        ({"mean": [0.3, -0.4, 0.0]}, 0.5),
+        ({"mean": [3e-7, -4e-7, 0.0]}, 5e-7),
+        ({"scale": [0.0, 0.25, -0.5]}, 0.5),
+        ({"quaternion": [-2.0, 0.0, 0.0, 0.0]}, 0.0),  # q becomes -q
+        ({"quaternion": [0.0, 2e-6, 0.0, 0.0]}, 4e-6 * 2),  # 4e-6 rad, scale 2
+        ({"quaternion": [-1.0, 0.0, 1.0, 0.0]}, 2 * 2),  # half a turn
+        ({"opacity": 0.5}, 0.0),
+        ({}, 0.0),
+    ],
+)
+def test_the_reach_of_a_single_change_is_that_change(change, exact, dtype):
+    before = Gaussians(
+        *(
+            jnp.asarray([x], dtype)
+            for x in ([0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [1.0, 0.5, 2.0], 0.5)
+        )
+    )
+    by = {name: jnp.asarray([x], dtype) for name, x in change.items()}
+    after = before._replace(**{name: getattr(before, name) + by[name] for name in by})
+    rounding = {"float32": 1e-6, "float64": 1e-15}[dtype]
+    np.testing.assert_allclose(
+        still_rows.reach(before, after), [exact], rtol=rounding, atol=1e-12
+    )
+
+
+def scene(rng, dtype="float32", count=40):
+    """Parameters of rows whose speed is theirs, a third of them zero, some dead."""
+    rows = splats.from_points(
+        rng.normal(size=(count, 3)), rng.uniform(size=(count, 3)), dtype=dtype
+    )
+    speed = np.where(np.arange(count) % 3, rng.uniform(1e-4, 0.3, count), 0)
+    speed[1] = np.nan
+    params = Params({"splats": rows, "speed": jnp.asarray(speed, dtype)}, {})
+    return splats.pad_rows(params, count + 8)
+
+
+def pose(params, time):
+    """Every Gaussian sways, turns and breathes at its own speed."""
+    gaussians = splats.activate(params.rows["splats"])
+    swing = params.rows["speed"] * jnp.sin(5 * time)
+    return gaussians._replace(
+        mean=gaussians.mean + swing[:, None],
+        quaternion=gaussians.quaternion + 0.2 * swing[:, None],
+        scale=gaussians.scale * jnp.exp(swing)[:, None],
+    )
+
+
+@pytest.mark.parametrize("still_below", [0.0, 0.02, 0.3])
+def test_what_is_left_out_is_off_by_no_more_than_the_tolerance(still_below, rng):
+    params = scene(rng)
+    parts = still_rows.split(params, pose, TIMES, still_below)
+    count = len(parts.moving.rows["speed"])
+    dead = ~np.asarray(splats.alive(params.rows["splats"]))
+    moves = np.asarray(parts.where.moves)
+    assert 0 < count == moves.sum() < len(moves)
+    assert not moves[dead].any()
+    assert moves[1]  # its motion is not a number: not taken for still
+    for time in TIMES:
+        time = jnp.asarray(time, jnp.float32)
+        found, exact = still_rows.pose(parts, pose, time), pose(params, time)
+        for name in Gaussians._fields:
+            np.testing.assert_array_equal(
+                np.asarray(getattr(found, name))[moves],
+                np.asarray(getattr(exact, name))[moves],
+                err_msg=name,
+            )
+        reach = np.asarray(still_rows.reach(found, exact))[~moves & ~dead]
+        assert (reach <= still_below).all()
+
+
+def test_a_larger_tolerance_leaves_fewer_rows(rng):
+    params = scene(rng)
+    counts = [
+        len(still_rows.split(params, pose, TIMES, below).moving.rows["speed"])
+        for below in (0.0, 0.3, 0.6, 1e9)
+    ]
+    assert counts == sorted(counts, reverse=True)
+    assert counts[0] > counts[1] > counts[2] > counts[3] == 1  # the one with NaN
+
+
+def test_where_nothing_moves_nothing_is_evaluated(rng):
+    params = scene(rng)
+    params.rows["speed"] = jnp.zeros_like(params.rows["speed"])
+    parts = still_rows.split(params, pose, TIMES, 0.0)
+
+    def refuse(params, time):
+        raise AssertionError("evaluated")
+
+    found = still_rows.pose(parts, refuse, jnp.asarray(0.3))
+    exact = splats.activate(params.rows["splats"])
+    jax.tree.map(np.testing.assert_array_equal, found, exact)
+
+
+def test_moving_rows_keep_their_gradients(rng, float64):
+    params = scene(rng, float64)
+    params.rows["speed"] = jnp.nan_to_num(params.rows["speed"])
+    parts = still_rows.split(params, pose, TIMES, 0.02)
+
+    def loss(speed, time):
+        rows = parts.moving.rows | {"speed": speed}
+        now = parts._replace(moving=parts.moving._replace(rows=rows))
+        posed = still_rows.pose(now, pose, time)
+        return sum(jnp.sum(jnp.sin(3 * leaf)) for leaf in posed)
+
+    speed = parts.moving.rows["speed"]
+    assert gradients.directional_error(loss, speed, jnp.asarray(0.4)) < 1e-7
+
+
+@pytest.mark.parametrize("below", [-1e-3, float("nan")])
+def test_a_tolerance_below_zero_is_refused(below, rng):
+    with pytest.raises(ValueError, match=r"still_below=.* scene units"):
+        still_rows.split(scene(rng), pose, TIMES, below)
+
+
+def test_no_times_are_refused(rng):
+    with pytest.raises(ValueError, match="no times to look for motion at"):
+        still_rows.split(scene(rng), pose, TIMES[:0], 0.1)
