@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
+from gaussians_jax import phases
+from gaussians_jax.phases import AnnealingSpec
 from gaussians_jax.splats import Params, Splats
 from nerfies_jax.training import schedules
 
@@ -42,11 +44,17 @@ class RateSpec:
 
 
 def learning_rates(
-    spec: RateSpec, extent: float, steps: int, step: Int[Array, ""]
+    spec: RateSpec,
+    extent: float,
+    steps: int,
+    step: Int[Array, ""],
+    annealing: AnnealingSpec | None = None,
 ) -> Splats:
     """One rate for each kind of row, at a traced step of a run of `steps`."""
     if spec.mean > 0:
         decay = schedules.log_linear(spec.mean, spec.mean_end, steps)
+        if annealing is not None:
+            decay = phases.annealed(decay, annealing, steps)
         mean = extent * decay(step)
     else:
         mean = jnp.zeros(())
