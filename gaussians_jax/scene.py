@@ -9,12 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from gaussians_jax import density, rates, render, splats, start
+from gaussians_jax import density, phases, rates, render, splats, start
 from gaussians_jax.density import DensitySpec
-from gaussians_jax.effects import deformation, mlp_motion
+from gaussians_jax.effects import deformation, mlp_motion, spectral
 from gaussians_jax.effects.effect import Around, Effect, Moment, Shot
 from gaussians_jax.effects.mlp_motion import MotionSpec
-from gaussians_jax.optimiser import scale_by_row_adam
+from gaussians_jax.effects.spectral import SpectralSpec
+from gaussians_jax.optimiser import scale_by_row_adam, scale_by_row_radam
+from gaussians_jax.phases import AlternationSpec, AnnealingSpec, Trained
 from gaussians_jax.raster_spec import RasterSpec
 from gaussians_jax.rates import RateSpec
 from gaussians_jax.splats import Params
@@ -33,6 +35,7 @@ from nerfies_jax.training.model import (
 
 PyTree = Any
 
+OPTIMISERS = {"adam": scale_by_row_adam, "radam": scale_by_row_radam}
 # Streams of the run's key beside those of the steps, which are its 0, 1, 2, ...
 ORDER, EVENT = 2**32 - 1, 2**32 - 2
 
@@ -49,7 +52,11 @@ class SplatScene:
     rates: RateSpec = RateSpec()
     raster: RasterSpec = RasterSpec()
     density: DensitySpec | None = DensitySpec()
+    optimiser: str = "adam"
     motion: MotionSpec | None = None
+    alternation: AlternationSpec | None = None
+    annealing: AnnealingSpec | None = None
+    spectral: SpectralSpec | None = None
 
     def __post_init__(self):
         if self.steps < 1:
@@ -58,6 +65,11 @@ class SplatScene:
             raise ValueError(f"sh_degree={self.sh_degree} must be 0, 1, 2 or 3")
         if not 0 <= self.dssim_weight <= 1:
             raise ValueError(f"dssim_weight={self.dssim_weight} must lie in [0, 1]")
+        if self.optimiser not in OPTIMISERS:
+            raise ValueError(
+                f"unknown optimiser {self.optimiser!r}; choose from "
+                f"{sorted(OPTIMISERS)}"
+            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,6 +97,8 @@ def effects_of(spec: SplatScene, facts: Facts) -> tuple[Effect, ...]:
     effects = []
     if spec.motion is not None:
         effects.append(mlp_motion.effect(spec.motion, spec.steps, facts.frames))
+    if spec.spectral is not None:
+        effects.append(spectral.effect(spec.spectral, spec.steps))
     return tuple(effects)
 
 
@@ -107,87 +121,104 @@ def carried_by(effects: tuple[Effect, ...], params: Params) -> dict[str, PyTree]
 def build(spec: SplatScene, facts: Facts) -> Model:
     """Everything the loop, the renderer and the report need of this scene."""
     effects = effects_of(spec, facts)
-    # Counts updates per row; for the networks, whose rows are never born, plain Adam.
-    optimiser = scale_by_row_adam()
-
-    def draw(params, gaussians, view, size, degree, probe=None):
-        return render.render_harmonics(
-            gaussians,
-            splats.active_harmonics(params.rows["splats"], degree),
-            view.camera,
-            size,
-            spec.raster,
-            jnp.asarray(facts.background, gaussians.mean.dtype),
-            mean2d_offset=probe,
-        )
-
-    def draw_trained(params, gaussians, view, size, step):
-        degree = splats.active_degree(step, spec.sh_every, spec.sh_degree)
-        return draw(params, gaussians, view, size, degree).rendering
-
-    def pose(params, prepared, time):
-        return deformation.pose(effects, params, prepared, time)
-
-    def prepare(params):
-        return deformation.prepare(effects, params)
+    # Counts updates per row; for the networks, whose rows are never born, it is plain.
+    optimiser = OPTIMISERS[spec.optimiser]()
+    stages = _stages(spec, facts, effects)
 
     def whole_frame(params, view, size, step):
-        posed = pose(params, prepare(params), view.time)
-        return draw_trained(params, posed, view, size, step)
-
-    def step(state: TrainState, frames: Frames):
-        key = loop.step_key(state)
-        row = shuffled_row(state.key, state.step, len(frames.times))
-        view = _view(frames, row)
-        size = frames.images.shape[2], frames.images.shape[1]
-        degree = splats.active_degree(state.step, spec.sh_every, spec.sh_degree)
-        moment = Moment(view.time, state.step, key)
-
-        def loss(params, probe):
-            canonical = splats.activate(params.rows["splats"])
-            moved = deformation.pose_in_training(effects, params, canonical, moment)
-            frame = draw(params, moved, view, size, degree, probe)
-            seen = shot(frames, row, frame.rendering)
-            value, metrics = loss_of(
-                spec, effects, params, seen, moment, state.extra.carried
-            )
-            return value, (metrics, frame.footprints, canonical, moved)
-
-        probe = jnp.zeros_like(state.params.rows["splats"].mean[:, :2])
-        (value, (metrics, footprints, canonical, moved)), (slopes, probe_slope) = (
-            jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)(state.params, probe)
-        )
-        directions, moments = optimiser.update(slopes, state.optimiser, state.params)
-        rate = _rates(spec, facts, effects, state.step)
-        params = rates.descend(state.params, directions, rate)
-        stats, carried = state.extra
-        if spec.density is not None:
-            stats = density.observe(
-                stats,
-                probe_slope,
-                footprints.visible,
-                jnp.max(footprints.extent_px, axis=1),
-                size,
-            )
-        for effect in effects:
-            if effect.observe is not None:
-                own = effect.observe(carried[effect.name], canonical, moved, moment)
-                carried = carried | {effect.name: own}
-        state = TrainState(
-            params, moments, Extra(stats, carried), state.step + 1, state.key
-        )
-        return state, {"loss": value, **metrics}
+        posed = stages.pose(params, stages.prepare(params), view.time)
+        return stages.draw(params, posed, view, size, step)
 
     return Model(
         spec=(spec, facts),
         init=lambda capture, key: first_state(spec, effects, optimiser, capture, key),
-        step=step,
+        step=_stepper(spec, facts, effects, optimiser),
         render=whole_frame,
         events=_events(spec, facts, effects, optimiser),
         counts=count_rows,
         wants=frozenset().union(*(effect.wants for effect in effects)),
-        stages=Stages(prepare, pose, draw_trained),
+        stages=stages,
     )
+
+
+def _stages(spec, facts, effects):
+    """Rendering of trained parameters in parts."""
+
+    def prepare(params):
+        return deformation.prepare(effects, params)
+
+    def pose(params, prepared, time):
+        return deformation.pose(effects, params, prepared, time)
+
+    def draw(params, posed, view, size, step):
+        degree = splats.active_degree(step, spec.sh_every, spec.sh_degree)
+        return _draw(spec, facts, params, posed, view, size, degree).rendering
+
+    return Stages(prepare, pose, draw)
+
+
+def _draw(spec, facts, params, gaussians, view, size, degree, probe=None):
+    return render.render_harmonics(
+        gaussians,
+        splats.active_harmonics(params.rows["splats"], degree),
+        view.camera,
+        size,
+        spec.raster,
+        jnp.asarray(facts.background, gaussians.mean.dtype),
+        mean2d_offset=probe,
+    )
+
+
+def _stepper(spec, facts, effects, optimiser):
+    """One update from one frame: (state, frames) -> (state, metrics), pure."""
+
+    def step(state: TrainState, frames: Frames):
+        row = shuffled_row(state.key, state.step, len(frames.times))
+        view = _view(frames, row)
+        size = frames.images.shape[2], frames.images.shape[1]
+        degree = splats.active_degree(state.step, spec.sh_every, spec.sh_degree)
+        moment = Moment(view.time, state.step, loop.step_key(state))
+        turn = phases.turn(spec.alternation, state.step)
+
+        def posed(params, gaussians):
+            return deformation.pose_in_training(effects, params, gaussians, moment)
+
+        if spec.alternation is not None:
+            posed = phases.spared(turn, posed)
+
+        def loss(params, probe):
+            canonical = splats.activate(params.rows["splats"])
+            moved = posed(params, canonical)
+            frame = _draw(spec, facts, params, moved, view, size, degree, probe)
+            seen = shot(frames, row, frame.rendering)
+            carried = state.extra.carried
+            value, metrics = loss_of(spec, effects, params, seen, moment, carried)
+            return value, (metrics, frame.footprints, canonical, moved)
+
+        probe = jnp.zeros_like(state.params.rows["splats"].mean[:, :2])
+        (value, (metrics, footprints, *poses)), (slopes, probe_slope) = (
+            jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)(state.params, probe)
+        )
+        directions, moments = optimiser.update(slopes, state.optimiser, state.params)
+        rate = _rates(spec, facts, effects, state.step)
+        trained = Trained(rates.descend(state.params, directions, rate), moments)
+        if spec.alternation is not None:
+            before = Trained(state.params, state.optimiser)
+            trained = phases.hold(optimiser, turn, before, trained)
+        stats, carried = state.extra
+        if spec.density is not None:
+            radius_px = jnp.max(footprints.extent_px, axis=1)
+            stats = density.observe(
+                stats, probe_slope, footprints.visible, radius_px, size
+            )
+        for effect in effects:
+            if effect.observe is not None:
+                own = effect.observe(carried[effect.name], *poses, moment)
+                carried = carried | {effect.name: own}
+        state = TrainState(*trained, Extra(stats, carried), state.step + 1, state.key)
+        return state, {"loss": value, **metrics}
+
+    return step
 
 
 def loss_of(
@@ -237,7 +268,11 @@ def _view(frames, row):
 
 def _rates(spec, facts, effects, step):
     """A prefix of `Params` with the learning rate of everything below each leaf."""
-    rows = {"splats": rates.learning_rates(spec.rates, facts.extent, spec.steps, step)}
+    rows = {
+        "splats": rates.learning_rates(
+            spec.rates, facts.extent, spec.steps, step, spec.annealing
+        )
+    }
     nets = {}
     for effect in effects:
         if effect.init_rows is not None:
