@@ -1,0 +1,167 @@
+"""Growth where things move: the density control's threshold depends on the motion.
+
+MoBa-GS, section 3.4: a Gaussian is cloned or split only if its gradient on the screen
+and its motion both pass a threshold (equation 7). Printed so, what stands still never
+grows, however badly it is drawn: a scene that starts from random points keeps them for
+its background, and one whose motion has not begun does not grow at all. The soft form
+asks what stands still for a steeper gradient instead.
+"""
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from gaussians_jax.effects.effect import Effect, Moment
+from gaussians_jax.splats import Gaussians, Params
+
+NAME = "motion_growth"
+FORMS = ("soft", "hard")
+# At most so many rows give the median of all. Measured at 10k rows, one core: 0.2 ms
+# for all of `observe`, against 5.6 ms with every row, nearly all of it sorting.
+MEDIAN_ROWS = 512
+
+
+@dataclasses.dataclass(frozen=True)
+class MotionGrowthSpec:
+    """How the motion of a Gaussian bears on its growth.
+
+    `start` is the step before which the plain rule holds; let the motion's own warm-up
+    and some hundred steps pass first. In the soft form a Gaussian at rest needs 1 +
+    `beta` times the gradient, one at the threshold `motion` needs twice as much, and a
+    fast one needs no more than without this effect.
+    """
+
+    form: str = "soft"  # or "hard", the conjunction as printed
+    start: int = 5000  # step
+    motion: float = 1e-3  # threshold, of the scene's extent
+    beta: float = 4.0  # of the soft form
+
+    def __post_init__(self):
+        if self.form not in FORMS:
+            raise ValueError(f"unknown form {self.form!r}; choose from {FORMS}")
+        if self.start < 0:
+            raise ValueError(f"start={self.start} is a step and not negative")
+        if not 0 < self.motion < math.inf:
+            raise ValueError(
+                f"motion={self.motion} must be positive and finite: a share of the "
+                "scene's extent; for growth without regard to motion leave this effect "
+                "out (None)"
+            )
+        if not 1 < self.beta < math.inf:
+            raise ValueError(
+                f"beta={self.beta} must be finite and above 1, or what stands still "
+                'grows as easily as what moves; for no growth at rest use form="hard"'
+            )
+
+
+class Travel(NamedTuple):
+    """The box around where each row was seen, relative to its canonical place."""
+
+    low: Float[Array, "gaussians 3"]  # scene units; above `high` where not seen yet
+    high: Float[Array, "gaussians 3"]
+
+
+def carry(params: Params) -> Travel:
+    """Nothing seen yet."""
+    mean = params.rows["splats"].mean
+    return Travel(jnp.full_like(mean, jnp.inf), jnp.full_like(mean, -jnp.inf))
+
+
+def observe(
+    carried: Travel, canonical: Gaussians, moved: Gaussians, moment: Moment
+) -> Travel:
+    """One more instant.
+
+    A displacement counts relative to the median displacement of the living rows at that
+    instant: what the field moves as a whole, such as the camera's own motion, is not
+    motion of a Gaussian. Displacements that are not finite do not count.
+    """
+    del moment
+    displacement = moved.mean - canonical.mean
+    known = jnp.all(jnp.isfinite(displacement), axis=1)
+    # The logistic function of a dead row's mark is exactly zero.
+    common = common_motion(displacement, known & (canonical.opacity > 0))
+    relative = displacement - common
+    known = known[:, None]
+    return Travel(
+        jnp.where(known, jnp.minimum(carried.low, relative), carried.low),
+        jnp.where(known, jnp.maximum(carried.high, relative), carried.high),
+    )
+
+
+def common_motion(
+    displacement: Float[Array, "gaussians 3"], counts: Bool[Array, " gaussians"]
+) -> Float[Array, "3"]:
+    """The median of each component over the rows that count; zero if none does.
+
+    Of every k-th row only, at most `MEDIAN_ROWS` of them: where most are at rest, or
+    are moved as one, such a sample says so as well as all do.
+    """
+    every = max(1, -(-displacement.shape[0] // MEDIAN_ROWS))
+    counts, displacement = counts[::every], displacement[::every]
+    ordered = jnp.sort(jnp.where(counts[:, None], displacement, jnp.inf), axis=0)
+    number = jnp.sum(counts, dtype=jnp.int32)
+    middle = (ordered[jnp.maximum(number - 1, 0) // 2] + ordered[number // 2]) / 2
+    return jnp.where(number > 0, middle, jnp.zeros_like(middle))
+
+
+def motion(carried: Travel) -> Float[np.ndarray, " gaussians"]:
+    """How far each row was seen to move, in scene units; zero if never seen. Host side.
+
+    Half the diagonal of its box, which does not depend on the order of the frames. On a
+    straight path through evenly spread instants that is the largest distance from its
+    mean place; in general it is between 1/2 and sqrt(3) times as large, and one instant
+    makes no motion. Kept instead, the largest distance from the mean so far depends on
+    the order: 0.9 to 1.6 times on a path that swings once through 24 frames.
+    """
+    low, high = (np.asarray(x, np.float64) for x in carried)
+    seen = (low <= high).all(axis=1, keepdims=True)
+    side = np.subtract(high, low, where=seen, out=np.zeros_like(low))
+    # Scaled by the largest side, whose square may leave the range of a float.
+    longest = side.max(axis=1, initial=0.0, keepdims=True)
+    share = np.divide(side, longest, where=longest > 0, out=np.zeros_like(side))
+    return longest[:, 0] / 2 * np.linalg.norm(share, axis=1)
+
+
+def growth_factor(
+    spec: MotionGrowthSpec, motion: Float[np.ndarray, " gaussians"], threshold: float
+) -> Float[np.ndarray, " gaussians"]:
+    """What the gradient counts, in [0, 1]; `motion` and `threshold` in one unit.
+
+    Soft: 1 / (1 + beta^(1 - m/tau)). Of the threshold tau_grad (1 + beta exp(-m/tau)),
+    the obvious softening, no limit is equation 7: as beta grows it stops everything
+    that moves less than tau log(beta), in the end all. With m log(beta) / tau in the
+    exponent the half-way point stays at tau, and beta to infinity is the hard form.
+    """
+    if spec.form == "hard":
+        return (motion > threshold).astype(np.float64)
+    # The exponent is at most one: the power underflows to 0 and never overflows.
+    return 1 / (1 + spec.beta ** (1 - motion / threshold))
+
+
+def grow_score(
+    spec: MotionGrowthSpec, extent: float, carried: Travel, step: int
+) -> Float[np.ndarray, " gaussians"]:
+    """The factor of each row's gradient at a step; host side."""
+    rows, dtype = carried.low.shape[0], carried.low.dtype
+    if step < spec.start:
+        return np.ones(rows, dtype)
+    return growth_factor(spec, motion(carried), spec.motion * extent).astype(dtype)
+
+
+def effect(spec: MotionGrowthSpec, extent: float) -> Effect:
+    """The seams this effect fills in a scene of the given extent, in scene units."""
+    if not 0 < extent < math.inf:
+        raise ValueError(
+            f"extent={extent} of the scene must be positive and finite; see "
+            "`splats.scene_extent`"
+        )
+
+    def score(carried, step):
+        return grow_score(spec, extent, carried, step)
+
+    return Effect(name=NAME, carry=carry, observe=observe, grow_score=score)
