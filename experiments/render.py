@@ -6,9 +6,12 @@ python -m experiments.render RUN --path sway --freeze 0.5
 python -m experiments.render RUN --path sway --show depth
 python -m experiments.render RUN --without warp          # the canonical scene
 python -m experiments.render RUN --path sway --freeze 0 --appearance 0 7
+python -m experiments.render RUN --path sway --knots 32   # the motion from a table
+python -m experiments.render RUN --path sway --still-below 1e-4
 """
 
 import dataclasses
+import math
 import pathlib
 from typing import Literal
 
@@ -40,6 +43,14 @@ class Render:
     appearance: tuple[str, str] | None = None
     """Go from one appearance to another along the pictures: two frame names, or two
     appearance ids."""
+    knots: int | None = None
+    """Evaluate the motion of Gaussians at so many instants only and interpolate between
+    them; experiments.deformation_cost shows what that costs and saves."""
+    interpolation: Literal["linear", "cubic"] = "linear"
+    """Between the knots."""
+    still_below: float | None = None
+    """Do not evaluate the motion of Gaussians that move less than this, in scene units;
+    1e-4 is not seen."""
     show: Literal["colour", "depth"] = "colour"
     """What the png and mp4 pictures show; depth is bright near and dark far."""
     out: pathlib.Path | None = None
@@ -58,6 +69,15 @@ class Render:
             raise ValueError(f"--freeze {self.freeze}: the time lies in [0, 1]")
         if not self.slow > 0:
             raise ValueError(f"--slow {self.slow}: a positive factor; 4 is slow motion")
+        if self.interpolation != "linear" and self.knots is None:
+            raise ValueError(
+                f"--interpolation {self.interpolation} is for --knots; say how many"
+            )
+        if self.still_below is not None and not 0 <= self.still_below < math.inf:
+            raise ValueError(
+                f"--still-below {self.still_below}: a distance in scene units, not "
+                "negative"
+            )
         if not self.formats:
             raise ValueError("--formats: name at least one of png, mp4, exr")
 
@@ -68,17 +88,17 @@ def main(arguments=None):
         asked = run_settings.parse(Render, arguments)
         threads = run_settings.threads_for(run_settings.stored_preset(asked.run))
         run_settings.start_jax(asked.device, threads)
-        from experiments import runs
+        from experiments import evaluate, runs
 
         run = runs.saved_run(asked.run)
         state = runs.restore(asked.run, run).state
         size = _size(run.capture.size, asked.max_side)
-        renderer = _renderer(asked, run, size)
+        model, state = _faster(asked, _model(asked, run), state)
         names, views = _views(asked, run)
         views = _seen(asked, run, size, views)
         out = asked.out or asked.run / "renders" / _name(asked)
         out.mkdir(parents=True, exist_ok=True)
-    _write(asked, out, renderer, state, names, views)
+    _write(asked, out, evaluate.Renderer(model, size), state, names, views)
 
 
 def _name(asked):
@@ -87,19 +107,37 @@ def _name(asked):
     without = "".join(f"-without-{name}" for name in asked.without)
     named = [pathlib.PurePath(name).name for name in asked.appearance or ()]
     blended = "" if not named else f"-from-{named[0]}-to-{named[1]}"
+    knots = "" if asked.knots is None else f"-knots-{asked.knots}"
+    knots += "" if asked.interpolation == "linear" else f"-{asked.interpolation}"
+    if asked.still_below is not None:
+        knots += f"-still-below-{asked.still_below:g}"
     depth = "" if asked.show == "colour" else f"-{asked.show}"
-    return f"{asked.path}{frozen}{slow}{without}{blended}{depth}"
+    return f"{asked.path}{frozen}{slow}{without}{blended}{knots}{depth}"
 
 
-def _renderer(asked, run, size):
-    """Of the model, or of a variant of it; ValueError where the run has none such."""
-    from experiments import evaluate
+def _model(asked, run):
+    """The run's, or a variant of it; ValueError where the run has none such."""
+    blended = asked.appearance is not None
+    if not asked.without and not blended:
+        return run.model
+    return run.representation.variant(run.spec, run.facts, asked.without, blended)
 
-    model, blended = run.model, asked.appearance is not None
-    if asked.without or blended:
-        make = run.representation.variant
-        model = make(run.spec, run.facts, asked.without, blended)
-    return evaluate.Renderer(model, size)
+
+def _faster(asked, model, state):
+    """The model and its state, the motion from a table or of what moves alone."""
+    from experiments import variants
+
+    still_below = 0.0 if asked.still_below is None else asked.still_below
+    if asked.knots is not None:
+        made = variants.from_knots(
+            model, state, asked.knots, asked.interpolation, still_below
+        )
+    elif asked.still_below is not None:
+        made = variants.without_still(model, state, still_below)
+    else:
+        return model, state
+    print(made.summary)
+    return made.model, made.state
 
 
 def _seen(asked, run, size, views):

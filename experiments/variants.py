@@ -1,13 +1,16 @@
-"""A trained scene drawn otherwise: effects left out, appearances blended."""
+"""A trained scene drawn otherwise: effects left out, appearances blended, faster."""
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.training.model import Model, View
+from nerfies_jax.training.model import Model, Stages, TrainState, View
+
+INSTANTS = 33  # at which rows are looked for that move
 
 
 class Between(NamedTuple):
@@ -70,6 +73,118 @@ def of_fields(spec, facts, without: tuple[str, ...], blended: bool) -> Model:
 
     render = blend if blended else plain
     return scene.build(spec, facts)._replace(render=render, stages=None)
+
+
+class Faster(NamedTuple):
+    """A model that is drawn faster, the state that it needs, and what was gained."""
+
+    model: Model
+    state: TrainState
+    summary: str
+
+
+def from_knots(
+    model: Model,
+    state: TrainState,
+    knots: int,
+    interpolation: str = "linear",
+    still_below: float = 0.0,
+) -> Faster:
+    """The model with its motion read from a table of `knots` instants; host side."""
+    from gaussians_jax import time_knots
+
+    stages = _stages(model, "--knots")
+    time_knots.check(knots, interpolation)
+    params = state.params
+    prepared = jax.jit(stages.prepare)(params)
+    pose = jax.jit(stages.pose)
+    table = time_knots.bake(
+        lambda time: pose(params, prepared, time), knots, still_below
+    )
+    summary = (
+        f"{knots} knots, {interpolation}, of {_moving(table.where, still_below)}: "
+        f"{table.bytes / 1e6:.1f} MB"
+    )
+    return _with(
+        model,
+        state,
+        table,
+        Stages(
+            prepare=lambda both: (),
+            pose=lambda both, prepared, time: time_knots.at(
+                both[1], time, interpolation
+            ),
+            draw=lambda both, *rest: stages.draw(both[0], *rest),
+        ),
+        summary,
+    )
+
+
+def without_still(model: Model, state: TrainState, still_below: float) -> Faster:
+    """The model with the deformation evaluated for moving Gaussians alone; host side.
+
+    Those are the ones that move farther than `still_below` (scene units) over
+    `INSTANTS` instants of [0, 1].
+    """
+    from gaussians_jax import still_rows
+
+    stages = _stages(model, "--still-below")
+
+    def pose_rows(params, time):
+        return stages.pose(params, stages.prepare(params), time)
+
+    times = np.linspace(0, 1, INSTANTS)
+    parts = still_rows.split(state.params, pose_rows, times, still_below)
+
+    def pose(both, prepared, time):
+        return still_rows.pose(
+            both[1], lambda rows, time: stages.pose(rows, prepared, time), time
+        )
+
+    return _with(
+        model,
+        state,
+        parts,
+        Stages(
+            prepare=lambda both: stages.prepare(both[1].moving),
+            pose=pose,
+            draw=lambda both, *rest: stages.draw(both[0], *rest),
+        ),
+        f"the deformation of {_moving(parts.where, still_below)}",
+    )
+
+
+def _stages(model, option):
+    if model.stages is None:
+        raise ValueError(
+            f"{option} is for runs of Gaussians; a radiance field has no table of "
+            "where its points are"
+        )
+    return model.stages
+
+
+def _moving(where, still_below):
+    moving, rows = int(where.moves.sum()), len(where.moves)
+    if not moving:
+        raise ValueError(
+            f"nothing in this run moves farther than {still_below:g} scene units; "
+            "leave --knots and --still-below out, or lower the latter"
+        )
+    return f"{moving} of {rows} rows that move"
+
+
+def _with(model: Model, state: TrainState, beside: Any, stages: Stages, summary: str):
+    """The model on `(params, beside)`: what is beside is an argument, no constant."""
+
+    def render(both, view, size, step):
+        posed = stages.pose(both, stages.prepare(both), view.time)
+        return stages.draw(both, posed, view, size, step)
+
+    return Faster(
+        model._replace(render=render, stages=stages),
+        state._replace(params=(state.params, beside)),
+        summary,
+    )
 
 
 def appearance_id(capture: Capture, name: str) -> int:

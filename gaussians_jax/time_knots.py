@@ -53,10 +53,11 @@ def bake(
     still_below: float = 0.0,
     dtype=jnp.float32,
 ) -> Knots:
-    """The table of a motion; host side.
+    """The table of a motion, `pose` at every knot; host side.
 
-    Rows of which no point moves farther than `still_below` (scene units, from where
-    it is at the middle knot) at any knot are still and stored once.
+    `pose` is called as it is: compile it. Rows of which no point moves farther than
+    `still_below` (scene units, from where it is at the middle knot) at any knot are
+    still and stored once.
     """
     if knots < FEWEST["linear"]:
         raise ValueError(
@@ -64,8 +65,7 @@ def bake(
             "and its last instant"
         )
     times = jnp.linspace(0, 1, knots, dtype=dtype)
-    posed = jax.jit(pose)
-    poses = [jax.device_get(posed(time)) for time in times]
+    poses = [jax.device_get(pose(time)) for time in times]
     still = poses[knots // 2]
     moves = np.zeros(len(still.mean), bool)
     for time, now in zip(times, poses, strict=True):

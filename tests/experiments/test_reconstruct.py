@@ -251,6 +251,11 @@ def test_the_canonical_scene_and_its_depth_are_rendered(run, tmp_path):
     [
         (["--without", "warp"], "those are: motion"),
         (["--appearance", "0", "1"], "no appearance codes"),
+        (["--knots", "1"], "reads 2 knots at once"),
+        (["--interpolation", "cubic"], "is for --knots"),
+        (["--still-below", "-1"], "not negative"),
+        (["--still-below", "1e9"], "nothing in this run moves"),
+        (["--knots", "8", "--without", "motion"], "nothing in this run moves"),
     ],
 )
 def test_a_render_that_a_run_cannot_give_is_refused(run, capsys, arguments, words):
@@ -260,6 +265,21 @@ def test_a_render_that_a_run_cannot_give_is_refused(run, capsys, arguments, word
     line = capsys.readouterr().err
     assert words in line
     assert line.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_a_motion_is_rendered_from_knots(run, capsys):
+    for arguments in ([], ["--knots", "6", "--interpolation", "cubic"]):
+        render.main([str(run), "--formats", "png", *arguments])
+    assert "6 knots, cubic" in capsys.readouterr().out
+    found, exact = (
+        [images.read_image(path)[0].astype(int) for path in sorted(where.glob("*.png"))]
+        for where in (
+            run / "renders" / "heldout-knots-6-cubic",
+            run / "renders/heldout",
+        )
+    )
+    assert np.abs(np.subtract(found, exact)).max() <= 2
 
 
 @pytest.mark.slow

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from experiments import evaluate, held_out_codes, variants
-from gaussians_jax import scene
+from gaussians_jax import scene, splats, still_rows
+from gaussians_jax.splats import Gaussians
 from nerfies_jax import scene as nerf_scene
 from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.effects.warp import WarpSpec
@@ -57,6 +58,113 @@ def test_an_effect_that_is_not_there_cannot_be_left_out(moving):
 def test_splats_have_no_appearance_to_blend(moving):
     with pytest.raises(ValueError, match=r"--appearance: splats .* nerf-w"):
         variants.of_splats(scenes.TINY_SPLATS, moving[0], (), True)
+
+
+def state_of(params):
+    return TrainState(params, (), (), jnp.asarray(20, jnp.int32), None)
+
+
+@pytest.fixture(scope="module")
+def swaying():
+    """A deformable scene whose Gaussians move at their own speeds."""
+    capture = scenes.tiny_capture()
+    model = scene.build(scenes.TINY_DEFORMABLE, scene.facts_of(capture))
+    params = model.init(capture, jax.random.key(0)).params
+    rng = np.random.default_rng(0)
+    nets = jax.tree.map(
+        lambda leaf: leaf + 0.1 * jnp.asarray(rng.normal(size=leaf.shape), leaf.dtype),
+        params.nets,
+    )
+    return model, state_of(params._replace(nets=nets))
+
+
+def poses(model, state, times=(0.0, 0.3, 1.0)):
+    stages = model.stages
+    prepared = stages.prepare(state.params)
+    pose = jax.jit(stages.pose)
+    moments = [jnp.asarray(time, jnp.float32) for time in times]
+    return [pose(state.params, prepared, time) for time in moments]
+
+
+def test_a_motion_from_knots_is_met_at_the_knots_and_near_between(swaying):
+    exact = poses(*swaying)
+    living = np.asarray(splats.alive(swaying[1].params.rows["splats"]))
+    shift = np.abs(exact[0].mean - exact[2].mean).max()
+    errors = []
+    for knots, interpolation in ((4, "linear"), (4, "cubic"), (40, "cubic")):
+        made = variants.from_knots(*swaying, knots, interpolation)
+        assert f"{knots} knots, {interpolation}, of" in made.summary
+        found = poses(made.model, made.state)
+        for end in (0, 2):
+            met = np.abs(found[end].mean - exact[end].mean)[living]
+            assert met.max() < 1e-6
+        errors.append(np.abs(found[1].mean - exact[1].mean)[living].max() / shift)
+    assert 0.2 > errors[0] > errors[1] > 5e-3 > errors[2]
+
+
+def test_a_faster_model_draws_what_the_model_draws(swaying):
+    model, state = swaying
+    view = evaluate.view_of(scenes.tiny_capture(), 0)
+    view = view._replace(time=jnp.asarray(0.3))
+    made = variants.from_knots(model, state, 40, "cubic")
+    whole = made.model._replace(stages=None)  # by its `render`
+    exact, staged, found = (
+        evaluate.Renderer(model, SIZE)(state, view).colour
+        for model, state in ((model, state), made[:2], (whole, made.state))
+    )
+    still = variants.of_splats(*model.spec, ("motion",), False)
+    assert (
+        np.abs(evaluate.Renderer(still, SIZE)(state, view).colour - exact).max() > 0.1
+    )
+    np.testing.assert_allclose(staged, exact, atol=1e-3)
+    np.testing.assert_allclose(found, staged, atol=1e-5)
+
+
+def test_what_stands_still_may_be_left_out(swaying):
+    exact = poses(*swaying)
+    made = variants.without_still(*swaying, 0.0)
+    living = np.asarray(splats.alive(swaying[1].params.rows["splats"]))
+    for found, pose in zip(poses(made.model, made.state), exact, strict=True):
+        for name in Gaussians._fields:  # a row that is not drawn may be anywhere
+            a, b = (np.asarray(getattr(x, name))[living] for x in (found, pose))
+            np.testing.assert_allclose(a, b, atol=2e-6, err_msg=name)
+    middle, *_, end = poses(*swaying, (0.5, 1.0))
+    moved = np.asarray(still_rows.reach(middle, end))[living]
+    below = float(np.median(moved))
+    made = variants.without_still(*swaying, below)
+    left = len(made.state.params[1].moving.rows["splats"].mean)
+    assert 0 < left < len(moved)
+    assert f"{left} of {len(living)} rows that move" in made.summary
+    for found, pose in zip(poses(made.model, made.state), exact, strict=True):
+        error = np.linalg.norm(found.mean - pose.mean, axis=1)[living]
+        assert 0 < error.max() <= below
+        assert (error == 0).sum() >= left
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda *a: variants.from_knots(*a, 1), "reads 2 knots at once, got 1"),
+        (lambda *a: variants.from_knots(*a, 3, "cubic"), "take more, or linear"),
+        (lambda *a: variants.from_knots(*a, 8, "linear", 1e9), "farther than 1e\\+09"),
+        (lambda *a: variants.without_still(*a, 1e9), "nothing in this run moves"),
+        (lambda *a: variants.without_still(*a, -1.0), "cannot be negative"),
+    ],
+)
+def test_a_faster_motion_that_cannot_be_is_refused(swaying, make, words):
+    with pytest.raises(ValueError, match=words):
+        make(*swaying)
+
+
+def test_fields_and_still_scenes_have_no_knots(moving, swaying):
+    still = variants.of_splats(scenes.TINY_DEFORMABLE, moving[0], ("motion",), False)
+    with pytest.raises(ValueError, match="nothing in this run moves farther than 0 "):
+        variants.from_knots(still, swaying[1], 8)
+    field = still._replace(stages=None)
+    with pytest.raises(ValueError, match="--knots is for runs of Gaussians"):
+        variants.from_knots(field, swaying[1], 8)
+    with pytest.raises(ValueError, match="--still-below is for runs of Gaussians"):
+        variants.without_still(field, swaying[1], 0.1)
 
 
 def test_an_appearance_is_named_by_its_frame_or_its_number():
