@@ -14,16 +14,18 @@ PyTree = Any
 def in_blocks(
     evaluate: Callable[..., PyTree],
     rows: tuple[PyTree, ...],
-    alive: Bool[Array, " gaussians"],
+    alive: Bool[Array, " gaussians"] | None,
     block: int,
 ) -> PyTree:
     """`evaluate(*rows)` with the memory that `block` rows need.
 
     `evaluate` takes and returns pytrees whose leaves have the Gaussians first. A block
     in which no row is alive is not evaluated, so compacted rows do not pay for the
-    capacity behind them; what it would have returned is zero.
+    capacity behind them; what it would have returned is zero. None: all are alive.
     """
-    count = alive.shape[0]
+    count = jax.tree.leaves(rows)[0].shape[0]
+    if alive is None:
+        alive = jnp.ones(count, bool)
     block = max(1, min(block, count))
     blocks = -(-count // block)
 

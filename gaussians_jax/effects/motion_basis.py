@@ -24,7 +24,7 @@ from gaussians_jax.splats import Gaussians, Params
 from nerfies_jax.geometry import quaternion
 from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
-from nerfies_jax.nets.mlp import MLP, HeadSpec, Layer, MLPSpec
+from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
 
 NAME = "motion_basis"
@@ -109,7 +109,9 @@ class Prepared(NamedTuple):
     """What the canonical means alone decide, a row for each Gaussian.
 
     4 (3 K + base_width) bytes each: 608 with the paper's sizes, 24 MB for its 39,000
-    Gaussians.
+    Gaussians. Measured on one core at 10,000, posing them takes 160 ms with nothing
+    kept, 154 with the directions kept, 147 with both; 10.2, 8.5 and 6.8 in the small
+    sizes.
     """
 
     base: Float[Array, "gaussians width"]  # p's share of the base's first layer
@@ -232,24 +234,9 @@ def fold_time(
     slow = encoding.encode(spec.base_time, time[None], None)
     fast = encoding.encode(spec.time, time[None], None)
     return AtTime(
-        _with_known(params.base, slow, ()),
-        _with_known(params.weights, fast, spec.skips),
+        mlp.with_known(base_spec(spec), params.base, slow),
+        mlp.with_known(weights_spec(spec), params.weights, fast),
     )
-
-
-def _with_known(network, features, skips):
-    """The network once the last of its inputs are known."""
-    known = len(features)
-
-    def fold(index, layer):
-        if index != 0 and index not in skips:
-            return layer
-        return Layer(
-            layer.weight[:-known], layer.bias + features @ layer.weight[-known:]
-        )
-
-    hidden = tuple(fold(*item) for item in enumerate(network.hidden))
-    return network._replace(hidden=hidden)
 
 
 def base_displacement(
@@ -299,7 +286,7 @@ def prepare(
     return in_blocks(
         jax.vmap(lambda point: prepare_point(params, spec, point)),
         (_seen(spec, mean),),
-        _all_of(mean) if alive is None else alive,
+        alive,
         spec.block,
     )
 
@@ -320,17 +307,13 @@ def deform(
     return in_blocks(
         jax.vmap(lambda point, row: offsets_at_time(at_time, spec, point, row)),
         (_seen(spec, mean), prepared),
-        _all_of(mean) if alive is None else alive,
+        alive,
         spec.block,
     )
 
 
 def _seen(spec, mean):
     return jax.lax.stop_gradient(mean) if spec.detach else mean
-
-
-def _all_of(mean):
-    return jnp.ones(mean.shape[0], bool)
 
 
 def apply(gaussians: Gaussians, offsets: Offsets) -> Gaussians:

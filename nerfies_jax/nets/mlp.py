@@ -152,6 +152,23 @@ def affine(
     return inputs @ layer.weight + layer.bias
 
 
+def with_known(spec: MLPSpec, params: MLP, known: Float[Array, " known"]) -> MLP:
+    """The network once the last of its inputs are known: one of the others alone.
+
+    What a layer makes of them is the same for a whole batch; here it is summed once,
+    into the bias of each layer that reads the input.
+    """
+
+    def fold(index, layer):
+        if index != 0 and index not in spec.skips:
+            return layer
+        read = layer.weight[-len(known) :]
+        return Layer(layer.weight[: -len(known)], layer.bias + known @ read)
+
+    hidden = tuple(fold(*item) for item in enumerate(params.hidden))
+    return params._replace(hidden=hidden)
+
+
 def _fan_in(spec, layer):
     if layer == 0:
         return spec.inputs

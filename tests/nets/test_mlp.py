@@ -177,3 +177,19 @@ def test_impossible_heads_are_refused():
         HeadSpec(0)
     with pytest.raises(ValueError, match="initialiser"):
         HeadSpec(1, "one")
+
+
+@pytest.mark.parametrize("skips", [(), (1, 2)])
+def test_inputs_known_beforehand_may_be_summed_once(skips, dtype):
+    """Against the network that reads them with every row."""
+    heads = (("out", HeadSpec(4)),)
+    spec = MLPSpec(7, 3, 8, heads, skips, "softplus")
+    params = mlp.init(spec, jax.random.key(0), jnp.dtype(dtype))
+    rows = jax.random.normal(jax.random.key(1), (5, 4), dtype)
+    known = jax.random.normal(jax.random.key(2), (3,), dtype)
+    whole = jnp.concatenate([rows, jnp.broadcast_to(known, (5, 3))], axis=1)
+    rest = dataclasses.replace(spec, inputs=4)
+    ours = mlp.apply(rest, mlp.with_known(spec, params, known), rows)["out"]
+    theirs = mlp.apply(spec, params, whole)["out"]
+    tolerance = {"float32": 2e-6, "float64": 1e-14}[dtype]
+    np.testing.assert_allclose(ours, theirs, atol=tolerance)
