@@ -1,0 +1,246 @@
+"""A trained scene in one file: living Gaussians, networks, and what they mean.
+
+The file is a NumPy archive (.npz): one float32 array for each leaf of the parameters,
+and one text, JSON, with the format's version, the structure that the leaves form and a
+description. The description may hold the frozen settings of this package; they come
+back as what they were, so that a file is enough to draw a frame:
+
+    params, about = model_file.load("model.npz")
+    model = scene.build(about["spec"], about["facts"])
+    step = jnp.asarray(about["step"], jnp.int32)
+    rendering = model.render(params, view, (width, height), step)
+
+with `gaussians_jax.scene` and a `View` (nerfies_jax.training.model) from wherever the
+picture is to be taken. Nothing in a file is executed: names in it can only call up
+settings and records of `gaussians_jax` and `nerfies_jax`.
+"""
+
+import contextlib
+import dataclasses
+import importlib
+import io
+import json
+import os
+import pathlib
+import zipfile
+import zlib
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gaussians_jax import splats
+from gaussians_jax.splats import Params
+from nerfies_jax.capture.json_files import replaced_file
+from nerfies_jax.training import settings_text
+
+FORMAT = "gaussians_jax model"
+VERSION = 1
+ABOUT = "about.json"  # the archive's member with the text
+PACKAGES = ("gaussians_jax", "nerfies_jax")  # whose types a file may name
+PyTree = Any
+
+
+def save(path: str | os.PathLike, params: Params, description: dict[str, Any]) -> int:
+    """Write the living rows and the networks in float32; returns the file's bytes.
+
+    `description` holds plain values and frozen settings. The file appears whole or not
+    at all. A value that is not finite is refused.
+    """
+    path = pathlib.Path(path)
+    living = np.asarray(splats.alive(params.rows["splats"]))
+    if not living.any():
+        raise ValueError(
+            f"{path}: none of the {len(living)} rows is alive; not written"
+        )
+    rows = jax.tree.map(lambda leaf: np.asarray(leaf)[living], params.rows)
+    arrays: dict[str, np.ndarray] = {}
+    try:
+        structure = _taken_apart(params._replace(rows=rows), "params", arrays)
+        described = settings_text.describe(description)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}; not written") from error
+    about = {
+        "format": FORMAT,
+        "version": VERSION,
+        "params": structure,
+        "description": described,
+    }
+    content = io.BytesIO()
+    text = np.frombuffer(json.dumps(about).encode(), np.uint8)
+    np.savez_compressed(content, **{ABOUT: text}, **arrays)
+    with replaced_file(path) as partial:
+        partial.write_bytes(content.getvalue())
+    return path.stat().st_size
+
+
+def load(path: str | os.PathLike) -> tuple[Params, dict[str, Any]]:
+    """Parameters and description, as they were saved; host side.
+
+    Sequences in the description come back as tuples. Every complaint is a ValueError of
+    one line that starts with the path.
+    """
+    path = pathlib.Path(path)
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            about = _about(archive)
+            params = _put_together(about["params"], archive)
+        description = _rebuilt(about["description"])
+        _check(params)
+    except zipfile.BadZipFile as error:
+        raise ValueError(
+            f"{path}: not the file of a model, or damaged ({_line(error)}); save it "
+            "again with model_file.save"
+        ) from error
+    except _BROKEN as error:
+        raise ValueError(f"{path}: {_line(error)}") from error
+    return params, description
+
+
+# What reading bytes that anyone may have written can raise, beside BadZipFile.
+_BROKEN = (
+    *(ValueError, KeyError, TypeError, AttributeError, IndexError, RecursionError),
+    *(OSError, EOFError, zlib.error, NotImplementedError, RuntimeError, MemoryError),
+)
+
+
+def _line(error):
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def _about(archive):
+    if ABOUT not in {name.removesuffix(".npy") for name in archive.namelist()}:
+        raise ValueError(
+            "an archive, but not of a model: it has no about.json; models are written "
+            "by model_file.save"
+        )
+    about = json.loads(_array(archive, ABOUT).tobytes())
+    if not isinstance(about, dict) or about.get("format") != FORMAT:
+        raise ValueError(f"its about.json is not that of a {FORMAT}")
+    if about.get("version") != VERSION:
+        raise ValueError(
+            f"a model of version {about.get('version')}, and this program reads "
+            f"version {VERSION}; load it with the program that wrote it"
+        )
+    return about
+
+
+def _array(archive, name):
+    with archive.open(f"{name}.npy") as stream:
+        return np.lib.format.read_array(stream, allow_pickle=False)
+
+
+def _check(params):
+    """What every reader of parameters counts on."""
+    if not isinstance(params, Params) or "splats" not in params.rows:
+        raise ValueError("no Gaussians in it: params.rows['splats'] is missing")
+    count = len(params.rows["splats"].mean)
+    for leaf in jax.tree.leaves(params.rows):
+        if not leaf.ndim or len(leaf) != count:
+            raise ValueError(
+                f"an array of shape {leaf.shape} among the rows of {count} Gaussians"
+            )
+    for leaf in jax.tree.leaves(params):
+        if not np.isfinite(leaf).all():
+            raise ValueError("a value that is not finite; save the model again")
+
+
+# The structure of the parameters ----------------------------------------------------
+
+
+def _taken_apart(tree, name, arrays):
+    """The structure as JSON; its leaves go into `arrays`, named by their place."""
+    if tree is None:
+        return None
+    if isinstance(tree, dict):
+        return {
+            "dict": {
+                key: _taken_apart(item, f"{name}.{key}", arrays)
+                for key, item in tree.items()
+            }
+        }
+    if isinstance(tree, tuple) and hasattr(tree, "_fields"):
+        fields = {
+            key: _taken_apart(item, f"{name}.{key}", arrays)
+            for key, item in tree._asdict().items()
+        }
+        return {"record": _name(type(tree)), "fields": fields}
+    if isinstance(tree, tuple | list):
+        items = [_taken_apart(x, f"{name}.{i}", arrays) for i, x in enumerate(tree)]
+        return {"tuple": items}
+    leaf = np.asarray(tree)
+    if leaf.dtype.kind == "f" or leaf.dtype == jnp.bfloat16:
+        leaf = leaf.astype(np.float32)
+    if leaf.dtype.kind not in "fiub":
+        raise ValueError(f"{name} is of type {leaf.dtype}, which is no number")
+    if not np.isfinite(leaf).all():
+        raise ValueError(f"{name} has a value that is not finite")
+    arrays[name] = leaf
+    return {"array": name}
+
+
+def _put_together(structure, archive):
+    if structure is None:
+        return None
+    if "array" in structure:
+        return jnp.asarray(_array(archive, structure["array"]))
+    if "dict" in structure:
+        items = structure["dict"].items()
+        return {key: _put_together(item, archive) for key, item in items}
+    if "tuple" in structure:
+        return tuple(_put_together(item, archive) for item in structure["tuple"])
+    record = _type(structure["record"])
+    fields = {
+        key: _put_together(item, archive) for key, item in structure["fields"].items()
+    }
+    return _made(record, fields)
+
+
+# Settings ---------------------------------------------------------------------------
+
+
+def _rebuilt(value):
+    """What `settings_text.describe` wrote as text, as the values it was made of."""
+    if isinstance(value, list):
+        return tuple(_rebuilt(item) for item in value)
+    if not isinstance(value, dict):
+        return value
+    fields = {key: _rebuilt(item) for key, item in value.items() if key != "type"}
+    if "type" not in value:
+        return fields
+    return _made(_type(value["type"]), fields)
+
+
+def _made(kind, fields):
+    try:
+        return kind(**fields)
+    except TypeError as error:
+        raise ValueError(
+            f"its {kind.__name__} is of another version of the program ({error})"
+        ) from error
+
+
+def _name(kind):
+    return f"{kind.__module__}.{kind.__qualname__}"
+
+
+def _type(name):
+    """A NamedTuple or a frozen dataclass of `PACKAGES`, by its full name."""
+    module, _, attribute = str(name).rpartition(".")
+    kind = None
+    if module.split(".")[0] in PACKAGES:
+        with contextlib.suppress(ImportError):
+            kind = getattr(importlib.import_module(module), attribute, None)
+    is_record = isinstance(kind, type) and (
+        dataclasses.is_dataclass(kind)
+        or (issubclass(kind, tuple) and hasattr(kind, "_fields"))
+    )
+    if not is_record:
+        raise ValueError(
+            f"it names {name!r}, which is no record or setting of this version of "
+            f"{' and '.join(PACKAGES)}"
+        )
+    return kind
