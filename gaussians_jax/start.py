@@ -11,19 +11,29 @@ from gaussians_jax import splats
 from gaussians_jax.splats import Splats
 from nerfies_jax.capture.capture import Capture, point_depths
 
+SOURCES = ("auto", "points", "random")
+
 
 @dataclasses.dataclass(frozen=True)
 class StartSpec:
-    """Where the first Gaussians come from."""
+    """Where the first Gaussians come from.
+
+    `source` "auto" takes the capture's own points where there are at least `fewest` and
+    random ones otherwise; "points" and "random" insist on one, as MoBa-GS does on
+    either (it claims to need no points from structure from motion).
+    """
 
     points: int = 100_000  # at most so many of the capture's own points
-    random: int = 10_000  # drawn in the views where the capture has fewer than `fewest`
+    random: int = 10_000  # drawn in the views instead of them
     fewest: int = 100
     beside: int = 0  # drawn in the views beside the capture's own points
     opacity: float = 0.1
     widest: float = 0.03  # first scale, over the distance to the nearest camera
+    source: str = "auto"
 
     def __post_init__(self):
+        if self.source not in SOURCES:
+            raise ValueError(f"unknown source {self.source!r}; choose from {SOURCES}")
         if self.points < 1 or self.random < 1 or self.beside < 0:
             raise ValueError(
                 f"a scene starts from at least one Gaussian, got points={self.points}, "
@@ -31,16 +41,37 @@ class StartSpec:
             )
 
 
+def starts_from_points(spec: StartSpec, capture: Capture) -> bool:
+    """Whether the first Gaussians are the capture's own points; host side."""
+    found = 0 if capture.points is None else len(capture.points.position)
+    if spec.source == "points" and not found:
+        raise ValueError(
+            f"{capture.path or capture.name}: the scene shall start from the capture's "
+            'own points, and it has none; choose source="random", or "auto" for random '
+            "ones only where there are no others"
+        )
+    enough = 1 if spec.source == "points" else max(spec.fewest, 1)
+    return spec.source != "random" and found >= enough
+
+
+def first_count(spec: StartSpec, capture: Capture) -> int:
+    """How many Gaussians there are at first; host side, nothing is drawn."""
+    if not starts_from_points(spec, capture):
+        return spec.random
+    return min(len(capture.points.position), spec.points) + spec.beside
+
+
 def first_points(spec: StartSpec, capture: Capture, seed: int):
     """Positions and colours in [0, 1] of the first Gaussians; host side.
 
     Structure from motion finds what stands still, so what moves has no points of its
-    own; `spec.beside` random ones in the volume give it something to grow from.
+    own; `spec.beside` random ones in the volume give it something to grow from. Random
+    points alone lie between the capture's near and far, whatever points it has.
     """
     rng = np.random.default_rng(seed)
-    cloud = capture.points
-    if cloud is None or len(cloud.position) < spec.fewest:
+    if not starts_from_points(spec, capture):
         return _random_points(rng, capture, spec.random, (capture.near, capture.far))
+    cloud = capture.points
     position, colour = cloud.position, cloud.colour / 255
     if len(position) > spec.points:
         kept = np.sort(rng.choice(len(position), spec.points, replace=False))

@@ -1,0 +1,84 @@
+"""Which points the first Gaussians stand on."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from gaussians_jax import start
+from gaussians_jax.start import StartSpec
+from tests import scenes
+
+SPEC = StartSpec(points=10**4, random=70, beside=30)
+
+
+def capture_with(points):
+    """The small capture with some of its own points, or with none."""
+    capture = scenes.tiny_capture()
+    cloud = capture.points
+    kept = None if points is None else type(cloud)(*(leaf[:points] for leaf in cloud))
+    return dataclasses.replace(capture, points=kept)
+
+
+def own_points(spec, capture):
+    """How many of the capture's own points the start has; checks the count foretold."""
+    position, colour = start.first_points(spec, capture, 0)
+    assert position.shape == colour.shape == (start.first_count(spec, capture), 3)
+    assert ((colour >= 0) & (colour <= 1)).all()
+    if capture.points is None:
+        return 0
+    known = {tuple(point) for point in capture.points.position}
+    return sum(tuple(point) in known for point in position)
+
+
+@pytest.mark.parametrize(
+    ("source", "points", "own", "drawn"),
+    [
+        ("auto", 150, 150, 30),
+        ("auto", 99, 0, 70),
+        ("auto", None, 0, 70),
+        ("points", 150, 150, 30),
+        ("points", 1, 1, 30),
+        ("random", 150, 0, 70),
+        ("random", None, 0, 70),
+    ],
+)
+def test_the_source_decides_whose_points_they_are(source, points, own, drawn):
+    spec, capture = dataclasses.replace(SPEC, source=source), capture_with(points)
+    assert own_points(spec, capture) == own
+    assert start.first_count(spec, capture) == own + drawn
+
+
+def test_a_start_is_never_empty():
+    spec = dataclasses.replace(SPEC, fewest=0)
+    assert start.first_count(spec, capture_with(0)) == 70
+    assert own_points(spec, capture_with(0)) == 0
+    assert own_points(spec, capture_with(1)) == 1
+
+
+def test_random_points_do_not_depend_on_the_points_of_the_capture():
+    """Or a start "without structure from motion" would have some after all."""
+    spec = dataclasses.replace(SPEC, source="random")
+    first, second, third = (
+        start.first_points(spec, capture_with(points), seed)
+        for points, seed in ((150, 0), (None, 0), (None, 1))
+    )
+    for a, b in zip(first, second, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert (first[0] != third[0]).any()
+
+
+@pytest.mark.parametrize("points", [None, 0])
+def test_a_capture_without_points_is_refused_by_name(points):
+    spec = dataclasses.replace(SPEC, source="points")
+    capture = capture_with(points)
+    for function in (start.starts_from_points, start.first_count):
+        with pytest.raises(ValueError, match=r'it has none; choose source="random"'):
+            function(spec, capture)
+    with pytest.raises(ValueError, match=str(capture.path or capture.name)):
+        start.first_points(spec, capture, 0)
+
+
+def test_an_unknown_source_is_refused():
+    with pytest.raises(ValueError, match="unknown source 'sfm'; choose from"):
+        StartSpec(source="sfm")
