@@ -1,0 +1,327 @@
+"""Kolmogorov-Arnold networks of Gaussian kernels (RBF-KAN) with explicit parameters.
+
+One layer is y_o = sum over inputs i of f_io(x_i) + bias_o, where each function of one
+variable is a sum of Gaussians on a uniform grid and, beside it, a weighted SiLU:
+
+    f_io(x) = sum_g C_gio exp(-((x - mu_g) / w)^2) + B_io silu(x)
+
+Li 2024, "Kolmogorov-Arnold networks are radial basis function networks",
+arXiv:2405.06721 (FastKAN), which is equation 5 of Sonata with w = sqrt(2) sigma.
+"""
+
+import dataclasses
+import functools
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key
+
+from nerfies_jax.nets import mlp
+from nerfies_jax.nets.mlp import HeadSpec
+
+HEAD_INITIALISERS = ("glorot", "small", "zero")
+# Narrower kernels leave gaps between the centres, wider ones are so alike that their
+# weights cannot be told apart: the Gram matrix of 16 kernels has condition 5.7 at
+# sigma / h = 0.5, 58 at 0.707, 4.5e3 at 1 and 2e7 at 1.5.
+WIDTH_RATIOS = (0.25, 1.5)
+# Of a hidden layer's features, before the kernels. Features that spread by less than
+# 1e-3 are left small instead of being amplified to one.
+NORM_VARIANCE = 1e-6
+# Trained log-widths may leave their start by this much, a factor of 2e4 either way;
+# 1 / width overflows float32 beyond 88.
+LOG_WIDTH_RANGE = 10.0
+
+
+@dataclasses.dataclass(frozen=True)
+class KANSpec:
+    """Layers from `inputs` through `hidden` widths to the heads, which read the last.
+
+    The first layer's `kernels` centres lie on `grid`, where raw inputs are expected;
+    those of the others on `hidden_grid`, in front of which `norm` standardises the
+    features of each point. The norm has no trained scale, which would be a trained
+    width under another name, and the first layer has none: it would turn one or two
+    coordinates into signs. `width_ratio` is sigma / h, the kernels' standard deviation
+    over the distance of their centres; the grid resolves half a period per h whatever
+    it is.
+
+    `trainable_kernels` makes every input's centres and log-widths parameters (Sonata,
+    equations 9 and 10). The paper argues against it (appendix A.3): with one width and
+    even spacing all Gaussians have one spectrum, exp(-sigma^2 w^2 / 2), and the weights
+    alone shape the sum's by their interference, sum_g C_g exp(-i w mu_g); unequal
+    widths and gaps break that up.
+    """
+
+    inputs: int
+    hidden: tuple[int, ...]
+    heads: tuple[tuple[str, HeadSpec], ...]
+    kernels: int = 8
+    grid: tuple[float, float] = (-1.0, 1.0)
+    hidden_grid: tuple[float, float] = (-2.0, 2.0)
+    width_ratio: float = math.sqrt(0.5)
+    base: bool = True  # the SiLU beside the kernels
+    norm: bool = True
+    trainable_kernels: bool = False
+
+    def __post_init__(self):
+        if self.inputs < 1 or any(width < 1 for width in self.hidden):
+            raise ValueError(
+                "a KAN needs inputs >= 1 and hidden widths >= 1, got inputs="
+                f"{self.inputs}, hidden={self.hidden}"
+            )
+        if self.kernels < 2:
+            raise ValueError(
+                f"kernels={self.kernels}: a grid has at least two centres, one at each "
+                "end"
+            )
+        for name in ("grid", "hidden_grid"):
+            low, high = getattr(self, name)
+            if not (math.isfinite(low) and math.isfinite(high) and low < high):
+                raise ValueError(f"{name} needs low < high, got {low} and {high}")
+        if not WIDTH_RATIOS[0] <= self.width_ratio <= WIDTH_RATIOS[1]:
+            raise ValueError(
+                f"width_ratio={self.width_ratio} is not within {WIDTH_RATIOS}: "
+                "narrower kernels leave gaps, wider ones cannot be told apart; 0.5 to "
+                "0.75 is sound"
+            )
+        if self.norm and any(width < 3 for width in self.hidden):
+            raise ValueError(
+                f"hidden={self.hidden}: standardising one feature leaves 0 and two "
+                "leaves signs; take widths of at least 3, or norm=False"
+            )
+        names = [name for name, _ in self.heads]
+        if not names or len(set(names)) < len(names):
+            raise ValueError(
+                f"a KAN needs heads, all with different names, got {names}"
+            )
+        for name, head in self.heads:
+            if head.init not in HEAD_INITIALISERS:
+                raise ValueError(
+                    f"head {name!r}: unknown init {head.init!r}; choose from "
+                    f"{HEAD_INITIALISERS}"
+                )
+
+    def widths(self) -> tuple[int, ...]:
+        """Inputs of each layer; the last are those of the heads."""
+        return (self.inputs, *self.hidden)
+
+    def grid_of(self, layer: int) -> tuple[float, float]:
+        """The ends of the grid of one layer, counted from 0."""
+        return self.hidden_grid if layer else self.grid
+
+
+class KANLayer(NamedTuple):
+    """What one layer learns."""
+
+    kernel: Float[Array, "kernels inputs outputs"]  # C, a weight for each Gaussian
+    base: Float[Array, "inputs outputs"] | None  # B, of the SiLU
+    bias: Float[Array, " outputs"]
+
+
+class Kernels(NamedTuple):
+    """Centres and log(sqrt(2) sigma) of one layer's Gaussians, if they are trained."""
+
+    centre: Float[Array, "kernels inputs"]
+    log_width: Float[Array, "kernels inputs"]
+
+
+class KAN(NamedTuple):
+    """Parameters of one network."""
+
+    hidden: tuple[KANLayer, ...]
+    heads: dict[str, KANLayer]  # all read the last hidden layer, through one basis
+    kernels: tuple[Kernels, ...] | None  # one for each layer; None where fixed
+
+
+def spacing(spec: KANSpec, layer: int) -> float:
+    """h, the distance between neighbouring centres of one layer."""
+    low, high = spec.grid_of(layer)
+    return (high - low) / (spec.kernels - 1)
+
+
+def centres(spec: KANSpec, layer: int, dtype=jnp.float32) -> Float[Array, " kernels"]:
+    """The fixed centres of one layer, or where the trained ones start."""
+    return jnp.linspace(*spec.grid_of(layer), spec.kernels, dtype=dtype)
+
+
+def width(spec: KANSpec, layer: int) -> float:
+    """w = sqrt(2) sigma, the fixed width of one layer or the start of the trained."""
+    return math.sqrt(2) * spec.width_ratio * spacing(spec, layer)
+
+
+def init(spec: KANSpec, key: Key[Array, ""], dtype=jnp.float32) -> KAN:
+    """Weights as the spec says, biases zero; drawn alike in every precision.
+
+    "glorot", which hidden layers are too, draws the weights of the Gaussians such that
+    inputs spread over the grid give outputs of variance one. "zero" and "small" hold
+    for kernel and base weights alike.
+    """
+    widths = spec.widths()
+    keys = jax.random.split(key, len(spec.hidden) + len(spec.heads))
+    hidden = tuple(
+        _init_layer(spec, keys[layer], widths[layer], outputs, "glorot", dtype)
+        for layer, outputs in enumerate(spec.hidden)
+    )
+    heads = {
+        name: _init_layer(spec, head_key, widths[-1], head.width, head.init, dtype)
+        for (name, head), head_key in zip(
+            spec.heads, keys[len(spec.hidden) :], strict=True
+        )
+    }
+    kernels = None
+    if spec.trainable_kernels:
+        kernels = tuple(
+            Kernels(
+                jnp.tile(centres(spec, layer, dtype)[:, None], (1, inputs)),
+                jnp.full((spec.kernels, inputs), math.log(width(spec, layer)), dtype),
+            )
+            for layer, inputs in enumerate(widths)
+        )
+    return KAN(hidden, heads, kernels)
+
+
+def _init_layer(spec, key, inputs, outputs, init, dtype):
+    # Far from the ends, sum_g exp(-((x - mu_g) / w)^2)^2 is sqrt(pi) sigma / h on
+    # average over x: 1.25 at the default. FastKAN draws 0.1 whatever the inputs.
+    power = inputs * math.sqrt(math.pi) * spec.width_ratio
+    kernel_bound, base_bound = {
+        "glorot": (math.sqrt(3 / power), math.sqrt(6 / (inputs + outputs))),
+        "small": (mlp.SMALL, mlp.SMALL),
+        "zero": (0.0, 0.0),
+    }[init]
+    shape = spec.kernels + 1, inputs, outputs
+    drawn = jax.random.uniform(key, shape, jnp.float32, -1, 1).astype(dtype)
+    base = base_bound * drawn[-1] if spec.base else None
+    return KANLayer(kernel_bound * drawn[:-1], base, jnp.zeros(outputs, dtype))
+
+
+def apply(
+    spec: KANSpec, params: KAN, inputs: Float[Array, "*batch inputs"]
+) -> dict[str, Float[Array, "*batch outputs"]]:
+    """Every head's output by name. For one input or a batch."""
+    return after_first_layer(spec, params, first_layer_part(spec, params, inputs, 0))
+
+
+def first_layer_part(
+    spec: KANSpec, params: KAN, part: Float[Array, "*batch part"], start: int
+) -> Float[Array, "*batch outputs"]:
+    """What the inputs `start`, `start + 1`, ... add to the first layer, without bias.
+
+    A layer is a sum over its inputs, so parts that are equal for many evaluations (the
+    time for all points, a point's code for all times) are evaluated once: the sum of
+    the parts goes into `after_first_layer`.
+    """
+    stop = start + part.shape[-1]
+    if not 0 <= start < stop <= spec.inputs:
+        raise ValueError(
+            f"inputs {start} .. {stop - 1} are not among the {spec.inputs} of this KAN"
+        )
+    layer, kernels = _layer(spec, params, 0)
+    layer = layer._replace(
+        kernel=layer.kernel[:, start:stop],
+        base=None if layer.base is None else layer.base[start:stop],
+    )
+    if kernels is not None:
+        kernels = jax.tree.map(lambda leaf: leaf[:, start:stop], kernels)
+    return _sum_over_inputs(spec, 0, layer, kernels, part)
+
+
+def after_first_layer(
+    spec: KANSpec, params: KAN, first: Float[Array, "*batch features"]
+) -> dict[str, Float[Array, "*batch outputs"]]:
+    """Every head's output by name, from the sum of the first layer's parts."""
+    layer, _ = _layer(spec, params, 0)
+    features = first + layer.bias
+    for index in range(1, len(spec.hidden) + 1):
+        layer, kernels = _layer(spec, params, index)
+        if spec.norm:
+            features = standardise(features)
+        features = _sum_over_inputs(spec, index, layer, kernels, features) + layer.bias
+    outputs, first_column = {}, 0
+    for name, head in spec.heads:
+        outputs[name] = features[..., first_column : first_column + head.width]
+        first_column += head.width
+    return outputs
+
+
+def standardise(
+    features: Float[Array, "*batch features"],
+) -> Float[Array, "*batch features"]:
+    """Each point's features with mean zero and variance one, or less than one."""
+    centred = features - jnp.mean(features, axis=-1, keepdims=True)
+    variance = jnp.mean(centred**2, axis=-1, keepdims=True)
+    return centred * jax.lax.rsqrt(variance + NORM_VARIANCE)
+
+
+def hold(
+    x: Float[Array, "*batch inputs"], grid: tuple[float, float], margin: float
+) -> Float[Array, "*batch inputs"]:
+    """`x` inside the grid; outside it tends to `margin` beyond the nearer end.
+
+    Gaussians are 5e-2 of their height a quarter of a grid beyond its end and 1e-12
+    three quarters beyond, so an input that strays there stops learning, and SiLU helps
+    on one side only. Codes that start 50 grids away fit a signal of 1 to 0.81 without a
+    remedy, 0.65 with tanh and 0.41 with a slope that falls as here, from 1 like
+    0.6 (margin / distance)^2. The slope and its derivative are continuous.
+    """
+    low, high = grid
+    middle, half = (low + high) / 2, (high - low) / 2
+    offset = x - middle
+    outside = jnp.abs(offset) > half
+    excess = jnp.where(outside, jnp.abs(offset) - half, 0) / margin
+    # Its slope is (1 + 3 e) (1 + 2 e + 3 e^2)^(-3/2), which nothing cancels in; that of
+    # e / sqrt(1 + e^2), a difference of equals, is noise in float32 from e = 3000.
+    risen = 1 - jax.lax.rsqrt(1 + (2 + 3 * excess) * excess)
+    beyond = middle + jnp.sign(offset) * (half + margin * risen)
+    return jnp.where(outside, beyond, x)
+
+
+def _layer(spec, params, index):
+    """One layer and its kernels; the heads are the last layer, side by side."""
+    kernels = None if params.kernels is None else params.kernels[index]
+    if index < len(params.hidden):
+        return params.hidden[index], kernels
+    heads = [params.heads[name] for name, _ in spec.heads]
+    joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=-1), *heads)
+    return joined, kernels
+
+
+def _sum_over_inputs(spec, index, layer, kernels, inputs):
+    """A layer without its bias."""
+    dtype = inputs.dtype
+    # One standard deviation beyond the end the outermost Gaussian is steepest.
+    margin = width(spec, index) / math.sqrt(2)
+    held = hold(inputs, spec.grid_of(index), margin)
+    if kernels is None:
+        centre = centres(spec, index, dtype)
+        per_width = jnp.full_like(centre, 1 / width(spec, index))
+    else:
+        centre = kernels.centre
+        start = math.log(width(spec, index))
+        bounds = start - LOG_WIDTH_RANGE, start + LOG_WIDTH_RANGE
+        per_width = jnp.exp(-jnp.clip(kernels.log_width, *bounds))
+
+    # One kernel's Gaussians are made, used and forgotten. Forward and backward of one
+    # layer, 8192 x 64 -> 64, one core, ms for 8, 16, 32 kernels: einsum over a basis
+    # [n, in, kernels] 96, 200, 396 (117 to 470 MB); the basis flat for one product 72,
+    # 172, 356; kernel by kernel, kept for the backward pass, 24, 87, 196 (32 to
+    # 152 MB); with a hand-written derivative 24, 86, 205; this scan 26, 50, 106 (6 MB).
+    # Three layers 64, 64, 64 -> 9 of 10k points: einsum 284, flat 251, kept 187, this
+    # 92; in blocks of 512 that are recomputed 191, 126, 112, 112, so only memory asks
+    # for blocks. Four kernels at a time save a quarter at narrow widths. No custom
+    # derivative, so forward mode works.
+    # The scan already keeps XLA from merging the two passes.
+    @functools.partial(jax.checkpoint, prevent_cse=False)
+    def add_kernel(total, kernel):
+        centre, per_width, weight = kernel
+        distance = (held - centre) * per_width
+        return total + jnp.exp(-(distance**2)) @ weight, None
+
+    nothing = jnp.zeros((*inputs.shape[:-1], layer.bias.shape[0]), dtype)
+    total, _ = jax.lax.scan(
+        add_kernel, nothing, (centre, per_width, layer.kernel), unroll=4
+    )
+    if layer.base is not None:
+        total = total + jax.nn.silu(inputs) @ layer.base
+    return total

@@ -1,0 +1,482 @@
+"""RBF-KANs against loops and closed forms: values, derivatives, spectrum."""
+
+import dataclasses
+import itertools
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.special
+
+from nerfies_jax.nets import kan
+from nerfies_jax.nets.kan import KAN, KANLayer, KANSpec, Kernels
+from nerfies_jax.nets.mlp import HeadSpec
+from tests import gradients
+
+SPEC = KANSpec(
+    inputs=5,
+    hidden=(7, 6),
+    heads=(("shift", HeadSpec(3)), ("turn", HeadSpec(2))),
+    kernels=5,
+    width_ratio=0.6,
+)
+VARIANTS = {
+    "full": SPEC,
+    "no base": dataclasses.replace(SPEC, base=False),
+    "no norm": dataclasses.replace(SPEC, norm=False),
+    "trained kernels": dataclasses.replace(SPEC, trainable_kernels=True),
+    "no hidden": dataclasses.replace(SPEC, hidden=()),
+}
+CURVE = KANSpec(1, (), (("y", HeadSpec(1)),), kernels=8, base=False)
+
+apply = jax.jit(kan.apply, static_argnums=0)
+
+
+def filled(spec, dtype):
+    """A network all of whose parameters matter: kernels moved, biases not zero."""
+    shapes = jax.eval_shape(lambda key: kan.init(spec, key), jax.random.key(0))
+    rng = np.random.default_rng(1)
+
+    def draw(leaf):
+        return jnp.asarray(0.4 * rng.normal(size=leaf.shape), jnp.dtype(dtype))
+
+    params = jax.tree.map(draw, shapes)
+    if not spec.trainable_kernels:
+        return params
+    kernels = tuple(
+        Kernels(
+            0.3 * layer.centre + kan.centres(spec, index, layer.centre.dtype)[:, None],
+            0.3 * layer.log_width + math.log(kan.width(spec, index)),
+        )
+        for index, layer in enumerate(params.kernels)
+    )
+    return params._replace(kernels=kernels)
+
+
+def held(x, grid, margin):
+    low, high = grid
+    if low <= x <= high:
+        return x
+    excess = (x - high if x > high else low - x) / margin
+    risen = margin * (1 - (1 + 2 * excess + 3 * excess**2) ** -0.5)
+    return high + risen if x > high else low - risen
+
+
+def by_hand(spec, params, x):
+    """Edge by edge and kernel by kernel in Python floats."""
+    params = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), params)
+    layers = [[layer] for layer in params.hidden] + [list(params.heads.values())]
+    features = [float(v) for v in x]
+    for index, side_by_side in enumerate(layers):
+        grid = spec.hidden_grid if index else spec.grid
+        step = (grid[1] - grid[0]) / (spec.kernels - 1)
+        sigma = spec.width_ratio * step
+        if index and spec.norm:
+            mean = sum(features) / len(features)
+            variance = sum((v - mean) ** 2 for v in features) / len(features)
+            features = [(v - mean) / math.sqrt(variance + 1e-6) for v in features]
+        outputs = []
+        for layer in side_by_side:
+            sums = list(layer.bias)
+            for o in range(len(sums)):
+                for i, v in enumerate(features):
+                    if spec.base:
+                        sums[o] += layer.base[i, o] * v / (1 + math.exp(-v))
+                    for g in range(spec.kernels):
+                        centre, scale = grid[0] + g * step, math.sqrt(2) * sigma
+                        if spec.trainable_kernels:
+                            centre = params.kernels[index].centre[g, i]
+                            scale = math.exp(params.kernels[index].log_width[g, i])
+                        place = (held(v, grid, sigma) - centre) / scale
+                        sums[o] += layer.kernel[g, i, o] * math.exp(-(place**2))
+            outputs.append(sums)
+        features = [v for sums in outputs for v in sums]
+    return dict(zip(params.heads, outputs, strict=True))
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_outputs_edge_by_edge(variant, dtype, rng):
+    spec = VARIANTS[variant]
+    params = filled(spec, dtype)
+    inputs = jnp.asarray(rng.normal(size=(4, 5)), dtype)  # a third outside the grid
+    batch = apply(spec, params, inputs)
+    bound = {"float32": 2e-5, "float64": 1e-13}[dtype]
+    for row in range(4):
+        for name, value in by_hand(spec, params, inputs[row]).items():
+            assert batch[name].dtype == dtype
+            np.testing.assert_allclose(batch[name][row], value, rtol=bound, atol=bound)
+
+
+def test_one_input_is_a_batch_of_itself(dtype, rng):
+    params = filled(SPEC, dtype)
+    inputs = jnp.asarray(rng.normal(size=(2, 5)), dtype)
+    one = apply(SPEC, params, inputs[1])
+    for name, value in apply(SPEC, params, inputs).items():
+        tolerance = {"float32": 1e-5, "float64": 1e-14}[dtype]
+        np.testing.assert_allclose(one[name], value[1], atol=tolerance)
+
+
+@pytest.mark.parametrize("kernels", [5, 8, 16])
+def test_the_sum_over_kernels_is_the_three_index_form(kernels, rng):
+    """In float32, value and slopes, within 1e-6 of the largest."""
+    spec = KANSpec(6, (), (("y", HeadSpec(9)),), kernels=kernels)
+    params = filled(spec, "float32")
+    x = jnp.asarray(rng.uniform(-1, 1, (32, 6)), jnp.float32)
+    weigh = jnp.asarray(rng.normal(size=(32, 9)), jnp.float32)
+    centre = jnp.linspace(-1, 1, kernels)
+
+    def plain(params, x):
+        basis = jnp.exp(-(((x[..., None] - centre) * (kernels - 1) / 2) ** 2))
+        head = params.heads["y"]
+        return (
+            jnp.einsum("nig,gio->no", basis, head.kernel)
+            + jax.nn.silu(x) @ head.base
+            + head.bias
+        )
+
+    def ours(params, x):
+        return kan.apply(spec, params, x)["y"]
+
+    def value_and_slopes(function):
+        def total(*args):
+            outputs = function(*args)
+            return jnp.vdot(outputs, weigh), outputs
+
+        return jax.jit(jax.grad(total, argnums=(0, 1), has_aux=True))(params, x)
+
+    for one, other in zip(
+        jax.tree.leaves(value_and_slopes(ours)),
+        jax.tree.leaves(value_and_slopes(plain)),
+        strict=True,
+    ):
+        np.testing.assert_allclose(one, other, atol=1e-6 * np.abs(other).max())
+
+
+@pytest.mark.parametrize("variant", ["full", "no base", "trained kernels"])
+def test_the_first_layer_may_be_summed_in_parts(variant, dtype, rng):
+    spec = VARIANTS[variant]
+    params = filled(spec, dtype)
+    inputs = jnp.asarray(rng.normal(size=(6, 5)), dtype)
+
+    @jax.jit
+    def in_parts(params, inputs):
+        points = kan.first_layer_part(spec, params, inputs[:, :3], 0)
+        time = kan.first_layer_part(spec, params, inputs[0, 3:], 3)  # same for all
+        return kan.after_first_layer(spec, params, points + time)
+
+    whole = apply(spec, params, inputs.at[:, 3:].set(inputs[0, 3:]))
+    tolerance = {"float32": 1e-5, "float64": 1e-13}[dtype]
+    for name, value in in_parts(params, inputs).items():
+        np.testing.assert_allclose(value, whole[name], atol=tolerance)
+
+
+def test_parts_outside_the_inputs_are_refused():
+    params = filled(SPEC, "float32")
+    with pytest.raises(ValueError, match=r"4 \.\. 6 .* 5 of this KAN"):
+        kan.first_layer_part(SPEC, params, jnp.zeros(3), 4)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_gradients(variant, float64, rng):
+    spec = VARIANTS[variant]
+
+    def total(params, inputs):
+        return sum(
+            jnp.sum(jnp.sin(head)) for head in kan.apply(spec, params, inputs).values()
+        )
+
+    inputs = jnp.asarray(rng.normal(size=(3, 5)))
+    error = gradients.directional_error(total, filled(spec, "float64"), inputs)
+    assert error < 1e-6
+
+
+def test_forward_mode_and_reverse_over_forward(float64, rng):
+    """The Jacobian of a point, and its slopes: what an elastic penalty asks for."""
+    spec = dataclasses.replace(SPEC, hidden=(4,), kernels=3)
+    params = filled(spec, "float64")
+    point = jnp.asarray(rng.uniform(-1, 1, 5))
+
+    def shift(params, point):
+        return kan.apply(spec, params, point)["shift"]
+
+    forward = jax.jit(jax.jacfwd(shift, argnums=1))(params, point)
+    backward = jax.jit(jax.jacrev(shift, argnums=1))(params, point)
+    np.testing.assert_allclose(forward, backward, atol=1e-13)
+
+    def stretch(params, points):
+        jacobian = jax.vmap(jax.jacfwd(shift, argnums=1), (None, 0))(params, points)
+        return jnp.sum(jacobian**2)
+
+    points = jnp.stack([point, -point / 2])
+    assert gradients.directional_error(stretch, params, points) < 1e-6
+
+
+def curve_params(weights, dtype="float64"):
+    head = KANLayer(jnp.asarray(weights, dtype)[:, None, None], None, jnp.zeros(1))
+    return KAN((), {"y": head._replace(bias=head.bias.astype(dtype))}, None)
+
+
+def curve(params, x):
+    return kan.apply(CURVE, params, x[None])["y"][0]
+
+
+SIGMA = math.sqrt(0.5) * 2 / 7
+CENTRES = np.linspace(-1, 1, 8)
+
+
+@pytest.mark.parametrize("order", range(6))
+def test_derivatives_are_hermite_polynomials(order, float64, rng):
+    """Equations 6 to 8: psi^(k) = psi (-1 / w)^k H_k((x - mu) / w), w = √2 sigma."""
+    weights = rng.normal(size=8)
+    w = math.sqrt(2) * SIGMA
+    x = np.linspace(-0.99, 0.99, 11)
+    place = (x[:, None] - CENTRES) / w
+    kernels = np.exp(-(place**2)) * (-1 / w) ** order
+    expected = (scipy.special.eval_hermite(order, place) * kernels) @ weights
+
+    function = curve
+    for _ in range(order):
+        function = jax.jacfwd(function, argnums=1)
+    ours = jax.jit(jax.vmap(function, (None, 0)))(curve_params(weights), x)
+    np.testing.assert_allclose(ours, expected, atol=1e-13 * w**-order * 2**order)
+
+
+def test_the_slope_by_reverse_mode_is_equation_6(dtype, rng):
+    weights = np.asarray(rng.normal(size=8), dtype).astype(np.float64)
+    x = np.asarray(np.linspace(-1, 1, 9), dtype)  # both ends of the grid among them
+    offset = x[:, None].astype(np.float64) - CENTRES
+    expected = (-offset / SIGMA**2 * np.exp(-(offset**2) / (2 * SIGMA**2))) @ weights
+    ours = jax.vmap(jax.grad(curve, argnums=1), (None, 0))(
+        curve_params(weights, dtype), x
+    )
+    tolerance = {"float32": 1e-5, "float64": 1e-13}[dtype]
+    np.testing.assert_allclose(ours, expected, atol=tolerance)
+
+
+def test_slopes_of_trained_kernels_are_equations_9_and_10(float64, rng):
+    spec = dataclasses.replace(CURVE, trainable_kernels=True)
+    weights, x = rng.normal(size=8), 0.37
+    centre = CENTRES + 0.05 * rng.normal(size=8)
+    sigma = SIGMA * np.exp(0.2 * rng.normal(size=8))
+    log_width = np.log(math.sqrt(2) * sigma)
+    kernels = Kernels(jnp.asarray(centre[:, None]), jnp.asarray(log_width[:, None]))
+    params = curve_params(weights)._replace(kernels=(kernels,))
+    slopes = jax.grad(lambda p: kan.apply(spec, p, jnp.asarray([x]))["y"][0])(params)
+    (found,) = slopes.kernels
+    psi = np.exp(-((x - centre) ** 2) / (2 * sigma**2))
+    by_centre = weights * (x - centre) / sigma**2 * psi
+    by_sigma = weights * (x - centre) ** 2 / sigma**3 * psi
+    np.testing.assert_allclose(found.centre[:, 0], by_centre, atol=1e-13)
+    np.testing.assert_allclose(found.log_width[:, 0], by_sigma * sigma, atol=1e-13)
+
+
+def test_the_spectrum_is_an_envelope_times_the_weights_interference(float64, rng):
+    """Appendix A.1, equations 20 and 21, with angular frequencies throughout."""
+    weights = rng.normal(size=8)
+    # A wide grid of which eight kernels count: none lies near where inputs are held.
+    inner = dataclasses.replace(CURVE, kernels=281, grid=(-40.0, 40.0))  # h = 2/7
+    padded = np.zeros(281)
+    padded[140 - 7 : 140 + 8 : 2] = weights  # at -2, -10/7, ..., 2
+    centre = np.arange(-7, 8, 2) * 2 / 7
+    x = np.linspace(-20, 20, 8001)
+    values = apply(inner, curve_params(padded), jnp.asarray(x[:, None]))["y"][:, 0]
+    values = np.asarray(values)
+    for omega in (0.0, 0.5, 2.0, 7.0, 15.0):
+        # The trapezoid rule is exact to rounding for what vanishes at both ends.
+        found = np.sum(values * np.exp(-1j * omega * x)) * (x[1] - x[0])
+        envelope = math.sqrt(2 * math.pi) * SIGMA * np.exp(-((SIGMA * omega) ** 2) / 2)
+        interference = np.sum(weights * np.exp(-1j * omega * centre))
+        assert abs(found - envelope * interference) < 1e-12
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("base", [True, False])
+@pytest.mark.parametrize("grid", [(-1.0, 1.0), (-2.0, 2.0), (0.0, 2.5)])
+def test_inputs_far_outside_the_grid_stay_alive(grid, base, dtype):
+    """Their slopes are those of the closed form, to rounding, and not zero."""
+    spec = dataclasses.replace(CURVE, grid=grid, base=base)
+    weights = np.linspace(1, 2, 8)
+    params = curve_params(weights, dtype)
+    if base:
+        head = params.heads["y"]._replace(base=jnp.full((1, 1), 0.5, dtype))
+        params = params._replace(heads={"y": head})
+
+    def value(x):
+        return kan.apply(spec, params, x[None])["y"][0]
+
+    far = np.array([3.0, 5.0, 50.0, 1e4])
+    far = np.concatenate([far, -far])
+    slopes = jax.jit(jax.vmap(jax.grad(value)))(jnp.asarray(far, dtype))
+    sigma = math.sqrt(0.5) * (grid[1] - grid[0]) / 7
+    for x, slope in zip(far, np.asarray(slopes, np.float64), strict=True):
+        excess = (x - grid[1] if x > 0 else grid[0] - x) / sigma
+        rate = (1 + 3 * excess) * (1 + 2 * excess + 3 * excess**2) ** -1.5
+        offset = held(x, grid, sigma) - np.linspace(*grid, 8)
+        psi = np.exp(-(offset**2) / (2 * sigma**2))
+        expected = rate * np.sum(-offset / sigma**2 * psi * weights)
+        if base:
+            logistic = scipy.special.expit(x)
+            expected += 0.5 * logistic * (1 + x * scipy.special.expit(-x))
+        assert slope != 0
+        tolerance = {"float32": 1e-4, "float64": 1e-11}[dtype]
+        np.testing.assert_allclose(slope, expected, rtol=tolerance)
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("order", [0, 1, 2])
+def test_holding_is_twice_differentiable_at_the_ends(order, float64):
+    ends = np.array([-1.0, 2.0])
+    places = jnp.asarray(ends + np.array([[-1e-9], [0.0], [1e-9]])).reshape(-1)
+
+    def function(x):
+        return kan.hold(x[None], (-1.0, 2.0), 0.3)[0]
+
+    for _ in range(order):
+        function = jax.grad(function)
+    found = jax.jit(jax.vmap(function))(places).reshape(3, 2)
+    expected = {0: ends, 1: np.ones(2), 2: np.zeros(2)}[order]
+    np.testing.assert_array_equal(found[1], expected)
+    np.testing.assert_allclose(found, np.tile(expected, (3, 1)), atol=1e-6)
+
+
+def test_holding_keeps_the_order_of_its_inputs(dtype):
+    x = jnp.linspace(-9, 9, 2001).astype(dtype)
+    moved = np.diff(kan.hold(x, (-1.0, 2.0), 0.3))
+    assert (moved > 0).all()
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("variant", ["full", "no norm", "trained kernels"])
+def test_any_input_has_finite_slopes(variant, dtype):
+    """Without SiLU, which hands on what it reads; all alike, so nothing spreads."""
+    spec = dataclasses.replace(VARIANTS[variant], base=False)
+    params = filled(spec, dtype)
+    still = jax.tree.map(jnp.zeros_like, params)  # hidden features without spread
+
+    def total(params, x):
+        return sum(jnp.sum(head) for head in kan.apply(spec, params, x).values())
+
+    run = jax.jit(jax.value_and_grad(total, argnums=(0, 1)))
+    for values, x in itertools.product((params, still), (0.0, -1e20, 1e30)):
+        found = run(values, jnp.full(5, x, dtype))
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
+
+
+@pytest.mark.hard_cases
+def test_trained_widths_of_any_size_have_finite_slopes(dtype):
+    spec = VARIANTS["trained kernels"]
+    params = filled(spec, dtype)
+
+    def total(params, x):
+        return sum(jnp.sum(head) for head in kan.apply(spec, params, x).values())
+
+    x = params.kernels[0].centre[2]  # at a centre, where 0 meets 1 / width
+    run = jax.jit(jax.value_and_grad(total, argnums=(0, 1)))
+    for log_width in (-200.0, 200.0):
+        kernels = tuple(
+            layer._replace(log_width=jnp.full_like(layer.log_width, log_width))
+            for layer in params.kernels
+        )
+        found = run(params._replace(kernels=kernels), x)
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
+
+
+@pytest.mark.hard_cases
+def test_bfloat16_is_finite_and_near(rng):
+    inputs = rng.normal(size=(16, 5))
+    for spec in (VARIANTS["full"], VARIANTS["trained kernels"]):
+        exact = apply(spec, filled(spec, "float32"), jnp.asarray(inputs, jnp.float32))
+
+        def total(params, x, spec=spec):
+            heads = kan.apply(spec, params, x)
+            return sum(jnp.sum(head) for head in heads.values()), heads
+
+        (_, heads), slopes = jax.jit(jax.value_and_grad(total, has_aux=True))(
+            filled(spec, "bfloat16"), jnp.asarray(inputs, jnp.bfloat16)
+        )
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
+        for name, value in heads.items():
+            assert value.dtype == jnp.bfloat16
+            # Three layers with eight bits; standardised features lose the most.
+            error = np.abs(np.asarray(value, np.float32) - exact[name])
+            assert np.median(error) < 0.05 * np.abs(exact[name]).max()
+
+
+def test_initial_outputs_have_variance_one(dtype):
+    """Over inputs spread over the grid, whatever their number and the kernels'."""
+    key, place = jax.random.split(jax.random.key(0))
+    for inputs, kernels, ratio in ((2, 8, 0.7), (48, 5, 0.5), (200, 16, 1.0)):
+        spec = KANSpec(
+            inputs,
+            (),
+            (("y", HeadSpec(256)),),
+            kernels=kernels,
+            width_ratio=ratio,
+            base=False,
+        )
+        params = kan.init(spec, key, jnp.dtype(dtype))
+        assert not np.asarray(params.heads["y"].bias).any()
+        x = jax.random.uniform(place, (256, inputs), dtype, -0.8, 0.8)
+        outputs = np.asarray(apply(spec, params, x)["y"], np.float64)
+        # A mean of squares: a constant f(x) counts, as it does for the next layer.
+        assert abs(np.mean(outputs**2) - 1) < 0.25
+
+
+def test_both_precisions_start_from_the_same_weights():
+    spec = dataclasses.replace(SPEC, hidden=(), trainable_kernels=True)
+    with jax.enable_x64(True):
+        wide = kan.init(spec, jax.random.key(3), jnp.float64)
+    narrow = kan.init(spec, jax.random.key(3))
+    for one, other in zip(jax.tree.leaves(wide), jax.tree.leaves(narrow), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-7)
+
+
+def test_heads_start_as_they_are_told(rng):
+    spec = dataclasses.replace(
+        SPEC,
+        heads=(("still", HeadSpec(3, "zero")), ("hardly", HeadSpec(2, "small"))),
+    )
+    heads = apply(spec, kan.init(spec, jax.random.key(0)), rng.normal(size=(9, 5)))
+    assert not np.asarray(heads["still"]).any()
+    assert 0 < np.abs(heads["hardly"]).max() < 1e-4 * 6 * 6
+
+
+def test_layers_heads_and_base_are_drawn_independently():
+    spec = dataclasses.replace(
+        SPEC, hidden=(5, 5), heads=(("a", HeadSpec(5)), ("b", HeadSpec(5)))
+    )
+    params = kan.init(spec, jax.random.key(4))
+    weights = [layer.kernel for layer in (*params.hidden, *params.heads.values())]
+    for index, one in enumerate(weights):
+        assert not any(np.any(one == other) for other in weights[:index])
+        assert np.unique(one).size == one.size
+
+
+def test_what_is_off_has_no_parameters():
+    bare = kan.init(VARIANTS["no base"], jax.random.key(0))
+    assert len(jax.tree.leaves(bare)) == 2 * 4  # kernel weights and biases
+    trained = kan.init(VARIANTS["trained kernels"], jax.random.key(0))
+    assert [layer.centre.shape for layer in trained.kernels] == [(5, 5), (5, 7), (5, 6)]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"inputs": 0}, "inputs >= 1"),
+        ({"hidden": (4, 0)}, "hidden widths"),
+        ({"kernels": 1}, "two centres"),
+        ({"grid": (1.0, 1.0)}, "grid needs low < high"),
+        ({"hidden_grid": (0.0, math.inf)}, "hidden_grid needs"),
+        ({"width_ratio": 3.0}, "cannot be told apart"),
+        ({"width_ratio": math.nan}, "width_ratio=nan"),
+        ({"hidden": (7, 2)}, "leaves signs"),
+        ({"heads": ()}, "needs heads"),
+        ({"heads": (("a", HeadSpec(1)), ("a", HeadSpec(2)))}, "different names"),
+        ({"heads": (("a", HeadSpec(1, "he")),)}, "unknown init 'he'"),
+    ],
+)
+def test_wrong_specs_are_refused(change, said):
+    with pytest.raises(ValueError, match=said):
+        dataclasses.replace(SPEC, **change)
