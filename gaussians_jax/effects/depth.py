@@ -1,0 +1,196 @@
+"""Depth that was filmed, or guessed from single pictures, as a second truth.
+
+"Sonata" names a depth loss and leaves its form open. A depth of one picture is known up
+to scale and offset only; the forms here are those of Ranftl et al. 2020 ("MiDaS"),
+arXiv:1907.01341, section 5, and Li et al. 2021 ("NSFF"), arXiv:2011.13084.
+"""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from gaussians_jax.effects.effect import Effect, Moment, Shot, Term
+from gaussians_jax.splats import Params
+from nerfies_jax.training import losses
+
+NAME = "depth"
+KINDS = ("correlation", "affine", "metric")
+SPACES = ("depth", "disparity")
+# Deviation of the depths of a picture, as a share of their middle, below which they
+# count as flat: what is divided by it stays below a thousand, and so do slopes.
+FLATTEST = 1e-3
+
+
+@dataclasses.dataclass(frozen=True)
+class DepthSpec:
+    """What of the depths is compared, and how much it counts beside the colours.
+
+    "correlation" is 1 - r, Pearson's, blind to a positive scale and any offset. A
+    least-squares scale and offset leave a share 1 - r^2 of the variance, which is as
+    content with a depth turned inside out; this turns it back. "affine" takes from both
+    depths their median and divides by their mean distance from it, which bends less
+    where a part of the depths is wildly wrong; but it is level where every pixel is on
+    the wrong side of the median, and from random starts it ended short of the truth in
+    two of five fits, correlation in none. "metric" compares the depths as they are, for
+    sensors and renderers.
+
+    `space="disparity"` compares 1 / z, of which the far counts less. An affine guess
+    of disparities is no affine guess of depths: choose what the guess was made in.
+    """
+
+    kind: str = "correlation"
+    space: str = "depth"
+    weight: float = 0.1
+    opaque: float = 0.5  # least opacity of a pixel whose depth is compared
+
+    def __post_init__(self):
+        if self.kind not in KINDS or self.space not in SPACES:
+            raise ValueError(
+                f"kind is one of {KINDS} and space one of {SPACES}, got "
+                f"{self.kind!r} and {self.space!r}"
+            )
+        if not (0 <= self.weight < math.inf and 0 < self.opaque < 1):
+            raise ValueError(
+                "weight is finite and not negative, and 0 < opaque < 1; got "
+                f"weight={self.weight} and opaque={self.opaque}"
+            )
+
+
+def affine(
+    depth: Float[Array, " pixels"],
+    truth: Float[Array, " pixels"],
+    known: Bool[Array, " pixels"],
+) -> Float[Array, ""]:
+    """Mean |a - b| of the depths, each less its median and over its mean deviation.
+
+    Both are positive where `known`. Equations 5 to 7 of Ranftl et al. 2020. Zero with
+    fewer than two known pixels.
+    """
+    known = known & (jnp.sum(known) > 1)
+    return losses.l1(
+        _about_median(depth, known)[:, None],
+        _about_median(truth, known)[:, None],
+        known,
+    )
+
+
+def correlation(
+    depth: Float[Array, " pixels"],
+    truth: Float[Array, " pixels"],
+    known: Bool[Array, " pixels"],
+) -> Float[Array, ""]:
+    """1 - Pearson's r over the known pixels, in [0, 2]; zero with fewer than two."""
+    known = known & (jnp.sum(known) > 1)
+    # Half the mean square of the difference of standardised depths: 1 - r itself would
+    # have no digit left where the depths agree.
+    a, b = (_about_mean(x, known)[:, None] for x in (depth, truth))
+    return losses.mse(a, b, known) / 2
+
+
+def metric(
+    depth: Float[Array, " pixels"],
+    truth: Float[Array, " pixels"],
+    known: Bool[Array, " pixels"],
+) -> Float[Array, ""]:
+    """Mean |depth - truth| over the mean of the known truth; zero without any.
+
+    Relative, so that its weight means the same in every unit of length.
+    """
+    scale = losses.masked_mean(truth[:, None], known)
+    error = losses.l1(depth[:, None], truth[:, None], known)
+    return error / jnp.where(scale > 0, scale, 1)
+
+
+def _about_median(depth, known):
+    """Zero where unknown; slopes go through the median and the deviation too."""
+    middle = _median(depth, known)
+    offset = jnp.where(known, depth - middle, 0)
+    return _divided(offset, losses.masked_mean(jnp.abs(offset)[:, None], known), middle)
+
+
+def _about_mean(depth, known):
+    middle = losses.masked_mean(depth[:, None], known)
+    offset = jnp.where(known, depth - middle, 0)
+    variance = losses.masked_mean(jnp.square(offset)[:, None], known)
+    # Divided by at least 1e-3 of the middle, so the square root's slope is bounded.
+    least = jnp.square(FLATTEST * jax.lax.stop_gradient(middle))
+    deviation = jnp.sqrt(jnp.where(variance > least, variance, 1))
+    return _divided(offset, jnp.where(variance > least, deviation, 0), middle)
+
+
+def _divided(offset, deviation, middle):
+    least = FLATTEST * jnp.abs(jax.lax.stop_gradient(middle))
+    return offset / jnp.maximum(deviation, jnp.where(least > 0, least, 1))
+
+
+def _median(depth, known):
+    """The lower median of positive depths, as a choice of one pixel; 0 without any."""
+    count = jnp.sum(known)
+    fixed = jax.lax.stop_gradient(jnp.where(known, depth, 1))
+    middle = nth_smallest(fixed, known, jnp.maximum(count - 1, 0) // 2)
+    place = jnp.argmax(known & (fixed == middle))
+    return jnp.where(count > 0, jnp.where(known, depth, 0)[place], 0)
+
+
+def nth_smallest(
+    values: Float[Array, " n"], known: Bool[Array, " n"], rank: Int[Array, ""]
+) -> Float[Array, ""]:
+    """The known value that has `rank` known ones below it; all values are positive.
+
+    The bits of positive floats are ordered like the floats, so the answer is built from
+    its highest bit down, one count for each bit. Exact; 130k values, one core: 1.3 ms,
+    where sorting them takes 28.
+    """
+    size = jnp.finfo(values.dtype).bits
+    integer = jnp.dtype(f"int{size}")
+    bits = jax.lax.bitcast_convert_type(values, integer)
+
+    def settle(turn, found):
+        one = jnp.ones((), integer)
+        higher = found | (one << (size - 2 - turn).astype(integer))
+        below = jnp.sum(known & (bits < higher))
+        return jnp.where(below <= rank, higher, found)
+
+    found = jax.lax.fori_loop(0, size - 1, settle, jnp.zeros((), integer))
+    return jax.lax.bitcast_convert_type(found, values.dtype)
+
+
+FORMS = {"affine": affine, "correlation": correlation, "metric": metric}
+
+
+def loss(spec: DepthSpec, shot: Shot) -> Term:
+    """The weighted difference of drawn and filmed depth, with what it is made of.
+
+    Pixels count that are filmed, whose depth is known (positive and finite) and that
+    the drawing covers with at least `opaque`: elsewhere an expected depth is that of a
+    haze. Without any depth the term is zero and has no operations.
+    """
+    truth = shot.depth
+    if truth is None:
+        return Term(jnp.zeros((), shot.truth.dtype), {})
+    drawn = shot.rendering.depth
+    known = (truth > 0) & jnp.isfinite(truth) & (drawn > 0) & jnp.isfinite(drawn)
+    known = known & (shot.rendering.alpha >= spec.opaque)
+    if shot.valid is not None:
+        known = known & shot.valid
+    # Selected before anything is computed of them: unknown pixels may hold NaN.
+    drawn, truth = (jnp.where(known, x, 1).reshape(-1) for x in (drawn, truth))
+    if spec.space == "disparity":
+        drawn, truth = 1 / drawn, 1 / truth
+    known = known.reshape(-1)
+    error = FORMS[spec.kind](drawn, truth, known)
+    share = jnp.mean(known.astype(error.dtype))
+    return Term(spec.weight * error, {"error": error, "known": share})
+
+
+def effect(spec: DepthSpec) -> Effect:
+    """The seams of the depth loss; it reads the capture's depths."""
+
+    def image_loss(params: Params, shot: Shot, moment: Moment) -> Term:
+        del params, moment
+        return loss(spec, shot)
+
+    return Effect(name=NAME, image_loss=image_loss, wants=frozenset({"depths"}))

@@ -1,0 +1,308 @@
+"""Depth losses: their values, their blindness, and pictures that say nothing."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+import scipy.stats
+
+from gaussians_jax.effects import depth
+from gaussians_jax.effects.depth import DepthSpec
+from gaussians_jax.effects.effect import Moment, Shot
+from gaussians_jax.optimiser import scale_by_row_adam
+from gaussians_jax.splats import Params
+from nerfies_jax.training.model import Rendering
+from tests import gradients
+
+COUNT = 31
+FORMS = {name: jax.jit(form) for name, form in depth.FORMS.items()}
+SLOPES = {name: jax.jit(jax.value_and_grad(form)) for name, form in depth.FORMS.items()}
+EVERYWHERE = jnp.ones(COUNT, bool)
+
+
+def two_depths(dtype, seed=0):
+    rng = np.random.default_rng(seed)
+    depths = rng.uniform(1, 4, (2, COUNT)).astype(dtype)
+    known = rng.uniform(size=COUNT) < 0.7
+    return *(jnp.asarray(x) for x in depths), jnp.asarray(known)
+
+
+def expected_loss(kind, drawn, truth):
+    """From the known pixels alone, in NumPy and SciPy."""
+    if kind == "metric":
+        return np.abs(drawn - truth).mean() / truth.mean()
+    if kind == "correlation":
+        return 1 - scipy.stats.pearsonr(drawn, truth).statistic
+
+    def normalised(x):
+        middle = np.sort(x)[(len(x) - 1) // 2]
+        return (x - middle) / np.abs(x - middle).mean()
+
+    return np.abs(normalised(drawn) - normalised(truth)).mean()
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])  # even and odd numbers of known pixels
+@pytest.mark.parametrize("kind", depth.KINDS)
+def test_losses_are_those_of_the_known_pixels(kind, seed, dtype):
+    drawn, truth, known = two_depths(dtype, seed)
+    value = FORMS[kind](drawn, truth, known)
+    chosen = np.asarray(known)
+    expected = expected_loss(
+        kind, *(np.asarray(x, np.float64)[chosen] for x in (drawn, truth))
+    )
+    assert value.dtype.name == dtype
+    tolerance = {"float32": 1e-5, "float64": 1e-12}[dtype]
+    np.testing.assert_allclose(value, expected, rtol=tolerance)
+
+
+@pytest.mark.parametrize("kind", depth.KINDS)
+def test_gradients(kind, float64):
+    drawn, truth, known = two_depths("float64")
+
+    def total(drawn):
+        return depth.FORMS[kind](drawn, truth, known)
+
+    assert gradients.directional_error(total, drawn, step=1e-6) < 1e-6
+    slope = jax.jit(jax.grad(total))(drawn)
+    assert not np.asarray(slope)[~np.asarray(known)].any()
+
+
+@pytest.mark.parametrize("kind", ["affine", "correlation"])
+@pytest.mark.parametrize(("scale", "offset"), [(1e-3, 0.0), (1.0, 7.0), (50.0, -20.0)])
+def test_scale_and_offset_are_not_seen(kind, scale, offset, dtype):
+    drawn, truth, known = two_depths(dtype)
+    value = FORMS[kind](drawn, truth, known)
+    moved = FORMS[kind](drawn * scale + offset + 40, truth, known)
+    # At 1e-3 on 40 the deviation is under a thousandth of the depth: flat.
+    if scale < 1e-2:
+        moved = FORMS[kind](drawn * scale, truth, known)
+    tolerance = {"float32": 2e-5, "float64": 1e-11}[dtype]
+    np.testing.assert_allclose(moved, value, rtol=tolerance)
+    same = FORMS[kind](truth * 3 + 1, truth, known)
+    # In float32 the correlation keeps 1e-12: 1 - r would keep 1e-7.
+    limit = {"affine": {"float32": 2e-6}, "correlation": {"float32": 1e-11}}[kind]
+    assert 0 <= same <= limit.get(dtype, 1e-13)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def descended(kind, shape, start, truth):
+    """The depth 2 + shape @ p after Adam on p."""
+    tx = optax.chain(scale_by_row_adam(), optax.scale(-5e-3))
+
+    def loss(p):
+        return depth.FORMS[kind](2 + shape @ p, truth, EVERYWHERE)
+
+    def step(carry, _):
+        p, moments = carry
+        update, moments = tx.update(jax.grad(loss)(p), moments)
+        return (p + update, moments), None
+
+    (p, _), _ = jax.lax.scan(step, (start, tx.init(start)), None, length=3000)
+    return 2 + shape @ p
+
+
+def agreement(one, other):
+    return np.corrcoef(np.asarray(one), np.asarray(other))[0, 1]
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 3, 4])
+def test_descent_on_the_correlation_finds_the_truth_s_shape(seed, float64):
+    start, truth, _ = two_depths("float64", seed)
+    assert agreement(start, truth) < 0.5
+    end = descended("correlation", jnp.eye(COUNT), start - 2, truth)
+    assert agreement(end, truth) > 0.999
+
+
+def test_a_depth_turned_inside_out_is_wrong_and_correlation_turns_it_back():
+    """Least squares would give it a negative scale and no loss."""
+    truth = two_depths("float32")[1]
+    # Exactly inside out is level, as a maximum is; with a little noise it is not.
+    drawn = 5 - truth + 0.1 * two_depths("float32", 6)[0]
+    for kind in ("affine", "correlation"):
+        assert FORMS[kind](drawn, truth, EVERYWHERE) > 1.9  # of 2
+    end = descended("correlation", jnp.eye(COUNT, dtype="float32"), drawn - 2, truth)
+    assert agreement(end, truth) > 0.99
+
+
+@pytest.mark.hard_cases
+def test_the_affine_loss_is_level_where_every_pixel_is_on_the_wrong_side(dtype):
+    """Then mean |a - b| = mean |a| + mean |b| = 2: what the docstring warns of."""
+    truth = jnp.linspace(1, 3, COUNT, dtype=dtype)
+    value, slope = SLOPES["affine"](5 - truth, truth, EVERYWHERE)
+    np.testing.assert_allclose(value, 2, rtol=1e-6)
+    assert np.abs(slope).max() < 1e-6
+
+
+def test_outliers_of_a_guess_bend_the_affine_fit_less(float64):
+    """Smooth depths fitted to a guess that is wild in a tenth of its pixels."""
+    t = np.linspace(-np.pi, np.pi, COUNT)
+    shape = [np.cos(k * t) for k in range(1, 5)] + [np.sin(k * t) for k in range(1, 4)]
+    shape, errors = jnp.asarray(np.stack(shape, axis=1)), []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        waves = jnp.asarray(0.15 * rng.normal(size=7))
+        truth = 2 + shape @ waves
+        wild = rng.choice(COUNT, 3, replace=False)
+        guess = truth.at[wild].add(rng.uniform(1, 2, 3))
+        start = waves + 0.05 * rng.normal(size=7)
+        errors.append(
+            [
+                1 - agreement(descended(kind, shape, start, guess), truth)
+                for kind in ("affine", "correlation")
+            ]
+        )
+    affine, correlation = np.mean(errors, axis=0)
+    assert affine < 0.6 * correlation
+
+
+def hard_pictures():
+    rng = np.random.default_rng(0)
+    ramp = np.linspace(1, 3, COUNT)
+    flat = np.full(COUNT, 2.0)
+    all_known, none = np.ones(COUNT, bool), np.zeros(COUNT, bool)
+    one, two = none.copy(), none.copy()
+    one[4], two[4], two[9] = True, True, True
+    two_levels = np.where(np.arange(COUNT) < 3, 1.0, 2.0)  # median deviation is zero
+    return {
+        "nothing known": (ramp, ramp[::-1], none),
+        "one pixel": (ramp, flat, one),
+        "two pixels": (ramp, flat + ramp, two),
+        "two equal pixels": (flat, ramp, two),
+        "flat truth": (ramp, flat, all_known),
+        "flat drawing": (flat, ramp, all_known),
+        "both flat": (flat, 3 * flat, all_known),
+        "few outliers on a plane": (two_levels, ramp, all_known),
+        "deviation of an ulp": (1000 + 1e-4 * rng.normal(size=COUNT), ramp, all_known),
+        "tiny depths": (1e-6 * ramp, 1e-6 * ramp[::-1], all_known),
+        "huge depths": (1e6 * ramp, 1e6 * ramp[::-1], all_known),
+        "one far outlier": (np.append(ramp[1:], 1e6), ramp, all_known),
+        "inside out": (ramp, 5 - ramp, all_known),
+    }
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("kind", depth.KINDS)
+@pytest.mark.parametrize("name", hard_pictures())
+def test_pictures_that_say_little_stay_finite(kind, name, dtype):
+    drawn, truth, known = hard_pictures()[name]
+    value, slope = SLOPES[kind](
+        jnp.asarray(drawn, dtype), jnp.asarray(truth, dtype), jnp.asarray(known)
+    )
+    assert np.isfinite(value)
+    assert np.isfinite(slope).all()
+    # Slopes are at most a thousand over the depth of the picture.
+    assert np.abs(slope).max() * np.median(drawn) < 1100
+    if known.sum() < 2 and kind != "metric":
+        assert value == 0
+        assert not np.asarray(slope).any()
+
+
+@pytest.mark.hard_cases
+def test_a_flat_drawing_is_bent_towards_the_truth(dtype):
+    truth = jnp.linspace(1, 3, COUNT, dtype=dtype)
+    for kind in ("affine", "correlation"):
+        slope = SLOPES[kind](jnp.full(COUNT, 2.0, dtype), truth, EVERYWHERE)[1]
+        assert np.corrcoef(np.asarray(slope), np.asarray(truth))[0, 1] < -0.8
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("count", [1, 2, 7, 20])
+def test_the_nth_smallest_is_that_of_a_sort(count, dtype):
+    rng = np.random.default_rng(count)
+    values = np.exp(rng.uniform(-60, 60, 20)).astype(dtype)
+    values[[3, 8, 11]] = values[0]  # ties
+    known = np.zeros(20, bool)
+    known[rng.choice(20, count, replace=False)] = True
+    ordered = np.sort(values[known])
+    nth = jax.jit(depth.nth_smallest)
+    for rank in range(count):
+        found = nth(jnp.asarray(values), jnp.asarray(known), jnp.asarray(rank))
+        assert found == ordered[rank]
+
+
+def some_shot(dtype="float32", size=(5, 6)):
+    rng = np.random.default_rng(0)
+    drawn, truth = (jnp.asarray(rng.uniform(1, 4, size), dtype) for _ in range(2))
+    colour = jnp.zeros((*size, 3), dtype)
+    return Shot(Rendering(colour, jnp.ones(size, dtype), drawn), colour, None, truth)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def loss_and_slope(spec, shot):
+    def value(drawn, alpha):
+        rendering = shot.rendering._replace(depth=drawn, alpha=alpha)
+        term = depth.loss(spec, shot._replace(rendering=rendering))
+        return term.value, term.metrics
+
+    rendering = shot.rendering
+    return jax.value_and_grad(value, argnums=(0, 1), has_aux=True)(
+        rendering.depth, rendering.alpha
+    )
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("space", depth.SPACES)
+@pytest.mark.parametrize("kind", depth.KINDS)
+def test_what_is_unknown_or_see_through_teaches_nothing(kind, space, dtype):
+    """0, NaN and infinity stand for unknown; a haze's expected depth is none."""
+    spec = DepthSpec(kind, space, weight=0.3)
+    shot = some_shot(dtype)
+    valid = jnp.ones((5, 6), bool).at[4].set(False)
+    bad = jnp.asarray([0.0, np.nan, np.inf, -1.0, 2.0, 2.0], dtype)
+    alpha = shot.rendering.alpha.at[0, 4].set(0.4).at[0, 5].set(0.0)
+    drawn = shot.rendering.depth.at[4, 0].set(np.nan).at[0, 5].set(0.0)
+    rendering = shot.rendering._replace(alpha=alpha, depth=drawn)
+    masked = Shot(rendering, shot.truth, valid, shot.depth.at[0].set(bad))
+    (value, metrics), slopes = loss_and_slope(spec, masked)
+    ours, truth = (
+        np.asarray(x, np.float64)[1:4].ravel() for x in (drawn, masked.depth)
+    )
+    if space == "disparity":
+        ours, truth = 1 / ours, 1 / truth
+    expected = expected_loss(kind, ours, truth)
+    tolerance = {"float32": 1e-5, "float64": 1e-12}[dtype]
+    np.testing.assert_allclose(value, 0.3 * expected, rtol=tolerance)
+    np.testing.assert_allclose(metrics["error"], expected, rtol=tolerance)
+    np.testing.assert_allclose(metrics["known"], 18 / 30, rtol=1e-6)
+    slope, alpha_slope = (np.asarray(x) for x in slopes)
+    assert not slope[[0, 4]].any()
+    assert slope[1:4].any()
+    assert not alpha_slope.any()
+
+
+def test_without_depth_there_is_no_operation():
+    spec, shot = DepthSpec(), some_shot()._replace(depth=None)
+    term = depth.loss(spec, shot)
+    assert term.value == 0
+    assert not term.metrics
+    program = jax.make_jaxpr(
+        lambda rendering: depth.loss(spec, shot._replace(rendering=rendering)).value
+    )(shot.rendering)
+    assert not [e for e in program.eqns if e.primitive.name != "broadcast_in_dim"]
+
+
+def test_the_effect_reads_the_depths():
+    spec, shot = DepthSpec("metric"), some_shot()
+    effect = depth.effect(spec)
+    assert effect.wants == {"depths"}
+    term = effect.image_loss(Params({}, {}), shot, Moment(jnp.zeros(())))
+    truth = np.asarray(shot.depth)
+    error = np.abs(np.asarray(shot.rendering.depth) - truth).mean() / truth.mean()
+    np.testing.assert_allclose(term.value, 0.1 * error, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ({"kind": "ordinal"}, "kind is one of"),
+        ({"space": "log"}, "space one of"),
+        ({"weight": -1.0}, "not negative"),
+        ({"opaque": 0.0}, "0 < opaque < 1"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(setting, message):
+    with pytest.raises(ValueError, match=message):
+        DepthSpec(**setting)
