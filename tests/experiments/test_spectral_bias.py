@@ -1,0 +1,214 @@
+"""Errors by frequency, sizes of networks, and how rates and times are shared out."""
+
+import json
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from experiments import spectral_bias, spectral_bias_report
+from experiments.spectral_bias import Result, Signal, SpectralBias
+
+SMALL = Signal(np.array([[1.0], [3.0]]), np.array([0.3, 1.1]), 60, 2)
+
+
+@pytest.mark.parametrize("label", ["1-D", "2-D"])
+def test_planted_errors_are_found_at_their_frequencies(label):
+    signal = spectral_bias.SIGNALS[label]
+    waves, amplitude = signal.waves, signal.amplitude
+    planted = np.linspace(0.0, 0.4, len(waves))
+    elsewhere = waves[-1] + 1
+
+    def apply(points):
+        x = np.asarray(points, np.float64)
+        off = sum(
+            share * amplitude * np.sin(np.pi * x @ wave + 0.9 * index)
+            for index, (share, wave) in enumerate(zip(planted, waves, strict=True))
+        )
+        off = off + 0.2 * np.cos(np.pi * x @ elsewhere)
+        return signal(points) + jnp.asarray(off, jnp.float32)
+
+    rmse, missing = spectral_bias.errors(apply, signal)
+    np.testing.assert_allclose(missing, planted, atol=1e-5)
+    # Each sinusoid has its share of the signal's power of one; the stray one has 0.02.
+    exact = math.sqrt(np.mean(planted**2) + 0.02)
+    assert float(rmse) == pytest.approx(exact, rel=1e-5)
+    row = result(rmse=[float(rmse)], missing=[np.asarray(missing).tolist()])
+    assert spectral_bias_report.other(row) == pytest.approx(0.02**0.5, rel=1e-4)
+
+
+@pytest.mark.parametrize("label", ["1-D", "2-D"])
+def test_nothing_learnt_misses_everything_and_the_signal_has_unit_power(label):
+    signal = spectral_bias.SIGNALS[label]
+    rmse, missing = spectral_bias.errors(lambda x: 0 * x[:, 0], signal)
+    assert float(rmse) == pytest.approx(1, rel=1e-5)
+    np.testing.assert_allclose(missing, 1, rtol=1e-5)
+    point = np.array([0.3, -0.2][: signal.waves.shape[1]])
+    by_hand = sum(
+        math.sqrt(2 / len(signal.waves))
+        * math.sin(math.pi * float(wave @ point) + phase)
+        for wave, phase in zip(signal.waves, signal.phase, strict=True)
+    )
+    got = signal(jnp.asarray(point[None], jnp.float32))
+    np.testing.assert_allclose(got, [by_hand], atol=1e-5)
+
+
+@pytest.mark.parametrize("label", ["1-D", "2-D"])
+@pytest.mark.parametrize("kind", spectral_bias.KINDS)
+@pytest.mark.parametrize("encoded", [False, True])
+def test_networks_have_about_the_same_number_of_parameters(label, kind, encoded):
+    signal = spectral_bias.SIGNALS[label]
+    made = spectral_bias.network(kind, encoded, signal)
+    assert made.parameters == pytest.approx(signal.parameters, rel=0.05)
+    dimensions = signal.waves.shape[1]
+    n = dimensions * (2 * signal.bands + 1) if encoded else dimensions
+    w = made.width
+    if kind == "kan":  # eight kernels and a base for each edge
+        exact = 9 * (n * w + w * w + w) + 2 * w + 1
+    else:
+        exact = (n * w + w) + 2 * (w * w + w) + (w + 1)
+    assert made.parameters == exact
+
+
+def test_sine_networks_start_as_the_paper_says():
+    signal = spectral_bias.SIGNALS["2-D"]
+    made = spectral_bias.network("sine", False, signal)
+    params = made.init(jax.random.key(0))
+    bounds = [15.0] + 2 * [math.sqrt(6 / made.width)]
+    for layer, bound in zip(params.hidden, bounds, strict=True):
+        largest = float(jnp.max(jnp.abs(layer.weight)))
+        assert 0.9 * bound < largest <= bound
+    # What the paper designs for: values of every layer spread alike.
+    points = jax.random.uniform(jax.random.key(1), (500, 2), minval=-1, maxval=1)
+    assert 0.1 < float(jnp.std(made.apply(params, points))) < 2
+
+
+def test_training_is_adam_along_a_cosine_from_points_of_its_own():
+    made = spectral_bias.network("relu", False, SMALL)
+    train = jax.jit(spectral_bias.trainer(made, SMALL, 16))
+    key, rate, steps = jax.random.key(5), 1e-2, 4
+    with jax.numpy_dtype_promotion("standard"):
+        keys = jnp.stack([key, key, jax.random.key(6)])
+        params, loss = train(keys, jnp.array([rate, 1e-3, rate]), jnp.asarray(steps))
+
+        by_hand = made.init(key)
+        rule = optax.adam(optax.cosine_decay_schedule(rate, steps))
+        memory = rule.init(by_hand)
+
+        @jax.jit
+        def one(params, memory, step):
+            points = jax.random.uniform(
+                jax.random.fold_in(key, step), (16, 1), minval=-1, maxval=1
+            )
+            value, slope = jax.value_and_grad(
+                lambda params: jnp.mean(
+                    (made.apply(params, points) - SMALL(points)) ** 2
+                )
+            )(params)
+            change, memory = rule.update(slope, memory)
+            return optax.apply_updates(params, change), memory, value
+
+        for step in range(steps):
+            by_hand, memory, value = one(by_hand, memory, jnp.asarray(step))
+    trained, exact = jax.tree.leaves(params), jax.tree.leaves(by_hand)
+    for got, expected in zip(trained, exact, strict=True):
+        np.testing.assert_allclose(got[0], expected, atol=1e-6)
+    weight = np.asarray(params.hidden[1].weight)
+    for other in (1, 2):  # another rate, another key
+        assert np.abs(weight[0] - weight[other]).max() > 1e-3
+    # In a run this short, 50 / 53 of the mean is the last loss.
+    assert float(loss[0]) == pytest.approx(float(value), rel=0.2)
+
+
+def test_the_rate_is_the_best_one_and_time_is_shared_out(monkeypatch):
+    monkeypatch.setitem(spectral_bias.SIGNALS, "1-D", SMALL)
+    asked = SpectralBias(steps=80, seeds=2, rates=(1e-7, 1e-2), batch=16)
+    first, second = spectral_bias.measure(asked, "1-D", "relu", True, 0.5)
+    assert first.rate == second.rate == pytest.approx(1e-2)
+    assert first.network == "relu + encoding"
+    assert len(first.rmse) == len(second.rmse) == 2
+    assert first.steps == 80
+    assert second.steps == round(80 * 0.5 / first.seconds)
+    assert np.mean(first.rmse) < 1
+
+
+def result(**given):
+    plain = dict(
+        signal="2-D",
+        network="kan",
+        parameters=100,
+        rate=0.01,
+        steps=10,
+        seconds=1.0,
+        rmse=[0.1, 0.3],
+        missing=[[0.1, 0.2], [0.3, 0.4]],
+    )
+    return Result(**plain | given)
+
+
+def planted(kan, relu):
+    rows = [
+        result(rmse=[kan, kan]),
+        result(network="relu + encoding", rmse=[relu, relu]),
+        result(network="sine", rmse=[0.5, 0.5]),
+    ]
+    return {"equal steps": rows, "equal time": rows}
+
+
+def test_the_sentences_follow_from_the_numbers():
+    text = spectral_bias_report.said(planted(0.1, 0.3))
+    assert (
+        "2-D, equal steps: best is kan (0.1000), then relu + encoding (0.3000)" in text
+    )
+    assert "has 0.33 of the error" in text
+    assert "2-D signal: holds" in text
+    text = spectral_bias_report.said(planted(0.2, 0.3))
+    assert "has 0.67 of the error" in text
+    assert "DOES NOT HOLD" in text
+    text = spectral_bias_report.said(planted(0.6, 0.3))
+    assert "(relu + encoding): worse" in text
+    assert "(sine): worse" in text
+
+
+def test_the_table_and_the_figure_show_every_network(tmp_path):
+    waves = {"2-D": np.array([[1.0, 1.0], [3.0, -2.0]])}
+    text = spectral_bias_report.tables(planted(0.1, 0.3), waves)
+    assert text.count("k=3,-2") == 2
+    line = next(x for x in text.splitlines() if x.startswith("relu + encoding"))
+    assert line.split()[3:] == [
+        *("100", "0.01", "10", "1.00", "0.3000", "0.0000", "0.2000", "0.3000", "0.1275")
+    ]  # the last: sqrt(0.09 - 0.025) of the first seed, nothing of the second
+    spectral_bias_report.draw_figure(planted(0.1, 0.3), waves, tmp_path / "bias.png")
+    assert (tmp_path / "bias.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--steps 1", "--steps 1"),
+        ("--signals 3-D", "--signals 3-D"),
+        ("--kinds tanh", "--kinds tanh"),
+        ("--rates 0.1 -1", "--rates"),
+    ],
+)
+def test_impossible_settings_are_refused(arguments, message, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        spectral_bias.main(arguments.split())
+    assert stopped.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_the_command_writes_what_it_prints(tmp_path, capsys):
+    sizes = "--signals 1-D --kinds kan relu --steps 20 --seeds 2 --batch 32"
+    spectral_bias.main([*sizes.split(), "--out", str(tmp_path)])
+    record = json.loads((tmp_path / "spectral_bias.json").read_text())
+    assert [row["network"] for row in record["results"]["equal time"]] == [
+        *("kan", "kan + encoding", "relu", "relu + encoding")
+    ]
+    printed = capsys.readouterr().out
+    assert all(sentence in printed for sentence in record["said"])
+    assert (tmp_path / "spectral_bias.png").exists()
