@@ -78,7 +78,8 @@ def observe(
 
     A displacement counts relative to the median displacement of the living rows at that
     instant: what the field moves as a whole, such as the camera's own motion, is not
-    motion of a Gaussian. Displacements that are not finite do not count.
+    motion of a Gaussian. Where most of a scene moves as one, it is therefore the rest
+    that counts as moving. Displacements that are not finite are passed over.
     """
     del moment
     displacement = moved.mean - canonical.mean

@@ -360,9 +360,10 @@ def test_it_fills_only_the_seams_of_growth():
 
 def test_before_its_start_the_factor_is_one(dtype):
     carried = motion_growth.carry(rows_of(5, dtype))
-    factor = an_effect().grow_score(carried, 99)
-    np.testing.assert_array_equal(factor, np.ones(5))
-    assert factor.dtype.name == an_effect().grow_score(carried, 100).dtype.name == dtype
+    for step, factor in ((99, 1.0), (100, 0.2)):  # at rest, beta = 4
+        result = an_effect().grow_score(carried, step)
+        np.testing.assert_allclose(result, np.full(5, factor), rtol=1e-7)
+        assert result.dtype.name == dtype
 
 
 @pytest.mark.parametrize(
