@@ -1,0 +1,189 @@
+"""The tables of what deformations cost, from the command line to the picture."""
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experiments import deformation_arms, deformation_cost, knot_curve, known_motion
+from gaussians_jax.effects.mlp_motion import MotionSpec
+from gaussians_jax.splats import Gaussians
+from nerfies_jax.capture import images
+from nerfies_jax.nets.encoding import EncodingSpec
+from tests import scenes
+
+
+def narrowed(spec):
+    """The same kind of network, small."""
+    small = {"depth": 2, "width": 8, "skips": (), "base_depth": 2, "base_width": 8}
+    small |= {"basis_width": 8, "block": 16}
+    there = {field.name for field in dataclasses.fields(spec)}
+    return dataclasses.replace(spec, **{k: x for k, x in small.items() if k in there})
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """Networks that compile and run in no time, of every kind."""
+    few = [
+        network._replace(spec=narrowed(network.spec))
+        for network in deformation_arms.NETWORKS
+        if network.paper
+    ]
+    monkeypatch.setattr(deformation_arms, "NETWORKS", few)
+
+
+def swinging(count=30):
+    """A motion in closed form: a third of the rows swing, one of them is dead."""
+    rng = np.random.default_rng(0)
+    centre = jnp.asarray(rng.normal(size=(count, 3)), jnp.float32)
+    still = Gaussians(
+        centre,
+        jnp.tile(jnp.asarray([[1.0, 0, 0, 0]]), (count, 1)),
+        jnp.full((count, 3), 0.1),
+        jnp.ones(count).at[3].set(0),
+    )
+    swings = jnp.asarray(np.arange(count) % 3 == 0, jnp.float32)[:, None]
+
+    def pose(time):
+        way = swings * 0.5 * jnp.sin(2 * jnp.pi * time) * jnp.asarray([1.0, 0, 0])
+        return still._replace(mean=still.mean + way)
+
+    def draw(posed, time):
+        return jnp.broadcast_to(posed.mean.mean(axis=0) / 10 + 0.5, (4, 5, 3))
+
+    alive = np.arange(count) != 3
+    return known_motion.Moving("swing", jax.jit(pose), jax.jit(draw), alive)
+
+
+def test_the_curve_is_that_of_the_closed_form():
+    curve = knot_curve.curve(swinging(), (2, 5, 9), 0.0, 1)
+    assert (curve.gaussians, curve.moving) == (29, 9)
+    np.testing.assert_allclose(curve.size, 0.5, rtol=1e-5)
+    by = {(point.interpolation, point.knots): point for point in curve.points}
+    assert list(by) == [
+        *(("linear", count) for count in (2, 5, 9)),
+        *(("cubic", count) for count in (5, 9)),  # which needs four
+    ]
+    # Two knots see no motion at all: everything is missing, and nothing is stored.
+    nothing = by["linear", 2]
+    times = np.linspace(0, 1, knot_curve.INSTANTS)
+    swing = np.sin(2 * np.pi * times)
+    np.testing.assert_allclose(nothing.rms, np.sqrt(np.mean(swing**2)), rtol=1e-3)
+    np.testing.assert_allclose(nothing.largest, 1, rtol=1e-3)
+    for knots in (5, 9):
+        even = np.linspace(0, 1, knots)
+        table = np.interp(times, even, np.sin(2 * np.pi * even))
+        point = by["linear", knots]
+        np.testing.assert_allclose(
+            point.largest, np.abs(table - swing).max(), rtol=1e-3
+        )
+        rms = np.sqrt(np.mean((table - swing) ** 2))
+        np.testing.assert_allclose(point.rms, rms, rtol=1e-3)
+        assert point.bytes == 40 * knots * 9
+        assert by["cubic", knots].rms < 0.5 * rms
+        assert by["cubic", knots].psnr > point.psnr > nothing.psnr
+
+
+def test_a_motion_that_is_none_is_refused():
+    motion = swinging()
+    still = motion._replace(pose=lambda time: motion.pose(jnp.zeros(())))
+    with pytest.raises(ValueError, match="swing: nothing moves"):
+        knot_curve.curve(still, (4,), 0.0, 1)
+
+
+@pytest.mark.slow
+def test_the_network_learns_the_motion():
+    spec = MotionSpec(
+        position=EncodingSpec(3), time=EncodingSpec(3), depth=2, width=32, skips=()
+    )
+    motion = known_motion.fitted(200, spec, 300)
+    rest = known_motion.ball_and_wall(200).mean
+    errors, ways = [], []
+    for time in (0.1, 0.4, 0.8):
+        posed = motion.pose(jnp.asarray(time))
+        exact = known_motion.analytic(rest, jnp.asarray(time)).mean
+        errors.append(np.square(posed.mean - rest - exact).mean())
+        ways.append(np.square(exact).mean())
+    assert np.sqrt(np.mean(errors) / np.mean(ways)) < 0.5
+    first, later = (motion.draw(motion.pose(t), t) for t in jnp.asarray([0.2, 0.7]))
+    assert first.shape == (120, 160, 3)
+    assert np.abs(first - later).max() > 0.1
+
+
+def test_a_run_of_fields_has_no_motion_to_tabulate():
+    capture = scenes.tiny_capture()
+    model, state = _field(capture)
+    with pytest.raises(ValueError, match="a radiance field has no Gaussians"):
+        known_motion.of_run(model, state, capture)
+
+
+def _field(capture):
+    from nerfies_jax.training.model import Model, TrainState
+
+    zero = jnp.zeros((), jnp.int32)
+    return Model("field", *[None] * 3, (), None), TrainState({}, (), (), zero, None)
+
+
+@pytest.mark.usefixtures("small")
+def test_arms_agree_with_the_network_they_shorten():
+    made = {arm.name: arm for arm in deformation_arms.arms(40, 0.25)}
+    for network in deformation_arms.NETWORKS:
+        whole = made[network.name]
+        exact = jax.jit(whole.pose)(*whole.inputs)
+        shorter = [n for n in made if n.startswith(f"{network.name}, ")]
+        for name in (network.name, *shorter):
+            arm = made[name]
+            posed, counted = jax.jit(arm.pose), jax.jit(arm.counted_pose)
+            for found in (posed(*arm.inputs), counted(*arm.inputs)):
+                off = np.abs(found.mean - exact.mean).max(axis=1) > 1e-6
+                # What stands still is at rest instead, not where the network puts it.
+                assert off.sum() <= (10 if "still" in name else 0)
+        slopes = jax.jit(whole.gradient)(*whole.inputs)
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
+    papers = sum(network.paper for network in deformation_arms.NETWORKS)
+    assert sum("still" in name for name in made) == papers
+    assert sum("kept" in name for name in made) >= 2
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("small")
+def test_the_job_prints_both_tables_and_saves_them(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(known_motion, "FIT_STEPS", 5)
+    out = tmp_path / "cost.json"
+    sizes = "--gaussians 60 --knots 4 8 --repeats 1 --device cpu"
+    deformation_cost.main([*sizes.split(), "--out", str(out)])
+    kept = json.loads(out.read_text())
+    text = capsys.readouterr().out
+    for row in kept["costs"]:
+        assert row["name"] in text
+        assert row["forward_cpu_ms"] > 0
+        assert row["forward_flops"] > 0
+        trained = row["name"] in {n.name for n in deformation_arms.NETWORKS}
+        assert (row["both_ms"] is not None) == trained
+        if trained:
+            assert row["both_flops"] > 2 * row["forward_flops"]
+    assert "1.9 to 13.5 % as published" in text
+    assert [point["knots"] for point in kept["knots"]["points"]] == [4, 8, 4, 8]
+    picture, _ = images.read_image(out.with_suffix(".png"))
+    assert picture.shape[2] == 3
+    assert np.ptp(picture) > 200
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--gaussians 0", "--gaussians 0 must be at least 1"),
+        ("--still 1", "a share in [0, 1)"),
+        ("--knots 1 8", "at least 2"),
+        ("--still-below -1", "cannot be negative"),
+        ("--run nowhere", "no run here"),
+    ],
+)
+def test_what_cannot_be_is_refused(arguments, message, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        deformation_cost.main(arguments.split())
+    assert stopped.value.code == 2
+    assert message in capsys.readouterr().err
