@@ -55,6 +55,8 @@ class SpectralBias:
     """Learning rates to choose from."""
     batch: int = 256
     """Random points of a step."""
+    points: int | None = None
+    """Points that are learnt from, the same for all; new ones in every step if None."""
     kinds: tuple[str, ...] = KINDS
     """Networks; the first one's time is what the others get."""
     out: pathlib.Path | None = None
@@ -68,6 +70,8 @@ class SpectralBias:
                 raise ValueError(
                     f"--{name} {getattr(self, name)} must be at least {least}"
                 )
+        if self.points is not None and self.points < 1:
+            raise ValueError(f"--points {self.points} must be at least 1")
         for name, known in (("signals", SIGNALS), ("kinds", KINDS)):
             wrong = set(getattr(self, name)) - set(known)
             if wrong or not getattr(self, name):
@@ -181,17 +185,15 @@ def count_of(spec: KANSpec | MLPSpec) -> int:
     return sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(shapes))
 
 
-def trainer(made: Network, signal: Signal, batch: int):
+def trainer(made: Network, signal: Signal, batch: int, points: int | None = None):
     """A function (keys [lanes], rates [lanes], steps) -> (parameters, training loss)
     that trains as many networks side by side; the steps are traced.
     """
-    dimensions = signal.waves.shape[1]
+    draw = _drawing(signal.waves.shape[1], batch, points)
     adam = optax.scale_by_adam()
 
     def one(params, memory, key, rate, step):
-        points = jax.random.uniform(
-            jax.random.fold_in(key, step), (batch, dimensions), minval=-1, maxval=1
-        )
+        points = draw(jax.random.fold_in(key, step))
         truth = signal(points)
         loss, slope = jax.value_and_grad(
             lambda params: jnp.mean((made.apply(params, points) - truth) ** 2)
@@ -218,6 +220,16 @@ def trainer(made: Network, signal: Signal, batch: int):
         return params, mean
 
     return train
+
+
+def _drawing(dimensions, batch, points):
+    def fresh(key, count=batch):
+        return jax.random.uniform(key, (count, dimensions), minval=-1, maxval=1)
+
+    if points is None:
+        return fresh
+    known = fresh(jax.random.key(3), points)
+    return lambda key: jax.random.choice(key, known, (batch,))
 
 
 def errors(
@@ -251,7 +263,7 @@ def measure(
     """One network: at equal steps and, if `budget` seconds are given, in that time."""
     signal = SIGNALS[label]
     made = network(kind, encoded, signal)
-    train = trainer(made, signal, asked.batch)
+    train = trainer(made, signal, asked.batch, asked.points)
     lanes = max(asked.seeds, len(asked.rates))
     shapes = (
         jax.eval_shape(lambda: jax.random.split(jax.random.key(0), lanes)),

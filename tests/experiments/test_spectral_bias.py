@@ -123,6 +123,19 @@ def test_training_is_adam_along_a_cosine_from_points_of_its_own():
     assert float(loss[0]) == pytest.approx(float(value), rel=0.2)
 
 
+def test_one_known_point_is_learnt_and_nothing_else():
+    made = spectral_bias.network("relu", False, SMALL)
+    train = jax.jit(spectral_bias.trainer(made, SMALL, 4, points=1))
+    with jax.numpy_dtype_promotion("standard"):
+        keys = jax.random.split(jax.random.key(0), 1)
+        params, loss = train(keys, jnp.array([1e-2]), jnp.asarray(2000))
+    assert float(loss[0]) < 1e-6
+    rmse, _ = spectral_bias.errors(
+        lambda x: made.apply(jax.tree.map(lambda leaf: leaf[0], params), x), SMALL
+    )
+    assert float(rmse) > 0.3
+
+
 def test_the_rate_is_the_best_one_and_time_is_shared_out(monkeypatch):
     monkeypatch.setitem(spectral_bias.SIGNALS, "1-D", SMALL)
     asked = SpectralBias(steps=80, seeds=2, rates=(1e-7, 1e-2), batch=16)
@@ -191,6 +204,7 @@ def test_the_table_and_the_figure_show_every_network(tmp_path):
         ("--steps 1", "--steps 1"),
         ("--signals 3-D", "--signals 3-D"),
         ("--kinds tanh", "--kinds tanh"),
+        ("--points 0", "--points 0"),
         ("--rates 0.1 -1", "--rates"),
     ],
 )
