@@ -1,0 +1,305 @@
+"""The penalty on unrest: its value, its ends in time, its rows and its slopes."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from gaussians_jax import splats as rows
+from gaussians_jax.effects import acceleration, deformation, mlp_motion
+from gaussians_jax.effects.acceleration import AccelerationSpec
+from gaussians_jax.effects.effect import Around, Moment
+from gaussians_jax.effects.mlp_motion import MotionSpec
+from gaussians_jax.optimiser import scale_by_row_adam
+from gaussians_jax.splats import Params, Splats
+from nerfies_jax.nets.encoding import EncodingSpec
+from tests import gradients
+
+unrest = jax.jit(acceleration.unrest, static_argnums=(4, 5))
+instants = jax.jit(acceleration.instants, static_argnums=1)
+
+
+def scene(count=12, alive=None, dtype="float32", size=1.0):
+    """Gaussians and, under "amplitude", how far each swings."""
+    rng = np.random.default_rng(0)
+    leaves = [size * rng.normal(size=(count, 3))]
+    leaves += [np.zeros((count, *shape)) for shape in [(3,), (4,), (), (1, 3), (0, 3)]]
+    splats = Splats(*(jnp.asarray(leaf, dtype) for leaf in leaves))
+    if alive is not None:
+        splats = rows.bury(splats, jnp.asarray(~np.asarray(alive)))
+    amplitude = jnp.asarray(0.02 * size * rng.normal(size=(count, 3)), dtype)
+    return Params({"splats": splats, "amplitude": amplitude}, {})
+
+
+def swinging(params, time):
+    """A motion with a closed form: amplitude sin(5 t) + amplitude^2 t^2."""
+    gaussians = rows.activate(params.rows["splats"])
+    swing = params.rows["amplitude"]
+    moved = swing * jnp.sin(5 * time) + jnp.square(swing) * jnp.square(time)
+    return gaussians._replace(mean=gaussians.mean + moved)
+
+
+def places(params, time):
+    mean = np.asarray(params.rows["splats"].mean, np.float64)
+    swing = np.asarray(params.rows["amplitude"], np.float64)
+    return mean + swing * np.sin(5 * time) + swing**2 * time**2
+
+
+def slow_unrest(canonical, before, now, after, decay, drift):
+    total = 0.0
+    for c, b, n, a in zip(canonical, before, now, after, strict=True):
+        second = np.linalg.norm(a - 2 * n + b) ** 2
+        first = np.linalg.norm((a - b) / 2) ** 2
+        total += np.exp(-np.linalg.norm(n - c) / decay) * (second + drift * first)
+    return total / len(canonical) / decay**2
+
+
+@pytest.mark.parametrize("drift", [0.0, 0.5])
+def test_unrest_is_the_weighed_sum_of_differences(drift, dtype):
+    rng = np.random.default_rng(0)
+    four = rng.normal(size=(4, 9, 3)).astype(dtype)
+    value = unrest(*(jnp.asarray(x) for x in four), 2.0, drift)
+    expected = slow_unrest(*four.astype(np.float64), 2.0, drift)
+    tolerance = {"float32": 1e-6, "float64": 1e-13}[dtype]
+    np.testing.assert_allclose(value, expected, rtol=tolerance)
+    assert value.dtype.name == dtype
+
+
+def test_gradients_with_the_weight_held(float64):
+    rng = np.random.default_rng(0)
+    canonical, before, now, after = (jnp.asarray(x) for x in rng.normal(size=(4, 9, 3)))
+    weight = np.exp(-np.linalg.norm(np.asarray(now - canonical), axis=1) / 2)
+
+    def held(before, now, after):  # the weight as a constant
+        second = jnp.sum((after - 2 * now + before) ** 2, axis=1)
+        first = jnp.sum(((after - before) / 2) ** 2, axis=1)
+        return jnp.mean(weight * (second + 0.5 * first)) / 4
+
+    def ours(before, now, after):
+        return acceleration.unrest(canonical, before, now, after, 2.0, 0.5)
+
+    assert gradients.directional_error(held, before, now, after) < 1e-8
+    for a, b in zip(
+        jax.jit(jax.grad(ours, (0, 1, 2)))(before, now, after),
+        jax.jit(jax.grad(held, (0, 1, 2)))(before, now, after),
+        strict=True,
+    ):
+        np.testing.assert_allclose(a, b, atol=1e-14)
+
+
+def test_a_steady_drift_is_seen_by_the_first_difference_alone(dtype):
+    start = jnp.zeros((5, 3), dtype)
+    step = jnp.asarray([0.25, 0, 0], dtype)
+    motion = start, start + step, start + 2 * step, start + 3 * step
+    assert unrest(*motion, 1.0, 0.0) == 0
+    expected = np.exp(-0.5) * 0.0625
+    np.testing.assert_allclose(unrest(*motion, 1.0, 1.0), expected, rtol=1e-6)
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("distance", [0.0, 1e-30, 1e-10, 1.0, 100.0, 1e15])
+def test_slopes_are_finite_at_any_distance_and_free_far_away(distance, dtype):
+    canonical = jnp.zeros((1, 3), dtype)
+    now = canonical.at[0, 0].set(distance)
+
+    @jax.jit
+    @functools.partial(jax.value_and_grad, argnums=(0, 1, 2))
+    def energy(before, now, after):
+        return acceleration.unrest(canonical, before, now, after, 1.0, 1.0)
+
+    value, slopes = energy(now - 0.5, now, now)
+    assert np.isfinite(value)
+    assert all(np.isfinite(slope).all() for slope in slopes)
+    if distance < 1e-6:
+        np.testing.assert_allclose(value, 0.75 + 0.75 / 4, rtol=1e-6)
+    if distance >= 100:
+        assert float(value) < 1e-30  # exp(-100) is 4e-44
+    still, slopes = energy(now, now, now)
+    assert still == 0
+    assert not any(np.asarray(slope).any() for slope in slopes)
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("interval", [1 / 300, 1 / 7, 0.5, 0.8])
+@pytest.mark.parametrize("time", [0.0, 1e-3, 0.3, 0.5, 1 - 1e-3, 1.0])
+def test_the_three_times_stay_within_the_capture(interval, time, dtype):
+    before, now, after = np.asarray(
+        instants(jnp.asarray(time, dtype), interval), np.float64
+    )
+    assert 0 <= before < now < after <= 1
+    step = min(interval, 0.5)
+    np.testing.assert_allclose([now - before, after - now], step, rtol=2e-5)
+    if step < time < 1 - step:
+        np.testing.assert_allclose(now, time, rtol=1e-6)
+
+
+@pytest.mark.parametrize("living", [[3], [0, 11], [1, 2, 5, 8, 9]])
+def test_rows_are_drawn_evenly_from_the_living(living):
+    alive = jnp.asarray(np.isin(np.arange(12), living))
+    drawn = jax.jit(acceleration.draw_living, static_argnums=2)(
+        jax.random.key(0), alive, 6000
+    )
+    counts = np.bincount(np.asarray(drawn), minlength=12)
+    assert set(np.flatnonzero(counts)) == set(living)
+    share = 6000 / len(living)
+    assert np.abs(counts[living] - share).max() < 5 * np.sqrt(share)
+
+
+def ask(spec, params, time, step=0, at_time=swinging, extent=1.0, frames=11, seed=0):
+    effect = acceleration.effect(spec, extent, frames)
+    dtype = params.rows["splats"].mean.dtype
+
+    @jax.jit
+    def penalty(params, time, step):
+        moment = Moment(time, step, jax.random.key(seed))
+        return effect.penalty(Around(params, at_time, moment, None))
+
+    return penalty(params, jnp.asarray(time, dtype), jnp.asarray(step))
+
+
+@pytest.mark.parametrize("time", [0.0, 0.43, 1.0])
+def test_the_effect_is_the_mean_over_the_rows_it_draws(time, dtype):
+    spec = AccelerationSpec(weight=0.3, decay=0.02, drift=0.5, interval=2.0)
+    alive = np.arange(12) % 4 != 1
+    params = scene(alive=alive, dtype=dtype)
+    term = ask(spec, params, time, extent=3.0)
+    key = jax.random.fold_in(jax.random.key(0), acceleration._STREAM)
+    drawn = np.asarray(acceleration.draw_living(key, jnp.asarray(alive), 12))
+    middle = np.clip(time, 0.2, 0.8)
+    expected = slow_unrest(
+        np.asarray(params.rows["splats"].mean, np.float64)[drawn],
+        *(places(params, t)[drawn] for t in (middle - 0.2, middle, middle + 0.2)),
+        0.06,
+        0.5,
+    )
+    # In float32 a place near 1 has an ulp of 1e-7, differences are near 0.01.
+    tolerance = {"float32": 3e-4, "float64": 1e-12}[dtype]
+    np.testing.assert_allclose(term.value, 0.3 * expected, rtol=tolerance)
+    np.testing.assert_allclose(term.metrics["unrest"], expected, rtol=tolerance)
+    assert 0 < term.metrics["still"] < 1
+
+
+def test_other_steps_draw_other_rows():
+    spec, params = AccelerationSpec(samples=3), scene()
+    values = {float(ask(spec, params, 0.4, seed=seed).value) for seed in range(4)}
+    assert len(values) == 4
+
+
+def linear(params, time):
+    gaussians = rows.activate(params.rows["splats"])
+    swing = params.rows["amplitude"] * jnp.sin(5 * time)
+    return gaussians._replace(mean=gaussians.mean + swing)
+
+
+def test_its_weight_does_not_depend_on_the_unit_of_length(float64):
+    spec = AccelerationSpec()
+    small, large = (
+        ask(spec, scene(dtype="float64", size=x), 0.4, at_time=linear, extent=x)
+        for x in (1.0, 1000.0)
+    )
+    np.testing.assert_allclose(small.value, large.value, rtol=1e-9)
+
+
+def test_gradients_of_the_effect(float64):
+    """Through a motion whose displacement, and so the weight, is held at `now`."""
+    spec = AccelerationSpec(decay=1e6)  # the weight is 1 to 1e-8
+    params = scene(dtype="float64")
+    effect = acceleration.effect(spec, 1.0, 11)
+    moment = Moment(jnp.asarray(0.4), jnp.asarray(0), jax.random.key(0))
+
+    def total(amplitude):
+        swung = params._replace(rows=params.rows | {"amplitude": amplitude})
+        return 1e16 * effect.penalty(Around(swung, swinging, moment, None)).value
+
+    assert gradients.directional_error(total, params.rows["amplitude"]) < 1e-6
+
+
+@pytest.mark.hard_cases
+def test_without_living_rows_there_is_nothing(dtype):
+    term = ask(AccelerationSpec(), scene(alive=np.zeros(12, bool), dtype=dtype), 0.4)
+    assert term.value == 0
+    assert term.metrics["still"] == 0
+
+
+MOTION = MotionSpec(
+    position=EncodingSpec(2), time=EncodingSpec(3), depth=2, width=16, skips=()
+)
+
+
+def travel(motion, params, net):
+    """Root mean square distance between the places at two times."""
+    params = Params(params.rows, {mlp_motion.NAME: net})
+    gaussians = rows.activate(params.rows["splats"])
+    one, other = (
+        motion.deform(params, gaussians, Moment(jnp.asarray(time)), None).mean
+        for time in (0.3, 0.5)
+    )
+    return float(jnp.sqrt(jnp.mean(jnp.square(one - other))))
+
+
+def test_under_a_network_it_waits_for_its_start_and_then_stills_it():
+    """Through the scene's own seams: smoothing, blocks and a warm-up are in the way."""
+    motion = mlp_motion.effect(MOTION, steps=5000, frames=11)
+    params = scene()
+    net = motion.init_nets(jax.random.key(1))
+    heads = jax.tree.map(lambda leaf: 300 * leaf, net.trunk.heads)
+    net = net._replace(trunk=net.trunk._replace(heads=heads))
+    params = Params(params.rows, {mlp_motion.NAME: net})
+    spec = AccelerationSpec(start=4000, decay=0.1)
+    effect = acceleration.effect(spec, 1.0, 11)
+
+    def penalty(net, step):
+        moment = Moment(jnp.asarray(0.4), step, jax.random.key(0))
+
+        def at_time(params, time):
+            gaussians = rows.activate(params.rows["splats"])
+            then = moment._replace(time=time)
+            return deformation.pose_in_training((motion,), params, gaussians, then)
+
+        here = Params(params.rows, {mlp_motion.NAME: net})
+        return effect.penalty(Around(here, at_time, moment, None)).value
+
+    run = jax.jit(jax.value_and_grad(penalty))
+    value, slopes = run(net, jnp.asarray(3999))
+    assert value == 0
+    assert not any(np.asarray(leaf).any() for leaf in jax.tree.leaves(slopes))
+    value, slopes = run(net, jnp.asarray(4000))
+    assert value > 0
+    leaves = jax.tree.leaves(slopes)
+    assert all(np.isfinite(leaf).all() for leaf in leaves)
+    assert any(np.asarray(leaf).any() for leaf in leaves)
+    tx = optax.chain(scale_by_row_adam(), optax.scale(-2e-3))
+
+    def descend(_, carry):
+        net, moments = carry
+        update, moments = tx.update(run(net, jnp.asarray(4000))[1], moments)
+        return optax.apply_updates(net, update), moments
+
+    stilled, _ = jax.lax.fori_loop(0, 200, descend, (net, tx.init(net)))
+    assert travel(motion, params, stilled) < 0.3 * travel(motion, params, net)
+    program = run.lower(net, jnp.asarray(0)).compile().as_text()
+    assert "conditional" in program
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ({"weight": -1.0}, "weight=-1.0 must be finite and not negative"),
+        ({"drift": float("nan")}, "drift=nan"),
+        ({"decay": 0.0}, "decay=0.0 must be finite and positive"),
+        ({"interval": float("inf")}, "interval=inf"),
+        ({"samples": 0}, "samples >= 1"),
+        ({"start": -1}, "start >= 0"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(setting, message):
+    with pytest.raises(ValueError, match=message):
+        AccelerationSpec(**setting)
+
+
+def test_a_single_frame_has_no_acceleration():
+    with pytest.raises(ValueError, match="at least two frames"):
+        acceleration.effect(AccelerationSpec(), 1.0, 1)
