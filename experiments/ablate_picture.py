@@ -46,9 +46,12 @@ def draw(
     """The truth above, then render, error, depth and tracks of every arm in its row.
 
     `colour` and `depth` are of the shown frame. White: where points are and were;
-    orange: where they are followed to; red: from one to the other.
+    orange: where they are followed to; red: from one to the other. Of a real capture
+    only the pictures are known, and depths are shown between the limits of the first.
     """
     row = int(known.rows[shown])
+    if not known.exact:
+        return _draw_filmed(capture, row, colour, depth)
     truth, true_depth = capture.images[row], capture.depths[row]
     coloured = pictures.colour_depth(true_depth)
     limits = coloured.low, coloured.high
@@ -63,6 +66,18 @@ def draw(
         panels += [_enlarged(panel) for panel in (rendered, error, deep)]
         panels.append(_tracks(capture, known, path[arm], row))
         labels += [arm, f"error, to {LARGEST_ERROR:g}", "depth", captions[arm]]
+    return pictures.contact_sheet(panels, labels)
+
+
+def _draw_filmed(capture, row, colour, depth):
+    truth, limits, panels, labels = capture.images[row], None, [], []
+    for arm, rendered in colour.items():
+        error = pictures.colour_error(rendered, truth, LARGEST_ERROR).picture
+        coloured = pictures.colour_depth(depth[arm], limits=limits)
+        limits = coloured.low, coloured.high
+        shown = (truth, rendered, error, coloured.picture)
+        panels += [_enlarged(panel) for panel in shown]
+        labels += [capture.ids[row], arm, f"error, to {LARGEST_ERROR:g}", "depth"]
     return pictures.contact_sheet(panels, labels)
 
 

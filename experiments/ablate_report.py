@@ -2,42 +2,44 @@
 
 import math
 
-import numpy as np
-
-from experiments import ablate_arms, ablate_picture, ablate_protocol
+from experiments import (
+    ablate_arms,
+    ablate_measures,
+    ablate_picture,
+    ablate_protocol,
+    ablate_verdicts,
+)
 from experiments import settings as run_settings
-from experiments.ablate_arms import ARMS, MEASURES, Numbers
+from experiments.ablate_measures import MEASURES
+from experiments.ablate_verdicts import Numbers
 from nerfies_jax.measure import clock
 from nerfies_jax.measure.clock import Metric
 
 
-def write(job, finished) -> None:
-    """ablation.json and ablation.png in the job's folder; prints table and claims.
+def write(job, budget, finished) -> None:
+    """ablation.json and ablation.png in the budget's folder; prints table and claims.
 
-    `finished` holds what `ablate.Job.run` returned, by arm and seed.
+    `finished` holds what was kept under this budget, by arm and seed.
     """
     numbers = {key: kept.numbers for key, kept in finished.items()}
     still = ablate_protocol.still_error(job.known)
-    found = ablate_arms.verdicts(numbers)
-    print(ablate_arms.table(numbers, still))
-    print(ablate_arms.LEGEND)
-    for (name, seed), kept in finished.items():
-        if kept.notes["stopped_by"] != "steps":
-            print(
-                f"{name}, seed {seed}: stopped at step {kept.notes['steps']} by "
-                f"{kept.notes['stopped_by']}"
-            )
-        if kept.notes.get("points_ever_lost"):
-            print(
-                f"{name}, seed {seed}: {kept.notes['points_ever_lost']} of "
-                f"{kept.notes['points']} points were not found at some instant"
-            )
+    found = ablate_verdicts.verdicts(numbers, judged(job))
+    print(f"\n{job.capture.name}, each arm trained {budget.title}; the last iterate")
+    print(ablate_verdicts.table(numbers, still))
+    print(ablate_measures.legend(ablate_measures.shown(numbers)))
+    for line in remarks(finished):
+        print(line)
     print()
-    print(ablate_arms.claims_text(found))
+    print(ablate_verdicts.claims_text(found) or "no claim has both of its arms here")
+    if job.suite.context:
+        print("\n" + job.suite.context)
     about = {
-        "scene": job.capture.name,
+        "capture": job.capture.name,
         "settings": run_settings.as_json(job.asked),
-        "arms": {name: run_settings.as_json(arm) for name, arm in ARMS.items()},
+        "budget": {"steps": budget.steps, "seconds": budget.seconds},
+        "arms": {
+            name: run_settings.as_json(arm) for name, arm in job.suite.arms.items()
+        },
         "seeds": {
             name: [s for other, s in finished if other == name]
             for name in dict.fromkeys(name for name, _ in finished)
@@ -45,9 +47,33 @@ def write(job, finished) -> None:
         "claims": [_claim(verdict) for verdict in found],
         "machine": clock.machine(),
     }
-    clock.write_metrics(job.out / "ablation.json", metrics(numbers, still), about)
-    _picture(job, finished)
-    print(f"{job.out / 'ablation.png'} and {job.out / 'ablation.json'}")
+    clock.write_metrics(budget.folder / "ablation.json", metrics(numbers, still), about)
+    _picture(job, finished, budget.folder / "ablation.png")
+    print(f"{budget.folder / 'ablation.png'} and {budget.folder / 'ablation.json'}")
+
+
+def judged(job) -> list:
+    """The claims of the suite, by pictures alone where nothing else is known."""
+    if job.known.exact:
+        return list(job.suite.claims)
+    return [claim._replace(measures=ablate_arms.WHOLE) for claim in job.suite.claims]
+
+
+def remarks(finished) -> list[str]:
+    """What the table does not show: runs that ended early, points that were lost."""
+    found = []
+    for (name, seed), kept in finished.items():
+        if kept.notes["stopped_by"] != "steps":
+            found.append(
+                f"{name}, seed {seed}: stopped at step {kept.notes['steps']} by "
+                f"{kept.notes['stopped_by']}"
+            )
+        if kept.notes.get("points_ever_lost"):
+            found.append(
+                f"{name}, seed {seed}: {kept.notes['points_ever_lost']} of "
+                f"{kept.notes['points']} points were not found at some instant"
+            )
+    return found
 
 
 def metrics(numbers: Numbers, still: float) -> list[Metric]:
@@ -56,7 +82,7 @@ def metrics(numbers: Numbers, still: float) -> list[Metric]:
     for arm in dict.fromkeys(arm for arm, _ in numbers):
         rows = [row for (name, _), row in numbers.items() if name == arm]
         for name, measure in MEASURES.items():
-            values = np.asarray([row[name] for row in rows], float)
+            values = ablate_verdicts.values_of(rows, name)
             found.append(
                 Metric(
                     f"{arm}.{name}",
@@ -66,7 +92,7 @@ def metrics(numbers: Numbers, still: float) -> list[Metric]:
                     measure.tolerance,
                 )
             )
-            if len(rows) > 1:
+            if len(values) > 1:
                 spread = float(values.std(ddof=1))
                 found.append(
                     Metric(
@@ -91,18 +117,20 @@ def _claim(verdict):
     }
 
 
-def _picture(job, finished):
-    """Of the first seed that each arm has."""
-    shown = ablate_picture.shown_row(job.known, job.capture)
+def _picture(job, finished, path):
+    """Of the first seed that each arm has; a few arms, or what there is of others."""
     first = {}
     for (name, _), kept in finished.items():
         first.setdefault(name, kept)
+    few = [name for name in job.suite.pictured if name in first]
+    first = {name: first[name] for name in few or list(first)}
+    shown = ablate_picture.shown_row(job.known, job.capture)
     captions = {}
     for name, kept in first.items():
         error = kept.numbers["track_error"]
         captions[name] = f"tracks, EPE {error:.4f}"
         if math.isnan(error):
-            captions[name] = "no warp: points stay"
+            captions[name] = "no motion: points stay"
     ablate_picture.save(
         ablate_picture.draw(
             job.capture,
@@ -113,5 +141,5 @@ def _picture(job, finished):
             captions,
             shown,
         ),
-        job.out / "ablation.png",
+        path,
     )

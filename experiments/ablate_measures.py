@@ -1,0 +1,75 @@
+"""What an ablation measures of every arm; no JAX."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+
+class Measure(NamedTuple):
+    """One number of a trained arm."""
+
+    heading: str  # in the table
+    unit: str
+    direction: str  # which is better: "lower" or "higher"; "equal" for neither
+    tolerance: float  # how much worse a later run may be, in the unit
+    digits: int  # behind the point
+
+
+MEASURES = {
+    "psnr": Measure("PSNR", "dB", "higher", 0.5, 2),
+    "ssim": Measure("SSIM", "", "higher", 0.02, 3),
+    "moving_psnr": Measure("moving", "dB", "higher", 0.5, 2),
+    "moving_ssim": Measure("SSIM", "", "higher", 0.03, 3),
+    "depth_median": Measure("depth", "scene units", "lower", 0.002, 4),
+    "depth_rmse": Measure("RMSE", "scene units", "lower", 0.01, 4),
+    "moving_depth_median": Measure("moving", "scene units", "lower", 0.005, 4),
+    "moving_depth_rmse": Measure("RMSE", "scene units", "lower", 0.02, 4),
+    "track_error": Measure("EPE", "scene units", "lower", 0.003, 4),
+    "track_correct": Measure("<0.01", "", "higher", 0.05, 2),
+    "track_lost": Measure("lost", "", "lower", 0.02, 3),
+    "drift": Measure("drift", "scene units", "lower", 0.002, 4),
+    "strain": Measure("strain", "", "lower", 0.1, 2),
+    "gaussians": Measure("Gauss.", "", "equal", 2000.0, 0),
+    "parameters": Measure("params", "", "equal", 1e5, 0),
+    "steps": Measure("steps", "", "equal", 1000.0, 0),
+    "train_seconds": Measure("train s", "s", "lower", 60.0, 0),
+    "train_cpu_seconds": Measure("CPU s", "s", "lower", 60.0, 0),
+    "compile_seconds": Measure("compile", "s", "lower", 10.0, 1),
+    "render_ms": Measure("frame ms", "ms", "lower", 500.0, 0),
+}
+
+COSTS = tuple(MEASURES)[tuple(MEASURES).index("gaussians") :]  # the others are quality
+
+# One line and more for the columns of a group; a group is explained where it is shown.
+LEGENDS = {
+    "psnr": "PSNR, SSIM: of the 8-bit picture of a held-out camera, mean over the "
+    "frames; SSIM is\nscikit-image's Gaussian form (sigma 1.5).",
+    "moving_psnr": "moving: the same two over the pixels that show moving things.",
+    "depth_median": "depth, RMSE: median and root mean square of the error, scene "
+    "units; then of moving pixels.",
+    "track_error": "EPE: mean distance of points followed from the middle instant to "
+    "where they really are;\n<0.01: share nearer than that; lost: share that was not "
+    "found and counts as not moved.\nstill: the EPE of a point that does not move, all "
+    "that a scene without motion can say.",
+    "drift": "drift: how far static points wander.",
+    "strain": "strain: ||log S|| of the warp's Jacobian (root mean square).",
+    "gaussians": "Gauss.: living Gaussians at the end.",
+    "parameters": "params: trained numbers, 4 bytes each.",
+    "train_seconds": "train s: steps and what happens between them, without compiling "
+    "the step; CPU s: the\nsame of all threads; compile: the step's programs, as "
+    "without a cache (what one from the cache\nonce took is added); frame ms: "
+    "rendering a held-out frame.",
+}
+
+
+def shown(numbers: Mapping[tuple[str, int], Mapping[str, float]]) -> list[str]:
+    """The measures that any arm has a number for."""
+    return [
+        name
+        for name in MEASURES
+        if any(row[name] == row[name] for row in numbers.values())  # not NaN
+    ]
+
+
+def legend(names) -> str:
+    """What the columns mean, of those that are shown."""
+    return "\n".join(text for name, text in LEGENDS.items() if name in names)
