@@ -8,9 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from gaussians_jax import rates
 from gaussians_jax.effects import spectral
 from gaussians_jax.effects.effect import Moment, Shot
 from gaussians_jax.effects.spectral import FourierSpec, Gates, SpectralSpec, WaveletSpec
+from gaussians_jax.optimiser import scale_by_row_adam
 from gaussians_jax.splats import Params
 from nerfies_jax.training.model import Rendering
 from tests import gradients
@@ -386,6 +388,34 @@ def test_the_effect_weighs_logs_and_trains_what_its_gate_has(gate, rng):
     np.testing.assert_allclose(metrics["wavelet_weight"], 0.05, rtol=1e-6)
     if learned:
         np.testing.assert_allclose(filled_in.net_rate(step_of(5)), 1e-2)
+
+
+def test_the_scenes_optimiser_shuts_a_learned_gate_down_to_its_least(rng):
+    spec = SpectralSpec(rate=1.0)
+    made = spectral.effect(spec, 10)
+    shot = shot_of(*(picture(rng, 4, 4, "float32") for _ in range(2)))
+    optimiser = scale_by_row_adam()
+    params = Params({}, {"spectral": made.init_nets(jax.random.key(0))})
+
+    @jax.jit
+    def update(state, step):
+        params, moments = state
+
+        def value(params):
+            moment = Moment(jnp.asarray(0.0), step, jax.random.key(0))
+            term = made.image_loss(params, shot, moment)
+            return term.value, term.metrics["wavelet_weight"]
+
+        slopes, weight = jax.grad(value, has_aux=True)(params)
+        along, moments = optimiser.update(slopes, moments, params)
+        rate = Params({}, {"spectral": made.net_rate(step)})
+        return (rates.descend(params, along, rate), moments), weight
+
+    state = params, optimiser.init(params)
+    _, seen = jax.lax.scan(update, state, jnp.arange(200))
+    assert np.all(np.diff(seen) <= 0)
+    assert seen[1] < 0.9 * seen[0]
+    np.testing.assert_allclose(seen[-1], 0.1 * spectral.LEAST_OPENING, rtol=1e-6)
 
 
 @pytest.mark.parametrize("absent", ["wavelet", "fourier"])
