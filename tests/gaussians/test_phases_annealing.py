@@ -1,0 +1,136 @@
+"""How the canonical positions come to rest."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gaussians_jax import phases, rates
+from gaussians_jax.phases import AnnealingSpec
+from gaussians_jax.rates import RateSpec
+from gaussians_jax.splats import Params, Splats
+from nerfies_jax.training import schedules
+
+MAIN = schedules.log_linear(1.6e-4, 1.6e-6, 1000)
+ANNEALING = AnnealingSpec(after=750)
+SHAPES = (3,), (3,), (4,), (), (1, 3), (3, 3)  # of a row
+
+
+def exact_rate(step, spec, steps):
+    """Equation 8 in Python floats."""
+
+    def main(i):
+        return 1.6e-4 * (1.6e-6 / 1.6e-4) ** (i / steps)
+
+    if step >= steps * (1 - spec.freeze_share):
+        return 0.0
+    if step < spec.after:
+        return main(step)
+    return main(spec.after) * math.exp(
+        -spec.decay * (step - spec.after) / (steps - spec.after)
+    )
+
+
+def test_the_annealed_rate_is_equation_8_in_one_scan(dtype):
+    schedule = phases.annealed(MAIN, ANNEALING, 1000)
+    traced = jax.lax.scan(lambda i, _: (i + 1, schedule(i)), 0, None, length=1001)[1]
+    exact = [exact_rate(step, ANNEALING, 1000) for step in range(1001)]
+    np.testing.assert_allclose(
+        traced, exact, rtol={"float32": 1e-6, "float64": 1e-12}[dtype]
+    )
+    assert traced.dtype.name == dtype
+
+
+@pytest.mark.hard_cases
+def test_the_annealed_rate_is_exact_at_its_ends(dtype):
+    schedule = jax.jit(phases.annealed(MAIN, ANNEALING, 1000))
+    main = jax.jit(MAIN)
+    for step in (0, 1, 300, 749, 750):
+        np.testing.assert_array_equal(schedule(step), main(step))
+    # Continuous: from one step to the next it falls by its slope, 2 % at most.
+    assert 0.97 < float(schedule(751)) / float(schedule(749)) < 1
+    assert float(schedule(949)) > 0
+    for step in (950, 951, 999, 1000, 5000):
+        assert float(schedule(step)) == 0
+
+
+@pytest.mark.hard_cases
+def test_annealing_counts_steps_beyond_the_integers_of_float32(dtype):
+    steps, after = 40_000_000, 30_000_001
+    schedule = phases.annealed(
+        lambda step: jnp.ones(()), AnnealingSpec(after=after), steps
+    )
+    assert float(schedule(after)) == 1
+    np.testing.assert_allclose(
+        1 - float(schedule(after + 200_000)),
+        -math.expm1(-5 * 200_000 / (steps - after)),
+        rtol={"float32": 2e-6, "float64": 1e-12}[dtype],
+    )
+
+
+@pytest.mark.parametrize("step", [800, np.int32(800), np.int64(800), jnp.asarray(800)])
+def test_annealing_takes_any_kind_of_step(step):
+    schedule = phases.annealed(MAIN, ANNEALING, 1000)
+    np.testing.assert_allclose(schedule(step), exact_rate(800, ANNEALING, 1000), 1e-6)
+
+
+def test_an_annealing_without_freezing_trains_to_the_last_step():
+    spec = AnnealingSpec(after=0, decay=2.0, freeze_share=0.0)
+    schedule = phases.annealed(lambda step: jnp.ones(()), spec, 10)
+    ends = [float(schedule(step)) for step in (0, 9, 10)]
+    np.testing.assert_allclose(ends, [1, math.exp(-1.8), 0], rtol=1e-6)
+
+
+def test_only_the_rate_of_the_means_is_annealed():
+    spec = RateSpec()
+
+    @jax.jit
+    def both(step):
+        return (
+            rates.learning_rates(spec, 2.0, 1000, step, ANNEALING),
+            rates.learning_rates(spec, 2.0, 1000, step),
+        )
+
+    for step in (10, 800, 960):
+        annealed, plain = both(jnp.asarray(step))
+        expected = 2 * exact_rate(step, ANNEALING, 1000)
+        np.testing.assert_allclose(annealed.mean, expected, rtol=1e-6)
+        assert annealed._replace(mean=None) == plain._replace(mean=None)
+    still, step = RateSpec(mean=0.0), jnp.asarray(800)
+    assert float(rates.learning_rates(still, 2.0, 1000, step, ANNEALING).mean) == 0
+
+
+def test_at_the_end_the_means_stand_still_bit_for_bit():
+    params = Params(
+        {"splats": Splats(*(jnp.ones((4, *shape)) for shape in SHAPES))},
+        {"w": jnp.ones((4, 4))},
+    )
+    directions = jax.tree.map(jnp.ones_like, params)
+
+    @jax.jit
+    def after(step):
+        rate = rates.learning_rates(RateSpec(), 2.0, 1000, step, ANNEALING)
+        rate = Params({"splats": rate}, {"w": 1e-3})
+        return rates.descend(params, directions, rate)
+
+    mean = params.rows["splats"].mean
+    np.testing.assert_array_equal(after(950).rows["splats"].mean, mean)
+    assert (after(949).rows["splats"].mean != mean).any()
+    assert (after(950).nets["w"] != params.nets["w"]).all()
+
+
+@pytest.mark.parametrize(
+    ("make_spec", "words"),
+    [
+        (lambda: AnnealingSpec(-1), "after=-1"),
+        (lambda: AnnealingSpec(1, decay=-1.0), "decay=-1.0"),
+        (lambda: AnnealingSpec(1, decay=math.nan), "decay=nan"),
+        (lambda: AnnealingSpec(1, freeze_share=1.0), r"lie in \[0, 1\)"),
+        (lambda: phases.annealed(MAIN, AnnealingSpec(950), 1000), "3/4 of the run"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused_with_their_bound(make_spec, words):
+    with pytest.raises(ValueError, match=words):
+        make_spec()
