@@ -146,7 +146,7 @@ SONATA = Suite(
         ),
         Claim(
             "An RBF-KAN on embeddings beats deformable 3DGS (the paper's own 'w/ MLP': "
-            "other inputs, too)",
+            "other inputs, losses and optimiser, too)",
             "full",
             "deformable",
             TRACKED,
@@ -204,7 +204,8 @@ MOBA = Suite(
             MOVING,
         ),
         Claim(
-            "Spatially varying bases beat deformable 3DGS",
+            "Spatially varying bases beat deformable 3DGS (whole methods: all parts "
+            "differ)",
             "full",
             "deformable",
             TRACKED,

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 
-from experiments import ablate, ablate_kept, settings
+from experiments import ablate, ablate_job, ablate_kept, settings
 from experiments.ablate_arms import FIELDS, SUITES
 from experiments.ablate_job import Job
 from experiments.ablate_kept import Kept
@@ -35,6 +35,65 @@ def test_arms_differ_from_nerfies_only_in_what_their_name_says():
     shared = ("steps", "rays", "sampling", "template", "coarse", "extent", "rate")
     for spec in specs.values():
         assert all(getattr(spec, x) == getattr(whole, x) for x in shared)
+
+
+GAUSSIAN = {
+    "sonata": {
+        "no-position": {"motion.position": False},
+        "no-scale": {"motion.scale": False},
+        "no-rotation": {"motion.rotation": False},
+        "mlp": {"motion.network": "mlp"},
+        "no-frequency": {"spectral": None},
+        "no-depth": {"depth": None},
+        "no-neighbours": {"neighbours": None},
+    },
+    "moba": {
+        "no-basis": {"motion.count": None},
+        "no-annealing": {"annealing": None},
+        "no-motion-growth": {"motion_growth": None},
+        "hard-growth": {"motion_growth.form": "hard"},
+        "no-alternation": {"alternation": None},
+        "no-acceleration": {"acceleration": None},
+        "k2": {"motion.count": 2},
+        "k4": {"motion.count": 4},
+        "k16": {"motion.count": 16},
+        "k32": {"motion.count": 32},
+    },
+}
+
+
+def plain(spec, path=""):
+    """The fields of a spec by their dotted names, a removed part as None."""
+    found = {}
+    for field in dataclasses.fields(spec):
+        value = getattr(spec, field.name)
+        if dataclasses.is_dataclass(value):
+            found |= plain(value, f"{path}{field.name}.")
+        else:
+            found[path + field.name] = value
+    return found
+
+
+@pytest.mark.parametrize("suite", GAUSSIAN)
+@pytest.mark.parametrize("steps", [ablate_job.PILOT_STEPS, 3000])
+def test_arms_of_a_paper_differ_from_the_whole_only_in_what_their_name_says(
+    suite, steps
+):
+    job = types.SimpleNamespace(suite=SUITES[suite], asked=ablate.Ablate())
+    specs = {name: Job.spec(job, name, steps) for name in SUITES[suite].arms}
+    assert {spec.steps for spec in specs.values()} == {steps}
+    whole = plain(specs["full"])
+    for name, expected in GAUSSIAN[suite].items():
+        found = plain(specs[name])
+        changed = {key for key in found if found[key] != whole.get(key, "absent")}
+        assert changed == set(expected), name
+        assert {key: found[key] for key in changed} == expected
+        gone = {key.split(".")[0] for key in whole.keys() - found.keys()}
+        assert gone == {key for key, value in expected.items() if value is None} - {
+            "motion.count"
+        }
+    assert set(specs) == {"full", "deformable", "static", *GAUSSIAN[suite]}
+    assert (specs["static"].motion, specs["deformable"].motion is None) == (None, False)
 
 
 @pytest.fixture
