@@ -2,6 +2,7 @@
 
 import hashlib
 import math
+import os
 import pathlib
 import sys
 import time
@@ -63,6 +64,11 @@ class Job:
 
     def __init__(self, asked):
         self.asked, self.suite = asked, SUITES[asked.suite]
+        if asked.jobs > 1 and jax.default_backend() != "cpu":
+            raise ValueError(
+                f"--jobs {asked.jobs}: several processes would fight for one "
+                f"{jax.default_backend()}; leave it out, or use --device cpu"
+            )
         self._open()
         self.names = asked.arms or tuple(
             name
@@ -140,6 +146,9 @@ class Job:
         if self.asked.jobs > 1:
             from experiments import ablate_pool
 
+            cores = len(os.sched_getaffinity(0))
+            if self.asked.jobs > cores:
+                say(f"{cores} cores for {self.asked.jobs} jobs: their times will tell")
             return ablate_pool.run(self)
         began, longest = time.monotonic(), 0.0
         tasks = self.tasks()

@@ -24,7 +24,7 @@ def write(job, budget, finished) -> None:
     numbers = {key: kept.numbers for key, kept in finished.items()}
     still = ablate_protocol.still_error(job.known)
     found = ablate_verdicts.verdicts(numbers, judged(job))
-    print(f"\n{job.capture.name}, each arm trained {budget.title}; the last iterate")
+    print(f"\n{job.capture.name}, each arm trained {budget.title}:")
     print(ablate_verdicts.table(numbers, still))
     print(ablate_measures.legend(ablate_measures.shown(numbers)))
     for line in remarks(finished):

@@ -134,6 +134,12 @@ def test_a_wrong_setting_is_one_line_and_exit_code_two(tiny, capsys, arguments, 
     assert "Traceback" not in error
 
 
+def test_several_processes_do_not_share_an_accelerator(tiny, monkeypatch, capsys):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert run(*tiny, "--jobs", "2") == 2
+    assert "would fight for one gpu" in capsys.readouterr().err
+
+
 def kept(steps, seconds, stopped_by="steps"):
     numbers = dict.fromkeys(MEASURES, 0.0) | {"train_seconds": seconds}
     return Kept(numbers, {}, {"steps": steps, "stopped_by": stopped_by})
