@@ -55,8 +55,8 @@ def scale_by_row_radam(
     not divided by its size: these updates are as small or as large as the gradients
     are. Then come Adam's, times `rectification`: 0.026 at first, half of Adam's after
     556 updates and 0.92 after 3000. So it is for every row born late, which has 0.15
-    of Adam's step after 50 updates and 0.31 after 200. The paper switches at a length of 4; 5 is what
-    its code and optax do.
+    of Adam's step after 50 updates and 0.31 after 200. The paper switches at a length
+    of 4; 5 is what its code and optax do.
     """
     _check_decays(b1, b2)
     longest = _longest(b2)
