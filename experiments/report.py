@@ -25,6 +25,7 @@ HEADLINES = {
     "heldout.ssim": "SSIM, held out",
     "train.seconds": "training",
     "render.ms_per_frame": "a frame",
+    "file.bytes": "the model file",
     "gaussians": "Gaussians",
     "parameters": "parameters",
 }

@@ -10,6 +10,14 @@ from nerfies_jax.capture.capture import Capture
 from nerfies_jax.training.model import Frames, Model, TrainState
 
 Spec = Any
+MODEL = "model.npz"  # in a run folder: all of a trained scene of Gaussians
+
+
+class Saved(NamedTuple):
+    """The files of a trained scene, beside its checkpoint."""
+
+    model_bytes: int | None = None  # of the one file that holds all of it
+    notes: tuple[str, ...] = ()  # what the reader should know of them
 
 
 class Representation(NamedTuple):
@@ -32,20 +40,24 @@ class Representation(NamedTuple):
     # None where the scene has no codes of its own for each frame.
     score_halves: Callable[..., evaluate.Halves | None]
     fitted_rays: int  # rendered to fit the codes of one frame
-    # (folder, spec, state) -> what the reader should know of the files it wrote
-    save: Callable[[pathlib.Path, Spec, TrainState], tuple[str, ...]]
+    # (folder, spec, facts, state) -> what it wrote beside the checkpoint
+    save: Callable[[pathlib.Path, Spec, Any, TrainState], Saved]
 
 
 @functools.cache
 def gaussians() -> Representation:
     """Gaussian splats, static or moving."""
-    from gaussians_jax import files, presets, scene
+    from gaussians_jax import files, model_file, presets, scene
 
-    def save(folder, spec, state):
+    def save(folder, spec, facts, state):
+        about = {"spec": spec, "facts": facts, "step": int(state.step)}
+        size = model_file.save(folder / MODEL, state.params, about)
         files.save(folder / "gaussians.ply", state.params.rows["splats"])
-        if spec.motion is None:
-            return ()
-        return ("gaussians.ply holds the canonical Gaussians, without their motion.",)
+        effects = scene.effects_of(spec, facts)
+        if all(effect.deform is None for effect in effects):
+            return Saved(size)
+        note = "gaussians.ply holds the canonical Gaussians, without their motion."
+        return Saved(size, (note,))
 
     return Representation(
         name="gaussians",
@@ -83,7 +95,7 @@ def radiance() -> Representation:
         variant=variants.of_fields,
         score_halves=held_out_codes.score,
         fitted_rays=held_out_codes.RAYS * held_out_codes.EVALUATIONS,
-        save=lambda folder, spec, state: (),  # the checkpoint holds all there is
+        save=lambda *_: Saved(),  # the checkpoint holds all there is
     )
 
 

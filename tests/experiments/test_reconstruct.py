@@ -4,12 +4,22 @@ import json
 import pathlib
 import re
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib import colormaps
 
-from experiments import reconstruct, render, representations
+from experiments import (
+    evaluate,
+    products,
+    reconstruct,
+    render,
+    representations,
+    runs,
+)
+from gaussians_jax import model_file, scene
 from nerfies_jax.capture import exr, images, nerfies_format, video
+from nerfies_jax.training.model import TrainState
 from tests import scenes
 
 QUICK = (
@@ -174,6 +184,7 @@ def test_a_run_leaves_all_its_files(run):
         "psnr_over_time.png",
         "scene.mp4",
         "gaussians.ply",
+        "model.npz",
         "report.html",
         "checkpoints/12",
     ):
@@ -186,12 +197,56 @@ def test_the_metrics_are_all_there_and_finite(run):
     metrics = json.loads((run / "metrics.json").read_text())
     quality = ["heldout.psnr", "heldout.ssim", "heldout.frames"]
     cost = ["train.seconds", "train.steps", "train.compile_seconds"]
-    cost += ["render.ms_per_frame", "memory.peak_bytes", "gaussians", "parameters"]
+    cost += [
+        "render.ms_per_frame",
+        "render.fps",
+        "file.bytes",
+        "memory.peak_bytes",
+        "gaussians",
+        "parameters",
+    ]
     wanted = [*quality, *cost]
     assert set(wanted) <= set(metrics)
     assert all(np.isfinite(metrics[key]) for key in wanted)
     assert metrics["train.steps"] == 12
     assert metrics["heldout.frames"] == 1
+    assert metrics["file.bytes"] == (run / "model.npz").stat().st_size
+    speed = metrics["render.fps"] * metrics["render.ms_per_frame"]
+    np.testing.assert_allclose(speed, 1000)
+
+
+@pytest.mark.slow
+def test_the_model_file_is_enough_to_draw_a_frame(run):
+    params, about = model_file.load(run / "model.npz")
+    model = scene.build(about["spec"], about["facts"])
+    state = TrainState(params, (), (), jnp.asarray(about["step"], jnp.int32), None)
+    capture = scenes.tiny_capture()
+    filmed = runs.saved_run(run)
+    renderer = evaluate.Renderer(model, filmed.capture.size)
+    found = evaluate.score(renderer, state, filmed.capture, filmed.capture.heldout)
+    metrics = json.loads((run / "metrics.json").read_text())
+    np.testing.assert_allclose(found.psnr.mean(), metrics["heldout.psnr"], atol=1e-3)
+    assert found.colour.shape[1:3] == capture.size[::-1]
+
+
+@pytest.mark.parametrize(("preset", "notes"), [("moba-small", 1), ("splats-static", 0)])
+def test_the_size_and_speed_stand_beside_the_papers(preset, notes):
+    saved = representations.Saved(2_345_678)
+    lines = products.beside_the_paper(preset, saved, 40.0)
+    assert len(lines) == notes
+    for line in lines:
+        for words in (
+            "2.3 MB",
+            "25 frames",
+            "11.3 MB",
+            "163 frames",
+            "A100",
+            "context",
+        ):
+            assert words in line
+    assert not products.beside_the_paper(preset, representations.Saved(), 40.0)
+    (size,) = products.model_size(saved)
+    assert (size.key, size.value) == ("file.bytes", 2_345_678)
 
 
 @pytest.mark.slow

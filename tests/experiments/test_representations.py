@@ -2,9 +2,12 @@
 
 import json
 
+import jax
 import pytest
 
 from experiments import representations, runs, settings
+from gaussians_jax import files, model_file, splats
+from tests import scenes
 
 CHOICES = dict(
     capture=None,
@@ -50,6 +53,24 @@ def test_a_preset_takes_steps_and_settings():
     )
     spec = runs.scene_spec(choices)
     assert (spec.steps, spec.sh_degree) == (50, 0)
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_a_scene_of_gaussians_is_saved_as_a_model_and_for_viewers(moving, tmp_path):
+    kind = representations.named("gaussians")
+    spec = scenes.TINY_DEFORMABLE if moving else scenes.TINY_SPLATS
+    capture = scenes.tiny_capture()
+    facts = kind.facts_of(capture, spec)
+    state = kind.build(spec, facts).init(capture, jax.random.key(0))
+    saved = kind.save(tmp_path, spec, facts, state)
+    assert saved.model_bytes == (tmp_path / representations.MODEL).stat().st_size
+    assert [note.split()[0] for note in saved.notes] == ["gaussians.ply"] * moving
+    params, about = model_file.load(tmp_path / representations.MODEL)
+    assert about == {"spec": spec, "facts": facts, "step": 0}
+    assert jax.tree.structure(params) == jax.tree.structure(state.params)
+    living = splats.alive(state.params.rows["splats"]).sum()
+    assert len(params.rows["splats"].mean) == living
+    assert len(files.load(tmp_path / "gaussians.ply").splats.mean) == living
 
 
 @pytest.fixture
