@@ -4,6 +4,7 @@ import pathlib
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 
 from experiments.knot_curve import Curve
 from nerfies_jax.capture.json_files import replaced_file
@@ -47,8 +48,11 @@ def save(path: pathlib.Path, rows: list[dict], curve: Curve) -> None:
         xlabel="ms of one core for a pose (labels: knots)",
         xscale="log",
         ylabel="PSNR of the frame against the network's (dB)",
-        title=f"{curve.gaussians} Gaussians, {curve.moving} of them moving",
+        title=f"{curve.gaussians} Gaussians, {curve.moving} moving",
     )
+    quality.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    quality.xaxis.set_major_formatter("{x:g}")
+    quality.xaxis.set_minor_formatter("")
     for axes in (errors, quality):
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8)
