@@ -220,8 +220,9 @@ class Job:
         frames = evaluate.frames_of(self.capture, arm.model.wants)
         began, self._cache_saved = time.process_time(), 0.0
         result = loop.fit(arm.model, state, frames, steps=steps)
-        # Compiling keeps one thread busy.
-        cpu_seconds = time.process_time() - began - result.compile_seconds
+        # Compiling is taken out by its share of the time: its CPU time is not known.
+        share = result.seconds / (result.seconds + result.compile_seconds)
+        cpu_seconds = share * (time.process_time() - began)
         compile_seconds = result.compile_seconds + self._cache_saved
         if result.stopped_by.startswith("SIG"):
             print(f"stopped; go on with the same command and --out {self.out}")

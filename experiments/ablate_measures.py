@@ -56,8 +56,8 @@ LEGENDS = {
     "parameters": "params: trained numbers, 4 bytes each.",
     "train_seconds": "train s: steps and what happens between them, without compiling "
     "the step; CPU s: the\nsame of all threads; compile: the step's programs, as "
-    "without a cache (what one from the cache\nonce took is added); frame ms: "
-    "rendering a held-out frame.",
+    "without a cache (what one from it once took\nis added); frame ms: rendering a "
+    "held-out frame.",
 }
 
 
