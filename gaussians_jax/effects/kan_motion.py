@@ -1,0 +1,323 @@
+"""Motion as a network of Gaussian kernels, of a code for each Gaussian and the time.
+
+"Sonata", equation 11: a learnt embedding of each Gaussian and a learnt code of the time
+go through an RBF-KAN to residuals of position, scale and rotation. Where the paper is
+silent this follows Bae et al. 2024, "Per-Gaussian embedding-based deformation",
+arXiv:2404.03613 (E-D3DGS), whose inputs, neighbours and constants it shares. Of its two
+time tables, a coarse and a fine one that grows in training, there is one here.
+
+The first layer of the network is a sum over its inputs. What the embeddings add to it
+is the same at all times (`prepare`), what the time adds the same for all Gaussians.
+"""
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Key
+
+from gaussians_jax import splats
+from gaussians_jax.effects.blocks import in_blocks
+from gaussians_jax.effects.effect import Effect, Moment
+from gaussians_jax.splats import Gaussians, Params
+from nerfies_jax.geometry import quaternion
+from nerfies_jax.nets import codes, kan, mlp
+from nerfies_jax.nets.kan import KAN, KANSpec
+from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
+from nerfies_jax.training import schedules
+
+NAME = "kan_motion"
+NETWORKS = ("kan", "mlp")
+
+
+@dataclasses.dataclass(frozen=True)
+class KanMotionSpec:
+    """Sizes and schedule; the paper gives only the embedding's, the rest is E-D3DGS'.
+
+    `position`, `scale` and `rotation` say which residuals there are (the paper's
+    ablation): a head that is off has no parameters. `network` "mlp" is the paper's
+    ablation of the KAN: ReLU layers of the same inputs and heads, as many, and as wide
+    as makes the number of parameters equal, unless `mlp_width` says otherwise.
+    """
+
+    embedding: int = 32
+    time_code: int = 256
+    frames_per_code: int = 2  # a table of ceil(frames / 2) codes
+    # Standard deviation of the first embeddings and time codes. E-D3DGS starts from
+    # zero embeddings, which a penalty on differing neighbours never tells apart.
+    spread: float = 0.1
+    hidden: tuple[int, ...] = (128, 128)
+    kernels: int = 8
+    base: bool = True
+    norm: bool = True
+    trainable_kernels: bool = False
+    network: str = "kan"
+    mlp_width: int | None = None
+    position: bool = True
+    scale: bool = True
+    rotation: bool = True
+    warm_up: int = 0  # steps without motion
+    embedding_rate: float = 2.5e-3
+    rate: float = 1.6e-4  # of network and time codes
+    rate_end: float = 1.6e-5
+    block: int = 512  # Gaussians per evaluation
+
+    def __post_init__(self):
+        sizes = self.embedding, self.time_code, self.frames_per_code, self.block
+        if min(sizes) < 1 or self.warm_up < 0 or not self.hidden:
+            raise ValueError(
+                "embedding, time_code, frames_per_code and block are at least 1, "
+                "warm_up is not negative and there is a hidden layer; got "
+                f"embedding={self.embedding}, time_code={self.time_code}, "
+                f"frames_per_code={self.frames_per_code}, block={self.block}, "
+                f"warm_up={self.warm_up}, hidden={self.hidden}"
+            )
+        if self.network not in NETWORKS:
+            raise ValueError(
+                f"unknown network {self.network!r}; choose from {NETWORKS}"
+            )
+        if self.mlp_width is not None and self.network != "mlp":
+            raise ValueError(
+                f"mlp_width={self.mlp_width} is read by network='mlp' only"
+            )
+        if not (self.position or self.scale or self.rotation):
+            raise ValueError(
+                "position, scale and rotation are all off; leave the motion out instead"
+            )
+        if not 0 < self.spread < math.inf:
+            raise ValueError(
+                f"spread={self.spread}: equal codes stay equal; start at about 0.1"
+            )
+        if not (0 < self.rate_end <= self.rate and self.embedding_rate > 0):
+            raise ValueError(
+                f"the rate falls from rate={self.rate} to rate_end={self.rate_end}, "
+                f"and embedding_rate={self.embedding_rate} is positive"
+            )
+        field_spec(self)  # checks what the network is made of
+
+
+class KanMotion(NamedTuple):
+    """Parameters that all Gaussians share; the embeddings are rows."""
+
+    times: Float[Array, "moments code"]  # evenly over [0, 1]
+    field: KAN | MLP
+
+
+class Offsets(NamedTuple):
+    """How far Gaussians are from their canonical state; None where that is off."""
+
+    position: Float[Array, "gaussians 3"] | None  # scene units
+    log_scale: Float[Array, "gaussians 3"] | None  # added to the logarithm
+    turn: Float[Array, "gaussians 3"] | None  # rotation vector, rad, in world axes
+
+
+def field_spec(spec: KanMotionSpec) -> KANSpec | MLPSpec:
+    """The network from [embedding, time code] to the residuals that are on.
+
+    Its heads start at zero, and so does the motion.
+    """
+    kan_spec = _kan_spec(spec)
+    if spec.network == "kan":
+        return kan_spec
+    width = spec.mlp_width
+    if width is None:
+        width = equal_width(kan_spec)
+    return _mlp_spec(kan_spec, width)
+
+
+def _kan_spec(spec):
+    wanted = {
+        "position": spec.position,
+        "log_scale": spec.scale,
+        "turn": spec.rotation,
+    }
+    heads = tuple(
+        (name, HeadSpec(3, "zero")) for name, is_on in wanted.items() if is_on
+    )
+    return KANSpec(
+        inputs=spec.embedding + spec.time_code,
+        hidden=spec.hidden,
+        heads=heads,
+        kernels=spec.kernels,
+        base=spec.base,
+        norm=spec.norm,
+        trainable_kernels=spec.trainable_kernels,
+    )
+
+
+def _mlp_spec(spec: KANSpec, width):
+    return MLPSpec(spec.inputs, len(spec.hidden), width, spec.heads, (), "relu", "he")
+
+
+def equal_width(spec: KANSpec) -> int:
+    """The width of an MLP with the KAN's layers and nearest to its parameters."""
+    goal = parameter_count(spec)
+    width = 1
+    while parameter_count(_mlp_spec(spec, width + 1)) <= goal:
+        width += 1
+    below, above = (
+        abs(parameter_count(_mlp_spec(spec, w)) - goal) for w in (width, width + 1)
+    )
+    return width if below <= above else width + 1
+
+
+def parameter_count(spec: KANSpec | MLPSpec) -> int:
+    """How many numbers the network learns, whatever the number of Gaussians."""
+    each, trained = 1, 0
+    if isinstance(spec, KANSpec):
+        widths = spec.widths()
+        each = spec.kernels + spec.base
+        trained = 2 * spec.kernels * sum(widths) if spec.trainable_kernels else 0
+    else:
+        widths = (spec.inputs, *(spec.width,) * spec.depth)
+    outputs = (*widths[1:], sum(head.width for _, head in spec.heads))
+    return trained + sum(
+        each * read * made + made for read, made in zip(widths, outputs, strict=True)
+    )
+
+
+# Without SiLU, which takes a fifth of the time at this size.
+SMALL_KAN_MOTION = KanMotionSpec(time_code=16, hidden=(32, 32), kernels=5, base=False)
+
+
+def init_embedding(
+    key: Key[Array, ""], spec: KanMotionSpec, count: int, dtype=jnp.float32
+) -> Float[Array, "gaussians embedding"]:
+    """A normally distributed code for each Gaussian, alike in every precision."""
+    drawn = jax.random.normal(key, (count, spec.embedding), jnp.float32)
+    return spec.spread * drawn.astype(dtype)
+
+
+def init(
+    key: Key[Array, ""], spec: KanMotionSpec, frames: int, dtype=jnp.float32
+) -> KanMotion:
+    """A field that moves nothing yet, for a capture of `frames` to learn from."""
+    if frames < 1:
+        raise ValueError(f"frames={frames}: a motion is learnt from at least one frame")
+    times_key, field_key = jax.random.split(key)
+    moments = -(-frames // spec.frames_per_code)
+    scale = math.sqrt(3) * spec.spread  # of a uniform draw
+    times = codes.init(times_key, moments, spec.time_code, scale, dtype)
+    network = field_spec(spec)
+    init_field = kan.init if isinstance(network, KANSpec) else mlp.init
+    return KanMotion(times, init_field(network, field_key, dtype))
+
+
+def prepare(
+    params: KanMotion,
+    spec: KanMotionSpec,
+    embedding: Float[Array, "gaussians embedding"],
+    alive: Bool[Array, " gaussians"] | None = None,
+) -> Float[Array, "gaussians features"]:
+    """What the embeddings add to the first layer, whatever the time. Pure.
+
+    4 bytes for each feature of the first layer and Gaussian: 5 MB for 10,000 Gaussians
+    with the default sizes. Rows of blocks without a living one are zero.
+    """
+    return in_blocks(
+        lambda rows: _first_layer_part(spec, params.field, rows, 0),
+        (embedding,),
+        alive,
+        spec.block,
+    )
+
+
+def deform(
+    params: KanMotion,
+    spec: KanMotionSpec,
+    time: Float[Array, ""],
+    prepared: Float[Array, "gaussians features"],
+    alive: Bool[Array, " gaussians"] | None = None,
+) -> Offsets:
+    """Offsets of every Gaussian at one time; zero in blocks without a living row."""
+    code = codes.at_time(params.times, time)
+    share = _first_layer_part(spec, params.field, code, spec.embedding)
+    found = in_blocks(
+        lambda rows: _after_first_layer(spec, params.field, rows + share),
+        (prepared,),
+        alive,
+        spec.block,
+    )
+    return Offsets(*(found.get(name) for name in Offsets._fields))
+
+
+def _first_layer_part(spec, field, part, start):
+    """What the inputs from `start` on add to the first layer, without its bias."""
+    if isinstance(field, KAN):
+        return kan.first_layer_part(field_spec(spec), field, part, start)
+    return part @ field.hidden[0].weight[start : start + part.shape[-1]]
+
+
+def _after_first_layer(spec, field, first):
+    """The heads' outputs from the sum of the first layer's parts."""
+    network = field_spec(spec)
+    if isinstance(field, KAN):
+        return kan.after_first_layer(network, field, first)
+    layer, *others = field.hidden
+    features = mlp.ACTIVATIONS[network.activation](first + layer.bias)
+    rest = dataclasses.replace(network, inputs=network.width, depth=len(others))
+    return mlp.apply(rest, MLP(tuple(others), field.heads), features)
+
+
+def apply(gaussians: Gaussians, offsets: Offsets) -> Gaussians:
+    """Gaussians moved by the offsets there are.
+
+    Position adds. The logarithm of the scale adds, as in E-D3DGS, held to the range of
+    the scale's own. The paper's rotation has three numbers where a quaternion has four:
+    a rotation vector, applied after the Gaussian's own turn, exp(turn) q / |q|, of unit
+    length whatever the network says. Opacity and colour stay.
+    """
+    if offsets.position is not None:
+        gaussians = gaussians._replace(mean=gaussians.mean + offsets.position)
+    if offsets.log_scale is not None:
+        factor = jnp.exp(jnp.clip(offsets.log_scale, *splats.LOG_SCALE_RANGE))
+        gaussians = gaussians._replace(scale=gaussians.scale * factor)
+    if offsets.turn is not None:
+
+        def turned(turn, own):
+            return quaternion.multiply(quaternion.exp(turn), quaternion.normalise(own))
+
+        gaussians = gaussians._replace(
+            quaternion=jax.vmap(turned)(offsets.turn, gaussians.quaternion)
+        )
+    return gaussians
+
+
+def effect(spec: KanMotionSpec, steps: int, frames: int) -> Effect:
+    """The seams that this motion fills, for a run of `steps` over `frames`."""
+
+    def init_rows(key, count):
+        return init_embedding(key, spec, count)
+
+    def init_nets(key):
+        return init(key, spec, frames)
+
+    def embedding_rate(step):
+        return jnp.full((), spec.embedding_rate)
+
+    def prepared(params: Params) -> Float[Array, "gaussians features"]:
+        living = splats.alive(params.rows["splats"])
+        return prepare(params.nets[NAME], spec, params.rows[NAME], living)
+
+    def moved(
+        params: Params,
+        gaussians: Gaussians,
+        moment: Moment,
+        ready: Float[Array, "gaussians features"],
+    ) -> Gaussians:
+        living = splats.alive(params.rows["splats"])
+        offsets = deform(params.nets[NAME], spec, moment.time, ready, living)
+        return apply(gaussians, offsets)
+
+    return Effect(
+        name=NAME,
+        init_rows=init_rows,
+        init_nets=init_nets,
+        row_rate=embedding_rate,
+        net_rate=schedules.log_linear(spec.rate, spec.rate_end, steps),
+        warm_up=spec.warm_up,
+        prepare=prepared,
+        deform=moved,
+    )
