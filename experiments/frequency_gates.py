@@ -8,6 +8,12 @@ of `gaussians_jax.effects.spectral`, whose weights are ruled by each kind of gat
 rules that the library does not offer show why: "ascent" trains the gates against the
 loss, "log" rewards open ones with 0.01 log sigma. The table and the figure show PSNR
 and weights; the sentences below them are made from the numbers.
+
+Measured with the defaults, gain over L1 alone in dB (standard error): at weights of 0.1
+learned +0.1 (0.2), floor +0.35 (0.15), schedule +0.5 (0.2), fixed +0.9 (0.1); at 1
+learned -0.6 (0.4), fixed +0.5 (0.4), ascent +1.2 (0.3). So the losses help a little and
+the paper's gates take most of that away by shutting. How much depends on picture,
+network and steps; that learned gates shut does not.
 """
 
 import dataclasses
