@@ -9,25 +9,35 @@ import jax.numpy as jnp
 import numpy as np
 
 from gaussians_jax import splats, still_rows, time_knots
-from gaussians_jax.effects import deformation, mlp_motion, motion_basis
+from gaussians_jax.effects import deformation, kan_motion, mlp_motion, motion_basis
 from gaussians_jax.effects.effect import Effect
+from gaussians_jax.effects.kan_motion import SMALL_KAN_MOTION, KanMotionSpec
 from gaussians_jax.effects.mlp_motion import SMALL_MOTION, MotionSpec
 from gaussians_jax.effects.motion_basis import SMALL_BASIS_MOTION, BasisMotionSpec
 from gaussians_jax.splats import Params
 
+UNROLLED = 4  # kernels that a KAN's loop sums in one turn
+FRAMES = 100  # of the capture whose motion it would be
 KNOTS = 16  # of the tables that are timed; their number hardly changes the time
 
 
-class Arm(NamedTuple):
-    """One way to pose Gaussians, forward and, where it is trained, backward."""
+class Way(NamedTuple):
+    """A program that poses Gaussians, and its derivative where it is trained."""
 
-    name: str
     pose: Callable  # (*inputs) -> Gaussians
     inputs: tuple[Any, ...]
     gradient: Callable | None = None  # (*inputs) -> slopes
-    # The same, every Gaussian in one block: the compiler counts a loop's body once.
-    counted_pose: Callable | None = None
-    counted_gradient: Callable | None = None
+
+
+class Arm(NamedTuple):
+    """One way to pose Gaussians, as it is used and as the compiler can count it."""
+
+    name: str
+    used: Way
+    # Summed with these weights they have the operations of `used`. The compiler counts
+    # the body of a loop once: here every Gaussian is in one block, and a loop over
+    # kernels has one turn.
+    counted: tuple[tuple[float, Way], ...]
 
 
 class Network(NamedTuple):
@@ -47,6 +57,8 @@ NETWORKS = (
         mlp_motion.effect,
         False,
     ),
+    Network("RBF-KAN", KanMotionSpec(), kan_motion.effect, True),
+    Network("RBF-KAN, small", SMALL_KAN_MOTION, kan_motion.effect, False),
     Network("motion basis", BasisMotionSpec(), motion_basis.effect, True),
     Network("motion basis, small", SMALL_BASIS_MOTION, motion_basis.effect, False),
 )
@@ -54,12 +66,31 @@ NETWORKS = (
 
 def arms(count: int, still: float) -> list[Arm]:
     """All of them for `count` Gaussians, of which a share `still` need not be posed."""
-    time = jnp.asarray(0.37, jnp.float32)
     made = []
     for network in NETWORKS:
-        made += _network_arms(network, count, still, time)
-    made += _table_arms(count, time)
-    return made
+        used = _ways(network, network.spec, count, still)
+        counted = [
+            (weight, _ways(network, spec, count, still))
+            for weight, spec in in_one_turn(network.spec, count)
+        ]
+        for name, way in used.items():
+            parts = tuple((weight, ways[name]) for weight, ways in counted)
+            made.append(Arm(f"{network.name}{name}", way, parts))
+    return made + _table_arms(count)
+
+
+def in_one_turn(spec: Any, count: int) -> list[tuple[float, Any]]:
+    """Specs without loops whose operations, weighted, sum to those of `spec`."""
+    whole = dataclasses.replace(spec, block=count)
+    if getattr(spec, "kernels", 0) <= UNROLLED:
+        return [(1.0, whole)]
+    # Operations are a + b kernels: a line through two numbers that are one turn.
+    few, more = UNROLLED // 2, UNROLLED
+    beyond = (spec.kernels - more) / (more - few)
+    return [
+        (1 + beyond, dataclasses.replace(whole, kernels=more)),
+        (-beyond, dataclasses.replace(whole, kernels=few)),
+    ]
 
 
 def gaussians(count: int, seed: int = 0) -> Params:
@@ -82,92 +113,64 @@ def with_effect(params: Params, effect: Effect) -> Params:
     return Params(rows, nets)
 
 
-def _network_arms(network, count, still, time):
+def _ways(network, spec, count, still):
     """Whole, with what `prepare` returns kept, and without what stands still."""
+    time = jnp.asarray(0.37, jnp.float32)
+    effects = (network.effect(spec, 1, FRAMES),)
+    params = with_effect(gaussians(count), effects[0])
 
-    def effects(block=None):
-        spec = network.spec
-        spec = spec if block is None else dataclasses.replace(spec, block=block)
-        return (network.effect(spec, 1, 2),)
+    def pose(params, time):
+        ready = deformation.prepare(effects, params)
+        return deformation.pose(effects, params, ready, time)
 
-    blocked, whole = effects(), effects(count)
-    params = with_effect(gaussians(count), blocked[0])
+    def loss(params, time):
+        return sum(jnp.sum(jnp.sin(leaf)) for leaf in pose(params, time))
 
-    def posed(effects):
-        def pose(params, time):
-            ready = deformation.prepare(effects, params)
+    def pose_prepared(params, ready, time):
+        return deformation.pose(effects, params, ready, time)
+
+    def pose_moving(parts, ready, time):
+        def rows(params, time):
             return deformation.pose(effects, params, ready, time)
 
-        return pose
+        return still_rows.pose(parts, rows, time)
 
-    def sloped(pose):
-        def loss(params, time):
-            posed = pose(params, time)
-            return sum(jnp.sum(jnp.sin(leaf)) for leaf in posed)
-
-        return jax.grad(loss)
-
-    yield Arm(
-        network.name,
-        posed(blocked),
-        (params, time),
-        sloped(posed(blocked)),
-        posed(whole),
-        sloped(posed(whole)),
-    )
-    ready = jax.jit(lambda params: deformation.prepare(blocked, params))(params)
-    kept = jax.tree.leaves(ready)
+    prepare = jax.jit(lambda params: deformation.prepare(effects, params))
+    ready = prepare(params)
+    ways = {"": Way(pose, (params, time), jax.grad(loss))}
+    kept = ", prepared kept" if jax.tree.leaves(ready) else ""
     if kept:
-        yield Arm(
-            f"{network.name}, prepared kept",
-            lambda params, ready, time: deformation.pose(blocked, params, ready, time),
-            (params, ready, time),
-            counted_pose=lambda params, ready, time: deformation.pose(
-                whole, params, ready, time
-            ),
-        )
+        ways[kept] = Way(pose_prepared, (params, ready, time))
     if network.paper:
-        yield _still_arm(network, blocked, whole, params, still, time)
+        parts = _split(params, still)
+        name = f"{kept}, {100 * still:g} % still"
+        ways[name] = Way(pose_moving, (parts, prepare(parts.moving), time))
+    return ways
 
 
-def _still_arm(network, blocked, whole, params, still, time):
+def _split(params, still):
+    """As `still_rows.split` would leave it, of any rows."""
     count = len(params.rows["splats"].mean)
     moves = np.random.default_rng(1).permutation(count) >= round(still * count)
     rows = jnp.asarray(np.flatnonzero(moves), jnp.int32)
-    parts = still_rows.Split(
+    return still_rows.Split(
         splats.activate(params.rows["splats"]),
         still_rows.where(moves),
         splats.take_rows(params, rows),
     )
-    ready = jax.jit(lambda params: deformation.prepare(blocked, params))(parts.moving)
-
-    def posed(effects):
-        def pose(parts, ready, time):
-            return still_rows.pose(
-                parts,
-                lambda rows, time: deformation.pose(effects, rows, ready, time),
-                time,
-            )
-
-        return pose
-
-    kept = ", prepared kept" if jax.tree.leaves(ready) else ""
-    return Arm(
-        f"{network.name}{kept}, {100 * still:g} % still",
-        posed(blocked),
-        (parts, ready, time),
-        counted_pose=posed(whole),
-    )
 
 
-def _table_arms(count, time):
+def _table_arms(count):
     """From a table, every Gaussian moving: the time does not depend on the network."""
     still = splats.activate(gaussians(count).rows["splats"])
     table = time_knots.bake(lambda t: still._replace(mean=still.mean + t), KNOTS)
+    made = []
     for interpolation in time_knots.FEWEST:
 
         def pose(table, time, interpolation=interpolation):
             return time_knots.at(table, time, interpolation)
 
+        way = Way(pose, (table, jnp.asarray(0.37, jnp.float32)))
         name = f"{KNOTS} time knots, {interpolation}"
-        yield Arm(name, pose, (table, time), counted_pose=pose)
+        made.append(Arm(name, way, ((1.0, way),)))
+    return made

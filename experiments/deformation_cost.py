@@ -15,6 +15,7 @@ are the compiler's count of one pose.
 """
 
 import dataclasses
+import functools
 import pathlib
 
 from experiments import settings as run_settings
@@ -102,16 +103,18 @@ def costs(count: int, still: float, repeats: int) -> list[dict]:
     calls, rows = {}, []
     for arm in arms:
         row = {"name": arm.name}
-        for kind, function, counted in (
-            ("forward", arm.pose, arm.counted_pose),
-            ("both", arm.gradient, arm.counted_gradient),
-        ):
+        for kind, field in (("forward", "pose"), ("both", "gradient")):
+            function = getattr(arm.used, field)
             if function is None:
                 row |= {f"{kind}_{x}": None for x in ("ms", "cpu_ms", "flops")}
                 continue
-            program = jax.jit(function)
-            calls[f"{arm.name}: {kind}"] = lambda run=program, arm=arm: run(*arm.inputs)
-            flops = clock.cost(jax.jit(counted), *arm.inputs).flops
+            calls[f"{arm.name}: {kind}"] = functools.partial(
+                jax.jit(function), *arm.used.inputs
+            )
+            flops = sum(
+                weight * clock.cost(jax.jit(getattr(way, field)), *way.inputs).flops
+                for weight, way in arm.counted
+            )
             row[f"{kind}_flops"] = flops * 1e4 / count
         rows.append(row)
     timings = clock.compare(calls, repeats=repeats, warm_up=1)

@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 
 from experiments import deformation_arms, deformation_cost, knot_curve, known_motion
+from gaussians_jax.effects import deformation, kan_motion
+from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec
 from gaussians_jax.splats import Gaussians
 from nerfies_jax.capture import images
+from nerfies_jax.measure import clock
 from nerfies_jax.nets.encoding import EncodingSpec
 from tests import scenes
 
@@ -20,6 +23,7 @@ def narrowed(spec):
     """The same kind of network, small."""
     small = {"depth": 2, "width": 8, "skips": (), "base_depth": 2, "base_width": 8}
     small |= {"basis_width": 8, "block": 16}
+    small |= {"embedding": 4, "time_code": 4, "hidden": (6, 6), "kernels": 3}
     there = {field.name for field in dataclasses.fields(spec)}
     return dataclasses.replace(spec, **{k: x for k, x in small.items() if k in there})
 
@@ -131,21 +135,47 @@ def _field(capture):
 def test_arms_agree_with_the_network_they_shorten():
     made = {arm.name: arm for arm in deformation_arms.arms(40, 0.25)}
     for network in deformation_arms.NETWORKS:
-        whole = made[network.name]
+        whole = made[network.name].used
         exact = jax.jit(whole.pose)(*whole.inputs)
-        shorter = [n for n in made if n.startswith(f"{network.name}, ")]
-        for name in (network.name, *shorter):
-            arm = made[name]
-            posed, counted = jax.jit(arm.pose), jax.jit(arm.counted_pose)
-            for found in (posed(*arm.inputs), counted(*arm.inputs)):
-                off = np.abs(found.mean - exact.mean).max(axis=1) > 1e-6
-                # What stands still is at rest instead, not where the network puts it.
-                assert off.sum() <= (10 if "still" in name else 0)
+        for name in (n for n in made if n.startswith(network.name)):
+            way = made[name].used
+            found = jax.jit(way.pose)(*way.inputs)
+            off = np.abs(found.mean - exact.mean).max(axis=1) > 1e-6
+            # What stands still is at rest instead, not where the network puts it.
+            assert off.sum() <= (10 if "still" in name else 0)
         slopes = jax.jit(whole.gradient)(*whole.inputs)
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
     papers = sum(network.paper for network in deformation_arms.NETWORKS)
     assert sum("still" in name for name in made) == papers
     assert sum("kept" in name for name in made) >= 2
+
+
+@pytest.mark.slow
+def test_a_loop_over_kernels_is_counted_in_full():
+    count, time = 64, jnp.asarray(0.3)
+    spec = KanMotionSpec(embedding=5, time_code=3, hidden=(7, 6), kernels=12)
+
+    def flops(spec):
+        effect = kan_motion.effect(spec, 1, 4)
+
+        def pose(params):
+            ready = {effect.name: effect.prepare(params)}
+            return deformation.pose((effect,), params, ready, time)
+
+        rows = deformation_arms.gaussians(count)
+        return clock.cost(pose, deformation_arms.with_effect(rows, effect)).flops
+
+    whole = dataclasses.replace(spec, block=count)
+    two, three, four = (
+        flops(dataclasses.replace(whole, kernels=kernels)) for kernels in (2, 3, 4)
+    )
+    np.testing.assert_allclose(three, (two + four) / 2, rtol=0.01)  # a line
+    parts = deformation_arms.in_one_turn(spec, count)
+    found = sum(weight * flops(part) for weight, part in parts)
+    np.testing.assert_allclose(found, four + 8 * (four - three), rtol=0.05)
+    products = 2 * (5 * 7 + 7 * 6 + 6 * 9)  # of one Gaussian and one kernel
+    assert 12 * products * count < found
+    assert flops(whole) < 0.8 * found  # the compiler's own count
 
 
 @pytest.mark.slow
