@@ -205,6 +205,7 @@ def test_the_table_and_the_figure_show_every_network(tmp_path):
         ("--signals 3-D", "--signals 3-D"),
         ("--kinds tanh", "--kinds tanh"),
         ("--points 0", "--points 0"),
+        ("--pilot 0", "--pilot 0"),
         ("--rates 0.1 -1", "--rates"),
     ],
 )
