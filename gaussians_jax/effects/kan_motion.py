@@ -178,7 +178,10 @@ def parameter_count(spec: KANSpec | MLPSpec) -> int:
     )
 
 
-# Without SiLU, which takes a fifth of the time at this size.
+# One core, forward and backward with what is prepared, at 5k and 10k Gaussians: 16 and
+# 30 ms; `mlp_motion.SMALL_MOTION` takes 12 and 23 in the same run. SiLU would add a
+# quarter, a sixth kernel a fifth. The default sizes take 270 ms at 10k, an MLP of as
+# many parameters 370, the 8x256 of Deformable 3DGS 510.
 SMALL_KAN_MOTION = KanMotionSpec(time_code=16, hidden=(32, 32), kernels=5, base=False)
 
 
@@ -214,7 +217,9 @@ def prepare(
     """What the embeddings add to the first layer, whatever the time. Pure.
 
     4 bytes for each feature of the first layer and Gaussian: 5 MB for 10,000 Gaussians
-    with the default sizes. Rows of blocks without a living one are zero.
+    with the default sizes. Measured on one core at 10,000, posing them takes 68 ms with
+    nothing kept and 58 with this, 10 and 7 in the small sizes. Rows of blocks without
+    a living one are zero.
     """
     return in_blocks(
         lambda rows: _first_layer_part(spec, params.field, rows, 0),

@@ -61,7 +61,7 @@ def some_gaussians(count, dtype="float64", seed=0):
     )
 
 
-def scene_of(spec, dtype="float32", count=9):
+def scene_of(spec, dtype="float64", count=9):
     gaussians = some_gaussians(count, dtype)
     splats = Splats(
         gaussians.mean,
@@ -129,11 +129,11 @@ def test_gradients_of_the_field(spec, float64):
     assert error < 1e-6
 
 
-def test_blocks_change_nothing_but_memory(dtype):
-    params, codes = strong(SMALL, dtype), embeddings(17, dtype)
+def test_blocks_change_nothing_but_memory(float64):
+    params, codes = strong(SMALL), embeddings(17)
 
     def total(params, codes, spec):
-        offsets = together(params, spec, codes, jnp.asarray(0.3, dtype))
+        offsets = together(params, spec, codes, jnp.asarray(0.3))
         return sum(jnp.sum(leaf**2) for leaf in offsets), offsets
 
     run = jax.jit(jax.grad(total, (0, 1), has_aux=True), static_argnums=2)
@@ -143,8 +143,7 @@ def test_blocks_change_nothing_but_memory(dtype):
         jax.tree.leaves(blocked), jax.tree.leaves(at_once), strict=True
     ):
         scale = np.abs(theirs).max() + 1e-30
-        tolerance = {"float32": 2e-5, "float64": 1e-13}[dtype]
-        np.testing.assert_allclose(ours / scale, theirs / scale, atol=tolerance)
+        np.testing.assert_allclose(ours / scale, theirs / scale, atol=1e-13)
 
 
 def test_rows_beyond_the_living_blocks_are_still(float64):
@@ -201,14 +200,13 @@ def test_heads_that_are_off_cost_nothing():
     assert flops(alone) < flops(SMALL)
 
 
-def test_motion_starts_at_zero_and_does_not_stay_there(dtype):
+def test_motion_starts_at_zero_and_does_not_stay_there():
     """Heads of zero have slopes; through them the rest gets its own a step later."""
-    params = kan_motion.init(jax.random.key(0), SMALL, FRAMES, jnp.dtype(dtype))
-    codes = kan_motion.init_embedding(jax.random.key(1), SMALL, 9, jnp.dtype(dtype))
-    assert codes.dtype == params.times.dtype == dtype
+    params = kan_motion.init(jax.random.key(0), SMALL, FRAMES)
+    codes = kan_motion.init_embedding(jax.random.key(1), SMALL, 9)
 
     def total(params, codes):
-        offsets = together(params, SMALL, codes, jnp.asarray(0.3, dtype))
+        offsets = together(params, SMALL, codes, jnp.asarray(0.3))
         return sum(jnp.sum((leaf - 1) ** 2) for leaf in offsets), offsets
 
     run = jax.jit(jax.grad(total, (0, 1), has_aux=True))
@@ -229,6 +227,7 @@ def test_first_embeddings_have_the_promised_spread(dtype):
         jax.random.key(0), KanMotionSpec(), 2000, jnp.dtype(dtype)
     )
     assert codes.shape == (2000, 32)
+    assert codes.dtype == dtype
     assert abs(np.std(codes) / 0.1 - 1) < 0.02  # 64 000 draws
     assert abs(np.mean(codes)) < 0.002
 
@@ -323,12 +322,12 @@ def test_equal_and_wild_embeddings_have_finite_slopes(dtype):
         assert np.asarray(slopes[1]).any()
 
 
-def test_the_effect_moves_a_scene_and_leaves_it_alone_in_its_warm_up(dtype):
+def test_the_effect_moves_a_scene_and_leaves_it_alone_in_its_warm_up(float64):
     spec = dataclasses.replace(SMALL, warm_up=10)
-    params = scene_of(spec, dtype)
+    params = scene_of(spec)
     effects = (kan_motion.effect(spec, steps=100, frames=FRAMES),)
     canonical = rows.activate(params.rows["splats"])
-    time = jnp.asarray(0.3, dtype)
+    time = jnp.asarray(0.3)
 
     @jax.jit
     def in_training(step):
@@ -346,10 +345,9 @@ def test_the_effect_moves_a_scene_and_leaves_it_alone_in_its_warm_up(dtype):
     posed = jax.jit(lambda *args: deformation.pose(effects, *args))(
         params, prepared, time
     )
-    tolerance = {"float32": 1e-5, "float64": 1e-13}[dtype]
     for one, other, truth in zip(moved, posed, expected, strict=True):
-        np.testing.assert_allclose(one, truth, atol=tolerance)
-        np.testing.assert_allclose(other, truth, atol=tolerance)
+        np.testing.assert_allclose(one, truth, atol=1e-13)
+        np.testing.assert_allclose(other, truth, atol=1e-13)
 
 
 def test_the_effect_tells_its_rows_networks_and_rates():
