@@ -1,6 +1,5 @@
 """Gaussians and effects put together: a spec becomes a `Model` the loop can train."""
 
-import dataclasses
 import math
 from typing import Any, NamedTuple
 
@@ -10,17 +9,17 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from gaussians_jax import density, phases, rates, render, splats, start
-from gaussians_jax.density import DensitySpec
-from gaussians_jax.effects import deformation, mlp_motion, spectral
+from gaussians_jax.effects import deformation
 from gaussians_jax.effects.effect import Around, Effect, Moment, Shot
-from gaussians_jax.effects.mlp_motion import MotionSpec
-from gaussians_jax.effects.spectral import SpectralSpec
-from gaussians_jax.optimiser import scale_by_row_adam, scale_by_row_radam
-from gaussians_jax.phases import AlternationSpec, AnnealingSpec, Trained
-from gaussians_jax.raster_spec import RasterSpec
-from gaussians_jax.rates import RateSpec
+from gaussians_jax.phases import Trained
+from gaussians_jax.spec import (
+    OPTIMISERS,
+    Facts,
+    SplatScene,
+    effects_of,
+    refuse_what_cannot_train,
+)
 from gaussians_jax.splats import Params
-from gaussians_jax.start import StartSpec
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.training import loop, losses
 from nerfies_jax.training.model import (
@@ -35,50 +34,8 @@ from nerfies_jax.training.model import (
 
 PyTree = Any
 
-OPTIMISERS = {"adam": scale_by_row_adam, "radam": scale_by_row_radam}
 # Streams of the run's key beside those of the steps, which are its 0, 1, 2, ...
 ORDER, EVENT = 2**32 - 1, 2**32 - 2
-
-
-@dataclasses.dataclass(frozen=True)
-class SplatScene:
-    """Which scene of Gaussians; `None` for an effect means that it is not there."""
-
-    steps: int
-    start: StartSpec = StartSpec()
-    sh_degree: int = 3
-    sh_every: int = 1000  # steps between one degree and the next
-    dssim_weight: float = 0.2
-    rates: RateSpec = RateSpec()
-    raster: RasterSpec = RasterSpec()
-    density: DensitySpec | None = DensitySpec()
-    optimiser: str = "adam"
-    motion: MotionSpec | None = None
-    alternation: AlternationSpec | None = None
-    annealing: AnnealingSpec | None = None
-    spectral: SpectralSpec | None = None
-
-    def __post_init__(self):
-        if self.steps < 1:
-            raise ValueError(f"steps={self.steps}: train for at least one step")
-        if not 0 <= self.sh_degree <= 3:
-            raise ValueError(f"sh_degree={self.sh_degree} must be 0, 1, 2 or 3")
-        if not 0 <= self.dssim_weight <= 1:
-            raise ValueError(f"dssim_weight={self.dssim_weight} must lie in [0, 1]")
-        if self.optimiser not in OPTIMISERS:
-            raise ValueError(
-                f"unknown optimiser {self.optimiser!r}; choose from "
-                f"{sorted(OPTIMISERS)}"
-            )
-
-
-@dataclasses.dataclass(frozen=True)
-class Facts:
-    """What a scene must know of its capture before anything is compiled."""
-
-    extent: float  # scene units: how far the cameras spread
-    background: tuple[float, float, float]
-    frames: int  # to learn from
 
 
 def facts_of(capture: Capture) -> Facts:
@@ -90,16 +47,6 @@ def facts_of(capture: Capture) -> Facts:
         background=capture.background or (0.0, 0.0, 0.0),
         frames=len(capture.train),
     )
-
-
-def effects_of(spec: SplatScene, facts: Facts) -> tuple[Effect, ...]:
-    """The effects that the spec asks for, in the order in which they act."""
-    effects = []
-    if spec.motion is not None:
-        effects.append(mlp_motion.effect(spec.motion, spec.steps, facts.frames))
-    if spec.spectral is not None:
-        effects.append(spectral.effect(spec.spectral, spec.steps))
-    return tuple(effects)
 
 
 class Extra(NamedTuple):
@@ -292,11 +239,7 @@ def shuffled_row(
 
 def first_bytes(spec: SplatScene, capture: Capture) -> int:
     """Roughly the memory of the first state and step; host side, nothing allocated."""
-    cloud = capture.points
-    if cloud is not None and len(cloud.position) >= spec.start.fewest:
-        count = min(len(cloud.position), spec.start.points) + spec.start.beside
-    else:
-        count = spec.start.random
+    count = start.first_count(spec.start, capture)
     harmonics = 3 * (spec.sh_degree + 1) ** 2
     # Parameters, two moments, gradient, update; the tables of one projection.
     numbers = count * (5 * (11 + harmonics) + 60)
@@ -307,6 +250,7 @@ def first_bytes(spec: SplatScene, capture: Capture) -> int:
 
 def first_state(spec, effects, optimiser, capture, key) -> TrainState:
     """Parameters, moments and statistics before the first step; host side."""
+    refuse_what_cannot_train(spec)
     render.refuse_distortion(capture.cameras)
     start_key, run_key = jax.random.split(key)
     seed = int(jax.random.randint(start_key, (), 0, np.iinfo(np.int32).max))

@@ -5,7 +5,7 @@ import functools
 
 from gaussians_jax.density import DensitySpec
 from gaussians_jax.effects.mlp_motion import MotionSpec, SmoothingSpec
-from gaussians_jax.scene import SplatScene
+from gaussians_jax.spec import SplatScene
 from nerfies_jax.capture import synthetic
 from nerfies_jax.nets.encoding import EncodingSpec
 

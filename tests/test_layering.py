@@ -21,6 +21,7 @@ FLOORS = {
     "nerfies_jax.presets": 9,
     "nerfies_jax": 0,
     "gaussians_jax.effects": 7,
+    "gaussians_jax.spec": 8,
     "gaussians_jax.scene": 8,
     "gaussians_jax.presets": 9,
     "gaussians_jax": 6,

@@ -11,8 +11,9 @@ import pytest
 
 from experiments import evaluate
 from gaussians_jax import presets, rates, scene, splats, start
+from gaussians_jax.optimiser import scale_by_row_adam
 from gaussians_jax.rates import RateSpec
-from gaussians_jax.scene import Facts, SplatScene
+from gaussians_jax.spec import Facts, SplatScene
 from gaussians_jax.splats import Params, Splats
 from gaussians_jax.start import StartSpec
 from tests import scenes
@@ -107,7 +108,7 @@ def test_one_adam_step_is_optax_adam_for_rows_and_networks():
     slopes = jax.tree.map(
         lambda leaf: jax.random.normal(jax.random.key(1), leaf.shape), state.params
     )
-    ours = scene.scale_by_row_adam()
+    ours = scale_by_row_adam()
     directions, _ = jax.jit(ours.update)(slopes, ours.init(state.params))
     reference = optax.scale_by_adam(eps=1e-15)
     with jax.numpy_dtype_promotion("standard"):  # optax mixes ints and floats

@@ -1,0 +1,137 @@
+"""Which scene of Gaussians: its settings, and the effects that they ask for."""
+
+import dataclasses
+
+from gaussians_jax.density import DensitySpec
+from gaussians_jax.effects import (
+    acceleration,
+    depth,
+    kan_motion,
+    mlp_motion,
+    motion_basis,
+    motion_growth,
+    neighbours,
+    spectral,
+)
+from gaussians_jax.effects.acceleration import AccelerationSpec
+from gaussians_jax.effects.depth import DepthSpec
+from gaussians_jax.effects.effect import Effect
+from gaussians_jax.effects.kan_motion import KanMotionSpec
+from gaussians_jax.effects.mlp_motion import MotionSpec
+from gaussians_jax.effects.motion_basis import BasisMotionSpec
+from gaussians_jax.effects.motion_growth import MotionGrowthSpec
+from gaussians_jax.effects.neighbours import NeighbourSpec
+from gaussians_jax.effects.spectral import SpectralSpec
+from gaussians_jax.optimiser import scale_by_row_adam, scale_by_row_radam
+from gaussians_jax.phases import AlternationSpec, AnnealingSpec
+from gaussians_jax.raster_spec import RasterSpec
+from gaussians_jax.rates import RateSpec
+from gaussians_jax.start import StartSpec
+
+OPTIMISERS = {"adam": scale_by_row_adam, "radam": scale_by_row_radam}
+
+
+@dataclasses.dataclass(frozen=True)
+class SplatScene:
+    """Which scene of Gaussians; `None` for an effect means that it is not there."""
+
+    steps: int
+    start: StartSpec = StartSpec()
+    sh_degree: int = 3
+    sh_every: int = 1000  # steps between one degree and the next
+    dssim_weight: float = 0.2
+    rates: RateSpec = RateSpec()
+    raster: RasterSpec = RasterSpec()
+    density: DensitySpec | None = DensitySpec()
+    optimiser: str = "adam"
+    alternation: AlternationSpec | None = None
+    annealing: AnnealingSpec | None = None
+    motion: MotionSpec | KanMotionSpec | BasisMotionSpec | None = None
+    acceleration: AccelerationSpec | None = None
+    neighbours: NeighbourSpec | None = None
+    motion_growth: MotionGrowthSpec | None = None
+    spectral: SpectralSpec | None = None
+    depth: DepthSpec | None = None
+
+    def __post_init__(self):
+        if self.steps < 1:
+            raise ValueError(f"steps={self.steps}: train for at least one step")
+        if not 0 <= self.sh_degree <= 3:
+            raise ValueError(f"sh_degree={self.sh_degree} must be 0, 1, 2 or 3")
+        if not 0 <= self.dssim_weight <= 1:
+            raise ValueError(f"dssim_weight={self.dssim_weight} must lie in [0, 1]")
+        if self.optimiser not in OPTIMISERS:
+            raise ValueError(
+                f"unknown optimiser {self.optimiser!r}; choose from "
+                f"{sorted(OPTIMISERS)}"
+            )
+
+
+@dataclasses.dataclass(frozen=True)
+class Facts:
+    """What a scene must know of its capture before anything is compiled."""
+
+    extent: float  # scene units: how far the cameras spread
+    background: tuple[float, float, float]
+    frames: int  # to learn from
+
+
+def refuse_what_cannot_train(spec: SplatScene) -> None:
+    """Raise ValueError where parts that are asked for need others that are not.
+
+    Not when the settings are made: a trained scene may be drawn without its motion.
+    """
+    motion, growth = spec.motion, spec.motion_growth
+    if motion is None:
+        named = ("alternation", "acceleration", "motion_growth")
+        orphans = [name for name in named if getattr(spec, name) is not None]
+        if orphans:
+            raise ValueError(
+                f"{' and '.join(orphans)} without a motion would train nothing; leave "
+                "them out as well, or choose a preset that moves"
+            )
+    if spec.neighbours is not None and not isinstance(motion, KanMotionSpec):
+        raise ValueError(
+            "neighbours keep embeddings alike, and this motion has none; leave them "
+            "out (neighbours=none), or choose a preset with a KAN motion"
+        )
+    if growth is not None and spec.density is None:
+        raise ValueError(
+            "motion_growth steers the density control, which is left out; leave it out "
+            "as well (motion_growth=none)"
+        )
+    if growth is not None and growth.form == "hard" and growth.start <= motion.warm_up:
+        raise ValueError(
+            f"motion_growth.start={growth.start} lies in the warm-up of the motion "
+            f"(up to step {motion.warm_up}), when nothing moves and so nothing would "
+            "grow; start it some hundred steps later"
+        )
+
+
+MOTIONS = {
+    MotionSpec: mlp_motion.effect,
+    KanMotionSpec: kan_motion.effect,
+    BasisMotionSpec: motion_basis.effect,
+}
+
+
+def effects_of(spec: SplatScene, facts: Facts) -> tuple[Effect, ...]:
+    """The effects that the spec asks for, in the order in which they act."""
+    effects = []
+    if spec.motion is not None:
+        move = MOTIONS[type(spec.motion)]
+        effects.append(move(spec.motion, spec.steps, facts.frames))
+    if spec.acceleration is not None:
+        effects.append(
+            acceleration.effect(spec.acceleration, facts.extent, facts.frames)
+        )
+    if spec.neighbours is not None:
+        of = kan_motion.NAME  # the only rows that are an embedding
+        effects.append(neighbours.effect(spec.neighbours, facts.extent, of))
+    if spec.motion_growth is not None:
+        effects.append(motion_growth.effect(spec.motion_growth, facts.extent))
+    if spec.spectral is not None:
+        effects.append(spectral.effect(spec.spectral, spec.steps))
+    if spec.depth is not None:
+        effects.append(depth.effect(spec.depth))
+    return tuple(effects)
