@@ -306,7 +306,8 @@ def _sum_over_inputs(spec, index, layer, kernels, inputs):
     # layer, 8192 x 64 -> 64, one core, ms for 8, 16, 32 kernels: einsum over a basis
     # [n, in, kernels] 96, 200, 396 (117 to 470 MB); the basis flat for one product 72,
     # 172, 356; kernel by kernel, kept for the backward pass, 24, 87, 196 (32 to
-    # 152 MB); with a hand-written derivative 24, 86, 205; this scan 26, 50, 106 (6 MB).
+    # 152 MB); with a hand-written derivative 24, 86, 205; a scan 26, 50, 106 (6 MB).
+    # With held inputs it is 32, 59, 115 (23 MB) where the einsum takes 113, 221, 421.
     # Three layers 64, 64, 64 -> 9 of 10k points: einsum 284, flat 251, kept 187, this
     # 92; in blocks of 512 that are recomputed 191, 126, 112, 112, so only memory asks
     # for blocks. Four kernels at a time save a quarter at narrow widths. No custom
