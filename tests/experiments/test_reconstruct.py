@@ -307,8 +307,6 @@ def test_the_canonical_scene_and_its_depth_are_rendered(run, tmp_path):
         (["--without", "warp"], "those are: motion"),
         (["--appearance", "0", "1"], "no appearance codes"),
         (["--knots", "1"], "reads 2 knots at once"),
-        (["--interpolation", "cubic"], "is for --knots"),
-        (["--still-below", "-1"], "not negative"),
         (["--still-below", "1e9"], "nothing in this run moves"),
         (["--knots", "8", "--without", "motion"], "nothing in this run moves"),
     ],
@@ -320,6 +318,22 @@ def test_a_render_that_a_run_cannot_give_is_refused(run, capsys, arguments, word
     line = capsys.readouterr().err
     assert words in line
     assert line.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--interpolation", "cubic"], "is for --knots"),
+        (["--still-below", "-1"], "not negative"),
+    ],
+)
+def test_settings_of_a_faster_motion_that_cannot_be_are_refused(
+    arguments, words, capsys
+):
+    with pytest.raises(SystemExit) as stop:
+        render.main(["nowhere", *arguments])
+    assert stop.value.code == 2
+    assert words in " ".join(capsys.readouterr().err.replace("│", " ").split())
 
 
 @pytest.mark.slow
