@@ -14,7 +14,7 @@ from experiments import evaluate
 from gaussians_jax import scene, splats
 from gaussians_jax.effects import mlp_motion
 from gaussians_jax.effects.mlp_motion import Motion, MotionSpec
-from gaussians_jax.scene import Facts, SplatScene
+from gaussians_jax.spec import Facts, SplatScene
 from gaussians_jax.splats import Params, Splats
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.geometry import camera as cameras
