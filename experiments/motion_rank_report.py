@@ -50,7 +50,8 @@ def said(rows) -> str:
     sentences = [""]
     for kind in dict.fromkeys(row.kind for row in rows):
         own = {(row.model, row.count): row for row in rows if row.kind == kind}
-        sentences += [f"{kind}:", *_against_time(own), *_against_residual(own)]
+        sentences += [f"{kind}:", *_against_time(own), *_where_time_wins(own)]
+        sentences += _against_residual(own)
         sentences += [*_against_separable(own), *_across_counts(own), *_floors(own)]
     sentences.append(
         "For K >= 3 directions span space wherever they point, so V w with free "
@@ -73,6 +74,21 @@ def _against_time(own):
         yield (
             f"  K={count}: the moving basis has {learnt:.2f} of the time basis' error "
             f"({held:.2f} held out). Its claim to at most {TIME_GATE:g} {verdict}."
+        )
+
+
+def _where_time_wins(own):
+    wins = [
+        count
+        for (model, count), row in own.items()
+        if model == "time basis"
+        and ("moving basis", count) in own
+        and _mean(row, True) < _mean(own["moving basis", count], True)
+    ]
+    if wins:
+        yield (
+            "  The time basis is the better one, on held-out times, at K="
+            f"{', '.join(map(str, wins))}."
         )
 
 
@@ -132,7 +148,7 @@ def _floors(own):
         if above:
             yield (
                 f"  {name}: fits end {min(above):.2f} to {max(above):.2f} times "
-                "above what its rank allows."
+                "the error that its rank allows."
             )
 
 

@@ -141,6 +141,10 @@ def test_the_sentences_follow_the_numbers():
     assert "the basis is not what helps" in said
     said = motion_rank_report.said(rows_of(time=1.0, moving=0.9, residual=1.8))
     assert "0.5 DOES NOT SHOW" in said
+    assert "better one" not in said
+    assert "better one, on held-out times, at K=4." in motion_rank_report.said(
+        rows_of(time=0.1, moving=0.9)
+    )
     assert "2.00 of the moving basis' error" in said
     assert "the basis helps" in said
 
