@@ -198,7 +198,9 @@ def loss_of(
     return value, metrics
 
 
-def shot(frames: Frames, row: Int[Array, ""] | int, rendering: Rendering) -> Shot:
+def shot(
+    frames: Frames, row: Int[Array, ""] | int, rendering: Rendering | None
+) -> Shot:
     """What the losses compare: a frame that was drawn with the one that was filmed."""
     return Shot(
         rendering,

@@ -28,7 +28,7 @@ class Moment(NamedTuple):
 class Shot(NamedTuple):
     """One frame as it was drawn and as it was filmed."""
 
-    rendering: Rendering
+    rendering: Rendering | None  # None where a loss brings its own
     truth: Float[Array, "height width 3"]  # sRGB in [0, 1]
     valid: Bool[Array, "height width"] | None  # None: everywhere
     depth: Float[Array, "height width"] | None  # z-depth, scene units; 0 unknown
