@@ -106,8 +106,7 @@ def with_effect(params: Params, effect: Effect) -> Params:
     rows_key, nets_key = jax.random.split(jax.random.key(0))
     rows, nets = dict(params.rows), dict(params.nets)
     if effect.init_rows is not None:
-        count = len(params.rows["splats"].mean)
-        rows[effect.name] = effect.init_rows(rows_key, count)
+        rows[effect.name] = effect.init_rows(rows_key, params.rows["splats"])
     if effect.init_nets is not None:
         nets[effect.name] = effect.init_nets(nets_key)
     return Params(rows, nets)

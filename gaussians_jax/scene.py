@@ -268,7 +268,7 @@ def first_state(spec, effects, optimiser, capture, key) -> TrainState:
         effect_key = jax.random.fold_in(start_key, number)
         rows_key, nets_key = jax.random.split(effect_key)
         if effect.init_rows is not None:
-            params.rows[effect.name] = effect.init_rows(rows_key, count)
+            params.rows[effect.name] = effect.init_rows(rows_key, rows)
         if effect.init_nets is not None:
             params.nets[effect.name] = effect.init_nets(nets_key)
     params = splats.pad_rows(params, splats.capacity_for(count, most))

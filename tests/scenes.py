@@ -4,7 +4,15 @@ import dataclasses
 import functools
 
 from gaussians_jax.density import DensitySpec
+from gaussians_jax.effects.acceleration import AccelerationSpec
+from gaussians_jax.effects.depth import DepthSpec
+from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec, SmoothingSpec
+from gaussians_jax.effects.motion_basis import BasisMotionSpec
+from gaussians_jax.effects.motion_growth import MotionGrowthSpec
+from gaussians_jax.effects.neighbours import NeighbourSpec
+from gaussians_jax.effects.spectral import SpectralSpec
+from gaussians_jax.phases import AlternationSpec, AnnealingSpec
 from gaussians_jax.spec import SplatScene
 from nerfies_jax.capture import synthetic
 from nerfies_jax.nets.encoding import EncodingSpec
@@ -28,6 +36,36 @@ TINY_SPLATS = SplatScene(
     density=DensitySpec(interval=10, start=10, stop=25, most=600, reset_interval=20),
 )
 TINY_DEFORMABLE = dataclasses.replace(TINY_SPLATS, motion=TINY_MOTION)
+TINY_SONATA = dataclasses.replace(
+    TINY_SPLATS,
+    optimiser="radam",
+    motion=KanMotionSpec(
+        embedding=4, time_code=3, hidden=(6,), kernels=3, warm_up=3, rate=1e-2
+    ),
+    neighbours=NeighbourSpec(count=4, start=3),
+    spectral=SpectralSpec(),
+    depth=DepthSpec(),
+)
+TINY_MOBA = dataclasses.replace(
+    TINY_SPLATS,
+    motion=BasisMotionSpec(
+        position=EncodingSpec(2),
+        base_time=EncodingSpec(1),
+        time=EncodingSpec(2),
+        base_depth=1,
+        base_width=8,
+        count=4,
+        basis_width=8,
+        depth=2,
+        width=8,
+        skips=(),
+        warm_up=3,
+    ),
+    alternation=AlternationSpec(12, 18),
+    annealing=AnnealingSpec(18),
+    motion_growth=MotionGrowthSpec(start=5),
+    acceleration=AccelerationSpec(start=3, samples=64),
+)
 
 
 @functools.cache

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from gaussians_jax.splats import Gaussians, Params
+from gaussians_jax.splats import Gaussians, Params, Splats
 from nerfies_jax.training.model import Rendering
 
 PyTree = Any
@@ -58,7 +58,7 @@ class Effect(NamedTuple):
     """What one effect does, each seam optional."""
 
     name: str  # its key in `Params.rows`, `Params.nets` and what is carried
-    init_rows: Callable[[Any, int], PyTree] | None = None  # (key, rows) -> rows
+    init_rows: Callable[[Any, Splats], PyTree] | None = None  # (key, splats) -> rows
     init_nets: Callable[[Any], PyTree] | None = None  # key -> nets
     row_rate: Rate | None = None  # where there are rows
     net_rate: Rate | None = None  # where there are nets

@@ -48,6 +48,9 @@ class KanMotionSpec:
     # Standard deviation of the first embeddings and time codes. E-D3DGS starts from
     # zero embeddings, which a penalty on differing neighbours never tells apart.
     spread: float = 0.1
+    # First embeddings as random waves over space, so many radians from the middle of
+    # the Gaussians to their root mean square distance; None draws each by itself.
+    waves: float | None = None
     hidden: tuple[int, ...] = (128, 128)
     kernels: int = 8
     base: bool = True
@@ -186,11 +189,35 @@ SMALL_KAN_MOTION = KanMotionSpec(time_code=16, hidden=(32, 32), kernels=5, base=
 
 
 def init_embedding(
-    key: Key[Array, ""], spec: KanMotionSpec, count: int, dtype=jnp.float32
+    key: Key[Array, ""],
+    spec: KanMotionSpec,
+    mean: Float[Array, "gaussians 3"],
 ) -> Float[Array, "gaussians embedding"]:
-    """A normally distributed code for each Gaussian, alike in every precision."""
-    drawn = jax.random.normal(key, (count, spec.embedding), jnp.float32)
-    return spec.spread * drawn.astype(dtype)
+    """A code for each Gaussian, of standard deviation `spec.spread`.
+
+    Independent normal draws, or with `spec.waves` cosines of random direction, length
+    and phase over the positions (random Fourier features, Rahimi and Recht 2007): then
+    Gaussians that are near each other start alike, and what one frame says of one
+    Gaussian moves those around it.
+    """
+    if spec.waves is None:
+        drawn = jax.random.normal(key, (mean.shape[0], spec.embedding), jnp.float32)
+        return spec.spread * drawn.astype(mean.dtype)
+    centred = mean - jnp.mean(mean, axis=0)
+    radius_sq = jnp.mean(jnp.sum(centred**2, axis=1))
+    # One Gaussian, or all in one place: every code is that of the middle.
+    unit = centred / jnp.sqrt(jnp.where(radius_sq > 0, radius_sq, 1))
+    return _random_waves(key, spec, unit, spec.embedding)
+
+
+def _random_waves(key, spec, places, width):
+    """[places, width] cosines of random direction, length and phase over the places."""
+    wave_key, phase_key = jax.random.split(key)
+    shape = places.shape[1], width
+    waves = spec.waves * jax.random.normal(wave_key, shape, jnp.float32)
+    phase = jax.random.uniform(phase_key, (width,), jnp.float32, 0, 2 * jnp.pi)
+    angle = places @ waves.astype(places.dtype) + phase.astype(places.dtype)
+    return spec.spread * math.sqrt(2) * jnp.cos(angle)
 
 
 def init(
@@ -201,8 +228,12 @@ def init(
         raise ValueError(f"frames={frames}: a motion is learnt from at least one frame")
     times_key, field_key = jax.random.split(key)
     moments = -(-frames // spec.frames_per_code)
-    scale = math.sqrt(3) * spec.spread  # of a uniform draw
-    times = codes.init(times_key, moments, spec.time_code, scale, dtype)
+    if spec.waves is None:
+        scale = math.sqrt(3) * spec.spread  # of a uniform draw
+        times = codes.init(times_key, moments, spec.time_code, scale, dtype)
+    else:  # half the capture is to a moment what the mean radius is to a place
+        moment = jnp.linspace(-2, 2, moments, dtype=dtype)[:, None]
+        times = _random_waves(times_key, spec, moment, spec.time_code)
     network = field_spec(spec)
     init_field = kan.init if isinstance(network, KANSpec) else mlp.init
     return KanMotion(times, init_field(network, field_key, dtype))
@@ -293,8 +324,8 @@ def apply(gaussians: Gaussians, offsets: Offsets) -> Gaussians:
 def effect(spec: KanMotionSpec, steps: int, frames: int) -> Effect:
     """The seams that this motion fills, for a run of `steps` over `frames`."""
 
-    def init_rows(key, count):
-        return init_embedding(key, spec, count)
+    def init_rows(key, rows):
+        return init_embedding(key, spec, rows.mean)
 
     def init_nets(key):
         return init(key, spec, frames)

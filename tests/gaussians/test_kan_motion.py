@@ -203,7 +203,7 @@ def test_heads_that_are_off_cost_nothing():
 def test_motion_starts_at_zero_and_does_not_stay_there():
     """Heads of zero have slopes; through them the rest gets its own a step later."""
     params = kan_motion.init(jax.random.key(0), SMALL, FRAMES)
-    codes = kan_motion.init_embedding(jax.random.key(1), SMALL, 9)
+    codes = kan_motion.init_embedding(jax.random.key(1), SMALL, jnp.zeros((9, 3)))
 
     def total(params, codes):
         offsets = together(params, SMALL, codes, jnp.asarray(0.3))
@@ -222,14 +222,39 @@ def test_motion_starts_at_zero_and_does_not_stay_there():
     assert np.asarray(slopes[0].times).any()
 
 
-def test_first_embeddings_have_the_promised_spread(dtype):
-    codes = kan_motion.init_embedding(
-        jax.random.key(0), KanMotionSpec(), 2000, jnp.dtype(dtype)
-    )
+@pytest.mark.parametrize("waves", [None, 2.0])
+def test_first_embeddings_have_the_promised_spread(dtype, waves):
+    mean = jax.random.normal(jax.random.key(1), (2000, 3)).astype(dtype)
+    spec = KanMotionSpec(waves=waves)
+    codes = kan_motion.init_embedding(jax.random.key(0), spec, mean)
     assert codes.shape == (2000, 32)
     assert codes.dtype == dtype
-    assert abs(np.std(codes) / 0.1 - 1) < 0.02  # 64 000 draws
-    assert abs(np.mean(codes)) < 0.002
+    # 64 000 independent draws; as waves there are 32 of them.
+    assert abs(np.std(codes) / 0.1 - 1) < (0.02 if waves is None else 0.15)
+    assert abs(np.mean(codes)) < (0.002 if waves is None else 0.03)
+
+
+def test_codes_as_waves_start_alike_where_gaussians_are_near():
+    spec = KanMotionSpec(waves=2.0)
+    mean = jax.random.normal(jax.random.key(1), (500, 3))
+    near = mean + 0.01 * jax.random.normal(jax.random.key(2), mean.shape)
+    both = kan_motion.init_embedding(
+        jax.random.key(0), spec, jnp.concatenate([mean, near])
+    )
+    apart = np.linalg.norm(both[:500] - both[500:], axis=1)
+    others = np.linalg.norm(both[:500] - np.roll(both[:500], 1, axis=0), axis=1)
+    assert np.median(apart) < 0.05 * np.median(others)
+    times = kan_motion.init(jax.random.key(0), spec, 100).times
+    steps = np.linalg.norm(np.diff(times, axis=0), axis=1)
+    assert np.median(steps) < 0.2 * np.linalg.norm(times[0] - times[25])
+
+
+def test_codes_as_waves_are_finite_where_all_gaussians_are_in_one_place(dtype):
+    spec = KanMotionSpec(waves=2.0)
+    for count in (1, 5):
+        mean = jnp.full((count, 3), 0.3, dtype)
+        codes = kan_motion.init_embedding(jax.random.key(0), spec, mean)
+        assert np.isfinite(codes).all()
 
 
 @pytest.mark.parametrize(
@@ -352,7 +377,9 @@ def test_the_effect_moves_a_scene_and_leaves_it_alone_in_its_warm_up(float64):
 
 def test_the_effect_tells_its_rows_networks_and_rates():
     filled = kan_motion.effect(SMALL, steps=100, frames=FRAMES)
-    assert filled.init_rows(jax.random.key(0), 12).shape == (12, 6)
+    points = np.zeros((12, 3))
+    first = rows.from_points(points, points)
+    assert filled.init_rows(jax.random.key(0), first).shape == (12, 6)
     nets = jax.eval_shape(filled.init_nets, jax.random.key(0))
     assert isinstance(nets, KanMotion)
     assert nets.times.shape == (math.ceil(FRAMES / 2), 4)

@@ -1,0 +1,205 @@
+"""Sonata and MoBa-GS as whole scenes: every part on at once."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import rich.console
+
+from experiments import evaluate
+from gaussians_jax import scene
+from gaussians_jax.effects import deformation
+from gaussians_jax.effects.effect import Moment
+from gaussians_jax.effects.motion_growth import MotionGrowthSpec
+from gaussians_jax.phases import AlternationSpec
+from gaussians_jax.spec import effects_of, refuse_what_cannot_train
+from nerfies_jax.training import checkpoint, loop
+from tests import gradients, scenes
+
+PAPERS = {"sonata": scenes.TINY_SONATA, "moba": scenes.TINY_MOBA}
+QUIET = rich.console.Console(quiet=True)
+by_paper = pytest.mark.parametrize("paper", PAPERS)
+
+
+def facts():
+    return scene.facts_of(scenes.tiny_capture())
+
+
+@functools.cache
+def made(paper):
+    capture = scenes.tiny_capture()
+    model = scene.build(PAPERS[paper], facts())
+    frames = evaluate.frames_of(capture, model.wants)
+    return model, frames
+
+
+def start(paper):
+    return made(paper)[0].init(scenes.tiny_capture(), jax.random.key(3))
+
+
+def train(paper, state, steps, **settings):
+    model, frames = made(paper)
+    return loop.fit(model, state, frames, steps=steps, console=QUIET, **settings)
+
+
+@functools.cache
+def straight(paper):
+    """Through the warm-up, two densifications, and MoBa's alternation."""
+    return train(paper, start(paper), 21)
+
+
+def psnr(paper, state):
+    capture = scenes.tiny_capture()
+    renderer = evaluate.Renderer(made(paper)[0], capture.size)
+    return evaluate.score(renderer, state, capture, capture.train).psnr.mean()
+
+
+@pytest.mark.slow
+@by_paper
+def test_a_run_with_every_part_learns_and_stays_finite(paper):
+    result = straight(paper)
+    assert result.stopped_by == "steps"
+    rows = result.history.rows
+    first, last = psnr(paper, start(paper)), psnr(paper, result.state)
+    assert last > first + 1, (first, last)
+    names = {effect.name for effect in effects_of(PAPERS[paper], facts())}
+    silent = {"kan_motion", "motion_basis", "motion_growth"}  # add nothing to the loss
+    assert names - silent <= set(rows[-1])
+    for leaf in jax.tree.leaves(result.state.params):
+        assert np.isfinite(leaf).all()
+
+
+@pytest.mark.slow
+@by_paper
+def test_what_is_carried_follows_the_rows(paper):
+    state = straight(paper).state
+    capacity = state.params.rows["splats"].mean.shape[0]
+    assert capacity != start(paper).params.rows["splats"].mean.shape[0]
+    for leaf in jax.tree.leaves(state.extra):
+        assert leaf.shape[0] == capacity
+
+
+@pytest.mark.slow
+@by_paper
+def test_an_interrupted_run_ends_as_the_straight_one(paper, tmp_path):
+    """Bit for bit, with what the effects carry (MoBa's holds infinities)."""
+    model, _ = made(paper)
+    with checkpoint.Checkpoints(tmp_path, model.spec) as checkpoints:
+        train(paper, start(paper), 17, checkpoints=checkpoints)
+    found = checkpoint.restore(tmp_path, start(paper), model.spec)
+    again = train(paper, found.state, 21)
+    for a, b in zip(
+        jax.tree.leaves(again.state._replace(key=0)),
+        jax.tree.leaves(straight(paper).state._replace(key=0)),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.slow
+@by_paper
+def test_the_loss_of_a_whole_step_has_the_right_slope(paper, float64):
+    capture = scenes.tiny_capture()
+    spec, known = PAPERS[paper], facts()
+    if paper == "moba":  # else no slope reaches the means through the networks
+        motion = dataclasses.replace(spec.motion, detach=False)
+        spec = dataclasses.replace(spec, motion=motion)
+    effects = effects_of(spec, known)
+    model, frames = scene.build(spec, known), evaluate.frames_of(capture, {"depths"})
+    state = model.init(capture, jax.random.key(3))
+    keys = iter(jax.random.split(jax.random.key(4), 100))
+
+    def awake(leaf):
+        """Heads start at zero; away from there every part of the field acts."""
+        noise = 0.05 * jax.random.normal(next(keys), leaf.shape, jnp.float64)
+        return leaf.astype(jnp.float64) + noise
+
+    def wide(tree):
+        return jax.tree.map(
+            lambda leaf: leaf.astype(jnp.float64) if leaf.dtype.kind == "f" else leaf,
+            tree,
+        )
+
+    params = wide(state.params)._replace(nets=jax.tree.map(awake, state.params.nets))
+    view = wide(evaluate.view_of(capture, int(capture.train[2])))
+    truth = wide(scene.shot(frames, 2, None))
+    carried = wide(scene.carried_by(effects, params))
+    step = jnp.asarray(20, jnp.int32)
+    moment = Moment(view.time, step, jax.random.key(5))
+
+    def loss(params):
+        moved = deformation.pose_in_training(
+            effects, params, scene.splats.activate(params.rows["splats"]), moment
+        )
+        drawn = model.stages.draw(params, moved, view, (40, 30), step)
+        seen = truth._replace(rendering=drawn)
+        return scene.loss_of(spec, effects, params, seen, moment, carried)[0]
+
+    def of_rows(rows):
+        return loss(params._replace(rows=rows))
+
+    def of_nets(nets):
+        return loss(params._replace(nets=nets))
+
+    assert gradients.directional_error(of_nets, params.nets, step=1e-6) < 1e-5
+    assert gradients.directional_error(of_rows, params.rows, step=1e-6) < 1e-4
+
+
+@pytest.mark.slow
+@by_paper
+def test_stages_draw_what_render_draws(paper):
+    model, _ = made(paper)
+    state, capture = straight(paper).state, scenes.tiny_capture()
+    view = evaluate.view_of(capture, int(capture.heldout[0]))
+    renderer = evaluate.Renderer(model, capture.size)
+    whole = jax.jit(model.render, static_argnums=2)
+    expected = whole(state.params, view, capture.size, state.step)
+    for a, b in zip(renderer(state, view), expected, strict=True):
+        np.testing.assert_allclose(a, b, atol=2e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"motion": None}, "without a motion"),
+        ({"motion": scenes.TINY_MOTION, "neighbours": scenes.TINY_SONATA.neighbours},
+         "neighbours=none"),
+        ({"density": None}, "motion_growth=none"),
+        ({"motion_growth": MotionGrowthSpec(form="hard", start=3)}, "nothing would"),
+        ({"motion": None, "motion_growth": None, "acceleration": None},
+         "alternation without"),
+    ],
+)  # fmt: skip
+def test_parts_that_need_others_are_refused(change, words):
+    spec = dataclasses.replace(scenes.TINY_MOBA, **change)
+    with pytest.raises(ValueError, match=words):
+        refuse_what_cannot_train(spec)
+    model = scene.build(spec, facts())  # a trained scene may be drawn without
+    with pytest.raises(ValueError, match=words):
+        model.init(scenes.tiny_capture(), jax.random.key(0))
+
+
+@pytest.mark.slow
+def test_turns_are_told_apart():
+    spec = scenes.TINY_MOBA
+    assert spec.alternation == AlternationSpec(12, 18)
+    model, frames = made("moba")
+    state = train("moba", start("moba"), 12).state
+    step = jax.jit(model.step)
+    moved = []
+    for _ in range(7):
+        after, _ = step(state, frames)
+        same = [
+            all(
+                np.array_equal(a, b)
+                for a, b in zip(jax.tree.leaves(x), jax.tree.leaves(y), strict=True)
+            )
+            for x, y in zip(after.params, state.params, strict=True)
+        ]
+        moved.append(tuple(not s for s in same))
+        state = after
+    nets, rows, both = (False, True), (True, False), (True, True)
+    assert moved == [nets, nets, rows, nets, nets, rows, both]
