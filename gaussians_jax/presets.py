@@ -25,12 +25,13 @@ STATIC = SplatScene(steps=30_000)
 DEFORMABLE = SplatScene(steps=40_000, motion=MotionSpec())
 
 # Sonata. What it leaves open is as in E-D3DGS, which it descends from: 60,000 steps,
-# growth to the end, no opacity reset. Depth counts only where a capture has it.
+# growth to the end, no opacity reset. Depth counts only where a capture has it. Codes
+# start as waves, not as zeros: see `SMALL_SONATA`.
 SONATA = SplatScene(
     steps=60_000,
     optimiser="radam",
     density=DensitySpec(stop=60_000, reset_interval=1_000_000),
-    motion=KanMotionSpec(warm_up=3000),
+    motion=KanMotionSpec(waves=2.0, spread=0.5, warm_up=3000),
     neighbours=NeighbourSpec(start=3000),
     spectral=SpectralSpec(),
     depth=DepthSpec(),
