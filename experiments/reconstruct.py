@@ -25,9 +25,9 @@ class Reconstruct:
     capture: run_settings.Positional[pathlib.Path | None] = None
     """Folder in Nerfies, HyperNeRF, Blender, D-NeRF or COLMAP layout."""
     preset: str | None = None
-    """Gaussian splats: splats-static, splats-deformable. Radiance fields: nerf, nerf-w,
-    d-nerf, t-nerf, nerfies, hypernerf, nsff. Each with -small is made for a CPU
-    (default: splats-deformable-small)."""
+    """Gaussian splats: splats-static, splats-deformable, sonata, moba. Radiance fields:
+    nerf, nerf-w, d-nerf, t-nerf, nerfies, hypernerf, nsff. Each with -small is made for
+    a CPU (default: splats-deformable-small)."""
     scene: str = "default"
     """Which built-in scene, where no capture is given."""
     steps: int | None = None
