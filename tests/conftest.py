@@ -37,6 +37,14 @@ def pytest_collection_finish():
     gc.enable()
 
 
+@pytest.fixture(scope="module", autouse=True)
+def forget_programs():
+    """Compiled programs of a finished module: all together took 5 GB a process."""
+    yield
+    jax.clear_caches()
+    gc.collect()
+
+
 @pytest.fixture(params=["float32", "float64"])
 def dtype(request):
     """The precision a test runs in.
