@@ -6,7 +6,6 @@ are from their canonical values at that time.
 """
 
 import dataclasses
-import functools
 import zlib
 from typing import NamedTuple
 
@@ -15,11 +14,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from gaussians_jax import splats
+from gaussians_jax.effects.blocks import in_blocks
 from gaussians_jax.effects.effect import Effect, Moment
 from gaussians_jax.splats import Gaussians, Params
 from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
-from nerfies_jax.nets.mlp import HeadSpec, Layer, MLPSpec
+from nerfies_jax.nets.mlp import HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
 
 NAME = "mlp_motion"
@@ -157,58 +157,25 @@ def deform(
     compacted rows do not pay for the capacity behind them; their offsets are zero.
     """
     at_time = fold_time(params, spec, time)
-    count = mean.shape[0]
-    if count == 0:
+    if mean.shape[0] == 0:
         return Offsets(mean, jnp.zeros((0, 4), mean.dtype), mean)
-    block = min(spec.block, count)
-    blocks = -(-count // block)
-    padding = blocks * block - count
-    if alive is None:
-        alive = jnp.ones(count, bool)
-    means = jnp.pad(jax.lax.stop_gradient(mean), ((0, padding), (0, 0)))
-    used = jnp.pad(alive, (0, padding)).reshape(blocks, block).any(axis=1)
-
-    def evaluate(points):
-        return offsets_at_time(at_time, spec, points)
-
-    def still(points):
-        return jax.tree.map(
-            lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
-            jax.eval_shape(evaluate, points),
-        )
-
-    # Recomputing a block in the backward pass keeps one block's activations, not all.
-    # The loop already keeps XLA from merging the two passes.
-    @functools.partial(jax.remat, prevent_cse=False)
-    def one_block(points, is_used):
-        return jax.lax.cond(is_used, evaluate, still, points)
-
-    outputs = jax.lax.map(
-        lambda pair: one_block(*pair), (means.reshape(blocks, block, 3), used)
+    return in_blocks(
+        lambda points: offsets_at_time(at_time, spec, points),
+        (jax.lax.stop_gradient(mean),),
+        alive,
+        spec.block,
     )
-    return jax.tree.map(lambda x: x.reshape(blocks * block, -1)[:count], outputs)
 
 
 def fold_time(params: Motion, spec: MotionSpec, time: Float[Array, ""]) -> mlp.MLP:
     """The trunk at one time, a network of the position alone.
 
-    A layer that reads [.., time features] adds the same vector to every Gaussian:
-    here it moves into the bias, once per time. The same sum in another order.
+    What it makes of the time is the same for every Gaussian and is summed once.
     """
     features = encoding.encode(spec.time, time[None], None)
     if params.time is not None:
         features = mlp.apply(time_spec(spec), params.time, features)["code"]
-    width = features.shape[0]
-
-    def fold(index, layer):
-        if index != 0 and index not in spec.skips:
-            return layer
-        return Layer(
-            layer.weight[:-width], layer.bias + features @ layer.weight[-width:]
-        )
-
-    hidden = tuple(fold(*item) for item in enumerate(params.trunk.hidden))
-    return params.trunk._replace(hidden=hidden)
+    return mlp.with_known(trunk_spec(spec), params.trunk, features)
 
 
 def offsets_at_time(
