@@ -63,12 +63,14 @@ def test_a_run_with_every_part_learns_and_stays_finite(paper):
     result = straight(paper)
     assert result.stopped_by == "steps"
     rows = result.history.rows
-    first, last = psnr(paper, start(paper)), psnr(paper, result.state)
-    assert last > first + 1, (first, last)
+    # The opacities are reset at step 20: the picture needs some hundred to come back.
+    learnt = train(paper, result.state, 600).state
+    first, last = psnr(paper, start(paper)), psnr(paper, learnt)
+    assert last > first + 3, (first, last)
     names = {effect.name for effect in effects_of(PAPERS[paper], facts())}
     silent = {"kan_motion", "motion_basis", "motion_growth"}  # add nothing to the loss
     assert names - silent <= set(rows[-1])
-    for leaf in jax.tree.leaves(result.state.params):
+    for leaf in jax.tree.leaves(learnt.params):
         assert np.isfinite(leaf).all()
 
 
