@@ -1,0 +1,125 @@
+"""What a hard case is, and how far a formula is from the truth there.
+
+A case sweeps a function to where its textbook form loses digits, and holds both forms
+against 60-digit arithmetic: value, slopes and, where something differentiates twice,
+curvature. `hard_cases` prints the table, the tests hold the bounds.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+
+ORDERS = ("value", "slope", "curvature")
+
+
+class Case(NamedTuple):
+    """One function near its hard points.
+
+    `stable` and `textbook` map one input [n] to one output [m], as jit and vmap want
+    it; `exact` maps n mpmath numbers to a list of m. Inputs are rounded to the
+    precision under test before any of them sees them, so what the rounding itself does
+    is nobody's error.
+    """
+
+    name: str  # "screw near zero"
+    breaks: str  # what breaks in the textbook form
+    formula: str  # the one used
+    axis: str  # what is swept, with its unit: "θ / rad"
+    at: (
+        np.ndarray
+    )  # [points] the sweep, ascending, float64; from both sides of switches
+    inputs: np.ndarray  # [points, n] float64
+    stable: Callable
+    textbook: Callable
+    exact: Callable
+    # By precision: largest error of value, slope (and curvature). See `errors`.
+    bounds: dict[str, tuple[float, ...]]
+    # Errors are relative to the largest entry of the truth, which counts as at least
+    # this: by order, for the points where the truth itself is or nears zero.
+    floors: tuple[float, ...] = (0.0, 0.0, 0.0)
+    switch: str = "none"  # where the formula changes
+    # The precisions and orders that the textbook form fails, by a factor of ten.
+    caught: tuple[tuple[str, str], ...] = (("float32", "slope"),)
+    timed: np.ndarray | None = None  # [n] a usual input, to time (default: the middle)
+
+    @property
+    def orders(self) -> int:
+        """How many of value, slope and curvature are held."""
+        return max(len(bounds) for bounds in self.bounds.values())
+
+
+def derivative(function: Callable, order: int) -> Callable:
+    """[n] -> [m] with `order` more axes of n behind: forward over reverse mode."""
+    if order == 0:
+        return function
+    slope = jax.jacrev(function)
+    return slope if order == 1 else jax.jacfwd(slope)
+
+
+def truth(case: Case, inputs: np.ndarray, order: int, digits: int = 120) -> np.ndarray:
+    """[points, m, ...] what `derivative` should give, as float64.
+
+    Derivatives are central differences of `case.exact` with a step of 1e-32, good to
+    more than 30 digits; a function with a kink inside the step would be averaged.
+    """
+    with mpmath.workdps(digits):
+        return np.array([_differences(case.exact, row, order) for row in inputs])
+
+
+def _differences(function, row, order):
+    step = mpmath.mpf(10) ** -32
+    centre = [mpmath.mpf(float(x)) for x in row]
+    axes = range(len(centre))
+
+    def at(*moves):
+        moved = list(centre)
+        for axis, sign in moves:
+            moved[axis] += sign * step
+        return mpmath.matrix(function(moved))
+
+    if order == 0:
+        return [float(x) for x in at()]
+    if order == 1:
+        slopes = [(at((i, 1)) - at((i, -1))) / (2 * step) for i in axes]
+        return [[float(slope[m]) for slope in slopes] for m in range(len(slopes[0]))]
+    bends = [[_bend(at, i, j) / (4 * step**2) for j in axes] for i in axes]
+    return [
+        [[float(bend[m]) for bend in row] for row in bends]
+        for m in range(len(bends[0][0]))
+    ]
+
+
+def _bend(at, i, j):
+    return (
+        at((i, 1), (j, 1)) - at((i, 1), (j, -1)) - at((i, -1), (j, 1))
+    ) + at((i, -1), (j, -1))  # fmt: skip
+
+
+def rounded(inputs: np.ndarray, dtype: str) -> np.ndarray:
+    """Inputs as that precision holds them, as float64."""
+    return np.asarray(jnp.asarray(inputs, dtype), np.float64)
+
+
+def errors(case: Case, got: np.ndarray, exact: np.ndarray, order: int) -> np.ndarray:
+    """[points] largest error over the largest entry of the truth; inf where not finite.
+
+    `case.floors[order]` bounds the divisor from below.
+    """
+    axes = tuple(range(1, exact.ndim))
+    size = np.maximum(np.abs(exact).max(axis=axes), case.floors[order])
+    with np.errstate(invalid="ignore", over="ignore"):
+        off = np.abs(np.asarray(got, np.float64) - exact).max(axis=axes)
+    off = np.where(np.isfinite(off), off, np.inf)
+    # A truth of exactly zero without a floor is met exactly or not at all.
+    relative = off / np.where(size > 0, size, 1)
+    return np.where(size > 0, relative, np.where(off == 0, 0.0, np.inf))
+
+
+def evaluate(function: Callable, inputs: np.ndarray, dtype: str, order: int):
+    """[points, m, ...] of `function` or its derivative, jitted over all inputs."""
+    program = jax.jit(jax.vmap(derivative(function, order)))
+    return np.asarray(program(jnp.asarray(inputs, dtype)), np.float64)
