@@ -101,7 +101,7 @@ def _bend(at, i, j):
 
 def rounded(inputs: np.ndarray, dtype: str) -> np.ndarray:
     """Inputs as that precision holds them, as float64."""
-    return np.asarray(jnp.asarray(inputs, dtype), np.float64)
+    return np.asarray(inputs).astype(jnp.dtype(dtype)).astype(np.float64)
 
 
 def errors(case: Case, got: np.ndarray, exact: np.ndarray, order: int) -> np.ndarray:

@@ -1,0 +1,162 @@
+"""Where textbook formulas lose their digits, what ours keep, and what that costs.
+
+    python -m experiments.hard_cases
+    python -m experiments.hard_cases --rooms rotations splats --rows 10000
+    python -m experiments.hard_cases --document docs/numerics.md   # renew its table
+
+Every case sweeps a function to its singular point. The table shows the worst errors of
+value, slope and curvature of the textbook's form and of ours against 60-digit
+arithmetic, in float32 and float64, and the time of ours over the textbook's for values
+and for gradients, from interleaved calls over `--rows` inputs away from the singular
+point. Saves hard_cases.json and a figure of each case.
+"""
+
+import dataclasses
+import pathlib
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments import hard_case, hard_rotations
+from experiments import hard_cases_report as report
+from experiments import settings as run_settings
+from experiments.hard_case import ORDERS, Case
+from nerfies_jax.measure import clock
+
+# The file of each room's cases and, in tests/hard_cases, that of their tests.
+ROOMS = {
+    "rotations": (hard_rotations.CASES, "test_rotations.py"),
+}
+JITTER = 1e-3  # of the timed inputs, so that rows differ
+
+
+@dataclasses.dataclass(frozen=True)
+class HardCases:
+    """Measure errors and costs of formulas at their hard points."""
+
+    rooms: tuple[str, ...] = tuple(ROOMS)
+    """Which rooms' cases."""
+    cases: tuple[str, ...] = ()
+    """Names of cases, or parts of names (default: all of the rooms)."""
+    rows: int = 20_000
+    """Inputs of a timed call."""
+    repeats: int = 15
+    """Timed calls of each form, in turn; the table shows medians."""
+    out: pathlib.Path | None = None
+    """Folder for the figures and hard_cases.json (default: runs/hard_cases)."""
+    document: pathlib.Path | None = None
+    """Write the table into this Markdown file, between its two markers."""
+    device: Literal["auto", "cpu", "gpu", "tpu"] = "cpu"
+    """Where to compute."""
+
+    def __post_init__(self):
+        if not self.rooms or not set(self.rooms) <= set(ROOMS):
+            raise ValueError(
+                f"--rooms {' '.join(self.rooms)}: choose from {', '.join(ROOMS)}"
+            )
+        if self.rows < 1 or self.repeats < 1:
+            raise ValueError(
+                f"--rows {self.rows} and --repeats {self.repeats} are at least 1"
+            )
+
+
+class Outcome(NamedTuple):
+    """Errors of one form in one precision, by order, at each point of the sweep."""
+
+    stable: tuple[np.ndarray, ...]
+    textbook: tuple[np.ndarray, ...]
+
+
+class Row(NamedTuple):
+    """All that was measured of one case."""
+
+    case: Case
+    test: str  # file and test that hold it
+    outcomes: dict[str, Outcome]  # by precision
+    # Time of ours over the textbook's in float32, medians of processor time.
+    value_cost: float
+    slope_cost: float
+
+
+def main(arguments=None):
+    """Run the job of the command line; exit code 2 where its input is wrong."""
+    with run_settings.user_errors():
+        asked = run_settings.parse(HardCases, arguments)
+        chosen = choose(asked.rooms, asked.cases)
+        folder = run_settings.new_run_folder(asked.out, "hard_cases")
+        if asked.document is not None:
+            report.parts(asked.document)  # before the work
+        run_settings.start_jax(asked.device)
+    rows = []
+    for case, test in chosen:
+        rows.append(measure(case, test, asked.rows, asked.repeats))
+        print(report.block(rows[-1]), flush=True)
+        report.save_figure(folder, rows[-1])
+    report.save_numbers(folder, rows, asked)
+    print(f"\n{report.summary(rows)}\nsaved in {folder}")
+    if asked.document is not None:
+        report.renew(asked.document, rows)
+        print(f"renewed the table in {asked.document}")
+
+
+def choose(rooms, names) -> list[tuple[Case, str]]:
+    """Cases of the rooms whose name has one of `names` in it, with their tests."""
+    chosen = []
+    for room in rooms:
+        cases, test = ROOMS[room]
+        chosen += [
+            (case, f"hard_cases/{test}::test_held")
+            for case in cases
+            if not names or any(name in case.name for name in names)
+        ]
+    if not chosen:
+        known = [case.name for room in rooms for case in ROOMS[room][0]]
+        raise ValueError(
+            f"--cases {' '.join(names)}: no such case; there are {', '.join(known)}"
+        )
+    return chosen
+
+
+def measure(case: Case, test: str, rows: int, repeats: int) -> Row:
+    """Errors in every precision that is held, and what the stable form costs."""
+    outcomes = {}
+    for dtype, bounds in case.bounds.items():
+        inputs = hard_case.rounded(case.inputs, dtype)
+        found = {"stable": [], "textbook": []}
+        for order in range(len(bounds)):
+            exact = hard_case.truth(case, inputs, order)
+            for form in found:
+                with jax.enable_x64(dtype == "float64"):
+                    got = hard_case.evaluate(
+                        getattr(case, form), case.inputs, dtype, order
+                    )
+                found[form].append(hard_case.errors(case, got, exact, order))
+        outcomes[dtype] = Outcome(tuple(found["stable"]), tuple(found["textbook"]))
+    return Row(case, test, outcomes, *_costs(case, rows, repeats))
+
+
+def _costs(case, rows, repeats):
+    usual = case.inputs[len(case.inputs) // 2] if case.timed is None else case.timed
+    jitter = np.random.default_rng(0).uniform(-JITTER, JITTER, (rows, len(usual)))
+    inputs = jnp.asarray(usual * (1 + jitter), jnp.float32)
+
+    def total(function):
+        return lambda x: jnp.sum(jax.vmap(function)(x))
+
+    calls = {}
+    for form in ("stable", "textbook"):
+        function = getattr(case, form)
+        value, slope = jax.jit(jax.vmap(function)), jax.jit(jax.grad(total(function)))
+        calls[form, "value"] = lambda program=value: program(inputs)
+        calls[form, "slope"] = lambda program=slope: program(inputs)
+    times = clock.compare(calls, repeats=repeats)
+    return tuple(
+        times["stable", name].median_cpu / times["textbook", name].median_cpu
+        for name in ORDERS[:2]
+    )
+
+
+if __name__ == "__main__":
+    main()
