@@ -1,0 +1,172 @@
+"""Hostile captures, and what every run must hold to however it starts.
+
+Every change of the frames keeps their shapes, so that the program which is compiled for
+a model once serves all of them. `frames_of` gives frames that have every array which a
+change may want to fill.
+"""
+
+import re
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import rich.console
+
+from experiments import evaluate
+from nerfies_jax.training import checkpoint, loop
+from nerfies_jax.training.checkpoint import Checkpoints
+from nerfies_jax.training.loop import FitResult
+
+QUIET = rich.console.Console(quiet=True)
+BAD_STEP = re.compile(r"is not finite: (metric|params\.|optimiser\.|extra\.)")
+
+
+def frames_of(capture, wants=frozenset()):
+    """The training frames, with a mask; it leaves every pixel where there was none."""
+    frames = evaluate.frames_of(capture, wants)
+    if frames.valid is None:
+        frames = frames._replace(valid=jnp.ones(frames.images.shape[:3], bool))
+    return frames
+
+
+def _filled(level):
+    def change(frames):
+        return frames._replace(images=jnp.full_like(frames.images, level))
+
+    return change
+
+
+def _first(frames, *names):
+    """The given arrays (a camera counts as one) with the first row in every place."""
+
+    def repeat(leaf):
+        return jnp.broadcast_to(leaf[:1], leaf.shape)
+
+    return frames._replace(
+        **{name: jax.tree.map(repeat, getattr(frames, name)) for name in names}
+    )
+
+
+def duplicated(frames):
+    """One frame again and again: picture, camera, time and codes."""
+    names = [
+        name
+        for name in ("images", "cameras", "times", "warp", "appearance", "depths")
+        if getattr(frames, name) is not None
+    ]
+    return _first(frames, *names)
+
+
+def two_views(frames):
+    """The first and the last frame by turns, in place of all."""
+    rows = jnp.where(jnp.arange(len(frames.times)) % 2 == 0, 0, len(frames.times) - 1)
+    beside = dict(points=None, flow=None)
+    taken = jax.tree.map(lambda leaf: leaf[rows], frames._replace(**beside))
+    return taken._replace(points=frames.points, flow=frames.flow)
+
+
+def unfilmed(frames):
+    """A frame without a valid pixel, and one of which the left half was not filmed."""
+    half = frames.images.shape[2] // 2
+    valid = frames.valid.at[0].set(False).at[1, :, :half].set(False)
+    return frames._replace(valid=valid)
+
+
+def with_depths(value):
+    """All depths that value, where the frames have depths at all."""
+
+    def change(frames):
+        if frames.depths is None:
+            return frames
+        return frames._replace(depths=jnp.full_like(frames.depths, value))
+
+    return change
+
+
+def unfilmed_depth_nan(frames):
+    """The left half of one frame not filmed, its depth not a number."""
+    half = frames.images.shape[2] // 2
+    frames = frames._replace(valid=frames.valid.at[1, :, :half].set(False))
+    if frames.depths is None:
+        return frames
+    return frames._replace(depths=frames.depths.at[1, :, :half].set(jnp.nan))
+
+
+CAPTURES = {
+    "as filmed": lambda frames: frames,
+    "black images": _filled(0),
+    "white images": _filled(255),
+    "static scene": lambda frames: _first(frames, "images", "cameras"),
+    "one instant": lambda frames: _first(frames, "times", "warp"),
+    "identical cameras": lambda frames: _first(frames, "cameras"),
+    "duplicated frames": duplicated,
+    "two views": two_views,
+    "unfilmed frames": unfilmed,
+    "no depth known": with_depths(0.0),
+    "constant depth": with_depths(2.0),
+    "unfilmed depth not a number": unfilmed_depth_nan,
+}
+
+
+class Trained(NamedTuple):
+    """How a run from a hostile start ended."""
+
+    result: FitResult
+    first: dict[str, float]  # metrics of the first step
+    last: dict[str, float]  # mean metrics of the last chunk
+
+
+def train(model, start, frames, folder, *, steps, every_seconds=0.5) -> Trained:
+    """Fit, and hold the run to what every run promises.
+
+    It completes its steps, or it stops with a message that names what went bad; either
+    way nothing it returns, has written down or has on disk is not finite.
+    """
+    with Checkpoints(folder, model.spec, keep=1000) as checkpoints:
+        result = loop.fit(
+            model,
+            start,
+            frames,
+            steps=steps,
+            checkpoints=checkpoints,
+            checkpoint_seconds=every_seconds,
+            console=QUIET,
+        )
+    assert result.stopped_by in ("steps", "non-finite"), result.message
+    if result.stopped_by == "non-finite":
+        assert BAD_STEP.search(result.message), result.message
+        assert result.steps < steps
+    assert not not_finite(result.state), result.message
+    for row in result.history.rows:
+        assert np.isfinite(list(row.values())).all(), row
+    assert_checkpoints_finite(folder, model, result)
+    rows = result.history.rows or ({},)
+    return Trained(result, rows[0], rows[-1])
+
+
+def assert_checkpoints_finite(folder, model, result):
+    """Every checkpoint comes back whole and finite; the newest is what was returned."""
+    saved = checkpoint.steps(folder)
+    assert saved[-1] == result.steps
+    for step in saved:
+        restored = checkpoint.restore(folder, result.state, model.spec, step=step)
+        assert not not_finite(restored.state), (step, not_finite(restored.state))
+    newest, returned = map(numbers, (restored.state, result.state))
+    assert newest.keys() == returned.keys()
+    for name, array in newest.items():
+        np.testing.assert_array_equal(array, returned[name], err_msg=name)
+
+
+def numbers(tree):
+    """The floating arrays of a pytree as NumPy ones, by their paths."""
+    return {
+        jax.tree_util.keystr(path): np.asarray(leaf)
+        for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]
+        if jnp.issubdtype(leaf.dtype, jnp.inexact)
+    }
+
+
+def not_finite(tree):
+    """Paths of the floating arrays that hold anything but finite numbers."""
+    return [name for name, x in numbers(tree).items() if not np.isfinite(x).all()]
