@@ -7,7 +7,15 @@ import time
 
 import numpy as np
 
-from experiments import budget, camera_paths, evaluate, pictures, report, runs
+from experiments import (
+    budget,
+    camera_paths,
+    curves,
+    evaluate,
+    pictures,
+    report,
+    runs,
+)
 from experiments.evaluate import Renderer, Scored
 from experiments.representations import MODEL, Saved
 from experiments.runs import Run
@@ -36,6 +44,8 @@ def make(folder: pathlib.Path, run: Run, outcome: Outcome, began: float) -> None
             "apart, and the depth.",
         )
     ]
+    watched = [run.capture.ids[row] for row in outcome.watched]
+    curves.write(folder, outcome.result.history, watched)
     curve = save_curve(folder / "psnr_over_time.png", run, outcome)
     if curve is not None:
         figures.append(

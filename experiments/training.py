@@ -3,6 +3,8 @@
 import pathlib
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from experiments import budget, evaluate, runs
 from experiments.evaluate import Renderer
 from experiments.runs import Run
@@ -16,6 +18,7 @@ class Outcome(NamedTuple):
 
     result: FitResult
     renderer: Renderer
+    watched: np.ndarray  # rows of the held-out frames that its curve is of
 
 
 def open_checkpoints(folder: pathlib.Path, run: Run, after: int | None) -> Checkpoints:
@@ -59,4 +62,4 @@ def train(
             checkpoints=checkpoints,
             history=History() if record is None else History(**record),
         )
-    return Outcome(result, renderer)
+    return Outcome(result, renderer, few)

@@ -1,0 +1,252 @@
+"""Lay finished runs over each other: curves, time to a quality, pictures, a table.
+
+    python -m experiments.compare RUN RUN ...
+    python -m experiments.compare RUN RUN --psnr 22 24 --frames 4 --out compared
+
+The runs must have learnt from the same frames of the same capture. Prints a table of
+scores, times and sizes and after how many seconds of training each run reached a PSNR;
+saves compare.json, curves.png, and pictures.png with held-out frames side by side.
+Seconds are those of the machine of each run: the table says where machines differ.
+"""
+
+import dataclasses
+import json
+import math
+import pathlib
+from typing import Any, Literal, NamedTuple
+
+from experiments import settings as run_settings
+
+LARGEST_ERROR = 0.2
+SAME = ("capture", "scene", "factor", "max_side", "heldout")
+# Columns: key of metrics.json, head, digits behind the point, divisor.
+COLUMNS = (
+    ("heldout.psnr", "PSNR", 2, 1),
+    ("heldout.ssim", "SSIM", 3, 1),
+    ("train.steps", "steps", 0, 1),
+    ("train.seconds", "train s", 0, 1),
+    ("train.compile_seconds", "compile s", 0, 1),
+    ("render.ms_per_frame", "ms/frame", 1, 1),
+    ("parameters", "parameters", 0, 1),
+    ("file.bytes", "file MB", 2, 1e6),
+    ("memory.peak_bytes", "peak MB", 0, 1e6),
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Compare:
+    """Compare finished runs of one capture."""
+
+    runs: run_settings.Positional[tuple[pathlib.Path, ...]]
+    """Folders that experiments.reconstruct made."""
+    psnr: tuple[float, ...] = ()
+    """Qualities in dB to wait for (default: what the runs but the best ended with)."""
+    frames: int = 2
+    """Held-out frames in the picture; 0 renders none."""
+    out: pathlib.Path | None = None
+    """Folder for compare.json, curves.png and pictures.png (default: runs/compare)."""
+    device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
+    """Where to render."""
+
+    def __post_init__(self):
+        if len(self.runs) < 2 or len(set(self.runs)) < len(self.runs):
+            raise ValueError(
+                "name two or more different run folders, got "
+                f"{' '.join(map(str, self.runs)) or 'none'}"
+            )
+        if self.frames < 0:
+            raise ValueError(f"--frames {self.frames} must not be negative")
+
+
+class Compared(NamedTuple):
+    """One run as it is compared."""
+
+    name: str
+    folder: pathlib.Path
+    metrics: dict[str, float | None]
+    curve: Any  # curves.Curve
+
+
+def main(arguments=None):
+    """Run the job of the command line; exit code 2 where its input is wrong."""
+    with run_settings.user_errors():
+        asked = run_settings.parse(Compare, arguments)
+        compared = read(asked.runs)
+        folder = run_settings.new_run_folder(asked.out, "compare")
+        goals = asked.psnr or default_goals(compared)
+    print(table(compared, goals))
+    for line in remarks(compared):
+        print(line)
+    save(folder, compared, goals)
+    if asked.frames:
+        presets = [run_settings.stored_preset(each.folder) for each in compared]
+        threads = {run_settings.threads_for(preset) for preset in presets}
+        with run_settings.user_errors():
+            run_settings.start_jax(asked.device, "all" if "all" in threads else "one")
+            draw(folder / "pictures.png", compared, asked.frames)
+    print(f"saved in {folder}")
+
+
+def read(folders) -> list[Compared]:
+    """Runs of one capture; ValueErrors name the run and what is wrong with it."""
+    from experiments import curves
+
+    compared, choices = [], []
+    for folder, name in zip(folders, _names(folders), strict=True):
+        curve = curves.read(folder)
+        try:
+            metrics = json.loads((folder / "metrics.json").read_text())
+            stored = json.loads((folder / run_settings.CONFIG).read_text())["choices"]
+        except (OSError, ValueError, KeyError) as error:
+            raise ValueError(f"{folder}: not a finished run ({error!r})") from error
+        compared.append(Compared(name, folder, metrics, curve))
+        same = {key: stored.get(key) for key in SAME}
+        if stored.get("capture") is None:  # a built-in scene is made from the seed
+            same["seed"] = stored.get("seed")
+        choices.append(same)
+        for key, value in choices[0].items():
+            if choices[-1].get(key) != value:
+                raise ValueError(
+                    f"{folder} and {folders[0]} did not learn the same frames: {key} "
+                    f"is {choices[-1].get(key)} and {value}; compare runs of one "
+                    "capture"
+                )
+    return compared
+
+
+def _names(folders):
+    """The last parts of the paths, as many as tell them apart."""
+    parts = [folder.absolute().parts for folder in folders]
+    for count in range(1, max(map(len, parts)) + 1):
+        names = ["/".join(each[-count:]) for each in parts]
+        if len(set(names)) == len(names):
+            break
+    return names
+
+
+def default_goals(compared) -> tuple[float, ...]:
+    """What the curves of all runs but the best ended with, in whole tenths of a dB."""
+    ends = sorted(run.curve.psnr[-1] for run in compared if run.curve.psnr)
+    ends = [math.floor(10 * psnr) / 10 for psnr in ends[:-1] if math.isfinite(psnr)]
+    return tuple(dict.fromkeys(ends))
+
+
+def times(compared, goals) -> list[list[float | None]]:
+    """[runs][goals] seconds of training to each PSNR; None where not reached."""
+    from experiments import curves
+
+    return [[curves.seconds_to(run.curve, goal) for goal in goals] for run in compared]
+
+
+def table(compared, goals) -> str:
+    """One line for each run."""
+    known = [c for c in COLUMNS if any(run.metrics.get(c[0]) for run in compared)]
+    heads = ["run", *(c[1] for c in known), *(f"s to {goal:g} dB" for goal in goals)]
+    lines = [heads]
+    for run, reached in zip(compared, times(compared, goals), strict=True):
+        cells = [
+            _cell(run.metrics.get(key), digits, unit) for key, _, digits, unit in known
+        ]
+        cells += ["never" if x is None else f"{x:.0f}" for x in reached]
+        lines.append([run.name, *cells])
+    widths = [max(len(line[i]) for line in lines) for i in range(len(heads))]
+    return "\n".join(
+        "  ".join(
+            cell.ljust(width) if i == 0 else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
+        )
+        for line in lines
+    )
+
+
+def _cell(value, digits, unit):
+    return "-" if value is None else f"{value / unit:,.{digits}f}"
+
+
+def remarks(compared) -> list[str]:
+    """What a reader must know before he believes the table."""
+    found = []
+    first = compared[0]
+    for run in compared[1:]:
+        for key in ("cpu", "cores", "xla_cores", "jax"):
+            here, there = run.curve.machine.get(key), first.curve.machine.get(key)
+            if here != there:
+                found.append(
+                    f"Seconds do not compare: {key} is {there} in {first.name} and "
+                    f"{here} in {run.name}."
+                )
+        if run.curve.frames != first.curve.frames:
+            found.append(
+                f"The curves of {first.name} and {run.name} are of different held-out "
+                f"frames ({len(first.curve.frames)} and {len(run.curve.frames)}): "
+                "times to a PSNR compare roughly."
+            )
+        counts = [each.metrics.get("heldout.frames") for each in (first, run)]
+        if counts[0] != counts[1]:
+            found.append(
+                f"PSNR and SSIM of {first.name} are of {counts[0]} frames, those of "
+                f"{run.name} of {counts[1]}."
+            )
+    return found
+
+
+def save(folder: pathlib.Path, compared, goals) -> None:
+    """compare.json and curves.png."""
+    from experiments import pictures
+    from nerfies_jax.capture.json_files import write_json
+
+    reached = times(compared, goals)
+    write_json(
+        folder / "compare.json",
+        {
+            run.name: {
+                "metrics": run.metrics,
+                "seconds_to_psnr": dict(zip(map(str, goals), seconds, strict=True)),
+                "machine": run.curve.machine,
+            }
+            for run, seconds in zip(compared, reached, strict=True)
+        },
+    )
+    histories = {
+        run.name: pictures.History(run.curve.seconds, run.curve.psnr)
+        for run in compared
+        if run.curve.psnr
+    }
+    if histories:
+        pictures.curve(histories, folder / "curves.png")
+
+
+def draw(path: pathlib.Path, compared, count: int) -> None:
+    """Held-out frames: the truth and every run's picture, below them the errors."""
+    from experiments import evaluate, pictures, runs
+
+    scored = []
+    for each in compared:
+        run = runs.saved_run(each.folder)
+        state = runs.restore(each.folder, run).state
+        rows = evaluate.spread(run.capture.heldout, count)
+        renderer = evaluate.Renderer(run.model, run.capture.size)
+        scored.append(evaluate.score(renderer, state, run.capture, rows))
+        capture = run.capture
+    panels, captions = [], []
+    for place, row in enumerate(scored[0].rows):
+        truth = capture.images[row]
+        filmed = None if capture.valid is None else capture.valid[row][..., None]
+        drawn = [evaluate.as_picture(each.colour[place]) for each in scored]
+        if filmed is not None:  # what was not filmed is no error
+            truth, drawn = truth * filmed, [picture * filmed for picture in drawn]
+        errors = [pictures.colour_error(x, truth, LARGEST_ERROR).picture for x in drawn]
+        blank = truth * 0 + 255
+        panels += [truth, *drawn, blank, *errors]
+        captions += [capture.ids[row]]
+        captions += [
+            f"{run.name}: {each.psnr[place]:.2f} dB"
+            for run, each in zip(compared, scored, strict=True)
+        ]
+        captions += ["", *(f"error, to {LARGEST_ERROR:g}" for _ in scored)]
+    sheet = pictures.contact_sheet(panels, captions, columns=1 + len(compared))
+    pictures.save(sheet, path)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,122 @@
+"""Runs laid over each other, from folders as `reconstruct` leaves them."""
+
+import json
+
+import numpy as np
+import pytest
+
+from experiments import compare, curves
+from nerfies_jax.training.loop import History
+
+CHOICES = {"capture": "/films/cat", "scene": "default", "preset": "nerf", "seed": 0}
+
+
+def curve(seconds, psnr):
+    count = len(seconds)
+    return curves.Curve(
+        tuple(seconds), tuple(range(count)), tuple(psnr), (0.5,) * count, ("a",), 1, {}
+    )
+
+
+def run_folder(folder, psnr, seconds=(1.0, 3.0), **choices):
+    """A finished run: its curve ends at the last of `psnr`."""
+    folder.mkdir(parents=True)
+    rows = [
+        {"hook": "held out", "step": step, "seconds": at, "psnr": dB, "ssim": 0.5}
+        for step, (at, dB) in enumerate(zip(seconds, psnr, strict=True))
+    ]
+    history = History(
+        ({"step": 1, "seconds": 1.0, "loss": 0.1},), tuple(rows), 3.0, 2.0
+    )
+    curves.write(folder, history, ["frame 3"])
+    metrics = {"heldout.psnr": psnr[-1], "train.seconds": seconds[-1]}
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+    stored = {"choices": CHOICES | choices}
+    (folder / "config.json").write_text(json.dumps(stored))
+    return folder
+
+
+def test_time_to_a_quality_is_read_off_the_curve():
+    rising = curve([1, 3, 5], [10, 20, 20])
+    assert curves.seconds_to(rising, 15) == pytest.approx(2)
+    assert curves.seconds_to(rising, 20) == pytest.approx(3)
+    assert curves.seconds_to(rising, 5) == 1
+    assert curves.seconds_to(rising, 20.1) is None
+    assert curves.seconds_to(curve([], []), 5) is None
+
+
+def test_a_quality_that_was_lost_again_counts_from_the_last_crossing():
+    assert curves.seconds_to(curve([0, 1, 2, 3], [21, 22, 18, 22]), 20) == 2.5
+    assert curves.seconds_to(curve([0, 1], [21, 19]), 20) is None
+    assert curves.seconds_to(curve([0, 1], [np.nan, 22]), 20) == 1
+
+
+def test_a_curve_comes_back_as_it_was_written(tmp_path):
+    found = curves.read(run_folder(tmp_path / "run", (12.5, np.nan)))
+    assert found.seconds == (1.0, 3.0)
+    assert found.psnr[0] == 12.5
+    assert np.isnan(found.psnr[1])
+    assert found.frames == ("frame 3",)
+    assert found.compile_seconds == 2.0
+    assert "jax" in found.machine
+
+
+def test_the_table_tells_who_was_when_as_good(tmp_path, capsys):
+    slow = run_folder(tmp_path / "one" / "slow", (10.0, 20.04), (2.0, 4.0))
+    good = run_folder(tmp_path / "two" / "good", (10.0, 30.0), (1.0, 3.0))
+    out = tmp_path / "out"
+    compare.main([str(slow), str(good), "--frames", "0", "--out", str(out)])
+    head, first, second, *_ = capsys.readouterr().out.splitlines()
+    assert head.split()[:3] == ["run", "PSNR", "train"]
+    assert head.endswith("s to 20 dB")
+    assert first.split() == ["slow", "20.04", "4", "4"]
+    assert second.split() == ["good", "30.00", "3", "2"]
+    stored = json.loads((out / "compare.json").read_text())
+    assert stored["good"]["seconds_to_psnr"] == {"20.0": 2.0}
+    assert (out / "curves.png").stat().st_size > 5000
+
+
+def test_runs_of_equal_names_are_told_apart(tmp_path):
+    folders = [run_folder(tmp_path / name / "run", (1.0, 2.0)) for name in "ab"]
+    assert [run.name for run in compare.read(folders)] == ["a/run", "b/run"]
+
+
+def test_other_machines_and_frames_are_remarked(tmp_path):
+    one, two = (run_folder(tmp_path / name, (1.0, 2.0)) for name in "ab")
+    stored = json.loads((two / "curve.json").read_text())
+    stored["machine"]["cpu"], stored["frames"] = "another", ["frame 3", "frame 9"]
+    (two / "curve.json").write_text(json.dumps(stored))
+    lines = compare.remarks(compare.read([one, two]))
+    assert any("cpu" in line and "another" in line for line in lines)
+    assert any("different held-out frames (1 and 2)" in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (lambda folder: (folder / "curve.json").unlink(), "no curve.json"),
+        (lambda folder: (folder / "curve.json").write_text("{}"), "not the curve"),
+        (lambda folder: (folder / "metrics.json").unlink(), "not a finished run"),
+        (
+            lambda folder: (folder / "config.json").write_text(
+                json.dumps({"choices": CHOICES | {"capture": "/films/dog"}})
+            ),
+            "capture is /films/dog and /films/cat",
+        ),
+    ],
+)
+def test_what_cannot_be_compared_is_refused(damage, words, tmp_path, capsys):
+    one, two = (run_folder(tmp_path / name, (1.0, 2.0)) for name in "ab")
+    damage(two)
+    out = tmp_path / "out"
+    with pytest.raises(SystemExit) as stop:
+        compare.main([str(one), str(two), "--out", str(out)])
+    assert stop.value.code == 2
+    assert words in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_one_run_is_no_comparison(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        compare.main([str(tmp_path)])
+    assert "two or more" in capsys.readouterr().err
