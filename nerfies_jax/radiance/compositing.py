@@ -3,7 +3,8 @@
 Everything is for one ray, from its origin outwards; callers `jax.vmap`. The *optical
 depth* of a sample is its density times the length it stands for. Light that meets a
 depth d gets through with probability exp(-d). Preconditions: densities are finite and
-not negative, distances are sorted.
+not negative, distances are sorted. Sums over a ray are made in float32 at least: in
+bfloat16 the weights of a ray of 128 samples would be off by 1e-2.
 """
 
 from typing import NamedTuple
@@ -46,8 +47,11 @@ def weights(optical_depth: Float[Array, " samples"]) -> Float[Array, " samples"]
 
     Equation 3 of Mildenhall et al. 2020, arXiv:2003.08934.
     """
-    # 1 - exp(-x) would round to 0 in thin air.
-    return _transmittance(optical_depth) * -jnp.expm1(-optical_depth)
+    # 1 - exp(-x) would round to 0 in thin air. (JAX's slope of expm1 is exp(-x) to 6e-8
+    # of one; with all its digits behind walls the gradient takes 1.8 times as long.)
+    depth = _widened(optical_depth)
+    stopped = _transmittance(depth) * -jnp.expm1(-depth)
+    return stopped.astype(optical_depth.dtype)
 
 
 def media_weights(
@@ -62,8 +66,9 @@ def media_weights(
     than `weights` of their joint depth, up to as often as there are media; opacity and
     distances are therefore read from the joint depth (`composite_media`).
     """
-    reaching = _transmittance(jnp.sum(optical_depth, axis=0))
-    return reaching * -jnp.expm1(-optical_depth)
+    depth = _widened(optical_depth)
+    stopped = _transmittance(jnp.sum(depth, axis=0)) * -jnp.expm1(-depth)
+    return stopped.astype(optical_depth.dtype)
 
 
 def thinned(
@@ -136,7 +141,7 @@ def expected_distance(
 
 def median_index(weights: Float[Array, " samples"]) -> Int[Array, ""]:
     """The first sample by which half the light has stopped; the last if none."""
-    passed = jnp.cumsum(weights) >= 0.5
+    passed = jnp.cumsum(_widened(weights)) >= 0.5
     return jnp.where(jnp.any(passed), jnp.argmax(passed), weights.shape[0] - 1)
 
 
@@ -152,6 +157,10 @@ def _composite(colour, weights, distances, background):
     # The median may read the sample at infinity: it falls back to it anyway.
     median = distances[median_index(weights)]
     return Composite(colour, alpha, depth, median)
+
+
+def _widened(x):
+    return x.astype(jnp.float32) if x.dtype.itemsize < 4 else x
 
 
 def _transmittance(optical_depth):

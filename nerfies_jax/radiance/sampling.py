@@ -73,7 +73,11 @@ def from_weights(
         )
     if count < 1:
         raise ValueError(f"count={count} must be at least 1")
+    dtype = edges.dtype
     edges, weights = jax.lax.stop_gradient((edges, weights))
+    # A rounding unit of bfloat16 on each of 64 bins would be half of all weight.
+    if dtype.itemsize < 4:
+        edges, weights = edges.astype(jnp.float32), weights.astype(jnp.float32)
     limits = jnp.finfo(weights.dtype)
     if floor is None:
         # Absolute floors drown faint rays: weights that sum to 1e-30 under 1e-5 move
@@ -95,7 +99,7 @@ def from_weights(
     # A bin whose floor vanished beside the sum before it has no width.
     within = jnp.clip((reached - start) / jnp.where(width > 0, width, 1), 0, 1)
     left, right = edges[bin_], edges[bin_ + 1]
-    return jnp.minimum(left + within * (right - left), right)
+    return jnp.minimum(left + within * (right - left), right).astype(dtype)
 
 
 def union(
