@@ -122,10 +122,18 @@ def _coth_excess(x_sq):
 
 
 def _scale_by_row_moments(b1, b2, direction):
-    """Updates made by `direction(age, mean slope, mean squared slope)` of every row."""
+    """Updates made by `direction(age, mean slope, mean squared slope)` of every row.
+
+    A slope of more than 5e20, whose square is infinite in float32, makes its update
+    NaN: the run stops there, at its last good step. Divided by infinity, the number
+    would stand still unnoticed for the rest of the run (as good as for ever in float64
+    too: a slope of 1e20 is forgotten after 9e4 updates).
+    """
     _check_decays(b1, b2)
 
     def init(params):
+        _check_wide(params)
+
         def count(leaf):
             return jnp.zeros(leaf.shape[:1], jnp.int32)
 
@@ -148,7 +156,8 @@ def _scale_by_row_moments(b1, b2, direction):
             # 1 - b^n, which cancels in float32 for b = 0.999 and small n.
             seen = -jnp.expm1(age * math.log(b1))
             seen_sq = -jnp.expm1(age * math.log(b2))
-            return direction(age, m / seen, v / seen_sq)
+            told = jnp.where(jnp.isfinite(v), m, jnp.nan)
+            return direction(age, told / seen, v / seen_sq)
 
         return jax.tree.map(step, count, first, second), RowAdamState(
             count, first, second
@@ -163,6 +172,19 @@ def _check_decays(b1, b2):
             f"b1={b1} and b2={b2} must lie strictly between 0 and 1; "
             "0.9 and 0.999 are usual"
         )
+
+
+def _check_wide(params):
+    """Steps of a thousandth are lost in eight bits: nothing would ever move."""
+    for path, leaf in jax.tree_util.tree_flatten_with_path(params)[0]:
+        if leaf.dtype.itemsize < 4:
+            name = (
+                jax.tree_util.keystr(path, simple=True, separator=".") or "parameters"
+            )
+            raise ValueError(
+                f"{name} is {leaf.dtype}, in which small updates round to nothing; "
+                "train in float32 and cast where a network is evaluated"
+            )
 
 
 def _count_once_started(count, slopes):

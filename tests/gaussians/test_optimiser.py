@@ -268,6 +268,44 @@ def test_no_slope_is_no_step(dtype):
     assert not np.asarray(step).any()
 
 
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("name", PAIRS)
+@pytest.mark.parametrize("slope", [1e19, 1e21, 1e30, np.inf, np.nan])
+def test_a_slope_too_large_to_square_is_told_and_spares_the_others(name, slope, dtype):
+    """Divided by an infinite square, its row would stand still for ever, unnoticed."""
+    ours = PAIRS[name][0]()
+    slopes = jnp.ones((3, 2), dtype)
+    state, update = ours.init(slopes), jax.jit(ours.update)
+    for _ in range(7):  # past RAdam's threshold
+        _, state = update(slopes, state)
+    wild = slopes.at[1, 0].set(jnp.asarray(slope, dtype))
+    after = state
+    for hit in (wild, slopes, slopes):
+        usual, state = update(slopes, state)
+        step, after = update(hit, after)
+        others = np.ones((3, 2), bool)
+        others[1, 0] = False
+        np.testing.assert_array_equal(np.asarray(step)[others], usual[others])
+        square = np.asarray(after.second)[1, 0]
+        assert np.isnan(step[1, 0]) == (not np.isfinite(square))
+    huge = {"float32": 5e20, "float64": 1e150}[dtype]
+    assert np.isfinite(square) == (slope < huge)
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("name", PAIRS)
+@pytest.mark.parametrize("narrow", [jnp.bfloat16, jnp.float16])
+def test_parameters_that_small_steps_would_not_move_are_refused(name, narrow):
+    """In bfloat16, 200 steps of 1e-3 leave a parameter of one where it was."""
+    one = jnp.ones((), jnp.bfloat16)
+    assert one - jnp.asarray(1e-3, jnp.bfloat16) == one
+    params = rows_and_nets()
+    params.nets["w"] = params.nets["w"].astype(narrow)
+    message = f"nets.w is {jnp.dtype(narrow)}, .* train in float32"
+    with pytest.raises(ValueError, match=message):
+        PAIRS[name][0]().init(params)
+
+
 @pytest.mark.parametrize("name", PAIRS)
 def test_a_gather_moves_rows_with_their_moments_and_leaves_nets_alone(name):
     params, tx = rows_and_nets(), partitioned(PAIRS[name][0])
