@@ -79,18 +79,18 @@ def thinned(
     -log(1 - v (1 - exp(-d))): NSFF multiplies opacities by its blending weight v, which
     as a depth can share the transmittance of other media.
     """
-    share = jax.nn.sigmoid(share_logit)
-    thin = share * -jnp.expm1(-optical_depth) < 0.5
+    depth, logit = _widened(optical_depth), _widened(share_logit)
+    share = jax.nn.sigmoid(logit)
+    thin = share * -jnp.expm1(-depth) < 0.5
     # log1p keeps all digits of thin air but has 1 - v exp(..) → 0 for v → 1; the sum
     # (1 - v) + v exp(-d) of the same terms in logarithms is right there and loses small
     # depths to cancellation.
-    safe = jnp.where(thin, optical_depth, 0)
+    safe = jnp.where(thin, depth, 0)
     near_clear = -jnp.log1p(share * jnp.expm1(-safe))
     near_opaque = -jnp.logaddexp(
-        jax.nn.log_sigmoid(-share_logit),
-        jax.nn.log_sigmoid(share_logit) - optical_depth,
+        jax.nn.log_sigmoid(-logit), jax.nn.log_sigmoid(logit) - depth
     )
-    return jnp.where(thin, near_clear, near_opaque)
+    return jnp.where(thin, near_clear, near_opaque).astype(optical_depth.dtype)
 
 
 def composite(
