@@ -18,15 +18,16 @@ import pathlib
 from typing import Literal
 
 from experiments import settings as run_settings
-from experiments.ablate_arms import SUITES
+from experiments.ablate_suites import SUITES
 
 
 @dataclasses.dataclass(frozen=True)
 class Ablate:
     """Compare ways to reconstruct a moving scene with and without their parts."""
 
-    suite: Literal["fields", "sonata", "moba"] = "fields"
-    """Radiance fields, or the ablations of Sonata or MoBa-GS."""
+    suite: Literal["fields", "sonata", "moba", "settings"] = "fields"
+    """Radiance fields, the ablations of Sonata or MoBa-GS, or the settings of
+    experiments.accuracy_time."""
     arms: tuple[str, ...] = ()
     """Which arms of the suite (default: all)."""
     scene: str = "default"
@@ -41,6 +42,8 @@ class Ablate:
     """Frames of the capture to judge by: n for every n-th, or the name of a split."""
     steps: int | None = None
     """Steps of training of every arm (default: the presets' own)."""
+    share: float | None = None
+    """Steps of training of every arm as a share of its preset's own."""
     seconds: float | None = None
     """Seconds of training of every arm instead, or, with --steps, as well: each gets
     the steps that it can make in this time here, and its schedules stretch to them."""
@@ -76,7 +79,7 @@ def main(arguments=None):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with run_settings.user_errors():
         asked = run_settings.parse(Ablate, arguments)
-        _check(asked)
+        check(asked)
         arms = SUITES[asked.suite].arms
         names = asked.arms or tuple(arms)
         threads = {run_settings.threads_for(arms[name].preset) for name in names}
@@ -90,15 +93,19 @@ def main(arguments=None):
     raise SystemExit(1 if failed else 0)
 
 
-def _check(asked):
+def check(asked: Ablate) -> None:
+    """Raise ValueError for what cannot be run."""
     least = min(asked.frames, asked.tracks, asked.jobs, len(asked.all_seeds))
-    limits = (asked.budget, asked.seconds, asked.steps)
+    limits = (asked.budget, asked.seconds, asked.steps, asked.share)
     if least < 1 or not all(limit is None or limit > 0 for limit in limits):
         raise ValueError(
-            "--seeds, --frames, --tracks, --jobs, --budget, --seconds and --steps are "
-            f"positive, got {asked.seeds}, {asked.frames}, {asked.tracks}, "
-            f"{asked.jobs}, {asked.budget}, {asked.seconds} and {asked.steps}"
+            "--seeds, --frames, --tracks, --jobs, --budget, --seconds, --steps and "
+            f"--share are positive, got {asked.seeds}, {asked.frames}, {asked.tracks}, "
+            f"{asked.jobs}, {asked.budget}, {asked.seconds}, {asked.steps} and "
+            f"{asked.share}"
         )
+    if asked.share is not None and asked.steps is not None:
+        raise ValueError("--steps and --share say the same thing: give one of them")
     if asked.seed is not None and not (asked.seed >= 0 and asked.jobs == 1):
         raise ValueError(
             f"--seed {asked.seed}: one seed from 0 on, in one process (--jobs 1)"

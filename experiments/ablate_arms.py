@@ -256,5 +256,3 @@ MOBA = Suite(
         + _APART
     ),
 )
-
-SUITES = {"fields": FIELDS, "sonata": SONATA, "moba": MOBA}

@@ -19,10 +19,11 @@ from experiments import (
     runs,
 )
 from experiments import settings as run_settings
-from experiments.ablate_arms import SUITES
 from experiments.ablate_kept import Kept
 from experiments.ablate_measures import MEASURES
+from experiments.ablate_suites import SUITES
 from nerfies_jax.capture import synthetic
+from nerfies_jax.measure import clock
 from nerfies_jax.training import loop
 
 PILOT_STEPS = 150  # of a whole, short schedule, to see what a step costs
@@ -37,12 +38,15 @@ class Budget(NamedTuple):
     steps: int | None  # without seconds: None for the preset's own
     seconds: float | None
     folder: pathlib.Path
+    share: float | None = None  # of the preset's own steps
 
     @property
     def title(self) -> str:
         """As in "each arm trained ..."."""
         if self.seconds is not None:
             return f"for {self.seconds:g} s, in as many steps as that allows"
+        if self.share is not None:
+            return f"over {self.share:g} of its preset's own steps"
         if self.steps is None:
             return "over its preset's own steps"
         return f"over {self.steps} steps"
@@ -84,7 +88,7 @@ class Job:
         self.out = asked.out or pathlib.Path("runs", stem)
         self.budgets = []
         if asked.seconds is None or asked.steps is not None:
-            self.budgets.append(Budget(asked.steps, None, self.out))
+            self.budgets.append(Budget(asked.steps, None, self.out, asked.share))
         if asked.seconds is not None:
             folder = self.out / f"seconds-{asked.seconds:g}"
             self.budgets.append(Budget(None, asked.seconds, folder))
@@ -133,6 +137,8 @@ class Job:
         arm = self.suite.arms[name]
         representation = representations.of_preset(arm.preset)
         spec = representation.presets[arm.preset]
+        if steps is None and self.asked.share is not None:
+            steps = max(1, round(self.asked.share * spec.steps))
         if steps is not None:
             spec = representation.with_steps(spec, steps)
         return run_settings.override(spec, (*arm.changes, *self.asked.set))
@@ -244,9 +250,12 @@ class Job:
             "train_cpu_seconds": cpu_seconds,
             "compile_seconds": arm.compile_seconds + compile_seconds,
             "render_ms": arm.renderer.ms_per_frame(len(self.known.rows)),
+            "peak_mb": clock.peak_bytes() / 1e6,
         }
         if compiled_before:  # most of it in this very process
             numbers["compile_seconds"] = float("nan")
+        if len(self._built) > 1:  # what came before it counts, too
+            numbers["peak_mb"] = float("nan")
         arrays = {"colour": evaluate.as_picture(scored.colour), "depth": scored.depth}
         notes = {"steps": result.steps, "stopped_by": result.stopped_by}
         if followed is not None:

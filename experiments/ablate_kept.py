@@ -48,7 +48,8 @@ def read(path: pathlib.Path, identity: dict[str, Any]) -> Kept | None:
         return None
     try:
         stored = json.loads(path.read_text())
-        numbers = {name: stored["numbers"][name] for name in MEASURES}
+        # A measure that is younger than the file is not known there.
+        numbers = {name: stored["numbers"].get(name) for name in MEASURES}
         with np.load(path.with_suffix(".npz"), allow_pickle=False) as file:
             arrays = dict(file)
         made_with, notes = stored["identity"], stored["notes"]

@@ -35,6 +35,7 @@ MEASURES = {
     "train_cpu_seconds": Measure("CPU s", "s", "lower", 60.0, 0),
     "compile_seconds": Measure("compile", "s", "lower", 10.0, 1),
     "render_ms": Measure("frame ms", "ms", "lower", 500.0, 0),
+    "peak_mb": Measure("peak MB", "MB", "lower", 300.0, 0),
 }
 
 COSTS = tuple(MEASURES)[tuple(MEASURES).index("gaussians") :]  # the others are quality
@@ -57,7 +58,7 @@ LEGENDS = {
     "train_seconds": "train s: steps and what happens between them, without compiling "
     "the step; CPU s: the\nsame of all threads; compile: the step's programs, as "
     "without a cache (what one from it once took\nis added); frame ms: rendering a "
-    "held-out frame.",
+    "held-out frame; peak MB: most memory of the process, where it made one arm alone.",
 }
 
 

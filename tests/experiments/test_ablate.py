@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from experiments import ablate, ablate_job, ablate_kept, settings
-from experiments.ablate_arms import FIELDS, SUITES
+from experiments.ablate_arms import FIELDS
 from experiments.ablate_job import Job
 from experiments.ablate_kept import Kept
 from experiments.ablate_measures import MEASURES
+from experiments.ablate_suites import SUITES
 from nerfies_jax.capture import synthetic
 from nerfies_jax.measure import clock
 from tests import scenes
@@ -231,7 +232,7 @@ def test_the_command_measures_arms_and_goes_on_where_it_stopped(
     metrics = clock.read_metrics(out / "ablation.json")
     assert np.isnan(metrics["static.track_error"].value)
     for name in MEASURES:
-        if name != "gaussians":
+        if name not in ("gaussians", "peak_mb"):  # two arms in one process
             assert np.isfinite(metrics[f"nerfies.{name}"].value), name
     # Three steps move nothing.
     still = metrics["still.track_error"].value

@@ -7,8 +7,9 @@ import pytest
 import scipy.stats
 
 from experiments import ablate_measures, ablate_verdicts
-from experiments.ablate_arms import FIELDS, SUITES
+from experiments.ablate_arms import FIELDS
 from experiments.ablate_measures import MEASURES
+from experiments.ablate_suites import SUITES
 
 
 def numbers_of(**pairs):

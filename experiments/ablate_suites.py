@@ -1,0 +1,6 @@
+"""All suites of arms by name; no JAX."""
+
+from experiments.ablate_arms import FIELDS, MOBA, SONATA
+from experiments.accuracy_axes import SETTINGS
+
+SUITES = {"fields": FIELDS, "sonata": SONATA, "moba": MOBA, "settings": SETTINGS}

@@ -1,0 +1,219 @@
+"""Write down what settings cost: lines, fronts, metrics and what got worse."""
+
+import math
+import pathlib
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from experiments import ablate_protocol, ablate_report, ablate_verdicts
+from experiments import settings as run_settings
+from experiments.ablate_arms import Claim
+from experiments.ablate_measures import MEASURES
+from experiments.accuracy_axes import AXES
+from nerfies_jax.capture.json_files import replaced_file
+from nerfies_jax.measure import clock
+from nerfies_jax.measure.clock import Metric
+
+# What is drawn: qualities above each other, costs beside each other.
+QUALITIES = ("psnr", "ssim", "moving_psnr", "depth_median", "track_error")
+COSTS = ("train_seconds", "render_ms", "peak_mb", "parameters")
+TITLES = {
+    "psnr": "PSNR of held-out frames / dB",
+    "ssim": "SSIM",
+    "moving_psnr": "PSNR of what moves / dB",
+    "depth_median": "median depth error / scene units",
+    "track_error": "end-point error / scene units",
+    "train_seconds": "seconds of training",
+    "render_ms": "milliseconds a frame",
+    "peak_mb": "peak memory / MB",
+    "parameters": "parameters (4 bytes each in the file)",
+}
+SPLAT_COLOUR, FIELD_COLOUR = "#0a5fb4", "#c4501b"
+
+
+def write(job, asked, finished) -> list[Metric]:
+    """accuracy_time.json, front.png and fronts.png; prints the lines of every axis."""
+    numbers = {key: kept.numbers for key, kept in finished.items()}
+    still = ablate_protocol.still_error(job.known)
+    print(f"\n{job.capture.name}, every setting trained {job.budgets[0].title}:")
+    for name in asked.axes:
+        print(f"\n{AXES[name].question} ({name}, against {AXES[name].base})")
+        print("\n".join(axis_lines(AXES[name], numbers)) or "    nothing finished")
+    for line in ablate_report.remarks(finished):
+        print(line)
+    means = averages(numbers)
+    for cost in ("train_seconds", "render_ms"):
+        names = front(means, "psnr", cost)
+        print(f"\nfront of PSNR against {TITLES[cost]}:")
+        for name in names:
+            row = means[name]
+            print(f"    {row[cost]:9.1f}  {row['psnr']:.2f} dB  {name}")
+    metrics = ablate_report.metrics(numbers, still)
+    about = {
+        "capture": job.capture.name,
+        "settings": run_settings.as_json(asked),
+        "arms": {
+            name: run_settings.as_json(job.suite.arms[name]) for name in job.names
+        },
+        "machine": clock.machine(),
+    }
+    clock.write_metrics(job.out / "accuracy_time.json", metrics, about)
+    save_fronts(job.out / "front.png", job, means, ("psnr",), COSTS[:2])
+    shown = [q for q in QUALITIES if any(math.isfinite(r[q]) for r in means.values())]
+    save_fronts(job.out / "fronts.png", job, means, shown, COSTS)
+    print(f"\n{job.out / 'front.png'}, fronts.png and accuracy_time.json")
+    return metrics
+
+
+def averages(numbers: ablate_verdicts.Numbers) -> dict[str, dict[str, float]]:
+    """Means over the seeds, by setting and measure; NaN where none is known."""
+    means = {}
+    for name in dict.fromkeys(arm for arm, _ in numbers):
+        rows = [row for (arm, _), row in numbers.items() if arm == name]
+        means[name] = {
+            measure: float(ablate_verdicts.values_of(rows, measure).mean())
+            for measure in MEASURES
+        }
+    return means
+
+
+def axis_lines(axis, numbers: ablate_verdicts.Numbers) -> list[str]:
+    """One line for each finished setting: quality against the base, and its price."""
+    means = averages(numbers)
+    base = means.get(axis.base)
+    lines = []
+    for name in axis.settings:
+        row = means.get(name)
+        if row is None:
+            continue
+        words = [_quality(name, axis.base, measure, numbers, row)
+                 for measure in ("psnr", "moving_psnr", "track_error")
+                 if math.isfinite(row[measure])]  # fmt: skip
+        if base is None or name == axis.base:
+            price = f"{row['train_seconds']:.0f} s, {row['render_ms']:.0f} ms a frame"
+        else:
+            price = (
+                f"{row['train_seconds'] / base['train_seconds']:.2f} of the training "
+                f"time, {row['render_ms'] / base['render_ms']:.2f} of a frame's"
+            )
+        lines.append(f"    {name:24s} {', '.join(words)}; {price}")
+    return lines
+
+
+def _quality(name, base, measure, numbers, row):
+    """As in "PSNR 23.1 (+0.4: beyond the spread)"."""
+    heading = {"psnr": "PSNR", "moving_psnr": "moving", "track_error": "EPE"}[measure]
+    value = f"{heading} {row[measure]:.{MEASURES[measure].digits}f}"
+    if name == base:
+        return value
+    claim = Claim("", name, base, (measure,))
+    found = ablate_verdicts.verdicts(numbers, [claim])
+    if not found or not math.isfinite(found[0].gain):
+        return value
+    gain, half = found[0].gain, found[0].half_width
+    sign = -1 if MEASURES[measure].direction == "lower" else 1
+    change = f"{sign * gain:+.{MEASURES[measure].digits}f}"
+    if math.isnan(half):
+        return f"{value} ({change}, one seed)"
+    return f"{value} ({change}, {'same' if abs(gain) <= half else 'differs'})"
+
+
+def front(
+    means: Mapping[str, Mapping[str, float]], quality: str, cost: str
+) -> list[str]:
+    """Settings that no other beats in both, cheapest first.
+
+    A setting without one of the two numbers is left out; of equals the first stays.
+    """
+    sign = -1 if MEASURES[quality].direction == "lower" else 1
+    known = [
+        (row[cost], -sign * row[quality], place, name)
+        for place, (name, row) in enumerate(means.items())
+        if math.isfinite(row[cost]) and math.isfinite(row[quality])
+    ]
+    best, found = math.inf, []
+    for _, loss, _, name in sorted(known):
+        if loss < best:
+            best = loss
+            found.append(name)
+    return found
+
+
+def save_fronts(
+    path: pathlib.Path, job, means, qualities: Sequence[str], costs: Sequence[str]
+) -> None:
+    """A panel for each pair: all settings as dots, the front as a line with names."""
+    rows, columns = len(qualities), len(costs)
+    figure = Figure(figsize=(5.4 * columns, 4.0 * rows), dpi=100, layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(rows, columns, squeeze=False)
+    for quality, line in zip(qualities, panels, strict=True):
+        for cost, panel in zip(costs, line, strict=True):
+            _draw_front(panel, job, means, quality, cost)
+    figure.suptitle(
+        f"{job.capture.name}: settings (blue splats, orange fields) and the front "
+        "that none beats in both",
+        fontsize=10,
+    )
+    with replaced_file(path) as partial:
+        figure.savefig(partial)
+
+
+def _draw_front(panel, job, means, quality, cost):
+    for row in means.values():
+        if math.isfinite(row[cost]) and math.isfinite(row[quality]):
+            splats = math.isfinite(row["gaussians"])
+            colour = SPLAT_COLOUR if splats else FIELD_COLOUR
+            panel.plot(row[cost], row[quality], "o", color=colour, markersize=4)
+    names = front(means, quality, cost)
+    xs = [means[name][cost] for name in names]
+    ys = [means[name][quality] for name in names]
+    panel.plot(xs, ys, "-", color="#59636e", linewidth=1, zorder=0)
+    for number, (name, x, y) in enumerate(zip(names, xs, ys, strict=True)):
+        panel.annotate(
+            name,
+            (x, y),
+            xytext=(4, -9 if number % 2 else 5),
+            textcoords="offset points",
+            fontsize=7,
+        )
+    if xs and max(xs) > 0:
+        panel.set_xscale("log")
+    panel.set_xlabel(TITLES[cost])
+    panel.set_ylabel(TITLES[quality])
+    if MEASURES[quality].direction == "lower":
+        panel.invert_yaxis()  # better is up everywhere
+    panel.grid(alpha=0.3)
+    panel.spines[["top", "right"]].set_visible(False)
+
+
+def baseline(path: pathlib.Path) -> dict[str, Metric]:
+    """The metrics of an earlier run; ValueError where there are none."""
+    try:
+        return clock.read_metrics(path)
+    except OSError as error:
+        raise ValueError(
+            f"--check {path}: cannot be read ({error.strerror}); name an "
+            "accuracy_time.json"
+        ) from error
+
+
+def changes(metrics: Sequence[Metric], before: Mapping[str, Metric]) -> list[str]:
+    """One line for each number that is worse than before by more than its tolerance.
+
+    Only what both runs have is held; a number that was unknown before never is worse.
+    """
+    lines = []
+    for metric in metrics:
+        old = before.get(metric.key)
+        if old is None or not np.isfinite(old.value) or metric.key.endswith(".spread"):
+            continue
+        if not metric.holds(old.value):
+            lines.append(
+                f"worse: {metric.key} {metric.value:.4g} {metric.unit}, was "
+                f"{old.value:.4g} (tolerance {metric.tolerance:.3g})"
+            )
+    return lines

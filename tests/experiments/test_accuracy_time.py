@@ -1,0 +1,151 @@
+"""Settings under one clock: which there are, what is said of them, a tiny run of it."""
+
+import dataclasses
+import json
+import math
+import types
+
+import pytest
+
+from experiments import ablate, accuracy_report, accuracy_time
+from experiments.ablate_job import Job
+from experiments.ablate_measures import MEASURES
+from experiments.accuracy_axes import AXES, SETTINGS, Axis
+from nerfies_jax.measure.clock import Metric
+
+
+@pytest.mark.parametrize("name", AXES)
+def test_every_setting_of_an_axis_differs_from_its_base_and_the_others(name):
+    job = types.SimpleNamespace(suite=SETTINGS, asked=ablate.Ablate(suite="settings"))
+    specs = {setting: Job.spec(job, setting, 600) for setting in AXES[name].settings}
+    assert len(set(map(repr, specs.values()))) == len(specs)
+    assert AXES[name].base in specs
+
+
+def test_a_setting_that_stands_on_two_axes_is_the_same_on_both():
+    seen = {}
+    for axis in AXES.values():
+        for name, arm in axis.settings.items():
+            assert seen.setdefault(name, arm) == arm
+            assert "/" not in name  # it is part of a file's name
+    assert seen == SETTINGS.arms
+
+
+def test_a_share_stretches_every_preset_by_itself():
+    asked = ablate.Ablate(suite="settings", share=0.1)
+    job = types.SimpleNamespace(suite=SETTINGS, asked=asked)
+    spec = Job.spec(job, "splats-deformable-small", None)
+    assert spec.steps == 300
+    assert spec.motion.warm_up == 60
+
+
+def row(**values):
+    return dict.fromkeys(MEASURES, math.nan) | values
+
+
+def test_the_front_is_what_nothing_beats_in_both():
+    means = {
+        "slow and good": row(train_seconds=9.0, psnr=30.0),
+        "dominated": row(train_seconds=9.5, psnr=29.0),
+        "cheap": row(train_seconds=1.0, psnr=20.0),
+        "as good, dearer": row(train_seconds=2.0, psnr=20.0),
+        "unknown": row(train_seconds=0.1),
+    }
+    found = accuracy_report.front(means, "psnr", "train_seconds")
+    assert found == ["cheap", "slow and good"]
+
+
+def test_less_error_is_better_on_a_front():
+    means = {
+        "near": row(render_ms=5.0, track_error=0.01),
+        "far": row(render_ms=1.0, track_error=0.03),
+        "farther": row(render_ms=2.0, track_error=0.04),
+    }
+    found = accuracy_report.front(means, "track_error", "render_ms")
+    assert found == ["far", "near"]
+
+
+def test_a_line_says_what_changed_against_the_base_and_what_it_costs():
+    axis = Axis("", "base", {"base": None, "half": None})
+    numbers = {}
+    for seed, (dB, other) in enumerate([(20.0, 20.4), (20.2, 20.1)]):
+        numbers["base", seed] = row(psnr=dB, train_seconds=100.0, render_ms=10.0)
+        numbers["half", seed] = row(psnr=other, train_seconds=50.0, render_ms=5.0)
+    base, half = accuracy_report.axis_lines(axis, numbers)
+    assert "PSNR 20.10; 100 s, 10 ms a frame" in base
+    assert "PSNR 20.25 (+0.15, same); 0.50 of the training time, 0.50" in half
+    one = {key: value for key, value in numbers.items() if key[1] == 0}
+    assert "(+0.40, one seed)" in accuracy_report.axis_lines(axis, one)[1]
+
+
+def test_what_got_worse_is_named_and_what_is_new_is_not():
+    def metric(key, value, direction):
+        return Metric(key, value, "", direction, 0.5)
+
+    before = {
+        "a.psnr": metric("a.psnr", 20.0, "higher"),
+        "a.train_seconds": metric("a.train_seconds", 5.0, "lower"),
+        "a.track_error": metric("a.track_error", math.nan, "lower"),
+    }
+    now = [
+        metric("a.psnr", 19.4, "higher"),
+        metric("a.train_seconds", 5.4, "lower"),
+        metric("a.track_error", 9.0, "lower"),
+        metric("b.psnr", 1.0, "higher"),
+    ]
+    (line,) = accuracy_report.changes(now, before)
+    assert "a.psnr" in line
+    assert "19.4" in line
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--axes", "colour"], "choose from preset"),
+        (["--share", "0"], "--share 0"),
+        (["--check", "/nowhere.json"], "cannot be read"),
+        (["--jobs", "0"], "positive"),
+    ],
+)
+def test_wrong_input_is_refused(arguments, words, capsys):
+    with pytest.raises(SystemExit) as stop:
+        accuracy_time.main(arguments)
+    assert stop.value.code == 2
+    assert words in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_tiny_plan_runs_resumes_and_is_held_against_itself(tmp_path, capfd):
+    small = "rays=8 sampling.coarse=4 sampling.fine=0 template.depth=1 template.width=8"
+    out = tmp_path / "out"
+    words = ["--axes", "warp", "--share", "0.001", "--frames", "1", "--jobs", "2"]
+    words += ["--out", str(out), "--set", *small.split()]
+    with pytest.raises(SystemExit) as stop:
+        accuracy_time.main(words)
+    assert stop.value.code == 0
+    printed = capfd.readouterr().out
+    assert "rotation and translation, or translation alone" in printed
+    assert "of the training time" in printed
+    stored = json.loads((out / "accuracy_time.json").read_text())
+    assert stored["metrics"]["warp-translation.steps"]["value"] == 3
+    assert stored["metrics"]["nerfies-small.peak_mb"]["value"] > 100
+    assert all(
+        (out / name).stat().st_size > 5000 for name in ("front.png", "fronts.png")
+    )
+    before = {path: path.stat().st_mtime for path in out.glob("*-0.json")}
+    baseline = tmp_path / "baseline.json"
+    stored["metrics"]["nerfies-small.psnr"]["value"] += 10
+    baseline.write_text(json.dumps(stored))
+    with pytest.raises(SystemExit) as stop:
+        accuracy_time.main([*words, "--check", str(baseline)])
+    assert stop.value.code == 1
+    assert "worse: nerfies-small.psnr" in capfd.readouterr().out
+    assert before == {path: path.stat().st_mtime for path in out.glob("*-0.json")}
+
+
+def test_bases_are_trained_first():
+    asked = dataclasses.replace(
+        accuracy_time.AccuracyTime(), axes=("harmonics", "warp")
+    )
+    assert asked.arms[:2] == ("splats-deformable-small", "nerfies-small")
+    assert len(asked.arms) == len(set(asked.arms))
