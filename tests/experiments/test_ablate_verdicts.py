@@ -100,12 +100,14 @@ def test_the_verdicts_say_how_many_show_by_chance():
     assert "Of 3 such lines, 0.2 would show" in ablate_verdicts.claims_text(found)
 
 
-@pytest.mark.parametrize("suite", SUITES.values(), ids=SUITES)
-def test_claims_are_about_arms_and_measures_that_there_are(suite):
+@pytest.mark.parametrize("name", SUITES)
+def test_claims_are_about_arms_and_measures_that_there_are(name):
+    suite = SUITES[name]
     for claim in suite.claims:
         assert {claim.better, claim.worse} <= set(suite.arms)
         assert set(claim.measures) <= set(MEASURES)
     assert set(suite.pictured) <= set(suite.arms)
     # Every arm is part of a claim, but those that only stand beside.
     judged = {arm for claim in suite.claims for arm in (claim.better, claim.worse)}
-    assert set(suite.arms) - judged <= {"d-nerf"}
+    if name != "settings":  # which claims nothing: its lines say what there is
+        assert set(suite.arms) - judged <= {"d-nerf"}
