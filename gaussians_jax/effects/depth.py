@@ -171,7 +171,8 @@ def loss(spec: DepthSpec, shot: Shot) -> Term:
     truth = shot.depth
     if truth is None:
         return Term(jnp.zeros((), shot.truth.dtype), {})
-    drawn = shot.rendering.depth
+    # Depths are often kept in half precision, which neither counts nor centres them.
+    truth, drawn = losses.widened(truth), losses.widened(shot.rendering.depth)
     known = (truth > 0) & jnp.isfinite(truth) & (drawn > 0) & jnp.isfinite(drawn)
     known = known & (shot.rendering.alpha >= spec.opaque)
     if shot.valid is not None:

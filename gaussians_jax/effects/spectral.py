@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from gaussians_jax.effects.effect import Effect, Moment, Shot, Term
 from gaussians_jax.splats import Params
-from nerfies_jax.training import schedules
+from nerfies_jax.training import losses, schedules
 
 NAME = "spectral"
 GATES = ("learned", "floor", "fixed", "schedule")
@@ -196,11 +196,12 @@ def filled(
 ) -> tuple[
     Float[Array, "height width channels"], Float[Array, "height width channels"]
 ]:
-    """Both pictures, with the truth in place of the render where it is not valid.
+    """Both pictures, widened, with the truth for the render where it is not valid.
 
     A spectrum needs whole pictures. Pixels that are not valid then add no difference
     and have no slope; a truth that is not finite there counts as black in both.
     """
+    render, truth = losses.widened(render), losses.widened(truth)
     if valid is None:
         return render, truth
     keep = valid[..., None]
@@ -255,7 +256,7 @@ def amplitudes(
 
     The slope of an amplitude is taken as zero where it vanishes.
     """
-    spectrum = jnp.fft.rfft2(image, axes=(0, 1), norm="ortho")
+    spectrum = jnp.fft.rfft2(losses.widened(image), axes=(0, 1), norm="ortho")
     # abs, not a root of squares, whose slope at zero is NaN.
     return jnp.abs(spectrum)
 
@@ -324,7 +325,7 @@ def loss(
     valid: Bool[Array, "height width"] | None = None,
 ) -> Term:
     """Equation 17, and the weights and unweighted losses to log."""
-    value, metrics = jnp.zeros((), truth.dtype), {}
+    value, metrics = jnp.zeros((), losses.widened(truth).dtype), {}
     terms = (
         ("wavelet", wavelet_loss, spec.wavelet, weight.wavelet),
         ("fourier", fourier_loss, spec.fourier, weight.fourier),

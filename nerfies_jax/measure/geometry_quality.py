@@ -1,7 +1,8 @@
 """How right depth, flow, tracks and camera paths are.
 
-Depth, flow and tracks are pure JAX. Camera paths are compared on the host in float64:
-an alignment decides by rank what can be determined at all, and is not for training.
+Depth, flow and tracks are pure JAX, in float32 at least. Camera paths are compared on
+the host in float64: an alignment decides by rank what can be determined at all, and is
+not for training.
 """
 
 from typing import NamedTuple
@@ -9,6 +10,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
+
+from nerfies_jax.training.losses import widened
 
 DELTA = 1.25  # ratio of depths that still counts as right, Eigen et al. 2014
 # KITTI 2015 calls a flow wrong beyond 3 px and 5 % of its length.
@@ -56,6 +59,7 @@ def depth_errors(
     A depth that is not positive counts in full in the first two and as wrong in the
     third. For monocular depth, pass `align_depth`'s result first.
     """
+    depth, truth = widened(depth), widened(truth)
     known = known_depth(depth, truth, mask)
     depth, truth = jnp.where(known, depth, 1.0), jnp.where(known, truth, 1.0)
     error = depth - truth
@@ -82,6 +86,7 @@ def align_depth(
     pass those for their protocol. Solved about the means, where the normal equations of
     a depth of 1000 +- 1 would lose six digits.
     """
+    depth, truth = widened(depth), widened(truth)
     known = known_depth(depth, truth, mask)
     depth, truth = jnp.where(known, depth, 0.0), jnp.where(known, truth, 0.0)
     mean_depth, mean_truth = _mean(depth, known), _mean(truth, known)
@@ -115,6 +120,7 @@ def flow_errors(
     A flow that is not finite where the truth is known makes the mean infinite and
     counts as an outlier: a missing answer is a wrong one.
     """
+    flow, truth = widened(flow), widened(truth)
     known = jnp.all(jnp.isfinite(truth), axis=-1)
     known = known if mask is None else known & mask
     distance = _distance(flow, truth, known)
@@ -151,6 +157,7 @@ def track_errors(
         raise ValueError(
             f"the distance of a correct point is positive, got {threshold}"
         )
+    tracks, truth = widened(tracks), widened(truth)
     distance = _distance(tracks, truth, visible)
     return TrackErrors(
         endpoint=_mean(distance, visible),

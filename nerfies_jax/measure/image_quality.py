@@ -4,6 +4,7 @@ Pictures are `[height, width, channels]` in [0, 1]; batches go through `jax.vmap
 Published numbers mix protocols, so each one has its name here: `padding="valid"` is
 scikit-image's Gaussian SSIM, `padding="zero"` INRIA's (0.002 to 0.011 higher on
 photographs), and `quantise` first gives the score of the 8-bit file others re-read.
+Pictures narrower than float32 are widened to it first (`losses.widened`).
 """
 
 from typing import Literal
@@ -38,7 +39,8 @@ def psnr(
     The cap (`losses.LEAST_MSE`) is a maximum, not an offset: adding 1e-10 instead would
     report 79.957 dB where 80 is true. Equal pictures have gradient zero.
     """
-    return losses.psnr(jnp.mean((image - truth) ** 2))
+    error = losses.widened(image) - losses.widened(truth)
+    return losses.psnr(jnp.mean(error**2))
 
 
 def masked_psnr(
@@ -52,6 +54,7 @@ def masked_psnr(
     the mask may be anything, NaN included.
     """
     mask = mask[..., None]
+    image, truth = losses.widened(image), losses.widened(truth)
     # Both pictures are emptied before the difference: NaN * 0 is NaN, and so is the
     # gradient of a `where` whose other branch is NaN.
     error = jnp.where(mask, image, 0.0) - jnp.where(mask, truth, 0.0)
@@ -98,6 +101,7 @@ def ms_ssim(
     another metric: report the number of scales beside the score.
     """
     _check_scales(image.shape, scales)
+    image, truth = losses.widened(image), losses.widened(truth)
     weights = SCALE_WEIGHTS[:scales]
     if scales < len(SCALE_WEIGHTS):
         weights = [weight / sum(weights) for weight in weights]
@@ -156,6 +160,7 @@ def masked_ssim(
             f"masked SSIM needs {TAPS}x{TAPS} pixels, got {mask.shape[1]}x"
             f"{mask.shape[0]}; use masked_psnr"
         )
+    image, truth = losses.widened(image), losses.widened(truth)
     inside = mask[..., None].astype(image.dtype)
     image, truth = (jnp.where(mask[..., None], x, 0.0) for x in (image, truth))
     weight = _window_mean(inside)
@@ -183,6 +188,7 @@ def partial_ssim(
     a constant is not kept near the mask's edge; variances are clipped; and windows
     without any pixel count as a perfect 1. `masked_ssim` does none of that.
     """
+    image, truth = losses.widened(image), losses.widened(truth)
     inside = mask.astype(image.dtype)[..., None]
     image, truth = (jnp.where(mask[..., None], x, 0.0) for x in (image, truth))
 
@@ -219,7 +225,7 @@ def _terms(image, truth, mean):
     The identity of `losses.dssim_map`, the terms apart and with any windowed `mean`:
     2 cov(x, y) = var(x) + var(y) - var(x - y), variances about the truth's mean.
     """
-    centre = jax.lax.stop_gradient(jnp.mean(truth))
+    centre = losses.middle_level(truth)
     difference = image - truth
     mean_image, mean_truth = mean(image - centre), mean(truth - centre)
     mean_difference = mean_image - mean_truth

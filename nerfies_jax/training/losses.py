@@ -16,11 +16,23 @@ from jaxtyping import Array, Bool, Float
 LEAST_MSE = 1e-10
 
 
+def widened(values: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """At least float32: what is narrower counts pixels wrongly and loses variances.
+
+    A masked mean over 200x180 pixels in bfloat16 reads 0.064 for 0.039, because a count
+    stops at 256, SSIM of equal images -0.68; from 65504 pixels on float16 counts to
+    infinity, which a PSNR takes for no error. Slopes come back in the caller's type.
+    """
+    wide = values.dtype == jnp.float64
+    return values.astype(jnp.float64 if wide else jnp.float32)
+
+
 def psnr(
     mse: Float[Array, "*batch"], value_range: float = 1.0
 ) -> Float[Array, "*batch"]:
     """Decibels of a mean squared error; at most 100 for a range of one."""
     least = LEAST_MSE * value_range**2
+    mse = widened(mse)
     # max, not `mse + eps`: the sum would read 79.957 dB where 80 is right.
     return -10 * jnp.log10(jnp.maximum(mse, least) / value_range**2)
 
@@ -30,11 +42,12 @@ def _only_valid(
     target: Float[Array, "*pixels channels"],
     valid: Bool[Array, "*pixels"] | None,
 ) -> tuple[Float[Array, "*pixels channels"], Float[Array, "*pixels channels"]]:
-    """Both with zeros where `valid` is false, so that nothing there has a gradient.
+    """Both widened, with zeros where `valid` is false, so nothing there has a gradient.
 
     On the input: selecting after the residual is squared would still multiply a zero
     cotangent with the NaN that EXR and undistorted images carry in unfilmed pixels.
     """
+    image, target = widened(image), widened(target)
     if valid is None:
         return image, target
     keep = valid[..., None]
@@ -44,7 +57,8 @@ def _only_valid(
 def masked_mean(
     values: Float[Array, "*pixels channels"], valid: Bool[Array, "*pixels"] | None
 ) -> Float[Array, ""]:
-    """Mean over the valid pixels; zero where there are none."""
+    """Mean over the valid pixels, float32 at least; zero where there are none."""
+    values = widened(values)
     if valid is None:
         return jnp.mean(values)
     count = jnp.sum(valid, dtype=values.dtype) * values.shape[-1]
@@ -179,7 +193,7 @@ def dssim_map(
     """
     image, target = _comparable(image, target, padding)
     constant = value_range**2
-    centre = lax.stop_gradient(jnp.mean(target))
+    centre = middle_level(target)
     shape, channels = image.shape, image.shape[-1]
     image, target = (x.reshape(shape[0], -1) for x in (image, target))
     difference = image - target
@@ -237,6 +251,17 @@ def photometric(
     return (1 - dssim_weight) * absolute + dssim_weight * structural
 
 
+def middle_level(target: Float[Array, "*shape"]) -> Float[Array, ""]:
+    """The mean to 12 bits, without a slope; variances may be taken about it.
+
+    The compiler may contract x - sum * (1 / count) into one operation, in one place and
+    not in another, and so take E[x] and E[x^2] about two centres that are half an ulp
+    of the level apart: 4e-5 of SSIM at level 1000 in float32. Rounded, it is one.
+    """
+    mean = lax.stop_gradient(jnp.mean(target))
+    return lax.reduce_precision(mean, jnp.finfo(mean.dtype).nexp, 12)
+
+
 def _comparable(image, target, padding):
     """Both in float32 at least, of one shape that a window fits into."""
     if image.shape != target.shape:
@@ -255,9 +280,7 @@ def _comparable(image, target, padding):
             f"SSIM takes floating-point images, got {image.dtype}; "
             "divide 8-bit images by 255"
         )
-    # bfloat16 variances are noise: SSIM of equal images reads -0.68.
-    dtype = image.dtype if image.dtype == jnp.float64 else jnp.float32
-    return image.astype(dtype), target.astype(dtype)
+    return widened(image), widened(target)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
