@@ -19,7 +19,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import hard_case, hard_rotations
+from experiments import (
+    hard_case,
+    hard_encodings,
+    hard_networks,
+    hard_rotations,
+    hard_volume,
+)
 from experiments import hard_cases_report as report
 from experiments import settings as run_settings
 from experiments.hard_case import ORDERS, Case
@@ -28,6 +34,9 @@ from nerfies_jax.measure import clock
 # The file of each room's cases and, in tests/hard_cases, that of their tests.
 ROOMS = {
     "rotations": (hard_rotations.CASES, "test_rotations.py"),
+    "encodings": (hard_encodings.CASES, "test_encoding_cases.py"),
+    "volume": (hard_volume.CASES, "test_volume_cases.py"),
+    "networks": (hard_networks.CASES, "test_network_cases.py"),
 }
 JITTER = 1e-3  # of the timed inputs, so that rows differ
 

@@ -8,9 +8,10 @@ from experiments.hard_case import Case
 from nerfies_jax.nets import encoding
 from nerfies_jax.nets.encoding import EncodingSpec
 
-TIMES_PI = EncodingSpec(10, identity=False, times_pi=True)
-PLAIN = EncodingSpec(10, identity=False)
-TOP = 2.0 ** (TIMES_PI.bands - 1)  # of the last band
+BANDS = 10
+TIMES_PI = EncodingSpec(BANDS, identity=False, times_pi=True)
+PLAIN = EncodingSpec(BANDS, identity=False)
+TOP = 2.0 ** (BANDS - 1)  # of the last band, whose slopes and bends are the largest
 
 
 def _sides(edge):
@@ -25,30 +26,40 @@ def _with_negatives(places):
     return np.unique(np.concatenate([np.negative(places), places]))
 
 
-def _top_band(spec):
-    return lambda x: encoding.encode(spec, x, None)[-2:]
+def _features(spec):
+    return lambda x: encoding.encode(spec, x, None)
 
 
 def _rounded_pi(x):
     """As it stands in the papers: π is rounded in before the sine reduces."""
-    angle = TOP * jnp.pi * x[0]
-    return jnp.stack([jnp.sin(angle), jnp.cos(angle)])
+    angles = 2 ** jnp.arange(BANDS, dtype=x.dtype)[:, None] * jnp.pi * x
+    return jnp.stack([jnp.sin(angles), jnp.cos(angles)], axis=1).reshape(-1)
+
+
+def _exact_features(unit):
+    """Band by band, where `unit` is a half turn in terms of x."""
+
+    def features(x):
+        turns = [2**k * x[0] / unit() for k in range(BANDS)]
+        return [wave(t) for t in turns for wave in (mpmath.sinpi, mpmath.cospi)]
+
+    return features
 
 
 # Quadrants meet at odd eighths of a period of the last band, x = (2k + 1) / 2048.
 _SEAMS = [x / TOP for edge in (0.25, 0.75, 2.25) for x in _sides(edge)]
 _PI_PLACES = _with_negatives([0, 1e-30, 1e-8, 1e-4, *_SEAMS, 0.7371, 1, 10, 1e3, 1e4])
 HALF_TURNS = Case(
-    name="sin and cos of 2⁹πx",
-    breaks="π is rounded in before the reduction: 1e-4 off at 1, noise at 1e4",
+    name="sin and cos of 2ᵏπx",
+    breaks="π is rounded in before the reduction: k = 9 is noise at x = 1e4",
     formula="x - 2 round(x/2) first, then quadrants and a polynomial on [-¼, ¼]",
     switch="quadrants, odd eighths of a period",
     axis="x",
     at=_PI_PLACES,
     inputs=_PI_PLACES[:, None],
-    stable=_top_band(TIMES_PI),
+    stable=_features(TIMES_PI),
     textbook=_rounded_pi,
-    exact=lambda x: [mpmath.sinpi(TOP * x[0]), mpmath.cospi(TOP * x[0])],
+    exact=_exact_features(lambda: mpmath.mpf(1)),
     bounds={
         "bfloat16": (4e-3, 8e-3),
         "float32": (2e-7, 3e-7, 4e-7),
@@ -68,21 +79,22 @@ HALF_TURNS = Case(
 
 def _quarter_turn_on(x):
     """The cosine as the Nerfies code has it, the sine of a quarter turn more."""
-    angle = TOP * x[0]
-    return jnp.stack([jnp.sin(angle), jnp.sin(angle + 0.5 * jnp.pi)])
+    angles = 2 ** jnp.arange(BANDS, dtype=x.dtype)[:, None] * x
+    waves = jnp.sin(angles), jnp.sin(angles + 0.5 * jnp.pi)
+    return jnp.stack(waves, axis=1).reshape(-1)
 
 
 _PLACES = _with_negatives([0, 1e-30, 1e-8, 1e-4, 0.01, 0.7371, 1, 10, 1e3, 1e4])
 PLAIN_WAVES = Case(
-    name="sin and cos of 2⁹x",
+    name="sin and cos of 2ᵏx",
     breaks="cos as sin(a + π/2): the sum is rounded to an ulp of a",
     formula="sin and cos of the exact product",
     axis="x",
     at=_PLACES,
     inputs=_PLACES[:, None],
-    stable=_top_band(PLAIN),
+    stable=_features(PLAIN),
     textbook=_quarter_turn_on,
-    exact=lambda x: [mpmath.sin(TOP * x[0]), mpmath.cos(TOP * x[0])],
+    exact=_exact_features(lambda: +mpmath.pi),
     bounds={
         "bfloat16": (4e-3, 8e-3),
         "float32": (2e-7, 2e-7, 2e-7),
@@ -94,17 +106,17 @@ PLAIN_WAVES = Case(
 )
 
 
-BANDS = 6
+OPENED = 6
 
 
 def _by_cosine(alpha):
     """Equation 14 of Nerfies as printed."""
-    opened = jnp.clip(alpha[0] - jnp.arange(BANDS, dtype=alpha.dtype), 0, 1)
+    opened = jnp.clip(alpha[0] - jnp.arange(OPENED, dtype=alpha.dtype), 0, 1)
     return (1 - jnp.cos(jnp.pi * opened)) / 2
 
 
 def _exact_window(alpha):
-    opened = [min(max(alpha[0] - k, 0), 1) for k in range(BANDS)]
+    opened = [min(max(alpha[0] - k, 0), 1) for k in range(OPENED)]
     return [mpmath.sinpi(x / 2) ** 2 for x in opened]
 
 
@@ -119,7 +131,7 @@ WINDOW = Case(
     axis="bands open, a",
     at=_OPENING,
     inputs=_OPENING[:, None],
-    stable=lambda alpha: encoding.anneal(BANDS, alpha[0]),
+    stable=lambda alpha: encoding.anneal(OPENED, alpha[0]),
     textbook=_by_cosine,
     exact=_exact_window,
     bounds={

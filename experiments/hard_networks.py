@@ -130,7 +130,9 @@ def _trained(x):
 
 def _by_variance(x):
     sigma = jnp.exp(x[1]) / math.sqrt(2)
-    return jnp.exp(-((x[0] - CHOSEN) ** 2) / (2 * sigma**2))[None]
+    centre = jnp.arange(KERNELS, dtype=x.dtype)
+    kernels = jnp.exp(-((x[0] - centre) ** 2) / (2 * sigma**2))
+    return kernels @ jnp.eye(KERNELS, dtype=x.dtype)[:, CHOSEN, None]
 
 
 def _exact_trained(x):
