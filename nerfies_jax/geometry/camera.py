@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from nerfies_jax.geometry import distortion
+from nerfies_jax.geometry import distortion, precision
 
 # Both keep what is at or behind the camera finite in float32, where 1/z² overflows
 # below 1e-19 and the seventh power of a slope above 1e5.
@@ -81,6 +81,7 @@ def unproject(
     Where the lens model has no one-to-one solution the flag is False, and the direction
     is finite, has zero gradient with respect to the pixel, and means nothing.
     """
+    precision.refuse_half("the camera or the pixel", camera.position, pixel)
     offset = pixel - camera.principal_point_px
     bent_y = offset[1] / (camera.focal_px * camera.pixel_aspect)
     bent_x = (offset[0] - camera.skew_px * bent_y) / camera.focal_px
@@ -256,6 +257,7 @@ def validate(camera: Camera, size: tuple[int, int], name: str = "camera") -> Non
 
 def _in_camera(camera: Camera, point: Float[Array, "3"]):
     """Lateral offset and depth. R (x - c), never R x + t: that cancels far from 0."""
+    precision.refuse_half("the camera or the point", camera.position, point)
     offset = jnp.matmul(
         camera.camera_from_world, point - camera.position, precision="highest"
     )

@@ -9,6 +9,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from nerfies_jax.geometry.precision import refuse_half
+
 # A bracketed Newton: 5 steps for a phone lens; the rest is for strong lenses, close to
 # their fold, where the root is nearly double and each step only halves the distance.
 RADIAL_STEPS = 24
@@ -47,6 +49,7 @@ def undistort(
     happily lands) belong to no ray of light. Derivatives are those of the implicit
     function, to any order; zero where there is no solution.
     """
+    refuse_half("the distorted point or the lens", bent, radial)
     slopes = _undistorted(radial, tangential, bent)
     return slopes, _solves(radial, tangential, bent, slopes)
 

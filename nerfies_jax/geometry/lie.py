@@ -12,12 +12,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from nerfies_jax.geometry import quaternion
+from nerfies_jax.geometry.precision import at_least_float32
 from nerfies_jax.geometry.stumpff import stumpff
 
 Vector = Float[Array, "3"]
 Matrix = Float[Array, "3 3"]
 
 
+@at_least_float32
 def transform_point(angular: Vector, linear: Vector, point: Vector) -> Vector:
     """One point moved along a screw: R x + G v, without any matrix.
 
@@ -26,6 +28,7 @@ def transform_point(angular: Vector, linear: Vector, point: Vector) -> Vector:
     return point + displacement(angular, linear, point)
 
 
+@at_least_float32
 def displacement(angular: Vector, linear: Vector, point: Vector) -> Vector:
     """How far `transform_point` moves the point: (R - 1) x + G v, uncancelled.
 
@@ -38,6 +41,7 @@ def displacement(angular: Vector, linear: Vector, point: Vector) -> Vector:
     return linear + _cross(angular, inner)
 
 
+@at_least_float32
 def rotate_point(angular: Vector, point: Vector) -> Vector:
     """One point turned about the origin."""
     angle_sq = jnp.sum(angular**2)
@@ -47,12 +51,14 @@ def rotate_point(angular: Vector, point: Vector) -> Vector:
     )
 
 
+@at_least_float32
 def exp_so3(angular: Vector) -> Matrix:
     """The rotation matrix of axis × angle (Rodrigues)."""
     basis = jnp.eye(3, dtype=angular.dtype)
     return jax.vmap(rotate_point, (None, 0), out_axes=1)(angular, basis)
 
 
+@at_least_float32
 def log_so3(rotation: Matrix) -> Vector:
     """Axis × angle of a rotation matrix, at most π rad.
 
@@ -62,23 +68,27 @@ def log_so3(rotation: Matrix) -> Vector:
     return quaternion.log(quaternion.from_matrix(rotation))
 
 
+@at_least_float32
 def exp_se3(angular: Vector, linear: Vector) -> tuple[Matrix, Vector]:
     """Rotation matrix and translation of a screw."""
     return exp_so3(angular), left_jacobian(angular) @ linear
 
 
+@at_least_float32
 def log_se3(rotation: Matrix, translation: Vector) -> tuple[Vector, Vector]:
     """The screw of a rigid motion: the inverse of `exp_se3` for turns below π."""
     angular = log_so3(rotation)
     return angular, inverse_left_jacobian(angular) @ translation
 
 
+@at_least_float32
 def left_jacobian(angular: Vector) -> Matrix:
     """∫₀¹ exp(τ [w]) dτ: how `exp_so3(w)` turns as w moves, in the fixed frame."""
     angle_sq = jnp.sum(angular**2)
     return _polynomial(angular, stumpff(2, angle_sq), stumpff(3, angle_sq))
 
 
+@at_least_float32
 def inverse_left_jacobian(angular: Vector) -> Matrix:
     """The inverse, for turns below 2π, where it is singular."""
     angle_sq = jnp.sum(angular**2)
@@ -87,6 +97,7 @@ def inverse_left_jacobian(angular: Vector) -> Matrix:
     return _polynomial(angular, -jnp.full_like(c2, 0.5), (c3 - 2 * c4) / (2 * c2))
 
 
+@at_least_float32
 def left_jacobian_se3(angular: Vector, linear: Vector) -> Float[Array, "6 6"]:
     """The same for screws, ordered (angular, linear): [[J, 0], [Q, J]].
 
@@ -97,6 +108,7 @@ def left_jacobian_se3(angular: Vector, linear: Vector) -> Float[Array, "6 6"]:
     return jnp.block([[jacobian, jnp.zeros_like(jacobian)], [coupling, jacobian]])
 
 
+@at_least_float32
 def inverse_left_jacobian_se3(angular: Vector, linear: Vector) -> Float[Array, "6 6"]:
     """Its inverse, for turns below 2π."""
     inverse = inverse_left_jacobian(angular)

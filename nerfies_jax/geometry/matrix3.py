@@ -14,6 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from nerfies_jax.geometry.precision import at_least_float32
+
 Matrix = Float[Array, "3 3"]
 Scalar = Float[Array, ""]
 
@@ -29,6 +31,7 @@ SMALL_DISPLACEMENT = 0.1
 _SWEEPS = {"float32": 4, "float64": 5}  # quadratic convergence; 3 and 4 nearly suffice
 
 
+@at_least_float32
 def log_energy(matrix: Matrix) -> Scalar:
     """Σ log²σ over the singular values: zero for rotations and for reflections.
 
@@ -37,6 +40,7 @@ def log_energy(matrix: Matrix) -> Scalar:
     return _energy(False, matrix)
 
 
+@at_least_float32
 def signed_log_energy(matrix: Matrix) -> Scalar:
     """The same, but the smallest singular value carries the sign of the determinant.
 
@@ -45,6 +49,7 @@ def signed_log_energy(matrix: Matrix) -> Scalar:
     return _energy(True, matrix)
 
 
+@at_least_float32
 def displacement_log_energy(
     displacement: Matrix, otherwise: Callable[[Matrix], Scalar] = log_energy
 ) -> Scalar:
@@ -68,19 +73,25 @@ def _strain(displacement):
     )
 
 
-@jax.custom_jvp
+@at_least_float32
 def singular_values(matrix: Matrix) -> Float[Array, "3"]:
     """In descending order, not negative. Once differentiable, also where equal."""
+    return _singular_values(matrix)
+
+
+@jax.custom_jvp
+def _singular_values(matrix):
     return jnp.stack(_oriented(False, matrix)[1])
 
 
-@singular_values.defjvp
+@_singular_values.defjvp
 def _singular_values_jvp(primals, tangents):
     left, values, right = _oriented(False, primals[0])
     turned = _between(left, _entries(tangents[0]), right)
     return jnp.stack(values), jnp.stack([turned[k][k] for k in range(3)])
 
 
+@at_least_float32
 def svd(matrix: Matrix) -> tuple[Matrix, Float[Array, "3"], Matrix]:
     """U, σ, V with M = U diag(σ) Vᵀ, both of them rotations; not differentiable.
 

@@ -5,8 +5,10 @@ since what an optimiser moves is never exactly of length one.
 """
 
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
+from nerfies_jax.geometry.precision import at_least_float32
 from nerfies_jax.geometry.stumpff import stumpff
 
 Quaternion = Float[Array, "4"]
@@ -17,6 +19,7 @@ SERIES_BELOW = 0.04
 _ARCTAN = tuple((-1) ** n / (2 * n + 1) for n in range(14))
 
 
+@at_least_float32
 def normalise(quaternion: Quaternion) -> Quaternion:
     """The same rotation at unit length.
 
@@ -32,13 +35,17 @@ def normalise(quaternion: Quaternion) -> Quaternion:
     # The whole quaternion is replaced, not its length: at 3e38 the square's slope 2q
     # overflows, and inf times the zero of the branch not taken is NaN.
     usable = jnp.where(unusable, identity(quaternion.dtype), quaternion)
-    return usable / jnp.sqrt(jnp.sum(usable**2))
+    # First to a length near one, by a factor without derivative, which the second
+    # division does not see: |q|³ in its curvature would underflow from 1e-13 down.
+    near = usable * lax.stop_gradient(lax.rsqrt(jnp.sum(usable**2)))
+    return near / jnp.sqrt(jnp.sum(near**2))
 
 
 def identity(dtype=jnp.float32) -> Quaternion:
     return jnp.asarray([1, 0, 0, 0], dtype)
 
 
+@at_least_float32
 def multiply(second: Quaternion, first: Quaternion) -> Quaternion:
     """The rotation `first`, then `second`: the matrices' order of reading."""
     w, v = second[0], second[1:]
@@ -52,6 +59,7 @@ def conjugate(quaternion: Quaternion) -> Quaternion:
     return jnp.concatenate([quaternion[:1], -quaternion[1:]])
 
 
+@at_least_float32
 def rotate(quaternion: Quaternion, vector: Float[Array, "3"]) -> Float[Array, "3"]:
     """One vector, turned; the quaternion may have any length."""
     unit = normalise(quaternion)
@@ -59,6 +67,7 @@ def rotate(quaternion: Quaternion, vector: Float[Array, "3"]) -> Float[Array, "3
     return vector + 2 * (unit[0] * swept + jnp.cross(unit[1:], swept))
 
 
+@at_least_float32
 def to_matrix(quaternion: Quaternion) -> Float[Array, "3 3"]:
     """The rotation matrix; the quaternion may have any length.
 
@@ -74,6 +83,7 @@ def to_matrix(quaternion: Quaternion) -> Float[Array, "3 3"]:
     return jnp.stack(entries).reshape(3, 3)
 
 
+@at_least_float32
 def from_matrix(rotation: Float[Array, "3 3"]) -> Quaternion:
     """The unit quaternion of a rotation matrix, with w not negative.
 
@@ -101,6 +111,7 @@ def from_matrix(rotation: Float[Array, "3 3"]) -> Quaternion:
     return _upper(normalise(rows[jnp.argmax(diagonal)]))
 
 
+@at_least_float32
 def exp(rotation_vector: Float[Array, "3"]) -> Quaternion:
     """The unit quaternion of axis × angle, in rad."""
     quarter_sq = jnp.sum(rotation_vector**2) / 4
@@ -108,9 +119,14 @@ def exp(rotation_vector: Float[Array, "3"]) -> Quaternion:
     return jnp.concatenate([scalar[None], stumpff(1, quarter_sq) / 2 * rotation_vector])
 
 
+@at_least_float32
 def log(quaternion: Quaternion) -> Float[Array, "3"]:
-    """Axis × angle, the short way round (at most π rad); any length but zero."""
-    upper = _upper(quaternion)
+    """Axis × angle, the short way round (at most π rad), of a quaternion of any length.
+
+    Zero for lengths that `normalise` cannot use.
+    """
+    # The quotients below need no unit length, but their squares have half the range.
+    upper = _upper(normalise(quaternion))
     scalar, vector = upper[0], upper[1:]
     sine_sq = jnp.sum(vector**2)
     near = sine_sq < SERIES_BELOW * scalar**2
@@ -124,6 +140,7 @@ def log(quaternion: Quaternion) -> Float[Array, "3"]:
     return 2 * jnp.where(near, series / divisor, far) * vector
 
 
+@at_least_float32
 def slerp(start: Quaternion, end: Quaternion, fraction: Float[Array, ""]) -> Quaternion:
     """Between two unit quaternions at constant speed, the short way round."""
     turn = log(multiply(end, conjugate(start)))

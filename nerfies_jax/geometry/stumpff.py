@@ -7,12 +7,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from nerfies_jax.geometry.precision import at_least_float32
+
 # rad²: below, the series; above, the closed form. At 3 rad the closed forms of the
 # orders used here (up to 7, in second derivatives of a screw) have stopped cancelling.
 SERIES_BELOW = 9.0
 _TERMS = {"float32": 9, "float64": 15}  # leave 3e-9 and 3e-20 of the first at 9 rad²
 
 
+@at_least_float32
 def stumpff(order: int, angle_sq: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """c_k(s) = Σ (-s)ⁿ / (2n + k)! of s = θ² = `angle_sq`, in rad² (Stumpff 1947).
 
