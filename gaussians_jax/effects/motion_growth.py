@@ -68,7 +68,9 @@ class Travel(NamedTuple):
 def carry(params: Params) -> Travel:
     """Nothing seen yet."""
     mean = params.rows["splats"].mean
-    return Travel(jnp.full_like(mean, jnp.inf), jnp.full_like(mean, -jnp.inf))
+    # Not infinity: a state is finite throughout, or the loop stops.
+    most = jnp.finfo(mean.dtype).max
+    return Travel(jnp.full_like(mean, most), jnp.full_like(mean, -most))
 
 
 def observe(

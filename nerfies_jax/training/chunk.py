@@ -14,9 +14,8 @@ class Outcome(NamedTuple):
     """What a chunk reports beside its state; scalars."""
 
     done: Any  # steps run, the first with a non-finite metric included
-    metrics: Any  # summed over them
-    metrics_finite: Any
-    params_finite: Any
+    metrics: Any  # means over the steps asked for
+    finite: Any  # whether every metric was, and the state is
     step: Any
 
 
@@ -28,6 +27,9 @@ def _run_chunk(step, state, frames, count):
     the same bits wherever chunks begin and end. With the checks for finite values it
     costs 1.03 times a scan for Adam over 200 000 x 59 rows and 1 us more than 10 us for
     a toy; steps compiled one by one cost 1.8 times and 15 times as much.
+
+    The state is looked at as a whole, once: a second moment that overflows leaves the
+    parameters finite, and a row that never moves again.
     """
     _, metrics = jax.eval_shape(step, state, frames)
     accumulate = jnp.result_type(float)
@@ -43,19 +45,28 @@ def _run_chunk(step, state, frames, count):
         _check_same(state, new)
         new = jax.tree.map(_strong, new)
         metrics = {k: jnp.asarray(v).astype(accumulate) for k, v in metrics.items()}
-        total = {name: total[name] + metrics[name] for name in total}
+        # Means, not sums: a hundred large metrics must not overflow together.
+        share = count.astype(accumulate)
+        total = {name: total[name] + metrics[name] / share for name in total}
         finite = _all_finite(metrics)
         return done + 1, finite, new, total
 
     start = (jnp.zeros((), jnp.int32), jnp.asarray(True), state, total)
     done, finite, state, total = lax.while_loop(unfinished, advance, start)
-    return state, Outcome(done, total, finite, _all_finite(state.params), state.step)
+    return state, Outcome(done, total, finite & _all_finite(state), state.step)
 
 
 def _all_finite(tree):
-    leaves = [x for x in jax.tree.leaves(tree) if jnp.issubdtype(x.dtype, jnp.inexact)]
+    leaves = [
+        x
+        for x in jax.tree.leaves(tree)
+        if jnp.issubdtype(x.dtype, jnp.inexact) and x.size
+    ]
+    # The largest is NaN where one is. Of Adam's three arrays of 200 000 x 59 numbers on
+    # one core: 12 ms, and 40 ms as all(isfinite(x)); a step takes 32 ms.
+    largest = [jnp.max(jnp.abs(x)) for x in leaves]
     return functools.reduce(
-        jnp.logical_and, [jnp.all(jnp.isfinite(x)) for x in leaves], jnp.asarray(True)
+        jnp.logical_and, [jnp.isfinite(x) for x in largest], jnp.asarray(True)
     )
 
 

@@ -57,26 +57,29 @@ def _to_device(array, sharding, key_impl):
     )
 
 
-def last_good(program, snapshot, frames, bad_step):
+def last_good(program, snapshot, frames, good_step, bad_step):
     """The state before the first bad step, that step's number, and what was bad in it.
 
-    Metrics are looked at after every step and parameters after every chunk, so the
-    first bad step is found by bisection from the last copy; steps are deterministic.
+    Metrics are looked at after every step and the state after every chunk, so the first
+    bad step is found by bisection between the last chunk that was good and this one;
+    steps are deterministic, and are repeated from the last copy.
     """
 
-    def replay(count):
-        if count == 0:
+    def replay(step):
+        if step == snapshot.step:
             return snapshot.state(), True, {}
-        state, outcome = program(snapshot.state(), frames, np.int32(count))
+        count = np.int32(step - snapshot.step)
+        state, outcome = program(snapshot.state(), frames, count)
         outcome = jax.device_get(outcome)
-        return state, outcome.metrics_finite and outcome.params_finite, outcome.metrics
+        return state, bool(outcome.finite), outcome.metrics
 
-    good, bad = 0, bad_step - snapshot.step
+    good, bad = good_step, bad_step
     if replay(bad)[1]:
         detail = (
             f"step {bad_step:,} or one before was not finite, but not so when repeated"
         )
-        return snapshot.state(), snapshot.step, detail
+        state, finite, _ = replay(good)
+        return (state, good, detail) if finite else (*_kept(snapshot), detail)
     while bad - good > 1:
         middle = (good + bad) // 2
         if replay(middle)[1]:
@@ -85,22 +88,27 @@ def last_good(program, snapshot, frames, bad_step):
             bad = middle
     state, _, metrics = replay(bad)
     names = [f"metric {name}" for name, x in metrics.items() if not np.isfinite(x)]
-    names += bad_arrays(state.params, "params") + bad_arrays(
-        state.optimiser, "optimiser"
-    )
-    shown = ", ".join(names[:4]) + (f" and {len(names) - 4} more" if names[4:] else "")
-    detail = f"step {snapshot.step + bad:,} is not finite: {shown}"
-    return replay(good)[0], snapshot.step + good, detail
+    detail = f"step {bad:,} is not finite: {listed(names + bad_arrays(state))}"
+    return replay(good)[0], good, detail
 
 
-def bad_arrays(tree, root):
-    """Paths of the arrays that are not finite, and how much of them."""
+def _kept(snapshot):
+    return snapshot.state(), snapshot.step
+
+
+def listed(names):
+    """The first few of the names, the first to be computed first."""
+    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if names[4:] else "")
+
+
+def bad_arrays(state):
+    """Paths of the arrays of a state that are not finite, and how much of them."""
     found = []
-    for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
+    for path, leaf in jax.tree_util.tree_flatten_with_path(state)[0]:
         if not jnp.issubdtype(leaf.dtype, jnp.inexact):
             continue
-        bad = ~np.isfinite(np.asarray(leaf, np.float64))
+        bad = ~np.isfinite(np.asarray(leaf))
         if bad.any():
             name = jax.tree_util.keystr(path, simple=True, separator=".")
-            found.append(f"{root}.{name} ({bad.sum():,} of {bad.size:,} values)")
+            found.append(f"{name} ({bad.sum():,} of {bad.size:,} values)")
     return found

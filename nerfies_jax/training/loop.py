@@ -13,7 +13,7 @@ from jaxtyping import Array, Key
 
 from nerfies_jax.training.checkpoint import Checkpoints
 from nerfies_jax.training.chunk import compiled
-from nerfies_jax.training.guard import Snapshot, last_good
+from nerfies_jax.training.guard import Snapshot, bad_arrays, last_good, listed
 from nerfies_jax.training.model import Event, Frames, Model, TrainState
 from nerfies_jax.training.progress import Progress, duration
 from nerfies_jax.training.stopping import StopRequests
@@ -86,11 +86,12 @@ def fit(
 ) -> FitResult:
     """Train until `steps` steps are completed in all, from wherever `state` is.
 
-    `seconds` bounds the wall time of this call. Ctrl-C, SIGTERM and a metric or
-    parameter that is not finite end it too; whatever ends it, the last good state is
-    saved to `checkpoints` and returned. An event happens when its step is completed,
-    before a checkpoint of that step, so a resumed run repeats the uninterrupted one bit
-    for bit (on XLA:CPU with the same PJRT_NPROC). Pass the restored history on.
+    `seconds` bounds the wall time of this call. Ctrl-C, SIGTERM and a number that is
+    not finite, in a metric or anywhere in the state, end it too; whatever ends it, the
+    last good state is saved to `checkpoints` and returned. An event happens when its
+    step is completed, before a checkpoint of that step, so a resumed run repeats the
+    uninterrupted one bit for bit (on XLA:CPU with the same PJRT_NPROC). Pass the
+    restored history on.
 
     One program with a traced number of steps serves every chunk of a shape.
     """
@@ -121,6 +122,12 @@ class _Run:
         self.step_seconds = math.inf  # not known yet: the first chunk is one step
         self.called = {hook.name: [self.step, None] for hook in hooks}
         self.detail = ""
+        bad = bad_arrays(state)
+        if bad:
+            raise ValueError(
+                f"the state to train from is not finite: {listed(bad)}; start from "
+                "another one"
+            )
         # A copy: the first chunk overwrites its input, which is the caller's.
         self.snapshot = Snapshot(self.step, state)
         self.state = self.snapshot.state()
@@ -148,29 +155,49 @@ class _Run:
         self.state, outcome = program(self.state, self.frames, np.int32(count))
         outcome = jax.device_get(outcome)  # waits
         done = int(outcome.done)
-        if not (outcome.metrics_finite and outcome.params_finite):
-            self._fall_back(program, self.step + done)
+        if not outcome.finite:
+            self.state, self.step, self.detail = last_good(
+                program, self.snapshot, self.frames, self.step, self.step + done
+            )
             return False
         if int(outcome.step) != self.step + done:
             raise ValueError(
                 f"Model.step left state.step at {int(outcome.step)} after step "
                 f"{self.step + done}; it must return it one higher each time"
             )
-        self.step += done
         elapsed = time.perf_counter() - began
+        happening = self.events.get(self.step + done, ())
+        if not self._happen(happening, self.step + done):
+            # Before that step: a run that is resumed must not leave the event out.
+            count = np.int32(self.step + done - 1 - self.snapshot.step)
+            self.state, self.step = self.snapshot.state(), self.step + done - 1
+            if count:
+                self.state, _ = program(self.state, self.frames, count)
+            return False
+        self.step += done
         self.step_seconds = elapsed / done
-        happening = self.events.get(self.step, ())
-        for event in happening:
-            self.state = _distinct(event.apply(self.state, self.frames))
-            if int(self.state.step) != self.step:
-                raise ValueError(
-                    f"event {event.name!r} changed state.step; it must not"
-                )
         self._add(seconds=time.perf_counter() - began)
-        metrics = {name: float(x) / done for name, x in outcome.metrics.items()}
+        metrics = {name: float(x) for name, x in outcome.metrics.items()}
         row = {"step": self.step, "seconds": self.history.seconds, **metrics}
         self.history = self.history._replace(rows=(*self.history.rows, row))
         self.snapshot = self.snapshot.renewed(self.step, self.state, bool(happening))
+        return True
+
+    def _happen(self, happening, step) -> bool:
+        """Let the events of a step happen; false where one made something blow up."""
+        for event in happening:
+            self.state = _distinct(event.apply(self.state, self.frames))
+            if int(self.state.step) != step:
+                raise ValueError(
+                    f"event {event.name!r} changed state.step; it must not"
+                )
+            bad = bad_arrays(self.state)
+            if bad:
+                self.detail = (
+                    f"event {event.name!r} after step {step:,} is not finite: "
+                    f"{listed(bad)}"
+                )
+                return False
         return True
 
     def _count(self) -> int:
@@ -231,25 +258,21 @@ class _Run:
         values = {name: getattr(self.history, name) + x for name, x in more.items()}
         self.history = self.history._replace(**values)
 
-    def _fall_back(self, program, bad_step: int) -> None:
-        """Return to the last good step, by replaying from the last copy."""
-        self.state, self.step, self.detail = last_good(
-            program, self.snapshot, self.frames, bad_step
-        )
-
     def finish(self, reason: str) -> FitResult:
         """Last evaluations, last checkpoint, and the line that says how it ended."""
         if reason in ("steps", "seconds"):
             for hook in self.hooks:
                 if self.called[hook.name] != [self.step, self.history.seconds]:
                     self._call(hook)
-        message = f"stopped at step {self.step:,} of {self.steps:,} by {reason}"
+        message = f"stopped at step {self.step:,} of {self.steps:,}"
         if reason == "steps":
             message = f"completed {self.step:,} steps"
         elif reason == "seconds":
-            message += f": the {duration(self.limits[0])} given are over"
+            message += f" by seconds: the {duration(self.limits[0])} given are over"
         elif reason == "non-finite":
             message += f": {self.detail}"
+        else:
+            message += f" by {reason}"
         if self.checkpoints is not None:
             self._save()
             message += f"; saved in {self.checkpoints.folder}"

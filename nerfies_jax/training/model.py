@@ -46,7 +46,11 @@ class Rendering(NamedTuple):
 
 
 class TrainState(NamedTuple):
-    """Everything a run needs to continue bit for bit; arrays only."""
+    """Everything a run needs to continue bit for bit; arrays only, all of them finite.
+
+    Where an array would start at infinity, such as one that keeps a least value, let it
+    start at the largest number: the loop stops at whatever is not finite.
+    """
 
     params: PyTree
     optimiser: PyTree

@@ -228,37 +228,6 @@ def test_a_run_outside_the_main_thread_leaves_signals_alone(frames):
     assert results[0].stopped_by == "steps"
 
 
-def poisoned(at, where):
-    """The toy step with a NaN in one place at one step."""
-
-    def step(state, frames):
-        bad = state.step + 1 == at
-        new, metrics = toy.step(state, frames)
-        poison = jnp.where(bad, jnp.nan, 0.0)
-        if where == "metric":
-            metrics["loss"] = metrics["loss"] + poison
-        elif where == "parameter":
-            rows = {"mean": new.params.rows["mean"].at[2, 1].add(poison)}
-            new = new._replace(params=new.params._replace(rows=rows))
-        return new, metrics
-
-    return step
-
-
-@pytest.mark.parametrize("where", ["metric", "parameter"])
-@pytest.mark.parametrize("at", [1, 6, 8, 15])
-def test_a_step_that_blows_up_is_named_and_undone(where, at, frames):
-    model = toy.model(change=poisoned(at, where))
-    result = fit(frames, model=model, steps=20)
-    assert result.stopped_by == "non-finite"
-    assert result.steps == at - 1
-    assert f"step {at} is not finite" in result.message
-    name = {"metric": "metric loss", "parameter": "params.rows.mean (1 of"}[where]
-    assert name in result.message
-    good = fit(frames, model=model, steps=at - 1) if at > 1 else None
-    assert toy.same(result.state, good.state if good else start())
-
-
 def test_what_a_step_gets_wrong_is_named(frames):
     def wider(state, frames):
         new, metrics = toy.step(state, frames)

@@ -1,0 +1,272 @@
+"""Nothing that is not finite is kept: no state, no checkpoint, no history."""
+
+import functools
+import re
+
+import jax
+import jax.experimental
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from nerfies_jax.training import checkpoint, chunk, guard, loop
+from nerfies_jax.training.checkpoint import Checkpoints
+from nerfies_jax.training.model import Event
+from tests.hard_cases import hostile
+from tests.training import toy
+
+pytestmark = pytest.mark.hard_cases
+
+STEPS = 20  # of which the toy grows after the seventh
+NAMES = {
+    "metric": "metric loss",
+    "parameter": r"params\.rows\.mean \(1 of",
+    "moment": r"optimiser\.0\.nu\.rows\.mean \(1 of",
+    "statistic": r"extra\.hits \(1 of",
+}
+
+MODEL = toy.model()
+
+
+@pytest.fixture(scope="module")
+def frames():
+    return toy.frames()
+
+
+def start():
+    return toy.init(None, jax.random.key(5))
+
+
+def fit(frames, state=None, model=None, **settings):
+    state = start() if state is None else state
+    model = MODEL if model is None else model
+    return loop.fit(model, state, frames, console=hostile.QUIET, **settings)
+
+
+def spoil(state, where, value):
+    """The state with one number of one of its arrays replaced by a sum with `value`."""
+    rows = state.params.rows["mean"].at[2, 1].add(value)
+    if where == "parameter":
+        return state._replace(params=state.params._replace(rows={"mean": rows}))
+    if where == "moment":
+        adam, *rest = state.optimiser
+        second = adam.nu._replace(
+            rows={"mean": adam.nu.rows["mean"].at[1, 0].add(value)}
+        )
+        return state._replace(optimiser=(adam._replace(nu=second), *rest))
+    hits = state.extra["hits"].at[3].add(value)
+    return state._replace(extra={**state.extra, "hits": hits})
+
+
+@functools.cache
+def poisoned(where):
+    """The toy with one number in one place that is not finite after one step.
+
+    Which step and what number `poison` writes into the depths, which the toy does not
+    read: one program for all of them.
+    """
+
+    def step(state, frames):
+        at, value = frames.depths
+        poison = jnp.where((state.step + 1).astype(jnp.float32) == at, value, 0.0)
+        new, metrics = toy.step(state, frames)
+        if where == "metric":
+            metrics["loss"] = metrics["loss"] + poison
+            return new, metrics
+        return spoil(new, where, poison), metrics
+
+    return toy.model(change=step)
+
+
+def poison(frames, at, value=jnp.nan):
+    return frames._replace(depths=jnp.asarray([at, value], jnp.float32))
+
+
+def held(folder, result, model):
+    """The run kept nothing that is not finite, in memory or on disk."""
+    assert result.stopped_by == "non-finite"
+    assert not hostile.not_finite(result.state)
+    assert int(result.state.step) == result.steps
+    for row in result.history.rows:
+        assert row["step"] <= result.steps
+        assert np.isfinite(list(row.values())).all()
+    hostile.assert_checkpoints_finite(folder, model, result)
+
+
+@pytest.mark.parametrize("where", NAMES)
+@pytest.mark.parametrize("at", [1, 6, 8, 15])
+def test_a_step_that_blows_up_is_named_and_undone(where, at, frames, tmp_path):
+    model, spoilt = poisoned(where), poison(frames, at)
+    # A checkpoint after every chunk, and one at the end alone.
+    for name, every in (("often", 0.0), ("seldom", 1e9)):
+        folder = tmp_path / name
+        with Checkpoints(folder, model.spec, keep=100) as checkpoints:
+            result = fit(
+                spoilt,
+                model=model,
+                steps=STEPS,
+                checkpoints=checkpoints,
+                checkpoint_seconds=every,
+            )
+        assert result.steps == at - 1
+        said = (
+            rf"stopped at step {at - 1} of 20: step {at} is not finite: {NAMES[where]}"
+        )
+        assert re.match(said, result.message), result.message
+        held(folder, result, model)
+    good = fit(spoilt, model=model, steps=at - 1) if at > 1 else None
+    assert toy.same(result.state, good.state if good else start())
+
+
+@pytest.mark.parametrize("value", [jnp.inf, -jnp.inf])
+@pytest.mark.parametrize("where", NAMES)
+def test_infinities_are_not_finite_either(value, where, frames):
+    spoilt = poison(frames, 5, value)
+    result = fit(spoilt, model=poisoned(where), steps=STEPS)
+    assert result.steps == 4
+    assert re.search(f"step 5 is not finite: {NAMES[where]}", result.message)
+
+
+def test_a_second_moment_that_overflows_stops_the_run(frames):
+    """Its row would never move again, while every parameter stays finite."""
+
+    def steep(state, frames):
+        def loss(params):  # a cliff of 1e20 in one number, at step 9
+            wall = jnp.where(state.step == 8, 1e20, 0.0)
+            return jnp.mean(params.nets["weight"] ** 2) + wall * params.nets["bias"][3]
+
+        slope = jax.grad(loss)(state.params)
+        with jax.numpy_dtype_promotion("standard"):
+            updates, optimiser = toy.OPTIMISER.update(slope, state.optimiser)
+        params = optax.apply_updates(state.params, updates)
+        new = state._replace(params=params, optimiser=optimiser, step=state.step + 1)
+        return new, {"loss": loss(params) * 0}
+
+    state = start()
+    for _ in range(9):
+        state, metrics = jax.jit(steep)(state, frames)
+    assert not hostile.not_finite((state.params, metrics))
+    for _ in range(20):  # what a guard of parameters alone would let go on
+        stuck, _ = jax.jit(steep)(state, frames)
+    bias = [s.params.nets["bias"][3] for s in (state, stuck)]
+    assert bias[0] == bias[1]
+    result = fit(frames, model=toy.model(change=steep), steps=STEPS)
+    assert result.steps == 8
+    assert re.search(
+        r"step 9 is not finite: optimiser\.0\.nu\.nets\.bias \(1 of 8", result.message
+    )
+
+
+@pytest.mark.parametrize("where", [name for name in NAMES if name != "metric"])
+@pytest.mark.parametrize("at", [1, 6, 7, 12])
+def test_an_event_that_blows_up_is_named_and_undone(where, at, frames, tmp_path):
+    def harm(state, _):
+        return spoil(state, where, jnp.nan)
+
+    harmful = [Event("harm", (at,), harm)]
+    with Checkpoints(tmp_path, MODEL.spec, keep=100) as checkpoints:
+        result = fit(
+            frames,
+            steps=STEPS,
+            events=harmful,
+            checkpoints=checkpoints,
+            checkpoint_seconds=0.0,
+        )
+    # Before the step after which it happens: a resumed run must not leave it out.
+    assert result.steps == at - 1
+    said = rf"event 'harm' after step {at} is not finite: {NAMES[where]}"
+    assert re.search(said, result.message), result.message
+    held(tmp_path, result, MODEL)
+    straight = fit(frames, steps=STEPS)
+    assert toy.same(fit(frames, result.state, steps=STEPS).state, straight.state)
+
+
+def test_the_event_that_blew_up_is_named_among_several(frames):
+    seen = []
+
+    def note(state, _):
+        seen.append(int(state.step))
+        return state
+
+    def harm(state, _):
+        return spoil(state, "parameter", jnp.nan)
+
+    events = [
+        Event("a", (7, 8), note),
+        Event("b", (8,), harm),
+        Event("c", (8,), note),
+    ]
+    result = fit(frames, steps=STEPS, events=events)
+    assert result.steps == 7  # right after a copy: nothing is repeated
+    assert "event 'b' after step 8" in result.message
+    assert seen == [7, 8]
+
+
+@pytest.mark.parametrize("where", [name for name in NAMES if name != "metric"])
+def test_a_start_that_is_not_finite_is_refused(where, frames):
+    with pytest.raises(ValueError, match=f"train from is not finite: {NAMES[where]}"):
+        fit(frames, spoil(start(), where, jnp.nan), steps=STEPS)
+
+
+def test_large_metrics_do_not_overflow_together(frames):
+    def large(state, frames):
+        new, metrics = toy.step(state, frames)
+        return new, {**metrics, "sum": jnp.float32(3e38)}
+
+    result = fit(frames, model=toy.model(change=large), steps=STEPS)
+    assert result.stopped_by == "steps"
+    for row in result.history.rows:
+        assert row["sum"] == pytest.approx(3e38, rel=1e-6)
+
+
+def test_a_blow_up_that_does_not_repeat_keeps_the_last_good_chunk(frames):
+    calls = []
+
+    def once(step):
+        calls.append(int(step))
+        return np.float32(np.nan if calls.count(12) == 1 and step == 12 else 0)
+
+    def step(state, frames):
+        new, metrics = toy.step(state, frames)
+        like = jax.ShapeDtypeStruct((), jnp.float32)
+        poison = jax.experimental.io_callback(once, like, new.step)
+        return spoil(new, "parameter", poison), metrics
+
+    result = fit(frames, model=toy.model(change=step), steps=STEPS)
+    assert result.stopped_by == "non-finite"
+    assert "not so when repeated" in result.message
+    assert result.steps == 7  # the chunk before ended with the growth
+    assert not hostile.not_finite(result.state)
+
+
+@pytest.mark.parametrize("kind", ["float16", "bfloat16", "float32"])
+@pytest.mark.parametrize("value", [jnp.nan, jnp.inf, -jnp.inf, 6e4])
+def test_the_two_looks_at_a_state_agree(kind, value):
+    state = {
+        "whole": jnp.arange(3),
+        "none": jnp.zeros((0, 3), kind),
+        "key": jax.random.key(0),
+        "wide": jnp.ones((4, 5), kind).at[2, 3].set(value),
+        "flat": jnp.asarray(-value, kind),
+    }
+    finite = jax.jit(chunk._all_finite)(state)
+    named = guard.bad_arrays(state)
+    if np.isfinite(value):
+        assert finite
+        assert named == []
+    else:
+        assert not finite
+        assert named == ["flat (1 of 1 values)", "wide (1 of 20 values)"]
+
+
+def test_what_is_restored_after_a_blow_up_goes_on(frames, tmp_path):
+    model, spoilt = poisoned("moment"), poison(frames, 9)
+    with Checkpoints(tmp_path, model.spec) as checkpoints:
+        fit(spoilt, model=model, steps=STEPS, checkpoints=checkpoints)
+    restored = checkpoint.restore(tmp_path, start(), model.spec)
+    assert restored.step == 8
+    history = loop.History(**restored.record)
+    mended = fit(frames, restored.state, steps=STEPS, history=history)
+    assert toy.same(mended.state, fit(frames, steps=STEPS).state)
+    assert mended.history.rows[0]["step"] == 1
