@@ -95,6 +95,7 @@ def test_a_bent_slice_is_the_loop_over_its_layers(step, dtype, rng):
     np.testing.assert_allclose(lifted, features, atol=tolerance)
 
 
+@pytest.mark.hard_cases
 def test_the_window_follows_a_traced_step_and_ends_exactly(dtype):
     steps = jnp.asarray([0, 999, 1000, 1001, 6000, 10_999, 11_000, 10**6], jnp.int32)
     opened = jax.jit(

@@ -100,6 +100,7 @@ def test_of_many_points_as_many_as_asked_are_drawn(float64, rng):
     assert not np.array_equal(*seen)
 
 
+@pytest.mark.hard_cases
 def test_a_still_warp_costs_nothing_and_has_a_finite_slope(dtype, rng):
     """Zero, and displacements whose square underflows."""
     points = rng.normal(size=(20, 3))

@@ -80,6 +80,7 @@ def test_cost_is_that_of_the_singular_values(name, spec, dtype):
     np.testing.assert_allclose(value, truth, rtol=bound, atol=floor)
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("name", FOLDS)
 def test_folds_cost_more_than_any_stretch_and_by_their_volume(name, dtype):
     displacement = jnp.asarray(FOLDS[name] - np.eye(3), dtype)
@@ -91,6 +92,7 @@ def test_folds_cost_more_than_any_stretch_and_by_their_volume(name, dtype):
     np.testing.assert_allclose(free, plain(OFFICIAL, FOLDS[name]), rtol=1e-5, atol=1e-9)
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("name", [*MATRICES, *FOLDS, *SINGULAR])
 @pytest.mark.parametrize("robust_width", [0.03, None])
 def test_every_jacobian_has_a_finite_cost_and_slope(name, robust_width, dtype):
@@ -120,6 +122,7 @@ def test_slopes_of_the_cost(name, robust_width, float64):
         assert error < 1e-6 * 1e-6 * np.linalg.norm(slope)
 
 
+@pytest.mark.hard_cases
 def test_a_fold_is_pulled_open_all_the_way(dtype):
     """Along diag(1, 1, s) the cost falls from any fold to the identity.
 
@@ -164,6 +167,7 @@ def test_draws_are_unbiased(ray, draws, dtype):
     assert np.all(np.asarray(RAYS[ray])[chosen] > 0) or ray == "empty"
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("start", [0.0, 1 - 2.0**-24])
 def test_the_ends_of_the_marks_fall_on_samples_of_weight(start, dtype):
     weight = jnp.asarray(RAYS["surface"], dtype)
@@ -296,6 +300,7 @@ def test_gradients_reach_the_warp_and_not_the_weights(points, setting):
     np.testing.assert_array_equal(slope, 0)
 
 
+@pytest.mark.hard_cases
 def test_a_batch_of_empty_rays_costs_nothing(dtype):
     codes = {"motion": jnp.zeros((2, 2), dtype)}
     moments = Moment(jnp.zeros(2, dtype), codes, jnp.zeros(2, jnp.int32))

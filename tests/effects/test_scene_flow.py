@@ -99,6 +99,7 @@ def test_without_depth_and_flow_in_the_capture_their_terms_are_not_there(float64
 # --- edges of time
 
 
+@pytest.mark.hard_cases
 def test_the_first_and_the_last_moment_have_one_neighbour(float64):
     params, frames, batch, arrays = scenario("float64")
 
@@ -126,6 +127,7 @@ def test_the_first_and_the_last_moment_have_one_neighbour(float64):
     assert (hidden[rows == 0, 1] == 0).all()
 
 
+@pytest.mark.hard_cases
 def test_a_single_moment_has_no_neighbours_and_no_flow_to_learn(dtype):
     params, frames, batch, arrays = scenario(dtype)
     still = frames._replace(times=jnp.zeros_like(frames.times))
@@ -279,6 +281,7 @@ def test_the_medium_starts_still_and_undecided(dtype):
     assert found.density >= 0
 
 
+@pytest.mark.hard_cases
 def test_what_is_surely_hidden_keeps_a_slope(dtype):
     params, frames, batch, arrays = scenario(dtype)
     sure = params._replace(
@@ -299,6 +302,7 @@ def test_what_is_surely_hidden_keeps_a_slope(dtype):
     np.testing.assert_allclose(slope.disocclusion.bias, [-np.exp(-40.0), 0], rtol=2e-5)
 
 
+@pytest.mark.hard_cases
 def test_flow_stays_within_its_bound(dtype):
     params = scenario(dtype)[0]
     wild = params._replace(

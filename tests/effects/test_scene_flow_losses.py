@@ -9,6 +9,7 @@ from nerfies_jax.effects import scene_flow_losses as flow_losses
 from tests import gradients
 
 
+@pytest.mark.hard_cases
 def test_a_weighted_mean_of_nothing_is_zero_with_a_slope_of_zero(dtype):
     values, weight = jnp.ones((3, 2), dtype), jnp.zeros(3, dtype)
     value, slope = jax.value_and_grad(flow_losses.weighted_mean)(values, weight)
@@ -16,6 +17,7 @@ def test_a_weighted_mean_of_nothing_is_zero_with_a_slope_of_zero(dtype):
     assert (slope == 0).all()
 
 
+@pytest.mark.hard_cases
 def test_small_weights_count_like_large_ones(dtype):
     values = jnp.asarray([[1.0, 3.0], [5.0, 7.0]], dtype)
     weight = jnp.asarray([1e-12, 3e-12], dtype)  # 1e-8 added would leave 2e-3
@@ -70,6 +72,7 @@ def test_what_moves_does_not_turn_transparent_for_it(float64):
     assert (slope == 0).all()
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("logit", [-1e4, -100.0, -17.0, 0.0, 17.0, 100.0, 1e4])
 def test_entropy_is_finite_however_sure_it_is(dtype, logit):
     value, slope = jax.value_and_grad(flow_losses.entropy)(
@@ -82,6 +85,7 @@ def test_entropy_is_finite_however_sure_it_is(dtype, logit):
     assert np.isfinite(slope).all()
 
 
+@pytest.mark.hard_cases
 def test_expected_values_are_weighed_and_what_passes_ends_at_the_last(float64):
     values = jnp.asarray([[[1.0], [2.0], [5.0]]])
     weight = jnp.asarray([[0.5, 0.2, 0.1]])
@@ -104,6 +108,7 @@ def test_depth_is_compared_up_to_scale_and_offset(dtype):
     np.testing.assert_allclose(other, np.mean(expected**2), rtol=1e-5)
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize(
     ("depth", "count"),
     [

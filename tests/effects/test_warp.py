@@ -122,6 +122,7 @@ def test_samples_of_a_ray_share_the_product_of_their_code(float64, rng):
     assert "f64[7,4]" not in text
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("kind", warp.KINDS)
 @pytest.mark.parametrize("anneal_steps", [None, 100])
 def test_every_warp_starts_as_the_identity(kind, anneal_steps, rng):
@@ -143,6 +144,7 @@ def test_every_warp_starts_as_the_identity(kind, anneal_steps, rng):
         assert all(np.any(leaf != 0) for leaf in jax.tree.leaves(slope.hidden[-1]))
 
 
+@pytest.mark.hard_cases
 def test_weights_of_bands_that_open_late_start_at_zero():
     plain = warp.init(WarpSpec(), jax.random.key(0))
     annealed = warp.init(WarpSpec(anneal_steps=10), jax.random.key(0))
@@ -196,6 +198,7 @@ def test_a_shut_window_leaves_the_point_alone_to_be_read(float64, rng):
     )
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("kind", warp.KINDS)
 def test_time_zero_is_the_template(kind, dtype, rng):
     """D-NeRF's canonical frame; a hair later the field is as it is."""
@@ -235,6 +238,7 @@ def test_gradients(kind, condition, float64, rng):
     assert error < 1e-6
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("angular", [0.0, 1e-20, 1e-8, 1e-3])
 @pytest.mark.parametrize("linear", [0.0, 1.0])
 def test_tiny_turns_keep_their_slopes(angular, linear, dtype):

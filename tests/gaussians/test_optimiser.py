@@ -192,6 +192,7 @@ def test_settings_under_which_radam_cannot_work_are_refused(setting, message):
         optimiser.scale_by_row_radam(**setting)
 
 
+@pytest.mark.hard_cases
 def test_a_late_row_steps_as_if_it_were_alone(dtype):
     """The reference implementations start it 2.5 to 4.6 times too fast."""
     ours = optimiser.scale_by_row_adam()
@@ -223,6 +224,7 @@ def test_a_late_row_steps_as_if_it_were_alone(dtype):
     np.testing.assert_allclose(too_large, [2.52, 3.38, 3.94, 4.33, 4.61], rtol=0.01)
 
 
+@pytest.mark.hard_cases
 def test_a_row_counts_from_its_first_slope(dtype):
     """A band of harmonics or a network that waits does not start too fast."""
     ours = optimiser.scale_by_row_adam()

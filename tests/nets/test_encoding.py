@@ -63,6 +63,7 @@ def test_half_turns_are_exact_on_the_axes(dtype):
     assert np.array_equal(cosine, np.array([1, 0, -1, 0])[quarters % 4])
 
 
+@pytest.mark.hard_cases
 def test_half_turns_are_continuous_at_the_quadrant_seams(dtype):
     seams = np.arange(-7, 8, 2) / 4
     x = np.concatenate([seams * (1 - 1e-6), seams, seams * (1 + 1e-6)])
@@ -73,6 +74,7 @@ def test_half_turns_are_continuous_at_the_quadrant_seams(dtype):
     assert np.max(abs(cosine - np.cos(np.pi * rounded))) < bound + 1e-15
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("times_pi", [False, True])
 def test_gradient_and_curvature(times_pi, float64, rng):
     spec = EncodingSpec(4, times_pi=times_pi)
@@ -143,6 +145,7 @@ def test_the_window_is_exact_at_its_ends_and_opens_smoothly(dtype):
     assert np.all(slope(jnp.asarray(0, dtype)) == 0)
 
 
+@pytest.mark.hard_cases
 def test_a_shut_window_leaves_the_identity_alone():
     point = jnp.asarray([0.3, -0.4])
     features = encoding.encode(EncodingSpec(3), point, jnp.zeros(3))

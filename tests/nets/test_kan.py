@@ -192,6 +192,7 @@ def test_gradients(variant, float64, rng):
     assert error < 1e-6
 
 
+@pytest.mark.hard_cases
 def test_forward_mode_and_reverse_over_forward(float64, rng):
     """The Jacobian of a point, and its slopes: what an elastic penalty asks for."""
     spec = dataclasses.replace(SPEC, hidden=(4,), kernels=3)
@@ -226,6 +227,7 @@ SIGMA = math.sqrt(0.5) * 2 / 7
 CENTRES = np.linspace(-1, 1, 8)
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("order", range(6))
 def test_derivatives_are_hermite_polynomials(order, float64, rng):
     """Equations 6 to 8: psi^(k) = psi (-1 / w)^k H_k((x - mu) / w), w = √2 sigma."""
@@ -341,6 +343,7 @@ def test_holding_is_twice_differentiable_at_the_ends(order, float64):
     np.testing.assert_allclose(found, np.tile(expected, (3, 1)), atol=1e-6)
 
 
+@pytest.mark.hard_cases
 def test_holding_keeps_the_order_of_its_inputs(dtype):
     x = jnp.linspace(-9, 9, 2001).astype(dtype)
     moved = np.diff(kan.hold(x, (-1.0, 2.0), 0.3))

@@ -45,6 +45,7 @@ def exact_thinned(depth, logit):
         return float(-mpmath.log(1 - share * opacity))
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("level", [1e-8, 1e-4, 1.0, 30.0, 1e3])
 def test_weights_are_exact_from_thin_air_to_walls(level, dtype, rng):
     depth = jnp.asarray(rng.uniform(0.5, 1.5, 40) * level, dtype)
@@ -57,11 +58,13 @@ def test_weights_are_exact_from_thin_air_to_walls(level, dtype, rng):
     assert np.all(got[~shown] < 2e-30)
 
 
+@pytest.mark.hard_cases
 def test_thin_air_keeps_its_weight(dtype):
     weights = weights_of(jnp.full(128, 1e-8, dtype))
     assert abs(float(jnp.sum(weights)) / 1.28e-6 - 1) < 1e-5
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("case", ["walls", "mixed", "infinite last", "one wall"])
 def test_weights_never_sum_to_more_than_one(case, dtype, rng):
     depth = {
@@ -79,6 +82,7 @@ def test_weights_never_sum_to_more_than_one(case, dtype, rng):
         assert float(jnp.min(total)) >= 1 - 1e-6
 
 
+@pytest.mark.hard_cases
 def test_a_last_sample_at_infinity_leaves_the_others_alone(dtype, rng):
     depth = jnp.asarray(rng.uniform(0, 0.3, 20), dtype)
     closed = depth.at[-1].set(AT_INFINITY)
@@ -88,6 +92,7 @@ def test_a_last_sample_at_infinity_leaves_the_others_alone(dtype, rng):
     assert abs(float(weights[-1]) - passed) < ABSOLUTE[dtype]
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("density", [0.0, 1e-12, 1.0, 1e6])
 def test_density_at_infinity_has_finite_values_and_slopes(density, dtype):
     def seen(density):
@@ -99,6 +104,7 @@ def test_density_at_infinity_has_finite_values_and_slopes(density, dtype):
     assert np.all(np.isfinite(jax.jit(jax.jacrev(seen))(constant)))
 
 
+@pytest.mark.hard_cases
 def test_an_overflowing_depth_is_opaque(dtype):
     depth = jnp.asarray([0.1, np.inf, 1.0, np.inf], dtype)
     weights, slopes = weights_of(depth), jax.jit(jax.jacrev(weights_of))(depth)
@@ -115,6 +121,7 @@ def test_weights_have_the_slopes_of_central_differences(float64, rng):
     assert error < 1e-8
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("level", [1e-8, 1.0, 30.0])
 def test_media_share_their_transmittance(level, dtype, rng):
     depth = jnp.asarray(rng.uniform(0.1, 1, (3, 16)) * level, dtype)
@@ -172,6 +179,7 @@ def thin_grid(dtype):
     return np.asarray(value, np.float64), np.asarray(slopes, np.float64)
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("logit", LOGITS)
 @pytest.mark.parametrize("depth", DEPTHS)
 def test_thinned_is_exact_with_finite_slopes(depth, logit, dtype):
@@ -192,6 +200,7 @@ def test_thinned_is_exact_with_finite_slopes(depth, logit, dtype):
         assert abs(slope - wanted) < 3 * ABSOLUTE[dtype] * max(wanted, 1)
 
 
+@pytest.mark.hard_cases
 def test_thinned_meets_itself_at_the_switch(dtype):
     """Opacity one half: the two forms may not differ by more than they err."""
     logit = jnp.asarray(np.log(3.0), dtype)  # a share of 3/4 of an opacity of 2/3
@@ -268,6 +277,7 @@ def scene(dtype, samples=6):
     return colours, distances
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("scale", [0.0, 1e-38, 1e-20, 1e-8])
 def test_an_empty_ray_is_background_at_its_far_end(scale, dtype):
     colours, distances = scene(dtype)
@@ -294,6 +304,7 @@ def test_a_single_hit_is_where_it_is(dtype):
     assert seen.alpha == 1
 
 
+@pytest.mark.hard_cases
 def test_expected_distance_joins_its_two_ranges(dtype):
     """Continuous where the far end comes in, and between the two beyond."""
     _, distances = scene(dtype)
@@ -312,6 +323,7 @@ def test_expected_distance_joins_its_two_ranges(dtype):
     assert abs(depth(EMPTY_BELOW / 2) - 3.5) < 1e-5
 
 
+@pytest.mark.hard_cases
 def test_median_is_the_first_sample_past_half(dtype, rng):
     weights = rng.dirichlet(np.ones(9), size=50) * rng.uniform(0.3, 1, (50, 1))
     got = jax.vmap(compositing.median_index)(jnp.asarray(weights, dtype))
@@ -340,6 +352,7 @@ def test_composite_has_the_slopes_of_central_differences(background, float64, rn
     assert error < 1e-7
 
 
+@pytest.mark.hard_cases
 def test_faint_rays_have_the_slopes_of_central_differences(float64, rng):
     distances = jnp.asarray(np.sort(rng.uniform(1, 2, 8)))
     faint = jnp.asarray(rng.uniform(0, 1e-4, 8))

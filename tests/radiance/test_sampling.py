@@ -85,6 +85,7 @@ def test_jittered_distances_fill_their_bins(spacing, dtype):
     assert np.all(within.max(0) > 0.9)
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("spacing", sampling.SPACINGS)
 def test_distances_never_step_back_however_short_the_ray(spacing, dtype):
     near = jnp.asarray(0.7, dtype)
@@ -145,6 +146,7 @@ def hard_samples(keyed, dtype, count):
     return dict(zip(HARD, np.asarray(got), strict=True))
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("keyed", [False, True])
 @pytest.mark.parametrize("case", HARD)
 def test_hard_weights_give_sorted_samples_in_range(case, keyed, dtype):
@@ -155,6 +157,7 @@ def test_hard_weights_give_sorted_samples_in_range(case, keyed, dtype):
     assert np.all(np.diff(got) >= 0)
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("case", ["nothing", "1e-31", "subnormal", "huge"])
 def test_equal_weights_of_any_size_share_alike(case, dtype):
     tolerance = {"float32": 5e-7, "float64": 1e-15}[dtype]
@@ -162,6 +165,7 @@ def test_equal_weights_of_any_size_share_alike(case, dtype):
     np.testing.assert_allclose(got, np.linspace(2, 4, 34), rtol=tolerance)
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize(
     "case", ["one hot", "faint one hot", "two peaks", "first", "last"]
 )
@@ -196,6 +200,7 @@ def test_random_shares_are_stratified_and_unbiased(dtype, rng):
     assert np.all(np.abs(within.mean(0) - 0.5) < 0.11)
 
 
+@pytest.mark.hard_cases
 def test_thousands_of_bins_stay_in_range(dtype, rng):
     """cdf[-1] is 1 only to 1e-7 and sums in a tree may step back."""
     weights = jnp.asarray(rng.uniform(0, 1, 4096) ** 8, dtype)
@@ -208,6 +213,7 @@ def test_thousands_of_bins_stay_in_range(dtype, rng):
     assert got.max() > 0.99
 
 
+@pytest.mark.hard_cases
 def test_no_gradient_passes_through_the_samples(dtype, rng):
     edges = jnp.asarray(np.linspace(0, 1, 9), dtype)
     weights = jnp.asarray(rng.uniform(0, 1, 8), dtype)
@@ -219,6 +225,7 @@ def test_no_gradient_passes_through_the_samples(dtype, rng):
         np.testing.assert_array_equal(slope, 0)
 
 
+@pytest.mark.hard_cases
 def test_refined_distances_carry_no_gradient_to_the_weights(dtype, rng):
     distances = jnp.asarray(np.linspace(1, 2, 8), dtype)
 
@@ -229,6 +236,7 @@ def test_refined_distances_carry_no_gradient_to_the_weights(dtype, rng):
     np.testing.assert_array_equal(jax.grad(spread)(jnp.full(8, 0.3, dtype)), 0)
 
 
+@pytest.mark.hard_cases
 def test_union_keeps_all_and_their_gradients(dtype):
     coarse = jnp.asarray([1.0, 2.0, 3.0], dtype)
     fine = jnp.asarray([2.5, 2.0, 0.5], dtype)  # one tie

@@ -101,6 +101,7 @@ def test_the_samples_of_a_ray_share_the_product_of_their_view(float64):
     assert f"f64[3,{SMALL.width + CONDITION}]" not in text
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("raw", [-1e4, -100.0, 0.0, 100.0, 1e4])
 @pytest.mark.parametrize("density", template.DENSITIES)
 def test_any_raw_density_has_a_finite_value_and_slope(raw, density, dtype):
