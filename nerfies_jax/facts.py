@@ -68,6 +68,8 @@ def _span(capture):
     where the first point is at 0.4), and samples there are lost.
     """
     depth = point_depths(capture)
+    # Those beyond the far plane are not filmed; were all there, near would pass far.
+    depth = depth[depth < capture.far]
     if depth.size < FEWEST_POINTS:
         return float(capture.near), float(capture.far)
     low, high = np.quantile(depth, (OUTLIERS, 1 - OUTLIERS))
@@ -87,7 +89,14 @@ def _box(capture, near, far):
     else:
         points = _frustum_points(capture, near, far)
         low, high = np.quantile(points, (0.1, 0.9), axis=0)
-    return (low + high) / 2, max(float(np.max(high - low)) / 2, 1e-6)
+    half_side = float(np.max(high - low)) / 2
+    # No least size: units are the capture's own, and in metres a cell is 1e-5 wide.
+    if not half_side > 0:
+        raise ValueError(
+            f"what is filmed between near = {near:g} and far = {far:g} around "
+            f"{(low + high) / 2} has no width; move the scene nearer to the origin"
+        )
+    return (low + high) / 2, half_side
 
 
 def _frustum_points(capture, near, far, depths=8):

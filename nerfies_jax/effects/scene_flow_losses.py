@@ -12,16 +12,26 @@ Scalar = Float[Array, ""]
 # Mean deviation of the depths of a batch, as a share of their median, below which they
 # count as flat: bounds the normalised depth by a thousand and its slope.
 FLATTEST = 1e-3
+# Weights below count as none: the slope of a mean in a weight is up to the values over
+# the largest weight, and float32 holds 3e38.
+FAINTEST = 1e-30
 
 
 def weighted_mean(
     values: Float[Array, "*axes channels"], weight: Float[Array, "*axes"]
 ) -> Scalar:
-    """Mean over channels and over the other axes by `weight`; 0 where it sums to 0."""
-    total = jnp.sum(weight)
-    # Selected, not `total + eps`, which fades all weights that are small together.
-    safe = jnp.where(total > 0, total, 1)
-    return jnp.sum(weight * jnp.mean(values, axis=-1)) / safe
+    """Mean over channels and over the other axes by `weight`.
+
+    0, without a slope, where no weight reaches `FAINTEST`.
+    """
+    # Selected, not `total + eps`, which fades all weights that are small together. And
+    # of shares of the largest: a quotient's slope has the divisor's square, which is 0
+    # in float32 where all weights are below 1e-19, and the slope then 0 · inf.
+    largest = jax.lax.stop_gradient(jnp.max(weight))
+    some = largest > FAINTEST
+    share = jnp.where(some, weight / jnp.where(some, largest, 1), 0)
+    total = jnp.where(some, jnp.sum(share), 1)
+    return jnp.sum(share * jnp.mean(values, axis=-1)) / total
 
 
 def mean_where(

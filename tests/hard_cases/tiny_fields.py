@@ -1,0 +1,167 @@
+"""The papers' radiance fields shrunk to a few numbers, and whole runs of them.
+
+A field is compiled once. What a hostile start changes, down to the box of the scene and
+the rate of the optimiser, travels as arrays in `TrainState.extra`.
+"""
+
+import copy
+import dataclasses
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments import evaluate
+from nerfies_jax import presets, scene
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.facts import Facts
+from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.radiance.template import TemplateSpec
+from nerfies_jax.spec import RadianceScene
+from nerfies_jax.training import loop
+from nerfies_jax.training.model import Frames, Model, Rendering, TrainState
+from tests import scenes
+
+PAPERS = ("nerf", "nerf-w", "d-nerf", "t-nerf", "nerfies", "hypernerf", "nsff")
+STEPS = 200
+PICTURE = (8, 6)
+
+
+class Place(NamedTuple):
+    """What is otherwise static: where the scene is, and how fast it is learnt."""
+
+    near: Any
+    far: Any
+    centre: Any
+    scale: Any
+    speed: Any  # times what the optimiser would have moved
+
+
+class Run(NamedTuple):
+    """One field, ready to be trained from anywhere."""
+
+    spec: RadianceScene
+    facts: Facts
+    model: Model
+    state: TrainState
+    frames: Frames
+    picture: Any  # state -> Rendering, compiled
+
+
+def tiny(name: str) -> RadianceScene:
+    """A paper's field with networks of eight, over `STEPS` steps of 32 rays."""
+    spec = presets.with_steps(presets.PRESETS[name], STEPS)
+    few = EncodingSpec(2)
+    changes = {
+        "warp": {"position": few, "time": few, "depth": 2, "width": 8, "skips": (1,)},
+        "transient": {"depth": 1, "width": 8, "code_width": 4},
+        "appearance": {"width": 4},
+        "ambient": {"depth": 2, "width": 8, "skips": (1,)},
+        "time": {"encoding": few},
+        "elastic": {"points": 2},
+        "background": {"points": 16},
+    }
+    if spec.scene_flow is not None:
+        network = small_template(spec.scene_flow.network)
+        changes["scene_flow"] = {"network": network, "time": few}
+    effects = {
+        effect: dataclasses.replace(getattr(spec, effect), **change)
+        for effect, change in changes.items()
+        if getattr(spec, effect) is not None
+    }
+    fine = 8 if spec.sampling.fine else 0
+    sampling = dataclasses.replace(spec.sampling, coarse=8, fine=fine)
+    return dataclasses.replace(
+        spec,
+        template=small_template(spec.template),
+        sampling=sampling,
+        rays=32,
+        **effects,
+    )
+
+
+def small_template(spec: TemplateSpec) -> TemplateSpec:
+    """The same kind of network, two layers of eight."""
+    return dataclasses.replace(
+        spec,
+        position=EncodingSpec(3),
+        direction=EncodingSpec(1),
+        depth=2,
+        width=8,
+        skips=(1,),
+        colour_width=8,
+    )
+
+
+def moved(facts: Facts, place: Place) -> Facts:
+    """The facts with traced numbers, which their constructor would refuse."""
+    facts = copy.copy(facts)
+    for name in ("near", "far", "centre", "scale"):
+        object.__setattr__(facts, name, getattr(place, name))
+    return facts
+
+
+def place_of(facts: Facts, speed: float = 1.0) -> Place:
+    """As arrays."""
+    numbers = (facts.near, facts.far, facts.centre, facts.scale, speed)
+    return Place(*(jnp.asarray(number, jnp.float32) for number in numbers))
+
+
+def frames_of(capture: Capture, wants: frozenset[str]) -> Frames:
+    """Frames whose pictures can hold any number, with a mask in any case."""
+    frames = evaluate.frames_of(capture, wants)
+    valid = frames.valid
+    if valid is None:
+        valid = jnp.ones(frames.images.shape[:3], bool)
+    return frames._replace(images=frames.images.astype(jnp.float32), valid=valid)
+
+
+@functools.cache
+def started(name: str) -> Run:
+    """The field of one paper on the tiny capture."""
+    return start(tiny(name), scenes.tiny_capture())
+
+
+def start(spec: RadianceScene, capture: Capture) -> Run:
+    """Nothing is compiled before it runs."""
+    facts = scene.facts_of(capture, spec)
+    model = scene.build(spec, facts)
+
+    def step(state, frames):
+        here = scene.build(spec, moved(facts, state.extra))
+        new, metrics = here.step(state, frames)
+        params = jax.tree.map(
+            lambda old, new: old + state.extra.speed * (new - old),
+            state.params,
+            new.params,
+        )
+        return new._replace(params=params), metrics
+
+    view = evaluate.view_of(capture, int(capture.train[0]))
+
+    @jax.jit
+    def picture(state, camera, time) -> Rendering:
+        here = scene.build(spec, moved(facts, state.extra))
+        seen = view._replace(camera=camera, time=time)
+        return here.render(state.params, seen, PICTURE, state.step)
+
+    state = model.init(capture, jax.random.key(0))
+    state = state._replace(extra=place_of(facts))
+    frames = frames_of(capture, model.wants)
+    return Run(spec, facts, model._replace(step=step), state, frames, picture)
+
+
+def bad_leaves(tree: Any) -> list[str]:
+    """Paths of the arrays that hold a number which is not finite."""
+    return [
+        jax.tree_util.keystr(path)
+        for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]
+        if jnp.issubdtype(leaf.dtype, jnp.inexact) and not np.isfinite(leaf).all()
+    ]
+
+
+def fit(run: Run, state: TrainState, frames: Frames, steps: int) -> loop.FitResult:
+    """A run of the loop that users run."""
+    return loop.fit(run.model, state, frames, steps=steps)
