@@ -106,6 +106,9 @@ def draw_batch(frames: Frames, count: int, key: Key[Array, ""]) -> Batch:
     valid = found.valid
     if frames.valid is not None:
         valid = valid & frames.valid[row, line, column]
+    # Chosen here, once for all losses: what was not filmed may hold NaN, which stays
+    # NaN under a weight of zero.
+    colour = jnp.where(valid[:, None], colour, 0)
     cosine = jax.vmap(rays.depth_per_distance)(camera, found.direction)
     return Batch(row, pixel, found.origin, found.direction, cosine, colour, valid)
 
