@@ -1,0 +1,313 @@
+"""What a picture of Gaussians must not depend on, and what it must keep.
+
+Bounds. Where a footprint is off by δ px, its alpha is off by at most 1.1 δ: exp(-u²) is
+nowhere steeper than 0.86, and u grows by at most 1 / sqrt(2 * 0.3 px²) per px. Each of
+the Gaussians changes a pixel's colour by at most that. World coordinates of up to 30
+units are rounded to 15 eps each and stand for focal / depth = 40 / 3 px a unit, so δ is
+a few times 200 eps px, and needles, turned by a few eps, move less at the ends that are
+in the picture.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gaussians_jax import render, splats
+from gaussians_jax.raster_spec import RasterSpec
+from gaussians_jax.splats import Gaussians, Splats
+from tests.hard_cases import properties
+from tests.hard_cases.properties import GAUSSIANS, PICTURE, cast, close, eps, same
+
+pytestmark = pytest.mark.hard_cases
+# Without jumps: at the cut a Gaussian's edge is as faint as rounding.
+SMOOTH = RasterSpec(alpha_cut=1e-6, stop=0.0, near=1e-9, far=1e12, chunk=2)
+USUAL = RasterSpec(chunk=2)  # quicker to compile
+OTHERWISE_CUT = dataclasses.replace(SMOOTH, tile=4, capacity=5)
+ROWS = st.integers(0, GAUSSIANS - 1)
+SCENE = properties.gaussians()
+COLOURS = properties.many((GAUSSIANS, 3), 0, 1)
+CAMERA = properties.cameras().map(
+    lambda camera: camera._replace(camera_from_world=np.eye(3), position=np.zeros(3))
+)
+
+
+def picture_error(dtype):
+    return 1.1 * GAUSSIANS * 200 * eps(dtype)
+
+
+def drawn(gaussians, colours, camera, spec):
+    """Colour, alpha, and depth times alpha."""
+    frame = render.render(gaussians, colours, camera, PICTURE, spec).rendering
+    return frame.colour, frame.alpha, frame.depth * frame.alpha
+
+
+draw = jax.jit(drawn, static_argnums=3)
+
+
+@jax.jit
+def slopes(gaussians, colours, camera, weight):
+    """A weighted sum of the smooth picture, the picture, and the gradient of the sum.
+
+    It also draws wherever only the smooth picture is asked for: one program to compile.
+    """
+
+    def loss(*inputs):
+        picture = drawn(*inputs, SMOOTH)
+        return jnp.sum(weight * picture[0]), picture
+
+    inputs = gaussians, colours, camera
+    return jax.value_and_grad(loss, argnums=(0, 1, 2), has_aux=True)(*inputs)
+
+
+def smooth(scene, colours, camera):
+    weight = jnp.zeros((PICTURE[1], 1, 3), scene.mean.dtype)
+    return slopes(scene, colours, camera, weight)[0][1]
+
+
+def replaced(gaussians, row, **fields):
+    """One row with other values."""
+    changed = {name: getattr(gaussians, name).copy() for name in fields}
+    for name, value in fields.items():
+        changed[name][row] = value
+    return gaussians._replace(**changed)
+
+
+@given(scene=SCENE, colours=COLOURS, camera=CAMERA, motion=properties.motions())
+def test_a_rigid_motion_of_world_and_camera_cannot_be_seen(
+    scene, colours, camera, motion, dtype
+):
+    here = smooth(*cast(dtype, scene, colours, camera))
+    world = properties.moved(scene, motion)
+    there = smooth(
+        *cast(dtype, world, colours, properties.moved_camera(camera, motion))
+    )
+    for found, expected, largest in zip(there, here, (1, 1, 5), strict=True):
+        close(found, expected, largest * picture_error(dtype))
+
+
+@given(scene=SCENE, colours=COLOURS, camera=CAMERA, power=properties.numbers(-3, 3))
+def test_a_common_scale_of_scene_and_camera_cannot_be_seen(
+    scene, colours, camera, power, dtype
+):
+    here = smooth(*cast(dtype, scene, colours, camera))
+    factor = 10**power
+    larger = scene._replace(mean=scene.mean * factor, scale=scene.scale * factor)
+    there = smooth(*cast(dtype, larger, colours, camera))
+    close(there[0], here[0], picture_error(dtype))
+    close(there[1], here[1], picture_error(dtype))
+    close(there[2] / factor, here[2], 5 * picture_error(dtype))
+
+
+@given(
+    scene=SCENE,
+    colours=COLOURS,
+    camera=CAMERA,
+    order=st.permutations(range(GAUSSIANS)),
+)
+def test_the_order_of_the_rows_does_not_matter(scene, colours, camera, order, dtype):
+    """For Gaussians at one depth it does, by design: ties go by row."""
+    scene, colours, camera = cast(dtype, scene, colours, camera)
+    order = jnp.asarray(order)
+    shuffled = jax.tree.map(lambda leaf: leaf[order], scene)
+    here = smooth(scene, colours, camera)
+    same(smooth(shuffled, colours[order], camera), here)
+    here = draw(scene, colours, camera, USUAL)
+    same(draw(shuffled, colours[order], camera, USUAL), here)
+
+
+@given(scene=SCENE, colours=COLOURS, camera=CAMERA, powers=properties.many(6, -10, 10))
+def test_sign_and_length_of_a_quaternion_cannot_be_seen(
+    scene, colours, camera, powers, dtype
+):
+    here = draw(*cast(dtype, scene, colours, camera), USUAL)
+    turned = scene._replace(quaternion=-scene.quaternion)
+    same(draw(*cast(dtype, turned, colours, camera), USUAL), here)
+    longer = scene._replace(quaternion=scene.quaternion * 10 ** powers[:, None])
+    here = smooth(*cast(dtype, scene, colours, camera))
+    there = smooth(*cast(dtype, longer, colours, camera))
+    close(there[0], here[0], picture_error(dtype))
+
+
+@given(scene=SCENE, camera=CAMERA, colour=properties.many(3, 0, 1))
+def test_weights_sum_to_alpha_and_alpha_to_at_most_one(scene, camera, colour, dtype):
+    colours = np.tile(colour, (GAUSSIANS, 1))
+    scene, colours, camera = cast(dtype, scene, colours, camera)
+    inputs = scene, colours, camera
+    for picture, alpha, _ in (smooth(*inputs), draw(*inputs, USUAL)):
+        alpha = np.asarray(alpha)
+        assert np.all(alpha >= 0)
+        assert np.all(alpha <= 1)
+        # a sum of six products, and transmittance as a product of six differences
+        close(picture, alpha[..., None] * colours[0], 2 * GAUSSIANS * eps(dtype))
+
+
+@given(
+    scene=SCENE,
+    colours=COLOURS,
+    camera=CAMERA,
+    row=ROWS,
+    more=properties.numbers(0, 1),
+)
+def test_a_denser_gaussian_never_lets_more_light_through(
+    scene, colours, camera, row, more, dtype
+):
+    opacity = scene.opacity[row]
+    denser = replaced(scene, row, opacity=opacity + more * (1 - opacity))
+    inputs = [cast(dtype, g, colours, camera) for g in (scene, denser)]
+    rounding = 2 * GAUSSIANS * eps(dtype)
+    before, after = (smooth(*each)[1] for each in inputs)
+    assert np.all(after >= before - rounding)
+    # A pixel is done before its transmittance would fall below `stop`, so that what
+    # ends it early may keep an opaque Gaussian behind it out.
+    least = USUAL.stop / (1 - USUAL.alpha_max)
+    before, after = (draw(*each, USUAL)[1] for each in inputs)
+    assert np.all(after >= np.minimum(before, 1 - least) - rounding)
+
+
+PLACES = {
+    "behind": lambda mean: mean * [1, 1, -1],
+    "beside": lambda mean: mean + np.array([1000, 0, 0]),
+    "above": lambda mean: mean - [0, 1000, 0],
+    "in the camera": lambda mean: mean * 0,
+    "in its plane": lambda mean: mean * [1, 1, 0],
+    "too far": lambda mean: mean * 1e12,
+    "nowhere": lambda mean: mean * np.nan,
+}
+
+
+@settings(max_examples=100)
+@given(
+    scene=SCENE,
+    colours=COLOURS,
+    camera=CAMERA,
+    row=ROWS,
+    place=st.sampled_from(sorted(PLACES)),
+)
+def test_what_is_out_of_sight_is_as_if_absent_and_has_no_slope(
+    scene, colours, camera, row, place, dtype
+):
+    away = replaced(scene, row, mean=PLACES[place](scene.mean[row]))
+    away, colours, camera = cast(dtype, away, colours, camera)
+    weight = jnp.ones((PICTURE[1], 1, 3), dtype)
+    (_, here), gradient = slopes(away, colours, camera, weight)
+    # Absent: the rows behind it move up, and a clear one fills the end.
+    others = np.array([*(k for k in range(GAUSSIANS) if k != row), row])
+    rest = jax.tree.map(lambda leaf: leaf[others], away)
+    rest = rest._replace(opacity=rest.opacity.at[-1].set(0))
+    same(here, smooth(rest, colours[others], camera))
+    for leaf in jax.tree.leaves(gradient[:2]):
+        same(leaf[row], np.zeros_like(leaf[row]))
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(gradient))
+
+
+def as_splats(scene: Gaussians) -> Splats:
+    """Rows that are activated to this scene, with an opacity below one."""
+    opacity = np.minimum(scene.opacity, 0.999)
+    return Splats(
+        mean=scene.mean,
+        log_scale=np.log(scene.scale),
+        quaternion=scene.quaternion,
+        opacity_logit=np.log(opacity) - np.log1p(-opacity),
+        sh_dc=np.zeros((len(opacity), 1, 3)),
+        sh_rest=np.zeros((len(opacity), 0, 3)),
+    )
+
+
+@given(scene=SCENE, colours=COLOURS, camera=CAMERA, dead=properties.many(6, 0, 1))
+def test_dead_and_clear_gaussians_are_as_if_absent(scene, colours, camera, dead, dtype):
+    rows, colours, camera = cast(dtype, as_splats(scene), colours, camera)
+    dead = jnp.asarray(dead < 0.5)
+    buried = splats.activate(splats.bury(rows, dead))
+    clear = splats.activate(rows)
+    clear = clear._replace(opacity=jnp.where(dead, 0, clear.opacity))
+    same(buried.opacity, clear.opacity)
+    nowhere = clear._replace(mean=jnp.where(dead[:, None], jnp.nan, clear.mean))
+    here = draw(buried, colours, camera, USUAL)
+    same(here, draw(nowhere, colours, camera, USUAL))
+    assert all(np.all(np.isfinite(leaf)) for leaf in here)
+
+
+@given(
+    depth=properties.many(GAUSSIANS, 1, 5),
+    opacity=properties.many(GAUSSIANS, 0.01, 0.98),
+    colours=COLOURS,
+    camera=CAMERA,
+    row=st.integers(0, GAUSSIANS - 2),
+)
+def test_one_gaussian_is_two_in_one_place_of_root_transparency(
+    depth, opacity, colours, camera, row, dtype
+):
+    """Where its Gaussian is one: in fog, wider than any picture.
+
+    Elsewhere it is not, by design: two of opacity h leave (1 - h g)² where one leaves
+    1 - (2 h - h²) g.
+    """
+    depth = np.sort(depth) + 0.1 * np.arange(GAUSSIANS)
+    fog = Gaussians(
+        mean=depth[:, None] * [0, 0, 1],
+        quaternion=np.tile([1.0, 0, 0, 0], (GAUSSIANS, 1)),
+        scale=np.full((GAUSSIANS, 3), 1e10),
+        opacity=opacity,
+    )
+    last = GAUSSIANS - 1
+    half = -np.expm1(np.log1p(-opacity[row]) / 2)
+    one = replaced(fog, last, mean=fog.mean[row], opacity=0)
+    two = replaced(replaced(one, row, opacity=half), last, opacity=half)
+    colours[last] = colours[row]
+    here = smooth(*cast(dtype, one, colours, camera))
+    there = smooth(*cast(dtype, two, colours, camera))
+    # Depths reach 6. Compositing by hand, with g = 1, gives the same picture.
+    for found, expected in zip(there, here, strict=True):
+        close(found, expected, 6 * 2 * GAUSSIANS * eps(dtype))
+    opacity = one.opacity.copy()
+    before = np.concatenate([[1], np.cumprod(1 - opacity)[:-1]])
+    exact = (before * opacity) @ colours
+    close(here[0], np.broadcast_to(exact, here[0].shape), 4 * GAUSSIANS * eps(dtype))
+
+
+@given(scene=SCENE, colours=COLOURS, camera=CAMERA)
+def test_tiles_and_slabs_do_not_show(scene, colours, camera, dtype):
+    inputs = cast(dtype, scene, colours, camera)
+    here, there = smooth(*inputs), draw(*inputs, OTHERWISE_CUT)
+    close(there[0], here[0], picture_error(dtype))
+    close(there[1], here[1], picture_error(dtype))
+
+
+@given(
+    scene=SCENE,
+    colours=COLOURS,
+    camera=CAMERA,
+    motion=properties.motions(),
+    weight=properties.many((PICTURE[1], 1, 3), -1, 1),
+)
+def test_slopes_know_the_symmetries_of_the_picture(
+    scene, colours, camera, motion, weight, dtype
+):
+    """What cannot be seen has no slope: shifts, scales, lengths of quaternions.
+
+    And the slope in the colours, of which the picture is linear, returns the picture.
+    """
+    scene = properties.moved(scene, motion)
+    camera = properties.moved_camera(camera, motion)
+    inputs = cast(dtype, scene, colours, camera, weight)
+    (value, _), gradient = slopes(*inputs)
+    scene, colours, camera = cast("float64", *inputs[:3])
+    of_scene, of_colours, of_camera = cast("float64", gradient)
+
+    def vanishes(terms, axis, rounded):
+        """A sum of slopes is zero up to the rounding of what they are made of."""
+        bound = 100 * eps(dtype) * np.sum(np.abs(rounded))
+        close(np.sum(terms, axis=axis), 0, bound)
+
+    along = of_scene.scale * scene.scale
+    vanishes(np.vstack([of_scene.mean, of_camera.position]), 0, of_scene.mean)
+    # A slope of a rotation is a difference of slopes of shapes.
+    vanishes(of_scene.quaternion * scene.quaternion, 1, along)
+    towards = of_scene.mean * (scene.mean - camera.position)
+    vanishes(np.concatenate([towards, along], axis=1), None, towards)
+    vanishes([np.sum(of_colours * colours), -value], 0, of_colours)
