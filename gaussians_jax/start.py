@@ -106,6 +106,8 @@ def _filmed_depths(capture):
     is at 0.4), and a Gaussian there covers the whole picture: 20 times slower steps.
     """
     depth = point_depths(capture)
+    # Points beyond the far plane are drawn, but what is filmed lies before it.
+    depth = depth[depth < capture.far]
     if not depth.size:
         return capture.near, capture.far
     low, high = np.quantile(depth, (0.02, 0.98))
