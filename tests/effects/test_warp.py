@@ -310,3 +310,32 @@ def test_seams_of_the_effect():
 def test_wrong_settings_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
         WarpSpec(**change)
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("place", [0.3, 100.0])
+@pytest.mark.parametrize("times_pi", [False, True])
+def test_strain_keeps_its_slopes_through_the_encoding(times_pi, place):
+    """Second derivatives of the features: what an elastic penalty trains on.
+
+    Far from the origin too, where π rounded in before the sine reduces leaves float32
+    slopes of the strain 1e-2 off.
+    """
+    spec = dataclasses.replace(SMALL, position=EncodingSpec(8, times_pi=times_pi))
+    params = bent(spec, "float32")
+    point = np.float32(place) * np.array([1.0, -0.7, 0.4], np.float32)
+
+    def strain(params, point):
+        jacobian = jax.jacfwd(
+            lambda x: warp.displace(spec, params, x, moment(point.dtype))
+        )(point)
+        return jnp.sum(jacobian**2)
+
+    slopes = {}
+    for kind in ("float32", "float64"):
+        with jax.enable_x64(kind == "float64"):
+            args = jax.tree.map(lambda x, k=kind: jnp.asarray(x, k), (params, point))
+            found = jax.jit(jax.grad(strain, argnums=(0, 1)))(*args)
+            slopes[kind] = [np.asarray(x, np.float64) for x in jax.tree.leaves(found)]
+    for narrow, wide in zip(*slopes.values(), strict=True):
+        assert np.abs(narrow - wide).max() <= 2e-5 * np.abs(wide).max()

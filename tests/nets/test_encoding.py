@@ -170,3 +170,22 @@ def test_no_bands_is_the_identity():
     assert np.array_equal(
         encoding.encode(EncodingSpec(0), jnp.ones(3), None), np.ones(3)
     )
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("narrow", [jnp.bfloat16, jnp.float16])
+@pytest.mark.parametrize("times_pi", [False, True])
+def test_narrow_coordinates_are_encoded_in_float32(times_pi, narrow):
+    """2^15 x overflows float16, and a bfloat16 sine of 2^7 x is noise."""
+    spec = EncodingSpec(16, times_pi=times_pi)
+    point = jnp.asarray([0.0, -0.7371, 3.25], narrow)
+    features = jax.jit(lambda p: encoding.encode(spec, p, None))(point)
+    assert features.dtype == narrow
+    exact = exact_features(spec, np.asarray(point, np.float64), np.ones(16))
+    unit = float(jnp.finfo(narrow).eps)
+    np.testing.assert_allclose(
+        np.asarray(features, np.float64), exact, atol=unit, rtol=unit
+    )
+    window = encoding.anneal(4, jnp.asarray(1.5, narrow))
+    assert window.dtype == narrow
+    assert window.tolist() == [1, 0.5, 0, 0]

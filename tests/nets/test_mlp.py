@@ -193,3 +193,32 @@ def test_inputs_known_beforehand_may_be_summed_once(skips, dtype):
     theirs = mlp.apply(spec, params, whole)["out"]
     tolerance = {"float32": 2e-6, "float64": 1e-14}[dtype]
     np.testing.assert_allclose(ours, theirs, atol=tolerance)
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("activation", mlp.ACTIVATIONS)
+def test_bfloat16_is_finite_and_near(activation, rng):
+    """Parameters and inputs of eight bits: outputs as near, slopes finite."""
+    spec = dataclasses.replace(SPEC, activation=activation)
+    params = jax.tree.map(
+        lambda x: x.astype(jnp.bfloat16), mlp.init(spec, jax.random.key(0))
+    )
+    inputs = jnp.asarray(rng.normal(size=(32, 5)), jnp.bfloat16)
+
+    def heads(params, inputs):
+        found = mlp.apply(spec, params, inputs)
+        return sum(jnp.sum(head) for head in found.values()), found
+
+    run = jax.jit(jax.value_and_grad(heads, has_aux=True))
+    (_, narrow), slopes = run(params, inputs)
+    wide = jax.tree.map(lambda x: x.astype(jnp.float32), (params, inputs))
+    (_, exact), wanted = run(*wide)
+    for name, value in narrow.items():
+        assert value.dtype == jnp.bfloat16
+        off = np.abs(np.asarray(value, np.float32) - exact[name])
+        # Five roundings to 2^-9 on the way
+        assert off.max() < 0.03 * np.abs(exact[name]).max()
+    for slope, truth in zip(*map(jax.tree.leaves, (slopes, wanted)), strict=True):
+        assert slope.dtype == jnp.bfloat16
+        off = np.abs(np.asarray(slope, np.float32) - truth)
+        assert off.max() <= 0.03 * np.abs(truth).max()

@@ -458,3 +458,24 @@ class TestNerfies:
         wanted = np.einsum("rs,rsc->rc", weights, rgb) + (1 - weights.sum(1))[:, None]
         np.testing.assert_allclose(seen.colour, wanted, atol=self.TOLERANCE[dtype])
         assert np.max(np.abs(np.asarray(seen.colour) - theirs)) > 0.05
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("narrow", [jnp.bfloat16, jnp.float16])
+def test_narrow_depths_are_summed_in_float32(narrow, rng):
+    """A running sum of 128 depths in bfloat16 loses a hundredth of the light."""
+    depth = jnp.asarray(rng.uniform(0, 0.1, 128), narrow)
+    exact = exact_weights(np.asarray(depth, np.float64)[None])[0]
+    found = weights_of(depth)
+    joint = media_weights_of(jnp.stack([depth, depth]) / 2)
+    assert found.dtype == joint.dtype == narrow
+    unit = float(jnp.finfo(narrow).eps)
+    near = {"rtol": unit, "atol": 2.0**-24}  # of which float16 has no less
+    np.testing.assert_allclose(np.asarray(found, np.float64), exact, **near)
+    both = np.sum(np.asarray(joint, np.float64), axis=0)
+    # Two halves of the opacity of one sample overlap.
+    wanted = exact * 2 * -np.expm1(-np.asarray(depth, np.float64) / 2)
+    wanted /= -np.expm1(-np.asarray(depth, np.float64))
+    np.testing.assert_allclose(both, wanted, **near)
+    middle = np.searchsorted(np.cumsum(exact), 0.5)
+    assert abs(int(compositing.median_index(found)) - middle) <= 1

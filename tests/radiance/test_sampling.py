@@ -302,3 +302,28 @@ def test_nerfies_inverse(oracle_dir, dtype):
     np.testing.assert_allclose(invert(NERF_FLOOR), wanted, atol=tolerance)
     # its floor against ours: 8 bins of 1e-5 beside weights that sum to about 4
     np.testing.assert_allclose(invert(None), wanted, atol=5e-5)
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("narrow", [jnp.bfloat16, jnp.float16])
+def test_narrow_rays_keep_their_order_and_their_peaks(narrow):
+    near, far = jnp.asarray(2, narrow), jnp.asarray(4, narrow)
+    even = stratified(jax.random.key(0), near, far, 64, "linear")
+    edges = jnp.linspace(2, 4, 65).astype(narrow)
+    peak = jnp.zeros(64, narrow).at[40].set(1)
+    # A rounding unit of bfloat16 in each of 64 bins would be a third of the weight.
+    drawn = from_weights(jax.random.key(0), edges, peak, 64)
+    for found in (even, drawn):
+        assert found.dtype == narrow
+        found = np.asarray(found, np.float64)
+        assert np.all(np.diff(found) >= 0)
+        assert np.all((found >= 2) & (found <= 4))
+    assert np.all((drawn >= edges[40]) & (drawn <= edges[41]))
+
+
+@pytest.mark.hard_cases
+def test_a_weight_that_is_not_a_number_shows(dtype):
+    """Nothing is drawn from it as if it were one."""
+    weights = jnp.ones(8, dtype).at[3].set(jnp.nan)
+    edges = jnp.asarray(np.linspace(2, 4, 9), dtype)
+    assert np.isnan(from_weights(None, edges, weights, 9)).any()

@@ -152,3 +152,22 @@ def test_a_field_without_views_reads_codes_alone():
     spec = dataclasses.replace(SMALL, direction=None, position=EncodingSpec(2))
     assert template.colour_spec(spec, 3).inputs == spec.width + 3
     assert template.trunk_spec(spec, 15).inputs == 15
+
+
+@pytest.mark.hard_cases
+def test_bfloat16_is_finite_and_near():
+    params, features, condition = drawn("bfloat16")
+    spec = dataclasses.replace(SMALL, density="softplus")
+
+    def seen(params):
+        found = template.apply(spec, params, features, condition)
+        return found.density + jnp.sum(found.colour), found
+
+    (_, found), slopes = jax.jit(jax.value_and_grad(seen, has_aux=True))(params)
+    kinds = {leaf.dtype for leaf in jax.tree.leaves((found, slopes))}
+    assert kinds == {jnp.dtype(jnp.bfloat16)}
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
+    wide = jax.tree.map(lambda x: np.asarray(x, np.float64), (params, features))
+    exact = by_hand(spec, *wide, np.asarray(condition, np.float64))
+    np.testing.assert_allclose(np.asarray(found.density, float), exact[0], rtol=0.05)
+    np.testing.assert_allclose(np.asarray(found.colour, float), exact[1], atol=0.02)
