@@ -1,0 +1,208 @@
+"""Starts that nobody would choose, for radiance fields.
+
+A start changes numbers alone, never a shape, so one compiled field serves all of them.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.training.model import Frames
+from tests.hard_cases import hostile
+
+PyTree = Any
+
+
+def as_is(x: Any) -> Any:
+    """Nothing changes."""
+    return x
+
+
+class Start(NamedTuple):
+    """What is unusual, on the way from the film to the first step."""
+
+    film: Callable[[Capture], Capture] = as_is
+    frames: Callable[[Frames], Frames] = as_is
+    params: Callable[[PyTree], PyTree] = as_is
+    speed: float = 1.0  # times the learning rate
+
+
+def scaled(factor: float) -> Callable[[Capture], Capture]:
+    """The same film in other units."""
+
+    def film(capture):
+        cameras = capture.cameras
+        position = (cameras.position * factor).astype(np.float32)
+        points = (capture.points.position * factor).astype(np.float32)
+        return dataclasses.replace(
+            capture,
+            cameras=cameras._replace(position=position),
+            points=capture.points._replace(position=points),
+            depths=(capture.depths * factor).astype(np.float32),
+            near=capture.near * factor,
+            far=capture.far * factor,
+        )
+
+    return film
+
+
+def inside(capture: Capture) -> Capture:
+    """All cameras amid the points, looking the ways they did."""
+    middle = np.median(capture.points.position, axis=0)
+    position = np.broadcast_to(middle, capture.cameras.position.shape).copy()
+    return dataclasses.replace(
+        capture, cameras=capture.cameras._replace(position=position)
+    )
+
+
+def thin(share: float) -> Callable[[Capture], Capture]:
+    """A near plane that share of the depth before the far one."""
+    return lambda capture: dataclasses.replace(
+        capture, near=capture.far * (1 - share), points=None
+    )
+
+
+def from_the_lens(capture: Capture) -> Capture:
+    """A near plane at next to nothing."""
+    return dataclasses.replace(capture, near=1e-9, points=None)
+
+
+def rounded(frames: Frames) -> Frames:
+    """Pictures as bfloat16 shares."""
+    shares = (frames.images / 255).astype(jnp.bfloat16)
+    return frames._replace(images=255 * shares.astype(frames.images.dtype))
+
+
+def unfilmed_nan(frames: Frames) -> Frames:
+    """`hostile.unfilmed`, where nothing is but NaN."""
+    frames = hostile.unfilmed(frames)
+    images = jnp.where(frames.valid[..., None], frames.images, jnp.nan)
+    return frames._replace(images=images)
+
+
+def nothing_filmed(frames: Frames) -> Frames:
+    """No pixel at all, and NaN everywhere."""
+    return frames._replace(
+        images=jnp.full_like(frames.images, jnp.nan),
+        valid=jnp.zeros_like(frames.valid),
+    )
+
+
+def one_exposure(frames: Frames) -> Frames:
+    """All frames under one appearance id."""
+    return frames._replace(appearance=jnp.zeros_like(frames.appearance))
+
+
+def points_at(factor: float) -> Callable[[Frames], Frames]:
+    """Static points that far out, or all in one."""
+
+    def change(frames):
+        if frames.points is None:
+            return frames
+        return frames._replace(points=frames.points * factor)
+
+    return change
+
+
+def no_flow(frames: Frames) -> Frames:
+    """Optical flow that is known nowhere."""
+    if frames.flow is None:
+        return frames
+    seen = {
+        name: jnp.zeros_like(getattr(frames.flow, name))
+        for name in ("forward_seen", "backward_seen")
+    }
+    return frames._replace(flow=frames.flow._replace(**seen))
+
+
+def wild_flow(frames: Frames) -> Frames:
+    """Optical flow of ten thousand times as many pixels."""
+    if frames.flow is None:
+        return frames
+    flow = frames.flow
+    far = {name: 1e4 * getattr(flow, name) for name in ("forward", "backward")}
+    return frames._replace(flow=flow._replace(**far))
+
+
+def denser(raw: float) -> Callable[[PyTree], PyTree]:
+    """That much on every density before its activation, of every medium."""
+
+    def change(params):
+        return jax.tree_util.tree_map_with_path(
+            lambda path, leaf: leaf + raw * _is_density_bias(path), params
+        )
+
+    return change
+
+
+def _is_density_bias(path):
+    return jax.tree_util.keystr(path).endswith("['density'].bias")
+
+
+def bent(factor: float) -> Callable[[PyTree], PyTree]:
+    """The read-outs of the warp so many times as large."""
+
+    def change(params):
+        if "warp" not in params:
+            return params
+        heads = jax.tree.map(lambda leaf: leaf * factor, params["warp"].heads)
+        return params | {"warp": params["warp"]._replace(heads=heads)}
+
+    return change
+
+
+def coded(deviation: float) -> Callable[[PyTree], PyTree]:
+    """Codes as far apart as that."""
+
+    def change(params):
+        tables = {
+            name: deviation * jax.random.normal(jax.random.key(9), table.shape)
+            for name, table in params["codes"].items()
+        }
+        return params | {"codes": tables}
+
+    return change
+
+
+def times(factor: float) -> Callable[[PyTree], PyTree]:
+    """Every parameter so many times as large."""
+    return lambda params: jax.tree.map(lambda leaf: leaf * factor, params)
+
+
+OF_FRAMES = {name: Start(frames=change) for name, change in hostile.CAPTURES.items()}
+OF_FILMS = {
+    "bfloat16 images": Start(frames=rounded),
+    "unfilmed not a number": Start(frames=unfilmed_nan),
+    "nothing filmed": Start(frames=nothing_filmed),
+    "one exposure": Start(frames=one_exposure),
+    "no flow known": Start(frames=no_flow),
+    "wild flow": Start(frames=wild_flow),
+    "points in one place": Start(frames=points_at(0.0)),
+    "points at 1e20": Start(frames=points_at(1e20)),
+    "cameras inside": Start(film=inside),
+    "near 1e-6 before far": Start(film=thin(1e-6)),
+    "near as far as far": Start(film=thin(1e-9)),
+    "near at the lens": Start(film=from_the_lens),
+    "box of 1e-6 units": Start(film=scaled(1e-6)),
+    "box of 1e6 units": Start(film=scaled(1e6)),
+}
+OF_PARAMETERS = {
+    "opaque": Start(params=denser(100.0)),
+    "opaque by far": Start(params=denser(1e6)),
+    "empty": Start(params=denser(-100.0)),
+    # Weights of 1e-22: their squares are below float32
+    "next to empty": Start(params=denser(-75.0)),
+    "folded warp": Start(params=bent(1e3)),
+    "shattered warp": Start(params=bent(1e6)),
+    "codes of 1e3": Start(params=coded(1e3)),
+    "codes of 1e9": Start(params=coded(1e9)),
+    "all zero": Start(params=times(0.0)),
+    "all a hundredfold": Start(params=times(100.0)),
+    "rate tenfold": Start(speed=10.0),
+    "rate a thousandfold": Start(speed=1e3),
+}
