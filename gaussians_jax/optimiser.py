@@ -124,10 +124,9 @@ def _coth_excess(x_sq):
 def _scale_by_row_moments(b1, b2, direction):
     """Updates made by `direction(age, mean slope, mean squared slope)` of every row.
 
-    A slope of more than 5e20, whose square is infinite in float32, makes its update
-    NaN: the run stops there, at its last good step. Divided by infinity, the number
-    would stand still unnoticed for the rest of the run (as good as for ever in float64
-    too: a slope of 1e20 is forgotten after 9e4 updates).
+    The square of a slope of more than 5e20 is infinite in float32, and what is divided
+    by it stands still for good: the loop looks at moments too, and stops. (Scaling
+    would not help: float64 forgets a slope of 1e20 after 9e4 updates.)
     """
     _check_decays(b1, b2)
 
@@ -156,8 +155,7 @@ def _scale_by_row_moments(b1, b2, direction):
             # 1 - b^n, which cancels in float32 for b = 0.999 and small n.
             seen = -jnp.expm1(age * math.log(b1))
             seen_sq = -jnp.expm1(age * math.log(b2))
-            told = jnp.where(jnp.isfinite(v), m, jnp.nan)
-            return direction(age, told / seen, v / seen_sq)
+            return direction(age, m / seen, v / seen_sq)
 
         return jax.tree.map(step, count, first, second), RowAdamState(
             count, first, second

