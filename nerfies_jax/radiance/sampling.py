@@ -37,7 +37,9 @@ def stratified(
     if spacing == "linear":
         even = near + (far - near) * share
     else:
-        even = 1 / (1 / near + (1 / far - 1 / near) * share)
+        # That form cancels in 1 / far - 1 / near, and the last sample would be 0.04 %
+        # short of a far of 1e4 nears, 18 % of 1e7, in float32. The ulp is taken back.
+        even = jax.lax.cummax(near / ((1 - share) + share * (near / far)))
     even = jnp.clip(even, near, far)
     if key is None:
         return even
