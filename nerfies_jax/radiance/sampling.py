@@ -77,7 +77,7 @@ def from_weights(
         raise ValueError(f"count={count} must be at least 1")
     dtype = edges.dtype
     edges, weights = jax.lax.stop_gradient((edges, weights))
-    # A rounding unit of bfloat16 on each of 64 bins would be half of all weight.
+    # A rounding unit of bfloat16 on each of 64 bins would be a third of all weight.
     if dtype.itemsize < 4:
         edges, weights = edges.astype(jnp.float32), weights.astype(jnp.float32)
     limits = jnp.finfo(weights.dtype)
