@@ -10,7 +10,9 @@ import pytest
 from nerfies_jax import scene
 from nerfies_jax.effects import scene_flow_losses as flow_losses
 from tests import scenes
-from tests.hard_cases import field_starts, hostile, tiny_fields
+from tests.hard_cases import field_starts, hostile, linear_warps, tiny_fields
+from tests.hard_cases.field_starts import Start
+from tests.hard_cases.linear_warps import DISPLACEMENTS
 
 pytestmark = pytest.mark.hard_cases
 
@@ -51,6 +53,78 @@ def test_a_field_stays_finite_from(name, start, tmp_path):
     assert np.all((picture.colour > -1e-5) & (picture.colour < 2 + 1e-5))
     assert np.all((picture.alpha > -1e-5) & (picture.alpha < 1 + 1e-5))
     assert np.all(picture.depth >= 0)
+
+
+# One size a field of these widths does not survive: products of five layers pass 3e38.
+OVERFLOWING = Start(params=field_starts.times(1e12))
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_a_field_that_overflows_stops_where_it_started_and_says_so(name, tmp_path):
+    ended, _ = trained(name, OVERFLOWING, tmp_path)
+    assert ended.result.stopped_by == "non-finite"
+    assert "step 1 is not finite: metric " in ended.result.message
+    assert ended.result.steps == 0
+    start = OVERFLOWING.params(tiny_fields.started(name).state.params)
+    for kept, given in zip(
+        jax.tree.leaves(ended.result.state.params),
+        jax.tree.leaves(start),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(kept, given)
+
+
+@pytest.mark.parametrize("unit", ["box of 1e-6 units", "box of 1e6 units"])
+@pytest.mark.parametrize("name", FIELDS)
+def test_a_step_is_the_same_in_any_unit(name, unit, tmp_path):
+    usual, _ = trained(name, Start(), tmp_path / "usual", steps=1)
+    other, _ = trained(name, STARTS[unit], tmp_path / "other", steps=1)
+    # Positions are rounded before they are scaled: by 1e-7 of the box
+    for metric, value in usual.first.items():
+        if metric not in ("step", "seconds"):
+            np.testing.assert_allclose(other.first[metric], value, rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_where_the_origin_of_the_world_is_cannot_be_seen(name):
+    run = tiny_fields.started(name)
+    capture, away = run.capture, np.float32([3.0, -2.0, 1.0])
+    cameras = capture.cameras._replace(position=capture.cameras.position + away)
+    points = capture.points._replace(position=capture.points.position + away)
+    shifted = dataclasses.replace(capture, cameras=cameras, points=points)
+    state = run.state._replace(params=field_starts.denser(2.0)(run.state.params))
+    pictures = []
+    for film in (capture, shifted):
+        place = tiny_fields.place_of(scene.facts_of(film, run.spec))
+        frames = tiny_fields.frames_of(film, run.model.wants)
+        camera = jax.tree.map(lambda leaf: leaf[1], frames.cameras)
+        pictures.append(
+            run.picture(state._replace(extra=place), camera, frames.times[1])
+        )
+    # A shift of 4 units is rounded to 2e-7, five times that in units of the field; the
+    # fine samples move with it.
+    jax.tree.map(
+        lambda one, other: np.testing.assert_allclose(one, other, atol=1e-4), *pictures
+    )
+
+
+@pytest.mark.slow  # shares the program of nerfies
+@pytest.mark.parametrize("displacement", DISPLACEMENTS)
+def test_a_step_with_the_elastic_penalty_is_finite_from(displacement, tmp_path):
+    strain = DISPLACEMENTS[displacement]
+
+    def bent(params):
+        return params | {"warp": linear_warps.linear_warp(params["warp"], strain)}
+
+    ended, picture = trained("nerfies", Start(params=bent), tmp_path, steps=50)
+    assert ended.result.stopped_by == "steps", ended.result.message
+    assert not hostile.not_finite(picture)
+    # Every ray ends somewhere, for behind it is an interval of 1e10.
+    expected = linear_warps.cost(tiny_fields.tiny("nerfies").elastic, strain)
+    measured = ended.first["elastic/elastic"]
+    np.testing.assert_allclose(measured, expected, rtol=1e-4, atol=1e-12)
+    folded = np.linalg.det(np.eye(3) + strain) < 0
+    np.testing.assert_allclose(ended.first["elastic/folded"], float(folded), atol=1e-6)
 
 
 # --- what the field knows of a hostile capture ---------------------------------------

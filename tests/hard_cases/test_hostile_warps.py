@@ -1,0 +1,93 @@
+"""The elastic penalty's slopes, from warps whose Jacobian is known.
+
+A step differentiates the Jacobian of the warp once more. Whole steps of this kind are
+in test_hostile_fields.py, beside the field that they share.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from nerfies_jax.effects import elastic, warp
+from nerfies_jax.effects.effect import Moment
+from tests.hard_cases import hostile, linear_warps, tiny_fields
+from tests.hard_cases.linear_warps import CORNERS, DISPLACEMENTS
+
+pytestmark = pytest.mark.hard_cases
+
+
+@functools.cache
+def all_warps(dtype):
+    """The parameters of all warps, and what each costs at one point."""
+    spec = tiny_fields.tiny("nerfies")
+    start = warp.init(spec.warp, jax.random.key(0), dtype)
+    many = [linear_warps.linear_warp(start, one) for one in DISPLACEMENTS.values()]
+    many = jax.tree.map(lambda *leaves: jnp.stack(leaves), *many)
+    moment = Moment(
+        jnp.asarray(0.5, dtype),
+        {spec.warp.table: jnp.zeros(spec.warp.code_width, dtype)},
+        jnp.int32(0),
+    )
+    point = jnp.asarray([0.25, -0.5, 0.125], dtype)
+
+    def total(params):
+        jacobian = jax.jacfwd(lambda x: warp.displace(spec.warp, params, x, moment))
+        return elastic.cost(spec.elastic, jacobian(point))
+
+    return many, total
+
+
+@functools.cache
+def slopes_of_costs(dtype):
+    """What every warp costs, and the slopes in its parameters."""
+    many, total = all_warps(dtype)
+    return jax.jit(jax.vmap(jax.value_and_grad(total)))(many)
+
+
+@functools.cache
+def along_one_way():
+    """For every warp a slope along a random way, and the difference of its ends."""
+    many, total = all_warps("float64")
+    _, slopes = slopes_of_costs("float64")
+    rng = np.random.default_rng(0)
+    way = jax.tree.map(lambda leaf: rng.normal(size=leaf.shape), many)
+    step = 1e-6
+    total = jax.jit(jax.vmap(total))
+    ahead = total(jax.tree.map(lambda x, w: x + step * w, many, way))
+    behind = total(jax.tree.map(lambda x, w: x - step * w, many, way))
+    products = jax.tree.map(
+        lambda slope, w: np.sum(slope * w, axis=tuple(range(1, w.ndim))), slopes, way
+    )
+    return sum(jax.tree.leaves(products)), (ahead - behind) / (2 * step)
+
+
+# In float64 the derivatives of the Jacobian take ten seconds to compile.
+@pytest.mark.parametrize(
+    "dtype",
+    ["float32", pytest.param("float64", marks=pytest.mark.slow)],
+    indirect=True,
+)
+@pytest.mark.parametrize("name", DISPLACEMENTS)
+def test_slopes_through_the_jacobian_are_finite(name, dtype):
+    values, slopes = slopes_of_costs(dtype)
+    row = list(DISPLACEMENTS).index(name)
+    exact = linear_warps.cost(tiny_fields.tiny("nerfies").elastic, DISPLACEMENTS[name])
+    tolerance = {"float32": 2e-6, "float64": 1e-12}[dtype]
+    np.testing.assert_allclose(values[row], exact, rtol=tolerance, atol=1e-18)
+    slopes = jax.tree.map(lambda leaf: leaf[row], slopes)
+    assert not hostile.not_finite(slopes)
+    steep = max(float(jnp.max(jnp.abs(leaf))) for leaf in jax.tree.leaves(slopes))
+    rigid = name in ("nothing", "a half turn")
+    assert (steep == 0) if rigid else (steep > 0), steep
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [x for x in DISPLACEMENTS if x not in CORNERS])
+def test_slopes_through_the_jacobian_are_those_of_differences(name, float64):
+    row = list(DISPLACEMENTS).index(name)
+    slope, difference = (one[row] for one in along_one_way())
+    # Where it is zero the two ends differ by 1e-13, rounding of a Jacobian of minus one
+    np.testing.assert_allclose(difference, slope, rtol=1e-4, atol=1e-7)
