@@ -159,11 +159,19 @@ def _exact_thinned(x):
     return [-mpmath.log(1 - share * -mpmath.expm1(-x[0]))]
 
 
+def _sides(edge):
+    """Below and above an edge, by its neighbours in both precisions and by 1e-6."""
+    found = [edge * (1 - 1e-6), edge, edge * (1 + 1e-6)]
+    for kind in (np.float32, np.float64):
+        found += [float(np.nextafter(kind(edge), kind(to))) for to in (-9, 9)]
+    return sorted(found)
+
+
 # A share of 3/4 of an opacity of 2/3 is one half.
 _SWITCH = np.log(3.0)
 _THINNED = np.array(
     [[d, v] for d in (1e-8, 0.1, 1, 17, 50, 1e10) for v in (-60, -1, 3, 20, 80)]
-    + [[_SWITCH * (1 + nudge), _SWITCH] for nudge in (-1e-6, 0, 1e-6)]
+    + [[d, _SWITCH] for d in _sides(_SWITCH)]
     + [[1e-30, 0.5], [0.7, 16.7]]
 )
 _THINNED = _THINNED[np.argsort(_THINNED[:, 0], kind="stable")]
