@@ -32,10 +32,19 @@ SHOWN = 4  # held-out frames in the comparison
 
 
 def make(folder: pathlib.Path, run: Run, outcome: Outcome, began: float) -> None:
-    """Write everything into the run folder and say where it is."""
+    """Write everything into the run folder and say where it is.
+
+    Raises FloatingPointError, and writes nothing, where the state draws pictures that
+    are not finite: its parameters may be finite and yet beyond use.
+    """
     state, renderer = outcome.result.state, outcome.renderer
     rows, left_out = frames_to_score(run, outcome)
     scored = evaluate.score(renderer, state, run.capture, rows)
+    if not np.isfinite(scored.colour).all():
+        raise FloatingPointError(
+            f"no report: what the state of step {outcome.result.steps:,} draws is not "
+            "finite"
+        )
     ms_per_frame = renderer.ms_per_frame(len(scored.rows))
     figures = [
         report.Figure(
@@ -245,6 +254,8 @@ def _next(folder, run, outcome):
             f"python -m experiments.render {folder} --path orbit",
         )
     ]
+    if outcome.result.stopped_by == "non-finite":
+        return commands  # resumed, it would stop at the same step
     if outcome.result.steps < run.spec.steps:
         line = f"python -m experiments.reconstruct --out {folder} --resume"
         return [*commands, report.Command("Train it to the end:", line)]

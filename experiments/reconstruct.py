@@ -55,7 +55,10 @@ class Reconstruct:
 
 
 def main(arguments=None):
-    """Run the job of the command line; exit code 2 where its input is wrong."""
+    """Run the job of the command line.
+
+    Exit code 1 where training blew up, 2 where the input is wrong.
+    """
     try:
         _main(run_settings.parse(Reconstruct, arguments))
     except KeyboardInterrupt:
@@ -93,8 +96,19 @@ def _main(asked):
         raise SystemExit(128 + (2 if outcome.result.stopped_by == "SIGINT" else 15))
     from experiments import products
 
-    products.make(folder, run, outcome, began)
-    raise SystemExit(1 if outcome.result.stopped_by == "non-finite" else 0)
+    errors = []
+    try:
+        products.make(folder, run, outcome, began)
+    except FloatingPointError as error:
+        errors.append(str(error))
+    if outcome.result.stopped_by == "non-finite":
+        errors.append(
+            f"{outcome.result.message}; start anew with lower learning rates "
+            f"(--set, their names are in {folder / run_settings.CONFIG})"
+        )
+    for line in errors:
+        print(f"error: {line}", file=sys.stderr)
+    raise SystemExit(1 if errors else 0)
 
 
 def _preset(asked):

@@ -1,0 +1,90 @@
+"""The main job where training blows up: a line that says so, and an exit code."""
+
+import json
+
+import numpy as np
+import pytest
+
+from experiments import reconstruct, runs
+from nerfies_jax.capture import nerfies_format
+from nerfies_jax.training import checkpoint
+from tests import scenes
+from tests.hard_cases import hostile
+
+pytestmark = [pytest.mark.hard_cases, pytest.mark.slow]
+
+SPLATS = ("density=none", "sh_degree=0")
+FIELD = (
+    "rays=16",
+    "sampling.coarse=4",
+    "sampling.fine=4",
+    "template.depth=1",
+    "template.width=8",
+    "template.colour_width=8",
+    "template.skips=",
+    "coarse=none",
+)
+
+
+def reconstruct_at(tmp_path, capsys, preset, *settings):
+    """Exit code, what went to stderr, and the run folder."""
+    filmed, folder = tmp_path / "filmed", tmp_path / "run"
+    nerfies_format.write(scenes.tiny_capture(), filmed)
+    arguments = [filmed, "--preset", preset, "--steps", "6", "--out", folder]
+    with pytest.raises(SystemExit) as stop:
+        reconstruct.main([*map(str, arguments), "--set", *settings])
+    return stop.value.code, capsys.readouterr(), folder
+
+
+def held(folder):
+    """The newest checkpoint is finite; returns its step."""
+    run = runs.saved_run(folder)
+    restored = runs.restore(folder, run)
+    assert not hostile.not_finite(restored.state)
+    assert restored.step == checkpoint.latest(folder / runs.CHECKPOINTS)
+    return restored.step
+
+
+def test_splats_that_blow_up_say_where_and_exit_with_one(tmp_path, capsys):
+    # One update of an opacity by 3e38 stays in float32, the second does not.
+    code, printed, folder = reconstruct_at(
+        tmp_path, capsys, "splats-static-small", "rates.opacity_logit=3e38", *SPLATS
+    )
+    assert code == 1
+    last = printed.err.splitlines()[-1]
+    assert last.startswith("error: stopped at step ")
+    assert "is not finite: params.rows.splats.opacity_logit (" in last
+    assert "start anew with lower learning rates" in last
+    assert "--resume" not in printed.out  # it would stop at the same step
+    assert (
+        held(folder) == json.loads((folder / "metrics.json").read_text())["train.steps"]
+    )
+    assert (folder / "report.html").is_file()
+
+
+def test_a_field_that_draws_no_numbers_leaves_no_report(tmp_path, capsys):
+    code, printed, folder = reconstruct_at(
+        tmp_path, capsys, "nerf-small", "rate=1e38", *FIELD
+    )
+    assert code == 1
+    *_, drawn, last = printed.err.splitlines()
+    assert drawn.startswith("error: no report: what the state of step 1 draws is not")
+    assert last.startswith("error: stopped at step 1 of 6: step 2 is not finite: ")
+    assert held(folder) == 1
+    assert not (folder / "report.html").exists()
+
+
+def test_splats_at_ten_thousand_times_the_rates_end_with_a_report(tmp_path, capsys):
+    """Steps of Adam are bounded: a scene blown apart, and every number finite."""
+    code, _, folder = reconstruct_at(
+        tmp_path,
+        capsys,
+        "splats-static-small",
+        *("rates.mean=1.6", "rates.log_scale=50", "rates.quaternion=10"),
+        *("rates.opacity_logit=500", "rates.sh_dc=25"),
+        *SPLATS,
+    )
+    assert code == 0
+    scores = json.loads((folder / "metrics.json").read_text())
+    assert np.isfinite(scores["heldout.psnr"])
+    assert held(folder) == 6
