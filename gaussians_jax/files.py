@@ -72,7 +72,8 @@ def save(path: str | os.PathLike, rows: Splats, *, spz_version: int = 3) -> int:
             f"{path}: no writer for {path.suffix or 'a name without suffix'}; "
             f"known are {', '.join(SUFFIXES)}"
         )
-    living = np.asarray(splats.alive(rows))
+    # NaN compares false, but is no mark of death: such a row is refused below.
+    living = np.asarray(splats.alive(rows)) | np.isnan(rows.opacity_logit)
     if not living.any():
         raise ValueError(
             f"{path}: none of the {len(living)} rows is alive; not written"

@@ -49,7 +49,9 @@ def save(path: str | os.PathLike, params: Params, description: dict[str, Any]) -
     at all. A value that is not finite is refused.
     """
     path = pathlib.Path(path)
-    living = np.asarray(splats.alive(params.rows["splats"]))
+    rows = params.rows["splats"]
+    # NaN compares false, but is no mark of death: such a row is refused below.
+    living = np.asarray(splats.alive(rows)) | np.isnan(rows.opacity_logit)
     if not living.any():
         raise ValueError(
             f"{path}: none of the {len(living)} rows is alive; not written"

@@ -93,14 +93,17 @@ def encode(rows: Unpacked, version: int = 3) -> bytes:
     mean = np.ascontiguousarray(steps.astype("<i4")[..., None]).view(np.uint8)[..., :3]
     quaternion = _normalise(rows.quaternion) * _TURN_SIGN
     pack = _pack_first_three if version == 2 else _pack_smallest_three
-    sh = np.rint(rows.sh_rest * _SH_SIGN[:rest, None] * 128) + 128
+    # Held before they are scaled, which float32 coefficients above 2e36 would overflow;
+    # their bytes end at 1 and at 10 / 3.
+    sh = np.rint(np.clip(rows.sh_rest, -1, 1) * _SH_SIGN[:rest, None] * 128) + 128
+    colour = np.clip(rows.sh_dc, -4, 4) * (COLOUR_SCALE * 255) + 127.5
     # The reference keeps 5 bits of degree 1 and 4 of the others; the zeros compress.
     step = np.where(np.arange(rest) < 3, 8, 16)[:, None]
     logit = rows.opacity_logit.astype(np.float64)
     parts = [
         mean,
         _byte(255 / (1 + np.exp(-np.clip(logit, -700, 700)))),
-        _byte(rows.sh_dc * (COLOUR_SCALE * 255) + 127.5),
+        _byte(colour),
         _byte((np.clip(rows.log_scale, *LOG_SCALE_RANGE) + 10) * 16),
         pack(quaternion),
         _byte((sh + step // 2) // step * step),

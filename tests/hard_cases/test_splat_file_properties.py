@@ -1,0 +1,209 @@
+"""Files give back what they hold, for any Gaussians: to the bit, or within a step."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from gaussians_jax import files, model_file, splats
+from gaussians_jax.splats import SH_DC, Params, Splats
+from tests.hard_cases import properties
+from tests.hard_cases.properties import same
+
+pytestmark = pytest.mark.hard_cases
+LARGEST = float(np.finfo(np.float32).max)
+
+
+def float32s(shape, most=LARGEST):
+    """Any float32 of at most this size, subnormal ones among them."""
+    most = float(np.float32(most))
+    return arrays.arrays(np.float32, shape, elements=st.floats(-most, most, width=32))
+
+
+@st.composite
+def rows(draw, far: float = LARGEST):
+    """Three living rows of any harmonic degree and any finite values at all."""
+    count, rest = 3, draw(st.sampled_from([0, 3, 8, 15]))
+    quaternion = draw(float32s((count, 4)))
+    logit = draw(float32s(count))
+    logit = np.where(logit > splats.DEAD_LOGIT / 2, logit, 0)
+    return Splats(
+        mean=draw(float32s((count, 3), far)),
+        log_scale=draw(float32s((count, 3))),
+        quaternion=quaternion,
+        opacity_logit=logit.astype(np.float32),
+        sh_dc=draw(float32s((count, 1, 3))),
+        sh_rest=draw(float32s((count, rest, 3))),
+    )
+
+
+def on_device(rows_):
+    return jax.tree.map(jnp.asarray, rows_)
+
+
+def bits(tree):
+    return [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(tree)]
+
+
+@given(rows_=rows())
+def test_ply_keeps_every_bit_of_any_finite_gaussian(rows_, tmp_path):
+    files.save(tmp_path / "a.ply", on_device(rows_))
+    loaded = files.load(tmp_path / "a.ply")
+    assert bits(loaded.splats) == bits(rows_)
+    assert loaded.dropped == 0
+    assert not loaded.notes
+
+
+@given(rows_=rows(), dead=st.lists(st.booleans(), min_size=3, max_size=3))
+def test_a_model_file_keeps_every_bit_of_its_living_rows(rows_, dead, tmp_path):
+    dead = np.array(dead) & np.array([True, True, False])
+    buried = splats.bury(on_device(rows_), jnp.asarray(dead))
+    params = Params({"splats": buried}, {"net": {"weight": jnp.asarray(rows_.mean)}})
+    model_file.save(tmp_path / "model.npz", params, {"step": 3})
+    loaded, about = model_file.load(tmp_path / "model.npz")
+    kept = jax.tree.map(lambda leaf: leaf[~dead], rows_)
+    assert bits(loaded.rows["splats"]) == bits(kept)
+    assert bits(loaded.nets) == bits(rows_.mean)
+    assert about == {"step": 3}
+
+
+def opacity(logit):
+    return 1 / (1 + np.exp(-np.clip(np.asarray(logit, np.float64), -700, 700)))
+
+
+def same_turn(found, expected, least):
+    """|cos| of half the angle between two arrays of quaternions is at least this."""
+    found, expected = (np.asarray(q, np.float64) for q in (found, expected))
+    length = np.linalg.norm(expected, axis=1, keepdims=True)
+    unit = np.where(
+        length > 0, expected / np.where(length > 0, length, 1), [1, 0, 0, 0]
+    )
+    found = found / np.linalg.norm(found, axis=1, keepdims=True)
+    assert np.all(np.abs(np.sum(found * unit, axis=1)) >= least)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+@given(rows_=rows(far=2047.9))
+def test_spz_is_within_half_a_step_and_then_still(version, rows_, tmp_path):
+    """For any finite values: what its bytes cannot hold is held at their ends."""
+    path = tmp_path / "a.spz"
+    files.save(path, on_device(rows_), spz_version=version)
+    first = path.read_bytes()
+    found = files.load(path).splats
+    assert all(np.all(np.isfinite(leaf)) for leaf in found)
+    step = 1.0001 / 4096 / 2
+    np.testing.assert_allclose(found.mean, rows_.mean, atol=step, rtol=1e-7)
+    np.testing.assert_allclose(
+        found.log_scale, np.clip(rows_.log_scale, -10, 255 / 16 - 10), atol=0.5001 / 16
+    )
+    np.testing.assert_allclose(
+        opacity(found.opacity_logit), opacity(rows_.opacity_logit), atol=0.751 / 255
+    )
+    # w from three bytes, and near w = 0 from the rounding of its square
+    same_turn(found.quaternion, rows_.quaternion, 1 - (5e-3 if version == 2 else 1e-5))
+    half = 127.5 / 255 / 0.15
+    np.testing.assert_allclose(
+        found.sh_dc, np.clip(rows_.sh_dc, -half, half), atol=0.5001 / 255 / 0.15
+    )
+    files.save(path, found, spz_version=version)
+    again = files.load(path).splats
+    for name in ("mean", "log_scale", "opacity_logit", "sh_dc", "sh_rest"):
+        same(getattr(again, name), getattr(found, name))
+    # The other sign is the same rotation: the same bytes. Version 2 stores x, y, z
+    # of the half with w > 0, and where w = 0 it may be either.
+    assume(version == 3 or np.all(rows_.quaternion[:, 0] != 0))
+    turned = rows_._replace(quaternion=-rows_.quaternion)
+    files.save(path, on_device(turned), spz_version=version)
+    assert path.read_bytes() == first
+
+
+@given(rows_=rows())
+def test_splat_is_within_half_a_step_and_then_still(rows_, tmp_path):
+    path = tmp_path / "a.splat"
+    files.save(path, on_device(rows_))
+    found = files.load(path).splats
+    assert all(np.all(np.isfinite(leaf)) for leaf in found)
+    assert bits(found.mean) == bits(rows_.mean)
+    low, high = splats.LOG_SCALE_RANGE
+    # the scale itself is stored, in float32
+    np.testing.assert_allclose(
+        found.log_scale, np.clip(rows_.log_scale, low, high), atol=2e-6
+    )
+    np.testing.assert_allclose(
+        opacity(found.opacity_logit), opacity(rows_.opacity_logit), atol=0.751 / 255
+    )
+    shown = np.clip(0.5 + SH_DC * rows_.sh_dc.astype(np.float64), 0, 1)
+    np.testing.assert_allclose(
+        0.5 + SH_DC * np.asarray(found.sh_dc, np.float64), shown, atol=0.5001 / 255
+    )
+    # Four bytes of 1/128; one of exactly 1 is held at 127/128.
+    same_turn(found.quaternion, rows_.quaternion, 1 - 2e-4)
+    files.save(path, found)
+    again = files.load(path).splats
+    for name in ("mean", "opacity_logit", "sh_dc"):
+        same(getattr(again, name), getattr(found, name))
+
+
+@given(
+    value=st.sampled_from([np.nan, np.inf, -np.inf]),
+    row=st.integers(0, 2),
+    field=st.sampled_from(Splats._fields[:-1]),
+    suffix=st.sampled_from(files.SUFFIXES),
+    rows_=rows(far=1.0),
+)
+def test_what_is_not_finite_is_never_written(
+    value, row, field, suffix, rows_, tmp_path
+):
+    """A NaN opacity, which is above no threshold, does not make a row a dead one."""
+    assume(field != "opacity_logit" or not value < 0)  # minus infinity does
+    broken = {name: np.array(leaf) for name, leaf in rows_._asdict().items()}
+    broken[field].reshape(3, -1)[row, -1] = value
+    broken = on_device(Splats(**broken))
+    path = tmp_path / f"a{suffix}"
+    with pytest.raises(ValueError, match="not finite"):
+        files.save(path, broken)
+    assert not path.exists()
+    with pytest.raises(ValueError, match="finite"):
+        model_file.save(tmp_path / "model.npz", Params({"splats": broken}, {}), {})
+    assert not (tmp_path / "model.npz").exists()
+
+
+@given(points=properties.many((7, 3), -3, 3), colours=properties.many((7, 3), 0, 1))
+def test_splats_from_points_are_saved_and_drawn_alike(points, colours, tmp_path):
+    made = splats.from_points(points, colours, degree=0)
+    files.save(tmp_path / "a.ply", made)
+    loaded = files.load(tmp_path / "a.ply").splats
+    same(splats.activate(loaded), splats.activate(made))
+
+
+def plain(**fields):
+    made = splats.from_points(np.eye(3), np.eye(3), degree=1)
+    return made._replace(**{k: jnp.asarray(v, jnp.float32) for k, v in fields.items()})
+
+
+@pytest.mark.parametrize("suffix", [*files.SUFFIXES, ".npz"])
+def test_a_row_of_nan_opacity_is_refused_and_not_taken_for_dead(suffix, tmp_path):
+    broken = plain(opacity_logit=[0.0, np.nan, 0.0])
+    path = tmp_path / f"a{suffix}"
+    as_model = Params({"splats": broken}, {}), {}
+    save, what = (
+        (model_file.save, as_model) if suffix == ".npz" else (files.save, [broken])
+    )
+    with pytest.raises(ValueError, match="opacity_logit"):
+        save(path, *what)
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_the_largest_harmonics_are_held_and_do_not_overflow(version, tmp_path):
+    """Above 2e36 scaling them in float32 overflowed, which warnings make an error."""
+    size = np.array([LARGEST, -LARGEST, 1.0])
+    rows_ = plain(sh_dc=np.tile(size, (3, 1, 1)), sh_rest=np.tile(size, (3, 3, 1)))
+    files.save(tmp_path / "a.spz", rows_, spz_version=version)
+    found = files.load(tmp_path / "a.spz").splats
+    ends = np.array([127.5, -127.5, 0.15 * 255]) / 255 / 0.15
+    np.testing.assert_allclose(found.sh_dc[0, 0], ends, atol=0.5001 / 255 / 0.15)
+    assert np.all(np.abs(found.sh_rest[..., :2]) >= 1 - 8 / 128)
