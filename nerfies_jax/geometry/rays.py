@@ -14,6 +14,10 @@ from jaxtyping import Array, Bool, Float
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry.camera import Camera
 
+# A component of a unit direction, below which the ray runs along the face. 1e-20 would
+# have quotients that are finite and slopes, over 1e-40, that are not in float32.
+PARALLEL = 1e-12
+
 
 class Rays(NamedTuple):
     """Rays in world coordinates; one, or a batch along leading axes."""
@@ -87,9 +91,9 @@ def box_span(
     The ray starts at its origin, so the entry is not negative; a ray that misses has an
     entry that is not below its exit. The slab test of Kay and Kajiya 1986.
     """
-    # A component of exactly 0 never crosses its two planes; a quotient by 0 would be
-    # 0/0 where the origin lies in one of them.
-    moving = direction != 0
+    # A component of 0 never crosses its two planes; a quotient by 0 would be 0/0 where
+    # the origin lies in one of them.
+    moving = jnp.abs(direction) > PARALLEL
     divisor = jnp.where(moving, direction, 1)
     first, second = (low - origin) / divisor, (high - origin) / divisor
     inside = (origin >= low) & (origin <= high)

@@ -11,10 +11,18 @@ from experiments import hard_case
 from experiments.hard_case import ORDERS, Case
 
 
-def by_case(cases: tuple[Case, ...]):
-    """The two marks of a test that runs for every case in every precision."""
+def by_case(cases: tuple[Case, ...], slow: tuple[str, ...] = ()):
+    """The marks of a test that runs for every case in every precision.
+
+    Precisions in `slow` run with the slow tests: for cases that take long to compile.
+    """
     runs = [
-        pytest.param(case, dtype, id=f"{case.name}-{dtype}")
+        pytest.param(
+            case,
+            dtype,
+            id=f"{case.name}-{dtype}",
+            marks=pytest.mark.slow if dtype in slow else (),
+        )
         for case in cases
         for dtype in case.bounds
     ]
