@@ -30,6 +30,8 @@ class Start(NamedTuple):
     frames: Callable[[Frames], Frames] = as_is
     params: Callable[[PyTree], PyTree] = as_is
     speed: float = 1.0  # times the learning rate
+    # Effects one of which must be there for the start to differ from any other.
+    needs: tuple[str, ...] = ()
 
 
 def scaled(factor: float) -> Callable[[Capture], Capture]:
@@ -174,16 +176,26 @@ def times(factor: float) -> Callable[[PyTree], PyTree]:
     return lambda params: jax.tree.map(lambda leaf: leaf * factor, params)
 
 
-OF_FRAMES = {name: Start(frames=change) for name, change in hostile.CAPTURES.items()}
+BY_CODE = ("appearance",)  # codes of motion come with them in all these papers
+FLOW = ("scene_flow",)
+NEEDS = {
+    "no depth known": FLOW,
+    "constant depth": FLOW,
+    "unfilmed depth not a number": FLOW,
+}
+OF_FRAMES = {
+    name: Start(frames=change, needs=NEEDS.get(name, ()))
+    for name, change in hostile.CAPTURES.items()
+}
 OF_FILMS = {
     "bfloat16 images": Start(frames=rounded),
     "unfilmed not a number": Start(frames=unfilmed_nan),
     "nothing filmed": Start(frames=nothing_filmed),
-    "one exposure": Start(frames=one_exposure),
-    "no flow known": Start(frames=no_flow),
-    "wild flow": Start(frames=wild_flow),
-    "points in one place": Start(frames=points_at(0.0)),
-    "points at 1e20": Start(frames=points_at(1e20)),
+    "one exposure": Start(frames=one_exposure, needs=("appearance",)),
+    "no flow known": Start(frames=no_flow, needs=FLOW),
+    "wild flow": Start(frames=wild_flow, needs=FLOW),
+    "points in one place": Start(frames=points_at(0.0), needs=("background",)),
+    "points at 1e20": Start(frames=points_at(1e20), needs=("background",)),
     "cameras inside": Start(film=inside),
     "near 1e-6 before far": Start(film=thin(1e-6)),
     "near as far as far": Start(film=thin(1e-9)),
@@ -197,10 +209,10 @@ OF_PARAMETERS = {
     "empty": Start(params=denser(-100.0)),
     # Weights of 1e-22: their squares are below float32
     "next to empty": Start(params=denser(-75.0)),
-    "folded warp": Start(params=bent(1e3)),
-    "shattered warp": Start(params=bent(1e6)),
-    "codes of 1e3": Start(params=coded(1e3)),
-    "codes of 1e9": Start(params=coded(1e9)),
+    "folded warp": Start(params=bent(1e3), needs=("warp",)),
+    "shattered warp": Start(params=bent(1e6), needs=("warp",)),
+    "codes of 1e3": Start(params=coded(1e3), needs=BY_CODE),
+    "codes of 1e9": Start(params=coded(1e9), needs=BY_CODE),
     "all zero": Start(params=times(0.0)),
     "all a hundredfold": Start(params=times(100.0)),
     "rate tenfold": Start(speed=10.0),

@@ -7,7 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments import evaluate
 from nerfies_jax import scene
+from nerfies_jax.capture.capture import select
 from nerfies_jax.effects import scene_flow_losses as flow_losses
 from tests import scenes
 from tests.hard_cases import field_starts, hostile, linear_warps, tiny_fields
@@ -20,9 +22,21 @@ pytestmark = pytest.mark.hard_cases
 STARTS = field_starts.OF_FRAMES | field_starts.OF_FILMS | field_starts.OF_PARAMETERS
 # The default suite compiles one field, a second and an eighth of what all seven cost.
 DEFAULT = ("nerf-w",)
-FIELDS = [
-    name if name in DEFAULT else pytest.param(name, marks=pytest.mark.slow)
+
+
+def marked(name, *others):
+    """A case of the default suite, or a slow one."""
+    marks = () if name in DEFAULT else (pytest.mark.slow,)
+    return pytest.param(name, *others, marks=marks)
+
+
+FIELDS = [marked(name) for name in tiny_fields.PAPERS]
+RUNS = [
+    marked(name, start)
     for name in tiny_fields.PAPERS
+    for start, one in STARTS.items()
+    if not one.needs
+    or any(getattr(tiny_fields.tiny(name), effect) for effect in one.needs)
 ]
 
 
@@ -43,8 +57,7 @@ def trained(name, start, folder, steps=tiny_fields.STEPS):
     return ended, run.picture(ended.result.state, *view)
 
 
-@pytest.mark.parametrize("start", STARTS)
-@pytest.mark.parametrize("name", FIELDS)
+@pytest.mark.parametrize(("name", "start"), RUNS)
 def test_a_field_stays_finite_from(name, start, tmp_path):
     ended, picture = trained(name, STARTS[start], tmp_path)
     # The loop may stop with a word; none of these starts gives it a reason.
@@ -125,6 +138,42 @@ def test_a_step_with_the_elastic_penalty_is_finite_from(displacement, tmp_path):
     np.testing.assert_allclose(measured, expected, rtol=1e-4, atol=1e-12)
     folded = np.linalg.det(np.eye(3) + strain) < 0
     np.testing.assert_allclose(ended.first["elastic/folded"], float(folded), atol=1e-6)
+
+
+def bare(capture):
+    """One frame, and nothing but its picture."""
+    capture = dataclasses.replace(
+        capture, depths=None, flow=None, points=None, moving=None
+    )
+    one = select(capture, np.arange(2))
+    return dataclasses.replace(one, train=np.asarray([0]), heldout=np.asarray([1]))
+
+
+@pytest.mark.slow  # a program of its own: one frame, no depth and no flow
+def test_scene_flow_of_a_single_bare_frame_stays_finite(tmp_path):
+    spec = tiny_fields.tiny("nsff")
+    run = tiny_fields.start(spec, bare(scenes.tiny_capture()))
+    assert run.model.wants == frozenset()
+    frames = tiny_fields.frames_of(run.capture, run.model.wants)
+    ended = hostile.train(run.model, run.state, frames, tmp_path, steps=200)
+    assert ended.result.stopped_by == "steps", ended.result.message
+    assert ended.last["mse"] < ended.first["mse"]
+    for name in ("warped", "disocclusion", "cycle", "magnitude", "kinetic"):
+        assert ended.last[f"scene_flow/{name}"] == 0  # there is no neighbour
+
+
+@pytest.mark.parametrize("name", ["nerf-w", "nerfies"])
+def test_a_single_frame_has_one_code_at_all_times(name):
+    spec = dataclasses.replace(tiny_fields.tiny(name), background=None)
+    film = bare(scenes.tiny_capture())
+    made = scene.field(spec, scene.facts_of(film, spec))
+    params = made.init(jax.random.key(0))
+    for row in (0, 1):
+        found = made.codes_at(params, evaluate.view_of(film, row))
+        assert found.keys() == params["codes"].keys()
+        for table, code in found.items():
+            # Blended with itself: an ulp
+            np.testing.assert_allclose(code[None], params["codes"][table], rtol=2e-7)
 
 
 # --- what the field knows of a hostile capture ---------------------------------------
