@@ -21,8 +21,11 @@ import numpy as np
 
 from experiments import (
     hard_case,
+    hard_elastic,
     hard_encodings,
+    hard_geometry,
     hard_networks,
+    hard_quaternions,
     hard_rotations,
     hard_volume,
 )
@@ -33,7 +36,9 @@ from nerfies_jax.measure import clock
 
 # The file of each room's cases and, in tests/hard_cases, that of their tests.
 ROOMS = {
-    "rotations": (hard_rotations.CASES, "test_rotations.py"),
+    "rotations": (hard_rotations.CASES + hard_quaternions.CASES, "test_rotations.py"),
+    "elastic": (hard_elastic.CASES, "test_elastic_cases.py"),
+    "geometry": (hard_geometry.CASES, "test_geometry_cases.py"),
     "encodings": (hard_encodings.CASES, "test_encoding_cases.py"),
     "volume": (hard_volume.CASES, "test_volume_cases.py"),
     "networks": (hard_networks.CASES, "test_network_cases.py"),
