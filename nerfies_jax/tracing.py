@@ -137,10 +137,13 @@ def trace(
         coarse.weight[1:-1],
         plan.fine,
     )
-    more = _places(effects, params, ray, moment, drawn)
-    both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), places, more)
-    order = jnp.argsort(both.distance)
-    both = jax.tree.map(lambda x: x[order], both)
+    if all(effect.displace is None and effect.lift is None for effect in effects):
+        both = _places(effects, params, ray, moment, sampling.union(distance, drawn))
+    else:
+        more = _places(effects, params, ray, moment, drawn)
+        both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), places, more)
+        order = jnp.argsort(both.distance)
+        both = jax.tree.map(lambda x: x[order], both)
     return coarse, level("fine", both, True, 1)
 
 
@@ -185,6 +188,7 @@ def _composite(spec, facts, ray, places, radiance, media: dict[str, Medium]):
     end = compositing.AT_INFINITY
     if behind is not None:
         end = jnp.maximum(ray.far - distance[-1], 0)
+        behind = jnp.asarray(behind, distance.dtype)
     spacing = compositing.intervals(distance, end)
     static, others = radiance.density * spacing, []
     for medium in media.values():
@@ -193,14 +197,16 @@ def _composite(spec, facts, ray, places, radiance, media: dict[str, Medium]):
             depth = compositing.thinned(depth, medium.share)
             static = compositing.thinned(static, -medium.share)
         others.append(depth)
-    depths = jnp.stack([static, *others])
-    weights = compositing.media_weights(depths)
-    whole = compositing.composite_media(
-        depths,
-        jnp.stack([radiance.colour, *(medium.colour for medium in media.values())]),
-        distance,
-        None if behind is None else jnp.asarray(behind, distance.dtype),
-    )
+    if media:
+        depths = jnp.stack([static, *others])
+        colours = [radiance.colour, *(medium.colour for medium in media.values())]
+        weights = compositing.media_weights(depths)
+        whole = compositing.composite_media(
+            depths, jnp.stack(colours), distance, behind
+        )
+    else:
+        weights = compositing.weights(static)[None]
+        whole = compositing.composite(weights[0], radiance.colour, distance, behind)
     beta = None
     for medium, weight in zip(media.values(), weights[1:], strict=True):
         if medium.beta is not None:
