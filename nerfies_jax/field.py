@@ -9,7 +9,14 @@ from jaxtyping import Array, Float, Int, Key
 
 from nerfies_jax import spec as specs
 from nerfies_jax import tracing
-from nerfies_jax.effects.effect import MOMENT, Effect, Level, Moment, Table
+from nerfies_jax.effects.effect import (
+    MOMENT,
+    Effect,
+    Level,
+    Moment,
+    Table,
+    stream,
+)
 from nerfies_jax.facts import Facts
 from nerfies_jax.geometry import rays
 from nerfies_jax.nets import codes
@@ -115,14 +122,15 @@ def _init(spec, facts, effects, key):
     rows = {MOMENT: len(facts.times)}
     learnt = 1 + max((max(left, right) for left, right, _ in facts.exposures))
     params = {"template": nets, "codes": {}}
-    for number, table in enumerate(specs.tables_of(effects)):
+    for table in specs.tables_of(effects):
         count = rows.get(table.by, learnt)
         params["codes"][table.name] = codes.init(
-            jax.random.fold_in(keys[1], number), count, table.width
+            jax.random.fold_in(keys[1], stream(table.name)), count, table.width
         )
-    for number, effect in enumerate(effects):
+    for effect in effects:
         if effect.init is not None:
-            params[effect.name] = effect.init(jax.random.fold_in(keys[2], number))
+            own = jax.random.fold_in(keys[2], stream(effect.name))
+            params[effect.name] = effect.init(own)
     return params
 
 

@@ -12,7 +12,15 @@ from nerfies_jax import facts as scene_facts
 from nerfies_jax import tracing
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.effects import transient
-from nerfies_jax.effects.effect import Batch, Box, Context, Level, Moment, Term
+from nerfies_jax.effects.effect import (
+    Batch,
+    Box,
+    Context,
+    Level,
+    Moment,
+    Term,
+    stream,
+)
 from nerfies_jax.facts import Facts
 from nerfies_jax.field import Field, field
 from nerfies_jax.geometry import rays
@@ -158,10 +166,11 @@ def loss_terms(
         step=step,
         key=penalty_key,
     )
-    for number, effect in enumerate(made.effects):
+    for effect in made.effects:
         if effect.penalty is None:
             continue
-        own = context._replace(key=jax.random.fold_in(penalty_key, number))
+        own_key = jax.random.fold_in(penalty_key, stream(effect.name))
+        own = context._replace(key=own_key)
         found = effect.penalty(params.get(effect.name), own)
         terms.update({f"{effect.name}/{name}": term for name, term in found.items()})
     return terms

@@ -9,6 +9,7 @@ that the filmed volume fills a box around the origin. Functions of a point are w
 for one point and vmapped by the scene.
 """
 
+import zlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -144,3 +145,12 @@ class Effect(NamedTuple):
     medium: Callable[[PyTree, Sample, Moment], Medium] | None = None
     penalty: Callable[[PyTree, Context], dict[str, Term]] | None = None
     wants: frozenset[str] = frozenset()  # of "depths", "points", "flow" in `Frames`
+
+
+def stream(name: str) -> int:
+    """What to fold into a key for an effect or a table of this name.
+
+    Counted instead, what comes behind an effect would be drawn anew when it is left
+    out, and an ablation would compare two starts as well.
+    """
+    return zlib.crc32(name.encode())
