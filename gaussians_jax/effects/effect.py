@@ -77,4 +77,5 @@ class Effect(NamedTuple):
     # (carried, step) -> [rows] factor of the gradient that the density control
     # compares with its threshold; host side
     grow_score: Callable[[PyTree, int], np.ndarray] | None = None
-    wants: frozenset[str] = frozenset()  # of `Frames`, beside pictures and cameras
+    # Of `Frames`, beside pictures and cameras; who wants "depths" gets them drawn too.
+    wants: frozenset[str] = frozenset()
