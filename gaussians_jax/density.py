@@ -23,6 +23,7 @@ from gaussians_jax.splats import Params, Splats
 from nerfies_jax.geometry import quaternion
 
 PyTree = Any
+FAINT_LOGIT = -20.0  # below it an opacity is halved by its series
 KEPT, CLONED, CLONE, CHILD = 0, 1, 2, 3  # what a row is after the event
 
 
@@ -261,9 +262,13 @@ def halve_opacity(logit: Float[Array, " n"]) -> Float[Array, " n"]:
 
     Rota Bulò et al. 2024, arXiv:2404.06109, section 3.4.
     """
+    faint = logit < FAINT_LOGIT
+    # l - log 2 - e^l / 4: off by e^2l. The closed form is log 0 from -88 in float32.
+    low = jnp.where(faint, logit, FAINT_LOGIT)
+    series = low - math.log(2) - jnp.exp(low) / 4
     # log sqrt(1 - o) without forming 1 - o, which is 0 from a logit of 17 in float32.
-    half = jax.nn.log_sigmoid(-logit) / 2
-    return jnp.log(-jnp.expm1(half)) - half
+    half = jax.nn.log_sigmoid(-jnp.where(faint, 0, logit)) / 2
+    return jnp.where(faint, series, jnp.log(-jnp.expm1(half)) - half)
 
 
 def reset_opacity(

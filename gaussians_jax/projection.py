@@ -18,7 +18,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from gaussians_jax.raster_spec import RasterSpec
-from gaussians_jax.splats import Gaussians
+from gaussians_jax.splats import Gaussians, refuse_half
 from nerfies_jax.geometry.camera import Camera
 
 # gsplat's MIN_COMPENSATION, squared: the antialiased opacity factor is at least 0.005.
@@ -58,6 +58,7 @@ def project(
     is formed. The tangents x/z and y/z are clamped in J alone, to the image widened by
     `spec.tangent_margin` half images. Lens distortion is not modelled: undistort first.
     """
+    refuse_half(gaussians.mean.dtype)
 
     def one(mean, quaternion, scale, opacity):
         return _project_one(mean, quaternion, scale, opacity, camera, size, spec)

@@ -24,6 +24,7 @@ from gaussians_jax.binning import Cursor, Grid, Slab
 from gaussians_jax.blending import SHAPE_COLUMNS, Lockstep
 from gaussians_jax.projection import Footprints
 from gaussians_jax.raster_spec import RasterSpec
+from gaussians_jax.splats import refuse_half
 
 # By backend: tiles in lockstep, Gaussians a step. On the CPU a step of 32 x 8 x 64
 # evaluations hides XLA's overhead of some 0.2 us an operation and stays in cache; on a
@@ -107,6 +108,7 @@ def _in_depth_order(footprints, values, grid):
 
 
 def _layout(footprints, size, spec):
+    refuse_half(footprints.mean_px.dtype)
     if min(size) < 1:
         raise ValueError(
             f"an image needs at least one pixel, got size {size} (width, height)"

@@ -58,6 +58,19 @@ class Params(NamedTuple):
     nets: dict[str, PyTree]
 
 
+def refuse_half(dtype: Any) -> None:
+    """Raise for a type that cannot hold Gaussians: they are float32 or float64.
+
+    bfloat16 places a mean at 256 px to a whole pixel, and at usual rates Adam's steps
+    are below half an ulp of such parameters: nothing moves.
+    """
+    if jnp.finfo(dtype).bits < 32:
+        raise ValueError(
+            f"Gaussians in {jnp.dtype(dtype).name} cannot be drawn or trained; cast "
+            "them to float32"
+        )
+
+
 def activate(splats: Splats) -> Gaussians:
     """Scales by exp, opacities by the logistic function; finite for every finite row.
 
@@ -166,6 +179,7 @@ def from_points(
     distance zero and floors the result at 3e-4 whatever the unit). With two or three
     distinct points it uses those there are; where there is one, `lone_scale`.
     """
+    refuse_half(dtype)
     points = np.asarray(points, np.float64)
     colours = np.asarray(colours, np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or points.shape != colours.shape:
