@@ -48,6 +48,7 @@ def rays_of(row, rng, count):
     return origin, along, float(plan.time[row])
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("row", [0, 2, 7, 10])
 def test_cast_meets_what_numpy_meets_where_numpy_meets_it(row, dtype, rng):
     origin, along, time = rays_of(row, rng, 300)
@@ -111,6 +112,7 @@ def test_a_ray_along_a_face_or_through_nothing_gives_no_nan(dtype):
     assert np.isfinite(np.asarray(hit.material[:2])).all()
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("thing", MOVING, ids=lambda i: SPEC.things[i].name)
 def test_observe_is_numpy_s_map_and_canonical_its_inverse(thing, dtype, rng):
     body = SPEC.things[thing]
@@ -144,6 +146,7 @@ def test_observe_and_canonical_have_right_gradients(thing, float64):
         assert error < 1e-7
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("name", ["cloth", "cube", "ball"])
 def test_a_crossing_has_the_gradient_of_its_distance(name, float64):
     thing = SPEC.things[SPEC.id_of(name)]
@@ -260,6 +263,7 @@ def test_albedo_is_smooth_and_lies_between_black_and_white(float64, rng):
     assert error < 1e-5
 
 
+@pytest.mark.hard_cases
 def test_srgb_undoes_linear_and_has_a_slope_at_black(float64):
     coded = np.linspace(0, 1, 101)
     assert np.abs(texture.srgb(jnp.asarray(texture.linear(coded))) - coded).max() < 1e-7

@@ -90,6 +90,7 @@ def test_gradients_with_the_weight_held(float64):
         np.testing.assert_allclose(a, b, atol=1e-14)
 
 
+@pytest.mark.hard_cases
 def test_a_steady_drift_is_seen_by_the_first_difference_alone(dtype):
     start = jnp.zeros((5, 3), dtype)
     step = jnp.asarray([0.25, 0, 0], dtype)

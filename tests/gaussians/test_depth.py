@@ -70,6 +70,7 @@ def test_gradients(kind, float64):
     assert not np.asarray(slope)[~np.asarray(known)].any()
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("kind", ["affine", "correlation"])
 @pytest.mark.parametrize(("scale", "offset"), [(1e-3, 0.0), (1.0, 7.0), (50.0, -20.0)])
 def test_scale_and_offset_are_not_seen(kind, scale, offset, dtype):

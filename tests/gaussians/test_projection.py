@@ -92,6 +92,7 @@ def test_footprints_equal_the_textbook_with_skew_aspect_and_offset(spec, dtype, 
     np.testing.assert_allclose(found.extent_px[drawn], box[drawn], rtol=50 * tolerance)
 
 
+@pytest.mark.hard_cases
 def test_projection_gradient_equals_central_differences(float64, rng):
     gaussians = some_gaussians(rng, 6, float64)
     camera = camera_at([0.2, 0.1, -4.0], float64)
@@ -238,6 +239,7 @@ def test_edge_on_disc_keeps_the_least_compensation(dtype):
     np.testing.assert_allclose(found.opacity, [0.005], rtol=1e-6)
 
 
+@pytest.mark.hard_cases
 def test_the_jacobian_is_clamped_beside_the_image(dtype):
     """Unclamped, a ball at 89 degrees would smear over 1e5 px."""
     gaussians = one(dtype, mean=(50.0, 0.0, 0.5))

@@ -67,6 +67,7 @@ def close(found, expected, tolerance):
         np.testing.assert_allclose(a, b, rtol=0, atol=tolerance * scale)
 
 
+@pytest.mark.hard_cases
 def test_the_capacity_never_changes_picture_or_gradient(float64, rng):
     size = (43, 29)
     footprints, _ = some_footprints(rng, 150, size, float64)
@@ -81,6 +82,7 @@ def test_the_capacity_never_changes_picture_or_gradient(float64, rng):
     close(picture_and_slopes(footprints, values, size, spec), whole, 1e-12)
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("size", [(1, 1), (17, 11)])
 def test_odd_sizes_equal_the_dense_compositor(size, dtype, rng):
     footprints, conics = some_footprints(rng, 60, size, dtype)
@@ -155,6 +157,7 @@ def test_a_nan_value_shows_where_its_gaussian_is(dtype):
     assert not np.isnan(left).any()
 
 
+@pytest.mark.hard_cases
 def test_cameras_under_vmap_and_scan_equal_single_renders(float64, rng):
     size, cameras = (21, 13), 3
     footprints, _ = some_footprints(rng, 40, size, float64)
@@ -172,6 +175,7 @@ def test_cameras_under_vmap_and_scan_equal_single_renders(float64, rng):
     close(scanned(shifts), single, 1e-13)
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("count", [1, 2, 1000, 70_000])
 def test_depth_order_is_a_stable_sort(count, dtype, rng):
     """70000 rows leave 15 bits a pass, so wide ranges take three."""
@@ -188,6 +192,7 @@ def test_depth_order_is_a_stable_sort(count, dtype, rng):
         np.testing.assert_array_equal(found, expected)
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("tiles_per_side", [16, 1024], ids=["packed", "two keys"])
 def test_pairs_are_sorted_by_tile_then_depth(tiles_per_side, dtype, rng):
     """2^20 tiles and 5000 ranks need 33 bits, so they take the sort of two arrays."""
@@ -206,6 +211,7 @@ def test_pairs_are_sorted_by_tile_then_depth(tiles_per_side, dtype, rng):
     np.testing.assert_array_equal(slab.ends - slab.starts, numbers)
 
 
+@pytest.mark.hard_cases
 def test_the_ellipse_test_keeps_every_tile_that_shows_a_gaussian(float64, rng):
     """And drops most of the others: needles' boxes are mostly empty."""
     size = (96, 64)
@@ -277,6 +283,7 @@ def test_an_image_without_pixels_is_refused(dtype, rng):
         raster.rasterise(footprints, jnp.ones((2, 3), dtype), (5, 0), QUICK)
 
 
+@pytest.mark.hard_cases
 def test_more_pairs_than_an_int32_counts(dtype):
     """Totals wrap behind the slab; the slab and the one after it must not notice."""
     tiles, capacity = 1 << 14, 1 << 12

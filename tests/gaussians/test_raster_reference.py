@@ -113,6 +113,7 @@ def case(request, dtype, oracle_dir):
     return Case(oracle_dir / "splatting" / f"{request.param}.npz", dtype)
 
 
+@pytest.mark.hard_cases
 def test_picture_and_gradients_equal_the_reference(case):
     offset = jnp.zeros((case.gaussians.mean.shape[0], 2), case.dtype)
     args = (case.gaussians, case.colours, case.view, offset)

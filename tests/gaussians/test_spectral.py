@@ -58,6 +58,7 @@ def pyramid_by_matrices(image, levels):
     return high, low
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("size", SIZES)
 def test_the_pyramid_is_that_of_explicit_orthonormal_matrices(size, dtype, rng):
     image = picture(rng, *size, dtype)
@@ -100,6 +101,7 @@ def test_the_pyramid_keeps_the_energy_of_a_picture_it_need_not_extend(dtype, rng
     assert energy == pytest.approx(float(jnp.sum(image**2)), rel=4 * TINY[dtype])
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("level", [0.1, 1000.3])
 def test_a_constant_has_no_high_bands_whatever_its_size(size, level, dtype):
@@ -135,6 +137,7 @@ def test_white_noise_costs_the_same_at_every_level(rng):
     np.testing.assert_allclose(np.diff([0, *costs]), 3, rtol=0.1)
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("dc_weight", [0.0, 1.0])
 def test_the_half_spectrum_counts_like_the_whole_one(size, dc_weight, dtype, rng):
@@ -159,6 +162,7 @@ def test_amplitudes_have_the_energy_of_the_picture(size, dtype, rng):
     assert float(cost) == pytest.approx(float(jnp.mean(image**2)), rel=9 * TINY[dtype])
 
 
+@pytest.mark.hard_cases
 def test_the_fourier_loss_does_not_grow_with_the_picture(rng):
     costs = [
         float(
@@ -205,6 +209,7 @@ def test_both_losses_have_the_slopes_of_central_differences(size, float64, rng):
         assert gradients.directional_error(function, picture(rng, *size)) < 1e-7
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("level", [0.0, 1e-42, 1e-20, 0.5])
 def test_slopes_are_finite_where_amplitudes_vanish(level, dtype, rng):
     truth = picture(rng, 7, 6, dtype)
@@ -215,6 +220,7 @@ def test_slopes_are_finite_where_amplitudes_vanish(level, dtype, rng):
         assert not jnp.any(slope)
 
 
+@pytest.mark.hard_cases
 def test_slopes_are_zero_where_the_render_is_right(dtype, rng):
     truth = picture(rng, 9, 8, dtype)
     for function, spec in (
@@ -228,6 +234,7 @@ def test_slopes_are_zero_where_the_render_is_right(dtype, rng):
         assert not jnp.any(slope)
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("hole", [np.nan, np.inf, 1e30])
 def test_pixels_that_are_not_valid_teach_nothing_whatever_they_hold(hole, dtype, rng):
     render, truth = picture(rng, 9, 6, dtype), picture(rng, 9, 6, dtype)
@@ -260,6 +267,7 @@ def test_pixels_that_are_not_valid_teach_nothing_whatever_they_hold(hole, dtype,
         assert float(total(render, unseen)) == float(total(render, blackened))
 
 
+@pytest.mark.hard_cases
 def test_nothing_valid_costs_nothing(dtype, rng):
     valid = jnp.zeros((5, 4), bool)
     weight = Gates(jnp.asarray(0.1, dtype), jnp.asarray(0.1, dtype))
@@ -319,6 +327,7 @@ def test_the_slope_of_a_learned_gate_is_never_negative_and_the_closed_form(
             assert gradients.directional_error(value, gates) < 1e-6
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize(
     ("gate", "least"), [("learned", 1e-4), ("floor", 0.05)], ids=["learned", "floor"]
 )

@@ -69,6 +69,7 @@ def test_raw_values_far_out_stay_finite_with_their_slopes(raw, dtype):
     assert np.isfinite(slope)
 
 
+@pytest.mark.hard_cases
 def test_a_dead_row_has_no_opacity_and_no_way_back(dtype):
     dead = jnp.asarray(rows.DEAD_LOGIT, dtype)
     assert jax.nn.sigmoid(dead) == 0
@@ -241,6 +242,7 @@ def test_a_tripod_has_no_extent_of_its_own():
     assert rows.scene_extent(position, still=2.5) == 2.5
 
 
+@pytest.mark.hard_cases
 def test_dead_rows_change_neither_the_picture_nor_learn_anything(rng):
     splats = some_splats(rng, dtype="float32", degree=1)
     camera = jax.tree.map(

@@ -202,6 +202,7 @@ def test_masked_psnr_is_the_psnr_of_the_masked_pixels(dtype, rng):
     assert abs(value - exact) < {"float32": 1e-4, "float64": 1e-12}[dtype]
 
 
+@pytest.mark.hard_cases
 def test_masked_ssim_is_a_slow_loop_over_masked_windows(dtype, rng):
     image, truth = pair(rng, (26, 24, 3))
     mask = blob(image.shape[:2])
@@ -276,6 +277,7 @@ def test_nothing_outside_the_mask_matters(name, dtype, rng):
     assert np.all(slope[~mask] == 0)
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("name", ["masked_psnr", "masked_ssim"])
 def test_an_empty_mask_scores_nan(name, dtype, rng):
     image, truth = arrays(*pair(rng), dtype=dtype)
@@ -301,6 +303,7 @@ def test_gradients_agree_with_central_differences(name, float64, rng):
     assert gradients.directional_error(score, image, truth) < 1e-6
 
 
+@pytest.mark.hard_cases
 def test_metrics_batch_and_compile(dtype, rng):
     image, truth = arrays(*pair(rng), dtype=dtype)
     frames = jnp.stack([image, truth]), jnp.stack([truth, truth])

@@ -41,6 +41,7 @@ def reference_dssim(image, target, padding, value_range=1.0):
     return 1 - (ssim[5:-5, 5:-5] if padding == "valid" else ssim)
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("padding", ["zero", "valid"])
 def test_dssim_is_the_textbook_five_window_form(padding, rng, dtype):
     image, target = images(rng)
@@ -163,6 +164,7 @@ def test_dssim_has_second_derivatives(rng, float64):
     assert gradients.directional_error(slope, image) < 1e-6
 
 
+@pytest.mark.hard_cases
 def test_dssim_under_vmap_is_the_single_one(rng):
     stack = jnp.asarray(rng.random((3, 2, 14, 13, 3)), jnp.float32)
     mapped = jax.jit(jax.vmap(losses.dssim_map))(stack[:, 0], stack[:, 1])
@@ -315,6 +317,7 @@ def test_masked_losses_are_means_over_what_is_valid(rng, dtype):
     assert abs(losses.mse(*arrays) - (difference**2).mean()) < tolerance
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("name", LOSSES)
 def test_a_frame_without_a_valid_pixel_has_no_loss(name, dtype):
     image = jnp.full((14, 13, 3), jnp.nan, dtype)
@@ -351,6 +354,7 @@ def test_photometric_refuses_a_share_beyond_one():
         losses.photometric(jnp.ones((4, 4, 3)), jnp.ones((4, 4, 3)), dssim_weight=1.5)
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize(
     ("error", "expected"), [(1e-8, 80.0), (0.0, 100.0), (0.25, 6.0206)]
 )
