@@ -1,0 +1,396 @@
+"""Encodings, networks, spectra, losses and schedules: the laws they are used for.
+
+Bounds count roundings; `eps` times the number of terms of a sum, times their size.
+"""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from gaussians_jax import harmonics
+from gaussians_jax.effects import depth as depths
+from gaussians_jax.effects import neighbours, spectral
+from gaussians_jax.splats import Params, Splats
+from nerfies_jax.nets import encoding, kan
+from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.nets.kan import KANLayer, KANSpec
+from nerfies_jax.nets.mlp import HeadSpec
+from nerfies_jax.training import losses, schedules
+from tests.hard_cases import properties
+from tests.hard_cases.properties import cast, close, eps, norm, same
+
+pytestmark = pytest.mark.hard_cases
+BANDS = 6
+TIMES_PI = EncodingSpec(BANDS, identity=False, times_pi=True)
+encode = jax.jit(lambda x, window: encoding.encode(TIMES_PI, x, window))
+anneal = jax.jit(lambda alpha: encoding.anneal(BANDS, alpha))
+
+
+@given(
+    steps=st.lists(st.integers(-4096, 4096), min_size=3, max_size=3),
+    turns=st.integers(-8, 8),
+)
+def test_bands_are_periodic_odd_and_even_to_the_bit(steps, turns, dtype):
+    """At multiples of 2^-12, where adding whole periods does not round."""
+    x = np.array(steps) / 4096
+    inputs = cast(dtype, x, x + 2 * turns, -x)
+    window = jnp.ones(BANDS, dtype)
+    here, later, mirrored = (encode(point, window) for point in inputs)
+    same(here, later)
+    here, mirrored = (
+        np.asarray(x, np.float64).reshape(BANDS, 2, 3) for x in (here, mirrored)
+    )
+    same(mirrored, here * np.array([-1, 1])[:, None])
+    close(np.sum(here**2, axis=1), np.ones((BANDS, 3)), 8 * eps(dtype))
+    # the double angle: each band follows from the one before it
+    sine, cosine = here[:, 0], here[:, 1]
+    close(sine[1:], (2 * sine * cosine)[:-1], 8 * eps(dtype))
+    close(cosine[1:], (cosine**2 - sine**2)[:-1], 8 * eps(dtype))
+
+
+@given(alpha=properties.numbers(-1, BANDS + 1), more=properties.magnitudes(high=2))
+def test_windows_open_one_after_the_other_and_never_close(alpha, more, dtype):
+    before, after = (
+        np.asarray(anneal(cast(dtype, np.array(a)))) for a in (alpha, alpha + more)
+    )
+    assert np.all((before >= 0) & (before <= 1))
+    assert np.all(np.diff(before) <= 0)
+    assert np.all(after >= before - 4 * eps(dtype))
+    assert np.sum((before > 0) & (before < 1)) <= 1
+
+
+KAN_SPEC = KANSpec(3, (), (("a", HeadSpec(2)),), kernels=5)
+
+
+@jax.jit
+def of_kan(params, x):
+    return kan.apply(KAN_SPEC, params, x)["a"]
+
+
+def kan_weights():
+    fields = (properties.many((5, 3, 2), -1, 1), properties.many((3, 2), -1, 1))
+    return st.builds(KANLayer, *fields, properties.many(2, -1, 1))
+
+
+@given(
+    one=kan_weights(),
+    other=kan_weights(),
+    share=properties.numbers(-2, 2),
+    x=properties.many(3, -3, 3),
+)
+def test_a_kan_layer_is_linear_in_its_weights(one, other, share, x, dtype):
+    joint = jax.tree.map(lambda a, b: a + share * b, one, other)
+    values = [
+        np.asarray(of_kan(kan.KAN((), {"a": cast(dtype, w)}, None), cast(dtype, x)))
+        for w in (one, other, joint)
+    ]
+    # 3 inputs of 5 kernels and a SiLU of up to 3, weights of up to 3
+    close(values[2], values[0] + share * values[1], 16 * 4 * 9 * eps(dtype))
+
+
+held = jax.jit(lambda x: kan.hold(x, (-1.0, 1.0), 0.3))
+
+
+@given(x=properties.many(8, -5, 5), far=properties.magnitudes(1.0, 1e18))
+def test_held_inputs_keep_their_order_and_their_range(x, far, dtype):
+    x = cast(dtype, np.sort([*x, far, -far]))
+    found = np.asarray(held(x))
+    assert np.all(np.diff(found) >= -2 * eps(dtype))
+    assert np.all(np.abs(found) <= 1.3 + 2 * eps(dtype))
+    inside = np.abs(x) <= 1
+    same(found[inside], x[inside])
+    same(np.asarray(held(-x)), -found)
+
+
+split = jax.jit(lambda image: spectral.haar_pyramid(image, 3))
+join = jax.jit(spectral.haar_image, static_argnums=(1, 2))
+
+
+@pytest.mark.parametrize("shape", [(8, 12), (7, 5), (1, 6), (1, 1)])
+@given(data=st.data(), share=properties.numbers(-2, 2))
+def test_a_wavelet_pyramid_is_orthonormal_and_linear(shape, data, share, dtype):
+    one, other = (data.draw(properties.pictures(*shape, 1)) for _ in range(2))
+    one, other = cast(dtype, one, other)
+    pyramids = [split(image) for image in (one, other, one + share * other)]
+    parts = [jax.tree.leaves(cast("float64", pyramid)) for pyramid in pyramids]
+    for a, b, joint in zip(*parts, strict=True):
+        # three levels of sums of four, each level doubling what a constant adds
+        close(joint, a + share * b, 3 * 8 * 4 * eps(dtype))
+    back = join(pyramids[0], *shape)
+    close(back, one, 16 * eps(dtype))
+    whole = np.asarray(one, np.float64)
+    for bands in pyramids[0].high:  # odd sides are extended, level by level
+        odd = [(0, n % 2) for n in whole.shape[:2]]
+        whole = np.pad(whole, [*odd, (0, 0)], mode="edge")
+        low = (
+            whole[::2, ::2] + whole[::2, 1::2] + whole[1::2, ::2] + whole[1::2, 1::2]
+        ) / 2
+        high = sum(np.sum(np.asarray(band, np.float64) ** 2) for band in bands)
+        energy = np.sum(whole**2)
+        close(high + np.sum(low**2), energy, 64 * eps(dtype) * energy)
+        whole = low
+
+
+@jax.jit
+def spectra(image, truth):
+    return (
+        spectral.amplitudes(image),
+        spectral.amplitudes(jnp.roll(image, (2, 3), axis=(0, 1))),
+        spectral.fourier_loss(spectral.FourierSpec(), image, truth),
+        spectral.fourier_loss(spectral.FourierSpec(), truth, image),
+        spectral.wavelet_loss(spectral.WaveletSpec(), image, truth),
+        spectral.wavelet_loss(spectral.WaveletSpec(), truth, image),
+        spectral.fourier_loss(spectral.FourierSpec(), truth, truth),
+        spectral.wavelet_loss(spectral.WaveletSpec(), truth, truth),
+    )
+
+
+@given(image=properties.pictures(), truth=properties.pictures())
+def test_spectra_keep_energy_and_their_losses_are_symmetric(image, truth, dtype):
+    image, truth = cast(dtype, image, truth)
+    size, shifted, *both, nothing, no_wavelet = spectra(image, truth)
+    size = np.asarray(size, np.float64)
+    width = image.shape[1]
+    twice = [1 if k in (0, width / 2) else 2 for k in range(width // 2 + 1)]
+    energy = np.sum(np.asarray(image, np.float64) ** 2)
+    found = np.sum(size**2 * np.array(twice)[:, None])
+    close(found, energy, 32 * eps(dtype) * energy)  # Parseval
+    largest = math.sqrt(energy)
+    close(shifted, size, 32 * eps(dtype) * largest)
+    for here, there in (both[:2], both[2:]):
+        assert here >= 0
+        close(here, there, 32 * eps(dtype) * float(here))
+    assert nothing == 0
+    assert no_wavelet == 0
+
+
+@jax.jit
+def compared(image, truth):
+    def how(a, b):
+        return {
+            "ssim": losses.ssim(a, b),
+            "valid": losses.ssim(a, b, padding="valid"),
+            "l1": losses.l1(a, b),
+            "mse": losses.mse(a, b),
+            "photometric": losses.photometric(a, b),
+        }
+
+    return jax.vmap(how)(
+        jnp.stack([image, truth, truth, image[::-1]]),
+        jnp.stack([truth, image, truth, truth[::-1]]),
+    )
+
+
+@given(image=properties.pictures(), truth=properties.pictures())
+def test_image_losses_are_symmetric_and_zero_only_at_equality(image, truth, dtype):
+    image, truth = cast(dtype, image, truth)
+    found = compared(image, truth)
+    apart = bool(np.any(image != truth))
+    for name, (here, swapped, equal, mirrored) in found.items():
+        similarity = name in ("ssim", "valid")
+        assert equal == (1 if similarity else 0), name
+        # Local variances are differences of squares; the least divisor is C2.
+        bound = 64 * eps(dtype) * (1 + 1 / losses.CONTRAST)
+        if not similarity:
+            assert here > 0 or not apart or name == "mse", name
+            bound = 64 * eps(dtype) * (1 + 0.2 / losses.CONTRAST)
+        else:
+            assert -1 - bound <= here <= 1 + bound, name
+        close(swapped, here, bound)
+        close(mirrored, here, bound)
+
+
+ROBUST = {
+    "charbonnier": lambda s: losses.charbonnier(s, 0.1),
+    "huber": lambda s: losses.huber(s, 0.1),
+    "geman_mcclure": lambda s: losses.geman_mcclure(s, 0.1),
+}
+robust = jax.jit(lambda s: {name: f(s) for name, f in ROBUST.items()})
+
+
+@given(s=st.lists(properties.magnitudes(1e-30, 1e30), min_size=8, max_size=8))
+def test_robust_losses_rise_from_zero_and_stay_below_their_bounds(s, dtype):
+    s = cast(dtype, np.sort([0.0, *s]))
+    found = {name: np.asarray(value) for name, value in robust(s).items()}
+    for name, value in found.items():
+        assert value[0] == 0, name
+        assert np.all((value > 0) | (s == 0)), name
+        assert np.all(np.diff(value) >= -4 * eps(dtype) * value[1:]), name
+    more = 1 + 4 * eps(dtype)
+    assert np.all(found["charbonnier"] <= np.sqrt(s) * more)
+    assert np.all(found["huber"] <= s / 2 * more)
+    assert np.all(found["geman_mcclure"] <= 2 * more)
+
+
+@given(
+    start=properties.magnitudes(1e-8, 1e3).filter(bool),
+    end=properties.magnitudes(1e-8, 1e3).filter(bool),
+    steps=st.integers(1, 2**30),
+    after=st.integers(0, 2**30),
+)
+def test_schedules_are_monotone_between_their_exact_ends(
+    start, end, steps, after, dtype
+):
+    marks = np.array([0, 0.1, 0.5, 0.9, 1, 1.5])
+    at = np.minimum(marks * steps, 2**31 - 1 - after).astype(np.int64)
+    built = {
+        "log_linear": (schedules.log_linear(start, end, steps), at),
+        "ramp": (schedules.ramp(start, end, steps, after=after), at + after),
+        "cosine": (schedules.cosine(start, end, steps, after=after), at + after),
+    }
+    for name, (schedule, when) in built.items():
+        rate = np.asarray(schedule(when.astype(np.int32)), np.float64)
+        rise = np.diff(rate) * np.sign(end - start)
+        assert np.all(rise >= -16 * eps(dtype) * max(start, end)), name
+        slack = 0 if name != "log_linear" else 32 * eps(dtype)
+        close(rate[0], start, (slack + eps(dtype)) * start)
+        close(rate[-1], end, (slack + eps(dtype)) * end)
+        assert schedule(np.int32(0)) == rate[0], name
+
+
+PIXELS = 12
+
+
+@jax.jit
+def depth_losses(depth, truth, known, scale, offset):
+    affine = scale * depth + offset
+    return {
+        name: (
+            form(depth, truth, known),
+            form(affine, truth, known),
+            form(truth, truth, known),
+        )
+        for name, form in depths.FORMS.items()
+    } | {"scaled": depths.metric(scale * depth, scale * truth, known)}
+
+
+@given(
+    depth=properties.many(PIXELS, 1, 10),
+    truth=properties.many(PIXELS, 1, 10),
+    known=properties.many(PIXELS, 0, 1),
+    scale=properties.numbers(-3, 3).map(lambda e: 10**e),
+    offset=properties.numbers(0, 5),
+)
+def test_relative_depth_losses_do_not_see_scale_and_offset(
+    depth, truth, known, scale, offset, dtype
+):
+    """Unless the depths count as flat, deviating by under 1e-3 of their middle.
+
+    There, by design, they are divided by that much, and an offset raises the middle.
+    """
+    known = known < 0.7
+    offset = offset * scale
+    if known.sum() > 1:
+        spread = min(
+            np.abs(x[known] - f(x[known])).mean()
+            for x in (depth, truth)
+            for f in (np.mean, np.median)
+        )
+        lower = np.sort(depth[known])[(known.sum() - 1) // 2]
+        spread = min(spread, np.abs(depth[known] - lower).mean())
+        assume(spread > 0.1)
+    depth, truth, scale, offset = cast(
+        dtype, depth, truth, np.array(scale), np.array(offset)
+    )
+    found = depth_losses(depth, truth, jnp.asarray(known), scale, offset)
+    # depths of up to 15 over a deviation of at least 0.1; squared for the correlation
+    bound = 64 * eps(dtype) * (15 / 0.1) ** 2
+    for name in ("affine", "correlation"):
+        here, there, _ = found[name]
+        close(there, here, bound)
+    for name in depths.FORMS:
+        here, _, nothing = found[name]
+        assert here >= 0, name
+        assert nothing == 0, name
+    assert found["correlation"][0] <= 2 + bound
+    # errors of up to 9 over a mean of at least 1
+    close(found["scaled"], found["metric"][0], 32 * 10 * eps(dtype))
+
+
+def splats_at(mean, dead):
+    count = len(mean)
+    return Splats(
+        mean=jnp.asarray(mean, jnp.float32),
+        log_scale=jnp.zeros((count, 3)),
+        quaternion=jnp.ones((count, 4)),
+        opacity_logit=jnp.where(jnp.asarray(dead), -1000.0, 0.0),
+        sh_dc=jnp.zeros((count, 1, 3)),
+        sh_rest=jnp.zeros((count, 0, 3)),
+    )
+
+
+@given(
+    mean=properties.many((12, 3), -1, 1),
+    dead=properties.many(12, 0, 1),
+    motion=properties.motions(),
+    scale=st.sampled_from([1.0, 2.0**-10, 1024.0]),
+)
+def test_neighbours_do_not_see_motion_nor_unit(mean, dead, motion, scale):
+    """The graph itself may name equally distant neighbours in either order."""
+    spec = neighbours.NeighbourSpec(count=4)
+    dead = dead < 0.3
+    moved = scale * (mean @ motion.rotation.T + motion.translation)
+    here, there = (
+        neighbours.find(spec, Params({"splats": splats_at(x, dead)}, {}), 1.0)
+        for x in (mean, moved)
+    )
+    weight = np.asarray(here.weight)
+    assert np.all((weight >= 0) & (weight <= 1))
+    assert np.all(np.diff(weight, axis=1) <= 0)
+    assert np.all(weight[dead] == 0)
+    assert not np.any(dead[np.asarray(here.index)[weight > 0]])
+    # float32 means of up to 12 round to 12 eps; a weight is gamma d² of its exponent,
+    # with d = 0.03 at the median of the farthest, so 2 gamma d δ = 1.2 e2 of δ / d
+    live = mean[~dead].astype(np.float32).astype(np.float64)
+    between = np.linalg.norm(live[:, None] - live, axis=-1)
+    near = np.sort(between, axis=1)[:, 1:5]
+    unit = np.median(near[:, -1]) if len(live) > 1 else 0.0
+    assume(unit > 1e-2 and len(live) > 4)
+    close(there.weight, weight, 32 * 12 * eps("float32") / unit)
+
+
+@jax.jit
+def harmonic_powers(direction):
+    terms = jnp.stack(harmonics.basis(direction, 3))
+    opposite = jnp.stack(harmonics.basis(-direction, 3))
+    return terms, opposite
+
+
+@given(direction=properties.directions())
+def test_harmonics_of_a_degree_have_one_power_and_parity(direction, dtype):
+    """Unsöld's theorem: their squares sum to (2 l + 1) / 4 π, in every direction."""
+    terms, opposite = harmonic_powers(cast(dtype, direction))
+    terms = np.asarray(terms, np.float64)
+    for degree in range(4):
+        band = slice(degree**2, (degree + 1) ** 2)
+        power = (2 * degree + 1) / (4 * math.pi)
+        close(np.sum(terms[band] ** 2), power, 32 * eps(dtype) * power)
+        same(opposite[band], (-1) ** degree * terms[band])
+
+
+towards = jax.jit(harmonics.colour_towards)
+
+
+@given(
+    coefficients=properties.many((4, 3), -1, 1),
+    mean=properties.vectors(),
+    position=properties.vectors(),
+    motion=properties.motions(),
+)
+def test_degree_one_turns_with_the_world(coefficients, mean, position, motion, dtype):
+    """-y, z, -x are a vector's components, so its coefficients turn like a vector."""
+    assume(norm(mean - position) > 1e-2)
+    order, sign = [2, 0, 1], np.array([-1, -1, 1])[:, None]  # of x, y, z in the basis
+    vector = coefficients[1:][order] * sign
+    turned = coefficients.copy()
+    turned[1:][order] = motion.rotation @ vector * sign
+    moved = [motion.rotation @ x + motion.translation for x in (mean, position)]
+    here = towards(*cast(dtype, coefficients, mean, position))
+    there = towards(*cast(dtype, turned, *moved))
+    # positions of up to 20 units round to 20 eps of what may be 1e-2 apart
+    close(there, here, 16 * eps(dtype) * (1 + 20 / norm(mean - position)))
