@@ -1,0 +1,231 @@
+"""Static scenes written out by hand, without effects, and presets made tiny.
+
+What is here knows of no effect: neither the records of their seams nor the functions
+that go through them. Samples, networks, compositing, drawing and losses are the
+library's; how they are put together is not.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from gaussians_jax import density, harmonics, optimiser, projection, raster, splats
+from gaussians_jax import presets as splat_presets
+from gaussians_jax import rates as splat_rates
+from gaussians_jax.effects.kan_motion import KanMotionSpec
+from gaussians_jax.effects.mlp_motion import MotionSpec
+from gaussians_jax.splats import Params
+from gaussians_jax.start import StartSpec
+from nerfies_jax import presets as field_presets
+from nerfies_jax.geometry import rays
+from nerfies_jax.nets import encoding
+from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.radiance import compositing, sampling, template
+from nerfies_jax.training import losses, schedules
+from nerfies_jax.training.model import TrainState
+
+FEW = EncodingSpec(2)
+STEPS = 100
+
+
+def shrunk(part, **changes):
+    """The same settings with those of the changes that it has; None stays None."""
+    if part is None:
+        return None
+    names = {field.name for field in dataclasses.fields(part)}
+    return dataclasses.replace(part, **{k: v for k, v in changes.items() if k in names})
+
+
+def tiny_template(spec):
+    """The same kind of network, two layers of eight."""
+    direction = None if spec is None or spec.direction is None else EncodingSpec(1)
+    return shrunk(
+        spec,
+        position=EncodingSpec(3),
+        direction=direction,
+        depth=2,
+        width=8,
+        skips=(1,) if spec is not None and spec.skips else (),
+        colour_width=8,
+    )
+
+
+def tiny_field(name):
+    """A preset of `nerfies_jax` with networks of eight and 16 rays."""
+    spec = field_presets.with_steps(field_presets.PRESETS[name], STEPS)
+    net = {"depth": 2, "width": 8, "skips": (), "position": FEW, "time": FEW}
+    flow = spec.scene_flow
+    if flow is not None:
+        flow = shrunk(flow, network=tiny_template(flow.network), time=FEW)
+    return dataclasses.replace(
+        spec,
+        template=tiny_template(spec.template),
+        coarse=tiny_template(spec.coarse),
+        sampling=shrunk(spec.sampling, coarse=6, fine=6 if spec.sampling.fine else 0),
+        rays=16,
+        extent=1.0,
+        appearance=shrunk(spec.appearance, width=3),
+        transient=shrunk(spec.transient, depth=1, width=8, code_width=4),
+        time=shrunk(spec.time, encoding=FEW),
+        warp=shrunk(spec.warp, **net),
+        ambient=shrunk(spec.ambient, **net),
+        elastic=shrunk(spec.elastic, points=2),
+        background=shrunk(spec.background, points=16),
+        scene_flow=flow,
+    )
+
+
+def tiny_splats(name):
+    """A preset of `gaussians_jax` with a few hundred Gaussians and small networks."""
+    spec = splat_presets.with_steps(splat_presets.PRESETS[name], STEPS)
+    motion = spec.motion
+    if isinstance(motion, KanMotionSpec):
+        motion = shrunk(motion, embedding=4, time_code=3, hidden=(6,), kernels=3)
+    elif isinstance(motion, MotionSpec):
+        motion = shrunk(motion, position=FEW, time=FEW, depth=1, width=8, skips=())
+    else:
+        motion = shrunk(
+            motion,
+            position=FEW,
+            base_time=FEW,
+            time=FEW,
+            base_depth=1,
+            base_width=8,
+            basis_width=8,
+            depth=1,
+            width=8,
+            skips=(),
+        )
+    return dataclasses.replace(
+        spec,
+        start=StartSpec(random=100, fewest=1000),
+        sh_degree=1,
+        density=shrunk(spec.density, most=256),
+        motion=motion,
+        acceleration=shrunk(spec.acceleration, samples=16),
+        neighbours=shrunk(spec.neighbours, count=3),
+    )
+
+
+def field_loss(spec, facts, params, batch, key):
+    """Squared errors of the levels of a static NeRF: (their sum, each by name)."""
+
+    def level(name, origin, direction, far, distance):
+        one = spec.coarse if name == "coarse" and spec.coarse else spec.template
+        condition = jnp.zeros(0)
+        if one.direction is not None:
+            condition = encoding.encode(one.direction, direction, None)
+
+        def ask(at):
+            point = rays.point_at(origin, direction, at)
+            features = encoding.encode(one.position, point, None)
+            return template.apply(one, params["template"][name], features, condition)
+
+        found = jax.vmap(ask)(distance)
+        behind, end = None, compositing.AT_INFINITY
+        if facts.background is not None:
+            behind = jnp.asarray(facts.background, distance.dtype)
+            end = jnp.maximum(far - distance[-1], 0)
+        optical_depth = found.density * compositing.intervals(distance, end)
+        weights = compositing.weights(optical_depth)
+        whole = compositing.composite(weights, found.colour, distance, behind)
+        return weights, whole.colour
+
+    def ray(origin, direction, cosine, key):
+        plan = spec.sampling
+        origin = (origin - jnp.asarray(facts.centre, origin.dtype)) * facts.scale
+        span = facts.scale / cosine
+        near, far = facts.near * span, facts.far * span
+        first, second, _ = jax.random.split(key, 3)
+        distance = sampling.stratified(first, near, far, plan.coarse, plan.spacing)
+        if plan.fine == 0:
+            return (level("fine", origin, direction, far, distance)[1],)
+        name = "fine" if plan.shared else "coarse"
+        weights, coarse = level(name, origin, direction, far, distance)
+        distance = sampling.refine(second, distance, weights, plan.fine)
+        return coarse, level("fine", origin, direction, far, distance)[1]
+
+    keys = jax.random.split(jax.random.split(key)[0], len(batch.origin))
+    seen = jax.vmap(ray)(batch.origin, batch.direction, batch.cosine, keys)
+    terms = {"fine": losses.mse(seen[-1], batch.colour, batch.valid)}
+    if len(seen) > 1:
+        terms["coarse"] = losses.mse(seen[0], batch.colour, batch.valid)
+    return sum(terms.values()), terms
+
+
+def field_step(spec, facts, draw_batch):
+    """One update of a static NeRF from rays that `draw_batch` draws."""
+    adam = optax.scale_by_adam()
+    rate = schedules.log_linear(spec.rate, spec.rate_end, spec.steps)
+
+    def step(state, frames):
+        key = jax.random.fold_in(state.key, state.step)
+        batch_key, field_key = jax.random.split(key)
+        batch = draw_batch(frames, spec.rays, batch_key)
+
+        def loss(params):
+            return field_loss(spec, facts, params, batch, field_key)
+
+        (value, terms), slope = jax.value_and_grad(loss, has_aux=True)(state.params)
+        with jax.numpy_dtype_promotion("standard"):
+            direction, moments = adam.update(slope, state.optimiser)
+        speed = rate(state.step)
+        params = jax.tree.map(lambda x, d: x - speed * d, state.params, direction)
+        state = TrainState(params, moments, (), state.step + 1, state.key)
+        return state, {"loss": value, "mse": terms["fine"], **terms}
+
+    return step
+
+
+def splat_step(spec, facts, shuffled_row):
+    """One update of a static scene of Gaussians, from the frame that is its turn."""
+    update = optimiser.scale_by_row_adam().update
+    if spec.optimiser == "radam":
+        update = optimiser.scale_by_row_radam().update
+
+    def drawn(rows, offset, camera, size, degree):
+        gaussians = splats.activate(rows)
+        shown = splats.active_harmonics(rows, degree)
+        colour = harmonics.colour_towards(shown, gaussians.mean, camera.position)
+        seen = projection.project(gaussians, camera, size, spec.raster)
+        placed = seen._replace(mean_px=seen.mean_px + offset)
+        image, passing = raster.rasterise(placed, colour, size, spec.raster)
+        behind = jnp.asarray(facts.background, image.dtype)
+        return image + behind * passing[..., None], seen
+
+    def step(state, frames):
+        row = shuffled_row(state.key, state.step, len(frames.times))
+        camera = jax.tree.map(lambda leaf: leaf[row], frames.cameras)
+        truth = frames.images[row].astype(jnp.float32) / 255
+        valid = None if frames.valid is None else frames.valid[row]
+        size = frames.images.shape[2], frames.images.shape[1]
+        degree = jnp.minimum(state.step // spec.sh_every, spec.sh_degree)
+
+        def loss(params, offset):
+            image, seen = drawn(params.rows["splats"], offset, camera, size, degree)
+            value = losses.photometric(
+                image, truth, valid, dssim_weight=spec.dssim_weight
+            )
+            return value, (losses.mse(image, truth, valid), seen)
+
+        still = jnp.zeros_like(state.params.rows["splats"].mean[:, :2])
+        (value, (mse, seen)), (slope, moved) = jax.value_and_grad(
+            loss, argnums=(0, 1), has_aux=True
+        )(state.params, still)
+        direction, moments = update(slope, state.optimiser, state.params)
+        rates = splat_rates.learning_rates(
+            spec.rates, facts.extent, spec.steps, state.step
+        )
+        rates = Params({"splats": rates}, {})
+        params = splat_rates.descend(state.params, direction, rates)
+        extra = state.extra
+        if spec.density is not None:
+            radius_px = jnp.max(seen.extent_px, axis=1)
+            stats = density.observe(extra.stats, moved, seen.visible, radius_px, size)
+            extra = extra._replace(stats=stats)
+        state = TrainState(params, moments, extra, state.step + 1, state.key)
+        return state, {"loss": value, "mse": mse}
+
+    return step

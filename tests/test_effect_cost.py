@@ -1,0 +1,397 @@
+"""What is off costs nothing: no parameters, no state, no operations, no other bits.
+
+A preset from which everything was removed is the static scene of `tests.bare_scenes`,
+which knows of no effect: the compiled steps have the same flops, bytes and memory and
+give the same bits. A preset from which one effect was removed (and what cannot be
+without it) is the scene that was put together by hand from the others, while every
+function of the module of the one that is missing refuses to be called: both lower to
+the same text, and a compiler that gets the same text makes the same program.
+"""
+
+import contextlib
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experiments import evaluate
+from gaussians_jax import presets as splat_presets
+from gaussians_jax import scene as splat_scene
+from gaussians_jax.effects import (
+    acceleration,
+    depth,
+    kan_motion,
+    mlp_motion,
+    motion_basis,
+    motion_growth,
+    neighbours,
+    spectral,
+)
+from nerfies_jax import presets as field_presets
+from nerfies_jax import scene as field_scene
+from nerfies_jax import spec as field_spec
+from nerfies_jax.effects import (
+    ambient,
+    appearance,
+    background,
+    elastic,
+    scene_flow,
+    time_condition,
+    transient,
+    warp,
+)
+from nerfies_jax.measure import clock
+from tests import bare_scenes, scenes
+
+FIELD_MODULES = {
+    "appearance": appearance,
+    "transient": transient,
+    "time": time_condition,
+    "warp": warp,
+    "ambient": ambient,
+    "elastic": elastic,
+    "background": background,
+    "scene_flow": scene_flow,
+}
+SPLAT_MODULES = {
+    "acceleration": acceleration,
+    "neighbours": neighbours,
+    "motion_growth": motion_growth,
+    "spectral": spectral,
+    "depth": depth,
+}
+MOTION_MODULES = {
+    mlp_motion.MotionSpec: mlp_motion,
+    kan_motion.KanMotionSpec: kan_motion,
+    motion_basis.BasisMotionSpec: motion_basis,
+}
+# How many layers of a tiny preset read what these add to the template: one in each of
+# two networks, and there again behind the skip.
+WIDENED = {"appearance": 2, "ambient": 4}
+# What cannot be without another.
+LEANS_ON = {
+    "elastic": ("warp",),
+    "background": ("warp",),
+    "alternation": ("motion",),
+    "acceleration": ("motion",),
+    "neighbours": ("motion",),
+    "motion_growth": ("motion", "density"),
+}
+FIELD_PAPERS = ("nerf", "nerf-w", "d-nerf", "t-nerf", "nerfies", "hypernerf", "nsff")
+SPLAT_PAPERS = ("splats-static", "splats-deformable", "sonata", "moba")
+
+
+class Started:
+    """A scene on the tiny capture: its model, first state and frames."""
+
+    def __init__(self, spec, build, facts_of):
+        self.capture = scenes.tiny_capture()
+        self.spec, self.facts = spec, facts_of(self.capture)
+        self.model = build(spec, self.facts)
+        self.frames = evaluate.frames_of(self.capture, self.model.wants)
+
+    def init(self, key):
+        return self.model.init(self.capture, key)
+
+    @functools.cached_property
+    def state(self):
+        if isinstance(self.spec, field_spec.RadianceScene):
+            return jax.jit(self.init)(jax.random.key(0))
+        return self.init(jax.random.key(0))  # draws on the host
+
+    def lower(self):
+        """The step as the compiler gets it."""
+        if isinstance(self.spec, field_spec.RadianceScene):
+            state = jax.eval_shape(self.init, jax.random.key(0))
+        else:
+            state = self.state
+        return jax.jit(self.model.step).lower(state, self.frames)
+
+
+def started_field(spec):
+    return Started(
+        spec, field_scene.build, lambda capture: field_scene.facts_of(capture, spec)
+    )
+
+
+def started_splats(spec):
+    return Started(spec, splat_scene.build, splat_scene.facts_of)
+
+
+def parts_of(spec):
+    """The names of what the scene has and could be without."""
+    return [
+        field.name
+        for field in dataclasses.fields(spec)
+        if field.default is None and getattr(spec, field.name) is not None
+        if field.name != "coarse"
+    ]
+
+
+def without(spec, *names):
+    """The scene without these parts and what leans on them."""
+    gone = set(names)
+    gone |= {name for name, on in LEANS_ON.items() if gone & set(on)}
+    fields = {field.name for field in dataclasses.fields(spec)}
+    return dataclasses.replace(spec, **dict.fromkeys(gone & fields))
+
+
+def bare(spec):
+    return without(spec, *parts_of(spec))
+
+
+def same_bits(found, expected):
+    found, expected = (
+        jax.tree_util.tree_flatten_with_path(x)[0] for x in (found, expected)
+    )
+    assert [path for path, _ in found] == [path for path, _ in expected]
+    for (path, one), (_, other) in zip(found, expected, strict=True):
+        if jnp.issubdtype(one.dtype, jax.dtypes.prng_key):
+            one, other = jax.random.key_data(one), jax.random.key_data(other)
+        np.testing.assert_array_equal(one, other, err_msg=jax.tree_util.keystr(path))
+
+
+def same_program(ours, by_hand, *args):
+    """Equal cost as compiled, and bitwise equal results."""
+    ours, by_hand = jax.jit(ours), jax.jit(by_hand)
+    found, expected = clock.cost(ours, *args), clock.cost(by_hand, *args)
+    assert found._replace(compile_seconds=0) == expected._replace(compile_seconds=0)
+    assert found.flops > 0
+    same_bits(ours(*args), by_hand(*args))
+
+
+# Every kind of static field: two networks for two levels, one for both, one level, and
+# a coarse network of its own that does not see the direction.
+@pytest.mark.parametrize(
+    "name",
+    [
+        "nerf-small",
+        *(pytest.param(n, marks=pytest.mark.slow) for n in ("nerf", "d-nerf", "nsff")),
+    ],
+)
+def test_a_field_without_effects_is_the_static_one_bit_for_bit(name):
+    run = started_field(bare(bare_scenes.tiny_field(name)))
+    step = bare_scenes.field_step(run.spec, run.facts, field_scene.draw_batch)
+    same_program(run.model.step, step, run.state, run.frames)
+
+
+def test_there_is_no_other_kind_of_static_field():
+    def kind(name):
+        spec = field_presets.PRESETS[name]
+        plan, coarse = spec.sampling, spec.coarse
+        two = plan.fine > 0
+        blind = two and coarse is not None and coarse.direction is None
+        return two, plan.shared, blind, plan.spacing, plan.jitter, spec.density_noise
+
+    held = {kind(name) for name in ("nerf-small", "nerf", "d-nerf", "nsff")}
+    # SMALL_D_NERF has two networks, and NSFF's levels are one
+    assert {kind(name) for name in field_presets.PRESETS} == held
+
+
+@pytest.mark.parametrize(
+    "name", ["splats-static-small", pytest.param("sonata", marks=pytest.mark.slow)]
+)
+def test_splats_without_effects_are_the_static_ones_bit_for_bit(name):
+    run = started_splats(bare(bare_scenes.tiny_splats(name)))
+    step = bare_scenes.splat_step(run.spec, run.facts, splat_scene.shuffled_row)
+    same_program(run.model.step, step, run.state, run.frames)
+
+
+@pytest.mark.slow
+def test_splats_without_density_control_keep_no_statistics_of_it():
+    spec = dataclasses.replace(bare_scenes.tiny_splats("splats-static"), density=None)
+    run = started_splats(spec)
+    assert jax.tree.leaves(run.state.extra) == []
+    step = bare_scenes.splat_step(run.spec, run.facts, splat_scene.shuffled_row)
+    same_program(run.model.step, step, run.state, run.frames)
+
+
+def hand_made(spec, facts):
+    """The effects of a field, asked one by one from their own modules."""
+    width = spec.template.width
+    made = []
+    if spec.appearance is not None:
+        made.append(appearance.effect(spec.appearance))
+    if spec.transient is not None:
+        made.append(transient.effect(spec.transient, width))
+    if spec.time is not None:
+        made.append(time_condition.effect(spec.time))
+    if spec.warp is not None:
+        made.append(warp.effect(spec.warp))
+    if spec.ambient is not None:
+        made.append(ambient.effect(spec.ambient))
+    if spec.elastic is not None:
+        made.append(elastic.effect(spec.elastic))
+    if spec.background is not None:
+        made.append(background.effect(spec.background))
+    if spec.scene_flow is not None:
+        moments = len(facts.times)
+        made.append(scene_flow.effect(spec.scene_flow, moments, width))
+    return tuple(made)
+
+
+def hand_made_splats(spec, facts):
+    """The effects of a scene of Gaussians, asked one by one from their own modules."""
+    made, extent, frames = [], facts.extent, facts.frames
+    motion = spec.motion
+    if isinstance(motion, mlp_motion.MotionSpec):
+        made.append(mlp_motion.effect(motion, spec.steps, frames))
+    if isinstance(motion, kan_motion.KanMotionSpec):
+        made.append(kan_motion.effect(motion, spec.steps, frames))
+    if isinstance(motion, motion_basis.BasisMotionSpec):
+        made.append(motion_basis.effect(motion, spec.steps, frames))
+    if spec.acceleration is not None:
+        made.append(acceleration.effect(spec.acceleration, extent, frames))
+    if spec.neighbours is not None:
+        made.append(neighbours.effect(spec.neighbours, extent, "kan_motion"))
+    if spec.motion_growth is not None:
+        made.append(motion_growth.effect(spec.motion_growth, extent))
+    if spec.spectral is not None:
+        made.append(spectral.effect(spec.spectral, spec.steps))
+    if spec.depth is not None:
+        made.append(depth.effect(spec.depth))
+    return tuple(made)
+
+
+def absent_modules(spec):
+    """Modules whose effect is not in the scene, and that no other one builds on."""
+    if isinstance(spec, field_spec.RadianceScene):
+        return [m for name, m in FIELD_MODULES.items() if getattr(spec, name) is None]
+    gone = [m for name, m in SPLAT_MODULES.items() if getattr(spec, name) is None]
+    motion = spec.motion
+    gone += [m for kind, m in MOTION_MODULES.items() if not isinstance(motion, kind)]
+    if isinstance(motion, motion_basis.BasisMotionSpec):
+        gone.remove(mlp_motion)
+    return gone
+
+
+@contextlib.contextmanager
+def poisoned(modules):
+    """Every function of these modules raises when it is called."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in modules:
+
+            def refuse(*_, name=module.__name__, **__):
+                raise AssertionError(f"{name} is off and was called")
+
+            functions = [
+                name
+                for name, value in vars(module).items()
+                if callable(value) and not isinstance(value, type)
+                if getattr(value, "__module__", None) == module.__name__
+            ]
+            assert "effect" in functions
+            for name in functions:
+                patch.setattr(module, name, refuse)
+        yield
+
+
+def file_of(module):
+    return "/".join(module.__file__.replace("\\", "/").split("/")[-3:])
+
+
+def check_removed(run, start, owner, make):
+    """Nothing is left of what was removed, as if it had never been there."""
+    gone = absent_modules(run.spec)
+    assert gone
+    # What JAX remembers of its own functions has the place of their first call.
+    jax.clear_caches()
+    lowered = run.lower()
+    places = lowered.as_text(debug_info=True)
+    for module in gone:
+        assert file_of(module) not in places
+    with pytest.MonkeyPatch.context() as patch, poisoned(gone):
+        patch.setattr(owner, "effects_of", make)
+        upwards = start(run.spec)
+        assert upwards.lower().as_text() == lowered.as_text()
+        same_bits(run.state, upwards.state)
+
+
+# Left to the slow suite: scenes that keep an elastic penalty, whose derivatives are
+# second ones, or whose like is held already.
+SLOW = {
+    ("nerfies", "appearance"),
+    ("nerfies", "background"),
+    ("nerfies", "warp"),
+    ("hypernerf", "appearance"),
+    ("hypernerf", "warp"),
+    ("hypernerf", "background"),
+    ("sonata", "neighbours"),
+    ("sonata", "depth"),
+    ("moba", "motion"),
+    ("moba", "motion_growth"),
+    ("moba", "alternation"),
+    ("moba", "annealing"),
+}
+
+
+def removals(presets):
+    """Each part of each paper's preset; the small ones are those papers' in kind."""
+    return [
+        pytest.param(
+            name, part, marks=[pytest.mark.slow] if (name, part) in SLOW else []
+        )
+        for name, spec in presets.items()
+        if not name.endswith("-small")
+        for part in parts_of(spec)
+    ]
+
+
+@pytest.mark.parametrize(("preset", "part"), removals(field_presets.PRESETS))
+def test_a_field_without_an_effect_is_one_that_never_had_it(preset, part):
+    run = started_field(without(bare_scenes.tiny_field(preset), part))
+    check_removed(run, started_field, field_spec, hand_made)
+
+
+@pytest.mark.parametrize(("preset", "part"), removals(splat_presets.PRESETS))
+def test_splats_without_an_effect_are_some_that_never_had_it(preset, part):
+    run = started_splats(without(bare_scenes.tiny_splats(preset), part))
+    check_removed(run, started_splats, splat_scene, hand_made_splats)
+
+
+def test_small_presets_have_parts_that_papers_have():
+    for presets in (field_presets.PRESETS, splat_presets.PRESETS):
+        for name, spec in presets.items():
+            paper = presets[name.removesuffix("-small")]
+            assert set(parts_of(spec)) <= set(parts_of(paper)), name
+
+
+@pytest.mark.parametrize("preset", ["nerf-w", "hypernerf"])
+def test_what_an_effect_does_shows_in_the_places_of_the_operations(preset):
+    """Without which the tests above could not fail."""
+    run = started_field(bare_scenes.tiny_field(preset))
+    jax.clear_caches()
+    places = run.lower().as_text(debug_info=True)
+    for part in parts_of(run.spec):
+        module = FIELD_MODULES[part]
+        # An appearance code is looked up elsewhere and reads nothing itself
+        assert (file_of(module) in places) == (part != "appearance"), part
+
+
+def test_a_poisoned_effect_cannot_be_built():
+    with poisoned([warp]), pytest.raises(AssertionError, match="is off and was called"):
+        field_spec.effects_of(bare_scenes.tiny_field("d-nerf"), None)
+
+
+@pytest.mark.parametrize(
+    ("preset", "part"),
+    [
+        ("nerf-w", "appearance"),
+        ("nerfies", "elastic"),
+        pytest.param("nerfies", "appearance", marks=pytest.mark.slow),
+        pytest.param("hypernerf", "ambient", marks=pytest.mark.slow),
+    ],
+)
+def test_what_stays_starts_from_the_numbers_it_had(preset, part):
+    spec = bare_scenes.tiny_field(preset)
+    whole, rest = (
+        dict(jax.tree_util.tree_flatten_with_path(started_field(s).state.params)[0])
+        for s in (spec, without(spec, part))
+    )
+    same = {path for path in rest if rest[path].shape == whole[path].shape}
+    assert len(rest) - len(same) == WIDENED.get(part, 0)
+    for path in same:
+        np.testing.assert_array_equal(rest[path], whole[path], err_msg=str(path))
