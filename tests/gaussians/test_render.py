@@ -154,3 +154,25 @@ def test_render_gradient_equals_central_differences(float64, rng):
         return jnp.sum(picture.colour * toward) + jnp.sum(picture.depth)
 
     assert gradients.directional_error(loss, gaussians, colours) < 1e-6
+
+
+def test_a_depth_that_is_not_asked_for_changes_nothing_else(rng):
+    size = (14, 12)
+    gaussians = make_gaussians(rng, 6, jnp.float32)
+    camera = make_camera(jnp.float32, size)
+    colours, features = (
+        jnp.asarray(rng.uniform(size=(6, n)), jnp.float32) for n in (3, 2)
+    )
+
+    def draw(depth):
+        return jax.jit(
+            lambda *scene: render.render(
+                *scene, camera, size, features=features, depth=depth
+            )
+        )(gaussians, colours)
+
+    blind, seeing = draw(False), draw(True)
+    assert blind.rendering.depth is None
+    np.testing.assert_array_equal(blind.rendering.colour, seeing.rendering.colour)
+    np.testing.assert_array_equal(blind.rendering.alpha, seeing.rendering.alpha)
+    np.testing.assert_array_equal(blind.features, seeing.features)
