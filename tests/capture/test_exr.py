@@ -30,6 +30,7 @@ def test_float_channels_come_back_bit_for_bit(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["a.exr"]
 
 
+@pytest.mark.hard_cases
 def test_half_rounds_colour_but_not_depth(tmp_path):
     exr.write_exr(tmp_path / "a.exr", COLOUR, depth=DEPTH, half=True)
     found = exr.read_exr(tmp_path / "a.exr")
@@ -39,6 +40,7 @@ def test_half_rounds_colour_but_not_depth(tmp_path):
         exr.write_exr(tmp_path / "b.exr", COLOUR * 1e4, half=True)
 
 
+@pytest.mark.hard_cases
 def test_nan_and_infinity_are_zeroed_and_marked(tmp_path):
     depth = DEPTH.copy()
     depth[1, 2], depth[3, 4] = np.nan, np.inf

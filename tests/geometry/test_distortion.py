@@ -39,6 +39,7 @@ def first_branch(radial, targets):
     return np.interp(targets, bent[: end + 1], radii[: end + 1]), bent[end]
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("name", LENSES)
 def test_the_root_is_on_the_axis_branch_or_flagged(name, dtype):
     radial = np.asarray(LENSES[name], np.float64)
@@ -57,6 +58,7 @@ def test_the_root_is_on_the_axis_branch_or_flagged(name, dtype):
     assert np.max(abs(error[clear & np.asarray(converged)])) < 1e-5
 
 
+@pytest.mark.hard_cases
 def test_plain_newton_would_land_on_another_branch():
     """The failure that the flag is for: a residual of zero on no ray of light."""
     k1, target = -0.5, 0.6
@@ -71,6 +73,7 @@ def test_plain_newton_would_land_on_another_branch():
     assert not converged
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("tangential", [(1e-3, -2e-3), (0.02, 0.03)])
 @pytest.mark.parametrize("name", ["none", "phone", "pincushion"])
 def test_round_trip_with_tangential_terms(name, tangential, dtype, rng):

@@ -181,6 +181,7 @@ def test_logarithm_inverts_the_exponential_up_to_pi(angle, dtype, rng):
             assert np.all(np.isfinite(log_slope(angular)))
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("axis", np.concatenate([np.eye(3), [[0, 0.6, -0.8]]]))
 def test_logarithm_of_a_half_turn(axis, dtype):
     """No sign to choose and no digits to lose: exactly π about ± the axis."""
@@ -189,6 +190,7 @@ def test_logarithm_of_a_half_turn(axis, dtype):
     assert np.min([np.max(abs(found - s * np.pi * axis)) for s in (1, -1)]) < 1e-6
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("angle", [0, 1e-8, 1e-3, 1.0, 3.0])
 def test_screw_logarithm_inverts_the_exponential(angle, dtype):
     angular, linear = jnp.asarray(angle * AXIS, dtype), jnp.asarray(LINEAR, dtype)
@@ -198,6 +200,7 @@ def test_screw_logarithm_inverts_the_exponential(angle, dtype):
     assert np.max(abs(found[1] - linear)) < bound
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("angle", [0, 1e-6, 1e-3, 0.5, 3.0, 3.2, 6.0])
 def test_left_jacobians_are_integrals_and_inverse_to_each_other(angle, dtype):
     angular, linear = jnp.asarray(angle * AXIS, dtype), jnp.asarray(LINEAR, dtype)

@@ -63,6 +63,7 @@ def matrices(rng):
     return drawn.reshape(-1, 3, 3)
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("size", [1e-25, 1e-10, 1.0, 1e15, 1e25])
 def test_decomposition_restores_the_matrix(size, dtype, rng):
     given = jnp.asarray(size * matrices(rng), dtype)
@@ -181,6 +182,7 @@ def test_curvature_at_the_identity_is_that_of_the_strain(dtype, rng):
     np.testing.assert_allclose(small, truth, atol=2e-6)
 
 
+@pytest.mark.hard_cases
 def test_a_reflection_is_free_only_without_the_sign(dtype):
     """... and the signed energy pushes it back through the collapse."""
     mirror, flat = (jnp.asarray(np.diag([1, 1, s]), dtype) for s in (-1.0, 0.0))
@@ -220,6 +222,7 @@ def _mp_energy(displacement):
     return sum(mpmath.log(value) ** 2 for value in singular)
 
 
+@pytest.mark.hard_cases
 def test_both_forms_agree_around_the_switch(float64, rng):
     drawn = rng.normal(size=(100, 3, 3))
     drawn *= (0.1 * np.linspace(0.9, 1.1, 100) / np.linalg.norm(drawn, axis=(1, 2)))[
@@ -231,6 +234,7 @@ def test_both_forms_agree_around_the_switch(float64, rng):
     )
 
 
+@pytest.mark.hard_cases
 def test_strain_of_a_nearly_rigid_screw_survives_float32():
     """Turning by 1e-3 and straining by 1e-5, like a warp at its start."""
     strain = np.array([[1e-5, 0, 2e-5], [0, -1e-5, 0], [3e-5, 0, 1e-5]], np.float32)

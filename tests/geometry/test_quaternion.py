@@ -75,6 +75,7 @@ def test_normalising_never_makes_what_is_no_rotation(length, dtype):
         assert np.all(slope == 0)
 
 
+@pytest.mark.hard_cases
 def test_normalising_does_not_hide_nan():
     assert np.isnan(normalise(jnp.asarray([jnp.nan, 0, 0, 1]))).any()
 
@@ -112,6 +113,7 @@ def test_log_inverts_exp_below_pi_for_both_signs(angle, dtype, rng):
     assert np.max(abs(slopes - np.eye(3))) < {"float32": 1e-6, "float64": 2e-15}[dtype]
 
 
+@pytest.mark.hard_cases
 def test_the_long_way_round_is_not_taken(dtype):
     """A turn of 5 rad is one of 2π - 5 the other way."""
     unit = exp(jnp.asarray([[0, 5.0, 0]], dtype))
@@ -129,6 +131,7 @@ def test_slerp_matches_scipy(dtype, rng):
             assert error < {"float32": 1e-6, "float64": 3e-15}[dtype]
 
 
+@pytest.mark.hard_cases
 def test_slerp_between_equal_ends_has_a_gradient(dtype):
     start = quaternion.identity(jnp.dtype(dtype))
     slope = jax.jacrev(

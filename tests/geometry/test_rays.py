@@ -34,6 +34,7 @@ def test_rays_go_through_pixel_centres(dtype):
     np.testing.assert_allclose(back, np.stack([columns, rows], axis=-1), atol=2e-5)
 
 
+@pytest.mark.hard_cases
 def test_pixels_without_a_ray_are_marked(dtype):
     """The corners of a strong barrel lens; no NaN and no made-up neighbour there."""
     camera = make_camera(dtype, radial=np.asarray([-0.8, 0, 0], dtype))

@@ -60,6 +60,7 @@ def hat(angular):
     return np.cross(np.eye(3), angular)
 
 
+@pytest.mark.hard_cases
 def test_rigid_motions_are_inverted_to_rounding(dtype, rng):
     angular, linear = jnp.asarray(np.array(SCREWS), dtype).swapaxes(0, 1)
     points = rng.uniform(-1, 1, (len(SCREWS), 3))
@@ -80,6 +81,7 @@ def test_rigid_motions_are_inverted_to_rounding(dtype, rng):
     assert error < {"float32": 2e-6, "float64": 1e-14}[dtype]
 
 
+@pytest.mark.hard_cases
 def test_a_strongly_non_rigid_warp_is_inverted(dtype, rng):
     params = wave_params(rng, 0.95, dtype)
     points = rng.uniform(-1, 1, (256, 3)).astype(dtype)
@@ -104,6 +106,7 @@ def _there_and_back(displace, params, points, spec=SPEC):
     return run(params, jnp.asarray(points))
 
 
+@pytest.mark.hard_cases
 def test_a_flag_is_true_only_at_upright_roots_of_a_folding_warp(float64, rng):
     params = wave_params(rng, 4.0)
     points = rng.uniform(-1, 1, (512, 3))
@@ -126,6 +129,7 @@ def test_a_flag_is_true_only_at_upright_roots_of_a_folding_warp(float64, rng):
     assert not fit.converged.all()
 
 
+@pytest.mark.hard_cases
 def test_a_fold_has_no_unique_inverse_and_is_flagged(dtype):
     """Against the number of roots counted by sign changes on a fine grid."""
     params = (jnp.asarray(0.1, dtype), jnp.asarray(20.0, dtype))  # slope 1 ± 2
@@ -145,6 +149,7 @@ def test_a_fold_has_no_unique_inverse_and_is_flagged(dtype):
     np.testing.assert_array_equal(fit.converged[clear], (roots == 1)[clear])
 
 
+@pytest.mark.hard_cases
 def test_the_middle_of_a_fold_is_flagged_without_a_search(dtype):
     """Newton stands on the root already; it is turned over (slope -1)."""
     params = (jnp.asarray(0.1, dtype), jnp.asarray(20.0, dtype))
@@ -154,6 +159,7 @@ def test_the_middle_of_a_fold_is_flagged_without_a_search(dtype):
     assert not fit.converged
 
 
+@pytest.mark.hard_cases
 def test_outside_the_image_of_a_warp_there_is_nothing(dtype):
     """Flagged, finite, and without any derivative; the lane beside it keeps its own."""
     half = jnp.asarray(0.5, dtype)
@@ -178,6 +184,7 @@ def test_outside_the_image_of_a_warp_there_is_nothing(dtype):
     assert by_width == 0
 
 
+@pytest.mark.hard_cases
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_a_field_that_is_not_finite_is_flagged(bad, dtype):
     point = jnp.asarray([0.1, 0.2, 0.3], dtype)
@@ -210,6 +217,7 @@ def test_gradients_are_those_of_the_implicit_function(float64, rng):
     np.testing.assert_allclose(by_amplitude, exact, rtol=1e-10, atol=1e-12)
 
 
+@pytest.mark.hard_cases
 def test_float32_stays_float32_with_x64_on(float64, rng):
     params = wave_params(rng, 0.5, "float32")
     fit = _there_and_back(waves, params, np.float32([[0.1, 0.2, 0.3]]))
