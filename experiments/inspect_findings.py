@@ -1,0 +1,96 @@
+"""What an inspection found: one record for each effect, and how sure it is."""
+
+import dataclasses
+import math
+
+CERTAIN, LIKELY, CANNOT_TELL = "certain", "likely", "cannot tell"
+# How far from its threshold evidence must be, as a factor. What an effect is worth is
+# known to a factor of two at best: within a quarter of the threshold nobody knows.
+CERTAIN_FACTOR, LIKELY_FACTOR = 2.0, 1.25
+DEVIATIONS = 2.0  # standard errors that evidence is moved towards its threshold first
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding:
+    """What was seen of one effect; plain values, so that it goes into a JSON file.
+
+    `wanted` is None where the evidence cannot tell, and then decides nothing. `numbers`
+    are the measured quantities by name, unit in the name.
+    """
+
+    effect: str
+    evidence: str  # for a person: what was measured, with numbers and units
+    threshold: str
+    wanted: bool | None
+    confidence: str
+    numbers: dict[str, float] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self):
+        if (self.wanted is None) != (self.confidence == CANNOT_TELL):
+            raise ValueError(
+                f"{self.effect}: decision {self.wanted} with confidence "
+                f"{self.confidence!r}; what cannot be told decides nothing"
+            )
+
+    @property
+    def decision(self) -> str:
+        """Yes, no, or a dash."""
+        return {True: "yes", False: "no", None: "-"}[self.wanted]
+
+
+def judge(value: float, threshold: float, error: float) -> tuple[bool | None, str]:
+    """Whether a value that is not negative passes its threshold, and how surely.
+
+    `error` is its standard error. The value is first moved two errors towards the
+    threshold; if it gets there, or ends within a quarter of it, nothing is decided.
+    From a factor of two on it is certain.
+    """
+    if not (threshold > 0 and value >= 0 and error >= 0):
+        return None, CANNOT_TELL  # NaN included: something could not be measured
+    above = bool(value > threshold)
+    if above:
+        factor = (value - DEVIATIONS * error) / threshold
+    else:
+        nearer = value + DEVIATIONS * error
+        factor = threshold / nearer if nearer > 0 else math.inf
+    if factor < LIKELY_FACTOR:
+        return None, CANNOT_TELL
+    return above, CERTAIN if factor >= CERTAIN_FACTOR else LIKELY
+
+
+def cannot_tell(effect: str, reason: str, threshold: str = "") -> Finding:
+    """A finding that decides nothing, and why."""
+    return Finding(effect, reason, threshold, None, CANNOT_TELL)
+
+
+def table(findings: tuple[Finding, ...], width: int = 100) -> list[str]:
+    """Lines of a table for a terminal; long evidence is folded."""
+    heads = ("effect", "decision", "confidence", "evidence", "threshold")
+    rows = [
+        (one.effect, one.decision, one.confidence, one.evidence, one.threshold)
+        for one in findings
+    ]
+    narrow = [max(len(row[i]) for row in (heads, *rows)) for i in range(3)]
+    rest = max(width - sum(narrow) - 8, 40)
+    columns = [*narrow, rest * 3 // 5, rest * 2 // 5]
+    lines = []
+    for row in (heads, tuple("-" * column for column in columns), *rows):
+        cells = [_folded(cell, size) for cell, size in zip(row, columns, strict=True)]
+        for line in range(max(len(cell) for cell in cells)):
+            parts = [cell[line] if line < len(cell) else "" for cell in cells]
+            padded = (
+                part.ljust(size) for part, size in zip(parts, columns, strict=True)
+            )
+            lines.append("  ".join(padded).rstrip())
+    return lines
+
+
+def _folded(text, width):
+    lines, line = [], ""
+    for word in text.split():
+        if line and len(line) + 1 + len(word) > width:
+            lines.append(line)
+            line = word
+        else:
+            line = f"{line} {word}".strip()
+    return [*lines, line]

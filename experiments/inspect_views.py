@@ -1,0 +1,205 @@
+"""The frames of a capture as an inspection looks at them: small, in order, in NumPy."""
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import numpy as np
+import scipy.ndimage as nd
+
+from nerfies_jax.capture import capture as captures
+from nerfies_jax.capture.capture import Capture
+
+WIDEST = 256  # pixels: pictures are looked at no wider than this
+MOST = 72  # frames that are looked at, spread over the film
+PLAIN_SHARE = 0.9  # of the border's pixels: then what lies behind has one colour
+PLAIN_LEVELS = 3  # grey levels of 255: JPEG and rounding, not a picture
+FEWEST_POINTS = 300  # that say where the scene is
+OUTSIDE = 0.02  # share of points on either side taken for outliers
+# Slope in grey levels a pixel, and over what noise alone gives (a Gaussian derivative
+# of 1 px passes a fifth of it); flow over less is a guess of its regulariser.
+LEAST_GRADIENT, LEAST_OVER_NOISE, NOISE_PASSED = 0.4, 3.0, 0.2
+
+
+class Views(NamedTuple):
+    """Frames to learn from, by camera and then by time.
+
+    Pinholes in float64. Pixels are those of the small pictures, whose centres lie
+    at +0.5.
+    """
+
+    row: np.ndarray  # [frames] row of the capture
+    camera: np.ndarray  # [frames] which physical camera
+    time: np.ndarray  # [frames] in [0, 1]
+    image: np.ndarray  # [frames, height, width, 3] uint8 sRGB
+    grey: np.ndarray  # [frames, height, width] float32 in [0, 1]
+    filmed: np.ndarray  # [frames, height, width] bool: neither black border nor plain
+    textured: np.ndarray  # [frames, height, width] bool: flow can be seen there
+    intrinsics: np.ndarray  # [frames, 3, 3]: pixel ~ K @ point in camera
+    rotation: np.ndarray  # [frames, 3, 3] camera_from_world
+    position: np.ndarray  # [frames, 3] scene units
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels."""
+        return self.grey.shape[2], self.grey.shape[1]
+
+
+@dataclasses.dataclass(frozen=True)
+class Shrunk:
+    """A capture made small, and by how much."""
+
+    capture: Capture
+    factor: int  # of its own pixels for one of these
+
+
+def shrunk(capture: Capture) -> Shrunk:
+    """The capture with pictures no wider than `WIDEST`."""
+    factor = math.ceil(max(capture.size) / WIDEST)
+    return Shrunk(captures.downscale(capture, factor), factor)
+
+
+def look(capture: Capture) -> Views:
+    """The frames to learn from, at most `MOST` of them, evenly over the film."""
+    rows = capture.train
+    order = np.lexsort((rows, capture.times[rows], capture.camera_ids[rows]))
+    rows = rows[order]
+    if len(rows) > MOST:
+        # A whole stride: uneven steps would look like uneven motion.
+        rows = rows[:: math.ceil(len(rows) / MOST)]
+    image = capture.images[rows]
+    grey = np.ascontiguousarray(image.mean(-1) / 255, np.float32)
+    filmed = ~plain(capture, rows)
+    if capture.valid is not None:
+        # What is sampled at the rim of a black corner is half black.
+        filmed &= nd.binary_erosion(
+            capture.valid[rows], np.ones((1, 5, 5)), border_value=1
+        )
+    cameras = capture.cameras
+    return Views(
+        row=rows,
+        camera=capture.camera_ids[rows],
+        time=capture.times[rows].astype(np.float64),
+        image=image,
+        grey=grey,
+        filmed=filmed,
+        textured=filmed & np.stack([_textured(one) for one in grey]),
+        intrinsics=np.stack([_matrix(cameras, row) for row in rows]),
+        rotation=cameras.camera_from_world[rows].astype(np.float64),
+        position=cameras.position[rows].astype(np.float64),
+    )
+
+
+def plain(capture: Capture, rows: np.ndarray) -> np.ndarray:
+    """[rows, height, width]: where a picture shows one colour behind everything.
+
+    The known background, or the median of the border where nearly all of the border
+    has it; a plain wall that only fills part of the border counts as scene.
+    """
+    images = capture.images[rows]
+    border = np.concatenate(
+        [images[:, 0], images[:, -1], images[:, :, 0], images[:, :, -1]], axis=1
+    )
+    colour = np.median(border.reshape(-1, 3), axis=0)
+
+    def near(pixels):
+        return (np.abs(pixels - colour) <= PLAIN_LEVELS).all(-1)
+
+    if near(border).mean() < PLAIN_SHARE:
+        return np.zeros(images.shape[:3], bool)
+    behind = near(images.astype(np.float32))
+    # Only what hangs together with the border: a black spot of the object stays.
+    kept = np.zeros_like(behind)
+    for row, one in enumerate(behind):
+        seeds = np.zeros_like(one)
+        seeds[[0, -1]], seeds[:, [0, -1]] = True, True
+        kept[row] = nd.binary_propagation(seeds & one, mask=one)
+    return kept
+
+
+def sequences(views: Views) -> list[np.ndarray]:
+    """Indices of frames of one camera in order of time, each time once."""
+    found = []
+    for camera in np.unique(views.camera):
+        index = np.flatnonzero(views.camera == camera)
+        _, first = np.unique(views.time[index], return_index=True)
+        found.append(index[first])
+    return found
+
+
+def rays(views: Views, index: int) -> np.ndarray:
+    """[height, width, 3]: world directions of z-depth one through the pixel centres."""
+    width, height = views.size
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    pixel = np.stack([x, y, np.ones_like(x)], axis=-1)
+    inverse = np.linalg.inv(views.intrinsics[index])
+    return pixel @ inverse.T @ views.rotation[index]
+
+
+def project(
+    views: Views, index: int, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels [points, 2] and z-depths [points] of world points in one view."""
+    inside = (points - views.position[index]) @ views.rotation[index].T
+    depth = inside[:, 2]
+    pixel = inside @ views.intrinsics[index].T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return pixel[:, :2] / pixel[:, 2:], depth
+
+
+def in_picture(views: Views, pixel: np.ndarray, depth: np.ndarray, rim: float = 1.0):
+    """Which pixels lie in front and in the picture, `rim` pixels from its edge."""
+    bounds = np.array(views.size) - rim
+    with np.errstate(invalid="ignore"):
+        return (depth > 0) & ((pixel > rim) & (pixel < bounds)).all(-1)
+
+
+def depth_span(
+    capture: Capture, views: Views, points: np.ndarray
+) -> tuple[float, float]:
+    """The z-depths between which a scene lies: its points', or the capture's planes."""
+    if len(points) < FEWEST_POINTS:
+        return capture.near, capture.far
+    depths = []
+    for index in range(len(views.row)):
+        pixel, depth = project(views, index, points)
+        depths.append(depth[in_picture(views, pixel, depth)])
+    depths = np.concatenate(depths)
+    if not len(depths):
+        return capture.near, capture.far
+    low, high = np.quantile(depths, (OUTSIDE, 1 - OUTSIDE))
+    # What moves stands in front of what structure from motion finds.
+    return max(capture.near, 0.5 * float(low)), 1.2 * float(high)
+
+
+def _matrix(cameras, row):
+    focal = float(cameras.focal_px[row])
+    x, y = cameras.principal_point_px[row]
+    return np.array(
+        [
+            [focal, cameras.skew_px[row], x],
+            [0, focal * cameras.pixel_aspect[row], y],
+            [0, 0, 1],
+        ],
+        np.float64,
+    )
+
+
+def _textured(grey):
+    """Where the picture varies in every direction: no aperture problem.
+
+    The lesser eigenvalue of the structure tensor over 2 px, as a slope in grey levels.
+    """
+    down, across = (nd.gaussian_filter(grey, 1, order) for order in ((1, 0), (0, 1)))
+    xx, yy, xy = (
+        nd.gaussian_filter(product, 2)
+        for product in (across * across, down * down, across * down)
+    )
+    half = (xx + yy) / 2
+    least = half - np.sqrt(np.maximum(half**2 - (xx * yy - xy**2), 0))
+    # Immerkaer 1996: the Laplacian of a picture that has no curvature is noise alone.
+    mask = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]])
+    # Its lower quarter (0.3186 deviations): where there is least detail.
+    noise = np.quantile(np.abs(nd.convolve(grey, mask)), 0.25) / (6 * 0.3186)
+    bound = max(LEAST_GRADIENT / 255, LEAST_OVER_NOISE * NOISE_PASSED * noise)
+    return least > bound**2

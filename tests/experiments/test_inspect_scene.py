@@ -1,0 +1,173 @@
+"""What an inspection says of small films whose truth is known."""
+
+import functools
+import json
+
+import numpy as np
+import pytest
+
+from experiments import inspect_findings, inspect_job, inspect_scene, settings
+from experiments.inspect_findings import CANNOT_TELL, CERTAIN, LIKELY
+from nerfies_jax.capture import nerfies_format
+from tests.experiments import inspect_films
+
+
+@functools.cache
+def still():
+    return inspect_job.inspect(inspect_films.film())
+
+
+@functools.cache
+def swaying():
+    return inspect_job.inspect(inspect_films.film(card=inspect_films.swaying))
+
+
+def told(inspection, effect):
+    found = inspection.finding(effect)
+    return found.wanted, found.confidence
+
+
+def test_a_still_scene_under_a_moving_camera_does_not_move():
+    assert told(still(), "motion") == (False, CERTAIN)
+
+
+def test_a_swaying_card_moves():
+    assert told(swaying(), "motion") == (True, CERTAIN)
+
+
+def test_moving_pixels_lie_on_what_moves():
+    film = inspect_films.film(card=inspect_films.swaying)
+    red = swaying().films[0].centres
+    found = np.stack([one.moving for one in red])
+    views = swaying().views
+    width, height = inspect_films.SIZE
+    hit = np.zeros_like(found)
+    for row, one in enumerate(red):
+        eye = film.cameras.position[views.row[one.view]]
+        middle = np.array(inspect_films.swaying(views.time[one.view]))
+        edge = (middle - eye[:2]) / inspect_films.NEAR * inspect_films.FOCAL
+        half = inspect_films.CARD / inspect_films.NEAR * inspect_films.FOCAL
+        x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+        beside = np.abs(np.stack([x - width / 2 - edge[0], y - height / 2 - edge[1]]))
+        hit[row] = (beside < half + 2).all(0)  # flow is smooth over some two pixels
+    assert found.any()
+    assert (found & ~hit).sum() < 0.1 * found.sum()
+
+
+def test_speed_is_a_lower_bound_of_the_right_size():
+    numbers = swaying().finding("motion").numbers
+    times = np.linspace(0, 1, inspect_films.FRAMES)
+    place = np.array([inspect_films.swaying(time) for time in times])
+    truth = np.median(np.linalg.norm(np.diff(place, axis=0), axis=1))
+    truth_px = truth / inspect_films.NEAR * inspect_films.FOCAL
+    assert 0.3 * truth_px < numbers["speed_px"] < 1.1 * truth_px
+
+
+def test_a_static_camera_sees_motion_and_stillness():
+    def fixed(time):
+        return (0.0, 0.0, 0.0)
+
+    moving = inspect_films.film(card=inspect_films.swaying, camera=fixed)
+    assert told(inspect_job.inspect(moving), "motion") == (True, CERTAIN)
+    quiet = inspect_films.film(camera=fixed)
+    assert told(inspect_job.inspect(quiet), "motion") == (False, CERTAIN)
+
+
+def test_a_drifting_exposure_is_told_from_motion():
+    film = inspect_films.film(gain=lambda time: 2 ** (0.5 * np.sin(7 * time)) / 1.5)
+    found = inspect_job.inspect(film)
+    assert told(found, "appearance codes") == (True, CERTAIN)
+    assert told(found, "motion") == (False, CERTAIN)
+    times = np.linspace(0, 1, inspect_films.FRAMES)
+    truth = np.std(0.5 * np.sin(7 * times))
+    stops = found.finding("appearance codes").numbers["drift_stops"]
+    # The film is coded by a power of 1/2.2 and read as sRGB: some 3 % apart.
+    assert stops == pytest.approx(truth, rel=0.06)
+
+
+def test_an_even_exposure_is_seen_with_motion_and_without_points():
+    assert told(swaying(), "appearance codes") == (False, CERTAIN)
+    bare = inspect_job.inspect(inspect_films.film(points=0))
+    assert told(bare, "appearance codes") == (False, CERTAIN)
+    assert told(bare, "start from points") == (False, CERTAIN)
+    assert told(bare, "background points") == (False, CERTAIN)
+
+
+def test_points_of_the_wall_are_fit_for_both_their_uses():
+    assert told(still(), "start from points")[0]
+    assert told(still(), "background points")[0]
+
+
+def test_points_on_what_moves_are_no_background():
+    film = inspect_films.film(card=inspect_films.swaying)
+    rng = np.random.default_rng(3)
+    on_card = rng.uniform(-inspect_films.CARD, inspect_films.CARD, (1500, 3))
+    on_card[:, 2] = inspect_films.NEAR
+    film.points.position[:] = on_card
+    assert told(inspect_job.inspect(film), "background points") == (False, CERTAIN)
+
+
+@pytest.mark.parametrize(
+    "film",
+    [
+        functools.partial(inspect_films.film, frames=2),
+        functools.partial(inspect_films.film, blank=True),
+        functools.partial(
+            inspect_films.film, times=np.zeros(inspect_films.FRAMES, np.float32)
+        ),
+    ],
+    ids=["two frames", "nothing to see", "one moment"],
+)
+def test_what_cannot_be_seen_decides_nothing_and_says_why(film):
+    found = inspect_job.inspect(film()).finding("motion")
+    assert (found.wanted, found.confidence) == (None, CANNOT_TELL)
+    assert len(found.evidence) > 20
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "told"),
+    [
+        (3.0, 0.0, (True, CERTAIN)),
+        (1.5, 0.0, (True, LIKELY)),
+        (1.1, 0.0, (None, CANNOT_TELL)),
+        (0.95, 0.0, (None, CANNOT_TELL)),
+        (0.7, 0.0, (False, LIKELY)),
+        (0.0, 0.0, (False, CERTAIN)),
+        (3.0, 1.0, (None, CANNOT_TELL)),
+        (0.0, 0.3, (False, LIKELY)),
+        (float("nan"), 0.0, (None, CANNOT_TELL)),
+        (3.0, float("inf"), (None, CANNOT_TELL)),
+    ],
+)
+def test_confidence_is_the_distance_to_the_threshold(value, error, told):
+    assert inspect_findings.judge(value, 1.0, error) == told
+
+
+def test_the_command_line_prints_the_table_and_writes_both_files(
+    tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr(settings, "start_jax", lambda *_: None)
+    nerfies_format.write(inspect_films.film(), tmp_path / "film")
+    names = ("sheet.png", "found.json")
+    sheet, found = (tmp_path / name for name in names)
+    inspect_scene.main(
+        [str(tmp_path / "film"), "--picture", str(sheet), "--json", str(found)]
+    )
+    said = capsys.readouterr().out
+    assert "splats-static-small" in said
+    assert "nerf-small" in said
+    assert sheet.stat().st_size > 10_000
+    stored = json.loads(found.read_text())
+    by_name = {one["effect"]: one for one in stored["findings"]}
+    assert by_name["motion"]["wanted"] is False
+    assert {one["representation"] for one in stored["advice"]} == {"splats", "fields"}
+
+
+def test_a_capture_that_is_not_there_is_one_line_and_exit_code_two(
+    tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr(settings, "start_jax", lambda *_: None)
+    with pytest.raises(SystemExit) as stop:
+        inspect_scene.main([str(tmp_path / "none")])
+    assert stop.value.code == 2
+    assert capsys.readouterr().err.count("\n") == 1
