@@ -57,16 +57,11 @@ def _run_chunk(step, state, frames, count):
 
 
 def _all_finite(tree):
-    leaves = [
-        x
-        for x in jax.tree.leaves(tree)
-        if jnp.issubdtype(x.dtype, jnp.inexact) and x.size
-    ]
-    # The largest is NaN where one is. Of Adam's three arrays of 200 000 x 59 numbers on
-    # one core: 12 ms, and 40 ms as all(isfinite(x)); a step takes 32 ms.
-    largest = [jnp.max(jnp.abs(x)) for x in leaves]
+    leaves = [x for x in jax.tree.leaves(tree) if jnp.issubdtype(x.dtype, jnp.inexact)]
+    # Of Adam's three arrays of 200 000 x 59 numbers on one core: 40 ms, a step 32 ms.
+    # Not isfinite(max(abs(x))), for 12 ms: XLA:CPU's max passes over NaN.
     return functools.reduce(
-        jnp.logical_and, [jnp.isfinite(x) for x in largest], jnp.asarray(True)
+        jnp.logical_and, [jnp.all(jnp.isfinite(x)) for x in leaves], jnp.asarray(True)
     )
 
 

@@ -260,6 +260,15 @@ def test_the_two_looks_at_a_state_agree(kind, value):
         assert named == ["flat (1 of 1 values)", "wide (1 of 20 values)"]
 
 
+@pytest.mark.parametrize("value", [jnp.nan, jnp.inf, -jnp.inf])
+def test_one_number_is_found_wherever_it_hides(value, dtype):
+    """The largest of many is NaN where one is, whatever the order of the reduction."""
+    state = jax.random.normal(jax.random.key(0), (1000, 59), dtype)
+    finite = jax.jit(lambda row: chunk._all_finite(state.at[row, row % 59].set(value)))
+    assert jax.jit(chunk._all_finite)(state)
+    assert not any(finite(row) for row in [0, 1, 7, 8, 63, 64, 500, 991, 998, 999])
+
+
 def test_what_is_restored_after_a_blow_up_goes_on(frames, tmp_path):
     model, spoilt = poisoned("moment"), poison(frames, 9)
     with Checkpoints(tmp_path, model.spec) as checkpoints:
