@@ -37,9 +37,14 @@ def stratified(
     if spacing == "linear":
         even = near + (far - near) * share
     else:
-        # That form cancels in 1 / far - 1 / near, and the last sample would be 0.04 %
-        # short of a far of 1e4 nears, 18 % of 1e7, in float32. The ulp is taken back.
-        even = jax.lax.cummax(near / ((1 - share) + share * (near / far)))
+        # Each half from its own end. All from the near one cancels: in float32 the last
+        # sample would be 0.04 % short of a far of 1e4 nears, 18 % of 1e7.
+        gap = 1 / near - 1 / far
+        middle = 1 / near - gap / 2  # the halves may miss each other by an ulp
+        nearer = jnp.maximum(1 / near - gap * share, middle)
+        farther = jnp.minimum(1 / far + gap * (1 - share), middle)
+        even = 1 / jnp.where(share < 0.5, nearer, farther)
+        even = jnp.where(share == 1, far, even)  # 1 / (1 / far) may be an ulp short
     even = jnp.clip(even, near, far)
     if key is None:
         return even
