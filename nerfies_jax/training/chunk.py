@@ -24,12 +24,13 @@ def _run_chunk(step, state, frames, count):
 
     A `while` with a traced bound, not a `scan` of one length: one program for every
     chunk is compiled once per shape, not once per shape and length, and gives a step
-    the same bits wherever chunks begin and end. With the checks for finite values it
+    the same bits wherever chunks begin and end. With metrics and parameters checked it
     costs 1.03 times a scan for Adam over 200 000 x 59 rows and 1 us more than 10 us for
     a toy; steps compiled one by one cost 1.8 times and 15 times as much.
 
     The state is looked at as a whole, once: a second moment that overflows leaves the
-    parameters finite, and a row that never moves again.
+    parameters finite, and a row that never moves again. Of those rows it takes 40 ms,
+    of the parameters alone 6, in a chunk of half a second.
     """
     _, metrics = jax.eval_shape(step, state, frames)
     accumulate = jnp.result_type(float)
@@ -58,8 +59,7 @@ def _run_chunk(step, state, frames, count):
 
 def _all_finite(tree):
     leaves = [x for x in jax.tree.leaves(tree) if jnp.issubdtype(x.dtype, jnp.inexact)]
-    # Of Adam's three arrays of 200 000 x 59 numbers on one core: 40 ms, a step 32 ms.
-    # Not isfinite(max(abs(x))), for 12 ms: XLA:CPU's max passes over NaN.
+    # Not isfinite(max(abs(x))), in 12 ms for 40: XLA:CPU's max passes over NaN.
     return functools.reduce(
         jnp.logical_and, [jnp.all(jnp.isfinite(x)) for x in leaves], jnp.asarray(True)
     )
