@@ -153,6 +153,15 @@ def test_lpips_is_zero_for_equal_pictures_and_its_gradient_is_finite(tiny, rng):
     assert np.all(slope == 0)
 
 
+@pytest.mark.hard_cases
+def test_half_precision_pictures_are_compared_in_float32(tiny, rng):
+    half = [jnp.asarray(x, jnp.bfloat16) for x in rng.random((2, 40, 36, 3))]
+    wide = [x.astype(jnp.float32) for x in half]
+    found, expected = (perceptual.lpips(tiny, TINY, *pair) for pair in (half, wide))
+    assert found.dtype == jnp.float32
+    assert found == expected
+
+
 def test_gradients_agree_with_central_differences(tiny, float64, rng):
     params = jax.tree.map(lambda x: jnp.asarray(x, float64), tiny)
     image, truth = (jnp.asarray(x) for x in pair(rng, (17, 14)))
