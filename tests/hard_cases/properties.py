@@ -97,6 +97,11 @@ def many(shape, low: float, high: float):
     )
 
 
+def rounded(vector):
+    """No entry so small that scaling takes it out of the range of floats."""
+    return np.round(vector, 4)
+
+
 def magnitudes(low: float = 1e-30, high: float = 1.0):
     """Zero, or evenly in the logarithm."""
     spread = numbers(math.log10(low), math.log10(high)).map(lambda e: 10.0**e)

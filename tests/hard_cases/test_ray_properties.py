@@ -167,16 +167,11 @@ def test_a_pinhole_is_its_two_matrices(camera, slopes, depth, dtype):
 span = jax.jit(rays.box_span)
 
 
-def rounded(vector):
-    """No entry so small that scaling takes it out of the range of floats."""
-    return np.round(vector, 4)
-
-
 @given(
-    origin=properties.many(3, -3, 3).map(rounded),
-    direction=properties.directions().map(rounded),
-    corner=properties.many(3, -1, 0).map(rounded),
-    size=properties.many(3, 0, 2).map(rounded),
+    origin=properties.many(3, -3, 3).map(properties.rounded),
+    direction=properties.directions().map(properties.rounded),
+    corner=properties.many(3, -1, 0).map(properties.rounded),
+    size=properties.many(3, 0, 2).map(properties.rounded),
     factor=st.sampled_from([2.0**-8, 0.5, 4.0]),
 )
 def test_a_box_is_met_in_order_and_scales_with_the_world(
