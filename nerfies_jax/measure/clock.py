@@ -187,7 +187,11 @@ def cost(function: Callable, *args, **kwargs) -> Cost:
     began = time.perf_counter()
     lower = function.lower if hasattr(function, "lower") else jax.jit(function).lower
     compiled = lower(*args, **kwargs).compile()
-    seconds = time.perf_counter() - began
+    return cost_of(compiled, time.perf_counter() - began)
+
+
+def cost_of(compiled: jax.stages.Compiled, compile_seconds: float) -> Cost:
+    """What a call of a program takes that is compiled already."""
     counted = compiled.cost_analysis() or {}
     if isinstance(counted, list):  # one per computation on some backends
         counted = counted[0] if counted else {}
@@ -198,7 +202,7 @@ def cost(function: Callable, *args, **kwargs) -> Cost:
         int(memory.temp_size_in_bytes),
         int(memory.argument_size_in_bytes),
         int(memory.output_size_in_bytes),
-        seconds,
+        compile_seconds,
     )
 
 

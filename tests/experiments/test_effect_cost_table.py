@@ -1,0 +1,235 @@
+"""What effects cost: operations counted right, scenes chosen right, numbers kept."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experiments import effect_cost, matrix_flops
+from experiments import effect_cost_report as report
+from experiments.effect_cost import Arm, EffectCost, Priced, Row
+from gaussians_jax import presets as splat_presets
+from nerfies_jax import presets as field_presets
+from nerfies_jax import scene
+from nerfies_jax.effects.effect import Moment
+from nerfies_jax.measure import clock
+from nerfies_jax.tracing import Ray
+from tests import bare_scenes, scenes
+
+
+def product(x, y):
+    return x @ y
+
+
+LEFT, RIGHT = jnp.ones((3, 4)), jnp.ones((4, 5))
+
+
+def test_a_matrix_product_has_two_operations_a_multiply_add():
+    found = matrix_flops.count(product, LEFT, RIGHT)
+    assert found == matrix_flops.Counted(2 * 3 * 4 * 5, False)
+    batched = matrix_flops.count(
+        jax.vmap(product), jnp.ones((7, 3, 4)), jnp.ones((7, 4, 5))
+    )
+    assert batched.flops == 7 * found.flops
+    # A vector under vmap is a matrix; what is alike for the batch is computed once.
+    row = matrix_flops.count(jax.vmap(product, (0, None)), LEFT, RIGHT)
+    assert row.flops == found.flops
+
+
+def test_a_gradient_has_a_product_for_each_side():
+    def total(x, y):
+        return jnp.sum(product(x, y))
+
+    both = matrix_flops.count(jax.grad(total, (0, 1)), LEFT, RIGHT)
+    one = matrix_flops.count(jax.grad(total), LEFT, RIGHT)
+    # The value itself is read by nobody
+    assert (both.flops, one.flops) == (2 * 120, 120)
+
+
+def test_every_round_of_a_loop_counts_and_of_branches_the_dearest():
+    def rounds(x):
+        return jax.lax.map(lambda row: jnp.tanh(row @ RIGHT), x, batch_size=2)
+
+    assert matrix_flops.count(rounds, jnp.ones((6, 4))) == (2 * 6 * 4 * 5, False)
+
+    def either(x):
+        return jax.lax.cond(
+            x[0, 0] > 0, lambda x: x @ RIGHT, lambda x: (x @ RIGHT) @ RIGHT.T @ RIGHT, x
+        )
+
+    assert matrix_flops.count(either, LEFT) == (3 * 120, False)
+
+
+def test_a_loop_whose_rounds_nobody_knows_counts_once_and_says_so():
+    def until(x):
+        return jax.lax.while_loop(
+            lambda x: x[0, 0] < 9, lambda x: x @ jnp.ones((4, 4)), x
+        )
+
+    assert matrix_flops.count(until, LEFT) == (2 * 3 * 4 * 4, True)
+    # Without products there is nothing more to count
+    loose = matrix_flops.count(
+        lambda x: jax.lax.while_loop(lambda x: x < 9, lambda x: 2 * x, x), 1.0
+    )
+    assert loose == (0, False)
+
+
+@pytest.mark.parametrize("name", ["nerf", "nerf-small", "d-nerf", "nsff"])
+def test_the_products_of_a_static_field_are_those_of_its_networks(name):
+    preset = bare_scenes.tiny_field(name)
+    spec = effect_cost.without(preset, tuple(effect_cost.effects_in(preset)))
+    facts = scene.facts_of(scenes.tiny_capture(), spec)
+    made = scene.field(spec, facts)
+    one, zero = jnp.ones(()), jnp.zeros(())
+    ray = Ray(jnp.zeros(3), jnp.asarray([0.0, 0.0, 1.0]), 0.5 * one, one)
+    moment = Moment(zero, {}, jnp.int32(0))
+
+    def colours(params):
+        return [level.colour for level in made.trace(params, ray, moment)]
+
+    found = matrix_flops.count(colours, made.init(jax.random.key(0)))
+    plan = spec.sampling
+    expected = network_flops(spec.template, plan.coarse + plan.fine)
+    if plan.fine:
+        shared = plan.shared or spec.coarse is None
+        first = spec.template if shared else spec.coarse
+        expected += network_flops(first, plan.coarse)
+    assert found == (expected, False)
+
+
+def network_flops(one, samples):
+    """Figure 7 of Mildenhall et al. 2020, layer by layer."""
+    point = 3 * (1 + 2 * one.position.bands)
+    view = 0 if one.direction is None else 3 * (1 + 2 * one.direction.bands)
+    each, width = point * one.width, one.width
+    for layer in range(1, one.depth):
+        each += (width + point * (layer in one.skips)) * width
+    each += width * (1 + width)  # density, bottleneck
+    each += width * one.colour_width + one.colour_width * 3
+    return 2 * (samples * each + view * one.colour_width)
+
+
+def test_every_default_preset_has_effects_and_every_paper_is_there():
+    for name in effect_cost.PRESETS:
+        presets = field_presets.PRESETS | splat_presets.PRESETS
+        assert effect_cost.effects_in(presets[name]), name
+    left_out = {"nerf-small", "splats-static-small", "d-nerf-small", "t-nerf-small"}
+    small = {n for n in presets if n.endswith("-small")}
+    assert small - set(effect_cost.PRESETS) == left_out  # nothing, or the warp alone
+
+
+def test_scenes_of_a_preset_stand_behind_those_they_are_compared_with():
+    for presets in (field_presets.PRESETS, splat_presets.PRESETS):
+        for spec in presets.values():
+            if not effect_cost.effects_in(spec):
+                continue
+            arms = effect_cost.arms(spec)
+            seen = []
+            for arm in arms:
+                assert arm.base is None or arm.base in [a.name for a in arms]
+                assert arm.name not in seen
+                seen.append(arm.name)
+            by_name = {arm.name: arm.spec for arm in arms}
+            assert effect_cost.effects_in(by_name["bare"]) == []
+            assert by_name.get("all", arms[-1].spec) == spec
+
+
+def test_elastic_alone_is_priced_over_the_warp_it_needs():
+    arms = {a.name: a for a in effect_cost.arms(field_presets.PRESETS["nerfies"])}
+    alone = arms["only elastic"]
+    assert alone.base == "only warp"
+    assert effect_cost.effects_in(alone.spec) == ["warp", "elastic"]
+    assert effect_cost.effects_in(arms["without warp"].spec) == ["appearance"]
+    assert effect_cost.effects_in(arms["without elastic"].spec) == [
+        "appearance",
+        "warp",
+        "background",
+    ]
+
+
+def test_a_preset_without_effects_is_refused():
+    with pytest.raises(ValueError, match=r"no effect to be priced.*nerfies-small"):
+        effect_cost.arms(field_presets.PRESETS["nerf"])
+    for wrong in ({"presets": ()}, {"at": 1.0}, {"repeats": 0}, {"rays": 0}):
+        with pytest.raises(ValueError, match=f"--{next(iter(wrong))}"):
+            EffectCost(**wrong)
+
+
+def row(name, base, seconds, flops=2e9):
+    step = Priced(flops, 3e6, 4_000_000, 5e8, base is None, 1.5, seconds, 2 * seconds)
+    loss = step._replace(seconds=seconds / 4)
+    return Row(Arm(name, None, base, None), 1234, {"loss": loss, "step": step})
+
+
+ROWS = [
+    row("bare", None, 0.010),
+    row("only warp", "bare", 0.016),
+    row("all", "bare", 0.020),
+    row("without warp", "all", 0.012),
+]
+
+
+def test_the_table_says_what_an_effect_adds_alone_and_beside_the_others():
+    lines = report.table("nerfies-small", ROWS).splitlines()
+    assert lines[1] == "nerfies-small"
+    bare, alone, whole, beside = lines[3:]
+    assert bare.split()[:4] == ["bare", "1,234", "2000", "2000"]
+    assert bare.count("500+") == 2
+    assert alone.endswith("+6.0 ms over bare, x1.60")
+    assert whole.endswith("+10.0 ms over bare, x2.00")
+    assert beside.endswith("+8.0 ms all over without warp, x1.67")
+    assert "loop's body counts once" in report.heading()
+
+
+def test_what_became_dearer_than_its_tolerance_is_named(tmp_path):
+    asked = EffectCost(presets=("nerfies-small",))
+    report.write(tmp_path, {"nerfies-small": ROWS}, asked)
+    assert (tmp_path / "effect_cost.png").stat().st_size > 5000
+    stored = json.loads((tmp_path / "effect_cost.json").read_text())
+    assert stored["about"]["cpu"] == clock.machine()["cpu"]
+    assert "a loop's body once" in stored["about"]["counts"]
+    before = report.baseline(tmp_path / "effect_cost.json")
+    same = report.metrics_of({"nerfies-small": ROWS})
+    assert report.changes(same, before) == []
+    # A hundredth more flops, a tenth more time: only the first repeats exactly.
+    dearer = [*ROWS[:1], row("only warp", "bare", 0.0176, 2.02e9)]
+    worse = report.changes(report.metrics_of({"nerfies-small": dearer}), before)
+    assert [line.split()[1] for line in worse] == [
+        f"nerfies-small.only_warp.{name}.flops" for name in ("loss", "step")
+    ]
+    slower = [*ROWS[:1], row("only warp", "bare", 0.024)]
+    worse = report.changes(report.metrics_of({"nerfies-small": slower}), before)
+    assert {line.split()[1].split(".")[-1] for line in worse} == {"over_bare"}
+    with pytest.raises(ValueError, match=r"--check .*none.json"):
+        report.baseline(tmp_path / "none.json")
+
+
+def test_tolerances_are_those_of_the_value(tmp_path):
+    for metric in report.metrics_of({"nerfies-small": ROWS}):
+        assert metric.direction == "lower"
+        assert np.isfinite(metric.tolerance), metric
+        assert metric.holds(float(metric.value))
+        assert not metric.holds(metric.value / 2.01), metric.key
+
+
+@pytest.mark.slow
+def test_a_small_run_prices_a_transient_medium(tmp_path, capsys, monkeypatch):
+    spec = bare_scenes.tiny_field("nerf-w")
+    capture = scenes.tiny_capture()
+    arms = [a for a in effect_cost.arms(spec) if a.name in ("bare", "only transient")]
+    monkeypatch.setattr("experiments.runs.read_capture", lambda _: capture)
+    bare, transient = effect_cost.measure("nerf-w-small", arms, 0.4, 2)
+    for name in effect_cost.PROGRAMS:
+        cheap, dear = bare.programs[name], transient.programs[name]
+        assert cheap.flops < dear.flops
+        assert cheap.matrix_flops < dear.matrix_flops < dear.flops
+        assert cheap.bytes_accessed < dear.bytes_accessed
+        assert min(cheap.seconds, dear.seconds, dear.compile_seconds) > 0
+    loss, step = (bare.programs[name] for name in effect_cost.PROGRAMS)
+    assert loss.flops < step.flops
+    # A step runs every product and, for weights and inputs, two more, but the inputs'
+    # of the first layers.
+    assert 2 * loss.matrix_flops < step.matrix_flops < 3 * loss.matrix_flops
+    assert bare.parameters < transient.parameters
