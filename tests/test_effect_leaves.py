@@ -1,0 +1,147 @@
+"""Each array of a scene belongs to an effect that is there, at the presets' full sizes.
+
+The expected arrays are counted out here, effect by effect, without the machinery that
+puts scenes together; nothing is allocated or compiled for the fields.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from gaussians_jax import presets as splat_presets
+from gaussians_jax import scene as splat_scene
+from gaussians_jax.effects import kan_motion, mlp_motion, motion_basis, spectral
+from gaussians_jax.effects.kan_motion import KanMotionSpec
+from gaussians_jax.effects.mlp_motion import MotionSpec
+from nerfies_jax import field as fields
+from nerfies_jax import presets as field_presets
+from nerfies_jax.effects import ambient, scene_flow, transient, warp
+from nerfies_jax.facts import Facts
+from nerfies_jax.radiance import template
+from tests import bare_scenes, scenes
+
+MOMENTS, EXPOSURES = 5, 3
+FACTS = Facts(
+    near=1.0,
+    far=3.0,
+    centre=(0.0, 0.0, 0.0),
+    scale=1.0,
+    background=None,
+    times=tuple(t / (MOMENTS - 1) for t in range(MOMENTS)),
+    exposures=tuple((row, row, 0.0) for row in range(EXPOSURES)),
+)
+
+
+def shapes(tree):
+    """Shape and type of every array, by its path."""
+    return {
+        jax.tree_util.keystr(path): (leaf.shape, leaf.dtype)
+        for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]
+    }
+
+
+def drawn(init, *args):
+    """What an `init` would return, without drawing it."""
+    return jax.eval_shape(lambda key: init(key, *args), jax.random.key(0))
+
+
+def counted_out(spec):
+    """The parameters that a field should have."""
+    key, width = jax.random.key(0), spec.template.width
+    lifted = beside = 0
+    tables, own = {}, {}
+    if spec.appearance is not None:
+        beside += spec.appearance.width
+        tables["appearance"] = (EXPOSURES, spec.appearance.width)
+    if spec.transient is not None:
+        tables["transient"] = (EXPOSURES, spec.transient.code_width)
+        own["transient"] = transient.init(spec.transient, key, width)
+    if spec.time is not None:
+        lifted += 1 + 2 * spec.time.encoding.bands  # of the time itself
+    if spec.warp is not None:
+        own["warp"] = warp.init(spec.warp, key)
+        if spec.warp.condition == "code":
+            tables["motion"] = (MOMENTS, spec.warp.code_width)
+    if spec.ambient is not None:
+        own["ambient"] = ambient.init(spec.ambient, key)
+        tables["motion"] = (MOMENTS, spec.ambient.code_width)
+        lifted += 2 * spec.ambient.encoding.bands * spec.ambient.dims
+    if spec.scene_flow is not None:
+        own["scene_flow"] = scene_flow.init(spec.scene_flow, key, width)
+    nets = {"fine": spec.template}
+    if spec.sampling.fine and not spec.sampling.shared:
+        nets["coarse"] = spec.coarse or spec.template
+    own["template"] = {}
+    for name, one in nets.items():
+        point = 3 * (1 + 2 * one.position.bands) + lifted
+        view = 0 if one.direction is None else 3 * (1 + 2 * one.direction.bands)
+        own["template"][name] = template.init(one, key, point, view + beside)
+    own["codes"] = {name: jnp.zeros(shape) for name, shape in tables.items()}
+    return own
+
+
+def removed_from(spec):
+    """The preset itself, and without each of what it has."""
+    names = ("appearance", "transient", "time", "ambient", "elastic", "background")
+    yield spec
+    for name in names:
+        if getattr(spec, name) is not None:
+            yield dataclasses.replace(spec, **{name: None})
+    if spec.warp is not None:
+        yield dataclasses.replace(spec, warp=None, elastic=None, background=None)
+    if spec.scene_flow is not None:
+        yield dataclasses.replace(spec, scene_flow=None)
+
+
+@pytest.mark.parametrize("preset", field_presets.PRESETS)
+def test_a_field_has_the_arrays_of_what_it_has_and_no_others(preset):
+    for spec in removed_from(field_presets.PRESETS[preset]):
+        made = fields.field(spec, FACTS)
+        found = jax.eval_shape(made.init, jax.random.key(0))
+        expected = jax.eval_shape(lambda spec=spec: counted_out(spec))
+        assert shapes(found) == shapes(expected)
+
+
+def splats_without(spec):
+    """The preset itself, and without each of what it has."""
+    yield spec
+    for name in ("neighbours", "spectral", "depth", "acceleration", "motion_growth"):
+        if getattr(spec, name) is not None:
+            yield dataclasses.replace(spec, **{name: None})
+    for name in ("alternation", "annealing"):
+        if getattr(spec, name) is not None:
+            yield dataclasses.replace(spec, **{name: None})
+    if spec.motion is not None:
+        leaning = ("motion", "neighbours", "acceleration", "motion_growth")
+        yield dataclasses.replace(spec, alternation=None, **dict.fromkeys(leaning))
+
+
+@pytest.mark.parametrize("preset", splat_presets.PRESETS)
+def test_splats_have_the_arrays_of_what_they_have_and_no_others(preset):
+    capture = scenes.tiny_capture()
+    facts = splat_scene.facts_of(capture)
+    for spec in splats_without(bare_scenes.tiny_splats(preset)):
+        state = splat_scene.build(spec, facts).init(capture, jax.random.key(0))
+        motion, key, nets = spec.motion, jax.random.key(0), {}
+        rows, carried = {"splats"}, set()
+        if isinstance(motion, MotionSpec):
+            nets["mlp_motion"] = mlp_motion.init(key, motion)
+        elif isinstance(motion, KanMotionSpec):
+            rows.add("kan_motion")
+            nets["kan_motion"] = kan_motion.init(key, motion, facts.frames)
+        elif motion is not None:
+            nets["motion_basis"] = motion_basis.init(key, motion)
+        if spec.spectral is not None:
+            nets["spectral"] = spectral.init(spec.spectral)
+        if spec.neighbours is not None:
+            carried.add("neighbours")
+        if spec.motion_growth is not None:
+            carried.add("motion_growth")
+        assert set(state.params.rows) == rows
+        assert shapes(state.params.nets) == shapes(nets)
+        assert set(state.extra.carried) == carried
+        # A count and two moments for each array that is trained, and nothing else.
+        trained = len(jax.tree.leaves(state.params))
+        assert len(jax.tree.leaves(state.optimiser)) == 3 * trained
