@@ -93,8 +93,8 @@ class Priced(NamedTuple):
     temporary_bytes: int
     matrix_flops: float
     at_least: bool  # of the matrix products: some loops run longer than is known
-    compile_seconds: float
-    seconds: float  # median of processor time
+    compile_seconds: float  # of the processor
+    seconds: float  # of the processor, median
     wall_seconds: float
 
 
@@ -111,15 +111,15 @@ def main(arguments=None):
     with run_settings.user_errors():
         asked = run_settings.parse(EffectCost, arguments)
         run_settings.start_jax(asked.device, "one")
+        import jax
+
+        # Compiling is one of the prices; JAX asks once, when it first compiles.
+        jax.config.update("jax_enable_compilation_cache", False)
         from experiments import effect_cost_report as report
 
         before = None if asked.check is None else report.baseline(asked.check)
         tables = {name: arms(_spec(name, asked)) for name in asked.presets}
         folder = run_settings.new_run_folder(asked.out, "effect_cost")
-    import jax
-
-    # Compiling is one of the prices.
-    jax.config.update("jax_enable_compilation_cache", False)
     print(report.heading())
     rows = {}
     for name, scenes in tables.items():
@@ -246,9 +246,9 @@ def _compile(representation, capture, spec, at):
 
     calls, costs = {}, {}
     for name, function in {"loss": loss, "step": model.step}.items():
-        began = time.perf_counter()
+        began = time.process_time()
         program = jax.jit(function).lower(state, frames).compile()
-        cost = clock.cost_of(program, time.perf_counter() - began)
+        cost = clock.cost_of(program, time.process_time() - began)
         costs[name] = cost, matrix_flops.count(function, state, frames)
         calls[name] = lambda program=program: program(state, frames)
     return calls, (model.counts(state)["parameters"], costs)

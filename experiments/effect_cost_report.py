@@ -41,7 +41,7 @@ def heading() -> str:
         "them in blocks are undercounted. Matmul Mflop has the matrix\nproducts alone, "
         "with all rounds of loops whose number is known (+: and more in others). The "
         "last columns are\nthe step's price: its time less that of the scene named, "
-        "and the ratio of both."
+        "and the ratio of both. Times are the processor's."
     )
 
 
