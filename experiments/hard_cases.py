@@ -23,10 +23,13 @@ from experiments import (
     hard_case,
     hard_elastic,
     hard_encodings,
+    hard_footprints,
     hard_geometry,
+    hard_losses,
     hard_networks,
     hard_quaternions,
     hard_rotations,
+    hard_splats,
     hard_volume,
 )
 from experiments import hard_cases_report as report
@@ -42,6 +45,8 @@ ROOMS = {
     "encodings": (hard_encodings.CASES, "test_encoding_cases.py"),
     "volume": (hard_volume.CASES, "test_volume_cases.py"),
     "networks": (hard_networks.CASES, "test_network_cases.py"),
+    "losses": (hard_losses.CASES, "test_loss_cases.py"),
+    "splats": (hard_footprints.CASES + hard_splats.CASES, "test_splat_cases.py"),
 }
 JITTER = 1e-3  # of the timed inputs, so that rows differ
 
