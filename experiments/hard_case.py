@@ -45,6 +45,7 @@ class Case(NamedTuple):
     # The precisions and orders that the textbook form fails, by a factor of ten.
     caught: tuple[tuple[str, str], ...] = (("float32", "slope"),)
     timed: np.ndarray | None = None  # [n] a usual input, to time (default: the middle)
+    alike: bool = True  # both forms do the same work, so that their times compare
 
     @property
     def orders(self) -> int:

@@ -1,0 +1,90 @@
+"""The table of hard cases: a cheap room from the command line to the page."""
+
+import json
+
+import numpy as np
+import pytest
+
+from experiments import hard_case, hard_cases, hard_cases_report
+from experiments.hard_cases import ROOMS, Outcome, Row
+
+PAGE = f"before\n{hard_cases_report.BEGIN}\nold\n{hard_cases_report.END}\nbehind\n"
+
+
+def test_names_tell_all_cases_apart():
+    names = [case.name for cases, _ in ROOMS.values() for case in cases]
+    assert len(set(names)) == len(names)
+    for cases, _ in ROOMS.values():
+        for case in cases:
+            assert len(case.at) == len(case.inputs)
+            assert {"float32", "float64"} <= set(case.bounds)
+
+
+def test_the_command_measures_prints_draws_and_renews_the_page(tmp_path, capsys):
+    page, out = tmp_path / "page.md", tmp_path / "out"
+    page.write_text(PAGE)
+    words = ["--rooms", "encodings", "--cases", "window", "--rows", "10"]
+    words += ["--repeats", "1", "--out", str(out), "--document", str(page)]
+    hard_cases.main(words)
+    printed = capsys.readouterr().out
+    assert "window of a band that opens" in printed
+    assert "1 of 1 textbook forms" in printed
+    text = page.read_text()
+    assert text.startswith("before\n")
+    assert text.endswith("behind\n")
+    assert "old" not in text
+    assert "test_encoding_cases.py::test_held[window of a band that opens-…]" in text
+    stored = json.loads((out / "hard_cases.json").read_text())["metrics"]
+    key = "window_of_a_band_that_opens.float32.slope"
+    assert stored[f"{key}.ours"]["value"] < 1e-5 < stored[f"{key}.textbook"]["value"]
+    assert (out / "window-of-a-band-that-opens.png").stat().st_size > 5000
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--rooms", "kitchen"], "choose from rotations"),
+        (["--cases", "nothing"], "no such case; there are screw"),
+        (["--rows", "0"], "at least 1"),
+        (["--document", "nowhere.md"], "no such file, or not both"),
+    ],
+)
+def test_wrong_input_is_refused(words, message, tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        hard_cases.main([*words, "--out", str(tmp_path / "out")])
+    assert stop.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+def test_errors_are_of_the_largest_entry_and_never_forgiving():
+    case = ROOMS["encodings"][0][0]._replace(floors=(0.0, 0.0, 0.0))
+    exact = np.array([[1.0, -4.0], [0.0, 0.0], [0.0, 0.0], [1.0, 1.0]])
+    got = np.array([[1.0, -3.0], [0.0, 0.0], [0.0, 1e-9], [1.0, np.nan]])
+    found = hard_case.errors(case, got, exact, 0)
+    np.testing.assert_array_equal(found, [0.25, 0.0, np.inf, np.inf])
+    floored = hard_case.errors(case._replace(floors=(2.0,)), got, exact, 0)
+    np.testing.assert_allclose(floored, [0.25, 0.0, 5e-10, np.inf])
+
+
+def test_the_truth_of_a_derivative_is_that_of_the_closed_form():
+    case = ROOMS["encodings"][0][0]._replace(exact=lambda x: [x[0] ** 3 * x[1]])
+    row = np.array([[2.0, 5.0]])
+    np.testing.assert_allclose(hard_case.truth(case, row, 1), [[[60.0, 8.0]]])
+    np.testing.assert_allclose(
+        hard_case.truth(case, row, 2), [[[[60.0, 12.0], [12.0, 0.0]]]]
+    )
+
+
+def test_a_number_names_what_is_not_finite_and_the_worst_else():
+    assert hard_cases_report.number([0.0]) == "0"
+    assert hard_cases_report.number([1e-7, 3e-7]) == "3e-07"
+    assert hard_cases_report.number([np.inf, 0.3]) == "not finite, 3e-01"
+    assert hard_cases_report.number([np.inf]) == "not finite"
+
+
+def test_what_cannot_be_timed_side_by_side_is_not():
+    case = ROOMS["encodings"][0][0]._replace(alike=False)
+    outcome = Outcome((np.zeros(1),), (np.ones(1),))
+    row = Row(case, "a test", {"float32": outcome}, np.nan, np.nan)
+    assert "not comparable" in hard_cases_report.table([row])
+    assert hard_cases_report.summary([row]).endswith("derivative.")
