@@ -1,8 +1,15 @@
 """From what was found to presets and overrides for splats and for fields."""
 
 import dataclasses
+from typing import Any
 
-from experiments.inspect_findings import Finding
+from experiments import settings as run_settings
+from experiments.inspect_findings import Finding, table
+from experiments.inspect_light import EFFECT as LIGHT
+from experiments.inspect_motion import EFFECT as MOTION
+from experiments.inspect_points import BACKGROUND, START
+from experiments.inspect_stored import DEPTH
+from experiments.inspect_transient import EFFECT as TRANSIENT
 
 SPLATS, FIELDS = "splats", "fields"
 
@@ -27,59 +34,71 @@ def advise(
 ) -> Advice:
     """What to reconstruct with; `full` takes the papers' sizes, not those for a CPU.
 
-    What cannot be told keeps the default of `experiments.reconstruct`, a model that
-    moves: on a still scene it costs time, and the other way round all that moves.
+    What cannot be told keeps what the preset has. Where motion itself cannot be told,
+    that is a model that moves: on a still scene it costs time, on a moving one a model
+    at rest loses whatever moves.
     """
     wanted = {one.effect: one.wanted for one in findings}
-    numbers = {one.effect: one.numbers for one in findings}
-    notes = []
-    for effect, choice in wanted.items():
-        if choice is None:
-            notes.append(f"{effect}: cannot tell, the preset's own setting stays")
+    notes = [
+        f"{effect}: cannot tell, the preset's own setting stays"
+        for effect, choice in wanted.items()
+        if choice is None
+    ]
     build = {SPLATS: _splats, FIELDS: _fields}[representation]
-    preset, overrides, more = build(wanted, numbers)
-    preset = preset if full else f"{preset}-small"
-    return Advice(representation, preset, tuple(overrides), (*notes, *more))
+    preset, overrides, more = build(wanted, full)
+    return Advice(
+        representation,
+        preset if full else f"{preset}-small",
+        tuple(overrides),
+        (*notes, *more),
+    )
 
 
-def _splats(wanted, numbers):
+def representation_of(preset: str) -> str:
+    """Whose preset it is, by its name alone."""
+    return SPLATS if preset.startswith(run_settings.SPLATS) else FIELDS
+
+
+def follow(choices: Any, findings: tuple[Finding, ...]) -> tuple[Any, list[str]]:
+    """`runs.Choices` as advised, and what to tell; the user's own settings come last.
+
+    The preset asked for says which representation and which size.
+    """
+    full = not choices.preset.endswith("-small")
+    advice = advise(findings, representation_of(choices.preset), full)
+    lines = [*table(findings), f"effects: {advice.arguments()}"]
+    lines += [f"note: {note}" for note in advice.notes]
+    overrides = (*advice.overrides, *choices.overrides)
+    changed = dataclasses.replace(choices, preset=advice.preset, overrides=overrides)
+    return changed, lines
+
+
+def _splats(wanted, full):
     overrides, notes = [], []
-    preset = "splats-static" if wanted.get("motion") is False else "splats-deformable"
-    if wanted.get("appearance codes"):
-        notes.append(
-            "appearance codes: splats have none; the drift ends up in their colours, "
-            "so prefer the field"
-        )
-    if wanted.get("transient"):
-        notes.append("transient: splats have no medium for it; prefer the field")
-    if wanted.get("start from points") is False:
+    preset = "splats-static" if wanted.get(MOTION) is False else "splats-deformable"
+    for effect, there in ((LIGHT, "codes"), (TRANSIENT, "medium")):
+        if wanted.get(effect):
+            notes.append(f"{effect}: splats have no {there} for it; prefer the field")
+    if wanted.get(START) is False:
         overrides.append("start.source=random")
-    if wanted.get("depth") and wanted.get("motion") is not False:
-        notes.append("depth: --preset sonata-small has a loss that uses it")
-    if preset == "splats-deformable" and "time_bands" in numbers.get("motion", {}):
-        overrides.append(f"motion.time.bands={numbers['motion']['time_bands']:.0f}")
+    if wanted.get(DEPTH):
+        overrides.append("depth.weight=0.1")
     return preset, overrides, notes
 
 
-def _fields(wanted, numbers):
+def _fields(wanted, full):
     overrides, notes = [], []
-    moves, passes = wanted.get("motion"), wanted.get("transient")
-    drifts = wanted.get("appearance codes")
-    if moves is False:
-        preset = "nerf-w" if passes or drifts else "nerf"
-        if preset == "nerf-w" and not passes:
-            overrides.append("transient=none")
-        if preset == "nerf-w" and drifts is False:
-            overrides.append("appearance=none")
-        return preset, overrides, notes
-    preset = "nerfies"
-    if drifts is False:
+    drifts, passes = wanted.get(LIGHT), wanted.get(TRANSIENT)
+    preset = "nerf" if wanted.get(MOTION) is False else "nerfies"
+    has_codes = preset == "nerfies" and full
+    if drifts and not has_codes:
+        overrides.append(f"appearance.width={48 if full else 4}")
+    if drifts is False and has_codes:
         overrides.append("appearance=none")
-    if wanted.get("background points") is False:
-        overrides.append("background=none")
     if passes:
-        notes.append(
-            "transient: nerfies-small has no medium for what comes and goes; its warp "
-            "codes take what they can"
-        )
+        size = (16, 4, 128) if full else (8, 2, 48)  # of NeRF-W and of its small preset
+        names = ("code_width", "depth", "width")
+        overrides += [f"transient.{n}={v}" for n, v in zip(names, size, strict=True)]
+    if preset == "nerfies" and wanted.get(BACKGROUND) is False:
+        overrides.append("background=none")
     return preset, overrides, notes

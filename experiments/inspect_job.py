@@ -8,11 +8,14 @@ import numpy as np
 from experiments import (
     inspect_light,
     inspect_motion,
+    inspect_outlines,
     inspect_picture,
     inspect_points,
+    inspect_stored,
+    inspect_transient,
     inspect_views,
 )
-from experiments.inspect_findings import Finding
+from experiments.inspect_findings import CERTAIN, Finding
 from experiments.inspect_motion import Film
 from experiments.inspect_views import Views
 from nerfies_jax.capture import pinholes
@@ -48,11 +51,33 @@ def inspect(capture: Capture) -> Inspection:
     if not len(points) and inspect_motion.unusable(views, films) is None:
         rest = inspect_points.followed_points(views, films)
     findings = (
-        inspect_motion.motion(views, films, spans),
+        _motion(views, films, spans),
         inspect_light.exposure(views, rest),
+        inspect_transient.transient(views, films),
         inspect_points.start(looked, views, films, points),
         inspect_points.background(looked, views, films, points),
+        inspect_stored.depth(looked, views, films),
+        inspect_stored.masks(looked, views, films),
+        inspect_stored.lens(capture),
     )
     sheet = inspect_picture.sheet(views, films)
     seconds = time.perf_counter() - began
     return Inspection(findings, sheet, small.factor, seconds, views, films)
+
+
+def _motion(views, films, spans):
+    """By paths of pixels, or by outlines where views are too far apart to follow."""
+    if np.ptp(views.time) == 0:
+        return Finding(
+            inspect_motion.EFFECT,
+            "all frames have the same time: a motion has nothing to depend on",
+            "two times",
+            False,
+            CERTAIN,
+        )
+    found = inspect_motion.motion(views, films, spans)
+    if found.wanted is None:
+        shapes = inspect_outlines.outlines(views)
+        if shapes is not None:
+            return inspect_outlines.motion(views, shapes)
+    return found

@@ -14,7 +14,9 @@ EFFECT = "appearance codes"
 DRIFT_STOPS = 0.1
 GROUPS = 8  # of points by place: what all of them agree on is the frame's
 FEWEST = 40  # points in a frame and group
-DARK, BRIGHT = 0.02, 0.9  # linear light between which a pixel measures gain
+# Linear light between which a pixel measures gain: sRGB 15 of 255, where a level is
+# 0.1 stop, to where highlights are clipped.
+DARK, BRIGHT = 0.005, 0.9
 POLISHES = 12  # rounds of medians; the gains move by less than 1e-3 afterwards
 
 

@@ -12,7 +12,7 @@ START, BACKGROUND = "start from points", "background points"
 CELLS = (8, 6)  # across and down: a picture is covered where a cell holds a point
 COVERED = 0.5  # of the cells that show anything
 # A point that a following frame's flow misses by so much is not where it should be.
-AGREES_PX = 3.0
+AGREES_PX, AGREES_DEVIATIONS = 3.0, 4.0
 DEPTH_KNOWN, DEPTH_AGREES = 0.05, 0.2  # shares of a depth: its deviation, its bound
 STILL_SHARE = 0.8  # of the points that can be checked
 MOST = 4000  # points that are looked at
@@ -128,31 +128,34 @@ def background(
     if not len(points):
         evidence = "the capture has no points"
         return Finding(BACKGROUND, evidence, threshold, False, CERTAIN)
-    seen = agree = 0
+    seen, agree = np.zeros(len(points)), np.zeros(len(points))
     for film in films:
         for one in film.centres:
-            met, stayed = _stays(views, one, points)
-            seen, agree = seen + met, agree + stayed
-    if seen < FEWEST_POINTS:
+            which, stays = _stays(views, one, points)
+            seen[which] += 1
+            agree[which] += stays
+    count = int((seen > 0).sum())
+    if count < FEWEST_POINTS:
         return cannot_tell(
             BACKGROUND,
-            f"{len(points)} points, but only {seen} sightings to check them by",
+            f"{len(points)} points, but only {count} on pixels that can be followed",
             threshold,
         )
-    share = agree / seen
+    # A point is where it should be if most frames say so: rims make single ones err.
+    share = float((agree[seen > 0] > 0.5 * seen[seen > 0]).mean())
     # On what strays, not on what stays: 1 % and 2 % astray differ by a factor of two.
     moved, confidence = judge(
-        1 - share, 1 - STILL_SHARE, np.sqrt(share * (1 - share) / len(points))
+        1 - share, 1 - STILL_SHARE, np.sqrt(share * (1 - share) / count)
     )
     wanted = None if moved is None else not moved
-    evidence = f"{share:.1%} of the sightings of the points stay with the film's paths"
+    evidence = f"{share:.1%} of {count} points stay with the film's paths"
     return Finding(
         BACKGROUND, evidence, threshold, wanted, confidence, {"still_share": share}
     )
 
 
 def _stays(views, centre, points):
-    """How many points the followed pixels could check, and how many agree.
+    """Which points the followed pixels could check, and which of them agree.
 
     A point behind what the paths show is hidden there and checks nothing; one that is
     looked through is not where it should be. Without parallax the paths show no depth,
@@ -161,6 +164,7 @@ def _stays(views, centre, points):
     pixel, depth = inspect_views.project(views, centre.view, points)
     inside = inspect_views.in_picture(views, pixel, depth)
     column, line = pixel[inside].astype(int).T
+    which = np.flatnonzero(inside)
     points, depth = points[inside], depth[inside]
     shown = centre.fit.inverse_depth[line, column]
     parallax = centre.fit.parallax_px[line, column]
@@ -175,8 +179,8 @@ def _stays(views, centre, points):
         miss = np.linalg.norm(there - centre.paths.place[at][line, column], axis=-1)
         misses.append(np.where(followed, miss, np.nan))
     if not checked.any():
-        return 0, 0
+        return which[:0], checked[:0]
     middle = np.nanmedian(np.array(misses)[:, checked], axis=0)
     # The pixel's own centre lies up to 0.7 px from the point.
-    stays = (middle < AGREES_PX) & ~through[checked]
-    return int(checked.sum()), int(stays.sum())
+    bound = max(AGREES_PX, AGREES_DEVIATIONS * centre.noise_px)
+    return which[checked], (middle < bound) & ~through[checked]

@@ -67,11 +67,10 @@ def main(arguments=None):
 def read(asked):
     """The capture as it is stored: distortion is still in it."""
     from experiments import runs
-    from nerfies_jax import capture as captures
 
-    if asked.capture is None:
-        choices = runs.Choices(
-            capture=None,
+    return runs.stored_capture(
+        runs.Choices(
+            capture=None if asked.capture is None else str(asked.capture),
             scene=asked.scene,
             preset="",
             steps=None,
@@ -81,12 +80,6 @@ def read(asked):
             heldout=asked.heldout,
             seed=asked.seed,
         )
-        return runs.read_capture(choices)
-    heldout = asked.heldout
-    if heldout is not None and heldout.isdigit():
-        heldout = int(heldout)
-    return captures.load(
-        asked.capture, factor=asked.factor, max_side=asked.max_side, heldout=heldout
     )
 
 

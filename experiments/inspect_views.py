@@ -11,7 +11,7 @@ from nerfies_jax.capture import capture as captures
 from nerfies_jax.capture.capture import Capture
 
 WIDEST = 256  # pixels: pictures are looked at no wider than this
-MOST = 72  # frames that are looked at, spread over the film
+MOST_PIXELS = 4_000_000  # of all frames; half a minute of flow on one core
 PLAIN_SHARE = 0.9  # of the border's pixels: then what lies behind has one colour
 PLAIN_LEVELS = 3  # grey levels of 255: JPEG and rounding, not a picture
 FEWEST_POINTS = 300  # that say where the scene is
@@ -60,13 +60,12 @@ def shrunk(capture: Capture) -> Shrunk:
 
 
 def look(capture: Capture) -> Views:
-    """The frames to learn from, at most `MOST` of them, evenly over the film."""
+    """The frames to learn from, as many as `MOST_PIXELS` allow, evenly."""
     rows = capture.train
     order = np.lexsort((rows, capture.times[rows], capture.camera_ids[rows]))
     rows = rows[order]
-    if len(rows) > MOST:
-        # A whole stride: uneven steps would look like uneven motion.
-        rows = rows[:: math.ceil(len(rows) / MOST)]
+    # A whole stride: uneven steps would look like uneven motion.
+    rows = rows[:: math.ceil(len(rows) * math.prod(capture.size) / MOST_PIXELS)]
     image = capture.images[rows]
     grey = np.ascontiguousarray(image.mean(-1) / 255, np.float32)
     filmed = ~plain(capture, rows)

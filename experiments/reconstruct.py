@@ -28,6 +28,9 @@ class Reconstruct:
     """Gaussian splats: splats-static, splats-deformable, sonata, moba. Radiance fields:
     nerf, nerf-w, d-nerf, t-nerf, nerfies, hypernerf, nsff. Each with -small is made for
     a CPU (default: splats-deformable-small)."""
+    effects: Literal["preset", "auto"] = "preset"
+    """auto: look at the capture first and take the effects that it calls for, in the
+    representation and size of the preset (see experiments.inspect_scene)."""
     scene: str = "default"
     """Which built-in scene, where no capture is given."""
     steps: int | None = None
@@ -128,19 +131,25 @@ def _resumed(asked, runs):
 
 def _new(asked, runs):
     """The run that the command line asks for."""
-    return runs.new_run(
-        runs.Choices(
-            capture=None if asked.capture is None else str(asked.capture.absolute()),
-            scene=asked.scene,
-            preset=asked.preset or DEFAULT_PRESET,
-            steps=asked.steps,
-            overrides=asked.set,
-            factor=asked.factor,
-            max_side=asked.max_side,
-            heldout=asked.heldout,
-            seed=asked.seed,
-        )
+    choices = runs.Choices(
+        capture=None if asked.capture is None else str(asked.capture.absolute()),
+        scene=asked.scene,
+        preset=asked.preset or DEFAULT_PRESET,
+        steps=asked.steps,
+        overrides=asked.set,
+        factor=asked.factor,
+        max_side=asked.max_side,
+        heldout=asked.heldout,
+        seed=asked.seed,
     )
+    if asked.effects == "auto":
+        from experiments import inspect_advice, inspect_job
+
+        runs.scene_spec(choices)  # refuses a wrong preset before half a minute's look
+        found = inspect_job.inspect(runs.stored_capture(choices))
+        choices, lines = inspect_advice.follow(choices, found.findings)
+        print("\n".join(lines))
+    return runs.new_run(choices)
 
 
 def _start(asked, run, runs):

@@ -72,6 +72,11 @@ def scene_spec(choices: Choices) -> Any:
 
 def read_capture(choices: Choices) -> Capture:
     """The capture asked for, ready for a pinhole renderer."""
+    return pinholes.as_pinholes(stored_capture(choices))
+
+
+def stored_capture(choices: Choices) -> Capture:
+    """The capture asked for, with the lens that filmed it."""
     if choices.capture is None:
         if choices.scene not in synthetic.PRESETS:
             raise ValueError(
@@ -91,13 +96,12 @@ def read_capture(choices: Choices) -> Capture:
     heldout = choices.heldout
     if heldout is not None and heldout.isdigit():
         heldout = int(heldout)
-    capture = captures.load(
+    return captures.load(
         choices.capture,
         factor=choices.factor,
         max_side=choices.max_side,
         heldout=heldout,
     )
-    return pinholes.as_pinholes(capture)
 
 
 def save_choices(folder: pathlib.Path, run: Run) -> None:

@@ -95,8 +95,9 @@ def start_jax(device, threads="one"):
 def override(spec, assignments):
     """`spec` with `path.to.field=value` applied, each value read by the field's type.
 
-    A field that holds another spec is set with a dotted path, or removed with `none`
-    where its type allows it. Raises ValueError for an unknown field or a wrong value.
+    A field that holds another spec is set with a dotted path, which brings it in with
+    its defaults where it is none, or removed with `none` where its type allows it.
+    Raises ValueError for an unknown field or a wrong value.
     """
     for assignment in assignments:
         path, equals, text = assignment.partition("=")
@@ -116,11 +117,20 @@ def _assign(spec, names, text, path):
         )
     if rest:
         inner = getattr(spec, name)
+        if inner is None:
+            inner = _absent(spec, name)
         if not dataclasses.is_dataclass(inner):
             raise ValueError(f"--set {path}: {name!r} is {inner!r} and has no fields")
         return dataclasses.replace(spec, **{name: _assign(inner, rest, text, path)})
     kind = typing.get_type_hints(type(spec))[name]
     return dataclasses.replace(spec, **{name: _read(kind, text, path)})
+
+
+def _absent(spec, name):
+    """The defaults of an effect that is not there; None unless there is one choice."""
+    options = typing.get_args(typing.get_type_hints(type(spec))[name])
+    specs = [option for option in options if dataclasses.is_dataclass(option)]
+    return specs[0]() if len(specs) == 1 else None
 
 
 def _read(kind, text, path):

@@ -1,12 +1,19 @@
 """What an inspection says of small films whose truth is known."""
 
+import dataclasses
 import functools
 import json
 
 import numpy as np
 import pytest
 
-from experiments import inspect_findings, inspect_job, inspect_scene, settings
+from experiments import (
+    inspect_findings,
+    inspect_job,
+    inspect_scene,
+    inspect_stored,
+    settings,
+)
 from experiments.inspect_findings import CANNOT_TELL, CERTAIN, LIKELY
 from nerfies_jax.capture import nerfies_format
 from tests.experiments import inspect_films
@@ -18,8 +25,21 @@ def still():
 
 
 @functools.cache
+def swaying_film():
+    return inspect_films.film(card=inspect_films.swaying)
+
+
+@functools.cache
 def swaying():
-    return inspect_job.inspect(inspect_films.film(card=inspect_films.swaying))
+    return inspect_job.inspect(dataclasses.replace(swaying_film(), moving=None))
+
+
+def swaying_with(masks):
+    """The findings about masks alone; what moves is already known."""
+    found = swaying()
+    film = dataclasses.replace(swaying_film(), moving=masks)
+    finding = inspect_stored.masks(film, found.views, found.films)
+    return dataclasses.replace(found, findings=(finding,))
 
 
 def told(inspection, effect):
@@ -112,16 +132,82 @@ def test_points_on_what_moves_are_no_background():
     [
         functools.partial(inspect_films.film, frames=2),
         functools.partial(inspect_films.film, blank=True),
-        functools.partial(
-            inspect_films.film, times=np.zeros(inspect_films.FRAMES, np.float32)
-        ),
     ],
-    ids=["two frames", "nothing to see", "one moment"],
+    ids=["two frames", "nothing to see"],
 )
 def test_what_cannot_be_seen_decides_nothing_and_says_why(film):
     found = inspect_job.inspect(film()).finding("motion")
     assert (found.wanted, found.confidence) == (None, CANNOT_TELL)
     assert len(found.evidence) > 20
+
+
+def test_frames_of_one_moment_ask_for_no_motion():
+    times = np.zeros(inspect_films.FRAMES, np.float32)
+    film = inspect_films.film(card=inspect_films.swaying, times=times)
+    found = inspect_job.inspect(film)
+    assert told(found, "motion") == (False, CERTAIN)
+    assert "same time" in found.finding("motion").evidence
+
+
+def test_a_card_that_comes_and_goes_is_transient_and_one_that_sways_is_not():
+    film = inspect_films.film(
+        card=lambda time: (0.2 * (time - 0.5), 0.0),
+        shown=lambda time: 0.2 < time < 0.45 or 0.6 < time < 0.85,
+        half=0.26,
+    )
+    found = inspect_job.inspect(film)
+    assert told(found, "transient objects") == (True, CERTAIN)
+    assert told(swaying(), "transient objects")[0] is False
+    assert told(still(), "transient objects")[0] is False
+
+
+def test_depth_is_held_against_parallax():
+    film = inspect_films.film()
+    scene = np.full(film.images.shape[:3], inspect_films.FAR, np.float32)
+    wall = inspect_job.inspect(
+        inspect_films.film(shown=lambda time: False, depths=3.0 * scene)
+    )
+    found = wall.finding("depth")
+    assert (found.wanted, found.confidence) == (True, CERTAIN)
+    assert found.numbers["scale"] == pytest.approx(1 / 3, rel=0.02)
+    x = np.linspace(0.5, 2, scene.shape[2], dtype=np.float32)
+    bent = inspect_films.film(shown=lambda time: False, depths=scene * x)
+    wrong = inspect_stored.depth(bent, wall.views, wall.films)
+    assert (wrong.wanted, wrong.confidence) == (False, CERTAIN)
+
+
+def test_masks_are_held_against_what_moves():
+    truth = swaying_film().moving
+    assert told(swaying_with(truth), "masks of what moves")[0] is True
+    elsewhere = np.zeros_like(truth)
+    elsewhere[:, :10] = True
+    assert told(swaying_with(elsewhere), "masks of what moves") == (False, CERTAIN)
+    assert told(swaying(), "masks of what moves") == (False, CERTAIN)
+
+
+def test_a_lens_is_measured_in_pixels():
+    film = inspect_films.film()
+    width, height = inspect_films.SIZE
+    corner = np.hypot(width / 2, height / 2) / inspect_films.FOCAL
+    film.cameras.radial[:, 0] = 0.1
+    found = inspect_stored.lens(film)
+    expected = 0.1 * corner**3 * inspect_films.FOCAL
+    assert found.numbers["most_px"] == pytest.approx(expected, rel=1e-4)
+    assert found.wanted
+    film.cameras.radial[:, 0] = 0
+    assert inspect_stored.lens(film).wanted is False
+
+
+@pytest.mark.parametrize(
+    ("turn", "answer"),
+    [(0.0, (False, LIKELY)), (0.9, (True, CERTAIN))],
+    ids=["at rest", "turning"],
+)
+def test_outlines_tell_motion_where_no_flow_can(turn, answer):
+    film = inspect_films.rod(turn)
+    found = inspect_job.inspect(film).finding("motion")
+    assert (found.wanted, found.confidence) == answer
+    assert "outlines" in found.evidence
 
 
 @pytest.mark.parametrize(
