@@ -8,7 +8,6 @@ function of the module of the one that is missing refuses to be called: both low
 the same text, and a compiler that gets the same text makes the same program.
 """
 
-import contextlib
 import dataclasses
 import functools
 
@@ -20,54 +19,13 @@ import pytest
 from experiments import evaluate
 from gaussians_jax import presets as splat_presets
 from gaussians_jax import scene as splat_scene
-from gaussians_jax.effects import (
-    acceleration,
-    depth,
-    kan_motion,
-    mlp_motion,
-    motion_basis,
-    motion_growth,
-    neighbours,
-    spectral,
-)
 from nerfies_jax import presets as field_presets
 from nerfies_jax import scene as field_scene
 from nerfies_jax import spec as field_spec
-from nerfies_jax.effects import (
-    ambient,
-    appearance,
-    background,
-    elastic,
-    scene_flow,
-    time_condition,
-    transient,
-    warp,
-)
 from nerfies_jax.measure import clock
-from tests import bare_scenes, scenes
+from tests import bare_scenes, hand_made_effects, scenes
+from tests.hand_made_effects import FIELD_MODULES
 
-FIELD_MODULES = {
-    "appearance": appearance,
-    "transient": transient,
-    "time": time_condition,
-    "warp": warp,
-    "ambient": ambient,
-    "elastic": elastic,
-    "background": background,
-    "scene_flow": scene_flow,
-}
-SPLAT_MODULES = {
-    "acceleration": acceleration,
-    "neighbours": neighbours,
-    "motion_growth": motion_growth,
-    "spectral": spectral,
-    "depth": depth,
-}
-MOTION_MODULES = {
-    mlp_motion.MotionSpec: mlp_motion,
-    kan_motion.KanMotionSpec: kan_motion,
-    motion_basis.BasisMotionSpec: motion_basis,
-}
 # How many layers of a tiny preset read what these add to the template: one in each of
 # two networks, and there again behind the skip.
 WIDENED = {"appearance": 2, "ambient": 4}
@@ -80,8 +38,6 @@ LEANS_ON = {
     "neighbours": ("motion",),
     "motion_growth": ("motion", "density"),
 }
-FIELD_PAPERS = ("nerf", "nerf-w", "d-nerf", "t-nerf", "nerfies", "hypernerf", "nsff")
-SPLAT_PAPERS = ("splats-static", "splats-deformable", "sonata", "moba")
 
 
 class Started:
@@ -209,101 +165,17 @@ def test_splats_without_density_control_keep_no_statistics_of_it():
     same_program(run.model.step, step, run.state, run.frames)
 
 
-def hand_made(spec, facts):
-    """The effects of a field, asked one by one from their own modules."""
-    width = spec.template.width
-    made = []
-    if spec.appearance is not None:
-        made.append(appearance.effect(spec.appearance))
-    if spec.transient is not None:
-        made.append(transient.effect(spec.transient, width))
-    if spec.time is not None:
-        made.append(time_condition.effect(spec.time))
-    if spec.warp is not None:
-        made.append(warp.effect(spec.warp))
-    if spec.ambient is not None:
-        made.append(ambient.effect(spec.ambient))
-    if spec.elastic is not None:
-        made.append(elastic.effect(spec.elastic))
-    if spec.background is not None:
-        made.append(background.effect(spec.background))
-    if spec.scene_flow is not None:
-        moments = len(facts.times)
-        made.append(scene_flow.effect(spec.scene_flow, moments, width))
-    return tuple(made)
-
-
-def hand_made_splats(spec, facts):
-    """The effects of a scene of Gaussians, asked one by one from their own modules."""
-    made, extent, frames = [], facts.extent, facts.frames
-    motion = spec.motion
-    if isinstance(motion, mlp_motion.MotionSpec):
-        made.append(mlp_motion.effect(motion, spec.steps, frames))
-    if isinstance(motion, kan_motion.KanMotionSpec):
-        made.append(kan_motion.effect(motion, spec.steps, frames))
-    if isinstance(motion, motion_basis.BasisMotionSpec):
-        made.append(motion_basis.effect(motion, spec.steps, frames))
-    if spec.acceleration is not None:
-        made.append(acceleration.effect(spec.acceleration, extent, frames))
-    if spec.neighbours is not None:
-        made.append(neighbours.effect(spec.neighbours, extent, "kan_motion"))
-    if spec.motion_growth is not None:
-        made.append(motion_growth.effect(spec.motion_growth, extent))
-    if spec.spectral is not None:
-        made.append(spectral.effect(spec.spectral, spec.steps))
-    if spec.depth is not None:
-        made.append(depth.effect(spec.depth))
-    return tuple(made)
-
-
-def absent_modules(spec):
-    """Modules whose effect is not in the scene, and that no other one builds on."""
-    if isinstance(spec, field_spec.RadianceScene):
-        return [m for name, m in FIELD_MODULES.items() if getattr(spec, name) is None]
-    gone = [m for name, m in SPLAT_MODULES.items() if getattr(spec, name) is None]
-    motion = spec.motion
-    gone += [m for kind, m in MOTION_MODULES.items() if not isinstance(motion, kind)]
-    if isinstance(motion, motion_basis.BasisMotionSpec):
-        gone.remove(mlp_motion)
-    return gone
-
-
-@contextlib.contextmanager
-def poisoned(modules):
-    """Every function of these modules raises when it is called."""
-    with pytest.MonkeyPatch.context() as patch:
-        for module in modules:
-
-            def refuse(*_, name=module.__name__, **__):
-                raise AssertionError(f"{name} is off and was called")
-
-            functions = [
-                name
-                for name, value in vars(module).items()
-                if callable(value) and not isinstance(value, type)
-                if getattr(value, "__module__", None) == module.__name__
-            ]
-            assert "effect" in functions
-            for name in functions:
-                patch.setattr(module, name, refuse)
-        yield
-
-
-def file_of(module):
-    return "/".join(module.__file__.replace("\\", "/").split("/")[-3:])
-
-
 def check_removed(run, start, owner, make):
     """Nothing is left of what was removed, as if it had never been there."""
-    gone = absent_modules(run.spec)
+    gone = hand_made_effects.absent_modules(run.spec)
     assert gone
     # What JAX remembers of its own functions has the place of their first call.
     jax.clear_caches()
     lowered = run.lower()
     places = lowered.as_text(debug_info=True)
     for module in gone:
-        assert file_of(module) not in places
-    with pytest.MonkeyPatch.context() as patch, poisoned(gone):
+        assert hand_made_effects.file_of(module) not in places
+    with pytest.MonkeyPatch.context() as patch, hand_made_effects.poisoned(gone):
         patch.setattr(owner, "effects_of", make)
         upwards = start(run.spec)
         assert upwards.lower().as_text() == lowered.as_text()
@@ -319,6 +191,7 @@ SLOW = {
     ("hypernerf", "appearance"),
     ("hypernerf", "warp"),
     ("hypernerf", "background"),
+    ("sonata", "motion"),
     ("sonata", "neighbours"),
     ("sonata", "depth"),
     ("moba", "motion"),
@@ -343,13 +216,13 @@ def removals(presets):
 @pytest.mark.parametrize(("preset", "part"), removals(field_presets.PRESETS))
 def test_a_field_without_an_effect_is_one_that_never_had_it(preset, part):
     run = started_field(without(bare_scenes.tiny_field(preset), part))
-    check_removed(run, started_field, field_spec, hand_made)
+    check_removed(run, started_field, field_spec, hand_made_effects.of_field)
 
 
 @pytest.mark.parametrize(("preset", "part"), removals(splat_presets.PRESETS))
 def test_splats_without_an_effect_are_some_that_never_had_it(preset, part):
     run = started_splats(without(bare_scenes.tiny_splats(preset), part))
-    check_removed(run, started_splats, splat_scene, hand_made_splats)
+    check_removed(run, started_splats, splat_scene, hand_made_effects.of_splats)
 
 
 def test_small_presets_have_parts_that_papers_have():
@@ -359,20 +232,23 @@ def test_small_presets_have_parts_that_papers_have():
             assert set(parts_of(spec)) <= set(parts_of(paper)), name
 
 
-@pytest.mark.parametrize("preset", ["nerf-w", "hypernerf"])
+@pytest.mark.parametrize(
+    "preset", ["nerf-w", pytest.param("hypernerf", marks=pytest.mark.slow)]
+)
 def test_what_an_effect_does_shows_in_the_places_of_the_operations(preset):
     """Without which the tests above could not fail."""
     run = started_field(bare_scenes.tiny_field(preset))
     jax.clear_caches()
     places = run.lower().as_text(debug_info=True)
     for part in parts_of(run.spec):
-        module = FIELD_MODULES[part]
-        # An appearance code is looked up elsewhere and reads nothing itself
-        assert (file_of(module) in places) == (part != "appearance"), part
+        shown = hand_made_effects.file_of(FIELD_MODULES[part]) in places
+        # An appearance code is looked up elsewhere: its module has no operation
+        assert shown == (part != "appearance"), part
 
 
 def test_a_poisoned_effect_cannot_be_built():
-    with poisoned([warp]), pytest.raises(AssertionError, match="is off and was called"):
+    refused = pytest.raises(AssertionError, match="is off and was called")
+    with hand_made_effects.poisoned([FIELD_MODULES["warp"]]), refused:
         field_spec.effects_of(bare_scenes.tiny_field("d-nerf"), None)
 
 
@@ -395,3 +271,26 @@ def test_what_stays_starts_from_the_numbers_it_had(preset, part):
     assert len(rest) - len(same) == WIDENED.get(part, 0)
     for path in same:
         np.testing.assert_array_equal(rest[path], whole[path], err_msg=str(path))
+
+
+@pytest.mark.parametrize(
+    ("start", "spec"),
+    [
+        (started_field, bare(bare_scenes.tiny_field("nerfies"))),
+        (started_splats, bare(bare_scenes.tiny_splats("moba"))),
+    ],
+    ids=["field", "splats"],
+)
+def test_a_picture_without_effects_asks_none(start, spec):
+    run = start(spec)
+    view = evaluate.view_of(run.capture, 0)
+    modules = hand_made_effects.absent_modules(spec)
+    assert len(modules) == 8
+
+    def draw(params):
+        return run.model.render(params, view, (8, 6), jnp.int32(0))
+
+    with hand_made_effects.poisoned(modules):
+        places = jax.jit(draw).lower(run.state.params).as_text(debug_info=True)
+    for module in modules:
+        assert hand_made_effects.file_of(module) not in places

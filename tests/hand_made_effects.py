@@ -1,0 +1,134 @@
+"""Effects asked one by one from their own modules, and modules that do not answer."""
+
+import contextlib
+
+import pytest
+
+from gaussians_jax.effects import (
+    acceleration,
+    depth,
+    kan_motion,
+    mlp_motion,
+    motion_basis,
+    motion_growth,
+    neighbours,
+    spectral,
+)
+from nerfies_jax.effects import (
+    ambient,
+    appearance,
+    background,
+    elastic,
+    scene_flow,
+    time_condition,
+    transient,
+    warp,
+)
+from nerfies_jax.spec import RadianceScene
+
+FIELD_MODULES = {
+    "appearance": appearance,
+    "transient": transient,
+    "time": time_condition,
+    "warp": warp,
+    "ambient": ambient,
+    "elastic": elastic,
+    "background": background,
+    "scene_flow": scene_flow,
+}
+SPLAT_MODULES = {
+    "acceleration": acceleration,
+    "neighbours": neighbours,
+    "motion_growth": motion_growth,
+    "spectral": spectral,
+    "depth": depth,
+}
+MOTION_MODULES = {
+    mlp_motion.MotionSpec: mlp_motion,
+    kan_motion.KanMotionSpec: kan_motion,
+    motion_basis.BasisMotionSpec: motion_basis,
+}
+
+
+def of_field(spec, facts):
+    """The effects of a field, asked one by one from their own modules."""
+    width = spec.template.width
+    made = []
+    if spec.appearance is not None:
+        made.append(appearance.effect(spec.appearance))
+    if spec.transient is not None:
+        made.append(transient.effect(spec.transient, width))
+    if spec.time is not None:
+        made.append(time_condition.effect(spec.time))
+    if spec.warp is not None:
+        made.append(warp.effect(spec.warp))
+    if spec.ambient is not None:
+        made.append(ambient.effect(spec.ambient))
+    if spec.elastic is not None:
+        made.append(elastic.effect(spec.elastic))
+    if spec.background is not None:
+        made.append(background.effect(spec.background))
+    if spec.scene_flow is not None:
+        moments = len(facts.times)
+        made.append(scene_flow.effect(spec.scene_flow, moments, width))
+    return tuple(made)
+
+
+def of_splats(spec, facts):
+    """The effects of a scene of Gaussians, asked one by one from their own modules."""
+    made, extent, frames = [], facts.extent, facts.frames
+    motion = spec.motion
+    if isinstance(motion, mlp_motion.MotionSpec):
+        made.append(mlp_motion.effect(motion, spec.steps, frames))
+    if isinstance(motion, kan_motion.KanMotionSpec):
+        made.append(kan_motion.effect(motion, spec.steps, frames))
+    if isinstance(motion, motion_basis.BasisMotionSpec):
+        made.append(motion_basis.effect(motion, spec.steps, frames))
+    if spec.acceleration is not None:
+        made.append(acceleration.effect(spec.acceleration, extent, frames))
+    if spec.neighbours is not None:
+        made.append(neighbours.effect(spec.neighbours, extent, "kan_motion"))
+    if spec.motion_growth is not None:
+        made.append(motion_growth.effect(spec.motion_growth, extent))
+    if spec.spectral is not None:
+        made.append(spectral.effect(spec.spectral, spec.steps))
+    if spec.depth is not None:
+        made.append(depth.effect(spec.depth))
+    return tuple(made)
+
+
+def absent_modules(spec):
+    """Modules whose effect is not in the scene, and that no other one builds on."""
+    if isinstance(spec, RadianceScene):
+        return [m for name, m in FIELD_MODULES.items() if getattr(spec, name) is None]
+    gone = [m for name, m in SPLAT_MODULES.items() if getattr(spec, name) is None]
+    motion = spec.motion
+    gone += [m for kind, m in MOTION_MODULES.items() if not isinstance(motion, kind)]
+    if isinstance(motion, motion_basis.BasisMotionSpec):
+        gone.remove(mlp_motion)
+    return gone
+
+
+@contextlib.contextmanager
+def poisoned(modules):
+    """Every function of these modules raises when it is called."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in modules:
+
+            def refuse(*_, name=module.__name__, **__):
+                raise AssertionError(f"{name} is off and was called")
+
+            functions = [
+                name
+                for name, value in vars(module).items()
+                if callable(value) and not isinstance(value, type)
+                if getattr(value, "__module__", None) == module.__name__
+            ]
+            assert "effect" in functions
+            for name in functions:
+                patch.setattr(module, name, refuse)
+        yield
+
+
+def file_of(module):
+    return "/".join(module.__file__.replace("\\", "/").split("/")[-3:])
