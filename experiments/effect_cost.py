@@ -79,7 +79,7 @@ class EffectCost:
 class Arm(NamedTuple):
     """One scene of a preset's table."""
 
-    name: str  # "bare", "only warp", "all", "without warp"
+    name: str  # "bare", "only warp", "warp + elastic", "all", "without warp"
     effect: str | None  # that is priced
     base: str | None  # the arm that its price is a difference from
     spec: Any
@@ -181,7 +181,8 @@ def arms(spec: Any) -> list[Arm]:
     for name in names:
         needed = tuple(x for x in NEEDS.get(name, ()) if x in names)
         base = f"only {needed[0]}" if needed else "bare"
-        found.append(Arm(f"only {name}", name, base, only(name, *needed)))
+        title = f"{needed[0]} + {name}" if needed else f"only {name}"
+        found.append(Arm(title, name, base, only(name, *needed)))
     if len(names) == 1:
         return found  # the only one is all there is
     found.append(Arm("all", None, "bare", spec))

@@ -93,7 +93,7 @@ def metrics_of(rows) -> list[Metric]:
     for preset, found in rows.items():
         bare = found[0]
         for row in found:
-            stem = f"{preset}.{row.arm.name.replace(' ', '_')}"
+            stem = f"{preset}.{row.arm.name.replace(' + ', '_and_').replace(' ', '_')}"
             metrics.append(
                 Metric(f"{stem}.parameters", row.parameters, "numbers", "lower")
             )

@@ -138,7 +138,7 @@ def test_scenes_of_a_preset_stand_behind_those_they_are_compared_with():
 
 def test_elastic_alone_is_priced_over_the_warp_it_needs():
     arms = {a.name: a for a in effect_cost.arms(field_presets.PRESETS["nerfies"])}
-    alone = arms["only elastic"]
+    alone = arms["warp + elastic"]
     assert alone.base == "only warp"
     assert effect_cost.effects_in(alone.spec) == ["warp", "elastic"]
     assert effect_cost.effects_in(arms["without warp"].spec) == ["appearance"]
