@@ -6,6 +6,7 @@ import time
 import numpy as np
 
 from experiments import (
+    inspect_bands,
     inspect_light,
     inspect_motion,
     inspect_outlines,
@@ -59,6 +60,7 @@ def inspect(capture: Capture) -> Inspection:
         inspect_stored.depth(looked, views, films),
         inspect_stored.masks(looked, views, films),
         inspect_stored.lens(capture),
+        inspect_bands.texture(looked, views, small.factor),
     )
     sheet = inspect_picture.sheet(views, films)
     seconds = time.perf_counter() - began

@@ -12,7 +12,7 @@ from experiments.inspect_views import Views
 
 EFFECT = "motion"
 REACH = 8  # frames before and after: what moves 0.1 px a frame on shows in them
-CENTRES = 16  # frames whose pixels are followed
+CENTRES = 12  # frames whose pixels are followed
 FEWEST_FRAMES = 3  # of one camera: two tell depth, and nothing else
 FEWEST_FOLLOWED = 4  # frames a pixel is followed to; fewer in shorter films
 # A path that a still point misses by so much moves. Still scenes (built-in `static`

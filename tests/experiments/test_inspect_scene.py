@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from experiments import (
+    inspect_bands,
     inspect_findings,
     inspect_job,
     inspect_scene,
@@ -197,6 +198,27 @@ def test_a_lens_is_measured_in_pixels():
     assert found.wanted
     film.cameras.radial[:, 0] = 0
     assert inspect_stored.lens(film).wanted is False
+
+
+@pytest.mark.parametrize("period_px", [4.0, 12.0])
+def test_the_finest_detail_is_that_of_the_picture(period_px):
+    film = inspect_films.film()
+    width, height = inspect_films.SIZE
+    wave = 0.5 + 0.3 * np.sin(2 * np.pi * np.arange(width) / period_px)
+    grey = np.tile(wave, (inspect_films.FRAMES, height, 1)).astype(np.float32)
+    found = inspect_bands.texture(film, still().views._replace(grey=grey), 1)
+    # A Hann window of 96 pixels smears a frequency by two lines of its spectrum.
+    slack = 2 * period_px / width
+    assert found.numbers["finest_px"] == pytest.approx(period_px, rel=slack)
+    halved = inspect_bands.texture(film, still().views._replace(grey=grey), 2)
+    assert halved.numbers["finest_px"] == 2 * found.numbers["finest_px"]
+
+
+@pytest.mark.parametrize("cycles", [0.1, 0.9, 7.0, 100.0])
+def test_the_last_band_is_fast_enough_and_the_one_before_is_not(cycles):
+    bands = inspect_bands.bands_for(cycles)
+    assert 2 ** (bands - 1) >= 2 * np.pi * cycles or bands == 1
+    assert bands == 1 or 2 ** (bands - 2) < 2 * np.pi * cycles
 
 
 @pytest.mark.parametrize(
