@@ -1,13 +1,13 @@
 """Where textbook formulas lose their digits, what ours keep, and what that costs.
 
     python -m experiments.hard_cases
-    python -m experiments.hard_cases --rooms rotations splats --rows 10000
+    python -m experiments.hard_cases --rooms rotations splats --repeats 30
     python -m experiments.hard_cases --document docs/numerics.md   # renew its table
 
 Every case sweeps a function to its singular point. The table shows the worst errors of
 value, slope and curvature of the textbook's form and of ours against 60-digit
 arithmetic, in float32 and float64, and the time of ours over the textbook's for values
-and for gradients, from interleaved calls over `--rows` inputs away from the singular
+and for gradients, from interleaved calls over many inputs away from the singular
 point. Saves hard_cases.json and a figure of each case.
 """
 
@@ -60,8 +60,8 @@ class HardCases:
     """Which rooms' cases."""
     cases: tuple[str, ...] = ()
     """Names of cases, or parts of names (default: all of the rooms)."""
-    rows: int = 20_000
-    """Inputs of a timed call."""
+    numbers: int = 300_000
+    """In the inputs of a timed call: fewer inputs where one holds more numbers."""
     repeats: int = 15
     """Timed calls of each form, in turn; the table shows medians."""
     out: pathlib.Path | None = None
@@ -76,9 +76,9 @@ class HardCases:
             raise ValueError(
                 f"--rooms {' '.join(self.rooms)}: choose from {', '.join(ROOMS)}"
             )
-        if self.rows < 1 or self.repeats < 1:
+        if self.numbers < 1 or self.repeats < 1:
             raise ValueError(
-                f"--rows {self.rows} and --repeats {self.repeats} are at least 1"
+                f"--numbers {self.numbers} and --repeats {self.repeats} are at least 1"
             )
 
 
@@ -112,7 +112,7 @@ def main(arguments=None):
         run_settings.start_jax(asked.device)
     rows = []
     for case, test in chosen:
-        rows.append(measure(case, test, asked.rows, asked.repeats))
+        rows.append(measure(case, test, asked.numbers, asked.repeats))
         print(report.block(rows[-1]), flush=True)
         report.save_figure(folder, rows[-1])
     report.save_numbers(folder, rows, asked)
@@ -140,7 +140,7 @@ def choose(rooms, names) -> list[tuple[Case, str]]:
     return chosen
 
 
-def measure(case: Case, test: str, rows: int, repeats: int) -> Row:
+def measure(case: Case, test: str, numbers: int, repeats: int) -> Row:
     """Errors in every precision that is held, and what the stable form costs."""
     outcomes = {}
     for dtype, bounds in case.bounds.items():
@@ -155,13 +155,14 @@ def measure(case: Case, test: str, rows: int, repeats: int) -> Row:
                     )
                 found[form].append(hard_case.errors(case, got, exact, order))
         outcomes[dtype] = Outcome(tuple(found["stable"]), tuple(found["textbook"]))
-    return Row(case, test, outcomes, *_costs(case, rows, repeats))
+    return Row(case, test, outcomes, *_costs(case, numbers, repeats))
 
 
-def _costs(case, rows, repeats):
+def _costs(case, numbers, repeats):
     if not case.alike:
         return math.nan, math.nan
     usual = case.inputs[len(case.inputs) // 2] if case.timed is None else case.timed
+    rows = max(1, numbers // len(usual))
     jitter = np.random.default_rng(0).uniform(-JITTER, JITTER, (rows, len(usual)))
     inputs = jnp.asarray(usual * (1 + jitter), jnp.float32)
 

@@ -146,7 +146,7 @@ def save_numbers(folder, rows, asked) -> None:
         measured = {"value": row.value_cost, "gradient": row.slope_cost}
         for name, cost in measured.items() if row.case.alike else ():
             metrics.append(Metric(f"{key}.{name}_cost", cost, "", "lower", 0.25))
-    about = {"rows": asked.rows, "repeats": asked.repeats, **clock.machine()}
+    about = {"numbers": asked.numbers, "repeats": asked.repeats, **clock.machine()}
     clock.write_metrics(folder / "hard_cases.json", metrics, about)
 
 

@@ -23,7 +23,7 @@ def test_names_tell_all_cases_apart():
 def test_the_command_measures_prints_draws_and_renews_the_page(tmp_path, capsys):
     page, out = tmp_path / "page.md", tmp_path / "out"
     page.write_text(PAGE)
-    words = ["--rooms", "encodings", "--cases", "window", "--rows", "10"]
+    words = ["--rooms", "encodings", "--cases", "window", "--numbers", "10"]
     words += ["--repeats", "1", "--out", str(out), "--document", str(page)]
     hard_cases.main(words)
     printed = capsys.readouterr().out
@@ -45,7 +45,7 @@ def test_the_command_measures_prints_draws_and_renews_the_page(tmp_path, capsys)
     [
         (["--rooms", "kitchen"], "choose from rotations"),
         (["--cases", "nothing"], "no such case; there are screw"),
-        (["--rows", "0"], "at least 1"),
+        (["--numbers", "0"], "at least 1"),
         (["--document", "nowhere.md"], "no such file, or not both"),
     ],
 )
