@@ -28,6 +28,9 @@ FALSE_SHARE = 0.001  # standard error: three times what still scenes leave
 CALM_PX = 2 * MOVES_PX / MOVES_DEVIATIONS
 # Paths are of use where at least so many of the textured pixels can be followed.
 FOLLOWED_SHARE, TEXTURED_SHARE = 0.3, 0.05
+# And "no" needs nearly all of them, in films of some length: what moves too fast to be
+# followed drops out. Still built-in scenes keep 0.9 to 0.99.
+FOLLOWED_FOR_NO, FEWEST_FOR_NO = 0.8, 9
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,15 +136,32 @@ def unusable(views: Views, found: list[Film]) -> str | None:
     textured = np.array([views.textured[centre.view].mean() for centre in centres])
     if np.median(textured) < TEXTURED_SHARE:
         return f"only {np.median(textured):.1%} of the pixels have texture to follow"
-    kept = [
-        centre.usable.sum() / max(views.textured[centre.view].sum(), 1)
-        for centre in centres
-    ]
-    if np.median(kept) < FOLLOWED_SHARE:
+    kept = _kept(views, centres)
+    if kept < FOLLOWED_SHARE:
         return (
-            f"views of neighbouring times are too far apart: {np.median(kept):.0%} of "
-            "the textured pixels can be followed"
+            f"views of neighbouring times are too far apart: {kept:.0%} of the "
+            "textured pixels can be followed"
         )
+    return None
+
+
+def _kept(views, centres):
+    """The share of the textured pixels that can be followed, in the median frame."""
+    return np.median(
+        [one.usable.sum() / max(views.textured[one.view].sum(), 1) for one in centres]
+    )
+
+
+def _why_not_no(views, found, noise):
+    """Why motion may be there and not show; None where it would."""
+    if noise > CALM_PX:
+        return f"above {CALM_PX:g} px slow motion would not show"
+    longest = max(len(film.sequence) for film in found)
+    if longest < FEWEST_FOR_NO:
+        return f"what moves far between {longest} frames cannot be followed"
+    kept = _kept(views, [one for film in found for one in film.centres])
+    if kept < FOLLOWED_FOR_NO:
+        return f"what is fast may be among the {1 - kept:.0%} that cannot be followed"
     return None
 
 
@@ -155,7 +175,8 @@ def motion(views: Views, found: list[Film], spans: tuple[float, float]) -> Findi
     shares = np.array([one.moving.sum() / one.usable.sum() for one in centres])
     noise = float(np.median([one.noise_px for one in centres]))
     wanted, confidence = judge(float(shares.mean()), MOVING_SHARE, FALSE_SHARE)
-    if wanted is False and noise > CALM_PX:
+    lost = _why_not_no(views, found, noise) if wanted is False else None
+    if lost is not None:
         wanted, confidence = None, CANNOT_TELL
     numbers = {
         "moving_share": float(shares.mean()),
@@ -167,8 +188,8 @@ def motion(views: Views, found: list[Film], spans: tuple[float, float]) -> Findi
         f"{shares.mean():.1%} of the pixels (up to {shares.max():.1%} of a frame) take "
         f"paths that no still point takes; the rest is explained to {noise:.2f} px"
     )
-    if wanted is None and noise > CALM_PX:
-        evidence += f"; above {CALM_PX:g} px slow motion would not show"
+    if lost is not None:
+        evidence += f"; {lost}"
     if wanted:
         speed = speeds(views, found, spans)
         numbers |= speed

@@ -132,9 +132,12 @@ def test_points_on_what_moves_are_no_background():
     "film",
     [
         functools.partial(inspect_films.film, frames=2),
+        functools.partial(
+            inspect_films.film, frames=5, card=inspect_films.swaying
+        ),  # too fast to be followed
         functools.partial(inspect_films.film, blank=True),
     ],
-    ids=["two frames", "nothing to see"],
+    ids=["two frames", "five frames", "nothing to see"],
 )
 def test_what_cannot_be_seen_decides_nothing_and_says_why(film):
     found = inspect_job.inspect(film()).finding("motion")
