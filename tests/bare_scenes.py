@@ -190,7 +190,9 @@ def splat_step(spec, facts, shuffled_row):
         shown = splats.active_harmonics(rows, degree)
         colour = harmonics.colour_towards(shown, gaussians.mean, camera.position)
         seen = projection.project(gaussians, camera, size, spec.raster)
-        placed = seen._replace(mean_px=seen.mean_px + offset)
+        placed = seen
+        if offset is not None:  # whose slope the density control wants to know
+            placed = seen._replace(mean_px=seen.mean_px + offset)
         image, passing = raster.rasterise(placed, colour, size, spec.raster)
         behind = jnp.asarray(facts.background, image.dtype)
         return image + behind * passing[..., None], seen
@@ -210,11 +212,14 @@ def splat_step(spec, facts, shuffled_row):
             )
             return value, (losses.mse(image, truth, valid), seen)
 
-        still = jnp.zeros_like(state.params.rows["splats"].mean[:, :2])
-        (value, (mse, seen)), (slope, moved) = jax.value_and_grad(
-            loss, argnums=(0, 1), has_aux=True
+        still, wanted = None, (0,)
+        if spec.density is not None:
+            still = jnp.zeros_like(state.params.rows["splats"].mean[:, :2])
+            wanted = (0, 1)
+        (value, (mse, seen)), slopes = jax.value_and_grad(
+            loss, argnums=wanted, has_aux=True
         )(state.params, still)
-        direction, moments = update(slope, state.optimiser, state.params)
+        direction, moments = update(slopes[0], state.optimiser, state.params)
         rates = splat_rates.learning_rates(
             spec.rates, facts.extent, spec.steps, state.step
         )
@@ -223,7 +228,9 @@ def splat_step(spec, facts, shuffled_row):
         extra = state.extra
         if spec.density is not None:
             radius_px = jnp.max(seen.extent_px, axis=1)
-            stats = density.observe(extra.stats, moved, seen.visible, radius_px, size)
+            stats = density.observe(
+                extra.stats, slopes[1], seen.visible, radius_px, size
+            )
             extra = extra._replace(stats=stats)
         state = TrainState(params, moments, extra, state.step + 1, state.key)
         return state, {"loss": value, "mse": mse}
