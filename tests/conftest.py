@@ -33,6 +33,31 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 SHARED = pathlib.Path(__file__).resolve().parents[2] / "shared"
 
 
+# Files too long for one worker; what a parameter of this name stands for is compiled
+# once and shared by all tests that have it.
+SHARED_BY = {
+    "test_hostile_fields.py": ("name", "paper"),
+    "test_hostile_splats.py": ("name", "preset"),
+    "test_rotations.py": ("case",),
+    "test_elastic_cases.py": ("case",),
+    "test_splat_cases.py": ("case",),
+}
+
+
+# First: xdist reads the groups in its own, later, turn.
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    for item in items:
+        group = item.path.name
+        values = item.callspec.params if hasattr(item, "callspec") else {}
+        for name in SHARED_BY.get(group, ()):
+            if name in values:
+                shared = values[name]
+                group = f"{group}-{getattr(shared, 'name', shared)}"
+                break
+        item.add_marker(pytest.mark.xdist_group(f"{item.path.parent.name}/{group}"))
+
+
 def pytest_collection_finish():
     gc.enable()
 

@@ -42,7 +42,8 @@ class Rendering(NamedTuple):
 
     colour: Float[Array, "height width 3"]  # sRGB; not clipped
     alpha: Float[Array, "height width"]
-    depth: Float[Array, "height width"]  # expected z-depth, scene units
+    # Expected z-depth, scene units; None in a training step that nobody asks for it.
+    depth: Float[Array, "height width"] | None
 
 
 class TrainState(NamedTuple):
