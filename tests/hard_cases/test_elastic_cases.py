@@ -121,7 +121,7 @@ def _field(params, point):
 @pytest.mark.slow
 @pytest.mark.parametrize("spec", [elastic.ElasticSpec(), None], ids=["robust", "plain"])
 def test_the_elastic_gradient_of_a_translating_warp_survives_float32(spec):
-    """Through warp, Jacobian and energy; 80 % wrong in the turn by the official lines."""
+    """Through warp, Jacobian and energy; officially 80 % wrong in the turn."""
     cost = matrix3.displacement_log_energy
     if spec is not None:
 
