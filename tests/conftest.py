@@ -3,6 +3,7 @@
 import gc
 import os
 import pathlib
+import signal
 import tempfile
 
 # XLA:CPU splits the bodies of tight loops over all visible cores, which slows the
@@ -29,6 +30,9 @@ _CACHE = os.environ.get(
 )
 jax.config.update("jax_compilation_cache_dir", _CACHE)
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+# A run in the background inherits an ignored SIGINT, and what Ctrl-C does is tested.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 SHARED = pathlib.Path(__file__).resolve().parents[2] / "shared"
 
