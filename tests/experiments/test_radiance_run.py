@@ -62,6 +62,7 @@ def test_a_field_leaves_the_files_of_a_run_and_no_gaussians(run):
         "metrics.json",
         "comparison.png",
         "psnr_over_time.png",
+        "curve.json",
         "scene.mp4",
         "report.html",
         "checkpoints",

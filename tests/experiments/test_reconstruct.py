@@ -182,6 +182,7 @@ def test_a_run_leaves_all_its_files(run):
         "metrics.json",
         "comparison.png",
         "psnr_over_time.png",
+        "curve.json",
         "scene.mp4",
         "gaussians.ply",
         "model.npz",
