@@ -194,7 +194,7 @@ def field():
     """A field whose warp and codes show, and a view of it."""
     capture = scenes.tiny_capture()
     facts = nerf_scene.facts_of(capture, TINY_FIELD)
-    params = nerf_scene.field(TINY_FIELD, facts).init(jax.random.key(0))
+    params = nerf_scene.field(TINY_FIELD, facts).init(jax.random.key(3))
     params["warp"] = jax.tree.map(lambda leaf: leaf + 0.1, params["warp"])
     params["codes"] = jax.tree.map(lambda leaf: 40 * leaf, params["codes"])
     view = evaluate.view_of(capture, int(capture.heldout[0]))
