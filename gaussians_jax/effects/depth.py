@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from gaussians_jax.effects.effect import Effect, Moment, Shot, Term
 from gaussians_jax.splats import Params
+from nerfies_jax.geometry.precision import widened
 from nerfies_jax.training import losses
 
 NAME = "depth"
@@ -172,7 +173,7 @@ def loss(spec: DepthSpec, shot: Shot) -> Term:
     if truth is None:
         return Term(jnp.zeros((), shot.truth.dtype), {})
     # Depths are often kept in half precision, which neither counts nor centres them.
-    truth, drawn = losses.widened(truth), losses.widened(shot.rendering.depth)
+    truth, drawn = widened(truth), widened(shot.rendering.depth)
     known = (truth > 0) & jnp.isfinite(truth) & (drawn > 0) & jnp.isfinite(drawn)
     known = known & (shot.rendering.alpha >= spec.opaque)
     if shot.valid is not None:

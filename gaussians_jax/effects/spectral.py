@@ -15,7 +15,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from gaussians_jax.effects.effect import Effect, Moment, Shot, Term
 from gaussians_jax.splats import Params
-from nerfies_jax.training import losses, schedules
+from nerfies_jax.geometry.precision import widened
+from nerfies_jax.training import schedules
 
 NAME = "spectral"
 GATES = ("learned", "floor", "fixed", "schedule")
@@ -201,7 +202,7 @@ def filled(
     A spectrum needs whole pictures. Pixels that are not valid then add no difference
     and have no slope; a truth that is not finite there counts as black in both.
     """
-    render, truth = losses.widened(render), losses.widened(truth)
+    render, truth = widened(render), widened(truth)
     if valid is None:
         return render, truth
     keep = valid[..., None]
@@ -256,7 +257,7 @@ def amplitudes(
 
     The slope of an amplitude is taken as zero where it vanishes.
     """
-    spectrum = jnp.fft.rfft2(losses.widened(image), axes=(0, 1), norm="ortho")
+    spectrum = jnp.fft.rfft2(widened(image), axes=(0, 1), norm="ortho")
     # abs, not a root of squares, whose slope at zero is NaN.
     return jnp.abs(spectrum)
 
@@ -325,7 +326,7 @@ def loss(
     valid: Bool[Array, "height width"] | None = None,
 ) -> Term:
     """Equation 17, and the weights and unweighted losses to log."""
-    value, metrics = jnp.zeros((), losses.widened(truth).dtype), {}
+    value, metrics = jnp.zeros((), widened(truth).dtype), {}
     terms = (
         ("wavelet", wavelet_loss, spec.wavelet, weight.wavelet),
         ("fourier", fourier_loss, spec.fourier, weight.fourier),

@@ -9,6 +9,7 @@ import functools
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 _HALVES = (jnp.dtype(jnp.bfloat16), jnp.dtype(jnp.float16))
 
@@ -21,16 +22,26 @@ def at_least_float32(function):
     """
 
     @functools.wraps(function)
-    def widened(*args):
+    def wide(*args):
         kinds = {arg.dtype for arg in args if hasattr(arg, "dtype")}
         if not kinds.intersection(_HALVES):
             return function(*args)
-        results = function(*(_widened(arg) for arg in args))
+        results = function(*(_wide(arg) for arg in args))
         if len(kinds) > 1:
             return results
         return jax.tree.map(lambda leaf: leaf.astype(*kinds), results)
 
-    return widened
+    return wide
+
+
+def widened(values: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """At least float32: what is narrower counts pixels wrongly and loses variances.
+
+    A masked mean over 200x180 pixels in bfloat16 reads 0.064 for 0.039, because a count
+    stops at 256, SSIM of equal images -0.68; from 65504 pixels on float16 counts to
+    infinity, which a PSNR takes for no error. Slopes come back in the caller's type.
+    """
+    return values.astype(jnp.float32) if values.dtype in _HALVES else values
 
 
 def refuse_half(what: str, *arrays) -> None:
@@ -44,6 +55,5 @@ def refuse_half(what: str, *arrays) -> None:
             )
 
 
-def _widened(arg):
-    half = getattr(arg, "dtype", None) in _HALVES
-    return arg.astype(jnp.float32) if half else arg
+def _wide(arg):
+    return widened(arg) if getattr(arg, "dtype", None) in _HALVES else arg

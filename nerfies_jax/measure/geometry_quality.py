@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from nerfies_jax.training.losses import widened
+from nerfies_jax.geometry.precision import widened
 
 DELTA = 1.25  # ratio of depths that still counts as right, Eigen et al. 2014
 # KITTI 2015 calls a flow wrong beyond 3 px and 5 % of its length.

@@ -4,7 +4,7 @@ Pictures are `[height, width, channels]` in [0, 1]; batches go through `jax.vmap
 Published numbers mix protocols, so each one has its name here: `padding="valid"` is
 scikit-image's Gaussian SSIM, `padding="zero"` INRIA's (0.002 to 0.011 higher on
 photographs), and `quantise` first gives the score of the 8-bit file others re-read.
-Pictures narrower than float32 are widened to it first (`losses.widened`).
+Pictures narrower than float32 are widened to it first (`widened`).
 """
 
 from typing import Literal
@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from nerfies_jax.geometry.precision import widened
 from nerfies_jax.training import losses
 
 TAPS = len(losses.WINDOW)  # 11 pixels
@@ -39,7 +40,7 @@ def psnr(
     The cap (`losses.LEAST_MSE`) is a maximum, not an offset: adding 1e-10 instead would
     report 79.957 dB where 80 is true. Equal pictures have gradient zero.
     """
-    error = losses.widened(image) - losses.widened(truth)
+    error = widened(image) - widened(truth)
     return losses.psnr(jnp.mean(error**2))
 
 
@@ -54,7 +55,7 @@ def masked_psnr(
     the mask may be anything, NaN included.
     """
     mask = mask[..., None]
-    image, truth = losses.widened(image), losses.widened(truth)
+    image, truth = widened(image), widened(truth)
     # Both pictures are emptied before the difference: NaN * 0 is NaN, and so is the
     # gradient of a `where` whose other branch is NaN.
     error = jnp.where(mask, image, 0.0) - jnp.where(mask, truth, 0.0)
@@ -101,7 +102,7 @@ def ms_ssim(
     another metric: report the number of scales beside the score.
     """
     _check_scales(image.shape, scales)
-    image, truth = losses.widened(image), losses.widened(truth)
+    image, truth = widened(image), widened(truth)
     weights = SCALE_WEIGHTS[:scales]
     if scales < len(SCALE_WEIGHTS):
         weights = [weight / sum(weights) for weight in weights]
@@ -160,7 +161,7 @@ def masked_ssim(
             f"masked SSIM needs {TAPS}x{TAPS} pixels, got {mask.shape[1]}x"
             f"{mask.shape[0]}; use masked_psnr"
         )
-    image, truth = losses.widened(image), losses.widened(truth)
+    image, truth = widened(image), widened(truth)
     inside = mask[..., None].astype(image.dtype)
     image, truth = (jnp.where(mask[..., None], x, 0.0) for x in (image, truth))
     weight = _window_mean(inside)
@@ -188,7 +189,7 @@ def partial_ssim(
     a constant is not kept near the mask's edge; variances are clipped; and windows
     without any pixel count as a perfect 1. `masked_ssim` does none of that.
     """
-    image, truth = losses.widened(image), losses.widened(truth)
+    image, truth = widened(image), widened(truth)
     inside = mask.astype(image.dtype)[..., None]
     image, truth = (jnp.where(mask[..., None], x, 0.0) for x in (image, truth))
 

@@ -18,8 +18,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from nerfies_jax.geometry.precision import widened
 from nerfies_jax.measure import weight_files
-from nerfies_jax.training import losses
 
 # The reference's ImageNet statistics, moved to pictures in [-1, 1].
 SHIFT = (-0.030, -0.088, -0.188)
@@ -188,7 +188,7 @@ def features(
 def _stage_distances(params, network, image, truth, scaling):
     if scaling not in ("standard", "unscaled"):
         raise ValueError(f'scaling must be "standard" or "unscaled", got {scaling!r}')
-    image, truth = losses.widened(image), losses.widened(truth)
+    image, truth = widened(image), widened(truth)
     if scaling == "standard":
         image, truth = 2.0 * image - 1.0, 2.0 * truth - 1.0
     pairs = zip(

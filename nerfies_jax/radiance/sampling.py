@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
+from nerfies_jax.geometry.precision import widened
+
 SPACINGS = ("linear", "disparity")
 NERF_FLOOR = 1e-5  # what the published codes add to every weight before they invert
 
@@ -83,8 +85,7 @@ def from_weights(
     dtype = edges.dtype
     edges, weights = jax.lax.stop_gradient((edges, weights))
     # A rounding unit of bfloat16 on each of 64 bins would be a third of all weight.
-    if dtype.itemsize < 4:
-        edges, weights = edges.astype(jnp.float32), weights.astype(jnp.float32)
+    edges, weights = widened(edges), widened(weights)
     limits = jnp.finfo(weights.dtype)
     if floor is None:
         # Absolute floors drown faint rays: weights that sum to 1e-30 under 1e-5 move
