@@ -72,12 +72,7 @@ def save(path: str | os.PathLike, rows: Splats, *, spz_version: int = 3) -> int:
             f"{path}: no writer for {path.suffix or 'a name without suffix'}; "
             f"known are {', '.join(SUFFIXES)}"
         )
-    # NaN compares false, but is no mark of death: such a row is refused below.
-    living = np.asarray(splats.alive(rows)) | np.isnan(rows.opacity_logit)
-    if not living.any():
-        raise ValueError(
-            f"{path}: none of the {len(living)} rows is alive; not written"
-        )
+    living = splats.rows_to_write(rows, path)
     kept = Splats(*(np.asarray(leaf, np.float32)[living] for leaf in rows))
     try:
         kept, _ = _without_broken(kept, False)

@@ -50,12 +50,7 @@ def save(path: str | os.PathLike, params: Params, description: dict[str, Any]) -
     """
     path = pathlib.Path(path)
     rows = params.rows["splats"]
-    # NaN compares false, but is no mark of death: such a row is refused below.
-    living = np.asarray(splats.alive(rows)) | np.isnan(rows.opacity_logit)
-    if not living.any():
-        raise ValueError(
-            f"{path}: none of the {len(living)} rows is alive; not written"
-        )
+    living = splats.rows_to_write(rows, path)
     rows = jax.tree.map(lambda leaf: np.asarray(leaf)[living], params.rows)
     arrays: dict[str, np.ndarray] = {}
     try:

@@ -7,6 +7,7 @@ between two chunks revives a row. `alive` reads that mark and nothing else.
 """
 
 import math
+import pathlib
 from typing import Any, NamedTuple
 
 import jax
@@ -88,6 +89,20 @@ def activate(splats: Splats) -> Gaussians:
 def alive(splats: Splats) -> Bool[Array, " gaussians"]:
     """Which rows stand for a Gaussian; the others only fill the capacity."""
     return splats.opacity_logit > DEAD_LOGIT / 2
+
+
+def rows_to_write(splats: Splats, path: pathlib.Path) -> np.ndarray:
+    """[gaussians] bool: what of them a file holds; ValueError where that is none.
+
+    NaN compares false, but is no mark of death: such a row counts, and the writer
+    refuses it.
+    """
+    living = np.asarray(alive(splats)) | np.isnan(splats.opacity_logit)
+    if not living.any():
+        raise ValueError(
+            f"{path}: none of the {len(living)} rows is alive; not written"
+        )
+    return living
 
 
 def active_degree(step: Int[Array, ""], every: int, degree: int) -> Int[Array, ""]:
