@@ -4,7 +4,6 @@ import math
 import pathlib
 from collections.abc import Mapping, Sequence
 
-import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -188,32 +187,3 @@ def _draw_front(panel, job, means, quality, cost):
         panel.invert_yaxis()  # better is up everywhere
     panel.grid(alpha=0.3)
     panel.spines[["top", "right"]].set_visible(False)
-
-
-def baseline(path: pathlib.Path) -> dict[str, Metric]:
-    """The metrics of an earlier run; ValueError where there are none."""
-    try:
-        return clock.read_metrics(path)
-    except OSError as error:
-        raise ValueError(
-            f"--check {path}: cannot be read ({error.strerror}); name an "
-            "accuracy_time.json"
-        ) from error
-
-
-def changes(metrics: Sequence[Metric], before: Mapping[str, Metric]) -> list[str]:
-    """One line for each number that is worse than before by more than its tolerance.
-
-    Only what both runs have is held; a number that was unknown before never is worse.
-    """
-    lines = []
-    for metric in metrics:
-        old = before.get(metric.key)
-        if old is None or not np.isfinite(old.value) or metric.key.endswith(".spread"):
-            continue
-        if not metric.holds(old.value):
-            lines.append(
-                f"worse: {metric.key} {metric.value:.4g} {metric.unit}, was "
-                f"{old.value:.4g} (tolerance {metric.tolerance:.3g})"
-            )
-    return lines

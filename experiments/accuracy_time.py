@@ -18,6 +18,7 @@ import dataclasses
 import pathlib
 from typing import Literal
 
+from experiments import ablate
 from experiments import settings as run_settings
 from experiments.accuracy_axes import AXES
 
@@ -77,11 +78,13 @@ class AccuracyTime:
 
 def main(arguments=None):
     """Run the job of the command line; exit code 2 where its input is wrong."""
-    from experiments import accuracy_report
+    from experiments import accuracy_report, baselines
 
     with run_settings.user_errors():
         asked = run_settings.parse(AccuracyTime, arguments)
-        before = None if asked.check is None else accuracy_report.baseline(asked.check)
+        before = None
+        if asked.check is not None:
+            before = baselines.read(asked.check, "accuracy_time.json")
         job = _job(asked)
     from experiments import ablate_pool
 
@@ -92,7 +95,7 @@ def main(arguments=None):
     if finished:
         metrics = accuracy_report.write(job, asked, finished)
         if before is not None:
-            worse = accuracy_report.changes(metrics, before)
+            worse = baselines.changes(metrics, before)
             print("\n".join(worse) or f"nothing is worse than in {asked.check}")
     missing = len(job.tasks()) - len(finished)
     if missing:
@@ -103,11 +106,9 @@ def main(arguments=None):
 
 def _job(asked):
     """The runs as an ablation of the suite "settings", each in its own process."""
-    from experiments.ablate import Ablate
-
     source = asked.scene if asked.capture is None else asked.capture.resolve().name
     out = asked.out or pathlib.Path("runs", f"accuracy_time-{source}")
-    ablation = Ablate(
+    ablation = ablate.Ablate(
         suite="settings",
         arms=asked.arms,
         scene=asked.scene,
@@ -124,8 +125,6 @@ def _job(asked):
         set=asked.set,
         device=asked.device,
     )
-    from experiments import ablate
-
     ablate.check(ablation)
     run_settings.start_jax(asked.device)
     from experiments.ablate_job import Job

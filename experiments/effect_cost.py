@@ -115,9 +115,12 @@ def main(arguments=None):
 
         # Compiling is one of the prices; JAX asks once, when it first compiles.
         jax.config.update("jax_enable_compilation_cache", False)
+        from experiments import baselines
         from experiments import effect_cost_report as report
 
-        before = None if asked.check is None else report.baseline(asked.check)
+        before = None
+        if asked.check is not None:
+            before = baselines.read(asked.check, "effect_cost.json")
         tables = {name: arms(_spec(name, asked)) for name in asked.presets}
         folder = run_settings.new_run_folder(asked.out, "effect_cost")
     print(report.heading())
@@ -127,7 +130,7 @@ def main(arguments=None):
         print(report.table(name, rows[name]), flush=True)
     metrics = report.write(folder, rows, asked)
     print(f"saved in {folder}")
-    worse = [] if before is None else report.changes(metrics, before)
+    worse = [] if before is None else baselines.changes(metrics, before)
     if before is not None:
         print("\n".join(worse) or f"nothing is worse than in {asked.check}")
     raise SystemExit(1 if worse else 0)

@@ -6,12 +6,9 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from experiments.accuracy_report import changes
 from nerfies_jax.capture.json_files import replaced_file
 from nerfies_jax.measure import clock
 from nerfies_jax.measure.clock import Metric
-
-__all__ = ["baseline", "changes", "heading", "metrics_of", "save_figure", "table"]
 
 # (field of `Priced`, unit, share of the new value by which it may be above the old, so
 # that a half is twice as much). Counts repeat exactly under one version of XLA; times
@@ -114,17 +111,6 @@ def metrics_of(rows) -> list[Metric]:
                 tolerance = RATIO_TOLERANCE * ratio
                 metrics.append(Metric(key, ratio, "", "lower", tolerance))
     return metrics
-
-
-def baseline(path: pathlib.Path) -> dict[str, Metric]:
-    """The metrics of an earlier run; ValueError where there are none."""
-    try:
-        return clock.read_metrics(path)
-    except OSError as error:
-        raise ValueError(
-            f"--check {path}: cannot be read ({error.strerror}); name an "
-            "effect_cost.json"
-        ) from error
 
 
 def write(folder: pathlib.Path, rows, asked) -> list[Metric]:

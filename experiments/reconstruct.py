@@ -142,14 +142,16 @@ def _new(asked, runs):
         heldout=asked.heldout,
         seed=asked.seed,
     )
+    stored = None
     if asked.effects == "auto":
         from experiments import inspect_advice, inspect_job
 
         runs.scene_spec(choices)  # refuses a wrong preset before half a minute's look
-        found = inspect_job.inspect(runs.stored_capture(choices))
+        stored = runs.stored_capture(choices)
+        found = inspect_job.inspect(stored)
         choices, lines = inspect_advice.follow(choices, found.findings)
         print("\n".join(lines))
-    return runs.new_run(choices)
+    return runs.new_run(choices, stored)
 
 
 def _start(asked, run, runs):

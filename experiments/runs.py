@@ -47,15 +47,23 @@ class Run(NamedTuple):
     model: Model
 
 
-def new_run(choices: Choices) -> Run:
-    """A run as it is asked for; ValueErrors name what the user can mend."""
+def new_run(choices: Choices, stored: Capture | None = None) -> Run:
+    """A run as it is asked for; ValueErrors name what the user can mend.
+
+    `stored` is its `stored_capture` where that has been read already.
+    """
     representation = representations.of_preset(choices.preset)
-    return open_run(choices, representation, scene_spec(choices))
+    return open_run(choices, representation, scene_spec(choices), stored)
 
 
-def open_run(choices: Choices, representation: Representation, spec: Any) -> Run:
+def open_run(
+    choices: Choices,
+    representation: Representation,
+    spec: Any,
+    stored: Capture | None = None,
+) -> Run:
     """Read the capture and build the model."""
-    capture = read_capture(choices)
+    capture = pinholes.as_pinholes(stored or stored_capture(choices))
     facts = representation.facts_of(capture, spec)
     model = representation.build(spec, facts)
     return Run(choices, capture, representation, spec, facts, model)

@@ -7,7 +7,7 @@ import types
 
 import pytest
 
-from experiments import ablate, accuracy_report, accuracy_time
+from experiments import ablate, accuracy_report, accuracy_time, baselines
 from experiments.ablate_job import Job
 from experiments.ablate_measures import MEASURES
 from experiments.accuracy_axes import AXES, SETTINGS, Axis
@@ -93,7 +93,7 @@ def test_what_got_worse_is_named_and_what_is_new_is_not():
         metric("a.track_error", 9.0, "lower"),
         metric("b.psnr", 1.0, "higher"),
     ]
-    (line,) = accuracy_report.changes(now, before)
+    (line,) = baselines.changes(now, before)
     assert "a.psnr" in line
     assert "19.4" in line
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import effect_cost, matrix_flops
+from experiments import baselines, effect_cost, matrix_flops
 from experiments import effect_cost_report as report
 from experiments.effect_cost import Arm, EffectCost, Priced, Row
 from gaussians_jax import presets as splat_presets
@@ -190,20 +190,20 @@ def test_what_became_dearer_than_its_tolerance_is_named(tmp_path):
     stored = json.loads((tmp_path / "effect_cost.json").read_text())
     assert stored["about"]["cpu"] == clock.machine()["cpu"]
     assert "a loop's body once" in stored["about"]["counts"]
-    before = report.baseline(tmp_path / "effect_cost.json")
+    before = clock.read_metrics(tmp_path / "effect_cost.json")
     same = report.metrics_of({"nerfies-small": ROWS})
-    assert report.changes(same, before) == []
+    assert baselines.changes(same, before) == []
     # A hundredth more flops, a tenth more time: only the first repeats exactly.
     dearer = [*ROWS[:1], row("only warp", "bare", 0.0176, 2.02e9)]
-    worse = report.changes(report.metrics_of({"nerfies-small": dearer}), before)
+    worse = baselines.changes(report.metrics_of({"nerfies-small": dearer}), before)
     assert [line.split()[1] for line in worse] == [
         f"nerfies-small.only_warp.{name}.flops" for name in ("loss", "step")
     ]
     slower = [*ROWS[:1], row("only warp", "bare", 0.024)]
-    worse = report.changes(report.metrics_of({"nerfies-small": slower}), before)
+    worse = baselines.changes(report.metrics_of({"nerfies-small": slower}), before)
     assert {line.split()[1].split(".")[-1] for line in worse} == {"over_bare"}
     with pytest.raises(ValueError, match=r"--check .*none.json"):
-        report.baseline(tmp_path / "none.json")
+        baselines.read(tmp_path / "none.json", "effect_cost.json")
 
 
 def test_tolerances_are_those_of_the_value(tmp_path):
