@@ -14,6 +14,7 @@ class Arm:
     preset: str
     changes: tuple[str, ...] = ()
     needs: Literal["depths"] | None = None  # in the capture, or it changes nothing
+    environment: tuple[str, ...] = ()  # of its process: NAME=VALUE
 
 
 class Claim(NamedTuple):

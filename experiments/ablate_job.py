@@ -184,6 +184,8 @@ class Job:
                 return
             if self.kept(name, seed, budget) is not None:
                 return
+            with run_settings.user_errors():
+                self._check_environment(name)
             if budget.seconds is None:
                 steps = self.spec(name, budget.steps).steps
                 kept = self._train(name, seed, steps)
@@ -196,6 +198,15 @@ class Job:
             identity = self._identity(name, seed, steps, budget)
             ablate_kept.write(path, identity, kept)
         say("    " + line(kept.numbers))
+
+    def _check_environment(self, name):
+        for word in self.suite.arms[name].environment:
+            variable, value = word.split("=", 1)
+            if os.environ.get(variable) != value:
+                raise ValueError(
+                    f"{name} is trained under {word}: set it, or give --jobs 2, which "
+                    "gives every arm a process and sets it there"
+                )
 
     def _train_for(self, name, budget) -> tuple[int, Kept]:
         """The first seed, over as many steps as can be made in the time given.

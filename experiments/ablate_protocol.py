@@ -18,7 +18,7 @@ from experiments.evaluate import Renderer, Scored
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.synthetic import SceneTruth
 from nerfies_jax.measure import geometry_quality, image_quality
-from nerfies_jax.training.model import TrainState
+from nerfies_jax.training.model import TrainState, in_default_precision
 
 CORRECT_WITHIN = 0.01  # scene units: a quarter of the default cube's half-side
 STILL_POINTS = 500  # of the capture's static points, to see whether they drift
@@ -230,7 +230,7 @@ def follow_fields(spec, facts, state, capture, known) -> Followed | None:
     centre = np.asarray(facts.centre, np.float32)
 
     def to_field(points):
-        return jnp.asarray((points - centre) * np.float32(facts.scale))
+        return in_default_precision((points - centre) * np.float32(facts.scale))
 
     still = np.zeros((0, 3), np.float32)
     if capture.points is not None:
@@ -294,7 +294,7 @@ def follow_splats(spec, facts, state, capture, known) -> Followed | None:
     stages = scene.build(spec, facts).stages
     prepared = jax.jit(stages.prepare)(state.params)
     pose = jax.jit(lambda params, ready, time: stages.pose(params, ready, time))
-    times = jnp.asarray(capture.times[known.moments])
+    times = in_default_precision(capture.times[known.moments])
     # [moments, gaussians, 3]
     means = np.stack(
         [np.asarray(pose(state.params, prepared, time).mean) for time in times]

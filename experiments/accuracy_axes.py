@@ -35,6 +35,21 @@ def _axis(question: str, preset: str, **changes: str) -> Axis:
     return Axis(question, preset, settings)
 
 
+def _precisions(preset: str, stem: str) -> dict[str, Arm]:
+    """The preset under each of JAX's own switches of precision.
+
+    XLA for CPUs takes the one for products as a hint: it sums float32 as before, in
+    another order, and saves nothing.
+    """
+    return {
+        preset: Arm(preset),
+        f"{stem}-products-bfloat16": Arm(
+            preset, environment=("JAX_DEFAULT_MATMUL_PRECISION=BF16_BF16_F32",)
+        ),
+        f"{stem}-float64": Arm(preset, environment=("JAX_ENABLE_X64=1",)),
+    }
+
+
 _PRESETS = (
     "splats-static-small",
     SPLATS,
@@ -143,6 +158,14 @@ AXES = {
         "rotation and translation, or translation alone",
         FIELD,
         **{"warp-translation": "warp.kind=translation"},
+    ),
+    "precision": Axis(
+        "in which precision a field is trained", FIELD, _precisions(FIELD, "field")
+    ),
+    "splat-precision": Axis(
+        "in which precision Gaussians are trained",
+        SPLATS,
+        _precisions(SPLATS, "splats"),
     ),
     "bands": _axis(
         "how many bands encode the position",

@@ -13,7 +13,14 @@ from nerfies_jax.capture.flow import training_flow
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.measure import image_quality
-from nerfies_jax.training.model import Frames, Model, Rendering, TrainState, View
+from nerfies_jax.training.model import (
+    Frames,
+    Model,
+    Rendering,
+    TrainState,
+    View,
+    in_default_precision,
+)
 
 
 class Scored(NamedTuple):
@@ -32,30 +39,32 @@ def frames_of(capture: Capture, wants: frozenset[str] = frozenset()) -> Frames:
     rows = capture.train
     beside = {}
     if "depths" in wants and capture.depths is not None:
-        beside["depths"] = jnp.asarray(capture.depths[rows])
+        beside["depths"] = capture.depths[rows]
     if "points" in wants and capture.points is not None:
-        beside["points"] = jnp.asarray(capture.points.position)
+        beside["points"] = capture.points.position
     if "flow" in wants and capture.flow is not None:
-        beside["flow"] = jax.tree.map(jnp.asarray, training_flow(capture))
-    return Frames(
-        images=jnp.asarray(capture.images[rows]),
-        cameras=jax.tree.map(jnp.asarray, cameras.take(capture.cameras, rows)),
-        times=jnp.asarray(capture.times[rows]),
-        warp=jnp.asarray(capture.warp_ids[rows]),
-        appearance=jnp.asarray(capture.appearance_ids[rows]),
-        valid=None if capture.valid is None else jnp.asarray(capture.valid[rows]),
+        beside["flow"] = training_flow(capture)
+    frames = Frames(
+        images=capture.images[rows],
+        cameras=cameras.take(capture.cameras, rows),
+        times=capture.times[rows],
+        warp=capture.warp_ids[rows],
+        appearance=capture.appearance_ids[rows],
+        valid=None if capture.valid is None else capture.valid[rows],
         **beside,
     )
+    return in_default_precision(frames)
 
 
 def view_of(capture: Capture, row: int) -> View:
     """The view in which a frame was filmed."""
-    return View(
-        jax.tree.map(jnp.asarray, cameras.take(capture.cameras, row)),
-        jnp.asarray(capture.times[row]),
-        jnp.asarray(capture.warp_ids[row]),
-        jnp.asarray(capture.appearance_ids[row]),
+    view = View(
+        cameras.take(capture.cameras, row),
+        capture.times[row],
+        capture.warp_ids[row],
+        capture.appearance_ids[row],
     )
+    return in_default_precision(view)
 
 
 def resized(view: View, old: tuple[int, int], new: tuple[int, int]) -> View:
@@ -69,7 +78,7 @@ def path_views(path: Camera, times: np.ndarray, like: View) -> list[View]:
     """Views along a camera path, one for each time; codes as in `like`."""
     return [
         like._replace(
-            camera=jax.tree.map(jnp.asarray, cameras.take(path, row)),
+            camera=in_default_precision(cameras.take(path, row)),
             time=jnp.asarray(moment, like.time.dtype),
         )
         for row, moment in enumerate(times)
@@ -174,9 +183,14 @@ class _Programs(NamedTuple):
     draw: Callable
 
 
+def _float32(rendering):
+    """A picture needs no more, whatever precision it was computed in."""
+    return jax.tree.map(lambda leaf: leaf.astype(jnp.float32), rendering)
+
+
 def _whole(model, size, inputs):
     def render(params, view, step):
-        return model.render(params, view, size, step)
+        return _float32(model.render(params, view, size, step))
 
     return jax.jit(render).lower(*inputs).compile()
 
@@ -185,7 +199,7 @@ def _staged(model, size, inputs):
     stages, (params, view, step) = model.stages, inputs
 
     def draw(params, posed, view, step):
-        return stages.draw(params, posed, view, size, step)
+        return _float32(stages.draw(params, posed, view, size, step))
 
     prepare = jax.jit(stages.prepare).lower(params)
     pose = jax.jit(stages.pose).lower(params, prepare.out_info, view.time)

@@ -30,6 +30,7 @@ from nerfies_jax.training.model import (
     Stages,
     TrainState,
     View,
+    in_default_precision,
 )
 
 PyTree = Any
@@ -208,7 +209,7 @@ def shot(
     """What the losses compare: a frame that was drawn with the one that was filmed."""
     return Shot(
         rendering,
-        frames.images[row].astype(jnp.float32) / 255,
+        frames.images[row].astype(frames.times.dtype) / 255,
         None if frames.valid is None else frames.valid[row],
         None if frames.depths is None else frames.depths[row],
     )
@@ -276,6 +277,7 @@ def first_state(spec, effects, optimiser, capture, key) -> TrainState:
         if effect.init_nets is not None:
             params.nets[effect.name] = effect.init_nets(nets_key)
     params = splats.pad_rows(params, splats.capacity_for(count, most))
+    params = in_default_precision(params)
     stats = () if spec.density is None else density.empty_stats(params.rows["splats"])
     extra = Extra(stats, carried_by(effects, params))
     return TrainState(

@@ -27,7 +27,13 @@ from nerfies_jax.geometry import rays
 from nerfies_jax.nets import codes
 from nerfies_jax.spec import RadianceScene
 from nerfies_jax.training import loop, losses, schedules
-from nerfies_jax.training.model import Frames, Model, TrainState, View
+from nerfies_jax.training.model import (
+    Frames,
+    Model,
+    TrainState,
+    View,
+    in_default_precision,
+)
 
 __all__ = ["Facts", "Field", "RadianceScene", "build", "facts_of", "field"]
 
@@ -83,7 +89,7 @@ def build(spec: RadianceScene, facts: Facts) -> Model:
     def init(capture, key):
         codes.check_ids(capture.appearance_ids, len(facts.exposures), "appearance_ids")
         start_key, run_key = jax.random.split(key)
-        params = made.init(start_key)
+        params = in_default_precision(made.init(start_key))
         return TrainState(
             params, optimiser.init(params), (), jnp.zeros((), jnp.int32), run_key
         )

@@ -356,7 +356,7 @@ def flow_term(
     )
     total = jnp.zeros((), level.point.dtype)
     for sign, one, (shift, seen, rows) in zip(SIGNS, sides, pairs, strict=True):
-        other = rows[batch.row]
+        other = rows[batch.row].astype(batch.row.dtype)
         elapsed = sign * (frames.times[other] - context.moments.time) / gap
         point = level.point + elapsed[:, None, None] * one.flow
         place = flow_losses.settle(weight, point) / context.box.scale

@@ -3,6 +3,8 @@
 from collections.abc import Callable, Hashable
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
 from nerfies_jax.capture.flow import FrameFlow
@@ -58,6 +60,22 @@ class TrainState(NamedTuple):
     extra: PyTree  # what the representation carries beside: row statistics, ...
     step: Int[Array, ""]
     key: Key[Array, ""]  # of the run; step i uses fold_in(key, i)
+
+
+def in_default_precision(tree: PyTree) -> PyTree:
+    """A pytree on the device, its floating arrays as `jax_enable_x64` says.
+
+    float32, or float64 where it is on; what is drawn at random is drawn in float32
+    first, so both precisions start alike. Other arrays stay as they are.
+    """
+    default = jnp.result_type(float)
+
+    def convert(leaf):
+        leaf = jnp.asarray(leaf)
+        wrong = jnp.issubdtype(leaf.dtype, jnp.floating) and leaf.dtype != default
+        return leaf.astype(default) if wrong else leaf
+
+    return jax.tree.map(convert, tree)
 
 
 class Event(NamedTuple):
