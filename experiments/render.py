@@ -5,6 +5,7 @@ python -m experiments.render RUN --path orbit            # mp4 of the moving sce
 python -m experiments.render RUN --path sway --freeze 0.5
 python -m experiments.render RUN --path sway --show depth
 python -m experiments.render RUN --without warp          # the canonical scene
+python -m experiments.render RUN --hide-moving 0.02       # what stands still alone
 python -m experiments.render RUN --path sway --freeze 0 --appearance 0 7
 python -m experiments.render RUN --path sway --knots 32   # the motion from a table
 python -m experiments.render RUN --path sway --still-below 1e-4
@@ -51,6 +52,9 @@ class Render:
     still_below: float | None = None
     """Do not evaluate the motion of Gaussians that move less than this, in scene units;
     1e-4 is not seen."""
+    hide_moving: float | None = None
+    """Leave out the Gaussians that move farther than this, in scene units: the static
+    scene, with holes where nothing was ever filmed behind what moves."""
     show: Literal["colour", "depth"] = "colour"
     """What the png and mp4 pictures show; depth is bright near and dark far."""
     out: pathlib.Path | None = None
@@ -73,11 +77,13 @@ class Render:
             raise ValueError(
                 f"--interpolation {self.interpolation} is for --knots; say how many"
             )
-        if self.still_below is not None and not 0 <= self.still_below < math.inf:
-            raise ValueError(
-                f"--still-below {self.still_below}: a distance in scene units, not "
-                "negative"
-            )
+        for name in ("still_below", "hide_moving"):
+            distance = getattr(self, name)
+            if distance is not None and not 0 <= distance < math.inf:
+                raise ValueError(
+                    f"--{name.replace('_', '-')} {distance}: a distance in scene "
+                    "units, not negative"
+                )
         if not self.formats:
             raise ValueError("--formats: name at least one of png, mp4, exr")
 
@@ -91,7 +97,7 @@ def main(arguments=None):
         from experiments import evaluate, runs
 
         run = runs.saved_run(asked.run)
-        state = runs.restore(asked.run, run).state
+        state = _shown(asked, run.model, runs.restore(asked.run, run).state)
         size = _size(run.capture.size, asked.max_side)
         model, state = _faster(asked, _model(asked, run), state)
         names, views = _views(asked, run)
@@ -111,6 +117,8 @@ def _name(asked):
     knots += "" if asked.interpolation == "linear" else f"-{asked.interpolation}"
     if asked.still_below is not None:
         knots += f"-still-below-{asked.still_below:g}"
+    if asked.hide_moving is not None:
+        knots += f"-hide-moving-{asked.hide_moving:g}"
     depth = "" if asked.show == "colour" else f"-{asked.show}"
     return f"{asked.path}{frozen}{slow}{without}{blended}{knots}{depth}"
 
@@ -121,6 +129,17 @@ def _model(asked, run):
     if not asked.without and not blended:
         return run.model
     return run.representation.variant(run.spec, run.facts, asked.without, blended)
+
+
+def _shown(asked, model, state):
+    """The state without what is hidden in all pictures."""
+    if asked.hide_moving is None:
+        return state
+    from experiments import variants
+
+    state, summary = variants.without_moving(model, state, asked.hide_moving)
+    print(summary)
+    return state
 
 
 def _faster(asked, model, state):
@@ -145,6 +164,7 @@ def _seen(asked, run, size, views):
     import jax.numpy as jnp
 
     from experiments import evaluate, variants
+    from nerfies_jax.training.model import in_default_precision
 
     views = [evaluate.resized(view, run.capture.size, size) for view in views]
     if asked.appearance is None:
@@ -155,7 +175,9 @@ def _seen(asked, run, size, views):
     )
     shares = np.linspace(0, 1, len(views), dtype=np.float32)
     return [
-        variants.Between(view._replace(appearance=start), end, jnp.asarray(share))
+        variants.Between(
+            view._replace(appearance=start), end, in_default_precision(share)
+        )
         for view, share in zip(views, shares, strict=True)
     ]
 

@@ -154,6 +154,38 @@ def without_still(model: Model, state: TrainState, still_below: float) -> Faster
     )
 
 
+def without_moving(
+    model: Model, state: TrainState, farther_than: float
+) -> tuple[TrainState, str]:
+    """The state without the Gaussians that move, and what was left out; host side.
+
+    Those are the ones of which a point moves farther than `farther_than` (scene units)
+    over `INSTANTS` instants of [0, 1]: what is left is the static scene, with holes
+    where nothing was ever filmed behind what moves.
+    """
+    from gaussians_jax import splats, still_rows
+
+    stages = _stages(model, "--hide-moving")
+
+    def pose_rows(params, time):
+        return stages.pose(params, stages.prepare(params), time)
+
+    times = np.linspace(0, 1, INSTANTS)
+    parts = still_rows.split(state.params, pose_rows, times, farther_than)
+    moves = parts.where.moves
+    rows = state.params.rows
+    living = int(splats.alive(rows["splats"]).sum())
+    if int(moves.sum()) == living:
+        raise ValueError(
+            f"--hide-moving {farther_than:g}: all {living} Gaussians move farther than "
+            "that, and nothing would be left; give a longer distance"
+        )
+    shown = rows | {"splats": splats.bury(rows["splats"], moves)}
+    params = state.params._replace(rows=shown)
+    summary = f"{int(moves.sum())} of {living} Gaussians move and are left out"
+    return state._replace(params=params), summary
+
+
 def _stages(model, option):
     if model.stages is None:
         raise ValueError(

@@ -156,6 +156,41 @@ def test_a_faster_motion_that_cannot_be_is_refused(swaying, make, words):
         make(*swaying)
 
 
+def test_what_moves_may_be_left_out(swaying):
+    model, state = swaying
+    # Slower, so that all stay in the picture
+    nets = jax.tree.map(lambda leaf: 0.5 * leaf, state.params.nets)
+    state = state_of(state.params._replace(nets=nets))
+    middle, *ends = poses(model, state, (0.5, 0.0, 1.0))
+    reach = np.max([still_rows.reach(middle, end) for end in ends], axis=0)
+    living = np.asarray(splats.alive(state.params.rows["splats"]))
+    far = float(np.median(reach[living]))
+    left, summary = variants.without_moving(model, state, far)
+    rows = left.params.rows["splats"]
+    shown = np.asarray(splats.alive(rows))
+    assert 0 < shown.sum() < living.sum() / 2 + 1
+    assert reach[shown].max() <= far
+    assert f"{living.sum() - shown.sum()} of {living.sum()} Gaussians" in summary
+    # What is left is drawn as it was, wherever it still moves a little
+    alone = splats.take_rows(state.params, jnp.asarray(np.flatnonzero(shown)))
+    view = evaluate.view_of(scenes.tiny_capture(), 0)
+    found, expected = (
+        evaluate.Renderer(model, SIZE)(one, view).colour
+        for one in (left, state._replace(params=alone))
+    )
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    everything = evaluate.Renderer(model, SIZE)(state, view).colour
+    assert np.abs(found - everything).max() > 0.02
+
+
+def test_a_static_scene_of_nothing_is_refused(swaying):
+    with pytest.raises(ValueError, match=r"--hide-moving 0: all .* longer distance"):
+        variants.without_moving(*swaying, 0.0)
+    field = swaying[0]._replace(stages=None)
+    with pytest.raises(ValueError, match="--hide-moving is for runs of Gaussians"):
+        variants.without_moving(field, swaying[1], 0.1)
+
+
 def test_fields_and_still_scenes_have_no_knots(moving, swaying):
     still = variants.of_splats(scenes.TINY_DEFORMABLE, moving[0], ("motion",), False)
     with pytest.raises(ValueError, match="nothing in this run moves farther than 0 "):
