@@ -184,28 +184,15 @@ def check_removed(run, start, owner, make):
 
 # Left to the slow suite: scenes that keep an elastic penalty, whose derivatives are
 # second ones, or whose like is held already.
-SLOW = {
-    ("nerfies", "appearance"),
-    ("nerfies", "background"),
-    ("nerfies", "warp"),
-    ("hypernerf", "appearance"),
-    ("hypernerf", "warp"),
-    ("hypernerf", "background"),
-    ("sonata", "motion"),
-    ("sonata", "neighbours"),
-    ("sonata", "depth"),
-    ("moba", "motion"),
-    ("moba", "motion_growth"),
-    ("moba", "alternation"),
-    ("moba", "annealing"),
-}
+# One field and one scene of splats by default; the others run with the slow tests.
+QUICK = {("nerf-w", "appearance"), ("splats-deformable", "motion")}
 
 
 def removals(presets):
     """Each part of each paper's preset; the small ones are those papers' in kind."""
     return [
         pytest.param(
-            name, part, marks=[pytest.mark.slow] if (name, part) in SLOW else []
+            name, part, marks=() if (name, part) in QUICK else pytest.mark.slow
         )
         for name, spec in presets.items()
         if not name.endswith("-small")
@@ -256,7 +243,7 @@ def test_a_poisoned_effect_cannot_be_built():
     ("preset", "part"),
     [
         ("nerf-w", "appearance"),
-        ("nerfies", "elastic"),
+        pytest.param("nerfies", "elastic", marks=pytest.mark.slow),
         pytest.param("nerfies", "appearance", marks=pytest.mark.slow),
         pytest.param("hypernerf", "ambient", marks=pytest.mark.slow),
     ],

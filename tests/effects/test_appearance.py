@@ -133,7 +133,13 @@ def test_there_are_presets_with_codes():
 
 
 @pytest.mark.hard_cases
-@pytest.mark.parametrize("name", WITH_CODES)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name == "nerf-w" else pytest.mark.slow)
+        for name in WITH_CODES
+    ],
+)
 def test_codes_of_every_preset_learn(name):
     """In the official Nerfies presets this gradient is exactly zero."""
     spec = dataclasses.replace(presets.PRESETS[name], **CHEAP)

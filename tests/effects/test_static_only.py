@@ -133,6 +133,7 @@ def test_with_it_the_ray_sees_both_through_one_transmittance(dtype):
     assert float(joint.depth) < float(alone.depth)  # it stands in front
 
 
+@pytest.mark.slow
 def test_a_step_trains_the_transient_its_codes_and_the_trunk():
     capture = scenes.tiny_capture()
     model = scene.build(TINY, facts())

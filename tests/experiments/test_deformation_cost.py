@@ -131,6 +131,7 @@ def _field(capture):
     return Model("field", *[None] * 3, (), None), TrainState({}, (), (), zero, None)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small")
 def test_arms_agree_with_the_network_they_shorten():
     made = {arm.name: arm for arm in deformation_arms.arms(40, 0.25)}

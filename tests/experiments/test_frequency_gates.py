@@ -12,6 +12,7 @@ TINY = FrequencyGates(steps=20, seeds=2, most=(0.5,), pixels=8, width=4, bands=2
 NONE = Arm("none", None)
 
 
+@pytest.mark.slow
 def test_descent_shuts_the_gates_and_ascent_opens_them():
     falling = frequency_gates.fit(Arm("learned", 0.5), TINY)
     rising = frequency_gates.fit(Arm("ascent", 0.5), TINY)

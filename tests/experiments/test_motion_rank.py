@@ -34,6 +34,7 @@ def test_the_floors_by_hand():
     assert motion_rank.separable_floor(circle, 1) == pytest.approx(0.5**0.5, rel=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", list(motion_rank.FLOORS))
 def test_no_factorisation_passes_below_its_floor_and_a_fit_comes_close(model):
     """The floor is of all values of the factors, the fits are of some."""
@@ -54,6 +55,7 @@ def test_no_factorisation_passes_below_its_floor_and_a_fit_comes_close(model):
         assert motion_rank.FLOORS[model](some, count) < 1e-5 * np.abs(some).max()
 
 
+@pytest.mark.slow
 def test_the_moving_models_are_not_of_low_rank():
     """Weights that follow the point pass below both floors of the same K."""
     chosen = motion_rank.model_of("moving basis", 1)
@@ -104,6 +106,7 @@ def test_the_built_in_scene_has_tracks_too():
     assert not tracks.moved[:, 0].any()
 
 
+@pytest.mark.slow
 def test_a_tiny_run_prints_and_keeps_everything(tmp_path, capsys):
     sizes = "--kinds rigid --counts 4 --seeds 2 --steps 4 --points 8 --times 8"
     rows = motion_rank.main([*sizes.split(), "--out", str(tmp_path / "out")])

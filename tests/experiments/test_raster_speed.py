@@ -55,6 +55,7 @@ def test_blended_pairs_are_the_tiles_that_show_a_gaussian(case):
     assert abs(int(found) - expected) <= 1  # a pixel on the cut itself
 
 
+@pytest.mark.slow
 def test_a_case_is_timed_and_a_wrong_one_refused():
     settings = raster_speed.Settings(cases=(CASE,), repeats=1)
     row = raster_speed.time_case(CASE, settings, limit_ns=0.5)

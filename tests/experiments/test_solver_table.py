@@ -17,6 +17,7 @@ SMALL = dict(
 )
 
 
+@pytest.mark.slow
 def test_the_table_holds_solvers_against_the_best_known_code(tmp_path, capsys):
     settings = solver_table.Settings(steps=(2, 8), out=tmp_path / "t.json", **SMALL)
     rows = solver_table.main(settings)

@@ -54,26 +54,19 @@ def weights_for(rng, size, channels):
 
 
 CASES = {
+    "gsplat": GSPLAT,
+    "inria": INRIA,
+    "large tile": dataclasses.replace(GSPLAT, tile=16, batch=3, chunk=2),
     "tiny capacity": dataclasses.replace(
         GSPLAT, capacity=64, kept_slabs=2, antialiased=True
     ),
 }
-SLOW_CASES = {
-    "gsplat": GSPLAT,
-    "inria": INRIA,
-    "large tile": dataclasses.replace(GSPLAT, tile=16, batch=3, chunk=2),
-}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "spec",
-    [
-        *(pytest.param(spec, id=name) for name, spec in CASES.items()),
-        *(
-            pytest.param(spec, id=name, marks=pytest.mark.slow)
-            for name, spec in SLOW_CASES.items()
-        ),
-    ],
+    [pytest.param(spec, id=name) for name, spec in CASES.items()],
 )
 def test_render_and_all_gradients_equal_the_dense_renderer(spec, float64, rng):
     size = (53, 37)

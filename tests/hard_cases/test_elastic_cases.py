@@ -170,6 +170,7 @@ def _energies(matrix, one, other):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("kind", ["float32", "float64"])
 @axioms

@@ -64,12 +64,7 @@ def along_one_way():
     return sum(jax.tree.leaves(products)), (ahead - behind) / (2 * step)
 
 
-# In float64 the derivatives of the Jacobian take ten seconds to compile.
-@pytest.mark.parametrize(
-    "dtype",
-    ["float32", pytest.param("float64", marks=pytest.mark.slow)],
-    indirect=True,
-)
+@pytest.mark.slow  # the derivatives of the Jacobian take ten seconds to compile
 @pytest.mark.parametrize("name", DISPLACEMENTS)
 def test_slopes_through_the_jacobian_are_finite(name, dtype):
     values, slopes = slopes_of_costs(dtype)

@@ -386,6 +386,7 @@ def test_trained_widths_of_any_size_have_finite_slopes(dtype):
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
 
 
+@pytest.mark.slow
 @pytest.mark.hard_cases
 def test_bfloat16_is_finite_and_near(rng):
     inputs = rng.normal(size=(16, 5))

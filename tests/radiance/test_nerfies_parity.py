@@ -231,7 +231,7 @@ def descended(file, name, dtype):
     return slope_of(weights_of(read(file), name, dtype), asked(read(file), dtype))[0]
 
 
-@pytest.fixture(params=["init", "live"])
+@pytest.fixture(params=[pytest.param("init", marks=pytest.mark.slow), "live"])
 def both(request, dtype, oracle_dir):
     """What we compute and what was recorded, in one precision."""
     file = oracle_dir / "nerfies.npz"

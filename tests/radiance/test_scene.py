@@ -104,7 +104,13 @@ def moment_of(dtype, **found):
     return Moment(jnp.asarray(0.4, dtype), found, jnp.int32(0))
 
 
-@pytest.mark.parametrize("spec", [STATIC, NERFIES], ids=["static", "nerfies"])
+@pytest.mark.parametrize(
+    "spec",
+    [
+        pytest.param(STATIC, id="static"),
+        pytest.param(NERFIES, id="nerfies", marks=pytest.mark.slow),
+    ],
+)
 def test_training_lowers_the_loss(spec):
     _, trace = stepped(spec, 40)
     first = np.mean([row["mse"] for row in trace[:8]])
@@ -182,6 +188,7 @@ def test_blocks_of_rays_do_not_show_in_a_picture():
         np.testing.assert_allclose(whole.depth, other.depth, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_memory_of_a_render_does_not_grow_with_the_picture():
     model, state, _ = started(STATIC)
     view = evaluate.view_of(scenes.tiny_capture(), 0)
@@ -313,6 +320,7 @@ def test_wrong_specs_are_refused_early():
         scene.build(spec, FACTS)
 
 
+@pytest.mark.slow
 def test_gradient_of_a_whole_step(float64):
     # One level and no elastic term: where fine samples lie and how elastic samples are
     # weighed depends on the parameters, and by design no gradient says so.

@@ -289,6 +289,7 @@ def test_a_track_survives_a_moment_at_which_it_is_lost(dtype):
     np.testing.assert_allclose(tracks.points[0, :, 0], exact, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_gradients_of_tracks_equal_central_differences(float64):
     params = (jnp.asarray([0.0, 2.5, 0.4]), jnp.asarray(0.2))
     moments = {"time": jnp.linspace(0, 1, 5), "centre": jnp.zeros((5, 3)) + 0.1}
