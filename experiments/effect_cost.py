@@ -13,7 +13,7 @@ a preset in turn. A run is priced at `--at` of its steps, where every warm-up is
 
 The price of an effect alone is a difference from the scene without it. Prices do not
 add up exactly: the compiler joins what it finds side by side. Prints the table, saves
-effect_cost.json and effect_cost.png.
+effect_cost.json, effect_cost.md and effect_cost.png.
 """
 
 import dataclasses
@@ -59,7 +59,7 @@ class EffectCost:
     repeats: int = 5
     """Timed calls of every program, in turn; the table shows medians."""
     out: pathlib.Path | None = None
-    """Folder for effect_cost.json and effect_cost.png (default: runs/effect_cost)."""
+    """Folder for effect_cost.json, .md and .png (default: runs/effect_cost)."""
     check: pathlib.Path | None = None
     """An earlier effect_cost.json: says what got worse since, exit code 1 if any."""
     device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"

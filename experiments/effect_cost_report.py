@@ -1,6 +1,7 @@
 """Table, metrics and figure of `experiments.effect_cost`."""
 
 import pathlib
+from collections.abc import Mapping
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -22,6 +23,11 @@ MEASURES = (
     ("seconds", "s", 0.5),
 )
 RATIO_TOLERANCE = 0.25  # of a time over that of the bare scene of the same run
+PAGE_HEADS = ("scene", "parameters", "Mflop", "matmul Mflop", "MB", "temporary MB")
+PAGE_HEADS += ("compile s", "step ms", "over bare")
+MILLIONS = ("flops", "matrix_flops", "bytes_accessed", "temporary_bytes")
+PAGE_KEYS = ("parameters", *(f"step.{x}" for x in MILLIONS))
+PAGE_KEYS += ("step.compile_seconds", "step.seconds", "step.over_bare")
 COLOURS = {"loss": "#8fb8de", "step": "#0a5fb4"}
 WIDTHS = (21, 10, 8, 8, 9, 9, 8, 8, 8, 8, 7, 7, 8, 8)
 
@@ -113,8 +119,38 @@ def metrics_of(rows) -> list[Metric]:
     return metrics
 
 
+def page(metrics: Mapping[str, Metric]) -> list[str]:
+    """Tables in Markdown of a training step, from what effect_cost.json holds."""
+    scenes: dict[str, list[str]] = {}
+    for key in metrics:
+        preset, arm, *rest = key.split(".")
+        if rest == ["parameters"]:
+            scenes.setdefault(preset, []).append(arm)
+    lines = []
+    for preset, arms in scenes.items():
+        lines += ["", f"### `{preset}`", "", "| " + " | ".join(PAGE_HEADS) + " |"]
+        lines.append("|---|" + "---:|" * (len(PAGE_HEADS) - 1))
+        for arm in arms:
+            value = {key: metrics[f"{preset}.{arm}.{key}"].value for key in PAGE_KEYS}
+            cells = [_title(arm), f"{int(value['parameters']):,}"]
+            cells += [_number(value[f"step.{x}"] / 1e6) for x in MILLIONS]
+            cells.append(f"{value['step.compile_seconds']:.0f}")
+            cells.append(_number(1e3 * value["step.seconds"]))
+            cells.append(f"{value['step.over_bare']:.2f}")
+            lines.append("| " + " | ".join(cells) + " |")
+    return lines[1:]
+
+
+def _title(arm):
+    """As in the table, from a key of the metrics."""
+    for word in ("only", "without"):
+        if arm.startswith(f"{word}_"):
+            return f"{word} {arm.removeprefix(f'{word}_')}"
+    return arm.replace("_and_", " + ")
+
+
 def write(folder: pathlib.Path, rows, asked) -> list[Metric]:
-    """effect_cost.json and effect_cost.png; returns the metrics."""
+    """effect_cost.json, .md and .png; returns the metrics."""
     metrics = metrics_of(rows)
     about = {
         "presets": list(asked.presets),
@@ -127,6 +163,9 @@ def write(folder: pathlib.Path, rows, asked) -> list[Metric]:
     }
     clock.write_metrics(folder / "effect_cost.json", metrics, about)
     save_figure(folder / "effect_cost.png", rows)
+    lines = page({metric.key: metric for metric in metrics})
+    with replaced_file(folder / "effect_cost.md") as partial:
+        partial.write_text("\n".join(lines) + "\n")
     return metrics
 
 
