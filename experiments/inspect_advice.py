@@ -1,15 +1,19 @@
-"""From what was found to presets and overrides for splats and for fields."""
+"""From what was found to presets and overrides for splats and for fields; no JAX."""
 
 import dataclasses
 from typing import Any
 
 from experiments import settings as run_settings
-from experiments.inspect_findings import Finding, table
-from experiments.inspect_light import EFFECT as LIGHT
-from experiments.inspect_motion import EFFECT as MOTION
-from experiments.inspect_points import BACKGROUND, START
-from experiments.inspect_stored import DEPTH
-from experiments.inspect_transient import EFFECT as TRANSIENT
+from experiments.inspect_findings import (
+    BACKGROUND,
+    DEPTH,
+    LIGHT,
+    MOTION,
+    START,
+    TRANSIENT,
+    Finding,
+    table,
+)
 
 SPLATS, FIELDS = "splats", "fields"
 
@@ -64,9 +68,12 @@ def follow(choices: Any, findings: tuple[Finding, ...]) -> tuple[Any, list[str]]
 
     The preset asked for says which representation and which size.
     """
+    from experiments import inspect_prices
+
     full = not choices.preset.endswith("-small")
     advice = advise(findings, representation_of(choices.preset), full)
-    lines = [*table(findings), f"effects: {advice.arguments()}"]
+    costs = inspect_prices.told(findings)
+    lines = [*table(findings, costs), f"effects: {advice.arguments()}"]
     lines += [f"note: {note}" for note in advice.notes]
     overrides = (*advice.overrides, *choices.overrides)
     changed = dataclasses.replace(choices, preset=advice.preset, overrides=overrides)

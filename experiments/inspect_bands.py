@@ -6,11 +6,11 @@ import numpy as np
 
 from experiments import inspect_points, inspect_views
 from experiments.inspect_findings import CERTAIN, LIKELY, Finding, cannot_tell
+from experiments.inspect_findings import TEXTURE as EFFECT
 from experiments.inspect_views import Views
 from nerfies_jax import facts
 from nerfies_jax.capture.capture import Capture
 
-EFFECT = "more texture bands"
 SMALL = 8  # of the fields' small presets
 ENERGY = 0.95  # of the slopes' energy lies in coarser detail than "the finest"
 SHOWN = 8  # frames whose spectrum is taken

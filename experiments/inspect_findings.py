@@ -2,8 +2,14 @@
 
 import dataclasses
 import math
+from collections.abc import Mapping
 
 CERTAIN, LIKELY, CANNOT_TELL = "certain", "likely", "cannot tell"
+# Names of the effects, in all findings
+MOTION, LIGHT, TRANSIENT = "motion", "appearance codes", "transient objects"
+START, BACKGROUND = "start from points", "background points"
+DEPTH, MASKS, LENS = "depth", "masks of what moves", "lens distortion"
+TEXTURE = "more texture bands"
 # How far from its threshold evidence must be, as a factor. What an effect is worth is
 # known to a factor of two at best: within a quarter of the threshold nobody knows.
 CERTAIN_FACTOR, LIKELY_FACTOR = 2.0, 1.25
@@ -63,15 +69,28 @@ def cannot_tell(effect: str, reason: str, threshold: str = "") -> Finding:
     return Finding(effect, reason, threshold, None, CANNOT_TELL)
 
 
-def table(findings: tuple[Finding, ...], width: int = 100) -> list[str]:
-    """Lines of a table for a terminal; long evidence is folded."""
-    heads = ("effect", "decision", "confidence", "evidence", "threshold")
+def table(
+    findings: tuple[Finding, ...], costs: Mapping[str, str], width: int = 110
+) -> list[str]:
+    """Lines of a table for a terminal; long evidence is folded.
+
+    `costs` says by effect what it costs a step.
+    """
+    heads = ("effect", "decision", "confidence", "cost per step")
+    heads += ("evidence", "threshold")
     rows = [
-        (one.effect, one.decision, one.confidence, one.evidence, one.threshold)
+        (
+            one.effect,
+            one.decision,
+            one.confidence,
+            costs[one.effect],
+            one.evidence,
+            one.threshold,
+        )
         for one in findings
     ]
-    narrow = [max(len(row[i]) for row in (heads, *rows)) for i in range(3)]
-    rest = max(width - sum(narrow) - 8, 40)
+    narrow = [max(len(row[i]) for row in (heads, *rows)) for i in range(4)]
+    rest = max(width - sum(narrow) - 10, 40)
     columns = [*narrow, rest * 3 // 5, rest * 2 // 5]
     lines = []
     for row in (heads, tuple("-" * column for column in columns), *rows):

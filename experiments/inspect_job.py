@@ -16,7 +16,7 @@ from experiments import (
     inspect_transient,
     inspect_views,
 )
-from experiments.inspect_findings import CERTAIN, Finding
+from experiments.inspect_findings import CERTAIN, MOTION, Finding
 from experiments.inspect_motion import Film
 from experiments.inspect_views import Views
 from nerfies_jax.capture import pinholes
@@ -71,7 +71,7 @@ def _motion(views, films, spans):
     """By paths of pixels, or by outlines where views are too far apart to follow."""
     if np.ptp(views.time) == 0:
         return Finding(
-            inspect_motion.EFFECT,
+            MOTION,
             "all frames have the same time: a motion has nothing to depend on",
             "two times",
             False,

@@ -4,11 +4,11 @@ import numpy as np
 import scipy.ndimage as nd
 
 from experiments import inspect_flow, inspect_views
+from experiments.inspect_findings import LIGHT as EFFECT
 from experiments.inspect_findings import Finding, cannot_tell, judge
 from experiments.inspect_views import Views
 from nerfies_jax.capture.synthetic import texture
 
-EFFECT = "appearance codes"
 # A gain of a tenth of a stop, 7 %, left in the frames bounds a fit at 36 dB (3 % of a
 # mean sRGB value of 0.5, twice that in linear light): above what is reached otherwise.
 DRIFT_STOPS = 0.1

@@ -7,10 +7,10 @@ import scipy.ndimage as nd
 
 from experiments import inspect_depths, inspect_flow, inspect_sweep, inspect_views
 from experiments.inspect_findings import CANNOT_TELL, Finding, cannot_tell, judge
+from experiments.inspect_findings import MOTION as EFFECT
 from experiments.inspect_flow import Paths, Step, StillFit
 from experiments.inspect_views import Views
 
-EFFECT = "motion"
 REACH = 8  # frames before and after: what moves 0.1 px a frame on shows in them
 CENTRES = 12  # frames whose pixels are followed
 FEWEST_FRAMES = 3  # of one camera: two tell depth, and nothing else

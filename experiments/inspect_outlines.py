@@ -10,7 +10,7 @@ import scipy.ndimage as nd
 
 from experiments import inspect_views
 from experiments.inspect_findings import LIKELY, Finding, cannot_tell, judge
-from experiments.inspect_motion import EFFECT
+from experiments.inspect_findings import MOTION as EFFECT
 from experiments.inspect_views import Views
 
 FEWEST_VIEWS = 8  # fewer cut little away, at rest or not

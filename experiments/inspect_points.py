@@ -3,12 +3,18 @@
 import numpy as np
 
 from experiments import inspect_views
-from experiments.inspect_findings import CERTAIN, Finding, cannot_tell, judge
+from experiments.inspect_findings import (
+    BACKGROUND,
+    CERTAIN,
+    START,
+    Finding,
+    cannot_tell,
+    judge,
+)
 from experiments.inspect_motion import Film
 from experiments.inspect_views import FEWEST_POINTS, Views
 from nerfies_jax.capture.capture import Capture
 
-START, BACKGROUND = "start from points", "background points"
 CELLS = (8, 6)  # across and down: a picture is covered where a cell holds a point
 COVERED = 0.5  # of the cells that show anything
 # A point that a following frame's flow misses by so much is not where it should be.

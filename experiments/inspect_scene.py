@@ -85,9 +85,11 @@ def read(asked):
 
 def report(found, advice, source):
     """Lines for a person: the table, then the commands."""
-    from experiments import inspect_findings
+    from experiments import inspect_findings, inspect_prices
 
-    lines = ["", *inspect_findings.table(found.findings), ""]
+    costs = inspect_prices.told(found.findings)
+    lines = ["", *inspect_findings.table(found.findings, costs), ""]
+    lines += [inspect_prices.LEGEND, ""]
     for one in advice:
         lines.append(f"{one.representation}:")
         lines.append(f"  python -m experiments.reconstruct {source} {one.arguments()}")
@@ -98,9 +100,12 @@ def report(found, advice, source):
 
 def as_json(capture, found, advice):
     """The same as plain data."""
+    from experiments import inspect_prices
+
     return {
         "capture": capture.name,
         "findings": [dataclasses.asdict(one) for one in found.findings],
+        "cost per step": inspect_prices.as_json(found.findings),
         "advice": [dataclasses.asdict(one) for one in advice],
         "pictures made smaller by": found.factor,
         "seconds": found.seconds,

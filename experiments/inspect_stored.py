@@ -4,13 +4,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.inspect_findings import CERTAIN, Finding, cannot_tell, judge
+from experiments.inspect_findings import (
+    CERTAIN,
+    DEPTH,
+    LENS,
+    MASKS,
+    Finding,
+    cannot_tell,
+    judge,
+)
 from experiments.inspect_motion import Film
 from experiments.inspect_views import FEWEST_POINTS, Views
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.geometry import distortion
 
-DEPTH, MASKS, LENS = "depth", "masks of what moves", "lens distortion"
 KNOWN_SHARE = 0.2  # of the pixels: fewer depths are points
 DEPTH_ERROR = 0.1  # median share that depth is off what parallax says
 DEPTH_SURE = 0.03  # deviation of a depth from parallax, to be compared with

@@ -10,11 +10,11 @@ import scipy.ndimage as nd
 import skimage.feature
 
 from experiments import inspect_flow, inspect_motion
+from experiments.inspect_findings import TRANSIENT as EFFECT
 from experiments.inspect_findings import Finding, cannot_tell, judge
 from experiments.inspect_motion import Film
 from experiments.inspect_views import Views
 
-EFFECT = "transient objects"
 LOST_PX, LOST_SHARE = 1.0, 0.1  # forward and back must meet, of the way
 LOST_COLOUR = 0.1  # half the contrast of a picture whose deviation is a fifth
 OPENED_SHARE = 3 / 176  # of the picture's width: no strips

@@ -100,7 +100,7 @@ def test_effects_auto_takes_the_advice_and_the_users_word_comes_last(
     nerfies_format.write(inspect_films.film(), tmp_path / "film")
     taken = {}
 
-    def caught(choices):
+    def caught(choices, stored):
         taken["choices"] = choices
         raise ValueError("caught")
 
