@@ -25,9 +25,9 @@ from experiments.ablate_suites import SUITES
 class Ablate:
     """Compare ways to reconstruct a moving scene with and without their parts."""
 
-    suite: Literal["fields", "sonata", "moba", "settings"] = "fields"
-    """Radiance fields, the ablations of Sonata or MoBa-GS, or the settings of
-    experiments.accuracy_time."""
+    suite: Literal["fields", "sonata", "moba", "settings", "advice"] = "fields"
+    """Radiance fields, the ablations of Sonata or MoBa-GS, the settings of
+    experiments.accuracy_time, or what experiments.inspect_scene can advise."""
     arms: tuple[str, ...] = ()
     """Which arms of the suite (default: all)."""
     scene: str = "default"

@@ -1,0 +1,239 @@
+"""Whether advice paid: which scenes are trained, what is kept, how it is judged."""
+
+import dataclasses
+import itertools
+import json
+import math
+import subprocess
+import sys
+
+import pytest
+
+from experiments import (
+    ablate,
+    ablate_kept,
+    ablate_pool,
+    inspect_advice,
+    inspect_arms,
+    inspect_job,
+    inspect_pays,
+    runs,
+    settings,
+)
+from experiments import inspect_pays_report as report
+from experiments.ablate_arms import Arm
+from experiments.inspect_findings import (
+    BACKGROUND,
+    CANNOT_TELL,
+    CERTAIN,
+    LIGHT,
+    MOTION,
+    Finding,
+)
+from experiments.inspect_pays_job import Row, Side, Trial, read
+from nerfies_jax.capture import nerfies_format
+from nerfies_jax.measure import clock
+from tests.experiments import inspect_films
+
+
+def finding(effect, wanted):
+    return Finding(effect, "", "", wanted, CANNOT_TELL if wanted is None else CERTAIN)
+
+
+def test_whatever_is_advised_is_an_arm():
+    arms = set()
+    for full, kind in itertools.product((False, True), ("splats", "fields")):
+        for choices in itertools.product((True, False, None), repeat=6):
+            told = zip(inspect_arms.DECIDING, choices, strict=True)
+            found = tuple(finding(*one) for one in told)
+            advice = inspect_advice.advise(found, kind, full)
+            name = inspect_arms.name_of(advice)
+            assert inspect_arms.ADVICE.arms[name] == Arm(
+                advice.preset, advice.overrides
+            )
+            arms.add(name)
+    assert arms == {*inspect_arms.ADVICE.arms}
+    assert not any("/" in name for name in arms)  # it is part of a file's name
+
+
+def test_arms_are_known_without_jax():
+    words = "import sys; import experiments.inspect_pays; print('jax' in sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", words], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "False"
+
+
+def side(psnr, seconds, depth=math.nan):
+    return Side(psnr, depth, seconds, 1)
+
+
+def row(before, after, advised="nerfies-small+appearance.width=4", refused=""):
+    same = advised == "nerfies-small"
+    return Row("exposure", "nerfies-small", advised, (), same, refused, before, after)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "said"),
+    [
+        ((25.0, 60.0), (26.0, 80.0), "yes: better"),
+        ((25.0, 60.0), (26.0, 40.0), "yes: better and quicker"),
+        ((25.0, 60.0), (25.1, 40.0), "yes: as good, quicker"),
+        ((25.0, 60.0), (24.9, 62.0), "neither way"),
+        ((25.0, 60.0), (25.2, 70.0), "no: as good, slower"),
+        ((25.0, 60.0), (24.0, 60.0), "no: worse"),
+        ((25.0, 60.0), (24.0, 30.0), "no: worse, though quicker"),
+        ((25.0, 60.0), (math.nan, 60.0), "a run blew up"),
+    ],
+)
+def test_quality_comes_first_and_then_time(before, after, said):
+    assert report.verdict(row(side(*before), side(*after))) == said
+
+
+def test_what_is_the_same_or_not_there_is_not_judged():
+    only = row(None, side(25.0, 60.0), refused="no points")
+    assert report.verdict(only) == "yes: the preset cannot be built"
+    assert report.verdict(row(None, None, "nerfies-small")) == "nothing to change"
+    assert report.verdict(row(side(25.0, 60.0), None)) == "not trained yet"
+    assert report.metrics_of([row(None, None, "nerfies-small")]) == []
+
+
+def test_the_table_says_what_is_changed():
+    rows = [
+        row(side(25.0, 60.0, 0.0123), side(26.0, 80.0, 0.0077)),
+        row(None, None, "nerfies-small"),
+        row(side(25.0, 60.0), side(25.0, 30.0), "nerf-small+appearance.width=4"),
+    ]
+    head, _, one, same, other = report.table(rows)
+    assert one == (
+        "| exposure | `nerfies-small` | `appearance.width=4` | 25.00 | 26.00 | 0.0123 "
+        "| 0.0077 | 60 | 80 | yes: better |"
+    )
+    assert head.count("|") == one.count("|")
+    assert "| the same | - | - | - | - | - | - | nothing to change |" in same
+    assert "`nerf-small appearance.width=4`" in other
+
+
+def test_wrong_wishes_are_refused_with_what_can_be_had():
+    with pytest.raises(ValueError, match=r"--presets moba-small.*nerfies-small"):
+        inspect_pays.InspectPays(presets=("moba-small",))
+    with pytest.raises(ValueError, match="--steps"):
+        inspect_pays.InspectPays(steps=0)
+
+
+@pytest.fixture
+def film(tmp_path):
+    """A still film with held-out frames, where the light is even."""
+    folder = tmp_path / "film"
+    nerfies_format.write(inspect_films.film(), folder)
+    return folder
+
+
+FOUND = (finding(MOTION, False), finding(LIGHT, True))
+SCORES = {"splats-deformable-small": 20.0, "splats-static-small": 24.0}
+
+
+@pytest.fixture
+def looked(monkeypatch):
+    """Nothing is looked at and nothing trained: both are known beforehand."""
+    calls = []
+
+    def inspect(capture):
+        calls.append("look")
+        sheet = inspect_films.texture(1).astype("uint8")
+        return inspect_job.Inspection(FOUND, sheet, 1, 0.0, None, [])
+
+    def train(job):
+        (budget,) = job.budgets
+        for name, seed in job.tasks():
+            if job.is_finished(name, seed):
+                continue
+            calls.append(f"train {name}")
+            numbers = {"psnr": SCORES.get(name, 22.0), "train_cpu_seconds": 10.0}
+            identity = job._identity(name, seed, budget.steps, budget)
+            kept = ablate_kept.Kept(numbers, {}, {"steps": budget.steps})
+            ablate_kept.write(job.path(name, seed, budget), identity, kept)
+        return []
+
+    monkeypatch.setattr(inspect_job, "inspect", inspect)
+    monkeypatch.setattr(ablate_pool, "run", train)
+    monkeypatch.setattr(settings, "start_jax", lambda *_: None)
+    return calls
+
+
+def test_what_differs_is_trained_once_and_kept(film, tmp_path, looked, capsys):
+    words = [str(film), "--heldout", "3", "--out", str(tmp_path / "out")]
+    words += ["--steps", "7"]
+    for _ in range(2):
+        with pytest.raises(SystemExit) as ended:
+            inspect_pays.main(words)
+        assert ended.value.code == 0
+    assert looked == [
+        "look",
+        "train splats-deformable-small",
+        "train splats-static-small",
+        "train nerfies-small",
+        "train nerf-small+appearance.width=4",
+    ]
+    said = capsys.readouterr().out
+    assert "| 20.00 | 24.00 | - | - | 10 | 10 | yes: better |" in said
+    assert "2 pairs: 1 yes: better; 1 neither way." in said
+    assert (tmp_path / "out/pays.md").read_text() in said
+    stored = clock.read_metrics(tmp_path / "out/pays.json")
+    assert stored["film.splats-deformable-small.gain"].value == 4.0
+    kept = json.loads((tmp_path / "out/film/inspected.json").read_text())
+    assert kept["cost per step"]["motion"]["fields"] > 1.2
+    # Other sizes are another capture
+    with pytest.raises(SystemExit) as ended:
+        inspect_pays.main([*words, "--max-side", "48"])
+    assert ended.value.code == 2
+    assert "was read otherwise" in capsys.readouterr().err
+
+
+def test_where_the_advice_is_the_preset_nothing_is_trained(film, tmp_path, looked):
+    asked = inspect_pays.InspectPays(
+        presets=("splats-static-small",), out=tmp_path, heldout="3"
+    )
+    trial = Trial(asked, *read(asked, film))
+    assert trial.run() == []
+    assert looked == ["look"]
+    (one,) = trial.rows()
+    assert one.same
+    assert one.advised == "splats-static-small"
+
+
+def test_a_preset_that_needs_what_is_not_there_is_left_out(
+    tmp_path, looked, monkeypatch
+):
+    nerfies_format.write(inspect_films.film(points=0), tmp_path / "film")
+    lacking = (finding(MOTION, True), finding(BACKGROUND, False))
+    monkeypatch.setattr(Trial, "findings", lambda self: lacking)
+    asked = inspect_pays.InspectPays(
+        presets=("nerfies-small",), out=tmp_path, heldout="3", steps=7
+    )
+    trial = Trial(asked, *read(asked, tmp_path / "film"))
+    assert trial.run() == []
+    assert looked == ["train nerfies-small+background=none"]
+    (one,) = trial.rows()
+    assert "background=none" in one.refused
+    assert report.verdict(one) == "yes: the preset cannot be built"
+
+
+def test_a_run_is_a_command_that_ablate_takes(film, tmp_path, looked, monkeypatch):
+    jobs = []
+    monkeypatch.setattr(ablate_pool, "run", lambda job: jobs.append(job) or [])
+    asked = inspect_pays.InspectPays(out=tmp_path, heldout="3", steps=7)
+    Trial(asked, *read(asked, film)).run()
+    name = "nerf-small+appearance.width=4"
+    words = ablate_pool.command(jobs[0], name, 0)
+    parsed = settings.parse(ablate.Ablate, words[3:])
+    ablate.check(parsed)
+    assert parsed == dataclasses.replace(
+        jobs[0].asked, arms=(name,), seed=0, seeds=None
+    )
+
+
+def test_a_capture_without_held_out_frames_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(runs, "stored_capture", lambda _: inspect_films.film())
+    with pytest.raises(ValueError, match="--heldout 8"):
+        read(inspect_pays.InspectPays(), tmp_path)
