@@ -13,6 +13,7 @@ from nerfies_jax.measure.clock import Metric
 # processor time of the same program on a shared machine.
 PSNR_DB = 0.25
 TIME_SHARE = 0.1
+DEPTH_SHARE = 0.2  # of the median depth error
 
 
 def verdict(row: Row) -> str:
@@ -23,19 +24,29 @@ def verdict(row: Row) -> str:
         return "yes: the preset cannot be built"
     if row.before is None or row.after is None:
         return "not trained yet"
-    gain = row.after.psnr - row.before.psnr
-    ratio = row.after.seconds / row.before.seconds
-    if not (math.isfinite(gain) and math.isfinite(ratio)):
+    if not (math.isfinite(row.before.psnr) and math.isfinite(row.after.psnr)):
         return "a run blew up"
-    better, worse = gain > PSNR_DB, gain < -PSNR_DB
+    gain, what = _quality(row.before, row.after)
+    ratio = row.after.seconds / row.before.seconds
     quicker, slower = ratio < 1 - TIME_SHARE, ratio > 1 + TIME_SHARE
-    if better:
-        return "yes: better and quicker" if quicker else "yes: better"
-    if worse:
-        return "no: worse, though quicker" if quicker else "no: worse"
+    if gain > 0:
+        return f"yes: better {what}, quicker" if quicker else f"yes: better {what}"
+    if gain < 0:
+        return f"no: worse {what}, quicker" if quicker else f"no: worse {what}"
     if quicker:
         return "yes: as good, quicker"
     return "no: as good, slower" if slower else "neither way"
+
+
+def _quality(before, after):
+    """1 for better, -1 for worse, 0 for neither, and by what; pictures come first."""
+    gain = after.psnr - before.psnr
+    if abs(gain) > PSNR_DB:
+        return math.copysign(1, gain), "pictures"
+    ratio = after.depth / before.depth  # NaN where the depth is not known
+    if ratio < 1 - DEPTH_SHARE:
+        return 1, "depth"
+    return (-1 if ratio > 1 + DEPTH_SHARE else 0), "depth"
 
 
 def table(rows: list[Row]) -> list[str]:
@@ -75,6 +86,10 @@ def metrics_of(rows: list[Row]) -> list[Metric]:
             Metric(f"{stem}.psnr", row.before.psnr, "dB", "higher", 0.5),
             Metric(f"{stem}.advised_psnr", row.after.psnr, "dB", "higher", 0.5),
             Metric(f"{stem}.gain", gain, "dB", "higher", 2 * PSNR_DB),
+            Metric(f"{stem}.depth", row.before.depth, "scene units", "lower", 0.005),
+            Metric(
+                f"{stem}.advised_depth", row.after.depth, "scene units", "lower", 0.005
+            ),
             Metric(f"{stem}.time_ratio", ratio, "", "lower", TIME_SHARE),
         ]
     return found

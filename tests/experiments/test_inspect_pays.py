@@ -76,13 +76,17 @@ def row(before, after, advised="nerfies-small+appearance.width=4", refused=""):
 @pytest.mark.parametrize(
     ("before", "after", "said"),
     [
-        ((25.0, 60.0), (26.0, 80.0), "yes: better"),
-        ((25.0, 60.0), (26.0, 40.0), "yes: better and quicker"),
+        ((25.0, 60.0), (26.0, 80.0), "yes: better pictures"),
+        ((25.0, 60.0), (26.0, 40.0), "yes: better pictures, quicker"),
         ((25.0, 60.0), (25.1, 40.0), "yes: as good, quicker"),
         ((25.0, 60.0), (24.9, 62.0), "neither way"),
         ((25.0, 60.0), (25.2, 70.0), "no: as good, slower"),
-        ((25.0, 60.0), (24.0, 60.0), "no: worse"),
-        ((25.0, 60.0), (24.0, 30.0), "no: worse, though quicker"),
+        ((25.0, 60.0), (24.0, 60.0), "no: worse pictures"),
+        ((25.0, 60.0), (24.0, 30.0), "no: worse pictures, quicker"),
+        ((25.0, 60.0, 0.02), (25.0, 62.0, 0.01), "yes: better depth"),
+        ((25.0, 60.0, 0.02), (25.0, 50.0, 0.03), "no: worse depth, quicker"),
+        ((25.0, 60.0, 0.02), (25.0, 60.0, 0.019), "neither way"),
+        ((25.0, 60.0, 0.02), (24.0, 60.0, 0.01), "no: worse pictures"),
         ((25.0, 60.0), (math.nan, 60.0), "a run blew up"),
     ],
 )
@@ -107,7 +111,7 @@ def test_the_table_says_what_is_changed():
     head, _, one, same, other = report.table(rows)
     assert one == (
         "| exposure | `nerfies-small` | `appearance.width=4` | 25.00 | 26.00 | 0.0123 "
-        "| 0.0077 | 60 | 80 | yes: better |"
+        "| 0.0077 | 60 | 80 | yes: better pictures |"
     )
     assert head.count("|") == one.count("|")
     assert "| the same | - | - | - | - | - | - | nothing to change |" in same
@@ -176,8 +180,8 @@ def test_what_differs_is_trained_once_and_kept(film, tmp_path, looked, capsys):
         "train nerf-small+appearance.width=4",
     ]
     said = capsys.readouterr().out
-    assert "| 20.00 | 24.00 | - | - | 10 | 10 | yes: better |" in said
-    assert "2 pairs: 1 yes: better; 1 neither way." in said
+    assert "| 20.00 | 24.00 | - | - | 10 | 10 | yes: better pictures |" in said
+    assert "2 pairs: 1 yes: better pictures; 1 neither way." in said
     assert (tmp_path / "out/pays.md").read_text() in said
     stored = clock.read_metrics(tmp_path / "out/pays.json")
     assert stored["film.splats-deformable-small.gain"].value == 4.0
