@@ -29,7 +29,7 @@ _CACHE = os.environ.get(
     str(pathlib.Path(tempfile.gettempdir()) / "nerfies_jax_test_cache"),
 )
 jax.config.update("jax_compilation_cache_dir", _CACHE)
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 # A run in the background inherits an ignored SIGINT, and what Ctrl-C does is tested.
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -10,14 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import evaluate
 from gaussians_jax import density, scene, splats
 from gaussians_jax.rates import RateSpec
 from gaussians_jax.scene import Extra
 from gaussians_jax.spec import effects_of
 from gaussians_jax.start import StartSpec
 from nerfies_jax.capture.capture import PointCloud
-from nerfies_jax.training.model import Frames, Model, TrainState
+from nerfies_jax.training.model import Frames, Model, TrainState, View
 from tests import scenes
 from tests.hard_cases import hostile
 
@@ -39,9 +38,10 @@ PRESETS = [
 DIE = ("huge", "needles", "transparent")
 # |dL/dq| is 1e30 times that of a unit quaternion; its square is beyond float32.
 STOPS = {"quaternions of nearly nothing": "optimiser.second.rows.splats.quaternion"}
-# The error of the best chunk over that of the first frame. In so few updates RAdam's
-# steps are 0.03 to 0.15 of Adam's: frames differ by more than it learns.
-FALLS = {"sonata": 1.2}
+# The last frame's error over that of the start; 0.15 to 0.63 where Adam trains. RAdam's
+# steps are 0.03 to 0.15 of Adam's in so few updates, too short to make good what the
+# reset of the opacities at half time took: 1.12 to 1.24, as filmed, too.
+FALLS = {"sonata": 1.5}
 
 
 def hostile_spec(name):
@@ -70,16 +70,15 @@ class Ready(NamedTuple):
     start: TrainState
     frames: Frames
     effects: tuple
-    render: object
+    render: object  # (state, view) -> Rendering
 
 
 def ready_for(spec, capture) -> Ready:
     facts = scene.facts_of(capture)
     model = scene.build(spec, facts)
-    view = evaluate.view_of(capture, int(capture.heldout[0]))
 
     @jax.jit
-    def render(state):
+    def render(state, view):
         return model.render(state.params, view, capture.size, state.step)
 
     return Ready(
@@ -161,7 +160,7 @@ def run(made, start, frames, folder):
     """Train, hold the run to its promises and look at its picture."""
     steps = made.model.spec[0].steps
     trained = hostile.train(made.model, start, frames, folder, steps=steps)
-    picture = made.render(trained.result.state)
+    picture = made.render(trained.result.state, view_of(frames, 0))
     for name, leaf in picture._asdict().items():
         assert np.isfinite(np.asarray(leaf)).all(), name
     return trained
@@ -173,16 +172,20 @@ def from_rows(name, case, folder):
     return run(made, started_with(made, rows), made.frames, folder)
 
 
-def on_capture(name, case, folder):
-    made = ready(name)
-    frames = hostile.CAPTURES[case](made.frames)
-    return run(made, made.start, frames, folder)
+def view_of(frames, row):
+    camera = jax.tree.map(lambda leaf: leaf[row], frames.cameras)
+    return View(camera, frames.times[row], frames.warp[row], frames.appearance[row])
 
 
-def falls(trained):
-    """How far the error fell at best, over that of the first step."""
-    first, *later = [row["mse"] for row in trained.result.history.rows]
-    return min(later) / first
+def falls(made, frames, trained):
+    """The last frame's mean squared error after training, over that before it."""
+    truth = frames.images[-1].astype(jnp.float32) / 255
+    drawn = [
+        made.render(state, view_of(frames, -1)).colour
+        for state in (made.start, trained.result.state)
+    ]
+    before, after = (float(jnp.mean((colour - truth) ** 2)) for colour in drawn)
+    return after / before
 
 
 @pytest.mark.parametrize("case", ROWS)
@@ -201,9 +204,11 @@ def test_splats_train_from_hostile_rows(name, case, tmp_path):
 @pytest.mark.parametrize("case", hostile.CAPTURES)
 @pytest.mark.parametrize("name", PRESETS)
 def test_splats_train_on_hostile_captures(name, case, tmp_path):
-    trained = on_capture(name, case, tmp_path)
+    made = ready(name)
+    frames = hostile.CAPTURES[case](made.frames)
+    trained = run(made, made.start, frames, tmp_path)
     assert trained.result.stopped_by == "steps", trained.result.message
-    assert falls(trained) < FALLS.get(name, 0.95)
+    assert falls(made, frames, trained) < FALLS.get(name, 0.95)
 
 
 def faster(spec, factor):
@@ -229,7 +234,7 @@ def test_splats_train_on_two_frames_at_ten_times_the_rates(name, tmp_path):
     assert made.frames.times.shape == (2,)
     trained = run(made, made.start, made.frames, tmp_path)
     assert trained.result.stopped_by == "steps", trained.result.message
-    assert falls(trained) < FALLS.get(name, 0.95)
+    assert falls(made, made.frames, trained) < FALLS.get(name, 0.95)
 
 
 def points_at(position):
