@@ -1,0 +1,52 @@
+"""The nearest kernels alone: the dense sum where all count, its cut-off where not."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experiments import kan_local
+from nerfies_jax.nets import kan
+from nerfies_jax.nets.mlp import HeadSpec
+
+SPEC = kan.KANSpec(
+    inputs=3, hidden=(), heads=(("y", HeadSpec(2)),), kernels=8, base=False
+)
+
+
+def test_the_nearest_kernels_are_the_terms_of_a_loop(float64, rng):
+    layer = kan.init(SPEC, jax.random.key(0), jnp.float64).heads["y"]
+    x = rng.uniform(-1, 1, (20, 3))
+    centres = np.linspace(-1, 1, 8)
+    width = np.sqrt(2) * SPEC.width_ratio * 2 / 7
+    for nearest in (3, 4, 8):
+        truth = np.zeros((20, 2)) + np.asarray(layer.bias)
+        for n in range(20):
+            for i in range(3):
+                close = np.argsort(np.abs(x[n, i] - centres), kind="stable")[:nearest]
+                for g in close:
+                    height = np.exp(-(((x[n, i] - centres[g]) / width) ** 2))
+                    truth[n] += height * np.asarray(layer.kernel)[g, i]
+        found = kan_local.local(SPEC, layer, jnp.asarray(x), nearest)
+        np.testing.assert_allclose(found, truth, rtol=0, atol=1e-13)
+
+
+def test_a_tiny_table(tmp_path, capsys):
+    words = "--kernels 6 --nearest 2 4 --points 30 --width 3 --repeats 1 --out"
+    kan_local.main([*words.split(), str(tmp_path / "t.json")])
+    rows = json.loads((tmp_path / "t.json").read_text())["rows"]
+    assert [row["nearest"] for row in rows] == ["all", 2, 4]
+    dense, two, four = (row["error"] for row in rows)
+    assert dense == 0
+    assert 0 < four < two / 3
+    assert "of dense" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("words", ["--kernels 1", "--nearest 0", "--points 0"])
+def test_wrong_settings_are_refused(words, capsys):
+    with pytest.raises(SystemExit) as refused:
+        kan_local.main(words.split())
+    assert refused.value.code == 2
+    assert words.split()[0] in capsys.readouterr().err
