@@ -3,6 +3,7 @@
 import json
 import pathlib
 import re
+import shutil
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +11,9 @@ import pytest
 from matplotlib import colormaps
 
 from experiments import (
+    compare,
     evaluate,
+    pictures,
     products,
     reconstruct,
     render,
@@ -191,6 +194,35 @@ def test_a_run_leaves_all_its_files(run):
     ):
         assert (run / name).exists(), name
     assert len(list((run / "depth").glob("*.exr"))) == 1
+
+
+@pytest.mark.slow
+def test_runs_are_drawn_beside_each_other(run, tmp_path, monkeypatch, capsys):
+    """A run beside a copy of itself: the truth, twice the same picture and error."""
+    shutil.copytree(run, tmp_path / "again")
+    laid, sheet = {}, pictures.contact_sheet
+
+    def caught(panels, captions, columns):
+        laid.update(panels=panels, captions=captions, columns=columns)
+        return sheet(panels, captions, columns)
+
+    monkeypatch.setattr(pictures, "contact_sheet", caught)
+    out = tmp_path / "beside"
+    folders = [str(run), str(tmp_path / "again")]
+    compare.main([*folders, "--frames", "1", "--out", str(out)])
+    said = capsys.readouterr().out
+    assert str(out) in said
+    truth, one, other, _, error, same = laid["panels"]
+    assert laid["columns"] == 3
+    capture = scenes.tiny_capture()
+    np.testing.assert_array_equal(truth, capture.images[capture.heldout[0]])
+    np.testing.assert_array_equal(one, other)
+    np.testing.assert_array_equal(error, same)
+    assert np.abs(one.astype(float) - truth).mean() < 60  # it is of this scene
+    psnr = json.loads((run / "metrics.json").read_text())["heldout.psnr"]
+    assert f": {psnr:.2f} dB" in laid["captions"][1]
+    for name in ("pictures.png", "curves.png", "compare.json"):
+        assert (out / name).stat().st_size > 300, name
 
 
 @pytest.mark.slow
