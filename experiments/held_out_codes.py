@@ -7,7 +7,6 @@ is, the code is fitted to the left half of a frame, and the right half is scored
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from experiments import evaluate
@@ -15,7 +14,12 @@ from nerfies_jax import scene, tracing
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.effects.effect import APPEARANCE, Moment
 from nerfies_jax.training import fit, losses
-from nerfies_jax.training.model import Rendering, TrainState, View
+from nerfies_jax.training.model import (
+    Rendering,
+    TrainState,
+    View,
+    in_default_precision,
+)
 
 RAYS = 512  # of the left half that a code is fitted to
 # L-BFGS is as good as converged after some twenty steps, of about two evaluations each.
@@ -68,8 +72,8 @@ def score(
             return made.codes_at(params, view)
         # With repeats: one shape, however little of the half was filmed.
         line, column = place[np.random.default_rng(0).integers(len(place), size=RAYS)].T
-        pixels = jnp.asarray(np.stack([column, line], axis=1) + 0.5, jnp.float32)
-        colours = jnp.asarray(left[line, column].astype(np.float32) / 255)
+        pixels = in_default_precision(np.stack([column, line], axis=1) + 0.5)
+        colours = in_default_precision(left[line, column].astype(np.float32) / 255)
         return solve(params, view, pixels, colours, step)
 
     def render(view: View, codes: Any) -> Rendering:
