@@ -12,6 +12,11 @@ class Measure(NamedTuple):
     direction: str  # which is better: "lower" or "higher"; "equal" for neither
     tolerance: float  # how much worse a later run may be, in the unit
     digits: int  # behind the point
+    share: float = 0.0  # or so much of its value, whichever is more
+
+    def allowed(self, value: float) -> float:
+        """How much worse than before `value` may be; nothing where it is not known."""
+        return max(self.tolerance, self.share * value) if value == value else 0.0
 
 
 MEASURES = {
@@ -28,14 +33,14 @@ MEASURES = {
     "track_lost": Measure("lost", "", "lower", 0.02, 3),
     "drift": Measure("drift", "scene units", "lower", 0.002, 4),
     "strain": Measure("strain", "", "lower", 0.1, 2),
-    "gaussians": Measure("Gauss.", "", "equal", 2000.0, 0),
-    "parameters": Measure("params", "", "equal", 1e5, 0),
-    "steps": Measure("steps", "", "equal", 1000.0, 0),
-    "train_seconds": Measure("train s", "s", "lower", 60.0, 0),
-    "train_cpu_seconds": Measure("CPU s", "s", "lower", 60.0, 0),
-    "compile_seconds": Measure("compile", "s", "lower", 10.0, 1),
-    "render_ms": Measure("frame ms", "ms", "lower", 500.0, 0),
-    "peak_mb": Measure("peak MB", "MB", "lower", 300.0, 0),
+    "gaussians": Measure("Gauss.", "", "equal", 200.0, 0, 0.1),
+    "parameters": Measure("params", "", "equal", 0.0, 0, 0.1),
+    "steps": Measure("steps", "", "equal", 0.0, 0, 0.1),
+    "train_seconds": Measure("train s", "s", "lower", 2.0, 0, 0.33),
+    "train_cpu_seconds": Measure("CPU s", "s", "lower", 2.0, 0, 0.33),
+    "compile_seconds": Measure("compile", "s", "lower", 5.0, 1, 0.33),
+    "render_ms": Measure("frame ms", "ms", "lower", 10.0, 0, 0.33),
+    "peak_mb": Measure("peak MB", "MB", "lower", 100.0, 0, 0.2),
 }
 
 COSTS = tuple(MEASURES)[tuple(MEASURES).index("gaussians") :]  # the others are quality

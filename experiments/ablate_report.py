@@ -83,14 +83,10 @@ def metrics(numbers: Numbers, still: float) -> list[Metric]:
         rows = [row for (name, _), row in numbers.items() if name == arm]
         for name, measure in MEASURES.items():
             values = ablate_verdicts.values_of(rows, name)
+            mean = float(values.mean())
+            allowed = measure.allowed(mean)
             found.append(
-                Metric(
-                    f"{arm}.{name}",
-                    float(values.mean()),
-                    measure.unit,
-                    measure.direction,
-                    measure.tolerance,
-                )
+                Metric(f"{arm}.{name}", mean, measure.unit, measure.direction, allowed)
             )
             if len(values) > 1:
                 spread = float(values.std(ddof=1))
@@ -100,7 +96,7 @@ def metrics(numbers: Numbers, still: float) -> list[Metric]:
                         spread,
                         measure.unit,
                         "lower",
-                        measure.tolerance,
+                        allowed,
                     )
                 )
     return found

@@ -7,7 +7,13 @@ import types
 
 import pytest
 
-from experiments import ablate, accuracy_report, accuracy_time, baselines
+from experiments import (
+    ablate,
+    ablate_pool,
+    accuracy_report,
+    accuracy_time,
+    baselines,
+)
 from experiments.ablate_job import Job
 from experiments.ablate_measures import MEASURES
 from experiments.accuracy_axes import AXES, SETTINGS, Axis
@@ -17,8 +23,9 @@ from nerfies_jax.measure.clock import Metric
 @pytest.mark.parametrize("name", AXES)
 def test_every_setting_of_an_axis_differs_from_its_base_and_the_others(name):
     job = types.SimpleNamespace(suite=SETTINGS, asked=ablate.Ablate(suite="settings"))
-    specs = {setting: Job.spec(job, setting, 600) for setting in AXES[name].settings}
-    assert len(set(map(repr, specs.values()))) == len(specs)
+    arms = AXES[name].settings
+    specs = [(Job.spec(job, each, 600), arm.environment) for each, arm in arms.items()]
+    assert len(set(map(repr, specs))) == len(specs)
     assert AXES[name].base in specs
 
 
@@ -43,15 +50,42 @@ def row(**values):
     return dict.fromkeys(MEASURES, math.nan) | values
 
 
+def test_a_setting_of_precision_has_its_switch_in_its_process(tmp_path, monkeypatch):
+    job = types.SimpleNamespace(
+        suite=SETTINGS, out=tmp_path, asked=ablate.Ablate(suite="settings")
+    )
+    begun = {}
+
+    def caught(words, **given):
+        begun[words[words.index("--arms") + 1]] = given["env"]
+
+    monkeypatch.setattr(ablate_pool.subprocess, "Popen", caught)
+    monkeypatch.delenv("JAX_ENABLE_X64", raising=False)
+    for name in ("field-float64", "nerfies-small"):
+        ablate_pool.start(job, name, 0)
+    assert begun["field-float64"]["JAX_ENABLE_X64"] == "1"
+    assert "JAX_ENABLE_X64" not in begun["nerfies-small"]
+
+
+def test_a_setting_of_precision_is_refused_without_its_switch(monkeypatch):
+    job = types.SimpleNamespace(suite=SETTINGS)
+    monkeypatch.setenv("JAX_ENABLE_X64", "0")
+    with pytest.raises(ValueError, match="field-float64 is trained under JAX_ENABLE"):
+        Job._check_environment(job, "field-float64")
+    monkeypatch.setenv("JAX_ENABLE_X64", "1")
+    Job._check_environment(job, "field-float64")
+    Job._check_environment(job, "nerfies-small")
+
+
 def test_the_front_is_what_nothing_beats_in_both():
     means = {
-        "slow and good": row(train_seconds=9.0, psnr=30.0),
-        "dominated": row(train_seconds=9.5, psnr=29.0),
-        "cheap": row(train_seconds=1.0, psnr=20.0),
-        "as good, dearer": row(train_seconds=2.0, psnr=20.0),
-        "unknown": row(train_seconds=0.1),
+        "slow and good": row(train_cpu_seconds=9.0, psnr=30.0),
+        "dominated": row(train_cpu_seconds=9.5, psnr=29.0),
+        "cheap": row(train_cpu_seconds=1.0, psnr=20.0),
+        "as good, dearer": row(train_cpu_seconds=2.0, psnr=20.0),
+        "unknown": row(train_cpu_seconds=0.1),
     }
-    found = accuracy_report.front(means, "psnr", "train_seconds")
+    found = accuracy_report.front(means, "psnr", "train_cpu_seconds")
     assert found == ["cheap", "slow and good"]
 
 
@@ -69,13 +103,24 @@ def test_a_line_says_what_changed_against_the_base_and_what_it_costs():
     axis = Axis("", "base", {"base": None, "half": None})
     numbers = {}
     for seed, (dB, other) in enumerate([(20.0, 20.4), (20.2, 20.1)]):
-        numbers["base", seed] = row(psnr=dB, train_seconds=100.0, render_ms=10.0)
-        numbers["half", seed] = row(psnr=other, train_seconds=50.0, render_ms=5.0)
+        numbers["base", seed] = row(psnr=dB, train_cpu_seconds=100.0, render_ms=10.0)
+        numbers["half", seed] = row(psnr=other, train_cpu_seconds=50.0, render_ms=5.0)
     base, half = accuracy_report.axis_lines(axis, numbers)
     assert "PSNR 20.10; 100 s, 10 ms a frame" in base
     assert "PSNR 20.25 (+0.15, same); 0.50 of the training time, 0.50" in half
     one = {key: value for key, value in numbers.items() if key[1] == 0}
     assert "(+0.40, one seed)" in accuracy_report.axis_lines(axis, one)[1]
+
+
+def test_a_cost_may_grow_by_a_share_and_a_quality_by_a_number():
+    before = Metric("a", 300.0, "", "lower")
+    measure = MEASURES["train_cpu_seconds"]
+    assert measure.allowed(1.0) == 2.0
+    dearer = Metric("a", 440.0, "", "lower", measure.allowed(440.0))
+    assert dearer.holds(before.value)
+    assert not Metric("a", 460.0, "", "lower", measure.allowed(460.0)).holds(300.0)
+    assert MEASURES["psnr"].allowed(30.0) == MEASURES["psnr"].tolerance
+    assert measure.allowed(math.nan) == 0
 
 
 def test_what_got_worse_is_named_and_what_is_new_is_not():
@@ -84,12 +129,12 @@ def test_what_got_worse_is_named_and_what_is_new_is_not():
 
     before = {
         "a.psnr": metric("a.psnr", 20.0, "higher"),
-        "a.train_seconds": metric("a.train_seconds", 5.0, "lower"),
+        "a.train_cpu_seconds": metric("a.train_cpu_seconds", 5.0, "lower"),
         "a.track_error": metric("a.track_error", math.nan, "lower"),
     }
     now = [
         metric("a.psnr", 19.4, "higher"),
-        metric("a.train_seconds", 5.4, "lower"),
+        metric("a.train_cpu_seconds", 5.4, "lower"),
         metric("a.track_error", 9.0, "lower"),
         metric("b.psnr", 1.0, "higher"),
     ]
