@@ -56,11 +56,15 @@ class _Key:
 
 def hold(case: Case, dtype: str) -> None:
     """Value and derivatives within their bounds, eager, under jit and under vmap."""
+    bounds = case.bounds[dtype]
+    # Programs are most of a room's time: value and derivatives share one. Slopes alone,
+    # and values without jit, a program for every operation, are of float32 only.
+    whole = _derivatives(case, len(bounds))
+    alone = jax.jit(_derivatives(case, 2 if dtype == "float32" else 1))
     with jax.enable_x64(dtype == "float64"):
         inputs = jnp.asarray(case.inputs, dtype)
-        for order, bound in enumerate(case.bounds[dtype]):
-            function = hard_case.derivative(case.stable, order)
-            together = jax.jit(jax.vmap(function))(inputs)
+        every = jax.jit(jax.vmap(whole))(inputs)
+        for order, (together, bound) in enumerate(zip(every, bounds, strict=True)):
             exact = _exact(_Key(case), order, dtype)
             off = hard_case.errors(case, together, exact, order)
             worst = int(np.argmax(off))
@@ -69,21 +73,23 @@ def hold(case: Case, dtype: str) -> None:
                 f"{case.axis} = {case.at[worst]:.17g}, bound {bound:.1e}"
             )
             size = np.abs(exact).max(axis=tuple(range(1, exact.ndim)))
-            size = np.maximum(size, case.floors[order])
-            # Another program of the same derivative is most of a room's time: slopes
-            # are compiled alone in float32 only, curvatures never.
-            if order == 2 or (order == 1 and dtype != "float32"):
-                continue
+            allowed = 2 * bound * np.maximum(size, case.floors[order])
             # Alone, and without jit, at the ends and at the worst point.
-            some = sorted({0, worst, len(inputs) - 1})
-            some, bounds = np.array(some), 2 * bound * size
-            one = jax.jit(function)
-            alone = [one(inputs[k]) for k in some]
-            _alike(case, dtype, "jit", alone, together[some], bounds[some])
-            if order == 0:
-                alone = [function(inputs[k]) for k in some]
-                assert alone[0].dtype == together.dtype
-                _alike(case, dtype, "eager", alone, together[some], bounds[some])
+            some = np.array(sorted({0, worst, len(inputs) - 1}))
+            singly = [alone(inputs[k]) for k in some]
+            if order < len(singly[0]):
+                one = [each[order] for each in singly]
+                _alike(case, dtype, "jit", one, together[some], allowed[some])
+            if order == 0 and dtype == "float32":
+                one = [case.stable(inputs[k]) for k in some]
+                assert one[0].dtype == together.dtype
+                _alike(case, dtype, "eager", one, together[some], allowed[some])
+
+
+def _derivatives(case, count):
+    """One input -> the first so many of value, slope and curvature."""
+    forms = [hard_case.derivative(case.stable, order) for order in range(count)]
+    return lambda x: tuple(form(x) for form in forms)
 
 
 def _alike(case, dtype, how, alone, together, bounds):
