@@ -82,9 +82,16 @@ def test_codes_and_media_come_in_where_the_preset_has_none():
     spec, _ = spec_of(FIELDS, motion=True, appearance_codes=True)
     assert spec.appearance == AppearanceSpec(4)
     assert spec.transient is None
-    assert spec_of(FIELDS, transient_objects=True)[0].transient.width == 48
+    passed, _ = spec_of(FIELDS, motion=False, transient_objects=True)
+    assert passed.transient.width == 48
     _, advice = spec_of(SPLATS, appearance_codes=True)
     assert any("prefer the field" in note for note in advice.notes)
+
+
+def test_no_medium_is_brought_in_beside_a_warp():
+    spec, advice = spec_of(FIELDS, motion=True, transient_objects=True)
+    assert spec.transient is None
+    assert any("left to the warp" in note for note in advice.notes)
 
 
 def test_an_effect_that_is_one_of_several_kinds_is_not_guessed():

@@ -99,6 +99,7 @@ def test_what_a_decision_switches_on_has_a_price():
 def _effects(kind, effect, wanted):
     """Names of the effects in the scene that is advised, the other decisions alike."""
     choices = {MOTION: True, LIGHT: False, TRANSIENT: False, BACKGROUND: True}
+    choices[MOTION] = effect != TRANSIENT  # which is not advised beside a warp
     choices[effect] = wanted
     findings = tuple(Finding(x, "", "", y, CERTAIN) for x, y in choices.items())
     advice = inspect_advice.advise(findings, kind)
