@@ -28,7 +28,7 @@ TITLES = {
     "track_error": "end-point error / scene units",
     "train_seconds": "seconds of training",
     "train_cpu_seconds": "processor seconds of training",
-    "render_ms": "milliseconds a frame",
+    "render_ms": "milliseconds a frame (of the processor, on a CPU)",
     "peak_mb": "peak memory / MB",
     "parameters": "parameters (4 bytes each in the file)",
 }
@@ -181,6 +181,17 @@ def _draw_front(panel, job, means, quality, cost):
             colour = SPLAT_COLOUR if splats else FIELD_COLOUR
             panel.plot(row[cost], row[quality], "o", color=colour, markersize=4)
     names = front(means, quality, cost)
+    for name in set(means) - set(names):
+        row = means[name]
+        if name.endswith("-small") and math.isfinite(row[cost] + row[quality]):
+            panel.annotate(
+                name.removesuffix("-small"),
+                (row[cost], row[quality]),
+                xytext=(4, -2),
+                textcoords="offset points",
+                fontsize=6,
+                color="#8b949e",
+            )
     xs = [means[name][cost] for name in names]
     ys = [means[name][quality] for name in names]
     panel.plot(xs, ys, "-", color="#59636e", linewidth=1, zorder=0)

@@ -108,6 +108,7 @@ class Renderer:
         self._posed = _Kept()
         self.size = size  # width and height in pixels
         self.seconds: list[float] = []  # of every frame, without compiling
+        self.cpu_seconds: list[float] = []  # the same, of the processor
         self.posed_anew: list[bool] = []  # whether that frame's instant was a new one
 
     def __call__(self, state: TrainState, view: View) -> Rendering:
@@ -116,10 +117,11 @@ class Renderer:
         if shapes not in self._programs:
             compiled = _whole if self._model.stages is None else _staged
             self._programs[shapes] = compiled(self._model, self.size, inputs)
-        start = time.perf_counter()
+        start, cpu_start = time.perf_counter(), time.process_time()
         rendering, anew = self._draw(self._programs[shapes], *inputs)
         rendering = jax.device_get(rendering)
         self.seconds.append(time.perf_counter() - start)
+        self.cpu_seconds.append(time.process_time() - cpu_start)
         self.posed_anew.append(anew)
         return rendering
 
@@ -134,14 +136,14 @@ class Renderer:
         )
         return programs.draw(params, posed, view, step), anew
 
-    def ms_per_frame(self, frames: int) -> float:
-        """What one of the last `frames` frames took.
+    def ms_per_frame(self, frames: int, cpu: bool = False) -> float:
+        """What one of the last `frames` frames took, on the wall or of the processor.
 
         The median, of frames at a new instant and of further views of the same instant
         apart, weighted by how many there were of each: the median of both together
         would leave out the poses altogether as soon as a second view shares them.
         """
-        seconds = np.asarray(self.seconds[-frames:])
+        seconds = np.asarray((self.cpu_seconds if cpu else self.seconds)[-frames:])
         anew = np.asarray(self.posed_anew[-frames:])
         parts = [seconds[anew], seconds[~anew]]
         total = sum(len(part) * np.median(part) for part in parts if len(part))

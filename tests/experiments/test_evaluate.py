@@ -163,6 +163,8 @@ def test_a_frame_costs_what_it_costs_with_its_share_of_the_poses():
     # Medians 0.010 of the three new instants and 0.003 of the other three.
     np.testing.assert_allclose(renderer.ms_per_frame(6), (3 * 10 + 3 * 3) / 6)
     np.testing.assert_allclose(renderer.ms_per_frame(1), 3)
+    renderer.cpu_seconds = [2 * seconds for seconds in renderer.seconds]
+    np.testing.assert_allclose(renderer.ms_per_frame(1, cpu=True), 6)
     np.testing.assert_allclose(renderer.ms_per_frame(2), (10 + 3) / 2)
 
 
