@@ -63,7 +63,8 @@ LEGENDS = {
     "train_seconds": "train s: steps and what happens between them, without compiling "
     "the step; CPU s: the\nsame of all threads; compile: the step's programs, as "
     "without a cache (what one from it once took\nis added); frame ms: rendering a "
-    "held-out frame (of all threads, on a CPU); peak MB: most memory of the process, where it made one arm alone.",
+    "held-out frame (of all threads, on a CPU);\npeak MB: most memory of the process, "
+    "where it made one arm alone.",
 }
 
 
