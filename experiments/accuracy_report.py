@@ -28,7 +28,7 @@ TITLES = {
     "track_error": "end-point error / scene units",
     "train_seconds": "seconds of training",
     "train_cpu_seconds": "processor seconds of training",
-    "render_ms": "milliseconds a frame (of the processor, on a CPU)",
+    "render_ms": "milliseconds a frame",
     "peak_mb": "peak memory / MB",
     "parameters": "parameters (4 bytes each in the file)",
 }
