@@ -11,6 +11,7 @@ import types
 import pytest
 
 from experiments import ablate, ablate_pool, settings
+from experiments.ablate_arms import Arm
 
 # A process that stands for an arm: it does what its own file says.
 ARM = """
@@ -32,6 +33,8 @@ class Job:
         self.out, self.wait, self.budgets = out, seconds, [None]
         self.every = [(name, seed) for seed in range(seeds) for name in names]
         self.asked = ablate.Ablate(**asked)
+        arms = {name: Arm("nerf-small") for name in names}
+        self.suite = types.SimpleNamespace(arms=arms)
 
     def tasks(self):
         return self.every
