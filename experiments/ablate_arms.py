@@ -16,6 +16,11 @@ class Arm:
     needs: Literal["depths"] | None = None  # in the capture, or it changes nothing
     environment: tuple[str, ...] = ()  # of its process: NAME=VALUE
 
+    @property
+    def variables(self) -> dict[str, str]:
+        """The environment by name."""
+        return dict(word.split("=", 1) for word in self.environment)
+
 
 class Claim(NamedTuple):
     """That one arm is better than another, by some measures."""

@@ -200,12 +200,11 @@ class Job:
         say("    " + line(kept.numbers))
 
     def _check_environment(self, name):
-        for word in self.suite.arms[name].environment:
-            variable, value = word.split("=", 1)
+        for variable, value in self.suite.arms[name].variables.items():
             if os.environ.get(variable) != value:
                 raise ValueError(
-                    f"{name} is trained under {word}: set it, or give --jobs 2, which "
-                    "gives every arm a process and sets it there"
+                    f"{name} is trained under {variable}={value}: set it, or give "
+                    "--jobs 2, which gives every arm a process and sets it there"
                 )
 
     def _train_for(self, name, budget) -> tuple[int, Kept]:

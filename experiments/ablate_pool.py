@@ -73,7 +73,7 @@ def start(job, name: str, seed: int) -> Running:
         "PJRT_NPROC": "1",
         "PYTHONPATH": os.pathsep.join(path),
         "COLUMNS": "88",
-        **dict(word.split("=", 1) for word in job.suite.arms[name].environment),
+        **job.suite.arms[name].variables,
     }
     with log.open("w") as file:
         process = subprocess.Popen(
