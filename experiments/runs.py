@@ -63,7 +63,7 @@ def open_run(
     stored: Capture | None = None,
 ) -> Run:
     """Read the capture and build the model."""
-    capture = pinholes.as_pinholes(stored or stored_capture(choices))
+    capture = read_capture(choices, stored)
     facts = representation.facts_of(capture, spec)
     model = representation.build(spec, facts)
     return Run(choices, capture, representation, spec, facts, model)
@@ -78,9 +78,9 @@ def scene_spec(choices: Choices) -> Any:
     return run_settings.override(spec, choices.overrides)
 
 
-def read_capture(choices: Choices) -> Capture:
-    """The capture asked for, ready for a pinhole renderer."""
-    return pinholes.as_pinholes(stored_capture(choices))
+def read_capture(choices: Choices, stored: Capture | None = None) -> Capture:
+    """The capture asked for, read unless it is `stored`, for a pinhole renderer."""
+    return pinholes.as_pinholes(stored or stored_capture(choices))
 
 
 def stored_capture(choices: Choices) -> Capture:
