@@ -139,9 +139,11 @@ def pose_problem(settings: Any) -> Problem:
     camera = looking_down_z()
     points = jnp.asarray(rng.uniform(-1, 1, (POINTS, 3)), jnp.float32)
 
+    def pixels_in(camera):
+        return jax.vmap(lambda point: cameras.project(camera, point)[0])(points)
+
     def seen(numbers):
-        moved = move_camera(camera, numbers[:3], numbers[3:])
-        return jax.vmap(lambda point: cameras.project(moved, point)[0])(points)
+        return pixels_in(move_camera(camera, numbers[:3], numbers[3:]))
 
     off = rng.normal(size=(settings.frames, 6)) * np.repeat([TURN, SHIFT], 3)
     noise = NOISE_PX * rng.normal(size=(settings.frames, POINTS, 2))
@@ -152,12 +154,8 @@ def pose_problem(settings: Any) -> Problem:
         return jnp.mean(jnp.sum((seen(numbers) - pixels) ** 2, axis=-1))
 
     def levenberg(pixels, most):
-        def residuals(moved):
-            found = jax.vmap(lambda point: cameras.project(moved, point)[0])(points)
-            return found - pixels
-
         spec = CameraSpec(tolerance=TOLERANCE, max_steps=most)
-        fit = refine_camera(residuals, camera, spec)
+        fit = refine_camera(lambda moved: pixels_in(moved) - pixels, camera, spec)
         return fit._replace(value=screw_between(camera, fit.value))
 
     start = jnp.zeros(6, jnp.float32)
