@@ -57,10 +57,11 @@ class _Key:
 def hold(case: Case, dtype: str) -> None:
     """Value and derivatives within their bounds, eager, under jit and under vmap."""
     bounds = case.bounds[dtype]
-    # Programs are most of a room's time: value and derivatives share one. Slopes alone,
-    # and values without jit, a program for every operation, are of float32 only.
+    # Programs are most of a room's time: value and derivatives share one, and alone
+    # slopes are compiled in float32 only, curvatures never.
     whole = _derivatives(case, len(bounds))
-    alone = jax.jit(_derivatives(case, 2 if dtype == "float32" else 1))
+    singly = min(len(bounds), 2 if dtype == "float32" else 1)
+    alone = jax.jit(_derivatives(case, singly))
     with jax.enable_x64(dtype == "float64"):
         inputs = jnp.asarray(case.inputs, dtype)
         every = jax.jit(jax.vmap(whole))(inputs)
@@ -76,11 +77,10 @@ def hold(case: Case, dtype: str) -> None:
             allowed = 2 * bound * np.maximum(size, case.floors[order])
             # Alone, and without jit, at the ends and at the worst point.
             some = np.array(sorted({0, worst, len(inputs) - 1}))
-            singly = [alone(inputs[k]) for k in some]
-            if order < len(singly[0]):
-                one = [each[order] for each in singly]
+            if order < singly:
+                one = [alone(inputs[k])[order] for k in some]
                 _alike(case, dtype, "jit", one, together[some], allowed[some])
-            if order == 0 and dtype == "float32":
+            if order == 0:
                 one = [case.stable(inputs[k]) for k in some]
                 assert one[0].dtype == together.dtype
                 _alike(case, dtype, "eager", one, together[some], allowed[some])
