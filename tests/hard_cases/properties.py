@@ -5,12 +5,12 @@ The draws of one checkout are always the same. For new ones, many of them, set
 PROPERTY_PROFILE=search.
 """
 
+import functools
 import math
 import os
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
@@ -24,7 +24,7 @@ from nerfies_jax.geometry.camera import Camera
 _QUIET = (HealthCheck.function_scoped_fixture, HealthCheck.too_slow)
 settings.register_profile(
     "properties",
-    max_examples=30,
+    max_examples=20,
     derandomize=True,
     database=None,
     deadline=None,
@@ -50,17 +50,31 @@ def eps(dtype) -> float:
 
 
 def cast(dtype, *trees):
-    """The same in a precision, as JAX arrays; one tree alone, several as a tuple.
+    """The same in a precision; one tree alone, several as a tuple.
 
-    Subnormal numbers become zero, as XLA's arithmetic makes them.
+    As NumPy arrays, which compiled functions take as they are: what a test does with
+    them beside compiles nothing. Subnormal numbers become zero, as XLA's arithmetic
+    makes them.
     """
+    tiny = np.finfo(dtype).tiny
 
     def cast_(leaf):
         leaf = np.asarray(leaf, dtype)
-        return jnp.asarray(np.where(np.abs(leaf) < np.finfo(dtype).tiny, 0, leaf))
+        return np.where(np.abs(leaf) < tiny, leaf.dtype.type(0), leaf)
 
     cast_trees = jax.tree.map(cast_, trees)
     return cast_trees if len(trees) > 1 else cast_trees[0]
+
+
+def compiled(function, **static):
+    """`jax.jit` with NumPy results: what a test does with them compiles nothing."""
+    run = jax.jit(function, **static)
+
+    @functools.wraps(function)
+    def run_(*args):
+        return jax.tree.map(np.asarray, run(*args))
+
+    return run_
 
 
 def norm(vector) -> float:
