@@ -245,15 +245,18 @@ def test_strain_of_a_nearly_rigid_screw_survives_float32():
         return lie.displacement(angular, rate @ point, point)
 
     @jax.jit
+    @jax.vmap
     def measured(point):
-        return matrix3.displacement_log_energy(jax.jacfwd(displacement)(point))
+        change = jax.jacfwd(displacement)(point)
+        whole = jnp.eye(3, dtype=point.dtype) + change
+        return matrix3.displacement_log_energy(change), matrix3.log_energy(whole)
 
-    narrow = measured(jnp.asarray([0.3, -0.2, 0.4]))
+    points = np.random.default_rng(0).uniform(-1, 1, (8, 3)).astype(np.float32)
+    narrow, rounded = map(np.asarray, measured(points))
     with jax.enable_x64(True):
-        wide = measured(jnp.asarray(np.float32([0.3, -0.2, 0.4]), jnp.float64))
-    assert abs(float(narrow) / float(wide) - 1) < 1e-5
-    jacobian = jnp.eye(3) + jax.jacfwd(displacement)(jnp.asarray([0.3, -0.2, 0.4]))
-    assert abs(float(matrix3.log_energy(jacobian)) / float(wide) - 1) > 1e-3
+        wide = np.asarray(measured(points.astype(np.float64))[0])
+    assert np.max(abs(narrow / wide - 1)) < 1e-5
+    assert np.max(abs(rounded / wide - 1)) > 1e-3
 
 
 def test_singular_vectors_refuse_to_be_differentiated():
