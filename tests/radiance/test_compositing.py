@@ -202,13 +202,22 @@ def test_thinned_is_exact_with_finite_slopes(depth, logit, dtype):
 
 @pytest.mark.hard_cases
 def test_thinned_meets_itself_at_the_switch(dtype):
-    """Opacity one half: the two forms may not differ by more than they err."""
-    logit = jnp.asarray(np.log(3.0), dtype)  # a share of 3/4 of an opacity of 2/3
-    for nudge in (-1e-6, 0.0, 1e-6):
-        depth = jnp.asarray(np.log(3.0) * (1 + nudge), dtype)
-        exact = exact_thinned(depth, logit)
-        got = float(thinned(depth, logit))
-        assert abs(got - exact) < ABSOLUTE[dtype]
+    """Opacity one quarter: the two forms may not differ by more than they err."""
+    logit = np.full(3, np.log(3.0), dtype)  # a share of 3/4 of an opacity of 1/3
+    depth = (np.log(1.5) * np.array([1 - 1e-6, 1, 1 + 1e-6])).astype(dtype)
+    exact = [exact_thinned(*pair) for pair in zip(depth, logit, strict=True)]
+    np.testing.assert_allclose(thinned(depth, logit), exact, atol=ABSOLUTE[dtype])
+
+
+@pytest.mark.hard_cases
+def test_thinned_keeps_its_digits_at_any_opacity(dtype):
+    """XLA's log1p of float64 loses 120 eps about -0.41."""
+    depth, logit = np.meshgrid([0.3, 1.0, 8.0], np.linspace(-2, 2, 41))
+    depth, logit = depth.astype(dtype).ravel(), logit.astype(dtype).ravel()
+    exact = [exact_thinned(*pair) for pair in zip(depth, logit, strict=True)]
+    found = np.asarray(thinned(depth, logit), np.float64)
+    # twice what was measured
+    np.testing.assert_allclose(found, exact, rtol=6 * np.finfo(dtype).eps)
 
 
 def test_thinned_multiplies_the_opacity(dtype, rng):
