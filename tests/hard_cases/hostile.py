@@ -5,6 +5,7 @@ a model once serves all of them. `frames_of` gives frames that have every array 
 change may want to fill.
 """
 
+import contextlib
 import re
 from typing import NamedTuple
 
@@ -117,20 +118,24 @@ class Trained(NamedTuple):
     last: dict[str, float]  # mean metrics of the last chunk
 
 
-def train(model, start, frames, folder, *, steps, every_seconds=0.5) -> Trained:
+def train(model, start, frames, folder=None, *, steps) -> Trained:
     """Fit, and hold the run to what every run promises.
 
     It completes its steps, or it stops with a message that names what went bad; either
-    way nothing it returns, has written down or has on disk is not finite.
+    way nothing it returns, has written down or has on disk is not finite. Without a
+    folder it writes no checkpoint, which takes as long as the run.
     """
-    with Checkpoints(folder, model.spec, keep=1000) as checkpoints:
+    keep = contextlib.nullcontext()
+    if folder is not None:
+        keep = Checkpoints(folder, model.spec, keep=1000)
+    with keep as checkpoints:
         result = loop.fit(
             model,
             start,
             frames,
             steps=steps,
             checkpoints=checkpoints,
-            checkpoint_seconds=every_seconds,
+            checkpoint_seconds=0.5,
             console=QUIET,
         )
     assert result.stopped_by in ("steps", "non-finite"), result.message
@@ -140,7 +145,8 @@ def train(model, start, frames, folder, *, steps, every_seconds=0.5) -> Trained:
     assert not not_finite(result.state), result.message
     for row in result.history.rows:
         assert np.isfinite(list(row.values())).all(), row
-    assert_checkpoints_finite(folder, model, result)
+    if folder is not None:
+        assert_checkpoints_finite(folder, model, result)
     rows = result.history.rows or ({},)
     return Trained(result, rows[0], rows[-1])
 

@@ -43,7 +43,7 @@ RUNS = [
 # --- whole runs ----------------------------------------------------------------------
 
 
-def trained(name, start, folder, steps=tiny_fields.STEPS):
+def trained(name, start, folder=None, steps=tiny_fields.STEPS):
     """A run that ended as every run must, and what it would show then."""
     run = tiny_fields.started(name)
     film = start.film(run.capture)
@@ -52,17 +52,20 @@ def trained(name, start, folder, steps=tiny_fields.STEPS):
         film = dataclasses.replace(film, points=run.capture.points)
     frames = start.frames(tiny_fields.frames_of(film, run.model.wants))
     state = run.state._replace(params=start.params(run.state.params), extra=place)
-    # One checkpoint, at the end: several took longer than the run.
-    ended = hostile.train(
-        run.model, state, frames, folder, steps=steps, every_seconds=60
-    )
-    view = jax.tree.map(lambda leaf: leaf[0], (frames.cameras, frames.times))
-    return ended, run.picture(ended.result.state, *view)
+    ended = hostile.train(run.model, state, frames, folder, steps=steps)
+    return ended, picture_of(run, ended.result.state, frames, 0)
+
+
+def picture_of(run, state, frames, row):
+    """The view of that frame; arrays that are placed alike share one program."""
+    view = jax.tree.map(lambda leaf: leaf[row], (frames.cameras, frames.times))
+    return run.picture(*jax.device_put((state, *view), jax.devices()[0]))
 
 
 @pytest.mark.parametrize(("name", "start"), RUNS)
 def test_a_field_stays_finite_from(name, start, tmp_path):
-    ended, picture = trained(name, STARTS[start], tmp_path)
+    folder = tmp_path if start == "as filmed" else None
+    ended, picture = trained(name, STARTS[start], folder)
     # The loop may stop with a word; none of these starts gives it a reason.
     assert ended.result.stopped_by == "steps", ended.result.message
     assert not hostile.not_finite(picture)
@@ -92,9 +95,9 @@ def test_a_field_that_overflows_stops_where_it_started_and_says_so(name, tmp_pat
 
 @pytest.mark.parametrize("unit", ["box of 1e-6 units", "box of 1e6 units"])
 @pytest.mark.parametrize("name", FIELDS)
-def test_a_step_is_the_same_in_any_unit(name, unit, tmp_path):
-    usual, _ = trained(name, Start(), tmp_path / "usual", steps=1)
-    other, _ = trained(name, STARTS[unit], tmp_path / "other", steps=1)
+def test_a_step_is_the_same_in_any_unit(name, unit):
+    usual, _ = trained(name, Start(), steps=1)
+    other, _ = trained(name, STARTS[unit], steps=1)
     # Positions are rounded before they are scaled: by 1e-7 of the box
     for metric, value in usual.first.items():
         if metric not in ("step", "seconds"):
@@ -113,10 +116,7 @@ def test_where_the_origin_of_the_world_is_cannot_be_seen(name):
     for film in (capture, shifted):
         place = tiny_fields.place_of(scene.facts_of(film, run.spec))
         frames = tiny_fields.frames_of(film, run.model.wants)
-        camera = jax.tree.map(lambda leaf: leaf[1], frames.cameras)
-        pictures.append(
-            run.picture(state._replace(extra=place), camera, frames.times[1])
-        )
+        pictures.append(picture_of(run, state._replace(extra=place), frames, 1))
     # A shift of 4 units is rounded to 2e-7, five times that in units of the field; the
     # fine samples move with it.
     jax.tree.map(
@@ -125,17 +125,18 @@ def test_where_the_origin_of_the_world_is_cannot_be_seen(name):
 
 
 @pytest.mark.slow  # shares the program of nerfies
+@pytest.mark.parametrize("name", ["nerfies"])
 @pytest.mark.parametrize("displacement", DISPLACEMENTS)
-def test_a_step_with_the_elastic_penalty_is_finite_from(displacement, tmp_path):
+def test_a_step_with_the_elastic_penalty_is_finite_from(displacement, name):
     strain = DISPLACEMENTS[displacement]
 
     def bent(params):
         return params | {"warp": linear_warps.linear_warp(params["warp"], strain)}
 
-    ended, picture = trained("nerfies", Start(params=bent), tmp_path, steps=50)
+    ended, picture = trained(name, Start(params=bent), steps=50)
     assert ended.result.stopped_by == "steps", ended.result.message
     assert not hostile.not_finite(picture)
-    expected = linear_warps.cost(tiny_fields.tiny("nerfies").elastic, strain)
+    expected = linear_warps.cost(tiny_fields.tiny(name).elastic, strain)
     measured = ended.first["elastic/elastic"]
     if displacement == "huge":
         # Asked 1e4 units out, the template leaves some rays empty.
@@ -156,12 +157,12 @@ def bare(capture):
 
 
 @pytest.mark.slow  # a program of its own: one frame, no depth and no flow
-def test_scene_flow_of_a_single_bare_frame_stays_finite(tmp_path):
+def test_scene_flow_of_a_single_bare_frame_stays_finite():
     spec = tiny_fields.tiny("nsff")
     run = tiny_fields.start(spec, bare(scenes.tiny_capture()))
     assert run.model.wants == frozenset()
     frames = tiny_fields.frames_of(run.capture, run.model.wants)
-    ended = hostile.train(run.model, run.state, frames, tmp_path, steps=200)
+    ended = hostile.train(run.model, run.state, frames, steps=200)
     assert ended.result.stopped_by == "steps", ended.result.message
     assert ended.last["mse"] < ended.first["mse"]
     for name in ("warped", "disocclusion", "cycle", "magnitude", "kinetic"):

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import re
 from typing import NamedTuple
 
 import jax
@@ -11,7 +10,6 @@ import numpy as np
 import pytest
 
 from gaussians_jax import density, scene, splats
-from gaussians_jax.rates import RateSpec
 from gaussians_jax.scene import Extra
 from gaussians_jax.spec import effects_of
 from gaussians_jax.start import StartSpec
@@ -23,6 +21,7 @@ from tests.hard_cases import hostile
 pytestmark = pytest.mark.hard_cases
 
 STEPS = 200
+DEVICE = jax.devices()[0]
 TINY = {
     "splats-static": scenes.TINY_SPLATS,
     "splats-deformable": scenes.TINY_DEFORMABLE,
@@ -63,6 +62,43 @@ def hostile_spec(name):
     return dataclasses.replace(TINY[name], steps=STEPS, density=plan)
 
 
+class Hurried(NamedTuple):
+    """What a scene carries, and how fast it is learnt."""
+
+    usual: Extra
+    speed: jax.Array  # times all learning rates
+
+
+def hurried(model):
+    """The model with the speed of `Hurried`: one program serves all."""
+
+    def plain(state):
+        return state._replace(extra=state.extra.usual)
+
+    def dressed(state, speed):
+        return state._replace(extra=Hurried(state.extra, speed))
+
+    def init(capture, key):
+        return dressed(model.init(capture, key), jnp.ones(()))
+
+    def step(state, frames):
+        speed = state.extra.speed
+        new, metrics = model.step(plain(state), frames)
+        params = jax.tree.map(
+            lambda old, new: old + speed * (new - old), state.params, new.params
+        )
+        return dressed(new._replace(params=params), speed), metrics
+
+    def happening(event):
+        def apply(state, frames):
+            return dressed(event.apply(plain(state), frames), state.extra.speed)
+
+        return event._replace(apply=apply)
+
+    events = tuple(happening(event) for event in model.events)
+    return model._replace(init=init, step=step, events=events)
+
+
 class Ready(NamedTuple):
     """A model, where it would start, its frames and its picture."""
 
@@ -70,16 +106,16 @@ class Ready(NamedTuple):
     start: TrainState
     frames: Frames
     effects: tuple
-    render: object  # (state, view) -> Rendering
+    render: object  # (params, view, step) -> Rendering
 
 
 def ready_for(spec, capture) -> Ready:
     facts = scene.facts_of(capture)
-    model = scene.build(spec, facts)
+    model = hurried(scene.build(spec, facts))
 
     @jax.jit
-    def render(state, view):
-        return model.render(state.params, view, capture.size, state.step)
+    def render(params, view, step):
+        return model.render(params, view, capture.size, step)
 
     return Ready(
         model,
@@ -100,7 +136,7 @@ def started_with(made: Ready, rows):
     params = made.start.params
     params = params._replace(rows=params.rows | {"splats": rows})
     extra = Extra(density.empty_stats(rows), scene.carried_by(made.effects, params))
-    return made.start._replace(params=params, extra=extra)
+    return made.start._replace(params=params, extra=Hurried(extra, jnp.ones(())))
 
 
 def one_point(rows):
@@ -156,43 +192,43 @@ ROWS = {
 }
 
 
-def run(made, start, frames, folder):
+def run(made, start, frames, folder=None):
     """Train, hold the run to its promises and look at its picture."""
     steps = made.model.spec[0].steps
     trained = hostile.train(made.model, start, frames, folder, steps=steps)
-    picture = made.render(trained.result.state, view_of(frames, 0))
+    picture = drawn(made, trained.result.state, frames, 0)
     for name, leaf in picture._asdict().items():
         assert np.isfinite(np.asarray(leaf)).all(), name
     return trained
 
 
-def from_rows(name, case, folder):
-    made = ready(name)
-    rows = ROWS[case](made.start.params.rows["splats"])
-    return run(made, started_with(made, rows), made.frames, folder)
-
-
-def view_of(frames, row):
+def drawn(made, state, frames, row):
+    """The view of that frame; arrays that are placed alike share one program."""
     camera = jax.tree.map(lambda leaf: leaf[row], frames.cameras)
-    return View(camera, frames.times[row], frames.warp[row], frames.appearance[row])
+    view = View(camera, frames.times[row], frames.warp[row], frames.appearance[row])
+    return made.render(*jax.device_put((state.params, view, state.step), DEVICE))
 
 
 def falls(made, frames, trained):
     """The last frame's mean squared error after training, over that before it."""
-    truth = frames.images[-1].astype(jnp.float32) / 255
-    drawn = [
-        made.render(state, view_of(frames, -1)).colour
+    truth = np.float32(frames.images[-1]) / 255
+    before, after = (
+        np.mean((np.asarray(drawn(made, state, frames, -1).colour) - truth) ** 2)
         for state in (made.start, trained.result.state)
-    ]
-    before, after = (float(jnp.mean((colour - truth) ** 2)) for colour in drawn)
+    )
     return after / before
 
 
 @pytest.mark.parametrize("case", ROWS)
 @pytest.mark.parametrize("name", PRESETS)
 def test_splats_train_from_hostile_rows(name, case, tmp_path):
-    trained = from_rows(name, case, tmp_path)
-    if case in STOPS and name != "sonata":  # whose RAdam starts with the plain slope
+    made = ready(name)
+    start = started_with(made, ROWS[case](made.start.params.rows["splats"]))
+    stops = (
+        case in STOPS and name != "sonata"
+    )  # whose RAdam starts with the plain slope
+    trained = run(made, start, made.frames, tmp_path if stops else None)
+    if stops:
         assert trained.result.stopped_by == "non-finite"
         assert STOPS[case] in trained.result.message
         return
@@ -206,34 +242,38 @@ def test_splats_train_from_hostile_rows(name, case, tmp_path):
 def test_splats_train_on_hostile_captures(name, case, tmp_path):
     made = ready(name)
     frames = hostile.CAPTURES[case](made.frames)
-    trained = run(made, made.start, frames, tmp_path)
+    folder = tmp_path if case == "as filmed" else None
+    trained = run(made, made.start, frames, folder)
     assert trained.result.stopped_by == "steps", trained.result.message
     assert falls(made, frames, trained) < FALLS.get(name, 0.95)
 
 
-def faster(spec, factor):
-    """The spec with every learning rate in it so many times as high."""
-    changed = {}
-    for field in dataclasses.fields(spec):
-        value = getattr(spec, field.name)
-        if dataclasses.is_dataclass(value):
-            changed[field.name] = faster(value, factor)
-        elif isinstance(spec, RateSpec) or re.search("rate(_end)?$", field.name):
-            changed[field.name] = value * factor
-    return dataclasses.replace(spec, **changed)
+def at_ten_times_the_rates(made, frames):
+    start = made.start._replace(
+        extra=made.start.extra._replace(speed=jnp.full((), 10.0))
+    )
+    trained = run(made, start, frames)
+    assert trained.result.stopped_by == "steps", trained.result.message
+    return trained
 
 
+@pytest.mark.parametrize("name", PRESETS)
+def test_splats_train_on_two_views_at_ten_times_the_rates(name):
+    made = ready(name)
+    frames = hostile.CAPTURES["two views"](made.frames)
+    trained = at_ten_times_the_rates(made, frames)
+    assert falls(made, frames, trained) < FALLS.get(name, 0.95)
+
+
+# What depends on the number of frames; a program of its own for each.
 @pytest.mark.slow
-@pytest.mark.parametrize("name", TINY)
-def test_splats_train_on_two_frames_at_ten_times_the_rates(name, tmp_path):
-    spec = faster(hostile_spec(name), 10.0)
-    assert spec.rates.mean == 1.6e-3
+@pytest.mark.parametrize("name", ["sonata", "moba"])
+def test_splats_train_on_two_frames_at_ten_times_the_rates(name):
     capture = scenes.tiny_capture()
     capture = dataclasses.replace(capture, train=capture.train[:2])
-    made = ready_for(spec, capture)
+    made = ready_for(hostile_spec(name), capture)
     assert made.frames.times.shape == (2,)
-    trained = run(made, made.start, made.frames, tmp_path)
-    assert trained.result.stopped_by == "steps", trained.result.message
+    trained = at_ten_times_the_rates(made, made.frames)
     assert falls(made, made.frames, trained) < FALLS.get(name, 0.95)
 
 
