@@ -171,17 +171,21 @@ def test_rows_beyond_the_living_blocks_are_still(float64):
 
 @pytest.mark.hard_cases
 def test_no_living_row_and_no_row_at_all(dtype):
-    params = strong(SMALL, dtype)
-    time = jnp.asarray(0.5, dtype)
+    spec = dataclasses.replace(SMALL, depth=1, skips=())
+    params = strong(spec, dtype)
 
-    def total(params, mean, alive):
-        offsets = mlp_motion.deform(params, SMALL, mean, time, alive)
-        return sum(jnp.sum(leaf) for leaf in offsets)
+    def deformed(params, mean, alive):
+        time = jnp.asarray(0.5, dtype)
+        return mlp_motion.deform(params, spec, mean, time, alive)
 
-    mean = some_gaussians(9, dtype).mean
-    slopes = jax.jit(jax.grad(total))(params, mean, jnp.zeros(9, bool))
+    def total(*args):
+        return sum(jnp.sum(leaf) for leaf in deformed(*args))
+
+    mean = np.asarray(some_gaussians(9, dtype).mean)
+    slopes = jax.jit(jax.grad(total))(params, mean, np.zeros(9, bool))
     assert not any(np.asarray(leaf).any() for leaf in jax.tree.leaves(slopes))
-    assert mlp_motion.deform(params, SMALL, mean[:0], time).quaternion.shape == (0, 4)
+    nobody = jax.eval_shape(deformed, params, mean[:0], np.zeros(0, bool))
+    assert nobody.quaternion.shape == (0, 4)
 
 
 def test_gradients_of_the_field(float64):

@@ -218,32 +218,37 @@ def test_gradients_of_the_field(detach, float64):
     assert error < 1e-6
 
 
-@functools.cache
-def directions_and_slopes(dtype):
-    encoded = np.ones(SMALL.position.width(3), dtype)
+@jax.jit
+def directions_and_slopes(params):
+    """The directions of one point, and their slopes in the bias of the head."""
 
-    def vectors(params):
-        return motion_basis.basis_vectors(params, SMALL, jnp.asarray(encoded))
+    def vectors(bias):
+        head = params.heads["directions"]._replace(bias=bias)
+        encoded = jnp.ones(SMALL.position.width(3), bias.dtype)
+        return motion_basis.basis_vectors(
+            params._replace(heads={"directions": head}), SMALL, encoded
+        )
 
-    return jax.jit(vectors), jax.jit(jax.jacrev(vectors))
+    bias = params.heads["directions"].bias
+    return vectors(bias), jax.jacfwd(vectors)(bias)
 
 
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("length", [0.0, 1e-30, 0.999, 1.0, 1.001, 1e12])
 def test_bounded_directions_are_at_most_one_long_with_finite_slopes(length, dtype):
-    params = strong(SMALL, dtype).basis
-    head = params.heads["directions"]
-    # Every direction along x, of the given length, whatever is encoded.
-    bias = jnp.zeros(12, dtype).at[:4].set(length)
-    fixed = head._replace(weight=jnp.zeros_like(head.weight), bias=bias)
-    params = params._replace(heads={"directions": fixed})
-    vectors, slopes_of = directions_and_slopes(dtype)
+    shapes = jax.eval_shape(
+        lambda: motion_basis.init(jax.random.key(0), SMALL, jnp.dtype(dtype)).basis
+    )
+    # No weights: every direction along x, of the given length, whatever is encoded.
+    params = jax.tree.map(lambda leaf: np.zeros(leaf.shape, dtype), shapes)
+    params.heads["directions"].bias[:4] = length
+    vectors, slopes = map(np.asarray, directions_and_slopes(params))
 
     expected = np.zeros((3, 4))
     expected[0] = min(length, 1.0)
     tolerance = {"float32": 3e-7, "float64": 1e-15}[dtype]
-    np.testing.assert_allclose(vectors(params), expected, rtol=tolerance)
-    slopes = slopes_of(params).heads["directions"].bias[0, 0]
+    np.testing.assert_allclose(vectors, expected, rtol=tolerance)
+    slopes = slopes[0, 0]
     # Along itself a short direction grows; a long one does not.
     along = {1.0: (0.0, 1.0)}.get(length, (float(length < 1),) * 2)
     assert along[0] - 1e-6 <= slopes[0] <= along[1] + 1e-6
@@ -359,10 +364,10 @@ def test_moving_gaussians(float64):
 def test_turns_of_every_size_are_rotations_with_finite_slopes(length, angle, dtype):
     """Also where q + dq would vanish: half a turn, and q of no length."""
     gaussians = some_gaussians(2, dtype)._replace(
-        quaternion=jnp.full((2, 4), length, dtype)
+        quaternion=np.full((2, 4), length, dtype)
     )
-    turn = jnp.asarray([[angle, 0, 0], [0, -0.6 * angle, 0.8 * angle]], dtype)
-    wild = jnp.asarray([[100.0] * 3, [-100.0] * 3], dtype)
+    turn = np.asarray([[angle, 0, 0], [0, -0.6 * angle, 0.8 * angle]], dtype)
+    wild = np.asarray([[100.0] * 3, [-100.0] * 3], dtype)
     slopes, moved = slopes_by_turn_and_scale(turn, wild, gaussians)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((slopes, moved)))
     tolerance = {"float32": 1e-6, "float64": 1e-14}[dtype]
