@@ -1,5 +1,7 @@
 """Elastic energies against NumPy's and mpmath's decompositions."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import mpmath
@@ -10,31 +12,43 @@ from nerfies_jax.geometry import lie, matrix3
 from tests import gradients
 
 ENERGIES = {False: matrix3.log_energy, True: matrix3.signed_log_energy}
-energy = {signed: jax.jit(jax.vmap(f)) for signed, f in ENERGIES.items()}
-slope = {signed: jax.jit(jax.vmap(jax.grad(f))) for signed, f in ENERGIES.items()}
-svd = jax.jit(jax.vmap(matrix3.svd))
-displaced = jax.jit(jax.vmap(jax.value_and_grad(matrix3.displacement_log_energy)))
-singular_values = jax.jit(jax.vmap(matrix3.singular_values))
 
 
-def turn_by_hand(function, matrix, direction):
-    """Hessian times a direction."""
-    return jax.jvp(jax.grad(function), (matrix,), (direction,))[1]
+@jax.jit
+@jax.vmap
+def decomposed(matrix):
+    """U, σ, V, and singular values by themselves."""
+    return matrix3.svd(matrix), matrix3.singular_values(matrix)
 
 
-hessian_product = {
-    signed: jax.jit(lambda m, d, f=f: turn_by_hand(f, m, d))
-    for signed, f in ENERGIES.items()
-}
-displaced_product = jax.jit(
-    lambda m, d: turn_by_hand(matrix3.displacement_log_energy, m, d)
-)
+def all_orders(function, matrix, direction):
+    """Value, slope, and Hessian times a direction."""
+    pair = jax.value_and_grad(function)
+    (value, slope), (_, bent) = jax.jvp(pair, (matrix,), (direction,))
+    return value, slope, bent
 
 
-def alone(function, matrix):
-    """The result for one matrix, by the program compiled for all of `matrices`."""
-    found = function(jnp.broadcast_to(matrix, (100, 3, 3)))
-    return jax.tree.map(lambda leaf: leaf[0], found)
+@jax.jit
+@jax.vmap
+def energies(matrix, direction):
+    """`all_orders` without and with the sign."""
+    return [all_orders(ENERGIES[s], matrix, direction) for s in (False, True)]
+
+
+@jax.jit
+@jax.vmap
+def displaced(displacement, direction):
+    return all_orders(matrix3.displacement_log_energy, displacement, direction)
+
+
+def of_some(function, matrices, direction=None):
+    """The results for some matrices, by the program compiled for 100 of them."""
+    given = np.resize(matrices, (100, 3, 3))
+    ways = (
+        np.zeros_like(given) if direction is None else np.resize(direction, (100, 3, 3))
+    )
+    found = jax.tree.map(np.asarray, function(given, ways.astype(given.dtype)))
+    return jax.tree.map(lambda leaf: leaf[: len(matrices)], found)
 
 
 def exact(matrix, signed):
@@ -66,8 +80,9 @@ def matrices(rng):
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("size", [1e-25, 1e-10, 1.0, 1e15, 1e25])
 def test_decomposition_restores_the_matrix(size, dtype, rng):
-    given = jnp.asarray(size * matrices(rng), dtype)
-    left, values, right = (np.asarray(x, np.float64) for x in svd(given))
+    given = (size * matrices(rng)).astype(dtype)
+    vectors, found = decomposed(given)
+    left, values, right = (np.asarray(x, np.float64) for x in vectors)
     restored = (left * values[:, None]) @ np.swapaxes(right, 1, 2)
     scale = np.abs(np.asarray(given, np.float64)).max(axis=(1, 2))
     bound = {"float32": 2e-6, "float64": 5e-15}[dtype]
@@ -77,20 +92,20 @@ def test_decomposition_restores_the_matrix(size, dtype, rng):
     assert np.min(np.linalg.det(left)) > 0.99
     assert np.min(np.linalg.det(right)) > 0.99
     assert np.array_equal(np.sign(values[:, 2]), np.sign(np.linalg.det(given / size)))
-    found = singular_values(given)
     np.testing.assert_allclose(found, np.abs(values), rtol=1e-6)
 
 
 @pytest.mark.parametrize("signed", [False, True])
 def test_energy_and_gradient(signed, dtype, rng):
-    given = jnp.asarray(matrices(rng), dtype)
+    given = matrices(rng).astype(dtype)
     truth = [exact(matrix, signed) for matrix in given]
     values = np.array([value for value, _ in truth])
     slopes = np.array([gradient for _, gradient in truth])
     # relative to the conditioning: an ulp of the matrix moves σ by as much
     bound = {"float32": 2e-5, "float64": 1e-13}[dtype]
-    np.testing.assert_allclose(energy[signed](given), values, rtol=bound, atol=bound)
-    error = np.abs(slope[signed](given) - slopes).max(axis=(1, 2))
+    found, slope, _ = of_some(energies, given)[signed]
+    np.testing.assert_allclose(found, values, rtol=bound, atol=bound)
+    error = np.abs(slope - slopes).max(axis=(1, 2))
     conditions = np.linalg.cond(np.asarray(given, np.float64))
     assert np.max(error / (1 + np.abs(slopes).max(axis=(1, 2)) * conditions)) < bound
 
@@ -147,58 +162,66 @@ HARD = {
     "huge": 1e15 * np.eye(3),
     "collapsing": np.diag([1, 1, 1e-5]),
     "mirror": np.diag([1, 1, -1.0]),
+    "flat": np.diag([1, 1, 0.0]),
     "at the switch": np.diag([1, 0.01, 0.01]),
     "nearly equal": np.diag([1, 1 + 1e-7, 1 - 1e-7]),
 }
 
 
+DIRECTION = np.random.default_rng(0).normal(size=(3, 3))
+
+
+@functools.cache
+def hard_energies(dtype):
+    """By sign and name: value, slope, and Hessian times `DIRECTION`."""
+    given = np.asarray(list(HARD.values()), dtype)
+    found = of_some(energies, given, DIRECTION)
+    return {
+        signed: dict(zip(HARD, zip(*found[signed], strict=True), strict=True))
+        for signed in (False, True)
+    }
+
+
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("signed", [False, True])
 @pytest.mark.parametrize("name", HARD)
-def test_hard_matrices_have_finite_energy_slope_and_curvature(name, signed, dtype, rng):
-    matrix = jnp.asarray(HARD[name], dtype)
-    direction = jnp.asarray(rng.normal(size=(3, 3)), dtype)
-    value, _ = exact(matrix, signed)
-    found = alone(energy[signed], matrix)
+def test_hard_matrices_have_finite_energy_slope_and_curvature(name, signed, dtype):
+    value, _ = exact(HARD[name].astype(dtype), signed)
+    found, gradient, bent = hard_energies(dtype)[signed][name]
     np.testing.assert_allclose(found, value, rtol=2e-6, atol=1e-12)
-    gradient = alone(slope[signed], matrix)
     assert np.all(np.isfinite(gradient))
-    assert np.all(np.isfinite(hessian_product[signed](matrix, direction)))
+    assert np.all(np.isfinite(bent))
     if name in {"zero", "rank one", "rank two", "tiny", "collapsing"}:
         assert np.max(abs(gradient)) > 100  # not the zero slope of a clamp
 
 
 @pytest.mark.hard_cases
-def test_curvature_at_the_identity_is_that_of_the_strain(dtype, rng):
+def test_curvature_at_the_identity_is_that_of_the_strain(dtype):
     """E = |sym D|² to second order; LAPACK's rule gives NaN here."""
-    direction = rng.normal(size=(3, 3))
-    truth = direction + direction.T
-    found = hessian_product[False](
-        jnp.eye(3, dtype=dtype), jnp.asarray(direction, dtype)
-    )
+    truth = DIRECTION + DIRECTION.T
+    _, _, found = hard_energies(dtype)[False]["identity"]
     np.testing.assert_allclose(found, truth, atol=2e-6)
-    zero = jnp.zeros((3, 3), dtype)
-    small = displaced_product(zero, jnp.asarray(direction, dtype))
-    np.testing.assert_allclose(small, truth, atol=2e-6)
+    _, _, small = of_some(displaced, np.zeros((1, 3, 3), dtype), DIRECTION)
+    np.testing.assert_allclose(small[0], truth, atol=2e-6)
 
 
 @pytest.mark.hard_cases
 def test_a_reflection_is_free_only_without_the_sign(dtype):
     """... and the signed energy pushes it back through the collapse."""
-    mirror, flat = (jnp.asarray(np.diag([1, 1, s]), dtype) for s in (-1.0, 0.0))
-    assert alone(energy[False], mirror) == 0
-    assert alone(energy[True], mirror) > alone(energy[True], flat) > 0
-    assert alone(slope[True], mirror)[2, 2] < 0
-    assert alone(slope[True], flat)[2, 2] < 0
+    plain, signed = (hard_energies(dtype)[signed] for signed in (False, True))
+    assert plain["mirror"][0] == 0
+    assert signed["mirror"][0] > signed["flat"][0] > 0
+    assert signed["mirror"][1][2, 2] < 0
+    assert signed["flat"][1][2, 2] < 0
 
 
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("size", [1e-8, 1e-5, 1e-3, 3e-2])
 def test_displacements_far_below_an_ulp_keep_their_energy(size, dtype, rng):
     """From J = 1 + D in float32 a strain of 1e-8 is 100 % wrong."""
-    drawn = jnp.asarray(size * rng.normal(size=(4, 3, 3)), dtype)
-    for matrix in drawn:
-        value, gradient = alone(displaced, matrix)
+    drawn = (size * rng.normal(size=(4, 3, 3))).astype(dtype)
+    values, slopes, _ = of_some(displaced, drawn)
+    for matrix, value, gradient in zip(drawn, values, slopes, strict=True):
         with mpmath.workdps(60):
             d = mpmath.matrix(np.asarray(matrix, np.float64).tolist())
             truth = _mp_energy(d)
@@ -228,10 +251,9 @@ def test_both_forms_agree_around_the_switch(float64, rng):
     drawn *= (0.1 * np.linspace(0.9, 1.1, 100) / np.linalg.norm(drawn, axis=(1, 2)))[
         :, None, None
     ]
-    values, _ = displaced(jnp.asarray(drawn))
-    np.testing.assert_allclose(
-        values, energy[False](jnp.asarray(np.eye(3) + drawn)), rtol=1e-12
-    )
+    values, _, _ = of_some(displaced, drawn)
+    exact, _, _ = of_some(energies, np.eye(3) + drawn)[False]
+    np.testing.assert_allclose(values, exact, rtol=1e-12)
 
 
 @pytest.mark.hard_cases
