@@ -132,7 +132,6 @@ def test_there_are_presets_with_codes():
     assert {"nerf-w", "nerf-w-small", "nerfies", "hypernerf"} <= set(WITH_CODES)
 
 
-@pytest.mark.hard_cases
 @pytest.mark.parametrize(
     "name",
     [
