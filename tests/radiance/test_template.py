@@ -1,6 +1,7 @@
 """The template against NumPy, layer by layer, and central differences."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -18,13 +19,22 @@ INPUTS, CONDITION = 7, 5
 
 def drawn(dtype, spec=SMALL, condition=CONDITION):
     """Parameters with biases that are not zero, and inputs."""
-    params = template.init(spec, jax.random.key(0), INPUTS, condition, jnp.dtype(dtype))
-    rng = np.random.default_rng(1)
-    params = jax.tree.map(
-        lambda x: x + jnp.asarray(0.1 * rng.normal(size=x.shape), dtype), params
+    dtype = jnp.dtype(dtype)
+    shapes = jax.eval_shape(
+        lambda key: template.init(spec, key, INPUTS, condition, dtype),
+        jax.random.key(0),
     )
-    features = jnp.asarray(rng.normal(size=INPUTS), dtype)
-    return params, features, jnp.asarray(rng.normal(size=condition), dtype)
+    rng = np.random.default_rng(1)
+
+    def draw(leaf):
+        size = np.sqrt(2 / sum(leaf.shape)) if len(leaf.shape) > 1 else 0.1
+        return jnp.asarray((size * rng.normal(size=leaf.shape)).astype(dtype))
+
+    params = jax.tree.map(draw, shapes)
+    features, condition = (
+        rng.normal(size=n).astype(dtype) for n in (INPUTS, condition)
+    )
+    return params, jnp.asarray(features), jnp.asarray(condition)
 
 
 def by_hand(spec, params, features, condition, noise=0.0):
@@ -101,17 +111,22 @@ def test_the_samples_of_a_ray_share_the_product_of_their_view(float64):
     assert f"f64[3,{SMALL.width + CONDITION}]" not in text
 
 
+@functools.partial(jax.jit, static_argnums=0)
+def density_and_slope(spec, params, features, condition, noise):
+    def at(noise):
+        return template.apply(spec, params, features, condition, noise).density
+
+    return jax.value_and_grad(at)(noise)
+
+
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("raw", [-1e4, -100.0, 0.0, 100.0, 1e4])
 @pytest.mark.parametrize("density", template.DENSITIES)
 def test_any_raw_density_has_a_finite_value_and_slope(raw, density, dtype):
     params, *inputs = drawn(dtype)
     spec = dataclasses.replace(SMALL, density=density)
-
-    def at(noise):
-        return template.apply(spec, params, *inputs, noise).density
-
-    value, slope = jax.value_and_grad(at)(jnp.asarray(raw, dtype))
+    noise = np.asarray(raw, dtype)
+    value, slope = map(float, density_and_slope(spec, params, *inputs, noise))
     assert 0 <= value < 1.1e4
     assert 0 <= slope <= 1
     if density == "softplus" and raw > -99:
