@@ -145,16 +145,18 @@ def measure(case: Case, test: str, numbers: int, repeats: int) -> Row:
     outcomes = {}
     for dtype, bounds in case.bounds.items():
         inputs = hard_case.rounded(case.inputs, dtype)
-        found = {"stable": [], "textbook": []}
-        for order in range(len(bounds)):
-            exact = hard_case.truth(case, inputs, order)
-            for form in found:
-                with jax.enable_x64(dtype == "float64"):
-                    got = hard_case.evaluate(
-                        getattr(case, form), case.inputs, dtype, order
-                    )
-                found[form].append(hard_case.errors(case, got, exact, order))
-        outcomes[dtype] = Outcome(tuple(found["stable"]), tuple(found["textbook"]))
+        exact = [hard_case.truth(case, inputs, order) for order in range(len(bounds))]
+        found = {}
+        for form in Outcome._fields:
+            with jax.enable_x64(dtype == "float64"):
+                got = hard_case.evaluate(
+                    getattr(case, form), case.inputs, dtype, len(bounds)
+                )
+            found[form] = tuple(
+                hard_case.errors(case, got[order], exact[order], order)
+                for order in range(len(bounds))
+            )
+        outcomes[dtype] = Outcome(**found)
     return Row(case, test, outcomes, *_costs(case, numbers, repeats))
 
 
