@@ -13,6 +13,7 @@ from tests import gradients
 # Compiled once per shape: uncompiled, each call traces and compiles its loop again.
 DSSIM = jax.jit(losses.dssim_map, static_argnames=("padding",))
 SSIM_SLOPE = jax.jit(jax.value_and_grad(losses.ssim))
+PSNR_SLOPE = jax.jit(jax.value_and_grad(losses.psnr))
 ULPS = {"float32": 4e-7, "float64": 1e-15}
 
 
@@ -41,13 +42,10 @@ def reference_dssim(image, target, padding, value_range=1.0):
     return 1 - (ssim[5:-5, 5:-5] if padding == "valid" else ssim)
 
 
-@pytest.mark.hard_cases
 @pytest.mark.parametrize("padding", ["zero", "valid"])
 def test_dssim_is_the_textbook_five_window_form(padding, rng, dtype):
     image, target = images(rng)
-    found = DSSIM(
-        jnp.asarray(image, dtype), jnp.asarray(target, dtype), padding=padding
-    )
+    found = DSSIM(image.astype(dtype), target.astype(dtype), padding=padding)
     assert found.dtype == dtype
     expected = reference_dssim(image, target, padding)
     # The float64 images are rounded to float32 before: 6e-8 of noise beside C2 = 9e-4.
@@ -93,20 +91,20 @@ def test_ssim_and_its_gradient_match_the_reference(name, oracle_dir, dtype):
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("level", [0.0, 0.5, 0.9, 1.0])
 def test_constant_equal_images_are_exactly_alike_without_a_slope(level, dtype):
-    image = jnp.full((16, 20, 3), level, dtype)
+    image = np.full((16, 20, 3), level, dtype)
     value, slope = SSIM_SLOPE(image, image)
-    assert value == 1
-    assert np.all(slope == 0)
+    assert float(value) == 1
+    assert not np.any(slope)
 
 
 @pytest.mark.hard_cases
 def test_constant_images_a_little_apart_have_the_exact_slope(dtype):
-    image, target = (jnp.full((16, 20, 3), level, dtype) for level in (0.9, 0.89))
+    image, target = (np.full((16, 20, 3), level, dtype) for level in (0.9, 0.89))
 
-    def loss(x):
+    def loss(x, target):
         return jnp.mean(losses.dssim_map(x, target, padding="valid"))
 
-    slope = np.asarray(jax.jit(jax.grad(loss))(image), np.float64)
+    slope = np.asarray(jax.jit(jax.grad(loss))(image, target), np.float64)
     x, y = float(image[0, 0, 0]), float(target[0, 0, 0])
     luminance = x**2 + y**2 + 1e-4
     exact = 2 * (x - y) / luminance - (x - y) ** 2 * 2 * x / luminance**2
@@ -118,9 +116,7 @@ def test_constant_images_a_little_apart_have_the_exact_slope(dtype):
 def test_dssim_of_bright_low_contrast_images_keeps_its_digits(rng, dtype):
     image = np.asarray(1000 + rng.normal(size=(24, 19, 3)), np.float32)
     target = np.asarray(image + 0.5 * rng.normal(size=image.shape), np.float32)
-    found = DSSIM(
-        jnp.asarray(image, dtype), jnp.asarray(target, dtype), padding="valid"
-    )
+    found = DSSIM(image.astype(dtype), target.astype(dtype), padding="valid")
     expected = reference_dssim(image, target, "valid")
     # In float64 the uncentred reference is the less exact of the two.
     tolerance = {"float32": 1e-6, "float64": 1e-8}[dtype]
@@ -130,7 +126,7 @@ def test_dssim_of_bright_low_contrast_images_keeps_its_digits(rng, dtype):
 @pytest.mark.hard_cases
 def test_dssim_of_half_precision_images_is_computed_in_float32(rng):
     image, target = images(rng)
-    half = [jnp.asarray(x, jnp.bfloat16) for x in (image, target)]
+    half = [x.astype(jnp.bfloat16) for x in (image, target)]
     found = DSSIM(*half)
     assert found.dtype == jnp.float32
     expected = reference_dssim(*(np.asarray(x, np.float64) for x in half), "zero")
@@ -164,9 +160,8 @@ def test_dssim_has_second_derivatives(rng, float64):
     assert gradients.directional_error(slope, image) < 1e-6
 
 
-@pytest.mark.hard_cases
 def test_dssim_under_vmap_is_the_single_one(rng):
-    stack = jnp.asarray(rng.random((3, 2, 14, 13, 3)), jnp.float32)
+    stack = rng.random((3, 2, 24, 19, 3)).astype(np.float32)
     mapped = jax.jit(jax.vmap(losses.dssim_map))(stack[:, 0], stack[:, 1])
     for one, pair in zip(mapped, stack, strict=True):
         np.testing.assert_allclose(one, DSSIM(*pair), atol=2e-6)
@@ -200,7 +195,7 @@ def test_robust_penalties_hold_from_nothing_to_the_largest_residual(name, dtype)
         expected = closed(extended, np.longdouble(width))
         if name == "charbonnier":  # 80 bits still cancel at 1e-30
             expected = extended / (np.sqrt(extended + width**2) + width)
-        found = function(jnp.asarray(squares, dtype), width)
+        found = jax.jit(function, static_argnums=1)(squares.astype(dtype), width)
         np.testing.assert_allclose(
             found, np.asarray(expected, np.float64), rtol=ULPS[dtype], atol=0
         )
@@ -221,9 +216,9 @@ def test_robust_penalties_keep_their_slopes(name, dtype):
     def penalty(s):
         return ROBUST[name][0](s, width)
 
-    slope = jax.jit(jax.vmap(jax.grad(penalty)))(s)
+    orders = jax.value_and_grad(jax.grad(penalty))
+    slope, curvature = jax.jit(jax.vmap(orders))(s)
     np.testing.assert_allclose(slope, np.float64(slopes[name]), rtol=3 * ULPS[dtype])
-    curvature = jax.jit(jax.vmap(jax.grad(jax.grad(penalty))))(s)
     assert np.all(np.isfinite(curvature))
 
 
@@ -248,16 +243,15 @@ def test_robust_penalties_of_a_vector_have_a_gradient_at_zero(name, factor):
         return ROBUST[name][0](jnp.sum(x**2), 0.1)
 
     both = jax.jit(lambda x: (jax.grad(penalty)(x), jax.hessian(penalty)(x)))
-    slope, curvature = both(jnp.zeros(3))
-    assert np.all(slope == 0)
+    slope, curvature = both(np.zeros(3, np.float32))
+    assert not np.any(slope)
     np.testing.assert_allclose(curvature, factor * np.eye(3), rtol=1e-6)
 
 
 @pytest.mark.hard_cases
 def test_geman_mcclure_saturates_at_infinity(dtype):
-    value, slope = jax.value_and_grad(losses.geman_mcclure)(
-        jnp.asarray(3e38, dtype), 1e-3
-    )
+    both = jax.jit(jax.value_and_grad(lambda s: losses.geman_mcclure(s, 1e-3)))
+    value, slope = map(float, both(np.asarray(3e38, dtype)))
     assert value == 2
     assert np.isfinite(slope)
     assert slope < 1e-30
@@ -296,12 +290,12 @@ def test_masked_pixels_teach_nothing_whatever_they_hold(
 ):
     image, target = images(rng, 14, 13)
     valid = rng.random((14, 13)) > 0.3
-    clean = (jnp.asarray(image, dtype), jnp.asarray(target, dtype), jnp.asarray(valid))
+    clean = image.astype(dtype), target.astype(dtype), valid
     {"image": image, "target": target}[where][~valid] = poison
-    dirty = (jnp.asarray(image, dtype), jnp.asarray(target, dtype), jnp.asarray(valid))
-    value, slope = SLOPES[name](*dirty)
+    dirty = image.astype(dtype), target.astype(dtype), valid
+    value, slope = jax.tree.map(np.asarray, SLOPES[name](*dirty))
     expected, expected_slope = SLOPES[name](*clean)
-    assert value == expected
+    assert value == float(expected)
     np.testing.assert_array_equal(slope, expected_slope)
     assert np.all(slope[~valid] == 0)
     assert np.any(slope[valid] != 0)
@@ -320,11 +314,10 @@ def test_masked_losses_are_means_over_what_is_valid(rng, dtype):
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("name", LOSSES)
 def test_a_frame_without_a_valid_pixel_has_no_loss(name, dtype):
-    image = jnp.full((14, 13, 3), jnp.nan, dtype)
-    nothing = jnp.zeros((14, 13), bool)
-    value, slope = SLOPES[name](image, image, nothing)
-    assert value == 0
-    assert np.all(slope == 0)
+    image = np.full((14, 13, 3), np.nan, dtype)
+    value, slope = SLOPES[name](image, image, np.zeros((14, 13), bool))
+    assert float(value) == 0
+    assert not np.any(slope)
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
@@ -359,7 +352,7 @@ def test_photometric_refuses_a_share_beyond_one():
     ("error", "expected"), [(1e-8, 80.0), (0.0, 100.0), (0.25, 6.0206)]
 )
 def test_psnr_is_finite_and_exact(error, expected, dtype):
-    value, slope = jax.value_and_grad(losses.psnr)(jnp.asarray(error, dtype))
+    value, slope = map(float, PSNR_SLOPE(np.asarray(error, dtype)))
     assert abs(value - expected) < 5e-5
     assert np.isfinite(slope)
 
