@@ -108,11 +108,6 @@ def _textbook_displacement(w, v, x):
     return rotation @ x + left @ v - x
 
 
-def _of_turn(form):
-    """Of the rotation alone: a screw without translation."""
-    return lambda w: form(w, jnp.zeros_like(w), jnp.asarray(POINT, w.dtype))
-
-
 def _of_screw(form):
     """Of w and the speed: v is the speed times one direction."""
     return lambda screw: form(
@@ -120,6 +115,20 @@ def _of_screw(form):
         screw[3] * jnp.asarray(LINEAR, screw.dtype),
         jnp.asarray(POINT, screw.dtype),
     )
+
+
+_displaced = _of_screw(lie.displacement)
+_displaced_textbook = _of_screw(_textbook_displacement)
+
+
+def _exact_displaced(screw):
+    return _exact_displacement(screw[:3], screw[3] * _column(LINEAR), _column(POINT))
+
+
+def _screws(turns, speeds):
+    """[screws, 4] rotation vectors of those angles, and speeds."""
+    turns, speeds = np.broadcast_arrays(turns, speeds)
+    return np.concatenate([turns[:, None] * AXIS, speeds[:, None]], axis=1)
 
 
 _TURNS = np.array([1e-30, 1e-12, 1e-8, 1e-5, 1e-3, 1e-2, 0.3, *_SEAM, 4])
@@ -130,13 +139,13 @@ TURN = Case(
     switch=f"|w|² = {SERIES_BELOW:g}",
     axis="θ / rad",
     at=_TURNS,
-    inputs=_TURNS[:, None] * AXIS,
-    stable=_of_turn(lie.displacement),
-    textbook=_of_turn(_textbook_displacement),
-    exact=lambda w: _exact_displacement(w, [0, 0, 0], _column(POINT)),
+    inputs=_screws(_TURNS, 0.0),
+    stable=_displaced,
+    textbook=_displaced_textbook,
+    exact=_exact_displaced,
     bounds={"float32": (1e-6, 1e-6, 1e-6), "float64": (2e-15, 2e-15, 3e-15)},
     caught=(("float32", "value"), ("float32", "slope"), ("float64", "value")),
-    timed=0.3 * AXIS,
+    timed=np.array([*(0.3 * AXIS), 0.0]),
 )
 
 _SPEEDS = np.array([0, 1e-20, 1e-8, 1e-4, 1e-2, 1, 1e3, 1e6])
@@ -146,12 +155,10 @@ SHIFT = Case(
     formula="Stumpff functions of |w|²; v enters linearly",
     axis="speed / scene units",
     at=_SPEEDS,
-    inputs=np.concatenate([np.tile(1e-4 * AXIS, (8, 1)), _SPEEDS[:, None]], axis=1),
-    stable=_of_screw(lie.displacement),
-    textbook=_of_screw(_textbook_displacement),
-    exact=lambda screw: _exact_displacement(
-        screw[:3], screw[3] * _column(LINEAR), _column(POINT)
-    ),
+    inputs=_screws(1e-4, _SPEEDS),
+    stable=_displaced,
+    textbook=_displaced_textbook,
+    exact=_exact_displaced,
     bounds={"float32": (1e-6, 1e-6, 1e-6), "float64": (2e-15, 2e-15, 2e-15)},
     caught=(("float32", "slope"), ("float32", "curvature"), ("float64", "slope")),
     timed=np.array([*(0.3 * AXIS), 1.0]),

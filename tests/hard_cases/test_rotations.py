@@ -1,5 +1,7 @@
 """Rotations and screws at their hard points."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +10,7 @@ import scipy.spatial.transform
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from experiments import hard_quaternions, hard_rotations
+from experiments import hard_case, hard_quaternions, hard_rotations
 from nerfies_jax.geometry import lie, quaternion
 from nerfies_jax.geometry.stumpff import SERIES_BELOW, stumpff
 from tests.hard_cases import checks
@@ -65,6 +67,38 @@ EVERY = {
 }
 
 
+@jax.jit
+def every(inputs):
+    """All of them in one program: 22 take half as long again to compile."""
+    return {name: EVERY[name][0](*args) for name, args in inputs.items()}
+
+
+every_row = jax.jit(jax.vmap(every))
+
+
+def inputs_of(kind):
+    return {
+        name: tuple(np.asarray(arg).astype(jnp.dtype(kind)) for arg in args)
+        for name, (_, args) in EVERY.items()
+    }
+
+
+@functools.cache
+def in_half_and_float32(kind):
+    half = inputs_of(kind)
+    return every(half), every(jax.tree.map(lambda x: x.astype(np.float32), half))
+
+
+@functools.cache
+def with_x64_on():
+    """At once, and as the second of two rows."""
+    inputs = inputs_of("float32")
+    with jax.enable_x64(True):
+        return every(inputs), every_row(
+            jax.tree.map(lambda x: np.stack([x, x]), inputs)
+        )
+
+
 def joined(results):
     return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(results)])
 
@@ -74,12 +108,9 @@ def joined(results):
 @pytest.mark.parametrize("name", EVERY)
 def test_half_precision_is_rounded_once(name, kind):
     """Computed in float32 from the same inputs; in bfloat16 a screw is 3e-2 off."""
-    function, args = EVERY[name]
-    halves = [jnp.asarray(arg, kind) for arg in args]
-    wide = [half.astype(jnp.float32) for half in halves]
-    found, exact = jax.jit(function)(*halves), joined(jax.jit(function)(*wide))
+    found, exact = (results[name] for results in in_half_and_float32(kind))
     assert all(leaf.dtype == kind for leaf in jax.tree.leaves(found))
-    half_ulp = float(jnp.finfo(kind).eps) / 2
+    half_ulp, exact = float(jnp.finfo(kind).eps) / 2, joined(exact)
     off = np.abs(joined(found).astype(np.float32) - exact)
     # float16's smallest numbers are 6e-8 apart
     assert np.all(off <= 1.001 * half_ulp * np.abs(exact) + 6e-8)
@@ -91,18 +122,19 @@ def test_slopes_in_half_precision_are_rounded_once():
     slope = jax.jit(jax.jacrev(lie.displacement))
     for angle in (0.0, 1e-3, 0.3):
         args = (angle * hard_rotations.AXIS, LINEAR, POINT)
-        halves = [jnp.asarray(arg, jnp.bfloat16) for arg in args]
-        exact = slope(*(half.astype(jnp.float32) for half in halves))
-        off = np.abs(slope(*halves).astype(jnp.float32) - exact)
+        halves = [arg.astype(jnp.bfloat16) for arg in args]
+        exact = np.asarray(slope(*(half.astype(np.float32) for half in halves)))
+        off = np.abs(np.asarray(slope(*halves)).astype(np.float32) - exact)
         assert np.all(off <= 2.0**-8 * np.abs(exact) + 1e-6)
 
 
 @pytest.mark.hard_cases
 def test_a_float32_point_moved_by_a_bfloat16_screw_stays_float32():
-    screw = [jnp.asarray(x, jnp.bfloat16) for x in (0.3 * hard_rotations.AXIS, LINEAR)]
-    point = jnp.asarray(POINT, jnp.float32)
-    moved = lie.transform_point(*screw, point)
-    wide = lie.transform_point(*(x.astype(jnp.float32) for x in screw), point)
+    screw = [x.astype(jnp.bfloat16) for x in (0.3 * hard_rotations.AXIS, LINEAR)]
+    point = POINT.astype(np.float32)
+    transform = jax.jit(lie.transform_point)
+    moved = transform(*screw, point)
+    wide = transform(*(x.astype(np.float32) for x in screw), point)
     assert moved.dtype == jnp.float32
     assert np.array_equal(moved, wide)
 
@@ -111,16 +143,24 @@ def test_a_float32_point_moved_by_a_bfloat16_screw_stays_float32():
 @pytest.mark.parametrize("name", EVERY)
 def test_float32_stays_float32_with_x64_on_and_every_way_of_calling_agrees(name):
     """Constants made under x64 would turn float32 arguments into float64."""
-    function, args = EVERY[name]
-    args = [jnp.asarray(arg, jnp.float32) for arg in args]
-    eager = function(*args)
-    with jax.enable_x64(True):
-        wide = jax.jit(function)(*args)
-        rows = jax.jit(jax.vmap(function))(*(jnp.stack([a, a]) for a in args))
+    eager = EVERY[name][0](*(jnp.asarray(arg) for arg in inputs_of("float32")[name]))
+    wide, rows = (results[name] for results in with_x64_on())
     assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves((wide, rows)))
-    rows = jax.tree.map(lambda leaf: leaf[1], rows)
+    rows = jax.tree.map(lambda leaf: np.asarray(leaf)[1], rows)
     for other in (wide, rows):
         np.testing.assert_allclose(joined(other), joined(eager), atol=4e-7)
+
+
+def _every_degree(x):
+    return jnp.stack([stumpff(degree, x[0]) for degree in range(6)])
+
+
+@functools.cache
+def beside_the_switch(dtype):
+    """Value, slope and curvature of all degrees: [2, 6, ...], below and at it."""
+    above = np.asarray(SERIES_BELOW, dtype)
+    below = np.nextafter(above, np.asarray(0, dtype))
+    return hard_case.evaluate(_every_degree, np.array([[below], [above]]), dtype, 3)
 
 
 @pytest.mark.hard_cases
@@ -128,15 +168,7 @@ def test_float32_stays_float32_with_x64_on_and_every_way_of_calling_agrees(name)
 @pytest.mark.parametrize("degree", range(6))
 def test_stumpff_functions_are_continuous_across_their_switch(degree, order, dtype):
     """Neighbouring numbers, one by the series and one by the closed form."""
-
-    def function(s):
-        return stumpff(degree, s)
-
-    for _ in range(order):
-        function = jax.grad(function)
-    above = np.asarray(SERIES_BELOW, dtype)
-    below = np.nextafter(above, np.asarray(0, dtype))
-    values = jax.jit(jax.vmap(function))(jnp.stack([below, above]))
+    values = beside_the_switch(dtype)[order][:, degree]
     # c_k(9) are 0.05 to 1; sin and cos of √9 carry an ulp of one
     assert abs(values[1] - values[0]) < 4 * np.finfo(dtype).eps / (1 + order)
 
@@ -148,8 +180,7 @@ def test_quaternion_logarithm_is_continuous_across_its_switch(dtype):
     step = 2 * np.finfo(dtype).eps
     ends = np.array([half * (1 - step), half * (1 + step)])
     given = np.stack([np.cos(ends), np.sin(ends), 0 * ends, 0 * ends], axis=1)
-    log = jax.jit(jax.vmap(quaternion.log))(jnp.asarray(given, dtype))
-    slope = jax.jit(jax.vmap(jax.jacrev(quaternion.log)))(jnp.asarray(given, dtype))
+    log, slope = hard_case.evaluate(quaternion.log, given, dtype, 2)
     assert np.all(abs(log[1] - log[0]) < 16 * step)
     assert np.all(abs(slope[1] - slope[0]) < 16 * step)
 
@@ -157,28 +188,48 @@ def test_quaternion_logarithm_is_continuous_across_its_switch(dtype):
 LENGTHS = [0, 1e-38, 1e-30, 1e-20, 1e-19, 2.2e-19, 1e-15, 1e15, 1e19, 1e25, 3e38]
 
 
+def _of_any_length(q):
+    """What follows, row by row, of one quaternion."""
+    return jnp.concatenate(
+        [
+            quaternion.normalise(q),
+            quaternion.to_matrix(q).reshape(9),
+            quaternion.log(q),
+            quaternion.rotate(q, jnp.asarray(POINT, q.dtype)),
+        ]
+    )
+
+
+OF_ANY_LENGTH = {
+    "normalise": slice(4),
+    "to_matrix": slice(4, 13),
+    "log": slice(13, 16),
+    "rotate": slice(16, 19),
+}
+
+
+@functools.cache
+def of_any_length(dtype):
+    """Value, slope and curvature, [LENGTHS and one, 19, ...]; the last: identity."""
+    given = np.array(LENGTHS)[:, None] * WXYZ / np.linalg.norm(WXYZ)
+    given = np.concatenate([given, [[1, 0, 0, 0]]])
+    return hard_case.evaluate(_of_any_length, given, dtype, 3)
+
+
 @pytest.mark.hard_cases
-@pytest.mark.parametrize("name", ["normalise", "to_matrix", "log", "rotate"])
+@pytest.mark.parametrize("name", OF_ANY_LENGTH)
 def test_any_length_has_finite_value_slope_and_curvature(name, dtype):
     """A curvature through |q|³ is NaN from 1e-13 down; an unscaled log at 1e-19."""
-    if name == "rotate":
-
-        def function(q):
-            return quaternion.rotate(q, jnp.asarray(POINT, q.dtype))
-
-    else:
-        function = getattr(quaternion, name)
-    given = jnp.asarray(np.array(LENGTHS)[:, None] * WXYZ / np.linalg.norm(WXYZ), dtype)
-    value = jax.jit(jax.vmap(function))(given)
-    usual = np.asarray(value)[LENGTHS.index(1e15)]
-    none = np.asarray(function(quaternion.identity(jnp.dtype(dtype))))
-    for row in np.asarray(value):
+    value, *derivatives = (
+        found[:, OF_ANY_LENGTH[name]] for found in of_any_length(dtype)
+    )
+    usual, none = value[LENGTHS.index(1e15)], value[-1]
+    for row in value:
         # the rotation itself, or none where the length cannot be used
         off = min(np.max(abs(row - usual)), np.max(abs(row - none)))
         assert off < TIGHT[dtype]
-    slope = jax.jacrev(function)
-    for derivative in (slope, jax.jacfwd(slope)):
-        assert np.all(np.isfinite(jax.jit(jax.vmap(derivative))(given)))
+    for derivative in derivatives:
+        assert np.all(np.isfinite(derivative))
 
 
 @pytest.mark.hard_cases
@@ -186,9 +237,20 @@ def test_lengths_at_the_edge_of_the_range_are_told_apart(dtype):
     """Squared lengths of neighbours of 4 tiny: one is normalised, one the identity."""
     edge = np.sqrt(4 * np.finfo(dtype).tiny).astype(dtype)  # a power of two: exact
     below = np.nextafter(edge, np.asarray(0, dtype))
-    given = jnp.asarray(np.array([[0, edge, 0, 0], [0, below, 0, 0]], dtype))
+    given = np.array([[0, edge, 0, 0], [0, below, 0, 0]], dtype)
     value = jax.jit(jax.vmap(quaternion.normalise))(given)
     assert np.array_equal(value, [[0, 1, 0, 0], [1, 0, 0, 0]])
+
+
+@jax.jit
+def with_a_residual(own, residual, angular):
+    """Their sum normalised, its slope in the residual, and `own` turned instead."""
+
+    def total(residual):
+        return quaternion.normalise(own + residual)
+
+    turned = quaternion.multiply(quaternion.exp(angular), own)
+    return total(residual), jax.jacrev(total)(residual), turned
 
 
 @pytest.mark.hard_cases
@@ -199,15 +261,17 @@ def test_a_residual_that_nearly_cancels_its_quaternion_gives_a_rotation(rest, dt
     Multiplying by an exponential has neither trouble, for any residual.
     """
     unit = WXYZ / np.linalg.norm(WXYZ)
-    own = jnp.asarray(unit, dtype)
-    other = jnp.asarray(-unit + rest * np.array([0.5, 0.5, -0.5, 0.5]), dtype)
-    total = quaternion.normalise(own + other)
-    slope = jax.jacrev(lambda d: quaternion.normalise(own + d))(other)
+    other = -unit + rest * np.array([0.5, 0.5, -0.5, 0.5])
+    total, slope, turned = (
+        np.asarray(found)
+        for found in with_a_residual(
+            *(x.astype(dtype) for x in (unit, other, 3 * POINT))
+        )
+    )
     assert abs(np.linalg.norm(total) - 1) < TIGHT[dtype]
     assert np.all(np.isfinite(slope))
     if rest:
         assert np.max(abs(slope)) < 1.1 / rest
-    turned = quaternion.multiply(quaternion.exp(jnp.asarray(3 * POINT, dtype)), own)
     assert abs(np.linalg.norm(turned) - 1) < TIGHT[dtype]
 
 
@@ -215,14 +279,18 @@ def test_a_residual_that_nearly_cancels_its_quaternion_gives_a_rotation(rest, dt
 def test_ten_thousand_compositions_stay_a_rotation(dtype):
     """Matrices drift from orthogonality and quaternions from length one: 1e-3."""
     turn = np.array([0.01, -0.02, 0.015], dtype)
-    step = quaternion.exp(jnp.asarray(turn))
 
-    def composed(_, q):
-        return quaternion.normalise(quaternion.multiply(step, q))
+    @jax.jit
+    def compose(turn):
+        step = quaternion.exp(turn)
 
-    total = jax.jit(lambda q: jax.lax.fori_loop(0, 10_000, composed, q))(
-        quaternion.identity(jnp.dtype(dtype))
-    )
+        def composed(_, q):
+            return quaternion.normalise(quaternion.multiply(step, q))
+
+        start = quaternion.identity(turn.dtype)
+        return jax.lax.fori_loop(0, 10_000, composed, start)
+
+    total = np.asarray(compose(turn))
     assert abs(np.linalg.norm(total) - 1) < 2 * np.finfo(dtype).eps
     truth = Rotation.from_rotvec(10_000 * np.float64(turn))
     found = Rotation.from_quat(np.roll(np.asarray(total, np.float64), -1))
@@ -269,7 +337,7 @@ def _group(one, two, three, linear, point):
 @given(one=triples, two=triples, three=triples, linear=triples, point=triples)
 def test_rotations_and_screws_are_groups(kind, one, two, three, linear, point):
     with jax.enable_x64(kind == "float64"):
-        args = [jnp.asarray(x, kind) for x in (one, two, three, linear, point)]
+        args = [np.asarray(x, kind) for x in (one, two, three, linear, point)]
         for name, rest in _group(*args).items():
             # of points up to 15 units away and squares up to 30
-            assert np.max(abs(rest)) < 10 * TIGHT[kind], name
+            assert np.max(abs(np.asarray(rest))) < 10 * TIGHT[kind], name
