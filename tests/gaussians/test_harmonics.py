@@ -35,14 +35,18 @@ def test_basis_equals_scipy(degree, dtype, rng):
     np.testing.assert_allclose(found, scipy_basis(direction, degree), atol=tolerance)
 
 
+@jax.jit
+def value_and_jacobian(offset):
+    function = harmonics.unit_direction
+    return function(offset), jax.jacrev(function)(offset)
+
+
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("length", [1e-30, 1e-3, 1.0, 1e30])
 def test_unit_direction_keeps_its_digits_at_any_length(length, dtype):
     direction = np.array([0.36, -0.48, 0.8])
-    offset = jnp.asarray(direction * length, dtype)
-    found, slope = jax.jvp(
-        harmonics.unit_direction, (offset,), (jnp.asarray([length, 0, 0], dtype),)
-    )
+    found, jacobian = value_and_jacobian((direction * length).astype(dtype))
+    slope = np.asarray(jacobian, np.float64)[:, 0] * length
     tolerance = {"float32": 3e-7, "float64": 1e-15}[dtype]
     np.testing.assert_allclose(found, direction, atol=tolerance)
     expected = np.array([1, 0, 0]) - direction * direction[0]  # (I - d d^t) e_x
@@ -51,9 +55,8 @@ def test_unit_direction_keeps_its_digits_at_any_length(length, dtype):
 
 @pytest.mark.hard_cases
 def test_zero_direction_looks_along_z_and_has_no_gradient(dtype):
-    zero = jnp.zeros(3, dtype)
-    jacobian = jax.jacrev(harmonics.unit_direction)(zero)
-    np.testing.assert_array_equal(harmonics.unit_direction(zero), [0, 0, 1])
+    value, jacobian = value_and_jacobian(np.zeros(3, dtype))
+    np.testing.assert_array_equal(value, [0, 0, 1])
     np.testing.assert_array_equal(jacobian, np.zeros((3, 3)))
 
 

@@ -16,6 +16,7 @@ from tests import gradients
 
 FEW = NeighbourSpec(count=4)
 inconsistency = jax.jit(neighbours.inconsistency)
+value_and_slope = jax.jit(jax.value_and_grad(neighbours.inconsistency))
 
 
 def scene(mean, alive=None, width=3, dtype="float32", seed=0):
@@ -26,7 +27,8 @@ def scene(mean, alive=None, width=3, dtype="float32", seed=0):
     rest = (np.zeros((count, *shape)) for shape in [(3,), (4,), (), (1, 3), (0, 3)])
     splats = Splats(*(jnp.asarray(leaf, dtype) for leaf in (mean, *rest)))
     if alive is not None:
-        splats = rows.bury(splats, jnp.asarray(~np.asarray(alive)))
+        logit = np.where(alive, 0, rows.DEAD_LOGIT)
+        splats = splats._replace(opacity_logit=jnp.asarray(logit, dtype))
     code = jnp.asarray(rng.normal(size=(count, width)), dtype)
     return Params({"splats": splats, "code": code}, {})
 
@@ -37,8 +39,8 @@ def some_places(count=40, seed=1):
 
 def listed(graph, row):
     """The neighbours of a row that have a weight."""
-    weighed = np.asarray(graph.weight[row]) > 0
-    return set(np.asarray(graph.index[row])[weighed].tolist())
+    weighed = np.asarray(graph.weight)[row] > 0
+    return set(np.asarray(graph.index)[row][weighed].tolist())
 
 
 @pytest.mark.parametrize("scale", neighbours.SCALES)
@@ -93,17 +95,12 @@ def test_weights_by_spacing_do_not_depend_on_the_unit():
 def test_with_few_living_rows_the_rest_names_itself(living, dtype):
     alive = np.isin(np.arange(8), [6, 1, 3, 4][:living])
     params = scene(some_places(8), alive, dtype=dtype)
-    graph = neighbours.find(FEW, params, extent=1.0)
+    graph = jax.tree.map(np.asarray, neighbours.find(FEW, params, extent=1.0))
     others = set(np.flatnonzero(alive).tolist())
     for row in range(8):
         assert listed(graph, row) == (others - {row} if alive[row] else set())
-        idle = np.asarray(graph.index[row])[np.asarray(graph.weight[row]) == 0]
-        assert (idle == row).all()
-
-    def penalty(code):
-        return neighbours.inconsistency(code, graph, jnp.asarray(alive))
-
-    value, slope = jax.jit(jax.value_and_grad(penalty))(params.rows["code"])
+        assert (graph.index[row][graph.weight[row] == 0] == row).all()
+    value, slope = value_and_slope(params.rows["code"], graph, alive)
     assert np.isfinite(value)
     assert np.isfinite(slope).all()
     assert (living >= 2) == bool(np.asarray(slope).any())
@@ -116,12 +113,13 @@ def test_clones_at_one_place_are_neighbours_but_never_oneself(copies, dtype):
     """Densification puts a clone onto its parent; the nearest distance is then zero."""
     places = np.repeat(some_places(6), copies, axis=0)
     graph = neighbours.find(FEW, scene(places, dtype=dtype), extent=1.0)
+    graph = jax.tree.map(np.asarray, graph)
     for row in range(len(places)):
-        assert row not in np.asarray(graph.index[row])
-        assert len(set(np.asarray(graph.index[row]).tolist())) == 4
-        alike = np.asarray(graph.index[row]) // copies == row // copies
+        assert row not in graph.index[row]
+        assert len(set(graph.index[row].tolist())) == 4
+        alike = graph.index[row] // copies == row // copies
         assert alike.sum() == min(copies - 1, 4)
-        np.testing.assert_array_equal(np.asarray(graph.weight[row])[alike], 1)
+        np.testing.assert_array_equal(graph.weight[row][alike], 1)
     assert np.isfinite(graph.weight).all()
 
 
@@ -176,15 +174,10 @@ def test_gradients_of_the_penalty(float64):
 @pytest.mark.parametrize("apart", [0.0, 1e-30, 1e-12, 1e-6, 1.0])
 def test_slopes_are_finite_and_bounded_where_embeddings_meet(kind, apart):
     """1e-20 is 0 in float16, and the square root's slope at 0 is infinite."""
-    graph = Neighbours(jnp.asarray([[1], [0]], jnp.int32), jnp.full((2, 1), 0.25, kind))
-    code = jnp.asarray([[0.0, 0.0], [apart, 0.0]], kind)
-
-    @jax.jit
-    @jax.value_and_grad
-    def penalty(code):
-        return neighbours.inconsistency(code, graph, jnp.ones(2, bool))
-
-    value, slope = penalty(code)
+    kind = jnp.dtype(kind)
+    graph = Neighbours(np.int32([[1], [0]]), np.full((2, 1), 0.25, kind))
+    code = np.asarray([[0.0, 0.0], [apart, 0.0]], kind)
+    value, slope = value_and_slope(code, graph, np.ones(2, bool))
     assert np.isfinite(np.asarray(value, np.float64))
     size = np.linalg.norm(np.asarray(slope, np.float64), axis=1)
     # Each row is in two of the pairs, which count 1 / 2 each: sqrt(w) at most.
@@ -198,11 +191,7 @@ def test_weights_that_vanish_bring_neither_loss_nor_slope(dtype):
     params = scene(places, dtype=dtype)
     graph = neighbours.find(NeighbourSpec(scale="units"), params, extent=1.0)
     assert not np.asarray(graph.weight).any()
-
-    def penalty(code):
-        return neighbours.inconsistency(code, graph, jnp.ones(3, bool))
-
-    value, slope = jax.jit(jax.value_and_grad(penalty))(params.rows["code"])
+    value, slope = value_and_slope(params.rows["code"], graph, np.ones(3, bool))
     np.testing.assert_allclose(value, 1e-9, rtol=1e-6)  # 20 floors of 2 neighbours
     assert not np.asarray(slope).any()
 

@@ -40,14 +40,14 @@ def make(opacity, dtype="float32"):
     return params, first_moments(params)
 
 
+spread_over = jax.jit(relocation.spread_over, static_argnums=3)
+
+
 def spread(opacity, copies, dtype, least=1e-12):
-    each, scale = relocation.spread_over(
-        jnp.asarray([opacity], dtype),
-        jnp.ones((1, 3), dtype),
-        jnp.asarray([copies]),
-        least,
+    each, scale = spread_over(
+        np.asarray([opacity], dtype), np.ones((1, 3), dtype), np.int32([copies]), least
     )
-    return float(each[0]), float(scale[0, 0])
+    return float(each[0]), float(np.asarray(scale)[0, 0])
 
 
 def test_spreading_equals_the_reference_kernel(oracle_dir, dtype):
