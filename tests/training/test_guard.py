@@ -1,6 +1,5 @@
 """Nothing that is not finite is kept: no state, no checkpoint, no history."""
 
-import functools
 import re
 
 import jax
@@ -27,6 +26,7 @@ NAMES = {
 }
 
 MODEL = toy.model()
+all_finite = jax.jit(chunk._all_finite)
 
 
 @pytest.fixture(scope="module")
@@ -59,28 +59,30 @@ def spoil(state, where, value):
     return state._replace(extra={**state.extra, "hits": hits})
 
 
-@functools.cache
-def poisoned(where):
-    """The toy with one number in one place that is not finite after one step.
+def _poisoned(state, frames):
+    """A step of the toy that leaves one number in one place not finite.
 
-    Which step and what number `poison` writes into the depths, which the toy does not
-    read: one program for all of them.
+    After which step, what number and where `poison` writes into the depths, which the
+    toy does not read: one program for all of them.
     """
-
-    def step(state, frames):
-        at, value = frames.depths
-        poison = jnp.where((state.step + 1).astype(jnp.float32) == at, value, 0.0)
-        new, metrics = toy.step(state, frames)
+    at, value, place = frames.depths
+    value = jnp.where((state.step + 1).astype(jnp.float32) == at, value, 0.0)
+    new, metrics = toy.step(state, frames)
+    for index, where in enumerate(NAMES):
+        here = jnp.where(place == index, value, 0.0)
         if where == "metric":
-            metrics["loss"] = metrics["loss"] + poison
-            return new, metrics
-        return spoil(new, where, poison), metrics
+            metrics["loss"] = metrics["loss"] + here
+        else:
+            new = spoil(new, where, here)
+    return new, metrics
 
-    return toy.model(change=step)
+
+POISONED = toy.model(change=_poisoned)
 
 
-def poison(frames, at, value=jnp.nan):
-    return frames._replace(depths=jnp.asarray([at, value], jnp.float32))
+def poison(frames, where, at, value=np.nan):
+    place = list(NAMES).index(where)
+    return frames._replace(depths=jnp.asarray(np.float32([at, value, place])))
 
 
 def held(folder, result, model):
@@ -97,7 +99,7 @@ def held(folder, result, model):
 @pytest.mark.parametrize("where", NAMES)
 @pytest.mark.parametrize("at", [1, 6, 8, 15])
 def test_a_step_that_blows_up_is_named_and_undone(where, at, frames, tmp_path):
-    model, spoilt = poisoned(where), poison(frames, at)
+    model, spoilt = POISONED, poison(frames, where, at)
     # A checkpoint after every chunk, and one at the end alone.
     for name, every in (("often", 0.0), ("seldom", 1e9)):
         folder = tmp_path / name
@@ -122,8 +124,8 @@ def test_a_step_that_blows_up_is_named_and_undone(where, at, frames, tmp_path):
 @pytest.mark.parametrize("value", [jnp.inf, -jnp.inf])
 @pytest.mark.parametrize("where", NAMES)
 def test_infinities_are_not_finite_either(value, where, frames):
-    spoilt = poison(frames, 5, value)
-    result = fit(spoilt, model=poisoned(where), steps=STEPS)
+    spoilt = poison(frames, where, 5, value)
+    result = fit(spoilt, model=POISONED, steps=STEPS)
     assert result.steps == 4
     assert re.search(f"step 5 is not finite: {NAMES[where]}", result.message)
 
@@ -143,12 +145,12 @@ def test_a_second_moment_that_overflows_stops_the_run(frames):
         new = state._replace(params=params, optimiser=optimiser, step=state.step + 1)
         return new, {"loss": loss(params) * 0}
 
-    state = start()
+    state, stepped = start(), jax.jit(steep)
     for _ in range(9):
-        state, metrics = jax.jit(steep)(state, frames)
+        state, metrics = stepped(state, frames)
     assert not hostile.not_finite((state.params, metrics))
     for _ in range(20):  # what a guard of parameters alone would let go on
-        stuck, _ = jax.jit(steep)(state, frames)
+        stuck, _ = stepped(state, frames)
     bias = [s.params.nets["bias"][3] for s in (state, stuck)]
     assert bias[0] == bias[1]
     result = fit(frames, model=toy.model(change=steep), steps=STEPS)
@@ -243,14 +245,16 @@ def test_a_blow_up_that_does_not_repeat_keeps_the_last_good_chunk(frames):
 @pytest.mark.parametrize("kind", ["float16", "bfloat16", "float32"])
 @pytest.mark.parametrize("value", [jnp.nan, jnp.inf, -jnp.inf, 6e4])
 def test_the_two_looks_at_a_state_agree(kind, value):
+    wide = np.ones((4, 5))
+    wide[2, 3] = value
     state = {
         "whole": jnp.arange(3),
         "none": jnp.zeros((0, 3), kind),
         "key": jax.random.key(0),
-        "wide": jnp.ones((4, 5), kind).at[2, 3].set(value),
+        "wide": jnp.asarray(wide, kind),
         "flat": jnp.asarray(-value, kind),
     }
-    finite = jax.jit(chunk._all_finite)(state)
+    finite = all_finite(state)
     named = guard.bad_arrays(state)
     if np.isfinite(value):
         assert finite
@@ -263,14 +267,16 @@ def test_the_two_looks_at_a_state_agree(kind, value):
 @pytest.mark.parametrize("value", [jnp.nan, jnp.inf, -jnp.inf])
 def test_one_number_is_found_wherever_it_hides(value, dtype):
     """The largest of many is NaN where one is, whatever the order of the reduction."""
-    state = jax.random.normal(jax.random.key(0), (1000, 59), dtype)
-    finite = jax.jit(lambda row: chunk._all_finite(state.at[row, row % 59].set(value)))
-    assert jax.jit(chunk._all_finite)(state)
-    assert not any(finite(row) for row in [0, 1, 7, 8, 63, 64, 500, 991, 998, 999])
+    state = np.random.default_rng(0).normal(size=(1000, 59)).astype(dtype)
+    assert all_finite(state)
+    for row in (0, 1, 7, 8, 63, 64, 500, 991, 998, 999):
+        spoilt = state.copy()
+        spoilt[row, row % 59] = value
+        assert not all_finite(spoilt)
 
 
 def test_what_is_restored_after_a_blow_up_goes_on(frames, tmp_path):
-    model, spoilt = poisoned("moment"), poison(frames, 9)
+    model, spoilt = POISONED, poison(frames, "moment", 9)
     with Checkpoints(tmp_path, model.spec) as checkpoints:
         fit(spoilt, model=model, steps=STEPS, checkpoints=checkpoints)
     restored = checkpoint.restore(tmp_path, start(), model.spec)
