@@ -59,8 +59,8 @@ def test_the_annealed_rate_is_exact_at_its_ends(dtype):
 @pytest.mark.hard_cases
 def test_annealing_counts_steps_beyond_the_integers_of_float32(dtype):
     steps, after = 40_000_000, 30_000_001
-    schedule = phases.annealed(
-        lambda step: jnp.ones(()), AnnealingSpec(after=after), steps
+    schedule = jax.jit(
+        phases.annealed(lambda step: jnp.ones(()), AnnealingSpec(after=after), steps)
     )
     assert float(schedule(after)) == 1
     np.testing.assert_allclose(
