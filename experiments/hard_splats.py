@@ -23,15 +23,15 @@ _VALUES = np.cos(np.arange(COUNT) * 0.7)
 
 def _pixel(x):
     """A pixel behind `COUNT` wide Gaussians, the first with alpha x0, all others x1."""
-    rest = jnp.full(COUNT - 1, 1, x.dtype) * x[1]
+    rest = jnp.asarray(np.ones(COUNT - 1), x.dtype) * x[1]
     footprints = Footprints(
-        mean_px=jnp.full((COUNT, 2), 0.5, x.dtype),
-        whitening=jnp.tile(jnp.asarray([1e-3, 0, 1e-3], x.dtype), (COUNT, 1)),
+        mean_px=jnp.asarray(np.full((COUNT, 2), 0.5), x.dtype),
+        whitening=jnp.asarray(np.tile([1e-3, 0, 1e-3], (COUNT, 1)), x.dtype),
         opacity=jnp.concatenate([x[:1], rest]),
-        depth=jnp.arange(1, COUNT + 1).astype(x.dtype),
-        extent_px=jnp.full((COUNT, 2), 2.0, x.dtype),
+        depth=jnp.asarray(np.arange(1, COUNT + 1), x.dtype),
+        extent_px=jnp.asarray(np.full((COUNT, 2), 2.0), x.dtype),
     )
-    values = jnp.asarray(_VALUES, x.dtype)[:, None]
+    values = jnp.asarray(_VALUES[:, None], x.dtype)
     image, _ = raster.rasterise(footprints, values, (1, 1), OPEN)
     return image[0, 0]
 
