@@ -1,5 +1,7 @@
 """Losses and measures at their hard points, and in half precision."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -46,40 +48,69 @@ def pair(kind, height=37, width=29):
     rng = np.random.default_rng(0)
     image = rng.random((height, width, 3))
     target = np.clip(image + 0.1 * rng.normal(size=image.shape), 0, 1)
-    half = jnp.asarray(image, kind), jnp.asarray(target, kind)
-    wide = tuple(x.astype(jnp.float32) for x in half)
-    return half, wide, jnp.asarray(rng.random((height, width)) < 0.6)
+    half = tuple(picture.astype(jnp.dtype(kind)) for picture in (image, target))
+    wide = tuple(x.astype(np.float32) for x in half)
+    return half, wide, rng.random((height, width)) < 0.6
+
+
+@jax.jit
+def every_slope(image, target, mask):
+    return {
+        name: jax.value_and_grad(loss)(image, target, mask)
+        for name, loss in LOSSES.items()
+    }
+
+
+@jax.jit
+def every_measure(image, target, mask):
+    return {name: f(image, target, mask) for name, f in MEASURES.items()}
+
+
+@functools.cache
+def slopes_in_half_and_float32():
+    half, wide, mask = pair("bfloat16")
+    return every_slope(*half, mask), every_slope(*wide, mask)
+
+
+@functools.cache
+def measured():
+    """In bfloat16, of a float32 render beside a bfloat16 picture, and in float32."""
+    half, wide, mask = pair("bfloat16")
+    mixed = wide[0], half[1]
+    return tuple(every_measure(*both, mask) for both in (half, mixed, wide))
 
 
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("name", LOSSES)
 def test_losses_of_bfloat16_pictures_are_those_of_their_float32_copies(name):
     """Counted and summed as they are, a masked mean was 1.7 times too large."""
-    half, wide, mask = pair("bfloat16")
-    both = jax.jit(jax.value_and_grad(LOSSES[name]))
-    value, slope = both(*half, mask)
-    expected, expected_slope = both(*wide, mask)
+    (value, slope), (expected, expected_slope) = (
+        found[name] for found in slopes_in_half_and_float32()
+    )
     assert value.dtype == jnp.float32
     assert slope.dtype == jnp.bfloat16
     assert abs(value - expected) <= 1e-6 * expected
-    size = float(jnp.abs(expected_slope).max())
+    slope, expected_slope = np.asarray(slope, np.float32), np.asarray(expected_slope)
+    size = np.abs(expected_slope).max()
     # Slopes come back rounded to eight bits.
-    np.testing.assert_allclose(
-        np.asarray(slope, np.float32) / size, expected_slope / size, atol=5e-3
-    )
+    np.testing.assert_allclose(slope / size, expected_slope / size, atol=5e-3)
 
 
 @pytest.mark.hard_cases
-@pytest.mark.parametrize(
-    ("name", "kind"),
-    [(name, "bfloat16") for name in MEASURES] + [("l1", "float16")],
-)
-def test_measures_of_half_precision_pictures_are_those_of_float32(name, kind):
-    half, wide, mask = pair(kind)
-    measure = jax.jit((LOSSES | MEASURES)[name])
-    expected = measure(*wide, mask)
-    # The second: a render in float32 against pictures kept in half precision.
-    for found in (measure(*half, mask), measure(wide[0], half[1], mask)):
+@pytest.mark.parametrize("name", MEASURES)
+def test_measures_of_half_precision_pictures_are_those_of_float32(name):
+    *found, expected = (values[name] for values in measured())
+    for value in found:
+        assert value.dtype == jnp.float32
+        assert abs(value - expected) <= 1e-6 * abs(expected)
+
+
+@pytest.mark.hard_cases
+def test_a_loss_of_float16_pictures_is_that_of_float32():
+    half, wide, mask = pair("float16")
+    loss = jax.jit(losses.l1)
+    expected = loss(*wide, mask)
+    for found in (loss(*half, mask), loss(wide[0], half[1], mask)):
         assert found.dtype == jnp.float32
         assert abs(found - expected) <= 1e-6 * abs(expected)
 
@@ -87,10 +118,10 @@ def test_measures_of_half_precision_pictures_are_those_of_float32(name, kind):
 @pytest.mark.hard_cases
 def test_a_float16_picture_may_have_more_pixels_than_float16_counts():
     """70 000 pixels were infinitely many: a mean of 0, and 100 dB."""
-    half = jnp.zeros((700, 100, 1), jnp.float16), jnp.ones((700, 100, 1), jnp.float16)
-    mask = jnp.ones((700, 100), bool)
-    assert losses.l1(*half, mask) == 1
-    assert image_quality.masked_psnr(*half, mask) == 0
+    half = np.zeros((700, 100, 1), np.float16), np.ones((700, 100, 1), np.float16)
+    mask = np.ones((700, 100), bool)
+    assert jax.jit(losses.l1)(*half, mask) == 1
+    assert jax.jit(image_quality.masked_psnr)(*half, mask) == 0
 
 
 @pytest.mark.hard_cases
@@ -99,14 +130,25 @@ def test_ssim_under_jit_is_about_one_level(level):
     """Contracted in one place and not in another, the mean of the target was two."""
     rng = np.random.default_rng(0)
     both = level + 0.5 * rng.integers(-2, 3, (2, 12, 13, 1))
-    found = jax.jit(losses.dssim_map)(*jnp.asarray(both, jnp.float32))
+    found = jax.jit(losses.dssim_map)(*np.float32(both))
     with jax.enable_x64(True):
-        exact = jax.jit(losses.dssim_map)(*jnp.asarray(both, jnp.float64))
+        exact = jax.jit(losses.dssim_map)(*both)
     np.testing.assert_allclose(found, exact, atol=1e-6)
-    valid = [jnp.asarray(x, jnp.float32) for x in both]
-    found = jax.jit(image_quality.ms_ssim, static_argnames="scales")(*valid, scales=1)
+    valid = jax.jit(image_quality.ms_ssim, static_argnames="scales")
+    found = valid(*np.float32(both), scales=1)
     expected = 1 - np.asarray(exact)[5:-5, 5:-5].mean()
     assert abs(found - expected) < 1e-6
+
+
+@jax.jit
+def geometry_measures(found, truth, mask):
+    pixels = found.reshape(450, 2), truth.reshape(450, 2)
+    return (
+        geometry_quality.depth_errors(found, truth, mask),
+        geometry_quality.align_depth(found, truth, mask),
+        geometry_quality.flow_errors(*pixels, mask[:450]),
+        geometry_quality.track_errors(*pixels, mask[:450], 0.3),
+    )
 
 
 @pytest.mark.hard_cases
@@ -114,23 +156,12 @@ def test_ssim_under_jit_is_about_one_level(level):
 def test_depths_flows_and_tracks_in_half_precision_are_counted(kind, rng):
     truth = rng.uniform(1, 5, 900)
     found = truth + 0.2 * rng.normal(size=900)
-    mask = jnp.asarray(rng.random(900) < 0.6)
-    half = jnp.asarray(found, kind), jnp.asarray(truth, kind)
-    wide = tuple(x.astype(jnp.float32) for x in half)
-
-    def measures(found, truth):
-        pixels = found.reshape(450, 2), truth.reshape(450, 2)
-        return (
-            geometry_quality.depth_errors(found, truth, mask),
-            geometry_quality.align_depth(found, truth, mask),
-            geometry_quality.flow_errors(*pixels, mask[:450]),
-            geometry_quality.track_errors(*pixels, mask[:450], 0.3),
-        )
-
-    compiled = jax.jit(measures)
+    mask = rng.random(900) < 0.6
+    half = [x.astype(jnp.dtype(kind)) for x in (found, truth)]
+    wide = [x.astype(np.float32) for x in half]
     for value, expected in zip(
-        jax.tree.leaves(compiled(*half)),
-        jax.tree.leaves(compiled(*wide)),
+        jax.tree.leaves(geometry_measures(*half, mask)),
+        jax.tree.leaves(geometry_measures(*wide, mask)),
         strict=True,
     ):
         assert value.dtype == expected.dtype

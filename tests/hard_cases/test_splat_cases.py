@@ -224,33 +224,6 @@ def test_five_thousand_gaussians_on_a_pixel_have_the_slopes_of_float64(rng):
 
 
 @pytest.mark.hard_cases
-def test_jit_and_vmap_draw_the_same_odd_picture(rng):
-    count, size = 12, (7, 5)
-    fields = (
-        rng.uniform((-0.1, -0.1, 1.5), (0.1, 0.1, 2.5), (count, 3)),
-        rng.normal(size=(count, 4)),
-        np.exp(rng.normal(-2.5, 0.5, (count, 3))),
-        rng.uniform(0.05, 0.95, count),
-    )
-    gaussians = Gaussians(*(np.float32(x) for x in fields))
-    values = np.float32(rng.uniform(size=(count, 2)))
-    view = camera("float32")._replace(principal_point_px=np.float32([3.5, 2.5]))
-    view, values = on_device((view, values))
-
-    def draw(gaussians):
-        footprints = projection.project(gaussians, view, size, QUICK)
-        return raster.rasterise(footprints, values, size, QUICK)
-
-    image, left = jax.jit(draw)(gaussians)
-    rows = jax.tree.map(lambda x: x[None], gaussians)
-    mapped = [np.asarray(x)[0] for x in jax.jit(jax.vmap(draw))(rows)]
-    assert image.shape == (5, 7, 2)
-    assert np.min(left) < 0.5
-    np.testing.assert_allclose(mapped[0], image, atol=2e-6)
-    np.testing.assert_allclose(mapped[1], left, atol=2e-6)
-
-
-@pytest.mark.hard_cases
 @pytest.mark.parametrize("kind", ["bfloat16", "float16"])
 def test_half_precision_gaussians_are_refused_by_name(kind):
     """Eight bits place a pixel to 1 px at 256; Adam's steps do not move such means."""
