@@ -29,6 +29,8 @@ CORNERS = ("a plane", "a line", "a point")
 def linear_warp(params, displacement):
     """Parameters under which every point x moves by `displacement` @ x.
 
+    `params` has the shapes and dtypes; their values do not matter.
+
     Three hidden units carry x + 16, which is positive, and the others rest; the
     read-out takes 16 off again.
     """
@@ -44,7 +46,7 @@ def linear_warp(params, displacement):
     weight = np.zeros(linear.weight.shape)
     weight[:3] = displacement.T
     heads = {
-        "angular": jax.tree.map(np.zeros_like, angular),
+        "angular": jax.tree.map(lambda leaf: np.zeros(leaf.shape), angular),
         "linear": linear._replace(weight=weight, bias=-16 * displacement.sum(1)),
     }
     layers = [
