@@ -121,35 +121,38 @@ def test_a_single_pixel_equals_the_dense_compositor(rng):
     check_against_dense(image, left, footprints, conics, values, (1, 1), "float32")
 
 
-def three(mean_px, sigma_px, opacity, depth, dtype):
-    """Three round Gaussians; drawn at one size, so one program draws them all."""
+def drawn(mean_px, sigma_px, opacity, depth, values, dtype):
+    """Picture and what is left behind a few round Gaussians of one size.
+
+    With rows that are not drawn they are `COUNT`, and go through the shared program.
+    """
+    count = len(mean_px)
+    rows = np.minimum(np.arange(COUNT), count - 1)
     footprints, _ = footprints_from(
-        np.array(mean_px), np.full((3, 2), sigma_px), np.zeros(3),
-        np.full(3, opacity), np.array(depth), dtype,
+        np.array(mean_px)[rows], np.full((COUNT, 2), sigma_px), np.zeros(COUNT),
+        np.full(COUNT, opacity), np.array(depth)[rows], dtype,
     )  # fmt: skip
-    return footprints
-
-
-THREE_SIZE = (24, 8)
+    extent = np.where(np.arange(COUNT)[:, None] < count, footprints.extent_px, 0)
+    footprints = footprints._replace(extent_px=jnp.asarray(extent))
+    values = np.asarray(values, dtype)[rows]
+    picture, _ = picture_and_slopes(footprints, values, SIZE, QUICK)
+    return map(np.asarray, picture)
 
 
 @pytest.mark.hard_cases
 def test_equal_depths_are_drawn_in_order_of_index(dtype):
-    footprints = three([[4.0, 4.0]] * 3, 3.0, 0.9, [2.0, 2.0, 2.0], dtype)
-    image, _ = rasterise(footprints, np.eye(3, dtype=dtype), THREE_SIZE, QUICK)
-    front, middle, back = np.asarray(image)[4, 4]
+    image, _ = drawn([[4.0, 4.0]] * 3, 3.0, 0.9, [2.0] * 3, np.eye(3), dtype)
+    front, middle, back = image[4, 4]
     assert front > 5 * middle > 20 * back > 0
 
 
 @pytest.mark.hard_cases
 def test_two_opaque_gaussians_stop_a_pixel(dtype):
     """0.99 twice leaves 1e-4: float32 rounds it below the stop, float64 above."""
-    footprints = three([[4.5, 4.5]] * 3, 100.0, 1.0, [1.0, 2.0, 3.0], dtype)
-    image, left = rasterise(footprints, np.eye(3, dtype=dtype), THREE_SIZE, QUICK)
-    image = np.asarray(image)
-    drawn = {"float32": [0.99, 0, 0], "float64": [0.99, 0.0099, 0]}[dtype]
-    np.testing.assert_allclose(image[4, 4], drawn, atol=1e-6)
-    np.testing.assert_allclose(image.sum(-1) + left, np.ones((8, 24)), atol=1e-6)
+    image, left = drawn([[4.5, 4.5]] * 3, 100.0, 1.0, [1.0, 2.0, 3.0], np.eye(3), dtype)
+    expected = {"float32": [0.99, 0, 0], "float64": [0.99, 0.0099, 0]}[dtype]
+    np.testing.assert_allclose(image[4, 4], expected, atol=1e-6)
+    np.testing.assert_allclose(image.sum(-1) + left, np.ones(SIZE[::-1]), atol=1e-6)
 
 
 @pytest.mark.hard_cases
@@ -171,10 +174,7 @@ def test_nothing_to_draw_leaves_the_background(count, dtype, rng):
 
 @pytest.mark.hard_cases
 def test_a_nan_value_shows_where_its_gaussian_is(dtype):
-    away = [-100.0, 4.0]
-    footprints = three([[4.0, 4.0], away, away], 0.8, 1.0, [1.0, 2.0, 3.0], dtype)
-    values = np.diag([np.nan, 1, 1]).astype(dtype)
-    image, left = map(np.asarray, rasterise(footprints, values, THREE_SIZE, QUICK))
+    image, left = drawn([[4.0, 4.0]], 0.8, 1.0, [1.0], [[np.nan, 1, 1]], dtype)
     assert np.isnan(image[4, 4, 0])
     assert not np.isnan(image[:, 8:]).any()
     assert not np.isnan(left).any()

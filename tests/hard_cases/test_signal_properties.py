@@ -111,7 +111,7 @@ split = compiled(lambda image: spectral.haar_pyramid(image, 3))
 join = compiled(spectral.haar_image, static_argnums=(1, 2))
 
 
-@pytest.mark.parametrize("shape", [(8, 12), (7, 5), (1, 6), (1, 1)])
+@pytest.mark.parametrize("shape", [(7, 5), (1, 6)])
 @given(data=st.data(), share=properties.numbers(-2, 2))
 def test_a_wavelet_pyramid_is_orthonormal_and_linear(shape, data, share, dtype):
     one, other = (data.draw(properties.pictures(*shape, 1)) for _ in range(2))
