@@ -17,9 +17,13 @@ AXIS = np.array([2.0, -1.0, 2.0]) / 3
 LINEAR = np.array([0.4, -0.2, 0.3])
 POINT = np.array([0.5, 0.25, -0.75])
 
-transform = jax.jit(lie.transform_point)
-gradient = jax.jit(jax.jacrev(lie.transform_point, argnums=(0, 1, 2)))
-hessian = jax.jit(jax.jacfwd(jax.jacrev(lie.transform_point)))
+
+@jax.jit
+def all_orders(*screw):
+    """The moved point, its slopes in all three, its curvature in the turn."""
+    slopes = jax.jacrev(lie.transform_point, argnums=(0, 1, 2))
+    bends = jax.jacfwd(lambda turn: slopes(turn, *screw[1:])[0])
+    return lie.transform_point(*screw), slopes(*screw), bends(screw[0])
 
 
 def screw_matrix(angular, linear):
@@ -74,24 +78,25 @@ def exact_derivatives(angular, linear, point):
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("angle", ANGLES)
 def test_a_screw_keeps_value_gradient_and_hessian(angle, dtype):
-    inputs = [jnp.asarray(x, dtype) for x in (angle * AXIS, LINEAR, POINT)]
+    inputs = [np.asarray(x, dtype) for x in (angle * AXIS, LINEAR, POINT)]
     with mpmath.workdps(120):
         value, first, second = exact_derivatives(*inputs)
-    moved = transform(*inputs)
-    assert moved.dtype == dtype
+    found = all_orders(*inputs)
+    assert found[0].dtype == dtype
+    moved, gradient, hessian = jax.tree.map(np.asarray, found)
     # a few ulps of the lengths; far out, half an ulp of the angle, as in w itself
     bound = {"float32": 5e-7, "float64": 1.5e-15}[dtype] * (1 + angle / 10)
     assert np.max(abs(moved - value)) < bound
-    assert np.max(abs(gradient(*inputs)[0] - first)) < bound
-    assert np.max(abs(hessian(*inputs) - second)) < bound
+    assert np.max(abs(gradient[0] - first)) < bound
+    assert np.max(abs(hessian - second)) < bound
 
 
 @pytest.mark.hard_cases
 def test_zero_screw_is_the_identity_and_its_derivative_the_generators(dtype):
-    point = jnp.asarray(POINT, dtype)
-    zero = jnp.zeros(3, dtype)
-    assert np.array_equal(transform(zero, zero, point), point)
-    angular, linear, _ = gradient(zero, zero, point)
+    point = np.asarray(POINT, dtype)
+    zero = np.zeros(3, dtype)
+    moved, (angular, linear, _), _ = all_orders(zero, zero, point)
+    assert np.array_equal(moved, point)
     assert np.array_equal(angular, np.cross(np.eye(3, dtype=dtype), point).T)
     assert np.array_equal(linear, np.eye(3))
 
@@ -100,12 +105,11 @@ def test_zero_screw_is_the_identity_and_its_derivative_the_generators(dtype):
 @pytest.mark.parametrize("speed", [1e-8, 1e-3, 1.0])
 def test_rotation_and_translation_may_vanish_separately(speed, dtype):
     """A translation-dominated warp, where the textbook gradient is 15 % wrong."""
-    inputs = [jnp.asarray(x, dtype) for x in (1e-4 * AXIS, speed * LINEAR, POINT)]
+    inputs = [np.asarray(x, dtype) for x in (1e-4 * AXIS, speed * LINEAR, POINT)]
     with mpmath.workdps(120):
         _, first, _ = exact_derivatives(*inputs)
-    assert np.max(abs(gradient(*inputs)[0] - first)) < {"float32": 2e-7}.get(
-        dtype, 1e-15
-    )
+    slope = np.asarray(all_orders(*inputs)[1][0])
+    assert np.max(abs(slope - first)) < {"float32": 2e-7}.get(dtype, 1e-15)
 
 
 def test_the_textbook_form_fails_where_this_one_does_not():
@@ -122,7 +126,7 @@ def test_the_textbook_form_fails_where_this_one_does_not():
 
     slope = jax.jacrev(textbook)
     inputs = [jnp.asarray(x, jnp.float32) for x in (1e-3 * AXIS, LINEAR, POINT)]
-    assert np.max(abs(slope(*inputs) - gradient(*inputs)[0])) > 1e-3
+    assert np.max(abs(slope(*inputs) - all_orders(*inputs)[1][0])) > 1e-3
     assert np.all(np.isnan(slope(jnp.zeros(3), *inputs[1:])))
 
 
@@ -152,8 +156,22 @@ def test_exponentials_match_scipy(angle, float64):
     )
 
 
-log_so3 = jax.jit(lie.log_so3)
-log_slope = jax.jit(jax.jacfwd(lambda w: lie.log_so3(lie.exp_so3(w))))
+@jax.jit
+@jax.vmap
+def log_and_slope(rotation, angular):
+    """Of a rotation, and in w of the logarithm of the exponential of w."""
+    slope = jax.jacfwd(lambda w: lie.log_so3(lie.exp_so3(w)))
+    return lie.log_so3(rotation), slope(angular)
+
+
+def logarithms(rotations, angular, dtype):
+    """NumPy arrays of five rows, as every test asks for, so that programs are shared.
+
+    Fewer rows are repeated.
+    """
+    rows = np.arange(5) % len(rotations)
+    given = (np.asarray(x, dtype)[rows] for x in (rotations, angular))
+    return [np.asarray(found)[: len(rotations)] for found in log_and_slope(*given)]
 
 
 @pytest.mark.hard_cases
@@ -162,66 +180,74 @@ log_slope = jax.jit(jax.jacfwd(lambda w: lie.log_so3(lie.exp_so3(w))))
     [0, 1e-20, 1e-8, 1e-4, 1e-2, 0.39, 0.41, 1.5, 3.0, np.pi - 1e-3, np.pi - 1e-6],
 )
 def test_logarithm_inverts_the_exponential_up_to_pi(angle, dtype, rng):
-    for _ in range(5):
-        axis = rng.normal(size=3)
-        angular = jnp.asarray(angle * axis / np.linalg.norm(axis), dtype)
-        # the rotation in float64, rounded: the log's own error, not the exponential's
-        exact = scipy.spatial.transform.Rotation.from_rotvec(np.array(angular, float))
-        found = log_so3(jnp.asarray(exact.as_matrix(), dtype))
-        error = np.linalg.norm(
-            np.asarray(found, np.float64) - np.asarray(angular, float)
-        )
-        # the matrix itself is rounded to 6e-8 in each entry
-        assert error < {"float32": 5e-7, "float64": 2e-15}[dtype]
-        # d log(exp w) / dw = 1; near π the matrix's rounding may flip the sign
-        if angle < 3.1:
-            slope = log_slope(angular)
-            assert np.max(abs(slope - np.eye(3))) < {"float32": 2e-6}.get(dtype, 5e-15)
-        else:
-            assert np.all(np.isfinite(log_slope(angular)))
+    axes = rng.normal(size=(5, 3))
+    angular = angle * axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    angular = angular.astype(dtype).astype(float)
+    # the rotation in float64, rounded: the log's own error, not the exponential's
+    exact = scipy.spatial.transform.Rotation.from_rotvec(angular)
+    found, slopes = logarithms(exact.as_matrix(), angular, dtype)
+    error = np.linalg.norm(found.astype(np.float64) - angular, axis=1)
+    # the matrix itself is rounded to 6e-8 in each entry
+    assert error.max() < {"float32": 5e-7, "float64": 2e-15}[dtype]
+    # d log(exp w) / dw = 1; near π the matrix's rounding may flip the sign
+    if angle < 3.1:
+        assert np.max(abs(slopes - np.eye(3))) < {"float32": 2e-6}.get(dtype, 5e-15)
+    else:
+        assert np.all(np.isfinite(slopes))
 
 
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("axis", np.concatenate([np.eye(3), [[0, 0.6, -0.8]]]))
 def test_logarithm_of_a_half_turn(axis, dtype):
     """No sign to choose and no digits to lose: exactly π about ± the axis."""
-    turn = jnp.asarray(2 * np.outer(axis, axis) - np.eye(3), dtype)
-    found = np.asarray(log_so3(turn))
+    turn = 2 * np.outer(axis, axis) - np.eye(3)
+    found = logarithms([turn], [np.pi * axis], dtype)[0][0]
     assert np.min([np.max(abs(found - s * np.pi * axis)) for s in (1, -1)]) < 1e-6
+
+
+screw_and_back = jax.jit(lambda *screw: lie.log_se3(*lie.exp_se3(*screw)))
 
 
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("angle", [0, 1e-8, 1e-3, 1.0, 3.0])
 def test_screw_logarithm_inverts_the_exponential(angle, dtype):
-    angular, linear = jnp.asarray(angle * AXIS, dtype), jnp.asarray(LINEAR, dtype)
-    found = lie.log_se3(*lie.exp_se3(angular, linear))
+    angular, linear = (np.asarray(x, dtype) for x in (angle * AXIS, LINEAR))
+    found = screw_and_back(angular, linear)
     bound = {"float32": 2e-6, "float64": 5e-15}[dtype]  # times θ/2 cot(θ/2) near π
-    assert np.max(abs(found[0] - angular)) < bound
-    assert np.max(abs(found[1] - linear)) < bound
+    assert np.max(abs(np.asarray(found[0]) - angular)) < bound
+    assert np.max(abs(np.asarray(found[1]) - linear)) < bound
+
+
+@jax.jit
+def jacobians(angular, linear):
+    return (
+        lie.left_jacobian(angular),
+        lie.left_jacobian_se3(angular, linear),
+        lie.inverse_left_jacobian(angular),
+        lie.inverse_left_jacobian_se3(angular, linear),
+    )
 
 
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("angle", [0, 1e-6, 1e-3, 0.5, 3.0, 3.2, 6.0])
 def test_left_jacobians_are_integrals_and_inverse_to_each_other(angle, dtype):
-    angular, linear = jnp.asarray(angle * AXIS, dtype), jnp.asarray(LINEAR, dtype)
-    nodes, weights = np.polynomial.legendre.leggauss(24)
+    angular, linear = (np.asarray(x, dtype) for x in (angle * AXIS, LINEAR))
     screw = np.zeros((6, 6))  # the adjoint of (angular, linear)
     hats = [np.cross(np.eye(3), np.asarray(x, np.float64)) for x in (angular, linear)]
     screw[:3, :3] = screw[3:, 3:] = hats[0]
     screw[3:, :3] = hats[1]
-    integral = sum(
-        w / 2 * scipy.linalg.expm((t + 1) / 2 * screw)
-        for t, w in zip(nodes, weights, strict=True)
-    )
+    # exp of [[A, 1], [0, 0]] has the integral of exp(tA) from 0 to 1 beside it
+    both = np.block([[screw, np.eye(6)], [np.zeros((6, 12))]])
+    integral = scipy.linalg.expm(both)[:6, 6:]
     bound = {"float32": 5e-7, "float64": 2e-14}[dtype]
-    small, large = lie.left_jacobian(angular), lie.left_jacobian_se3(angular, linear)
-    assert np.max(abs(small - integral[:3, :3])) < bound
-    assert np.max(abs(large - integral)) < bound
+    small, large, small_inverse, large_inverse = jacobians(angular, linear)
+    assert np.max(abs(np.asarray(small) - integral[:3, :3])) < bound
+    assert np.max(abs(np.asarray(large) - integral)) < bound
     # conditioned like θ/2 / sin(θ/2): 21 at 6 rad
     worse = bound * (400 if angle > 5 else 10)
     truth = np.linalg.inv(integral)
-    assert np.max(abs(lie.inverse_left_jacobian(angular) - truth[:3, :3])) < worse
-    assert np.max(abs(lie.inverse_left_jacobian_se3(angular, linear) - truth)) < worse
+    assert np.max(abs(np.asarray(small_inverse) - truth[:3, :3])) < worse
+    assert np.max(abs(np.asarray(large_inverse) - truth)) < worse
 
 
 def test_gradients_of_every_map(float64, rng):
