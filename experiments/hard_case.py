@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import mpmath
 import numpy as np
+from jax.typing import ArrayLike, DTypeLike
 
 ORDERS = ("value", "slope", "curvature")
 ROWS = 16  # a program is compiled for a multiple of so many inputs
@@ -53,6 +54,11 @@ class Case(NamedTuple):
     def orders(self) -> int:
         """How many of value, slope and curvature are held."""
         return max(len(bounds) for bounds in self.bounds.values())
+
+
+def constant(values: ArrayLike, dtype: DTypeLike) -> jax.Array:
+    """As `jnp.asarray`, which compiles a program for it where nothing is jitted."""
+    return jax.device_put(np.asarray(values).astype(jnp.dtype(dtype)))
 
 
 def derivatives(function: Callable, count: int) -> Callable:

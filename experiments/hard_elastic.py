@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import mpmath
 import numpy as np
 
-from experiments.hard_case import Case
+from experiments.hard_case import Case, constant
 from nerfies_jax.geometry import matrix3
 
 # Three directions in which a matrix moves, in numbers that every precision holds: a
@@ -21,7 +21,7 @@ ALONG = np.array([1.0, -0.5, 0.25])
 
 def _moved(shares):
     """[3, 3] the sum of directions, each so far."""
-    directions = jnp.asarray(DIRECTIONS, shares.dtype)
+    directions = constant(DIRECTIONS, shares.dtype)
     return jnp.sum(shares[:, None, None] * directions, axis=0)
 
 
@@ -126,7 +126,7 @@ _BACK = np.array([[-1, 2, 2], [-2, 1, -2], [-2, -2, 1]])
 
 def _stretched(stretches):
     """[3, 3] U diag(stretches) Vᵀ."""
-    left, right = (jnp.asarray(turn, stretches.dtype) for turn in (_TURN, _BACK))
+    left, right = (constant(turn, stretches.dtype) for turn in (_TURN, _BACK))
     return jnp.sum(left[:, None] * stretches * right, axis=-1) / 9
 
 

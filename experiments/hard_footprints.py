@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import mpmath
 import numpy as np
 
-from experiments.hard_case import Case
+from experiments.hard_case import Case, constant
 from gaussians_jax import harmonics, projection
 from gaussians_jax.raster_spec import GSPLAT
 from gaussians_jax.splats import Gaussians
@@ -20,13 +20,13 @@ SHARP = dataclasses.replace(GSPLAT, antialiased=True)
 
 def _camera(dtype, position=(0.0, 0.0, 0.0), turn=np.eye(3)):
     fields = (turn, position, FOCAL, [32.0, 24.0], 0.0, 1.0, [0.0] * 3, [0.0] * 2)
-    return Camera(*(jnp.asarray(x, dtype) for x in fields))
+    return Camera(*(constant(x, dtype) for x in fields))
 
 
 def _footprint(x, spec):
     """Of a quaternion [4] and a scale [3], straight ahead, opacity a half."""
-    ahead = jnp.asarray([[0, 0, DEPTH]], x.dtype)
-    half = jnp.asarray([0.5], x.dtype)
+    ahead = constant([[0, 0, DEPTH]], x.dtype)
+    half = constant([0.5], x.dtype)
     gaussians = Gaussians(ahead, x[None, :4], x[None, 4:7], half)
     return projection.project(gaussians, _camera(x.dtype), SIZE, spec)
 
@@ -161,18 +161,18 @@ def _offset_camera(x):
 def _mean_px(x):
     gaussians = Gaussians(
         x[None, 3:],
-        jnp.asarray([[1, 0, 0, 0]], x.dtype),
-        jnp.full((1, 3), 0.125, x.dtype),
-        jnp.full(1, 0.5, x.dtype),
+        constant([[1, 0, 0, 0]], x.dtype),
+        constant(np.full((1, 3), 0.125), x.dtype),
+        constant(np.full(1, 0.5), x.dtype),
     )
     return projection.project(gaussians, _offset_camera(x), SIZE, GSPLAT).mean_px[0]
 
 
 def _mean_px_textbook(x):
-    turn = jnp.asarray(_ROTATION, x.dtype)
+    turn = constant(_ROTATION, x.dtype)
     shift = -turn @ x[:3]
     here = turn @ x[3:] + shift
-    return FOCAL * here[:2] / here[2] + jnp.asarray([32, 24], x.dtype)
+    return FOCAL * here[:2] / here[2] + constant([32, 24], x.dtype)
 
 
 def _exact_mean_px(x):

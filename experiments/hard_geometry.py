@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import mpmath
 import numpy as np
 
-from experiments.hard_case import Case
+from experiments.hard_case import Case, constant
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry import distortion, rays
 
@@ -16,14 +16,14 @@ TURN = np.array([[2, -1, 2], [2, 2, -1], [-1, 2, 2]]) / 3
 def _pinhole(rotation, position):
     kind = position.dtype
     return cameras.Camera(
-        camera_from_world=jnp.asarray(rotation, kind),
+        camera_from_world=constant(rotation, kind),
         position=position,
-        focal_px=jnp.asarray(FOCAL_PX, kind),
-        principal_point_px=jnp.asarray(CENTRE_PX, kind),
-        skew_px=jnp.zeros((), kind),
-        pixel_aspect=jnp.ones((), kind),
-        radial=jnp.zeros(3, kind),
-        tangential=jnp.zeros(2, kind),
+        focal_px=constant(FOCAL_PX, kind),
+        principal_point_px=constant(CENTRE_PX, kind),
+        skew_px=constant(np.zeros(()), kind),
+        pixel_aspect=constant(np.ones(()), kind),
+        radial=constant(np.zeros(3), kind),
+        tangential=constant(np.zeros(2), kind),
     )
 
 
@@ -34,13 +34,13 @@ def _far_pixel(both):
 
 def _textbook_far_pixel(both):
     """K [R | t], with t = -R c."""
-    rotation = jnp.asarray(TURN, both.dtype)
+    rotation = constant(TURN, both.dtype)
     seen = rotation @ both[:3] + -rotation @ both[3:]
     return _on_plane(seen[:2], seen[2])
 
 
 def _on_plane(lateral, depth):
-    return FOCAL_PX * lateral / depth + jnp.asarray(CENTRE_PX, lateral.dtype)
+    return FOCAL_PX * lateral / depth + constant(CENTRE_PX, lateral.dtype)
 
 
 def _exact_pixel(x, y, divisor):
@@ -107,7 +107,7 @@ BARREL = -0.5  # k1; folds at a slope of √(2/3), distorted to 0.5443
 
 
 def _undistorted(bent):
-    lens = jnp.asarray([BARREL, 0, 0], bent.dtype), jnp.zeros(2, bent.dtype)
+    lens = constant([BARREL, 0, 0], bent.dtype), constant(np.zeros(2), bent.dtype)
     return distortion.undistort(*lens, bent)[0]
 
 
@@ -150,12 +150,12 @@ START = np.array([-3.0, 1.0, 0.5])  # in the plane of the face y = 1
 
 
 def _span(direction):
-    start, low, high = (jnp.asarray(x, direction.dtype) for x in (START, LOW, HIGH))
+    start, low, high = (constant(x, direction.dtype) for x in (START, LOW, HIGH))
     return jnp.stack(rays.box_span(start, direction, low, high))
 
 
 def _slabs(direction):
-    start, low, high = (jnp.asarray(x, direction.dtype) for x in (START, LOW, HIGH))
+    start, low, high = (constant(x, direction.dtype) for x in (START, LOW, HIGH))
     ends = jnp.stack([(low - start) / direction, (high - start) / direction])
     return jnp.stack([jnp.max(jnp.min(ends, axis=0)), jnp.min(jnp.max(ends, axis=0))])
 

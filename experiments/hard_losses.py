@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import mpmath
 import numpy as np
 
-from experiments.hard_case import Case
+from experiments.hard_case import Case, constant
 from gaussians_jax.effects import depth, spectral
 from nerfies_jax.capture.synthetic import texture
 from nerfies_jax.effects import transient
@@ -140,10 +140,10 @@ _RAW = np.array([-1000, -100, -30, -5, 0, 5, 30, 88, 89, 100, 1e4])
 
 def _uncertain(x):
     """NeRF-W's loss of a residual [3] and a raw β, one sample of weight one."""
-    one = jnp.ones((1,), x.dtype)
+    one = constant(np.ones((1,)), x.dtype)
     beta = transient.uncertainty(BETA_MIN, one, jax.nn.softplus(x[3:]))
     loss = transient.photometric(
-        x[None, :3], jnp.zeros((1, 3), x.dtype), beta[None], None
+        x[None, :3], constant(np.zeros((1, 3)), x.dtype), beta[None], None
     )
     return loss[None]
 
@@ -270,13 +270,13 @@ _LEVELS = [
 
 def _pair(x):
     level, offset, contrast = x
-    image, target = (jnp.asarray(p, x.dtype) for p in (_PICTURE, _OTHER))
+    image, target = (constant(p, x.dtype) for p in (_PICTURE, _OTHER))
     return level + offset + contrast * image, level + contrast * target
 
 
 def _dssim_textbook(x):
     image, target = _pair(x)
-    weight = jnp.asarray(np.multiply.outer(losses.WINDOW, losses.WINDOW), x.dtype)
+    weight = constant(np.multiply.outer(losses.WINDOW, losses.WINDOW), x.dtype)
     a, b, aa, bb, ab = (
         jnp.sum(weight[..., None] * part)
         for part in (image, target, image**2, target**2, image * target)
@@ -364,7 +364,7 @@ _OFF = np.array([2.0**-14, 2.0**-11, 2.0**-8, 2.0**-4, 1.0])
 
 
 def _truth_like(x):
-    return jnp.asarray(_DEPTHS, x.dtype)
+    return constant(_DEPTHS, x.dtype)
 
 
 def _pearson_textbook(x):
@@ -389,7 +389,9 @@ CORRELATION = Case(
     axis="departure from the truth",
     at=_OFF,
     inputs=_DEPTHS + _OFF[:, None] * _WRONG,
-    stable=lambda x: depth.correlation(x, _truth_like(x), jnp.ones(6, bool))[None],
+    stable=lambda x: depth.correlation(x, _truth_like(x), constant(np.ones(6), bool))[
+        None
+    ],
     textbook=_pearson_textbook,
     exact=_exact_pearson,
     bounds={"float32": (1e-3, 1e-3), "float64": (1e-11, 1e-11)},

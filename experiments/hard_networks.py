@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import mpmath
 import numpy as np
 
-from experiments.hard_case import Case
+from experiments.hard_case import Case, constant
 from gaussians_jax import optimiser
 from nerfies_jax.nets import kan
 from nerfies_jax.nets.kan import KAN, KANLayer, KANSpec, Kernels
@@ -30,15 +30,15 @@ WEIGHTS = np.linspace(1, 2, KERNELS)
 
 def _edge(spec, x, weights=WEIGHTS, kernels=None):
     """The function of one variable that one edge of a KAN is."""
-    weight = jnp.asarray(weights, x.dtype)[:, None, None]
-    head = KANLayer(weight, None, jnp.zeros(1, x.dtype))
+    weight = constant(weights, x.dtype)[:, None, None]
+    head = KANLayer(weight, None, constant(np.zeros(1), x.dtype))
     return kan.apply(spec, KAN((), {"y": head}, kernels), x)["y"]
 
 
 def _gaussians(x):
     """FastKAN's layer: nothing holds its inputs."""
     centre = jnp.arange(KERNELS, dtype=x.dtype)
-    return jnp.exp(-((x - centre) ** 2)) @ jnp.asarray(WEIGHTS, x.dtype)[:, None]
+    return jnp.exp(-((x - centre) ** 2)) @ constant(WEIGHTS, x.dtype)[:, None]
 
 
 def _exact_edge(x, first=0):
@@ -96,7 +96,7 @@ def _expanded(x):
     """As a matrix product would have it, |x|² - 2xμ + μ²."""
     centre = 1024 + jnp.arange(KERNELS, dtype=x.dtype)
     squares = x**2 - 2 * x * centre + centre**2
-    return jnp.exp(-squares) @ jnp.asarray(WEIGHTS, x.dtype)[:, None]
+    return jnp.exp(-squares) @ constant(WEIGHTS, x.dtype)[:, None]
 
 
 _OFFSETS = 1024 + np.array([0, 1e-3, 0.25, 1, 3.3, 6.75, 7])
@@ -179,12 +179,12 @@ _PATTERN = np.array([1.0, -2.0, 0.5, 0.25])  # sums to -0.25, so the mean is not
 
 
 def _standardised(x):
-    return kan.standardise(64 + x[0] * jnp.asarray(_PATTERN, x.dtype))
+    return kan.standardise(64 + x[0] * constant(_PATTERN, x.dtype))
 
 
 def _by_moments(x):
     """The variance as the mean square less the square of the mean."""
-    features = 64 + x[0] * jnp.asarray(_PATTERN, x.dtype)
+    features = 64 + x[0] * constant(_PATTERN, x.dtype)
     mean = jnp.mean(features)
     variance = jnp.mean(features**2) - mean**2
     return (features - mean) / jnp.sqrt(variance + kan.NORM_VARIANCE)
@@ -222,7 +222,7 @@ B1, B2 = 0.9, 0.999
 
 def _length_as_printed(x):
     """Equation 8 of Liu et al. 2020."""
-    seen = jnp.asarray(B2, x.dtype) ** x
+    seen = constant(B2, x.dtype) ** x
     return 2 / (1 - B2) - 1 - 2 * x * seen / (1 - seen)
 
 
@@ -270,8 +270,8 @@ def _update_at(count, x):
     before = [-jnp.expm1((x[:1] - 1) * math.log(b)) for _, b in _MOMENTS]
     first = B1 * slope * before[0] + (1 - B1) * slope
     second = B2 * slope**2 * before[1] + (1 - B2) * slope**2
-    mean = first / (1 - jnp.asarray(B1, x.dtype) ** count)
-    square = second / (1 - jnp.asarray(B2, x.dtype) ** count)
+    mean = first / (1 - constant(B1, x.dtype) ** count)
+    square = second / (1 - constant(B2, x.dtype) ** count)
     return mean / (jnp.sqrt(square) + 1e-8)
 
 

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import mpmath
 import numpy as np
 
-from experiments.hard_case import Case
+from experiments.hard_case import Case, constant
 from nerfies_jax.geometry import lie, quaternion
 
 AXIS = np.array([2.0, -1.0, 2.0]) / 3
@@ -141,14 +141,14 @@ _START = np.array([0.5, -0.5, 0.5, 0.5])
 
 def _slerp(w):
     """From the start, a quarter of the turn by w."""
-    start = jnp.asarray(_START, w.dtype)
+    start = constant(_START, w.dtype)
     end = quaternion.multiply(quaternion.exp(w), start)
-    return quaternion.slerp(start, end, jnp.asarray(SHARE, w.dtype))
+    return quaternion.slerp(start, end, constant(SHARE, w.dtype))
 
 
 def _textbook_slerp(w):
     """Shoemake 1985, by sines of parts of the angle."""
-    start = jnp.asarray(_START, w.dtype)
+    start = constant(_START, w.dtype)
     end = quaternion.multiply(quaternion.exp(w), start)
     end = jnp.where(jnp.sum(start * end) < 0, -end, end)
     angle = jnp.arccos(jnp.sum(start * end))

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import mpmath
 import numpy as np
 
-from experiments.hard_case import Case
+from experiments.hard_case import Case, constant
 from nerfies_jax.geometry import lie
 from nerfies_jax.geometry.stumpff import SERIES_BELOW
 
@@ -14,14 +14,12 @@ POINT = np.array([0.5, 0.25, -0.75])
 
 
 def _screw(w):
-    return lie.transform_point(
-        w, jnp.asarray(LINEAR, w.dtype), jnp.asarray(POINT, w.dtype)
-    )
+    return lie.transform_point(w, constant(LINEAR, w.dtype), constant(POINT, w.dtype))
 
 
 def _rodrigues(w):
     """As it stands in the textbooks and in the official Nerfies code."""
-    linear, point = jnp.asarray(LINEAR, w.dtype), jnp.asarray(POINT, w.dtype)
+    linear, point = constant(LINEAR, w.dtype), constant(POINT, w.dtype)
     angle = jnp.sqrt(jnp.sum(w**2))
     sine = jnp.sin(angle) / angle
     versine = (1 - jnp.cos(angle)) / angle**2
@@ -112,8 +110,8 @@ def _of_screw(form):
     """Of w and the speed: v is the speed times one direction."""
     return lambda screw: form(
         screw[:3],
-        screw[3] * jnp.asarray(LINEAR, screw.dtype),
-        jnp.asarray(POINT, screw.dtype),
+        screw[3] * constant(LINEAR, screw.dtype),
+        constant(POINT, screw.dtype),
     )
 
 
@@ -166,11 +164,11 @@ SHIFT = Case(
 
 
 def _inverse_jacobian(w):
-    return lie.inverse_left_jacobian(w) @ jnp.asarray(LINEAR, w.dtype)
+    return lie.inverse_left_jacobian(w) @ constant(LINEAR, w.dtype)
 
 
 def _textbook_inverse_jacobian(w):
-    angle, v = jnp.sqrt(jnp.sum(w**2)), jnp.asarray(LINEAR, w.dtype)
+    angle, v = jnp.sqrt(jnp.sum(w**2)), constant(LINEAR, w.dtype)
     twice = jnp.cross(w, jnp.cross(w, v))
     rest = (1 - angle / 2 / jnp.tan(angle / 2)) / angle**2
     return v - jnp.cross(w, v) / 2 + rest * twice
@@ -204,8 +202,8 @@ INVERSE_JACOBIAN = Case(
 
 def _coupling(w):
     """The lower left block of the screws' Jacobian, on one vector."""
-    jacobian = lie.left_jacobian_se3(w, jnp.asarray(LINEAR, w.dtype))
-    return jacobian[3:, :3] @ jnp.asarray(POINT, w.dtype)
+    jacobian = lie.left_jacobian_se3(w, constant(LINEAR, w.dtype))
+    return jacobian[3:, :3] @ constant(POINT, w.dtype)
 
 
 def _coupling_terms(w, v):
@@ -221,7 +219,7 @@ def _textbook_coupling(w):
     """Barfoot and Furgale 2014, equation 102, as printed."""
     angle = jnp.sqrt(jnp.sum(w**2))
     sine, cosine = jnp.sin(angle), jnp.cos(angle)
-    hat, shift = lie.hat(w), lie.hat(jnp.asarray(LINEAR, w.dtype))
+    hat, shift = lie.hat(w), lie.hat(constant(LINEAR, w.dtype))
     wv, vw = hat @ shift, shift @ hat
     wvw = wv @ hat
     three = (angle - sine) / angle**3
@@ -233,7 +231,7 @@ def _textbook_coupling(w):
         - four * (hat @ wv + vw @ hat - 3 * wvw)
         - (four - 3 * five) / 2 * (wvw @ hat + hat @ wvw)
     )
-    return matrix @ jnp.asarray(POINT, w.dtype)
+    return matrix @ constant(POINT, w.dtype)
 
 
 def _exact_coupling(w):

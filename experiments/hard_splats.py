@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import mpmath
 import numpy as np
 
-from experiments.hard_case import Case
+from experiments.hard_case import Case, constant
 from gaussians_jax import density, raster, relocation, splats
 from gaussians_jax.effects import acceleration
 from gaussians_jax.projection import Footprints
@@ -23,15 +23,15 @@ _VALUES = np.cos(np.arange(COUNT) * 0.7)
 
 def _pixel(x):
     """A pixel behind `COUNT` wide Gaussians, the first with alpha x0, all others x1."""
-    rest = jnp.asarray(np.ones(COUNT - 1), x.dtype) * x[1]
+    rest = constant(np.ones(COUNT - 1), x.dtype) * x[1]
     footprints = Footprints(
-        mean_px=jnp.asarray(np.full((COUNT, 2), 0.5), x.dtype),
-        whitening=jnp.asarray(np.tile([1e-3, 0, 1e-3], (COUNT, 1)), x.dtype),
+        mean_px=constant(np.full((COUNT, 2), 0.5), x.dtype),
+        whitening=constant(np.tile([1e-3, 0, 1e-3], (COUNT, 1)), x.dtype),
         opacity=jnp.concatenate([x[:1], rest]),
-        depth=jnp.asarray(np.arange(1, COUNT + 1), x.dtype),
-        extent_px=jnp.asarray(np.full((COUNT, 2), 2.0), x.dtype),
+        depth=constant(np.arange(1, COUNT + 1), x.dtype),
+        extent_px=constant(np.full((COUNT, 2), 2.0), x.dtype),
     )
-    values = jnp.asarray(_VALUES[:, None], x.dtype)
+    values = constant(_VALUES[:, None], x.dtype)
     image, _ = raster.rasterise(footprints, values, (1, 1), OPEN)
     return image[0, 0]
 
@@ -68,9 +68,9 @@ _composite_dividing.defvjp(_dividing_forward, _dividing_backward)
 
 
 def _pixel_textbook(x):
-    alpha = jnp.concatenate([x[:1], jnp.full(COUNT - 1, 1, x.dtype) * x[1]])
+    alpha = jnp.concatenate([x[:1], constant(np.full(COUNT - 1, 1), x.dtype) * x[1]])
     alpha = jnp.where(alpha < OPEN.alpha_cut, 0, jnp.minimum(alpha, OPEN.alpha_max))
-    return _composite_dividing(alpha, jnp.asarray(_VALUES, x.dtype))[None]
+    return _composite_dividing(alpha, constant(_VALUES, x.dtype))[None]
 
 
 def _exact_pixel(x):
@@ -151,14 +151,14 @@ _LOGS = np.array(
 
 
 def _variance(log_scale):
-    one = jnp.zeros(1, log_scale.dtype)
+    one = constant(np.zeros(1), log_scale.dtype)
     rows = Splats(
-        jnp.zeros((1, 3), log_scale.dtype),
-        jnp.full((1, 3), 1, log_scale.dtype) * log_scale,
-        jnp.zeros((1, 4), log_scale.dtype),
+        constant(np.zeros((1, 3)), log_scale.dtype),
+        constant(np.full((1, 3), 1), log_scale.dtype) * log_scale,
+        constant(np.zeros((1, 4)), log_scale.dtype),
         one,
-        jnp.zeros((1, 1, 3), log_scale.dtype),
-        jnp.zeros((1, 0, 3), log_scale.dtype),
+        constant(np.zeros((1, 1, 3)), log_scale.dtype),
+        constant(np.zeros((1, 0, 3)), log_scale.dtype),
     )
     return splats.activate(rows).scale[0, :1] ** 2
 
@@ -191,8 +191,8 @@ _OPACITIES = np.array([1e-4, 0.01, 0.1, 0.5, 0.9, 0.999, 1 - 1e-6])
 def _spread(opacity):
     each, scale = relocation.spread_over(
         opacity,
-        jnp.ones((1, 3), opacity.dtype),
-        jnp.full(1, COPIES, jnp.int32),
+        constant(np.ones((1, 3)), opacity.dtype),
+        constant(np.full(1, COPIES), jnp.int32),
         least=0.0,
     )
     return jnp.concatenate([each, scale[0, :1]])
@@ -212,7 +212,7 @@ def _binomials():
 def _spread_textbook(opacity):
     """Equation 9, its alternating sum in the precision of the opacity."""
     each = 1 - (1 - opacity) ** (1 / COPIES)
-    factors = jnp.asarray([float(f) for f in _binomials()], opacity.dtype)
+    factors = constant([float(f) for f in _binomials()], opacity.dtype)
     powers = each ** jnp.arange(1, COPIES + 1).astype(opacity.dtype)
     return jnp.concatenate([each, opacity / jnp.sum(factors * powers)])
 

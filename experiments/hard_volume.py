@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import mpmath
 import numpy as np
 
-from experiments.hard_case import Case
+from experiments.hard_case import Case, constant
 from nerfies_jax.radiance import compositing, sampling
 from nerfies_jax.radiance.compositing import AT_INFINITY, EMPTY_BELOW
 
@@ -60,14 +60,14 @@ DISTANCES = np.array([1.0, 1.25, 2.0, 2.125, 3.0])
 
 
 def _closed_by_infinity(density):
-    distances = jnp.asarray(DISTANCES, density.dtype)
+    distances = constant(DISTANCES, density.dtype)
     spacing = compositing.intervals(distances, AT_INFINITY)
     return compositing.weights(density * spacing)
 
 
 def _subtracted(density):
     """The depth in front of a sample as the sum up to it without it."""
-    spacing = jnp.diff(jnp.asarray([*DISTANCES, DISTANCES[-1] + 1e10], density.dtype))
+    spacing = jnp.diff(constant([*DISTANCES, DISTANCES[-1] + 1e10], density.dtype))
     depth = density * spacing
     through = jnp.exp(-(jnp.cumsum(depth) - depth))
     return through * -jnp.expm1(-depth)
@@ -99,13 +99,13 @@ _SHARES = [0.5, 1.0, 0.25, 2.0, 0.25]  # sum to 4
 
 
 def _expected(weights):
-    distances = jnp.asarray(DISTANCES, weights.dtype)
-    far = jnp.asarray(FAR, weights.dtype)
+    distances = constant(DISTANCES, weights.dtype)
+    far = constant(FAR, weights.dtype)
     return compositing.expected_distance(weights, distances, far)[None]
 
 
 def _quotient(weights):
-    distances = jnp.asarray(DISTANCES, weights.dtype)
+    distances = constant(DISTANCES, weights.dtype)
     return (jnp.sum(weights * distances) / jnp.sum(weights))[None]
 
 
@@ -207,13 +207,13 @@ DRAWN = 11
 
 
 def _samples(weights):
-    edges = jnp.asarray(EDGES, weights.dtype)
+    edges = constant(EDGES, weights.dtype)
     return sampling.from_weights(None, edges, weights, DRAWN)
 
 
 def _with_a_floor(weights):
     """As the Nerfies code: 1e-5 on every weight, a mask for every share and edge."""
-    edges = jnp.asarray(EDGES, weights.dtype)
+    edges = constant(EDGES, weights.dtype)
     weights = weights + 1e-5
     share = jnp.cumsum(weights / jnp.sum(weights))
     share = jnp.concatenate([jnp.zeros_like(share[:1]), share])
