@@ -246,7 +246,7 @@ def _svd_untraced(matrix):
     right = [tuple(one if row == k else zero for row in range(3)) for k in range(3)]
 
     def sweep(_, both):
-        columns, right = map(list, both)
+        columns, right, _ = map(list, both)
         for p, q in ((0, 1), (0, 2), (1, 2)):
             cosine, sine = _angle(
                 _dot(columns[q], columns[q]) - _dot(columns[p], columns[p]),
@@ -254,13 +254,21 @@ def _svd_untraced(matrix):
             )
             _turn(columns, p, q, cosine, sine)
             _turn(right, p, q, cosine, sine)
-        return columns, right
+        return columns, right, [_dot(column, column) for column in columns]
 
     sweeps = _SWEEPS[matrix.dtype.name]
-    columns, right = lax.fori_loop(0, sweeps, sweep, (columns, right))
+    # Lengths leave the loop as numbers: computed anew wherever they are compared, with
+    # other roundings, nearly equal ones are swapped in one place and not in another.
+    columns, right, lengths = lax.fori_loop(
+        0, sweeps, sweep, (columns, right, [zero, zero, zero])
+    )
     for p, q in ((0, 1), (0, 2), (1, 2)):
         # a quarter turn, not a swap: the basis stays a rotation
-        swap = _dot(columns[p], columns[p]) < _dot(columns[q], columns[q])
+        swap = lengths[p] < lengths[q]
+        lengths[p], lengths[q] = (
+            jnp.where(swap, lengths[q], lengths[p]),
+            jnp.where(swap, lengths[p], lengths[q]),
+        )
         cosine, sine = jnp.where(swap, 0, one), jnp.where(swap, one, 0)
         _turn(columns, p, q, cosine, sine)
         _turn(right, p, q, cosine, sine)

@@ -98,10 +98,6 @@ def test_decomposition_restores_the_matrix(size, dtype, rng):
 
 
 @pytest.mark.hard_cases
-@pytest.mark.xfail(
-    strict=True,
-    reason="columns of equal length are swapped in one fusion and not in another",
-)
 def test_many_nearly_rigid_matrices_are_decomposed_at_once(dtype, rng):
     """Which column is the longer one is then a matter of rounding."""
     turns = Rotation.random(100, random_state=0).as_matrix()

@@ -151,10 +151,6 @@ axioms = settings(max_examples=40, deadline=None, derandomize=True, database=Non
 
 @pytest.mark.slow
 @pytest.mark.hard_cases
-@pytest.mark.xfail(
-    strict=True,
-    reason="columns of equal length are swapped in one fusion and not in another",
-)
 @pytest.mark.parametrize("kind", ["float32", "float64"])
 @axioms
 @given(stretch=triples, one=triples, other=triples)
