@@ -1,6 +1,7 @@
 """Both precisions, strict promotion, one compilation cache for the whole run."""
 
 import gc
+import itertools
 import os
 import pathlib
 import signal
@@ -42,9 +43,6 @@ SHARED = pathlib.Path(__file__).resolve().parents[2] / "shared"
 SHARED_BY = {
     "test_hostile_fields.py": ("name", "paper"),
     "test_hostile_splats.py": ("name", "preset"),
-    "test_rotations.py": ("case",),
-    "test_elastic_cases.py": ("case",),
-    "test_splat_cases.py": ("case",),
 }
 
 
@@ -66,12 +64,22 @@ def pytest_collection_finish():
     gc.enable()
 
 
+# All programs of a run together took 5 GB a process; those of so many modules, 1 GB.
+REMEMBERED = 12
+_remembered = itertools.count(1)
+
+
 @pytest.fixture(scope="module", autouse=True)
 def forget_programs():
-    """Compiled programs of a finished module: all together took 5 GB a process."""
+    """Compiled programs of finished modules, now and then.
+
+    Not of each: small operations are the same in all, and a worker that takes tests of
+    two files by turns would compile everything again at each turn.
+    """
     yield
-    jax.clear_caches()
-    gc.collect()
+    if next(_remembered) % REMEMBERED == 0:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture(params=["float32", "float64"])
