@@ -128,9 +128,13 @@ def scenario(dtype):
     """Parameters and the rest, with nothing next to zero."""
     rng = np.random.default_rng(4)
     frames, batch = frames_and_batch(rng, dtype)
-    params = scene_flow.init(TINY, jax.random.key(1), FEATURES, jnp.dtype(dtype))
+    # Drawn here: its own start is a program for each array.
+    shapes = jax.eval_shape(
+        lambda key: scene_flow.init(TINY, key, FEATURES, jnp.dtype(dtype)),
+        jax.random.key(1),
+    )
     params = jax.tree.map(
-        lambda x: x + jnp.asarray(0.4 * rng.normal(size=x.shape), dtype), params
+        lambda x: jax.device_put(0.5 * rng.normal(size=x.shape).astype(x.dtype)), shapes
     )
     distance = np.sort(rng.uniform(1.0, 3.0, (RAYS, SAMPLES)), 1)
     features = rng.normal(size=(RAYS, SAMPLES, FEATURES))

@@ -11,8 +11,10 @@ from gaussians_jax.splats import Gaussians
 from nerfies_jax.geometry.camera import Camera
 
 QUICK = ["n100_64_sh3_bg_aa"]
-HARD = ["degenerate_64_aa", "opaque_64_clamp0999", "wide_offaxis_near_80x60"]
 SLOW = [
+    "degenerate_64_aa",
+    "opaque_64_clamp0999",
+    "wide_offaxis_near_80x60",
     "opaque_64_clamp099",
     "n50_48_sh0",
     "n50_48_sh1",
@@ -28,14 +30,7 @@ SLOW = [
     "garden10k_cam1_162x105",
     "garden10k_cam2_162x105",
 ]
-CASES = [
-    *QUICK,
-    *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW),
-    *(
-        pytest.param(name, marks=[pytest.mark.slow, pytest.mark.hard_cases])
-        for name in HARD
-    ),
-]
+CASES = [*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)]
 
 
 class Case:

@@ -1,6 +1,7 @@
 """Starts that nobody would choose, for radiance fields.
 
 A start changes numbers alone, never a shape, so one compiled field serves all of them.
+Frames and parameters are NumPy's: each jax operation outside would be a program.
 """
 
 import dataclasses
@@ -77,27 +78,27 @@ def from_the_lens(capture: Capture) -> Capture:
 def rounded(frames: Frames) -> Frames:
     """Pictures as bfloat16 shares."""
     shares = (frames.images / 255).astype(jnp.bfloat16)
-    return frames._replace(images=255 * shares.astype(frames.images.dtype))
+    return frames._replace(images=255 * shares.astype(np.float32))
 
 
 def unfilmed_nan(frames: Frames) -> Frames:
     """`hostile.unfilmed`, where nothing is but NaN."""
     frames = hostile.unfilmed(frames)
-    images = jnp.where(frames.valid[..., None], frames.images, jnp.nan)
+    images = np.where(frames.valid[..., None], frames.images, np.float32(np.nan))
     return frames._replace(images=images)
 
 
 def nothing_filmed(frames: Frames) -> Frames:
     """No pixel at all, and NaN everywhere."""
     return frames._replace(
-        images=jnp.full_like(frames.images, jnp.nan),
-        valid=jnp.zeros_like(frames.valid),
+        images=np.full_like(frames.images, np.nan),
+        valid=np.zeros_like(frames.valid),
     )
 
 
 def one_exposure(frames: Frames) -> Frames:
     """All frames under one appearance id."""
-    return frames._replace(appearance=jnp.zeros_like(frames.appearance))
+    return frames._replace(appearance=np.zeros_like(frames.appearance))
 
 
 def points_at(factor: float) -> Callable[[Frames], Frames]:
@@ -106,7 +107,7 @@ def points_at(factor: float) -> Callable[[Frames], Frames]:
     def change(frames):
         if frames.points is None:
             return frames
-        return frames._replace(points=frames.points * factor)
+        return frames._replace(points=frames.points * np.float32(factor))
 
     return change
 
@@ -116,7 +117,7 @@ def no_flow(frames: Frames) -> Frames:
     if frames.flow is None:
         return frames
     seen = {
-        name: jnp.zeros_like(getattr(frames.flow, name))
+        name: np.zeros_like(getattr(frames.flow, name))
         for name in ("forward_seen", "backward_seen")
     }
     return frames._replace(flow=frames.flow._replace(**seen))
@@ -127,7 +128,9 @@ def wild_flow(frames: Frames) -> Frames:
     if frames.flow is None:
         return frames
     flow = frames.flow
-    far = {name: 1e4 * getattr(flow, name) for name in ("forward", "backward")}
+    far = {
+        name: np.float32(1e4) * getattr(flow, name) for name in ("forward", "backward")
+    }
     return frames._replace(flow=flow._replace(**far))
 
 
@@ -136,7 +139,7 @@ def denser(raw: float) -> Callable[[PyTree], PyTree]:
 
     def change(params):
         return jax.tree_util.tree_map_with_path(
-            lambda path, leaf: leaf + raw * _is_density_bias(path), params
+            lambda path, leaf: leaf + np.float32(raw * _is_density_bias(path)), params
         )
 
     return change
@@ -152,7 +155,9 @@ def bent(factor: float) -> Callable[[PyTree], PyTree]:
     def change(params):
         if "warp" not in params:
             return params
-        heads = jax.tree.map(lambda leaf: leaf * factor, params["warp"].heads)
+        heads = jax.tree.map(
+            lambda leaf: leaf * np.float32(factor), params["warp"].heads
+        )
         return params | {"warp": params["warp"]._replace(heads=heads)}
 
     return change
@@ -161,9 +166,12 @@ def bent(factor: float) -> Callable[[PyTree], PyTree]:
 def coded(deviation: float) -> Callable[[PyTree], PyTree]:
     """Codes as far apart as that."""
 
+    def normal(shape):
+        return np.random.default_rng(9).normal(size=shape).astype(np.float32)
+
     def change(params):
         tables = {
-            name: deviation * jax.random.normal(jax.random.key(9), table.shape)
+            name: np.float32(deviation) * normal(table.shape)
             for name, table in params["codes"].items()
         }
         return params | {"codes": tables}
@@ -173,7 +181,7 @@ def coded(deviation: float) -> Callable[[PyTree], PyTree]:
 
 def times(factor: float) -> Callable[[PyTree], PyTree]:
     """Every parameter so many times as large."""
-    return lambda params: jax.tree.map(lambda leaf: leaf * factor, params)
+    return lambda params: jax.tree.map(lambda leaf: leaf * np.float32(factor), params)
 
 
 BY_CODE = ("appearance",)  # codes of motion come with them in all these papers

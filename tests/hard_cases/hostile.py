@@ -1,8 +1,8 @@
 """Hostile captures, and what every run must hold to however it starts.
 
 Every change of the frames keeps their shapes, so that the program which is compiled for
-a model once serves all of them. `frames_of` gives frames that have every array which a
-change may want to fill.
+a model once serves all of them; changes are made in NumPy, which compiles nothing.
+`frames_of` gives frames that have every array which a change may want to fill.
 """
 
 import contextlib
@@ -24,16 +24,16 @@ BAD_STEP = re.compile(r"is not finite: (metric|params\.|optimiser\.|extra\.)")
 
 
 def frames_of(capture, wants=frozenset()):
-    """The training frames, with a mask; it leaves every pixel where there was none."""
-    frames = evaluate.frames_of(capture, wants)
+    """The training frames in NumPy, masked; the mask may leave every pixel."""
+    frames = jax.tree.map(np.asarray, evaluate.frames_of(capture, wants))
     if frames.valid is None:
-        frames = frames._replace(valid=jnp.ones(frames.images.shape[:3], bool))
+        frames = frames._replace(valid=np.ones(frames.images.shape[:3], bool))
     return frames
 
 
 def _filled(level):
     def change(frames):
-        return frames._replace(images=jnp.full_like(frames.images, level))
+        return frames._replace(images=np.full_like(frames.images, level))
 
     return change
 
@@ -42,7 +42,7 @@ def _first(frames, *names):
     """The given arrays (a camera counts as one) with the first row in every place."""
 
     def repeat(leaf):
-        return jnp.broadcast_to(leaf[:1], leaf.shape)
+        return np.broadcast_to(leaf[:1], leaf.shape)
 
     return frames._replace(
         **{name: jax.tree.map(repeat, getattr(frames, name)) for name in names}
@@ -61,7 +61,7 @@ def duplicated(frames):
 
 def two_views(frames):
     """The first and the last frame by turns, in place of all."""
-    rows = jnp.where(jnp.arange(len(frames.times)) % 2 == 0, 0, len(frames.times) - 1)
+    rows = np.arange(len(frames.times)) % 2 * (len(frames.times) - 1)
     beside = dict(points=None, flow=None)
     taken = jax.tree.map(lambda leaf: leaf[rows], frames._replace(**beside))
     return taken._replace(points=frames.points, flow=frames.flow)
@@ -70,7 +70,8 @@ def two_views(frames):
 def unfilmed(frames):
     """A frame without a valid pixel, and one of which the left half was not filmed."""
     half = frames.images.shape[2] // 2
-    valid = frames.valid.at[0].set(False).at[1, :, :half].set(False)
+    valid = frames.valid.copy()
+    valid[0], valid[1, :, :half] = False, False
     return frames._replace(valid=valid)
 
 
@@ -80,7 +81,7 @@ def with_depths(value):
     def change(frames):
         if frames.depths is None:
             return frames
-        return frames._replace(depths=jnp.full_like(frames.depths, value))
+        return frames._replace(depths=np.full_like(frames.depths, value))
 
     return change
 
@@ -88,10 +89,13 @@ def with_depths(value):
 def unfilmed_depth_nan(frames):
     """The left half of one frame not filmed, its depth not a number."""
     half = frames.images.shape[2] // 2
-    frames = frames._replace(valid=frames.valid.at[1, :, :half].set(False))
+    valid = frames.valid.copy()
+    valid[1, :, :half] = False
     if frames.depths is None:
-        return frames
-    return frames._replace(depths=frames.depths.at[1, :, :half].set(jnp.nan))
+        return frames._replace(valid=valid)
+    depths = frames.depths.copy()
+    depths[1, :, :half] = np.nan
+    return frames._replace(valid=valid, depths=depths)
 
 
 CAPTURES = {

@@ -51,7 +51,8 @@ def trained(name, start, folder=None, steps=tiny_fields.STEPS):
     if film.points is None:  # they are told the field's planes alone
         film = dataclasses.replace(film, points=run.capture.points)
     frames = start.frames(tiny_fields.frames_of(film, run.model.wants))
-    state = run.state._replace(params=start.params(run.state.params), extra=place)
+    params = start.params(jax.tree.map(np.asarray, run.state.params))
+    state = run.state._replace(params=params, extra=place)
     ended = hostile.train(run.model, state, frames, folder, steps=steps)
     return ended, picture_of(run, ended.result.state, frames, 0)
 
@@ -84,7 +85,9 @@ def test_a_field_that_overflows_stops_where_it_started_and_says_so(name, tmp_pat
     assert ended.result.stopped_by == "non-finite"
     assert "step 1 is not finite: metric " in ended.result.message
     assert ended.result.steps == 0
-    start = OVERFLOWING.params(tiny_fields.started(name).state.params)
+    start = OVERFLOWING.params(
+        jax.tree.map(np.asarray, tiny_fields.started(name).state.params)
+    )
     for kept, given in zip(
         jax.tree.leaves(ended.result.state.params),
         jax.tree.leaves(start),

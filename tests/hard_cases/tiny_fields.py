@@ -10,7 +10,7 @@ import functools
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
+import numpy as np
 
 from experiments import evaluate
 from nerfies_jax import presets, scene
@@ -105,13 +105,13 @@ def moved(facts: Facts, place: Place) -> Facts:
 def place_of(facts: Facts, speed: float = 1.0) -> Place:
     """As arrays."""
     numbers = (facts.near, facts.far, facts.centre, facts.scale, speed)
-    return Place(*(jnp.asarray(number, jnp.float32) for number in numbers))
+    return Place(*(np.asarray(number, np.float32) for number in numbers))
 
 
 def frames_of(capture: Capture, wants: frozenset[str]) -> Frames:
     """Frames whose pictures can hold any number, with a mask in any case."""
     frames = hostile.frames_of(capture, wants)
-    return frames._replace(images=frames.images.astype(jnp.float32))
+    return frames._replace(images=frames.images.astype(np.float32))
 
 
 @functools.cache
