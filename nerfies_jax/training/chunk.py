@@ -32,6 +32,8 @@ def _run_chunk(step, state, frames, count):
     parameters finite, and a row that never moves again. Of those rows it takes 40 ms,
     of the parameters alone 6, in a chunk of half a second.
     """
+    # Traced once for both uses: twice took 1.7 times as long to lower.
+    step = jax.jit(step, inline=True)
     _, metrics = jax.eval_shape(step, state, frames)
     accumulate = jnp.result_type(float)
     total = {name: jnp.zeros((), accumulate) for name in metrics}

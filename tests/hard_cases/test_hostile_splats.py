@@ -266,9 +266,9 @@ def test_splats_train_on_two_views_at_ten_times_the_rates(name):
     assert falls(made, frames, trained) < FALLS.get(name, 0.95)
 
 
-# What depends on the number of frames; a program of its own for each.
+# Sonata's table of time codes has one row then; shapes of the others stay as they are.
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["sonata", "moba"])
+@pytest.mark.parametrize("name", ["sonata"])
 def test_splats_train_on_two_frames_at_ten_times_the_rates(name):
     capture = scenes.tiny_capture()
     capture = dataclasses.replace(capture, train=capture.train[:2])
