@@ -38,10 +38,10 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 SHARED = pathlib.Path(__file__).resolve().parents[2] / "shared"
 
 
-# The longest files come first: workers then end together, and not half a minute apart.
-# Hostile starts come after three others: one worker compiles what they share, not all at
-# once. They are too long for one worker: what a parameter of the name given stands for
-# is compiled once, and shared by all tests that have it.
+# The longest files come first: workers then end together, not half a minute apart.
+# Hostile starts come after three others: one worker compiles what they share, not all
+# at once. They are too long for one worker: what a parameter of the name given stands
+# for is compiled once, and shared by all tests that have it.
 LONGEST = {
     "test_rotations.py": (),
     "test_splat_cases.py": (),

@@ -59,7 +59,6 @@ def met_by_numpy(row):
     return origin, along, time, *(np.array(part) for part in zip(*exact, strict=True))
 
 
-@pytest.mark.hard_cases
 @pytest.mark.parametrize("row", [0, 2, 7, 10])
 def test_cast_meets_what_numpy_meets_where_numpy_meets_it(row, dtype):
     origin, along, time, distance, thing = met_by_numpy(row)
@@ -118,7 +117,6 @@ def test_a_ray_along_a_face_or_through_nothing_gives_no_nan(dtype):
     assert np.isfinite(np.asarray(hit.material[:2])).all()
 
 
-@pytest.mark.hard_cases
 @pytest.mark.parametrize("thing", MOVING, ids=lambda i: SPEC.things[i].name)
 def test_observe_is_numpy_s_map_and_canonical_its_inverse(thing, dtype, rng):
     body = SPEC.things[thing]

@@ -80,7 +80,6 @@ def ray_and_moment(dtype):
     return ray, Moment(jnp.asarray(0.4, dtype), codes, jnp.int32(0))
 
 
-@pytest.mark.hard_cases
 def test_left_out_it_is_a_transient_of_no_density(dtype):
     params, (ray, moment) = params_of(dtype), ray_and_moment(dtype)
     coarse, left_out = tracer(TINY, ("transient",))(params, ray, moment)

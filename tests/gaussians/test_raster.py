@@ -70,7 +70,6 @@ def close(found, expected, tolerance):
         np.testing.assert_allclose(a, b, rtol=0, atol=tolerance * scale)
 
 
-@pytest.mark.hard_cases
 def test_the_capacity_never_changes_picture_or_gradient(float64, rng):
     footprints, _ = some_footprints(rng, COUNT, SIZE, "float64")
     # Three Gaussians cover every tile, 6 of them, more than a slab of 5 pairs holds.

@@ -62,7 +62,6 @@ def hat(angular):
     return np.cross(np.eye(3), angular)
 
 
-@pytest.mark.hard_cases
 def test_rigid_motions_are_inverted_to_rounding(dtype, rng):
     angular, linear = jnp.asarray(np.array(SCREWS), dtype).swapaxes(0, 1)
     points = rng.uniform(-1, 1, (len(SCREWS), 3))
@@ -83,7 +82,6 @@ def test_rigid_motions_are_inverted_to_rounding(dtype, rng):
     assert error < {"float32": 2e-6, "float64": 1e-14}[dtype]
 
 
-@pytest.mark.hard_cases
 def test_a_strongly_non_rigid_warp_is_inverted(dtype, rng):
     params = wave_params(rng, 0.95, dtype)
     points = rng.uniform(-1, 1, (256, 3)).astype(dtype)
