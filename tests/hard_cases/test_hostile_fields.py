@@ -58,9 +58,9 @@ def trained(name, start, folder=None, steps=tiny_fields.STEPS):
 
 
 def picture_of(run, state, frames, row):
-    """The view of that frame; arrays that are placed alike share one program."""
+    """The view of that frame."""
     view = jax.tree.map(lambda leaf: leaf[row], (frames.cameras, frames.times))
-    return run.picture(*jax.device_put((state, *view), jax.devices()[0]))
+    return run.picture(*hostile.on_device((state, *view)))
 
 
 @pytest.mark.parametrize(("name", "start"), RUNS)

@@ -21,7 +21,6 @@ from tests.hard_cases import hostile
 pytestmark = pytest.mark.hard_cases
 
 STEPS = 200
-DEVICE = jax.devices()[0]
 TINY = {
     "splats-static": scenes.TINY_SPLATS,
     "splats-deformable": scenes.TINY_DEFORMABLE,
@@ -84,9 +83,7 @@ def hurried(model):
     def step(state, frames):
         speed = state.extra.speed
         new, metrics = model.step(plain(state), frames)
-        params = jax.tree.map(
-            lambda old, new: old + speed * (new - old), state.params, new.params
-        )
+        params = hostile.sped_up(state.params, new.params, speed)
         return dressed(new._replace(params=params), speed), metrics
 
     def happening(event):
@@ -205,10 +202,10 @@ def run(made, start, frames, folder=None):
 
 
 def drawn(made, state, frames, row):
-    """The view of that frame; arrays that are placed alike share one program."""
+    """The view of that frame."""
     camera = jax.tree.map(lambda leaf: leaf[row], frames.cameras)
     view = View(camera, frames.times[row], frames.warp[row], frames.appearance[row])
-    return made.render(*jax.device_put((state.params, view, state.step), DEVICE))
+    return made.render(*hostile.on_device((state.params, view, state.step)))
 
 
 def falls(made, frames, trained):

@@ -46,10 +46,6 @@ def one(dtype, mean=(0, 0, 2), opacity=0.5):
     return Gaussians(*(np.asarray(x, jnp.dtype(dtype)) for x in fields))
 
 
-def on_device(tree):
-    return jax.tree.map(jnp.asarray, tree)
-
-
 def neighbours(value, dtype):
     """That number in that precision, and the next ones below and above."""
     exact = np.dtype(dtype).type(value)
@@ -228,9 +224,9 @@ def test_five_thousand_gaussians_on_a_pixel_have_the_slopes_of_float64(rng):
 def test_half_precision_gaussians_are_refused_by_name(kind):
     """Eight bits place a pixel to 1 px at 256; Adam's steps do not move such means."""
     with pytest.raises(ValueError, match=f"{kind}.*float32"):
-        projection.project(*on_device((one(kind), camera(kind))), SIZE, GSPLAT)
+        projection.project(*jax.device_put((one(kind), camera(kind))), SIZE, GSPLAT)
     shapes = (1, 2), (1, 3), (1,), (1,), (1, 2)
-    half = on_device(Footprints(*(np.ones(x, jnp.dtype(kind)) for x in shapes)))
+    half = jax.device_put(Footprints(*(np.ones(x, jnp.dtype(kind)) for x in shapes)))
     with pytest.raises(ValueError, match=f"{kind}.*float32"):
         raster.rasterise(half, half.whitening, SIZE, GSPLAT)
     with pytest.raises(ValueError, match=f"{kind}.*float32"):

@@ -135,11 +135,7 @@ def start(spec: RadianceScene, capture: Capture) -> Run:
     def step(state, frames):
         here = scene.build(spec, moved(facts, state.extra))
         new, metrics = here.step(state, frames)
-        params = jax.tree.map(
-            lambda old, new: old + state.extra.speed * (new - old),
-            state.params,
-            new.params,
-        )
+        params = hostile.sped_up(state.params, new.params, state.extra.speed)
         return new._replace(params=params), metrics
 
     view = evaluate.view_of(capture, int(capture.train[0]))
