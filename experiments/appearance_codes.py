@@ -17,7 +17,8 @@ from typing import Literal
 
 import numpy as np
 
-from experiments import settings
+from experiments import cli
+from nerfies_jax.runs import platform
 
 SHOWN = 4  # frames in the picture
 SCORED = 12  # frames with a transient in them
@@ -43,11 +44,11 @@ class AppearanceCodes:
 
 def main(arguments=None):
     """Run the job of the command line; exit code 2 where its input is wrong."""
-    asked = settings.parse(AppearanceCodes, arguments)
-    with settings.user_errors():
+    asked = cli.parse(AppearanceCodes, arguments)
+    with cli.user_errors():
         if asked.steps < 1:
             raise ValueError(f"steps={asked.steps} must be at least 1")
-        settings.start_jax(asked.device, "all")
+        platform.start_jax(asked.device, "all")
         compare = {"exposure": compare_exposure, "transient": compare_transient}
         film = filmed(asked.scene, asked.size)
         figures, picture = compare[asked.scene](film, asked.steps, asked.seed)
@@ -70,8 +71,7 @@ def filmed(scene, size):
 
 def compare_exposure(film, steps, seed):
     """PSNR of the right halves of the second camera's frames, and a picture."""
-    from experiments import evaluate, held_out_codes
-    from nerfies_jax import presets
+    from nerfies_jax import evaluation, held_out_codes, presets
     from nerfies_jax.capture import synthetic
 
     capture, _ = synthetic.make(film, seed)
@@ -82,28 +82,28 @@ def compare_exposure(film, steps, seed):
     drawn, figures = {}, {}
     for name, spec in (("without codes", plain_spec), ("with codes", coded_spec)):
         model, state, seconds = trained(spec, capture, seed)
-        renderer = evaluate.Renderer(model, capture.size)
-        drawn[name] = evaluate.score(renderer, state, capture, rows).colour
+        renderer = evaluation.Renderer(model, capture.size)
+        drawn[name] = evaluation.score(renderer, state, capture, rows).colour
         figures[f"{name}: seconds"] = seconds
         key = "without codes" if name == "without codes" else "codes of neighbours"
         figures[f"{key}: PSNR (dB)"] = _right_psnr(drawn[name], capture.images[rows])
     halves = held_out_codes.score(*model.spec, state, capture, rows)
     figures["codes fitted to the left half: PSNR (dB)"] = float(np.mean(halves.psnr))
-    shown = evaluate.spread(np.arange(len(rows)), SHOWN)
+    shown = evaluation.spread(np.arange(len(rows)), SHOWN)
     columns = {"truth": capture.images[rows], **drawn}
     return figures, _sheet(columns, shown, [capture.ids[row] for row in rows])
 
 
 def compare_transient(film, steps, seed):
     """PSNR against the scene without its transient, and a picture."""
-    from experiments import evaluate, variants
-    from nerfies_jax import presets
+    from experiments import variants
+    from nerfies_jax import evaluation, presets
     from nerfies_jax.capture import synthetic
 
     capture, truth = synthetic.make(film, seed)
     clean, _ = synthetic.make(dataclasses.replace(film, transient=None), seed)
     passed = np.flatnonzero(truth.transient.any((1, 2)))
-    rows = evaluate.spread(passed, SCORED)
+    rows = evaluation.spread(passed, SCORED)
     masks = truth.transient[rows]
     plain = dataclasses.replace(presets.SMALL_NERF, steps=steps)
     medium = dataclasses.replace(plain, transient=presets.SMALL_NERF_W.transient)
@@ -112,20 +112,20 @@ def compare_transient(film, steps, seed):
         model, state, seconds = trained(spec, capture, seed)
         left_out = () if spec.transient is None else ("transient",)
         static = variants.of_fields(*model.spec, left_out, False)
-        renderer = evaluate.Renderer(static, capture.size)
-        drawn[name] = evaluate.score(renderer, state, clean, rows).colour
-        held_out = evaluate.score(renderer, state, clean, clean.heldout)
+        renderer = evaluation.Renderer(static, capture.size)
+        drawn[name] = evaluation.score(renderer, state, clean, rows).colour
+        held_out = evaluation.score(renderer, state, clean, clean.heldout)
         figures[f"{name}: seconds"] = seconds
         for place, where in (("where it stood", masks), ("elsewhere", ~masks)):
             psnr = _psnr(drawn[name], clean.images[rows], where)
             figures[f"{name}: PSNR {place} (dB)"] = psnr
         figures[f"{name}: PSNR held out (dB)"] = float(held_out.psnr.mean())
-    whole = evaluate.Renderer(model, capture.size)
-    drawn["with the transient"] = evaluate.score(whole, state, capture, rows).colour
+    whole = evaluation.Renderer(model, capture.size)
+    drawn["with the transient"] = evaluation.score(whole, state, capture, rows).colour
     figures["transient rendered: PSNR where it stood (dB)"] = _psnr(
         drawn["with the transient"], capture.images[rows], masks
     )
-    shown = evaluate.spread(np.arange(len(rows)), SHOWN)
+    shown = evaluation.spread(np.arange(len(rows)), SHOWN)
     columns = {"filmed": capture.images[rows], "truth": clean.images[rows], **drawn}
     return figures, _sheet(columns, shown, [capture.ids[row] for row in rows])
 
@@ -134,13 +134,12 @@ def trained(spec, capture, seed):
     """(model, state, seconds) after all steps of a spec."""
     import jax
 
-    from experiments import evaluate
-    from nerfies_jax import scene
+    from nerfies_jax import evaluation, scene
     from nerfies_jax.training import loop
 
     model = scene.build(spec, scene.facts_of(capture, spec))
     state = model.init(capture, jax.random.key(seed))
-    frames = evaluate.frames_of(capture, model.wants)
+    frames = evaluation.frames_of(capture, model.wants)
     result = loop.fit(model, state, frames, steps=spec.steps)
     if result.steps < spec.steps:
         raise ValueError(f"training ended early: {result.message}")
@@ -163,7 +162,7 @@ def _right_psnr(colour, truth):
 
 def _sheet(columns, shown, ids):
     """A row for each frame shown, a column for each way to see it."""
-    from experiments import pictures
+    from nerfies_jax.evaluation import pictures
 
     cells, captions = [], []
     for row in shown:
@@ -174,8 +173,8 @@ def _sheet(columns, shown, ids):
 
 
 def _write(asked, figures, picture):
-    from experiments import pictures
     from nerfies_jax.capture.json_files import write_json
+    from nerfies_jax.evaluation import pictures
     from nerfies_jax.measure import clock
 
     folder = asked.out or pathlib.Path(f"codes_{asked.scene}")

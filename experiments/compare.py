@@ -15,7 +15,8 @@ import math
 import pathlib
 from typing import Any, Literal, NamedTuple
 
-from experiments import settings as run_settings
+from experiments import cli
+from nerfies_jax.runs import platform, representations, run_folder
 
 LARGEST_ERROR = 0.2
 SAME = ("capture", "scene", "factor", "max_side", "heldout")
@@ -37,7 +38,7 @@ COLUMNS = (
 class Compare:
     """Compare finished runs of one capture."""
 
-    runs: run_settings.Positional[tuple[pathlib.Path, ...]]
+    runs: cli.Positional[tuple[pathlib.Path, ...]]
     """Folders that experiments.reconstruct made."""
     psnr: tuple[float, ...] = ()
     """Qualities in dB to wait for (default: what the runs but the best ended with)."""
@@ -69,46 +70,47 @@ class Compared(NamedTuple):
 
 def main(arguments=None):
     """Run the job of the command line; exit code 2 where its input is wrong."""
-    with run_settings.user_errors():
-        asked = run_settings.parse(Compare, arguments)
+    with cli.user_errors():
+        asked = cli.parse(Compare, arguments)
         compared = read(asked.runs)
-        folder = run_settings.new_run_folder(asked.out, "compare")
+        folder = run_folder.new_run_folder(asked.out, "compare")
         goals = asked.psnr or default_goals(compared)
     print(table(compared, goals))
     for line in remarks(compared):
         print(line)
     save(folder, compared, goals)
     if asked.frames:
-        presets = [run_settings.stored_preset(each.folder) for each in compared]
-        threads = {run_settings.threads_for(preset) for preset in presets}
-        with run_settings.user_errors():
-            run_settings.start_jax(asked.device, "all" if "all" in threads else "one")
+        kinds = [representations.of_run(each.folder) for each in compared]
+        threads = {kind.threads for kind in kinds if kind is not None}
+        with cli.user_errors():
+            platform.start_jax(asked.device, "all" if "all" in threads else "one")
             draw(folder / "pictures.png", compared, asked.frames)
     print(f"saved in {folder}")
 
 
 def read(folders) -> list[Compared]:
     """Runs of one capture; ValueErrors name the run and what is wrong with it."""
-    from experiments import curves
+    from nerfies_jax.runs import curves
 
-    compared, choices = [], []
+    compared, sources = [], []
     for folder, name in zip(folders, _names(folders), strict=True):
         curve = curves.read(folder)
         try:
             metrics = json.loads((folder / "metrics.json").read_text())
-            stored = json.loads((folder / run_settings.CONFIG).read_text())["choices"]
-        except (OSError, ValueError, KeyError) as error:
+            config = json.loads((folder / run_folder.CONFIG).read_text())["config"]
+            source = config["source"]
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"{folder}: not a finished run ({error!r})") from error
         compared.append(Compared(name, folder, metrics, curve))
-        same = {key: stored.get(key) for key in SAME}
-        if stored.get("capture") is None:  # a built-in scene is made from the seed
-            same["seed"] = stored.get("seed")
-        choices.append(same)
-        for key, value in choices[0].items():
-            if choices[-1].get(key) != value:
+        same = {key: source.get(key) for key in SAME}
+        if source.get("capture") is None:  # a built-in scene is made from the seed
+            same["seed"] = config.get("seed")
+        sources.append(same)
+        for key, value in sources[0].items():
+            if sources[-1].get(key) != value:
                 raise ValueError(
                     f"{folder} and {folders[0]} did not learn the same frames: {key} "
-                    f"is {choices[-1].get(key)} and {value}; compare runs of one "
+                    f"is {sources[-1].get(key)} and {value}; compare runs of one "
                     "capture"
                 )
     return compared
@@ -133,7 +135,7 @@ def default_goals(compared) -> tuple[float, ...]:
 
 def times(compared, goals) -> list[list[float | None]]:
     """[runs][goals] seconds of training to each PSNR; None where not reached."""
-    from experiments import curves
+    from nerfies_jax.runs import curves
 
     return [[curves.seconds_to(run.curve, goal) for goal in goals] for run in compared]
 
@@ -192,8 +194,8 @@ def remarks(compared) -> list[str]:
 
 def save(folder: pathlib.Path, compared, goals) -> None:
     """compare.json and curves.png."""
-    from experiments import pictures
     from nerfies_jax.capture.json_files import write_json
+    from nerfies_jax.evaluation import pictures
 
     reached = times(compared, goals)
     write_json(
@@ -218,21 +220,22 @@ def save(folder: pathlib.Path, compared, goals) -> None:
 
 def draw(path: pathlib.Path, compared, count: int) -> None:
     """Held-out frames: the truth and every run's picture, below them the errors."""
-    from experiments import evaluate, pictures, runs
+    from nerfies_jax import evaluation, runs
+    from nerfies_jax.evaluation import pictures
 
     scored = []
     for each in compared:
         run = runs.saved_run(each.folder)
         state = runs.restore(each.folder, run).state
-        rows = evaluate.spread(run.capture.heldout, count)
-        renderer = evaluate.Renderer(run.model, run.capture.size)
-        scored.append(evaluate.score(renderer, state, run.capture, rows))
+        rows = evaluation.spread(run.capture.heldout, count)
+        renderer = evaluation.Renderer(run.model, run.capture.size)
+        scored.append(evaluation.score(renderer, state, run.capture, rows))
         capture = run.capture
     panels, captions = [], []
     for place, row in enumerate(scored[0].rows):
         truth = capture.images[row]
         filmed = None if capture.valid is None else capture.valid[row][..., None]
-        drawn = [evaluate.as_picture(each.colour[place]) for each in scored]
+        drawn = [evaluation.as_picture(each.colour[place]) for each in scored]
         if filmed is not None:  # what was not filmed is no error
             truth, drawn = truth * filmed, [picture * filmed for picture in drawn]
         errors = [pictures.colour_error(x, truth, LARGEST_ERROR).picture for x in drawn]

@@ -12,7 +12,8 @@ evenly, each standing for its own weight: what drawing by weight saves.
 import dataclasses
 import pathlib
 
-from experiments import settings as run_settings
+from experiments import cli
+from nerfies_jax.runs import platform
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,8 +38,8 @@ class ElasticPoints:
 
 def main(arguments=None):
     """Run the job of the command line; exit code 2 where its input is wrong."""
-    with run_settings.user_errors():
-        asked = run_settings.parse(ElasticPoints, arguments)
+    with cli.user_errors():
+        asked = cli.parse(ElasticPoints, arguments)
         for name in ("rays", "samples", "draws", "repeats"):
             if getattr(asked, name) < 1:
                 raise ValueError(f"--{name} {getattr(asked, name)} must be at least 1")
@@ -48,7 +49,7 @@ def main(arguments=None):
                 f"--points {wrong[0]} must be in 1 .. {asked.samples - 1}: a ray has "
                 f"{asked.samples} samples"
             )
-        run_settings.start_jax(asked.device, "all")
+        platform.start_jax(asked.device, "all")
     figures = estimator_table(asked)
     print(table(figures))
     if asked.out is not None:

@@ -26,11 +26,12 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from experiments import settings as run_settings
+from experiments import cli
 from gaussians_jax.effects import spectral
 from gaussians_jax.effects.spectral import FourierSpec, SpectralSpec, WaveletSpec
 from nerfies_jax.nets import encoding, mlp
-from nerfies_jax.training import losses
+from nerfies_jax.runs import platform
+from nerfies_jax.training import losses, specs
 
 REWARD = 0.01  # of "log", for each gate's log sigma; as in the loss, in units of L1
 WARNINGS = ("ascent", "log")
@@ -321,11 +322,11 @@ def draw_figure(fitted: dict[Arm, Fitted], path: pathlib.Path) -> None:
 
 def main(arguments=None):
     """Run the job of the command line; exit code 2 where its input is wrong."""
-    with run_settings.user_errors():
-        asked = run_settings.parse(FrequencyGates, arguments)
+    with cli.user_errors():
+        asked = cli.parse(FrequencyGates, arguments)
         if asked.out is not None:
             asked.out.mkdir(parents=True, exist_ok=True)
-        run_settings.start_jax(asked.device)
+        platform.start_jax(asked.device)
     fitted = {}
     for arm in arms(asked):
         fitted[arm] = fit(arm, asked)
@@ -340,7 +341,7 @@ def main(arguments=None):
         from nerfies_jax.measure import clock
 
         record = {
-            "settings": run_settings.as_json(asked),
+            "settings": specs.as_json(asked),
             "machine": clock.machine(),
             "rows": rows,
             "said": said(rows).split("\n"),

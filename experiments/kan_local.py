@@ -12,7 +12,8 @@ value and slopes, both forms in turn.
 import dataclasses
 import pathlib
 
-from experiments import settings as run_settings
+from experiments import cli
+from nerfies_jax.runs import platform
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,9 +47,9 @@ class KanLocal:
 
 def main(arguments=None):
     """Run the job of the command line; exit code 2 where its input is wrong."""
-    with run_settings.user_errors():
-        asked = run_settings.parse(KanLocal, arguments)
-        run_settings.start_jax(asked.device, "one")
+    with cli.user_errors():
+        asked = cli.parse(KanLocal, arguments)
+        platform.start_jax(asked.device, "one")
     figures = measured(asked)
     print(table(figures))
     if asked.out is not None:

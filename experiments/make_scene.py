@@ -7,7 +7,9 @@ import dataclasses
 import pathlib
 from typing import Literal
 
-from experiments import settings
+from experiments import cli
+from nerfies_jax.runs import platform
+from nerfies_jax.training import specs
 
 Preset = Literal[
     "default",
@@ -29,7 +31,7 @@ class MakeScene:
     `truth.npz` beside it holds flow, point tracks, thing ids and transient masks.
     """
 
-    out: settings.Positional[pathlib.Path]
+    out: cli.Positional[pathlib.Path]
     """Folder to write; must not hold anything yet."""
     preset: Preset = "default"
     """Which scene."""
@@ -47,15 +49,15 @@ class MakeScene:
 
 def main(arguments=None):
     """Parse, film, write, and say where it is."""
-    asked = settings.parse(MakeScene, arguments)
-    with settings.user_errors():
-        settings.start_jax(asked.device)
+    asked = cli.parse(MakeScene, arguments)
+    with cli.user_errors():
+        platform.start_jax(asked.device)
         from nerfies_jax.capture import synthetic
 
         given = {"frames": asked.frames, "size": asked.size}
         given = {name: value for name, value in given.items() if value is not None}
         spec = dataclasses.replace(synthetic.PRESETS[asked.preset], **given)
-        spec = settings.override(spec, asked.set)
+        spec = specs.override(spec, asked.set)
         synthetic.write(spec, asked.out, asked.seed)
     width, height = spec.size
     print(

@@ -13,7 +13,8 @@ machine may be shared.
 import dataclasses
 import pathlib
 
-from experiments import settings as run_settings
+from experiments import cli
+from nerfies_jax.runs import platform
 
 RAYS = 256
 # CPU seconds over those of the warp, GFLOP, temporaries (MiB) and seconds of compiling
@@ -45,9 +46,9 @@ class NerfSpeed:
 
 def main(arguments=None):
     """Run the job of the command line; exit code 2 where its input is wrong."""
-    with run_settings.user_errors():
-        asked = run_settings.parse(NerfSpeed, arguments)
-        run_settings.start_jax(asked.device, "all")
+    with cli.user_errors():
+        asked = cli.parse(NerfSpeed, arguments)
+        platform.start_jax(asked.device, "all")
         unknown = set(asked.rows) - set(specs())
         if unknown:
             raise ValueError(f"--rows {min(unknown)!r}: there are {', '.join(specs())}")
@@ -101,13 +102,12 @@ def measured(rows: tuple[str, ...], repeats: int) -> dict[str, dict[str, float]]
     """Processor and wall seconds, flops, temporaries and compile time of each row."""
     import jax
 
-    from experiments import evaluate
-    from nerfies_jax import scene
+    from nerfies_jax import evaluation, scene
     from nerfies_jax.capture import synthetic
     from nerfies_jax.measure import clock
 
     capture = synthetic.cached(
-        synthetic.PRESETS["default"], run_settings.CACHE / "scenes", 0
+        synthetic.PRESETS["default"], platform.CACHE / "scenes", 0
     )[0]
     # A program from the cache would not show what compiling it takes.
     jax.config.update("jax_enable_compilation_cache", False)
@@ -116,7 +116,7 @@ def measured(rows: tuple[str, ...], repeats: int) -> dict[str, dict[str, float]]
         spec = specs()[name]
         model = scene.build(spec, scene.facts_of(capture, spec))
         state = model.init(capture, jax.random.key(0))
-        frames = evaluate.frames_of(capture, model.wants)
+        frames = evaluation.frames_of(capture, model.wants)
         cost = clock.cost(model.step, state, frames)
         figures[name] = {
             "gflop": cost.flops / 1e9,

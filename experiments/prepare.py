@@ -12,7 +12,7 @@ import zipfile
 
 import numpy as np
 
-from experiments import settings
+from experiments import cli
 
 SAME_POSE = 1e-6  # of matrix entries; a camera on a tripod repeats its matrix exactly
 TRIPOD_ROWS = 5  # fewer rows of one pose are no validation sweep
@@ -27,9 +27,9 @@ class Npz:
     the rows before them are learnt from and the rows after them are left out.
     """
 
-    file: settings.Positional[pathlib.Path]
+    file: cli.Positional[pathlib.Path]
     """The archive."""
-    out: settings.Positional[pathlib.Path]
+    out: cli.Positional[pathlib.Path]
     """Folder to write; must not hold anything yet."""
     heldout: str | None = None
     """Rows to score on, as first:last+1."""
@@ -41,9 +41,9 @@ class Npz:
 class Video:
     """A film: its sharpest frames, their cameras by COLMAP, as a Nerfies directory."""
 
-    file: settings.Positional[pathlib.Path]
+    file: cli.Positional[pathlib.Path]
     """The film."""
-    out: settings.Positional[pathlib.Path]
+    out: cli.Positional[pathlib.Path]
     """Folder to write; must not hold anything yet."""
     frames: int = 100
     """How many frames to keep, evenly spread over the film."""
@@ -55,9 +55,9 @@ class Video:
 class Pictures:
     """A folder of pictures: cameras by COLMAP, as a Nerfies directory."""
 
-    folder: settings.Positional[pathlib.Path]
+    folder: cli.Positional[pathlib.Path]
     """The pictures, in the order of their names."""
-    out: settings.Positional[pathlib.Path]
+    out: cli.Positional[pathlib.Path]
     """Folder to write; must not hold anything yet."""
     masks: pathlib.Path | None = None
     """Folder with NAME.png for every picture NAME; black: moves by itself."""
@@ -65,8 +65,8 @@ class Pictures:
 
 def main(arguments=None):
     """Parse, convert, and say what came out."""
-    asked = settings.parse(Npz | Video | Pictures, arguments)
-    with settings.user_errors():
+    asked = cli.parse(Npz | Video | Pictures, arguments)
+    with cli.user_errors():
         for line in CONVERTERS[type(asked)](asked):
             print(line)
     print(f"next: python -m experiments.reconstruct {asked.out}")

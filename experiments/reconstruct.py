@@ -12,7 +12,9 @@ import sys
 import time
 from typing import Literal
 
-from experiments import settings as run_settings
+from experiments import cli
+from nerfies_jax.runs import platform, representations, run_folder
+from nerfies_jax.runs.config import RunConfig
 
 DEFAULT_PRESET = "splats-deformable-small"
 EVALUATED = 4  # held-out frames in the curve; all of them are scored at the end
@@ -22,8 +24,7 @@ EVALUATED = 4  # held-out frames in the curve; all of them are scored at the end
 class Reconstruct:
     """Reconstruct a filmed, moving scene; without a capture, the built-in one."""
 
-    capture: run_settings.Positional[pathlib.Path | None] = None
-    """Folder in Nerfies, HyperNeRF, Blender, D-NeRF or COLMAP layout."""
+    source: cli.Source = cli.NamedSource()
     preset: str | None = None
     """Gaussian splats: splats-static, splats-deformable, sonata, moba. Radiance fields:
     nerf, nerf-w, d-nerf, t-nerf, nerfies, hypernerf, nsff. Each with -small is made for
@@ -31,8 +32,6 @@ class Reconstruct:
     effects: Literal["preset", "auto"] = "preset"
     """auto: look at the capture first and take the effects that it calls for, in the
     representation and size of the preset (see experiments.inspect_scene)."""
-    scene: str = "default"
-    """Which built-in scene, where no capture is given."""
     steps: int | None = None
     """Steps of training; schedules stretch with them."""
     seconds: float | None = None
@@ -45,12 +44,6 @@ class Reconstruct:
     """Where to compute."""
     seed: int = 0
     """Of everything random."""
-    factor: int | None = None
-    """Read the pictures at 1/FACTOR of their size."""
-    max_side: int | None = None
-    """Read the pictures with no side longer than this, in pixels."""
-    heldout: str | None = None
-    """Which frames to score: n for every n-th, or the name of a split."""
     set: tuple[str, ...] = ()
     """Fields of the preset, as density.most=20000 motion.width=128 warp=none."""
     evaluate_every: float = 20.0
@@ -63,7 +56,7 @@ def main(arguments=None):
     Exit code 1 where training blew up, 2 where the input is wrong.
     """
     try:
-        _main(run_settings.parse(Reconstruct, arguments))
+        _main(cli.parse(Reconstruct, arguments))
     except KeyboardInterrupt:
         # While it trains, the loop takes the signal itself, saves and says so.
         print("interrupted while no step was running", file=sys.stderr)
@@ -71,9 +64,9 @@ def main(arguments=None):
 
 
 def _main(asked):
-    with run_settings.user_errors():
-        run_settings.start_jax(asked.device, run_settings.threads_for(_preset(asked)))
-        from experiments import runs
+    with cli.user_errors():
+        platform.start_jax(asked.device, _threads(asked))
+        from nerfies_jax import runs
         from nerfies_jax.capture.capture import describe
 
         began = time.perf_counter()
@@ -81,11 +74,11 @@ def _main(asked):
         for line in describe(run.capture):
             print(line)
         folder, state, history, after = _start(asked, run, runs)
-    from experiments import training
+    from nerfies_jax.runs import train
 
-    with run_settings.user_errors():
-        checkpoints = training.open_checkpoints(folder, run, after)
-    outcome = training.train(
+    with cli.user_errors():
+        checkpoints = train.open_checkpoints(folder, run, after)
+    outcome = train.train(
         run,
         state,
         history,
@@ -97,7 +90,7 @@ def _main(asked):
     if outcome.result.stopped_by in ("SIGINT", "SIGTERM"):
         print(f"continue with: {_command(folder)}")
         raise SystemExit(128 + (2 if outcome.result.stopped_by == "SIGINT" else 15))
-    from experiments import products
+    from nerfies_jax.runs import products
 
     errors = []
     try:
@@ -107,17 +100,22 @@ def _main(asked):
     if outcome.result.stopped_by == "non-finite":
         errors.append(
             f"{outcome.result.message}; start anew with lower learning rates "
-            f"(--set, their names are in {folder / run_settings.CONFIG})"
+            f"(--set, their names are in {folder / run_folder.CONFIG})"
         )
     for line in errors:
         print(f"error: {line}", file=sys.stderr)
     raise SystemExit(1 if errors else 0)
 
 
-def _preset(asked):
-    """The preset that the run has, or will have."""
+def _threads(asked):
+    """How many cores the representation wants XLA to see."""
+    found = None
     if asked.resume and asked.out is not None:
-        return run_settings.stored_preset(asked.out)
+        found = representations.of_run(asked.out)
+    return (found or representations.of_preset(_preset(asked))).threads
+
+
+def _preset(asked):
     return asked.preset or DEFAULT_PRESET
 
 
@@ -131,27 +129,24 @@ def _resumed(asked, runs):
 
 def _new(asked, runs):
     """The run that the command line asks for."""
-    choices = runs.Choices(
-        capture=None if asked.capture is None else str(asked.capture.absolute()),
-        scene=asked.scene,
-        preset=asked.preset or DEFAULT_PRESET,
+    config = RunConfig(
+        preset=_preset(asked),
+        source=cli.plain(asked.source),
         steps=asked.steps,
         overrides=asked.set,
-        factor=asked.factor,
-        max_side=asked.max_side,
-        heldout=asked.heldout,
         seed=asked.seed,
     )
     stored = None
     if asked.effects == "auto":
-        from experiments import inspect_advice, inspect_job
+        from nerfies_jax.evidence import inspection
+        from nerfies_jax.runs import adviser
 
-        runs.scene_spec(choices)  # refuses a wrong preset before half a minute's look
-        stored = runs.stored_capture(choices)
-        found = inspect_job.inspect(stored)
-        choices, lines = inspect_advice.follow(choices, found.findings)
+        runs.scene_spec(config)  # refuses a wrong preset before half a minute's look
+        stored = runs.stored_capture(config.source, config.seed)
+        found = inspection.inspect(stored)
+        config, lines = adviser.follow(config, found.findings)
         print("\n".join(lines))
-    return runs.new_run(choices, stored)
+    return runs.new_run(config, stored)
 
 
 def _start(asked, run, runs):
@@ -160,9 +155,9 @@ def _start(asked, run, runs):
         restored = runs.restore(asked.out, run)
         return asked.out, restored.state, restored.record, restored.step
     state = runs.first_state(run)
-    stem = "-".join(run.capture.name.split()) + "-" + run.choices.preset
-    folder = run_settings.new_run_folder(asked.out, stem)
-    runs.save_choices(folder, run)
+    stem = "-".join(run.capture.name.split()) + "-" + run.config.preset
+    folder = run_folder.new_run_folder(asked.out, stem)
+    runs.save_config(folder, run)
     return folder, state, None, None
 
 

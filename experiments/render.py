@@ -18,7 +18,8 @@ from typing import Literal
 
 import numpy as np
 
-from experiments import settings as run_settings
+from experiments import cli
+from nerfies_jax.runs import platform, representations
 
 RATE = 24.0  # frames per second of the films
 
@@ -27,7 +28,7 @@ RATE = 24.0  # frames per second of the films
 class Render:
     """Render a finished run, as PNG, mp4 and EXR."""
 
-    run: run_settings.Positional[pathlib.Path]
+    run: cli.Positional[pathlib.Path]
     """Run folder that experiments.reconstruct made."""
     path: Literal["heldout", "sway", "orbit", "captured"] = "heldout"
     """Held-out frames, or a camera moving within the filmed span, in a circle, or as it
@@ -90,11 +91,11 @@ class Render:
 
 def main(arguments=None):
     """Run the job of the command line; exit code 2 where its input is wrong."""
-    with run_settings.user_errors():
-        asked = run_settings.parse(Render, arguments)
-        threads = run_settings.threads_for(run_settings.stored_preset(asked.run))
-        run_settings.start_jax(asked.device, threads)
-        from experiments import evaluate, runs
+    with cli.user_errors():
+        asked = cli.parse(Render, arguments)
+        found = representations.of_run(asked.run)
+        platform.start_jax(asked.device, "all" if found is None else found.threads)
+        from nerfies_jax import evaluation, runs
 
         run = runs.saved_run(asked.run)
         state = _shown(asked, run.model, runs.restore(asked.run, run).state)
@@ -104,7 +105,7 @@ def main(arguments=None):
         views = _seen(asked, run, size, views)
         out = asked.out or asked.run / "renders" / _name(asked)
         out.mkdir(parents=True, exist_ok=True)
-    _write(asked, out, evaluate.Renderer(model, size), state, names, views)
+    _write(asked, out, evaluation.Renderer(model, size), state, names, views)
 
 
 def _name(asked):
@@ -135,7 +136,7 @@ def _shown(asked, model, state):
     """The state without what is hidden in all pictures."""
     if asked.hide_moving is None:
         return state
-    from experiments import variants
+    from gaussians_jax import variants
 
     state, summary = variants.without_moving(model, state, asked.hide_moving)
     print(summary)
@@ -144,7 +145,7 @@ def _shown(asked, model, state):
 
 def _faster(asked, model, state):
     """The model and its state, the motion from a table or of what moves alone."""
-    from experiments import variants
+    from gaussians_jax import variants
 
     still_below = 0.0 if asked.still_below is None else asked.still_below
     if asked.knots is not None:
@@ -163,10 +164,10 @@ def _seen(asked, run, size, views):
     """Views of the size asked for, each with its share of the two appearances."""
     import jax.numpy as jnp
 
-    from experiments import evaluate, variants
+    from nerfies_jax import evaluation, variants
     from nerfies_jax.training.model import in_default_precision
 
-    views = [evaluate.resized(view, run.capture.size, size) for view in views]
+    views = [evaluation.resized(view, run.capture.size, size) for view in views]
     if asked.appearance is None:
         return views
     start, end = (
@@ -184,11 +185,12 @@ def _seen(asked, run, size, views):
 
 def _views(asked, run):
     """Names and views of all pictures."""
-    from experiments import camera_paths, evaluate
+    from nerfies_jax import evaluation
+    from nerfies_jax.capture import camera_paths
 
     if asked.path == "heldout":
         rows = run.capture.heldout
-        views = [evaluate.view_of(run.capture, row) for row in rows]
+        views = [evaluation.view_of(run.capture, row) for row in rows]
         names = [pathlib.PurePath(run.capture.ids[row]).name for row in rows]
         if asked.freeze is not None:
             time = views[0].time.dtype.type(asked.freeze)
@@ -199,9 +201,9 @@ def _views(asked, run):
         times = camera_paths.times(asked.frames, loops=1 / asked.slow)
     else:
         times = np.full(asked.frames, asked.freeze, np.float32)
-    like = evaluate.view_of(run.capture, int(run.capture.train[0]))
+    like = evaluation.view_of(run.capture, int(run.capture.train[0]))
     names = [f"{number:04d}" for number in range(asked.frames)]
-    return names, evaluate.path_views(path, times, like)
+    return names, evaluation.path_views(path, times, like)
 
 
 def _write(asked, out, renderer, state, names, views):
@@ -244,10 +246,11 @@ class _Pictures:
         self.show, self.limits = show, None
 
     def __call__(self, rendering):
-        from experiments import evaluate, pictures
+        from nerfies_jax import evaluation
+        from nerfies_jax.evaluation import pictures
 
         if self.show == "colour":
-            return evaluate.as_picture(rendering.colour)
+            return evaluation.as_picture(rendering.colour)
         known = rendering.alpha > 0.5
         coloured = pictures.colour_depth(rendering.depth, known, self.limits)
         if known.any():

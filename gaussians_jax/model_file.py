@@ -11,13 +11,9 @@ back as what they were, so that a file is enough to draw a frame:
     rendering = model.render(params, view, (width, height), step)
 
 with `gaussians_jax.scene` and a `View` (nerfies_jax.training.model) from wherever the
-picture is to be taken. Nothing in a file is executed: names in it can only call up
-settings and records of `gaussians_jax` and `nerfies_jax`.
+picture is to be taken. Nothing in a file is executed (`nerfies_jax.training.specs`).
 """
 
-import contextlib
-import dataclasses
-import importlib
 import io
 import json
 import os
@@ -33,12 +29,11 @@ import numpy as np
 from gaussians_jax import splats
 from gaussians_jax.splats import Params
 from nerfies_jax.capture.json_files import replaced_file
-from nerfies_jax.training import settings_text
+from nerfies_jax.training import specs
 
 FORMAT = "gaussians_jax model"
-VERSION = 1
+VERSION = 2
 ABOUT = "about.json"  # the archive's member with the text
-PACKAGES = ("gaussians_jax", "nerfies_jax")  # whose types a file may name
 PyTree = Any
 
 
@@ -55,7 +50,7 @@ def save(path: str | os.PathLike, params: Params, description: dict[str, Any]) -
     arrays: dict[str, np.ndarray] = {}
     try:
         structure = _taken_apart(params._replace(rows=rows), "params", arrays)
-        described = settings_text.describe(description)
+        described = specs.as_json(description)
     except ValueError as error:
         raise ValueError(f"{path}: {error}; not written") from error
     about = {
@@ -85,7 +80,7 @@ def load(path: str | os.PathLike) -> tuple[Params, dict[str, Any]]:
         with zipfile.ZipFile(path) as archive:
             about = _about(archive)
             params = _put_together(about["params"], archive)
-        description = _rebuilt(about["description"])
+        description = specs.from_json(about["description"])
         _check(params)
     except zipfile.BadZipFile as error:
         raise ValueError(
@@ -164,7 +159,7 @@ def _taken_apart(tree, name, arrays):
             key: _taken_apart(item, f"{name}.{key}", arrays)
             for key, item in tree._asdict().items()
         }
-        return {"record": _name(type(tree)), "fields": fields}
+        return {"record": specs.type_name(type(tree)), "fields": fields}
     if isinstance(tree, tuple | list):
         items = [_taken_apart(x, f"{name}.{i}", arrays) for i, x in enumerate(tree)]
         return {"tuple": items}
@@ -189,55 +184,8 @@ def _put_together(structure, archive):
         return {key: _put_together(item, archive) for key, item in items}
     if "tuple" in structure:
         return tuple(_put_together(item, archive) for item in structure["tuple"])
-    record = _type(structure["record"])
+    record = specs.type_named(structure["record"])
     fields = {
         key: _put_together(item, archive) for key, item in structure["fields"].items()
     }
-    return _made(record, fields)
-
-
-# Settings ---------------------------------------------------------------------------
-
-
-def _rebuilt(value):
-    """What `settings_text.describe` wrote as text, as the values it was made of."""
-    if isinstance(value, list):
-        return tuple(_rebuilt(item) for item in value)
-    if not isinstance(value, dict):
-        return value
-    fields = {key: _rebuilt(item) for key, item in value.items() if key != "type"}
-    if "type" not in value:
-        return fields
-    return _made(_type(value["type"]), fields)
-
-
-def _made(kind, fields):
-    try:
-        return kind(**fields)
-    except TypeError as error:
-        raise ValueError(
-            f"its {kind.__name__} is of another version of the program ({error})"
-        ) from error
-
-
-def _name(kind):
-    return f"{kind.__module__}.{kind.__qualname__}"
-
-
-def _type(name):
-    """A NamedTuple or a frozen dataclass of `PACKAGES`, by its full name."""
-    module, _, attribute = str(name).rpartition(".")
-    kind = None
-    if module.split(".")[0] in PACKAGES:
-        with contextlib.suppress(ImportError):
-            kind = getattr(importlib.import_module(module), attribute, None)
-    is_record = isinstance(kind, type) and (
-        dataclasses.is_dataclass(kind)
-        or (issubclass(kind, tuple) and hasattr(kind, "_fields"))
-    )
-    if not is_record:
-        raise ValueError(
-            f"it names {name!r}, which is no record or setting of this version of "
-            f"{' and '.join(PACKAGES)}"
-        )
-    return kind
+    return specs.made(record, fields)

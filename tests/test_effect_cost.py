@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import evaluate
 from gaussians_jax import presets as splat_presets
 from gaussians_jax import scene as splat_scene
+from nerfies_jax import evaluation
 from nerfies_jax import presets as field_presets
 from nerfies_jax import scene as field_scene
 from nerfies_jax import spec as field_spec
@@ -47,7 +47,7 @@ class Started:
         self.capture = scenes.tiny_capture()
         self.spec, self.facts = spec, facts_of(self.capture)
         self.model = build(spec, self.facts)
-        self.frames = evaluate.frames_of(self.capture, self.model.wants)
+        self.frames = evaluation.frames_of(self.capture, self.model.wants)
 
     def init(self, key):
         return self.model.init(self.capture, key)
@@ -270,7 +270,7 @@ def test_what_stays_starts_from_the_numbers_it_had(preset, part):
 )
 def test_a_picture_without_effects_asks_none(start, spec):
     run = start(spec)
-    view = evaluate.view_of(run.capture, 0)
+    view = evaluation.view_of(run.capture, 0)
     modules = hand_made_effects.absent_modules(spec)
     assert len(modules) == 8
 

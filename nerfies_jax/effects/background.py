@@ -39,7 +39,7 @@ class BackgroundSpec:
             value = getattr(self, name)
             if not 0 <= value < float("inf"):
                 raise ValueError(f"{name}={value} must be finite and not negative")
-        losses.geman_mcclure(jnp.zeros(()), self.width, self.scaling)  # refuses wrong
+        losses.check_geman_mcclure(self.width, self.scaling)
 
 
 def effect(spec: BackgroundSpec) -> Effect:

@@ -56,7 +56,7 @@ class ElasticSpec:
                 raise ValueError(f"{name}={value} must be finite and not negative")
         schedule(self)  # refuses impossible steps
         if self.robust_width is not None:  # refuses wrong widths and scalings
-            losses.geman_mcclure(jnp.zeros(()), self.robust_width, self.scaling)
+            losses.check_geman_mcclure(self.robust_width, self.scaling)
 
 
 def schedule(spec: ElasticSpec) -> schedules.Schedule | float:

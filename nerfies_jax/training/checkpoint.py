@@ -16,7 +16,7 @@ import ml_dtypes  # noqa: F401  (NumPy's names for bfloat16 and its kin)
 import numpy as np
 import orbax.checkpoint as ocp
 
-from nerfies_jax.training.settings_text import describe, differences
+from nerfies_jax.training.specs import as_json, differences
 
 PyTree = Any
 
@@ -46,7 +46,7 @@ class Checkpoints:
         if keep < 1:
             raise ValueError(f"at least one checkpoint must be kept, got keep={keep}")
         self.folder = pathlib.Path(folder).absolute()
-        self._about = {"format": FORMAT, "spec": describe(spec), **provenance()}
+        self._about = {"format": FORMAT, "spec": as_json(spec), **provenance()}
         _check_writable(self.folder)
         present = steps(self.folder)
         if after is None and present:
@@ -147,7 +147,7 @@ def restore(folder, example: PyTree, spec, *, step: int | None = None) -> Restor
                 raise ValueError(f"{message}; none that is older is left") from error
             warnings.warn(f"{message}; trying the one before", RuntimeWarning, 2)
             continue
-        changed = differences(about["spec"], describe(spec))
+        changed = differences(about["spec"], as_json(spec))
         if changed:
             raise ValueError(
                 f"checkpoint {folder / str(candidate)} was made with other settings: "

@@ -108,13 +108,18 @@ def geman_mcclure(
     with `width`, so that its elastic weight acts as 0.03 of what it says and the
     background weight as 0.001: `scaling="official"`.
     """
+    check_geman_mcclure(width, scaling)
+    factor = 2.0 if scaling == "paper" else 2.0 * width
+    return factor * _saturating(residual_sq / (4 * width**2))
+
+
+def check_geman_mcclure(width: float, scaling: str) -> None:
+    """Raise ValueError for settings that `geman_mcclure` cannot have; no JAX."""
     _positive(width)
     if scaling not in ("paper", "official"):
         raise ValueError(
             f"Geman-McClure scaling is 'paper' or 'official', got {scaling!r}"
         )
-    factor = 2.0 if scaling == "paper" else 2.0 * width
-    return factor * _saturating(residual_sq / (4 * width**2))
 
 
 @jax.custom_jvp

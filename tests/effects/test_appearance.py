@@ -8,8 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import evaluate
-from nerfies_jax import presets, scene
+from nerfies_jax import evaluation, presets, scene
 from nerfies_jax.effects import appearance
 from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.effects.effect import APPEARANCE, Moment, Table
@@ -148,7 +147,7 @@ def test_codes_of_every_preset_learn(name):
     capture = scenes.tiny_capture()
     facts = scene.facts_of(capture, spec)
     made = scene.field(spec, facts)
-    frames = evaluate.frames_of(capture, scene.build(spec, facts).wants)
+    frames = evaluation.frames_of(capture, scene.build(spec, facts).wants)
     params = made.init(jax.random.key(0))
     keys = jax.random.split(jax.random.key(1))
     batch = scene.draw_batch(frames, spec.rays, keys[0])

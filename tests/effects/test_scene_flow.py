@@ -8,8 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import evaluate
-from nerfies_jax import scene
+from nerfies_jax import evaluation, scene
 from nerfies_jax.effects import scene_flow
 from nerfies_jax.effects.effect import Moment, Sample
 from nerfies_jax.effects.scene_flow import FlowWeights, SceneFlowSpec
@@ -352,7 +351,7 @@ def test_a_scene_with_it_learns_from_pictures_depth_and_flow():
     model = scene.build(spec, facts)
     assert model.wants == {"depths", "flow"}
     state = model.init(capture, jax.random.key(0))
-    frames = evaluate.frames_of(capture, model.wants)
+    frames = evaluation.frames_of(capture, model.wants)
     first, step, losses = state.params, jax.jit(model.step), []
     for _ in range(30):
         state, metrics = step(state, frames)
@@ -366,7 +365,7 @@ def test_a_scene_with_it_learns_from_pictures_depth_and_flow():
     both, still = (
         scene.field(spec, facts, without) for without in ((), ("scene_flow",))
     )
-    view = evaluate.view_of(capture, 0)
+    view = evaluation.view_of(capture, 0)
     pictures = [
         jax.jit(one.render, static_argnums=4)(
             state.params, view.camera, view.time, {}, (8, 6), state.step

@@ -8,8 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import evaluate
-from nerfies_jax import scene
+from nerfies_jax import evaluation, scene
 from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.effects.effect import Moment
 from nerfies_jax.effects.transient import TransientSpec
@@ -147,7 +146,7 @@ def test_a_step_trains_the_transient_its_codes_and_the_trunk():
     capture = scenes.tiny_capture()
     model = scene.build(TINY, facts())
     state = model.init(capture, jax.random.key(3))
-    frames = evaluate.frames_of(capture, model.wants)
+    frames = evaluation.frames_of(capture, model.wants)
     after, metrics = jax.jit(model.step)(state, frames)
     assert {"colour", "fine", "coarse", "transient/density"} <= set(metrics)
     changed = jax.tree.map(

@@ -8,14 +8,18 @@ import jax
 import numpy as np
 import pytest
 
-from experiments import ablate, ablate_job, ablate_kept, settings
-from experiments.ablate_arms import FIELDS
-from experiments.ablate_job import Job
-from experiments.ablate_kept import Kept
-from experiments.ablate_measures import MEASURES
-from experiments.ablate_suites import SUITES
+from experiments import cli
+from experiments.ablate import __main__ as ablate
+from experiments.ablate import job as ablate_job
+from experiments.ablate import results
+from experiments.ablate.arms import FIELDS
+from experiments.ablate.job import Job
+from experiments.ablate.measures import MEASURES
+from experiments.ablate.results import Kept
+from experiments.ablate.suites import SUITES
 from nerfies_jax.capture import synthetic
 from nerfies_jax.measure import clock
+from nerfies_jax.runs import platform
 from tests import scenes
 
 
@@ -100,8 +104,8 @@ def test_arms_of_a_paper_differ_from_the_whole_only_in_what_their_name_says(
 @pytest.fixture
 def tiny(tmp_path, monkeypatch):
     """The command on the tiny scene, with nothing global changed by it."""
-    monkeypatch.setattr(settings, "start_jax", lambda *_: None)
-    monkeypatch.setattr(settings, "CACHE", tmp_path / "cache")
+    monkeypatch.setattr(platform, "start_jax", lambda *_: None)
+    monkeypatch.setattr(platform, "CACHE", tmp_path / "cache")
     monkeypatch.setitem(synthetic.PRESETS, "tiny", scenes.TINY_FILM)
     return ["--scene", "tiny", "--out", str(tmp_path / "out"), "--frames", "1"]
 
@@ -155,7 +159,7 @@ def kept(steps, seconds, stopped_by="steps"):
 )
 def test_the_steps_are_what_the_time_allows(tiny, cost, runs, monkeypatch):
     """A step costs the more the longer the run: one more try comes near enough."""
-    settled = settings.parse(ablate.Ablate, [*tiny, "--seconds", "60"])
+    settled = cli.parse(ablate.Ablate, [*tiny, "--seconds", "60"])
     job = Job(settled)
     made = []
 
@@ -171,7 +175,7 @@ def test_the_steps_are_what_the_time_allows(tiny, cost, runs, monkeypatch):
 
 
 def test_over_steps_and_seconds_the_run_over_steps_is_the_pilot(tiny, monkeypatch):
-    settled = settings.parse(
+    settled = cli.parse(
         ablate.Ablate, [*tiny, "--steps", "40", "--seconds", "3", "--arms", "static"]
     )
     job = Job(settled)
@@ -193,9 +197,9 @@ def test_over_steps_and_seconds_the_run_over_steps_is_the_pilot(tiny, monkeypatc
 
 
 def test_what_another_process_makes_is_left_to_it(tiny, monkeypatch, capsys):
-    job = Job(settings.parse(ablate.Ablate, [*tiny, "--arms", "static"]))
+    job = Job(cli.parse(ablate.Ablate, [*tiny, "--arms", "static"]))
     monkeypatch.setattr(job, "_train", lambda *_: pytest.fail("trained twice"))
-    with ablate_kept.claimed(job.path("static", 0, job.budgets[0])) as ours:
+    with results.claimed(job.path("static", 0, job.budgets[0])) as ours:
         assert ours
         job.make("static", 0, job.budgets[0])
     assert "another process is making it" in capsys.readouterr().err
@@ -207,7 +211,7 @@ def test_arms_that_need_depth_are_not_run_without_it(tiny, monkeypatch):
     arms = {"all": FIELDS.arms["static"]}
     arms["less"] = dataclasses.replace(arms["all"], needs="depths")
     monkeypatch.setitem(SUITES, "fields", FIELDS._replace(arms=arms))
-    settled = settings.parse(ablate.Ablate, tiny)
+    settled = cli.parse(ablate.Ablate, tiny)
     assert Job(settled).names == ("all", "less")
     made = synthetic.cached
 

@@ -10,8 +10,10 @@ import types
 
 import pytest
 
-from experiments import ablate, ablate_pool, settings
-from experiments.ablate_arms import Arm
+from experiments import cli
+from experiments.ablate import __main__ as ablate
+from experiments.ablate import pool
+from experiments.ablate.arms import Arm
 
 # A process that stands for an arm: it does what its own file says.
 ARM = """
@@ -58,7 +60,7 @@ def acted(monkeypatch):
     def command(job, name, seed):
         return [sys.executable, "-c", ARM, str(job.out), name, str(seed), str(job.wait)]
 
-    monkeypatch.setattr(ablate_pool, "command", command)
+    monkeypatch.setattr(pool, "command", command)
 
 
 def overlap(job, one, other):
@@ -70,7 +72,7 @@ def overlap(job, one, other):
 def test_no_more_run_at_once_than_asked_for_and_what_is_there_is_left(tmp_path, capsys):
     job = Job(tmp_path, ["a", "b", "c"], 1, seconds=1.0, jobs=2)
     (tmp_path / "b-0.ended").write_text("0")
-    assert ablate_pool.run(job) == []
+    assert pool.run(job) == []
     assert not (tmp_path / "b-0.begun").exists()
     assert overlap(job, ("a", 0), ("c", 0))
     error = capsys.readouterr().err
@@ -82,7 +84,7 @@ def test_no_more_run_at_once_than_asked_for_and_what_is_there_is_left(tmp_path, 
 def test_over_seconds_later_seeds_wait_for_the_first_of_their_arm(tmp_path, capsys):
     job = Job(tmp_path, ["a", "bad"], 2, jobs=4)
     job.asked = ablate.Ablate(jobs=4, seconds=1.0)
-    assert sorted(ablate_pool.run(job)) == [("bad", 0), ("bad", 1)]
+    assert sorted(pool.run(job)) == [("bad", 0), ("bad", 1)]
     assert job.time_of("a", 1, "begun") > job.time_of("a", 0, "ended")
     error = capsys.readouterr().err
     assert "bad, seed 1: not begun, seed 0 failed" in error
@@ -90,7 +92,7 @@ def test_over_seconds_later_seeds_wait_for_the_first_of_their_arm(tmp_path, caps
 
 def test_an_arm_that_fails_is_named_and_the_others_go_on(tmp_path, capsys):
     job = Job(tmp_path, ["bad", "a"], 2, jobs=2)
-    assert sorted(ablate_pool.run(job)) == [("bad", 0), ("bad", 1)]
+    assert sorted(pool.run(job)) == [("bad", 0), ("bad", 1)]
     assert job.is_finished("a", 0)
     assert job.is_finished("a", 1)
     error = capsys.readouterr().err
@@ -100,7 +102,7 @@ def test_an_arm_that_fails_is_named_and_the_others_go_on(tmp_path, capsys):
 
 def test_after_the_budget_nothing_is_begun(tmp_path):
     job = Job(tmp_path, ["a", "b"], 1, seconds=1.0, jobs=1, budget=1.5)
-    assert ablate_pool.run(job) == []
+    assert pool.run(job) == []
     assert job.is_finished("a", 0)
     assert not (tmp_path / "b-0.begun").exists()
 
@@ -109,13 +111,13 @@ def test_after_the_budget_nothing_is_begun(tmp_path):
 def test_a_signal_ends_every_process(tmp_path, monkeypatch, number, code):
     job = Job(tmp_path, ["a", "b"], 1, seconds=60.0, jobs=2)
     started = []
-    start = ablate_pool.start
+    start = pool.start
 
     def noted(*arguments):
         started.append(start(*arguments))
         return started[-1]
 
-    monkeypatch.setattr(ablate_pool, "start", noted)
+    monkeypatch.setattr(pool, "start", noted)
 
     def interrupt():
         while not all((tmp_path / f"{name}-0.begun").exists() for name in "ab"):
@@ -125,7 +127,7 @@ def test_a_signal_ends_every_process(tmp_path, monkeypatch, number, code):
     thread = threading.Thread(target=interrupt)
     thread.start()
     with pytest.raises(SystemExit) as stop:
-        ablate_pool.run(job)
+        pool.run(job)
     thread.join()
     assert stop.value.code == code
     assert len(started) == 2
@@ -147,8 +149,8 @@ def test_the_command_has_the_same_settings_for_one_arm(monkeypatch):
         set=("density.most=99", "sh_degree=0"),
     )
     job = types.SimpleNamespace(asked=asked, out=pathlib.Path("there"))
-    words = ablate_pool.command(job, "full", 2)
-    found = settings.parse(ablate.Ablate, words[3:])
+    words = pool.command(job, "full", 2)
+    found = cli.parse(ablate.Ablate, words[3:])
     assert found == dataclasses.replace(
         asked,
         arms=("full",),

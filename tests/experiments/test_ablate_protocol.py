@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 import scipy.spatial.transform
 
-from experiments import ablate_picture, ablate_protocol, representations
-from experiments.ablate_protocol import EXACT, Followed
+from experiments.ablate import picture as ablate_picture
 from gaussians_jax import scene as splat_scene
 from gaussians_jax.splats import Gaussians, Params, Splats, bury
 from nerfies_jax import scene
 from nerfies_jax.capture import synthetic
 from nerfies_jax.effects.effect import Effect
+from nerfies_jax.evaluation import protocol
+from nerfies_jax.evaluation.protocol import EXACT, Followed
 from nerfies_jax.measure import geometry_quality
+from nerfies_jax.runs import representations
 from nerfies_jax.training.model import Rendering, Stages
 from tests import scenes
 
@@ -27,7 +29,7 @@ SHIFT = np.float32([0.012, 0.0, 0.016])  # 0.02 long
 def filmed():
     film = dataclasses.replace(scenes.TINY_FILM, heldout_every=2)
     capture, truth = synthetic.make(film)
-    return capture, truth, ablate_protocol.known(capture, truth, 2, 5)
+    return capture, truth, protocol.known(capture, truth, 2, 5)
 
 
 def test_the_known_paths_are_those_of_points_seen_at_the_start(filmed):
@@ -47,7 +49,7 @@ def test_the_known_paths_are_those_of_points_seen_at_the_start(filmed):
 def test_a_scaled_capture_has_its_paths_in_scene_units(filmed):
     capture, truth, known = filmed
     other = dataclasses.replace(capture, scale=2.0, centre=(0.1, 0.2, -0.3))
-    found = ablate_protocol.known(other, truth, 2, 5)
+    found = protocol.known(other, truth, 2, 5)
     expected = 2 * (known.path - np.float32([0.1, 0.2, -0.3]))
     np.testing.assert_allclose(found.path, expected, atol=1e-6)
 
@@ -55,7 +57,7 @@ def test_a_scaled_capture_has_its_paths_in_scene_units(filmed):
 def test_the_truth_of_another_capture_is_refused(filmed):
     capture, truth, _ = filmed
     with pytest.raises(ValueError, match="other frames than the capture"):
-        ablate_protocol.known(capture, truth._replace(ids=truth.ids[1:]), 2, 5)
+        protocol.known(capture, truth._replace(ids=truth.ids[1:]), 2, 5)
 
 
 def test_tracks_are_scored_by_their_distance_at_all_instants_but_the_start(filmed):
@@ -64,26 +66,26 @@ def test_tracks_are_scored_by_their_distance_at_all_instants_but_the_start(filme
     found[0, 4:6] = False
     right = Followed(known.path, found, 0.1, 0.2)
     later = found[:, 1:].size  # all but one column
-    numbers = ablate_protocol.score_tracks(known, right)
+    numbers = protocol.score_tracks(known, right)
     assert numbers["track_error"] == 0
     assert numbers["track_correct"] == 1
     assert numbers["track_lost"] == pytest.approx(2 / later)
     assert (numbers["drift"], numbers["strain"]) == (0.1, 0.2)
     wrong = right._replace(path=known.path + SHIFT)
-    numbers = ablate_protocol.score_tracks(known, wrong)
+    numbers = protocol.score_tracks(known, wrong)
     assert numbers["track_error"] == pytest.approx(0.02, rel=1e-4)
     assert numbers["track_correct"] == 0
     # What cannot be seen is not scored.
     half = known.seen.copy()
     half[:, ::2] = False
     wrong.path[:, ::2] = 9.0
-    numbers = ablate_protocol.score_tracks(known._replace(seen=half), wrong)
+    numbers = protocol.score_tracks(known._replace(seen=half), wrong)
     assert numbers["track_error"] == pytest.approx(0.02, rel=1e-4)
     away = np.linalg.norm(known.path - known.path[:, 3:4], axis=-1)
     away = np.delete(away, 3, axis=1)
-    assert ablate_protocol.still_error(known) == pytest.approx(away.mean(), rel=1e-5)
+    assert protocol.still_error(known) == pytest.approx(away.mean(), rel=1e-5)
     assert away.mean() > 1e-3
-    nothing = ablate_protocol.score_tracks(known, None)
+    nothing = protocol.score_tracks(known, None)
     assert np.isnan(list(nothing.values())).all()
 
 
@@ -101,7 +103,7 @@ def test_pictures_are_scored_as_a_whole_and_where_things_move(filmed):
         depth = capture.depths[row] + 0.125 * still
         return Rendering(np.float32(colour), still, np.float32(depth))
 
-    _, numbers = ablate_protocol.score_pictures(renderer, None, capture, known)
+    _, numbers = protocol.score_pictures(renderer, None, capture, known)
     share = 1 - capture.moving[known.rows].mean(axis=(1, 2))
     psnr = -10 * np.log10(share * 0.2**2)
     assert numbers["psnr"] == pytest.approx(psnr.mean(), abs=1e-3)
@@ -136,7 +138,7 @@ def test_points_are_followed_through_a_warp_in_closed_form(
     )
     monkeypatch.setattr(scene, "field", lambda spec, facts: made)
     state = types.SimpleNamespace(params=velocity, step=jnp.int32(5))
-    followed = ablate_protocol.follow_fields(None, facts, state, capture, known)
+    followed = protocol.follow_fields(None, facts, state, capture, known)
 
     start = 4.0 * (known.path[:, 3] - np.float32(facts.centre))
     template = start / (1 + times[3]) - np.asarray(velocity) * times[3]
@@ -162,7 +164,7 @@ def test_a_field_without_a_warp_follows_nothing(filmed):
     kind = representations.of_preset("t-nerf-small")
     spec = kind.presets["t-nerf-small"]
     facts = kind.facts_of(capture, spec)
-    assert ablate_protocol.follow_fields(spec, facts, None, capture, known) is None
+    assert protocol.follow_fields(spec, facts, None, capture, known) is None
 
 
 def test_the_picture_shows_how_far_points_are_from_where_they_should_be(filmed):
@@ -220,7 +222,7 @@ def follow_moved(monkeypatch, filmed, rows, moved):
     effects = (types.SimpleNamespace(deform=pose),)
     monkeypatch.setattr(splat_scene, "effects_of", lambda *_: effects)
     state = types.SimpleNamespace(params=Params({"splats": rows}, {}))
-    return ablate_protocol.follow_splats(None, None, state, capture, known)
+    return protocol.follow_splats(None, None, state, capture, known)
 
 
 @pytest.fixture
@@ -303,7 +305,7 @@ def test_what_cannot_be_seen_carries_nothing(filmed, monkeypatch, cloud):
 def test_the_weights_of_neighbours_are_a_slow_sum(rng):
     distance = np.sort(rng.uniform(size=(4, 8)), axis=1)
     opacity = rng.uniform(0.1, 1, size=(4, 8))
-    found = ablate_protocol.neighbour_weights(distance, opacity)
+    found = protocol.neighbour_weights(distance, opacity)
     for row in range(4):
         expected = [
             opacity[row, k] / np.exp(2 * (distance[row, k] / distance[row, 7]) ** 2)
@@ -311,20 +313,18 @@ def test_the_weights_of_neighbours_are_a_slow_sum(rng):
         ]
         np.testing.assert_allclose(found[row], expected / np.sum(expected), rtol=1e-12)
     # All at the point itself: by opacity alone.
-    found = ablate_protocol.neighbour_weights(np.zeros((1, 2)), np.array([[0.3, 0.1]]))
+    found = protocol.neighbour_weights(np.zeros((1, 2)), np.array([[0.3, 0.1]]))
     np.testing.assert_allclose(found, [[0.75, 0.25]], rtol=1e-12)
 
 
 def test_splats_without_motion_follow_nothing_and_untrained_motion_stays(filmed):
     capture, _, known = filmed
     facts = splat_scene.facts_of(capture)
-    still = ablate_protocol.follow_splats(
-        scenes.TINY_SPLATS, facts, None, capture, known
-    )
+    still = protocol.follow_splats(scenes.TINY_SPLATS, facts, None, capture, known)
     assert still is None
     model = splat_scene.build(scenes.TINY_DEFORMABLE, facts)
     state = model.init(capture, jax.random.key(0))
-    followed = ablate_protocol.follow_splats(
+    followed = protocol.follow_splats(
         scenes.TINY_DEFORMABLE, facts, state, capture, known
     )
     assert followed.path.shape == known.path.shape
@@ -340,7 +340,7 @@ def test_splats_without_motion_follow_nothing_and_untrained_motion_stays(filmed)
 
 def test_a_real_capture_is_judged_by_its_pictures_alone(filmed):
     capture, _, known = filmed
-    found = ablate_protocol.filmed(capture, 2)
+    found = protocol.filmed(capture, 2)
     np.testing.assert_array_equal(found.rows, known.rows)
     np.testing.assert_array_equal(found.moments, known.moments)
 
@@ -350,16 +350,16 @@ def test_a_real_capture_is_judged_by_its_pictures_alone(filmed):
         colour = np.float32(capture.images[row]) / 255
         return Rendering(colour, np.ones_like(colour[..., 0]), colour[..., 0])
 
-    _, numbers = ablate_protocol.score_pictures(renderer, None, capture, found)
+    _, numbers = protocol.score_pictures(renderer, None, capture, found)
     assert (numbers["psnr"], numbers["ssim"]) == (100, pytest.approx(1))
     assert np.isnan([numbers[name] for name in EXACT]).all()
-    assert np.isnan(list(ablate_protocol.score_tracks(found, None).values())).all()
-    assert np.isnan(ablate_protocol.still_error(found))
+    assert np.isnan(list(protocol.score_tracks(found, None).values())).all()
+    assert np.isnan(protocol.still_error(found))
     blind = dataclasses.replace(
         capture, train=np.arange(len(capture.ids)), heldout=np.zeros(0, int)
     )
     with pytest.raises(ValueError, match="no held-out frames to judge by"):
-        ablate_protocol.filmed(blind, 2)
+        protocol.filmed(blind, 2)
     shown = ablate_picture.shown_row(found, capture)
     row = found.rows[shown]
     picture = ablate_picture.draw(

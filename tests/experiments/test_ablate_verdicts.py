@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from experiments import ablate_measures, ablate_verdicts
-from experiments.ablate_arms import FIELDS
-from experiments.ablate_measures import MEASURES
-from experiments.ablate_suites import SUITES
+from experiments.ablate import measures, verdicts
+from experiments.ablate.arms import FIELDS
+from experiments.ablate.measures import MEASURES
+from experiments.ablate.suites import SUITES
 
 
 def numbers_of(**pairs):
@@ -35,7 +35,7 @@ def numbers_of(**pairs):
 )
 def test_a_claim_is_held_against_the_spread_over_seeds(nerfies, translation, says):
     numbers = numbers_of(nerfies=nerfies, translation=translation)
-    found = ablate_verdicts.verdicts(numbers, FIELDS.claims)
+    found = verdicts.verdicts(numbers, FIELDS.claims)
     assert {verdict.claim.worse for verdict in found} == {"translation"}
     # A lower error and a higher PSNR are both a gain.
     by_measure = {verdict.measure: verdict for verdict in found}
@@ -48,18 +48,18 @@ def test_a_claim_is_held_against_the_spread_over_seeds(nerfies, translation, say
         interval = scipy.stats.ttest_1samp(gains, 0).confidence_interval(0.95)
         width = (interval.high - interval.low) / 2
         assert verdict.half_width == pytest.approx(width, rel=1e-9)
-    assert says in ablate_verdicts.claims_text(found)
+    assert says in verdicts.claims_text(found)
 
 
 def test_only_seeds_that_both_arms_have_are_compared():
     numbers = numbers_of(nerfies=[0.01, 0.01, 0.5], translation=[0.02, 0.03])
-    verdict = ablate_verdicts.verdicts(numbers, FIELDS.claims)[0]
+    verdict = verdicts.verdicts(numbers, FIELDS.claims)[0]
     assert verdict.gain == pytest.approx(0.015)
 
 
 def test_the_table_has_a_row_for_each_arm_and_says_what_still_points_score():
     numbers = numbers_of(nerfies=[0.01, 0.03], static=[np.nan])
-    text = ablate_verdicts.table(numbers, 0.0272)
+    text = verdicts.table(numbers, 0.0272)
     lines = text.splitlines()
     assert lines[1].startswith("nerfies")
     assert "0.0200" in lines[1]
@@ -74,30 +74,28 @@ def test_columns_without_numbers_are_left_out_with_their_legend():
     names = ("depth_median", "moving_psnr", "strain", "gaussians")
     for row in numbers.values():
         row |= dict.fromkeys(names, math.nan)
-    text = ablate_verdicts.table(numbers, math.nan)
+    text = verdicts.table(numbers, math.nan)
     for heading in ("depth", "strain", "Gauss.", "still"):
         assert heading not in text
     assert "PSNR" in text
-    shown = ablate_measures.shown(numbers)
+    shown = measures.shown(numbers)
     assert not set(names) & set(shown)
-    legend = ablate_measures.legend(shown)
+    legend = measures.legend(shown)
     assert "strain" not in legend
     assert "scikit-image" in legend
 
 
 def test_compiling_is_the_mean_of_the_seeds_that_did_it():
     rows = [{"compile_seconds": x} for x in (30.0, math.nan, 34.0)]
-    np.testing.assert_array_equal(
-        ablate_verdicts.values_of(rows, "compile_seconds"), [30, 34]
-    )
+    np.testing.assert_array_equal(verdicts.values_of(rows, "compile_seconds"), [30, 34])
     rows = [{"psnr": x} for x in (30.0, math.nan)]
-    assert np.isnan(ablate_verdicts.values_of(rows, "psnr").mean())
+    assert np.isnan(verdicts.values_of(rows, "psnr").mean())
 
 
 def test_the_verdicts_say_how_many_show_by_chance():
     numbers = numbers_of(nerfies=[0.01, 0.02], translation=[0.02, 0.04])
-    found = ablate_verdicts.verdicts(numbers, FIELDS.claims)
-    assert "Of 3 such lines, 0.2 would show" in ablate_verdicts.claims_text(found)
+    found = verdicts.verdicts(numbers, FIELDS.claims)
+    assert "Of 3 such lines, 0.2 would show" in verdicts.claims_text(found)
 
 
 @pytest.mark.parametrize("name", SUITES)

@@ -7,16 +7,14 @@ import types
 
 import pytest
 
-from experiments import (
-    ablate,
-    ablate_pool,
-    accuracy_report,
-    accuracy_time,
-    baselines,
-)
-from experiments.ablate_job import Job
-from experiments.ablate_measures import MEASURES
-from experiments.accuracy_axes import AXES, SETTINGS, Axis
+from experiments.ablate import __main__ as ablate
+from experiments.ablate import pool
+from experiments.ablate.job import Job
+from experiments.ablate.measures import MEASURES
+from experiments.accuracy_time import __main__ as accuracy_time
+from experiments.accuracy_time import report
+from experiments.accuracy_time.axes import AXES, SETTINGS, Axis
+from nerfies_jax.measure import baselines
 from nerfies_jax.measure.clock import Metric
 
 
@@ -59,10 +57,10 @@ def test_a_setting_of_precision_has_its_switch_in_its_process(tmp_path, monkeypa
     def caught(words, **given):
         begun[words[words.index("--arms") + 1]] = given["env"]
 
-    monkeypatch.setattr(ablate_pool.subprocess, "Popen", caught)
+    monkeypatch.setattr(pool.subprocess, "Popen", caught)
     monkeypatch.delenv("JAX_ENABLE_X64", raising=False)
     for name in ("field-float64", "nerfies-small"):
-        ablate_pool.start(job, name, 0)
+        pool.start(job, name, 0)
     assert begun["field-float64"]["JAX_ENABLE_X64"] == "1"
     assert "JAX_ENABLE_X64" not in begun["nerfies-small"]
 
@@ -85,7 +83,7 @@ def test_the_front_is_what_nothing_beats_in_both():
         "as good, dearer": row(train_cpu_seconds=2.0, psnr=20.0),
         "unknown": row(train_cpu_seconds=0.1),
     }
-    found = accuracy_report.front(means, "psnr", "train_cpu_seconds")
+    found = report.front(means, "psnr", "train_cpu_seconds")
     assert found == ["cheap", "slow and good"]
 
 
@@ -95,7 +93,7 @@ def test_less_error_is_better_on_a_front():
         "far": row(render_ms=1.0, track_error=0.03),
         "farther": row(render_ms=2.0, track_error=0.04),
     }
-    found = accuracy_report.front(means, "track_error", "render_ms")
+    found = report.front(means, "track_error", "render_ms")
     assert found == ["far", "near"]
 
 
@@ -105,11 +103,11 @@ def test_a_line_says_what_changed_against_the_base_and_what_it_costs():
     for seed, (dB, other) in enumerate([(20.0, 20.4), (20.2, 20.1)]):
         numbers["base", seed] = row(psnr=dB, train_cpu_seconds=100.0, render_ms=10.0)
         numbers["half", seed] = row(psnr=other, train_cpu_seconds=50.0, render_ms=5.0)
-    base, half = accuracy_report.axis_lines(axis, numbers)
+    base, half = report.axis_lines(axis, numbers)
     assert "PSNR 20.10; 100 s, 10 ms a frame" in base
     assert "PSNR 20.25 (+0.15, same); 0.50 of the training time, 0.50" in half
     one = {key: value for key, value in numbers.items() if key[1] == 0}
-    assert "(+0.40, one seed)" in accuracy_report.axis_lines(axis, one)[1]
+    assert "(+0.40, one seed)" in report.axis_lines(axis, one)[1]
 
 
 def test_a_cost_may_grow_by_a_share_and_a_quality_by_a_number():

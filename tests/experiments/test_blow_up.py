@@ -4,7 +4,8 @@ import json
 
 import pytest
 
-from experiments import reconstruct, runs
+from experiments import reconstruct
+from nerfies_jax import runs
 from nerfies_jax.capture import nerfies_format
 from nerfies_jax.training import checkpoint
 from tests import scenes

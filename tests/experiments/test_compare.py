@@ -5,7 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from experiments import compare, curves
+from experiments import compare
+from nerfies_jax.runs import curves
 from nerfies_jax.training.loop import History
 
 CHOICES = {"capture": "/films/cat", "scene": "default", "preset": "nerf", "seed": 0}

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import deformation_arms, deformation_cost, knot_curve, known_motion
+from experiments.deformation_cost import __main__ as deformation_cost
+from experiments.deformation_cost import arms, knot_curve, known_motion
 from gaussians_jax.effects import deformation, kan_motion
 from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec
@@ -33,10 +34,10 @@ def small(monkeypatch):
     """Networks that compile and run in no time, of every kind."""
     few = [
         network._replace(spec=narrowed(network.spec))
-        for network in deformation_arms.NETWORKS
+        for network in arms.NETWORKS
         if network.paper
     ]
-    monkeypatch.setattr(deformation_arms, "NETWORKS", few)
+    monkeypatch.setattr(arms, "NETWORKS", few)
 
 
 def swinging(count=30):
@@ -134,8 +135,8 @@ def _field(capture):
 @pytest.mark.slow
 @pytest.mark.usefixtures("small")
 def test_arms_agree_with_the_network_they_shorten():
-    made = {arm.name: arm for arm in deformation_arms.arms(40, 0.25)}
-    for network in deformation_arms.NETWORKS:
+    made = {arm.name: arm for arm in arms.arms(40, 0.25)}
+    for network in arms.NETWORKS:
         whole = made[network.name].used
         exact = jax.jit(whole.pose)(*whole.inputs)
         for name in (n for n in made if n.startswith(network.name)):
@@ -146,7 +147,7 @@ def test_arms_agree_with_the_network_they_shorten():
             assert off.sum() <= (10 if "still" in name else 0)
         slopes = jax.jit(whole.gradient)(*whole.inputs)
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
-    papers = sum(network.paper for network in deformation_arms.NETWORKS)
+    papers = sum(network.paper for network in arms.NETWORKS)
     assert sum("still" in name for name in made) == papers
     assert sum("kept" in name for name in made) >= 2
 
@@ -163,15 +164,15 @@ def test_a_loop_over_kernels_is_counted_in_full():
             ready = {effect.name: effect.prepare(params)}
             return deformation.pose((effect,), params, ready, time)
 
-        rows = deformation_arms.gaussians(count)
-        return clock.cost(pose, deformation_arms.with_effect(rows, effect)).flops
+        rows = arms.gaussians(count)
+        return clock.cost(pose, arms.with_effect(rows, effect)).flops
 
     whole = dataclasses.replace(spec, block=count)
     two, three, four = (
         flops(dataclasses.replace(whole, kernels=kernels)) for kernels in (2, 3, 4)
     )
     np.testing.assert_allclose(three, (two + four) / 2, rtol=0.01)  # a line
-    parts = deformation_arms.in_one_turn(spec, count)
+    parts = arms.in_one_turn(spec, count)
     found = sum(weight * flops(part) for weight, part in parts)
     np.testing.assert_allclose(found, four + 8 * (four - three), rtol=0.05)
     products = 2 * (5 * 7 + 7 * 6 + 6 * 9)  # of one Gaussian and one kernel
@@ -192,7 +193,7 @@ def test_the_job_prints_both_tables_and_saves_them(tmp_path, capsys, monkeypatch
         assert row["name"] in text
         assert row["forward_cpu_ms"] > 0
         assert row["forward_flops"] > 0
-        trained = row["name"] in {n.name for n in deformation_arms.NETWORKS}
+        trained = row["name"] in {n.name for n in arms.NETWORKS}
         assert (row["both_ms"] is not None) == trained
         if trained:
             assert row["both_flops"] > 2 * row["forward_flops"]

@@ -9,14 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import baselines, effect_cost, matrix_flops
-from experiments import effect_cost_report as report
-from experiments.effect_cost import Arm, EffectCost, Priced, Row
+from experiments.effect_cost import __main__ as effect_cost
+from experiments.effect_cost import report as report
+from experiments.effect_cost.__main__ import Arm, EffectCost, Priced, Row
 from gaussians_jax import presets as splat_presets
 from nerfies_jax import presets as field_presets
 from nerfies_jax import scene
 from nerfies_jax.effects.effect import Moment
-from nerfies_jax.measure import clock
+from nerfies_jax.measure import baselines, clock, matrix_flops
 from nerfies_jax.tracing import Ray
 from tests import bare_scenes, scenes
 

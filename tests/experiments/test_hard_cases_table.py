@@ -5,10 +5,12 @@ import json
 import numpy as np
 import pytest
 
-from experiments import hard_case, hard_cases, hard_cases_report
-from experiments.hard_cases import ROOMS, Outcome, Row
+from experiments.hard_cases import __main__ as hard_cases
+from experiments.hard_cases import case as hard_case
+from experiments.hard_cases import report
+from experiments.hard_cases.__main__ import ROOMS, Outcome, Row
 
-PAGE = f"before\n{hard_cases_report.BEGIN}\nold\n{hard_cases_report.END}\nbehind\n"
+PAGE = f"before\n{report.BEGIN}\nold\n{report.END}\nbehind\n"
 
 
 def test_names_tell_all_cases_apart():
@@ -76,15 +78,15 @@ def test_the_truth_of_a_derivative_is_that_of_the_closed_form():
 
 
 def test_a_number_names_what_is_not_finite_and_the_worst_else():
-    assert hard_cases_report.number([0.0]) == "0"
-    assert hard_cases_report.number([1e-7, 3e-7]) == "3e-07"
-    assert hard_cases_report.number([np.inf, 0.3]) == "not finite, 3e-01"
-    assert hard_cases_report.number([np.inf]) == "not finite"
+    assert report.number([0.0]) == "0"
+    assert report.number([1e-7, 3e-7]) == "3e-07"
+    assert report.number([np.inf, 0.3]) == "not finite, 3e-01"
+    assert report.number([np.inf]) == "not finite"
 
 
 def test_what_cannot_be_timed_side_by_side_is_not():
     case = ROOMS["encodings"][0][0]._replace(alike=False)
     outcome = Outcome((np.zeros(1),), (np.ones(1),))
     row = Row(case, "a test", {"float32": outcome}, np.nan, np.nan)
-    assert "not comparable" in hard_cases_report.table([row])
-    assert hard_cases_report.summary([row]).endswith("derivative.")
+    assert "not comparable" in report.table([row])
+    assert report.summary([row]).endswith("derivative.")

@@ -4,13 +4,16 @@ import itertools
 
 import pytest
 
-from experiments import inspect_advice, reconstruct, representations, runs, settings
-from experiments.inspect_advice import FIELDS, SPLATS
-from experiments.inspect_findings import CANNOT_TELL, CERTAIN, Finding
+from experiments import reconstruct
+from nerfies_jax import runs
 from nerfies_jax.capture import nerfies_format
 from nerfies_jax.effects.appearance import AppearanceSpec
+from nerfies_jax.evidence.findings import CANNOT_TELL, CERTAIN, Finding
+from nerfies_jax.runs import adviser, platform, representations
+from nerfies_jax.runs.adviser import FIELDS, SPLATS
+from nerfies_jax.training import specs
 from tests import scenes
-from tests.experiments import inspect_films
+from tests.evidence import films
 
 EFFECTS = (
     "motion",
@@ -47,22 +50,20 @@ def test_all_decisions_lead_to_a_model_that_can_be_built(kind, full):
     capture = scenes.tiny_capture()
     built = set()
     for choices in itertools.product((True, False, None), repeat=len(EFFECTS)):
-        advice = inspect_advice.advise(decided(choices), kind, full)
+        advice = adviser.advise(decided(choices), kind, full)
         if advice.arguments() in built:
             continue
         built.add(advice.arguments())
         representation = representations.of_preset(advice.preset)
-        spec = settings.override(
-            representation.presets[advice.preset], advice.overrides
-        )
+        spec = specs.override(representation.presets[advice.preset], advice.overrides)
         representation.build(spec, representation.facts_of(capture, spec))
     assert len(built) > 4
 
 
 def spec_of(kind, **wanted):
-    advice = inspect_advice.advise(findings(**wanted), kind)
+    advice = adviser.advise(findings(**wanted), kind)
     presets = representations.of_preset(advice.preset).presets
-    return settings.override(presets[advice.preset], advice.overrides), advice
+    return specs.override(presets[advice.preset], advice.overrides), advice
 
 
 def test_a_still_scene_gets_no_motion_and_a_moving_one_gets_it():
@@ -97,14 +98,14 @@ def test_no_medium_is_brought_in_beside_a_warp():
 def test_an_effect_that_is_one_of_several_kinds_is_not_guessed():
     preset = representations.gaussians().presets["splats-static-small"]
     with pytest.raises(ValueError, match="has no fields"):
-        settings.override(preset, ("motion.width=8",))
+        specs.override(preset, ("motion.width=8",))
 
 
 def test_effects_auto_takes_the_advice_and_the_users_word_comes_last(
     tmp_path, monkeypatch, capsys
 ):
-    monkeypatch.setattr(settings, "start_jax", lambda *_: None)
-    nerfies_format.write(inspect_films.film(), tmp_path / "film")
+    monkeypatch.setattr(platform, "start_jax", lambda *_: None)
+    nerfies_format.write(films.film(), tmp_path / "film")
     taken = {}
 
     def caught(choices, stored):

@@ -9,20 +9,18 @@ import sys
 
 import pytest
 
-from experiments import (
-    ablate,
-    ablate_kept,
-    ablate_pool,
-    inspect_advice,
-    inspect_arms,
-    inspect_job,
-    inspect_pays,
-    runs,
-    settings,
-)
-from experiments import inspect_pays_report as report
-from experiments.ablate_arms import Arm
-from experiments.inspect_findings import (
+from experiments import cli
+from experiments.ablate import __main__ as ablate
+from experiments.ablate import pool, results
+from experiments.ablate.arms import Arm
+from experiments.inspect_pays import __main__ as inspect_pays
+from experiments.inspect_pays import arms as inspect_arms
+from experiments.inspect_pays import report as report
+from experiments.inspect_pays.job import Row, Side, Trial, read
+from nerfies_jax import runs
+from nerfies_jax.capture import nerfies_format
+from nerfies_jax.evidence import inspection
+from nerfies_jax.evidence.findings import (
     BACKGROUND,
     CANNOT_TELL,
     CERTAIN,
@@ -30,10 +28,9 @@ from experiments.inspect_findings import (
     MOTION,
     Finding,
 )
-from experiments.inspect_pays_job import Row, Side, Trial, read
-from nerfies_jax.capture import nerfies_format
 from nerfies_jax.measure import clock
-from tests.experiments import inspect_films
+from nerfies_jax.runs import adviser, platform
+from tests.evidence import films
 
 
 def finding(effect, wanted):
@@ -46,7 +43,7 @@ def test_whatever_is_advised_is_an_arm():
         for choices in itertools.product((True, False, None), repeat=6):
             told = zip(inspect_arms.DECIDING, choices, strict=True)
             found = tuple(finding(*one) for one in told)
-            advice = inspect_advice.advise(found, kind, full)
+            advice = adviser.advise(found, kind, full)
             name = inspect_arms.name_of(advice)
             assert inspect_arms.ADVICE.arms[name] == Arm(
                 advice.preset, advice.overrides
@@ -129,7 +126,7 @@ def test_wrong_wishes_are_refused_with_what_can_be_had():
 def film(tmp_path):
     """A still film with held-out frames, where the light is even."""
     folder = tmp_path / "film"
-    nerfies_format.write(inspect_films.film(), folder)
+    nerfies_format.write(films.film(), folder)
     return folder
 
 
@@ -144,8 +141,8 @@ def looked(monkeypatch):
 
     def inspect(capture):
         calls.append("look")
-        sheet = inspect_films.texture(1).astype("uint8")
-        return inspect_job.Inspection(FOUND, sheet, 1, 0.0, None, [])
+        sheet = films.texture(1).astype("uint8")
+        return inspection.Inspection(FOUND, sheet, 1, 0.0, None, [])
 
     def train(job):
         (budget,) = job.budgets
@@ -155,13 +152,13 @@ def looked(monkeypatch):
             calls.append(f"train {name}")
             numbers = {"psnr": SCORES.get(name, 22.0), "train_cpu_seconds": 10.0}
             identity = job._identity(name, seed, budget.steps, budget)
-            kept = ablate_kept.Kept(numbers, {}, {"steps": budget.steps})
-            ablate_kept.write(job.path(name, seed, budget), identity, kept)
+            kept = results.Kept(numbers, {}, {"steps": budget.steps})
+            results.write(job.path(name, seed, budget), identity, kept)
         return []
 
-    monkeypatch.setattr(inspect_job, "inspect", inspect)
-    monkeypatch.setattr(ablate_pool, "run", train)
-    monkeypatch.setattr(settings, "start_jax", lambda *_: None)
+    monkeypatch.setattr(inspection, "inspect", inspect)
+    monkeypatch.setattr(pool, "run", train)
+    monkeypatch.setattr(platform, "start_jax", lambda *_: None)
     return calls
 
 
@@ -209,7 +206,7 @@ def test_where_the_advice_is_the_preset_nothing_is_trained(film, tmp_path, looke
 def test_a_preset_that_needs_what_is_not_there_is_left_out(
     tmp_path, looked, monkeypatch
 ):
-    nerfies_format.write(inspect_films.film(points=0), tmp_path / "film")
+    nerfies_format.write(films.film(points=0), tmp_path / "film")
     lacking = (finding(MOTION, True), finding(BACKGROUND, False))
     monkeypatch.setattr(Trial, "findings", lambda self: lacking)
     asked = inspect_pays.InspectPays(
@@ -225,12 +222,12 @@ def test_a_preset_that_needs_what_is_not_there_is_left_out(
 
 def test_a_run_is_a_command_that_ablate_takes(film, tmp_path, looked, monkeypatch):
     jobs = []
-    monkeypatch.setattr(ablate_pool, "run", lambda job: jobs.append(job) or [])
+    monkeypatch.setattr(pool, "run", lambda job: jobs.append(job) or [])
     asked = inspect_pays.InspectPays(out=tmp_path, heldout="3", steps=7)
     Trial(asked, *read(asked, film)).run()
     name = "nerf-small+appearance.width=4"
-    words = ablate_pool.command(jobs[0], name, 0)
-    parsed = settings.parse(ablate.Ablate, words[3:])
+    words = pool.command(jobs[0], name, 0)
+    parsed = cli.parse(ablate.Ablate, words[3:])
     ablate.check(parsed)
     assert parsed == dataclasses.replace(
         jobs[0].asked, arms=(name,), seed=0, seeds=None
@@ -238,6 +235,6 @@ def test_a_run_is_a_command_that_ablate_takes(film, tmp_path, looked, monkeypatc
 
 
 def test_a_capture_without_held_out_frames_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(runs, "stored_capture", lambda _: inspect_films.film())
+    monkeypatch.setattr(runs, "stored_capture", lambda _: films.film())
     with pytest.raises(ValueError, match="--heldout 8"):
         read(inspect_pays.InspectPays(), tmp_path)

@@ -4,17 +4,11 @@ import math
 
 import pytest
 
-from experiments import (
-    effect_cost,
-    inspect_advice,
-    inspect_findings,
-    inspect_prices,
-    representations,
-    settings,
-)
-from experiments import effect_cost_report as report
-from experiments.effect_cost import Arm, Priced, Row
-from experiments.inspect_findings import (
+from experiments.effect_cost import __main__ as effect_cost
+from experiments.effect_cost import report as report
+from experiments.effect_cost.__main__ import Arm, Priced, Row
+from nerfies_jax.evidence import findings as inspect_findings
+from nerfies_jax.evidence.findings import (
     BACKGROUND,
     CERTAIN,
     DEPTH,
@@ -27,6 +21,8 @@ from experiments.inspect_findings import (
     TRANSIENT,
     Finding,
 )
+from nerfies_jax.runs import adviser, prices, representations
+from nerfies_jax.training import specs
 
 DECIDING = (MOTION, LIGHT, TRANSIENT, START, BACKGROUND, DEPTH)
 
@@ -72,23 +68,23 @@ MEASURED = measured(
     ],
 )
 def test_a_price_is_what_an_effect_adds_in_bare_steps(effect, told):
-    assert str(inspect_prices.price(effect, MEASURED)) == told
+    assert str(prices.price(effect, MEASURED)) == told
 
 
 def test_the_kept_baseline_prices_every_decision():
-    for pairs in (inspect_prices.SPLATS, inspect_prices.FIELDS):
+    for pairs in (prices.SPLATS, prices.FIELDS):
         for pair in pairs.values():
             for arm in (pair.with_it, pair.without):
-                ratio = inspect_prices.baseline()[f"{pair.preset}.{arm}.step.over_bare"]
+                ratio = prices.baseline()[f"{pair.preset}.{arm}.step.over_bare"]
                 assert 0.8 < ratio.value < 20
-    motion = inspect_prices.price(MOTION, inspect_prices.baseline())
+    motion = prices.price(MOTION, prices.baseline())
     # A network for every Gaussian or sample is never free
     assert min(motion) > 1.2
 
 
 def test_what_a_decision_switches_on_has_a_price():
     """An effect that changes the compiled step is priced, whatever it is called."""
-    kinds = {"splats": inspect_prices.SPLATS, "fields": inspect_prices.FIELDS}
+    kinds = {"splats": prices.SPLATS, "fields": prices.FIELDS}
     for kind, pairs in kinds.items():
         for effect in DECIDING:
             scenes = [_effects(kind, effect, wanted) for wanted in (True, False)]
@@ -102,9 +98,9 @@ def _effects(kind, effect, wanted):
     choices[MOTION] = effect != TRANSIENT  # which is not advised beside a warp
     choices[effect] = wanted
     findings = tuple(Finding(x, "", "", y, CERTAIN) for x, y in choices.items())
-    advice = inspect_advice.advise(findings, kind)
+    advice = adviser.advise(findings, kind)
     presets = representations.of_preset(advice.preset).presets
-    spec = settings.override(presets[advice.preset], advice.overrides)
+    spec = specs.override(presets[advice.preset], advice.overrides)
     return effect_cost.effects_in(spec)
 
 
@@ -118,7 +114,7 @@ def test_the_table_and_the_json_have_the_price():
     column = head.index("cost per step")
     assert motion[column:].startswith("x2.50 / x2.20  it moves")
     assert start[column:].startswith("- / -")
-    assert inspect_prices.told(findings)[START] == "- / -"
-    stored = inspect_prices.as_json(findings)
+    assert prices.told(findings)[START] == "- / -"
+    stored = prices.as_json(findings)
     assert stored[START] == {"splats": None, "fields": None}
     assert all(math.isfinite(factor) for factor in stored[MOTION].values())

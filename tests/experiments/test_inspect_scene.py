@@ -7,27 +7,24 @@ import json
 import numpy as np
 import pytest
 
-from experiments import (
-    inspect_bands,
-    inspect_findings,
-    inspect_job,
-    inspect_scene,
-    inspect_stored,
-    settings,
-)
-from experiments.inspect_findings import CANNOT_TELL, CERTAIN, LIKELY
+from experiments import inspect_scene
 from nerfies_jax.capture import nerfies_format
-from tests.experiments import inspect_films
+from nerfies_jax.evidence import findings, texture
+from nerfies_jax.evidence import inspection as inspect_job
+from nerfies_jax.evidence import stored as inspect_stored
+from nerfies_jax.evidence.findings import CANNOT_TELL, CERTAIN, LIKELY
+from nerfies_jax.runs import platform
+from tests.evidence import films
 
 
 @functools.cache
 def still():
-    return inspect_job.inspect(inspect_films.film())
+    return inspect_job.inspect(films.film())
 
 
 @functools.cache
 def swaying_film():
-    return inspect_films.film(card=inspect_films.swaying)
+    return films.film(card=films.swaying)
 
 
 @functools.cache
@@ -57,17 +54,17 @@ def test_a_swaying_card_moves():
 
 
 def test_moving_pixels_lie_on_what_moves():
-    film = inspect_films.film(card=inspect_films.swaying)
+    film = films.film(card=films.swaying)
     red = swaying().films[0].centres
     found = np.stack([one.moving for one in red])
     views = swaying().views
-    width, height = inspect_films.SIZE
+    width, height = films.SIZE
     hit = np.zeros_like(found)
     for row, one in enumerate(red):
         eye = film.cameras.position[views.row[one.view]]
-        middle = np.array(inspect_films.swaying(views.time[one.view]))
-        edge = (middle - eye[:2]) / inspect_films.NEAR * inspect_films.FOCAL
-        half = inspect_films.CARD / inspect_films.NEAR * inspect_films.FOCAL
+        middle = np.array(films.swaying(views.time[one.view]))
+        edge = (middle - eye[:2]) / films.NEAR * films.FOCAL
+        half = films.CARD / films.NEAR * films.FOCAL
         x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
         beside = np.abs(np.stack([x - width / 2 - edge[0], y - height / 2 - edge[1]]))
         hit[row] = (beside < half + 2).all(0)  # flow is smooth over some two pixels
@@ -77,10 +74,10 @@ def test_moving_pixels_lie_on_what_moves():
 
 def test_speed_is_a_lower_bound_of_the_right_size():
     numbers = swaying().finding("motion").numbers
-    times = np.linspace(0, 1, inspect_films.FRAMES)
-    place = np.array([inspect_films.swaying(time) for time in times])
+    times = np.linspace(0, 1, films.FRAMES)
+    place = np.array([films.swaying(time) for time in times])
     truth = np.median(np.linalg.norm(np.diff(place, axis=0), axis=1))
-    truth_px = truth / inspect_films.NEAR * inspect_films.FOCAL
+    truth_px = truth / films.NEAR * films.FOCAL
     assert 0.3 * truth_px < numbers["speed_px"] < 1.1 * truth_px
 
 
@@ -88,18 +85,18 @@ def test_a_static_camera_sees_motion_and_stillness():
     def fixed(time):
         return (0.0, 0.0, 0.0)
 
-    moving = inspect_films.film(card=inspect_films.swaying, camera=fixed)
+    moving = films.film(card=films.swaying, camera=fixed)
     assert told(inspect_job.inspect(moving), "motion") == (True, CERTAIN)
-    quiet = inspect_films.film(camera=fixed)
+    quiet = films.film(camera=fixed)
     assert told(inspect_job.inspect(quiet), "motion") == (False, CERTAIN)
 
 
 def test_a_drifting_exposure_is_told_from_motion():
-    film = inspect_films.film(gain=lambda time: 2 ** (0.5 * np.sin(7 * time)) / 1.5)
+    film = films.film(gain=lambda time: 2 ** (0.5 * np.sin(7 * time)) / 1.5)
     found = inspect_job.inspect(film)
     assert told(found, "appearance codes") == (True, CERTAIN)
     assert told(found, "motion") == (False, CERTAIN)
-    times = np.linspace(0, 1, inspect_films.FRAMES)
+    times = np.linspace(0, 1, films.FRAMES)
     truth = np.std(0.5 * np.sin(7 * times))
     stops = found.finding("appearance codes").numbers["drift_stops"]
     # The film is coded by a power of 1/2.2 and read as sRGB: some 3 % apart.
@@ -108,7 +105,7 @@ def test_a_drifting_exposure_is_told_from_motion():
 
 def test_an_even_exposure_is_seen_with_motion_and_without_points():
     assert told(swaying(), "appearance codes") == (False, CERTAIN)
-    bare = inspect_job.inspect(inspect_films.film(points=0))
+    bare = inspect_job.inspect(films.film(points=0))
     assert told(bare, "appearance codes") == (False, CERTAIN)
     assert told(bare, "start from points") == (False, CERTAIN)
     assert told(bare, "background points") == (False, CERTAIN)
@@ -120,10 +117,10 @@ def test_points_of_the_wall_are_fit_for_both_their_uses():
 
 
 def test_points_on_what_moves_are_no_background():
-    film = inspect_films.film(card=inspect_films.swaying)
+    film = films.film(card=films.swaying)
     rng = np.random.default_rng(3)
-    on_card = rng.uniform(-inspect_films.CARD, inspect_films.CARD, (1500, 3))
-    on_card[:, 2] = inspect_films.NEAR
+    on_card = rng.uniform(-films.CARD, films.CARD, (1500, 3))
+    on_card[:, 2] = films.NEAR
     film.points.position[:] = on_card
     assert told(inspect_job.inspect(film), "background points") == (False, CERTAIN)
 
@@ -131,11 +128,11 @@ def test_points_on_what_moves_are_no_background():
 @pytest.mark.parametrize(
     "film",
     [
-        functools.partial(inspect_films.film, frames=2),
+        functools.partial(films.film, frames=2),
         functools.partial(
-            inspect_films.film, frames=5, card=inspect_films.swaying
+            films.film, frames=5, card=films.swaying
         ),  # too fast to be followed
-        functools.partial(inspect_films.film, blank=True),
+        functools.partial(films.film, blank=True),
     ],
     ids=["two frames", "five frames", "nothing to see"],
 )
@@ -146,15 +143,15 @@ def test_what_cannot_be_seen_decides_nothing_and_says_why(film):
 
 
 def test_frames_of_one_moment_ask_for_no_motion():
-    times = np.zeros(inspect_films.FRAMES, np.float32)
-    film = inspect_films.film(card=inspect_films.swaying, times=times)
+    times = np.zeros(films.FRAMES, np.float32)
+    film = films.film(card=films.swaying, times=times)
     found = inspect_job.inspect(film)
     assert told(found, "motion") == (False, CERTAIN)
     assert "same time" in found.finding("motion").evidence
 
 
 def test_a_card_that_comes_and_goes_is_transient_and_one_that_sways_is_not():
-    film = inspect_films.film(
+    film = films.film(
         card=lambda time: (0.2 * (time - 0.5), 0.0),
         shown=lambda time: 0.2 < time < 0.45 or 0.6 < time < 0.85,
         half=0.26,
@@ -167,16 +164,14 @@ def test_a_card_that_comes_and_goes_is_transient_and_one_that_sways_is_not():
 
 
 def test_depth_is_held_against_parallax():
-    film = inspect_films.film()
-    scene = np.full(film.images.shape[:3], inspect_films.FAR, np.float32)
-    wall = inspect_job.inspect(
-        inspect_films.film(shown=lambda time: False, depths=3.0 * scene)
-    )
+    film = films.film()
+    scene = np.full(film.images.shape[:3], films.FAR, np.float32)
+    wall = inspect_job.inspect(films.film(shown=lambda time: False, depths=3.0 * scene))
     found = wall.finding("depth")
     assert (found.wanted, found.confidence) == (True, CERTAIN)
     assert found.numbers["scale"] == pytest.approx(1 / 3, rel=0.02)
     x = np.linspace(0.5, 2, scene.shape[2], dtype=np.float32)
-    bent = inspect_films.film(shown=lambda time: False, depths=scene * x)
+    bent = films.film(shown=lambda time: False, depths=scene * x)
     wrong = inspect_stored.depth(bent, wall.views, wall.films)
     assert (wrong.wanted, wrong.confidence) == (False, CERTAIN)
 
@@ -191,12 +186,12 @@ def test_masks_are_held_against_what_moves():
 
 
 def test_a_lens_is_measured_in_pixels():
-    film = inspect_films.film()
-    width, height = inspect_films.SIZE
-    corner = np.hypot(width / 2, height / 2) / inspect_films.FOCAL
+    film = films.film()
+    width, height = films.SIZE
+    corner = np.hypot(width / 2, height / 2) / films.FOCAL
     film.cameras.radial[:, 0] = 0.1
     found = inspect_stored.lens(film)
-    expected = 0.1 * corner**3 * inspect_films.FOCAL
+    expected = 0.1 * corner**3 * films.FOCAL
     assert found.numbers["most_px"] == pytest.approx(expected, rel=1e-4)
     assert found.wanted
     film.cameras.radial[:, 0] = 0
@@ -205,21 +200,21 @@ def test_a_lens_is_measured_in_pixels():
 
 @pytest.mark.parametrize("period_px", [4.0, 12.0])
 def test_the_finest_detail_is_that_of_the_picture(period_px):
-    film = inspect_films.film()
-    width, height = inspect_films.SIZE
+    film = films.film()
+    width, height = films.SIZE
     wave = 0.5 + 0.3 * np.sin(2 * np.pi * np.arange(width) / period_px)
-    grey = np.tile(wave, (inspect_films.FRAMES, height, 1)).astype(np.float32)
-    found = inspect_bands.texture(film, still().views._replace(grey=grey), 1)
+    grey = np.tile(wave, (films.FRAMES, height, 1)).astype(np.float32)
+    found = texture.texture(film, still().views._replace(grey=grey), 1)
     # A Hann window of 96 pixels smears a frequency by two lines of its spectrum.
     slack = 2 * period_px / width
     assert found.numbers["finest_px"] == pytest.approx(period_px, rel=slack)
-    halved = inspect_bands.texture(film, still().views._replace(grey=grey), 2)
+    halved = texture.texture(film, still().views._replace(grey=grey), 2)
     assert halved.numbers["finest_px"] == 2 * found.numbers["finest_px"]
 
 
 @pytest.mark.parametrize("cycles", [0.1, 0.9, 7.0, 100.0])
 def test_the_last_band_is_fast_enough_and_the_one_before_is_not(cycles):
-    bands = inspect_bands.bands_for(cycles)
+    bands = texture.bands_for(cycles)
     assert 2 ** (bands - 1) >= 2 * np.pi * cycles or bands == 1
     assert bands == 1 or 2 ** (bands - 2) < 2 * np.pi * cycles
 
@@ -230,7 +225,7 @@ def test_the_last_band_is_fast_enough_and_the_one_before_is_not(cycles):
     ids=["at rest", "turning"],
 )
 def test_outlines_tell_motion_where_no_flow_can(turn, answer):
-    film = inspect_films.rod(turn)
+    film = films.rod(turn)
     found = inspect_job.inspect(film).finding("motion")
     assert (found.wanted, found.confidence) == answer
     assert "outlines" in found.evidence
@@ -252,14 +247,14 @@ def test_outlines_tell_motion_where_no_flow_can(turn, answer):
     ],
 )
 def test_confidence_is_the_distance_to_the_threshold(value, error, told):
-    assert inspect_findings.judge(value, 1.0, error) == told
+    assert findings.judge(value, 1.0, error) == told
 
 
 def test_the_command_line_prints_the_table_and_writes_both_files(
     tmp_path, capsys, monkeypatch
 ):
-    monkeypatch.setattr(settings, "start_jax", lambda *_: None)
-    nerfies_format.write(inspect_films.film(), tmp_path / "film")
+    monkeypatch.setattr(platform, "start_jax", lambda *_: None)
+    nerfies_format.write(films.film(), tmp_path / "film")
     names = ("sheet.png", "found.json")
     sheet, found = (tmp_path / name for name in names)
     inspect_scene.main(
@@ -272,13 +267,16 @@ def test_the_command_line_prints_the_table_and_writes_both_files(
     stored = json.loads(found.read_text())
     by_name = {one["effect"]: one for one in stored["findings"]}
     assert by_name["motion"]["wanted"] is False
-    assert {one["representation"] for one in stored["advice"]} == {"splats", "fields"}
+    assert {one["representation"] for one in stored["advice"]} == {
+        "gaussians",
+        "radiance",
+    }
 
 
 def test_a_capture_that_is_not_there_is_one_line_and_exit_code_two(
     tmp_path, capsys, monkeypatch
 ):
-    monkeypatch.setattr(settings, "start_jax", lambda *_: None)
+    monkeypatch.setattr(platform, "start_jax", lambda *_: None)
     with pytest.raises(SystemExit) as stop:
         inspect_scene.main([str(tmp_path / "none")])
     assert stop.value.code == 2

@@ -4,15 +4,16 @@ import typing
 
 import pytest
 
-from experiments import make_scene, settings
+from experiments import make_scene
 from nerfies_jax import capture
 from nerfies_jax.capture import synthetic
 from nerfies_jax.capture.synthetic import truth
+from nerfies_jax.runs import platform
 
 
 @pytest.fixture(autouse=True)
 def no_global_settings(monkeypatch):
-    monkeypatch.setattr(settings, "start_jax", lambda device: None)
+    monkeypatch.setattr(platform, "start_jax", lambda device: None)
 
 
 def test_a_scene_is_written_and_loads_as_a_capture(tmp_path, capsys):

@@ -7,8 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import motion_rank, motion_rank_report, motion_tracks
-from experiments.motion_rank import MotionRank, Row
+from experiments.motion_rank import __main__ as motion_rank
+from experiments.motion_rank import report
+from experiments.motion_rank import tracks as motion_tracks
+from experiments.motion_rank.__main__ import MotionRank, Row
 
 TINY = dict(kinds=("rigid",), counts=(2,), seeds=1, steps=30, points=8, times=12)
 
@@ -137,15 +139,15 @@ def rows_of(**errors):
 
 def test_the_sentences_follow_the_numbers():
     """Also where they contradict the paper."""
-    said = motion_rank_report.said(rows_of(time=1.0, moving=0.4, residual=0.3))
+    said = report.said(rows_of(time=1.0, moving=0.4, residual=0.3))
     assert "0.40 of the time basis' error" in said
     assert "0.5 shows" in said
     assert "0.75 of the moving basis' error" in said
     assert "the basis is not what helps" in said
-    said = motion_rank_report.said(rows_of(time=1.0, moving=0.9, residual=1.8))
+    said = report.said(rows_of(time=1.0, moving=0.9, residual=1.8))
     assert "0.5 DOES NOT SHOW" in said
     assert "better one" not in said
-    assert "better one, on held-out times, at K=4." in motion_rank_report.said(
+    assert "better one, on held-out times, at K=4." in report.said(
         rows_of(time=0.1, moving=0.9)
     )
     assert "2.00 of the moving basis' error" in said

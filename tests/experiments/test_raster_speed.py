@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import raster_baselines, raster_speed
+from experiments.raster_speed import __main__ as raster_speed
+from experiments.raster_speed import baselines
 from gaussians_jax import raster
 
 CASE = "150@40x24"
@@ -24,8 +25,8 @@ def test_dense_and_lockstep_draw_the_same_picture_and_slopes(case):
     expected = case.gradient()(*case.arguments())
     image, left = case.forward()(case.footprints, case.values)
     for drawing, sizes in (
-        (raster_baselines.dense, {}),
-        (raster_baselines.lockstep, dict(pairs=pairs, longest=longest)),
+        (baselines.dense, {}),
+        (baselines.lockstep, dict(pairs=pairs, longest=longest)),
     ):
         picture = case.forward(drawing, **sizes)(case.footprints, case.values)
         np.testing.assert_allclose(picture[0], image, atol=2e-5)

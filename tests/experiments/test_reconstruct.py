@@ -10,18 +10,12 @@ import numpy as np
 import pytest
 from matplotlib import colormaps
 
-from experiments import (
-    compare,
-    evaluate,
-    pictures,
-    products,
-    reconstruct,
-    render,
-    representations,
-    runs,
-)
+from experiments import compare, reconstruct, render
 from gaussians_jax import model_file, scene
+from nerfies_jax import evaluation, runs
 from nerfies_jax.capture import exr, images, nerfies_format, video
+from nerfies_jax.evaluation import pictures
+from nerfies_jax.runs import products, representations
 from nerfies_jax.training.model import TrainState
 from tests import scenes
 
@@ -255,8 +249,8 @@ def test_the_model_file_is_enough_to_draw_a_frame(run):
     state = TrainState(params, (), (), jnp.asarray(about["step"], jnp.int32), None)
     capture = scenes.tiny_capture()
     filmed = runs.saved_run(run)
-    renderer = evaluate.Renderer(model, filmed.capture.size)
-    found = evaluate.score(renderer, state, filmed.capture, filmed.capture.heldout)
+    renderer = evaluation.Renderer(model, filmed.capture.size)
+    found = evaluation.score(renderer, state, filmed.capture, filmed.capture.heldout)
     metrics = json.loads((run / "metrics.json").read_text())
     np.testing.assert_allclose(found.psnr.mean(), metrics["heldout.psnr"], atol=1e-3)
     assert found.colour.shape[1:3] == capture.size[::-1]

@@ -4,7 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import solver_problems, solver_table
+from experiments.solver_table import __main__ as solver_table
+from experiments.solver_table import problems
 from nerfies_jax.training.fit import move_camera
 
 SMALL = dict(
@@ -42,25 +43,25 @@ def test_the_table_holds_solvers_against_the_best_known_code(tmp_path, capsys):
 
 def test_held_out_pictures_are_not_among_the_known_ones():
     settings = solver_table.Settings(**SMALL | {"training_steps": 1})
-    task = solver_problems.code_problem(settings)
-    known = solver_problems.pattern(np.arange(3) / 3, 6)
+    task = problems.code_problem(settings)
+    known = problems.pattern(np.arange(3) / 3, 6)
     apart = np.abs(np.asarray(task.unseen)[:, None] - known).max((2, 3))
     assert apart.min() > 0.05
 
 
 def test_the_pose_found_leaves_the_noise_alone():
-    task = solver_problems.pose_problem(solver_table.Settings(frames=1))
+    task = problems.pose_problem(solver_table.Settings(frames=1))
     pixels = task.unseen[0]
 
     def residuals(numbers):
         return np.sqrt(float(task.loss(jnp.asarray(numbers, jnp.float32), pixels)))
 
-    found = task.solvers[solver_problems.LEVENBERG](pixels, most=20)
+    found = task.solvers[problems.LEVENBERG](pixels, most=20)
     assert bool(found.converged)
     assert 0 < found.steps <= 20
     # Two numbers of noise a point, six of which the pose takes away.
-    points = solver_problems.POINTS
-    left = solver_problems.NOISE_PX * np.sqrt((2 * points - 6) / points)
+    points = problems.POINTS
+    left = problems.NOISE_PX * np.sqrt((2 * points - 6) / points)
     np.testing.assert_allclose(residuals(found.value), left, rtol=0.1)
     for axis in range(6):
         for sign in (-1, 1):
@@ -69,10 +70,10 @@ def test_the_pose_found_leaves_the_noise_alone():
 
 
 def test_a_screw_between_cameras_is_that_which_moved_one():
-    camera = solver_problems.looking_down_z()
+    camera = problems.looking_down_z()
     screw = jnp.asarray([0.3, -0.2, 0.1, 0.5, -0.4, 0.2])
     moved = move_camera(camera, screw[:3], screw[3:])
-    found = solver_problems.screw_between(camera, moved)
+    found = problems.screw_between(camera, moved)
     np.testing.assert_allclose(found, screw, atol=1e-6)
 
 
@@ -80,7 +81,7 @@ def test_an_empty_table_is_refused():
     with pytest.raises(ValueError, match="must be among"):
         solver_table.Settings(solvers=("newton",))
     with pytest.raises(ValueError, match="must be among"):
-        solver_table.Settings(solvers=(solver_problems.LEVENBERG,))
+        solver_table.Settings(solvers=(problems.LEVENBERG,))
     with pytest.raises(ValueError, match="at least 1"):
         solver_table.Settings(frames=0)
     with pytest.raises(ValueError, match="at least 1"):

@@ -9,8 +9,9 @@ import numpy as np
 import optax
 import pytest
 
-from experiments import spectral_bias, spectral_bias_report
-from experiments.spectral_bias import Result, Signal, SpectralBias
+from experiments.spectral_bias import __main__ as spectral_bias
+from experiments.spectral_bias import report
+from experiments.spectral_bias.__main__ import Result, Signal, SpectralBias
 
 SMALL = Signal(np.array([[1.0], [3.0]]), np.array([0.3, 1.1]), 60, 2)
 
@@ -37,7 +38,7 @@ def test_planted_errors_are_found_at_their_frequencies(label):
     exact = math.sqrt(np.mean(planted**2) + 0.02)
     assert float(rmse) == pytest.approx(exact, rel=1e-5)
     row = result(rmse=[float(rmse)], missing=[np.asarray(missing).tolist()])
-    assert spectral_bias_report.other(row) == pytest.approx(0.02**0.5, rel=1e-4)
+    assert report.other(row) == pytest.approx(0.02**0.5, rel=1e-4)
 
 
 @pytest.mark.parametrize("label", ["1-D", "2-D"])
@@ -172,29 +173,29 @@ def planted(kan, relu):
 
 
 def test_the_sentences_follow_from_the_numbers():
-    text = spectral_bias_report.said(planted(0.1, 0.3))
+    text = report.said(planted(0.1, 0.3))
     assert (
         "2-D, equal steps: best is kan (0.1000), then relu + encoding (0.3000)" in text
     )
     assert "has 0.33 of the error" in text
     assert "2-D signal: holds" in text
-    text = spectral_bias_report.said(planted(0.2, 0.3))
+    text = report.said(planted(0.2, 0.3))
     assert "has 0.67 of the error" in text
     assert "DOES NOT HOLD" in text
-    text = spectral_bias_report.said(planted(0.6, 0.3))
+    text = report.said(planted(0.6, 0.3))
     assert "(relu + encoding): worse" in text
     assert "(sine): worse" in text
 
 
 def test_the_table_and_the_figure_show_every_network(tmp_path):
     waves = {"2-D": np.array([[1.0, 1.0], [3.0, -2.0]])}
-    text = spectral_bias_report.tables(planted(0.1, 0.3), waves)
+    text = report.tables(planted(0.1, 0.3), waves)
     assert text.count("k=3,-2") == 2
     line = next(x for x in text.splitlines() if x.startswith("relu + encoding"))
     assert line.split()[3:] == [
         *("100", "0.01", "10", "1.00", "0.3000", "0.0000", "0.2000", "0.3000", "0.1275")
     ]  # the last: sqrt(0.09 - 0.025) of the first seed, nothing of the second
-    spectral_bias_report.draw_figure(planted(0.1, 0.3), waves, tmp_path / "bias.png")
+    report.draw_figure(planted(0.1, 0.3), waves, tmp_path / "bias.png")
     assert (tmp_path / "bias.png").stat().st_size > 10_000
 
 

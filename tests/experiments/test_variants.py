@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import evaluate, held_out_codes, variants
+from experiments import variants
 from gaussians_jax import scene, splats, still_rows
 from gaussians_jax.splats import Gaussians
+from nerfies_jax import evaluation, held_out_codes
 from nerfies_jax import scene as nerf_scene
 from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.effects.warp import WarpSpec
@@ -30,7 +31,7 @@ def moving():
     model = scene.build(scenes.TINY_DEFORMABLE, facts)
     params = model.init(capture, jax.random.key(0)).params
     nets = jax.tree.map(lambda leaf: leaf + 0.05, params.nets)
-    view = evaluate.view_of(capture, int(capture.heldout[0]))
+    view = evaluation.view_of(capture, int(capture.heldout[0]))
     return facts, model, params._replace(nets=nets), view
 
 
@@ -104,17 +105,17 @@ def test_a_motion_from_knots_is_met_at_the_knots_and_near_between(swaying):
 
 def test_a_faster_model_draws_what_the_model_draws(swaying):
     model, state = swaying
-    view = evaluate.view_of(scenes.tiny_capture(), 0)
+    view = evaluation.view_of(scenes.tiny_capture(), 0)
     view = view._replace(time=jnp.asarray(0.3))
     made = variants.from_knots(model, state, 40, "cubic")
     whole = made.model._replace(stages=None)  # by its `render`
     exact, staged, found = (
-        evaluate.Renderer(model, SIZE)(state, view).colour
+        evaluation.Renderer(model, SIZE)(state, view).colour
         for model, state in ((model, state), made[:2], (whole, made.state))
     )
     still = variants.of_splats(*model.spec, ("motion",), False)
     assert (
-        np.abs(evaluate.Renderer(still, SIZE)(state, view).colour - exact).max() > 0.1
+        np.abs(evaluation.Renderer(still, SIZE)(state, view).colour - exact).max() > 0.1
     )
     np.testing.assert_allclose(staged, exact, atol=1e-3)
     np.testing.assert_allclose(found, staged, atol=1e-5)
@@ -173,13 +174,13 @@ def test_what_moves_may_be_left_out(swaying):
     assert f"{living.sum() - shown.sum()} of {living.sum()} Gaussians" in summary
     # What is left is drawn as it was, wherever it still moves a little
     alone = splats.take_rows(state.params, jnp.asarray(np.flatnonzero(shown)))
-    view = evaluate.view_of(scenes.tiny_capture(), 0)
+    view = evaluation.view_of(scenes.tiny_capture(), 0)
     found, expected = (
-        evaluate.Renderer(model, SIZE)(one, view).colour
+        evaluation.Renderer(model, SIZE)(one, view).colour
         for one in (left, state._replace(params=alone))
     )
     np.testing.assert_allclose(found, expected, atol=1e-6)
-    everything = evaluate.Renderer(model, SIZE)(state, view).colour
+    everything = evaluation.Renderer(model, SIZE)(state, view).colour
     assert np.abs(found - everything).max() > 0.02
 
 
@@ -232,7 +233,7 @@ def field():
     params = nerf_scene.field(TINY_FIELD, facts).init(jax.random.key(3))
     params["warp"] = jax.tree.map(lambda leaf: leaf + 0.1, params["warp"])
     params["codes"] = jax.tree.map(lambda leaf: 40 * leaf, params["codes"])
-    view = evaluate.view_of(capture, int(capture.heldout[0]))
+    view = evaluation.view_of(capture, int(capture.heldout[0]))
     return facts, params, view
 
 
@@ -293,11 +294,11 @@ def repainted(capture, field, rows):
     draw = jax.jit(made.render, static_argnums=4)
     step, pictures = jnp.asarray(10, jnp.int32), capture.images.copy()
     for row in rows:
-        view = evaluate.view_of(capture, int(row))
+        view = evaluation.view_of(capture, int(row))
         codes = made.codes_at(params, view)
         codes["appearance"] = jnp.asarray([3.0, -4.0, 2.0])
         colour = draw(params, view.camera, view.time, codes, capture.size, step).colour
-        pictures[row] = evaluate.as_picture(np.asarray(colour))
+        pictures[row] = evaluation.as_picture(np.asarray(colour))
     return dataclasses.replace(capture, images=pictures)
 
 
@@ -309,9 +310,9 @@ def test_a_code_is_found_again_from_half_a_picture(field):
     capture = repainted(capture, field, rows)
     state = TrainState(params, (), (), jnp.asarray(10, jnp.int32), jax.random.key(0))
     model = nerf_scene.build(TINY_FIELD, facts)
-    renderer = evaluate.Renderer(model, capture.size)
-    before = evaluate.score_right_halves(
-        capture, rows, evaluate.score(renderer, state, capture, rows).colour
+    renderer = evaluation.Renderer(model, capture.size)
+    before = evaluation.score_right_halves(
+        capture, rows, evaluation.score(renderer, state, capture, rows).colour
     )
     found = held_out_codes.score(TINY_FIELD, facts, state, capture, rows)
     assert before.psnr[0] < 35
@@ -328,9 +329,9 @@ def test_a_half_that_was_not_filmed_keeps_the_code_it_had(field):
     valid[:, :, :20] = False
     capture = dataclasses.replace(repainted(capture, field, rows), valid=valid)
     state = TrainState(params, (), (), jnp.asarray(10, jnp.int32), jax.random.key(0))
-    renderer = evaluate.Renderer(nerf_scene.build(TINY_FIELD, facts), capture.size)
-    colour = evaluate.score(renderer, state, capture, rows).colour
-    before = evaluate.score_right_halves(capture, rows, colour)
+    renderer = evaluation.Renderer(nerf_scene.build(TINY_FIELD, facts), capture.size)
+    colour = evaluation.score(renderer, state, capture, rows).colour
+    before = evaluation.score_right_halves(capture, rows, colour)
     found = held_out_codes.score(TINY_FIELD, facts, state, capture, rows)
     np.testing.assert_allclose(found.psnr, before.psnr, atol=1e-3)
 

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import evaluate
 from gaussians_jax import model_file, scene, splats
 from gaussians_jax.splats import Params
+from nerfies_jax import evaluation
 from tests import scenes
 
 SIZE = (20, 15)
@@ -65,7 +65,7 @@ def test_the_file_is_about_as_large_as_its_numbers(trained, saved):
 
 def test_a_frame_is_drawn_from_the_file_alone(trained, saved):
     params, about = trained
-    view = evaluate.view_of(scenes.tiny_capture(), 3)
+    view = evaluation.view_of(scenes.tiny_capture(), 3)
     pictures = []
     for params, about in (trained, model_file.load(saved)):
         model = scene.build(about["spec"], about["facts"])

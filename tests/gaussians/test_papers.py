@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import rich.console
 
-from experiments import evaluate
 from gaussians_jax import scene
 from gaussians_jax.effects import deformation
 from gaussians_jax.effects.effect import Moment
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec
 from gaussians_jax.phases import AlternationSpec
 from gaussians_jax.spec import effects_of, refuse_what_cannot_train
+from nerfies_jax import evaluation
 from nerfies_jax.training import checkpoint, loop
 from tests import gradients, scenes
 
@@ -32,7 +32,7 @@ def facts():
 def made(paper):
     capture = scenes.tiny_capture()
     model = scene.build(PAPERS[paper], facts())
-    frames = evaluate.frames_of(capture, model.wants)
+    frames = evaluation.frames_of(capture, model.wants)
     return model, frames
 
 
@@ -53,8 +53,8 @@ def straight(paper):
 
 def psnr(paper, state):
     capture = scenes.tiny_capture()
-    renderer = evaluate.Renderer(made(paper)[0], capture.size)
-    return evaluate.score(renderer, state, capture, capture.train).psnr.mean()
+    renderer = evaluation.Renderer(made(paper)[0], capture.size)
+    return evaluation.score(renderer, state, capture, capture.train).psnr.mean()
 
 
 @pytest.mark.slow
@@ -110,7 +110,7 @@ def test_the_loss_of_a_whole_step_has_the_right_slope(paper, float64):
         motion = dataclasses.replace(spec.motion, detach=False)
         spec = dataclasses.replace(spec, motion=motion)
     effects = effects_of(spec, known)
-    model, frames = scene.build(spec, known), evaluate.frames_of(capture, {"depths"})
+    model, frames = scene.build(spec, known), evaluation.frames_of(capture, {"depths"})
     state = model.init(capture, jax.random.key(3))
     keys = iter(jax.random.split(jax.random.key(4), 100))
 
@@ -126,7 +126,7 @@ def test_the_loss_of_a_whole_step_has_the_right_slope(paper, float64):
         )
 
     params = wide(state.params)._replace(nets=jax.tree.map(awake, state.params.nets))
-    view = wide(evaluate.view_of(capture, int(capture.train[2])))
+    view = wide(evaluation.view_of(capture, int(capture.train[2])))
     truth = wide(scene.shot(frames, 2, None))
     carried = wide(scene.carried_by(effects, params))
     step = jnp.asarray(20, jnp.int32)
@@ -155,8 +155,8 @@ def test_the_loss_of_a_whole_step_has_the_right_slope(paper, float64):
 def test_stages_draw_what_render_draws(paper):
     model, _ = made(paper)
     state, capture = straight(paper).state, scenes.tiny_capture()
-    view = evaluate.view_of(capture, int(capture.heldout[0]))
-    renderer = evaluate.Renderer(model, capture.size)
+    view = evaluation.view_of(capture, int(capture.heldout[0]))
+    renderer = evaluation.Renderer(model, capture.size)
     whole = jax.jit(model.render, static_argnums=2)
     expected = whole(state.params, view, capture.size, state.step)
     for a, b in zip(renderer(state, view), expected, strict=True):

@@ -11,11 +11,11 @@ import numpy as np
 import optax
 import pytest
 
-from experiments import evaluate
 from gaussians_jax import phases, scene
 from gaussians_jax.optimiser import scale_by_row_adam, scale_by_row_radam
 from gaussians_jax.phases import AlternationSpec, AnnealingSpec, Trained, Turn
 from gaussians_jax.splats import Params, Splats
+from nerfies_jax import evaluation
 from tests import gradients, scenes
 
 COUNT = 5
@@ -349,7 +349,7 @@ def test_a_scene_trains_one_group_at_a_time_in_one_program():
     )
     capture = scenes.tiny_capture()
     model = scene.build(spec, scene.facts_of(capture))
-    step, frames = jax.jit(model.step), evaluate.frames_of(capture)
+    step, frames = jax.jit(model.step), evaluation.frames_of(capture)
     states = [model.init(capture, jax.random.key(0))]
     for _ in range(14):
         states.append(step(states[-1], frames)[0])

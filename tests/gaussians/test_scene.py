@@ -9,13 +9,13 @@ import numpy as np
 import optax
 import pytest
 
-from experiments import evaluate
 from gaussians_jax import presets, rates, scene, splats, start
 from gaussians_jax.optimiser import scale_by_row_adam
 from gaussians_jax.rates import RateSpec
 from gaussians_jax.spec import Facts, SplatScene
 from gaussians_jax.splats import Params, Splats
 from gaussians_jax.start import StartSpec
+from nerfies_jax import evaluation
 from tests import scenes
 
 KEY = 3
@@ -25,7 +25,11 @@ KEY = 3
 def started(spec):
     capture = scenes.tiny_capture()
     model = scene.build(spec, scene.facts_of(capture))
-    return model, model.init(capture, jax.random.key(KEY)), evaluate.frames_of(capture)
+    return (
+        model,
+        model.init(capture, jax.random.key(KEY)),
+        evaluation.frames_of(capture),
+    )
 
 
 @functools.cache
@@ -150,7 +154,7 @@ def test_an_event_is_a_function_of_the_state():
 def test_a_frame_is_rendered_without_a_step():
     model, state, _ = started(scenes.TINY_DEFORMABLE)
     capture = scenes.tiny_capture()
-    view = evaluate.view_of(capture, int(capture.heldout[0]))
+    view = evaluation.view_of(capture, int(capture.heldout[0]))
     render = jax.jit(model.render, static_argnums=2)
     rendering = render(state.params, view, (20, 15), state.step)
     assert rendering.colour.shape == (15, 20, 3)
@@ -161,7 +165,7 @@ def test_a_frame_is_rendered_without_a_step():
 def test_a_frame_has_the_harmonics_of_its_step():
     model, state, _ = started(scenes.TINY_SPLATS)
     capture = scenes.tiny_capture()
-    view = evaluate.view_of(capture, int(capture.heldout[0]))
+    view = evaluation.view_of(capture, int(capture.heldout[0]))
     rows = state.params.rows["splats"]
     plain = state.params
     shaded = Params({"splats": rows._replace(sh_rest=rows.sh_rest + 0.3)}, {})

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import rich.console
 
-from experiments import evaluate
+from nerfies_jax import evaluation
 from nerfies_jax.training import checkpoint, loop
 from nerfies_jax.training.checkpoint import Checkpoints
 from nerfies_jax.training.loop import FitResult
@@ -25,7 +25,7 @@ BAD_STEP = re.compile(r"is not finite: (metric|params\.|optimiser\.|extra\.)")
 
 def frames_of(capture, wants=frozenset()):
     """The training frames in NumPy, masked; the mask may leave every pixel."""
-    frames = jax.tree.map(np.asarray, evaluate.frames_of(capture, wants))
+    frames = jax.tree.map(np.asarray, evaluation.frames_of(capture, wants))
     if frames.valid is None:
         frames = frames._replace(valid=np.ones(frames.images.shape[:3], bool))
     return frames

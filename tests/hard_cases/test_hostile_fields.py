@@ -7,8 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import evaluate
-from nerfies_jax import scene
+from nerfies_jax import evaluation, scene
 from nerfies_jax.capture.capture import select
 from nerfies_jax.effects import scene_flow_losses as flow_losses
 from tests import scenes
@@ -179,7 +178,7 @@ def test_a_single_frame_has_one_code_at_all_times():
     params = made.init(jax.random.key(0))
     assert set(params["codes"]) == {"motion", "appearance"}
     for row in (0, 1):
-        found = made.codes_at(params, evaluate.view_of(film, row))
+        found = made.codes_at(params, evaluation.view_of(film, row))
         assert found.keys() == params["codes"].keys()
         for table, code in found.items():
             # Blended with itself: an ulp

@@ -12,8 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from experiments import evaluate
-from nerfies_jax import presets, scene
+from nerfies_jax import evaluation, presets, scene
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.facts import Facts
 from nerfies_jax.nets.encoding import EncodingSpec
@@ -138,7 +137,7 @@ def start(spec: RadianceScene, capture: Capture) -> Run:
         params = hostile.sped_up(state.params, new.params, state.extra.speed)
         return new._replace(params=params), metrics
 
-    view = evaluate.view_of(capture, int(capture.train[0]))
+    view = evaluation.view_of(capture, int(capture.train[0]))
 
     @jax.jit
     def picture(state, camera, time) -> Rendering:

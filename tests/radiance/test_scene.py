@@ -8,8 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import evaluate
-from nerfies_jax import scene, tracing
+from nerfies_jax import evaluation, scene, tracing
 from nerfies_jax.effects.ambient import AmbientSpec
 from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.effects.background import BackgroundSpec
@@ -67,7 +66,7 @@ FACTS = Facts(
 def started(spec):
     capture = scenes.tiny_capture()
     model = scene.build(spec, scene.facts_of(capture, spec))
-    frames = evaluate.frames_of(capture, model.wants)
+    frames = evaluation.frames_of(capture, model.wants)
     return model, model.init(capture, jax.random.key(3)), frames
 
 
@@ -86,7 +85,7 @@ def stepped(spec, count):
 def rendered(spec):
     model, state, _ = started(spec)
     capture = scenes.tiny_capture()
-    view = evaluate.view_of(capture, 0)
+    view = evaluation.view_of(capture, 0)
     return jax.jit(lambda p: model.render(p, view, (13, 7), jnp.int32(0)))(state.params)
 
 
@@ -191,7 +190,7 @@ def test_blocks_of_rays_do_not_show_in_a_picture():
 @pytest.mark.slow
 def test_memory_of_a_render_does_not_grow_with_the_picture():
     model, state, _ = started(STATIC)
-    view = evaluate.view_of(scenes.tiny_capture(), 0)
+    view = evaluation.view_of(scenes.tiny_capture(), 0)
 
     def temporaries(size):
         draw = jax.jit(lambda p: model.render(p, view, size, jnp.int32(0)))
@@ -212,7 +211,7 @@ def test_depth_is_along_the_viewing_axis_in_scene_units():
     for net in params["template"].values():
         head = net.trunk.heads["density"]
         net.trunk.heads["density"] = head._replace(bias=head.bias + 1e6)
-    view = evaluate.view_of(capture, 0)
+    view = evaluation.view_of(capture, 0)
     picture = jax.jit(lambda p: model.render(p, view, (9, 7), jnp.int32(0)))(params)
     np.testing.assert_allclose(picture.depth, facts.near, rtol=1e-4)
     np.testing.assert_allclose(picture.alpha, 1, atol=1e-6)

@@ -1,0 +1,59 @@
+"""What each part of a method is worth: the whole of it against itself without the part.
+
+    python -m experiments.ablate                                  # radiance fields
+    python -m experiments.ablate --suite sonata --jobs 4          # Sonata's ablation
+    python -m experiments.ablate --suite moba --steps 2000 --seconds 120 --jobs 4
+    python -m experiments.ablate --arms static nerfies --scene fast --budget 30
+    python -m experiments.ablate --suite sonata --capture FOLDER  # no truth: PSNR, SSIM
+
+All arms of a suite learn the same frames from the same seeds, over as many steps
+(--steps), as much time (--seconds), or first the one and then the other; the last
+iterate counts. Prints a table and what it says of the claims, writes ablation.json and
+ablation.png. Finished arms are kept in --out: the same command goes on where it was
+stopped.
+"""
+
+from experiments import cli
+from experiments.ablate import settings, suites
+from experiments.ablate.settings import Ablate
+from nerfies_jax.runs import platform, representations
+
+
+def main(arguments=None):
+    """Run the job of the command line; exit code 2 where its input is wrong."""
+    with cli.user_errors():
+        asked = cli.parse(Ablate, arguments)
+        settings.check(asked)
+        arms = suites.named(asked.suite).arms
+        kinds = {
+            representations.of_preset(arms[name].preset).threads
+            for name in asked.arms or arms
+        }
+        platform.start_jax(asked.device, "all" if "all" in kinds else "one")
+        from experiments.ablate.job import Job
+
+        job = Job(asked)
+    failed = job.run()
+    if asked.seed is None:
+        _report(job)
+    raise SystemExit(1 if failed else 0)
+
+
+def _report(job):
+    for budget in job.budgets:
+        finished = job.finished(budget)
+        if finished:
+            from experiments.ablate import report
+
+            report.write(job, budget, finished)
+    missing = job.missing()
+    if missing:
+        print(
+            f"{len(missing)} arms and seeds are left: "
+            + ", ".join(f"{name} {seed}" for name, seed in missing)
+            + f"; the same command with --out {job.out} goes on"
+        )
+
+
+if __name__ == "__main__":
+    main()

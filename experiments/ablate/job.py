@@ -1,0 +1,351 @@
+"""Train and measure the arms of an ablation, one after the other."""
+
+import hashlib
+import math
+import os
+import pathlib
+import time
+from typing import Any, NamedTuple
+
+import jax
+import rich.console
+
+from experiments import cli
+from experiments.ablate import results, suites
+from experiments.ablate.log import line, say
+from experiments.ablate.results import Kept
+from experiments.ablate.settings import Ablate
+from nerfies_jax import evaluation, runs
+from nerfies_jax.capture import synthetic
+from nerfies_jax.evaluation import protocol
+from nerfies_jax.measure import clock
+from nerfies_jax.runs import platform, representations
+from nerfies_jax.runs.config import CaptureSource
+from nerfies_jax.training import loop, specs
+
+PILOT_STEPS = 150  # of a whole, short schedule, to see what a step costs
+NEAR_ENOUGH = 0.1  # share of --seconds by which a first seed may miss them
+# JAX's event for a program that was read from the compilation cache.
+SAVED = "/jax/compilation_cache/compile_time_saved_sec"
+
+
+class Budget(NamedTuple):
+    """How long every arm is trained, and where its results are."""
+
+    steps: int | None  # without seconds: None for the preset's own
+    seconds: float | None
+    folder: pathlib.Path
+    share: float | None = None  # of the preset's own steps
+
+    @property
+    def title(self) -> str:
+        """As in "each arm trained ..."."""
+        if self.seconds is not None:
+            return f"for {self.seconds:g} s, in as many steps as that allows"
+        if self.share is not None:
+            return f"over {self.share:g} of its preset's own steps"
+        if self.steps is None:
+            return "over its preset's own steps"
+        return f"over {self.steps} steps"
+
+
+class Built(NamedTuple):
+    """An arm ready to train; kept over its seeds, so that it is compiled once."""
+
+    representation: Any
+    spec: Any
+    facts: Any
+    model: Any
+    renderer: Any
+    compile_seconds: float
+
+
+class Job:
+    """A capture, what is known of it, and the folder that holds what was finished."""
+
+    def __init__(self, asked: Ablate):
+        self.asked, self.suite = asked, suites.named(asked.suite)
+        if asked.jobs > 1 and jax.default_backend() != "cpu":
+            raise ValueError(
+                f"--jobs {asked.jobs}: several processes would fight for one "
+                f"{jax.default_backend()}; leave it out, or use --device cpu"
+            )
+        self._open()
+        self.names = asked.arms or tuple(
+            name
+            for name, arm in self.suite.arms.items()
+            if arm.needs is None or getattr(self.capture, arm.needs) is not None
+        )
+        self.seeds = asked.all_seeds if asked.seed is None else (asked.seed,)
+        for name in self.names:  # refuses wrong settings before any training
+            self.spec(name, asked.steps)
+        stem = f"ablation-{asked.suite}-{'-'.join(self.capture.name.split())}"
+        if asked.suite == "fields" and asked.source.capture is None:
+            stem = f"ablation-{asked.source.scene}"
+        self.out = asked.out or pathlib.Path("runs", stem)
+        self.budgets = []
+        if asked.seconds is None or asked.steps is not None:
+            self.budgets.append(Budget(asked.steps, None, self.out, asked.share))
+        if asked.seconds is not None:
+            folder = self.out / f"seconds-{asked.seconds:g}"
+            self.budgets.append(Budget(None, asked.seconds, folder))
+        for budget in self.budgets:
+            budget.folder.mkdir(parents=True, exist_ok=True)
+        self._built: dict[tuple[str, int], Built] = {}
+        self._cache_saved = 0.0
+        jax.monitoring.register_event_duration_secs_listener(self._listen)
+
+    def _open(self):
+        """The capture; a built-in scene comes with its truth."""
+        asked, source = self.asked, self.asked.source
+        if source == CaptureSource(scene=source.scene) and (
+            source.scene in synthetic.PRESETS
+        ):
+            film = synthetic.PRESETS[source.scene]
+            self.filmed = synthetic.digest(film)
+            self.capture, truth = synthetic.cached(film, platform.CACHE / "scenes")
+            self.known = protocol.known(self.capture, truth, asked.frames, asked.tracks)
+            return
+        self.capture = runs.read_capture(source)
+        self.filmed = hashlib.sha256(self.capture.images.tobytes()).hexdigest()[:16]
+        self.known = protocol.filmed(self.capture, asked.frames)
+
+    def _listen(self, event, seconds, **_):
+        if event == SAVED:
+            self._cache_saved += seconds
+
+    def spec(self, name: str, steps: int | None) -> Any:
+        """The preset of an arm over so many steps, with what is changed in it."""
+        arm = self.suite.arms[name]
+        representation = representations.of_preset(arm.preset)
+        spec = representation.presets[arm.preset]
+        if steps is None and self.asked.share is not None:
+            steps = max(1, round(self.asked.share * spec.steps))
+        if steps is not None:
+            spec = representation.with_steps(spec, steps)
+        return specs.override(spec, (*arm.changes, *self.asked.set))
+
+    def tasks(self) -> list[tuple[str, int]]:
+        """All arms of the first seed, then of the next."""
+        return [(name, seed) for seed in self.seeds for name in self.names]
+
+    def run(self) -> list[tuple[str, int]]:
+        """Make what is not there yet; returns the arms and seeds that failed."""
+        if self.asked.jobs > 1:
+            from experiments.ablate import pool
+
+            cores = len(os.sched_getaffinity(0))
+            if self.asked.jobs > cores:
+                say(f"{cores} cores for {self.asked.jobs} jobs: their times will tell")
+            return pool.run(self)
+        began, longest = time.monotonic(), 0.0
+        tasks = self.tasks()
+        for number, (name, seed) in enumerate(tasks, 1):
+            if self.is_finished(name, seed):
+                continue
+            spent = time.monotonic() - began
+            if self.is_over(spent, longest):
+                break
+            say(f"[{number}/{len(tasks)}] {name}, seed {seed}, after {spent:.0f} s")
+            for budget in self.budgets:
+                self.make(name, seed, budget)
+            longest = max(longest, time.monotonic() - began - spent)
+        return []
+
+    def is_over(self, spent: float, longest: float) -> bool:
+        """Whether another arm might end after the --budget."""
+        minutes = self.asked.budget
+        return minutes is not None and spent + longest > 60 * minutes
+
+    def make(self, name: str, seed: int, budget: Budget) -> None:
+        """Train an arm and write down where it ends, unless that is there already."""
+        path = self.path(name, seed, budget)
+        with results.claimed(path) as ours:
+            if not ours:
+                say(f"    {path}: another process is making it; left to that one")
+                return
+            if self.kept(name, seed, budget) is not None:
+                return
+            with cli.user_errors():
+                self._check_environment(name)
+            if budget.seconds is None:
+                steps = self.spec(name, budget.steps).steps
+                kept = self._train(name, seed, steps)
+            elif seed == 0:
+                steps, kept = self._train_for(name, budget)
+            else:
+                with cli.user_errors():
+                    steps = self._steps(name, budget)
+                kept = self._train(name, seed, steps)
+            identity = self._identity(name, seed, steps, budget)
+            results.write(path, identity, kept)
+        say("    " + line(kept.numbers))
+
+    def _check_environment(self, name):
+        for variable, value in self.suite.arms[name].variables.items():
+            if os.environ.get(variable) != value:
+                raise ValueError(
+                    f"{name} is trained under {variable}={value}: set it, or give "
+                    "--jobs 2, which gives every arm a process and sets it there"
+                )
+
+    def _train_for(self, name, budget) -> tuple[int, Kept]:
+        """The first seed, over as many steps as can be made in the time given.
+
+        What a step costs is seen on the arm's run over --steps where there is one, or
+        on a short pilot. It depends on the number of steps, as Gaussians grow: where
+        the first try misses the time by too much, there is a second one.
+        """
+        other = None
+        if self.budgets[0] is not budget:
+            other = self.kept(name, 0, self.budgets[0])
+        pilot = other or self._train(name, 0, PILOT_STEPS)
+        steps = _affordable(pilot, budget.seconds)
+        kept = self._train(name, 0, steps)
+        took = kept.numbers["train_seconds"]
+        missed = abs(took / budget.seconds - 1) > NEAR_ENOUGH
+        if missed and kept.notes["stopped_by"] == "steps":
+            say(f"    {steps} steps took {took:.1f} s: once more, with a better guess")
+            steps = _affordable(kept, budget.seconds, pilot)
+            kept = self._train(name, 0, steps)
+        return steps, kept
+
+    def _train(self, name, seed, steps) -> Kept:
+        """Train one arm from the start, and measure where it ends."""
+        compiled_before = (name, steps) in self._built
+        arm = self._build(name, steps)
+        state = arm.model.init(self.capture, jax.random.key(seed))
+        frames = evaluation.frames_of(self.capture, arm.model.wants)
+        began, self._cache_saved = time.process_time(), 0.0
+        result = loop.fit(arm.model, state, frames, steps=steps)
+        # Compiling is taken out by its share of the time: its CPU time is not known.
+        share = result.seconds / (result.seconds + result.compile_seconds)
+        cpu_seconds = share * (time.process_time() - began)
+        compile_seconds = result.compile_seconds + self._cache_saved
+        if result.stopped_by.startswith("SIG"):
+            print(f"stopped; go on with the same command and --out {self.out}")
+            raise SystemExit(130 if result.stopped_by == "SIGINT" else 143)
+        scored, pictures = protocol.score_pictures(
+            arm.renderer, result.state, self.capture, self.known
+        )
+        followed = arm.representation.follow(
+            arm.spec, arm.facts, result.state, self.capture, self.known
+        )
+        counts = arm.model.counts(result.state)
+        numbers = {
+            **pictures,
+            **protocol.score_tracks(self.known, followed),
+            "gaussians": float(counts.get("gaussians", float("nan"))),
+            "parameters": float(counts["parameters"]),
+            "steps": float(result.steps),
+            "train_seconds": result.seconds,
+            "train_cpu_seconds": cpu_seconds,
+            "compile_seconds": arm.compile_seconds + compile_seconds,
+            # Jobs side by side double what the wall clock says.
+            "render_ms": arm.renderer.ms_per_frame(
+                len(self.known.rows), cpu=jax.default_backend() == "cpu"
+            ),
+            "peak_mb": clock.peak_bytes() / 1e6,
+        }
+        if compiled_before:  # most of it in this very process
+            numbers["compile_seconds"] = float("nan")
+        if len(self._built) > 1:  # what came before it counts, too
+            numbers["peak_mb"] = float("nan")
+        arrays = {"colour": evaluation.as_picture(scored.colour), "depth": scored.depth}
+        notes = {"steps": result.steps, "stopped_by": result.stopped_by}
+        if followed is not None:
+            arrays |= {"path": followed.path, "found": followed.found}
+            notes["points"] = len(followed.found)
+            notes["points_ever_lost"] = int((~followed.found.all(axis=1)).sum())
+        return Kept(numbers, arrays, notes)
+
+    def _build(self, name, steps) -> Built:
+        """The arm, its step compiled by one step that is thrown away."""
+        if (name, steps) not in self._built:
+            spec = self.spec(name, steps)
+            preset = self.suite.arms[name].preset
+            representation = representations.of_preset(preset)
+            facts = representation.facts_of(self.capture, spec)
+            model = representation.build(spec, facts)
+            self._cache_saved = 0.0
+            first = loop.fit(
+                model,
+                model.init(self.capture, jax.random.key(0)),
+                evaluation.frames_of(self.capture, model.wants),
+                steps=1,
+                console=rich.console.Console(quiet=True),
+            )
+            seconds = first.compile_seconds + self._cache_saved
+            renderer = evaluation.Renderer(model, self.capture.size)
+            self._built[name, steps] = Built(
+                representation, spec, facts, model, renderer, seconds
+            )
+        return self._built[name, steps]
+
+    def _steps(self, name, budget) -> int:
+        """Those of the first seed, so that seeds differ in nothing else."""
+        steps = results.steps_of(self.path(name, 0, budget))
+        if steps is None:
+            raise ValueError(
+                f"{self.path(name, 0, budget)} is not there: seed 0 of {name} finds "
+                "how many steps fit into --seconds, train it first"
+            )
+        return steps
+
+    def _identity(self, name, seed, steps, budget) -> dict[str, Any]:
+        """What a kept arm must have been made with to be taken over."""
+        return {
+            "scene": self.filmed,
+            "arm": name,
+            "seed": seed,
+            "steps": steps,
+            "seconds": budget.seconds,
+            "spec": specs.as_json(self.spec(name, steps)),
+            "rows": self.known.rows.tolist(),
+            "tracks": len(self.known.path),
+            "start": self.known.start,
+        }
+
+    def path(self, name: str, seed: int, budget: Budget) -> pathlib.Path:
+        """Where an arm's numbers are when it is finished; its pictures are beside."""
+        return budget.folder / f"{name}-{seed}.json"
+
+    def kept(self, name: str, seed: int, budget: Budget) -> Kept | None:
+        """A finished arm; exit code 2 where it is one of another experiment."""
+        path = self.path(name, seed, budget)
+        with cli.user_errors():
+            if not path.is_file():
+                return None
+            steps = self.spec(name, budget.steps).steps
+            if budget.seconds is not None:
+                steps = self._steps(name, budget)
+            return results.read(path, self._identity(name, seed, steps, budget))
+
+    def is_finished(self, name: str, seed: int) -> bool:
+        """Whether an arm is there for every budget."""
+        return all(self.kept(name, seed, b) is not None for b in self.budgets)
+
+    def finished(self, budget: Budget) -> dict[tuple[str, int], Kept]:
+        """By arm and seed, what is there."""
+        found = {task: self.kept(*task, budget) for task in self.tasks()}
+        return {task: kept for task, kept in found.items() if kept is not None}
+
+    def missing(self) -> list[tuple[str, int]]:
+        """Arms and seeds that are not finished."""
+        return [task for task in self.tasks() if not self.is_finished(*task)]
+
+
+def _affordable(kept, seconds, shorter=None):
+    """Steps that take so many seconds, from what one run took, or two.
+
+    Longer runs grow more Gaussians: between two runs the time is a power of the steps.
+    """
+    done, took = max(kept.notes["steps"], 1), kept.numbers["train_seconds"]
+    power = 1.0
+    if shorter is not None:
+        before, earlier = shorter.notes["steps"], shorter.numbers["train_seconds"]
+        if before != done and earlier > 0:
+            power = math.log(took / earlier) / math.log(done / before)
+    # Outside it is the machine's other work that was timed.
+    power = min(max(power, 1.0), 2.0)
+    return max(1, round(done * (seconds / took) ** (1 / power)))

@@ -1,0 +1,135 @@
+"""One held-out frame as every arm renders it, and the points that it follows."""
+
+import math
+import pathlib
+from collections.abc import Mapping
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import PIL.Image
+import PIL.ImageDraw
+
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.evaluation import pictures
+from nerfies_jax.evaluation.protocol import Known
+from nerfies_jax.geometry import camera as cameras
+
+WIDTH = 352  # pixels of a panel, at least
+DRAWN = 24  # tracks
+LARGEST_ERROR = 0.2
+TRUE, FOUND, APART = (255, 255, 255), (255, 140, 0), (230, 30, 30)
+
+
+def shown_row(known: Known, capture: Capture) -> int:
+    """Which of the rendered frames to show: where points are farthest from the start.
+
+    Without any that move, the middle one.
+    """
+    if not len(known.path):
+        return len(known.rows) // 2
+    away = np.linalg.norm(known.path - known.start_points[:, None], axis=-1).mean(
+        axis=0
+    )
+    return int(np.argmax([away[_moment(known, capture, row)] for row in known.rows]))
+
+
+def draw(
+    capture: Capture,
+    known: Known,
+    colour: Mapping[str, np.ndarray],
+    depth: Mapping[str, np.ndarray],
+    path: Mapping[str, np.ndarray | None],
+    captions: Mapping[str, str],
+    shown: int,
+) -> np.ndarray:
+    """The truth above, then render, error, depth and tracks of every arm in its row.
+
+    `colour` and `depth` are of the shown frame. White: where points are and were;
+    orange: where they are followed to; red: from one to the other. Of a real capture
+    only the pictures are known, and depths are shown between the limits of the first.
+    """
+    row = int(known.rows[shown])
+    if not known.exact:
+        return _draw_filmed(capture, row, colour, depth)
+    truth, true_depth = capture.images[row], capture.depths[row]
+    coloured = pictures.colour_depth(true_depth)
+    limits = coloured.low, coloured.high
+    moving = np.where(capture.moving[row][..., None], truth, truth // 4)
+    panels = [truth, moving, coloured.picture]
+    panels = [_enlarged(panel) for panel in panels]
+    panels.append(_tracks(capture, known, known.path, row))
+    labels = [f"truth: {capture.ids[row]}", "what moves", "true depth", "true tracks"]
+    for arm, rendered in colour.items():
+        error = pictures.colour_error(rendered, truth, LARGEST_ERROR).picture
+        deep = pictures.colour_depth(depth[arm], limits=limits).picture
+        panels += [_enlarged(panel) for panel in (rendered, error, deep)]
+        panels.append(_tracks(capture, known, path[arm], row))
+        labels += [arm, f"error, to {LARGEST_ERROR:g}", "depth", captions[arm]]
+    return pictures.contact_sheet(panels, labels)
+
+
+def _draw_filmed(capture, row, colour, depth):
+    truth, limits, panels, labels = capture.images[row], None, [], []
+    for arm, rendered in colour.items():
+        error = pictures.colour_error(rendered, truth, LARGEST_ERROR).picture
+        coloured = pictures.colour_depth(depth[arm], limits=limits)
+        limits = coloured.low, coloured.high
+        shown = (truth, rendered, error, coloured.picture)
+        panels += [_enlarged(panel) for panel in shown]
+        labels += [capture.ids[row], arm, f"error, to {LARGEST_ERROR:g}", "depth"]
+    return pictures.contact_sheet(panels, labels)
+
+
+def _enlarged(picture):
+    factor = math.ceil(WIDTH / picture.shape[1])
+    return pictures.as_bytes(picture).repeat(factor, 0).repeat(factor, 1)
+
+
+def _moment(known, capture, row):
+    """Which of the moments is nearest in time to a frame."""
+    return np.argmin(np.abs(capture.times[known.moments] - capture.times[row]))
+
+
+def _tracks(capture, known, path, row):
+    """Tracks over the darkened frame; a `path` of None does not move."""
+    picture = _enlarged(capture.images[row] // 2)
+    factor = picture.shape[1] / capture.size[0]
+    image = PIL.Image.fromarray(picture)
+    if len(known.path):
+        pen = PIL.ImageDraw.Draw(image)
+        few = np.linspace(0, len(known.path) - 1, min(DRAWN, len(known.path)))
+        few = few.round().astype(int)
+        now = _moment(known, capture, row)
+        if path is None:
+            path = np.broadcast_to(known.start_points[:, None], known.path.shape)
+        camera = jax.tree.map(jnp.asarray, cameras.take(capture.cameras, row))
+        true, found = (
+            factor * np.asarray(_pixels(camera, points[few]))
+            for points in (known.path, path)
+        )
+        # The truth last: a point that is followed well is white.
+        for points, colour in ((found, FOUND), (true, TRUE)):
+            for line in points:
+                pen.line([tuple(p) for p in line.tolist()], fill=colour, width=1)
+        for there, here in zip(true[:, now], found[:, now], strict=True):
+            pen.line([*there.tolist(), *here.tolist()], fill=APART, width=2)
+            _dot(pen, here.tolist(), FOUND)
+            _dot(pen, there.tolist(), TRUE)
+    return np.asarray(image)
+
+
+def _dot(pen, place, colour, radius=3):
+    x, y = place
+    pen.ellipse([x - radius, y - radius, x + radius, y + radius], fill=colour)
+
+
+@jax.jit
+def _pixels(camera, points):
+    project = jax.vmap(jax.vmap(lambda point: cameras.project(camera, point)[0]))
+    return project(points)
+
+
+def save(picture: np.ndarray, path: pathlib.Path) -> None:
+    """As a PNG, written atomically."""
+    pictures.save(picture, path)

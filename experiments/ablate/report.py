@@ -1,0 +1,134 @@
+"""Write an ablation down: the table, the claims, metrics and a picture."""
+
+import math
+
+from experiments.ablate import arms, measures, picture, verdicts
+from experiments.ablate.measures import MEASURES
+from experiments.ablate.verdicts import Numbers
+from nerfies_jax.evaluation import protocol
+from nerfies_jax.measure import clock
+from nerfies_jax.measure.clock import Metric
+from nerfies_jax.training import specs
+
+
+def write(job, budget, finished) -> None:
+    """ablation.json and ablation.png in the budget's folder; prints table and claims.
+
+    `finished` holds what was kept under this budget, by arm and seed.
+    """
+    numbers = {key: kept.numbers for key, kept in finished.items()}
+    still = protocol.still_error(job.known)
+    found = verdicts.verdicts(numbers, judged(job))
+    print(f"\n{job.capture.name}, each arm trained {budget.title}:")
+    print(verdicts.table(numbers, still))
+    print(measures.legend(measures.shown(numbers)))
+    for line in remarks(finished):
+        print(line)
+    print()
+    print(verdicts.claims_text(found) or "no claim has both of its arms here")
+    if job.suite.context:
+        print("\n" + job.suite.context)
+    about = {
+        "capture": job.capture.name,
+        "settings": specs.as_json(job.asked),
+        "budget": {"steps": budget.steps, "seconds": budget.seconds},
+        "arms": {name: specs.as_json(arm) for name, arm in job.suite.arms.items()},
+        "seeds": {
+            name: [s for other, s in finished if other == name]
+            for name in dict.fromkeys(name for name, _ in finished)
+        },
+        "claims": [_claim(verdict) for verdict in found],
+        "machine": clock.machine(),
+    }
+    clock.write_metrics(budget.folder / "ablation.json", metrics(numbers, still), about)
+    _picture(job, finished, budget.folder / "ablation.png")
+    print(f"{budget.folder / 'ablation.png'} and {budget.folder / 'ablation.json'}")
+
+
+def judged(job) -> list:
+    """The claims of the suite, by pictures alone where nothing else is known."""
+    if job.known.exact:
+        return list(job.suite.claims)
+    return [claim._replace(measures=arms.WHOLE) for claim in job.suite.claims]
+
+
+def remarks(finished) -> list[str]:
+    """What the table does not show: runs that ended early, points that were lost."""
+    found = []
+    for (name, seed), kept in finished.items():
+        if kept.notes["stopped_by"] != "steps":
+            found.append(
+                f"{name}, seed {seed}: stopped at step {kept.notes['steps']} by "
+                f"{kept.notes['stopped_by']}"
+            )
+        if kept.notes.get("points_ever_lost"):
+            found.append(
+                f"{name}, seed {seed}: {kept.notes['points_ever_lost']} of "
+                f"{kept.notes['points']} points were not found at some instant"
+            )
+    return found
+
+
+def metrics(numbers: Numbers, still: float) -> list[Metric]:
+    """Means over the seeds; their standard deviations where there are several."""
+    found = [Metric("still.track_error", still, "scene units", "equal", 1e-6)]
+    for arm in dict.fromkeys(arm for arm, _ in numbers):
+        rows = [row for (name, _), row in numbers.items() if name == arm]
+        for name, measure in MEASURES.items():
+            values = verdicts.values_of(rows, name)
+            mean = float(values.mean())
+            allowed = measure.allowed(mean)
+            found.append(
+                Metric(f"{arm}.{name}", mean, measure.unit, measure.direction, allowed)
+            )
+            if len(values) > 1:
+                spread = float(values.std(ddof=1))
+                found.append(
+                    Metric(
+                        f"{arm}.{name}.spread",
+                        spread,
+                        measure.unit,
+                        "lower",
+                        allowed,
+                    )
+                )
+    return found
+
+
+def _claim(verdict):
+    row = verdict._asdict()
+    claim = row.pop("claim")
+    row = {k: None if x != x else x for k, x in row.items()}  # NaN
+    return {
+        "claim": claim.statement,
+        "arms": [claim.better, claim.worse],
+        **row,
+    }
+
+
+def _picture(job, finished, path):
+    """Of the first seed that each arm has; a few arms, or what there is of others."""
+    first = {}
+    for (name, _), kept in finished.items():
+        first.setdefault(name, kept)
+    few = [name for name in job.suite.pictured if name in first]
+    first = {name: first[name] for name in few or list(first)}
+    shown = picture.shown_row(job.known, job.capture)
+    captions = {}
+    for name, kept in first.items():
+        error = kept.numbers["track_error"]
+        captions[name] = f"tracks, EPE {error:.4f}"
+        if math.isnan(error):
+            captions[name] = "no motion: points stay"
+    picture.save(
+        picture.draw(
+            job.capture,
+            job.known,
+            {name: kept.arrays["colour"][shown] for name, kept in first.items()},
+            {name: kept.arrays["depth"][shown] for name, kept in first.items()},
+            {name: kept.arrays.get("path") for name, kept in first.items()},
+            captions,
+            shown,
+        ),
+        path,
+    )

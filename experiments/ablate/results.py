@@ -1,0 +1,97 @@
+"""The folder of an ablation: one pair of files for every finished arm and seed."""
+
+import contextlib
+import fcntl
+import json
+import math
+import pathlib
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from experiments.ablate.measures import MEASURES
+from nerfies_jax.capture.json_files import replaced_file, write_json
+from nerfies_jax.training import checkpoint
+
+
+class Kept(NamedTuple):
+    """What is left of one arm and seed when it is finished."""
+
+    numbers: dict[str, float]
+    arrays: dict[str, Any]  # colour, depth, and path where points were followed
+    notes: dict[str, Any]  # steps, what stopped it, points that were ever lost
+
+
+def write(path: pathlib.Path, identity: dict[str, Any], kept: Kept) -> None:
+    """`path` and its .npz; numbers last: an arm is finished when they are there."""
+    with replaced_file(path.with_suffix(".npz")) as partial:
+        np.savez_compressed(partial, **kept.arrays)
+    numbers = {k: x if math.isfinite(x) else None for k, x in kept.numbers.items()}
+    write_json(
+        path,
+        {
+            "identity": identity,
+            "numbers": numbers,
+            "notes": kept.notes,
+            "made by": checkpoint.provenance(),
+        },
+    )
+
+
+def read(path: pathlib.Path, identity: dict[str, Any]) -> Kept | None:
+    """A finished arm, None where there is none.
+
+    ValueError where it cannot be read, or was made with another identity.
+    """
+    if not path.is_file():
+        return None
+    try:
+        stored = json.loads(path.read_text())
+        # A measure that is younger than the file is not known there.
+        numbers = {name: stored["numbers"].get(name) for name in MEASURES}
+        with np.load(path.with_suffix(".npz"), allow_pickle=False) as file:
+            arrays = dict(file)
+        made_with, notes = stored["identity"], stored["notes"]
+    except (KeyError, TypeError, ValueError, OSError) as error:
+        raise ValueError(
+            f"{path}: not a finished arm ({error}); remove it to run it again"
+        ) from error
+    if made_with != json.loads(json.dumps(identity)):  # tuples come back as lists
+        raise ValueError(
+            f"{path} was made with other settings; name another --out, or remove it to "
+            "run it again"
+        )
+    numbers = {k: math.nan if x is None else x for k, x in numbers.items()}
+    return Kept(numbers, arrays, notes)
+
+
+def steps_of(path: pathlib.Path) -> int | None:
+    """Over how many steps a finished arm was to be trained; None where none is."""
+    try:
+        return int(json.loads(path.read_text())["identity"]["steps"])
+    except FileNotFoundError:
+        return None
+    except (KeyError, TypeError, ValueError, OSError) as error:
+        raise ValueError(
+            f"{path}: not a finished arm ({error}); remove it to run it again"
+        ) from error
+
+
+@contextlib.contextmanager
+def claimed(path: pathlib.Path) -> Iterator[bool]:
+    """Whether this process may make `path`; false while another one does.
+
+    The claim ends with the block, or with the process, however that ends.
+    """
+    lock = path.with_name(f".{path.stem}.lock")
+    with lock.open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            yield False
+            return
+        try:
+            yield True
+        finally:
+            lock.unlink(missing_ok=True)

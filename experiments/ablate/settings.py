@@ -1,0 +1,79 @@
+"""What an ablation is asked for; no JAX."""
+
+import dataclasses
+import pathlib
+from typing import Literal
+
+from experiments import cli
+from experiments.ablate import suites
+from nerfies_jax.runs.config import CaptureSource
+
+
+@dataclasses.dataclass(frozen=True)
+class Ablate:
+    """Compare ways to reconstruct a moving scene with and without their parts."""
+
+    suite: Literal["fields", "sonata", "moba", "settings", "advice"] = "fields"
+    """Radiance fields, the ablations of Sonata or MoBa-GS, the settings of
+    experiments.accuracy_time, or what experiments.inspect_scene can advise."""
+    arms: tuple[str, ...] = ()
+    """Which arms of the suite (default: all)."""
+    source: cli.SourceOptions = CaptureSource()
+    steps: int | None = None
+    """Steps of training of every arm (default: the presets' own)."""
+    share: float | None = None
+    """Steps of training of every arm as a share of its preset's own."""
+    seconds: float | None = None
+    """Seconds of training of every arm instead, or, with --steps, as well: each gets
+    the steps that it can make in this time here, and its schedules stretch to them."""
+    seeds: int | None = None
+    """How many seeds (default: 1 for fields, otherwise 3); from two on, differences
+    are held against their spread."""
+    seed: int | None = None
+    """Train this seed alone and report nothing: one share of a run over several
+    machines or processes."""
+    jobs: int = 1
+    """Arms to train at once, each in a process with one core."""
+    out: pathlib.Path | None = None
+    """Folder of results (default: runs/ablation-...). It may hold finished arms."""
+    budget: float | None = None
+    """Minutes after which no arm is begun that may not end in time."""
+    frames: int = 6
+    """Held-out frames to render, evenly over the time."""
+    tracks: int = 200
+    """Points to follow, at most."""
+    set: tuple[str, ...] = ()
+    """Fields that are changed in every arm, as density.most=5000 template.depth=4."""
+    device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
+    """Where to compute."""
+
+    @property
+    def all_seeds(self) -> range:
+        """The seeds of the whole run."""
+        count = suites.named(self.suite).seeds if self.seeds is None else self.seeds
+        return range(count)
+
+
+def check(asked: Ablate) -> None:
+    """Raise ValueError for what cannot be run."""
+    least = min(asked.frames, asked.tracks, asked.jobs, len(asked.all_seeds))
+    limits = (asked.budget, asked.seconds, asked.steps, asked.share)
+    if least < 1 or not all(limit is None or limit > 0 for limit in limits):
+        raise ValueError(
+            "--seeds, --frames, --tracks, --jobs, --budget, --seconds, --steps and "
+            f"--share are positive, got {asked.seeds}, {asked.frames}, {asked.tracks}, "
+            f"{asked.jobs}, {asked.budget}, {asked.seconds}, {asked.steps} and "
+            f"{asked.share}"
+        )
+    if asked.share is not None and asked.steps is not None:
+        raise ValueError("--steps and --share say the same thing: give one of them")
+    if asked.seed is not None and not (asked.seed >= 0 and asked.jobs == 1):
+        raise ValueError(
+            f"--seed {asked.seed}: one seed from 0 on, in one process (--jobs 1)"
+        )
+    for name in asked.arms:
+        if name not in suites.named(asked.suite).arms:
+            raise ValueError(
+                f"--arms {name}: in --suite {asked.suite} there are "
+                + ", ".join(suites.named(asked.suite).arms)
+            )

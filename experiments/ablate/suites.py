@@ -1,0 +1,18 @@
+"""All suites of arms by name; no JAX until one needs it."""
+
+import functools
+
+from experiments.ablate.arms import FIELDS, MOBA, SONATA, Suite
+from experiments.accuracy_time.axes import SETTINGS
+
+KEPT = {"fields": FIELDS, "sonata": SONATA, "moba": MOBA, "settings": SETTINGS}
+
+
+@functools.cache
+def named(name: str) -> Suite:
+    """The suite of that name."""
+    if name == "advice":  # asks every representation what it would advise
+        from experiments.inspect_pays.arms import advice
+
+        return advice()
+    return KEPT[name]

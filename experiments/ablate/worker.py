@@ -1,0 +1,35 @@
+"""One arm and seed of an ablation, in a process of its own.
+
+python -m experiments.ablate.worker SETTINGS.json
+"""
+
+import dataclasses
+import json
+import pathlib
+import sys
+
+from experiments import cli
+from experiments.ablate import suites
+from experiments.ablate.settings import Ablate
+from nerfies_jax.runs import platform, representations
+from nerfies_jax.training import specs
+
+
+def main(path: str) -> None:
+    """Train what the settings in a file name; exit code 2 where they are wrong."""
+    with cli.user_errors():
+        stored = specs.from_json(json.loads(pathlib.Path(path).read_text()))
+        # Paths were stored as text.
+        asked: Ablate = dataclasses.replace(stored, out=pathlib.Path(stored.out))
+        (name,) = asked.arms
+        preset = suites.named(asked.suite).arms[name].preset
+        threads = representations.of_preset(preset).threads
+        platform.start_jax(asked.device, threads)
+        from experiments.ablate.job import Job
+
+        job = Job(asked)
+    raise SystemExit(1 if job.run() else 0)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -1,0 +1,54 @@
+"""The command line: settings read by tyro, wrong input told in one line.
+
+JAX is not imported here, so `--help` is quick and `--device` can still choose the
+platform.
+"""
+
+import contextlib
+import dataclasses
+import pathlib
+import sys
+from typing import Annotated
+
+import tyro
+
+from nerfies_jax.runs.config import CaptureSource
+
+Positional = tyro.conf.Positional
+
+
+@dataclasses.dataclass(frozen=True)
+class NamedSource(CaptureSource):
+    """Which pictures, the folder named without an option."""
+
+    capture: Positional[pathlib.Path | None] = None
+    """Folder in Nerfies, HyperNeRF, Blender, D-NeRF or COLMAP layout."""
+
+
+# Their fields stand among the other options of a command.
+Source = Annotated[NamedSource, tyro.conf.arg(name="")]
+SourceOptions = Annotated[CaptureSource, tyro.conf.arg(name="")]
+
+
+def plain(source: CaptureSource) -> CaptureSource:
+    """The same source as a run keeps it, however its folder was named."""
+    return CaptureSource(**vars(source))
+
+
+def parse(settings_class, arguments=None):
+    """A frozen dataclass from the command line; its docstrings are the help text."""
+    return tyro.cli(settings_class, args=arguments)
+
+
+@contextlib.contextmanager
+def user_errors():
+    """Wrong input in one line and exit code 2; our own bugs keep their traceback.
+
+    Wraps the stages that read what the user gave (captures, settings, run folders),
+    which raise `ValueError` or `OSError` naming the value, the bound and the mend.
+    """
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        print("error: " + " ".join(str(error).split()), file=sys.stderr)
+        sys.exit(2)

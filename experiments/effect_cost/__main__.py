@@ -1,0 +1,264 @@
+"""What each effect of a scene costs, by itself and beside the others.
+
+    python -m experiments.effect_cost
+    python -m experiments.effect_cost --presets sonata-small --repeats 9
+    python -m experiments.effect_cost --check runs/effect_cost/effect_cost.json
+
+For every preset: the bare scene, the bare scene with each effect alone (and what that
+cannot be without), the whole preset, and the whole preset without each. Of the loss and
+of the training step it tabulates what the compiler counts (flops, bytes read and
+written, temporary memory), the matrix products with every round of every loop, the
+parameters, the seconds to compile and the processor time of warm calls, all scenes of
+a preset in turn. A run is priced at `--at` of its steps, where every warm-up is over.
+
+The price of an effect alone is a difference from the scene without it. Prices do not
+add up exactly: the compiler joins what it finds side by side. Prints the table, saves
+effect_cost.json, effect_cost.md and effect_cost.png.
+"""
+
+import dataclasses
+import pathlib
+import time
+from typing import Any, Literal, NamedTuple
+
+from experiments import cli
+from nerfies_jax.runs import platform, run_folder
+
+PRESETS = (
+    "nerf-w-small",
+    "nerfies-small",
+    "hypernerf-small",
+    "nsff-small",
+    "splats-deformable-small",
+    "sonata-small",
+    "moba-small",
+)
+# Without these the effect on the left cannot be there, or does nothing.
+NEEDS = {
+    "elastic": ("warp",),
+    "background": ("warp",),
+    "alternation": ("motion",),
+    "acceleration": ("motion",),
+    "neighbours": ("motion",),
+    "motion_growth": ("motion",),
+}
+PROGRAMS = ("loss", "step")
+
+
+@dataclasses.dataclass(frozen=True)
+class EffectCost:
+    """Tabulate what the effects of presets cost."""
+
+    presets: tuple[str, ...] = PRESETS
+    """Which scenes, on the built-in capture."""
+    at: float = 0.4
+    """Share of a run's steps that is behind the step that is priced."""
+    rows: int | None = None
+    """Gaussians that a scene of splats starts from (default: the preset's)."""
+    rays: int | None = None
+    """Rays of a step of a radiance field (default: the preset's)."""
+    repeats: int = 5
+    """Timed calls of every program, in turn; the table shows medians."""
+    out: pathlib.Path | None = None
+    """Folder for effect_cost.json, .md and .png (default: runs/effect_cost)."""
+    check: pathlib.Path | None = None
+    """An earlier effect_cost.json: says what got worse since, exit code 1 if any."""
+    device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
+    """Where to compute."""
+
+    def __post_init__(self):
+        if not self.presets:
+            raise ValueError("--presets: name at least one")
+        if not 0 <= self.at < 1:
+            raise ValueError(f"--at {self.at}: a share of the steps, from 0 to below 1")
+        for name in ("rows", "rays", "repeats"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"--{name} {value} must be at least 1")
+
+
+class Arm(NamedTuple):
+    """One scene of a preset's table."""
+
+    name: str  # "bare", "only warp", "warp + elastic", "all", "without warp"
+    effect: str | None  # that is priced
+    base: str | None  # the arm that its price is a difference from
+    spec: Any
+
+
+class Priced(NamedTuple):
+    """What one program of one scene takes."""
+
+    flops: float
+    bytes_accessed: float
+    temporary_bytes: int
+    matrix_flops: float
+    at_least: bool  # of the matrix products: some loops run longer than is known
+    compile_seconds: float  # of the processor
+    seconds: float  # of the processor, median
+    wall_seconds: float
+
+
+class Row(NamedTuple):
+    """All that was measured of one scene."""
+
+    arm: Arm
+    parameters: int
+    programs: dict[str, Priced]  # by the names in PROGRAMS
+
+
+def main(arguments=None):
+    """Run the job of the command line; exit code 2 where its input is wrong."""
+    with cli.user_errors():
+        asked = cli.parse(EffectCost, arguments)
+        platform.start_jax(asked.device, "one")
+        import jax
+
+        # Compiling is one of the prices; JAX asks once, when it first compiles.
+        jax.config.update("jax_enable_compilation_cache", False)
+        from experiments.effect_cost import report as report
+        from nerfies_jax.measure import baselines
+
+        before = None
+        if asked.check is not None:
+            before = baselines.read(asked.check, "effect_cost.json")
+        tables = {name: arms(_spec(name, asked)) for name in asked.presets}
+        folder = run_folder.new_run_folder(asked.out, "effect_cost")
+    print(report.heading())
+    rows = {}
+    for name, scenes in tables.items():
+        rows[name] = measure(name, scenes, asked.at, asked.repeats)
+        print(report.table(name, rows[name]), flush=True)
+    metrics = report.write(folder, rows, asked)
+    print(f"saved in {folder}")
+    worse = [] if before is None else baselines.changes(metrics, before)
+    if before is not None:
+        print("\n".join(worse) or f"nothing is worse than in {asked.check}")
+    raise SystemExit(1 if worse else 0)
+
+
+def _spec(name, asked):
+    from nerfies_jax.runs import representations
+
+    spec = representations.of_preset(name).presets[name]
+    if asked.rays is not None and hasattr(spec, "rays"):
+        spec = dataclasses.replace(spec, rays=asked.rays)
+    if asked.rows is not None and hasattr(spec, "start"):
+        start = dataclasses.replace(spec.start, source="random", random=asked.rows)
+        most = max(spec.density.most or asked.rows, asked.rows)
+        density = dataclasses.replace(spec.density, most=most)
+        spec = dataclasses.replace(spec, start=start, density=density)
+    return spec
+
+
+def effects_in(spec: Any) -> list[str]:
+    """The names of the effects that a scene has, in the order of its settings."""
+    return [
+        field.name
+        for field in dataclasses.fields(spec)
+        if field.name != "coarse"  # a network's size, and no effect
+        and field.default is None
+        and dataclasses.is_dataclass(getattr(spec, field.name))
+    ]
+
+
+def without(spec: Any, names: tuple[str, ...]) -> Any:
+    """The scene without these effects and without what needs them."""
+    gone = set(names)
+    gone |= {name for name, needed in NEEDS.items() if gone & {*needed}}
+    return dataclasses.replace(spec, **dict.fromkeys(gone & {*effects_in(spec)}))
+
+
+def arms(spec: Any) -> list[Arm]:
+    """The scenes of a preset's table; ValueError where it has no effect."""
+    names = effects_in(spec)
+    if not names:
+        raise ValueError(
+            "--presets: one of them has no effect to be priced; choose from "
+            + ", ".join(PRESETS)
+        )
+
+    def only(*kept):
+        return without(spec, tuple(name for name in names if name not in kept))
+
+    found = [Arm("bare", None, None, only())]
+    for name in names:
+        needed = tuple(x for x in NEEDS.get(name, ()) if x in names)
+        base = f"only {needed[0]}" if needed else "bare"
+        title = f"{needed[0]} + {name}" if needed else f"only {name}"
+        found.append(Arm(title, name, base, only(name, *needed)))
+    if len(names) == 1:
+        return found  # the only one is all there is
+    found.append(Arm("all", None, "bare", spec))
+    for name in names:
+        found.append(Arm(f"without {name}", name, "all", without(spec, (name,))))
+    return found
+
+
+def measure(preset: str, scenes: list[Arm], at: float, repeats: int) -> list[Row]:
+    """Compile the programs of every scene once and time all of them in turn."""
+    from nerfies_jax import runs
+    from nerfies_jax.measure import clock
+    from nerfies_jax.runs import representations
+    from nerfies_jax.runs.config import CaptureSource
+
+    representation = representations.of_preset(preset)
+    capture = runs.read_capture(CaptureSource())
+    # The same scene may stand under several names: "without" the one effect is "bare".
+    first = {arm.spec: arm.name for arm in reversed(scenes)}
+    calls, counted = {}, {}
+    for spec, arm_name in first.items():
+        programs, counted[spec] = _compile(representation, capture, spec, at)
+        calls |= {f"{arm_name} {name}": call for name, call in programs.items()}
+    timings = clock.compare(calls, repeats=repeats, warm_up=1)
+    rows = []
+    for arm in scenes:
+        parameters, costs = counted[arm.spec]
+        programs = {}
+        for name in PROGRAMS:
+            cost, products = costs[name]
+            timing = timings[f"{first[arm.spec]} {name}"]
+            programs[name] = Priced(
+                flops=cost.flops,
+                bytes_accessed=cost.bytes_accessed,
+                temporary_bytes=cost.temporary_bytes,
+                matrix_flops=products.flops,
+                at_least=products.at_least,
+                compile_seconds=cost.compile_seconds,
+                seconds=timing.median_cpu,
+                wall_seconds=timing.median,
+            )
+        rows.append(Row(arm, parameters, programs))
+    return rows
+
+
+def _compile(representation, capture, spec, at):
+    """Warm calls of a scene's programs, and (parameters, costs of each program)."""
+    import jax
+    import jax.numpy as jnp
+
+    from nerfies_jax import evaluation
+    from nerfies_jax.measure import clock, matrix_flops
+
+    facts = representation.facts_of(capture, spec)
+    model = representation.build(spec, facts)
+    state = model.init(capture, jax.random.key(0))
+    state = state._replace(step=jnp.asarray(round(at * spec.steps), jnp.int32))
+    frames = evaluation.frames_of(capture, model.wants)
+
+    def loss(state, frames):
+        # The compiler drops the slopes and the update, which nothing reads.
+        return model.step(state, frames)[1]["loss"]
+
+    calls, costs = {}, {}
+    for name, function in {"loss": loss, "step": model.step}.items():
+        began = time.process_time()
+        program = jax.jit(function).lower(state, frames).compile()
+        cost = clock.cost_of(program, time.process_time() - began)
+        costs[name] = cost, matrix_flops.count(function, state, frames)
+        calls[name] = lambda program=program: program(state, frames)
+    return calls, (model.counts(state)["parameters"], costs)
+
+
+if __name__ == "__main__":
+    main()

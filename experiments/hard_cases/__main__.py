@@ -1,0 +1,189 @@
+"""Where textbook formulas lose their digits, what ours keep, and what that costs.
+
+    python -m experiments.hard_cases
+    python -m experiments.hard_cases --rooms rotations splats --repeats 30
+    python -m experiments.hard_cases --document docs/numerics.md   # renew its table
+
+Every case sweeps a function to its singular point. The table shows the worst errors of
+value, slope and curvature of the textbook's form and of ours against 60-digit
+arithmetic, in float32 and float64, and the time of ours over the textbook's for values
+and for gradients, from interleaved calls over many inputs away from the singular
+point. Saves hard_cases.json and a figure of each case.
+"""
+
+import dataclasses
+import math
+import pathlib
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments import cli
+from experiments.hard_cases import case as hard_case
+from experiments.hard_cases import (
+    elastic,
+    encodings,
+    footprints,
+    geometry,
+    losses,
+    networks,
+    quaternions,
+    rotations,
+    splats,
+    volume,
+)
+from experiments.hard_cases import report as report
+from experiments.hard_cases.case import ORDERS, Case
+from nerfies_jax.measure import clock
+from nerfies_jax.runs import platform, run_folder
+
+# The cases of each room and, in tests/experiments/hard_cases, the file of their tests.
+ROOMS = {
+    "rotations": (rotations.CASES + quaternions.CASES, "test_rotations.py"),
+    "elastic": (elastic.CASES, "test_elastic_cases.py"),
+    "geometry": (geometry.CASES, "test_geometry_cases.py"),
+    "encodings": (encodings.CASES, "test_encoding_cases.py"),
+    "volume": (volume.CASES, "test_volume_cases.py"),
+    "networks": (networks.CASES, "test_network_cases.py"),
+    "losses": (losses.CASES, "test_loss_cases.py"),
+    "splats": (footprints.CASES + splats.CASES, "test_splat_cases.py"),
+}
+JITTER = 1e-3  # of the timed inputs, so that rows differ
+
+
+@dataclasses.dataclass(frozen=True)
+class HardCases:
+    """Measure errors and costs of formulas at their hard points."""
+
+    rooms: tuple[str, ...] = tuple(ROOMS)
+    """Which rooms' cases."""
+    cases: tuple[str, ...] = ()
+    """Names of cases, or parts of names (default: all of the rooms)."""
+    numbers: int = 300_000
+    """In the inputs of a timed call: fewer inputs where one holds more numbers."""
+    repeats: int = 15
+    """Timed calls of each form, in turn; the table shows medians."""
+    out: pathlib.Path | None = None
+    """Folder for the figures and hard_cases.json (default: runs/hard_cases)."""
+    document: pathlib.Path | None = None
+    """Write the table into this Markdown file, between its two markers."""
+    device: Literal["auto", "cpu", "gpu", "tpu"] = "cpu"
+    """Where to compute."""
+
+    def __post_init__(self):
+        if not self.rooms or not set(self.rooms) <= set(ROOMS):
+            raise ValueError(
+                f"--rooms {' '.join(self.rooms)}: choose from {', '.join(ROOMS)}"
+            )
+        if self.numbers < 1 or self.repeats < 1:
+            raise ValueError(
+                f"--numbers {self.numbers} and --repeats {self.repeats} are at least 1"
+            )
+
+
+class Outcome(NamedTuple):
+    """Errors of one form in one precision, by order, at each point of the sweep."""
+
+    stable: tuple[np.ndarray, ...]
+    textbook: tuple[np.ndarray, ...]
+
+
+class Row(NamedTuple):
+    """All that was measured of one case."""
+
+    case: Case
+    test: str  # file and test that hold it
+    outcomes: dict[str, Outcome]  # by precision
+    # Time of ours over the textbook's in float32, medians of processor time; NaN where
+    # the two do not do the same work.
+    value_cost: float
+    slope_cost: float
+
+
+def main(arguments=None):
+    """Run the job of the command line; exit code 2 where its input is wrong."""
+    with cli.user_errors():
+        asked = cli.parse(HardCases, arguments)
+        chosen = choose(asked.rooms, asked.cases)
+        folder = run_folder.new_run_folder(asked.out, "hard_cases")
+        if asked.document is not None:
+            report.parts(asked.document)  # before the work
+        platform.start_jax(asked.device)
+    rows = []
+    for case, test in chosen:
+        rows.append(measure(case, test, asked.numbers, asked.repeats))
+        print(report.block(rows[-1]), flush=True)
+        report.save_figure(folder, rows[-1])
+    report.save_numbers(folder, rows, asked)
+    print(f"\n{report.summary(rows)}\nsaved in {folder}")
+    if asked.document is not None:
+        report.renew(asked.document, rows)
+        print(f"renewed the table in {asked.document}")
+
+
+def choose(rooms, names) -> list[tuple[Case, str]]:
+    """Cases of the rooms whose name has one of `names` in it, with their tests."""
+    chosen = []
+    for room in rooms:
+        cases, test = ROOMS[room]
+        chosen += [
+            (case, f"hard_cases/{test}::test_held")
+            for case in cases
+            if not names or any(name in case.name for name in names)
+        ]
+    if not chosen:
+        known = [case.name for room in rooms for case in ROOMS[room][0]]
+        raise ValueError(
+            f"--cases {' '.join(names)}: no such case; there are {', '.join(known)}"
+        )
+    return chosen
+
+
+def measure(case: Case, test: str, numbers: int, repeats: int) -> Row:
+    """Errors in every precision that is held, and what the stable form costs."""
+    outcomes = {}
+    for dtype, bounds in case.bounds.items():
+        inputs = hard_case.rounded(case.inputs, dtype)
+        exact = [hard_case.truth(case, inputs, order) for order in range(len(bounds))]
+        found = {}
+        for form in Outcome._fields:
+            with jax.enable_x64(dtype == "float64"):
+                got = hard_case.evaluate(
+                    getattr(case, form), case.inputs, dtype, len(bounds)
+                )
+            found[form] = tuple(
+                hard_case.errors(case, got[order], exact[order], order)
+                for order in range(len(bounds))
+            )
+        outcomes[dtype] = Outcome(**found)
+    return Row(case, test, outcomes, *_costs(case, numbers, repeats))
+
+
+def _costs(case, numbers, repeats):
+    if not case.alike:
+        return math.nan, math.nan
+    usual = case.inputs[len(case.inputs) // 2] if case.timed is None else case.timed
+    rows = max(1, numbers // len(usual))
+    jitter = np.random.default_rng(0).uniform(-JITTER, JITTER, (rows, len(usual)))
+    inputs = jnp.asarray(usual * (1 + jitter), jnp.float32)
+
+    def total(function):
+        return lambda x: jnp.sum(jax.vmap(function)(x))
+
+    calls = {}
+    for form in ("stable", "textbook"):
+        function = getattr(case, form)
+        value, slope = jax.jit(jax.vmap(function)), jax.jit(jax.grad(total(function)))
+        calls[f"{form} value"] = lambda program=value: program(inputs)
+        calls[f"{form} slope"] = lambda program=slope: program(inputs)
+    times = clock.compare(calls, repeats=repeats)
+    return tuple(
+        times[f"stable {name}"].median_cpu / times[f"textbook {name}"].median_cpu
+        for name in ORDERS[:2]
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,147 @@
+"""Hard cases of Fourier features and of the window that opens their bands."""
+
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+
+from experiments.hard_cases.case import Case
+from nerfies_jax.nets import encoding
+from nerfies_jax.nets.encoding import EncodingSpec
+
+BANDS = 10
+TIMES_PI = EncodingSpec(BANDS, identity=False, times_pi=True)
+PLAIN = EncodingSpec(BANDS, identity=False)
+TOP = 2.0 ** (BANDS - 1)  # of the last band, whose slopes and bends are the largest
+
+
+def _sides(edge):
+    """The neighbours of an edge in both precisions, and itself."""
+    found = [edge]
+    for kind in (np.float32, np.float64):
+        found += [float(np.nextafter(kind(edge), kind(to))) for to in (-9, 9)]
+    return sorted(found)
+
+
+def _with_negatives(places):
+    return np.unique(np.concatenate([np.negative(places), places]))
+
+
+def _features(spec):
+    return lambda x: encoding.encode(spec, x, None)
+
+
+def _rounded_pi(x):
+    """As it stands in the papers: π is rounded in before the sine reduces."""
+    angles = 2 ** jnp.arange(BANDS, dtype=x.dtype)[:, None] * jnp.pi * x
+    return jnp.stack([jnp.sin(angles), jnp.cos(angles)], axis=1).reshape(-1)
+
+
+def _exact_features(unit):
+    """Band by band, where `unit` is a half turn in terms of x."""
+
+    def features(x):
+        turns = [2**k * x[0] / unit() for k in range(BANDS)]
+        return [wave(t) for t in turns for wave in (mpmath.sinpi, mpmath.cospi)]
+
+    return features
+
+
+# Quadrants meet at odd eighths of a period of the last band, x = (2k + 1) / 2048.
+_SEAMS = [x / TOP for edge in (0.25, 0.75, 2.25) for x in _sides(edge)]
+_PI_PLACES = _with_negatives([0, 1e-30, 1e-8, 1e-4, *_SEAMS, 0.7371, 1, 10, 1e3, 1e4])
+HALF_TURNS = Case(
+    name="sin and cos of 2ᵏπx",
+    breaks="π is rounded in before the reduction: k = 9 is noise at x = 1e4",
+    formula="x - 2 round(x/2) first, then quadrants and a polynomial on [-¼, ¼]",
+    switch="quadrants, odd eighths of a period",
+    axis="x",
+    at=_PI_PLACES,
+    inputs=_PI_PLACES[:, None],
+    stable=_features(TIMES_PI),
+    textbook=_rounded_pi,
+    exact=_exact_features(lambda: mpmath.mpf(1)),
+    bounds={
+        "bfloat16": (4e-3, 8e-3),
+        "float32": (2e-7, 3e-7, 4e-7),
+        "float64": (4e-16, 6e-16, 8e-16),
+    },
+    floors=(1, TOP * np.pi, (TOP * np.pi) ** 2),
+    caught=(
+        ("bfloat16", "value"),
+        ("float32", "value"),
+        ("float64", "value"),
+        ("float32", "slope"),
+        ("float32", "curvature"),
+    ),
+    timed=np.array([0.3]),
+)
+
+
+def _quarter_turn_on(x):
+    """The cosine as the Nerfies code has it, the sine of a quarter turn more."""
+    angles = 2 ** jnp.arange(BANDS, dtype=x.dtype)[:, None] * x
+    waves = jnp.sin(angles), jnp.sin(angles + 0.5 * jnp.pi)
+    return jnp.stack(waves, axis=1).reshape(-1)
+
+
+_PLACES = _with_negatives([0, 1e-30, 1e-8, 1e-4, 0.01, 0.7371, 1, 10, 1e3, 1e4])
+PLAIN_WAVES = Case(
+    name="sin and cos of 2ᵏx",
+    breaks="cos as sin(a + π/2): the sum is rounded to an ulp of a",
+    formula="sin and cos of the exact product",
+    axis="x",
+    at=_PLACES,
+    inputs=_PLACES[:, None],
+    stable=_features(PLAIN),
+    textbook=_quarter_turn_on,
+    exact=_exact_features(lambda: +mpmath.pi),
+    bounds={
+        "bfloat16": (4e-3, 8e-3),
+        "float32": (2e-7, 2e-7, 2e-7),
+        "float64": (4e-16, 4e-16, 4e-16),
+    },
+    floors=(1, TOP, TOP**2),
+    caught=(("float32", "value"), ("float64", "value"), ("float32", "slope")),
+    timed=np.array([0.3]),
+)
+
+
+OPENED = 6
+
+
+def _by_cosine(alpha):
+    """Equation 14 of Nerfies as printed."""
+    opened = jnp.clip(alpha[0] - jnp.arange(OPENED, dtype=alpha.dtype), 0, 1)
+    return (1 - jnp.cos(jnp.pi * opened)) / 2
+
+
+def _exact_window(alpha):
+    opened = [min(max(alpha[0] - k, 0), 1) for k in range(OPENED)]
+    return [mpmath.sinpi(x / 2) ** 2 for x in opened]
+
+
+_OPENING = np.array(
+    [0, 1e-15, 1e-8, 1e-5, 1e-4, 1e-3, 0.01, 0.1, *_sides(0.5), *_sides(1.0), 3.25, 6]
+)
+WINDOW = Case(
+    name="window of a band that opens",
+    breaks="½(1 - cos πa) cancels: 0 below a = 1e-4, a slope that is not 0 at 0",
+    formula="sin²(πa/2) by the same polynomial",
+    switch="quadrant, a = ½",
+    axis="bands open, a",
+    at=_OPENING,
+    inputs=_OPENING[:, None],
+    stable=lambda alpha: encoding.anneal(OPENED, alpha[0]),
+    textbook=_by_cosine,
+    exact=_exact_window,
+    bounds={
+        "bfloat16": (8e-3, 2e-2),
+        "float32": (4e-7, 4e-7),
+        "float64": (8e-16, 8e-16),
+    },
+    floors=(1e-35, 1e-14),  # differences of 1e-32 see past the end at 0
+    caught=(("float32", "value"), ("float64", "value")),
+    timed=np.array([0.3]),
+)
+
+CASES = (HALF_TURNS, PLAIN_WAVES, WINDOW)

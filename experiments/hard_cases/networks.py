@@ -1,0 +1,321 @@
+"""Hard cases of networks and optimisers: RBF-KANs, Adam and RAdam of late rows."""
+
+import math
+
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+
+from experiments.hard_cases.case import Case, constant
+from gaussians_jax import optimiser
+from nerfies_jax.nets import kan
+from nerfies_jax.nets.kan import KAN, KANLayer, KANSpec, Kernels
+from nerfies_jax.nets.mlp import HeadSpec
+
+KERNELS = 8
+# Centres at whole numbers, which every precision holds, and w = h = 1.
+EDGE = KANSpec(1, (), (("y", HeadSpec(1)),), KERNELS, (0.0, 7.0), base=False)
+FAR_EDGE = KANSpec(1, (), (("y", HeadSpec(1)),), KERNELS, (1024.0, 1031.0), base=False)
+TRAINED_EDGE = KANSpec(
+    1,
+    (),
+    (("y", HeadSpec(1)),),
+    KERNELS,
+    (0.0, 7.0),
+    base=False,
+    trainable_kernels=True,
+)
+WEIGHTS = np.linspace(1, 2, KERNELS)
+
+
+def _edge(spec, x, weights=WEIGHTS, kernels=None):
+    """The function of one variable that one edge of a KAN is."""
+    weight = constant(weights, x.dtype)[:, None, None]
+    head = KANLayer(weight, None, constant(np.zeros(1), x.dtype))
+    return kan.apply(spec, KAN((), {"y": head}, kernels), x)["y"]
+
+
+def _gaussians(x):
+    """FastKAN's layer: nothing holds its inputs."""
+    centre = jnp.arange(KERNELS, dtype=x.dtype)
+    return jnp.exp(-((x - centre) ** 2)) @ constant(WEIGHTS, x.dtype)[:, None]
+
+
+def _exact_edge(x, first=0):
+    low, high, sigma = first, first + KERNELS - 1, mpmath.sqrt(mpmath.mpf(0.5))
+    excess = max(low - x, x - high, 0) / sigma
+    beyond = sigma * (1 - 1 / mpmath.sqrt(1 + 2 * excess + 3 * excess**2))
+    held = low - beyond if x < low else high + beyond if x > high else x
+    return [
+        mpmath.fsum(
+            mpmath.mpf(w) * mpmath.exp(-((held - first - g) ** 2))
+            for g, w in enumerate(WEIGHTS)
+        )
+    ]
+
+
+def _sides(edge):
+    """The neighbours of an edge in both precisions, and itself."""
+    found = [edge]
+    for kind in (np.float32, np.float64):
+        found += [float(np.nextafter(kind(edge), kind(to))) for to in (-9e9, 9e9)]
+    return sorted(found)
+
+
+_PLACES = np.array(
+    [-1e4, -50, -5, -1, *_sides(0.0), 0.3, 3.5, *_sides(7.0), 8, 12, 57, 1e4]
+)
+OUTSIDE = Case(
+    name="KAN input outside its grid",
+    breaks="kernels are 1e-11 five spacings outside: value and slope vanish",
+    formula="held to w/√2 beyond the end by 1 - 1/√(1 + 2e + 3e²)",
+    switch="the ends of the grid",
+    axis="x, grid 0 to 7",
+    at=_PLACES,
+    inputs=_PLACES[:, None],
+    stable=lambda x: _edge(EDGE, x),
+    textbook=_gaussians,
+    exact=lambda x: _exact_edge(x[0]),
+    bounds={
+        "bfloat16": (6e-2, 6e-2),
+        "float32": (1e-6, 2e-6, 6e-5),
+        "float64": (2e-15, 4e-15, 1e-13),
+    },
+    caught=(
+        ("bfloat16", "value"),
+        ("float32", "value"),
+        ("float64", "value"),
+        ("float32", "slope"),
+        ("float64", "slope"),
+    ),
+    timed=np.array([3.3]),
+)
+
+
+def _expanded(x):
+    """As a matrix product would have it, |x|² - 2xμ + μ²."""
+    centre = 1024 + jnp.arange(KERNELS, dtype=x.dtype)
+    squares = x**2 - 2 * x * centre + centre**2
+    return jnp.exp(-squares) @ constant(WEIGHTS, x.dtype)[:, None]
+
+
+_OFFSETS = 1024 + np.array([0, 1e-3, 0.25, 1, 3.3, 6.75, 7])
+FAR_AWAY = Case(
+    name="KAN grid far from zero",
+    breaks="x² - 2xμ + μ² cancels",
+    formula="the square of the difference",
+    axis="x",
+    at=_OFFSETS,
+    inputs=_OFFSETS[:, None],
+    stable=lambda x: _edge(FAR_EDGE, x),
+    textbook=_expanded,
+    exact=lambda x: _exact_edge(x[0], 1024),
+    bounds={"float32": (4e-7, 1e-6, 2e-6), "float64": (1e-15, 2e-15, 4e-15)},
+    floors=(0, 0.3, 1),
+    caught=(("float32", "value"), ("float64", "value"), ("float32", "slope")),
+    timed=np.array([1027.3]),
+)
+
+
+CHOSEN = 3  # the one kernel of the next case, at x = 3
+
+
+def _trained(x):
+    """One kernel of a trained width e^s; x and s."""
+    shape = KERNELS, 1
+    centre = jnp.arange(KERNELS, dtype=x.dtype)[:, None]
+    kernels = (Kernels(centre, jnp.broadcast_to(x[1], shape)),)
+    return _edge(TRAINED_EDGE, x[:1], np.eye(KERNELS)[CHOSEN], kernels)
+
+
+def _by_variance(x):
+    sigma = jnp.exp(x[1]) / math.sqrt(2)
+    centre = jnp.arange(KERNELS, dtype=x.dtype)
+    kernels = jnp.exp(-((x[0] - centre) ** 2) / (2 * sigma**2))
+    return kernels @ jnp.eye(KERNELS, dtype=x.dtype)[:, CHOSEN, None]
+
+
+def _exact_trained(x):
+    log_width = min(max(x[1], -kan.LOG_WIDTH_RANGE), kan.LOG_WIDTH_RANGE)
+    return [mpmath.exp(-(((x[0] - CHOSEN) * mpmath.exp(-log_width)) ** 2))]
+
+
+# One step of bfloat16 beside the kernel's centre, 2^-6, is many narrow widths.
+_WIDTHS = np.array(
+    [
+        [CHOSEN + beside, s]
+        for s in (-200, -60, -10.25, -9.75, -4, 0, 3, 9.75, 10.25, 60, 200)
+        for beside in (0, 2.0**-17, 2.0**-6)
+    ]
+)
+WIDTH = Case(
+    name="KAN kernel of a trained width",
+    breaks="(x - μ)² over a squared width: 0/0 below 1e-20, slopes before",
+    formula="((x - μ) e^-s)², s held to ±10 of its start",
+    switch="s = ±10",
+    axis="s, the width's logarithm",
+    at=_WIDTHS[:, 1],
+    inputs=_WIDTHS,
+    stable=_trained,
+    textbook=_by_variance,
+    exact=_exact_trained,
+    bounds={
+        "bfloat16": (6e-3, 6e-3),
+        "float32": (1e-6, 2e-6),
+        "float64": (2e-15, 4e-15),
+    },
+    floors=(1, 1),
+    caught=(
+        ("bfloat16", "value"),
+        ("float32", "value"),
+        ("float32", "slope"),
+        ("float64", "slope"),
+    ),
+    timed=np.array([3.3, 0.1]),
+)
+
+
+_PATTERN = np.array([1.0, -2.0, 0.5, 0.25])  # sums to -0.25, so the mean is not exact
+
+
+def _standardised(x):
+    return kan.standardise(64 + x[0] * constant(_PATTERN, x.dtype))
+
+
+def _by_moments(x):
+    """The variance as the mean square less the square of the mean."""
+    features = 64 + x[0] * constant(_PATTERN, x.dtype)
+    mean = jnp.mean(features)
+    variance = jnp.mean(features**2) - mean**2
+    return (features - mean) / jnp.sqrt(variance + kan.NORM_VARIANCE)
+
+
+def _exact_standardised(x):
+    features = [64 + x[0] * mpmath.mpf(p) for p in _PATTERN]
+    mean = mpmath.fsum(features) / len(features)
+    centred = [f - mean for f in features]
+    variance = mpmath.fsum(c**2 for c in centred) / len(features)
+    return [c / mpmath.sqrt(variance + mpmath.mpf(kan.NORM_VARIANCE)) for c in centred]
+
+
+# Powers of two, so that what is standardised is exact in float32.
+_SPREADS = np.array([0, 2.0**-13, 2.0**-12, 2.0**-10, 2.0**-7, 0.125, 1, 16])
+NORM = Case(
+    name="KAN features of little spread",
+    breaks="mean square less squared mean: no digit left, or a negative variance",
+    formula="mean square of what is centred, + 1e-6",
+    axis="spread about 64",
+    at=_SPREADS,
+    inputs=_SPREADS[:, None],
+    stable=_standardised,
+    textbook=_by_moments,
+    exact=_exact_standardised,
+    bounds={"float32": (1e-6, 1e-5), "float64": (1e-15, 1e-14)},
+    floors=(1e-30, 1),
+    caught=(("float32", "value"), ("float32", "slope"), ("float64", "slope")),
+    timed=np.array([1.0]),
+)
+
+
+B1, B2 = 0.9, 0.999
+
+
+def _length_as_printed(x):
+    """Equation 8 of Liu et al. 2020."""
+    seen = constant(B2, x.dtype) ** x
+    return 2 / (1 - B2) - 1 - 2 * x * seen / (1 - seen)
+
+
+def _exact_length(x):
+    b2 = mpmath.mpf(B2)
+    seen = b2 ** x[0]
+    return [2 / (1 - b2) - 1 - 2 * x[0] * seen / (1 - seen)]
+
+
+# The series ends at t = -1 / log b2 = 999.5.
+_UPDATES = np.array(
+    [1, 2, 3, 4, 5, 6, 7, 20, 100, 690, 999, 1000, 1001, 1e4, 1e5, 1e6], float
+)
+LENGTH = Case(
+    name="length of RAdam's second moment",
+    breaks="2/(1 - b) - 1 - 2tb^t/(1 - b^t): 0.03 off at t = 5, where RAdam decides",
+    formula="t - (2/L)(h(tL/2) - h(L/2)), h(x) = x coth x - 1 by its series",
+    switch="t = 999.5",
+    axis="updates",
+    at=_UPDATES,
+    inputs=_UPDATES[:, None],
+    stable=lambda x: optimiser.moment_length(x, B2),
+    textbook=_length_as_printed,
+    exact=_exact_length,
+    bounds={"float32": (4e-7,), "float64": (2e-15,)},
+    caught=(("float32", "value"), ("float64", "value")),
+    timed=np.array([40.0]),
+)
+
+
+def _nth_update(x):
+    """Adam's n-th update of a row with a steady slope; n and the slope."""
+    count, slope = x[:1], x[1:]
+    before = [slope**k * -jnp.expm1((count - 1) * math.log(b)) for k, b in _MOMENTS]
+    state = optimiser.RowAdamState((count - 1).astype(jnp.int32), *before)
+    return optimiser.scale_by_row_adam(B1, B2).update(slope, state)[0]
+
+
+_MOMENTS = ((1, B1), (2, B2))
+
+
+def _update_at(count, x):
+    """As Adam's paper prints it."""
+    slope = x[1:]
+    before = [-jnp.expm1((x[:1] - 1) * math.log(b)) for _, b in _MOMENTS]
+    first = B1 * slope * before[0] + (1 - B1) * slope
+    second = B2 * slope**2 * before[1] + (1 - B2) * slope**2
+    mean = first / (1 - constant(B1, x.dtype) ** count)
+    square = second / (1 - constant(B2, x.dtype) ** count)
+    return mean / (jnp.sqrt(square) + 1e-8)
+
+
+def _exact_update(x):
+    return [x[1] / (abs(x[1]) + mpmath.mpf("1e-15"))]
+
+
+_AGES = np.array([[n, 1e-3] for n in (1, 2, 3, 5, 10, 100, 1000, 1e5)])
+NEWBORN = Case(
+    name="Adam's update of a newborn row",
+    breaks="one count for all, here 1000 older: 2.5 to 4.6 times too fast",
+    formula="a count for each row",
+    axis="updates since birth",
+    at=_AGES[:, 0],
+    inputs=_AGES,
+    stable=_nth_update,
+    textbook=lambda x: _update_at(1000 + x[:1], x),
+    exact=_exact_update,
+    bounds={"float32": (1e-6,), "float64": (2e-15,)},
+    caught=(("float32", "value"), ("float64", "value")),
+    timed=np.array([10, 1e-3]),
+)
+
+BIAS = NEWBORN._replace(
+    name="bias of Adam's moments",
+    breaks="1 - bⁿ cancels for the first updates: 1.5e-5; eps 1e-8",
+    formula="-expm1(n log b), eps 1e-15",
+    textbook=lambda x: _update_at(x[:1], x),
+    bounds={"float32": (1e-6,), "float64": (2e-15,)},
+)
+
+_SLOPES = np.array(
+    [[3, g] for g in (1e-30, 1e-20, 1e-18, 1e-15, 1e-10, 1e-8, 1e-4, 1, 1e10, 1e18)]
+)
+SIZE = NEWBORN._replace(
+    name="Adam's update for a slope of any size",
+    breaks="eps 1e-8 halves the step where slopes are 1e-8; 1e-3 of it at 1e-11",
+    formula="eps 1e-15",
+    axis="slope",
+    at=_SLOPES[:, 1],
+    inputs=_SLOPES,
+    textbook=lambda x: _update_at(x[:1], x),
+    bounds={"float32": (3e-6,), "float64": (2e-15,)},
+    floors=(1,),  # of a full step; squares below 1e-38 are 0 in float32
+)
+
+CASES = (OUTSIDE, FAR_AWAY, WIDTH, NORM, LENGTH, NEWBORN, BIAS, SIZE)

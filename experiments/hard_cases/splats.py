@@ -1,0 +1,278 @@
+"""Hard cases of Gaussians: compositing, activations, relocation, motion."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+
+from experiments.hard_cases.case import Case, constant
+from gaussians_jax import density, raster, relocation, splats
+from gaussians_jax.effects import acceleration
+from gaussians_jax.projection import Footprints
+from gaussians_jax.raster_spec import GSPLAT
+from gaussians_jax.splats import Splats
+
+NEAR = 1e-6  # how close to a switch its two sides are tried, as a share of it
+OPEN = dataclasses.replace(GSPLAT, stop=0.0, tile=4, batch=1, chunk=1)
+COUNT = 300
+_VALUES = np.cos(np.arange(COUNT) * 0.7)
+
+
+def _pixel(x):
+    """A pixel behind `COUNT` wide Gaussians, the first with alpha x0, all others x1."""
+    rest = constant(np.ones(COUNT - 1), x.dtype) * x[1]
+    footprints = Footprints(
+        mean_px=constant(np.full((COUNT, 2), 0.5), x.dtype),
+        whitening=constant(np.tile([1e-3, 0, 1e-3], (COUNT, 1)), x.dtype),
+        opacity=jnp.concatenate([x[:1], rest]),
+        depth=constant(np.arange(1, COUNT + 1), x.dtype),
+        extent_px=constant(np.full((COUNT, 2), 2.0), x.dtype),
+    )
+    values = constant(_VALUES[:, None], x.dtype)
+    image, _ = raster.rasterise(footprints, values, (1, 1), OPEN)
+    return image[0, 0]
+
+
+@jax.custom_vjp
+def _composite_dividing(alpha, values):
+    """As INRIA's kernel: the backward pass divides the transmittance back out."""
+    passed = jnp.cumprod(1 - alpha)
+    before = jnp.concatenate([jnp.ones_like(passed[:1]), passed[:-1]])
+    return jnp.sum(before * alpha * values)
+
+
+def _dividing_forward(alpha, values):
+    return _composite_dividing(alpha, values), (alpha, values, jnp.prod(1 - alpha))
+
+
+def _dividing_backward(residuals, cotangent):
+    alpha, values, final = residuals
+
+    def step(carry, row):
+        transmittance, behind = carry
+        opacity, value = row
+        transmittance = transmittance / (1 - opacity)
+        slope = transmittance * (value - behind)
+        behind = opacity * value + (1 - opacity) * behind
+        return (transmittance, behind), slope
+
+    start = (final, jnp.zeros_like(final))
+    slopes = jax.lax.scan(step, start, (alpha, values), reverse=True)[1]
+    return cotangent * slopes, jnp.zeros_like(values)
+
+
+_composite_dividing.defvjp(_dividing_forward, _dividing_backward)
+
+
+def _pixel_textbook(x):
+    alpha = jnp.concatenate([x[:1], constant(np.full(COUNT - 1, 1), x.dtype) * x[1]])
+    alpha = jnp.where(alpha < OPEN.alpha_cut, 0, jnp.minimum(alpha, OPEN.alpha_max))
+    return _composite_dividing(alpha, constant(_VALUES, x.dtype))[None]
+
+
+def _exact_pixel(x):
+    def seen(alpha):
+        if alpha < mpmath.mpf(OPEN.alpha_cut):
+            return mpmath.mpf(0)
+        return min(alpha, mpmath.mpf(OPEN.alpha_max))
+
+    first, rest = seen(x[0]), seen(x[1])
+    total, passed = first * mpmath.mpf(float(_VALUES[0])), 1 - first
+    for value in _VALUES[1:].tolist():
+        total += passed * rest * mpmath.mpf(value)
+        passed *= 1 - rest
+    return [total]
+
+
+_CUT = OPEN.alpha_cut
+_MOST = OPEN.alpha_max
+_SEEN = [_CUT * (1 - NEAR), _CUT * (1 + 1e-4), 0.01, 0.1, 0.5, 0.9]
+_ALPHAS = np.array([*_SEEN, _MOST * (1 - NEAR), _MOST * (1 + NEAR), 1.0])
+
+LONG_LIST = Case(
+    name=f"a pixel behind {COUNT} Gaussians",
+    breaks="T / (1 - alpha) of a transmittance that is 0 (126 times 0.5 in f32)",
+    formula="front to back in both passes; what is behind is a running difference",
+    switch="alpha = 1/255 (cut) and 0.99 (clamp)",
+    axis="alpha",
+    at=_ALPHAS,
+    inputs=np.stack([np.full(len(_ALPHAS), 0.25), _ALPHAS], axis=1),
+    stable=_pixel,
+    textbook=_pixel_textbook,
+    exact=_exact_pixel,
+    bounds={"float32": (2e-6, 2e-4), "float64": (5e-15, 1e-12)},
+    caught=(("float32", "slope"), ("float64", "slope")),
+    alike=False,  # a whole rasteriser against one product
+)
+
+
+_SWITCH = density.FAINT_LOGIT
+_BOTH = [_SWITCH * (1 + NEAR), _SWITCH * (1 - NEAR)]
+_LOGITS = np.array(
+    [-500.0, -100, -88, -30, *_BOTH, -8, -1, 0, 1, 8, 16, 17, 37, 40, 80, 100]
+)
+
+
+def _halved_textbook(logit):
+    opacity = 1 - jnp.sqrt(1 - 1 / (1 + jnp.exp(-logit)))
+    return jnp.log(opacity / (1 - opacity))
+
+
+def _exact_halved(logit):
+    half = mpmath.log1p(mpmath.exp(logit[0])) / 2
+    return [mpmath.log(-mpmath.expm1(-half)) + half]
+
+
+HALVED = Case(
+    name="halved opacity",
+    breaks="1 - o is 0 from a logit of 17 (37), 1 - √(1 - o) below -17",
+    formula="h = log_sigmoid(-l) / 2, logit log(-expm1(h)) - h; series below",
+    switch="logit -20",
+    axis="logit",
+    at=_LOGITS,
+    inputs=_LOGITS[:, None],
+    stable=density.halve_opacity,
+    textbook=_halved_textbook,
+    exact=_exact_halved,
+    bounds={"float32": (1e-6, 1e-6), "float64": (1e-14, 1e-14)},
+    floors=(1.0, 0.0, 0.0),
+    caught=(("float32", "value"), ("float64", "value"), ("float32", "slope")),
+)
+
+
+_LOW, _HIGH = splats.LOG_SCALE_RANGE
+_INSIDE = [_LOW * (1 - NEAR), -1, 0, 5, _HIGH * (1 - NEAR)]
+_LOGS = np.array(
+    [-1e30, -100, _LOW * (1 + NEAR), *_INSIDE, _HIGH * (1 + NEAR), 45, 89, 800, 1e30]
+)
+
+
+def _variance(log_scale):
+    one = constant(np.zeros(1), log_scale.dtype)
+    rows = Splats(
+        constant(np.zeros((1, 3)), log_scale.dtype),
+        constant(np.full((1, 3), 1), log_scale.dtype) * log_scale,
+        constant(np.zeros((1, 4)), log_scale.dtype),
+        one,
+        constant(np.zeros((1, 1, 3)), log_scale.dtype),
+        constant(np.zeros((1, 0, 3)), log_scale.dtype),
+    )
+    return splats.activate(rows).scale[0, :1] ** 2
+
+
+def _exact_variance(log_scale):
+    return [mpmath.exp(2 * max(min(log_scale[0], _HIGH), _LOW))]
+
+
+LOG_SCALE = Case(
+    name="variance of a log-scale",
+    breaks="exp(s)² is infinite from 45 (355), and its slope NaN",
+    formula="exp(clip(s, -20, 15)); no slope outside",
+    switch="-20 and 15",
+    axis="log-scale",
+    at=_LOGS,
+    inputs=_LOGS[:, None],
+    stable=_variance,
+    textbook=lambda s: jnp.exp(s) ** 2,
+    exact=_exact_variance,
+    bounds={"float32": (3e-6, 3e-6), "float64": (1e-14, 1e-14)},
+    caught=(("float32", "value"), ("float64", "value"), ("float32", "slope")),
+    alike=False,  # all of a row is activated, not one scale
+)
+
+
+COPIES = 40
+_OPACITIES = np.array([1e-4, 0.01, 0.1, 0.5, 0.9, 0.999, 1 - 1e-6])
+
+
+def _spread(opacity):
+    each, scale = relocation.spread_over(
+        opacity,
+        constant(np.ones((1, 3)), opacity.dtype),
+        constant(np.full(1, COPIES), jnp.int32),
+        least=0.0,
+    )
+    return jnp.concatenate([each, scale[0, :1]])
+
+
+@functools.cache
+def _binomials():
+    """Factor of each^(k+1) in equation 9, summed over the copies i: [COPIES]."""
+    return [
+        mpmath.mpf(-1) ** k
+        * sum(mpmath.binomial(i, k) for i in range(COPIES))
+        / mpmath.sqrt(k + 1)
+        for k in range(COPIES)
+    ]
+
+
+def _spread_textbook(opacity):
+    """Equation 9, its alternating sum in the precision of the opacity."""
+    each = 1 - (1 - opacity) ** (1 / COPIES)
+    factors = constant([float(f) for f in _binomials()], opacity.dtype)
+    powers = each ** jnp.arange(1, COPIES + 1).astype(opacity.dtype)
+    return jnp.concatenate([each, opacity / jnp.sum(factors * powers)])
+
+
+def _exact_spread(opacity):
+    each = 1 - (1 - opacity[0]) ** (mpmath.mpf(1) / COPIES)
+    total = sum(f * each ** (k + 1) for k, f in enumerate(_binomials()))
+    return [each, opacity[0] / total]
+
+
+RELOCATION = Case(
+    name=f"relocation to {COPIES} copies",
+    breaks="alternating binomials of 1e10; 1 - (1 - o)^(1/n)",
+    formula="integral of what n copies cover, all terms positive; expm1, log1p",
+    axis="opacity",
+    at=_OPACITIES,
+    inputs=_OPACITIES[:, None],
+    stable=_spread,
+    textbook=_spread_textbook,
+    exact=_exact_spread,
+    bounds={"float32": (2e-6,), "float64": (1e-13,)},
+    caught=(("float32", "value"), ("float64", "value")),
+    timed=np.array([0.5]),
+)
+
+
+_SPEEDS = np.array([0, 1e-4, 1e-3, 1e-2, 1])
+
+
+def _bend(x):
+    before, now, after = (x[None, 3 * i : 3 * i + 3] for i in range(3))
+    return acceleration.unrest(now, before, now, after, 1.0, 0.0)[None]
+
+
+def _bend_textbook(x):
+    second = x[:3] + x[6:] - 2 * x[3:6]
+    return jnp.sum(second**2)[None]
+
+
+def _exact_bend(x):
+    second = [x[i] - 2 * x[3 + i] + x[6 + i] for i in range(3)]
+    return [mpmath.fdot(second, second)]
+
+
+_FROM, _MOVE = np.array([10.3, -20.7, 5.1]), np.array([0.6, -0.3, 0.5])
+
+ACCELERATION = Case(
+    name="acceleration of a slow motion",
+    breaks="p₊ + p₋ - 2p: the sum rounds before it cancels",
+    formula="(p₊ - p) - (p - p₋), each exact for close places",
+    axis="scene units per interval",
+    at=_SPEEDS,
+    inputs=np.concatenate(
+        [_FROM + _SPEEDS[:, None] * share * _MOVE for share in (-1.0, 0.0, 1.25)], 1
+    ),
+    stable=_bend,
+    textbook=_bend_textbook,
+    exact=_exact_bend,
+    bounds={"float32": (1e-6, 1e-6), "float64": (1e-15, 1e-15)},
+    caught=(("float32", "value"),),
+)
+
+CASES = (LONG_LIST, HALVED, LOG_SCALE, RELOCATION, ACCELERATION)

@@ -1,0 +1,283 @@
+"""Hard cases of volume rendering: weights, distances, samples where light stops."""
+
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+
+from experiments.hard_cases.case import Case, constant
+from nerfies_jax.radiance import compositing, sampling
+from nerfies_jax.radiance.compositing import AT_INFINITY, EMPTY_BELOW
+
+
+def _times(sizes, pattern):
+    sizes = np.array(sizes)
+    return {"at": sizes, "inputs": sizes[:, None] * np.array(pattern)}
+
+
+def _by_product(depth):
+    """The weights of the NeRF and Nerfies codes."""
+    opacity = 1 - jnp.exp(-depth)
+    through = jnp.cumprod(1 - opacity[:-1] + 1e-10)
+    return opacity * jnp.concatenate([jnp.ones_like(depth[:1]), through])
+
+
+def _exact_weights(depth):
+    before, weights = mpmath.mpf(0), []
+    for one in depth:
+        weights.append(mpmath.exp(-before) * -mpmath.expm1(-one))
+        before += one
+    return weights
+
+
+WEIGHTS = Case(
+    name="weights from thin air to walls",
+    breaks="1 - exp(-d) is 0 below d = 6e-8: a ray through thin air weighs nothing",
+    formula="-expm1(-d) exp(-sum of the depths before)",
+    axis="depth of a sample",
+    **_times([1e-30, 1e-12, 1e-8, 1e-4, 0.01, 0.3, 1, 5, 16, 30, 1e3], [1, 0.5, 2, 1]),
+    stable=compositing.weights,
+    textbook=_by_product,
+    exact=_exact_weights,
+    bounds={
+        "bfloat16": (8e-3, 8e-3),
+        "float32": (4e-7, 4e-7),
+        "float64": (8e-16, 8e-16),
+    },
+    # expm1's slope is exp to a rounding unit of one.
+    floors=(0, 1),
+    caught=(
+        ("bfloat16", "value"),
+        ("float32", "value"),
+        ("float64", "value"),
+        ("float64", "slope"),
+    ),
+    timed=np.array([0.1, 0.05, 0.2, 0.1]),
+)
+
+
+DISTANCES = np.array([1.0, 1.25, 2.0, 2.125, 3.0])
+
+
+def _closed_by_infinity(density):
+    distances = constant(DISTANCES, density.dtype)
+    spacing = compositing.intervals(distances, AT_INFINITY)
+    return compositing.weights(density * spacing)
+
+
+def _subtracted(density):
+    """The depth in front of a sample as the sum up to it without it."""
+    spacing = jnp.diff(constant([*DISTANCES, DISTANCES[-1] + 1e10], density.dtype))
+    depth = density * spacing
+    through = jnp.exp(-(jnp.cumsum(depth) - depth))
+    return through * -jnp.expm1(-depth)
+
+
+def _exact_closed(density):
+    spacing = [mpmath.mpf(float(s)) for s in (*np.diff(DISTANCES), AT_INFINITY)]
+    return _exact_weights([d * s for d, s in zip(density, spacing, strict=True)])
+
+
+LAST = Case(
+    name="last interval of 1e10",
+    breaks="cumsum(d) - d swallows the depths in front: weights sum to 1.6",
+    formula="sum of the samples before, without the sample itself",
+    axis="density",
+    **_times([1e-20, 1e-14, 1e-11, 1e-10, 1e-4, 0.1, 1, 10, 1e3], [1, 1, 0.5, 2, 1]),
+    stable=_closed_by_infinity,
+    textbook=_subtracted,
+    exact=_exact_closed,
+    bounds={"float32": (4e-7, 4e-7), "float64": (1e-15, 1e-15)},
+    floors=(0, 1),
+    caught=(("float32", "value"), ("float64", "value"), ("float32", "slope")),
+    timed=np.array([0.1, 0.2, 0.3, 0.4, 0.5]),
+)
+
+
+FAR = 3.0
+_SHARES = [0.5, 1.0, 0.25, 2.0, 0.25]  # sum to 4
+
+
+def _expected(weights):
+    distances = constant(DISTANCES, weights.dtype)
+    far = constant(FAR, weights.dtype)
+    return compositing.expected_distance(weights, distances, far)[None]
+
+
+def _quotient(weights):
+    distances = constant(DISTANCES, weights.dtype)
+    return (jnp.sum(weights * distances) / jnp.sum(weights))[None]
+
+
+def _exact_expected(weights):
+    alpha = sum(weights)
+    missing = max(EMPTY_BELOW - alpha, 0)
+    along = sum(w * d for w, d in zip(weights, DISTANCES, strict=True))
+    return [(along + missing * FAR) / (alpha + missing)]
+
+
+_EDGE = EMPTY_BELOW / 4
+DISTANCE = Case(
+    name="expected distance of an empty ray",
+    breaks="0/0, and a slope that grows as 1/opacity",
+    formula="opacity below 1e-3 is filled up at the far end",
+    switch="opacity 1e-3",
+    axis="opacity / 4",
+    **_times(
+        [
+            0,
+            1e-38,
+            1e-30,
+            1e-8,
+            1e-5,
+            _EDGE * (1 - 1e-6),
+            _EDGE * (1 + 1e-6),
+            0.01,
+            0.2,
+        ],
+        _SHARES,
+    ),
+    stable=_expected,
+    textbook=_quotient,
+    exact=_exact_expected,
+    bounds={"float32": (3e-7, 1e-6), "float64": (8e-16, 2e-15)},
+    caught=(("float32", "value"), ("float64", "value"), ("float32", "slope")),
+    timed=0.1 * np.array(_SHARES),
+)
+
+
+def _thinned(x):
+    return compositing.thinned(x[0], x[1])[None]
+
+
+def _thinned_as_printed(x):
+    return -jnp.log(1 - jax.nn.sigmoid(x[1]) * (1 - jnp.exp(-x[0])))[None]
+
+
+def _exact_thinned(x):
+    share = 1 / (1 + mpmath.exp(-x[1]))
+    return [-mpmath.log(1 - share * -mpmath.expm1(-x[0]))]
+
+
+def _sides(edge):
+    """Below and above an edge, by its neighbours in both precisions and by 1e-6."""
+    found = [edge * (1 - 1e-6), edge, edge * (1 + 1e-6)]
+    for kind in (np.float32, np.float64):
+        found += [float(np.nextafter(kind(edge), kind(to))) for to in (-9, 9)]
+    return sorted(found)
+
+
+# A share of 3/4 of an opacity of 2/3 is one half.
+_SWITCH = np.log(3.0)
+_THINNED = np.array(
+    [[d, v] for d in (1e-8, 0.1, 1, 17, 50, 1e10) for v in (-60, -1, 3, 20, 80)]
+    + [[d, _SWITCH] for d in _sides(_SWITCH)]
+    + [[1e-30, 0.5], [0.7, 16.7]]
+)
+_THINNED = _THINNED[np.argsort(_THINNED[:, 0], kind="stable")]
+THINNED = Case(
+    name="opacity times a share",
+    breaks="-log(1 - v(1 - exp(-d))): infinite for v → 1, 0 in thin air",
+    formula="-log1p(v expm1(-d)); -logaddexp(log(1 - v), log v - d) for walls",
+    switch="opacity ½",
+    axis="depth",
+    at=_THINNED[:, 0],
+    inputs=_THINNED,
+    stable=_thinned,
+    textbook=_thinned_as_printed,
+    exact=_exact_thinned,
+    bounds={
+        "bfloat16": (8e-3, 8e-3),
+        "float32": (1e-6, 1.5e-6),
+        "float64": (2e-15, 3e-15),
+    },
+    floors=(1e-37, 1),
+    caught=(
+        ("bfloat16", "value"),
+        ("float32", "value"),
+        ("float64", "value"),
+        ("float32", "slope"),
+    ),
+    timed=np.array([0.5, 0.3]),
+)
+
+
+EDGES = np.linspace(2, 4, 9)
+DRAWN = 11
+
+
+def _samples(weights):
+    edges = constant(EDGES, weights.dtype)
+    return sampling.from_weights(None, edges, weights, DRAWN)
+
+
+def _with_a_floor(weights):
+    """As the Nerfies code: 1e-5 on every weight, a mask for every share and edge."""
+    edges = constant(EDGES, weights.dtype)
+    weights = weights + 1e-5
+    share = jnp.cumsum(weights / jnp.sum(weights))
+    share = jnp.concatenate([jnp.zeros_like(share[:1]), share])
+    asked = jnp.linspace(0, 1, DRAWN, dtype=weights.dtype)
+    reached = asked[:, None] >= share
+    low, high = (
+        (
+            jnp.max(jnp.where(reached, x, x[0]), axis=1),
+            jnp.min(jnp.where(~reached, x, x[-1]), axis=1),
+        )
+        for x in (share, edges)
+    )
+    span = jnp.where(low[1] - low[0] < 1e-5, 1, low[1] - low[0])
+    return high[0] + (asked - low[0]) / span * (high[1] - high[0])
+
+
+def _exact_samples(weights):
+    """Nothing is added but where there is nothing; the ends are the range's."""
+    total = sum(weights)
+    if total == 0:
+        weights, total = [mpmath.mpf(1)] * len(weights), mpmath.mpf(len(weights))
+    drawn = []
+    for k in range(1, DRAWN - 1):
+        left = total * k / (DRAWN - 1)
+        index = 0
+        while left > weights[index]:
+            left -= weights[index]
+            index += 1
+        start, stop = EDGES[index], EDGES[index + 1]
+        drawn.append(start + left / weights[index] * (stop - start))
+    return [mpmath.mpf(EDGES[0]), *drawn, mpmath.mpf(EDGES[-1])]
+
+
+_UNEVEN = np.array([0.2, 1.3, 0.7, 2.1, 0.45, 0.9, 0.31, 1.1])
+_PEAK = np.eye(8)[3]
+_DRAWS = [
+    (0, _UNEVEN),
+    (1e-37, _UNEVEN),
+    (1e-31, _PEAK),
+    (1e-31, _UNEVEN),
+    (1e-10, _PEAK + np.eye(8)[6] * 1.17),
+    (1e-5, _UNEVEN),
+    (1, _PEAK),
+    (1, _UNEVEN),
+    (1e30, _UNEVEN),
+]
+SAMPLES = Case(
+    name="samples where light stops",
+    breaks="a floor of 1e-5 on all weights drowns faint ones: 0.4 of the range off",
+    formula="scaled by the largest, floor of a rounding unit, running maximum",
+    switch="largest weight 1.2e-38, none",
+    axis="size of the weights",
+    at=np.array([size for size, _ in _DRAWS]),
+    inputs=np.array([size * pattern for size, pattern in _DRAWS]),
+    stable=_samples,
+    textbook=_with_a_floor,
+    exact=_exact_samples,
+    bounds={
+        "bfloat16": (6e-3,),
+        "float32": (1e-6,),
+        "float64": (2e-15,),
+    },
+    caught=(("bfloat16", "value"), ("float32", "value"), ("float64", "value")),
+    timed=_UNEVEN,
+)
+
+CASES = (WEIGHTS, LAST, DISTANCE, THINNED, SAMPLES)

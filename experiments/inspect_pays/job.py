@@ -1,0 +1,188 @@
+"""Inspect a capture, then train presets on it as they are and as advised."""
+
+import json
+import math
+import pathlib
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from experiments import cli, inspect_scene
+from experiments.ablate import __main__ as ablate
+from experiments.ablate import pool
+from experiments.ablate.job import Job, say
+from experiments.inspect_pays import arms
+from nerfies_jax import runs
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.capture.json_files import write_json
+from nerfies_jax.evaluation import pictures
+from nerfies_jax.evidence import inspection
+from nerfies_jax.evidence.findings import Finding
+from nerfies_jax.runs import adviser, representations
+from nerfies_jax.runs.config import CaptureSource
+from nerfies_jax.training import specs
+
+FOUND = "inspected.json"
+
+
+class Side(NamedTuple):
+    """One way to train, over all seeds: means; NaN where not known."""
+
+    psnr: float  # dB, held-out frames
+    depth: float  # median error, scene units
+    seconds: float  # of the processor, training alone
+    runs: int
+
+
+class Row(NamedTuple):
+    """A preset on a capture against what was advised for it."""
+
+    capture: str
+    preset: str
+    advised: str  # the preset and what is changed in it
+    notes: tuple[str, ...]
+    same: bool  # the advice is the preset as it is
+    refused: str  # why the preset cannot be built on the capture; empty if it can
+    before: Side | None  # None where not trained
+    after: Side | None
+
+
+def read(
+    asked: Any, capture: pathlib.Path | None, scene: str = "default"
+) -> tuple[str, CaptureSource, Capture]:
+    """A capture's name, how it is read, and itself; ValueError where it cannot be."""
+    own = capture is not None
+    source = CaptureSource(
+        capture=capture,
+        scene=scene,
+        factor=asked.factor if own else None,
+        max_side=asked.max_side if own else None,
+        heldout=asked.heldout if own else None,
+    )
+    stored = runs.stored_capture(source)
+    if not len(stored.heldout):
+        raise ValueError(
+            f"{capture}: no held-out frames to judge by; choose some with --heldout, "
+            "as --heldout 8 for every eighth"
+        )
+    return capture.absolute().name if own else scene, source, stored
+
+
+class Trial:
+    """A capture, what was found in it, and the runs that tell what it was worth."""
+
+    def __init__(self, asked: Any, name: str, source: CaptureSource, stored: Capture):
+        self.asked, self.name, self._source = asked, name, source
+        self._stored = stored
+        self.folder = asked.out / name
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self._found: tuple[Finding, ...] | None = None
+        self._job: Job | None = None
+        self._refused: dict[str, str] = {}  # arms that cannot be built, and why
+
+    def findings(self) -> tuple[Finding, ...]:
+        """As kept, or looked for now; ValueError where another capture's are kept."""
+        if self._found is not None:
+            return self._found
+        path = self.folder / FOUND
+        asked = specs.as_json(self._source)
+        if path.is_file():
+            kept = json.loads(path.read_text())
+            if kept["read as"] != asked:
+                raise ValueError(
+                    f"{path}: the capture was read otherwise; name another --out"
+                )
+            self._found = tuple(Finding(**one) for one in kept["findings"])
+            return self._found
+        say(f"{self.name}: looking at it")
+        found = inspection.inspect(self._stored)
+        pictures.save(found.sheet, self.folder / "inspected.png")
+        advice = adviser.advise_all(found.findings)
+        told = inspect_scene.as_json(self._stored, found, advice)
+        write_json(path, {"read as": asked, **told})
+        self._found = found.findings
+        return self._found
+
+    def advice(self, preset: str) -> adviser.Advice:
+        """In the representation and size of a preset."""
+        return adviser.advise_for(self.findings(), preset)
+
+    def pairs(self) -> dict[str, str]:
+        """By preset, the arm that is advised in its place."""
+        return {
+            preset: arms.name_of(self.advice(preset)) for preset in self.asked.presets
+        }
+
+    def run(self) -> list[tuple[str, int]]:
+        """Train what is not there yet; returns the arms and seeds that failed."""
+        with cli.user_errors():
+            differ = [pair for pair in self.pairs().items() if len({*pair}) > 1]
+            names = dict.fromkeys(name for pair in differ for name in pair)
+            if not names:
+                return []
+            asked = self.asked
+            self._job = Job(
+                ablate.Ablate(
+                    suite="advice",
+                    arms=tuple(names),
+                    source=self._source,
+                    steps=asked.steps,
+                    seeds=asked.seeds,
+                    jobs=asked.jobs,
+                    out=self.folder,
+                    frames=asked.frames,
+                    set=asked.set,
+                    device="cpu",
+                )
+            )
+        self._refused = dict(filter(None, map(self._reason, names)))
+        self._job.names = tuple(name for name in names if name not in self._refused)
+        for name, reason in self._refused.items():
+            say(f"{self.name}: {name} cannot be built: {reason}")
+        say(f"{self.name}: {', '.join(self._job.names)}")
+        return pool.run(self._job)
+
+    def _reason(self, name):
+        """Why an arm cannot be built on the capture, with its name; None if it can."""
+        spec = self._job.spec(name, self.asked.steps)
+        representation = representations.of_preset(self._job.suite.arms[name].preset)
+        try:
+            facts = representation.facts_of(self._job.capture, spec)
+            representation.build(spec, facts)
+        except ValueError as error:
+            return name, str(error)
+        return None
+
+    def rows(self) -> list[Row]:
+        """One for each preset, with what has been trained by now."""
+        finished = {}
+        if self._job is not None:
+            (budget,) = self._job.budgets
+            finished = self._job.finished(budget)
+        rows = []
+        for preset, advised in self.pairs().items():
+            before, after = (_side(finished, name) for name in (preset, advised))
+            rows.append(
+                Row(
+                    capture=self.name,
+                    preset=preset,
+                    advised=advised,
+                    notes=self.advice(preset).notes,
+                    same=preset == advised,
+                    refused=self._refused.get(preset, ""),
+                    before=before,
+                    after=after,
+                )
+            )
+        return rows
+
+
+def _side(finished, name):
+    kept = [one.numbers for (arm, _), one in finished.items() if arm == name]
+    if not kept:
+        return None
+    psnr, depth, seconds = (
+        float(np.mean([one.get(key, math.nan) for one in kept]))
+        for key in ("psnr", "depth_median", "train_cpu_seconds")
+    )
+    return Side(psnr, depth, seconds, len(kept))

@@ -1,0 +1,171 @@
+"""Tables, sentences and the figure of `experiments.spectral_bias`."""
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from nerfies_jax.capture.json_files import replaced_file, write_json
+from nerfies_jax.measure import clock
+from nerfies_jax.training import specs
+
+# The measured expectation of the design: on the 2-D signal at equal parameters the KAN
+# of raw coordinates has at most half the error of the best encoded MLP.
+GATE = 0.5
+
+
+def progress(found) -> str:
+    """One line for a network that is done."""
+    first = found[0]
+    return (
+        f"{first.signal} {first.network}: rmse {np.mean(first.rmse):.4f} in "
+        f"{first.steps} steps, {first.seconds:.2f} s"
+    )
+
+
+def name_of(wave) -> str:
+    """Periods along each axis, "3" or "3,-2"."""
+    return ",".join(f"{periods:g}" for periods in wave)
+
+
+def other(row) -> float:
+    """RMS error that is in none of the signal's sinusoids, of the signal's RMS."""
+    # The sinusoids share the signal's power equally.
+    own = np.mean(np.square(row.missing), axis=1)
+    return float(np.mean(np.sqrt(np.maximum(np.square(row.rmse) - own, 0))))
+
+
+def tables(results, waves) -> str:
+    """One table for each signal and each kind of equality."""
+    blocks = []
+    for label, components in waves.items():
+        for equality, rows in results.items():
+            names = "".join(f"{'k=' + name_of(wave):>9s}" for wave in components)
+            lines = [
+                f"\n{label}, {equality}: RMS error (mean and deviation over seeds, "
+                "of the signal's), missing share of each sinusoid, and the RMS of "
+                "what is at other frequencies",
+                f"{'network':20s} {'size':>5s} {'rate':>6s} {'steps':>6s} {'s':>6s} "
+                f"{'rmse':>8s} {'+-':>7s} {names} {'other':>8s}",
+            ]
+            for row in rows:
+                if row.signal != label:
+                    continue
+                missing = np.mean(row.missing, axis=0)
+                lines.append(
+                    f"{row.network:20s} {row.parameters:5d} {row.rate:6g} "
+                    f"{row.steps:6d} {row.seconds:6.2f} {np.mean(row.rmse):8.4f} "
+                    f"{np.std(row.rmse):7.4f} "
+                    + "".join(f"{share:9.4f}" for share in missing)
+                    + f" {other(row):8.4f}"
+                )
+            blocks.append("\n".join(lines))
+    return "\n".join(blocks)
+
+
+def said(results) -> str:
+    """What the numbers show, in sentences."""
+    sentences = [""]
+    for equality, rows in results.items():
+        for label in dict.fromkeys(row.signal for row in rows):
+            error = {
+                row.network: float(np.mean(row.rmse))
+                for row in rows
+                if row.signal == label
+            }
+            ranked = sorted(error, key=error.get)
+            sentences.append(
+                f"{label}, {equality}: best is {ranked[0]} ({error[ranked[0]]:.4f}), "
+                f"then {ranked[1]} ({error[ranked[1]]:.4f})."
+                if len(ranked) > 1
+                else f"{label}, {equality}: {ranked[0]} ({error[ranked[0]]:.4f})."
+            )
+            if "kan" in error:
+                sentences += _against_kan(label, equality, error)
+    return "\n".join(sentences)
+
+
+def _against_kan(label, equality, error):
+    own = error["kan"]
+    for others, words in (
+        ([n for n in error if n in ("relu", "softplus")], "ReLU or softplus, raw"),
+        (
+            [n for n in error if n in ("relu + encoding", "softplus + encoding")],
+            "ReLU or softplus, encoded",
+        ),
+        ([n for n in error if n.startswith("sine")], "sine"),
+        ([n for n in error if n == "kan + encoding"], "KAN, encoded"),
+    ):
+        if not others:
+            continue
+        best = min(others, key=error.get)
+        ratio = own / error[best]
+        verdict = "better" if ratio < 1 else "worse"
+        yield (
+            f"  The KAN of raw coordinates has {ratio:.2f} of the error of the best "
+            f"of {words} ({best}): {verdict}."
+        )
+    encoded = [
+        error[n] for n in ("relu + encoding", "softplus + encoding") if n in error
+    ]
+    if label == "2-D" and equality == "equal steps" and encoded:
+        holds = own <= GATE * min(encoded)
+        yield (
+            f"  At most {GATE:g} of the best encoded MLP's error on the 2-D signal: "
+            f"{'holds' if holds else 'DOES NOT HOLD'}."
+        )
+
+
+def write(asked, results, waves) -> None:
+    """spectral_bias.json and spectral_bias.png in the folder asked for."""
+    record = {
+        "settings": specs.as_json(asked),
+        "machine": clock.machine(),
+        "waves": {label: found.tolist() for label, found in waves.items()},
+        "results": {
+            equality: [row._asdict() for row in rows]
+            for equality, rows in results.items()
+        },
+        "said": said(results).strip().split("\n"),
+    }
+    write_json(asked.out / "spectral_bias.json", record)
+    draw_figure(results, waves, asked.out / "spectral_bias.png")
+    print(asked.out / "spectral_bias.png")
+
+
+def draw_figure(results, waves, path) -> None:
+    """What is missing of each sinusoid: colour a network, dashes an encoding."""
+    size = 6 * len(results) + 1.5, 3.6 * len(waves)
+    figure = Figure(figsize=size, dpi=120, layout="constrained")
+    FigureCanvasAgg(figure)  # no pyplot: it keeps every figure and a global state
+    axes = figure.subplots(len(waves), len(results), squeeze=False, sharey="row")
+    for line, (label, components) in zip(axes, waves.items(), strict=True):
+        for panel, (equality, rows) in zip(line, results.items(), strict=True):
+            _draw_panel(panel, [row for row in rows if row.signal == label])
+            panel.set_title(f"{label}, {equality}", fontsize=10)
+            panel.set_xticks(range(len(components)), [name_of(w) for w in components])
+            panel.set_xlabel("periods of the sinusoid over [-1, 1]")
+        line[0].set_ylabel("missing share of its amplitude")
+    axes[0, -1].legend(
+        frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5)
+    )
+    with replaced_file(path) as partial:
+        figure.savefig(partial)
+
+
+def _draw_panel(panel, rows):
+    kinds = list(dict.fromkeys(row.network.split(" ")[0] for row in rows))
+    for row in rows:
+        kind = row.network.split(" ")[0]
+        missing = np.asarray(row.missing)
+        panel.plot(
+            missing.mean(axis=0),
+            color=f"C{kinds.index(kind)}",
+            linestyle="--" if "+" in row.network else "-",
+            marker="o",
+            markersize=3.5,
+            label=row.network,
+        )
+    panel.axhline(1, color="0.7", linewidth=0.8, zorder=0)
+    panel.set_yscale("log")
+    panel.grid(alpha=0.3)
+    panel.spines[["top", "right"]].set_visible(False)

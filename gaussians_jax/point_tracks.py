@@ -1,0 +1,90 @@
+"""Points followed through time by the Gaussians around them."""
+
+import jax
+import numpy as np
+import scipy.spatial
+
+from gaussians_jax import scene, splats
+from nerfies_jax.evaluation.protocol import STILL_POINTS, Followed
+from nerfies_jax.training.model import in_default_precision
+
+NEIGHBOURS = 8  # Gaussians that carry a point
+LEAST_OPACITY = 0.05  # of a Gaussian that can carry one; fainter ones are not seen
+
+
+def follow(spec, facts, state, capture, known) -> Followed | None:
+    """Points of the start at all other moments, carried by the Gaussians around them.
+
+    A point moves as the `NEIGHBOURS` nearest Gaussians that can be seen do on average,
+    where they are at the start; `neighbour_weights` says how much each counts. This
+    tells where what is drawn at a point goes. It cannot tell whether these Gaussians
+    stand for the point: beside a silhouette some belong to what is behind it, and where
+    Gaussians fade in and out instead of moving, a point stays. The average of a turn is
+    exact at the mean of the neighbours, and off by the turn of the way from there.
+    Every point is carried by something, so none is lost; between Gaussians there is no
+    Jacobian, so no strain.
+    """
+
+    effects = scene.effects_of(spec, facts)
+    if all(effect.deform is None for effect in effects) or not len(known.path):
+        return None
+    stages = scene.build(spec, facts).stages
+    prepared = jax.jit(stages.prepare)(state.params)
+    pose = jax.jit(lambda params, ready, time: stages.pose(params, ready, time))
+    times = in_default_precision(capture.times[known.moments])
+    # [moments, gaussians, 3]
+    means = np.stack(
+        [np.asarray(pose(state.params, prepared, time).mean) for time in times]
+    )
+    first = pose(state.params, prepared, times[known.start])
+    alive = np.asarray(splats.alive(state.params.rows["splats"]))
+    opacity = np.where(alive, np.asarray(first.opacity), 0.0)
+    path = carried(known.start_points, means, opacity, known.start)
+    drift = float("nan")
+    if capture.points is not None:
+        still = capture.points.position[:STILL_POINTS]
+        still = carried(still, means, opacity, known.start)
+        apart = still - still.mean(axis=1, keepdims=True)
+        drift = float(np.linalg.norm(apart, axis=-1).mean())
+    return Followed(
+        path=path.astype(np.float32),
+        found=np.ones(path.shape[:2], bool),
+        drift=drift,
+        strain=float("nan"),
+    )
+
+
+def carried(
+    points: np.ndarray, means: np.ndarray, opacity: np.ndarray, start: int
+) -> np.ndarray:
+    """Where Gaussians carry points [points, 3] to: [points, moments, 3].
+
+    `means` [moments, gaussians, 3] are theirs; the points are given at moment `start`.
+    Where no Gaussian can be seen, points stay.
+    """
+    rows = np.flatnonzero(opacity > LEAST_OPACITY)
+    path = np.repeat(points[:, None].astype(float), len(means), axis=1)
+    if not len(rows):
+        return path
+    tree = scipy.spatial.cKDTree(means[start, rows])
+    count = min(NEIGHBOURS, len(rows))
+    distance, nearest = tree.query(points, np.arange(1, count + 1))
+    nearest = rows[nearest]
+    weight = neighbour_weights(distance, opacity[nearest])
+    for moment, mean in enumerate(means):
+        moved = mean[nearest].astype(float) - means[start][nearest]
+        path[:, moment] += np.einsum("pk,pkd->pd", weight, moved)
+    return path
+
+
+def neighbour_weights(distance: np.ndarray, opacity: np.ndarray) -> np.ndarray:
+    """Weights [points, neighbours] that sum to one, nearest neighbour first.
+
+    Opacity times a Gaussian of the distance, as wide as half the way to the farthest
+    of the neighbours: not their own extents, which are thin across a surface and would
+    leave a point beside it to a single one.
+    """
+    # Where all lie at the point itself, no distance differs, whatever the width.
+    width = np.where(distance[:, -1:] > 0, distance[:, -1:], 1.0) / 2
+    weight = opacity * np.exp(-0.5 * (distance / width) ** 2)
+    return weight / weight.sum(axis=1, keepdims=True)

@@ -1,0 +1,78 @@
+"""Gaussian splats, as `nerfies_jax.runs` finds them."""
+
+import pathlib
+from typing import Any
+
+from gaussians_jax import (
+    files,
+    model_file,
+    point_tracks,
+    presets,
+    scene,
+    step_time,
+    variants,
+)
+from nerfies_jax.evaluation.representation import (
+    MODEL,
+    Choice,
+    Pair,
+    Representation,
+    Saved,
+)
+from nerfies_jax.evidence.findings import DEPTH, LIGHT, MOTION, START, TRANSIENT
+from nerfies_jax.training.model import TrainState
+
+
+def save(folder: pathlib.Path, spec: Any, facts: Any, state: TrainState) -> Saved:
+    """`model.npz`, all of the scene, and `gaussians.ply` for viewers."""
+    about = {"spec": spec, "facts": facts, "step": int(state.step)}
+    size = model_file.save(folder / MODEL, state.params, about)
+    files.save(folder / "gaussians.ply", state.params.rows["splats"])
+    effects = scene.effects_of(spec, facts)
+    if all(effect.deform is None for effect in effects):
+        return Saved(size)
+    note = "gaussians.ply holds the canonical Gaussians, without their motion."
+    return Saved(size, (note,))
+
+
+def advise(wanted: dict[str, bool | None], full: bool) -> Choice:
+    """The preset and its changes for what a capture calls for."""
+    del full  # no effect of splats has another size in the papers' presets
+    overrides, notes = [], []
+    preset = "splats-static" if wanted.get(MOTION) is False else "splats-deformable"
+    if wanted.get(LIGHT):
+        notes.append(f"{LIGHT}: splats have none; prefer the field")
+    if wanted.get(TRANSIENT) and preset == "splats-static":
+        notes.append(f"{TRANSIENT}: splats have no medium for it; prefer the field")
+    if wanted.get(START) is False:
+        overrides.append("start.source=random")
+    if wanted.get(DEPTH):
+        overrides.append("depth.weight=0.1")
+    return Choice(preset, tuple(overrides), tuple(notes))
+
+
+GAUSSIANS = Representation(
+    name="gaussians",
+    # Splats are tight loops. XLA splits their bodies over all cores it sees and gains
+    # nothing: 87 to 94 ms a training step with one, 94 to 109 with four (10,000
+    # Gaussians, 176x132). With one, the bits do not depend on the core count either.
+    threads="one",
+    spec_type=scene.SplatScene,
+    presets=presets.PRESETS,
+    with_steps=presets.with_steps,
+    facts_of=lambda capture, spec: scene.facts_of(capture),
+    build=scene.build,
+    first_bytes=scene.first_bytes,
+    lighter="lower start.points, start.random or raster.capacity with --set",
+    time_parts=step_time.parts,
+    variant=variants.without_effects,
+    score_halves=lambda *_: None,
+    fitted_rays=0,
+    save=save,
+    follow=point_tracks.follow,
+    advise=advise,
+    prices={
+        MOTION: Pair("splats-deformable-small", "only_motion"),
+        DEPTH: Pair("sonata-small", "only_depth"),
+    },
+)

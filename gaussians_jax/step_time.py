@@ -1,0 +1,82 @@
+"""Where the time of a training step of Gaussians goes."""
+
+import jax
+import jax.numpy as jnp
+
+from gaussians_jax import render, scene, splats
+from gaussians_jax.effects import deformation
+from gaussians_jax.effects.effect import Around, Moment
+from nerfies_jax.measure.part_time import part_ms
+from nerfies_jax.training import losses
+from nerfies_jax.training.model import Frames, Model, Rendering, TrainState
+
+
+def parts(
+    spec, facts, model: Model, state: TrainState, frames: Frames
+) -> dict[str, float]:
+    """Milliseconds of each part of one step, forward and backward; medians, warm.
+
+    Each part is timed by itself on the first frame. What is left of the whole step is
+    the optimiser and the statistics for the density control.
+    """
+    params = state.params
+    size = frames.images.shape[2], frames.images.shape[1]
+    camera = jax.tree.map(lambda leaf: leaf[0], frames.cameras)
+    shot = scene.shot(frames, 0, None)
+    moment = Moment(frames.times[0], state.step, state.key)
+    effects = scene.effects_of(spec, facts)
+
+    def draw(gaussians, coefficients):
+        frame = render.render_harmonics(
+            gaussians, coefficients, camera, size, spec.raster
+        )
+        return jnp.sum(frame.rendering.colour)
+
+    def compare(colour):
+        return losses.photometric(
+            colour, shot.truth, shot.valid, dssim_weight=spec.dssim_weight
+        )
+
+    gaussians = splats.activate(params.rows["splats"])
+    coefficients = splats.active_harmonics(params.rows["splats"], spec.sh_degree)
+    timed = {
+        "project and blend": part_ms(jax.grad(draw, (0, 1)), gaussians, coefficients),
+        "loss": part_ms(jax.grad(compare), shot.truth),
+    }
+    for effect in effects:
+
+        def one(params, rendering, carried, effect=effect):
+            return _sum_of_effect(
+                effect,
+                effects,
+                params,
+                shot._replace(rendering=rendering),
+                moment,
+                carried,
+            )
+
+        carried = state.extra.carried.get(effect.name)
+        drawn = Rendering(shot.truth, *(jnp.ones(shot.truth.shape[:2]) for _ in "ad"))
+        if {effect.deform, effect.image_loss, effect.penalty} != {None}:
+            slope = jax.grad(one, (0, 1))
+            timed[effect.name.replace("_", " ")] = part_ms(
+                slope, params, drawn, carried
+            )
+    whole = part_ms(model.step, state, frames)
+    timed["optimiser and statistics"] = max(whole - sum(timed.values()), 0.0)
+    return timed
+
+
+def _sum_of_effect(effect, effects, params, shot, moment, carried):
+    """A scalar whose gradient takes the work of one effect in a step."""
+    total = jnp.zeros(())
+    if effect.deform is not None:
+        gaussians = splats.activate(params.rows["splats"])
+        moved = deformation.pose_in_training((effect,), params, gaussians, moment)
+        total += sum(jnp.sum(leaf) for leaf in moved)
+    if effect.image_loss is not None:
+        total += effect.image_loss(params, shot, moment).value
+    if effect.penalty is not None:
+        at_time = deformation.poser(effects, moment)
+        total += effect.penalty(Around(params, at_time, moment, carried)).value
+    return total

@@ -1,0 +1,164 @@
+"""Trained Gaussians drawn otherwise: effects left out, faster, without what moves."""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from gaussians_jax import scene, splats, still_rows, time_knots
+from nerfies_jax.evaluation.representation import check_there
+from nerfies_jax.training.model import Model, Stages, TrainState
+
+INSTANTS = 33  # at which rows are looked for that move
+
+
+def without_effects(spec, facts, without: tuple[str, ...], blended: bool) -> Model:
+    """The model with some effects left out."""
+    if blended:
+        raise ValueError(
+            "--appearance: splats have no appearance codes; reconstruct with a preset "
+            "that has them, as nerf-w or nerfies"
+        )
+    there = [name for name in ("motion",) if getattr(spec, name) is not None]
+    check_there(without, there)
+    left = dataclasses.replace(spec, **dict.fromkeys(without))
+    return scene.build(left, facts)
+
+
+class Faster(NamedTuple):
+    """A model that is drawn faster, the state that it needs, and what was gained."""
+
+    model: Model
+    state: TrainState
+    summary: str
+
+
+def from_knots(
+    model: Model,
+    state: TrainState,
+    knots: int,
+    interpolation: str = "linear",
+    still_below: float = 0.0,
+) -> Faster:
+    """The model with its motion read from a table of `knots` instants; host side."""
+    stages = _stages(model, "--knots")
+    time_knots.check(knots, interpolation)
+    params = state.params
+    prepared = jax.jit(stages.prepare)(params)
+    pose = jax.jit(stages.pose)
+    table = time_knots.bake(
+        lambda time: pose(params, prepared, time), knots, still_below
+    )
+    summary = (
+        f"{knots} knots, {interpolation}, of {_moving(table.where, still_below)}: "
+        f"{table.bytes / 1e6:.1f} MB"
+    )
+    return _with(
+        model,
+        state,
+        table,
+        Stages(
+            prepare=lambda both: (),
+            pose=lambda both, prepared, time: time_knots.at(
+                both[1], time, interpolation
+            ),
+            draw=lambda both, *rest: stages.draw(both[0], *rest),
+        ),
+        summary,
+    )
+
+
+def without_still(model: Model, state: TrainState, still_below: float) -> Faster:
+    """The model with the deformation evaluated for moving Gaussians alone; host side.
+
+    Those are the ones that move farther than `still_below` (scene units) over
+    `INSTANTS` instants of [0, 1].
+    """
+    stages = _stages(model, "--still-below")
+
+    def pose_rows(params, time):
+        return stages.pose(params, stages.prepare(params), time)
+
+    times = np.linspace(0, 1, INSTANTS)
+    parts = still_rows.split(state.params, pose_rows, times, still_below)
+
+    def pose(both, prepared, time):
+        return still_rows.pose(
+            both[1], lambda rows, time: stages.pose(rows, prepared, time), time
+        )
+
+    return _with(
+        model,
+        state,
+        parts,
+        Stages(
+            prepare=lambda both: stages.prepare(both[1].moving),
+            pose=pose,
+            draw=lambda both, *rest: stages.draw(both[0], *rest),
+        ),
+        f"the deformation of {_moving(parts.where, still_below)}",
+    )
+
+
+def without_moving(
+    model: Model, state: TrainState, farther_than: float
+) -> tuple[TrainState, str]:
+    """The state without the Gaussians that move, and what was left out; host side.
+
+    Those are the ones of which a point moves farther than `farther_than` (scene units)
+    over `INSTANTS` instants of [0, 1]: what is left is the static scene, with holes
+    where nothing was ever filmed behind what moves.
+    """
+    stages = _stages(model, "--hide-moving")
+
+    def pose_rows(params, time):
+        return stages.pose(params, stages.prepare(params), time)
+
+    times = np.linspace(0, 1, INSTANTS)
+    parts = still_rows.split(state.params, pose_rows, times, farther_than)
+    moves = parts.where.moves
+    rows = state.params.rows
+    living = int(splats.alive(rows["splats"]).sum())
+    if int(moves.sum()) == living:
+        raise ValueError(
+            f"--hide-moving {farther_than:g}: all {living} Gaussians move farther than "
+            "that, and nothing would be left; give a longer distance"
+        )
+    shown = rows | {"splats": splats.bury(rows["splats"], moves)}
+    params = state.params._replace(rows=shown)
+    summary = f"{int(moves.sum())} of {living} Gaussians move and are left out"
+    return state._replace(params=params), summary
+
+
+def _stages(model, option):
+    if model.stages is None:
+        raise ValueError(
+            f"{option} is for runs of Gaussians; a radiance field has no table of "
+            "where its points are"
+        )
+    return model.stages
+
+
+def _moving(where, still_below):
+    moving, rows = int(where.moves.sum()), len(where.moves)
+    if not moving:
+        raise ValueError(
+            f"nothing in this run moves farther than {still_below:g} scene units; "
+            "leave --knots and --still-below out, or lower the latter"
+        )
+    return f"{moving} of {rows} rows that move"
+
+
+def _with(model: Model, state: TrainState, beside: Any, stages: Stages, summary: str):
+    """The model on `(params, beside)`: what is beside is an argument, no constant."""
+
+    def render(both, view, size, step):
+        posed = stages.pose(both, stages.prepare(both), view.time)
+        return stages.draw(both, posed, view, size, step)
+
+    return Faster(
+        model._replace(render=render, stages=stages),
+        state._replace(params=(state.params, beside)),
+        summary,
+    )

@@ -1,0 +1,32 @@
+"""Frames of a capture, the renderer, and scores of what it draws."""
+
+from nerfies_jax.evaluation.frames import (
+    frames_of,
+    path_views,
+    resized,
+    spread,
+    view_of,
+)
+from nerfies_jax.evaluation.renderer import Renderer, as_picture
+from nerfies_jax.evaluation.scores import (
+    Halves,
+    Scored,
+    score,
+    score_halves,
+    score_right_halves,
+)
+
+__all__ = [
+    "Halves",
+    "Renderer",
+    "Scored",
+    "as_picture",
+    "frames_of",
+    "path_views",
+    "resized",
+    "score",
+    "score_halves",
+    "score_right_halves",
+    "spread",
+    "view_of",
+]

@@ -1,0 +1,67 @@
+"""The frames of a capture on the device, and views to render."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.capture.flow import training_flow
+from nerfies_jax.geometry import camera as cameras
+from nerfies_jax.geometry.camera import Camera
+from nerfies_jax.training.model import Frames, View, in_default_precision
+
+
+def frames_of(capture: Capture, wants: frozenset[str] = frozenset()) -> Frames:
+    """The training frames on the device, with what a model `wants` and there is."""
+    rows = capture.train
+    beside = {}
+    if "depths" in wants and capture.depths is not None:
+        beside["depths"] = capture.depths[rows]
+    if "points" in wants and capture.points is not None:
+        beside["points"] = capture.points.position
+    if "flow" in wants and capture.flow is not None:
+        beside["flow"] = training_flow(capture)
+    frames = Frames(
+        images=capture.images[rows],
+        cameras=cameras.take(capture.cameras, rows),
+        times=capture.times[rows],
+        warp=capture.warp_ids[rows],
+        appearance=capture.appearance_ids[rows],
+        valid=None if capture.valid is None else capture.valid[rows],
+        **beside,
+    )
+    return in_default_precision(frames)
+
+
+def view_of(capture: Capture, row: int) -> View:
+    """The view in which a frame was filmed."""
+    view = View(
+        cameras.take(capture.cameras, row),
+        capture.times[row],
+        capture.warp_ids[row],
+        capture.appearance_ids[row],
+    )
+    return in_default_precision(view)
+
+
+def resized(view: View, old: tuple[int, int], new: tuple[int, int]) -> View:
+    """The same view as a picture of another (width, height)."""
+    if old == new:
+        return view
+    return view._replace(camera=cameras.resize(view.camera, old, new))
+
+
+def path_views(path: Camera, times: np.ndarray, like: View) -> list[View]:
+    """Views along a camera path, one for each time; codes as in `like`."""
+    return [
+        like._replace(
+            camera=in_default_precision(cameras.take(path, row)),
+            time=jnp.asarray(moment, like.time.dtype),
+        )
+        for row, moment in enumerate(times)
+    ]
+
+
+def spread(rows: np.ndarray, most: int) -> np.ndarray:
+    """At most `most` of the rows, evenly spread."""
+    picked = np.linspace(0, len(rows) - 1, min(most, len(rows))).round().astype(int)
+    return rows[picked]

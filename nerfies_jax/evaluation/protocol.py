@@ -1,0 +1,208 @@
+"""What a trained scene is measured by; one protocol for all.
+
+Pictures of held-out frames; where the truth is known also their depth, what moves in
+them, and points followed through time by the learned motion. Everything that is
+reported is in scene units.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from nerfies_jax import evaluation
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.capture.synthetic import SceneTruth
+from nerfies_jax.evaluation import Renderer, Scored
+from nerfies_jax.measure import geometry_quality, image_quality
+from nerfies_jax.training.model import TrainState
+
+CORRECT_WITHIN = 0.01  # scene units: a quarter of the default cube's half-side
+STILL_POINTS = 500  # of the capture's static points, to see whether they drift
+
+
+# What only a truth can score.
+EXACT = (
+    "moving_psnr",
+    "moving_ssim",
+    "depth_median",
+    "depth_rmse",
+    "moving_depth_median",
+    "moving_depth_rmse",
+)
+
+
+class Known(NamedTuple):
+    """What all arms are held against; NumPy. Without a truth there are no tracks."""
+
+    rows: np.ndarray  # held-out frames of the capture that are rendered
+    moments: np.ndarray  # frames learnt from, in time: when points are looked for
+    path: np.ndarray  # [tracks, moments, 3] where they are, scene units
+    seen: np.ndarray  # [tracks, moments] whether the camera that is learnt from sees it
+    # The moment from which points are followed: the middle one. D-NeRF's template is
+    # what it sees at time 0, and its warp jumps there.
+    start: int
+    exact: bool = True  # whether depth and what moves are known, too
+
+    @property
+    def start_points(self) -> np.ndarray:
+        """[tracks, 3] where the points are known to be, scene units."""
+        return self.path[:, self.start]
+
+
+class Followed(NamedTuple):
+    """Points as a learned warp moves them."""
+
+    path: np.ndarray  # [tracks, moments, 3] scene units; the start where not found
+    found: np.ndarray  # [tracks, moments] bool
+    # Mean distance of static points in the template from where they are on average;
+    # where that is does not matter: a template may lie anywhere. Gaussians have no
+    # template: the distance is that of the points themselves. Scene units.
+    drift: float
+    # Root mean square of ||log Σ|| of the Jacobian at the true points; NaN where there
+    # is no Jacobian.
+    strain: float
+
+
+def known(capture: Capture, truth: SceneTruth, frames: int, tracks: int) -> Known:
+    """At most `frames` held-out frames and `tracks` points seen at the start.
+
+    Raises ValueError where the truth is not that of the capture.
+    """
+    if truth.ids != capture.ids:
+        raise ValueError(
+            f"{capture.name}: the truth has other frames than the capture; make the "
+            "scene again"
+        )
+    moments = capture.train[np.argsort(capture.times[capture.train], kind="stable")]
+    last = truth.track_world.shape[1] - 1
+    instants = np.round(capture.times[moments] * last).astype(int)
+    if np.abs(instants - capture.times[moments] * last).max() > 1e-3:
+        raise ValueError(
+            f"{capture.name}: its frames lie between the {last + 1} instants of the "
+            "truth; make the scene again"
+        )
+    start = len(moments) // 2
+    chosen = np.flatnonzero(truth.track_seen[:, moments[start]])
+    if len(chosen):
+        chosen = evaluation.spread(chosen, tracks)
+    world = (truth.track_world[chosen] - np.float32(capture.centre)) * capture.scale
+    return Known(
+        rows=evaluation.spread(capture.heldout, frames),
+        moments=moments,
+        path=world[:, instants].astype(np.float32),
+        seen=truth.track_seen[chosen][:, moments],
+        start=start,
+    )
+
+
+def filmed(capture: Capture, frames: int) -> Known:
+    """What is known of a real capture: how at most `frames` held-out frames look.
+
+    Its depths and masks, if it has any, are estimates, and nothing is judged by them.
+    """
+    if not len(capture.heldout):
+        raise ValueError(
+            f"{capture.name}: no held-out frames to judge by; choose some with "
+            "--heldout, as --heldout 8 for every eighth"
+        )
+    moments = capture.train[np.argsort(capture.times[capture.train], kind="stable")]
+    return Known(
+        rows=evaluation.spread(capture.heldout, frames),
+        moments=moments,
+        path=np.zeros((0, len(moments), 3), np.float32),
+        seen=np.zeros((0, len(moments)), bool),
+        start=len(moments) // 2,
+        exact=False,
+    )
+
+
+def score_pictures(
+    renderer: Renderer, state: TrainState, capture: Capture, known: Known
+) -> tuple[Scored, dict[str, float]]:
+    """The held-out frames as rendered, and their scores, also of what moves alone.
+
+    What is not known is NaN.
+    """
+    scored = evaluation.score(renderer, state, capture, known.rows)
+    numbers = {"psnr": float(scored.psnr.mean()), "ssim": float(scored.ssim.mean())}
+    if known.exact:
+        return scored, numbers | _score_truth(scored, capture, known)
+    return scored, numbers | dict.fromkeys(EXACT, float("nan"))
+
+
+def _score_truth(scored, capture, known):
+    truth, moving = capture.depths[known.rows], capture.moving[known.rows]
+    parts = [
+        jax.device_get(_score_moving(colour, capture.images[row], capture.moving[row]))
+        for row, colour in zip(known.rows, scored.colour, strict=True)
+        if capture.moving[row].any()
+    ]
+    psnr, ssim = np.mean(parts, axis=0) if parts else (np.nan, np.nan)
+    numbers = {"moving_psnr": psnr, "moving_ssim": ssim}
+    depth, truth = jnp.asarray(scored.depth), jnp.asarray(truth)
+    for name, mask in (("", np.ones_like(moving)), ("moving_", moving)):
+        mask = jnp.asarray(mask)
+        compared = geometry_quality.known_depth(depth, truth, mask)
+        error = np.abs(np.asarray(depth - truth))[np.asarray(compared)]
+        numbers[f"{name}depth_median"] = np.median(error) if error.size else np.nan
+        errors = geometry_quality.depth_errors(depth, truth, mask)
+        numbers[f"{name}depth_rmse"] = errors.rmse
+    return {name: float(value) for name, value in numbers.items()}
+
+
+@jax.jit
+def _score_moving(colour, truth, moving):
+    picture = image_quality.quantise(colour)
+    truth = truth.astype(colour.dtype) / 255
+    return (
+        image_quality.masked_psnr(picture, truth, moving),
+        image_quality.masked_ssim(picture, truth, moving),
+    )
+
+
+def score_tracks(known: Known, followed: Followed | None) -> dict[str, float]:
+    """End-point errors over the seen points of all moments but the start.
+
+    Without anything followed, or anything to follow, all are NaN.
+    """
+    names = ("track_error", "track_correct", "track_lost", "drift", "strain")
+    if followed is None or not len(known.path):
+        return dict.fromkeys(names, float("nan"))
+    errors = _endpoints(followed.path, known)
+    lost = 1 - followed.found[_scored(known)].mean()
+    values = (errors.endpoint, errors.correct, lost, followed.drift, followed.strain)
+    return {name: float(value) for name, value in zip(names, values, strict=True)}
+
+
+def still_error(known: Known) -> float:
+    """The end-point error of points that are said not to move; NaN without any."""
+    if not len(known.path):
+        return float("nan")
+    return float(
+        _endpoints(
+            np.broadcast_to(known.start_points[:, None], known.path.shape), known
+        )[0]
+    )
+
+
+def _scored(known):
+    """Seen, and not given."""
+    scored = known.seen.copy()
+    scored[:, known.start] = False
+    return scored
+
+
+def _endpoints(path, known):
+    return geometry_quality.track_errors(
+        jnp.asarray(path),
+        jnp.asarray(known.path),
+        jnp.asarray(_scored(known)),
+        CORRECT_WITHIN,
+    )
+
+
+# (spec, facts, state, capture, known) -> None where nothing is warped
+Follow = Callable[[Any, Any, TrainState, Capture, Known], Followed | None]

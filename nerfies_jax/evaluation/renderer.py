@@ -1,0 +1,132 @@
+"""A model's whole-frame function, compiled, keeping what stays as it was."""
+
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from nerfies_jax.training.model import Model, Rendering, TrainState, View
+
+
+class Renderer:
+    """A model's whole-frame function; compiled once for each shape of its state.
+
+    Where the model is drawn in stages, what stays as it was is not computed again:
+    the first stage as long as the parameters are the very same arrays, the second for
+    all views of the same instant.
+    """
+
+    def __init__(self, model: Model, size: tuple[int, int]):
+        self._model = model
+        self._programs = {}
+        self._prepared = _Kept()
+        self._posed = _Kept()
+        self.size = size  # width and height in pixels
+        self.seconds: list[float] = []  # of every frame, without compiling
+        self.cpu_seconds: list[float] = []  # the same, of the processor
+        self.posed_anew: list[bool] = []  # whether that frame's instant was a new one
+
+    def __call__(self, state: TrainState, view: View) -> Rendering:
+        inputs = state.params, view, state.step
+        shapes = tuple(jax.typeof(leaf) for leaf in jax.tree.leaves(inputs))
+        if shapes not in self._programs:
+            compiled = _whole if self._model.stages is None else _staged
+            self._programs[shapes] = compiled(self._model, self.size, inputs)
+        start, cpu_start = time.perf_counter(), time.process_time()
+        rendering, anew = self._draw(self._programs[shapes], *inputs)
+        rendering = jax.device_get(rendering)
+        self.seconds.append(time.perf_counter() - start)
+        self.cpu_seconds.append(time.process_time() - cpu_start)
+        self.posed_anew.append(anew)
+        return rendering
+
+    def _draw(self, programs, params, view, step):
+        """The picture, and whether what is in it had to be posed for it."""
+        if self._model.stages is None:
+            return programs(params, view, step), True
+        prepared, _ = self._prepared.get(params, None, lambda: programs.prepare(params))
+        instant = np.asarray(view.time).tobytes()
+        posed, anew = self._posed.get(
+            params, instant, lambda: programs.pose(params, prepared, view.time)
+        )
+        return programs.draw(params, posed, view, step), anew
+
+    def ms_per_frame(self, frames: int, cpu: bool = False) -> float:
+        """What one of the last `frames` frames took, on the wall or of the processor.
+
+        The median, of frames at a new instant and of further views of the same instant
+        apart, weighted by how many there were of each: the median of both together
+        would leave out the poses altogether as soon as a second view shares them.
+        """
+        seconds = np.asarray((self.cpu_seconds if cpu else self.seconds)[-frames:])
+        anew = np.asarray(self.posed_anew[-frames:])
+        parts = [seconds[anew], seconds[~anew]]
+        total = sum(len(part) * np.median(part) for part in parts if len(part))
+        return 1e3 * float(total) / len(seconds)
+
+
+class _Kept:
+    """The last result of a function of parameters and a key.
+
+    It is right as long as every leaf is the very same array; the leaves are held, so
+    that no new array can be taken for an old one. NumPy arrays can be written into, so
+    nothing is kept for parameters that contain one.
+    """
+
+    def __init__(self):
+        self._leaves, self._key, self._result = None, None, None
+
+    def get(self, params, key, compute):
+        """The result, and whether it was computed now."""
+        leaves, structure = jax.tree.flatten(params)
+        if (
+            self._leaves is not None
+            and self._key == (key, structure)
+            and all(a is b for a, b in zip(leaves, self._leaves, strict=True))
+        ):
+            return self._result, False
+        self._leaves = self._result = None  # freed before the new one is made
+        result = compute()
+        if all(isinstance(leaf, jax.Array) for leaf in leaves):
+            self._leaves, self._key, self._result = leaves, (key, structure), result
+        return result, True
+
+
+class _Programs(NamedTuple):
+    """The stages of a model, compiled."""
+
+    prepare: Callable
+    pose: Callable
+    draw: Callable
+
+
+def _float32(rendering):
+    """A picture needs no more, whatever precision it was computed in."""
+    return jax.tree.map(lambda leaf: leaf.astype(jnp.float32), rendering)
+
+
+def _whole(model, size, inputs):
+    def render(params, view, step):
+        return _float32(model.render(params, view, size, step))
+
+    return jax.jit(render).lower(*inputs).compile()
+
+
+def _staged(model, size, inputs):
+    stages, (params, view, step) = model.stages, inputs
+
+    def draw(params, posed, view, step):
+        return _float32(stages.draw(params, posed, view, size, step))
+
+    prepare = jax.jit(stages.prepare).lower(params)
+    pose = jax.jit(stages.pose).lower(params, prepare.out_info, view.time)
+    drawn = jax.jit(draw).lower(params, pose.out_info, view, step)
+    return _Programs(prepare.compile(), pose.compile(), drawn.compile())
+
+
+def as_picture(colour: np.ndarray) -> np.ndarray:
+    """A rendered colour as 8 bits."""
+    return np.round(np.clip(colour, 0, 1) * 255).astype(np.uint8)

@@ -1,0 +1,83 @@
+"""What a run must know of a representation; each package fills one record.
+
+`nerfies_jax.runs` finds the records by the entry points of the group
+"nerfies_jax.representations", so it imports no package that has one.
+"""
+
+import pathlib
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
+
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.evaluation.protocol import Follow
+from nerfies_jax.evaluation.scores import Halves
+from nerfies_jax.training.model import Frames, Model, TrainState
+
+Spec = Any
+MODEL = "model.npz"  # in a run folder: all of a trained scene of Gaussians
+
+
+class Saved(NamedTuple):
+    """The files of a trained scene, beside its checkpoint."""
+
+    model_bytes: int | None = None  # of the one file that holds all of it
+    notes: tuple[str, ...] = ()  # what the reader should know of them
+
+
+class Choice(NamedTuple):
+    """A preset, by its name without "-small", and what to change in it."""
+
+    preset: str
+    overrides: tuple[str, ...]
+    notes: tuple[str, ...]  # what could not be decided or done
+
+
+class Pair(NamedTuple):
+    """Two scenes of a preset that differ in what a decision switches on.
+
+    The names are those of the keys of `experiments.effect_cost`.
+    """
+
+    preset: str
+    with_it: str
+    without: str = "bare"
+
+
+class Representation(NamedTuple):
+    """How its scenes are named, built, followed, timed and saved."""
+
+    name: str
+    # How many cores XLA:CPU should see: "one" where its own threading slows the loops.
+    threads: Literal["one", "all"]
+    spec_type: type
+    presets: dict[str, Spec]
+    with_steps: Callable[[Spec, int], Spec]  # schedules stretch with the steps
+    facts_of: Callable[[Capture, Spec], Any]
+    build: Callable[..., Model]  # (spec, facts) -> model
+    first_bytes: Callable[[Spec, Capture], int]  # of the first state and step
+    lighter: str  # which settings make the first state smaller
+    # (spec, facts, model, state, frames) -> milliseconds of each part of a step
+    time_parts: Callable[[Spec, Any, Model, TrainState, Frames], dict[str, float]]
+    # (spec, facts, effects left out, whether appearances are blended) -> model;
+    # it draws a `nerfies_jax.variants.Between` instead of a view where they are.
+    variant: Callable[[Spec, Any, tuple[str, ...], bool], Model]
+    # (spec, facts, state, capture, rows) -> scores with codes fitted to half a frame;
+    # None where the scene has no codes of its own for each frame.
+    score_halves: Callable[..., Halves | None]
+    fitted_rays: int  # rendered to fit the codes of one frame
+    # (folder, spec, facts, state) -> what it wrote beside the checkpoint
+    save: Callable[[pathlib.Path, Spec, Any, TrainState], Saved]
+    follow: Follow
+    # ({effect: whether it is called for, None unknown}, papers' sizes) -> what to take
+    advise: Callable[[dict[str, bool | None], bool], Choice]
+    prices: dict[str, Pair]  # by effect, as in `nerfies_jax.evidence.findings`
+
+
+def check_there(without: tuple[str, ...], there: list[str]) -> None:
+    """Raise ValueError for effects that a trained scene cannot be drawn without."""
+    for name in without:
+        if name not in there:
+            raise ValueError(
+                f"--without {name}: no effect that this run can be drawn without; "
+                f"those are: {', '.join(there) or 'none'}"
+            )

@@ -1,0 +1,110 @@
+"""Exposure and colour: whether points at rest look alike in all frames."""
+
+import numpy as np
+import scipy.ndimage as nd
+
+from nerfies_jax.capture.synthetic import texture
+from nerfies_jax.evidence import optical_flow, view_set
+from nerfies_jax.evidence.findings import LIGHT as EFFECT
+from nerfies_jax.evidence.findings import Finding, cannot_tell, judge
+from nerfies_jax.evidence.view_set import Views
+
+# A gain of a tenth of a stop, 7 %, left in the frames bounds a fit at 36 dB (3 % of a
+# mean sRGB value of 0.5, twice that in linear light): above what is reached otherwise.
+DRIFT_STOPS = 0.1
+GROUPS = 8  # of points by place: what all of them agree on is the frame's
+FEWEST = 40  # points in a frame and group
+# Linear light between which a pixel measures gain: sRGB 15 of 255, where a level is
+# 0.1 stop, to where highlights are clipped.
+DARK, BRIGHT = 0.005, 0.9
+POLISHES = 12  # rounds of medians; the gains move by less than 1e-3 afterwards
+
+
+def exposure(views: Views, points: np.ndarray) -> Finding:
+    """Whether whole frames differ in brightness or colour, by points [points, 3]."""
+    threshold = f"{DRIFT_STOPS:g} stops, root mean square over frames and channels"
+    if len(points) < GROUPS * FEWEST:
+        return cannot_tell(
+            EFFECT,
+            f"{len(points)} points at rest; {GROUPS * FEWEST} are needed",
+            threshold,
+        )
+    light = sightings(views, points)
+    groups = np.array_split(np.argsort(_along_widest(points)), GROUPS)
+    each = np.stack([gains(light[:, group]) for group in groups])
+    known = np.isfinite(each).all(-1).sum(0) >= GROUPS // 2
+    if known.sum() < max(3, 0.5 * len(views.row)):
+        return cannot_tell(
+            EFFECT, f"only {known.sum()} frames see enough points at rest", threshold
+        )
+    each = each[:, known]
+    count = np.isfinite(each).sum(0)
+    common = np.nanmedian(each, axis=0)
+    common = common - common.mean(0)
+    # Of a median over groups: 1.25 times that of their mean.
+    spread = np.nanmedian(np.abs(each - np.nanmedian(each, axis=0)), axis=0) * 1.48
+    error = float(np.sqrt(np.mean((1.25 * spread) ** 2 / count)))
+    total = float(np.sqrt(np.mean(common**2)))
+    drift = float(np.sqrt(max(total**2 - error**2, 0)))
+    brightness = float(np.sqrt(np.mean(common.mean(-1) ** 2)))
+    tint = float(np.sqrt(np.mean((common - common.mean(-1, keepdims=True)) ** 2)))
+    # Half of it: the error of a root mean square over dozens of frames is less still.
+    wanted, confidence = judge(drift, DRIFT_STOPS, error / 2)
+    evidence = (
+        f"frames differ by {drift:.3f} stops on points at rest (brightness "
+        f"{brightness:.3f}, colour {tint:.3f}), known to {error:.3f}"
+    )
+    numbers = {
+        "drift_stops": drift,
+        "brightness_stops": brightness,
+        "colour_stops": tint,
+        "noise_stops": error,
+        "points": float(len(points)),
+    }
+    return Finding(EFFECT, evidence, threshold, wanted, confidence, numbers)
+
+
+def sightings(views: Views, points: np.ndarray) -> np.ndarray:
+    """[frames, points, 3]: linear light in stops; NaN where a point is not measured."""
+    light = np.full((len(views.row), len(points), 3), np.nan)
+    for index in range(len(views.row)):
+        pixel, depth = view_set.project(views, index, points)
+        inside = view_set.in_picture(views, pixel, depth, 2)
+        picture = texture.linear(views.image[index] / 255)
+        # A pixel's blur: points are known to a fraction of one.
+        picture = nd.gaussian_filter(picture, (1, 1, 0))
+        place = pixel[inside]
+        value = optical_flow.sample(picture, place - 0.5)
+        shown = views.filmed[index][tuple(place[:, ::-1].astype(int).T)]
+        usable = ((value > DARK) & (value < BRIGHT)).all(-1) & shown
+        light[index, inside] = np.where(usable[:, None], np.log2(value), np.nan)
+    return light
+
+
+def gains(light: np.ndarray) -> np.ndarray:
+    """Gain of each frame [frames, 3] in stops, by median polish (Tukey 1977).
+
+    `light` [frames, points, 3] is a frame's gain plus a point's colour, but where the
+    point is hidden. NaN for frames that see too few.
+    """
+    gain = np.zeros((len(light), 3))
+    seen = np.isfinite(light).all(-1)
+    enough = seen.sum(1) >= FEWEST
+    kept = (seen & enough[:, None]).sum(0) >= 2
+    light = np.where(enough[:, None, None], light, np.nan)[:, kept]
+    if not enough.any() or not kept.any():
+        return np.full_like(gain, np.nan)
+    rows = light[enough]
+    for _ in range(POLISHES):
+        colour = np.nanmedian(rows - gain[enough][:, None], axis=0)
+        gain[enough] = np.nanmedian(rows - colour, axis=1)
+        gain[enough] -= gain[enough].mean(0)
+    gain[~enough] = np.nan
+    return gain
+
+
+def _along_widest(points):
+    """Where points lie along the direction in which they spread most."""
+    centred = points - np.median(points, axis=0)
+    _, _, axes = np.linalg.svd(centred, full_matrices=False)
+    return centred @ axes[0]

@@ -1,0 +1,124 @@
+"""What a capture brings along, and whether it can be used: depth, masks, a lens."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.evidence.findings import (
+    CERTAIN,
+    DEPTH,
+    LENS,
+    MASKS,
+    Finding,
+    cannot_tell,
+    judge,
+)
+from nerfies_jax.evidence.motion import Film
+from nerfies_jax.evidence.view_set import FEWEST_POINTS, Views
+from nerfies_jax.geometry import distortion
+
+KNOWN_SHARE = 0.2  # of the pixels: fewer depths are points
+DEPTH_ERROR = 0.1  # median share that depth is off what parallax says
+DEPTH_SURE = 0.03  # deviation of a depth from parallax, to be compared with
+MISSED_SHARE = 0.3  # of what is seen to move may lie outside a mask
+FEWEST_MOVING = 200  # pixels over all frames
+LENS_PX = 0.5  # half a pixel is what cameras are known to
+GRID = 9  # pixels across and down where a lens is asked
+
+
+def depth(capture: Capture, views: Views, films: list[Film]) -> Finding:
+    """Whether the capture's depth pictures say what parallax says, up to one scale."""
+    threshold = f"{KNOWN_SHARE:.0%} of the pixels, off parallax by {DEPTH_ERROR:.0%}"
+    if capture.depths is None:
+        return Finding(DEPTH, "the capture has none", threshold, False, CERTAIN)
+    stored = capture.depths[views.row]
+    share = float((stored > 0).mean())
+    if share < KNOWN_SHARE:
+        evidence = f"depth on {share:.1%} of the pixels"
+        return Finding(DEPTH, evidence, threshold, False, CERTAIN, {"share": share})
+    ratios = []
+    for one in (centre for film in films for centre in film.centres):
+        fit = one.fit
+        sure = one.usable & ~one.moving & (stored[one.view] > 0)
+        sure &= fit.inverse_depth * fit.parallax_px * DEPTH_SURE > one.noise_px
+        ratios.append((stored[one.view] * fit.inverse_depth)[sure])
+    ratio = np.concatenate(ratios) if ratios else np.zeros(0)
+    if len(ratio) < FEWEST_POINTS:
+        return cannot_tell(
+            DEPTH,
+            f"depth on {share:.1%} of the pixels, and no parallax to check it by",
+            threshold,
+        )
+    scale = float(np.median(ratio))
+    error = float(np.median(np.abs(ratio / scale - 1)))
+    wrong, confidence = judge(error, DEPTH_ERROR, 0.0)
+    evidence = (
+        f"depth on {share:.1%} of the pixels, {error:.1%} off parallax in the median "
+        f"once scaled by {1 / scale:.3g}"
+    )
+    numbers = {"share": share, "error_share": error, "scale": 1 / scale}
+    wanted = None if wrong is None else not wrong
+    return Finding(DEPTH, evidence, threshold, wanted, confidence, numbers)
+
+
+def masks(capture: Capture, views: Views, films: list[Film]) -> Finding:
+    """Whether the capture's masks hold what is seen to move."""
+    threshold = f"at most {MISSED_SHARE:.0%} of what is seen to move outside them"
+    if capture.moving is None:
+        return Finding(MASKS, "the capture has none", threshold, False, CERTAIN)
+    moving = capture.moving[views.row]
+    share = float(moving.mean())
+    seen = missed = frames = 0
+    for one in (centre for film in films for centre in film.centres):
+        seen += one.moving.sum()
+        missed += (one.moving & ~moving[one.view]).sum()
+        frames += one.moving.any()
+    numbers = {"share": share}
+    evidence = f"masks on {share:.1%} of the pixels"
+    if share in (0.0, 1.0):
+        return Finding(MASKS, evidence, threshold, False, CERTAIN, numbers)
+    if seen < FEWEST_MOVING:
+        return cannot_tell(
+            MASKS, f"{evidence}, and too little seen to move to check them", threshold
+        )
+    part = float(missed / seen)
+    # Whole regions are in or out: one region a frame.
+    error = np.sqrt(part * (1 - part) / frames)
+    wrong, confidence = judge(part, MISSED_SHARE, float(error))
+    wanted = None if wrong is None else not wrong
+    evidence += f"; {part:.1%} of what is seen to move lies outside"
+    return Finding(
+        MASKS, evidence, threshold, wanted, confidence, numbers | {"missed": part}
+    )
+
+
+def lens(capture: Capture) -> Finding:
+    """How far the lens bends pixels away from a pinhole's; of the capture as stored."""
+    threshold = f"{LENS_PX:g} px"
+    cameras = capture.cameras
+    width, height = capture.size
+    across, down = np.meshgrid(
+        np.linspace(0, width, GRID), np.linspace(0, height, GRID)
+    )
+    pixel = np.stack([across, down], -1).reshape(-1, 2)
+    parameters = np.concatenate(
+        [cameras.radial, cameras.tangential, cameras.focal_px[:, None]], axis=1
+    )
+    worst = 0.0
+    for row in np.unique(parameters, axis=0, return_index=True)[1]:
+        focal = np.array([1, cameras.pixel_aspect[row]]) * cameras.focal_px[row]
+        slope = ((pixel - cameras.principal_point_px[row]) / focal).astype(np.float32)
+        bend = jax.vmap(distortion.distort, (None, None, 0))
+        bent = bend(
+            jnp.asarray(cameras.radial[row], jnp.float32),
+            jnp.asarray(cameras.tangential[row], jnp.float32),
+            jnp.asarray(slope),
+        )
+        moved = np.linalg.norm((np.asarray(bent) - slope) * focal, axis=-1)
+        worst = max(worst, float(moved.max()))
+    wanted, confidence = judge(worst, LENS_PX, 0.0)
+    evidence = f"the lens moves pixels by up to {worst:.2g} px"
+    if wanted:
+        evidence += "; it is taken out when the pictures are read"
+    return Finding(LENS, evidence, threshold, wanted, confidence, {"most_px": worst})

@@ -1,0 +1,73 @@
+"""How fine the texture is, in bands of an encoding of positions."""
+
+import math
+
+import numpy as np
+
+from nerfies_jax import facts
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.evidence import scene_points, view_set
+from nerfies_jax.evidence.findings import CERTAIN, LIKELY, Finding, cannot_tell
+from nerfies_jax.evidence.findings import TEXTURE as EFFECT
+from nerfies_jax.evidence.view_set import Views
+
+SMALL = 8  # of the fields' small presets
+ENERGY = 0.95  # of the slopes' energy lies in coarser detail than "the finest"
+SHOWN = 8  # frames whose spectrum is taken
+
+
+def bands_for(cycles_per_unit: float) -> int:
+    """Bands of sin 2^k x, k = 0 .. bands-1, whose last one is at least as fast."""
+    return max(1, 1 + math.ceil(math.log2(max(2 * math.pi * cycles_per_unit, 1))))
+
+
+def texture(capture: Capture, views: Views, factor: int) -> Finding:
+    """How many bands of position the texture needs in the box of a field of extent 1.
+
+    From the spectrum of the pictures at the median depth; `factor` is how much smaller
+    they are than the capture's own, which may hold finer detail.
+    """
+    threshold = f"{SMALL} bands, as the fields' small presets have"
+    seen = [one for one in _shown(views) if views.filmed[one].mean() > 0.5]
+    if not seen:
+        return cannot_tell(
+            EFFECT, "plain background fills most of the views", threshold
+        )
+    cycles = float(np.median([_finest(views.grey[one]) for one in seen]))
+    points = scene_points.own_points(capture)
+    near, far = view_set.depth_span(capture, views, points)
+    depth = math.sqrt(near * far)
+    scale = facts.facts_of(capture, 1.0).scale
+    per_unit = cycles * views.intrinsics[0, 0, 0] / depth / scale
+    bands = bands_for(per_unit)
+    evidence = (
+        f"{ENERGY:.0%} of the detail is coarser than {1 / cycles:.1f} px at 1/{factor} "
+        f"of the size, {1 / per_unit:.3g} of a field's half-side: {bands} bands"
+    )
+    numbers = {"finest_px": 1 / cycles * factor, "bands": float(bands)}
+    sure = CERTAIN if abs(bands - SMALL) > 1 else LIKELY
+    return Finding(EFFECT, evidence, threshold, bands > SMALL, sure, numbers)
+
+
+def _shown(views):
+    return np.unique(np.linspace(0, len(views.row) - 1, SHOWN).round().astype(int))
+
+
+def _finest(grey):
+    """Cycles a pixel below which `ENERGY` of the slopes' energy lies, less the noise.
+
+    Noise is white, and what there is at the highest frequencies is taken for it.
+    """
+    height, width = grey.shape
+    window = np.hanning(height)[:, None] * np.hanning(width)
+    power = np.abs(np.fft.fft2((grey - grey.mean()) * window)) ** 2
+    across, down = np.fft.fftfreq(width), np.fft.fftfreq(height)
+    frequency = np.hypot(*np.meshgrid(across, down))
+    noise = np.median(power[frequency > 0.45])
+    slope = np.maximum(power - noise, 0) * frequency**2
+    order = np.argsort(frequency.ravel())
+    total = np.cumsum(slope.ravel()[order])
+    if not total[-1] > 0:
+        return 1 / max(width, height)
+    at = min(int(np.searchsorted(total, ENERGY * total[-1])), len(order) - 1)
+    return float(np.clip(frequency.ravel()[order][at], 1 / width, 0.5))

@@ -1,0 +1,72 @@
+"""Points followed through time by the warp of a radiance field."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from nerfies_jax import evaluation, scene
+from nerfies_jax.effects.effect import Moment
+from nerfies_jax.evaluation.protocol import STILL_POINTS, Followed
+from nerfies_jax.training import tracks
+from nerfies_jax.training.model import in_default_precision
+
+LEAST_STRETCH = 1e-6  # a collapsed direction has a logarithm, too
+
+
+def follow(spec, facts, state, capture, known) -> Followed | None:
+    """Points of the start at all other moments, through the template of a field.
+
+    A point goes to the template by the warp of the start, and from there by the inverse
+    warp of every other moment.
+    """
+
+    made = scene.field(spec, facts)
+    if all(effect.displace is None for effect in made.effects) or not len(known.path):
+        return None
+    views = [evaluation.view_of(capture, int(row)) for row in known.moments]
+    views = jax.tree.map(lambda *leaves: jnp.stack(leaves), *views)
+    centre = np.asarray(facts.centre, np.float32)
+
+    def to_field(points):
+        return in_default_precision((points - centre) * np.float32(facts.scale))
+
+    still = np.zeros((0, 3), np.float32)
+    if capture.points is not None:
+        still = capture.points.position[:STILL_POINTS]
+
+    @jax.jit
+    def solve(params, step, start, true, still):
+        def moment_of(view):
+            return Moment(view.time, made.codes_at(params, view), step)
+
+        moments = jax.vmap(moment_of)(views)
+        followed = tracks.point_tracks(
+            made.displace, params, start, moments, known.start
+        )
+        each = jax.vmap(made.displace, (None, 0, None))  # point
+        moved = jax.vmap(each, (None, None, 0))(params, still, moments)
+        slope = jax.vmap(jax.jacfwd(made.displace, 1), (None, 0, None))
+        slopes = jax.vmap(slope, (None, 1, 0))(params, true, moments)
+        apart = jnp.linalg.norm(moved - jnp.mean(moved, axis=0), axis=-1)
+        return followed, apart, slopes
+
+    followed, apart, slopes = jax.device_get(
+        solve(
+            state.params,
+            state.step,
+            to_field(known.start_points),
+            to_field(known.path),
+            to_field(still),
+        )
+    )
+    path = followed.points / np.float32(facts.scale) + centre
+    still_path = known.start_points[:, None]
+    path = np.where(followed.converged[..., None], path, still_path)
+    stretch = np.linalg.svd(np.eye(3) + slopes.astype(float), compute_uv=False)
+    strain = np.log(np.maximum(stretch, LEAST_STRETCH))
+    return Followed(
+        path=path.astype(np.float32),
+        found=followed.converged,
+        drift=float(apart.mean() / facts.scale) if apart.size else float("nan"),
+        strain=float(np.sqrt(np.mean(np.sum(strain**2, axis=-1)))),
+    )

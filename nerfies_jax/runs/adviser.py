@@ -1,0 +1,75 @@
+"""From what was found to presets and overrides, one for each representation."""
+
+import dataclasses
+
+from nerfies_jax.evaluation.representation import Representation
+from nerfies_jax.evidence.findings import Finding, table
+from nerfies_jax.runs import prices, representations
+from nerfies_jax.runs.config import RunConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class Advice:
+    """A preset, the fields to change in it, and what could not be decided or done."""
+
+    representation: str
+    preset: str
+    overrides: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    def arguments(self) -> str:
+        """As on the command line of `experiments.reconstruct`."""
+        words = f"--preset {self.preset}"
+        return f"{words} --set {' '.join(self.overrides)}" if self.overrides else words
+
+
+def advise(
+    findings: tuple[Finding, ...], representation: Representation, full: bool = False
+) -> Advice:
+    """What to reconstruct with; `full` takes the papers' sizes, not those for a CPU.
+
+    What cannot be told keeps what the preset has. Where motion itself cannot be told,
+    that is a model that moves: on a still scene it costs time, on a moving one a model
+    at rest loses whatever moves.
+    """
+    wanted = {one.effect: one.wanted for one in findings}
+    notes = [
+        f"{effect}: cannot tell, the preset's own setting stays"
+        for effect, choice in wanted.items()
+        if choice is None
+    ]
+    choice = representation.advise(wanted, full)
+    return Advice(
+        representation.name,
+        choice.preset if full else f"{choice.preset}-small",
+        choice.overrides,
+        (*notes, *choice.notes),
+    )
+
+
+def advise_all(findings: tuple[Finding, ...], full: bool = False) -> list[Advice]:
+    """One for each representation that is installed."""
+    return [
+        advise(findings, each, full) for each in representations.installed().values()
+    ]
+
+
+def advise_for(findings: tuple[Finding, ...], preset: str) -> Advice:
+    """In the representation and size of a preset."""
+    full = not preset.endswith("-small")
+    return advise(findings, representations.of_preset(preset), full)
+
+
+def follow(
+    config: RunConfig, findings: tuple[Finding, ...]
+) -> tuple[RunConfig, list[str]]:
+    """A config as advised, and what to tell; the user's own settings come last.
+
+    The preset asked for says which representation and which size.
+    """
+    advice = advise_for(findings, config.preset)
+    lines = [*table(findings, prices.told(findings)), f"effects: {advice.arguments()}"]
+    lines += [f"note: {note}" for note in advice.notes]
+    overrides = (*advice.overrides, *config.overrides)
+    changed = dataclasses.replace(config, preset=advice.preset, overrides=overrides)
+    return changed, lines

@@ -1,0 +1,42 @@
+"""What a user asks for: which pictures, which scene, over how many steps; no JAX."""
+
+import dataclasses
+import pathlib
+
+
+@dataclasses.dataclass(frozen=True)
+class CaptureSource:
+    """Which pictures to read: a folder's, or those of a built-in scene."""
+
+    capture: pathlib.Path | None = None
+    """Folder in Nerfies, HyperNeRF, Blender, D-NeRF or COLMAP layout."""
+    scene: str = "default"
+    """Which built-in scene, where no capture is given."""
+    factor: int | None = None
+    """Read the pictures at 1/FACTOR of their size."""
+    max_side: int | None = None
+    """Read the pictures with no side longer than this, in pixels."""
+    heldout: str | None = None
+    """Which frames to score: n for every n-th, or the name of a split."""
+
+    def __post_init__(self):
+        if self.capture is not None:  # one folder has one name, wherever it is opened
+            folder = pathlib.Path(self.capture).absolute()
+            object.__setattr__(self, "capture", folder)
+
+    @property
+    def words(self) -> str:
+        """The pictures as named on a command line."""
+        return f"--scene {self.scene}" if self.capture is None else str(self.capture)
+
+
+@dataclasses.dataclass(frozen=True)
+class RunConfig:
+    """What fixes a run: kept in its `config.json` and enough to open it again."""
+
+    preset: str
+    source: CaptureSource = CaptureSource()
+    steps: int | None = None  # the preset's own; schedules stretch with them
+    overrides: tuple[str, ...] = ()  # of the preset's fields, as for --set
+    effects: tuple[str, ...] = ()  # of the user's own, as MODULE:NAME
+    seed: int = 0

@@ -1,0 +1,49 @@
+"""Where a process computes, and what it keeps between runs.
+
+JAX is imported only when it is started: which platform, and how many cores XLA:CPU
+sees, is decided before its first array.
+"""
+
+import contextlib
+import os
+import pathlib
+from typing import Literal
+
+Device = Literal["auto", "cpu", "gpu", "tpu"]
+# Whether XLA:CPU sees one core or all of them; each representation says which suits it.
+Threads = Literal["one", "all"]
+
+CACHE = (
+    pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache")
+    / "nerfies_jax"
+)
+
+
+def start_jax(device: Device = "auto", threads: Threads = "one") -> None:
+    """Choose the platform, how many cores XLA:CPU sees, and the compilation cache.
+
+    Call it before the first array is made; it is too late afterwards. `PJRT_NPROC` in
+    the environment has the last word. Raises ValueError where the device is not there.
+    """
+    if threads == "one":
+        os.environ.setdefault("PJRT_NPROC", "1")
+    import jax
+
+    if device != "auto":
+        name = {"gpu": "cuda"}.get(device, device)
+        os.environ["JAX_PLATFORMS"] = name  # of the processes that this one starts
+        jax.config.update("jax_platforms", name)
+    try:
+        jax.devices()
+    except (RuntimeError, AssertionError) as error:
+        reason = (str(error).splitlines() or ["JAX finds none"])[0]
+        raise ValueError(
+            f"--device {device} cannot be used here ({reason}); choose --device cpu, "
+            "or install a JAX built for that device"
+        ) from error
+    jax.config.update("jax_numpy_dtype_promotion", "strict")
+    if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+        folder = CACHE / "compiled"
+        with contextlib.suppress(OSError):  # a cache that cannot be kept is no error
+            folder.mkdir(parents=True, exist_ok=True)
+            jax.config.update("jax_compilation_cache_dir", str(folder))

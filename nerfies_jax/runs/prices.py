@@ -1,0 +1,71 @@
+"""What an effect adds to a step, read from a kept run of `experiments.effect_cost`."""
+
+import functools
+import importlib.resources
+import math
+from collections.abc import Mapping
+
+from nerfies_jax.evaluation.representation import Pair
+from nerfies_jax.evidence.findings import Finding
+from nerfies_jax.measure import clock
+from nerfies_jax.measure.clock import Metric
+from nerfies_jax.runs import representations
+
+EFFECT_COST = "effect_cost.json"  # beside this file; the study writes it
+Price = dict[str, float]  # by representation; NaN where an effect costs no step
+
+
+@functools.cache
+def baseline() -> Mapping[str, Metric]:
+    """The committed numbers, by key."""
+    path = importlib.resources.files("nerfies_jax.runs") / EFFECT_COST
+    with importlib.resources.as_file(path) as file:
+        return clock.read_metrics(file)
+
+
+def legend() -> str:
+    """What the column of costs means."""
+    names = " / ".join(representations.installed())
+    return (
+        "cost per step: a training step with the effect over one without any, of "
+        f"{names};\n- where no step takes longer. From experiments.effect_cost."
+    )
+
+
+def price(effect: str, measured: Mapping[str, Metric]) -> Price:
+    """A step with the effect, over a bare one, by representation."""
+    return {
+        name: _factor(each.prices.get(effect), measured)
+        for name, each in representations.installed().items()
+    }
+
+
+def told(findings: tuple[Finding, ...]) -> dict[str, str]:
+    """By effect, what it costs a step, for a table."""
+    return {
+        one.effect: " / ".join(
+            f"x{factor:.2f}" if math.isfinite(factor) else "-"
+            for factor in price(one.effect, baseline()).values()
+        )
+        for one in findings
+    }
+
+
+def as_json(findings: tuple[Finding, ...]) -> dict[str, dict[str, float | None]]:
+    """By effect, its factors; None where it costs nothing in a step."""
+    prices = {one.effect: price(one.effect, baseline()) for one in findings}
+    return {
+        effect: {k: x if math.isfinite(x) else None for k, x in one.items()}
+        for effect, one in prices.items()
+    }
+
+
+def _factor(pair: Pair | None, measured):
+    """One plus what the effect adds, in bare steps."""
+    if pair is None:
+        return math.nan
+    dearer, cheaper = (
+        measured[f"{pair.preset}.{arm}.step.over_bare"].value
+        for arm in (pair.with_it, pair.without)
+    )
+    return 1 + dearer - cheaper

@@ -1,0 +1,274 @@
+"""What a finished run leaves behind: scores, pictures, a film, depth, a report."""
+
+import json
+import math
+import pathlib
+import time
+
+import numpy as np
+
+from nerfies_jax import evaluation, runs
+from nerfies_jax.capture import camera_paths, exr, video
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.capture.json_files import write_json
+from nerfies_jax.evaluation import Renderer, Scored, pictures
+from nerfies_jax.measure import clock
+from nerfies_jax.measure.clock import Metric
+from nerfies_jax.runs import Run, budget, curves, report
+from nerfies_jax.runs.representations import MODEL, Saved
+from nerfies_jax.runs.train import Outcome
+from nerfies_jax.training import losses
+from nerfies_jax.training.model import TrainState
+
+SHOWN = 4  # held-out frames in the comparison
+
+
+def make(folder: pathlib.Path, run: Run, outcome: Outcome, began: float) -> None:
+    """Write everything into the run folder and say where it is.
+
+    Raises FloatingPointError, and writes nothing, where the state draws pictures that
+    are not finite: its parameters may be finite and yet beyond use.
+    """
+    state, renderer = outcome.result.state, outcome.renderer
+    rows, left_out = frames_to_score(run, outcome)
+    scored = evaluation.score(renderer, state, run.capture, rows)
+    if not np.isfinite(scored.colour).all():
+        raise FloatingPointError(
+            f"no report: what the state of step {outcome.result.steps:,} draws is not "
+            "finite"
+        )
+    ms_per_frame = renderer.ms_per_frame(len(scored.rows))
+    figures = [
+        report.Figure(
+            save_comparison(folder / "comparison.png", run.capture, scored),
+            "Held-out frames: what was filmed, what was rendered, how far they are "
+            "apart, and the depth.",
+        )
+    ]
+    watched = [run.capture.ids[row] for row in outcome.watched]
+    curves.write(folder, outcome.result.history, watched)
+    curve = save_curve(folder / "psnr_over_time.png", run, outcome)
+    if curve is not None:
+        figures.append(
+            report.Figure(curve, "PSNR of a few held-out frames while it trained.")
+        )
+    film = save_film(folder / "scene.mp4", run, renderer, state, ms_per_frame / 1e3)
+    save_depth(folder / "depth", run.capture, scored)
+    saved = run.representation.save(folder, run.spec, run.facts, state)
+    frames = evaluation.frames_of(run.capture, run.model.wants)
+    fitted, gain = score_halves(run, state, scored, ms_per_frame / 1e3)
+    metrics = [*measured(run, outcome, scored, ms_per_frame, began), *fitted]
+    metrics += model_size(saved)
+    write_json(
+        folder / "metrics.json",
+        {m.key: m.value if math.isfinite(m.value) else None for m in metrics},
+    )
+    notes = [outcome.result.message, *run.capture.notes, *left_out, *gain, *saved.notes]
+    notes += beside_the_paper(run.config.preset, saved, ms_per_frame)
+    commands = _next(folder, run, outcome)
+    page = report.write(
+        folder,
+        f"{run.capture.name}: {run.config.preset}",
+        metrics,
+        json.loads((folder / runs.CONFIG).read_text()),
+        figures,
+        film,
+        run.representation.time_parts(run.spec, run.facts, run.model, state, frames),
+        notes,
+        commands,
+    )
+    _say(folder, page, metrics, commands)
+
+
+def frames_to_score(run: Run, outcome: Outcome) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Rows of held-out frames, and a note where there is no time for all of them."""
+    heldout = run.capture.heldout
+    seconds = outcome.renderer.ms_per_frame(1) / 1e3
+    count = budget.scored(seconds, len(heldout))
+    if count == len(heldout):
+        return heldout, ()
+    note = (
+        f"Scores are of {count} of the {len(heldout)} held-out frames, evenly spread: "
+        f"one takes {seconds:.1f} s to render."
+    )
+    return evaluation.spread(heldout, count), (note,)
+
+
+def measured(
+    run: Run, outcome: Outcome, scored: Scored, ms_per_frame: float, began: float
+) -> list[Metric]:
+    """The figures of a run."""
+    result = outcome.result
+    counts = run.model.counts(result.state)
+    seconds, fps = time.perf_counter() - began, 1e3 / ms_per_frame
+    return [
+        Metric("heldout.psnr", float(scored.psnr.mean()), "dB", "higher", 0.2),
+        Metric("heldout.ssim", float(scored.ssim.mean()), "", "higher", 0.01),
+        Metric("heldout.frames", len(scored.rows), "", "equal"),
+        Metric("train.seconds", result.seconds, "s", "lower", 0.2 * result.seconds),
+        Metric("train.compile_seconds", result.compile_seconds, "s", "lower", 10.0),
+        Metric("train.steps", result.steps, "", "equal"),
+        Metric("render.ms_per_frame", ms_per_frame, "ms", "lower", 0.2 * ms_per_frame),
+        Metric("render.fps", fps, "frames/s", "higher", 0.2 * fps),
+        Metric("memory.peak_bytes", clock.peak_bytes(), "bytes", "lower", 2e8),
+        Metric("total.seconds", seconds, "s", "lower", 0.2 * seconds),
+        *(
+            Metric(name, count, "", "lower", 0.1 * count)
+            for name, count in counts.items()
+        ),
+    ]
+
+
+def model_size(saved: Saved) -> list[Metric]:
+    """The size of the file that holds all of a scene, where there is one."""
+    size = saved.model_bytes
+    return [] if size is None else [Metric("file.bytes", size, "bytes", "lower", 1e5)]
+
+
+def beside_the_paper(preset: str, saved: Saved, ms_per_frame: float) -> list[str]:
+    """MoBa-GS's own size and speed beside a run's, as context."""
+    if not preset.startswith("moba") or saved.model_bytes is None:
+        return []
+    return [
+        f"{MODEL} holds all of the scene in {saved.model_bytes / 1e6:.1f} MB, and "
+        f"{1e3 / ms_per_frame:.3g} frames are drawn in a second. MoBa-GS reports "
+        "11.3 MB and 163 frames per second, on an A100 and of other scenes: context, "
+        "no comparison."
+    ]
+
+
+def score_halves(
+    run: Run, state: TrainState, scored: Scored, frame_seconds: float
+) -> tuple[list[Metric], tuple[str, ...]]:
+    """Metrics and a note where frames have codes of their own, else neither."""
+    width, height = run.capture.size
+    if width // 2 < len(losses.WINDOW):
+        return [], ()  # too narrow for the window of the SSIM
+    share = run.representation.fitted_rays / (width * height)
+    count = budget.halves(frame_seconds, share, len(scored.rows))
+    few = evaluation.spread(np.arange(len(scored.rows)), count)
+    halves = run.representation.score_halves(
+        run.spec, run.facts, state, run.capture, scored.rows[few]
+    )
+    if halves is None:
+        return [], ()
+    before = evaluation.score_right_halves(
+        run.capture, scored.rows[few], scored.colour[few]
+    )
+    psnr, ssim = float(halves.psnr.mean()), float(halves.ssim.mean())
+    note = (
+        f"Right halves of {count} held-out frames: {before.psnr.mean():.2f} dB with "
+        f"codes interpolated in time, {psnr:.2f} dB with codes fitted to the left "
+        "halves."
+    )
+    metrics = [
+        Metric("heldout.fitted_psnr", psnr, "dB", "higher", 0.2),
+        Metric("heldout.fitted_ssim", ssim, "", "higher", 0.01),
+    ]
+    return metrics, (note,)
+
+
+def save_comparison(path: pathlib.Path, capture: Capture, scored: Scored):
+    """Truth, render, error and depth of a few held-out frames."""
+    shown = evaluation.spread(np.arange(len(scored.rows)), SHOWN)
+    captions = [
+        f"frame {capture.ids[scored.rows[i]]}   {scored.psnr[i]:.2f} dB   "
+        f"SSIM {scored.ssim[i]:.3f}"
+        for i in shown
+    ]
+    truth, colour = capture.images[scored.rows[shown]], scored.colour[shown]
+    if capture.valid is not None:  # what was not filmed is black in both: no error
+        filmed = capture.valid[scored.rows[shown]][..., None]
+        truth, colour = np.where(filmed, truth, 0), np.where(filmed, colour, 0)
+    picture = pictures.comparison(
+        truth,
+        colour,
+        scored.depth[shown],
+        captions,
+        known_depth=scored.alpha[shown] > 0.5,
+    )
+    pictures.save(picture, path)
+    return path
+
+
+def save_curve(path: pathlib.Path, run: Run, outcome: Outcome):
+    """PSNR against seconds; None where the run ended before it was evaluated."""
+    history = outcome.result.history
+    if not history.evaluations:
+        return None
+    points = pictures.History(
+        [row["seconds"] for row in history.evaluations],
+        [row["psnr"] for row in history.evaluations],
+    )
+    pictures.curve({run.config.preset: points}, path)
+    return path
+
+
+def save_film(
+    path: pathlib.Path,
+    run: Run,
+    renderer: Renderer,
+    state: TrainState,
+    frame_seconds: float,
+) -> pathlib.Path:
+    """The moving scene from a moving camera, as long and large as time allows."""
+    size = run.capture.size
+    film = budget.film(frame_seconds, size)
+    if film.size != size:
+        renderer = Renderer(run.model, film.size)
+    views = evaluation.path_views(
+        camera_paths.path("sway", run.capture, film.frames),
+        camera_paths.times(film.frames),
+        evaluation.view_of(run.capture, int(run.capture.train[0])),
+    )
+    frames = (
+        evaluation.as_picture(
+            renderer(state, evaluation.resized(view, size, film.size)).colour
+        )
+        for view in views
+    )
+    video.write_video(path, frames, film.rate)
+    return path
+
+
+def save_depth(folder: pathlib.Path, capture: Capture, scored: Scored) -> None:
+    """Z-depth (scene units) and alpha of every held-out frame as EXR."""
+    folder.mkdir(exist_ok=True)
+    for row, depth, alpha in zip(scored.rows, scored.depth, scored.alpha, strict=True):
+        name = pathlib.PurePath(capture.ids[row]).name
+        exr.write_exr(folder / f"{name}.exr", alpha=alpha, depth=depth)
+
+
+def _next(folder, run, outcome):
+    commands = [
+        report.Command(
+            "Render it from other cameras, at other times:",
+            f"python -m experiments.render {folder} --path orbit",
+        )
+    ]
+    if outcome.result.stopped_by == "non-finite":
+        return commands  # resumed, it would stop at the same step
+    if outcome.result.steps < run.spec.steps:
+        line = f"python -m experiments.reconstruct --out {folder} --resume"
+        return [*commands, report.Command("Train it to the end:", line)]
+    capture = "" if run.config.capture is None else f" {run.config.capture}"
+    line = (
+        f"python -m experiments.reconstruct{capture} --preset {run.config.preset} "
+        f"--steps {2 * run.spec.steps}"
+    )
+    return [*commands, report.Command("Train it twice as long:", line)]
+
+
+def _say(folder, page, metrics, commands):
+    value = {metric.key: metric.value for metric in metrics}
+    print(
+        f"held out: {value['heldout.psnr']:.2f} dB, SSIM {value['heldout.ssim']:.3f} "
+        f"over {value['heldout.frames']} frames; {value['train.seconds']:.0f} s of "
+        f"training and {value['train.compile_seconds']:.0f} s of compiling; "
+        f"{value['render.ms_per_frame']:.0f} ms a frame"
+    )
+    print(f"report:     {page}")
+    print(f"comparison: {folder / 'comparison.png'}")
+    print(f"film:       {folder / 'scene.mp4'}")
+    for command in commands:
+        print(f"{command.purpose}\n  {command.line}")

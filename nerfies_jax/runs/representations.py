@@ -1,0 +1,57 @@
+"""The representations that are installed, found by entry point."""
+
+import functools
+import importlib.metadata
+import json
+import pathlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:  # a record is loaded when it is asked for, not with this module
+    from nerfies_jax.evaluation.representation import Representation
+
+from nerfies_jax.runs.run_folder import CONFIG
+
+GROUP = "nerfies_jax.representations"
+
+
+@functools.cache
+def installed() -> dict[str, "Representation"]:
+    """All representations by name, in the order of their names."""
+    points = importlib.metadata.entry_points(group=GROUP)
+    # A checkout that is installed and also stands on the path is found twice.
+    found = {point.name: point for point in points}
+    if not found:
+        raise ValueError(
+            f"no entry point of the group {GROUP}: install this project, as with "
+            "pip install -e ."
+        )
+    return {name: found[name].load() for name in sorted(found)}
+
+
+def named(name: str) -> "Representation":
+    """The representation of that name; ValueError where there is none."""
+    if name not in installed():
+        known = ", ".join(installed())
+        raise ValueError(f"no representation {name!r}; there are {known}")
+    return installed()[name]
+
+
+def of_preset(preset: str) -> "Representation":
+    """The representation that has a preset; ValueError names all there are."""
+    for representation in installed().values():
+        if preset in representation.presets:
+            return representation
+    known = sorted(p for each in installed().values() for p in each.presets)
+    raise ValueError(f"--preset {preset}: no such preset; there are {', '.join(known)}")
+
+
+def of_run(folder: pathlib.Path) -> "Representation | None":
+    """That of the run in a folder; None where none can be read.
+
+    Reading the run properly, later, says what is wrong with it.
+    """
+    try:
+        stored = json.loads((folder / CONFIG).read_text())
+        return named(stored["representation"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None

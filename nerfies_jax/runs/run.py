@@ -1,0 +1,165 @@
+"""A run: which capture, which scene, and the folder that holds what came of it."""
+
+import json
+import pathlib
+from typing import Any, NamedTuple
+
+import jax
+
+from nerfies_jax import capture as captures
+from nerfies_jax.capture import pinholes, synthetic
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.capture.json_files import write_json
+from nerfies_jax.evaluation.representation import Representation
+from nerfies_jax.runs import representations
+from nerfies_jax.runs.config import CaptureSource, RunConfig
+from nerfies_jax.runs.platform import CACHE
+from nerfies_jax.runs.run_folder import CHECKPOINTS, CONFIG
+from nerfies_jax.training import checkpoint, specs
+from nerfies_jax.training.model import Model, TrainState
+
+
+class Run(NamedTuple):
+    """Everything that a run is made of before its first step."""
+
+    config: RunConfig
+    capture: Capture
+    representation: Representation
+    spec: Any  # of the representation's `spec_type`
+    facts: Any  # what the scene must know of the capture
+    model: Model
+
+
+def new_run(config: RunConfig, stored: Capture | None = None) -> Run:
+    """A run as it is asked for; ValueErrors name what the user can mend.
+
+    `stored` is its `stored_capture` where that has been read already.
+    """
+    representation = representations.of_preset(config.preset)
+    return open_run(config, representation, scene_spec(config), stored)
+
+
+def open_run(
+    config: RunConfig,
+    representation: Representation,
+    spec: Any,
+    stored: Capture | None = None,
+) -> Run:
+    """Read the capture and build the model."""
+    capture = pinholes.as_pinholes(stored or stored_capture(config.source, config.seed))
+    facts = representation.facts_of(capture, spec)
+    model = representation.build(spec, facts)
+    return Run(config, capture, representation, spec, facts, model)
+
+
+def scene_spec(config: RunConfig) -> Any:
+    """The preset with its steps and overrides."""
+    representation = representations.of_preset(config.preset)
+    spec = representation.presets[config.preset]
+    if config.steps is not None:
+        spec = representation.with_steps(spec, config.steps)
+    return specs.override(spec, config.overrides)
+
+
+def read_capture(source: CaptureSource, seed: int = 0) -> Capture:
+    """The capture asked for, for a pinhole renderer."""
+    return pinholes.as_pinholes(stored_capture(source, seed))
+
+
+def stored_capture(source: CaptureSource, seed: int = 0) -> Capture:
+    """The capture asked for, with the lens that filmed it; host side.
+
+    `seed` makes a built-in scene. Raises ValueError where it cannot be read as asked.
+    """
+    if source.capture is None:
+        return _built_in(source, seed)
+    heldout = source.heldout
+    if heldout is not None and heldout.isdigit():
+        heldout = int(heldout)
+    return captures.load(
+        source.capture,
+        factor=source.factor,
+        max_side=source.max_side,
+        heldout=heldout,
+    )
+
+
+def _built_in(source, seed):
+    if source.scene not in synthetic.PRESETS:
+        raise ValueError(
+            f"--scene {source.scene}: no such built-in scene; there are "
+            + ", ".join(synthetic.PRESETS)
+        )
+    for name in ("factor", "max_side", "heldout"):
+        if getattr(source, name) is not None:
+            raise ValueError(
+                f"--{name.replace('_', '-')} is for captures; film the built-in "
+                "scene as you want it with experiments.make_scene and name its "
+                "folder"
+            )
+    film = synthetic.PRESETS[source.scene]
+    return synthetic.cached(film, CACHE / "scenes", seed)[0]
+
+
+def save_config(folder: pathlib.Path, run: Run) -> None:
+    """`config.json`: the config, the whole spec it led to, and what made it."""
+    write_json(
+        folder / CONFIG,
+        {
+            "config": specs.as_json(run.config),
+            "representation": run.representation.name,
+            "spec": specs.as_json(run.spec),
+            "made by": checkpoint.provenance(),
+        },
+    )
+
+
+def saved_run(folder: pathlib.Path, overrides: tuple[str, ...] = ()) -> Run:
+    """The run in a folder, with the settings it was made with.
+
+    They come from its `config.json`, not from the preset, which may have changed since.
+    """
+    path = folder / CONFIG
+    if not path.is_file():
+        raise ValueError(
+            f"{folder}: no run here (there is no {CONFIG}); name the folder that "
+            "experiments.reconstruct printed"
+        )
+    try:
+        stored = json.loads(path.read_text())
+        kind = representations.named(stored["representation"])
+        config, spec = (specs.from_json(stored[name]) for name in ("config", "spec"))
+        for value, wanted in ((config, RunConfig), (spec, kind.spec_type)):
+            if not isinstance(value, wanted):
+                raise ValueError(f"a {type(value).__name__} for a {wanted.__name__}")
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise ValueError(f"{path}: not the settings of a run ({error})") from error
+    return open_run(config, kind, specs.override(spec, overrides))
+
+
+def first_state(run: Run) -> TrainState:
+    """The state before the first step; ValueError where it would not fit in memory."""
+    needed = run.representation.first_bytes(run.spec, run.capture)
+    free = free_memory()
+    if free is not None and needed > free:
+        raise ValueError(
+            f"the first state needs about {needed / 2**30:.1f} GiB and "
+            f"{free / 2**30:.1f} GiB are free; {run.representation.lighter}, or read "
+            "smaller pictures with --max-side"
+        )
+    return run.model.init(run.capture, jax.random.key(run.config.seed))
+
+
+def free_memory() -> int | None:
+    """Bytes of memory that programs may still take; None where nothing tells."""
+    try:
+        lines = pathlib.Path("/proc/meminfo").read_text().splitlines()
+        row = next(line for line in lines if line.startswith("MemAvailable"))
+    except (OSError, StopIteration):
+        return None
+    return int(row.split()[1]) * 1024
+
+
+def restore(folder: pathlib.Path, run: Run) -> checkpoint.Restored:
+    """The newest state saved in a run folder."""
+    return checkpoint.restore(folder / CHECKPOINTS, first_state(run), run.model.spec)

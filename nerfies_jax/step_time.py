@@ -1,0 +1,32 @@
+"""Where the time of a training step of a radiance field goes."""
+
+import jax
+
+from nerfies_jax import scene
+from nerfies_jax.measure.part_time import part_ms
+from nerfies_jax.training import loop
+from nerfies_jax.training.model import Frames, Model, TrainState
+
+
+def parts(
+    spec, facts, model: Model, state: TrainState, frames: Frames
+) -> dict[str, float]:
+    """Milliseconds of each part of one step of a radiance field; medians, warm."""
+    made = scene.field(spec, facts)
+    batch_key, loss_key = jax.random.split(loop.step_key(state))
+    batch = jax.jit(scene.draw_batch, static_argnums=1)(frames, spec.rays, batch_key)
+
+    def loss(params, frames, batch):
+        terms = scene.loss_terms(
+            spec, facts, made, params, frames, batch, state.step, loss_key
+        )
+        return sum(term.weight * term.value for term in terms.values())
+
+    forward = part_ms(loss, state.params, frames, batch)
+    both = part_ms(jax.value_and_grad(loss), state.params, frames, batch)
+    whole = part_ms(model.step, state, frames)
+    return {
+        "forward": forward,
+        "backward": max(both - forward, 0.0),
+        "rays and optimiser": max(whole - both, 0.0),
+    }

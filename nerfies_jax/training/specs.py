@@ -1,0 +1,217 @@
+"""Frozen settings ("specs") as plain JSON, changed by `path.to.field=value`, compared.
+
+One codec serves checkpoints, run folders, model files and results of studies. Nothing
+in a file is executed: names in it can only call up settings and records of packages
+that this process has imported, or of the packages named in `PACKAGES`.
+"""
+
+import contextlib
+import dataclasses
+import importlib
+import json
+import math
+import pathlib
+import sys
+import typing
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+TYPE = "type"  # a spec's, in JSON; no field can have this name
+NUMBER = "number"  # around an infinity or NaN, which JSON does not have
+PACKAGES = ("gaussians_jax", "nerfies_jax")  # imported where a file names them
+
+# JSON -------------------------------------------------------------------------------
+
+
+def as_json(value: Any) -> Any:
+    """A spec as plain JSON values: dataclasses and NamedTuples by type and fields.
+
+    `from_json` brings it back, with tuples for lists and sets. Raises ValueError for
+    what is no setting, naming its place.
+    """
+    return _plain(value, "spec")
+
+
+def _plain(value, path):
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else {NUMBER: str(value)}
+    if isinstance(value, pathlib.Path):
+        return str(value)
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = {
+            field.name: getattr(value, field.name)
+            for field in dataclasses.fields(value)
+        }
+        return {TYPE: type_name(type(value)), **_items(fields, path)}
+    if isinstance(value, tuple) and hasattr(value, "_fields"):
+        return {TYPE: type_name(type(value)), **_items(value._asdict(), path)}
+    if isinstance(value, tuple | list):
+        return [_plain(item, f"{path}[{i}]") for i, item in enumerate(value)]
+    if isinstance(value, frozenset) and all(isinstance(item, str) for item in value):
+        return sorted(value)  # in one order, whatever the hashes of this process
+    if isinstance(value, dict) and all(isinstance(key, str) for key in value):
+        return _items(value, path)
+    raise ValueError(
+        f"{path} holds a {type(value).__name__}, which cannot be written; settings are "
+        "numbers, strings, tuples and frozen dataclasses"
+    )
+
+
+def _items(content, path):
+    return {key: _plain(item, f"{path}.{key}") for key, item in content.items()}
+
+
+def from_json(stored: Any) -> Any:
+    """The value that `as_json` wrote; lists come back as tuples.
+
+    Raises ValueError where a type is not one of this version's, or a field is unknown,
+    missing or out of its bounds.
+    """
+    if isinstance(stored, list):
+        return tuple(from_json(item) for item in stored)
+    if not isinstance(stored, dict):
+        return stored
+    if stored.keys() == {NUMBER}:
+        return float(stored[NUMBER])
+    fields = {key: from_json(item) for key, item in stored.items() if key != TYPE}
+    if TYPE not in stored:
+        return fields
+    return made(type_named(stored[TYPE]), fields)
+
+
+def made(kind: type, fields: dict[str, Any]) -> Any:
+    """A record of its fields; ValueError where they are not those of this version."""
+    if dataclasses.is_dataclass(kind):
+        wanted = {field.name for field in dataclasses.fields(kind)}
+    else:
+        wanted = {*kind._fields}
+    if fields.keys() != wanted:
+        raise ValueError(
+            f"a stored {kind.__name__} with {', '.join(sorted(fields))} is none of "
+            f"this version, which has {', '.join(sorted(wanted))}; open it with the "
+            "version that made it"
+        )
+    return kind(**fields)
+
+
+def type_name(kind: type) -> str:
+    """The full name of a type, as `type_named` finds it."""
+    return f"{kind.__module__}.{kind.__qualname__}"
+
+
+def type_named(name: str) -> type:
+    """A NamedTuple or a frozen dataclass by its full name.
+
+    A module is imported only if it belongs to `PACKAGES`; a type of any other must
+    have been imported before. Raises ValueError for anything else.
+    """
+    module, _, attribute = str(name).rpartition(".")
+    if module.split(".")[0] in PACKAGES:
+        with contextlib.suppress(ImportError):
+            importlib.import_module(module)
+    kind = getattr(sys.modules.get(module), attribute, None)
+    is_record = isinstance(kind, type) and (
+        dataclasses.is_dataclass(kind)
+        or (issubclass(kind, tuple) and hasattr(kind, "_fields"))
+    )
+    if not is_record:
+        raise ValueError(
+            f"it names {name!r}, which is no record or setting of this version of "
+            f"{' and '.join(PACKAGES)}, nor of anything else imported here"
+        )
+    return kind
+
+
+# Comparing --------------------------------------------------------------------------
+
+
+def differences(saved: Any, wanted: Any) -> list[str]:
+    """One line for each field in which two specs, as JSON, differ."""
+    saved, wanted = dict(_leaves(saved, "spec")), dict(_leaves(wanted, "spec"))
+    lines = []
+    for path in {**saved, **wanted}:
+        before, now = saved.get(path, "absent"), wanted.get(path, "absent")
+        if before != now:
+            lines.append(f"{path}: saved {before}, now {now}")
+    return lines
+
+
+def _leaves(value, path) -> Iterator[tuple[str, str]]:
+    """Leaves by dotted path, as text: 1 is not 1.0."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from _leaves(item, f"{path}.{key}")
+    elif isinstance(value, list):
+        yield f"{path}.length", str(len(value))
+        for index, item in enumerate(value):
+            yield from _leaves(item, f"{path}[{index}]")
+    else:
+        yield path, json.dumps(value)
+
+
+# Changing ---------------------------------------------------------------------------
+
+
+def override(spec: Any, assignments: Iterable[str]) -> Any:
+    """`spec` with `path.to.field=value` applied, each value read by the field's type.
+
+    A field that holds another spec is set with a dotted path, which brings it in with
+    its defaults where it is none, or removed with `none` where its type allows it.
+    Raises ValueError for an unknown field or a wrong value.
+    """
+    for assignment in assignments:
+        path, equals, text = assignment.partition("=")
+        if not equals:
+            raise ValueError(f"--set {assignment}: expected path.to.field=value")
+        spec = _assign(spec, path.split("."), text, path)
+    return spec
+
+
+def _assign(spec, names, text, path):
+    fields = {field.name for field in dataclasses.fields(spec)}
+    name, rest = names[0], names[1:]
+    if name not in fields:
+        raise ValueError(
+            f"--set {path}: {type(spec).__name__} has no field {name!r}; "
+            f"it has {', '.join(sorted(fields))}"
+        )
+    if rest:
+        inner = getattr(spec, name)
+        if inner is None:
+            inner = _absent(spec, name)
+        if not dataclasses.is_dataclass(inner):
+            raise ValueError(f"--set {path}: {name!r} is {inner!r} and has no fields")
+        return dataclasses.replace(spec, **{name: _assign(inner, rest, text, path)})
+    kind = typing.get_type_hints(type(spec))[name]
+    return dataclasses.replace(spec, **{name: _read(kind, text, path)})
+
+
+def _absent(spec, name):
+    """The defaults of an effect that is not there; None unless there is one choice."""
+    options = typing.get_args(typing.get_type_hints(type(spec))[name])
+    choices = [option for option in options if dataclasses.is_dataclass(option)]
+    return choices[0]() if len(choices) == 1 else None
+
+
+def _read(kind, text, path):
+    options = typing.get_args(kind)
+    if type(None) in options:
+        if text.lower() == "none":
+            return None
+        kind = next(option for option in options if option is not type(None))
+    if kind is bool and text.lower() in {"true", "false"}:
+        return text.lower() == "true"
+    origin = typing.get_origin(kind)
+    try:
+        if kind in {int, float, str}:
+            return kind(text)
+        if origin is typing.Literal and text in typing.get_args(kind):
+            return text
+        if origin is tuple:
+            item = typing.get_args(kind)[0]
+            return tuple(item(part) for part in text.split(",") if part)
+    except ValueError:
+        pass
+    raise ValueError(f"--set {path}={text}: cannot be read as {kind}")

@@ -1,0 +1,70 @@
+"""A trained field drawn otherwise: effects left out, appearances blended."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from nerfies_jax import scene
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.effects.effect import APPEARANCE
+from nerfies_jax.evaluation.representation import check_there
+from nerfies_jax.training.model import Model, View
+
+
+class Between(NamedTuple):
+    """A view whose appearance lies between those of two frames."""
+
+    view: View  # its own appearance is the one at share 0
+    towards: Int[Array, ""]  # appearance id at share 1
+    share: Float[Array, ""]  # in [0, 1]
+
+
+def without_effects(spec, facts, without: tuple[str, ...], blended: bool) -> Model:
+    """The model with some effects left out of its pictures, or drawing a `Between`."""
+
+    whole = scene.field(spec, facts)
+    # What feeds the network's inputs is part of it; a penalty draws nothing.
+    drawn = [
+        effect.name
+        for effect in whole.effects
+        if (effect.displace is not None or effect.medium is not None)
+        and effect.condition is None
+        and effect.lift is None
+    ]
+    check_there(without, drawn)
+    made = scene.field(spec, facts, without)
+    tables = [table for effect in made.effects for table in effect.tables]
+    if blended and all(table.by != APPEARANCE for table in tables):
+        raise ValueError(
+            "--appearance: this field has no appearance codes; reconstruct with a "
+            "preset that has them, as nerf-w or nerfies"
+        )
+
+    def plain(params, view, size, step):
+        codes = made.codes_at(params, view)
+        return made.render(params, view.camera, view.time, codes, size, step)
+
+    def blend(params, between, size, step):
+        view, share = between.view, between.share
+        start = made.codes_at(params, view)
+        end = made.codes_at(params, view._replace(appearance=between.towards))
+        # Codes of the moment are the same at both ends and stay as they are.
+        codes = {name: (1 - share) * start[name] + share * end[name] for name in start}
+        return made.render(params, view.camera, view.time, codes, size, step)
+
+    render = blend if blended else plain
+    return scene.build(spec, facts)._replace(render=render, stages=None)
+
+
+def appearance_id(capture: Capture, name: str) -> int:
+    """The appearance of a frame, by its name, or an appearance id itself."""
+    if name in capture.ids:
+        return int(capture.appearance_ids[capture.ids.index(name)])
+    known = np.unique(capture.appearance_ids)
+    if name.isdigit() and int(name) in known:
+        return int(name)
+    raise ValueError(
+        f"--appearance {name}: neither a frame of {capture.name}, as "
+        f"{capture.ids[0]!r}, nor one of its appearance ids, {known[0]} to {known[-1]}"
+    )

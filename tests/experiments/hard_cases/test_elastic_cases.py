@@ -1,0 +1,192 @@
+"""The elastic energy at its hard points."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.spatial.transform
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from experiments.hard_cases.elastic import CASES, DIRECTIONS
+from nerfies_jax.effects import elastic
+from nerfies_jax.geometry import lie, matrix3
+from tests.experiments.hard_cases import checks
+
+Rotation = scipy.spatial.transform.Rotation
+ENERGIES = {
+    "log_energy": matrix3.log_energy,
+    "signed_log_energy": matrix3.signed_log_energy,
+    "displacement_log_energy": matrix3.displacement_log_energy,
+}
+TURN = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
+BACK = Rotation.from_rotvec([-1, 0.4, 0.7]).as_matrix()
+HALVED = (*ENERGIES, "singular_values", "svd")
+ROWS = 7  # as many matrices as one test asks for at most
+
+
+@checks.by_case(CASES, slow=("float64",))
+def test_held(case, dtype):
+    checks.hold(case, dtype)
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_the_textbook_form_is_caught(case):
+    checks.catches_the_textbook(case)
+
+
+def neighbours(edge, dtype):
+    """Two adjacent numbers, the lower one below `edge`."""
+    above = np.asarray(edge, dtype)
+    return np.stack([np.nextafter(above, np.asarray(0, dtype)), above])
+
+
+@jax.jit
+@jax.vmap
+def every_way(matrix):
+    """By name the value and the slope; one program for most of this file."""
+    energies = {name: jax.value_and_grad(f)(matrix) for name, f in ENERGIES.items()}
+    values = matrix3.singular_values
+    return energies | {"singular_values": (values(matrix), jax.jacrev(values)(matrix))}
+
+
+def of_all(matrices, dtype):
+    """`every_way` of a few matrices; more rows than asked for share the program."""
+    rows = np.resize(np.asarray(matrices, dtype), (ROWS, 3, 3))
+    found = jax.tree.map(np.asarray, every_way(rows))
+    return jax.tree.map(lambda leaf: leaf[: len(matrices)], found)
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("name", ["log_energy", "signed_log_energy"])
+def test_value_and_slope_are_continuous_where_the_logarithm_becomes_a_tangent(
+    name, dtype
+):
+    """Twice differentiable but for this edge, where the curvature jumps."""
+    edge = np.asarray(matrix3.COLLAPSED, dtype)
+    least = [np.nextafter(edge, np.asarray(0, dtype)), edge]
+    value, slope = of_all([np.diag([2, 1, x]) for x in least], dtype)[name]
+    eps = np.finfo(dtype).eps
+    assert abs(value[1] - value[0]) < 8 * eps * value[0]
+    assert np.max(abs(slope[1] - slope[0])) < 8 * eps * np.max(abs(slope[0]))
+
+
+@functools.cache
+def halved(kind):
+    """By name what each function makes of a matrix of this kind, and of it in float32.
+
+    One program for all: they share the decomposition.
+    """
+    matrix = np.asarray(0.1 * DIRECTIONS[0], jnp.dtype(kind))
+    functions = {name: getattr(matrix3, name) for name in HALVED}
+    every = jax.jit(lambda x: {name: f(x) for name, f in functions.items()})
+    return every(matrix), every(matrix.astype(np.float32))
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("kind", ["bfloat16", "float16"])
+@pytest.mark.parametrize("name", HALVED)
+def test_half_precision_is_rounded_once(name, kind):
+    found, exact = (jax.tree.leaves(results[name]) for results in halved(kind))
+    for one, other in zip(found, exact, strict=True):
+        assert one.dtype == kind
+        off = np.abs(np.asarray(one, np.float32) - np.asarray(other))
+        half_ulp = float(jnp.finfo(kind).eps) / 2
+        assert np.all(off <= 1.001 * half_ulp * np.abs(other) + 6e-8)
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("name", [*ENERGIES, "singular_values"])
+def test_float32_stays_float32_with_x64_on(name):
+    matrix = [np.eye(3) + 0.2 * DIRECTIONS[2]]
+    alone = of_all(matrix, "float32")[name]
+    with jax.enable_x64(True):
+        wide = of_all(matrix, "float32")[name]
+    for one, other in zip(wide, alone, strict=True):
+        assert one.dtype == other.dtype == np.float32
+        np.testing.assert_allclose(one, other, rtol=2e-6)
+
+
+def _field(params, point):
+    """A warp that mostly translates: turns of 1e-5, changing from place to place."""
+    turn, shift = params
+    return lie.displacement(turn @ point, shift @ point + jnp.sum(shift), point)
+
+
+@pytest.mark.hard_cases
+@pytest.mark.slow
+def test_the_elastic_gradient_of_a_translating_warp_survives_float32():
+    """Through warp, Jacobian and energy; officially 80 % wrong in the turn."""
+
+    @jax.jit
+    @jax.grad
+    def slopes(params, points):
+        def at(point):
+            jacobian = jax.jacfwd(lambda x: _field(params, x))(point)
+            return elastic.cost(elastic.ElasticSpec(), jacobian)
+
+        return jnp.mean(jax.vmap(at)(points))
+
+    rng = np.random.default_rng(0)
+    turn, shift = 1e-5 * rng.normal(size=(3, 3)), 1e-3 * rng.normal(size=(3, 3))
+    shift[0] += 0.4  # scene units of plain translation beside it
+    points = rng.uniform(-1, 1, (16, 3))
+    inputs = [np.asarray(x, np.float32) for x in (turn, shift, points)]
+    found = slopes(tuple(inputs[:2]), inputs[2])
+    with jax.enable_x64(True):
+        wide = [np.asarray(x, np.float64) for x in inputs]
+        exact = slopes(tuple(wide[:2]), wide[2])
+    for one, other in zip(found, exact, strict=True):
+        one, other = np.asarray(one, np.float64), np.asarray(other)
+        assert np.max(abs(one - other)) < 1e-5 * np.max(abs(other))
+
+
+numbers = st.floats(-1, 1, width=32)
+triples = st.tuples(numbers, numbers, numbers)
+axioms = settings(max_examples=40, deadline=None, derandomize=True, database=None)
+
+
+@pytest.mark.slow
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("kind", ["float32", "float64"])
+@axioms
+@given(stretch=triples, one=triples, other=triples)
+def test_turning_before_or_after_costs_nothing(kind, stretch, one, other):
+    """Nor does undoing or transposing; stretches from 1/e to e."""
+    matrix = TURN @ np.diag(np.exp(stretch)) @ BACK
+    one, other = (Rotation.from_rotvec(turn).as_matrix() for turn in (one, other))
+    still, turned = np.eye(3), one @ matrix @ other
+    undone = np.linalg.inv(matrix)
+    given = [matrix, turned, matrix.T, -matrix, undone, matrix - still, one - still]
+    with jax.enable_x64(kind == "float64"):
+        found = {name: value for name, (value, _) in of_all(given, kind).items()}
+    energy, signed = found["log_energy"], found["signed_log_energy"]
+    displaced = found["displacement_log_energy"]
+    rests = {
+        "turned": energy[1] - energy[0],
+        "turned, signed": signed[1] - signed[0],
+        "turned over": energy[2] - energy[0],
+        "mirrored": energy[3] - energy[0],
+        "undone": energy[4] - energy[0],
+        "displaced": displaced[5] - energy[0],
+        "rigid": displaced[6],
+    }
+    for name, rest in rests.items():
+        # energies to 3, by matrices of condition up to e²
+        assert abs(rest) < {"float32": 2e-5, "float64": 4e-14}[kind], name
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("name", ["log_energy", "signed_log_energy"])
+@pytest.mark.parametrize("stretch", [0, 1e-5, 1e-3, 9e-3])
+def test_a_collapsed_direction_is_pulled_open(name, stretch, dtype):
+    """A clamp at 1e-6 has no slope below it; the tangent keeps 2 log(0.01) / 0.01."""
+    matrix = TURN @ np.diag([1.5, 1, stretch]) @ BACK
+    _, slope = of_all([matrix], dtype)[name]
+    along = np.sum(slope[0] * np.outer(TURN[:, 2], BACK[2]))
+    if name == "log_energy" and stretch == 0:
+        along = -abs(along)  # at the cone either way is up
+    assert along < -900

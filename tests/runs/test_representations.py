@@ -1,0 +1,103 @@
+"""One registry of representations; their presets, threads and run folders agree."""
+
+import json
+
+import jax
+import pytest
+
+from gaussians_jax import files, model_file, splats
+from nerfies_jax import runs
+from nerfies_jax.evaluation.representation import MODEL
+from nerfies_jax.runs import representations, run
+from nerfies_jax.runs.config import CaptureSource, RunConfig
+from nerfies_jax.runs.run_folder import CONFIG
+from tests import scenes
+
+THREADS = {"gaussians": "one", "radiance": "all"}
+
+
+@pytest.mark.parametrize("name", THREADS)
+def test_every_preset_finds_its_representation(name):
+    found = representations.named(name)
+    assert (found.name, found.threads) == (name, THREADS[name])
+    assert found.presets
+    for preset, spec in found.presets.items():
+        assert representations.of_preset(preset) is found
+        assert isinstance(spec, found.spec_type)
+        assert found.with_steps(spec, 77).steps == 77
+
+
+def test_preset_names_are_unique_over_all_representations():
+    names = [p for each in representations.installed().values() for p in each.presets]
+    assert len(names) == len(set(names))
+
+
+def test_an_unknown_preset_names_those_of_every_representation():
+    with pytest.raises(ValueError, match="--preset magic: no such preset") as error:
+        representations.of_preset("magic")
+    for each in representations.installed().values():
+        assert all(preset in str(error.value) for preset in each.presets)
+
+
+def test_a_preset_takes_steps_and_settings():
+    config = RunConfig("splats-static-small", steps=50, overrides=("sh_degree=0",))
+    spec = runs.scene_spec(config)
+    assert (spec.steps, spec.sh_degree) == (50, 0)
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_a_scene_of_gaussians_is_saved_as_a_model_and_for_viewers(moving, tmp_path):
+    kind = representations.named("gaussians")
+    spec = scenes.TINY_DEFORMABLE if moving else scenes.TINY_SPLATS
+    capture = scenes.tiny_capture()
+    facts = kind.facts_of(capture, spec)
+    state = kind.build(spec, facts).init(capture, jax.random.key(0))
+    saved = kind.save(tmp_path, spec, facts, state)
+    assert saved.model_bytes == (tmp_path / MODEL).stat().st_size
+    assert [note.split()[0] for note in saved.notes] == ["gaussians.ply"] * moving
+    params, about = model_file.load(tmp_path / MODEL)
+    assert about == {"spec": spec, "facts": facts, "step": 0}
+    assert jax.tree.structure(params) == jax.tree.structure(state.params)
+    living = splats.alive(state.params.rows["splats"]).sum()
+    assert len(params.rows["splats"].mean) == living
+    assert len(files.load(tmp_path / "gaussians.ply").splats.mean) == living
+
+
+@pytest.fixture
+def opened(monkeypatch):
+    """What `saved_run` opens, without reading a capture."""
+    monkeypatch.setattr(run, "open_run", lambda *given: given)
+
+
+def save(folder, preset):
+    config = RunConfig(preset, CaptureSource(folder, max_side=9), overrides=("a=1",))
+    kind = representations.of_preset(preset)
+    spec = kind.presets[preset]
+    runs.save_config(folder, runs.Run(config, None, kind, spec, None, None))
+    return config, spec
+
+
+@pytest.mark.usefixtures("opened")
+@pytest.mark.parametrize("name", THREADS)
+def test_a_run_folder_knows_its_representation(name, tmp_path):
+    preset, *_ = representations.named(name).presets
+    saved = save(tmp_path, preset)
+    config, kind, spec = runs.saved_run(tmp_path)
+    assert (config, spec) == saved
+    assert kind is representations.of_run(tmp_path) is representations.named(name)
+
+
+def test_a_representation_of_another_version_is_refused(tmp_path):
+    save(tmp_path, "splats-static")
+    path = tmp_path / CONFIG
+    stored = json.loads(path.read_text()) | {"representation": "voxels"}
+    path.write_text(json.dumps(stored))
+    with pytest.raises(ValueError, match=r"config\.json: .*'voxels'.*gaussians"):
+        runs.saved_run(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"representation": {}}'])
+def test_a_broken_run_folder_has_no_representation_yet(text, tmp_path):
+    assert representations.of_run(tmp_path) is None
+    (tmp_path / CONFIG).write_text(text)
+    assert representations.of_run(tmp_path) is None
