@@ -78,14 +78,3 @@ def test_a_spec_of_another_version_is_refused():
 def test_a_name_that_is_no_setting_is_refused(name):
     with pytest.raises(ValueError, match="no record or setting"):
         specs.from_json({"type": name})
-
-
-@dataclasses.dataclass(frozen=True)
-class Own:
-    """A user's own settings, of no package of ours."""
-
-    kind: str = "se3"
-
-
-def test_settings_from_outside_come_back_where_they_are_imported():
-    assert there_and_back(Own()) == Own()

@@ -18,7 +18,8 @@ from nerfies_jax.training import specs
 def main(path: str) -> None:
     """Train what the settings in a file name; exit code 2 where they are wrong."""
     with cli.user_errors():
-        stored = specs.from_json(json.loads(pathlib.Path(path).read_text()))
+        text = pathlib.Path(path).read_text()
+        stored = specs.from_json(json.loads(text), ("experiments", *specs.PACKAGES))
         # Paths were stored as text.
         asked: Ablate = dataclasses.replace(stored, out=pathlib.Path(stored.out))
         (name,) = asked.arms

@@ -102,7 +102,7 @@ def write(
     return path
 
 
-def readable(value: float, unit: str) -> str:
+def readable(value: float | int, unit: str) -> str:
     """A value with its unit, as a person would write it."""
     if not math.isfinite(value):
         return "not a number"

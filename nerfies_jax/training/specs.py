@@ -1,8 +1,8 @@
 """Frozen settings ("specs") as plain JSON, changed by `path.to.field=value`, compared.
 
 One codec serves checkpoints, run folders, model files and results of studies. Nothing
-in a file is executed: names in it can only call up settings and records of packages
-that this process has imported, or of the packages named in `PACKAGES`.
+in a file is executed: names in it can only call up settings and records of the packages
+that the reader allows.
 """
 
 import contextlib
@@ -11,14 +11,13 @@ import importlib
 import json
 import math
 import pathlib
-import sys
 import typing
 from collections.abc import Iterable, Iterator
 from typing import Any
 
 TYPE = "type"  # a spec's, in JSON; no field can have this name
 NUMBER = "number"  # around an infinity or NaN, which JSON does not have
-PACKAGES = ("gaussians_jax", "nerfies_jax")  # imported where a file names them
+PACKAGES = ("gaussians_jax", "nerfies_jax")  # whose types a file may name
 
 # JSON -------------------------------------------------------------------------------
 
@@ -63,22 +62,24 @@ def _items(content, path):
     return {key: _plain(item, f"{path}.{key}") for key, item in content.items()}
 
 
-def from_json(stored: Any) -> Any:
+def from_json(stored: Any, packages: tuple[str, ...] = PACKAGES) -> Any:
     """The value that `as_json` wrote; lists come back as tuples.
 
-    Raises ValueError where a type is not one of this version's, or a field is unknown,
-    missing or out of its bounds.
+    Types are looked up in `packages` alone. Raises ValueError where a type is not one
+    of this version's, or a field is unknown, missing or out of its bounds.
     """
     if isinstance(stored, list):
-        return tuple(from_json(item) for item in stored)
+        return tuple(from_json(item, packages) for item in stored)
     if not isinstance(stored, dict):
         return stored
     if stored.keys() == {NUMBER}:
         return float(stored[NUMBER])
-    fields = {key: from_json(item) for key, item in stored.items() if key != TYPE}
+    fields = {
+        key: from_json(item, packages) for key, item in stored.items() if key != TYPE
+    }
     if TYPE not in stored:
         return fields
-    return made(type_named(stored[TYPE]), fields)
+    return made(type_named(stored[TYPE], packages), fields)
 
 
 def made(kind: type, fields: dict[str, Any]) -> Any:
@@ -101,17 +102,16 @@ def type_name(kind: type) -> str:
     return f"{kind.__module__}.{kind.__qualname__}"
 
 
-def type_named(name: str) -> type:
-    """A NamedTuple or a frozen dataclass by its full name.
+def type_named(name: str, packages: tuple[str, ...] = PACKAGES) -> type:
+    """A NamedTuple or a frozen dataclass of `packages` by its full name.
 
-    A module is imported only if it belongs to `PACKAGES`; a type of any other must
-    have been imported before. Raises ValueError for anything else.
+    Raises ValueError for anything else.
     """
     module, _, attribute = str(name).rpartition(".")
-    if module.split(".")[0] in PACKAGES:
+    kind = None
+    if module.split(".")[0] in packages:
         with contextlib.suppress(ImportError):
-            importlib.import_module(module)
-    kind = getattr(sys.modules.get(module), attribute, None)
+            kind = getattr(importlib.import_module(module), attribute, None)
     is_record = isinstance(kind, type) and (
         dataclasses.is_dataclass(kind)
         or (issubclass(kind, tuple) and hasattr(kind, "_fields"))
@@ -119,7 +119,7 @@ def type_named(name: str) -> type:
     if not is_record:
         raise ValueError(
             f"it names {name!r}, which is no record or setting of this version of "
-            f"{' and '.join(PACKAGES)}, nor of anything else imported here"
+            f"{' and '.join(packages)}"
         )
     return kind
 
