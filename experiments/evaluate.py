@@ -48,7 +48,6 @@ def frames_of(capture: Capture, wants: frozenset[str] = frozenset()) -> Frames:
         images=capture.images[rows],
         cameras=cameras.take(capture.cameras, rows),
         times=capture.times[rows],
-        warp=capture.warp_ids[rows],
         appearance=capture.appearance_ids[rows],
         valid=None if capture.valid is None else capture.valid[rows],
         **beside,
@@ -61,7 +60,6 @@ def view_of(capture: Capture, row: int) -> View:
     view = View(
         cameras.take(capture.cameras, row),
         capture.times[row],
-        capture.warp_ids[row],
         capture.appearance_ids[row],
     )
     return in_default_precision(view)

@@ -87,7 +87,7 @@ def fitted(count: int, spec: MotionSpec, steps: int) -> Moving:
     )
     camera = cameras.look_at((0.5, -0.5, -2.2), (0, 0, 0.2), (0, -1, 0), 150.0, SIZE)
     zero = jnp.zeros((), jnp.int32)
-    view = View(jax.tree.map(jnp.asarray, camera), jnp.zeros(()), zero, zero)
+    view = View(jax.tree.map(jnp.asarray, camera), jnp.zeros(()), zero)
     state = TrainState(params, (), (), zero, None)
     return of_model("a motion in closed form", model, state, view, SIZE)
 

@@ -217,7 +217,7 @@ def shot(
 
 def _view(frames, row):
     camera = jax.tree.map(lambda leaf: leaf[row], frames.cameras)
-    return View(camera, frames.times[row], frames.warp[row], frames.appearance[row])
+    return View(camera, frames.times[row], frames.appearance[row])
 
 
 def _rates(spec, facts, effects, step):

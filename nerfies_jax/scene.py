@@ -148,7 +148,6 @@ def loss_terms(
         view = View(
             jax.tree.map(lambda leaf: leaf[row], frames.cameras),
             frames.times[row],
-            frames.warp[row],
             frames.appearance[row],
         )
         return Moment(view.time, made.codes_at(params, view), step)

@@ -56,7 +56,6 @@ def frames_and_batch(rng, dtype):
         cameras=jax.tree.map(lambda leaf: leaf.astype(dtype), filmed),
         # the third is filmed a little late, and the flow stretched to it
         times=np.array([0, 1 / 3, 0.7, 1], dtype),
-        warp=np.arange(MOMENTS, dtype=np.int32),
         appearance=np.arange(MOMENTS, dtype=np.int32),
         valid=None,
         depths=np.where(depths < 2.3, 0, depths),

@@ -19,7 +19,6 @@ class Frames(NamedTuple):
     images: Any  # [frames, height, width, 3] uint8
     cameras: Camera
     times: Float[Array, " frames"]
-    warp: Int[Array, " frames"]
     appearance: Int[Array, " frames"]
     valid: Any  # [frames, height, width] bool, or None
     # What a model reads only if it `wants` it:
@@ -35,7 +34,6 @@ class View(NamedTuple):
 
     camera: Camera
     time: Float[Array, ""]
-    warp: Int[Array, ""]
     appearance: Int[Array, ""]
 
 

@@ -204,7 +204,7 @@ def run(made, start, frames, folder=None):
 def drawn(made, state, frames, row):
     """The view of that frame."""
     camera = jax.tree.map(lambda leaf: leaf[row], frames.cameras)
-    view = View(camera, frames.times[row], frames.warp[row], frames.appearance[row])
+    view = View(camera, frames.times[row], frames.appearance[row])
     return made.render(*hostile.on_device((state.params, view, state.step)))
 
 

@@ -226,7 +226,7 @@ def test_a_code_is_its_row_at_its_own_time_and_between_rows_elsewhere(dtype):
     assert table.shape == (3, TINY_WARP.code_width)
 
     def at(time):
-        view = View(None, jnp.asarray(time, dtype), jnp.int32(0), jnp.int32(0))
+        view = View(None, jnp.asarray(time, dtype), jnp.int32(0))
         return field.codes_at(params, view)["motion"]
 
     for row, time in enumerate(FACTS.times):
@@ -242,7 +242,7 @@ def test_an_exposure_that_was_not_learnt_lies_between_its_neighbours(float64):
     params = field.init(jax.random.key(0))
     table = params["codes"]["appearance"]
     assert table.shape == (2, 2)  # only what is learnt from has a row
-    view = View(None, jnp.asarray(0.0), jnp.int32(0), jnp.int32(2))
+    view = View(None, jnp.asarray(0.0), jnp.int32(2))
     found = field.codes_at(params, view)["appearance"]
     np.testing.assert_allclose(found, 0.75 * table[0] + 0.25 * table[1], atol=1e-7)
 

@@ -32,7 +32,7 @@ def frames():
     camera = Camera(*(jnp.zeros(()) for _ in Camera._fields))
     count = jnp.arange(4)
     images = rng.integers(0, 255, (4, 2, 3, 3), dtype=np.uint8)
-    return Frames(images, camera, jnp.linspace(0.0, 1.0, 4), count, count, None)
+    return Frames(images, camera, jnp.linspace(0.0, 1.0, 4), count, None)
 
 
 def init(_capture, key, spec=ToySpec()):
