@@ -283,7 +283,7 @@ class Job:
             spec = self.spec(name, steps)
             preset = self.suite.arms[name].preset
             representation = representations.of_preset(preset)
-            facts = representation.facts_of(self.capture, spec)
+            facts = representation.metadata_of(self.capture, spec)
             model = representation.build(spec, facts)
             self._cache_saved = 0.0
             first = loop.fit(

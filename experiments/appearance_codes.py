@@ -138,7 +138,7 @@ def trained(spec, capture, seed):
     from nerfies_jax import scene
     from nerfies_jax.training import loop
 
-    model = scene.build(spec, scene.facts_of(capture, spec))
+    model = scene.build(spec, scene.metadata_of(capture, spec))
     state = model.init(capture, jax.random.key(seed))
     frames = evaluate.frames_of(capture, model.wants)
     result = loop.fit(model, state, frames, steps=spec.steps)

@@ -238,7 +238,7 @@ def _compile(representation, capture, spec, at):
     from experiments import evaluate, matrix_flops
     from nerfies_jax.measure import clock
 
-    facts = representation.facts_of(capture, spec)
+    facts = representation.metadata_of(capture, spec)
     model = representation.build(spec, facts)
     state = model.init(capture, jax.random.key(0))
     state = state._replace(step=jnp.asarray(round(at * spec.steps), jnp.int32))

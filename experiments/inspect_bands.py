@@ -8,7 +8,7 @@ from experiments import inspect_points, inspect_views
 from experiments.inspect_findings import CERTAIN, LIKELY, Finding, cannot_tell
 from experiments.inspect_findings import TEXTURE as EFFECT
 from experiments.inspect_views import Views
-from nerfies_jax import facts
+from nerfies_jax import scene_metadata
 from nerfies_jax.capture.capture import Capture
 
 SMALL = 8  # of the fields' small presets
@@ -37,7 +37,7 @@ def texture(capture: Capture, views: Views, factor: int) -> Finding:
     points = inspect_points.own_points(capture)
     near, far = inspect_views.depth_span(capture, views, points)
     depth = math.sqrt(near * far)
-    scale = facts.facts_of(capture, 1.0).scale
+    scale = scene_metadata.metadata_of(capture, 1.0).scale
     per_unit = cycles * views.intrinsics[0, 0, 0] / depth / scale
     bands = bands_for(per_unit)
     evidence = (

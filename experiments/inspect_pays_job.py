@@ -166,7 +166,7 @@ class Trial:
             inspect_arms.ADVICE.arms[name].preset
         )
         try:
-            facts = representation.facts_of(self._job.capture, spec)
+            facts = representation.metadata_of(self._job.capture, spec)
             representation.build(spec, facts)
         except ValueError as error:
             return name, str(error)

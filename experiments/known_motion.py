@@ -14,7 +14,7 @@ from experiments import evaluate
 from gaussians_jax import scene, splats
 from gaussians_jax.effects import mlp_motion
 from gaussians_jax.effects.mlp_motion import Motion, MotionSpec
-from gaussians_jax.spec import Facts, SplatScene
+from gaussians_jax.spec import SceneMetadata, SplatScene
 from gaussians_jax.splats import Params, Splats
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.geometry import camera as cameras
@@ -81,7 +81,9 @@ def fitted(count: int, spec: MotionSpec, steps: int) -> Moving:
     """
     spec = dataclasses.replace(spec, smoothing=None, warm_up=0)
     whole = SplatScene(steps=1, sh_degree=0, density=None, motion=spec)
-    model = scene.build(whole, Facts(extent=1.0, background=(0.1, 0.1, 0.1), frames=2))
+    model = scene.build(
+        whole, SceneMetadata(extent=1.0, background=(0.1, 0.1, 0.1), frames=2)
+    )
     params = Params(
         {"splats": ball_and_wall(count)}, {mlp_motion.NAME: fit(spec, steps)}
     )

@@ -114,7 +114,7 @@ def measured(rows: tuple[str, ...], repeats: int) -> dict[str, dict[str, float]]
     figures, calls = {}, {}
     for name in rows:
         spec = specs()[name]
-        model = scene.build(spec, scene.facts_of(capture, spec))
+        model = scene.build(spec, scene.metadata_of(capture, spec))
         state = model.init(capture, jax.random.key(0))
         frames = evaluate.frames_of(capture, model.wants)
         cost = clock.cost(model.step, state, frames)

@@ -27,7 +27,7 @@ class Representation(NamedTuple):
     spec_type: type
     presets: dict[str, Spec]
     with_steps: Callable[[Spec, int], Spec]  # schedules stretch with the steps
-    facts_of: Callable[[Capture, Spec], Any]
+    metadata_of: Callable[[Capture, Spec], Any]
     build: Callable[[Spec, Any], Model]  # (spec, facts) -> model
     first_bytes: Callable[[Spec, Capture], int]  # of the first state and step
     lighter: str  # which settings make the first state smaller
@@ -64,7 +64,7 @@ def gaussians() -> Representation:
         spec_type=scene.SplatScene,
         presets=presets.PRESETS,
         with_steps=presets.with_steps,
-        facts_of=lambda capture, spec: scene.facts_of(capture),
+        metadata_of=lambda capture, spec: scene.metadata_of(capture),
         build=scene.build,
         first_bytes=scene.first_bytes,
         lighter="lower start.points, start.random or raster.capacity with --set",
@@ -87,7 +87,7 @@ def radiance() -> Representation:
         spec_type=scene.RadianceScene,
         presets=presets.PRESETS,
         with_steps=presets.with_steps,
-        facts_of=scene.facts_of,
+        metadata_of=scene.metadata_of,
         build=scene.build,
         first_bytes=scene.first_bytes,
         lighter="lower rays, sampling.coarse or sampling.fine with --set",

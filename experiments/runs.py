@@ -64,7 +64,7 @@ def open_run(
 ) -> Run:
     """Read the capture and build the model."""
     capture = read_capture(choices, stored)
-    facts = representation.facts_of(capture, spec)
+    facts = representation.metadata_of(capture, spec)
     model = representation.build(spec, facts)
     return Run(choices, capture, representation, spec, facts, model)
 

@@ -14,7 +14,7 @@ from gaussians_jax.effects.effect import Around, Effect, Moment, Shot
 from gaussians_jax.phases import Trained
 from gaussians_jax.spec import (
     OPTIMISERS,
-    Facts,
+    SceneMetadata,
     SplatScene,
     effects_of,
     refuse_what_cannot_train,
@@ -39,11 +39,11 @@ PyTree = Any
 ORDER, EVENT = 2**32 - 1, 2**32 - 2
 
 
-def facts_of(capture: Capture) -> Facts:
-    """The facts of a capture; host side."""
+def metadata_of(capture: Capture) -> SceneMetadata:
+    """The metadata of a capture; host side."""
     positions = np.asarray(capture.cameras.position)[capture.train]
     halfway = 2 / (1 / capture.near + 1 / capture.far)
-    return Facts(
+    return SceneMetadata(
         extent=splats.scene_extent(positions, still=halfway),
         background=capture.background or (0.0, 0.0, 0.0),
         frames=len(capture.train),
@@ -66,30 +66,30 @@ def carried_by(effects: tuple[Effect, ...], params: Params) -> dict[str, PyTree]
     }
 
 
-def build(spec: SplatScene, facts: Facts) -> Model:
+def build(spec: SplatScene, metadata: SceneMetadata) -> Model:
     """Everything the loop, the renderer and the report need of this scene."""
-    effects = effects_of(spec, facts)
+    effects = effects_of(spec, metadata)
     # Counts updates per row; for the networks, whose rows are never born, it is plain.
     optimiser = OPTIMISERS[spec.optimiser]()
-    stages = _stages(spec, facts, effects)
+    stages = _stages(spec, metadata, effects)
 
     def whole_frame(params, view, size, step):
         posed = stages.pose(params, stages.prepare(params), view.time)
         return stages.draw(params, posed, view, size, step)
 
     return Model(
-        spec=(spec, facts),
+        spec=(spec, metadata),
         init=lambda capture, key: first_state(spec, effects, optimiser, capture, key),
-        step=_stepper(spec, facts, effects, optimiser),
+        step=_stepper(spec, metadata, effects, optimiser),
         render=whole_frame,
-        events=_events(spec, facts, effects, optimiser),
+        events=_events(spec, metadata, effects, optimiser),
         counts=count_rows,
         wants=frozenset().union(*(effect.wants for effect in effects)),
         stages=stages,
     )
 
 
-def _stages(spec, facts, effects):
+def _stages(spec, metadata, effects):
     """Rendering of trained parameters in parts."""
 
     def prepare(params):
@@ -100,25 +100,27 @@ def _stages(spec, facts, effects):
 
     def draw(params, posed, view, size, step):
         degree = splats.active_degree(step, spec.sh_every, spec.sh_degree)
-        return _draw(spec, facts, params, posed, view, size, degree).rendering
+        return _draw(spec, metadata, params, posed, view, size, degree).rendering
 
     return Stages(prepare, pose, draw)
 
 
-def _draw(spec, facts, params, gaussians, view, size, degree, probe=None, depth=True):
+def _draw(
+    spec, metadata, params, gaussians, view, size, degree, probe=None, depth=True
+):
     return render.render_harmonics(
         gaussians,
         splats.active_harmonics(params.rows["splats"], degree),
         view.camera,
         size,
         spec.raster,
-        jnp.asarray(facts.background, gaussians.mean.dtype),
+        jnp.asarray(metadata.background, gaussians.mean.dtype),
         mean2d_offset=probe,
         depth=depth,
     )
 
 
-def _stepper(spec, facts, effects, optimiser):
+def _stepper(spec, metadata, effects, optimiser):
     """One update from one frame: (state, frames) -> (state, metrics), pure."""
 
     def step(state: TrainState, frames: Frames):
@@ -141,7 +143,9 @@ def _stepper(spec, facts, effects, optimiser):
         def loss(params, probe):
             canonical = splats.activate(params.rows["splats"])
             moved = posed(params, canonical)
-            frame = _draw(spec, facts, params, moved, view, size, degree, probe, depth)
+            frame = _draw(
+                spec, metadata, params, moved, view, size, degree, probe, depth
+            )
             seen = shot(frames, row, frame.rendering)
             carried = state.extra.carried
             value, metrics = loss_of(spec, effects, params, seen, moment, carried)
@@ -152,7 +156,7 @@ def _stepper(spec, facts, effects, optimiser):
             jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)(state.params, probe)
         )
         directions, moments = optimiser.update(slopes, state.optimiser, state.params)
-        rate = _rates(spec, facts, effects, state.step)
+        rate = _rates(spec, metadata, effects, state.step)
         trained = Trained(rates.descend(state.params, directions, rate), moments)
         if spec.alternation is not None:
             before = Trained(state.params, state.optimiser)
@@ -220,11 +224,11 @@ def _view(frames, row):
     return View(camera, frames.times[row], frames.appearance[row])
 
 
-def _rates(spec, facts, effects, step):
+def _rates(spec, metadata, effects, step):
     """A prefix of `Params` with the learning rate of everything below each leaf."""
     rows = {
         "splats": rates.learning_rates(
-            spec.rates, facts.extent, spec.steps, step, spec.annealing
+            spec.rates, metadata.extent, spec.steps, step, spec.annealing
         )
     }
     nets = {}
@@ -285,7 +289,7 @@ def first_state(spec, effects, optimiser, capture, key) -> TrainState:
     )
 
 
-def _events(spec, facts, effects, optimiser):
+def _events(spec, metadata, effects, optimiser):
     if spec.density is None:
         return ()
     plan = spec.density
@@ -307,7 +311,7 @@ def _events(spec, facts, effects, optimiser):
             jax.random.fold_in(jax.random.fold_in(state.key, EVENT), state.step),
             plan,
             step=step,
-            extent=facts.extent,
+            extent=metadata.extent,
         )
         extra = Extra(changed.stats, carried_by(effects, changed.params))
         return state._replace(

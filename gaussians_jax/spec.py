@@ -68,7 +68,7 @@ class SplatScene:
 
 
 @dataclasses.dataclass(frozen=True)
-class Facts:
+class SceneMetadata:
     """What a scene must know of its capture before anything is compiled."""
 
     extent: float  # scene units: how far the cameras spread
@@ -115,21 +115,21 @@ MOTIONS = {
 }
 
 
-def effects_of(spec: SplatScene, facts: Facts) -> tuple[Effect, ...]:
+def effects_of(spec: SplatScene, metadata: SceneMetadata) -> tuple[Effect, ...]:
     """The effects that the spec asks for, in the order in which they act."""
     effects = []
     if spec.motion is not None:
         move = MOTIONS[type(spec.motion)]
-        effects.append(move(spec.motion, spec.steps, facts.frames))
+        effects.append(move(spec.motion, spec.steps, metadata.frames))
     if spec.acceleration is not None:
         effects.append(
-            acceleration.effect(spec.acceleration, facts.extent, facts.frames)
+            acceleration.effect(spec.acceleration, metadata.extent, metadata.frames)
         )
     if spec.neighbours is not None:
         of = kan_motion.NAME  # the only rows that are an embedding
-        effects.append(neighbours.effect(spec.neighbours, facts.extent, of))
+        effects.append(neighbours.effect(spec.neighbours, metadata.extent, of))
     if spec.motion_growth is not None:
-        effects.append(motion_growth.effect(spec.motion_growth, facts.extent))
+        effects.append(motion_growth.effect(spec.motion_growth, metadata.extent))
     if spec.spectral is not None:
         effects.append(spectral.effect(spec.spectral, spec.steps))
     if spec.depth is not None:

@@ -8,8 +8,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Key
 
-from nerfies_jax import facts as scene_facts
-from nerfies_jax import tracing
+from nerfies_jax import scene_metadata, tracing
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.effects import transient
 from nerfies_jax.effects.effect import (
@@ -21,10 +20,10 @@ from nerfies_jax.effects.effect import (
     Term,
     stream,
 )
-from nerfies_jax.facts import Facts
 from nerfies_jax.field import Field, field
 from nerfies_jax.geometry import rays
 from nerfies_jax.nets import codes
+from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.spec import RadianceScene
 from nerfies_jax.training import loop, losses, schedules
 from nerfies_jax.training.model import (
@@ -35,23 +34,23 @@ from nerfies_jax.training.model import (
     in_default_precision,
 )
 
-__all__ = ["Facts", "Field", "RadianceScene", "build", "facts_of", "field"]
+__all__ = ["Field", "RadianceScene", "SceneMetadata", "build", "field", "metadata_of"]
 
 PyTree = Any
 
 
-def facts_of(capture: Capture, spec: RadianceScene) -> Facts:
+def metadata_of(capture: Capture, spec: RadianceScene) -> SceneMetadata:
     """What the field must know of a capture; host side."""
-    return scene_facts.facts_of(capture, spec.extent)
+    return scene_metadata.metadata_of(capture, spec.extent)
 
 
-def build(spec: RadianceScene, facts: Facts) -> Model:
+def build(spec: RadianceScene, metadata: SceneMetadata) -> Model:
     """Everything the loop, the renderer and the report need of this scene.
 
     Raises ValueError where an effect needs what the capture does not have.
     """
-    made = field(spec, facts)
-    if spec.background is not None and "points" not in facts.provides:
+    made = field(spec, metadata)
+    if spec.background is not None and "points" not in metadata.provides:
         raise ValueError(
             "the background effect holds static points still, and this capture has "
             "none; leave it out with --set background=none"
@@ -65,7 +64,7 @@ def build(spec: RadianceScene, facts: Facts) -> Model:
 
         def loss(params):
             terms = loss_terms(
-                spec, facts, made, params, frames, batch, state.step, field_key
+                spec, metadata, made, params, frames, batch, state.step, field_key
             )
             total = sum(term.weight * term.value for term in terms.values())
             return total, {name: term.value for name, term in terms.items()}
@@ -87,7 +86,9 @@ def build(spec: RadianceScene, facts: Facts) -> Model:
         return made.render(params, view.camera, view.time, found, size, step)
 
     def init(capture, key):
-        codes.check_ids(capture.appearance_ids, len(facts.exposures), "appearance_ids")
+        codes.check_ids(
+            capture.appearance_ids, len(metadata.exposures), "appearance_ids"
+        )
         start_key, run_key = jax.random.split(key)
         params = in_default_precision(made.init(start_key))
         return TrainState(
@@ -96,13 +97,13 @@ def build(spec: RadianceScene, facts: Facts) -> Model:
 
     wants = frozenset().union(*(effect.wants for effect in made.effects))
     return Model(
-        spec=(spec, facts),
+        spec=(spec, metadata),
         init=init,
         step=step,
         render=whole_frame,
         events=(),
         counts=count_parameters,
-        wants=wants & facts.provides,
+        wants=wants & metadata.provides,
     )
 
 
@@ -129,7 +130,7 @@ def draw_batch(frames: Frames, count: int, key: Key[Array, ""]) -> Batch:
 
 def loss_terms(
     spec: RadianceScene,
-    facts: Facts,
+    metadata: SceneMetadata,
     made: Field,
     params: PyTree,
     frames: Frames,
@@ -153,13 +154,13 @@ def loss_terms(
         return Moment(view.time, made.codes_at(params, view), step)
 
     moments = jax.vmap(moment_of)(batch.row)
-    lines = jax.vmap(lambda *ray: tracing.field_ray(facts, *ray))(
+    lines = jax.vmap(lambda *ray: tracing.field_ray(metadata, *ray))(
         batch.origin, batch.direction, batch.cosine
     )
     keys = jax.random.split(trace_key, len(batch.row))
     levels = jax.vmap(lambda *ray: made.trace(params, *ray))(lines, moments, keys)
     terms = _colour_terms(levels, batch)
-    centre = jnp.asarray(facts.centre, batch.origin.dtype)
+    centre = jnp.asarray(metadata.centre, batch.origin.dtype)
     context = Context(
         displace=lambda point, moment: made.displace(params, point, moment),
         moment_of=moment_of,
@@ -167,7 +168,7 @@ def loss_terms(
         batch=batch,
         levels=levels,
         frames=frames,
-        box=Box(centre, jnp.asarray(facts.scale, batch.origin.dtype)),
+        box=Box(centre, jnp.asarray(metadata.scale, batch.origin.dtype)),
         step=step,
         key=penalty_key,
     )

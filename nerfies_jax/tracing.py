@@ -8,11 +8,11 @@ from jaxtyping import Array, Float, Key
 
 from nerfies_jax.effects import transient
 from nerfies_jax.effects.effect import Effect, Level, Medium, Moment, Sample
-from nerfies_jax.facts import Facts
 from nerfies_jax.geometry import rays
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.nets import encoding
 from nerfies_jax.radiance import compositing, sampling, template
+from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.spec import RadianceScene, template_of
 
 PyTree = Any
@@ -29,25 +29,30 @@ class Ray(NamedTuple):
     far: Scalar
 
 
-def field_ray(facts: Facts, origin: Vector, direction: Vector, cosine: Scalar) -> Ray:
+def field_ray(
+    metadata: SceneMetadata, origin: Vector, direction: Vector, cosine: Scalar
+) -> Ray:
     """A ray of the scene in the field's coordinates, between the near and far planes.
 
     The planes are z-depths, so a slanted ray is sampled further out.
     """
-    centre = jnp.asarray(facts.centre, origin.dtype)
-    span = facts.scale / cosine
+    centre = jnp.asarray(metadata.centre, origin.dtype)
+    span = metadata.scale / cosine
     return Ray(
-        (origin - centre) * facts.scale, direction, facts.near * span, facts.far * span
+        (origin - centre) * metadata.scale,
+        direction,
+        metadata.near * span,
+        metadata.far * span,
     )
 
 
 def pixel_ray(
-    facts: Facts, camera: Camera, pixel: Float[Array, "2"]
+    metadata: SceneMetadata, camera: Camera, pixel: Float[Array, "2"]
 ) -> tuple[Ray, Scalar]:
     """The field's ray through one pixel position, and its z-depth per distance."""
     found = rays.pixel_ray(camera, pixel)
     cosine = rays.depth_per_distance(camera, found.direction)
-    return field_ray(facts, found.origin, found.direction, cosine), cosine
+    return field_ray(metadata, found.origin, found.direction, cosine), cosine
 
 
 def displacement(
@@ -89,7 +94,7 @@ def _places(effects, params, ray, moment, distance):
 
 def trace(
     spec: RadianceScene,
-    facts: Facts,
+    metadata: SceneMetadata,
     effects: tuple[Effect, ...],
     params: PyTree,
     ray: Ray,
@@ -124,7 +129,7 @@ def trace(
             )
             noise = spec.density_noise * drawn
         return _level(
-            spec, facts, effects, params, name, ray, moment, places, last, noise
+            spec, metadata, effects, params, name, ray, moment, places, last, noise
         )
 
     if plan.fine == 0:
@@ -147,7 +152,7 @@ def trace(
     return coarse, level("fine", both, True, 1)
 
 
-def _level(spec, facts, effects, params, name, ray, moment, places, last, noise):
+def _level(spec, metadata, effects, params, name, ray, moment, places, last, noise):
     """One level of one ray: ask the template, composite with other media."""
     one = template_of(spec, name)
     condition = []
@@ -179,12 +184,12 @@ def _level(spec, facts, effects, params, name, ray, moment, places, last, noise)
             return effect.medium(params.get(effect.name), sample, moment)
 
         media[effect.name] = jax.vmap(at)(places.point, radiance.features)
-    return _composite(spec, facts, ray, places, radiance, media)
+    return _composite(spec, metadata, ray, places, radiance, media)
 
 
-def _composite(spec, facts, ray, places, radiance, media: dict[str, Medium]):
+def _composite(spec, metadata, ray, places, radiance, media: dict[str, Medium]):
     distance = places.distance
-    behind = facts.background
+    behind = metadata.background
     end = compositing.AT_INFINITY
     if behind is not None:
         end = jnp.maximum(ray.far - distance[-1], 0)

@@ -13,7 +13,7 @@ FLOORS = {
     "nerfies_jax.measure": 5,
     "nerfies_jax.radiance": 6,
     "nerfies_jax.effects": 7,
-    "nerfies_jax.facts": 8,
+    "nerfies_jax.scene_metadata": 8,
     "nerfies_jax.spec": 8,
     "nerfies_jax.tracing": 8,
     "nerfies_jax.field": 8,

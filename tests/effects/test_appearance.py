@@ -13,10 +13,10 @@ from nerfies_jax import presets, scene
 from nerfies_jax.effects import appearance
 from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.effects.effect import APPEARANCE, Moment, Table
-from nerfies_jax.facts import Facts
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.radiance.template import TemplateSpec
 from nerfies_jax.scene import RadianceScene
+from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.spec import SamplingSpec
 from nerfies_jax.tracing import Ray
 from tests import gradients, scenes
@@ -30,7 +30,7 @@ TINY = RadianceScene(
     sampling=SamplingSpec(5, 3, jitter=False),
     appearance=AppearanceSpec(width=3),
 )
-FACTS = Facts(
+METADATA = SceneMetadata(
     near=1.0,
     far=3.0,
     centre=(0.0, 0.0, 0.0),
@@ -66,11 +66,11 @@ def moment(code):
 
 @functools.cache
 def tracer():
-    return jax.jit(scene.field(TINY, FACTS).trace)
+    return jax.jit(scene.field(TINY, METADATA).trace)
 
 
 def params_of(dtype):
-    params = scene.field(TINY, FACTS).init(jax.random.key(0))
+    params = scene.field(TINY, METADATA).init(jax.random.key(0))
     return jax.tree.map(lambda leaf: leaf.astype(dtype), params)
 
 
@@ -117,7 +117,7 @@ def test_colour_has_the_code_s_slope(float64, rng):
     params = params_of(float64)
     pull = jnp.asarray(rng.normal(size=3))
     plain = dataclasses.replace(TINY, sampling=SamplingSpec(4, 0, jitter=False))
-    trace = scene.field(plain, FACTS).trace
+    trace = scene.field(plain, METADATA).trace
 
     def shade(code):
         levels = trace(params, ray(float64), moment(code))
@@ -146,9 +146,9 @@ def test_codes_of_every_preset_learn(name):
         warp = dataclasses.replace(spec.warp, depth=1, width=8, skips=())
         spec = dataclasses.replace(spec, warp=warp)
     capture = scenes.tiny_capture()
-    facts = scene.facts_of(capture, spec)
-    made = scene.field(spec, facts)
-    frames = evaluate.frames_of(capture, scene.build(spec, facts).wants)
+    metadata = scene.metadata_of(capture, spec)
+    made = scene.field(spec, metadata)
+    frames = evaluate.frames_of(capture, scene.build(spec, metadata).wants)
     params = made.init(jax.random.key(0))
     keys = jax.random.split(jax.random.key(1))
     batch = scene.draw_batch(frames, spec.rays, keys[0])
@@ -156,7 +156,7 @@ def test_codes_of_every_preset_learn(name):
     def loss(codes):
         terms = scene.loss_terms(
             spec,
-            facts,
+            metadata,
             made,
             params | {"codes": params["codes"] | {"appearance": codes}},
             frames,

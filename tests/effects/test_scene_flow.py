@@ -348,8 +348,8 @@ def test_a_scene_with_it_learns_from_pictures_depth_and_flow():
         rate_end=1e-3,
         scene_flow=TINY,
     )
-    facts = scene.facts_of(capture, spec)
-    model = scene.build(spec, facts)
+    metadata = scene.metadata_of(capture, spec)
+    model = scene.build(spec, metadata)
     assert model.wants == {"depths", "flow"}
     state = model.init(capture, jax.random.key(0))
     frames = evaluate.frames_of(capture, model.wants)
@@ -364,7 +364,7 @@ def test_a_scene_with_it_learns_from_pictures_depth_and_flow():
     moved = jax.tree.map(lambda a, b: bool((a != b).any()), first, state.params)
     assert all(jax.tree.leaves(moved["scene_flow"]))
     both, still = (
-        scene.field(spec, facts, without) for without in ((), ("scene_flow",))
+        scene.field(spec, metadata, without) for without in ((), ("scene_flow",))
     )
     view = evaluate.view_of(capture, 0)
     pictures = [

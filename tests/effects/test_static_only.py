@@ -35,18 +35,18 @@ NOWHERE = -1e4
 
 
 @functools.cache
-def facts():
-    return scene.facts_of(scenes.tiny_capture(), TINY)
+def metadata():
+    return scene.metadata_of(scenes.tiny_capture(), TINY)
 
 
 @functools.cache
 def tracer(spec, without=()):
-    return jax.jit(scene.field(spec, facts(), without).trace)
+    return jax.jit(scene.field(spec, metadata(), without).trace)
 
 
 def params_of(dtype):
     """Drawn by NumPy: there is nothing to compile."""
-    shapes = jax.eval_shape(scene.field(TINY, facts()).init, jax.random.key(2))
+    shapes = jax.eval_shape(scene.field(TINY, metadata()).init, jax.random.key(2))
     rng = np.random.default_rng(2)
 
     def draw(leaf):
@@ -115,7 +115,7 @@ def test_with_it_the_ray_sees_both_through_one_transmittance(dtype):
     distance = np.asarray(joint.distance, np.float64)
     end = max(float(ray.far) - distance[-1], 0)
     spacing = np.append(np.diff(distance), end)
-    if facts().background is None:
+    if metadata().background is None:
         pytest.fail("this test has the background shine through the last sample")
     static = np.asarray(alone.static_weight, np.float64)
     medium = jax.tree.map(
@@ -145,7 +145,7 @@ def test_with_it_the_ray_sees_both_through_one_transmittance(dtype):
 @pytest.mark.slow
 def test_a_step_trains_the_transient_its_codes_and_the_trunk():
     capture = scenes.tiny_capture()
-    model = scene.build(TINY, facts())
+    model = scene.build(TINY, metadata())
     state = model.init(capture, jax.random.key(3))
     frames = evaluate.frames_of(capture, model.wants)
     after, metrics = jax.jit(model.step)(state, frames)

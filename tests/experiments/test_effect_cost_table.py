@@ -82,8 +82,8 @@ def test_a_loop_whose_rounds_nobody_knows_counts_once_and_says_so():
 def test_the_products_of_a_static_field_are_those_of_its_networks(name):
     preset = bare_scenes.tiny_field(name)
     spec = effect_cost.without(preset, tuple(effect_cost.effects_in(preset)))
-    facts = scene.facts_of(scenes.tiny_capture(), spec)
-    made = scene.field(spec, facts)
+    metadata = scene.metadata_of(scenes.tiny_capture(), spec)
+    made = scene.field(spec, metadata)
     one, zero = jnp.ones(()), jnp.zeros(())
     ray = Ray(jnp.zeros(3), jnp.asarray([0.0, 0.0, 1.0]), 0.5 * one, one)
     moment = Moment(zero, {}, jnp.int32(0))

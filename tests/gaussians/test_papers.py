@@ -24,14 +24,14 @@ QUIET = rich.console.Console(quiet=True)
 by_paper = pytest.mark.parametrize("paper", PAPERS)
 
 
-def facts():
-    return scene.facts_of(scenes.tiny_capture())
+def metadata():
+    return scene.metadata_of(scenes.tiny_capture())
 
 
 @functools.cache
 def made(paper):
     capture = scenes.tiny_capture()
-    model = scene.build(PAPERS[paper], facts())
+    model = scene.build(PAPERS[paper], metadata())
     frames = evaluate.frames_of(capture, model.wants)
     return model, frames
 
@@ -67,7 +67,7 @@ def test_a_run_with_every_part_learns_and_stays_finite(paper):
     learnt = train(paper, result.state, 600).state
     first, last = psnr(paper, start(paper)), psnr(paper, learnt)
     assert last > first + 3, (first, last)
-    names = {effect.name for effect in effects_of(PAPERS[paper], facts())}
+    names = {effect.name for effect in effects_of(PAPERS[paper], metadata())}
     silent = {"kan_motion", "motion_basis", "motion_growth"}  # add nothing to the loss
     assert names - silent <= set(rows[-1])
     for leaf in jax.tree.leaves(learnt.params):
@@ -105,7 +105,7 @@ def test_an_interrupted_run_ends_as_the_straight_one(paper, tmp_path):
 @by_paper
 def test_the_loss_of_a_whole_step_has_the_right_slope(paper, float64):
     capture = scenes.tiny_capture()
-    spec, known = PAPERS[paper], facts()
+    spec, known = PAPERS[paper], metadata()
     if paper == "moba":  # else no slope reaches the means through the networks
         motion = dataclasses.replace(spec.motion, detach=False)
         spec = dataclasses.replace(spec, motion=motion)
@@ -179,7 +179,7 @@ def test_parts_that_need_others_are_refused(change, words):
     spec = dataclasses.replace(scenes.TINY_MOBA, **change)
     with pytest.raises(ValueError, match=words):
         refuse_what_cannot_train(spec)
-    model = scene.build(spec, facts())  # a trained scene may be drawn without
+    model = scene.build(spec, metadata())  # a trained scene may be drawn without
     with pytest.raises(ValueError, match=words):
         model.init(scenes.tiny_capture(), jax.random.key(0))
 

@@ -13,7 +13,7 @@ from experiments import evaluate
 from gaussians_jax import presets, rates, scene, splats, start
 from gaussians_jax.optimiser import scale_by_row_adam
 from gaussians_jax.rates import RateSpec
-from gaussians_jax.spec import Facts, SplatScene
+from gaussians_jax.spec import SceneMetadata, SplatScene
 from gaussians_jax.splats import Params, Splats
 from gaussians_jax.start import StartSpec
 from tests import scenes
@@ -24,7 +24,7 @@ KEY = 3
 @functools.cache
 def started(spec):
     capture = scenes.tiny_capture()
-    model = scene.build(spec, scene.facts_of(capture))
+    model = scene.build(spec, scene.metadata_of(capture))
     return model, model.init(capture, jax.random.key(KEY)), evaluate.frames_of(capture)
 
 
@@ -129,7 +129,7 @@ def test_events_grow_the_scene_and_keep_its_picture_learnable():
         scenes.TINY_SPLATS,
         density=dataclasses.replace(scenes.TINY_SPLATS.density, gradient=1e-9),
     )
-    eager = scene.build(spec, scene.facts_of(scenes.tiny_capture()))
+    eager = scene.build(spec, scene.metadata_of(scenes.tiny_capture()))
     after = eager.events[0].apply(state, frames)
     assert model.counts(after)["gaussians"] > model.counts(state)["gaussians"]
     assert int(after.step) == int(state.step)
@@ -198,7 +198,7 @@ def test_facts_take_a_depth_for_the_extent_of_a_camera_that_stands_still():
     capture = dataclasses.replace(
         capture, cameras=capture.cameras._replace(position=still)
     )
-    assert capture.near < scene.facts_of(capture).extent < capture.far
+    assert capture.near < scene.metadata_of(capture).extent < capture.far
 
 
 @pytest.mark.parametrize(
@@ -227,11 +227,11 @@ def test_a_rate_that_cannot_decay_is_refused():
 @pytest.mark.parametrize("name", sorted(presets.PRESETS))
 def test_presets_build_and_stretch_with_their_steps(name):
     spec = presets.PRESETS[name]
-    facts = Facts(extent=1.0, background=(0.0, 0.0, 0.0), frames=10)
+    metadata = SceneMetadata(extent=1.0, background=(0.0, 0.0, 0.0), frames=10)
     half = presets.with_steps(spec, spec.steps // 2)
     assert half.steps == spec.steps // 2
     assert half.density.stop == round(spec.density.stop / 2)
-    assert scene.build(half, facts).spec == (half, facts)
+    assert scene.build(half, metadata).spec == (half, metadata)
     assert presets.with_steps(spec, spec.steps) == spec
 
 

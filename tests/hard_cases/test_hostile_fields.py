@@ -47,7 +47,7 @@ def trained(name, start, folder=None, steps=tiny_fields.STEPS):
     """A run that ended as every run must, and what it would show then."""
     run = tiny_fields.started(name)
     film = start.film(run.capture)
-    place = tiny_fields.place_of(scene.facts_of(film, run.spec), start.speed)
+    place = tiny_fields.place_of(scene.metadata_of(film, run.spec), start.speed)
     if film.points is None:  # they are told the field's planes alone
         film = dataclasses.replace(film, points=run.capture.points)
     frames = start.frames(tiny_fields.frames_of(film, run.model.wants))
@@ -117,7 +117,7 @@ def test_where_the_origin_of_the_world_is_cannot_be_seen(name):
     state = run.state._replace(params=field_starts.denser(2.0)(run.state.params))
     pictures = []
     for film in (capture, shifted):
-        place = tiny_fields.place_of(scene.facts_of(film, run.spec))
+        place = tiny_fields.place_of(scene.metadata_of(film, run.spec))
         frames = tiny_fields.frames_of(film, run.model.wants)
         pictures.append(picture_of(run, state._replace(extra=place), frames, 1))
     # A shift of 4 units is rounded to 2e-7, five times that in units of the field; the
@@ -175,7 +175,7 @@ def test_scene_flow_of_a_single_bare_frame_stays_finite():
 def test_a_single_frame_has_one_code_at_all_times():
     spec = dataclasses.replace(tiny_fields.tiny("nerfies"), background=None)
     film = bare(scenes.tiny_capture())
-    made = scene.field(spec, scene.facts_of(film, spec))
+    made = scene.field(spec, scene.metadata_of(film, spec))
     params = made.init(jax.random.key(0))
     assert set(params["codes"]) == {"motion", "appearance"}
     for row in (0, 1):
@@ -193,8 +193,8 @@ def test_a_single_frame_has_one_code_at_all_times():
 def test_units_of_a_capture_do_not_reach_the_field(factor):
     spec = tiny_fields.tiny("nerf")
     capture = scenes.tiny_capture()
-    usual = scene.facts_of(capture, spec)
-    other = scene.facts_of(field_starts.scaled(factor)(capture), spec)
+    usual = scene.metadata_of(capture, spec)
+    other = scene.metadata_of(field_starts.scaled(factor)(capture), spec)
     # To the rounding of float32 points and cameras
     np.testing.assert_allclose(other.scale * factor, usual.scale, rtol=1e-6)
     np.testing.assert_allclose(other.near / factor, usual.near, rtol=1e-6)
@@ -208,9 +208,9 @@ def test_points_behind_the_far_plane_do_not_push_the_near_one_past_it():
     capture = scenes.tiny_capture()
     ahead = 50 * capture.cameras.camera_from_world[0, 2]
     points = capture.points._replace(position=capture.points.position + ahead)
-    facts = scene.facts_of(dataclasses.replace(capture, points=points), spec)
-    assert facts.near == capture.near
-    assert facts.far == capture.far
+    metadata = scene.metadata_of(dataclasses.replace(capture, points=points), spec)
+    assert metadata.near == capture.near
+    assert metadata.far == capture.far
 
 
 def test_a_scene_without_width_in_float64_is_refused():
@@ -219,7 +219,7 @@ def test_a_scene_without_width_in_float64_is_refused():
     away = cameras._replace(position=np.full_like(cameras.position, 1e30))
     away = dataclasses.replace(capture, cameras=away, points=None)
     with pytest.raises(ValueError, match=r"no width; move the scene"):
-        scene.facts_of(away, tiny_fields.tiny("nerf"))
+        scene.metadata_of(away, tiny_fields.tiny("nerf"))
 
 
 # --- means of what is hardly there ---------------------------------------------------

@@ -107,8 +107,8 @@ class Ready(NamedTuple):
 
 
 def ready_for(spec, capture) -> Ready:
-    facts = scene.facts_of(capture)
-    model = hurried(scene.build(spec, facts))
+    metadata = scene.metadata_of(capture)
+    model = hurried(scene.build(spec, metadata))
 
     @jax.jit
     def render(params, view, step):
@@ -118,7 +118,7 @@ def ready_for(spec, capture) -> Ready:
         model,
         model.init(capture, jax.random.key(3)),
         hostile.frames_of(capture, model.wants),
-        effects_of(spec, facts),
+        effects_of(spec, metadata),
         render,
     )
 
@@ -312,6 +312,8 @@ def test_every_cloud_of_points_is_a_finite_start(cloud, beside, source):
     capture = points_at(CLOUDS[cloud](place, ahead, capture.far))
     plan = StartSpec(random=120, beside=beside, source=source)
     spec = dataclasses.replace(scenes.TINY_SPLATS, start=plan)
-    state = scene.build(spec, scene.facts_of(capture)).init(capture, jax.random.key(0))
+    state = scene.build(spec, scene.metadata_of(capture)).init(
+        capture, jax.random.key(0)
+    )
     assert not hostile.not_finite(state)
     assert splats.alive(state.params.rows["splats"]).any()

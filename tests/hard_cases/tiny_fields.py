@@ -15,9 +15,9 @@ import numpy as np
 from experiments import evaluate
 from nerfies_jax import presets, scene
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.facts import Facts
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.radiance.template import TemplateSpec
+from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.spec import RadianceScene
 from nerfies_jax.training.model import Frames, Model, Rendering, TrainState
 from tests import scenes
@@ -94,17 +94,17 @@ def small_template(spec: TemplateSpec) -> TemplateSpec:
     )
 
 
-def moved(facts: Facts, place: Place) -> Facts:
-    """The facts with traced numbers, which their constructor would refuse."""
-    facts = copy.copy(facts)
+def moved(metadata: SceneMetadata, place: Place) -> SceneMetadata:
+    """The metadata with traced numbers, which their constructor would refuse."""
+    metadata = copy.copy(metadata)
     for name in ("near", "far", "centre", "scale"):
-        object.__setattr__(facts, name, getattr(place, name))
-    return facts
+        object.__setattr__(metadata, name, getattr(place, name))
+    return metadata
 
 
-def place_of(facts: Facts, speed: float = 1.0) -> Place:
+def place_of(metadata: SceneMetadata, speed: float = 1.0) -> Place:
     """As arrays."""
-    numbers = (facts.near, facts.far, facts.centre, facts.scale, speed)
+    numbers = (metadata.near, metadata.far, metadata.centre, metadata.scale, speed)
     return Place(*(np.asarray(number, np.float32) for number in numbers))
 
 
@@ -129,11 +129,11 @@ def started(name: str) -> Run:
 
 def start(spec: RadianceScene, capture: Capture) -> Run:
     """Nothing is compiled before it runs."""
-    facts = scene.facts_of(capture, spec)
-    model = scene.build(spec, facts)
+    metadata = scene.metadata_of(capture, spec)
+    model = scene.build(spec, metadata)
 
     def step(state, frames):
-        here = scene.build(spec, moved(facts, state.extra))
+        here = scene.build(spec, moved(metadata, state.extra))
         new, metrics = here.step(state, frames)
         params = hostile.sped_up(state.params, new.params, state.extra.speed)
         return new._replace(params=params), metrics
@@ -142,10 +142,10 @@ def start(spec: RadianceScene, capture: Capture) -> Run:
 
     @jax.jit
     def picture(state, camera, time) -> Rendering:
-        here = scene.build(spec, moved(facts, state.extra))
+        here = scene.build(spec, moved(metadata, state.extra))
         seen = view._replace(camera=camera, time=time)
         return here.render(state.params, seen, PICTURE, state.step)
 
     state = model.init(capture, jax.random.key(0))
-    state = state._replace(extra=place_of(facts))
+    state = state._replace(extra=place_of(metadata))
     return Run(spec, capture, model._replace(step=step), state, picture)

@@ -23,7 +23,7 @@ def test_a_step_of_every_preset_keeps_its_state(name):
     # Traced, not compiled: shapes, dtypes and promotion of the whole step.
     capture = scenes.tiny_capture()
     spec = PRESETS[name]
-    model = scene.build(spec, scene.facts_of(capture, spec))
+    model = scene.build(spec, scene.metadata_of(capture, spec))
     state = jax.eval_shape(lambda key: model.init(capture, key), jax.random.key(0))
     frames = evaluate.frames_of(capture, model.wants)
     after, metrics = jax.eval_shape(model.step, state, frames)
@@ -70,7 +70,7 @@ def test_presets_differ_only_in_what_their_names_say():
 def test_a_small_preset_learns_more_than_one_colour(name):
     capture = scenes.tiny_capture()
     spec = dataclasses.replace(presets.with_steps(PRESETS[name], 200), rays=128)
-    model = scene.build(spec, scene.facts_of(capture, spec))
+    model = scene.build(spec, scene.metadata_of(capture, spec))
     frames = evaluate.frames_of(capture, model.wants)
     state, step = model.init(capture, jax.random.key(0)), jax.jit(model.step)
     errors = []

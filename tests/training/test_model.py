@@ -24,12 +24,12 @@ def one_step(name):
     """The first parameters, and shapes of the second state, its log and its picture."""
     if name in SPLATS:
         capture, spec, kind = scenes.tiny_capture(), SPLATS[name], gaussians_jax.scene
-        facts = kind.facts_of(capture)
+        metadata = kind.metadata_of(capture)
     else:
         capture, spec = scenes.tiny_capture(), tiny_fields.tiny(name)
         kind = nerfies_jax.scene
-        facts = kind.facts_of(capture, spec)
-    model = kind.build(spec, facts)
+        metadata = kind.metadata_of(capture, spec)
+    model = kind.build(spec, metadata)
     first = model.init(capture, jax.random.key(0))
     frames = evaluate.frames_of(capture, model.wants)
     second, logged = jax.eval_shape(model.step, first, frames)

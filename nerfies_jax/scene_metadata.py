@@ -13,8 +13,8 @@ OUTLIERS = 0.02
 
 
 @dataclasses.dataclass(frozen=True)
-class Facts:
-    """Static, hashable facts; `facts_of` reads them from a capture."""
+class SceneMetadata:
+    """Static, hashable; `metadata_of` reads them from a capture."""
 
     near: float  # z-depth, scene units
     far: float
@@ -29,8 +29,8 @@ class Facts:
     provides: frozenset[str] = frozenset()  # of "depths", "points", "flow"
 
 
-def facts_of(capture: Capture, extent: float | None) -> Facts:
-    """The facts of a capture; host side.
+def metadata_of(capture: Capture, extent: float | None) -> SceneMetadata:
+    """The metadata of a capture; host side.
 
     The filmed volume becomes a box whose longest half-side is `extent` units of the
     field; None keeps the capture's own coordinates.
@@ -49,7 +49,7 @@ def facts_of(capture: Capture, extent: float | None) -> Facts:
         provides.add("depths")
     if capture.flow is not None:
         provides.add("flow")
-    return Facts(
+    return SceneMetadata(
         near=near,
         far=far,
         centre=tuple(float(x) for x in centre),
