@@ -140,7 +140,7 @@ def penalty(params, key, batch, points):
     import jax.numpy as jnp
 
     from nerfies_jax.effects import elastic, warp
-    from nerfies_jax.effects.effect import Context, Level
+    from nerfies_jax.effects.effect import Context, RayOutput
     from nerfies_jax.effects.elastic import ElasticSpec
     from nerfies_jax.effects.warp import WarpSpec
 
@@ -152,8 +152,8 @@ def penalty(params, key, batch, points):
         chosen, _ = jax.vmap(elastic.systematic, (0, 0, None))(even, start, 4)
         point = jnp.take_along_axis(point, chosen[..., None], axis=1)
         weight = jnp.take_along_axis(weight, chosen, axis=1) * (samples / 4)
-    nothing = dict.fromkeys(Level._fields)
-    level = Level(**nothing | {"point": point, "static_weight": weight})
+    nothing = dict.fromkeys(RayOutput._fields)
+    level = RayOutput(**nothing | {"point": point, "static_weight": weight})
     context = Context(
         **dict.fromkeys(Context._fields)
         | {

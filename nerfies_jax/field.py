@@ -12,8 +12,8 @@ from nerfies_jax import tracing
 from nerfies_jax.effects.effect import (
     MOMENT,
     Effect,
-    Level,
     Moment,
+    RayOutput,
     Table,
     stream,
 )
@@ -38,7 +38,7 @@ class Field(NamedTuple):
     codes_at: Callable[[PyTree, View], Codes]  # of a view, by table
     # (params, ray, moment, key) -> its levels, coarse to fine. Without a key nothing is
     # random.
-    trace: Callable[..., tuple[Level, ...]]
+    trace: Callable[..., tuple[RayOutput, ...]]
     # (params, point, moment) -> template point minus observed point, field units
     displace: Callable[[PyTree, Vector, Moment], Vector]
     # (params, camera, time, codes, size, step) -> whole frame
@@ -75,7 +75,7 @@ def field(
         def pixel(position):
             ray, cosine = tracing.pixel_ray(metadata, camera, position)
             level = trace(params, ray, moment)[-1]
-            depth = level.depth * cosine / metadata.scale
+            depth = level.distance * cosine / metadata.scale
             return Rendering(level.colour, level.alpha, depth)
 
         width, height = size

@@ -15,8 +15,8 @@ from nerfies_jax.effects.effect import (
     Batch,
     Box,
     Context,
-    Level,
     Moment,
+    RayOutput,
     Term,
     stream,
 )
@@ -182,7 +182,7 @@ def loss_terms(
     return terms
 
 
-def _colour_terms(levels: tuple[Level, ...], batch: Batch) -> dict[str, Term]:
+def _colour_terms(levels: tuple[RayOutput, ...], batch: Batch) -> dict[str, Term]:
     last = levels[-1]
     mse = losses.mse(last.colour, batch.colour, batch.valid)
     terms = {"fine": Term(mse, 1.0)}

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from nerfies_jax.effects import transient
-from nerfies_jax.effects.effect import Effect, Level, Medium, Moment, Sample
+from nerfies_jax.effects.effect import Effect, Medium, Moment, RayOutput, Sample
 from nerfies_jax.geometry import rays
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.nets import encoding
@@ -100,7 +100,7 @@ def trace(
     ray: Ray,
     moment: Moment,
     key: Key[Array, ""] | None,
-) -> tuple[Level, ...]:
+) -> tuple[RayOutput, ...]:
     """The levels of one ray, coarse to fine; without a key nothing is random.
 
     Warps and lifts are asked once per sample: the fine level takes those of the coarse
@@ -216,8 +216,8 @@ def _composite(spec, metadata, ray, places, radiance, media: dict[str, Medium]):
     for medium, weight in zip(media.values(), weights[1:], strict=True):
         if medium.beta is not None:
             beta = transient.uncertainty(spec.transient.beta_min, weight, medium.beta)
-    return Level(
-        distance=distance,
+    return RayOutput(
+        distances=distance,
         point=places.point,
         warped=places.warped,
         static_weight=weights[0],
@@ -225,7 +225,7 @@ def _composite(spec, metadata, ray, places, radiance, media: dict[str, Medium]):
         media_weight=dict(zip(media, weights[1:], strict=True)),
         colour=whole.colour,
         alpha=whole.alpha,
-        depth=whole.depth,
-        median_depth=whole.median,
+        distance=whole.distance,
+        median_distance=whole.median_distance,
         beta=beta,
     )

@@ -11,7 +11,7 @@ import numpy as np
 
 from nerfies_jax.capture.flow import FrameFlow
 from nerfies_jax.effects import scene_flow
-from nerfies_jax.effects.effect import Batch, Box, Context, Level, Moment, Sample
+from nerfies_jax.effects.effect import Batch, Box, Context, Moment, RayOutput, Sample
 from nerfies_jax.effects.scene_flow import SceneFlowSpec
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.nets.encoding import EncodingSpec
@@ -96,8 +96,8 @@ def context_of(spec, params, frames, batch, distance, features, weight, step):
         point, features, batch.direction, moments
     )
     none = jnp.zeros(RAYS, distance.dtype)
-    level = Level(
-        distance=distance,
+    level = RayOutput(
+        distances=distance,
         point=point,
         warped=point,
         static_weight=jnp.zeros_like(weight),
@@ -105,8 +105,8 @@ def context_of(spec, params, frames, batch, distance, features, weight, step):
         media_weight={"scene_flow": weight},
         colour=batch.colour,
         alpha=none,
-        depth=none,
-        median_depth=none,
+        distance=none,
+        median_distance=none,
         beta=None,
     )
     return Context(

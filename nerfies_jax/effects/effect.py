@@ -62,10 +62,10 @@ class Medium(NamedTuple):
     extras: dict[str, Array] = {}  # noqa: RUF012  what the penalty needs again
 
 
-class Level(NamedTuple):
+class RayOutput(NamedTuple):
     """One ray (or a batch) as one level of sampling renders it."""
 
-    distance: Float[Array, "*rays samples"]
+    distances: Float[Array, "*rays samples"]
     point: Float[Array, "*rays samples 3"]  # where it was observed
     warped: Float[Array, "*rays samples 3"]  # where the template was asked
     static_weight: Float[Array, "*rays samples"]
@@ -73,8 +73,8 @@ class Level(NamedTuple):
     media_weight: dict[str, Float[Array, "*rays samples"]]
     colour: Float[Array, "*rays 3"]
     alpha: Float[Array, "*rays"]
-    depth: Float[Array, "*rays"]  # expected distance, units of the field
-    median_depth: Float[Array, "*rays"]
+    distance: Float[Array, "*rays"]  # expected, units of the field
+    median_distance: Float[Array, "*rays"]
     beta: Float[Array, "*rays"] | None  # standard deviation of the colour, or None
 
     @property
@@ -109,7 +109,7 @@ class Context(NamedTuple):
     moment_of: Callable[[Int[Array, ""]], Moment]  # of one frame learnt from
     moments: Moment  # of the rays; leading axis rays
     batch: Batch
-    levels: tuple[Level, ...]  # coarse to fine; leading axis rays
+    levels: tuple[RayOutput, ...]  # coarse to fine; leading axis rays
     frames: Frames  # all that is learnt from, in scene units
     box: Box
     step: Int[Array, ""]

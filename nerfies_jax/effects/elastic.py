@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
-from nerfies_jax.effects.effect import Context, Effect, Level, Scalar, Term
+from nerfies_jax.effects.effect import Context, Effect, RayOutput, Scalar, Term
 from nerfies_jax.geometry import matrix3
 from nerfies_jax.training import losses, schedules
 
@@ -133,7 +133,7 @@ def energy(spec: ElasticSpec, context: Context) -> tuple[Scalar, Scalar]:
 
 
 def draw(
-    points: int | None, level: Level, key: Key[Array, ""]
+    points: int | None, level: RayOutput, key: Key[Array, ""]
 ) -> tuple[Float[Array, "rays points 3"], Float[Array, "rays points"]]:
     """Points of each ray and weights under which their sum is that over all samples.
 

@@ -19,9 +19,9 @@ from nerfies_jax.effects import scene_flow_losses as flow_losses
 from nerfies_jax.effects.effect import (
     Context,
     Effect,
-    Level,
     Medium,
     Moment,
+    RayOutput,
     Sample,
     Scalar,
     Term,
@@ -225,7 +225,7 @@ def neighbour(
     there = jax.vmap(jax.vmap(ask, (0, None, None)))(
         point, context.batch.direction, time
     )
-    weight = dynamic_weights(level.distance, there.density)
+    weight = dynamic_weights(level.distances, there.density)
     logit = extras["disocclusion"][..., side]
     return Neighbour(
         point=point,
@@ -264,7 +264,7 @@ def penalty(
     """All losses beside that of the blended picture, as logged."""
     batch, level = context.batch, context.levels[-1]
     own = level.media[NAME]
-    weight = dynamic_weights(level.distance, own.density)
+    weight = dynamic_weights(level.distances, own.density)
     sides = [neighbour(spec, gap, params, context, side) for side in (0, 1)]
     mask = jnp.where(batch.valid, picture_mask(spec, level, context.step), 0)
     values = {
@@ -315,7 +315,7 @@ def penalty(
 
 
 def picture_mask(
-    spec: SceneFlowSpec, level: Level, step: Int[Array, ""]
+    spec: SceneFlowSpec, level: RayOutput, step: Int[Array, ""]
 ) -> Float[Array, " rays"]:
     """How much the medium alone must look like the picture, in [0, 1] and fixed.
 
@@ -330,7 +330,7 @@ def depth_term(context: Context, weight: Float[Array, "rays samples"]) -> Scalar
     """How far the medium's own depth is from the capture's, both normalised."""
     batch, level = context.batch, context.levels[-1]
     known = _pixels(context.frames.depths, batch.row, batch.pixel)
-    distance = flow_losses.settle(weight, level.distance[..., None])[..., 0]
+    distance = flow_losses.settle(weight, level.distances[..., None])[..., 0]
     predicted = distance * batch.cosine / context.box.scale
     return flow_losses.normalised_depth(
         predicted, known.astype(predicted.dtype), batch.valid & (known > 0)

@@ -107,8 +107,8 @@ def test_codes_change_the_colour_and_never_the_geometry(dtype):
     )
     for one, other in zip(first, second, strict=True):
         np.testing.assert_array_equal(one.static_weight, other.static_weight)
-        np.testing.assert_array_equal(one.distance, other.distance)
-        assert one.depth == other.depth
+        np.testing.assert_array_equal(one.distances, other.distances)
+        assert one.distance == other.distance
         # both levels read it; a reimplementation of NeRF-W leaves the coarse one out
         assert np.abs(one.colour - other.colour).max() > 1e-2
 

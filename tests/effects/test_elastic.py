@@ -11,7 +11,7 @@ import pytest
 import scipy.spatial.transform
 
 from nerfies_jax.effects import elastic, warp
-from nerfies_jax.effects.effect import Context, Level, Moment
+from nerfies_jax.effects.effect import Context, Moment, RayOutput
 from nerfies_jax.effects.elastic import ElasticSpec
 from nerfies_jax.effects.warp import WarpSpec
 from nerfies_jax.nets.encoding import EncodingSpec
@@ -197,8 +197,8 @@ def test_the_ends_of_the_marks_fall_on_samples_of_weight(start, dtype):
 
 
 def level(point, weight):
-    fields = dict.fromkeys(Level._fields)
-    return Level(
+    fields = dict.fromkeys(RayOutput._fields)
+    return RayOutput(
         **fields | {"point": point, "static_weight": weight, "media_weight": {}}
     )
 

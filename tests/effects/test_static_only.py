@@ -111,8 +111,8 @@ def test_with_it_the_ray_sees_both_through_one_transmittance(dtype):
     params, (ray, moment) = params_of(dtype), ray_and_moment(dtype)
     _, joint = tracer(TINY)(params, ray, moment)
     _, alone = tracer(TINY, ("transient",))(params, ray, moment)
-    np.testing.assert_array_equal(joint.distance, alone.distance)
-    distance = np.asarray(joint.distance, np.float64)
+    np.testing.assert_array_equal(joint.distances, alone.distances)
+    distance = np.asarray(joint.distances, np.float64)
     end = max(float(ray.far) - distance[-1], 0)
     spacing = np.append(np.diff(distance), end)
     if metadata().background is None:
@@ -139,7 +139,7 @@ def test_with_it_the_ray_sees_both_through_one_transmittance(dtype):
     np.testing.assert_allclose(joint.media_weight["transient"], others, atol=tolerance)
     np.testing.assert_allclose(joint.beta, beta, rtol=tolerance)
     assert np.abs(joint.colour - alone.colour).max() > 1e-2
-    assert float(joint.depth) < float(alone.depth)  # it stands in front
+    assert float(joint.distance) < float(alone.distance)  # it stands in front
 
 
 @pytest.mark.slow

@@ -12,9 +12,9 @@ from nerfies_jax.effects.effect import (
     APPEARANCE,
     Batch,
     Context,
-    Level,
     Medium,
     Moment,
+    RayOutput,
     Sample,
     Table,
 )
@@ -266,7 +266,7 @@ def context(dtype, density, valid):
     medium = Medium(
         jnp.asarray(density, dtype), jnp.zeros((*np.shape(density), 3), dtype)
     )
-    nothing = Level(**dict.fromkeys(Level._fields))
+    nothing = RayOutput(**dict.fromkeys(RayOutput._fields))
     batch = Batch(**dict.fromkeys(Batch._fields))
     return Context(**dict.fromkeys(Context._fields))._replace(
         levels=(nothing, nothing._replace(media={"transient": medium})),

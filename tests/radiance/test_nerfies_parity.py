@@ -17,7 +17,7 @@ import pytest
 
 from nerfies_jax.effects import background, elastic, warp
 from nerfies_jax.effects.background import BackgroundSpec
-from nerfies_jax.effects.effect import Context, Level, Moment
+from nerfies_jax.effects.effect import Context, Moment, RayOutput
 from nerfies_jax.effects.elastic import ElasticSpec
 from nerfies_jax.effects.warp import WarpSpec
 from nerfies_jax.geometry import matrix3
@@ -138,7 +138,7 @@ def level(flat, name, distance, given):
         "acc": seen.alpha,
         # upstream does not divide by the opacity, nor leave out the last sample
         "depth": jnp.sum(weight * distance),
-        "med_depth": seen.median,
+        "med_depth": seen.median_distance,
         # ours, of the same densities
         "our_weights": compositing.weights(radiance.density * spacing),
     }
@@ -157,8 +157,8 @@ def both_levels(flat, given):
 
 def penalty_context(flat, rays, coarse):
     none = dict.fromkeys(Context._fields)
-    fields = dict.fromkeys(Level._fields)
-    one = Level(
+    fields = dict.fromkeys(RayOutput._fields)
+    one = RayOutput(
         **fields | {"point": coarse["points"], "static_weight": coarse["weights"]}
     )
     return Context(

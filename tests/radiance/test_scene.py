@@ -139,10 +139,10 @@ def test_a_static_level_is_the_plain_nerf(dtype):
     expected = plain_nerf(params["template"]["coarse"], ray, np.linspace(0.5, 1.5, 8))
     tolerance = {"float32": 3e-6, "float64": 1e-12}[dtype]
     np.testing.assert_allclose(coarse.colour, expected, atol=tolerance)
-    expected = plain_nerf(params["template"]["fine"], ray, np.asarray(fine.distance))
+    expected = plain_nerf(params["template"]["fine"], ray, np.asarray(fine.distances))
     np.testing.assert_allclose(fine.colour, expected, atol=tolerance)
-    assert len(fine.distance) == 16
-    assert np.all(np.diff(fine.distance) >= 0)
+    assert len(fine.distances) == 16
+    assert np.all(np.diff(fine.distances) >= 0)
 
 
 def plain_nerf(net, ray, distances):
