@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from experiments import evaluate
-from nerfies_jax import scene, tracing
+from nerfies_jax import render_ray, scene
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.effects.effect import APPEARANCE, Moment
 from nerfies_jax.training import fit, losses
@@ -55,8 +55,10 @@ def score(
             moment = Moment(view.time, codes | fitted, step)
             seen = jax.vmap(
                 lambda pixel: (
-                    made.trace(
-                        params, tracing.pixel_ray(facts, view.camera, pixel)[0], moment
+                    made.render_ray(
+                        params,
+                        render_ray.field_ray_through(facts, view.camera, pixel)[0],
+                        moment,
                     )[-1].colour
                 )
             )

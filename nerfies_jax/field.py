@@ -8,7 +8,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
 from nerfies_jax import spec as specs
-from nerfies_jax import tracing
 from nerfies_jax.effects.effect import (
     MOMENT,
     Effect,
@@ -20,6 +19,7 @@ from nerfies_jax.effects.effect import (
 from nerfies_jax.geometry import rays
 from nerfies_jax.nets import codes
 from nerfies_jax.radiance import template
+from nerfies_jax.render_ray import displacement, field_ray_through, render_ray
 from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.spec import RadianceScene
 from nerfies_jax.training.model import Rendering, View
@@ -38,7 +38,7 @@ class Field(NamedTuple):
     codes_at: Callable[[PyTree, View], Codes]  # of a view, by table
     # (params, ray, moment, key) -> its levels, coarse to fine. Without a key nothing is
     # random.
-    trace: Callable[..., tuple[RayOutput, ...]]
+    render_ray: Callable[..., tuple[RayOutput, ...]]
     # (params, point, moment) -> template point minus observed point, field units
     displace: Callable[[PyTree, Vector, Moment], Vector]
     # (params, camera, time, codes, size, step) -> whole frame
@@ -64,17 +64,17 @@ def field(
         return look_up(tables, metadata, params, view.time, view.appearance)
 
     def displace(params, point, moment):
-        return tracing.displacement(active, params, point, moment)
+        return displacement(active, params, point, moment)
 
-    def trace(params, ray, moment, key=None):
-        return tracing.trace(spec, metadata, active, params, ray, moment, key)
+    def levels_of(params, ray, moment, key=None):
+        return render_ray(spec, metadata, active, params, ray, moment, key)
 
     def render(params, camera, time, codes, size, step):
         moment = Moment(time, codes, step)
 
         def pixel(position):
-            ray, cosine = tracing.pixel_ray(metadata, camera, position)
-            level = trace(params, ray, moment)[-1]
+            ray, cosine = field_ray_through(metadata, camera, position)
+            level = levels_of(params, ray, moment)[-1]
             depth = level.distance * cosine / metadata.scale
             return Rendering(level.colour, level.alpha, depth)
 
@@ -85,7 +85,7 @@ def field(
         )
         return jax.tree.map(lambda x: x.reshape(height, width, *x.shape[1:]), flat)
 
-    return Field(active, init, codes_at, trace, displace, render)
+    return Field(active, init, codes_at, levels_of, displace, render)
 
 
 def _active(effects, without):

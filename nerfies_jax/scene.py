@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Key
 
-from nerfies_jax import scene_metadata, tracing
+from nerfies_jax import render_ray, scene_metadata
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.effects import transient
 from nerfies_jax.effects.effect import (
@@ -143,7 +143,7 @@ def loss_terms(
     "coarse" and "fine" are mean squared errors of colour; "colour" is NeRF-W's negative
     log-likelihood where a transient medium says how uncertain it is.
     """
-    trace_key, penalty_key = jax.random.split(key)
+    ray_key, penalty_key = jax.random.split(key)
 
     def moment_of(row):
         view = View(
@@ -154,11 +154,11 @@ def loss_terms(
         return Moment(view.time, made.codes_at(params, view), step)
 
     moments = jax.vmap(moment_of)(batch.row)
-    lines = jax.vmap(lambda *ray: tracing.field_ray(metadata, *ray))(
+    lines = jax.vmap(lambda *ray: render_ray.field_ray(metadata, *ray))(
         batch.origin, batch.direction, batch.cosine
     )
-    keys = jax.random.split(trace_key, len(batch.row))
-    levels = jax.vmap(lambda *ray: made.trace(params, *ray))(lines, moments, keys)
+    keys = jax.random.split(ray_key, len(batch.row))
+    levels = jax.vmap(lambda *ray: made.render_ray(params, *ray))(lines, moments, keys)
     terms = _colour_terms(levels, batch)
     centre = jnp.asarray(metadata.centre, batch.origin.dtype)
     context = Context(

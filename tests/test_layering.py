@@ -15,7 +15,7 @@ FLOORS = {
     "nerfies_jax.effects": 7,
     "nerfies_jax.scene_metadata": 8,
     "nerfies_jax.spec": 8,
-    "nerfies_jax.tracing": 8,
+    "nerfies_jax.render_ray": 8,
     "nerfies_jax.field": 8,
     "nerfies_jax.scene": 8,
     "nerfies_jax.presets": 9,

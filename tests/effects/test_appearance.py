@@ -15,10 +15,10 @@ from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.effects.effect import APPEARANCE, Moment, Table
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.radiance.template import TemplateSpec
+from nerfies_jax.render_ray import Ray
 from nerfies_jax.scene import RadianceScene
 from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.spec import SamplingSpec
-from nerfies_jax.tracing import Ray
 from tests import gradients, scenes
 
 TINY = RadianceScene(
@@ -66,7 +66,7 @@ def moment(code):
 
 @functools.cache
 def tracer():
-    return jax.jit(scene.field(TINY, METADATA).trace)
+    return jax.jit(scene.field(TINY, METADATA).render_ray)
 
 
 def params_of(dtype):
@@ -117,10 +117,10 @@ def test_colour_has_the_code_s_slope(float64, rng):
     params = params_of(float64)
     pull = jnp.asarray(rng.normal(size=3))
     plain = dataclasses.replace(TINY, sampling=SamplingSpec(4, 0, jitter=False))
-    trace = scene.field(plain, METADATA).trace
+    render = scene.field(plain, METADATA).render_ray
 
     def shade(code):
-        levels = trace(params, ray(float64), moment(code))
+        levels = render(params, ray(float64), moment(code))
         return sum(jnp.sum(pull * level.colour) for level in levels)
 
     code = jnp.asarray(rng.normal(size=3))

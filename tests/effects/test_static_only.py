@@ -15,9 +15,9 @@ from nerfies_jax.effects.effect import Moment
 from nerfies_jax.effects.transient import TransientSpec
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.radiance.template import TemplateSpec
+from nerfies_jax.render_ray import Ray
 from nerfies_jax.scene import RadianceScene
 from nerfies_jax.spec import SamplingSpec
-from nerfies_jax.tracing import Ray
 from tests import scenes
 
 TINY = RadianceScene(
@@ -41,7 +41,7 @@ def metadata():
 
 @functools.cache
 def tracer(spec, without=()):
-    return jax.jit(scene.field(spec, metadata(), without).trace)
+    return jax.jit(scene.field(spec, metadata(), without).render_ray)
 
 
 def params_of(dtype):

@@ -17,7 +17,7 @@ from nerfies_jax import presets as field_presets
 from nerfies_jax import scene
 from nerfies_jax.effects.effect import Moment
 from nerfies_jax.measure import clock
-from nerfies_jax.tracing import Ray
+from nerfies_jax.render_ray import Ray
 from tests import bare_scenes, scenes
 
 
@@ -89,7 +89,7 @@ def test_the_products_of_a_static_field_are_those_of_its_networks(name):
     moment = Moment(zero, {}, jnp.int32(0))
 
     def colours(params):
-        return [level.colour for level in made.trace(params, ray, moment)]
+        return [level.colour for level in made.render_ray(params, ray, moment)]
 
     found = matrix_flops.count(colours, made.init(jax.random.key(0)))
     plan = spec.sampling

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from experiments import evaluate
-from nerfies_jax import scene, tracing
+from nerfies_jax import render_ray, scene
 from nerfies_jax.effects.ambient import AmbientSpec
 from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.effects.background import BackgroundSpec
@@ -91,7 +91,7 @@ def rendered(spec):
 
 
 def ray_of(dtype):
-    return tracing.Ray(
+    return render_ray.Ray(
         jnp.asarray([0.1, -0.2, 0.3], dtype),
         jnp.asarray([0.6, 0.0, 0.8], dtype),
         jnp.asarray(0.5, dtype),
@@ -134,7 +134,7 @@ def test_a_static_level_is_the_plain_nerf(dtype):
     field = scene.field(STATIC, metadata)
     params = jax.tree.map(lambda x: x.astype(dtype), field.init(jax.random.key(0)))
     ray = ray_of(dtype)
-    coarse, fine = jax.jit(field.trace)(params, ray, moment_of(dtype))
+    coarse, fine = jax.jit(field.render_ray)(params, ray, moment_of(dtype))
     assert fine.colour.dtype == dtype
     expected = plain_nerf(params["template"]["coarse"], ray, np.linspace(0.5, 1.5, 8))
     tolerance = {"float32": 3e-6, "float64": 1e-12}[dtype]
@@ -284,12 +284,12 @@ def test_without_its_warp_a_field_shows_the_canonical_scene():
         for name, head in warp.heads.items()
     }
     params = params | {"warp": warp._replace(heads=grown)}
-    bent = jax.jit(field.trace)(params, ray_of("float32"), moment)[-1]
-    straight = jax.jit(canonical.trace)(params, ray_of("float32"), moment)[-1]
+    bent = jax.jit(field.render_ray)(params, ray_of("float32"), moment)[-1]
+    straight = jax.jit(canonical.render_ray)(params, ray_of("float32"), moment)[-1]
     assert np.abs(bent.warped - bent.point).max() > 1e-3
     np.testing.assert_array_equal(straight.warped, straight.point)
     static = scene.field(STATIC, METADATA)
-    plain = jax.jit(static.trace)(params, ray_of("float32"), moment)[-1]
+    plain = jax.jit(static.render_ray)(params, ray_of("float32"), moment)[-1]
     np.testing.assert_array_equal(straight.colour, plain.colour)
 
 
@@ -363,7 +363,7 @@ def test_shared_and_single_levels(levels):
     field = scene.field(spec, METADATA)
     params = field.init(jax.random.key(0))
     assert set(params["template"]) == {"fine"}
-    found = jax.jit(field.trace)(params, ray_of("float32"), moment_of("float32"))
+    found = jax.jit(field.render_ray)(params, ray_of("float32"), moment_of("float32"))
     assert len(found) == levels
 
 

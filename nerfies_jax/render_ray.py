@@ -46,7 +46,7 @@ def field_ray(
     )
 
 
-def pixel_ray(
+def field_ray_through(
     metadata: SceneMetadata, camera: Camera, pixel: Float[Array, "2"]
 ) -> tuple[Ray, Scalar]:
     """The field's ray through one pixel position, and its z-depth per distance."""
@@ -67,7 +67,7 @@ def displacement(
     return total
 
 
-class _Places(NamedTuple):
+class _Samples(NamedTuple):
     """Samples of one ray before the template is asked."""
 
     distance: Float[Array, " samples"]
@@ -76,7 +76,7 @@ class _Places(NamedTuple):
     lifted: tuple[Float[Array, "samples features"], ...]
 
 
-def _places(effects, params, ray, moment, distance):
+def _samples(effects, params, ray, moment, distance):
     def one(distance):
         point = rays.point_at(ray.origin, ray.direction, distance)
         warped = point
@@ -87,12 +87,12 @@ def _places(effects, params, ray, moment, distance):
             for effect in effects
             if effect.lift is not None
         )
-        return _Places(distance, point, warped, lifted)
+        return _Samples(distance, point, warped, lifted)
 
     return jax.vmap(one)(distance)
 
 
-def trace(
+def render_ray(
     spec: RadianceScene,
     metadata: SceneMetadata,
     effects: tuple[Effect, ...],
@@ -117,25 +117,25 @@ def trace(
         plan.coarse,
         plan.spacing,
     )
-    places = _places(effects, params, ray, moment, distance)
+    samples = _samples(effects, params, ray, moment, distance)
 
-    def level(name, places, last, number):
+    def level(name, samples, last, number):
         noise = None
         if noise_key is not None and spec.density_noise > 0:
             drawn = jax.random.normal(
                 jax.random.fold_in(noise_key, number),
-                places.distance.shape,
-                places.distance.dtype,
+                samples.distance.shape,
+                samples.distance.dtype,
             )
             noise = spec.density_noise * drawn
         return _level(
-            spec, metadata, effects, params, name, ray, moment, places, last, noise
+            spec, metadata, effects, params, name, ray, moment, samples, last, noise
         )
 
     if plan.fine == 0:
-        return (level("fine", places, True, 0),)
+        return (level("fine", samples, True, 0),)
     first = "fine" if plan.shared else "coarse"
-    coarse = level(first, places, False, 0)
+    coarse = level(first, samples, False, 0)
     drawn = sampling.from_weights(
         fine_key if plan.jitter else None,
         (distance[1:] + distance[:-1]) / 2,
@@ -143,16 +143,16 @@ def trace(
         plan.fine,
     )
     if all(effect.displace is None and effect.lift is None for effect in effects):
-        both = _places(effects, params, ray, moment, sampling.union(distance, drawn))
+        both = _samples(effects, params, ray, moment, sampling.union(distance, drawn))
     else:
-        more = _places(effects, params, ray, moment, drawn)
-        both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), places, more)
+        more = _samples(effects, params, ray, moment, drawn)
+        both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), samples, more)
         order = jnp.argsort(both.distance)
         both = jax.tree.map(lambda x: x[order], both)
     return coarse, level("fine", both, True, 1)
 
 
-def _level(spec, metadata, effects, params, name, ray, moment, places, last, noise):
+def _level(spec, metadata, effects, params, name, ray, moment, samples, last, noise):
     """One level of one ray: ask the template, composite with other media."""
     one = template_of(spec, name)
     condition = []
@@ -172,7 +172,7 @@ def _level(spec, metadata, effects, params, name, ray, moment, places, last, noi
         return template.apply(one, net, features, condition, noise)
 
     radiance = jax.vmap(ask, (0, 0, None if noise is None else 0))(
-        places.warped, places.lifted, noise
+        samples.warped, samples.lifted, noise
     )
     media = {}
     for effect in effects:
@@ -183,12 +183,12 @@ def _level(spec, metadata, effects, params, name, ray, moment, places, last, noi
             sample = Sample(point, ray.direction, features)
             return effect.medium(params.get(effect.name), sample, moment)
 
-        media[effect.name] = jax.vmap(at)(places.point, radiance.features)
-    return _composite(spec, metadata, ray, places, radiance, media)
+        media[effect.name] = jax.vmap(at)(samples.point, radiance.features)
+    return _composite(spec, metadata, ray, samples, radiance, media)
 
 
-def _composite(spec, metadata, ray, places, radiance, media: dict[str, Medium]):
-    distance = places.distance
+def _composite(spec, metadata, ray, samples, radiance, media: dict[str, Medium]):
+    distance = samples.distance
     behind = metadata.background
     end = compositing.AT_INFINITY
     if behind is not None:
@@ -218,8 +218,8 @@ def _composite(spec, metadata, ray, places, radiance, media: dict[str, Medium]):
             beta = transient.uncertainty(spec.transient.beta_min, weight, medium.beta)
     return RayOutput(
         distances=distance,
-        point=places.point,
-        warped=places.warped,
+        point=samples.point,
+        warped=samples.warped,
         static_weight=weights[0],
         media=media,
         media_weight=dict(zip(media, weights[1:], strict=True)),
