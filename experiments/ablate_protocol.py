@@ -95,7 +95,7 @@ def known(capture: Capture, truth: SceneTruth, frames: int, tracks: int) -> Know
     world = (truth.track_world[chosen] - np.float32(capture.centre)) * capture.scale
     return Known(
         rows=evaluate.spread(capture.heldout, frames),
-        moments=moments,
+        conditions=conditions,
         path=world[:, instants].astype(np.float32),
         seen=truth.track_seen[chosen][:, moments],
         start=start,
@@ -115,7 +115,7 @@ def filmed(capture: Capture, frames: int) -> Known:
     moments = capture.train[np.argsort(capture.times[capture.train], kind="stable")]
     return Known(
         rows=evaluate.spread(capture.heldout, frames),
-        moments=moments,
+        conditions=conditions,
         path=np.zeros((0, len(moments), 3), np.float32),
         seen=np.zeros((0, len(moments)), bool),
         start=len(moments) // 2,
@@ -219,7 +219,7 @@ def follow_fields(spec, facts, state, capture, known) -> Followed | None:
     warp of every other moment.
     """
     from nerfies_jax import scene
-    from nerfies_jax.effects.effect import Moment
+    from nerfies_jax.effects.effect import FrameCondition
     from nerfies_jax.training import tracks
 
     made = scene.field(spec, facts)
@@ -238,17 +238,17 @@ def follow_fields(spec, facts, state, capture, known) -> Followed | None:
 
     @jax.jit
     def solve(params, step, start, true, still):
-        def moment_of(view):
-            return Moment(view.time, made.codes_at(params, view), step)
+        def condition_of(view):
+            return FrameCondition(view.time, made.codes_at(params, view), step)
 
-        moments = jax.vmap(moment_of)(views)
+        conditions = jax.vmap(condition_of)(views)
         followed = tracks.point_tracks(
-            made.displace, params, start, moments, known.start
+            made.displace, params, start, conditions, known.start
         )
         each = jax.vmap(made.displace, (None, 0, None))  # point
-        moved = jax.vmap(each, (None, None, 0))(params, still, moments)
+        moved = jax.vmap(each, (None, None, 0))(params, still, conditions)
         slope = jax.vmap(jax.jacfwd(made.displace, 1), (None, 0, None))
-        slopes = jax.vmap(slope, (None, 1, 0))(params, true, moments)
+        slopes = jax.vmap(slope, (None, 1, 0))(params, true, conditions)
         apart = jnp.linalg.norm(moved - jnp.mean(moved, axis=0), axis=-1)
         return followed, apart, slopes
 

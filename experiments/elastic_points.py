@@ -111,7 +111,7 @@ def warp_and_rays(rays: int, samples: int):
     import jax.numpy as jnp
 
     from nerfies_jax.effects import warp
-    from nerfies_jax.effects.effect import Moment
+    from nerfies_jax.effects.effect import FrameCondition
     from nerfies_jax.effects.warp import WarpSpec
     from nerfies_jax.radiance import compositing
 
@@ -130,8 +130,10 @@ def warp_and_rays(rays: int, samples: int):
     spacing = compositing.intervals(distance, 2.0 / samples)
     weight = jax.vmap(compositing.weights)(density * spacing)
     codes = 0.05 * jax.random.normal(keys[4], (rays, 8))
-    moments = Moment(jnp.zeros(rays), {"motion": codes}, jnp.zeros(rays, jnp.int32))
-    return params, (point, weight, moments)
+    conditions = FrameCondition(
+        jnp.zeros(rays), {"motion": codes}, jnp.zeros(rays, jnp.int32)
+    )
+    return params, (point, weight, conditions)
 
 
 def penalty(params, key, batch, points):
@@ -144,7 +146,7 @@ def penalty(params, key, batch, points):
     from nerfies_jax.effects.elastic import ElasticSpec
     from nerfies_jax.effects.warp import WarpSpec
 
-    point, weight, moments = batch
+    point, weight, conditions = batch
     if points is None:
         samples = weight.shape[1]
         even = jnp.ones_like(weight)
@@ -157,8 +159,10 @@ def penalty(params, key, batch, points):
     context = Context(
         **dict.fromkeys(Context._fields)
         | {
-            "displace": lambda x, moment: warp.displace(WarpSpec(), params, x, moment),
-            "moments": moments,
+            "displace": lambda x, condition: warp.displace(
+                WarpSpec(), params, x, condition
+            ),
+            "conditions": conditions,
             "levels": (level,),
             "key": key,
         }

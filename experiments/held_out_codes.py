@@ -12,7 +12,7 @@ import numpy as np
 from experiments import evaluate
 from nerfies_jax import render_ray, scene
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.effects.effect import APPEARANCE, Moment
+from nerfies_jax.effects.effect import APPEARANCE, FrameCondition
 from nerfies_jax.training import fit, losses
 from nerfies_jax.training.model import (
     Rendering,
@@ -52,13 +52,13 @@ def score(
         codes = made.codes_at(params, view)
 
         def loss(fitted):
-            moment = Moment(view.time, codes | fitted, step)
+            condition = FrameCondition(view.time, codes | fitted, step)
             seen = jax.vmap(
                 lambda pixel: (
                     made.render_ray(
                         params,
                         render_ray.field_ray_through(facts, view.camera, pixel)[0],
-                        moment,
+                        condition,
                     )[-1].colour
                 )
             )

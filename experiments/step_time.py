@@ -20,13 +20,13 @@ def of_splats(
     the optimiser and the statistics for the density control.
     """
     from gaussians_jax import render, scene, splats
-    from gaussians_jax.effects.effect import Moment
+    from gaussians_jax.effects.effect import FrameCondition
 
     params = state.params
     size = frames.images.shape[2], frames.images.shape[1]
     camera = jax.tree.map(lambda leaf: leaf[0], frames.cameras)
     shot = scene.shot(frames, 0, None)
-    moment = Moment(frames.times[0], state.step, state.key)
+    condition = FrameCondition(frames.times[0], state.step, state.key)
     effects = scene.effects_of(spec, facts)
 
     def draw(gaussians, coefficients):
@@ -54,7 +54,7 @@ def of_splats(
                 effects,
                 params,
                 shot._replace(rendering=rendering),
-                moment,
+                condition,
                 carried,
             )
 
@@ -68,7 +68,7 @@ def of_splats(
     return timed
 
 
-def _sum_of_effect(effect, effects, params, shot, moment, carried):
+def _sum_of_effect(effect, effects, params, shot, condition, carried):
     """A scalar whose gradient takes the work of one effect in a step."""
     from gaussians_jax import splats
     from gaussians_jax.effects import deformation
@@ -77,13 +77,13 @@ def _sum_of_effect(effect, effects, params, shot, moment, carried):
     total = jnp.zeros(())
     if effect.deform is not None:
         gaussians = splats.activate(params.rows["splats"])
-        moved = deformation.pose_in_training((effect,), params, gaussians, moment)
+        moved = deformation.pose_in_training((effect,), params, gaussians, condition)
         total += sum(jnp.sum(leaf) for leaf in moved)
     if effect.image_loss is not None:
-        total += effect.image_loss(params, shot, moment).value
+        total += effect.image_loss(params, shot, condition).value
     if effect.penalty is not None:
-        at_time = deformation.poser(effects, moment)
-        total += effect.penalty(Around(params, at_time, moment, carried)).value
+        at_time = deformation.poser(effects, condition)
+        total += effect.penalty(Around(params, at_time, condition, carried)).value
     return total
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int, Key
 
 from gaussians_jax import density, phases, rates, render, splats, start
 from gaussians_jax.effects import deformation
-from gaussians_jax.effects.effect import Around, Effect, Moment, Shot
+from gaussians_jax.effects.effect import Around, Effect, FrameCondition, Shot
 from gaussians_jax.phases import Trained
 from gaussians_jax.spec import (
     OPTIMISERS,
@@ -128,11 +128,11 @@ def _stepper(spec, metadata, effects, optimiser):
         view = _view(frames, row)
         size = frames.images.shape[2], frames.images.shape[1]
         degree = splats.active_degree(state.step, spec.sh_every, spec.sh_degree)
-        moment = Moment(view.time, state.step, loop.step_key(state))
+        condition = FrameCondition(view.time, state.step, loop.step_key(state))
         turn = phases.turn(spec.alternation, state.step)
 
         def posed(params, gaussians):
-            return deformation.pose_in_training(effects, params, gaussians, moment)
+            return deformation.pose_in_training(effects, params, gaussians, condition)
 
         if spec.alternation is not None:
             posed = phases.spared(turn, posed)
@@ -148,7 +148,7 @@ def _stepper(spec, metadata, effects, optimiser):
             )
             seen = shot(frames, row, frame.rendering)
             carried = state.extra.carried
-            value, metrics = loss_of(spec, effects, params, seen, moment, carried)
+            value, metrics = loss_of(spec, effects, params, seen, condition, carried)
             return value, (metrics, frame.footprints, canonical, moved)
 
         probe = jnp.zeros_like(state.params.rows["splats"].mean[:, :2])
@@ -169,7 +169,7 @@ def _stepper(spec, metadata, effects, optimiser):
             )
         for effect in effects:
             if effect.observe is not None:
-                own = effect.observe(carried[effect.name], *poses, moment)
+                own = effect.observe(carried[effect.name], *poses, condition)
                 carried = carried | {effect.name: own}
         state = TrainState(*trained, Extra(stats, carried), state.step + 1, state.key)
         return state, {"loss": value, **metrics}
@@ -182,7 +182,7 @@ def loss_of(
     effects: tuple[Effect, ...],
     params: Params,
     seen: Shot,
-    moment: Moment,
+    condition: FrameCondition,
     carried: dict[str, PyTree],
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
     """The loss of one frame with what every effect adds, and numbers to log."""
@@ -192,14 +192,14 @@ def loss_of(
     )
     metrics = {"mse": losses.mse(colour, seen.truth, seen.valid)}
 
-    at_time = deformation.poser(effects, moment)
+    at_time = deformation.poser(effects, condition)
     for effect in effects:
         terms = []
         if effect.image_loss is not None:
-            terms.append(effect.image_loss(params, seen, moment))
+            terms.append(effect.image_loss(params, seen, condition))
         if effect.penalty is not None:
             own = carried.get(effect.name)
-            terms.append(effect.penalty(Around(params, at_time, moment, own)))
+            terms.append(effect.penalty(Around(params, at_time, condition, own)))
         for term in terms:
             value = value + term.value
             named = {f"{effect.name}.{key}": x for key, x in term.metrics.items()}

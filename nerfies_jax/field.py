@@ -11,7 +11,7 @@ from nerfies_jax import spec as specs
 from nerfies_jax.effects.effect import (
     MOMENT,
     Effect,
-    Moment,
+    FrameCondition,
     RayOutput,
     Table,
     stream,
@@ -36,11 +36,11 @@ class Field(NamedTuple):
     effects: tuple[Effect, ...]
     init: Callable[[Key[Array, ""]], PyTree]
     codes_at: Callable[[PyTree, View], Codes]  # of a view, by table
-    # (params, ray, moment, key) -> its levels, coarse to fine. Without a key nothing is
-    # random.
+    # (params, ray, condition, key) -> its levels, coarse to fine. Without a key nothing
+    # is random.
     render_ray: Callable[..., tuple[RayOutput, ...]]
-    # (params, point, moment) -> template point minus observed point, field units
-    displace: Callable[[PyTree, Vector, Moment], Vector]
+    # (params, point, condition) -> template point minus observed point, field units
+    displace: Callable[[PyTree, Vector, FrameCondition], Vector]
     # (params, camera, time, codes, size, step) -> whole frame
     render: Callable[..., Rendering]
 
@@ -63,18 +63,18 @@ def field(
     def codes_at(params, view):
         return look_up(tables, metadata, params, view.time, view.appearance)
 
-    def displace(params, point, moment):
-        return displacement(active, params, point, moment)
+    def displace(params, point, condition):
+        return displacement(active, params, point, condition)
 
-    def levels_of(params, ray, moment, key=None):
-        return render_ray(spec, metadata, active, params, ray, moment, key)
+    def levels_of(params, ray, condition, key=None):
+        return render_ray(spec, metadata, active, params, ray, condition, key)
 
     def render(params, camera, time, codes, size, step):
-        moment = Moment(time, codes, step)
+        condition = FrameCondition(time, codes, step)
 
         def pixel(position):
             ray, cosine = field_ray_through(metadata, camera, position)
-            level = levels_of(params, ray, moment)[-1]
+            level = levels_of(params, ray, condition)[-1]
             depth = level.distance * cosine / metadata.scale
             return Rendering(level.colour, level.alpha, depth)
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from nerfies_jax.effects import transient
-from nerfies_jax.effects.effect import Effect, Medium, Moment, RayOutput, Sample
+from nerfies_jax.effects.effect import Effect, FrameCondition, Medium, RayOutput, Sample
 from nerfies_jax.geometry import rays
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.nets import encoding
@@ -56,14 +56,17 @@ def field_ray_through(
 
 
 def displacement(
-    effects: tuple[Effect, ...], params: PyTree, point: Vector, moment: Moment
+    effects: tuple[Effect, ...],
+    params: PyTree,
+    point: Vector,
+    condition: FrameCondition,
 ) -> Vector:
     """Template point minus observed point: what all warps do, one after the other."""
     total = jnp.zeros_like(point)
     for effect in effects:
         if effect.displace is not None:
             own = params.get(effect.name)
-            total = total + effect.displace(own, point + total, moment)
+            total = total + effect.displace(own, point + total, condition)
     return total
 
 
@@ -76,14 +79,14 @@ class _Samples(NamedTuple):
     lifted: tuple[Float[Array, "samples features"], ...]
 
 
-def _samples(effects, params, ray, moment, distance):
+def _samples(effects, params, ray, condition, distance):
     def one(distance):
         point = rays.point_at(ray.origin, ray.direction, distance)
         warped = point
         if any(effect.displace is not None for effect in effects):
-            warped = point + displacement(effects, params, point, moment)
+            warped = point + displacement(effects, params, point, condition)
         lifted = tuple(
-            effect.lift(params.get(effect.name), point, moment)
+            effect.lift(params.get(effect.name), point, condition)
             for effect in effects
             if effect.lift is not None
         )
@@ -98,7 +101,7 @@ def render_ray(
     effects: tuple[Effect, ...],
     params: PyTree,
     ray: Ray,
-    moment: Moment,
+    condition: FrameCondition,
     key: Key[Array, ""] | None,
 ) -> tuple[RayOutput, ...]:
     """The levels of one ray, coarse to fine; without a key nothing is random.
@@ -117,7 +120,7 @@ def render_ray(
         plan.coarse,
         plan.spacing,
     )
-    samples = _samples(effects, params, ray, moment, distance)
+    samples = _samples(effects, params, ray, condition, distance)
 
     def level(name, samples, last, number):
         noise = None
@@ -129,7 +132,7 @@ def render_ray(
             )
             noise = spec.density_noise * drawn
         return _level(
-            spec, metadata, effects, params, name, ray, moment, samples, last, noise
+            spec, metadata, effects, params, name, ray, condition, samples, last, noise
         )
 
     if plan.fine == 0:
@@ -143,33 +146,35 @@ def render_ray(
         plan.fine,
     )
     if all(effect.displace is None and effect.lift is None for effect in effects):
-        both = _samples(effects, params, ray, moment, sampling.union(distance, drawn))
+        both = _samples(
+            effects, params, ray, condition, sampling.union(distance, drawn)
+        )
     else:
-        more = _samples(effects, params, ray, moment, drawn)
+        more = _samples(effects, params, ray, condition, drawn)
         both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), samples, more)
         order = jnp.argsort(both.distance)
         both = jax.tree.map(lambda x: x[order], both)
     return coarse, level("fine", both, True, 1)
 
 
-def _level(spec, metadata, effects, params, name, ray, moment, samples, last, noise):
+def _level(spec, metadata, effects, params, name, ray, condition, samples, last, noise):
     """One level of one ray: ask the template, composite with other media."""
     one = template_of(spec, name)
-    condition = []
+    colour_inputs = []
     if one.direction is not None:
-        condition.append(encoding.encode(one.direction, ray.direction, None))
-    condition += [
-        effect.condition(params.get(effect.name), moment)
+        colour_inputs.append(encoding.encode(one.direction, ray.direction, None))
+    colour_inputs += [
+        effect.condition(params.get(effect.name), condition)
         for effect in effects
         if effect.condition is not None
     ]
-    condition = jnp.concatenate([*condition, jnp.zeros(0, ray.direction.dtype)])
+    colour_inputs = jnp.concatenate([*colour_inputs, jnp.zeros(0, ray.direction.dtype)])
     net = params["template"][name]
 
     def ask(warped, lifted, noise):
         encoded = encoding.encode(one.position, warped, None)
         features = jnp.concatenate([encoded, *lifted])
-        return template.apply(one, net, features, condition, noise)
+        return template.apply(one, net, features, colour_inputs, noise)
 
     radiance = jax.vmap(ask, (0, 0, None if noise is None else 0))(
         samples.warped, samples.lifted, noise
@@ -181,7 +186,7 @@ def _level(spec, metadata, effects, params, name, ray, moment, samples, last, no
 
         def at(point, features, effect=effect):
             sample = Sample(point, ray.direction, features)
-            return effect.medium(params.get(effect.name), sample, moment)
+            return effect.medium(params.get(effect.name), sample, condition)
 
         media[effect.name] = jax.vmap(at)(samples.point, radiance.features)
     return _composite(spec, metadata, ray, samples, radiance, media)

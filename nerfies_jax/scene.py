@@ -15,7 +15,7 @@ from nerfies_jax.effects.effect import (
     Batch,
     Box,
     Context,
-    Moment,
+    FrameCondition,
     RayOutput,
     Term,
     stream,
@@ -145,26 +145,28 @@ def loss_terms(
     """
     ray_key, penalty_key = jax.random.split(key)
 
-    def moment_of(row):
+    def condition_of(row):
         view = View(
             jax.tree.map(lambda leaf: leaf[row], frames.cameras),
             frames.times[row],
             frames.appearance[row],
         )
-        return Moment(view.time, made.codes_at(params, view), step)
+        return FrameCondition(view.time, made.codes_at(params, view), step)
 
-    moments = jax.vmap(moment_of)(batch.row)
+    conditions = jax.vmap(condition_of)(batch.row)
     lines = jax.vmap(lambda *ray: render_ray.field_ray(metadata, *ray))(
         batch.origin, batch.direction, batch.cosine
     )
     keys = jax.random.split(ray_key, len(batch.row))
-    levels = jax.vmap(lambda *ray: made.render_ray(params, *ray))(lines, moments, keys)
+    levels = jax.vmap(lambda *ray: made.render_ray(params, *ray))(
+        lines, conditions, keys
+    )
     terms = _colour_terms(levels, batch)
     centre = jnp.asarray(metadata.centre, batch.origin.dtype)
     context = Context(
-        displace=lambda point, moment: made.displace(params, point, moment),
-        moment_of=moment_of,
-        moments=moments,
+        displace=lambda point, condition: made.displace(params, point, condition),
+        condition_of=condition_of,
+        conditions=conditions,
         batch=batch,
         levels=levels,
         frames=frames,

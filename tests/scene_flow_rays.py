@@ -11,7 +11,14 @@ import numpy as np
 
 from nerfies_jax.capture.flow import FrameFlow
 from nerfies_jax.effects import scene_flow
-from nerfies_jax.effects.effect import Batch, Box, Context, Moment, RayOutput, Sample
+from nerfies_jax.effects.effect import (
+    Batch,
+    Box,
+    Context,
+    FrameCondition,
+    RayOutput,
+    Sample,
+)
 from nerfies_jax.effects.scene_flow import SceneFlowSpec
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.nets.encoding import EncodingSpec
@@ -85,15 +92,15 @@ def context_of(spec, params, frames, batch, distance, features, weight, step):
     centre = jnp.asarray(BOX_CENTRE, distance.dtype)
     origin = (batch.origin - centre) * BOX_SCALE
     point = origin[:, None] + distance[..., None] * batch.direction[:, None]
-    moments = Moment(frames.times[batch.row], {}, jnp.full(RAYS, step))
+    conditions = FrameCondition(frames.times[batch.row], {}, jnp.full(RAYS, step))
 
-    def at(point, features, direction, moment):
+    def at(point, features, direction, condition):
         return scene_flow.medium(
             spec, params, Sample(point, direction, features), moment
         )
 
     media = jax.vmap(jax.vmap(at, (0, 0, None, None)))(
-        point, features, batch.direction, moments
+        point, features, batch.direction, conditions
     )
     none = jnp.zeros(RAYS, distance.dtype)
     level = RayOutput(
@@ -111,8 +118,8 @@ def context_of(spec, params, frames, batch, distance, features, weight, step):
     )
     return Context(
         displace=None,
-        moment_of=None,
-        moments=moments,
+        condition_of=None,
+        conditions=conditions,
         batch=batch,
         levels=(level,),
         frames=frames,

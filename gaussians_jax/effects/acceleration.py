@@ -120,15 +120,15 @@ def effect(spec: AccelerationSpec, extent: float, frames: int) -> Effect:
     decay = spec.decay * extent
 
     def penalty(around: Around) -> Term:
-        params, moment = around.params, around.moment
+        params, condition = around.params, around.condition
         alive = splats.alive(params.rows["splats"])
-        key = jax.random.fold_in(moment.key, _STREAM)
+        key = jax.random.fold_in(condition.key, _STREAM)
         rows = draw_living(key, alive, min(spec.samples, alive.shape[0]))
 
         def evaluate(params):
             some = splats.take_rows(params, rows)
             canonical = some.rows["splats"].mean
-            times = instants(moment.time, interval)
+            times = instants(condition.time, interval)
             before, now, after = (around.at_time(some, t).mean for t in times)
             value = unrest(canonical, before, now, after, decay, spec.drift)
             still = jnp.mean(_stillness(canonical, now, decay))
@@ -143,7 +143,7 @@ def effect(spec: AccelerationSpec, extent: float, frames: int) -> Effect:
             value, still = evaluate(params)
         else:
             value, still = jax.lax.cond(
-                moment.step < spec.start, nothing, evaluate, params
+                condition.step < spec.start, nothing, evaluate, params
             )
         return Term(spec.weight * value, {"unrest": value, "still": still})
 

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from gaussians_jax.effects.effect import Effect, Moment, Shot, Term
+from gaussians_jax.effects.effect import Effect, FrameCondition, Shot, Term
 from gaussians_jax.splats import Params
 from nerfies_jax.geometry.precision import widened
 from nerfies_jax.training import losses
@@ -191,7 +191,7 @@ def loss(spec: DepthSpec, shot: Shot) -> Term:
 def effect(spec: DepthSpec) -> Effect:
     """The seams of the depth loss; it reads the capture's depths."""
 
-    def image_loss(params: Params, shot: Shot, moment: Moment) -> Term:
+    def image_loss(params: Params, shot: Shot, condition: FrameCondition) -> Term:
         del params, moment
         return loss(spec, shot)
 

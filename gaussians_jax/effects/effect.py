@@ -17,7 +17,7 @@ from nerfies_jax.training.model import Rendering
 PyTree = Any
 
 
-class Moment(NamedTuple):
+class FrameCondition(NamedTuple):
     """When a scene is drawn, and at which step of which run if it is being trained."""
 
     time: Float[Array, ""]  # in [0, 1] over the capture
@@ -40,7 +40,7 @@ class Around(NamedTuple):
     params: Params
     # Gaussians of any choice of rows (`splats.take_rows`) at any time.
     at_time: Callable[[Params, Float[Array, ""]], Gaussians]
-    moment: Moment
+    condition: FrameCondition
     carried: PyTree  # of this effect; None where it carries nothing
 
 
@@ -66,14 +66,18 @@ class Effect(NamedTuple):
     # What stays as it is while the parameters do, whatever the time.
     prepare: Callable[[Params], PyTree] | None = None
     # The last argument is what `prepare` returned, None without it.
-    deform: Callable[[Params, Gaussians, Moment, PyTree], Gaussians] | None = None
-    image_loss: Callable[[Params, Shot, Moment], Term] | None = None
+    deform: Callable[[Params, Gaussians, FrameCondition, PyTree], Gaussians] | None = (
+        None
+    )
+    image_loss: Callable[[Params, Shot, FrameCondition], Term] | None = None
     penalty: Callable[[Around], Term] | None = None
     # Host side, at the start and after every change of the rows: what the steps up to
     # the next change carry. Arrays only.
     carry: Callable[[Params], PyTree] | None = None
-    # (carried, canonical, moved, moment) -> carried; pure, in every step
-    observe: Callable[[PyTree, Gaussians, Gaussians, Moment], PyTree] | None = None
+    # (carried, canonical, moved, condition) -> carried; pure, in every step
+    observe: Callable[[PyTree, Gaussians, Gaussians, FrameCondition], PyTree] | None = (
+        None
+    )
     # (carried, step) -> [rows] factor of the gradient that the density control
     # compares with its threshold; host side
     grow_score: Callable[[PyTree, int], np.ndarray] | None = None

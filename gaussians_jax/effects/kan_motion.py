@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Key
 
 from gaussians_jax import splats
 from gaussians_jax.effects.blocks import in_blocks
-from gaussians_jax.effects.effect import Effect, Moment
+from gaussians_jax.effects.effect import Effect, FrameCondition
 from gaussians_jax.splats import Gaussians, Params
 from nerfies_jax.geometry import quaternion
 from nerfies_jax.nets import codes, kan, mlp
@@ -340,11 +340,11 @@ def effect(spec: KanMotionSpec, steps: int, frames: int) -> Effect:
     def moved(
         params: Params,
         gaussians: Gaussians,
-        moment: Moment,
+        condition: FrameCondition,
         ready: Float[Array, "gaussians features"],
     ) -> Gaussians:
         living = splats.alive(params.rows["splats"])
-        offsets = deform(params.nets[NAME], spec, moment.time, ready, living)
+        offsets = deform(params.nets[NAME], spec, condition.time, ready, living)
         return apply(gaussians, offsets)
 
     return Effect(

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from gaussians_jax import splats
 from gaussians_jax.effects.blocks import in_blocks
-from gaussians_jax.effects.effect import Effect, Moment
+from gaussians_jax.effects.effect import Effect, FrameCondition
 from gaussians_jax.splats import Gaussians, Params
 from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
@@ -239,11 +239,13 @@ def effect(spec: MotionSpec, steps: int, frames: int) -> Effect:
     def init_nets(key):
         return init(key, spec)
 
-    def moved(params: Params, gaussians: Gaussians, moment: Moment, _) -> Gaussians:
-        time = moment.time
-        if spec.smoothing is not None and moment.step is not None:
-            key = jax.random.fold_in(moment.key, _STREAM)
-            time = smooth_time(key, spec.smoothing, time, moment.step, frames)
+    def moved(
+        params: Params, gaussians: Gaussians, condition: FrameCondition, _
+    ) -> Gaussians:
+        time = condition.time
+        if spec.smoothing is not None and condition.step is not None:
+            key = jax.random.fold_in(condition.key, _STREAM)
+            time = smooth_time(key, spec.smoothing, time, condition.step, frames)
         living = splats.alive(params.rows["splats"])
         motion = params.nets[NAME]
         offsets = deform(motion, spec, gaussians.mean, time, living)

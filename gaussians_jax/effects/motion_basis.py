@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Key
 from gaussians_jax import splats
 from gaussians_jax.effects import mlp_motion
 from gaussians_jax.effects.blocks import in_blocks
-from gaussians_jax.effects.effect import Effect, Moment
+from gaussians_jax.effects.effect import Effect, FrameCondition
 from gaussians_jax.effects.mlp_motion import SmoothingSpec
 from gaussians_jax.splats import Gaussians, Params
 from nerfies_jax.geometry import quaternion
@@ -374,13 +374,13 @@ def effect(spec: BasisMotionSpec, steps: int, frames: int) -> Effect:
         return prepare(params.nets[NAME], spec, rows.mean, splats.alive(rows))
 
     def moved(
-        params: Params, gaussians: Gaussians, moment: Moment, ready: Prepared
+        params: Params, gaussians: Gaussians, condition: FrameCondition, ready: Prepared
     ) -> Gaussians:
-        time = moment.time
-        if spec.smoothing is not None and moment.step is not None:
-            key = jax.random.fold_in(moment.key, _STREAM)
+        time = condition.time
+        if spec.smoothing is not None and condition.step is not None:
+            key = jax.random.fold_in(condition.key, _STREAM)
             time = mlp_motion.smooth_time(
-                key, spec.smoothing, time, moment.step, frames
+                key, spec.smoothing, time, condition.step, frames
             )
         rows = params.rows["splats"]
         offsets = deform(

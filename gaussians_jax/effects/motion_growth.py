@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from gaussians_jax.effects.effect import Effect, Moment
+from gaussians_jax.effects.effect import Effect, FrameCondition
 from gaussians_jax.splats import Gaussians, Params
 
 NAME = "motion_growth"
@@ -74,7 +74,7 @@ def carry(params: Params) -> Travel:
 
 
 def observe(
-    carried: Travel, canonical: Gaussians, moved: Gaussians, moment: Moment
+    carried: Travel, canonical: Gaussians, moved: Gaussians, condition: FrameCondition
 ) -> Travel:
     """One more instant.
 
@@ -83,7 +83,7 @@ def observe(
     motion of a Gaussian. Where most of a scene moves as one, it is therefore the rest
     that counts as moving. Displacements that are not finite are passed over.
     """
-    del moment
+    del condition
     displacement = moved.mean - canonical.mean
     known = jnp.all(jnp.isfinite(displacement), axis=1)
     # The logistic function of a dead row's mark is exactly zero.

@@ -186,4 +186,4 @@ def _from_step(start, around, evaluate, embedding):
     def nothing(embedding):
         return jnp.zeros((), embedding.dtype)
 
-    return jax.lax.cond(around.moment.step < start, nothing, evaluate, embedding)
+    return jax.lax.cond(around.condition.step < start, nothing, evaluate, embedding)

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from gaussians_jax.effects.effect import Effect, Moment, Shot, Term
+from gaussians_jax.effects.effect import Effect, FrameCondition, Shot, Term
 from gaussians_jax.splats import Params
 from nerfies_jax.geometry.precision import widened
 from nerfies_jax.training import schedules
@@ -349,9 +349,9 @@ def effect(spec: SpectralSpec, steps: int) -> Effect:
         )
     learned = spec.gate in LEARNED
 
-    def image_loss(params: Params, shot: Shot, moment: Moment) -> Term:
+    def image_loss(params: Params, shot: Shot, condition: FrameCondition) -> Term:
         gates = params.nets[NAME] if learned else None
-        weight = weights(spec, gates, moment.step, steps)
+        weight = weights(spec, gates, condition.step, steps)
         return loss(spec, weight, shot.rendering.colour, shot.truth, shot.valid)
 
     return Effect(

@@ -34,6 +34,6 @@ def effect(spec: AppearanceSpec) -> Effect:
     return Effect(
         "appearance",
         tables=(Table(spec.table, APPEARANCE, spec.width),),
-        condition=lambda _, moment: moment.codes[spec.table],
+        condition=lambda _, condition: condition.codes[spec.table],
         condition_width=spec.width,
     )

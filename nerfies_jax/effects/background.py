@@ -77,8 +77,8 @@ def mean_drift(
     rows: Int[Array, " points"],
 ) -> Scalar:
     """The same at given points, in units of the field, each in a given frame."""
-    moments = jax.vmap(context.moment_of)(rows)
-    moved = jax.vmap(context.displace)(point, moments)
+    conditions = jax.vmap(context.condition_of)(rows)
+    moved = jax.vmap(context.displace)(point, conditions)
     # ρ takes the square: the length has no slope where nothing moves
     costs = losses.geman_mcclure(jnp.sum(moved**2, axis=-1), spec.width, spec.scaling)
     return jnp.mean(costs)

@@ -34,7 +34,7 @@ class Table(NamedTuple):
     width: int
 
 
-class Moment(NamedTuple):
+class FrameCondition(NamedTuple):
     """When a ray was filmed, and what is known of that frame."""
 
     time: Scalar  # in [0, 1] over the capture
@@ -105,9 +105,9 @@ class Box(NamedTuple):
 class Context(NamedTuple):
     """What a penalty may look at: one step's rays as rendered, and the field itself."""
 
-    displace: Callable[[Vector, Moment], Vector]  # of all warps together
-    moment_of: Callable[[Int[Array, ""]], Moment]  # of one frame learnt from
-    moments: Moment  # of the rays; leading axis rays
+    displace: Callable[[Vector, FrameCondition], Vector]  # of all warps together
+    condition_of: Callable[[Int[Array, ""]], FrameCondition]  # of one frame learnt from
+    conditions: FrameCondition  # of the rays; leading axis rays
     batch: Batch
     levels: tuple[RayOutput, ...]  # coarse to fine; leading axis rays
     frames: Frames  # all that is learnt from, in scene units
@@ -133,16 +133,20 @@ class Effect(NamedTuple):
     name: str
     tables: tuple[Table, ...] = ()
     init: Callable[[Key[Array, ""]], PyTree] | None = None
-    # (params, moment) -> what the colour branch reads beside the view direction
-    condition: Callable[[PyTree, Moment], Float[Array, " features"]] | None = None
+    # (params, condition) -> what the colour branch reads beside the view direction
+    condition: Callable[[PyTree, FrameCondition], Float[Array, " features"]] | None = (
+        None
+    )
     condition_width: int = 0
-    # (params, point, moment) -> displacement: template point minus observed point
-    displace: Callable[[PyTree, Vector, Moment], Vector] | None = None
-    # (params, observed point, moment) -> features the trunk reads beside the point's
-    lift: Callable[[PyTree, Vector, Moment], Float[Array, " features"]] | None = None
+    # (params, point, condition) -> displacement: template point minus observed point
+    displace: Callable[[PyTree, Vector, FrameCondition], Vector] | None = None
+    # (params, observed point, condition) -> features the trunk reads beside the point's
+    lift: (
+        Callable[[PyTree, Vector, FrameCondition], Float[Array, " features"]] | None
+    ) = None
     lift_width: int = 0
-    # (params, sample, moment); on the last level only
-    medium: Callable[[PyTree, Sample, Moment], Medium] | None = None
+    # (params, sample, condition); on the last level only
+    medium: Callable[[PyTree, Sample, FrameCondition], Medium] | None = None
     penalty: Callable[[PyTree, Context], dict[str, Term]] | None = None
     wants: frozenset[str] = frozenset()  # of "depths", "points", "flow" in `Frames`
 

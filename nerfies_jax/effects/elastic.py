@@ -121,12 +121,12 @@ def energy(spec: ElasticSpec, context: Context) -> tuple[Scalar, Scalar]:
     level = context.levels[0]
     point, weight = draw(spec.points, level, context.key)
 
-    def at(point, moment):
-        jacobian = jax.jacfwd(lambda x: context.displace(x, moment))(point)
+    def at(point, condition):
+        jacobian = jax.jacfwd(lambda x: context.displace(x, condition))(point)
         folded = determinant(jax.lax.stop_gradient(jacobian)) < 0
         return cost(spec, jacobian), folded.astype(point.dtype)
 
-    costs, folded = jax.vmap(jax.vmap(at, (0, None)))(point, context.moments)
+    costs, folded = jax.vmap(jax.vmap(at, (0, None)))(point, context.conditions)
     seen = jnp.sum(weight)
     share = jnp.sum(weight * folded) / jnp.where(seen > 0, seen, 1)
     return jnp.mean(jnp.sum(weight * costs, axis=-1)), share

@@ -8,6 +8,7 @@ like this one. Weights and sizes are those of the public code; chains over two m
 """
 
 import dataclasses
+import functools
 import math
 from typing import NamedTuple
 
@@ -19,8 +20,8 @@ from nerfies_jax.effects import scene_flow_losses as flow_losses
 from nerfies_jax.effects.effect import (
     Context,
     Effect,
+    FrameCondition,
     Medium,
-    Moment,
     RayOutput,
     Sample,
     Scalar,
@@ -139,7 +140,7 @@ def effect(spec: SceneFlowSpec, moments: int, features: int) -> Effect:
     return Effect(
         NAME,
         init=lambda key: init(spec, key, features),
-        medium=lambda params, sample, moment: medium(spec, params, sample, moment),
+        medium=functools.partial(medium, spec),
         penalty=lambda params, context: penalty(spec, gap, params, context),
         wants=frozenset(name for name, weight in wants.items() if weight > 0),
     )
@@ -187,7 +188,7 @@ def dynamic(
 
 
 def medium(
-    spec: SceneFlowSpec, params: SceneFlow, sample: Sample, moment: Moment
+    spec: SceneFlowSpec, params: SceneFlow, sample: Sample, condition: FrameCondition
 ) -> Medium:
     """The medium at one sample, and its share of the opacity there."""
     width = params.blend.weight.shape[0]
@@ -196,7 +197,7 @@ def medium(
             f"the blending reads {width} features of the template, whose trunk has "
             f"{sample.features.shape[0]}; build the effect with the trunk's width"
         )
-    found = dynamic(spec, params, sample.point, sample.direction, moment.time)
+    found = dynamic(spec, params, sample.point, sample.direction, condition.time)
     share = mlp.affine(params.blend, sample.features)[0]
     extras = {
         "flow_forward": found.flow[FORWARD],
@@ -214,7 +215,7 @@ def neighbour(
     extras = level.media[NAME].extras
     flow = extras[("flow_forward", "flow_backward")[side]]
     point = level.point + flow
-    time = context.moments.time + SIGNS[side] * gap
+    time = context.conditions.time + SIGNS[side] * gap
     # Half a gap of slack: times are rounded, and need not be quite even.
     present = (time > -gap / 2) & (time < 1 + gap / 2)
 
@@ -357,7 +358,7 @@ def flow_term(
     total = jnp.zeros((), level.point.dtype)
     for sign, one, (shift, seen, rows) in zip(SIGNS, sides, pairs, strict=True):
         other = rows[batch.row].astype(batch.row.dtype)
-        elapsed = sign * (frames.times[other] - context.moments.time) / gap
+        elapsed = sign * (frames.times[other] - context.conditions.time) / gap
         point = level.point + elapsed[:, None, None] * one.flow
         place = flow_losses.settle(weight, point) / context.box.scale
         camera = cameras.take(frames.cameras, other)

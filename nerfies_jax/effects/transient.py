@@ -6,6 +6,7 @@ field each photograph has a medium of its own, with density, colour and an uncer
 """
 
 import dataclasses
+import functools
 import math
 
 import jax
@@ -16,8 +17,8 @@ from nerfies_jax.effects.effect import (
     APPEARANCE,
     Context,
     Effect,
+    FrameCondition,
     Medium,
-    Moment,
     Sample,
     Table,
     Term,
@@ -80,7 +81,7 @@ def effect(spec: TransientSpec, features: int) -> Effect:
         NAME,
         tables=(Table(TABLE, APPEARANCE, spec.code_width),),
         init=lambda key: init(spec, key, features),
-        medium=lambda params, sample, moment: medium(spec, params, sample, moment),
+        medium=functools.partial(medium, spec),
         penalty=lambda _, context: penalty(spec, context),
     )
 
@@ -92,12 +93,14 @@ def init(
     return mlp.init(network(spec, features), key, dtype)
 
 
-def medium(spec: TransientSpec, params: MLP, sample: Sample, moment: Moment) -> Medium:
+def medium(
+    spec: TransientSpec, params: MLP, sample: Sample, condition: FrameCondition
+) -> Medium:
     """Density, colour and uncertainty of the medium at one sample.
 
     The trunk is shared and learns from both media, as in the paper: nothing is stopped.
     """
-    inputs = jnp.concatenate([sample.features, moment.codes[TABLE]])
+    inputs = jnp.concatenate([sample.features, condition.codes[TABLE]])
     raw = mlp.apply(network(spec, sample.features.shape[-1]), params, inputs)
     return Medium(
         density=jax.nn.softplus(raw["density"][0]),

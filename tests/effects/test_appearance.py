@@ -12,7 +12,7 @@ from experiments import evaluate
 from nerfies_jax import presets, scene
 from nerfies_jax.effects import appearance
 from nerfies_jax.effects.appearance import AppearanceSpec
-from nerfies_jax.effects.effect import APPEARANCE, Moment, Table
+from nerfies_jax.effects.effect import APPEARANCE, FrameCondition, Table
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.radiance.template import TemplateSpec
 from nerfies_jax.render_ray import Ray
@@ -60,8 +60,10 @@ def ray(dtype):
     return Ray(jnp.asarray(origin, dtype), jnp.asarray(direction, dtype), near, far)
 
 
-def moment(code):
-    return Moment(jnp.asarray(0.5, code.dtype), {"appearance": code}, jnp.int32(0))
+def condition(code):
+    return FrameCondition(
+        jnp.asarray(0.5, code.dtype), {"appearance": code}, jnp.int32(0)
+    )
 
 
 @functools.cache
@@ -80,7 +82,7 @@ def test_the_condition_is_the_code_itself(dtype, rng):
     assert made.name == "appearance"
     assert made.tables == (Table("appearance", APPEARANCE, 3),)
     assert made.condition_width == 3
-    found = made.condition(None, moment(code))
+    found = made.condition(None, condition(code))
     assert found.dtype == dtype
     np.testing.assert_array_equal(found, code)
 
@@ -89,7 +91,7 @@ def test_effects_may_share_a_named_table():
     made = appearance.effect(AppearanceSpec(width=3, table="exposure"))
     assert made.tables == (Table("exposure", APPEARANCE, 3),)
     codes = {"exposure": jnp.arange(3.0), "appearance": jnp.zeros(3)}
-    found = made.condition(None, Moment(jnp.asarray(0.0), codes, jnp.int32(0)))
+    found = made.condition(None, FrameCondition(jnp.asarray(0.0), codes, jnp.int32(0)))
     np.testing.assert_array_equal(found, np.arange(3.0))
 
 
@@ -102,7 +104,7 @@ def test_a_code_without_numbers_is_refused(width):
 def test_codes_change_the_colour_and_never_the_geometry(dtype):
     params = params_of(dtype)
     first, second = (
-        tracer()(params, ray(dtype), moment(jnp.full(3, value, dtype)))
+        tracer()(params, ray(dtype), condition(jnp.full(3, value, dtype)))
         for value in (0.0, 2.0)
     )
     for one, other in zip(first, second, strict=True):
@@ -120,7 +122,7 @@ def test_colour_has_the_code_s_slope(float64, rng):
     render = scene.field(plain, METADATA).render_ray
 
     def shade(code):
-        levels = render(params, ray(float64), moment(code))
+        levels = render(params, ray(float64), condition(code))
         return sum(jnp.sum(pull * level.colour) for level in levels)
 
     code = jnp.asarray(rng.normal(size=3))

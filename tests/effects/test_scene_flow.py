@@ -11,7 +11,7 @@ import pytest
 from experiments import evaluate
 from nerfies_jax import scene
 from nerfies_jax.effects import scene_flow
-from nerfies_jax.effects.effect import Moment, Sample
+from nerfies_jax.effects.effect import FrameCondition, Sample
 from nerfies_jax.effects.scene_flow import FlowWeights, SceneFlowSpec
 from nerfies_jax.scene import RadianceScene
 from nerfies_jax.spec import SamplingSpec
@@ -270,8 +270,8 @@ def test_the_medium_starts_still_and_undecided(dtype):
     sample = Sample(
         point, jnp.asarray([0.0, 0.6, 0.8], dtype), jnp.ones(FEATURES, dtype)
     )
-    moment = Moment(jnp.asarray(0.4, dtype), {}, jnp.asarray(0))
-    found = scene_flow.medium(TINY, params, sample, moment)
+    condition = FrameCondition(jnp.asarray(0.4, dtype), {}, jnp.asarray(0))
+    found = scene_flow.medium(TINY, params, sample, condition)
     assert np.abs(found.extras["flow_forward"]).max() < 1e-3 * TINY.flow_bound
     assert np.abs(found.extras["disocclusion"]).max() < 1e-2
     assert abs(found.share) < 1e-2
@@ -313,9 +313,9 @@ def test_flow_stays_within_its_bound(dtype):
 def test_the_blending_says_what_width_it_was_built_for(float64):
     params = scenario("float64")[0]
     sample = Sample(jnp.zeros(3), jnp.zeros(3), jnp.zeros(FEATURES + 1))
-    moment = Moment(jnp.zeros(()), {}, jnp.asarray(0))
+    condition = FrameCondition(jnp.zeros(()), {}, jnp.asarray(0))
     with pytest.raises(ValueError, match=r"reads 7 features .* has 8"):
-        scene_flow.medium(TINY, params, sample, moment)
+        scene_flow.medium(TINY, params, sample, condition)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import pytest
 from experiments import evaluate
 from nerfies_jax import scene
 from nerfies_jax.effects.appearance import AppearanceSpec
-from nerfies_jax.effects.effect import Moment
+from nerfies_jax.effects.effect import FrameCondition
 from nerfies_jax.effects.transient import TransientSpec
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.radiance.template import TemplateSpec
@@ -66,7 +66,7 @@ def emptied(params):
     return params | {"transient": net._replace(heads=net.heads | {"density": gone})}
 
 
-def ray_and_moment(dtype):
+def ray_and_condition(dtype):
     ray = Ray(
         jnp.asarray([0.1, 0.2, 2.0], dtype),
         jnp.asarray([0.0, -0.28, -0.96], dtype),
@@ -77,13 +77,13 @@ def ray_and_moment(dtype):
         "appearance": jnp.asarray([0.3, -0.2], dtype),
         "transient": jnp.asarray([0.5, -1.0, 2.0], dtype),
     }
-    return ray, Moment(jnp.asarray(0.4, dtype), codes, jnp.int32(0))
+    return ray, FrameCondition(jnp.asarray(0.4, dtype), codes, jnp.int32(0))
 
 
 def test_left_out_it_is_a_transient_of_no_density(dtype):
-    params, (ray, moment) = params_of(dtype), ray_and_moment(dtype)
-    coarse, left_out = tracer(TINY, ("transient",))(params, ray, moment)
-    same_coarse, empty = tracer(TINY)(emptied(params), ray, moment)
+    params, (ray, condition) = params_of(dtype), ray_and_condition(dtype)
+    coarse, left_out = tracer(TINY, ("transient",))(params, ray, condition)
+    same_coarse, empty = tracer(TINY)(emptied(params), ray, condition)
     empty = jax.tree.map(np.asarray, empty)
     # Two programs: the last bits of a product may differ.
     tolerance = {"float32": 1e-6, "float64": 1e-14}[dtype]
@@ -98,19 +98,19 @@ def test_left_out_it_is_a_transient_of_no_density(dtype):
 
 
 def test_left_out_it_is_the_field_that_never_had_one(dtype):
-    params, (ray, moment) = params_of(dtype), ray_and_moment(dtype)
+    params, (ray, condition) = params_of(dtype), ray_and_condition(dtype)
     never = dataclasses.replace(TINY, transient=None)
-    _, left_out = tracer(TINY, ("transient",))(params, ray, moment)
-    _, plain = tracer(never)(params, ray, moment)
+    _, left_out = tracer(TINY, ("transient",))(params, ray, condition)
+    _, plain = tracer(never)(params, ray, condition)
     np.testing.assert_array_equal(left_out.colour, plain.colour)
     np.testing.assert_array_equal(left_out.static_weight, plain.static_weight)
 
 
 def test_with_it_the_ray_sees_both_through_one_transmittance(dtype):
     """Against a loop over the samples in Python floats (NeRF-W, section 4.2)."""
-    params, (ray, moment) = params_of(dtype), ray_and_moment(dtype)
-    _, joint = tracer(TINY)(params, ray, moment)
-    _, alone = tracer(TINY, ("transient",))(params, ray, moment)
+    params, (ray, condition) = params_of(dtype), ray_and_condition(dtype)
+    _, joint = tracer(TINY)(params, ray, condition)
+    _, alone = tracer(TINY, ("transient",))(params, ray, condition)
     np.testing.assert_array_equal(joint.distances, alone.distances)
     distance = np.asarray(joint.distances, np.float64)
     end = max(float(ray.far) - distance[-1], 0)

@@ -15,7 +15,7 @@ from experiments.effect_cost import Arm, EffectCost, Priced, Row
 from gaussians_jax import presets as splat_presets
 from nerfies_jax import presets as field_presets
 from nerfies_jax import scene
-from nerfies_jax.effects.effect import Moment
+from nerfies_jax.effects.effect import FrameCondition
 from nerfies_jax.measure import clock
 from nerfies_jax.render_ray import Ray
 from tests import bare_scenes, scenes
@@ -86,10 +86,10 @@ def test_the_products_of_a_static_field_are_those_of_its_networks(name):
     made = scene.field(spec, metadata)
     one, zero = jnp.ones(()), jnp.zeros(())
     ray = Ray(jnp.zeros(3), jnp.asarray([0.0, 0.0, 1.0]), 0.5 * one, one)
-    moment = Moment(zero, {}, jnp.int32(0))
+    condition = FrameCondition(zero, {}, jnp.int32(0))
 
     def colours(params):
-        return [level.colour for level in made.render_ray(params, ray, moment)]
+        return [level.colour for level in made.render_ray(params, ray, condition)]
 
     found = matrix_flops.count(colours, made.init(jax.random.key(0)))
     plan = spec.sampling

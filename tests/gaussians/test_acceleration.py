@@ -11,7 +11,7 @@ import pytest
 from gaussians_jax import splats as rows
 from gaussians_jax.effects import acceleration, deformation, mlp_motion
 from gaussians_jax.effects.acceleration import AccelerationSpec
-from gaussians_jax.effects.effect import Around, Moment
+from gaussians_jax.effects.effect import Around, FrameCondition
 from gaussians_jax.effects.mlp_motion import MotionSpec
 from gaussians_jax.optimiser import scale_by_row_adam
 from gaussians_jax.splats import Params, Splats
@@ -156,8 +156,8 @@ def ask(spec, params, time, step=0, at_time=swinging, extent=1.0, frames=11, see
 
     @jax.jit
     def penalty(params, time, step):
-        moment = Moment(time, step, jax.random.key(seed))
-        return effect.penalty(Around(params, at_time, moment, None))
+        condition = FrameCondition(time, step, jax.random.key(seed))
+        return effect.penalty(Around(params, at_time, condition, None))
 
     return penalty(params, jnp.asarray(time, dtype), jnp.asarray(step))
 
@@ -210,11 +210,11 @@ def test_gradients_of_the_effect(float64):
     spec = AccelerationSpec(decay=1e6)  # the weight is 1 to 1e-8
     params = scene(dtype="float64")
     effect = acceleration.effect(spec, 1.0, 11)
-    moment = Moment(jnp.asarray(0.4), jnp.asarray(0), jax.random.key(0))
+    condition = FrameCondition(jnp.asarray(0.4), jnp.asarray(0), jax.random.key(0))
 
     def total(amplitude):
         swung = params._replace(rows=params.rows | {"amplitude": amplitude})
-        return 1e16 * effect.penalty(Around(swung, swinging, moment, None)).value
+        return 1e16 * effect.penalty(Around(swung, swinging, condition, None)).value
 
     assert gradients.directional_error(total, params.rows["amplitude"]) < 1e-6
 
@@ -236,7 +236,7 @@ def travel(motion, params, net):
     params = Params(params.rows, {mlp_motion.NAME: net})
     gaussians = rows.activate(params.rows["splats"])
     one, other = (
-        motion.deform(params, gaussians, Moment(jnp.asarray(time)), None).mean
+        motion.deform(params, gaussians, FrameCondition(jnp.asarray(time)), None).mean
         for time in (0.3, 0.5)
     )
     return float(jnp.sqrt(jnp.mean(jnp.square(one - other))))
@@ -254,15 +254,15 @@ def test_under_a_network_it_waits_for_its_start_and_then_stills_it():
     effect = acceleration.effect(spec, 1.0, 11)
 
     def penalty(net, step):
-        moment = Moment(jnp.asarray(0.4), step, jax.random.key(0))
+        condition = FrameCondition(jnp.asarray(0.4), step, jax.random.key(0))
 
         def at_time(params, time):
             gaussians = rows.activate(params.rows["splats"])
-            then = moment._replace(time=time)
+            then = condition._replace(time=time)
             return deformation.pose_in_training((motion,), params, gaussians, then)
 
         here = Params(params.rows, {mlp_motion.NAME: net})
-        return effect.penalty(Around(here, at_time, moment, None)).value
+        return effect.penalty(Around(here, at_time, condition, None)).value
 
     run = jax.jit(jax.value_and_grad(penalty))
     value, slopes = run(net, jnp.asarray(3999))

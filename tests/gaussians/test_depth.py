@@ -11,7 +11,7 @@ import scipy.stats
 
 from gaussians_jax.effects import depth
 from gaussians_jax.effects.depth import DepthSpec
-from gaussians_jax.effects.effect import Moment, Shot
+from gaussians_jax.effects.effect import FrameCondition, Shot
 from gaussians_jax.optimiser import scale_by_row_adam
 from gaussians_jax.splats import Params
 from nerfies_jax.training.model import Rendering
@@ -290,7 +290,7 @@ def test_the_effect_reads_the_depths():
     spec, shot = DepthSpec("metric"), some_shot()
     effect = depth.effect(spec)
     assert effect.wants == {"depths"}
-    term = effect.image_loss(Params({}, {}), shot, Moment(jnp.zeros(())))
+    term = effect.image_loss(Params({}, {}), shot, FrameCondition(jnp.zeros(())))
     truth = np.asarray(shot.depth)
     error = np.abs(np.asarray(shot.rendering.depth) - truth).mean() / truth.mean()
     np.testing.assert_allclose(term.value, 0.1 * error, rtol=1e-6)

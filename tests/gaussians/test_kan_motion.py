@@ -13,7 +13,7 @@ import scipy.spatial.transform
 
 from gaussians_jax import splats as rows
 from gaussians_jax.effects import deformation, kan_motion
-from gaussians_jax.effects.effect import Moment
+from gaussians_jax.effects.effect import FrameCondition
 from gaussians_jax.effects.kan_motion import KanMotion, KanMotionSpec, Offsets
 from gaussians_jax.splats import Gaussians, Params, Splats
 from nerfies_jax.measure import clock
@@ -357,8 +357,8 @@ def test_the_effect_moves_a_scene_and_leaves_it_alone_in_its_warm_up(float64):
 
     @jax.jit
     def in_training(step):
-        moment = Moment(time, step, jax.random.key(0))
-        return deformation.pose_in_training(effects, params, canonical, moment)
+        condition = FrameCondition(time, step, jax.random.key(0))
+        return deformation.pose_in_training(effects, params, canonical, condition)
 
     for before, after in zip(canonical, in_training(jnp.asarray(9)), strict=True):
         np.testing.assert_array_equal(before, after)

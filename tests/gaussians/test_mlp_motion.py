@@ -10,7 +10,7 @@ import pytest
 
 from gaussians_jax import splats as rows
 from gaussians_jax.effects import deformation, mlp_motion
-from gaussians_jax.effects.effect import Moment
+from gaussians_jax.effects.effect import FrameCondition
 from gaussians_jax.effects.mlp_motion import Motion, MotionSpec, Offsets, SmoothingSpec
 from gaussians_jax.splats import Gaussians, Params, Splats
 from nerfies_jax.nets.encoding import EncodingSpec
@@ -295,8 +295,8 @@ def test_warm_up_is_a_branch_without_motion():
     params, gaussians = scene_at()
 
     def moved(params, step):
-        moment = Moment(jnp.asarray(0.5), step, jax.random.key(0))
-        return deformation.pose_in_training((field,), params, gaussians, moment)
+        condition = FrameCondition(jnp.asarray(0.5), step, jax.random.key(0))
+        return deformation.pose_in_training((field,), params, gaussians, condition)
 
     run = jax.jit(moved)
     before, after = run(params, jnp.asarray(9)), run(params, jnp.asarray(10))
@@ -319,7 +319,7 @@ def test_a_trained_scene_has_neither_warm_up_nor_noise():
     field = mlp_motion.effect(SMALL, steps=100, frames=20)
     params, gaussians = scene_at()
     time = jnp.asarray(0.25)
-    moved = jax.jit(field.deform)(params, gaussians, Moment(time), None)
+    moved = jax.jit(field.deform)(params, gaussians, FrameCondition(time), None)
     motion = params.nets[mlp_motion.NAME]
     offsets = deform(motion, SMALL, gaussians.mean, time)
     expected = mlp_motion.apply(gaussians, offsets, SMALL.scale_rule)

@@ -11,7 +11,7 @@ import scipy.spatial.transform
 
 from gaussians_jax import splats as rows
 from gaussians_jax.effects import deformation, mlp_motion, motion_basis
-from gaussians_jax.effects.effect import Moment
+from gaussians_jax.effects.effect import FrameCondition
 from gaussians_jax.effects.mlp_motion import SmoothingSpec
 from gaussians_jax.effects.motion_basis import BasisMotionSpec, Offsets
 from gaussians_jax.splats import Gaussians, Params, Splats
@@ -405,12 +405,12 @@ def test_warm_up_and_noise_are_of_training_alone():
 
     @jax.jit
     def moved(params, step):
-        moment = Moment(time, step, jax.random.key(0))
-        return deformation.pose_in_training((field,), params, gaussians, moment)
+        condition = FrameCondition(time, step, jax.random.key(0))
+        return deformation.pose_in_training((field,), params, gaussians, condition)
 
     np.testing.assert_array_equal(moved(params, jnp.asarray(9)).mean, gaussians.mean)
     ready = jax.jit(field.prepare)(params)
-    trained = jax.jit(field.deform)(params, gaussians, Moment(time), ready)
+    trained = jax.jit(field.deform)(params, gaussians, FrameCondition(time), ready)
     motion = params.nets[motion_basis.NAME]
     at_rest = motion_basis.apply(
         gaussians, uncached(motion, spec, gaussians.mean, time)

@@ -13,7 +13,7 @@ import pytest
 from gaussians_jax import density, optimiser, splats
 from gaussians_jax.density import DensitySpec
 from gaussians_jax.effects import motion_growth
-from gaussians_jax.effects.effect import Moment
+from gaussians_jax.effects.effect import FrameCondition
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec, Travel
 from gaussians_jax.splats import Gaussians, Params, Splats
 
@@ -45,8 +45,8 @@ def watch(canonical, displacements):
 
     def body(carried, displacement):
         moved = canonical._replace(mean=canonical.mean + displacement)
-        moment = Moment(jnp.asarray(0.5, displacement.dtype))
-        return motion_growth.observe(carried, canonical, moved, moment), None
+        condition = FrameCondition(jnp.asarray(0.5, displacement.dtype))
+        return motion_growth.observe(carried, canonical, moved, condition), None
 
     params = Params({"splats": canonical}, {})  # its means are all that is read
     return jax.lax.scan(body, motion_growth.carry(params), displacements)[0]

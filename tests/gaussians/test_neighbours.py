@@ -9,7 +9,7 @@ import pytest
 
 from gaussians_jax import splats as rows
 from gaussians_jax.effects import neighbours
-from gaussians_jax.effects.effect import Around, Moment
+from gaussians_jax.effects.effect import Around, FrameCondition
 from gaussians_jax.effects.neighbours import Neighbours, NeighbourSpec
 from gaussians_jax.splats import Params, Splats
 from tests import gradients
@@ -201,8 +201,8 @@ def compiled_penalty(spec):
     effect = neighbours.effect(spec, extent=1.0, of="code")
 
     def penalty(params, graph, step):
-        moment = Moment(jnp.zeros(()), step, jax.random.key(0))
-        return effect.penalty(Around(params, None, moment, graph))
+        condition = FrameCondition(jnp.zeros(()), step, jax.random.key(0))
+        return effect.penalty(Around(params, None, condition, graph))
 
     return effect, jax.jit(penalty)
 

@@ -12,7 +12,7 @@ import rich.console
 from experiments import evaluate
 from gaussians_jax import scene
 from gaussians_jax.effects import deformation
-from gaussians_jax.effects.effect import Moment
+from gaussians_jax.effects.effect import FrameCondition
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec
 from gaussians_jax.phases import AlternationSpec
 from gaussians_jax.spec import effects_of, refuse_what_cannot_train
@@ -130,7 +130,7 @@ def test_the_loss_of_a_whole_step_has_the_right_slope(paper, float64):
     truth = wide(scene.shot(frames, 2, None))
     carried = wide(scene.carried_by(effects, params))
     step = jnp.asarray(20, jnp.int32)
-    moment = Moment(view.time, step, jax.random.key(5))
+    condition = FrameCondition(view.time, step, jax.random.key(5))
 
     def loss(params):
         moved = deformation.pose_in_training(
@@ -138,7 +138,7 @@ def test_the_loss_of_a_whole_step_has_the_right_slope(paper, float64):
         )
         drawn = model.stages.draw(params, moved, view, (40, 30), step)
         seen = truth._replace(rendering=drawn)
-        return scene.loss_of(spec, effects, params, seen, moment, carried)[0]
+        return scene.loss_of(spec, effects, params, seen, condition, carried)[0]
 
     def of_rows(rows):
         return loss(params._replace(rows=rows))

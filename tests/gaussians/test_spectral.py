@@ -11,7 +11,7 @@ import pytest
 
 from gaussians_jax import rates
 from gaussians_jax.effects import spectral
-from gaussians_jax.effects.effect import Moment, Shot
+from gaussians_jax.effects.effect import FrameCondition, Shot
 from gaussians_jax.effects.spectral import FourierSpec, Gates, SpectralSpec, WaveletSpec
 from gaussians_jax.optimiser import scale_by_row_adam
 from gaussians_jax.splats import Params
@@ -390,8 +390,8 @@ def test_the_effect_weighs_logs_and_trains_what_its_gate_has(gate, rng):
     shot = shot_of(*(picture(rng, 6, 6, "float32") for _ in range(2)))
 
     def value(params, step):
-        moment = Moment(jnp.asarray(0.0), step, jax.random.key(0))
-        term = filled_in.image_loss(params, shot, moment)
+        condition = FrameCondition(jnp.asarray(0.0), step, jax.random.key(0))
+        term = filled_in.image_loss(params, shot, condition)
         return term.value, term.metrics
 
     both = jax.jit(jax.value_and_grad(value, has_aux=True))
@@ -422,8 +422,8 @@ def test_the_scenes_optimiser_shuts_a_learned_gate_down_to_its_least(rng):
         params, moments = state
 
         def value(params):
-            moment = Moment(jnp.asarray(0.0), step, jax.random.key(0))
-            term = made.image_loss(params, shot, moment)
+            condition = FrameCondition(jnp.asarray(0.0), step, jax.random.key(0))
+            term = made.image_loss(params, shot, condition)
             return term.value, term.metrics["wavelet_weight"]
 
         slopes, weight = jax.grad(value, has_aux=True)(params)
@@ -445,12 +445,12 @@ def test_an_absent_loss_has_no_gate_no_metric_and_no_operation(absent, rng):
     nets = {"spectral": made.init_nets(jax.random.key(0))}
     assert getattr(nets["spectral"], absent) is None
     shot = shot_of(*(picture(rng, 6, 6, "float32") for _ in range(2)))
-    moment = Moment(jnp.asarray(0.0), step_of(1), jax.random.key(0))
-    term = made.image_loss(Params({}, nets), shot, moment)
+    condition = FrameCondition(jnp.asarray(0.0), step_of(1), jax.random.key(0))
+    term = made.image_loss(Params({}, nets), shot, condition)
     other = {"wavelet": "fourier", "fourier": "wavelet"}[absent]
     assert set(term.metrics) == {other, f"{other}_weight"}
     text = str(
-        jax.make_jaxpr(lambda nets: made.image_loss(Params({}, nets), shot, moment))(
+        jax.make_jaxpr(lambda nets: made.image_loss(Params({}, nets), shot, condition))(
             nets
         )
     )

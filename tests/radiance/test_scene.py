@@ -13,7 +13,7 @@ from nerfies_jax import render_ray, scene
 from nerfies_jax.effects.ambient import AmbientSpec
 from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.effects.background import BackgroundSpec
-from nerfies_jax.effects.effect import Moment
+from nerfies_jax.effects.effect import FrameCondition
 from nerfies_jax.effects.elastic import ElasticSpec
 from nerfies_jax.effects.time_condition import TimeSpec
 from nerfies_jax.effects.warp import WarpSpec
@@ -99,9 +99,9 @@ def ray_of(dtype):
     )
 
 
-def moment_of(dtype, **found):
+def condition_of(dtype, **found):
     found = {name: jnp.asarray(code, dtype) for name, code in found.items()}
-    return Moment(jnp.asarray(0.4, dtype), found, jnp.int32(0))
+    return FrameCondition(jnp.asarray(0.4, dtype), found, jnp.int32(0))
 
 
 @pytest.mark.parametrize(
@@ -134,7 +134,7 @@ def test_a_static_level_is_the_plain_nerf(dtype):
     field = scene.field(STATIC, metadata)
     params = jax.tree.map(lambda x: x.astype(dtype), field.init(jax.random.key(0)))
     ray = ray_of(dtype)
-    coarse, fine = jax.jit(field.render_ray)(params, ray, moment_of(dtype))
+    coarse, fine = jax.jit(field.render_ray)(params, ray, condition_of(dtype))
     assert fine.colour.dtype == dtype
     expected = plain_nerf(params["template"]["coarse"], ray, np.linspace(0.5, 1.5, 8))
     tolerance = {"float32": 3e-6, "float64": 1e-12}[dtype]
@@ -277,19 +277,19 @@ def test_without_its_warp_a_field_shows_the_canonical_scene():
     )
     params = field.init(jax.random.key(0))
     code = np.ones(TINY_WARP.code_width)
-    moment = moment_of("float32", motion=code)
+    condition = condition_of("float32", motion=code)
     warp = params["warp"]
     grown = {
         name: head._replace(weight=head.weight * 1e3)
         for name, head in warp.heads.items()
     }
     params = params | {"warp": warp._replace(heads=grown)}
-    bent = jax.jit(field.render_ray)(params, ray_of("float32"), moment)[-1]
-    straight = jax.jit(canonical.render_ray)(params, ray_of("float32"), moment)[-1]
+    bent = jax.jit(field.render_ray)(params, ray_of("float32"), condition)[-1]
+    straight = jax.jit(canonical.render_ray)(params, ray_of("float32"), condition)[-1]
     assert np.abs(bent.warped - bent.point).max() > 1e-3
     np.testing.assert_array_equal(straight.warped, straight.point)
     static = scene.field(STATIC, METADATA)
-    plain = jax.jit(static.render_ray)(params, ray_of("float32"), moment)[-1]
+    plain = jax.jit(static.render_ray)(params, ray_of("float32"), condition)[-1]
     np.testing.assert_array_equal(straight.colour, plain.colour)
 
 
@@ -363,7 +363,9 @@ def test_shared_and_single_levels(levels):
     field = scene.field(spec, METADATA)
     params = field.init(jax.random.key(0))
     assert set(params["template"]) == {"fine"}
-    found = jax.jit(field.render_ray)(params, ray_of("float32"), moment_of("float32"))
+    found = jax.jit(field.render_ray)(
+        params, ray_of("float32"), condition_of("float32")
+    )
     assert len(found) == levels
 
 
