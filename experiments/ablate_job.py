@@ -233,7 +233,7 @@ class Job:
         compiled_before = (name, steps) in self._built
         arm = self._build(name, steps)
         state = arm.model.init(self.capture, jax.random.key(seed))
-        frames = evaluate.frames_of(self.capture, arm.model.wants)
+        frames = evaluate.frames_of(self.capture, arm.model.required_data)
         began, self._cache_saved = time.process_time(), 0.0
         result = loop.fit(arm.model, state, frames, steps=steps)
         # Compiling is taken out by its share of the time: its CPU time is not known.
@@ -289,7 +289,7 @@ class Job:
             first = loop.fit(
                 model,
                 model.init(self.capture, jax.random.key(0)),
-                evaluate.frames_of(self.capture, model.wants),
+                evaluate.frames_of(self.capture, model.required_data),
                 steps=1,
                 console=rich.console.Console(quiet=True),
             )

@@ -140,7 +140,7 @@ def trained(spec, capture, seed):
 
     model = scene.build(spec, scene.metadata_of(capture, spec))
     state = model.init(capture, jax.random.key(seed))
-    frames = evaluate.frames_of(capture, model.wants)
+    frames = evaluate.frames_of(capture, model.required_data)
     result = loop.fit(model, state, frames, steps=spec.steps)
     if result.steps < spec.steps:
         raise ValueError(f"training ended early: {result.message}")

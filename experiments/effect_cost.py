@@ -242,7 +242,7 @@ def _compile(representation, capture, spec, at):
     model = representation.build(spec, facts)
     state = model.init(capture, jax.random.key(0))
     state = state._replace(step=jnp.asarray(round(at * spec.steps), jnp.int32))
-    frames = evaluate.frames_of(capture, model.wants)
+    frames = evaluate.frames_of(capture, model.required_data)
 
     def loss(state, frames):
         # The compiler drops the slopes and the update, which nothing reads.

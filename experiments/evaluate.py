@@ -34,15 +34,15 @@ class Scored(NamedTuple):
     ssim: np.ndarray  # scikit-image's Gaussian form
 
 
-def frames_of(capture: Capture, wants: frozenset[str] = frozenset()) -> Frames:
-    """The training frames on the device, with what a model `wants` and there is."""
+def frames_of(capture: Capture, required_data: frozenset[str] = frozenset()) -> Frames:
+    """The training frames on the device, with what of `required_data` there is."""
     rows = capture.train
     beside = {}
-    if "depths" in wants and capture.depths is not None:
+    if "depths" in required_data and capture.depths is not None:
         beside["depths"] = capture.depths[rows]
-    if "points" in wants and capture.points is not None:
+    if "points" in required_data and capture.points is not None:
         beside["points"] = capture.points.position
-    if "flow" in wants and capture.flow is not None:
+    if "flow" in required_data and capture.flow is not None:
         beside["flow"] = training_flow(capture)
     frames = Frames(
         images=capture.images[rows],

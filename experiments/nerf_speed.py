@@ -116,7 +116,7 @@ def measured(rows: tuple[str, ...], repeats: int) -> dict[str, dict[str, float]]
         spec = specs()[name]
         model = scene.build(spec, scene.metadata_of(capture, spec))
         state = model.init(capture, jax.random.key(0))
-        frames = evaluate.frames_of(capture, model.wants)
+        frames = evaluate.frames_of(capture, model.required_data)
         cost = clock.cost(model.step, state, frames)
         figures[name] = {
             "gflop": cost.flops / 1e9,

@@ -55,7 +55,7 @@ def train(
         result = loop.fit(
             run.model,
             state,
-            evaluate.frames_of(run.capture, run.model.wants),
+            evaluate.frames_of(run.capture, run.model.required_data),
             steps=run.spec.steps,
             hooks=hooks if len(few) else [],
             seconds=seconds,

@@ -84,7 +84,7 @@ def build(spec: SplatScene, metadata: SceneMetadata) -> Model:
         render=whole_frame,
         events=_events(spec, metadata, effects, optimiser),
         counts=count_rows,
-        wants=frozenset().union(*(effect.wants for effect in effects)),
+        required_data=frozenset().union(*(effect.required_data for effect in effects)),
         stages=stages,
     )
 
@@ -137,7 +137,7 @@ def _stepper(spec, metadata, effects, optimiser):
         if spec.alternation is not None:
             posed = phases.spared(turn, posed)
         # A channel that nothing reads is still blended: 4 % of a step.
-        read = any("depths" in effect.wants for effect in effects)
+        read = any("depths" in effect.required_data for effect in effects)
         depth = read and frames.depths is not None
 
         def loss(params, probe):

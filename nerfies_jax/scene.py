@@ -50,7 +50,7 @@ def build(spec: RadianceScene, metadata: SceneMetadata) -> Model:
     Raises ValueError where an effect needs what the capture does not have.
     """
     made = field(spec, metadata)
-    if spec.background is not None and "points" not in metadata.provides:
+    if spec.background is not None and "points" not in metadata.available_data:
         raise ValueError(
             "the background effect holds static points still, and this capture has "
             "none; leave it out with --set background=none"
@@ -95,7 +95,9 @@ def build(spec: RadianceScene, metadata: SceneMetadata) -> Model:
             params, optimiser.init(params), (), jnp.zeros((), jnp.int32), run_key
         )
 
-    wants = frozenset().union(*(effect.wants for effect in made.effects))
+    required_data = frozenset().union(
+        *(effect.required_data for effect in made.effects)
+    )
     return Model(
         spec=(spec, metadata),
         init=init,
@@ -103,7 +105,7 @@ def build(spec: RadianceScene, metadata: SceneMetadata) -> Model:
         render=whole_frame,
         events=(),
         counts=count_parameters,
-        wants=wants & metadata.provides,
+        required_data=required_data & metadata.available_data,
     )
 
 

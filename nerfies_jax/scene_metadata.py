@@ -26,7 +26,7 @@ class SceneMetadata:
     # (left, right, progress). An exposure that is not learnt from lies between those
     # before and after it in time.
     exposures: tuple[tuple[int, int, float], ...]
-    provides: frozenset[str] = frozenset()  # of "depths", "points", "flow"
+    available_data: frozenset[str] = frozenset()  # of "depths", "points", "flow"
 
 
 def metadata_of(capture: Capture, extent: float | None) -> SceneMetadata:
@@ -42,13 +42,13 @@ def metadata_of(capture: Capture, extent: float | None) -> SceneMetadata:
     else:
         scale = extent / half_side
     times = np.unique(capture.times[capture.train])
-    provides = set()
+    available_data = set()
     if capture.points is not None and len(capture.points.position):
-        provides.add("points")
+        available_data.add("points")
     if capture.depths is not None:
-        provides.add("depths")
+        available_data.add("depths")
     if capture.flow is not None:
-        provides.add("flow")
+        available_data.add("flow")
     return SceneMetadata(
         near=near,
         far=far,
@@ -57,7 +57,7 @@ def metadata_of(capture: Capture, extent: float | None) -> SceneMetadata:
         background=capture.background,
         times=tuple(float(time) for time in times),
         exposures=_exposures(capture),
-        provides=frozenset(provides),
+        available_data=frozenset(available_data),
     )
 
 

@@ -47,7 +47,7 @@ class Started:
         self.capture = scenes.tiny_capture()
         self.spec, self.metadata = spec, metadata_of(self.capture)
         self.model = build(spec, self.metadata)
-        self.frames = evaluate.frames_of(self.capture, self.model.wants)
+        self.frames = evaluate.frames_of(self.capture, self.model.required_data)
 
     def init(self, key):
         return self.model.init(self.capture, key)

@@ -195,4 +195,4 @@ def effect(spec: DepthSpec) -> Effect:
         del params, moment
         return loss(spec, shot)
 
-    return Effect(name=NAME, image_loss=image_loss, wants=frozenset({"depths"}))
+    return Effect(name=NAME, image_loss=image_loss, required_data=frozenset({"depths"}))

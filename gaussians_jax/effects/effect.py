@@ -81,5 +81,5 @@ class Effect(NamedTuple):
     # (carried, step) -> [rows] factor of the gradient that the density control
     # compares with its threshold; host side
     grow_score: Callable[[PyTree, int], np.ndarray] | None = None
-    # Of `Frames`, beside pictures and cameras; who wants "depths" gets them drawn too.
-    wants: frozenset[str] = frozenset()
+    # Of `Frames`, beside pictures and cameras; who asks for "depths" gets them drawn too.
+    required_data: frozenset[str] = frozenset()

@@ -48,7 +48,7 @@ def effect(spec: BackgroundSpec) -> Effect:
     def penalty(_, context):
         return {"background": Term(drift(spec, context), spec.weight)}
 
-    return Effect("background", penalty=penalty, wants=frozenset({"points"}))
+    return Effect("background", penalty=penalty, required_data=frozenset({"points"}))
 
 
 def drift(spec: BackgroundSpec, context: Context) -> Scalar:

@@ -148,7 +148,9 @@ class Effect(NamedTuple):
     # (params, sample, condition); on the last level only
     medium: Callable[[PyTree, Sample, FrameCondition], Medium] | None = None
     penalty: Callable[[PyTree, Context], dict[str, Term]] | None = None
-    wants: frozenset[str] = frozenset()  # of "depths", "points", "flow" in `Frames`
+    required_data: frozenset[str] = (
+        frozenset()
+    )  # of "depths", "points", "flow" in `Frames`
 
 
 def stream(name: str) -> int:

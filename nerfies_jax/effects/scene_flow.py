@@ -136,13 +136,15 @@ def effect(spec: SceneFlowSpec, moments: int, features: int) -> Effect:
     `features` is the width of the static template's trunk.
     """
     gap = interval(moments)
-    wants = {"depths": spec.weights.depth, "flow": spec.weights.flow}
+    required_data = {"depths": spec.weights.depth, "flow": spec.weights.flow}
     return Effect(
         NAME,
         init=lambda key: init(spec, key, features),
         medium=functools.partial(medium, spec),
         penalty=lambda params, context: penalty(spec, gap, params, context),
-        wants=frozenset(name for name, weight in wants.items() if weight > 0),
+        required_data=frozenset(
+            name for name, weight in required_data.items() if weight > 0
+        ),
     )
 
 

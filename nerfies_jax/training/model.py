@@ -21,7 +21,7 @@ class Frames(NamedTuple):
     times: Float[Array, " frames"]
     appearance: Int[Array, " frames"]
     valid: Any  # [frames, height, width] bool, or None
-    # What a model reads only if it `wants` it:
+    # What a model reads only if it names in `required_data`:
     depths: Any = (
         None  # [frames, height, width] float32 z-depth, scene units; 0 unknown
     )
@@ -110,5 +110,7 @@ class Model(NamedTuple):
     render: Callable[[PyTree, View, tuple[int, int], Int[Array, ""]], Rendering]
     events: tuple[Event, ...]
     counts: Callable[[TrainState], dict[str, int]]  # {"gaussians": n, ...}
-    wants: frozenset[str] = frozenset()  # which of "depths", "points", "flow" it reads
+    required_data: frozenset[str] = (
+        frozenset()
+    )  # which of "depths", "points", "flow" it reads
     stages: Stages | None = None  # where rendering has parts worth keeping

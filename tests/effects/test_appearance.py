@@ -150,7 +150,7 @@ def test_codes_of_every_preset_learn(name):
     capture = scenes.tiny_capture()
     metadata = scene.metadata_of(capture, spec)
     made = scene.field(spec, metadata)
-    frames = evaluate.frames_of(capture, scene.build(spec, metadata).wants)
+    frames = evaluate.frames_of(capture, scene.build(spec, metadata).required_data)
     params = made.init(jax.random.key(0))
     keys = jax.random.split(jax.random.key(1))
     batch = scene.draw_batch(frames, spec.rays, keys[0])

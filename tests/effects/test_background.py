@@ -142,7 +142,7 @@ def test_gradients(float64, rng):
 def test_seams_of_the_effect():
     seams = background.effect(BackgroundSpec())
     assert seams.name == "background"
-    assert seams.wants == {"points"}
+    assert seams.required_data == {"points"}
     assert seams.init is None
     assert seams.tables == ()
 

@@ -80,10 +80,10 @@ def test_terms_with_a_weight_of_zero_are_not_there(float64):
     params, frames, batch, arrays = scenario("float64")
     spec = dataclasses.replace(TINY, weights=FlowWeights(**dict.fromkeys(NAMES, 0.0)))
     assert terms_of(spec, params, frames, batch, arrays, 0) == {}
-    assert scene_flow.effect(spec, 4, FEATURES).wants == frozenset()
+    assert scene_flow.effect(spec, 4, FEATURES).required_data == frozenset()
     only_flow = dataclasses.replace(spec, weights=FlowWeights(depth=0.0))
-    assert scene_flow.effect(only_flow, 4, FEATURES).wants == {"flow"}
-    assert scene_flow.effect(TINY, 4, FEATURES).wants == {"flow", "depths"}
+    assert scene_flow.effect(only_flow, 4, FEATURES).required_data == {"flow"}
+    assert scene_flow.effect(TINY, 4, FEATURES).required_data == {"flow", "depths"}
 
 
 NAMES = tuple(field.name for field in dataclasses.fields(FlowWeights))
@@ -350,9 +350,9 @@ def test_a_scene_with_it_learns_from_pictures_depth_and_flow():
     )
     metadata = scene.metadata_of(capture, spec)
     model = scene.build(spec, metadata)
-    assert model.wants == {"depths", "flow"}
+    assert model.required_data == {"depths", "flow"}
     state = model.init(capture, jax.random.key(0))
-    frames = evaluate.frames_of(capture, model.wants)
+    frames = evaluate.frames_of(capture, model.required_data)
     first, step, losses = state.params, jax.jit(model.step), []
     for _ in range(30):
         state, metrics = step(state, frames)

@@ -147,7 +147,7 @@ def test_a_step_trains_the_transient_its_codes_and_the_trunk():
     capture = scenes.tiny_capture()
     model = scene.build(TINY, metadata())
     state = model.init(capture, jax.random.key(3))
-    frames = evaluate.frames_of(capture, model.wants)
+    frames = evaluate.frames_of(capture, model.required_data)
     after, metrics = jax.jit(model.step)(state, frames)
     assert {"colour", "fine", "coarse", "transient/density"} <= set(metrics)
     changed = jax.tree.map(

@@ -289,7 +289,7 @@ def test_without_depth_there_is_no_operation():
 def test_the_effect_reads_the_depths():
     spec, shot = DepthSpec("metric"), some_shot()
     effect = depth.effect(spec)
-    assert effect.wants == {"depths"}
+    assert effect.required_data == {"depths"}
     term = effect.image_loss(Params({}, {}), shot, FrameCondition(jnp.zeros(())))
     truth = np.asarray(shot.depth)
     error = np.abs(np.asarray(shot.rendering.depth) - truth).mean() / truth.mean()

@@ -354,8 +354,8 @@ def an_effect():
 def test_it_fills_only_the_seams_of_growth():
     effect = an_effect()
     filled = {name for name in effect._fields if getattr(effect, name) not in (None, 0)}
-    assert filled == {"name", "carry", "observe", "grow_score", "wants"}
-    assert effect.wants == frozenset()
+    assert filled == {"name", "carry", "observe", "grow_score", "required_data"}
+    assert effect.required_data == frozenset()
 
 
 def test_before_its_start_the_factor_is_one(dtype):

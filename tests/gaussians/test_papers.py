@@ -32,7 +32,7 @@ def metadata():
 def made(paper):
     capture = scenes.tiny_capture()
     model = scene.build(PAPERS[paper], metadata())
-    frames = evaluate.frames_of(capture, model.wants)
+    frames = evaluate.frames_of(capture, model.required_data)
     return model, frames
 
 

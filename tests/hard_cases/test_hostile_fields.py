@@ -50,7 +50,7 @@ def trained(name, start, folder=None, steps=tiny_fields.STEPS):
     place = tiny_fields.place_of(scene.metadata_of(film, run.spec), start.speed)
     if film.points is None:  # they are told the field's planes alone
         film = dataclasses.replace(film, points=run.capture.points)
-    frames = start.frames(tiny_fields.frames_of(film, run.model.wants))
+    frames = start.frames(tiny_fields.frames_of(film, run.model.required_data))
     params = start.params(jax.tree.map(np.asarray, run.state.params))
     state = run.state._replace(params=params, extra=place)
     ended = hostile.train(run.model, state, frames, folder, steps=steps)
@@ -118,7 +118,7 @@ def test_where_the_origin_of_the_world_is_cannot_be_seen(name):
     pictures = []
     for film in (capture, shifted):
         place = tiny_fields.place_of(scene.metadata_of(film, run.spec))
-        frames = tiny_fields.frames_of(film, run.model.wants)
+        frames = tiny_fields.frames_of(film, run.model.required_data)
         pictures.append(picture_of(run, state._replace(extra=place), frames, 1))
     # A shift of 4 units is rounded to 2e-7, five times that in units of the field; the
     # fine samples move with it.
@@ -163,8 +163,8 @@ def bare(capture):
 def test_scene_flow_of_a_single_bare_frame_stays_finite():
     spec = tiny_fields.tiny("nsff")
     run = tiny_fields.start(spec, bare(scenes.tiny_capture()))
-    assert run.model.wants == frozenset()
-    frames = tiny_fields.frames_of(run.capture, run.model.wants)
+    assert run.model.required_data == frozenset()
+    frames = tiny_fields.frames_of(run.capture, run.model.required_data)
     ended = hostile.train(run.model, run.state, frames, steps=200)
     assert ended.result.stopped_by == "steps", ended.result.message
     assert ended.last["mse"] < ended.first["mse"]

@@ -117,7 +117,7 @@ def ready_for(spec, capture) -> Ready:
     return Ready(
         model,
         model.init(capture, jax.random.key(3)),
-        hostile.frames_of(capture, model.wants),
+        hostile.frames_of(capture, model.required_data),
         effects_of(spec, metadata),
         render,
     )

@@ -108,9 +108,9 @@ def place_of(metadata: SceneMetadata, speed: float = 1.0) -> Place:
     return Place(*(np.asarray(number, np.float32) for number in numbers))
 
 
-def frames_of(capture: Capture, wants: frozenset[str]) -> Frames:
+def frames_of(capture: Capture, required_data: frozenset[str]) -> Frames:
     """Frames whose pictures can hold any number, with a mask in any case."""
-    frames = hostile.frames_of(capture, wants)
+    frames = hostile.frames_of(capture, required_data)
     return frames._replace(images=frames.images.astype(np.float32))
 
 

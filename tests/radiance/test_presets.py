@@ -25,7 +25,7 @@ def test_a_step_of_every_preset_keeps_its_state(name):
     spec = PRESETS[name]
     model = scene.build(spec, scene.metadata_of(capture, spec))
     state = jax.eval_shape(lambda key: model.init(capture, key), jax.random.key(0))
-    frames = evaluate.frames_of(capture, model.wants)
+    frames = evaluate.frames_of(capture, model.required_data)
     after, metrics = jax.eval_shape(model.step, state, frames)
     assert jax.tree.structure(after) == jax.tree.structure(state)
     for before, now in zip(jax.tree.leaves(state), jax.tree.leaves(after), strict=True):
@@ -71,7 +71,7 @@ def test_a_small_preset_learns_more_than_one_colour(name):
     capture = scenes.tiny_capture()
     spec = dataclasses.replace(presets.with_steps(PRESETS[name], 200), rays=128)
     model = scene.build(spec, scene.metadata_of(capture, spec))
-    frames = evaluate.frames_of(capture, model.wants)
+    frames = evaluate.frames_of(capture, model.required_data)
     state, step = model.init(capture, jax.random.key(0)), jax.jit(model.step)
     errors = []
     for _ in range(120):

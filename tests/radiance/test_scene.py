@@ -67,7 +67,7 @@ METADATA = SceneMetadata(
 def started(spec):
     capture = scenes.tiny_capture()
     model = scene.build(spec, scene.metadata_of(capture, spec))
-    frames = evaluate.frames_of(capture, model.wants)
+    frames = evaluate.frames_of(capture, model.required_data)
     return model, model.init(capture, jax.random.key(3)), frames
 
 
@@ -124,7 +124,7 @@ def test_a_static_field_has_a_template_and_nothing_else():
     assert state.params["codes"] == {}
     assert frames.points is None
     assert frames.depths is None
-    assert model.wants == frozenset()
+    assert model.required_data == frozenset()
     _, trace = stepped(STATIC, 40)
     assert set(trace[0]) == {"loss", "mse", "coarse", "fine"}
 

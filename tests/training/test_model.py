@@ -31,7 +31,7 @@ def one_step(name):
         metadata = kind.metadata_of(capture, spec)
     model = kind.build(spec, metadata)
     first = model.init(capture, jax.random.key(0))
-    frames = evaluate.frames_of(capture, model.wants)
+    frames = evaluate.frames_of(capture, model.required_data)
     second, logged = jax.eval_shape(model.step, first, frames)
     view = evaluate.view_of(capture, int(capture.heldout[0]))
     drawn = jax.eval_shape(
