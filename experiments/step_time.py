@@ -48,27 +48,27 @@ def of_splats(
     }
     for effect in effects:
 
-        def one(params, rendering, carried, effect=effect):
+        def one(params, rendering, state, effect=effect):
             return _sum_of_effect(
                 effect,
                 effects,
                 params,
                 shot._replace(rendering=rendering),
                 condition,
-                carried,
+                state,
             )
 
-        carried = state.extra.carried.get(effect.name)
+        kept = state.aux_state.effects.get(effect.name)
         drawn = Rendering(shot.truth, *(jnp.ones(shot.truth.shape[:2]) for _ in "ad"))
         if {effect.deform, effect.image_loss, effect.penalty} != {None}:
             slope = jax.grad(one, (0, 1))
-            timed[effect.name.replace("_", " ")] = _ms(slope, params, drawn, carried)
+            timed[effect.name.replace("_", " ")] = _ms(slope, params, drawn, kept)
     whole = _ms(model.step, state, frames)
     timed["optimiser and statistics"] = max(whole - sum(timed.values()), 0.0)
     return timed
 
 
-def _sum_of_effect(effect, effects, params, shot, condition, carried):
+def _sum_of_effect(effect, effects, params, shot, condition, state):
     """A scalar whose gradient takes the work of one effect in a step."""
     from gaussians_jax import splats
     from gaussians_jax.effects import deformation
@@ -83,7 +83,7 @@ def _sum_of_effect(effect, effects, params, shot, condition, carried):
         total += effect.image_loss(params, shot, condition).value
     if effect.penalty is not None:
         at_time = deformation.poser(effects, condition)
-        total += effect.penalty(Around(params, at_time, condition, carried)).value
+        total += effect.penalty(Around(params, at_time, condition, state)).value
     return total
 
 

@@ -50,19 +50,19 @@ def metadata_of(capture: Capture) -> SceneMetadata:
     )
 
 
-class Extra(NamedTuple):
-    """What a scene carries beside its parameters; everything in it has rows."""
+class AuxState(NamedTuple):
+    """What a scene keeps beside its parameters; everything in it has rows."""
 
     stats: PyTree  # density.RowStats, or () without density control
-    carried: dict[str, PyTree]  # by the name of the effect
+    effects: dict[str, PyTree]  # by the name of the effect
 
 
-def carried_by(effects: tuple[Effect, ...], params: Params) -> dict[str, PyTree]:
-    """What each effect carries from this change of the rows to the next; host side."""
+def states_of(effects: tuple[Effect, ...], params: Params) -> dict[str, PyTree]:
+    """What each effect keeps from this change of the rows to the next; host side."""
     return {
-        effect.name: effect.carry(params)
+        effect.name: effect.state(params)
         for effect in effects
-        if effect.carry is not None
+        if effect.state is not None
     }
 
 
@@ -147,8 +147,8 @@ def _stepper(spec, metadata, effects, optimiser):
                 spec, metadata, params, moved, view, size, degree, probe, depth
             )
             seen = shot(frames, row, frame.rendering)
-            carried = state.extra.carried
-            value, metrics = loss_of(spec, effects, params, seen, condition, carried)
+            states = state.aux_state.effects
+            value, metrics = loss_of(spec, effects, params, seen, condition, states)
             return value, (metrics, frame.footprints, canonical, moved)
 
         probe = jnp.zeros_like(state.params.rows["splats"].mean[:, :2])
@@ -161,17 +161,17 @@ def _stepper(spec, metadata, effects, optimiser):
         if spec.alternation is not None:
             before = Trained(state.params, state.optimiser)
             trained = phases.hold(optimiser, turn, before, trained)
-        stats, carried = state.extra
+        stats, states = state.aux_state
         if spec.density is not None:
             radius_px = jnp.max(footprints.extent_px, axis=1)
             stats = density.observe(
                 stats, probe_slope, footprints.visible, radius_px, size
             )
         for effect in effects:
-            if effect.observe is not None:
-                own = effect.observe(carried[effect.name], *poses, condition)
-                carried = carried | {effect.name: own}
-        state = TrainState(*trained, Extra(stats, carried), state.step + 1, state.key)
+            if effect.update_state is not None:
+                own = effect.update_state(states[effect.name], *poses, condition)
+                states = states | {effect.name: own}
+        state = TrainState(*trained, AuxState(stats, states), state.step + 1, state.key)
         return state, {"loss": value, **metrics}
 
     return step
@@ -183,7 +183,7 @@ def loss_of(
     params: Params,
     seen: Shot,
     condition: FrameCondition,
-    carried: dict[str, PyTree],
+    states: dict[str, PyTree],
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
     """The loss of one frame with what every effect adds, and numbers to log."""
     colour = seen.rendering.colour
@@ -198,7 +198,7 @@ def loss_of(
         if effect.image_loss is not None:
             terms.append(effect.image_loss(params, seen, condition))
         if effect.penalty is not None:
-            own = carried.get(effect.name)
+            own = states.get(effect.name)
             terms.append(effect.penalty(Around(params, at_time, condition, own)))
         for term in terms:
             value = value + term.value
@@ -283,9 +283,9 @@ def first_state(spec, effects, optimiser, capture, key) -> TrainState:
     params = splats.pad_rows(params, splats.capacity_for(count, most))
     params = in_default_precision(params)
     stats = () if spec.density is None else density.empty_stats(params.rows["splats"])
-    extra = Extra(stats, carried_by(effects, params))
+    aux_state = AuxState(stats, states_of(effects, params))
     return TrainState(
-        params, optimiser.init(params), extra, jnp.zeros((), jnp.int32), run_key
+        params, optimiser.init(params), aux_state, jnp.zeros((), jnp.int32), run_key
     )
 
 
@@ -297,11 +297,11 @@ def _events(spec, metadata, effects, optimiser):
 
     def densify(state, frames):
         del frames
-        stats, carried = state.extra
+        stats, states = state.aux_state
         step = int(state.step)
         for effect in effects:
             if effect.grow_score is not None:
-                factor = effect.grow_score(carried[effect.name], step)
+                factor = effect.grow_score(states[effect.name], step)
                 stats = stats._replace(gradient=stats.gradient * jnp.asarray(factor))
         changed = density.densify(
             optimiser,
@@ -313,9 +313,9 @@ def _events(spec, metadata, effects, optimiser):
             step=step,
             extent=metadata.extent,
         )
-        extra = Extra(changed.stats, carried_by(effects, changed.params))
+        aux_state = AuxState(changed.stats, states_of(effects, changed.params))
         return state._replace(
-            params=changed.params, optimiser=changed.moments, extra=extra
+            params=changed.params, optimiser=changed.moments, aux_state=aux_state
         )
 
     def reset(state, frames):

@@ -78,7 +78,7 @@ def build(spec: RadianceScene, metadata: SceneMetadata) -> Model:
             lambda x, d: x - (speed * d).astype(x.dtype), state.params, direction
         )
         metrics = {"loss": value, "mse": logged["fine"], **logged}
-        state = TrainState(params, moments, state.extra, state.step + 1, state.key)
+        state = TrainState(params, moments, state.aux_state, state.step + 1, state.key)
         return state, metrics
 
     def whole_frame(params, view: View, size, step):

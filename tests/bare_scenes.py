@@ -225,14 +225,14 @@ def splat_step(spec, metadata, shuffled_row):
         )
         rates = Params({"splats": rates}, {})
         params = splat_rates.descend(state.params, direction, rates)
-        extra = state.extra
+        aux_state = state.aux_state
         if spec.density is not None:
             radius_px = jnp.max(seen.extent_px, axis=1)
             stats = density.observe(
-                extra.stats, slopes[1], seen.visible, radius_px, size
+                aux_state.stats, slopes[1], seen.visible, radius_px, size
             )
-            extra = extra._replace(stats=stats)
-        state = TrainState(params, moments, extra, state.step + 1, state.key)
+            aux_state = aux_state._replace(stats=stats)
+        state = TrainState(params, moments, aux_state, state.step + 1, state.key)
         return state, {"loss": value, "mse": mse}
 
     return step

@@ -160,7 +160,7 @@ def test_splats_without_effects_are_the_static_ones_bit_for_bit(name):
 def test_splats_without_density_control_keep_no_statistics_of_it():
     spec = dataclasses.replace(bare_scenes.tiny_splats("splats-static"), density=None)
     run = started_splats(spec)
-    assert jax.tree.leaves(run.state.extra) == []
+    assert jax.tree.leaves(run.state.aux_state) == []
     step = bare_scenes.splat_step(run.spec, run.metadata, splat_scene.shuffled_row)
     same_program(run.model.step, step, run.state, run.frames)
 

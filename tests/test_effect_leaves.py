@@ -125,7 +125,7 @@ def test_splats_have_the_arrays_of_what_they_have_and_no_others(preset):
     for spec in splats_without(bare_scenes.tiny_splats(preset)):
         state = splat_scene.build(spec, metadata).init(capture, jax.random.key(0))
         motion, key, nets = spec.motion, jax.random.key(0), {}
-        rows, carried = {"splats"}, set()
+        rows, states = {"splats"}, set()
         if isinstance(motion, MotionSpec):
             nets["mlp_motion"] = mlp_motion.init(key, motion)
         elif isinstance(motion, KanMotionSpec):
@@ -136,12 +136,12 @@ def test_splats_have_the_arrays_of_what_they_have_and_no_others(preset):
         if spec.spectral is not None:
             nets["spectral"] = spectral.init(spec.spectral)
         if spec.neighbours is not None:
-            carried.add("neighbours")
+            states.add("neighbours")
         if spec.motion_growth is not None:
-            carried.add("motion_growth")
+            states.add("motion_growth")
         assert set(state.params.rows) == rows
         assert shapes(state.params.nets) == shapes(nets)
-        assert set(state.extra.carried) == carried
+        assert set(state.aux_state.effects) == states
         # A count and two moments for each array that is trained, and nothing else.
         trained = len(jax.tree.leaves(state.params))
         assert len(jax.tree.leaves(state.optimiser)) == 3 * trained

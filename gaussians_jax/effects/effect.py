@@ -41,7 +41,7 @@ class Around(NamedTuple):
     # Gaussians of any choice of rows (`splats.take_rows`) at any time.
     at_time: Callable[[Params, Float[Array, ""]], Gaussians]
     condition: FrameCondition
-    carried: PyTree  # of this effect; None where it carries nothing
+    state: PyTree  # of this effect; None where it keeps nothing
 
 
 class Term(NamedTuple):
@@ -57,7 +57,7 @@ Rate = Callable[[Int[Array, ""]], Float[Array, ""]]  # learning rate at a traced
 class Effect(NamedTuple):
     """What one effect does, each seam optional."""
 
-    name: str  # its key in `Params.rows`, `Params.nets` and what is carried
+    name: str  # its key in `Params.rows`, `Params.nets` and in what is kept
     init_rows: Callable[[Any, Splats], PyTree] | None = None  # (key, splats) -> rows
     init_nets: Callable[[Any], PyTree] | None = None  # key -> nets
     row_rate: Rate | None = None  # where there are rows
@@ -72,13 +72,13 @@ class Effect(NamedTuple):
     image_loss: Callable[[Params, Shot, FrameCondition], Term] | None = None
     penalty: Callable[[Around], Term] | None = None
     # Host side, at the start and after every change of the rows: what the steps up to
-    # the next change carry. Arrays only.
-    carry: Callable[[Params], PyTree] | None = None
-    # (carried, canonical, moved, condition) -> carried; pure, in every step
-    observe: Callable[[PyTree, Gaussians, Gaussians, FrameCondition], PyTree] | None = (
-        None
-    )
-    # (carried, step) -> [rows] factor of the gradient that the density control
+    # the next change keep. Arrays only.
+    state: Callable[[Params], PyTree] | None = None
+    # (state, canonical, moved, condition) -> state; pure, in every step
+    update_state: (
+        Callable[[PyTree, Gaussians, Gaussians, FrameCondition], PyTree] | None
+    ) = None
+    # (state, step) -> [rows] factor of the gradient that the density control
     # compares with its threshold; host side
     grow_score: Callable[[PyTree, int], np.ndarray] | None = None
     # Of `Frames`, beside pictures and cameras; who asks for "depths" gets them drawn too.

@@ -154,7 +154,7 @@ def inconsistency(
 def effect(spec: NeighbourSpec, extent: float, of: str) -> Effect:
     """The seams of the penalty on `params.rows[of]`, [gaussians, width]."""
 
-    def carry(params: Params) -> Neighbours:
+    def state(params: Params) -> Neighbours:
         if of not in params.rows:
             raise ValueError(
                 f"there are no rows {of!r} whose neighbours could be alike, only "
@@ -164,7 +164,7 @@ def effect(spec: NeighbourSpec, extent: float, of: str) -> Effect:
 
     def penalty(around: Around) -> Term:
         alive = splats.alive(around.params.rows["splats"])
-        graph = around.carried
+        graph = around.state
 
         def evaluate(embedding):
             return spec.weight * inconsistency(embedding, graph, alive)
@@ -175,7 +175,7 @@ def effect(spec: NeighbourSpec, extent: float, of: str) -> Effect:
         # Dead rows have no weight and so are not counted.
         return Term(value, {"linked": jnp.sum(linked) / living})
 
-    return Effect(name=NAME, carry=carry, penalty=penalty)
+    return Effect(name=NAME, state=state, penalty=penalty)
 
 
 def _from_step(start, around, evaluate, embedding):

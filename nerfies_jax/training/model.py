@@ -21,7 +21,7 @@ class Frames(NamedTuple):
     times: Float[Array, " frames"]
     appearance: Int[Array, " frames"]
     valid: Any  # [frames, height, width] bool, or None
-    # What a model reads only if it names in `required_data`:
+    # What a model reads only where its `required_data` says so:
     depths: Any = (
         None  # [frames, height, width] float32 z-depth, scene units; 0 unknown
     )
@@ -55,7 +55,7 @@ class TrainState(NamedTuple):
 
     params: PyTree
     optimiser: PyTree
-    extra: PyTree  # what the representation carries beside: row statistics, ...
+    aux_state: PyTree  # what the representation carries beside: row statistics, ...
     step: Int[Array, ""]
     key: Key[Array, ""]  # of the run; step i uses fold_in(key, i)
 

@@ -210,7 +210,7 @@ def compiled_penalty(spec):
 def test_the_effect_weighs_and_waits_for_its_start():
     params = scene(some_places(), dtype="float32")
     effect, penalty = compiled_penalty(NeighbourSpec(weight=0.5, start=10))
-    graph = effect.carry(params)
+    graph = effect.state(params)
     before = penalty(params, graph, jnp.asarray(9))
     after = penalty(params, graph, jnp.asarray(10))
     assert before.value == 0
@@ -254,7 +254,7 @@ def test_the_penalty_draws_neighbours_together_and_leaves_the_far_apart():
 def test_missing_rows_are_named():
     effect = neighbours.effect(NeighbourSpec(), extent=1.0, of="kan_motion")
     with pytest.raises(ValueError, match=r"no rows .kan_motion.*code"):
-        effect.carry(scene(some_places()))
+        effect.state(scene(some_places()))
 
 
 @pytest.mark.parametrize(

@@ -80,7 +80,7 @@ def test_what_is_carried_follows_the_rows(paper):
     state = straight(paper).state
     capacity = state.params.rows["splats"].mean.shape[0]
     assert capacity != start(paper).params.rows["splats"].mean.shape[0]
-    for leaf in jax.tree.leaves(state.extra):
+    for leaf in jax.tree.leaves(state.aux_state):
         assert leaf.shape[0] == capacity
 
 
@@ -128,7 +128,7 @@ def test_the_loss_of_a_whole_step_has_the_right_slope(paper, float64):
     params = wide(state.params)._replace(nets=jax.tree.map(awake, state.params.nets))
     view = wide(evaluate.view_of(capture, int(capture.train[2])))
     truth = wide(scene.shot(frames, 2, None))
-    carried = wide(scene.carried_by(effects, params))
+    states = wide(scene.states_of(effects, params))
     step = jnp.asarray(20, jnp.int32)
     condition = FrameCondition(view.time, step, jax.random.key(5))
 
@@ -138,7 +138,7 @@ def test_the_loss_of_a_whole_step_has_the_right_slope(paper, float64):
         )
         drawn = model.stages.draw(params, moved, view, (40, 30), step)
         seen = truth._replace(rendering=drawn)
-        return scene.loss_of(spec, effects, params, seen, condition, carried)[0]
+        return scene.loss_of(spec, effects, params, seen, condition, states)[0]
 
     def of_rows(rows):
         return loss(params._replace(rows=rows))

@@ -135,7 +135,7 @@ def test_events_grow_the_scene_and_keep_its_picture_learnable():
     assert int(after.step) == int(state.step)
     again, metrics = jax.jit(eager.step)(after, frames)
     assert np.isfinite(float(metrics["loss"]))
-    assert again.params.rows["splats"].mean.shape == (*after.extra.stats.alive.shape, 3)
+    assert again.params.rows["splats"].mean.shape == (*after.aux_state.stats.alive.shape, 3)
 
 
 def test_an_event_is_a_function_of_the_state():

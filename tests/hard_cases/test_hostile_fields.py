@@ -52,7 +52,7 @@ def trained(name, start, folder=None, steps=tiny_fields.STEPS):
         film = dataclasses.replace(film, points=run.capture.points)
     frames = start.frames(tiny_fields.frames_of(film, run.model.required_data))
     params = start.params(jax.tree.map(np.asarray, run.state.params))
-    state = run.state._replace(params=params, extra=place)
+    state = run.state._replace(params=params, aux_state=place)
     ended = hostile.train(run.model, state, frames, folder, steps=steps)
     return ended, picture_of(run, ended.result.state, frames, 0)
 
@@ -119,7 +119,7 @@ def test_where_the_origin_of_the_world_is_cannot_be_seen(name):
     for film in (capture, shifted):
         place = tiny_fields.place_of(scene.metadata_of(film, run.spec))
         frames = tiny_fields.frames_of(film, run.model.required_data)
-        pictures.append(picture_of(run, state._replace(extra=place), frames, 1))
+        pictures.append(picture_of(run, state._replace(aux_state=place), frames, 1))
     # A shift of 4 units is rounded to 2e-7, five times that in units of the field; the
     # fine samples move with it.
     jax.tree.map(

@@ -1,7 +1,7 @@
 """The papers' radiance fields shrunk to a few numbers, and whole runs of them.
 
 A field is compiled once. What a hostile start changes, down to the box of the scene and
-the rate of the optimiser, travels as arrays in `TrainState.extra`.
+the rate of the optimiser, travels as arrays in `TrainState.aux_state`.
 """
 
 import copy
@@ -133,19 +133,19 @@ def start(spec: RadianceScene, capture: Capture) -> Run:
     model = scene.build(spec, metadata)
 
     def step(state, frames):
-        here = scene.build(spec, moved(metadata, state.extra))
+        here = scene.build(spec, moved(metadata, state.aux_state))
         new, metrics = here.step(state, frames)
-        params = hostile.sped_up(state.params, new.params, state.extra.speed)
+        params = hostile.sped_up(state.params, new.params, state.aux_state.speed)
         return new._replace(params=params), metrics
 
     view = evaluate.view_of(capture, int(capture.train[0]))
 
     @jax.jit
     def picture(state, camera, time) -> Rendering:
-        here = scene.build(spec, moved(metadata, state.extra))
+        here = scene.build(spec, moved(metadata, state.aux_state))
         seen = view._replace(camera=camera, time=time)
         return here.render(state.params, seen, PICTURE, state.step)
 
     state = model.init(capture, jax.random.key(0))
-    state = state._replace(extra=place_of(metadata))
+    state = state._replace(aux_state=place_of(metadata))
     return Run(spec, capture, model._replace(step=step), state, picture)
