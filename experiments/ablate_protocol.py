@@ -219,8 +219,8 @@ def follow_fields(spec, facts, state, capture, known) -> Followed | None:
     warp of every other moment.
     """
     from nerfies_jax import scene
-    from nerfies_jax.effects.effect import FrameCondition
     from nerfies_jax.training import tracks
+    from nerfies_jax.training.effects import FrameCondition
 
     made = scene.field(spec, facts)
     if all(effect.displace is None for effect in made.effects) or not len(known.path):

@@ -111,9 +111,9 @@ def warp_and_rays(rays: int, samples: int):
     import jax.numpy as jnp
 
     from nerfies_jax.effects import warp
-    from nerfies_jax.effects.effect import FrameCondition
     from nerfies_jax.effects.warp import WarpSpec
     from nerfies_jax.radiance import compositing
+    from nerfies_jax.training.effects import FrameCondition
 
     keys = jax.random.split(jax.random.key(0), 6)
     params = warp.init(WarpSpec(), keys[0])
@@ -142,9 +142,10 @@ def penalty(params, key, batch, points):
     import jax.numpy as jnp
 
     from nerfies_jax.effects import elastic, warp
-    from nerfies_jax.effects.effect import Context, RayOutput
+    from nerfies_jax.effects.effect import RayOutput
     from nerfies_jax.effects.elastic import ElasticSpec
     from nerfies_jax.effects.warp import WarpSpec
+    from nerfies_jax.training.effects import PenaltyContext
 
     point, weight, conditions = batch
     if points is None:
@@ -156,13 +157,13 @@ def penalty(params, key, batch, points):
         weight = jnp.take_along_axis(weight, chosen, axis=1) * (samples / 4)
     nothing = dict.fromkeys(RayOutput._fields)
     level = RayOutput(**nothing | {"point": point, "static_weight": weight})
-    context = Context(
-        **dict.fromkeys(Context._fields)
+    context = PenaltyContext(
+        **dict.fromkeys(PenaltyContext._fields)
         | {
             "displace": lambda x, condition: warp.displace(
                 WarpSpec(), params, x, condition
             ),
-            "conditions": conditions,
+            "condition": conditions,
             "levels": (level,),
             "key": key,
         }

@@ -12,8 +12,8 @@ import numpy as np
 from experiments import evaluate
 from nerfies_jax import render_ray, scene
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.effects.effect import APPEARANCE, FrameCondition
 from nerfies_jax.training import fit, losses
+from nerfies_jax.training.effects import APPEARANCE, FrameCondition
 from nerfies_jax.training.model import (
     Rendering,
     TrainState,

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 
 from nerfies_jax.measure import clock
 from nerfies_jax.training import loop, losses
+from nerfies_jax.training.effects import weighted_sum
 from nerfies_jax.training.model import Frames, Model, Rendering, TrainState
 
 REPEATS = 7
@@ -20,13 +21,13 @@ def of_splats(
     the optimiser and the statistics for the density control.
     """
     from gaussians_jax import render, scene, splats
-    from gaussians_jax.effects.effect import FrameCondition
+    from nerfies_jax.training.effects import FrameCondition
 
     params = state.params
     size = frames.images.shape[2], frames.images.shape[1]
     camera = jax.tree.map(lambda leaf: leaf[0], frames.cameras)
-    shot = scene.shot(frames, 0, None)
-    condition = FrameCondition(frames.times[0], state.step, state.key)
+    observation = scene.observe(frames, 0, None)
+    condition = FrameCondition(frames.times[0], step=state.step, key=state.key)
     effects = scene.effects_of(spec, facts)
 
     def draw(gaussians, coefficients):
@@ -37,14 +38,14 @@ def of_splats(
 
     def compare(colour):
         return losses.photometric(
-            colour, shot.truth, shot.valid, dssim_weight=spec.dssim_weight
+            colour, observation.truth, observation.valid, dssim_weight=spec.dssim_weight
         )
 
     gaussians = splats.activate(params.rows["splats"])
     coefficients = splats.active_harmonics(params.rows["splats"], spec.sh_degree)
     timed = {
         "project and blend": _ms(jax.grad(draw, (0, 1)), gaussians, coefficients),
-        "loss": _ms(jax.grad(compare), shot.truth),
+        "loss": _ms(jax.grad(compare), observation.truth),
     }
     for effect in effects:
 
@@ -53,14 +54,16 @@ def of_splats(
                 effect,
                 effects,
                 params,
-                shot._replace(rendering=rendering),
+                observation._replace(rendering=rendering),
                 condition,
                 state,
             )
 
         kept = state.aux_state.effects.get(effect.name)
-        drawn = Rendering(shot.truth, *(jnp.ones(shot.truth.shape[:2]) for _ in "ad"))
-        if {effect.deform, effect.image_loss, effect.penalty} != {None}:
+        drawn = Rendering(
+            observation.truth, *(jnp.ones(observation.truth.shape[:2]) for _ in "ad")
+        )
+        if {effect.deform, effect.penalty} != {None}:
             slope = jax.grad(one, (0, 1))
             timed[effect.name.replace("_", " ")] = _ms(slope, params, drawn, kept)
     whole = _ms(model.step, state, frames)
@@ -68,23 +71,27 @@ def of_splats(
     return timed
 
 
-def _sum_of_effect(effect, effects, params, shot, condition, state):
+def _sum_of_effect(effect, effects, params, observation, condition, state):
     """A scalar whose gradient takes the work of one effect in a step."""
     from gaussians_jax import splats
     from gaussians_jax.effects import deformation
-    from gaussians_jax.effects.effect import Around
+    from nerfies_jax.training.effects import PenaltyContext, penalty_terms
 
     total = jnp.zeros(())
     if effect.deform is not None:
         gaussians = splats.activate(params.rows["splats"])
         moved = deformation.pose_in_training((effect,), params, gaussians, condition)
         total += sum(jnp.sum(leaf) for leaf in moved)
-    if effect.image_loss is not None:
-        total += effect.image_loss(params, shot, condition).value
-    if effect.penalty is not None:
-        at_time = deformation.poser(effects, condition)
-        total += effect.penalty(Around(params, at_time, condition, state)).value
-    return total
+    context = PenaltyContext(
+        condition=condition,
+        step=condition.step,
+        key=condition.key,
+        params=params,
+        observation=observation,
+        at_time=deformation.poser(effects, condition),
+    )
+    states = {effect.name: state}
+    return weighted_sum(penalty_terms((effect,), params.nets, context, states), total)
 
 
 def of_fields(
@@ -98,10 +105,8 @@ def of_fields(
     batch = jax.jit(scene.draw_batch, static_argnums=1)(frames, spec.rays, batch_key)
 
     def loss(params, frames, batch):
-        terms = scene.loss_terms(
-            spec, facts, made, params, frames, batch, state.step, loss_key
-        )
-        return sum(term.weight * term.value for term in terms.values())
+        terms = scene.loss_terms(made, params, frames, batch, state.step, loss_key)
+        return weighted_sum(terms)
 
     forward = _ms(loss, state.params, frames, batch)
     both = _ms(jax.value_and_grad(loss), state.params, frames, batch)

@@ -39,7 +39,7 @@ def of_splats(spec, facts, without: tuple[str, ...], blended: bool) -> Model:
 def of_fields(spec, facts, without: tuple[str, ...], blended: bool) -> Model:
     """The model with some effects left out of its pictures, or drawing a `Between`."""
     from nerfies_jax import scene
-    from nerfies_jax.effects.effect import APPEARANCE
+    from nerfies_jax.training.effects import APPEARANCE
 
     whole = scene.field(spec, facts)
     # What feeds the network's inputs is part of it; a penalty draws nothing.

@@ -10,7 +10,6 @@ from jaxtyping import Array, Float, Int, Key
 
 from gaussians_jax import density, phases, rates, render, splats, start
 from gaussians_jax.effects import deformation
-from gaussians_jax.effects.effect import Around, Effect, FrameCondition, Shot
 from gaussians_jax.phases import Trained
 from gaussians_jax.spec import (
     OPTIMISERS,
@@ -22,6 +21,17 @@ from gaussians_jax.spec import (
 from gaussians_jax.splats import Params
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.training import loop, losses
+from nerfies_jax.training.effects import (
+    FIELD_SEAMS,
+    Effect,
+    FrameCondition,
+    Observation,
+    PenaltyContext,
+    joined,
+    penalty_terms,
+    values,
+    weighted_sum,
+)
 from nerfies_jax.training.model import (
     Event,
     Frames,
@@ -32,6 +42,7 @@ from nerfies_jax.training.model import (
     View,
     in_default_precision,
 )
+from nerfies_jax.training.updates import apply_updates
 
 PyTree = Any
 
@@ -66,9 +77,34 @@ def states_of(effects: tuple[Effect, ...], params: Params) -> dict[str, PyTree]:
     }
 
 
-def build(spec: SplatScene, metadata: SceneMetadata) -> Model:
-    """Everything the loop, the renderer and the report need of this scene."""
-    effects = effects_of(spec, metadata)
+def all_effects(
+    spec: SplatScene, metadata: SceneMetadata, more: tuple[Effect, ...] = ()
+) -> tuple[Effect, ...]:
+    """The effects of a spec and then `more`, each with the learning rates it needs."""
+    own = effects_of(spec, metadata)
+    every = joined(own, more, refused=FIELD_SEAMS, reserved=("splats",))
+    for effect in every:
+        for seam, rate in (
+            ("init", "learning_rate"),
+            ("init_rows", "row_learning_rate"),
+        ):
+            if getattr(effect, seam) and not getattr(effect, rate):
+                raise ValueError(
+                    f"the effect {effect.name!r} has {seam} and no {rate}, so what it "
+                    f"starts would not train; give it a {rate}, a function of the step"
+                )
+    return every
+
+
+def build(
+    spec: SplatScene, metadata: SceneMetadata, effects: tuple[Effect, ...] = ()
+) -> Model:
+    """Everything the loop, the renderer and the report need of this scene.
+
+    `effects` act behind those of the spec.
+    """
+    more = tuple(effect.name for effect in effects)
+    effects = all_effects(spec, metadata, effects)
     # Counts updates per row; for the networks, whose rows are never born, it is plain.
     optimiser = OPTIMISERS[spec.optimiser]()
     stages = _stages(spec, metadata, effects)
@@ -78,7 +114,8 @@ def build(spec: SplatScene, metadata: SceneMetadata) -> Model:
         return stages.draw(params, posed, view, size, step)
 
     return Model(
-        spec=(spec, metadata),
+        # By name alone: a run with other effects of one's own is another run.
+        spec=(spec, metadata, *more),
         init=lambda capture, key: first_state(spec, effects, optimiser, capture, key),
         step=_stepper(spec, metadata, effects, optimiser),
         render=whole_frame,
@@ -128,7 +165,7 @@ def _stepper(spec, metadata, effects, optimiser):
         view = _view(frames, row)
         size = frames.images.shape[2], frames.images.shape[1]
         degree = splats.active_degree(state.step, spec.sh_every, spec.sh_degree)
-        condition = FrameCondition(view.time, state.step, loop.step_key(state))
+        condition = FrameCondition(view.time, step=state.step, key=loop.step_key(state))
         turn = phases.turn(spec.alternation, state.step)
 
         def posed(params, gaussians):
@@ -146,18 +183,18 @@ def _stepper(spec, metadata, effects, optimiser):
             frame = _draw(
                 spec, metadata, params, moved, view, size, degree, probe, depth
             )
-            seen = shot(frames, row, frame.rendering)
+            seen = observe(frames, row, frame.rendering)
             states = state.aux_state.effects
             value, metrics = loss_of(spec, effects, params, seen, condition, states)
             return value, (metrics, frame.footprints, canonical, moved)
 
         probe = jnp.zeros_like(state.params.rows["splats"].mean[:, :2])
-        (value, (metrics, footprints, *poses)), (slopes, probe_slope) = (
+        (value, (metrics, footprints, *poses)), (grads, mean2d_grad) = (
             jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)(state.params, probe)
         )
-        directions, moments = optimiser.update(slopes, state.optimiser, state.params)
-        rate = _rates(spec, metadata, effects, state.step)
-        trained = Trained(rates.descend(state.params, directions, rate), moments)
+        updates, moments = optimiser.update(grads, state.optimiser, state.params)
+        by_part = _learning_rates(spec, metadata, effects, state.step)
+        trained = Trained(apply_updates(state.params, updates, by_part), moments)
         if spec.alternation is not None:
             before = Trained(state.params, state.optimiser)
             trained = phases.hold(optimiser, turn, before, trained)
@@ -165,7 +202,7 @@ def _stepper(spec, metadata, effects, optimiser):
         if spec.density is not None:
             radius_px = jnp.max(footprints.extent_px, axis=1)
             stats = density.observe(
-                stats, probe_slope, footprints.visible, radius_px, size
+                stats, mean2d_grad, footprints.visible, radius_px, size
             )
         for effect in effects:
             if effect.update_state is not None:
@@ -181,37 +218,34 @@ def loss_of(
     spec: SplatScene,
     effects: tuple[Effect, ...],
     params: Params,
-    seen: Shot,
+    observation: Observation,
     condition: FrameCondition,
     states: dict[str, PyTree],
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
     """The loss of one frame with what every effect adds, and numbers to log."""
-    colour = seen.rendering.colour
-    value = losses.photometric(
-        colour, seen.truth, seen.valid, dssim_weight=spec.dssim_weight
+    truth, valid = observation.truth, observation.valid
+    colour = observation.rendering.colour
+    photometric = losses.photometric(
+        colour, truth, valid, dssim_weight=spec.dssim_weight
     )
-    metrics = {"mse": losses.mse(colour, seen.truth, seen.valid)}
-
-    at_time = deformation.poser(effects, condition)
-    for effect in effects:
-        terms = []
-        if effect.image_loss is not None:
-            terms.append(effect.image_loss(params, seen, condition))
-        if effect.penalty is not None:
-            own = states.get(effect.name)
-            terms.append(effect.penalty(Around(params, at_time, condition, own)))
-        for term in terms:
-            value = value + term.value
-            named = {f"{effect.name}.{key}": x for key, x in term.metrics.items()}
-            metrics |= {effect.name: term.value} | named
-    return value, metrics
+    context = PenaltyContext(
+        condition=condition,
+        step=condition.step,
+        key=condition.key,
+        params=params,
+        observation=observation,
+        at_time=deformation.poser(effects, condition),
+    )
+    terms = penalty_terms(effects, params.nets, context, states)
+    metrics = {"mse": losses.mse(colour, truth, valid)} | values(terms)
+    return weighted_sum(terms, photometric), metrics
 
 
-def shot(
+def observe(
     frames: Frames, row: Int[Array, ""] | int, rendering: Rendering | None
-) -> Shot:
+) -> Observation:
     """What the losses compare: a frame that was drawn with the one that was filmed."""
-    return Shot(
+    return Observation(
         rendering,
         frames.images[row].astype(frames.times.dtype) / 255,
         None if frames.valid is None else frames.valid[row],
@@ -224,7 +258,7 @@ def _view(frames, row):
     return View(camera, frames.times[row], frames.appearance[row])
 
 
-def _rates(spec, metadata, effects, step):
+def _learning_rates(spec, metadata, effects, step):
     """A prefix of `Params` with the learning rate of everything below each leaf."""
     rows = {
         "splats": rates.learning_rates(
@@ -234,9 +268,9 @@ def _rates(spec, metadata, effects, step):
     nets = {}
     for effect in effects:
         if effect.init_rows is not None:
-            rows[effect.name] = effect.row_rate(step)
-        if effect.init_nets is not None:
-            nets[effect.name] = effect.net_rate(step)
+            rows[effect.name] = effect.row_learning_rate(step)
+        if effect.init is not None:
+            nets[effect.name] = effect.learning_rate(step)
     return Params(rows, nets)
 
 
@@ -278,8 +312,8 @@ def first_state(spec, effects, optimiser, capture, key) -> TrainState:
         rows_key, nets_key = jax.random.split(effect_key)
         if effect.init_rows is not None:
             params.rows[effect.name] = effect.init_rows(rows_key, rows)
-        if effect.init_nets is not None:
-            params.nets[effect.name] = effect.init_nets(nets_key)
+        if effect.init is not None:
+            params.nets[effect.name] = effect.init(nets_key)
     params = splats.pad_rows(params, splats.capacity_for(count, most))
     params = in_default_precision(params)
     stats = () if spec.density is None else density.empty_stats(params.rows["splats"])

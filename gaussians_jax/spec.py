@@ -15,7 +15,6 @@ from gaussians_jax.effects import (
 )
 from gaussians_jax.effects.acceleration import AccelerationSpec
 from gaussians_jax.effects.depth import DepthSpec
-from gaussians_jax.effects.effect import Effect
 from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec
 from gaussians_jax.effects.motion_basis import BasisMotionSpec
@@ -27,6 +26,7 @@ from gaussians_jax.phases import AlternationSpec, AnnealingSpec
 from gaussians_jax.raster_spec import RasterSpec
 from gaussians_jax.rates import RateSpec
 from gaussians_jax.start import StartSpec
+from nerfies_jax.training.effects import Effect
 
 OPTIMISERS = {"adam": scale_by_row_adam, "radam": scale_by_row_radam}
 

@@ -8,20 +8,28 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
 from nerfies_jax import spec as specs
-from nerfies_jax.effects.effect import (
-    MOMENT,
-    Effect,
-    FrameCondition,
-    RayOutput,
-    Table,
-    stream,
-)
+from nerfies_jax.effects.effect import RayOutput
 from nerfies_jax.geometry import rays
 from nerfies_jax.nets import codes
 from nerfies_jax.radiance import template
-from nerfies_jax.render_ray import displacement, field_ray_through, render_ray
+from nerfies_jax.render_ray import (
+    Bound,
+    Ray,
+    displacement,
+    field_ray_through,
+    render_ray,
+)
 from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.spec import RadianceScene
+from nerfies_jax.training.effects import (
+    MOMENT,
+    SPLAT_SEAMS,
+    Effect,
+    FrameCondition,
+    Table,
+    joined,
+    stream,
+)
 from nerfies_jax.training.model import Rendering, View
 
 PyTree = Any
@@ -33,6 +41,8 @@ Codes = dict[str, Float[Array, " code"]]
 class Field(NamedTuple):
     """Pure functions of a field; `params` is what `init` returns."""
 
+    spec: RadianceScene
+    metadata: SceneMetadata
     effects: tuple[Effect, ...]
     init: Callable[[Key[Array, ""]], PyTree]
     codes_at: Callable[[PyTree, View], Codes]  # of a view, by table
@@ -46,28 +56,32 @@ class Field(NamedTuple):
 
 
 def field(
-    spec: RadianceScene, metadata: SceneMetadata, without: tuple[str, ...] = ()
+    spec: RadianceScene,
+    metadata: SceneMetadata,
+    without: tuple[str, ...] = (),
+    effects: tuple[Effect, ...] = (),
 ) -> Field:
-    """The field of a spec, some effects left out by name.
+    """The field of a spec and of more `effects`, some left out by name.
 
     Without "warp" a render shows the canonical scene; without "transient" or
     "scene_flow" only what is static. The parameters stay those of the whole field.
     """
-    effects = specs.effects_of(spec, metadata)
-    tables = specs.tables_of(effects)
-    active = _active(effects, without)
+    own = specs.effects_of(spec, metadata)
+    every = joined(own, effects, refused=SPLAT_SEAMS, reserved=("template", "codes"))
+    tables = specs.tables_of(every)
+    active = _active(every, without)
 
     def init(key):
-        return _init(spec, metadata, effects, key)
+        return _init(spec, metadata, every, key)
 
     def codes_at(params, view):
         return look_up(tables, metadata, params, view.time, view.appearance)
 
     def displace(params, point, condition):
-        return displacement(active, params, point, condition)
+        return displacement(Bound(spec, metadata, active, params), point, condition)
 
-    def levels_of(params, ray, condition, key=None):
-        return render_ray(spec, metadata, active, params, ray, condition, key)
+    def levels_of(params, ray: Ray, condition, key=None):
+        return render_ray(Bound(spec, metadata, active, params), ray, condition, key)
 
     def render(params, camera, time, codes, size, step):
         condition = FrameCondition(time, codes, step)
@@ -85,7 +99,7 @@ def field(
         )
         return jax.tree.map(lambda x: x.reshape(height, width, *x.shape[1:]), flat)
 
-    return Field(active, init, codes_at, levels_of, displace, render)
+    return Field(spec, metadata, active, init, codes_at, levels_of, displace, render)
 
 
 def _active(effects, without):

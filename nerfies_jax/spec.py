@@ -15,7 +15,6 @@ from nerfies_jax.effects import (
 from nerfies_jax.effects.ambient import AmbientSpec
 from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.effects.background import BackgroundSpec
-from nerfies_jax.effects.effect import Effect, Table
 from nerfies_jax.effects.elastic import ElasticSpec
 from nerfies_jax.effects.scene_flow import SceneFlowSpec
 from nerfies_jax.effects.time_condition import TimeSpec
@@ -23,6 +22,7 @@ from nerfies_jax.effects.transient import TransientSpec
 from nerfies_jax.effects.warp import WarpSpec
 from nerfies_jax.radiance.template import TemplateSpec
 from nerfies_jax.scene_metadata import SceneMetadata
+from nerfies_jax.training.effects import Effect, Table
 
 
 @dataclasses.dataclass(frozen=True)

@@ -25,6 +25,7 @@ from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.radiance import compositing, sampling, template
 from nerfies_jax.training import losses, schedules
 from nerfies_jax.training.model import TrainState
+from nerfies_jax.training.updates import apply_updates
 
 FEW = EncodingSpec(2)
 STEPS = 100
@@ -224,7 +225,7 @@ def splat_step(spec, metadata, shuffled_row):
             spec.rates, metadata.extent, spec.steps, state.step
         )
         rates = Params({"splats": rates}, {})
-        params = splat_rates.descend(state.params, direction, rates)
+        params = apply_updates(state.params, direction, rates)
         aux_state = state.aux_state
         if spec.density is not None:
             radius_px = jnp.max(seen.extent_px, axis=1)

@@ -11,18 +11,12 @@ import numpy as np
 
 from nerfies_jax.capture.flow import FrameFlow
 from nerfies_jax.effects import scene_flow
-from nerfies_jax.effects.effect import (
-    Batch,
-    Box,
-    Context,
-    FrameCondition,
-    RayOutput,
-    Sample,
-)
+from nerfies_jax.effects.effect import Batch, Box, RayOutput, Sample
 from nerfies_jax.effects.scene_flow import SceneFlowSpec
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.radiance.template import TemplateSpec
+from nerfies_jax.training.effects import FrameCondition, PenaltyContext
 from nerfies_jax.training.model import Frames
 
 TINY = SceneFlowSpec(
@@ -116,10 +110,10 @@ def context_of(spec, params, frames, batch, distance, features, weight, step):
         median_distance=none,
         beta=None,
     )
-    return Context(
+    return PenaltyContext(
         displace=None,
         condition_of=None,
-        conditions=conditions,
+        condition=conditions,
         batch=batch,
         levels=(level,),
         frames=frames,

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from gaussians_jax import splats
-from gaussians_jax.effects.effect import Around, Effect, Term
+from nerfies_jax.training.effects import Effect, PenaltyContext, Term
 
 NAME = "acceleration"
 _STREAM = zlib.crc32(NAME.encode()) >> 1  # of the step's key, for the choice of rows
@@ -119,8 +119,8 @@ def effect(spec: AccelerationSpec, extent: float, frames: int) -> Effect:
     interval = spec.interval / (frames - 1)
     decay = spec.decay * extent
 
-    def penalty(around: Around) -> Term:
-        params, condition = around.params, around.condition
+    def penalty(_, context: PenaltyContext) -> dict[str, Term]:
+        params, condition = context.params, context.condition
         alive = splats.alive(params.rows["splats"])
         key = jax.random.fold_in(condition.key, _STREAM)
         rows = draw_living(key, alive, min(spec.samples, alive.shape[0]))
@@ -129,7 +129,7 @@ def effect(spec: AccelerationSpec, extent: float, frames: int) -> Effect:
             some = splats.take_rows(params, rows)
             canonical = some.rows["splats"].mean
             times = instants(condition.time, interval)
-            before, now, after = (around.at_time(some, t).mean for t in times)
+            before, now, after = (context.at_time(some, t).mean for t in times)
             value = unrest(canonical, before, now, after, decay, spec.drift)
             still = jnp.mean(_stillness(canonical, now, decay))
             there = jnp.any(alive)
@@ -145,6 +145,6 @@ def effect(spec: AccelerationSpec, extent: float, frames: int) -> Effect:
             value, still = jax.lax.cond(
                 condition.step < spec.start, nothing, evaluate, params
             )
-        return Term(spec.weight * value, {"unrest": value, "still": still})
+        return {"unrest": Term(value, spec.weight), "still": Term(still, None)}
 
     return Effect(name=NAME, penalty=penalty)

@@ -1,14 +1,16 @@
 """The motion of a scene: every effect that deforms, one after the other."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 from jaxtyping import Array, Float
 
 from gaussians_jax import splats
-from gaussians_jax.effects.effect import Effect, FrameCondition, PyTree
 from gaussians_jax.splats import Gaussians, Params
+from nerfies_jax.training.effects import Effect, FrameCondition
 
+PyTree = Any
 Effects = tuple[Effect, ...]
 
 
@@ -71,7 +73,7 @@ def pose_in_training(
 def poser(
     effects: Effects, condition: FrameCondition
 ) -> Callable[[Params, Float[Array, ""]], Gaussians]:
-    """A function of rows and of a time near `condition`, for `effect.Around`."""
+    """A function of rows and of a time near `condition`, for `PenaltyContext`."""
 
     def at_time(params, time):
         gaussians = splats.activate(params.rows["splats"])

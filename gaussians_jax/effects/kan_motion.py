@@ -20,13 +20,13 @@ from jaxtyping import Array, Bool, Float, Key
 
 from gaussians_jax import splats
 from gaussians_jax.effects.blocks import in_blocks
-from gaussians_jax.effects.effect import Effect, FrameCondition
 from gaussians_jax.splats import Gaussians, Params
 from nerfies_jax.geometry import quaternion
 from nerfies_jax.nets import codes, kan, mlp
 from nerfies_jax.nets.kan import KAN, KANSpec
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
+from nerfies_jax.training.effects import Effect, FrameCondition
 
 NAME = "kan_motion"
 NETWORKS = ("kan", "mlp")
@@ -327,7 +327,7 @@ def effect(spec: KanMotionSpec, steps: int, frames: int) -> Effect:
     def init_rows(key, rows):
         return init_embedding(key, spec, rows.mean)
 
-    def init_nets(key):
+    def init_networks(key):
         return init(key, spec, frames)
 
     def embedding_rate(step):
@@ -350,9 +350,9 @@ def effect(spec: KanMotionSpec, steps: int, frames: int) -> Effect:
     return Effect(
         name=NAME,
         init_rows=init_rows,
-        init_nets=init_nets,
-        row_rate=embedding_rate,
-        net_rate=schedules.log_linear(spec.rate, spec.rate_end, steps),
+        init=init_networks,
+        row_learning_rate=embedding_rate,
+        learning_rate=schedules.log_linear(spec.rate, spec.rate_end, steps),
         warm_up=spec.warm_up,
         prepare=prepared,
         deform=moved,

@@ -15,12 +15,12 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from gaussians_jax import splats
 from gaussians_jax.effects.blocks import in_blocks
-from gaussians_jax.effects.effect import Effect, FrameCondition
 from gaussians_jax.splats import Gaussians, Params
 from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
+from nerfies_jax.training.effects import Effect, FrameCondition
 
 NAME = "mlp_motion"
 SCALE_RULES = ("log", "linear")
@@ -236,7 +236,7 @@ def smooth_time(
 def effect(spec: MotionSpec, steps: int, frames: int) -> Effect:
     """The seams that this motion fills, for a run of `steps` over `frames`."""
 
-    def init_nets(key):
+    def init_networks(key):
         return init(key, spec)
 
     def moved(
@@ -253,8 +253,8 @@ def effect(spec: MotionSpec, steps: int, frames: int) -> Effect:
 
     return Effect(
         name=NAME,
-        init_nets=init_nets,
-        net_rate=schedules.log_linear(spec.rate, spec.rate_end, steps),
+        init=init_networks,
+        learning_rate=schedules.log_linear(spec.rate, spec.rate_end, steps),
         warm_up=spec.warm_up,
         deform=moved,
     )

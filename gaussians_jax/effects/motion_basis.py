@@ -18,7 +18,6 @@ from jaxtyping import Array, Bool, Float, Key
 from gaussians_jax import splats
 from gaussians_jax.effects import mlp_motion
 from gaussians_jax.effects.blocks import in_blocks
-from gaussians_jax.effects.effect import Effect, FrameCondition
 from gaussians_jax.effects.mlp_motion import SmoothingSpec
 from gaussians_jax.splats import Gaussians, Params
 from nerfies_jax.geometry import quaternion
@@ -26,6 +25,7 @@ from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
+from nerfies_jax.training.effects import Effect, FrameCondition
 
 NAME = "motion_basis"
 BASIS_FORMS = ("bounded", "free")
@@ -366,7 +366,7 @@ def multiply_adds(spec: BasisMotionSpec) -> dict[str, int]:
 def effect(spec: BasisMotionSpec, steps: int, frames: int) -> Effect:
     """The seams that this motion fills, for a run of `steps` over `frames`."""
 
-    def init_nets(key):
+    def init_networks(key):
         return init(key, spec)
 
     def prepared(params: Params) -> Prepared:
@@ -390,8 +390,8 @@ def effect(spec: BasisMotionSpec, steps: int, frames: int) -> Effect:
 
     return Effect(
         name=NAME,
-        init_nets=init_nets,
-        net_rate=schedules.log_linear(spec.rate, spec.rate_end, steps),
+        init=init_networks,
+        learning_rate=schedules.log_linear(spec.rate, spec.rate_end, steps),
         warm_up=spec.warm_up,
         prepare=prepared,
         deform=moved,

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from gaussians_jax.effects.effect import Effect, FrameCondition
 from gaussians_jax.splats import Gaussians, Params
+from nerfies_jax.training.effects import Effect, FrameCondition
 
 NAME = "motion_growth"
 FORMS = ("soft", "hard")

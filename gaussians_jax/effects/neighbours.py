@@ -17,8 +17,8 @@ import scipy.spatial
 from jaxtyping import Array, Bool, Float, Int
 
 from gaussians_jax import splats
-from gaussians_jax.effects.effect import Around, Effect, Term
 from gaussians_jax.splats import Params
+from nerfies_jax.training.effects import Effect, PenaltyContext, Term
 
 NAME = "neighbours"
 SCALES = ("spacing", "extent", "units")
@@ -162,23 +162,26 @@ def effect(spec: NeighbourSpec, extent: float, of: str) -> Effect:
             )
         return find(spec, params, extent)
 
-    def penalty(around: Around) -> Term:
-        alive = splats.alive(around.params.rows["splats"])
-        graph = around.state
+    def penalty(_, context: PenaltyContext) -> dict[str, Term]:
+        alive = splats.alive(context.params.rows["splats"])
+        graph = context.state
 
         def evaluate(embedding):
-            return spec.weight * inconsistency(embedding, graph, alive)
+            return inconsistency(embedding, graph, alive)
 
-        value = _from_step(spec.start, around, evaluate, around.params.rows[of])
+        value = _from_step(spec.start, context.step, evaluate, context.params.rows[of])
         linked = jnp.mean((graph.weight > LINKED).astype(value.dtype), axis=1)
         living = jnp.maximum(jnp.sum(alive), 1).astype(value.dtype)
         # Dead rows have no weight and so are not counted.
-        return Term(value, {"linked": jnp.sum(linked) / living})
+        return {
+            "inconsistency": Term(value, spec.weight),
+            "linked": Term(jnp.sum(linked) / living, None),
+        }
 
     return Effect(name=NAME, state=state, penalty=penalty)
 
 
-def _from_step(start, around, evaluate, embedding):
+def _from_step(start, step, evaluate, embedding):
     """`evaluate(embedding)`, or zero in the steps before `start`."""
     if start == 0:
         return evaluate(embedding)
@@ -186,4 +189,4 @@ def _from_step(start, around, evaluate, embedding):
     def nothing(embedding):
         return jnp.zeros((), embedding.dtype)
 
-    return jax.lax.cond(around.condition.step < start, nothing, evaluate, embedding)
+    return jax.lax.cond(step < start, nothing, evaluate, embedding)

@@ -11,7 +11,7 @@ switch, and under the published presets their gradient is exactly zero.
 
 import dataclasses
 
-from nerfies_jax.effects.effect import APPEARANCE, Effect, Table
+from nerfies_jax.training.effects import APPEARANCE, Effect, Table
 
 
 @dataclasses.dataclass(frozen=True)

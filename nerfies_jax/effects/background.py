@@ -10,8 +10,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from nerfies_jax.effects.effect import Context, Effect, Scalar, Term
+from nerfies_jax.effects.effect import Scalar
 from nerfies_jax.training import losses
+from nerfies_jax.training.effects import Effect, PenaltyContext, Term
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,7 +52,7 @@ def effect(spec: BackgroundSpec) -> Effect:
     return Effect("background", penalty=penalty, required_data=frozenset({"points"}))
 
 
-def drift(spec: BackgroundSpec, context: Context) -> Scalar:
+def drift(spec: BackgroundSpec, context: PenaltyContext) -> Scalar:
     """Mean over static points of ρ(|displacement|²).
 
     With no more points than `spec.points` all are taken, each once; of more, as many
@@ -72,7 +73,7 @@ def drift(spec: BackgroundSpec, context: Context) -> Scalar:
 
 def mean_drift(
     spec: BackgroundSpec,
-    context: Context,
+    context: PenaltyContext,
     point: Float[Array, "points 3"],
     rows: Int[Array, " points"],
 ) -> Scalar:

@@ -12,9 +12,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
-from nerfies_jax.effects.effect import Context, Effect, RayOutput, Scalar, Term
+from nerfies_jax.effects.effect import RayOutput, Scalar
 from nerfies_jax.geometry import matrix3
 from nerfies_jax.training import losses, schedules
+from nerfies_jax.training.effects import Effect, PenaltyContext, Term
 
 Matrix = Float[Array, "3 3"]
 
@@ -76,7 +77,7 @@ def effect(spec: ElasticSpec) -> Effect:
         weight = schedule(spec)
         if callable(weight):
             weight = weight(context.step)
-        return {"elastic": Term(value, weight), "folded": Term(folded, 0.0)}
+        return {"elastic": Term(value, weight), "folded": Term(folded, None)}
 
     return Effect("elastic", penalty=penalty)
 
@@ -111,7 +112,7 @@ def determinant(displacement: Matrix) -> Scalar:
     )
 
 
-def energy(spec: ElasticSpec, context: Context) -> tuple[Scalar, Scalar]:
+def energy(spec: ElasticSpec, context: PenaltyContext) -> tuple[Scalar, Scalar]:
     """Mean over rays of Σ_s w_s cost_s on the coarse level, and the share of folds.
 
     The weights are those of the static medium, which is what the warp deforms, and get
@@ -126,7 +127,7 @@ def energy(spec: ElasticSpec, context: Context) -> tuple[Scalar, Scalar]:
         folded = determinant(jax.lax.stop_gradient(jacobian)) < 0
         return cost(spec, jacobian), folded.astype(point.dtype)
 
-    costs, folded = jax.vmap(jax.vmap(at, (0, None)))(point, context.conditions)
+    costs, folded = jax.vmap(jax.vmap(at, (0, None)))(point, context.condition)
     seen = jnp.sum(weight)
     share = jnp.sum(weight * folded) / jnp.where(seen > 0, seen, 1)
     return jnp.mean(jnp.sum(weight * costs, axis=-1)), share

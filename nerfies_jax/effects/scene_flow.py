@@ -17,22 +17,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from nerfies_jax.effects import scene_flow_losses as flow_losses
-from nerfies_jax.effects.effect import (
-    Context,
-    Effect,
-    FrameCondition,
-    Medium,
-    RayOutput,
-    Sample,
-    Scalar,
-    Term,
-    Vector,
-)
+from nerfies_jax.effects.effect import Medium, RayOutput, Sample, Scalar, Vector
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.radiance import compositing, template
 from nerfies_jax.radiance.template import Template, TemplateSpec
+from nerfies_jax.training.effects import Effect, FrameCondition, PenaltyContext, Term
 
 NAME = "scene_flow"
 FORWARD, BACKWARD = 0, 1  # places in everything that has a side
@@ -141,7 +132,7 @@ def effect(spec: SceneFlowSpec, moments: int, features: int) -> Effect:
         NAME,
         init=lambda key: init(spec, key, features),
         medium=functools.partial(medium, spec),
-        penalty=lambda params, context: penalty(spec, gap, params, context),
+        penalty=functools.partial(penalty, spec, gap),
         required_data=frozenset(
             name for name, weight in required_data.items() if weight > 0
         ),
@@ -210,14 +201,18 @@ def medium(
 
 
 def neighbour(
-    spec: SceneFlowSpec, gap: float, params: SceneFlow, context: Context, side: int
+    spec: SceneFlowSpec,
+    gap: float,
+    params: SceneFlow,
+    context: PenaltyContext,
+    side: int,
 ) -> Neighbour:
     """The samples of the last level at the moment after (FORWARD) or before them."""
     level = context.levels[-1]
     extras = level.media[NAME].extras
     flow = extras[("flow_forward", "flow_backward")[side]]
     point = level.point + flow
-    time = context.conditions.time + SIGNS[side] * gap
+    time = context.condition.time + SIGNS[side] * gap
     # Half a gap of slack: times are rounded, and need not be quite even.
     present = (time > -gap / 2) & (time < 1 + gap / 2)
 
@@ -262,7 +257,7 @@ def fading(decay_steps: int, step: Int[Array, ""]) -> Scalar:
 
 
 def penalty(
-    spec: SceneFlowSpec, gap: float, params: SceneFlow, context: Context
+    spec: SceneFlowSpec, gap: float, params: SceneFlow, context: PenaltyContext
 ) -> dict[str, Term]:
     """All losses beside that of the blended picture, as logged."""
     batch, level = context.batch, context.levels[-1]
@@ -329,7 +324,7 @@ def picture_mask(
     return jnp.where(step < spec.decay_steps, 1, jnp.clip(share, 0, 1))
 
 
-def depth_term(context: Context, weight: Float[Array, "rays samples"]) -> Scalar:
+def depth_term(context: PenaltyContext, weight: Float[Array, "rays samples"]) -> Scalar:
     """How far the medium's own depth is from the capture's, both normalised."""
     batch, level = context.batch, context.levels[-1]
     known = _pixels(context.frames.depths, batch.row, batch.pixel)
@@ -341,7 +336,7 @@ def depth_term(context: Context, weight: Float[Array, "rays samples"]) -> Scalar
 
 
 def flow_term(
-    context: Context,
+    context: PenaltyContext,
     gap: float,
     weight: Float[Array, "rays samples"],
     sides: list[Neighbour],
@@ -360,7 +355,7 @@ def flow_term(
     total = jnp.zeros((), level.point.dtype)
     for sign, one, (shift, seen, rows) in zip(SIGNS, sides, pairs, strict=True):
         other = rows[batch.row].astype(batch.row.dtype)
-        elapsed = sign * (frames.times[other] - context.conditions.time) / gap
+        elapsed = sign * (frames.times[other] - context.condition.time) / gap
         point = level.point + elapsed[:, None, None] * one.flow
         place = flow_losses.settle(weight, point) / context.box.scale
         camera = cameras.take(frames.cameras, other)

@@ -10,9 +10,9 @@ import dataclasses
 
 from jaxtyping import Array, Float
 
-from nerfies_jax.effects.effect import MOMENT, Effect, FrameCondition, Table
 from nerfies_jax.nets import encoding
 from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.training.effects import MOMENT, Effect, FrameCondition, Table
 
 CONDITIONS = ("time", "code")
 

@@ -13,19 +13,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
-from nerfies_jax.effects.effect import (
-    APPEARANCE,
-    Context,
-    Effect,
-    FrameCondition,
-    Medium,
-    Sample,
-    Table,
-    Term,
-)
+from nerfies_jax.effects.effect import Medium, Sample
 from nerfies_jax.nets import mlp
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
 from nerfies_jax.training import losses
+from nerfies_jax.training.effects import (
+    APPEARANCE,
+    Effect,
+    FrameCondition,
+    PenaltyContext,
+    Table,
+    Term,
+)
 
 NAME = TABLE = "transient"
 
@@ -83,6 +82,7 @@ def effect(spec: TransientSpec, features: int) -> Effect:
         init=lambda key: init(spec, key, features),
         medium=functools.partial(medium, spec),
         penalty=lambda _, context: penalty(spec, context),
+        beta_min=spec.beta_min,
     )
 
 
@@ -148,7 +148,7 @@ def photometric(
     return losses.masked_mean(each[..., None], valid)
 
 
-def penalty(spec: TransientSpec, context: Context) -> dict[str, Term]:
+def penalty(spec: TransientSpec, context: PenaltyContext) -> dict[str, Term]:
     """The mean transient density of the finest samples of the valid rays.
 
     The last term of equation 13. In units of the field: where the box is scaled by s,

@@ -13,12 +13,13 @@ import math
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
-from nerfies_jax.effects.effect import MOMENT, Effect, FrameCondition, Table, Vector
+from nerfies_jax.effects.effect import Vector
 from nerfies_jax.geometry import lie
 from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
+from nerfies_jax.training.effects import MOMENT, Effect, FrameCondition, Table
 
 KINDS = ("se3", "translation")
 CONDITIONS = ("code", "time")

@@ -10,9 +10,9 @@ import pytest
 
 from nerfies_jax.effects import ambient
 from nerfies_jax.effects.ambient import AmbientSpec
-from nerfies_jax.effects.effect import MOMENT, FrameCondition, Table
 from nerfies_jax.nets import mlp
 from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.training.effects import MOMENT, FrameCondition, Table
 from tests import gradients
 
 BENT = AmbientSpec(

@@ -12,13 +12,13 @@ from experiments import evaluate
 from nerfies_jax import presets, scene
 from nerfies_jax.effects import appearance
 from nerfies_jax.effects.appearance import AppearanceSpec
-from nerfies_jax.effects.effect import APPEARANCE, FrameCondition, Table
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.radiance.template import TemplateSpec
 from nerfies_jax.render_ray import Ray
 from nerfies_jax.scene import RadianceScene
 from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.spec import SamplingSpec
+from nerfies_jax.training.effects import APPEARANCE, FrameCondition, Table, weighted_sum
 from tests import gradients, scenes
 
 TINY = RadianceScene(
@@ -157,8 +157,6 @@ def test_codes_of_every_preset_learn(name):
 
     def loss(codes):
         terms = scene.loss_terms(
-            spec,
-            metadata,
             made,
             params | {"codes": params["codes"] | {"appearance": codes}},
             frames,
@@ -166,7 +164,7 @@ def test_codes_of_every_preset_learn(name):
             jnp.int32(0),
             keys[1],
         )
-        return sum(term.weight * term.value for term in terms.values())
+        return weighted_sum(terms)
 
     slope = jax.jit(jax.grad(loss))(params["codes"]["appearance"])
     assert np.all(np.isfinite(slope))

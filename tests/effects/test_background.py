@@ -7,9 +7,10 @@ import pytest
 
 from nerfies_jax.effects import background, warp
 from nerfies_jax.effects.background import BackgroundSpec
-from nerfies_jax.effects.effect import Box, Context, FrameCondition
+from nerfies_jax.effects.effect import Box
 from nerfies_jax.effects.warp import WarpSpec
 from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.training.effects import FrameCondition, PenaltyContext
 from nerfies_jax.training.model import Frames
 from tests import gradients
 
@@ -18,10 +19,10 @@ CENTRE, SCALE = np.array([1.0, -2.0, 3.0]), 0.25
 
 def context(displace, points, frames, dtype, key=0):
     """Frame k is at time k / 10."""
-    fields = dict.fromkeys(Context._fields)
+    fields = dict.fromkeys(PenaltyContext._fields)
     times = jnp.arange(frames, dtype=dtype) / 10
     seen = Frames(**dict.fromkeys(Frames._fields))
-    return Context(
+    return PenaltyContext(
         **fields
         | {
             "displace": displace,

@@ -11,10 +11,11 @@ import pytest
 import scipy.spatial.transform
 
 from nerfies_jax.effects import elastic, warp
-from nerfies_jax.effects.effect import Context, FrameCondition, RayOutput
+from nerfies_jax.effects.effect import RayOutput
 from nerfies_jax.effects.elastic import ElasticSpec
 from nerfies_jax.effects.warp import WarpSpec
 from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.training.effects import FrameCondition, PenaltyContext
 from tests import gradients
 
 TURN = scipy.spatial.transform.Rotation.from_rotvec([0.3, -0.5, 0.7]).as_matrix()
@@ -204,12 +205,12 @@ def level(point, weight):
 
 
 def context(displace, point, weight, conditions, key=0, step=0):
-    fields = dict.fromkeys(Context._fields)
-    return Context(
+    fields = dict.fromkeys(PenaltyContext._fields)
+    return PenaltyContext(
         **fields
         | {
             "displace": displace,
-            "conditions": conditions,
+            "condition": conditions,
             "levels": (level(point, weight), None),
             "step": jnp.int32(step),
             "key": jax.random.key(key),

@@ -11,10 +11,11 @@ import pytest
 from experiments import evaluate
 from nerfies_jax import scene
 from nerfies_jax.effects import scene_flow
-from nerfies_jax.effects.effect import FrameCondition, Sample
+from nerfies_jax.effects.effect import Sample
 from nerfies_jax.effects.scene_flow import FlowWeights, SceneFlowSpec
 from nerfies_jax.scene import RadianceScene
 from nerfies_jax.spec import SamplingSpec
+from nerfies_jax.training.effects import FrameCondition
 from tests import gradients, scenes
 from tests.scene_flow_rays import (
     BOX_CENTRE,

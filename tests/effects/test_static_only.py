@@ -11,13 +11,13 @@ import pytest
 from experiments import evaluate
 from nerfies_jax import scene
 from nerfies_jax.effects.appearance import AppearanceSpec
-from nerfies_jax.effects.effect import FrameCondition
 from nerfies_jax.effects.transient import TransientSpec
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.radiance.template import TemplateSpec
 from nerfies_jax.render_ray import Ray
 from nerfies_jax.scene import RadianceScene
 from nerfies_jax.spec import SamplingSpec
+from nerfies_jax.training.effects import FrameCondition
 from tests import scenes
 
 TINY = RadianceScene(
@@ -90,7 +90,7 @@ def test_left_out_it_is_a_transient_of_no_density(dtype):
     assert np.all(empty.media_weight["transient"] == 0)
     assert left_out.media == {}
     assert left_out.beta is None
-    for name in ("colour", "alpha", "depth", "static_weight", "distance"):
+    for name in ("colour", "alpha", "distance", "static_weight", "distances"):
         one, other = getattr(left_out, name), getattr(empty, name)
         np.testing.assert_allclose(one, other, atol=tolerance, err_msg=name)
     np.testing.assert_allclose(coarse.colour, same_coarse.colour, atol=tolerance)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from nerfies_jax.effects import time_condition
-from nerfies_jax.effects.effect import MOMENT, FrameCondition, Table
 from nerfies_jax.effects.time_condition import TimeSpec
 from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.training.effects import MOMENT, FrameCondition, Table
 from tests import gradients
 
 BY_CODE = TimeSpec(condition="code", code_width=5)

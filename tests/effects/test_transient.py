@@ -8,17 +8,14 @@ import numpy as np
 import pytest
 
 from nerfies_jax.effects import transient
-from nerfies_jax.effects.effect import (
+from nerfies_jax.effects.effect import Batch, Medium, RayOutput, Sample
+from nerfies_jax.effects.transient import TransientSpec
+from nerfies_jax.training.effects import (
     APPEARANCE,
-    Batch,
-    Context,
     FrameCondition,
-    Medium,
-    RayOutput,
-    Sample,
+    PenaltyContext,
     Table,
 )
-from nerfies_jax.effects.transient import TransientSpec
 from tests import gradients
 
 SPEC = TransientSpec(code_width=3, depth=2, width=8)
@@ -268,7 +265,7 @@ def context(dtype, density, valid):
     )
     nothing = RayOutput(**dict.fromkeys(RayOutput._fields))
     batch = Batch(**dict.fromkeys(Batch._fields))
-    return Context(**dict.fromkeys(Context._fields))._replace(
+    return PenaltyContext(**dict.fromkeys(PenaltyContext._fields))._replace(
         levels=(nothing, nothing._replace(media={"transient": medium})),
         batch=batch._replace(valid=jnp.asarray(valid)),
     )

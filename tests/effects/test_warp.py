@@ -11,9 +11,9 @@ import pytest
 import scipy.linalg
 
 from nerfies_jax.effects import warp
-from nerfies_jax.effects.effect import MOMENT, FrameCondition, Table
 from nerfies_jax.effects.warp import WarpSpec
 from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.training.effects import MOMENT, FrameCondition, Table
 from tests import gradients
 
 SMALL = WarpSpec(

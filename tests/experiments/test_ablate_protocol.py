@@ -15,8 +15,8 @@ from gaussians_jax import scene as splat_scene
 from gaussians_jax.splats import Gaussians, Params, Splats, bury
 from nerfies_jax import scene
 from nerfies_jax.capture import synthetic
-from nerfies_jax.effects.effect import Effect
 from nerfies_jax.measure import geometry_quality
+from nerfies_jax.training.effects import Effect
 from nerfies_jax.training.model import Rendering, Stages
 from tests import scenes
 

@@ -15,9 +15,9 @@ from experiments.effect_cost import Arm, EffectCost, Priced, Row
 from gaussians_jax import presets as splat_presets
 from nerfies_jax import presets as field_presets
 from nerfies_jax import scene
-from nerfies_jax.effects.effect import FrameCondition
 from nerfies_jax.measure import clock
 from nerfies_jax.render_ray import Ray
+from nerfies_jax.training.effects import FrameCondition
 from tests import bare_scenes, scenes
 
 

@@ -12,11 +12,11 @@ import rich.console
 from experiments import evaluate
 from gaussians_jax import scene
 from gaussians_jax.effects import deformation
-from gaussians_jax.effects.effect import FrameCondition
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec
 from gaussians_jax.phases import AlternationSpec
 from gaussians_jax.spec import effects_of, refuse_what_cannot_train
 from nerfies_jax.training import checkpoint, loop
+from nerfies_jax.training.effects import FrameCondition
 from tests import gradients, scenes
 
 PAPERS = {"sonata": scenes.TINY_SONATA, "moba": scenes.TINY_MOBA}
@@ -127,14 +127,14 @@ def test_the_loss_of_a_whole_step_has_the_right_slope(paper, float64):
 
     params = wide(state.params)._replace(nets=jax.tree.map(awake, state.params.nets))
     view = wide(evaluate.view_of(capture, int(capture.train[2])))
-    truth = wide(scene.shot(frames, 2, None))
+    truth = wide(scene.observe(frames, 2, None))
     states = wide(scene.states_of(effects, params))
     step = jnp.asarray(20, jnp.int32)
-    condition = FrameCondition(view.time, step, jax.random.key(5))
+    condition = FrameCondition(view.time, step=step, key=jax.random.key(5))
 
     def loss(params):
         moved = deformation.pose_in_training(
-            effects, params, scene.splats.activate(params.rows["splats"]), moment
+            effects, params, scene.splats.activate(params.rows["splats"]), condition
         )
         drawn = model.stages.draw(params, moved, view, (40, 30), step)
         seen = truth._replace(rendering=drawn)

@@ -16,6 +16,7 @@ from gaussians_jax.rates import RateSpec
 from gaussians_jax.spec import SceneMetadata, SplatScene
 from gaussians_jax.splats import Params, Splats
 from gaussians_jax.start import StartSpec
+from nerfies_jax.training.updates import apply_updates
 from tests import scenes
 
 KEY = 3
@@ -94,7 +95,7 @@ def test_descent_scales_each_kind_of_row_by_its_rate():
     _, state, _ = started(scenes.TINY_SPLATS)
     ones = jax.tree.map(jnp.ones_like, state.params)
     rate = rates.learning_rates(spec, 2.0, 100, jnp.asarray(50))
-    after = rates.descend(state.params, ones, Params({"splats": rate}, {}))
+    after = apply_updates(state.params, ones, Params({"splats": rate}, {}))
     before = state.params.rows["splats"]
     step = jax.tree.map(lambda a, b: a - b, before, after.rows["splats"])
     # Halfway in the logarithm between 1e-2 and 1e-4, times the extent of 2.
@@ -135,7 +136,10 @@ def test_events_grow_the_scene_and_keep_its_picture_learnable():
     assert int(after.step) == int(state.step)
     again, metrics = jax.jit(eager.step)(after, frames)
     assert np.isfinite(float(metrics["loss"]))
-    assert again.params.rows["splats"].mean.shape == (*after.aux_state.stats.alive.shape, 3)
+    assert again.params.rows["splats"].mean.shape == (
+        *after.aux_state.stats.alive.shape,
+        3,
+    )
 
 
 def test_an_event_is_a_function_of_the_state():

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from nerfies_jax.effects import elastic, warp
-from nerfies_jax.effects.effect import FrameCondition
+from nerfies_jax.training.effects import FrameCondition
 from tests.hard_cases import hostile, linear_warps, tiny_fields
 from tests.hard_cases.linear_warps import CORNERS, DISPLACEMENTS
 

@@ -17,7 +17,7 @@ import pytest
 
 from nerfies_jax.effects import background, elastic, warp
 from nerfies_jax.effects.background import BackgroundSpec
-from nerfies_jax.effects.effect import Context, FrameCondition, RayOutput
+from nerfies_jax.effects.effect import RayOutput
 from nerfies_jax.effects.elastic import ElasticSpec
 from nerfies_jax.effects.warp import WarpSpec
 from nerfies_jax.geometry import matrix3
@@ -27,6 +27,7 @@ from nerfies_jax.nets.mlp import MLP, Layer
 from nerfies_jax.radiance import compositing, sampling, template
 from nerfies_jax.radiance.template import Template, TemplateSpec
 from nerfies_jax.training import losses
+from nerfies_jax.training.effects import FrameCondition, PenaltyContext
 
 TEMPLATE = TemplateSpec(position=EncodingSpec(8))
 WARP = WarpSpec(anneal_steps=32)
@@ -156,19 +157,17 @@ def both_levels(flat, given):
 
 
 def penalty_context(flat, rays, coarse):
-    none = dict.fromkeys(Context._fields)
+    none = dict.fromkeys(PenaltyContext._fields)
     fields = dict.fromkeys(RayOutput._fields)
     one = RayOutput(
         **fields | {"point": coarse["points"], "static_weight": coarse["weights"]}
     )
-    return Context(
+    return PenaltyContext(
         **none
         | {
             "displace": displacement(flat),
             "condition_of": lambda id_: frame_condition(flat, id_),
-            "conditions": jax.vmap(lambda id_: frame_condition(flat, id_))(
-                rays.warp_id
-            ),
+            "condition": jax.vmap(lambda id_: frame_condition(flat, id_))(rays.warp_id),
             "levels": (one,),
             "key": jax.random.key(0),
         }

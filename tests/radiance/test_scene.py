@@ -13,7 +13,6 @@ from nerfies_jax import render_ray, scene
 from nerfies_jax.effects.ambient import AmbientSpec
 from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.effects.background import BackgroundSpec
-from nerfies_jax.effects.effect import FrameCondition
 from nerfies_jax.effects.elastic import ElasticSpec
 from nerfies_jax.effects.time_condition import TimeSpec
 from nerfies_jax.effects.warp import WarpSpec
@@ -23,6 +22,7 @@ from nerfies_jax.radiance.template import TemplateSpec
 from nerfies_jax.scene import RadianceScene
 from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.spec import SamplingSpec
+from nerfies_jax.training.effects import FrameCondition, weighted_sum
 from nerfies_jax.training.model import TrainState, View
 from tests import gradients, scenes
 
@@ -349,9 +349,9 @@ def test_gradient_of_a_whole_step(float64):
 
     def loss(params):
         terms = scene.loss_terms(
-            spec, metadata, made, params, frames, batch, jnp.int32(4), jax.random.key(2)
+            made, params, frames, batch, jnp.int32(4), jax.random.key(2)
         )
-        return sum(term.weight * term.value for term in terms.values())
+        return weighted_sum(terms)
 
     assert gradients.directional_error(loss, params) < 1e-5
 
