@@ -29,6 +29,7 @@ from nerfies_jax.training.effects import (
     PenaltyContext,
     joined,
     penalty_terms,
+    stream,
     values,
     weighted_sum,
 )
@@ -307,8 +308,8 @@ def first_state(spec, effects, optimiser, capture, key) -> TrainState:
     count = len(position)
     most = None if spec.density is None else spec.density.most
     params = Params({"splats": rows}, {})
-    for number, effect in enumerate(effects):
-        effect_key = jax.random.fold_in(start_key, number)
+    for effect in effects:
+        effect_key = jax.random.fold_in(start_key, stream(effect.name))
         rows_key, nets_key = jax.random.split(effect_key)
         if effect.init_rows is not None:
             params.rows[effect.name] = effect.init_rows(rows_key, rows)
