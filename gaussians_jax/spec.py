@@ -27,6 +27,7 @@ from gaussians_jax.raster_spec import RasterSpec
 from gaussians_jax.rates import RateSpec
 from gaussians_jax.start import StartSpec
 from nerfies_jax.training.effects import Effect
+from nerfies_jax.training.step_counts import steps
 
 OPTIMISERS = {"adam": scale_by_row_adam, "radam": scale_by_row_radam}
 
@@ -38,7 +39,7 @@ class SplatScene:
     steps: int
     start: StartSpec = StartSpec()
     sh_degree: int = 3
-    sh_every: int = 1000  # steps between one degree and the next
+    sh_every: int = steps(1000)  # steps between one degree and the next
     dssim_weight: float = 0.2
     rates: RateSpec = RateSpec()
     raster: RasterSpec = RasterSpec()

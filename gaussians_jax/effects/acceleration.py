@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from gaussians_jax import splats
 from nerfies_jax.training.effects import Effect, PenaltyContext, Term
+from nerfies_jax.training.step_counts import steps
 
 NAME = "acceleration"
 _STREAM = zlib.crc32(NAME.encode()) >> 1  # of the step's key, for the choice of rows
@@ -37,7 +38,7 @@ class AccelerationSpec:
     drift: float = 1.0
     interval: float = 1.0  # between the times compared, in frames
     samples: int = 1024  # Gaussians drawn in a step
-    start: int = 0  # steps before which it is not evaluated
+    start: int = steps(0)  # steps before which it is not evaluated
 
     def __post_init__(self):
         for name in ("weight", "drift"):

@@ -27,6 +27,7 @@ from nerfies_jax.nets.kan import KAN, KANSpec
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
 from nerfies_jax.training.effects import Effect, FrameCondition
+from nerfies_jax.training.step_counts import steps
 
 NAME = "kan_motion"
 NETWORKS = ("kan", "mlp")
@@ -61,7 +62,7 @@ class KanMotionSpec:
     position: bool = True
     scale: bool = True
     rotation: bool = True
-    warm_up: int = 0  # steps without motion
+    warm_up: int = steps(0)  # steps without motion
     embedding_rate: float = 2.5e-3
     rate: float = 1.6e-4  # of network and time codes
     rate_end: float = 1.6e-5

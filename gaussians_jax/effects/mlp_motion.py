@@ -21,6 +21,7 @@ from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
 from nerfies_jax.training.effects import Effect, FrameCondition
+from nerfies_jax.training.step_counts import steps
 
 NAME = "mlp_motion"
 SCALE_RULES = ("log", "linear")
@@ -35,7 +36,7 @@ class SmoothingSpec:
     """
 
     first: float = 0.1
-    steps: int = 20_000
+    steps: int = steps(20_000)
 
     def __post_init__(self):
         if not (self.first >= 0 and self.steps >= 1):
@@ -62,7 +63,7 @@ class MotionSpec:
     width: int = 256
     skips: tuple[int, ...] = (5,)  # layers that read the input again
     scale_rule: str = "log"
-    warm_up: int = 3000  # steps without motion
+    warm_up: int = steps(3000)  # steps without motion
     smoothing: SmoothingSpec | None = SmoothingSpec()
     rate: float = 8e-4
     rate_end: float = 1.6e-6

@@ -26,6 +26,7 @@ from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
 from nerfies_jax.training.effects import Effect, FrameCondition
+from nerfies_jax.training.step_counts import steps
 
 NAME = "motion_basis"
 BASIS_FORMS = ("bounded", "free")
@@ -61,7 +62,7 @@ class BasisMotionSpec:
     # No gradient to the canonical means through the networks, as in Deformable 3DGS:
     # they would chase a moving target. The paper does not say.
     detach: bool = True
-    warm_up: int = 3000  # steps without motion
+    warm_up: int = steps(3000)  # steps without motion
     smoothing: SmoothingSpec | None = None
     rate: float = 8e-4
     rate_end: float = 1.6e-6

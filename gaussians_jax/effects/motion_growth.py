@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float
 
 from gaussians_jax.splats import Gaussians, Params
 from nerfies_jax.training.effects import Effect, FrameCondition
+from nerfies_jax.training.step_counts import steps
 
 NAME = "motion_growth"
 FORMS = ("soft", "hard")
@@ -36,7 +37,7 @@ class MotionGrowthSpec:
     """
 
     form: str = "soft"  # or "hard", the conjunction as printed
-    start: int = 5000  # step
+    start: int = steps(5000)  # step
     motion: float = 1e-3  # threshold, of the scene's extent
     beta: float = 4.0  # of the soft form
 

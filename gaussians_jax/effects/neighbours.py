@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 from gaussians_jax import splats
 from gaussians_jax.splats import Params
 from nerfies_jax.training.effects import Effect, PenaltyContext, Term
+from nerfies_jax.training.step_counts import steps
 
 NAME = "neighbours"
 SCALES = ("spacing", "extent", "units")
@@ -49,7 +50,7 @@ class NeighbourSpec:
     gamma: float = 2000.0
     weight: float = 1.0
     scale: str = "spacing"
-    start: int = 0  # steps before which it is not evaluated
+    start: int = steps(0)  # steps before which it is not evaluated
 
     def __post_init__(self):
         if self.count < 1 or self.start < 0:

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from nerfies_jax.geometry.precision import widened
 from nerfies_jax.training import schedules
 from nerfies_jax.training.effects import Effect, PenaltyContext, Term
+from nerfies_jax.training.step_counts import steps
 
 NAME = "spectral"
 GATES = ("learned", "floor", "fixed", "schedule")
@@ -88,7 +89,7 @@ class SpectralSpec:
     opening: float = 0.5  # equation 16 at g = 0
     rate: float = 1e-2  # Adam's, of the logits g
     floor: float = 0.05
-    after: int = 0  # steps without these losses
+    after: int = steps(0)  # steps without these losses
 
     def __post_init__(self):
         if self.gate not in GATES:

@@ -19,6 +19,7 @@ from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
 from nerfies_jax.training.effects import MOMENT, Effect, FrameCondition, Table
+from nerfies_jax.training.step_counts import steps
 
 KINDS = ("bent", "plane")
 PLANE_TABLE = "ambient"
@@ -50,8 +51,8 @@ class AmbientSpec:
     table: str = "motion"
     code_width: int = 8
     encoding: EncodingSpec = EncodingSpec(1, identity=False)
-    closed_steps: int = 1000
-    anneal_steps: int = 10_000
+    closed_steps: int = steps(1000)
+    anneal_steps: int = steps(10_000)
 
     def __post_init__(self):
         if self.kind not in KINDS:

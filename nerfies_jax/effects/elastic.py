@@ -16,6 +16,7 @@ from nerfies_jax.effects.effect import RayOutput, Scalar
 from nerfies_jax.geometry import matrix3
 from nerfies_jax.training import losses, schedules
 from nerfies_jax.training.effects import Effect, PenaltyContext, Term
+from nerfies_jax.training.step_counts import steps
 
 Matrix = Float[Array, "3 3"]
 
@@ -38,8 +39,8 @@ class ElasticSpec:
     """
 
     weight: float = 1e-3
-    hold_steps: int = 0
-    decay_steps: int | None = None
+    hold_steps: int = steps(0)
+    decay_steps: int | None = steps(None)
     last_weight: float = 1e-8
     points: int | None = 4
     robust_width: float | None = 0.03

@@ -24,6 +24,7 @@ from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.radiance import compositing, template
 from nerfies_jax.radiance.template import Template, TemplateSpec
 from nerfies_jax.training.effects import Effect, FrameCondition, PenaltyContext, Term
+from nerfies_jax.training.step_counts import steps
 
 NAME = "scene_flow"
 FORWARD, BACKWARD = 0, 1  # places in everything that has a side
@@ -70,7 +71,7 @@ class SceneFlowSpec:
     time: EncodingSpec = EncodingSpec(10)
     flow_bound: float = 1.0
     weights: FlowWeights = FlowWeights()
-    decay_steps: int = 50_000
+    decay_steps: int = steps(50_000)
 
     def __post_init__(self):
         if not (math.isfinite(self.flow_bound) and self.flow_bound > 0):

@@ -20,6 +20,7 @@ from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
 from nerfies_jax.training.effects import MOMENT, Effect, FrameCondition, Table
+from nerfies_jax.training.step_counts import steps
 
 KINDS = ("se3", "translation")
 CONDITIONS = ("code", "time")
@@ -45,7 +46,7 @@ class WarpSpec:
     depth: int = 6
     width: int = 128
     skips: tuple[int, ...] = (4,)
-    anneal_steps: int | None = None
+    anneal_steps: int | None = steps(None)
 
     def __post_init__(self):
         if self.kind not in KINDS:

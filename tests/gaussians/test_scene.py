@@ -228,13 +228,30 @@ def test_a_rate_that_cannot_decay_is_refused():
         RateSpec(mean_end=0.0)
 
 
+# Fields of the parts that count steps.
+COUNTED = {
+    "density": ("start", "stop", "reset_interval"),
+    "motion": ("warm_up",),
+    "alternation": ("start", "stop"),
+    "annealing": ("after",),
+    "acceleration": ("start",),
+    "neighbours": ("start",),
+    "motion_growth": ("start",),
+    "spectral": ("after",),
+}
+
+
 @pytest.mark.parametrize("name", sorted(presets.PRESETS))
 def test_presets_build_and_stretch_with_their_steps(name):
     spec = presets.PRESETS[name]
     metadata = SceneMetadata(extent=1.0, background=(0.0, 0.0, 0.0), frames=10)
     half = presets.with_steps(spec, spec.steps // 2)
     assert half.steps == spec.steps // 2
-    assert half.density.stop == round(spec.density.stop / 2)
+    for part, fields in COUNTED.items():
+        whole, short = getattr(spec, part), getattr(half, part)
+        for name in fields if whole is not None else ():
+            assert getattr(short, name) == round(getattr(whole, name) / 2)
+    assert half.sh_every == spec.sh_every // 2
     assert scene.build(half, metadata).spec == (half, metadata)
     assert presets.with_steps(spec, spec.steps) == spec
 
