@@ -65,8 +65,8 @@ def parts(
             observation.truth, *(jnp.ones(observation.truth.shape[:2]) for _ in "ad")
         )
         if {effect.deform, effect.penalty} != {None}:
-            slope = jax.grad(one, (0, 1))
-            timed[effect.name.replace("_", " ")] = part_ms(slope, params, drawn, kept)
+            grads = jax.grad(one, (0, 1))
+            timed[effect.name.replace("_", " ")] = part_ms(grads, params, drawn, kept)
     whole = part_ms(model.step, state, frames)
     timed["optimiser and statistics"] = max(whole - sum(timed.values()), 0.0)
     return timed

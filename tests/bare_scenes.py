@@ -169,11 +169,11 @@ def field_step(spec, metadata, draw_batch):
         def loss(params):
             return field_loss(spec, metadata, params, batch, field_key)
 
-        (value, terms), slope = jax.value_and_grad(loss, has_aux=True)(state.params)
+        (value, terms), grads = jax.value_and_grad(loss, has_aux=True)(state.params)
         with jax.numpy_dtype_promotion("standard"):
-            direction, moments = adam.update(slope, state.optimiser)
-        speed = rate(state.step)
-        params = jax.tree.map(lambda x, d: x - speed * d, state.params, direction)
+            updates, moments = adam.update(grads, state.optimiser)
+        now = rate(state.step)
+        params = jax.tree.map(lambda x, d: x - now * d, state.params, updates)
         state = TrainState(params, moments, (), state.step + 1, state.key)
         return state, {"loss": value, "mse": terms["fine"], **terms}
 
@@ -192,7 +192,7 @@ def splat_step(spec, metadata, shuffled_row):
         colour = harmonics.colour_towards(shown, gaussians.mean, camera.position)
         seen = projection.project(gaussians, camera, size, spec.raster)
         placed = seen
-        if offset is not None:  # whose slope the density control wants to know
+        if offset is not None:  # whose gradient the density control wants to know
             placed = seen._replace(mean_px=seen.mean_px + offset)
         image, passing = raster.rasterise(placed, colour, size, spec.raster)
         behind = jnp.asarray(metadata.background, image.dtype)
@@ -217,20 +217,20 @@ def splat_step(spec, metadata, shuffled_row):
         if spec.density is not None:
             still = jnp.zeros_like(state.params.rows["splats"].mean[:, :2])
             wanted = (0, 1)
-        (value, (mse, seen)), slopes = jax.value_and_grad(
+        (value, (mse, seen)), grads = jax.value_and_grad(
             loss, argnums=wanted, has_aux=True
         )(state.params, still)
-        direction, moments = update(slopes[0], state.optimiser, state.params)
+        updates, moments = update(grads[0], state.optimiser, state.params)
         rates = splat_rates.learning_rates(
             spec.rates, metadata.extent, spec.steps, state.step
         )
         rates = Params({"splats": rates}, {})
-        params = apply_updates(state.params, direction, rates)
+        params = apply_updates(state.params, updates, rates)
         aux_state = state.aux_state
         if spec.density is not None:
             radius_px = jnp.max(seen.extent_px, axis=1)
             stats = density.observe(
-                aux_state.stats, slopes[1], seen.visible, radius_px, size
+                aux_state.stats, grads[1], seen.visible, radius_px, size
             )
             aux_state = aux_state._replace(stats=stats)
         state = TrainState(params, moments, aux_state, state.step + 1, state.key)
