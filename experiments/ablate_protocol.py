@@ -95,7 +95,7 @@ def known(capture: Capture, truth: SceneTruth, frames: int, tracks: int) -> Know
     world = (truth.track_world[chosen] - np.float32(capture.centre)) * capture.scale
     return Known(
         rows=evaluate.spread(capture.heldout, frames),
-        conditions=conditions,
+        moments=moments,
         path=world[:, instants].astype(np.float32),
         seen=truth.track_seen[chosen][:, moments],
         start=start,
@@ -115,7 +115,7 @@ def filmed(capture: Capture, frames: int) -> Known:
     moments = capture.train[np.argsort(capture.times[capture.train], kind="stable")]
     return Known(
         rows=evaluate.spread(capture.heldout, frames),
-        conditions=conditions,
+        moments=moments,
         path=np.zeros((0, len(moments), 3), np.float32),
         seen=np.zeros((0, len(moments)), bool),
         start=len(moments) // 2,

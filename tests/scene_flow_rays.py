@@ -90,7 +90,7 @@ def context_of(spec, params, frames, batch, distance, features, weight, step):
 
     def at(point, features, direction, condition):
         return scene_flow.medium(
-            spec, params, Sample(point, direction, features), moment
+            spec, params, Sample(point, direction, features), condition
         )
 
     media = jax.vmap(jax.vmap(at, (0, 0, None, None)))(
@@ -111,9 +111,8 @@ def context_of(spec, params, frames, batch, distance, features, weight, step):
         beta=None,
     )
     return PenaltyContext(
-        displace=None,
-        condition_of=None,
         condition=conditions,
+        params=params,
         batch=batch,
         levels=(level,),
         frames=frames,
