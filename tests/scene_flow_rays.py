@@ -111,9 +111,8 @@ def context_of(spec, params, frames, batch, distance, features, weight, step):
         beta=None,
     )
     return PenaltyContext(
-        displace=None,
-        condition_of=None,
         condition=conditions,
+        params=params,
         batch=batch,
         levels=(level,),
         frames=frames,

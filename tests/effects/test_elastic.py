@@ -363,7 +363,7 @@ def test_terms_and_schedule(setting):
         terms = at_step(jnp.int32(step))
         assert set(terms) == {"elastic", "folded"}
         np.testing.assert_allclose(terms["elastic"].weight, weight, rtol=1e-6)
-        assert terms["folded"].weight == 0
+        assert terms["folded"].weight is None
     assert elastic.schedule(ElasticSpec()) == 1e-3
 
 
