@@ -8,9 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import evaluate
 from gaussians_jax import scene as splat_scene
-from nerfies_jax import scene
+from nerfies_jax import evaluation, scene
 from nerfies_jax.effects.effect import Medium
 from nerfies_jax.training.effects import Effect
 from tests import bare_scenes, scenes
@@ -41,7 +40,7 @@ def of_field(*effects):
     capture, spec = scenes.tiny_capture(), bare_scenes.tiny_field("nerf-small")
     metadata = scene.metadata_of(capture, spec)
     made = scene.field(spec, metadata, effects=effects)
-    frames = evaluate.frames_of(capture)
+    frames = evaluation.frames_of(capture)
 
     @jax.jit
     def values(key):
