@@ -5,6 +5,7 @@ import pathlib
 from typing import Any, NamedTuple
 
 import jax
+import psutil
 
 from nerfies_jax import capture as captures
 from nerfies_jax.capture import pinholes, synthetic
@@ -141,7 +142,7 @@ def first_state(run: Run) -> TrainState:
     """The state before the first step; ValueError where it would not fit in memory."""
     needed = run.representation.first_bytes(run.spec, run.capture)
     free = free_memory()
-    if free is not None and needed > free:
+    if needed > free:
         raise ValueError(
             f"the first state needs about {needed / 2**30:.1f} GiB and "
             f"{free / 2**30:.1f} GiB are free; {run.representation.lighter}, or read "
@@ -150,14 +151,9 @@ def first_state(run: Run) -> TrainState:
     return run.model.init(run.capture, jax.random.key(run.config.seed))
 
 
-def free_memory() -> int | None:
-    """Bytes of memory that programs may still take; None where nothing tells."""
-    try:
-        lines = pathlib.Path("/proc/meminfo").read_text().splitlines()
-        row = next(line for line in lines if line.startswith("MemAvailable"))
-    except (OSError, StopIteration):
-        return None
-    return int(row.split()[1]) * 1024
+def free_memory() -> int:
+    """Bytes of memory that programs may still take."""
+    return psutil.virtual_memory().available
 
 
 def restore(folder: pathlib.Path, run: Run) -> checkpoint.Restored:

@@ -253,9 +253,13 @@ def test_the_command_measures_arms_and_goes_on_where_it_stopped(
     assert "A static field cannot show" in capsys.readouterr().out
     assert run(*tiny, "--arms", "static", "--steps", "4") == 2
     assert "made with other settings" in capsys.readouterr().err
-    (out / "static-0.npz").unlink()
-    assert run(*tiny, "--arms", "static") == 2
-    assert "remove it to run it again" in capsys.readouterr().err
+    arrays = out / "static-0.npz"
+    for cut in (arrays.read_bytes()[:-30], b"", None):
+        arrays.unlink()
+        if cut is not None:
+            arrays.write_bytes(cut)
+        assert run(*tiny, "--arms", "static") == 2
+        assert "remove it to run it again" in capsys.readouterr().err
     # With no time left nothing is begun, and what is finished is reported.
     monkeypatch.setattr(Job, "is_over", lambda *_: True)
     assert run(*tiny, "--arms", "nerfies", "d-nerf") == 0
