@@ -14,7 +14,7 @@ import numpy as np
 
 from experiments.ablate.measures import MEASURES
 from nerfies_jax.capture.json_files import replaced_file, write_json
-from nerfies_jax.training import checkpoint
+from nerfies_jax.training.provenance import provenance
 
 
 class Kept(NamedTuple):
@@ -36,7 +36,7 @@ def write(path: pathlib.Path, identity: dict[str, Any], kept: Kept) -> None:
             "identity": identity,
             "numbers": numbers,
             "notes": kept.notes,
-            "made by": checkpoint.provenance(),
+            "made by": provenance(),
         },
     )
 

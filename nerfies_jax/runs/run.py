@@ -18,6 +18,7 @@ from nerfies_jax.runs.platform import CACHE
 from nerfies_jax.runs.run_folder import CHECKPOINTS, CONFIG
 from nerfies_jax.training import checkpoint, specs
 from nerfies_jax.training.model import Model, TrainState
+from nerfies_jax.training.provenance import provenance
 
 
 class Run(NamedTuple):
@@ -110,7 +111,7 @@ def save_config(folder: pathlib.Path, run: Run) -> None:
             "config": specs.as_json(run.config),
             "representation": run.representation.name,
             "spec": specs.as_json(run.spec),
-            "made by": checkpoint.provenance(),
+            "made by": provenance(),
         },
     )
 
