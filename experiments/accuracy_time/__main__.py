@@ -100,7 +100,7 @@ def main(arguments=None):
 def _job(asked):
     """The runs as an ablation of the suite "settings", each in its own process."""
     folder = asked.source.capture
-    source = asked.source.scene if folder is None else folder.name
+    source = cli.plain(asked.source).scene if folder is None else folder.name
     out = asked.out or pathlib.Path("runs", f"accuracy_time-{source}")
     ablation = ablate.Ablate(
         suite="settings",

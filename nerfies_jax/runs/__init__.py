@@ -1,16 +1,8 @@
 """Floor 9: a run and its folder, of whichever representation is installed."""
 
+import importlib
 
-def __getattr__(name):
-    # Lazy: the settings of a command (`runs.config`) must not cost an import of JAX.
-    if name in __all__:
-        from nerfies_jax.runs import run
-
-        return getattr(run, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-__all__ = [
+_RUN = (
     "Run",
     "first_state",
     "free_memory",
@@ -22,4 +14,17 @@ __all__ = [
     "saved_run",
     "scene_spec",
     "stored_capture",
-]
+)
+_RECONSTRUCTION = ("Outcome", "Refused", "reconstruct", "resume")
+_MODULES = dict.fromkeys(_RUN, "run") | dict.fromkeys(_RECONSTRUCTION, "reconstruction")
+
+
+def __getattr__(name):
+    # Lazy: the settings of a command (`runs.config`) must not cost an import of JAX.
+    if name in _MODULES:
+        module = importlib.import_module(f"{__name__}.{_MODULES[name]}")
+        return getattr(module, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+__all__ = [*_RUN, *_RECONSTRUCTION]

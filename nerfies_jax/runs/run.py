@@ -21,6 +21,14 @@ from nerfies_jax.training.model import Model, TrainState
 from nerfies_jax.training.provenance import provenance
 
 
+class Settings(NamedTuple):
+    """What a `config.json` says."""
+
+    config: RunConfig
+    representation: Representation
+    spec: Any  # of the representation's `spec_type`
+
+
 class Run(NamedTuple):
     """Everything that a run is made of before its first step."""
 
@@ -120,12 +128,27 @@ def saved_run(folder: pathlib.Path, overrides: tuple[str, ...] = ()) -> Run:
     """The run in a folder, with the settings it was made with.
 
     They come from its `config.json`, not from the preset, which may have changed since.
+    Raises ValueError where `overrides` would change them.
     """
+    config, kind, spec = read_settings(folder)
+    asked = specs.override(spec, overrides)
+    changed = specs.differences(specs.as_json(spec), specs.as_json(asked))
+    if changed:
+        raise ValueError(
+            f"{folder}: the run was started with other settings: {'; '.join(changed)}; "
+            "leave them out to continue it, or start anew in another --out"
+        )
+    return open_run(config, kind, spec)
+
+
+def read_settings(folder: pathlib.Path) -> Settings:
+    """The settings of the run in a folder; ValueError where they cannot be read."""
     path = folder / CONFIG
     if not path.is_file():
         raise ValueError(
             f"{folder}: no run here (there is no {CONFIG}); name the folder that "
-            "experiments.reconstruct printed"
+            "experiments.reconstruct printed, or start the run, which cannot have "
+            "begun, without --resume"
         )
     try:
         stored = json.loads(path.read_text())
@@ -136,7 +159,7 @@ def saved_run(folder: pathlib.Path, overrides: tuple[str, ...] = ()) -> Run:
                 raise ValueError(f"a {type(value).__name__} for a {wanted.__name__}")
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise ValueError(f"{path}: not the settings of a run ({error})") from error
-    return open_run(config, kind, specs.override(spec, overrides))
+    return Settings(config, kind, spec)
 
 
 def first_state(run: Run) -> TrainState:
