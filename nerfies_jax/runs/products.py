@@ -7,15 +7,15 @@ import time
 
 import numpy as np
 
-from nerfies_jax import evaluation, runs
+from nerfies_jax import evaluation
 from nerfies_jax.capture import camera_paths, exr, video
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.json_files import write_json
 from nerfies_jax.evaluation import Renderer, Scored, pictures
+from nerfies_jax.evaluation.representation import MODEL, Saved
 from nerfies_jax.measure import clock
 from nerfies_jax.measure.clock import Metric
-from nerfies_jax.runs import Run, budget, curves, report
-from nerfies_jax.runs.representations import MODEL, Saved
+from nerfies_jax.runs import Run, budget, curves, report, run_folder
 from nerfies_jax.runs.train import Outcome
 from nerfies_jax.training import losses
 from nerfies_jax.training.model import TrainState
@@ -70,7 +70,7 @@ def make(folder: pathlib.Path, run: Run, outcome: Outcome, began: float) -> None
         folder,
         f"{run.capture.name}: {run.config.preset}",
         metrics,
-        json.loads((folder / runs.CONFIG).read_text()),
+        json.loads((folder / run_folder.CONFIG).read_text()),
         figures,
         film,
         run.representation.time_parts(run.spec, run.facts, run.model, state, frames),

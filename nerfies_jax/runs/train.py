@@ -5,9 +5,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from nerfies_jax import evaluation, runs
+from nerfies_jax import evaluation
 from nerfies_jax.evaluation import Renderer
-from nerfies_jax.runs import Run, budget
+from nerfies_jax.runs import Run, budget, run_folder
 from nerfies_jax.training import loop
 from nerfies_jax.training.checkpoint import Checkpoints
 from nerfies_jax.training.loop import FitResult, History, Hook
@@ -23,7 +23,7 @@ class Outcome(NamedTuple):
 
 def open_checkpoints(folder: pathlib.Path, run: Run, after: int | None) -> Checkpoints:
     """Where this run saves; ValueError where it cannot."""
-    return Checkpoints(folder / runs.CHECKPOINTS, run.model.spec, after=after)
+    return Checkpoints(folder / run_folder.CHECKPOINTS, run.model.spec, after=after)
 
 
 def train(
