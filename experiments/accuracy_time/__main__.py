@@ -70,16 +70,16 @@ class AccuracyTime:
 
 def main(arguments=None):
     """Run the job of the command line; exit code 2 where its input is wrong."""
-    from experiments.accuracy_time import report
-    from nerfies_jax.measure import baselines
-
     with cli.user_errors():
         asked = cli.parse(AccuracyTime, arguments)
+        from nerfies_jax.measure import baselines
+
         before = None
         if asked.check is not None:
             before = baselines.read(asked.check, "accuracy_time.json")
         job = _job(asked)
     from experiments.ablate import pool
+    from experiments.accuracy_time import report
 
     failed = pool.run(job)
     (budget,) = job.budgets

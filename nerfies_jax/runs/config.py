@@ -8,7 +8,7 @@ import pathlib
 class CaptureSource:
     """Which pictures to read: a folder's, or those of a built-in scene."""
 
-    capture: pathlib.Path | None = None
+    capture: pathlib.Path | str | None = None  # a path, once it is made
     """Folder in Nerfies, HyperNeRF, Blender, D-NeRF or COLMAP layout."""
     scene: str = "default"
     """Which built-in scene, where no capture is given."""

@@ -13,10 +13,10 @@ from nerfies_jax.capture import camera_paths, exr, video
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.json_files import write_json
 from nerfies_jax.evaluation import Renderer, Scored, pictures
+from nerfies_jax.evaluation.representation import MODEL, Saved
 from nerfies_jax.measure import clock
 from nerfies_jax.measure.clock import Metric
 from nerfies_jax.runs import budget, commands, curves, report
-from nerfies_jax.runs.representations import MODEL, Saved
 from nerfies_jax.runs.run import Run
 from nerfies_jax.runs.run_folder import CONFIG
 from nerfies_jax.runs.train import Trained
