@@ -74,8 +74,8 @@ AXES = {
         SPLATS,
         **{
             "most-4000": "start.points=1500 start.random=2000 start.beside=500 "
-            "density.most=4000",
-            "most-20000": "density.most=20000",
+            "density.cap_max=4000",
+            "most-20000": "density.cap_max=20000",
             "no-growth": "density=none",
         },
     ),

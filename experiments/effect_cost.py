@@ -144,8 +144,8 @@ def _spec(name, asked):
         spec = dataclasses.replace(spec, rays=asked.rays)
     if asked.rows is not None and hasattr(spec, "start"):
         start = dataclasses.replace(spec.start, source="random", random=asked.rows)
-        most = max(spec.density.most or asked.rows, asked.rows)
-        density = dataclasses.replace(spec.density, most=most)
+        most = max(spec.density.cap_max or asked.rows, asked.rows)
+        density = dataclasses.replace(spec.density, cap_max=most)
         spec = dataclasses.replace(spec, start=start, density=density)
     return spec
 

@@ -9,7 +9,7 @@ import mpmath
 import numpy as np
 
 from experiments.hard_case import Case, constant
-from gaussians_jax import density, raster, relocation, splats
+from gaussians_jax import density, mcmc, raster, splats
 from gaussians_jax.effects import acceleration
 from gaussians_jax.projection import Footprints
 from gaussians_jax.raster_spec import GSPLAT
@@ -189,7 +189,7 @@ _OPACITIES = np.array([1e-4, 0.01, 0.1, 0.5, 0.9, 0.999, 1 - 1e-6])
 
 
 def _spread(opacity):
-    each, scale = relocation.spread_over(
+    each, scale = mcmc.spread_over(
         opacity,
         constant(np.ones((1, 3)), opacity.dtype),
         constant(np.full(1, COPIES), jnp.int32),

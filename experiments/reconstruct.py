@@ -25,9 +25,9 @@ class Reconstruct:
     capture: run_settings.Positional[pathlib.Path | None] = None
     """Folder in Nerfies, HyperNeRF, Blender, D-NeRF or COLMAP layout."""
     preset: str | None = None
-    """Gaussian splats: splats-static, splats-deformable, sonata, moba. Radiance fields:
-    nerf, nerf-w, d-nerf, t-nerf, nerfies, hypernerf, nsff. Each with -small is made for
-    a CPU (default: splats-deformable-small)."""
+    """Gaussian splats: splats-static, splats-mcmc, splats-deformable, sonata, moba.
+    Radiance fields: nerf, nerf-w, d-nerf, t-nerf, nerfies, hypernerf, nsff. Each with
+    -small is made for a CPU (default: splats-deformable-small)."""
     effects: Literal["preset", "auto"] = "preset"
     """auto: look at the capture first and take the effects that it calls for, in the
     representation and size of the preset (see experiments.inspect_scene)."""
@@ -52,7 +52,7 @@ class Reconstruct:
     heldout: str | None = None
     """Which frames to score: n for every n-th, or the name of a split."""
     set: tuple[str, ...] = ()
-    """Fields of the preset, as density.most=20000 motion.width=128 warp=none."""
+    """Fields of the preset, as density.cap_max=20000 motion.width=128 warp=none."""
     evaluate_every: float = 20.0
     """Seconds of training between two points of the PSNR curve."""
 

@@ -42,7 +42,7 @@ class DensitySpec:
     prune_radius_px: float | None = None  # 20 in the paper, where it had no effect
     reset_interval: int = 3000  # steps; pruning by size starts after the first reset
     reset_opacity: float = 0.01
-    most: int = 1_000_000  # Gaussians
+    cap_max: int = 1_000_000  # Gaussians
     revised_opacity: bool = False  # two halves together as opaque as the parent
 
     def __post_init__(self):
@@ -52,7 +52,7 @@ class DensitySpec:
                 f"everything; got prune_opacity={self.prune_opacity} and "
                 f"reset_opacity={self.reset_opacity}"
             )
-        for name in ("interval", "reset_interval", "most"):
+        for name in ("interval", "reset_interval", "cap_max"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is at least 1, got {getattr(self, name)}")
         if not self.shrink > 1:
@@ -149,7 +149,7 @@ def densify(
     """
     rows, kind, report = _plan(params.rows["splats"], stats, spec, step, extent)
     count, capacity = len(rows), stats.alive.shape[0]
-    needed = splats.capacity_for(count, spec.most)
+    needed = splats.capacity_for(count, spec.cap_max)
     # Two buckets of slack before shrinking: a wavering count must not recompile.
     if needed > capacity or count * 9 < capacity * 4:
         capacity = needed
@@ -184,7 +184,7 @@ def _plan(rows, stats, spec, step, extent):
         if spec.prune_radius_px is not None:
             kept &= splits | (stats.radius_px <= spec.prune_radius_px)
     grows &= kept
-    room = max(spec.most - int(kept.sum()), 0)
+    room = max(spec.cap_max - int(kept.sum()), 0)
     wanting = np.flatnonzero(grows)
     best = wanting[np.argsort(-score[wanting], kind="stable")][:room]
     chosen = np.zeros_like(grows)

@@ -8,9 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from gaussians_jax import density, phases, rates, render, splats, start
+from gaussians_jax import density, mcmc, phases, rates, render, splats, start
+from gaussians_jax.density import DensitySpec
 from gaussians_jax.effects import deformation
 from gaussians_jax.effects.effect import Around, Effect, Moment, Shot
+from gaussians_jax.mcmc import MCMCStrategySpec
 from gaussians_jax.phases import Trained
 from gaussians_jax.spec import (
     OPTIMISERS,
@@ -36,7 +38,7 @@ from nerfies_jax.training.model import (
 PyTree = Any
 
 # Streams of the run's key beside those of the steps, which are its 0, 1, 2, ...
-ORDER, EVENT = 2**32 - 1, 2**32 - 2
+ORDER, EVENT, NOISE = 2**32 - 1, 2**32 - 2, 2**32 - 3
 
 
 def facts_of(capture: Capture) -> Facts:
@@ -53,7 +55,7 @@ def facts_of(capture: Capture) -> Facts:
 class Extra(NamedTuple):
     """What a scene carries beside its parameters; everything in it has rows."""
 
-    stats: PyTree  # density.RowStats, or () without density control
+    stats: PyTree  # density.RowStats, or () where no strategy keeps them
     carried: dict[str, PyTree]  # by the name of the effect
 
 
@@ -154,11 +156,15 @@ def _stepper(spec, facts, effects, optimiser):
         directions, moments = optimiser.update(slopes, state.optimiser, state.params)
         rate = _rates(spec, facts, effects, state.step)
         trained = Trained(rates.descend(state.params, directions, rate), moments)
+        if isinstance(spec.density, MCMCStrategySpec):
+            key, speed = _stream(state, NOISE), rate.rows["splats"].mean
+            shaken = mcmc.shake(key, trained.params, speed, spec.density)
+            trained = trained._replace(params=shaken)
         if spec.alternation is not None:
             before = Trained(state.params, state.optimiser)
             trained = phases.hold(optimiser, turn, before, trained)
         stats, carried = state.extra
-        if spec.density is not None:
+        if isinstance(spec.density, DensitySpec):
             radius_px = jnp.max(footprints.extent_px, axis=1)
             stats = density.observe(
                 stats, probe_slope, footprints.visible, radius_px, size
@@ -187,6 +193,9 @@ def loss_of(
         colour, seen.truth, seen.valid, dssim_weight=spec.dssim_weight
     )
     metrics = {"mse": losses.mse(colour, seen.truth, seen.valid)}
+    if isinstance(spec.density, MCMCStrategySpec):
+        cost = mcmc.penalty(params.rows["splats"], spec.density)
+        value, metrics = value + cost, metrics | {"mcmc": cost}
 
     at_time = deformation.poser(effects, moment)
     for effect in effects:
@@ -263,11 +272,15 @@ def first_state(spec, effects, optimiser, capture, key) -> TrainState:
     seed = int(jax.random.randint(start_key, (), 0, np.iinfo(np.int32).max))
     position, colour = start.first_points(spec.start, capture, seed)
     rows = splats.from_points(
-        position, colour, degree=spec.sh_degree, opacity=spec.start.opacity
+        position,
+        colour,
+        degree=spec.sh_degree,
+        opacity=spec.start.opacity,
+        scale=spec.start.scale,
     )
     rows = start.narrowed(rows, capture, spec.start.widest)
     count = len(position)
-    most = None if spec.density is None else spec.density.most
+    most = None if spec.density is None else spec.density.cap_max
     params = Params({"splats": rows}, {})
     for number, effect in enumerate(effects):
         effect_key = jax.random.fold_in(start_key, number)
@@ -278,17 +291,26 @@ def first_state(spec, effects, optimiser, capture, key) -> TrainState:
             params.nets[effect.name] = effect.init_nets(nets_key)
     params = splats.pad_rows(params, splats.capacity_for(count, most))
     params = in_default_precision(params)
-    stats = () if spec.density is None else density.empty_stats(params.rows["splats"])
+    stats = ()
+    if isinstance(spec.density, DensitySpec):
+        stats = density.empty_stats(params.rows["splats"])
     extra = Extra(stats, carried_by(effects, params))
     return TrainState(
         params, optimiser.init(params), extra, jnp.zeros((), jnp.int32), run_key
     )
 
 
+def _stream(state, name):
+    """A key of this step for something beside `loop.step_key`."""
+    return jax.random.fold_in(jax.random.fold_in(state.key, name), state.step)
+
+
 def _events(spec, facts, effects, optimiser):
     if spec.density is None:
         return ()
     plan = spec.density
+    if isinstance(plan, MCMCStrategySpec):
+        return _mcmc_events(plan, spec.steps, effects, optimiser)
     last = min(plan.stop, spec.steps)
 
     def densify(state, frames):
@@ -304,7 +326,7 @@ def _events(spec, facts, effects, optimiser):
             state.params,
             state.optimiser,
             stats,
-            jax.random.fold_in(jax.random.fold_in(state.key, EVENT), state.step),
+            _stream(state, EVENT),
             plan,
             step=step,
             extent=facts.extent,
@@ -330,6 +352,20 @@ def _events(spec, facts, effects, optimiser):
             reset,
         ),
     )
+
+
+def _mcmc_events(plan, steps, effects, optimiser):
+    def refine(state, frames):
+        del frames
+        params, moments, _ = mcmc.refine(
+            optimiser, state.params, state.optimiser, _stream(state, EVENT), plan
+        )
+        extra = Extra((), carried_by(effects, params))
+        return state._replace(params=params, optimiser=moments, extra=extra)
+
+    last = min(plan.refine_stop_iter, steps)
+    when = tuple(range(plan.refine_start_iter, last, plan.refine_every))
+    return (Event("relocate and add", when, refine),)
 
 
 def count_rows(state: TrainState) -> dict[str, int]:

@@ -22,6 +22,7 @@ from gaussians_jax.effects.motion_basis import BasisMotionSpec
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec
 from gaussians_jax.effects.neighbours import NeighbourSpec
 from gaussians_jax.effects.spectral import SpectralSpec
+from gaussians_jax.mcmc import MCMCStrategySpec
 from gaussians_jax.optimiser import scale_by_row_adam, scale_by_row_radam
 from gaussians_jax.phases import AlternationSpec, AnnealingSpec
 from gaussians_jax.raster_spec import RasterSpec
@@ -42,7 +43,7 @@ class SplatScene:
     dssim_weight: float = 0.2
     rates: RateSpec = RateSpec()
     raster: RasterSpec = RasterSpec()
-    density: DensitySpec | None = DensitySpec()
+    density: DensitySpec | MCMCStrategySpec | None = DensitySpec()
     optimiser: str = "adam"
     alternation: AlternationSpec | None = None
     annealing: AnnealingSpec | None = None
@@ -95,10 +96,10 @@ def refuse_what_cannot_train(spec: SplatScene) -> None:
             "neighbours keep embeddings alike, and this motion has none; leave them "
             "out (neighbours=none), or choose a preset with a KAN motion"
         )
-    if growth is not None and spec.density is None:
+    if growth is not None and not isinstance(spec.density, DensitySpec):
         raise ValueError(
-            "motion_growth steers the density control, which is left out; leave it out "
-            "as well (motion_growth=none)"
+            "motion_growth steers the gradient thresholds of DensitySpec, and this "
+            "scene has none; leave it out as well (motion_growth=none)"
         )
     if growth is not None and growth.form == "hard" and growth.start <= motion.warm_up:
         raise ValueError(

@@ -183,16 +183,18 @@ def from_points(
     *,
     degree: int = 3,
     opacity: float = 0.1,
+    scale: float = 1.0,
     lone_scale: float = 1.0,
     dtype: Any = jnp.float32,
 ) -> Splats:
     """One round Gaussian for each point; host side.
 
     `points` [n, 3] in scene units and `colours` [n, 3] in [0, 1]. The standard
-    deviation is the root mean square distance to the three nearest points that lie
-    elsewhere (Kerbl et al. 2023, section 5.1, counts a duplicate as a neighbour at
-    distance zero and floors the result at 3e-4 whatever the unit). With two or three
-    distinct points it uses those there are; where there is one, `lone_scale`.
+    deviation is `scale` times the root mean square distance to the three nearest points
+    that lie elsewhere (Kerbl et al. 2023, section 5.1, counts a duplicate as a
+    neighbour at distance zero and floors the result at 3e-4 whatever the unit). With
+    two or three distinct points it uses those there are; where there is one,
+    `lone_scale` is that distance.
     """
     refuse_half(dtype)
     points = np.asarray(points, np.float64)
@@ -213,9 +215,10 @@ def from_points(
                 f"{name} {np.flatnonzero(bad)[0]} is not finite, and so are "
                 f"{bad.sum() - 1} more; drop those rows before starting from them"
             )
-    log_scale = np.clip(
-        np.log(_neighbour_distance(points, lone_scale)), *LOG_SCALE_RANGE
-    )
+    if not 0 < scale < math.inf:
+        raise ValueError(f"the first scale must be positive and finite, got {scale}")
+    distance = _neighbour_distance(points, lone_scale)
+    log_scale = np.clip(np.log(scale * distance), *LOG_SCALE_RANGE)
     count, rest = len(points), (degree + 1) ** 2 - 1
     return Splats(
         mean=jnp.asarray(points, dtype),

@@ -28,6 +28,7 @@ class StartSpec:
     fewest: int = 100
     beside: int = 0  # drawn in the views beside the capture's own points
     opacity: float = 0.1
+    scale: float = 1.0  # over the distance to the nearest neighbours
     widest: float = 0.03  # first scale, over the distance to the nearest camera
     source: str = "auto"
 

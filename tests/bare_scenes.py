@@ -102,7 +102,7 @@ def tiny_splats(name):
         spec,
         start=StartSpec(random=100, fewest=1000),
         sh_degree=1,
-        density=shrunk(spec.density, most=256),
+        density=shrunk(spec.density, cap_max=256),
         motion=motion,
         acceleration=shrunk(spec.acceleration, samples=16),
         neighbours=shrunk(spec.neighbours, count=3),

@@ -33,7 +33,7 @@ TINY_SPLATS = SplatScene(
     steps=30,
     sh_degree=1,
     sh_every=10,
-    density=DensitySpec(interval=10, start=10, stop=25, most=600, reset_interval=20),
+    density=DensitySpec(interval=10, start=10, stop=25, cap_max=600, reset_interval=20),
 )
 TINY_DEFORMABLE = dataclasses.replace(TINY_SPLATS, motion=TINY_MOTION)
 TINY_SONATA = dataclasses.replace(

@@ -7,15 +7,16 @@ import pytest
 
 from experiments import settings
 from gaussians_jax import presets
+from gaussians_jax.mcmc import MCMCStrategySpec
 from gaussians_jax.raster_spec import INRIA
 
 
 def test_an_override_reaches_a_nested_field_with_its_type():
     spec = settings.override(
         presets.SMALL_DEFORMABLE,
-        ("density.most=123", "motion.rate=1e-3", "raster.antialiased=true"),
+        ("density.cap_max=123", "motion.rate=1e-3", "raster.antialiased=true"),
     )
-    assert spec.density.most == 123
+    assert spec.density.cap_max == 123
     assert spec.motion.rate == 1e-3
     assert spec.raster.antialiased is True
     assert spec.start == presets.SMALL_DEFORMABLE.start
@@ -23,6 +24,14 @@ def test_an_override_reaches_a_nested_field_with_its_type():
 
 def test_an_effect_is_taken_out_with_none():
     assert settings.override(presets.SMALL_DEFORMABLE, ("motion=none",)).motion is None
+
+
+def test_one_of_several_kinds_is_chosen_by_the_name_of_its_class():
+    spec = settings.override(
+        presets.SMALL_DEFORMABLE,
+        ("density=MCMCStrategySpec", "density.cap_max=123"),
+    )
+    assert spec.density == MCMCStrategySpec(cap_max=123)
 
 
 def test_a_tuple_is_read_by_its_items():
@@ -33,8 +42,10 @@ def test_a_tuple_is_read_by_its_items():
 @pytest.mark.parametrize(
     ("assignment", "words"),
     [
-        ("density.mots=3", "has no field 'mots'; it has .*most"),
-        ("density.most=many", "cannot be read as"),
+        ("density.cap_mxa=3", "has no field 'cap_mxa'; it has .*cap_max"),
+        ("density.cap_max=many", "cannot be read as"),
+        ("density=MCMC", "one of DensitySpec, MCMCStrategySpec"),
+        ("alternation.nets=3", "no defaults for start and stop"),
         ("steps", "expected path.to.field=value"),
         ("steps.more=1", "has no fields"),
         ("sh_degree=7", "0, 1, 2 or 3"),

@@ -202,10 +202,10 @@ def test_the_cap_takes_the_largest_gradients_and_says_who_was_refused():
     stats = stats._replace(
         gradient=jnp.asarray([1.0, 5, 2, 4, 3, 0]), views=jnp.full(6, 2)
     )
-    changed = run(params, moments, stats, DensitySpec(most=8))
+    changed = run(params, moments, stats, DensitySpec(cap_max=8))
     assert labels(changed) == [0, 1, 2, 3, 4, 5, 1, 3]
     assert changed.report == density.Report(cloned=2, refused=3, alive=8, capacity=8)
-    again = run(*changed[:2], hot(changed.stats, [0]), DensitySpec(most=8))
+    again = run(*changed[:2], hot(changed.stats, [0]), DensitySpec(cap_max=8))
     assert again.report == density.Report(refused=1, alive=8, capacity=8)
 
 

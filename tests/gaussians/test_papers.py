@@ -14,6 +14,7 @@ from gaussians_jax import scene
 from gaussians_jax.effects import deformation
 from gaussians_jax.effects.effect import Moment
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec
+from gaussians_jax.mcmc import MCMCStrategySpec
 from gaussians_jax.phases import AlternationSpec
 from gaussians_jax.spec import effects_of, refuse_what_cannot_train
 from nerfies_jax.training import checkpoint, loop
@@ -170,6 +171,7 @@ def test_stages_draw_what_render_draws(paper):
         ({"motion": scenes.TINY_MOTION, "neighbours": scenes.TINY_SONATA.neighbours},
          "neighbours=none"),
         ({"density": None}, "motion_growth=none"),
+        ({"density": MCMCStrategySpec()}, "gradient thresholds of DensitySpec"),
         ({"motion_growth": MotionGrowthSpec(form="hard", start=3)}, "nothing would"),
         ({"motion": None, "motion_growth": None, "acceleration": None},
          "alternation without"),

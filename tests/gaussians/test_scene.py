@@ -230,7 +230,8 @@ def test_presets_build_and_stretch_with_their_steps(name):
     facts = Facts(extent=1.0, background=(0.0, 0.0, 0.0), frames=10)
     half = presets.with_steps(spec, spec.steps // 2)
     assert half.steps == spec.steps // 2
-    assert half.density.stop == round(spec.density.stop / 2)
+    stop = "stop" if hasattr(spec.density, "stop") else "refine_stop_iter"
+    assert getattr(half.density, stop) == round(getattr(spec.density, stop) / 2)
     assert scene.build(half, facts).spec == (half, facts)
     assert presets.with_steps(spec, spec.steps) == spec
 

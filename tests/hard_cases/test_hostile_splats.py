@@ -53,7 +53,7 @@ def hostile_spec(name):
         start=50,
         stop=STEPS,
         reset_interval=100,
-        most=splats.BUCKET,
+        cap_max=splats.BUCKET,
         gradient=1e-5,
         # Of an extent of 0.04 scene units: the paper's 0.1 prunes all of this scene.
         prune_scale=50.0,

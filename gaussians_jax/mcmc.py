@@ -1,7 +1,9 @@
 """A fixed budget of Gaussians: the faint ones move to where they are needed.
 
 Kheradmand et al. 2024, "3D Gaussian splatting as Markov chain Monte Carlo",
-arXiv:2404.09591. The alternative to `density`: no thresholds on gradients, no resets.
+arXiv:2404.09591. The alternative to `density`: no thresholds on gradients, no resets,
+and therefore no statistics. Means are shaken in every step (`position_noise`), opacity
+and scale cost something (`penalty`), and the events (`refine`) run on the host.
 """
 
 import dataclasses
@@ -28,24 +30,46 @@ _NODES = np.arange(64) * 0.1
 
 
 @dataclasses.dataclass(frozen=True)
-class RelocationSpec:
-    """When rows move, how many are added, how much the means shake."""
+class MCMCStrategySpec:
+    """When rows move, how many are added, how much the means are shaken.
 
-    interval: int = 100  # steps
-    start: int = 500  # steps
-    stop: int = 25_000  # steps
-    dead_opacity: float = 0.005  # at most this is free to move
+    The numbers are those of the paper's code, where `cap_max` is set for each scene to
+    what Kerbl et al. 2023 end with. The noise has no unit that follows the scene: it
+    grows with the square of the scales and with the extent, which is in the learning
+    rate of the means.
+    """
+
+    refine_every: int = 100  # steps
+    refine_start_iter: int = 500  # steps
+    refine_stop_iter: int = 25_000  # steps
+    min_opacity: float = 0.005  # at most this is free to move
     growth: float = 1.05  # of the count, per event
-    most: int = 1_000_000  # Gaussians
-    noise: float = 5e5  # per unit of the learning rate of the means
-    opacity_weight: float = 0.01
-    scale_weight: float = 0.01  # per scene unit
+    cap_max: int = 1_000_000  # Gaussians
+    noise_lr: float = 5e5  # per unit of the learning rate of the means
+    opacity_reg: float = 0.01
+    scale_reg: float = 0.01  # per scene unit
 
     def __post_init__(self):
-        if not 0 < self.dead_opacity < 1:
-            raise ValueError(f"dead_opacity is in (0, 1), got {self.dead_opacity}")
-        if self.growth < 1:
-            raise ValueError(f"growth is at least 1, got {self.growth}")
+        if not 0 < self.min_opacity < 1:
+            raise ValueError(
+                f"min_opacity={self.min_opacity} must lie in (0, 1); 0.005 is usual"
+            )
+        if not 1 <= self.growth < math.inf:
+            raise ValueError(
+                f"growth={self.growth} must be at least 1; 1 adds no Gaussians"
+            )
+        for name in ("refine_every", "cap_max"):
+            if getattr(self, name) < 1:
+                raise ValueError(
+                    f"{name}={getattr(self, name)} must be at least 1; to keep the "
+                    "Gaussians as they are, leave the strategy out (none)"
+                )
+        for name in ("noise_lr", "opacity_reg", "scale_reg"):
+            value = getattr(self, name)
+            if not 0 <= value < math.inf:
+                raise ValueError(
+                    f"{name}={value} must be finite and not negative; 0 leaves it out"
+                )
 
 
 def spread_over(
@@ -80,7 +104,7 @@ def relocate(
     params: Params,
     moments: PyTree,
     key: Key[Array, ""],
-    spec: RelocationSpec,
+    spec: MCMCStrategySpec,
 ) -> tuple[Params, PyTree, density.Report]:
     """Every faint Gaussian becomes a copy of a visible one; host side.
 
@@ -90,7 +114,7 @@ def relocate(
     """
     rows = params.rows["splats"]
     living, opacity = _opacities(rows)
-    faint = living & (opacity <= spec.dead_opacity)
+    faint = living & (opacity <= spec.min_opacity)
     seen = living & ~faint
     report = density.Report(alive=int(living.sum()), capacity=len(living))
     if not faint.any():
@@ -103,24 +127,41 @@ def relocate(
     return params, moments, report._replace(relocated=int(faint.sum()))
 
 
+def refine(
+    optimiser: optax.GradientTransformation,
+    params: Params,
+    moments: PyTree,
+    key: Key[Array, ""],
+    spec: MCMCStrategySpec,
+) -> tuple[Params, PyTree, density.Report]:
+    """One event: the faint Gaussians move, then new ones come; host side."""
+    move_key, add_key = jax.random.split(key)
+    params, moments, moved = relocate(optimiser, params, moments, move_key, spec)
+    params, moments, added = add(optimiser, params, moments, add_key, spec)
+    report = added._replace(
+        relocated=moved.relocated, refused=moved.refused + added.refused
+    )
+    return params, moments, report
+
+
 def add(
     optimiser: optax.GradientTransformation,
     params: Params,
     moments: PyTree,
     key: Key[Array, ""],
-    spec: RelocationSpec,
+    spec: MCMCStrategySpec,
 ) -> tuple[Params, PyTree, density.Report]:
     """`spec.growth` times as many Gaussians, as far as the cap allows; host side."""
     rows = params.rows["splats"]
     living, opacity = _opacities(rows)
     count = int(living.sum())
     wanted = int(spec.growth * count) - count
-    extra = max(min(wanted, spec.most - count), 0)
+    extra = max(min(wanted, spec.cap_max - count), 0)
     seen = living & (opacity > 0)
     report = density.Report(alive=count, capacity=len(living), refused=wanted - extra)
     if extra == 0 or not seen.any():
         return params, moments, report._replace(refused=wanted)
-    capacity = max(splats.capacity_for(count + extra, spec.most), len(living))
+    capacity = max(splats.capacity_for(count + extra, spec.cap_max), len(living))
     source = np.zeros(capacity, int)
     source[: len(living)] = np.arange(len(living))
     dead = np.ones(capacity, bool)
@@ -159,7 +200,7 @@ def _spread(optimiser, params, moments, source, dead, spec):
         source.astype(np.int32),
         np.where(dead, 1, copies).astype(np.int32),
         dead,
-        spec.dead_opacity,
+        spec.min_opacity,
     )
 
 
@@ -184,7 +225,7 @@ def position_noise(
     key: Key[Array, ""],
     rows: Splats,
     learning_rate: Float[Array, ""] | float,
-    spec: RelocationSpec,
+    spec: MCMCStrategySpec,
 ) -> Float[Array, "gaussians 3"]:
     """What to add to the means after an update, in scene units; pure.
 
@@ -198,16 +239,30 @@ def position_noise(
     )  # columns are the principal axes
     along = jnp.einsum("nji,nj->ni", axes, noise) * drawn.scale**2
     shaped = jnp.einsum("nij,nj->ni", axes, along)
-    faint = jax.nn.sigmoid(-100 * (drawn.opacity - spec.dead_opacity))
-    strength = jnp.where(splats.alive(rows), faint * spec.noise * learning_rate, 0)
+    faint = jax.nn.sigmoid(-100 * (drawn.opacity - spec.min_opacity))
+    rate = jnp.asarray(spec.noise_lr * learning_rate, faint.dtype)
+    strength = jnp.where(splats.alive(rows), faint * rate, 0)
     return strength[:, None] * shaped
 
 
-def penalty(rows: Splats, spec: RelocationSpec) -> Float[Array, ""]:
+def shake(
+    key: Key[Array, ""],
+    params: Params,
+    learning_rate: Float[Array, ""] | float,
+    spec: MCMCStrategySpec,
+) -> Params:
+    """The parameters with `position_noise` on their means; pure."""
+    rows = params.rows["splats"]
+    noise = position_noise(key, rows, learning_rate, spec)
+    rows = rows._replace(mean=rows.mean + noise)
+    return params._replace(rows=params.rows | {"splats": rows})
+
+
+def penalty(rows: Splats, spec: MCMCStrategySpec) -> Float[Array, ""]:
     """Opacities and scales cost their mean over the living rows (section 3.4)."""
     drawn = splats.activate(rows)
     living = splats.alive(rows)
     count = jnp.maximum(jnp.sum(living), 1).astype(drawn.opacity.dtype)
     opacity = jnp.sum(jnp.where(living, drawn.opacity, 0)) / count
     scale = jnp.sum(jnp.where(living[:, None], drawn.scale, 0)) / (3 * count)
-    return spec.opacity_weight * opacity + spec.scale_weight * scale
+    return spec.opacity_reg * opacity + spec.scale_reg * scale
