@@ -64,7 +64,7 @@ class Ablate:
     tracks: int = 200
     """Points to follow, at most."""
     set: tuple[str, ...] = ()
-    """Fields changed in every arm, as density.cap_max=5000 template.depth=4."""
+    """Fields changed in every arm, as densification.cap_max=5000 template.depth=4."""
     device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
     """Where to compute."""
 

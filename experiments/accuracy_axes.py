@@ -74,9 +74,9 @@ AXES = {
         SPLATS,
         **{
             "most-4000": "start.points=1500 start.random=2000 start.beside=500 "
-            "density.cap_max=4000",
-            "most-20000": "density.cap_max=20000",
-            "no-growth": "density=none",
+            "densification.cap_max=4000",
+            "most-20000": "densification.cap_max=20000",
+            "no-growth": "densification=none",
         },
     ),
     "harmonics": _axis(

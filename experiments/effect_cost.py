@@ -144,9 +144,9 @@ def _spec(name, asked):
         spec = dataclasses.replace(spec, rays=asked.rays)
     if asked.rows is not None and hasattr(spec, "start"):
         start = dataclasses.replace(spec.start, source="random", random=asked.rows)
-        most = max(spec.density.cap_max or asked.rows, asked.rows)
-        density = dataclasses.replace(spec.density, cap_max=most)
-        spec = dataclasses.replace(spec, start=start, density=density)
+        most = max(spec.densification.cap_max or asked.rows, asked.rows)
+        densification = dataclasses.replace(spec.densification, cap_max=most)
+        spec = dataclasses.replace(spec, start=start, densification=densification)
     return spec
 
 

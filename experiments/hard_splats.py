@@ -9,7 +9,7 @@ import mpmath
 import numpy as np
 
 from experiments.hard_case import Case, constant
-from gaussians_jax import density, mcmc, raster, splats
+from gaussians_jax import densification, mcmc, raster, splats
 from gaussians_jax.effects import acceleration
 from gaussians_jax.projection import Footprints
 from gaussians_jax.raster_spec import GSPLAT
@@ -109,7 +109,7 @@ LONG_LIST = Case(
 )
 
 
-_SWITCH = density.FAINT_LOGIT
+_SWITCH = densification.FAINT_LOGIT
 _BOTH = [_SWITCH * (1 + NEAR), _SWITCH * (1 - NEAR)]
 _LOGITS = np.array(
     [-500.0, -100, -88, -30, *_BOTH, -8, -1, 0, 1, 8, 16, 17, 37, 40, 80, 100]
@@ -134,7 +134,7 @@ HALVED = Case(
     axis="logit",
     at=_LOGITS,
     inputs=_LOGITS[:, None],
-    stable=density.halve_opacity,
+    stable=densification.halve_opacity,
     textbook=_halved_textbook,
     exact=_exact_halved,
     bounds={"float32": (1e-6, 1e-6), "float64": (1e-14, 1e-14)},

@@ -80,7 +80,7 @@ def fitted(count: int, spec: MotionSpec, steps: int) -> Moving:
     fitted, because one that was never trained does not move.
     """
     spec = dataclasses.replace(spec, smoothing=None, warm_up=0)
-    whole = SplatScene(steps=1, sh_degree=0, density=None, motion=spec)
+    whole = SplatScene(steps=1, sh_degree=0, densification=None, motion=spec)
     model = scene.build(whole, Facts(extent=1.0, background=(0.1, 0.1, 0.1), frames=2))
     params = Params(
         {"splats": ball_and_wall(count)}, {mlp_motion.NAME: fit(spec, steps)}

@@ -52,7 +52,7 @@ class Reconstruct:
     heldout: str | None = None
     """Which frames to score: n for every n-th, or the name of a split."""
     set: tuple[str, ...] = ()
-    """Fields of the preset, as density.cap_max=20000 motion.width=128 warp=none."""
+    """Fields of the preset: densification.cap_max=20000 motion.width=128 warp=none."""
     evaluate_every: float = 20.0
     """Seconds of training between two points of the PSNR curve."""
 

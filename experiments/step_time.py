@@ -17,7 +17,7 @@ def of_splats(
     """Milliseconds of each part of one step, forward and backward; medians, warm.
 
     Each part is timed by itself on the first frame. What is left of the whole step is
-    the optimiser and the statistics for the density control.
+    the optimiser and the statistics for densification.
     """
     from gaussians_jax import render, scene, splats
     from gaussians_jax.effects.effect import Moment

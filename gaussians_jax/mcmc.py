@@ -1,9 +1,9 @@
 """A fixed budget of Gaussians: the faint ones move to where they are needed.
 
 Kheradmand et al. 2024, "3D Gaussian splatting as Markov chain Monte Carlo",
-arXiv:2404.09591. The alternative to `density`: no thresholds on gradients, no resets,
-and therefore no statistics. Means are shaken in every step (`position_noise`), opacity
-and scale cost something (`penalty`), and the events (`refine`) run on the host.
+arXiv:2404.09591. The alternative to `densification`: no thresholds on gradients, no
+resets, and therefore no statistics. Means are shaken in every step (`position_noise`),
+opacity and scale cost something (`penalty`), the events (`refine`) run on the host.
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Int, Key
 
-from gaussians_jax import density, splats
+from gaussians_jax import densification, splats
 from gaussians_jax import optimiser as row_optimiser
 from gaussians_jax.splats import Params, Splats
 from nerfies_jax.geometry import quaternion
@@ -105,7 +105,7 @@ def relocate(
     moments: PyTree,
     key: Key[Array, ""],
     spec: MCMCStrategySpec,
-) -> tuple[Params, PyTree, density.Report]:
+) -> tuple[Params, PyTree, densification.Report]:
     """Every faint Gaussian becomes a copy of a visible one; host side.
 
     Sources are drawn in proportion to their opacity. A source and its copies share its
@@ -116,7 +116,7 @@ def relocate(
     living, opacity = _opacities(rows)
     faint = living & (opacity <= spec.min_opacity)
     seen = living & ~faint
-    report = density.Report(alive=int(living.sum()), capacity=len(living))
+    report = densification.Report(alive=int(living.sum()), capacity=len(living))
     if not faint.any():
         return params, moments, report
     if not seen.any():
@@ -133,7 +133,7 @@ def refine(
     moments: PyTree,
     key: Key[Array, ""],
     spec: MCMCStrategySpec,
-) -> tuple[Params, PyTree, density.Report]:
+) -> tuple[Params, PyTree, densification.Report]:
     """One event: the faint Gaussians move, then new ones come; host side."""
     move_key, add_key = jax.random.split(key)
     params, moments, moved = relocate(optimiser, params, moments, move_key, spec)
@@ -150,7 +150,7 @@ def add(
     moments: PyTree,
     key: Key[Array, ""],
     spec: MCMCStrategySpec,
-) -> tuple[Params, PyTree, density.Report]:
+) -> tuple[Params, PyTree, densification.Report]:
     """`spec.growth` times as many Gaussians, as far as the cap allows; host side."""
     rows = params.rows["splats"]
     living, opacity = _opacities(rows)
@@ -158,7 +158,9 @@ def add(
     wanted = int(spec.growth * count) - count
     extra = max(min(wanted, spec.cap_max - count), 0)
     seen = living & (opacity > 0)
-    report = density.Report(alive=count, capacity=len(living), refused=wanted - extra)
+    report = densification.Report(
+        alive=count, capacity=len(living), refused=wanted - extra
+    )
     if extra == 0 or not seen.any():
         return params, moments, report._replace(refused=wanted)
     capacity = max(splats.capacity_for(count + extra, spec.cap_max), len(living))

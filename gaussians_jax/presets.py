@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from gaussians_jax.density import DensitySpec
+from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.effects.acceleration import AccelerationSpec
 from gaussians_jax.effects.depth import DepthSpec
 from gaussians_jax.effects.kan_motion import SMALL_KAN_MOTION, KanMotionSpec
@@ -29,7 +29,7 @@ STATIC = SplatScene(steps=30_000)
 MCMC = SplatScene(
     steps=30_000,
     start=StartSpec(opacity=0.5, scale=0.1),
-    density=MCMCStrategySpec(),
+    densification=MCMCStrategySpec(),
 )
 
 # Yang et al. 2023, arXiv:2309.13101, for real captures: the network, the warm-up and
@@ -42,7 +42,7 @@ DEFORMABLE = SplatScene(steps=40_000, motion=MotionSpec())
 SONATA = SplatScene(
     steps=60_000,
     optimiser="radam",
-    density=DensitySpec(stop=60_000, reset_interval=1_000_000),
+    densification=DefaultStrategySpec(refine_stop_iter=60_000, reset_every=1_000_000),
     motion=KanMotionSpec(waves=2.0, spread=0.5, warm_up=3000),
     neighbours=NeighbourSpec(start=3000),
     spectral=SpectralSpec(),
@@ -54,7 +54,7 @@ SONATA = SplatScene(
 MOBA = SplatScene(
     steps=20_000,
     start=StartSpec(source="random", random=100_000),
-    density=DensitySpec(stop=10_000),
+    densification=DefaultStrategySpec(refine_stop_iter=10_000),
     motion=BasisMotionSpec(),
     alternation=AlternationSpec(10_000, 15_000),
     annealing=AnnealingSpec(15_000),
@@ -75,8 +75,12 @@ SMALL_STATIC = SplatScene(
     start=StartSpec(points=4000, random=5000, beside=2000),
     sh_degree=1,
     sh_every=1000,
-    density=DensitySpec(
-        interval=200, start=300, stop=2000, reset_interval=100_000, cap_max=10_000
+    densification=DefaultStrategySpec(
+        refine_every=200,
+        refine_start_iter=300,
+        refine_stop_iter=2000,
+        reset_every=100_000,
+        cap_max=10_000,
     ),
     rates=RateSpec(mean_end=3.2e-6),
 )
@@ -87,7 +91,7 @@ SMALL_STATIC = SplatScene(
 #   and events every 100 steps (7692 Gaussians)   21.93 / 0.795
 SMALL_MCMC = dataclasses.replace(
     SMALL_STATIC,
-    density=MCMCStrategySpec(
+    densification=MCMCStrategySpec(
         refine_every=50, refine_start_iter=300, refine_stop_iter=2500, cap_max=10_000
     ),
 )
@@ -135,7 +139,9 @@ SMALL_SONATA = dataclasses.replace(
 # time, 21.90 with these.
 SMALL_MOBA = dataclasses.replace(
     SMALL_STATIC,
-    density=dataclasses.replace(SMALL_STATIC.density, stop=1500),
+    densification=dataclasses.replace(
+        SMALL_STATIC.densification, refine_stop_iter=1500
+    ),
     motion=dataclasses.replace(
         SMALL_BASIS_MOTION,
         time=EncodingSpec(6),
@@ -167,12 +173,10 @@ PRESETS = {
 
 # The fields of each part that count steps, where its kind has them.
 STEP_FIELDS = {
-    "density": (
-        "start",
-        "stop",
-        "reset_interval",
+    "densification": (
         "refine_start_iter",
         "refine_stop_iter",
+        "reset_every",
     ),
     "motion": ("warm_up",),
     "alternation": ("start", "stop"),

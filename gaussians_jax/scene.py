@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from gaussians_jax import density, mcmc, phases, rates, render, splats, start
-from gaussians_jax.density import DensitySpec
+from gaussians_jax import densification, mcmc, phases, rates, render, splats, start
+from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.effects import deformation
 from gaussians_jax.effects.effect import Around, Effect, Moment, Shot
 from gaussians_jax.mcmc import MCMCStrategySpec
@@ -55,7 +55,7 @@ def facts_of(capture: Capture) -> Facts:
 class Extra(NamedTuple):
     """What a scene carries beside its parameters; everything in it has rows."""
 
-    stats: PyTree  # density.RowStats, or () where no strategy keeps them
+    stats: PyTree  # densification.RowStats, or () where no strategy keeps them
     carried: dict[str, PyTree]  # by the name of the effect
 
 
@@ -156,17 +156,17 @@ def _stepper(spec, facts, effects, optimiser):
         directions, moments = optimiser.update(slopes, state.optimiser, state.params)
         rate = _rates(spec, facts, effects, state.step)
         trained = Trained(rates.descend(state.params, directions, rate), moments)
-        if isinstance(spec.density, MCMCStrategySpec):
+        if isinstance(spec.densification, MCMCStrategySpec):
             key, speed = _stream(state, NOISE), rate.rows["splats"].mean
-            shaken = mcmc.shake(key, trained.params, speed, spec.density)
+            shaken = mcmc.shake(key, trained.params, speed, spec.densification)
             trained = trained._replace(params=shaken)
         if spec.alternation is not None:
             before = Trained(state.params, state.optimiser)
             trained = phases.hold(optimiser, turn, before, trained)
         stats, carried = state.extra
-        if isinstance(spec.density, DensitySpec):
+        if isinstance(spec.densification, DefaultStrategySpec):
             radius_px = jnp.max(footprints.extent_px, axis=1)
-            stats = density.observe(
+            stats = densification.observe(
                 stats, probe_slope, footprints.visible, radius_px, size
             )
         for effect in effects:
@@ -193,8 +193,8 @@ def loss_of(
         colour, seen.truth, seen.valid, dssim_weight=spec.dssim_weight
     )
     metrics = {"mse": losses.mse(colour, seen.truth, seen.valid)}
-    if isinstance(spec.density, MCMCStrategySpec):
-        cost = mcmc.penalty(params.rows["splats"], spec.density)
+    if isinstance(spec.densification, MCMCStrategySpec):
+        cost = mcmc.penalty(params.rows["splats"], spec.densification)
         value, metrics = value + cost, metrics | {"mcmc": cost}
 
     at_time = deformation.poser(effects, moment)
@@ -280,7 +280,7 @@ def first_state(spec, effects, optimiser, capture, key) -> TrainState:
     )
     rows = start.narrowed(rows, capture, spec.start.widest)
     count = len(position)
-    most = None if spec.density is None else spec.density.cap_max
+    most = None if spec.densification is None else spec.densification.cap_max
     params = Params({"splats": rows}, {})
     for number, effect in enumerate(effects):
         effect_key = jax.random.fold_in(start_key, number)
@@ -292,8 +292,8 @@ def first_state(spec, effects, optimiser, capture, key) -> TrainState:
     params = splats.pad_rows(params, splats.capacity_for(count, most))
     params = in_default_precision(params)
     stats = ()
-    if isinstance(spec.density, DensitySpec):
-        stats = density.empty_stats(params.rows["splats"])
+    if isinstance(spec.densification, DefaultStrategySpec):
+        stats = densification.empty_stats(params.rows["splats"])
     extra = Extra(stats, carried_by(effects, params))
     return TrainState(
         params, optimiser.init(params), extra, jnp.zeros((), jnp.int32), run_key
@@ -306,12 +306,12 @@ def _stream(state, name):
 
 
 def _events(spec, facts, effects, optimiser):
-    if spec.density is None:
+    if spec.densification is None:
         return ()
-    plan = spec.density
+    plan = spec.densification
     if isinstance(plan, MCMCStrategySpec):
         return _mcmc_events(plan, spec.steps, effects, optimiser)
-    last = min(plan.stop, spec.steps)
+    last = min(plan.refine_stop_iter, spec.steps)
 
     def densify(state, frames):
         del frames
@@ -320,8 +320,8 @@ def _events(spec, facts, effects, optimiser):
         for effect in effects:
             if effect.grow_score is not None:
                 factor = effect.grow_score(carried[effect.name], step)
-                stats = stats._replace(gradient=stats.gradient * jnp.asarray(factor))
-        changed = density.densify(
+                stats = stats._replace(grad2d=stats.grad2d * jnp.asarray(factor))
+        changed = densification.densify(
             optimiser,
             state.params,
             state.optimiser,
@@ -338,17 +338,17 @@ def _events(spec, facts, effects, optimiser):
 
     def reset(state, frames):
         del frames
-        params, moments = density.reset_opacity(
+        params, moments = densification.reset_opacity(
             optimiser, state.params, state.optimiser, plan
         )
         return state._replace(params=params, optimiser=moments)
 
-    grow = tuple(range(plan.start, last, plan.interval))
+    grow = tuple(range(plan.refine_start_iter, last, plan.refine_every))
     return (
         Event("densify", grow, densify),
         Event(
             "reset opacity",
-            tuple(range(plan.reset_interval, last, plan.reset_interval)),
+            tuple(range(plan.reset_every, last, plan.reset_every)),
             reset,
         ),
     )

@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from gaussians_jax.density import DensitySpec
+from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.effects import (
     acceleration,
     depth,
@@ -43,7 +43,7 @@ class SplatScene:
     dssim_weight: float = 0.2
     rates: RateSpec = RateSpec()
     raster: RasterSpec = RasterSpec()
-    density: DensitySpec | MCMCStrategySpec | None = DensitySpec()
+    densification: DefaultStrategySpec | MCMCStrategySpec | None = DefaultStrategySpec()
     optimiser: str = "adam"
     alternation: AlternationSpec | None = None
     annealing: AnnealingSpec | None = None
@@ -96,10 +96,10 @@ def refuse_what_cannot_train(spec: SplatScene) -> None:
             "neighbours keep embeddings alike, and this motion has none; leave them "
             "out (neighbours=none), or choose a preset with a KAN motion"
         )
-    if growth is not None and not isinstance(spec.density, DensitySpec):
+    if growth is not None and not isinstance(spec.densification, DefaultStrategySpec):
         raise ValueError(
-            "motion_growth steers the gradient thresholds of DensitySpec, and this "
-            "scene has none; leave it out as well (motion_growth=none)"
+            "motion_growth steers the gradient threshold of DefaultStrategySpec, which "
+            "this scene has not; leave it out as well (motion_growth=none)"
         )
     if growth is not None and growth.form == "hard" and growth.start <= motion.warm_up:
         raise ValueError(

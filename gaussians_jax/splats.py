@@ -295,9 +295,10 @@ def random_in_views(
 def scene_extent(position: np.ndarray, still: float | None = None) -> float:
     """1.1 times the largest distance of a camera from their mean; host side.
 
-    The unit of the learning rate of the means and of the density thresholds (Kerbl et
-    al. 2023, reference implementation). Cameras that stand still have none, and a zero
-    would stop the means from learning; `still`, a typical depth, stands in for it.
+    The unit of the learning rate of the means and of the thresholds of densification
+    (Kerbl et al. 2023, reference implementation). Cameras that stand still have none,
+    and a zero would stop the means from learning; `still`, a typical depth, stands in
+    for it.
     """
     position = np.asarray(position, np.float64).reshape(-1, 3)
     middle = position.mean(axis=0)

@@ -11,7 +11,14 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from gaussians_jax import density, harmonics, optimiser, projection, raster, splats
+from gaussians_jax import (
+    densification,
+    harmonics,
+    optimiser,
+    projection,
+    raster,
+    splats,
+)
 from gaussians_jax import presets as splat_presets
 from gaussians_jax import rates as splat_rates
 from gaussians_jax.effects.kan_motion import KanMotionSpec
@@ -102,7 +109,7 @@ def tiny_splats(name):
         spec,
         start=StartSpec(random=100, fewest=1000),
         sh_degree=1,
-        density=shrunk(spec.density, cap_max=256),
+        densification=shrunk(spec.densification, cap_max=256),
         motion=motion,
         acceleration=shrunk(spec.acceleration, samples=16),
         neighbours=shrunk(spec.neighbours, count=3),
@@ -191,7 +198,7 @@ def splat_step(spec, facts, shuffled_row):
         colour = harmonics.colour_towards(shown, gaussians.mean, camera.position)
         seen = projection.project(gaussians, camera, size, spec.raster)
         placed = seen
-        if offset is not None:  # whose slope the density control wants to know
+        if offset is not None:  # whose slope densification wants to know
             placed = seen._replace(mean_px=seen.mean_px + offset)
         image, passing = raster.rasterise(placed, colour, size, spec.raster)
         behind = jnp.asarray(facts.background, image.dtype)
@@ -213,7 +220,7 @@ def splat_step(spec, facts, shuffled_row):
             return value, (losses.mse(image, truth, valid), seen)
 
         still, wanted = None, (0,)
-        if spec.density is not None:
+        if spec.densification is not None:
             still = jnp.zeros_like(state.params.rows["splats"].mean[:, :2])
             wanted = (0, 1)
         (value, (mse, seen)), slopes = jax.value_and_grad(
@@ -226,9 +233,9 @@ def splat_step(spec, facts, shuffled_row):
         rates = Params({"splats": rates}, {})
         params = splat_rates.descend(state.params, direction, rates)
         extra = state.extra
-        if spec.density is not None:
+        if spec.densification is not None:
             radius_px = jnp.max(seen.extent_px, axis=1)
-            stats = density.observe(
+            stats = densification.observe(
                 extra.stats, slopes[1], seen.visible, radius_px, size
             )
             extra = extra._replace(stats=stats)

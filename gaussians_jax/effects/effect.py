@@ -74,7 +74,7 @@ class Effect(NamedTuple):
     carry: Callable[[Params], PyTree] | None = None
     # (carried, canonical, moved, moment) -> carried; pure, in every step
     observe: Callable[[PyTree, Gaussians, Gaussians, Moment], PyTree] | None = None
-    # (carried, step) -> [rows] factor of the gradient that the density control
+    # (carried, step) -> [rows] factor of the gradient that densification
     # compares with its threshold; host side
     grow_score: Callable[[PyTree, int], np.ndarray] | None = None
     # Of `Frames`, beside pictures and cameras; who wants "depths" gets them drawn too.

@@ -1,4 +1,4 @@
-"""Growth where things move: the density control's threshold depends on the motion.
+"""Growth where things move: densification's threshold depends on the motion.
 
 MoBa-GS, section 3.4: a Gaussian is cloned or split only if its gradient on the screen
 and its motion both pass a threshold (equation 7). Printed so, what stands still never

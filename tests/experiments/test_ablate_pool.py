@@ -144,7 +144,7 @@ def test_the_command_has_the_same_settings_for_one_arm(monkeypatch):
         budget=5.0,
         max_side=64,
         capture=pathlib.Path("a folder"),
-        set=("density.cap_max=99", "sh_degree=0"),
+        set=("densification.cap_max=99", "sh_degree=0"),
     )
     job = types.SimpleNamespace(asked=asked, out=pathlib.Path("there"))
     words = ablate_pool.command(job, "full", 2)

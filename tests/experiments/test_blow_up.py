@@ -12,7 +12,7 @@ from tests.hard_cases import hostile
 
 pytestmark = pytest.mark.slow
 
-SPLATS = ("density=none", "sh_degree=0")
+SPLATS = ("densification=none", "sh_degree=0")
 FIELD = (
     "rays=16",
     "sampling.coarse=4",

@@ -26,10 +26,10 @@ from nerfies_jax.training.model import TrainState
 from tests import scenes
 
 QUICK = (
-    "density.interval=4",
-    "density.start=4",
-    "density.stop=10",
-    "density.cap_max=300",
+    "densification.refine_every=4",
+    "densification.refine_start_iter=4",
+    "densification.refine_stop_iter=10",
+    "densification.cap_max=300",
     "motion.width=8",
     "motion.depth=2",
     "motion.skips=",

@@ -14,9 +14,9 @@ from gaussians_jax.raster_spec import INRIA
 def test_an_override_reaches_a_nested_field_with_its_type():
     spec = settings.override(
         presets.SMALL_DEFORMABLE,
-        ("density.cap_max=123", "motion.rate=1e-3", "raster.antialiased=true"),
+        ("densification.cap_max=123", "motion.rate=1e-3", "raster.antialiased=true"),
     )
-    assert spec.density.cap_max == 123
+    assert spec.densification.cap_max == 123
     assert spec.motion.rate == 1e-3
     assert spec.raster.antialiased is True
     assert spec.start == presets.SMALL_DEFORMABLE.start
@@ -29,9 +29,9 @@ def test_an_effect_is_taken_out_with_none():
 def test_one_of_several_kinds_is_chosen_by_the_name_of_its_class():
     spec = settings.override(
         presets.SMALL_DEFORMABLE,
-        ("density=MCMCStrategySpec", "density.cap_max=123"),
+        ("densification=MCMCStrategySpec", "densification.cap_max=123"),
     )
-    assert spec.density == MCMCStrategySpec(cap_max=123)
+    assert spec.densification == MCMCStrategySpec(cap_max=123)
 
 
 def test_a_tuple_is_read_by_its_items():
@@ -42,9 +42,9 @@ def test_a_tuple_is_read_by_its_items():
 @pytest.mark.parametrize(
     ("assignment", "words"),
     [
-        ("density.cap_mxa=3", "has no field 'cap_mxa'; it has .*cap_max"),
-        ("density.cap_max=many", "cannot be read as"),
-        ("density=MCMC", "one of DensitySpec, MCMCStrategySpec"),
+        ("densification.cap_mxa=3", "has no field 'cap_mxa'; it has .*cap_max"),
+        ("densification.cap_max=many", "cannot be read as"),
+        ("densification=MCMC", "one of DefaultStrategySpec, MCMCStrategySpec"),
         ("alternation.nets=3", "no defaults for start and stop"),
         ("steps", "expected path.to.field=value"),
         ("steps.more=1", "has no fields"),

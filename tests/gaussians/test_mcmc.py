@@ -12,7 +12,7 @@ import pytest
 import rich.console
 
 from experiments import evaluate
-from gaussians_jax import density, mcmc, optimiser, scene
+from gaussians_jax import densification, mcmc, optimiser, scene
 from gaussians_jax import splats as rows
 from gaussians_jax.mcmc import MCMCStrategySpec
 from gaussians_jax.phases import AlternationSpec
@@ -27,7 +27,7 @@ QUIET = rich.console.Console(quiet=True)
 # 200 points, and five events of 5 % up to the cap.
 SCENE = dataclasses.replace(
     scenes.TINY_DEFORMABLE,
-    density=MCMCStrategySpec(refine_every=4, refine_start_iter=4, cap_max=230),
+    densification=MCMCStrategySpec(refine_every=4, refine_start_iter=4, cap_max=230),
 )
 
 
@@ -124,7 +124,7 @@ def test_spreading_gradient(float64):
 def test_a_copy_and_its_source_composite_to_the_opacity_there_was(dtype):
     params, moments = make([0.9, 0.001, 0.002, 0.003], dtype)
     moved, after, report = mcmc.relocate(TX, params, moments, KEY, SPEC)
-    assert report == density.Report(relocated=3, alive=4, capacity=4)
+    assert report == densification.Report(relocated=3, alive=4, capacity=4)
     splats = moved.rows["splats"]
     np.testing.assert_array_equal(
         splats.mean, np.tile(params.rows["splats"].mean[0], (4, 1))
@@ -170,7 +170,7 @@ def test_nothing_faint_and_nothing_visible():
 def test_adding_grows_by_a_twentieth_into_the_dead_rows_and_stops_at_the_cap():
     params, moments = make(np.full(100, 0.3))
     params, moments, report = mcmc.add(TX, params, moments, KEY, SPEC)
-    assert report == density.Report(cloned=5, alive=105, capacity=256)
+    assert report == densification.Report(cloned=5, alive=105, capacity=256)
     splats = params.rows["splats"]
     assert int(rows.alive(splats).sum()) == 105
     opacity = np.asarray(rows.activate(splats).opacity, np.float64)
@@ -178,9 +178,9 @@ def test_adding_grows_by_a_twentieth_into_the_dead_rows_and_stops_at_the_cap():
     np.testing.assert_allclose(np.log1p(-opacity).sum(), 100 * np.log(0.7), rtol=1e-5)
     capped = MCMCStrategySpec(cap_max=107)
     params, moments, report = mcmc.add(TX, params, moments, KEY, capped)
-    assert report == density.Report(cloned=2, refused=3, alive=107, capacity=256)
+    assert report == densification.Report(cloned=2, refused=3, alive=107, capacity=256)
     _, _, report = mcmc.add(TX, params, moments, KEY, capped)
-    assert report == density.Report(refused=5, alive=107, capacity=256)
+    assert report == densification.Report(refused=5, alive=107, capacity=256)
 
 
 def test_noise_has_the_covariance_squared_and_spares_the_opaque(dtype):
@@ -293,8 +293,8 @@ def test_a_step_shakes_the_means_and_nothing_else():
     spec = dataclasses.replace(SCENE, alternation=AlternationSpec(1, 3, nets=1))
 
     def stepped(spec, **changed):
-        plan = dataclasses.replace(SCENE.density, **changed)
-        model, state, frames = built(dataclasses.replace(spec, density=plan))
+        plan = dataclasses.replace(SCENE.densification, **changed)
+        model, state, frames = built(dataclasses.replace(spec, densification=plan))
         # Opacities of 0.0067, near the threshold: at 0.1 there is next to no noise.
         splats = state.params.rows["splats"]
         logit = jnp.where(rows.alive(splats), -5.0, splats.opacity_logit)

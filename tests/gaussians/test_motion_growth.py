@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import density, optimiser, splats
-from gaussians_jax.density import DensitySpec
+from gaussians_jax import densification, optimiser, splats
+from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.effects import motion_growth
 from gaussians_jax.effects.effect import Moment
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec, Travel
@@ -21,7 +21,7 @@ EXTENT = 2.0
 TAU = 2e-3  # of the default threshold in this extent, scene units
 SOFT = MotionGrowthSpec(start=100)
 HARD = dataclasses.replace(SOFT, form="hard")
-DENSITY = DensitySpec()
+STRATEGY = DefaultStrategySpec()
 TX = optimiser.scale_by_row_adam()
 
 
@@ -254,21 +254,21 @@ def test_the_soft_form_becomes_the_hard_one_as_beta_grows():
 def grown(spec, params, gradient, motion, step=600):
     """The event of a scene with this effect: labels of the rows that were cloned."""
     rows = params.rows["splats"]
-    stats = density.empty_stats(rows)
-    gradient = jnp.zeros_like(stats.gradient).at[: len(gradient)].set(gradient)
-    stats = stats._replace(gradient=gradient, views=jnp.ones_like(stats.views))
+    stats = densification.empty_stats(rows)
+    gradient = jnp.zeros_like(stats.grad2d).at[: len(gradient)].set(gradient)
+    stats = stats._replace(grad2d=gradient, views=jnp.ones_like(stats.views))
     if spec is not None:
         high = jnp.zeros_like(rows.mean).at[: len(motion), 0].set(2 * motion)
         carried = Travel(jnp.zeros_like(high), high)
         factor = motion_growth.effect(spec, EXTENT).grow_score(carried, step)
-        stats = stats._replace(gradient=stats.gradient * jnp.asarray(factor))
-    changed = density.densify(
+        stats = stats._replace(grad2d=stats.grad2d * jnp.asarray(factor))
+    changed = densification.densify(
         TX,
         params,
         TX.init(params),
         stats,
         jax.random.key(0),
-        DENSITY,
+        STRATEGY,
         step=step,
         extent=EXTENT,
     )
@@ -277,7 +277,7 @@ def grown(spec, params, gradient, motion, step=600):
     return changed, sorted(labels[-changed.report.cloned or len(labels) :].astype(int))
 
 
-STEEP, FLAT = 1.5 * DENSITY.gradient, 0.5 * DENSITY.gradient
+STEEP, FLAT = 1.5 * STRATEGY.grow_grad2d, 0.5 * STRATEGY.grow_grad2d
 # Every combination of slope and motion, in the order of the rows.
 TABLE = tuple(itertools.product((STEEP, FLAT), (2 * TAU, 0.5 * TAU, 0.0)))
 
@@ -299,7 +299,7 @@ def test_truth_table_of_the_conjunction(spec, step, cloned, dtype):
     params = rows_of(len(TABLE), dtype)
     changed, labels = grown(spec, params, gradient, motion, step)
     assert labels == cloned
-    assert changed.stats.gradient.dtype.name == dtype
+    assert changed.stats.grad2d.dtype.name == dtype
 
 
 def test_at_the_threshold_itself_nothing_grows():
@@ -313,7 +313,7 @@ def test_at_the_threshold_itself_nothing_grows():
 
 def test_hard_growth_is_dead_where_nothing_moves_yet_and_soft_is_not():
     """Random points, motion zero at first: equation 7 never lets them grow."""
-    params, gradient = rows_of(20), np.full(20, 20 * DENSITY.gradient)
+    params, gradient = rows_of(20), np.full(20, 20 * STRATEGY.grow_grad2d)
     for spec, growth in ((HARD, 0), (SOFT, 20), (None, 20)):
         changed, _ = grown(spec, params, gradient, np.zeros(20))
         assert changed.report.cloned == growth
@@ -332,7 +332,7 @@ def spread(spec, rounds=8):
         moves = np.asarray(params.rows["label"])[:count, 0] == 1
         slope = np.where(moves, 24 / moves.sum(), 96 / (~moves).sum())
         motion = np.where(moves, 5 * TAU, 0.1 * TAU)
-        changed, _ = grown(spec, params, slope * DENSITY.gradient, motion)
+        changed, _ = grown(spec, params, slope * STRATEGY.grow_grad2d, motion)
         params, count = changed.params, changed.report.alive
     assert changed.report.cloned == 0  # at rest
     moves = np.asarray(params.rows["label"])[:count, 0] == 1

@@ -127,7 +127,9 @@ def test_events_grow_the_scene_and_keep_its_picture_learnable():
     assert grow.steps == (10, 20)
     spec = dataclasses.replace(
         scenes.TINY_SPLATS,
-        density=dataclasses.replace(scenes.TINY_SPLATS.density, gradient=1e-9),
+        densification=dataclasses.replace(
+            scenes.TINY_SPLATS.densification, grow_grad2d=1e-9
+        ),
     )
     eager = scene.build(spec, scene.facts_of(scenes.tiny_capture()))
     after = eager.events[0].apply(state, frames)
@@ -230,8 +232,8 @@ def test_presets_build_and_stretch_with_their_steps(name):
     facts = Facts(extent=1.0, background=(0.0, 0.0, 0.0), frames=10)
     half = presets.with_steps(spec, spec.steps // 2)
     assert half.steps == spec.steps // 2
-    stop = "stop" if hasattr(spec.density, "stop") else "refine_stop_iter"
-    assert getattr(half.density, stop) == round(getattr(spec.density, stop) / 2)
+    stop = spec.densification.refine_stop_iter
+    assert half.densification.refine_stop_iter == round(stop / 2)
     assert scene.build(half, facts).spec == (half, facts)
     assert presets.with_steps(spec, spec.steps) == spec
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import density, scene, splats
+from gaussians_jax import densification, scene, splats
 from gaussians_jax.scene import Extra
 from gaussians_jax.spec import effects_of
 from gaussians_jax.start import StartSpec
@@ -48,17 +48,17 @@ def hostile_spec(name):
     One capacity is one program for all starts; 200 points leave room for 56.
     """
     plan = dataclasses.replace(
-        scenes.TINY_SPLATS.density,
-        interval=50,
-        start=50,
-        stop=STEPS,
-        reset_interval=100,
+        scenes.TINY_SPLATS.densification,
+        refine_every=50,
+        refine_start_iter=50,
+        refine_stop_iter=STEPS,
+        reset_every=100,
         cap_max=splats.BUCKET,
-        gradient=1e-5,
+        grow_grad2d=1e-5,
         # Of an extent of 0.04 scene units: the paper's 0.1 prunes all of this scene.
-        prune_scale=50.0,
+        prune_scale3d=50.0,
     )
-    return dataclasses.replace(TINY[name], steps=STEPS, density=plan)
+    return dataclasses.replace(TINY[name], steps=STEPS, densification=plan)
 
 
 class Hurried(NamedTuple):
@@ -132,7 +132,9 @@ def started_with(made: Ready, rows):
     """The first state with these rows, and what is made of the rows made anew."""
     params, rows = made.start.params, jax.device_put(rows)
     params = params._replace(rows=params.rows | {"splats": rows})
-    extra = Extra(density.empty_stats(rows), scene.carried_by(made.effects, params))
+    extra = Extra(
+        densification.empty_stats(rows), scene.carried_by(made.effects, params)
+    )
     return made.start._replace(params=params, extra=Hurried(extra, np.float32(1)))
 
 

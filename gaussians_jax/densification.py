@@ -1,4 +1,4 @@
-"""Adaptive density: clone the small, split the large, prune the faint.
+"""Densification: clone the small, split the large, prune the faint.
 
 Kerbl et al. 2023, arXiv:2308.04079, section 5.2, with the constants of its reference
 implementation. Statistics are gathered inside the step (`observe`, pure); the events
@@ -28,31 +28,31 @@ KEPT, CLONED, CLONE, CHILD = 0, 1, 2, 3  # what a row is after the event
 
 
 @dataclasses.dataclass(frozen=True)
-class DensitySpec:
+class DefaultStrategySpec:
     """When and where Gaussians are added and removed."""
 
-    interval: int = 100  # steps
-    start: int = 500  # steps
-    stop: int = 15_000  # steps
-    gradient: float = 2e-4  # of the mean on the screen, in NDC units per view
-    clone_below: float = 0.01  # largest scale, of the scene extent
+    refine_every: int = 100  # steps
+    refine_start_iter: int = 500  # steps
+    refine_stop_iter: int = 15_000  # steps
+    grow_grad2d: float = 2e-4  # of the mean on the screen, in NDC units per view
+    grow_scale3d: float = 0.01  # largest scale, of the scene extent
     shrink: float = 1.6  # scale of a parent over that of its children
-    prune_opacity: float = 0.005
-    prune_scale: float = 0.1  # largest scale, of the scene extent
+    prune_opa: float = 0.005
+    prune_scale3d: float = 0.1  # largest scale, of the scene extent
     prune_radius_px: float | None = None  # 20 in the paper, where it had no effect
-    reset_interval: int = 3000  # steps; pruning by size starts after the first reset
+    reset_every: int = 3000  # steps; pruning by size starts after the first reset
     reset_opacity: float = 0.01
     cap_max: int = 1_000_000  # Gaussians
     revised_opacity: bool = False  # two halves together as opaque as the parent
 
     def __post_init__(self):
-        if not 0 < self.prune_opacity < self.reset_opacity < 1:
+        if not 0 < self.prune_opa < self.reset_opacity < 1:
             raise ValueError(
                 "opacities must satisfy 0 < prune < reset < 1, or a reset prunes "
-                f"everything; got prune_opacity={self.prune_opacity} and "
+                f"everything; got prune_opa={self.prune_opa} and "
                 f"reset_opacity={self.reset_opacity}"
             )
-        for name in ("interval", "reset_interval", "cap_max"):
+        for name in ("refine_every", "reset_every", "cap_max"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is at least 1, got {getattr(self, name)}")
         if not self.shrink > 1:
@@ -63,7 +63,7 @@ class RowStats(NamedTuple):
     """What the rows did since the last event."""
 
     alive: Bool[Array, " gaussians"]
-    gradient: Float[Array, " gaussians"]  # summed norms, NDC units
+    grad2d: Float[Array, " gaussians"]  # summed norms, NDC units
     views: Int[Array, " gaussians"]  # in which the row was visible
     radius_px: Float[Array, " gaussians"]  # the largest seen
 
@@ -95,7 +95,7 @@ def empty_stats(rows: Splats) -> RowStats:
     like = rows.opacity_logit
     return RowStats(
         alive=splats.alive(rows),
-        gradient=jnp.zeros_like(like),
+        grad2d=jnp.zeros_like(like),
         views=jnp.zeros(like.shape, jnp.int32),
         radius_px=jnp.zeros_like(like),  # its own buffer: the loop donates them all
     )
@@ -122,7 +122,7 @@ def observe(
     norm = jnp.hypot(slope[:, 0], slope[:, 1])
     return RowStats(
         alive=stats.alive,
-        gradient=stats.gradient + jnp.where(visible, norm, 0),
+        grad2d=stats.grad2d + jnp.where(visible, norm, 0),
         views=stats.views + visible.astype(jnp.int32),
         radius_px=jnp.maximum(stats.radius_px, jnp.where(visible, radius_px, 0)),
     )
@@ -134,7 +134,7 @@ def densify(
     moments: PyTree,
     stats: RowStats,
     key: Key[Array, ""],
-    spec: DensitySpec,
+    spec: DefaultStrategySpec,
     *,
     step: int,
     extent: float,
@@ -144,7 +144,7 @@ def densify(
     A row grows where its mean gradient per view reaches the threshold: a small one is
     copied, a large one is replaced by two drawn from it. Where the cap leaves room for
     some, those with the largest gradient grow. An effect that scores rows its own way
-    scales `stats.gradient` first. The clones and the children come back with zero
+    scales `stats.grad2d` first. The clones and the children come back with zero
     moments. `extent` is `splats.scene_extent`.
     """
     rows, kind, report = _plan(params.rows["splats"], stats, spec, step, extent)
@@ -173,14 +173,14 @@ def _plan(rows, stats, spec, step, extent):
     """Which old row each new row comes from, and what becomes of it."""
     stats = jax.tree.map(np.asarray, stats)
     whole, opacity, scale = map(np.asarray, _facts(rows))
-    score = stats.gradient / np.maximum(stats.views, 1)
+    score = stats.grad2d / np.maximum(stats.views, 1)
 
-    kept = stats.alive & whole & (opacity >= spec.prune_opacity)
-    grows = kept & (score >= spec.gradient)
-    splits = grows & (scale > spec.clone_below * extent)
-    if step > spec.reset_interval:
+    kept = stats.alive & whole & (opacity >= spec.prune_opa)
+    grows = kept & (score >= spec.grow_grad2d)
+    splits = grows & (scale > spec.grow_scale3d * extent)
+    if step > spec.reset_every:
         after = np.where(splits, scale / spec.shrink, scale)
-        kept &= after <= spec.prune_scale * extent
+        kept &= after <= spec.prune_scale3d * extent
         if spec.prune_radius_px is not None:
             kept &= splits | (stats.radius_px <= spec.prune_radius_px)
     grows &= kept
@@ -275,7 +275,7 @@ def reset_opacity(
     optimiser: optax.GradientTransformation,
     params: Params,
     moments: PyTree,
-    spec: DensitySpec,
+    spec: DefaultStrategySpec,
 ) -> tuple[Params, PyTree]:
     """No opacity above `spec.reset_opacity`; the moments of the opacities start anew.
 
