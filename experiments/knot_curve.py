@@ -65,7 +65,7 @@ def curve(
         for (way, count), table in tables.items()
     }
     timing = clock.compare(calls, repeats=repeats)
-    paths = np.stack([pose.mean for pose in exact])[:, motion.alive]
+    paths = np.stack([pose.mean for pose in exact])[:, motion.active]
     ways = np.linalg.norm(paths - paths[INSTANTS // 2], axis=-1)
     size = float(ways.max())
     if not size > 0:
@@ -76,7 +76,7 @@ def curve(
     points = []
     for (way, count), table in tables.items():
         posed = [_at(table, time, way) for time in times]
-        found = np.stack([pose.mean for pose in posed])[:, motion.alive]
+        found = np.stack([pose.mean for pose in posed])[:, motion.active]
         errors = np.linalg.norm(found - paths, axis=-1)[:, moved] / size
         pictures = [motion.draw(posed[k], times[k]) for k in drawn]
         squares = [np.square(a - b) for a, b in zip(pictures, truth, strict=True)]
@@ -95,7 +95,7 @@ def curve(
     network = timing["network"]
     return Curve(
         motion.name,
-        int(motion.alive.sum()),
+        int(motion.active.sum()),
         int(moved.sum()),
         size,
         1e3 * network.median,

@@ -30,7 +30,7 @@ class Moving(NamedTuple):
     name: str
     pose: Callable  # time -> Gaussians, compiled
     draw: Callable  # (Gaussians, time) -> colour, compiled
-    alive: np.ndarray  # [gaussians] bool
+    active: np.ndarray  # [gaussians] bool
 
 
 class Change(NamedTuple):
@@ -69,7 +69,7 @@ def of_model(
         name,
         lambda time: pose(params, prepared, time),
         lambda posed, time: draw(params, posed, view._replace(time=time), state.step),
-        np.asarray(splats.alive(params.rows["splats"])),
+        np.asarray(splats.active_mask(params.rows["splats"])),
     )
 
 

@@ -174,15 +174,15 @@ def without_moving(
     parts = still_rows.split(state.params, pose_rows, times, farther_than)
     moves = parts.where.moves
     rows = state.params.rows
-    living = int(splats.alive(rows["splats"]).sum())
-    if int(moves.sum()) == living:
+    active = int(splats.active_mask(rows["splats"]).sum())
+    if int(moves.sum()) == active:
         raise ValueError(
-            f"--hide-moving {farther_than:g}: all {living} Gaussians move farther than "
+            f"--hide-moving {farther_than:g}: all {active} Gaussians move farther than "
             "that, and nothing would be left; give a longer distance"
         )
-    shown = rows | {"splats": splats.bury(rows["splats"], moves)}
+    shown = rows | {"splats": splats.deactivate(rows["splats"], moves)}
     params = state.params._replace(rows=shown)
-    summary = f"{int(moves.sum())} of {living} Gaussians move and are left out"
+    summary = f"{int(moves.sum())} of {active} Gaussians move and are left out"
     return state._replace(params=params), summary
 
 

@@ -62,7 +62,7 @@ class DefaultStrategySpec:
 class RowStats(NamedTuple):
     """What the rows did since the last event."""
 
-    alive: Bool[Array, " gaussians"]
+    active: Bool[Array, " gaussians"]
     grad2d: Float[Array, " gaussians"]  # summed norms, NDC units
     views: Int[Array, " gaussians"]  # in which the row was visible
     radius_px: Float[Array, " gaussians"]  # the largest seen
@@ -77,7 +77,7 @@ class Report(NamedTuple):
     broken: int = 0  # pruned because a value was not finite
     refused: int = 0  # should have grown, but the cap is reached
     relocated: int = 0
-    alive: int = 0
+    active: int = 0
     capacity: int = 0
 
 
@@ -94,7 +94,7 @@ def empty_stats(rows: Splats) -> RowStats:
     """Nothing observed yet."""
     like = rows.opacity_logit
     return RowStats(
-        alive=splats.alive(rows),
+        active=splats.active_mask(rows),
         grad2d=jnp.zeros_like(like),
         views=jnp.zeros(like.shape, jnp.int32),
         radius_px=jnp.zeros_like(like),  # its own buffer: the loop donates them all
@@ -121,7 +121,7 @@ def observe(
     # Summed squares underflow in float32 below 1e-19; hypot does not.
     norm = jnp.hypot(slope[:, 0], slope[:, 1])
     return RowStats(
-        alive=stats.alive,
+        active=stats.active,
         grad2d=stats.grad2d + jnp.where(visible, norm, 0),
         views=stats.views + visible.astype(jnp.int32),
         radius_px=jnp.maximum(stats.radius_px, jnp.where(visible, radius_px, 0)),
@@ -148,7 +148,7 @@ def densify(
     moments. `extent` is `splats.scene_extent`.
     """
     rows, kind, report = _plan(params.rows["splats"], stats, spec, step, extent)
-    count, capacity = len(rows), stats.alive.shape[0]
+    count, capacity = len(rows), stats.active.shape[0]
     needed = splats.capacity_for(count, spec.cap_max)
     # Two buckets of slack before shrinking: a wavering count must not recompile.
     if needed > capacity or count * 9 < capacity * 4:
@@ -165,7 +165,7 @@ def densify(
         spec.shrink,
         spec.revised_opacity,
     )
-    report = report._replace(alive=count, capacity=capacity)
+    report = report._replace(active=count, capacity=capacity)
     return Changed(params, moments, fresh, report)
 
 
@@ -175,7 +175,7 @@ def _plan(rows, stats, spec, step, extent):
     whole, opacity, scale = map(np.asarray, _facts(rows))
     score = stats.grad2d / np.maximum(stats.views, 1)
 
-    kept = stats.alive & whole & (opacity >= spec.prune_opa)
+    kept = stats.active & whole & (opacity >= spec.prune_opa)
     grows = kept & (score >= spec.grow_grad2d)
     splits = grows & (scale > spec.grow_scale3d * extent)
     if step > spec.reset_every:
@@ -202,11 +202,11 @@ def _plan(rows, stats, spec, step, extent):
             np.full(2 * len(parents), CHILD),
         ]
     )
-    broken = int((stats.alive & ~whole).sum())
+    broken = int((stats.active & ~whole).sum())
     report = Report(
         cloned=len(clones),
         split=len(parents),
-        pruned=int((stats.alive & ~kept).sum()) - broken,
+        pruned=int((stats.active & ~kept).sum()) - broken,
         broken=broken,
         refused=len(wanting) - len(best),
     )
@@ -226,15 +226,15 @@ def _facts(rows):
 
 
 @functools.partial(jax.jit, static_argnames=("optimiser", "shrink", "revised"))
-def _rebuild(optimiser, params, moments, rows, kind, dead, key, shrink, revised):
+def _rebuild(optimiser, params, moments, rows, kind, inactive, key, shrink, revised):
     fresh = (kind == CLONE) | (kind == CHILD)
     params, moments = row_optimiser.gather_rows(
-        optimiser, params, moments, rows, fresh, dead
+        optimiser, params, moments, rows, fresh, inactive
     )
     moved = split_rows(params.rows["splats"], kind == CHILD, key, shrink)
     if revised:
         halved = halve_opacity(moved.opacity_logit)
-        logit = jnp.where((kind == KEPT) | dead, moved.opacity_logit, halved)
+        logit = jnp.where((kind == KEPT) | inactive, moved.opacity_logit, halved)
         moved = moved._replace(opacity_logit=logit)
     params = params._replace(rows=params.rows | {"splats": moved})
     return params, moments, empty_stats(moved)
@@ -279,8 +279,8 @@ def reset_opacity(
 ) -> tuple[Params, PyTree]:
     """No opacity above `spec.reset_opacity`; the moments of the opacities start anew.
 
-    Dead rows stay dead. With the renderer's cut-off at 1/255 a Gaussian reset to 0.01
-    gets gradients only out to 1.37 standard deviations.
+    Inactive rows stay inactive. With the renderer's cut-off at 1/255 a Gaussian reset
+    to 0.01 gets gradients only out to 1.37 standard deviations.
     """
     rows = params.rows["splats"]
     bound = math.log(spec.reset_opacity / (1 - spec.reset_opacity))

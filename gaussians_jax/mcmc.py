@@ -113,17 +113,17 @@ def relocate(
     is visible, nothing can move and the report counts the faint ones as refused.
     """
     rows = params.rows["splats"]
-    living, opacity = _opacities(rows)
-    faint = living & (opacity <= spec.min_opacity)
-    seen = living & ~faint
-    report = densification.Report(alive=int(living.sum()), capacity=len(living))
+    active, opacity = _opacities(rows)
+    faint = active & (opacity <= spec.min_opacity)
+    seen = active & ~faint
+    report = densification.Report(active=int(active.sum()), capacity=len(active))
     if not faint.any():
         return params, moments, report
     if not seen.any():
         return params, moments, report._replace(refused=int(faint.sum()))
-    source = np.arange(len(living))
+    source = np.arange(len(active))
     source[faint] = _draw(key, opacity, seen, int(faint.sum()))
-    params, moments = _spread(optimiser, params, moments, source, ~living, spec)
+    params, moments = _spread(optimiser, params, moments, source, ~active, spec)
     return params, moments, report._replace(relocated=int(faint.sum()))
 
 
@@ -153,37 +153,37 @@ def add(
 ) -> tuple[Params, PyTree, densification.Report]:
     """`spec.growth` times as many Gaussians, as far as the cap allows; host side."""
     rows = params.rows["splats"]
-    living, opacity = _opacities(rows)
-    count = int(living.sum())
+    active, opacity = _opacities(rows)
+    count = int(active.sum())
     wanted = int(spec.growth * count) - count
     extra = max(min(wanted, spec.cap_max - count), 0)
-    seen = living & (opacity > 0)
+    seen = active & (opacity > 0)
     report = densification.Report(
-        alive=count, capacity=len(living), refused=wanted - extra
+        active=count, capacity=len(active), refused=wanted - extra
     )
     if extra == 0 or not seen.any():
         return params, moments, report._replace(refused=wanted)
-    capacity = max(splats.capacity_for(count + extra, spec.cap_max), len(living))
+    capacity = max(splats.capacity_for(count + extra, spec.cap_max), len(active))
     source = np.zeros(capacity, int)
-    source[: len(living)] = np.arange(len(living))
-    dead = np.ones(capacity, bool)
-    dead[: len(living)] = ~living
-    places = np.flatnonzero(dead)[:extra]
+    source[: len(active)] = np.arange(len(active))
+    inactive = np.ones(capacity, bool)
+    inactive[: len(active)] = ~active
+    places = np.flatnonzero(inactive)[:extra]
     source[places] = _draw(key, opacity, seen, extra)
-    dead[places] = False
-    params, moments = _spread(optimiser, params, moments, source, dead, spec)
-    report = report._replace(cloned=extra, alive=count + extra, capacity=capacity)
+    inactive[places] = False
+    params, moments = _spread(optimiser, params, moments, source, inactive, spec)
+    report = report._replace(cloned=extra, active=count + extra, capacity=capacity)
     return params, moments, report
 
 
 def _opacities(rows):
-    living, opacity = _facts(rows)
-    return np.asarray(living), np.asarray(opacity, np.float64)
+    active, opacity = _facts(rows)
+    return np.asarray(active), np.asarray(opacity, np.float64)
 
 
 @jax.jit
 def _facts(rows):
-    return splats.alive(rows), splats.activate(rows).opacity
+    return splats.active_mask(rows), splats.activate(rows).opacity
 
 
 def _draw(key, opacity, seen, count):
@@ -193,23 +193,23 @@ def _draw(key, opacity, seen, count):
     return rng.choice(len(opacity), size=count, p=chance / chance.sum())
 
 
-def _spread(optimiser, params, moments, source, dead, spec):
-    copies = np.bincount(source[~dead], minlength=len(source))[source]
+def _spread(optimiser, params, moments, source, inactive, spec):
+    copies = np.bincount(source[~inactive], minlength=len(source))[source]
     return _share(
         optimiser,
         params,
         moments,
         source.astype(np.int32),
-        np.where(dead, 1, copies).astype(np.int32),
-        dead,
+        np.where(inactive, 1, copies).astype(np.int32),
+        inactive,
         spec.min_opacity,
     )
 
 
 @functools.partial(jax.jit, static_argnames=("optimiser", "least"))
-def _share(optimiser, params, moments, source, copies, dead, least):
+def _share(optimiser, params, moments, source, copies, inactive, least):
     params, moments = row_optimiser.gather_rows(
-        optimiser, params, moments, source, copies > 1, dead
+        optimiser, params, moments, source, copies > 1, inactive
     )
     rows = params.rows["splats"]
     drawn = splats.activate(rows)
@@ -232,7 +232,8 @@ def position_noise(
     """What to add to the means after an update, in scene units; pure.
 
     Equation 8 of the paper: Gaussian noise shaped by each covariance, in proportion to
-    the current learning rate of the means, for faint rows only. Dead rows keep still.
+    the current learning rate of the means, for faint rows only.
+    Inactive rows keep still.
     """
     drawn = splats.activate(rows)
     noise = jax.random.normal(key, rows.mean.shape, rows.mean.dtype)
@@ -243,7 +244,7 @@ def position_noise(
     shaped = jnp.einsum("nij,nj->ni", axes, along)
     faint = jax.nn.sigmoid(-100 * (drawn.opacity - spec.min_opacity))
     rate = jnp.asarray(spec.noise_lr * learning_rate, faint.dtype)
-    strength = jnp.where(splats.alive(rows), faint * rate, 0)
+    strength = jnp.where(splats.active_mask(rows), faint * rate, 0)
     return strength[:, None] * shaped
 
 
@@ -261,10 +262,10 @@ def shake(
 
 
 def penalty(rows: Splats, spec: MCMCStrategySpec) -> Float[Array, ""]:
-    """Opacities and scales cost their mean over the living rows (section 3.4)."""
+    """Opacities and scales cost their mean over the active rows (section 3.4)."""
     drawn = splats.activate(rows)
-    living = splats.alive(rows)
-    count = jnp.maximum(jnp.sum(living), 1).astype(drawn.opacity.dtype)
-    opacity = jnp.sum(jnp.where(living, drawn.opacity, 0)) / count
-    scale = jnp.sum(jnp.where(living[:, None], drawn.scale, 0)) / (3 * count)
+    active = splats.active_mask(rows)
+    count = jnp.maximum(jnp.sum(active), 1).astype(drawn.opacity.dtype)
+    opacity = jnp.sum(jnp.where(active, drawn.opacity, 0)) / count
+    scale = jnp.sum(jnp.where(active[:, None], drawn.scale, 0)) / (3 * count)
     return spec.opacity_reg * opacity + spec.scale_reg * scale

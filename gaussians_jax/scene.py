@@ -369,8 +369,8 @@ def _mcmc_events(plan, steps, effects, optimiser):
 
 
 def count_rows(state: TrainState) -> dict[str, int]:
-    """Living Gaussians, and `parameters`: the numbers of them and the networks."""
-    counts = {"gaussians": int(splats.alive(state.params.rows["splats"]).sum())}
+    """Active Gaussians, and `parameters`: the numbers of them and the networks."""
+    counts = {"gaussians": int(splats.active_mask(state.params.rows["splats"]).sum())}
     rows = jax.tree.leaves(state.params.rows)
     nets = jax.tree.leaves(state.params.nets)
     each = sum(math.prod(leaf.shape[1:]) for leaf in rows)

@@ -1,9 +1,10 @@
 """Gaussians: the rows that are trained, and what they stand for.
 
-A row that is not in use is *dead*: its opacity logit is `DEAD_LOGIT`, so its opacity
-and the slope of its opacity are exactly zero in float32 and float64. It is culled by
-the renderer's cut-off, covers no tile, and no gradient can bring it back; only an event
-between two chunks revives a row. `alive` reads that mark and nothing else.
+A row that is not in use is *inactive*: its opacity logit is `INACTIVE_LOGIT`, so its
+opacity and the slope of its opacity are exactly zero in float32 and float64. It is
+culled by the renderer's cut-off, covers no tile, and no gradient can bring it back;
+only an event between two chunks activates a row. `active_mask` reads that mark and
+nothing else.
 """
 
 import math
@@ -20,7 +21,7 @@ from nerfies_jax.geometry.camera import Camera
 
 PyTree = Any
 
-DEAD_LOGIT = -1000.0  # sigmoid and its slope underflow to 0 below -745 in float64
+INACTIVE_LOGIT = -1000.0  # sigmoid and its slope underflow to 0 below -745 in float64
 # exp(15)^2 = 1e13 and exp(-20)^2 = 4e-18 keep products of scales far from overflow and
 # from the flush to zero; raw values beyond are drawn at the bound and get no gradient.
 # An unbounded exp is inf at 89 in float32.
@@ -86,23 +87,23 @@ def activate(splats: Splats) -> Gaussians:
     )
 
 
-def alive(splats: Splats) -> Bool[Array, " gaussians"]:
+def active_mask(splats: Splats) -> Bool[Array, " gaussians"]:
     """Which rows stand for a Gaussian; the others only fill the capacity."""
-    return splats.opacity_logit > DEAD_LOGIT / 2
+    return splats.opacity_logit > INACTIVE_LOGIT / 2
 
 
 def rows_to_write(splats: Splats, path: pathlib.Path) -> np.ndarray:
     """[gaussians] bool: what of them a file holds; ValueError where that is none.
 
-    NaN compares false, but is no mark of death: such a row counts, and the writer
-    refuses it.
+    NaN compares false, but marks no row as inactive: it counts, and the writer refuses
+    it.
     """
-    living = np.asarray(alive(splats)) | np.isnan(splats.opacity_logit)
-    if not living.any():
+    active = np.asarray(active_mask(splats)) | np.isnan(splats.opacity_logit)
+    if not active.any():
         raise ValueError(
-            f"{path}: none of the {len(living)} rows is alive; not written"
+            f"{path}: none of the {len(active)} rows is active; not written"
         )
-    return living
+    return active
 
 
 def active_degree(step: Int[Array, ""], every: int, degree: int) -> Int[Array, ""]:
@@ -149,19 +150,19 @@ def take_rows(params: Params, rows: Int[Array, " kept"]) -> Params:
     return params._replace(rows=jax.tree.map(lambda leaf: leaf[rows], params.rows))
 
 
-def bury(splats: Splats, dead: Bool[Array, " gaussians"]) -> Splats:
-    """The same splats with the given rows marked dead."""
-    mark = jnp.asarray(DEAD_LOGIT, splats.opacity_logit.dtype)
+def deactivate(splats: Splats, inactive: Bool[Array, " gaussians"]) -> Splats:
+    """The same splats with the given rows marked inactive."""
+    mark = jnp.asarray(INACTIVE_LOGIT, splats.opacity_logit.dtype)
     return splats._replace(
-        opacity_logit=jnp.where(dead, mark, splats.opacity_logit),
+        opacity_logit=jnp.where(inactive, mark, splats.opacity_logit),
     )
 
 
 def pad_rows(params: Params, capacity: int) -> Params:
-    """The same rows and dead ones behind them, up to `capacity`.
+    """The same rows and inactive ones behind them, up to `capacity`.
 
-    Dead rows repeat the first one, so every leaf keeps values that its own code knows
-    how to handle (a unit quaternion, a finite scale).
+    Inactive rows repeat the first one, so every leaf keeps values that its own code
+    knows how to handle (a unit quaternion, a finite scale).
     """
     count = params.rows["splats"].mean.shape[0]
     if not 0 < count <= capacity:
@@ -171,9 +172,9 @@ def pad_rows(params: Params, capacity: int) -> Params:
         )
     rows = np.concatenate([np.arange(count), np.zeros(capacity - count, int)])
     padded = take_rows(params, jnp.asarray(rows, jnp.int32))
-    dead = jnp.arange(capacity) >= count
+    inactive = jnp.arange(capacity) >= count
     return padded._replace(
-        rows=padded.rows | {"splats": bury(padded.rows["splats"], dead)}
+        rows=padded.rows | {"splats": deactivate(padded.rows["splats"], inactive)}
     )
 
 

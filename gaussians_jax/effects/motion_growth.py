@@ -78,7 +78,7 @@ def observe(
 ) -> Travel:
     """One more instant.
 
-    A displacement counts relative to the median displacement of the living rows at that
+    A displacement counts relative to the median displacement of the active rows at that
     instant: what the field moves as a whole, such as the camera's own motion, is not
     motion of a Gaussian. Where most of a scene moves as one, it is therefore the rest
     that counts as moving. Displacements that are not finite are passed over.
@@ -86,7 +86,7 @@ def observe(
     del moment
     displacement = moved.mean - canonical.mean
     known = jnp.all(jnp.isfinite(displacement), axis=1)
-    # The logistic function of a dead row's mark is exactly zero.
+    # The logistic function of an inactive row's mark is exactly zero.
     common = common_motion(displacement, known & (canonical.opacity > 0))
     relative = displacement - common
     known = known[:, None]

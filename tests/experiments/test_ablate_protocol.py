@@ -12,7 +12,7 @@ import scipy.spatial.transform
 from experiments import ablate_picture, ablate_protocol, representations
 from experiments.ablate_protocol import EXACT, Followed
 from gaussians_jax import scene as splat_scene
-from gaussians_jax.splats import Gaussians, Params, Splats, bury
+from gaussians_jax.splats import Gaussians, Params, Splats, deactivate
 from nerfies_jax import scene
 from nerfies_jax.capture import synthetic
 from nerfies_jax.effects.effect import Effect
@@ -281,13 +281,13 @@ def test_a_turning_body_carries_its_points_but_for_the_way_to_the_neighbours_mea
 
 
 def test_what_cannot_be_seen_carries_nothing(filmed, monkeypatch, cloud):
-    """Faint and dead Gaussians fly off; those that can be seen stay."""
+    """Faint and inactive Gaussians fly off; those that can be seen stay."""
     known = filmed[2]
     mean = np.concatenate([cloud, cloud + 1e-4, cloud - 1e-4])
     logit = np.repeat([0.0, -4.0, 5.0], len(cloud))
     rows = splat_rows(mean, logit)
     hidden = jnp.arange(len(mean)) >= len(cloud)
-    rows = bury(rows, jnp.arange(len(mean)) >= 2 * len(cloud))
+    rows = deactivate(rows, jnp.arange(len(mean)) >= 2 * len(cloud))
 
     def moved(mean, time):
         return jnp.where(hidden[:, None], mean + time, mean)

@@ -88,7 +88,7 @@ def poses(model, state, times=(0.0, 0.3, 1.0)):
 
 def test_a_motion_from_knots_is_met_at_the_knots_and_near_between(swaying):
     exact = poses(*swaying)
-    living = np.asarray(splats.alive(swaying[1].params.rows["splats"]))
+    active = np.asarray(splats.active_mask(swaying[1].params.rows["splats"]))
     shift = np.abs(exact[0].mean - exact[2].mean).max()
     errors = []
     for knots, interpolation in ((4, "linear"), (4, "cubic"), (40, "cubic")):
@@ -96,9 +96,9 @@ def test_a_motion_from_knots_is_met_at_the_knots_and_near_between(swaying):
         assert f"{knots} knots, {interpolation}, of" in made.summary
         found = poses(made.model, made.state)
         for end in (0, 2):
-            met = np.abs(found[end].mean - exact[end].mean)[living]
+            met = np.abs(found[end].mean - exact[end].mean)[active]
             assert met.max() < 1e-6
-        errors.append(np.abs(found[1].mean - exact[1].mean)[living].max() / shift)
+        errors.append(np.abs(found[1].mean - exact[1].mean)[active].max() / shift)
     assert 0.2 > errors[0] > errors[1] > 5e-3 > errors[2]
 
 
@@ -123,20 +123,20 @@ def test_a_faster_model_draws_what_the_model_draws(swaying):
 def test_what_stands_still_may_be_left_out(swaying):
     exact = poses(*swaying)
     made = variants.without_still(*swaying, 0.0)
-    living = np.asarray(splats.alive(swaying[1].params.rows["splats"]))
+    active = np.asarray(splats.active_mask(swaying[1].params.rows["splats"]))
     for found, pose in zip(poses(made.model, made.state), exact, strict=True):
         for name in Gaussians._fields:  # a row that is not drawn may be anywhere
-            a, b = (np.asarray(getattr(x, name))[living] for x in (found, pose))
+            a, b = (np.asarray(getattr(x, name))[active] for x in (found, pose))
             np.testing.assert_allclose(a, b, atol=2e-6, err_msg=name)
     middle, *_, end = poses(*swaying, (0.5, 1.0))
-    moved = np.asarray(still_rows.reach(middle, end))[living]
+    moved = np.asarray(still_rows.reach(middle, end))[active]
     below = float(np.median(moved))
     made = variants.without_still(*swaying, below)
     left = len(made.state.params[1].moving.rows["splats"].mean)
     assert 0 < left < len(moved)
-    assert f"{left} of {len(living)} rows that move" in made.summary
+    assert f"{left} of {len(active)} rows that move" in made.summary
     for found, pose in zip(poses(made.model, made.state), exact, strict=True):
-        error = np.linalg.norm(found.mean - pose.mean, axis=1)[living]
+        error = np.linalg.norm(found.mean - pose.mean, axis=1)[active]
         assert 0 < error.max() <= below
         assert (error == 0).sum() >= left
 
@@ -163,14 +163,14 @@ def test_what_moves_may_be_left_out(swaying):
     state = state_of(state.params._replace(nets=nets))
     middle, *ends = poses(model, state, (0.5, 0.0, 1.0))
     reach = np.max([still_rows.reach(middle, end) for end in ends], axis=0)
-    living = np.asarray(splats.alive(state.params.rows["splats"]))
-    far = float(np.median(reach[living]))
+    active = np.asarray(splats.active_mask(state.params.rows["splats"]))
+    far = float(np.median(reach[active]))
     left, summary = variants.without_moving(model, state, far)
     rows = left.params.rows["splats"]
-    shown = np.asarray(splats.alive(rows))
-    assert 0 < shown.sum() < living.sum() / 2 + 1
+    shown = np.asarray(splats.active_mask(rows))
+    assert 0 < shown.sum() < active.sum() / 2 + 1
     assert reach[shown].max() <= far
-    assert f"{living.sum() - shown.sum()} of {living.sum()} Gaussians" in summary
+    assert f"{active.sum() - shown.sum()} of {active.sum()} Gaussians" in summary
     # What is left is drawn as it was, wherever it still moves a little
     alone = splats.take_rows(state.params, jnp.asarray(np.flatnonzero(shown)))
     view = evaluate.view_of(scenes.tiny_capture(), 0)

@@ -25,7 +25,7 @@ def first_state(params):
 
 
 def make(count, dtype="float32", scale=0.01, opacity=0.5):
-    """`count` living rows, one tell-tale parameter each, with moments."""
+    """`count` active rows, one tell-tale parameter each, with moments."""
     rng = np.random.default_rng(count)
     splats = Splats(
         mean=rng.normal(size=(count, 3)),
@@ -58,12 +58,12 @@ observe = jax.jit(densification.observe, static_argnums=4)
 
 
 def labels(changed):
-    living = np.asarray(changed.stats.alive)
-    return np.asarray(changed.params.rows["label"])[living, 0].astype(int).tolist()
+    active = np.asarray(changed.stats.active)
+    return np.asarray(changed.params.rows["label"])[active, 0].astype(int).tolist()
 
 
 def counts(changed):
-    return np.asarray(changed.moments[0].count.rows["label"])[: changed.report.alive]
+    return np.asarray(changed.moments[0].count.rows["label"])[: changed.report.active]
 
 
 def test_observe_counts_visible_views_in_ndc_units(dtype):
@@ -100,7 +100,7 @@ def test_a_small_row_is_cloned_and_its_clone_starts_without_moments(dtype):
     params, moments, stats = make(5, dtype)
     changed = run(params, moments, hot(stats, [2]))
     report = changed.report
-    assert report == densification.Report(cloned=1, alive=6, capacity=256)
+    assert report == densification.Report(cloned=1, active=6, capacity=256)
     assert labels(changed) == [0, 1, 2, 3, 4, 2]
     np.testing.assert_array_equal(
         changed.params.rows["splats"].mean[5], params.rows["splats"].mean[2]
@@ -124,7 +124,7 @@ def test_a_large_row_becomes_two_that_are_drawn_from_it():
     params = params._replace(rows=params.rows | {"splats": stretched})
     changed = run(params, moments, hot(stats, np.arange(4000)))
     assert changed.report.split == 4000
-    assert changed.report.alive == 8000
+    assert changed.report.active == 8000
     child = changed.params.rows["splats"]
     np.testing.assert_allclose(
         np.exp(child.log_scale[:8000]),
@@ -205,20 +205,24 @@ def test_the_cap_takes_the_largest_gradients_and_says_who_was_refused():
     changed = run(params, moments, stats, DefaultStrategySpec(cap_max=8))
     assert labels(changed) == [0, 1, 2, 3, 4, 5, 1, 3]
     assert changed.report == densification.Report(
-        cloned=2, refused=3, alive=8, capacity=8
+        cloned=2, refused=3, active=8, capacity=8
     )
     again = run(*changed[:2], hot(changed.stats, [0]), DefaultStrategySpec(cap_max=8))
-    assert again.report == densification.Report(refused=1, alive=8, capacity=8)
+    assert again.report == densification.Report(refused=1, active=8, capacity=8)
 
 
 def test_capacity_grows_in_buckets_and_does_not_waver():
     params, moments, stats = make(200)
     changed = run(params, moments, hot(stats, np.arange(100)))
     assert changed.report.capacity == 512
-    stats = changed.stats._replace(alive=changed.stats.alive & (jnp.arange(512) < 240))
+    stats = changed.stats._replace(
+        active=changed.stats.active & (jnp.arange(512) < 240)
+    )
     changed = run(*changed[:2], stats)
     assert changed.report.capacity == 512  # 256 would do
-    stats = changed.stats._replace(alive=changed.stats.alive & (jnp.arange(512) < 200))
+    stats = changed.stats._replace(
+        active=changed.stats.active & (jnp.arange(512) < 200)
+    )
     assert run(*changed[:2], stats).report.capacity == 256
 
 
@@ -227,11 +231,11 @@ def test_one_gaussian_and_none():
     params, moments, stats = make(1)
     changed = run(params, moments, hot(stats, [0]))
     assert labels(changed) == [0, 0]
-    gone = changed.stats._replace(alive=jnp.zeros(256, bool))
+    gone = changed.stats._replace(active=jnp.zeros(256, bool))
     changed = run(*changed[:2], gone)
-    assert changed.report.alive == 0
-    assert not np.asarray(rows.alive(changed.params.rows["splats"])).any()
-    assert run(*changed[:3]).report.alive == 0
+    assert changed.report.active == 0
+    assert not np.asarray(rows.active_mask(changed.params.rows["splats"])).any()
+    assert run(*changed[:3]).report.active == 0
 
 
 def test_the_same_key_gives_the_same_rows():
@@ -267,7 +271,7 @@ def test_halved_opacity_is_right_where_the_opacity_saturates(logit, dtype):
 
 def test_a_reset_lowers_opacities_and_forgets_their_moments_only(dtype):
     params, moments, _ = make(4, dtype)
-    logit = jnp.asarray([3.0, -6.0, rows.DEAD_LOGIT, 0.1], dtype)
+    logit = jnp.asarray([3.0, -6.0, rows.INACTIVE_LOGIT, 0.1], dtype)
     splats = params.rows["splats"]._replace(opacity_logit=logit)
     params = params._replace(rows=params.rows | {"splats": splats})
     lowered, after = densification.reset_opacity(
@@ -275,7 +279,7 @@ def test_a_reset_lowers_opacities_and_forgets_their_moments_only(dtype):
     )
     opacity = np.asarray(rows.activate(lowered.rows["splats"]).opacity)
     np.testing.assert_allclose(opacity, [0.01, 1 / (1 + math.exp(6)), 0, 0.01], 1e-6)
-    assert list(rows.alive(lowered.rows["splats"])) == [True, True, False, True]
+    assert list(rows.active_mask(lowered.rows["splats"])) == [True, True, False, True]
     assert not np.asarray(after[0].first.rows["splats"].opacity_logit).any()
     assert not np.asarray(after[0].count.rows["splats"].opacity_logit).any()
     kept = after[0].first.rows["splats"]._replace(opacity_logit=None)

@@ -124,7 +124,7 @@ def test_spreading_gradient(float64):
 def test_a_copy_and_its_source_composite_to_the_opacity_there_was(dtype):
     params, moments = make([0.9, 0.001, 0.002, 0.003], dtype)
     moved, after, report = mcmc.relocate(TX, params, moments, KEY, SPEC)
-    assert report == densification.Report(relocated=3, alive=4, capacity=4)
+    assert report == densification.Report(relocated=3, active=4, capacity=4)
     splats = moved.rows["splats"]
     np.testing.assert_array_equal(
         splats.mean, np.tile(params.rows["splats"].mean[0], (4, 1))
@@ -167,20 +167,20 @@ def test_nothing_faint_and_nothing_visible():
     assert same is params
 
 
-def test_adding_grows_by_a_twentieth_into_the_dead_rows_and_stops_at_the_cap():
+def test_adding_grows_by_a_twentieth_into_the_inactive_rows_and_stops_at_the_cap():
     params, moments = make(np.full(100, 0.3))
     params, moments, report = mcmc.add(TX, params, moments, KEY, SPEC)
-    assert report == densification.Report(cloned=5, alive=105, capacity=256)
+    assert report == densification.Report(cloned=5, active=105, capacity=256)
     splats = params.rows["splats"]
-    assert int(rows.alive(splats).sum()) == 105
+    assert int(rows.active_mask(splats).sum()) == 105
     opacity = np.asarray(rows.activate(splats).opacity, np.float64)
     # However they were shared out, all of them together hide what 100 of 0.3 did.
     np.testing.assert_allclose(np.log1p(-opacity).sum(), 100 * np.log(0.7), rtol=1e-5)
     capped = MCMCStrategySpec(cap_max=107)
     params, moments, report = mcmc.add(TX, params, moments, KEY, capped)
-    assert report == densification.Report(cloned=2, refused=3, alive=107, capacity=256)
+    assert report == densification.Report(cloned=2, refused=3, active=107, capacity=256)
     _, _, report = mcmc.add(TX, params, moments, KEY, capped)
-    assert report == densification.Report(refused=5, alive=107, capacity=256)
+    assert report == densification.Report(refused=5, active=107, capacity=256)
 
 
 def test_noise_has_the_covariance_squared_and_spares_the_opaque(dtype):
@@ -207,21 +207,21 @@ def test_noise_has_the_covariance_squared_and_spares_the_opaque(dtype):
     number = np.arange(8000)
     logit = jnp.asarray(np.where(number < 4000, 0.0, -6.0), dtype)
     splats = splats._replace(opacity_logit=logit)
-    splats = rows.bury(splats, jnp.asarray(number >= 6000))
+    splats = rows.deactivate(splats, jnp.asarray(number >= 6000))
     noise = np.abs(np.asarray(shake(KEY, splats, 1e-6, SPEC)))
     assert noise[:4000].max() < 1e-18
     assert noise[4000:6000].max() > 1e-5
     assert not noise[6000:].any()
 
 
-def test_penalty_counts_living_rows_only(dtype):
+def test_penalty_counts_active_rows_only(dtype):
     params, _ = make([0.5, 0.25, 0.9], dtype)
-    splats = rows.bury(params.rows["splats"], jnp.asarray([False, False, True]))
+    splats = rows.deactivate(params.rows["splats"], jnp.asarray([False, False, True]))
     expected = 0.01 * 0.375 + 0.01 * np.exp(np.asarray(splats.log_scale[:2])).mean()
     np.testing.assert_allclose(mcmc.penalty(splats, SPEC), expected, rtol=1e-6)
     slopes = jax.jit(jax.grad(mcmc.penalty), static_argnums=1)(splats, SPEC)
     assert not any(np.asarray(leaf)[2].any() for leaf in slopes)
-    none = rows.bury(splats, jnp.ones(3, bool))
+    none = rows.deactivate(splats, jnp.ones(3, bool))
     assert mcmc.penalty(none, SPEC) == 0
 
 
@@ -276,16 +276,16 @@ def test_a_moving_scene_grows_to_the_cap_and_resumes_bit_for_bit(tmp_path):
 def test_an_event_of_a_scene_leaves_no_faint_row():
     model, state, frames = built(SCENE)
     splats = state.params.rows["splats"]
-    faint = rows.alive(splats) & (jnp.arange(len(splats.mean)) % 3 == 0)
+    faint = rows.active_mask(splats) & (jnp.arange(len(splats.mean)) % 3 == 0)
     logit = jnp.where(faint, -9.0, splats.opacity_logit)
     splats = splats._replace(opacity_logit=logit)
     state = state._replace(params=state.params._replace(rows={"splats": splats}))
     (event,) = model.events
     assert event.steps == (4, 8, 12, 16, 20, 24, 28)
     after = event.apply(state, frames).params.rows["splats"]
-    assert int(rows.alive(after).sum()) == 210
-    seen = np.asarray(splats.mean[np.asarray(rows.alive(splats) & ~faint)])
-    placed = np.asarray(after.mean[np.asarray(rows.alive(after))])
+    assert int(rows.active_mask(after).sum()) == 210
+    seen = np.asarray(splats.mean[np.asarray(rows.active_mask(splats) & ~faint)])
+    placed = np.asarray(after.mean[np.asarray(rows.active_mask(after))])
     assert {*map(bytes, placed)} <= {*map(bytes, seen)}
 
 
@@ -297,7 +297,7 @@ def test_a_step_shakes_the_means_and_nothing_else():
         model, state, frames = built(dataclasses.replace(spec, densification=plan))
         # Opacities of 0.0067, near the threshold: at 0.1 there is next to no noise.
         splats = state.params.rows["splats"]
-        logit = jnp.where(rows.alive(splats), -5.0, splats.opacity_logit)
+        logit = jnp.where(rows.active_mask(splats), -5.0, splats.opacity_logit)
         splats = splats._replace(opacity_logit=logit)
         state = state._replace(params=state.params._replace(rows={"splats": splats}))
         step = jax.jit(model.step)
@@ -307,9 +307,9 @@ def test_a_step_shakes_the_means_and_nothing_else():
     noisy, held, metrics = stepped(spec)
     still, _, unpaid = stepped(spec, noise_lr=0.0)
     shift = np.abs(noisy.params.rows["splats"].mean - still.params.rows["splats"].mean)
-    living = np.asarray(rows.alive(still.params.rows["splats"]))
-    assert (shift[living] > 0).any(axis=1).all()
-    assert not shift[~living].any()
+    active = np.asarray(rows.active_mask(still.params.rows["splats"]))
+    assert (shift[active] > 0).any(axis=1).all()
+    assert not shift[~active].any()
     quiet = noisy.params.rows["splats"]._replace(mean=still.params.rows["splats"].mean)
     same_bits(quiet, still.params.rows["splats"])
     same_bits(noisy.optimiser, still.optimiser)

@@ -137,7 +137,10 @@ def test_events_grow_the_scene_and_keep_its_picture_learnable():
     assert int(after.step) == int(state.step)
     again, metrics = jax.jit(eager.step)(after, frames)
     assert np.isfinite(float(metrics["loss"]))
-    assert again.params.rows["splats"].mean.shape == (*after.extra.stats.alive.shape, 3)
+    assert again.params.rows["splats"].mean.shape == (
+        *after.extra.stats.active.shape,
+        3,
+    )
 
 
 def test_an_event_is_a_function_of_the_state():

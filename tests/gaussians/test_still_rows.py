@@ -78,7 +78,7 @@ def test_the_reach_of_a_single_change_is_that_change(change, exact, dtype):
 
 
 def scene(rng, dtype="float32", count=40):
-    """Parameters of rows whose speed is theirs, a third of them zero, some dead."""
+    """Parameters of rows whose speed is theirs, a third of them zero, some inactive."""
     rows = splats.from_points(
         rng.normal(size=(count, 3)), rng.uniform(size=(count, 3)), dtype=dtype
     )
@@ -104,10 +104,10 @@ def test_what_is_left_out_is_off_by_no_more_than_the_tolerance(still_below, rng)
     params = scene(rng)
     parts = still_rows.split(params, pose, TIMES, still_below)
     count = len(parts.moving.rows["speed"])
-    dead = ~np.asarray(splats.alive(params.rows["splats"]))
+    inactive = ~np.asarray(splats.active_mask(params.rows["splats"]))
     moves = np.asarray(parts.where.moves)
     assert 0 < count == moves.sum() < len(moves)
-    assert not moves[dead].any()
+    assert not moves[inactive].any()
     assert moves[1]  # its motion is not a number: not taken for still
     for time in TIMES:
         time = jnp.asarray(time, jnp.float32)
@@ -118,7 +118,7 @@ def test_what_is_left_out_is_off_by_no_more_than_the_tolerance(still_below, rng)
                 np.asarray(getattr(exact, name))[moves],
                 err_msg=name,
             )
-        reach = np.asarray(still_rows.reach(found, exact))[~moves & ~dead]
+        reach = np.asarray(still_rows.reach(found, exact))[~moves & ~inactive]
         assert (reach <= still_below).all()
 
 

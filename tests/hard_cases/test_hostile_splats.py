@@ -147,13 +147,13 @@ def one_colour(rows):
 
 
 def alone(rows):
-    return splats.bury(jax.device_put(rows), jnp.arange(len(rows.mean)) > 0)
+    return splats.deactivate(jax.device_put(rows), jnp.arange(len(rows.mean)) > 0)
 
 
-def living(rows, logit):
-    """Every living row with that opacity; dead ones stay dead."""
+def with_logit(rows, logit):
+    """Every active row with that opacity; inactive ones stay inactive."""
     logits = np.where(
-        splats.alive(jax.device_put(rows)), np.float32(logit), rows.opacity_logit
+        splats.active_mask(jax.device_put(rows)), np.float32(logit), rows.opacity_logit
     )
     return rows._replace(opacity_logit=logits)
 
@@ -181,8 +181,8 @@ ROWS = {
     "needles": lambda rows: rows._replace(
         log_scale=np.zeros_like(rows.log_scale) + np.float32([-30.0, -30.0, 3.0])
     ),
-    "opaque": lambda rows: living(rows, 100.0),
-    "transparent": lambda rows: living(rows, -100.0),
+    "opaque": lambda rows: with_logit(rows, 100.0),
+    "transparent": lambda rows: with_logit(rows, -100.0),
     "of one colour": one_colour,
     "about the cameras": about_the_cameras,
     "alone": alone,
@@ -235,8 +235,8 @@ def test_splats_train_from_hostile_rows(name, case, tmp_path):
         assert STOPS[case] in trained.result.message
         return
     assert trained.result.stopped_by == "steps", trained.result.message
-    living = trained.result.state.params.rows["splats"]
-    assert bool(splats.alive(living).any()) == (case not in DIE), case
+    rows = trained.result.state.params.rows["splats"]
+    assert bool(splats.active_mask(rows).any()) == (case not in DIE), case
 
 
 @pytest.mark.parametrize("case", hostile.CAPTURES)
@@ -316,4 +316,4 @@ def test_every_cloud_of_points_is_a_finite_start(cloud, beside, source):
     spec = dataclasses.replace(scenes.TINY_SPLATS, start=plan)
     state = scene.build(spec, scene.facts_of(capture)).init(capture, jax.random.key(0))
     assert not hostile.not_finite(state)
-    assert splats.alive(state.params.rows["splats"]).any()
+    assert splats.active_mask(state.params.rows["splats"]).any()

@@ -235,19 +235,21 @@ def as_splats(scene: Gaussians) -> Splats:
 
 
 @compiled
-def buried_and_alive(rows, dead):
-    return splats.activate(splats.bury(rows, dead)), splats.activate(rows)
+def inactive_and_active(rows, inactive):
+    return splats.activate(splats.deactivate(rows, inactive)), splats.activate(rows)
 
 
-@given(scene=SCENE, colours=COLOURS, camera=CAMERA, dead=properties.many(6, 0, 1))
-def test_dead_and_clear_gaussians_are_as_if_absent(scene, colours, camera, dead, dtype):
+@given(scene=SCENE, colours=COLOURS, camera=CAMERA, inactive=properties.many(6, 0, 1))
+def test_inactive_and_clear_gaussians_are_as_if_absent(
+    scene, colours, camera, inactive, dtype
+):
     rows, colours, camera = cast(dtype, as_splats(scene), colours, camera)
-    dead = dead < 0.5
-    buried, clear = buried_and_alive(rows, dead)
-    clear = replaced(clear, dead, opacity=0)
-    same(buried.opacity, clear.opacity)
-    nowhere = replaced(clear, dead, mean=np.nan)
-    here = smooth(buried, colours, camera)
+    inactive = inactive < 0.5
+    deactivated, clear = inactive_and_active(rows, inactive)
+    clear = replaced(clear, inactive, opacity=0)
+    same(deactivated.opacity, clear.opacity)
+    nowhere = replaced(clear, inactive, mean=np.nan)
+    here = smooth(deactivated, colours, camera)
     same(here, smooth(nowhere, colours, camera))
     assert all(np.all(np.isfinite(leaf)) for leaf in here)
 
