@@ -73,7 +73,7 @@ AXES = {
         "how many Gaussians, and whether they grow",
         SPLATS,
         **{
-            "most-4000": "start.points=1500 start.random=2000 start.beside=500 "
+            "most-4000": "init.points=1500 init.random=2000 init.extra_random=500 "
             "densification.cap_max=4000",
             "most-20000": "densification.cap_max=20000",
             "no-growth": "densification=none",

@@ -88,7 +88,7 @@ def _splats(wanted, full):
     if wanted.get(TRANSIENT) and preset == "splats-static":
         notes.append(f"{TRANSIENT}: splats have no medium for it; prefer the field")
     if wanted.get(START) is False:
-        overrides.append("start.source=random")
+        overrides.append("init.source=random")
     if wanted.get(DEPTH):
         overrides.append("depth.weight=0.1")
     return preset, overrides, notes

@@ -67,7 +67,7 @@ def gaussians() -> Representation:
         facts_of=lambda capture, spec: scene.facts_of(capture),
         build=scene.build,
         first_bytes=scene.first_bytes,
-        lighter="lower start.points, start.random or raster.capacity with --set",
+        lighter="lower init.points, init.random or raster.capacity with --set",
         time_parts=step_time.of_splats,
         variant=variants.of_splats,
         score_halves=lambda *_: None,

@@ -11,11 +11,11 @@ from gaussians_jax.effects.motion_basis import SMALL_BASIS_MOTION, BasisMotionSp
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec
 from gaussians_jax.effects.neighbours import NeighbourSpec
 from gaussians_jax.effects.spectral import SpectralSpec
+from gaussians_jax.initialisation import InitSpec
 from gaussians_jax.mcmc import MCMCStrategySpec
 from gaussians_jax.phases import AlternationSpec, AnnealingSpec
 from gaussians_jax.rates import RateSpec
 from gaussians_jax.spec import SplatScene
-from gaussians_jax.start import StartSpec
 from nerfies_jax.nets.encoding import EncodingSpec
 
 # Kerbl et al. 2023, arXiv:2308.04079: every other number is a default of its spec.
@@ -28,7 +28,7 @@ STATIC = SplatScene(steps=30_000)
 # moments of those that moved and has one count for all.
 MCMC = SplatScene(
     steps=30_000,
-    start=StartSpec(opacity=0.5, scale=0.1),
+    init=InitSpec(opacity=0.5, scale=0.1),
     densification=MCMCStrategySpec(),
 )
 
@@ -53,7 +53,7 @@ SONATA = SplatScene(
 # quarters on annealed positions. It starts from random points.
 MOBA = SplatScene(
     steps=20_000,
-    start=StartSpec(source="random", random=100_000),
+    init=InitSpec(source="random", random=100_000),
     densification=DefaultStrategySpec(refine_stop_iter=10_000),
     motion=BasisMotionSpec(),
     alternation=AlternationSpec(10_000, 15_000),
@@ -72,7 +72,7 @@ MOBA = SplatScene(
 # follow the camera; without points of its own, what moves is painted onto the walls.
 SMALL_STATIC = SplatScene(
     steps=3000,
-    start=StartSpec(points=4000, random=5000, beside=2000),
+    init=InitSpec(points=4000, random=5000, extra_random=2000),
     sh_degree=1,
     sh_every=1000,
     densification=DefaultStrategySpec(

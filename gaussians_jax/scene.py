@@ -8,7 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from gaussians_jax import densification, mcmc, phases, rates, render, splats, start
+from gaussians_jax import (
+    densification,
+    initialisation,
+    mcmc,
+    phases,
+    rates,
+    render,
+    splats,
+)
 from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.effects import deformation
 from gaussians_jax.effects.effect import Around, Effect, Moment, Shot
@@ -255,7 +263,7 @@ def shuffled_row(
 
 def first_bytes(spec: SplatScene, capture: Capture) -> int:
     """Roughly the memory of the first state and step; host side, nothing allocated."""
-    count = start.first_count(spec.start, capture)
+    count = initialisation.initial_count(spec.init, capture)
     harmonics = 3 * (spec.sh_degree + 1) ** 2
     # Parameters, two moments, gradient, update; the tables of one projection.
     numbers = count * (5 * (11 + harmonics) + 60)
@@ -270,15 +278,15 @@ def first_state(spec, effects, optimiser, capture, key) -> TrainState:
     render.refuse_distortion(capture.cameras)
     start_key, run_key = jax.random.split(key)
     seed = int(jax.random.randint(start_key, (), 0, np.iinfo(np.int32).max))
-    position, colour = start.first_points(spec.start, capture, seed)
+    position, colour = initialisation.initial_points(spec.init, capture, seed)
     rows = splats.from_points(
         position,
         colour,
         degree=spec.sh_degree,
-        opacity=spec.start.opacity,
-        scale=spec.start.scale,
+        opacity=spec.init.opacity,
+        scale=spec.init.scale,
     )
-    rows = start.narrowed(rows, capture, spec.start.widest)
+    rows = initialisation.clamp_scales(rows, capture, spec.init.max_scale)
     count = len(position)
     most = None if spec.densification is None else spec.densification.cap_max
     params = Params({"splats": rows}, {})

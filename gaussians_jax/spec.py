@@ -22,12 +22,12 @@ from gaussians_jax.effects.motion_basis import BasisMotionSpec
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec
 from gaussians_jax.effects.neighbours import NeighbourSpec
 from gaussians_jax.effects.spectral import SpectralSpec
+from gaussians_jax.initialisation import InitSpec
 from gaussians_jax.mcmc import MCMCStrategySpec
 from gaussians_jax.optimiser import scale_by_row_adam, scale_by_row_radam
 from gaussians_jax.phases import AlternationSpec, AnnealingSpec
 from gaussians_jax.raster_spec import RasterSpec
 from gaussians_jax.rates import RateSpec
-from gaussians_jax.start import StartSpec
 
 OPTIMISERS = {"adam": scale_by_row_adam, "radam": scale_by_row_radam}
 
@@ -37,7 +37,7 @@ class SplatScene:
     """Which scene of Gaussians; `None` for an effect means that it is not there."""
 
     steps: int
-    start: StartSpec = StartSpec()
+    init: InitSpec = InitSpec()
     sh_degree: int = 3
     sh_every: int = 1000  # steps between one degree and the next
     dssim_weight: float = 0.2

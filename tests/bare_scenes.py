@@ -23,8 +23,8 @@ from gaussians_jax import presets as splat_presets
 from gaussians_jax import rates as splat_rates
 from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec
+from gaussians_jax.initialisation import InitSpec
 from gaussians_jax.splats import Params
-from gaussians_jax.start import StartSpec
 from nerfies_jax import presets as field_presets
 from nerfies_jax.geometry import rays
 from nerfies_jax.nets import encoding
@@ -107,7 +107,7 @@ def tiny_splats(name):
         )
     return dataclasses.replace(
         spec,
-        start=StartSpec(random=100, fewest=1000),
+        init=InitSpec(random=100, min_points=1000),
         sh_degree=1,
         densification=shrunk(spec.densification, cap_max=256),
         motion=motion,

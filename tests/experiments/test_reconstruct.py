@@ -34,7 +34,7 @@ QUICK = (
     "motion.depth=2",
     "motion.skips=",
     "sh_degree=0",
-    "start.beside=0",
+    "init.extra_random=0",
 )
 
 
@@ -125,7 +125,7 @@ def test_a_folder_that_is_no_capture_says_what_was_looked_for(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--set", "start.points=0"), "at least one Gaussian"),
+        (("--set", "init.points=0"), "at least one Gaussian"),
         (("--set", "raster.capacity=1000000000000"), "GiB are free"),
         (("--preset", "splats-magic"), "splats-deformable-small"),
         (("--steps", "0"), "at least one step"),

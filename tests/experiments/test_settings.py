@@ -19,7 +19,7 @@ def test_an_override_reaches_a_nested_field_with_its_type():
     assert spec.densification.cap_max == 123
     assert spec.motion.rate == 1e-3
     assert spec.raster.antialiased is True
-    assert spec.start == presets.SMALL_DEFORMABLE.start
+    assert spec.init == presets.SMALL_DEFORMABLE.init
 
 
 def test_an_effect_is_taken_out_with_none():

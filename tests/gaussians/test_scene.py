@@ -10,12 +10,12 @@ import optax
 import pytest
 
 from experiments import evaluate
-from gaussians_jax import presets, rates, scene, splats, start
+from gaussians_jax import initialisation, presets, rates, scene, splats
+from gaussians_jax.initialisation import InitSpec
 from gaussians_jax.optimiser import scale_by_row_adam
 from gaussians_jax.rates import RateSpec
 from gaussians_jax.spec import Facts, SplatScene
 from gaussians_jax.splats import Params, Splats
-from gaussians_jax.start import StartSpec
 from tests import scenes
 
 KEY = 3
@@ -182,8 +182,8 @@ def test_a_frame_has_the_harmonics_of_its_step():
 
 def test_few_points_start_from_random_ones_in_the_views():
     capture = scenes.tiny_capture()
-    spec = StartSpec(random=50, fewest=10**6)
-    position, colour = start.first_points(spec, capture, 0)
+    spec = InitSpec(random=50, min_points=10**6)
+    position, colour = initialisation.initial_points(spec, capture, 0)
     assert position.shape == colour.shape == (50, 3)
     turn = capture.cameras.camera_from_world[capture.train]
     offset = position[None] - capture.cameras.position[capture.train][:, None]
@@ -193,7 +193,9 @@ def test_few_points_start_from_random_ones_in_the_views():
 
 
 def test_more_points_than_asked_for_are_thinned_without_repeats():
-    position, _ = start.first_points(StartSpec(points=120), scenes.tiny_capture(), 0)
+    position, _ = initialisation.initial_points(
+        InitSpec(points=120), scenes.tiny_capture(), 0
+    )
     assert len(np.unique(position, axis=0)) == len(position) == 120
 
 
@@ -221,7 +223,7 @@ def test_wrong_settings_are_refused_with_their_bound(field, value, words):
 
 def test_zero_gaussians_are_refused():
     with pytest.raises(ValueError, match="at least one Gaussian"):
-        StartSpec(points=0)
+        InitSpec(points=0)
 
 
 def test_a_rate_that_cannot_decay_is_refused():

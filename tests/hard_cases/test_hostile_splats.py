@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from gaussians_jax import densification, scene, splats
+from gaussians_jax.initialisation import InitSpec
 from gaussians_jax.scene import Extra
 from gaussians_jax.spec import effects_of
-from gaussians_jax.start import StartSpec
 from nerfies_jax.capture.capture import PointCloud
 from nerfies_jax.training.model import Frames, Model, TrainState, View
 from tests import scenes
@@ -305,15 +305,15 @@ CLOUDS = {
 
 
 @pytest.mark.parametrize("source", ["auto", "points"])
-@pytest.mark.parametrize("beside", [0, 50])
+@pytest.mark.parametrize("extra", [0, 50])
 @pytest.mark.parametrize("cloud", CLOUDS)
-def test_every_cloud_of_points_is_a_finite_start(cloud, beside, source):
+def test_every_cloud_of_points_is_a_finite_start(cloud, extra, source):
     capture = scenes.tiny_capture()
     place = capture.cameras.position[capture.train]
     ahead = capture.cameras.camera_from_world[capture.train[0], 2]
     capture = points_at(CLOUDS[cloud](place, ahead, capture.far))
-    plan = StartSpec(random=120, beside=beside, source=source)
-    spec = dataclasses.replace(scenes.TINY_SPLATS, start=plan)
+    plan = InitSpec(random=120, extra_random=extra, source=source)
+    spec = dataclasses.replace(scenes.TINY_SPLATS, init=plan)
     state = scene.build(spec, scene.facts_of(capture)).init(capture, jax.random.key(0))
     assert not hostile.not_finite(state)
     assert splats.active_mask(state.params.rows["splats"]).any()
