@@ -12,9 +12,9 @@ from gaussians_jax.effects.motion_growth import MotionGrowthSpec
 from gaussians_jax.effects.neighbours import NeighbourSpec
 from gaussians_jax.effects.spectral import SpectralSpec
 from gaussians_jax.initialisation import InitSpec
+from gaussians_jax.learning_rates import LearningRateSpec
 from gaussians_jax.mcmc import MCMCStrategySpec
 from gaussians_jax.phases import AlternationSpec, AnnealingSpec
-from gaussians_jax.rates import RateSpec
 from gaussians_jax.spec import SplatScene
 from nerfies_jax.nets.encoding import EncodingSpec
 
@@ -82,7 +82,7 @@ SMALL_STATIC = SplatScene(
         reset_every=100_000,
         cap_max=10_000,
     ),
-    rates=RateSpec(mean_end=3.2e-6),
+    learning_rates=LearningRateSpec(mean_end=3.2e-6),
 )
 # Built-in scene, 1500 steps, up to 10,000 Gaussians (held-out PSNR and SSIM, one seed):
 #   clone and split (`SMALL_STATIC`)              22.41 / 0.816

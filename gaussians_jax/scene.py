@@ -11,9 +11,9 @@ from jaxtyping import Array, Float, Int, Key
 from gaussians_jax import (
     densification,
     initialisation,
+    learning_rates,
     mcmc,
     phases,
-    rates,
     render,
     splats,
 )
@@ -163,7 +163,9 @@ def _stepper(spec, facts, effects, optimiser):
         )
         directions, moments = optimiser.update(slopes, state.optimiser, state.params)
         rate = _rates(spec, facts, effects, state.step)
-        trained = Trained(rates.descend(state.params, directions, rate), moments)
+        trained = Trained(
+            learning_rates.descend(state.params, directions, rate), moments
+        )
         if isinstance(spec.densification, MCMCStrategySpec):
             key, speed = _stream(state, NOISE), rate.rows["splats"].mean
             shaken = mcmc.shake(key, trained.params, speed, spec.densification)
@@ -240,8 +242,8 @@ def _view(frames, row):
 def _rates(spec, facts, effects, step):
     """A prefix of `Params` with the learning rate of everything below each leaf."""
     rows = {
-        "splats": rates.learning_rates(
-            spec.rates, facts.extent, spec.steps, step, spec.annealing
+        "splats": learning_rates.at_step(
+            spec.learning_rates, facts.extent, spec.steps, step, spec.annealing
         )
     }
     nets = {}

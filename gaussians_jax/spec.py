@@ -23,11 +23,11 @@ from gaussians_jax.effects.motion_growth import MotionGrowthSpec
 from gaussians_jax.effects.neighbours import NeighbourSpec
 from gaussians_jax.effects.spectral import SpectralSpec
 from gaussians_jax.initialisation import InitSpec
+from gaussians_jax.learning_rates import LearningRateSpec
 from gaussians_jax.mcmc import MCMCStrategySpec
 from gaussians_jax.optimiser import scale_by_row_adam, scale_by_row_radam
 from gaussians_jax.phases import AlternationSpec, AnnealingSpec
 from gaussians_jax.raster_spec import RasterSpec
-from gaussians_jax.rates import RateSpec
 
 OPTIMISERS = {"adam": scale_by_row_adam, "radam": scale_by_row_radam}
 
@@ -41,7 +41,7 @@ class SplatScene:
     sh_degree: int = 3
     sh_every: int = 1000  # steps between one degree and the next
     dssim_weight: float = 0.2
-    rates: RateSpec = RateSpec()
+    learning_rates: LearningRateSpec = LearningRateSpec()
     raster: RasterSpec = RasterSpec()
     densification: DefaultStrategySpec | MCMCStrategySpec | None = DefaultStrategySpec()
     optimiser: str = "adam"

@@ -19,8 +19,8 @@ from gaussians_jax import (
     raster,
     splats,
 )
+from gaussians_jax import learning_rates as splat_rates
 from gaussians_jax import presets as splat_presets
-from gaussians_jax import rates as splat_rates
 from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec
 from gaussians_jax.initialisation import InitSpec
@@ -227,8 +227,8 @@ def splat_step(spec, facts, shuffled_row):
             loss, argnums=wanted, has_aux=True
         )(state.params, still)
         direction, moments = update(slopes[0], state.optimiser, state.params)
-        rates = splat_rates.learning_rates(
-            spec.rates, facts.extent, spec.steps, state.step
+        rates = splat_rates.at_step(
+            spec.learning_rates, facts.extent, spec.steps, state.step
         )
         rates = Params({"splats": rates}, {})
         params = splat_rates.descend(state.params, direction, rates)

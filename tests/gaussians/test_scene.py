@@ -10,10 +10,10 @@ import optax
 import pytest
 
 from experiments import evaluate
-from gaussians_jax import initialisation, presets, rates, scene, splats
+from gaussians_jax import initialisation, learning_rates, presets, scene, splats
 from gaussians_jax.initialisation import InitSpec
+from gaussians_jax.learning_rates import LearningRateSpec
 from gaussians_jax.optimiser import scale_by_row_adam
-from gaussians_jax.rates import RateSpec
 from gaussians_jax.spec import Facts, SplatScene
 from gaussians_jax.splats import Params, Splats
 from tests import scenes
@@ -90,11 +90,11 @@ def test_every_epoch_shows_every_frame_once_in_its_own_order():
 
 
 def test_descent_scales_each_kind_of_row_by_its_rate():
-    spec = RateSpec(mean=1e-2, mean_end=1e-4, log_scale=0.1, quaternion=0.2)
+    spec = LearningRateSpec(mean=1e-2, mean_end=1e-4, log_scale=0.1, quaternion=0.2)
     _, state, _ = started(scenes.TINY_SPLATS)
     ones = jax.tree.map(jnp.ones_like, state.params)
-    rate = rates.learning_rates(spec, 2.0, 100, jnp.asarray(50))
-    after = rates.descend(state.params, ones, Params({"splats": rate}, {}))
+    rate = learning_rates.at_step(spec, 2.0, 100, jnp.asarray(50))
+    after = learning_rates.descend(state.params, ones, Params({"splats": rate}, {}))
     before = state.params.rows["splats"]
     step = jax.tree.map(lambda a, b: a - b, before, after.rows["splats"])
     # Halfway in the logarithm between 1e-2 and 1e-4, times the extent of 2.
@@ -228,7 +228,7 @@ def test_zero_gaussians_are_refused():
 
 def test_a_rate_that_cannot_decay_is_refused():
     with pytest.raises(ValueError, match="mean_end"):
-        RateSpec(mean_end=0.0)
+        LearningRateSpec(mean_end=0.0)
 
 
 @pytest.mark.parametrize("name", sorted(presets.PRESETS))

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import rates
+from gaussians_jax import learning_rates
 from gaussians_jax.effects import spectral
 from gaussians_jax.effects.effect import Moment, Shot
 from gaussians_jax.effects.spectral import FourierSpec, Gates, SpectralSpec, WaveletSpec
@@ -429,7 +429,7 @@ def test_the_scenes_optimiser_shuts_a_learned_gate_down_to_its_least(rng):
         slopes, weight = jax.grad(value, has_aux=True)(params)
         along, moments = optimiser.update(slopes, moments, params)
         rate = Params({}, {"spectral": made.net_rate(step)})
-        return (rates.descend(params, along, rate), moments), weight
+        return (learning_rates.descend(params, along, rate), moments), weight
 
     state = params, optimiser.init(params)
     _, seen = jax.lax.scan(update, state, jnp.arange(200))
