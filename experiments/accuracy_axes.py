@@ -94,9 +94,9 @@ AXES = {
         SPLATS,
         **{
             "tile-16": "raster.tile=16",
-            "cut-0.01": "raster.alpha_cut=0.01",
-            "cut-0.001": "raster.alpha_cut=0.001",
-            "stop-1e-2": "raster.stop=0.01",
+            "cut-0.01": "raster.alpha_threshold=0.01",
+            "cut-0.001": "raster.alpha_threshold=0.001",
+            "stop-1e-2": "raster.transmittance_threshold=0.01",
             "antialiased": "raster.antialiased=true",
         },
     ),

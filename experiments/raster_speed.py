@@ -123,7 +123,7 @@ def footprints_of(scene: dict) -> Footprints:
     a, b, c = scene["covs"].astype(np.float64).T
     opacity = scene["opacities"].astype(np.float64)
     whitening = [np.sqrt(0.5 / a), b / a, np.sqrt(0.5 / (c - b * b / a))]
-    reach = 2 * np.log(np.maximum(opacity / SPEC.alpha_cut, 1))
+    reach = 2 * np.log(np.maximum(opacity / SPEC.alpha_threshold, 1))
     extent = np.sqrt(reach[:, None] * np.stack([a, c], 1))
     fields = (
         scene["means2d"],

@@ -185,7 +185,9 @@ def _alphas(rows, middle, spec, grid):
     u = u0 + u_x * x
     v = v0 + v_x * x + v_y * y
     raw = jnp.exp(rows[5][..., None] - u * u - v * v)
-    return raw, jnp.where(raw >= spec.alpha_cut, jnp.minimum(raw, spec.alpha_max), 0)
+    return raw, jnp.where(
+        raw >= spec.alpha_threshold, jnp.minimum(raw, spec.alpha_max), 0
+    )
 
 
 def _pass_through(transmittance, alpha, spec):
@@ -193,7 +195,7 @@ def _pass_through(transmittance, alpha, spec):
     # A product, not T - alpha T: two alphas of 0.99 leave 0.99999e-4, and rounding the
     # difference could put that above the stop.
     passed = transmittance * (1 - alpha)
-    drawn = passed > spec.stop
+    drawn = passed > spec.transmittance_threshold
     return jnp.where(drawn, passed, -jnp.abs(transmittance)), drawn
 
 

@@ -179,7 +179,7 @@ def _blank(layout, channels, dtype):
 
 def _next_slab(layout, cursor, boxes, table, state):
     open_tiles = jnp.max(state[:, 0], axis=1) > 0
-    log_cut = math.log(layout.spec.alpha_cut)
+    log_cut = math.log(layout.spec.alpha_threshold)
     return binning.next_slab(
         cursor, boxes, table, open_tiles, log_cut, layout.grid, layout.capacity
     )

@@ -147,7 +147,7 @@ def test_equal_depths_are_drawn_in_order_of_index(dtype):
 
 @pytest.mark.hard_cases
 def test_two_opaque_gaussians_stop_a_pixel(dtype):
-    """0.99 twice leaves 1e-4: float32 rounds it below the stop, float64 above."""
+    """0.99 twice leaves 1e-4: float32 rounds it below the threshold, float64 above."""
     image, left = drawn([[4.5, 4.5]] * 3, 100.0, 1.0, [1.0, 2.0, 3.0], np.eye(3), dtype)
     expected = {"float32": [0.99, 0, 0], "float64": [0.99, 0.0099, 0]}[dtype]
     np.testing.assert_allclose(image[4, 4], expected, atol=1e-6)
@@ -287,12 +287,12 @@ def test_forward_and_backward_lower_for_cuda(dtype, rng):
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        (dict(alpha_max=1.0), "alpha_cut < alpha_max < 1"),
+        (dict(alpha_max=1.0), "alpha_threshold < alpha_max < 1"),
         (dict(near=0.0), "0 < near < far"),
         (dict(tile=12), "tile must be one of"),
         (dict(capacity=0), "capacity must be at least 1"),
-        (dict(dilation_px2=0.0), "dilation_px2 must be positive"),
-        (dict(stop=1.0), "0 <= stop < 1"),
+        (dict(eps2d=0.0), "eps2d must be positive"),
+        (dict(transmittance_threshold=1.0), "0 <= transmittance_threshold < 1"),
     ],
 )
 def test_wrong_settings_are_refused(wrong, message):

@@ -33,7 +33,9 @@ from tests.hard_cases.properties import (
 
 pytestmark = pytest.mark.hard_cases
 # Without jumps: at the cut a Gaussian's edge is as faint as rounding.
-SMOOTH = RasterSpec(alpha_cut=1e-6, stop=0.0, near=1e-9, far=1e12, chunk=2)
+SMOOTH = RasterSpec(
+    alpha_threshold=1e-6, transmittance_threshold=0.0, near=1e-9, far=1e12, chunk=2
+)
 USUAL = RasterSpec(chunk=2)  # quicker to compile
 OTHERWISE_CUT = dataclasses.replace(SMOOTH, tile=4, capacity=5)
 ROWS = st.integers(0, GAUSSIANS - 1)
@@ -177,7 +179,7 @@ def test_a_denser_gaussian_never_lets_more_light_through(
     rounding = 2 * GAUSSIANS * eps(dtype)
     # A pixel is done before its transmittance would fall below `stop`, so that what
     # ends it early may keep an opaque Gaussian behind it out.
-    most = 1, 1 - USUAL.stop / (1 - USUAL.alpha_max)
+    most = 1, 1 - USUAL.transmittance_threshold / (1 - USUAL.alpha_max)
     before, after = (pictures(*each) for each in inputs)
     for (_, before_, _), (_, after_, _), alpha in zip(
         before, after, most, strict=False
