@@ -1,4 +1,4 @@
-"""What the rasteriser is asked to do: thresholds, clamps, tiles, slabs."""
+"""What the rasteriser is asked to do: thresholds, clamps, tiles, chunks of pairs."""
 
 import dataclasses
 from typing import Literal
@@ -10,7 +10,7 @@ TILE_SIZES = (4, 8, 16, 32)
 class RasterSpec:
     """Every threshold of the picture by name, and the sizes that only cost time.
 
-    `tile`, `capacity`, `batch`, `chunk` and `kept_slabs` never change the picture
+    `tile`, `capacity`, `batch`, `chunk` and `kept_chunks` never change the picture
     beyond rounding; the others are the picture's definition. The defaults are those of
     gsplat 1.6 (`GSPLAT`); `INRIA` is the original 3D Gaussian splatting (Kerbl et al.
     2023, arXiv:2308.04079) as its public rasteriser runs.
@@ -29,7 +29,7 @@ class RasterSpec:
     capacity: int | None = None  # (tile, Gaussian) pairs sorted at a time; None: chosen
     batch: int | None = None  # tiles blended in lockstep; None: by backend
     chunk: int | None = None  # Gaussians blended in one step; None: by backend
-    kept_slabs: int = 4  # sorted slabs kept for the backward pass, 4 bytes a pair
+    kept_chunks: int = 4  # of sorted pairs, for the backward pass; 4 bytes a pair
 
     def __post_init__(self):
         if not 0 < self.alpha_threshold < self.alpha_max < 1:
@@ -62,8 +62,8 @@ class RasterSpec:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ValueError(f"{name} must be at least 1 or None, got {value}")
-        if self.kept_slabs < 1:
-            raise ValueError(f"kept_slabs must be at least 1, got {self.kept_slabs}")
+        if self.kept_chunks < 1:
+            raise ValueError(f"kept_chunks must be at least 1, got {self.kept_chunks}")
 
 
 GSPLAT = RasterSpec()

@@ -269,7 +269,7 @@ def first_bytes(spec: SplatScene, capture: Capture) -> int:
     harmonics = 3 * (spec.sh_degree + 1) ** 2
     # Parameters, two moments, gradient, update; the tables of one projection.
     numbers = count * (5 * (11 + harmonics) + 60)
-    # A slab holds keys, rows and blending inputs of every pair.
+    # A chunk holds keys, rows and blending inputs of every pair.
     numbers += 16 * (spec.raster.capacity or 0)
     return 4 * numbers + capture.images.nbytes
 

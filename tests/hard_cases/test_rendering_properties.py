@@ -296,7 +296,7 @@ def test_one_gaussian_is_two_in_one_place_of_root_transparency(
 
 @in_float32
 @given(scene=SCENE, colours=COLOURS, camera=CAMERA)
-def test_tiles_and_slabs_do_not_show(scene, colours, camera, dtype):
+def test_tiles_and_chunks_do_not_show(scene, colours, camera, dtype):
     inputs = cast(dtype, scene, colours, camera)
     here, there = smooth(*inputs), draw(*inputs, OTHERWISE_CUT)
     close(there[0], here[0], picture_error(dtype))
