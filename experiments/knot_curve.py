@@ -45,7 +45,7 @@ class Curve(NamedTuple):
 
 
 def curve(
-    motion: Moving, knots: Sequence[int], still_below: float, repeats: int
+    motion: Moving, knots: Sequence[int], static_threshold: float, repeats: int
 ) -> Curve:
     """Tables of so many knots, linear and cubic, against the motion itself."""
     times = jnp.linspace(0, 1, INSTANTS)
@@ -53,7 +53,7 @@ def curve(
     drawn = np.linspace(1, INSTANTS - 2, DRAWN).round().astype(int)
     truth = [motion.draw(exact[k], times[k]) for k in drawn]
     tables = {
-        (way, count): time_knots.bake(motion.pose, count, still_below)
+        (way, count): time_knots.bake(motion.pose, count, static_threshold)
         for way, fewest in time_knots.FEWEST.items()
         for count in knots
         if count >= fewest
@@ -72,7 +72,7 @@ def curve(
         raise ValueError(
             f"{motion.name}: nothing moves, so there is nothing to compare"
         )
-    moved = ways.max(axis=0) > still_below
+    moved = ways.max(axis=0) > static_threshold
     points = []
     for (way, count), table in tables.items():
         posed = [_at(table, time, way) for time in times]

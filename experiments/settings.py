@@ -31,6 +31,11 @@ def parse(settings_class, arguments=None):
     return tyro.cli(settings_class, args=arguments)
 
 
+def formerly(option):
+    """For `Annotated`: the option is understood by its earlier name as well."""
+    return tyro.conf.arg(aliases=[option])
+
+
 @contextlib.contextmanager
 def user_errors():
     """Wrong input in one line and exit code 2; our own bugs keep their traceback.

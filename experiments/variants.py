@@ -88,7 +88,7 @@ def from_knots(
     state: TrainState,
     knots: int,
     interpolation: str = "linear",
-    still_below: float = 0.0,
+    static_threshold: float = 0.0,
 ) -> Faster:
     """The model with its motion read from a table of `knots` instants; host side."""
     from gaussians_jax import time_knots
@@ -99,10 +99,10 @@ def from_knots(
     prepared = jax.jit(stages.prepare)(params)
     pose = jax.jit(stages.pose)
     table = time_knots.bake(
-        lambda time: pose(params, prepared, time), knots, still_below
+        lambda time: pose(params, prepared, time), knots, static_threshold
     )
     summary = (
-        f"{knots} knots, {interpolation}, of {_moving(table.where, still_below)}: "
+        f"{knots} knots, {interpolation}, of {_moving(table.index, static_threshold)}: "
         f"{table.bytes / 1e6:.1f} MB"
     )
     return _with(
@@ -120,24 +120,24 @@ def from_knots(
     )
 
 
-def without_still(model: Model, state: TrainState, still_below: float) -> Faster:
+def without_static(model: Model, state: TrainState, static_threshold: float) -> Faster:
     """The model with the deformation evaluated for moving Gaussians alone; host side.
 
-    Those are the ones that move farther than `still_below` (scene units) over
+    Those are the ones that move farther than `static_threshold` (scene units) over
     `INSTANTS` instants of [0, 1].
     """
-    from gaussians_jax import still_rows
+    from gaussians_jax import static_rows
 
-    stages = _stages(model, "--still-below")
+    stages = _stages(model, "--static-threshold")
 
     def pose_rows(params, time):
         return stages.pose(params, stages.prepare(params), time)
 
     times = np.linspace(0, 1, INSTANTS)
-    parts = still_rows.split(state.params, pose_rows, times, still_below)
+    parts = static_rows.split(state.params, pose_rows, times, static_threshold)
 
     def pose(both, prepared, time):
-        return still_rows.pose(
+        return static_rows.pose(
             both[1], lambda rows, time: stages.pose(rows, prepared, time), time
         )
 
@@ -146,11 +146,11 @@ def without_still(model: Model, state: TrainState, still_below: float) -> Faster
         state,
         parts,
         Stages(
-            prepare=lambda both: stages.prepare(both[1].moving),
+            prepare=lambda both: stages.prepare(both[1].dynamic),
             pose=pose,
             draw=lambda both, *rest: stages.draw(both[0], *rest),
         ),
-        f"the deformation of {_moving(parts.where, still_below)}",
+        f"the deformation of {_moving(parts.index, static_threshold)}",
     )
 
 
@@ -163,7 +163,7 @@ def without_moving(
     over `INSTANTS` instants of [0, 1]: what is left is the static scene, with holes
     where nothing was ever filmed behind what moves.
     """
-    from gaussians_jax import splats, still_rows
+    from gaussians_jax import splats, static_rows
 
     stages = _stages(model, "--hide-moving")
 
@@ -171,8 +171,8 @@ def without_moving(
         return stages.pose(params, stages.prepare(params), time)
 
     times = np.linspace(0, 1, INSTANTS)
-    parts = still_rows.split(state.params, pose_rows, times, farther_than)
-    moves = parts.where.moves
+    parts = static_rows.split(state.params, pose_rows, times, farther_than)
+    moves = parts.index.moves
     rows = state.params.rows
     active = int(splats.active_mask(rows["splats"]).sum())
     if int(moves.sum()) == active:
@@ -195,12 +195,12 @@ def _stages(model, option):
     return model.stages
 
 
-def _moving(where, still_below):
+def _moving(where, static_threshold):
     moving, rows = int(where.moves.sum()), len(where.moves)
     if not moving:
         raise ValueError(
-            f"nothing in this run moves farther than {still_below:g} scene units; "
-            "leave --knots and --still-below out, or lower the latter"
+            f"nothing in this run moves farther than {static_threshold:g} scene units; "
+            "leave --knots and --static-threshold out, or lower the latter"
         )
     return f"{moving} of {rows} rows that move"
 

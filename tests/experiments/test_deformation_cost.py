@@ -209,7 +209,7 @@ def test_the_job_prints_both_tables_and_saves_them(tmp_path, capsys, monkeypatch
         ("--gaussians 0", "--gaussians 0 must be at least 1"),
         ("--still 1", "a share in [0, 1)"),
         ("--knots 1 8", "at least 2"),
-        ("--still-below -1", "cannot be negative"),
+        ("--static-threshold -1", "cannot be negative"),
         ("--run nowhere", "no run here"),
     ],
 )

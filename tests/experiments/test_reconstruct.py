@@ -340,7 +340,7 @@ def test_the_canonical_scene_and_its_depth_are_rendered(run, tmp_path):
         (["--without", "warp"], "those are: motion"),
         (["--appearance", "0", "1"], "no appearance codes"),
         (["--knots", "1"], "reads 2 knots at once"),
-        (["--still-below", "1e9"], "nothing in this run moves"),
+        (["--static-threshold", "1e9"], "nothing in this run moves"),
         (["--knots", "8", "--without", "motion"], "nothing in this run moves"),
     ],
 )

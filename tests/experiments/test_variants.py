@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from experiments import evaluate, held_out_codes, variants
-from gaussians_jax import scene, splats, still_rows
+from gaussians_jax import scene, splats, static_rows
 from gaussians_jax.splats import Gaussians
 from nerfies_jax import scene as nerf_scene
 from nerfies_jax.effects.appearance import AppearanceSpec
@@ -38,10 +38,10 @@ def test_splats_without_motion_are_the_canonical_ones(moving):
     facts, model, params, view = moving
     step = jnp.asarray(20, jnp.int32)
     draw = variants.of_splats(scenes.TINY_DEFORMABLE, facts, ("motion",), False)
-    still = scene.build(scenes.TINY_SPLATS, facts).render
+    static = scene.build(scenes.TINY_SPLATS, facts).render
     found, expected, moved = (
         jax.jit(each, static_argnums=2)(params, view, SIZE, step).colour
-        for each in (draw.render, still, model.render)
+        for each in (draw.render, static, model.render)
     )
     np.testing.assert_array_equal(found, expected)
     assert np.abs(found - moved).max() > 0.02
@@ -112,9 +112,9 @@ def test_a_faster_model_draws_what_the_model_draws(swaying):
         evaluate.Renderer(model, SIZE)(state, view).colour
         for model, state in ((model, state), made[:2], (whole, made.state))
     )
-    still = variants.of_splats(*model.spec, ("motion",), False)
+    static = variants.of_splats(*model.spec, ("motion",), False)
     assert (
-        np.abs(evaluate.Renderer(still, SIZE)(state, view).colour - exact).max() > 0.1
+        np.abs(evaluate.Renderer(static, SIZE)(state, view).colour - exact).max() > 0.1
     )
     np.testing.assert_allclose(staged, exact, atol=1e-3)
     np.testing.assert_allclose(found, staged, atol=1e-5)
@@ -122,17 +122,17 @@ def test_a_faster_model_draws_what_the_model_draws(swaying):
 
 def test_what_stands_still_may_be_left_out(swaying):
     exact = poses(*swaying)
-    made = variants.without_still(*swaying, 0.0)
+    made = variants.without_static(*swaying, 0.0)
     active = np.asarray(splats.active_mask(swaying[1].params.rows["splats"]))
     for found, pose in zip(poses(made.model, made.state), exact, strict=True):
         for name in Gaussians._fields:  # a row that is not drawn may be anywhere
             a, b = (np.asarray(getattr(x, name))[active] for x in (found, pose))
             np.testing.assert_allclose(a, b, atol=2e-6, err_msg=name)
     middle, *_, end = poses(*swaying, (0.5, 1.0))
-    moved = np.asarray(still_rows.reach(middle, end))[active]
+    moved = np.asarray(static_rows.max_displacement(middle, end))[active]
     below = float(np.median(moved))
-    made = variants.without_still(*swaying, below)
-    left = len(made.state.params[1].moving.rows["splats"].mean)
+    made = variants.without_static(*swaying, below)
+    left = len(made.state.params[1].dynamic.rows["splats"].mean)
     assert 0 < left < len(moved)
     assert f"{left} of {len(active)} rows that move" in made.summary
     for found, pose in zip(poses(made.model, made.state), exact, strict=True):
@@ -147,8 +147,8 @@ def test_what_stands_still_may_be_left_out(swaying):
         (lambda *a: variants.from_knots(*a, 1), "reads 2 knots at once, got 1"),
         (lambda *a: variants.from_knots(*a, 3, "cubic"), "take more, or linear"),
         (lambda *a: variants.from_knots(*a, 8, "linear", 1e9), "farther than 1e\\+09"),
-        (lambda *a: variants.without_still(*a, 1e9), "nothing in this run moves"),
-        (lambda *a: variants.without_still(*a, -1.0), "cannot be negative"),
+        (lambda *a: variants.without_static(*a, 1e9), "nothing in this run moves"),
+        (lambda *a: variants.without_static(*a, -1.0), "cannot be negative"),
     ],
 )
 def test_a_faster_motion_that_cannot_be_is_refused(swaying, make, words):
@@ -162,14 +162,16 @@ def test_what_moves_may_be_left_out(swaying):
     nets = jax.tree.map(lambda leaf: 0.5 * leaf, state.params.nets)
     state = state_of(state.params._replace(nets=nets))
     middle, *ends = poses(model, state, (0.5, 0.0, 1.0))
-    reach = np.max([still_rows.reach(middle, end) for end in ends], axis=0)
+    distance = np.max(
+        [static_rows.max_displacement(middle, end) for end in ends], axis=0
+    )
     active = np.asarray(splats.active_mask(state.params.rows["splats"]))
-    far = float(np.median(reach[active]))
+    far = float(np.median(distance[active]))
     left, summary = variants.without_moving(model, state, far)
     rows = left.params.rows["splats"]
     shown = np.asarray(splats.active_mask(rows))
     assert 0 < shown.sum() < active.sum() / 2 + 1
-    assert reach[shown].max() <= far
+    assert distance[shown].max() <= far
     assert f"{active.sum() - shown.sum()} of {active.sum()} Gaussians" in summary
     # What is left is drawn as it was, wherever it still moves a little
     alone = splats.take_rows(state.params, jnp.asarray(np.flatnonzero(shown)))
@@ -192,14 +194,14 @@ def test_a_static_scene_of_nothing_is_refused(swaying):
 
 
 def test_fields_and_still_scenes_have_no_knots(moving, swaying):
-    still = variants.of_splats(scenes.TINY_DEFORMABLE, moving[0], ("motion",), False)
+    static = variants.of_splats(scenes.TINY_DEFORMABLE, moving[0], ("motion",), False)
     with pytest.raises(ValueError, match="nothing in this run moves farther than 0 "):
-        variants.from_knots(still, swaying[1], 8)
-    field = still._replace(stages=None)
+        variants.from_knots(static, swaying[1], 8)
+    field = static._replace(stages=None)
     with pytest.raises(ValueError, match="--knots is for runs of Gaussians"):
         variants.from_knots(field, swaying[1], 8)
-    with pytest.raises(ValueError, match="--still-below is for runs of Gaussians"):
-        variants.without_still(field, swaying[1], 0.1)
+    with pytest.raises(ValueError, match="--static-threshold is for runs of Gaussians"):
+        variants.without_static(field, swaying[1], 0.1)
 
 
 def test_an_appearance_is_named_by_its_frame_or_its_number():
@@ -246,10 +248,10 @@ def drawn(field, seen, without=(), blended=False):
 def test_a_field_without_its_warp_is_the_template(field):
     facts, params, view = field
     found = drawn(field, view, without=("warp",))
-    still = dataclasses.replace(TINY_FIELD, warp=None)
+    static = dataclasses.replace(TINY_FIELD, warp=None)
     step = jnp.asarray(10, jnp.int32)
     codes = {"appearance": params["codes"]["appearance"]}
-    model = nerf_scene.build(still, facts)
+    model = nerf_scene.build(static, facts)
     expected = jax.jit(model.render, static_argnums=2)(
         {"template": params["template"], "codes": codes}, view, SIZE, step
     ).colour
