@@ -29,8 +29,8 @@ class Representation(NamedTuple):
     with_steps: Callable[[Spec, int], Spec]  # schedules stretch with the steps
     facts_of: Callable[[Capture, Spec], Any]
     build: Callable[[Spec, Any], Model]  # (spec, facts) -> model
-    first_bytes: Callable[[Spec, Capture], int]  # of the first state and step
-    lighter: str  # which settings make the first state smaller
+    estimate_memory_bytes: Callable[[Spec, Capture], int]  # of the first state and step
+    memory_hint: str  # which settings make the first state smaller
     # (spec, facts, model, state, frames) -> milliseconds of each part of a step
     time_parts: Callable[[Spec, Any, Model, TrainState, Frames], dict[str, float]]
     # (spec, facts, effects left out, whether appearances are blended) -> model;
@@ -66,8 +66,8 @@ def gaussians() -> Representation:
         with_steps=presets.with_steps,
         facts_of=lambda capture, spec: scene.facts_of(capture),
         build=scene.build,
-        first_bytes=scene.first_bytes,
-        lighter="lower init.points, init.random or raster.capacity with --set",
+        estimate_memory_bytes=scene.estimate_memory_bytes,
+        memory_hint="lower init.points, init.random or raster.capacity with --set",
         time_parts=step_time.of_splats,
         variant=variants.of_splats,
         score_halves=lambda *_: None,
@@ -89,8 +89,8 @@ def radiance() -> Representation:
         with_steps=presets.with_steps,
         facts_of=scene.facts_of,
         build=scene.build,
-        first_bytes=scene.first_bytes,
-        lighter="lower rays, sampling.coarse or sampling.fine with --set",
+        estimate_memory_bytes=scene.estimate_memory_bytes,
+        memory_hint="lower rays, sampling.coarse or sampling.fine with --set",
         time_parts=step_time.of_fields,
         variant=variants.of_fields,
         score_halves=held_out_codes.score,

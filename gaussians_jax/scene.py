@@ -137,13 +137,13 @@ def _stepper(spec, facts, effects, optimiser):
         size = frames.images.shape[2], frames.images.shape[1]
         degree = splats.active_degree(state.step, spec.sh_every, spec.sh_degree)
         moment = Moment(view.time, state.step, loop.step_key(state))
-        turn = phases.turn(spec.alternation, state.step)
+        mask = phases.update_mask(spec.alternation, state.step)
 
         def posed(params, gaussians):
             return deformation.pose_in_training(effects, params, gaussians, moment)
 
         if spec.alternation is not None:
-            posed = phases.spared(turn, posed)
+            posed = phases.stop_frozen_gradients(mask, posed)
         # A channel that nothing reads is still blended: 4 % of a step.
         read = any("depths" in effect.wants for effect in effects)
         depth = read and frames.depths is not None
@@ -172,7 +172,7 @@ def _stepper(spec, facts, effects, optimiser):
             trained = trained._replace(params=shaken)
         if spec.alternation is not None:
             before = Trained(state.params, state.optimiser)
-            trained = phases.hold(optimiser, turn, before, trained)
+            trained = phases.freeze(optimiser, mask, before, trained)
         stats, carried = state.extra
         if isinstance(spec.densification, DefaultStrategySpec):
             radius_px = jnp.max(footprints.extent_px, axis=1)
@@ -263,7 +263,7 @@ def shuffled_row(
     return jax.random.permutation(epoch, frames)[step % frames]
 
 
-def first_bytes(spec: SplatScene, capture: Capture) -> int:
+def estimate_memory_bytes(spec: SplatScene, capture: Capture) -> int:
     """Roughly the memory of the first state and step; host side, nothing allocated."""
     count = initialisation.initial_count(spec.init, capture)
     harmonics = 3 * (spec.sh_degree + 1) ** 2

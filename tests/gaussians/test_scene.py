@@ -243,11 +243,11 @@ def test_presets_build_and_stretch_with_their_steps(name):
     assert presets.with_steps(spec, spec.steps) == spec
 
 
-def test_first_bytes_counts_rows_and_capacity():
+def test_estimate_memory_counts_rows_and_capacity():
     capture = scenes.tiny_capture()
-    small = scene.first_bytes(scenes.TINY_SPLATS, capture)
+    small = scene.estimate_memory_bytes(scenes.TINY_SPLATS, capture)
     slab = dataclasses.replace(scenes.TINY_SPLATS.raster, capacity=10**12)
-    large = scene.first_bytes(
+    large = scene.estimate_memory_bytes(
         dataclasses.replace(scenes.TINY_SPLATS, raster=slab), capture
     )
     assert small < 10**7
