@@ -227,18 +227,19 @@ def gather_rows(
     moments: PyTree,
     rows: Int[Array, " capacity"],
     fresh: Bool[Array, " capacity"],
-    dead: Bool[Array, " capacity"],
+    inactive: Bool[Array, " capacity"],
 ) -> tuple[Params, PyTree]:
     """Row `rows[i]` of everything becomes row i, in parameters and moments alike.
 
-    `fresh` rows start with zero moments and a zero count; `dead` ones are buried.
+    `fresh` rows start with zero moments and a zero count, and so do `inactive` ones,
+    which lose their opacity.
     """
     taken = splats.take_rows(params, rows)
-    buried = splats.bury(taken.rows["splats"], dead)
-    taken = taken._replace(rows=taken.rows | {"splats": buried})
+    deactivated = splats.deactivate(taken.rows["splats"], inactive)
+    taken = taken._replace(rows=taken.rows | {"splats": deactivated})
 
     def gather(moment):
-        forget = (fresh | dead).reshape(fresh.shape + (1,) * (moment.ndim - 1))
+        forget = (fresh | inactive).reshape(fresh.shape + (1,) * (moment.ndim - 1))
         return jnp.where(forget, jnp.zeros_like(moment[:1]), moment[rows])
 
     return taken, map_moments(optimiser, gather, moments, row_leaves(params))

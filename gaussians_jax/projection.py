@@ -69,7 +69,9 @@ def project(
 def _project_one(mean, quaternion, scale, opacity, camera, size, spec):
     offset = mean - camera.position  # R (x - c), not R x + t: exact far from origin
     depth = _dot(camera.camera_from_world[2], offset)
-    drawn = (depth >= spec.near) & (depth <= spec.far) & (opacity >= spec.alpha_cut)
+    drawn = (
+        (depth >= spec.near) & (depth <= spec.far) & (opacity >= spec.alpha_threshold)
+    )
     for part in (offset, quaternion, scale):
         drawn &= jnp.all(jnp.isfinite(part))
     drawn &= jnp.any(quaternion != 0) & jnp.isfinite(opacity)
@@ -93,7 +95,7 @@ def _project_one(mean, quaternion, scale, opacity, camera, size, spec):
     whitening, compensation = _whiten(first, second, spec)
     if spec.antialiased:
         opacity = opacity * compensation
-        drawn &= opacity >= spec.alpha_cut
+        drawn &= opacity >= spec.alpha_threshold
     extent = jnp.where(drawn, _extent(whitening, opacity, spec), 0)
     fields = (
         jnp.where(drawn, field, lax.stop_gradient(field))
@@ -174,7 +176,7 @@ def _whiten(first, second, spec):
     c - b^2/a as a sum of squares: |t1 x t2|^2/a + dilation (1 + |t2|^2/a), with t1
     scaled by 1/sqrt(a) beforehand so that nothing of fourth order in px is formed.
     """
-    dilation = spec.dilation_px2
+    dilation = spec.eps2d
     variance_x = _dot(first, first) + dilation
     inverse = lax.rsqrt(variance_x)
     n = [x * inverse for x in first]
@@ -200,7 +202,7 @@ def _whiten(first, second, spec):
 def _extent(whitening, opacity, spec):
     """Half width and height (px) of the box around alpha >= cut."""
     p, k, r = whitening
-    reach = jnp.sqrt(jnp.maximum(jnp.log(opacity / spec.alpha_cut), 0))
+    reach = jnp.sqrt(jnp.maximum(jnp.log(opacity / spec.alpha_threshold), 0))
     across = reach / p
     # c = (c - b^2/a) + k^2 a
     down = jnp.hypot(reach / r, k * across)

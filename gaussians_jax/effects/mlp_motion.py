@@ -149,12 +149,12 @@ def deform(
     spec: MotionSpec,
     mean: Float[Array, "gaussians 3"],
     time: Float[Array, ""],
-    alive: Bool[Array, " gaussians"] | None = None,
+    active: Bool[Array, " gaussians"] | None = None,
 ) -> Offsets:
     """Offsets of every Gaussian at one time.
 
     No gradient reaches the means through the network, as in the paper: they would
-    chase a moving target. Blocks in which no row is `alive` are not evaluated, so
+    chase a moving target. Blocks in which no row is `active` are not evaluated, so
     compacted rows do not pay for the capacity behind them; their offsets are zero.
     """
     at_time = fold_time(params, spec, time)
@@ -163,7 +163,7 @@ def deform(
     return in_blocks(
         lambda points: offsets_at_time(at_time, spec, points),
         (jax.lax.stop_gradient(mean),),
-        alive,
+        active,
         spec.block,
     )
 
@@ -247,9 +247,9 @@ def effect(spec: MotionSpec, steps: int, frames: int) -> Effect:
         if spec.smoothing is not None and condition.step is not None:
             key = jax.random.fold_in(condition.key, _STREAM)
             time = smooth_time(key, spec.smoothing, time, condition.step, frames)
-        living = splats.alive(params.rows["splats"])
+        active = splats.active_mask(params.rows["splats"])
         motion = params.nets[NAME]
-        offsets = deform(motion, spec, gaussians.mean, time, living)
+        offsets = deform(motion, spec, gaussians.mean, time, active)
         return apply(gaussians, offsets, spec.scale_rule)
 
     return Effect(

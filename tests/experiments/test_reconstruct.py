@@ -21,15 +21,15 @@ from tests import scenes
 from tests.evidence import films
 
 QUICK = (
-    "density.interval=4",
-    "density.start=4",
-    "density.stop=10",
-    "density.most=300",
+    "densification.refine_every=4",
+    "densification.refine_start_iter=4",
+    "densification.refine_stop_iter=10",
+    "densification.cap_max=300",
     "motion.width=8",
     "motion.depth=2",
     "motion.skips=",
     "sh_degree=0",
-    "start.beside=0",
+    "init.extra_random=0",
 )
 
 
@@ -120,7 +120,7 @@ def test_a_folder_that_is_no_capture_says_what_was_looked_for(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--set", "start.points=0"), "at least one Gaussian"),
+        (("--set", "init.points=0"), "at least one Gaussian"),
         (("--set", "raster.capacity=1000000000000"), "GiB are free"),
         (("--preset", "splats-magic"), "splats-deformable-small"),
         (("--steps", "0"), "at least one step"),
@@ -336,7 +336,7 @@ def test_the_canonical_scene_and_its_depth_are_rendered(run, tmp_path):
         (["--without", "warp"], "those are: motion"),
         (["--appearance", "0", "1"], "no appearance codes"),
         (["--knots", "1"], "reads 2 knots at once"),
-        (["--still-below", "1e9"], "nothing in this run moves"),
+        (["--static-threshold", "1e9"], "nothing in this run moves"),
         (["--knots", "8", "--without", "motion"], "nothing in this run moves"),
     ],
 )

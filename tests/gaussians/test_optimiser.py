@@ -10,7 +10,7 @@ import optax
 import pytest
 
 from gaussians_jax import optimiser
-from gaussians_jax.splats import DEAD_LOGIT, Params, Splats
+from gaussians_jax.splats import INACTIVE_LOGIT, Params, Splats
 
 COUNT = 6
 # optax 0.2.8 raises a float to an integer power, which strict promotion refuses.
@@ -326,14 +326,14 @@ def test_a_gather_moves_rows_with_their_moments_and_leaves_nets_alone(name):
     moments = first_moments(tx, slopes, params)
     rows = jnp.asarray([5, 0, 0, 2, 1, 0, 0, 0])
     fresh = jnp.asarray([0, 0, 1, 0, 0, 0, 0, 0], bool)
-    dead = jnp.arange(8) >= 5
+    inactive = jnp.arange(8) >= 5
     taken, moved = jax.jit(optimiser.gather_rows, static_argnums=0)(
-        tx, params, moments, rows, fresh, dead
+        tx, params, moments, rows, fresh, inactive
     )
     np.testing.assert_array_equal(
         taken.rows["embedding"], params.rows["embedding"][rows]
     )
-    assert (taken.rows["splats"].opacity_logit[5:] == DEAD_LOGIT).all()
+    assert (taken.rows["splats"].opacity_logit[5:] == INACTIVE_LOGIT).all()
     np.testing.assert_array_equal(taken.nets["w"], params.nets["w"])
 
     by_kind = moved[1].inner_states

@@ -76,7 +76,7 @@ def test_footprints_equal_the_textbook_with_skew_aspect_and_offset(spec, dtype, 
         mean_px, covariance, depth, opacity = textbook(exact, exact_camera, spec)
     drawn = (np.asarray(depth) > 0.02) & (np.asarray(opacity) > 1.01 / 255)
     np.testing.assert_array_equal(np.asarray(found.visible)[drawn], True)
-    dilated = np.asarray(covariance) + spec.dilation_px2 * np.eye(2)
+    dilated = np.asarray(covariance) + spec.eps2d * np.eye(2)
     size = np.trace(dilated, axis1=1, axis2=2)[:, None, None]
     # Relative: depths down to 0.02 magnify the rounding of x - c in float32.
     tolerance = {"float32": 2e-4, "float64": 1e-12}[dtype]
