@@ -198,7 +198,7 @@ DRAWABLE = {
     "flat and edge-on": dict(scale=(0.0, 1.0, 1.0)),
     "a point": dict(scale=(0.0, 0.0, 0.0)),
     "tiny quaternion": dict(quaternion=(1e-25, 0, 0, 1e-25)),
-    "long quaternion": dict(quaternion=(1e25, 0, 0, 1e25)),
+    "long quaternion": dict(quaternion=(3e38, 0, 0, 3e38)),
     "opaque": dict(opacity=1.0),
 }
 
