@@ -108,8 +108,9 @@ def _longest(b2):
 
 
 # x coth x - 1 as a series in x^2 with radius pi^2; ten terms leave 1e-17 at x = 1/2.
+# Python's floats: NumPy's make float64 of float32 where x64 is on.
 _COTH = tuple(
-    2 * (-1) ** (n + 1) * scipy.special.zeta(2 * n) / math.pi ** (2 * n)
+    float(2 * (-1) ** (n + 1) * scipy.special.zeta(2 * n) / math.pi ** (2 * n))
     for n in range(1, 11)
 )
 

@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float
 from gaussians_jax.raster_spec import RasterSpec
 from gaussians_jax.splats import Gaussians, refuse_half
 from nerfies_jax.geometry.camera import Camera
+from nerfies_jax.geometry.precision import near_one
 
 # gsplat's MIN_COMPENSATION, squared: the antialiased opacity factor is at least 0.005.
 MIN_COMPENSATION_SQ = 0.005**2
@@ -74,7 +75,8 @@ def _project_one(mean, quaternion, scale, opacity, camera, size, spec):
     )
     for part in (offset, quaternion, scale):
         drawn &= jnp.all(jnp.isfinite(part))
-    drawn &= jnp.any(quaternion != 0) & jnp.isfinite(opacity)
+    tiny = jnp.finfo(quaternion.dtype).tiny
+    drawn &= (jnp.max(jnp.abs(quaternion)) >= tiny) & jnp.isfinite(opacity)
 
     # `where` differentiates both branches: what is not drawn becomes a unit sphere one
     # unit ahead before anything is divided.
@@ -145,10 +147,8 @@ def _clamp_tangent(tangent, focal, centre, pixels, spec):
 
 def _footprint_rows(rows, quaternion, scale):
     """The two rows of T = J W R diag(scale), as component lists."""
-    # Scaling by the largest component keeps 1e-30 and 1e30 apart from 0 and infinity;
-    # a rotation does not depend on the length, so the scale carries no gradient.
-    largest = lax.stop_gradient(jnp.max(jnp.abs(quaternion)))
-    w, x, y, z = quaternion / largest
+    # keeps lengths of 1e-30 and 3e38 apart from 0 and infinity
+    w, x, y, z = near_one(quaternion)[0]
     double = 2 / (w * w + x * x + y * y + z * z)
     columns = (
         (

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from gaussians_jax import splats
 from gaussians_jax.effects.blocks import in_blocks
 from gaussians_jax.splats import Gaussians, Params
+from nerfies_jax.geometry import quaternion
 from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import HeadSpec, MLPSpec
@@ -196,11 +197,7 @@ def apply(gaussians: Gaussians, offsets: Offsets, scale_rule: str) -> Gaussians:
     The rotation is q / |q| + offset, which the renderer normalises; a zero quaternion
     counts as the identity.
     """
-    length_sq = jnp.sum(gaussians.quaternion**2, axis=-1, keepdims=True)
-    usable = (length_sq > 4 * jnp.finfo(length_sq.dtype).tiny) & (length_sq < jnp.inf)
-    identity = jnp.asarray([1, 0, 0, 0], gaussians.quaternion.dtype)
-    unit = gaussians.quaternion / jnp.sqrt(jnp.where(usable, length_sq, 1))
-    unit = jnp.where(usable, unit, identity)
+    unit = jax.vmap(quaternion.normalise)(gaussians.quaternion)
     if scale_rule == "log":
         # Bounded like the canonical logarithm, so that a wild field stays finite.
         factor = jnp.exp(jnp.clip(offsets.scale, *splats.LOG_SCALE_RANGE))

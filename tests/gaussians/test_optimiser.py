@@ -307,6 +307,16 @@ def test_a_slope_too_large_to_square_shows_and_spares_the_others(name, slope, dt
 
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("name", PAIRS)
+def test_float32_stays_float32_where_x64_is_on(name):
+    """NumPy's float64 among the coefficients would make the updates float64."""
+    rule, slopes = PAIRS[name][0](), {"w": jnp.ones((3, 2), jnp.float32)}
+    with jax.enable_x64(True):
+        shapes = jax.eval_shape(rule.update, slopes, jax.eval_shape(rule.init, slopes))
+    kinds = {leaf.dtype.name for leaf in jax.tree.leaves(shapes)}
+    assert kinds == {"float32", "int32"}
+
+
+@pytest.mark.parametrize("name", PAIRS)
 @pytest.mark.parametrize("narrow", [jnp.bfloat16, jnp.float16])
 def test_parameters_that_small_steps_would_not_move_are_refused(name, narrow):
     """In bfloat16, 200 steps of 1e-3 leave a parameter of one where it was."""

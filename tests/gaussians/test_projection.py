@@ -175,7 +175,7 @@ HOPELESS = {
     "infinite scale": dict(scale=(float("inf"), 1, 1)),
     "scale beyond WIDEST_PX": dict(scale=(1e18, 1, 1)),
     "nan opacity": dict(opacity=float("nan")),
-    "faint": dict(opacity=0.0039),
+    "faint": dict(opacity=0.003915),  # between 1/256 and 1/255, where it is cut
 }
 
 
@@ -198,8 +198,9 @@ DRAWABLE = {
     "flat and edge-on": dict(scale=(0.0, 1.0, 1.0)),
     "a point": dict(scale=(0.0, 0.0, 0.0)),
     "tiny quaternion": dict(quaternion=(1e-25, 0, 0, 1e-25)),
-    "long quaternion": dict(quaternion=(1e25, 0, 0, 1e25)),
+    "long quaternion": dict(quaternion=(3e38, 0, 0, 3e38)),
     "opaque": dict(opacity=1.0),
+    "barely there": dict(opacity=0.00393),  # between 1/255 and 1/254
 }
 
 
