@@ -177,8 +177,8 @@ def read_settings(folder: pathlib.Path) -> Settings:
     if not path.is_file():
         raise ValueError(
             f"{folder}: no run here (there is no {CONFIG}); name the folder that "
-            "experiments.reconstruct printed, or start the run, which cannot have "
-            "begun, without --resume"
+            "experiments.reconstruct printed; a run that was killed before it had one "
+            "is started again, without --resume"
         )
     try:
         stored = json.loads(path.read_text())
