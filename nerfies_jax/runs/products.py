@@ -251,10 +251,9 @@ def _next(folder, run, outcome):
     if outcome.result.steps < run.spec.steps:
         line = f"python -m experiments.reconstruct --out {folder} --resume"
         return [*commands, report.Command("Train it to the end:", line)]
-    capture = "" if run.config.capture is None else f" {run.config.capture}"
     line = (
-        f"python -m experiments.reconstruct{capture} --preset {run.config.preset} "
-        f"--steps {2 * run.spec.steps}"
+        f"python -m experiments.reconstruct {run.config.source.words} "
+        f"--preset {run.config.preset} --steps {2 * run.spec.steps}"
     )
     return [*commands, report.Command("Train it twice as long:", line)]
 
