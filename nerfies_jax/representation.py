@@ -57,7 +57,7 @@ RADIANCE = Representation(
     variant=variants.without_effects,
     score_halves=held_out_codes.score,
     fitted_rays=held_out_codes.RAYS * held_out_codes.EVALUATIONS,
-    save=lambda *_: Saved(),  # the checkpoint holds all there is
+    save=lambda *_, **__: Saved(),  # the checkpoint holds all there is
     follow=point_tracks.follow,
     advise=advise,
     # Motion brings the elastic penalty along.
