@@ -253,7 +253,7 @@ def last_bits(folder):
 @pytest.mark.slow
 @pytest.mark.parametrize("left", ["no state", "all steps"])
 def test_a_killed_run_resumes_to_the_same_bits(left, run, tmp_path, capsys):
-    """Before its first checkpoint, in the middle of writing that, and after the last."""
+    """In the middle of writing its first checkpoint, and after the last."""
     folder = tmp_path / "killed"
     shutil.copytree(run, folder)
     saved = folder / CHECKPOINTS
