@@ -28,7 +28,7 @@ from nerfies_jax.radiance import compositing, sampling, template
 from nerfies_jax.radiance.template import Template, TemplateSpec
 from nerfies_jax.training import losses
 
-TEMPLATE = TemplateSpec(position=EncodingSpec(8))
+TEMPLATE = TemplateSpec(position=EncodingSpec(8), skips=(4,))
 WARP = WarpSpec(anneal_steps=32)
 STEP = 17  # of 32 for 8 bands: alpha is 4.25
 ELASTIC = ElasticSpec(points=None, scaling="official", fold_cost=0.0)
