@@ -13,7 +13,7 @@ machine may be shared.
 import dataclasses
 import pathlib
 
-from experiments import cli
+from experiments import cli, markdown
 from nerfies_jax.runs import platform
 
 RAYS = 256
@@ -153,6 +153,31 @@ def table(figures: dict[str, dict[str, float]]) -> str:
             f"{row['compile_seconds']:9.1f}"
         )
     return "\n".join(lines)
+
+
+def page(stored) -> str:
+    """The page in docs/results below the docstring, from what `--out` wrote."""
+    figures = stored["rows"]
+    base = figures.get("warp", next(iter(figures.values())))["cpu_seconds"]
+    rows = []
+    for name, row in figures.items():
+        ratio, flop, memory = OFFICIAL.get(name, (None, None, None))
+        rows.append(
+            [
+                name,
+                markdown.number(row["cpu_seconds"], 2),
+                markdown.number(row["cpu_seconds"] / base, 2),
+                markdown.number(ratio, 2),
+                markdown.number(row["gflop"], 1),
+                markdown.number(flop, 1),
+                markdown.number(row["temporary_mib"], 0),
+                markdown.number(memory, 0),
+                markdown.number(row["compile_seconds"], 1),
+            ]
+        )
+    heads = ("scene", "CPU s", "over warp", "official", "GFLOP", "official")
+    heads += ("MiB", "official", "compile s")
+    return markdown.table(heads, rows)
 
 
 if __name__ == "__main__":

@@ -39,6 +39,7 @@ def test_the_table_holds_solvers_against_the_best_known_code(tmp_path, capsys):
     assert len(record["rows"]) == len(rows)
     assert record["about"]["pixels"] == 6
     assert record["rows"][0]["solver"] in capsys.readouterr().out
+    assert f"| adam | 8 | {by['adam', 8].steps:.0f} |" in solver_table.page(record)
 
 
 def test_held_out_pictures_are_not_among_the_known_ones():
