@@ -137,9 +137,9 @@ def trained(spec, capture, seed):
     from nerfies_jax import evaluation, scene
     from nerfies_jax.training import loop
 
-    model = scene.build(spec, scene.facts_of(capture, spec))
+    model = scene.build(spec, scene.metadata_of(capture, spec))
     state = model.init(capture, jax.random.key(seed))
-    frames = evaluation.frames_of(capture, model.wants)
+    frames = evaluation.frames_of(capture, model.required_data)
     result = loop.fit(model, state, frames, steps=spec.steps)
     if result.steps < spec.steps:
         raise ValueError(f"training ended early: {result.message}")

@@ -21,6 +21,7 @@ from gaussians_jax import optimiser as row_optimiser
 from gaussians_jax import splats
 from gaussians_jax.splats import Params, Splats
 from nerfies_jax.geometry import quaternion
+from nerfies_jax.training.step_counts import steps
 
 PyTree = Any
 FAINT_LOGIT = -20.0  # below it an opacity is halved by its series
@@ -32,15 +33,16 @@ class DensitySpec:
     """When and where Gaussians are added and removed."""
 
     interval: int = 100  # steps
-    start: int = 500  # steps
-    stop: int = 15_000  # steps
+    start: int = steps(500)
+    stop: int = steps(15_000)
     gradient: float = 2e-4  # of the mean on the screen, in NDC units per view
     clone_below: float = 0.01  # largest scale, of the scene extent
     shrink: float = 1.6  # scale of a parent over that of its children
     prune_opacity: float = 0.005
     prune_scale: float = 0.1  # largest scale, of the scene extent
     prune_radius_px: float | None = None  # 20 in the paper, where it had no effect
-    reset_interval: int = 3000  # steps; pruning by size starts after the first reset
+    # Pruning by size starts after the first reset.
+    reset_interval: int = steps(3000)
     reset_opacity: float = 0.01
     most: int = 1_000_000  # Gaussians
     revised_opacity: bool = False  # two halves together as opaque as the parent

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Int
 
 from gaussians_jax.splats import Params
 from nerfies_jax.training.schedules import Schedule
+from nerfies_jax.training.step_counts import steps
 
 PyTree = Any
 SHARED = "shared"  # marks what mirrors no parameter in an optimiser's state
@@ -30,8 +31,8 @@ class AlternationSpec:
     and the annealing of the positions.
     """
 
-    start: int  # step
-    stop: int  # the first step in which everything trains again
+    start: int = steps()  # step
+    stop: int = steps()  # the first step in which everything trains again
     nets: int = 2  # steps of a cycle
     rows: int = 1  # steps of a cycle
 
@@ -58,7 +59,7 @@ class AnnealingSpec:
     share of the run (3/4 here). `annealed` has the rate.
     """
 
-    after: int  # step
+    after: int = steps()  # step
     decay: float = 5.0  # the rate would fall to exp(-decay) by the end of the run
     freeze_share: float = 0.05  # of the whole run: its last steps, with a rate of zero
 

@@ -20,6 +20,7 @@ from gaussians_jax.rates import RateSpec
 from gaussians_jax.spec import SplatScene
 from gaussians_jax.start import StartSpec
 from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.training import step_counts
 
 # Kerbl et al. 2023, arXiv:2308.04079: every other number is a default of its spec.
 STATIC = SplatScene(steps=30_000)
@@ -153,40 +154,9 @@ PRESETS = {
 }
 
 
-# The fields of each part that count steps.
-STEP_FIELDS = {
-    "density": ("start", "stop", "reset_interval"),
-    "motion": ("warm_up",),
-    "alternation": ("start", "stop"),
-    "annealing": ("after",),
-    "acceleration": ("start",),
-    "neighbours": ("start",),
-    "motion_growth": ("start",),
-    "spectral": ("after",),
-}
-
-
 def with_steps(spec: SplatScene, steps: int) -> SplatScene:
     """The same scene over another number of steps, its schedules in proportion."""
     if steps < 1:
         raise ValueError(f"steps={steps}: train for at least one step")
-    share = steps / spec.steps
-
-    def scaled(count):
-        return max(1, round(count * share)) if count else 0
-
-    def stretched(part, names):
-        return dataclasses.replace(part, **{n: scaled(getattr(part, n)) for n in names})
-
-    parts = {
-        name: stretched(getattr(spec, name), counted)
-        for name, counted in STEP_FIELDS.items()
-        if getattr(spec, name) is not None
-    }
-    smoothing = getattr(parts.get("motion"), "smoothing", None)
-    if smoothing is not None:
-        smoothing = stretched(smoothing, ("steps",))
-        parts["motion"] = dataclasses.replace(parts["motion"], smoothing=smoothing)
-    return dataclasses.replace(
-        spec, steps=steps, sh_every=scaled(spec.sh_every), **parts
-    )
+    in_proportion = step_counts.stretched(spec, steps / spec.steps)
+    return dataclasses.replace(in_proportion, steps=steps)

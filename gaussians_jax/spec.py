@@ -15,7 +15,6 @@ from gaussians_jax.effects import (
 )
 from gaussians_jax.effects.acceleration import AccelerationSpec
 from gaussians_jax.effects.depth import DepthSpec
-from gaussians_jax.effects.effect import Effect
 from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec
 from gaussians_jax.effects.motion_basis import BasisMotionSpec
@@ -27,6 +26,8 @@ from gaussians_jax.phases import AlternationSpec, AnnealingSpec
 from gaussians_jax.raster_spec import RasterSpec
 from gaussians_jax.rates import RateSpec
 from gaussians_jax.start import StartSpec
+from nerfies_jax.training.effects import Effect
+from nerfies_jax.training.step_counts import steps
 
 OPTIMISERS = {"adam": scale_by_row_adam, "radam": scale_by_row_radam}
 
@@ -38,7 +39,7 @@ class SplatScene:
     steps: int
     start: StartSpec = StartSpec()
     sh_degree: int = 3
-    sh_every: int = 1000  # steps between one degree and the next
+    sh_every: int = steps(1000)  # steps between one degree and the next
     dssim_weight: float = 0.2
     rates: RateSpec = RateSpec()
     raster: RasterSpec = RasterSpec()
@@ -68,7 +69,7 @@ class SplatScene:
 
 
 @dataclasses.dataclass(frozen=True)
-class Facts:
+class SceneMetadata:
     """What a scene must know of its capture before anything is compiled."""
 
     extent: float  # scene units: how far the cameras spread
@@ -115,21 +116,21 @@ MOTIONS = {
 }
 
 
-def effects_of(spec: SplatScene, facts: Facts) -> tuple[Effect, ...]:
+def effects_of(spec: SplatScene, metadata: SceneMetadata) -> tuple[Effect, ...]:
     """The effects that the spec asks for, in the order in which they act."""
     effects = []
     if spec.motion is not None:
         move = MOTIONS[type(spec.motion)]
-        effects.append(move(spec.motion, spec.steps, facts.frames))
+        effects.append(move(spec.motion, spec.steps, metadata.frames))
     if spec.acceleration is not None:
         effects.append(
-            acceleration.effect(spec.acceleration, facts.extent, facts.frames)
+            acceleration.effect(spec.acceleration, metadata.extent, metadata.frames)
         )
     if spec.neighbours is not None:
         of = kan_motion.NAME  # the only rows that are an embedding
-        effects.append(neighbours.effect(spec.neighbours, facts.extent, of))
+        effects.append(neighbours.effect(spec.neighbours, metadata.extent, of))
     if spec.motion_growth is not None:
-        effects.append(motion_growth.effect(spec.motion_growth, facts.extent))
+        effects.append(motion_growth.effect(spec.motion_growth, metadata.extent))
     if spec.spectral is not None:
         effects.append(spectral.effect(spec.spectral, spec.steps))
     if spec.depth is not None:

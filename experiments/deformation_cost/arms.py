@@ -10,11 +10,11 @@ import numpy as np
 
 from gaussians_jax import splats, still_rows, time_knots
 from gaussians_jax.effects import deformation, kan_motion, mlp_motion, motion_basis
-from gaussians_jax.effects.effect import Effect
 from gaussians_jax.effects.kan_motion import SMALL_KAN_MOTION, KanMotionSpec
 from gaussians_jax.effects.mlp_motion import SMALL_MOTION, MotionSpec
 from gaussians_jax.effects.motion_basis import SMALL_BASIS_MOTION, BasisMotionSpec
 from gaussians_jax.splats import Params
+from nerfies_jax.training.effects import Effect
 
 UNROLLED = 4  # kernels that a KAN's loop sums in one turn
 FRAMES = 100  # of the capture whose motion it would be
@@ -107,8 +107,8 @@ def with_effect(params: Params, effect: Effect) -> Params:
     rows, nets = dict(params.rows), dict(params.nets)
     if effect.init_rows is not None:
         rows[effect.name] = effect.init_rows(rows_key, params.rows["splats"])
-    if effect.init_nets is not None:
-        nets[effect.name] = effect.init_nets(nets_key)
+    if effect.init is not None:
+        nets[effect.name] = effect.init(nets_key)
     return Params(rows, nets)
 
 

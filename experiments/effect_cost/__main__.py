@@ -240,11 +240,11 @@ def _compile(representation, capture, spec, at):
     from nerfies_jax import evaluation
     from nerfies_jax.measure import clock, matrix_flops
 
-    facts = representation.facts_of(capture, spec)
+    facts = representation.metadata_of(capture, spec)
     model = representation.build(spec, facts)
     state = model.init(capture, jax.random.key(0))
     state = state._replace(step=jnp.asarray(round(at * spec.steps), jnp.int32))
-    frames = evaluation.frames_of(capture, model.wants)
+    frames = evaluation.frames_of(capture, model.required_data)
 
     def loss(state, frames):
         # The compiler drops the slopes and the update, which nothing reads.

@@ -147,7 +147,7 @@ class Trial:
         spec = self._job.spec(name, self.asked.steps)
         representation = representations.of_preset(self._job.suite.arms[name].preset)
         try:
-            facts = representation.facts_of(self._job.capture, spec)
+            facts = representation.metadata_of(self._job.capture, spec)
             representation.build(spec, facts)
         except ValueError as error:
             return name, str(error)

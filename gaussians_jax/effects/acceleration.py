@@ -15,7 +15,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from gaussians_jax import splats
-from gaussians_jax.effects.effect import Around, Effect, Term
+from nerfies_jax.training.effects import Effect, PenaltyContext, Term
+from nerfies_jax.training.step_counts import steps
 
 NAME = "acceleration"
 _STREAM = zlib.crc32(NAME.encode()) >> 1  # of the step's key, for the choice of rows
@@ -37,7 +38,7 @@ class AccelerationSpec:
     drift: float = 1.0
     interval: float = 1.0  # between the times compared, in frames
     samples: int = 1024  # Gaussians drawn in a step
-    start: int = 0  # steps before which it is not evaluated
+    start: int = steps(0)  # steps before which it is not evaluated
 
     def __post_init__(self):
         for name in ("weight", "drift"):
@@ -119,17 +120,17 @@ def effect(spec: AccelerationSpec, extent: float, frames: int) -> Effect:
     interval = spec.interval / (frames - 1)
     decay = spec.decay * extent
 
-    def penalty(around: Around) -> Term:
-        params, moment = around.params, around.moment
+    def penalty(_, context: PenaltyContext) -> dict[str, Term]:
+        params, condition = context.params, context.condition
         alive = splats.alive(params.rows["splats"])
-        key = jax.random.fold_in(moment.key, _STREAM)
+        key = jax.random.fold_in(condition.key, _STREAM)
         rows = draw_living(key, alive, min(spec.samples, alive.shape[0]))
 
         def evaluate(params):
             some = splats.take_rows(params, rows)
             canonical = some.rows["splats"].mean
-            times = instants(moment.time, interval)
-            before, now, after = (around.at_time(some, t).mean for t in times)
+            times = instants(condition.time, interval)
+            before, now, after = (context.at_time(some, t).mean for t in times)
             value = unrest(canonical, before, now, after, decay, spec.drift)
             still = jnp.mean(_stillness(canonical, now, decay))
             there = jnp.any(alive)
@@ -143,8 +144,8 @@ def effect(spec: AccelerationSpec, extent: float, frames: int) -> Effect:
             value, still = evaluate(params)
         else:
             value, still = jax.lax.cond(
-                moment.step < spec.start, nothing, evaluate, params
+                condition.step < spec.start, nothing, evaluate, params
             )
-        return Term(spec.weight * value, {"unrest": value, "still": still})
+        return {"unrest": Term(value, spec.weight), "still": Term(still, None)}
 
     return Effect(name=NAME, penalty=penalty)

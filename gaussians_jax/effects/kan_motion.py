@@ -20,13 +20,14 @@ from jaxtyping import Array, Bool, Float, Key
 
 from gaussians_jax import splats
 from gaussians_jax.effects.blocks import in_blocks
-from gaussians_jax.effects.effect import Effect, Moment
 from gaussians_jax.splats import Gaussians, Params
 from nerfies_jax.geometry import quaternion
 from nerfies_jax.nets import codes, kan, mlp
 from nerfies_jax.nets.kan import KAN, KANSpec
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
+from nerfies_jax.training.effects import Effect, FrameCondition
+from nerfies_jax.training.step_counts import steps
 
 NAME = "kan_motion"
 NETWORKS = ("kan", "mlp")
@@ -61,7 +62,7 @@ class KanMotionSpec:
     position: bool = True
     scale: bool = True
     rotation: bool = True
-    warm_up: int = 0  # steps without motion
+    warm_up: int = steps(0)  # steps without motion
     embedding_rate: float = 2.5e-3
     rate: float = 1.6e-4  # of network and time codes
     rate_end: float = 1.6e-5
@@ -327,7 +328,7 @@ def effect(spec: KanMotionSpec, steps: int, frames: int) -> Effect:
     def init_rows(key, rows):
         return init_embedding(key, spec, rows.mean)
 
-    def init_nets(key):
+    def init_networks(key):
         return init(key, spec, frames)
 
     def embedding_rate(step):
@@ -340,19 +341,19 @@ def effect(spec: KanMotionSpec, steps: int, frames: int) -> Effect:
     def moved(
         params: Params,
         gaussians: Gaussians,
-        moment: Moment,
+        condition: FrameCondition,
         ready: Float[Array, "gaussians features"],
     ) -> Gaussians:
         living = splats.alive(params.rows["splats"])
-        offsets = deform(params.nets[NAME], spec, moment.time, ready, living)
+        offsets = deform(params.nets[NAME], spec, condition.time, ready, living)
         return apply(gaussians, offsets)
 
     return Effect(
         name=NAME,
         init_rows=init_rows,
-        init_nets=init_nets,
-        row_rate=embedding_rate,
-        net_rate=schedules.log_linear(spec.rate, spec.rate_end, steps),
+        init=init_networks,
+        row_learning_rate=embedding_rate,
+        learning_rate=schedules.log_linear(spec.rate, spec.rate_end, steps),
         warm_up=spec.warm_up,
         prepare=prepared,
         deform=moved,

@@ -15,12 +15,13 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from gaussians_jax import splats
 from gaussians_jax.effects.blocks import in_blocks
-from gaussians_jax.effects.effect import Effect, Moment
 from gaussians_jax.splats import Gaussians, Params
 from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
+from nerfies_jax.training.effects import Effect, FrameCondition
+from nerfies_jax.training.step_counts import steps
 
 NAME = "mlp_motion"
 SCALE_RULES = ("log", "linear")
@@ -35,7 +36,7 @@ class SmoothingSpec:
     """
 
     first: float = 0.1
-    steps: int = 20_000
+    steps: int = steps(20_000)
 
     def __post_init__(self):
         if not (self.first >= 0 and self.steps >= 1):
@@ -62,7 +63,7 @@ class MotionSpec:
     width: int = 256
     skips: tuple[int, ...] = (5,)  # layers that read the input again
     scale_rule: str = "log"
-    warm_up: int = 3000  # steps without motion
+    warm_up: int = steps(3000)  # steps without motion
     smoothing: SmoothingSpec | None = SmoothingSpec()
     rate: float = 8e-4
     rate_end: float = 1.6e-6
@@ -236,14 +237,16 @@ def smooth_time(
 def effect(spec: MotionSpec, steps: int, frames: int) -> Effect:
     """The seams that this motion fills, for a run of `steps` over `frames`."""
 
-    def init_nets(key):
+    def init_networks(key):
         return init(key, spec)
 
-    def moved(params: Params, gaussians: Gaussians, moment: Moment, _) -> Gaussians:
-        time = moment.time
-        if spec.smoothing is not None and moment.step is not None:
-            key = jax.random.fold_in(moment.key, _STREAM)
-            time = smooth_time(key, spec.smoothing, time, moment.step, frames)
+    def moved(
+        params: Params, gaussians: Gaussians, condition: FrameCondition, _
+    ) -> Gaussians:
+        time = condition.time
+        if spec.smoothing is not None and condition.step is not None:
+            key = jax.random.fold_in(condition.key, _STREAM)
+            time = smooth_time(key, spec.smoothing, time, condition.step, frames)
         living = splats.alive(params.rows["splats"])
         motion = params.nets[NAME]
         offsets = deform(motion, spec, gaussians.mean, time, living)
@@ -251,8 +254,8 @@ def effect(spec: MotionSpec, steps: int, frames: int) -> Effect:
 
     return Effect(
         name=NAME,
-        init_nets=init_nets,
-        net_rate=schedules.log_linear(spec.rate, spec.rate_end, steps),
+        init=init_networks,
+        learning_rate=schedules.log_linear(spec.rate, spec.rate_end, steps),
         warm_up=spec.warm_up,
         deform=moved,
     )

@@ -17,8 +17,9 @@ import scipy.spatial
 from jaxtyping import Array, Bool, Float, Int
 
 from gaussians_jax import splats
-from gaussians_jax.effects.effect import Around, Effect, Term
 from gaussians_jax.splats import Params
+from nerfies_jax.training.effects import Effect, PenaltyContext, Term
+from nerfies_jax.training.step_counts import steps
 
 NAME = "neighbours"
 SCALES = ("spacing", "extent", "units")
@@ -49,7 +50,7 @@ class NeighbourSpec:
     gamma: float = 2000.0
     weight: float = 1.0
     scale: str = "spacing"
-    start: int = 0  # steps before which it is not evaluated
+    start: int = steps(0)  # steps before which it is not evaluated
 
     def __post_init__(self):
         if self.count < 1 or self.start < 0:
@@ -154,7 +155,7 @@ def inconsistency(
 def effect(spec: NeighbourSpec, extent: float, of: str) -> Effect:
     """The seams of the penalty on `params.rows[of]`, [gaussians, width]."""
 
-    def carry(params: Params) -> Neighbours:
+    def state(params: Params) -> Neighbours:
         if of not in params.rows:
             raise ValueError(
                 f"there are no rows {of!r} whose neighbours could be alike, only "
@@ -162,23 +163,26 @@ def effect(spec: NeighbourSpec, extent: float, of: str) -> Effect:
             )
         return find(spec, params, extent)
 
-    def penalty(around: Around) -> Term:
-        alive = splats.alive(around.params.rows["splats"])
-        graph = around.carried
+    def penalty(_, context: PenaltyContext) -> dict[str, Term]:
+        alive = splats.alive(context.params.rows["splats"])
+        graph = context.state
 
         def evaluate(embedding):
-            return spec.weight * inconsistency(embedding, graph, alive)
+            return inconsistency(embedding, graph, alive)
 
-        value = _from_step(spec.start, around, evaluate, around.params.rows[of])
+        value = _from_step(spec.start, context.step, evaluate, context.params.rows[of])
         linked = jnp.mean((graph.weight > LINKED).astype(value.dtype), axis=1)
         living = jnp.maximum(jnp.sum(alive), 1).astype(value.dtype)
         # Dead rows have no weight and so are not counted.
-        return Term(value, {"linked": jnp.sum(linked) / living})
+        return {
+            "inconsistency": Term(value, spec.weight),
+            "linked": Term(jnp.sum(linked) / living, None),
+        }
 
-    return Effect(name=NAME, carry=carry, penalty=penalty)
+    return Effect(name=NAME, state=state, penalty=penalty)
 
 
-def _from_step(start, around, evaluate, embedding):
+def _from_step(start, step, evaluate, embedding):
     """`evaluate(embedding)`, or zero in the steps before `start`."""
     if start == 0:
         return evaluate(embedding)
@@ -186,4 +190,4 @@ def _from_step(start, around, evaluate, embedding):
     def nothing(embedding):
         return jnp.zeros((), embedding.dtype)
 
-    return jax.lax.cond(around.moment.step < start, nothing, evaluate, embedding)
+    return jax.lax.cond(step < start, nothing, evaluate, embedding)

@@ -52,7 +52,7 @@ class Representation(NamedTuple):
     spec_type: type
     presets: dict[str, Spec]
     with_steps: Callable[[Spec, int], Spec]  # schedules stretch with the steps
-    facts_of: Callable[[Capture, Spec], Any]
+    metadata_of: Callable[[Capture, Spec], Any]
     build: Callable[..., Model]  # (spec, facts) -> model
     first_bytes: Callable[[Spec, Capture], int]  # of the first state and step
     lighter: str  # which settings make the first state smaller

@@ -55,7 +55,7 @@ def make(folder: pathlib.Path, run: Run, outcome: Outcome, began: float) -> None
     film = save_film(folder / "scene.mp4", run, renderer, state, ms_per_frame / 1e3)
     save_depth(folder / "depth", run.capture, scored)
     saved = run.representation.save(folder, run.spec, run.facts, state)
-    frames = evaluation.frames_of(run.capture, run.model.wants)
+    frames = evaluation.frames_of(run.capture, run.model.required_data)
     fitted, gain = score_halves(run, state, scored, ms_per_frame / 1e3)
     metrics = [*measured(run, outcome, scored, ms_per_frame, began), *fitted]
     metrics += model_size(saved)

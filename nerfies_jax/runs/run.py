@@ -47,7 +47,7 @@ def open_run(
 ) -> Run:
     """Read the capture and build the model."""
     capture = pinholes.as_pinholes(stored or stored_capture(config.source, config.seed))
-    facts = representation.facts_of(capture, spec)
+    facts = representation.metadata_of(capture, spec)
     model = representation.build(spec, facts)
     return Run(config, capture, representation, spec, facts, model)
 

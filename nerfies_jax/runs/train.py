@@ -57,7 +57,7 @@ def train(
         result = loop.fit(
             run.model,
             state,
-            evaluation.frames_of(run.capture, run.model.wants),
+            evaluation.frames_of(run.capture, run.model.required_data),
             steps=run.spec.steps,
             hooks=hooks if len(few) else [],
             seconds=seconds,

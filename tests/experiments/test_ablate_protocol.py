@@ -14,11 +14,11 @@ from gaussians_jax import scene as splat_scene
 from gaussians_jax.splats import Gaussians, Params, Splats, bury
 from nerfies_jax import scene
 from nerfies_jax.capture import synthetic
-from nerfies_jax.effects.effect import Effect
 from nerfies_jax.evaluation import protocol
 from nerfies_jax.evaluation.protocol import EXACT, Followed
 from nerfies_jax.measure import geometry_quality
 from nerfies_jax.runs import representations
+from nerfies_jax.training.effects import Effect
 from nerfies_jax.training.model import Rendering, Stages
 from tests import scenes
 
@@ -121,7 +121,7 @@ def test_points_are_followed_through_a_warp_in_closed_form(
 ):
     """x + d(x) = x / s(t) - v t: a point is scaled by s and moved, in field units."""
     capture, _, known = filmed
-    facts = types.SimpleNamespace(centre=(0.1, -0.2, 0.3), scale=4.0)
+    metadata = types.SimpleNamespace(centre=(0.1, -0.2, 0.3), scale=4.0)
     times = capture.times[known.moments]
     velocity = jnp.asarray([0.3, 0.1, -0.2])
 
@@ -136,15 +136,15 @@ def test_points_are_followed_through_a_warp_in_closed_form(
         codes_at=lambda params, view: {},
         displace=displace,
     )
-    monkeypatch.setattr(scene, "field", lambda spec, facts: made)
+    monkeypatch.setattr(scene, "field", lambda spec, metadata: made)
     state = types.SimpleNamespace(params=velocity, step=jnp.int32(5))
-    followed = protocol.follow_fields(None, facts, state, capture, known)
+    followed = protocol.follow_fields(None, metadata, state, capture, known)
 
-    start = 4.0 * (known.path[:, 3] - np.float32(facts.centre))
+    start = 4.0 * (known.path[:, 3] - np.float32(metadata.centre))
     template = start / (1 + times[3]) - np.asarray(velocity) * times[3]
     for column, time in enumerate(times):
         place = (template + np.asarray(velocity) * time) * (1 + time)
-        place = place / 4.0 + np.float32(facts.centre)
+        place = place / 4.0 + np.float32(metadata.centre)
         if column == lost_at:
             place = known.path[:, 3]
         np.testing.assert_allclose(followed.path[:, column], place, atol=3e-6)
@@ -152,7 +152,7 @@ def test_points_are_followed_through_a_warp_in_closed_form(
     if lost_at is None:
         stretch = np.sqrt(np.mean(3 * np.log(1 / (1 + times)) ** 2))
         assert followed.strain == pytest.approx(stretch, rel=1e-4)
-        still = 4.0 * (capture.points.position - np.float32(facts.centre))
+        still = 4.0 * (capture.points.position - np.float32(metadata.centre))
         moved = still / (1 + times[:, None, None]) - still
         moved = moved - np.asarray(velocity) * times[:, None, None]
         drift = np.linalg.norm(moved - moved.mean(0), axis=-1).mean() / 4.0
@@ -163,8 +163,8 @@ def test_a_field_without_a_warp_follows_nothing(filmed):
     capture, _, known = filmed
     kind = representations.of_preset("t-nerf-small")
     spec = kind.presets["t-nerf-small"]
-    facts = kind.facts_of(capture, spec)
-    assert protocol.follow_fields(spec, facts, None, capture, known) is None
+    metadata = kind.metadata_of(capture, spec)
+    assert protocol.follow_fields(spec, metadata, None, capture, known) is None
 
 
 def test_the_picture_shows_how_far_points_are_from_where_they_should_be(filmed):
@@ -319,13 +319,13 @@ def test_the_weights_of_neighbours_are_a_slow_sum(rng):
 
 def test_splats_without_motion_follow_nothing_and_untrained_motion_stays(filmed):
     capture, _, known = filmed
-    facts = splat_scene.facts_of(capture)
-    still = protocol.follow_splats(scenes.TINY_SPLATS, facts, None, capture, known)
+    metadata = splat_scene.metadata_of(capture)
+    still = protocol.follow_splats(scenes.TINY_SPLATS, metadata, None, capture, known)
     assert still is None
-    model = splat_scene.build(scenes.TINY_DEFORMABLE, facts)
+    model = splat_scene.build(scenes.TINY_DEFORMABLE, metadata)
     state = model.init(capture, jax.random.key(0))
     followed = protocol.follow_splats(
-        scenes.TINY_DEFORMABLE, facts, state, capture, known
+        scenes.TINY_DEFORMABLE, metadata, state, capture, known
     )
     assert followed.path.shape == known.path.shape
     errors = geometry_quality.track_errors(

@@ -13,9 +13,9 @@ from experiments.effect_cost.__main__ import Arm, EffectCost, Priced, Row
 from gaussians_jax import presets as splat_presets
 from nerfies_jax import presets as field_presets
 from nerfies_jax import scene
-from nerfies_jax.effects.effect import Moment
 from nerfies_jax.measure import baselines, clock, matrix_flops
-from nerfies_jax.tracing import Ray
+from nerfies_jax.render_ray import Ray
+from nerfies_jax.training.effects import FrameCondition
 from tests import bare_scenes, scenes
 
 
@@ -80,14 +80,14 @@ def test_a_loop_whose_rounds_nobody_knows_counts_once_and_says_so():
 def test_the_products_of_a_static_field_are_those_of_its_networks(name):
     preset = bare_scenes.tiny_field(name)
     spec = effect_cost.without(preset, tuple(effect_cost.effects_in(preset)))
-    facts = scene.facts_of(scenes.tiny_capture(), spec)
-    made = scene.field(spec, facts)
+    metadata = scene.metadata_of(scenes.tiny_capture(), spec)
+    made = scene.field(spec, metadata)
     one, zero = jnp.ones(()), jnp.zeros(())
     ray = Ray(jnp.zeros(3), jnp.asarray([0.0, 0.0, 1.0]), 0.5 * one, one)
-    moment = Moment(zero, {}, jnp.int32(0))
+    condition = FrameCondition(zero, {}, jnp.int32(0))
 
     def colours(params):
-        return [level.colour for level in made.trace(params, ray, moment)]
+        return [level.colour for level in made.render_ray(params, ray, condition)]
 
     found = matrix_flops.count(colours, made.init(jax.random.key(0)))
     plan = spec.sampling

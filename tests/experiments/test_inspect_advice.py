@@ -56,7 +56,7 @@ def test_all_decisions_lead_to_a_model_that_can_be_built(kind, full):
         built.add(advice.arguments())
         representation = representations.of_preset(advice.preset)
         spec = specs.override(representation.presets[advice.preset], advice.overrides)
-        representation.build(spec, representation.facts_of(capture, spec))
+        representation.build(spec, representation.metadata_of(capture, spec))
     assert len(built) > 4
 
 

@@ -27,19 +27,19 @@ SIZE = (20, 15)
 def moving():
     """A deformable scene whose network moves something, and a view of it."""
     capture = scenes.tiny_capture()
-    facts = scene.facts_of(capture)
-    model = scene.build(scenes.TINY_DEFORMABLE, facts)
+    metadata = scene.metadata_of(capture)
+    model = scene.build(scenes.TINY_DEFORMABLE, metadata)
     params = model.init(capture, jax.random.key(0)).params
     nets = jax.tree.map(lambda leaf: leaf + 0.05, params.nets)
     view = evaluation.view_of(capture, int(capture.heldout[0]))
-    return facts, model, params._replace(nets=nets), view
+    return metadata, model, params._replace(nets=nets), view
 
 
 def test_splats_without_motion_are_the_canonical_ones(moving):
-    facts, model, params, view = moving
+    metadata, model, params, view = moving
     step = jnp.asarray(20, jnp.int32)
-    draw = variants.of_splats(scenes.TINY_DEFORMABLE, facts, ("motion",), False)
-    still = scene.build(scenes.TINY_SPLATS, facts).render
+    draw = variants.of_splats(scenes.TINY_DEFORMABLE, metadata, ("motion",), False)
+    still = scene.build(scenes.TINY_SPLATS, metadata).render
     found, expected, moved = (
         jax.jit(each, static_argnums=2)(params, view, SIZE, step).colour
         for each in (draw.render, still, model.render)
@@ -49,11 +49,11 @@ def test_splats_without_motion_are_the_canonical_ones(moving):
 
 
 def test_an_effect_that_is_not_there_cannot_be_left_out(moving):
-    facts = moving[0]
+    metadata = moving[0]
     with pytest.raises(ValueError, match=r"--without warp: .* those are: motion"):
-        variants.of_splats(scenes.TINY_DEFORMABLE, facts, ("warp",), False)
+        variants.of_splats(scenes.TINY_DEFORMABLE, metadata, ("warp",), False)
     with pytest.raises(ValueError, match=r"--without motion: .* those are: none"):
-        variants.of_splats(scenes.TINY_SPLATS, facts, ("motion",), False)
+        variants.of_splats(scenes.TINY_SPLATS, metadata, ("motion",), False)
 
 
 def test_splats_have_no_appearance_to_blend(moving):
@@ -69,7 +69,7 @@ def state_of(params):
 def swaying():
     """A deformable scene whose Gaussians move at their own speeds."""
     capture = scenes.tiny_capture()
-    model = scene.build(scenes.TINY_DEFORMABLE, scene.facts_of(capture))
+    model = scene.build(scenes.TINY_DEFORMABLE, scene.metadata_of(capture))
     params = model.init(capture, jax.random.key(0)).params
     rng = np.random.default_rng(0)
     nets = jax.tree.map(
@@ -229,28 +229,28 @@ TINY_FIELD = RadianceScene(
 def field():
     """A field whose warp and codes show, and a view of it."""
     capture = scenes.tiny_capture()
-    facts = nerf_scene.facts_of(capture, TINY_FIELD)
-    params = nerf_scene.field(TINY_FIELD, facts).init(jax.random.key(3))
+    metadata = nerf_scene.metadata_of(capture, TINY_FIELD)
+    params = nerf_scene.field(TINY_FIELD, metadata).init(jax.random.key(3))
     params["warp"] = jax.tree.map(lambda leaf: leaf + 0.1, params["warp"])
     params["codes"] = jax.tree.map(lambda leaf: 40 * leaf, params["codes"])
     view = evaluation.view_of(capture, int(capture.heldout[0]))
-    return facts, params, view
+    return metadata, params, view
 
 
 def drawn(field, seen, without=(), blended=False):
-    facts, params, _ = field
-    draw = variants.of_fields(TINY_FIELD, facts, without, blended)
+    metadata, params, _ = field
+    draw = variants.of_fields(TINY_FIELD, metadata, without, blended)
     step = jnp.asarray(10, jnp.int32)
     return jax.jit(draw.render, static_argnums=2)(params, seen, SIZE, step).colour
 
 
 def test_a_field_without_its_warp_is_the_template(field):
-    facts, params, view = field
+    metadata, params, view = field
     found = drawn(field, view, without=("warp",))
     still = dataclasses.replace(TINY_FIELD, warp=None)
     step = jnp.asarray(10, jnp.int32)
     codes = {"appearance": params["codes"]["appearance"]}
-    model = nerf_scene.build(still, facts)
+    model = nerf_scene.build(still, metadata)
     expected = jax.jit(model.render, static_argnums=2)(
         {"template": params["template"], "codes": codes}, view, SIZE, step
     ).colour
@@ -289,8 +289,8 @@ def test_a_field_without_codes_has_no_appearance_to_blend(field):
 
 def repainted(capture, field, rows):
     """The capture as the field itself would film it, in appearances it never learnt."""
-    facts, params, _ = field
-    made = nerf_scene.field(TINY_FIELD, facts)
+    metadata, params, _ = field
+    made = nerf_scene.field(TINY_FIELD, metadata)
     draw = jax.jit(made.render, static_argnums=4)
     step, pictures = jnp.asarray(10, jnp.int32), capture.images.copy()
     for row in rows:
@@ -304,17 +304,17 @@ def repainted(capture, field, rows):
 
 @pytest.mark.slow
 def test_a_code_is_found_again_from_half_a_picture(field):
-    facts, params, _ = field
+    metadata, params, _ = field
     capture = scenes.tiny_capture()
     rows = capture.heldout[:1]
     capture = repainted(capture, field, rows)
     state = TrainState(params, (), (), jnp.asarray(10, jnp.int32), jax.random.key(0))
-    model = nerf_scene.build(TINY_FIELD, facts)
+    model = nerf_scene.build(TINY_FIELD, metadata)
     renderer = evaluation.Renderer(model, capture.size)
     before = evaluation.score_right_halves(
         capture, rows, evaluation.score(renderer, state, capture, rows).colour
     )
-    found = held_out_codes.score(TINY_FIELD, facts, state, capture, rows)
+    found = held_out_codes.score(TINY_FIELD, metadata, state, capture, rows)
     assert before.psnr[0] < 35
     assert found.psnr[0] > 48  # the truth has 8 bits: 59 dB is all there is
     assert found.ssim[0] > 0.99
@@ -322,17 +322,17 @@ def test_a_code_is_found_again_from_half_a_picture(field):
 
 @pytest.mark.slow
 def test_a_half_that_was_not_filmed_keeps_the_code_it_had(field):
-    facts, params, _ = field
+    metadata, params, _ = field
     capture = scenes.tiny_capture()
     rows = capture.heldout[:1]
     valid = np.ones(capture.images.shape[:3], bool)
     valid[:, :, :20] = False
     capture = dataclasses.replace(repainted(capture, field, rows), valid=valid)
     state = TrainState(params, (), (), jnp.asarray(10, jnp.int32), jax.random.key(0))
-    renderer = evaluation.Renderer(nerf_scene.build(TINY_FIELD, facts), capture.size)
+    renderer = evaluation.Renderer(nerf_scene.build(TINY_FIELD, metadata), capture.size)
     colour = evaluation.score(renderer, state, capture, rows).colour
     before = evaluation.score_right_halves(capture, rows, colour)
-    found = held_out_codes.score(TINY_FIELD, facts, state, capture, rows)
+    found = held_out_codes.score(TINY_FIELD, metadata, state, capture, rows)
     np.testing.assert_allclose(found.psnr, before.psnr, atol=1e-3)
 
 

@@ -13,11 +13,11 @@ import scipy.spatial.transform
 
 from gaussians_jax import splats as rows
 from gaussians_jax.effects import deformation, kan_motion
-from gaussians_jax.effects.effect import Moment
 from gaussians_jax.effects.kan_motion import KanMotion, KanMotionSpec, Offsets
 from gaussians_jax.splats import Gaussians, Params, Splats
 from nerfies_jax.measure import clock
 from nerfies_jax.nets import kan, mlp
+from nerfies_jax.training.effects import FrameCondition
 from tests import gradients
 
 SMALL = KanMotionSpec(embedding=6, time_code=4, hidden=(5,), kernels=3, block=8)
@@ -357,8 +357,8 @@ def test_the_effect_moves_a_scene_and_leaves_it_alone_in_its_warm_up(float64):
 
     @jax.jit
     def in_training(step):
-        moment = Moment(time, step, jax.random.key(0))
-        return deformation.pose_in_training(effects, params, canonical, moment)
+        condition = FrameCondition(time, step=step, key=jax.random.key(0))
+        return deformation.pose_in_training(effects, params, canonical, condition)
 
     for before, after in zip(canonical, in_training(jnp.asarray(9)), strict=True):
         np.testing.assert_array_equal(before, after)
@@ -381,12 +381,14 @@ def test_the_effect_tells_its_rows_networks_and_rates():
     points = np.zeros((12, 3))
     first = rows.from_points(points, points)
     assert filled.init_rows(jax.random.key(0), first).shape == (12, 6)
-    nets = jax.eval_shape(filled.init_nets, jax.random.key(0))
+    nets = jax.eval_shape(filled.init, jax.random.key(0))
     assert isinstance(nets, KanMotion)
     assert nets.times.shape == (math.ceil(FRAMES / 2), 4)
-    np.testing.assert_allclose(filled.row_rate(jnp.asarray(50)), 2.5e-3)
+    np.testing.assert_allclose(filled.row_learning_rate(jnp.asarray(50)), 2.5e-3)
     for step, rate in ((0, 1.6e-4), (50, 1.6e-4 / math.sqrt(10)), (100, 1.6e-5)):
-        np.testing.assert_allclose(filled.net_rate(jnp.asarray(step)), rate, rtol=1e-5)
+        np.testing.assert_allclose(
+            filled.learning_rate(jnp.asarray(step)), rate, rtol=1e-5
+        )
 
 
 def test_one_frame_has_one_code():

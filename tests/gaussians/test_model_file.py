@@ -21,8 +21,8 @@ SIZE = (20, 15)
 def trained():
     """A deformable scene with dead rows in between, and what describes it."""
     capture = scenes.tiny_capture()
-    facts = scene.facts_of(capture)
-    model = scene.build(scenes.TINY_DEFORMABLE, facts)
+    metadata = scene.metadata_of(capture)
+    model = scene.build(scenes.TINY_DEFORMABLE, metadata)
     params = model.init(capture, jax.random.key(0)).params
     params = params._replace(nets=jax.tree.map(lambda leaf: leaf + 0.02, params.nets))
     rows = params.rows["splats"]
@@ -31,7 +31,12 @@ def trained():
     params = params._replace(
         rows={"splats": splats.bury(rows, dead), "codes": codes.astype(jnp.float32)}
     )
-    about = {"spec": scenes.TINY_DEFORMABLE, "facts": facts, "step": 20, "name": "tiny"}
+    about = {
+        "spec": scenes.TINY_DEFORMABLE,
+        "facts": metadata,
+        "step": 20,
+        "name": "tiny",
+    }
     return params, about
 
 

@@ -11,12 +11,12 @@ import scipy.spatial.transform
 
 from gaussians_jax import splats as rows
 from gaussians_jax.effects import deformation, mlp_motion, motion_basis
-from gaussians_jax.effects.effect import Moment
 from gaussians_jax.effects.mlp_motion import SmoothingSpec
 from gaussians_jax.effects.motion_basis import BasisMotionSpec, Offsets
 from gaussians_jax.splats import Gaussians, Params, Splats
 from nerfies_jax.measure import clock
 from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.training.effects import FrameCondition
 from tests import gradients
 
 SMALL = BasisMotionSpec(
@@ -405,12 +405,12 @@ def test_warm_up_and_noise_are_of_training_alone():
 
     @jax.jit
     def moved(params, step):
-        moment = Moment(time, step, jax.random.key(0))
-        return deformation.pose_in_training((field,), params, gaussians, moment)
+        condition = FrameCondition(time, step=step, key=jax.random.key(0))
+        return deformation.pose_in_training((field,), params, gaussians, condition)
 
     np.testing.assert_array_equal(moved(params, jnp.asarray(9)).mean, gaussians.mean)
     ready = jax.jit(field.prepare)(params)
-    trained = jax.jit(field.deform)(params, gaussians, Moment(time), ready)
+    trained = jax.jit(field.deform)(params, gaussians, FrameCondition(time), ready)
     motion = params.nets[motion_basis.NAME]
     at_rest = motion_basis.apply(
         gaussians, uncached(motion, spec, gaussians.mean, time)
@@ -513,7 +513,7 @@ def test_settings_that_cannot_work_are_refused(setting, message):
 
 def test_the_rate_falls_in_equal_ratios():
     field = motion_basis.effect(BasisMotionSpec(), steps=1000, frames=20)
-    rates = [float(field.net_rate(jnp.asarray(s))) for s in (0, 500, 1000, 4000)]
+    rates = [float(field.learning_rate(jnp.asarray(s))) for s in (0, 500, 1000, 4000)]
     middle = (8e-4 * 1.6e-6) ** 0.5
     np.testing.assert_allclose(rates, [8e-4, middle, 1.6e-6, 1.6e-6], rtol=1e-5)
     assert field.name != mlp_motion.NAME

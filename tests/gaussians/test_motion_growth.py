@@ -13,9 +13,9 @@ import pytest
 from gaussians_jax import density, optimiser, splats
 from gaussians_jax.density import DensitySpec
 from gaussians_jax.effects import motion_growth
-from gaussians_jax.effects.effect import Moment
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec, Travel
 from gaussians_jax.splats import Gaussians, Params, Splats
+from nerfies_jax.training.effects import Effect, FrameCondition
 
 EXTENT = 2.0
 TAU = 2e-3  # of the default threshold in this extent, scene units
@@ -41,15 +41,15 @@ def rows_of(count, dtype="float32"):
 
 @jax.jit
 def watch(canonical, displacements):
-    """What is carried after all displacements [instants, gaussians, 3], in one scan."""
+    """What is kept after all displacements [instants, gaussians, 3], in one scan."""
 
-    def body(carried, displacement):
+    def body(state, displacement):
         moved = canonical._replace(mean=canonical.mean + displacement)
-        moment = Moment(jnp.asarray(0.5, displacement.dtype))
-        return motion_growth.observe(carried, canonical, moved, moment), None
+        condition = FrameCondition(jnp.asarray(0.5, displacement.dtype))
+        return motion_growth.update_state(state, canonical, moved, condition), None
 
     params = Params({"splats": canonical}, {})  # its means are all that is read
-    return jax.lax.scan(body, motion_growth.carry(params), displacements)[0]
+    return jax.lax.scan(body, motion_growth.init_state(params), displacements)[0]
 
 
 def drawn(displacements, opacity=None, mean=0.0):
@@ -145,7 +145,7 @@ def test_a_constant_offset_is_no_motion(dtype):
 def test_one_instant_and_none_are_no_motion(dtype):
     paths = np.ones((1, 4, 3), dtype) * np.arange(4, dtype=dtype)[:, None]
     assert not seen_motion(paths).any()
-    nothing = motion_growth.carry(rows_of(4, dtype))
+    nothing = motion_growth.init_state(rows_of(4, dtype))
     assert not motion_growth.motion(nothing).any()
     assert nothing.low.dtype.name == nothing.high.dtype.name == dtype
     assert motion_growth.motion(jax.tree.map(lambda x: x[:0], nothing)).shape == (0,)
@@ -208,13 +208,13 @@ def test_the_common_motion_is_the_median_of_a_sample(count, rng, dtype):
 
 
 def factor_of(spec, motion):
-    """The factor of rows that moved so far, by way of what is carried."""
+    """The factor of rows that moved so far, by way of what is kept."""
     motion = np.asarray(motion, np.float32)
     high = np.zeros((len(motion), 3), np.float32)
     high[:, 1] = 2 * motion  # half the diagonal of the box
-    carried = Travel(jnp.zeros_like(high), jnp.asarray(high))
+    state = Travel(jnp.zeros_like(high), jnp.asarray(high))
     effect = motion_growth.effect(spec, EXTENT)
-    return effect.grow_score(carried, 500)
+    return effect.grow_score(state, 500)
 
 
 def test_the_soft_factor_is_its_formula():
@@ -259,8 +259,8 @@ def grown(spec, params, gradient, motion, step=600):
     stats = stats._replace(gradient=gradient, views=jnp.ones_like(stats.views))
     if spec is not None:
         high = jnp.zeros_like(rows.mean).at[: len(motion), 0].set(2 * motion)
-        carried = Travel(jnp.zeros_like(high), high)
-        factor = motion_growth.effect(spec, EXTENT).grow_score(carried, step)
+        state = Travel(jnp.zeros_like(high), high)
+        factor = motion_growth.effect(spec, EXTENT).grow_score(state, step)
         stats = stats._replace(gradient=stats.gradient * jnp.asarray(factor))
     changed = density.densify(
         TX,
@@ -353,15 +353,15 @@ def an_effect():
 
 def test_it_fills_only_the_seams_of_growth():
     effect = an_effect()
-    filled = {name for name in effect._fields if getattr(effect, name) not in (None, 0)}
-    assert filled == {"name", "carry", "observe", "grow_score", "wants"}
-    assert effect.wants == frozenset()
+    empty = Effect(effect.name)
+    filled = {n for n in effect._fields if getattr(effect, n) != getattr(empty, n)}
+    assert filled == {"state", "update_state", "grow_score"}
 
 
 def test_before_its_start_the_factor_is_one(dtype):
-    carried = motion_growth.carry(rows_of(5, dtype))
+    state = motion_growth.init_state(rows_of(5, dtype))
     for step, factor in ((99, 1.0), (100, 0.2)):  # at rest, beta = 4
-        result = an_effect().grow_score(carried, step)
+        result = an_effect().grow_score(state, step)
         np.testing.assert_allclose(result, np.full(5, factor), rtol=1e-7)
         assert result.dtype.name == dtype
 

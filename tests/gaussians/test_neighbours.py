@@ -9,9 +9,9 @@ import pytest
 
 from gaussians_jax import splats as rows
 from gaussians_jax.effects import neighbours
-from gaussians_jax.effects.effect import Around, Moment
 from gaussians_jax.effects.neighbours import Neighbours, NeighbourSpec
 from gaussians_jax.splats import Params, Splats
+from nerfies_jax.training.effects import PenaltyContext, weighted_sum
 from tests import gradients
 
 FEW = NeighbourSpec(count=4)
@@ -201,8 +201,9 @@ def compiled_penalty(spec):
     effect = neighbours.effect(spec, extent=1.0, of="code")
 
     def penalty(params, graph, step):
-        moment = Moment(jnp.zeros(()), step, jax.random.key(0))
-        return effect.penalty(Around(params, None, moment, graph))
+        return effect.penalty(
+            None, PenaltyContext(None, step, None, params, state=graph)
+        )
 
     return effect, jax.jit(penalty)
 
@@ -210,14 +211,14 @@ def compiled_penalty(spec):
 def test_the_effect_weighs_and_waits_for_its_start():
     params = scene(some_places(), dtype="float32")
     effect, penalty = compiled_penalty(NeighbourSpec(weight=0.5, start=10))
-    graph = effect.carry(params)
-    before = penalty(params, graph, jnp.asarray(9))
+    graph = effect.state(params)
+    before = weighted_sum(penalty(params, graph, jnp.asarray(9)))
     after = penalty(params, graph, jnp.asarray(10))
-    assert before.value == 0
+    assert before == 0
     expected = inconsistency(params.rows["code"], graph, jnp.ones(40, bool))
-    np.testing.assert_allclose(after.value, 0.5 * expected, rtol=1e-6)
+    np.testing.assert_allclose(weighted_sum(after), 0.5 * expected, rtol=1e-6)
     linked = np.mean(np.asarray(graph.weight) > 1e-3)
-    np.testing.assert_allclose(after.metrics["linked"], linked, rtol=1e-6)
+    np.testing.assert_allclose(after["linked"].value, linked, rtol=1e-6)
     assert linked > 0.5
     program = penalty.lower(params, graph, jnp.asarray(9)).compile().as_text()
     assert "conditional" in program
@@ -254,7 +255,7 @@ def test_the_penalty_draws_neighbours_together_and_leaves_the_far_apart():
 def test_missing_rows_are_named():
     effect = neighbours.effect(NeighbourSpec(), extent=1.0, of="kan_motion")
     with pytest.raises(ValueError, match=r"no rows .kan_motion.*code"):
-        effect.carry(scene(some_places()))
+        effect.state(scene(some_places()))
 
 
 @pytest.mark.parametrize(

@@ -348,7 +348,7 @@ def test_a_scene_trains_one_group_at_a_time_in_one_program():
         annealing=AnnealingSpec(after=5, freeze_share=0.6),  # means rest from 12 on
     )
     capture = scenes.tiny_capture()
-    model = scene.build(spec, scene.facts_of(capture))
+    model = scene.build(spec, scene.metadata_of(capture))
     step, frames = jax.jit(model.step), evaluation.frames_of(capture)
     states = [model.init(capture, jax.random.key(0))]
     for _ in range(14):

@@ -12,6 +12,7 @@ from gaussians_jax.phases import AnnealingSpec
 from gaussians_jax.rates import RateSpec
 from gaussians_jax.splats import Params, Splats
 from nerfies_jax.training import schedules
+from nerfies_jax.training.updates import apply_updates
 
 MAIN = schedules.log_linear(1.6e-4, 1.6e-6, 1000)
 ANNEALING = AnnealingSpec(after=750)
@@ -113,7 +114,7 @@ def test_at_the_end_the_means_stand_still_bit_for_bit():
     def after(step):
         rate = rates.learning_rates(RateSpec(), 2.0, 1000, step, ANNEALING)
         rate = Params({"splats": rate}, {"w": 1e-3})
-        return rates.descend(params, directions, rate)
+        return apply_updates(params, directions, rate)
 
     mean = params.rows["splats"].mean
     np.testing.assert_array_equal(after(950).rows["splats"].mean, mean)

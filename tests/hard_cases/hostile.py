@@ -20,12 +20,12 @@ from nerfies_jax.training.checkpoint import Checkpoints
 from nerfies_jax.training.loop import FitResult
 
 QUIET = rich.console.Console(quiet=True)
-BAD_STEP = re.compile(r"is not finite: (metric|params\.|optimiser\.|extra\.)")
+BAD_STEP = re.compile(r"is not finite: (metric|params\.|optimiser\.|aux_state\.)")
 
 
-def frames_of(capture, wants=frozenset()):
+def frames_of(capture, required_data=frozenset()):
     """The training frames in NumPy, masked; the mask may leave every pixel."""
-    frames = jax.tree.map(np.asarray, evaluation.frames_of(capture, wants))
+    frames = jax.tree.map(np.asarray, evaluation.frames_of(capture, required_data))
     if frames.valid is None:
         frames = frames._replace(valid=np.ones(frames.images.shape[:3], bool))
     return frames

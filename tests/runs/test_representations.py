@@ -50,7 +50,7 @@ def test_a_scene_of_gaussians_is_saved_as_a_model_and_for_viewers(moving, tmp_pa
     kind = representations.named("gaussians")
     spec = scenes.TINY_DEFORMABLE if moving else scenes.TINY_SPLATS
     capture = scenes.tiny_capture()
-    facts = kind.facts_of(capture, spec)
+    facts = kind.metadata_of(capture, spec)
     state = kind.build(spec, facts).init(capture, jax.random.key(0))
     saved = kind.save(tmp_path, spec, facts, state)
     assert saved.model_bytes == (tmp_path / MODEL).stat().st_size

@@ -180,11 +180,13 @@ def test_arrays_that_do_not_fit_are_named(tmp_path):
     other = state._replace(params=state.params._replace(nets=wide))
     with pytest.raises(ValueError, match=r"params\.nets\.weight as float32\[3, 8\]"):
         checkpoint.restore(tmp_path, other, SPEC)
-    half = state._replace(extra=state.extra | {"hits": jnp.zeros(6, jnp.float16)})
+    half = state._replace(
+        aux_state=state.aux_state | {"hits": jnp.zeros(6, jnp.float16)}
+    )
     with pytest.raises(ValueError, match=r"this run needs float16\[6\]"):
         checkpoint.restore(tmp_path, half, SPEC)
-    more = state._replace(extra=state.extra | {"new": jnp.zeros(6)})
-    with pytest.raises(ValueError, match=r"without \['extra.new'\]"):
+    more = state._replace(aux_state=state.aux_state | {"new": jnp.zeros(6)})
+    with pytest.raises(ValueError, match=r"without \['aux_state.new'\]"):
         checkpoint.restore(tmp_path, more, SPEC)
 
 

@@ -55,7 +55,7 @@ def test_a_run_is_the_plain_loop_over_its_steps(frames, straight):
         if not jnp.issubdtype(plain.dtype, jax.dtypes.prng_key):
             # Another program: a few ulps, which Adam's normalisation may enlarge.
             np.testing.assert_allclose(ours, plain, rtol=2e-4, atol=2e-6)
-    assert straight.state.extra["hits"].shape == (9,)
+    assert straight.state.aux_state["hits"].shape == (9,)
     assert int(straight.state.step) == straight.steps == 20
     assert straight.stopped_by == "steps"
 
@@ -136,10 +136,10 @@ def test_events_happen_in_order_after_their_steps(frames):
 def test_an_event_may_put_one_array_in_two_places(frames):
     def share(state, _):
         zero = jnp.zeros(6)
-        return state._replace(extra=state.extra | {"hits": zero, "more": zero})
+        return state._replace(aux_state=state.aux_state | {"hits": zero, "more": zero})
 
     state = start()
-    state = state._replace(extra=state.extra | {"more": jnp.ones(6)})
+    state = state._replace(aux_state=state.aux_state | {"more": jnp.ones(6)})
     extra = (Event("share", (2,), share),)
     assert fit(frames, state, steps=5, events=extra).steps == 5
 
@@ -231,8 +231,8 @@ def test_a_run_outside_the_main_thread_leaves_signals_alone(frames):
 def test_what_a_step_gets_wrong_is_named(frames):
     def wider(state, frames):
         new, metrics = toy.step(state, frames)
-        extra = {**new.extra, "hits": jnp.zeros(7)}
-        return new._replace(extra=extra), metrics
+        extra = {**new.aux_state, "hits": jnp.zeros(7)}
+        return new._replace(aux_state=extra), metrics
 
     def standing(state, frames):
         new, metrics = toy.step(state, frames)
@@ -242,7 +242,7 @@ def test_what_a_step_gets_wrong_is_named(frames):
         return state._replace(step=state.step + 1)
 
     with pytest.raises(
-        ValueError, match=r"extra.hits from float32\[6\] to float32\[7\]"
+        ValueError, match=r"aux_state.hits from float32\[6\] to float32\[7\]"
     ):
         fit(frames, model=toy.model(change=wider), steps=2)
     with pytest.raises(ValueError, match=r"left state\.step at 0 after step 1"):
