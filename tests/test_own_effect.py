@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import evaluate
+from nerfies_jax import evaluation
 from gaussians_jax import scene as splat_scene
 from nerfies_jax import scene
 from nerfies_jax.effects.effect import Medium
@@ -41,7 +41,7 @@ def of_field(*effects):
     capture, spec = scenes.tiny_capture(), bare_scenes.tiny_field("nerf-small")
     metadata = scene.metadata_of(capture, spec)
     made = scene.field(spec, metadata, effects=effects)
-    frames = evaluate.frames_of(capture)
+    frames = evaluation.frames_of(capture)
 
     @jax.jit
     def values(key):
