@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from gaussians_jax import density, phases, rates, render, splats, start
+from gaussians_jax import density, phases, rates, rendering, splats, start
 from gaussians_jax.effects import deformation
 from gaussians_jax.phases import Trained
 from gaussians_jax.spec import (
@@ -146,7 +146,7 @@ def _stages(spec, metadata, effects):
 def _draw(
     spec, metadata, params, gaussians, view, size, degree, probe=None, depth=True
 ):
-    return render.render_harmonics(
+    return rendering.render_harmonics(
         gaussians,
         splats.active_harmonics(params.rows["splats"], degree),
         view.camera,
@@ -297,7 +297,7 @@ def first_bytes(spec: SplatScene, capture: Capture) -> int:
 def first_state(spec, effects, optimiser, capture, key) -> TrainState:
     """Parameters, moments and statistics before the first step; host side."""
     refuse_what_cannot_train(spec)
-    render.refuse_distortion(capture.cameras)
+    rendering.refuse_distortion(capture.cameras)
     start_key, run_key = jax.random.split(key)
     seed = int(jax.random.randint(start_key, (), 0, np.iinfo(np.int32).max))
     position, colour = start.first_points(spec.start, capture, seed)

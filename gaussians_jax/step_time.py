@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from gaussians_jax import render, scene, splats
+from gaussians_jax import rendering, scene, splats
 from gaussians_jax.effects import deformation
 from nerfies_jax.measure.part_time import part_ms
 from nerfies_jax.training import losses
@@ -32,7 +32,7 @@ def parts(
     effects = scene.effects_of(spec, facts)
 
     def draw(gaussians, coefficients):
-        frame = render.render_harmonics(
+        frame = rendering.render_harmonics(
             gaussians, coefficients, camera, size, spec.raster
         )
         return jnp.sum(frame.rendering.colour)

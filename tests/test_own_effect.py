@@ -8,9 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nerfies_jax import evaluation
 from gaussians_jax import scene as splat_scene
-from nerfies_jax import scene
+from nerfies_jax import evaluation, scene
 from nerfies_jax.effects.effect import Medium
 from nerfies_jax.training.effects import Effect
 from tests import bare_scenes, scenes

@@ -1,6 +1,7 @@
 """A run: which capture, which scene, and the folder that holds what came of it."""
 
 import json
+import os
 import pathlib
 from typing import Any, NamedTuple
 
@@ -59,6 +60,35 @@ def scene_spec(config: RunConfig) -> Any:
     if config.steps is not None:
         spec = representation.with_steps(spec, config.steps)
     return specs.override(spec, config.overrides)
+
+
+def load_capture(
+    folder: str | os.PathLike,
+    *,
+    factor: int | None = None,
+    max_side: int | None = None,
+    heldout: int | str | None = None,
+) -> Capture:
+    """A capture of any known format, for a pinhole renderer; host side.
+
+    `factor` and `max_side` (pixels) make the pictures smaller; `heldout` chooses the
+    frames to judge by, every n-th or a split by its name. Raises ValueError where it
+    cannot be read.
+    """
+    chosen = None if heldout is None else str(heldout)
+    return read_capture(
+        CaptureSource(
+            capture=pathlib.Path(folder),
+            factor=factor,
+            max_side=max_side,
+            heldout=chosen,
+        )
+    )
+
+
+def built_in_scene(name: str = "default", seed: int = 0) -> Capture:
+    """A film of a built-in scene; ValueError names those there are."""
+    return read_capture(CaptureSource(scene=name), seed)
 
 
 def read_capture(source: CaptureSource, seed: int = 0) -> Capture:

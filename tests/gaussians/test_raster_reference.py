@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import harmonics, render
+from gaussians_jax import harmonics, rendering
 from gaussians_jax.raster_spec import RasterSpec
 from gaussians_jax.splats import Gaussians
 from nerfies_jax.geometry.camera import Camera
@@ -88,7 +88,7 @@ class Case:
             colours = harmonics.colour_towards(
                 colours[:, : (degree + 1) ** 2], gaussians.mean, position
             )
-        return render.render(
+        return rendering.render(
             gaussians,
             colours,
             camera,

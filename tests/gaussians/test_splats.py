@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import render
+from gaussians_jax import rendering
 from gaussians_jax import splats as rows
 from gaussians_jax.splats import Params, Splats
 from nerfies_jax.geometry.camera import Camera
@@ -250,7 +250,7 @@ def test_dead_rows_change_neither_the_picture_nor_learn_anything(rng):
     )
 
     def loss(splats):
-        colour = render.render_harmonics(
+        colour = rendering.render_harmonics(
             rows.activate(splats), rows.active_harmonics(splats, 0), camera, (16, 12)
         ).rendering.colour
         return jnp.sum(colour**2), colour

@@ -53,7 +53,7 @@ def duplicated(frames):
     """One frame again and again: picture, camera, time and codes."""
     names = [
         name
-        for name in ("images", "cameras", "times", "warp", "appearance", "depths")
+        for name in ("images", "cameras", "times", "appearance", "depths")
         if getattr(frames, name) is not None
     ]
     return _first(frames, *names)
@@ -103,7 +103,7 @@ CAPTURES = {
     "black images": _filled(0),
     "white images": _filled(255),
     "static scene": lambda frames: _first(frames, "images", "cameras"),
-    "one instant": lambda frames: _first(frames, "times", "warp"),
+    "one instant": lambda frames: _first(frames, "times"),
     "identical cameras": lambda frames: _first(frames, "cameras"),
     "duplicated frames": duplicated,
     "two views": two_views,

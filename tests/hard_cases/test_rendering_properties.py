@@ -17,7 +17,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gaussians_jax import render, splats
+from gaussians_jax import rendering, splats
 from gaussians_jax.raster_spec import RasterSpec
 from gaussians_jax.splats import Gaussians, Splats
 from tests.hard_cases import properties
@@ -52,7 +52,7 @@ def picture_error(dtype):
 
 def drawn(gaussians, colours, camera, spec):
     """Colour, alpha, and depth times alpha."""
-    frame = render.render(gaussians, colours, camera, PICTURE, spec).rendering
+    frame = rendering.render(gaussians, colours, camera, PICTURE, spec).rendering
     return frame.colour, frame.alpha, frame.depth * frame.alpha
 
 
