@@ -25,9 +25,9 @@ INDEX = """\
 
 Every number on these pages stands in a file of this repository, and the page is
 written from that file: `python -m experiments.results` writes all of them, and a test
-holds each against its file. The command beside a page measures anew; it names the
-file it writes, and `python -m experiments.results PAGE --measured FILE` keeps that
-file and renews the page.
+holds each against its file. The command beside a page measures anew and names the file
+it writes; `python -m experiments.results kan_local --measured kan_local.json`, say,
+keeps that file and renews the page.
 
 {pages}
 
