@@ -96,8 +96,7 @@ def compare_exposure(film, steps, seed):
 
 def compare_transient(film, steps, seed):
     """PSNR against the scene without its transient, and a picture."""
-    from experiments import variants
-    from nerfies_jax import evaluation, presets
+    from nerfies_jax import evaluation, presets, variants
     from nerfies_jax.capture import synthetic
 
     capture, truth = synthetic.make(film, seed)
@@ -111,7 +110,7 @@ def compare_transient(film, steps, seed):
     for name, spec in (("without the effect", plain), ("static part", medium)):
         model, state, seconds = trained(spec, capture, seed)
         left_out = () if spec.transient is None else ("transient",)
-        static = variants.of_fields(*model.spec, left_out, False)
+        static = variants.without_effects(*model.spec, left_out, False)
         renderer = evaluation.Renderer(static, capture.size)
         drawn[name] = evaluation.score(renderer, state, clean, rows).colour
         held_out = evaluation.score(renderer, state, clean, clean.heldout)

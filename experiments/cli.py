@@ -8,7 +8,7 @@ import contextlib
 import dataclasses
 import pathlib
 import sys
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -23,6 +23,8 @@ class NamedSource(CaptureSource):
 
     capture: Positional[pathlib.Path | None] = None
     """Folder in Nerfies, HyperNeRF, Blender, D-NeRF or COLMAP layout."""
+    scene: str | None = None
+    """Which built-in scene, where no capture is given (default: default)."""
 
 
 # Their fields stand among the other options of a command.
@@ -32,7 +34,12 @@ SourceOptions = Annotated[CaptureSource, tyro.conf.arg(name="")]
 
 def plain(source: CaptureSource) -> CaptureSource:
     """The same source as a run keeps it, however its folder was named."""
-    return CaptureSource(**vars(source))
+    return CaptureSource(**given(source))
+
+
+def given(source: CaptureSource) -> dict[str, Any]:
+    """What the command line says of the source, by field."""
+    return {name: value for name, value in vars(source).items() if value is not None}
 
 
 def parse(settings_class, arguments=None):
@@ -41,7 +48,7 @@ def parse(settings_class, arguments=None):
 
 
 @contextlib.contextmanager
-def user_errors():
+def user_errors(kinds: tuple[type[Exception], ...] = (ValueError, OSError)):
     """Wrong input in one line and exit code 2; our own bugs keep their traceback.
 
     Wraps the stages that read what the user gave (captures, settings, run folders),
@@ -49,6 +56,6 @@ def user_errors():
     """
     try:
         yield
-    except (ValueError, OSError) as error:
+    except kinds as error:
         print("error: " + " ".join(str(error).split()), file=sys.stderr)
         sys.exit(2)

@@ -39,6 +39,7 @@ def test_a_tuple_is_read_by_its_items():
         ("density.most=many", "cannot be read as"),
         ("steps", "expected path.to.field=value"),
         ("steps.more=1", "has no fields"),
+        ("motion.width=8", "has no fields"),  # of which kind is not guessed
         ("sh_degree=7", "0, 1, 2 or 3"),
     ],
 )

@@ -116,7 +116,7 @@ def main(arguments=None):
 
         # Compiling is one of the prices; JAX asks once, when it first compiles.
         jax.config.update("jax_enable_compilation_cache", False)
-        from experiments.effect_cost import report as report
+        from experiments.effect_cost import report
         from nerfies_jax.measure import baselines
 
         before = None

@@ -15,7 +15,7 @@ import numpy as np
 from nerfies_jax import evaluation
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.synthetic import SceneTruth
-from nerfies_jax.evaluation import Renderer, Scored
+from nerfies_jax.evaluation.scores import Draw, Scored
 from nerfies_jax.measure import geometry_quality, image_quality
 from nerfies_jax.training.model import TrainState
 
@@ -120,7 +120,7 @@ def filmed(capture: Capture, frames: int) -> Known:
 
 
 def score_pictures(
-    renderer: Renderer, state: TrainState, capture: Capture, known: Known
+    renderer: Draw, state: TrainState, capture: Capture, known: Known
 ) -> tuple[Scored, dict[str, float]]:
     """The held-out frames as rendered, and their scores, also of what moves alone.
 

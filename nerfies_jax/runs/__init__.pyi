@@ -1,3 +1,7 @@
+from .reconstruction import Outcome as Outcome
+from .reconstruction import Refused as Refused
+from .reconstruction import reconstruct as reconstruct
+from .reconstruction import resume as resume
 from .run import Run as Run
 from .run import built_in_scene as built_in_scene
 from .run import first_state as first_state

@@ -8,7 +8,7 @@ import pathlib
 class CaptureSource:
     """Which pictures to read: a folder's, or those of a built-in scene."""
 
-    capture: pathlib.Path | None = None
+    capture: pathlib.Path | str | None = None  # a path, once it is made
     """Folder in Nerfies, HyperNeRF, Blender, D-NeRF or COLMAP layout."""
     scene: str = "default"
     """Which built-in scene, where no capture is given."""
@@ -25,9 +25,16 @@ class CaptureSource:
             object.__setattr__(self, "capture", folder)
 
     @property
-    def words(self) -> str:
-        """The pictures as named on a command line."""
-        return f"--scene {self.scene}" if self.capture is None else str(self.capture)
+    def arguments(self) -> tuple[str, ...]:
+        """The pictures as named on a command line, not quoted."""
+        if self.capture is None:
+            return ("--scene", self.scene)
+        words = [str(self.capture)]
+        for name in ("factor", "max_side", "heldout"):
+            value = getattr(self, name)
+            if value is not None:
+                words += [f"--{name.replace('_', '-')}", str(value)]
+        return tuple(words)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """What a finished run leaves behind: scores, pictures, a film, depth, a report."""
 
+import dataclasses
 import json
 import math
 import pathlib
@@ -7,34 +8,36 @@ import time
 
 import numpy as np
 
-from nerfies_jax import evaluation, runs
+from nerfies_jax import evaluation
 from nerfies_jax.capture import camera_paths, exr, video
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.json_files import write_json
 from nerfies_jax.evaluation import Renderer, Scored, pictures
+from nerfies_jax.evaluation.representation import MODEL, Saved
 from nerfies_jax.measure import clock
 from nerfies_jax.measure.clock import Metric
-from nerfies_jax.runs import Run, budget, curves, report
-from nerfies_jax.runs.representations import MODEL, Saved
-from nerfies_jax.runs.train import Outcome
+from nerfies_jax.runs import budget, commands, curves, report
+from nerfies_jax.runs.run import Run
+from nerfies_jax.runs.run_folder import CONFIG
+from nerfies_jax.runs.train import Trained
 from nerfies_jax.training import losses
 from nerfies_jax.training.model import TrainState
 
 SHOWN = 4  # held-out frames in the comparison
 
 
-def make(folder: pathlib.Path, run: Run, outcome: Outcome, began: float) -> None:
+def make(folder: pathlib.Path, run: Run, trained: Trained, began: float) -> None:
     """Write everything into the run folder and say where it is.
 
     Raises FloatingPointError, and writes nothing, where the state draws pictures that
     are not finite: its parameters may be finite and yet beyond use.
     """
-    state, renderer = outcome.result.state, outcome.renderer
-    rows, left_out = frames_to_score(run, outcome)
+    state, renderer = trained.result.state, trained.renderer
+    rows, left_out = frames_to_score(run, trained)
     scored = evaluation.score(renderer, state, run.capture, rows)
     if not np.isfinite(scored.colour).all():
         raise FloatingPointError(
-            f"no report: what the state of step {outcome.result.steps:,} draws is not "
+            f"no report: what the state of step {trained.result.steps:,} draws is not "
             "finite"
         )
     ms_per_frame = renderer.ms_per_frame(len(scored.rows))
@@ -45,9 +48,9 @@ def make(folder: pathlib.Path, run: Run, outcome: Outcome, began: float) -> None
             "apart, and the depth.",
         )
     ]
-    watched = [run.capture.ids[row] for row in outcome.watched]
-    curves.write(folder, outcome.result.history, watched)
-    curve = save_curve(folder / "psnr_over_time.png", run, outcome)
+    watched = [run.capture.ids[row] for row in trained.watched]
+    curves.write(folder, trained.result.history, watched)
+    curve = save_curve(folder / "psnr_over_time.png", run, trained)
     if curve is not None:
         figures.append(
             report.Figure(curve, "PSNR of a few held-out frames while it trained.")
@@ -57,33 +60,33 @@ def make(folder: pathlib.Path, run: Run, outcome: Outcome, began: float) -> None
     saved = run.representation.save(folder, run.spec, run.facts, state)
     frames = evaluation.frames_of(run.capture, run.model.required_data)
     fitted, gain = score_halves(run, state, scored, ms_per_frame / 1e3)
-    metrics = [*measured(run, outcome, scored, ms_per_frame, began), *fitted]
+    metrics = [*measured(run, trained, scored, ms_per_frame, began), *fitted]
     metrics += model_size(saved)
     write_json(
         folder / "metrics.json",
         {m.key: m.value if math.isfinite(m.value) else None for m in metrics},
     )
-    notes = [outcome.result.message, *run.capture.notes, *left_out, *gain, *saved.notes]
+    notes = [trained.result.message, *run.capture.notes, *left_out, *gain, *saved.notes]
     notes += beside_the_paper(run.config.preset, saved, ms_per_frame)
-    commands = _next(folder, run, outcome)
+    following = _next(folder, run, trained)
     page = report.write(
         folder,
         f"{run.capture.name}: {run.config.preset}",
         metrics,
-        json.loads((folder / runs.CONFIG).read_text()),
+        json.loads((folder / CONFIG).read_text()),
         figures,
         film,
         run.representation.time_parts(run.spec, run.facts, run.model, state, frames),
         notes,
-        commands,
+        following,
     )
-    _say(folder, page, metrics, commands)
+    _say(folder, page, metrics, following)
 
 
-def frames_to_score(run: Run, outcome: Outcome) -> tuple[np.ndarray, tuple[str, ...]]:
+def frames_to_score(run: Run, trained: Trained) -> tuple[np.ndarray, tuple[str, ...]]:
     """Rows of held-out frames, and a note where there is no time for all of them."""
     heldout = run.capture.heldout
-    seconds = outcome.renderer.ms_per_frame(1) / 1e3
+    seconds = trained.renderer.ms_per_frame(1) / 1e3
     count = budget.scored(seconds, len(heldout))
     if count == len(heldout):
         return heldout, ()
@@ -95,10 +98,10 @@ def frames_to_score(run: Run, outcome: Outcome) -> tuple[np.ndarray, tuple[str, 
 
 
 def measured(
-    run: Run, outcome: Outcome, scored: Scored, ms_per_frame: float, began: float
+    run: Run, trained: Trained, scored: Scored, ms_per_frame: float, began: float
 ) -> list[Metric]:
     """The figures of a run."""
-    result = outcome.result
+    result = trained.result
     counts = run.model.counts(result.state)
     seconds, fps = time.perf_counter() - began, 1e3 / ms_per_frame
     return [
@@ -191,9 +194,9 @@ def save_comparison(path: pathlib.Path, capture: Capture, scored: Scored):
     return path
 
 
-def save_curve(path: pathlib.Path, run: Run, outcome: Outcome):
+def save_curve(path: pathlib.Path, run: Run, trained: Trained):
     """PSNR against seconds; None where the run ended before it was evaluated."""
-    history = outcome.result.history
+    history = trained.result.history
     if not history.evaluations:
         return None
     points = pictures.History(
@@ -239,27 +242,22 @@ def save_depth(folder: pathlib.Path, capture: Capture, scored: Scored) -> None:
         exr.write_exr(folder / f"{name}.exr", alpha=alpha, depth=depth)
 
 
-def _next(folder, run, outcome):
-    commands = [
-        report.Command(
-            "Render it from other cameras, at other times:",
-            f"python -m experiments.render {folder} --path orbit",
-        )
-    ]
-    if outcome.result.stopped_by == "non-finite":
-        return commands  # resumed, it would stop at the same step
-    if outcome.result.steps < run.spec.steps:
-        line = f"python -m experiments.reconstruct --out {folder} --resume"
-        return [*commands, report.Command("Train it to the end:", line)]
-    capture = "" if run.config.capture is None else f" {run.config.capture}"
-    line = (
-        f"python -m experiments.reconstruct{capture} --preset {run.config.preset} "
-        f"--steps {2 * run.spec.steps}"
+def _next(folder, run, trained):
+    """What a user may want to run next."""
+    looked = report.Command(
+        "Render it from other cameras, at other times:", commands.render(folder)
     )
-    return [*commands, report.Command("Train it twice as long:", line)]
+    if trained.result.stopped_by == "non-finite":
+        return [looked]  # resumed, it would stop at the same step
+    if trained.result.steps < run.spec.steps:
+        line = commands.resume(folder)
+        return [looked, report.Command("Train it to the end:", line)]
+    longer = dataclasses.replace(run.config, steps=2 * run.spec.steps)
+    line = commands.reconstruct(longer)
+    return [looked, report.Command("Train it twice as long:", line)]
 
 
-def _say(folder, page, metrics, commands):
+def _say(folder, page, metrics, following):
     value = {metric.key: metric.value for metric in metrics}
     print(
         f"held out: {value['heldout.psnr']:.2f} dB, SSIM {value['heldout.ssim']:.3f} "
@@ -270,5 +268,5 @@ def _say(folder, page, metrics, commands):
     print(f"report:     {page}")
     print(f"comparison: {folder / 'comparison.png'}")
     print(f"film:       {folder / 'scene.mp4'}")
-    for command in commands:
+    for command in following:
         print(f"{command.purpose}\n  {command.line}")

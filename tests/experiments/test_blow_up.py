@@ -7,6 +7,7 @@ import pytest
 from experiments import reconstruct
 from nerfies_jax import runs
 from nerfies_jax.capture import nerfies_format
+from nerfies_jax.runs import run_folder
 from nerfies_jax.training import checkpoint
 from tests import scenes
 from tests.hard_cases import hostile
@@ -41,7 +42,7 @@ def held(folder):
     run = runs.saved_run(folder)
     restored = runs.restore(folder, run)
     assert not hostile.not_finite(restored.state)
-    assert restored.step == checkpoint.latest(folder / runs.CHECKPOINTS)
+    assert restored.step == checkpoint.latest(folder / run_folder.CHECKPOINTS)
     return restored.step
 
 

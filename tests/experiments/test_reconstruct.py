@@ -15,9 +15,10 @@ from gaussians_jax import model_file, scene
 from nerfies_jax import evaluation, runs
 from nerfies_jax.capture import exr, images, nerfies_format, video
 from nerfies_jax.evaluation import pictures
-from nerfies_jax.runs import products, representations
+from nerfies_jax.runs import platform, representations
 from nerfies_jax.training.model import TrainState
 from tests import scenes
+from tests.evidence import films
 
 QUICK = (
     "density.interval=4",
@@ -155,9 +156,30 @@ def test_help_names_the_presets(capsys):
         reconstruct.main(["--help"])
     assert stop.value.code == 0
     page = re.sub(r"[\s│]", "", capsys.readouterr().out)  # as if it were one line
-    for make in representations.MAKERS.values():
-        for preset in make().presets:
+    for kind in representations.installed().values():
+        for preset in kind.presets:
             assert preset.removesuffix("-small") in page
+
+
+def test_effects_auto_takes_the_advice_and_the_users_word_comes_last(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(platform, "start_jax", lambda *_: None)
+    nerfies_format.write(films.film(), tmp_path / "film")
+    taken = {}
+
+    def caught(config, stored):
+        taken["config"] = config
+        raise ValueError("caught")
+
+    monkeypatch.setattr(runs, "new_run", caught)
+    with pytest.raises(SystemExit):
+        reconstruct.main(
+            [str(tmp_path / "film"), "--effects", "auto", "--set", "sh_degree=0"]
+        )
+    assert taken["config"].preset == "splats-static-small"
+    assert taken["config"].overrides[-1] == "sh_degree=0"
+    assert "effects: --preset splats-static-small" in capsys.readouterr().out
 
 
 @pytest.fixture(scope="module")
@@ -254,26 +276,6 @@ def test_the_model_file_is_enough_to_draw_a_frame(run):
     metrics = json.loads((run / "metrics.json").read_text())
     np.testing.assert_allclose(found.psnr.mean(), metrics["heldout.psnr"], atol=1e-3)
     assert found.colour.shape[1:3] == capture.size[::-1]
-
-
-@pytest.mark.parametrize(("preset", "notes"), [("moba-small", 1), ("splats-static", 0)])
-def test_the_size_and_speed_stand_beside_the_papers(preset, notes):
-    saved = representations.Saved(2_345_678)
-    lines = products.beside_the_paper(preset, saved, 40.0)
-    assert len(lines) == notes
-    for line in lines:
-        for words in (
-            "2.3 MB",
-            "25 frames",
-            "11.3 MB",
-            "163 frames",
-            "A100",
-            "context",
-        ):
-            assert words in line
-    assert not products.beside_the_paper(preset, representations.Saved(), 40.0)
-    (size,) = products.model_size(saved)
-    assert (size.key, size.value) == ("file.bytes", 2_345_678)
 
 
 @pytest.mark.slow
@@ -389,8 +391,8 @@ def test_held_out_frames_are_rendered_under_their_names(run, tmp_path):
 @pytest.mark.slow
 def test_a_stopped_run_resumes_to_its_end(run, tmp_path, capsys):
     folder = tmp_path / "stopped"
-    filmed = json.loads((run / "config.json").read_text())["choices"]["capture"]
-    common = [filmed, "--steps", "12", "--out", str(folder)]
+    filmed = runs.saved_run(run).config.source.capture
+    common = [str(filmed), "--steps", "12", "--out", str(folder)]
     with pytest.raises(SystemExit) as stop:
         reconstruct.main([*common, "--seconds", "0.001", "--set", *QUICK])
     assert stop.value.code == 0

@@ -66,7 +66,11 @@ def test_a_scene_of_gaussians_is_saved_as_a_model_and_for_viewers(moving, tmp_pa
 @pytest.fixture
 def opened(monkeypatch):
     """What `saved_run` opens, without reading a capture."""
-    monkeypatch.setattr(run, "open_run", lambda *given: given)
+
+    def unread(config, kind, spec):
+        return runs.Run(config, None, kind, spec, None, None)
+
+    monkeypatch.setattr(run, "open_run", unread)
 
 
 def save(folder, preset):
@@ -82,8 +86,9 @@ def save(folder, preset):
 def test_a_run_folder_knows_its_representation(name, tmp_path):
     preset, *_ = representations.named(name).presets
     saved = save(tmp_path, preset)
-    config, kind, spec = runs.saved_run(tmp_path)
-    assert (config, spec) == saved
+    found = runs.saved_run(tmp_path)
+    assert (found.config, found.spec) == saved
+    kind = found.representation
     assert kind is representations.of_run(tmp_path) is representations.named(name)
 
 

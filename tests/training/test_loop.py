@@ -193,7 +193,7 @@ def test_chunks_of_slow_steps_stay_short_enough_to_interrupt(frames, monkeypatch
     assert len(lengths) < 25
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_the_run_after_its_chunk(number, frames, straight):
     def send(state, step):
         if step == 11:
@@ -215,9 +215,21 @@ def test_a_second_interrupt_does_not_wait(frames):
         os.kill(os.getpid(), signal.SIGINT)
         time.sleep(5)
 
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(KeyboardInterrupt, match="a second time"):
         fit(frames, steps=1000, hooks=[loop.Hook("send", send, every_steps=3)])
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_signal_that_is_to_be_ignored_still_is(frames):
+    def send(state, step):
+        os.kill(os.getpid(), signal.SIGHUP)
+
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
+    try:
+        result = fit(frames, steps=4, hooks=[loop.Hook("send", send, every_steps=2)])
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert result.stopped_by == "steps"
 
 
 def test_a_run_outside_the_main_thread_leaves_signals_alone(frames):

@@ -1,22 +1,13 @@
-"""Trained scenes drawn otherwise."""
-
-import dataclasses
+"""Trained Gaussians drawn otherwise."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import variants
-from gaussians_jax import scene, splats, still_rows
+from gaussians_jax import scene, splats, still_rows, variants
 from gaussians_jax.splats import Gaussians
-from nerfies_jax import evaluation, held_out_codes
-from nerfies_jax import scene as nerf_scene
-from nerfies_jax.effects.appearance import AppearanceSpec
-from nerfies_jax.effects.warp import WarpSpec
-from nerfies_jax.nets.encoding import EncodingSpec
-from nerfies_jax.radiance.template import TemplateSpec
-from nerfies_jax.spec import RadianceScene, SamplingSpec
+from nerfies_jax import evaluation
 from nerfies_jax.training.model import TrainState
 from tests import scenes
 
@@ -38,7 +29,9 @@ def moving():
 def test_splats_without_motion_are_the_canonical_ones(moving):
     metadata, model, params, view = moving
     step = jnp.asarray(20, jnp.int32)
-    draw = variants.of_splats(scenes.TINY_DEFORMABLE, metadata, ("motion",), False)
+    draw = variants.without_effects(
+        scenes.TINY_DEFORMABLE, metadata, ("motion",), False
+    )
     still = scene.build(scenes.TINY_SPLATS, metadata).render
     found, expected, moved = (
         jax.jit(each, static_argnums=2)(params, view, SIZE, step).colour
@@ -51,14 +44,14 @@ def test_splats_without_motion_are_the_canonical_ones(moving):
 def test_an_effect_that_is_not_there_cannot_be_left_out(moving):
     metadata = moving[0]
     with pytest.raises(ValueError, match=r"--without warp: .* those are: motion"):
-        variants.of_splats(scenes.TINY_DEFORMABLE, metadata, ("warp",), False)
+        variants.without_effects(scenes.TINY_DEFORMABLE, metadata, ("warp",), False)
     with pytest.raises(ValueError, match=r"--without motion: .* those are: none"):
-        variants.of_splats(scenes.TINY_SPLATS, metadata, ("motion",), False)
+        variants.without_effects(scenes.TINY_SPLATS, metadata, ("motion",), False)
 
 
 def test_splats_have_no_appearance_to_blend(moving):
     with pytest.raises(ValueError, match=r"--appearance: splats .* nerf-w"):
-        variants.of_splats(scenes.TINY_SPLATS, moving[0], (), True)
+        variants.without_effects(scenes.TINY_SPLATS, moving[0], (), True)
 
 
 def state_of(params):
@@ -113,7 +106,7 @@ def test_a_faster_model_draws_what_the_model_draws(swaying):
         evaluation.Renderer(model, SIZE)(state, view).colour
         for model, state in ((model, state), made[:2], (whole, made.state))
     )
-    still = variants.of_splats(*model.spec, ("motion",), False)
+    still = variants.without_effects(*model.spec, ("motion",), False)
     assert (
         np.abs(evaluation.Renderer(still, SIZE)(state, view).colour - exact).max() > 0.1
     )
@@ -193,7 +186,9 @@ def test_a_static_scene_of_nothing_is_refused(swaying):
 
 
 def test_fields_and_still_scenes_have_no_knots(moving, swaying):
-    still = variants.of_splats(scenes.TINY_DEFORMABLE, moving[0], ("motion",), False)
+    still = variants.without_effects(
+        scenes.TINY_DEFORMABLE, moving[0], ("motion",), False
+    )
     with pytest.raises(ValueError, match="nothing in this run moves farther than 0 "):
         variants.from_knots(still, swaying[1], 8)
     field = still._replace(stages=None)
@@ -201,141 +196,3 @@ def test_fields_and_still_scenes_have_no_knots(moving, swaying):
         variants.from_knots(field, swaying[1], 8)
     with pytest.raises(ValueError, match="--still-below is for runs of Gaussians"):
         variants.without_still(field, swaying[1], 0.1)
-
-
-def test_an_appearance_is_named_by_its_frame_or_its_number():
-    capture = scenes.tiny_capture()
-    name = capture.ids[2]
-    expected = int(capture.appearance_ids[2])
-    assert variants.appearance_id(capture, name) == expected
-    assert variants.appearance_id(capture, str(expected)) == expected
-    for wrong in ("nobody", "-1", "1000"):
-        with pytest.raises(ValueError, match=f"--appearance {wrong}: neither a frame"):
-            variants.appearance_id(capture, wrong)
-
-
-TINY_FIELD = RadianceScene(
-    steps=10,
-    template=TemplateSpec(
-        EncodingSpec(2), EncodingSpec(1), depth=1, width=8, skips=(), colour_width=8
-    ),
-    sampling=SamplingSpec(4, 0),
-    appearance=AppearanceSpec(width=3),
-    warp=WarpSpec(position=EncodingSpec(2), depth=1, width=8, skips=()),
-)
-
-
-@pytest.fixture(scope="module")
-def field():
-    """A field whose warp and codes show, and a view of it."""
-    capture = scenes.tiny_capture()
-    metadata = nerf_scene.metadata_of(capture, TINY_FIELD)
-    params = nerf_scene.field(TINY_FIELD, metadata).init(jax.random.key(3))
-    params["warp"] = jax.tree.map(lambda leaf: leaf + 0.1, params["warp"])
-    params["codes"] = jax.tree.map(lambda leaf: 40 * leaf, params["codes"])
-    view = evaluation.view_of(capture, int(capture.heldout[0]))
-    return metadata, params, view
-
-
-def drawn(field, seen, without=(), blended=False):
-    metadata, params, _ = field
-    draw = variants.of_fields(TINY_FIELD, metadata, without, blended)
-    step = jnp.asarray(10, jnp.int32)
-    return jax.jit(draw.render, static_argnums=2)(params, seen, SIZE, step).colour
-
-
-def test_a_field_without_its_warp_is_the_template(field):
-    metadata, params, view = field
-    found = drawn(field, view, without=("warp",))
-    still = dataclasses.replace(TINY_FIELD, warp=None)
-    step = jnp.asarray(10, jnp.int32)
-    codes = {"appearance": params["codes"]["appearance"]}
-    model = nerf_scene.build(still, metadata)
-    expected = jax.jit(model.render, static_argnums=2)(
-        {"template": params["template"], "codes": codes}, view, SIZE, step
-    ).colour
-    np.testing.assert_allclose(found, expected, atol=1e-6)
-    assert np.abs(found - drawn(field, view)).max() > 1e-3
-
-
-def test_a_blend_starts_at_one_appearance_and_ends_at_the_other(field):
-    view = field[2]
-    first, last = (
-        view._replace(appearance=jnp.asarray(row, jnp.int32)) for row in (0, 5)
-    )
-    ends = [drawn(field, end) for end in (first, last)]
-    assert np.abs(ends[0] - ends[1]).max() > 0.02
-
-    def at(share):
-        share = jnp.asarray(share, jnp.float32)
-        between = variants.Between(first, last.appearance, share)
-        return drawn(field, between, blended=True)
-
-    np.testing.assert_allclose(at(0.0), ends[0], atol=1e-6)
-    np.testing.assert_allclose(at(1.0), ends[1], atol=1e-6)
-    assert all(np.abs(at(0.5) - end).max() > 0.005 for end in ends)
-
-
-def test_what_feeds_the_network_cannot_be_left_out(field):
-    with pytest.raises(ValueError, match=r"--without appearance: .* those are: warp"):
-        variants.of_fields(TINY_FIELD, field[0], ("appearance",), False)
-
-
-def test_a_field_without_codes_has_no_appearance_to_blend(field):
-    plain = dataclasses.replace(TINY_FIELD, appearance=None)
-    with pytest.raises(ValueError, match=r"--appearance: .* no appearance codes"):
-        variants.of_fields(plain, field[0], (), True)
-
-
-def repainted(capture, field, rows):
-    """The capture as the field itself would film it, in appearances it never learnt."""
-    metadata, params, _ = field
-    made = nerf_scene.field(TINY_FIELD, metadata)
-    draw = jax.jit(made.render, static_argnums=4)
-    step, pictures = jnp.asarray(10, jnp.int32), capture.images.copy()
-    for row in rows:
-        view = evaluation.view_of(capture, int(row))
-        codes = made.codes_at(params, view)
-        codes["appearance"] = jnp.asarray([3.0, -4.0, 2.0])
-        colour = draw(params, view.camera, view.time, codes, capture.size, step).colour
-        pictures[row] = evaluation.as_picture(np.asarray(colour))
-    return dataclasses.replace(capture, images=pictures)
-
-
-@pytest.mark.slow
-def test_a_code_is_found_again_from_half_a_picture(field):
-    metadata, params, _ = field
-    capture = scenes.tiny_capture()
-    rows = capture.heldout[:1]
-    capture = repainted(capture, field, rows)
-    state = TrainState(params, (), (), jnp.asarray(10, jnp.int32), jax.random.key(0))
-    model = nerf_scene.build(TINY_FIELD, metadata)
-    renderer = evaluation.Renderer(model, capture.size)
-    before = evaluation.score_right_halves(
-        capture, rows, evaluation.score(renderer, state, capture, rows).colour
-    )
-    found = held_out_codes.score(TINY_FIELD, metadata, state, capture, rows)
-    assert before.psnr[0] < 35
-    assert found.psnr[0] > 48  # the truth has 8 bits: 59 dB is all there is
-    assert found.ssim[0] > 0.99
-
-
-@pytest.mark.slow
-def test_a_half_that_was_not_filmed_keeps_the_code_it_had(field):
-    metadata, params, _ = field
-    capture = scenes.tiny_capture()
-    rows = capture.heldout[:1]
-    valid = np.ones(capture.images.shape[:3], bool)
-    valid[:, :, :20] = False
-    capture = dataclasses.replace(repainted(capture, field, rows), valid=valid)
-    state = TrainState(params, (), (), jnp.asarray(10, jnp.int32), jax.random.key(0))
-    renderer = evaluation.Renderer(nerf_scene.build(TINY_FIELD, metadata), capture.size)
-    colour = evaluation.score(renderer, state, capture, rows).colour
-    before = evaluation.score_right_halves(capture, rows, colour)
-    found = held_out_codes.score(TINY_FIELD, metadata, state, capture, rows)
-    np.testing.assert_allclose(found.psnr, before.psnr, atol=1e-3)
-
-
-def test_a_field_without_codes_has_none_to_fit(field):
-    plain = dataclasses.replace(TINY_FIELD, appearance=None)
-    assert held_out_codes.score(plain, field[0], None, None, None) is None
