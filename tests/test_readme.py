@@ -31,8 +31,9 @@ def test_the_program_trains_renders_and_scores(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     with jax.numpy_dtype_promotion("standard"):  # JAX's own, as a user has it
         exec(compile(program.replace(", 500)", ", 2)"), "README.md", "exec"), {})
-    found = re.search(r"2 held-out frames: (\d+\.\d\d) dB", capsys.readouterr().out)
-    assert 0 < float(found[1]) < 60
+    said = re.search(r"(\d+) held-out frames: (\S+) dB", capsys.readouterr().out)
+    assert int(said[1]) == len(capture.heldout)
+    assert 0 < float(said[2]) < 60
     with PIL.Image.open("held_out.png") as picture:
         assert picture.size == capture.size
 

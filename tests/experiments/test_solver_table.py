@@ -22,8 +22,11 @@ SMALL = dict(
 
 @pytest.mark.slow
 def test_the_table_holds_solvers_against_the_best_known_code(tmp_path, capsys):
-    settings = solver_table.Settings(steps=(2, 8), out=tmp_path / "t.json", **SMALL)
-    rows = solver_table.main(settings)
+    words = ["--steps", "2", "8", "--out", str(tmp_path / "t.json")]
+    for name, value in SMALL.items():
+        many = value if isinstance(value, tuple) else (value,)
+        words += [f"--{name.replace('_', '-')}", *map(str, many)]
+    rows = solver_table.main(words)
     assert {(r.solver, r.max_steps) for r in rows} == {
         (name, steps) for name in ("lbfgs", "adam") for steps in (2, 8)
     }
