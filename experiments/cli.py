@@ -47,6 +47,11 @@ def parse(settings_class, arguments=None):
     return tyro.cli(settings_class, args=arguments)
 
 
+def formerly(option):
+    """For `Annotated`: the option is understood by its earlier name as well."""
+    return tyro.conf.arg(aliases=[option])
+
+
 @contextlib.contextmanager
 def user_errors(kinds: tuple[type[Exception], ...] = (ValueError, OSError)):
     """Wrong input in one line and exit code 2; our own bugs keep their traceback.

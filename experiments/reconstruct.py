@@ -26,9 +26,9 @@ class Reconstruct:
 
     source: cli.Source = cli.NamedSource()
     preset: str | None = None
-    """Gaussian splats: splats-static, splats-deformable, sonata, moba. Radiance fields:
-    nerf, nerf-w, d-nerf, t-nerf, nerfies, hypernerf, nsff. Each with -small is made for
-    a CPU (default: splats-deformable-small)."""
+    """Gaussian splats: splats-static, splats-mcmc, splats-deformable, sonata, moba.
+    Radiance fields: nerf, nerf-w, d-nerf, t-nerf, nerfies, hypernerf, nsff. Each with
+    -small is made for a CPU (default: splats-deformable-small)."""
     effects: Literal["preset", "auto"] = "preset"
     """auto: look at the capture first and take the effects that it calls for, in the
     representation and size of the preset (see experiments.inspect_scene)."""
@@ -45,7 +45,7 @@ class Reconstruct:
     seed: int | None = None
     """Of everything random (default: 0)."""
     set: tuple[str, ...] = ()
-    """Fields of the preset, as density.most=20000 motion.width=128 warp=none."""
+    """Fields of the preset: densification.cap_max=20000 motion.width=128 warp=none."""
     evaluate_every: float = 20.0
     """Seconds of training between two points of the PSNR curve."""
     checkpoint_every: float = 60.0

@@ -37,8 +37,8 @@ def follow(spec, facts, state, capture, known) -> Followed | None:
         [np.asarray(pose(state.params, prepared, time).mean) for time in times]
     )
     first = pose(state.params, prepared, times[known.start])
-    alive = np.asarray(splats.alive(state.params.rows["splats"]))
-    opacity = np.where(alive, np.asarray(first.opacity), 0.0)
+    active = np.asarray(splats.active_mask(state.params.rows["splats"]))
+    opacity = np.where(active, np.asarray(first.opacity), 0.0)
     path = carried(known.start_points, means, opacity, known.start)
     drift = float("nan")
     if capture.points is not None:

@@ -8,8 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from gaussians_jax import density, phases, rates, rendering, splats, start
+from gaussians_jax import (
+    densification,
+    initialisation,
+    learning_rates,
+    mcmc,
+    phases,
+    rendering,
+    splats,
+)
+from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.effects import deformation
+from gaussians_jax.mcmc import MCMCStrategySpec
 from gaussians_jax.phases import Trained
 from gaussians_jax.spec import (
     OPTIMISERS,
@@ -27,6 +37,7 @@ from nerfies_jax.training.effects import (
     FrameCondition,
     Observation,
     PenaltyContext,
+    Term,
     joined,
     penalty_terms,
     stream,
@@ -48,7 +59,7 @@ from nerfies_jax.training.updates import apply_updates
 PyTree = Any
 
 # Streams of the run's key beside those of the steps, which are its 0, 1, 2, ...
-ORDER, EVENT = 2**32 - 1, 2**32 - 2
+ORDER, EVENT, NOISE = 2**32 - 1, 2**32 - 2, 2**32 - 3
 
 
 def metadata_of(capture: Capture) -> SceneMetadata:
@@ -65,7 +76,7 @@ def metadata_of(capture: Capture) -> SceneMetadata:
 class AuxState(NamedTuple):
     """What a scene keeps beside its parameters; everything in it has rows."""
 
-    stats: PyTree  # density.RowStats, or () without density control
+    stats: PyTree  # densification.RowStats, or () where no strategy keeps them
     effects: dict[str, PyTree]  # by the name of the effect
 
 
@@ -167,13 +178,13 @@ def _stepper(spec, metadata, effects, optimiser):
         size = frames.images.shape[2], frames.images.shape[1]
         degree = splats.active_degree(state.step, spec.sh_every, spec.sh_degree)
         condition = FrameCondition(view.time, step=state.step, key=loop.step_key(state))
-        turn = phases.turn(spec.alternation, state.step)
+        mask = phases.update_mask(spec.alternation, state.step)
 
         def posed(params, gaussians):
             return deformation.pose_in_training(effects, params, gaussians, condition)
 
         if spec.alternation is not None:
-            posed = phases.spared(turn, posed)
+            posed = phases.stop_frozen_gradients(mask, posed)
         # A channel that nothing reads is still blended: 4 % of a step.
         read = any("depths" in effect.required_data for effect in effects)
         depth = read and frames.depths is not None
@@ -193,16 +204,20 @@ def _stepper(spec, metadata, effects, optimiser):
         (value, (metrics, footprints, *poses)), (grads, mean2d_grad) = (
             jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)(state.params, probe)
         )
-        updates, moments = optimiser.update(grads, state.optimiser, state.params)
+        updates, opt_state = optimiser.update(grads, state.optimiser, state.params)
         by_part = _learning_rates(spec, metadata, effects, state.step)
-        trained = Trained(apply_updates(state.params, updates, by_part), moments)
+        trained = Trained(apply_updates(state.params, updates, by_part), opt_state)
+        if isinstance(spec.densification, MCMCStrategySpec):
+            noise_key, rate = _stream(state, NOISE), by_part.rows["splats"].mean
+            params = mcmc.shake(noise_key, trained.params, rate, spec.densification)
+            trained = trained._replace(params=params)
         if spec.alternation is not None:
             before = Trained(state.params, state.optimiser)
-            trained = phases.hold(optimiser, turn, before, trained)
+            trained = phases.freeze(optimiser, mask, before, trained)
         stats, states = state.aux_state
-        if spec.density is not None:
+        if isinstance(spec.densification, DefaultStrategySpec):
             radius_px = jnp.max(footprints.extent_px, axis=1)
-            stats = density.observe(
+            stats = densification.observe(
                 stats, mean2d_grad, footprints.visible, radius_px, size
             )
         for effect in effects:
@@ -238,6 +253,9 @@ def loss_of(
         at_time=deformation.poser(effects, condition),
     )
     terms = penalty_terms(effects, params.nets, context, states)
+    if isinstance(spec.densification, MCMCStrategySpec):
+        cost = mcmc.penalty(params.rows["splats"], spec.densification)
+        terms["mcmc/penalty"] = Term(cost, 1.0)
     metrics = {"mse": losses.mse(colour, truth, valid)} | values(terms)
     return weighted_sum(terms, photometric), metrics
 
@@ -262,8 +280,8 @@ def _view(frames, row):
 def _learning_rates(spec, metadata, effects, step):
     """A prefix of `Params` with the learning rate of everything below each leaf."""
     rows = {
-        "splats": rates.learning_rates(
-            spec.rates, metadata.extent, spec.steps, step, spec.annealing
+        "splats": learning_rates.at_step(
+            spec.learning_rates, metadata.extent, spec.steps, step, spec.annealing
         )
     }
     nets = {}
@@ -283,13 +301,13 @@ def shuffled_row(
     return jax.random.permutation(epoch, frames)[step % frames]
 
 
-def first_bytes(spec: SplatScene, capture: Capture) -> int:
+def estimate_memory_bytes(spec: SplatScene, capture: Capture) -> int:
     """Roughly the memory of the first state and step; host side, nothing allocated."""
-    count = start.first_count(spec.start, capture)
+    count = initialisation.initial_count(spec.init, capture)
     harmonics = 3 * (spec.sh_degree + 1) ** 2
     # Parameters, two moments, gradient, update; the tables of one projection.
     numbers = count * (5 * (11 + harmonics) + 60)
-    # A slab holds keys, rows and blending inputs of every pair.
+    # A chunk holds keys, rows and blending inputs of every pair.
     numbers += 16 * (spec.raster.capacity or 0)
     return 4 * numbers + capture.images.nbytes
 
@@ -300,13 +318,17 @@ def first_state(spec, effects, optimiser, capture, key) -> TrainState:
     rendering.refuse_distortion(capture.cameras)
     start_key, run_key = jax.random.split(key)
     seed = int(jax.random.randint(start_key, (), 0, np.iinfo(np.int32).max))
-    position, colour = start.first_points(spec.start, capture, seed)
+    position, colour = initialisation.initial_points(spec.init, capture, seed)
     rows = splats.from_points(
-        position, colour, degree=spec.sh_degree, opacity=spec.start.opacity
+        position,
+        colour,
+        degree=spec.sh_degree,
+        opacity=spec.init.opacity,
+        scale=spec.init.scale,
     )
-    rows = start.narrowed(rows, capture, spec.start.widest)
+    rows = initialisation.clamp_scales(rows, capture, spec.init.max_scale)
     count = len(position)
-    most = None if spec.density is None else spec.density.most
+    most = None if spec.densification is None else spec.densification.cap_max
     params = Params({"splats": rows}, {})
     for effect in effects:
         effect_key = jax.random.fold_in(start_key, stream(effect.name))
@@ -317,18 +339,27 @@ def first_state(spec, effects, optimiser, capture, key) -> TrainState:
             params.nets[effect.name] = effect.init(nets_key)
     params = splats.pad_rows(params, splats.capacity_for(count, most))
     params = in_default_precision(params)
-    stats = () if spec.density is None else density.empty_stats(params.rows["splats"])
+    stats = ()
+    if isinstance(spec.densification, DefaultStrategySpec):
+        stats = densification.empty_stats(params.rows["splats"])
     aux_state = AuxState(stats, states_of(effects, params))
     return TrainState(
         params, optimiser.init(params), aux_state, jnp.zeros((), jnp.int32), run_key
     )
 
 
+def _stream(state, name):
+    """A key of this step for something beside `loop.step_key`."""
+    return jax.random.fold_in(jax.random.fold_in(state.key, name), state.step)
+
+
 def _events(spec, metadata, effects, optimiser):
-    if spec.density is None:
+    if spec.densification is None:
         return ()
-    plan = spec.density
-    last = min(plan.stop, spec.steps)
+    plan = spec.densification
+    if isinstance(plan, MCMCStrategySpec):
+        return _mcmc_events(plan, spec.steps, effects, optimiser)
+    last = min(plan.refine_stop_iter, spec.steps)
 
     def densify(state, frames):
         del frames
@@ -337,13 +368,13 @@ def _events(spec, metadata, effects, optimiser):
         for effect in effects:
             if effect.grow_score is not None:
                 factor = effect.grow_score(states[effect.name], step)
-                stats = stats._replace(gradient=stats.gradient * jnp.asarray(factor))
-        changed = density.densify(
+                stats = stats._replace(grad2d=stats.grad2d * jnp.asarray(factor))
+        changed = densification.densify(
             optimiser,
             state.params,
             state.optimiser,
             stats,
-            jax.random.fold_in(jax.random.fold_in(state.key, EVENT), state.step),
+            _stream(state, EVENT),
             plan,
             step=step,
             extent=metadata.extent,
@@ -355,25 +386,39 @@ def _events(spec, metadata, effects, optimiser):
 
     def reset(state, frames):
         del frames
-        params, moments = density.reset_opacity(
+        params, moments = densification.reset_opacity(
             optimiser, state.params, state.optimiser, plan
         )
         return state._replace(params=params, optimiser=moments)
 
-    grow = tuple(range(plan.start, last, plan.interval))
+    grow = tuple(range(plan.refine_start_iter, last, plan.refine_every))
     return (
         Event("densify", grow, densify),
         Event(
             "reset opacity",
-            tuple(range(plan.reset_interval, last, plan.reset_interval)),
+            tuple(range(plan.reset_every, last, plan.reset_every)),
             reset,
         ),
     )
 
 
+def _mcmc_events(plan, steps, effects, optimiser):
+    def refine(state, frames):
+        del frames
+        params, moments, _ = mcmc.refine(
+            optimiser, state.params, state.optimiser, _stream(state, EVENT), plan
+        )
+        aux_state = AuxState((), states_of(effects, params))
+        return state._replace(params=params, optimiser=moments, aux_state=aux_state)
+
+    last = min(plan.refine_stop_iter, steps)
+    when = tuple(range(plan.refine_start_iter, last, plan.refine_every))
+    return (Event("relocate and add", when, refine),)
+
+
 def count_rows(state: TrainState) -> dict[str, int]:
-    """Living Gaussians, and `parameters`: the numbers of them and the networks."""
-    counts = {"gaussians": int(splats.alive(state.params.rows["splats"]).sum())}
+    """Active Gaussians, and `parameters`: the numbers of them and the networks."""
+    counts = {"gaussians": int(splats.active_mask(state.params.rows["splats"]).sum())}
     rows = jax.tree.leaves(state.params.rows)
     nets = jax.tree.leaves(state.params.nets)
     each = sum(math.prod(leaf.shape[1:]) for leaf in rows)

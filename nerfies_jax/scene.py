@@ -206,7 +206,7 @@ def _colour_terms(levels: tuple[RayOutput, ...], batch: Batch) -> dict[str, Term
     return terms
 
 
-def first_bytes(spec: RadianceScene, capture: Capture) -> int:
+def estimate_memory_bytes(spec: RadianceScene, capture: Capture) -> int:
     """Roughly the memory of the first state and step; host side, nothing allocated."""
     samples = 2 * spec.sampling.coarse + spec.sampling.fine
     widths = spec.template.depth * spec.template.width + spec.template.colour_width

@@ -11,13 +11,20 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from gaussians_jax import density, harmonics, optimiser, projection, raster, splats
+from gaussians_jax import (
+    densification,
+    harmonics,
+    optimiser,
+    projection,
+    raster,
+    splats,
+)
+from gaussians_jax import learning_rates as splat_rates
 from gaussians_jax import presets as splat_presets
-from gaussians_jax import rates as splat_rates
 from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec
+from gaussians_jax.initialisation import InitSpec
 from gaussians_jax.splats import Params
-from gaussians_jax.start import StartSpec
 from nerfies_jax import presets as field_presets
 from nerfies_jax.geometry import rays
 from nerfies_jax.nets import encoding
@@ -101,9 +108,9 @@ def tiny_splats(name):
         )
     return dataclasses.replace(
         spec,
-        start=StartSpec(random=100, fewest=1000),
+        init=InitSpec(random=100, min_points=1000),
         sh_degree=1,
-        density=shrunk(spec.density, most=256),
+        densification=shrunk(spec.densification, cap_max=256),
         motion=motion,
         acceleration=shrunk(spec.acceleration, samples=16),
         neighbours=shrunk(spec.neighbours, count=3),
@@ -192,7 +199,7 @@ def splat_step(spec, metadata, shuffled_row):
         colour = harmonics.colour_towards(shown, gaussians.mean, camera.position)
         seen = projection.project(gaussians, camera, size, spec.raster)
         placed = seen
-        if offset is not None:  # whose gradient the density control wants to know
+        if offset is not None:  # whose gradient densification wants to know
             placed = seen._replace(mean_px=seen.mean_px + offset)
         image, passing = raster.rasterise(placed, colour, size, spec.raster)
         behind = jnp.asarray(metadata.background, image.dtype)
@@ -214,22 +221,22 @@ def splat_step(spec, metadata, shuffled_row):
             return value, (losses.mse(image, truth, valid), seen)
 
         still, wanted = None, (0,)
-        if spec.density is not None:
+        if spec.densification is not None:
             still = jnp.zeros_like(state.params.rows["splats"].mean[:, :2])
             wanted = (0, 1)
         (value, (mse, seen)), grads = jax.value_and_grad(
             loss, argnums=wanted, has_aux=True
         )(state.params, still)
         updates, moments = update(grads[0], state.optimiser, state.params)
-        rates = splat_rates.learning_rates(
-            spec.rates, metadata.extent, spec.steps, state.step
+        rates = splat_rates.at_step(
+            spec.learning_rates, metadata.extent, spec.steps, state.step
         )
         rates = Params({"splats": rates}, {})
         params = apply_updates(state.params, updates, rates)
         aux_state = state.aux_state
-        if spec.density is not None:
+        if spec.densification is not None:
             radius_px = jnp.max(seen.extent_px, axis=1)
-            stats = density.observe(
+            stats = densification.observe(
                 aux_state.stats, grads[1], seen.visible, radius_px, size
             )
             aux_state = aux_state._replace(stats=stats)

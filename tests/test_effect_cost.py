@@ -36,7 +36,7 @@ LEANS_ON = {
     "alternation": ("motion",),
     "acceleration": ("motion",),
     "neighbours": ("motion",),
-    "motion_growth": ("motion", "density"),
+    "motion_growth": ("motion", "densification"),
 }
 
 
@@ -157,8 +157,10 @@ def test_splats_without_effects_are_the_static_ones_bit_for_bit(name):
 
 
 @pytest.mark.slow
-def test_splats_without_density_control_keep_no_statistics_of_it():
-    spec = dataclasses.replace(bare_scenes.tiny_splats("splats-static"), density=None)
+def test_splats_without_densification_keep_no_statistics_of_it():
+    spec = dataclasses.replace(
+        bare_scenes.tiny_splats("splats-static"), densification=None
+    )
     run = started_splats(spec)
     assert jax.tree.leaves(run.state.aux_state) == []
     step = bare_scenes.splat_step(run.spec, run.metadata, splat_scene.shuffled_row)

@@ -10,7 +10,8 @@ HOW = """\
 ## How to read
 
 - The first table has every preset as it is. Those below change one thing in one of
-  them: *time* is then the training time over that of the preset.
+  them, written as when it was measured (fields may have other names since): *time* is
+  then the training time over that of the preset.
 - *moves* is the PSNR of what moves, *depth* the median error of depth and *EPE* the
   mean distance of followed points from where they really are, both in scene
   units{still}.

@@ -30,7 +30,7 @@ class Moving(NamedTuple):
     name: str
     pose: Callable  # time -> Gaussians, compiled
     draw: Callable  # (Gaussians, time) -> colour, compiled
-    alive: np.ndarray  # [gaussians] bool
+    active: np.ndarray  # [gaussians] bool
 
 
 class Change(NamedTuple):
@@ -69,7 +69,7 @@ def of_model(
         name,
         lambda time: pose(params, prepared, time),
         lambda posed, time: draw(params, posed, view._replace(time=time), state.step),
-        np.asarray(splats.alive(params.rows["splats"])),
+        np.asarray(splats.active_mask(params.rows["splats"])),
     )
 
 
@@ -80,7 +80,7 @@ def fitted(count: int, spec: MotionSpec, steps: int) -> Moving:
     fitted, because one that was never trained does not move.
     """
     spec = dataclasses.replace(spec, smoothing=None, warm_up=0)
-    whole = SplatScene(steps=1, sh_degree=0, density=None, motion=spec)
+    whole = SplatScene(steps=1, sh_degree=0, densification=None, motion=spec)
     model = scene.build(
         whole, SceneMetadata(extent=1.0, background=(0.1, 0.1, 0.1), frames=2)
     )

@@ -143,11 +143,11 @@ def _spec(name, asked):
     spec = representations.of_preset(name).presets[name]
     if asked.rays is not None and hasattr(spec, "rays"):
         spec = dataclasses.replace(spec, rays=asked.rays)
-    if asked.rows is not None and hasattr(spec, "start"):
-        start = dataclasses.replace(spec.start, source="random", random=asked.rows)
-        most = max(spec.density.most or asked.rows, asked.rows)
-        density = dataclasses.replace(spec.density, most=most)
-        spec = dataclasses.replace(spec, start=start, density=density)
+    if asked.rows is not None and hasattr(spec, "init"):
+        init = dataclasses.replace(spec.init, source="random", random=asked.rows)
+        most = max(spec.densification.cap_max or asked.rows, asked.rows)
+        densification = dataclasses.replace(spec.densification, cap_max=most)
+        spec = dataclasses.replace(spec, init=init, densification=densification)
     return spec
 
 

@@ -95,14 +95,14 @@ def _stillness(canonical, now, decay):
     return jnp.exp(-jnp.sqrt(jnp.sum(jnp.square(moved), axis=-1)))
 
 
-def draw_living(
-    key: Key[Array, ""], alive: Bool[Array, " gaussians"], count: int
+def draw_active(
+    key: Key[Array, ""], active: Bool[Array, " gaussians"], count: int
 ) -> Int[Array, " count"]:
-    """Rows drawn evenly from those `alive`, with replacement; any, if none are."""
-    rank = jnp.cumsum(alive)
+    """Rows drawn evenly from those `active`, with replacement; any, if none are."""
+    rank = jnp.cumsum(active)
     drawn = jax.random.randint(key, (count,), 1, jnp.maximum(rank[-1], 1) + 1)
     rows = jnp.searchsorted(rank, drawn.astype(rank.dtype))
-    return jnp.minimum(rows, alive.shape[0] - 1)
+    return jnp.minimum(rows, active.shape[0] - 1)
 
 
 def effect(spec: AccelerationSpec, extent: float, frames: int) -> Effect:
@@ -122,9 +122,9 @@ def effect(spec: AccelerationSpec, extent: float, frames: int) -> Effect:
 
     def penalty(_, context: PenaltyContext) -> dict[str, Term]:
         params, condition = context.params, context.condition
-        alive = splats.alive(params.rows["splats"])
+        active = splats.active_mask(params.rows["splats"])
         key = jax.random.fold_in(condition.key, _STREAM)
-        rows = draw_living(key, alive, min(spec.samples, alive.shape[0]))
+        rows = draw_active(key, active, min(spec.samples, active.shape[0]))
 
         def evaluate(params):
             some = splats.take_rows(params, rows)
@@ -133,7 +133,7 @@ def effect(spec: AccelerationSpec, extent: float, frames: int) -> Effect:
             before, now, after = (context.at_time(some, t).mean for t in times)
             value = unrest(canonical, before, now, after, decay, spec.drift)
             still = jnp.mean(_stillness(canonical, now, decay))
-            there = jnp.any(alive)
+            there = jnp.any(active)
             return jnp.where(there, value, 0), jnp.where(there, still, 0)
 
         def nothing(params):

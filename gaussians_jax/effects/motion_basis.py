@@ -277,7 +277,7 @@ def prepare(
     params: BasisMotion,
     spec: BasisMotionSpec,
     mean: Float[Array, "gaussians 3"],
-    alive: Bool[Array, " gaussians"] | None = None,
+    active: Bool[Array, " gaussians"] | None = None,
 ) -> Prepared:
     """All that `deform` needs and the time does not change. Pure.
 
@@ -287,7 +287,7 @@ def prepare(
     return in_blocks(
         jax.vmap(lambda point: prepare_point(params, spec, point)),
         (_seen(spec, mean),),
-        alive,
+        active,
         spec.block,
     )
 
@@ -298,9 +298,9 @@ def deform(
     mean: Float[Array, "gaussians 3"],
     time: Float[Array, ""],
     prepared: Prepared,
-    alive: Bool[Array, " gaussians"] | None = None,
+    active: Bool[Array, " gaussians"] | None = None,
 ) -> Offsets:
-    """Offsets of every Gaussian at one time; zero in blocks without a living row.
+    """Offsets of every Gaussian at one time; zero in blocks without an active row.
 
     `mean` is canonical, and what `prepared` was made of.
     """
@@ -308,7 +308,7 @@ def deform(
     return in_blocks(
         jax.vmap(lambda point, row: offsets_at_time(at_time, spec, point, row)),
         (_seen(spec, mean), prepared),
-        alive,
+        active,
         spec.block,
     )
 
@@ -372,7 +372,7 @@ def effect(spec: BasisMotionSpec, steps: int, frames: int) -> Effect:
 
     def prepared(params: Params) -> Prepared:
         rows = params.rows["splats"]
-        return prepare(params.nets[NAME], spec, rows.mean, splats.alive(rows))
+        return prepare(params.nets[NAME], spec, rows.mean, splats.active_mask(rows))
 
     def moved(
         params: Params, gaussians: Gaussians, condition: FrameCondition, ready: Prepared
@@ -385,7 +385,7 @@ def effect(spec: BasisMotionSpec, steps: int, frames: int) -> Effect:
             )
         rows = params.rows["splats"]
         offsets = deform(
-            params.nets[NAME], spec, rows.mean, time, ready, splats.alive(rows)
+            params.nets[NAME], spec, rows.mean, time, ready, splats.active_mask(rows)
         )
         return apply(gaussians, offsets)
 

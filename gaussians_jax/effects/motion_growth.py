@@ -1,4 +1,4 @@
-"""Growth where things move: the density control's threshold depends on the motion.
+"""Growth where things move: densification's threshold depends on the motion.
 
 MoBa-GS, section 3.4: a Gaussian is cloned or split only if its gradient on the screen
 and its motion both pass a threshold (equation 7). Printed so, what stands still never
@@ -79,7 +79,7 @@ def update_state(
 ) -> Travel:
     """One more instant.
 
-    A displacement counts relative to the median displacement of the living rows at that
+    A displacement counts relative to the median displacement of the active rows at that
     instant: what the field moves as a whole, such as the camera's own motion, is not
     motion of a Gaussian. Where most of a scene moves as one, it is therefore the rest
     that counts as moving. Displacements that are not finite are passed over.
@@ -87,7 +87,7 @@ def update_state(
     del condition
     displacement = moved.mean - canonical.mean
     known = jnp.all(jnp.isfinite(displacement), axis=1)
-    # The logistic function of a dead row's mark is exactly zero.
+    # The logistic function of an inactive row's mark is exactly zero.
     common = common_motion(displacement, known & (canonical.opacity > 0))
     relative = displacement - common
     known = known[:, None]

@@ -177,8 +177,8 @@ def read_settings(folder: pathlib.Path) -> Settings:
     if not path.is_file():
         raise ValueError(
             f"{folder}: no run here (there is no {CONFIG}); name the folder that "
-            "experiments.reconstruct printed, or start the run, which cannot have "
-            "begun, without --resume"
+            "experiments.reconstruct printed; a run that was killed before it had one "
+            "is started again, without --resume"
         )
     try:
         stored = json.loads(path.read_text())
@@ -194,13 +194,13 @@ def read_settings(folder: pathlib.Path) -> Settings:
 
 def first_state(run: Run) -> TrainState:
     """The state before the first step; ValueError where it would not fit in memory."""
-    needed = run.representation.first_bytes(run.spec, run.capture)
+    needed = run.representation.estimate_memory_bytes(run.spec, run.capture)
     free = free_memory()
     if needed > free:
         raise ValueError(
             f"the first state needs about {needed / 2**30:.1f} GiB and "
-            f"{free / 2**30:.1f} GiB are free; {run.representation.lighter}, or read "
-            "smaller pictures with --max-side"
+            f"{free / 2**30:.1f} GiB are free; {run.representation.memory_hint}, or "
+            "read smaller pictures with --max-side"
         )
     return run.model.init(run.capture, jax.random.key(run.config.seed))
 

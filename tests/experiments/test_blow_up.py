@@ -14,7 +14,7 @@ from tests.hard_cases import hostile
 
 pytestmark = pytest.mark.slow
 
-SPLATS = ("density=none", "sh_degree=0")
+SPLATS = ("densification=none", "sh_degree=0")
 FIELD = (
     "rays=16",
     "sampling.coarse=4",
@@ -50,7 +50,11 @@ def held(folder):
 def test_splats_that_blow_up_say_where_and_exit_with_one(tmp_path, capsys):
     # One update of an opacity by 3e38 stays in float32, the second does not.
     code, printed, folder = reconstruct_at(
-        tmp_path, capsys, "splats-static-small", "rates.opacity_logit=3e38", *SPLATS
+        tmp_path,
+        capsys,
+        "splats-static-small",
+        "learning_rates.opacity_logit=3e38",
+        *SPLATS,
     )
     assert code == 1
     last = printed.err.splitlines()[-1]

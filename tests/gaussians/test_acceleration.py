@@ -22,14 +22,14 @@ unrest = jax.jit(acceleration.unrest, static_argnums=(4, 5))
 instants = jax.jit(acceleration.instants, static_argnums=1)
 
 
-def scene(count=12, alive=None, dtype="float32", size=1.0):
+def scene(count=12, active=None, dtype="float32", size=1.0):
     """Gaussians and, under "amplitude", how far each swings."""
     rng = np.random.default_rng(0)
     leaves = [size * rng.normal(size=(count, 3))]
     leaves += [np.zeros((count, *shape)) for shape in [(3,), (4,), (), (1, 3), (0, 3)]]
     splats = Splats(*(jnp.asarray(leaf, dtype) for leaf in leaves))
-    if alive is not None:
-        logit = np.where(alive, 0, rows.DEAD_LOGIT)
+    if active is not None:
+        logit = np.where(active, 0, rows.INACTIVE_LOGIT)
         splats = splats._replace(opacity_logit=jnp.asarray(logit, dtype))
     amplitude = jnp.asarray(0.02 * size * rng.normal(size=(count, 3)), dtype)
     return Params({"splats": splats, "amplitude": amplitude}, {})
@@ -138,16 +138,16 @@ def test_the_three_times_stay_within_the_capture(interval, time, dtype):
         np.testing.assert_allclose(now, time, rtol=1e-6)
 
 
-@pytest.mark.parametrize("living", [[3], [0, 11], [1, 2, 5, 8, 9]])
-def test_rows_are_drawn_evenly_from_the_living(living):
-    alive = jnp.asarray(np.isin(np.arange(12), living))
-    drawn = jax.jit(acceleration.draw_living, static_argnums=2)(
-        jax.random.key(0), alive, 6000
+@pytest.mark.parametrize("places", [[3], [0, 11], [1, 2, 5, 8, 9]])
+def test_rows_are_drawn_evenly_from_the_active(places):
+    active = jnp.asarray(np.isin(np.arange(12), places))
+    drawn = jax.jit(acceleration.draw_active, static_argnums=2)(
+        jax.random.key(0), active, 6000
     )
     counts = np.bincount(np.asarray(drawn), minlength=12)
-    assert set(np.flatnonzero(counts)) == set(living)
-    share = 6000 / len(living)
-    assert np.abs(counts[living] - share).max() < 5 * np.sqrt(share)
+    assert set(np.flatnonzero(counts)) == set(places)
+    share = 6000 / len(places)
+    assert np.abs(counts[places] - share).max() < 5 * np.sqrt(share)
 
 
 def ask(spec, params, time, step=0, at_time=swinging, extent=1.0, frames=11, seed=0):
@@ -166,11 +166,11 @@ def ask(spec, params, time, step=0, at_time=swinging, extent=1.0, frames=11, see
 @pytest.mark.parametrize("time", [0.0, 0.43, 1.0])
 def test_the_effect_is_the_mean_over_the_rows_it_draws(time, dtype):
     spec = AccelerationSpec(weight=0.3, decay=0.02, drift=0.5, interval=2.0)
-    alive = np.arange(12) % 4 != 1
-    params = scene(alive=alive, dtype=dtype)
+    active = np.arange(12) % 4 != 1
+    params = scene(active=active, dtype=dtype)
     terms = ask(spec, params, time, extent=3.0)
     key = jax.random.fold_in(jax.random.key(0), acceleration._STREAM)
-    drawn = np.asarray(acceleration.draw_living(key, jnp.asarray(alive), 12))
+    drawn = np.asarray(acceleration.draw_active(key, jnp.asarray(active), 12))
     middle = np.clip(time, 0.2, 0.8)
     expected = slow_unrest(
         np.asarray(params.rows["splats"].mean, np.float64)[drawn],
@@ -229,8 +229,8 @@ def test_gradients_of_the_effect(float64):
 
 
 @pytest.mark.hard_cases
-def test_without_living_rows_there_is_nothing(dtype):
-    terms = ask(AccelerationSpec(), scene(alive=np.zeros(12, bool), dtype=dtype), 0.4)
+def test_without_active_rows_there_is_nothing(dtype):
+    terms = ask(AccelerationSpec(), scene(active=np.zeros(12, bool), dtype=dtype), 0.4)
     assert {name: term.value for name, term in terms.items()} == {
         "unrest": 0,
         "still": 0,

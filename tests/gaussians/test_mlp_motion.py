@@ -158,11 +158,11 @@ def test_the_time_part_may_be_summed_once(float64):
         np.testing.assert_allclose(getattr(offsets, name), expected, atol=1e-13)
 
 
-def test_rows_beyond_the_living_blocks_are_still(float64):
+def test_rows_beyond_the_active_blocks_are_still(float64):
     params = strong(SMALL)
     mean = some_gaussians(24).mean
-    alive = jnp.arange(24) < 9  # the last of three blocks of 8 is idle
-    offsets = deform(params, SMALL, mean, jnp.asarray(0.5), alive)
+    active = jnp.arange(24) < 9  # the last of three blocks of 8 is idle
+    offsets = deform(params, SMALL, mean, jnp.asarray(0.5), active)
     full = deform(params, SMALL, mean, jnp.asarray(0.5))
     for ours, theirs in zip(offsets, full, strict=True):
         np.testing.assert_array_equal(ours[:16], theirs[:16])
@@ -170,13 +170,13 @@ def test_rows_beyond_the_living_blocks_are_still(float64):
 
 
 @pytest.mark.hard_cases
-def test_no_living_row_and_no_row_at_all(dtype):
+def test_no_active_row_and_no_row_at_all(dtype):
     spec = dataclasses.replace(SMALL, depth=1, skips=())
     params = strong(spec, dtype)
 
-    def deformed(params, mean, alive):
+    def deformed(params, mean, active):
         time = jnp.asarray(0.5, dtype)
-        return mlp_motion.deform(params, spec, mean, time, alive)
+        return mlp_motion.deform(params, spec, mean, time, active)
 
     def total(*args):
         return sum(jnp.sum(leaf) for leaf in deformed(*args))

@@ -49,10 +49,10 @@ def strong(spec, dtype="float64", seed=0):
 
 
 @functools.partial(jax.jit, static_argnums=1)
-def uncached(params, spec, mean, time, alive=None):
+def uncached(params, spec, mean, time, active=None):
     """As in a training step: prepared and used in one program."""
-    prepared = motion_basis.prepare(params, spec, mean, alive)
-    return motion_basis.deform(params, spec, mean, time, prepared, alive)
+    prepared = motion_basis.prepare(params, spec, mean, active)
+    return motion_basis.deform(params, spec, mean, time, prepared, active)
 
 
 prepare = jax.jit(motion_basis.prepare, static_argnums=1)
@@ -315,17 +315,17 @@ def test_blocks_change_nothing_but_memory(count, dtype):
     assert blocked.mean.shape == blocked.turn.shape == (count, 3)
 
 
-def test_rows_beyond_the_living_blocks_are_still(float64):
+def test_rows_beyond_the_active_blocks_are_still(float64):
     params = strong(SMALL)
     mean = some_gaussians(24).mean
     time = jnp.asarray(0.5)
-    alive = jnp.arange(24) < 9  # the last of three blocks of 8 is idle
-    offsets = uncached(params, SMALL, mean, time, alive)
+    active = jnp.arange(24) < 9  # the last of three blocks of 8 is idle
+    offsets = uncached(params, SMALL, mean, time, active)
     full = uncached(params, SMALL, mean, time)
     for ours, theirs in zip(offsets, full, strict=True):
         np.testing.assert_array_equal(ours[:16], theirs[:16])
         assert not np.asarray(ours[16:]).any()
-    assert not np.asarray(prepare(params, SMALL, mean, alive).basis[16:]).any()
+    assert not np.asarray(prepare(params, SMALL, mean, active).basis[16:]).any()
 
     def total(params):
         nobody = jnp.zeros(24, bool)
@@ -380,8 +380,7 @@ def test_turns_of_every_size_are_rotations_with_finite_slopes(length, angle, dty
     half = float(turn[0, 0]) / 2
     w, x = np.cos(half), np.sin(half)
     expected = [w, x, 0, 0]
-    usable = {"float32": (1.0,), "float64": (1e-30, 1.0, 1e25)}[dtype]
-    if length in usable:
+    if length > 0:
         expected = np.array([w - x, w + x, w - x, w + x]) / 2
     np.testing.assert_allclose(
         moved.quaternion[0], expected, atol=tolerance * max(1, angle)

@@ -12,6 +12,7 @@ import rich.console
 from gaussians_jax import scene
 from gaussians_jax.effects import deformation
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec
+from gaussians_jax.mcmc import MCMCStrategySpec
 from gaussians_jax.phases import AlternationSpec
 from gaussians_jax.spec import effects_of, refuse_what_cannot_train
 from nerfies_jax import evaluation
@@ -169,7 +170,8 @@ def test_stages_draw_what_render_draws(paper):
         ({"motion": None}, "without a motion"),
         ({"motion": scenes.TINY_MOTION, "neighbours": scenes.TINY_SONATA.neighbours},
          "neighbours=none"),
-        ({"density": None}, "motion_growth=none"),
+        ({"densification": None}, "motion_growth=none"),
+        ({"densification": MCMCStrategySpec()}, "threshold of Default"),
         ({"motion_growth": MotionGrowthSpec(form="hard", start=3)}, "nothing would"),
         ({"motion": None, "motion_growth": None, "acceleration": None},
          "alternation without"),

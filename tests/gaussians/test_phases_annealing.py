@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import phases, rates
+from gaussians_jax import learning_rates, phases
+from gaussians_jax.learning_rates import LearningRateSpec
 from gaussians_jax.phases import AnnealingSpec
-from gaussians_jax.rates import RateSpec
 from gaussians_jax.splats import Params, Splats
 from nerfies_jax.training import schedules
 from nerfies_jax.training.updates import apply_updates
@@ -85,13 +85,13 @@ def test_an_annealing_without_freezing_trains_to_the_last_step():
 
 
 def test_only_the_rate_of_the_means_is_annealed():
-    spec = RateSpec()
+    spec = LearningRateSpec()
 
     @jax.jit
     def both(step):
         return (
-            rates.learning_rates(spec, 2.0, 1000, step, ANNEALING),
-            rates.learning_rates(spec, 2.0, 1000, step),
+            learning_rates.at_step(spec, 2.0, 1000, step, ANNEALING),
+            learning_rates.at_step(spec, 2.0, 1000, step),
         )
 
     for step in (10, 800, 960):
@@ -99,8 +99,8 @@ def test_only_the_rate_of_the_means_is_annealed():
         expected = 2 * exact_rate(step, ANNEALING, 1000)
         np.testing.assert_allclose(annealed.mean, expected, rtol=1e-6)
         assert annealed._replace(mean=None) == plain._replace(mean=None)
-    still, step = RateSpec(mean=0.0), jnp.asarray(800)
-    assert float(rates.learning_rates(still, 2.0, 1000, step, ANNEALING).mean) == 0
+    still, step = LearningRateSpec(mean=0.0), jnp.asarray(800)
+    assert float(learning_rates.at_step(still, 2.0, 1000, step, ANNEALING).mean) == 0
 
 
 def test_at_the_end_the_means_stand_still_bit_for_bit():
@@ -112,7 +112,7 @@ def test_at_the_end_the_means_stand_still_bit_for_bit():
 
     @jax.jit
     def after(step):
-        rate = rates.learning_rates(RateSpec(), 2.0, 1000, step, ANNEALING)
+        rate = learning_rates.at_step(LearningRateSpec(), 2.0, 1000, step, ANNEALING)
         rate = Params({"splats": rate}, {"w": 1e-3})
         return apply_updates(params, directions, rate)
 

@@ -11,7 +11,7 @@ import scipy.spatial.transform
 
 from gaussians_jax import point_tracks
 from gaussians_jax import scene as splat_scene
-from gaussians_jax.splats import Gaussians, Params, Splats, bury
+from gaussians_jax.splats import Gaussians, Params, Splats, deactivate
 from nerfies_jax.capture import synthetic
 from nerfies_jax.evaluation import protocol
 from nerfies_jax.measure import geometry_quality
@@ -123,7 +123,7 @@ def test_what_cannot_be_seen_carries_nothing(filmed, monkeypatch, cloud):
     logit = np.repeat([0.0, -4.0, 5.0], len(cloud))
     rows = splat_rows(mean, logit)
     hidden = jnp.arange(len(mean)) >= len(cloud)
-    rows = bury(rows, jnp.arange(len(mean)) >= 2 * len(cloud))
+    rows = deactivate(rows, jnp.arange(len(mean)) >= 2 * len(cloud))
 
     def moved(mean, time):
         return jnp.where(hidden[:, None], mean + time, mean)

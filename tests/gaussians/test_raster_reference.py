@@ -42,10 +42,10 @@ class Case:
         get = self.stored.__getitem__
         self.size = int(get("width")), int(get("height"))
         self.spec = RasterSpec(
-            alpha_cut=float(get("alpha_threshold")),
+            alpha_threshold=float(get("alpha_threshold")),
             alpha_max=float(get("max_alpha")),
-            stop=float(get("t_threshold")),
-            dilation_px2=float(get("eps2d")),
+            transmittance_threshold=float(get("t_threshold")),
+            eps2d=float(get("eps2d")),
             antialiased=bool(get("antialiased")),
             near=float(get("near")),
             far=float(get("far")),

@@ -58,7 +58,7 @@ CASES = {
     "inria": INRIA,
     "large tile": dataclasses.replace(GSPLAT, tile=16, batch=3, chunk=2),
     "tiny capacity": dataclasses.replace(
-        GSPLAT, capacity=64, kept_slabs=2, antialiased=True
+        GSPLAT, capacity=64, kept_chunks=2, antialiased=True
     ),
 }
 

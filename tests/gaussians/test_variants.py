@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import scene, splats, still_rows, variants
+from gaussians_jax import scene, splats, static_rows, variants
 from gaussians_jax.splats import Gaussians
 from nerfies_jax import evaluation
 from nerfies_jax.training.model import TrainState
@@ -32,10 +32,10 @@ def test_splats_without_motion_are_the_canonical_ones(moving):
     draw = variants.without_effects(
         scenes.TINY_DEFORMABLE, metadata, ("motion",), False
     )
-    still = scene.build(scenes.TINY_SPLATS, metadata).render
+    static = scene.build(scenes.TINY_SPLATS, metadata).render
     found, expected, moved = (
         jax.jit(each, static_argnums=2)(params, view, SIZE, step).colour
-        for each in (draw.render, still, model.render)
+        for each in (draw.render, static, model.render)
     )
     np.testing.assert_array_equal(found, expected)
     assert np.abs(found - moved).max() > 0.02
@@ -82,7 +82,7 @@ def poses(model, state, times=(0.0, 0.3, 1.0)):
 
 def test_a_motion_from_knots_is_met_at_the_knots_and_near_between(swaying):
     exact = poses(*swaying)
-    living = np.asarray(splats.alive(swaying[1].params.rows["splats"]))
+    active = np.asarray(splats.active_mask(swaying[1].params.rows["splats"]))
     shift = np.abs(exact[0].mean - exact[2].mean).max()
     errors = []
     for knots, interpolation in ((4, "linear"), (4, "cubic"), (40, "cubic")):
@@ -90,9 +90,9 @@ def test_a_motion_from_knots_is_met_at_the_knots_and_near_between(swaying):
         assert f"{knots} knots, {interpolation}, of" in made.summary
         found = poses(made.model, made.state)
         for end in (0, 2):
-            met = np.abs(found[end].mean - exact[end].mean)[living]
+            met = np.abs(found[end].mean - exact[end].mean)[active]
             assert met.max() < 1e-6
-        errors.append(np.abs(found[1].mean - exact[1].mean)[living].max() / shift)
+        errors.append(np.abs(found[1].mean - exact[1].mean)[active].max() / shift)
     assert 0.2 > errors[0] > errors[1] > 5e-3 > errors[2]
 
 
@@ -106,9 +106,10 @@ def test_a_faster_model_draws_what_the_model_draws(swaying):
         evaluation.Renderer(model, SIZE)(state, view).colour
         for model, state in ((model, state), made[:2], (whole, made.state))
     )
-    still = variants.without_effects(*model.spec, ("motion",), False)
+    static = variants.without_effects(*model.spec, ("motion",), False)
     assert (
-        np.abs(evaluation.Renderer(still, SIZE)(state, view).colour - exact).max() > 0.1
+        np.abs(evaluation.Renderer(static, SIZE)(state, view).colour - exact).max()
+        > 0.1
     )
     np.testing.assert_allclose(staged, exact, atol=1e-3)
     np.testing.assert_allclose(found, staged, atol=1e-5)
@@ -116,21 +117,21 @@ def test_a_faster_model_draws_what_the_model_draws(swaying):
 
 def test_what_stands_still_may_be_left_out(swaying):
     exact = poses(*swaying)
-    made = variants.without_still(*swaying, 0.0)
-    living = np.asarray(splats.alive(swaying[1].params.rows["splats"]))
+    made = variants.without_static(*swaying, 0.0)
+    active = np.asarray(splats.active_mask(swaying[1].params.rows["splats"]))
     for found, pose in zip(poses(made.model, made.state), exact, strict=True):
         for name in Gaussians._fields:  # a row that is not drawn may be anywhere
-            a, b = (np.asarray(getattr(x, name))[living] for x in (found, pose))
+            a, b = (np.asarray(getattr(x, name))[active] for x in (found, pose))
             np.testing.assert_allclose(a, b, atol=2e-6, err_msg=name)
     middle, *_, end = poses(*swaying, (0.5, 1.0))
-    moved = np.asarray(still_rows.reach(middle, end))[living]
+    moved = np.asarray(static_rows.max_displacement(middle, end))[active]
     below = float(np.median(moved))
-    made = variants.without_still(*swaying, below)
-    left = len(made.state.params[1].moving.rows["splats"].mean)
+    made = variants.without_static(*swaying, below)
+    left = len(made.state.params[1].dynamic.rows["splats"].mean)
     assert 0 < left < len(moved)
-    assert f"{left} of {len(living)} rows that move" in made.summary
+    assert f"{left} of {len(active)} rows that move" in made.summary
     for found, pose in zip(poses(made.model, made.state), exact, strict=True):
-        error = np.linalg.norm(found.mean - pose.mean, axis=1)[living]
+        error = np.linalg.norm(found.mean - pose.mean, axis=1)[active]
         assert 0 < error.max() <= below
         assert (error == 0).sum() >= left
 
@@ -141,8 +142,8 @@ def test_what_stands_still_may_be_left_out(swaying):
         (lambda *a: variants.from_knots(*a, 1), "reads 2 knots at once, got 1"),
         (lambda *a: variants.from_knots(*a, 3, "cubic"), "take more, or linear"),
         (lambda *a: variants.from_knots(*a, 8, "linear", 1e9), "farther than 1e\\+09"),
-        (lambda *a: variants.without_still(*a, 1e9), "nothing in this run moves"),
-        (lambda *a: variants.without_still(*a, -1.0), "cannot be negative"),
+        (lambda *a: variants.without_static(*a, 1e9), "nothing in this run moves"),
+        (lambda *a: variants.without_static(*a, -1.0), "cannot be negative"),
     ],
 )
 def test_a_faster_motion_that_cannot_be_is_refused(swaying, make, words):
@@ -156,15 +157,17 @@ def test_what_moves_may_be_left_out(swaying):
     nets = jax.tree.map(lambda leaf: 0.5 * leaf, state.params.nets)
     state = state_of(state.params._replace(nets=nets))
     middle, *ends = poses(model, state, (0.5, 0.0, 1.0))
-    reach = np.max([still_rows.reach(middle, end) for end in ends], axis=0)
-    living = np.asarray(splats.alive(state.params.rows["splats"]))
-    far = float(np.median(reach[living]))
+    distance = np.max(
+        [static_rows.max_displacement(middle, end) for end in ends], axis=0
+    )
+    active = np.asarray(splats.active_mask(state.params.rows["splats"]))
+    far = float(np.median(distance[active]))
     left, summary = variants.without_moving(model, state, far)
     rows = left.params.rows["splats"]
-    shown = np.asarray(splats.alive(rows))
-    assert 0 < shown.sum() < living.sum() / 2 + 1
-    assert reach[shown].max() <= far
-    assert f"{living.sum() - shown.sum()} of {living.sum()} Gaussians" in summary
+    shown = np.asarray(splats.active_mask(rows))
+    assert 0 < shown.sum() < active.sum() / 2 + 1
+    assert distance[shown].max() <= far
+    assert f"{active.sum() - shown.sum()} of {active.sum()} Gaussians" in summary
     # What is left is drawn as it was, wherever it still moves a little
     alone = splats.take_rows(state.params, jnp.asarray(np.flatnonzero(shown)))
     view = evaluation.view_of(scenes.tiny_capture(), 0)
@@ -186,13 +189,13 @@ def test_a_static_scene_of_nothing_is_refused(swaying):
 
 
 def test_fields_and_still_scenes_have_no_knots(moving, swaying):
-    still = variants.without_effects(
+    static = variants.without_effects(
         scenes.TINY_DEFORMABLE, moving[0], ("motion",), False
     )
     with pytest.raises(ValueError, match="nothing in this run moves farther than 0 "):
-        variants.from_knots(still, swaying[1], 8)
-    field = still._replace(stages=None)
+        variants.from_knots(static, swaying[1], 8)
+    field = static._replace(stages=None)
     with pytest.raises(ValueError, match="--knots is for runs of Gaussians"):
         variants.from_knots(field, swaying[1], 8)
-    with pytest.raises(ValueError, match="--still-below is for runs of Gaussians"):
-        variants.without_still(field, swaying[1], 0.1)
+    with pytest.raises(ValueError, match="--static-threshold is for runs of Gaussians"):
+        variants.without_static(field, swaying[1], 0.1)

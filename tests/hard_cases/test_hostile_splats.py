@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import density, scene, splats
+from gaussians_jax import densification, scene, splats
+from gaussians_jax.initialisation import InitSpec
 from gaussians_jax.scene import AuxState
 from gaussians_jax.spec import effects_of
-from gaussians_jax.start import StartSpec
 from nerfies_jax.capture.capture import PointCloud
 from nerfies_jax.training.model import Frames, Model, TrainState, View
 from tests import scenes
@@ -48,17 +48,17 @@ def hostile_spec(name):
     One capacity is one program for all starts; 200 points leave room for 56.
     """
     plan = dataclasses.replace(
-        scenes.TINY_SPLATS.density,
-        interval=50,
-        start=50,
-        stop=STEPS,
-        reset_interval=100,
-        most=splats.BUCKET,
-        gradient=1e-5,
+        scenes.TINY_SPLATS.densification,
+        refine_every=50,
+        refine_start_iter=50,
+        refine_stop_iter=STEPS,
+        reset_every=100,
+        cap_max=splats.BUCKET,
+        grow_grad2d=1e-5,
         # Of an extent of 0.04 scene units: the paper's 0.1 prunes all of this scene.
-        prune_scale=50.0,
+        prune_scale3d=50.0,
     )
-    return dataclasses.replace(TINY[name], steps=STEPS, density=plan)
+    return dataclasses.replace(TINY[name], steps=STEPS, densification=plan)
 
 
 class Hurried(NamedTuple):
@@ -133,7 +133,7 @@ def started_with(made: Ready, rows):
     params, rows = made.start.params, jax.device_put(rows)
     params = params._replace(rows=params.rows | {"splats": rows})
     aux_state = AuxState(
-        density.empty_stats(rows), scene.states_of(made.effects, params)
+        densification.empty_stats(rows), scene.states_of(made.effects, params)
     )
     return made.start._replace(
         params=params, aux_state=Hurried(aux_state, np.float32(1))
@@ -149,13 +149,13 @@ def one_colour(rows):
 
 
 def alone(rows):
-    return splats.bury(jax.device_put(rows), jnp.arange(len(rows.mean)) > 0)
+    return splats.deactivate(jax.device_put(rows), jnp.arange(len(rows.mean)) > 0)
 
 
-def living(rows, logit):
-    """Every living row with that opacity; dead ones stay dead."""
+def with_logit(rows, logit):
+    """Every active row with that opacity; inactive ones stay inactive."""
     logits = np.where(
-        splats.alive(jax.device_put(rows)), np.float32(logit), rows.opacity_logit
+        splats.active_mask(jax.device_put(rows)), np.float32(logit), rows.opacity_logit
     )
     return rows._replace(opacity_logit=logits)
 
@@ -183,8 +183,8 @@ ROWS = {
     "needles": lambda rows: rows._replace(
         log_scale=np.zeros_like(rows.log_scale) + np.float32([-30.0, -30.0, 3.0])
     ),
-    "opaque": lambda rows: living(rows, 100.0),
-    "transparent": lambda rows: living(rows, -100.0),
+    "opaque": lambda rows: with_logit(rows, 100.0),
+    "transparent": lambda rows: with_logit(rows, -100.0),
     "of one colour": one_colour,
     "about the cameras": about_the_cameras,
     "alone": alone,
@@ -237,8 +237,8 @@ def test_splats_train_from_hostile_rows(name, case, tmp_path):
         assert STOPS[case] in trained.result.message
         return
     assert trained.result.stopped_by == "steps", trained.result.message
-    living = trained.result.state.params.rows["splats"]
-    assert bool(splats.alive(living).any()) == (case not in DIE), case
+    rows = trained.result.state.params.rows["splats"]
+    assert bool(splats.active_mask(rows).any()) == (case not in DIE), case
 
 
 @pytest.mark.parametrize("case", hostile.CAPTURES)
@@ -309,17 +309,17 @@ CLOUDS = {
 
 
 @pytest.mark.parametrize("source", ["auto", "points"])
-@pytest.mark.parametrize("beside", [0, 50])
+@pytest.mark.parametrize("extra", [0, 50])
 @pytest.mark.parametrize("cloud", CLOUDS)
-def test_every_cloud_of_points_is_a_finite_start(cloud, beside, source):
+def test_every_cloud_of_points_is_a_finite_start(cloud, extra, source):
     capture = scenes.tiny_capture()
     place = capture.cameras.position[capture.train]
     ahead = capture.cameras.camera_from_world[capture.train[0], 2]
     capture = points_at(CLOUDS[cloud](place, ahead, capture.far))
-    plan = StartSpec(random=120, beside=beside, source=source)
-    spec = dataclasses.replace(scenes.TINY_SPLATS, start=plan)
+    plan = InitSpec(random=120, extra_random=extra, source=source)
+    spec = dataclasses.replace(scenes.TINY_SPLATS, init=plan)
     state = scene.build(spec, scene.metadata_of(capture)).init(
         capture, jax.random.key(0)
     )
     assert not hostile.not_finite(state)
-    assert splats.alive(state.params.rows["splats"]).any()
+    assert splats.active_mask(state.params.rows["splats"]).any()

@@ -58,9 +58,9 @@ def test_a_scene_of_gaussians_is_saved_as_a_model_and_for_viewers(moving, tmp_pa
     params, about = model_file.load(tmp_path / MODEL)
     assert about == {"spec": spec, "facts": facts, "step": 0}
     assert jax.tree.structure(params) == jax.tree.structure(state.params)
-    living = splats.alive(state.params.rows["splats"]).sum()
-    assert len(params.rows["splats"].mean) == living
-    assert len(files.load(tmp_path / "gaussians.ply").splats.mean) == living
+    active = splats.active_mask(state.params.rows["splats"]).sum()
+    assert len(params.rows["splats"].mean) == active
+    assert len(files.load(tmp_path / "gaussians.ply").splats.mean) == active
 
 
 @pytest.fixture

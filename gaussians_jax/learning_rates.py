@@ -13,7 +13,7 @@ from nerfies_jax.training import schedules
 
 
 @dataclasses.dataclass(frozen=True)
-class RateSpec:
+class LearningRateSpec:
     """Adam's learning rates: the defaults of Kerbl et al. 2023, reference code.
 
     Means learn in units of the scene's extent, decaying log-linearly over the run.
@@ -42,8 +42,8 @@ class RateSpec:
             )
 
 
-def learning_rates(
-    spec: RateSpec,
+def at_step(
+    spec: LearningRateSpec,
     extent: float,
     steps: int,
     step: Int[Array, ""],
