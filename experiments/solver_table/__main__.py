@@ -25,7 +25,7 @@ from typing import Literal, NamedTuple
 import jax
 import numpy as np
 
-from experiments import cli
+from experiments import cli, markdown
 from experiments.solver_table.problems import LEVENBERG, PROBLEMS, Problem
 from nerfies_jax.measure import clock
 from nerfies_jax.training.fit import CODE_SOLVERS
@@ -133,6 +133,25 @@ def text(rows: list[Row], frames: int) -> str:
     return "\n".join([head, *lines])
 
 
+def page(stored) -> str:
+    """The page in docs/results below the docstring, from what `--out` wrote."""
+    heads = ("solver", "at most", "steps", "ms", "CPU ms", "loss", "excess")
+    heads += ("distance", "converged")
+    rows = [
+        [
+            row["solver"],
+            str(row["max_steps"]),
+            markdown.number(row["steps"], 0),
+            markdown.number(1e3 * row["seconds"], 2),
+            markdown.number(1e3 * row["cpu_seconds"], 2),
+            *(markdown.short(row[name]) for name in ("loss", "excess", "distance")),
+            f"{row['converged']} of {stored['about']['frames']}",
+        ]
+        for row in sorted(stored["rows"], key=lambda r: (r["solver"], r["max_steps"]))
+    ]
+    return f"## Fitting {stored['about']['fit']}\n\n{markdown.table(heads, rows)}"
+
+
 def main(arguments=None) -> list[Row]:
     """Run the job of the command line."""
     settings = cli.parse(Settings, arguments)
@@ -141,7 +160,8 @@ def main(arguments=None) -> list[Row]:
     print(text(rows, settings.frames))
     if settings.out:
         about = dataclasses.asdict(settings) | {"out": str(settings.out)}
-        record = {"about": about, "rows": [row._asdict() for row in rows]}
+        record = {"about": about, "machine": clock.machine()}
+        record["rows"] = [row._asdict() for row in rows]
         settings.out.write_text(json.dumps(record, indent=1) + "\n")
     return rows
 

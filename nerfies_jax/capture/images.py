@@ -18,7 +18,6 @@ from nerfies_jax.capture.json_files import AnyPath, replaced_file
 # An 8K video frame has 33 million. Pillow itself only warns above 89 million, and at
 # 144 million a picture is 430 MB.
 MAX_PIXELS = 64_000_000
-MAX_EXR_FLOATS = 512_000_000
 _ORIENTATION = 0x0112  # the EXIF tag; 1 is upright, 0 unknown
 _PILLOW_ERRORS = (OSError, SyntaxError, ValueError, EOFError, IndexError, TypeError)
 

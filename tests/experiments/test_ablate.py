@@ -11,6 +11,7 @@ import pytest
 from experiments import cli
 from experiments.ablate import __main__ as ablate
 from experiments.ablate import job as ablate_job
+from experiments.ablate import page as ablate_page
 from experiments.ablate import results, suites
 from experiments.ablate.arms import FIELDS
 from experiments.ablate.job import Job
@@ -241,7 +242,10 @@ def test_the_command_measures_arms_and_goes_on_where_it_stopped(
     # Three steps move nothing.
     still = metrics["still.track_error"].value
     assert metrics["nerfies.track_error"].value == pytest.approx(still, rel=0.05)
-    about = json.loads((out / "ablation.json").read_text())["about"]
+    stored = json.loads((out / "ablation.json").read_text())
+    page, about = ablate_page.page(stored), stored["about"]
+    assert f"| `nerfies` | {metrics['nerfies.psnr'].value:.2f} |" in page
+    assert "no spread to hold it against" in page
     assert about["claims"][0]["says"].endswith("no spread to hold it against")
     assert (out / "ablation.png").stat().st_size > 1000
 

@@ -10,6 +10,7 @@ import pytest
 
 from experiments.deformation_cost import __main__ as deformation_cost
 from experiments.deformation_cost import arms, knot_curve, known_motion
+from experiments.deformation_cost import page as deformation_page
 from gaussians_jax.effects import deformation, kan_motion
 from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec
@@ -197,8 +198,12 @@ def test_the_job_prints_both_tables_and_saves_them(tmp_path, capsys, monkeypatch
         assert (row["both_ms"] is not None) == trained
         if trained:
             assert row["both_flops"] > 2 * row["forward_flops"]
-    assert "1.9 to 13.5 % as published" in text
+    assert "of the deformation's multiply-adds" in text
     assert [point["knots"] for point in kept["knots"]["points"]] == [4, 8, 4, 8]
+    page = deformation_page.page(kept)
+    for row in kept["costs"]:
+        assert f"| {row['name']} | {row['forward_cpu_ms']:.3g} |" in page
+    assert page.count("\n| cubic | ") == 2
     picture, _ = images.read_image(out.with_suffix(".png"))
     assert picture.shape[2] == 3
     assert np.ptp(picture) > 200

@@ -129,3 +129,5 @@ def test_the_command_writes_what_it_prints(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert all(sentence in printed for sentence in record["said"])
     assert (tmp_path / "frequency_gates.png").exists()
+    name, row = next(iter(record["rows"].items()))
+    assert f"| {name} | {row['psnr']:.2f} |" in frequency_gates.page(record)

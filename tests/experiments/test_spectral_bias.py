@@ -228,3 +228,6 @@ def test_the_command_writes_what_it_prints(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert all(sentence in printed for sentence in record["said"])
     assert (tmp_path / "spectral_bias.png").exists()
+    page = report.page(record)
+    assert page.count("\n| relu + encoding | ") == 2
+    assert f"- {record['said'][0].strip()}" in page

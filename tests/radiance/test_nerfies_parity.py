@@ -29,7 +29,7 @@ from nerfies_jax.radiance.template import Template, TemplateSpec
 from nerfies_jax.training import losses
 from nerfies_jax.training.effects import FrameCondition, PenaltyContext
 
-TEMPLATE = TemplateSpec(position=EncodingSpec(8))
+TEMPLATE = TemplateSpec(position=EncodingSpec(8), skips=(4,))
 WARP = WarpSpec(anneal_steps=32)
 STEP = 17  # of 32 for 8 bands: alpha is 4.25
 ELASTIC = ElasticSpec(points=None, scaling="official", fold_cost=0.0)
