@@ -27,7 +27,6 @@ OFFICIAL = {
     "warp + background": (1.02, 212.9, 855),
     "warp + elastic, all samples, + background": (1.38, 247.8, 867),
 }
-OFFICIAL_ELASTIC_COMPILE = 1.7
 
 
 @dataclasses.dataclass(frozen=True)
