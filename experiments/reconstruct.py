@@ -48,6 +48,21 @@ class Reconstruct:
     """Fields of the preset, as density.most=20000 motion.width=128 warp=none."""
     evaluate_every: float = 20.0
     """Seconds of training between two points of the PSNR curve."""
+    lpips_weights: tuple[pathlib.Path, ...] = ()
+    """Measure LPIPS, too: files (.pth, .safetensors, .npz) with the trained classifier
+    and LPIPS heads; read before the training."""
+    lpips_network: Literal["alex", "vgg"] = "alex"
+    """Whose weights these are."""
+    fit_heldout_cameras: int = 0
+    """Fit the cameras of so many held-out frames to what was filmed, the scene as it is
+    after training, and score them again."""
+
+    def __post_init__(self):
+        if self.fit_heldout_cameras < 0:
+            raise ValueError(
+                f"--fit-heldout-cameras {self.fit_heldout_cameras}: a number of "
+                "frames, not negative"
+            )
 
 
 def main(arguments=None):
@@ -73,6 +88,7 @@ def _main(asked):
         run = _resumed(asked, runs) if asked.resume else _new(asked, runs)
         for line in describe(run.capture):
             print(line)
+        lpips = _lpips(asked, run)
         folder, state, history, after = _start(asked, run, runs)
     from nerfies_jax.runs import train
 
@@ -94,7 +110,7 @@ def _main(asked):
 
     errors = []
     try:
-        products.make(folder, run, outcome, began)
+        products.make(folder, run, outcome, began, lpips, asked.fit_heldout_cameras)
     except FloatingPointError as error:
         errors.append(str(error))
     if outcome.result.stopped_by == "non-finite":
@@ -105,6 +121,17 @@ def _main(asked):
     for line in errors:
         print(f"error: {line}", file=sys.stderr)
     raise SystemExit(1 if errors else 0)
+
+
+def _lpips(asked, run):
+    """The weights named on the command line; None without any."""
+    if not asked.lpips_weights:
+        return None
+    from nerfies_jax.evaluation import heldout
+    from nerfies_jax.measure import perceptual
+
+    network = {"alex": perceptual.ALEX, "vgg": perceptual.VGG}[asked.lpips_network]
+    return heldout.load_lpips(network, asked.lpips_weights, run.capture.size)
 
 
 def _threads(asked):

@@ -32,7 +32,7 @@ def frames_of(capture: Capture, wants: frozenset[str] = frozenset()) -> Frames:
     return in_default_precision(frames)
 
 
-def view_of(capture: Capture, row: int) -> View:
+def view_of(capture: Capture, row: int | np.integer) -> View:
     """The view in which a frame was filmed."""
     view = View(
         cameras.take(capture.cameras, row),

@@ -11,23 +11,42 @@ from nerfies_jax import evaluation, runs
 from nerfies_jax.capture import camera_paths, exr, video
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.json_files import write_json
-from nerfies_jax.evaluation import Renderer, Scored, pictures
+from nerfies_jax.evaluation import (
+    Renderer,
+    Scored,
+    fitted_cameras,
+    heldout,
+    model_flow,
+    pictures,
+    protocol,
+)
+from nerfies_jax.evaluation.heldout import Lpips
+from nerfies_jax.evaluation.representation import MODEL, Saved
 from nerfies_jax.measure import clock
 from nerfies_jax.measure.clock import Metric
 from nerfies_jax.runs import Run, budget, curves, report
-from nerfies_jax.runs.representations import MODEL, Saved
 from nerfies_jax.runs.train import Outcome
 from nerfies_jax.training import losses
 from nerfies_jax.training.model import TrainState
 
 SHOWN = 4  # held-out frames in the comparison
+TRACKS = 200  # points of a built-in scene that are followed
 
 
-def make(folder: pathlib.Path, run: Run, outcome: Outcome, began: float) -> None:
+def make(
+    folder: pathlib.Path,
+    run: Run,
+    outcome: Outcome,
+    began: float,
+    lpips: Lpips | None = None,
+    camera_fits: int = 0,
+) -> None:
     """Write everything into the run folder and say where it is.
 
-    Raises FloatingPointError, and writes nothing, where the state draws pictures that
-    are not finite: its parameters may be finite and yet beyond use.
+    LPIPS is measured where weights are given, and `camera_fits` held-out frames are
+    drawn again with cameras fitted to them. Raises FloatingPointError, and writes
+    nothing, where the state draws pictures that are not finite: its parameters may be
+    finite and yet beyond use.
     """
     state, renderer = outcome.result.state, outcome.renderer
     rows, left_out = frames_to_score(run, outcome)
@@ -57,13 +76,16 @@ def make(folder: pathlib.Path, run: Run, outcome: Outcome, began: float) -> None
     saved = run.representation.save(folder, run.spec, run.facts, state)
     frames = evaluation.frames_of(run.capture, run.model.wants)
     fitted, gain = score_halves(run, state, scored, ms_per_frame / 1e3)
-    metrics = [*measured(run, outcome, scored, ms_per_frame, began), *fitted]
+    found, remarks = quality(run, state, renderer, scored, lpips, camera_fits)
+    metrics = heldout.metrics(found)
+    metrics += [*measured(run, outcome, scored, ms_per_frame, began), *fitted]
     metrics += model_size(saved)
     write_json(
         folder / "metrics.json",
         {m.key: m.value if math.isfinite(m.value) else None for m in metrics},
     )
-    notes = [outcome.result.message, *run.capture.notes, *left_out, *gain, *saved.notes]
+    notes = [outcome.result.message, *run.capture.notes, *left_out, *remarks, *gain]
+    notes += saved.notes
     notes += beside_the_paper(run.config.preset, saved, ms_per_frame)
     commands = _next(folder, run, outcome)
     page = report.write(
@@ -94,16 +116,66 @@ def frames_to_score(run: Run, outcome: Outcome) -> tuple[np.ndarray, tuple[str, 
     return evaluation.spread(heldout, count), (note,)
 
 
+def quality(
+    run: Run,
+    state: TrainState,
+    renderer: Renderer,
+    scored: Scored,
+    lpips: Lpips | None,
+    fits: int,
+) -> tuple[dict[str, float], list[str]]:
+    """How good the held-out frames are, by the keys of `heldout.MEASURES`, and notes.
+
+    Points and flow are held against the truth of a built-in scene.
+    """
+    capture = run.capture
+    known = followed = flow = fitted = None
+    notes = []
+    try:
+        truth = protocol.stored_truth(capture)
+        if truth is not None:
+            known = protocol.known(capture, truth, len(scored.rows), TRACKS)
+    except ValueError as error:
+        notes.append(f"No points were followed: {error}")
+    if known is not None:
+        kind, scene = run.representation, (run.spec, run.facts)
+        followed = kind.follow(*scene, state, capture, known)
+        move = kind.mover(*scene)
+        if move is not None:
+            flow = model_flow.heldout_flow(move, state, capture, scored)
+    if fits:
+        places = evaluation.spread(np.arange(len(scored.rows)), fits)
+        fitted = fitted_cameras.fit_cameras(
+            run.model, renderer, state, capture, scored.rows[places]
+        )
+        notes.append(
+            f"Cameras fitted to {len(places)} held-out frames: "
+            f"{scored.psnr[places].mean():.2f} dB with those of the capture, "
+            f"{fitted.scored.psnr.mean():.2f} dB with the fitted ones, of which "
+            f"{fitted.converged.sum()} converged."
+        )
+    if lpips is not None:
+        notes.append(f"LPIPS is that of {lpips.network.name}, version 0.1.")
+    found = heldout.heldout_metrics(
+        scored,
+        capture,
+        lpips=lpips,
+        known=known,
+        followed=followed,
+        flow=flow,
+        fitted=fitted,
+    )
+    return found, notes
+
+
 def measured(
     run: Run, outcome: Outcome, scored: Scored, ms_per_frame: float, began: float
 ) -> list[Metric]:
-    """The figures of a run."""
+    """What a run took."""
     result = outcome.result
     counts = run.model.counts(result.state)
     seconds, fps = time.perf_counter() - began, 1e3 / ms_per_frame
     return [
-        Metric("heldout.psnr", float(scored.psnr.mean()), "dB", "higher", 0.2),
-        Metric("heldout.ssim", float(scored.ssim.mean()), "", "higher", 0.01),
         Metric("heldout.frames", len(scored.rows), "", "equal"),
         Metric("train.seconds", result.seconds, "s", "lower", 0.2 * result.seconds),
         Metric("train.compile_seconds", result.compile_seconds, "s", "lower", 10.0),
@@ -111,12 +183,21 @@ def measured(
         Metric("render.ms_per_frame", ms_per_frame, "ms", "lower", 0.2 * ms_per_frame),
         Metric("render.fps", fps, "frames/s", "higher", 0.2 * fps),
         Metric("memory.peak_bytes", clock.peak_bytes(), "bytes", "lower", 2e8),
+        *_device_memory(),
         Metric("total.seconds", seconds, "s", "lower", 0.2 * seconds),
         *(
             Metric(name, count, "", "lower", 0.1 * count)
             for name, count in counts.items()
         ),
     ]
+
+
+def _device_memory():
+    """Where the backend keeps account; that of a CPU does not."""
+    peak = clock.device_peak_bytes()
+    if peak is None:
+        return []
+    return [Metric("memory.device_peak_bytes", peak, "bytes", "lower", 2e8)]
 
 
 def model_size(saved: Saved) -> list[Metric]:
@@ -263,12 +344,27 @@ def _say(folder, page, metrics, commands):
     value = {metric.key: metric.value for metric in metrics}
     print(
         f"held out: {value['heldout.psnr']:.2f} dB, SSIM {value['heldout.ssim']:.3f} "
-        f"over {value['heldout.frames']} frames; {value['train.seconds']:.0f} s of "
+        f"over {value['heldout.frames']} frames{_parts(value)}; "
+        f"{value['train.seconds']:.0f} s of "
         f"training and {value['train.compile_seconds']:.0f} s of compiling; "
         f"{value['render.ms_per_frame']:.0f} ms a frame"
     )
+    if "tracks.epe" in value:
+        print(
+            f"points:   {value['tracks.epe']:.4f} scene units from where they are, "
+            f"{value['tracks.still_epe']:.4f} if they stood still"
+        )
     print(f"report:     {page}")
     print(f"comparison: {folder / 'comparison.png'}")
     print(f"film:       {folder / 'scene.mp4'}")
     for command in commands:
         print(f"{command.purpose}\n  {command.line}")
+
+
+def _parts(value):
+    """The PSNR of what moves and of what stands still, where masks tell them apart."""
+    names = {"moving": "heldout.moving_psnr", "still": "heldout.still_psnr"}
+    parts = [
+        f"{value[key]:.2f} dB {name}" for name, key in names.items() if key in value
+    ]
+    return f" ({', '.join(parts)})" if parts else ""
