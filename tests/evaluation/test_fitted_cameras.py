@@ -113,7 +113,7 @@ def test_a_displaced_camera_is_found_again(capture, rng, turn, shift, most_pixel
     )
     angles = Rotation.from_matrix(turns).magnitude()
     # Measured: 4e-4 units and 6e-4 rad from eight bits and a valley in which turns and
-    # shifts trade; 2e-3 and 4e-3 from pictures two thirds as wide, of pixels that are
+    # shifts trade; 2e-3 and 4e-3 from pictures half as wide, of pixels that are
     # means where the scene is drawn at their centres.
     bound = 1e-3 if most_pixels == 5000 else 6e-3
     assert apart.max() < bound
