@@ -41,6 +41,8 @@ def main(arguments: list[str] | None = None) -> None:
     package = (HERE / name).is_dir()
     module = f"experiments.{name}.__main__" if package else f"experiments.{name}"
     sys.argv[0] = f"nerfies {name}"  # as --help shows it
+    if "" not in sys.path:  # as python -m does: --effect finds what lies here
+        sys.path.insert(0, "")
     importlib.import_module(module).main(rest)
 
 

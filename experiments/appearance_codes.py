@@ -96,8 +96,7 @@ def compare_exposure(film, steps, seed):
 
 def compare_transient(film, steps, seed):
     """PSNR against the scene without its transient, and a picture."""
-    from experiments import variants
-    from nerfies_jax import evaluation, presets
+    from nerfies_jax import evaluation, presets, variants
     from nerfies_jax.capture import synthetic
 
     capture, truth = synthetic.make(film, seed)
@@ -111,7 +110,7 @@ def compare_transient(film, steps, seed):
     for name, spec in (("without the effect", plain), ("static part", medium)):
         model, state, seconds = trained(spec, capture, seed)
         left_out = () if spec.transient is None else ("transient",)
-        static = variants.of_fields(*model.spec, left_out, False)
+        static = variants.without_effects(*model.spec, left_out, False)
         renderer = evaluation.Renderer(static, capture.size)
         drawn[name] = evaluation.score(renderer, state, clean, rows).colour
         held_out = evaluation.score(renderer, state, clean, clean.heldout)
@@ -137,9 +136,9 @@ def trained(spec, capture, seed):
     from nerfies_jax import evaluation, scene
     from nerfies_jax.training import loop
 
-    model = scene.build(spec, scene.facts_of(capture, spec))
+    model = scene.build(spec, scene.metadata_of(capture, spec))
     state = model.init(capture, jax.random.key(seed))
-    frames = evaluation.frames_of(capture, model.wants)
+    frames = evaluation.frames_of(capture, model.required_data)
     result = loop.fit(model, state, frames, steps=spec.steps)
     if result.steps < spec.steps:
         raise ValueError(f"training ended early: {result.message}")

@@ -8,11 +8,11 @@ import contextlib
 import dataclasses
 import pathlib
 import sys
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
-from nerfies_jax.runs.config import CaptureSource
+from nerfies_jax.runs.config import CaptureSource, MoreMetrics
 
 Positional = tyro.conf.Positional
 
@@ -23,16 +23,24 @@ class NamedSource(CaptureSource):
 
     capture: Positional[pathlib.Path | None] = None
     """Folder in Nerfies, HyperNeRF, Blender, D-NeRF or COLMAP layout."""
+    scene: str | None = None
+    """Which built-in scene, where no capture is given (default: default)."""
 
 
 # Their fields stand among the other options of a command.
 Source = Annotated[NamedSource, tyro.conf.arg(name="")]
+More = Annotated[MoreMetrics, tyro.conf.arg(name="")]
 SourceOptions = Annotated[CaptureSource, tyro.conf.arg(name="")]
 
 
 def plain(source: CaptureSource) -> CaptureSource:
     """The same source as a run keeps it, however its folder was named."""
-    return CaptureSource(**vars(source))
+    return CaptureSource(**given(source))
+
+
+def given(source: CaptureSource) -> dict[str, Any]:
+    """What the command line says of the source, by field."""
+    return {name: value for name, value in vars(source).items() if value is not None}
 
 
 def parse(settings_class, arguments=None):
@@ -40,8 +48,13 @@ def parse(settings_class, arguments=None):
     return tyro.cli(settings_class, args=arguments)
 
 
+def formerly(option):
+    """For `Annotated`: the option is understood by its earlier name as well."""
+    return tyro.conf.arg(aliases=[option])
+
+
 @contextlib.contextmanager
-def user_errors():
+def user_errors(kinds: tuple[type[Exception], ...] = (ValueError, OSError)):
     """Wrong input in one line and exit code 2; our own bugs keep their traceback.
 
     Wraps the stages that read what the user gave (captures, settings, run folders),
@@ -49,6 +62,6 @@ def user_errors():
     """
     try:
         yield
-    except (ValueError, OSError) as error:
+    except kinds as error:
         print("error: " + " ".join(str(error).split()), file=sys.stderr)
         sys.exit(2)

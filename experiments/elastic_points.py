@@ -112,9 +112,9 @@ def warp_and_rays(rays: int, samples: int):
     import jax.numpy as jnp
 
     from nerfies_jax.effects import warp
-    from nerfies_jax.effects.effect import Moment
     from nerfies_jax.effects.warp import WarpSpec
     from nerfies_jax.radiance import compositing
+    from nerfies_jax.training.effects import FrameCondition
 
     keys = jax.random.split(jax.random.key(0), 6)
     params = warp.init(WarpSpec(), keys[0])
@@ -131,8 +131,10 @@ def warp_and_rays(rays: int, samples: int):
     spacing = compositing.intervals(distance, 2.0 / samples)
     weight = jax.vmap(compositing.weights)(density * spacing)
     codes = 0.05 * jax.random.normal(keys[4], (rays, 8))
-    moments = Moment(jnp.zeros(rays), {"motion": codes}, jnp.zeros(rays, jnp.int32))
-    return params, (point, weight, moments)
+    conditions = FrameCondition(
+        jnp.zeros(rays), {"motion": codes}, jnp.zeros(rays, jnp.int32)
+    )
+    return params, (point, weight, conditions)
 
 
 def penalty(params, key, batch, points):
@@ -141,11 +143,12 @@ def penalty(params, key, batch, points):
     import jax.numpy as jnp
 
     from nerfies_jax.effects import elastic, warp
-    from nerfies_jax.effects.effect import Context, Level
+    from nerfies_jax.effects.effect import RayOutput
     from nerfies_jax.effects.elastic import ElasticSpec
     from nerfies_jax.effects.warp import WarpSpec
+    from nerfies_jax.training.effects import PenaltyContext
 
-    point, weight, moments = batch
+    point, weight, conditions = batch
     if points is None:
         samples = weight.shape[1]
         even = jnp.ones_like(weight)
@@ -153,13 +156,15 @@ def penalty(params, key, batch, points):
         chosen, _ = jax.vmap(elastic.systematic, (0, 0, None))(even, start, 4)
         point = jnp.take_along_axis(point, chosen[..., None], axis=1)
         weight = jnp.take_along_axis(weight, chosen, axis=1) * (samples / 4)
-    nothing = dict.fromkeys(Level._fields)
-    level = Level(**nothing | {"point": point, "static_weight": weight})
-    context = Context(
-        **dict.fromkeys(Context._fields)
+    nothing = dict.fromkeys(RayOutput._fields)
+    level = RayOutput(**nothing | {"point": point, "static_weight": weight})
+    context = PenaltyContext(
+        **dict.fromkeys(PenaltyContext._fields)
         | {
-            "displace": lambda x, moment: warp.displace(WarpSpec(), params, x, moment),
-            "moments": moments,
+            "displace": lambda x, condition: warp.displace(
+                WarpSpec(), params, x, condition
+            ),
+            "condition": conditions,
             "levels": (level,),
             "key": key,
         }

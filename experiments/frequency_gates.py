@@ -32,6 +32,7 @@ from gaussians_jax.effects.spectral import FourierSpec, SpectralSpec, WaveletSpe
 from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.runs import platform
 from nerfies_jax.training import losses, specs
+from nerfies_jax.training.effects import weighted_sum
 
 REWARD = 0.01  # of "log", for each gate's log sigma; as in the loss, in units of L1
 WARNINGS = ("ascent", "log")
@@ -139,7 +140,8 @@ def fit(arm: Arm, asked: FrequencyGates) -> Fitted:
         weight = None
         if spec is not None:
             weight = spectral.weights(spec, trained[1], step, asked.steps)
-            value = value + spectral.loss(spec, weight, image, truth).value
+            terms = spectral.terms(spec, weight, image, truth)
+            value = value + weighted_sum(terms)
         if arm.rule == "log":
             value = value - REWARD * sum(map(jax.nn.log_sigmoid, trained[1]))
         return value, (losses.psnr(losses.mse(image, truth)), weight)

@@ -46,7 +46,7 @@ def main(arguments=None):
             print(line)
         found = inspection.inspect(capture)
         advice = adviser.advise_all(found.findings, asked.full)
-        for line in report(found, advice, source.words):
+        for line in report(found, advice, source):
             print(line)
         path = asked.picture or pathlib.Path("runs", f"inspect-{_name(capture)}.png")
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -60,14 +60,16 @@ def main(arguments=None):
 def report(found, advice, source):
     """Lines for a person: the table, then the commands."""
     from nerfies_jax.evidence import findings
-    from nerfies_jax.runs import prices
+    from nerfies_jax.runs import commands, prices
+    from nerfies_jax.runs.config import RunConfig
 
     costs = prices.told(found.findings)
     lines = ["", *findings.table(found.findings, costs), ""]
     lines += [prices.legend(), ""]
     for one in advice:
         lines.append(f"{one.representation}:")
-        lines.append(f"  python -m experiments.reconstruct {source} {one.arguments()}")
+        config = RunConfig(one.preset, source, overrides=one.overrides)
+        lines.append(f"  {commands.reconstruct(config)}")
         lines += [f"  note: {note}" for note in one.notes]
     lines.append(f"looked for {found.seconds:.0f} s")
     return lines

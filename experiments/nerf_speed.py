@@ -113,9 +113,9 @@ def measured(rows: tuple[str, ...], repeats: int) -> dict[str, dict[str, float]]
     figures, calls = {}, {}
     for name in rows:
         spec = specs()[name]
-        model = scene.build(spec, scene.facts_of(capture, spec))
+        model = scene.build(spec, scene.metadata_of(capture, spec))
         state = model.init(capture, jax.random.key(0))
-        frames = evaluation.frames_of(capture, model.wants)
+        frames = evaluation.frames_of(capture, model.required_data)
         cost = clock.cost(model.step, state, frames)
         figures[name] = {
             "gflop": cost.flops / 1e9,

@@ -8,16 +8,16 @@ Leaves a run folder with checkpoints, metrics, pictures, a video and a report.
 
 import dataclasses
 import pathlib
+import signal
 import sys
-import time
 from typing import Literal
 
 from experiments import cli
-from nerfies_jax.runs import platform, representations, run_folder
-from nerfies_jax.runs.config import RunConfig
+from nerfies_jax.runs import commands, platform, representations
+from nerfies_jax.runs.config import MoreMetrics, RunConfig
+from nerfies_jax.training import stopping
 
 DEFAULT_PRESET = "splats-deformable-small"
-EVALUATED = 4  # held-out frames in the curve; all of them are scored at the end
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,9 +26,9 @@ class Reconstruct:
 
     source: cli.Source = cli.NamedSource()
     preset: str | None = None
-    """Gaussian splats: splats-static, splats-deformable, sonata, moba. Radiance fields:
-    nerf, nerf-w, d-nerf, t-nerf, nerfies, hypernerf, nsff. Each with -small is made for
-    a CPU (default: splats-deformable-small)."""
+    """Gaussian splats: splats-static, splats-mcmc, splats-deformable, sonata, moba.
+    Radiance fields: nerf, nerf-w, d-nerf, t-nerf, nerfies, hypernerf, nsff. Each with
+    -small is made for a CPU (default: splats-deformable-small)."""
     effects: Literal["preset", "auto"] = "preset"
     """auto: look at the capture first and take the effects that it calls for, in the
     representation and size of the preset (see experiments.inspect_scene)."""
@@ -42,103 +42,83 @@ class Reconstruct:
     """Continue the run in --out from its last checkpoint."""
     device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
     """Where to compute."""
-    seed: int = 0
-    """Of everything random."""
+    seed: int | None = None
+    """Of everything random (default: 0)."""
     set: tuple[str, ...] = ()
-    """Fields of the preset, as density.most=20000 motion.width=128 warp=none."""
+    """Fields of the preset: densification.cap_max=20000 motion.width=128 warp=none."""
     evaluate_every: float = 20.0
     """Seconds of training between two points of the PSNR curve."""
-    lpips_weights: tuple[pathlib.Path, ...] = ()
-    """Measure LPIPS, too: files (.pth, .safetensors, .npz) with the trained classifier
-    and LPIPS heads; read before the training."""
-    lpips_network: Literal["alex", "vgg"] = "alex"
-    """Whose weights these are."""
-    fit_heldout_cameras: int = 0
-    """Fit the cameras of so many held-out frames to what was filmed, the scene as it is
-    after training, and score them again."""
-
-    def __post_init__(self):
-        if self.fit_heldout_cameras < 0:
-            raise ValueError(
-                f"--fit-heldout-cameras {self.fit_heldout_cameras}: a number of "
-                "frames, not negative"
-            )
+    checkpoint_every: float = 60.0
+    """Seconds between two checkpoints; a run that is killed loses no more than that."""
+    more: cli.More = MoreMetrics()
 
 
 def main(arguments=None):
     """Run the job of the command line.
 
-    Exit code 1 where training blew up, 2 where the input is wrong.
+    Exit code 0 where all went well, 1 where training blew up or could not be saved or
+    drawn, 2 where the input is wrong, and 128 and more for a signal.
     """
     try:
-        _main(cli.parse(Reconstruct, arguments))
-    except KeyboardInterrupt:
-        # While it trains, the loop takes the signal itself, saves and says so.
-        print("interrupted while no step was running", file=sys.stderr)
+        outcome = _outcome(cli.parse(Reconstruct, arguments))
+    except KeyboardInterrupt as stop:
+        print(str(stop) or "interrupted while no step was running", file=sys.stderr)
         raise SystemExit(130) from None
-
-
-def _main(asked):
-    with cli.user_errors():
-        platform.start_jax(asked.device, _threads(asked))
-        from nerfies_jax import runs
-        from nerfies_jax.capture.capture import describe
-
-        began = time.perf_counter()
-        run = _resumed(asked, runs) if asked.resume else _new(asked, runs)
-        for line in describe(run.capture):
-            print(line)
-        lpips = _lpips(asked, run)
-        folder, state, history, after = _start(asked, run, runs)
-    from nerfies_jax.runs import train
-
-    with cli.user_errors():
-        checkpoints = train.open_checkpoints(folder, run, after)
-    outcome = train.train(
-        run,
-        state,
-        history,
-        checkpoints,
-        seconds=asked.seconds,
-        evaluate_every=asked.evaluate_every,
-        evaluated=EVALUATED,
-    )
-    if outcome.result.stopped_by in ("SIGINT", "SIGTERM"):
-        print(f"continue with: {_command(folder)}")
-        raise SystemExit(128 + (2 if outcome.result.stopped_by == "SIGINT" else 15))
-    from nerfies_jax.runs import products
-
-    errors = []
-    try:
-        products.make(folder, run, outcome, began, lpips, asked.fit_heldout_cameras)
-    except FloatingPointError as error:
-        errors.append(str(error))
-    if outcome.result.stopped_by == "non-finite":
-        errors.append(
-            f"{outcome.result.message}; start anew with lower learning rates "
-            f"(--set, their names are in {folder / run_folder.CONFIG})"
-        )
-    for line in errors:
+    for line in outcome.errors:
         print(f"error: {line}", file=sys.stderr)
-    raise SystemExit(1 if errors else 0)
+    stopped_by = outcome.result.stopped_by
+    code = 1 if outcome.errors else 0
+    if stopped_by in stopping.NAMES:
+        print(f"continue with: {commands.resume(outcome.folder)}")
+        code = code or 128 + signal.Signals[stopped_by]
+    raise SystemExit(code)
 
 
-def _lpips(asked, run):
-    """The weights named on the command line; None without any."""
-    if not asked.lpips_weights:
-        return None
-    from nerfies_jax.evaluation import heldout
-    from nerfies_jax.measure import perceptual
+def _outcome(asked):
+    with cli.user_errors():
+        if asked.resume:
+            _check_resumed(asked)
+        platform.start_jax(asked.device, _threads(asked))
+    from nerfies_jax import runs
 
-    network = {"alex": perceptual.ALEX, "vgg": perceptual.VGG}[asked.lpips_network]
-    return heldout.load_lpips(network, asked.lpips_weights, run.capture.size)
+    common = {
+        name: getattr(asked, name)
+        for name in ("more", "seconds", "evaluate_every", "checkpoint_every")
+    }
+    if asked.resume:
+        steps = () if asked.steps is None else (f"steps={asked.steps}",)
+        with cli.user_errors((runs.Refused,)):
+            return runs.resume(
+                asked.out,
+                expected=_expected(asked),
+                overrides=(*steps, *asked.set),
+                **common,
+            )
+    config = RunConfig(
+        preset=_preset(asked),
+        source=cli.plain(asked.source),
+        steps=asked.steps,
+        overrides=asked.set,
+        seed=asked.seed or 0,
+    )
+    with cli.user_errors((runs.Refused,)):
+        return runs.reconstruct(config, asked.out, effects=asked.effects, **common)
+
+
+def _check_resumed(asked):
+    """Raise ValueError where options do not go with --resume."""
+    if asked.out is None:
+        raise ValueError("--resume continues the run in a folder: name it with --out")
+    if asked.effects == "auto":
+        raise ValueError(
+            "--effects auto chooses what a new run begins with; leave it out with "
+            "--resume"
+        )
 
 
 def _threads(asked):
     """How many cores the representation wants XLA to see."""
-    found = None
-    if asked.resume and asked.out is not None:
-        found = representations.of_run(asked.out)
+    found = representations.of_run(asked.out) if asked.resume else None
     return (found or representations.of_preset(_preset(asked))).threads
 
 
@@ -146,50 +126,11 @@ def _preset(asked):
     return asked.preset or DEFAULT_PRESET
 
 
-def _resumed(asked, runs):
-    """The run in --out; other steps or settings make a spec its checkpoint refuses."""
-    if asked.out is None:
-        raise ValueError("--resume continues the run in a folder: name it with --out")
-    steps = () if asked.steps is None else (f"steps={asked.steps}",)
-    return runs.saved_run(asked.out, (*steps, *asked.set))
-
-
-def _new(asked, runs):
-    """The run that the command line asks for."""
-    config = RunConfig(
-        preset=_preset(asked),
-        source=cli.plain(asked.source),
-        steps=asked.steps,
-        overrides=asked.set,
-        seed=asked.seed,
-    )
-    stored = None
-    if asked.effects == "auto":
-        from nerfies_jax.evidence import inspection
-        from nerfies_jax.runs import adviser
-
-        runs.scene_spec(config)  # refuses a wrong preset before half a minute's look
-        stored = runs.stored_capture(config.source, config.seed)
-        found = inspection.inspect(stored)
-        config, lines = adviser.follow(config, found.findings)
-        print("\n".join(lines))
-    return runs.new_run(config, stored)
-
-
-def _start(asked, run, runs):
-    """The run folder, the state to go on from and its history."""
-    if asked.resume:
-        restored = runs.restore(asked.out, run)
-        return asked.out, restored.state, restored.record, restored.step
-    state = runs.first_state(run)
-    stem = "-".join(run.capture.name.split()) + "-" + run.config.preset
-    folder = run_folder.new_run_folder(asked.out, stem)
-    runs.save_config(folder, run)
-    return folder, state, None, None
-
-
-def _command(folder):
-    return f"python -m experiments.reconstruct --out {folder} --resume"
+def _expected(asked):
+    """What the command line says of the run that it continues, by field."""
+    said = {"preset": asked.preset, "seed": asked.seed}
+    said = {name: value for name, value in said.items() if value is not None}
+    return {**cli.given(asked.source), **said}
 
 
 if __name__ == "__main__":

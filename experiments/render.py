@@ -9,13 +9,13 @@ python -m experiments.render RUN --without warp          # the canonical scene
 python -m experiments.render RUN --hide-moving 0.02       # what stands still alone
 python -m experiments.render RUN --path sway --freeze 0 --appearance 0 7
 python -m experiments.render RUN --path sway --knots 32   # the motion from a table
-python -m experiments.render RUN --path sway --still-below 1e-4
+python -m experiments.render RUN --path sway --static-threshold 1e-4
 """
 
 import dataclasses
 import math
 import pathlib
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -51,7 +51,7 @@ class Render:
     them; experiments.deformation_cost shows what that costs and saves."""
     interpolation: Literal["linear", "cubic"] = "linear"
     """Between the knots."""
-    still_below: float | None = None
+    static_threshold: Annotated[float | None, cli.formerly("--still-below")] = None
     """Do not evaluate the motion of Gaussians that move less than this, in scene units;
     1e-4 is not seen."""
     hide_moving: float | None = None
@@ -81,7 +81,7 @@ class Render:
             raise ValueError(
                 f"--interpolation {self.interpolation} is for --knots; say how many"
             )
-        for name in ("still_below", "hide_moving"):
+        for name in ("static_threshold", "hide_moving"):
             distance = getattr(self, name)
             if distance is not None and not 0 <= distance < math.inf:
                 raise ValueError(
@@ -128,8 +128,8 @@ def _name(asked):
     blended = "" if not named else f"-from-{named[0]}-to-{named[1]}"
     knots = "" if asked.knots is None else f"-knots-{asked.knots}"
     knots += "" if asked.interpolation == "linear" else f"-{asked.interpolation}"
-    if asked.still_below is not None:
-        knots += f"-still-below-{asked.still_below:g}"
+    if asked.static_threshold is not None:
+        knots += f"-static-threshold-{asked.static_threshold:g}"
     if asked.hide_moving is not None:
         knots += f"-hide-moving-{asked.hide_moving:g}"
     depth = "" if asked.show == "colour" else f"-{asked.show}"
@@ -171,13 +171,13 @@ def _faster(asked, model, state):
     """The model and its state, the motion from a table or of what moves alone."""
     from gaussians_jax import variants
 
-    still_below = 0.0 if asked.still_below is None else asked.still_below
+    static_threshold = 0.0 if asked.static_threshold is None else asked.static_threshold
     if asked.knots is not None:
         made = variants.from_knots(
-            model, state, asked.knots, asked.interpolation, still_below
+            model, state, asked.knots, asked.interpolation, static_threshold
         )
-    elif asked.still_below is not None:
-        made = variants.without_still(model, state, still_below)
+    elif asked.static_threshold is not None:
+        made = variants.without_static(model, state, static_threshold)
     else:
         return model, state
     print(made.summary)

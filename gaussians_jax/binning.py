@@ -1,9 +1,9 @@
-"""Which Gaussians touch which tiles, in depth order, one slab of pairs at a time.
+"""Which Gaussians touch which tiles, in depth order, one chunk of pairs at a time.
 
 All (Gaussian, tile) pairs form one conceptual list: nearest Gaussian first, its tiles
-row by row. A slab is the next `capacity` entries of that list, sorted by tile. Each
+row by row. A chunk is the next `capacity` entries of that list, sorted by tile. Each
 tile therefore meets its Gaussians in depth order whatever the capacity, and a Gaussian
-wider than a slab simply continues in the next one: nothing can overflow.
+wider than a chunk simply continues in the next one: nothing can overflow.
 """
 
 import math
@@ -38,8 +38,8 @@ class Grid(NamedTuple):
         return self.rows * self.columns
 
 
-class Boxes(NamedTuple):
-    """Tiles that a Gaussian's box touches, one row per Gaussian, nearest first."""
+class TileRects(NamedTuple):
+    """Tiles that a Gaussian's rectangle covers, one row per Gaussian, nearest first."""
 
     left: Int[Array, " gaussians"]
     top: Int[Array, " gaussians"]
@@ -48,13 +48,13 @@ class Boxes(NamedTuple):
 
 
 class Cursor(NamedTuple):
-    """Where the next slab starts in the list of pairs."""
+    """Where the next chunk starts in the list of pairs."""
 
     rank: Int[Array, ""]  # Gaussian, in depth order
-    skip: Int[Array, ""]  # its tiles that earlier slabs have already taken
+    skip: Int[Array, ""]  # its tiles that earlier chunks have already taken
 
 
-class Slab(NamedTuple):
+class Intersections(NamedTuple):
     """Pairs sorted by tile, then by depth."""
 
     ranks: Int[Array, " capacity"]
@@ -62,11 +62,11 @@ class Slab(NamedTuple):
     ends: Int[Array, " tiles"]
 
 
-def tile_boxes(
+def tile_rects(
     mean_px: Float[Array, "gaussians 2"],
     extent_px: Float[Array, "gaussians 2"],
     grid: Grid,
-) -> Boxes:
+) -> TileRects:
     """Tiles with a pixel centre inside mean +- extent; extent 0 means not drawn."""
     eps = jnp.finfo(mean_px.dtype).eps
     # Rounding of mean +- extent, so that a pixel on the edge is never lost.
@@ -79,7 +79,7 @@ def tile_boxes(
     high = jnp.clip(high, 0, limit).astype(jnp.int32)
     spans = jnp.maximum(high - low, 0)
     count = jnp.where(extent_px[:, 0] > 0, spans[:, 0] * spans[:, 1], 0)
-    return Boxes(low[:, 0], low[:, 1], jnp.maximum(spans[:, 0], 1), count)
+    return TileRects(low[:, 0], low[:, 1], jnp.maximum(spans[:, 0], 1), count)
 
 
 def depth_order(
@@ -123,37 +123,37 @@ def _ordered_bits(depth):
     return jnp.where(bits >= sign, ~bits, bits | sign)
 
 
-def next_slab(
+def next_intersections(
     cursor: Cursor,
-    boxes: Boxes,
+    rects: TileRects,
     table: Float[Array, "rows columns"],
     open_tiles: Bool[Array, " tiles"],
     log_cut: float,
     grid: Grid,
     capacity: int,
-) -> tuple[Slab, Cursor]:
-    """The pairs from `cursor` on, and where the slab after them starts.
+) -> tuple[Intersections, Cursor]:
+    """The pairs from `cursor` on, and where the chunk after them starts.
 
     `table` holds mean (px), p, k, r and log opacity in its first six columns, a row per
     rank; `log_cut` is the log of the alpha below which nothing is drawn. Pairs of tiles
     that are not in `open_tiles` (all pixels done) and pairs whose ellipse misses the
     tile are left out.
     """
-    rank, within, following = _expand(cursor, boxes.count, capacity)
+    rank, within, following = _expand(cursor, rects.count, capacity)
     in_use = rank >= 0
     rank = jnp.maximum(rank, 0)
-    box_columns = boxes.columns[rank]
-    row = boxes.top[rank] + within // box_columns
-    column = boxes.left[rank] + within % box_columns
+    rect_columns = rects.columns[rank]
+    row = rects.top[rank] + within // rect_columns
+    column = rects.left[rank] + within % rect_columns
     tile = row * grid.columns + column
     keep = in_use & _ellipse_meets_tile(table[rank, :6], row, column, log_cut, grid)
     keep &= open_tiles[jnp.where(in_use, tile, 0)]
     tile = jnp.where(keep, tile, grid.tiles)
-    return sort_pairs(tile, rank, cursor.rank, boxes.count.shape[0], grid), following
+    return sort_pairs(tile, rank, cursor.rank, rects.count.shape[0], grid), following
 
 
 def advance(cursor: Cursor, count: Int[Array, " gaussians"], capacity: int) -> Cursor:
-    """Where the slab after the one at `cursor` starts; `count` is that of `Boxes`."""
+    """Where the chunk after that at `cursor` starts; `count` is that of `TileRects`."""
     return _span(cursor, count, capacity)[2]
 
 
@@ -163,7 +163,7 @@ def _span(cursor, count, capacity):
     index = jnp.arange(gaussians, dtype=jnp.int32)
     count = jnp.where(index < cursor.rank, 0, count)
     count = count - jnp.where(index == cursor.rank, cursor.skip, 0)
-    # int32 sums may wrap far behind the slab, never before its end: the first total
+    # int32 sums may wrap far behind the chunk, never before its end: the first total
     # beyond the capacity is at most capacity + tiles. So only what precedes the first
     # crossing is read.
     total = lax.cumsum(count)
@@ -183,7 +183,7 @@ def _span(cursor, count, capacity):
 
 
 def _expand(cursor, count, capacity):
-    """Rank and number within its box for each of `capacity` slots; rank -1 beyond."""
+    """Rank and number within its rectangle of each of `capacity` slots; -1 beyond."""
     begin, filled, following = _span(cursor, count, capacity)
     index = jnp.arange(count.shape[0], dtype=jnp.int32)
     marks = jnp.zeros(capacity + 1, jnp.int32).at[begin].max(index + 1)
@@ -225,15 +225,15 @@ def sort_pairs(
     first_rank: Int[Array, ""],
     gaussians: int,
     grid: Grid,
-) -> Slab:
+) -> Intersections:
     """Pairs in order of rank, sorted by tile; tile `grid.tiles` marks an unused slot.
 
-    One unsigned sort of (tile, rank since the slab's first) where both fit 32 bits: a
+    One unsigned sort of (tile, rank since the chunk's first) where both fit 32 bits: a
     sort with a payload costs five times as much on the CPU.
     """
     capacity = tile.shape[0]
     # Only Gaussians that touch no tile, and these come last, have no pair: so ranks
-    # within a slab span less than its capacity.
+    # within a chunk span less than its capacity.
     rank_bits = max(1, (min(capacity, gaussians) - 1).bit_length())
     tile_bits = grid.tiles.bit_length()
     if rank_bits + tile_bits <= 32:
@@ -248,4 +248,4 @@ def sort_pairs(
         tile, ranks = lax.sort((tile, rank), num_keys=1, is_stable=True)
     bounds = jnp.searchsorted(tile, jnp.arange(grid.tiles + 1, dtype=jnp.int32))
     bounds = bounds.astype(jnp.int32)
-    return Slab(ranks, bounds[:-1], bounds[1:])
+    return Intersections(ranks, bounds[:-1], bounds[1:])

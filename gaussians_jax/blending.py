@@ -12,7 +12,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from gaussians_jax.binning import Grid, Slab
+from gaussians_jax.binning import Grid, Intersections
 from gaussians_jax.raster_spec import RasterSpec
 
 EXACT = lax.Precision.HIGHEST  # no TF32 on GPU
@@ -28,22 +28,22 @@ class Lockstep(NamedTuple):
 
 def blend(
     state: Float[Array, "tiles rows pixels"],
-    slab: Slab,
+    isects: Intersections,
     table: Float[Array, "gaussians columns"],
     spec: RasterSpec,
     grid: Grid,
     step: Lockstep,
 ) -> tuple[Float[Array, "tiles rows pixels"], Int[Array, " tiles"]]:
-    """Composite a slab onto `state`; also how many pairs each tile looked at.
+    """Composite a chunk of pairs onto `state`; also how many pairs each tile looked at.
 
     The last row of `table` must be transparent (log opacity minus infinity).
     """
-    order, batches = _by_length(slab, step.batch)
+    order, batches = _by_length(isects, step.batch)
 
     def one_batch(carry):
         number, state, used = carry
         tiles = lax.dynamic_slice(order, (number * step.batch,), (step.batch,))
-        start, end, middle = _tile_rows(tiles, slab, grid, state.dtype)
+        start, end, middle = _tile_rows(tiles, isects, grid, state.dtype)
         longest = jnp.max(end - start)
 
         def unfinished(inner):
@@ -52,7 +52,7 @@ def blend(
 
         def one_chunk(inner):
             position, local, alive = inner
-            _, rows = _chunk(table, slab.ranks, start, end, position, step.chunk)
+            _, rows = _chunk(table, isects.ranks, start, end, position, step.chunk)
             _, alpha = _alphas(rows, middle, spec, grid)
             local = _composite(local, alpha, rows, spec)
             alive = jnp.max(local[:, 0], axis=1) > 0
@@ -80,14 +80,14 @@ def blend(
 def blend_gradient(
     state: Float[Array, "tiles rows pixels"],
     gradient: Float[Array, "gaussians columns"],
-    slab: Slab,
+    isects: Intersections,
     table: Float[Array, "gaussians columns"],
     cotangent: Float[Array, "tiles channels pixels"],
     spec: RasterSpec,
     grid: Grid,
     step: Lockstep,
 ) -> tuple[Float[Array, "tiles rows pixels"], Float[Array, "gaussians columns"]]:
-    """Add a slab's part of the gradient of every table entry.
+    """Add a chunk's part of the gradient of every table entry.
 
     `state` carries two rows: transmittance, and what is still to come of the loss
     through this pixel, S = sum over the Gaussians not yet met of w (colour . g), plus
@@ -97,12 +97,12 @@ def blend_gradient(
 
     S_i being what remains behind Gaussian i. No image but the final one is needed.
     """
-    order, batches = _by_length(slab, step.batch)
+    order, batches = _by_length(isects, step.batch)
 
     def one_batch(carry):
         number, state, gradient = carry
         tiles = lax.dynamic_slice(order, (number * step.batch,), (step.batch,))
-        start, end, middle = _tile_rows(tiles, slab, grid, state.dtype)
+        start, end, middle = _tile_rows(tiles, isects, grid, state.dtype)
         longest = jnp.max(end - start)
         toward = cotangent.at[tiles].get(mode="clip")
 
@@ -112,7 +112,7 @@ def blend_gradient(
 
         def one_chunk(inner):
             position, local, _, gradient = inner
-            rank, rows = _chunk(table, slab.ranks, start, end, position, step.chunk)
+            rank, rows = _chunk(table, isects.ranks, start, end, position, step.chunk)
             raw, alpha = _alphas(rows, middle, spec, grid)
             local, weight, slope = _trace_back(local, raw, alpha, rows, toward, spec)
             update = _pair_gradients(rows, middle, weight, slope, toward, grid)
@@ -133,12 +133,12 @@ def blend_gradient(
     return state, gradient
 
 
-def _by_length(slab, batch):
+def _by_length(isects, batch):
     """Tiles from most to fewest pairs, padded to whole batches, and how many batches.
 
     Tiles of one batch run in lockstep, so they should be about equally long.
     """
-    length = slab.ends - slab.starts
+    length = isects.ends - isects.starts
     order = jnp.argsort(-length, stable=True).astype(jnp.int32)
     tiles = length.shape[0]
     padding = jnp.full(-tiles % batch, tiles, jnp.int32)
@@ -146,10 +146,10 @@ def _by_length(slab, batch):
     return jnp.concatenate([order, padding]), batches
 
 
-def _tile_rows(tiles, slab, grid, dtype):
+def _tile_rows(tiles, isects, grid, dtype):
     """First pair, end, and centre (px) of each tile of a batch; padding is empty."""
-    start = slab.starts.at[tiles].get(mode="fill", fill_value=0)
-    end = slab.ends.at[tiles].get(mode="fill", fill_value=0)
+    start = isects.starts.at[tiles].get(mode="fill", fill_value=0)
+    end = isects.ends.at[tiles].get(mode="fill", fill_value=0)
     corner = jnp.stack([tiles % grid.columns, tiles // grid.columns]) * grid.tile
     return start, end, corner.astype(dtype) + grid.tile / 2
 
@@ -185,7 +185,9 @@ def _alphas(rows, middle, spec, grid):
     u = u0 + u_x * x
     v = v0 + v_x * x + v_y * y
     raw = jnp.exp(rows[5][..., None] - u * u - v * v)
-    return raw, jnp.where(raw >= spec.alpha_cut, jnp.minimum(raw, spec.alpha_max), 0)
+    return raw, jnp.where(
+        raw >= spec.alpha_threshold, jnp.minimum(raw, spec.alpha_max), 0
+    )
 
 
 def _pass_through(transmittance, alpha, spec):
@@ -193,7 +195,7 @@ def _pass_through(transmittance, alpha, spec):
     # A product, not T - alpha T: two alphas of 0.99 leave 0.99999e-4, and rounding the
     # difference could put that above the stop.
     passed = transmittance * (1 - alpha)
-    drawn = passed > spec.stop
+    drawn = passed > spec.transmittance_threshold
     return jnp.where(drawn, passed, -jnp.abs(transmittance)), drawn
 
 

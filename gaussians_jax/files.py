@@ -62,9 +62,9 @@ def load(path: str | os.PathLike, *, drop_broken: bool = False) -> Loaded:
 
 
 def save(path: str | os.PathLike, rows: Splats, *, spz_version: int = 3) -> int:
-    """Write the living Gaussians in the format of the suffix; returns how many.
+    """Write the active Gaussians in the format of the suffix; returns how many.
 
-    Dead rows are left out. A row that is not finite is refused: no viewer copes.
+    Inactive rows are left out. A row that is not finite is refused: no viewer copes.
     """
     path = pathlib.Path(path)
     if path.suffix.lower() not in SUFFIXES:
@@ -72,8 +72,8 @@ def save(path: str | os.PathLike, rows: Splats, *, spz_version: int = 3) -> int:
             f"{path}: no writer for {path.suffix or 'a name without suffix'}; "
             f"known are {', '.join(SUFFIXES)}"
         )
-    living = splats.rows_to_write(rows, path)
-    kept = Splats(*(np.asarray(leaf, np.float32)[living] for leaf in rows))
+    active = splats.rows_to_write(rows, path)
+    kept = Splats(*(np.asarray(leaf, np.float32)[active] for leaf in rows))
     try:
         kept, _ = _without_broken(kept, False)
         if path.suffix.lower() == ".ply":
@@ -85,7 +85,7 @@ def save(path: str | os.PathLike, rows: Splats, *, spz_version: int = 3) -> int:
     except ValueError as error:
         raise ValueError(f"{path}: {error}; not written") from error
     _write_atomically(path, data)
-    return int(living.sum())
+    return int(active.sum())
 
 
 def _without_broken(rows, drop):

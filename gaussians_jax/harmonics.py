@@ -2,9 +2,10 @@
 
 import math
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
+
+from nerfies_jax.geometry.precision import near_one
 
 _C0 = 0.28209479177387814
 _C1 = 0.4886025119029199
@@ -32,15 +33,13 @@ def degree_of(coefficients: int) -> int:
 def unit_direction(offset: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
     """`offset` at unit length; +z, with no gradient, where it is zero.
 
-    Divides by the largest component first, so 1e-30 and 1e30 keep their direction in
-    float32; the result does not depend on that scale, so its gradient may ignore it.
+    Scaled by its largest component first, so 1e-30 and 3e38 keep their direction in
+    float32.
     """
     largest = jnp.max(jnp.abs(offset), axis=-1, keepdims=True)
-    zero = largest == 0
-    scale = jnp.where(zero, 1, largest)
+    zero = largest < jnp.finfo(offset.dtype).tiny
     axis = jnp.asarray([0, 0, 1], offset.dtype)
-    # The scale is detached: d(v/|v|) is unchanged when v is replaced by v / constant.
-    scaled = jnp.where(zero, axis, offset / jax.lax.stop_gradient(scale))
+    scaled, _ = near_one(jnp.where(zero, axis, offset), axis=-1)
     return scaled / jnp.linalg.norm(scaled, axis=-1, keepdims=True)
 
 

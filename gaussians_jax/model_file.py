@@ -1,4 +1,4 @@
-"""A trained scene in one file: living Gaussians, networks, and what they mean.
+"""A trained scene in one file: active Gaussians, networks, and what they mean.
 
 The file is a NumPy archive (.npz): one float32 array for each leaf of the parameters,
 and one text, JSON, with the format's version, the structure that the leaves form and a
@@ -38,15 +38,15 @@ PyTree = Any
 
 
 def save(path: str | os.PathLike, params: Params, description: dict[str, Any]) -> int:
-    """Write the living rows and the networks in float32; returns the file's bytes.
+    """Write the active rows and the networks in float32; returns the file's bytes.
 
     `description` holds plain values and frozen settings. The file appears whole or not
     at all. A value that is not finite is refused.
     """
     path = pathlib.Path(path)
     rows = params.rows["splats"]
-    living = splats.rows_to_write(rows, path)
-    rows = jax.tree.map(lambda leaf: np.asarray(leaf)[living], params.rows)
+    active = splats.rows_to_write(rows, path)
+    rows = jax.tree.map(lambda leaf: np.asarray(leaf)[active], params.rows)
     arrays: dict[str, np.ndarray] = {}
     try:
         structure = _taken_apart(params._replace(rows=rows), "params", arrays)

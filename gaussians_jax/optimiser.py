@@ -108,8 +108,9 @@ def _longest(b2):
 
 
 # x coth x - 1 as a series in x^2 with radius pi^2; ten terms leave 1e-17 at x = 1/2.
+# Python's floats: NumPy's make float64 of float32 where x64 is on.
 _COTH = tuple(
-    2 * (-1) ** (n + 1) * scipy.special.zeta(2 * n) / math.pi ** (2 * n)
+    float(2 * (-1) ** (n + 1) * scipy.special.zeta(2 * n) / math.pi ** (2 * n))
     for n in range(1, 11)
 )
 
@@ -227,18 +228,19 @@ def gather_rows(
     moments: PyTree,
     rows: Int[Array, " capacity"],
     fresh: Bool[Array, " capacity"],
-    dead: Bool[Array, " capacity"],
+    inactive: Bool[Array, " capacity"],
 ) -> tuple[Params, PyTree]:
     """Row `rows[i]` of everything becomes row i, in parameters and moments alike.
 
-    `fresh` rows start with zero moments and a zero count; `dead` ones are buried.
+    `fresh` rows start with zero moments and a zero count, and so do `inactive` ones,
+    which lose their opacity.
     """
     taken = splats.take_rows(params, rows)
-    buried = splats.bury(taken.rows["splats"], dead)
-    taken = taken._replace(rows=taken.rows | {"splats": buried})
+    deactivated = splats.deactivate(taken.rows["splats"], inactive)
+    taken = taken._replace(rows=taken.rows | {"splats": deactivated})
 
     def gather(moment):
-        forget = (fresh | dead).reshape(fresh.shape + (1,) * (moment.ndim - 1))
+        forget = (fresh | inactive).reshape(fresh.shape + (1,) * (moment.ndim - 1))
         return jnp.where(forget, jnp.zeros_like(moment[:1]), moment[rows])
 
     return taken, map_moments(optimiser, gather, moments, row_leaves(params))

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Int
 
 from gaussians_jax.splats import Params
 from nerfies_jax.training.schedules import Schedule
+from nerfies_jax.training.step_counts import steps
 
 PyTree = Any
 SHARED = "shared"  # marks what mirrors no parameter in an optimiser's state
@@ -30,8 +31,8 @@ class AlternationSpec:
     and the annealing of the positions.
     """
 
-    start: int  # step
-    stop: int  # the first step in which everything trains again
+    start: int = steps()  # step
+    stop: int = steps()  # the first step in which everything trains again
     nets: int = 2  # steps of a cycle
     rows: int = 1  # steps of a cycle
 
@@ -58,7 +59,7 @@ class AnnealingSpec:
     share of the run (3/4 here). `annealed` has the rate.
     """
 
-    after: int  # step
+    after: int = steps()  # step
     decay: float = 5.0  # the rate would fall to exp(-decay) by the end of the run
     freeze_share: float = 0.05  # of the whole run: its last steps, with a rate of zero
 
@@ -74,7 +75,7 @@ class AnnealingSpec:
             )
 
 
-class Turn(NamedTuple):
+class UpdateMask(NamedTuple):
     """Which of the parameters a step trains."""
 
     rows: Bool[Array, ""]
@@ -85,26 +86,29 @@ class Trained(NamedTuple):
     """Parameters with the state of their optimiser."""
 
     params: Params
-    moments: PyTree
+    opt_state: PyTree
 
 
-def turn(spec: AlternationSpec | None, step: Int[Array, ""] | int) -> Turn:
+def update_mask(spec: AlternationSpec | None, step: Int[Array, ""] | int) -> UpdateMask:
     """Whose turn it is at a traced step."""
     step = jnp.asarray(step, jnp.int32)
     if spec is None:
-        return Turn(jnp.asarray(True), jnp.asarray(True))
+        return UpdateMask(jnp.asarray(True), jnp.asarray(True))
     outside = (step < spec.start) | (step >= spec.stop)
     # Before `start` the remainder is not negative either; `outside` decides there.
     place = (step - spec.start) % (spec.nets + spec.rows)
-    return Turn(outside | (place >= spec.nets), outside | (place < spec.nets))
+    return UpdateMask(outside | (place >= spec.nets), outside | (place < spec.nets))
 
 
-def hold(
-    optimiser: optax.GradientTransformation, turn: Turn, before: Trained, after: Trained
+def freeze(
+    optimiser: optax.GradientTransformation,
+    mask: UpdateMask,
+    before: Trained,
+    after: Trained,
 ) -> Trained:
     """A step's outcome, but for the group whose turn it was not: that is as before.
 
-    So are its moments and counts, bit for bit. Zero slopes would not do: Adam's
+    So are its moments and counts, bit for bit. Zero gradients would not do: Adam's
     momentum goes on moving what has none. What mirrors a parameter is asked of optax; a
     count belongs to the group with which it shares the smallest part of the state, and
     where that is both (`optax.adam` over everything) it is refused.
@@ -114,27 +118,29 @@ def hold(
     # and 0.9 (1.4) in branches, which know less than `jnp.where` of what they may
     # overwrite and need an optimiser for each group. Drawing takes 30 ms.
     params = _by_group(before.params)
-    moments = _groups_of_moments(optimiser, params, before.moments)
+    moments = _groups_of_moments(optimiser, params, before.opt_state)
 
     def kept(group, old, new):
-        return jnp.where(getattr(turn, group), new, old)
+        return jnp.where(getattr(mask, group), new, old)
 
     return jax.tree.map(kept, Trained(params, moments), before, after)
 
 
-def spared(turn: Turn, function: Callable[..., PyTree]) -> Callable[..., PyTree]:
-    """`function(params, ...)` with nothing spent on slopes of networks that are frozen.
+def stop_frozen_gradients(
+    mask: UpdateMask, function: Callable[..., PyTree]
+) -> Callable[..., PyTree]:
+    """`function(params, ...)` with nothing spent on gradients of frozen networks.
 
-    The same values, and the same slopes where it is the networks' turn; where it is not
-    theirs are zero. Forward and backward, 10k Gaussians on one core: 539 ms become
+    The same values, and the same gradients where it is the networks' turn; where it is
+    not theirs are zero. Forward and backward, 10k Gaussians on one core: 539 ms become
     127 ms for 8x256, 98 become 29 for 4x128; in the networks' own turn 537 and 96.
     """
 
-    def still(params, *rest):
+    def frozen(params, *rest):
         return function(params._replace(nets=jax.lax.stop_gradient(params.nets)), *rest)
 
     def either(params, *rest):
-        return jax.lax.cond(turn.nets, function, still, params, *rest)
+        return jax.lax.cond(mask.nets, function, frozen, params, *rest)
 
     return either
 

@@ -78,9 +78,9 @@ def mover(spec, facts) -> Move | None:
 
 
 def _seen_opacity(state, posed):
-    """[gaussians] opacity of posed Gaussians, 0 for rows that are not alive."""
-    alive = np.asarray(splats.alive(state.params.rows["splats"]))
-    return np.where(alive, np.asarray(posed.opacity), 0.0)
+    """[gaussians] opacity of posed Gaussians, 0 for rows that are not active."""
+    active = np.asarray(splats.active_mask(state.params.rows["splats"]))
+    return np.where(active, np.asarray(posed.opacity), 0.0)
 
 
 def carried(

@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float
 from gaussians_jax.raster_spec import RasterSpec
 from gaussians_jax.splats import Gaussians, refuse_half
 from nerfies_jax.geometry.camera import Camera
+from nerfies_jax.geometry.precision import near_one
 
 # gsplat's MIN_COMPENSATION, squared: the antialiased opacity factor is at least 0.005.
 MIN_COMPENSATION_SQ = 0.005**2
@@ -69,10 +70,13 @@ def project(
 def _project_one(mean, quaternion, scale, opacity, camera, size, spec):
     offset = mean - camera.position  # R (x - c), not R x + t: exact far from origin
     depth = _dot(camera.camera_from_world[2], offset)
-    drawn = (depth >= spec.near) & (depth <= spec.far) & (opacity >= spec.alpha_cut)
+    drawn = (
+        (depth >= spec.near) & (depth <= spec.far) & (opacity >= spec.alpha_threshold)
+    )
     for part in (offset, quaternion, scale):
         drawn &= jnp.all(jnp.isfinite(part))
-    drawn &= jnp.any(quaternion != 0) & jnp.isfinite(opacity)
+    tiny = jnp.finfo(quaternion.dtype).tiny
+    drawn &= (jnp.max(jnp.abs(quaternion)) >= tiny) & jnp.isfinite(opacity)
 
     # `where` differentiates both branches: what is not drawn becomes a unit sphere one
     # unit ahead before anything is divided.
@@ -93,7 +97,7 @@ def _project_one(mean, quaternion, scale, opacity, camera, size, spec):
     whitening, compensation = _whiten(first, second, spec)
     if spec.antialiased:
         opacity = opacity * compensation
-        drawn &= opacity >= spec.alpha_cut
+        drawn &= opacity >= spec.alpha_threshold
     extent = jnp.where(drawn, _extent(whitening, opacity, spec), 0)
     fields = (
         jnp.where(drawn, field, lax.stop_gradient(field))
@@ -143,10 +147,8 @@ def _clamp_tangent(tangent, focal, centre, pixels, spec):
 
 def _footprint_rows(rows, quaternion, scale):
     """The two rows of T = J W R diag(scale), as component lists."""
-    # Scaling by the largest component keeps 1e-30 and 1e30 apart from 0 and infinity;
-    # a rotation does not depend on the length, so the scale carries no gradient.
-    largest = lax.stop_gradient(jnp.max(jnp.abs(quaternion)))
-    w, x, y, z = quaternion / largest
+    # keeps lengths of 1e-30 and 3e38 apart from 0 and infinity
+    w, x, y, z = near_one(quaternion)[0]
     double = 2 / (w * w + x * x + y * y + z * z)
     columns = (
         (
@@ -174,7 +176,7 @@ def _whiten(first, second, spec):
     c - b^2/a as a sum of squares: |t1 x t2|^2/a + dilation (1 + |t2|^2/a), with t1
     scaled by 1/sqrt(a) beforehand so that nothing of fourth order in px is formed.
     """
-    dilation = spec.dilation_px2
+    dilation = spec.eps2d
     variance_x = _dot(first, first) + dilation
     inverse = lax.rsqrt(variance_x)
     n = [x * inverse for x in first]
@@ -200,7 +202,7 @@ def _whiten(first, second, spec):
 def _extent(whitening, opacity, spec):
     """Half width and height (px) of the box around alpha >= cut."""
     p, k, r = whitening
-    reach = jnp.sqrt(jnp.maximum(jnp.log(opacity / spec.alpha_cut), 0))
+    reach = jnp.sqrt(jnp.maximum(jnp.log(opacity / spec.alpha_threshold), 0))
     across = reach / p
     # c = (c - b^2/a) + k^2 a
     down = jnp.hypot(reach / r, k * across)

@@ -1,8 +1,8 @@
 """Footprints to pixels: exact, differentiable, in memory that does not grow with pairs.
 
 Front-to-back compositing over square tiles (Kerbl et al. 2023, arXiv:2308.04079,
-equation 3), streamed over depth slabs (`binning`), with a hand-written backward pass
-that recomputes every alpha (`blending`).
+equation 3), streamed over chunks in depth order (`binning`), with a hand-written
+backward pass that recomputes every alpha (`blending`).
 
 On the CPU let each device see one core (environment variable PJRT_NPROC=1, set before
 JAX starts): XLA splits every small operation of the loops over all cores it sees, which
@@ -20,7 +20,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from gaussians_jax import binning, blending
-from gaussians_jax.binning import Cursor, Grid, Slab
+from gaussians_jax.binning import Cursor, Grid, Intersections
 from gaussians_jax.blending import SHAPE_COLUMNS, Lockstep
 from gaussians_jax.projection import Footprints
 from gaussians_jax.raster_spec import RasterSpec
@@ -45,11 +45,11 @@ class Layout(NamedTuple):
     capacity: int
 
 
-class Kept(NamedTuple):
-    """Slabs sorted in the forward pass, for the backward pass."""
+class Residuals(NamedTuple):
+    """Chunks sorted in the forward pass, for the backward pass."""
 
-    slabs: Slab  # leading axis: the first `kept_slabs` slabs
-    count: Int[Array, ""]  # slabs there were
+    chunks: Intersections  # leading axis: the first `kept_chunks` chunks
+    count: Int[Array, ""]  # chunks there were
     pairs: Int[Array, ""]  # (tile, Gaussian) pairs blended in all of them
 
 
@@ -86,25 +86,25 @@ def blended_pairs(
     """
     layout = _layout(footprints, size, spec)
     nothing = jnp.zeros((footprints.depth.shape[0], 1), footprints.depth.dtype)
-    boxes, table = _in_depth_order(footprints, nothing, layout.grid)
-    return _stream(layout, boxes, table)[1].pairs
+    rects, table = _in_depth_order(footprints, nothing, layout.grid)
+    return _stream(layout, rects, table)[1].pairs
 
 
 def _in_depth_order(footprints, values, grid):
-    """Boxes and table, a row per rank."""
-    boxes = binning.tile_boxes(
+    """Rectangles and table, a row per rank."""
+    rects = binning.tile_rects(
         lax.stop_gradient(footprints.mean_px), footprints.extent_px, grid
     )
-    order = binning.depth_order(lax.stop_gradient(footprints.depth), boxes.count)
-    boxes = binning.Boxes(*(x[order] for x in boxes))
-    log_opacity = jnp.log(jnp.where(boxes.count > 0, footprints.opacity[order], 1))
+    order = binning.depth_order(lax.stop_gradient(footprints.depth), rects.count)
+    rects = binning.TileRects(*(x[order] for x in rects))
+    log_opacity = jnp.log(jnp.where(rects.count > 0, footprints.opacity[order], 1))
     table = [
         footprints.mean_px[order],
         footprints.whitening[order],
         log_opacity[:, None],
         values[order],
     ]
-    return boxes, jnp.concatenate(table, axis=1)
+    return rects, jnp.concatenate(table, axis=1)
 
 
 def _layout(footprints, size, spec):
@@ -123,7 +123,7 @@ def _layout(footprints, size, spec):
         capacity = min(max(wanted, SMALLEST_CAPACITY), LARGEST_CAPACITY)
         capacity = 1 << math.ceil(math.log2(capacity))
         # Tile and rank in one 32-bit word: the sort of two arrays takes five times as
-        # long. Not at any price, because each slab also passes over every tile.
+        # long. Not at any price, because each chunk also passes over every tile.
         packed = 1 << (32 - grid.tiles.bit_length())
         if packed >= LEAST_PACKED_CAPACITY:
             capacity = min(capacity, packed)
@@ -131,29 +131,29 @@ def _layout(footprints, size, spec):
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _raster(layout, boxes, table):
+def _raster(layout, rects, table):
     """State [tiles, 1 + channels, pixels]: transmittance, then channels."""
-    return _raster_forward(layout, boxes, table)[0]
+    return _raster_forward(layout, rects, table)[0]
 
 
-def _raster_forward(layout, boxes, table):
+def _raster_forward(layout, rects, table):
     """One camera after another under vmap: lockstep over cameras would wait for all."""
 
     @jax.custom_batching.sequential_vmap
-    def forward(boxes, table):
-        return _stream(layout, boxes, table)
+    def forward(rects, table):
+        return _stream(layout, rects, table)
 
-    state, kept = forward(boxes, table)
-    return jnp.abs(state), (boxes, table, state, kept)
+    state, residuals = forward(rects, table)
+    return jnp.abs(state), (rects, table, state, residuals)
 
 
 def _raster_backward(layout, residuals, cotangent):
     @jax.custom_batching.sequential_vmap
-    def backward(boxes, table, state, kept, cotangent):
-        return _stream_back(layout, boxes, table, state, kept, cotangent)
+    def backward(rects, table, state, residuals, cotangent):
+        return _stream_back(layout, rects, table, state, residuals, cotangent)
 
-    boxes = residuals[0]
-    return jax.tree.map(lambda _: None, boxes), backward(*residuals, cotangent)
+    rects = residuals[0]
+    return jax.tree.map(lambda _: None, rects), backward(*residuals, cotangent)
 
 
 _raster.defvjp(_raster_forward, _raster_backward)
@@ -177,44 +177,48 @@ def _blank(layout, channels, dtype):
     return jnp.concatenate([transmittance, zeros], axis=1)
 
 
-def _next_slab(layout, cursor, boxes, table, state):
+def _next_intersections(layout, cursor, rects, table, state):
     open_tiles = jnp.max(state[:, 0], axis=1) > 0
-    log_cut = math.log(layout.spec.alpha_cut)
-    return binning.next_slab(
-        cursor, boxes, table, open_tiles, log_cut, layout.grid, layout.capacity
+    log_cut = math.log(layout.spec.alpha_threshold)
+    return binning.next_intersections(
+        cursor, rects, table, open_tiles, log_cut, layout.grid, layout.capacity
     )
 
 
-def _more(cursor, state, boxes):
-    drawn = jnp.sum(boxes.count > 0, dtype=jnp.int32)
+def _more(cursor, state, rects):
+    drawn = jnp.sum(rects.count > 0, dtype=jnp.int32)
     return (cursor.rank < drawn) & (jnp.max(state[:, 0]) > 0)
 
 
-def _stream(layout, boxes, table):
-    """Forward over all slabs."""
+def _stream(layout, rects, table):
+    """Forward over all chunks."""
     channels = table.shape[1] - SHAPE_COLUMNS
     rows = _with_transparent_row(table)
     spec, grid, step = layout.spec, layout.grid, layout.step
 
     def body(carry):
-        cursor, state, kept = carry
-        slab, cursor = _next_slab(layout, cursor, boxes, table, state)
-        state, used = blending.blend(state, slab, rows, spec, grid, step)
+        cursor, state, residuals = carry
+        isects, cursor = _next_intersections(layout, cursor, rects, table, state)
+        state, used = blending.blend(state, isects, rows, spec, grid, step)
         # What early stopping left out is not looked at again in the backward pass.
-        slab = slab._replace(ends=slab.starts + used)
-        slabs = jax.tree.map(
-            lambda all_, one: all_.at[kept.count].set(one, mode="drop"),
-            kept.slabs,
-            slab,
+        isects = isects._replace(ends=isects.starts + used)
+        chunks = jax.tree.map(
+            lambda all_, one: all_.at[residuals.count].set(one, mode="drop"),
+            residuals.chunks,
+            isects,
         )
         return (
             cursor,
             state,
-            Kept(slabs, kept.count + 1, kept.pairs + jnp.sum(used, dtype=jnp.int32)),
+            Residuals(
+                chunks,
+                residuals.count + 1,
+                residuals.pairs + jnp.sum(used, dtype=jnp.int32),
+            ),
         )
 
-    keep = spec.kept_slabs
-    slabs = Slab(
+    keep = spec.kept_chunks
+    chunks = Intersections(
         jnp.zeros((keep, layout.capacity), jnp.int32),
         jnp.zeros((keep, grid.tiles), jnp.int32),
         jnp.zeros((keep, grid.tiles), jnp.int32),
@@ -222,16 +226,16 @@ def _stream(layout, boxes, table):
     start = (
         Cursor(jnp.int32(0), jnp.int32(0)),
         _blank(layout, channels, table.dtype),
-        Kept(slabs, jnp.int32(0), jnp.int32(0)),
+        Residuals(chunks, jnp.int32(0), jnp.int32(0)),
     )
-    _, state, kept = lax.while_loop(
-        lambda carry: _more(carry[0], carry[1], boxes), body, start
+    _, state, residuals = lax.while_loop(
+        lambda carry: _more(carry[0], carry[1], rects), body, start
     )
-    return state, kept
+    return state, residuals
 
 
-def _stream_back(layout, boxes, table, final, kept, cotangent):
-    """Backward over the same slabs; those not kept are sorted again."""
+def _stream_back(layout, rects, table, final, residuals, cotangent):
+    """Backward over the same chunks; those not kept are sorted again."""
     rows = _with_transparent_row(table)
     spec, grid, step = layout.spec, layout.grid, layout.step
     toward = cotangent[:, 1:]
@@ -239,17 +243,17 @@ def _stream_back(layout, boxes, table, final, kept, cotangent):
     behind += jnp.abs(final[:, 0]) * cotangent[:, 0]
     blank = _blank(layout, 0, table.dtype)
     state = jnp.concatenate([blank, behind[:, None]], axis=1)
-    keep = spec.kept_slabs
+    keep = spec.kept_chunks
 
     def body(carry):
         number, cursor, state, gradient = carry
-        slab, cursor = lax.cond(
+        isects, cursor = lax.cond(
             number < keep,
-            lambda: _kept_slab(layout, kept, number, cursor, boxes),
-            lambda: _next_slab(layout, cursor, boxes, table, state),
+            lambda: _kept_intersections(layout, residuals, number, cursor, rects),
+            lambda: _next_intersections(layout, cursor, rects, table, state),
         )
         state, gradient = blending.blend_gradient(
-            state, gradient, slab, rows, toward, spec, grid, step
+            state, gradient, isects, rows, toward, spec, grid, step
         )
         return number + 1, cursor, state, gradient
 
@@ -259,13 +263,13 @@ def _stream_back(layout, boxes, table, final, kept, cotangent):
         state,
         jnp.zeros_like(rows),
     )
-    *_, gradient = lax.while_loop(lambda carry: carry[0] < kept.count, body, start)
+    *_, gradient = lax.while_loop(lambda carry: carry[0] < residuals.count, body, start)
     return gradient[:-1]
 
 
-def _kept_slab(layout, kept, number, cursor, boxes):
-    slab = jax.tree.map(lambda x: x[number], kept.slabs)
-    return slab, binning.advance(cursor, boxes.count, layout.capacity)
+def _kept_intersections(layout, residuals, number, cursor, rects):
+    isects = jax.tree.map(lambda x: x[number], residuals.chunks)
+    return isects, binning.advance(cursor, rects.count, layout.capacity)
 
 
 def _to_tiles(image, grid):

@@ -1,4 +1,4 @@
-"""What the rasteriser is asked to do: thresholds, clamps, tiles, slabs."""
+"""What the rasteriser is asked to do: thresholds, clamps, tiles, chunks of pairs."""
 
 import dataclasses
 from typing import Literal
@@ -10,17 +10,17 @@ TILE_SIZES = (4, 8, 16, 32)
 class RasterSpec:
     """Every threshold of the picture by name, and the sizes that only cost time.
 
-    `tile`, `capacity`, `batch`, `chunk` and `kept_slabs` never change the picture
+    `tile`, `capacity`, `batch`, `chunk` and `kept_chunks` never change the picture
     beyond rounding; the others are the picture's definition. The defaults are those of
     gsplat 1.6 (`GSPLAT`); `INRIA` is the original 3D Gaussian splatting (Kerbl et al.
     2023, arXiv:2308.04079) as its public rasteriser runs.
     """
 
-    alpha_cut: float = 1 / 255  # a Gaussian adds nothing where its alpha is below
+    alpha_threshold: float = 1 / 255  # a Gaussian adds nothing where its alpha is below
     alpha_max: float = 0.99  # alpha is clamped here
     clamp_gradient: Literal["zero", "through"] = "zero"  # above the clamp
-    stop: float = 1e-4  # a pixel is done before its transmittance would fall below
-    dilation_px2: float = 0.3  # added to both variances of the footprint
+    transmittance_threshold: float = 1e-4  # a pixel is done before it falls below
+    eps2d: float = 0.3  # px^2, added to both variances of the footprint
     antialiased: bool = False  # opacity times sqrt(det before / after dilation)
     near: float = 0.01  # z-depth, scene units
     far: float = 1e10
@@ -29,24 +29,25 @@ class RasterSpec:
     capacity: int | None = None  # (tile, Gaussian) pairs sorted at a time; None: chosen
     batch: int | None = None  # tiles blended in lockstep; None: by backend
     chunk: int | None = None  # Gaussians blended in one step; None: by backend
-    kept_slabs: int = 4  # sorted slabs kept for the backward pass, 4 bytes a pair
+    kept_chunks: int = 4  # of sorted pairs, for the backward pass; 4 bytes a pair
 
     def __post_init__(self):
-        if not 0 < self.alpha_cut < self.alpha_max < 1:
+        if not 0 < self.alpha_threshold < self.alpha_max < 1:
             raise ValueError(
-                f"need 0 < alpha_cut < alpha_max < 1, got {self.alpha_cut} and "
-                f"{self.alpha_max}; the backward pass divides by 1 - alpha"
+                "need 0 < alpha_threshold < alpha_max < 1, got "
+                f"{self.alpha_threshold} and {self.alpha_max}; the backward pass "
+                "divides by 1 - alpha"
             )
-        if not 0 <= self.stop < 1:
+        if not 0 <= self.transmittance_threshold < 1:
             raise ValueError(
-                f"stop is a transmittance, 0 <= stop < 1, got {self.stop}; "
-                "0 composites to the end"
+                "need 0 <= transmittance_threshold < 1, got "
+                f"{self.transmittance_threshold}; 0 composites to the end"
             )
         if not 0 < self.near < self.far:
             raise ValueError(f"need 0 < near < far, got {self.near} and {self.far}")
-        if self.dilation_px2 <= 0:
+        if self.eps2d <= 0:
             raise ValueError(
-                f"dilation_px2 must be positive, got {self.dilation_px2}; without it a "
+                f"eps2d must be positive, got {self.eps2d}; without it a "
                 "flat Gaussian seen edge-on has no inverse covariance"
             )
         if self.tangent_margin < 0:
@@ -61,10 +62,11 @@ class RasterSpec:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ValueError(f"{name} must be at least 1 or None, got {value}")
-        if self.kept_slabs < 1:
-            raise ValueError(f"kept_slabs must be at least 1, got {self.kept_slabs}")
+        if self.kept_chunks < 1:
+            raise ValueError(f"kept_chunks must be at least 1, got {self.kept_chunks}")
 
 
 GSPLAT = RasterSpec()
-# Its footprints end at a square of three sigma in whole tiles; ours reach alpha_cut.
+# Its footprints end at a square of three sigma in whole tiles; ours reach
+# alpha_threshold.
 INRIA = RasterSpec(near=0.2, far=float("inf"), clamp_gradient="through")

@@ -45,7 +45,7 @@ def advise(wanted: dict[str, bool | None], full: bool) -> Choice:
     if wanted.get(TRANSIENT) and preset == "splats-static":
         notes.append(f"{TRANSIENT}: splats have no medium for it; prefer the field")
     if wanted.get(START) is False:
-        overrides.append("start.source=random")
+        overrides.append("init.source=random")
     if wanted.get(DEPTH):
         overrides.append("depth.weight=0.1")
     return Choice(preset, tuple(overrides), tuple(notes))
@@ -60,10 +60,10 @@ GAUSSIANS = Representation(
     spec_type=scene.SplatScene,
     presets=presets.PRESETS,
     with_steps=presets.with_steps,
-    facts_of=lambda capture, spec: scene.facts_of(capture),
+    metadata_of=lambda capture, spec: scene.metadata_of(capture),
     build=scene.build,
-    first_bytes=scene.first_bytes,
-    lighter="lower start.points, start.random or raster.capacity with --set",
+    estimate_memory_bytes=scene.estimate_memory_bytes,
+    memory_hint="lower init.points, init.random or raster.capacity with --set",
     time_parts=step_time.parts,
     variant=variants.without_effects,
     score_halves=lambda *_: None,

@@ -8,13 +8,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from gaussians_jax import density, phases, rates, render, splats, start
+from gaussians_jax import (
+    densification,
+    initialisation,
+    learning_rates,
+    mcmc,
+    phases,
+    rendering,
+    splats,
+)
+from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.effects import deformation
-from gaussians_jax.effects.effect import Around, Effect, Moment, Shot
+from gaussians_jax.mcmc import MCMCStrategySpec
 from gaussians_jax.phases import Trained
 from gaussians_jax.spec import (
     OPTIMISERS,
-    Facts,
+    SceneMetadata,
     SplatScene,
     effects_of,
     refuse_what_cannot_train,
@@ -22,6 +31,19 @@ from gaussians_jax.spec import (
 from gaussians_jax.splats import Params
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.training import loop, losses
+from nerfies_jax.training.effects import (
+    FIELD_SEAMS,
+    Effect,
+    FrameCondition,
+    Observation,
+    PenaltyContext,
+    Term,
+    joined,
+    penalty_terms,
+    stream,
+    values,
+    weighted_sum,
+)
 from nerfies_jax.training.model import (
     Event,
     Frames,
@@ -32,64 +54,91 @@ from nerfies_jax.training.model import (
     View,
     in_default_precision,
 )
+from nerfies_jax.training.updates import apply_updates
 
 PyTree = Any
 
 # Streams of the run's key beside those of the steps, which are its 0, 1, 2, ...
-ORDER, EVENT = 2**32 - 1, 2**32 - 2
+ORDER, EVENT, NOISE = 2**32 - 1, 2**32 - 2, 2**32 - 3
 
 
-def facts_of(capture: Capture) -> Facts:
-    """The facts of a capture; host side."""
+def metadata_of(capture: Capture) -> SceneMetadata:
+    """The metadata of a capture; host side."""
     positions = np.asarray(capture.cameras.position)[capture.train]
     halfway = 2 / (1 / capture.near + 1 / capture.far)
-    return Facts(
+    return SceneMetadata(
         extent=splats.scene_extent(positions, still=halfway),
         background=capture.background or (0.0, 0.0, 0.0),
         frames=len(capture.train),
     )
 
 
-class Extra(NamedTuple):
-    """What a scene carries beside its parameters; everything in it has rows."""
+class AuxState(NamedTuple):
+    """What a scene keeps beside its parameters; everything in it has rows."""
 
-    stats: PyTree  # density.RowStats, or () without density control
-    carried: dict[str, PyTree]  # by the name of the effect
+    stats: PyTree  # densification.RowStats, or () where no strategy keeps them
+    effects: dict[str, PyTree]  # by the name of the effect
 
 
-def carried_by(effects: tuple[Effect, ...], params: Params) -> dict[str, PyTree]:
-    """What each effect carries from this change of the rows to the next; host side."""
+def states_of(effects: tuple[Effect, ...], params: Params) -> dict[str, PyTree]:
+    """What each effect keeps from this change of the rows to the next; host side."""
     return {
-        effect.name: effect.carry(params)
+        effect.name: effect.state(params)
         for effect in effects
-        if effect.carry is not None
+        if effect.state is not None
     }
 
 
-def build(spec: SplatScene, facts: Facts) -> Model:
-    """Everything the loop, the renderer and the report need of this scene."""
-    effects = effects_of(spec, facts)
+def all_effects(
+    spec: SplatScene, metadata: SceneMetadata, more: tuple[Effect, ...] = ()
+) -> tuple[Effect, ...]:
+    """The effects of a spec and then `more`, each with the learning rates it needs."""
+    own = effects_of(spec, metadata)
+    every = joined(own, more, refused=FIELD_SEAMS, reserved=("splats",))
+    for effect in every:
+        for seam, rate in (
+            ("init", "learning_rate"),
+            ("init_rows", "row_learning_rate"),
+        ):
+            if getattr(effect, seam) and not getattr(effect, rate):
+                raise ValueError(
+                    f"the effect {effect.name!r} has {seam} and no {rate}, so what it "
+                    f"starts would not train; give it a {rate}, a function of the step"
+                )
+    return every
+
+
+def build(
+    spec: SplatScene, metadata: SceneMetadata, effects: tuple[Effect, ...] = ()
+) -> Model:
+    """Everything the loop, the renderer and the report need of this scene.
+
+    `effects` act behind those of the spec.
+    """
+    more = tuple(effect.name for effect in effects)
+    effects = all_effects(spec, metadata, effects)
     # Counts updates per row; for the networks, whose rows are never born, it is plain.
     optimiser = OPTIMISERS[spec.optimiser]()
-    stages = _stages(spec, facts, effects)
+    stages = _stages(spec, metadata, effects)
 
     def whole_frame(params, view, size, step):
         posed = stages.pose(params, stages.prepare(params), view.time)
         return stages.draw(params, posed, view, size, step)
 
     return Model(
-        spec=(spec, facts),
+        # By name alone: a run with other effects of one's own is another run.
+        spec=(spec, metadata, *more),
         init=lambda capture, key: first_state(spec, effects, optimiser, capture, key),
-        step=_stepper(spec, facts, effects, optimiser),
+        step=_stepper(spec, metadata, effects, optimiser),
         render=whole_frame,
-        events=_events(spec, facts, effects, optimiser),
+        events=_events(spec, metadata, effects, optimiser),
         counts=count_rows,
-        wants=frozenset().union(*(effect.wants for effect in effects)),
+        required_data=frozenset().union(*(effect.required_data for effect in effects)),
         stages=stages,
     )
 
 
-def _stages(spec, facts, effects):
+def _stages(spec, metadata, effects):
     """Rendering of trained parameters in parts."""
 
     def prepare(params):
@@ -100,25 +149,27 @@ def _stages(spec, facts, effects):
 
     def draw(params, posed, view, size, step):
         degree = splats.active_degree(step, spec.sh_every, spec.sh_degree)
-        return _draw(spec, facts, params, posed, view, size, degree).rendering
+        return _draw(spec, metadata, params, posed, view, size, degree).rendering
 
     return Stages(prepare, pose, draw)
 
 
-def _draw(spec, facts, params, gaussians, view, size, degree, probe=None, depth=True):
-    return render.render_harmonics(
+def _draw(
+    spec, metadata, params, gaussians, view, size, degree, probe=None, depth=True
+):
+    return rendering.render_harmonics(
         gaussians,
         splats.active_harmonics(params.rows["splats"], degree),
         view.camera,
         size,
         spec.raster,
-        jnp.asarray(facts.background, gaussians.mean.dtype),
+        jnp.asarray(metadata.background, gaussians.mean.dtype),
         mean2d_offset=probe,
         depth=depth,
     )
 
 
-def _stepper(spec, facts, effects, optimiser):
+def _stepper(spec, metadata, effects, optimiser):
     """One update from one frame: (state, frames) -> (state, metrics), pure."""
 
     def step(state: TrainState, frames: Frames):
@@ -126,48 +177,54 @@ def _stepper(spec, facts, effects, optimiser):
         view = _view(frames, row)
         size = frames.images.shape[2], frames.images.shape[1]
         degree = splats.active_degree(state.step, spec.sh_every, spec.sh_degree)
-        moment = Moment(view.time, state.step, loop.step_key(state))
-        turn = phases.turn(spec.alternation, state.step)
+        condition = FrameCondition(view.time, step=state.step, key=loop.step_key(state))
+        mask = phases.update_mask(spec.alternation, state.step)
 
         def posed(params, gaussians):
-            return deformation.pose_in_training(effects, params, gaussians, moment)
+            return deformation.pose_in_training(effects, params, gaussians, condition)
 
         if spec.alternation is not None:
-            posed = phases.spared(turn, posed)
+            posed = phases.stop_frozen_gradients(mask, posed)
         # A channel that nothing reads is still blended: 4 % of a step.
-        read = any("depths" in effect.wants for effect in effects)
+        read = any("depths" in effect.required_data for effect in effects)
         depth = read and frames.depths is not None
 
         def loss(params, probe):
             canonical = splats.activate(params.rows["splats"])
             moved = posed(params, canonical)
-            frame = _draw(spec, facts, params, moved, view, size, degree, probe, depth)
-            seen = shot(frames, row, frame.rendering)
-            carried = state.extra.carried
-            value, metrics = loss_of(spec, effects, params, seen, moment, carried)
+            frame = _draw(
+                spec, metadata, params, moved, view, size, degree, probe, depth
+            )
+            seen = observe(frames, row, frame.rendering)
+            states = state.aux_state.effects
+            value, metrics = loss_of(spec, effects, params, seen, condition, states)
             return value, (metrics, frame.footprints, canonical, moved)
 
         probe = jnp.zeros_like(state.params.rows["splats"].mean[:, :2])
-        (value, (metrics, footprints, *poses)), (slopes, probe_slope) = (
+        (value, (metrics, footprints, *poses)), (grads, mean2d_grad) = (
             jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)(state.params, probe)
         )
-        directions, moments = optimiser.update(slopes, state.optimiser, state.params)
-        rate = _rates(spec, facts, effects, state.step)
-        trained = Trained(rates.descend(state.params, directions, rate), moments)
+        updates, opt_state = optimiser.update(grads, state.optimiser, state.params)
+        by_part = _learning_rates(spec, metadata, effects, state.step)
+        trained = Trained(apply_updates(state.params, updates, by_part), opt_state)
+        if isinstance(spec.densification, MCMCStrategySpec):
+            noise_key, rate = _stream(state, NOISE), by_part.rows["splats"].mean
+            params = mcmc.shake(noise_key, trained.params, rate, spec.densification)
+            trained = trained._replace(params=params)
         if spec.alternation is not None:
             before = Trained(state.params, state.optimiser)
-            trained = phases.hold(optimiser, turn, before, trained)
-        stats, carried = state.extra
-        if spec.density is not None:
+            trained = phases.freeze(optimiser, mask, before, trained)
+        stats, states = state.aux_state
+        if isinstance(spec.densification, DefaultStrategySpec):
             radius_px = jnp.max(footprints.extent_px, axis=1)
-            stats = density.observe(
-                stats, probe_slope, footprints.visible, radius_px, size
+            stats = densification.observe(
+                stats, mean2d_grad, footprints.visible, radius_px, size
             )
         for effect in effects:
-            if effect.observe is not None:
-                own = effect.observe(carried[effect.name], *poses, moment)
-                carried = carried | {effect.name: own}
-        state = TrainState(*trained, Extra(stats, carried), state.step + 1, state.key)
+            if effect.update_state is not None:
+                own = effect.update_state(states[effect.name], *poses, condition)
+                states = states | {effect.name: own}
+        state = TrainState(*trained, AuxState(stats, states), state.step + 1, state.key)
         return state, {"loss": value, **metrics}
 
     return step
@@ -177,37 +234,37 @@ def loss_of(
     spec: SplatScene,
     effects: tuple[Effect, ...],
     params: Params,
-    seen: Shot,
-    moment: Moment,
-    carried: dict[str, PyTree],
+    observation: Observation,
+    condition: FrameCondition,
+    states: dict[str, PyTree],
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
     """The loss of one frame with what every effect adds, and numbers to log."""
-    colour = seen.rendering.colour
-    value = losses.photometric(
-        colour, seen.truth, seen.valid, dssim_weight=spec.dssim_weight
+    truth, valid = observation.truth, observation.valid
+    colour = observation.rendering.colour
+    photometric = losses.photometric(
+        colour, truth, valid, dssim_weight=spec.dssim_weight
     )
-    metrics = {"mse": losses.mse(colour, seen.truth, seen.valid)}
+    context = PenaltyContext(
+        condition=condition,
+        step=condition.step,
+        key=condition.key,
+        params=params,
+        observation=observation,
+        at_time=deformation.poser(effects, condition),
+    )
+    terms = penalty_terms(effects, params.nets, context, states)
+    if isinstance(spec.densification, MCMCStrategySpec):
+        cost = mcmc.penalty(params.rows["splats"], spec.densification)
+        terms["mcmc/penalty"] = Term(cost, 1.0)
+    metrics = {"mse": losses.mse(colour, truth, valid)} | values(terms)
+    return weighted_sum(terms, photometric), metrics
 
-    at_time = deformation.poser(effects, moment)
-    for effect in effects:
-        terms = []
-        if effect.image_loss is not None:
-            terms.append(effect.image_loss(params, seen, moment))
-        if effect.penalty is not None:
-            own = carried.get(effect.name)
-            terms.append(effect.penalty(Around(params, at_time, moment, own)))
-        for term in terms:
-            value = value + term.value
-            named = {f"{effect.name}.{key}": x for key, x in term.metrics.items()}
-            metrics |= {effect.name: term.value} | named
-    return value, metrics
 
-
-def shot(
+def observe(
     frames: Frames, row: Int[Array, ""] | int, rendering: Rendering | None
-) -> Shot:
+) -> Observation:
     """What the losses compare: a frame that was drawn with the one that was filmed."""
-    return Shot(
+    return Observation(
         rendering,
         frames.images[row].astype(frames.times.dtype) / 255,
         None if frames.valid is None else frames.valid[row],
@@ -217,22 +274,22 @@ def shot(
 
 def _view(frames, row):
     camera = jax.tree.map(lambda leaf: leaf[row], frames.cameras)
-    return View(camera, frames.times[row], frames.warp[row], frames.appearance[row])
+    return View(camera, frames.times[row], frames.appearance[row])
 
 
-def _rates(spec, facts, effects, step):
+def _learning_rates(spec, metadata, effects, step):
     """A prefix of `Params` with the learning rate of everything below each leaf."""
     rows = {
-        "splats": rates.learning_rates(
-            spec.rates, facts.extent, spec.steps, step, spec.annealing
+        "splats": learning_rates.at_step(
+            spec.learning_rates, metadata.extent, spec.steps, step, spec.annealing
         )
     }
     nets = {}
     for effect in effects:
         if effect.init_rows is not None:
-            rows[effect.name] = effect.row_rate(step)
-        if effect.init_nets is not None:
-            nets[effect.name] = effect.net_rate(step)
+            rows[effect.name] = effect.row_learning_rate(step)
+        if effect.init is not None:
+            nets[effect.name] = effect.learning_rate(step)
     return Params(rows, nets)
 
 
@@ -244,13 +301,13 @@ def shuffled_row(
     return jax.random.permutation(epoch, frames)[step % frames]
 
 
-def first_bytes(spec: SplatScene, capture: Capture) -> int:
+def estimate_memory_bytes(spec: SplatScene, capture: Capture) -> int:
     """Roughly the memory of the first state and step; host side, nothing allocated."""
-    count = start.first_count(spec.start, capture)
+    count = initialisation.initial_count(spec.init, capture)
     harmonics = 3 * (spec.sh_degree + 1) ** 2
     # Parameters, two moments, gradient, update; the tables of one projection.
     numbers = count * (5 * (11 + harmonics) + 60)
-    # A slab holds keys, rows and blending inputs of every pair.
+    # A chunk holds keys, rows and blending inputs of every pair.
     numbers += 16 * (spec.raster.capacity or 0)
     return 4 * numbers + capture.images.nbytes
 
@@ -258,83 +315,110 @@ def first_bytes(spec: SplatScene, capture: Capture) -> int:
 def first_state(spec, effects, optimiser, capture, key) -> TrainState:
     """Parameters, moments and statistics before the first step; host side."""
     refuse_what_cannot_train(spec)
-    render.refuse_distortion(capture.cameras)
+    rendering.refuse_distortion(capture.cameras)
     start_key, run_key = jax.random.split(key)
     seed = int(jax.random.randint(start_key, (), 0, np.iinfo(np.int32).max))
-    position, colour = start.first_points(spec.start, capture, seed)
+    position, colour = initialisation.initial_points(spec.init, capture, seed)
     rows = splats.from_points(
-        position, colour, degree=spec.sh_degree, opacity=spec.start.opacity
+        position,
+        colour,
+        degree=spec.sh_degree,
+        opacity=spec.init.opacity,
+        scale=spec.init.scale,
     )
-    rows = start.narrowed(rows, capture, spec.start.widest)
+    rows = initialisation.clamp_scales(rows, capture, spec.init.max_scale)
     count = len(position)
-    most = None if spec.density is None else spec.density.most
+    most = None if spec.densification is None else spec.densification.cap_max
     params = Params({"splats": rows}, {})
-    for number, effect in enumerate(effects):
-        effect_key = jax.random.fold_in(start_key, number)
+    for effect in effects:
+        effect_key = jax.random.fold_in(start_key, stream(effect.name))
         rows_key, nets_key = jax.random.split(effect_key)
         if effect.init_rows is not None:
             params.rows[effect.name] = effect.init_rows(rows_key, rows)
-        if effect.init_nets is not None:
-            params.nets[effect.name] = effect.init_nets(nets_key)
+        if effect.init is not None:
+            params.nets[effect.name] = effect.init(nets_key)
     params = splats.pad_rows(params, splats.capacity_for(count, most))
     params = in_default_precision(params)
-    stats = () if spec.density is None else density.empty_stats(params.rows["splats"])
-    extra = Extra(stats, carried_by(effects, params))
+    stats = ()
+    if isinstance(spec.densification, DefaultStrategySpec):
+        stats = densification.empty_stats(params.rows["splats"])
+    aux_state = AuxState(stats, states_of(effects, params))
     return TrainState(
-        params, optimiser.init(params), extra, jnp.zeros((), jnp.int32), run_key
+        params, optimiser.init(params), aux_state, jnp.zeros((), jnp.int32), run_key
     )
 
 
-def _events(spec, facts, effects, optimiser):
-    if spec.density is None:
+def _stream(state, name):
+    """A key of this step for something beside `loop.step_key`."""
+    return jax.random.fold_in(jax.random.fold_in(state.key, name), state.step)
+
+
+def _events(spec, metadata, effects, optimiser):
+    if spec.densification is None:
         return ()
-    plan = spec.density
-    last = min(plan.stop, spec.steps)
+    plan = spec.densification
+    if isinstance(plan, MCMCStrategySpec):
+        return _mcmc_events(plan, spec.steps, effects, optimiser)
+    last = min(plan.refine_stop_iter, spec.steps)
 
     def densify(state, frames):
         del frames
-        stats, carried = state.extra
+        stats, states = state.aux_state
         step = int(state.step)
         for effect in effects:
             if effect.grow_score is not None:
-                factor = effect.grow_score(carried[effect.name], step)
-                stats = stats._replace(gradient=stats.gradient * jnp.asarray(factor))
-        changed = density.densify(
+                factor = effect.grow_score(states[effect.name], step)
+                stats = stats._replace(grad2d=stats.grad2d * jnp.asarray(factor))
+        changed = densification.densify(
             optimiser,
             state.params,
             state.optimiser,
             stats,
-            jax.random.fold_in(jax.random.fold_in(state.key, EVENT), state.step),
+            _stream(state, EVENT),
             plan,
             step=step,
-            extent=facts.extent,
+            extent=metadata.extent,
         )
-        extra = Extra(changed.stats, carried_by(effects, changed.params))
+        aux_state = AuxState(changed.stats, states_of(effects, changed.params))
         return state._replace(
-            params=changed.params, optimiser=changed.moments, extra=extra
+            params=changed.params, optimiser=changed.moments, aux_state=aux_state
         )
 
     def reset(state, frames):
         del frames
-        params, moments = density.reset_opacity(
+        params, moments = densification.reset_opacity(
             optimiser, state.params, state.optimiser, plan
         )
         return state._replace(params=params, optimiser=moments)
 
-    grow = tuple(range(plan.start, last, plan.interval))
+    grow = tuple(range(plan.refine_start_iter, last, plan.refine_every))
     return (
         Event("densify", grow, densify),
         Event(
             "reset opacity",
-            tuple(range(plan.reset_interval, last, plan.reset_interval)),
+            tuple(range(plan.reset_every, last, plan.reset_every)),
             reset,
         ),
     )
 
 
+def _mcmc_events(plan, steps, effects, optimiser):
+    def refine(state, frames):
+        del frames
+        params, moments, _ = mcmc.refine(
+            optimiser, state.params, state.optimiser, _stream(state, EVENT), plan
+        )
+        aux_state = AuxState((), states_of(effects, params))
+        return state._replace(params=params, optimiser=moments, aux_state=aux_state)
+
+    last = min(plan.refine_stop_iter, steps)
+    when = tuple(range(plan.refine_start_iter, last, plan.refine_every))
+    return (Event("relocate and add", when, refine),)
+
+
 def count_rows(state: TrainState) -> dict[str, int]:
-    """Living Gaussians, and `parameters`: the numbers of them and the networks."""
-    counts = {"gaussians": int(splats.alive(state.params.rows["splats"]).sum())}
+    """Active Gaussians, and `parameters`: the numbers of them and the networks."""
+    counts = {"gaussians": int(splats.active_mask(state.params.rows["splats"]).sum())}
     rows = jax.tree.leaves(state.params.rows)
     nets = jax.tree.leaves(state.params.nets)
     each = sum(math.prod(leaf.shape[1:]) for leaf in rows)

@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from gaussians_jax.density import DensitySpec
+from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.effects import (
     acceleration,
     depth,
@@ -15,18 +15,20 @@ from gaussians_jax.effects import (
 )
 from gaussians_jax.effects.acceleration import AccelerationSpec
 from gaussians_jax.effects.depth import DepthSpec
-from gaussians_jax.effects.effect import Effect
 from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec
 from gaussians_jax.effects.motion_basis import BasisMotionSpec
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec
 from gaussians_jax.effects.neighbours import NeighbourSpec
 from gaussians_jax.effects.spectral import SpectralSpec
+from gaussians_jax.initialisation import InitSpec
+from gaussians_jax.learning_rates import LearningRateSpec
+from gaussians_jax.mcmc import MCMCStrategySpec
 from gaussians_jax.optimiser import scale_by_row_adam, scale_by_row_radam
 from gaussians_jax.phases import AlternationSpec, AnnealingSpec
 from gaussians_jax.raster_spec import RasterSpec
-from gaussians_jax.rates import RateSpec
-from gaussians_jax.start import StartSpec
+from nerfies_jax.training.effects import Effect
+from nerfies_jax.training.step_counts import steps
 
 OPTIMISERS = {"adam": scale_by_row_adam, "radam": scale_by_row_radam}
 
@@ -36,13 +38,13 @@ class SplatScene:
     """Which scene of Gaussians; `None` for an effect means that it is not there."""
 
     steps: int
-    start: StartSpec = StartSpec()
+    init: InitSpec = InitSpec()
     sh_degree: int = 3
-    sh_every: int = 1000  # steps between one degree and the next
+    sh_every: int = steps(1000)  # steps between one degree and the next
     dssim_weight: float = 0.2
-    rates: RateSpec = RateSpec()
+    learning_rates: LearningRateSpec = LearningRateSpec()
     raster: RasterSpec = RasterSpec()
-    density: DensitySpec | None = DensitySpec()
+    densification: DefaultStrategySpec | MCMCStrategySpec | None = DefaultStrategySpec()
     optimiser: str = "adam"
     alternation: AlternationSpec | None = None
     annealing: AnnealingSpec | None = None
@@ -68,7 +70,7 @@ class SplatScene:
 
 
 @dataclasses.dataclass(frozen=True)
-class Facts:
+class SceneMetadata:
     """What a scene must know of its capture before anything is compiled."""
 
     extent: float  # scene units: how far the cameras spread
@@ -95,10 +97,10 @@ def refuse_what_cannot_train(spec: SplatScene) -> None:
             "neighbours keep embeddings alike, and this motion has none; leave them "
             "out (neighbours=none), or choose a preset with a KAN motion"
         )
-    if growth is not None and spec.density is None:
+    if growth is not None and not isinstance(spec.densification, DefaultStrategySpec):
         raise ValueError(
-            "motion_growth steers the density control, which is left out; leave it out "
-            "as well (motion_growth=none)"
+            "motion_growth steers the gradient threshold of DefaultStrategySpec, which "
+            "this scene has not; leave it out as well (motion_growth=none)"
         )
     if growth is not None and growth.form == "hard" and growth.start <= motion.warm_up:
         raise ValueError(
@@ -115,21 +117,21 @@ MOTIONS = {
 }
 
 
-def effects_of(spec: SplatScene, facts: Facts) -> tuple[Effect, ...]:
+def effects_of(spec: SplatScene, metadata: SceneMetadata) -> tuple[Effect, ...]:
     """The effects that the spec asks for, in the order in which they act."""
     effects = []
     if spec.motion is not None:
         move = MOTIONS[type(spec.motion)]
-        effects.append(move(spec.motion, spec.steps, facts.frames))
+        effects.append(move(spec.motion, spec.steps, metadata.frames))
     if spec.acceleration is not None:
         effects.append(
-            acceleration.effect(spec.acceleration, facts.extent, facts.frames)
+            acceleration.effect(spec.acceleration, metadata.extent, metadata.frames)
         )
     if spec.neighbours is not None:
         of = kan_motion.NAME  # the only rows that are an embedding
-        effects.append(neighbours.effect(spec.neighbours, facts.extent, of))
+        effects.append(neighbours.effect(spec.neighbours, metadata.extent, of))
     if spec.motion_growth is not None:
-        effects.append(motion_growth.effect(spec.motion_growth, facts.extent))
+        effects.append(motion_growth.effect(spec.motion_growth, metadata.extent))
     if spec.spectral is not None:
         effects.append(spectral.effect(spec.spectral, spec.steps))
     if spec.depth is not None:

@@ -1,9 +1,10 @@
 """Gaussians: the rows that are trained, and what they stand for.
 
-A row that is not in use is *dead*: its opacity logit is `DEAD_LOGIT`, so its opacity
-and the slope of its opacity are exactly zero in float32 and float64. It is culled by
-the renderer's cut-off, covers no tile, and no gradient can bring it back; only an event
-between two chunks revives a row. `alive` reads that mark and nothing else.
+A row that is not in use is *inactive*: its opacity logit is `INACTIVE_LOGIT`, so its
+opacity and the slope of its opacity are exactly zero in float32 and float64. It is
+culled by the renderer's cut-off, covers no tile, and no gradient can bring it back;
+only an event between two chunks activates a row. `active_mask` reads that mark and
+nothing else.
 """
 
 import math
@@ -20,7 +21,7 @@ from nerfies_jax.geometry.camera import Camera
 
 PyTree = Any
 
-DEAD_LOGIT = -1000.0  # sigmoid and its slope underflow to 0 below -745 in float64
+INACTIVE_LOGIT = -1000.0  # sigmoid and its slope underflow to 0 below -745 in float64
 # exp(15)^2 = 1e13 and exp(-20)^2 = 4e-18 keep products of scales far from overflow and
 # from the flush to zero; raw values beyond are drawn at the bound and get no gradient.
 # An unbounded exp is inf at 89 in float32.
@@ -86,23 +87,23 @@ def activate(splats: Splats) -> Gaussians:
     )
 
 
-def alive(splats: Splats) -> Bool[Array, " gaussians"]:
+def active_mask(splats: Splats) -> Bool[Array, " gaussians"]:
     """Which rows stand for a Gaussian; the others only fill the capacity."""
-    return splats.opacity_logit > DEAD_LOGIT / 2
+    return splats.opacity_logit > INACTIVE_LOGIT / 2
 
 
 def rows_to_write(splats: Splats, path: pathlib.Path) -> np.ndarray:
     """[gaussians] bool: what of them a file holds; ValueError where that is none.
 
-    NaN compares false, but is no mark of death: such a row counts, and the writer
-    refuses it.
+    NaN compares false, but marks no row as inactive: it counts, and the writer refuses
+    it.
     """
-    living = np.asarray(alive(splats)) | np.isnan(splats.opacity_logit)
-    if not living.any():
+    active = np.asarray(active_mask(splats)) | np.isnan(splats.opacity_logit)
+    if not active.any():
         raise ValueError(
-            f"{path}: none of the {len(living)} rows is alive; not written"
+            f"{path}: none of the {len(active)} rows is active; not written"
         )
-    return living
+    return active
 
 
 def active_degree(step: Int[Array, ""], every: int, degree: int) -> Int[Array, ""]:
@@ -149,19 +150,19 @@ def take_rows(params: Params, rows: Int[Array, " kept"]) -> Params:
     return params._replace(rows=jax.tree.map(lambda leaf: leaf[rows], params.rows))
 
 
-def bury(splats: Splats, dead: Bool[Array, " gaussians"]) -> Splats:
-    """The same splats with the given rows marked dead."""
-    mark = jnp.asarray(DEAD_LOGIT, splats.opacity_logit.dtype)
+def deactivate(splats: Splats, inactive: Bool[Array, " gaussians"]) -> Splats:
+    """The same splats with the given rows marked inactive."""
+    mark = jnp.asarray(INACTIVE_LOGIT, splats.opacity_logit.dtype)
     return splats._replace(
-        opacity_logit=jnp.where(dead, mark, splats.opacity_logit),
+        opacity_logit=jnp.where(inactive, mark, splats.opacity_logit),
     )
 
 
 def pad_rows(params: Params, capacity: int) -> Params:
-    """The same rows and dead ones behind them, up to `capacity`.
+    """The same rows and inactive ones behind them, up to `capacity`.
 
-    Dead rows repeat the first one, so every leaf keeps values that its own code knows
-    how to handle (a unit quaternion, a finite scale).
+    Inactive rows repeat the first one, so every leaf keeps values that its own code
+    knows how to handle (a unit quaternion, a finite scale).
     """
     count = params.rows["splats"].mean.shape[0]
     if not 0 < count <= capacity:
@@ -171,9 +172,9 @@ def pad_rows(params: Params, capacity: int) -> Params:
         )
     rows = np.concatenate([np.arange(count), np.zeros(capacity - count, int)])
     padded = take_rows(params, jnp.asarray(rows, jnp.int32))
-    dead = jnp.arange(capacity) >= count
+    inactive = jnp.arange(capacity) >= count
     return padded._replace(
-        rows=padded.rows | {"splats": bury(padded.rows["splats"], dead)}
+        rows=padded.rows | {"splats": deactivate(padded.rows["splats"], inactive)}
     )
 
 
@@ -183,16 +184,18 @@ def from_points(
     *,
     degree: int = 3,
     opacity: float = 0.1,
+    scale: float = 1.0,
     lone_scale: float = 1.0,
     dtype: Any = jnp.float32,
 ) -> Splats:
     """One round Gaussian for each point; host side.
 
     `points` [n, 3] in scene units and `colours` [n, 3] in [0, 1]. The standard
-    deviation is the root mean square distance to the three nearest points that lie
-    elsewhere (Kerbl et al. 2023, section 5.1, counts a duplicate as a neighbour at
-    distance zero and floors the result at 3e-4 whatever the unit). With two or three
-    distinct points it uses those there are; where there is one, `lone_scale`.
+    deviation is `scale` times the root mean square distance to the three nearest points
+    that lie elsewhere (Kerbl et al. 2023, section 5.1, counts a duplicate as a
+    neighbour at distance zero and floors the result at 3e-4 whatever the unit). With
+    two or three distinct points it uses those there are; where there is one,
+    `lone_scale` is that distance.
     """
     refuse_half(dtype)
     points = np.asarray(points, np.float64)
@@ -213,9 +216,10 @@ def from_points(
                 f"{name} {np.flatnonzero(bad)[0]} is not finite, and so are "
                 f"{bad.sum() - 1} more; drop those rows before starting from them"
             )
-    log_scale = np.clip(
-        np.log(_neighbour_distance(points, lone_scale)), *LOG_SCALE_RANGE
-    )
+    if not 0 < scale < math.inf:
+        raise ValueError(f"the first scale must be positive and finite, got {scale}")
+    distance = _neighbour_distance(points, lone_scale)
+    log_scale = np.clip(np.log(scale * distance), *LOG_SCALE_RANGE)
     count, rest = len(points), (degree + 1) ** 2 - 1
     return Splats(
         mean=jnp.asarray(points, dtype),
@@ -282,9 +286,10 @@ def random_in_views(
 def scene_extent(position: np.ndarray, still: float | None = None) -> float:
     """1.1 times the largest distance of a camera from their mean; host side.
 
-    The unit of the learning rate of the means and of the density thresholds (Kerbl et
-    al. 2023, reference implementation). Cameras that stand still have none, and a zero
-    would stop the means from learning; `still`, a typical depth, stands in for it.
+    The unit of the learning rate of the means and of the thresholds of densification
+    (Kerbl et al. 2023, reference implementation). Cameras that stand still have none,
+    and a zero would stop the means from learning; `still`, a typical depth, stands in
+    for it.
     """
     position = np.asarray(position, np.float64).reshape(-1, 3)
     middle = position.mean(axis=0)

@@ -3,11 +3,16 @@
 import jax
 import jax.numpy as jnp
 
-from gaussians_jax import render, scene, splats
+from gaussians_jax import rendering, scene, splats
 from gaussians_jax.effects import deformation
-from gaussians_jax.effects.effect import Around, Moment
 from nerfies_jax.measure.part_time import part_ms
 from nerfies_jax.training import losses
+from nerfies_jax.training.effects import (
+    FrameCondition,
+    PenaltyContext,
+    penalty_terms,
+    weighted_sum,
+)
 from nerfies_jax.training.model import Frames, Model, Rendering, TrainState
 
 
@@ -22,61 +27,65 @@ def parts(
     params = state.params
     size = frames.images.shape[2], frames.images.shape[1]
     camera = jax.tree.map(lambda leaf: leaf[0], frames.cameras)
-    shot = scene.shot(frames, 0, None)
-    moment = Moment(frames.times[0], state.step, state.key)
+    observation = scene.observe(frames, 0, None)
+    condition = FrameCondition(frames.times[0], step=state.step, key=state.key)
     effects = scene.effects_of(spec, facts)
 
     def draw(gaussians, coefficients):
-        frame = render.render_harmonics(
+        frame = rendering.render_harmonics(
             gaussians, coefficients, camera, size, spec.raster
         )
         return jnp.sum(frame.rendering.colour)
 
     def compare(colour):
         return losses.photometric(
-            colour, shot.truth, shot.valid, dssim_weight=spec.dssim_weight
+            colour, observation.truth, observation.valid, dssim_weight=spec.dssim_weight
         )
 
     gaussians = splats.activate(params.rows["splats"])
     coefficients = splats.active_harmonics(params.rows["splats"], spec.sh_degree)
     timed = {
         "project and blend": part_ms(jax.grad(draw, (0, 1)), gaussians, coefficients),
-        "loss": part_ms(jax.grad(compare), shot.truth),
+        "loss": part_ms(jax.grad(compare), observation.truth),
     }
     for effect in effects:
 
-        def one(params, rendering, carried, effect=effect):
+        def one(params, rendering, state, effect=effect):
             return _sum_of_effect(
                 effect,
                 effects,
                 params,
-                shot._replace(rendering=rendering),
-                moment,
-                carried,
+                observation._replace(rendering=rendering),
+                condition,
+                state,
             )
 
-        carried = state.extra.carried.get(effect.name)
-        drawn = Rendering(shot.truth, *(jnp.ones(shot.truth.shape[:2]) for _ in "ad"))
-        if {effect.deform, effect.image_loss, effect.penalty} != {None}:
-            slope = jax.grad(one, (0, 1))
-            timed[effect.name.replace("_", " ")] = part_ms(
-                slope, params, drawn, carried
-            )
+        kept = state.aux_state.effects.get(effect.name)
+        drawn = Rendering(
+            observation.truth, *(jnp.ones(observation.truth.shape[:2]) for _ in "ad")
+        )
+        if {effect.deform, effect.penalty} != {None}:
+            grads = jax.grad(one, (0, 1))
+            timed[effect.name.replace("_", " ")] = part_ms(grads, params, drawn, kept)
     whole = part_ms(model.step, state, frames)
     timed["optimiser and statistics"] = max(whole - sum(timed.values()), 0.0)
     return timed
 
 
-def _sum_of_effect(effect, effects, params, shot, moment, carried):
+def _sum_of_effect(effect, effects, params, observation, condition, state):
     """A scalar whose gradient takes the work of one effect in a step."""
     total = jnp.zeros(())
     if effect.deform is not None:
         gaussians = splats.activate(params.rows["splats"])
-        moved = deformation.pose_in_training((effect,), params, gaussians, moment)
+        moved = deformation.pose_in_training((effect,), params, gaussians, condition)
         total += sum(jnp.sum(leaf) for leaf in moved)
-    if effect.image_loss is not None:
-        total += effect.image_loss(params, shot, moment).value
-    if effect.penalty is not None:
-        at_time = deformation.poser(effects, moment)
-        total += effect.penalty(Around(params, at_time, moment, carried)).value
-    return total
+    context = PenaltyContext(
+        condition=condition,
+        step=condition.step,
+        key=condition.key,
+        params=params,
+        observation=observation,
+        at_time=deformation.poser(effects, condition),
+    )
+    states = {effect.name: state}
+    return weighted_sum(penalty_terms((effect,), params.nets, context, states), total)

@@ -2,7 +2,7 @@
 
 The deformation is evaluated once for each knot and never again; an instant then costs
 reading two or four rows of a table, whatever the network that made it. The error falls
-with the knots, as experiments/deformation_cost.py measures, and the table takes 40
+with the knots, as experiments.deformation_cost measures, and the table takes 40
 bytes (ten float32) for each knot and each Gaussian that moves: 10 000 of them at 32
 knots are 13 MB, while a Gaussian that stands still is stored once.
 """
@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from gaussians_jax import splats, still_rows
+from gaussians_jax import splats, static_rows
 from gaussians_jax.splats import Gaussians
-from gaussians_jax.still_rows import Where
+from gaussians_jax.static_rows import RowIndex
 from nerfies_jax.geometry import quaternion
 
 FEWEST = {"linear": 2, "cubic": 4}  # knots that an interpolation reads at once
@@ -38,8 +38,8 @@ class Knots(NamedTuple):
 
     times: Float[Array, " knots"]  # evenly over [0, 1]
     track: Track  # of the rows that move
-    where: Where
-    still: Gaussians  # all rows, as they are at the middle knot
+    index: RowIndex
+    static: Gaussians  # all rows, as they are at the middle knot
 
     @property
     def bytes(self) -> int:
@@ -50,14 +50,14 @@ class Knots(NamedTuple):
 def bake(
     pose: Callable[[Float[Array, ""]], Gaussians],
     knots: int,
-    still_below: float = 0.0,
+    static_threshold: float = 0.0,
     dtype=jnp.float32,
 ) -> Knots:
     """The table of a motion, `pose` at every knot; host side.
 
     `pose` is called as it is: compile it. Rows of which no point moves farther than
-    `still_below` (scene units, from where it is at the middle knot) at any knot are
-    still and stored once.
+    `static_threshold` (scene units, from where it is at the middle knot) at any knot
+    are static and stored once.
     """
     if knots < FEWEST["linear"]:
         raise ValueError(
@@ -66,22 +66,22 @@ def bake(
         )
     times = jnp.linspace(0, 1, knots, dtype=dtype)
     poses = [jax.device_get(pose(time)) for time in times]
-    still = poses[knots // 2]
-    moves = np.zeros(len(still.mean), bool)
+    static = poses[knots // 2]
+    moves = np.zeros(len(static.mean), bool)
     for time, now in zip(times, poses, strict=True):
-        if not np.array_equal(now.opacity, still.opacity):
+        if not np.array_equal(now.opacity, static.opacity):
             raise ValueError(
                 f"the opacities at time {float(time):g} are not those at "
                 f"{float(times[knots // 2]):g}; a table of knots keeps them fixed, so "
                 "draw this motion without one"
             )
-        moves |= still_rows.moving(still, now, still_below)
+        moves |= static_rows.dynamic_mask(static, now, static_threshold)
     rows = np.flatnonzero(moves)
     tracks = [_track(jax.tree.map(lambda leaf: leaf[rows], now)) for now in poses]
     track = Track(*(jnp.stack(leaves) for leaves in zip(*tracks, strict=True)))
     track = track._replace(quaternion=_aligned(track.quaternion))
-    still = jax.tree.map(jnp.asarray, still)
-    return Knots(times, track, still_rows.where(moves), still)
+    static = jax.tree.map(jnp.asarray, static)
+    return Knots(times, track, static_rows.row_index(moves), static)
 
 
 def at(
@@ -97,7 +97,7 @@ def at(
     lies between them is never short.
     """
     if not knots.track.mean.shape[1]:
-        return knots.still
+        return knots.static
     start, weights = _window(knots.times, time, interpolation)
 
     def between(leaf):
@@ -112,8 +112,8 @@ def at(
         # Not interpolated; merged from here only to be overwritten.
         opacity=jnp.zeros_like(mean[:, 0]),
     )
-    merged = still_rows.merge(knots.still, moved, knots.where)
-    return merged._replace(opacity=knots.still.opacity)
+    merged = static_rows.merge(knots.static, moved, knots.index)
+    return merged._replace(opacity=knots.static.opacity)
 
 
 def check(knots: int, interpolation: str) -> None:

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from gaussians_jax import scene, splats, still_rows, time_knots
+from gaussians_jax import scene, splats, static_rows, time_knots
 from nerfies_jax.evaluation.representation import check_there
 from nerfies_jax.training.model import Model, Stages, TrainState
 
@@ -39,7 +39,7 @@ def from_knots(
     state: TrainState,
     knots: int,
     interpolation: str = "linear",
-    still_below: float = 0.0,
+    static_threshold: float = 0.0,
 ) -> Faster:
     """The model with its motion read from a table of `knots` instants; host side."""
     stages = _stages(model, "--knots")
@@ -48,10 +48,10 @@ def from_knots(
     prepared = jax.jit(stages.prepare)(params)
     pose = jax.jit(stages.pose)
     table = time_knots.bake(
-        lambda time: pose(params, prepared, time), knots, still_below
+        lambda time: pose(params, prepared, time), knots, static_threshold
     )
     summary = (
-        f"{knots} knots, {interpolation}, of {_moving(table.where, still_below)}: "
+        f"{knots} knots, {interpolation}, of {_moving(table.index, static_threshold)}: "
         f"{table.bytes / 1e6:.1f} MB"
     )
     return _with(
@@ -69,22 +69,22 @@ def from_knots(
     )
 
 
-def without_still(model: Model, state: TrainState, still_below: float) -> Faster:
+def without_static(model: Model, state: TrainState, static_threshold: float) -> Faster:
     """The model with the deformation evaluated for moving Gaussians alone; host side.
 
-    Those are the ones that move farther than `still_below` (scene units) over
+    Those are the ones that move farther than `static_threshold` (scene units) over
     `INSTANTS` instants of [0, 1].
     """
-    stages = _stages(model, "--still-below")
+    stages = _stages(model, "--static-threshold")
 
     def pose_rows(params, time):
         return stages.pose(params, stages.prepare(params), time)
 
     times = np.linspace(0, 1, INSTANTS)
-    parts = still_rows.split(state.params, pose_rows, times, still_below)
+    parts = static_rows.split(state.params, pose_rows, times, static_threshold)
 
     def pose(both, prepared, time):
-        return still_rows.pose(
+        return static_rows.pose(
             both[1], lambda rows, time: stages.pose(rows, prepared, time), time
         )
 
@@ -93,11 +93,11 @@ def without_still(model: Model, state: TrainState, still_below: float) -> Faster
         state,
         parts,
         Stages(
-            prepare=lambda both: stages.prepare(both[1].moving),
+            prepare=lambda both: stages.prepare(both[1].dynamic),
             pose=pose,
             draw=lambda both, *rest: stages.draw(both[0], *rest),
         ),
-        f"the deformation of {_moving(parts.where, still_below)}",
+        f"the deformation of {_moving(parts.index, static_threshold)}",
     )
 
 
@@ -116,18 +116,18 @@ def without_moving(
         return stages.pose(params, stages.prepare(params), time)
 
     times = np.linspace(0, 1, INSTANTS)
-    parts = still_rows.split(state.params, pose_rows, times, farther_than)
-    moves = parts.where.moves
+    parts = static_rows.split(state.params, pose_rows, times, farther_than)
+    moves = parts.index.moves
     rows = state.params.rows
-    living = int(splats.alive(rows["splats"]).sum())
-    if int(moves.sum()) == living:
+    active = int(splats.active_mask(rows["splats"]).sum())
+    if int(moves.sum()) == active:
         raise ValueError(
-            f"--hide-moving {farther_than:g}: all {living} Gaussians move farther than "
+            f"--hide-moving {farther_than:g}: all {active} Gaussians move farther than "
             "that, and nothing would be left; give a longer distance"
         )
-    shown = rows | {"splats": splats.bury(rows["splats"], moves)}
+    shown = rows | {"splats": splats.deactivate(rows["splats"], moves)}
     params = state.params._replace(rows=shown)
-    summary = f"{int(moves.sum())} of {living} Gaussians move and are left out"
+    summary = f"{int(moves.sum())} of {active} Gaussians move and are left out"
     return state._replace(params=params), summary
 
 
@@ -140,12 +140,12 @@ def _stages(model, option):
     return model.stages
 
 
-def _moving(where, still_below):
+def _moving(where, static_threshold):
     moving, rows = int(where.moves.sum()), len(where.moves)
     if not moving:
         raise ValueError(
-            f"nothing in this run moves farther than {still_below:g} scene units; "
-            "leave --knots and --still-below out, or lower the latter"
+            f"nothing in this run moves farther than {static_threshold:g} scene units; "
+            "leave --knots and --static-threshold out, or lower the latter"
         )
     return f"{moving} of {rows} rows that move"
 

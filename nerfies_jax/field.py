@@ -8,20 +8,28 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
 from nerfies_jax import spec as specs
-from nerfies_jax import tracing
-from nerfies_jax.effects.effect import (
-    MOMENT,
-    Effect,
-    Level,
-    Moment,
-    Table,
-    stream,
-)
-from nerfies_jax.facts import Facts
+from nerfies_jax.effects.effect import RayOutput
 from nerfies_jax.geometry import rays
 from nerfies_jax.nets import codes
 from nerfies_jax.radiance import template
+from nerfies_jax.render_ray import (
+    Bound,
+    Ray,
+    displacement,
+    field_ray_through,
+    render_ray,
+)
+from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.spec import RadianceScene
+from nerfies_jax.training.effects import (
+    MOMENT,
+    SPLAT_SEAMS,
+    Effect,
+    FrameCondition,
+    Table,
+    joined,
+    stream,
+)
 from nerfies_jax.training.model import Rendering, View
 
 PyTree = Any
@@ -33,47 +41,55 @@ Codes = dict[str, Float[Array, " code"]]
 class Field(NamedTuple):
     """Pure functions of a field; `params` is what `init` returns."""
 
+    spec: RadianceScene
+    metadata: SceneMetadata
     effects: tuple[Effect, ...]
     init: Callable[[Key[Array, ""]], PyTree]
     codes_at: Callable[[PyTree, View], Codes]  # of a view, by table
-    # (params, ray, moment, key) -> its levels, coarse to fine. Without a key nothing is
-    # random.
-    trace: Callable[..., tuple[Level, ...]]
-    # (params, point, moment) -> template point minus observed point, field units
-    displace: Callable[[PyTree, Vector, Moment], Vector]
+    # (params, ray, condition, key) -> its levels, coarse to fine. Without a key nothing
+    # is random.
+    render_ray: Callable[..., tuple[RayOutput, ...]]
+    # (params, point, condition) -> template point minus observed point, field units
+    displace: Callable[[PyTree, Vector, FrameCondition], Vector]
     # (params, camera, time, codes, size, step) -> whole frame
     render: Callable[..., Rendering]
 
 
-def field(spec: RadianceScene, facts: Facts, without: tuple[str, ...] = ()) -> Field:
-    """The field of a spec, some effects left out by name.
+def field(
+    spec: RadianceScene,
+    metadata: SceneMetadata,
+    without: tuple[str, ...] = (),
+    effects: tuple[Effect, ...] = (),
+) -> Field:
+    """The field of a spec and of more `effects`, some left out by name.
 
     Without "warp" a render shows the canonical scene; without "transient" or
     "scene_flow" only what is static. The parameters stay those of the whole field.
     """
-    effects = specs.effects_of(spec, facts)
-    tables = specs.tables_of(effects)
-    active = _active(effects, without)
+    own = specs.effects_of(spec, metadata)
+    every = joined(own, effects, refused=SPLAT_SEAMS, reserved=("template", "codes"))
+    tables = specs.tables_of(every)
+    active = _active(every, without)
 
     def init(key):
-        return _init(spec, facts, effects, key)
+        return _init(spec, metadata, every, key)
 
     def codes_at(params, view):
-        return look_up(tables, facts, params, view.time, view.appearance)
+        return look_up(tables, metadata, params, view.time, view.appearance)
 
-    def displace(params, point, moment):
-        return tracing.displacement(active, params, point, moment)
+    def displace(params, point, condition):
+        return displacement(Bound(spec, metadata, active, params), point, condition)
 
-    def trace(params, ray, moment, key=None):
-        return tracing.trace(spec, facts, active, params, ray, moment, key)
+    def levels_of(params, ray: Ray, condition, key=None):
+        return render_ray(Bound(spec, metadata, active, params), ray, condition, key)
 
     def render(params, camera, time, codes, size, step):
-        moment = Moment(time, codes, step)
+        condition = FrameCondition(time, codes, step)
 
         def pixel(position):
-            ray, cosine = tracing.pixel_ray(facts, camera, position)
-            level = trace(params, ray, moment)[-1]
-            depth = level.depth * cosine / facts.scale
+            ray, cosine = field_ray_through(metadata, camera, position)
+            level = levels_of(params, ray, condition)[-1]
+            depth = level.distance * cosine / metadata.scale
             return Rendering(level.colour, level.alpha, depth)
 
         width, height = size
@@ -87,7 +103,7 @@ def field(spec: RadianceScene, facts: Facts, without: tuple[str, ...] = ()) -> F
         )
         return jax.tree.map(lambda x: x.reshape(height, width, *x.shape[1:]), flat)
 
-    return Field(active, init, codes_at, trace, displace, render)
+    return Field(spec, metadata, active, init, codes_at, levels_of, displace, render)
 
 
 def _active(effects, without):
@@ -107,7 +123,7 @@ def _active(effects, without):
     return tuple(effect for effect in effects if effect.name not in without)
 
 
-def _init(spec, facts, effects, key):
+def _init(spec, metadata, effects, key):
     single = spec.sampling.fine == 0 or spec.sampling.shared
     names = ("fine",) if single else ("coarse", "fine")
     lifted = sum(effect.lift_width for effect in effects)
@@ -123,8 +139,8 @@ def _init(spec, facts, effects, key):
             one.position.width(3) + lifted,
             condition + beside,
         )
-    rows = {MOMENT: len(facts.times)}
-    learnt = 1 + max((max(left, right) for left, right, _ in facts.exposures))
+    rows = {MOMENT: len(metadata.times)}
+    learnt = 1 + max((max(left, right) for left, right, _ in metadata.exposures))
     params = {"template": nets, "codes": {}}
     for table in specs.tables_of(effects):
         count = rows.get(table.by, learnt)
@@ -140,7 +156,7 @@ def _init(spec, facts, effects, key):
 
 def look_up(
     tables: tuple[Table, ...],
-    facts: Facts,
+    metadata: SceneMetadata,
     params: PyTree,
     time: Scalar,
     appearance: Int[Array, ""],
@@ -150,27 +166,27 @@ def look_up(
     for table in tables:
         rows = params["codes"][table.name]
         place = (
-            _place_in_time(facts, time)
+            _place_in_time(metadata, time)
             if table.by == MOMENT
-            else _place_of_exposure(facts, appearance, rows.dtype)
+            else _place_of_exposure(metadata, appearance, rows.dtype)
         )
         found[table.name] = codes.blend(rows, *place)
     return found
 
 
-def _place_in_time(facts, time):
+def _place_in_time(metadata, time):
     """Rows before and after a time, and where between them; exact at a row's own."""
-    times = jnp.asarray(facts.times, time.dtype)
-    last = max(len(facts.times) - 2, 0)
+    times = jnp.asarray(metadata.times, time.dtype)
+    last = max(len(metadata.times) - 2, 0)
     left = jnp.clip(jnp.searchsorted(times, time, side="right") - 1, 0, last)
-    right = jnp.minimum(left + 1, len(facts.times) - 1)
+    right = jnp.minimum(left + 1, len(metadata.times) - 1)
     gap = times[right] - times[left]
     progress = (time - times[left]) / jnp.where(gap > 0, gap, 1)
     return left, right, jnp.clip(progress, 0, 1)
 
 
-def _place_of_exposure(facts, appearance, dtype):
-    left, right, progress = zip(*facts.exposures, strict=True)
+def _place_of_exposure(metadata, appearance, dtype):
+    left, right, progress = zip(*metadata.exposures, strict=True)
     row = jnp.clip(appearance, 0, len(left) - 1)
     return (
         jnp.asarray(left, jnp.int32)[row],

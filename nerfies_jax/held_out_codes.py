@@ -9,10 +9,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from nerfies_jax import evaluation, scene, tracing
+from nerfies_jax import evaluation, render_ray, scene
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.effects.effect import APPEARANCE, Moment
 from nerfies_jax.training import fit, losses
+from nerfies_jax.training.effects import APPEARANCE, FrameCondition
 from nerfies_jax.training.model import (
     Rendering,
     TrainState,
@@ -51,11 +51,13 @@ def score(
         codes = made.codes_at(params, view)
 
         def loss(fitted):
-            moment = Moment(view.time, codes | fitted, step)
+            condition = FrameCondition(view.time, codes | fitted, step)
             seen = jax.vmap(
                 lambda pixel: (
-                    made.trace(
-                        params, tracing.pixel_ray(facts, view.camera, pixel)[0], moment
+                    made.render_ray(
+                        params,
+                        render_ray.field_ray_through(facts, view.camera, pixel)[0],
+                        condition,
                     )[-1].colour
                 )
             )

@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from nerfies_jax import evaluation, scene
-from nerfies_jax.effects.effect import Moment
 from nerfies_jax.evaluation.model_flow import Move, Moved
 from nerfies_jax.evaluation.protocol import STILL_POINTS, Followed
 from nerfies_jax.training import tracks
+from nerfies_jax.training.effects import FrameCondition
 from nerfies_jax.training.model import in_default_precision
 
 LEAST_STRETCH = 1e-6  # a collapsed direction has a logarithm, too
@@ -37,17 +37,17 @@ def follow(spec, facts, state, capture, known) -> Followed | None:
 
     @jax.jit
     def solve(params, step, start, true, still):
-        def moment_of(view):
-            return Moment(view.time, made.codes_at(params, view), step)
+        def condition_of(view):
+            return FrameCondition(view.time, made.codes_at(params, view), step)
 
-        moments = jax.vmap(moment_of)(views)
+        conditions = jax.vmap(condition_of)(views)
         followed = tracks.point_tracks(
-            made.displace, params, start, moments, known.start
+            made.displace, params, start, conditions, known.start
         )
         each = jax.vmap(made.displace, (None, 0, None))  # point
-        moved = jax.vmap(each, (None, None, 0))(params, still, moments)
+        moved = jax.vmap(each, (None, None, 0))(params, still, conditions)
         slope = jax.vmap(jax.jacfwd(made.displace, 1), (None, 0, None))
-        slopes = jax.vmap(slope, (None, 1, 0))(params, true, moments)
+        slopes = jax.vmap(slope, (None, 1, 0))(params, true, conditions)
         apart = jnp.linalg.norm(moved - jnp.mean(moved, axis=0), axis=-1)
         return followed, apart, slopes
 
@@ -82,12 +82,12 @@ def mover(spec, facts) -> Move | None:
 
     @jax.jit
     def solve(params, step, points, here, there):
-        def moment_of(view):
-            return Moment(view.time, made.codes_at(params, view), step)
+        def condition_of(view):
+            return FrameCondition(view.time, made.codes_at(params, view), step)
 
         views = jax.tree.map(lambda *leaves: jnp.stack(leaves), here, there)
-        moments = jax.vmap(moment_of)(views)
-        found = tracks.point_tracks(made.displace, params, points, moments, 0)
+        conditions = jax.vmap(condition_of)(views)
+        found = tracks.point_tracks(made.displace, params, points, conditions, 0)
         return found.points[:, 1], found.converged[:, 1]
 
     def move(state, points, here, there):

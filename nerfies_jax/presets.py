@@ -18,6 +18,7 @@ from nerfies_jax.effects.warp import WarpSpec
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.radiance.template import TemplateSpec
 from nerfies_jax.spec import RadianceScene, SamplingSpec
+from nerfies_jax.training import step_counts
 
 # Mildenhall et al. 2020, arXiv:2003.08934. Densities pass a softplus, not their ReLU,
 # under which a ray that starts without any never learns.
@@ -179,29 +180,10 @@ PRESETS = {
     "nsff-small": SMALL_NSFF,
 }
 
-# Fields of the effects that count steps, beside those of the scene itself.
-COUNTED = {
-    "warp": ("anneal_steps",),
-    "ambient": ("closed_steps", "anneal_steps"),
-    "elastic": ("hold_steps", "decay_steps"),
-    "scene_flow": ("decay_steps",),
-}
-
 
 def with_steps(spec: RadianceScene, steps: int) -> RadianceScene:
     """The same field over another number of steps, its schedules in proportion."""
     if steps < 1:
         raise ValueError(f"steps={steps}: train for at least one step")
-    share = steps / spec.steps
-    changed = {}
-    for name, fields in COUNTED.items():
-        effect = getattr(spec, name)
-        if effect is None:
-            continue
-        counts = {field: getattr(effect, field) for field in fields}
-        scaled = {
-            field: max(1, round(count * share)) if count else count
-            for field, count in counts.items()
-        }
-        changed[name] = dataclasses.replace(effect, **scaled)
-    return dataclasses.replace(spec, steps=steps, **changed)
+    in_proportion = step_counts.stretched(spec, steps / spec.steps)
+    return dataclasses.replace(in_proportion, steps=steps)

@@ -1,5 +1,6 @@
 """A radiance field put together: a spec becomes a `Model` the loop can train."""
 
+import functools
 import math
 from typing import Any
 
@@ -8,25 +9,25 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Key
 
-from nerfies_jax import facts as scene_facts
-from nerfies_jax import tracing
+from nerfies_jax import render_ray, scene_metadata
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.effects import transient
-from nerfies_jax.effects.effect import (
-    Batch,
-    Box,
-    Context,
-    Level,
-    Moment,
-    Term,
-    stream,
-)
-from nerfies_jax.facts import Facts
+from nerfies_jax.effects.effect import Batch, Box, RayOutput
 from nerfies_jax.field import Field, field
 from nerfies_jax.geometry import rays
 from nerfies_jax.nets import codes
+from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.spec import RadianceScene
 from nerfies_jax.training import loop, losses, schedules
+from nerfies_jax.training.effects import (
+    Effect,
+    FrameCondition,
+    PenaltyContext,
+    Term,
+    penalty_terms,
+    values,
+    weighted_sum,
+)
 from nerfies_jax.training.model import (
     Frames,
     Model,
@@ -34,52 +35,52 @@ from nerfies_jax.training.model import (
     View,
     in_default_precision,
 )
+from nerfies_jax.training.schedules import Schedule
+from nerfies_jax.training.updates import apply_updates
 
-__all__ = ["Facts", "Field", "RadianceScene", "build", "facts_of", "field"]
+__all__ = ["Field", "RadianceScene", "SceneMetadata", "build", "field", "metadata_of"]
 
 PyTree = Any
 
 
-def facts_of(capture: Capture, spec: RadianceScene) -> Facts:
+def metadata_of(capture: Capture, spec: RadianceScene) -> SceneMetadata:
     """What the field must know of a capture; host side."""
-    return scene_facts.facts_of(capture, spec.extent)
+    return scene_metadata.metadata_of(capture, spec.extent)
 
 
-def build(spec: RadianceScene, facts: Facts) -> Model:
+def build(
+    spec: RadianceScene, metadata: SceneMetadata, effects: tuple[Effect, ...] = ()
+) -> Model:
     """Everything the loop, the renderer and the report need of this scene.
 
-    Raises ValueError where an effect needs what the capture does not have.
+    `effects` act behind those of the spec. Raises ValueError where an effect needs what
+    the capture does not have.
     """
-    made = field(spec, facts)
-    if spec.background is not None and "points" not in facts.provides:
+    made = field(spec, metadata, effects=effects)
+    if spec.background is not None and "points" not in metadata.available_data:
         raise ValueError(
             "the background effect holds static points still, and this capture has "
             "none; leave it out with --set background=none"
         )
     optimiser = optax.scale_by_adam()
-    rate = schedules.log_linear(spec.rate, spec.rate_end, spec.steps)
+    schedule = schedules.log_linear(spec.rate, spec.rate_end, spec.steps)
 
     def step(state: TrainState, frames: Frames):
         batch_key, field_key = jax.random.split(loop.step_key(state))
         batch = draw_batch(frames, spec.rays, batch_key)
 
         def loss(params):
-            terms = loss_terms(
-                spec, facts, made, params, frames, batch, state.step, field_key
-            )
-            total = sum(term.weight * term.value for term in terms.values())
-            return total, {name: term.value for name, term in terms.items()}
+            terms = loss_terms(made, params, frames, batch, state.step, field_key)
+            return weighted_sum(terms), values(terms)
 
-        (value, logged), slope = jax.value_and_grad(loss, has_aux=True)(state.params)
+        (value, logged), grads = jax.value_and_grad(loss, has_aux=True)(state.params)
         # optax counts in int32 and multiplies float32 by it.
         with jax.numpy_dtype_promotion("standard"):
-            direction, moments = optimiser.update(slope, state.optimiser)
-        speed = rate(state.step)
-        params = jax.tree.map(
-            lambda x, d: x - (speed * d).astype(x.dtype), state.params, direction
-        )
+            updates, moments = optimiser.update(grads, state.optimiser)
+        rates = learning_rates(made.effects, schedule, state.params, state.step)
+        params = apply_updates(state.params, updates, rates)
         metrics = {"loss": value, "mse": logged["fine"], **logged}
-        state = TrainState(params, moments, state.extra, state.step + 1, state.key)
+        state = TrainState(params, moments, state.aux_state, state.step + 1, state.key)
         return state, metrics
 
     def whole_frame(params, view: View, size, step):
@@ -87,23 +88,35 @@ def build(spec: RadianceScene, facts: Facts) -> Model:
         return made.render(params, view.camera, view.time, found, size, step)
 
     def init(capture, key):
-        codes.check_ids(capture.appearance_ids, len(facts.exposures), "appearance_ids")
+        codes.check_ids(
+            capture.appearance_ids, len(metadata.exposures), "appearance_ids"
+        )
         start_key, run_key = jax.random.split(key)
         params = in_default_precision(made.init(start_key))
         return TrainState(
             params, optimiser.init(params), (), jnp.zeros((), jnp.int32), run_key
         )
 
-    wants = frozenset().union(*(effect.wants for effect in made.effects))
+    read = frozenset().union(*(effect.required_data for effect in made.effects))
     return Model(
-        spec=(spec, facts),
+        # By name alone: a run with other effects of one's own is another run.
+        spec=(spec, metadata, *(effect.name for effect in effects)),
         init=init,
         step=step,
         render=whole_frame,
         events=(),
         counts=count_parameters,
-        wants=wants & facts.provides,
+        required_data=read & metadata.available_data,
     )
+
+
+def learning_rates(
+    effects: tuple[Effect, ...], schedule: Schedule, params: PyTree, step: Array
+) -> dict[str, Array]:
+    """Of each part of the parameters: the effect's own, or that of the schedule."""
+    own = {e.name: e.learning_rate for e in effects if e.learning_rate is not None}
+    common = schedule(step)
+    return {name: own[name](step) if name in own else common for name in params}
 
 
 def draw_batch(frames: Frames, count: int, key: Key[Array, ""]) -> Batch:
@@ -128,8 +141,6 @@ def draw_batch(frames: Frames, count: int, key: Key[Array, ""]) -> Batch:
 
 
 def loss_terms(
-    spec: RadianceScene,
-    facts: Facts,
     made: Field,
     params: PyTree,
     frames: Frames,
@@ -142,47 +153,43 @@ def loss_terms(
     "coarse" and "fine" are mean squared errors of colour; "colour" is NeRF-W's negative
     log-likelihood where a transient medium says how uncertain it is.
     """
-    trace_key, penalty_key = jax.random.split(key)
+    ray_key, penalty_key = jax.random.split(key)
+    metadata = made.metadata
 
-    def moment_of(row):
+    def condition_of(row):
         view = View(
             jax.tree.map(lambda leaf: leaf[row], frames.cameras),
             frames.times[row],
-            frames.warp[row],
             frames.appearance[row],
         )
-        return Moment(view.time, made.codes_at(params, view), step)
+        return FrameCondition(view.time, made.codes_at(params, view), step)
 
-    moments = jax.vmap(moment_of)(batch.row)
-    lines = jax.vmap(lambda *ray: tracing.field_ray(facts, *ray))(
+    conditions = jax.vmap(condition_of)(batch.row)
+    lines = jax.vmap(lambda *ray: render_ray.field_ray(metadata, *ray))(
         batch.origin, batch.direction, batch.cosine
     )
-    keys = jax.random.split(trace_key, len(batch.row))
-    levels = jax.vmap(lambda *ray: made.trace(params, *ray))(lines, moments, keys)
-    terms = _colour_terms(levels, batch)
-    centre = jnp.asarray(facts.centre, batch.origin.dtype)
-    context = Context(
-        displace=lambda point, moment: made.displace(params, point, moment),
-        moment_of=moment_of,
-        moments=moments,
+    keys = jax.random.split(ray_key, len(batch.row))
+    levels = jax.vmap(lambda *ray: made.render_ray(params, *ray))(
+        lines, conditions, keys
+    )
+    centre = jnp.asarray(metadata.centre, batch.origin.dtype)
+    context = PenaltyContext(
+        condition=conditions,
+        step=step,
+        key=penalty_key,
+        params=params,
+        displace=functools.partial(made.displace, params),
+        condition_of=condition_of,
         batch=batch,
         levels=levels,
         frames=frames,
-        box=Box(centre, jnp.asarray(facts.scale, batch.origin.dtype)),
-        step=step,
-        key=penalty_key,
+        box=Box(centre, jnp.asarray(metadata.scale, batch.origin.dtype)),
     )
-    for effect in made.effects:
-        if effect.penalty is None:
-            continue
-        own_key = jax.random.fold_in(penalty_key, stream(effect.name))
-        own = context._replace(key=own_key)
-        found = effect.penalty(params.get(effect.name), own)
-        terms.update({f"{effect.name}/{name}": term for name, term in found.items()})
-    return terms
+    terms = _colour_terms(levels, batch)
+    return terms | penalty_terms(made.effects, params, context, {})
 
 
-def _colour_terms(levels: tuple[Level, ...], batch: Batch) -> dict[str, Term]:
+def _colour_terms(levels: tuple[RayOutput, ...], batch: Batch) -> dict[str, Term]:
     last = levels[-1]
     mse = losses.mse(last.colour, batch.colour, batch.valid)
     terms = {"fine": Term(mse, 1.0)}
@@ -191,7 +198,7 @@ def _colour_terms(levels: tuple[Level, ...], batch: Batch) -> dict[str, Term]:
         likelihood = transient.photometric(
             last.colour, batch.colour, last.beta, batch.valid
         )
-        terms = {"fine": Term(mse, 0.0), "colour": Term(likelihood, 1.0)}
+        terms = {"fine": Term(mse, None), "colour": Term(likelihood, 1.0)}
         coarse_weight = 1.5  # NeRF-W, equation 13: half of the sum over channels
     if len(levels) > 1:
         coarse = losses.mse(levels[0].colour, batch.colour, batch.valid)
@@ -199,7 +206,7 @@ def _colour_terms(levels: tuple[Level, ...], batch: Batch) -> dict[str, Term]:
     return terms
 
 
-def first_bytes(spec: RadianceScene, capture: Capture) -> int:
+def estimate_memory_bytes(spec: RadianceScene, capture: Capture) -> int:
     """Roughly the memory of the first state and step; host side, nothing allocated."""
     samples = 2 * spec.sampling.coarse + spec.sampling.fine
     widths = spec.template.depth * spec.template.width + spec.template.colour_width

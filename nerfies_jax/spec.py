@@ -15,14 +15,14 @@ from nerfies_jax.effects import (
 from nerfies_jax.effects.ambient import AmbientSpec
 from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.effects.background import BackgroundSpec
-from nerfies_jax.effects.effect import Effect, Table
 from nerfies_jax.effects.elastic import ElasticSpec
 from nerfies_jax.effects.scene_flow import SceneFlowSpec
 from nerfies_jax.effects.time_condition import TimeSpec
 from nerfies_jax.effects.transient import TransientSpec
 from nerfies_jax.effects.warp import WarpSpec
-from nerfies_jax.facts import Facts
 from nerfies_jax.radiance.template import TemplateSpec
+from nerfies_jax.scene_metadata import SceneMetadata
+from nerfies_jax.training.effects import Effect, Table
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,11 +98,11 @@ class RadianceScene:
                 )
 
 
-def effects_of(spec: RadianceScene, facts: Facts) -> tuple[Effect, ...]:
+def effects_of(spec: RadianceScene, metadata: SceneMetadata) -> tuple[Effect, ...]:
     """The effects that the spec asks for, in the order in which they act."""
 
     def flow(one):
-        return scene_flow.effect(one, len(facts.times), spec.template.width)
+        return scene_flow.effect(one, len(metadata.times), spec.template.width)
 
     built = (
         (spec.appearance, appearance.effect),

@@ -5,6 +5,7 @@ import jax
 from nerfies_jax import scene
 from nerfies_jax.measure.part_time import part_ms
 from nerfies_jax.training import loop
+from nerfies_jax.training.effects import weighted_sum
 from nerfies_jax.training.model import Frames, Model, TrainState
 
 
@@ -17,10 +18,8 @@ def parts(
     batch = jax.jit(scene.draw_batch, static_argnums=1)(frames, spec.rays, batch_key)
 
     def loss(params, frames, batch):
-        terms = scene.loss_terms(
-            spec, facts, made, params, frames, batch, state.step, loss_key
-        )
-        return sum(term.weight * term.value for term in terms.values())
+        terms = scene.loss_terms(made, params, frames, batch, state.step, loss_key)
+        return weighted_sum(terms)
 
     forward = part_ms(loss, state.params, frames, batch)
     both = part_ms(jax.value_and_grad(loss), state.params, frames, batch)

@@ -7,8 +7,8 @@ from jaxtyping import Array, Float, Int
 
 from nerfies_jax import scene
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.effects.effect import APPEARANCE
 from nerfies_jax.evaluation.representation import check_there
+from nerfies_jax.training.effects import APPEARANCE
 from nerfies_jax.training.model import Model, View
 
 

@@ -11,13 +11,20 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from gaussians_jax import density, harmonics, optimiser, projection, raster, splats
+from gaussians_jax import (
+    densification,
+    harmonics,
+    optimiser,
+    projection,
+    raster,
+    splats,
+)
+from gaussians_jax import learning_rates as splat_rates
 from gaussians_jax import presets as splat_presets
-from gaussians_jax import rates as splat_rates
 from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec
+from gaussians_jax.initialisation import InitSpec
 from gaussians_jax.splats import Params
-from gaussians_jax.start import StartSpec
 from nerfies_jax import presets as field_presets
 from nerfies_jax.geometry import rays
 from nerfies_jax.nets import encoding
@@ -25,6 +32,7 @@ from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.radiance import compositing, sampling, template
 from nerfies_jax.training import losses, schedules
 from nerfies_jax.training.model import TrainState
+from nerfies_jax.training.updates import apply_updates
 
 FEW = EncodingSpec(2)
 STEPS = 100
@@ -100,16 +108,16 @@ def tiny_splats(name):
         )
     return dataclasses.replace(
         spec,
-        start=StartSpec(random=100, fewest=1000),
+        init=InitSpec(random=100, min_points=1000),
         sh_degree=1,
-        density=shrunk(spec.density, most=256),
+        densification=shrunk(spec.densification, cap_max=256),
         motion=motion,
         acceleration=shrunk(spec.acceleration, samples=16),
         neighbours=shrunk(spec.neighbours, count=3),
     )
 
 
-def field_loss(spec, facts, params, batch, key):
+def field_loss(spec, metadata, params, batch, key):
     """Squared errors of the levels of a static NeRF: (their sum, each by name)."""
 
     def level(name, origin, direction, far, distance):
@@ -125,8 +133,8 @@ def field_loss(spec, facts, params, batch, key):
 
         found = jax.vmap(ask)(distance)
         behind, end = None, compositing.AT_INFINITY
-        if facts.background is not None:
-            behind = jnp.asarray(facts.background, distance.dtype)
+        if metadata.background is not None:
+            behind = jnp.asarray(metadata.background, distance.dtype)
             end = jnp.maximum(far - distance[-1], 0)
         optical_depth = found.density * compositing.intervals(distance, end)
         weights = compositing.weights(optical_depth)
@@ -135,9 +143,9 @@ def field_loss(spec, facts, params, batch, key):
 
     def ray(origin, direction, cosine, key):
         plan = spec.sampling
-        origin = (origin - jnp.asarray(facts.centre, origin.dtype)) * facts.scale
-        span = facts.scale / cosine
-        near, far = facts.near * span, facts.far * span
+        origin = (origin - jnp.asarray(metadata.centre, origin.dtype)) * metadata.scale
+        span = metadata.scale / cosine
+        near, far = metadata.near * span, metadata.far * span
         first, second, _ = jax.random.split(key, 3)
         distance = sampling.stratified(first, near, far, plan.coarse, plan.spacing)
         if plan.fine == 0:
@@ -155,7 +163,7 @@ def field_loss(spec, facts, params, batch, key):
     return sum(terms.values()), terms
 
 
-def field_step(spec, facts, draw_batch):
+def field_step(spec, metadata, draw_batch):
     """One update of a static NeRF from rays that `draw_batch` draws."""
     adam = optax.scale_by_adam()
     rate = schedules.log_linear(spec.rate, spec.rate_end, spec.steps)
@@ -166,20 +174,20 @@ def field_step(spec, facts, draw_batch):
         batch = draw_batch(frames, spec.rays, batch_key)
 
         def loss(params):
-            return field_loss(spec, facts, params, batch, field_key)
+            return field_loss(spec, metadata, params, batch, field_key)
 
-        (value, terms), slope = jax.value_and_grad(loss, has_aux=True)(state.params)
+        (value, terms), grads = jax.value_and_grad(loss, has_aux=True)(state.params)
         with jax.numpy_dtype_promotion("standard"):
-            direction, moments = adam.update(slope, state.optimiser)
-        speed = rate(state.step)
-        params = jax.tree.map(lambda x, d: x - speed * d, state.params, direction)
+            updates, moments = adam.update(grads, state.optimiser)
+        now = rate(state.step)
+        params = jax.tree.map(lambda x, d: x - now * d, state.params, updates)
         state = TrainState(params, moments, (), state.step + 1, state.key)
         return state, {"loss": value, "mse": terms["fine"], **terms}
 
     return step
 
 
-def splat_step(spec, facts, shuffled_row):
+def splat_step(spec, metadata, shuffled_row):
     """One update of a static scene of Gaussians, from the frame that is its turn."""
     update = optimiser.scale_by_row_adam().update
     if spec.optimiser == "radam":
@@ -191,10 +199,10 @@ def splat_step(spec, facts, shuffled_row):
         colour = harmonics.colour_towards(shown, gaussians.mean, camera.position)
         seen = projection.project(gaussians, camera, size, spec.raster)
         placed = seen
-        if offset is not None:  # whose slope the density control wants to know
+        if offset is not None:  # whose gradient densification wants to know
             placed = seen._replace(mean_px=seen.mean_px + offset)
         image, passing = raster.rasterise(placed, colour, size, spec.raster)
-        behind = jnp.asarray(facts.background, image.dtype)
+        behind = jnp.asarray(metadata.background, image.dtype)
         return image + behind * passing[..., None], seen
 
     def step(state, frames):
@@ -213,26 +221,26 @@ def splat_step(spec, facts, shuffled_row):
             return value, (losses.mse(image, truth, valid), seen)
 
         still, wanted = None, (0,)
-        if spec.density is not None:
+        if spec.densification is not None:
             still = jnp.zeros_like(state.params.rows["splats"].mean[:, :2])
             wanted = (0, 1)
-        (value, (mse, seen)), slopes = jax.value_and_grad(
+        (value, (mse, seen)), grads = jax.value_and_grad(
             loss, argnums=wanted, has_aux=True
         )(state.params, still)
-        direction, moments = update(slopes[0], state.optimiser, state.params)
-        rates = splat_rates.learning_rates(
-            spec.rates, facts.extent, spec.steps, state.step
+        updates, moments = update(grads[0], state.optimiser, state.params)
+        rates = splat_rates.at_step(
+            spec.learning_rates, metadata.extent, spec.steps, state.step
         )
         rates = Params({"splats": rates}, {})
-        params = splat_rates.descend(state.params, direction, rates)
-        extra = state.extra
-        if spec.density is not None:
+        params = apply_updates(state.params, updates, rates)
+        aux_state = state.aux_state
+        if spec.densification is not None:
             radius_px = jnp.max(seen.extent_px, axis=1)
-            stats = density.observe(
-                extra.stats, slopes[1], seen.visible, radius_px, size
+            stats = densification.observe(
+                aux_state.stats, grads[1], seen.visible, radius_px, size
             )
-            extra = extra._replace(stats=stats)
-        state = TrainState(params, moments, extra, state.step + 1, state.key)
+            aux_state = aux_state._replace(stats=stats)
+        state = TrainState(params, moments, aux_state, state.step + 1, state.key)
         return state, {"loss": value, "mse": mse}
 
     return step

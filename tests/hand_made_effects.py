@@ -50,7 +50,7 @@ MOTION_MODULES = {
 }
 
 
-def of_field(spec, facts):
+def of_field(spec, metadata):
     """The effects of a field, asked one by one from their own modules."""
     width = spec.template.width
     made = []
@@ -69,14 +69,14 @@ def of_field(spec, facts):
     if spec.background is not None:
         made.append(background.effect(spec.background))
     if spec.scene_flow is not None:
-        moments = len(facts.times)
+        moments = len(metadata.times)
         made.append(scene_flow.effect(spec.scene_flow, moments, width))
     return tuple(made)
 
 
-def of_splats(spec, facts):
+def of_splats(spec, metadata):
     """The effects of a scene of Gaussians, asked one by one from their own modules."""
-    made, extent, frames = [], facts.extent, facts.frames
+    made, extent, frames = [], metadata.extent, metadata.frames
     motion = spec.motion
     if isinstance(motion, mlp_motion.MotionSpec):
         made.append(mlp_motion.effect(motion, spec.steps, frames))

@@ -11,11 +11,12 @@ import numpy as np
 
 from nerfies_jax.capture.flow import FrameFlow
 from nerfies_jax.effects import scene_flow
-from nerfies_jax.effects.effect import Batch, Box, Context, Level, Moment, Sample
+from nerfies_jax.effects.effect import Batch, Box, RayOutput, Sample
 from nerfies_jax.effects.scene_flow import SceneFlowSpec
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.radiance.template import TemplateSpec
+from nerfies_jax.training.effects import FrameCondition, PenaltyContext
 from nerfies_jax.training.model import Frames
 
 TINY = SceneFlowSpec(
@@ -56,7 +57,6 @@ def frames_and_batch(rng, dtype):
         cameras=jax.tree.map(lambda leaf: leaf.astype(dtype), filmed),
         # the third is filmed a little late, and the flow stretched to it
         times=np.array([0, 1 / 3, 0.7, 1], dtype),
-        warp=np.arange(MOMENTS, dtype=np.int32),
         appearance=np.arange(MOMENTS, dtype=np.int32),
         valid=None,
         depths=np.where(depths < 2.3, 0, depths),
@@ -86,19 +86,19 @@ def context_of(spec, params, frames, batch, distance, features, weight, step):
     centre = jnp.asarray(BOX_CENTRE, distance.dtype)
     origin = (batch.origin - centre) * BOX_SCALE
     point = origin[:, None] + distance[..., None] * batch.direction[:, None]
-    moments = Moment(frames.times[batch.row], {}, jnp.full(RAYS, step))
+    conditions = FrameCondition(frames.times[batch.row], {}, jnp.full(RAYS, step))
 
-    def at(point, features, direction, moment):
+    def at(point, features, direction, condition):
         return scene_flow.medium(
-            spec, params, Sample(point, direction, features), moment
+            spec, params, Sample(point, direction, features), condition
         )
 
     media = jax.vmap(jax.vmap(at, (0, 0, None, None)))(
-        point, features, batch.direction, moments
+        point, features, batch.direction, conditions
     )
     none = jnp.zeros(RAYS, distance.dtype)
-    level = Level(
-        distance=distance,
+    level = RayOutput(
+        distances=distance,
         point=point,
         warped=point,
         static_weight=jnp.zeros_like(weight),
@@ -106,14 +106,13 @@ def context_of(spec, params, frames, batch, distance, features, weight, step):
         media_weight={"scene_flow": weight},
         colour=batch.colour,
         alpha=none,
-        depth=none,
-        median_depth=none,
+        distance=none,
+        median_distance=none,
         beta=None,
     )
-    return Context(
-        displace=None,
-        moment_of=None,
-        moments=moments,
+    return PenaltyContext(
+        condition=conditions,
+        params=params,
         batch=batch,
         levels=(level,),
         frames=frames,

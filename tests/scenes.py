@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 
-from gaussians_jax.density import DensitySpec
+from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.effects.acceleration import AccelerationSpec
 from gaussians_jax.effects.depth import DepthSpec
 from gaussians_jax.effects.kan_motion import KanMotionSpec
@@ -33,7 +33,13 @@ TINY_SPLATS = SplatScene(
     steps=30,
     sh_degree=1,
     sh_every=10,
-    density=DensitySpec(interval=10, start=10, stop=25, most=600, reset_interval=20),
+    densification=DefaultStrategySpec(
+        refine_every=10,
+        refine_start_iter=10,
+        refine_stop_iter=25,
+        cap_max=600,
+        reset_every=20,
+    ),
 )
 TINY_DEFORMABLE = dataclasses.replace(TINY_SPLATS, motion=TINY_MOTION)
 TINY_SONATA = dataclasses.replace(

@@ -36,18 +36,18 @@ LEANS_ON = {
     "alternation": ("motion",),
     "acceleration": ("motion",),
     "neighbours": ("motion",),
-    "motion_growth": ("motion", "density"),
+    "motion_growth": ("motion", "densification"),
 }
 
 
 class Started:
     """A scene on the tiny capture: its model, first state and frames."""
 
-    def __init__(self, spec, build, facts_of):
+    def __init__(self, spec, build, metadata_of):
         self.capture = scenes.tiny_capture()
-        self.spec, self.facts = spec, facts_of(self.capture)
-        self.model = build(spec, self.facts)
-        self.frames = evaluation.frames_of(self.capture, self.model.wants)
+        self.spec, self.metadata = spec, metadata_of(self.capture)
+        self.model = build(spec, self.metadata)
+        self.frames = evaluation.frames_of(self.capture, self.model.required_data)
 
     def init(self, key):
         return self.model.init(self.capture, key)
@@ -69,12 +69,12 @@ class Started:
 
 def started_field(spec):
     return Started(
-        spec, field_scene.build, lambda capture: field_scene.facts_of(capture, spec)
+        spec, field_scene.build, lambda capture: field_scene.metadata_of(capture, spec)
     )
 
 
 def started_splats(spec):
-    return Started(spec, splat_scene.build, splat_scene.facts_of)
+    return Started(spec, splat_scene.build, splat_scene.metadata_of)
 
 
 def parts_of(spec):
@@ -130,7 +130,7 @@ def same_program(ours, by_hand, *args):
 )
 def test_a_field_without_effects_is_the_static_one_bit_for_bit(name):
     run = started_field(bare(bare_scenes.tiny_field(name)))
-    step = bare_scenes.field_step(run.spec, run.facts, field_scene.draw_batch)
+    step = bare_scenes.field_step(run.spec, run.metadata, field_scene.draw_batch)
     same_program(run.model.step, step, run.state, run.frames)
 
 
@@ -152,16 +152,18 @@ def test_there_is_no_other_kind_of_static_field():
 )
 def test_splats_without_effects_are_the_static_ones_bit_for_bit(name):
     run = started_splats(bare(bare_scenes.tiny_splats(name)))
-    step = bare_scenes.splat_step(run.spec, run.facts, splat_scene.shuffled_row)
+    step = bare_scenes.splat_step(run.spec, run.metadata, splat_scene.shuffled_row)
     same_program(run.model.step, step, run.state, run.frames)
 
 
 @pytest.mark.slow
-def test_splats_without_density_control_keep_no_statistics_of_it():
-    spec = dataclasses.replace(bare_scenes.tiny_splats("splats-static"), density=None)
+def test_splats_without_densification_keep_no_statistics_of_it():
+    spec = dataclasses.replace(
+        bare_scenes.tiny_splats("splats-static"), densification=None
+    )
     run = started_splats(spec)
-    assert jax.tree.leaves(run.state.extra) == []
-    step = bare_scenes.splat_step(run.spec, run.facts, splat_scene.shuffled_row)
+    assert jax.tree.leaves(run.state.aux_state) == []
+    step = bare_scenes.splat_step(run.spec, run.metadata, splat_scene.shuffled_row)
     same_program(run.model.step, step, run.state, run.frames)
 
 

@@ -18,12 +18,12 @@ from gaussians_jax.effects.mlp_motion import MotionSpec
 from nerfies_jax import field as fields
 from nerfies_jax import presets as field_presets
 from nerfies_jax.effects import ambient, scene_flow, transient, warp
-from nerfies_jax.facts import Facts
 from nerfies_jax.radiance import template
+from nerfies_jax.scene_metadata import SceneMetadata
 from tests import bare_scenes, scenes
 
 MOMENTS, EXPOSURES = 5, 3
-FACTS = Facts(
+METADATA = SceneMetadata(
     near=1.0,
     far=3.0,
     centre=(0.0, 0.0, 0.0),
@@ -98,7 +98,7 @@ def removed_from(spec):
 @pytest.mark.parametrize("preset", field_presets.PRESETS)
 def test_a_field_has_the_arrays_of_what_it_has_and_no_others(preset):
     for spec in removed_from(field_presets.PRESETS[preset]):
-        made = fields.field(spec, FACTS)
+        made = fields.field(spec, METADATA)
         found = jax.eval_shape(made.init, jax.random.key(0))
         expected = jax.eval_shape(lambda spec=spec: counted_out(spec))
         assert shapes(found) == shapes(expected)
@@ -121,27 +121,27 @@ def splats_without(spec):
 @pytest.mark.parametrize("preset", splat_presets.PRESETS)
 def test_splats_have_the_arrays_of_what_they_have_and_no_others(preset):
     capture = scenes.tiny_capture()
-    facts = splat_scene.facts_of(capture)
+    metadata = splat_scene.metadata_of(capture)
     for spec in splats_without(bare_scenes.tiny_splats(preset)):
-        state = splat_scene.build(spec, facts).init(capture, jax.random.key(0))
+        state = splat_scene.build(spec, metadata).init(capture, jax.random.key(0))
         motion, key, nets = spec.motion, jax.random.key(0), {}
-        rows, carried = {"splats"}, set()
+        rows, states = {"splats"}, set()
         if isinstance(motion, MotionSpec):
             nets["mlp_motion"] = mlp_motion.init(key, motion)
         elif isinstance(motion, KanMotionSpec):
             rows.add("kan_motion")
-            nets["kan_motion"] = kan_motion.init(key, motion, facts.frames)
+            nets["kan_motion"] = kan_motion.init(key, motion, metadata.frames)
         elif motion is not None:
             nets["motion_basis"] = motion_basis.init(key, motion)
         if spec.spectral is not None:
             nets["spectral"] = spectral.init(spec.spectral)
         if spec.neighbours is not None:
-            carried.add("neighbours")
+            states.add("neighbours")
         if spec.motion_growth is not None:
-            carried.add("motion_growth")
+            states.add("motion_growth")
         assert set(state.params.rows) == rows
         assert shapes(state.params.nets) == shapes(nets)
-        assert set(state.extra.carried) == carried
+        assert set(state.aux_state.effects) == states
         # A count and two moments for each array that is trained, and nothing else.
         trained = len(jax.tree.leaves(state.params))
         assert len(jax.tree.leaves(state.optimiser)) == 3 * trained

@@ -24,14 +24,14 @@ def one_step(name):
     """The first parameters, and shapes of the second state, its log and its picture."""
     if name in SPLATS:
         capture, spec, kind = scenes.tiny_capture(), SPLATS[name], gaussians_jax.scene
-        facts = kind.facts_of(capture)
+        metadata = kind.metadata_of(capture)
     else:
         capture, spec = scenes.tiny_capture(), tiny_fields.tiny(name)
         kind = nerfies_jax.scene
-        facts = kind.facts_of(capture, spec)
-    model = kind.build(spec, facts)
+        metadata = kind.metadata_of(capture, spec)
+    model = kind.build(spec, metadata)
     first = model.init(capture, jax.random.key(0))
-    frames = evaluation.frames_of(capture, model.wants)
+    frames = evaluation.frames_of(capture, model.required_data)
     second, logged = jax.eval_shape(model.step, first, frames)
     view = evaluation.view_of(capture, int(capture.heldout[0]))
     drawn = jax.eval_shape(

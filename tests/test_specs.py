@@ -7,6 +7,7 @@ import math
 import pytest
 
 from gaussians_jax import presets
+from gaussians_jax.mcmc import MCMCStrategySpec
 from gaussians_jax.raster_spec import INRIA
 from nerfies_jax import presets as fields
 from nerfies_jax.training import specs
@@ -15,16 +16,24 @@ from nerfies_jax.training import specs
 def test_an_override_reaches_a_nested_field_with_its_type():
     spec = specs.override(
         presets.SMALL_DEFORMABLE,
-        ("density.most=123", "motion.rate=1e-3", "raster.antialiased=true"),
+        ("densification.cap_max=123", "motion.rate=1e-3", "raster.antialiased=true"),
     )
-    assert spec.density.most == 123
+    assert spec.densification.cap_max == 123
     assert spec.motion.rate == 1e-3
     assert spec.raster.antialiased is True
-    assert spec.start == presets.SMALL_DEFORMABLE.start
+    assert spec.init == presets.SMALL_DEFORMABLE.init
 
 
 def test_an_effect_is_taken_out_with_none():
     assert specs.override(presets.SMALL_DEFORMABLE, ("motion=none",)).motion is None
+
+
+def test_one_of_several_kinds_is_chosen_by_the_name_of_its_class():
+    spec = specs.override(
+        presets.SMALL_DEFORMABLE,
+        ("densification=MCMCStrategySpec", "densification.cap_max=123"),
+    )
+    assert spec.densification == MCMCStrategySpec(cap_max=123)
 
 
 def test_a_tuple_is_read_by_its_items():
@@ -35,10 +44,13 @@ def test_a_tuple_is_read_by_its_items():
 @pytest.mark.parametrize(
     ("assignment", "words"),
     [
-        ("density.mots=3", "has no field 'mots'; it has .*most"),
-        ("density.most=many", "cannot be read as"),
+        ("densification.cap_mxa=3", "has no field 'cap_mxa'; it has .*cap_max"),
+        ("densification.cap_max=many", "cannot be read as"),
+        ("densification=MCMC", "one of DefaultStrategySpec, MCMCStrategySpec"),
+        ("alternation.nets=3", "no defaults for start and stop"),
         ("steps", "expected path.to.field=value"),
         ("steps.more=1", "has no fields"),
+        ("motion.width=8", "has no fields"),  # of which kind is not guessed
         ("sh_degree=7", "0, 1, 2 or 3"),
     ],
 )

@@ -215,7 +215,7 @@ class Job:
         compiled_before = (name, steps) in self._built
         arm = self._build(name, steps)
         state = arm.model.init(self.capture, jax.random.key(seed))
-        frames = evaluation.frames_of(self.capture, arm.model.wants)
+        frames = evaluation.frames_of(self.capture, arm.model.required_data)
         began, self._cache_saved = time.process_time(), 0.0
         result = loop.fit(arm.model, state, frames, steps=steps)
         # Compiling is taken out by its share of the time: its CPU time is not known.
@@ -267,13 +267,13 @@ class Job:
             spec = self.spec(name, steps)
             preset = self.suite.arms[name].preset
             representation = representations.of_preset(preset)
-            facts = representation.facts_of(self.capture, spec)
+            facts = representation.metadata_of(self.capture, spec)
             model = representation.build(spec, facts)
             self._cache_saved = 0.0
             first = loop.fit(
                 model,
                 model.init(self.capture, jax.random.key(0)),
-                evaluation.frames_of(self.capture, model.wants),
+                evaluation.frames_of(self.capture, model.required_data),
                 steps=1,
                 console=rich.console.Console(quiet=True),
             )

@@ -85,7 +85,7 @@ LEGENDS = {
     "that a scene without motion can say.",
     "drift": "drift: how far static points wander.",
     "strain": "strain: ||log S|| of the warp's Jacobian (root mean square).",
-    "gaussians": "Gauss.: living Gaussians at the end.",
+    "gaussians": "Gauss.: active Gaussians at the end.",
     "parameters": "params: trained numbers, 4 bytes each.",
     "train_seconds": "train s: steps and what happens between them, without compiling "
     "the step; CPU s: the\nsame of all threads; compile: the step's programs, as "

@@ -1,18 +1,20 @@
 """The folder of an ablation: one pair of files for every finished arm and seed."""
 
 import contextlib
-import fcntl
 import json
 import math
 import pathlib
+import zipfile
+import zlib
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
+import filelock
 import numpy as np
 
 from experiments.ablate.measures import MEASURES
 from nerfies_jax.capture.json_files import replaced_file, write_json
-from nerfies_jax.training import checkpoint
+from nerfies_jax.training.provenance import provenance
 
 
 class Kept(NamedTuple):
@@ -34,7 +36,7 @@ def write(path: pathlib.Path, identity: dict[str, Any], kept: Kept) -> None:
             "identity": identity,
             "numbers": numbers,
             "notes": kept.notes,
-            "made by": checkpoint.provenance(),
+            "made by": provenance(),
         },
     )
 
@@ -53,7 +55,15 @@ def read(path: pathlib.Path, identity: dict[str, Any]) -> Kept | None:
         with np.load(path.with_suffix(".npz"), allow_pickle=False) as file:
             arrays = dict(file)
         made_with, notes = stored["identity"], stored["notes"]
-    except (KeyError, TypeError, ValueError, OSError) as error:
+    except (
+        KeyError,
+        TypeError,
+        ValueError,
+        OSError,
+        EOFError,
+        zipfile.BadZipFile,
+        zlib.error,
+    ) as error:
         raise ValueError(
             f"{path}: not a finished arm ({error}); remove it to run it again"
         ) from error
@@ -84,14 +94,16 @@ def claimed(path: pathlib.Path) -> Iterator[bool]:
 
     The claim ends with the block, or with the process, however that ends.
     """
-    lock = path.with_name(f".{path.stem}.lock")
-    with lock.open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            yield False
-            return
-        try:
-            yield True
-        finally:
-            lock.unlink(missing_ok=True)
+    name = path.with_name(f".{path.stem}.lock")
+    lock = filelock.FileLock(name)
+    try:
+        lock.acquire(blocking=False)
+    except filelock.Timeout:
+        yield False
+        return
+    try:
+        yield True
+    finally:
+        with contextlib.suppress(OSError):  # Windows removes no file that is open
+            name.unlink()
+        lock.release()

@@ -43,7 +43,7 @@ class Ablate:
     tracks: int = 200
     """Points to follow, at most."""
     set: tuple[str, ...] = ()
-    """Fields that are changed in every arm, as density.most=5000 template.depth=4."""
+    """Fields changed in every arm, as densification.cap_max=5000 template.depth=4."""
     device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
     """Where to compute."""
 

@@ -70,16 +70,16 @@ class AccuracyTime:
 
 def main(arguments=None):
     """Run the job of the command line; exit code 2 where its input is wrong."""
-    from experiments.accuracy_time import report
-    from nerfies_jax.measure import baselines
-
     with cli.user_errors():
         asked = cli.parse(AccuracyTime, arguments)
+        from nerfies_jax.measure import baselines
+
         before = None
         if asked.check is not None:
             before = baselines.read(asked.check, "accuracy_time.json")
         job = _job(asked)
     from experiments.ablate import pool
+    from experiments.accuracy_time import report
 
     failed = pool.run(job)
     (budget,) = job.budgets
@@ -100,7 +100,7 @@ def main(arguments=None):
 def _job(asked):
     """The runs as an ablation of the suite "settings", each in its own process."""
     folder = asked.source.capture
-    source = asked.source.scene if folder is None else folder.name
+    source = cli.plain(asked.source).scene if folder is None else folder.name
     out = asked.out or pathlib.Path("runs", f"accuracy_time-{source}")
     ablation = ablate.Ablate(
         suite="settings",

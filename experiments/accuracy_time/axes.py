@@ -73,10 +73,10 @@ AXES = {
         "how many Gaussians, and whether they grow",
         SPLATS,
         **{
-            "most-4000": "start.points=1500 start.random=2000 start.beside=500 "
-            "density.most=4000",
-            "most-20000": "density.most=20000",
-            "no-growth": "density=none",
+            "most-4000": "init.points=1500 init.random=2000 init.extra_random=500 "
+            "densification.cap_max=4000",
+            "most-20000": "densification.cap_max=20000",
+            "no-growth": "densification=none",
         },
     ),
     "harmonics": _axis(
@@ -94,9 +94,9 @@ AXES = {
         SPLATS,
         **{
             "tile-16": "raster.tile=16",
-            "cut-0.01": "raster.alpha_cut=0.01",
-            "cut-0.001": "raster.alpha_cut=0.001",
-            "stop-1e-2": "raster.stop=0.01",
+            "cut-0.01": "raster.alpha_threshold=0.01",
+            "cut-0.001": "raster.alpha_threshold=0.001",
+            "stop-1e-2": "raster.transmittance_threshold=0.01",
             "antialiased": "raster.antialiased=true",
         },
     ),

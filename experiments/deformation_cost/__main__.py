@@ -17,6 +17,7 @@ are the compiler's count of one pose.
 import dataclasses
 import functools
 import pathlib
+from typing import Annotated
 
 from experiments import cli
 from nerfies_jax.runs import platform
@@ -39,7 +40,7 @@ class DeformationCost:
     """Share of them that stands still where that is made use of."""
     knots: tuple[int, ...] = (4, 8, 16, 32, 64)
     """Knots of the tables."""
-    still_below: float = 0.0
+    static_threshold: Annotated[float, cli.formerly("--still-below")] = 0.0
     """Gaussians that move less, in scene units, are not in the tables."""
     repeats: int = 7
     """Rounds of timing."""
@@ -56,8 +57,10 @@ class DeformationCost:
             raise ValueError(f"--still {self.still} is a share in [0, 1)")
         if not self.knots or min(self.knots) < 2:
             raise ValueError(f"--knots {self.knots}: a table has at least 2")
-        if not self.still_below >= 0:
-            raise ValueError(f"--still-below {self.still_below} cannot be negative")
+        if not self.static_threshold >= 0:
+            raise ValueError(
+                f"--static-threshold {self.static_threshold} cannot be negative"
+            )
 
 
 def main(arguments=None):
@@ -68,7 +71,9 @@ def main(arguments=None):
         from experiments.deformation_cost import knot_curve
 
         motion = _motion(asked)
-        curve = knot_curve.curve(motion, asked.knots, asked.still_below, asked.repeats)
+        curve = knot_curve.curve(
+            motion, asked.knots, asked.static_threshold, asked.repeats
+        )
     rows = costs(asked.gaussians, asked.still, asked.repeats)
     print(text(rows, asked.gaussians))
     for line in spared():

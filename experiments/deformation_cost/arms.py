@@ -8,13 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gaussians_jax import splats, still_rows, time_knots
+from gaussians_jax import splats, static_rows, time_knots
 from gaussians_jax.effects import deformation, kan_motion, mlp_motion, motion_basis
-from gaussians_jax.effects.effect import Effect
 from gaussians_jax.effects.kan_motion import SMALL_KAN_MOTION, KanMotionSpec
 from gaussians_jax.effects.mlp_motion import SMALL_MOTION, MotionSpec
 from gaussians_jax.effects.motion_basis import SMALL_BASIS_MOTION, BasisMotionSpec
 from gaussians_jax.splats import Params
+from nerfies_jax.training.effects import Effect
 
 UNROLLED = 4  # kernels that a KAN's loop sums in one turn
 FRAMES = 100  # of the capture whose motion it would be
@@ -107,8 +107,8 @@ def with_effect(params: Params, effect: Effect) -> Params:
     rows, nets = dict(params.rows), dict(params.nets)
     if effect.init_rows is not None:
         rows[effect.name] = effect.init_rows(rows_key, params.rows["splats"])
-    if effect.init_nets is not None:
-        nets[effect.name] = effect.init_nets(nets_key)
+    if effect.init is not None:
+        nets[effect.name] = effect.init(nets_key)
     return Params(rows, nets)
 
 
@@ -132,7 +132,7 @@ def _ways(network, spec, count, still):
         def rows(params, time):
             return deformation.pose(effects, params, ready, time)
 
-        return still_rows.pose(parts, rows, time)
+        return static_rows.pose(parts, rows, time)
 
     prepare = jax.jit(lambda params: deformation.prepare(effects, params))
     ready = prepare(params)
@@ -143,18 +143,18 @@ def _ways(network, spec, count, still):
     if network.paper:
         parts = _split(params, still)
         name = f"{kept}, {100 * still:g} % still"
-        ways[name] = Way(pose_moving, (parts, prepare(parts.moving), time))
+        ways[name] = Way(pose_moving, (parts, prepare(parts.dynamic), time))
     return ways
 
 
 def _split(params, still):
-    """As `still_rows.split` would leave it, of any rows."""
+    """As `static_rows.split` would leave it, of any rows."""
     count = len(params.rows["splats"].mean)
     moves = np.random.default_rng(1).permutation(count) >= round(still * count)
     rows = jnp.asarray(np.flatnonzero(moves), jnp.int32)
-    return still_rows.Split(
+    return static_rows.StaticDynamicSplit(
         splats.activate(params.rows["splats"]),
-        still_rows.where(moves),
+        static_rows.row_index(moves),
         splats.take_rows(params, rows),
     )
 

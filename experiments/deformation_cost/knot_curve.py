@@ -45,7 +45,7 @@ class Curve(NamedTuple):
 
 
 def curve(
-    motion: Moving, knots: Sequence[int], still_below: float, repeats: int
+    motion: Moving, knots: Sequence[int], static_threshold: float, repeats: int
 ) -> Curve:
     """Tables of so many knots, linear and cubic, against the motion itself."""
     times = jnp.linspace(0, 1, INSTANTS)
@@ -53,7 +53,7 @@ def curve(
     drawn = np.linspace(1, INSTANTS - 2, DRAWN).round().astype(int)
     truth = [motion.draw(exact[k], times[k]) for k in drawn]
     tables = {
-        (way, count): time_knots.bake(motion.pose, count, still_below)
+        (way, count): time_knots.bake(motion.pose, count, static_threshold)
         for way, fewest in time_knots.FEWEST.items()
         for count in knots
         if count >= fewest
@@ -65,18 +65,18 @@ def curve(
         for (way, count), table in tables.items()
     }
     timing = clock.compare(calls, repeats=repeats)
-    paths = np.stack([pose.mean for pose in exact])[:, motion.alive]
+    paths = np.stack([pose.mean for pose in exact])[:, motion.active]
     ways = np.linalg.norm(paths - paths[INSTANTS // 2], axis=-1)
     size = float(ways.max())
     if not size > 0:
         raise ValueError(
             f"{motion.name}: nothing moves, so there is nothing to compare"
         )
-    moved = ways.max(axis=0) > still_below
+    moved = ways.max(axis=0) > static_threshold
     points = []
     for (way, count), table in tables.items():
         posed = [_at(table, time, way) for time in times]
-        found = np.stack([pose.mean for pose in posed])[:, motion.alive]
+        found = np.stack([pose.mean for pose in posed])[:, motion.active]
         errors = np.linalg.norm(found - paths, axis=-1)[:, moved] / size
         pictures = [motion.draw(posed[k], times[k]) for k in drawn]
         squares = [np.square(a - b) for a, b in zip(pictures, truth, strict=True)]
@@ -95,7 +95,7 @@ def curve(
     network = timing["network"]
     return Curve(
         motion.name,
-        int(motion.alive.sum()),
+        int(motion.active.sum()),
         int(moved.sum()),
         size,
         1e3 * network.median,

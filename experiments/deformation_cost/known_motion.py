@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from gaussians_jax import scene, splats
 from gaussians_jax.effects import mlp_motion
 from gaussians_jax.effects.mlp_motion import Motion, MotionSpec
-from gaussians_jax.spec import Facts, SplatScene
+from gaussians_jax.spec import SceneMetadata, SplatScene
 from gaussians_jax.splats import Params, Splats
 from nerfies_jax import evaluation
 from nerfies_jax.capture.capture import Capture
@@ -30,7 +30,7 @@ class Moving(NamedTuple):
     name: str
     pose: Callable  # time -> Gaussians, compiled
     draw: Callable  # (Gaussians, time) -> colour, compiled
-    alive: np.ndarray  # [gaussians] bool
+    active: np.ndarray  # [gaussians] bool
 
 
 class Change(NamedTuple):
@@ -69,7 +69,7 @@ def of_model(
         name,
         lambda time: pose(params, prepared, time),
         lambda posed, time: draw(params, posed, view._replace(time=time), state.step),
-        np.asarray(splats.alive(params.rows["splats"])),
+        np.asarray(splats.active_mask(params.rows["splats"])),
     )
 
 
@@ -80,14 +80,16 @@ def fitted(count: int, spec: MotionSpec, steps: int) -> Moving:
     fitted, because one that was never trained does not move.
     """
     spec = dataclasses.replace(spec, smoothing=None, warm_up=0)
-    whole = SplatScene(steps=1, sh_degree=0, density=None, motion=spec)
-    model = scene.build(whole, Facts(extent=1.0, background=(0.1, 0.1, 0.1), frames=2))
+    whole = SplatScene(steps=1, sh_degree=0, densification=None, motion=spec)
+    model = scene.build(
+        whole, SceneMetadata(extent=1.0, background=(0.1, 0.1, 0.1), frames=2)
+    )
     params = Params(
         {"splats": ball_and_wall(count)}, {mlp_motion.NAME: fit(spec, steps)}
     )
     camera = cameras.look_at((0.5, -0.5, -2.2), (0, 0, 0.2), (0, -1, 0), 150.0, SIZE)
     zero = jnp.zeros((), jnp.int32)
-    view = View(jax.tree.map(jnp.asarray, camera), jnp.zeros(()), zero, zero)
+    view = View(jax.tree.map(jnp.asarray, camera), jnp.zeros(()), zero)
     state = TrainState(params, (), (), zero, None)
     return of_model("a motion in closed form", model, state, view, SIZE)
 

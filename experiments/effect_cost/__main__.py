@@ -116,7 +116,7 @@ def main(arguments=None):
 
         # Compiling is one of the prices; JAX asks once, when it first compiles.
         jax.config.update("jax_enable_compilation_cache", False)
-        from experiments.effect_cost import report as report
+        from experiments.effect_cost import report
         from nerfies_jax.measure import baselines
 
         before = None
@@ -143,11 +143,11 @@ def _spec(name, asked):
     spec = representations.of_preset(name).presets[name]
     if asked.rays is not None and hasattr(spec, "rays"):
         spec = dataclasses.replace(spec, rays=asked.rays)
-    if asked.rows is not None and hasattr(spec, "start"):
-        start = dataclasses.replace(spec.start, source="random", random=asked.rows)
-        most = max(spec.density.most or asked.rows, asked.rows)
-        density = dataclasses.replace(spec.density, most=most)
-        spec = dataclasses.replace(spec, start=start, density=density)
+    if asked.rows is not None and hasattr(spec, "init"):
+        init = dataclasses.replace(spec.init, source="random", random=asked.rows)
+        most = max(spec.densification.cap_max or asked.rows, asked.rows)
+        densification = dataclasses.replace(spec.densification, cap_max=most)
+        spec = dataclasses.replace(spec, init=init, densification=densification)
     return spec
 
 
@@ -240,11 +240,11 @@ def _compile(representation, capture, spec, at):
     from nerfies_jax import evaluation
     from nerfies_jax.measure import clock, matrix_flops
 
-    facts = representation.facts_of(capture, spec)
+    facts = representation.metadata_of(capture, spec)
     model = representation.build(spec, facts)
     state = model.init(capture, jax.random.key(0))
     state = state._replace(step=jnp.asarray(round(at * spec.steps), jnp.int32))
-    frames = evaluation.frames_of(capture, model.wants)
+    frames = evaluation.frames_of(capture, model.required_data)
 
     def loss(state, frames):
         # The compiler drops the slopes and the update, which nothing reads.

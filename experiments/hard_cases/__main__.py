@@ -30,11 +30,11 @@ from experiments.hard_cases import (
     losses,
     networks,
     quaternions,
+    report,
     rotations,
     splats,
     volume,
 )
-from experiments.hard_cases import report as report
 from experiments.hard_cases.case import ORDERS, Case
 from nerfies_jax.measure import clock
 from nerfies_jax.runs import platform, run_folder

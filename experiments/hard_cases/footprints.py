@@ -68,7 +68,7 @@ def _gaussian(x):
 
 
 def _gaussian_textbook(x):
-    (a, b), (_, c) = _covariance(x) + GSPLAT.dilation_px2 * jnp.eye(2, dtype=x.dtype)
+    (a, b), (_, c) = _covariance(x) + GSPLAT.eps2d * jnp.eye(2, dtype=x.dtype)
     dx, dy = x[7], x[8]
     form = (c * dx**2 - 2 * b * dx * dy + a * dy**2) / (a * c - b**2)
     return jnp.exp(-form / 2)[None]
@@ -76,7 +76,7 @@ def _gaussian_textbook(x):
 
 def _exact_gaussian(x):
     a, b, c = _exact_covariance(x)
-    a, c = (v + mpmath.mpf(GSPLAT.dilation_px2) for v in (a, c))
+    a, c = (v + mpmath.mpf(GSPLAT.eps2d) for v in (a, c))
     dx, dy = x[7:]
     form = (c * dx**2 - 2 * b * dx * dy + a * dy**2) / (a * c - b**2)
     return [mpmath.exp(-form / 2)]
@@ -116,14 +116,14 @@ NEEDLE = Case(
 
 def _antialiased_textbook(x):
     flat = _covariance(x)
-    dilated = flat + SHARP.dilation_px2 * jnp.eye(2, dtype=x.dtype)
+    dilated = flat + SHARP.eps2d * jnp.eye(2, dtype=x.dtype)
     ratio = jnp.linalg.det(flat) / jnp.linalg.det(dilated)
     return 0.5 * jnp.sqrt(jnp.maximum(ratio, projection.MIN_COMPENSATION_SQ))[None]
 
 
 def _exact_antialiased(x):
     a, b, c = _exact_covariance(x)
-    wide = mpmath.mpf(SHARP.dilation_px2)
+    wide = mpmath.mpf(SHARP.eps2d)
     ratio = (a * c - b**2) / ((a + wide) * (c + wide) - b**2)
     return [mpmath.sqrt(ratio) / 2]
 

@@ -69,7 +69,8 @@ def _exact_charbonnier(r):
 CHARBONNIER = Case(
     name="Charbonnier of a vector",
     breaks="√(s + c²) - c is 0 below s = 1e-7 c², and its digits go before",
-    formula="s / (√(s + c²) + c)",
+    formula="s / (√(s + c²) + c), from s = 8 c² on √(s + c²) - c",
+    switch="s = 8 c²",
     **_along([0, 1e-15, 1e-9, 1e-6, 1e-3, WIDTH, 1, 1e3, 1e6, 1e15]),
     stable=lambda r: losses.charbonnier(jnp.sum(r**2), WIDTH)[None],
     textbook=_charbonnier_by_difference,

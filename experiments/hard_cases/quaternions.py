@@ -111,19 +111,19 @@ def _entries(w, x, y, z):
 
 def _exact_matrix(q):
     length_sq = sum(c**2 for c in q)
-    if length_sq < mpmath.mpf(10) ** -50:  # what no precision here can normalise
+    if length_sq < mpmath.mpf(10) ** -60:  # zero, and the steps about it
         q, length_sq = [mpmath.mpf(c) for c in (1, 0, 0, 0)], mpmath.mpf(1)
     length = mpmath.sqrt(length_sq)
     return _entries(*(c / length for c in q))
 
 
-_LENGTHS = np.array([0, 1e-18, 1e-15, 1e-10, 1e-3, 1, 1e3, 1e10, 1e15])
+_LENGTHS = np.array([0, 1e-18, 1e-15, 1e-10, 1e-3, 1, 1e3, 1e10, 1e15, 1e30, 2e38])
 LENGTH = Case(
     name="rotation matrix of q of any length",
     breaks="0/0 at 0; |q|³ in the curvature underflows from 1e-13 down",
-    formula="identity where |q|² leaves the range, else normalised twice, first by a "
-    "factor without derivative",
-    switch="|q|² = 4 tiny",
+    formula="scaled by a power of two without derivative, then normalised; identity "
+    "at zero and infinity",
+    switch="largest component 1.2e-38",
     axis="|q|",
     at=_LENGTHS,
     inputs=_LENGTHS[:, None] * _half_turns([2.0]),
@@ -131,6 +131,7 @@ LENGTH = Case(
     textbook=_textbook_matrix,
     exact=_exact_matrix,
     bounds={"float32": (1e-6, 1e-6, 1e-6), "float64": (2e-15, 2e-15, 2e-15)},
+    floors=(0, 1e-31, 1e-37),  # 1 / 2e38 and 1 / 1e60 are zero in float32
     caught=(("float32", "value"), ("float32", "curvature"), ("float64", "slope")),
     timed=_half_turns([2.0])[0],
 )

@@ -9,14 +9,16 @@ import mpmath
 import numpy as np
 
 from experiments.hard_cases.case import Case, constant
-from gaussians_jax import density, raster, relocation, splats
+from gaussians_jax import densification, mcmc, raster, splats
 from gaussians_jax.effects import acceleration
 from gaussians_jax.projection import Footprints
 from gaussians_jax.raster_spec import GSPLAT
 from gaussians_jax.splats import Splats
 
 NEAR = 1e-6  # how close to a switch its two sides are tried, as a share of it
-OPEN = dataclasses.replace(GSPLAT, stop=0.0, tile=4, batch=1, chunk=1)
+OPEN = dataclasses.replace(
+    GSPLAT, transmittance_threshold=0.0, tile=4, batch=1, chunk=1
+)
 COUNT = 300
 _VALUES = np.cos(np.arange(COUNT) * 0.7)
 
@@ -69,13 +71,15 @@ _composite_dividing.defvjp(_dividing_forward, _dividing_backward)
 
 def _pixel_textbook(x):
     alpha = jnp.concatenate([x[:1], constant(np.full(COUNT - 1, 1), x.dtype) * x[1]])
-    alpha = jnp.where(alpha < OPEN.alpha_cut, 0, jnp.minimum(alpha, OPEN.alpha_max))
+    alpha = jnp.where(
+        alpha < OPEN.alpha_threshold, 0, jnp.minimum(alpha, OPEN.alpha_max)
+    )
     return _composite_dividing(alpha, constant(_VALUES, x.dtype))[None]
 
 
 def _exact_pixel(x):
     def seen(alpha):
-        if alpha < mpmath.mpf(OPEN.alpha_cut):
+        if alpha < mpmath.mpf(OPEN.alpha_threshold):
             return mpmath.mpf(0)
         return min(alpha, mpmath.mpf(OPEN.alpha_max))
 
@@ -87,7 +91,7 @@ def _exact_pixel(x):
     return [total]
 
 
-_CUT = OPEN.alpha_cut
+_CUT = OPEN.alpha_threshold
 _MOST = OPEN.alpha_max
 _SEEN = [_CUT * (1 - NEAR), _CUT * (1 + 1e-4), 0.01, 0.1, 0.5, 0.9]
 _ALPHAS = np.array([*_SEEN, _MOST * (1 - NEAR), _MOST * (1 + NEAR), 1.0])
@@ -109,7 +113,7 @@ LONG_LIST = Case(
 )
 
 
-_SWITCH = density.FAINT_LOGIT
+_SWITCH = densification.FAINT_LOGIT
 _BOTH = [_SWITCH * (1 + NEAR), _SWITCH * (1 - NEAR)]
 _LOGITS = np.array(
     [-500.0, -100, -88, -30, *_BOTH, -8, -1, 0, 1, 8, 16, 17, 37, 40, 80, 100]
@@ -134,7 +138,7 @@ HALVED = Case(
     axis="logit",
     at=_LOGITS,
     inputs=_LOGITS[:, None],
-    stable=density.halve_opacity,
+    stable=densification.halve_opacity,
     textbook=_halved_textbook,
     exact=_exact_halved,
     bounds={"float32": (1e-6, 1e-6), "float64": (1e-14, 1e-14)},
@@ -189,7 +193,7 @@ _OPACITIES = np.array([1e-4, 0.01, 0.1, 0.5, 0.9, 0.999, 1 - 1e-6])
 
 
 def _spread(opacity):
-    each, scale = relocation.spread_over(
+    each, scale = mcmc.spread_over(
         opacity,
         constant(np.ones((1, 3)), opacity.dtype),
         constant(np.full(1, COPIES), jnp.int32),

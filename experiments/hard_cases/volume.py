@@ -259,11 +259,14 @@ _DRAWS = [
     (1, _PEAK),
     (1, _UNEVEN),
     (1e30, _UNEVEN),
+    (1.6e38, _PEAK),
+    (1.6e38, _UNEVEN),
 ]
 SAMPLES = Case(
     name="samples where light stops",
     breaks="a floor of 1e-5 on all weights drowns faint ones: 0.4 of the range off",
-    formula="scaled by the largest, floor of a rounding unit, running maximum",
+    formula="scaled by the largest in two steps, floor of a rounding unit, running "
+    "maximum",
     switch="largest weight 1.2e-38, none",
     axis="size of the weights",
     at=np.array([size for size, _ in _DRAWS]),

@@ -63,7 +63,7 @@ def main(arguments=None):
         asked = cli.parse(InspectPays, arguments)
         platform.start_jax("cpu")
         check(asked.presets)
-        from experiments.inspect_pays import report as report
+        from experiments.inspect_pays import report
         from experiments.inspect_pays.job import Trial, read
 
         # All are read before the first is trained: a wrong name ends it at once.

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from experiments import cli, inspect_scene
-from experiments.ablate import __main__ as ablate
 from experiments.ablate import pool
 from experiments.ablate.job import Job, say
+from experiments.ablate.settings import Ablate
 from experiments.inspect_pays import arms
 from nerfies_jax import runs
 from nerfies_jax.capture.capture import Capture
@@ -122,7 +122,7 @@ class Trial:
                 return []
             asked = self.asked
             self._job = Job(
-                ablate.Ablate(
+                Ablate(
                     suite="advice",
                     arms=tuple(names),
                     source=self._source,
@@ -147,7 +147,7 @@ class Trial:
         spec = self._job.spec(name, self.asked.steps)
         representation = representations.of_preset(self._job.suite.arms[name].preset)
         try:
-            facts = representation.facts_of(self._job.capture, spec)
+            facts = representation.metadata_of(self._job.capture, spec)
             representation.build(spec, facts)
         except ValueError as error:
             return name, str(error)

@@ -27,7 +27,7 @@ import numpy as np
 import optax
 
 from experiments import cli
-from experiments.motion_rank import report as report
+from experiments.motion_rank import report
 from experiments.motion_rank import tracks as motion_tracks
 from gaussians_jax.effects import motion_basis
 from gaussians_jax.effects.motion_basis import SMALL_BASIS_MOTION, BasisMotionSpec

@@ -123,7 +123,7 @@ def footprints_of(scene: dict) -> Footprints:
     a, b, c = scene["covs"].astype(np.float64).T
     opacity = scene["opacities"].astype(np.float64)
     whitening = [np.sqrt(0.5 / a), b / a, np.sqrt(0.5 / (c - b * b / a))]
-    reach = 2 * np.log(np.maximum(opacity / SPEC.alpha_cut, 1))
+    reach = 2 * np.log(np.maximum(opacity / SPEC.alpha_threshold, 1))
     extent = np.sqrt(reach[:, None] * np.stack([a, c], 1))
     fields = (
         scene["means2d"],
@@ -243,12 +243,12 @@ def baseline_times(case, settings) -> dict:
 
 
 def longest_tile(case) -> tuple[int, int]:
-    """Most Gaussians in one tile's box list, and all box pairs (host count)."""
+    """Most Gaussians whose rectangle meets one tile, and all such pairs (host)."""
     grid = raster.Grid(*case.size, SPEC.tile)
-    boxes = raster.binning.tile_boxes(
+    rects = raster.binning.tile_rects(
         case.footprints.mean_px, case.footprints.extent_px, grid
     )
-    left, top, columns, count = (np.asarray(x) for x in boxes)
+    left, top, columns, count = (np.asarray(x) for x in rects)
     per_tile = np.zeros((grid.rows + 1, grid.columns + 1), np.int64)
     rows = count // columns
     np.add.at(per_tile, (top, left), count > 0)

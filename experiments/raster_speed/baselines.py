@@ -27,7 +27,7 @@ def _alphas(footprints, x, y, spec):
     dy = y - footprints.mean_px[..., 1, None]
     exponent = jnp.square(p * dx) + jnp.square(r * (dy - k * dx))
     raw = footprints.opacity[..., None] * jnp.exp(-exponent)
-    return jnp.where(raw >= spec.alpha_cut, jnp.minimum(raw, spec.alpha_max), 0)
+    return jnp.where(raw >= spec.alpha_threshold, jnp.minimum(raw, spec.alpha_max), 0)
 
 
 def dense(
@@ -47,7 +47,7 @@ def dense(
         alpha = _alphas(footprints, pixels[0] + 0.5, pixels[1] + 0.5, spec)
         passed = jnp.cumprod(1 - alpha, axis=0)
         before = jnp.concatenate([jnp.ones_like(passed[:1]), passed[:-1]])
-        drawn = passed > spec.stop
+        drawn = passed > spec.transmittance_threshold
         weight = jnp.where(drawn, alpha * before, 0)
         left = jnp.min(jnp.where(drawn, passed, 1), axis=0)
         return jnp.concatenate([weight.T @ values, left[:, None]], axis=1)
@@ -76,17 +76,17 @@ def lockstep(
     """
     grid = Grid(*size, spec.tile)
     fixed = jax.tree.map(lax.stop_gradient, footprints)
-    boxes = binning.tile_boxes(fixed.mean_px, fixed.extent_px, grid)
-    order = binning.depth_order(fixed.depth, boxes.count)
-    boxes = binning.Boxes(*(x[order] for x in boxes))
-    log_opacity = jnp.log(jnp.where(boxes.count > 0, fixed.opacity[order], 1))
+    rects = binning.tile_rects(fixed.mean_px, fixed.extent_px, grid)
+    order = binning.depth_order(fixed.depth, rects.count)
+    rects = binning.TileRects(*(x[order] for x in rects))
+    log_opacity = jnp.log(jnp.where(rects.count > 0, fixed.opacity[order], 1))
     table = [fixed.mean_px[order], fixed.whitening[order], log_opacity[:, None]]
-    slab, _ = binning.next_slab(
+    isects, _ = binning.next_intersections(
         Cursor(jnp.int32(0), jnp.int32(0)),
-        boxes,
+        rects,
         jnp.concatenate(table, axis=1),
         jnp.ones(grid.tiles, bool),
-        math.log(spec.alpha_cut),
+        math.log(spec.alpha_threshold),
         grid,
         pairs,
     )
@@ -98,12 +98,12 @@ def lockstep(
 
     def step(state, number):
         transmittance, channels = state
-        slot = slab.starts + number
-        row = order[slab.ranks.at[slot].get(mode="clip")]
+        slot = isects.starts + number
+        row = order[isects.ranks.at[slot].get(mode="clip")]
         here = jax.tree.map(lambda leaf: leaf[row], footprints)
-        alpha = jnp.where((slot < slab.ends)[:, None], _alphas(here, x, y, spec), 0)
+        alpha = jnp.where((slot < isects.ends)[:, None], _alphas(here, x, y, spec), 0)
         passed = transmittance * (1 - alpha)
-        drawn = passed > spec.stop
+        drawn = passed > spec.transmittance_threshold
         weight = jnp.where(drawn, transmittance * alpha, 0)
         channels = channels + weight[:, None] * values[row][..., None]
         return (jnp.where(drawn, passed, -jnp.abs(transmittance)), channels), None

@@ -36,7 +36,7 @@ import numpy as np
 import optax
 
 from experiments import cli
-from experiments.spectral_bias import report as report
+from experiments.spectral_bias import report
 from nerfies_jax.nets import encoding, kan, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.kan import KANSpec

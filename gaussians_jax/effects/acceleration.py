@@ -15,7 +15,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from gaussians_jax import splats
-from gaussians_jax.effects.effect import Around, Effect, Term
+from nerfies_jax.training.effects import Effect, PenaltyContext, Term
+from nerfies_jax.training.step_counts import steps
 
 NAME = "acceleration"
 _STREAM = zlib.crc32(NAME.encode()) >> 1  # of the step's key, for the choice of rows
@@ -37,7 +38,7 @@ class AccelerationSpec:
     drift: float = 1.0
     interval: float = 1.0  # between the times compared, in frames
     samples: int = 1024  # Gaussians drawn in a step
-    start: int = 0  # steps before which it is not evaluated
+    start: int = steps(0)  # steps before which it is not evaluated
 
     def __post_init__(self):
         for name in ("weight", "drift"):
@@ -94,14 +95,14 @@ def _stillness(canonical, now, decay):
     return jnp.exp(-jnp.sqrt(jnp.sum(jnp.square(moved), axis=-1)))
 
 
-def draw_living(
-    key: Key[Array, ""], alive: Bool[Array, " gaussians"], count: int
+def draw_active(
+    key: Key[Array, ""], active: Bool[Array, " gaussians"], count: int
 ) -> Int[Array, " count"]:
-    """Rows drawn evenly from those `alive`, with replacement; any, if none are."""
-    rank = jnp.cumsum(alive)
+    """Rows drawn evenly from those `active`, with replacement; any, if none are."""
+    rank = jnp.cumsum(active)
     drawn = jax.random.randint(key, (count,), 1, jnp.maximum(rank[-1], 1) + 1)
     rows = jnp.searchsorted(rank, drawn.astype(rank.dtype))
-    return jnp.minimum(rows, alive.shape[0] - 1)
+    return jnp.minimum(rows, active.shape[0] - 1)
 
 
 def effect(spec: AccelerationSpec, extent: float, frames: int) -> Effect:
@@ -119,20 +120,20 @@ def effect(spec: AccelerationSpec, extent: float, frames: int) -> Effect:
     interval = spec.interval / (frames - 1)
     decay = spec.decay * extent
 
-    def penalty(around: Around) -> Term:
-        params, moment = around.params, around.moment
-        alive = splats.alive(params.rows["splats"])
-        key = jax.random.fold_in(moment.key, _STREAM)
-        rows = draw_living(key, alive, min(spec.samples, alive.shape[0]))
+    def penalty(_, context: PenaltyContext) -> dict[str, Term]:
+        params, condition = context.params, context.condition
+        active = splats.active_mask(params.rows["splats"])
+        key = jax.random.fold_in(condition.key, _STREAM)
+        rows = draw_active(key, active, min(spec.samples, active.shape[0]))
 
         def evaluate(params):
             some = splats.take_rows(params, rows)
             canonical = some.rows["splats"].mean
-            times = instants(moment.time, interval)
-            before, now, after = (around.at_time(some, t).mean for t in times)
+            times = instants(condition.time, interval)
+            before, now, after = (context.at_time(some, t).mean for t in times)
             value = unrest(canonical, before, now, after, decay, spec.drift)
             still = jnp.mean(_stillness(canonical, now, decay))
-            there = jnp.any(alive)
+            there = jnp.any(active)
             return jnp.where(there, value, 0), jnp.where(there, still, 0)
 
         def nothing(params):
@@ -143,8 +144,8 @@ def effect(spec: AccelerationSpec, extent: float, frames: int) -> Effect:
             value, still = evaluate(params)
         else:
             value, still = jax.lax.cond(
-                moment.step < spec.start, nothing, evaluate, params
+                condition.step < spec.start, nothing, evaluate, params
             )
-        return Term(spec.weight * value, {"unrest": value, "still": still})
+        return {"unrest": Term(value, spec.weight), "still": Term(still, None)}
 
     return Effect(name=NAME, penalty=penalty)

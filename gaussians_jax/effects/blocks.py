@@ -14,18 +14,18 @@ PyTree = Any
 def in_blocks(
     evaluate: Callable[..., PyTree],
     rows: tuple[PyTree, ...],
-    alive: Bool[Array, " gaussians"] | None,
+    active: Bool[Array, " gaussians"] | None,
     block: int,
 ) -> PyTree:
     """`evaluate(*rows)` with the memory that `block` rows need.
 
     `evaluate` takes and returns pytrees whose leaves have the Gaussians first. A block
-    in which no row is alive is not evaluated, so compacted rows do not pay for the
-    capacity behind them; what it would have returned is zero. None: all are alive.
+    in which no row is active is not evaluated, so compacted rows do not pay for the
+    capacity behind them; what it would have returned is zero. None: all are active.
     """
     count = jax.tree.leaves(rows)[0].shape[0]
-    if alive is None:
-        alive = jnp.ones(count, bool)
+    if active is None:
+        active = jnp.ones(count, bool)
     block = max(1, min(block, count))
     blocks = -(-count // block)
 
@@ -45,7 +45,7 @@ def in_blocks(
     def one_block(rows, is_used):
         return jax.lax.cond(is_used, evaluate, still, *rows)
 
-    pieces = jax.tree.map(cut, rows), cut(alive).any(axis=1)
+    pieces = jax.tree.map(cut, rows), cut(active).any(axis=1)
     outputs = jax.lax.map(lambda piece: one_block(*piece), pieces)
     return jax.tree.map(
         lambda leaf: leaf.reshape(blocks * block, *leaf.shape[2:])[:count], outputs

@@ -1,14 +1,16 @@
 """The motion of a scene: every effect that deforms, one after the other."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 from jaxtyping import Array, Float
 
 from gaussians_jax import splats
-from gaussians_jax.effects.effect import Effect, Moment, PyTree
 from gaussians_jax.splats import Gaussians, Params
+from nerfies_jax.training.effects import Effect, FrameCondition
 
+PyTree = Any
 Effects = tuple[Effect, ...]
 
 
@@ -35,12 +37,12 @@ def pose(
     for effect in effects:
         if effect.deform is not None:
             ready = prepared.get(effect.name)
-            gaussians = effect.deform(params, gaussians, Moment(time), ready)
+            gaussians = effect.deform(params, gaussians, FrameCondition(time), ready)
     return gaussians
 
 
 def pose_in_training(
-    effects: Effects, params: Params, gaussians: Gaussians, moment: Moment
+    effects: Effects, params: Params, gaussians: Gaussians, condition: FrameCondition
 ) -> Gaussians:
     """`gaussians` as they are at a moment of training.
 
@@ -53,13 +55,13 @@ def pose_in_training(
 
         def moved(params, gaussians, effect=effect):
             ready = None if effect.prepare is None else effect.prepare(params)
-            return effect.deform(params, gaussians, moment, ready)
+            return effect.deform(params, gaussians, condition, ready)
 
         if not effect.warm_up:
             gaussians = moved(params, gaussians)
             continue
         gaussians = jax.lax.cond(
-            moment.step < effect.warm_up,
+            condition.step < effect.warm_up,
             lambda params, gaussians: gaussians,
             moved,
             params,
@@ -69,13 +71,13 @@ def pose_in_training(
 
 
 def poser(
-    effects: Effects, moment: Moment
+    effects: Effects, condition: FrameCondition
 ) -> Callable[[Params, Float[Array, ""]], Gaussians]:
-    """A function of rows and of a time near `moment`, for `effect.Around`."""
+    """A function of rows and of a time near `condition`, for `PenaltyContext`."""
 
     def at_time(params, time):
         gaussians = splats.activate(params.rows["splats"])
-        then = moment._replace(time=time)
+        then = condition._replace(time=time)
         return pose_in_training(effects, params, gaussians, then)
 
     return at_time

@@ -12,10 +12,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from gaussians_jax.effects.effect import Effect, Moment, Shot, Term
-from gaussians_jax.splats import Params
 from nerfies_jax.geometry.precision import widened
 from nerfies_jax.training import losses
+from nerfies_jax.training.effects import Effect, Observation, PenaltyContext, Term
 
 NAME = "depth"
 KINDS = ("correlation", "affine", "metric")
@@ -162,22 +161,22 @@ def nth_smallest(
 FORMS = {"affine": affine, "correlation": correlation, "metric": metric}
 
 
-def loss(spec: DepthSpec, shot: Shot) -> Term:
-    """The weighted difference of drawn and filmed depth, with what it is made of.
+def terms(spec: DepthSpec, observation: Observation) -> dict[str, Term]:
+    """The difference of drawn and filmed depth, and the share of pixels compared.
 
     Pixels count that are filmed, whose depth is known (positive and finite) and that
     the drawing covers with at least `opaque`: elsewhere an expected depth is that of a
-    haze. Without any depth the term is zero and has no operations.
+    haze. Without any depth there are no terms and no operations.
     """
-    truth = shot.depth
+    truth, rendering = observation.depth, observation.rendering
     if truth is None:
-        return Term(jnp.zeros((), shot.truth.dtype), {})
+        return {}
     # Depths are often kept in half precision, which neither counts nor centres them.
-    truth, drawn = widened(truth), widened(shot.rendering.depth)
+    truth, drawn = widened(truth), widened(rendering.depth)
     known = (truth > 0) & jnp.isfinite(truth) & (drawn > 0) & jnp.isfinite(drawn)
-    known = known & (shot.rendering.alpha >= spec.opaque)
-    if shot.valid is not None:
-        known = known & shot.valid
+    known = known & (rendering.alpha >= spec.opaque)
+    if observation.valid is not None:
+        known = known & observation.valid
     # Selected before anything is computed of them: unknown pixels may hold NaN.
     drawn, truth = (jnp.where(known, x, 1).reshape(-1) for x in (drawn, truth))
     if spec.space == "disparity":
@@ -185,14 +184,13 @@ def loss(spec: DepthSpec, shot: Shot) -> Term:
     known = known.reshape(-1)
     error = FORMS[spec.kind](drawn, truth, known)
     share = jnp.mean(known.astype(error.dtype))
-    return Term(spec.weight * error, {"error": error, "known": share})
+    return {"error": Term(error, spec.weight), "known": Term(share, None)}
 
 
 def effect(spec: DepthSpec) -> Effect:
     """The seams of the depth loss; it reads the capture's depths."""
 
-    def image_loss(params: Params, shot: Shot, moment: Moment) -> Term:
-        del params, moment
-        return loss(spec, shot)
+    def penalty(_, context: PenaltyContext) -> dict[str, Term]:
+        return terms(spec, context.observation)
 
-    return Effect(name=NAME, image_loss=image_loss, wants=frozenset({"depths"}))
+    return Effect(name=NAME, penalty=penalty, required_data=frozenset({"depths"}))

@@ -20,13 +20,14 @@ from jaxtyping import Array, Bool, Float, Key
 
 from gaussians_jax import splats
 from gaussians_jax.effects.blocks import in_blocks
-from gaussians_jax.effects.effect import Effect, Moment
 from gaussians_jax.splats import Gaussians, Params
 from nerfies_jax.geometry import quaternion
 from nerfies_jax.nets import codes, kan, mlp
 from nerfies_jax.nets.kan import KAN, KANSpec
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
+from nerfies_jax.training.effects import Effect, FrameCondition
+from nerfies_jax.training.step_counts import steps
 
 NAME = "kan_motion"
 NETWORKS = ("kan", "mlp")
@@ -61,7 +62,7 @@ class KanMotionSpec:
     position: bool = True
     scale: bool = True
     rotation: bool = True
-    warm_up: int = 0  # steps without motion
+    warm_up: int = steps(0)  # steps without motion
     embedding_rate: float = 2.5e-3
     rate: float = 1.6e-4  # of network and time codes
     rate_end: float = 1.6e-5
@@ -243,19 +244,19 @@ def prepare(
     params: KanMotion,
     spec: KanMotionSpec,
     embedding: Float[Array, "gaussians embedding"],
-    alive: Bool[Array, " gaussians"] | None = None,
+    active: Bool[Array, " gaussians"] | None = None,
 ) -> Float[Array, "gaussians features"]:
     """What the embeddings add to the first layer, whatever the time. Pure.
 
     4 bytes for each feature of the first layer and Gaussian: 5 MB for 10,000 Gaussians
     with the default sizes. Measured on one core at 10,000, posing them takes 68 ms with
     nothing kept and 58 with this, 10 and 7 in the small sizes. Rows of blocks without
-    a living one are zero.
+    an active one are zero.
     """
     return in_blocks(
         lambda rows: _first_layer_part(spec, params.field, rows, 0),
         (embedding,),
-        alive,
+        active,
         spec.block,
     )
 
@@ -265,15 +266,15 @@ def deform(
     spec: KanMotionSpec,
     time: Float[Array, ""],
     prepared: Float[Array, "gaussians features"],
-    alive: Bool[Array, " gaussians"] | None = None,
+    active: Bool[Array, " gaussians"] | None = None,
 ) -> Offsets:
-    """Offsets of every Gaussian at one time; zero in blocks without a living row."""
+    """Offsets of every Gaussian at one time; zero in blocks without an active row."""
     code = codes.at_time(params.times, time)
     share = _first_layer_part(spec, params.field, code, spec.embedding)
     found = in_blocks(
         lambda rows: _after_first_layer(spec, params.field, rows + share),
         (prepared,),
-        alive,
+        active,
         spec.block,
     )
     return Offsets(*(found.get(name) for name in Offsets._fields))
@@ -327,32 +328,32 @@ def effect(spec: KanMotionSpec, steps: int, frames: int) -> Effect:
     def init_rows(key, rows):
         return init_embedding(key, spec, rows.mean)
 
-    def init_nets(key):
+    def init_networks(key):
         return init(key, spec, frames)
 
     def embedding_rate(step):
         return jnp.full((), spec.embedding_rate)
 
     def prepared(params: Params) -> Float[Array, "gaussians features"]:
-        living = splats.alive(params.rows["splats"])
-        return prepare(params.nets[NAME], spec, params.rows[NAME], living)
+        active = splats.active_mask(params.rows["splats"])
+        return prepare(params.nets[NAME], spec, params.rows[NAME], active)
 
     def moved(
         params: Params,
         gaussians: Gaussians,
-        moment: Moment,
+        condition: FrameCondition,
         ready: Float[Array, "gaussians features"],
     ) -> Gaussians:
-        living = splats.alive(params.rows["splats"])
-        offsets = deform(params.nets[NAME], spec, moment.time, ready, living)
+        active = splats.active_mask(params.rows["splats"])
+        offsets = deform(params.nets[NAME], spec, condition.time, ready, active)
         return apply(gaussians, offsets)
 
     return Effect(
         name=NAME,
         init_rows=init_rows,
-        init_nets=init_nets,
-        row_rate=embedding_rate,
-        net_rate=schedules.log_linear(spec.rate, spec.rate_end, steps),
+        init=init_networks,
+        row_learning_rate=embedding_rate,
+        learning_rate=schedules.log_linear(spec.rate, spec.rate_end, steps),
         warm_up=spec.warm_up,
         prepare=prepared,
         deform=moved,

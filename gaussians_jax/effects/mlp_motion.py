@@ -15,12 +15,14 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from gaussians_jax import splats
 from gaussians_jax.effects.blocks import in_blocks
-from gaussians_jax.effects.effect import Effect, Moment
 from gaussians_jax.splats import Gaussians, Params
+from nerfies_jax.geometry import quaternion
 from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
+from nerfies_jax.training.effects import Effect, FrameCondition
+from nerfies_jax.training.step_counts import steps
 
 NAME = "mlp_motion"
 SCALE_RULES = ("log", "linear")
@@ -35,7 +37,7 @@ class SmoothingSpec:
     """
 
     first: float = 0.1
-    steps: int = 20_000
+    steps: int = steps(20_000)
 
     def __post_init__(self):
         if not (self.first >= 0 and self.steps >= 1):
@@ -62,7 +64,7 @@ class MotionSpec:
     width: int = 256
     skips: tuple[int, ...] = (5,)  # layers that read the input again
     scale_rule: str = "log"
-    warm_up: int = 3000  # steps without motion
+    warm_up: int = steps(3000)  # steps without motion
     smoothing: SmoothingSpec | None = SmoothingSpec()
     rate: float = 8e-4
     rate_end: float = 1.6e-6
@@ -148,12 +150,12 @@ def deform(
     spec: MotionSpec,
     mean: Float[Array, "gaussians 3"],
     time: Float[Array, ""],
-    alive: Bool[Array, " gaussians"] | None = None,
+    active: Bool[Array, " gaussians"] | None = None,
 ) -> Offsets:
     """Offsets of every Gaussian at one time.
 
     No gradient reaches the means through the network, as in the paper: they would
-    chase a moving target. Blocks in which no row is `alive` are not evaluated, so
+    chase a moving target. Blocks in which no row is `active` are not evaluated, so
     compacted rows do not pay for the capacity behind them; their offsets are zero.
     """
     at_time = fold_time(params, spec, time)
@@ -162,7 +164,7 @@ def deform(
     return in_blocks(
         lambda points: offsets_at_time(at_time, spec, points),
         (jax.lax.stop_gradient(mean),),
-        alive,
+        active,
         spec.block,
     )
 
@@ -195,11 +197,7 @@ def apply(gaussians: Gaussians, offsets: Offsets, scale_rule: str) -> Gaussians:
     The rotation is q / |q| + offset, which the renderer normalises; a zero quaternion
     counts as the identity.
     """
-    length_sq = jnp.sum(gaussians.quaternion**2, axis=-1, keepdims=True)
-    usable = (length_sq > 4 * jnp.finfo(length_sq.dtype).tiny) & (length_sq < jnp.inf)
-    identity = jnp.asarray([1, 0, 0, 0], gaussians.quaternion.dtype)
-    unit = gaussians.quaternion / jnp.sqrt(jnp.where(usable, length_sq, 1))
-    unit = jnp.where(usable, unit, identity)
+    unit = jax.vmap(quaternion.normalise)(gaussians.quaternion)
     if scale_rule == "log":
         # Bounded like the canonical logarithm, so that a wild field stays finite.
         factor = jnp.exp(jnp.clip(offsets.scale, *splats.LOG_SCALE_RANGE))
@@ -236,23 +234,25 @@ def smooth_time(
 def effect(spec: MotionSpec, steps: int, frames: int) -> Effect:
     """The seams that this motion fills, for a run of `steps` over `frames`."""
 
-    def init_nets(key):
+    def init_networks(key):
         return init(key, spec)
 
-    def moved(params: Params, gaussians: Gaussians, moment: Moment, _) -> Gaussians:
-        time = moment.time
-        if spec.smoothing is not None and moment.step is not None:
-            key = jax.random.fold_in(moment.key, _STREAM)
-            time = smooth_time(key, spec.smoothing, time, moment.step, frames)
-        living = splats.alive(params.rows["splats"])
+    def moved(
+        params: Params, gaussians: Gaussians, condition: FrameCondition, _
+    ) -> Gaussians:
+        time = condition.time
+        if spec.smoothing is not None and condition.step is not None:
+            key = jax.random.fold_in(condition.key, _STREAM)
+            time = smooth_time(key, spec.smoothing, time, condition.step, frames)
+        active = splats.active_mask(params.rows["splats"])
         motion = params.nets[NAME]
-        offsets = deform(motion, spec, gaussians.mean, time, living)
+        offsets = deform(motion, spec, gaussians.mean, time, active)
         return apply(gaussians, offsets, spec.scale_rule)
 
     return Effect(
         name=NAME,
-        init_nets=init_nets,
-        net_rate=schedules.log_linear(spec.rate, spec.rate_end, steps),
+        init=init_networks,
+        learning_rate=schedules.log_linear(spec.rate, spec.rate_end, steps),
         warm_up=spec.warm_up,
         deform=moved,
     )

@@ -18,7 +18,6 @@ from jaxtyping import Array, Bool, Float, Key
 from gaussians_jax import splats
 from gaussians_jax.effects import mlp_motion
 from gaussians_jax.effects.blocks import in_blocks
-from gaussians_jax.effects.effect import Effect, Moment
 from gaussians_jax.effects.mlp_motion import SmoothingSpec
 from gaussians_jax.splats import Gaussians, Params
 from nerfies_jax.geometry import quaternion
@@ -26,6 +25,8 @@ from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
+from nerfies_jax.training.effects import Effect, FrameCondition
+from nerfies_jax.training.step_counts import steps
 
 NAME = "motion_basis"
 BASIS_FORMS = ("bounded", "free")
@@ -61,7 +62,7 @@ class BasisMotionSpec:
     # No gradient to the canonical means through the networks, as in Deformable 3DGS:
     # they would chase a moving target. The paper does not say.
     detach: bool = True
-    warm_up: int = 3000  # steps without motion
+    warm_up: int = steps(3000)  # steps without motion
     smoothing: SmoothingSpec | None = None
     rate: float = 8e-4
     rate_end: float = 1.6e-6
@@ -276,7 +277,7 @@ def prepare(
     params: BasisMotion,
     spec: BasisMotionSpec,
     mean: Float[Array, "gaussians 3"],
-    alive: Bool[Array, " gaussians"] | None = None,
+    active: Bool[Array, " gaussians"] | None = None,
 ) -> Prepared:
     """All that `deform` needs and the time does not change. Pure.
 
@@ -286,7 +287,7 @@ def prepare(
     return in_blocks(
         jax.vmap(lambda point: prepare_point(params, spec, point)),
         (_seen(spec, mean),),
-        alive,
+        active,
         spec.block,
     )
 
@@ -297,9 +298,9 @@ def deform(
     mean: Float[Array, "gaussians 3"],
     time: Float[Array, ""],
     prepared: Prepared,
-    alive: Bool[Array, " gaussians"] | None = None,
+    active: Bool[Array, " gaussians"] | None = None,
 ) -> Offsets:
-    """Offsets of every Gaussian at one time; zero in blocks without a living row.
+    """Offsets of every Gaussian at one time; zero in blocks without an active row.
 
     `mean` is canonical, and what `prepared` was made of.
     """
@@ -307,7 +308,7 @@ def deform(
     return in_blocks(
         jax.vmap(lambda point, row: offsets_at_time(at_time, spec, point, row)),
         (_seen(spec, mean), prepared),
-        alive,
+        active,
         spec.block,
     )
 
@@ -366,32 +367,32 @@ def multiply_adds(spec: BasisMotionSpec) -> dict[str, int]:
 def effect(spec: BasisMotionSpec, steps: int, frames: int) -> Effect:
     """The seams that this motion fills, for a run of `steps` over `frames`."""
 
-    def init_nets(key):
+    def init_networks(key):
         return init(key, spec)
 
     def prepared(params: Params) -> Prepared:
         rows = params.rows["splats"]
-        return prepare(params.nets[NAME], spec, rows.mean, splats.alive(rows))
+        return prepare(params.nets[NAME], spec, rows.mean, splats.active_mask(rows))
 
     def moved(
-        params: Params, gaussians: Gaussians, moment: Moment, ready: Prepared
+        params: Params, gaussians: Gaussians, condition: FrameCondition, ready: Prepared
     ) -> Gaussians:
-        time = moment.time
-        if spec.smoothing is not None and moment.step is not None:
-            key = jax.random.fold_in(moment.key, _STREAM)
+        time = condition.time
+        if spec.smoothing is not None and condition.step is not None:
+            key = jax.random.fold_in(condition.key, _STREAM)
             time = mlp_motion.smooth_time(
-                key, spec.smoothing, time, moment.step, frames
+                key, spec.smoothing, time, condition.step, frames
             )
         rows = params.rows["splats"]
         offsets = deform(
-            params.nets[NAME], spec, rows.mean, time, ready, splats.alive(rows)
+            params.nets[NAME], spec, rows.mean, time, ready, splats.active_mask(rows)
         )
         return apply(gaussians, offsets)
 
     return Effect(
         name=NAME,
-        init_nets=init_nets,
-        net_rate=schedules.log_linear(spec.rate, spec.rate_end, steps),
+        init=init_networks,
+        learning_rate=schedules.log_linear(spec.rate, spec.rate_end, steps),
         warm_up=spec.warm_up,
         prepare=prepared,
         deform=moved,

@@ -1,4 +1,4 @@
-"""Growth where things move: the density control's threshold depends on the motion.
+"""Growth where things move: densification's threshold depends on the motion.
 
 MoBa-GS, section 3.4: a Gaussian is cloned or split only if its gradient on the screen
 and its motion both pass a threshold (equation 7). Printed so, what stands still never
@@ -15,13 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from gaussians_jax.effects.effect import Effect, Moment
 from gaussians_jax.splats import Gaussians, Params
+from nerfies_jax.training.effects import Effect, FrameCondition
+from nerfies_jax.training.step_counts import steps
 
 NAME = "motion_growth"
 FORMS = ("soft", "hard")
 # At most so many rows give the median of all. Measured at 10k rows, one core: 0.2 ms
-# for all of `observe`, against 5.6 ms with every row, nearly all of it sorting.
+# for all of `update_state`, against 5.6 ms with every row, nearly all of it sorting.
 MEDIAN_ROWS = 512
 
 
@@ -36,7 +37,7 @@ class MotionGrowthSpec:
     """
 
     form: str = "soft"  # or "hard", the conjunction as printed
-    start: int = 5000  # step
+    start: int = steps(5000)  # step
     motion: float = 1e-3  # threshold, of the scene's extent
     beta: float = 4.0  # of the soft form
 
@@ -65,7 +66,7 @@ class Travel(NamedTuple):
     high: Float[Array, "gaussians 3"]
 
 
-def carry(params: Params) -> Travel:
+def init_state(params: Params) -> Travel:
     """Nothing seen yet."""
     mean = params.rows["splats"].mean
     # Not infinity: a state is finite throughout, or the loop stops.
@@ -73,26 +74,26 @@ def carry(params: Params) -> Travel:
     return Travel(jnp.full_like(mean, most), jnp.full_like(mean, -most))
 
 
-def observe(
-    carried: Travel, canonical: Gaussians, moved: Gaussians, moment: Moment
+def update_state(
+    state: Travel, canonical: Gaussians, moved: Gaussians, condition: FrameCondition
 ) -> Travel:
     """One more instant.
 
-    A displacement counts relative to the median displacement of the living rows at that
+    A displacement counts relative to the median displacement of the active rows at that
     instant: what the field moves as a whole, such as the camera's own motion, is not
     motion of a Gaussian. Where most of a scene moves as one, it is therefore the rest
     that counts as moving. Displacements that are not finite are passed over.
     """
-    del moment
+    del condition
     displacement = moved.mean - canonical.mean
     known = jnp.all(jnp.isfinite(displacement), axis=1)
-    # The logistic function of a dead row's mark is exactly zero.
+    # The logistic function of an inactive row's mark is exactly zero.
     common = common_motion(displacement, known & (canonical.opacity > 0))
     relative = displacement - common
     known = known[:, None]
     return Travel(
-        jnp.where(known, jnp.minimum(carried.low, relative), carried.low),
-        jnp.where(known, jnp.maximum(carried.high, relative), carried.high),
+        jnp.where(known, jnp.minimum(state.low, relative), state.low),
+        jnp.where(known, jnp.maximum(state.high, relative), state.high),
     )
 
 
@@ -112,7 +113,7 @@ def common_motion(
     return jnp.where(number > 0, middle, jnp.zeros_like(middle))
 
 
-def motion(carried: Travel) -> Float[np.ndarray, " gaussians"]:
+def motion(state: Travel) -> Float[np.ndarray, " gaussians"]:
     """How far each row was seen to move, in scene units; zero if never seen. Host side.
 
     Half the diagonal of its box, which does not depend on the order of the frames. On a
@@ -121,7 +122,7 @@ def motion(carried: Travel) -> Float[np.ndarray, " gaussians"]:
     makes no motion. Kept instead, the largest distance from the mean so far depends on
     the order: 0.9 to 1.6 times on a path that swings once through 24 frames.
     """
-    low, high = (np.asarray(x, np.float64) for x in carried)
+    low, high = (np.asarray(x, np.float64) for x in state)
     seen = (low <= high).all(axis=1, keepdims=True)
     side = np.subtract(high, low, where=seen, out=np.zeros_like(low))
     # Scaled by the largest side, whose square may leave the range of a float.
@@ -147,13 +148,13 @@ def growth_factor(
 
 
 def grow_score(
-    spec: MotionGrowthSpec, extent: float, carried: Travel, step: int
+    spec: MotionGrowthSpec, extent: float, state: Travel, step: int
 ) -> Float[np.ndarray, " gaussians"]:
     """The factor of each row's gradient at a step; host side."""
-    rows, dtype = carried.low.shape[0], carried.low.dtype
+    rows, dtype = state.low.shape[0], state.low.dtype
     if step < spec.start:
         return np.ones(rows, dtype)
-    return growth_factor(spec, motion(carried), spec.motion * extent).astype(dtype)
+    return growth_factor(spec, motion(state), spec.motion * extent).astype(dtype)
 
 
 def effect(spec: MotionGrowthSpec, extent: float) -> Effect:
@@ -164,7 +165,9 @@ def effect(spec: MotionGrowthSpec, extent: float) -> Effect:
             "`splats.scene_extent`"
         )
 
-    def score(carried, step):
-        return grow_score(spec, extent, carried, step)
+    def score(state, step):
+        return grow_score(spec, extent, state, step)
 
-    return Effect(name=NAME, carry=carry, observe=observe, grow_score=score)
+    return Effect(
+        name=NAME, state=init_state, update_state=update_state, grow_score=score
+    )

@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from gaussians_jax.effects.effect import Effect, Moment, Shot, Term
-from gaussians_jax.splats import Params
 from nerfies_jax.geometry.precision import widened
 from nerfies_jax.training import schedules
+from nerfies_jax.training.effects import Effect, PenaltyContext, Term
+from nerfies_jax.training.step_counts import steps
 
 NAME = "spectral"
 GATES = ("learned", "floor", "fixed", "schedule")
@@ -89,7 +89,7 @@ class SpectralSpec:
     opening: float = 0.5  # equation 16 at g = 0
     rate: float = 1e-2  # Adam's, of the logits g
     floor: float = 0.05
-    after: int = 0  # steps without these losses
+    after: int = steps(0)  # steps without these losses
 
     def __post_init__(self):
         if self.gate not in GATES:
@@ -291,26 +291,26 @@ def _opening(spec, logit, step, steps):
     return spec.opening
 
 
-def loss(
+def terms(
     spec: SpectralSpec,
     weight: Gates,
     render: Float[Array, "height width channels"],
     truth: Float[Array, "height width channels"],
     valid: Bool[Array, "height width"] | None = None,
-) -> Term:
-    """Equation 17, and the weights and unweighted losses to log."""
-    value, metrics = jnp.zeros((), widened(truth).dtype), {}
-    terms = (
+) -> dict[str, Term]:
+    """Those of equation 17, and their weights to log."""
+    found = {}
+    parts = (
         ("wavelet", wavelet_loss, spec.wavelet, weight.wavelet),
         ("fourier", fourier_loss, spec.fourier, weight.fourier),
     )
-    for name, unweighted, part, factor in terms:
+    for name, unweighted, part, factor in parts:
         if part is None:
             continue
         size = unweighted(part, render, truth, valid)
-        value = value + factor.astype(size.dtype) * size
-        metrics |= {name: size, f"{name}_weight": factor}
-    return Term(value, metrics)
+        found[name] = Term(size, factor.astype(size.dtype))
+        found[f"{name}_weight"] = Term(factor, None)
+    return found
 
 
 def effect(spec: SpectralSpec, steps: int) -> Effect:
@@ -322,14 +322,14 @@ def effect(spec: SpectralSpec, steps: int) -> Effect:
         )
     learned = spec.gate in LEARNED
 
-    def image_loss(params: Params, shot: Shot, moment: Moment) -> Term:
-        gates = params.nets[NAME] if learned else None
-        weight = weights(spec, gates, moment.step, steps)
-        return loss(spec, weight, shot.rendering.colour, shot.truth, shot.valid)
+    def penalty(gates: Gates | None, context: PenaltyContext) -> dict[str, Term]:
+        seen = context.observation
+        weight = weights(spec, gates, context.step, steps)
+        return terms(spec, weight, seen.rendering.colour, seen.truth, seen.valid)
 
     return Effect(
         name=NAME,
-        init_nets=(lambda key: init(spec)) if learned else None,
-        net_rate=(lambda step: jnp.asarray(spec.rate)) if learned else None,
-        image_loss=image_loss,
+        init=(lambda key: init(spec)) if learned else None,
+        learning_rate=(lambda step: jnp.asarray(spec.rate)) if learned else None,
+        penalty=penalty,
     )

@@ -68,13 +68,20 @@ def inside(root: pathlib.Path, name: str, named_in: pathlib.Path) -> pathlib.Pat
 
 @contextlib.contextmanager
 def replaced_file(path: AnyPath):
-    """A path to write to; it takes the name `path` when the block ends well."""
+    """A path to write to; it takes the name `path` when the block ends well.
+
+    What is in it is on disk before it takes the name: after a power cut the file is the
+    old one or the new one, whole.
+    """
     path = pathlib.Path(path)
     # The suffix stays last: image and video writers choose the format by it.
     partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
     try:
         yield partial
+        with partial.open("r+b") as file:
+            os.fsync(file.fileno())
         os.replace(partial, path)
+        _sync_names(path.parent)
     except OSError as error:
         raise CaptureError(
             f"{path}: cannot be written ({error.strerror or error}); choose another "
@@ -82,6 +89,16 @@ def replaced_file(path: AnyPath):
         ) from None
     finally:
         partial.unlink(missing_ok=True)
+
+
+def _sync_names(folder):
+    """Put the names in a folder on disk, where the system can: Windows cannot."""
+    with contextlib.suppress(OSError):
+        opened = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(opened)
+        finally:
+            os.close(opened)
 
 
 @contextlib.contextmanager

@@ -7,16 +7,19 @@ own ambient coordinates (equation 8); the axis-aligned *plane* has one for the f
 """
 
 import dataclasses
+import functools
 import math
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
-from nerfies_jax.effects.effect import MOMENT, Effect, Moment, Table, Vector
+from nerfies_jax.effects.effect import Vector
 from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
+from nerfies_jax.training.effects import MOMENT, Effect, FrameCondition, Table
+from nerfies_jax.training.step_counts import steps
 
 KINDS = ("bent", "plane")
 PLANE_TABLE = "ambient"
@@ -48,8 +51,8 @@ class AmbientSpec:
     table: str = "motion"
     code_width: int = 8
     encoding: EncodingSpec = EncodingSpec(1, identity=False)
-    closed_steps: int = 1000
-    anneal_steps: int = 10_000
+    closed_steps: int = steps(1000)
+    anneal_steps: int = steps(10_000)
 
     def __post_init__(self):
         if self.kind not in KINDS:
@@ -97,7 +100,7 @@ def effect(spec: AmbientSpec) -> Effect:
         "ambient",
         tables=(table,),
         init=(lambda key: init(spec, key)) if bent else None,
-        lift=lambda params, point, moment: features(spec, params, point, moment),
+        lift=functools.partial(features, spec),
         lift_width=spec.encoding.width(spec.dims),
     )
 
@@ -114,16 +117,16 @@ def init(spec: AmbientSpec, key: Key[Array, ""], dtype=jnp.float32) -> MLP:
 
 
 def features(
-    spec: AmbientSpec, params: MLP | None, point: Vector, moment: Moment
+    spec: AmbientSpec, params: MLP | None, point: Vector, condition: FrameCondition
 ) -> Float[Array, " features"]:
     """What the template reads: the encoded ambient point, as far as it is open."""
-    ambient = ambient_point(spec, params, point, moment)
-    opened = window(spec, moment.step, ambient)
+    ambient = ambient_point(spec, params, point, condition)
+    opened = window(spec, condition.step, ambient)
     return encoding.encode(spec.encoding, ambient, opened)
 
 
 def ambient_point(
-    spec: AmbientSpec, params: MLP | None, point: Vector, moment: Moment
+    spec: AmbientSpec, params: MLP | None, point: Vector, condition: FrameCondition
 ) -> Float[Array, " dims"]:
     """Where in the ambient dimensions the slice of this moment is at an observed point.
 
@@ -131,9 +134,9 @@ def ambient_point(
     has no parameters.
     """
     if spec.kind == "plane":
-        return moment.codes[PLANE_TABLE]
+        return condition.codes[PLANE_TABLE]
     encoded = encoding.encode(spec.position, point, None)
-    inputs = jnp.concatenate([encoded, moment.codes[spec.table]])
+    inputs = jnp.concatenate([encoded, condition.codes[spec.table]])
     return mlp.apply(network(spec), params, inputs)["ambient"]
 
 

@@ -11,7 +11,7 @@ switch, and under the published presets their gradient is exactly zero.
 
 import dataclasses
 
-from nerfies_jax.effects.effect import APPEARANCE, Effect, Table
+from nerfies_jax.training.effects import APPEARANCE, Effect, Table
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,6 +34,6 @@ def effect(spec: AppearanceSpec) -> Effect:
     return Effect(
         "appearance",
         tables=(Table(spec.table, APPEARANCE, spec.width),),
-        condition=lambda _, moment: moment.codes[spec.table],
+        condition=lambda _, condition: condition.codes[spec.table],
         condition_width=spec.width,
     )

@@ -10,8 +10,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from nerfies_jax.effects.effect import Context, Effect, Scalar, Term
+from nerfies_jax.effects.effect import Scalar
 from nerfies_jax.training import losses
+from nerfies_jax.training.effects import Effect, PenaltyContext, Term
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,10 +49,10 @@ def effect(spec: BackgroundSpec) -> Effect:
     def penalty(_, context):
         return {"background": Term(drift(spec, context), spec.weight)}
 
-    return Effect("background", penalty=penalty, wants=frozenset({"points"}))
+    return Effect("background", penalty=penalty, required_data=frozenset({"points"}))
 
 
-def drift(spec: BackgroundSpec, context: Context) -> Scalar:
+def drift(spec: BackgroundSpec, context: PenaltyContext) -> Scalar:
     """Mean over static points of ρ(|displacement|²).
 
     With no more points than `spec.points` all are taken, each once; of more, as many
@@ -72,13 +73,13 @@ def drift(spec: BackgroundSpec, context: Context) -> Scalar:
 
 def mean_drift(
     spec: BackgroundSpec,
-    context: Context,
+    context: PenaltyContext,
     point: Float[Array, "points 3"],
     rows: Int[Array, " points"],
 ) -> Scalar:
     """The same at given points, in units of the field, each in a given frame."""
-    moments = jax.vmap(context.moment_of)(rows)
-    moved = jax.vmap(context.displace)(point, moments)
+    conditions = jax.vmap(context.condition_of)(rows)
+    moved = jax.vmap(context.displace)(point, conditions)
     # ρ takes the square: the length has no slope where nothing moves
     costs = losses.geman_mcclure(jnp.sum(moved**2, axis=-1), spec.width, spec.scaling)
     return jnp.mean(costs)

@@ -12,9 +12,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
-from nerfies_jax.effects.effect import Context, Effect, Level, Scalar, Term
+from nerfies_jax.effects.effect import RayOutput, Scalar
 from nerfies_jax.geometry import matrix3
 from nerfies_jax.training import losses, schedules
+from nerfies_jax.training.effects import Effect, PenaltyContext, Term
+from nerfies_jax.training.step_counts import steps
 
 Matrix = Float[Array, "3 3"]
 
@@ -37,8 +39,8 @@ class ElasticSpec:
     """
 
     weight: float = 1e-3
-    hold_steps: int = 0
-    decay_steps: int | None = None
+    hold_steps: int = steps(0)
+    decay_steps: int | None = steps(None)
     last_weight: float = 1e-8
     points: int | None = 4
     robust_width: float | None = 0.03
@@ -76,7 +78,7 @@ def effect(spec: ElasticSpec) -> Effect:
         weight = schedule(spec)
         if callable(weight):
             weight = weight(context.step)
-        return {"elastic": Term(value, weight), "folded": Term(folded, 0.0)}
+        return {"elastic": Term(value, weight), "folded": Term(folded, None)}
 
     return Effect("elastic", penalty=penalty)
 
@@ -111,7 +113,7 @@ def determinant(displacement: Matrix) -> Scalar:
     )
 
 
-def energy(spec: ElasticSpec, context: Context) -> tuple[Scalar, Scalar]:
+def energy(spec: ElasticSpec, context: PenaltyContext) -> tuple[Scalar, Scalar]:
     """Mean over rays of Σ_s w_s cost_s on the coarse level, and the share of folds.
 
     The weights are those of the static medium, which is what the warp deforms, and get
@@ -121,19 +123,19 @@ def energy(spec: ElasticSpec, context: Context) -> tuple[Scalar, Scalar]:
     level = context.levels[0]
     point, weight = draw(spec.points, level, context.key)
 
-    def at(point, moment):
-        jacobian = jax.jacfwd(lambda x: context.displace(x, moment))(point)
+    def at(point, condition):
+        jacobian = jax.jacfwd(lambda x: context.displace(x, condition))(point)
         folded = determinant(jax.lax.stop_gradient(jacobian)) < 0
         return cost(spec, jacobian), folded.astype(point.dtype)
 
-    costs, folded = jax.vmap(jax.vmap(at, (0, None)))(point, context.moments)
+    costs, folded = jax.vmap(jax.vmap(at, (0, None)))(point, context.condition)
     seen = jnp.sum(weight)
     share = jnp.sum(weight * folded) / jnp.where(seen > 0, seen, 1)
     return jnp.mean(jnp.sum(weight * costs, axis=-1)), share
 
 
 def draw(
-    points: int | None, level: Level, key: Key[Array, ""]
+    points: int | None, level: RayOutput, key: Key[Array, ""]
 ) -> tuple[Float[Array, "rays points 3"], Float[Array, "rays points"]]:
     """Points of each ray and weights under which their sum is that over all samples.
 

@@ -8,6 +8,7 @@ like this one. Weights and sizes are those of the public code; chains over two m
 """
 
 import dataclasses
+import functools
 import math
 from typing import NamedTuple
 
@@ -16,22 +17,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from nerfies_jax.effects import scene_flow_losses as flow_losses
-from nerfies_jax.effects.effect import (
-    Context,
-    Effect,
-    Level,
-    Medium,
-    Moment,
-    Sample,
-    Scalar,
-    Term,
-    Vector,
-)
+from nerfies_jax.effects.effect import Medium, RayOutput, Sample, Scalar, Vector
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.radiance import compositing, template
 from nerfies_jax.radiance.template import Template, TemplateSpec
+from nerfies_jax.training.effects import Effect, FrameCondition, PenaltyContext, Term
+from nerfies_jax.training.step_counts import steps
 
 NAME = "scene_flow"
 FORWARD, BACKWARD = 0, 1  # places in everything that has a side
@@ -78,7 +71,7 @@ class SceneFlowSpec:
     time: EncodingSpec = EncodingSpec(10)
     flow_bound: float = 1.0
     weights: FlowWeights = FlowWeights()
-    decay_steps: int = 50_000
+    decay_steps: int = steps(50_000)
 
     def __post_init__(self):
         if not (math.isfinite(self.flow_bound) and self.flow_bound > 0):
@@ -135,13 +128,15 @@ def effect(spec: SceneFlowSpec, moments: int, features: int) -> Effect:
     `features` is the width of the static template's trunk.
     """
     gap = interval(moments)
-    wants = {"depths": spec.weights.depth, "flow": spec.weights.flow}
+    required_data = {"depths": spec.weights.depth, "flow": spec.weights.flow}
     return Effect(
         NAME,
         init=lambda key: init(spec, key, features),
-        medium=lambda params, sample, moment: medium(spec, params, sample, moment),
-        penalty=lambda params, context: penalty(spec, gap, params, context),
-        wants=frozenset(name for name, weight in wants.items() if weight > 0),
+        medium=functools.partial(medium, spec),
+        penalty=functools.partial(penalty, spec, gap),
+        required_data=frozenset(
+            name for name, weight in required_data.items() if weight > 0
+        ),
     )
 
 
@@ -187,7 +182,7 @@ def dynamic(
 
 
 def medium(
-    spec: SceneFlowSpec, params: SceneFlow, sample: Sample, moment: Moment
+    spec: SceneFlowSpec, params: SceneFlow, sample: Sample, condition: FrameCondition
 ) -> Medium:
     """The medium at one sample, and its share of the opacity there."""
     width = params.blend.weight.shape[0]
@@ -196,7 +191,7 @@ def medium(
             f"the blending reads {width} features of the template, whose trunk has "
             f"{sample.features.shape[0]}; build the effect with the trunk's width"
         )
-    found = dynamic(spec, params, sample.point, sample.direction, moment.time)
+    found = dynamic(spec, params, sample.point, sample.direction, condition.time)
     share = mlp.affine(params.blend, sample.features)[0]
     extras = {
         "flow_forward": found.flow[FORWARD],
@@ -207,14 +202,18 @@ def medium(
 
 
 def neighbour(
-    spec: SceneFlowSpec, gap: float, params: SceneFlow, context: Context, side: int
+    spec: SceneFlowSpec,
+    gap: float,
+    params: SceneFlow,
+    context: PenaltyContext,
+    side: int,
 ) -> Neighbour:
     """The samples of the last level at the moment after (FORWARD) or before them."""
     level = context.levels[-1]
     extras = level.media[NAME].extras
     flow = extras[("flow_forward", "flow_backward")[side]]
     point = level.point + flow
-    time = context.moments.time + SIGNS[side] * gap
+    time = context.condition.time + SIGNS[side] * gap
     # Half a gap of slack: times are rounded, and need not be quite even.
     present = (time > -gap / 2) & (time < 1 + gap / 2)
 
@@ -225,7 +224,7 @@ def neighbour(
     there = jax.vmap(jax.vmap(ask, (0, None, None)))(
         point, context.batch.direction, time
     )
-    weight = dynamic_weights(level.distance, there.density)
+    weight = dynamic_weights(level.distances, there.density)
     logit = extras["disocclusion"][..., side]
     return Neighbour(
         point=point,
@@ -259,12 +258,12 @@ def fading(decay_steps: int, step: Int[Array, ""]) -> Scalar:
 
 
 def penalty(
-    spec: SceneFlowSpec, gap: float, params: SceneFlow, context: Context
+    spec: SceneFlowSpec, gap: float, params: SceneFlow, context: PenaltyContext
 ) -> dict[str, Term]:
     """All losses beside that of the blended picture, as logged."""
     batch, level = context.batch, context.levels[-1]
     own = level.media[NAME]
-    weight = dynamic_weights(level.distance, own.density)
+    weight = dynamic_weights(level.distances, own.density)
     sides = [neighbour(spec, gap, params, context, side) for side in (0, 1)]
     mask = jnp.where(batch.valid, picture_mask(spec, level, context.step), 0)
     values = {
@@ -315,7 +314,7 @@ def penalty(
 
 
 def picture_mask(
-    spec: SceneFlowSpec, level: Level, step: Int[Array, ""]
+    spec: SceneFlowSpec, level: RayOutput, step: Int[Array, ""]
 ) -> Float[Array, " rays"]:
     """How much the medium alone must look like the picture, in [0, 1] and fixed.
 
@@ -326,11 +325,11 @@ def picture_mask(
     return jnp.where(step < spec.decay_steps, 1, jnp.clip(share, 0, 1))
 
 
-def depth_term(context: Context, weight: Float[Array, "rays samples"]) -> Scalar:
+def depth_term(context: PenaltyContext, weight: Float[Array, "rays samples"]) -> Scalar:
     """How far the medium's own depth is from the capture's, both normalised."""
     batch, level = context.batch, context.levels[-1]
     known = _pixels(context.frames.depths, batch.row, batch.pixel)
-    distance = flow_losses.settle(weight, level.distance[..., None])[..., 0]
+    distance = flow_losses.settle(weight, level.distances[..., None])[..., 0]
     predicted = distance * batch.cosine / context.box.scale
     return flow_losses.normalised_depth(
         predicted, known.astype(predicted.dtype), batch.valid & (known > 0)
@@ -338,7 +337,7 @@ def depth_term(context: Context, weight: Float[Array, "rays samples"]) -> Scalar
 
 
 def flow_term(
-    context: Context,
+    context: PenaltyContext,
     gap: float,
     weight: Float[Array, "rays samples"],
     sides: list[Neighbour],
@@ -357,7 +356,7 @@ def flow_term(
     total = jnp.zeros((), level.point.dtype)
     for sign, one, (shift, seen, rows) in zip(SIGNS, sides, pairs, strict=True):
         other = rows[batch.row].astype(batch.row.dtype)
-        elapsed = sign * (frames.times[other] - context.moments.time) / gap
+        elapsed = sign * (frames.times[other] - context.condition.time) / gap
         point = level.point + elapsed[:, None, None] * one.flow
         place = flow_losses.settle(weight, point) / context.box.scale
         camera = cameras.take(frames.cameras, other)

@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from nerfies_jax.geometry.precision import near_one
+
 Scalar = Float[Array, ""]
 # Mean deviation of the depths of a batch, as a share of their median, below which they
 # count as flat: bounds the normalised depth by a thousand and its slope.
@@ -25,12 +27,12 @@ def weighted_mean(
     0, without a slope, where no weight reaches `FAINTEST`.
     """
     # Selected, not `total + eps`, which fades all weights that are small together. And
-    # of shares of the largest: a quotient's slope has the divisor's square, which is 0
+    # of weights near one: a quotient's slope has the divisor's square, which is 0
     # in float32 where all weights are below 1e-19, and the slope then 0 · inf.
-    largest = jax.lax.stop_gradient(jnp.max(weight))
-    some = largest > FAINTEST
-    share = jnp.where(some, weight / jnp.where(some, largest, 1), 0)
-    total = jnp.where(some, jnp.sum(share), 1)
+    none = jnp.max(weight) <= FAINTEST
+    scaled, _ = near_one(jnp.where(none, 1, weight))
+    share = jnp.where(none, 0, scaled)
+    total = jnp.where(none, 1, jnp.sum(share))
     return jnp.sum(share * jnp.mean(values, axis=-1)) / total
 
 

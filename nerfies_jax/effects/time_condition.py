@@ -10,9 +10,9 @@ import dataclasses
 
 from jaxtyping import Array, Float
 
-from nerfies_jax.effects.effect import MOMENT, Effect, Moment, Table
 from nerfies_jax.nets import encoding
 from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.training.effects import MOMENT, Effect, FrameCondition, Table
 
 CONDITIONS = ("time", "code")
 
@@ -55,13 +55,13 @@ def effect(spec: TimeSpec) -> Effect:
     return Effect(
         "time",
         tables=(Table(spec.table, MOMENT, spec.code_width),) if by_code else (),
-        lift=lambda _, point, moment: features(spec, moment),
+        lift=lambda _, point, condition: features(spec, condition),
         lift_width=spec.width,
     )
 
 
-def features(spec: TimeSpec, moment: Moment) -> Float[Array, " features"]:
+def features(spec: TimeSpec, condition: FrameCondition) -> Float[Array, " features"]:
     """The encoded time, or the code of the frame."""
     if spec.condition == "code":
-        return moment.codes[spec.table]
-    return encoding.encode(spec.encoding, moment.time[None], None)
+        return condition.codes[spec.table]
+    return encoding.encode(spec.encoding, condition.time[None], None)

@@ -6,25 +6,25 @@ field each photograph has a medium of its own, with density, colour and an uncer
 """
 
 import dataclasses
+import functools
 import math
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
-from nerfies_jax.effects.effect import (
-    APPEARANCE,
-    Context,
-    Effect,
-    Medium,
-    Moment,
-    Sample,
-    Table,
-    Term,
-)
+from nerfies_jax.effects.effect import Medium, Sample
 from nerfies_jax.nets import mlp
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
 from nerfies_jax.training import losses
+from nerfies_jax.training.effects import (
+    APPEARANCE,
+    Effect,
+    FrameCondition,
+    PenaltyContext,
+    Table,
+    Term,
+)
 
 NAME = TABLE = "transient"
 
@@ -80,8 +80,9 @@ def effect(spec: TransientSpec, features: int) -> Effect:
         NAME,
         tables=(Table(TABLE, APPEARANCE, spec.code_width),),
         init=lambda key: init(spec, key, features),
-        medium=lambda params, sample, moment: medium(spec, params, sample, moment),
+        medium=functools.partial(medium, spec),
         penalty=lambda _, context: penalty(spec, context),
+        beta_min=spec.beta_min,
     )
 
 
@@ -92,12 +93,14 @@ def init(
     return mlp.init(network(spec, features), key, dtype)
 
 
-def medium(spec: TransientSpec, params: MLP, sample: Sample, moment: Moment) -> Medium:
+def medium(
+    spec: TransientSpec, params: MLP, sample: Sample, condition: FrameCondition
+) -> Medium:
     """Density, colour and uncertainty of the medium at one sample.
 
     The trunk is shared and learns from both media, as in the paper: nothing is stopped.
     """
-    inputs = jnp.concatenate([sample.features, moment.codes[TABLE]])
+    inputs = jnp.concatenate([sample.features, condition.codes[TABLE]])
     raw = mlp.apply(network(spec, sample.features.shape[-1]), params, inputs)
     return Medium(
         density=jax.nn.softplus(raw["density"][0]),
@@ -145,7 +148,7 @@ def photometric(
     return losses.masked_mean(each[..., None], valid)
 
 
-def penalty(spec: TransientSpec, context: Context) -> dict[str, Term]:
+def penalty(spec: TransientSpec, context: PenaltyContext) -> dict[str, Term]:
     """The mean transient density of the finest samples of the valid rays.
 
     The last term of equation 13. In units of the field: where the box is scaled by s,

@@ -7,17 +7,20 @@ one point, of which `matrix3.displacement_log_energy` makes an exact elastic ene
 """
 
 import dataclasses
+import functools
 import math
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
-from nerfies_jax.effects.effect import MOMENT, Effect, Moment, Table, Vector
+from nerfies_jax.effects.effect import Vector
 from nerfies_jax.geometry import lie
 from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
+from nerfies_jax.training.effects import MOMENT, Effect, FrameCondition, Table
+from nerfies_jax.training.step_counts import steps
 
 KINDS = ("se3", "translation")
 CONDITIONS = ("code", "time")
@@ -43,7 +46,7 @@ class WarpSpec:
     depth: int = 6
     width: int = 128
     skips: tuple[int, ...] = (4,)
-    anneal_steps: int | None = None
+    anneal_steps: int | None = steps(None)
 
     def __post_init__(self):
         if self.kind not in KINDS:
@@ -86,7 +89,7 @@ def effect(spec: WarpSpec) -> Effect:
         "warp",
         tables=(Table(spec.table, MOMENT, spec.code_width),) if by_code else (),
         init=lambda key: init(spec, key),
-        displace=lambda params, point, moment: displace(spec, params, point, moment),
+        displace=functools.partial(displace, spec),
     )
 
 
@@ -113,14 +116,16 @@ def init(spec: WarpSpec, key: Key[Array, ""], dtype=jnp.float32) -> MLP:
     return MLP(tuple(hidden), heads)
 
 
-def displace(spec: WarpSpec, params: MLP, point: Vector, moment: Moment) -> Vector:
+def displace(
+    spec: WarpSpec, params: MLP, point: Vector, condition: FrameCondition
+) -> Vector:
     """Template point minus observed point, in units of the field."""
-    encoded = encoding.encode(spec.position, point, window(spec, moment.step, point))
+    encoded = encoding.encode(spec.position, point, window(spec, condition.step, point))
     if spec.condition == "code":
-        return _move(spec, params, point, encoded, moment.codes[spec.table])
-    time = encoding.encode(spec.time, moment.time[None], None)
+        return _move(spec, params, point, encoded, condition.codes[spec.table])
+    time = encoding.encode(spec.time, condition.time[None], None)
     moved = _move(spec, params, point, encoded, time)
-    return jnp.where(moment.time == 0, 0, moved)
+    return jnp.where(condition.time == 0, 0, moved)
 
 
 def window(

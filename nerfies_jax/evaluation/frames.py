@@ -10,21 +10,20 @@ from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.training.model import Frames, View, in_default_precision
 
 
-def frames_of(capture: Capture, wants: frozenset[str] = frozenset()) -> Frames:
-    """The training frames on the device, with what a model `wants` and there is."""
+def frames_of(capture: Capture, required_data: frozenset[str] = frozenset()) -> Frames:
+    """The training frames on the device, with what of `required_data` there is."""
     rows = capture.train
     beside = {}
-    if "depths" in wants and capture.depths is not None:
+    if "depths" in required_data and capture.depths is not None:
         beside["depths"] = capture.depths[rows]
-    if "points" in wants and capture.points is not None:
+    if "points" in required_data and capture.points is not None:
         beside["points"] = capture.points.position
-    if "flow" in wants and capture.flow is not None:
+    if "flow" in required_data and capture.flow is not None:
         beside["flow"] = training_flow(capture)
     frames = Frames(
         images=capture.images[rows],
         cameras=cameras.take(capture.cameras, rows),
         times=capture.times[rows],
-        warp=capture.warp_ids[rows],
         appearance=capture.appearance_ids[rows],
         valid=None if capture.valid is None else capture.valid[rows],
         **beside,
@@ -37,7 +36,6 @@ def view_of(capture: Capture, row: int | np.integer) -> View:
     view = View(
         cameras.take(capture.cameras, row),
         capture.times[row],
-        capture.warp_ids[row],
         capture.appearance_ids[row],
     )
     return in_default_precision(view)

@@ -67,7 +67,9 @@ def colour_depth(
     return Coloured(_mapped(nearness, shown, DEPTH_MAP), low, high)
 
 
-def colour_error(image: np.ndarray, truth: np.ndarray, largest: float) -> Coloured:
+def colour_error(
+    image: np.ndarray, truth: np.ndarray, largest: float | int
+) -> Coloured:
     """Mean absolute difference over the channels of pictures in [0, 1].
 
     Black is 0, light yellow `largest` and more; grey where either is not finite.
@@ -83,7 +85,7 @@ def colour_error(image: np.ndarray, truth: np.ndarray, largest: float) -> Colour
     )
 
 
-def colour_flow(flow: np.ndarray, largest: float | None = None) -> Coloured:
+def colour_flow(flow: np.ndarray, largest: float | int | None = None) -> Coloured:
     """Image motion [..., height, width, 2]: direction as hue, length as saturation.
 
     Still is white, right is red, down yellow-green, left cyan and up violet; full

@@ -53,10 +53,10 @@ class Representation(NamedTuple):
     spec_type: type
     presets: dict[str, Spec]
     with_steps: Callable[[Spec, int], Spec]  # schedules stretch with the steps
-    facts_of: Callable[[Capture, Spec], Any]
+    metadata_of: Callable[[Capture, Spec], Any]
     build: Callable[..., Model]  # (spec, facts) -> model
-    first_bytes: Callable[[Spec, Capture], int]  # of the first state and step
-    lighter: str  # which settings make the first state smaller
+    estimate_memory_bytes: Callable[[Spec, Capture], int]  # of the first state and step
+    memory_hint: str  # which settings make the first state smaller
     # (spec, facts, model, state, frames) -> milliseconds of each part of a step
     time_parts: Callable[[Spec, Any, Model, TrainState, Frames], dict[str, float]]
     # (spec, facts, effects left out, whether appearances are blended) -> model;

@@ -8,9 +8,10 @@ import numpy as np
 
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation.frames import view_of
-from nerfies_jax.evaluation.renderer import Renderer
 from nerfies_jax.measure import image_quality
 from nerfies_jax.training.model import Rendering, TrainState, View
+
+Draw = Callable[[TrainState, View], Rendering]  # as a `Renderer` does
 
 
 class Scored(NamedTuple):
@@ -33,7 +34,7 @@ class Halves(NamedTuple):
 
 
 def score(
-    renderer: Renderer, state: TrainState, capture: Capture, rows: np.ndarray
+    renderer: Draw, state: TrainState, capture: Capture, rows: np.ndarray
 ) -> Scored:
     """Render frames of a capture and compare them with what was filmed.
 

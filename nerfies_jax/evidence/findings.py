@@ -44,7 +44,9 @@ class Finding:
         return {True: "yes", False: "no", None: "-"}[self.wanted]
 
 
-def judge(value: float, threshold: float, error: float) -> tuple[bool | None, str]:
+def judge(
+    value: float | int, threshold: float | int, error: float | int
+) -> tuple[bool | None, str]:
     """Whether a value that is not negative passes its threshold, and how surely.
 
     `error` is its standard error. The value is first moved two errors towards the

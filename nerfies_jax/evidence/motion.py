@@ -109,7 +109,11 @@ def _opening(views):
 
 
 def follow(
-    views: Views, sequence, flows: list[Step], at: int, spans: tuple[float, float]
+    views: Views,
+    sequence: np.ndarray,
+    flows: list[Step],
+    at: int | np.integer,
+    spans: tuple[float, float],
 ) -> Centre:
     """One frame's pixels through its neighbours, against a still scene."""
     index = int(sequence[at])

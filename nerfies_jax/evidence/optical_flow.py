@@ -52,7 +52,7 @@ class StillFit(NamedTuple):
     parallax_px: np.ndarray  # [height, width] px for one unit of inverse depth
 
 
-def between(views: Views, first: int, second: int) -> Step:
+def between(views: Views, first: int | np.integer, second: int | np.integer) -> Step:
     """Dense flow between two frames, both ways; differences of exposure taken out."""
     one, other = (levelled(views.grey[index]) for index in (first, second))
     return Step(_flow(one, other), _flow(other, one))
@@ -76,7 +76,9 @@ def steps(views: Views, sequence: np.ndarray) -> list[Step]:
     return [between(views, first, second) for first, second in pairs]
 
 
-def follow(flows: list[Step], sequence: np.ndarray, at: int, reach: int) -> Paths:
+def follow(
+    flows: list[Step], sequence: np.ndarray, at: int | np.integer, reach: int
+) -> Paths:
     """Paths from frame `at` of a sequence to `reach` frames before and after it."""
     height, width = flows[0].forward.shape[:2]
     bound = np.array([width - 1, height - 1])

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from nerfies_jax import facts
+from nerfies_jax import scene_metadata
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evidence import scene_points, view_set
 from nerfies_jax.evidence.findings import CERTAIN, LIKELY, Finding, cannot_tell
@@ -37,7 +37,7 @@ def texture(capture: Capture, views: Views, factor: int) -> Finding:
     points = scene_points.own_points(capture)
     near, far = view_set.depth_span(capture, views, points)
     depth = math.sqrt(near * far)
-    scale = facts.facts_of(capture, 1.0).scale
+    scale = scene_metadata.metadata_of(capture, 1.0).scale
     per_unit = cycles * views.intrinsics[0, 0, 0] / depth / scale
     bands = bands_for(per_unit)
     evidence = (

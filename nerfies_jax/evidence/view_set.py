@@ -146,7 +146,9 @@ def project(
         return pixel[:, :2] / pixel[:, 2:], depth
 
 
-def in_picture(views: Views, pixel: np.ndarray, depth: np.ndarray, rim: float = 1.0):
+def in_picture(
+    views: Views, pixel: np.ndarray, depth: np.ndarray, rim: float | int = 1.0
+):
     """Which pixels lie in front and in the picture, `rim` pixels from its edge."""
     bounds = np.array(views.size) - rim
     with np.errstate(invalid="ignore"):

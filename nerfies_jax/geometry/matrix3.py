@@ -13,9 +13,10 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float
 
+from nerfies_jax.geometry import jacobi
+from nerfies_jax.geometry.jacobi import dot
 from nerfies_jax.geometry.precision import at_least_float32
 
 Matrix = Float[Array, "3 3"]
@@ -30,7 +31,6 @@ CONE = 1e-6
 # |J - 1| (Frobenius): below, strains are resolved to 1e-8 from J - 1; above, the form
 # through JᵀJ loses more by squaring than J itself does by rounding.
 SMALL_DISPLACEMENT = 0.1
-_SWEEPS = {"float32": 4, "float64": 5}  # quadratic convergence; 3 and 4 nearly suffice
 
 
 @at_least_float32
@@ -99,7 +99,7 @@ def svd(matrix: Matrix) -> tuple[Matrix, Float[Array, "3"], Matrix]:
 
     σ1 >= σ2 >= |σ3|, and σ3 has the sign of the determinant.
     """
-    left, values, right = _svd(matrix)
+    left, values, right = jacobi.svd(matrix)
     return _matrix(left), jnp.stack(values), _matrix(right)
 
 
@@ -159,7 +159,7 @@ def _strain_energy_jvp(primals, tangents):
 
 @jax.custom_jvp
 def _strain_energy_and_slope(strain):
-    return _strain_energy_of(*_eigen(strain))
+    return _strain_energy_of(*jacobi.eigen(strain))
 
 
 def _strain_energy_of(values, basis):
@@ -170,12 +170,15 @@ def _strain_energy_of(values, basis):
 
 @_strain_energy_and_slope.defjvp
 def _strain_energy_and_slope_jvp(primals, tangents):
-    values, basis = _eigen(primals[0])
+    values, basis = jacobi.eigen(primals[0])
     turned = _stacked(_between(basis, _entries(tangents[0]), basis))
-    both = jnp.stack(values)
-    bent = turned * _log_quotient_difference(both[:, None], both) / 2
+    one, other = jnp.stack(values)[:, None], jnp.stack(values)
+    less = jnp.minimum(one, other)
+    bent = turned * _log_quotient_difference(
+        jnp.abs(one - other) / (1 + less), jnp.log1p(less), (1 + one) * (1 + other)
+    )
     energy, slope = _strain_energy_of(values, basis)
-    change = _stacked(_outer(basis, _entries(bent), basis))
+    change = _stacked(_outer(basis, _entries(bent / 2), basis))
     return (energy, slope), (jnp.sum(slope * tangents[0]), change)
 
 
@@ -195,169 +198,45 @@ def _log_sq_slope(stretch):
 def _slope_difference(one, other):
     """Divided difference of `_log_sq_slope`; its derivative where the two are equal.
 
-    Split at `COLLAPSED`, on either side of which it is known without cancellation.
+    Split at `COLLAPSED`: the shares of the way from one to the other that lie above and
+    below, on either side of which it is known without cancellation.
     """
     high, low = jnp.maximum(one, COLLAPSED), jnp.maximum(other, COLLAPSED)
     gap = one - other
     equal = gap == 0
-    quotient = (high - low) / jnp.where(equal, 1, gap)
-    share = jnp.where(equal, jnp.where(one < COLLAPSED, 0, 1), quotient)
-    above = 2 * _log_quotient_difference(high - 1, low - 1)
-    return share * above + (1 - share) * (2 / COLLAPSED**2)
+    divisor = jnp.where(equal, 1, gap)
+    above = (high - low) / divisor
+    # Not 1 - above: that is 3e-3 off for stretches of 1e5 and -1 in float32.
+    edge = jnp.asarray(COLLAPSED, gap.dtype)
+    below = (jnp.minimum(one, edge) - jnp.minimum(other, edge)) / divisor
+    above = jnp.where(equal, jnp.where(one < COLLAPSED, 0, 1), above)
+    below = jnp.where(equal, jnp.where(one < COLLAPSED, 1, 0), below)
+    less = jnp.minimum(high, low)
+    # finite, also from 3e38 down to `COLLAPSED`
+    excess = jnp.minimum(jnp.abs(high - low) / less, jnp.finfo(less.dtype).max)
+    logarithm = _log_quotient_difference(excess, jnp.log(less), high * low)
+    return above * 2 * logarithm + below * (2 / COLLAPSED**2)
 
 
-def _log_quotient_difference(one, other):
-    """Divided difference of log(1 + x) / (1 + x), without cancellation."""
-    ratio = (one - other) / (1 + other)
-    equal = ratio == 0
-    quotient = jnp.where(equal, 1, jnp.log1p(ratio) / jnp.where(equal, 1, ratio))
-    return (quotient - jnp.log1p(other)) / ((1 + one) * (1 + other))
+def _log_quotient_difference(excess, log_less, product):
+    """Divided difference of log x / x between y and (1 + `excess`) y, uncancelled.
+
+    From the smaller one up: down from the larger, log1p nears log 0. In float32 the
+    result was 4e-4 off at a ratio of 5e4 and NaN at 5e7.
+    """
+    equal = excess == 0
+    quotient = jnp.where(equal, 1, jnp.log1p(excess) / jnp.where(equal, 1, excess))
+    return (quotient - log_less) / product
 
 
 def _oriented(signed, matrix):
     """U, σ, V; without sign, a negative σ3 goes into U, which then is a reflection."""
-    left, values, right = _svd(matrix)
+    left, values, right = jacobi.svd(matrix)
     if signed:
         return left, values, right
     mirror = jnp.where(values[2] < 0, -1, 1).astype(values[2].dtype)
     left = [*left[:2], tuple(mirror * x for x in left[2])]
     return left, (*values[:2], mirror * values[2]), right
-
-
-@jax.custom_jvp
-def _svd(matrix):
-    """One-sided Jacobi (Hestenes 1958), in columns of scalars.
-
-    It turns columns until they are orthogonal and never forms MᵀM, whose condition is
-    squared: σ = 1e-3 keeps 3e-5 of itself in float32 where JᵀJ leaves a fifth.
-    """
-    # Squares of squares must stay in range. Outside, the matrix is zero or inf to any
-    # purpose of this module, and `_log` takes it as that.
-    largest = jnp.max(jnp.abs(matrix))
-    usable = (largest > 1e-30) & (largest < 1e30)
-    scale = jnp.where(usable, largest, 1)
-    columns = [tuple(matrix[row, k] / scale for row in range(3)) for k in range(3)]
-    one, zero = jnp.ones_like(scale), jnp.zeros_like(scale)
-    right = [tuple(one if row == k else zero for row in range(3)) for k in range(3)]
-
-    def sweep(_, both):
-        columns, right, _ = map(list, both)
-        for p, q in ((0, 1), (0, 2), (1, 2)):
-            cosine, sine = _angle(
-                _dot(columns[q], columns[q]) - _dot(columns[p], columns[p]),
-                2 * _dot(columns[p], columns[q]),
-            )
-            _turn(columns, p, q, cosine, sine)
-            _turn(right, p, q, cosine, sine)
-        return columns, right, [_dot(column, column) for column in columns]
-
-    # Lengths leave the loop as numbers: computed anew wherever they are compared, with
-    # other roundings, nearly equal ones are swapped in one place and not in another.
-    start = columns, right, [zero, zero, zero]
-    columns, right, lengths = lax.fori_loop(0, _SWEEPS[one.dtype.name], sweep, start)
-    for p, q in ((0, 1), (0, 2), (1, 2)):
-        # a quarter turn, not a swap: the basis stays a rotation
-        swap = lengths[p] < lengths[q]
-        both = lengths[p], lengths[q]
-        lengths[p], lengths[q] = jnp.maximum(*both), jnp.minimum(*both)
-        cosine, sine = jnp.where(swap, 0, one), jnp.where(swap, one, 0)
-        _turn(columns, p, q, cosine, sine)
-        _turn(right, p, q, cosine, sine)
-    left, values = _complete(columns)
-    return left, tuple(value * scale for value in values), right
-
-
-@_svd.defjvp
-def _svd_jvp(primals, tangents):
-    raise NotImplementedError(
-        "singular vectors have no derivative where singular values are equal; use "
-        "singular_values (once differentiable) or the energies (twice)"
-    )
-
-
-def _complete(columns):
-    """Left vectors of orthogonal columns in falling order, also where some are zero."""
-    first, second, third = columns
-    one, zero = jnp.ones_like(first[0]), jnp.zeros_like(first[0])
-    u1, length1 = _unit(first, (one, zero, zero))
-    # Any direction across u1 will do for a column that is nothing but rounding.
-    x, y, z = u1
-    upright = jnp.abs(z) > 0.5
-    across = (
-        jnp.where(upright, z, y),
-        jnp.where(upright, 0, -x),
-        jnp.where(upright, -x, 0),
-    )
-    spare, _ = _unit(across, (zero, one, zero))
-    along = _dot(u1, second)
-    rest = tuple(s - along * u for s, u in zip(second, u1, strict=True))
-    noise = 4 * jnp.finfo(one.dtype).eps * length1
-    length2 = jnp.sqrt(_dot(rest, rest))
-    lost = length2 <= noise
-    u2, _ = _unit(
-        tuple(jnp.where(lost, s, r) for s, r in zip(spare, rest, strict=True)), spare
-    )
-    u3 = (
-        u1[1] * u2[2] - u1[2] * u2[1],
-        u1[2] * u2[0] - u1[0] * u2[2],
-        u1[0] * u2[1] - u1[1] * u2[0],
-    )
-    return [u1, u2, u3], (length1, length2, _dot(u3, third))
-
-
-def _eigen(matrix):
-    """Eigenvalues and columns of eigenvectors of a symmetric matrix, by Jacobi."""
-    a = [[matrix[i, j] for j in range(3)] for i in range(3)]
-    one, zero = jnp.ones_like(a[0][0]), jnp.zeros_like(a[0][0])
-    basis = [tuple(one if row == k else zero for row in range(3)) for k in range(3)]
-
-    def sweep(_, both):
-        a, basis = [list(row) for row in both[0]], list(both[1])
-        for p, q, r in ((0, 1, 2), (0, 2, 1), (1, 2, 0)):
-            cosine, sine = _angle(a[q][q] - a[p][p], 2 * a[p][q])
-            tangent = sine / cosine  # at most one turn of 45 degrees
-            moved = tangent * a[p][q]
-            a[p][p], a[q][q] = a[p][p] - moved, a[q][q] + moved
-            a[p][q] = a[q][p] = zero
-            rp = cosine * a[r][p] - sine * a[r][q]
-            rq = sine * a[r][p] + cosine * a[r][q]
-            a[r][p] = a[p][r] = rp
-            a[r][q] = a[q][r] = rq
-            _turn(basis, p, q, cosine, sine)
-        return a, basis
-
-    a, basis = lax.fori_loop(0, _SWEEPS[matrix.dtype.name], sweep, (a, basis))
-    return (a[0][0], a[1][1], a[2][2]), basis
-
-
-def _angle(difference, twice_product):
-    """Cosine and sine of the smaller turn that makes two columns orthogonal."""
-    size = jnp.abs(difference) + jnp.sqrt(difference**2 + twice_product**2)
-    still = size == 0
-    signed = jnp.where(difference < 0, -twice_product, twice_product)
-    tangent = jnp.where(still, 0, signed / jnp.where(still, 1, size))
-    cosine = 1 / jnp.sqrt(1 + tangent**2)
-    return cosine, cosine * tangent
-
-
-def _turn(columns, p, q, cosine, sine):
-    both = list(zip(columns[p], columns[q], strict=True))
-    columns[p] = tuple(cosine * x - sine * y for x, y in both)
-    columns[q] = tuple(sine * x + cosine * y for x, y in both)
-
-
-def _unit(vector, otherwise):
-    length = jnp.sqrt(_dot(vector, vector))
-    none = length == 0
-    divisor = jnp.where(none, 1, length)
-    unit = (
-        jnp.where(none, o, v / divisor) for o, v in zip(otherwise, vector, strict=True)
-    )
-    return tuple(unit), length
-
-
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def _matrix(columns):
@@ -389,7 +268,7 @@ def _diagonal(values):
 
 def _between(left, rows, right):
     """Uᵀ M V from columns of U and V."""
-    moved = [[_dot(row, column) for column in right] for row in rows]  # M V
+    moved = [[dot(row, column) for column in right] for row in rows]  # M V
     return _each(lambda i, j: sum(left[i][k] * moved[k][j] for k in range(3)))
 
 

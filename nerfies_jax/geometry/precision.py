@@ -9,6 +9,7 @@ import functools
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 _HALVES = (jnp.dtype(jnp.bfloat16), jnp.dtype(jnp.float16))
@@ -42,6 +43,32 @@ def widened(values: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     infinity, which a PSNR takes for no error. Slopes come back in the caller's type.
     """
     return values.astype(jnp.float32) if values.dtype in _HALVES else values
+
+
+def near_one(
+    values: Float[Array, "*shape"], axis: int | None = None
+) -> tuple[Float[Array, "*shape"], Float[Array, "..."]]:
+    """`values` over the power of two next to their largest size, and that power.
+
+    The largest comes out between 2/3 and 4, so that sums of squares stay in range, and
+    no digit changes. Shares and directions do not depend on the scale: it carries no
+    derivative. What XLA flushes to zero (below 1.2e-38 in float32) stays zero; the axis
+    is kept, with length one.
+    """
+    largest = jnp.max(jnp.abs(values), axis=axis, keepdims=axis is not None)
+    scale = power_of_two(lax.stop_gradient(largest))
+    return values / scale, scale
+
+
+def power_of_two(size: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """The power of two next to `size`, of those whose reciprocals are normal numbers.
+
+    XLA:CPU divides by x as it multiplies with 1 / x, and flushes that to zero from
+    8.5e37 in float32 on. NaN stays.
+    """
+    limits = jnp.finfo(size.dtype)
+    power = lax.reduce_precision(size, limits.nexp, 0)
+    return jnp.clip(power, limits.tiny, 1 / float(limits.tiny))
 
 
 def refuse_half(what: str, *arrays) -> None:

@@ -5,10 +5,9 @@ since what an optimiser moves is never exactly of length one.
 """
 
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float
 
-from nerfies_jax.geometry.precision import at_least_float32
+from nerfies_jax.geometry.precision import at_least_float32, near_one
 from nerfies_jax.geometry.stumpff import stumpff
 
 Quaternion = Float[Array, "4"]
@@ -23,22 +22,19 @@ _ARCTAN = tuple((-1) ** n / (2 * n + 1) for n in range(14))
 def normalise(quaternion: Quaternion) -> Quaternion:
     """The same rotation at unit length.
 
-    Zero, and lengths whose square leaves the floating-point range (2e-19 to 1.8e19 in
-    float32), give the identity with zero gradient: 0/0 would poison the whole batch,
-    and q / (|q| + small) would return something that is no rotation.
+    Zero (in float32 also what XLA flushes to it, below 1.2e-38) and infinity give the
+    identity with zero gradient: 0/0 would poison the whole batch, and q / (|q| + small)
+    would return something that is no rotation. Slopes are as large as 1 / |q|, and a
+    curvature overflows below a length of 1e-19 in float32.
     """
-    length_sq = jnp.sum(quaternion**2)
-    # XLA:CPU flushes denormals, so the guard starts at a multiple of the smallest
-    # normal number. NaN is neither small nor infinite and passes through.
-    tiny = 4 * jnp.finfo(quaternion.dtype).tiny
-    unusable = (length_sq < tiny) | (length_sq == jnp.inf)
-    # The whole quaternion is replaced, not its length: at 3e38 the square's slope 2q
-    # overflows, and inf times the zero of the branch not taken is NaN.
+    largest = jnp.max(jnp.abs(quaternion))
+    # NaN is neither small nor infinite and passes through.
+    unusable = (largest < jnp.finfo(quaternion.dtype).tiny) | (largest == jnp.inf)
+    # The whole quaternion is replaced, not its length: inf times the zero of the branch
+    # not taken is NaN. Scaled first: |q|³ in its curvature underflows from 1e-13 down.
     usable = jnp.where(unusable, identity(quaternion.dtype), quaternion)
-    # First to a length near one, by a factor without derivative, which the second
-    # division does not see: |q|³ in its curvature would underflow from 1e-13 down.
-    near = usable * lax.stop_gradient(lax.rsqrt(jnp.sum(usable**2)))
-    return near / jnp.sqrt(jnp.sum(near**2))
+    scaled, _ = near_one(usable)
+    return scaled / jnp.sqrt(jnp.sum(scaled**2))
 
 
 def identity(dtype=jnp.float32) -> Quaternion:
@@ -113,7 +109,7 @@ def from_matrix(rotation: Float[Array, "3 3"]) -> Quaternion:
 
 @at_least_float32
 def exp(rotation_vector: Float[Array, "3"]) -> Quaternion:
-    """The unit quaternion of axis × angle, in rad."""
+    """The unit quaternion of axis × angle, in rad; below 1e19 rad in float32."""
     quarter_sq = jnp.sum(rotation_vector**2) / 4
     scalar = stumpff(0, quarter_sq)
     return jnp.concatenate([scalar[None], stumpff(1, quarter_sq) / 2 * rotation_vector])
@@ -123,7 +119,7 @@ def exp(rotation_vector: Float[Array, "3"]) -> Quaternion:
 def log(quaternion: Quaternion) -> Float[Array, "3"]:
     """Axis × angle, the short way round (at most π rad), of a quaternion of any length.
 
-    Zero for lengths that `normalise` cannot use.
+    Zero for zero and infinity, as `normalise` takes them.
     """
     # The quotients below need no unit length, but their squares have half the range.
     upper = _upper(normalise(quaternion))

@@ -6,9 +6,7 @@ import math
 import os
 import pathlib
 import platform
-import resource
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
@@ -16,6 +14,9 @@ from typing import Any, NamedTuple
 import jax
 import jaxlib
 import numpy as np
+import psutil
+
+from nerfies_jax.capture.json_files import write_json
 
 DIRECTIONS = ("lower", "higher", "equal")
 
@@ -71,7 +72,6 @@ def write_metrics(
     What is not finite is written as null, for JSON has no word for it. The file appears
     whole or not at all.
     """
-    path = pathlib.Path(path)
     rows: dict[str, Any] = {}
     for metric in metrics:
         if metric.key in rows:
@@ -82,13 +82,7 @@ def write_metrics(
         del row["key"]
         row["value"] = float(metric.value) if math.isfinite(metric.value) else None
         rows[metric.key] = row
-    text = json.dumps(
-        {"about": dict(about), "metrics": rows}, indent=1, allow_nan=False
-    )
-    with tempfile.NamedTemporaryFile("w", dir=path.parent, delete=False) as file:
-        file.write(text + "\n")
-    os.chmod(file.name, 0o644)
-    os.replace(file.name, path)
+    write_json(path, {"about": dict(about), "metrics": rows})
 
 
 def read_metrics(path) -> dict[str, Metric]:
@@ -208,14 +202,20 @@ def cost_of(compiled: jax.stages.Compiled, compile_seconds: float) -> Cost:
 
 def peak_bytes() -> int:
     """Largest resident memory of this program so far."""
-    # On Linux getrusage also remembers the process that started this one, which for a
-    # small program under a large one reads the parent's memory.
+    # psutil knows the peak on Windows alone, and getrusage on Linux also remembers the
+    # process that started this one: a small program under a large one would read its
+    # parent's memory.
+    peak = getattr(psutil.Process().memory_info(), "peak_wset", None)
+    if peak is not None:
+        return peak
     try:
         for line in pathlib.Path("/proc/self/status").read_text().splitlines():
             if line.startswith("VmHWM:"):
                 return 1024 * int(line.split()[1])
     except OSError:
         pass
+    import resource  # not there on Windows
+
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else 1024 * peak  # macOS counts bytes
 
@@ -235,7 +235,7 @@ def machine() -> dict[str, Any]:
         if hasattr(os, "sched_getaffinity")
         else os.cpu_count(),
         "xla_cores": os.environ.get("PJRT_NPROC") or os.environ.get("NPROC"),
-        "memory_bytes": os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
+        "memory_bytes": psutil.virtual_memory().total,
         "system": f"{platform.system()} {platform.release()}",
         "python": platform.python_version(),
         "jax": jax.__version__,

@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
+from nerfies_jax.geometry.precision import power_of_two
 from nerfies_jax.nets import mlp
 from nerfies_jax.nets.mlp import HeadSpec
 
@@ -249,9 +250,14 @@ def standardise(
     features: Float[Array, "*batch features"],
 ) -> Float[Array, "*batch features"]:
     """Each point's features with mean zero and variance one, or less than one."""
-    centred = features - jnp.mean(features, axis=-1, keepdims=True)
+    # Features of 1e20 have a variance that float32 cannot hold, and would all become 0.
+    # A power of two changes no digit; below one, `NORM_VARIANCE` would overflow.
+    largest = jnp.max(jnp.abs(features), axis=-1, keepdims=True)
+    scale = jnp.maximum(power_of_two(jax.lax.stop_gradient(largest)), 1)
+    scaled = features / scale
+    centred = scaled - jnp.mean(scaled, axis=-1, keepdims=True)
     variance = jnp.mean(centred**2, axis=-1, keepdims=True)
-    return centred * jax.lax.rsqrt(variance + NORM_VARIANCE)
+    return centred * jax.lax.rsqrt(variance + NORM_VARIANCE / scale**2)
 
 
 def hold(
@@ -269,10 +275,19 @@ def hold(
     middle, half = (low + high) / 2, (high - low) / 2
     offset = x - middle
     outside = jnp.abs(offset) > half
-    excess = jnp.where(outside, jnp.abs(offset) - half, 0) / margin
+    distance = jnp.where(outside, jnp.abs(offset) - half, 0)
     # Its slope is (1 + 3 e) (1 + 2 e + 3 e^2)^(-3/2), which nothing cancels in; that of
-    # e / sqrt(1 + e^2), a difference of equals, is noise in float32 from e = 3000.
-    risen = 1 - jax.lax.rsqrt(1 + (2 + 3 * excess) * excess)
+    # e / sqrt(1 + e^2), a difference of equals, is noise in float32 from e = 3000. Far
+    # out in 1 / e: the square of e would overflow, and the slope be 0 from 1e15 on.
+    far = distance > margin
+    excess = jnp.where(far, 0, distance) / margin
+    inverse = margin / jnp.where(far, distance, margin)
+    left = jnp.where(
+        far,
+        inverse * jax.lax.rsqrt(3 + (2 + inverse) * inverse),
+        jax.lax.rsqrt(1 + (2 + 3 * excess) * excess),
+    )
+    risen = 1 - left
     beyond = middle + jnp.sign(offset) * (half + margin * risen)
     return jnp.where(outside, beyond, x)
 

@@ -28,8 +28,8 @@ class Composite(NamedTuple):
 
     colour: Float[Array, "3"]
     alpha: Float[Array, ""]  # share of the light that stops; may round to 1 + 1e-6
-    depth: Float[Array, ""]  # expected distance of what stops it
-    median: Float[Array, ""]  # distance by which half the light has stopped
+    distance: Float[Array, ""]  # expected, of what stops it
+    median_distance: Float[Array, ""]  # by which half the light has stopped
 
 
 def intervals(
@@ -106,8 +106,9 @@ def composite(
 
     A `background` shines through what the samples let pass. `None` says that the last
     sample is the background, its interval being `AT_INFINITY`: its colour counts but
-    `alpha`, `depth` and `median` leave it out, as `alpha` does in the Nerfies code.
-    (That code also adds white behind such a sample, where none can be seen.)
+    `alpha`, `distance` and `median_distance` leave it out, as `alpha` does in the
+    Nerfies code. (That code also adds white behind such a sample, where none can be
+    seen.)
     """
     # Sums of products: a matrix product may be rounded to ten bits on a GPU.
     colour = jnp.sum(weights[:, None] * colours, axis=0)
@@ -156,10 +157,10 @@ def _composite(colour, weights, distances, background):
         finite = weights
         alpha = jnp.sum(finite)
         colour = colour + (1 - alpha) * background
-    depth = expected_distance(finite, distances[: finite.shape[0]], distances[-1])
+    distance = expected_distance(finite, distances[: finite.shape[0]], distances[-1])
     # The median may read the sample at infinity: it falls back to it anyway.
     median = distances[median_index(weights)]
-    return Composite(colour, alpha, depth, median)
+    return Composite(colour, alpha, distance, median)
 
 
 _running_sum = at_least_float32(jnp.cumsum)

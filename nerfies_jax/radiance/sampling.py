@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from nerfies_jax.geometry.precision import widened
+from nerfies_jax.geometry.precision import near_one, widened
 
 SPACINGS = ("linear", "disparity")
 NERF_FLOOR = 1e-5  # what the published codes add to every weight before they invert
@@ -89,11 +89,11 @@ def from_weights(
     limits = jnp.finfo(weights.dtype)
     if floor is None:
         # Absolute floors drown faint rays: weights that sum to 1e-30 under 1e-5 move
-        # samples by 0.84 of the range. Subnormal weights, which may divide as 0/0, are
-        # none.
-        largest = jnp.max(weights)
-        faint = largest < limits.tiny
-        weights = jnp.where(faint, 1, weights / jnp.where(faint, 1, largest))
+        # samples by 0.84 of the range. Subnormal weights are none. Scaled before it is
+        # divided: in float32 1 / 9e37 is none either, and all bins would share alike.
+        faint = jnp.max(weights) < limits.tiny
+        weights, _ = near_one(jnp.where(faint, 1, weights))
+        weights = weights / jnp.max(weights)
         floor = float(limits.eps)
     # XLA sums in a tree: from 300 bins on neighbouring float32 sums step back
     # by an ulp, and a search needs them sorted. Costs nothing measurable.

@@ -1,25 +1,9 @@
-"""Floor 9: a run and its folder, of whichever representation is installed."""
+"""Floor 9: a run and its folder, of whichever representation is installed.
 
+Loaded when used: the settings of a command (`runs.config`) must not cost an import of
+JAX.
+"""
 
-def __getattr__(name):
-    # Lazy: the settings of a command (`runs.config`) must not cost an import of JAX.
-    if name in __all__:
-        from nerfies_jax.runs import run
+import lazy_loader
 
-        return getattr(run, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-__all__ = [
-    "Run",
-    "first_state",
-    "free_memory",
-    "new_run",
-    "open_run",
-    "read_capture",
-    "restore",
-    "save_config",
-    "saved_run",
-    "scene_spec",
-    "stored_capture",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -76,7 +76,7 @@ def _number(value):
     return math.nan if value is None else float(value)
 
 
-def seconds_to(curve: Curve, psnr: float) -> float | None:
+def seconds_to(curve: Curve, psnr: float | int) -> float | None:
     """Seconds of training after which the curve stays at or above a PSNR in dB.
 
     Linear between evaluations; None where it ends below. A curve that falls back under

@@ -1,5 +1,6 @@
 """What a finished run leaves behind: scores, pictures, a film, depth, a report."""
 
+import dataclasses
 import json
 import math
 import pathlib
@@ -7,53 +8,42 @@ import time
 
 import numpy as np
 
-from nerfies_jax import evaluation, runs
+from nerfies_jax import evaluation
 from nerfies_jax.capture import camera_paths, exr, video
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.json_files import write_json
-from nerfies_jax.evaluation import (
-    Renderer,
-    Scored,
-    fitted_cameras,
-    heldout,
-    model_flow,
-    pictures,
-    protocol,
-)
-from nerfies_jax.evaluation.heldout import Lpips
+from nerfies_jax.evaluation import Renderer, Scored, heldout, pictures
 from nerfies_jax.evaluation.representation import MODEL, Saved
 from nerfies_jax.measure import clock
 from nerfies_jax.measure.clock import Metric
-from nerfies_jax.runs import Run, budget, curves, report
-from nerfies_jax.runs.train import Outcome
+from nerfies_jax.runs import budget, commands, curves, quality, report
+from nerfies_jax.runs.run import Run
+from nerfies_jax.runs.run_folder import CONFIG
+from nerfies_jax.runs.train import Trained
 from nerfies_jax.training import losses
 from nerfies_jax.training.model import TrainState
 
 SHOWN = 4  # held-out frames in the comparison
-TRACKS = 200  # points of a built-in scene that are followed
 
 
 def make(
     folder: pathlib.Path,
     run: Run,
-    outcome: Outcome,
+    trained: Trained,
     began: float,
-    lpips: Lpips | None = None,
-    camera_fits: int = 0,
+    extra: quality.Extra = quality.NOTHING,
 ) -> None:
     """Write everything into the run folder and say where it is.
 
-    LPIPS is measured where weights are given, and `camera_fits` held-out frames are
-    drawn again with cameras fitted to them. Raises FloatingPointError, and writes
-    nothing, where the state draws pictures that are not finite: its parameters may be
-    finite and yet beyond use.
+    Raises FloatingPointError, and writes nothing, where the state draws pictures that
+    are not finite: its parameters may be finite and yet beyond use.
     """
-    state, renderer = outcome.result.state, outcome.renderer
-    rows, left_out = frames_to_score(run, outcome)
+    state, renderer = trained.result.state, trained.renderer
+    rows, left_out = frames_to_score(run, trained)
     scored = evaluation.score(renderer, state, run.capture, rows)
     if not np.isfinite(scored.colour).all():
         raise FloatingPointError(
-            f"no report: what the state of step {outcome.result.steps:,} draws is not "
+            f"no report: what the state of step {trained.result.steps:,} draws is not "
             "finite"
         )
     ms_per_frame = renderer.ms_per_frame(len(scored.rows))
@@ -64,9 +54,9 @@ def make(
             "apart, and the depth.",
         )
     ]
-    watched = [run.capture.ids[row] for row in outcome.watched]
-    curves.write(folder, outcome.result.history, watched)
-    curve = save_curve(folder / "psnr_over_time.png", run, outcome)
+    watched = [run.capture.ids[row] for row in trained.watched]
+    curves.write(folder, trained.result.history, watched)
+    curve = save_curve(folder / "psnr_over_time.png", run, trained)
     if curve is not None:
         figures.append(
             report.Figure(curve, "PSNR of a few held-out frames while it trained.")
@@ -74,38 +64,38 @@ def make(
     film = save_film(folder / "scene.mp4", run, renderer, state, ms_per_frame / 1e3)
     save_depth(folder / "depth", run.capture, scored)
     saved = run.representation.save(folder, run.spec, run.facts, state)
-    frames = evaluation.frames_of(run.capture, run.model.wants)
+    frames = evaluation.frames_of(run.capture, run.model.required_data)
     fitted, gain = score_halves(run, state, scored, ms_per_frame / 1e3)
-    found, remarks = quality(run, state, renderer, scored, lpips, camera_fits)
+    found, remarks = quality.measure(run, state, renderer, scored, extra)
     metrics = heldout.metrics(found)
-    metrics += [*measured(run, outcome, scored, ms_per_frame, began), *fitted]
+    metrics += [*measured(run, trained, scored, ms_per_frame, began), *fitted]
     metrics += model_size(saved)
     write_json(
         folder / "metrics.json",
         {m.key: m.value if math.isfinite(m.value) else None for m in metrics},
     )
-    notes = [outcome.result.message, *run.capture.notes, *left_out, *remarks, *gain]
+    notes = [trained.result.message, *run.capture.notes, *left_out, *remarks, *gain]
     notes += saved.notes
     notes += beside_the_paper(run.config.preset, saved, ms_per_frame)
-    commands = _next(folder, run, outcome)
+    following = _next(folder, run, trained)
     page = report.write(
         folder,
         f"{run.capture.name}: {run.config.preset}",
         metrics,
-        json.loads((folder / runs.CONFIG).read_text()),
+        json.loads((folder / CONFIG).read_text()),
         figures,
         film,
         run.representation.time_parts(run.spec, run.facts, run.model, state, frames),
         notes,
-        commands,
+        following,
     )
-    _say(folder, page, metrics, commands)
+    _say(folder, page, metrics, following)
 
 
-def frames_to_score(run: Run, outcome: Outcome) -> tuple[np.ndarray, tuple[str, ...]]:
+def frames_to_score(run: Run, trained: Trained) -> tuple[np.ndarray, tuple[str, ...]]:
     """Rows of held-out frames, and a note where there is no time for all of them."""
     heldout = run.capture.heldout
-    seconds = outcome.renderer.ms_per_frame(1) / 1e3
+    seconds = trained.renderer.ms_per_frame(1) / 1e3
     count = budget.scored(seconds, len(heldout))
     if count == len(heldout):
         return heldout, ()
@@ -116,63 +106,11 @@ def frames_to_score(run: Run, outcome: Outcome) -> tuple[np.ndarray, tuple[str, 
     return evaluation.spread(heldout, count), (note,)
 
 
-def quality(
-    run: Run,
-    state: TrainState,
-    renderer: Renderer,
-    scored: Scored,
-    lpips: Lpips | None,
-    fits: int,
-) -> tuple[dict[str, float], list[str]]:
-    """How good the held-out frames are, by the keys of `heldout.MEASURES`, and notes.
-
-    Points and flow are held against the truth of a built-in scene.
-    """
-    capture = run.capture
-    known = followed = flow = fitted = None
-    notes = []
-    try:
-        truth = protocol.stored_truth(capture)
-        if truth is not None:
-            known = protocol.known(capture, truth, len(scored.rows), TRACKS)
-    except ValueError as error:
-        notes.append(f"No points were followed: {error}")
-    if known is not None:
-        kind, scene = run.representation, (run.spec, run.facts)
-        followed = kind.follow(*scene, state, capture, known)
-        move = kind.mover(*scene)
-        if move is not None:
-            flow = model_flow.heldout_flow(move, state, capture, scored)
-    if fits:
-        places = evaluation.spread(np.arange(len(scored.rows)), fits)
-        fitted = fitted_cameras.fit_cameras(
-            run.model, renderer, state, capture, scored.rows[places]
-        )
-        notes.append(
-            f"Cameras fitted to {len(places)} held-out frames: "
-            f"{scored.psnr[places].mean():.2f} dB with those of the capture, "
-            f"{fitted.scored.psnr.mean():.2f} dB with the fitted ones, of which "
-            f"{fitted.converged.sum()} converged."
-        )
-    if lpips is not None:
-        notes.append(f"LPIPS is that of {lpips.network.name}, version 0.1.")
-    found = heldout.heldout_metrics(
-        scored,
-        capture,
-        lpips=lpips,
-        known=known,
-        followed=followed,
-        flow=flow,
-        fitted=fitted,
-    )
-    return found, notes
-
-
 def measured(
-    run: Run, outcome: Outcome, scored: Scored, ms_per_frame: float, began: float
+    run: Run, trained: Trained, scored: Scored, ms_per_frame: float, began: float
 ) -> list[Metric]:
     """What a run took."""
-    result = outcome.result
+    result = trained.result
     counts = run.model.counts(result.state)
     seconds, fps = time.perf_counter() - began, 1e3 / ms_per_frame
     return [
@@ -272,9 +210,9 @@ def save_comparison(path: pathlib.Path, capture: Capture, scored: Scored):
     return path
 
 
-def save_curve(path: pathlib.Path, run: Run, outcome: Outcome):
+def save_curve(path: pathlib.Path, run: Run, trained: Trained):
     """PSNR against seconds; None where the run ended before it was evaluated."""
-    history = outcome.result.history
+    history = trained.result.history
     if not history.evaluations:
         return None
     points = pictures.History(
@@ -320,27 +258,22 @@ def save_depth(folder: pathlib.Path, capture: Capture, scored: Scored) -> None:
         exr.write_exr(folder / f"{name}.exr", alpha=alpha, depth=depth)
 
 
-def _next(folder, run, outcome):
-    commands = [
-        report.Command(
-            "Render it from other cameras, at other times:",
-            f"python -m experiments.render {folder} --path orbit",
-        )
-    ]
-    if outcome.result.stopped_by == "non-finite":
-        return commands  # resumed, it would stop at the same step
-    if outcome.result.steps < run.spec.steps:
-        line = f"python -m experiments.reconstruct --out {folder} --resume"
-        return [*commands, report.Command("Train it to the end:", line)]
-    capture = "" if run.config.capture is None else f" {run.config.capture}"
-    line = (
-        f"python -m experiments.reconstruct{capture} --preset {run.config.preset} "
-        f"--steps {2 * run.spec.steps}"
+def _next(folder, run, trained):
+    """What a user may want to run next."""
+    looked = report.Command(
+        "Render it from other cameras, at other times:", commands.render(folder)
     )
-    return [*commands, report.Command("Train it twice as long:", line)]
+    if trained.result.stopped_by == "non-finite":
+        return [looked]  # resumed, it would stop at the same step
+    if trained.result.steps < run.spec.steps:
+        line = commands.resume(folder)
+        return [looked, report.Command("Train it to the end:", line)]
+    longer = dataclasses.replace(run.config, steps=2 * run.spec.steps)
+    line = commands.reconstruct(longer)
+    return [looked, report.Command("Train it twice as long:", line)]
 
 
-def _say(folder, page, metrics, commands):
+def _say(folder, page, metrics, following):
     value = {metric.key: metric.value for metric in metrics}
     print(
         f"held out: {value['heldout.psnr']:.2f} dB, SSIM {value['heldout.ssim']:.3f} "
@@ -357,7 +290,7 @@ def _say(folder, page, metrics, commands):
     print(f"report:     {page}")
     print(f"comparison: {folder / 'comparison.png'}")
     print(f"film:       {folder / 'scene.mp4'}")
-    for command in commands:
+    for command in following:
         print(f"{command.purpose}\n  {command.line}")
 
 

@@ -1,10 +1,12 @@
 """A run: which capture, which scene, and the folder that holds what came of it."""
 
 import json
+import os
 import pathlib
 from typing import Any, NamedTuple
 
 import jax
+import psutil
 
 from nerfies_jax import capture as captures
 from nerfies_jax.capture import pinholes, synthetic
@@ -17,6 +19,15 @@ from nerfies_jax.runs.platform import CACHE
 from nerfies_jax.runs.run_folder import CHECKPOINTS, CONFIG
 from nerfies_jax.training import checkpoint, specs
 from nerfies_jax.training.model import Model, TrainState
+from nerfies_jax.training.provenance import provenance
+
+
+class Settings(NamedTuple):
+    """What a `config.json` says."""
+
+    config: RunConfig
+    representation: Representation
+    spec: Any  # of the representation's `spec_type`
 
 
 class Run(NamedTuple):
@@ -47,7 +58,7 @@ def open_run(
 ) -> Run:
     """Read the capture and build the model."""
     capture = pinholes.as_pinholes(stored or stored_capture(config.source, config.seed))
-    facts = representation.facts_of(capture, spec)
+    facts = representation.metadata_of(capture, spec)
     model = representation.build(spec, facts)
     return Run(config, capture, representation, spec, facts, model)
 
@@ -59,6 +70,35 @@ def scene_spec(config: RunConfig) -> Any:
     if config.steps is not None:
         spec = representation.with_steps(spec, config.steps)
     return specs.override(spec, config.overrides)
+
+
+def load_capture(
+    folder: str | os.PathLike,
+    *,
+    factor: int | None = None,
+    max_side: int | None = None,
+    heldout: int | str | None = None,
+) -> Capture:
+    """A capture of any known format, for a pinhole renderer; host side.
+
+    `factor` and `max_side` (pixels) make the pictures smaller; `heldout` chooses the
+    frames to judge by, every n-th or a split by its name. Raises ValueError where it
+    cannot be read.
+    """
+    chosen = None if heldout is None else str(heldout)
+    return read_capture(
+        CaptureSource(
+            capture=pathlib.Path(folder),
+            factor=factor,
+            max_side=max_side,
+            heldout=chosen,
+        )
+    )
+
+
+def built_in_scene(name: str = "default", seed: int = 0) -> Capture:
+    """A film of a built-in scene; ValueError names those there are."""
+    return read_capture(CaptureSource(scene=name), seed)
 
 
 def read_capture(source: CaptureSource, seed: int = 0) -> Capture:
@@ -109,7 +149,7 @@ def save_config(folder: pathlib.Path, run: Run) -> None:
             "config": specs.as_json(run.config),
             "representation": run.representation.name,
             "spec": specs.as_json(run.spec),
-            "made by": checkpoint.provenance(),
+            "made by": provenance(),
         },
     )
 
@@ -118,12 +158,27 @@ def saved_run(folder: pathlib.Path, overrides: tuple[str, ...] = ()) -> Run:
     """The run in a folder, with the settings it was made with.
 
     They come from its `config.json`, not from the preset, which may have changed since.
+    Raises ValueError where `overrides` would change them.
     """
+    config, kind, spec = read_settings(folder)
+    asked = specs.override(spec, overrides)
+    changed = specs.differences(specs.as_json(spec), specs.as_json(asked))
+    if changed:
+        raise ValueError(
+            f"{folder}: the run was started with other settings: {'; '.join(changed)}; "
+            "leave them out to continue it, or start anew in another --out"
+        )
+    return open_run(config, kind, spec)
+
+
+def read_settings(folder: pathlib.Path) -> Settings:
+    """The settings of the run in a folder; ValueError where they cannot be read."""
     path = folder / CONFIG
     if not path.is_file():
         raise ValueError(
             f"{folder}: no run here (there is no {CONFIG}); name the folder that "
-            "experiments.reconstruct printed"
+            "experiments.reconstruct printed; a run that was killed before it had one "
+            "is started again, without --resume"
         )
     try:
         stored = json.loads(path.read_text())
@@ -134,30 +189,25 @@ def saved_run(folder: pathlib.Path, overrides: tuple[str, ...] = ()) -> Run:
                 raise ValueError(f"a {type(value).__name__} for a {wanted.__name__}")
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise ValueError(f"{path}: not the settings of a run ({error})") from error
-    return open_run(config, kind, specs.override(spec, overrides))
+    return Settings(config, kind, spec)
 
 
 def first_state(run: Run) -> TrainState:
     """The state before the first step; ValueError where it would not fit in memory."""
-    needed = run.representation.first_bytes(run.spec, run.capture)
+    needed = run.representation.estimate_memory_bytes(run.spec, run.capture)
     free = free_memory()
-    if free is not None and needed > free:
+    if needed > free:
         raise ValueError(
             f"the first state needs about {needed / 2**30:.1f} GiB and "
-            f"{free / 2**30:.1f} GiB are free; {run.representation.lighter}, or read "
-            "smaller pictures with --max-side"
+            f"{free / 2**30:.1f} GiB are free; {run.representation.memory_hint}, or "
+            "read smaller pictures with --max-side"
         )
     return run.model.init(run.capture, jax.random.key(run.config.seed))
 
 
-def free_memory() -> int | None:
-    """Bytes of memory that programs may still take; None where nothing tells."""
-    try:
-        lines = pathlib.Path("/proc/meminfo").read_text().splitlines()
-        row = next(line for line in lines if line.startswith("MemAvailable"))
-    except (OSError, StopIteration):
-        return None
-    return int(row.split()[1]) * 1024
+def free_memory() -> int:
+    """Bytes of memory that programs may still take."""
+    return psutil.virtual_memory().available
 
 
 def restore(folder: pathlib.Path, run: Run) -> checkpoint.Restored:

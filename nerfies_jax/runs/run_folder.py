@@ -1,10 +1,20 @@
-"""The folder of a run: a new one, and the names of what is in it."""
+"""The folder of a run: a new one, its one owner, and the names of what is in it."""
 
+import contextlib
+import datetime
+import json
+import os
 import pathlib
+import platform
 import tempfile
+from collections.abc import Iterator
+
+import filelock
 
 CONFIG = "config.json"  # which capture and which scene, and the whole of its spec
 CHECKPOINTS = "checkpoints"
+LOCK = ".lock"
+OWNER = ".owner.json"  # beside the lock: Windows lets nobody read a locked file
 
 
 def new_run_folder(out: pathlib.Path | None, stem: str) -> pathlib.Path:
@@ -13,26 +23,89 @@ def new_run_folder(out: pathlib.Path | None, stem: str) -> pathlib.Path:
     Raises ValueError if `out` holds something already or cannot be written.
     """
     if out is None:
-        number, folder = 1, pathlib.Path("runs", stem)
-        while folder.exists():
-            number += 1
-            folder = pathlib.Path("runs", f"{stem}-{number}")
-    else:
-        folder = out
-        if folder.exists() and not folder.is_dir():
-            raise ValueError(f"{folder}: the run folder is a file; name another --out")
-        if folder.is_dir() and any(folder.iterdir()):
-            raise ValueError(
-                f"{folder}: the run folder is not empty; name another --out, or "
-                "continue the run in it with --resume"
-            )
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
+        return _numbered(pathlib.Path("runs"), stem)
+    check_free(out)
+    with _named_if_not_writable(out):
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=out):
             pass
+    return out
+
+
+def check_free(out: pathlib.Path) -> None:
+    """Raise ValueError where a run cannot begin in `out`; nothing is made."""
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"{out}: the run folder is a file; name another --out")
+    if not out.is_dir():
+        return
+    if (out / LOCK).exists():
+        with owned(out):
+            pass
+    # A run that was killed before its first file leaves these.
+    if any(path.name not in (LOCK, OWNER) for path in out.iterdir()):
+        raise ValueError(
+            f"{out}: the run folder is not empty; name another --out, or "
+            "continue the run in it with --resume"
+        )
+
+
+@contextlib.contextmanager
+def owned(folder: pathlib.Path) -> Iterator[None]:
+    """Be the one process that writes into a run folder.
+
+    Raises ValueError naming the owner while there is another one. The system gives the
+    folder free when this process ends, however it does.
+    """
+    lock = filelock.FileLock(folder / LOCK)
+    try:
+        lock.acquire(blocking=False)
+    except filelock.Timeout:
+        raise ValueError(
+            f"{folder}: {_owner(folder)} is at work in this run folder; wait for it, "
+            "or stop it (Ctrl-C, kill), which saves"
+        ) from None
+    try:
+        me = {
+            "pid": os.getpid(),
+            "host": platform.node(),
+            "since": datetime.datetime.now().astimezone().isoformat(" ", "seconds"),
+        }
+        (folder / OWNER).write_text(json.dumps(me))
+        yield
+    finally:
+        with contextlib.suppress(OSError):  # gone, or no longer to be written
+            (folder / OWNER).unlink()
+        lock.release()
+
+
+def _owner(folder):
+    try:
+        found = json.loads((folder / OWNER).read_text())
+        return f"process {found['pid']} on {found['host']} (since {found['since']})"
+    except (OSError, ValueError, KeyError, TypeError):  # it is just writing it
+        return "another process"
+
+
+def _numbered(above, stem):
+    """The first of STEM, STEM-2, ... that is not there, made by this process."""
+    number, folder = 1, above / stem
+    with _named_if_not_writable(folder):
+        above.mkdir(parents=True, exist_ok=True)
+        while True:
+            try:
+                folder.mkdir()
+                return folder
+            except FileExistsError:
+                number += 1
+                folder = above / f"{stem}-{number}"
+
+
+@contextlib.contextmanager
+def _named_if_not_writable(folder):
+    try:
+        yield
     except OSError as error:
         raise ValueError(
             f"{folder}: the run folder cannot be written ({error.strerror}); "
             "name another --out"
         ) from error
-    return folder

@@ -1,19 +1,40 @@
 """Train a run, with held-out scores along the way."""
 
+import dataclasses
 import pathlib
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from nerfies_jax import evaluation, runs
+from nerfies_jax import evaluation
 from nerfies_jax.evaluation import Renderer
-from nerfies_jax.runs import Run, budget
+from nerfies_jax.runs import budget, run_folder
+from nerfies_jax.runs.run import Run
 from nerfies_jax.training import loop
 from nerfies_jax.training.checkpoint import Checkpoints
 from nerfies_jax.training.loop import FitResult, History, Hook
 
+EVALUATED = 4  # held-out frames in the curve; all of them are scored at the end
 
-class Outcome(NamedTuple):
+
+@dataclasses.dataclass(frozen=True)
+class Pace:
+    """How long to train and how often to do what else there is to do, in seconds."""
+
+    seconds: float | int | None = None  # no bound but the steps
+    evaluate_every: float | int = 20.0
+    checkpoint_every: float | int = 60.0
+
+    def __post_init__(self):
+        for name in ("seconds", "evaluate_every", "checkpoint_every"):
+            value = getattr(self, name)
+            if value is not None and not value >= 0:
+                raise ValueError(
+                    f"--{name.replace('_', '-')} {value}: seconds, not negative"
+                )
+
+
+class Trained(NamedTuple):
     """A finished training, and the renderer that is compiled for it."""
 
     result: FitResult
@@ -23,29 +44,27 @@ class Outcome(NamedTuple):
 
 def open_checkpoints(folder: pathlib.Path, run: Run, after: int | None) -> Checkpoints:
     """Where this run saves; ValueError where it cannot."""
-    return Checkpoints(folder / runs.CHECKPOINTS, run.model.spec, after=after)
+    return Checkpoints(
+        folder / run_folder.CHECKPOINTS,
+        run.model.spec,
+        after=after,
+        beside=folder / run_folder.CONFIG,
+    )
 
 
 def train(
-    run: Run,
-    state: Any,
-    record: dict | None,
-    checkpoints: Checkpoints,
-    *,
-    seconds: float | None,
-    evaluate_every: float,
-    evaluated: int,
-) -> Outcome:
+    run: Run, state: Any, record: dict | None, checkpoints: Checkpoints, pace: Pace
+) -> Trained:
     """Fit the model; its PSNR and SSIM on a few held-out frames go into the history."""
     renderer = Renderer(run.model, run.capture.size)
-    few = run.capture.heldout
+    few, evaluate_every = run.capture.heldout, pace.evaluate_every
     if len(few):
         renderer(
             state, evaluation.view_of(run.capture, int(few[0]))
         )  # how long it takes
-        pace = budget.evaluations(renderer.seconds[-1], evaluate_every, evaluated)
-        few = evaluation.spread(run.capture.heldout, pace.frames)
-        evaluate_every = pace.every_seconds
+        share = budget.evaluations(renderer.seconds[-1], evaluate_every, EVALUATED)
+        few = evaluation.spread(run.capture.heldout, share.frames)
+        evaluate_every = share.every_seconds
 
     def held_out(state, step):
         del step
@@ -53,15 +72,15 @@ def train(
         return {"psnr": scored.psnr.mean(), "ssim": scored.ssim.mean()}
 
     hooks = [Hook("held out", held_out, every_seconds=evaluate_every)]
-    with checkpoints:
-        result = loop.fit(
-            run.model,
-            state,
-            evaluation.frames_of(run.capture, run.model.wants),
-            steps=run.spec.steps,
-            hooks=hooks if len(few) else [],
-            seconds=seconds,
-            checkpoints=checkpoints,
-            history=History() if record is None else History(**record),
-        )
-    return Outcome(result, renderer, few)
+    result = loop.fit(
+        run.model,
+        state,
+        evaluation.frames_of(run.capture, run.model.required_data),
+        steps=run.spec.steps,
+        hooks=hooks if len(few) else [],
+        seconds=pace.seconds,
+        checkpoints=checkpoints,
+        checkpoint_seconds=pace.checkpoint_every,
+        history=History() if record is None else History(**record),
+    )
+    return Trained(result, renderer, few)

@@ -1,10 +1,12 @@
 """Save and restore a run: orbax directories that carry what they were made with."""
 
+import concurrent.futures
 import contextlib
+import json
+import logging
+import os
 import pathlib
 import shutil
-import subprocess
-import sys
 import tempfile
 import warnings
 import zlib
@@ -16,12 +18,15 @@ import ml_dtypes  # noqa: F401  (NumPy's names for bfloat16 and its kin)
 import numpy as np
 import orbax.checkpoint as ocp
 
+from nerfies_jax.training.provenance import provenance
 from nerfies_jax.training.specs import as_json, differences
 
 PyTree = Any
 
-FORMAT = 1
-_STATE, _ABOUT = "state", "about"
+FORMAT = 2
+SPARE_BYTES = 2**20  # for the notes beside the arrays
+_UNFINISHED = ".unfinished"
+_STATE, _ABOUT = "state", "about.json"
 
 
 class Restored(NamedTuple):
@@ -33,19 +38,37 @@ class Restored(NamedTuple):
     about: dict[str, Any]  # revision, versions, spec, checksums
 
 
+class SaveError(ValueError):
+    """A checkpoint that could not be written; those before it are whole."""
+
+
 class Checkpoints:
     """Writes the checkpoints of one run; the newest `keep` stay.
 
     A directory appears under its final name only once everything in it is on disk, so
     a killed process leaves the previous checkpoint intact. Saving copies the arrays and
-    writes in the background; `close` waits.
+    writes in the background; a write that fails is a SaveError of the next `save`,
+    `wait` or `close`, unless `failure` has told it.
     """
 
-    def __init__(self, folder, spec, *, keep: int = 3, after: int | None = None):
-        """`after` is the step the run goes on from, None for a new run."""
+    def __init__(
+        self,
+        folder,
+        spec,
+        *,
+        keep: int = 3,
+        after: int | None = None,
+        beside: pathlib.Path | None = None,
+    ):
+        """`after` is the step the run goes on from, None for a new run.
+
+        Nothing is saved once the file `beside` is gone, without which the checkpoints
+        are of no use.
+        """
         if keep < 1:
             raise ValueError(f"at least one checkpoint must be kept, got keep={keep}")
         self.folder = pathlib.Path(folder).absolute()
+        self._keep, self._beside = keep, beside
         self._about = {"format": FORMAT, "spec": as_json(spec), **provenance()}
         _check_writable(self.folder)
         present = steps(self.folder)
@@ -57,53 +80,134 @@ class Checkpoints:
         for step in present:
             if step > after:  # left behind by a fall-back, never to be continued
                 shutil.rmtree(self.folder / str(step))
-        self._manager = ocp.CheckpointManager(
-            self.folder,
-            options=ocp.CheckpointManagerOptions(
-                max_to_keep=keep, create=False, cleanup_tmp_directories=True
-            ),
-        )
+        self._remove_unfinished()
+        self._writer = concurrent.futures.ThreadPoolExecutor(1, "checkpoints")
+        self._writing: concurrent.futures.Future | None = None
 
     def save(self, state: PyTree, step: int, record: Any = None) -> None:
         """Save the state after `step` completed steps; nothing where it exists."""
-        if self._manager.latest_step() == step:
+        self.wait()
+        if latest(self.folder) == step and not self._is_orphaned():
             return
-        leaves, about = _encode(state)
-        about = {**self._about, "step": step, "record": record, "leaves": about}
-        items = {
-            _STATE: ocp.args.StandardSave(leaves),
-            _ABOUT: ocp.args.JsonSave(about),
-        }
-        with self._naming_the_folder():
-            self._manager.save(step, args=ocp.args.Composite(**items), force=True)
+        leaves, notes = _encode(state)
+        about = {**self._about, "step": step, "record": record, "leaves": notes}
+        self._writing = self._writer.submit(self._write, step, leaves, about)
+
+    def failure(self, wait: bool = False) -> SaveError | None:
+        """Why the last save failed, told once; None where it did not, or not yet."""
+        if self._writing is None or not (wait or self._writing.done()):
+            return None
+        error, self._writing = self._writing.exception(), None
+        return error
 
     def wait(self) -> None:
         """Until everything saved is on disk."""
-        with self._naming_the_folder():
-            self._manager.wait_until_finished()
+        error = self.failure(wait=True)
+        if error is not None:
+            raise error
 
     def close(self) -> None:
         """Wait, and let go of the folder."""
+        self._writer.shutdown()
         self.wait()
-        self._manager.close()
 
-    @contextlib.contextmanager
-    def _naming_the_folder(self):
-        """A failed write, often of the save before: a full disk, a lost folder."""
+    def _write(self, step, leaves, about):
         try:
-            yield
+            self._check_room(leaves)
+            for name, array in leaves.items():
+                about["leaves"][name]["crc32"] = _checksum(array)
+            about["crc32"] = _text_checksum(about)
+            partial = self.folder / f"{step}{_UNFINISHED}"
+            _write_arrays(partial / _STATE, leaves)
+            _write_text(partial / _ABOUT, json.dumps(about))
+            partial.rename(self.folder / str(step))
+            for old in steps(self.folder)[: -self._keep]:
+                shutil.rmtree(self.folder / str(old))
         except Exception as error:  # orbax and tensorstore raise whatever they meet
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise ValueError(
-                f"cannot write checkpoints to {self.folder}: {reason}; the newest that "
-                f"is whole is of step {latest(self.folder)}"
+            self._remove_unfinished()
+            reason = getattr(error, "strerror", None) or str(error) or repr(error)
+            whole = latest(self.folder)
+            left = (
+                "none is whole" if whole is None else f"that of step {whole} is whole"
+            )
+            raise SaveError(
+                f"cannot write checkpoints to {self.folder}: "
+                f"{reason.splitlines()[0]}; {left}"
             ) from error
+
+    def _check_room(self, leaves):
+        """Raise OSError where a write is bound to fail, before orbax begins it."""
+        if self._is_orphaned():
+            raise FileNotFoundError(f"{self._beside} is gone")
+        with tempfile.TemporaryFile(dir=self.folder):
+            pass
+        needed = sum(array.nbytes for array in leaves.values()) + SPARE_BYTES
+        free = shutil.disk_usage(self.folder).free
+        if free < needed:
+            raise OSError(
+                f"no space: it may take {needed / 1e6:.1f} MB and {free / 1e6:.1f} MB "
+                "are free"
+            )
+
+    def _is_orphaned(self):
+        return self._beside is not None and not self._beside.exists()
+
+    def _remove_unfinished(self):
+        for path in self.folder.glob(f"*{_UNFINISHED}*"):
+            shutil.rmtree(path, ignore_errors=True)
 
     def __enter__(self):
         return self
 
-    def __exit__(self, *_):
-        self.close()
+    def __exit__(self, kind, *_):
+        if kind is None:
+            self.close()
+        else:  # what ended the block is what to tell
+            self._writer.shutdown()
+
+
+def _write_arrays(folder, leaves):
+    """Through orbax's writer of arrays alone.
+
+    Its checkpointers and managers make their threads wait for each other by the wall
+    clock: after a failed write they keep the process for up to 300 s, and a clock that
+    is set ahead fails the save.
+    """
+    folder.mkdir(parents=True)
+    filled = {name: array for name, array in leaves.items() if array.size}
+    with _quiet_orbax(), contextlib.closing(_array_files()) as files:
+        # orbax refuses empty arrays
+        files.save(folder, args=ocp.args.StandardSave(filled))
+        files.finalize(folder)
+
+
+def _read_arrays(folder, expected):
+    with contextlib.closing(_array_files()) as files:
+        args = ocp.args.StandardRestore(expected)
+        return files.restore(folder, args=args)
+
+
+def _array_files():
+    return ocp.StandardCheckpointHandler()
+
+
+@contextlib.contextmanager
+def _quiet_orbax():
+    """Without orbax's log: it prints a traceback for every array it cannot write."""
+    logger = logging.getLogger("absl")
+    before = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
+
+
+def _write_text(path, text):
+    with path.open("w") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def steps(folder) -> list[int]:
@@ -111,8 +215,9 @@ def steps(folder) -> list[int]:
     folder = pathlib.Path(folder)
     if not folder.is_dir():
         return []
-    # A checkpoint being written has a suffix; orbax renames it when it is whole.
-    return sorted(int(path.name) for path in folder.iterdir() if path.name.isdigit())
+    # A checkpoint being written has a suffix until it is whole.
+    names = (path.name for path in folder.iterdir())
+    return sorted(int(name) for name in names if name.isascii() and name.isdigit())
 
 
 def latest(folder) -> int | None:
@@ -136,7 +241,7 @@ def restore(folder, example: PyTree, spec, *, step: int | None = None) -> Restor
         )
     if not present:
         raise ValueError(
-            f"{folder} holds no checkpoint; start the run without resuming"
+            f"{folder} holds no checkpoint; the run saves its first when it begins"
         )
     for candidate in [step] if step is not None else reversed(present):
         try:
@@ -162,6 +267,10 @@ class _Damaged(Exception):
     """A checkpoint that is not what was written."""
 
 
+class _Foreign(ValueError):
+    """A checkpoint that a newer version wrote."""
+
+
 def _encode(state):
     """Leaves by path as host arrays of their own, and what orbax does not keep."""
     leaves, about = {}, {}
@@ -172,32 +281,46 @@ def _encode(state):
             note["key"] = str(jax.random.key_impl(leaf))
             leaf = jax.random.key_data(leaf)
         # A copy: the loop overwrites its arrays while orbax still writes.
-        array = np.array(leaf, copy=True)
-        note |= {"dtype": str(array.dtype), "shape": list(array.shape)}
-        note["crc32"] = zlib.crc32(np.ascontiguousarray(array).view(np.uint8).data)
-        if array.size:  # orbax refuses empty arrays
-            leaves[name] = array
-        about[name] = note
+        leaves[name] = array = np.array(leaf, copy=True)
+        about[name] = note | {"dtype": str(array.dtype), "shape": list(array.shape)}
     return leaves, about
+
+
+def _checksum(array):
+    return zlib.crc32(np.ascontiguousarray(array).view(np.uint8).data)
+
+
+def _text_checksum(about):
+    """Of the notes but for their own checksum; the same before and after JSON."""
+    rest = {key: value for key, value in about.items() if key != "crc32"}
+    return zlib.crc32(json.dumps(rest, sort_keys=True).encode())
+
+
+def _read_about(folder):
+    about = json.loads((folder / _ABOUT).read_text())
+    if isinstance(about.get("format"), int) and about["format"] > FORMAT:
+        raise _Foreign(
+            f"checkpoint {folder} is of format {about['format']} and this version "
+            f"reads up to {FORMAT}; resume it with the version that saved it"
+        )
+    if about["crc32"] != _text_checksum(about):
+        raise _Damaged("its notes are not what was saved")
+    return about
 
 
 def _read(folder):
     """Leaves and notes of one checkpoint; _Damaged unless every byte is as written."""
     try:
-        checkpointer = ocp.Checkpointer(ocp.CompositeCheckpointHandler(_STATE, _ABOUT))
-        about = checkpointer.restore(
-            folder, args=ocp.args.Composite(**{_ABOUT: ocp.args.JsonRestore()})
-        )[_ABOUT]
+        about = _read_about(folder)
         notes = about["leaves"]
         expected = {
             name: np.empty(note["shape"], note["dtype"])
             for name, note in notes.items()
             if 0 not in note["shape"]
         }
-        leaves = checkpointer.restore(
-            folder,
-            args=ocp.args.Composite(**{_STATE: ocp.args.StandardRestore(expected)}),
-        )[_STATE]
+        leaves = _read_arrays(folder / _STATE, expected)
+    except (_Damaged, _Foreign):
+        raise
     except Exception as error:  # orbax and tensorstore raise whatever they meet
         raise _Damaged(
             f"{type(error).__name__}: {str(error).splitlines()[:1]}"
@@ -207,7 +330,7 @@ def _read(folder):
         array = np.empty(note["shape"], note["dtype"]) if empty else leaves[name]
         leaves[name] = array = np.asarray(array)
         # tensorstore fills a missing chunk with zeros and says nothing.
-        if zlib.crc32(np.ascontiguousarray(array).view(np.uint8).data) != note["crc32"]:
+        if _checksum(array) != note["crc32"]:
             raise _Damaged(f"{name} is not what was saved")
     return leaves, about
 
@@ -254,34 +377,3 @@ def _check_writable(folder):
             f"cannot write checkpoints to {folder}: {error.strerror}; "
             "choose a folder that can be written"
         ) from error
-
-
-def provenance() -> dict[str, Any]:
-    """What made a checkpoint: revision, versions, and what its last bits depend on."""
-    return {
-        "revision": revision(),
-        "python": sys.version.split()[0],
-        "jax": jax.__version__,
-        "numpy": np.__version__,
-        "device": jax.devices()[0].device_kind,
-        "x64": bool(jax.config.jax_enable_x64),
-    }
-
-
-def revision() -> str:
-    """Git revision this library runs from, with "+changes"; "unknown" outside git."""
-    here = pathlib.Path(__file__).resolve().parents[2]
-    if not (here / ".git").exists():  # installed, perhaps inside another repository
-        return "unknown"
-    command = "describe --always --exclude=* --dirty=+changes --abbrev=40"
-    try:
-        text = subprocess.run(
-            ["git", "-C", here, *command.split()],
-            capture_output=True,
-            text=True,
-            timeout=10,
-            check=True,
-        ).stdout
-    except (OSError, subprocess.SubprocessError):
-        return "unknown"
-    return text.strip()

@@ -156,7 +156,7 @@ def fit_code(
     `residual` is the length of the loss's gradient; at most `tolerance` (loss per unit
     of code) counts as converged. The code returned is never worse than the start, which
     is what comes back where the loss is not finite there. No derivatives. The solvers
-    are `CODE_SOLVERS`; experiments/solver_table measures them. "lbfgs" is optax's.
+    are `CODE_SOLVERS`; experiments.solver_table measures them. "lbfgs" is optax's.
     """
     check_positive(max_steps=max_steps, tolerance=tolerance)
     if solver not in CODE_SOLVERS:
@@ -269,7 +269,7 @@ CODE_SOLVERS: Mapping[str, CodeSolver] = {
     "optimistix-lbfgs": _optimistix("LBFGS"),
     "jaxopt-lbfgs": _jaxopt_lbfgs,
     # Rates of 0.01, 0.03, 0.1, 0.3 end 200 steps 6e-4, 5e-5, 1e-6, 6e-10 above the
-    # least loss of experiments/solver_table; beyond, 50 steps get worse.
+    # least loss of experiments.solver_table; beyond, 50 steps get worse.
     "adam": _optax(lambda steps: optax.adam(optax.cosine_decay_schedule(0.2, steps))),
 }
 

@@ -51,8 +51,9 @@ class FitResult(NamedTuple):
     state: TrainState
     history: History
     steps: int  # completed
-    stopped_by: str  # "steps", "seconds", "SIGINT", "SIGTERM" or "non-finite"
+    stopped_by: str  # "steps", "seconds", "non-finite" or a signal's name
     message: str  # one line for the user
+    unsaved: str = ""  # why the last state could not be saved
 
     @property
     def seconds(self) -> float:
@@ -86,9 +87,10 @@ def fit(
 ) -> FitResult:
     """Train until `steps` steps are completed in all, from wherever `state` is.
 
-    `seconds` bounds the wall time of this call. Ctrl-C, SIGTERM and a number that is
+    `seconds` bounds the time of this call. Ctrl-C, SIGTERM, SIGHUP and a number that is
     not finite, in a metric or anywhere in the state, end it too; whatever ends it, the
-    last good state is saved to `checkpoints` and returned. An event happens when its
+    last good state is saved to `checkpoints` and returned. A save that fails is told
+    and tried again with the next; it ends nothing. An event happens when its
     step is completed, before a checkpoint of that step, so a resumed run repeats the
     uninterrupted one bit for bit (on XLA:CPU with the same PJRT_NPROC). Pass the
     restored history on.
@@ -216,9 +218,10 @@ class _Run:
         for hook in self.hooks:
             if self._due(hook):
                 self._call(hook)
-        now = time.monotonic()
-        if self.checkpoints is not None and now - self.saved_at >= self.limits[1]:
-            self._save()
+        if self.checkpoints is not None:
+            self._tell_failed_save(self.checkpoints.failure())
+            if time.monotonic() - self.saved_at >= self.limits[1]:
+                self._save()
         if self.progress.due():
             row = self.history.rows[-1]
             metrics = {k: v for k, v in row.items() if k not in ("step", "seconds")}
@@ -250,7 +253,12 @@ class _Run:
             rows = (*self.history.evaluations, row)
             self.history = self.history._replace(evaluations=rows)
 
+    def _tell_failed_save(self, failure) -> None:
+        if failure is not None:
+            self.progress.say(f"warning: {failure}; training goes on")
+
     def _save(self) -> None:
+        self._tell_failed_save(self.checkpoints.failure(wait=True))
         self.checkpoints.save(self.state, self.step, self.history._asdict())
         self.saved_at = time.monotonic()
 
@@ -273,14 +281,17 @@ class _Run:
             message += f": {self.detail}"
         else:
             message += f" by {reason}"
+        failure = None
         if self.checkpoints is not None:
             self._save()
-            message += f"; saved in {self.checkpoints.folder}"
-            if reason not in ("steps", "non-finite"):
-                message += ", resume from there to go on"
-            self.checkpoints.wait()
+            failure = self.checkpoints.failure(wait=True)
+            if failure is None:
+                message += f"; saved in {self.checkpoints.folder}"
+                if reason not in ("steps", "non-finite"):
+                    message += ", resume from there to go on"
         self.progress.say(message)
-        return FitResult(self.state, self.history, self.step, reason, message)
+        unsaved = "" if failure is None else f"the last state is not saved: {failure}"
+        return FitResult(self.state, self.history, self.step, reason, message, unsaved)
 
 
 def _distinct(state: TrainState) -> TrainState:

@@ -85,8 +85,12 @@ def charbonnier(
     Charbonnier et al. 1994, with the offset taken out so that it is zero at zero.
     """
     _positive(width)
-    # The difference of roots would be 0 below s = 1e-8 at width 1e-2 in float32.
-    return residual_sq / (jnp.sqrt(residual_sq + width**2) + width)
+    # The difference of roots would be 0 below s = 1e-8 at width 1e-2 in float32, and
+    # the quotient is NaN where a square has become infinite.
+    near = residual_sq < 8 * width**2
+    small = jnp.where(near, residual_sq, 0)
+    quotient = small / (jnp.sqrt(small + width**2) + width)
+    return jnp.where(near, quotient, jnp.sqrt(residual_sq + width**2) - width)
 
 
 def huber(residual_sq: Float[Array, "*batch"], width: float) -> Float[Array, "*batch"]:

@@ -19,10 +19,9 @@ class Frames(NamedTuple):
     images: Any  # [frames, height, width, 3] uint8
     cameras: Camera
     times: Float[Array, " frames"]
-    warp: Int[Array, " frames"]
     appearance: Int[Array, " frames"]
     valid: Any  # [frames, height, width] bool, or None
-    # What a model reads only if it `wants` it:
+    # What a model reads only where its `required_data` says so:
     depths: Any = (
         None  # [frames, height, width] float32 z-depth, scene units; 0 unknown
     )
@@ -35,7 +34,6 @@ class View(NamedTuple):
 
     camera: Camera
     time: Float[Array, ""]
-    warp: Int[Array, ""]
     appearance: Int[Array, ""]
 
 
@@ -57,7 +55,7 @@ class TrainState(NamedTuple):
 
     params: PyTree
     optimiser: PyTree
-    extra: PyTree  # what the representation carries beside: row statistics, ...
+    aux_state: PyTree  # what the representation carries beside: row statistics, ...
     step: Int[Array, ""]
     key: Key[Array, ""]  # of the run; step i uses fold_in(key, i)
 
@@ -112,5 +110,7 @@ class Model(NamedTuple):
     render: Callable[[PyTree, View, tuple[int, int], Int[Array, ""]], Rendering]
     events: tuple[Event, ...]
     counts: Callable[[TrainState], dict[str, int]]  # {"gaussians": n, ...}
-    wants: frozenset[str] = frozenset()  # which of "depths", "points", "flow" it reads
+    required_data: frozenset[str] = (
+        frozenset()
+    )  # which of "depths", "points", "flow" it reads
     stages: Stages | None = None  # where rendering has parts worth keeping

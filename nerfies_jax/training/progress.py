@@ -1,5 +1,6 @@
 """How far a run is: a live bar on a terminal, a line every ten seconds elsewhere."""
 
+import contextlib
 import time
 
 import rich.console
@@ -34,7 +35,8 @@ class Progress:
 
     def __exit__(self, *_):
         if self._bar is not None:
-            self._bar.stop()
+            with contextlib.suppress(OSError):
+                self._bar.stop()
 
     def due(self) -> bool:
         """Whether enough time has passed to be worth an update."""
@@ -65,7 +67,9 @@ class Progress:
 
     def say(self, text: str) -> None:
         """One line that stays."""
-        self._console.print(text, highlight=False, markup=False, soft_wrap=True)
+        # A terminal that was closed must not keep its run from being saved.
+        with contextlib.suppress(OSError):
+            self._console.print(text, highlight=False, markup=False, soft_wrap=True)
 
 
 def duration(seconds: float) -> str:

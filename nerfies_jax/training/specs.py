@@ -158,7 +158,8 @@ def override(spec: Any, assignments: Iterable[str]) -> Any:
     """`spec` with `path.to.field=value` applied, each value read by the field's type.
 
     A field that holds another spec is set with a dotted path, which brings it in with
-    its defaults where it is none, or removed with `none` where its type allows it.
+    its defaults where it is none, or removed with `none` where its type allows it. The
+    name of a spec's class, as `config.json` has it, chooses one of several kinds.
     Raises ValueError for an unknown field or a wrong value.
     """
     for assignment in assignments:
@@ -192,11 +193,15 @@ def _absent(spec, name):
     """The defaults of an effect that is not there; None unless there is one choice."""
     options = typing.get_args(typing.get_type_hints(type(spec))[name])
     choices = [option for option in options if dataclasses.is_dataclass(option)]
-    return choices[0]() if len(choices) == 1 else None
+    return _defaults(choices[0], name) if len(choices) == 1 else None
 
 
 def _read(kind, text, path):
     options = typing.get_args(kind)
+    choices = [option for option in options if dataclasses.is_dataclass(option)]
+    named = {choice.__name__: choice for choice in choices}
+    if text in named:
+        return _defaults(named[text], path)
     if type(None) in options:
         if text.lower() == "none":
             return None
@@ -214,4 +219,21 @@ def _read(kind, text, path):
             return tuple(item(part) for part in text.split(",") if part)
     except ValueError:
         pass
+    if named:
+        kind = f"one of {', '.join(named)}"
     raise ValueError(f"--set {path}={text}: cannot be read as {kind}")
+
+
+def _defaults(spec_class, path):
+    """A spec as it is where nothing is said of its fields."""
+    needed = [
+        field.name
+        for field in dataclasses.fields(spec_class)
+        if field.default is field.default_factory is dataclasses.MISSING
+    ]
+    if needed:
+        raise ValueError(
+            f"--set {path}: {spec_class.__name__} has no defaults for "
+            f"{' and '.join(needed)}; choose a preset that has it"
+        )
+    return spec_class()

@@ -10,9 +10,9 @@ import pytest
 
 from nerfies_jax.effects import ambient
 from nerfies_jax.effects.ambient import AmbientSpec
-from nerfies_jax.effects.effect import MOMENT, Moment, Table
 from nerfies_jax.nets import mlp
 from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.training.effects import MOMENT, FrameCondition, Table
 from tests import gradients
 
 BENT = AmbientSpec(
@@ -28,11 +28,11 @@ PLANE = AmbientSpec(kind="plane", dims=3)
 OPEN = 11_000
 
 
-def moment(dtype, step=OPEN, seed=3):
+def condition(dtype, step=OPEN, seed=3):
     rng = np.random.default_rng(seed)
     codes = {"motion": rng.normal(size=4), "ambient": rng.normal(size=3)}
     codes = {name: jnp.asarray(code, dtype) for name, code in codes.items()}
-    return Moment(jnp.asarray(0.4, dtype), codes, jnp.int32(step))
+    return FrameCondition(jnp.asarray(0.4, dtype), codes, jnp.int32(step))
 
 
 started = jax.jit(ambient.init, static_argnums=(0, 2))
@@ -85,7 +85,7 @@ def slice_by_hand(params, point, when):
 def test_a_bent_slice_is_the_loop_over_its_layers(step, dtype, rng):
     params = bent_params(dtype)
     point = jnp.asarray(rng.uniform(-1, 1, 3), dtype)
-    when = moment(dtype, step)
+    when = condition(dtype, step)
     made = ambient.effect(BENT)
     exact = slice_by_hand(params, point, when)
     tolerance = {"float32": 3e-6, "float64": 1e-13}[dtype]
@@ -123,12 +123,12 @@ def test_while_shut_the_template_reads_zeros_and_nothing_learns(spec, dtype, rng
     params = bent_params(dtype) if spec.kind == "bent" else None
     point = jnp.asarray(rng.uniform(-1, 1, 3), dtype)
     pull = jnp.asarray(rng.normal(size=made.lift_width), dtype)
-    still = moment(dtype)
+    still = condition(dtype)
 
     @jax.jit
     def read(params, codes, step):
         def total(params, codes):
-            lifted = made.lift(params, point, Moment(still.time, codes, step))
+            lifted = made.lift(params, point, FrameCondition(still.time, codes, step))
             return pull @ lifted, lifted
 
         return jax.grad(total, argnums=(0, 1), has_aux=True)(params, codes)
@@ -149,7 +149,7 @@ def test_while_shut_the_template_reads_zeros_and_nothing_learns(spec, dtype, rng
 
 def test_identity_is_never_shut(dtype, rng):
     spec = dataclasses.replace(PLANE, encoding=EncodingSpec(1))
-    when = moment(dtype, 0)
+    when = condition(dtype, 0)
     lifted = ambient.effect(spec).lift(None, jnp.zeros(3, dtype), when)
     np.testing.assert_array_equal(lifted[:3], when.codes["ambient"])
     assert np.all(lifted[3:] == 0)
@@ -157,7 +157,7 @@ def test_identity_is_never_shut(dtype, rng):
 
 def test_an_encoding_without_bands_is_the_ambient_point(dtype):
     spec = dataclasses.replace(PLANE, encoding=EncodingSpec(0))
-    when = moment(dtype, 0)
+    when = condition(dtype, 0)
     lifted = ambient.effect(spec).lift(None, jnp.zeros(3, dtype), when)
     np.testing.assert_array_equal(lifted, when.codes["ambient"])
 
@@ -166,7 +166,7 @@ def test_a_plane_has_one_ambient_point_for_all_points(dtype, rng):
     made = ambient.effect(PLANE)
     assert made.init is None
     assert made.tables == (Table("ambient", MOMENT, 3),)
-    when = moment(dtype)
+    when = condition(dtype)
     points = jnp.asarray(rng.normal(size=(5, 3)), dtype)
     for point in points:
         found = ambient.ambient_point(PLANE, None, point, when)
@@ -186,7 +186,7 @@ def test_a_bent_slice_shares_the_code_of_the_warp_and_starts_flat():
     rng = np.random.default_rng(0)
     points = jnp.asarray(rng.uniform(-1, 1, (200, 3)), jnp.float32)
     codes = {"motion": jnp.full(8, 0.05)}
-    when = Moment(jnp.asarray(0.0), codes, jnp.int32(0))
+    when = FrameCondition(jnp.asarray(0.0), codes, jnp.int32(0))
     found = jax.vmap(lambda x: ambient.ambient_point(spec, params, x, when))(points)
     # 64 features of size one, each times 1e-5, of random sign
     assert 0 < np.abs(found).max() < 1e-3
@@ -197,7 +197,7 @@ def test_a_bent_slice_shares_the_code_of_the_warp_and_starts_flat():
 
 
 def test_a_slice_has_its_slopes_in_point_code_and_weights(float64, rng):
-    params, when = bent_params(float64), moment(float64, 7000)
+    params, when = bent_params(float64), condition(float64, 7000)
     made = ambient.effect(BENT)
     pull = jnp.asarray(rng.normal(size=made.lift_width))
 

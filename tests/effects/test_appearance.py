@@ -11,13 +11,13 @@ import pytest
 from nerfies_jax import evaluation, presets, scene
 from nerfies_jax.effects import appearance
 from nerfies_jax.effects.appearance import AppearanceSpec
-from nerfies_jax.effects.effect import APPEARANCE, Moment, Table
-from nerfies_jax.facts import Facts
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.radiance.template import TemplateSpec
+from nerfies_jax.render_ray import Ray
 from nerfies_jax.scene import RadianceScene
+from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.spec import SamplingSpec
-from nerfies_jax.tracing import Ray
+from nerfies_jax.training.effects import APPEARANCE, FrameCondition, Table, weighted_sum
 from tests import gradients, scenes
 
 TINY = RadianceScene(
@@ -29,7 +29,7 @@ TINY = RadianceScene(
     sampling=SamplingSpec(5, 3, jitter=False),
     appearance=AppearanceSpec(width=3),
 )
-FACTS = Facts(
+METADATA = SceneMetadata(
     near=1.0,
     far=3.0,
     centre=(0.0, 0.0, 0.0),
@@ -59,17 +59,19 @@ def ray(dtype):
     return Ray(jnp.asarray(origin, dtype), jnp.asarray(direction, dtype), near, far)
 
 
-def moment(code):
-    return Moment(jnp.asarray(0.5, code.dtype), {"appearance": code}, jnp.int32(0))
+def condition(code):
+    return FrameCondition(
+        jnp.asarray(0.5, code.dtype), {"appearance": code}, jnp.int32(0)
+    )
 
 
 @functools.cache
 def tracer():
-    return jax.jit(scene.field(TINY, FACTS).trace)
+    return jax.jit(scene.field(TINY, METADATA).render_ray)
 
 
 def params_of(dtype):
-    params = scene.field(TINY, FACTS).init(jax.random.key(0))
+    params = scene.field(TINY, METADATA).init(jax.random.key(0))
     return jax.tree.map(lambda leaf: leaf.astype(dtype), params)
 
 
@@ -79,7 +81,7 @@ def test_the_condition_is_the_code_itself(dtype, rng):
     assert made.name == "appearance"
     assert made.tables == (Table("appearance", APPEARANCE, 3),)
     assert made.condition_width == 3
-    found = made.condition(None, moment(code))
+    found = made.condition(None, condition(code))
     assert found.dtype == dtype
     np.testing.assert_array_equal(found, code)
 
@@ -88,7 +90,7 @@ def test_effects_may_share_a_named_table():
     made = appearance.effect(AppearanceSpec(width=3, table="exposure"))
     assert made.tables == (Table("exposure", APPEARANCE, 3),)
     codes = {"exposure": jnp.arange(3.0), "appearance": jnp.zeros(3)}
-    found = made.condition(None, Moment(jnp.asarray(0.0), codes, jnp.int32(0)))
+    found = made.condition(None, FrameCondition(jnp.asarray(0.0), codes, jnp.int32(0)))
     np.testing.assert_array_equal(found, np.arange(3.0))
 
 
@@ -101,13 +103,13 @@ def test_a_code_without_numbers_is_refused(width):
 def test_codes_change_the_colour_and_never_the_geometry(dtype):
     params = params_of(dtype)
     first, second = (
-        tracer()(params, ray(dtype), moment(jnp.full(3, value, dtype)))
+        tracer()(params, ray(dtype), condition(jnp.full(3, value, dtype)))
         for value in (0.0, 2.0)
     )
     for one, other in zip(first, second, strict=True):
         np.testing.assert_array_equal(one.static_weight, other.static_weight)
-        np.testing.assert_array_equal(one.distance, other.distance)
-        assert one.depth == other.depth
+        np.testing.assert_array_equal(one.distances, other.distances)
+        assert one.distance == other.distance
         # both levels read it; a reimplementation of NeRF-W leaves the coarse one out
         assert np.abs(one.colour - other.colour).max() > 1e-2
 
@@ -116,10 +118,10 @@ def test_colour_has_the_code_s_slope(float64, rng):
     params = params_of(float64)
     pull = jnp.asarray(rng.normal(size=3))
     plain = dataclasses.replace(TINY, sampling=SamplingSpec(4, 0, jitter=False))
-    trace = scene.field(plain, FACTS).trace
+    render = scene.field(plain, METADATA).render_ray
 
     def shade(code):
-        levels = trace(params, ray(float64), moment(code))
+        levels = render(params, ray(float64), condition(code))
         return sum(jnp.sum(pull * level.colour) for level in levels)
 
     code = jnp.asarray(rng.normal(size=3))
@@ -145,17 +147,15 @@ def test_codes_of_every_preset_learn(name):
         warp = dataclasses.replace(spec.warp, depth=1, width=8, skips=())
         spec = dataclasses.replace(spec, warp=warp)
     capture = scenes.tiny_capture()
-    facts = scene.facts_of(capture, spec)
-    made = scene.field(spec, facts)
-    frames = evaluation.frames_of(capture, scene.build(spec, facts).wants)
+    metadata = scene.metadata_of(capture, spec)
+    made = scene.field(spec, metadata)
+    frames = evaluation.frames_of(capture, scene.build(spec, metadata).required_data)
     params = made.init(jax.random.key(0))
     keys = jax.random.split(jax.random.key(1))
     batch = scene.draw_batch(frames, spec.rays, keys[0])
 
     def loss(codes):
         terms = scene.loss_terms(
-            spec,
-            facts,
             made,
             params | {"codes": params["codes"] | {"appearance": codes}},
             frames,
@@ -163,7 +163,7 @@ def test_codes_of_every_preset_learn(name):
             jnp.int32(0),
             keys[1],
         )
-        return sum(term.weight * term.value for term in terms.values())
+        return weighted_sum(terms)
 
     slope = jax.jit(jax.grad(loss))(params["codes"]["appearance"])
     assert np.all(np.isfinite(slope))

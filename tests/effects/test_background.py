@@ -7,9 +7,10 @@ import pytest
 
 from nerfies_jax.effects import background, warp
 from nerfies_jax.effects.background import BackgroundSpec
-from nerfies_jax.effects.effect import Box, Context, Moment
+from nerfies_jax.effects.effect import Box
 from nerfies_jax.effects.warp import WarpSpec
 from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.training.effects import FrameCondition, PenaltyContext
 from nerfies_jax.training.model import Frames
 from tests import gradients
 
@@ -18,14 +19,14 @@ CENTRE, SCALE = np.array([1.0, -2.0, 3.0]), 0.25
 
 def context(displace, points, frames, dtype, key=0):
     """Frame k is at time k / 10."""
-    fields = dict.fromkeys(Context._fields)
+    fields = dict.fromkeys(PenaltyContext._fields)
     times = jnp.arange(frames, dtype=dtype) / 10
     seen = Frames(**dict.fromkeys(Frames._fields))
-    return Context(
+    return PenaltyContext(
         **fields
         | {
             "displace": displace,
-            "moment_of": lambda row: Moment(times[row], {}, jnp.int32(0)),
+            "condition_of": lambda row: FrameCondition(times[row], {}, jnp.int32(0)),
             "frames": seen._replace(points=jnp.asarray(points, dtype), times=times),
             "box": Box(jnp.asarray(CENTRE, dtype), jnp.asarray(SCALE, dtype)),
             "key": jax.random.key(key),
@@ -55,9 +56,9 @@ def test_points_are_seen_in_the_field_in_all_frames(scaling, dtype, rng):
     spec = BackgroundSpec(points=6000, noise=0.5, width=0.2, scaling=scaling)
     asked = []
 
-    def displace(x, moment):
-        x = overheard(asked, x, moment.time)
-        return 0.1 * x + moment.time
+    def displace(x, condition):
+        x = overheard(asked, x, condition.time)
+        return 0.1 * x + condition.time
 
     here = context(displace, points, 7, dtype)
     value = background.effect(spec).penalty(None, here)["background"].value
@@ -86,8 +87,8 @@ def test_of_many_points_as_many_as_asked_are_drawn(float64, rng):
     for key in range(2):
         asked = []
 
-        def displace(x, moment, asked=asked):
-            return 0 * overheard(asked, x, moment.time)
+        def displace(x, condition, asked=asked):
+            return 0 * overheard(asked, x, condition.time)
 
         assert background.drift(spec, context(displace, points, 3, "float64", key)) == 0
         rows = asked[0][0] / SCALE + CENTRE
@@ -132,7 +133,7 @@ def test_gradients(float64, rng):
     points = rng.normal(size=(30, 3)) + CENTRE
 
     def total(params):
-        displace = lambda x, moment: warp.displace(spec, params, x, moment)  # noqa: E731
+        displace = lambda x, condition: warp.displace(spec, params, x, condition)  # noqa: E731
         here = context(displace, points, 4, "float64")
         return background.drift(BackgroundSpec(width=0.1, scaling="paper"), here)
 
@@ -142,7 +143,7 @@ def test_gradients(float64, rng):
 def test_seams_of_the_effect():
     seams = background.effect(BackgroundSpec())
     assert seams.name == "background"
-    assert seams.wants == {"points"}
+    assert seams.required_data == {"points"}
     assert seams.init is None
     assert seams.tables == ()
 

@@ -10,10 +10,11 @@ import pytest
 
 from nerfies_jax import evaluation, scene
 from nerfies_jax.effects import scene_flow
-from nerfies_jax.effects.effect import Moment, Sample
+from nerfies_jax.effects.effect import Sample
 from nerfies_jax.effects.scene_flow import FlowWeights, SceneFlowSpec
 from nerfies_jax.scene import RadianceScene
 from nerfies_jax.spec import SamplingSpec
+from nerfies_jax.training.effects import FrameCondition
 from tests import gradients, scenes
 from tests.scene_flow_rays import (
     BOX_CENTRE,
@@ -79,10 +80,10 @@ def test_terms_with_a_weight_of_zero_are_not_there(float64):
     params, frames, batch, arrays = scenario("float64")
     spec = dataclasses.replace(TINY, weights=FlowWeights(**dict.fromkeys(NAMES, 0.0)))
     assert terms_of(spec, params, frames, batch, arrays, 0) == {}
-    assert scene_flow.effect(spec, 4, FEATURES).wants == frozenset()
+    assert scene_flow.effect(spec, 4, FEATURES).required_data == frozenset()
     only_flow = dataclasses.replace(spec, weights=FlowWeights(depth=0.0))
-    assert scene_flow.effect(only_flow, 4, FEATURES).wants == {"flow"}
-    assert scene_flow.effect(TINY, 4, FEATURES).wants == {"flow", "depths"}
+    assert scene_flow.effect(only_flow, 4, FEATURES).required_data == {"flow"}
+    assert scene_flow.effect(TINY, 4, FEATURES).required_data == {"flow", "depths"}
 
 
 NAMES = tuple(field.name for field in dataclasses.fields(FlowWeights))
@@ -269,8 +270,8 @@ def test_the_medium_starts_still_and_undecided(dtype):
     sample = Sample(
         point, jnp.asarray([0.0, 0.6, 0.8], dtype), jnp.ones(FEATURES, dtype)
     )
-    moment = Moment(jnp.asarray(0.4, dtype), {}, jnp.asarray(0))
-    found = scene_flow.medium(TINY, params, sample, moment)
+    condition = FrameCondition(jnp.asarray(0.4, dtype), {}, jnp.asarray(0))
+    found = scene_flow.medium(TINY, params, sample, condition)
     assert np.abs(found.extras["flow_forward"]).max() < 1e-3 * TINY.flow_bound
     assert np.abs(found.extras["disocclusion"]).max() < 1e-2
     assert abs(found.share) < 1e-2
@@ -312,9 +313,9 @@ def test_flow_stays_within_its_bound(dtype):
 def test_the_blending_says_what_width_it_was_built_for(float64):
     params = scenario("float64")[0]
     sample = Sample(jnp.zeros(3), jnp.zeros(3), jnp.zeros(FEATURES + 1))
-    moment = Moment(jnp.zeros(()), {}, jnp.asarray(0))
+    condition = FrameCondition(jnp.zeros(()), {}, jnp.asarray(0))
     with pytest.raises(ValueError, match=r"reads 7 features .* has 8"):
-        scene_flow.medium(TINY, params, sample, moment)
+        scene_flow.medium(TINY, params, sample, condition)
 
 
 @pytest.mark.parametrize(
@@ -347,11 +348,11 @@ def test_a_scene_with_it_learns_from_pictures_depth_and_flow():
         rate_end=1e-3,
         scene_flow=TINY,
     )
-    facts = scene.facts_of(capture, spec)
-    model = scene.build(spec, facts)
-    assert model.wants == {"depths", "flow"}
+    metadata = scene.metadata_of(capture, spec)
+    model = scene.build(spec, metadata)
+    assert model.required_data == {"depths", "flow"}
     state = model.init(capture, jax.random.key(0))
-    frames = evaluation.frames_of(capture, model.wants)
+    frames = evaluation.frames_of(capture, model.required_data)
     first, step, losses = state.params, jax.jit(model.step), []
     for _ in range(30):
         state, metrics = step(state, frames)
@@ -363,7 +364,7 @@ def test_a_scene_with_it_learns_from_pictures_depth_and_flow():
     moved = jax.tree.map(lambda a, b: bool((a != b).any()), first, state.params)
     assert all(jax.tree.leaves(moved["scene_flow"]))
     both, still = (
-        scene.field(spec, facts, without) for without in ((), ("scene_flow",))
+        scene.field(spec, metadata, without) for without in ((), ("scene_flow",))
     )
     view = evaluation.view_of(capture, 0)
     pictures = [

@@ -23,9 +23,11 @@ def test_a_weighted_mean_of_nothing_is_zero_with_a_slope_of_zero(dtype):
 
 
 @pytest.mark.hard_cases
-def test_small_weights_count_like_large_ones(dtype):
+@pytest.mark.parametrize("size", [1e-12, 1e38])
+def test_weights_count_alike_whatever_their_size(size, dtype):
+    """1e-8 added to small ones would leave 2e-3; 1 / 3e38 is no normal number."""
     values = np.asarray([[1.0, 3.0], [5.0, 7.0], [9.0, 9.0]], dtype)
-    weight = np.asarray([1e-12, 3e-12, 0], dtype)  # 1e-8 added would leave 2e-3
+    weight = np.asarray([size, 3 * size, 0], dtype)
     value, _ = weighted_mean(values, weight)
     np.testing.assert_allclose(value, 5, rtol=1e-6)
 

@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 from nerfies_jax.effects import time_condition
-from nerfies_jax.effects.effect import MOMENT, Moment, Table
 from nerfies_jax.effects.time_condition import TimeSpec
 from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.training.effects import MOMENT, FrameCondition, Table
 from tests import gradients
 
 BY_CODE = TimeSpec(condition="code", code_width=5)
 
 
-def moment(dtype, time, code=()):
+def condition(dtype, time, code=()):
     codes = {"motion": jnp.asarray(code, dtype)}
-    return Moment(jnp.asarray(time, dtype), codes, jnp.int32(7))
+    return FrameCondition(jnp.asarray(time, dtype), codes, jnp.int32(7))
 
 
 def by_hand(encoding, time):
@@ -37,7 +37,7 @@ def by_hand(encoding, time):
 def test_the_template_reads_the_encoded_time(encoding, time, dtype, rng):
     made = time_condition.effect(TimeSpec(encoding))
     point = jnp.asarray(rng.normal(size=3), dtype)
-    found = jax.jit(lambda when: made.lift(None, point, when))(moment(dtype, time))
+    found = jax.jit(lambda when: made.lift(None, point, when))(condition(dtype, time))
     assert found.dtype == dtype
     assert found.shape == (made.lift_width,)
     exact = by_hand(encoding, float(np.asarray(time, dtype)))
@@ -51,7 +51,7 @@ def test_by_code_it_is_the_frame_s_code(dtype, rng):
     code = jnp.asarray(rng.normal(size=5), dtype)
     assert made.tables == (Table("motion", MOMENT, 5),)
     assert made.lift_width == 5
-    found = made.lift(None, jnp.zeros(3, dtype), moment(dtype, 0.2, code))
+    found = made.lift(None, jnp.zeros(3, dtype), condition(dtype, 0.2, code))
     assert found.dtype == dtype
     np.testing.assert_array_equal(found, code)
 
@@ -70,7 +70,7 @@ def test_time_has_a_slope(float64, rng):
 
     def read(time):
         found = time_condition.features(
-            TimeSpec(), moment(float64, 0)._replace(time=time)
+            TimeSpec(), condition(float64, 0)._replace(time=time)
         )
         return pull @ found
 

@@ -8,26 +8,23 @@ import numpy as np
 import pytest
 
 from nerfies_jax.effects import transient
-from nerfies_jax.effects.effect import (
+from nerfies_jax.effects.effect import Batch, Medium, RayOutput, Sample
+from nerfies_jax.effects.transient import TransientSpec
+from nerfies_jax.training.effects import (
     APPEARANCE,
-    Batch,
-    Context,
-    Level,
-    Medium,
-    Moment,
-    Sample,
+    FrameCondition,
+    PenaltyContext,
     Table,
 )
-from nerfies_jax.effects.transient import TransientSpec
 from tests import gradients
 
 SPEC = TransientSpec(code_width=3, depth=2, width=8)
 FEATURES = 6
 
 
-def moment(dtype, seed=1):
+def condition(dtype, seed=1):
     code = np.random.default_rng(seed).normal(size=3)
-    return Moment(
+    return FrameCondition(
         jnp.asarray(0.4, dtype),
         {"transient": jnp.asarray(code, dtype)},
         jnp.int32(0),
@@ -86,7 +83,7 @@ def loss_by_hand(colour, truth, beta, valid):
 
 
 def test_the_medium_is_the_loop_over_its_layers(dtype):
-    params, found, when = params_of(dtype), sample(dtype), moment(dtype)
+    params, found, when = params_of(dtype), sample(dtype), condition(dtype)
     made = transient.effect(SPEC, FEATURES)
     medium = jax.jit(made.medium)(params, found, when)
     tolerance = {"float32": 2e-6, "float64": 1e-14}[dtype]
@@ -114,7 +111,7 @@ def test_one_code_for_each_exposure_is_asked_for():
 
 def test_the_trunk_learns_from_the_transient(float64, rng):
     """The gradient is not stopped, and it is right, for features, code and weights."""
-    params, found, when = params_of(float64), sample(float64), moment(float64)
+    params, found, when = params_of(float64), sample(float64), condition(float64)
     pull = jnp.asarray(rng.normal(size=5))
 
     def read(params, features, code):
@@ -136,7 +133,7 @@ def test_the_trunk_learns_from_the_transient(float64, rng):
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("size", [1e3, 1e30])
 def test_wild_features_leave_the_medium_finite_and_not_negative(size, dtype):
-    params, when = params_of(dtype), moment(dtype)
+    params, when = params_of(dtype), condition(dtype)
     for sign in (-1, 1):
         found = sample(dtype)._replace(features=np.full(FEATURES, sign * size, dtype))
         medium = jax.tree.map(np.asarray, medium_of(SPEC, params, found, when))
@@ -266,9 +263,9 @@ def context(dtype, density, valid):
     medium = Medium(
         jnp.asarray(density, dtype), jnp.zeros((*np.shape(density), 3), dtype)
     )
-    nothing = Level(**dict.fromkeys(Level._fields))
+    nothing = RayOutput(**dict.fromkeys(RayOutput._fields))
     batch = Batch(**dict.fromkeys(Batch._fields))
-    return Context(**dict.fromkeys(Context._fields))._replace(
+    return PenaltyContext(**dict.fromkeys(PenaltyContext._fields))._replace(
         levels=(nothing, nothing._replace(media={"transient": medium})),
         batch=batch._replace(valid=jnp.asarray(valid)),
     )

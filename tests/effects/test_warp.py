@@ -11,9 +11,9 @@ import pytest
 import scipy.linalg
 
 from nerfies_jax.effects import warp
-from nerfies_jax.effects.effect import MOMENT, Moment, Table
 from nerfies_jax.effects.warp import WarpSpec
 from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.training.effects import MOMENT, FrameCondition, Table
 from tests import gradients
 
 SMALL = WarpSpec(
@@ -26,9 +26,9 @@ SMALL = WarpSpec(
 )
 
 
-def moment(dtype, time=0.4, width=4, step=0, seed=3):
+def condition(dtype, time=0.4, width=4, step=0, seed=3):
     code = np.random.default_rng(seed).normal(size=width)
-    return Moment(
+    return FrameCondition(
         jnp.asarray(time, dtype), {"motion": jnp.asarray(code, dtype)}, jnp.int32(step)
     )
 
@@ -104,7 +104,7 @@ def compiled(spec):
 @pytest.mark.parametrize("step", [0, 7, 100])
 def test_points_move_as_the_matrix_exponential_says(kind, condition, step, dtype, rng):
     spec = dataclasses.replace(SMALL, kind=kind, condition=condition, anneal_steps=20)
-    params, when = bent(spec, dtype), moment(dtype, step=step)
+    params, when = bent(spec, dtype), condition(dtype, step=step)
     for point in jnp.asarray(rng.uniform(-1, 1, (4, 3)), dtype):
         moved = compiled(spec)(params, point, when)
         assert moved.dtype == dtype
@@ -118,7 +118,7 @@ def test_points_move_as_the_matrix_exponential_says(kind, condition, step, dtype
 
 def test_samples_of_a_ray_share_the_product_of_their_code(float64, rng):
     spec = SMALL
-    params, when = bent(spec, "float64"), moment("float64")
+    params, when = bent(spec, "float64"), condition("float64")
     points = jnp.asarray(rng.uniform(-1, 1, (7, 3)))
     along = jax.vmap(functools.partial(warp.displace, spec, params), in_axes=(0, None))
     truth = np.stack([by_hand(spec, params, x, when) for x in points])
@@ -136,14 +136,16 @@ def test_samples_of_a_ray_share_the_product_of_their_code(float64, rng):
 def test_every_warp_starts_as_the_identity(kind, anneal_steps, rng):
     spec = WarpSpec(kind=kind, anneal_steps=anneal_steps)
     points = rng.uniform(-1, 1, (300, 3)).astype(np.float32)
-    when = moment("float32", width=8)
+    when = condition("float32", width=8)
     code = np.float32(0.05) * when.codes["motion"]
     displaced = jax.vmap(functools.partial(warp.displace, spec), (None, 0, None))
 
     @jax.jit
     def run(params):
         def total(params, step):
-            moved = displaced(params, points, Moment(when.time, {"motion": code}, step))
+            moved = displaced(
+                params, points, FrameCondition(when.time, {"motion": code}, step)
+            )
             squared = jnp.sum(moved**2, axis=-1)
             return jnp.sum(squared), jnp.max(squared)
 
@@ -191,7 +193,7 @@ def test_a_shut_window_leaves_the_point_alone_to_be_read(float64, rng):
     assert warp.window(SMALL, jnp.int32(0), like) is None
     params = bent(spec, "float64")
     point = jnp.asarray(rng.uniform(-1, 1, 3))
-    when = moment("float64", step=0)
+    when = condition("float64", step=0)
     flat = dataclasses.replace(SMALL, position=EncodingSpec(0), anneal_steps=None)
     rows = [0, 1, 2, -4, -3, -2, -1]  # the point's and the code's
 
@@ -224,7 +226,9 @@ def test_time_zero_is_the_template(kind, dtype, rng):
     point = rng.uniform(-1, 1, 3).astype(dtype)
 
     def moved(params, point, time):
-        return warp.displace(spec, params, point, Moment(time, {}, jnp.int32(0)))
+        return warp.displace(
+            spec, params, point, FrameCondition(time, {}, jnp.int32(0))
+        )
 
     @jax.jit
     def every(*args):
@@ -248,7 +252,7 @@ def test_gradients(kind, condition, float64, rng):
     target = jnp.asarray(rng.normal(size=3))
 
     def total(params, point, code, time):
-        when = Moment(time, {"motion": code}, jnp.int32(11))
+        when = FrameCondition(time, {"motion": code}, jnp.int32(11))
         return jnp.sum((warp.displace(spec, params, point, when) - target) ** 2)
 
     code = jnp.asarray(rng.normal(size=4))
@@ -271,7 +275,7 @@ def by_biases(w, v, x):
             "angular": blank["angular"]._replace(bias=w),
             "linear": blank["linear"]._replace(bias=v),
         }
-        return warp.displace(spec, params._replace(heads=heads), x, moment(w.dtype))
+        return warp.displace(spec, params._replace(heads=heads), x, condition(w.dtype))
 
     return moved(w, v, x), jax.jacfwd(moved, (0, 1, 2))(w, v, x)
 
@@ -342,7 +346,7 @@ def strain_slopes(times_pi, params, point):
     spec = encoded(times_pi)
 
     def strain(params, point):
-        when = moment(point.dtype)
+        when = condition(point.dtype)
         jacobian = jax.jacfwd(lambda x: warp.displace(spec, params, x, when))(point)
         return jnp.sum(jacobian**2)
 

@@ -172,7 +172,7 @@ def test_a_frame_costs_what_it_costs_with_its_share_of_the_poses():
 def moving():
     """A deformable scene that moves, its state at the last step."""
     capture = scenes.tiny_capture()
-    model = scene.build(scenes.TINY_DEFORMABLE, scene.facts_of(capture))
+    model = scene.build(scenes.TINY_DEFORMABLE, scene.metadata_of(capture))
     state = model.init(capture, jax.random.key(0))
     nets = jax.tree.map(lambda leaf: leaf + 0.02, state.params.nets)
     params = state.params._replace(nets=nets)

@@ -10,10 +10,12 @@ import types
 
 import pytest
 
-from experiments import cli
-from experiments.ablate import __main__ as ablate
-from experiments.ablate import pool
+from experiments.ablate import job as ablate_job
+from experiments.ablate import pool, worker
 from experiments.ablate.arms import Arm
+from experiments.ablate.settings import Ablate
+from nerfies_jax.runs import platform
+from nerfies_jax.runs.config import CaptureSource
 
 # A process that stands for an arm: it does what its own file says.
 ARM = """
@@ -29,12 +31,12 @@ if name == "bad":
 
 
 class Job:
-    """As `ablate_job.Job`, of arms that only wait."""
+    """As `experiments.ablate.job.Job`, of arms that only wait."""
 
     def __init__(self, out, names, seeds, seconds=0.2, **asked):
         self.out, self.wait, self.budgets = out, seconds, [None]
         self.every = [(name, seed) for seed in range(seeds) for name in names]
-        self.asked = ablate.Ablate(**asked)
+        self.asked = Ablate(**asked)
         arms = {name: Arm("nerf-small") for name in names}
         self.suite = types.SimpleNamespace(arms=arms)
 
@@ -83,7 +85,7 @@ def test_no_more_run_at_once_than_asked_for_and_what_is_there_is_left(tmp_path, 
 
 def test_over_seconds_later_seeds_wait_for_the_first_of_their_arm(tmp_path, capsys):
     job = Job(tmp_path, ["a", "bad"], 2, jobs=4)
-    job.asked = ablate.Ablate(jobs=4, seconds=1.0)
+    job.asked = Ablate(jobs=4, seconds=1.0)
     assert sorted(pool.run(job)) == [("bad", 0), ("bad", 1)]
     assert job.time_of("a", 1, "begun") > job.time_of("a", 0, "ended")
     error = capsys.readouterr().err
@@ -135,28 +137,35 @@ def test_a_signal_ends_every_process(tmp_path, monkeypatch, number, code):
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
-def test_the_command_has_the_same_settings_for_one_arm(monkeypatch):
+def test_a_process_takes_the_settings_of_its_arm_from_their_file(tmp_path, monkeypatch):
     monkeypatch.undo()  # of what every test here has
-    asked = ablate.Ablate(
+    asked = Ablate(
         suite="sonata",
         arms=("full", "static"),
+        source=CaptureSource(pathlib.Path("a folder"), max_side=64),
         steps=30,
         seeds=3,
         jobs=4,
         budget=5.0,
-        max_side=64,
-        capture=pathlib.Path("a folder"),
-        set=("density.most=99", "sh_degree=0"),
+        set=("densification.cap_max=99", "sh_degree=0"),
     )
-    job = types.SimpleNamespace(asked=asked, out=pathlib.Path("there"))
-    words = pool.command(job, "full", 2)
-    found = cli.parse(ablate.Ablate, words[3:])
-    assert found == dataclasses.replace(
-        asked,
-        arms=("full",),
-        seed=2,
-        seeds=None,
-        jobs=1,
-        budget=None,
-        out=pathlib.Path("there"),
-    )
+    (tmp_path / "logs").mkdir()
+    words = pool.command(types.SimpleNamespace(asked=asked, out=tmp_path), "full", 2)
+    assert words[:3] == [sys.executable, "-m", worker.__name__]
+    taken, started = [], []
+
+    def job(asked):
+        taken.append(asked)
+        return types.SimpleNamespace(run=list)  # nothing failed
+
+    monkeypatch.setattr(ablate_job, "Job", job)
+    monkeypatch.setattr(platform, "start_jax", lambda *given: started.append(given))
+    with pytest.raises(SystemExit) as stop:
+        worker.main(*words[3:])
+    assert stop.value.code == 0
+    assert started == [("auto", "one")]
+    assert taken == [
+        dataclasses.replace(
+            asked, arms=("full",), seed=2, jobs=1, budget=None, out=tmp_path
+        )
+    ]

@@ -7,13 +7,14 @@ import pytest
 from experiments import reconstruct
 from nerfies_jax import runs
 from nerfies_jax.capture import nerfies_format
+from nerfies_jax.runs import run_folder
 from nerfies_jax.training import checkpoint
 from tests import scenes
 from tests.hard_cases import hostile
 
 pytestmark = pytest.mark.slow
 
-SPLATS = ("density=none", "sh_degree=0")
+SPLATS = ("densification=none", "sh_degree=0")
 FIELD = (
     "rays=16",
     "sampling.coarse=4",
@@ -41,7 +42,7 @@ def held(folder):
     run = runs.saved_run(folder)
     restored = runs.restore(folder, run)
     assert not hostile.not_finite(restored.state)
-    assert restored.step == checkpoint.latest(folder / runs.CHECKPOINTS)
+    assert restored.step == checkpoint.latest(folder / run_folder.CHECKPOINTS)
     return restored.step
 
 
@@ -49,7 +50,11 @@ def held(folder):
 def test_splats_that_blow_up_say_where_and_exit_with_one(tmp_path, capsys):
     # One update of an opacity by 3e38 stays in float32, the second does not.
     code, printed, folder = reconstruct_at(
-        tmp_path, capsys, "splats-static-small", "rates.opacity_logit=3e38", *SPLATS
+        tmp_path,
+        capsys,
+        "splats-static-small",
+        "learning_rates.opacity_logit=3e38",
+        *SPLATS,
     )
     assert code == 1
     last = printed.err.splitlines()[-1]

@@ -2,24 +2,22 @@
 
 import json
 
-import numpy as np
 import pytest
 
 from experiments import compare
 from nerfies_jax.runs import curves
+from nerfies_jax.runs.config import CaptureSource, RunConfig
+from nerfies_jax.training import specs
 from nerfies_jax.training.loop import History
 
-CHOICES = {"capture": "/films/cat", "scene": "default", "preset": "nerf", "seed": 0}
+
+def stored(film):
+    """What a run of a film has in its config.json, as far as it is compared."""
+    config = RunConfig("nerf", CaptureSource(f"/films/{film}"))
+    return json.dumps({"config": specs.as_json(config)})
 
 
-def curve(seconds, psnr):
-    count = len(seconds)
-    return curves.Curve(
-        tuple(seconds), tuple(range(count)), tuple(psnr), (0.5,) * count, ("a",), 1, {}
-    )
-
-
-def run_folder(folder, psnr, seconds=(1.0, 3.0), **choices):
+def run_folder(folder, psnr, seconds=(1.0, 3.0)):
     """A finished run: its curve ends at the last of `psnr`."""
     folder.mkdir(parents=True)
     rows = [
@@ -32,34 +30,8 @@ def run_folder(folder, psnr, seconds=(1.0, 3.0), **choices):
     curves.write(folder, history, ["frame 3"])
     metrics = {"heldout.psnr": psnr[-1], "train.seconds": seconds[-1]}
     (folder / "metrics.json").write_text(json.dumps(metrics))
-    stored = {"choices": CHOICES | choices}
-    (folder / "config.json").write_text(json.dumps(stored))
+    (folder / "config.json").write_text(stored("cat"))
     return folder
-
-
-def test_time_to_a_quality_is_read_off_the_curve():
-    rising = curve([1, 3, 5], [10, 20, 20])
-    assert curves.seconds_to(rising, 15) == pytest.approx(2)
-    assert curves.seconds_to(rising, 20) == pytest.approx(3)
-    assert curves.seconds_to(rising, 5) == 1
-    assert curves.seconds_to(rising, 20.1) is None
-    assert curves.seconds_to(curve([], []), 5) is None
-
-
-def test_a_quality_that_was_lost_again_counts_from_the_last_crossing():
-    assert curves.seconds_to(curve([0, 1, 2, 3], [21, 22, 18, 22]), 20) == 2.5
-    assert curves.seconds_to(curve([0, 1], [21, 19]), 20) is None
-    assert curves.seconds_to(curve([0, 1], [np.nan, 22]), 20) == 1
-
-
-def test_a_curve_comes_back_as_it_was_written(tmp_path):
-    found = curves.read(run_folder(tmp_path / "run", (12.5, np.nan)))
-    assert found.seconds == (1.0, 3.0)
-    assert found.psnr[0] == 12.5
-    assert np.isnan(found.psnr[1])
-    assert found.frames == ("frame 3",)
-    assert found.compile_seconds == 2.0
-    assert "jax" in found.machine
 
 
 def test_the_table_tells_who_was_when_as_good(tmp_path, capsys):
@@ -72,8 +44,8 @@ def test_the_table_tells_who_was_when_as_good(tmp_path, capsys):
     assert head.endswith("s to 20 dB")
     assert first.split() == ["slow", "20.04", "4", "4"]
     assert second.split() == ["good", "30.00", "3", "2"]
-    stored = json.loads((out / "compare.json").read_text())
-    assert stored["good"]["seconds_to_psnr"] == {"20.0": 2.0}
+    saved = json.loads((out / "compare.json").read_text())
+    assert saved["good"]["seconds_to_psnr"] == {"20.0": 2.0}
     assert (out / "curves.png").stat().st_size > 5000
 
 
@@ -84,9 +56,9 @@ def test_runs_of_equal_names_are_told_apart(tmp_path):
 
 def test_other_machines_and_frames_are_remarked(tmp_path):
     one, two = (run_folder(tmp_path / name, (1.0, 2.0)) for name in "ab")
-    stored = json.loads((two / "curve.json").read_text())
-    stored["machine"]["cpu"], stored["frames"] = "another", ["frame 3", "frame 9"]
-    (two / "curve.json").write_text(json.dumps(stored))
+    saved = json.loads((two / "curve.json").read_text())
+    saved["machine"]["cpu"], saved["frames"] = "another", ["frame 3", "frame 9"]
+    (two / "curve.json").write_text(json.dumps(saved))
     lines = compare.remarks(compare.read([one, two]))
     assert any("cpu" in line and "another" in line for line in lines)
     assert any("different held-out frames (1 and 2)" in line for line in lines)
@@ -99,9 +71,7 @@ def test_other_machines_and_frames_are_remarked(tmp_path):
         (lambda folder: (folder / "curve.json").write_text("{}"), "not the curve"),
         (lambda folder: (folder / "metrics.json").unlink(), "not a finished run"),
         (
-            lambda folder: (folder / "config.json").write_text(
-                json.dumps({"choices": CHOICES | {"capture": "/films/dog"}})
-            ),
+            lambda folder: (folder / "config.json").write_text(stored("dog")),
             "capture is /films/dog and /films/cat",
         ),
     ],

@@ -41,7 +41,7 @@ def small(monkeypatch):
 
 
 def swinging(count=30):
-    """A motion in closed form: a third of the rows swing, one of them is dead."""
+    """A motion in closed form: a third of the rows swing, one of them is inactive."""
     rng = np.random.default_rng(0)
     centre = jnp.asarray(rng.normal(size=(count, 3)), jnp.float32)
     still = Gaussians(
@@ -59,8 +59,8 @@ def swinging(count=30):
     def draw(posed, time):
         return jnp.broadcast_to(posed.mean.mean(axis=0) / 10 + 0.5, (4, 5, 3))
 
-    alive = np.arange(count) != 3
-    return known_motion.Moving("swing", jax.jit(pose), jax.jit(draw), alive)
+    active = np.arange(count) != 3
+    return known_motion.Moving("swing", jax.jit(pose), jax.jit(draw), active)
 
 
 def test_the_curve_is_that_of_the_closed_form():
@@ -210,7 +210,7 @@ def test_the_job_prints_both_tables_and_saves_them(tmp_path, capsys, monkeypatch
         ("--gaussians 0", "--gaussians 0 must be at least 1"),
         ("--still 1", "a share in [0, 1)"),
         ("--knots 1 8", "at least 2"),
-        ("--still-below -1", "cannot be negative"),
+        ("--static-threshold -1", "cannot be negative"),
         ("--run nowhere", "no run here"),
     ],
 )

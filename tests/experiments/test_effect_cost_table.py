@@ -1,6 +1,5 @@
-"""What effects cost: operations counted right, scenes chosen right, numbers kept."""
+"""What effects cost: scenes chosen right, operations and numbers kept."""
 
-import importlib.resources
 import json
 import pathlib
 
@@ -10,86 +9,32 @@ import numpy as np
 import pytest
 
 from experiments.effect_cost import __main__ as effect_cost
-from experiments.effect_cost import report as report
+from experiments.effect_cost import report
 from experiments.effect_cost.__main__ import Arm, EffectCost, Priced, Row
 from gaussians_jax import presets as splat_presets
 from nerfies_jax import presets as field_presets
-from nerfies_jax import scene
-from nerfies_jax.effects.effect import Moment
+from nerfies_jax import runs, scene
 from nerfies_jax.measure import baselines, clock, matrix_flops
-from nerfies_jax.tracing import Ray
+from nerfies_jax.render_ray import Ray
+from nerfies_jax.runs import prices
+from nerfies_jax.training.effects import FrameCondition
 from tests import bare_scenes, scenes
 
-
-def product(x, y):
-    return x @ y
-
-
 LEFT, RIGHT = jnp.ones((3, 4)), jnp.ones((4, 5))
-
-
-def test_a_matrix_product_has_two_operations_a_multiply_add():
-    found = matrix_flops.count(product, LEFT, RIGHT)
-    assert found == matrix_flops.Counted(2 * 3 * 4 * 5, False)
-    batched = matrix_flops.count(
-        jax.vmap(product), jnp.ones((7, 3, 4)), jnp.ones((7, 4, 5))
-    )
-    assert batched.flops == 7 * found.flops
-    # A vector under vmap is a matrix; what is alike for the batch is computed once.
-    row = matrix_flops.count(jax.vmap(product, (0, None)), LEFT, RIGHT)
-    assert row.flops == found.flops
-
-
-def test_a_gradient_has_a_product_for_each_side():
-    def total(x, y):
-        return jnp.sum(product(x, y))
-
-    both = matrix_flops.count(jax.grad(total, (0, 1)), LEFT, RIGHT)
-    one = matrix_flops.count(jax.grad(total), LEFT, RIGHT)
-    # The value itself is read by nobody
-    assert (both.flops, one.flops) == (2 * 120, 120)
-
-
-def test_every_round_of_a_loop_counts_and_of_branches_the_dearest():
-    def rounds(x):
-        return jax.lax.map(lambda row: jnp.tanh(row @ RIGHT), x, batch_size=2)
-
-    assert matrix_flops.count(rounds, jnp.ones((6, 4))) == (2 * 6 * 4 * 5, False)
-
-    def either(x):
-        return jax.lax.cond(
-            x[0, 0] > 0, lambda x: x @ RIGHT, lambda x: (x @ RIGHT) @ RIGHT.T @ RIGHT, x
-        )
-
-    assert matrix_flops.count(either, LEFT) == (3 * 120, False)
-
-
-def test_a_loop_whose_rounds_nobody_knows_counts_once_and_says_so():
-    def until(x):
-        return jax.lax.while_loop(
-            lambda x: x[0, 0] < 9, lambda x: x @ jnp.ones((4, 4)), x
-        )
-
-    assert matrix_flops.count(until, LEFT) == (2 * 3 * 4 * 4, True)
-    # Without products there is nothing more to count
-    loose = matrix_flops.count(
-        lambda x: jax.lax.while_loop(lambda x: x < 9, lambda x: 2 * x, x), 1.0
-    )
-    assert loose == (0, False)
 
 
 @pytest.mark.parametrize("name", ["nerf", "nerf-small", "d-nerf", "nsff"])
 def test_the_products_of_a_static_field_are_those_of_its_networks(name):
     preset = bare_scenes.tiny_field(name)
     spec = effect_cost.without(preset, tuple(effect_cost.effects_in(preset)))
-    facts = scene.facts_of(scenes.tiny_capture(), spec)
-    made = scene.field(spec, facts)
+    metadata = scene.metadata_of(scenes.tiny_capture(), spec)
+    made = scene.field(spec, metadata)
     one, zero = jnp.ones(()), jnp.zeros(())
     ray = Ray(jnp.zeros(3), jnp.asarray([0.0, 0.0, 1.0]), 0.5 * one, one)
-    moment = Moment(zero, {}, jnp.int32(0))
+    condition = FrameCondition(zero, {}, jnp.int32(0))
 
     def colours(params):
-        return [level.colour for level in made.trace(params, ray, moment)]
+        return [level.colour for level in made.trace(params, ray, condition)]
 
     found = matrix_flops.count(colours, made.init(jax.random.key(0)))
     plan = spec.sampling
@@ -117,7 +62,8 @@ def test_every_default_preset_has_effects_and_every_paper_is_there():
     for name in effect_cost.PRESETS:
         presets = field_presets.PRESETS | splat_presets.PRESETS
         assert effect_cost.effects_in(presets[name]), name
-    left_out = {"nerf-small", "splats-static-small", "d-nerf-small", "t-nerf-small"}
+    left_out = {"nerf-small", "d-nerf-small", "t-nerf-small"}
+    left_out |= {"splats-static-small", "splats-mcmc-small"}
     small = {n for n in presets if n.endswith("-small")}
     assert small - set(effect_cost.PRESETS) == left_out  # nothing, or the warp alone
 
@@ -197,9 +143,7 @@ def test_the_page_has_a_row_for_every_scene():
 
 
 def test_the_page_of_prices_shows_the_kept_run():
-    kept = importlib.resources.files("experiments") / "measured/effect_cost.json"
-    with importlib.resources.as_file(kept) as path:
-        lines = report.page(clock.read_metrics(path))
+    lines = report.page(prices.baseline())
     docs = pathlib.Path(__file__).parents[2] / "docs/effects_and_their_prices.md"
     assert "\n".join(lines) in docs.read_text()
 
@@ -240,7 +184,7 @@ def test_a_small_run_prices_a_transient_medium(tmp_path, capsys, monkeypatch):
     spec = bare_scenes.tiny_field("nerf-w")
     capture = scenes.tiny_capture()
     arms = [a for a in effect_cost.arms(spec) if a.name in ("bare", "only transient")]
-    monkeypatch.setattr("experiments.runs.read_capture", lambda _: capture)
+    monkeypatch.setattr(runs, "read_capture", lambda _: capture)
     bare, transient = effect_cost.measure("nerf-w-small", arms, 0.4, 2)
     for name in effect_cost.PROGRAMS:
         cheap, dear = bare.programs[name], transient.programs[name]

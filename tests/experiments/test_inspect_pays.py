@@ -1,21 +1,18 @@
 """Whether advice paid: which scenes are trained, what is kept, how it is judged."""
 
-import dataclasses
 import itertools
 import json
 import math
-import subprocess
-import sys
+import pathlib
 
 import pytest
 
-from experiments import cli
-from experiments.ablate import __main__ as ablate
 from experiments.ablate import pool, results
+from experiments.ablate import settings as ablate
 from experiments.ablate.arms import Arm
 from experiments.inspect_pays import __main__ as inspect_pays
 from experiments.inspect_pays import arms as inspect_arms
-from experiments.inspect_pays import report as report
+from experiments.inspect_pays import report
 from experiments.inspect_pays.job import Row, Side, Trial, read
 from nerfies_jax import runs
 from nerfies_jax.capture import nerfies_format
@@ -28,8 +25,9 @@ from nerfies_jax.evidence.findings import (
     MOTION,
     Finding,
 )
+from nerfies_jax.evidence.view_set import look
 from nerfies_jax.measure import clock
-from nerfies_jax.runs import adviser, platform
+from nerfies_jax.runs import adviser, platform, representations
 from tests.evidence import films
 
 
@@ -39,26 +37,18 @@ def finding(effect, wanted):
 
 def test_whatever_is_advised_is_an_arm():
     arms = set()
-    for full, kind in itertools.product((False, True), ("splats", "fields")):
+    kinds = representations.installed().values()
+    suite = inspect_arms.advice().arms
+    for full, kind in itertools.product((False, True), kinds):
         for choices in itertools.product((True, False, None), repeat=6):
             told = zip(inspect_arms.DECIDING, choices, strict=True)
             found = tuple(finding(*one) for one in told)
             advice = adviser.advise(found, kind, full)
             name = inspect_arms.name_of(advice)
-            assert inspect_arms.ADVICE.arms[name] == Arm(
-                advice.preset, advice.overrides
-            )
+            assert suite[name] == Arm(advice.preset, advice.overrides)
             arms.add(name)
-    assert arms == {*inspect_arms.ADVICE.arms}
+    assert arms == {*suite}
     assert not any("/" in name for name in arms)  # it is part of a file's name
-
-
-def test_arms_are_known_without_jax():
-    words = "import sys; import experiments.inspect_pays; print('jax' in sys.modules)"
-    done = subprocess.run(
-        [sys.executable, "-c", words], capture_output=True, text=True, check=True
-    )
-    assert done.stdout.strip() == "False"
 
 
 def side(psnr, seconds, depth=math.nan):
@@ -117,7 +107,7 @@ def test_the_table_says_what_is_changed():
 
 def test_wrong_wishes_are_refused_with_what_can_be_had():
     with pytest.raises(ValueError, match=r"--presets moba-small.*nerfies-small"):
-        inspect_pays.InspectPays(presets=("moba-small",))
+        inspect_pays.check(("moba-small",))
     with pytest.raises(ValueError, match="--steps"):
         inspect_pays.InspectPays(steps=0)
 
@@ -142,7 +132,7 @@ def looked(monkeypatch):
     def inspect(capture):
         calls.append("look")
         sheet = films.texture(1).astype("uint8")
-        return inspection.Inspection(FOUND, sheet, 1, 0.0, None, [])
+        return inspection.Inspection(FOUND, sheet, 1, 0.0, look(capture), [])
 
     def train(job):
         (budget,) = job.budgets
@@ -183,7 +173,7 @@ def test_what_differs_is_trained_once_and_kept(film, tmp_path, looked, capsys):
     stored = clock.read_metrics(tmp_path / "out/pays.json")
     assert stored["film.splats-deformable-small.gain"].value == 4.0
     kept = json.loads((tmp_path / "out/film/inspected.json").read_text())
-    assert kept["cost per step"]["motion"]["fields"] > 1.2
+    assert kept["cost per step"]["motion"]["radiance"] > 1.2
     # Other sizes are another capture
     with pytest.raises(SystemExit) as ended:
         inspect_pays.main([*words, "--max-side", "48"])
@@ -220,18 +210,19 @@ def test_a_preset_that_needs_what_is_not_there_is_left_out(
     assert report.verdict(one) == "yes: the preset cannot be built"
 
 
-def test_a_run_is_a_command_that_ablate_takes(film, tmp_path, looked, monkeypatch):
+def test_a_process_can_take_the_settings_of_what_is_trained(
+    film, tmp_path, looked, monkeypatch
+):
     jobs = []
     monkeypatch.setattr(pool, "run", lambda job: jobs.append(job) or [])
     asked = inspect_pays.InspectPays(out=tmp_path, heldout="3", steps=7)
     Trial(asked, *read(asked, film)).run()
     name = "nerf-small+appearance.width=4"
-    words = pool.command(jobs[0], name, 0)
-    parsed = cli.parse(ablate.Ablate, words[3:])
-    ablate.check(parsed)
-    assert parsed == dataclasses.replace(
-        jobs[0].asked, arms=(name,), seed=0, seeds=None
-    )
+    ablate.check(jobs[0].asked)
+    (jobs[0].out / "logs").mkdir()
+    taken = json.loads(pathlib.Path(pool.command(jobs[0], name, 0)[-1]).read_text())
+    assert (taken["suite"], taken["arms"], taken["seed"]) == ("advice", [name], 0)
+    assert taken["source"]["capture"] == str(film)
 
 
 def test_a_capture_without_held_out_frames_is_refused(tmp_path, monkeypatch):

@@ -18,9 +18,9 @@ FLOORS = {
     "nerfies_jax.evidence": 5,
     "nerfies_jax.radiance": 6,
     "nerfies_jax.effects": 7,
-    "nerfies_jax.facts": 5,  # of a capture; reads nothing else
+    "nerfies_jax.scene_metadata": 5,  # of a capture; reads nothing else
     "nerfies_jax.spec": 8,
-    "nerfies_jax.tracing": 8,
+    "nerfies_jax.render_ray": 8,
     "nerfies_jax.field": 8,
     "nerfies_jax.scene": 8,
     "nerfies_jax.held_out_codes": 8,

@@ -1,8 +1,9 @@
-"""The main job from the command line: wrong input first, then the whole of it."""
+"""The main job from the command line to its files, and on from where it was cut."""
 
+import errno
 import json
+import os
 import pathlib
-import re
 import shutil
 
 import jax.numpy as jnp
@@ -15,149 +16,22 @@ from gaussians_jax import model_file, scene
 from nerfies_jax import evaluation, runs
 from nerfies_jax.capture import exr, images, nerfies_format, video
 from nerfies_jax.evaluation import pictures
-from nerfies_jax.runs import products, representations
+from nerfies_jax.runs import commands, products, train
+from nerfies_jax.runs.run_folder import CHECKPOINTS
 from nerfies_jax.training.model import TrainState
 from tests import scenes
 
 QUICK = (
-    "density.interval=4",
-    "density.start=4",
-    "density.stop=10",
-    "density.most=300",
+    "densification.refine_every=4",
+    "densification.refine_start_iter=4",
+    "densification.refine_stop_iter=10",
+    "densification.cap_max=300",
     "motion.width=8",
     "motion.depth=2",
     "motion.skips=",
     "sh_degree=0",
-    "start.beside=0",
+    "init.extra_random=0",
 )
-
-
-@pytest.fixture
-def filmed(tmp_path):
-    """A Nerfies directory that a test may damage."""
-    nerfies_format.write(scenes.tiny_capture(), tmp_path / "filmed")
-    return tmp_path / "filmed"
-
-
-def refused(capsys, *arguments):
-    """The one line that the main job prints when it refuses; checks the exit code."""
-    with pytest.raises(SystemExit) as stop:
-        reconstruct.main([str(argument) for argument in arguments])
-    assert stop.value.code == 2
-    line = capsys.readouterr().err
-    assert line.startswith("error: ")
-    assert line.count("\n") == 1
-    return line
-
-
-def edit(path, **values):
-    stored = json.loads(path.read_text())
-    path.write_text(json.dumps(stored | values))
-
-
-def one_picture(filmed):
-    return sorted((filmed / "rgb").rglob("*.png"))[0]
-
-
-def damage(filmed, kind):
-    """Break a capture in one way; returns words that the error must hold."""
-    picture = one_picture(filmed)
-    camera = filmed / "camera" / f"{picture.stem}.json"
-    if kind == "missing picture":
-        picture.unlink()
-    elif kind == "truncated picture":
-        picture.write_bytes(picture.read_bytes()[:200])
-    elif kind == "picture of another size":
-        images.write_png(picture, np.zeros((20, 33, 3), np.uint8))
-    elif kind == "camera that is not a number":
-        camera.write_text(camera.read_text().replace("focal_length", "focal_lenght"))
-    elif kind == "camera with NaN":
-        edit(camera, position=[float("nan"), 0.0, 0.0])
-    elif kind == "id out of range":
-        path = filmed / "metadata.json"
-        table = json.loads(path.read_text())
-        table[picture.stem]["warp_id"] = -3
-        path.write_text(json.dumps(table))
-    elif kind == "a single frame":
-        edit(
-            filmed / "dataset.json",
-            ids=[picture.stem],
-            train_ids=[picture.stem],
-            val_ids=[],
-            count=1,
-            num_exemplars=1,
-        )
-    return picture.stem
-
-
-@pytest.mark.parametrize(
-    "kind",
-    [
-        "missing picture",
-        "truncated picture",
-        "picture of another size",
-        "camera that is not a number",
-        "camera with NaN",
-        "id out of range",
-        "a single frame",
-    ],
-)
-def test_a_broken_capture_is_refused_by_name(kind, filmed, tmp_path, capsys):
-    stem = damage(filmed, kind)
-    line = refused(capsys, filmed, "--out", tmp_path / "run")
-    assert str(filmed) in line or stem in line
-    assert not (tmp_path / "run").exists()
-
-
-def test_a_folder_that_is_no_capture_says_what_was_looked_for(tmp_path, capsys):
-    line = refused(capsys, tmp_path, "--out", tmp_path / "run")
-    assert "scene.json" in line
-    assert "transforms" in line
-    assert "cameras.bin" in line
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("--set", "start.points=0"), "at least one Gaussian"),
-        (("--set", "raster.capacity=1000000000000"), "GiB are free"),
-        (("--preset", "splats-magic"), "splats-deformable-small"),
-        (("--steps", "0"), "at least one step"),
-        (("--resume",), "--out"),
-        (("--heldout", "1"), "held"),
-    ],
-)
-def test_wrong_settings_are_refused(arguments, words, filmed, capsys, tmp_path):
-    out = () if arguments == ("--resume",) else ("--out", tmp_path / "run")
-    assert words in refused(capsys, filmed, *out, *arguments)
-    assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize("option", ["--factor", "--max-side", "--heldout"])
-def test_the_built_in_scene_takes_no_options_of_captures(option, tmp_path, capsys):
-    line = refused(capsys, "--out", tmp_path / "run", option, "2")
-    assert option in line
-    assert "make_scene" in line
-    assert not (tmp_path / "run").exists()
-
-
-def test_a_run_folder_that_cannot_be_written_is_refused(filmed, tmp_path, capsys):
-    (tmp_path / "file").write_text("")
-    assert "--out" in refused(capsys, filmed, "--out", tmp_path / "file" / "run")
-
-
-def test_a_folder_without_a_run_cannot_be_resumed(tmp_path, capsys):
-    assert "no run here" in refused(capsys, "--resume", "--out", tmp_path)
-
-
-def test_help_names_the_presets(capsys):
-    with pytest.raises(SystemExit) as stop:
-        reconstruct.main(["--help"])
-    assert stop.value.code == 0
-    page = re.sub(r"[\s│]", "", capsys.readouterr().out)  # as if it were one line
-    for make in representations.MAKERS.values():
-        for preset in make().presets:
-            assert preset.removesuffix("-small") in page
 
 
 @pytest.fixture(scope="module")
@@ -256,26 +130,6 @@ def test_the_model_file_is_enough_to_draw_a_frame(run):
     assert found.colour.shape[1:3] == capture.size[::-1]
 
 
-@pytest.mark.parametrize(("preset", "notes"), [("moba-small", 1), ("splats-static", 0)])
-def test_the_size_and_speed_stand_beside_the_papers(preset, notes):
-    saved = representations.Saved(2_345_678)
-    lines = products.beside_the_paper(preset, saved, 40.0)
-    assert len(lines) == notes
-    for line in lines:
-        for words in (
-            "2.3 MB",
-            "25 frames",
-            "11.3 MB",
-            "163 frames",
-            "A100",
-            "context",
-        ):
-            assert words in line
-    assert not products.beside_the_paper(preset, representations.Saved(), 40.0)
-    (size,) = products.model_size(saved)
-    assert (size.key, size.value) == ("file.bytes", 2_345_678)
-
-
 @pytest.mark.slow
 def test_the_depth_is_in_scene_units(run):
     capture = scenes.tiny_capture()
@@ -293,12 +147,6 @@ def test_the_report_needs_nothing_beside_itself(run):
     assert "data:video/mp4;base64" in page
     assert "http://" not in page.replace("http://www.w3.org", "")
     assert "Where a training step" in page
-
-
-@pytest.mark.slow
-def test_a_checkpoint_of_another_spec_is_refused(run, capsys):
-    line = refused(capsys, "--out", run, "--resume", "--set", "dssim_weight=0.5")
-    assert "dssim_weight" in line
 
 
 @pytest.mark.slow
@@ -386,23 +234,89 @@ def test_held_out_frames_are_rendered_under_their_names(run, tmp_path):
     assert {path.stem for path in tmp_path.glob("*.png")} == names
 
 
+def ended(*arguments):
+    """Exit code of the main job."""
+    with pytest.raises(SystemExit) as stop:
+        reconstruct.main([str(argument) for argument in arguments])
+    return stop.value.code
+
+
+def last_bits(folder):
+    """Checksums of every array of the last checkpoint, by name."""
+    path = folder / CHECKPOINTS / "12" / "about.json"
+    return {
+        name: note["crc32"]
+        for name, note in json.loads(path.read_text())["leaves"].items()
+    }
+
+
 @pytest.mark.slow
-def test_a_stopped_run_resumes_to_its_end(run, tmp_path, capsys):
-    folder = tmp_path / "stopped"
-    filmed = json.loads((run / "config.json").read_text())["choices"]["capture"]
-    common = [filmed, "--steps", "12", "--out", str(folder)]
-    with pytest.raises(SystemExit) as stop:
-        reconstruct.main([*common, "--seconds", "0.001", "--set", *QUICK])
-    assert stop.value.code == 0
-    stopped = json.loads((folder / "metrics.json").read_text())["train.steps"]
-    assert stopped < 12
-    assert "--resume" in capsys.readouterr().out
-    with pytest.raises(SystemExit) as stop:
-        reconstruct.main(["--out", str(folder), "--resume"])
-    assert stop.value.code == 0
+@pytest.mark.parametrize("left", ["settings", "unfinished", "first state", "all steps"])
+def test_a_killed_run_resumes_to_the_same_bits(left, run, tmp_path, capsys):
+    """From what a kill can leave, one file after the other."""
+    folder = tmp_path / "killed"
+    shutil.copytree(run, folder)
+    saved = folder / CHECKPOINTS
+    for name in ("metrics.json", "report.html", "model.npz"):
+        (folder / name).unlink()
+    if left != "all steps":
+        shutil.rmtree(saved / "12")
+    if left == "settings":
+        shutil.rmtree(saved)
+    elif left == "unfinished":
+        (saved / "0").rename(saved / "0.unfinished")
+    assert ended("--out", folder, "--resume") == 0
+    assert last_bits(folder) == last_bits(run)
+    assert not list(saved.glob("*.unfinished"))
     whole, resumed = (
         json.loads((path / "metrics.json").read_text()) for path in (run, folder)
     )
-    assert resumed["train.steps"] == 12
-    assert resumed["heldout.psnr"] == whole["heldout.psnr"]
-    assert resumed["gaussians"] == whole["gaussians"]
+    for key in ("train.steps", "heldout.psnr", "gaussians"):
+        assert resumed[key] == whole[key]
+    assert (folder / "model.npz").is_file()
+
+
+@pytest.mark.slow
+def test_a_stopped_run_resumes_to_its_end(run, tmp_path, capsys):
+    folder = tmp_path / "stopped"
+    filmed = runs.saved_run(run).config.source.capture
+    common = [filmed, "--steps", "12", "--out", folder]
+    assert ended(*common, "--seconds", "0.001", "--set", *QUICK) == 0
+    stopped = json.loads((folder / "metrics.json").read_text())["train.steps"]
+    assert stopped < 12
+    assert commands.resume(folder) in capsys.readouterr().out
+    assert ended("--out", folder, "--resume") == 0
+    assert last_bits(folder) == last_bits(run)
+
+
+@pytest.mark.slow
+def test_a_run_that_cannot_be_drawn_or_kept_says_so_and_ends(
+    run, tmp_path, capsys, monkeypatch
+):
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    folder = tmp_path / "run"
+    shutil.copytree(run, folder)
+    shutil.rmtree(folder / CHECKPOINTS / "12")
+    with monkeypatch.context() as patch:
+        patch.setattr(products, "save_film", full)
+        assert ended("--out", folder, "--resume") == 1
+    assert "error: not all of what came of the run is written: [Errno 28] No space" in (
+        capsys.readouterr().err
+    )
+    shutil.rmtree(folder / CHECKPOINTS / "12")
+    trained = train.train
+
+    def losing(*arguments):
+        shutil.rmtree(folder)
+        return trained(*arguments)
+
+    monkeypatch.setattr(train, "train", losing)
+    assert ended("--out", folder, "--resume") == 1
+    told = capsys.readouterr()
+    assert (
+        f"error: the last state is not saved: cannot write checkpoints to {folder}"
+        in (told.err)
+    )
+    assert "saved in" not in told.err

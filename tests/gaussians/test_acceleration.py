@@ -11,25 +11,25 @@ import pytest
 from gaussians_jax import splats as rows
 from gaussians_jax.effects import acceleration, deformation, mlp_motion
 from gaussians_jax.effects.acceleration import AccelerationSpec
-from gaussians_jax.effects.effect import Around, Moment
 from gaussians_jax.effects.mlp_motion import MotionSpec
 from gaussians_jax.optimiser import scale_by_row_adam
 from gaussians_jax.splats import Params, Splats
 from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.training.effects import FrameCondition, PenaltyContext, weighted_sum
 from tests import gradients
 
 unrest = jax.jit(acceleration.unrest, static_argnums=(4, 5))
 instants = jax.jit(acceleration.instants, static_argnums=1)
 
 
-def scene(count=12, alive=None, dtype="float32", size=1.0):
+def scene(count=12, active=None, dtype="float32", size=1.0):
     """Gaussians and, under "amplitude", how far each swings."""
     rng = np.random.default_rng(0)
     leaves = [size * rng.normal(size=(count, 3))]
     leaves += [np.zeros((count, *shape)) for shape in [(3,), (4,), (), (1, 3), (0, 3)]]
     splats = Splats(*(jnp.asarray(leaf, dtype) for leaf in leaves))
-    if alive is not None:
-        logit = np.where(alive, 0, rows.DEAD_LOGIT)
+    if active is not None:
+        logit = np.where(active, 0, rows.INACTIVE_LOGIT)
         splats = splats._replace(opacity_logit=jnp.asarray(logit, dtype))
     amplitude = jnp.asarray(0.02 * size * rng.normal(size=(count, 3)), dtype)
     return Params({"splats": splats, "amplitude": amplitude}, {})
@@ -138,16 +138,16 @@ def test_the_three_times_stay_within_the_capture(interval, time, dtype):
         np.testing.assert_allclose(now, time, rtol=1e-6)
 
 
-@pytest.mark.parametrize("living", [[3], [0, 11], [1, 2, 5, 8, 9]])
-def test_rows_are_drawn_evenly_from_the_living(living):
-    alive = jnp.asarray(np.isin(np.arange(12), living))
-    drawn = jax.jit(acceleration.draw_living, static_argnums=2)(
-        jax.random.key(0), alive, 6000
+@pytest.mark.parametrize("places", [[3], [0, 11], [1, 2, 5, 8, 9]])
+def test_rows_are_drawn_evenly_from_the_active(places):
+    active = jnp.asarray(np.isin(np.arange(12), places))
+    drawn = jax.jit(acceleration.draw_active, static_argnums=2)(
+        jax.random.key(0), active, 6000
     )
     counts = np.bincount(np.asarray(drawn), minlength=12)
-    assert set(np.flatnonzero(counts)) == set(living)
-    share = 6000 / len(living)
-    assert np.abs(counts[living] - share).max() < 5 * np.sqrt(share)
+    assert set(np.flatnonzero(counts)) == set(places)
+    share = 6000 / len(places)
+    assert np.abs(counts[places] - share).max() < 5 * np.sqrt(share)
 
 
 def ask(spec, params, time, step=0, at_time=swinging, extent=1.0, frames=11, seed=0):
@@ -156,8 +156,9 @@ def ask(spec, params, time, step=0, at_time=swinging, extent=1.0, frames=11, see
 
     @jax.jit
     def penalty(params, time, step):
-        moment = Moment(time, step, jax.random.key(seed))
-        return effect.penalty(Around(params, at_time, moment, None))
+        condition = FrameCondition(time, step=step, key=jax.random.key(seed))
+        context = PenaltyContext(condition, step, None, params, at_time=at_time)
+        return effect.penalty(None, context)
 
     return penalty(params, jnp.asarray(time, dtype), jnp.asarray(step))
 
@@ -165,11 +166,11 @@ def ask(spec, params, time, step=0, at_time=swinging, extent=1.0, frames=11, see
 @pytest.mark.parametrize("time", [0.0, 0.43, 1.0])
 def test_the_effect_is_the_mean_over_the_rows_it_draws(time, dtype):
     spec = AccelerationSpec(weight=0.3, decay=0.02, drift=0.5, interval=2.0)
-    alive = np.arange(12) % 4 != 1
-    params = scene(alive=alive, dtype=dtype)
-    term = ask(spec, params, time, extent=3.0)
+    active = np.arange(12) % 4 != 1
+    params = scene(active=active, dtype=dtype)
+    terms = ask(spec, params, time, extent=3.0)
     key = jax.random.fold_in(jax.random.key(0), acceleration._STREAM)
-    drawn = np.asarray(acceleration.draw_living(key, jnp.asarray(alive), 12))
+    drawn = np.asarray(acceleration.draw_active(key, jnp.asarray(active), 12))
     middle = np.clip(time, 0.2, 0.8)
     expected = slow_unrest(
         np.asarray(params.rows["splats"].mean, np.float64)[drawn],
@@ -179,14 +180,17 @@ def test_the_effect_is_the_mean_over_the_rows_it_draws(time, dtype):
     )
     # In float32 a place near 1 has an ulp of 1e-7, differences are near 0.01.
     tolerance = {"float32": 3e-4, "float64": 1e-12}[dtype]
-    np.testing.assert_allclose(term.value, 0.3 * expected, rtol=tolerance)
-    np.testing.assert_allclose(term.metrics["unrest"], expected, rtol=tolerance)
-    assert 0 < term.metrics["still"] < 1
+    np.testing.assert_allclose(terms["unrest"].value, expected, rtol=tolerance)
+    assert terms["unrest"].weight == 0.3
+    assert 0 < terms["still"].value < 1
+    assert terms["still"].weight is None
 
 
 def test_other_steps_draw_other_rows():
     spec, params = AccelerationSpec(samples=3), scene()
-    values = {float(ask(spec, params, 0.4, seed=seed).value) for seed in range(4)}
+    values = {
+        float(ask(spec, params, 0.4, seed=seed)["unrest"].value) for seed in range(4)
+    }
     assert len(values) == 4
 
 
@@ -202,7 +206,7 @@ def test_its_weight_does_not_depend_on_the_unit_of_length(float64):
         ask(spec, scene(dtype="float64", size=x), 0.4, at_time=linear, extent=x)
         for x in (1.0, 1000.0)
     )
-    np.testing.assert_allclose(small.value, large.value, rtol=1e-9)
+    np.testing.assert_allclose(small["unrest"].value, large["unrest"].value, rtol=1e-9)
 
 
 def test_gradients_of_the_effect(float64):
@@ -210,20 +214,27 @@ def test_gradients_of_the_effect(float64):
     spec = AccelerationSpec(decay=1e6)  # the weight is 1 to 1e-8
     params = scene(dtype="float64")
     effect = acceleration.effect(spec, 1.0, 11)
-    moment = Moment(jnp.asarray(0.4), jnp.asarray(0), jax.random.key(0))
+    condition = FrameCondition(
+        jnp.asarray(0.4), step=jnp.asarray(0), key=jax.random.key(0)
+    )
 
     def total(amplitude):
         swung = params._replace(rows=params.rows | {"amplitude": amplitude})
-        return 1e16 * effect.penalty(Around(swung, swinging, moment, None)).value
+        context = PenaltyContext(
+            condition, condition.step, None, swung, at_time=swinging
+        )
+        return 1e14 * effect.penalty(None, context)["unrest"].value
 
     assert gradients.directional_error(total, params.rows["amplitude"]) < 1e-6
 
 
 @pytest.mark.hard_cases
-def test_without_living_rows_there_is_nothing(dtype):
-    term = ask(AccelerationSpec(), scene(alive=np.zeros(12, bool), dtype=dtype), 0.4)
-    assert term.value == 0
-    assert term.metrics["still"] == 0
+def test_without_active_rows_there_is_nothing(dtype):
+    terms = ask(AccelerationSpec(), scene(active=np.zeros(12, bool), dtype=dtype), 0.4)
+    assert {name: term.value for name, term in terms.items()} == {
+        "unrest": 0,
+        "still": 0,
+    }
 
 
 MOTION = MotionSpec(
@@ -236,7 +247,7 @@ def travel(motion, params, net):
     params = Params(params.rows, {mlp_motion.NAME: net})
     gaussians = rows.activate(params.rows["splats"])
     one, other = (
-        motion.deform(params, gaussians, Moment(jnp.asarray(time)), None).mean
+        motion.deform(params, gaussians, FrameCondition(jnp.asarray(time)), None).mean
         for time in (0.3, 0.5)
     )
     return float(jnp.sqrt(jnp.mean(jnp.square(one - other))))
@@ -246,7 +257,7 @@ def test_under_a_network_it_waits_for_its_start_and_then_stills_it():
     """Through the scene's own seams: smoothing, blocks and a warm-up are in the way."""
     motion = mlp_motion.effect(MOTION, steps=5000, frames=11)
     params = scene()
-    net = motion.init_nets(jax.random.key(1))
+    net = motion.init(jax.random.key(1))
     heads = jax.tree.map(lambda leaf: 300 * leaf, net.trunk.heads)
     net = net._replace(trunk=net.trunk._replace(heads=heads))
     params = Params(params.rows, {mlp_motion.NAME: net})
@@ -254,15 +265,16 @@ def test_under_a_network_it_waits_for_its_start_and_then_stills_it():
     effect = acceleration.effect(spec, 1.0, 11)
 
     def penalty(net, step):
-        moment = Moment(jnp.asarray(0.4), step, jax.random.key(0))
+        condition = FrameCondition(jnp.asarray(0.4), step=step, key=jax.random.key(0))
 
         def at_time(params, time):
             gaussians = rows.activate(params.rows["splats"])
-            then = moment._replace(time=time)
+            then = condition._replace(time=time)
             return deformation.pose_in_training((motion,), params, gaussians, then)
 
         here = Params(params.rows, {mlp_motion.NAME: net})
-        return effect.penalty(Around(here, at_time, moment, None)).value
+        context = PenaltyContext(condition, step, None, here, at_time=at_time)
+        return weighted_sum(effect.penalty(None, context))
 
     run = jax.jit(jax.value_and_grad(penalty))
     value, slopes = run(net, jnp.asarray(3999))

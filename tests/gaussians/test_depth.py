@@ -11,9 +11,13 @@ import scipy.stats
 
 from gaussians_jax.effects import depth
 from gaussians_jax.effects.depth import DepthSpec
-from gaussians_jax.effects.effect import Moment, Shot
 from gaussians_jax.optimiser import scale_by_row_adam
-from gaussians_jax.splats import Params
+from nerfies_jax.training.effects import (
+    Observation,
+    PenaltyContext,
+    values,
+    weighted_sum,
+)
 from nerfies_jax.training.model import Rendering
 from tests import gradients
 
@@ -226,15 +230,17 @@ def some_shot(dtype="float32", size=(5, 6)):
     rng = np.random.default_rng(0)
     drawn, truth = (jnp.asarray(rng.uniform(1, 4, size), dtype) for _ in range(2))
     colour = jnp.zeros((*size, 3), dtype)
-    return Shot(Rendering(colour, jnp.ones(size, dtype), drawn), colour, None, truth)
+    return Observation(
+        Rendering(colour, jnp.ones(size, dtype), drawn), colour, None, truth
+    )
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def loss_and_slope(spec, shot):
     def value(drawn, alpha):
         rendering = shot.rendering._replace(depth=drawn, alpha=alpha)
-        term = depth.loss(spec, shot._replace(rendering=rendering))
-        return term.value, term.metrics
+        terms = depth.terms(spec, shot._replace(rendering=rendering))
+        return weighted_sum(terms), values(terms)
 
     rendering = shot.rendering
     return jax.value_and_grad(value, argnums=(0, 1), has_aux=True)(
@@ -275,25 +281,20 @@ def test_what_is_unknown_or_see_through_teaches_nothing(kind, space, dtype):
     assert not alpha_slope.any()
 
 
-def test_without_depth_there_is_no_operation():
+def test_without_depth_there_is_no_term():
     spec, shot = DepthSpec(), some_shot()._replace(depth=None)
-    term = depth.loss(spec, shot)
-    assert term.value == 0
-    assert not term.metrics
-    program = jax.make_jaxpr(
-        lambda rendering: depth.loss(spec, shot._replace(rendering=rendering)).value
-    )(shot.rendering)
-    assert not [e for e in program.eqns if e.primitive.name != "broadcast_in_dim"]
+    assert depth.terms(spec, shot) == {}
 
 
 def test_the_effect_reads_the_depths():
     spec, shot = DepthSpec("metric"), some_shot()
     effect = depth.effect(spec)
-    assert effect.wants == {"depths"}
-    term = effect.image_loss(Params({}, {}), shot, Moment(jnp.zeros(())))
+    assert effect.required_data == {"depths"}
+    context = PenaltyContext(None, None, None, None, observation=shot)
+    terms = effect.penalty(None, context)
     truth = np.asarray(shot.depth)
     error = np.abs(np.asarray(shot.rendering.depth) - truth).mean() / truth.mean()
-    np.testing.assert_allclose(term.value, 0.1 * error, rtol=1e-6)
+    np.testing.assert_allclose(weighted_sum(terms), 0.1 * error, rtol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import plyfile
 import pytest
 
 from gaussians_jax import files, harmonics, spz
-from gaussians_jax.splats import DEAD_LOGIT, Splats
+from gaussians_jax.splats import INACTIVE_LOGIT, Splats
 
 
 def some_splats(count=20, degree=3, seed=0):
@@ -83,14 +83,14 @@ def test_a_file_of_another_tool_comes_back_bit_for_bit(name, data_dir, tmp_path)
     )
 
 
-def test_dead_rows_stay_behind(tmp_path):
+def test_inactive_rows_stay_behind(tmp_path):
     rows = some_splats()
-    rows = rows._replace(opacity_logit=rows.opacity_logit.at[3:].set(DEAD_LOGIT))
+    rows = rows._replace(opacity_logit=rows.opacity_logit.at[3:].set(INACTIVE_LOGIT))
     assert files.save(tmp_path / "a.ply", rows) == 3
     assert files.load(tmp_path / "a.ply").splats.mean.shape == (3, 3)
-    dead = jnp.full(20, DEAD_LOGIT, jnp.float32)
-    with pytest.raises(ValueError, match="none of the 20 rows is alive"):
-        files.save(tmp_path / "b.ply", rows._replace(opacity_logit=dead))
+    inactive = jnp.full(20, INACTIVE_LOGIT, jnp.float32)
+    with pytest.raises(ValueError, match="none of the 20 rows is active"):
+        files.save(tmp_path / "b.ply", rows._replace(opacity_logit=inactive))
     assert not (tmp_path / "b.ply").exists()
 
 

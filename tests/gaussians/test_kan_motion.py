@@ -13,11 +13,11 @@ import scipy.spatial.transform
 
 from gaussians_jax import splats as rows
 from gaussians_jax.effects import deformation, kan_motion
-from gaussians_jax.effects.effect import Moment
 from gaussians_jax.effects.kan_motion import KanMotion, KanMotionSpec, Offsets
 from gaussians_jax.splats import Gaussians, Params, Splats
 from nerfies_jax.measure import clock
 from nerfies_jax.nets import kan, mlp
+from nerfies_jax.training.effects import FrameCondition
 from tests import gradients
 
 SMALL = KanMotionSpec(embedding=6, time_code=4, hidden=(5,), kernels=3, block=8)
@@ -42,10 +42,10 @@ def embeddings(count, dtype="float64"):
     return jnp.asarray(drawn, dtype)
 
 
-def together(params, spec, embedding, time, alive=None):
+def together(params, spec, embedding, time, active=None):
     """As in a training step: prepared and used in one program."""
-    prepared = kan_motion.prepare(params, spec, embedding, alive)
-    return kan_motion.deform(params, spec, time, prepared, alive)
+    prepared = kan_motion.prepare(params, spec, embedding, active)
+    return kan_motion.deform(params, spec, time, prepared, active)
 
 
 uncached = jax.jit(together, static_argnums=1)
@@ -146,31 +146,31 @@ def test_blocks_change_nothing_but_memory(float64):
         np.testing.assert_allclose(ours / scale, theirs / scale, atol=1e-13)
 
 
-def test_rows_beyond_the_living_blocks_are_still(float64):
+def test_rows_beyond_the_active_blocks_are_still(float64):
     params, codes = strong(SMALL), embeddings(24)
     time = jnp.asarray(0.5)
-    alive = jnp.arange(24) < 9  # the last of three blocks of 8 is idle
+    active = jnp.arange(24) < 9  # the last of three blocks of 8 is idle
     full = uncached(params, SMALL, codes, time)
     for ours, theirs in zip(
-        uncached(params, SMALL, codes, time, alive), full, strict=True
+        uncached(params, SMALL, codes, time, active), full, strict=True
     ):
         np.testing.assert_array_equal(ours[:16], theirs[:16])
         assert not np.asarray(ours[16:]).any()
 
 
 @jax.jit
-def slopes_of_sum(params, codes, time, alive):
+def slopes_of_sum(params, codes, time, active):
     """Slopes of the sum of all offsets in parameters, codes and time."""
 
     def total(params, codes, time):
-        offsets = together(params, SMALL, codes, time, alive)
+        offsets = together(params, SMALL, codes, time, active)
         return sum(jnp.sum(leaf) for leaf in offsets)
 
     return jax.grad(total, (0, 1, 2))(params, codes, time)
 
 
 @pytest.mark.hard_cases
-def test_no_living_row_and_no_row_at_all(dtype):
+def test_no_active_row_and_no_row_at_all(dtype):
     params, time = strong(SMALL, dtype), np.asarray(0.5, dtype)
     slopes = slopes_of_sum(params, embeddings(9, dtype), time, np.zeros(9, bool))
     assert not any(np.asarray(leaf).any() for leaf in jax.tree.leaves(slopes))
@@ -339,11 +339,11 @@ def test_unusable_quaternions_and_wild_residuals_stay_finite(dtype):
 
 @pytest.mark.hard_cases
 def test_equal_and_wild_embeddings_have_finite_slopes(dtype):
-    params, alive = strong(SMALL, dtype), np.ones(9, bool)
+    params, active = strong(SMALL, dtype), np.ones(9, bool)
     codes = np.asarray(embeddings(9, dtype))
     for scale, time in itertools.product((0.0, 1e-20, 1e4), (0.0, 1.0, 2.0)):
         drawn = codes * codes.dtype.type(scale)
-        slopes = slopes_of_sum(params, drawn, np.asarray(time, dtype), alive)
+        slopes = slopes_of_sum(params, drawn, np.asarray(time, dtype), active)
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
         assert np.asarray(slopes[1]).any()
 
@@ -357,8 +357,8 @@ def test_the_effect_moves_a_scene_and_leaves_it_alone_in_its_warm_up(float64):
 
     @jax.jit
     def in_training(step):
-        moment = Moment(time, step, jax.random.key(0))
-        return deformation.pose_in_training(effects, params, canonical, moment)
+        condition = FrameCondition(time, step=step, key=jax.random.key(0))
+        return deformation.pose_in_training(effects, params, canonical, condition)
 
     for before, after in zip(canonical, in_training(jnp.asarray(9)), strict=True):
         np.testing.assert_array_equal(before, after)
@@ -381,12 +381,14 @@ def test_the_effect_tells_its_rows_networks_and_rates():
     points = np.zeros((12, 3))
     first = rows.from_points(points, points)
     assert filled.init_rows(jax.random.key(0), first).shape == (12, 6)
-    nets = jax.eval_shape(filled.init_nets, jax.random.key(0))
+    nets = jax.eval_shape(filled.init, jax.random.key(0))
     assert isinstance(nets, KanMotion)
     assert nets.times.shape == (math.ceil(FRAMES / 2), 4)
-    np.testing.assert_allclose(filled.row_rate(jnp.asarray(50)), 2.5e-3)
+    np.testing.assert_allclose(filled.row_learning_rate(jnp.asarray(50)), 2.5e-3)
     for step, rate in ((0, 1.6e-4), (50, 1.6e-4 / math.sqrt(10)), (100, 1.6e-5)):
-        np.testing.assert_allclose(filled.net_rate(jnp.asarray(step)), rate, rtol=1e-5)
+        np.testing.assert_allclose(
+            filled.learning_rate(jnp.asarray(step)), rate, rtol=1e-5
+        )
 
 
 def test_one_frame_has_one_code():

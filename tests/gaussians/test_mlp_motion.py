@@ -10,11 +10,11 @@ import pytest
 
 from gaussians_jax import splats as rows
 from gaussians_jax.effects import deformation, mlp_motion
-from gaussians_jax.effects.effect import Moment
 from gaussians_jax.effects.mlp_motion import Motion, MotionSpec, Offsets, SmoothingSpec
 from gaussians_jax.splats import Gaussians, Params, Splats
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import MLP, Layer
+from nerfies_jax.training.effects import FrameCondition
 from tests import gradients
 
 SMALL = MotionSpec(
@@ -158,11 +158,11 @@ def test_the_time_part_may_be_summed_once(float64):
         np.testing.assert_allclose(getattr(offsets, name), expected, atol=1e-13)
 
 
-def test_rows_beyond_the_living_blocks_are_still(float64):
+def test_rows_beyond_the_active_blocks_are_still(float64):
     params = strong(SMALL)
     mean = some_gaussians(24).mean
-    alive = jnp.arange(24) < 9  # the last of three blocks of 8 is idle
-    offsets = deform(params, SMALL, mean, jnp.asarray(0.5), alive)
+    active = jnp.arange(24) < 9  # the last of three blocks of 8 is idle
+    offsets = deform(params, SMALL, mean, jnp.asarray(0.5), active)
     full = deform(params, SMALL, mean, jnp.asarray(0.5))
     for ours, theirs in zip(offsets, full, strict=True):
         np.testing.assert_array_equal(ours[:16], theirs[:16])
@@ -170,13 +170,13 @@ def test_rows_beyond_the_living_blocks_are_still(float64):
 
 
 @pytest.mark.hard_cases
-def test_no_living_row_and_no_row_at_all(dtype):
+def test_no_active_row_and_no_row_at_all(dtype):
     spec = dataclasses.replace(SMALL, depth=1, skips=())
     params = strong(spec, dtype)
 
-    def deformed(params, mean, alive):
+    def deformed(params, mean, active):
         time = jnp.asarray(0.5, dtype)
-        return mlp_motion.deform(params, spec, mean, time, alive)
+        return mlp_motion.deform(params, spec, mean, time, active)
 
     def total(*args):
         return sum(jnp.sum(leaf) for leaf in deformed(*args))
@@ -295,8 +295,8 @@ def test_warm_up_is_a_branch_without_motion():
     params, gaussians = scene_at()
 
     def moved(params, step):
-        moment = Moment(jnp.asarray(0.5), step, jax.random.key(0))
-        return deformation.pose_in_training((field,), params, gaussians, moment)
+        condition = FrameCondition(jnp.asarray(0.5), step=step, key=jax.random.key(0))
+        return deformation.pose_in_training((field,), params, gaussians, condition)
 
     run = jax.jit(moved)
     before, after = run(params, jnp.asarray(9)), run(params, jnp.asarray(10))
@@ -319,7 +319,7 @@ def test_a_trained_scene_has_neither_warm_up_nor_noise():
     field = mlp_motion.effect(SMALL, steps=100, frames=20)
     params, gaussians = scene_at()
     time = jnp.asarray(0.25)
-    moved = jax.jit(field.deform)(params, gaussians, Moment(time), None)
+    moved = jax.jit(field.deform)(params, gaussians, FrameCondition(time), None)
     motion = params.nets[mlp_motion.NAME]
     offsets = deform(motion, SMALL, gaussians.mean, time)
     expected = mlp_motion.apply(gaussians, offsets, SMALL.scale_rule)
@@ -344,7 +344,7 @@ def test_motion_sets_in_smoothly(dtype):
 
 def test_the_rate_falls_in_equal_ratios():
     field = mlp_motion.effect(MotionSpec(), steps=1000, frames=20)
-    rates = [float(field.net_rate(jnp.asarray(s))) for s in (0, 500, 1000, 4000)]
+    rates = [float(field.learning_rate(jnp.asarray(s))) for s in (0, 500, 1000, 4000)]
     middle = (8e-4 * 1.6e-6) ** 0.5
     np.testing.assert_allclose(rates, [8e-4, middle, 1.6e-6, 1.6e-6], rtol=1e-5)
 

@@ -19,19 +19,27 @@ SIZE = (20, 15)
 
 @pytest.fixture(scope="module")
 def trained():
-    """A deformable scene with dead rows in between, and what describes it."""
+    """A deformable scene with inactive rows in between, and what describes it."""
     capture = scenes.tiny_capture()
-    facts = scene.facts_of(capture)
-    model = scene.build(scenes.TINY_DEFORMABLE, facts)
+    metadata = scene.metadata_of(capture)
+    model = scene.build(scenes.TINY_DEFORMABLE, metadata)
     params = model.init(capture, jax.random.key(0)).params
     params = params._replace(nets=jax.tree.map(lambda leaf: leaf + 0.02, params.nets))
     rows = params.rows["splats"]
-    dead = jnp.arange(len(rows.mean)) % 7 == 0
+    inactive = jnp.arange(len(rows.mean)) % 7 == 0
     codes = jnp.asarray(np.random.default_rng(0).normal(size=(len(rows.mean), 5)))
     params = params._replace(
-        rows={"splats": splats.bury(rows, dead), "codes": codes.astype(jnp.float32)}
+        rows={
+            "splats": splats.deactivate(rows, inactive),
+            "codes": codes.astype(jnp.float32),
+        }
     )
-    about = {"spec": scenes.TINY_DEFORMABLE, "facts": facts, "step": 20, "name": "tiny"}
+    about = {
+        "spec": scenes.TINY_DEFORMABLE,
+        "facts": metadata,
+        "step": 20,
+        "name": "tiny",
+    }
     return params, about
 
 
@@ -43,12 +51,12 @@ def saved(trained, tmp_path):
     return path
 
 
-def test_living_rows_networks_and_settings_come_back_bit_for_bit(trained, saved):
+def test_active_rows_networks_and_settings_come_back_bit_for_bit(trained, saved):
     params, about = trained
     loaded, described = model_file.load(saved)
-    living = np.flatnonzero(splats.alive(params.rows["splats"]))
-    expected = splats.take_rows(params, jnp.asarray(living))
-    assert 0 < len(living) < len(params.rows["codes"])
+    active = np.flatnonzero(splats.active_mask(params.rows["splats"]))
+    expected = splats.take_rows(params, jnp.asarray(active))
+    assert 0 < len(active) < len(params.rows["codes"])
     assert jax.tree.structure(loaded) == jax.tree.structure(expected)
     for found, exact in zip(*map(jax.tree.leaves, (loaded, expected)), strict=True):
         assert found.dtype == exact.dtype == jnp.float32
@@ -81,8 +89,8 @@ def test_float64_is_stored_in_float32(trained, tmp_path, float64):
     wide = jax.tree.map(lambda leaf: jnp.asarray(leaf, float64) + 1e-12, params)
     model_file.save(tmp_path / "model.npz", wide, about)
     loaded, _ = model_file.load(tmp_path / "model.npz")
-    living = np.asarray(splats.alive(params.rows["splats"]))
-    mean = np.asarray(wide.rows["splats"].mean)[living].astype(np.float32)
+    active = np.asarray(splats.active_mask(params.rows["splats"]))
+    mean = np.asarray(wide.rows["splats"].mean)[active].astype(np.float32)
     assert loaded.rows["splats"].mean.dtype == np.float32
     np.testing.assert_array_equal(loaded.rows["splats"].mean, mean)
 
@@ -99,9 +107,9 @@ def test_a_failed_save_leaves_the_file_that_was_there(trained, saved):
         model_file.save(saved, params, {"f": lambda: 0})
     rows = params.rows["splats"]
     none = params.rows | {
-        "splats": splats.bury(rows, rows.mean[:, 0] == rows.mean[:, 0])
+        "splats": splats.deactivate(rows, rows.mean[:, 0] == rows.mean[:, 0])
     }
-    with pytest.raises(ValueError, match=r"model\.npz: none of the .* rows is alive"):
+    with pytest.raises(ValueError, match=r"model\.npz: none of the .* rows is active"):
         model_file.save(saved, params._replace(rows=none), about)
     assert saved.read_bytes() == before
     assert [path.name for path in saved.parent.iterdir()] == ["model.npz"]
@@ -212,8 +220,8 @@ def test_arrays_that_do_not_fit_are_refused(saved, array, words):
 
 
 def test_numbers_that_are_not_finite_are_refused(trained, saved):
-    living = int(splats.alive(trained[0].rows["splats"]).sum())
-    codes = np.full((living, 5), np.inf, np.float32)
+    active = int(splats.active_mask(trained[0].rows["splats"]).sum())
+    codes = np.full((active, 5), np.inf, np.float32)
     edited(saved, lambda about: None, {"params.rows.codes": codes})
     refused(saved, "not finite")
 

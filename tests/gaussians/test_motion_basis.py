@@ -11,12 +11,12 @@ import scipy.spatial.transform
 
 from gaussians_jax import splats as rows
 from gaussians_jax.effects import deformation, mlp_motion, motion_basis
-from gaussians_jax.effects.effect import Moment
 from gaussians_jax.effects.mlp_motion import SmoothingSpec
 from gaussians_jax.effects.motion_basis import BasisMotionSpec, Offsets
 from gaussians_jax.splats import Gaussians, Params, Splats
 from nerfies_jax.measure import clock
 from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.training.effects import FrameCondition
 from tests import gradients
 
 SMALL = BasisMotionSpec(
@@ -49,10 +49,10 @@ def strong(spec, dtype="float64", seed=0):
 
 
 @functools.partial(jax.jit, static_argnums=1)
-def uncached(params, spec, mean, time, alive=None):
+def uncached(params, spec, mean, time, active=None):
     """As in a training step: prepared and used in one program."""
-    prepared = motion_basis.prepare(params, spec, mean, alive)
-    return motion_basis.deform(params, spec, mean, time, prepared, alive)
+    prepared = motion_basis.prepare(params, spec, mean, active)
+    return motion_basis.deform(params, spec, mean, time, prepared, active)
 
 
 prepare = jax.jit(motion_basis.prepare, static_argnums=1)
@@ -315,17 +315,17 @@ def test_blocks_change_nothing_but_memory(count, dtype):
     assert blocked.mean.shape == blocked.turn.shape == (count, 3)
 
 
-def test_rows_beyond_the_living_blocks_are_still(float64):
+def test_rows_beyond_the_active_blocks_are_still(float64):
     params = strong(SMALL)
     mean = some_gaussians(24).mean
     time = jnp.asarray(0.5)
-    alive = jnp.arange(24) < 9  # the last of three blocks of 8 is idle
-    offsets = uncached(params, SMALL, mean, time, alive)
+    active = jnp.arange(24) < 9  # the last of three blocks of 8 is idle
+    offsets = uncached(params, SMALL, mean, time, active)
     full = uncached(params, SMALL, mean, time)
     for ours, theirs in zip(offsets, full, strict=True):
         np.testing.assert_array_equal(ours[:16], theirs[:16])
         assert not np.asarray(ours[16:]).any()
-    assert not np.asarray(prepare(params, SMALL, mean, alive).basis[16:]).any()
+    assert not np.asarray(prepare(params, SMALL, mean, active).basis[16:]).any()
 
     def total(params):
         nobody = jnp.zeros(24, bool)
@@ -380,8 +380,7 @@ def test_turns_of_every_size_are_rotations_with_finite_slopes(length, angle, dty
     half = float(turn[0, 0]) / 2
     w, x = np.cos(half), np.sin(half)
     expected = [w, x, 0, 0]
-    usable = {"float32": (1.0,), "float64": (1e-30, 1.0, 1e25)}[dtype]
-    if length in usable:
+    if length > 0:
         expected = np.array([w - x, w + x, w - x, w + x]) / 2
     np.testing.assert_allclose(
         moved.quaternion[0], expected, atol=tolerance * max(1, angle)
@@ -405,12 +404,12 @@ def test_warm_up_and_noise_are_of_training_alone():
 
     @jax.jit
     def moved(params, step):
-        moment = Moment(time, step, jax.random.key(0))
-        return deformation.pose_in_training((field,), params, gaussians, moment)
+        condition = FrameCondition(time, step=step, key=jax.random.key(0))
+        return deformation.pose_in_training((field,), params, gaussians, condition)
 
     np.testing.assert_array_equal(moved(params, jnp.asarray(9)).mean, gaussians.mean)
     ready = jax.jit(field.prepare)(params)
-    trained = jax.jit(field.deform)(params, gaussians, Moment(time), ready)
+    trained = jax.jit(field.deform)(params, gaussians, FrameCondition(time), ready)
     motion = params.nets[motion_basis.NAME]
     at_rest = motion_basis.apply(
         gaussians, uncached(motion, spec, gaussians.mean, time)
@@ -513,7 +512,7 @@ def test_settings_that_cannot_work_are_refused(setting, message):
 
 def test_the_rate_falls_in_equal_ratios():
     field = motion_basis.effect(BasisMotionSpec(), steps=1000, frames=20)
-    rates = [float(field.net_rate(jnp.asarray(s))) for s in (0, 500, 1000, 4000)]
+    rates = [float(field.learning_rate(jnp.asarray(s))) for s in (0, 500, 1000, 4000)]
     middle = (8e-4 * 1.6e-6) ** 0.5
     np.testing.assert_allclose(rates, [8e-4, middle, 1.6e-6, 1.6e-6], rtol=1e-5)
     assert field.name != mlp_motion.NAME

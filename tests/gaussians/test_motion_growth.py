@@ -10,18 +10,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import density, optimiser, splats
-from gaussians_jax.density import DensitySpec
+from gaussians_jax import densification, optimiser, splats
+from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.effects import motion_growth
-from gaussians_jax.effects.effect import Moment
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec, Travel
 from gaussians_jax.splats import Gaussians, Params, Splats
+from nerfies_jax.training.effects import Effect, FrameCondition
 
 EXTENT = 2.0
 TAU = 2e-3  # of the default threshold in this extent, scene units
 SOFT = MotionGrowthSpec(start=100)
 HARD = dataclasses.replace(SOFT, form="hard")
-DENSITY = DensitySpec()
+STRATEGY = DefaultStrategySpec()
 TX = optimiser.scale_by_row_adam()
 
 
@@ -41,19 +41,19 @@ def rows_of(count, dtype="float32"):
 
 @jax.jit
 def watch(canonical, displacements):
-    """What is carried after all displacements [instants, gaussians, 3], in one scan."""
+    """What is kept after all displacements [instants, gaussians, 3], in one scan."""
 
-    def body(carried, displacement):
+    def body(state, displacement):
         moved = canonical._replace(mean=canonical.mean + displacement)
-        moment = Moment(jnp.asarray(0.5, displacement.dtype))
-        return motion_growth.observe(carried, canonical, moved, moment), None
+        condition = FrameCondition(jnp.asarray(0.5, displacement.dtype))
+        return motion_growth.update_state(state, canonical, moved, condition), None
 
     params = Params({"splats": canonical}, {})  # its means are all that is read
-    return jax.lax.scan(body, motion_growth.carry(params), displacements)[0]
+    return jax.lax.scan(body, motion_growth.init_state(params), displacements)[0]
 
 
 def drawn(displacements, opacity=None, mean=0.0):
-    """Rows around `mean` that `watch` can move, all alive unless told."""
+    """Rows around `mean` that `watch` can move, all active unless told."""
     displacements = jnp.asarray(displacements)
     count, dtype = displacements.shape[1], displacements.dtype
     opacity = jnp.full(count, 0.5, dtype) if opacity is None else opacity
@@ -70,12 +70,12 @@ def seen_motion(displacements, **kind):
     return motion_growth.motion(watch(drawn(displacements, **kind), displacements))
 
 
-def slow_motion(displacements, alive):
+def slow_motion(displacements, active):
     """Half the diagonal of each row's box about the median row, in plain loops."""
     displacements = np.asarray(displacements, np.float64)
-    places = [[] for _ in alive]
+    places = [[] for _ in active]
     for instant in displacements:
-        middle = [np.median(instant[alive, axis]) for axis in range(3)]
+        middle = [np.median(instant[active, axis]) for axis in range(3)]
         for row, displacement in enumerate(instant):
             places[row].append(displacement - middle)
     sides = [np.ptp(place, axis=0) for place in places]
@@ -85,10 +85,10 @@ def slow_motion(displacements, alive):
 @pytest.mark.parametrize("count", [1, 2, 9, 10])
 def test_motion_is_the_box_about_the_median_row(count, rng, dtype):
     paths = rng.normal(size=(6, count, 3)).astype(dtype)
-    alive = np.arange(count) % 4 != 1
-    result = seen_motion(paths, opacity=np.where(alive, 0.5, 0.0))
+    active = np.arange(count) % 4 != 1
+    result = seen_motion(paths, opacity=np.where(active, 0.5, 0.0))
     tolerance = {"float32": 1e-6, "float64": 1e-14}[dtype]
-    np.testing.assert_allclose(result, slow_motion(paths, alive), atol=tolerance)
+    np.testing.assert_allclose(result, slow_motion(paths, active), atol=tolerance)
 
 
 def test_motion_does_not_depend_on_the_order_of_the_frames(rng):
@@ -145,7 +145,7 @@ def test_a_constant_offset_is_no_motion(dtype):
 def test_one_instant_and_none_are_no_motion(dtype):
     paths = np.ones((1, 4, 3), dtype) * np.arange(4, dtype=dtype)[:, None]
     assert not seen_motion(paths).any()
-    nothing = motion_growth.carry(rows_of(4, dtype))
+    nothing = motion_growth.init_state(rows_of(4, dtype))
     assert not motion_growth.motion(nothing).any()
     assert nothing.low.dtype.name == nothing.high.dtype.name == dtype
     assert motion_growth.motion(jax.tree.map(lambda x: x[:0], nothing)).shape == (0,)
@@ -183,14 +183,14 @@ def test_far_from_the_origin_motion_is_good_to_an_ulp_of_the_place(dtype):
     assert ulp < 0.1 * TAU
 
 
-def test_dead_rows_do_not_bear_on_the_median(rng):
+def test_inactive_rows_do_not_bear_on_the_median(rng):
     paths = np.zeros((3, 10, 3), "float32")
-    paths[:, 4:] = rng.normal(size=(3, 6, 3))  # more than half, but dead
+    paths[:, 4:] = rng.normal(size=(3, 6, 3))  # more than half, but inactive
     opacity = np.where(np.arange(10) < 4, 0.5, 0)
     assert not seen_motion(paths, opacity=opacity)[:4].any()
-    logit = jnp.full(10, splats.DEAD_LOGIT)
+    logit = jnp.full(10, splats.INACTIVE_LOGIT)
     assert not np.asarray(jax.nn.sigmoid(logit)).any()
-    # Nothing alive at all, then: no common motion.
+    # Nothing active at all, then: no common motion.
     assert np.isfinite(seen_motion(paths, opacity=np.zeros(10))).all()
 
 
@@ -208,13 +208,13 @@ def test_the_common_motion_is_the_median_of_a_sample(count, rng, dtype):
 
 
 def factor_of(spec, motion):
-    """The factor of rows that moved so far, by way of what is carried."""
+    """The factor of rows that moved so far, by way of what is kept."""
     motion = np.asarray(motion, np.float32)
     high = np.zeros((len(motion), 3), np.float32)
     high[:, 1] = 2 * motion  # half the diagonal of the box
-    carried = Travel(jnp.zeros_like(high), jnp.asarray(high))
+    state = Travel(jnp.zeros_like(high), jnp.asarray(high))
     effect = motion_growth.effect(spec, EXTENT)
-    return effect.grow_score(carried, 500)
+    return effect.grow_score(state, 500)
 
 
 def test_the_soft_factor_is_its_formula():
@@ -254,30 +254,30 @@ def test_the_soft_form_becomes_the_hard_one_as_beta_grows():
 def grown(spec, params, gradient, motion, step=600):
     """The event of a scene with this effect: labels of the rows that were cloned."""
     rows = params.rows["splats"]
-    stats = density.empty_stats(rows)
-    gradient = jnp.zeros_like(stats.gradient).at[: len(gradient)].set(gradient)
-    stats = stats._replace(gradient=gradient, views=jnp.ones_like(stats.views))
+    stats = densification.empty_stats(rows)
+    gradient = jnp.zeros_like(stats.grad2d).at[: len(gradient)].set(gradient)
+    stats = stats._replace(grad2d=gradient, views=jnp.ones_like(stats.views))
     if spec is not None:
         high = jnp.zeros_like(rows.mean).at[: len(motion), 0].set(2 * motion)
-        carried = Travel(jnp.zeros_like(high), high)
-        factor = motion_growth.effect(spec, EXTENT).grow_score(carried, step)
-        stats = stats._replace(gradient=stats.gradient * jnp.asarray(factor))
-    changed = density.densify(
+        state = Travel(jnp.zeros_like(high), high)
+        factor = motion_growth.effect(spec, EXTENT).grow_score(state, step)
+        stats = stats._replace(grad2d=stats.grad2d * jnp.asarray(factor))
+    changed = densification.densify(
         TX,
         params,
         TX.init(params),
         stats,
         jax.random.key(0),
-        DENSITY,
+        STRATEGY,
         step=step,
         extent=EXTENT,
     )
     assert changed.report.split == changed.report.pruned == 0
-    labels = np.asarray(changed.params.rows["label"])[: changed.report.alive, 0]
+    labels = np.asarray(changed.params.rows["label"])[: changed.report.active, 0]
     return changed, sorted(labels[-changed.report.cloned or len(labels) :].astype(int))
 
 
-STEEP, FLAT = 1.5 * DENSITY.gradient, 0.5 * DENSITY.gradient
+STEEP, FLAT = 1.5 * STRATEGY.grow_grad2d, 0.5 * STRATEGY.grow_grad2d
 # Every combination of slope and motion, in the order of the rows.
 TABLE = tuple(itertools.product((STEEP, FLAT), (2 * TAU, 0.5 * TAU, 0.0)))
 
@@ -299,7 +299,7 @@ def test_truth_table_of_the_conjunction(spec, step, cloned, dtype):
     params = rows_of(len(TABLE), dtype)
     changed, labels = grown(spec, params, gradient, motion, step)
     assert labels == cloned
-    assert changed.stats.gradient.dtype.name == dtype
+    assert changed.stats.grad2d.dtype.name == dtype
 
 
 def test_at_the_threshold_itself_nothing_grows():
@@ -313,7 +313,7 @@ def test_at_the_threshold_itself_nothing_grows():
 
 def test_hard_growth_is_dead_where_nothing_moves_yet_and_soft_is_not():
     """Random points, motion zero at first: equation 7 never lets them grow."""
-    params, gradient = rows_of(20), np.full(20, 20 * DENSITY.gradient)
+    params, gradient = rows_of(20), np.full(20, 20 * STRATEGY.grow_grad2d)
     for spec, growth in ((HARD, 0), (SOFT, 20), (None, 20)):
         changed, _ = grown(spec, params, gradient, np.zeros(20))
         assert changed.report.cloned == growth
@@ -332,8 +332,8 @@ def spread(spec, rounds=8):
         moves = np.asarray(params.rows["label"])[:count, 0] == 1
         slope = np.where(moves, 24 / moves.sum(), 96 / (~moves).sum())
         motion = np.where(moves, 5 * TAU, 0.1 * TAU)
-        changed, _ = grown(spec, params, slope * DENSITY.gradient, motion)
-        params, count = changed.params, changed.report.alive
+        changed, _ = grown(spec, params, slope * STRATEGY.grow_grad2d, motion)
+        params, count = changed.params, changed.report.active
     assert changed.report.cloned == 0  # at rest
     moves = np.asarray(params.rows["label"])[:count, 0] == 1
     return int((~moves).sum()), int(moves.sum())
@@ -353,15 +353,15 @@ def an_effect():
 
 def test_it_fills_only_the_seams_of_growth():
     effect = an_effect()
-    filled = {name for name in effect._fields if getattr(effect, name) not in (None, 0)}
-    assert filled == {"name", "carry", "observe", "grow_score", "wants"}
-    assert effect.wants == frozenset()
+    empty = Effect(effect.name)
+    filled = {n for n in effect._fields if getattr(effect, n) != getattr(empty, n)}
+    assert filled == {"state", "update_state", "grow_score"}
 
 
 def test_before_its_start_the_factor_is_one(dtype):
-    carried = motion_growth.carry(rows_of(5, dtype))
+    state = motion_growth.init_state(rows_of(5, dtype))
     for step, factor in ((99, 1.0), (100, 0.2)):  # at rest, beta = 4
-        result = an_effect().grow_score(carried, step)
+        result = an_effect().grow_score(state, step)
         np.testing.assert_allclose(result, np.full(5, factor), rtol=1e-7)
         assert result.dtype.name == dtype
 

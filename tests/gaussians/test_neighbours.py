@@ -9,9 +9,9 @@ import pytest
 
 from gaussians_jax import splats as rows
 from gaussians_jax.effects import neighbours
-from gaussians_jax.effects.effect import Around, Moment
 from gaussians_jax.effects.neighbours import Neighbours, NeighbourSpec
 from gaussians_jax.splats import Params, Splats
+from nerfies_jax.training.effects import PenaltyContext, weighted_sum
 from tests import gradients
 
 FEW = NeighbourSpec(count=4)
@@ -19,15 +19,15 @@ inconsistency = jax.jit(neighbours.inconsistency)
 value_and_slope = jax.jit(jax.value_and_grad(neighbours.inconsistency))
 
 
-def scene(mean, alive=None, width=3, dtype="float32", seed=0):
+def scene(mean, active=None, width=3, dtype="float32", seed=0):
     """Gaussians at given places with random embeddings under "code"."""
     mean = np.asarray(mean, np.float64)
     count = len(mean)
     rng = np.random.default_rng(seed)
     rest = (np.zeros((count, *shape)) for shape in [(3,), (4,), (), (1, 3), (0, 3)])
     splats = Splats(*(jnp.asarray(leaf, dtype) for leaf in (mean, *rest)))
-    if alive is not None:
-        logit = np.where(alive, 0, rows.DEAD_LOGIT)
+    if active is not None:
+        logit = np.where(active, 0, rows.INACTIVE_LOGIT)
         splats = splats._replace(opacity_logit=jnp.asarray(logit, dtype))
     code = jnp.asarray(rng.normal(size=(count, width)), dtype)
     return Params({"splats": splats, "code": code}, {})
@@ -46,25 +46,25 @@ def listed(graph, row):
 @pytest.mark.parametrize("scale", neighbours.SCALES)
 def test_the_graph_is_that_of_all_distances(scale, dtype):
     places = some_places()
-    alive = np.arange(40) % 5 != 2
-    params = scene(places, alive, dtype=dtype)
+    active = np.arange(40) % 5 != 2
+    params = scene(places, active, dtype=dtype)
     spec = NeighbourSpec(count=6, gamma=3.0, scale=scale)
     graph = neighbours.find(spec, params, extent=0.7)
 
     places = np.asarray(params.rows["splats"].mean, np.float64)
     apart = np.linalg.norm(places[:, None] - places, axis=-1)
-    apart[:, ~alive] = np.inf
+    apart[:, ~active] = np.inf
     np.fill_diagonal(apart, np.inf)
     nearest = np.argsort(apart, axis=1)[:, :6]
     distance = np.take_along_axis(apart, nearest, axis=1)
     unit = {
         "units": 1,
         "extent": 0.7,
-        "spacing": np.median(distance[alive][:, -1]) / 0.03,
+        "spacing": np.median(distance[active][:, -1]) / 0.03,
     }[scale]
     weight = np.exp(-3.0 * (distance / unit) ** 2)
-    weight[~alive] = 0
-    nearest[~alive] = np.flatnonzero(~alive)[:, None]
+    weight[~active] = 0
+    nearest[~active] = np.flatnonzero(~active)[:, None]
     np.testing.assert_array_equal(graph.index, nearest)
     tolerance = {"float32": 1e-6, "float64": 1e-13}[dtype]
     np.testing.assert_allclose(graph.weight, weight, rtol=tolerance)
@@ -91,20 +91,20 @@ def test_weights_by_spacing_do_not_depend_on_the_unit():
 
 
 @pytest.mark.hard_cases
-@pytest.mark.parametrize("living", [0, 1, 2, 4])
-def test_with_few_living_rows_the_rest_names_itself(living, dtype):
-    alive = np.isin(np.arange(8), [6, 1, 3, 4][:living])
-    params = scene(some_places(8), alive, dtype=dtype)
+@pytest.mark.parametrize("active_count", [0, 1, 2, 4])
+def test_with_few_active_rows_the_rest_names_itself(active_count, dtype):
+    active = np.isin(np.arange(8), [6, 1, 3, 4][:active_count])
+    params = scene(some_places(8), active, dtype=dtype)
     graph = jax.tree.map(np.asarray, neighbours.find(FEW, params, extent=1.0))
-    others = set(np.flatnonzero(alive).tolist())
+    others = set(np.flatnonzero(active).tolist())
     for row in range(8):
-        assert listed(graph, row) == (others - {row} if alive[row] else set())
+        assert listed(graph, row) == (others - {row} if active[row] else set())
         assert (graph.index[row][graph.weight[row] == 0] == row).all()
-    value, slope = value_and_slope(params.rows["code"], graph, alive)
+    value, slope = value_and_slope(params.rows["code"], graph, active)
     assert np.isfinite(value)
     assert np.isfinite(slope).all()
-    assert (living >= 2) == bool(np.asarray(slope).any())
-    assert not np.asarray(slope)[~alive].any()
+    assert (active_count >= 2) == bool(np.asarray(slope).any())
+    assert not np.asarray(slope)[~active].any()
 
 
 @pytest.mark.hard_cases
@@ -123,9 +123,9 @@ def test_clones_at_one_place_are_neighbours_but_never_oneself(copies, dtype):
     assert np.isfinite(graph.weight).all()
 
 
-def slow_inconsistency(code, graph, alive, count):
+def slow_inconsistency(code, graph, active, count):
     total, pairs = 0.0, 0
-    for i in np.flatnonzero(alive):
+    for i in np.flatnonzero(active):
         for k, w in zip(graph.index[i], graph.weight[i], strict=True):
             total += np.sqrt(w * np.sum((code[i] - code[k]) ** 2) + 1e-20)
         pairs += count
@@ -133,14 +133,14 @@ def slow_inconsistency(code, graph, alive, count):
 
 
 def test_the_penalty_is_the_sum_over_all_pairs(dtype):
-    alive = np.arange(40) % 7 != 3
-    params = scene(some_places(), alive, width=5, dtype=dtype)
+    active = np.arange(40) % 7 != 3
+    params = scene(some_places(), active, width=5, dtype=dtype)
     graph = neighbours.find(NeighbourSpec(count=6), params, extent=1.0)
     code = params.rows["code"]
-    value = inconsistency(code, graph, jnp.asarray(alive))
+    value = inconsistency(code, graph, jnp.asarray(active))
     as_numpy = Neighbours(*(np.asarray(leaf, np.float64) for leaf in graph))
     as_numpy = as_numpy._replace(index=np.asarray(graph.index))
-    expected = slow_inconsistency(np.asarray(code, np.float64), as_numpy, alive, 6)
+    expected = slow_inconsistency(np.asarray(code, np.float64), as_numpy, active, 6)
     assert value.dtype.name == dtype
     np.testing.assert_allclose(
         value, expected, rtol={"float32": 1e-6, "float64": 1e-13}[dtype]
@@ -148,23 +148,23 @@ def test_the_penalty_is_the_sum_over_all_pairs(dtype):
 
 
 def test_few_neighbours_are_averaged_over_those_there_are(float64):
-    alive = np.arange(8) < 3
-    params = scene(some_places(8), alive, dtype="float64")
+    active = np.arange(8) < 3
+    params = scene(some_places(8), active, dtype="float64")
     graph = neighbours.find(NeighbourSpec(count=6, gamma=0.0), params, extent=1.0)
     code = np.asarray(params.rows["code"])[:3]
     apart = np.linalg.norm(code[:, None] - code, axis=-1)
-    value = inconsistency(params.rows["code"], graph, jnp.asarray(alive))
+    value = inconsistency(params.rows["code"], graph, jnp.asarray(active))
     # The three rows' idle places cost the floor's 1e-10 each.
     np.testing.assert_allclose(value, apart.sum() / 6, atol=1e-9)
 
 
 def test_gradients_of_the_penalty(float64):
-    alive = jnp.arange(40) % 7 != 3
-    params = scene(some_places(), np.asarray(alive), width=5, dtype="float64")
+    active = jnp.arange(40) % 7 != 3
+    params = scene(some_places(), np.asarray(active), width=5, dtype="float64")
     graph = neighbours.find(NeighbourSpec(count=6), params, extent=1.0)
 
     def total(code):
-        return neighbours.inconsistency(code, graph, alive)
+        return neighbours.inconsistency(code, graph, active)
 
     assert gradients.directional_error(total, params.rows["code"]) < 1e-7
 
@@ -201,8 +201,9 @@ def compiled_penalty(spec):
     effect = neighbours.effect(spec, extent=1.0, of="code")
 
     def penalty(params, graph, step):
-        moment = Moment(jnp.zeros(()), step, jax.random.key(0))
-        return effect.penalty(Around(params, None, moment, graph))
+        return effect.penalty(
+            None, PenaltyContext(None, step, None, params, state=graph)
+        )
 
     return effect, jax.jit(penalty)
 
@@ -210,14 +211,14 @@ def compiled_penalty(spec):
 def test_the_effect_weighs_and_waits_for_its_start():
     params = scene(some_places(), dtype="float32")
     effect, penalty = compiled_penalty(NeighbourSpec(weight=0.5, start=10))
-    graph = effect.carry(params)
-    before = penalty(params, graph, jnp.asarray(9))
+    graph = effect.state(params)
+    before = weighted_sum(penalty(params, graph, jnp.asarray(9)))
     after = penalty(params, graph, jnp.asarray(10))
-    assert before.value == 0
+    assert before == 0
     expected = inconsistency(params.rows["code"], graph, jnp.ones(40, bool))
-    np.testing.assert_allclose(after.value, 0.5 * expected, rtol=1e-6)
+    np.testing.assert_allclose(weighted_sum(after), 0.5 * expected, rtol=1e-6)
     linked = np.mean(np.asarray(graph.weight) > 1e-3)
-    np.testing.assert_allclose(after.metrics["linked"], linked, rtol=1e-6)
+    np.testing.assert_allclose(after["linked"].value, linked, rtol=1e-6)
     assert linked > 0.5
     program = penalty.lower(params, graph, jnp.asarray(9)).compile().as_text()
     assert "conditional" in program
@@ -235,8 +236,8 @@ def test_the_penalty_draws_neighbours_together_and_leaves_the_far_apart():
         return [float(jnp.std(code[part], axis=0).mean()) for part in halves]
 
     halves = np.arange(12), np.arange(12, 24)
-    slope = jax.grad(lambda code: neighbours.inconsistency(code, graph, alive))
-    alive = jnp.ones(24, bool)
+    slope = jax.grad(lambda code: neighbours.inconsistency(code, graph, active))
+    active = jnp.ones(24, bool)
     code = params.rows["code"]
     centres = [np.asarray(code[part]).mean(axis=0) for part in halves]
     end = jax.jit(
@@ -254,7 +255,7 @@ def test_the_penalty_draws_neighbours_together_and_leaves_the_far_apart():
 def test_missing_rows_are_named():
     effect = neighbours.effect(NeighbourSpec(), extent=1.0, of="kan_motion")
     with pytest.raises(ValueError, match=r"no rows .kan_motion.*code"):
-        effect.carry(scene(some_places()))
+        effect.state(scene(some_places()))
 
 
 @pytest.mark.parametrize(

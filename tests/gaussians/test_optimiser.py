@@ -10,7 +10,7 @@ import optax
 import pytest
 
 from gaussians_jax import optimiser
-from gaussians_jax.splats import DEAD_LOGIT, Params, Splats
+from gaussians_jax.splats import INACTIVE_LOGIT, Params, Splats
 
 COUNT = 6
 # optax 0.2.8 raises a float to an integer power, which strict promotion refuses.
@@ -307,6 +307,16 @@ def test_a_slope_too_large_to_square_shows_and_spares_the_others(name, slope, dt
 
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("name", PAIRS)
+def test_float32_stays_float32_where_x64_is_on(name):
+    """NumPy's float64 among the coefficients would make the updates float64."""
+    rule, slopes = PAIRS[name][0](), {"w": jnp.ones((3, 2), jnp.float32)}
+    with jax.enable_x64(True):
+        shapes = jax.eval_shape(rule.update, slopes, jax.eval_shape(rule.init, slopes))
+    kinds = {leaf.dtype.name for leaf in jax.tree.leaves(shapes)}
+    assert kinds == {"float32", "int32"}
+
+
+@pytest.mark.parametrize("name", PAIRS)
 @pytest.mark.parametrize("narrow", [jnp.bfloat16, jnp.float16])
 def test_parameters_that_small_steps_would_not_move_are_refused(name, narrow):
     """In bfloat16, 200 steps of 1e-3 leave a parameter of one where it was."""
@@ -326,14 +336,14 @@ def test_a_gather_moves_rows_with_their_moments_and_leaves_nets_alone(name):
     moments = first_moments(tx, slopes, params)
     rows = jnp.asarray([5, 0, 0, 2, 1, 0, 0, 0])
     fresh = jnp.asarray([0, 0, 1, 0, 0, 0, 0, 0], bool)
-    dead = jnp.arange(8) >= 5
+    inactive = jnp.arange(8) >= 5
     taken, moved = jax.jit(optimiser.gather_rows, static_argnums=0)(
-        tx, params, moments, rows, fresh, dead
+        tx, params, moments, rows, fresh, inactive
     )
     np.testing.assert_array_equal(
         taken.rows["embedding"], params.rows["embedding"][rows]
     )
-    assert (taken.rows["splats"].opacity_logit[5:] == DEAD_LOGIT).all()
+    assert (taken.rows["splats"].opacity_logit[5:] == INACTIVE_LOGIT).all()
     np.testing.assert_array_equal(taken.nets["w"], params.nets["w"])
 
     by_kind = moved[1].inner_states

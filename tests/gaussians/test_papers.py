@@ -11,12 +11,13 @@ import rich.console
 
 from gaussians_jax import scene
 from gaussians_jax.effects import deformation
-from gaussians_jax.effects.effect import Moment
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec
+from gaussians_jax.mcmc import MCMCStrategySpec
 from gaussians_jax.phases import AlternationSpec
 from gaussians_jax.spec import effects_of, refuse_what_cannot_train
 from nerfies_jax import evaluation
 from nerfies_jax.training import checkpoint, loop
+from nerfies_jax.training.effects import FrameCondition
 from tests import gradients, scenes
 
 PAPERS = {"sonata": scenes.TINY_SONATA, "moba": scenes.TINY_MOBA}
@@ -24,15 +25,15 @@ QUIET = rich.console.Console(quiet=True)
 by_paper = pytest.mark.parametrize("paper", PAPERS)
 
 
-def facts():
-    return scene.facts_of(scenes.tiny_capture())
+def metadata():
+    return scene.metadata_of(scenes.tiny_capture())
 
 
 @functools.cache
 def made(paper):
     capture = scenes.tiny_capture()
-    model = scene.build(PAPERS[paper], facts())
-    frames = evaluation.frames_of(capture, model.wants)
+    model = scene.build(PAPERS[paper], metadata())
+    frames = evaluation.frames_of(capture, model.required_data)
     return model, frames
 
 
@@ -67,7 +68,7 @@ def test_a_run_with_every_part_learns_and_stays_finite(paper):
     learnt = train(paper, result.state, 600).state
     first, last = psnr(paper, start(paper)), psnr(paper, learnt)
     assert last > first + 3, (first, last)
-    names = {effect.name for effect in effects_of(PAPERS[paper], facts())}
+    names = {effect.name for effect in effects_of(PAPERS[paper], metadata())}
     silent = {"kan_motion", "motion_basis", "motion_growth"}  # add nothing to the loss
     assert names - silent <= set(rows[-1])
     for leaf in jax.tree.leaves(learnt.params):
@@ -80,7 +81,7 @@ def test_what_is_carried_follows_the_rows(paper):
     state = straight(paper).state
     capacity = state.params.rows["splats"].mean.shape[0]
     assert capacity != start(paper).params.rows["splats"].mean.shape[0]
-    for leaf in jax.tree.leaves(state.extra):
+    for leaf in jax.tree.leaves(state.aux_state):
         assert leaf.shape[0] == capacity
 
 
@@ -105,7 +106,7 @@ def test_an_interrupted_run_ends_as_the_straight_one(paper, tmp_path):
 @by_paper
 def test_the_loss_of_a_whole_step_has_the_right_slope(paper, float64):
     capture = scenes.tiny_capture()
-    spec, known = PAPERS[paper], facts()
+    spec, known = PAPERS[paper], metadata()
     if paper == "moba":  # else no slope reaches the means through the networks
         motion = dataclasses.replace(spec.motion, detach=False)
         spec = dataclasses.replace(spec, motion=motion)
@@ -127,18 +128,18 @@ def test_the_loss_of_a_whole_step_has_the_right_slope(paper, float64):
 
     params = wide(state.params)._replace(nets=jax.tree.map(awake, state.params.nets))
     view = wide(evaluation.view_of(capture, int(capture.train[2])))
-    truth = wide(scene.shot(frames, 2, None))
-    carried = wide(scene.carried_by(effects, params))
+    truth = wide(scene.observe(frames, 2, None))
+    states = wide(scene.states_of(effects, params))
     step = jnp.asarray(20, jnp.int32)
-    moment = Moment(view.time, step, jax.random.key(5))
+    condition = FrameCondition(view.time, step=step, key=jax.random.key(5))
 
     def loss(params):
         moved = deformation.pose_in_training(
-            effects, params, scene.splats.activate(params.rows["splats"]), moment
+            effects, params, scene.splats.activate(params.rows["splats"]), condition
         )
         drawn = model.stages.draw(params, moved, view, (40, 30), step)
         seen = truth._replace(rendering=drawn)
-        return scene.loss_of(spec, effects, params, seen, moment, carried)[0]
+        return scene.loss_of(spec, effects, params, seen, condition, states)[0]
 
     def of_rows(rows):
         return loss(params._replace(rows=rows))
@@ -169,7 +170,8 @@ def test_stages_draw_what_render_draws(paper):
         ({"motion": None}, "without a motion"),
         ({"motion": scenes.TINY_MOTION, "neighbours": scenes.TINY_SONATA.neighbours},
          "neighbours=none"),
-        ({"density": None}, "motion_growth=none"),
+        ({"densification": None}, "motion_growth=none"),
+        ({"densification": MCMCStrategySpec()}, "threshold of Default"),
         ({"motion_growth": MotionGrowthSpec(form="hard", start=3)}, "nothing would"),
         ({"motion": None, "motion_growth": None, "acceleration": None},
          "alternation without"),
@@ -179,7 +181,7 @@ def test_parts_that_need_others_are_refused(change, words):
     spec = dataclasses.replace(scenes.TINY_MOBA, **change)
     with pytest.raises(ValueError, match=words):
         refuse_what_cannot_train(spec)
-    model = scene.build(spec, facts())  # a trained scene may be drawn without
+    model = scene.build(spec, metadata())  # a trained scene may be drawn without
     with pytest.raises(ValueError, match=words):
         model.init(scenes.tiny_capture(), jax.random.key(0))
 

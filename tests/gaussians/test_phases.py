@@ -13,7 +13,7 @@ import pytest
 
 from gaussians_jax import phases, scene
 from gaussians_jax.optimiser import scale_by_row_adam, scale_by_row_radam
-from gaussians_jax.phases import AlternationSpec, AnnealingSpec, Trained, Turn
+from gaussians_jax.phases import AlternationSpec, AnnealingSpec, Trained, UpdateMask
 from gaussians_jax.splats import Params, Splats
 from nerfies_jax import evaluation
 from tests import gradients, scenes
@@ -77,7 +77,9 @@ def slopes_at(params, step):
 def descend(optimiser, trained, slopes):
     # optax mixes integers and floats in its bias corrections.
     with jax.numpy_dtype_promotion("standard"):
-        directions, moments = optimiser.update(slopes, trained.moments, trained.params)
+        directions, moments = optimiser.update(
+            slopes, trained.opt_state, trained.params
+        )
     moved = jax.tree.map(lambda p, d: p - RATE * d, trained.params, directions)
     return Trained(moved, moments)
 
@@ -86,9 +88,9 @@ def alternate(optimiser, spec, steps, trained):
     """All states of a run in one scan, and whose turn it was."""
 
     def body(carried, step):
-        mine = phases.turn(spec, step)
+        mine = phases.update_mask(spec, step)
         after = descend(optimiser, carried, slopes_at(carried.params, step))
-        carried = phases.hold(optimiser, mine, carried, after)
+        carried = phases.freeze(optimiser, mine, carried, after)
         return carried, (carried, mine)
 
     return jax.lax.scan(body, trained, jnp.arange(steps))[1]
@@ -109,9 +111,9 @@ def of_group(name, trained, group):
     """Parameters and state of one group, picked out by hand."""
     kept = [getattr(trained.params, group)]
     if name != "partitioned":
-        kept += [getattr(part, group) for part in trained.moments]
+        kept += [getattr(part, group) for part in trained.opt_state]
     else:
-        inner = trained.moments[1].inner_states
+        inner = trained.opt_state[1].inner_states
         kept += [
             inner[key] for key in {"rows": ("mean", "rest"), "nets": ("nets",)}[group]
         ]
@@ -150,7 +152,7 @@ def test_turns_follow_the_cycle_in_one_program(spec):
         traced.append(first)
 
         def body(step, _):
-            return step + 1, phases.turn(spec, step)
+            return step + 1, phases.update_mask(spec, step)
 
         return jax.lax.scan(body, first, None, length=20)[1]
 
@@ -212,8 +214,8 @@ def adam_step(trained, slopes):
 
 
 @jax.jit
-def adam_hold(turn, before, after):
-    return phases.hold(scale_by_row_adam(), turn, before, after)
+def adam_freeze(turn, before, after):
+    return phases.freeze(scale_by_row_adam(), turn, before, after)
 
 
 def begun(params):
@@ -228,7 +230,7 @@ def test_zero_slopes_do_not_freeze_what_has_momentum():
     drifted = adam_step(trained, jax.tree.map(np.zeros_like, trained.params))
     for a, b in zip(*map(jax.tree.leaves, (trained, drifted)), strict=True):
         assert (np.asarray(a) != np.asarray(b)).any()
-    held = adam_hold(phases.turn(ALTERNATION, 2), trained, drifted)
+    held = adam_freeze(phases.update_mask(ALTERNATION, 2), trained, drifted)
     jax.tree.map(np.testing.assert_array_equal, held.params.rows, trained.params.rows)
     jax.tree.map(np.testing.assert_array_equal, held.params.nets, drifted.params.nets)
 
@@ -238,15 +240,15 @@ def test_what_is_frozen_is_safe_from_values_that_are_not_finite(dtype):
     before = begun(make(dtype))
     after = jax.tree.map(lambda leaf: np.full_like(leaf, np.nan), before.params)
     after = adam_step(before, after)
-    assert np.isnan(after.moments.first.nets["w"]).all()
-    held = adam_hold(Turn(*map(jnp.asarray, (False, False))), before, after)
+    assert np.isnan(after.opt_state.first.nets["w"]).all()
+    held = adam_freeze(UpdateMask(*map(jnp.asarray, (False, False))), before, after)
     jax.tree.map(np.testing.assert_array_equal, held, before)
 
 
 def test_without_an_alternation_everything_trains():
     before = begun(make())
     after = adam_step(before, before.params)
-    held = adam_hold(phases.turn(None, 3), before, after)
+    held = adam_freeze(phases.update_mask(None, 3), before, after)
     jax.tree.map(np.testing.assert_array_equal, held, after)
 
 
@@ -261,7 +263,7 @@ def test_a_state_that_both_groups_share_is_refused(optimiser):
     params = make()
     state = Trained(params, jax.jit(optimiser.init)(params))
     with pytest.raises(ValueError, match=r"count belongs to rows and networks alike"):
-        phases.hold(optimiser, phases.turn(ALTERNATION, 3), state, state)
+        phases.freeze(optimiser, phases.update_mask(ALTERNATION, 3), state, state)
 
 
 def wave(params, shift):
@@ -271,18 +273,18 @@ def wave(params, shift):
 
 
 def loss(params, shift, on):
-    mine = Turn(jnp.asarray(True), on)
-    return jnp.sum(phases.spared(mine, wave)(params, shift) ** 2)
+    mine = UpdateMask(jnp.asarray(True), on)
+    return jnp.sum(phases.stop_frozen_gradients(mine, wave)(params, shift) ** 2)
 
 
-def test_spared_has_the_values_and_the_slopes_of_the_function(dtype):
+def test_stopped_gradients_have_the_values_and_the_slopes_of_the_function(dtype):
     params, shift = make(dtype), jnp.asarray(0.3, dtype)
     plain = jax.value_and_grad(lambda params: jnp.sum(wave(params, shift) ** 2))
     value, slopes = jax.jit(plain)(params)
-    spared = jax.jit(jax.value_and_grad(loss))
+    stop_frozen_gradients = jax.jit(jax.value_and_grad(loss))
     tolerance = {"float32": 1e-5, "float64": 1e-13}[dtype]
     for on in (True, False):
-        same, kept = spared(params, shift, jnp.asarray(on))
+        same, kept = stop_frozen_gradients(params, shift, jnp.asarray(on))
         np.testing.assert_allclose(same, value, rtol=tolerance)
         for group in ("rows", "nets") if on else ("rows",):
             jax.tree.map(
@@ -297,7 +299,7 @@ def test_spared_has_the_values_and_the_slopes_of_the_function(dtype):
             assert np.asarray(slopes.nets["w"]).all()
 
 
-def test_spared_slopes_are_those_of_central_differences(float64):
+def test_stopped_gradients_are_those_of_central_differences(float64):
     params, on = make("float64"), jnp.asarray(True)
     error = gradients.directional_error(lambda p: loss(p, 0.3, on), params)
     assert error < 1e-8
@@ -348,7 +350,7 @@ def test_a_scene_trains_one_group_at_a_time_in_one_program():
         annealing=AnnealingSpec(after=5, freeze_share=0.6),  # means rest from 12 on
     )
     capture = scenes.tiny_capture()
-    model = scene.build(spec, scene.facts_of(capture))
+    model = scene.build(spec, scene.metadata_of(capture))
     step, frames = jax.jit(model.step), evaluation.frames_of(capture)
     states = [model.init(capture, jax.random.key(0))]
     for _ in range(14):

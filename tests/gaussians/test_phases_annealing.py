@@ -7,11 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import phases, rates
+from gaussians_jax import learning_rates, phases
+from gaussians_jax.learning_rates import LearningRateSpec
 from gaussians_jax.phases import AnnealingSpec
-from gaussians_jax.rates import RateSpec
 from gaussians_jax.splats import Params, Splats
 from nerfies_jax.training import schedules
+from nerfies_jax.training.updates import apply_updates
 
 MAIN = schedules.log_linear(1.6e-4, 1.6e-6, 1000)
 ANNEALING = AnnealingSpec(after=750)
@@ -84,13 +85,13 @@ def test_an_annealing_without_freezing_trains_to_the_last_step():
 
 
 def test_only_the_rate_of_the_means_is_annealed():
-    spec = RateSpec()
+    spec = LearningRateSpec()
 
     @jax.jit
     def both(step):
         return (
-            rates.learning_rates(spec, 2.0, 1000, step, ANNEALING),
-            rates.learning_rates(spec, 2.0, 1000, step),
+            learning_rates.at_step(spec, 2.0, 1000, step, ANNEALING),
+            learning_rates.at_step(spec, 2.0, 1000, step),
         )
 
     for step in (10, 800, 960):
@@ -98,8 +99,8 @@ def test_only_the_rate_of_the_means_is_annealed():
         expected = 2 * exact_rate(step, ANNEALING, 1000)
         np.testing.assert_allclose(annealed.mean, expected, rtol=1e-6)
         assert annealed._replace(mean=None) == plain._replace(mean=None)
-    still, step = RateSpec(mean=0.0), jnp.asarray(800)
-    assert float(rates.learning_rates(still, 2.0, 1000, step, ANNEALING).mean) == 0
+    still, step = LearningRateSpec(mean=0.0), jnp.asarray(800)
+    assert float(learning_rates.at_step(still, 2.0, 1000, step, ANNEALING).mean) == 0
 
 
 def test_at_the_end_the_means_stand_still_bit_for_bit():
@@ -111,9 +112,9 @@ def test_at_the_end_the_means_stand_still_bit_for_bit():
 
     @jax.jit
     def after(step):
-        rate = rates.learning_rates(RateSpec(), 2.0, 1000, step, ANNEALING)
+        rate = learning_rates.at_step(LearningRateSpec(), 2.0, 1000, step, ANNEALING)
         rate = Params({"splats": rate}, {"w": 1e-3})
-        return rates.descend(params, directions, rate)
+        return apply_updates(params, directions, rate)
 
     mean = params.rows["splats"].mean
     np.testing.assert_array_equal(after(950).rows["splats"].mean, mean)

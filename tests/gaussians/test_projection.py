@@ -76,7 +76,7 @@ def test_footprints_equal_the_textbook_with_skew_aspect_and_offset(spec, dtype, 
         mean_px, covariance, depth, opacity = textbook(exact, exact_camera, spec)
     drawn = (np.asarray(depth) > 0.02) & (np.asarray(opacity) > 1.01 / 255)
     np.testing.assert_array_equal(np.asarray(found.visible)[drawn], True)
-    dilated = np.asarray(covariance) + spec.dilation_px2 * np.eye(2)
+    dilated = np.asarray(covariance) + spec.eps2d * np.eye(2)
     size = np.trace(dilated, axis1=1, axis2=2)[:, None, None]
     # Relative: depths down to 0.02 magnify the rounding of x - c in float32.
     tolerance = {"float32": 2e-4, "float64": 1e-12}[dtype]
@@ -175,7 +175,7 @@ HOPELESS = {
     "infinite scale": dict(scale=(float("inf"), 1, 1)),
     "scale beyond WIDEST_PX": dict(scale=(1e18, 1, 1)),
     "nan opacity": dict(opacity=float("nan")),
-    "faint": dict(opacity=0.0039),
+    "faint": dict(opacity=0.003915),  # between 1/256 and 1/255, where it is cut
 }
 
 
@@ -198,8 +198,9 @@ DRAWABLE = {
     "flat and edge-on": dict(scale=(0.0, 1.0, 1.0)),
     "a point": dict(scale=(0.0, 0.0, 0.0)),
     "tiny quaternion": dict(quaternion=(1e-25, 0, 0, 1e-25)),
-    "long quaternion": dict(quaternion=(1e25, 0, 0, 1e25)),
+    "long quaternion": dict(quaternion=(3e38, 0, 0, 3e38)),
     "opaque": dict(opacity=1.0),
+    "barely there": dict(opacity=0.00393),  # between 1/255 and 1/254
 }
 
 

@@ -1,4 +1,4 @@
-"""Slabs, ties, edges of the image, empty scenes, transformations, the CUDA lowering."""
+"""Chunks, ties, image edges, empty scenes, transformations, the CUDA lowering."""
 
 import dataclasses
 import functools
@@ -72,7 +72,7 @@ def close(found, expected, tolerance):
 
 def test_the_capacity_never_changes_picture_or_gradient(float64, rng):
     footprints, _ = some_footprints(rng, COUNT, SIZE, "float64")
-    # Three Gaussians cover every tile, 6 of them, more than a slab of 5 pairs holds.
+    # Three Gaussians cover every tile, 6 of them, more than a chunk of 5 pairs holds.
     whitening, extent = (np.array(x) for x in (footprints[1], footprints[4]))
     whitening[:3] *= [0.02, 1.0, 0.02]
     extent[:3] *= 50.0
@@ -81,7 +81,7 @@ def test_the_capacity_never_changes_picture_or_gradient(float64, rng):
     )
     values = rng.uniform(size=(COUNT, 3))
     whole = picture_and_slopes(footprints, values, SIZE, QUICK)
-    spec = dataclasses.replace(QUICK, capacity=5, kept_slabs=3)
+    spec = dataclasses.replace(QUICK, capacity=5, kept_chunks=3)
     close(picture_and_slopes(footprints, values, SIZE, spec), whole, 1e-12)
 
 
@@ -147,7 +147,7 @@ def test_equal_depths_are_drawn_in_order_of_index(dtype):
 
 @pytest.mark.hard_cases
 def test_two_opaque_gaussians_stop_a_pixel(dtype):
-    """0.99 twice leaves 1e-4: float32 rounds it below the stop, float64 above."""
+    """0.99 twice leaves 1e-4: float32 rounds it below the threshold, float64 above."""
     image, left = drawn([[4.5, 4.5]] * 3, 100.0, 1.0, [1.0, 2.0, 3.0], np.eye(3), dtype)
     expected = {"float32": [0.99, 0, 0], "float64": [0.99, 0.0099, 0]}[dtype]
     np.testing.assert_allclose(image[4, 4], expected, atol=1e-6)
@@ -223,15 +223,15 @@ def test_pairs_are_sorted_by_tile_then_depth(tiles_per_side, dtype, rng):
     rank = np.sort(rng.integers(first, first + count, count)).astype(np.int32)
     tile = rng.integers(0, min(grid.tiles, 300) + 1, count).astype(np.int32)
     tile = np.where(tile == 300, grid.tiles, tile)
-    slab = jax.jit(binning.sort_pairs, static_argnums=(3, 4))(
+    isects = jax.jit(binning.sort_pairs, static_argnums=(3, 4))(
         tile, rank, np.int32(first), 20_000, grid
     )
-    slab = jax.tree.map(np.asarray, slab)
+    isects = jax.tree.map(np.asarray, isects)
     order = np.lexsort((rank, tile))
     kept = int((tile < grid.tiles).sum())
-    np.testing.assert_array_equal(slab.ranks[:kept], rank[order][:kept])
+    np.testing.assert_array_equal(isects.ranks[:kept], rank[order][:kept])
     numbers = np.bincount(tile, minlength=grid.tiles + 1)[:-1]
-    np.testing.assert_array_equal(slab.ends - slab.starts, numbers)
+    np.testing.assert_array_equal(isects.ends - isects.starts, numbers)
 
 
 @pytest.mark.hard_cases
@@ -252,29 +252,29 @@ def test_the_ellipse_test_keeps_every_tile_that_shows_a_gaussian(float64, rng):
     grid = Grid(*size, 8)
 
     @jax.jit
-    def first_slab(footprints):
-        boxes = binning.tile_boxes(footprints.mean_px, footprints.extent_px, grid)
+    def first_intersections(footprints):
+        rects = binning.tile_rects(footprints.mean_px, footprints.extent_px, grid)
         log_opacity = jnp.log(footprints.opacity)[:, None]
         table = [footprints.mean_px, footprints.whitening, log_opacity]
         cursor = binning.Cursor(jnp.int32(0), jnp.int32(0))
         every = jnp.ones(grid.tiles, bool)
         log_cut = float(np.log(1 / 255))
-        slab, _ = binning.next_slab(
-            cursor, boxes, jnp.concatenate(table, 1), every, log_cut, grid, 8192
+        isects, _ = binning.next_intersections(
+            cursor, rects, jnp.concatenate(table, 1), every, log_cut, grid, 8192
         )
-        return boxes, slab
+        return rects, isects
 
-    boxes, slab = jax.tree.map(np.asarray, first_slab(footprints))
+    rects, isects = jax.tree.map(np.asarray, first_intersections(footprints))
     found = np.zeros((60, grid.tiles), bool)
     for tile in range(grid.tiles):
-        found[slab.ranks[slab.starts[tile] : slab.ends[tile]], tile] = True
+        found[isects.ranks[isects.starts[tile] : isects.ends[tile]], tile] = True
     y, x = np.mgrid[:64, :96] + 0.5
     offset = np.stack([x, y], -1)[None] - np.asarray(footprints.mean_px)[:, None, None]
     exponent = np.einsum("nhwi,nij,nhwj->nhw", offset, np.asarray(conics), offset) / 2
     alpha = np.asarray(footprints.opacity)[:, None, None] * np.exp(-exponent)
     shows = (alpha >= 1 / 255).reshape(60, 8, 8, 12, 8).any((2, 4)).reshape(60, -1)
     np.testing.assert_array_equal(found, shows)
-    assert shows.sum() < 0.5 * int(boxes.count.sum())
+    assert shows.sum() < 0.5 * int(rects.count.sum())
 
 
 def test_forward_and_backward_lower_for_cuda(dtype, rng):
@@ -287,12 +287,12 @@ def test_forward_and_backward_lower_for_cuda(dtype, rng):
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        (dict(alpha_max=1.0), "alpha_cut < alpha_max < 1"),
+        (dict(alpha_max=1.0), "alpha_threshold < alpha_max < 1"),
         (dict(near=0.0), "0 < near < far"),
         (dict(tile=12), "tile must be one of"),
         (dict(capacity=0), "capacity must be at least 1"),
-        (dict(dilation_px2=0.0), "dilation_px2 must be positive"),
-        (dict(stop=1.0), "0 <= stop < 1"),
+        (dict(eps2d=0.0), "eps2d must be positive"),
+        (dict(transmittance_threshold=1.0), "0 <= transmittance_threshold < 1"),
     ],
 )
 def test_wrong_settings_are_refused(wrong, message):
@@ -308,7 +308,7 @@ def test_an_image_without_pixels_is_refused(dtype, rng):
 
 @pytest.mark.hard_cases
 def test_more_pairs_than_an_int32_counts(dtype):
-    """Totals wrap behind the slab; the slab and the one after it must not notice."""
+    """Totals wrap behind the chunk; the chunk and the one after it must not notice."""
     tiles, capacity = 1 << 14, 1 << 12
     count = jnp.asarray(np.full(300_000, tiles, np.int32))  # 4.9e9 pairs
     cursor = binning.Cursor(np.int32(0), np.int32(0))

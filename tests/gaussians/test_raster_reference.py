@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import harmonics, render
+from gaussians_jax import harmonics, rendering
 from gaussians_jax.raster_spec import RasterSpec
 from gaussians_jax.splats import Gaussians
 from nerfies_jax.geometry.camera import Camera
@@ -42,10 +42,10 @@ class Case:
         get = self.stored.__getitem__
         self.size = int(get("width")), int(get("height"))
         self.spec = RasterSpec(
-            alpha_cut=float(get("alpha_threshold")),
+            alpha_threshold=float(get("alpha_threshold")),
             alpha_max=float(get("max_alpha")),
-            stop=float(get("t_threshold")),
-            dilation_px2=float(get("eps2d")),
+            transmittance_threshold=float(get("t_threshold")),
+            eps2d=float(get("eps2d")),
             antialiased=bool(get("antialiased")),
             near=float(get("near")),
             far=float(get("far")),
@@ -88,7 +88,7 @@ class Case:
             colours = harmonics.colour_towards(
                 colours[:, : (degree + 1) ** 2], gaussians.mean, position
             )
-        return render.render(
+        return rendering.render(
             gaussians,
             colours,
             camera,

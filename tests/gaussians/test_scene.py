@@ -9,13 +9,14 @@ import numpy as np
 import optax
 import pytest
 
-from gaussians_jax import presets, rates, scene, splats, start
+from gaussians_jax import initialisation, learning_rates, presets, scene, splats
+from gaussians_jax.initialisation import InitSpec
+from gaussians_jax.learning_rates import LearningRateSpec
 from gaussians_jax.optimiser import scale_by_row_adam
-from gaussians_jax.rates import RateSpec
-from gaussians_jax.spec import Facts, SplatScene
+from gaussians_jax.spec import SceneMetadata, SplatScene
 from gaussians_jax.splats import Params, Splats
-from gaussians_jax.start import StartSpec
 from nerfies_jax import evaluation
+from nerfies_jax.training.updates import apply_updates
 from tests import scenes
 
 KEY = 3
@@ -24,7 +25,7 @@ KEY = 3
 @functools.cache
 def started(spec):
     capture = scenes.tiny_capture()
-    model = scene.build(spec, scene.facts_of(capture))
+    model = scene.build(spec, scene.metadata_of(capture))
     return (
         model,
         model.init(capture, jax.random.key(KEY)),
@@ -94,11 +95,11 @@ def test_every_epoch_shows_every_frame_once_in_its_own_order():
 
 
 def test_descent_scales_each_kind_of_row_by_its_rate():
-    spec = RateSpec(mean=1e-2, mean_end=1e-4, log_scale=0.1, quaternion=0.2)
+    spec = LearningRateSpec(mean=1e-2, mean_end=1e-4, log_scale=0.1, quaternion=0.2)
     _, state, _ = started(scenes.TINY_SPLATS)
     ones = jax.tree.map(jnp.ones_like, state.params)
-    rate = rates.learning_rates(spec, 2.0, 100, jnp.asarray(50))
-    after = rates.descend(state.params, ones, Params({"splats": rate}, {}))
+    rate = learning_rates.at_step(spec, 2.0, 100, jnp.asarray(50))
+    after = apply_updates(state.params, ones, Params({"splats": rate}, {}))
     before = state.params.rows["splats"]
     step = jax.tree.map(lambda a, b: a - b, before, after.rows["splats"])
     # Halfway in the logarithm between 1e-2 and 1e-4, times the extent of 2.
@@ -131,15 +132,20 @@ def test_events_grow_the_scene_and_keep_its_picture_learnable():
     assert grow.steps == (10, 20)
     spec = dataclasses.replace(
         scenes.TINY_SPLATS,
-        density=dataclasses.replace(scenes.TINY_SPLATS.density, gradient=1e-9),
+        densification=dataclasses.replace(
+            scenes.TINY_SPLATS.densification, grow_grad2d=1e-9
+        ),
     )
-    eager = scene.build(spec, scene.facts_of(scenes.tiny_capture()))
+    eager = scene.build(spec, scene.metadata_of(scenes.tiny_capture()))
     after = eager.events[0].apply(state, frames)
     assert model.counts(after)["gaussians"] > model.counts(state)["gaussians"]
     assert int(after.step) == int(state.step)
     again, metrics = jax.jit(eager.step)(after, frames)
     assert np.isfinite(float(metrics["loss"]))
-    assert again.params.rows["splats"].mean.shape == (*after.extra.stats.alive.shape, 3)
+    assert again.params.rows["splats"].mean.shape == (
+        *after.aux_state.stats.alive.shape,
+        3,
+    )
 
 
 def test_an_event_is_a_function_of_the_state():
@@ -181,8 +187,8 @@ def test_a_frame_has_the_harmonics_of_its_step():
 
 def test_few_points_start_from_random_ones_in_the_views():
     capture = scenes.tiny_capture()
-    spec = StartSpec(random=50, fewest=10**6)
-    position, colour = start.first_points(spec, capture, 0)
+    spec = InitSpec(random=50, min_points=10**6)
+    position, colour = initialisation.initial_points(spec, capture, 0)
     assert position.shape == colour.shape == (50, 3)
     turn = capture.cameras.camera_from_world[capture.train]
     offset = position[None] - capture.cameras.position[capture.train][:, None]
@@ -192,7 +198,9 @@ def test_few_points_start_from_random_ones_in_the_views():
 
 
 def test_more_points_than_asked_for_are_thinned_without_repeats():
-    position, _ = start.first_points(StartSpec(points=120), scenes.tiny_capture(), 0)
+    position, _ = initialisation.initial_points(
+        InitSpec(points=120), scenes.tiny_capture(), 0
+    )
     assert len(np.unique(position, axis=0)) == len(position) == 120
 
 
@@ -202,7 +210,7 @@ def test_facts_take_a_depth_for_the_extent_of_a_camera_that_stands_still():
     capture = dataclasses.replace(
         capture, cameras=capture.cameras._replace(position=still)
     )
-    assert capture.near < scene.facts_of(capture).extent < capture.far
+    assert capture.near < scene.metadata_of(capture).extent < capture.far
 
 
 @pytest.mark.parametrize(
@@ -220,30 +228,47 @@ def test_wrong_settings_are_refused_with_their_bound(field, value, words):
 
 def test_zero_gaussians_are_refused():
     with pytest.raises(ValueError, match="at least one Gaussian"):
-        StartSpec(points=0)
+        InitSpec(points=0)
 
 
 def test_a_rate_that_cannot_decay_is_refused():
     with pytest.raises(ValueError, match="mean_end"):
-        RateSpec(mean_end=0.0)
+        LearningRateSpec(mean_end=0.0)
+
+
+# Fields of the parts that count steps.
+COUNTED = {
+    "density": ("start", "stop", "reset_interval"),
+    "motion": ("warm_up",),
+    "alternation": ("start", "stop"),
+    "annealing": ("after",),
+    "acceleration": ("start",),
+    "neighbours": ("start",),
+    "motion_growth": ("start",),
+    "spectral": ("after",),
+}
 
 
 @pytest.mark.parametrize("name", sorted(presets.PRESETS))
 def test_presets_build_and_stretch_with_their_steps(name):
     spec = presets.PRESETS[name]
-    facts = Facts(extent=1.0, background=(0.0, 0.0, 0.0), frames=10)
+    metadata = SceneMetadata(extent=1.0, background=(0.0, 0.0, 0.0), frames=10)
     half = presets.with_steps(spec, spec.steps // 2)
     assert half.steps == spec.steps // 2
-    assert half.density.stop == round(spec.density.stop / 2)
-    assert scene.build(half, facts).spec == (half, facts)
+    for part, fields in COUNTED.items():
+        whole, short = getattr(spec, part), getattr(half, part)
+        for name in fields if whole is not None else ():
+            assert getattr(short, name) == round(getattr(whole, name) / 2)
+    assert half.sh_every == spec.sh_every // 2
+    assert scene.build(half, metadata).spec == (half, metadata)
     assert presets.with_steps(spec, spec.steps) == spec
 
 
-def test_first_bytes_counts_rows_and_capacity():
+def test_estimate_memory_counts_rows_and_capacity():
     capture = scenes.tiny_capture()
-    small = scene.first_bytes(scenes.TINY_SPLATS, capture)
+    small = scene.estimate_memory_bytes(scenes.TINY_SPLATS, capture)
     slab = dataclasses.replace(scenes.TINY_SPLATS.raster, capacity=10**12)
-    large = scene.first_bytes(
+    large = scene.estimate_memory_bytes(
         dataclasses.replace(scenes.TINY_SPLATS, raster=slab), capture
     )
     assert small < 10**7

@@ -9,13 +9,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import rates
 from gaussians_jax.effects import spectral
-from gaussians_jax.effects.effect import Moment, Shot
 from gaussians_jax.effects.spectral import FourierSpec, Gates, SpectralSpec, WaveletSpec
 from gaussians_jax.optimiser import scale_by_row_adam
 from gaussians_jax.splats import Params
+from nerfies_jax.training.effects import (
+    Observation,
+    PenaltyContext,
+    values,
+    weighted_sum,
+)
 from nerfies_jax.training.model import Rendering
+from nerfies_jax.training.updates import apply_updates
 from tests import gradients
 
 SIZES = [(1, 1), (7, 5), (12, 10)]
@@ -268,10 +273,10 @@ def test_pixels_that_are_not_valid_teach_nothing_whatever_they_hold(hole, dtype,
 def test_nothing_valid_costs_nothing(dtype, rng):
     weight = Gates(np.asarray(0.1, dtype), np.asarray(0.1, dtype))
     pictures = (picture(rng, *PATCH, dtype) for _ in range(2))
-    term = jax.jit(spectral.loss, static_argnums=0)(
+    terms = jax.jit(spectral.terms, static_argnums=0)(
         SpectralSpec(), weight, *pictures, ~EVERYWHERE
     )
-    assert float(term.value) == 0
+    assert float(weighted_sum(terms)) == 0
 
 
 def step_of(number):
@@ -300,7 +305,7 @@ def test_the_slope_of_a_learned_gate_is_never_negative_and_the_closed_form(
     @jax.jit
     def value(gates):
         weight = spectral.weights(spec, gates, step_of(0), 10)
-        return spectral.loss(spec, weight, render, truth).value
+        return weighted_sum(spectral.terms(spec, weight, render, truth))
 
     slope_of = jax.jit(jax.grad(value))
     for logit in (-9.0, -3.0, 0.0, 3.0, 30.0):
@@ -365,7 +370,7 @@ def test_a_schedule_falls_along_half_a_cosine_to_exactly_nothing():
 def shot_of(render, truth, valid=None):
     render, truth = jnp.asarray(render), jnp.asarray(truth)
     flat = jnp.zeros(render.shape[:2], render.dtype)
-    return Shot(Rendering(render, flat, flat), truth, valid, None)
+    return Observation(Rendering(render, flat, flat), truth, valid, None)
 
 
 @pytest.mark.parametrize("gate", spectral.GATES)
@@ -373,16 +378,16 @@ def test_the_effect_weighs_logs_and_trains_what_its_gate_has(gate, rng):
     spec = SpectralSpec(gate=gate, after=3)
     filled_in = spectral.effect(spec, 10)
     learned = gate in spectral.LEARNED
-    assert (filled_in.init_nets is not None) == learned
-    assert (filled_in.net_rate is not None) == learned
-    nets = {"spectral": filled_in.init_nets(jax.random.key(0))} if learned else {}
+    assert (filled_in.init is not None) == learned
+    assert (filled_in.learning_rate is not None) == learned
+    nets = {"spectral": filled_in.init(jax.random.key(0))} if learned else {}
     params = Params({}, nets)
     shot = shot_of(*(picture(rng, 6, 6, "float32") for _ in range(2)))
 
     def value(params, step):
-        moment = Moment(jnp.asarray(0.0), step, jax.random.key(0))
-        term = filled_in.image_loss(params, shot, moment)
-        return term.value, term.metrics
+        context = PenaltyContext(None, step, None, params, observation=shot)
+        terms = filled_in.penalty(params.nets.get("spectral"), context)
+        return weighted_sum(terms), values(terms)
 
     both = jax.jit(jax.value_and_grad(value, has_aux=True))
     (early, _), slope = both(params, step_of(2))
@@ -397,7 +402,7 @@ def test_the_effect_weighs_logs_and_trains_what_its_gate_has(gate, rng):
     assert float(later) == pytest.approx(by_hand, rel=1e-6)
     np.testing.assert_allclose(metrics["wavelet_weight"], 0.05, rtol=1e-6)
     if learned:
-        np.testing.assert_allclose(filled_in.net_rate(step_of(5)), 1e-2)
+        np.testing.assert_allclose(filled_in.learning_rate(step_of(5)), 1e-2)
 
 
 def test_the_scenes_optimiser_shuts_a_learned_gate_down_to_its_least(rng):
@@ -405,21 +410,21 @@ def test_the_scenes_optimiser_shuts_a_learned_gate_down_to_its_least(rng):
     made = spectral.effect(spec, 10)
     shot = shot_of(*(picture(rng, 4, 4, "float32") for _ in range(2)))
     optimiser = scale_by_row_adam()
-    params = Params({}, {"spectral": made.init_nets(jax.random.key(0))})
+    params = Params({}, {"spectral": made.init(jax.random.key(0))})
 
     @jax.jit
     def update(state, step):
         params, moments = state
 
         def value(params):
-            moment = Moment(jnp.asarray(0.0), step, jax.random.key(0))
-            term = made.image_loss(params, shot, moment)
-            return term.value, term.metrics["wavelet_weight"]
+            context = PenaltyContext(None, step, None, params, observation=shot)
+            terms = made.penalty(params.nets["spectral"], context)
+            return weighted_sum(terms), terms["wavelet_weight"].value
 
         slopes, weight = jax.grad(value, has_aux=True)(params)
         along, moments = optimiser.update(slopes, moments, params)
-        rate = Params({}, {"spectral": made.net_rate(step)})
-        return (rates.descend(params, along, rate), moments), weight
+        rate = Params({}, {"spectral": made.learning_rate(step)})
+        return (apply_updates(params, along, rate), moments), weight
 
     state = params, optimiser.init(params)
     _, seen = jax.lax.scan(update, state, jnp.arange(200))
@@ -432,16 +437,16 @@ def test_the_scenes_optimiser_shuts_a_learned_gate_down_to_its_least(rng):
 def test_an_absent_loss_has_no_gate_no_metric_and_no_operation(absent, rng):
     spec = dataclasses.replace(SpectralSpec(), **{absent: None})
     made = spectral.effect(spec, 10)
-    nets = {"spectral": made.init_nets(jax.random.key(0))}
+    nets = {"spectral": made.init(jax.random.key(0))}
     assert getattr(nets["spectral"], absent) is None
     shot = shot_of(*(picture(rng, 6, 6, "float32") for _ in range(2)))
-    moment = Moment(jnp.asarray(0.0), step_of(1), jax.random.key(0))
-    term = made.image_loss(Params({}, nets), shot, moment)
+    context = PenaltyContext(None, step_of(1), None, None, observation=shot)
+    terms = made.penalty(nets["spectral"], context)
     other = {"wavelet": "fourier", "fourier": "wavelet"}[absent]
-    assert set(term.metrics) == {other, f"{other}_weight"}
+    assert set(terms) == {other, f"{other}_weight"}
     text = str(
-        jax.make_jaxpr(lambda nets: made.image_loss(Params({}, nets), shot, moment))(
-            nets
+        jax.make_jaxpr(lambda gates: values(made.penalty(gates, context)))(
+            nets["spectral"]
         )
     )
     assert ("fft[" in text) == (absent == "wavelet")

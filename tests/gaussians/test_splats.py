@@ -1,4 +1,4 @@
-"""Rows: activation, first guesses, capacities, dead rows."""
+"""Rows: activation, first guesses, capacities, inactive rows."""
 
 import itertools
 
@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import render
+from gaussians_jax import rendering
 from gaussians_jax import splats as rows
 from gaussians_jax.splats import Params, Splats
 from nerfies_jax.geometry.camera import Camera
@@ -70,18 +70,18 @@ def test_raw_values_far_out_stay_finite_with_their_slopes(raw, dtype):
 
 
 @pytest.mark.hard_cases
-def test_a_dead_row_has_no_opacity_and_no_way_back(dtype):
-    dead = jnp.asarray(rows.DEAD_LOGIT, dtype)
-    assert jax.nn.sigmoid(dead) == 0
-    assert jax.grad(jax.nn.sigmoid)(dead) == 0
+def test_an_inactive_row_has_no_opacity_and_no_way_back(dtype):
+    inactive = jnp.asarray(rows.INACTIVE_LOGIT, dtype)
+    assert jax.nn.sigmoid(inactive) == 0
+    assert jax.grad(jax.nn.sigmoid)(inactive) == 0
 
 
-def test_padding_repeats_the_first_row_and_marks_it_dead(rng, dtype):
+def test_padding_repeats_the_first_row_and_marks_it_inactive(rng, dtype):
     splats = some_splats(rng, dtype=dtype)
     label = jnp.arange(7)
     params = Params({"splats": splats, "label": label}, {"weight": jnp.ones((7, 2))})
     padded = jax.jit(rows.pad_rows, static_argnums=1)(params, 12)
-    assert list(rows.alive(padded.rows["splats"])) == [True] * 7 + [False] * 5
+    assert list(rows.active_mask(padded.rows["splats"])) == [True] * 7 + [False] * 5
     assert list(padded.rows["label"]) == [0, 1, 2, 3, 4, 5, 6, 0, 0, 0, 0, 0]
     assert padded.nets["weight"].shape == (7, 2)  # as many rows by chance, yet no row
     np.testing.assert_array_equal(padded.rows["splats"].mean[:7], splats.mean)
@@ -233,19 +233,19 @@ def test_a_tripod_has_no_extent_of_its_own():
 
 
 @pytest.mark.hard_cases
-def test_dead_rows_change_neither_the_picture_nor_learn_anything(rng):
+def test_inactive_rows_change_neither_the_picture_nor_learn_anything(rng):
     splats = some_splats(rng, dtype="float32", degree=0)
     camera = jax.tree.map(
         lambda leaf: jnp.asarray(leaf[0], jnp.float32), ring_of_cameras(1)
     )
 
     def loss(splats):
-        colour = render.render_harmonics(
+        colour = rendering.render_harmonics(
             rows.activate(splats), rows.active_harmonics(splats, 0), camera, (16, 12)
         ).rendering.colour
         return jnp.sum(colour**2), colour
 
-    # Five rows beyond the living hold numbers of their own, dead in one of the two.
+    # Five rows beyond the active hold numbers of their own, inactive in one of the two.
     padded = rows.pad_rows(Params({"splats": splats}, {}), 12).rows["splats"]
     other = jax.tree.map(
         lambda leaf: np.concatenate([leaf[:7], leaf[6:1:-1]]), padded

@@ -9,7 +9,7 @@ import pytest
 import scipy.interpolate
 import scipy.spatial.transform
 
-from gaussians_jax import still_rows, time_knots
+from gaussians_jax import static_rows, time_knots
 from gaussians_jax.splats import LOG_SCALE_RANGE, Gaussians
 from tests import gradients
 
@@ -103,7 +103,7 @@ def test_cubic_is_a_hermite_spline_with_central_slopes(count, dtype):
     times = np.linspace(0, 1, 57)
     even = np.linspace(0, 1, count)
     means, logs = (np.asarray(x, np.float64) for x in knots.track[:2])
-    rows = np.flatnonzero(knots.where.moves)
+    rows = np.flatnonzero(knots.index.moves)
     for time, mean, log in zip(
         times,
         catmull_rom(even, means, times),
@@ -118,7 +118,7 @@ def test_cubic_is_a_hermite_spline_with_central_slopes(count, dtype):
 
 def test_linear_rotations_follow_the_great_circle(dtype):
     knots = time_knots.bake(lambda t: moving(t, dtype), 40, dtype=dtype)
-    rows = np.flatnonzero(knots.where.moves)
+    rows = np.flatnonzero(knots.index.moves)
     times = np.asarray(knots.times, np.float64)
     left, right = (
         rotations(moving(jnp.asarray(times[k], dtype), dtype)) for k in (9, 10)
@@ -184,8 +184,8 @@ def test_a_time_outside_is_held_at_the_nearer_end(dtype):
 @pytest.mark.parametrize("size", [0.0, 1e-30, 1e-3, -0.5])
 def test_scales_that_shrink_through_zero_stay_positive_and_finite(size, dtype):
     def pose(time):
-        still = constant([1.0, 0, 0, 0], dtype)
-        return still._replace(scale=jnp.ones((1, 3), dtype) + (size - 1) * time)
+        static = constant([1.0, 0, 0, 0], dtype)
+        return static._replace(scale=jnp.ones((1, 3), dtype) + (size - 1) * time)
 
     knots = time_knots.bake(pose, 4, dtype=dtype)
     for interpolation in time_knots.FEWEST:
@@ -198,18 +198,20 @@ def test_scales_that_shrink_through_zero_stay_positive_and_finite(size, dtype):
         np.testing.assert_allclose(scale, smallest, rtol=1e-4)
 
 
-@pytest.mark.parametrize("still_below", [0.0, 0.5, 1e9])
-def test_still_rows_are_stored_once_and_stay_within_the_tolerance(still_below):
-    knots = time_knots.bake(moving, 9, still_below)
-    moves = np.asarray(knots.where.moves)
+@pytest.mark.parametrize("static_threshold", [0.0, 0.5, 1e9])
+def test_static_rows_are_stored_once_and_stay_within_the_tolerance(static_threshold):
+    knots = time_knots.bake(moving, 9, static_threshold)
+    moves = np.asarray(knots.index.moves)
     assert not moves[::2].any()
     assert knots.bytes == time_knots.BYTES * 9 * moves.sum()
     for time in knots.times:
         found = at(knots, time)
-        reach = np.asarray(still_rows.reach(found, moving(time)))
-        assert reach[~moves].max() <= still_below
-        np.testing.assert_allclose(reach[moves], 0, atol=2e-6)
-    assert {0.0: moves.sum() == COUNT // 2, 1e9: not moves.any()}.get(still_below, True)
+        distance = np.asarray(static_rows.max_displacement(found, moving(time)))
+        assert distance[~moves].max() <= static_threshold
+        np.testing.assert_allclose(distance[moves], 0, atol=2e-6)
+    assert {0.0: moves.sum() == COUNT // 2, 1e9: not moves.any()}.get(
+        static_threshold, True
+    )
 
 
 def test_gradients_in_time_and_in_the_knots(float64):
@@ -256,8 +258,8 @@ def test_a_table_too_short_is_refused(knots, interpolation, words):
 
 def test_opacities_that_change_are_refused():
     def pose(time):
-        still = moving(jnp.zeros_like(time))
-        return still._replace(opacity=still.opacity * (1 - time / 2))
+        static = moving(jnp.zeros_like(time))
+        return static._replace(opacity=static.opacity * (1 - time / 2))
 
     with pytest.raises(ValueError, match=r"opacities at time 0 .* at 0\.5"):
         time_knots.bake(pose, 5)

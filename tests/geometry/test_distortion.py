@@ -1,10 +1,12 @@
 """The lens model's inverse, against a dense search in NumPy float64."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from nerfies_jax.geometry import distortion
+from tests import gradients
 
 LENSES = {
     "none": (0, 0, 0),
@@ -106,6 +108,16 @@ def test_derivatives_stay_finite_past_the_fold(target, dtype):
     assert np.all(np.isfinite(gradient))
     if target > 0.55:
         assert np.all(gradient == 0)
+
+
+def test_derivatives_in_the_point_and_the_lens_match_differences(float64):
+    """The sign of the lens's term is not seen by derivatives in the point alone."""
+    lens = jnp.asarray(LENSES["phone"]), jnp.asarray([1e-3, -2e-3])
+
+    def along(radial, tangential, bent):
+        return distortion.undistort(radial, tangential, bent)[0] @ jnp.asarray([1, 2.0])
+
+    assert gradients.directional_error(along, *lens, jnp.asarray([0.3, -0.4])) < 1e-8
 
 
 @pytest.mark.hard_cases

@@ -212,6 +212,49 @@ def test_hard_matrices_have_finite_energy_slope_and_curvature(name, signed, dtyp
         assert np.max(abs(gradient)) > 100  # not the zero slope of a clamp
 
 
+STRETCHED = [
+    *([size, 0.02, 0.018] for size in (1e3, 5e4, 1e6, 1e20)),
+    *([1e5, 1, 0.9], [1e5, 1, -0.9], [1e6, 1, -0.9], [1e30, 0.02, 0.018]),
+    [1e-30, 8e-31, 6e-31],
+]
+SIDES = [(0, 1), (0, 2), (1, 2)]
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("signed", [False, True])
+def test_stretches_far_apart_keep_their_slopes_and_curvature(signed, dtype):
+    """The closed form of a diagonal matrix, sheared alike in both directions.
+
+    log1p from the larger stretch down flips the sign of a curvature at a ratio of 5e6
+    and is NaN at 5e7; a second stretch taken for rounding flips that of a slope.
+    """
+    drawn = np.asarray(STRETCHED, dtype)
+    drawn = drawn if signed else abs(drawn)
+    cases = [(stretches, i, j) for stretches in drawn for i, j in SIDES]
+    ways = np.zeros((len(cases), 3, 3), dtype)
+    for way, (_, i, j) in zip(ways, cases, strict=True):
+        way[i, j] = way[j, i] = 1
+    given = np.stack([np.diag(stretches) for stretches, _, _ in cases])
+    _, slopes, bent = of_some(energies, given, ways)[signed]
+    # below 1e-37 float32 is flushed to zero
+    close = {"rtol": {"float32": 2e-6, "float64": 1e-14}[dtype], "atol": 1e-37}
+    for (stretches, i, j), slope, bend in zip(cases, slopes, bent, strict=True):
+        with mpmath.workdps(60):
+            exact = [mpmath.mpf(float(s)) for s in stretches]
+            rate = [_mp_slope(s) for s in exact]
+            change = float((rate[i] - rate[j]) / (exact[i] - exact[j]))
+        np.testing.assert_allclose(np.diag(slope), [float(r) for r in rate], **close)
+        np.testing.assert_allclose([bend[i, j], bend[j, i]], [change] * 2, **close)
+
+
+def _mp_slope(stretch):
+    """d(log² σ)/dσ, its logarithm straight below a hundredth."""
+    edge = mpmath.mpf(matrix3.COLLAPSED)
+    below = mpmath.log(edge) + (stretch - edge) / edge
+    logarithm = below if stretch < edge else mpmath.log(stretch)
+    return 2 * logarithm / max(stretch, edge)
+
+
 @pytest.mark.hard_cases
 def test_curvature_at_the_identity_is_that_of_the_strain(dtype):
     """E = |sym D|² to second order; LAPACK's rule gives NaN here."""

@@ -63,7 +63,7 @@ def test_products_compose_like_matrices(dtype, rng):
 
 
 @pytest.mark.hard_cases
-@pytest.mark.parametrize("length", [1e-15, 0.1, 1.01, 10, 1e15])
+@pytest.mark.parametrize("length", [1e-30, 1e-15, 1.01, 1e15, 3e38])
 def test_any_length_is_the_same_rotation(length, dtype, rng):
     """The unnormalised polynomial is bent by 0.057 at a length of 1.01."""
     wxyz = drawn(rng)
@@ -72,13 +72,13 @@ def test_any_length_is_the_same_rotation(length, dtype, rng):
 
 
 @pytest.mark.hard_cases
-@pytest.mark.parametrize("length", [0, 1e-38, 1e-30, 1e-20, 1e-19, 1e19, 1e25, 3e38])
+@pytest.mark.parametrize("length", [0, 1e-38, 1e-30, 1e-19, 1e25, 3e38, np.inf])
 def test_normalising_never_makes_what_is_no_rotation(length, dtype):
     given = np.asarray(length * np.array([0.5, -0.5, 0.1, 0.7]), dtype)
     unit, slope = (np.asarray(found) for found in normalised(given))
     assert abs(np.linalg.norm(unit) - 1) < 1e-6
     assert np.all(np.isfinite(slope))
-    if length == 0:
+    if length in (0, np.inf):
         assert np.array_equal(unit, [1, 0, 0, 0])
         assert np.all(slope == 0)
 

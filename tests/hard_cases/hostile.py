@@ -20,12 +20,12 @@ from nerfies_jax.training.checkpoint import Checkpoints
 from nerfies_jax.training.loop import FitResult
 
 QUIET = rich.console.Console(quiet=True)
-BAD_STEP = re.compile(r"is not finite: (metric|params\.|optimiser\.|extra\.)")
+BAD_STEP = re.compile(r"is not finite: (metric|params\.|optimiser\.|aux_state\.)")
 
 
-def frames_of(capture, wants=frozenset()):
+def frames_of(capture, required_data=frozenset()):
     """The training frames in NumPy, masked; the mask may leave every pixel."""
-    frames = jax.tree.map(np.asarray, evaluation.frames_of(capture, wants))
+    frames = jax.tree.map(np.asarray, evaluation.frames_of(capture, required_data))
     if frames.valid is None:
         frames = frames._replace(valid=np.ones(frames.images.shape[:3], bool))
     return frames
@@ -53,7 +53,7 @@ def duplicated(frames):
     """One frame again and again: picture, camera, time and codes."""
     names = [
         name
-        for name in ("images", "cameras", "times", "warp", "appearance", "depths")
+        for name in ("images", "cameras", "times", "appearance", "depths")
         if getattr(frames, name) is not None
     ]
     return _first(frames, *names)
@@ -103,7 +103,7 @@ CAPTURES = {
     "black images": _filled(0),
     "white images": _filled(255),
     "static scene": lambda frames: _first(frames, "images", "cameras"),
-    "one instant": lambda frames: _first(frames, "times", "warp"),
+    "one instant": lambda frames: _first(frames, "times"),
     "identical cameras": lambda frames: _first(frames, "cameras"),
     "duplicated frames": duplicated,
     "two views": two_views,

@@ -46,12 +46,12 @@ def trained(name, start, folder=None, steps=tiny_fields.STEPS):
     """A run that ended as every run must, and what it would show then."""
     run = tiny_fields.started(name)
     film = start.film(run.capture)
-    place = tiny_fields.place_of(scene.facts_of(film, run.spec), start.speed)
+    place = tiny_fields.place_of(scene.metadata_of(film, run.spec), start.speed)
     if film.points is None:  # they are told the field's planes alone
         film = dataclasses.replace(film, points=run.capture.points)
-    frames = start.frames(tiny_fields.frames_of(film, run.model.wants))
+    frames = start.frames(tiny_fields.frames_of(film, run.model.required_data))
     params = start.params(jax.tree.map(np.asarray, run.state.params))
-    state = run.state._replace(params=params, extra=place)
+    state = run.state._replace(params=params, aux_state=place)
     ended = hostile.train(run.model, state, frames, folder, steps=steps)
     return ended, picture_of(run, ended.result.state, frames, 0)
 
@@ -116,9 +116,9 @@ def test_where_the_origin_of_the_world_is_cannot_be_seen(name):
     state = run.state._replace(params=field_starts.denser(2.0)(run.state.params))
     pictures = []
     for film in (capture, shifted):
-        place = tiny_fields.place_of(scene.facts_of(film, run.spec))
-        frames = tiny_fields.frames_of(film, run.model.wants)
-        pictures.append(picture_of(run, state._replace(extra=place), frames, 1))
+        place = tiny_fields.place_of(scene.metadata_of(film, run.spec))
+        frames = tiny_fields.frames_of(film, run.model.required_data)
+        pictures.append(picture_of(run, state._replace(aux_state=place), frames, 1))
     # A shift of 4 units is rounded to 2e-7, five times that in units of the field; the
     # fine samples move with it.
     jax.tree.map(
@@ -162,8 +162,8 @@ def bare(capture):
 def test_scene_flow_of_a_single_bare_frame_stays_finite():
     spec = tiny_fields.tiny("nsff")
     run = tiny_fields.start(spec, bare(scenes.tiny_capture()))
-    assert run.model.wants == frozenset()
-    frames = tiny_fields.frames_of(run.capture, run.model.wants)
+    assert run.model.required_data == frozenset()
+    frames = tiny_fields.frames_of(run.capture, run.model.required_data)
     ended = hostile.train(run.model, run.state, frames, steps=200)
     assert ended.result.stopped_by == "steps", ended.result.message
     assert ended.last["mse"] < ended.first["mse"]
@@ -174,7 +174,7 @@ def test_scene_flow_of_a_single_bare_frame_stays_finite():
 def test_a_single_frame_has_one_code_at_all_times():
     spec = dataclasses.replace(tiny_fields.tiny("nerfies"), background=None)
     film = bare(scenes.tiny_capture())
-    made = scene.field(spec, scene.facts_of(film, spec))
+    made = scene.field(spec, scene.metadata_of(film, spec))
     params = made.init(jax.random.key(0))
     assert set(params["codes"]) == {"motion", "appearance"}
     for row in (0, 1):
@@ -192,8 +192,8 @@ def test_a_single_frame_has_one_code_at_all_times():
 def test_units_of_a_capture_do_not_reach_the_field(factor):
     spec = tiny_fields.tiny("nerf")
     capture = scenes.tiny_capture()
-    usual = scene.facts_of(capture, spec)
-    other = scene.facts_of(field_starts.scaled(factor)(capture), spec)
+    usual = scene.metadata_of(capture, spec)
+    other = scene.metadata_of(field_starts.scaled(factor)(capture), spec)
     # To the rounding of float32 points and cameras
     np.testing.assert_allclose(other.scale * factor, usual.scale, rtol=1e-6)
     np.testing.assert_allclose(other.near / factor, usual.near, rtol=1e-6)
@@ -207,9 +207,9 @@ def test_points_behind_the_far_plane_do_not_push_the_near_one_past_it():
     capture = scenes.tiny_capture()
     ahead = 50 * capture.cameras.camera_from_world[0, 2]
     points = capture.points._replace(position=capture.points.position + ahead)
-    facts = scene.facts_of(dataclasses.replace(capture, points=points), spec)
-    assert facts.near == capture.near
-    assert facts.far == capture.far
+    metadata = scene.metadata_of(dataclasses.replace(capture, points=points), spec)
+    assert metadata.near == capture.near
+    assert metadata.far == capture.far
 
 
 def test_a_scene_without_width_in_float64_is_refused():
@@ -218,7 +218,7 @@ def test_a_scene_without_width_in_float64_is_refused():
     away = cameras._replace(position=np.full_like(cameras.position, 1e30))
     away = dataclasses.replace(capture, cameras=away, points=None)
     with pytest.raises(ValueError, match=r"no width; move the scene"):
-        scene.facts_of(away, tiny_fields.tiny("nerf"))
+        scene.metadata_of(away, tiny_fields.tiny("nerf"))
 
 
 # --- means of what is hardly there ---------------------------------------------------

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import density, scene, splats
-from gaussians_jax.scene import Extra
+from gaussians_jax import densification, scene, splats
+from gaussians_jax.initialisation import InitSpec
+from gaussians_jax.scene import AuxState
 from gaussians_jax.spec import effects_of
-from gaussians_jax.start import StartSpec
 from nerfies_jax.capture.capture import PointCloud
 from nerfies_jax.training.model import Frames, Model, TrainState, View
 from tests import scenes
@@ -48,23 +48,23 @@ def hostile_spec(name):
     One capacity is one program for all starts; 200 points leave room for 56.
     """
     plan = dataclasses.replace(
-        scenes.TINY_SPLATS.density,
-        interval=50,
-        start=50,
-        stop=STEPS,
-        reset_interval=100,
-        most=splats.BUCKET,
-        gradient=1e-5,
+        scenes.TINY_SPLATS.densification,
+        refine_every=50,
+        refine_start_iter=50,
+        refine_stop_iter=STEPS,
+        reset_every=100,
+        cap_max=splats.BUCKET,
+        grow_grad2d=1e-5,
         # Of an extent of 0.04 scene units: the paper's 0.1 prunes all of this scene.
-        prune_scale=50.0,
+        prune_scale3d=50.0,
     )
-    return dataclasses.replace(TINY[name], steps=STEPS, density=plan)
+    return dataclasses.replace(TINY[name], steps=STEPS, densification=plan)
 
 
 class Hurried(NamedTuple):
     """What a scene carries, and how fast it is learnt."""
 
-    usual: Extra
+    usual: AuxState
     speed: jax.Array  # times all learning rates
 
 
@@ -72,23 +72,23 @@ def hurried(model):
     """The model with the speed of `Hurried`: one program serves all."""
 
     def plain(state):
-        return state._replace(extra=state.extra.usual)
+        return state._replace(aux_state=state.aux_state.usual)
 
     def dressed(state, speed):
-        return state._replace(extra=Hurried(state.extra, speed))
+        return state._replace(aux_state=Hurried(state.aux_state, speed))
 
     def init(capture, key):
         return dressed(model.init(capture, key), jnp.ones(()))
 
     def step(state, frames):
-        speed = state.extra.speed
+        speed = state.aux_state.speed
         new, metrics = model.step(plain(state), frames)
         params = hostile.sped_up(state.params, new.params, speed)
         return dressed(new._replace(params=params), speed), metrics
 
     def happening(event):
         def apply(state, frames):
-            return dressed(event.apply(plain(state), frames), state.extra.speed)
+            return dressed(event.apply(plain(state), frames), state.aux_state.speed)
 
         return event._replace(apply=apply)
 
@@ -107,8 +107,8 @@ class Ready(NamedTuple):
 
 
 def ready_for(spec, capture) -> Ready:
-    facts = scene.facts_of(capture)
-    model = hurried(scene.build(spec, facts))
+    metadata = scene.metadata_of(capture)
+    model = hurried(scene.build(spec, metadata))
 
     @jax.jit
     def render(params, view, step):
@@ -117,8 +117,8 @@ def ready_for(spec, capture) -> Ready:
     return Ready(
         model,
         model.init(capture, jax.random.key(3)),
-        hostile.frames_of(capture, model.wants),
-        effects_of(spec, facts),
+        hostile.frames_of(capture, model.required_data),
+        effects_of(spec, metadata),
         render,
     )
 
@@ -132,8 +132,12 @@ def started_with(made: Ready, rows):
     """The first state with these rows, and what is made of the rows made anew."""
     params, rows = made.start.params, jax.device_put(rows)
     params = params._replace(rows=params.rows | {"splats": rows})
-    extra = Extra(density.empty_stats(rows), scene.carried_by(made.effects, params))
-    return made.start._replace(params=params, extra=Hurried(extra, np.float32(1)))
+    aux_state = AuxState(
+        densification.empty_stats(rows), scene.states_of(made.effects, params)
+    )
+    return made.start._replace(
+        params=params, aux_state=Hurried(aux_state, np.float32(1))
+    )
 
 
 def one_point(rows):
@@ -145,13 +149,13 @@ def one_colour(rows):
 
 
 def alone(rows):
-    return splats.bury(jax.device_put(rows), jnp.arange(len(rows.mean)) > 0)
+    return splats.deactivate(jax.device_put(rows), jnp.arange(len(rows.mean)) > 0)
 
 
-def living(rows, logit):
-    """Every living row with that opacity; dead ones stay dead."""
+def with_logit(rows, logit):
+    """Every active row with that opacity; inactive ones stay inactive."""
     logits = np.where(
-        splats.alive(jax.device_put(rows)), np.float32(logit), rows.opacity_logit
+        splats.active_mask(jax.device_put(rows)), np.float32(logit), rows.opacity_logit
     )
     return rows._replace(opacity_logit=logits)
 
@@ -179,8 +183,8 @@ ROWS = {
     "needles": lambda rows: rows._replace(
         log_scale=np.zeros_like(rows.log_scale) + np.float32([-30.0, -30.0, 3.0])
     ),
-    "opaque": lambda rows: living(rows, 100.0),
-    "transparent": lambda rows: living(rows, -100.0),
+    "opaque": lambda rows: with_logit(rows, 100.0),
+    "transparent": lambda rows: with_logit(rows, -100.0),
     "of one colour": one_colour,
     "about the cameras": about_the_cameras,
     "alone": alone,
@@ -204,7 +208,7 @@ def run(made, start, frames, folder=None):
 def drawn(made, state, frames, row):
     """The view of that frame."""
     camera = jax.tree.map(lambda leaf: leaf[row], frames.cameras)
-    view = View(camera, frames.times[row], frames.warp[row], frames.appearance[row])
+    view = View(camera, frames.times[row], frames.appearance[row])
     return made.render(*hostile.on_device((state.params, view, state.step)))
 
 
@@ -233,8 +237,8 @@ def test_splats_train_from_hostile_rows(name, case, tmp_path):
         assert STOPS[case] in trained.result.message
         return
     assert trained.result.stopped_by == "steps", trained.result.message
-    living = trained.result.state.params.rows["splats"]
-    assert bool(splats.alive(living).any()) == (case not in DIE), case
+    rows = trained.result.state.params.rows["splats"]
+    assert bool(splats.active_mask(rows).any()) == (case not in DIE), case
 
 
 @pytest.mark.parametrize("case", hostile.CAPTURES)
@@ -249,7 +253,9 @@ def test_splats_train_on_hostile_captures(name, case, tmp_path):
 
 
 def at_ten_times_the_rates(made, frames):
-    start = made.start._replace(extra=made.start.extra._replace(speed=np.float32(10)))
+    start = made.start._replace(
+        aux_state=made.start.aux_state._replace(speed=np.float32(10))
+    )
     trained = run(made, start, frames)
     assert trained.result.stopped_by == "steps", trained.result.message
     return trained
@@ -303,15 +309,17 @@ CLOUDS = {
 
 
 @pytest.mark.parametrize("source", ["auto", "points"])
-@pytest.mark.parametrize("beside", [0, 50])
+@pytest.mark.parametrize("extra", [0, 50])
 @pytest.mark.parametrize("cloud", CLOUDS)
-def test_every_cloud_of_points_is_a_finite_start(cloud, beside, source):
+def test_every_cloud_of_points_is_a_finite_start(cloud, extra, source):
     capture = scenes.tiny_capture()
     place = capture.cameras.position[capture.train]
     ahead = capture.cameras.camera_from_world[capture.train[0], 2]
     capture = points_at(CLOUDS[cloud](place, ahead, capture.far))
-    plan = StartSpec(random=120, beside=beside, source=source)
-    spec = dataclasses.replace(scenes.TINY_SPLATS, start=plan)
-    state = scene.build(spec, scene.facts_of(capture)).init(capture, jax.random.key(0))
+    plan = InitSpec(random=120, extra_random=extra, source=source)
+    spec = dataclasses.replace(scenes.TINY_SPLATS, init=plan)
+    state = scene.build(spec, scene.metadata_of(capture)).init(
+        capture, jax.random.key(0)
+    )
     assert not hostile.not_finite(state)
-    assert splats.alive(state.params.rows["splats"]).any()
+    assert splats.active_mask(state.params.rows["splats"]).any()

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from nerfies_jax.effects import elastic, warp
-from nerfies_jax.effects.effect import Moment
+from nerfies_jax.training.effects import FrameCondition
 from tests.hard_cases import hostile, linear_warps, tiny_fields
 from tests.hard_cases.linear_warps import CORNERS, DISPLACEMENTS
 
@@ -28,7 +28,7 @@ def all_warps(dtype):
     )
     many = [linear_warps.linear_warp(start, one) for one in DISPLACEMENTS.values()]
     many = jax.tree.map(lambda *leaves: np.stack(leaves), *many)
-    moment = Moment(
+    condition = FrameCondition(
         jnp.asarray(0.5, dtype),
         {spec.warp.table: jnp.zeros(spec.warp.code_width, dtype)},
         jnp.int32(0),
@@ -36,7 +36,7 @@ def all_warps(dtype):
     point = jnp.asarray([0.25, -0.5, 0.125], dtype)
 
     def total(params):
-        jacobian = jax.jacfwd(lambda x: warp.displace(spec.warp, params, x, moment))
+        jacobian = jax.jacfwd(lambda x: warp.displace(spec.warp, params, x, condition))
         return elastic.cost(spec.elastic, jacobian(point))
 
     return many, jax.jit(jax.vmap(jax.value_and_grad(total)))

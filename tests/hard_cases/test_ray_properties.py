@@ -327,10 +327,12 @@ def test_what_a_ray_sees_lies_among_what_is_there(
     near, far = float(inputs[2][0]), float(inputs[2][-1])
     # Divided by an opacity of at least EMPTY_BELOW, which is itself off by n eps.
     slack = rounding * far / compositing.EMPTY_BELOW
-    assert near - slack <= found.depth <= far + slack
-    assert near <= found.median <= far
+    assert near - slack <= found.distance <= far + slack
+    assert near <= found.median_distance <= far
     later = seen(inputs[0], inputs[1], cast(dtype, distances_ + shift), inputs[3])
-    close(later.depth, float(found.depth) + shift, 12 * slack / far * (far + shift))
+    close(
+        later.distance, float(found.distance) + shift, 12 * slack / far * (far + shift)
+    )
 
 
 stratified = compiled(sampling.stratified, static_argnums=(3, 4))

@@ -17,7 +17,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gaussians_jax import render, splats
+from gaussians_jax import rendering, splats
 from gaussians_jax.raster_spec import RasterSpec
 from gaussians_jax.splats import Gaussians, Splats
 from tests.hard_cases import properties
@@ -33,7 +33,9 @@ from tests.hard_cases.properties import (
 
 pytestmark = pytest.mark.hard_cases
 # Without jumps: at the cut a Gaussian's edge is as faint as rounding.
-SMOOTH = RasterSpec(alpha_cut=1e-6, stop=0.0, near=1e-9, far=1e12, chunk=2)
+SMOOTH = RasterSpec(
+    alpha_threshold=1e-6, transmittance_threshold=0.0, near=1e-9, far=1e12, chunk=2
+)
 USUAL = RasterSpec(chunk=2)  # quicker to compile
 OTHERWISE_CUT = dataclasses.replace(SMOOTH, tile=4, capacity=5)
 ROWS = st.integers(0, GAUSSIANS - 1)
@@ -52,7 +54,7 @@ def picture_error(dtype):
 
 def drawn(gaussians, colours, camera, spec):
     """Colour, alpha, and depth times alpha."""
-    frame = render.render(gaussians, colours, camera, PICTURE, spec).rendering
+    frame = rendering.render(gaussians, colours, camera, PICTURE, spec).rendering
     return frame.colour, frame.alpha, frame.depth * frame.alpha
 
 
@@ -177,7 +179,7 @@ def test_a_denser_gaussian_never_lets_more_light_through(
     rounding = 2 * GAUSSIANS * eps(dtype)
     # A pixel is done before its transmittance would fall below `stop`, so that what
     # ends it early may keep an opaque Gaussian behind it out.
-    most = 1, 1 - USUAL.stop / (1 - USUAL.alpha_max)
+    most = 1, 1 - USUAL.transmittance_threshold / (1 - USUAL.alpha_max)
     before, after = (pictures(*each) for each in inputs)
     for (_, before_, _), (_, after_, _), alpha in zip(
         before, after, most, strict=False
@@ -235,19 +237,21 @@ def as_splats(scene: Gaussians) -> Splats:
 
 
 @compiled
-def buried_and_alive(rows, dead):
-    return splats.activate(splats.bury(rows, dead)), splats.activate(rows)
+def inactive_and_active(rows, inactive):
+    return splats.activate(splats.deactivate(rows, inactive)), splats.activate(rows)
 
 
-@given(scene=SCENE, colours=COLOURS, camera=CAMERA, dead=properties.many(6, 0, 1))
-def test_dead_and_clear_gaussians_are_as_if_absent(scene, colours, camera, dead, dtype):
+@given(scene=SCENE, colours=COLOURS, camera=CAMERA, inactive=properties.many(6, 0, 1))
+def test_inactive_and_clear_gaussians_are_as_if_absent(
+    scene, colours, camera, inactive, dtype
+):
     rows, colours, camera = cast(dtype, as_splats(scene), colours, camera)
-    dead = dead < 0.5
-    buried, clear = buried_and_alive(rows, dead)
-    clear = replaced(clear, dead, opacity=0)
-    same(buried.opacity, clear.opacity)
-    nowhere = replaced(clear, dead, mean=np.nan)
-    here = smooth(buried, colours, camera)
+    inactive = inactive < 0.5
+    deactivated, clear = inactive_and_active(rows, inactive)
+    clear = replaced(clear, inactive, opacity=0)
+    same(deactivated.opacity, clear.opacity)
+    nowhere = replaced(clear, inactive, mean=np.nan)
+    here = smooth(deactivated, colours, camera)
     same(here, smooth(nowhere, colours, camera))
     assert all(np.all(np.isfinite(leaf)) for leaf in here)
 
@@ -292,7 +296,7 @@ def test_one_gaussian_is_two_in_one_place_of_root_transparency(
 
 @in_float32
 @given(scene=SCENE, colours=COLOURS, camera=CAMERA)
-def test_tiles_and_slabs_do_not_show(scene, colours, camera, dtype):
+def test_tiles_and_chunks_do_not_show(scene, colours, camera, dtype):
     inputs = cast(dtype, scene, colours, camera)
     here, there = smooth(*inputs), draw(*inputs, OTHERWISE_CUT)
     close(there[0], here[0], picture_error(dtype))

@@ -309,13 +309,13 @@ def test_relative_depth_losses_do_not_see_scale_and_offset(
     close(found["scaled"], found["metric"][0], 32 * 10 * eps(dtype))
 
 
-def splats_at(mean, dead):
+def splats_at(mean, inactive):
     count = len(mean)
     rows = Splats(
         mean=mean,
         log_scale=np.zeros((count, 3)),
         quaternion=np.ones((count, 4)),
-        opacity_logit=np.where(dead, -1000, 0),
+        opacity_logit=np.where(inactive, -1000, 0),
         sh_dc=np.zeros((count, 1, 3)),
         sh_rest=np.zeros((count, 0, 3)),
     )
@@ -324,27 +324,27 @@ def splats_at(mean, dead):
 
 @given(
     mean=properties.many((12, 3), -1, 1),
-    dead=properties.many(12, 0, 1),
+    inactive=properties.many(12, 0, 1),
     motion=properties.motions(),
     scale=st.sampled_from([1.0, 2.0**-10, 1024.0]),
 )
-def test_neighbours_do_not_see_motion_nor_unit(mean, dead, motion, scale):
+def test_neighbours_do_not_see_motion_nor_unit(mean, inactive, motion, scale):
     """The graph itself may name equally distant neighbours in either order."""
     spec = neighbours.NeighbourSpec(count=4)
-    dead = dead < 0.3
+    inactive = inactive < 0.3
     moved = scale * (mean @ motion.rotation.T + motion.translation)
     here, there = (
-        neighbours.find(spec, Params({"splats": splats_at(x, dead)}, {}), 1.0)
+        neighbours.find(spec, Params({"splats": splats_at(x, inactive)}, {}), 1.0)
         for x in (mean, moved)
     )
     weight = np.asarray(here.weight)
     assert np.all((weight >= 0) & (weight <= 1))
     assert np.all(np.diff(weight, axis=1) <= 0)
-    assert np.all(weight[dead] == 0)
-    assert not np.any(dead[np.asarray(here.index)[weight > 0]])
+    assert np.all(weight[inactive] == 0)
+    assert not np.any(inactive[np.asarray(here.index)[weight > 0]])
     # float32 means of up to 12 round to 12 eps; a weight is gamma d² of its exponent,
     # with d = 0.03 at the median of the farthest, so 2 gamma d δ = 1.2 e2 of δ / d
-    live = mean[~dead].astype(np.float32).astype(np.float64)
+    live = mean[~inactive].astype(np.float32).astype(np.float64)
     between = np.linalg.norm(live[:, None] - live, axis=-1)
     near = np.sort(between, axis=1)[:, 1:5]
     unit = np.median(near[:, -1]) if len(live) > 1 else 0.0

@@ -25,11 +25,11 @@ def float32s(shape, most=LARGEST):
 
 @st.composite
 def rows(draw, far: float = LARGEST):
-    """Three living rows of any harmonic degree and any finite values at all."""
+    """Three active rows of any harmonic degree and any finite values at all."""
     count, rest = 3, draw(st.sampled_from([0, 3, 8, 15]))
     quaternion = draw(float32s((count, 4)))
     logit = draw(float32s(count))
-    logit = np.where(logit > splats.DEAD_LOGIT / 2, logit, 0)
+    logit = np.where(logit > splats.INACTIVE_LOGIT / 2, logit, 0)
     return Splats(
         mean=draw(float32s((count, 3), far)),
         log_scale=draw(float32s((count, 3))),
@@ -57,14 +57,16 @@ def test_ply_keeps_every_bit_of_any_finite_gaussian(rows_, tmp_path):
     assert not loaded.notes
 
 
-@given(rows_=rows(), dead=st.lists(st.booleans(), min_size=3, max_size=3))
-def test_a_model_file_keeps_every_bit_of_its_living_rows(rows_, dead, tmp_path):
-    dead = np.array(dead) & np.array([True, True, False])
-    buried = splats.bury(on_device(rows_), jnp.asarray(dead))
-    params = Params({"splats": buried}, {"net": {"weight": jnp.asarray(rows_.mean)}})
+@given(rows_=rows(), inactive=st.lists(st.booleans(), min_size=3, max_size=3))
+def test_a_model_file_keeps_every_bit_of_its_active_rows(rows_, inactive, tmp_path):
+    inactive = np.array(inactive) & np.array([True, True, False])
+    deactivated = splats.deactivate(on_device(rows_), jnp.asarray(inactive))
+    params = Params(
+        {"splats": deactivated}, {"net": {"weight": jnp.asarray(rows_.mean)}}
+    )
     model_file.save(tmp_path / "model.npz", params, {"step": 3})
     loaded, about = model_file.load(tmp_path / "model.npz")
-    kept = jax.tree.map(lambda leaf: leaf[~dead], rows_)
+    kept = jax.tree.map(lambda leaf: leaf[~inactive], rows_)
     assert bits(loaded.rows["splats"]) == bits(kept)
     assert bits(loaded.nets) == bits(rows_.mean)
     assert about == {"step": 3}
@@ -158,7 +160,7 @@ def test_splat_is_within_half_a_step_and_then_still(rows_, tmp_path):
 def test_what_is_not_finite_is_never_written(
     value, row, field, suffix, rows_, tmp_path
 ):
-    """A NaN opacity, which is above no threshold, does not make a row a dead one."""
+    """A NaN opacity, which is above no threshold, does not make a row inactive."""
     assume(field != "opacity_logit" or not value < 0)  # minus infinity does
     broken = {name: np.array(leaf) for name, leaf in rows_._asdict().items()}
     broken[field].reshape(3, -1)[row, -1] = value
@@ -186,7 +188,7 @@ def plain(**fields):
 
 
 @pytest.mark.parametrize("suffix", [*files.SUFFIXES, ".npz"])
-def test_a_row_of_nan_opacity_is_refused_and_not_taken_for_dead(suffix, tmp_path):
+def test_a_row_of_nan_opacity_is_refused_and_not_taken_for_inactive(suffix, tmp_path):
     broken = plain(opacity_logit=[0.0, np.nan, 0.0])
     path = tmp_path / f"a{suffix}"
     as_model = Params({"splats": broken}, {}), {}

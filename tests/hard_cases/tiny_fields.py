@@ -1,7 +1,7 @@
 """The papers' radiance fields shrunk to a few numbers, and whole runs of them.
 
 A field is compiled once. What a hostile start changes, down to the box of the scene and
-the rate of the optimiser, travels as arrays in `TrainState.extra`.
+the rate of the optimiser, travels as arrays in `TrainState.aux_state`.
 """
 
 import copy
@@ -14,9 +14,9 @@ import numpy as np
 
 from nerfies_jax import evaluation, presets, scene
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.facts import Facts
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.radiance.template import TemplateSpec
+from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.spec import RadianceScene
 from nerfies_jax.training.model import Frames, Model, Rendering, TrainState
 from tests import scenes
@@ -93,23 +93,23 @@ def small_template(spec: TemplateSpec) -> TemplateSpec:
     )
 
 
-def moved(facts: Facts, place: Place) -> Facts:
-    """The facts with traced numbers, which their constructor would refuse."""
-    facts = copy.copy(facts)
+def moved(metadata: SceneMetadata, place: Place) -> SceneMetadata:
+    """The metadata with traced numbers, which their constructor would refuse."""
+    metadata = copy.copy(metadata)
     for name in ("near", "far", "centre", "scale"):
-        object.__setattr__(facts, name, getattr(place, name))
-    return facts
+        object.__setattr__(metadata, name, getattr(place, name))
+    return metadata
 
 
-def place_of(facts: Facts, speed: float = 1.0) -> Place:
+def place_of(metadata: SceneMetadata, speed: float = 1.0) -> Place:
     """As arrays."""
-    numbers = (facts.near, facts.far, facts.centre, facts.scale, speed)
+    numbers = (metadata.near, metadata.far, metadata.centre, metadata.scale, speed)
     return Place(*(np.asarray(number, np.float32) for number in numbers))
 
 
-def frames_of(capture: Capture, wants: frozenset[str]) -> Frames:
+def frames_of(capture: Capture, required_data: frozenset[str]) -> Frames:
     """Frames whose pictures can hold any number, with a mask in any case."""
-    frames = hostile.frames_of(capture, wants)
+    frames = hostile.frames_of(capture, required_data)
     return frames._replace(images=frames.images.astype(np.float32))
 
 
@@ -128,23 +128,23 @@ def started(name: str) -> Run:
 
 def start(spec: RadianceScene, capture: Capture) -> Run:
     """Nothing is compiled before it runs."""
-    facts = scene.facts_of(capture, spec)
-    model = scene.build(spec, facts)
+    metadata = scene.metadata_of(capture, spec)
+    model = scene.build(spec, metadata)
 
     def step(state, frames):
-        here = scene.build(spec, moved(facts, state.extra))
+        here = scene.build(spec, moved(metadata, state.aux_state))
         new, metrics = here.step(state, frames)
-        params = hostile.sped_up(state.params, new.params, state.extra.speed)
+        params = hostile.sped_up(state.params, new.params, state.aux_state.speed)
         return new._replace(params=params), metrics
 
     view = evaluation.view_of(capture, int(capture.train[0]))
 
     @jax.jit
     def picture(state, camera, time) -> Rendering:
-        here = scene.build(spec, moved(facts, state.extra))
+        here = scene.build(spec, moved(metadata, state.aux_state))
         seen = view._replace(camera=camera, time=time)
         return here.render(state.params, seen, PICTURE, state.step)
 
     state = model.init(capture, jax.random.key(0))
-    state = state._replace(extra=place_of(facts))
+    state = state._replace(aux_state=place_of(metadata))
     return Run(spec, capture, model._replace(step=step), state, picture)

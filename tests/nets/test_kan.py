@@ -375,6 +375,36 @@ def test_holding_is_twice_differentiable_at_the_ends(order, float64):
 
 
 @pytest.mark.hard_cases
+def test_holding_keeps_its_slope_however_far_out(dtype):
+    """The square of the distance overflows float32 from 1e19 on: 0, and NaN at 3e38."""
+    x = np.array([-1e10, 1e10, 1e15, 1e18, 3e38], dtype)
+    exact = (0.3 / x.astype(np.float64)) ** 2 / np.sqrt(3)  # to 1 / x of itself
+    value, slope, curvature = holding(x)
+    np.testing.assert_allclose(value, [-1.3, *[2.3] * 4], rtol=1e-6)
+    np.testing.assert_allclose(slope, exact, rtol=1e-6, atol=np.finfo(dtype).tiny)
+    assert np.isfinite(curvature).all()
+
+
+@jax.jit
+def standardised(features):
+    """And its slopes."""
+    return kan.standardise(features), jax.jacrev(kan.standardise)(features)
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("size", [1.0, 1e20, 3e38])
+def test_features_of_any_size_are_standardised(size, dtype):
+    """In float32 the variance of 1e20 overflows, and every feature would become 0."""
+    given = np.array([0.9, -0.3, 0.5, -1.0])
+    exact = (given - given.mean()) / np.sqrt(given.var() + 1e-6 / size**2)
+    found, slopes = standardised((size * given).astype(dtype))
+    np.testing.assert_allclose(found, exact, rtol=1e-6)
+    # d z = (1 - 1/n - z zᵀ/n) dx / deviation
+    change = (np.eye(4) - 0.25 - np.outer(exact, exact) / 4) / given.std() / size
+    np.testing.assert_allclose(slopes, change, rtol=2e-6, atol=2e-6 / size + 1e-38)
+
+
+@pytest.mark.hard_cases
 def test_holding_keeps_the_order_of_its_inputs(dtype):
     x = np.linspace(-9, 9, 2001).astype(dtype)
     assert (np.diff(holding(x)[0]) > 0).all()

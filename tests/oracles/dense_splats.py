@@ -58,7 +58,7 @@ def footprint(mean, quaternion, scale, camera, size, spec):
 
 
 def opacities_and_conics(covariance, opacity, spec):
-    dilated = covariance + spec.dilation_px2 * jnp.eye(2)
+    dilated = covariance + spec.eps2d * jnp.eye(2)
     if spec.antialiased:
         ratio = jnp.linalg.det(covariance) / jnp.linalg.det(dilated)
         small = ratio < 0.005**2
@@ -82,10 +82,10 @@ def composite(mean_px, conic, opacity, depth, values, size, spec):
         alpha = jnp.minimum(raw, spec.alpha_max)
     else:
         alpha = raw + jax.lax.stop_gradient(jnp.minimum(raw, spec.alpha_max) - raw)
-    alpha = jnp.where((raw >= spec.alpha_cut) & (opacity[order] > 0), alpha, 0)
+    alpha = jnp.where((raw >= spec.alpha_threshold) & (opacity[order] > 0), alpha, 0)
     passed = jnp.cumprod(1 - alpha, axis=1)
     before = jnp.concatenate([jnp.ones_like(passed[:, :1]), passed[:, :-1]], axis=1)
-    drawn = passed > spec.stop
+    drawn = passed > spec.transmittance_threshold
     weight = jnp.where(drawn, alpha * before, 0)
     left = jnp.prod(jnp.where(drawn, 1 - alpha, 1), axis=1)
     return weight @ values[order], left

@@ -171,7 +171,7 @@ def test_media_composite_term_by_term(float64, rng):
     np.testing.assert_allclose(seen.colour, colour, rtol=1e-13)
     assert abs(float(seen.alpha) - (1 - passed)) < 1e-14
     joint = exact_weights(depth.sum(0)[None])[0]
-    assert abs(float(seen.depth) - joint @ distances / joint.sum()) < 1e-13
+    assert abs(float(seen.distance) - joint @ distances / joint.sum()) < 1e-13
 
 
 LOGITS = [-100.0, -20.0, -1.0, 0.0, 3.0, 20.0, 100.0]
@@ -285,8 +285,10 @@ def test_a_ray_cut_in_two_is_the_ray(dtype, rng):
     np.testing.assert_allclose(front.colour, whole.colour, atol=ABSOLUTE[dtype])
     joined = front.alpha + (1 - front.alpha) * back.alpha
     assert abs(float(joined - whole.alpha)) < ABSOLUTE[dtype]
-    stopped = front.alpha * front.depth + (1 - front.alpha) * back.alpha * back.depth
-    assert abs(float(stopped / joined - whole.depth)) < 3 * ABSOLUTE[dtype]
+    stopped = (
+        front.alpha * front.distance + (1 - front.alpha) * back.alpha * back.distance
+    )
+    assert abs(float(stopped / joined - whole.distance)) < 3 * ABSOLUTE[dtype]
 
 
 def scene(dtype, samples=6):
@@ -300,7 +302,7 @@ def seen_and_slope(weights, colours, distances, background):
 
     def depth(weights):
         seen = compositing.composite(weights, colours, distances, background)
-        return seen.depth, seen
+        return seen.distance, seen
 
     slope, seen = jax.grad(depth, has_aux=True)(weights)
     return seen, slope
@@ -314,8 +316,8 @@ def test_an_empty_ray_is_background_at_its_far_end(scale, dtype):
     weights = (scale * np.array([0.0, 1, 0, 2, 0, 0])).astype(dtype)
     seen, slopes = seen_and_slope(weights, colours, distances, background)
     np.testing.assert_allclose(seen.colour, background, atol=1e-7)
-    assert abs(float(seen.depth) - 4.5) < 1e-4
-    assert float(seen.median) == 4.5
+    assert abs(float(seen.distance) - 4.5) < 1e-4
+    assert float(seen.median_distance) == 4.5
     assert np.all(np.abs(slopes) <= 4.5 / EMPTY_BELOW)
 
 
@@ -324,7 +326,7 @@ def test_a_single_hit_is_where_it_is(dtype):
     weights = np.eye(6, dtype=dtype)[2]
     seen = composite(weights, colours, distances, np.ones(3, dtype))
     np.testing.assert_array_equal(seen.colour, colours[2])
-    assert seen.depth == distances[2] == seen.median
+    assert seen.distance == distances[2] == seen.median_distance
     assert seen.alpha == 1
 
 
@@ -367,7 +369,7 @@ def test_composite_has_the_slopes_of_central_differences(background, float64, rn
 
     def loss(depth, colours, distances):
         seen = composite(weights_of(depth), colours, distances, behind)
-        return jnp.sum(jnp.sin(3 * seen.colour)) + seen.alpha**2 + seen.depth**2
+        return jnp.sum(jnp.sin(3 * seen.colour)) + seen.alpha**2 + seen.distance**2
 
     error = gradients.directional_error(loss, depth, colours, distances)
     assert error < 1e-7
@@ -438,9 +440,9 @@ class TestNerfies:
         close(np.sum(weights * z, axis=-1), wanted["depth"])
         # ours leaves out the sample at infinity, theirs takes it for a surface
         hit = 1 - np.asarray(weights[:, -1])
-        ours = seen.depth * hit + weights[:, -1] * z[:, -1]
+        ours = seen.distance * hit + weights[:, -1] * z[:, -1]
         close(ours, wanted["depth"])
-        close(seen.median, wanted["med_depth"])
+        close(seen.median_distance, wanted["med_depth"])
 
     def test_white_behind_a_finite_last_sample(self, oracle_dir, dtype):
         white = jnp.ones(3, dtype)
@@ -452,8 +454,8 @@ class TestNerfies:
         close(seen.colour, wanted["rgb"])
         close(seen.alpha, wanted["acc"])
         close(np.sum(weights * z, axis=-1), wanted["depth"])
-        close(seen.depth * seen.alpha, wanted["depth"])
-        close(seen.median, wanted["med_depth"])
+        close(seen.distance * seen.alpha, wanted["depth"])
+        close(seen.median_distance, wanted["med_depth"])
 
     def test_black_behind_a_finite_last_sample(self, oracle_dir, dtype):
         weights, _, wanted, _, rgb = self.render(oracle_dir, dtype, False, None)

@@ -17,7 +17,7 @@ import pytest
 
 from nerfies_jax.effects import background, elastic, warp
 from nerfies_jax.effects.background import BackgroundSpec
-from nerfies_jax.effects.effect import Context, Level, Moment
+from nerfies_jax.effects.effect import RayOutput
 from nerfies_jax.effects.elastic import ElasticSpec
 from nerfies_jax.effects.warp import WarpSpec
 from nerfies_jax.geometry import matrix3
@@ -27,6 +27,7 @@ from nerfies_jax.nets.mlp import MLP, Layer
 from nerfies_jax.radiance import compositing, sampling, template
 from nerfies_jax.radiance.template import Template, TemplateSpec
 from nerfies_jax.training import losses
+from nerfies_jax.training.effects import FrameCondition, PenaltyContext
 
 TEMPLATE = TemplateSpec(position=EncodingSpec(8))
 WARP = WarpSpec(anneal_steps=32)
@@ -99,9 +100,9 @@ def displacement(flat):
     return functools.partial(warp.displace, WARP, warp_params(flat))
 
 
-def moment(flat, id_):
+def frame_condition(flat, id_):
     codes = {"motion": flat[CODES][id_]}
-    return Moment(jnp.zeros((), flat[CODES].dtype), codes, jnp.int32(STEP))
+    return FrameCondition(jnp.zeros((), flat[CODES].dtype), codes, jnp.int32(STEP))
 
 
 def official_weights(optical_depth):
@@ -114,7 +115,7 @@ def official_weights(optical_depth):
 def level(flat, name, distance, given):
     """One level of one ray."""
     point = given.origin + distance[:, None] * given.direction
-    when = moment(flat, given.warp_id)
+    when = frame_condition(flat, given.warp_id)
     warped = point + jax.vmap(displacement(flat), (0, None))(point, when)
     view = encoding.encode(TEMPLATE.direction, given.direction, None)
     condition = jnp.concatenate([view, flat[CAMERAS][given.camera_id]])
@@ -138,7 +139,7 @@ def level(flat, name, distance, given):
         "acc": seen.alpha,
         # upstream does not divide by the opacity, nor leave out the last sample
         "depth": jnp.sum(weight * distance),
-        "med_depth": seen.median,
+        "med_depth": seen.median_distance,
         # ours, of the same densities
         "our_weights": compositing.weights(radiance.density * spacing),
     }
@@ -156,17 +157,17 @@ def both_levels(flat, given):
 
 
 def penalty_context(flat, rays, coarse):
-    none = dict.fromkeys(Context._fields)
-    fields = dict.fromkeys(Level._fields)
-    one = Level(
+    none = dict.fromkeys(PenaltyContext._fields)
+    fields = dict.fromkeys(RayOutput._fields)
+    one = RayOutput(
         **fields | {"point": coarse["points"], "static_weight": coarse["weights"]}
     )
-    return Context(
+    return PenaltyContext(
         **none
         | {
             "displace": displacement(flat),
-            "moment_of": lambda id_: moment(flat, id_),
-            "moments": jax.vmap(lambda id_: moment(flat, id_))(rays.warp_id),
+            "condition_of": lambda id_: frame_condition(flat, id_),
+            "condition": jax.vmap(lambda id_: frame_condition(flat, id_))(rays.warp_id),
             "levels": (one,),
             "key": jax.random.key(0),
         }
@@ -263,7 +264,7 @@ def test_our_weights_are_the_official_ones_but_for_their_epsilon(both, dtype):
 
 def test_jacobians(both, dtype, oracle_dir):
     _, answer, truth = both
-    when = jax.vmap(lambda id_: moment(answer.flat, id_))(
+    when = jax.vmap(lambda id_: frame_condition(answer.flat, id_))(
         asked(read(oracle_dir / "nerfies.npz"), dtype).rays.warp_id
     )
     by_point = jax.vmap(

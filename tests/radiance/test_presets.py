@@ -10,6 +10,13 @@ from nerfies_jax import evaluation, presets, scene
 from nerfies_jax.presets import PRESETS
 from tests import scenes
 
+# Fields of the effects that count steps.
+COUNTED = {
+    "warp": ("anneal_steps",),
+    "ambient": ("closed_steps", "anneal_steps"),
+    "elastic": ("hold_steps", "decay_steps"),
+    "scene_flow": ("decay_steps",),
+}
 PAPERS = ("nerf", "nerf-w", "d-nerf", "t-nerf", "nerfies", "hypernerf", "nsff")
 
 
@@ -22,9 +29,9 @@ def test_a_step_of_every_preset_keeps_its_state(name):
     # Traced, not compiled: shapes, dtypes and promotion of the whole step.
     capture = scenes.tiny_capture()
     spec = PRESETS[name]
-    model = scene.build(spec, scene.facts_of(capture, spec))
+    model = scene.build(spec, scene.metadata_of(capture, spec))
     state = jax.eval_shape(lambda key: model.init(capture, key), jax.random.key(0))
-    frames = evaluation.frames_of(capture, model.wants)
+    frames = evaluation.frames_of(capture, model.required_data)
     after, metrics = jax.eval_shape(model.step, state, frames)
     assert jax.tree.structure(after) == jax.tree.structure(state)
     for before, now in zip(jax.tree.leaves(state), jax.tree.leaves(after), strict=True):
@@ -37,7 +44,7 @@ def test_half_the_steps_halve_the_schedules(name):
     spec = PRESETS[name]
     half = presets.with_steps(spec, spec.steps // 2)
     assert half.steps == spec.steps // 2
-    for effect, fields in presets.COUNTED.items():
+    for effect, fields in COUNTED.items():
         whole = getattr(spec, effect)
         for field in fields if whole is not None else ():
             count = getattr(whole, field)
@@ -69,8 +76,8 @@ def test_presets_differ_only_in_what_their_names_say():
 def test_a_small_preset_learns_more_than_one_colour(name):
     capture = scenes.tiny_capture()
     spec = dataclasses.replace(presets.with_steps(PRESETS[name], 200), rays=128)
-    model = scene.build(spec, scene.facts_of(capture, spec))
-    frames = evaluation.frames_of(capture, model.wants)
+    model = scene.build(spec, scene.metadata_of(capture, spec))
+    frames = evaluation.frames_of(capture, model.required_data)
     state, step = model.init(capture, jax.random.key(0)), jax.jit(model.step)
     errors = []
     for _ in range(120):

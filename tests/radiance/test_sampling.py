@@ -135,7 +135,8 @@ HARD = {
     "first": np.eye(16)[0],
     "last": np.eye(16)[15],
     "two peaks": np.eye(16)[2] + np.eye(16)[12],
-    "huge": np.full(16, 1e30),
+    "huge": np.full(16, 3e38),  # 1 / 3e38 is no normal number
+    "huge one hot": np.eye(16)[5] * 3e38,
 }
 
 
@@ -172,9 +173,10 @@ def test_equal_weights_of_any_size_share_alike(case, dtype):
 
 @pytest.mark.hard_cases
 @pytest.mark.parametrize(
-    "case", ["one hot", "faint one hot", "two peaks", "first", "last"]
+    "case",
+    ["one hot", "faint one hot", "huge one hot", "two peaks", "first", "last"],
 )
-def test_peaks_draw_all_samples_however_faint(case, dtype):
+def test_peaks_draw_all_samples_however_faint_or_bright(case, dtype):
     """But the ends u = 0 and 1 of the even shares, which are the ends of the range."""
     even = hard_samples(False, dtype, 34)[case]
     wanted = bisect_inverse(EDGES, HARD[case], np.linspace(0, 1, 34))

@@ -8,20 +8,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nerfies_jax import evaluation, scene, tracing
+from nerfies_jax import evaluation, render_ray, scene
 from nerfies_jax.effects.ambient import AmbientSpec
 from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.effects.background import BackgroundSpec
-from nerfies_jax.effects.effect import Moment
 from nerfies_jax.effects.elastic import ElasticSpec
 from nerfies_jax.effects.time_condition import TimeSpec
 from nerfies_jax.effects.warp import WarpSpec
-from nerfies_jax.facts import Facts
 from nerfies_jax.nets import codes
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.radiance.template import TemplateSpec
 from nerfies_jax.scene import RadianceScene
+from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.spec import SamplingSpec
+from nerfies_jax.training.effects import FrameCondition, weighted_sum
 from nerfies_jax.training.model import TrainState, View
 from tests import gradients, scenes
 
@@ -51,7 +51,7 @@ NERFIES = dataclasses.replace(
     elastic=ElasticSpec(points=2),
     background=BackgroundSpec(points=16),
 )
-FACTS = Facts(
+METADATA = SceneMetadata(
     near=1.0,
     far=3.0,
     centre=(0.5, 0.0, -0.5),
@@ -65,8 +65,8 @@ FACTS = Facts(
 @functools.cache
 def started(spec):
     capture = scenes.tiny_capture()
-    model = scene.build(spec, scene.facts_of(capture, spec))
-    frames = evaluation.frames_of(capture, model.wants)
+    model = scene.build(spec, scene.metadata_of(capture, spec))
+    frames = evaluation.frames_of(capture, model.required_data)
     return model, model.init(capture, jax.random.key(3)), frames
 
 
@@ -90,7 +90,7 @@ def rendered(spec):
 
 
 def ray_of(dtype):
-    return tracing.Ray(
+    return render_ray.Ray(
         jnp.asarray([0.1, -0.2, 0.3], dtype),
         jnp.asarray([0.6, 0.0, 0.8], dtype),
         jnp.asarray(0.5, dtype),
@@ -98,9 +98,9 @@ def ray_of(dtype):
     )
 
 
-def moment_of(dtype, **found):
+def condition_of(dtype, **found):
     found = {name: jnp.asarray(code, dtype) for name, code in found.items()}
-    return Moment(jnp.asarray(0.4, dtype), found, jnp.int32(0))
+    return FrameCondition(jnp.asarray(0.4, dtype), found, jnp.int32(0))
 
 
 @pytest.mark.parametrize(
@@ -123,25 +123,25 @@ def test_a_static_field_has_a_template_and_nothing_else():
     assert state.params["codes"] == {}
     assert frames.points is None
     assert frames.depths is None
-    assert model.wants == frozenset()
+    assert model.required_data == frozenset()
     _, trace = stepped(STATIC, 40)
     assert set(trace[0]) == {"loss", "mse", "coarse", "fine"}
 
 
 def test_a_static_level_is_the_plain_nerf(dtype):
-    facts = FACTS
-    field = scene.field(STATIC, facts)
+    metadata = METADATA
+    field = scene.field(STATIC, metadata)
     params = jax.tree.map(lambda x: x.astype(dtype), field.init(jax.random.key(0)))
     ray = ray_of(dtype)
-    coarse, fine = jax.jit(field.trace)(params, ray, moment_of(dtype))
+    coarse, fine = jax.jit(field.render_ray)(params, ray, condition_of(dtype))
     assert fine.colour.dtype == dtype
     expected = plain_nerf(params["template"]["coarse"], ray, np.linspace(0.5, 1.5, 8))
     tolerance = {"float32": 3e-6, "float64": 1e-12}[dtype]
     np.testing.assert_allclose(coarse.colour, expected, atol=tolerance)
-    expected = plain_nerf(params["template"]["fine"], ray, np.asarray(fine.distance))
+    expected = plain_nerf(params["template"]["fine"], ray, np.asarray(fine.distances))
     np.testing.assert_allclose(fine.colour, expected, atol=tolerance)
-    assert len(fine.distance) == 16
-    assert np.all(np.diff(fine.distance) >= 0)
+    assert len(fine.distances) == 16
+    assert np.all(np.diff(fine.distances) >= 0)
 
 
 def plain_nerf(net, ray, distances):
@@ -205,7 +205,7 @@ def test_memory_of_a_render_does_not_grow_with_the_picture():
 def test_depth_is_along_the_viewing_axis_in_scene_units():
     capture = scenes.tiny_capture()
     model, state, _ = started(STATIC)
-    facts = model.spec[1]
+    metadata = model.spec[1]
     # An opaque field stops every ray at its first sample: the near plane.
     params = jax.tree.map(lambda x: x, state.params)
     for net in params["template"].values():
@@ -213,22 +213,22 @@ def test_depth_is_along_the_viewing_axis_in_scene_units():
         net.trunk.heads["density"] = head._replace(bias=head.bias + 1e6)
     view = evaluation.view_of(capture, 0)
     picture = jax.jit(lambda p: model.render(p, view, (9, 7), jnp.int32(0)))(params)
-    np.testing.assert_allclose(picture.depth, facts.near, rtol=1e-4)
+    np.testing.assert_allclose(picture.depth, metadata.near, rtol=1e-4)
     np.testing.assert_allclose(picture.alpha, 1, atol=1e-6)
 
 
 def test_a_code_is_its_row_at_its_own_time_and_between_rows_elsewhere(dtype):
     spec = dataclasses.replace(STATIC, warp=TINY_WARP)
-    field = scene.field(spec, FACTS)
+    field = scene.field(spec, METADATA)
     params = jax.tree.map(lambda x: x.astype(dtype), field.init(jax.random.key(0)))
     table = params["codes"]["motion"]
     assert table.shape == (3, TINY_WARP.code_width)
 
     def at(time):
-        view = View(None, jnp.asarray(time, dtype), jnp.int32(0), jnp.int32(0))
+        view = View(None, jnp.asarray(time, dtype), jnp.int32(0))
         return field.codes_at(params, view)["motion"]
 
-    for row, time in enumerate(FACTS.times):
+    for row, time in enumerate(METADATA.times):
         np.testing.assert_array_equal(at(time), table[row])
     np.testing.assert_allclose(at(0.4), 0.8 * table[1] + 0.2 * table[2], atol=1e-7)
     np.testing.assert_array_equal(at(-1.0), table[0])
@@ -237,34 +237,34 @@ def test_a_code_is_its_row_at_its_own_time_and_between_rows_elsewhere(dtype):
 
 def test_an_exposure_that_was_not_learnt_lies_between_its_neighbours(float64):
     spec = dataclasses.replace(STATIC, appearance=AppearanceSpec(width=2))
-    field = scene.field(spec, FACTS)
+    field = scene.field(spec, METADATA)
     params = field.init(jax.random.key(0))
     table = params["codes"]["appearance"]
     assert table.shape == (2, 2)  # only what is learnt from has a row
-    view = View(None, jnp.asarray(0.0), jnp.int32(0), jnp.int32(2))
+    view = View(None, jnp.asarray(0.0), jnp.int32(2))
     found = field.codes_at(params, view)["appearance"]
     np.testing.assert_allclose(found, 0.75 * table[0] + 0.25 * table[1], atol=1e-7)
 
 
 def test_facts_place_held_out_exposures_by_time():
     capture = scenes.tiny_capture()
-    facts = scene.facts_of(capture, STATIC)
+    metadata = scene.metadata_of(capture, STATIC)
     learnt = set(capture.appearance_ids[capture.train].tolist())
-    rows = [facts.exposures[one] for one in sorted(learnt)]
+    rows = [metadata.exposures[one] for one in sorted(learnt)]
     assert sorted(left for left, right, _ in rows) == list(range(len(learnt)))
     assert all(left == right for left, right, _ in rows)
-    assert max(max(left, right) for left, right, _ in facts.exposures) < len(learnt)
-    assert facts.times == tuple(sorted(set(capture.times[capture.train].tolist())))
+    assert max(max(left, right) for left, right, _ in metadata.exposures) < len(learnt)
+    assert metadata.times == tuple(sorted(set(capture.times[capture.train].tolist())))
 
 
 def test_the_filmed_volume_fills_the_box():
     capture = scenes.tiny_capture()
-    facts = scene.facts_of(capture, STATIC)
-    inside = (capture.points.position - np.asarray(facts.centre)) * facts.scale
+    metadata = scene.metadata_of(capture, STATIC)
+    inside = (capture.points.position - np.asarray(metadata.centre)) * metadata.scale
     # Outliers of structure from motion may lie outside
     assert np.mean(np.abs(inside) <= 1) > 0.9
     assert np.abs(inside).max() > 0.5
-    own = scene.facts_of(capture, dataclasses.replace(STATIC, extent=None))
+    own = scene.metadata_of(capture, dataclasses.replace(STATIC, extent=None))
     assert own.scale == 1
     assert own.centre == (0, 0, 0)
 
@@ -272,23 +272,23 @@ def test_the_filmed_volume_fills_the_box():
 def test_without_its_warp_a_field_shows_the_canonical_scene():
     spec = dataclasses.replace(STATIC, warp=TINY_WARP)
     field, canonical = (
-        scene.field(spec, FACTS, without) for without in ((), ("warp",))
+        scene.field(spec, METADATA, without) for without in ((), ("warp",))
     )
     params = field.init(jax.random.key(0))
     code = np.ones(TINY_WARP.code_width)
-    moment = moment_of("float32", motion=code)
+    condition = condition_of("float32", motion=code)
     warp = params["warp"]
     grown = {
         name: head._replace(weight=head.weight * 1e3)
         for name, head in warp.heads.items()
     }
     params = params | {"warp": warp._replace(heads=grown)}
-    bent = jax.jit(field.trace)(params, ray_of("float32"), moment)[-1]
-    straight = jax.jit(canonical.trace)(params, ray_of("float32"), moment)[-1]
+    bent = jax.jit(field.render_ray)(params, ray_of("float32"), condition)[-1]
+    straight = jax.jit(canonical.render_ray)(params, ray_of("float32"), condition)[-1]
     assert np.abs(bent.warped - bent.point).max() > 1e-3
     np.testing.assert_array_equal(straight.warped, straight.point)
-    static = scene.field(STATIC, FACTS)
-    plain = jax.jit(static.trace)(params, ray_of("float32"), moment)[-1]
+    static = scene.field(STATIC, METADATA)
+    plain = jax.jit(static.render_ray)(params, ray_of("float32"), condition)[-1]
     np.testing.assert_array_equal(straight.colour, plain.colour)
 
 
@@ -297,10 +297,10 @@ def test_what_cannot_be_left_out_is_refused():
         STATIC, warp=TINY_WARP, time=TimeSpec(), appearance=AppearanceSpec()
     )
     with pytest.raises(ValueError, match=r"no effect 'elastic'.*warp"):
-        scene.field(spec, FACTS, without=("elastic",))
+        scene.field(spec, METADATA, without=("elastic",))
     for name in ("time", "appearance"):
         with pytest.raises(ValueError, match="feeds the template"):
-            scene.field(spec, FACTS, without=(name,))
+            scene.field(spec, METADATA, without=(name,))
 
 
 def test_wrong_specs_are_refused_early():
@@ -316,7 +316,7 @@ def test_wrong_specs_are_refused_early():
         dataclasses.replace(STATIC, rate=1e-4, rate_end=1e-3)
     spec = dataclasses.replace(STATIC, warp=TINY_WARP, background=BackgroundSpec())
     with pytest.raises(ValueError, match="background=none"):
-        scene.build(spec, FACTS)
+        scene.build(spec, METADATA)
 
 
 @pytest.mark.slow
@@ -330,8 +330,8 @@ def test_gradient_of_a_whole_step(float64):
         ambient=AmbientSpec(depth=1, width=4, skips=(), closed_steps=1, anneal_steps=4),
     )
     model, state, frames = started(spec)
-    facts = model.spec[1]
-    made = scene.field(spec, facts)
+    metadata = model.spec[1]
+    made = scene.field(spec, metadata)
     as_float64 = functools.partial(
         jax.tree.map,
         lambda x: x.astype(float64) if x.dtype == jnp.float32 else x,
@@ -348,9 +348,9 @@ def test_gradient_of_a_whole_step(float64):
 
     def loss(params):
         terms = scene.loss_terms(
-            spec, facts, made, params, frames, batch, jnp.int32(4), jax.random.key(2)
+            made, params, frames, batch, jnp.int32(4), jax.random.key(2)
         )
-        return sum(term.weight * term.value for term in terms.values())
+        return weighted_sum(terms)
 
     assert gradients.directional_error(loss, params) < 1e-5
 
@@ -359,10 +359,12 @@ def test_gradient_of_a_whole_step(float64):
 def test_shared_and_single_levels(levels):
     plan = SamplingSpec(8, 8 if levels == 2 else 0, shared=levels == 2)
     spec = dataclasses.replace(STATIC, sampling=plan)
-    field = scene.field(spec, FACTS)
+    field = scene.field(spec, METADATA)
     params = field.init(jax.random.key(0))
     assert set(params["template"]) == {"fine"}
-    found = jax.jit(field.trace)(params, ray_of("float32"), moment_of("float32"))
+    found = jax.jit(field.render_ray)(
+        params, ray_of("float32"), condition_of("float32")
+    )
     assert len(found) == levels
 
 
@@ -391,7 +393,7 @@ def test_codes_of_one_table_must_agree():
     wide = dataclasses.replace(TINY_WARP, code_width=5)
     spec = dataclasses.replace(STATIC, warp=wide, time=TimeSpec(condition="code"))
     with pytest.raises(ValueError, match="code_width"):
-        scene.field(spec, FACTS)
+        scene.field(spec, METADATA)
 
 
 def test_blend_of_codes_is_what_look_up_uses():

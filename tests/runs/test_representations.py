@@ -50,7 +50,7 @@ def test_a_scene_of_gaussians_is_saved_as_a_model_and_for_viewers(moving, tmp_pa
     kind = representations.named("gaussians")
     spec = scenes.TINY_DEFORMABLE if moving else scenes.TINY_SPLATS
     capture = scenes.tiny_capture()
-    facts = kind.facts_of(capture, spec)
+    facts = kind.metadata_of(capture, spec)
     state = kind.build(spec, facts).init(capture, jax.random.key(0))
     saved = kind.save(tmp_path, spec, facts, state)
     assert saved.model_bytes == (tmp_path / MODEL).stat().st_size
@@ -58,15 +58,19 @@ def test_a_scene_of_gaussians_is_saved_as_a_model_and_for_viewers(moving, tmp_pa
     params, about = model_file.load(tmp_path / MODEL)
     assert about == {"spec": spec, "facts": facts, "step": 0}
     assert jax.tree.structure(params) == jax.tree.structure(state.params)
-    living = splats.alive(state.params.rows["splats"]).sum()
-    assert len(params.rows["splats"].mean) == living
-    assert len(files.load(tmp_path / "gaussians.ply").splats.mean) == living
+    active = splats.active_mask(state.params.rows["splats"]).sum()
+    assert len(params.rows["splats"].mean) == active
+    assert len(files.load(tmp_path / "gaussians.ply").splats.mean) == active
 
 
 @pytest.fixture
 def opened(monkeypatch):
     """What `saved_run` opens, without reading a capture."""
-    monkeypatch.setattr(run, "open_run", lambda *given: given)
+
+    def unread(config, kind, spec):
+        return runs.Run(config, None, kind, spec, None, None)
+
+    monkeypatch.setattr(run, "open_run", unread)
 
 
 def save(folder, preset):
@@ -82,8 +86,9 @@ def save(folder, preset):
 def test_a_run_folder_knows_its_representation(name, tmp_path):
     preset, *_ = representations.named(name).presets
     saved = save(tmp_path, preset)
-    config, kind, spec = runs.saved_run(tmp_path)
-    assert (config, spec) == saved
+    found = runs.saved_run(tmp_path)
+    assert (found.config, found.spec) == saved
+    kind = found.representation
     assert kind is representations.of_run(tmp_path) is representations.named(name)
 
 

@@ -1,4 +1,10 @@
-"""The folder of a run."""
+"""The folder of a run, and its one owner."""
+
+import os
+import pathlib
+import signal
+import subprocess
+import sys
 
 import pytest
 
@@ -19,3 +25,40 @@ def test_a_run_folder_that_cannot_be_written_is_an_early_error(tmp_path):
     for out in (tmp_path / "file", tmp_path / "file" / "below"):
         with pytest.raises(ValueError, match=r"run folder .*--out"):
             run_folder.new_run_folder(out, "x")
+
+
+OWN = """
+import pathlib, sys
+from nerfies_jax.runs import run_folder
+with run_folder.owned(pathlib.Path(sys.argv[1])):
+    print("mine", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.mark.parametrize("end", ["in peace", "killed"])
+def test_a_folder_has_one_owner_for_the_life_of_its_process(end, tmp_path):
+    root = pathlib.Path(run_folder.__file__).parents[2]
+    owner = subprocess.Popen(
+        [sys.executable, "-c", OWN, str(tmp_path)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": str(root)},
+    )
+    try:
+        assert owner.stdout.readline() == b"mine\n"
+        told = (
+            rf"process {owner.pid} on .* \(since 20.*\) is at work in this run folder"
+        )
+        with pytest.raises(ValueError, match=told):
+            run_folder.new_run_folder(tmp_path, "x")
+        with pytest.raises(ValueError, match=told), run_folder.owned(tmp_path):
+            pytest.fail("owned twice")
+    finally:
+        if end == "killed":
+            owner.send_signal(signal.SIGKILL)
+        owner.communicate()
+    # What it leaves is nobody's, and no run either.
+    assert run_folder.new_run_folder(tmp_path, "x") == tmp_path
+    with run_folder.owned(tmp_path):
+        pass

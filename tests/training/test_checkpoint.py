@@ -1,6 +1,9 @@
 """Checkpoints: whole or absent, refused when foreign, and resumed to the last bit."""
 
 import dataclasses
+import errno
+import io
+import itertools
 import json
 import os
 import pathlib
@@ -8,6 +11,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 
 import jax
@@ -139,14 +143,29 @@ def damage_lose_arrays(folder):
 
 
 def damage_lose_notes(folder):
-    for path in (folder / "about").rglob("*"):
-        path.unlink()
+    (folder / "about.json").unlink()
+
+
+def edit_notes(folder, **values):
+    path = folder / "about.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | values))
+
+
+def damage_notes(folder):
+    edit_notes(folder, step=7)
 
 
 # When one array cannot be read, orbax closes its event loop on the reads of the others.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize(
-    "damage", [damage_truncate, damage_flip, damage_lose_arrays, damage_lose_notes]
+    "damage",
+    [
+        damage_truncate,
+        damage_flip,
+        damage_lose_arrays,
+        damage_lose_notes,
+        damage_notes,
+    ],
 )
 def test_a_damaged_newest_checkpoint_falls_back_to_the_one_before(damage, tmp_path):
     older, newer = start(), MODEL.init(None, jax.random.key(6))
@@ -168,9 +187,17 @@ def test_a_damaged_newest_checkpoint_falls_back_to_the_one_before(damage, tmp_pa
 
 def test_an_unfinished_checkpoint_is_none(tmp_path):
     save(tmp_path, (start(), 4))
-    (tmp_path / "8.orbax-checkpoint-tmp-123" / "state").mkdir(parents=True)
+    (tmp_path / "8.unfinished" / "state").mkdir(parents=True)
+    (tmp_path / "²").mkdir()  # a digit to Python, and no step
     assert checkpoint.latest(tmp_path) == 4
     assert checkpoint.restore(tmp_path, start(), SPEC).step == 4
+
+
+def test_a_checkpoint_of_a_newer_format_is_refused_and_stays(tmp_path):
+    save(tmp_path, (start(), 4), (start(), 8))
+    edit_notes(tmp_path / "8", format=99)
+    with pytest.raises(ValueError, match="is of format 99 and this version reads up"):
+        checkpoint.restore(tmp_path, start(), SPEC)
 
 
 def test_arrays_that_do_not_fit_are_named(tmp_path):
@@ -180,11 +207,13 @@ def test_arrays_that_do_not_fit_are_named(tmp_path):
     other = state._replace(params=state.params._replace(nets=wide))
     with pytest.raises(ValueError, match=r"params\.nets\.weight as float32\[3, 8\]"):
         checkpoint.restore(tmp_path, other, SPEC)
-    half = state._replace(extra=state.extra | {"hits": jnp.zeros(6, jnp.float16)})
+    half = state._replace(
+        aux_state=state.aux_state | {"hits": jnp.zeros(6, jnp.float16)}
+    )
     with pytest.raises(ValueError, match=r"this run needs float16\[6\]"):
         checkpoint.restore(tmp_path, half, SPEC)
-    more = state._replace(extra=state.extra | {"new": jnp.zeros(6)})
-    with pytest.raises(ValueError, match=r"without \['extra.new'\]"):
+    more = state._replace(aux_state=state.aux_state | {"new": jnp.zeros(6)})
+    with pytest.raises(ValueError, match=r"without \['aux_state.new'\]"):
         checkpoint.restore(tmp_path, more, SPEC)
 
 
@@ -198,20 +227,90 @@ def test_an_unwritable_folder_is_an_error_before_training(tmp_path):
         checkpoint.Checkpoints(tmp_path / "run", SPEC, keep=0)
 
 
-def test_a_write_that_fails_later_names_the_folder(tmp_path):
-    folder = tmp_path / "run"
-    checkpoints = checkpoint.Checkpoints(folder, SPEC)
-    checkpoints.save(start(), 1)
-    checkpoints.wait()
+def lose_folder(folder, patch):
     shutil.rmtree(folder)
-    folder.write_text("in the way")
 
-    def write():
-        checkpoints.save(start(), 2)
-        checkpoints.wait()
 
-    with pytest.raises(ValueError, match=r"cannot write checkpoints to .*step None"):
-        write()
+def lose_settings(folder, patch):
+    (folder.parent / "config.json").unlink()
+
+
+def fill_disk(folder, patch):
+    full = shutil.disk_usage(folder)._replace(free=100)
+    patch.setattr(shutil, "disk_usage", lambda path: full)
+
+
+def make_read_only(folder, patch):
+    def refuse(**_):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    patch.setattr(tempfile, "TemporaryFile", refuse)
+
+
+@pytest.mark.parametrize(
+    ("harm", "words", "whole"),
+    [
+        (lose_folder, "No such file", "none is whole"),
+        (lose_settings, "config.json is gone", "step 10 is whole"),
+        (fill_disk, "no space: it may take 1.0 MB and 0.0 MB are", "step 10 is whole"),
+        (make_read_only, "Read-only file system", "step 10 is whole"),
+    ],
+)
+def test_training_goes_on_where_saving_fails_and_says_so(
+    harm, words, whole, tmp_path, straight, monkeypatch
+):
+    """Whether the trouble passes before the end or not; nothing hangs."""
+    settings = tmp_path / "config.json"
+    for passes in (True, False):
+        folder = tmp_path / f"passes {passes}"
+        settings.touch()
+        with (
+            monkeypatch.context() as patch,
+            checkpoint.Checkpoints(folder, SPEC, beside=settings) as checkpoints,
+        ):
+
+            def disturb(state, step, patch=patch, folder=folder, passes=passes):
+                if step == 11:
+                    checkpoints.wait()  # for the save of step 10
+                    harm(folder, patch)
+                if step == 19 and passes:
+                    patch.undo()
+                    folder.mkdir(exist_ok=True)
+                    settings.touch()
+
+            said = io.StringIO()
+            result = loop.fit(
+                MODEL,
+                start(),
+                toy.frames(),
+                steps=20,
+                console=rich.console.Console(file=said),
+                hooks=[loop.Hook("disturb", disturb, every_steps=1)],
+                checkpoints=checkpoints,
+                checkpoint_seconds=0.0,
+            )
+        assert toy.same(result.state, straight.state)
+        warned = f"warning: cannot write checkpoints to {folder}: "
+        assert f"{warned}" in said.getvalue()
+        assert f"{words}" in said.getvalue()
+        assert f"{whole}; training goes on" in said.getvalue()
+        if passes:
+            assert result.unsaved == ""
+            assert checkpoint.latest(folder) == 20
+            assert f"saved in {folder}" in result.message
+        else:
+            assert words in result.unsaved
+            assert whole in result.unsaved
+            assert "saved in" not in result.message
+            assert not list(tmp_path.rglob("*.unfinished"))
+
+
+def test_saving_does_not_read_the_wall_clock(tmp_path, monkeypatch):
+    """Set a day ahead at every look: orbax's own waiting would give up."""
+    days = itertools.count()
+    monkeypatch.setattr(time, "time", lambda: 1.8e9 + 86_400.0 * next(days))
+    save(tmp_path, (start(), 3))
+    assert checkpoint.restore(tmp_path, start(), SPEC).step == 3
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")

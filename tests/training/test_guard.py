@@ -22,7 +22,7 @@ NAMES = {
     "metric": "metric loss",
     "parameter": r"params\.rows\.mean \(1 of",
     "moment": r"optimiser\.0\.nu\.rows\.mean \(1 of",
-    "statistic": r"extra\.hits \(1 of",
+    "statistic": r"aux_state\.hits \(1 of",
 }
 
 MODEL = toy.model()
@@ -55,8 +55,8 @@ def spoil(state, where, value):
             rows={"mean": adam.nu.rows["mean"].at[1, 0].add(value)}
         )
         return state._replace(optimiser=(adam._replace(nu=second), *rest))
-    hits = state.extra["hits"].at[3].add(value)
-    return state._replace(extra={**state.extra, "hits": hits})
+    hits = state.aux_state["hits"].at[3].add(value)
+    return state._replace(aux_state={**state.aux_state, "hits": hits})
 
 
 def _poisoned(state, frames):

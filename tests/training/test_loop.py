@@ -55,7 +55,7 @@ def test_a_run_is_the_plain_loop_over_its_steps(frames, straight):
         if not jnp.issubdtype(plain.dtype, jax.dtypes.prng_key):
             # Another program: a few ulps, which Adam's normalisation may enlarge.
             np.testing.assert_allclose(ours, plain, rtol=2e-4, atol=2e-6)
-    assert straight.state.extra["hits"].shape == (9,)
+    assert straight.state.aux_state["hits"].shape == (9,)
     assert int(straight.state.step) == straight.steps == 20
     assert straight.stopped_by == "steps"
 
@@ -136,10 +136,10 @@ def test_events_happen_in_order_after_their_steps(frames):
 def test_an_event_may_put_one_array_in_two_places(frames):
     def share(state, _):
         zero = jnp.zeros(6)
-        return state._replace(extra=state.extra | {"hits": zero, "more": zero})
+        return state._replace(aux_state=state.aux_state | {"hits": zero, "more": zero})
 
     state = start()
-    state = state._replace(extra=state.extra | {"more": jnp.ones(6)})
+    state = state._replace(aux_state=state.aux_state | {"more": jnp.ones(6)})
     extra = (Event("share", (2,), share),)
     assert fit(frames, state, steps=5, events=extra).steps == 5
 
@@ -193,7 +193,7 @@ def test_chunks_of_slow_steps_stay_short_enough_to_interrupt(frames, monkeypatch
     assert len(lengths) < 25
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_the_run_after_its_chunk(number, frames, straight):
     def send(state, step):
         if step == 11:
@@ -215,9 +215,21 @@ def test_a_second_interrupt_does_not_wait(frames):
         os.kill(os.getpid(), signal.SIGINT)
         time.sleep(5)
 
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(KeyboardInterrupt, match="a second time"):
         fit(frames, steps=1000, hooks=[loop.Hook("send", send, every_steps=3)])
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_signal_that_is_to_be_ignored_still_is(frames):
+    def send(state, step):
+        os.kill(os.getpid(), signal.SIGHUP)
+
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
+    try:
+        result = fit(frames, steps=4, hooks=[loop.Hook("send", send, every_steps=2)])
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert result.stopped_by == "steps"
 
 
 def test_a_run_outside_the_main_thread_leaves_signals_alone(frames):
@@ -231,8 +243,8 @@ def test_a_run_outside_the_main_thread_leaves_signals_alone(frames):
 def test_what_a_step_gets_wrong_is_named(frames):
     def wider(state, frames):
         new, metrics = toy.step(state, frames)
-        extra = {**new.extra, "hits": jnp.zeros(7)}
-        return new._replace(extra=extra), metrics
+        extra = {**new.aux_state, "hits": jnp.zeros(7)}
+        return new._replace(aux_state=extra), metrics
 
     def standing(state, frames):
         new, metrics = toy.step(state, frames)
@@ -242,7 +254,7 @@ def test_what_a_step_gets_wrong_is_named(frames):
         return state._replace(step=state.step + 1)
 
     with pytest.raises(
-        ValueError, match=r"extra.hits from float32\[6\] to float32\[7\]"
+        ValueError, match=r"aux_state.hits from float32\[6\] to float32\[7\]"
     ):
         fit(frames, model=toy.model(change=wider), steps=2)
     with pytest.raises(ValueError, match=r"left state\.step at 0 after step 1"):

@@ -257,6 +257,20 @@ def test_geman_mcclure_saturates_at_infinity(dtype):
     assert slope < 1e-30
 
 
+@pytest.mark.hard_cases
+def test_charbonnier_of_a_square_that_overflowed_is_infinite(dtype):
+    """Not NaN, which s / (sqrt(s + width^2) + width) is there."""
+
+    def penalty(s):
+        return losses.charbonnier(s, 1e-3)
+
+    @jax.jit
+    def orders(s):
+        return penalty(s), jax.grad(penalty)(s), jax.grad(jax.grad(penalty))(s)
+
+    assert [float(x) for x in orders(np.asarray(np.inf, dtype))] == [np.inf, 0, 0]
+
+
 def test_official_geman_mcclure_is_width_times_the_papers():
     s = jnp.asarray([0.0, 1e-3, 0.5])
     official = losses.geman_mcclure(s, 0.03, "official")

@@ -32,7 +32,7 @@ def frames():
     camera = Camera(*(jnp.zeros(()) for _ in Camera._fields))
     count = jnp.arange(4)
     images = rng.integers(0, 255, (4, 2, 3, 3), dtype=np.uint8)
-    return Frames(images, camera, jnp.linspace(0.0, 1.0, 4), count, count, None)
+    return Frames(images, camera, jnp.linspace(0.0, 1.0, 4), count, None)
 
 
 def init(_capture, key, spec=ToySpec()):
@@ -59,11 +59,11 @@ def step(state, frames):
     value, slope = jax.value_and_grad(loss)(state.params, target, noise)
     with jax.numpy_dtype_promotion("standard"):  # optax raises floats to integers
         updates, optimiser = OPTIMISER.update(slope, state.optimiser)
-    hits = state.extra["hits"] + jnp.abs(slope.rows["mean"]).sum(-1)
+    hits = state.aux_state["hits"] + jnp.abs(slope.rows["mean"]).sum(-1)
     return TrainState(
         optax.apply_updates(state.params, updates),
         optimiser,
-        {**state.extra, "hits": hits},
+        {**state.aux_state, "hits": hits},
         state.step + 1,
         state.key,
     ), {"loss": value, "psnr": -10 * jnp.log10(value)}
@@ -71,18 +71,18 @@ def step(state, frames):
 
 def grow(state, _frames):
     """Half as many rows again, moments and statistics with them."""
-    capacity = state.extra["hits"].shape[0]
+    capacity = state.aux_state["hits"].shape[0]
     take = jnp.arange(capacity * 3 // 2) % capacity
 
     def gather(path, leaf):
-        in_rows = any("rows" in str(key) or "extra" in str(key) for key in path)
+        in_rows = any("rows" in str(key) or "aux_state" in str(key) for key in path)
         return leaf[take] if in_rows else leaf
 
     return jax.tree_util.tree_map_with_path(gather, state)
 
 
 def counts(state):
-    return {"rows": state.extra["hits"].shape[0]}
+    return {"rows": state.aux_state["hits"].shape[0]}
 
 
 def model(spec=ToySpec(), change=None):

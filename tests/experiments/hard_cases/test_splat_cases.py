@@ -22,7 +22,7 @@ SIZE = (64, 48)
 QUICK = dataclasses.replace(GSPLAT, tile=4, batch=1, chunk=1)
 # One for what is projected and two for what is drawn: each is a program.
 NEARBY = dataclasses.replace(GSPLAT, far=1e3)
-ONE_PIXEL = dataclasses.replace(QUICK, stop=1e-3)
+ONE_PIXEL = dataclasses.replace(QUICK, transmittance_threshold=1e-3)
 THROUGH = dataclasses.replace(INRIA, tile=4, batch=1, chunk=1)
 
 
@@ -70,7 +70,7 @@ def seen_and_slopes(gaussians, view):
     [
         ("near", NEARBY.near, [False, True, True]),
         ("far", NEARBY.far, [True, True, False]),
-        ("opacity", NEARBY.alpha_cut, [False, True, True]),
+        ("opacity", NEARBY.alpha_threshold, [False, True, True]),
     ],
 )
 def test_what_is_drawn_ends_within_one_step_of_its_edge(what, edge, drawn, dtype):
@@ -185,7 +185,7 @@ def test_a_pixel_is_done_on_the_side_of_the_stop_its_transmittance_is_on(dtype):
     values = np.asarray([0.0, 1.0], dtype)
     for share, drawn in ((1 + ulps, True), (1 - ulps, False)):
         # 0.98 * 0.98 stay clear of the clamp: (1 - 0.98) (1 - a) = stop * share.
-        alpha = 1 - ONE_PIXEL.stop * share / 0.02
+        alpha = 1 - ONE_PIXEL.transmittance_threshold * share / 0.02
         alphas = np.asarray([0.98, alpha], dtype)
         (colour, left), slopes = pixel_and_slopes(alphas, values, ONE_PIXEL)
         assert abs(colour - (0.02 * alpha if drawn else 0)) < ulps
@@ -196,23 +196,23 @@ def test_a_pixel_is_done_on_the_side_of_the_stop_its_transmittance_is_on(dtype):
 @pytest.mark.hard_cases
 def test_five_thousand_gaussians_on_a_pixel_have_the_slopes_of_float64(rng):
     """Their transmittance underflows after a few hundred; alphas up to 1 among them."""
-    spec = dataclasses.replace(QUICK, stop=0.0)
+    spec = dataclasses.replace(QUICK, transmittance_threshold=0.0)
     count = 5000
     alphas = np.float32(rng.uniform(0, 0.99, count) ** 4)
     alphas[[3, 700]] = 1.0
     values = np.float32(rng.uniform(-1, 1, count))
     found, slopes = pixel_and_slopes(alphas, values, spec)
 
-    seen = np.minimum(np.where(alphas < GSPLAT.alpha_cut, 0, alphas), 0.99).astype(
-        np.float64
-    )
+    seen = np.minimum(
+        np.where(alphas < GSPLAT.alpha_threshold, 0, alphas), 0.99
+    ).astype(np.float64)
     before = np.concatenate([[1], np.cumprod(1 - seen)[:-1]])
     weight = before * seen
     behind, by_alpha = 0.5, np.zeros(count)  # half of what is left counts, too
     for k in reversed(range(count)):
         by_alpha[k] = before[k] * (values[k] - behind)
         behind = seen[k] * values[k] + (1 - seen[k]) * behind
-    by_alpha[(alphas > 0.99) | (alphas < GSPLAT.alpha_cut)] = 0
+    by_alpha[(alphas > 0.99) | (alphas < GSPLAT.alpha_threshold)] = 0
     assert abs(found[0] - weight @ values) < 1e-6
     assert abs(found[1] - np.prod(1 - seen)) < 1e-6
     for slope, expected in zip(slopes, (by_alpha, weight), strict=True):

@@ -21,22 +21,22 @@ from nerfies_jax.geometry import quaternion
 PoseRows = Callable[[Params, Float[Array, ""]], Gaussians]
 
 
-class Where(NamedTuple):
+class RowIndex(NamedTuple):
     """For each row, whether it moves, and then where it is among those that do."""
 
     moves: Bool[Array, " gaussians"]
     place: Int[Array, " gaussians"]  # 0 where it does not move
 
 
-class Split(NamedTuple):
-    """A trained scene, its moving rows apart from those that stand still."""
+class StaticDynamicSplit(NamedTuple):
+    """A trained scene, its moving rows apart from the static ones."""
 
-    still: Gaussians  # all rows, as they are at the middle instant
-    where: Where
-    moving: Params  # the parameters of the rows that move, and all networks
+    static: Gaussians  # all rows, as they are at the middle instant
+    index: RowIndex
+    dynamic: Params  # the parameters of the rows that move, and all networks
 
 
-def reach(before: Gaussians, after: Gaussians) -> Float[Array, " gaussians"]:
+def max_displacement(before: Gaussians, after: Gaussians) -> Float[Array, " gaussians"]:
     """How far the surface of each Gaussian moves at most; scene units.
 
     A point of the one-sigma ellipsoid, mean + R S u with |u| = 1, moves by no more than
@@ -60,66 +60,71 @@ def reach(before: Gaussians, after: Gaussians) -> Float[Array, " gaussians"]:
     return shift + growth + chord * widest
 
 
-def where(moves: np.ndarray) -> Where:
+def row_index(moves: np.ndarray) -> RowIndex:
     """The table of the rows that move, `moves` [gaussians] bool; host side."""
     place = np.where(moves, np.cumsum(moves) - 1, 0)
-    return Where(jnp.asarray(moves), jnp.asarray(place, jnp.int32))
+    return RowIndex(jnp.asarray(moves), jnp.asarray(place, jnp.int32))
 
 
-def moving(still: Gaussians, now: Gaussians, still_below: float) -> np.ndarray:
-    """[gaussians] bool: the rows that reach farther than `still_below`; host side.
+def dynamic_mask(
+    static: Gaussians, now: Gaussians, static_threshold: float
+) -> np.ndarray:
+    """[gaussians] bool: the rows that move farther than `static_threshold`; host side.
 
     A row that is not drawn, of opacity zero, does not move.
     """
-    if not still_below >= 0:
+    if not static_threshold >= 0:
         raise ValueError(
-            f"still_below={still_below} is a distance in scene units; it cannot be "
-            "negative (0 keeps every row that moves at all)"
+            f"static_threshold={static_threshold} is a distance in scene units; it "
+            "cannot be negative (0 keeps every row that moves at all)"
         )
-    # "not <=": a row whose motion is not a number is not taken for still.
-    far = ~(np.asarray(_reach(still, now)) <= still_below)
-    return far & (np.asarray(still.opacity) > 0)
+    # "not <=": a row whose motion is not a number is not taken for static.
+    far = ~(np.asarray(_max_displacement(static, now)) <= static_threshold)
+    return far & (np.asarray(static.opacity) > 0)
 
 
 def split(
-    params: Params, pose: PoseRows, times: np.ndarray, still_below: float
-) -> Split:
-    """The rows that move farther than `still_below` (scene units); host side.
+    params: Params, pose: PoseRows, times: np.ndarray, static_threshold: float
+) -> StaticDynamicSplit:
+    """The rows that move farther than `static_threshold` (scene units); host side.
 
     `times` [instants] lie in [0, 1]. Rows are compared with where they are at the
     middle one, and drawn there from then on: at `times` no point of a Gaussian is
-    farther than `still_below` from where the whole deformation puts it. Between them
-    nothing is promised: a row that moves only between two instants has not been met.
+    farther than `static_threshold` from where the whole deformation puts it. Between
+    them nothing is promised: a row that moves only between two instants has not been
+    met.
     """
     if not len(times):
         raise ValueError("no times to look for motion at; 16 over [0, 1] will do")
     dtype = params.rows["splats"].mean.dtype
     posed = jax.jit(pose)
-    still = posed(params, jnp.asarray(times[len(times) // 2], dtype))
-    moves = np.zeros(len(still.mean), bool)
+    static = posed(params, jnp.asarray(times[len(times) // 2], dtype))
+    moves = np.zeros(len(static.mean), bool)
     for time in times:
         now = posed(params, jnp.asarray(time, dtype))
-        moves |= moving(still, now, still_below)
+        moves |= dynamic_mask(static, now, static_threshold)
     rows = jnp.asarray(np.flatnonzero(moves), jnp.int32)
-    return Split(still, where(moves), splats.take_rows(params, rows))
+    return StaticDynamicSplit(static, row_index(moves), splats.take_rows(params, rows))
 
 
-def pose(parts: Split, pose_rows: PoseRows, time: Float[Array, ""]) -> Gaussians:
+def pose(
+    parts: StaticDynamicSplit, pose_rows: PoseRows, time: Float[Array, ""]
+) -> Gaussians:
     """All Gaussians at one time, the deformation evaluated for those that move."""
-    if not len(parts.moving.rows["splats"].mean):
-        return parts.still
-    return merge(parts.still, pose_rows(parts.moving, time), parts.where)
+    if not len(parts.dynamic.rows["splats"].mean):
+        return parts.static
+    return merge(parts.static, pose_rows(parts.dynamic, time), parts.index)
 
 
-def merge(still: Gaussians, moved: Gaussians, table: Where) -> Gaussians:
-    """The rows that move as in `moved`, which holds nothing else, the others still."""
+def merge(static: Gaussians, moved: Gaussians, table: RowIndex) -> Gaussians:
+    """The rows that move as in `moved`, which holds nothing else, the others static."""
 
-    def leaf(still, moved):
+    def leaf(static, moved):
         # A gather, not a scatter: XLA:CPU runs a scatter row by row.
-        moves = table.moves.reshape(-1, *[1] * (still.ndim - 1))
-        return jnp.where(moves, moved[table.place], still)
+        moves = table.moves.reshape(-1, *[1] * (static.ndim - 1))
+        return jnp.where(moves, moved[table.place], static)
 
-    return jax.tree.map(leaf, still, moved)
+    return jax.tree.map(leaf, static, moved)
 
 
-_reach = jax.jit(reach)
+_max_displacement = jax.jit(max_displacement)

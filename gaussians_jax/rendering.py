@@ -40,7 +40,7 @@ def render(
 
     `background` is one colour or an image, black where absent. `mean2d_offset` (px)
     moves the footprints on the image: pass zeros, and its gradient is the gradient of
-    each projected mean in pixels, which density control thresholds. Without `depth`
+    each projected mean in pixels, which densification thresholds. Without `depth`
     that of the rendering is None, and a training step 4 % faster. The camera must be
     free of distortion (`refuse_distortion` on the host).
     """

@@ -5,11 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gaussians_jax import start
-from gaussians_jax.start import StartSpec
+from gaussians_jax import initialisation
+from gaussians_jax.initialisation import InitSpec
 from tests import scenes
 
-SPEC = StartSpec(points=10**4, random=70, beside=30)
+SPEC = InitSpec(points=10**4, random=70, extra_random=30)
 
 
 def capture_with(points):
@@ -22,8 +22,12 @@ def capture_with(points):
 
 def own_points(spec, capture):
     """How many of the capture's own points the start has; checks the count foretold."""
-    position, colour = start.first_points(spec, capture, 0)
-    assert position.shape == colour.shape == (start.first_count(spec, capture), 3)
+    position, colour = initialisation.initial_points(spec, capture, 0)
+    assert (
+        position.shape
+        == colour.shape
+        == (initialisation.initial_count(spec, capture), 3)
+    )
     assert ((colour >= 0) & (colour <= 1)).all()
     if capture.points is None:
         return 0
@@ -46,12 +50,12 @@ def own_points(spec, capture):
 def test_the_source_decides_whose_points_they_are(source, points, own, drawn):
     spec, capture = dataclasses.replace(SPEC, source=source), capture_with(points)
     assert own_points(spec, capture) == own
-    assert start.first_count(spec, capture) == own + drawn
+    assert initialisation.initial_count(spec, capture) == own + drawn
 
 
 def test_a_start_is_never_empty():
-    spec = dataclasses.replace(SPEC, fewest=0)
-    assert start.first_count(spec, capture_with(0)) == 70
+    spec = dataclasses.replace(SPEC, min_points=0)
+    assert initialisation.initial_count(spec, capture_with(0)) == 70
     assert own_points(spec, capture_with(0)) == 0
     assert own_points(spec, capture_with(1)) == 1
 
@@ -60,7 +64,7 @@ def test_random_points_do_not_depend_on_the_points_of_the_capture():
     """Or a start "without structure from motion" would have some after all."""
     spec = dataclasses.replace(SPEC, source="random")
     first, second, third = (
-        start.first_points(spec, capture_with(points), seed)
+        initialisation.initial_points(spec, capture_with(points), seed)
         for points, seed in ((150, 0), (None, 0), (None, 1))
     )
     for a, b in zip(first, second, strict=True):
@@ -72,13 +76,13 @@ def test_random_points_do_not_depend_on_the_points_of_the_capture():
 def test_a_capture_without_points_is_refused_by_name(points):
     spec = dataclasses.replace(SPEC, source="points")
     capture = capture_with(points)
-    for function in (start.starts_from_points, start.first_count):
+    for function in (initialisation.uses_capture_points, initialisation.initial_count):
         with pytest.raises(ValueError, match=r'it has none; choose source="random"'):
             function(spec, capture)
     with pytest.raises(ValueError, match=str(capture.path or capture.name)):
-        start.first_points(spec, capture, 0)
+        initialisation.initial_points(spec, capture, 0)
 
 
 def test_an_unknown_source_is_refused():
     with pytest.raises(ValueError, match="unknown source 'sfm'; choose from"):
-        StartSpec(source="sfm")
+        InitSpec(source="sfm")

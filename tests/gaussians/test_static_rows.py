@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.spatial.transform
 
-from gaussians_jax import splats, still_rows
+from gaussians_jax import splats, static_rows
 from gaussians_jax.splats import Gaussians, Params
 from tests import gradients
 
@@ -44,7 +44,7 @@ def test_no_point_of_a_gaussian_moves_farther_than_its_reach(dtype, rng):
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     moved = surface_points(after, directions) - surface_points(before, directions)
     farthest = np.linalg.norm(moved, axis=-1).max(axis=1)
-    found = np.asarray(still_rows.reach(before, after))
+    found = np.asarray(static_rows.max_displacement(before, after))
     assert (found >= farthest * (1 - 1e-5)).all()
     assert np.median(found / farthest) < 2  # a bound that says something
 
@@ -73,12 +73,12 @@ def test_the_reach_of_a_single_change_is_that_change(change, exact, dtype):
     after = before._replace(**{name: getattr(before, name) + by[name] for name in by})
     rounding = {"float32": 1e-6, "float64": 1e-15}[dtype]
     np.testing.assert_allclose(
-        still_rows.reach(before, after), [exact], rtol=rounding, atol=1e-12
+        static_rows.max_displacement(before, after), [exact], rtol=rounding, atol=1e-12
     )
 
 
 def scene(rng, dtype="float32", count=40):
-    """Parameters of rows whose speed is theirs, a third of them zero, some dead."""
+    """Parameters of rows whose speed is theirs, a third of them zero, some inactive."""
     rows = splats.from_points(
         rng.normal(size=(count, 3)), rng.uniform(size=(count, 3)), dtype=dtype
     )
@@ -99,33 +99,35 @@ def pose(params, time):
     )
 
 
-@pytest.mark.parametrize("still_below", [0.0, 0.02, 0.3])
-def test_what_is_left_out_is_off_by_no_more_than_the_tolerance(still_below, rng):
+@pytest.mark.parametrize("static_threshold", [0.0, 0.02, 0.3])
+def test_what_is_left_out_is_off_by_no_more_than_the_tolerance(static_threshold, rng):
     params = scene(rng)
-    parts = still_rows.split(params, pose, TIMES, still_below)
-    count = len(parts.moving.rows["speed"])
-    dead = ~np.asarray(splats.alive(params.rows["splats"]))
-    moves = np.asarray(parts.where.moves)
+    parts = static_rows.split(params, pose, TIMES, static_threshold)
+    count = len(parts.dynamic.rows["speed"])
+    inactive = ~np.asarray(splats.active_mask(params.rows["splats"]))
+    moves = np.asarray(parts.index.moves)
     assert 0 < count == moves.sum() < len(moves)
-    assert not moves[dead].any()
-    assert moves[1]  # its motion is not a number: not taken for still
+    assert not moves[inactive].any()
+    assert moves[1]  # its motion is not a number: not taken for static
     for time in TIMES:
         time = jnp.asarray(time, jnp.float32)
-        found, exact = still_rows.pose(parts, pose, time), pose(params, time)
+        found, exact = static_rows.pose(parts, pose, time), pose(params, time)
         for name in Gaussians._fields:
             np.testing.assert_array_equal(
                 np.asarray(getattr(found, name))[moves],
                 np.asarray(getattr(exact, name))[moves],
                 err_msg=name,
             )
-        reach = np.asarray(still_rows.reach(found, exact))[~moves & ~dead]
-        assert (reach <= still_below).all()
+        found = np.asarray(static_rows.max_displacement(found, exact))[
+            ~moves & ~inactive
+        ]
+        assert (found <= static_threshold).all()
 
 
 def test_a_larger_tolerance_leaves_fewer_rows(rng):
     params = scene(rng)
     counts = [
-        len(still_rows.split(params, pose, TIMES, below).moving.rows["speed"])
+        len(static_rows.split(params, pose, TIMES, below).dynamic.rows["speed"])
         for below in (0.0, 0.3, 0.6, 1e9)
     ]
     assert counts == sorted(counts, reverse=True)
@@ -135,12 +137,12 @@ def test_a_larger_tolerance_leaves_fewer_rows(rng):
 def test_where_nothing_moves_nothing_is_evaluated(rng):
     params = scene(rng)
     params.rows["speed"] = jnp.zeros_like(params.rows["speed"])
-    parts = still_rows.split(params, pose, TIMES, 0.0)
+    parts = static_rows.split(params, pose, TIMES, 0.0)
 
     def refuse(params, time):
         raise AssertionError("evaluated")
 
-    found = still_rows.pose(parts, refuse, jnp.asarray(0.3))
+    found = static_rows.pose(parts, refuse, jnp.asarray(0.3))
     exact = splats.activate(params.rows["splats"])
     jax.tree.map(np.testing.assert_array_equal, found, exact)
 
@@ -148,24 +150,24 @@ def test_where_nothing_moves_nothing_is_evaluated(rng):
 def test_moving_rows_keep_their_gradients(rng, float64):
     params = scene(rng, float64)
     params.rows["speed"] = jnp.nan_to_num(params.rows["speed"])
-    parts = still_rows.split(params, pose, TIMES, 0.02)
+    parts = static_rows.split(params, pose, TIMES, 0.02)
 
     def loss(speed, time):
-        rows = parts.moving.rows | {"speed": speed}
-        now = parts._replace(moving=parts.moving._replace(rows=rows))
-        posed = still_rows.pose(now, pose, time)
+        rows = parts.dynamic.rows | {"speed": speed}
+        now = parts._replace(dynamic=parts.dynamic._replace(rows=rows))
+        posed = static_rows.pose(now, pose, time)
         return sum(jnp.sum(jnp.sin(3 * leaf)) for leaf in posed)
 
-    speed = parts.moving.rows["speed"]
+    speed = parts.dynamic.rows["speed"]
     assert gradients.directional_error(loss, speed, jnp.asarray(0.4)) < 1e-7
 
 
 @pytest.mark.parametrize("below", [-1e-3, float("nan")])
 def test_a_tolerance_below_zero_is_refused(below, rng):
-    with pytest.raises(ValueError, match=r"still_below=.* scene units"):
-        still_rows.split(scene(rng), pose, TIMES, below)
+    with pytest.raises(ValueError, match=r"static_threshold=.* scene units"):
+        static_rows.split(scene(rng), pose, TIMES, below)
 
 
 def test_no_times_are_refused(rng):
     with pytest.raises(ValueError, match="no times to look for motion at"):
-        still_rows.split(scene(rng), pose, TIMES[:0], 0.1)
+        static_rows.split(scene(rng), pose, TIMES[:0], 0.1)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import render
+from gaussians_jax import rendering
 from gaussians_jax.raster_spec import GSPLAT, INRIA
 from gaussians_jax.splats import Gaussians
 from nerfies_jax.geometry.camera import Camera
@@ -58,7 +58,7 @@ CASES = {
     "inria": INRIA,
     "large tile": dataclasses.replace(GSPLAT, tile=16, batch=3, chunk=2),
     "tiny capacity": dataclasses.replace(
-        GSPLAT, capacity=64, kept_slabs=2, antialiased=True
+        GSPLAT, capacity=64, kept_chunks=2, antialiased=True
     ),
 }
 
@@ -77,7 +77,7 @@ def test_render_and_all_gradients_equal_the_dense_renderer(spec, float64, rng):
     toward = weights_for(rng, size, 7)
 
     def ours(gaussians, values, background, offset, pose):
-        frame = render.render(
+        frame = rendering.render(
             gaussians,
             values[:, :3],
             pose,
@@ -142,7 +142,7 @@ def test_render_gradient_equals_central_differences(float64, rng):
     toward = weights_for(rng, size, 3)
 
     def loss(gaussians, colours):
-        frame = render.render(gaussians, colours, camera, size)
+        frame = rendering.render(gaussians, colours, camera, size)
         picture = frame.rendering
         return jnp.sum(picture.colour * toward) + jnp.sum(picture.depth)
 
@@ -159,7 +159,7 @@ def test_a_depth_that_is_not_asked_for_changes_nothing_else(rng):
 
     def draw(depth):
         return jax.jit(
-            lambda *scene: render.render(
+            lambda *scene: rendering.render(
                 *scene, camera, size, features=features, depth=depth
             )
         )(gaussians, colours)

@@ -1,4 +1,4 @@
-"""Adaptive density: clone the small, split the large, prune the faint.
+"""Densification: clone the small, split the large, prune the faint.
 
 Kerbl et al. 2023, arXiv:2308.04079, section 5.2, with the constants of its reference
 implementation. Statistics are gathered inside the step (`observe`, pure); the events
@@ -21,6 +21,7 @@ from gaussians_jax import optimiser as row_optimiser
 from gaussians_jax import splats
 from gaussians_jax.splats import Params, Splats
 from nerfies_jax.geometry import quaternion
+from nerfies_jax.training.step_counts import steps
 
 PyTree = Any
 FAINT_LOGIT = -20.0  # below it an opacity is halved by its series
@@ -28,31 +29,32 @@ KEPT, CLONED, CLONE, CHILD = 0, 1, 2, 3  # what a row is after the event
 
 
 @dataclasses.dataclass(frozen=True)
-class DensitySpec:
+class DefaultStrategySpec:
     """When and where Gaussians are added and removed."""
 
-    interval: int = 100  # steps
-    start: int = 500  # steps
-    stop: int = 15_000  # steps
-    gradient: float = 2e-4  # of the mean on the screen, in NDC units per view
-    clone_below: float = 0.01  # largest scale, of the scene extent
+    refine_every: int = 100  # steps
+    refine_start_iter: int = steps(500)
+    refine_stop_iter: int = steps(15_000)
+    grow_grad2d: float = 2e-4  # of the mean on the screen, in NDC units per view
+    grow_scale3d: float = 0.01  # largest scale, of the scene extent
     shrink: float = 1.6  # scale of a parent over that of its children
-    prune_opacity: float = 0.005
-    prune_scale: float = 0.1  # largest scale, of the scene extent
+    prune_opa: float = 0.005
+    prune_scale3d: float = 0.1  # largest scale, of the scene extent
     prune_radius_px: float | None = None  # 20 in the paper, where it had no effect
-    reset_interval: int = 3000  # steps; pruning by size starts after the first reset
+    # Pruning by size starts after the first reset.
+    reset_every: int = steps(3000)
     reset_opacity: float = 0.01
-    most: int = 1_000_000  # Gaussians
+    cap_max: int = 1_000_000  # Gaussians
     revised_opacity: bool = False  # two halves together as opaque as the parent
 
     def __post_init__(self):
-        if not 0 < self.prune_opacity < self.reset_opacity < 1:
+        if not 0 < self.prune_opa < self.reset_opacity < 1:
             raise ValueError(
                 "opacities must satisfy 0 < prune < reset < 1, or a reset prunes "
-                f"everything; got prune_opacity={self.prune_opacity} and "
+                f"everything; got prune_opa={self.prune_opa} and "
                 f"reset_opacity={self.reset_opacity}"
             )
-        for name in ("interval", "reset_interval", "most"):
+        for name in ("refine_every", "reset_every", "cap_max"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is at least 1, got {getattr(self, name)}")
         if not self.shrink > 1:
@@ -62,8 +64,8 @@ class DensitySpec:
 class RowStats(NamedTuple):
     """What the rows did since the last event."""
 
-    alive: Bool[Array, " gaussians"]
-    gradient: Float[Array, " gaussians"]  # summed norms, NDC units
+    active: Bool[Array, " gaussians"]
+    grad2d: Float[Array, " gaussians"]  # summed norms, NDC units
     views: Int[Array, " gaussians"]  # in which the row was visible
     radius_px: Float[Array, " gaussians"]  # the largest seen
 
@@ -77,7 +79,7 @@ class Report(NamedTuple):
     broken: int = 0  # pruned because a value was not finite
     refused: int = 0  # should have grown, but the cap is reached
     relocated: int = 0
-    alive: int = 0
+    active: int = 0
     capacity: int = 0
 
 
@@ -94,8 +96,8 @@ def empty_stats(rows: Splats) -> RowStats:
     """Nothing observed yet."""
     like = rows.opacity_logit
     return RowStats(
-        alive=splats.alive(rows),
-        gradient=jnp.zeros_like(like),
+        active=splats.active_mask(rows),
+        grad2d=jnp.zeros_like(like),
         views=jnp.zeros(like.shape, jnp.int32),
         radius_px=jnp.zeros_like(like),  # its own buffer: the loop donates them all
     )
@@ -121,8 +123,8 @@ def observe(
     # Summed squares underflow in float32 below 1e-19; hypot does not.
     norm = jnp.hypot(slope[:, 0], slope[:, 1])
     return RowStats(
-        alive=stats.alive,
-        gradient=stats.gradient + jnp.where(visible, norm, 0),
+        active=stats.active,
+        grad2d=stats.grad2d + jnp.where(visible, norm, 0),
         views=stats.views + visible.astype(jnp.int32),
         radius_px=jnp.maximum(stats.radius_px, jnp.where(visible, radius_px, 0)),
     )
@@ -134,7 +136,7 @@ def densify(
     moments: PyTree,
     stats: RowStats,
     key: Key[Array, ""],
-    spec: DensitySpec,
+    spec: DefaultStrategySpec,
     *,
     step: int,
     extent: float,
@@ -144,12 +146,12 @@ def densify(
     A row grows where its mean gradient per view reaches the threshold: a small one is
     copied, a large one is replaced by two drawn from it. Where the cap leaves room for
     some, those with the largest gradient grow. An effect that scores rows its own way
-    scales `stats.gradient` first. The clones and the children come back with zero
+    scales `stats.grad2d` first. The clones and the children come back with zero
     moments. `extent` is `splats.scene_extent`.
     """
     rows, kind, report = _plan(params.rows["splats"], stats, spec, step, extent)
-    count, capacity = len(rows), stats.alive.shape[0]
-    needed = splats.capacity_for(count, spec.most)
+    count, capacity = len(rows), stats.active.shape[0]
+    needed = splats.capacity_for(count, spec.cap_max)
     # Two buckets of slack before shrinking: a wavering count must not recompile.
     if needed > capacity or count * 9 < capacity * 4:
         capacity = needed
@@ -165,7 +167,7 @@ def densify(
         spec.shrink,
         spec.revised_opacity,
     )
-    report = report._replace(alive=count, capacity=capacity)
+    report = report._replace(active=count, capacity=capacity)
     return Changed(params, moments, fresh, report)
 
 
@@ -173,18 +175,18 @@ def _plan(rows, stats, spec, step, extent):
     """Which old row each new row comes from, and what becomes of it."""
     stats = jax.tree.map(np.asarray, stats)
     whole, opacity, scale = map(np.asarray, _facts(rows))
-    score = stats.gradient / np.maximum(stats.views, 1)
+    score = stats.grad2d / np.maximum(stats.views, 1)
 
-    kept = stats.alive & whole & (opacity >= spec.prune_opacity)
-    grows = kept & (score >= spec.gradient)
-    splits = grows & (scale > spec.clone_below * extent)
-    if step > spec.reset_interval:
+    kept = stats.active & whole & (opacity >= spec.prune_opa)
+    grows = kept & (score >= spec.grow_grad2d)
+    splits = grows & (scale > spec.grow_scale3d * extent)
+    if step > spec.reset_every:
         after = np.where(splits, scale / spec.shrink, scale)
-        kept &= after <= spec.prune_scale * extent
+        kept &= after <= spec.prune_scale3d * extent
         if spec.prune_radius_px is not None:
             kept &= splits | (stats.radius_px <= spec.prune_radius_px)
     grows &= kept
-    room = max(spec.most - int(kept.sum()), 0)
+    room = max(spec.cap_max - int(kept.sum()), 0)
     wanting = np.flatnonzero(grows)
     best = wanting[np.argsort(-score[wanting], kind="stable")][:room]
     chosen = np.zeros_like(grows)
@@ -202,11 +204,11 @@ def _plan(rows, stats, spec, step, extent):
             np.full(2 * len(parents), CHILD),
         ]
     )
-    broken = int((stats.alive & ~whole).sum())
+    broken = int((stats.active & ~whole).sum())
     report = Report(
         cloned=len(clones),
         split=len(parents),
-        pruned=int((stats.alive & ~kept).sum()) - broken,
+        pruned=int((stats.active & ~kept).sum()) - broken,
         broken=broken,
         refused=len(wanting) - len(best),
     )
@@ -226,15 +228,15 @@ def _facts(rows):
 
 
 @functools.partial(jax.jit, static_argnames=("optimiser", "shrink", "revised"))
-def _rebuild(optimiser, params, moments, rows, kind, dead, key, shrink, revised):
+def _rebuild(optimiser, params, moments, rows, kind, inactive, key, shrink, revised):
     fresh = (kind == CLONE) | (kind == CHILD)
     params, moments = row_optimiser.gather_rows(
-        optimiser, params, moments, rows, fresh, dead
+        optimiser, params, moments, rows, fresh, inactive
     )
     moved = split_rows(params.rows["splats"], kind == CHILD, key, shrink)
     if revised:
         halved = halve_opacity(moved.opacity_logit)
-        logit = jnp.where((kind == KEPT) | dead, moved.opacity_logit, halved)
+        logit = jnp.where((kind == KEPT) | inactive, moved.opacity_logit, halved)
         moved = moved._replace(opacity_logit=logit)
     params = params._replace(rows=params.rows | {"splats": moved})
     return params, moments, empty_stats(moved)
@@ -275,12 +277,12 @@ def reset_opacity(
     optimiser: optax.GradientTransformation,
     params: Params,
     moments: PyTree,
-    spec: DensitySpec,
+    spec: DefaultStrategySpec,
 ) -> tuple[Params, PyTree]:
     """No opacity above `spec.reset_opacity`; the moments of the opacities start anew.
 
-    Dead rows stay dead. With the renderer's cut-off at 1/255 a Gaussian reset to 0.01
-    gets gradients only out to 1.37 standard deviations.
+    Inactive rows stay inactive. With the renderer's cut-off at 1/255 a Gaussian reset
+    to 0.01 gets gradients only out to 1.37 standard deviations.
     """
     rows = params.rows["splats"]
     bound = math.log(spec.reset_opacity / (1 - spec.reset_opacity))

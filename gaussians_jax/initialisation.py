@@ -15,33 +15,34 @@ SOURCES = ("auto", "points", "random")
 
 
 @dataclasses.dataclass(frozen=True)
-class StartSpec:
+class InitSpec:
     """Where the first Gaussians come from.
 
-    `source` "auto" takes the capture's own points where there are at least `fewest` and
-    random ones otherwise; "points" and "random" insist on one, as MoBa-GS does on
+    `source` "auto" takes the capture's own points where there are at least `min_points`
+    and random ones otherwise; "points" and "random" insist on one, as MoBa-GS does on
     either (it claims to need no points from structure from motion).
     """
 
     points: int = 100_000  # at most so many of the capture's own points
     random: int = 10_000  # drawn in the views instead of them
-    fewest: int = 100
-    beside: int = 0  # drawn in the views beside the capture's own points
+    min_points: int = 100
+    extra_random: int = 0  # drawn in the views beside the capture's own points
     opacity: float = 0.1
-    widest: float = 0.03  # first scale, over the distance to the nearest camera
+    scale: float = 1.0  # over the distance to the nearest neighbours
+    max_scale: float = 0.03  # first scale, over the distance to the nearest camera
     source: str = "auto"
 
     def __post_init__(self):
         if self.source not in SOURCES:
             raise ValueError(f"unknown source {self.source!r}; choose from {SOURCES}")
-        if self.points < 1 or self.random < 1 or self.beside < 0:
+        if self.points < 1 or self.random < 1 or self.extra_random < 0:
             raise ValueError(
                 f"a scene starts from at least one Gaussian, got points={self.points}, "
-                f"random={self.random} and beside={self.beside}"
+                f"random={self.random} and extra_random={self.extra_random}"
             )
 
 
-def starts_from_points(spec: StartSpec, capture: Capture) -> bool:
+def uses_capture_points(spec: InitSpec, capture: Capture) -> bool:
     """Whether the first Gaussians are the capture's own points; host side."""
     found = 0 if capture.points is None else len(capture.points.position)
     if spec.source == "points" and not found:
@@ -50,26 +51,26 @@ def starts_from_points(spec: StartSpec, capture: Capture) -> bool:
             'own points, and it has none; choose source="random", or "auto" for random '
             "ones only where there are no others"
         )
-    enough = 1 if spec.source == "points" else max(spec.fewest, 1)
+    enough = 1 if spec.source == "points" else max(spec.min_points, 1)
     return spec.source != "random" and found >= enough
 
 
-def first_count(spec: StartSpec, capture: Capture) -> int:
+def initial_count(spec: InitSpec, capture: Capture) -> int:
     """How many Gaussians there are at first; host side, nothing is drawn."""
-    if not starts_from_points(spec, capture):
+    if not uses_capture_points(spec, capture):
         return spec.random
-    return min(len(capture.points.position), spec.points) + spec.beside
+    return min(len(capture.points.position), spec.points) + spec.extra_random
 
 
-def first_points(spec: StartSpec, capture: Capture, seed: int):
+def initial_points(spec: InitSpec, capture: Capture, seed: int):
     """Positions and colours in [0, 1] of the first Gaussians; host side.
 
     Structure from motion finds what stands still, so what moves has no points of its
-    own; `spec.beside` random ones in the volume give it something to grow from. Random
-    points alone lie between the capture's near and far, whatever points it has.
+    own; `spec.extra_random` random ones in the volume give it something to grow from.
+    Random points alone lie between the capture's near and far, whatever points it has.
     """
     rng = np.random.default_rng(seed)
-    if not starts_from_points(spec, capture):
+    if not uses_capture_points(spec, capture):
         return _random_points(rng, capture, spec.random, (capture.near, capture.far))
     cloud = capture.points
     position, colour = cloud.position, cloud.colour / 255
@@ -77,7 +78,7 @@ def first_points(spec: StartSpec, capture: Capture, seed: int):
         kept = np.sort(rng.choice(len(position), spec.points, replace=False))
         position, colour = position[kept], colour[kept]
     span = _filmed_depths(capture)
-    more, more_colour = _random_points(rng, capture, spec.beside, span)
+    more, more_colour = _random_points(rng, capture, spec.extra_random, span)
     return np.concatenate([position, more]), np.concatenate([colour, more_colour])
 
 
@@ -87,7 +88,7 @@ def _random_points(rng, capture, count, span):
     return position, rng.uniform(size=position.shape)
 
 
-def narrowed(rows: Splats, capture: Capture, widest: float) -> Splats:
+def clamp_scales(rows: Splats, capture: Capture, max_scale: float) -> Splats:
     """The rows, none wider than a share of its distance to the nearest camera.
 
     A lone point gets the distance to its neighbours for a scale, and close to a camera
@@ -95,7 +96,7 @@ def narrowed(rows: Splats, capture: Capture, widest: float) -> Splats:
     """
     cameras = scipy.spatial.cKDTree(capture.cameras.position[capture.train])
     distance, _ = cameras.query(np.asarray(rows.mean))
-    bound = np.log(np.maximum(widest * distance, 1e-8)).astype(np.float32)
+    bound = np.log(np.maximum(max_scale * distance, 1e-8)).astype(np.float32)
     return rows._replace(log_scale=jnp.minimum(rows.log_scale, bound[:, None]))
 
 

@@ -3,18 +3,17 @@
 import dataclasses
 import math
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from gaussians_jax import phases
 from gaussians_jax.phases import AnnealingSpec
-from gaussians_jax.splats import Params, Splats
+from gaussians_jax.splats import Splats
 from nerfies_jax.training import schedules
 
 
 @dataclasses.dataclass(frozen=True)
-class RateSpec:
+class LearningRateSpec:
     """Adam's learning rates: the defaults of Kerbl et al. 2023, reference code.
 
     Means learn in units of the scene's extent, decaying log-linearly over the run.
@@ -43,8 +42,8 @@ class RateSpec:
             )
 
 
-def learning_rates(
-    spec: RateSpec,
+def at_step(
+    spec: LearningRateSpec,
     extent: float,
     steps: int,
     step: Int[Array, ""],
@@ -66,16 +65,3 @@ def learning_rates(
         sh_dc=spec.sh_dc,
         sh_rest=spec.sh_rest,
     )
-
-
-def descend(params: Params, directions: Params, rates: Params) -> Params:
-    """`params - rate * direction`; `rates` is a prefix, a rate serves all below it."""
-
-    def below(rate, parameters, along):
-        def move(parameter, direction):
-            rate_here = jnp.asarray(rate, parameter.dtype)
-            return parameter - rate_here * direction.astype(parameter.dtype)
-
-        return jax.tree.map(move, parameters, along)
-
-    return jax.tree.map(below, rates, params, directions)

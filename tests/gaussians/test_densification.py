@@ -8,9 +8,9 @@ import numpy as np
 import optax
 import pytest
 
-from gaussians_jax import density, optimiser
+from gaussians_jax import densification, optimiser
 from gaussians_jax import splats as rows
-from gaussians_jax.density import DensitySpec
+from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.splats import Params, Splats
 
 EXTENT = 2.0  # so that 0.02 separates small from large
@@ -21,11 +21,11 @@ TX = optax.chain(optimiser.scale_by_row_adam(), optax.scale(-1e-2))
 @jax.jit
 def first_state(params):
     _, moments = TX.update(jax.tree.map(jnp.ones_like, params), TX.init(params))
-    return params, moments, density.empty_stats(params.rows["splats"])
+    return params, moments, densification.empty_stats(params.rows["splats"])
 
 
 def make(count, dtype="float32", scale=0.01, opacity=0.5):
-    """`count` living rows, one tell-tale parameter each, with moments."""
+    """`count` active rows, one tell-tale parameter each, with moments."""
     rng = np.random.default_rng(count)
     splats = Splats(
         mean=rng.normal(size=(count, 3)),
@@ -42,28 +42,28 @@ def make(count, dtype="float32", scale=0.01, opacity=0.5):
 
 
 def hot(stats, which, gradient=1.0):
-    slopes, views = np.array(stats.gradient), np.array(stats.views)
+    slopes, views = np.array(stats.grad2d), np.array(stats.views)
     slopes[which], views[which] = gradient, 1
-    return stats._replace(gradient=jnp.asarray(slopes), views=jnp.asarray(views))
+    return stats._replace(grad2d=jnp.asarray(slopes), views=jnp.asarray(views))
 
 
 def run(params, moments, stats, spec=None, step=600):
-    spec = spec or DensitySpec()
-    return density.densify(
+    spec = spec or DefaultStrategySpec()
+    return densification.densify(
         TX, params, moments, stats, KEY, spec, step=step, extent=EXTENT
     )
 
 
-observe = jax.jit(density.observe, static_argnums=4)
+observe = jax.jit(densification.observe, static_argnums=4)
 
 
 def labels(changed):
-    living = np.asarray(changed.stats.alive)
-    return np.asarray(changed.params.rows["label"])[living, 0].astype(int).tolist()
+    active = np.asarray(changed.stats.active)
+    return np.asarray(changed.params.rows["label"])[active, 0].astype(int).tolist()
 
 
 def counts(changed):
-    return np.asarray(changed.moments[0].count.rows["label"])[: changed.report.alive]
+    return np.asarray(changed.moments[0].count.rows["label"])[: changed.report.active]
 
 
 def test_observe_counts_visible_views_in_ndc_units(dtype):
@@ -72,11 +72,11 @@ def test_observe_counts_visible_views_in_ndc_units(dtype):
     visible = jnp.asarray([True, True, False])
     radius = jnp.asarray([2, 9, 90], dtype)
     for _ in range(2):
-        stats = density.observe(stats, gradient, visible, radius, (64, 48))
-    np.testing.assert_allclose(stats.gradient, [6e-4 * 32, 8e-4 * 24, 0], rtol=1e-6)
+        stats = densification.observe(stats, gradient, visible, radius, (64, 48))
+    np.testing.assert_allclose(stats.grad2d, [6e-4 * 32, 8e-4 * 24, 0], rtol=1e-6)
     assert list(stats.views) == [2, 2, 0]
     assert list(stats.radius_px) == [2, 9, 0]
-    assert stats.gradient.dtype.name == dtype
+    assert stats.grad2d.dtype.name == dtype
 
 
 @pytest.mark.hard_cases
@@ -84,7 +84,7 @@ def test_tiny_slopes_are_not_lost_to_their_squares(dtype):
     _, _, stats = make(1, dtype)
     gradient = np.full((1, 2), 1e-25, dtype)
     stats = observe(stats, gradient, np.ones(1, bool), np.ones(1, dtype), (2, 2))
-    np.testing.assert_allclose(stats.gradient, math.sqrt(2) * 1e-25, rtol=1e-6)
+    np.testing.assert_allclose(stats.grad2d, math.sqrt(2) * 1e-25, rtol=1e-6)
 
 
 @pytest.mark.hard_cases
@@ -93,14 +93,14 @@ def test_invisible_rows_may_have_slopes_that_are_not_finite():
     gradient = np.float32([[1, 0], [np.nan, 0]])
     visible = np.array([True, False])
     stats = observe(stats, gradient, visible, np.ones(2, np.float32), (2, 2))
-    assert stats.gradient.tolist() == [1, 0]
+    assert stats.grad2d.tolist() == [1, 0]
 
 
 def test_a_small_row_is_cloned_and_its_clone_starts_without_moments(dtype):
     params, moments, stats = make(5, dtype)
     changed = run(params, moments, hot(stats, [2]))
     report = changed.report
-    assert report == density.Report(cloned=1, alive=6, capacity=256)
+    assert report == densification.Report(cloned=1, active=6, capacity=256)
     assert labels(changed) == [0, 1, 2, 3, 4, 2]
     np.testing.assert_array_equal(
         changed.params.rows["splats"].mean[5], params.rows["splats"].mean[2]
@@ -117,14 +117,14 @@ def test_a_large_row_becomes_two_that_are_drawn_from_it():
     params, moments, stats = make(3, scale=0.1)
     params = rows.take_rows(params, jnp.ones(4000, int))
     moments = TX.init(params)
-    stats = density.empty_stats(params.rows["splats"])
+    stats = densification.empty_stats(params.rows["splats"])
     stretched = params.rows["splats"]._replace(
         log_scale=jnp.tile(jnp.log(jnp.asarray([0.3, 0.1, 0.05])), (4000, 1))
     )
     params = params._replace(rows=params.rows | {"splats": stretched})
     changed = run(params, moments, hot(stats, np.arange(4000)))
     assert changed.report.split == 4000
-    assert changed.report.alive == 8000
+    assert changed.report.active == 8000
     child = changed.params.rows["splats"]
     np.testing.assert_allclose(
         np.exp(child.log_scale[:8000]),
@@ -176,7 +176,7 @@ def test_rows_wide_on_the_screen_go_where_asked():
     params, moments, stats = make(3)
     stats = stats._replace(radius_px=jnp.asarray([1.0, 30.0, 5.0]))
     assert run(params, moments, stats, step=5000).report.pruned == 0
-    spec = DensitySpec(prune_radius_px=20.0)
+    spec = DefaultStrategySpec(prune_radius_px=20.0)
     assert labels(run(params, moments, stats, spec, step=5000)) == [0, 2]
 
 
@@ -200,23 +200,29 @@ def test_rows_that_are_not_finite_are_pruned_and_counted(value):
 def test_the_cap_takes_the_largest_gradients_and_says_who_was_refused():
     params, moments, stats = make(6)
     stats = stats._replace(
-        gradient=jnp.asarray([1.0, 5, 2, 4, 3, 0]), views=jnp.full(6, 2)
+        grad2d=jnp.asarray([1.0, 5, 2, 4, 3, 0]), views=jnp.full(6, 2)
     )
-    changed = run(params, moments, stats, DensitySpec(most=8))
+    changed = run(params, moments, stats, DefaultStrategySpec(cap_max=8))
     assert labels(changed) == [0, 1, 2, 3, 4, 5, 1, 3]
-    assert changed.report == density.Report(cloned=2, refused=3, alive=8, capacity=8)
-    again = run(*changed[:2], hot(changed.stats, [0]), DensitySpec(most=8))
-    assert again.report == density.Report(refused=1, alive=8, capacity=8)
+    assert changed.report == densification.Report(
+        cloned=2, refused=3, active=8, capacity=8
+    )
+    again = run(*changed[:2], hot(changed.stats, [0]), DefaultStrategySpec(cap_max=8))
+    assert again.report == densification.Report(refused=1, active=8, capacity=8)
 
 
 def test_capacity_grows_in_buckets_and_does_not_waver():
     params, moments, stats = make(200)
     changed = run(params, moments, hot(stats, np.arange(100)))
     assert changed.report.capacity == 512
-    stats = changed.stats._replace(alive=changed.stats.alive & (jnp.arange(512) < 240))
+    stats = changed.stats._replace(
+        active=changed.stats.active & (jnp.arange(512) < 240)
+    )
     changed = run(*changed[:2], stats)
     assert changed.report.capacity == 512  # 256 would do
-    stats = changed.stats._replace(alive=changed.stats.alive & (jnp.arange(512) < 200))
+    stats = changed.stats._replace(
+        active=changed.stats.active & (jnp.arange(512) < 200)
+    )
     assert run(*changed[:2], stats).report.capacity == 256
 
 
@@ -225,11 +231,11 @@ def test_one_gaussian_and_none():
     params, moments, stats = make(1)
     changed = run(params, moments, hot(stats, [0]))
     assert labels(changed) == [0, 0]
-    gone = changed.stats._replace(alive=jnp.zeros(256, bool))
+    gone = changed.stats._replace(active=jnp.zeros(256, bool))
     changed = run(*changed[:2], gone)
-    assert changed.report.alive == 0
-    assert not np.asarray(rows.alive(changed.params.rows["splats"])).any()
-    assert run(*changed[:3]).report.alive == 0
+    assert changed.report.active == 0
+    assert not np.asarray(rows.active_mask(changed.params.rows["splats"])).any()
+    assert run(*changed[:3]).report.active == 0
 
 
 def test_the_same_key_gives_the_same_rows():
@@ -240,13 +246,15 @@ def test_the_same_key_gives_the_same_rows():
 
 def test_a_revised_clone_and_its_source_hide_what_one_did(dtype):
     params, moments, stats = make(3, dtype, opacity=0.8)
-    changed = run(params, moments, hot(stats, [1]), DensitySpec(revised_opacity=True))
+    changed = run(
+        params, moments, hot(stats, [1]), DefaultStrategySpec(revised_opacity=True)
+    )
     opacity = np.asarray(rows.activate(changed.params.rows["splats"]).opacity)[:4]
     half = 1 - math.sqrt(0.2)
     np.testing.assert_allclose(opacity, [0.8, half, 0.8, half], rtol=1e-6)
 
 
-halve_opacity = jax.jit(lambda logit: density.halve_opacity(logit[None])[0])
+halve_opacity = jax.jit(lambda logit: densification.halve_opacity(logit[None])[0])
 
 
 @pytest.mark.hard_cases
@@ -263,13 +271,15 @@ def test_halved_opacity_is_right_where_the_opacity_saturates(logit, dtype):
 
 def test_a_reset_lowers_opacities_and_forgets_their_moments_only(dtype):
     params, moments, _ = make(4, dtype)
-    logit = jnp.asarray([3.0, -6.0, rows.DEAD_LOGIT, 0.1], dtype)
+    logit = jnp.asarray([3.0, -6.0, rows.INACTIVE_LOGIT, 0.1], dtype)
     splats = params.rows["splats"]._replace(opacity_logit=logit)
     params = params._replace(rows=params.rows | {"splats": splats})
-    lowered, after = density.reset_opacity(TX, params, moments, DensitySpec())
+    lowered, after = densification.reset_opacity(
+        TX, params, moments, DefaultStrategySpec()
+    )
     opacity = np.asarray(rows.activate(lowered.rows["splats"]).opacity)
     np.testing.assert_allclose(opacity, [0.01, 1 / (1 + math.exp(6)), 0, 0.01], 1e-6)
-    assert list(rows.alive(lowered.rows["splats"])) == [True, True, False, True]
+    assert list(rows.active_mask(lowered.rows["splats"])) == [True, True, False, True]
     assert not np.asarray(after[0].first.rows["splats"].opacity_logit).any()
     assert not np.asarray(after[0].count.rows["splats"].opacity_logit).any()
     kept = after[0].first.rows["splats"]._replace(opacity_logit=None)
@@ -280,11 +290,11 @@ def test_a_reset_lowers_opacities_and_forgets_their_moments_only(dtype):
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ({"prune_opacity": 0.02}, "0 < prune < reset < 1"),
-        ({"interval": 0}, "interval is at least 1"),
+        ({"prune_opa": 0.02}, "0 < prune < reset < 1"),
+        ({"refine_every": 0}, "refine_every is at least 1"),
         ({"shrink": 1.0}, "shrink > 1"),
     ],
 )
 def test_settings_that_cannot_work_are_refused(setting, message):
     with pytest.raises(ValueError, match=message):
-        DensitySpec(**setting)
+        DefaultStrategySpec(**setting)

@@ -13,8 +13,8 @@ OUTLIERS = 0.02
 
 
 @dataclasses.dataclass(frozen=True)
-class Facts:
-    """Static, hashable facts; `facts_of` reads them from a capture."""
+class SceneMetadata:
+    """Static, hashable; `metadata_of` reads them from a capture."""
 
     near: float  # z-depth, scene units
     far: float
@@ -26,11 +26,11 @@ class Facts:
     # (left, right, progress). An exposure that is not learnt from lies between those
     # before and after it in time.
     exposures: tuple[tuple[int, int, float], ...]
-    provides: frozenset[str] = frozenset()  # of "depths", "points", "flow"
+    available_data: frozenset[str] = frozenset()  # of "depths", "points", "flow"
 
 
-def facts_of(capture: Capture, extent: float | None) -> Facts:
-    """The facts of a capture; host side.
+def metadata_of(capture: Capture, extent: float | None) -> SceneMetadata:
+    """The metadata of a capture; host side.
 
     The filmed volume becomes a box whose longest half-side is `extent` units of the
     field; None keeps the capture's own coordinates.
@@ -42,14 +42,14 @@ def facts_of(capture: Capture, extent: float | None) -> Facts:
     else:
         scale = extent / half_side
     times = np.unique(capture.times[capture.train])
-    provides = set()
+    available_data = set()
     if capture.points is not None and len(capture.points.position):
-        provides.add("points")
+        available_data.add("points")
     if capture.depths is not None:
-        provides.add("depths")
+        available_data.add("depths")
     if capture.flow is not None:
-        provides.add("flow")
-    return Facts(
+        available_data.add("flow")
+    return SceneMetadata(
         near=near,
         far=far,
         centre=tuple(float(x) for x in centre),
@@ -57,7 +57,7 @@ def facts_of(capture: Capture, extent: float | None) -> Facts:
         background=capture.background,
         times=tuple(float(time) for time in times),
         exposures=_exposures(capture),
-        provides=frozenset(provides),
+        available_data=frozenset(available_data),
     )
 
 

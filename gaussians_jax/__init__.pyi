@@ -1,0 +1,15 @@
+from .files import load as load
+from .files import save as save
+from .presets import PRESETS as PRESETS
+from .presets import with_steps as with_steps
+from .projection import project as project
+from .raster import rasterise as rasterise
+from .raster_spec import RasterSpec as RasterSpec
+from .rendering import render as render
+from .scene import build as build
+from .scene import metadata_of as metadata_of
+from .spec import SplatScene as SplatScene
+from .splats import Gaussians as Gaussians
+from .splats import Params as Params
+from .splats import Splats as Splats
+from .splats import from_points as from_points

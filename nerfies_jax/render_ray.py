@@ -1,0 +1,266 @@
+"""One ray through a radiance field: sample, warp, ask the template, composite."""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key
+
+from nerfies_jax.effects import transient
+from nerfies_jax.effects.effect import Medium, RayOutput, Sample
+from nerfies_jax.geometry import rays
+from nerfies_jax.geometry.camera import Camera
+from nerfies_jax.nets import encoding
+from nerfies_jax.radiance import compositing, sampling, template
+from nerfies_jax.scene_metadata import SceneMetadata
+from nerfies_jax.spec import RadianceScene, template_of
+from nerfies_jax.training.effects import Effect, FrameCondition
+
+PyTree = Any
+Vector = Float[Array, "3"]
+Scalar = Float[Array, ""]
+
+
+class Ray(NamedTuple):
+    """One ray in units of the field."""
+
+    origin: Vector
+    direction: Vector  # unit length
+    near: Scalar  # distance
+    far: Scalar
+
+
+@dataclasses.dataclass(frozen=True)
+class Bound:
+    """A field with its parameters: what all its rays have in common."""
+
+    spec: RadianceScene
+    metadata: SceneMetadata
+    effects: tuple[Effect, ...]
+    params: PyTree
+
+    def own(self, effect: Effect) -> PyTree:
+        """The parameters of one effect, None without any."""
+        return self.params.get(effect.name)
+
+
+def field_ray(
+    metadata: SceneMetadata, origin: Vector, direction: Vector, cosine: Scalar
+) -> Ray:
+    """A ray of the scene in the field's coordinates, between the near and far planes.
+
+    The planes are z-depths, so a slanted ray is sampled further out.
+    """
+    centre = jnp.asarray(metadata.centre, origin.dtype)
+    span = metadata.scale / cosine
+    return Ray(
+        (origin - centre) * metadata.scale,
+        direction,
+        metadata.near * span,
+        metadata.far * span,
+    )
+
+
+def field_ray_through(
+    metadata: SceneMetadata, camera: Camera, pixel: Float[Array, "2"]
+) -> tuple[Ray, Scalar]:
+    """The field's ray through one pixel position, and its z-depth per distance."""
+    found = rays.pixel_ray(camera, pixel)
+    cosine = rays.depth_per_distance(camera, found.direction)
+    return field_ray(metadata, found.origin, found.direction, cosine), cosine
+
+
+def displacement(bound: Bound, point: Vector, condition: FrameCondition) -> Vector:
+    """Template point minus observed point: what all warps do, one after the other."""
+    total = jnp.zeros_like(point)
+    for effect in bound.effects:
+        if effect.displace is not None:
+            moved = effect.displace(bound.own(effect), point + total, condition)
+            total = total + moved
+    return total
+
+
+class _Samples(NamedTuple):
+    """Samples of one ray before the template is asked."""
+
+    distance: Float[Array, " samples"]
+    point: Float[Array, "samples 3"]
+    warped: Float[Array, "samples 3"]
+    lifted: tuple[Float[Array, "samples features"], ...]
+
+
+def _samples(bound, ray, condition, distance):
+    effects = bound.effects
+
+    def one(distance):
+        point = rays.point_at(ray.origin, ray.direction, distance)
+        warped = point
+        if any(effect.displace is not None for effect in effects):
+            warped = point + displacement(bound, point, condition)
+        lifted = tuple(
+            effect.lift(bound.own(effect), point, condition)
+            for effect in effects
+            if effect.lift is not None
+        )
+        return _Samples(distance, point, warped, lifted)
+
+    return jax.vmap(one)(distance)
+
+
+def render_ray(
+    bound: Bound, ray: Ray, condition: FrameCondition, key: Key[Array, ""] | None
+) -> tuple[RayOutput, ...]:
+    """The levels of one ray, coarse to fine; without a key nothing is random.
+
+    Warps and lifts are asked once per sample: the fine level takes those of the coarse
+    samples over, which the published code computes again (a third of its warps).
+    """
+    spec, plan = bound.spec, bound.spec.sampling
+    coarse_key, fine_key, noise_key = (
+        (None,) * 3 if key is None else tuple(jax.random.split(key, 3))
+    )
+    distance = sampling.stratified(
+        coarse_key if plan.jitter else None,
+        ray.near,
+        ray.far,
+        plan.coarse,
+        plan.spacing,
+    )
+    samples = _samples(bound, ray, condition, distance)
+
+    def level(name, samples, media_of, number):
+        noise = None
+        if noise_key is not None and spec.density_noise > 0:
+            drawn = jax.random.normal(
+                jax.random.fold_in(noise_key, number),
+                samples.distance.shape,
+                samples.distance.dtype,
+            )
+            noise = spec.density_noise * drawn
+        radiance = _radiance(bound, name, ray, condition, samples, noise)
+        media = _media(bound, media_of, ray, condition, samples, radiance)
+        return _composite(bound, ray, samples, radiance, media)
+
+    # Media are on the last level only: one that guides the samples needs no more.
+    last = [effect for effect in bound.effects if effect.medium is not None]
+    if plan.fine == 0:
+        return (level("fine", samples, last, 0),)
+    first = "fine" if plan.shared else "coarse"
+    coarse = level(first, samples, (), 0)
+    drawn = sampling.from_weights(
+        fine_key if plan.jitter else None,
+        (distance[1:] + distance[:-1]) / 2,
+        coarse.weight[1:-1],
+        plan.fine,
+    )
+    if all(effect.displace is None and effect.lift is None for effect in bound.effects):
+        both = _samples(bound, ray, condition, sampling.union(distance, drawn))
+    else:
+        more = _samples(bound, ray, condition, drawn)
+        both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), samples, more)
+        order = jnp.argsort(both.distance)
+        both = jax.tree.map(lambda x: x[order], both)
+    return coarse, level("fine", both, last, 1)
+
+
+def _radiance(bound, name, ray, condition, samples, noise):
+    """What the template of one level says at the samples of one ray."""
+    one = template_of(bound.spec, name)
+    colour_inputs = []
+    if one.direction is not None:
+        colour_inputs.append(encoding.encode(one.direction, ray.direction, None))
+    colour_inputs += [
+        effect.condition(bound.own(effect), condition)
+        for effect in bound.effects
+        if effect.condition is not None
+    ]
+    colour_inputs = jnp.concatenate([*colour_inputs, jnp.zeros(0, ray.direction.dtype)])
+    net = bound.params["template"][name]
+
+    def ask(warped, lifted, noise):
+        encoded = encoding.encode(one.position, warped, None)
+        features = jnp.concatenate([encoded, *lifted])
+        return template.apply(one, net, features, colour_inputs, noise)
+
+    return jax.vmap(ask, (0, 0, None if noise is None else 0))(
+        samples.warped, samples.lifted, noise
+    )
+
+
+def _media(bound, effects, ray, condition, samples, radiance) -> dict[str, Medium]:
+    """What these effects put on the ray, by their names."""
+    media = {}
+    for effect in effects:
+
+        def at(point, features, effect=effect):
+            sample = Sample(point, ray.direction, features)
+            return effect.medium(bound.own(effect), sample, condition)
+
+        media[effect.name] = jax.vmap(at)(samples.point, radiance.features)
+    return media
+
+
+def _composite(bound, ray, samples, radiance, media):
+    distance = samples.distance
+    behind = bound.metadata.background
+    end = compositing.AT_INFINITY
+    if behind is not None:
+        end = jnp.maximum(ray.far - distance[-1], 0)
+        behind = jnp.asarray(behind, distance.dtype)
+    spacing = compositing.intervals(distance, end)
+    static, others = radiance.density * spacing, []
+    for medium in media.values():
+        depth = medium.density * spacing
+        if medium.share is not None:
+            depth = compositing.thinned(depth, medium.share)
+            static = compositing.thinned(static, -medium.share)
+        others.append(depth)
+    if media:
+        depths = jnp.stack([static, *others])
+        colours = [radiance.colour, *(medium.colour for medium in media.values())]
+        weights = compositing.media_weights(depths)
+        whole = compositing.composite_media(
+            depths, jnp.stack(colours), distance, behind
+        )
+    else:
+        weights = compositing.weights(static)[None]
+        whole = compositing.composite(weights[0], radiance.colour, distance, behind)
+    media_weight = dict(zip(media, weights[1:], strict=True))
+    return RayOutput(
+        distances=distance,
+        point=samples.point,
+        warped=samples.warped,
+        static_weight=weights[0],
+        media=media,
+        media_weight=media_weight,
+        colour=whole.colour,
+        alpha=whole.alpha,
+        distance=whole.distance,
+        median_distance=whole.median_distance,
+        beta=_uncertainty(bound, media, media_weight),
+    )
+
+
+def _uncertainty(bound, media, media_weight):
+    """Of the ray's colour, from the one medium that says it; None if none does."""
+    beta, said_by = None, None
+    for effect in bound.effects:
+        medium = media.get(effect.name)
+        if medium is None or medium.beta is None:
+            continue
+        if effect.beta_min is None:
+            raise ValueError(
+                f"the medium of the effect {effect.name!r} has a beta, and the effect "
+                "no beta_min: without a least uncertainty the loss is unbounded below; "
+                "give the effect one, as 0.03"
+            )
+        if said_by is not None:
+            raise ValueError(
+                f"both {said_by!r} and {effect.name!r} say how uncertain a ray's "
+                "colour is; leave the beta of one medium None"
+            )
+        weight = media_weight[effect.name]
+        beta = transient.uncertainty(effect.beta_min, weight, medium.beta)
+        said_by = effect.name
+    return beta

@@ -1,0 +1,17 @@
+from .reconstruction import Outcome as Outcome
+from .reconstruction import Refused as Refused
+from .reconstruction import reconstruct as reconstruct
+from .reconstruction import resume as resume
+from .run import Run as Run
+from .run import built_in_scene as built_in_scene
+from .run import first_state as first_state
+from .run import free_memory as free_memory
+from .run import load_capture as load_capture
+from .run import new_run as new_run
+from .run import open_run as open_run
+from .run import read_capture as read_capture
+from .run import restore as restore
+from .run import save_config as save_config
+from .run import saved_run as saved_run
+from .run import scene_spec as scene_spec
+from .run import stored_capture as stored_capture

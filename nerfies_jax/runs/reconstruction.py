@@ -1,0 +1,190 @@
+"""The main job as a call: a filmed scene in, a run folder out, and on from a cut."""
+
+import contextlib
+import pathlib
+import time
+from collections.abc import Iterator, Mapping
+from typing import Any, Literal, NamedTuple
+
+from nerfies_jax.capture.capture import CaptureError, describe
+from nerfies_jax.evidence import inspection
+from nerfies_jax.runs import adviser, products, quality, run_folder, train
+from nerfies_jax.runs.config import MoreMetrics, RunConfig
+from nerfies_jax.runs.run import (
+    Run,
+    first_state,
+    new_run,
+    read_settings,
+    restore,
+    save_config,
+    saved_run,
+    scene_spec,
+    stored_capture,
+)
+from nerfies_jax.runs.train import Pace
+from nerfies_jax.training import checkpoint
+from nerfies_jax.training.loop import FitResult
+
+
+class Refused(ValueError):
+    """What was asked for cannot be done; nothing was trained."""
+
+
+class Outcome(NamedTuple):
+    """Where a run ended and what it left behind."""
+
+    folder: pathlib.Path
+    run: Run
+    result: FitResult
+    errors: tuple[str, ...]  # one line each; empty where all went well
+
+
+def reconstruct(
+    config: RunConfig,
+    out: str | pathlib.Path | None = None,
+    *,
+    effects: Literal["preset", "auto"] = "preset",
+    seconds: float | int | None = None,
+    evaluate_every: float | int = 20.0,
+    checkpoint_every: float | int = 60.0,
+    more: MoreMetrics = MoreMetrics(),
+) -> Outcome:
+    """Train a run from its first step, and score, draw and film what came of it.
+
+    Everything goes into the new folder `out`, by default `runs/CAPTURE-PRESET`, and
+    from its first moment on `resume` continues the run that is in there. `effects`
+    "auto" looks at the capture first and takes those that it calls for. `seconds` ends
+    the training early; an evaluation follows after `evaluate_every` seconds of it, a
+    checkpoint after `checkpoint_every` seconds. `more` is measured at the end. Raises
+    Refused where it cannot begin.
+    """
+    began = time.perf_counter()
+    with contextlib.ExitStack() as held:
+        with _refusing():
+            pace = Pace(seconds, evaluate_every, checkpoint_every)
+            if out is not None:
+                out = pathlib.Path(out)
+                run_folder.check_free(out)
+            run = _new_run(config, effects)
+            _describe(run)
+            extra = quality.prepared(more, run.capture.size)
+            state = first_state(run)
+            stem = "-".join(run.capture.name.split()) + "-" + run.config.preset
+            folder = run_folder.new_run_folder(out, stem)
+            held.enter_context(run_folder.owned(folder))
+            save_config(folder, run)
+            checkpoints = _opened(held, folder, run, state, None)
+        return _finished(folder, run, state, None, checkpoints, pace, began, extra)
+
+
+def resume(
+    folder: str | pathlib.Path,
+    *,
+    expected: Mapping[str, Any] = {},
+    overrides: tuple[str, ...] = (),
+    seconds: float | int | None = None,
+    evaluate_every: float | int = 20.0,
+    checkpoint_every: float | int = 60.0,
+    more: MoreMetrics = MoreMetrics(),
+) -> Outcome:
+    """Continue the run in a folder from its last checkpoint, to the same bits.
+
+    One that is complete gets its products again. `expected` and `overrides` say what
+    the run must have been started with: fields of its config and of its source by name,
+    and fields of its spec. Raises Refused where they differ, and where another process
+    is at work in the folder.
+    """
+    began = time.perf_counter()
+    folder = pathlib.Path(folder)
+    with contextlib.ExitStack() as held:
+        with _refusing():
+            pace = Pace(seconds, evaluate_every, checkpoint_every)
+            _check_expected(folder, expected)
+            held.enter_context(run_folder.owned(folder))
+            run = saved_run(folder, overrides)
+            _describe(run)
+            extra = quality.prepared(more, run.capture.size)
+            state, record, after = _restored(folder, run)
+            checkpoints = _opened(held, folder, run, state, after)
+        return _finished(folder, run, state, record, checkpoints, pace, began, extra)
+
+
+@contextlib.contextmanager
+def _refusing() -> Iterator[None]:
+    """What readers of settings, captures and folders raise, as Refused."""
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        raise Refused(str(error)) from error
+
+
+def _new_run(config, effects):
+    if effects == "preset":
+        return new_run(config)
+    scene_spec(config)  # refuses a wrong preset before half a minute's look
+    stored = stored_capture(config.source, config.seed)
+    found = inspection.inspect(stored)
+    config, lines = adviser.follow(config, found.findings)
+    print("\n".join(lines))
+    return new_run(config, stored)
+
+
+def _describe(run):
+    for line in describe(run.capture):
+        print(line)
+
+
+def _check_expected(folder, expected):
+    """Raise ValueError naming both values where a run was started with others."""
+    config = read_settings(folder).config
+    stored = {**vars(config), **vars(config.source)}
+    unlike = [
+        f"{name.replace('_', '-')}: saved {stored[name]}, now {value}"
+        for name, value in expected.items()
+        if value != stored[name]
+    ]
+    if unlike:
+        raise ValueError(
+            f"{folder}: the run was started with other settings: {'; '.join(unlike)}; "
+            "leave them out to continue it, or start anew in another --out"
+        )
+
+
+def _restored(folder, run):
+    """The newest state saved, its record and step.
+
+    The first one, without them, where the run was killed before it saved that.
+    """
+    if checkpoint.latest(folder / run_folder.CHECKPOINTS) is None:
+        return first_state(run), None, None
+    found = restore(folder, run)
+    return found.state, found.record, found.step
+
+
+def _opened(held, folder, run, state, after):
+    """Where the run saves, with its state saved there: nothing done is ever lost."""
+    checkpoints = held.enter_context(train.open_checkpoints(folder, run, after))
+    if after is None:
+        checkpoints.save(state, 0)
+        checkpoints.wait()
+    return checkpoints
+
+
+def _finished(folder, run, state, record, checkpoints, pace, began, extra):
+    """The outcome of training to the end, with what is to be seen of it written."""
+    trained = train.train(run, state, record, checkpoints, pace)
+    result = trained.result
+    errors = [result.unsaved] if result.unsaved else []
+    if result.stopped_by in ("steps", "seconds", "non-finite"):
+        try:
+            products.make(folder, run, trained, began, extra)
+        except FloatingPointError as error:
+            errors.append(str(error))
+        except (OSError, CaptureError) as error:
+            errors.append(f"not all of what came of the run is written: {error}")
+    if result.stopped_by == "non-finite":
+        errors.append(
+            f"{result.message}; start anew with lower learning rates "
+            f"(--set, their names are in {folder / run_folder.CONFIG})"
+        )
+    return Outcome(folder, run, result, tuple(errors))

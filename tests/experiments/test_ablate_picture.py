@@ -1,0 +1,62 @@
+"""The ablation's picture."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from experiments.ablate import picture as ablate_picture
+from nerfies_jax.capture import synthetic
+from nerfies_jax.evaluation import protocol
+from tests import scenes
+
+SHIFT = np.float32([0.012, 0.0, 0.016])  # 0.02 long
+
+
+@pytest.fixture(scope="module")
+def filmed():
+    film = dataclasses.replace(scenes.TINY_FILM, heldout_every=2)
+    capture, truth = synthetic.make(film)
+    return capture, truth, protocol.known(capture, truth, 2, 5)
+
+
+def test_the_picture_shows_how_far_points_are_from_where_they_should_be(filmed):
+    capture, _, known = filmed
+    shown = ablate_picture.shown_row(known, capture)
+    row = known.rows[shown]
+    colour = {"a": capture.images[row]}
+
+    def apart(path):
+        picture = ablate_picture.draw(
+            capture,
+            known,
+            colour,
+            {"a": capture.depths[row]},
+            {"a": path},
+            {"a": ""},
+            shown,
+        )
+        assert picture.shape[1] > 4 * ablate_picture.WIDTH
+        return np.sum(np.all(picture == ablate_picture.APART, axis=-1))
+
+    assert apart(known.path) == 0
+    near, far = apart(known.path + SHIFT), apart(known.path + 4 * SHIFT)
+    assert 0 < near < far
+    assert apart(None) == apart(np.repeat(known.path[:, 3:4], known.path.shape[1], 1))
+
+
+def test_a_real_capture_is_drawn_without_points(filmed):
+    capture, _, _ = filmed
+    known = protocol.filmed(capture, 2)
+    shown = ablate_picture.shown_row(known, capture)
+    row = known.rows[shown]
+    picture = ablate_picture.draw(
+        capture,
+        known,
+        dict.fromkeys("ab", capture.images[row]),
+        dict.fromkeys("ab", capture.depths[row]),
+        dict.fromkeys("ab"),
+        dict.fromkeys("ab", ""),
+        shown,
+    )
+    assert picture.shape[1] > 4 * ablate_picture.WIDTH

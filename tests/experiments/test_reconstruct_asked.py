@@ -1,0 +1,221 @@
+"""What the main job is asked: wrong input, other settings, commands to paste."""
+
+import json
+import re
+import shlex
+
+import numpy as np
+import pytest
+
+from experiments import cli, reconstruct
+from nerfies_jax import runs
+from nerfies_jax.capture import images, nerfies_format
+from nerfies_jax.runs import (
+    commands,
+    platform,
+    reconstruction,
+    representations,
+)
+from nerfies_jax.runs.config import CaptureSource, RunConfig
+from tests import scenes
+from tests.evidence import films
+
+
+@pytest.fixture
+def filmed(tmp_path):
+    """A Nerfies directory that a test may damage."""
+    nerfies_format.write(scenes.tiny_capture(), tmp_path / "filmed")
+    return tmp_path / "filmed"
+
+
+def refused(capsys, *arguments):
+    """The one line that the main job prints when it refuses; checks the exit code."""
+    with pytest.raises(SystemExit) as stop:
+        reconstruct.main([str(argument) for argument in arguments])
+    assert stop.value.code == 2
+    line = capsys.readouterr().err
+    assert line.startswith("error: ")
+    assert line.count("\n") == 1
+    return line
+
+
+def edit(path, **values):
+    stored = json.loads(path.read_text())
+    path.write_text(json.dumps(stored | values))
+
+
+def one_picture(filmed):
+    return sorted((filmed / "rgb").rglob("*.png"))[0]
+
+
+def damage(filmed, kind):
+    """Break a capture in one way; returns words that the error must hold."""
+    picture = one_picture(filmed)
+    camera = filmed / "camera" / f"{picture.stem}.json"
+    if kind == "missing picture":
+        picture.unlink()
+    elif kind == "truncated picture":
+        picture.write_bytes(picture.read_bytes()[:200])
+    elif kind == "picture of another size":
+        images.write_png(picture, np.zeros((20, 33, 3), np.uint8))
+    elif kind == "camera that is not a number":
+        camera.write_text(camera.read_text().replace("focal_length", "focal_lenght"))
+    elif kind == "camera with NaN":
+        edit(camera, position=[float("nan"), 0.0, 0.0])
+    elif kind == "id out of range":
+        path = filmed / "metadata.json"
+        table = json.loads(path.read_text())
+        table[picture.stem]["warp_id"] = -3
+        path.write_text(json.dumps(table))
+    elif kind == "a single frame":
+        edit(
+            filmed / "dataset.json",
+            ids=[picture.stem],
+            train_ids=[picture.stem],
+            val_ids=[],
+            count=1,
+            num_exemplars=1,
+        )
+    return picture.stem
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "missing picture",
+        "truncated picture",
+        "picture of another size",
+        "camera that is not a number",
+        "camera with NaN",
+        "id out of range",
+        "a single frame",
+    ],
+)
+def test_a_broken_capture_is_refused_by_name(kind, filmed, tmp_path, capsys):
+    stem = damage(filmed, kind)
+    line = refused(capsys, filmed, "--out", tmp_path / "run")
+    assert str(filmed) in line or stem in line
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_folder_that_is_no_capture_says_what_was_looked_for(tmp_path, capsys):
+    line = refused(capsys, tmp_path, "--out", tmp_path / "run")
+    assert "scene.json" in line
+    assert "transforms" in line
+    assert "cameras.bin" in line
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--set", "init.points=0"), "at least one Gaussian"),
+        (("--set", "raster.capacity=1000000000000"), "GiB are free"),
+        (("--preset", "splats-magic"), "splats-deformable-small"),
+        (("--steps", "0"), "at least one step"),
+        (("--resume",), "--out"),
+        (("--heldout", "1"), "held"),
+        (("--checkpoint-every", "-1"), "--checkpoint-every -1"),
+    ],
+)
+def test_wrong_settings_are_refused(arguments, words, filmed, capsys, tmp_path):
+    out = () if arguments == ("--resume",) else ("--out", tmp_path / "run")
+    assert words in refused(capsys, filmed, *out, *arguments)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("option", ["--factor", "--max-side", "--heldout"])
+def test_the_built_in_scene_takes_no_options_of_captures(option, tmp_path, capsys):
+    line = refused(capsys, "--out", tmp_path / "run", option, "2")
+    assert option in line
+    assert "make_scene" in line
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_folder_that_cannot_be_written_is_refused(filmed, tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    assert "--out" in refused(capsys, filmed, "--out", tmp_path / "file" / "run")
+
+
+def test_a_folder_without_a_run_cannot_be_resumed(tmp_path, capsys):
+    line = refused(capsys, "--resume", "--out", tmp_path)
+    assert "no run here" in line
+    assert "without --resume" in line
+
+
+def started(folder, config):
+    """A run folder with its settings and nothing else."""
+    kind = representations.of_preset(config.preset)
+    spec = runs.scene_spec(config)
+    runs.save_config(folder, runs.Run(config, None, kind, spec, None, None))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["elsewhere"], "capture: saved"),
+        (["--factor", "2"], "factor: saved 4, now 2"),
+        (["--max-side", "9"], "max-side: saved None, now 9"),
+        (["--heldout", "5"], "heldout: saved 8, now 5"),
+        (["--scene", "wheel"], "scene: saved default, now wheel"),
+        (["--preset", "nerf"], "preset: saved splats-static, now nerf"),
+        (["--seed", "0"], "seed: saved 3, now 0"),
+        (["--steps", "70"], "spec.steps: saved 60, now 70"),
+        (["--set", "sh_degree=2"], "spec.sh_degree: saved 1, now 2"),
+        (["--effects", "auto"], "--effects auto"),
+    ],
+)
+def test_a_run_is_not_continued_as_another_one(arguments, words, tmp_path, capsys):
+    source = CaptureSource(tmp_path / "filmed", factor=4, heldout="8")
+    config = RunConfig("splats-static", source, 60, ("sh_degree=1",), seed=3)
+    started(tmp_path, config)
+    line = refused(capsys, *arguments, "--resume", "--out", tmp_path)
+    assert words in line
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        CaptureSource(scene="wheel"),
+        CaptureSource("a $(b) 'c'", factor=4, max_side=90, heldout="8"),
+    ],
+)
+def test_a_command_that_is_printed_keeps_all_options(source):
+    overrides = ("sh_degree=1", "densification=none")
+    config = RunConfig("splats-static", source, 60, overrides, seed=3)
+    words = shlex.split(commands.reconstruct(config))
+    assert words[:3] == ["python", "-m", "experiments.reconstruct"]
+    asked = cli.parse(reconstruct.Reconstruct, words[3:])
+    assert cli.plain(asked.source) == source
+    found = (asked.preset, asked.steps, asked.set, asked.seed)
+    assert found == (config.preset, config.steps, config.overrides, config.seed)
+
+
+def test_help_names_the_presets(capsys):
+    with pytest.raises(SystemExit) as stop:
+        reconstruct.main(["--help"])
+    assert stop.value.code == 0
+    page = re.sub(r"[\s│]", "", capsys.readouterr().out)  # as if it were one line
+    for kind in representations.installed().values():
+        for preset in kind.presets:
+            assert preset.removesuffix("-small") in page
+
+
+def test_effects_auto_takes_the_advice_and_the_users_word_comes_last(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(platform, "start_jax", lambda *_: None)
+    nerfies_format.write(films.film(), tmp_path / "film")
+    taken = {}
+
+    def caught(config, stored):
+        taken["config"] = config
+        raise ValueError("caught")
+
+    monkeypatch.setattr(reconstruction, "new_run", caught)
+    with pytest.raises(SystemExit):
+        reconstruct.main(
+            [str(tmp_path / "film"), "--effects", "auto", "--set", "sh_degree=0"]
+        )
+    assert taken["config"].preset == "splats-static-small"
+    assert taken["config"].overrides[-1] == "sh_degree=0"
+    assert "effects: --preset splats-static-small" in capsys.readouterr().out

@@ -1,0 +1,172 @@
+"""Points carried by Gaussians, against closed forms."""
+
+import dataclasses
+import types
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.spatial.transform
+
+from gaussians_jax import point_tracks
+from gaussians_jax import scene as splat_scene
+from gaussians_jax.splats import Gaussians, Params, Splats, deactivate
+from nerfies_jax.capture import synthetic
+from nerfies_jax.evaluation import protocol
+from nerfies_jax.measure import geometry_quality
+from nerfies_jax.training.model import Stages
+from tests import scenes
+
+
+@pytest.fixture(scope="module")
+def filmed():
+    film = dataclasses.replace(scenes.TINY_FILM, heldout_every=2)
+    capture, truth = synthetic.make(film)
+    return capture, truth, protocol.known(capture, truth, 2, 5)
+
+
+def splat_rows(mean, logit):
+    """Splats of which only the place and the opacity matter."""
+    count = len(mean)
+    return Splats(
+        mean=jnp.asarray(mean, jnp.float32),
+        log_scale=jnp.zeros((count, 3)),
+        quaternion=jnp.tile(jnp.asarray([1.0, 0.0, 0.0, 0.0]), (count, 1)),
+        opacity_logit=jnp.asarray(logit, jnp.float32),
+        sh_dc=jnp.zeros((count, 1, 3)),
+        sh_rest=jnp.zeros((count, 0, 3)),
+    )
+
+
+def follow_moved(monkeypatch, filmed, rows, moved):
+    """Follow through Gaussians that `moved(mean, time)` poses in closed form."""
+    capture, _, known = filmed
+
+    def pose(params, prepared, time):
+        splats = params.rows["splats"]
+        opacity = jax.nn.sigmoid(splats.opacity_logit)
+        mean = moved(splats.mean, time) + 0 * prepared
+        return Gaussians(mean, splats.quaternion, jnp.exp(splats.log_scale), opacity)
+
+    stages = Stages(lambda params: jnp.zeros(()), pose, None)
+    monkeypatch.setattr(
+        splat_scene, "build", lambda *_: types.SimpleNamespace(stages=stages)
+    )
+    effects = (types.SimpleNamespace(deform=pose),)
+    monkeypatch.setattr(splat_scene, "effects_of", lambda *_: effects)
+    state = types.SimpleNamespace(params=Params({"splats": rows}, {}))
+    return point_tracks.follow(None, None, state, capture, known)
+
+
+@pytest.fixture
+def cloud(filmed, rng):
+    """Gaussians all around the known points and the static ones."""
+    capture, _, known = filmed
+    near = np.concatenate([known.start_points, capture.points.position])
+    return near.repeat(20, 0) + rng.normal(scale=0.01, size=(20 * len(near), 3))
+
+
+def test_points_are_carried_by_gaussians_that_all_move_alike(
+    filmed, monkeypatch, cloud
+):
+    capture, _, known = filmed
+    velocity = np.float32([0.3, 0.1, -0.2])
+    rows = splat_rows(cloud, np.zeros(len(cloud)))
+    followed = follow_moved(
+        monkeypatch, filmed, rows, lambda mean, time: mean + velocity * time
+    )
+    since = capture.times[known.moments] - capture.times[known.moments][known.start]
+    expected = known.start_points[:, None] + since[:, None] * velocity
+    np.testing.assert_allclose(followed.path, expected, atol=1e-6)
+    assert followed.found.all()
+    assert np.isnan(followed.strain)
+    away = since - since.mean()  # how far a static point is from its mean
+    drift = np.abs(away).mean() * np.linalg.norm(velocity)
+    assert followed.drift == pytest.approx(drift, rel=1e-4)
+
+
+def test_a_turning_body_carries_its_points_but_for_the_way_to_the_neighbours_mean(
+    filmed, monkeypatch, cloud
+):
+    """x(t) = R(t) x with a turn of t radians about an axis through the origin."""
+    capture, _, known = filmed
+    axis = np.float32([0.6, 0.0, 0.8])
+
+    def turned(points, time):
+        turn = scipy.spatial.transform.Rotation.from_rotvec(axis * float(time))
+        return np.float32(turn.apply(points))
+
+    def moved(mean, time):
+        shape = jax.ShapeDtypeStruct(mean.shape, mean.dtype)
+        return jax.pure_callback(turned, shape, mean, time)
+
+    times = capture.times[known.moments]
+    # Turned back, so that they are around the points when these are given.
+    rows = splat_rows(turned(cloud, -times[known.start]), np.zeros(len(cloud)))
+    followed = follow_moved(monkeypatch, filmed, rows, moved)
+    body = turned(known.start_points, -times[known.start])
+    right = np.stack([turned(body, time) for time in times], axis=1)
+    error = np.linalg.norm(followed.path - right, axis=-1)
+    assert error[:, known.start].max() == pytest.approx(0, abs=1e-6)
+    # The mean of eight of twenty neighbours 0.01 away lies some 0.003 beside the point.
+    turn = 2 * np.abs(np.sin((times - times[known.start]) / 2))
+    assert np.all(error <= 0.01 * turn + 1e-6)
+    still = np.linalg.norm(right - known.start_points[:, None], axis=-1)
+    assert error[:, -1].mean() < 0.05 * still[:, -1].mean()
+
+
+def test_what_cannot_be_seen_carries_nothing(filmed, monkeypatch, cloud):
+    """Faint and dead Gaussians fly off; those that can be seen stay."""
+    known = filmed[2]
+    mean = np.concatenate([cloud, cloud + 1e-4, cloud - 1e-4])
+    logit = np.repeat([0.0, -4.0, 5.0], len(cloud))
+    rows = splat_rows(mean, logit)
+    hidden = jnp.arange(len(mean)) >= len(cloud)
+    rows = deactivate(rows, jnp.arange(len(mean)) >= 2 * len(cloud))
+
+    def moved(mean, time):
+        return jnp.where(hidden[:, None], mean + time, mean)
+
+    followed = follow_moved(monkeypatch, filmed, rows, moved)
+    still = np.repeat(known.start_points[:, None], known.path.shape[1], 1)
+    np.testing.assert_allclose(followed.path, still, atol=1e-6)
+    none = splat_rows(cloud, np.full(len(cloud), -4.0))
+    followed = follow_moved(monkeypatch, filmed, none, lambda mean, time: mean + time)
+    np.testing.assert_allclose(followed.path, still, atol=1e-6)
+
+
+def test_the_weights_of_neighbours_are_a_slow_sum(rng):
+    distance = np.sort(rng.uniform(size=(4, 8)), axis=1)
+    opacity = rng.uniform(0.1, 1, size=(4, 8))
+    found = point_tracks.neighbour_weights(distance, opacity)
+    for row in range(4):
+        expected = [
+            opacity[row, k] / np.exp(2 * (distance[row, k] / distance[row, 7]) ** 2)
+            for k in range(8)
+        ]
+        np.testing.assert_allclose(found[row], expected / np.sum(expected), rtol=1e-12)
+    # All at the point itself: by opacity alone.
+    found = point_tracks.neighbour_weights(np.zeros((1, 2)), np.array([[0.3, 0.1]]))
+    np.testing.assert_allclose(found, [[0.75, 0.25]], rtol=1e-12)
+
+
+def test_splats_without_motion_follow_nothing_and_untrained_motion_stays(filmed):
+    capture, _, known = filmed
+    metadata = splat_scene.metadata_of(capture)
+    still = point_tracks.follow(scenes.TINY_SPLATS, metadata, None, capture, known)
+    assert still is None
+    model = splat_scene.build(scenes.TINY_DEFORMABLE, metadata)
+    state = model.init(capture, jax.random.key(0))
+    followed = point_tracks.follow(
+        scenes.TINY_DEFORMABLE, metadata, state, capture, known
+    )
+    assert followed.path.shape == known.path.shape
+    errors = geometry_quality.track_errors(
+        jnp.asarray(followed.path),
+        jnp.asarray(np.repeat(known.start_points[:, None], followed.path.shape[1], 1)),
+        jnp.ones(known.seen.shape, bool),
+        0.01,
+    )
+    assert errors.endpoint < 1e-3  # the heads begin near zero
+    assert followed.drift < 1e-3

@@ -1,0 +1,90 @@
+"""Every combination of decisions becomes a run that can be built."""
+
+import itertools
+
+import pytest
+
+from nerfies_jax.effects.appearance import AppearanceSpec
+from nerfies_jax.evidence.findings import CANNOT_TELL, CERTAIN, Finding
+from nerfies_jax.runs import adviser, representations
+from nerfies_jax.training import specs
+from tests import scenes
+
+EFFECTS = (
+    "motion",
+    "appearance codes",
+    "transient objects",
+    "start from points",
+    "background points",
+    "depth",
+)
+
+
+def findings(**wanted):
+    """Findings by effect, words joined by underscores; None cannot be told."""
+    return tuple(
+        Finding(
+            name.replace("_", " "),
+            "",
+            "",
+            choice,
+            CANNOT_TELL if choice is None else CERTAIN,
+        )
+        for name, choice in wanted.items()
+    )
+
+
+def decided(choices):
+    names = (name.replace(" ", "_") for name in EFFECTS)
+    return findings(**dict(zip(names, choices, strict=True)))
+
+
+@pytest.mark.parametrize("full", [False, True])
+@pytest.mark.parametrize("name", representations.installed())
+def test_all_decisions_lead_to_a_model_that_can_be_built(name, full):
+    kind = representations.named(name)
+    capture = scenes.tiny_capture()
+    built = set()
+    for choices in itertools.product((True, False, None), repeat=len(EFFECTS)):
+        advice = adviser.advise(decided(choices), kind, full)
+        if advice.arguments() in built:
+            continue
+        built.add(advice.arguments())
+        spec = specs.override(kind.presets[advice.preset], advice.overrides)
+        kind.build(spec, kind.metadata_of(capture, spec))
+    assert len(built) > 4
+
+
+def spec_of(name, **wanted):
+    kind = representations.named(name)
+    advice = adviser.advise(findings(**wanted), kind)
+    return specs.override(kind.presets[advice.preset], advice.overrides), advice
+
+
+def test_a_still_scene_gets_no_motion_and_a_moving_one_gets_it():
+    assert spec_of("gaussians", motion=False)[0].motion is None
+    assert spec_of("gaussians", motion=True)[0].motion is not None
+    assert spec_of("radiance", motion=False)[0].warp is None
+    assert spec_of("radiance", motion=True)[0].warp is not None
+
+
+def test_what_cannot_be_told_keeps_the_default_that_moves():
+    spec, advice = spec_of("gaussians", motion=None)
+    assert spec.motion is not None
+    assert any("cannot tell" in note for note in advice.notes)
+
+
+def test_codes_and_media_come_in_where_the_preset_has_none():
+    spec, _ = spec_of("radiance", motion=True, appearance_codes=True)
+    assert spec.appearance == AppearanceSpec(4)
+    assert spec.transient is None
+    passed, _ = spec_of("radiance", motion=False, transient_objects=True)
+    assert passed.transient.width == 48
+    _, advice = spec_of("gaussians", appearance_codes=True)
+    assert any("prefer the field" in note for note in advice.notes)
+
+
+def test_no_medium_is_brought_in_beside_a_warp():
+    spec, advice = spec_of("radiance", motion=True, transient_objects=True)
+    assert spec.transient is None
+    assert any("left to the warp" in note for note in advice.notes)

@@ -1,0 +1,51 @@
+"""The curve of a run: written, read, and when it reached a quality."""
+
+import numpy as np
+import pytest
+
+from nerfies_jax.runs import curves
+from nerfies_jax.training.loop import History
+
+
+def curve(seconds, psnr):
+    count = len(seconds)
+    return curves.Curve(
+        tuple(map(float, seconds)),
+        tuple(range(count)),
+        tuple(psnr),
+        (0.5,) * count,
+        ("a",),
+        1.0,
+        {},
+    )
+
+
+def test_time_to_a_quality_is_read_off_the_curve():
+    rising = curve([1, 3, 5], [10, 20, 20])
+    assert curves.seconds_to(rising, 15) == pytest.approx(2)
+    assert curves.seconds_to(rising, 20) == pytest.approx(3)
+    assert curves.seconds_to(rising, 5) == 1
+    assert curves.seconds_to(rising, 20.1) is None
+    assert curves.seconds_to(curve([], []), 5) is None
+
+
+def test_a_quality_that_was_lost_again_counts_from_the_last_crossing():
+    assert curves.seconds_to(curve([0, 1, 2, 3], [21, 22, 18, 22]), 20) == 2.5
+    assert curves.seconds_to(curve([0, 1], [21, 19]), 20) is None
+    assert curves.seconds_to(curve([0, 1], [np.nan, 22]), 20) == 1
+
+
+def test_a_curve_comes_back_as_it_was_written(tmp_path):
+    rows = tuple(
+        {"hook": "held out", "step": step, "seconds": at, "psnr": dB, "ssim": 0.5}
+        for step, at, dB in ((0, 1.0, 12.5), (1, 3.0, np.nan))
+    )
+    history = History(({"step": 1, "seconds": 1.0, "loss": 0.1},), rows, 3.0, 2.0)
+    curves.write(tmp_path, history, ["frame 3"])
+    found = curves.read(tmp_path)
+    assert found.seconds == (1.0, 3.0)
+    assert found.psnr[0] == 12.5
+    assert np.isnan(found.psnr[1])
+    assert found.frames == ("frame 3",)
+    assert found.compile_seconds == 2.0
+    assert "jax" in found.machine

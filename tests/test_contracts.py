@@ -1,0 +1,391 @@
+"""What every public function of numbers promises, made from its annotations.
+
+Inputs are drawn from the jaxtyping annotation of each argument; arguments that are no
+arrays stand in `SETTINGS`, and a function that is in neither fails here until it is
+named. With x64 on and under strict promotion: what goes in as float32 comes out as
+float32, value and slopes are the same for one row, for many and without the compiler's
+rewriting, and both are finite at zero, near the smallest normal number and as far up as
+`REACH` says.
+"""
+
+import functools
+import importlib
+import inspect
+import typing
+import zlib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gaussians_jax.raster_spec import GSPLAT
+from nerfies_jax.nets import kan, mlp
+from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.nets.kan import KANSpec
+from nerfies_jax.nets.mlp import HeadSpec, MLPSpec
+from nerfies_jax.radiance import template
+from nerfies_jax.radiance.template import TemplateSpec
+
+MODULES = (
+    *(f"nerfies_jax.geometry.{name}" for name in ("lie", "quaternion", "stumpff")),
+    *(f"nerfies_jax.geometry.{name}" for name in ("matrix3", "camera", "distortion")),
+    *("nerfies_jax.geometry.rays", "nerfies_jax.geometry.precision"),
+    *(f"nerfies_jax.nets.{name}" for name in ("codes", "encoding", "kan", "mlp")),
+    *(f"nerfies_jax.radiance.{name}" for name in ("compositing", "sampling")),
+    *("nerfies_jax.radiance.template", "nerfies_jax.training.losses"),
+    *("gaussians_jax.projection", "gaussians_jax.splats", "gaussians_jax.harmonics"),
+    "gaussians_jax.blending",
+)
+# No function of arrays alone, or held where the reason says.
+EXCUSED = {
+    **dict.fromkeys(
+        ["camera.resize", "camera.crop", "camera.pinhole", "camera.look_at"], "host"
+    ),
+    **dict.fromkeys(["camera.stack", "camera.take", "camera.validate"], "host"),
+    **dict.fromkeys(["codes.check_ids", "splats.rows_to_write"], "host"),
+    **dict.fromkeys(["splats.from_points", "splats.random_in_box"], "host"),
+    **dict.fromkeys(["splats.random_in_views", "splats.scene_extent"], "host"),
+    **dict.fromkeys(["splats.capacity_for", "harmonics.degree_of"], "sizes"),
+    **dict.fromkeys(["kan.spacing", "kan.width", "kan.centres"], "settings"),
+    **dict.fromkeys(["template.trunk_spec", "template.colour_spec"], "settings"),
+    **dict.fromkeys(["quaternion.identity", "rays.pixel_centres"], "constants"),
+    **dict.fromkeys(["codes.init", "kan.init", "mlp.init", "mlp.init_layer"], "draws"),
+    "template.init": "draws",
+    **dict.fromkeys(["precision.at_least_float32", "precision.refuse_half"], "types"),
+    "splats.refuse_half": "types",
+    **dict.fromkeys(["splats.take_rows", "splats.pad_rows"], "moves rows of any tree"),
+    **dict.fromkeys(["blending.blend", "blending.blend_gradient"], "test_raster.py"),
+    **dict.fromkeys(["kan.first_layer_part", "kan.after_first_layer"], "in kan.apply"),
+    **dict.fromkeys(["losses.ssim", "losses.photometric"], "means of dssim_map"),
+}
+
+_MLP = MLPSpec(3, 2, 4, (("y", HeadSpec(2)),), skips=(1,))
+_KAN = KANSpec(3, (4,), (("y", HeadSpec(2)),), kernels=4)
+_TEMPLATE = TemplateSpec(
+    EncodingSpec(2), EncodingSpec(1), depth=2, width=4, skips=(1,), colour_width=4
+)
+
+
+def _network(make):
+    """Parameters of its shapes, in the precision asked for."""
+
+    def drawn(dtype):
+        shapes = jax.eval_shape(lambda key: make(key, dtype), jax.random.key(0))
+        rng = np.random.default_rng(0)
+        return jax.tree.map(lambda x: 0.3 * rng.normal(size=x.shape), shapes)
+
+    return lambda dtype: jax.tree.map(lambda x: x.astype(dtype), drawn(dtype))
+
+
+SETTINGS = {
+    "stumpff.stumpff": {"order": 2},
+    "rays.pixel_rays": {"size": (3, 2)},
+    "precision.near_one": {"axis": -1},
+    "encoding.encode": {"spec": EncodingSpec(4, times_pi=True), "window": None},
+    "encoding.anneal": {"bands": 4},
+    "kan.apply": {"spec": _KAN, "params": _network(functools.partial(kan.init, _KAN))},
+    "kan.hold": {"grid": (-1.0, 1.0), "margin": 0.3},
+    "mlp.apply": {"spec": _MLP, "params": _network(functools.partial(mlp.init, _MLP))},
+    "mlp.hidden_features": {
+        "spec": _MLP,
+        "params": _network(functools.partial(mlp.init, _MLP)),
+    },
+    "mlp.with_known": {
+        "spec": _MLP,
+        "params": _network(functools.partial(mlp.init, _MLP)),
+    },
+    "mlp.affine": {
+        "layer": _network(lambda key, dtype: mlp.init_layer(key, 3, 2, "he", dtype))
+    },
+    "template.apply": {
+        "spec": _TEMPLATE,
+        "params": _network(
+            lambda key, dtype: template.init(_TEMPLATE, key, 15, 3, dtype)
+        ),
+        "density_noise": None,
+    },
+    "compositing.intervals": {"last": 1e10},
+    "sampling.stratified": {"key": None, "count": 4},
+    "sampling.from_weights": {"key": None, "count": 4},
+    "sampling.refine": {"key": None, "count": 4},
+    **{
+        f"losses.{name}": {"width": 0.1}
+        for name in ("charbonnier", "huber", "geman_mcclure")
+    },
+    "projection.project": {"size": (8, 8), "spec": GSPLAT},
+    "splats.active_degree": {"every": 10, "degree": 3},
+    "harmonics.basis": {"degree": 3},
+}
+
+# Lengths of axes; all others are 3. Variadic axes are one axis of 2, but for
+# a batch, which callers make with `vmap`.
+SIZES = {
+    "height": 12,
+    "width": 12,
+    "channels": 2,
+    "samples": 6,
+    "edges": 7,
+    "bins": 6,
+    "dim": 3,
+    "code": 4,
+    "features": 4,
+    "rest": 3,
+    "coefficients": 4,
+    "part": 2,
+    "known": 1,
+}
+SIZES_OF = {
+    "template.apply": {"inputs": 15, "condition": 3},
+    "kan.standardise": {"features": 5},
+}
+
+
+def _rotation(rng, shape):
+    turned, _ = np.linalg.qr(rng.normal(size=shape))
+    return turned * np.linalg.det(turned)[..., None, None]
+
+
+def _unit(rng, shape):
+    drawn = rng.normal(size=shape)
+    return drawn / np.linalg.norm(drawn, axis=-1, keepdims=True)
+
+
+def _positive(rng, shape):
+    return rng.uniform(0.1, 1, shape)
+
+
+def _sorted(rng, shape):
+    return np.sort(rng.uniform(1, 4, shape), axis=-1)
+
+
+def _near(value, spread=0.1):
+    return lambda rng, shape: value + spread * rng.uniform(-1, 1, shape)
+
+
+# Arguments that are not any number, by name: how they are drawn, and whether they may
+# be scaled.
+DRAWS = {
+    **dict.fromkeys(["rotation", "camera_from_world"], (_rotation, False)),
+    **dict.fromkeys(["direction", "start", "end"], (_unit, False)),
+    **dict.fromkeys(["optical_depth", "residual_sq", "mse", "size"], (_positive, True)),
+    "angle_sq": (_positive, True),
+    **dict.fromkeys(["weight", "weights", "scale"], (_positive, True)),
+    **dict.fromkeys(["opacity", "time", "progress"], (_positive, False)),
+    **dict.fromkeys(["distances", "edges", "coarse", "fine"], (_sorted, False)),
+    "near": (_near(1.0), False),
+    "far": (_near(4.0), False),
+    "focal_px": (_near(10.0), False),
+    "pixel_aspect": (_near(1.0), False),
+    **dict.fromkeys(["skew_px", "radial", "tangential"], (_near(0.0, 0.01), False)),
+    "fraction": (_positive, False),
+}
+
+
+class Function(typing.NamedTuple):
+    name: str  # "lie.exp_so3"
+    call: typing.Callable
+    annotations: dict[str, typing.Any]  # of the arguments that are drawn
+
+
+def _public():
+    for path in MODULES:
+        module = importlib.import_module(path)
+        for name, function in vars(module).items():
+            if name.startswith("_") or not inspect.isfunction(function):
+                continue
+            if inspect.unwrap(function).__module__ == path:
+                yield f"{path.rsplit('.', 1)[1]}.{name}", function
+
+
+def _drawn(name, function):
+    given = SETTINGS.get(name, {})
+    return {
+        key: parameter.annotation
+        for key, parameter in inspect.signature(function).parameters.items()
+        if key not in given and parameter.default is inspect.Parameter.empty
+    }
+
+
+FUNCTIONS = {
+    name: Function(name, function, _drawn(name, function))
+    for name, function in _public()
+    if name not in EXCUSED
+}
+
+
+def _draw(name, key, annotation, rng, sizes):
+    """One input, and whether each of its leaves may be scaled."""
+    if hasattr(annotation, "_fields"):
+        hints = typing.get_type_hints(annotation)
+        both = [_draw(name, k, hints[k], rng, sizes) for k in annotation._fields]
+        return tuple(annotation(*leaves) for leaves in zip(*both, strict=True))
+    options = [a for a in typing.get_args(annotation) if a is not type(None)]
+    if not hasattr(annotation, "dim_str") and options:
+        return _draw(name, key, options[0], rng, sizes)
+    if not hasattr(annotation, "dim_str"):
+        raise TypeError(
+            f"{name}: {key} is no array ({annotation}); give it in SETTINGS, or name "
+            "the function in EXCUSED"
+        )
+    shape = tuple(
+        int(axis) if axis.isdigit() else sizes.get(axis, 2 if axis[0] == "*" else 3)
+        for axis in annotation.dim_str.split()
+        if axis != "*batch"
+    )
+    if "float32" in annotation.dtypes:
+        draw, free = DRAWS.get(key, (lambda rng, shape: rng.normal(size=shape), True))
+        return draw(rng, shape), free
+    if "bool" in annotation.dtypes:
+        return rng.uniform(size=shape) < 0.7, False
+    return rng.integers(0, 2, shape).astype(np.int32), False
+
+
+# How far up inputs may go, as a power of the largest number; others may be any. A
+# quarter of it is taken, since sums of a few of the largest overflow.
+_TURNS = ["transform_point", "displacement", "rotate_point", "exp_so3", "exp_se3"]
+_JACOBIANS = ["left_jacobian", "left_jacobian_se3"]
+_INVERSES = ["inverse_left_jacobian", "inverse_left_jacobian_se3"]
+REACH = {
+    # squares and products with the axis: documented to 1e19 for the angle alone
+    **{f"lie.{name}": 0.25 for name in [*_TURNS, *_JACOBIANS]},
+    **{f"lie.{name}": 0.0 for name in _INVERSES},  # singular from 2π on
+    "lie.log_se3": 0.5,
+    # products of two inputs
+    **dict.fromkeys(["quaternion.exp", "quaternion.multiply"], 0.45),
+    **dict.fromkeys(["compositing.composite", "compositing.expected_distance"], 0.45),
+    "losses.mse": 0.45,
+    "distortion.distort": 0.1,  # seventh powers of the radius, and their slopes
+    "losses.dssim_map": 0.2,  # variances over squared means
+    # sums of more than four, or multiples
+    **dict.fromkeys(["codes.blend", "encoding.encode", "losses.l1"], 0.9),
+}
+# Relative to the largest entry, between two orders of the same operations. Measured in
+# float32: 4e-7 for the polynomial of the lens, 8e-7 for dssim_map, 2e-7 for the others.
+ALIKE = {"float32": 2e-6, "float64": 4e-15}
+# Two seconds and more to compile; what they are made of is held by itself.
+_SLOW = [f"lie.{name}" for name in ("exp_se3", "log_se3")]
+_SLOW += [f"lie.{name}" for name in ("left_jacobian_se3", "inverse_left_jacobian_se3")]
+_SLOW += ["lie.log_so3", "lie.transform_point", "quaternion.slerp", "template.apply"]
+_SLOW += ["matrix3.displacement_log_energy", "matrix3.signed_log_energy"]
+_SLOW += ["camera.unproject", "rays.pixel_ray", "rays.pixel_rays"]
+_SLOW += ["distortion.undistort", "kan.apply", "losses.dssim_map"]
+SLOW = {*_SLOW, "projection.project"}
+# Compiled operation by operation, as they run without `jit`: to run them so takes
+# longer by ten, each being a program.
+ONE_BY_ONE = {
+    "xla_backend_optimization_level": 0,
+    "xla_disable_hlo_passes": "fusion,fusion_merger,algsimp,reassociate",
+}
+
+USUAL = 2  # rows drawn; then one of zeros, one of the smallest, one of the largest
+
+
+def _rows(function, dtype):
+    """The drawn arguments and those given, [rows, ...] each."""
+    limits = np.finfo(dtype)
+    most = float(limits.max) ** REACH.get(function.name, 1.0) / 4
+    factors = [1, 1, 0, 10 * float(limits.tiny), most]
+    sizes = SIZES | SIZES_OF.get(function.name, {})
+    arguments = {}
+    for key, annotation in function.annotations.items():
+        drawn = []
+        for row, factor in enumerate(factors):
+            seed = zlib.crc32(f"{function.name} {key} {min(row, USUAL)}".encode())
+            rng = np.random.default_rng(seed)
+            leaves, free = _draw(function.name, key, annotation, rng, sizes)
+            drawn.append(jax.tree.map(functools.partial(_scaled, factor), leaves, free))
+        arguments[key] = jax.tree.map(
+            lambda *leaves: _typed(np.stack(leaves), dtype), *drawn
+        )
+    return arguments
+
+
+def _scaled(factor, leaf, free):
+    return np.asarray(leaf * factor if free else leaf)
+
+
+def _typed(leaf, dtype):
+    return leaf.astype(dtype) if np.issubdtype(leaf.dtype, np.floating) else leaf
+
+
+def _given(name, dtype):
+    given = SETTINGS.get(name, {})
+    return {k: v(jnp.dtype(dtype)) if callable(v) else v for k, v in given.items()}
+
+
+def _is_float(leaf):
+    return jnp.issubdtype(leaf.dtype, jnp.floating)
+
+
+def _value_and_slopes(function, given, arguments):
+    """Float results, others, and slopes of the sum of the first in all floats."""
+    leaves, tree = jax.tree.flatten(arguments)
+
+    def of_floats(floats):
+        given_floats = iter(floats)
+        filled = [next(given_floats) if _is_float(x) else x for x in leaves]
+        results = jax.tree.leaves(_called(function, tree.unflatten(filled) | given))
+        return (
+            [x for x in results if _is_float(x)],
+            [x for x in results if not _is_float(x)],
+        )
+
+    floats = [x for x in leaves if _is_float(x)]
+    if function is FUNCTIONS["matrix3.svd"].call:  # refuses to be differentiated
+        return *of_floats(floats), []
+    values, pull, others = jax.vjp(of_floats, floats, has_aux=True)
+    # Not all ones: what is standardised has no slope along them.
+    along = [np.cos(np.arange(x.size)).reshape(x.shape).astype(x.dtype) for x in values]
+    return values, others, pull(along)[0]
+
+
+def _called(function, arguments):
+    """By position, in the order of the signature: `at_least_float32` takes no names."""
+    names = [key for key in inspect.signature(function).parameters if key in arguments]
+    return function(*(arguments[key] for key in names))
+
+
+def _of(name, dtype):
+    """The function of its arguments alone, and its rows."""
+    function, given = FUNCTIONS[name], _given(name, dtype)
+    one = functools.partial(_value_and_slopes, function.call, given)
+    return one, _rows(function, dtype)
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_float32_stays_float32_where_x64_is_on(name):
+    with jax.enable_x64(True):
+        one, rows = _of(name, "float32")
+        values, _, slopes = jax.eval_shape(jax.vmap(one), rows)
+    for leaf in (*values, *slopes):
+        assert leaf.dtype == jnp.float32
+
+
+def _held():
+    for name in FUNCTIONS:
+        for dtype in ("float32", "float64"):
+            # in float64 the programs are the same
+            slow = name in SLOW or dtype == "float64"
+            marks = pytest.mark.slow if slow else ()
+            yield pytest.param(name, dtype, id=f"{name}-{dtype}", marks=marks)
+
+
+@pytest.mark.parametrize(("name", "dtype"), list(_held()))
+def test_rows_alike_with_and_without_the_compiler_and_finite_everywhere(name, dtype):
+    with jax.enable_x64(dtype == "float64"):
+        one, rows = _of(name, dtype)
+        first = jax.tree.map(lambda leaf: leaf[0], rows)
+        plain = jax.jit(one, compiler_options=ONE_BY_ONE)(first)
+        many = jax.tree.map(np.asarray, jax.jit(jax.vmap(one))(rows))
+    for single, together in zip(*map(jax.tree.leaves, (plain, many)), strict=True):
+        assert np.isfinite(together).all()
+        single = np.asarray(single, np.float64)
+        size = max(np.max(np.abs(single), initial=0), 1e-3)
+        assert np.max(np.abs(single - together[0]), initial=0) <= ALIKE[dtype] * size
+
+
+def test_no_name_is_excused_or_set_in_vain():
+    every = {name for name, _ in _public()}
+    assert set(EXCUSED) <= every
+    assert {*SETTINGS, *SIZES_OF, *REACH, *SLOW} <= set(FUNCTIONS)
