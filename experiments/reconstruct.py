@@ -46,6 +46,9 @@ class Reconstruct:
     """Of everything random (default: 0)."""
     set: tuple[str, ...] = ()
     """Fields of the preset: densification.cap_max=20000 motion.width=128 warp=none."""
+    effect: tuple[str, ...] = ()
+    """Effects of your own beside those of the preset, as MODULE:NAME: an Effect, or a
+    function that makes one from the scene's metadata (docs/own_effect.md)."""
     evaluate_every: float = 20.0
     """Seconds of training between two points of the PSNR curve."""
     checkpoint_every: float = 60.0
@@ -99,6 +102,7 @@ def _outcome(asked):
         source=cli.plain(asked.source),
         steps=asked.steps,
         overrides=asked.set,
+        effects=asked.effect,
         seed=asked.seed or 0,
     )
     with cli.user_errors((runs.Refused,)):
@@ -128,7 +132,7 @@ def _preset(asked):
 
 def _expected(asked):
     """What the command line says of the run that it continues, by field."""
-    said = {"preset": asked.preset, "seed": asked.seed}
+    said = {"preset": asked.preset, "seed": asked.seed, "effects": asked.effect or None}
     said = {name: value for name, value in said.items() if value is not None}
     return {**cli.given(asked.source), **said}
 

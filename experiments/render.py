@@ -141,7 +141,9 @@ def _model(asked, run):
     blended = asked.appearance is not None
     if not asked.without and not blended:
         return run.model
-    return run.representation.variant(run.spec, run.facts, asked.without, blended)
+    return run.representation.variant(
+        run.spec, run.metadata, asked.without, blended, effects=run.effects
+    )
 
 
 def _mover(asked, run):

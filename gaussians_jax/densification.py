@@ -174,7 +174,7 @@ def densify(
 def _plan(rows, stats, spec, step, extent):
     """Which old row each new row comes from, and what becomes of it."""
     stats = jax.tree.map(np.asarray, stats)
-    whole, opacity, scale = map(np.asarray, _facts(rows))
+    whole, opacity, scale = map(np.asarray, _row_summary(rows))
     score = stats.grad2d / np.maximum(stats.views, 1)
 
     kept = stats.active & whole & (opacity >= spec.prune_opa)
@@ -216,7 +216,7 @@ def _plan(rows, stats, spec, step, extent):
 
 
 @jax.jit
-def _facts(rows):
+def _row_summary(rows):
     """Of each row: whether it is finite, its opacity, its largest scale."""
 
     def finite(leaf):

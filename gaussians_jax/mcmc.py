@@ -178,12 +178,12 @@ def add(
 
 
 def _opacities(rows):
-    active, opacity = _facts(rows)
+    active, opacity = _row_summary(rows)
     return np.asarray(active), np.asarray(opacity, np.float64)
 
 
 @jax.jit
-def _facts(rows):
+def _row_summary(rows):
     return splats.active_mask(rows), splats.activate(rows).opacity
 
 

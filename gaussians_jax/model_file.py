@@ -6,7 +6,7 @@ description. The description may hold the frozen settings of this package; they 
 back as what they were, so that a file is enough to draw a frame:
 
     params, about = model_file.load("model.npz")
-    model = scene.build(about["spec"], about["facts"])
+    model = scene.build(about["spec"], about["metadata"])
     step = jnp.asarray(about["step"], jnp.int32)
     rendering = model.render(params, view, (width, height), step)
 

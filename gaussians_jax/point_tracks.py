@@ -13,7 +13,7 @@ NEIGHBOURS = 8  # Gaussians that carry a point
 LEAST_OPACITY = 0.05  # of a Gaussian that can carry one; fainter ones are not seen
 
 
-def follow(spec, facts, state, capture, known) -> Followed | None:
+def follow(spec, metadata, state, capture, known, effects=()) -> Followed | None:
     """Points of the start at all other moments, carried by the Gaussians around them.
 
     A point moves as the `NEIGHBOURS` nearest Gaussians that can be seen do on average,
@@ -26,10 +26,10 @@ def follow(spec, facts, state, capture, known) -> Followed | None:
     Jacobian, so no strain.
     """
 
-    effects = scene.effects_of(spec, facts)
-    if all(effect.deform is None for effect in effects) or not len(known.path):
+    every = scene.all_effects(spec, metadata, effects)
+    if all(effect.deform is None for effect in every) or not len(known.path):
         return None
-    stages = scene.build(spec, facts).stages
+    stages = scene.build(spec, metadata, effects).stages
     prepared = jax.jit(stages.prepare)(state.params)
     pose = jax.jit(lambda params, ready, time: stages.pose(params, ready, time))
     times = in_default_precision(capture.times[known.moments])

@@ -20,16 +20,23 @@ from nerfies_jax.evaluation.representation import (
     Saved,
 )
 from nerfies_jax.evidence.findings import DEPTH, LIGHT, MOTION, START, TRANSIENT
+from nerfies_jax.training.effects import Effect
 from nerfies_jax.training.model import TrainState
 
 
-def save(folder: pathlib.Path, spec: Any, facts: Any, state: TrainState) -> Saved:
+def save(
+    folder: pathlib.Path,
+    spec: Any,
+    metadata: Any,
+    state: TrainState,
+    effects: tuple[Effect, ...] = (),
+) -> Saved:
     """`model.npz`, all of the scene, and `gaussians.ply` for viewers."""
-    about = {"spec": spec, "facts": facts, "step": int(state.step)}
+    about = {"spec": spec, "metadata": metadata, "step": int(state.step)}
     size = model_file.save(folder / MODEL, state.params, about)
     files.save(folder / "gaussians.ply", state.params.rows["splats"])
-    effects = scene.effects_of(spec, facts)
-    if all(effect.deform is None for effect in effects):
+    every = scene.all_effects(spec, metadata, effects)
+    if all(effect.deform is None for effect in every):
         return Saved(size)
     note = "gaussians.ply holds the canonical Gaussians, without their motion."
     return Saved(size, (note,))
@@ -66,7 +73,7 @@ GAUSSIANS = Representation(
     memory_hint="lower init.points, init.random or raster.capacity with --set",
     time_parts=step_time.parts,
     variant=variants.without_effects,
-    score_halves=lambda *_: None,
+    score_halves=lambda *_, **__: None,
     fitted_rays=0,
     save=save,
     follow=point_tracks.follow,

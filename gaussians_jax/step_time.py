@@ -8,6 +8,7 @@ from gaussians_jax.effects import deformation
 from nerfies_jax.measure.part_time import part_ms
 from nerfies_jax.training import losses
 from nerfies_jax.training.effects import (
+    Effect,
     FrameCondition,
     PenaltyContext,
     penalty_terms,
@@ -17,7 +18,12 @@ from nerfies_jax.training.model import Frames, Model, Rendering, TrainState
 
 
 def parts(
-    spec, facts, model: Model, state: TrainState, frames: Frames
+    spec,
+    metadata,
+    model: Model,
+    state: TrainState,
+    frames: Frames,
+    effects: tuple[Effect, ...] = (),
 ) -> dict[str, float]:
     """Milliseconds of each part of one step, forward and backward; medians, warm.
 
@@ -29,7 +35,7 @@ def parts(
     camera = jax.tree.map(lambda leaf: leaf[0], frames.cameras)
     observation = scene.observe(frames, 0, None)
     condition = FrameCondition(frames.times[0], step=state.step, key=state.key)
-    effects = scene.effects_of(spec, facts)
+    effects = scene.all_effects(spec, metadata, effects)
 
     def draw(gaussians, coefficients):
         frame = rendering.render_harmonics(

@@ -8,22 +8,31 @@ import numpy as np
 
 from gaussians_jax import scene, splats, static_rows, time_knots
 from nerfies_jax.evaluation.representation import check_there
+from nerfies_jax.training.effects import Effect
 from nerfies_jax.training.model import Model, Stages, TrainState
 
 INSTANTS = 33  # at which rows are looked for that move
 
 
-def without_effects(spec, facts, without: tuple[str, ...], blended: bool) -> Model:
+def without_effects(
+    spec,
+    metadata,
+    without: tuple[str, ...],
+    blended: bool,
+    effects: tuple[Effect, ...] = (),
+) -> Model:
     """The model with some effects left out."""
     if blended:
         raise ValueError(
             "--appearance: splats have no appearance codes; reconstruct with a preset "
             "that has them, as nerf-w or nerfies"
         )
+    own = [effect.name for effect in effects if effect.deform is not None]
     there = [name for name in ("motion",) if getattr(spec, name) is not None]
-    check_there(without, there)
-    left = dataclasses.replace(spec, **dict.fromkeys(without))
-    return scene.build(left, facts)
+    check_there(without, [*there, *own])
+    left = {name: None for name in there if name in without}
+    kept = tuple(effect for effect in effects if effect.name not in without)
+    return scene.build(dataclasses.replace(spec, **left), metadata, kept)
 
 
 class Faster(NamedTuple):

@@ -12,7 +12,7 @@ import numpy as np
 from nerfies_jax import evaluation, render_ray, scene
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.training import fit, losses
-from nerfies_jax.training.effects import APPEARANCE, FrameCondition
+from nerfies_jax.training.effects import APPEARANCE, Effect, FrameCondition
 from nerfies_jax.training.model import (
     Rendering,
     TrainState,
@@ -30,16 +30,22 @@ TOLERANCE = 1e-6
 
 
 def score(
-    spec, facts, state: TrainState, capture: Capture, rows: np.ndarray
+    spec,
+    metadata,
+    state: TrainState,
+    capture: Capture,
+    rows: np.ndarray,
+    effects: tuple[Effect, ...] = (),
 ) -> evaluation.Halves | None:
     """Scores of the right halves of frames, their codes fitted to the left ones.
 
     None where the field has no codes that only frames learnt from own. A transient
     medium is left out: what passed by in one frame is in no other.
     """
-    effects = {effect.name for effect in scene.field(spec, facts).effects}
-    passing = tuple(sorted({"transient"} & effects))
-    made = scene.field(spec, facts, passing)
+    whole = scene.field(spec, metadata, effects=effects)
+    names = {effect.name for effect in whole.effects}
+    passing = tuple(sorted({"transient"} & names))
+    made = scene.field(spec, metadata, passing, effects)
     tables = _tables(made)
     if not tables:
         return None
@@ -56,7 +62,7 @@ def score(
                 lambda pixel: (
                     made.render_ray(
                         params,
-                        render_ray.field_ray_through(facts, view.camera, pixel)[0],
+                        render_ray.field_ray_through(metadata, view.camera, pixel)[0],
                         condition,
                     )[-1].colour
                 )

@@ -14,22 +14,22 @@ from nerfies_jax.training.model import in_default_precision
 LEAST_STRETCH = 1e-6  # a collapsed direction has a logarithm, too
 
 
-def follow(spec, facts, state, capture, known) -> Followed | None:
+def follow(spec, metadata, state, capture, known, effects=()) -> Followed | None:
     """Points of the start at all other moments, through the template of a field.
 
     A point goes to the template by the warp of the start, and from there by the inverse
     warp of every other moment.
     """
 
-    made = scene.field(spec, facts)
+    made = scene.field(spec, metadata, effects=effects)
     if all(effect.displace is None for effect in made.effects) or not len(known.path):
         return None
     views = [evaluation.view_of(capture, int(row)) for row in known.moments]
     views = jax.tree.map(lambda *leaves: jnp.stack(leaves), *views)
-    centre = np.asarray(facts.centre, np.float32)
+    centre = np.asarray(metadata.centre, np.float32)
 
     def to_field(points):
-        return in_default_precision((points - centre) * np.float32(facts.scale))
+        return in_default_precision((points - centre) * np.float32(metadata.scale))
 
     still = np.zeros((0, 3), np.float32)
     if capture.points is not None:
@@ -60,7 +60,7 @@ def follow(spec, facts, state, capture, known) -> Followed | None:
             to_field(still),
         )
     )
-    path = followed.points / np.float32(facts.scale) + centre
+    path = followed.points / np.float32(metadata.scale) + centre
     still_path = known.start_points[:, None]
     path = np.where(followed.converged[..., None], path, still_path)
     stretch = np.linalg.svd(np.eye(3) + slopes.astype(float), compute_uv=False)
@@ -68,7 +68,7 @@ def follow(spec, facts, state, capture, known) -> Followed | None:
     return Followed(
         path=path.astype(np.float32),
         found=followed.converged,
-        drift=float(apart.mean() / facts.scale) if apart.size else float("nan"),
+        drift=float(apart.mean() / metadata.scale) if apart.size else float("nan"),
         strain=float(np.sqrt(np.mean(np.sum(strain**2, axis=-1)))),
     )
 

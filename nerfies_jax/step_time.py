@@ -5,15 +5,20 @@ import jax
 from nerfies_jax import scene
 from nerfies_jax.measure.part_time import part_ms
 from nerfies_jax.training import loop
-from nerfies_jax.training.effects import weighted_sum
+from nerfies_jax.training.effects import Effect, weighted_sum
 from nerfies_jax.training.model import Frames, Model, TrainState
 
 
 def parts(
-    spec, facts, model: Model, state: TrainState, frames: Frames
+    spec,
+    metadata,
+    model: Model,
+    state: TrainState,
+    frames: Frames,
+    effects: tuple[Effect, ...] = (),
 ) -> dict[str, float]:
     """Milliseconds of each part of one step of a radiance field; medians, warm."""
-    made = scene.field(spec, facts)
+    made = scene.field(spec, metadata, effects=effects)
     batch_key, loss_key = jax.random.split(loop.step_key(state))
     batch = jax.jit(scene.draw_batch, static_argnums=1)(frames, spec.rays, batch_key)
 

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Int
 from nerfies_jax import scene
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation.representation import check_there
-from nerfies_jax.training.effects import APPEARANCE
+from nerfies_jax.training.effects import APPEARANCE, Effect
 from nerfies_jax.training.model import Model, View
 
 
@@ -20,10 +20,15 @@ class Between(NamedTuple):
     share: Float[Array, ""]  # in [0, 1]
 
 
-def without_effects(spec, facts, without: tuple[str, ...], blended: bool) -> Model:
+def without_effects(
+    spec,
+    metadata,
+    without: tuple[str, ...],
+    blended: bool,
+    effects: tuple[Effect, ...] = (),
+) -> Model:
     """The model with some effects left out of its pictures, or drawing a `Between`."""
-
-    whole = scene.field(spec, facts)
+    whole = scene.field(spec, metadata, effects=effects)
     # What feeds the network's inputs is part of it; a penalty draws nothing.
     drawn = [
         effect.name
@@ -33,7 +38,7 @@ def without_effects(spec, facts, without: tuple[str, ...], blended: bool) -> Mod
         and effect.lift is None
     ]
     check_there(without, drawn)
-    made = scene.field(spec, facts, without)
+    made = scene.field(spec, metadata, without, effects)
     tables = [table for effect in made.effects for table in effect.tables]
     if blended and all(table.by != APPEARANCE for table in tables):
         raise ValueError(
@@ -54,7 +59,7 @@ def without_effects(spec, facts, without: tuple[str, ...], blended: bool) -> Mod
         return made.render(params, view.camera, view.time, codes, size, step)
 
     render = blend if blended else plain
-    return scene.build(spec, facts)._replace(render=render, stages=None)
+    return scene.build(spec, metadata, effects)._replace(render=render, stages=None)
 
 
 def appearance_id(capture: Capture, name: str) -> int:

@@ -54,7 +54,7 @@ class Built(NamedTuple):
 
     representation: Any
     spec: Any
-    facts: Any
+    metadata: Any
     model: Any
     renderer: Any
     compile_seconds: float
@@ -229,7 +229,7 @@ class Job:
             arm.renderer, result.state, self.capture, self.known.rows
         )
         followed = arm.representation.follow(
-            arm.spec, arm.facts, result.state, self.capture, self.known
+            arm.spec, arm.metadata, result.state, self.capture, self.known
         )
         found = heldout.heldout_metrics(
             scored, self.capture, known=self.known, followed=followed
@@ -267,8 +267,8 @@ class Job:
             spec = self.spec(name, steps)
             preset = self.suite.arms[name].preset
             representation = representations.of_preset(preset)
-            facts = representation.metadata_of(self.capture, spec)
-            model = representation.build(spec, facts)
+            metadata = representation.metadata_of(self.capture, spec)
+            model = representation.build(spec, metadata)
             self._cache_saved = 0.0
             first = loop.fit(
                 model,
@@ -280,7 +280,7 @@ class Job:
             seconds = first.compile_seconds + self._cache_saved
             renderer = evaluation.Renderer(model, self.capture.size)
             self._built[name, steps] = Built(
-                representation, spec, facts, model, renderer, seconds
+                representation, spec, metadata, model, renderer, seconds
             )
         return self._built[name, steps]
 

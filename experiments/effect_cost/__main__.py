@@ -240,8 +240,8 @@ def _compile(representation, capture, spec, at):
     from nerfies_jax import evaluation
     from nerfies_jax.measure import clock, matrix_flops
 
-    facts = representation.metadata_of(capture, spec)
-    model = representation.build(spec, facts)
+    metadata = representation.metadata_of(capture, spec)
+    model = representation.build(spec, metadata)
     state = model.init(capture, jax.random.key(0))
     state = state._replace(step=jnp.asarray(round(at * spec.steps), jnp.int32))
     frames = evaluation.frames_of(capture, model.required_data)

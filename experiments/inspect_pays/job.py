@@ -147,8 +147,8 @@ class Trial:
         spec = self._job.spec(name, self.asked.steps)
         representation = representations.of_preset(self._job.suite.arms[name].preset)
         try:
-            facts = representation.metadata_of(self._job.capture, spec)
-            representation.build(spec, facts)
+            metadata = representation.metadata_of(self._job.capture, spec)
+            representation.build(spec, metadata)
         except ValueError as error:
             return name, str(error)
         return None

@@ -155,5 +155,5 @@ def _endpoints(path, known):
     )
 
 
-# (spec, facts, state, capture, known) -> None where nothing is warped
+# (spec, metadata, state, capture, known) -> None where nothing is warped
 Follow = Callable[[Any, Any, TrainState, Capture, Known], Followed | None]

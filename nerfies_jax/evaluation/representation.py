@@ -4,7 +4,6 @@
 "nerfies_jax.representations", so it imports no package that has one.
 """
 
-import pathlib
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
@@ -12,7 +11,7 @@ from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation.model_flow import Mover
 from nerfies_jax.evaluation.protocol import Follow
 from nerfies_jax.evaluation.scores import Halves
-from nerfies_jax.training.model import Frames, Model, TrainState
+from nerfies_jax.training.model import Model
 
 Spec = Any
 MODEL = "model.npz"  # in a run folder: all of a trained scene of Gaussians
@@ -45,7 +44,10 @@ class Pair(NamedTuple):
 
 
 class Representation(NamedTuple):
-    """How its scenes are named, built, followed, timed and saved."""
+    """How its scenes are named, built, followed, timed and saved.
+
+    What takes a spec and its metadata takes `effects`, those of the user's own, too.
+    """
 
     name: str
     # How many cores XLA:CPU should see: "one" where its own threading slows the loops.
@@ -54,20 +56,20 @@ class Representation(NamedTuple):
     presets: dict[str, Spec]
     with_steps: Callable[[Spec, int], Spec]  # schedules stretch with the steps
     metadata_of: Callable[[Capture, Spec], Any]
-    build: Callable[..., Model]  # (spec, facts) -> model
+    build: Callable[..., Model]  # (spec, metadata, effects=()) -> model
     estimate_memory_bytes: Callable[[Spec, Capture], int]  # of the first state and step
     memory_hint: str  # which settings make the first state smaller
-    # (spec, facts, model, state, frames) -> milliseconds of each part of a step
-    time_parts: Callable[[Spec, Any, Model, TrainState, Frames], dict[str, float]]
-    # (spec, facts, effects left out, whether appearances are blended) -> model;
-    # it draws a `nerfies_jax.variants.Between` instead of a view where they are.
-    variant: Callable[[Spec, Any, tuple[str, ...], bool], Model]
-    # (spec, facts, state, capture, rows) -> scores with codes fitted to half a frame;
+    # (spec, metadata, model, state, frames, effects=()) -> ms of each part of a step
+    time_parts: Callable[..., dict[str, float]]
+    # (spec, metadata, names left out, whether appearances are blended, effects=()) ->
+    # model; it draws a `nerfies_jax.variants.Between` instead of a view where they are.
+    variant: Callable[..., Model]
+    # (spec, metadata, state, capture, rows, effects=()), codes fitted to half a frame;
     # None where the scene has no codes of its own for each frame.
     score_halves: Callable[..., Halves | None]
     fitted_rays: int  # rendered to fit the codes of one frame
-    # (folder, spec, facts, state) -> what it wrote beside the checkpoint
-    save: Callable[[pathlib.Path, Spec, Any, TrainState], Saved]
+    # (folder, spec, metadata, state, effects=()) -> what it wrote beside the checkpoint
+    save: Callable[..., Saved]
     follow: Follow
     mover: Mover
     # ({effect: whether it is called for, None unknown}, papers' sizes) -> what to take

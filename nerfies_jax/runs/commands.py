@@ -22,6 +22,8 @@ def reconstruct(config: RunConfig) -> str:
         words += ["--seed", str(config.seed)]
     if config.overrides:
         words += ["--set", *config.overrides]
+    if config.effects:
+        words += ["--effect", *config.effects]
     return shlex.join(words)
 
 

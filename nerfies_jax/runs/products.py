@@ -63,7 +63,9 @@ def make(
         )
     film = save_film(folder / "scene.mp4", run, renderer, state, ms_per_frame / 1e3)
     save_depth(folder / "depth", run.capture, scored)
-    saved = run.representation.save(folder, run.spec, run.facts, state)
+    saved = run.representation.save(
+        folder, run.spec, run.metadata, state, effects=run.effects
+    )
     frames = evaluation.frames_of(run.capture, run.model.required_data)
     fitted, gain = score_halves(run, state, scored, ms_per_frame / 1e3)
     found, remarks = quality.measure(run, state, renderer, scored, extra)
@@ -85,7 +87,9 @@ def make(
         json.loads((folder / CONFIG).read_text()),
         figures,
         film,
-        run.representation.time_parts(run.spec, run.facts, run.model, state, frames),
+        run.representation.time_parts(
+            run.spec, run.metadata, run.model, state, frames, effects=run.effects
+        ),
         notes,
         following,
     )
@@ -167,7 +171,12 @@ def score_halves(
     count = budget.halves(frame_seconds, share, len(scored.rows))
     few = evaluation.spread(np.arange(len(scored.rows)), count)
     halves = run.representation.score_halves(
-        run.spec, run.facts, state, run.capture, scored.rows[few]
+        run.spec,
+        run.metadata,
+        state,
+        run.capture,
+        scored.rows[few],
+        effects=run.effects,
     )
     if halves is None:
         return [], ()

@@ -13,11 +13,12 @@ from nerfies_jax.capture import pinholes, synthetic
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.json_files import write_json
 from nerfies_jax.evaluation.representation import Representation
-from nerfies_jax.runs import representations
+from nerfies_jax.runs import own_effects, representations
 from nerfies_jax.runs.config import CaptureSource, RunConfig
 from nerfies_jax.runs.platform import CACHE
 from nerfies_jax.runs.run_folder import CHECKPOINTS, CONFIG
 from nerfies_jax.training import checkpoint, specs
+from nerfies_jax.training.effects import Effect
 from nerfies_jax.training.model import Model, TrainState
 from nerfies_jax.training.provenance import provenance
 
@@ -37,8 +38,9 @@ class Run(NamedTuple):
     capture: Capture
     representation: Representation
     spec: Any  # of the representation's `spec_type`
-    facts: Any  # what the scene must know of the capture
+    metadata: Any  # what the scene must know of the capture
     model: Model
+    effects: tuple[Effect, ...] = ()  # of the user's own, beside those of the spec
 
 
 def new_run(config: RunConfig, stored: Capture | None = None) -> Run:
@@ -58,9 +60,10 @@ def open_run(
 ) -> Run:
     """Read the capture and build the model."""
     capture = pinholes.as_pinholes(stored or stored_capture(config.source, config.seed))
-    facts = representation.metadata_of(capture, spec)
-    model = representation.build(spec, facts)
-    return Run(config, capture, representation, spec, facts, model)
+    metadata = representation.metadata_of(capture, spec)
+    effects = own_effects.load(config.effects, metadata)
+    model = representation.build(spec, metadata, effects=effects)
+    return Run(config, capture, representation, spec, metadata, model, effects)
 
 
 def scene_spec(config: RunConfig) -> Any:

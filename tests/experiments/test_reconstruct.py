@@ -119,7 +119,7 @@ def test_the_metrics_are_all_there_and_finite(run):
 @pytest.mark.slow
 def test_the_model_file_is_enough_to_draw_a_frame(run):
     params, about = model_file.load(run / "model.npz")
-    model = scene.build(about["spec"], about["facts"])
+    model = scene.build(about["spec"], about["metadata"])
     state = TrainState(params, (), (), jnp.asarray(about["step"], jnp.int32), None)
     capture = scenes.tiny_capture()
     filmed = runs.saved_run(run)

@@ -36,7 +36,7 @@ def trained():
     )
     about = {
         "spec": scenes.TINY_DEFORMABLE,
-        "facts": metadata,
+        "metadata": metadata,
         "step": 20,
         "name": "tiny",
     }
@@ -76,7 +76,7 @@ def test_a_frame_is_drawn_from_the_file_alone(trained, saved):
     view = evaluation.view_of(scenes.tiny_capture(), 3)
     pictures = []
     for params, about in (trained, model_file.load(saved)):
-        model = scene.build(about["spec"], about["facts"])
+        model = scene.build(about["spec"], about["metadata"])
         step = jnp.asarray(about["step"], jnp.int32)
         draw = jax.jit(model.render, static_argnums=2)
         pictures.append(draw(params, view, SIZE, step).colour)

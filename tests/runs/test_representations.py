@@ -50,13 +50,13 @@ def test_a_scene_of_gaussians_is_saved_as_a_model_and_for_viewers(moving, tmp_pa
     kind = representations.named("gaussians")
     spec = scenes.TINY_DEFORMABLE if moving else scenes.TINY_SPLATS
     capture = scenes.tiny_capture()
-    facts = kind.metadata_of(capture, spec)
-    state = kind.build(spec, facts).init(capture, jax.random.key(0))
-    saved = kind.save(tmp_path, spec, facts, state)
+    metadata = kind.metadata_of(capture, spec)
+    state = kind.build(spec, metadata).init(capture, jax.random.key(0))
+    saved = kind.save(tmp_path, spec, metadata, state)
     assert saved.model_bytes == (tmp_path / MODEL).stat().st_size
     assert [note.split()[0] for note in saved.notes] == ["gaussians.ply"] * moving
     params, about = model_file.load(tmp_path / MODEL)
-    assert about == {"spec": spec, "facts": facts, "step": 0}
+    assert about == {"spec": spec, "metadata": metadata, "step": 0}
     assert jax.tree.structure(params) == jax.tree.structure(state.params)
     active = splats.active_mask(state.params.rows["splats"]).sum()
     assert len(params.rows["splats"].mean) == active
