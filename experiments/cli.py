@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from nerfies_jax.runs.config import CaptureSource
+from nerfies_jax.runs.config import CaptureSource, MoreMetrics
 
 Positional = tyro.conf.Positional
 
@@ -29,6 +29,7 @@ class NamedSource(CaptureSource):
 
 # Their fields stand among the other options of a command.
 Source = Annotated[NamedSource, tyro.conf.arg(name="")]
+More = Annotated[MoreMetrics, tyro.conf.arg(name="")]
 SourceOptions = Annotated[CaptureSource, tyro.conf.arg(name="")]
 
 

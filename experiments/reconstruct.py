@@ -14,7 +14,7 @@ from typing import Literal
 
 from experiments import cli
 from nerfies_jax.runs import commands, platform, representations
-from nerfies_jax.runs.config import RunConfig
+from nerfies_jax.runs.config import MoreMetrics, RunConfig
 from nerfies_jax.training import stopping
 
 DEFAULT_PRESET = "splats-deformable-small"
@@ -53,6 +53,7 @@ class Reconstruct:
     """Seconds of training between two points of the PSNR curve."""
     checkpoint_every: float = 60.0
     """Seconds between two checkpoints; a run that is killed loses no more than that."""
+    more: cli.More = MoreMetrics()
 
 
 def main(arguments=None):
@@ -83,9 +84,9 @@ def _outcome(asked):
         platform.start_jax(asked.device, _threads(asked))
     from nerfies_jax import runs
 
-    pace = {
+    common = {
         name: getattr(asked, name)
-        for name in ("seconds", "evaluate_every", "checkpoint_every")
+        for name in ("more", "seconds", "evaluate_every", "checkpoint_every")
     }
     if asked.resume:
         steps = () if asked.steps is None else (f"steps={asked.steps}",)
@@ -94,7 +95,7 @@ def _outcome(asked):
                 asked.out,
                 expected=_expected(asked),
                 overrides=(*steps, *asked.set),
-                **pace,
+                **common,
             )
     config = RunConfig(
         preset=_preset(asked),
@@ -105,7 +106,7 @@ def _outcome(asked):
         seed=asked.seed or 0,
     )
     with cli.user_errors((runs.Refused,)):
-        return runs.reconstruct(config, asked.out, effects=asked.effects, **pace)
+        return runs.reconstruct(config, asked.out, effects=asked.effects, **common)
 
 
 def _check_resumed(asked):

@@ -4,6 +4,7 @@ python -m experiments.render RUN                         # the held-out frames
 python -m experiments.render RUN --path orbit            # mp4 of the moving scene
 python -m experiments.render RUN --path sway --freeze 0.5
 python -m experiments.render RUN --path sway --show depth
+python -m experiments.render RUN --path sway --show flow
 python -m experiments.render RUN --without warp          # the canonical scene
 python -m experiments.render RUN --hide-moving 0.02       # what stands still alone
 python -m experiments.render RUN --path sway --freeze 0 --appearance 0 7
@@ -56,8 +57,10 @@ class Render:
     hide_moving: float | None = None
     """Leave out the Gaussians that move farther than this, in scene units: the static
     scene, with holes where nothing was ever filmed behind what moves."""
-    show: Literal["colour", "depth"] = "colour"
-    """What the png and mp4 pictures show; depth is bright near and dark far."""
+    show: Literal["colour", "depth", "flow"] = "colour"
+    """What the png and mp4 pictures show; depth is bright near and dark far, flow is
+    where what is seen goes up to the next picture: direction as hue, length as
+    saturation."""
     out: pathlib.Path | None = None
     """Folder for the pictures (default: RUN/renders/PATH)."""
     formats: tuple[Literal["png", "mp4", "exr"], ...] = ("png", "mp4")
@@ -85,6 +88,11 @@ class Render:
                     f"--{name.replace('_', '-')} {distance}: a distance in scene "
                     "units, not negative"
                 )
+        if self.show == "flow" and (self.without or self.appearance is not None):
+            raise ValueError(
+                "--show flow follows the motion of the whole scene; leave out "
+                "--without and --appearance"
+            )
         if not self.formats:
             raise ValueError("--formats: name at least one of png, mp4, exr")
 
@@ -98,14 +106,18 @@ def main(arguments=None):
         from nerfies_jax import evaluation, runs
 
         run = runs.saved_run(asked.run)
+        move = _mover(asked, run)
         state = _shown(asked, run.model, runs.restore(asked.run, run).state)
         size = _size(run.capture.size, asked.max_side)
+        trained = state
         model, state = _faster(asked, _model(asked, run), state)
         names, views = _views(asked, run)
         views = _seen(asked, run, size, views)
         out = asked.out or asked.run / "renders" / _name(asked)
         out.mkdir(parents=True, exist_ok=True)
-    _write(asked, out, evaluation.Renderer(model, size), state, names, views)
+    picture_of = _Pictures(asked.show, move, trained, size, views)
+    renderer = evaluation.Renderer(model, size)
+    _write(asked, out, renderer, state, names, views, picture_of)
 
 
 def _name(asked):
@@ -132,6 +144,18 @@ def _model(asked, run):
     return run.representation.variant(
         run.spec, run.metadata, asked.without, blended, effects=run.effects
     )
+
+
+def _mover(asked, run):
+    """What takes points from one picture to the next, where that is to be seen."""
+    if asked.show != "flow":
+        return None
+    move = run.representation.mover(run.spec, run.facts)
+    if move is None:
+        raise ValueError(
+            "--show flow: nothing in this run moves points; it needs a warp or motion"
+        )
+    return move
 
 
 def _shown(asked, model, state):
@@ -208,16 +232,14 @@ def _views(asked, run):
     return names, evaluation.path_views(path, times, like)
 
 
-def _write(asked, out, renderer, state, names, views):
+def _write(asked, out, renderer, state, names, views, picture_of):
     """Render view after view and write each as it comes."""
     from nerfies_jax.capture import exr, images, video
 
-    picture_of = _Pictures(asked.show)
-
     def pictures():
-        for name, view in zip(names, views, strict=True):
+        for place, (name, view) in enumerate(zip(names, views, strict=True)):
             rendering = renderer(state, view)
-            picture = picture_of(rendering)
+            picture = picture_of(rendering, place)
             if "png" in asked.formats:
                 images.write_png(out / f"{name}.png", picture)
             if "exr" in asked.formats:
@@ -242,22 +264,46 @@ def _write(asked, out, renderer, state, names, views):
 
 
 class _Pictures:
-    """Renderings as 8-bit pictures; depths all over the range of the first."""
+    """Renderings as 8-bit pictures.
 
-    def __init__(self, show):
+    Depths and flows are all over the range of the first that has any.
+    """
+
+    def __init__(self, show, move, state, size, views):
         self.show, self.limits = show, None
+        self._move, self._state, self._views = move, state, views
+        self._size = size
 
-    def __call__(self, rendering):
+    def __call__(self, rendering, place):
         from nerfies_jax import evaluation
         from nerfies_jax.evaluation import pictures
 
         if self.show == "colour":
             return evaluation.as_picture(rendering.colour)
         known = rendering.alpha > 0.5
+        if self.show == "flow":
+            flow = self._flow(np.where(known, rendering.depth, 0), place)
+            coloured = pictures.colour_flow(flow, self.limits)
+            if np.nanmax(np.abs(flow), initial=0) > 0:
+                self.limits = coloured.high
+            return coloured.picture
         coloured = pictures.colour_depth(rendering.depth, known, self.limits)
         if known.any():
             self.limits = coloured.low, coloured.high
         return coloured.picture
+
+    def _flow(self, depth, place):
+        """To the next picture; the last one has none, and stands still."""
+        from nerfies_jax.evaluation import model_flow
+
+        width, height = self._size
+        column, line = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+        pixels = np.stack([column.ravel(), line.ravel()], axis=1)
+        here, there = self._views[place], self._views[place : place + 2][-1]
+        flow = model_flow.pixel_flow(
+            self._move, self._state, here, there, pixels, depth.ravel()
+        )
+        return flow.reshape(height, width, 2)
 
 
 def _size(size, max_side):

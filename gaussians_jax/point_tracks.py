@@ -5,6 +5,7 @@ import numpy as np
 import scipy.spatial
 
 from gaussians_jax import scene, splats
+from nerfies_jax.evaluation.model_flow import Move, Moved
 from nerfies_jax.evaluation.protocol import STILL_POINTS, Followed
 from nerfies_jax.training.model import in_default_precision
 
@@ -37,8 +38,7 @@ def follow(spec, metadata, state, capture, known, effects=()) -> Followed | None
         [np.asarray(pose(state.params, prepared, time).mean) for time in times]
     )
     first = pose(state.params, prepared, times[known.start])
-    active = np.asarray(splats.active_mask(state.params.rows["splats"]))
-    opacity = np.where(active, np.asarray(first.opacity), 0.0)
+    opacity = _seen_opacity(state, first)
     path = carried(known.start_points, means, opacity, known.start)
     drift = float("nan")
     if capture.points is not None:
@@ -52,6 +52,35 @@ def follow(spec, metadata, state, capture, known, effects=()) -> Followed | None
         drift=drift,
         strain=float("nan"),
     )
+
+
+def mover(spec, facts) -> Move | None:
+    """What takes points of one view's instant to another's, as `follow` does.
+
+    None where nothing moves the Gaussians.
+    """
+    effects = scene.effects_of(spec, facts)
+    if all(effect.deform is None for effect in effects):
+        return None
+    stages = scene.build(spec, facts).stages
+
+    @jax.jit
+    def pose(params, time):
+        return stages.pose(params, stages.prepare(params), time)
+
+    def move(state, points, here, there):
+        first, last = (pose(state.params, view.time) for view in (here, there))
+        means = np.stack([np.asarray(first.mean), np.asarray(last.mean)])
+        path = carried(points, means, _seen_opacity(state, first), 0)
+        return Moved(path[:, 1].astype(points.dtype), np.ones(len(points), bool))
+
+    return move
+
+
+def _seen_opacity(state, posed):
+    """[gaussians] opacity of posed Gaussians, 0 for rows that are not active."""
+    active = np.asarray(splats.active_mask(state.params.rows["splats"]))
+    return np.where(active, np.asarray(posed.opacity), 0.0)
 
 
 def carried(

@@ -77,6 +77,7 @@ GAUSSIANS = Representation(
     fitted_rays=0,
     save=save,
     follow=point_tracks.follow,
+    mover=point_tracks.mover,
     advise=advise,
     prices={
         MOTION: Pair("splats-deformable-small", "only_motion"),

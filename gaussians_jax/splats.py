@@ -243,16 +243,6 @@ def _neighbour_distance(points, lone_scale):
     return np.sqrt(np.mean(distance[:, 1:] ** 2, axis=1))[place.reshape(-1)]
 
 
-def random_in_box(
-    rng: np.random.Generator, low: np.ndarray, high: np.ndarray, count: int
-) -> np.ndarray:
-    """`count` points [count, 3] spread evenly over an axis-aligned box; host side."""
-    low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
-    if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
-        raise ValueError(f"a box needs low < high on every axis, got {low} and {high}")
-    return rng.uniform(low, high, (count, 3))
-
-
 def random_in_views(
     rng: np.random.Generator,
     cameras: Camera,

@@ -94,8 +94,12 @@ def field(
 
         width, height = size
         centres = rays.pixel_centres(size, camera.position.dtype).reshape(-1, 2)
+        # A slope, as of the camera, is found block by block: all samples of a frame at
+        # once would need as much memory as a training step over all its pixels.
         flat = jax.lax.map(
-            pixel, centres, batch_size=min(spec.sampling.block, width * height)
+            jax.checkpoint(pixel),
+            centres,
+            batch_size=min(spec.sampling.block, width * height),
         )
         return jax.tree.map(lambda x: x.reshape(height, width, *x.shape[1:]), flat)
 

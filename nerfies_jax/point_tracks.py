@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from nerfies_jax import evaluation, scene
+from nerfies_jax.evaluation.model_flow import Move, Moved
 from nerfies_jax.evaluation.protocol import STILL_POINTS, Followed
 from nerfies_jax.training import tracks
 from nerfies_jax.training.effects import FrameCondition
@@ -70,3 +71,31 @@ def follow(spec, metadata, state, capture, known, effects=()) -> Followed | None
         drift=float(apart.mean() / metadata.scale) if apart.size else float("nan"),
         strain=float(np.sqrt(np.mean(np.sum(strain**2, axis=-1)))),
     )
+
+
+def mover(spec, facts) -> Move | None:
+    """What takes points of one view's moment to another's; None without a warp."""
+    made = scene.field(spec, facts)
+    if all(effect.displace is None for effect in made.effects):
+        return None
+    centre = np.asarray(facts.centre, np.float32)
+
+    @jax.jit
+    def solve(params, step, points, here, there):
+        def condition_of(view):
+            return FrameCondition(view.time, made.codes_at(params, view), step)
+
+        views = jax.tree.map(lambda *leaves: jnp.stack(leaves), here, there)
+        conditions = jax.vmap(condition_of)(views)
+        found = tracks.point_tracks(made.displace, params, points, conditions, 0)
+        return found.points[:, 1], found.converged[:, 1]
+
+    def move(state, points, here, there):
+        inside = in_default_precision((points - centre) * np.float32(facts.scale))
+        found, known = jax.device_get(
+            solve(state.params, state.step, inside, here, there)
+        )
+        moved = found / np.float32(facts.scale) + centre
+        return Moved(np.where(known[:, None], moved, points), known)
+
+    return move

@@ -59,6 +59,7 @@ RADIANCE = Representation(
     fitted_rays=held_out_codes.RAYS * held_out_codes.EVALUATIONS,
     save=lambda *_, **__: Saved(),  # the checkpoint holds all there is
     follow=point_tracks.follow,
+    mover=point_tracks.mover,
     advise=advise,
     # Motion brings the elastic penalty along.
     prices={

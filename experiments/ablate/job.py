@@ -11,13 +11,13 @@ import jax
 import rich.console
 
 from experiments import cli
-from experiments.ablate import results, suites
+from experiments.ablate import measures, results, suites
 from experiments.ablate.log import line, say
 from experiments.ablate.results import Kept
 from experiments.ablate.settings import Ablate
 from nerfies_jax import evaluation, runs
 from nerfies_jax.capture import synthetic
-from nerfies_jax.evaluation import protocol
+from nerfies_jax.evaluation import heldout, protocol
 from nerfies_jax.measure import clock
 from nerfies_jax.runs import platform, representations
 from nerfies_jax.runs.config import CaptureSource
@@ -225,16 +225,18 @@ class Job:
         if result.stopped_by.startswith("SIG"):
             print(f"stopped; go on with the same command and --out {self.out}")
             raise SystemExit(130 if result.stopped_by == "SIGINT" else 143)
-        scored, pictures = protocol.score_pictures(
-            arm.renderer, result.state, self.capture, self.known
+        scored = evaluation.score(
+            arm.renderer, result.state, self.capture, self.known.rows
         )
         followed = arm.representation.follow(
             arm.spec, arm.metadata, result.state, self.capture, self.known
         )
+        found = heldout.heldout_metrics(
+            scored, self.capture, known=self.known, followed=followed
+        )
         counts = arm.model.counts(result.state)
         numbers = {
-            **pictures,
-            **protocol.score_tracks(self.known, followed),
+            **measures.quality(found, self.known.exact),
             "gaussians": float(counts.get("gaussians", float("nan"))),
             "parameters": float(counts["parameters"]),
             "steps": float(result.steps),

@@ -46,6 +46,33 @@ MEASURES = {
 
 COSTS = tuple(MEASURES)[tuple(MEASURES).index("gaussians") :]  # the others are quality
 
+# What `nerfies_jax.evaluation.heldout` calls the measures of quality.
+KEYS = {
+    "psnr": "heldout.psnr",
+    "ssim": "heldout.ssim",
+    "moving_psnr": "heldout.moving_psnr",
+    "moving_ssim": "heldout.moving_ssim",
+    "depth_median": "heldout.depth_median",
+    "depth_rmse": "heldout.depth_rmse",
+    "moving_depth_median": "heldout.moving_depth_median",
+    "moving_depth_rmse": "heldout.moving_depth_rmse",
+    "track_error": "tracks.epe",
+    "track_correct": "tracks.correct",
+    "track_lost": "tracks.lost",
+    "drift": "tracks.drift",
+    "strain": "tracks.strain",
+}
+ESTIMATED = tuple(KEYS)[2:8]  # where not exact, and nothing is judged by estimates
+
+
+def quality(found: Mapping[str, float], exact: bool) -> dict[str, float]:
+    """The measures of quality of an arm; NaN for what is not known."""
+    numbers = {name: found.get(key, float("nan")) for name, key in KEYS.items()}
+    if not exact:
+        numbers |= dict.fromkeys(ESTIMATED, float("nan"))
+    return numbers
+
+
 # One line and more for the columns of a group; a group is explained where it is shown.
 LEGENDS = {
     "psnr": "PSNR, SSIM: of the 8-bit picture of a held-out camera, mean over the "

@@ -147,21 +147,6 @@ def haar_pyramid(image: Float[Array, "height width channels"], levels: int) -> P
     return Pyramid(tuple(high), low)
 
 
-def haar_image(
-    pyramid: Pyramid, height: int, width: int
-) -> Float[Array, "{height} {width} channels"]:
-    """The picture of which `haar_pyramid` made this."""
-    sizes = [(height, width)]
-    for _ in pyramid.high[1:]:
-        sizes.append(((sizes[-1][0] + 1) // 2, (sizes[-1][1] + 1) // 2))
-    image = pyramid.low
-    for bands, (rows, columns) in zip(
-        reversed(pyramid.high), reversed(sizes), strict=True
-    ):
-        image = _join(image, bands)[:rows, :columns]
-    return image
-
-
 def _split(image):
     height, width, channels = image.shape
     odd = ((0, height % 2), (0, width % 2), (0, 0))
@@ -176,18 +161,6 @@ def _split(image):
         hh=((a - b) - (c - d)) / 2,
     )
     return ((a + b) + (c + d)) / 2, bands
-
-
-def _join(low, bands):
-    height, width, channels = low.shape
-    top = jnp.stack(
-        [low + bands.hl + bands.lh + bands.hh, low - bands.hl + bands.lh - bands.hh], 2
-    )
-    bottom = jnp.stack(
-        [low + bands.hl - bands.lh - bands.hh, low - bands.hl - bands.lh + bands.hh], 2
-    )
-    quads = jnp.stack([top, bottom], 1) / 2  # [height, 2, width, 2, channels]
-    return quads.reshape(2 * height, 2 * width, channels)
 
 
 def filled(

@@ -29,9 +29,7 @@ class ExrPicture(NamedTuple):
 
 def read_exr(path: AnyPath) -> ExrPicture:
     """The first part's data window. A luminance channel Y alone becomes grey colour."""
-    path = pathlib.Path(path)
-    if not path.is_file():
-        raise CaptureError(f"{path}: no such picture; restore it or drop its frame")
+    path = _existing(path)
     try:
         origin, (width, height) = _window(path)
         with OpenEXR.File(str(path), separate_channels=True) as file:
@@ -41,14 +39,35 @@ def read_exr(path: AnyPath) -> ExrPicture:
     except CaptureError:
         raise
     except Exception as error:  # OpenEXR raises RuntimeError, ValueError and its own
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise CaptureError(
-            f"{path}: not a readable EXR ({reason}); it may be cut short, so write it "
-            "again"
-        ) from None
+        raise _unreadable(path, error) from None
     if not channels or any(c.shape != (height, width) for c in channels.values()):
         raise CaptureError(f"{path}: its pixels do not fill its window; write it again")
     return _picture(channels, origin)
+
+
+def read_size(path: AnyPath) -> tuple[int, int]:
+    """Width and height in pixels, from the header alone."""
+    path = _existing(path)
+    try:
+        return _window(path)[1]
+    except CaptureError:
+        raise
+    except Exception as error:  # as above
+        raise _unreadable(path, error) from None
+
+
+def _existing(path):
+    path = pathlib.Path(path)
+    if not path.is_file():
+        raise CaptureError(f"{path}: no such picture; restore it or drop its frame")
+    return path
+
+
+def _unreadable(path, error):
+    reason = " ".join(str(error).split()) or type(error).__name__
+    return CaptureError(
+        f"{path}: not a readable EXR ({reason}); it may be cut short, so write it again"
+    )
 
 
 def _window(path):

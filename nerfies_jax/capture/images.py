@@ -1,7 +1,7 @@
 """Pictures in and out: PNG and JPEG by scikit-image, EXR by OpenEXR.
 
 Sizes are bounded from the header, before anything is decoded. Colours are sRGB in 8
-bits on disk and in memory; EXR holds linear light and depth in floats.
+bits on disk and in memory; EXR holds linear light, which is turned into them.
 """
 
 import pathlib
@@ -12,12 +12,14 @@ import numpy as np
 import PIL.Image
 import skimage.io
 
+from nerfies_jax.capture import exr
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.json_files import AnyPath, replaced_file
 
 # An 8K video frame has 33 million. Pillow itself only warns above 89 million, and at
 # 144 million a picture is 430 MB.
 MAX_PIXELS = 64_000_000
+EXR = ".exr"
 _ORIENTATION = 0x0112  # the EXIF tag; 1 is upright, 0 unknown
 _PILLOW_ERRORS = (OSError, SyntaxError, ValueError, EOFError, IndexError, TypeError)
 
@@ -26,13 +28,15 @@ class Header(NamedTuple):
     """What a picture says about itself before it is decoded."""
 
     size: tuple[int, int]  # width, height as stored
-    mode: str  # Pillow's name: RGB, RGBA, L, LA, P, I;16, ...
+    mode: str  # Pillow's name: RGB, RGBA, L, LA, P, I;16, ...; or EXR
     orientation: int  # EXIF, 1 where absent
 
 
 def read_header(path: AnyPath) -> Header:
-    """Size and kind of a PNG or JPEG, checked against `MAX_PIXELS`."""
+    """Size and kind of a PNG, JPEG or EXR, checked against `MAX_PIXELS`."""
     path = pathlib.Path(path)
+    if path.suffix.lower() == EXR:
+        return _checked(path, Header(exr.read_size(path), "EXR", 1))
     if not path.is_file():
         raise CaptureError(f"{path}: no such picture; restore it or drop its frame")
     try:
@@ -46,6 +50,10 @@ def read_header(path: AnyPath) -> Header:
         ) from None
     except _PILLOW_ERRORS as error:
         raise _unreadable(path, error) from None
+    return _checked(path, header)
+
+
+def _checked(path, header):
     width, height = header.size
     if width * height > MAX_PIXELS:
         raise CaptureError(
@@ -71,9 +79,12 @@ def read_pixels(path: AnyPath, orientation: str = "refuse") -> np.ndarray:
     A picture that a viewer would turn (EXIF) is refused, unless `orientation` is
     "stored": then its pixels come as they lie in the file, which is what COLMAP's
     cameras refer to. 16-bit grey is rounded to 8 bits; 16-bit colour is cut to them.
+    The linear light of an EXR becomes sRGB, brighter than 1 as 1.
     """
     path = pathlib.Path(path)
     header = read_header(path)
+    if header.mode == "EXR":
+        return _exr_pixels(path)
     if header.orientation not in (0, 1) and orientation != "stored":
         raise CaptureError(
             f"{path}: its EXIF orientation is {header.orientation}, so a viewer turns "
@@ -110,6 +121,18 @@ def read_pixels(path: AnyPath, orientation: str = "refuse") -> np.ndarray:
             "8-bit RGB PNG"
         )
     return pixels
+
+
+def _exr_pixels(path):
+    picture = exr.read_exr(path)
+    if picture.colour is None:
+        raise CaptureError(f"{path}: no colour channels; save it with R, G and B")
+    if picture.alpha is not None and np.any(picture.alpha < 1):
+        raise CaptureError(
+            f"{path}: it is transparent in places, and its colours may be multiplied "
+            "by alpha or not; lay it over its background first, or save it as a PNG"
+        )
+    return np.round(srgb_from_linear(picture.colour) * 255).astype(np.uint8)
 
 
 def read_image(

@@ -1,37 +1,23 @@
-"""What a trained scene is measured by; one protocol for all.
+"""What a trained scene is held against, and points followed by its learned motion.
 
-Pictures of held-out frames; where the truth is known also their depth, what moves in
-them, and points followed through time by the learned motion. Everything that is
-reported is in scene units.
+Everything is in scene units. `heldout.heldout_metrics` measures all.
 """
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from nerfies_jax import evaluation
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.capture.synthetic import SceneTruth
-from nerfies_jax.evaluation.scores import Draw, Scored
-from nerfies_jax.measure import geometry_quality, image_quality
+from nerfies_jax.capture.synthetic import TRUTH_FILE, SceneTruth
+from nerfies_jax.capture.synthetic import truth as truths
+from nerfies_jax.measure import geometry_quality
 from nerfies_jax.training.model import TrainState
 
 CORRECT_WITHIN = 0.01  # scene units: a quarter of the default cube's half-side
 STILL_POINTS = 500  # of the capture's static points, to see whether they drift
-
-
-# What only a truth can score.
-EXACT = (
-    "moving_psnr",
-    "moving_ssim",
-    "depth_median",
-    "depth_rmse",
-    "moving_depth_median",
-    "moving_depth_rmse",
-)
 
 
 class Known(NamedTuple):
@@ -64,6 +50,15 @@ class Followed(NamedTuple):
     # Root mean square of ||log Σ|| of the Jacobian at the true points; NaN where there
     # is no Jacobian.
     strain: float
+
+
+def stored_truth(capture: Capture) -> SceneTruth | None:
+    """The truth beside the files of a built-in scene; None for what a camera filmed.
+
+    Raises ValueError where it cannot be read.
+    """
+    path = None if capture.path is None else capture.path / TRUTH_FILE
+    return None if path is None or not path.is_file() else truths.load(path)
 
 
 def known(capture: Capture, truth: SceneTruth, frames: int, tracks: int) -> Known:
@@ -116,50 +111,6 @@ def filmed(capture: Capture, frames: int) -> Known:
         seen=np.zeros((0, len(moments)), bool),
         start=len(moments) // 2,
         exact=False,
-    )
-
-
-def score_pictures(
-    renderer: Draw, state: TrainState, capture: Capture, known: Known
-) -> tuple[Scored, dict[str, float]]:
-    """The held-out frames as rendered, and their scores, also of what moves alone.
-
-    What is not known is NaN.
-    """
-    scored = evaluation.score(renderer, state, capture, known.rows)
-    numbers = {"psnr": float(scored.psnr.mean()), "ssim": float(scored.ssim.mean())}
-    if known.exact:
-        return scored, numbers | _score_truth(scored, capture, known)
-    return scored, numbers | dict.fromkeys(EXACT, float("nan"))
-
-
-def _score_truth(scored, capture, known):
-    truth, moving = capture.depths[known.rows], capture.moving[known.rows]
-    parts = [
-        jax.device_get(_score_moving(colour, capture.images[row], capture.moving[row]))
-        for row, colour in zip(known.rows, scored.colour, strict=True)
-        if capture.moving[row].any()
-    ]
-    psnr, ssim = np.mean(parts, axis=0) if parts else (np.nan, np.nan)
-    numbers = {"moving_psnr": psnr, "moving_ssim": ssim}
-    depth, truth = jnp.asarray(scored.depth), jnp.asarray(truth)
-    for name, mask in (("", np.ones_like(moving)), ("moving_", moving)):
-        mask = jnp.asarray(mask)
-        compared = geometry_quality.known_depth(depth, truth, mask)
-        error = np.abs(np.asarray(depth - truth))[np.asarray(compared)]
-        numbers[f"{name}depth_median"] = np.median(error) if error.size else np.nan
-        errors = geometry_quality.depth_errors(depth, truth, mask)
-        numbers[f"{name}depth_rmse"] = errors.rmse
-    return {name: float(value) for name, value in numbers.items()}
-
-
-@jax.jit
-def _score_moving(colour, truth, moving):
-    picture = image_quality.quantise(colour)
-    truth = truth.astype(colour.dtype) / 255
-    return (
-        image_quality.masked_psnr(picture, truth, moving),
-        image_quality.masked_ssim(picture, truth, moving),
     )
 
 

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
 from nerfies_jax.capture.capture import Capture
+from nerfies_jax.evaluation.model_flow import Mover
 from nerfies_jax.evaluation.protocol import Follow
 from nerfies_jax.evaluation.scores import Halves
 from nerfies_jax.training.model import Model
@@ -70,6 +71,7 @@ class Representation(NamedTuple):
     # (folder, spec, metadata, state, effects=()) -> what it wrote beside the checkpoint
     save: Callable[..., Saved]
     follow: Follow
+    mover: Mover
     # ({effect: whether it is called for, None unknown}, papers' sizes) -> what to take
     advise: Callable[[dict[str, bool | None], bool], Choice]
     prices: dict[str, Pair]  # by effect, as in `nerfies_jax.evidence.findings`

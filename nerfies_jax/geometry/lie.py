@@ -108,14 +108,6 @@ def left_jacobian_se3(angular: Vector, linear: Vector) -> Float[Array, "6 6"]:
     return jnp.block([[jacobian, jnp.zeros_like(jacobian)], [coupling, jacobian]])
 
 
-@at_least_float32
-def inverse_left_jacobian_se3(angular: Vector, linear: Vector) -> Float[Array, "6 6"]:
-    """Its inverse, for turns below 2π."""
-    inverse = inverse_left_jacobian(angular)
-    lower = -inverse @ _coupling(angular, linear) @ inverse
-    return jnp.block([[inverse, jnp.zeros_like(inverse)], [lower, inverse]])
-
-
 def hat(vector: Vector) -> Matrix:
     """[w], with [w] x = w × x."""
     x, y, z = vector

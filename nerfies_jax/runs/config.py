@@ -2,6 +2,7 @@
 
 import dataclasses
 import pathlib
+from typing import Literal
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,3 +48,28 @@ class RunConfig:
     overrides: tuple[str, ...] = ()  # of the preset's fields, as for --set
     effects: tuple[str, ...] = ()  # of the user's own, as MODULE:NAME
     seed: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class MoreMetrics:
+    """What is measured of held-out frames only where it is asked for."""
+
+    lpips_weights: tuple[pathlib.Path | str, ...] = ()
+    """Measure LPIPS, too: files (.pth, .safetensors, .npz) with the trained classifier
+    and LPIPS heads; read before the training."""
+    lpips_network: Literal["alex", "vgg"] = "alex"
+    """Whose weights these are."""
+    fit_heldout_cameras: int = 0
+    """Fit the cameras of so many held-out frames to what was filmed, the scene as it is
+    after training, and score them again."""
+
+    def __post_init__(self):
+        if self.lpips_network not in ("alex", "vgg"):
+            raise ValueError(
+                f"lpips_network={self.lpips_network!r}: there are alex and vgg"
+            )
+        if self.fit_heldout_cameras < 0:
+            raise ValueError(
+                f"fit_heldout_cameras={self.fit_heldout_cameras}: a number of frames, "
+                "not negative"
+            )

@@ -12,11 +12,11 @@ from nerfies_jax import evaluation
 from nerfies_jax.capture import camera_paths, exr, video
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.json_files import write_json
-from nerfies_jax.evaluation import Renderer, Scored, pictures
+from nerfies_jax.evaluation import Renderer, Scored, heldout, pictures
 from nerfies_jax.evaluation.representation import MODEL, Saved
 from nerfies_jax.measure import clock
 from nerfies_jax.measure.clock import Metric
-from nerfies_jax.runs import budget, commands, curves, report
+from nerfies_jax.runs import budget, commands, curves, quality, report
 from nerfies_jax.runs.run import Run
 from nerfies_jax.runs.run_folder import CONFIG
 from nerfies_jax.runs.train import Trained
@@ -26,7 +26,13 @@ from nerfies_jax.training.model import TrainState
 SHOWN = 4  # held-out frames in the comparison
 
 
-def make(folder: pathlib.Path, run: Run, trained: Trained, began: float) -> None:
+def make(
+    folder: pathlib.Path,
+    run: Run,
+    trained: Trained,
+    began: float,
+    extra: quality.Extra = quality.NOTHING,
+) -> None:
     """Write everything into the run folder and say where it is.
 
     Raises FloatingPointError, and writes nothing, where the state draws pictures that
@@ -62,13 +68,16 @@ def make(folder: pathlib.Path, run: Run, trained: Trained, began: float) -> None
     )
     frames = evaluation.frames_of(run.capture, run.model.required_data)
     fitted, gain = score_halves(run, state, scored, ms_per_frame / 1e3)
-    metrics = [*measured(run, trained, scored, ms_per_frame, began), *fitted]
+    found, remarks = quality.measure(run, state, renderer, scored, extra)
+    metrics = heldout.metrics(found)
+    metrics += [*measured(run, trained, scored, ms_per_frame, began), *fitted]
     metrics += model_size(saved)
     write_json(
         folder / "metrics.json",
         {m.key: m.value if math.isfinite(m.value) else None for m in metrics},
     )
-    notes = [trained.result.message, *run.capture.notes, *left_out, *gain, *saved.notes]
+    notes = [trained.result.message, *run.capture.notes, *left_out, *remarks, *gain]
+    notes += saved.notes
     notes += beside_the_paper(run.config.preset, saved, ms_per_frame)
     following = _next(folder, run, trained)
     page = report.write(
@@ -104,13 +113,11 @@ def frames_to_score(run: Run, trained: Trained) -> tuple[np.ndarray, tuple[str, 
 def measured(
     run: Run, trained: Trained, scored: Scored, ms_per_frame: float, began: float
 ) -> list[Metric]:
-    """The figures of a run."""
+    """What a run took."""
     result = trained.result
     counts = run.model.counts(result.state)
     seconds, fps = time.perf_counter() - began, 1e3 / ms_per_frame
     return [
-        Metric("heldout.psnr", float(scored.psnr.mean()), "dB", "higher", 0.2),
-        Metric("heldout.ssim", float(scored.ssim.mean()), "", "higher", 0.01),
         Metric("heldout.frames", len(scored.rows), "", "equal"),
         Metric("train.seconds", result.seconds, "s", "lower", 0.2 * result.seconds),
         Metric("train.compile_seconds", result.compile_seconds, "s", "lower", 10.0),
@@ -118,12 +125,21 @@ def measured(
         Metric("render.ms_per_frame", ms_per_frame, "ms", "lower", 0.2 * ms_per_frame),
         Metric("render.fps", fps, "frames/s", "higher", 0.2 * fps),
         Metric("memory.peak_bytes", clock.peak_bytes(), "bytes", "lower", 2e8),
+        *_device_memory(),
         Metric("total.seconds", seconds, "s", "lower", 0.2 * seconds),
         *(
             Metric(name, count, "", "lower", 0.1 * count)
             for name, count in counts.items()
         ),
     ]
+
+
+def _device_memory():
+    """Where the backend keeps account; that of a CPU does not."""
+    peak = clock.device_peak_bytes()
+    if peak is None:
+        return []
+    return [Metric("memory.device_peak_bytes", peak, "bytes", "lower", 2e8)]
 
 
 def model_size(saved: Saved) -> list[Metric]:
@@ -270,12 +286,27 @@ def _say(folder, page, metrics, following):
     value = {metric.key: metric.value for metric in metrics}
     print(
         f"held out: {value['heldout.psnr']:.2f} dB, SSIM {value['heldout.ssim']:.3f} "
-        f"over {value['heldout.frames']} frames; {value['train.seconds']:.0f} s of "
+        f"over {value['heldout.frames']} frames{_parts(value)}; "
+        f"{value['train.seconds']:.0f} s of "
         f"training and {value['train.compile_seconds']:.0f} s of compiling; "
         f"{value['render.ms_per_frame']:.0f} ms a frame"
     )
+    if "tracks.epe" in value:
+        print(
+            f"points:   {value['tracks.epe']:.4f} scene units from where they are, "
+            f"{value['tracks.still_epe']:.4f} if they stood still"
+        )
     print(f"report:     {page}")
     print(f"comparison: {folder / 'comparison.png'}")
     print(f"film:       {folder / 'scene.mp4'}")
     for command in following:
         print(f"{command.purpose}\n  {command.line}")
+
+
+def _parts(value):
+    """The PSNR of what moves and of what stands still, where masks tell them apart."""
+    names = {"moving": "heldout.moving_psnr", "still": "heldout.still_psnr"}
+    parts = [
+        f"{value[key]:.2f} dB {name}" for name, key in names.items() if key in value
+    ]
+    return f" ({', '.join(parts)})" if parts else ""

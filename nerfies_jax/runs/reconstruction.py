@@ -8,8 +8,8 @@ from typing import Any, Literal, NamedTuple
 
 from nerfies_jax.capture.capture import CaptureError, describe
 from nerfies_jax.evidence import inspection
-from nerfies_jax.runs import adviser, products, run_folder, train
-from nerfies_jax.runs.config import RunConfig
+from nerfies_jax.runs import adviser, products, quality, run_folder, train
+from nerfies_jax.runs.config import MoreMetrics, RunConfig
 from nerfies_jax.runs.run import (
     Run,
     first_state,
@@ -47,6 +47,7 @@ def reconstruct(
     seconds: float | int | None = None,
     evaluate_every: float | int = 20.0,
     checkpoint_every: float | int = 60.0,
+    more: MoreMetrics = MoreMetrics(),
 ) -> Outcome:
     """Train a run from its first step, and score, draw and film what came of it.
 
@@ -54,7 +55,8 @@ def reconstruct(
     from its first moment on `resume` continues the run that is in there. `effects`
     "auto" looks at the capture first and takes those that it calls for. `seconds` ends
     the training early; an evaluation follows after `evaluate_every` seconds of it, a
-    checkpoint after `checkpoint_every` seconds. Raises Refused where it cannot begin.
+    checkpoint after `checkpoint_every` seconds. `more` is measured at the end. Raises
+    Refused where it cannot begin.
     """
     began = time.perf_counter()
     with contextlib.ExitStack() as held:
@@ -65,13 +67,14 @@ def reconstruct(
                 run_folder.check_free(out)
             run = _new_run(config, effects)
             _describe(run)
+            extra = quality.prepared(more, run.capture.size)
             state = first_state(run)
             stem = "-".join(run.capture.name.split()) + "-" + run.config.preset
             folder = run_folder.new_run_folder(out, stem)
             held.enter_context(run_folder.owned(folder))
             save_config(folder, run)
             checkpoints = _opened(held, folder, run, state, None)
-        return _finished(folder, run, state, None, checkpoints, pace, began)
+        return _finished(folder, run, state, None, checkpoints, pace, began, extra)
 
 
 def resume(
@@ -82,6 +85,7 @@ def resume(
     seconds: float | int | None = None,
     evaluate_every: float | int = 20.0,
     checkpoint_every: float | int = 60.0,
+    more: MoreMetrics = MoreMetrics(),
 ) -> Outcome:
     """Continue the run in a folder from its last checkpoint, to the same bits.
 
@@ -99,9 +103,10 @@ def resume(
             held.enter_context(run_folder.owned(folder))
             run = saved_run(folder, overrides)
             _describe(run)
+            extra = quality.prepared(more, run.capture.size)
             state, record, after = _restored(folder, run)
             checkpoints = _opened(held, folder, run, state, after)
-        return _finished(folder, run, state, record, checkpoints, pace, began)
+        return _finished(folder, run, state, record, checkpoints, pace, began, extra)
 
 
 @contextlib.contextmanager
@@ -165,14 +170,14 @@ def _opened(held, folder, run, state, after):
     return checkpoints
 
 
-def _finished(folder, run, state, record, checkpoints, pace, began):
+def _finished(folder, run, state, record, checkpoints, pace, began, extra):
     """The outcome of training to the end, with what is to be seen of it written."""
     trained = train.train(run, state, record, checkpoints, pace)
     result = trained.result
     errors = [result.unsaved] if result.unsaved else []
     if result.stopped_by in ("steps", "seconds", "non-finite"):
         try:
-            products.make(folder, run, trained, began)
+            products.make(folder, run, trained, began, extra)
         except FloatingPointError as error:
             errors.append(str(error))
         except (OSError, CaptureError) as error:

@@ -23,6 +23,8 @@ EMBEDDED_FILM_BYTES = 6 * 2**20
 HEADLINES = {
     "heldout.psnr": "PSNR, held out",
     "heldout.ssim": "SSIM, held out",
+    "heldout.moving_psnr": "PSNR, what moves",
+    "heldout.still_psnr": "PSNR, what stands still",
     "train.seconds": "training",
     "render.ms_per_frame": "a frame",
     "file.bytes": "the model file",

@@ -2,7 +2,8 @@
 
 Everything takes plain functions, runs under `jit`, and says by a flag, never by an
 exception, whether it got there. Flags are computed from the result: a solver's own word
-is about its last step only. jaxopt is imported in this file and nowhere else.
+is about its last step only. jaxopt is imported in this file and nowhere else; it and
+optimistix where a solver of theirs is called for.
 """
 
 import dataclasses
@@ -15,7 +16,6 @@ import jax
 import jax.flatten_util
 import jax.numpy as jnp
 import optax
-import optimistix
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
@@ -127,6 +127,8 @@ def refine_camera(
     def scaled(step, _):
         return unscaled(step * scale) / unit
 
+    import optimistix
+
     solver = optimistix.LevenbergMarquardt(
         rtol=spec.tolerance / 10, atol=spec.tolerance / 10
     )
@@ -154,7 +156,7 @@ def fit_code(
     `residual` is the length of the loss's gradient; at most `tolerance` (loss per unit
     of code) counts as converged. The code returned is never worse than the start, which
     is what comes back where the loss is not finite there. No derivatives. The solvers
-    are `CODE_SOLVERS`; experiments.solver_table measures them.
+    are `CODE_SOLVERS`; experiments.solver_table measures them. "lbfgs" is optax's.
     """
     check_positive(max_steps=max_steps, tolerance=tolerance)
     if solver not in CODE_SOLVERS:
@@ -207,8 +209,11 @@ def _jaxopt_lbfgs(loss, start, max_steps, tolerance):
     return code, state.iter_num
 
 
-def _optimistix(solver):
+def _optimistix(name):
     def solve(loss, start, max_steps, tolerance):
+        import optimistix
+
+        solver = getattr(optimistix, name)
         # It stops on differences of code and loss, not on the gradient.
         ulps = 4 * float(jnp.finfo(start.dtype).eps)
         # Its L-BFGS keeps its history in the default precision and takes no other.
@@ -259,10 +264,10 @@ def _optax(transformation):
 
 
 CODE_SOLVERS: Mapping[str, CodeSolver] = {
-    "lbfgs": _jaxopt_lbfgs,
-    "bfgs": _optimistix(optimistix.BFGS),
-    "optimistix-lbfgs": _optimistix(optimistix.LBFGS),
-    "optax-lbfgs": _optax(lambda steps: optax.lbfgs()),
+    "lbfgs": _optax(lambda steps: optax.lbfgs()),
+    "bfgs": _optimistix("BFGS"),
+    "optimistix-lbfgs": _optimistix("LBFGS"),
+    "jaxopt-lbfgs": _jaxopt_lbfgs,
     # Rates of 0.01, 0.03, 0.1, 0.3 end 200 steps 6e-4, 5e-5, 1e-6, 6e-10 above the
     # least loss of experiments.solver_table; beyond, 50 steps get worse.
     "adam": _optax(lambda steps: optax.adam(optax.cosine_decay_schedule(0.2, steps))),

@@ -7,7 +7,7 @@ import numpy as np
 import PIL.Image
 import pytest
 
-from nerfies_jax.capture import images
+from nerfies_jax.capture import exr, images
 from nerfies_jax.capture.capture import CaptureError
 
 RNG = np.random.default_rng(0)
@@ -183,3 +183,23 @@ def test_srgb_curves_are_the_standard_and_each_others_inverse():
     assert images.srgb_from_linear(np.array([-1.0, 2.0])).tolist() == pytest.approx(
         [0, 1]
     )
+
+
+def test_linear_light_is_read_as_the_colours_it_is_seen_as(tmp_path):
+    light = images.linear_from_srgb(COLOUR / 255)
+    light[0, 0] = 3.0  # brighter than a screen
+    exr.write_exr(tmp_path / "a.exr", light, alpha=np.ones(light.shape[:2]))
+    assert images.read_header(tmp_path / "a.exr").size == (9, 6)
+    colour, alpha = images.read_image(tmp_path / "a.exr")
+    expected = COLOUR.copy()
+    expected[0, 0] = 255
+    np.testing.assert_array_equal(colour, expected)
+    assert alpha is None
+    exr.write_exr(tmp_path / "b.exr", light, alpha=ALPHA / 255)
+    with pytest.raises(CaptureError, match="transparent in places"):
+        images.read_image(tmp_path / "b.exr")
+    exr.write_exr(tmp_path / "c.exr", depth=light[..., 0])
+    with pytest.raises(CaptureError, match="no colour"):
+        images.read_image(tmp_path / "c.exr")
+    with pytest.raises(CaptureError, match="no such picture"):
+        images.read_header(tmp_path / "d.exr")

@@ -2,20 +2,15 @@
 
 import dataclasses
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from nerfies_jax.capture import synthetic
 from nerfies_jax.evaluation import protocol
-from nerfies_jax.evaluation.protocol import EXACT, Followed
-from nerfies_jax.training.model import Rendering, TrainState
+from nerfies_jax.evaluation.protocol import Followed
 from tests import scenes
 
 SHIFT = np.float32([0.012, 0.0, 0.016])  # 0.02 long
-
-
-STATE = TrainState((), (), (), jnp.int32(0), None)  # of nothing: pictures are known
 
 
 @pytest.fixture(scope="module")
@@ -82,47 +77,12 @@ def test_tracks_are_scored_by_their_distance_at_all_instants_but_the_start(filme
     assert np.isnan(list(nothing.values())).all()
 
 
-def test_pictures_are_scored_as_a_whole_and_where_things_move(filmed):
-    capture, _, known = filmed
-
-    def renderer(_, view):
-        row = int(np.argmin(abs(capture.times[known.rows] - float(view.time))))
-        row = known.rows[row]
-        still = ~capture.moving[row]
-        colour = capture.images[row].astype(np.float32) / 255
-        # A fifth away from the truth, on the side where it is not clipped.
-        away = np.where(colour > 0.5, -0.2, 0.2)
-        colour = np.where(still[..., None], colour + away, colour)
-        depth = capture.depths[row] + 0.125 * still
-        return Rendering(np.float32(colour), still, np.float32(depth))
-
-    _, numbers = protocol.score_pictures(renderer, STATE, capture, known)
-    share = 1 - capture.moving[known.rows].mean(axis=(1, 2))
-    psnr = -10 * np.log10(share * 0.2**2)
-    assert numbers["psnr"] == pytest.approx(psnr.mean(), abs=1e-3)
-    assert numbers["moving_psnr"] == 100  # the cap of equal pictures
-    assert numbers["ssim"] < 0.99
-    assert numbers["depth_median"] == pytest.approx(0.125, abs=1e-6)
-    rmse = 0.125 * np.sqrt((~capture.moving[known.rows]).mean())
-    assert numbers["depth_rmse"] == pytest.approx(rmse, rel=1e-4)
-    assert numbers["moving_depth_median"] == numbers["moving_depth_rmse"] == 0
-
-
 def test_a_real_capture_is_judged_by_its_pictures_alone(filmed):
     capture, _, known = filmed
     found = protocol.filmed(capture, 2)
     np.testing.assert_array_equal(found.rows, known.rows)
     np.testing.assert_array_equal(found.moments, known.moments)
 
-    def renderer(_, view):
-        row = int(np.argmin(abs(capture.times[found.rows] - float(view.time))))
-        row = found.rows[row]
-        colour = np.float32(capture.images[row]) / 255
-        return Rendering(colour, np.ones_like(colour[..., 0]), colour[..., 0])
-
-    _, numbers = protocol.score_pictures(renderer, STATE, capture, found)
-    assert (numbers["psnr"], numbers["ssim"]) == (100, pytest.approx(1))
-    assert np.isnan([numbers[name] for name in EXACT]).all()
     assert np.isnan(list(protocol.score_tracks(found, None).values())).all()
     assert np.isnan(protocol.still_error(found))
     blind = dataclasses.replace(

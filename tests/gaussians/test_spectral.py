@@ -26,7 +26,6 @@ from tests import gradients
 SIZES = [(1, 1), (7, 5), (12, 10)]
 # Compiled whole: operation by operation, every new shape costs ten compilations.
 haar_pyramid = jax.jit(spectral.haar_pyramid, static_argnums=1)
-haar_image = jax.jit(spectral.haar_image, static_argnums=(1, 2))
 wavelet_loss = jax.jit(spectral.wavelet_loss, static_argnums=0)
 fourier_loss = jax.jit(spectral.fourier_loss, static_argnums=0)
 
@@ -89,15 +88,6 @@ def test_upright_edges_are_in_hl_level_ones_in_lh_and_a_checkerboard_in_hh():
         sizes = [float(np.max(np.abs(band))) for band in bands]
         assert sizes[own] == 1
         assert sum(sizes) == 1
-
-
-@pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("levels", [1, 8])
-def test_a_picture_comes_back_from_its_pyramid(size, levels, dtype, rng):
-    image = picture(rng, *size, dtype)
-    pyramid = haar_pyramid(image, levels)
-    again = haar_image(pyramid, *size)
-    np.testing.assert_allclose(again, image, atol=levels * TINY[dtype])
 
 
 def test_the_pyramid_keeps_the_energy_of_a_picture_it_need_not_extend(dtype, rng):

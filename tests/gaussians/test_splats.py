@@ -213,16 +213,6 @@ def test_one_camera_fills_its_picture_and_its_depth_evenly(rng):
         assert abs(share - 2500).max() < 250
 
 
-def test_random_points_in_a_box(rng):
-    low, high = np.array([0, 1, 2]), np.array([1, 3, 6])
-    points = rows.random_in_box(rng, low, high, 5000)
-    np.testing.assert_allclose(points.mean(axis=0), [0.5, 2, 4], atol=0.1)
-    assert (points >= low).all()
-    assert (points <= high).all()
-    with pytest.raises(ValueError, match="low < high"):
-        rows.random_in_box(rng, low, np.array([1, 1, 6]), 5)
-
-
 @pytest.mark.parametrize(("near", "far"), [(0.0, 1.0), (2.0, 1.0), (1.0, np.inf)])
 def test_impossible_depth_ranges_are_refused(near, far, rng):
     with pytest.raises(ValueError, match="0 < near < far"):

@@ -224,7 +224,6 @@ def jacobians(angular, linear):
         lie.left_jacobian(angular),
         lie.left_jacobian_se3(angular, linear),
         lie.inverse_left_jacobian(angular),
-        lie.inverse_left_jacobian_se3(angular, linear),
     )
 
 
@@ -240,14 +239,13 @@ def test_left_jacobians_are_integrals_and_inverse_to_each_other(angle, dtype):
     both = np.block([[screw, np.eye(6)], [np.zeros((6, 12))]])
     integral = scipy.linalg.expm(both)[:6, 6:]
     bound = {"float32": 5e-7, "float64": 2e-14}[dtype]
-    small, large, small_inverse, large_inverse = jacobians(angular, linear)
+    small, large, small_inverse = jacobians(angular, linear)
     assert np.max(abs(np.asarray(small) - integral[:3, :3])) < bound
     assert np.max(abs(np.asarray(large) - integral)) < bound
     # conditioned like θ/2 / sin(θ/2): 21 at 6 rad
     worse = bound * (400 if angle > 5 else 10)
-    truth = np.linalg.inv(integral)
-    assert np.max(abs(np.asarray(small_inverse) - truth[:3, :3])) < worse
-    assert np.max(abs(np.asarray(large_inverse) - truth)) < worse
+    truth = np.linalg.inv(integral[:3, :3])
+    assert np.max(abs(np.asarray(small_inverse) - truth)) < worse
 
 
 def test_gradients_of_every_map(float64, rng):
@@ -259,8 +257,9 @@ def test_gradients_of_every_map(float64, rng):
         return jnp.sum(jnp.concatenate(moved) * weight[0]) + jnp.sum(moved[0] ** 3)
 
     def jacobians(angular, linear):
-        both = lie.inverse_left_jacobian_se3(angular, linear) * weight
-        return jnp.sum(both) + jnp.sum(lie.left_jacobian(angular) * weight[:3, :3])
+        both = lie.left_jacobian_se3(angular, linear) * weight
+        inverse = lie.inverse_left_jacobian(angular) * weight[:3, :3]
+        return jnp.sum(both) + jnp.sum(inverse)
 
     assert gradients.directional_error(logs, angular, linear) < 1e-7
     assert gradients.directional_error(jacobians, angular, linear) < 1e-7

@@ -2,6 +2,7 @@
 
 import functools
 import pathlib
+import zipfile
 from typing import NamedTuple
 
 import jax
@@ -151,8 +152,14 @@ def save(truth: SceneTruth, path: pathlib.Path):
 
 
 def load(path: pathlib.Path) -> SceneTruth:
-    """Read what `save` wrote."""
-    with np.load(path, allow_pickle=False) as stored:
+    """Read what `save` wrote; ValueError for what it did not write."""
+    try:
+        opened = np.load(path, allow_pickle=False)
+    except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
+        raise ValueError(
+            f"{path}: no scene truth ({error}); delete it and make the scene again"
+        ) from error
+    with opened as stored:
         missing = set(SceneTruth._fields) - set(stored.files)
         if missing:
             raise ValueError(

@@ -1,0 +1,197 @@
+"""Cameras fitted to frames that were never learnt from, the scene as it is.
+
+A wrong camera costs a good scene several dB. By the colours alone: the squared error of
+the rendered frame falls along its slope with respect to the camera, a screw in the
+camera's own frame.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, UInt8
+
+from nerfies_jax.capture.capture import Capture, blocks, shrink
+from nerfies_jax.evaluation.frames import resized, view_of
+from nerfies_jax.evaluation.renderer import Renderer
+from nerfies_jax.evaluation.scores import Scored, score
+from nerfies_jax.geometry.camera import Camera
+from nerfies_jax.training import fit, losses
+from nerfies_jax.training.fit import Fit
+from nerfies_jax.training.model import Model, TrainState, View, in_default_precision
+
+LEVELS = 255.0  # of an 8-bit picture, the unit of the error
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraFitSpec:
+    """How a camera is fitted, and when it counts as found.
+
+    The unknowns are a turn and a shift that move a picture at `depth` by so many
+    pixels, so that one step length suits all. Found means that the mean squared error,
+    in grey levels of 255, changes by at most `tolerance` a pixel: where pictures have
+    slopes of two levels a pixel, that is 0.001 pixel from the least.
+    """
+
+    max_steps: int = 100  # of L-BFGS
+    tolerance: float = 0.01  # squared grey levels per pixel
+    # Larger pictures are halved, thirded, ...: a field would take minutes for each.
+    most_pixels: int = 5000
+
+    def __post_init__(self):
+        fit.check_positive(
+            max_steps=self.max_steps,
+            tolerance=self.tolerance,
+            most_pixels=self.most_pixels,
+        )
+
+
+class FittedCameras(NamedTuple):
+    """Frames scored with cameras that were fitted to them."""
+
+    cameras: Camera  # NumPy leaves, leading axis frames
+    converged: np.ndarray  # [frames] bool
+    scored: Scored  # with these cameras
+
+
+def photometric_loss(
+    model: Model,
+    state: TrainState,
+    view: View,
+    picture: UInt8[Array, "height width 3"],
+    valid: Bool[Array, "height width"] | None,
+    depth: Float[Array, ""],
+) -> Callable[[Float[Array, "6"]], Float[Array, ""]]:
+    """Mean squared error in grey levels of a frame whose camera is moved by a screw.
+
+    The screw is (turn, shift) in pixels, for what lies at z-depth `depth`.
+    """
+    size = picture.shape[1], picture.shape[0]
+    truth = picture.astype(view.camera.position.dtype) / LEVELS
+    draw = _drawer(model, state, view, size)
+
+    def loss(screw_px):
+        colour = draw(_moved(view.camera, screw_px, depth))
+        return LEVELS**2 * losses.mse(colour, truth, valid)
+
+    return loss
+
+
+def fit_camera(
+    model: Model,
+    state: TrainState,
+    view: View,
+    picture: UInt8[Array, "height width 3"],
+    valid: Bool[Array, "height width"] | None,
+    depth: Float[Array, ""],
+    spec: CameraFitSpec = CameraFitSpec(),
+) -> Fit:
+    """The camera near `view`'s whose rendering is closest to `picture`.
+
+    Under `jit`. `residual` is the length of the slope, squared grey levels per pixel. A
+    picture that does not depend on the camera is never converged.
+    """
+    loss = photometric_loss(model, state, view, picture, valid, depth)
+    start = jnp.zeros(6, view.camera.position.dtype)
+    found = fit.fit_code(
+        loss, start, max_steps=spec.max_steps, tolerance=spec.tolerance
+    )
+    return found._replace(
+        value=_moved(view.camera, found.value, depth),
+        converged=found.converged & (found.residual > 0),  # rounding leaves some slope
+    )
+
+
+def fit_cameras(
+    model: Model,
+    renderer: Renderer,
+    state: TrainState,
+    capture: Capture,
+    rows: np.ndarray,
+    spec: CameraFitSpec = CameraFitSpec(),
+) -> FittedCameras:
+    """Fit the cameras of some rows of a capture, and score these frames with them."""
+    factor = 1
+    while capture.images[0, ::factor, ::factor].size > 3 * spec.most_pixels:
+        factor += 1
+    width, height = capture.size
+    size = width // factor, height // factor
+    # What is trimmed at the right and the bottom is no part of the smaller picture.
+    whole = size[0] * factor, size[1] * factor
+    program = jax.jit(
+        lambda params, step, view, picture, valid, depth: fit_camera(
+            model,
+            state._replace(params=params, step=step),
+            view,
+            picture,
+            valid,
+            depth,
+            spec,
+        )
+    )
+    depth = in_default_precision(np.float32(2 / (1 / capture.near + 1 / capture.far)))
+    moved, converged = [], []
+    for row in rows:
+        view = view_of(capture, int(row))
+        valid = None
+        if capture.valid is not None:
+            valid = jnp.asarray(blocks(capture.valid[row], factor).all((-3, -1)))
+        found = program(
+            state.params,
+            state.step,
+            resized(view, whole, size),
+            jnp.asarray(shrink(capture.images[row], factor)),
+            valid,
+            depth,
+        )
+        moved.append(
+            view.camera._replace(
+                camera_from_world=found.value.camera_from_world,
+                position=found.value.position,
+            )
+        )
+        converged.append(bool(found.converged))
+    cameras = jax.tree.map(
+        lambda *leaves: np.stack([np.asarray(x, np.float32) for x in leaves]), *moved
+    )
+    return FittedCameras(
+        cameras,
+        np.asarray(converged),
+        score(renderer, state, _with_cameras(capture, rows, cameras), rows),
+    )
+
+
+def _drawer(model, state, view, size):
+    """Camera -> colour; what does not depend on the camera is computed once."""
+    if model.stages is None:
+        return lambda camera: (
+            model.render(
+                state.params, view._replace(camera=camera), size, state.step
+            ).colour
+        )
+    stages, params = model.stages, state.params
+    posed = stages.pose(params, stages.prepare(params), view.time)
+    return lambda camera: (
+        stages.draw(
+            params, posed, view._replace(camera=camera), size, state.step
+        ).colour
+    )
+
+
+def _moved(camera, screw_px, depth):
+    angle = screw_px / camera.focal_px
+    return fit.move_camera(camera, angle[:3], depth * angle[3:])
+
+
+def _with_cameras(capture, rows, cameras):
+    def replaced(old, new):
+        old = np.array(old)
+        old[rows] = new
+        return old
+
+    return dataclasses.replace(
+        capture, cameras=jax.tree.map(replaced, capture.cameras, cameras)
+    )

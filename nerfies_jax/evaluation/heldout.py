@@ -1,0 +1,243 @@
+"""All that is measured of frames that were never learnt from; a table of the keys."""
+
+import functools
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.evaluation import protocol
+from nerfies_jax.evaluation.fitted_cameras import FittedCameras
+from nerfies_jax.evaluation.model_flow import Flow
+from nerfies_jax.evaluation.protocol import Followed, Known
+from nerfies_jax.evaluation.scores import Scored
+from nerfies_jax.geometry import camera as cameras
+from nerfies_jax.measure import geometry_quality, image_quality, perceptual
+from nerfies_jax.measure.clock import Metric
+from nerfies_jax.measure.perceptual import LpipsParams, Network
+
+# Five scales halve a picture four times, and the window of 11 must fit into the last.
+MS_SSIM_SIDE = 160  # pixels that the shorter side must exceed
+
+
+class Measure(NamedTuple):
+    """What a key of `metrics.json` holds, as in `clock.Metric`."""
+
+    unit: str
+    direction: str
+    tolerance: float
+
+
+MEASURES = {
+    "heldout.psnr": Measure("dB", "higher", 0.2),
+    "heldout.ssim": Measure("", "higher", 0.01),
+    "heldout.ms_ssim": Measure("", "higher", 0.01),
+    "heldout.lpips": Measure("", "lower", 0.01),
+    "heldout.moving_psnr": Measure("dB", "higher", 0.3),
+    "heldout.moving_ssim": Measure("", "higher", 0.02),
+    "heldout.still_psnr": Measure("dB", "higher", 0.2),
+    "heldout.depth_abs_rel": Measure("", "lower", 0.01),
+    "heldout.depth_within_delta": Measure("", "higher", 0.02),
+    "heldout.depth_median": Measure("scene units", "lower", 0.002),
+    "heldout.depth_rmse": Measure("scene units", "lower", 0.01),
+    "heldout.moving_depth_median": Measure("scene units", "lower", 0.005),
+    "heldout.moving_depth_rmse": Measure("scene units", "lower", 0.02),
+    "heldout.camera_fitted_psnr": Measure("dB", "higher", 0.2),
+    "cameras.ate": Measure("scene units", "lower", 0.002),
+    "cameras.rotation_error": Measure("deg", "lower", 0.1),
+    "flow.epe": Measure("px", "lower", 0.2),
+    "flow.outliers": Measure("", "lower", 0.02),
+    "flow.missing": Measure("", "lower", 0.02),
+    "flow.moving_epe": Measure("px", "lower", 0.3),
+    "tracks.epe": Measure("scene units", "lower", 0.003),
+    "tracks.still_epe": Measure("scene units", "equal", 0.0),
+    "tracks.correct": Measure("", "higher", 0.05),
+    "tracks.lost": Measure("", "lower", 0.02),
+    "tracks.drift": Measure("scene units", "lower", 0.002),
+    "tracks.strain": Measure("", "lower", 0.1),
+}
+_TRACKS = {
+    "track_error": "tracks.epe",
+    "track_correct": "tracks.correct",
+    "track_lost": "tracks.lost",
+    "drift": "tracks.drift",
+    "strain": "tracks.strain",
+}
+
+
+class Lpips(NamedTuple):
+    """A classifier for LPIPS and its trained weights."""
+
+    network: Network
+    params: LpipsParams
+
+
+def load_lpips(network: Network, files: Sequence, size: tuple[int, int]) -> Lpips:
+    """Weights from files, for pictures of (width, height).
+
+    Raises ValueError where they cannot be read, are another network's, or the pictures
+    are too small for it.
+    """
+    if min(size) < network.smallest:
+        raise ValueError(
+            f"LPIPS with {network.name} needs {network.smallest} pixels on the shorter "
+            f"side, and the pictures are {size[0]}x{size[1]}; leave its weights out"
+        )
+    return Lpips(network, perceptual.load(network, files))
+
+
+def heldout_metrics(
+    scored: Scored,
+    capture: Capture,
+    *,
+    lpips: Lpips | None = None,
+    known: Known | None = None,
+    followed: Followed | None = None,
+    flow: Flow | None = None,
+    fitted: FittedCameras | None = None,
+) -> dict[str, float]:
+    """Everything that can be measured, by the keys of `MEASURES`.
+
+    PSNR and SSIM are always there; anything else where the capture has what it is held
+    against (masks of what moves, depths), or where it is passed: `known` and `followed`
+    points, `flow`, `fitted` cameras. What has nothing to be a mean of is left out.
+    """
+    found = {
+        "heldout.psnr": float(scored.psnr.mean()),
+        "heldout.ssim": float(scored.ssim.mean()),
+    }
+    more = _pictures(scored, capture, lpips)
+    if capture.depths is not None:
+        more |= _depths(scored, capture)
+    if known is not None and followed is not None:
+        numbers = protocol.score_tracks(known, followed)
+        more |= {_TRACKS[name]: value for name, value in numbers.items()}
+        more["tracks.still_epe"] = protocol.still_error(known)
+    if flow is not None:
+        more |= _flow(flow)
+    if fitted is not None:
+        more |= _cameras(fitted, capture, exact=known is not None)
+    return found | {key: float(x) for key, x in more.items() if not np.isnan(x)}
+
+
+def metrics(found: Mapping[str, float]) -> list[Metric]:
+    """Numbers by the keys of `MEASURES` as metrics, in its order."""
+    return [
+        Metric(key, found[key], *measure)
+        for key, measure in MEASURES.items()
+        if key in found
+    ]
+
+
+def _pictures(scored, capture, lpips):
+    """Means over the frames, each over the pixels that have what it needs."""
+    parts = {}
+    for row, colour in zip(scored.rows, scored.colour, strict=True):
+        valid = None if capture.valid is None else capture.valid[row]
+        moving = None if capture.moving is None else capture.moving[row]
+        scores = _score(colour, capture.images[row], valid, moving)
+        if lpips is not None:
+            scores["heldout.lpips"] = _lpips(
+                lpips.params, lpips.network, colour, capture.images[row], valid
+            )
+        for key, value in jax.device_get(scores).items():
+            parts.setdefault(key, []).append(value)
+    # A frame without anything that moves has no score of it, and none is all moving.
+    return {key: _mean(np.asarray(values)) for key, values in parts.items()}
+
+
+@jax.jit
+def _score(colour, truth, valid, moving):
+    picture = image_quality.quantise(colour)
+    truth = truth.astype(colour.dtype) / 255
+    found = {}
+    if moving is not None:
+        still = ~moving
+        if valid is not None:
+            moving, still = moving & valid, still & valid
+        found["heldout.moving_psnr"] = image_quality.masked_psnr(picture, truth, moving)
+        found["heldout.moving_ssim"] = image_quality.masked_ssim(picture, truth, moving)
+        found["heldout.still_psnr"] = image_quality.masked_psnr(picture, truth, still)
+    if valid is None and min(picture.shape[:2]) > MS_SSIM_SIDE:
+        found["heldout.ms_ssim"] = image_quality.ms_ssim(picture, truth)
+    return found
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _lpips(params, network, colour, truth, valid):
+    picture = image_quality.quantise(colour)
+    truth = truth.astype(colour.dtype) / 255
+    if valid is None:
+        return perceptual.lpips(params, network, picture, truth)
+    return perceptual.masked_lpips(params, network, picture, truth, valid)
+
+
+def _depths(scored, capture):
+    """Over the known pixels of all frames together."""
+    truth = jnp.asarray(capture.depths[scored.rows])
+    depth = jnp.asarray(scored.depth)
+    masks = {"": None}
+    if capture.moving is not None:
+        masks["moving_"] = jnp.asarray(capture.moving[scored.rows])
+    found = {}
+    for name, mask in masks.items():
+        compared = np.asarray(geometry_quality.known_depth(depth, truth, mask))
+        error = np.abs(np.asarray(depth - truth))[compared]
+        errors = geometry_quality.depth_errors(depth, truth, mask)
+        found[f"heldout.{name}depth_median"] = _mean(error, np.median)
+        found[f"heldout.{name}depth_rmse"] = errors.rmse
+        if mask is None:
+            found["heldout.depth_abs_rel"] = errors.abs_rel
+            found["heldout.depth_within_delta"] = errors.within_delta
+    return found
+
+
+def _flow(flow):
+    """End-point errors of the pixels that have an answer; none is an outlier, too."""
+    answered = np.isfinite(flow.found).all(axis=-1)
+
+    def errors(mask=None):
+        mask = None if mask is None else jnp.asarray(mask)
+        found, truth = jnp.asarray(flow.found), jnp.asarray(flow.truth)
+        return geometry_quality.flow_errors(found, truth, mask)
+
+    numbers = {
+        "flow.epe": errors(answered).endpoint,
+        "flow.outliers": errors().outliers,
+        "flow.missing": 1 - answered.mean(),
+    }
+    if flow.moving is not None:
+        numbers["flow.moving_epe"] = errors(answered & flow.moving).endpoint
+    return numbers
+
+
+def _cameras(fitted, capture, exact):
+    """PSNR with fitted cameras; where those of the capture are `exact`, their errors.
+
+    Without alignment's scale: the cameras were fitted to a scene in scene units.
+    """
+    numbers = {"heldout.camera_fitted_psnr": fitted.scored.psnr.mean()}
+    true = cameras.take(capture.cameras, fitted.scored.rows)
+    if exact and len(fitted.scored.rows) > 1:
+        path = geometry_quality.path_errors(
+            fitted.cameras.position, true.position, scaled=False
+        )
+        if path.alignment.determined:
+            numbers["cameras.ate"] = path.rmse
+        relative = geometry_quality.relative_errors(
+            fitted.cameras.camera_from_world,
+            fitted.cameras.position,
+            true.camera_from_world,
+            true.position,
+        )
+        numbers["cameras.rotation_error"] = relative.rotation_deg
+    return numbers
+
+
+def _mean(values, mean=np.mean):
+    """NaN over nothing."""
+    values = values[~np.isnan(values)]
+    return mean(values) if values.size else np.nan

@@ -1,0 +1,117 @@
+"""Optical flow of a trained scene: where what a pixel shows goes, by learned motion."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.evaluation.frames import spread, view_of
+from nerfies_jax.evaluation.scores import Scored
+from nerfies_jax.geometry import camera as cameras
+from nerfies_jax.geometry import rays
+from nerfies_jax.geometry.camera import Camera
+from nerfies_jax.training.model import TrainState, View, in_default_precision
+
+PIXELS = 500  # of a frame whose flow is scored, evenly spread
+FRAMES = 4
+
+
+class Moved(NamedTuple):
+    """Points of one instant at another; NumPy."""
+
+    points: np.ndarray  # [points, 3] scene units; where they were, if not found
+    found: np.ndarray  # [points] bool
+
+
+# (state, points [points, 3] in scene units, their view, another view) -> where they are
+Move = Callable[[TrainState, np.ndarray, View, View], Moved]
+# (spec, metadata of the capture) -> None where nothing in the scene moves points
+Mover = Callable[[Any, Any], Move | None]
+
+
+class Flow(NamedTuple):
+    """Flow of a few pixels of a few frames, in pixels right and down; NumPy."""
+
+    found: np.ndarray  # [pixels, 2]; NaN where the model has no answer
+    truth: np.ndarray  # [pixels, 2]
+    moving: np.ndarray | None  # [pixels] bool: shows what moves by itself
+
+
+def pixel_flow(
+    move: Move,
+    state: TrainState,
+    here: View,
+    there: View,
+    pixels: np.ndarray,
+    depth: np.ndarray,
+) -> np.ndarray:
+    """Flow [pixels, 2] of pixel positions [pixels, 2] from one view to another.
+
+    What lies at z-depth `depth` behind each is moved, and projected where it is then.
+    NaN where there is no depth, the point is lost, or it is behind the other camera.
+    """
+    known = np.isfinite(depth) & (depth > 0)
+    pixels = np.asarray(in_default_precision(pixels))
+    depth = np.asarray(in_default_precision(np.where(known, depth, 1)))
+    moved = move(state, np.asarray(_surface(here.camera, pixels, depth)), here, there)
+    place, ahead = _project(there.camera, in_default_precision(moved.points))
+    known = known & moved.found & np.asarray(ahead)
+    return np.where(known[:, None], np.asarray(place) - pixels, np.nan)
+
+
+@jax.jit
+def _surface(
+    camera: Camera, pixels: Float[Array, "pixels 2"], depth: Float[Array, " pixels"]
+) -> Float[Array, "pixels 3"]:
+    found = jax.vmap(lambda pixel: rays.pixel_ray(camera, pixel))(pixels)
+    distance = rays.distance_of_depth(camera, found.direction, depth)
+    return jax.vmap(rays.point_at)(found.origin, found.direction, distance)
+
+
+@jax.jit
+def _project(
+    camera: Camera, points: Float[Array, "pixels 3"]
+) -> tuple[Float[Array, "pixels 2"], Bool[Array, " pixels"]]:
+    pixel, depth = jax.vmap(lambda point: cameras.project(camera, point))(points)
+    return pixel, depth > 0
+
+
+def heldout_flow(
+    move: Move, state: TrainState, capture: Capture, scored: Scored
+) -> Flow | None:
+    """Flow of rendered frames to the next of their camera, beside the capture's.
+
+    At most `FRAMES` frames and `PIXELS` pixels of each, of those whose point both
+    frames show. None where the capture has no flow or none of its flow is of `scored`.
+    """
+    if capture.flow is None:
+        return None
+    seen = capture.flow.forward_seen[scored.rows]
+    places = np.flatnonzero(seen.any(axis=(1, 2)))
+    if not len(places):
+        return None
+    found, truth, moving = [], [], []
+    for place in spread(places, FRAMES):
+        row = int(scored.rows[place])
+        line, column = spread(np.argwhere(seen[place]), PIXELS).T
+        found.append(
+            pixel_flow(
+                move,
+                state,
+                view_of(capture, row),
+                view_of(capture, int(capture.flow.next_row[row])),
+                np.stack([column, line], axis=1) + 0.5,
+                scored.depth[place, line, column],
+            )
+        )
+        truth.append(capture.flow.forward[row, line, column])
+        if capture.moving is not None:
+            moving.append(capture.moving[row, line, column])
+    return Flow(
+        np.concatenate(found),
+        np.concatenate(truth),
+        np.concatenate(moving) if moving else None,
+    )

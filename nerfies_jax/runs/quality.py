@@ -1,0 +1,96 @@
+"""How good the held-out frames of a finished run are."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from nerfies_jax import evaluation
+from nerfies_jax.evaluation import (
+    Renderer,
+    Scored,
+    fitted_cameras,
+    heldout,
+    model_flow,
+    protocol,
+)
+from nerfies_jax.evaluation.heldout import Lpips
+from nerfies_jax.measure import perceptual
+from nerfies_jax.runs.config import MoreMetrics
+from nerfies_jax.runs.run import Run
+from nerfies_jax.training.model import TrainState
+
+TRACKS = 200  # points of a built-in scene that are followed
+NETWORKS = {"alex": perceptual.ALEX, "vgg": perceptual.VGG}
+
+
+class Extra(NamedTuple):
+    """What is measured only where it was asked for."""
+
+    lpips: Lpips | None
+    camera_fits: int  # frames that are scored with cameras fitted to them
+
+
+NOTHING = Extra(None, 0)
+
+
+def prepared(more: MoreMetrics, size: tuple[int, int]) -> Extra:
+    """The weights read, for pictures of (width, height); before any training.
+
+    Raises ValueError where they cannot be used.
+    """
+    lpips = None
+    if more.lpips_weights:
+        network = NETWORKS[more.lpips_network]
+        lpips = heldout.load_lpips(network, more.lpips_weights, size)
+    return Extra(lpips, more.fit_heldout_cameras)
+
+
+def measure(
+    run: Run,
+    state: TrainState,
+    renderer: Renderer,
+    scored: Scored,
+    extra: Extra = NOTHING,
+) -> tuple[dict[str, float], list[str]]:
+    """Numbers by the keys of `heldout.MEASURES`, and notes for the reader.
+
+    Points and flow are held against the truth of a built-in scene.
+    """
+    capture = run.capture
+    known = followed = flow = fitted = None
+    notes = []
+    try:
+        truth = protocol.stored_truth(capture)
+        if truth is not None:
+            known = protocol.known(capture, truth, len(scored.rows), TRACKS)
+    except ValueError as error:
+        notes.append(f"No points were followed: {error}")
+    if known is not None:
+        kind, scene = run.representation, (run.spec, run.facts)
+        followed = kind.follow(*scene, state, capture, known)
+        move = kind.mover(*scene)
+        if move is not None:
+            flow = model_flow.heldout_flow(move, state, capture, scored)
+    if extra.camera_fits:
+        places = evaluation.spread(np.arange(len(scored.rows)), extra.camera_fits)
+        fitted = fitted_cameras.fit_cameras(
+            run.model, renderer, state, capture, scored.rows[places]
+        )
+        notes.append(
+            f"Cameras fitted to {len(places)} held-out frames: "
+            f"{scored.psnr[places].mean():.2f} dB with those of the capture, "
+            f"{fitted.scored.psnr.mean():.2f} dB with the fitted ones, of which "
+            f"{fitted.converged.sum()} converged."
+        )
+    if extra.lpips is not None:
+        notes.append(f"LPIPS is that of {extra.lpips.network.name}, version 0.1.")
+    found = heldout.heldout_metrics(
+        scored,
+        capture,
+        lpips=extra.lpips,
+        known=known,
+        followed=followed,
+        flow=flow,
+        fitted=fitted,
+    )
+    return found, notes

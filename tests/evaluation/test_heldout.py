@@ -1,0 +1,324 @@
+"""Every number of held-out frames against NumPy, and which numbers there are."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gaussians_jax import scene as splat_scene
+from nerfies_jax import evaluation, runs, scene
+from nerfies_jax.capture import synthetic
+from nerfies_jax.effects.warp import WarpSpec
+from nerfies_jax.evaluation import heldout, model_flow, protocol
+from nerfies_jax.evaluation.heldout import heldout_metrics
+from nerfies_jax.evaluation.model_flow import Flow, Moved
+from nerfies_jax.evaluation.scores import Scored
+from nerfies_jax.geometry import camera as cameras
+from nerfies_jax.measure import image_quality, perceptual
+from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.radiance.template import TemplateSpec
+from nerfies_jax.runs import products, representations
+from nerfies_jax.runs.config import CaptureSource, RunConfig
+from nerfies_jax.spec import RadianceScene, SamplingSpec
+from nerfies_jax.training.model import TrainState
+from tests import scenes
+from tests.measure.test_perceptual import TINY, state_dict
+
+# Two frames of the second camera: one has a next one, so a flow.
+FILM = dataclasses.replace(scenes.TINY_FILM, heldout_every=2)
+NOBODY = TrainState((), (), (), jnp.zeros((), jnp.int32), jax.random.key(0))
+ALWAYS = {"heldout.psnr", "heldout.ssim"}
+MASKED = {f"heldout.{name}" for name in ("moving_psnr", "moving_ssim", "still_psnr")}
+DEPTHS = {
+    f"heldout.{name}"
+    for name in (
+        "depth_abs_rel",
+        "depth_within_delta",
+        "depth_median",
+        "depth_rmse",
+        "moving_depth_median",
+        "moving_depth_rmse",
+    )
+}
+TRUTH = {
+    "flow.epe",
+    "flow.outliers",
+    "flow.missing",
+    "flow.moving_epe",
+    "tracks.epe",
+    "tracks.still_epe",
+    "tracks.correct",
+    "tracks.lost",
+    "tracks.drift",
+}
+
+
+def drawn(capture, rng):
+    """Held-out frames as a poor scene might draw them."""
+    rows = capture.heldout
+    truth = capture.images[rows] / 255
+    colour = np.clip(truth + 0.1 * rng.normal(size=truth.shape), 0, 1)
+    near = np.ones(truth.shape[:3]) if capture.depths is None else capture.depths[rows]
+    depth = near * rng.uniform(0.7, 1.4, near.shape)
+    psnr = np.arange(len(rows)) + 20.0
+    return Scored(
+        rows,
+        np.float32(colour),
+        np.ones(near.shape, np.float32),
+        np.float32(depth),
+        psnr,
+        psnr / 100,
+    )
+
+
+masked_ssim = jax.jit(image_quality.masked_ssim)
+
+
+def psnr(picture, truth, mask):
+    return -10 * np.log10(np.mean((picture - truth)[mask] ** 2))
+
+
+@pytest.mark.parametrize("filmed", [False, True])
+def test_every_number_is_that_of_a_direct_computation(rng, filmed):
+    capture = scenes.tiny_capture()
+    valid = rng.random(capture.moving.shape) > 0.2
+    if filmed:
+        capture = dataclasses.replace(capture, valid=valid)
+    scored = drawn(capture, rng)
+    found = heldout_metrics(scored, capture)
+    assert set(found) == ALWAYS | MASKED | DEPTHS
+    assert found["heldout.psnr"] == pytest.approx(scored.psnr.mean())
+    rows = capture.heldout
+    picture = np.round(scored.colour.astype(float) * 255) / 255
+    truth = capture.images[rows] / 255
+    known = valid[rows] if filmed else np.ones_like(valid[rows])
+    moving = capture.moving[rows]
+    for name, mask in (("moving", moving & known), ("still", ~moving & known)):
+        frames = zip(picture, truth, mask, strict=True)
+        exact = np.mean([psnr(*frame) for frame in frames])
+        assert found[f"heldout.{name}_psnr"] == pytest.approx(exact, abs=1e-4)
+    ssim = [
+        masked_ssim(np.float32(a), np.float32(b), m)
+        for a, b, m in zip(picture, truth, moving & known, strict=True)
+    ]
+    assert found["heldout.moving_ssim"] == pytest.approx(np.mean(ssim), abs=1e-5)
+    depth = capture.depths[rows]
+    for name, mask in (("", depth > 0), ("moving_", (depth > 0) & moving)):
+        error = np.abs(scored.depth - depth)[mask]
+        exact = {"median": np.median(error), "rmse": np.sqrt(np.mean(error**2))}
+        for kind, value in exact.items():
+            key = f"heldout.{name}depth_{kind}"
+            assert found[key] == pytest.approx(value, rel=1e-4)
+    ratio = (scored.depth / depth)[depth > 0]
+    assert found["heldout.depth_abs_rel"] == pytest.approx(
+        np.abs(ratio - 1).mean(), rel=1e-4
+    )
+    assert found["heldout.depth_within_delta"] == pytest.approx(
+        np.mean(np.maximum(ratio, 1 / ratio) < 1.25), abs=1e-3
+    )
+
+
+def test_what_a_capture_has_not_is_not_among_the_numbers(rng):
+    capture = scenes.tiny_capture()
+    bare = dataclasses.replace(capture, moving=None, depths=None)
+    assert set(heldout_metrics(drawn(bare, rng), bare)) == ALWAYS
+    still = dataclasses.replace(capture, moving=np.zeros_like(capture.moving))
+    found = heldout_metrics(drawn(still, rng), still)
+    assert "heldout.still_psnr" in found
+    assert not [key for key in found if "moving" in key]
+    listed = {metric.key: metric.value for metric in heldout.metrics(found)}
+    assert listed == found
+
+
+def test_large_pictures_get_ms_ssim_and_weights_lpips(rng, tmp_path):
+    small = scenes.tiny_capture()
+    rows = small.heldout[:1]
+    capture = dataclasses.replace(
+        small,
+        images=small.images.repeat(6, 1).repeat(6, 2),
+        cameras=cameras.resize(small.cameras, (1, 1), (6, 6)),
+        heldout=rows,
+        moving=None,
+        depths=None,
+        flow=None,
+    )
+    np.savez(tmp_path / "tiny.npz", **state_dict("tiny", rng))
+    lpips = heldout.load_lpips(TINY, [tmp_path / "tiny.npz"], capture.size)
+    scored = drawn(capture, rng)
+    found = heldout_metrics(scored, capture, lpips=lpips)
+    assert set(found) == ALWAYS | {"heldout.ms_ssim", "heldout.lpips"}
+    picture = jnp.round(scored.colour[0] * 255) / 255
+    truth = jnp.asarray(capture.images[rows[0]] / 255, jnp.float32)
+    exact = image_quality.ms_ssim(picture, truth)
+    assert found["heldout.ms_ssim"] == pytest.approx(float(exact), abs=1e-5)
+    exact = perceptual.lpips(lpips.params, TINY, picture, truth)
+    assert found["heldout.lpips"] == pytest.approx(float(exact), rel=1e-4)
+
+    filmed = np.ones(capture.images.shape[:3], bool)
+    filmed[:, :, 100:] = False
+    capture = dataclasses.replace(capture, valid=filmed)
+    found = heldout_metrics(scored, capture, lpips=lpips)
+    assert "heldout.ms_ssim" not in found  # it has no masked form
+    mask = jnp.asarray(filmed[rows[0]])
+    exact = perceptual.masked_lpips(lpips.params, TINY, picture, truth, mask)
+    assert found["heldout.lpips"] == pytest.approx(float(exact), rel=1e-4)
+    with pytest.raises(ValueError, match="9 pixels on the shorter side"):
+        heldout.load_lpips(TINY, [], (40, 8))
+
+
+def test_flow_is_scored_where_there_is_an_answer():
+    truth = np.zeros((5, 2))
+    found = np.array([[3, 4], [0, 1], [np.nan, 0], [0, 0], [0, 2.0]])
+    moving = np.array([True, False, True, False, True])
+    scored = heldout._flow(Flow(found, truth, moving))
+    assert scored["flow.epe"] == pytest.approx((5 + 1 + 0 + 2) / 4)
+    assert scored["flow.moving_epe"] == pytest.approx((5 + 2) / 2)
+    assert scored["flow.outliers"] == pytest.approx(2 / 5)
+    assert scored["flow.missing"] == pytest.approx(1 / 5)
+
+
+def test_the_flow_of_a_known_motion_is_the_true_one():
+    """Points moved as the scene moves them, at the true depths: the true flow."""
+    spec = FILM
+    capture, truth = synthetic.make(spec)
+    lost = 7
+
+    def move(state, points, here, there):
+        row = int(np.argmin(abs(capture.times[capture.heldout] - float(here.time))))
+        row = capture.heldout[row]
+        place, ahead = jax.vmap(lambda p: cameras.project(here.camera, p))(
+            jnp.asarray(points)
+        )
+        np.testing.assert_allclose(np.asarray(place) % 1, 0.5, atol=2e-2)
+        column, line = np.floor(np.asarray(place)).astype(int).T
+        depth = capture.depths[row, line, column]
+        np.testing.assert_allclose(ahead, depth, rtol=1e-4)
+        thing = truth.things[row, line, column]
+        moved = points.copy()
+        for one in np.unique(thing):
+
+            def carry(point, one=int(one)):
+                material = synthetic.canonical(spec, one, point, here.time)
+                return synthetic.observe(spec, one, material, there.time)
+
+            moved[thing == one] = jax.vmap(carry)(jnp.asarray(points[thing == one]))
+        found = np.ones(len(points), bool)
+        found[lost] = False
+        return Moved(moved, found)
+
+    scored = drawn(capture, np.random.default_rng(0))
+    scored = scored._replace(depth=capture.depths[capture.heldout])
+    flow = model_flow.heldout_flow(move, NOBODY, capture, scored)
+    assert np.isnan(flow.found[lost]).all()
+    known = np.isfinite(flow.found).all(axis=1)
+    assert known.mean() > 0.95
+    assert flow.moving.any()
+    assert np.abs(flow.truth[flow.moving]).max() > 1
+    np.testing.assert_allclose(flow.found[known], flow.truth[known], atol=0.02)
+
+
+FIELD = RadianceScene(
+    steps=40,
+    template=TemplateSpec(
+        position=EncodingSpec(2), direction=None, depth=2, width=8, skips=()
+    ),
+    sampling=SamplingSpec(6, 0, block=200),
+    rays=64,
+    warp=WarpSpec(
+        position=EncodingSpec(2), depth=2, width=8, skips=(), anneal_steps=10
+    ),
+)
+KINDS = {"gaussians": scenes.TINY_DEFORMABLE, "radiance": FIELD}
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory):
+    """A folder with a tiny scene and its truth."""
+    folder = tmp_path_factory.mktemp("film") / "tiny"
+    synthetic.write(FILM, folder)
+    return folder
+
+
+def started(kind, folder):
+    """A run that was not trained, its motion away from nothing."""
+    config = RunConfig(preset="none", source=CaptureSource(capture=folder))
+    run = runs.open_run(config, representations.named(kind), KINDS[kind])
+    state = run.model.init(run.capture, jax.random.key(0))
+    state = state._replace(step=jnp.asarray(20, jnp.int32))
+    if kind == "gaussians":
+        nets = jax.tree.map(lambda leaf: leaf + 0.02, state.params.nets)
+        return run, state._replace(params=state.params._replace(nets=nets))
+    warp = jax.tree.map(lambda leaf: leaf + 0.02, state.params["warp"])
+    return run, state._replace(params=state.params | {"warp": warp})
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_run_is_held_against_the_truth_of_its_scene(kind, filmed, rng):
+    run, state = started(kind, filmed)
+    capture = run.capture
+    scored = drawn(capture, rng)
+    renderer = evaluation.Renderer(run.model, run.capture.size)
+    found, notes = products.quality(run, state, renderer, scored, None, 0)
+    assert notes == []
+    strain = {"tracks.strain"} if kind == "radiance" else set()
+    assert set(found) == ALWAYS | MASKED | DEPTHS | TRUTH | strain
+
+    truth = protocol.stored_truth(capture)
+    known = protocol.known(capture, truth, 2, products.TRACKS)
+    followed = run.representation.follow(run.spec, run.facts, state, capture, known)
+    assert np.abs(followed.path - known.start_points[:, None]).max() > 1e-3
+    seen = known.seen.copy()
+    seen[:, known.start] = False
+    for key, path in (
+        ("tracks.epe", followed.path),
+        ("tracks.still_epe", known.start_points[:, None]),
+    ):
+        away = np.linalg.norm(path - known.path, axis=-1)[seen]
+        assert found[key] == pytest.approx(away.mean(), rel=1e-4)
+    # The flow is that of the same motion: points of the start at the last moment.
+    move = run.representation.mover(run.spec, run.facts)
+    here, there = (
+        evaluation.view_of(capture, int(known.moments[place]))
+        for place in (known.start, -1)
+    )
+    moved = move(state, known.start_points, here, there)
+    both = moved.found & followed.found[:, -1]
+    assert both.any()
+    np.testing.assert_allclose(moved.points[both], followed.path[both, -1], atol=1e-5)
+    flow = model_flow.heldout_flow(move, state, capture, scored)
+    away = np.linalg.norm(flow.found - flow.truth, axis=1)
+    answered = np.isfinite(away)
+    assert found["flow.epe"] == pytest.approx(away[answered].mean(), rel=1e-4)
+    assert found["flow.missing"] == pytest.approx(1 - answered.mean(), abs=1e-6)
+
+
+def test_a_scene_without_motion_or_truth_has_no_points_to_follow(filmed, rng, tmp_path):
+    run, state = started("gaussians", filmed)
+    static = dataclasses.replace(KINDS["gaussians"], motion=None)
+    kind = run.representation
+    assert kind.mover(static, splat_scene.facts_of(run.capture)) is None
+    field = dataclasses.replace(FIELD, warp=None)
+    assert (
+        representations.named("radiance").mover(
+            field, scene.facts_of(run.capture, field)
+        )
+        is None
+    )
+    renderer = evaluation.Renderer(run.model, run.capture.size)
+    scored = drawn(run.capture, rng)
+    elsewhere = dataclasses.replace(run.capture, path=None)
+    found, notes = products.quality(
+        run._replace(capture=elsewhere), state, renderer, scored, None, 0
+    )
+    assert notes == []
+    assert set(found) == ALWAYS | MASKED | DEPTHS
+    # A truth of another scene is no reason to lose what was trained.
+    (tmp_path / synthetic.TRUTH_FILE).write_bytes(b"cut short")
+    broken = dataclasses.replace(run.capture, path=tmp_path)
+    found, notes = products.quality(
+        run._replace(capture=broken), state, renderer, scored, None, 0
+    )
+    assert set(found) == ALWAYS | MASKED | DEPTHS
+    assert "no scene truth" in notes[0]
