@@ -162,7 +162,10 @@ def test_an_empty_scene_finds_no_camera(capture):
 
 
 KINDS = {
-    "gaussians": (splat_scene, dataclasses.replace(scenes.TINY_SPLATS, density=None)),
+    "gaussians": (
+        splat_scene,
+        dataclasses.replace(scenes.TINY_SPLATS, densification=None),
+    ),
     "radiance": (scene, FIELD),
 }
 
