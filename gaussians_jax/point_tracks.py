@@ -31,13 +31,13 @@ def follow(spec, metadata, state, capture, known, effects=()) -> Followed | None
         return None
     stages = scene.build(spec, metadata, effects).stages
     prepared = jax.jit(stages.prepare)(state.params)
-    pose = jax.jit(lambda params, ready, time: stages.pose(params, ready, time))
+    deform = jax.jit(lambda params, ready, time: stages.deform(params, ready, time))
     times = in_default_precision(capture.times[known.moments])
     # [moments, gaussians, 3]
     means = np.stack(
-        [np.asarray(pose(state.params, prepared, time).mean) for time in times]
+        [np.asarray(deform(state.params, prepared, time).mean) for time in times]
     )
-    first = pose(state.params, prepared, times[known.start])
+    first = deform(state.params, prepared, times[known.start])
     opacity = _seen_opacity(state, first)
     path = carried(known.start_points, means, opacity, known.start)
     drift = float("nan")
@@ -65,11 +65,11 @@ def mover(spec, metadata, effects=()) -> Move | None:
     stages = scene.build(spec, metadata, effects).stages
 
     @jax.jit
-    def pose(params, time):
-        return stages.pose(params, stages.prepare(params), time)
+    def deform(params, time):
+        return stages.deform(params, stages.prepare(params), time)
 
     def move(state, points, here, there):
-        first, last = (pose(state.params, view.time) for view in (here, there))
+        first, last = (deform(state.params, view.time) for view in (here, there))
         means = np.stack([np.asarray(first.mean), np.asarray(last.mean)])
         path = carried(points, means, _seen_opacity(state, first), 0)
         return Moved(path[:, 1].astype(points.dtype), np.ones(len(points), bool))
@@ -77,10 +77,10 @@ def mover(spec, metadata, effects=()) -> Move | None:
     return move
 
 
-def _seen_opacity(state, posed):
-    """[gaussians] opacity of posed Gaussians, 0 for rows that are not active."""
+def _seen_opacity(state, deformed):
+    """[gaussians] opacity of deformed Gaussians, 0 for rows that are not active."""
     active = np.asarray(splats.active_mask(state.params.rows["splats"]))
-    return np.where(active, np.asarray(posed.opacity), 0.0)
+    return np.where(active, np.asarray(deformed.opacity), 0.0)
 
 
 def carried(

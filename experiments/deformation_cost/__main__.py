@@ -11,7 +11,7 @@ against their number of knots, for the motion of a run, or for a small network t
 fitted to a motion in closed form.
 
 Times are medians of this process's processor time, the ways in turn, on one core. Flops
-are the compiler's count of one pose.
+are the compiler's count of one instant.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ class DeformationCost:
     """Run folder whose motion is tabulated (default: a small network fitted to a motion
     in closed form)."""
     gaussians: int = 10_000
-    """Gaussians to pose; times and flops are given for 10,000."""
+    """Gaussians to deform; times and flops are given for 10,000."""
     still: float = 0.5
     """Share of them that stands still where that is made use of."""
     knots: tuple[int, ...] = (4, 8, 16, 32, 64)
@@ -106,7 +106,7 @@ def costs(count: int, still: float, repeats: int) -> list[dict]:
     calls, rows = {}, []
     for arm in arms:
         row = {"name": arm.name}
-        for kind, field in (("forward", "pose"), ("both", "gradient")):
+        for kind, field in (("forward", "deform"), ("both", "gradient")):
             function = getattr(arm.used, field)
             if function is None:
                 row |= {f"{kind}_{x}": None for x in ("ms", "cpu_ms", "flops")}

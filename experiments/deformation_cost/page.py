@@ -16,7 +16,7 @@ def page(stored) -> str:
             "## Tables of time knots",
             f"{curve['name']}: {curve['gaussians']} Gaussians, of which "
             f"{curve['moving']} move by up to {curve['size']:.3g} scene units. The "
-            f"network takes {curve['exact_cpu_ms']:.2f} ms of one core a pose.",
+            f"network takes {curve['exact_cpu_ms']:.2f} ms of one core an instant.",
             _knots(curve),
         ]
     )

@@ -270,7 +270,7 @@ def test_under_a_network_it_waits_for_its_start_and_then_stills_it():
         def at_time(params, time):
             gaussians = rows.activate(params.rows["splats"])
             then = condition._replace(time=time)
-            return deformation.pose_in_training((motion,), params, gaussians, then)
+            return deformation.deform_in_training((motion,), params, gaussians, then)
 
         here = Params(params.rows, {mlp_motion.NAME: net})
         context = PenaltyContext(condition, step, None, here, at_time=at_time)

@@ -358,7 +358,7 @@ def test_the_effect_moves_a_scene_and_leaves_it_alone_in_its_warm_up(float64):
     @jax.jit
     def in_training(step):
         condition = FrameCondition(time, step=step, key=jax.random.key(0))
-        return deformation.pose_in_training(effects, params, canonical, condition)
+        return deformation.deform_in_training(effects, params, canonical, condition)
 
     for before, after in zip(canonical, in_training(jnp.asarray(9)), strict=True):
         np.testing.assert_array_equal(before, after)
@@ -368,10 +368,10 @@ def test_the_effect_moves_a_scene_and_leaves_it_alone_in_its_warm_up(float64):
     )
     expected = kan_motion.apply(canonical, offsets)
     prepared = jax.jit(lambda params: deformation.prepare(effects, params))(params)
-    posed = jax.jit(lambda *args: deformation.pose(effects, *args))(
+    deformed = jax.jit(lambda *args: deformation.deform(effects, *args))(
         params, prepared, time
     )
-    for one, other, truth in zip(moved, posed, expected, strict=True):
+    for one, other, truth in zip(moved, deformed, expected, strict=True):
         np.testing.assert_allclose(one, truth, atol=1e-13)
         np.testing.assert_allclose(other, truth, atol=1e-13)
 

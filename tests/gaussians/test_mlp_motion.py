@@ -296,7 +296,7 @@ def test_warm_up_is_a_branch_without_motion():
 
     def moved(params, step):
         condition = FrameCondition(jnp.asarray(0.5), step=step, key=jax.random.key(0))
-        return deformation.pose_in_training((field,), params, gaussians, condition)
+        return deformation.deform_in_training((field,), params, gaussians, condition)
 
     run = jax.jit(moved)
     before, after = run(params, jnp.asarray(9)), run(params, jnp.asarray(10))

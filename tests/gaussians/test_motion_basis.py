@@ -405,7 +405,7 @@ def test_warm_up_and_noise_are_of_training_alone():
     @jax.jit
     def moved(params, step):
         condition = FrameCondition(time, step=step, key=jax.random.key(0))
-        return deformation.pose_in_training((field,), params, gaussians, condition)
+        return deformation.deform_in_training((field,), params, gaussians, condition)
 
     np.testing.assert_array_equal(moved(params, jnp.asarray(9)).mean, gaussians.mean)
     ready = jax.jit(field.prepare)(params)
@@ -442,9 +442,9 @@ def test_a_scene_poses_alike_from_what_it_prepared(dtype):
     @jax.jit
     def whole(params):
         ready = deformation.prepare((field,), params)
-        return deformation.pose((field,), params, ready, time)
+        return deformation.deform((field,), params, ready, time)
 
-    ours = jax.jit(lambda p, r: deformation.pose((field,), p, r, time))(params, ready)
+    ours = jax.jit(lambda p, r: deformation.deform((field,), p, r, time))(params, ready)
     tolerance = {"float32": 2e-6, "float64": 1e-14}[dtype]
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, atol=tolerance),
