@@ -65,10 +65,10 @@ def bake(
             "and its last instant"
         )
     times = jnp.linspace(0, 1, knots, dtype=dtype)
-    deformed_rows = [jax.device_get(deform(time)) for time in times]
-    static = deformed_rows[knots // 2]
+    frames = [jax.device_get(deform(time)) for time in times]
+    static = frames[knots // 2]
     moves = np.zeros(len(static.mean), bool)
-    for time, now in zip(times, deformed_rows, strict=True):
+    for time, now in zip(times, frames, strict=True):
         if not np.array_equal(now.opacity, static.opacity):
             raise ValueError(
                 f"the opacities at time {float(time):g} are not those at "
@@ -77,9 +77,7 @@ def bake(
             )
         moves |= static_rows.dynamic_mask(static, now, static_threshold)
     rows = np.flatnonzero(moves)
-    tracks = [
-        _track(jax.tree.map(lambda leaf: leaf[rows], now)) for now in deformed_rows
-    ]
+    tracks = [_track(jax.tree.map(lambda leaf: leaf[rows], now)) for now in frames]
     track = Track(*(jnp.stack(leaves) for leaves in zip(*tracks, strict=True)))
     track = track._replace(quaternion=_aligned(track.quaternion))
     static = jax.tree.map(jnp.asarray, static)

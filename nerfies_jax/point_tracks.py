@@ -46,12 +46,12 @@ def follow(spec, metadata, state, capture, known, effects=()) -> Followed | None
         )
         each = jax.vmap(made.displace, (None, 0, None))  # point
         moved = jax.vmap(each, (None, None, 0))(params, still, conditions)
-        slope = jax.vmap(jax.jacfwd(made.displace, 1), (None, 0, None))
-        slopes = jax.vmap(slope, (None, 1, 0))(params, true, conditions)
+        grad = jax.vmap(jax.jacfwd(made.displace, 1), (None, 0, None))
+        grads = jax.vmap(grad, (None, 1, 0))(params, true, conditions)
         apart = jnp.linalg.norm(moved - jnp.mean(moved, axis=0), axis=-1)
-        return followed, apart, slopes
+        return followed, apart, grads
 
-    followed, apart, slopes = jax.device_get(
+    followed, apart, grads = jax.device_get(
         solve(
             state.params,
             state.step,
@@ -63,7 +63,7 @@ def follow(spec, metadata, state, capture, known, effects=()) -> Followed | None
     path = followed.points / np.float32(metadata.scale) + centre
     still_path = known.start_points[:, None]
     path = np.where(followed.converged[..., None], path, still_path)
-    stretch = np.linalg.svd(np.eye(3) + slopes.astype(float), compute_uv=False)
+    stretch = np.linalg.svd(np.eye(3) + grads.astype(float), compute_uv=False)
     strain = np.log(np.maximum(stretch, LEAST_STRETCH))
     return Followed(
         path=path.astype(np.float32),

@@ -65,7 +65,7 @@ NETWORKS = (
 
 
 def arms(count: int, still: float) -> list[Arm]:
-    """All of them for `count` Gaussians, of which a share `still` need not be deformed."""
+    """All of them for `count` Gaussians; a share `still` need not be deformed."""
     made = []
     for network in NETWORKS:
         used = _ways(network, network.spec, count, still)

@@ -176,7 +176,7 @@ def _drawer(model, state, view, size):
     deformed = stages.deform(params, stages.prepare(params), view.time)
     return lambda camera: (
         stages.draw(
-            params, posed, view._replace(camera=camera), size, state.step
+            params, deformed, view._replace(camera=camera), size, state.step
         ).colour
     )
 

@@ -27,9 +27,7 @@ class Renderer:
         self.size = size  # width and height in pixels
         self.seconds: list[float] = []  # of every frame, without compiling
         self.cpu_seconds: list[float] = []  # the same, of the processor
-        self.deformed_anew: list[
-            bool
-        ] = []  # whether that frame's instant was a new one
+        self.deformed_anew: list[bool] = []  # whether its instant was a new one
 
     def __call__(self, state: TrainState, view: View) -> Rendering:
         inputs = state.params, view, state.step

@@ -146,8 +146,8 @@ def test_arms_agree_with_the_network_they_shorten():
             off = np.abs(found.mean - exact.mean).max(axis=1) > 1e-6
             # What stands still is at rest instead, not where the network puts it.
             assert off.sum() <= (10 if "still" in name else 0)
-        slopes = jax.jit(whole.gradient)(*whole.inputs)
-        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
+        grads = jax.jit(whole.gradient)(*whole.inputs)
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(grads))
     papers = sum(network.paper for network in arms.NETWORKS)
     assert sum("still" in name for name in made) == papers
     assert sum("kept" in name for name in made) >= 2

@@ -93,8 +93,8 @@ def test_the_error_falls_with_the_order_of_the_interpolation(
 
 def catmull_rom(times, values, at):
     """Cubic Hermite with central slopes, and a parabola's at the ends."""
-    slopes = np.gradient(values, times, axis=0, edge_order=2)
-    return scipy.interpolate.CubicHermiteSpline(times, values, slopes)(at)
+    grads = np.gradient(values, times, axis=0, edge_order=2)
+    return scipy.interpolate.CubicHermiteSpline(times, values, grads)(at)
 
 
 @pytest.mark.parametrize("count", [4, 5, 9])
@@ -162,12 +162,12 @@ def test_opposite_quaternions_have_a_rotation_between(ends, interpolation, dtype
 
     knots = time_knots.bake(deform, 6, dtype=dtype)
     draw = jax.jit(lambda time: at(knots, time, interpolation))
-    slope = jax.jit(jax.jacfwd(lambda time: draw(time).quaternion))
+    grad = jax.jit(jax.jacfwd(lambda time: draw(time).quaternion))
     for time in np.linspace(0, 1, 41):
         time = jnp.asarray(time, dtype)
         length = np.linalg.norm(draw(time).quaternion)
         np.testing.assert_allclose(length, 1, rtol=1e-6)
-        assert np.isfinite(slope(time)).all()
+        assert np.isfinite(grad(time)).all()
 
 
 def test_a_time_outside_is_held_at_the_nearer_end(dtype):
