@@ -150,7 +150,7 @@ def _mover(asked, run):
     """What takes points from one picture to the next, where that is to be seen."""
     if asked.show != "flow":
         return None
-    move = run.representation.mover(run.spec, run.facts)
+    move = run.representation.mover(run.spec, run.metadata, effects=run.effects)
     if move is None:
         raise ValueError(
             "--show flow: nothing in this run moves points; it needs a warp or motion"

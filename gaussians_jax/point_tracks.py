@@ -54,15 +54,15 @@ def follow(spec, metadata, state, capture, known, effects=()) -> Followed | None
     )
 
 
-def mover(spec, facts) -> Move | None:
+def mover(spec, metadata, effects=()) -> Move | None:
     """What takes points of one view's instant to another's, as `follow` does.
 
     None where nothing moves the Gaussians.
     """
-    effects = scene.effects_of(spec, facts)
-    if all(effect.deform is None for effect in effects):
+    every = scene.all_effects(spec, metadata, effects)
+    if all(effect.deform is None for effect in every):
         return None
-    stages = scene.build(spec, facts).stages
+    stages = scene.build(spec, metadata, effects).stages
 
     @jax.jit
     def pose(params, time):

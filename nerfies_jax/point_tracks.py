@@ -73,12 +73,12 @@ def follow(spec, metadata, state, capture, known, effects=()) -> Followed | None
     )
 
 
-def mover(spec, facts) -> Move | None:
+def mover(spec, metadata, effects=()) -> Move | None:
     """What takes points of one view's moment to another's; None without a warp."""
-    made = scene.field(spec, facts)
+    made = scene.field(spec, metadata, effects=effects)
     if all(effect.displace is None for effect in made.effects):
         return None
-    centre = np.asarray(facts.centre, np.float32)
+    centre = np.asarray(metadata.centre, np.float32)
 
     @jax.jit
     def solve(params, step, points, here, there):
@@ -91,11 +91,11 @@ def mover(spec, facts) -> Move | None:
         return found.points[:, 1], found.converged[:, 1]
 
     def move(state, points, here, there):
-        inside = in_default_precision((points - centre) * np.float32(facts.scale))
+        inside = in_default_precision((points - centre) * np.float32(metadata.scale))
         found, known = jax.device_get(
             solve(state.params, state.step, inside, here, there)
         )
-        moved = found / np.float32(facts.scale) + centre
+        moved = found / np.float32(metadata.scale) + centre
         return Moved(np.where(known[:, None], moved, points), known)
 
     return move

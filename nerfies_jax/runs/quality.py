@@ -66,9 +66,11 @@ def measure(
     except ValueError as error:
         notes.append(f"No points were followed: {error}")
     if known is not None:
-        kind, scene = run.representation, (run.spec, run.facts)
-        followed = kind.follow(*scene, state, capture, known)
-        move = kind.mover(*scene)
+        kind, own = run.representation, run.effects
+        followed = kind.follow(
+            run.spec, run.metadata, state, capture, known, effects=own
+        )
+        move = kind.mover(run.spec, run.metadata, effects=own)
         if move is not None:
             flow = model_flow.heldout_flow(move, state, capture, scored)
     if extra.camera_fits:
