@@ -1,7 +1,7 @@
 """Optical flow of a trained scene: where what a pixel shows goes, by learned motion."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -28,8 +28,8 @@ class Moved(NamedTuple):
 
 # (state, points [points, 3] in scene units, their view, another view) -> where they are
 Move = Callable[[TrainState, np.ndarray, View, View], Moved]
-# (spec, metadata of the capture) -> None where nothing in the scene moves points
-Mover = Callable[[Any, Any], Move | None]
+# (spec, metadata, effects=()) -> None where nothing in the scene moves points
+Mover = Callable[..., Move | None]
 
 
 class Flow(NamedTuple):

@@ -175,10 +175,12 @@ def test_the_slope_of_the_error_is_that_of_both_representations(kind, float64):
     """Through rendering, posing and the block by block map of a field."""
     module, spec = KINDS[kind]
     film = scenes.tiny_capture()
-    facts = (
-        module.facts_of(film) if kind == "gaussians" else module.facts_of(film, spec)
+    metadata = (
+        module.metadata_of(film)
+        if kind == "gaussians"
+        else module.metadata_of(film, spec)
     )
-    model = module.build(spec, facts)
+    model = module.build(spec, metadata)
     state = model.init(film, jax.random.key(1))
     small = (12, 9)
     view = evaluation.resized(evaluation.view_of(film, 2), film.size, small)

@@ -19,7 +19,7 @@ from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.measure import image_quality, perceptual
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.radiance.template import TemplateSpec
-from nerfies_jax.runs import products, representations
+from nerfies_jax.runs import quality, representations
 from nerfies_jax.runs.config import CaptureSource, RunConfig
 from nerfies_jax.spec import RadianceScene, SamplingSpec
 from nerfies_jax.training.model import TrainState
@@ -260,14 +260,14 @@ def test_a_run_is_held_against_the_truth_of_its_scene(kind, filmed, rng):
     capture = run.capture
     scored = drawn(capture, rng)
     renderer = evaluation.Renderer(run.model, run.capture.size)
-    found, notes = products.quality(run, state, renderer, scored, None, 0)
+    found, notes = quality.measure(run, state, renderer, scored)
     assert notes == []
     strain = {"tracks.strain"} if kind == "radiance" else set()
     assert set(found) == ALWAYS | MASKED | DEPTHS | TRUTH | strain
 
     truth = protocol.stored_truth(capture)
-    known = protocol.known(capture, truth, 2, products.TRACKS)
-    followed = run.representation.follow(run.spec, run.facts, state, capture, known)
+    known = protocol.known(capture, truth, 2, quality.TRACKS)
+    followed = run.representation.follow(run.spec, run.metadata, state, capture, known)
     assert np.abs(followed.path - known.start_points[:, None]).max() > 1e-3
     seen = known.seen.copy()
     seen[:, known.start] = False
@@ -278,7 +278,7 @@ def test_a_run_is_held_against_the_truth_of_its_scene(kind, filmed, rng):
         away = np.linalg.norm(path - known.path, axis=-1)[seen]
         assert found[key] == pytest.approx(away.mean(), rel=1e-4)
     # The flow is that of the same motion: points of the start at the last moment.
-    move = run.representation.mover(run.spec, run.facts)
+    move = run.representation.mover(run.spec, run.metadata)
     here, there = (
         evaluation.view_of(capture, int(known.moments[place]))
         for place in (known.start, -1)
@@ -298,27 +298,27 @@ def test_a_scene_without_motion_or_truth_has_no_points_to_follow(filmed, rng, tm
     run, state = started("gaussians", filmed)
     static = dataclasses.replace(KINDS["gaussians"], motion=None)
     kind = run.representation
-    assert kind.mover(static, splat_scene.facts_of(run.capture)) is None
+    assert kind.mover(static, splat_scene.metadata_of(run.capture)) is None
     field = dataclasses.replace(FIELD, warp=None)
     assert (
         representations.named("radiance").mover(
-            field, scene.facts_of(run.capture, field)
+            field, scene.metadata_of(run.capture, field)
         )
         is None
     )
     renderer = evaluation.Renderer(run.model, run.capture.size)
     scored = drawn(run.capture, rng)
     elsewhere = dataclasses.replace(run.capture, path=None)
-    found, notes = products.quality(
-        run._replace(capture=elsewhere), state, renderer, scored, None, 0
+    found, notes = quality.measure(
+        run._replace(capture=elsewhere), state, renderer, scored
     )
     assert notes == []
     assert set(found) == ALWAYS | MASKED | DEPTHS
     # A truth of another scene is no reason to lose what was trained.
     (tmp_path / synthetic.TRUTH_FILE).write_bytes(b"cut short")
     broken = dataclasses.replace(run.capture, path=tmp_path)
-    found, notes = products.quality(
-        run._replace(capture=broken), state, renderer, scored, None, 0
+    found, notes = quality.measure(
+        run._replace(capture=broken), state, renderer, scored
     )
     assert set(found) == ALWAYS | MASKED | DEPTHS
     assert "no scene truth" in notes[0]

@@ -108,3 +108,16 @@ def test_claims_are_about_arms_and_measures_that_there_are(name):
     judged = {arm for claim in suite.claims for arm in (claim.better, claim.worse)}
     if suite.claims:  # "settings" and "advice" claim nothing: they say what there is
         assert set(suite.arms) - judged <= {"d-nerf"}
+
+
+def test_what_is_estimated_of_a_real_capture_judges_nothing():
+    found = dict.fromkeys(measures.KEYS.values(), 1.0)
+    exact = measures.quality(found, exact=True)
+    assert exact == dict.fromkeys(measures.KEYS, 1.0)
+    estimated = measures.quality(found, exact=False)
+    known = {name for name, value in estimated.items() if value == 1}
+    assert known == {"psnr", "ssim"} | {n for n in measures.KEYS if "track" in n} | {
+        "drift",
+        "strain",
+    }
+    assert set(measures.quality({}, exact=True)) == set(measures.KEYS) <= set(MEASURES)

@@ -115,6 +115,8 @@ def test_a_folder_that_is_no_capture_says_what_was_looked_for(tmp_path, capsys):
         (("--resume",), "--out"),
         (("--heldout", "1"), "held"),
         (("--checkpoint-every", "-1"), "--checkpoint-every -1"),
+        (("--lpips-weights", "a.npz"), "31 pixels on the shorter side"),
+        (("--lpips-weights", "a.npz", "--lpips-network", "vgg"), "a.npz: no such file"),
     ],
 )
 def test_wrong_settings_are_refused(arguments, words, filmed, capsys, tmp_path):
