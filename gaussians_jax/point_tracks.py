@@ -6,14 +6,14 @@ import scipy.spatial
 
 from gaussians_jax import scene, splats
 from nerfies_jax.evaluation.model_flow import Move, Moved
-from nerfies_jax.evaluation.protocol import STILL_POINTS, Followed
+from nerfies_jax.evaluation.protocol import STATIC_POINTS, PointTracks
 from nerfies_jax.training.model import in_default_precision
 
 NEIGHBOURS = 8  # Gaussians that carry a point
 LEAST_OPACITY = 0.05  # of a Gaussian that can carry one; fainter ones are not seen
 
 
-def follow(spec, metadata, state, capture, known, effects=()) -> Followed | None:
+def follow(spec, metadata, state, capture, ground_truth, effects=()) -> PointTracks | None:
     """Points of the start at all other moments, carried by the Gaussians around them.
 
     A point moves as the `NEIGHBOURS` nearest Gaussians that can be seen do on average,
@@ -27,26 +27,26 @@ def follow(spec, metadata, state, capture, known, effects=()) -> Followed | None
     """
 
     every = scene.all_effects(spec, metadata, effects)
-    if all(effect.deform is None for effect in every) or not len(known.path):
+    if all(effect.deform is None for effect in every) or not len(ground_truth.path):
         return None
     stages = scene.build(spec, metadata, effects).stages
     prepared = jax.jit(stages.prepare)(state.params)
     deform = jax.jit(lambda params, ready, time: stages.deform(params, ready, time))
-    times = in_default_precision(capture.times[known.moments])
+    times = in_default_precision(capture.times[ground_truth.moments])
     # [moments, gaussians, 3]
     means = np.stack(
         [np.asarray(deform(state.params, prepared, time).mean) for time in times]
     )
-    first = deform(state.params, prepared, times[known.start])
+    first = deform(state.params, prepared, times[ground_truth.start])
     opacity = _seen_opacity(state, first)
-    path = carried(known.start_points, means, opacity, known.start)
+    path = carried(ground_truth.start_points, means, opacity, ground_truth.start)
     drift = float("nan")
     if capture.points is not None:
-        still = capture.points.position[:STILL_POINTS]
-        still = carried(still, means, opacity, known.start)
-        apart = still - still.mean(axis=1, keepdims=True)
+        static = capture.points.position[:STATIC_POINTS]
+        static = carried(static, means, opacity, ground_truth.start)
+        apart = static - static.mean(axis=1, keepdims=True)
         drift = float(np.linalg.norm(apart, axis=-1).mean())
-    return Followed(
+    return PointTracks(
         path=path.astype(np.float32),
         found=np.ones(path.shape[:2], bool),
         drift=drift,

@@ -67,7 +67,7 @@ def metadata_of(capture: Capture) -> SceneMetadata:
     positions = np.asarray(capture.cameras.position)[capture.train]
     halfway = 2 / (1 / capture.near + 1 / capture.far)
     return SceneMetadata(
-        extent=splats.scene_extent(positions, still=halfway),
+        extent=splats.scene_extent(positions, static=halfway),
         background=capture.background or (0.0, 0.0, 0.0),
         frames=len(capture.train),
     )

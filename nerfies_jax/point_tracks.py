@@ -6,7 +6,7 @@ import numpy as np
 
 from nerfies_jax import evaluation, scene
 from nerfies_jax.evaluation.model_flow import Move, Moved
-from nerfies_jax.evaluation.protocol import STILL_POINTS, Followed
+from nerfies_jax.evaluation.protocol import STATIC_POINTS, PointTracks
 from nerfies_jax.training import tracks
 from nerfies_jax.training.effects import FrameCondition
 from nerfies_jax.training.model import in_default_precision
@@ -14,7 +14,7 @@ from nerfies_jax.training.model import in_default_precision
 LEAST_STRETCH = 1e-6  # a collapsed direction has a logarithm, too
 
 
-def follow(spec, metadata, state, capture, known, effects=()) -> Followed | None:
+def follow(spec, metadata, state, capture, ground_truth, effects=()) -> PointTracks | None:
     """Points of the start at all other moments, through the template of a field.
 
     A point goes to the template by the warp of the start, and from there by the inverse
@@ -22,30 +22,30 @@ def follow(spec, metadata, state, capture, known, effects=()) -> Followed | None
     """
 
     made = scene.field(spec, metadata, effects=effects)
-    if all(effect.displace is None for effect in made.effects) or not len(known.path):
+    if all(effect.displace is None for effect in made.effects) or not len(ground_truth.path):
         return None
-    views = [evaluation.view_of(capture, int(row)) for row in known.moments]
+    views = [evaluation.view_of(capture, int(row)) for row in ground_truth.moments]
     views = jax.tree.map(lambda *leaves: jnp.stack(leaves), *views)
     centre = np.asarray(metadata.centre, np.float32)
 
     def to_field(points):
         return in_default_precision((points - centre) * np.float32(metadata.scale))
 
-    still = np.zeros((0, 3), np.float32)
+    static = np.zeros((0, 3), np.float32)
     if capture.points is not None:
-        still = capture.points.position[:STILL_POINTS]
+        static = capture.points.position[:STATIC_POINTS]
 
     @jax.jit
-    def solve(params, step, start, true, still):
+    def solve(params, step, start, true, static):
         def condition_of(view):
             return FrameCondition(view.time, made.codes_at(params, view), step)
 
         conditions = jax.vmap(condition_of)(views)
         followed = tracks.point_tracks(
-            made.displace, params, start, conditions, known.start
+            made.displace, params, start, conditions, ground_truth.start
         )
         each = jax.vmap(made.displace, (None, 0, None))  # point
-        moved = jax.vmap(each, (None, None, 0))(params, still, conditions)
+        moved = jax.vmap(each, (None, None, 0))(params, static, conditions)
         grad = jax.vmap(jax.jacfwd(made.displace, 1), (None, 0, None))
         grads = jax.vmap(grad, (None, 1, 0))(params, true, conditions)
         apart = jnp.linalg.norm(moved - jnp.mean(moved, axis=0), axis=-1)
@@ -55,17 +55,17 @@ def follow(spec, metadata, state, capture, known, effects=()) -> Followed | None
         solve(
             state.params,
             state.step,
-            to_field(known.start_points),
-            to_field(known.path),
-            to_field(still),
+            to_field(ground_truth.start_points),
+            to_field(ground_truth.path),
+            to_field(static),
         )
     )
     path = followed.points / np.float32(metadata.scale) + centre
-    still_path = known.start_points[:, None]
+    still_path = ground_truth.start_points[:, None]
     path = np.where(followed.converged[..., None], path, still_path)
     stretch = np.linalg.svd(np.eye(3) + grads.astype(float), compute_uv=False)
     strain = np.log(np.maximum(stretch, LEAST_STRETCH))
-    return Followed(
+    return PointTracks(
         path=path.astype(np.float32),
         found=followed.converged,
         drift=float(apart.mean() / metadata.scale) if apart.size else float("nan"),
@@ -92,10 +92,10 @@ def mover(spec, metadata, effects=()) -> Move | None:
 
     def move(state, points, here, there):
         inside = in_default_precision((points - centre) * np.float32(metadata.scale))
-        found, known = jax.device_get(
+        found, ground_truth = jax.device_get(
             solve(state.params, state.step, inside, here, there)
         )
         moved = found / np.float32(metadata.scale) + centre
-        return Moved(np.where(known[:, None], moved, points), known)
+        return Moved(np.where(ground_truth[:, None], moved, points), ground_truth)
 
     return move

@@ -104,11 +104,11 @@ class Job:
             film = synthetic.PRESETS[source.scene]
             self.filmed = synthetic.digest(film)
             self.capture, truth = synthetic.cached(film, platform.CACHE / "scenes")
-            self.known = protocol.known(self.capture, truth, asked.frames, asked.tracks)
+            self.ground_truth = protocol.ground_truth(self.capture, truth, asked.frames, asked.tracks)
             return
         self.capture = runs.read_capture(source)
         self.filmed = hashlib.sha256(self.capture.images.tobytes()).hexdigest()[:16]
-        self.known = protocol.filmed(self.capture, asked.frames)
+        self.ground_truth = protocol.held_out_only(self.capture, asked.frames)
 
     def _listen(self, event, seconds, **_):
         if event == SAVED:
@@ -226,17 +226,17 @@ class Job:
             print(f"stopped; go on with the same command and --out {self.out}")
             raise SystemExit(130 if result.stopped_by == "SIGINT" else 143)
         scored = evaluation.score(
-            arm.renderer, result.state, self.capture, self.known.rows
+            arm.renderer, result.state, self.capture, self.ground_truth.rows
         )
         followed = arm.representation.follow(
-            arm.spec, arm.metadata, result.state, self.capture, self.known
+            arm.spec, arm.metadata, result.state, self.capture, self.ground_truth
         )
         found = heldout.heldout_metrics(
-            scored, self.capture, known=self.known, followed=followed
+            scored, self.capture, ground_truth=self.ground_truth, followed=followed
         )
         counts = arm.model.counts(result.state)
         numbers = {
-            **measures.quality(found, self.known.exact),
+            **measures.quality(found, self.ground_truth.exact),
             "gaussians": float(counts.get("gaussians", float("nan"))),
             "parameters": float(counts["parameters"]),
             "steps": float(result.steps),
@@ -245,7 +245,7 @@ class Job:
             "compile_seconds": arm.compile_seconds + compile_seconds,
             # Jobs side by side double what the wall clock says.
             "render_ms": arm.renderer.ms_per_frame(
-                len(self.known.rows), cpu=jax.default_backend() == "cpu"
+                len(self.ground_truth.rows), cpu=jax.default_backend() == "cpu"
             ),
             "peak_mb": clock.peak_bytes() / 1e6,
         }
@@ -303,9 +303,9 @@ class Job:
             "steps": steps,
             "seconds": budget.seconds,
             "spec": specs.as_json(self.spec(name, steps)),
-            "rows": self.known.rows.tolist(),
-            "tracks": len(self.known.path),
-            "start": self.known.start,
+            "rows": self.ground_truth.rows.tolist(),
+            "tracks": len(self.ground_truth.path),
+            "start": self.ground_truth.start,
         }
 
     def path(self, name: str, seed: int, budget: Budget) -> pathlib.Path:

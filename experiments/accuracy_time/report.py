@@ -39,7 +39,7 @@ SPLAT_COLOUR, FIELD_COLOUR = "#0a5fb4", "#c4501b"
 def write(job, asked, finished) -> list[Metric]:
     """accuracy_time.json, front.png and fronts.png; prints the lines of every axis."""
     numbers = {key: kept.numbers for key, kept in finished.items()}
-    still = protocol.still_error(job.known)
+    static = protocol.static_error(job.ground_truth)
     print(f"\n{job.capture.name}, every setting trained {job.budgets[0].title}:")
     for name in asked.axes:
         print(f"\n{AXES[name].question} ({name}, against {AXES[name].base})")
@@ -54,7 +54,7 @@ def write(job, asked, finished) -> list[Metric]:
         for name in names:
             row = means[name]
             print(f"    {row[cost]:9.1f}  {row['psnr']:.2f} dB  {name}")
-    metrics = report.metrics(numbers, still)
+    metrics = report.metrics(numbers, static)
     about = {
         "capture": job.capture.name,
         "settings": specs.as_json(asked),
@@ -141,13 +141,13 @@ def front(
     A setting without one of the two numbers is left out; of equals the first stays.
     """
     sign = -1 if MEASURES[quality].direction == "lower" else 1
-    known = [
+    ground_truth = [
         (row[cost], -sign * row[quality], place, name)
         for place, (name, row) in enumerate(means.items())
         if math.isfinite(row[cost]) and math.isfinite(row[quality])
     ]
     best, found = math.inf, []
-    for _, loss, _, name in sorted(known):
+    for _, loss, _, name in sorted(ground_truth):
         if loss < best:
             best = loss
             found.append(name)

@@ -40,11 +40,11 @@ def followed_points(views: Views, films: list[Film]) -> np.ndarray:
     found = []
     for film in films:
         for one in film.centres:
-            still = one.usable & ~one.moving & (one.fit.inverse_depth > 0)
-            still &= one.fit.residual < 2 * one.noise_px
-            still &= one.fit.count >= 0.75 * len(one.paths.views)
-            depth = 1 / one.fit.inverse_depth[still]
-            ray = view_set.rays(views, one.view)[still]
+            static = one.usable & ~one.moving & (one.fit.inverse_depth > 0)
+            static &= one.fit.residual < 2 * one.noise_px
+            static &= one.fit.count >= 0.75 * len(one.paths.views)
+            depth = 1 / one.fit.inverse_depth[static]
+            ray = view_set.rays(views, one.view)[static]
             found.append(views.position[one.view] + depth[:, None] * ray)
     points = np.concatenate(found) if found else np.zeros((0, 3))
     rng = np.random.default_rng(0)

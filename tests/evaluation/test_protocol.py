@@ -7,7 +7,7 @@ import pytest
 
 from nerfies_jax.capture import synthetic
 from nerfies_jax.evaluation import protocol
-from nerfies_jax.evaluation.protocol import Followed
+from nerfies_jax.evaluation.protocol import PointTracks
 from tests import scenes
 
 SHIFT = np.float32([0.012, 0.0, 0.016])  # 0.02 long
@@ -17,76 +17,76 @@ SHIFT = np.float32([0.012, 0.0, 0.016])  # 0.02 long
 def filmed():
     film = dataclasses.replace(scenes.TINY_FILM, heldout_every=2)
     capture, truth = synthetic.make(film)
-    return capture, truth, protocol.known(capture, truth, 2, 5)
+    return capture, truth, protocol.ground_truth(capture, truth, 2, 5)
 
 
 def test_the_known_paths_are_those_of_points_seen_at_the_start(filmed):
-    capture, truth, known = filmed
-    assert known.path.shape == (5, len(capture.train), 3)
-    assert len(known.rows) == 2
-    assert set(known.rows) <= set(capture.heldout)
-    assert np.all(np.diff(capture.times[known.moments]) > 0)
-    assert known.start == len(known.moments) // 2
-    assert known.seen[:, known.start].all()
-    for point, seen in zip(known.path, known.seen, strict=True):
+    capture, truth, ground_truth = filmed
+    assert ground_truth.path.shape == (5, len(capture.train), 3)
+    assert len(ground_truth.rows) == 2
+    assert set(ground_truth.rows) <= set(capture.heldout)
+    assert np.all(np.diff(capture.times[ground_truth.moments]) > 0)
+    assert ground_truth.start == len(ground_truth.moments) // 2
+    assert ground_truth.seen[:, ground_truth.start].all()
+    for point, seen in zip(ground_truth.path, ground_truth.seen, strict=True):
         (track,) = np.flatnonzero((truth.track_canonical == point[0]).all(axis=1))
         np.testing.assert_array_equal(point, truth.track_world[track])
-        np.testing.assert_array_equal(seen, truth.track_seen[track][known.moments])
+        np.testing.assert_array_equal(seen, truth.track_seen[track][ground_truth.moments])
 
 
 def test_a_scaled_capture_has_its_paths_in_scene_units(filmed):
-    capture, truth, known = filmed
+    capture, truth, ground_truth = filmed
     other = dataclasses.replace(capture, scale=2.0, centre=(0.1, 0.2, -0.3))
-    found = protocol.known(other, truth, 2, 5)
-    expected = 2 * (known.path - np.float32([0.1, 0.2, -0.3]))
+    found = protocol.ground_truth(other, truth, 2, 5)
+    expected = 2 * (ground_truth.path - np.float32([0.1, 0.2, -0.3]))
     np.testing.assert_allclose(found.path, expected, atol=1e-6)
 
 
 def test_the_truth_of_another_capture_is_refused(filmed):
     capture, truth, _ = filmed
     with pytest.raises(ValueError, match="other frames than the capture"):
-        protocol.known(capture, truth._replace(ids=truth.ids[1:]), 2, 5)
+        protocol.ground_truth(capture, truth._replace(ids=truth.ids[1:]), 2, 5)
 
 
 def test_tracks_are_scored_by_their_distance_at_all_instants_but_the_start(filmed):
-    known = filmed[2]._replace(seen=np.ones_like(filmed[2].seen))
-    found = np.ones(known.seen.shape, bool)
+    ground_truth = filmed[2]._replace(seen=np.ones_like(filmed[2].seen))
+    found = np.ones(ground_truth.seen.shape, bool)
     found[0, 4:6] = False
-    right = Followed(known.path, found, 0.1, 0.2)
+    right = PointTracks(ground_truth.path, found, 0.1, 0.2)
     later = found[:, 1:].size  # all but one column
-    numbers = protocol.score_tracks(known, right)
+    numbers = protocol.score_tracks(ground_truth, right)
     assert numbers["track_error"] == 0
     assert numbers["track_correct"] == 1
     assert numbers["track_lost"] == pytest.approx(2 / later)
     assert (numbers["drift"], numbers["strain"]) == (0.1, 0.2)
-    wrong = right._replace(path=known.path + SHIFT)
-    numbers = protocol.score_tracks(known, wrong)
+    wrong = right._replace(path=ground_truth.path + SHIFT)
+    numbers = protocol.score_tracks(ground_truth, wrong)
     assert numbers["track_error"] == pytest.approx(0.02, rel=1e-4)
     assert numbers["track_correct"] == 0
     # What cannot be seen is not scored.
-    half = known.seen.copy()
+    half = ground_truth.seen.copy()
     half[:, ::2] = False
     wrong.path[:, ::2] = 9.0
-    numbers = protocol.score_tracks(known._replace(seen=half), wrong)
+    numbers = protocol.score_tracks(ground_truth._replace(seen=half), wrong)
     assert numbers["track_error"] == pytest.approx(0.02, rel=1e-4)
-    away = np.linalg.norm(known.path - known.path[:, 3:4], axis=-1)
+    away = np.linalg.norm(ground_truth.path - ground_truth.path[:, 3:4], axis=-1)
     away = np.delete(away, 3, axis=1)
-    assert protocol.still_error(known) == pytest.approx(away.mean(), rel=1e-5)
+    assert protocol.static_error(ground_truth) == pytest.approx(away.mean(), rel=1e-5)
     assert away.mean() > 1e-3
-    nothing = protocol.score_tracks(known, None)
+    nothing = protocol.score_tracks(ground_truth, None)
     assert np.isnan(list(nothing.values())).all()
 
 
 def test_a_real_capture_is_judged_by_its_pictures_alone(filmed):
-    capture, _, known = filmed
-    found = protocol.filmed(capture, 2)
-    np.testing.assert_array_equal(found.rows, known.rows)
-    np.testing.assert_array_equal(found.moments, known.moments)
+    capture, _, ground_truth = filmed
+    found = protocol.held_out_only(capture, 2)
+    np.testing.assert_array_equal(found.rows, ground_truth.rows)
+    np.testing.assert_array_equal(found.moments, ground_truth.moments)
 
     assert np.isnan(list(protocol.score_tracks(found, None).values())).all()
-    assert np.isnan(protocol.still_error(found))
+    assert np.isnan(protocol.static_error(found))
     blind = dataclasses.replace(
         capture, train=np.arange(len(capture.ids)), heldout=np.zeros(0, int)
     )
     with pytest.raises(ValueError, match="no held-out frames to judge by"):
-        protocol.filmed(blind, 2)
+        protocol.held_out_only(blind, 2)

@@ -229,7 +229,7 @@ def test_a_tripod_has_no_extent_of_its_own():
     position = np.tile([[1000.0, 2.0, 3.0]], (5, 1)) + np.float32(6e-5) * np.eye(5, 3)
     with pytest.raises(ValueError, match="stand still"):
         rows.scene_extent(position)
-    assert rows.scene_extent(position, still=2.5) == 2.5
+    assert rows.scene_extent(position, static=2.5) == 2.5
 
 
 @pytest.mark.hard_cases
