@@ -68,7 +68,7 @@ class FrequencyGates:
             raise ValueError(f"--most {self.most} must be positive numbers")
 
 
-class Arm(NamedTuple):
+class GateSetting(NamedTuple):
     """One rule at one weight."""
 
     rule: str  # one of RULES, or "none"
@@ -93,12 +93,12 @@ class Fitted(NamedTuple):
     opening: np.ndarray | None  # [seeds, 2, steps] wavelet, Fourier: weight over most
 
 
-def arms(asked: FrequencyGates) -> list[Arm]:
+def arms(asked: FrequencyGates) -> list[GateSetting]:
     """No spectral loss, every gate at every weight, warnings at the largest."""
-    found = [Arm("none", None)]
+    found = [GateSetting("none", None)]
     for most in asked.most:
-        found += [Arm(gate, most) for gate in spectral.GATES]
-    return found + [Arm(rule, max(asked.most)) for rule in WARNINGS]
+        found += [GateSetting(gate, most) for gate in spectral.GATES]
+    return found + [GateSetting(rule, max(asked.most)) for rule in WARNINGS]
 
 
 def picture(pixels: int) -> np.ndarray:
@@ -119,7 +119,7 @@ def picture(pixels: int) -> np.ndarray:
     return np.clip(image, 0, 1).astype(np.float32)
 
 
-def fit(arm: Arm, asked: FrequencyGates) -> Fitted:
+def fit(arm: GateSetting, asked: FrequencyGates) -> Fitted:
     """Train the arm from every seed at once."""
     truth = jnp.asarray(picture(asked.pixels))
     draw, first = _network(asked)
@@ -187,11 +187,11 @@ def _network(asked):
     return draw, lambda key: mlp.init(spec, key)
 
 
-def numbers(fitted: dict[Arm, Fitted]) -> dict[str, dict[str, float | None]]:
+def numbers(fitted: dict[GateSetting, Fitted]) -> dict[str, dict[str, float | None]]:
     """Of each arm: PSNR, its gain over no spectral loss (pairs of equal seeds), and
     both gates' openings half-way and at the end, in the mean over the seeds.
     """
-    plain = fitted[Arm("none", None)].psnr[:, -1]
+    plain = fitted[GateSetting("none", None)].psnr[:, -1]
     rows = {}
     for arm, found in fitted.items():
         last = found.psnr[:, -1]
@@ -284,7 +284,7 @@ def page(stored) -> str:
     return f"{markdown.table(heads, rows)}\n\n{markdown.bullets(stored['said'])}"
 
 
-def draw_figure(fitted: dict[Arm, Fitted], path: pathlib.Path) -> None:
+def draw_figure(fitted: dict[GateSetting, Fitted], path: pathlib.Path) -> None:
     """For each weight: the wavelet gate and the PSNR against the step."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

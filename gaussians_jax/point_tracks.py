@@ -13,7 +13,7 @@ NEIGHBOURS = 8  # Gaussians that carry a point
 LEAST_OPACITY = 0.05  # of a Gaussian that can carry one; fainter ones are not seen
 
 
-def follow(spec, metadata, state, capture, ground_truth, effects=()) -> PointTracks | None:
+def follow(spec, metadata, state, capture, known, effects=()) -> PointTracks | None:
     """Points of the start at all other moments, carried by the Gaussians around them.
 
     A point moves as the `NEIGHBOURS` nearest Gaussians that can be seen do on average,
@@ -27,23 +27,23 @@ def follow(spec, metadata, state, capture, ground_truth, effects=()) -> PointTra
     """
 
     every = scene.all_effects(spec, metadata, effects)
-    if all(effect.deform is None for effect in every) or not len(ground_truth.path):
+    if all(effect.deform is None for effect in every) or not len(known.path):
         return None
     stages = scene.build(spec, metadata, effects).stages
     prepared = jax.jit(stages.prepare)(state.params)
     deform = jax.jit(lambda params, ready, time: stages.deform(params, ready, time))
-    times = in_default_precision(capture.times[ground_truth.moments])
+    times = in_default_precision(capture.times[known.moments])
     # [moments, gaussians, 3]
     means = np.stack(
         [np.asarray(deform(state.params, prepared, time).mean) for time in times]
     )
-    first = deform(state.params, prepared, times[ground_truth.start])
+    first = deform(state.params, prepared, times[known.start])
     opacity = _seen_opacity(state, first)
-    path = carried(ground_truth.start_points, means, opacity, ground_truth.start)
+    path = carried(known.start_points, means, opacity, known.start)
     drift = float("nan")
     if capture.points is not None:
         static = capture.points.position[:STATIC_POINTS]
-        static = carried(static, means, opacity, ground_truth.start)
+        static = carried(static, means, opacity, known.start)
         apart = static - static.mean(axis=1, keepdims=True)
         drift = float(np.linalg.norm(apart, axis=-1).mean())
     return PointTracks(

@@ -14,7 +14,7 @@ from nerfies_jax.training.model import in_default_precision
 LEAST_STRETCH = 1e-6  # a collapsed direction has a logarithm, too
 
 
-def follow(spec, metadata, state, capture, ground_truth, effects=()) -> PointTracks | None:
+def follow(spec, metadata, state, capture, known, effects=()) -> PointTracks | None:
     """Points of the start at all other moments, through the template of a field.
 
     A point goes to the template by the warp of the start, and from there by the inverse
@@ -22,9 +22,9 @@ def follow(spec, metadata, state, capture, ground_truth, effects=()) -> PointTra
     """
 
     made = scene.field(spec, metadata, effects=effects)
-    if all(effect.displace is None for effect in made.effects) or not len(ground_truth.path):
+    if all(effect.displace is None for effect in made.effects) or not len(known.path):
         return None
-    views = [evaluation.view_of(capture, int(row)) for row in ground_truth.moments]
+    views = [evaluation.view_of(capture, int(row)) for row in known.moments]
     views = jax.tree.map(lambda *leaves: jnp.stack(leaves), *views)
     centre = np.asarray(metadata.centre, np.float32)
 
@@ -42,7 +42,7 @@ def follow(spec, metadata, state, capture, ground_truth, effects=()) -> PointTra
 
         conditions = jax.vmap(condition_of)(views)
         followed = tracks.point_tracks(
-            made.displace, params, start, conditions, ground_truth.start
+            made.displace, params, start, conditions, known.start
         )
         each = jax.vmap(made.displace, (None, 0, None))  # point
         moved = jax.vmap(each, (None, None, 0))(params, static, conditions)
@@ -55,13 +55,13 @@ def follow(spec, metadata, state, capture, ground_truth, effects=()) -> PointTra
         solve(
             state.params,
             state.step,
-            to_field(ground_truth.start_points),
-            to_field(ground_truth.path),
+            to_field(known.start_points),
+            to_field(known.path),
             to_field(static),
         )
     )
     path = followed.points / np.float32(metadata.scale) + centre
-    still_path = ground_truth.start_points[:, None]
+    still_path = known.start_points[:, None]
     path = np.where(followed.converged[..., None], path, still_path)
     stretch = np.linalg.svd(np.eye(3) + grads.astype(float), compute_uv=False)
     strain = np.log(np.maximum(stretch, LEAST_STRETCH))
@@ -92,10 +92,10 @@ def mover(spec, metadata, effects=()) -> Move | None:
 
     def move(state, points, here, there):
         inside = in_default_precision((points - centre) * np.float32(metadata.scale))
-        found, ground_truth = jax.device_get(
+        found, known = jax.device_get(
             solve(state.params, state.step, inside, here, there)
         )
         moved = found / np.float32(metadata.scale) + centre
-        return Moved(np.where(ground_truth[:, None], moved, points), ground_truth)
+        return Moved(np.where(known[:, None], moved, points), known)
 
     return move

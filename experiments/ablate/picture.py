@@ -21,22 +21,22 @@ LARGEST_ERROR = 0.2
 TRUE, FOUND, APART = (255, 255, 255), (255, 140, 0), (230, 30, 30)
 
 
-def shown_row(ground_truth: GroundTruth, capture: Capture) -> int:
+def shown_row(known: GroundTruth, capture: Capture) -> int:
     """Which of the rendered frames to show: where points are farthest from the start.
 
     Without any that move, the middle one.
     """
-    if not len(ground_truth.path):
-        return len(ground_truth.rows) // 2
-    away = np.linalg.norm(ground_truth.path - ground_truth.start_points[:, None], axis=-1).mean(
+    if not len(known.path):
+        return len(known.rows) // 2
+    away = np.linalg.norm(known.path - known.start_points[:, None], axis=-1).mean(
         axis=0
     )
-    return int(np.argmax([away[_moment(ground_truth, capture, row)] for row in ground_truth.rows]))
+    return int(np.argmax([away[_moment(known, capture, row)] for row in known.rows]))
 
 
 def draw(
     capture: Capture,
-    ground_truth: GroundTruth,
+    known: GroundTruth,
     colour: Mapping[str, np.ndarray],
     depth: Mapping[str, np.ndarray],
     path: Mapping[str, np.ndarray | None],
@@ -49,8 +49,8 @@ def draw(
     orange: where they are followed to; red: from one to the other. Of a real capture
     only the pictures are known, and depths are shown between the limits of the first.
     """
-    row = int(ground_truth.rows[shown])
-    if not ground_truth.exact:
+    row = int(known.rows[shown])
+    if not known.exact:
         return _draw_filmed(capture, row, colour, depth)
     truth, true_depth = capture.images[row], capture.depths[row]
     coloured = pictures.colour_depth(true_depth)
@@ -58,13 +58,13 @@ def draw(
     moving = np.where(capture.moving[row][..., None], truth, truth // 4)
     panels = [truth, moving, coloured.picture]
     panels = [_enlarged(panel) for panel in panels]
-    panels.append(_tracks(capture, ground_truth, ground_truth.path, row))
+    panels.append(_tracks(capture, known, known.path, row))
     labels = [f"truth: {capture.ids[row]}", "what moves", "true depth", "true tracks"]
     for arm, rendered in colour.items():
         error = pictures.colour_error(rendered, truth, LARGEST_ERROR).picture
         deep = pictures.colour_depth(depth[arm], limits=limits).picture
         panels += [_enlarged(panel) for panel in (rendered, error, deep)]
-        panels.append(_tracks(capture, ground_truth, path[arm], row))
+        panels.append(_tracks(capture, known, path[arm], row))
         labels += [arm, f"error, to {LARGEST_ERROR:g}", "depth", captions[arm]]
     return pictures.contact_sheet(panels, labels)
 
@@ -86,27 +86,27 @@ def _enlarged(picture):
     return pictures.as_bytes(picture).repeat(factor, 0).repeat(factor, 1)
 
 
-def _moment(ground_truth, capture, row):
+def _moment(known, capture, row):
     """Which of the moments is nearest in time to a frame."""
-    return np.argmin(np.abs(capture.times[ground_truth.moments] - capture.times[row]))
+    return np.argmin(np.abs(capture.times[known.moments] - capture.times[row]))
 
 
-def _tracks(capture, ground_truth, path, row):
+def _tracks(capture, known, path, row):
     """Tracks over the darkened frame; a `path` of None does not move."""
     picture = _enlarged(capture.images[row] // 2)
     factor = picture.shape[1] / capture.size[0]
     image = PIL.Image.fromarray(picture)
-    if len(ground_truth.path):
+    if len(known.path):
         pen = PIL.ImageDraw.Draw(image)
-        few = np.linspace(0, len(ground_truth.path) - 1, min(DRAWN, len(ground_truth.path)))
+        few = np.linspace(0, len(known.path) - 1, min(DRAWN, len(known.path)))
         few = few.round().astype(int)
-        now = _moment(ground_truth, capture, row)
+        now = _moment(known, capture, row)
         if path is None:
-            path = np.broadcast_to(ground_truth.start_points[:, None], ground_truth.path.shape)
+            path = np.broadcast_to(known.start_points[:, None], known.path.shape)
         camera = jax.tree.map(jnp.asarray, cameras.take(capture.cameras, row))
         true, found = (
             factor * np.asarray(_pixels(camera, points[few]))
-            for points in (ground_truth.path, path)
+            for points in (known.path, path)
         )
         # The truth last: a point that is followed well is white.
         for points, colour in ((found, FOUND), (true, TRUE)):

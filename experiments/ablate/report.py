@@ -17,7 +17,7 @@ def write(job, budget, finished) -> None:
     `finished` holds what was kept under this budget, by arm and seed.
     """
     numbers = {key: kept.numbers for key, kept in finished.items()}
-    static = protocol.static_error(job.ground_truth)
+    static = protocol.static_error(job.known)
     found = verdicts.verdicts(numbers, judged(job))
     print(f"\n{job.capture.name}, each arm trained {budget.title}:")
     print(verdicts.table(numbers, static))
@@ -40,14 +40,16 @@ def write(job, budget, finished) -> None:
         "claims": [_claim(verdict) for verdict in found],
         "machine": clock.machine(),
     }
-    clock.write_metrics(budget.folder / "ablation.json", metrics(numbers, static), about)
+    clock.write_metrics(
+        budget.folder / "ablation.json", metrics(numbers, static), about
+    )
     _picture(job, finished, budget.folder / "ablation.png")
     print(f"{budget.folder / 'ablation.png'} and {budget.folder / 'ablation.json'}")
 
 
 def judged(job) -> list:
     """The claims of the suite, by pictures alone where nothing else is known."""
-    if job.ground_truth.exact:
+    if job.known.exact:
         return list(job.suite.claims)
     return [claim._replace(measures=arms.WHOLE) for claim in job.suite.claims]
 
@@ -113,7 +115,7 @@ def _picture(job, finished, path):
         first.setdefault(name, kept)
     few = [name for name in job.suite.pictured if name in first]
     first = {name: first[name] for name in few or list(first)}
-    shown = picture.shown_row(job.ground_truth, job.capture)
+    shown = picture.shown_row(job.known, job.capture)
     captions = {}
     for name, kept in first.items():
         error = kept.numbers["track_error"]
@@ -123,7 +125,7 @@ def _picture(job, finished, path):
     picture.save(
         picture.draw(
             job.capture,
-            job.ground_truth,
+            job.known,
             {name: kept.arrays["colour"][shown] for name, kept in first.items()},
             {name: kept.arrays["depth"][shown] for name, kept in first.items()},
             {name: kept.arrays.get("path") for name, kept in first.items()},

@@ -39,7 +39,7 @@ SPLAT_COLOUR, FIELD_COLOUR = "#0a5fb4", "#c4501b"
 def write(job, asked, finished) -> list[Metric]:
     """accuracy_time.json, front.png and fronts.png; prints the lines of every axis."""
     numbers = {key: kept.numbers for key, kept in finished.items()}
-    static = protocol.static_error(job.ground_truth)
+    static = protocol.static_error(job.known)
     print(f"\n{job.capture.name}, every setting trained {job.budgets[0].title}:")
     for name in asked.axes:
         print(f"\n{AXES[name].question} ({name}, against {AXES[name].base})")
@@ -141,13 +141,13 @@ def front(
     A setting without one of the two numbers is left out; of equals the first stays.
     """
     sign = -1 if MEASURES[quality].direction == "lower" else 1
-    ground_truth = [
+    known = [
         (row[cost], -sign * row[quality], place, name)
         for place, (name, row) in enumerate(means.items())
         if math.isfinite(row[cost]) and math.isfinite(row[quality])
     ]
     best, found = math.inf, []
-    for _, loss, _, name in sorted(ground_truth):
+    for _, loss, _, name in sorted(known):
         if loss < best:
             best = loss
             found.append(name)

@@ -29,7 +29,7 @@ class Way(NamedTuple):
     gradient: Callable | None = None  # (*inputs) -> slopes
 
 
-class Arm(NamedTuple):
+class Contender(NamedTuple):
     """One way to deform Gaussians, as it is used and as the compiler can count it."""
 
     name: str
@@ -64,7 +64,7 @@ NETWORKS = (
 )
 
 
-def arms(count: int, still: float) -> list[Arm]:
+def arms(count: int, still: float) -> list[Contender]:
     """All of them for `count` Gaussians; a share `still` need not be deformed."""
     made = []
     for network in NETWORKS:
@@ -75,7 +75,7 @@ def arms(count: int, still: float) -> list[Arm]:
         ]
         for name, way in used.items():
             parts = tuple((weight, ways[name]) for weight, ways in counted)
-            made.append(Arm(f"{network.name}{name}", way, parts))
+            made.append(Contender(f"{network.name}{name}", way, parts))
     return made + _table_arms(count)
 
 
@@ -171,5 +171,5 @@ def _table_arms(count):
 
         way = Way(deform, (table, jnp.asarray(0.37, jnp.float32)))
         name = f"{KNOTS} time knots, {interpolation}"
-        made.append(Arm(name, way, ((1.0, way),)))
+        made.append(Contender(name, way, ((1.0, way),)))
     return made

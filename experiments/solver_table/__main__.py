@@ -60,7 +60,7 @@ class Settings:
             )
 
 
-class Row(NamedTuple):
+class SolverResult(NamedTuple):
     """One solver with so many steps at most, over all held-out frames."""
 
     solver: str
@@ -75,7 +75,7 @@ class Row(NamedTuple):
     converged: int  # frames
 
 
-def table(task: Problem, settings: Settings) -> list[Row]:
+def table(task: Problem, settings: Settings) -> list[SolverResult]:
     """Every solver with every number of steps, best known results included."""
     fits, timings = {}, {}
     for max_steps in settings.steps:
@@ -102,7 +102,7 @@ def table(task: Problem, settings: Settings) -> list[Row]:
     least = np.array([losses[keys[k]][i] for i, k in enumerate(best)])
     where = np.stack([fits[keys[k]][i].value for i, k in enumerate(best)])
     return [
-        Row(
+        SolverResult(
             solver=name,
             max_steps=max_steps,
             steps=float(np.median([f.steps for f in row])),
@@ -119,7 +119,7 @@ def table(task: Problem, settings: Settings) -> list[Row]:
     ]
 
 
-def text(rows: list[Row], frames: int) -> str:
+def text(rows: list[SolverResult], frames: int) -> str:
     head = (
         f"{'solver':<20}{'at most':>8}{'steps':>7}{'ms':>9}{'CPU ms':>9}"
         f"{'loss':>11}{'excess':>10}{'distance':>10}{'done':>7}"
@@ -152,7 +152,7 @@ def page(stored) -> str:
     return f"## Fitting {stored['about']['fit']}\n\n{markdown.table(heads, rows)}"
 
 
-def main(arguments=None) -> list[Row]:
+def main(arguments=None) -> list[SolverResult]:
     """Run the job of the command line."""
     settings = cli.parse(Settings, arguments)
     task = PROBLEMS[settings.fit](settings)

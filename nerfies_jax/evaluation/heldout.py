@@ -12,7 +12,7 @@ from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation import protocol
 from nerfies_jax.evaluation.fitted_cameras import FittedCameras
 from nerfies_jax.evaluation.model_flow import Flow
-from nerfies_jax.evaluation.protocol import PointTracks, GroundTruth
+from nerfies_jax.evaluation.protocol import GroundTruth, PointTracks
 from nerfies_jax.evaluation.scores import Scored
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.measure import geometry_quality, image_quality, perceptual
@@ -94,7 +94,7 @@ def heldout_metrics(
     capture: Capture,
     *,
     lpips: Lpips | None = None,
-    ground_truth: GroundTruth | None = None,
+    known: GroundTruth | None = None,
     followed: PointTracks | None = None,
     flow: Flow | None = None,
     fitted: FittedCameras | None = None,
@@ -102,7 +102,7 @@ def heldout_metrics(
     """Everything that can be measured, by the keys of `MEASURES`.
 
     PSNR and SSIM are always there; anything else where the capture has what it is held
-    against (masks of what moves, depths), or where it is passed: `ground_truth` and `followed`
+    against (masks of what moves, depths), or where it is passed: `known` and `followed`
     points, `flow`, `fitted` cameras. What has nothing to be a mean of is left out.
     """
     found = {
@@ -112,14 +112,14 @@ def heldout_metrics(
     more = _pictures(scored, capture, lpips)
     if capture.depths is not None:
         more |= _depths(scored, capture)
-    if ground_truth is not None and followed is not None:
-        numbers = protocol.score_tracks(ground_truth, followed)
+    if known is not None and followed is not None:
+        numbers = protocol.score_tracks(known, followed)
         more |= {_TRACKS[name]: value for name, value in numbers.items()}
-        more["tracks.still_epe"] = protocol.static_error(ground_truth)
+        more["tracks.still_epe"] = protocol.static_error(known)
     if flow is not None:
         more |= _flow(flow)
     if fitted is not None:
-        more |= _cameras(fitted, capture, exact=ground_truth is not None)
+        more |= _cameras(fitted, capture, exact=known is not None)
     return found | {key: float(x) for key, x in more.items() if not np.isnan(x)}
 
 

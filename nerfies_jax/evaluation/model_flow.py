@@ -53,13 +53,13 @@ def pixel_flow(
     What lies at z-depth `depth` behind each is moved, and projected where it is then.
     NaN where there is no depth, the point is lost, or it is behind the other camera.
     """
-    ground_truth = np.isfinite(depth) & (depth > 0)
+    known = np.isfinite(depth) & (depth > 0)
     pixels = np.asarray(in_default_precision(pixels))
-    depth = np.asarray(in_default_precision(np.where(ground_truth, depth, 1)))
+    depth = np.asarray(in_default_precision(np.where(known, depth, 1)))
     moved = move(state, np.asarray(_surface(here.camera, pixels, depth)), here, there)
     place, ahead = _project(there.camera, in_default_precision(moved.points))
-    ground_truth = ground_truth & moved.found & np.asarray(ahead)
-    return np.where(ground_truth[:, None], np.asarray(place) - pixels, np.nan)
+    known = known & moved.found & np.asarray(ahead)
+    return np.where(known[:, None], np.asarray(place) - pixels, np.nan)
 
 
 @jax.jit

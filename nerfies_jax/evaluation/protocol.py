@@ -61,7 +61,9 @@ def stored_truth(capture: Capture) -> SceneTruth | None:
     return None if path is None or not path.is_file() else truths.load(path)
 
 
-def ground_truth(capture: Capture, truth: SceneTruth, frames: int, tracks: int) -> GroundTruth:
+def ground_truth(
+    capture: Capture, truth: SceneTruth, frames: int, tracks: int
+) -> GroundTruth:
     """At most `frames` held-out frames and `tracks` points seen at the start.
 
     Raises ValueError where the truth is not that of the capture.
@@ -114,43 +116,44 @@ def held_out_only(capture: Capture, frames: int) -> GroundTruth:
     )
 
 
-def score_tracks(ground_truth: GroundTruth, followed: PointTracks | None) -> dict[str, float]:
+def score_tracks(known: GroundTruth, followed: PointTracks | None) -> dict[str, float]:
     """End-point errors over the seen points of all moments but the start.
 
     Without anything followed, or anything to follow, all are NaN.
     """
     names = ("track_error", "track_correct", "track_lost", "drift", "strain")
-    if followed is None or not len(ground_truth.path):
+    if followed is None or not len(known.path):
         return dict.fromkeys(names, float("nan"))
-    errors = _endpoints(followed.path, ground_truth)
-    lost = 1 - followed.found[_scored(ground_truth)].mean()
+    errors = _endpoints(followed.path, known)
+    lost = 1 - followed.found[_scored(known)].mean()
     values = (errors.endpoint, errors.correct, lost, followed.drift, followed.strain)
     return {name: float(value) for name, value in zip(names, values, strict=True)}
 
 
-def static_error(ground_truth: GroundTruth) -> float:
+def static_error(known: GroundTruth) -> float:
     """The end-point error of points that are said not to move; NaN without any."""
-    if not len(ground_truth.path):
+    if not len(known.path):
         return float("nan")
     return float(
         _endpoints(
-            np.broadcast_to(ground_truth.start_points[:, None], ground_truth.path.shape), ground_truth
+            np.broadcast_to(known.start_points[:, None], known.path.shape),
+            known,
         )[0]
     )
 
 
-def _scored(ground_truth):
+def _scored(known):
     """Seen, and not given."""
-    scored = ground_truth.seen.copy()
-    scored[:, ground_truth.start] = False
+    scored = known.seen.copy()
+    scored[:, known.start] = False
     return scored
 
 
-def _endpoints(path, ground_truth):
+def _endpoints(path, known):
     return geometry_quality.track_errors(
         jnp.asarray(path),
-        jnp.asarray(ground_truth.path),
-        jnp.asarray(_scored(ground_truth)),
+        jnp.asarray(known.path),
+        jnp.asarray(_scored(known)),
         CORRECT_WITHIN,
     )
 

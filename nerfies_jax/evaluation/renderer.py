@@ -22,8 +22,8 @@ class Renderer:
     def __init__(self, model: Model, size: tuple[int, int]):
         self._model = model
         self._programs = {}
-        self._prepared = _Kept()
-        self._deformed = _Kept()
+        self._prepared = _Memo()
+        self._deformed = _Memo()
         self.size = size  # width and height in pixels
         self.seconds: list[float] = []  # of every frame, without compiling
         self.cpu_seconds: list[float] = []  # the same, of the processor
@@ -68,7 +68,7 @@ class Renderer:
         return 1e3 * float(total) / len(seconds)
 
 
-class _Kept:
+class _Memo:
     """The last result of a function of parameters and a key.
 
     It is right as long as every leaf is the very same array; the leaves are held, so

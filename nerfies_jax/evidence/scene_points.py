@@ -65,7 +65,7 @@ def coverage(views: Views, points: np.ndarray) -> float:
         line = np.clip(pixel[inside, 1] * down / height, 0, down - 1).astype(int)
         has = np.zeros((down, across), bool)
         has[line, column] = True
-        lines = np.array_split(views.filmed[index], down, axis=0)
+        lines = np.array_split(views.valid[index], down, axis=0)
         scene = np.array(
             [
                 [cell.mean() > 0.5 for cell in np.array_split(one, across, axis=1)]

@@ -57,17 +57,17 @@ def measure(
     Points and flow are held against the truth of a built-in scene.
     """
     capture = run.capture
-    ground_truth = followed = flow = fitted = None
+    known = followed = flow = fitted = None
     notes = []
     try:
         truth = protocol.stored_truth(capture)
         if truth is not None:
-            ground_truth = protocol.ground_truth(capture, truth, len(scored.rows), TRACKS)
+            known = protocol.ground_truth(capture, truth, len(scored.rows), TRACKS)
     except ValueError as error:
         notes.append(f"No points were followed: {error}")
-    if ground_truth is not None:
+    if known is not None:
         kind, scene = run.representation, (run.spec, run.metadata)
-        followed = kind.follow(*scene, state, capture, ground_truth, effects=run.effects)
+        followed = kind.follow(*scene, state, capture, known, effects=run.effects)
         move = kind.mover(*scene, effects=run.effects)
         if move is not None:
             flow = model_flow.heldout_flow(move, state, capture, scored)
@@ -88,7 +88,7 @@ def measure(
         scored,
         capture,
         lpips=extra.lpips,
-        ground_truth=ground_truth,
+        known=known,
         followed=followed,
         flow=flow,
         fitted=fitted,

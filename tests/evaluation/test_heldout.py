@@ -93,15 +93,18 @@ def test_every_number_is_that_of_a_direct_computation(rng, filmed):
     rows = capture.heldout
     picture = np.round(scored.colour.astype(float) * 255) / 255
     truth = capture.images[rows] / 255
-    ground_truth = valid[rows] if filmed else np.ones_like(valid[rows])
+    known = valid[rows] if filmed else np.ones_like(valid[rows])
     moving = capture.moving[rows]
-    for name, mask in (("moving", moving & ground_truth), ("still", ~moving & ground_truth)):
+    for name, mask in (
+        ("moving", moving & known),
+        ("still", ~moving & known),
+    ):
         frames = zip(picture, truth, mask, strict=True)
         exact = np.mean([psnr(*frame) for frame in frames])
         assert found[f"heldout.{name}_psnr"] == pytest.approx(exact, abs=1e-4)
     ssim = [
         masked_ssim(np.float32(a), np.float32(b), m)
-        for a, b, m in zip(picture, truth, moving & ground_truth, strict=True)
+        for a, b, m in zip(picture, truth, moving & known, strict=True)
     ]
     assert found["heldout.moving_ssim"] == pytest.approx(np.mean(ssim), abs=1e-5)
     depth = capture.depths[rows]
@@ -212,11 +215,11 @@ def test_the_flow_of_a_known_motion_is_the_true_one():
     scored = scored._replace(depth=capture.depths[capture.heldout])
     flow = model_flow.heldout_flow(move, NOBODY, capture, scored)
     assert np.isnan(flow.found[lost]).all()
-    ground_truth = np.isfinite(flow.found).all(axis=1)
-    assert ground_truth.mean() > 0.95
+    known = np.isfinite(flow.found).all(axis=1)
+    assert known.mean() > 0.95
     assert flow.moving.any()
     assert np.abs(flow.truth[flow.moving]).max() > 1
-    np.testing.assert_allclose(flow.found[ground_truth], flow.truth[ground_truth], atol=0.02)
+    np.testing.assert_allclose(flow.found[known], flow.truth[known], atol=0.02)
 
 
 FIELD = RadianceScene(
@@ -266,24 +269,24 @@ def test_a_run_is_held_against_the_truth_of_its_scene(kind, filmed, rng):
     assert set(found) == ALWAYS | MASKED | DEPTHS | TRUTH | strain
 
     truth = protocol.stored_truth(capture)
-    ground_truth = protocol.ground_truth(capture, truth, 2, quality.TRACKS)
-    followed = run.representation.follow(run.spec, run.metadata, state, capture, ground_truth)
-    assert np.abs(followed.path - ground_truth.start_points[:, None]).max() > 1e-3
-    seen = ground_truth.seen.copy()
-    seen[:, ground_truth.start] = False
+    known = protocol.ground_truth(capture, truth, 2, quality.TRACKS)
+    followed = run.representation.follow(run.spec, run.metadata, state, capture, known)
+    assert np.abs(followed.path - known.start_points[:, None]).max() > 1e-3
+    seen = known.seen.copy()
+    seen[:, known.start] = False
     for key, path in (
         ("tracks.epe", followed.path),
-        ("tracks.still_epe", ground_truth.start_points[:, None]),
+        ("tracks.still_epe", known.start_points[:, None]),
     ):
-        away = np.linalg.norm(path - ground_truth.path, axis=-1)[seen]
+        away = np.linalg.norm(path - known.path, axis=-1)[seen]
         assert found[key] == pytest.approx(away.mean(), rel=1e-4)
     # The flow is that of the same motion: points of the start at the last moment.
     move = run.representation.mover(run.spec, run.metadata)
     here, there = (
-        evaluation.view_of(capture, int(ground_truth.moments[place]))
-        for place in (ground_truth.start, -1)
+        evaluation.view_of(capture, int(known.moments[place]))
+        for place in (known.start, -1)
     )
-    moved = move(state, ground_truth.start_points, here, there)
+    moved = move(state, known.start_points, here, there)
     both = moved.found & followed.found[:, -1]
     assert both.any()
     np.testing.assert_allclose(moved.points[both], followed.path[both, -1], atol=1e-5)

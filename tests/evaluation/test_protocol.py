@@ -21,24 +21,24 @@ def filmed():
 
 
 def test_the_known_paths_are_those_of_points_seen_at_the_start(filmed):
-    capture, truth, ground_truth = filmed
-    assert ground_truth.path.shape == (5, len(capture.train), 3)
-    assert len(ground_truth.rows) == 2
-    assert set(ground_truth.rows) <= set(capture.heldout)
-    assert np.all(np.diff(capture.times[ground_truth.moments]) > 0)
-    assert ground_truth.start == len(ground_truth.moments) // 2
-    assert ground_truth.seen[:, ground_truth.start].all()
-    for point, seen in zip(ground_truth.path, ground_truth.seen, strict=True):
+    capture, truth, known = filmed
+    assert known.path.shape == (5, len(capture.train), 3)
+    assert len(known.rows) == 2
+    assert set(known.rows) <= set(capture.heldout)
+    assert np.all(np.diff(capture.times[known.moments]) > 0)
+    assert known.start == len(known.moments) // 2
+    assert known.seen[:, known.start].all()
+    for point, seen in zip(known.path, known.seen, strict=True):
         (track,) = np.flatnonzero((truth.track_canonical == point[0]).all(axis=1))
         np.testing.assert_array_equal(point, truth.track_world[track])
-        np.testing.assert_array_equal(seen, truth.track_seen[track][ground_truth.moments])
+        np.testing.assert_array_equal(seen, truth.track_seen[track][known.moments])
 
 
 def test_a_scaled_capture_has_its_paths_in_scene_units(filmed):
-    capture, truth, ground_truth = filmed
+    capture, truth, known = filmed
     other = dataclasses.replace(capture, scale=2.0, centre=(0.1, 0.2, -0.3))
     found = protocol.ground_truth(other, truth, 2, 5)
-    expected = 2 * (ground_truth.path - np.float32([0.1, 0.2, -0.3]))
+    expected = 2 * (known.path - np.float32([0.1, 0.2, -0.3]))
     np.testing.assert_allclose(found.path, expected, atol=1e-6)
 
 
@@ -49,39 +49,39 @@ def test_the_truth_of_another_capture_is_refused(filmed):
 
 
 def test_tracks_are_scored_by_their_distance_at_all_instants_but_the_start(filmed):
-    ground_truth = filmed[2]._replace(seen=np.ones_like(filmed[2].seen))
-    found = np.ones(ground_truth.seen.shape, bool)
+    known = filmed[2]._replace(seen=np.ones_like(filmed[2].seen))
+    found = np.ones(known.seen.shape, bool)
     found[0, 4:6] = False
-    right = PointTracks(ground_truth.path, found, 0.1, 0.2)
+    right = PointTracks(known.path, found, 0.1, 0.2)
     later = found[:, 1:].size  # all but one column
-    numbers = protocol.score_tracks(ground_truth, right)
+    numbers = protocol.score_tracks(known, right)
     assert numbers["track_error"] == 0
     assert numbers["track_correct"] == 1
     assert numbers["track_lost"] == pytest.approx(2 / later)
     assert (numbers["drift"], numbers["strain"]) == (0.1, 0.2)
-    wrong = right._replace(path=ground_truth.path + SHIFT)
-    numbers = protocol.score_tracks(ground_truth, wrong)
+    wrong = right._replace(path=known.path + SHIFT)
+    numbers = protocol.score_tracks(known, wrong)
     assert numbers["track_error"] == pytest.approx(0.02, rel=1e-4)
     assert numbers["track_correct"] == 0
     # What cannot be seen is not scored.
-    half = ground_truth.seen.copy()
+    half = known.seen.copy()
     half[:, ::2] = False
     wrong.path[:, ::2] = 9.0
-    numbers = protocol.score_tracks(ground_truth._replace(seen=half), wrong)
+    numbers = protocol.score_tracks(known._replace(seen=half), wrong)
     assert numbers["track_error"] == pytest.approx(0.02, rel=1e-4)
-    away = np.linalg.norm(ground_truth.path - ground_truth.path[:, 3:4], axis=-1)
+    away = np.linalg.norm(known.path - known.path[:, 3:4], axis=-1)
     away = np.delete(away, 3, axis=1)
-    assert protocol.static_error(ground_truth) == pytest.approx(away.mean(), rel=1e-5)
+    assert protocol.static_error(known) == pytest.approx(away.mean(), rel=1e-5)
     assert away.mean() > 1e-3
-    nothing = protocol.score_tracks(ground_truth, None)
+    nothing = protocol.score_tracks(known, None)
     assert np.isnan(list(nothing.values())).all()
 
 
 def test_a_real_capture_is_judged_by_its_pictures_alone(filmed):
-    capture, _, ground_truth = filmed
+    capture, _, known = filmed
     found = protocol.held_out_only(capture, 2)
-    np.testing.assert_array_equal(found.rows, ground_truth.rows)
-    np.testing.assert_array_equal(found.moments, ground_truth.moments)
+    np.testing.assert_array_equal(found.rows, known.rows)
+    np.testing.assert_array_equal(found.moments, known.moments)
 
     assert np.isnan(list(protocol.score_tracks(found, None).values())).all()
     assert np.isnan(protocol.static_error(found))

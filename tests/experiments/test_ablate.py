@@ -16,7 +16,7 @@ from experiments.ablate import results, suites
 from experiments.ablate.arms import FIELDS
 from experiments.ablate.job import Job
 from experiments.ablate.measures import MEASURES
-from experiments.ablate.results import Kept
+from experiments.ablate.results import ArmResult
 from experiments.ablate.settings import Ablate
 from nerfies_jax.capture import synthetic
 from nerfies_jax.measure import clock
@@ -148,7 +148,7 @@ def test_several_processes_do_not_share_an_accelerator(tiny, monkeypatch, capsys
 
 def kept(steps, seconds, stopped_by="steps"):
     numbers = dict.fromkeys(MEASURES, 0.0) | {"train_seconds": seconds}
-    return Kept(numbers, {}, {"steps": steps, "stopped_by": stopped_by})
+    return ArmResult(numbers, {}, {"steps": steps, "stopped_by": stopped_by})
 
 
 @pytest.mark.parametrize(

@@ -21,15 +21,15 @@ def filmed():
 
 
 def test_the_picture_shows_how_far_points_are_from_where_they_should_be(filmed):
-    capture, _, ground_truth = filmed
-    shown = ablate_picture.shown_row(ground_truth, capture)
-    row = ground_truth.rows[shown]
+    capture, _, known = filmed
+    shown = ablate_picture.shown_row(known, capture)
+    row = known.rows[shown]
     colour = {"a": capture.images[row]}
 
     def apart(path):
         picture = ablate_picture.draw(
             capture,
-            ground_truth,
+            known,
             colour,
             {"a": capture.depths[row]},
             {"a": path},
@@ -39,20 +39,20 @@ def test_the_picture_shows_how_far_points_are_from_where_they_should_be(filmed):
         assert picture.shape[1] > 4 * ablate_picture.WIDTH
         return np.sum(np.all(picture == ablate_picture.APART, axis=-1))
 
-    assert apart(ground_truth.path) == 0
-    near, far = apart(ground_truth.path + SHIFT), apart(ground_truth.path + 4 * SHIFT)
+    assert apart(known.path) == 0
+    near, far = apart(known.path + SHIFT), apart(known.path + 4 * SHIFT)
     assert 0 < near < far
-    assert apart(None) == apart(np.repeat(ground_truth.path[:, 3:4], ground_truth.path.shape[1], 1))
+    assert apart(None) == apart(np.repeat(known.path[:, 3:4], known.path.shape[1], 1))
 
 
 def test_a_real_capture_is_drawn_without_points(filmed):
     capture, _, _ = filmed
-    ground_truth = protocol.held_out_only(capture, 2)
-    shown = ablate_picture.shown_row(ground_truth, capture)
-    row = ground_truth.rows[shown]
+    known = protocol.held_out_only(capture, 2)
+    shown = ablate_picture.shown_row(known, capture)
+    row = known.rows[shown]
     picture = ablate_picture.draw(
         capture,
-        ground_truth,
+        known,
         dict.fromkeys("ab", capture.images[row]),
         dict.fromkeys("ab", capture.depths[row]),
         dict.fromkeys("ab"),

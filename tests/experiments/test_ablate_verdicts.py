@@ -115,8 +115,8 @@ def test_what_is_estimated_of_a_real_capture_judges_nothing():
     exact = measures.quality(found, exact=True)
     assert exact == dict.fromkeys(measures.KEYS, 1.0)
     estimated = measures.quality(found, exact=False)
-    ground_truth = {name for name, value in estimated.items() if value == 1}
-    assert ground_truth == {"psnr", "ssim"} | {n for n in measures.KEYS if "track" in n} | {
+    known = {name for name, value in estimated.items() if value == 1}
+    assert known == {"psnr", "ssim"} | {n for n in measures.KEYS if "track" in n} | {
         "drift",
         "strain",
     }

@@ -9,7 +9,7 @@ import pytest
 
 from experiments.effect_cost import __main__ as effect_cost
 from experiments.effect_cost import report
-from experiments.effect_cost.__main__ import Arm, EffectCost, Priced, Row
+from experiments.effect_cost.__main__ import EffectCost, Priced, PricedScene, SceneCost
 from gaussians_jax import presets as splat_presets
 from nerfies_jax import presets as field_presets
 from nerfies_jax import runs, scene
@@ -106,7 +106,9 @@ def test_a_preset_without_effects_is_refused():
 def row(name, base, seconds, flops=2e9):
     step = Priced(flops, 3e6, 4_000_000, 5e8, base is None, 1.5, seconds, 2 * seconds)
     loss = step._replace(seconds=seconds / 4)
-    return Row(Arm(name, None, base, None), 1234, {"loss": loss, "step": step})
+    return SceneCost(
+        PricedScene(name, None, base, None), 1234, {"loss": loss, "step": step}
+    )
 
 
 ROWS = [

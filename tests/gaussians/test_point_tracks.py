@@ -41,7 +41,7 @@ def splat_rows(mean, logit):
 
 def follow_moved(monkeypatch, filmed, rows, moved):
     """Follow through Gaussians that `moved(mean, time)` poses in closed form."""
-    capture, _, ground_truth = filmed
+    capture, _, known = filmed
 
     def deform(params, prepared, time):
         splats = params.rows["splats"]
@@ -56,28 +56,28 @@ def follow_moved(monkeypatch, filmed, rows, moved):
     effects = (types.SimpleNamespace(deform=deform),)
     monkeypatch.setattr(splat_scene, "all_effects", lambda *_: effects)
     state = types.SimpleNamespace(params=Params({"splats": rows}, {}))
-    return point_tracks.follow(None, None, state, capture, ground_truth)
+    return point_tracks.follow(None, None, state, capture, known)
 
 
 @pytest.fixture
 def cloud(filmed, rng):
     """Gaussians all around the known points and the static ones."""
-    capture, _, ground_truth = filmed
-    near = np.concatenate([ground_truth.start_points, capture.points.position])
+    capture, _, known = filmed
+    near = np.concatenate([known.start_points, capture.points.position])
     return near.repeat(20, 0) + rng.normal(scale=0.01, size=(20 * len(near), 3))
 
 
 def test_points_are_carried_by_gaussians_that_all_move_alike(
     filmed, monkeypatch, cloud
 ):
-    capture, _, ground_truth = filmed
+    capture, _, known = filmed
     velocity = np.float32([0.3, 0.1, -0.2])
     rows = splat_rows(cloud, np.zeros(len(cloud)))
     followed = follow_moved(
         monkeypatch, filmed, rows, lambda mean, time: mean + velocity * time
     )
-    since = capture.times[ground_truth.moments] - capture.times[ground_truth.moments][ground_truth.start]
-    expected = ground_truth.start_points[:, None] + since[:, None] * velocity
+    since = capture.times[known.moments] - capture.times[known.moments][known.start]
+    expected = known.start_points[:, None] + since[:, None] * velocity
     np.testing.assert_allclose(followed.path, expected, atol=1e-6)
     assert followed.found.all()
     assert np.isnan(followed.strain)
@@ -90,7 +90,7 @@ def test_a_turning_body_carries_its_points_but_for_the_way_to_the_neighbours_mea
     filmed, monkeypatch, cloud
 ):
     """x(t) = R(t) x with a turn of t radians about an axis through the origin."""
-    capture, _, ground_truth = filmed
+    capture, _, known = filmed
     axis = np.float32([0.6, 0.0, 0.8])
 
     def turned(points, time):
@@ -101,24 +101,24 @@ def test_a_turning_body_carries_its_points_but_for_the_way_to_the_neighbours_mea
         shape = jax.ShapeDtypeStruct(mean.shape, mean.dtype)
         return jax.pure_callback(turned, shape, mean, time)
 
-    times = capture.times[ground_truth.moments]
+    times = capture.times[known.moments]
     # Turned back, so that they are around the points when these are given.
-    rows = splat_rows(turned(cloud, -times[ground_truth.start]), np.zeros(len(cloud)))
+    rows = splat_rows(turned(cloud, -times[known.start]), np.zeros(len(cloud)))
     followed = follow_moved(monkeypatch, filmed, rows, moved)
-    body = turned(ground_truth.start_points, -times[ground_truth.start])
+    body = turned(known.start_points, -times[known.start])
     right = np.stack([turned(body, time) for time in times], axis=1)
     error = np.linalg.norm(followed.path - right, axis=-1)
-    assert error[:, ground_truth.start].max() == pytest.approx(0, abs=1e-6)
+    assert error[:, known.start].max() == pytest.approx(0, abs=1e-6)
     # The mean of eight of twenty neighbours 0.01 away lies some 0.003 beside the point.
-    turn = 2 * np.abs(np.sin((times - times[ground_truth.start]) / 2))
+    turn = 2 * np.abs(np.sin((times - times[known.start]) / 2))
     assert np.all(error <= 0.01 * turn + 1e-6)
-    still = np.linalg.norm(right - ground_truth.start_points[:, None], axis=-1)
+    still = np.linalg.norm(right - known.start_points[:, None], axis=-1)
     assert error[:, -1].mean() < 0.05 * still[:, -1].mean()
 
 
 def test_what_cannot_be_seen_carries_nothing(filmed, monkeypatch, cloud):
     """Faint and dead Gaussians fly off; those that can be seen stay."""
-    ground_truth = filmed[2]
+    known = filmed[2]
     mean = np.concatenate([cloud, cloud + 1e-4, cloud - 1e-4])
     logit = np.repeat([0.0, -4.0, 5.0], len(cloud))
     rows = splat_rows(mean, logit)
@@ -129,7 +129,7 @@ def test_what_cannot_be_seen_carries_nothing(filmed, monkeypatch, cloud):
         return jnp.where(hidden[:, None], mean + time, mean)
 
     followed = follow_moved(monkeypatch, filmed, rows, moved)
-    still = np.repeat(ground_truth.start_points[:, None], ground_truth.path.shape[1], 1)
+    still = np.repeat(known.start_points[:, None], known.path.shape[1], 1)
     np.testing.assert_allclose(followed.path, still, atol=1e-6)
     none = splat_rows(cloud, np.full(len(cloud), -4.0))
     followed = follow_moved(monkeypatch, filmed, none, lambda mean, time: mean + time)
@@ -152,20 +152,20 @@ def test_the_weights_of_neighbours_are_a_slow_sum(rng):
 
 
 def test_splats_without_motion_follow_nothing_and_untrained_motion_stays(filmed):
-    capture, _, ground_truth = filmed
+    capture, _, known = filmed
     metadata = splat_scene.metadata_of(capture)
-    still = point_tracks.follow(scenes.TINY_SPLATS, metadata, None, capture, ground_truth)
+    still = point_tracks.follow(scenes.TINY_SPLATS, metadata, None, capture, known)
     assert still is None
     model = splat_scene.build(scenes.TINY_DEFORMABLE, metadata)
     state = model.init(capture, jax.random.key(0))
     followed = point_tracks.follow(
-        scenes.TINY_DEFORMABLE, metadata, state, capture, ground_truth
+        scenes.TINY_DEFORMABLE, metadata, state, capture, known
     )
-    assert followed.path.shape == ground_truth.path.shape
+    assert followed.path.shape == known.path.shape
     errors = geometry_quality.track_errors(
         jnp.asarray(followed.path),
-        jnp.asarray(np.repeat(ground_truth.start_points[:, None], followed.path.shape[1], 1)),
-        jnp.ones(ground_truth.seen.shape, bool),
+        jnp.asarray(np.repeat(known.start_points[:, None], followed.path.shape[1], 1)),
+        jnp.ones(known.seen.shape, bool),
         0.01,
     )
     assert errors.endpoint < 1e-3  # the heads begin near zero

@@ -26,9 +26,9 @@ def test_points_are_followed_through_a_warp_in_closed_form(
     filmed, monkeypatch, lost_at
 ):
     """x + d(x) = x / s(t) - v t: a point is scaled by s and moved, in field units."""
-    capture, _, ground_truth = filmed
+    capture, _, known = filmed
     metadata = types.SimpleNamespace(centre=(0.1, -0.2, 0.3), scale=4.0)
-    times = capture.times[ground_truth.moments]
+    times = capture.times[known.moments]
     velocity = jnp.asarray([0.3, 0.1, -0.2])
 
     def displace(params, point, moment):
@@ -44,15 +44,15 @@ def test_points_are_followed_through_a_warp_in_closed_form(
     )
     monkeypatch.setattr(scene, "field", lambda spec, metadata: made)
     state = types.SimpleNamespace(params=velocity, step=jnp.int32(5))
-    followed = point_tracks.follow(None, metadata, state, capture, ground_truth)
+    followed = point_tracks.follow(None, metadata, state, capture, known)
 
-    start = 4.0 * (ground_truth.path[:, 3] - np.float32(metadata.centre))
+    start = 4.0 * (known.path[:, 3] - np.float32(metadata.centre))
     template = start / (1 + times[3]) - np.asarray(velocity) * times[3]
     for column, time in enumerate(times):
         place = (template + np.asarray(velocity) * time) * (1 + time)
         place = place / 4.0 + np.float32(metadata.centre)
         if column == lost_at:
-            place = ground_truth.path[:, 3]
+            place = known.path[:, 3]
         np.testing.assert_allclose(followed.path[:, column], place, atol=3e-6)
         assert followed.found[:, column].all() == (column != lost_at)
     if lost_at is None:
@@ -66,7 +66,7 @@ def test_points_are_followed_through_a_warp_in_closed_form(
 
 
 def test_a_field_without_a_warp_follows_nothing(filmed):
-    capture, _, ground_truth = filmed
+    capture, _, known = filmed
     spec = presets.PRESETS["t-nerf-small"]
     metadata = scene.metadata_of(capture, spec)
-    assert point_tracks.follow(spec, metadata, None, capture, ground_truth) is None
+    assert point_tracks.follow(spec, metadata, None, capture, known) is None
