@@ -44,15 +44,15 @@ class AppearanceCodes:
 
 def main(arguments=None):
     """Run the job of the command line; exit code 2 where its input is wrong."""
-    asked = cli.parse(AppearanceCodes, arguments)
+    args = cli.parse(AppearanceCodes, arguments)
     with cli.user_errors():
-        if asked.steps < 1:
-            raise ValueError(f"steps={asked.steps} must be at least 1")
-        platform.start_jax(asked.device, "all")
+        if args.steps < 1:
+            raise ValueError(f"steps={args.steps} must be at least 1")
+        platform.start_jax(args.device, "all")
         compare = {"exposure": compare_exposure, "transient": compare_transient}
-        film = filmed(asked.scene, asked.size)
-        figures, picture = compare[asked.scene](film, asked.steps, asked.seed)
-        _write(asked, figures, picture)
+        film = filmed(args.scene, args.size)
+        figures, picture = compare[args.scene](film, args.steps, args.seed)
+        _write(args, figures, picture)
 
 
 def filmed(scene, size):
@@ -171,14 +171,14 @@ def _sheet(columns, shown, ids):
     return pictures.contact_sheet(cells, captions, columns=len(columns))
 
 
-def _write(asked, figures, picture):
+def _write(args, figures, picture):
     from nerfies_jax.capture.json_files import write_json
     from nerfies_jax.evaluation import pictures
     from nerfies_jax.measure import clock
 
-    folder = asked.out or pathlib.Path(f"codes_{asked.scene}")
+    folder = args.out or pathlib.Path(f"codes_{args.scene}")
     folder.mkdir(parents=True, exist_ok=True)
-    settled = {"scene": asked.scene, "steps": asked.steps, "size": list(asked.size)}
+    settled = {"scene": args.scene, "steps": args.steps, "size": list(args.size)}
     record = {**settled, "machine": clock.machine(), "figures": figures}
     write_json(folder / "figures.json", record)
     pictures.save(picture, folder / "picture.png")

@@ -71,20 +71,20 @@ class Compared(NamedTuple):
 def main(arguments=None):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        asked = cli.parse(Compare, arguments)
-        compared = read(asked.runs)
-        folder = run_folder.new_run_folder(asked.out, "compare")
-        goals = asked.psnr or default_goals(compared)
+        args = cli.parse(Compare, arguments)
+        compared = read(args.runs)
+        folder = run_folder.new_run_folder(args.out, "compare")
+        goals = args.psnr or default_goals(compared)
     print(table(compared, goals))
     for line in remarks(compared):
         print(line)
     save(folder, compared, goals)
-    if asked.frames:
+    if args.frames:
         kinds = [representations.of_run(each.folder) for each in compared]
         threads = {kind.threads for kind in kinds if kind is not None}
         with cli.user_errors():
-            platform.start_jax(asked.device, "all" if "all" in threads else "one")
-            draw(folder / "pictures.png", compared, asked.frames)
+            platform.start_jax(args.device, "all" if "all" in threads else "one")
+            draw(folder / "pictures.png", compared, args.frames)
     print(f"saved in {folder}")
 
 

@@ -39,27 +39,27 @@ class ElasticPoints:
 def main(arguments=None):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        asked = cli.parse(ElasticPoints, arguments)
+        args = cli.parse(ElasticPoints, arguments)
         for name in ("rays", "samples", "draws", "repeats"):
-            if getattr(asked, name) < 1:
-                raise ValueError(f"--{name} {getattr(asked, name)} must be at least 1")
-        wrong = [k for k in asked.points if not 0 < k < asked.samples]
+            if getattr(args, name) < 1:
+                raise ValueError(f"--{name} {getattr(args, name)} must be at least 1")
+        wrong = [k for k in args.points if not 0 < k < args.samples]
         if wrong:
             raise ValueError(
-                f"--points {wrong[0]} must be in 1 .. {asked.samples - 1}: a ray has "
-                f"{asked.samples} samples"
+                f"--points {wrong[0]} must be in 1 .. {args.samples - 1}: a ray has "
+                f"{args.samples} samples"
             )
-        platform.start_jax(asked.device, "all")
-    figures = estimator_table(asked)
+        platform.start_jax(args.device, "all")
+    figures = estimator_table(args)
     print(table(figures))
-    if asked.out is not None:
+    if args.out is not None:
         from nerfies_jax.capture.json_files import write_json
         from nerfies_jax.measure import clock
 
-        write_json(asked.out, {"machine": clock.machine(), "rows": figures})
+        write_json(args.out, {"machine": clock.machine(), "rows": figures})
 
 
-def estimator_table(asked: ElasticPoints) -> dict[str, dict[str, float]]:
+def estimator_table(args: ElasticPoints) -> dict[str, dict[str, float]]:
     """By estimator, relative to all samples: `bias` and its standard `error`,
     `deviation` (RMS) of the value and of the gradient, and `cpu_seconds`.
     """
@@ -69,9 +69,9 @@ def estimator_table(asked: ElasticPoints) -> dict[str, dict[str, float]]:
 
     from nerfies_jax.measure import clock
 
-    params, batch = warp_and_rays(asked.rays, asked.samples)
-    rows = {"uniform 4": None, **{str(k): k for k in asked.points}, "all": "all"}
-    rows = rows if asked.samples > 4 else {k: v for k, v in rows.items() if v}
+    params, batch = warp_and_rays(args.rays, args.samples)
+    rows = {"uniform 4": None, **{str(k): k for k in args.points}, "all": "all"}
+    rows = rows if args.samples > 4 else {k: v for k, v in rows.items() if v}
     figures, calls, exact = {}, {}, None
     for name, points in reversed(rows.items()):
         both = jax.jit(
@@ -86,9 +86,7 @@ def estimator_table(asked: ElasticPoints) -> dict[str, dict[str, float]]:
 
         if points == "all":
             exact = one(jax.random.key(0))
-        keys = jax.random.split(
-            jax.random.key(1), 1 if points == "all" else asked.draws
-        )
+        keys = jax.random.split(jax.random.key(1), 1 if points == "all" else args.draws)
         drawn = [one(key) for key in keys]
         values = jnp.stack([value for value, _ in drawn]) / exact[0] - 1
         off = [jnp.linalg.norm(slope - exact[1]) for _, slope in drawn]
@@ -101,7 +99,7 @@ def estimator_table(asked: ElasticPoints) -> dict[str, dict[str, float]]:
             "gradient_deviation": float(slope_deviation / jnp.linalg.norm(exact[1])),
         }
         calls[name] = lambda both=both: both(params, jax.random.key(2))
-    for name, timing in clock.compare(calls, repeats=asked.repeats).items():
+    for name, timing in clock.compare(calls, repeats=args.repeats).items():
         figures[name]["cpu_seconds"] = timing.median_cpu
     return {name: figures[name] for name in rows}
 

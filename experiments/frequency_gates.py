@@ -51,7 +51,7 @@ class FrequencyGates:
     """Of the network's two layers."""
     bands: int = 6
     """Of the encoding of the coordinates."""
-    rate: float = 5e-3
+    learning_rate: float = 5e-3
     """Adam's, for the network; falls to zero along a cosine."""
     out: pathlib.Path | None = None
     """Folder for frequency_gates.png and frequency_gates.json."""
@@ -93,12 +93,12 @@ class Fitted(NamedTuple):
     opening: np.ndarray | None  # [seeds, 2, steps] wavelet, Fourier: weight over most
 
 
-def arms(asked: FrequencyGates) -> list[GateSetting]:
+def arms(args: FrequencyGates) -> list[GateSetting]:
     """No spectral loss, every gate at every weight, warnings at the largest."""
     found = [GateSetting("none", None)]
-    for most in asked.most:
+    for most in args.most:
         found += [GateSetting(gate, most) for gate in spectral.GATES]
-    return found + [GateSetting(rule, max(asked.most)) for rule in WARNINGS]
+    return found + [GateSetting(rule, max(args.most)) for rule in WARNINGS]
 
 
 def picture(pixels: int) -> np.ndarray:
@@ -119,21 +119,21 @@ def picture(pixels: int) -> np.ndarray:
     return np.clip(image, 0, 1).astype(np.float32)
 
 
-def fit(arm: GateSetting, asked: FrequencyGates) -> Fitted:
+def fit(arm: GateSetting, args: FrequencyGates) -> Fitted:
     """Train the arm from every seed at once."""
-    truth = jnp.asarray(picture(asked.pixels))
-    draw, first = _network(asked)
+    truth = jnp.asarray(picture(args.pixels))
+    draw, first = _network(args)
     spec = arm.spec
     has_gates = spec is not None and spec.gate in spectral.LEARNED
-    rule = optax.adam(optax.cosine_decay_schedule(asked.rate, asked.steps))
-    gate_rule = optax.adam(1e-2 if spec is None else spec.rate)
+    rule = optax.adam(optax.cosine_decay_schedule(args.rate, args.steps))
+    gate_rule = optax.adam(1e-2 if spec is None else spec.learning_rate)
 
     def loss(trained, step):
         image = draw(trained[0])
         value = losses.l1(image, truth)
         weight = None
         if spec is not None:
-            weight = spectral.weights(spec, trained[1], step, asked.steps)
+            weight = spectral.weights(spec, trained[1], step, args.steps)
             terms = spectral.terms(spec, weight, image, truth)
             value = value + weighted_sum(terms)
         if arm.rule == "log":
@@ -158,10 +158,10 @@ def fit(arm: GateSetting, asked: FrequencyGates) -> Fitted:
     def one(key):
         trained = first(key), spectral.init(spec) if has_gates else None
         memory = rule.init(trained[0]), gate_rule.init(trained[1])
-        _, seen = jax.lax.scan(update, (trained, memory), jnp.arange(asked.steps))
+        _, seen = jax.lax.scan(update, (trained, memory), jnp.arange(args.steps))
         return seen
 
-    keys = jax.random.split(jax.random.key(0), asked.seeds)
+    keys = jax.random.split(jax.random.key(0), args.seeds)
     # optax adds its step count to floats
     with jax.numpy_dtype_promotion("standard"):
         psnr, weight = jax.jit(jax.vmap(one))(keys)
@@ -170,19 +170,19 @@ def fit(arm: GateSetting, asked: FrequencyGates) -> Fitted:
     return Fitted(np.asarray(psnr), np.stack(weight, axis=1) / arm.most)
 
 
-def _network(asked):
+def _network(args):
     """Parameters to picture, and key to parameters."""
-    axis = (np.arange(asked.pixels) + 0.5) / asked.pixels * 2 - 1
+    axis = (np.arange(args.pixels) + 0.5) / args.pixels * 2 - 1
     y, x = np.meshgrid(axis, axis, indexing="ij")
     places = jnp.asarray(np.stack([x, y], -1).reshape(-1, 2), jnp.float32)
-    waves = encoding.EncodingSpec(asked.bands, times_pi=True)
+    waves = encoding.EncodingSpec(args.bands, times_pi=True)
     features = jax.vmap(lambda place: encoding.encode(waves, place, None))(places)
     heads = (("colour", mlp.HeadSpec(3)),)
-    spec = mlp.MLPSpec(features.shape[1], 2, asked.width, heads, init="he")
+    spec = mlp.MLPSpec(features.shape[1], 2, args.width, heads, init="he")
 
     def draw(params):
         colour = 0.5 + mlp.apply(spec, params, features)["colour"]
-        return colour.reshape(asked.pixels, asked.pixels, 3)
+        return colour.reshape(args.pixels, args.pixels, 3)
 
     return draw, lambda key: mlp.init(spec, key)
 
@@ -333,32 +333,32 @@ def draw_figure(fitted: dict[GateSetting, Fitted], path: pathlib.Path) -> None:
 def main(arguments=None):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        asked = cli.parse(FrequencyGates, arguments)
-        if asked.out is not None:
-            asked.out.mkdir(parents=True, exist_ok=True)
-        platform.start_jax(asked.device)
+        args = cli.parse(FrequencyGates, arguments)
+        if args.out is not None:
+            args.out.mkdir(parents=True, exist_ok=True)
+        platform.start_jax(args.device)
     fitted = {}
-    for arm in arms(asked):
-        fitted[arm] = fit(arm, asked)
+    for arm in arms(args):
+        fitted[arm] = fit(arm, args)
         print(f"{arm.name}: {fitted[arm].psnr[:, -1].mean():.2f} dB", flush=True)
     print()
     rows = numbers(fitted)
     print(table(rows))
     print()
     print(said(rows))
-    if asked.out is not None:
+    if args.out is not None:
         from nerfies_jax.capture.json_files import write_json
         from nerfies_jax.measure import clock
 
         record = {
-            "settings": specs.as_json(asked),
+            "settings": specs.as_json(args),
             "machine": clock.machine(),
             "rows": rows,
             "said": said(rows).split("\n"),
         }
-        write_json(asked.out / "frequency_gates.json", record)
-        draw_figure(fitted, asked.out / "frequency_gates.png")
-        print(asked.out / "frequency_gates.png")
+        write_json(args.out / "frequency_gates.json", record)
+        draw_figure(fitted, args.out / "frequency_gates.png")
+        print(args.out / "frequency_gates.png")
 
 
 if __name__ == "__main__":

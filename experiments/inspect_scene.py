@@ -30,7 +30,7 @@ class InspectScene:
 
 def main(arguments=None):
     """Inspect what the command line names; exit code 2 where its input is wrong."""
-    asked = cli.parse(InspectScene, arguments)
+    args = cli.parse(InspectScene, arguments)
     with cli.user_errors():
         platform.start_jax("cpu")
         from nerfies_jax import runs
@@ -40,21 +40,21 @@ def main(arguments=None):
         from nerfies_jax.evidence import inspection
         from nerfies_jax.runs import adviser
 
-        source = cli.plain(asked.source)
-        capture = runs.stored_capture(source, asked.seed)
+        source = cli.plain(args.source)
+        capture = runs.stored_capture(source, args.seed)
         for line in describe(capture):
             print(line)
         found = inspection.inspect(capture)
-        advice = adviser.advise_all(found.findings, asked.full)
+        advice = adviser.advise_all(found.findings, args.full)
         for line in report(found, advice, source):
             print(line)
-        path = asked.picture or pathlib.Path("runs", f"inspect-{_name(capture)}.png")
+        path = args.picture or pathlib.Path("runs", f"inspect-{_name(capture)}.png")
         path.parent.mkdir(parents=True, exist_ok=True)
         pictures.save(found.sheet, path)
         print(f"contact sheet: {path}")
-        if asked.json is not None:
-            write_json(asked.json, as_json(capture, found, advice))
-            print(f"findings: {asked.json}")
+        if args.json is not None:
+            write_json(args.json, as_json(capture, found, advice))
+            print(f"findings: {args.json}")
 
 
 def report(found, advice, source):

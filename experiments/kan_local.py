@@ -48,26 +48,26 @@ class KanLocal:
 def main(arguments=None):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        asked = cli.parse(KanLocal, arguments)
-        platform.start_jax(asked.device, "one")
-    figures = measured(asked)
+        args = cli.parse(KanLocal, arguments)
+        platform.start_jax(args.device, "one")
+    figures = measured(args)
     print(table(figures))
-    if asked.out is not None:
+    if args.out is not None:
         from nerfies_jax.capture.json_files import write_json
         from nerfies_jax.measure import clock
 
-        write_json(asked.out, {"machine": clock.machine(), "rows": figures})
+        write_json(args.out, {"machine": clock.machine(), "rows": figures})
 
 
-def measured(asked: KanLocal) -> list[dict]:
+def measured(args: KanLocal) -> list[dict]:
     """One row for each number of kernels and each way to sum them."""
     rows = []
-    for kernels in asked.kernels:
-        rows += _rows(asked, kernels)
+    for kernels in args.kernels:
+        rows += _rows(args, kernels)
     return rows
 
 
-def _rows(asked, kernels):
+def _rows(args, kernels):
     import jax
     import jax.numpy as jnp
     import numpy as np
@@ -76,10 +76,10 @@ def _rows(asked, kernels):
     from nerfies_jax.nets import kan
     from nerfies_jax.nets.mlp import HeadSpec
 
-    heads = (("y", HeadSpec(asked.width)),)
-    spec = kan.KANSpec(asked.width, (), heads, kernels=kernels, base=False)
+    heads = (("y", HeadSpec(args.width)),)
+    spec = kan.KANSpec(args.width, (), heads, kernels=kernels, base=False)
     params = kan.init(spec, jax.random.key(0))
-    shape = asked.points, asked.width
+    shape = args.points, args.width
     places = jax.random.uniform(jax.random.key(1), shape, jnp.float32, -1, 1)
 
     def dense(params, x):
@@ -89,15 +89,13 @@ def _rows(asked, kernels):
         return lambda params, x: local(spec, params.heads["y"], x, nearest)
 
     ways = {"all": dense} | {
-        nearest: nearest_alone(nearest)
-        for nearest in asked.nearest
-        if nearest < kernels
+        nearest: nearest_alone(nearest) for nearest in args.nearest if nearest < kernels
     }
     values = {name: np.asarray(jax.jit(f)(params, places)) for name, f in ways.items()}
     programs = {name: jax.jit(_with_slopes(f)) for name, f in ways.items()}
     times = clock.compare(
         {n: lambda program=f: program(params, places) for n, f in programs.items()},
-        repeats=asked.repeats,
+        repeats=args.repeats,
         warm_up=1,
     )
     largest = np.abs(values["all"]).max()

@@ -49,21 +49,21 @@ class MakeScene:
 
 def main(arguments=None):
     """Parse, film, write, and say where it is."""
-    asked = cli.parse(MakeScene, arguments)
+    args = cli.parse(MakeScene, arguments)
     with cli.user_errors():
-        platform.start_jax(asked.device)
+        platform.start_jax(args.device)
         from nerfies_jax.capture import synthetic
 
-        given = {"frames": asked.frames, "size": asked.size}
+        given = {"frames": args.frames, "size": args.size}
         given = {name: value for name, value in given.items() if value is not None}
-        spec = dataclasses.replace(synthetic.PRESETS[asked.preset], **given)
-        spec = specs.override(spec, asked.set)
-        synthetic.write(spec, asked.out, asked.seed)
+        spec = dataclasses.replace(synthetic.PRESETS[args.preset], **given)
+        spec = specs.override(spec, args.set)
+        synthetic.write(spec, args.out, args.seed)
     width, height = spec.size
     print(
-        f"{asked.out}: {spec.name}, {spec.frames} instants at {width}x{height}, "
-        f"truth in {asked.out / synthetic.TRUTH_FILE}\n"
-        f"next: python -m experiments.reconstruct {asked.out}"
+        f"{args.out}: {spec.name}, {spec.frames} instants at {width}x{height}, "
+        f"truth in {args.out / synthetic.TRUTH_FILE}\n"
+        f"next: python -m experiments.reconstruct {args.out}"
     )
 
 

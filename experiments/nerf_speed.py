@@ -46,19 +46,19 @@ class NerfSpeed:
 def main(arguments=None):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        asked = cli.parse(NerfSpeed, arguments)
-        platform.start_jax(asked.device, "all")
-        unknown = set(asked.rows) - set(specs())
+        args = cli.parse(NerfSpeed, arguments)
+        platform.start_jax(args.device, "all")
+        unknown = set(args.rows) - set(specs())
         if unknown:
             raise ValueError(f"--rows {min(unknown)!r}: there are {', '.join(specs())}")
-        rows = asked.rows or tuple(specs())
-    figures = measured(rows, asked.repeats)
+        rows = args.rows or tuple(specs())
+    figures = measured(rows, args.repeats)
     print(table(figures))
-    if asked.out is not None:
+    if args.out is not None:
         from nerfies_jax.capture.json_files import write_json
         from nerfies_jax.measure import clock
 
-        write_json(asked.out, {"machine": clock.machine(), "rows": figures})
+        write_json(args.out, {"machine": clock.machine(), "rows": figures})
 
 
 def specs():

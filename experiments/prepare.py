@@ -65,27 +65,27 @@ class Pictures:
 
 def main(arguments=None):
     """Parse, convert, and say what came out."""
-    asked = cli.parse(Npz | Video | Pictures, arguments)
+    args = cli.parse(Npz | Video | Pictures, arguments)
     with cli.user_errors():
-        for line in CONVERTERS[type(asked)](asked):
+        for line in CONVERTERS[type(args)](args):
             print(line)
-    print(f"next: python -m experiments.reconstruct {asked.out}")
+    print(f"next: python -m experiments.reconstruct {args.out}")
 
 
-def convert_npz(asked: Npz) -> list[str]:
+def convert_npz(args: Npz) -> list[str]:
     """Write transforms_train.json and transforms_val.json with their pictures."""
     from nerfies_jax.capture import load
     from nerfies_jax.capture.capture import describe
     from nerfies_jax.capture.images import write_png
     from nerfies_jax.capture.json_files import new_folder, write_json
 
-    images, poses, times, focal = read_npz(asked.file)
-    train, heldout, note = rows_of(poses, asked)
+    images, poses, times, focal = read_npz(args.file)
+    train, heldout, note = rows_of(poses, args)
     common = {"camera_angle_x": 2 * math.atan(images.shape[2] / 2 / focal)}
     behind = background_of(images)
     if behind is not None:
         common["background"] = behind
-    with new_folder(asked.out) as folder:
+    with new_folder(args.out) as folder:
         for name, rows in (("train", train), ("val", heldout)):
             (folder / name).mkdir()
             entries = []
@@ -101,7 +101,7 @@ def convert_npz(asked: Npz) -> list[str]:
             file = folder / f"transforms_{name}.json"
             write_json(file, common | {"frames": entries})
         load(folder)  # refused now rather than when it is used
-    return [*describe(load(asked.out)), note]
+    return [*describe(load(args.out)), note]
 
 
 def read_npz(path):
@@ -158,17 +158,17 @@ def read_npz(path):
     return images, poses.astype(float), times, focal
 
 
-def rows_of(poses, asked):
+def rows_of(poses, args):
     """Rows to learn from, rows to score on, and why."""
     from nerfies_jax.capture.frames import HELD_OUT, hold_out_every
 
     count = len(poses)
-    if asked.heldout is not None:
-        heldout = _range(asked.heldout, count, "--heldout")
+    if args.heldout is not None:
+        heldout = _range(args.heldout, count, "--heldout")
         others = np.setdiff1d(np.arange(count), heldout)
-        train = others if asked.train is None else _range(asked.train, count, "--train")
+        train = others if args.train is None else _range(args.train, count, "--train")
         return train, heldout, "rows as asked for"
-    if asked.train is not None:
+    if args.train is not None:
         raise ValueError("--train needs --heldout too, so that both are known")
     same = np.abs(np.diff(poses, axis=0)).max((1, 2)) < SAME_POSE
     best, first = (0, 0), 0
@@ -185,7 +185,7 @@ def rows_of(poses, asked):
             f"rows {start} to {start + length - 1} share one pose: held out; "
             f"{rest} rows after them left out",
         )
-    train, heldout = hold_out_every(count, HELD_OUT, str(asked.file))
+    train, heldout = hold_out_every(count, HELD_OUT, str(args.file))
     return train, heldout, f"every {HELD_OUT}th row is held out"
 
 
@@ -208,26 +208,26 @@ def background_of(images):
     return (usual / 255).tolist()
 
 
-def convert_video(asked: Video) -> list[str]:
+def convert_video(args: Video) -> list[str]:
     """Pick sharp frames, find their cameras, write a Nerfies directory."""
     from nerfies_jax.capture.capture import shrink
     from nerfies_jax.capture.images import write_png
     from nerfies_jax.capture.json_files import scratch_folder
     from nerfies_jax.capture.video import read_video
 
-    if asked.frames < 2:
-        raise ValueError(f"--frames {asked.frames}: a reconstruction needs at least 2")
-    scores = [sharpness(frame) for _, frame in read_video(asked.file)]
-    kept, blurred = sharp_rows(np.array(scores), asked.frames)
-    with scratch_folder(asked.out) as scratch:
+    if args.frames < 2:
+        raise ValueError(f"--frames {args.frames}: a reconstruction needs at least 2")
+    scores = [sharpness(frame) for _, frame in read_video(args.file)]
+    kept, blurred = sharp_rows(np.array(scores), args.frames)
+    with scratch_folder(args.out) as scratch:
         (scratch / "pictures").mkdir()
         wanted = set(kept.tolist())
-        for row, (seconds, frame) in enumerate(read_video(asked.file)):
+        for row, (seconds, frame) in enumerate(read_video(args.file)):
             if row in wanted:
-                factor = max(1, math.ceil(max(frame.shape[:2]) / asked.max_side))
+                factor = max(1, math.ceil(max(frame.shape[:2]) / args.max_side))
                 name = f"ms{round(seconds * 1000):08d}.png"  # the name keeps the time
                 write_png(scratch / "pictures" / name, shrink(frame, factor))
-        lines = _reconstruct(scratch, scratch / "pictures", None, asked.out)
+        lines = _reconstruct(scratch, scratch / "pictures", None, args.out)
     return [f"{len(kept)} of {len(scores)} frames kept, {blurred} too blurred", *lines]
 
 
@@ -259,12 +259,12 @@ def _usual(scores, row):
     return min((np.median(side) for side in sides if side.size), default=0.0)
 
 
-def convert_pictures(asked: Pictures) -> list[str]:
+def convert_pictures(args: Pictures) -> list[str]:
     """Find the cameras of pictures, write a Nerfies directory."""
     from nerfies_jax.capture.json_files import scratch_folder
 
-    with scratch_folder(asked.out) as scratch:
-        return _reconstruct(scratch, asked.folder, asked.masks, asked.out)
+    with scratch_folder(args.out) as scratch:
+        return _reconstruct(scratch, args.folder, args.masks, args.out)
 
 
 def _reconstruct(scratch, pictures, masks, out):

@@ -77,64 +77,64 @@ def main(arguments=None):
     raise SystemExit(code)
 
 
-def _outcome(asked):
+def _outcome(args):
     with cli.user_errors():
-        if asked.resume:
-            _check_resumed(asked)
-        platform.start_jax(asked.device, _threads(asked))
+        if args.resume:
+            _check_resumed(args)
+        platform.start_jax(args.device, _threads(args))
     from nerfies_jax import runs
 
     common = {
-        name: getattr(asked, name)
+        name: getattr(args, name)
         for name in ("more", "seconds", "evaluate_every", "checkpoint_every")
     }
-    if asked.resume:
-        steps = () if asked.steps is None else (f"steps={asked.steps}",)
+    if args.resume:
+        steps = () if args.steps is None else (f"steps={args.steps}",)
         with cli.user_errors((runs.Refused,)):
             return runs.resume(
-                asked.out,
-                expected=_expected(asked),
-                overrides=(*steps, *asked.set),
+                args.out,
+                expected=_expected(args),
+                overrides=(*steps, *args.set),
                 **common,
             )
     config = RunConfig(
-        preset=_preset(asked),
-        source=cli.plain(asked.source),
-        steps=asked.steps,
-        overrides=asked.set,
-        effects=asked.effect,
-        seed=asked.seed or 0,
+        preset=_preset(args),
+        source=cli.plain(args.source),
+        steps=args.steps,
+        overrides=args.set,
+        effects=args.effect,
+        seed=args.seed or 0,
     )
     with cli.user_errors((runs.Refused,)):
-        return runs.reconstruct(config, asked.out, effects=asked.effects, **common)
+        return runs.reconstruct(config, args.out, effects=args.effects, **common)
 
 
-def _check_resumed(asked):
+def _check_resumed(args):
     """Raise ValueError where options do not go with --resume."""
-    if asked.out is None:
+    if args.out is None:
         raise ValueError("--resume continues the run in a folder: name it with --out")
-    if asked.effects == "auto":
+    if args.effects == "auto":
         raise ValueError(
             "--effects auto chooses what a new run begins with; leave it out with "
             "--resume"
         )
 
 
-def _threads(asked):
+def _threads(args):
     """How many cores the representation wants XLA to see."""
-    found = representations.of_run(asked.out) if asked.resume else None
-    return (found or representations.of_preset(_preset(asked))).threads
+    found = representations.of_run(args.out) if args.resume else None
+    return (found or representations.of_preset(_preset(args))).threads
 
 
-def _preset(asked):
-    return asked.preset or DEFAULT_PRESET
+def _preset(args):
+    return args.preset or DEFAULT_PRESET
 
 
-def _expected(asked):
+def _expected(args):
     """What the command line says of the run that it continues, by field."""
-    said = {"preset": asked.preset, "seed": asked.seed, "effects": asked.effect or None}
+    said = {"preset": args.preset, "seed": args.seed, "effects": args.effect or None}
     said = {name: value for name, value in said.items() if value is not None}
-    return {**cli.given(asked.source), **said}
+    return {**cli.given(args.source), **said}
 
 
 if __name__ == "__main__":

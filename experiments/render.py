@@ -100,55 +100,55 @@ class Render:
 def main(arguments=None):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        asked = cli.parse(Render, arguments)
-        found = representations.of_run(asked.run)
-        platform.start_jax(asked.device, "all" if found is None else found.threads)
+        args = cli.parse(Render, arguments)
+        found = representations.of_run(args.run)
+        platform.start_jax(args.device, "all" if found is None else found.threads)
         from nerfies_jax import evaluation, runs
 
-        run = runs.saved_run(asked.run)
-        move = _mover(asked, run)
-        state = _shown(asked, run.model, runs.restore(asked.run, run).state)
-        size = _size(run.capture.size, asked.max_side)
+        run = runs.saved_run(args.run)
+        move = _mover(args, run)
+        state = _shown(args, run.model, runs.restore(args.run, run).state)
+        size = _size(run.capture.size, args.max_side)
         trained = state
-        model, state = _faster(asked, _model(asked, run), state)
-        names, views = _views(asked, run)
-        views = _seen(asked, run, size, views)
-        out = asked.out or asked.run / "renders" / _name(asked)
+        model, state = _faster(args, _model(args, run), state)
+        names, views = _views(args, run)
+        views = _seen(args, run, size, views)
+        out = args.out or args.run / "renders" / _name(args)
         out.mkdir(parents=True, exist_ok=True)
-    picture_of = _Pictures(asked.show, move, trained, size, views)
+    picture_of = _Pictures(args.show, move, trained, size, views)
     renderer = evaluation.Renderer(model, size)
-    _write(asked, out, renderer, state, names, views, picture_of)
+    _write(args, out, renderer, state, names, views, picture_of)
 
 
-def _name(asked):
-    frozen = "" if asked.freeze is None else f"-at-{asked.freeze:g}"
-    slow = "" if asked.slow == 1 else f"-slow-{asked.slow:g}"
-    without = "".join(f"-without-{name}" for name in asked.without)
-    named = [pathlib.PurePath(name).name for name in asked.appearance or ()]
+def _name(args):
+    frozen = "" if args.freeze is None else f"-at-{args.freeze:g}"
+    slow = "" if args.slow == 1 else f"-slow-{args.slow:g}"
+    without = "".join(f"-without-{name}" for name in args.without)
+    named = [pathlib.PurePath(name).name for name in args.appearance or ()]
     blended = "" if not named else f"-from-{named[0]}-to-{named[1]}"
-    knots = "" if asked.knots is None else f"-knots-{asked.knots}"
-    knots += "" if asked.interpolation == "linear" else f"-{asked.interpolation}"
-    if asked.static_threshold is not None:
-        knots += f"-static-threshold-{asked.static_threshold:g}"
-    if asked.hide_moving is not None:
-        knots += f"-hide-moving-{asked.hide_moving:g}"
-    depth = "" if asked.show == "colour" else f"-{asked.show}"
-    return f"{asked.path}{frozen}{slow}{without}{blended}{knots}{depth}"
+    knots = "" if args.knots is None else f"-knots-{args.knots}"
+    knots += "" if args.interpolation == "linear" else f"-{args.interpolation}"
+    if args.static_threshold is not None:
+        knots += f"-static-threshold-{args.static_threshold:g}"
+    if args.hide_moving is not None:
+        knots += f"-hide-moving-{args.hide_moving:g}"
+    depth = "" if args.show == "colour" else f"-{args.show}"
+    return f"{args.path}{frozen}{slow}{without}{blended}{knots}{depth}"
 
 
-def _model(asked, run):
+def _model(args, run):
     """The run's, or a variant of it; ValueError where the run has none such."""
-    blended = asked.appearance is not None
-    if not asked.without and not blended:
+    blended = args.appearance is not None
+    if not args.without and not blended:
         return run.model
     return run.representation.variant(
-        run.spec, run.metadata, asked.without, blended, effects=run.effects
+        run.spec, run.metadata, args.without, blended, effects=run.effects
     )
 
 
-def _mover(asked, run):
+def _mover(args, run):
     """What takes points from one picture to the next, where that is to be seen."""
-    if asked.show != "flow":
+    if args.show != "flow":
         return None
     move = run.representation.mover(run.spec, run.metadata, effects=run.effects)
     if move is None:
@@ -158,27 +158,27 @@ def _mover(asked, run):
     return move
 
 
-def _shown(asked, model, state):
+def _shown(args, model, state):
     """The state without what is hidden in all pictures."""
-    if asked.hide_moving is None:
+    if args.hide_moving is None:
         return state
     from gaussians_jax import variants
 
-    state, summary = variants.without_moving(model, state, asked.hide_moving)
+    state, summary = variants.without_moving(model, state, args.hide_moving)
     print(summary)
     return state
 
 
-def _faster(asked, model, state):
+def _faster(args, model, state):
     """The model and its state, the motion from a table or of what moves alone."""
     from gaussians_jax import variants
 
-    static_threshold = 0.0 if asked.static_threshold is None else asked.static_threshold
-    if asked.knots is not None:
+    static_threshold = 0.0 if args.static_threshold is None else args.static_threshold
+    if args.knots is not None:
         made = variants.from_knots(
-            model, state, asked.knots, asked.interpolation, static_threshold
+            model, state, args.knots, args.interpolation, static_threshold
         )
-    elif asked.static_threshold is not None:
+    elif args.static_threshold is not None:
         made = variants.without_static(model, state, static_threshold)
     else:
         return model, state
@@ -186,7 +186,7 @@ def _faster(asked, model, state):
     return made.model, made.state
 
 
-def _seen(asked, run, size, views):
+def _seen(args, run, size, views):
     """Views of the size asked for, each with its share of the two appearances."""
     import jax.numpy as jnp
 
@@ -194,11 +194,11 @@ def _seen(asked, run, size, views):
     from nerfies_jax.training.model import in_default_precision
 
     views = [evaluation.resized(view, run.capture.size, size) for view in views]
-    if asked.appearance is None:
+    if args.appearance is None:
         return views
     start, end = (
         jnp.asarray(variants.appearance_id(run.capture, name), jnp.int32)
-        for name in asked.appearance
+        for name in args.appearance
     )
     shares = np.linspace(0, 1, len(views), dtype=np.float32)
     return [
@@ -209,30 +209,30 @@ def _seen(asked, run, size, views):
     ]
 
 
-def _views(asked, run):
+def _views(args, run):
     """Names and views of all pictures."""
     from nerfies_jax import evaluation
     from nerfies_jax.capture import camera_paths
 
-    if asked.path == "heldout":
+    if args.path == "heldout":
         rows = run.capture.heldout
         views = [evaluation.view_of(run.capture, row) for row in rows]
         names = [pathlib.PurePath(run.capture.ids[row]).name for row in rows]
-        if asked.freeze is not None:
-            time = views[0].time.dtype.type(asked.freeze)
+        if args.freeze is not None:
+            time = views[0].time.dtype.type(args.freeze)
             views = [view._replace(time=time) for view in views]
         return names, views
-    path = camera_paths.path(asked.path, run.capture, asked.frames)
-    if asked.freeze is None:
-        times = camera_paths.times(asked.frames, loops=1 / asked.slow)
+    path = camera_paths.path(args.path, run.capture, args.frames)
+    if args.freeze is None:
+        times = camera_paths.times(args.frames, loops=1 / args.slow)
     else:
-        times = np.full(asked.frames, asked.freeze, np.float32)
+        times = np.full(args.frames, args.freeze, np.float32)
     like = evaluation.view_of(run.capture, int(run.capture.train[0]))
-    names = [f"{number:04d}" for number in range(asked.frames)]
+    names = [f"{number:04d}" for number in range(args.frames)]
     return names, evaluation.path_views(path, times, like)
 
 
-def _write(asked, out, renderer, state, names, views, picture_of):
+def _write(args, out, renderer, state, names, views, picture_of):
     """Render view after view and write each as it comes."""
     from nerfies_jax.capture import exr, images, video
 
@@ -240,9 +240,9 @@ def _write(asked, out, renderer, state, names, views, picture_of):
         for place, (name, view) in enumerate(zip(names, views, strict=True)):
             rendering = renderer(state, view)
             picture = picture_of(rendering, place)
-            if "png" in asked.formats:
+            if "png" in args.formats:
                 images.write_png(out / f"{name}.png", picture)
-            if "exr" in asked.formats:
+            if "exr" in args.formats:
                 exr.write_exr(
                     out / f"{name}.exr",
                     colour=images.linear_from_srgb(np.clip(rendering.colour, 0, 1)),
@@ -251,7 +251,7 @@ def _write(asked, out, renderer, state, names, views, picture_of):
                 )
             yield picture
 
-    if "mp4" in asked.formats:
+    if "mp4" in args.formats:
         video.write_video(out / "film.mp4", pictures(), RATE)
     else:
         for _ in pictures():

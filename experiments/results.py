@@ -146,10 +146,10 @@ class Results:
 def main(arguments=None):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        asked = cli.parse(Results, arguments)
-        if asked.measured is not None:
-            keep(asked.pages[0], asked.measured)
-        for name in asked.pages or kept():
+        args = cli.parse(Results, arguments)
+        if args.measured is not None:
+            keep(args.pages[0], args.measured)
+        for name in args.pages or kept():
             path = PAGES / f"{name}.md"
             draw(name)
             path.write_text(page(name))

@@ -60,8 +60,8 @@ def render(
     if background is not None:
         colour = colour + background * transmittance[..., None]
     expected = image[..., 3] / jnp.maximum(alpha, LEAST_ALPHA) if depth else None
-    beside = None if features is None else image[..., 4 if depth else 3 :]
-    return Frame(Rendering(colour, alpha, expected), footprints, beside)
+    extras = None if features is None else image[..., 4 if depth else 3 :]
+    return Frame(Rendering(colour, alpha, expected), footprints, extras)
 
 
 def render_harmonics(
@@ -77,8 +77,8 @@ def render_harmonics(
 ) -> Frame:
     """`render` with view-dependent colour from 1, 4, 9 or 16 SH coefficients."""
     colours = harmonics.colour_towards(coefficients, gaussians.mean, camera.position)
-    beside = background, features, mean2d_offset, depth
-    return render(gaussians, colours, camera, size, spec, *beside)
+    extras = background, features, mean2d_offset, depth
+    return render(gaussians, colours, camera, size, spec, *extras)
 
 
 def refuse_distortion(camera: Camera) -> None:

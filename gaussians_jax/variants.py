@@ -159,7 +159,7 @@ def _moving(where, static_threshold):
     return f"{moving} of {rows} rows that move"
 
 
-def _with(model: Model, state: TrainState, beside: Any, stages: Stages, summary: str):
+def _with(model: Model, state: TrainState, extras: Any, stages: Stages, summary: str):
     """The model on `(params, beside)`: what is beside is an argument, no constant."""
 
     def render(both, view, size, step):
@@ -168,6 +168,6 @@ def _with(model: Model, state: TrainState, beside: Any, stages: Stages, summary:
 
     return Faster(
         model._replace(render=render, stages=stages),
-        state._replace(params=(state.params, beside)),
+        state._replace(params=(state.params, extras)),
         summary,
     )

@@ -132,12 +132,12 @@ def _init(spec, metadata, effects, key):
     keys = jax.random.split(key, 3)
     for number, name in enumerate(names):
         one = specs.template_of(spec, name)
-        beside = 0 if one.direction is None else one.direction.width(3)
+        extras = 0 if one.direction is None else one.direction.width(3)
         nets[name] = template.init(
             one,
             jax.random.fold_in(keys[0], number),
             one.position.width(3) + lifted,
-            condition + beside,
+            condition + extras,
         )
     rows = {MOMENT: len(metadata.times)}
     learnt = 1 + max((max(left, right) for left, right, _ in metadata.exposures))

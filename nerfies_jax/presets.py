@@ -34,8 +34,8 @@ NERF = RadianceScene(
     rays=4096,  # section 5.3
     sampling=SamplingSpec(64, 128),  # section 5.3
     template=TemplateSpec(EncodingSpec(10), EncodingSpec(4)),  # section 5.1
-    rate=5e-4,  # section 5.3, and its end
-    rate_end=5e-5,
+    learning_rate=5e-4,  # section 5.3, and its end
+    learning_rate_end=5e-5,
 )
 
 # Martin-Brualla et al. 2021, arXiv:2008.02268, with the sizes of its public
@@ -59,7 +59,7 @@ D_NERF = dataclasses.replace(
     steps=800_000,
     rays=500,
     sampling=SamplingSpec(64, 128, shared=True),
-    rate_end=5e-4 * 10 ** (-8 / 5),
+    learning_rate_end=5e-4 * 10 ** (-8 / 5),
     warp=WarpSpec(
         kind="translation",
         condition="time",
@@ -86,8 +86,8 @@ NERFIES = RadianceScene(
     sampling=SamplingSpec(128, 128),
     template=TemplateSpec(EncodingSpec(8), EncodingSpec(4), skips=(4,)),
     extent=0.3,  # a box of diagonal one
-    rate=1e-3,
-    rate_end=1e-4,
+    learning_rate=1e-3,
+    learning_rate_end=1e-4,
     appearance=AppearanceSpec(width=8),
     warp=WarpSpec(anneal_steps=80_000),
     elastic=ElasticSpec(
@@ -130,8 +130,8 @@ SMALL_NERF = RadianceScene(
     coarse=TemplateSpec(
         EncodingSpec(6), None, depth=2, width=48, skips=(), colour_width=32
     ),
-    rate=5e-3,
-    rate_end=2e-4,
+    learning_rate=5e-3,
+    learning_rate_end=2e-4,
 )
 # All bands from the start. Opened one by one over a tenth or a third of so short a run,
 # under both penalties, the warp never leaves the identity (built-in scene, 700 steps:

@@ -63,7 +63,9 @@ def build(
             "none; leave it out with --set background=none"
         )
     optimiser = optax.scale_by_adam()
-    schedule = schedules.log_linear(spec.rate, spec.rate_end, spec.steps)
+    schedule = schedules.log_linear(
+        spec.learning_rate, spec.learning_rate_end, spec.steps
+    )
 
     def step(state: TrainState, frames: Frames):
         batch_key, field_key = jax.random.split(loop.step_key(state))

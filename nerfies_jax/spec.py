@@ -22,6 +22,7 @@ from nerfies_jax.effects.transient import TransientSpec
 from nerfies_jax.effects.warp import WarpSpec
 from nerfies_jax.radiance.template import TemplateSpec
 from nerfies_jax.scene_metadata import SceneMetadata
+from nerfies_jax.training import schedules
 from nerfies_jax.training.effects import Effect, Table
 
 
@@ -65,8 +66,10 @@ class RadianceScene:
     # Longest half-side of the filmed volume in units of the field; None keeps the
     # capture's own coordinates.
     extent: float | None = 1.0
-    rate: float = 5e-4  # of Adam, falling to `rate_end` along a line in the logarithm
-    rate_end: float = 5e-5
+    learning_rate: float = (
+        5e-4  # of Adam, falling to `learning_rate_end` along a line in the logarithm
+    )
+    learning_rate_end: float = 5e-5
     density_noise: float = 0.0  # standard deviation, while training
     appearance: AppearanceSpec | None = None
     transient: TransientSpec | None = None
@@ -85,11 +88,7 @@ class RadianceScene:
             )
         if self.extent is not None and not self.extent > 0:
             raise ValueError(f"extent={self.extent} must be positive, or none")
-        if not 0 < self.rate_end <= self.rate:
-            raise ValueError(
-                f"the rate falls from rate={self.rate} to rate_end={self.rate_end}; "
-                "both are positive and the second is not larger"
-            )
+        schedules.check_falling(self.learning_rate, self.learning_rate_end)
         for name in ("elastic", "background"):
             if getattr(self, name) is not None and self.warp is None:
                 raise ValueError(

@@ -166,7 +166,7 @@ def field_loss(spec, metadata, params, batch, key):
 def field_step(spec, metadata, draw_batch):
     """One update of a static NeRF from rays that `draw_batch` draws."""
     adam = optax.scale_by_adam()
-    rate = schedules.log_linear(spec.rate, spec.rate_end, spec.steps)
+    rate = schedules.log_linear(spec.learning_rate, spec.learning_rate_end, spec.steps)
 
     def step(state, frames):
         key = jax.random.fold_in(state.key, state.step)

@@ -46,7 +46,7 @@ TINY_SONATA = dataclasses.replace(
     TINY_SPLATS,
     optimiser="radam",
     motion=KanMotionSpec(
-        embedding=4, time_code=3, hidden=(6,), kernels=3, warm_up=3, rate=1e-2
+        embedding=4, time_code=3, hidden=(6,), kernels=3, warm_up=3, learning_rate=1e-2
     ),
     neighbours=NeighbourSpec(count=4, start=3),
     spectral=SpectralSpec(),

@@ -16,10 +16,14 @@ from nerfies_jax.training import specs
 def test_an_override_reaches_a_nested_field_with_its_type():
     spec = specs.override(
         presets.SMALL_DEFORMABLE,
-        ("densification.cap_max=123", "motion.rate=1e-3", "raster.antialiased=true"),
+        (
+            "densification.cap_max=123",
+            "motion.learning_rate=1e-3",
+            "raster.antialiased=true",
+        ),
     )
     assert spec.densification.cap_max == 123
-    assert spec.motion.rate == 1e-3
+    assert spec.motion.learning_rate == 1e-3
     assert spec.raster.antialiased is True
     assert spec.init == presets.SMALL_DEFORMABLE.init
 

@@ -22,19 +22,19 @@ from nerfies_jax.runs import platform, representations
 def main(arguments=None):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        asked = cli.parse(Ablate, arguments)
-        settings.check(asked)
-        arms = suites.named(asked.suite).arms
+        args = cli.parse(Ablate, arguments)
+        settings.check(args)
+        arms = suites.named(args.suite).arms
         kinds = {
             representations.of_preset(arms[name].preset).threads
-            for name in asked.arms or arms
+            for name in args.arms or arms
         }
-        platform.start_jax(asked.device, "all" if "all" in kinds else "one")
+        platform.start_jax(args.device, "all" if "all" in kinds else "one")
         from experiments.ablate.job import Job
 
-        job = Job(asked)
+        job = Job(args)
     failed = job.run()
-    if asked.seed is None:
+    if args.seed is None:
         _report(job)
     raise SystemExit(1 if failed else 0)
 

@@ -63,32 +63,32 @@ class CompiledArm(NamedTuple):
 class Job:
     """A capture, what is known of it, and the folder that holds what was finished."""
 
-    def __init__(self, asked: Ablate):
-        self.asked, self.suite = asked, suites.named(asked.suite)
-        if asked.jobs > 1 and jax.default_backend() != "cpu":
+    def __init__(self, args: Ablate):
+        self.args, self.suite = args, suites.named(args.suite)
+        if args.jobs > 1 and jax.default_backend() != "cpu":
             raise ValueError(
-                f"--jobs {asked.jobs}: several processes would fight for one "
+                f"--jobs {args.jobs}: several processes would fight for one "
                 f"{jax.default_backend()}; leave it out, or use --device cpu"
             )
         self._open()
-        self.names = asked.arms or tuple(
+        self.names = args.arms or tuple(
             name
             for name, arm in self.suite.arms.items()
             if arm.needs is None or getattr(self.capture, arm.needs) is not None
         )
-        self.seeds = asked.all_seeds if asked.seed is None else (asked.seed,)
+        self.seeds = args.all_seeds if args.seed is None else (args.seed,)
         for name in self.names:  # refuses wrong settings before any training
-            self.spec(name, asked.steps)
-        stem = f"ablation-{asked.suite}-{'-'.join(self.capture.name.split())}"
-        if asked.suite == "fields" and asked.source.capture is None:
-            stem = f"ablation-{asked.source.scene}"
-        self.out = asked.out or pathlib.Path("runs", stem)
+            self.spec(name, args.steps)
+        stem = f"ablation-{args.suite}-{'-'.join(self.capture.name.split())}"
+        if args.suite == "fields" and args.source.capture is None:
+            stem = f"ablation-{args.source.scene}"
+        self.out = args.out or pathlib.Path("runs", stem)
         self.budgets = []
-        if asked.seconds is None or asked.steps is not None:
-            self.budgets.append(Budget(asked.steps, None, self.out, asked.share))
-        if asked.seconds is not None:
-            folder = self.out / f"seconds-{asked.seconds:g}"
-            self.budgets.append(Budget(None, asked.seconds, folder))
+        if args.seconds is None or args.steps is not None:
+            self.budgets.append(Budget(args.steps, None, self.out, args.share))
+        if args.seconds is not None:
+            folder = self.out / f"seconds-{args.seconds:g}"
+            self.budgets.append(Budget(None, args.seconds, folder))
         for budget in self.budgets:
             budget.folder.mkdir(parents=True, exist_ok=True)
         self._built: dict[tuple[str, int], CompiledArm] = {}
@@ -97,7 +97,7 @@ class Job:
 
     def _open(self):
         """The capture; a built-in scene comes with its truth."""
-        asked, source = self.asked, self.asked.source
+        args, source = self.args, self.args.source
         if source == CaptureSource(scene=source.scene) and (
             source.scene in synthetic.PRESETS
         ):
@@ -105,14 +105,14 @@ class Job:
             self.capture_digest = synthetic.digest(film)
             self.capture, truth = synthetic.cached(film, platform.CACHE / "scenes")
             self.known = protocol.ground_truth(
-                self.capture, truth, asked.frames, asked.tracks
+                self.capture, truth, args.frames, args.tracks
             )
             return
         self.capture = runs.read_capture(source)
         self.capture_digest = hashlib.sha256(self.capture.images.tobytes()).hexdigest()[
             :16
         ]
-        self.known = protocol.held_out_only(self.capture, asked.frames)
+        self.known = protocol.held_out_only(self.capture, args.frames)
 
     def _listen(self, event, seconds, **_):
         if event == SAVED:
@@ -123,11 +123,11 @@ class Job:
         arm = self.suite.arms[name]
         representation = representations.of_preset(arm.preset)
         spec = representation.presets[arm.preset]
-        if steps is None and self.asked.share is not None:
-            steps = max(1, round(self.asked.share * spec.steps))
+        if steps is None and self.args.share is not None:
+            steps = max(1, round(self.args.share * spec.steps))
         if steps is not None:
             spec = representation.with_steps(spec, steps)
-        return specs.override(spec, (*arm.changes, *self.asked.set))
+        return specs.override(spec, (*arm.changes, *self.args.set))
 
     def tasks(self) -> list[tuple[str, int]]:
         """All arms of the first seed, then of the next."""
@@ -135,12 +135,12 @@ class Job:
 
     def run(self) -> list[tuple[str, int]]:
         """Make what is not there yet; returns the arms and seeds that failed."""
-        if self.asked.jobs > 1:
+        if self.args.jobs > 1:
             from experiments.ablate import pool
 
             cores = len(os.sched_getaffinity(0))
-            if self.asked.jobs > cores:
-                say(f"{cores} cores for {self.asked.jobs} jobs: their times will tell")
+            if self.args.jobs > cores:
+                say(f"{cores} cores for {self.args.jobs} jobs: their times will tell")
             return pool.run(self)
         began, longest = time.monotonic(), 0.0
         tasks = self.tasks()
@@ -158,7 +158,7 @@ class Job:
 
     def is_over(self, spent: float, longest: float) -> bool:
         """Whether another arm might end after the --budget."""
-        minutes = self.asked.budget
+        minutes = self.args.budget
         return minutes is not None and spent + longest > 60 * minutes
 
     def make(self, name: str, seed: int, budget: Budget) -> None:

@@ -47,7 +47,7 @@ def run(job) -> list[tuple[str, int]]:
                     waiting = []
                 _skip_orphans(job, waiting, failed)
                 task = _next(job, waiting, running)
-                if task is not None and len(running) < job.asked.jobs:
+                if task is not None and len(running) < job.args.jobs:
                     waiting.remove(task)
                     running[task] = start(job, *task)
                     number = every.index(task) + 1
@@ -94,7 +94,7 @@ def command(job, name: str, seed: int) -> list[str]:
     """A process that makes one arm and seed, as its settings file says."""
     path = job.out / "logs" / f"{name}-{seed}.json"
     one = dataclasses.replace(
-        job.asked, arms=(name,), seed=seed, jobs=1, budget=None, out=job.out
+        job.args, arms=(name,), seed=seed, jobs=1, budget=None, out=job.out
     )
     write_json(path, specs.as_json(one))
     return [sys.executable, "-m", "experiments.ablate.worker", str(path)]
@@ -103,14 +103,14 @@ def command(job, name: str, seed: int) -> list[str]:
 def _next(job, waiting, running):
     """The first that may begin: over seconds, seed 0 finds the steps of all seeds."""
     for name, seed in waiting:
-        if job.asked.seconds is None or seed == 0 or job.is_finished(name, 0):
+        if job.args.seconds is None or seed == 0 or job.is_finished(name, 0):
             return name, seed
     return None
 
 
 def _skip_orphans(job, waiting, failed):
     """Over seconds, what waits for a first seed that failed can never begin."""
-    if job.asked.seconds is None:
+    if job.args.seconds is None:
         return
     for task in [t for t in waiting if (t[0], 0) in failed]:
         say(f"{_name(task)}: not begun, seed 0 failed and finds its steps")

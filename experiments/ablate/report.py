@@ -30,7 +30,7 @@ def write(job, budget, finished) -> None:
         print("\n" + job.suite.context)
     about = {
         "capture": job.capture.name,
-        "settings": specs.as_json(job.asked),
+        "settings": specs.as_json(job.args),
         "budget": {"steps": budget.steps, "seconds": budget.seconds},
         "arms": {name: specs.as_json(arm) for name, arm in job.suite.arms.items()},
         "seeds": {

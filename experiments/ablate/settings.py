@@ -54,26 +54,26 @@ class Ablate:
         return range(count)
 
 
-def check(asked: Ablate) -> None:
+def check(args: Ablate) -> None:
     """Raise ValueError for what cannot be run."""
-    least = min(asked.frames, asked.tracks, asked.jobs, len(asked.all_seeds))
-    limits = (asked.budget, asked.seconds, asked.steps, asked.share)
+    least = min(args.frames, args.tracks, args.jobs, len(args.all_seeds))
+    limits = (args.budget, args.seconds, args.steps, args.share)
     if least < 1 or not all(limit is None or limit > 0 for limit in limits):
         raise ValueError(
             "--seeds, --frames, --tracks, --jobs, --budget, --seconds, --steps and "
-            f"--share are positive, got {asked.seeds}, {asked.frames}, {asked.tracks}, "
-            f"{asked.jobs}, {asked.budget}, {asked.seconds}, {asked.steps} and "
-            f"{asked.share}"
+            f"--share are positive, got {args.seeds}, {args.frames}, {args.tracks}, "
+            f"{args.jobs}, {args.budget}, {args.seconds}, {args.steps} and "
+            f"{args.share}"
         )
-    if asked.share is not None and asked.steps is not None:
+    if args.share is not None and args.steps is not None:
         raise ValueError("--steps and --share say the same thing: give one of them")
-    if asked.seed is not None and not (asked.seed >= 0 and asked.jobs == 1):
+    if args.seed is not None and not (args.seed >= 0 and args.jobs == 1):
         raise ValueError(
-            f"--seed {asked.seed}: one seed from 0 on, in one process (--jobs 1)"
+            f"--seed {args.seed}: one seed from 0 on, in one process (--jobs 1)"
         )
-    for name in asked.arms:
-        if name not in suites.named(asked.suite).arms:
+    for name in args.arms:
+        if name not in suites.named(args.suite).arms:
             raise ValueError(
-                f"--arms {name}: in --suite {asked.suite} there are "
-                + ", ".join(suites.named(asked.suite).arms)
+                f"--arms {name}: in --suite {args.suite} there are "
+                + ", ".join(suites.named(args.suite).arms)
             )

@@ -21,14 +21,14 @@ def main(path: str) -> None:
         text = pathlib.Path(path).read_text()
         stored = specs.from_json(json.loads(text), ("experiments", *specs.PACKAGES))
         # Paths were stored as text.
-        asked: Ablate = dataclasses.replace(stored, out=pathlib.Path(stored.out))
-        (name,) = asked.arms
-        preset = suites.named(asked.suite).arms[name].preset
+        args: Ablate = dataclasses.replace(stored, out=pathlib.Path(stored.out))
+        (name,) = args.arms
+        preset = suites.named(args.suite).arms[name].preset
         threads = representations.of_preset(preset).threads
-        platform.start_jax(asked.device, threads)
+        platform.start_jax(args.device, threads)
         from experiments.ablate.job import Job
 
-        job = Job(asked)
+        job = Job(args)
     raise SystemExit(1 if job.run() else 0)
 
 

@@ -71,13 +71,13 @@ class AccuracyTime:
 def main(arguments=None):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        asked = cli.parse(AccuracyTime, arguments)
+        args = cli.parse(AccuracyTime, arguments)
         from nerfies_jax.measure import baselines
 
         before = None
-        if asked.check is not None:
-            before = baselines.read(asked.check, "accuracy_time.json")
-        job = _job(asked)
+        if args.check is not None:
+            before = baselines.read(args.check, "accuracy_time.json")
+        job = _job(args)
     from experiments.ablate import pool
     from experiments.accuracy_time import report
 
@@ -86,10 +86,10 @@ def main(arguments=None):
     finished = job.finished(budget)
     worse = []
     if finished:
-        metrics = report.write(job, asked, finished)
+        metrics = report.write(job, args, finished)
         if before is not None:
             worse = baselines.changes(metrics, before)
-            print("\n".join(worse) or f"nothing is worse than in {asked.check}")
+            print("\n".join(worse) or f"nothing is worse than in {args.check}")
     missing = len(job.tasks()) - len(finished)
     if missing:
         print(f"{missing} of {len(job.tasks())} runs are not there; the same command "
@@ -97,26 +97,26 @@ def main(arguments=None):
     raise SystemExit(1 if failed or worse else 0)
 
 
-def _job(asked):
+def _job(args):
     """The runs as an ablation of the suite "settings", each in its own process."""
-    folder = asked.source.capture
-    source = cli.plain(asked.source).scene if folder is None else folder.name
-    out = asked.out or pathlib.Path("runs", f"accuracy_time-{source}")
+    folder = args.source.capture
+    source = cli.plain(args.source).scene if folder is None else folder.name
+    out = args.out or pathlib.Path("runs", f"accuracy_time-{source}")
     ablation = ablate.Ablate(
         suite="settings",
-        arms=asked.arms,
-        source=cli.plain(asked.source),
-        share=asked.share,
-        seeds=asked.seeds,
-        jobs=asked.jobs,
+        arms=args.arms,
+        source=cli.plain(args.source),
+        share=args.share,
+        seeds=args.seeds,
+        jobs=args.jobs,
         out=out,
-        budget=asked.budget,
-        frames=asked.frames,
-        set=asked.set,
-        device=asked.device,
+        budget=args.budget,
+        frames=args.frames,
+        set=args.set,
+        device=args.device,
     )
     ablate.check(ablation)
-    platform.start_jax(asked.device)
+    platform.start_jax(args.device)
     from experiments.ablate.job import Job
 
     return Job(ablation)

@@ -75,9 +75,9 @@ def page(stored) -> str:
         HOW.format(
             still="" if still is None else f";\n  points at rest have {still:.4f}",
             repeat=_repeat(means, seconds),
-            share=_asked(about, "share"),
+            share=_args(about, "share"),
             seeds=ONE_SEED
-            if _asked(about, "seeds") == 1
+            if _args(about, "seeds") == 1
             else "Numbers are means over the seeds.",
         ),
         f"## The presets on {about['capture']}",
@@ -127,7 +127,7 @@ def _seconds(about):
     return "train_cpu_seconds" if on_cpu else "train_seconds"
 
 
-def _asked(about, name):
+def _args(about, name):
     return about["settings"][name]
 
 

@@ -36,12 +36,12 @@ TITLES = {
 SPLAT_COLOUR, FIELD_COLOUR = "#0a5fb4", "#c4501b"
 
 
-def write(job, asked, finished) -> list[Metric]:
+def write(job, args, finished) -> list[Metric]:
     """accuracy_time.json, front.png and fronts.png; prints the lines of every axis."""
     numbers = {key: kept.numbers for key, kept in finished.items()}
     static = protocol.static_error(job.known)
     print(f"\n{job.capture.name}, every setting trained {job.budgets[0].title}:")
-    for name in asked.axes:
+    for name in args.axes:
         print(f"\n{AXES[name].question} ({name}, against {AXES[name].base})")
         print("\n".join(axis_lines(AXES[name], numbers)) or "    nothing finished")
     for line in report.remarks(finished):
@@ -57,7 +57,7 @@ def write(job, asked, finished) -> list[Metric]:
     metrics = report.metrics(numbers, static)
     about = {
         "capture": job.capture.name,
-        "settings": specs.as_json(asked),
+        "settings": specs.as_json(args),
         "arms": {name: specs.as_json(job.suite.arms[name]) for name in job.names},
         "machine": clock.machine(),
     }

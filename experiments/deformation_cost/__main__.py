@@ -62,34 +62,34 @@ class DeformationCost:
 def main(arguments=None):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        asked = cli.parse(DeformationCost, arguments)
-        platform.start_jax(asked.device, "one")
+        args = cli.parse(DeformationCost, arguments)
+        platform.start_jax(args.device, "one")
         from experiments.deformation_cost import knot_curve
 
-        motion = _motion(asked)
+        motion = _motion(args)
         curve = knot_curve.curve(
-            motion, asked.knots, asked.static_threshold, asked.repeats
+            motion, args.knots, args.static_threshold, args.repeats
         )
-    rows = costs(asked.gaussians, asked.still, asked.repeats)
-    print(text(rows, asked.gaussians))
+    rows = costs(args.gaussians, args.still, args.repeats)
+    print(text(rows, args.gaussians))
     for line in spared():
         print(line)
     print()
     print(knot_curve.text(curve))
-    if asked.out is not None:
-        _save(asked.out, rows, curve)
+    if args.out is not None:
+        _save(args.out, rows, curve)
 
 
-def _motion(asked):
+def _motion(args):
     from experiments.deformation_cost import known_motion
     from gaussians_jax.effects.mlp_motion import SMALL_MOTION
     from nerfies_jax import runs
 
-    if asked.run is None:
+    if args.run is None:
         steps = known_motion.FIT_STEPS
-        return known_motion.fitted(asked.gaussians, SMALL_MOTION, steps)
-    run = runs.saved_run(asked.run)
-    state = runs.restore(asked.run, run).state
+        return known_motion.fitted(args.gaussians, SMALL_MOTION, steps)
+    run = runs.saved_run(args.run)
+    state = runs.restore(args.run, run).state
     return known_motion.of_run(run.model, state, run.capture)
 
 

@@ -110,8 +110,8 @@ class SceneCost(NamedTuple):
 def main(arguments=None):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        asked = cli.parse(EffectCost, arguments)
-        platform.start_jax(asked.device, "one")
+        args = cli.parse(EffectCost, arguments)
+        platform.start_jax(args.device, "one")
         import jax
 
         # Compiling is one of the prices; JAX asks once, when it first compiles.
@@ -120,32 +120,32 @@ def main(arguments=None):
         from nerfies_jax.measure import baselines
 
         before = None
-        if asked.check is not None:
-            before = baselines.read(asked.check, "effect_cost.json")
-        tables = {name: arms(_spec(name, asked)) for name in asked.presets}
-        folder = run_folder.new_run_folder(asked.out, "effect_cost")
+        if args.check is not None:
+            before = baselines.read(args.check, "effect_cost.json")
+        tables = {name: arms(_spec(name, args)) for name in args.presets}
+        folder = run_folder.new_run_folder(args.out, "effect_cost")
     print(report.heading())
     rows = {}
     for name, scenes in tables.items():
-        rows[name] = measure(name, scenes, asked.at, asked.repeats)
+        rows[name] = measure(name, scenes, args.at, args.repeats)
         print(report.table(name, rows[name]), flush=True)
-    metrics = report.write(folder, rows, asked)
+    metrics = report.write(folder, rows, args)
     print(f"saved in {folder}")
     worse = [] if before is None else baselines.changes(metrics, before)
     if before is not None:
-        print("\n".join(worse) or f"nothing is worse than in {asked.check}")
+        print("\n".join(worse) or f"nothing is worse than in {args.check}")
     raise SystemExit(1 if worse else 0)
 
 
-def _spec(name, asked):
+def _spec(name, args):
     from nerfies_jax.runs import representations
 
     spec = representations.of_preset(name).presets[name]
-    if asked.rays is not None and hasattr(spec, "rays"):
-        spec = dataclasses.replace(spec, rays=asked.rays)
-    if asked.rows is not None and hasattr(spec, "init"):
-        init = dataclasses.replace(spec.init, source="random", random=asked.rows)
-        most = max(spec.densification.cap_max or asked.rows, asked.rows)
+    if args.rays is not None and hasattr(spec, "rays"):
+        spec = dataclasses.replace(spec, rays=args.rays)
+    if args.rows is not None and hasattr(spec, "init"):
+        init = dataclasses.replace(spec.init, source="random", random=args.rows)
+        most = max(spec.densification.cap_max or args.rows, args.rows)
         densification = dataclasses.replace(spec.densification, cap_max=most)
         spec = dataclasses.replace(spec, init=init, densification=densification)
     return spec

@@ -149,15 +149,15 @@ def _title(arm):
     return arm.replace("_and_", " + ")
 
 
-def write(folder: pathlib.Path, rows, asked) -> list[Metric]:
+def write(folder: pathlib.Path, rows, args) -> list[Metric]:
     """effect_cost.json, .md and .png; returns the metrics."""
     metrics = metrics_of(rows)
     about = {
-        "presets": list(asked.presets),
-        "at": asked.at,
-        "rows": asked.rows,
-        "rays": asked.rays,
-        "repeats": asked.repeats,
+        "presets": list(args.presets),
+        "at": args.at,
+        "rows": args.rows,
+        "rays": args.rays,
+        "repeats": args.repeats,
         "counts": "XLA's, a loop's body once; matrix_flops with every known round",
         **clock.machine(),
     }

@@ -105,22 +105,22 @@ class CaseResult(NamedTuple):
 def main(arguments=None):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        asked = cli.parse(HardCases, arguments)
-        chosen = choose(asked.rooms, asked.cases)
-        folder = run_folder.new_run_folder(asked.out, "hard_cases")
-        if asked.document is not None:
-            report.parts(asked.document)  # before the work
-        platform.start_jax(asked.device)
+        args = cli.parse(HardCases, arguments)
+        chosen = choose(args.rooms, args.cases)
+        folder = run_folder.new_run_folder(args.out, "hard_cases")
+        if args.document is not None:
+            report.parts(args.document)  # before the work
+        platform.start_jax(args.device)
     rows = []
     for case, test in chosen:
-        rows.append(measure(case, test, asked.numbers, asked.repeats))
+        rows.append(measure(case, test, args.numbers, args.repeats))
         print(report.block(rows[-1]), flush=True)
         report.save_figure(folder, rows[-1])
-    report.save_numbers(folder, rows, asked)
+    report.save_numbers(folder, rows, args)
     print(f"\n{report.summary(rows)}\nsaved in {folder}")
-    if asked.document is not None:
-        report.renew(asked.document, rows)
-        print(f"renewed the table in {asked.document}")
+    if args.document is not None:
+        report.renew(args.document, rows)
+        print(f"renewed the table in {args.document}")
 
 
 def choose(rooms, names) -> list[tuple[Case, str]]:

@@ -133,7 +133,7 @@ def renew(path, rows) -> None:
         file.write_text(f"{before}\n{about}\n\n{table(rows)}\n\n{behind}")
 
 
-def save_numbers(folder, rows, asked) -> None:
+def save_numbers(folder, rows, args) -> None:
     """All numbers as metrics, to hold a later run against."""
     metrics = []
     for row in rows:
@@ -146,7 +146,7 @@ def save_numbers(folder, rows, asked) -> None:
         measured = {"value": row.value_cost, "gradient": row.slope_cost}
         for name, cost in measured.items() if row.case.alike else ():
             metrics.append(Metric(f"{key}.{name}_cost", cost, "", "lower", 0.25))
-    about = {"numbers": asked.numbers, "repeats": asked.repeats, **clock.machine()}
+    about = {"numbers": args.numbers, "repeats": args.repeats, **clock.machine()}
     clock.write_metrics(folder / "hard_cases.json", metrics, about)
 
 

@@ -217,8 +217,8 @@ def _with_a_floor(weights):
     weights = weights + 1e-5
     share = jnp.cumsum(weights / jnp.sum(weights))
     share = jnp.concatenate([jnp.zeros_like(share[:1]), share])
-    asked = jnp.linspace(0, 1, DRAWN, dtype=weights.dtype)
-    reached = asked[:, None] >= share
+    args = jnp.linspace(0, 1, DRAWN, dtype=weights.dtype)
+    reached = args[:, None] >= share
     low, high = (
         (
             jnp.max(jnp.where(reached, x, x[0]), axis=1),
@@ -227,7 +227,7 @@ def _with_a_floor(weights):
         for x in (share, edges)
     )
     span = jnp.where(low[1] - low[0] < 1e-5, 1, low[1] - low[0])
-    return high[0] + (asked - low[0]) / span * (high[1] - high[0])
+    return high[0] + (args - low[0]) / span * (high[1] - high[0])
 
 
 def _exact_samples(weights):

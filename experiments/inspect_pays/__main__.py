@@ -60,21 +60,21 @@ def main(arguments=None):
     """Run the job of the command line; exit code 1 where a run failed, 2 where its
     input is wrong."""
     with cli.user_errors():
-        asked = cli.parse(InspectPays, arguments)
+        args = cli.parse(InspectPays, arguments)
         platform.start_jax("cpu")
-        check(asked.presets)
+        check(args.presets)
         from experiments.inspect_pays import report
         from experiments.inspect_pays.job import Trial, read
 
         # All are read before the first is trained: a wrong name ends it at once.
-        trials = [Trial(asked, *read(asked, path)) for path in asked.captures]
-        names = asked.scenes or (() if asked.captures else _built_in())
-        trials += [Trial(asked, *read(asked, None, scene)) for scene in names]
+        trials = [Trial(args, *read(args, path)) for path in args.captures]
+        names = args.scenes or (() if args.captures else _built_in())
+        trials += [Trial(args, *read(args, None, scene)) for scene in names]
     failed, rows = False, []
     for trial in trials:
         failed |= bool(trial.run())
         rows += trial.rows()
-    lines = report.write(asked.out, asked, rows)
+    lines = report.write(args.out, args, rows)
     print("\n".join(lines))
     raise SystemExit(1 if failed else 0)
 

@@ -48,16 +48,16 @@ class Comparison(NamedTuple):
 
 
 def read(
-    asked: Any, capture: pathlib.Path | None, scene: str = "default"
+    args: Any, capture: pathlib.Path | None, scene: str = "default"
 ) -> tuple[str, CaptureSource, Capture]:
     """A capture's name, how it is read, and itself; ValueError where it cannot be."""
     own = capture is not None
     source = CaptureSource(
         capture=capture,
         scene=scene,
-        factor=asked.factor if own else None,
-        max_side=asked.max_side if own else None,
-        heldout=asked.heldout if own else None,
+        factor=args.factor if own else None,
+        max_side=args.max_side if own else None,
+        heldout=args.heldout if own else None,
     )
     stored = runs.stored_capture(source)
     if not len(stored.heldout):
@@ -71,10 +71,10 @@ def read(
 class Trial:
     """A capture, what was found in it, and the runs that tell what it was worth."""
 
-    def __init__(self, asked: Any, name: str, source: CaptureSource, stored: Capture):
-        self.asked, self.name, self._source = asked, name, source
+    def __init__(self, args: Any, name: str, source: CaptureSource, stored: Capture):
+        self.args, self.name, self._source = args, name, source
         self._stored = stored
-        self.folder = asked.out / name
+        self.folder = args.out / name
         self.folder.mkdir(parents=True, exist_ok=True)
         self._found: tuple[Finding, ...] | None = None
         self._job: Job | None = None
@@ -85,10 +85,10 @@ class Trial:
         if self._found is not None:
             return self._found
         path = self.folder / FOUND
-        asked = specs.as_json(self._source)
+        args = specs.as_json(self._source)
         if path.is_file():
             kept = json.loads(path.read_text())
-            if kept["read as"] != asked:
+            if kept["read as"] != args:
                 raise ValueError(
                     f"{path}: the capture was read otherwise; name another --out"
                 )
@@ -99,7 +99,7 @@ class Trial:
         pictures.save(found.sheet, self.folder / "inspected.png")
         advice = adviser.advise_all(found.findings)
         told = inspect_scene.as_json(self._stored, found, advice)
-        write_json(path, {"read as": asked, **told})
+        write_json(path, {"read as": args, **told})
         self._found = found.findings
         return self._found
 
@@ -110,7 +110,7 @@ class Trial:
     def pairs(self) -> dict[str, str]:
         """By preset, the arm that is advised in its place."""
         return {
-            preset: arms.name_of(self.advice(preset)) for preset in self.asked.presets
+            preset: arms.name_of(self.advice(preset)) for preset in self.args.presets
         }
 
     def run(self) -> list[tuple[str, int]]:
@@ -120,18 +120,18 @@ class Trial:
             names = dict.fromkeys(name for pair in differ for name in pair)
             if not names:
                 return []
-            asked = self.asked
+            args = self.args
             self._job = Job(
                 Ablate(
                     suite="advice",
                     arms=tuple(names),
                     source=self._source,
-                    steps=asked.steps,
-                    seeds=asked.seeds,
-                    jobs=asked.jobs,
+                    steps=args.steps,
+                    seeds=args.seeds,
+                    jobs=args.jobs,
                     out=self.folder,
-                    frames=asked.frames,
-                    set=asked.set,
+                    frames=args.frames,
+                    set=args.set,
                     device="cpu",
                 )
             )
@@ -144,7 +144,7 @@ class Trial:
 
     def _reason(self, name):
         """Why an arm cannot be built on the capture, with its name; None if it can."""
-        spec = self._job.spec(name, self.asked.steps)
+        spec = self._job.spec(name, self.args.steps)
         representation = representations.of_preset(self._job.suite.arms[name].preset)
         try:
             metadata = representation.metadata_of(self._job.capture, spec)

@@ -95,14 +95,14 @@ def metrics_of(rows: list[Comparison]) -> list[Metric]:
     return found
 
 
-def write(folder: pathlib.Path, asked: Any, rows: list[Comparison]) -> list[str]:
+def write(folder: pathlib.Path, args: Any, rows: list[Comparison]) -> list[str]:
     """pays.md and pays.json; returns the lines of the table and the count."""
     about = {
-        "presets": list(asked.presets),
-        "steps": asked.steps,
-        "seeds": asked.seeds,
-        "max_side": asked.max_side,
-        "set": list(asked.set),
+        "presets": list(args.presets),
+        "steps": args.steps,
+        "seeds": args.seeds,
+        "max_side": args.max_side,
+        "set": list(args.set),
         **clock.machine(),
     }
     clock.write_metrics(folder / "pays.json", metrics_of(rows), about)

@@ -106,36 +106,36 @@ class RankResult(NamedTuple):
 def main(arguments=None):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        asked = cli.parse(MotionRank, arguments)
-        platform.start_jax(asked.device)
-        if asked.out is not None:
-            asked.out.mkdir(parents=True, exist_ok=True)
-    rows = table(asked)
+        args = cli.parse(MotionRank, arguments)
+        platform.start_jax(args.device)
+        if args.out is not None:
+            args.out.mkdir(parents=True, exist_ok=True)
+    rows = table(args)
     print(report.text(rows))
     print(report.said(rows))
-    if asked.out is not None:
-        report.write(asked, rows)
+    if args.out is not None:
+        report.write(args, rows)
     return rows
 
 
-def table(asked: MotionRank) -> list[RankResult]:
+def table(args: MotionRank) -> list[RankResult]:
     """Every model at every K, for every kind of trajectories."""
     rows = []
     fits = {}  # compiled once for each number of points, which a scene may lack
-    for kind in asked.kinds:
+    for kind in args.kinds:
         drawn = [
-            motion_tracks.make(kind, asked.points, asked.times, seed)
-            for seed in range(asked.seeds)
+            motion_tracks.make(kind, args.points, args.times, seed)
+            for seed in range(args.seeds)
         ]
         for model in RATES:
-            for count in (None,) if model == "residual" else asked.counts:
-                row = one_row(asked, fits, kind, model, count, drawn)
+            for count in (None,) if model == "residual" else args.counts:
+                row = one_row(args, fits, kind, model, count, drawn)
                 rows.append(row)
                 print(report.progress(row), flush=True)
     return rows
 
 
-def one_row(asked, fits, kind, model, count, drawn) -> RankResult:
+def one_row(args, fits, kind, model, count, drawn) -> RankResult:
     """Fit one model to every draw; `fits` keeps what is compiled."""
     learnt, held_out, floor, seconds = [], [], [], []
     for seed, tracks in enumerate(drawn):
@@ -144,7 +144,7 @@ def one_row(asked, fits, kind, model, count, drawn) -> RankResult:
         given = [jnp.asarray(part, jnp.float32) for part in (*known, tracks.times)]
         name = model, count, len(tracks.rest)
         if name not in fits:
-            fits[name] = compiled_fit(asked, model, count, given)
+            fits[name] = compiled_fit(args, model, count, given)
         began = time.process_time()
         found = np.asarray(fits[name](jax.random.key(seed), *given), np.float64)
         seconds.append(time.process_time() - began)
@@ -188,12 +188,12 @@ class Fittable(NamedTuple):
     apply: Any  # (parameters, rest, times) -> [points, times, 3]
 
 
-def compiled_fit(asked: MotionRank, model: str, count: int | None, given):
+def compiled_fit(args: MotionRank, model: str, count: int | None, given):
     """The fit as a program: (key, rest, times, moved, all times) -> displacements."""
-    chosen = model_of(model, count, asked.basis_form)
+    chosen = model_of(model, count, args.basis_form)
     factors = model in FLOORS
-    few = None if factors else asked.batch
-    steps = asked.steps * (FACTOR_STEPS if factors else 1)
+    few = None if factors else args.batch
+    steps = args.steps * (FACTOR_STEPS if factors else 1)
     rule = optax.adam(optax.exponential_decay(RATES[model], steps, 0.01))
 
     def fit(key, rest, times, moved, every_time):

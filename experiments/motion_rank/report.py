@@ -153,17 +153,17 @@ def _floors(own):
             )
 
 
-def write(asked, rows) -> None:
+def write(args, rows) -> None:
     """motion_rank.json and motion_rank.png in the folder asked for."""
     record = {
-        "settings": specs.as_json(asked),
+        "settings": specs.as_json(args),
         "machine": clock.machine(),
         "rows": [row._asdict() for row in rows],
         "said": said(rows).strip().split("\n"),
     }
-    write_json(asked.out / "motion_rank.json", record)
-    draw_figure(rows, asked.out / "motion_rank.png")
-    print(asked.out / "motion_rank.png")
+    write_json(args.out / "motion_rank.json", record)
+    draw_figure(rows, args.out / "motion_rank.png")
+    print(args.out / "motion_rank.png")
 
 
 def page(stored) -> str:

@@ -263,13 +263,13 @@ def grid(dimensions: int) -> jax.Array:
 
 
 def measure(
-    asked: SpectralBias, label: str, kind: str, encoded: bool, budget: float | None
+    args: SpectralBias, label: str, kind: str, encoded: bool, budget: float | None
 ) -> list[Result]:
     """One network: at equal steps and, if `budget` seconds are given, in that time."""
     signal = SIGNALS[label]
     made = network(kind, encoded, signal)
-    train = trainer(made, signal, asked.batch, asked.points)
-    lanes = max(asked.seeds, len(asked.rates))
+    train = trainer(made, signal, args.batch, args.points)
+    lanes = max(args.seeds, len(args.rates))
     shapes = (
         jax.eval_shape(lambda: jax.random.split(jax.random.key(0), lanes)),
         jax.ShapeDtypeStruct((lanes,), jnp.float32),
@@ -281,11 +281,9 @@ def measure(
     score = jax.jit(
         jax.vmap(lambda params: errors(lambda x: made.apply(params, x), signal))
     )
-    tried = jnp.asarray(np.resize(asked.rates, lanes), jnp.float32)
+    tried = jnp.asarray(np.resize(args.rates, lanes), jnp.float32)
     same = jnp.stack([jax.random.key(1)] * lanes)
-    _, loss = compiled(
-        same, tried, jnp.asarray(max(round(asked.pilot * asked.steps), 2))
-    )
+    _, loss = compiled(same, tried, jnp.asarray(max(round(args.pilot * args.steps), 2)))
     # A run that blew up is not the best.
     best = int(np.argmin(np.nan_to_num(np.asarray(loss), nan=np.inf)))
     rate, keys = tried[best], jax.random.split(jax.random.key(2), lanes)
@@ -295,7 +293,7 @@ def measure(
         params, _ = compiled(keys, jnp.full(lanes, rate), jnp.asarray(steps))
         jax.block_until_ready(params)
         seconds = (time.process_time() - began) / lanes
-        rmse, missing = (np.asarray(x)[: asked.seeds] for x in score(params))
+        rmse, missing = (np.asarray(x)[: args.seeds] for x in score(params))
         name = kind + (" + encoding" if encoded else "")
         return Result(
             label,
@@ -308,20 +306,20 @@ def measure(
             missing.tolist(),
         )
 
-    found = [run(asked.steps)]
+    found = [run(args.steps)]
     if budget is not None:
-        found.append(run(max(2, round(asked.steps * budget / found[0].seconds))))
+        found.append(run(max(2, round(args.steps * budget / found[0].seconds))))
     return found
 
 
-def all_results(asked: SpectralBias) -> tuple[list[Result], list[Result]]:
+def all_results(args: SpectralBias) -> tuple[list[Result], list[Result]]:
     """Every network at equal steps, and in the first one's time."""
     equal_steps, equal_time = [], []
-    for label in asked.signals:
+    for label in args.signals:
         budget = None
-        for kind in asked.kinds:
+        for kind in args.kinds:
             for encoded in (False, True):
-                found = measure(asked, label, kind, encoded, budget)
+                found = measure(args, label, kind, encoded, budget)
                 equal_steps.append(found[0])
                 equal_time.append(found[-1])
                 if budget is None:
@@ -333,16 +331,16 @@ def all_results(asked: SpectralBias) -> tuple[list[Result], list[Result]]:
 def main(arguments=None):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        asked = cli.parse(SpectralBias, arguments)
-        if asked.out is not None:
-            asked.out.mkdir(parents=True, exist_ok=True)
-        platform.start_jax(asked.device)
-    results = dict(zip(("equal steps", "equal time"), all_results(asked), strict=True))
-    waves = {label: SIGNALS[label].waves for label in asked.signals}
+        args = cli.parse(SpectralBias, arguments)
+        if args.out is not None:
+            args.out.mkdir(parents=True, exist_ok=True)
+        platform.start_jax(args.device)
+    results = dict(zip(("equal steps", "equal time"), all_results(args), strict=True))
+    waves = {label: SIGNALS[label].waves for label in args.signals}
     print(report.tables(results, waves))
     print(report.said(results))
-    if asked.out is not None:
-        report.write(asked, results, waves)
+    if args.out is not None:
+        report.write(args, results, waves)
 
 
 if __name__ == "__main__":

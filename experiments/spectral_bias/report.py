@@ -116,10 +116,10 @@ def _against_kan(label, equality, error):
         )
 
 
-def write(asked, results, waves) -> None:
+def write(args, results, waves) -> None:
     """spectral_bias.json and spectral_bias.png in the folder asked for."""
     record = {
-        "settings": specs.as_json(asked),
+        "settings": specs.as_json(args),
         "machine": clock.machine(),
         "waves": {label: found.tolist() for label, found in waves.items()},
         "results": {
@@ -128,9 +128,9 @@ def write(asked, results, waves) -> None:
         },
         "said": said(results).strip().split("\n"),
     }
-    write_json(asked.out / "spectral_bias.json", record)
-    draw_figure(results, waves, asked.out / "spectral_bias.png")
-    print(asked.out / "spectral_bias.png")
+    write_json(args.out / "spectral_bias.json", record)
+    draw_figure(results, waves, args.out / "spectral_bias.png")
+    print(args.out / "spectral_bias.png")
 
 
 def page(stored) -> str:

@@ -64,8 +64,8 @@ class KanMotionSpec:
     rotation: bool = True
     warm_up: int = steps(0)  # steps without motion
     embedding_rate: float = 2.5e-3
-    rate: float = 1.6e-4  # of network and time codes
-    rate_end: float = 1.6e-5
+    learning_rate: float = 1.6e-4  # of network and time codes
+    learning_rate_end: float = 1.6e-5
     block: int = 512  # Gaussians per evaluation
 
     def __post_init__(self):
@@ -94,11 +94,9 @@ class KanMotionSpec:
             raise ValueError(
                 f"spread={self.spread}: equal codes stay equal; start at about 0.1"
             )
-        if not (0 < self.rate_end <= self.rate and self.embedding_rate > 0):
-            raise ValueError(
-                f"the rate falls from rate={self.rate} to rate_end={self.rate_end}, "
-                f"and embedding_rate={self.embedding_rate} is positive"
-            )
+        schedules.check_falling(self.learning_rate, self.learning_rate_end)
+        if not self.embedding_rate > 0:
+            raise ValueError(f"embedding_rate={self.embedding_rate} must be positive")
         field_spec(self)  # checks what the network is made of
 
 
@@ -353,7 +351,9 @@ def effect(spec: KanMotionSpec, steps: int, frames: int) -> Effect:
         init_rows=init_rows,
         init=init_networks,
         row_learning_rate=embedding_rate,
-        learning_rate=schedules.log_linear(spec.rate, spec.rate_end, steps),
+        learning_rate=schedules.log_linear(
+            spec.learning_rate, spec.learning_rate_end, steps
+        ),
         warm_up=spec.warm_up,
         prepare=prepared,
         deform=moved,

@@ -66,8 +66,8 @@ class MotionSpec:
     scale_rule: str = "log"
     warm_up: int = steps(3000)  # steps without motion
     smoothing: SmoothingSpec | None = SmoothingSpec()
-    rate: float = 8e-4
-    rate_end: float = 1.6e-6
+    learning_rate: float = 8e-4
+    learning_rate_end: float = 1.6e-6
     # Gaussians per evaluation. Measured at 10k, one core, forward and backward: 8x256
     # takes 598 ms and 11 MB in blocks of 512, 601 ms and 194 MB at once.
     block: int = 512
@@ -81,11 +81,7 @@ class MotionSpec:
             raise ValueError(
                 f"block >= 1 and warm_up >= 0, got {self.block} and {self.warm_up}"
             )
-        if not 0 < self.rate_end <= self.rate:
-            raise ValueError(
-                f"the rate falls from rate={self.rate} to rate_end={self.rate_end}; "
-                "both are positive and the second is not larger"
-            )
+        schedules.check_falling(self.learning_rate, self.learning_rate_end)
 
 
 # One core, forward and backward, at 5k and 10k Gaussians: 14 and 28 ms, about what
@@ -252,7 +248,9 @@ def effect(spec: MotionSpec, steps: int, frames: int) -> Effect:
     return Effect(
         name=NAME,
         init=init_networks,
-        learning_rate=schedules.log_linear(spec.rate, spec.rate_end, steps),
+        learning_rate=schedules.log_linear(
+            spec.learning_rate, spec.learning_rate_end, steps
+        ),
         warm_up=spec.warm_up,
         deform=moved,
     )

@@ -64,8 +64,8 @@ class BasisMotionSpec:
     detach: bool = True
     warm_up: int = steps(3000)  # steps without motion
     smoothing: SmoothingSpec | None = None
-    rate: float = 8e-4
-    rate_end: float = 1.6e-6
+    learning_rate: float = 8e-4
+    learning_rate_end: float = 1.6e-6
     block: int = 512  # Gaussians per evaluation
 
     def __post_init__(self):
@@ -87,11 +87,7 @@ class BasisMotionSpec:
             raise ValueError(
                 f"block >= 1 and warm_up >= 0, got {self.block} and {self.warm_up}"
             )
-        if not 0 < self.rate_end <= self.rate:
-            raise ValueError(
-                f"the rate falls from rate={self.rate} to rate_end={self.rate_end}; "
-                "both are positive and the second is not larger"
-            )
+        schedules.check_falling(self.learning_rate, self.learning_rate_end)
         base_spec(self)  # these check sizes, layers and activation
         weights_spec(self)
         if self.count is not None:
@@ -392,7 +388,9 @@ def effect(spec: BasisMotionSpec, steps: int, frames: int) -> Effect:
     return Effect(
         name=NAME,
         init=init_networks,
-        learning_rate=schedules.log_linear(spec.rate, spec.rate_end, steps),
+        learning_rate=schedules.log_linear(
+            spec.learning_rate, spec.learning_rate_end, steps
+        ),
         warm_up=spec.warm_up,
         prepare=prepared,
         deform=moved,

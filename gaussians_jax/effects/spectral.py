@@ -78,16 +78,17 @@ class SpectralSpec:
     """Which losses, and what becomes of their weights; each starts at opening * most.
 
     `gate` "learned" is equation 16. The loss grows with the gate, so descent can only
-    shut it: it acts as an annealing that paces itself by `rate`, whatever the losses
-    are. "floor" stops at `floor` of `most`, "fixed" stays at its opening, "schedule"
-    falls to zero along half a cosine. `experiments.frequency_gates` compares them.
+    shut it: it acts as an annealing that paces itself by `learning_rate`, whatever the
+    losses are. "floor" stops at `floor` of `most`, "fixed" stays at its opening,
+    "schedule" falls to zero along half a cosine. `experiments.frequency_gates` compares
+    them.
     """
 
     wavelet: WaveletSpec | None = WaveletSpec()
     fourier: FourierSpec | None = FourierSpec()
     gate: str = "learned"
     opening: float = 0.5  # equation 16 at g = 0
-    rate: float = 1e-2  # Adam's, of the logits g
+    learning_rate: float = 1e-2  # Adam's, of the logits g
     floor: float = 0.05
     after: int = steps(0)  # steps without these losses
 
@@ -106,7 +107,7 @@ class SpectralSpec:
                 f"floor={self.floor} must lie in [0, opening={self.opening}): a gate "
                 "falls from its opening"
             )
-        _positive("gates'", rate=self.rate)
+        _positive("gates'", learning_rate=self.learning_rate)
         if self.after < 0:
             raise ValueError(f"after={self.after} counts steps; it is not negative")
 
@@ -330,6 +331,8 @@ def effect(spec: SpectralSpec, steps: int) -> Effect:
     return Effect(
         name=NAME,
         init=(lambda key: init(spec)) if learned else None,
-        learning_rate=(lambda step: jnp.asarray(spec.rate)) if learned else None,
+        learning_rate=(lambda step: jnp.asarray(spec.learning_rate))
+        if learned
+        else None,
         penalty=penalty,
     )

@@ -13,20 +13,20 @@ from nerfies_jax.training.model import Frames, View, in_default_precision
 def frames_of(capture: Capture, required_data: frozenset[str] = frozenset()) -> Frames:
     """The training frames on the device, with what of `required_data` there is."""
     rows = capture.train
-    beside = {}
+    extras = {}
     if "depths" in required_data and capture.depths is not None:
-        beside["depths"] = capture.depths[rows]
+        extras["depths"] = capture.depths[rows]
     if "points" in required_data and capture.points is not None:
-        beside["points"] = capture.points.position
+        extras["points"] = capture.points.position
     if "flow" in required_data and capture.flow is not None:
-        beside["flow"] = training_flow(capture)
+        extras["flow"] = training_flow(capture)
     frames = Frames(
         images=capture.images[rows],
         cameras=cameras.take(capture.cameras, rows),
         times=capture.times[rows],
         appearance=capture.appearance_ids[rows],
         valid=None if capture.valid is None else capture.valid[rows],
-        **beside,
+        **extras,
     )
     return in_default_precision(frames)
 

@@ -14,6 +14,16 @@ from jaxtyping import Array, Float
 Schedule = Callable[..., Float[Array, "*steps"]]  # of an integer step
 
 
+def check_falling(learning_rate: float, learning_rate_end: float) -> None:
+    """Raise ValueError unless a rate falls, or stays, from one positive number on."""
+    if not 0 < learning_rate_end <= learning_rate:
+        raise ValueError(
+            f"the rate falls from learning_rate={learning_rate} to "
+            f"learning_rate_end={learning_rate_end}; both are positive and the second "
+            "is not larger"
+        )
+
+
 def log_linear(
     start: float, end: float, steps: int, *, delay_steps: int = 0, delay: float = 1.0
 ) -> Schedule:

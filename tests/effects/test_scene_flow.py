@@ -344,8 +344,8 @@ def test_a_scene_with_it_learns_from_pictures_depth_and_flow():
         template=TINY.network,
         sampling=SamplingSpec(8, 0, block=100),
         rays=64,
-        rate=5e-3,
-        rate_end=1e-3,
+        learning_rate=5e-3,
+        learning_rate_end=1e-3,
         scene_flow=TINY,
     )
     metadata = scene.metadata_of(capture, spec)

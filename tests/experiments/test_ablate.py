@@ -25,7 +25,7 @@ from tests import scenes
 
 
 def test_arms_differ_from_nerfies_only_in_what_their_name_says():
-    job = types.SimpleNamespace(suite=FIELDS, asked=Ablate())
+    job = types.SimpleNamespace(suite=FIELDS, args=Ablate())
     specs = {name: Job.spec(job, name, 600) for name in FIELDS.arms}
     whole = specs["nerfies"]
     assert None not in (whole.elastic, whole.background, whole.warp)
@@ -85,7 +85,7 @@ def plain(spec, path=""):
 def test_arms_of_a_paper_differ_from_the_whole_only_in_what_their_name_says(
     suite, steps
 ):
-    job = types.SimpleNamespace(suite=suites.named(suite), asked=Ablate())
+    job = types.SimpleNamespace(suite=suites.named(suite), args=Ablate())
     specs = {name: Job.spec(job, name, steps) for name in suites.named(suite).arms}
     assert {spec.steps for spec in specs.values()} == {steps}
     whole = plain(specs["full"])

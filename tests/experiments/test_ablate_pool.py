@@ -33,10 +33,10 @@ if name == "bad":
 class Job:
     """As `experiments.ablate.job.Job`, of arms that only wait."""
 
-    def __init__(self, out, names, seeds, seconds=0.2, **asked):
+    def __init__(self, out, names, seeds, seconds=0.2, **args):
         self.out, self.wait, self.budgets = out, seconds, [None]
         self.every = [(name, seed) for seed in range(seeds) for name in names]
-        self.asked = Ablate(**asked)
+        self.args = Ablate(**args)
         arms = {name: Arm("nerf-small") for name in names}
         self.suite = types.SimpleNamespace(arms=arms)
 
@@ -47,7 +47,7 @@ class Job:
         return (self.out / f"{name}-{seed}.ended").is_file()
 
     def is_over(self, spent, longest):
-        return self.asked.budget is not None and spent + longest > self.asked.budget
+        return self.args.budget is not None and spent + longest > self.args.budget
 
     def kept(self, name, seed, budget):
         names = ("psnr", "moving_psnr", "depth_median", "track_error", "train_seconds")
@@ -85,7 +85,7 @@ def test_no_more_run_at_once_than_asked_for_and_what_is_there_is_left(tmp_path, 
 
 def test_over_seconds_later_seeds_wait_for_the_first_of_their_arm(tmp_path, capsys):
     job = Job(tmp_path, ["a", "bad"], 2, jobs=4)
-    job.asked = Ablate(jobs=4, seconds=1.0)
+    job.args = Ablate(jobs=4, seconds=1.0)
     assert sorted(pool.run(job)) == [("bad", 0), ("bad", 1)]
     assert job.time_of("a", 1, "begun") > job.time_of("a", 0, "ended")
     error = capsys.readouterr().err
@@ -139,7 +139,7 @@ def test_a_signal_ends_every_process(tmp_path, monkeypatch, number, code):
 
 def test_a_process_takes_the_settings_of_its_arm_from_their_file(tmp_path, monkeypatch):
     monkeypatch.undo()  # of what every test here has
-    asked = Ablate(
+    args = Ablate(
         suite="sonata",
         arms=("full", "static"),
         source=CaptureSource(pathlib.Path("a folder"), max_side=64),
@@ -150,12 +150,12 @@ def test_a_process_takes_the_settings_of_its_arm_from_their_file(tmp_path, monke
         set=("densification.cap_max=99", "sh_degree=0"),
     )
     (tmp_path / "logs").mkdir()
-    words = pool.command(types.SimpleNamespace(asked=asked, out=tmp_path), "full", 2)
+    words = pool.command(types.SimpleNamespace(args=args, out=tmp_path), "full", 2)
     assert words[:3] == [sys.executable, "-m", worker.__name__]
     taken, started = [], []
 
-    def job(asked):
-        taken.append(asked)
+    def job(args):
+        taken.append(args)
         return types.SimpleNamespace(run=list)  # nothing failed
 
     monkeypatch.setattr(ablate_job, "Job", job)
@@ -166,6 +166,6 @@ def test_a_process_takes_the_settings_of_its_arm_from_their_file(tmp_path, monke
     assert started == [("auto", "one")]
     assert taken == [
         dataclasses.replace(
-            asked, arms=("full",), seed=2, jobs=1, budget=None, out=tmp_path
+            args, arms=("full",), seed=2, jobs=1, budget=None, out=tmp_path
         )
     ]

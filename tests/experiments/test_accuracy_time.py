@@ -20,7 +20,7 @@ from nerfies_jax.measure.clock import Metric
 
 @pytest.mark.parametrize("name", AXES)
 def test_every_setting_of_an_axis_differs_from_its_base_and_the_others(name):
-    job = types.SimpleNamespace(suite=SETTINGS, asked=Ablate(suite="settings"))
+    job = types.SimpleNamespace(suite=SETTINGS, args=Ablate(suite="settings"))
     arms = AXES[name].settings
     specs = [(Job.spec(job, each, 600), arm.environment) for each, arm in arms.items()]
     assert len(set(map(repr, specs))) == len(specs)
@@ -37,8 +37,8 @@ def test_a_setting_that_stands_on_two_axes_is_the_same_on_both():
 
 
 def test_a_share_stretches_every_preset_by_itself():
-    asked = Ablate(suite="settings", share=0.1)
-    job = types.SimpleNamespace(suite=SETTINGS, asked=asked)
+    args = Ablate(suite="settings", share=0.1)
+    job = types.SimpleNamespace(suite=SETTINGS, args=args)
     spec = Job.spec(job, "splats-deformable-small", None)
     assert spec.steps == 300
     assert spec.motion.warm_up == 60
@@ -50,7 +50,7 @@ def row(**values):
 
 def test_a_setting_of_precision_has_its_switch_in_its_process(tmp_path, monkeypatch):
     job = types.SimpleNamespace(
-        suite=SETTINGS, out=tmp_path, asked=Ablate(suite="settings")
+        suite=SETTINGS, out=tmp_path, args=Ablate(suite="settings")
     )
     begun = {}
 
@@ -168,8 +168,6 @@ def test_a_tiny_plan_runs_resumes_and_is_held_against_itself(tmp_path, capfd):
 
 
 def test_bases_are_trained_first():
-    asked = dataclasses.replace(
-        accuracy_time.AccuracyTime(), axes=("harmonics", "warp")
-    )
-    assert asked.arms[:2] == ("splats-deformable-small", "nerfies-small")
-    assert len(asked.arms) == len(set(asked.arms))
+    args = dataclasses.replace(accuracy_time.AccuracyTime(), axes=("harmonics", "warp"))
+    assert args.arms[:2] == ("splats-deformable-small", "nerfies-small")
+    assert len(args.arms) == len(set(args.arms))

@@ -70,7 +70,7 @@ def test_splats_that_blow_up_say_where_and_exit_with_one(tmp_path, capsys):
 
 def test_a_field_that_draws_no_numbers_leaves_no_report(tmp_path, capsys):
     code, printed, folder = reconstruct_at(
-        tmp_path, capsys, "nerf-small", "rate=1e38", *FIELD
+        tmp_path, capsys, "nerf-small", "learning_rate=1e38", *FIELD
     )
     assert code == 1
     *_, drawn, last = printed.err.splitlines()

@@ -143,8 +143,8 @@ def test_the_page_has_a_row_for_every_scene():
 
 
 def test_what_became_dearer_than_its_tolerance_is_named(tmp_path):
-    asked = EffectCost(presets=("nerfies-small",))
-    report.write(tmp_path, {"nerfies-small": ROWS}, asked)
+    args = EffectCost(presets=("nerfies-small",))
+    report.write(tmp_path, {"nerfies-small": ROWS}, args)
     assert (tmp_path / "effect_cost.png").stat().st_size > 5000
     stored = json.loads((tmp_path / "effect_cost.json").read_text())
     assert stored["about"]["cpu"] == clock.machine()["cpu"]

@@ -184,10 +184,10 @@ def test_what_differs_is_trained_once_and_kept(film, tmp_path, looked, capsys):
 
 
 def test_where_the_advice_is_the_preset_nothing_is_trained(film, tmp_path, looked):
-    asked = inspect_pays.InspectPays(
+    args = inspect_pays.InspectPays(
         presets=("splats-static-small",), out=tmp_path, heldout="3"
     )
-    trial = Trial(asked, *read(asked, film))
+    trial = Trial(args, *read(args, film))
     assert trial.run() == []
     assert looked == ["look"]
     (one,) = trial.rows()
@@ -201,10 +201,10 @@ def test_a_preset_that_needs_what_is_not_there_is_left_out(
     nerfies_format.write(films.film(points=0), tmp_path / "film")
     lacking = (finding(MOTION, True), finding(BACKGROUND, False))
     monkeypatch.setattr(Trial, "findings", lambda self: lacking)
-    asked = inspect_pays.InspectPays(
+    args = inspect_pays.InspectPays(
         presets=("nerfies-small",), out=tmp_path, heldout="3", steps=7
     )
-    trial = Trial(asked, *read(asked, tmp_path / "film"))
+    trial = Trial(args, *read(args, tmp_path / "film"))
     assert trial.run() == []
     assert looked == ["train nerfies-small+background=none"]
     (one,) = trial.rows()
@@ -217,10 +217,10 @@ def test_a_process_can_take_the_settings_of_what_is_trained(
 ):
     jobs = []
     monkeypatch.setattr(pool, "run", lambda job: jobs.append(job) or [])
-    asked = inspect_pays.InspectPays(out=tmp_path, heldout="3", steps=7)
-    Trial(asked, *read(asked, film)).run()
+    args = inspect_pays.InspectPays(out=tmp_path, heldout="3", steps=7)
+    Trial(args, *read(args, film)).run()
     name = "nerf-small+appearance.width=4"
-    ablate.check(jobs[0].asked)
+    ablate.check(jobs[0].args)
     (jobs[0].out / "logs").mkdir()
     taken = json.loads(pathlib.Path(pool.command(jobs[0], name, 0)[-1]).read_text())
     assert (taken["suite"], taken["arms"], taken["seed"]) == ("advice", [name], 0)

@@ -40,10 +40,10 @@ def test_the_floors_by_hand():
 @pytest.mark.parametrize("model", list(motion_rank.FLOORS))
 def test_no_factorisation_passes_below_its_floor_and_a_fit_comes_close(model):
     """The floor is of all values of the factors, the fits are of some."""
-    asked = MotionRank(**TINY | {"counts": (3,), "steps": 300})
-    for count in asked.counts:
+    args = MotionRank(**TINY | {"counts": (3,), "steps": 300})
+    for count in args.counts:
         tracks = motion_tracks.make("cloth", 8, 12, seed=3)
-        row = motion_rank.one_row(asked, {}, "cloth", model, count, [tracks])
+        row = motion_rank.one_row(args, {}, "cloth", model, count, [tracks])
         assert row.learnt[0] > row.floor[0] * (1 - 1e-5)
         if model == "time basis":  # its factors are free numbers, and a network of t
             assert row.learnt[0] < 1.2 * row.floor[0] + 0.02

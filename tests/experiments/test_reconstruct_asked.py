@@ -186,9 +186,9 @@ def test_a_command_that_is_printed_keeps_all_options(source):
     config = RunConfig("splats-static", source, 60, overrides, seed=3)
     words = shlex.split(commands.reconstruct(config))
     assert words[:3] == ["python", "-m", "experiments.reconstruct"]
-    asked = cli.parse(reconstruct.Reconstruct, words[3:])
-    assert cli.plain(asked.source) == source
-    found = (asked.preset, asked.steps, asked.set, asked.seed)
+    args = cli.parse(reconstruct.Reconstruct, words[3:])
+    assert cli.plain(args.source) == source
+    found = (args.preset, args.steps, args.set, args.seed)
     assert found == (config.preset, config.steps, config.overrides, config.seed)
 
 

@@ -139,8 +139,8 @@ def test_one_known_point_is_learnt_and_nothing_else():
 
 def test_the_rate_is_the_best_one_and_time_is_shared_out(monkeypatch):
     monkeypatch.setitem(spectral_bias.SIGNALS, "1-D", SMALL)
-    asked = SpectralBias(steps=80, seeds=2, rates=(1e-7, 1e-2), batch=16)
-    first, second = spectral_bias.measure(asked, "1-D", "relu", True, 0.5)
+    args = SpectralBias(steps=80, seeds=2, rates=(1e-7, 1e-2), batch=16)
+    first, second = spectral_bias.measure(args, "1-D", "relu", True, 0.5)
     assert first.rate == second.rate == pytest.approx(1e-2)
     assert first.network == "relu + encoding"
     assert len(first.rmse) == len(second.rmse) == 2

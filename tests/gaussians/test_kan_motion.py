@@ -408,7 +408,7 @@ def test_one_frame_has_one_code():
         ({"mlp_width": 8}, "network='mlp' only"),
         ({"position": False, "scale": False, "rotation": False}, "all off"),
         ({"spread": 0.0}, "equal codes stay equal"),
-        ({"rate": 1e-5, "rate_end": 1e-4}, "the rate falls"),
+        ({"learning_rate": 1e-5, "learning_rate_end": 1e-4}, "the rate falls"),
         ({"embedding_rate": 0.0}, "embedding_rate=0.0"),
         ({"kernels": 1}, "two centres"),
     ],

@@ -354,7 +354,7 @@ def test_the_rate_falls_in_equal_ratios():
     [
         ({"scale_rule": "cubic"}, "unknown scale_rule 'cubic'"),
         ({"block": 0}, "block >= 1"),
-        ({"rate_end": 0.0}, "both are positive"),
+        ({"learning_rate_end": 0.0}, "both are positive"),
     ],
 )
 def test_settings_that_cannot_work_are_refused(setting, message):

@@ -500,7 +500,7 @@ def test_what_is_prepared_spares_a_small_share_of_the_arithmetic(spec, share):
         ({"depth": 0, "skips": ()}, "hidden layer each"),
         ({"block": 0}, "block >= 1"),
         ({"warm_up": -1}, "warm_up >= 0"),
-        ({"rate": 1e-8}, "both are positive"),
+        ({"learning_rate": 1e-8}, "both are positive"),
         ({"activation": "cubic"}, "unknown activation 'cubic'"),
         ({"skips": (9,)}, "layer 9 is not in"),
     ],

@@ -264,7 +264,7 @@ def first_step(grads):
 
 
 @pytest.mark.hard_cases
-@pytest.mark.parametrize("slope", [1e-4, 1e-8, 1e-10, 1e-15])
+@pytest.mark.parametrize("grad", [1e-4, 1e-8, 1e-10, 1e-15])
 def test_steps_do_not_depend_on_the_size_of_the_slope(grad, dtype):
     step = first_step(np.full((3, 2), grad, dtype))
     # eps = 1e-15 halves the step at 1e-15 and takes 1e-5 at 1e-10.
@@ -282,7 +282,7 @@ UPDATES = {name: jax.jit(ours().update) for name, (ours, _) in PAIRS.items()}
 
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("name", PAIRS)
-@pytest.mark.parametrize("slope", [1e19, 1e21, 1e30, np.inf, np.nan])
+@pytest.mark.parametrize("grad", [1e19, 1e21, 1e30, np.inf, np.nan])
 def test_a_slope_too_large_to_square_shows_and_spares_the_others(name, grad, dtype):
     """Divided by an infinite square, its row stands still; the loop looks for it."""
     ours = PAIRS[name][0]()

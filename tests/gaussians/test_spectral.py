@@ -406,7 +406,7 @@ def test_the_effect_weighs_logs_and_trains_what_its_gate_has(gate, rng):
 
 
 def test_the_scenes_optimiser_shuts_a_learned_gate_down_to_its_least(rng):
-    spec = SpectralSpec(rate=1.0)
+    spec = SpectralSpec(learning_rate=1.0)
     made = spectral.effect(spec, 10)
     shot = shot_of(*(picture(rng, 4, 4, "float32") for _ in range(2)))
     optimiser = scale_by_row_adam()
@@ -464,7 +464,7 @@ def test_an_absent_loss_has_no_gate_no_metric_and_no_operation(absent, rng):
         (lambda: SpectralSpec(gate="open"), "unknown gate 'open'"),
         (lambda: SpectralSpec(opening=1.0), "opening=1.0"),
         (lambda: SpectralSpec(floor=0.5), "floor=0.5"),
-        (lambda: SpectralSpec(rate=0.0), "rate=0.0"),
+        (lambda: SpectralSpec(learning_rate=0.0), "learning_rate=0.0"),
         (lambda: SpectralSpec(after=-1), "after=-1"),
         (lambda: spectral.effect(SpectralSpec(after=10), 10), "after=10"),
     ],

@@ -38,8 +38,8 @@ STATIC = RadianceScene(
     template=TINY_TEMPLATE,
     sampling=SamplingSpec(8, 8, block=97),
     rays=64,
-    rate=5e-3,
-    rate_end=1e-3,
+    learning_rate=5e-3,
+    learning_rate_end=1e-3,
 )
 TINY_WARP = WarpSpec(
     position=EncodingSpec(2), depth=2, width=8, skips=(), anneal_steps=10
@@ -312,8 +312,8 @@ def test_wrong_specs_are_refused_early():
         SamplingSpec(spacing="log")
     with pytest.raises(ValueError, match="rays=0"):
         dataclasses.replace(STATIC, rays=0)
-    with pytest.raises(ValueError, match="rate_end"):
-        dataclasses.replace(STATIC, rate=1e-4, rate_end=1e-3)
+    with pytest.raises(ValueError, match="learning_rate_end"):
+        dataclasses.replace(STATIC, learning_rate=1e-4, learning_rate_end=1e-3)
     spec = dataclasses.replace(STATIC, warp=TINY_WARP, background=BackgroundSpec())
     with pytest.raises(ValueError, match="background=none"):
         scene.build(spec, METADATA)
