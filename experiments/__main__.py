@@ -9,7 +9,7 @@ import pathlib
 import sys
 
 HERE = pathlib.Path(__file__).resolve().parent
-NOT_COMMANDS = ("__init__", "__main__", "cli")
+NOT_COMMANDS = ("__init__", "__main__", "cli", "markdown")
 
 
 def commands() -> dict[str, str]:

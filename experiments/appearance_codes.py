@@ -17,7 +17,7 @@ from typing import Literal
 
 import numpy as np
 
-from experiments import cli
+from experiments import cli, markdown
 from nerfies_jax.runs import platform
 
 SHOWN = 4  # frames in the picture
@@ -185,6 +185,16 @@ def _write(asked, figures, picture):
     for name, value in figures.items():
         print(f"{name:52} {value:8.2f}")
     print(f"{folder / 'figures.json'}, {folder / 'picture.png'}")
+
+
+def page(stored) -> str:
+    """The page in docs/results below the docstring, from a figures.json."""
+    width, height = stored["size"]
+    rows = [[name, markdown.number(x, 2)] for name, x in stored["figures"].items()]
+    return (
+        f"## {stored['scene'].capitalize()}, {stored['steps']:,} steps, "
+        f"{width}x{height}\n\n{markdown.table(('', 'measured'), rows)}"
+    )
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ evenly, each standing for its own weight: what drawing by weight saves.
 import dataclasses
 import pathlib
 
-from experiments import cli
+from experiments import cli, markdown
 from nerfies_jax.runs import platform
 
 
@@ -187,6 +187,24 @@ def table(figures: dict[str, dict[str, float]]) -> str:
             f"{row['cpu_seconds']:7.3f} {row['cpu_seconds'] / whole:7.2f}"
         )
     return "\n".join(lines)
+
+
+def page(stored) -> str:
+    """The page in docs/results below the docstring, from what `--out` wrote."""
+    heads = ("samples", "bias", "± s.e.", "deviation", "of the gradient", "CPU ms")
+    keys = ("bias", "error", "value_deviation", "gradient_deviation")
+    rows = [
+        [
+            name,
+            *(markdown.number(row[key], 4) for key in keys),
+            markdown.number(1e3 * row["cpu_seconds"], 1),
+        ]
+        for name, row in stored["rows"].items()
+    ]
+    return markdown.table(heads, rows) + (
+        "\n\nBias and deviations are shares of the penalty, and of its gradient, over "
+        "all samples."
+    )
 
 
 if __name__ == "__main__":

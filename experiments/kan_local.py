@@ -12,7 +12,7 @@ value and slopes, both forms in turn.
 import dataclasses
 import pathlib
 
-from experiments import cli
+from experiments import cli, markdown
 from nerfies_jax.runs import platform
 
 
@@ -160,6 +160,22 @@ def table(figures: list[dict]) -> str:
         for row in figures
     ]
     return "\n".join(lines)
+
+
+def page(stored) -> str:
+    """The page in docs/results below the docstring, from what `--out` wrote."""
+    heads = ("kernels", "summed", "error", "CPU ms", "time over all")
+    rows = [
+        [
+            str(row["kernels"]),
+            str(row["nearest"]),
+            markdown.short(row["error"]),
+            markdown.number(1e3 * row["seconds"], 1),
+            markdown.number(row["over_dense"], 2),
+        ]
+        for row in stored["rows"]
+    ]
+    return markdown.table(heads, rows)
 
 
 if __name__ == "__main__":

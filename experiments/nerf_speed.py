@@ -13,12 +13,12 @@ machine may be shared.
 import dataclasses
 import pathlib
 
-from experiments import cli
+from experiments import cli, markdown
 from nerfies_jax.runs import platform
 
 RAYS = 256
-# CPU seconds over those of the warp, GFLOP, temporaries (MiB) and seconds of compiling
-# over those of the warp of google/nerfies@1a38512 on JAX 0.10.2, CPU, float32.
+# CPU seconds over those of the warp, GFLOP and temporaries (MiB) of
+# google/nerfies@1a38512 on JAX 0.10.2, CPU, float32.
 OFFICIAL = {
     "static": (0.77, 172.7, 628),
     "translation": (0.98, 203.0, 860),
@@ -74,7 +74,7 @@ def specs():
         steps=1000,
         rays=RAYS,
         sampling=SamplingSpec(64, 64),
-        template=TemplateSpec(EncodingSpec(8), EncodingSpec(4)),
+        template=TemplateSpec(EncodingSpec(8), EncodingSpec(4), skips=(4,)),
     )
     # Annealed, so that every row pays for its window.
     warp = dataclasses.replace(static, warp=WarpSpec(anneal_steps=500))
@@ -153,6 +153,31 @@ def table(figures: dict[str, dict[str, float]]) -> str:
             f"{row['compile_seconds']:9.1f}"
         )
     return "\n".join(lines)
+
+
+def page(stored) -> str:
+    """The page in docs/results below the docstring, from what `--out` wrote."""
+    figures = stored["rows"]
+    base = figures.get("warp", next(iter(figures.values())))["cpu_seconds"]
+    rows = []
+    for name, row in figures.items():
+        ratio, flop, memory = OFFICIAL.get(name, (None, None, None))
+        rows.append(
+            [
+                name,
+                markdown.number(row["cpu_seconds"], 2),
+                markdown.number(row["cpu_seconds"] / base, 2),
+                markdown.number(ratio, 2),
+                markdown.number(row["gflop"], 1),
+                markdown.number(flop, 1),
+                markdown.number(row["temporary_mib"], 0),
+                markdown.number(memory, 0),
+                markdown.number(row["compile_seconds"], 1),
+            ]
+        )
+    heads = ("scene", "CPU s", "over warp", "official", "GFLOP", "official")
+    heads += ("MiB", "official", "compile s")
+    return markdown.table(heads, rows)
 
 
 if __name__ == "__main__":

@@ -114,8 +114,8 @@ def blend_gradient(
             position, local, _, gradient = inner
             rank, rows = _chunk(table, isects.ranks, start, end, position, step.chunk)
             raw, alpha = _alphas(rows, middle, spec, grid)
-            local, weight, slope = _trace_back(local, raw, alpha, rows, toward, spec)
-            update = _pair_gradients(rows, middle, weight, slope, toward, grid)
+            local, weight, grad = _trace_back(local, raw, alpha, rows, toward, spec)
+            update = _pair_gradients(rows, middle, weight, grad, toward, grid)
             gradient = gradient.at[rank].add(update)
             alive = jnp.max(local[:, 0], axis=1) > 0
             return position + step.chunk, local, alive, gradient
@@ -213,7 +213,7 @@ def _composite(local, alpha, rows, spec):
 def _trace_back(local, raw, alpha, rows, toward, spec):
     """New state, compositing weights, and d loss / d exponent of every pair."""
     transmittance, behind = local[:, 0], local[:, 1]
-    weights, slopes = [], []
+    weights, grads = [], []
     for i in range(alpha.shape[0]):
         before = transmittance
         transmittance, drawn = _pass_through(before, alpha[i], spec)
@@ -223,25 +223,25 @@ def _trace_back(local, raw, alpha, rows, toward, spec):
             for c in range(toward.shape[1])
         )
         behind = behind - weight * along
-        slope = before * along - behind / (1 - alpha[i])
+        grad = before * along - behind / (1 - alpha[i])
         # d alpha / d exponent is alpha itself, so below the cut it is zero already.
         if spec.clamp_gradient == "zero":
             moves, along_exponent = drawn & (alpha[i] < spec.alpha_max), alpha[i]
         else:
             moves, along_exponent = drawn & (alpha[i] > 0), raw[i]
         weights.append(weight)
-        slopes.append(jnp.where(moves, slope * along_exponent, 0))
+        grads.append(jnp.where(moves, grad * along_exponent, 0))
     state = jnp.stack([transmittance, behind], axis=1)
-    return state, jnp.stack(weights), jnp.stack(slopes)
+    return state, jnp.stack(weights), jnp.stack(grads)
 
 
-def _pair_gradients(rows, middle, weight, slope, toward, grid):
+def _pair_gradients(rows, middle, weight, grad, toward, grid):
     """Gradient of the table's columns, one row per pair: [chunk, batch, columns].
 
     Moments are taken about the tile centre, where u and v of a Gaussian that is seen
     are of order one; about a mean 1e4 px away they would cancel in float32.
     """
-    moments = _moments(slope, grid)
+    moments = _moments(grad, grid)
     total, x, y, xx, xy, yy = moments
     u0, v0, u_x, v_y, v_x = _whitened(rows, middle)
     along, lean = u_x * x, v_y * y + v_x * x
@@ -265,12 +265,12 @@ def _pair_gradients(rows, middle, weight, slope, toward, grid):
     return jnp.concatenate([jnp.stack(columns, axis=-1), channels], axis=-1)
 
 
-def _moments(slope, grid):
+def _moments(grad, grid):
     """Sums over a tile's pixels of slope times 1, x, y, x^2, x y, y^2."""
-    x, y = _pixels(grid, slope.dtype)
+    x, y = _pixels(grid, grad.dtype)
     zero = jnp.zeros_like(x)
     # One product with eight columns, two of them idle: 0.36 ns a pair and pixel against
     # 0.51 for six columns and 1.1 for sums over rows, then columns.
     basis = jnp.stack([zero + 1, x, y, x * x, x * y, y * y, zero, zero], axis=1)
-    sums = jnp.dot(slope.reshape(-1, x.shape[0]), basis, precision=EXACT)
-    return tuple(sums[:, i].reshape(slope.shape[:-1]) for i in range(6))
+    sums = jnp.dot(grad.reshape(-1, x.shape[0]), basis, precision=EXACT)
+    return tuple(sums[:, i].reshape(grad.shape[:-1]) for i in range(6))

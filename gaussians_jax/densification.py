@@ -119,9 +119,9 @@ def observe(
     """
     width, height = size
     per_ndc = jnp.asarray([width / 2, height / 2], mean2d_gradient_px.dtype)
-    slope = mean2d_gradient_px * per_ndc
+    grad = mean2d_gradient_px * per_ndc
     # Summed squares underflow in float32 below 1e-19; hypot does not.
-    norm = jnp.hypot(slope[:, 0], slope[:, 1])
+    norm = jnp.hypot(grad[:, 0], grad[:, 1])
     return RowStats(
         active=stats.active,
         grad2d=stats.grad2d + jnp.where(visible, norm, 0),

@@ -186,8 +186,8 @@ def _check_wide(params):
             )
 
 
-def _count_once_started(count, slopes):
-    moved = jnp.any(slopes.reshape(*count.shape, -1) != 0, axis=-1)
+def _count_once_started(count, grads):
+    moved = jnp.any(grads.reshape(*count.shape, -1) != 0, axis=-1)
     return count + ((count > 0) | moved).astype(count.dtype)
 
 

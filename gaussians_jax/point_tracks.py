@@ -6,14 +6,14 @@ import scipy.spatial
 
 from gaussians_jax import scene, splats
 from nerfies_jax.evaluation.model_flow import Move, Moved
-from nerfies_jax.evaluation.protocol import STILL_POINTS, Followed
+from nerfies_jax.evaluation.protocol import STATIC_POINTS, PointTracks
 from nerfies_jax.training.model import in_default_precision
 
 NEIGHBOURS = 8  # Gaussians that carry a point
 LEAST_OPACITY = 0.05  # of a Gaussian that can carry one; fainter ones are not seen
 
 
-def follow(spec, metadata, state, capture, known, effects=()) -> Followed | None:
+def follow(spec, metadata, state, capture, known, effects=()) -> PointTracks | None:
     """Points of the start at all other moments, carried by the Gaussians around them.
 
     A point moves as the `NEIGHBOURS` nearest Gaussians that can be seen do on average,
@@ -31,22 +31,22 @@ def follow(spec, metadata, state, capture, known, effects=()) -> Followed | None
         return None
     stages = scene.build(spec, metadata, effects).stages
     prepared = jax.jit(stages.prepare)(state.params)
-    pose = jax.jit(lambda params, ready, time: stages.pose(params, ready, time))
+    deform = jax.jit(lambda params, ready, time: stages.deform(params, ready, time))
     times = in_default_precision(capture.times[known.moments])
     # [moments, gaussians, 3]
     means = np.stack(
-        [np.asarray(pose(state.params, prepared, time).mean) for time in times]
+        [np.asarray(deform(state.params, prepared, time).mean) for time in times]
     )
-    first = pose(state.params, prepared, times[known.start])
+    first = deform(state.params, prepared, times[known.start])
     opacity = _seen_opacity(state, first)
     path = carried(known.start_points, means, opacity, known.start)
     drift = float("nan")
     if capture.points is not None:
-        still = capture.points.position[:STILL_POINTS]
-        still = carried(still, means, opacity, known.start)
-        apart = still - still.mean(axis=1, keepdims=True)
+        static = capture.points.position[:STATIC_POINTS]
+        static = carried(static, means, opacity, known.start)
+        apart = static - static.mean(axis=1, keepdims=True)
         drift = float(np.linalg.norm(apart, axis=-1).mean())
-    return Followed(
+    return PointTracks(
         path=path.astype(np.float32),
         found=np.ones(path.shape[:2], bool),
         drift=drift,
@@ -65,11 +65,11 @@ def mover(spec, metadata, effects=()) -> Move | None:
     stages = scene.build(spec, metadata, effects).stages
 
     @jax.jit
-    def pose(params, time):
-        return stages.pose(params, stages.prepare(params), time)
+    def deform(params, time):
+        return stages.deform(params, stages.prepare(params), time)
 
     def move(state, points, here, there):
-        first, last = (pose(state.params, view.time) for view in (here, there))
+        first, last = (deform(state.params, view.time) for view in (here, there))
         means = np.stack([np.asarray(first.mean), np.asarray(last.mean)])
         path = carried(points, means, _seen_opacity(state, first), 0)
         return Moved(path[:, 1].astype(points.dtype), np.ones(len(points), bool))
@@ -77,10 +77,10 @@ def mover(spec, metadata, effects=()) -> Move | None:
     return move
 
 
-def _seen_opacity(state, posed):
-    """[gaussians] opacity of posed Gaussians, 0 for rows that are not active."""
+def _seen_opacity(state, deformed):
+    """[gaussians] opacity of deformed Gaussians, 0 for rows that are not active."""
     active = np.asarray(splats.active_mask(state.params.rows["splats"]))
-    return np.where(active, np.asarray(posed.opacity), 0.0)
+    return np.where(active, np.asarray(deformed.opacity), 0.0)
 
 
 def carried(

@@ -67,7 +67,7 @@ def metadata_of(capture: Capture) -> SceneMetadata:
     positions = np.asarray(capture.cameras.position)[capture.train]
     halfway = 2 / (1 / capture.near + 1 / capture.far)
     return SceneMetadata(
-        extent=splats.scene_extent(positions, still=halfway),
+        extent=splats.scene_extent(positions, static=halfway),
         background=capture.background or (0.0, 0.0, 0.0),
         frames=len(capture.train),
     )
@@ -122,8 +122,8 @@ def build(
     stages = _stages(spec, metadata, effects)
 
     def whole_frame(params, view, size, step):
-        posed = stages.pose(params, stages.prepare(params), view.time)
-        return stages.draw(params, posed, view, size, step)
+        deformed = stages.deform(params, stages.prepare(params), view.time)
+        return stages.draw(params, deformed, view, size, step)
 
     return Model(
         # By name alone: a run with other effects of one's own is another run.
@@ -144,14 +144,14 @@ def _stages(spec, metadata, effects):
     def prepare(params):
         return deformation.prepare(effects, params)
 
-    def pose(params, prepared, time):
-        return deformation.pose(effects, params, prepared, time)
+    def deform(params, prepared, time):
+        return deformation.deform(effects, params, prepared, time)
 
-    def draw(params, posed, view, size, step):
+    def draw(params, deformed, view, size, step):
         degree = splats.active_degree(step, spec.sh_every, spec.sh_degree)
-        return _draw(spec, metadata, params, posed, view, size, degree).rendering
+        return _draw(spec, metadata, params, deformed, view, size, degree).rendering
 
-    return Stages(prepare, pose, draw)
+    return Stages(prepare, deform, draw)
 
 
 def _draw(
@@ -180,18 +180,18 @@ def _stepper(spec, metadata, effects, optimiser):
         condition = FrameCondition(view.time, step=state.step, key=loop.step_key(state))
         mask = phases.update_mask(spec.alternation, state.step)
 
-        def posed(params, gaussians):
-            return deformation.pose_in_training(effects, params, gaussians, condition)
+        def deform(params, gaussians):
+            return deformation.deform_in_training(effects, params, gaussians, condition)
 
         if spec.alternation is not None:
-            posed = phases.stop_frozen_gradients(mask, posed)
+            deform = phases.stop_frozen_gradients(mask, deform)
         # A channel that nothing reads is still blended: 4 % of a step.
         read = any("depths" in effect.required_data for effect in effects)
         depth = read and frames.depths is not None
 
         def loss(params, probe):
             canonical = splats.activate(params.rows["splats"])
-            moved = posed(params, canonical)
+            moved = deform(params, canonical)
             frame = _draw(
                 spec, metadata, params, moved, view, size, degree, probe, depth
             )
@@ -201,7 +201,7 @@ def _stepper(spec, metadata, effects, optimiser):
             return value, (metrics, frame.footprints, canonical, moved)
 
         probe = jnp.zeros_like(state.params.rows["splats"].mean[:, :2])
-        (value, (metrics, footprints, *poses)), (grads, mean2d_grad) = (
+        (value, (metrics, footprints, *drawn)), (grads, mean2d_grad) = (
             jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)(state.params, probe)
         )
         updates, opt_state = optimiser.update(grads, state.optimiser, state.params)
@@ -222,7 +222,7 @@ def _stepper(spec, metadata, effects, optimiser):
             )
         for effect in effects:
             if effect.update_state is not None:
-                own = effect.update_state(states[effect.name], *poses, condition)
+                own = effect.update_state(states[effect.name], *drawn, condition)
                 states = states | {effect.name: own}
         state = TrainState(*trained, AuxState(stats, states), state.step + 1, state.key)
         return state, {"loss": value, **metrics}
@@ -250,7 +250,7 @@ def loss_of(
         key=condition.key,
         params=params,
         observation=observation,
-        at_time=deformation.poser(effects, condition),
+        at_time=deformation.deformer(effects, condition),
     )
     terms = penalty_terms(effects, params.nets, context, states)
     if isinstance(spec.densification, MCMCStrategySpec):

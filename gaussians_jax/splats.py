@@ -283,12 +283,12 @@ def random_in_views(
     return np.einsum("nij,ni->nj", turn, in_camera) + per_view(cameras.position, 3)
 
 
-def scene_extent(position: np.ndarray, still: float | None = None) -> float:
+def scene_extent(position: np.ndarray, static: float | None = None) -> float:
     """1.1 times the largest distance of a camera from their mean; host side.
 
     The unit of the learning rate of the means and of the thresholds of densification
     (Kerbl et al. 2023, reference implementation). Cameras that stand still have none,
-    and a zero would stop the means from learning; `still`, a typical depth, stands in
+    and a zero would stop the means from learning; `static`, a typical depth, stands in
     for it.
     """
     position = np.asarray(position, np.float64).reshape(-1, 3)
@@ -297,9 +297,9 @@ def scene_extent(position: np.ndarray, still: float | None = None) -> float:
     # Rounding of float32 positions far from the origin is no motion.
     if extent > 1e-5 * float(np.abs(position).max()):
         return extent
-    if still is None:
+    if static is None:
         raise ValueError(
             f"the cameras stand still (extent {extent:g} scene units), which would "
-            "stop the means from learning; pass `still`, a typical depth of the scene"
+            "stop the means from learning; pass `static`, a typical depth of the scene"
         )
-    return float(still)
+    return float(static)

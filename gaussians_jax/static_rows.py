@@ -1,8 +1,8 @@
-"""Which Gaussians move at all, and the pose of those alone.
+"""Which Gaussians move at all, and the deformation of those alone.
 
 Most of a filmed scene stands still, and a deformation network finds that out anew for
 every Gaussian at every instant. `split` asks once, on the host, at a few instants; from
-then on `pose` evaluates the deformation of the rows that move and of no other.
+then on `deform` evaluates the deformation of the rows that move and of no other.
 """
 
 from collections.abc import Callable
@@ -17,8 +17,8 @@ from gaussians_jax import splats
 from gaussians_jax.splats import Gaussians, Params
 from nerfies_jax.geometry import quaternion
 
-# The pose of any choice of rows: (parameters of those rows, time) -> Gaussians.
-PoseRows = Callable[[Params, Float[Array, ""]], Gaussians]
+# The deformation of any choice of rows: (parameters of those rows, time) -> Gaussians.
+DeformRows = Callable[[Params, Float[Array, ""]], Gaussians]
 
 
 class RowIndex(NamedTuple):
@@ -84,7 +84,7 @@ def dynamic_mask(
 
 
 def split(
-    params: Params, pose: PoseRows, times: np.ndarray, static_threshold: float
+    params: Params, deform: DeformRows, times: np.ndarray, static_threshold: float
 ) -> StaticDynamicSplit:
     """The rows that move farther than `static_threshold` (scene units); host side.
 
@@ -97,23 +97,23 @@ def split(
     if not len(times):
         raise ValueError("no times to look for motion at; 16 over [0, 1] will do")
     dtype = params.rows["splats"].mean.dtype
-    posed = jax.jit(pose)
-    static = posed(params, jnp.asarray(times[len(times) // 2], dtype))
+    deformed = jax.jit(deform)
+    static = deformed(params, jnp.asarray(times[len(times) // 2], dtype))
     moves = np.zeros(len(static.mean), bool)
     for time in times:
-        now = posed(params, jnp.asarray(time, dtype))
+        now = deformed(params, jnp.asarray(time, dtype))
         moves |= dynamic_mask(static, now, static_threshold)
     rows = jnp.asarray(np.flatnonzero(moves), jnp.int32)
     return StaticDynamicSplit(static, row_index(moves), splats.take_rows(params, rows))
 
 
-def pose(
-    parts: StaticDynamicSplit, pose_rows: PoseRows, time: Float[Array, ""]
+def deform(
+    parts: StaticDynamicSplit, deform_rows: DeformRows, time: Float[Array, ""]
 ) -> Gaussians:
     """All Gaussians at one time, the deformation evaluated for those that move."""
     if not len(parts.dynamic.rows["splats"].mean):
         return parts.static
-    return merge(parts.static, pose_rows(parts.dynamic, time), parts.index)
+    return merge(parts.static, deform_rows(parts.dynamic, time), parts.index)
 
 
 def merge(static: Gaussians, moved: Gaussians, table: RowIndex) -> Gaussians:

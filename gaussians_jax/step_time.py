@@ -83,7 +83,7 @@ def _sum_of_effect(effect, effects, params, observation, condition, state):
     total = jnp.zeros(())
     if effect.deform is not None:
         gaussians = splats.activate(params.rows["splats"])
-        moved = deformation.pose_in_training((effect,), params, gaussians, condition)
+        moved = deformation.deform_in_training((effect,), params, gaussians, condition)
         total += sum(jnp.sum(leaf) for leaf in moved)
     context = PenaltyContext(
         condition=condition,
@@ -91,7 +91,7 @@ def _sum_of_effect(effect, effects, params, observation, condition, state):
         key=condition.key,
         params=params,
         observation=observation,
-        at_time=deformation.poser(effects, condition),
+        at_time=deformation.deformer(effects, condition),
     )
     states = {effect.name: state}
     return weighted_sum(penalty_terms((effect,), params.nets, context, states), total)

@@ -48,14 +48,14 @@ class Knots(NamedTuple):
 
 
 def bake(
-    pose: Callable[[Float[Array, ""]], Gaussians],
+    deform: Callable[[Float[Array, ""]], Gaussians],
     knots: int,
     static_threshold: float = 0.0,
     dtype=jnp.float32,
 ) -> Knots:
-    """The table of a motion, `pose` at every knot; host side.
+    """The table of a motion, `deform` at every knot; host side.
 
-    `pose` is called as it is: compile it. Rows of which no point moves farther than
+    `deform` is called as it is: compile it. Rows of which no point moves farther than
     `static_threshold` (scene units, from where it is at the middle knot) at any knot
     are static and stored once.
     """
@@ -65,10 +65,10 @@ def bake(
             "and its last instant"
         )
     times = jnp.linspace(0, 1, knots, dtype=dtype)
-    poses = [jax.device_get(pose(time)) for time in times]
-    static = poses[knots // 2]
+    frames = [jax.device_get(deform(time)) for time in times]
+    static = frames[knots // 2]
     moves = np.zeros(len(static.mean), bool)
-    for time, now in zip(times, poses, strict=True):
+    for time, now in zip(times, frames, strict=True):
         if not np.array_equal(now.opacity, static.opacity):
             raise ValueError(
                 f"the opacities at time {float(time):g} are not those at "
@@ -77,7 +77,7 @@ def bake(
             )
         moves |= static_rows.dynamic_mask(static, now, static_threshold)
     rows = np.flatnonzero(moves)
-    tracks = [_track(jax.tree.map(lambda leaf: leaf[rows], now)) for now in poses]
+    tracks = [_track(jax.tree.map(lambda leaf: leaf[rows], now)) for now in frames]
     track = Track(*(jnp.stack(leaves) for leaves in zip(*tracks, strict=True)))
     track = track._replace(quaternion=_aligned(track.quaternion))
     static = jax.tree.map(jnp.asarray, static)

@@ -55,9 +55,9 @@ def from_knots(
     time_knots.check(knots, interpolation)
     params = state.params
     prepared = jax.jit(stages.prepare)(params)
-    pose = jax.jit(stages.pose)
+    deform = jax.jit(stages.deform)
     table = time_knots.bake(
-        lambda time: pose(params, prepared, time), knots, static_threshold
+        lambda time: deform(params, prepared, time), knots, static_threshold
     )
     summary = (
         f"{knots} knots, {interpolation}, of {_moving(table.index, static_threshold)}: "
@@ -69,7 +69,7 @@ def from_knots(
         table,
         Stages(
             prepare=lambda both: (),
-            pose=lambda both, prepared, time: time_knots.at(
+            deform=lambda both, prepared, time: time_knots.at(
                 both[1], time, interpolation
             ),
             draw=lambda both, *rest: stages.draw(both[0], *rest),
@@ -86,15 +86,15 @@ def without_static(model: Model, state: TrainState, static_threshold: float) -> 
     """
     stages = _stages(model, "--static-threshold")
 
-    def pose_rows(params, time):
-        return stages.pose(params, stages.prepare(params), time)
+    def deform_rows(params, time):
+        return stages.deform(params, stages.prepare(params), time)
 
     times = np.linspace(0, 1, INSTANTS)
-    parts = static_rows.split(state.params, pose_rows, times, static_threshold)
+    parts = static_rows.split(state.params, deform_rows, times, static_threshold)
 
-    def pose(both, prepared, time):
-        return static_rows.pose(
-            both[1], lambda rows, time: stages.pose(rows, prepared, time), time
+    def deform(both, prepared, time):
+        return static_rows.deform(
+            both[1], lambda rows, time: stages.deform(rows, prepared, time), time
         )
 
     return _with(
@@ -103,7 +103,7 @@ def without_static(model: Model, state: TrainState, static_threshold: float) -> 
         parts,
         Stages(
             prepare=lambda both: stages.prepare(both[1].dynamic),
-            pose=pose,
+            deform=deform,
             draw=lambda both, *rest: stages.draw(both[0], *rest),
         ),
         f"the deformation of {_moving(parts.index, static_threshold)}",
@@ -121,11 +121,11 @@ def without_moving(
     """
     stages = _stages(model, "--hide-moving")
 
-    def pose_rows(params, time):
-        return stages.pose(params, stages.prepare(params), time)
+    def deform_rows(params, time):
+        return stages.deform(params, stages.prepare(params), time)
 
     times = np.linspace(0, 1, INSTANTS)
-    parts = static_rows.split(state.params, pose_rows, times, farther_than)
+    parts = static_rows.split(state.params, deform_rows, times, farther_than)
     moves = parts.index.moves
     rows = state.params.rows
     active = int(splats.active_mask(rows["splats"]).sum())
@@ -163,8 +163,8 @@ def _with(model: Model, state: TrainState, beside: Any, stages: Stages, summary:
     """The model on `(params, beside)`: what is beside is an argument, no constant."""
 
     def render(both, view, size, step):
-        posed = stages.pose(both, stages.prepare(both), view.time)
-        return stages.draw(both, posed, view, size, step)
+        deformed = stages.deform(both, stages.prepare(both), view.time)
+        return stages.draw(both, deformed, view, size, step)
 
     return Faster(
         model._replace(render=render, stages=stages),

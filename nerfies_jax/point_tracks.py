@@ -6,7 +6,7 @@ import numpy as np
 
 from nerfies_jax import evaluation, scene
 from nerfies_jax.evaluation.model_flow import Move, Moved
-from nerfies_jax.evaluation.protocol import STILL_POINTS, Followed
+from nerfies_jax.evaluation.protocol import STATIC_POINTS, PointTracks
 from nerfies_jax.training import tracks
 from nerfies_jax.training.effects import FrameCondition
 from nerfies_jax.training.model import in_default_precision
@@ -14,7 +14,7 @@ from nerfies_jax.training.model import in_default_precision
 LEAST_STRETCH = 1e-6  # a collapsed direction has a logarithm, too
 
 
-def follow(spec, metadata, state, capture, known, effects=()) -> Followed | None:
+def follow(spec, metadata, state, capture, known, effects=()) -> PointTracks | None:
     """Points of the start at all other moments, through the template of a field.
 
     A point goes to the template by the warp of the start, and from there by the inverse
@@ -31,12 +31,12 @@ def follow(spec, metadata, state, capture, known, effects=()) -> Followed | None
     def to_field(points):
         return in_default_precision((points - centre) * np.float32(metadata.scale))
 
-    still = np.zeros((0, 3), np.float32)
+    static = np.zeros((0, 3), np.float32)
     if capture.points is not None:
-        still = capture.points.position[:STILL_POINTS]
+        static = capture.points.position[:STATIC_POINTS]
 
     @jax.jit
-    def solve(params, step, start, true, still):
+    def solve(params, step, start, true, static):
         def condition_of(view):
             return FrameCondition(view.time, made.codes_at(params, view), step)
 
@@ -45,27 +45,27 @@ def follow(spec, metadata, state, capture, known, effects=()) -> Followed | None
             made.displace, params, start, conditions, known.start
         )
         each = jax.vmap(made.displace, (None, 0, None))  # point
-        moved = jax.vmap(each, (None, None, 0))(params, still, conditions)
-        slope = jax.vmap(jax.jacfwd(made.displace, 1), (None, 0, None))
-        slopes = jax.vmap(slope, (None, 1, 0))(params, true, conditions)
+        moved = jax.vmap(each, (None, None, 0))(params, static, conditions)
+        grad = jax.vmap(jax.jacfwd(made.displace, 1), (None, 0, None))
+        grads = jax.vmap(grad, (None, 1, 0))(params, true, conditions)
         apart = jnp.linalg.norm(moved - jnp.mean(moved, axis=0), axis=-1)
-        return followed, apart, slopes
+        return followed, apart, grads
 
-    followed, apart, slopes = jax.device_get(
+    followed, apart, grads = jax.device_get(
         solve(
             state.params,
             state.step,
             to_field(known.start_points),
             to_field(known.path),
-            to_field(still),
+            to_field(static),
         )
     )
     path = followed.points / np.float32(metadata.scale) + centre
     still_path = known.start_points[:, None]
     path = np.where(followed.converged[..., None], path, still_path)
-    stretch = np.linalg.svd(np.eye(3) + slopes.astype(float), compute_uv=False)
+    stretch = np.linalg.svd(np.eye(3) + grads.astype(float), compute_uv=False)
     strain = np.log(np.maximum(stretch, LEAST_STRETCH))
-    return Followed(
+    return PointTracks(
         path=path.astype(np.float32),
         found=followed.converged,
         drift=float(apart.mean() / metadata.scale) if apart.size else float("nan"),

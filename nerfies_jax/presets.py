@@ -1,8 +1,15 @@
 """Named radiance fields: the papers' numbers, and variants for a CPU.
 
 Samples, networks, rates and weights are those of the paper or code cited at each;
-where the two differ, what differs is said. Numbers without a word are defaults of their
-specs, which cite their own source.
+numbers without a word are defaults of their specs, which cite their own source. Where a
+preset leaves its paper, that is said beside it. All of them leave the papers in this:
+
+- Densities pass a softplus for a ReLU, fine samples are stratified draws where the
+  papers' are independent, and encodings have the identity beside the bands and no
+  factor of pi.
+- `nerf` and what descends from it train without the crop of the first 500 steps, in
+  Euclidean space alone (no normalised device coordinates), without noise on densities.
+- None of the full sizes was ever trained to its end: they want a GPU.
 """
 
 import dataclasses
@@ -20,8 +27,8 @@ from nerfies_jax.radiance.template import TemplateSpec
 from nerfies_jax.spec import RadianceScene, SamplingSpec
 from nerfies_jax.training import step_counts
 
-# Mildenhall et al. 2020, arXiv:2003.08934. Densities pass a softplus, not their ReLU,
-# under which a ray that starts without any never learns.
+# Mildenhall et al. 2020, arXiv:2003.08934. Under their ReLU a ray that starts without
+# any density never learns.
 NERF = RadianceScene(
     steps=200_000,  # "100-300k iterations"
     rays=4096,  # section 5.3
@@ -32,7 +39,8 @@ NERF = RadianceScene(
 )
 
 # Martin-Brualla et al. 2021, arXiv:2008.02268, with the sizes of its public
-# reimplementation; beta_min is the paper's.
+# reimplementation; beta_min is the paper's, and the trunk NeRF's, whose input the
+# reimplementation joins one layer earlier. beta_min is added outside the rendered sum.
 NERF_W = dataclasses.replace(
     NERF,
     appearance=AppearanceSpec(width=48),
@@ -43,8 +51,9 @@ NERF_W = dataclasses.replace(
 
 # Pumarola et al. 2020, arXiv:2011.13961, and its code: one network for both levels,
 # 500 rays, 800k steps at a rate that falls tenfold every 500k. Its curriculum, which
-# shows the frames one by one over the first 10k steps, is not there: rays come from
-# all frames in every step.
+# shows the frames one by one over the first 10k steps, is not there, nor are its crop
+# of the centre and its total variation over time; rays come from all frames in every
+# step, where its step has one time.
 D_NERF = dataclasses.replace(
     NERF,
     steps=800_000,
@@ -58,19 +67,24 @@ D_NERF = dataclasses.replace(
         time=EncodingSpec(10),
         depth=8,
         width=256,
+        skips=(5,),  # as NeRF's trunk
     ),
 )
 
 # The same paper's baseline: the NeRF reads the time, and nothing is warped.
 T_NERF = dataclasses.replace(D_NERF, warp=None, time=TimeSpec())
 
-# Park et al. 2021, arXiv:2011.12948, the code's configuration for quarter resolution.
-# Its penalties are scaled as in that code, whose weights these are.
+# Park et al. 2021, arXiv:2011.12948, the code's configuration for quarter resolution;
+# those for the validation rig and for full HD are no presets. Its penalties are scaled
+# as in that code, whose weights these are, but the elastic term is taken at 4 samples
+# of a ray, not at all 128, and a fold costs 1.0, not 0 (`ElasticSpec` says why). The
+# rig's camera codes are not there; codes between two frames are mixed linearly, not by
+# a cubic spline.
 NERFIES = RadianceScene(
     steps=250_000,
     rays=6144,
     sampling=SamplingSpec(128, 128),
-    template=TemplateSpec(EncodingSpec(8), EncodingSpec(4)),
+    template=TemplateSpec(EncodingSpec(8), EncodingSpec(4), skips=(4,)),
     extent=0.3,  # a box of diagonal one
     rate=1e-3,
     rate_end=1e-4,
@@ -83,7 +97,8 @@ NERFIES = RadianceScene(
 )
 
 # Park et al. 2021, arXiv:2106.13228: six bands of warp, a bent slicing surface, no
-# elastic penalty.
+# elastic penalty. Colour reads an appearance code of each frame, as in Nerfies; the
+# code's own configuration for the validation rig has one for each camera.
 HYPERNERF = dataclasses.replace(
     NERFIES,
     warp=WarpSpec(position=EncodingSpec(6), anneal_steps=80_000),
@@ -92,7 +107,10 @@ HYPERNERF = dataclasses.replace(
 )
 
 # Li et al. 2021, arXiv:2011.13084, and its code: one level of 128 samples, 1024 rays.
-# Not in its normalised device coordinates, which fit forward-facing captures alone.
+# Not in its normalised device coordinates, which fit forward-facing captures alone, so
+# that the bound on the flow is one unit of the field. The kinetic term counts once; the
+# chain to frames two away and the rays drawn where the error is large are not there.
+# Flow and depth count where a capture has them; without, it trains on colours alone.
 NSFF = dataclasses.replace(
     NERF,
     steps=360_000,

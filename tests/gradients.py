@@ -26,7 +26,7 @@ def directional_error(function, *args, seed=0, directions=4, step=1e-5):
         difference = (
             along(flat + step * direction) - along(flat - step * direction)
         ) / (2 * step)
-        slope = gradient @ direction
-        scale = max(abs(slope), np.linalg.norm(gradient) / np.sqrt(flat.size), 1e-12)
-        errors.append(abs(float(difference) - slope) / scale)
+        grad = gradient @ direction
+        scale = max(abs(grad), np.linalg.norm(gradient) / np.sqrt(flat.size), 1e-12)
+        errors.append(abs(float(difference) - grad) / scale)
     return float(np.max(errors))  # unlike the built-in max it keeps NaN

@@ -73,8 +73,8 @@ def deform(shape, material, time):
         return point
     if type(shape).__name__ == "Sphere":
         zero = undeform(shape, np.zeros((1, 3)), time)[0]
-        slope = undeform(shape, np.eye(3), time) - zero
-        return np.linalg.solve(slope.T, (material - zero).T).T
+        grad = undeform(shape, np.eye(3), time) - zero
+        return np.linalg.solve(grad.T, (material - zero).T).T
     return material
 
 
@@ -147,8 +147,8 @@ def first(things, origin, direction, time):
 
 def directions(camera, pixels):
     """World directions of z-depth one of a camera without distortion."""
-    slopes = (pixels - camera.principal_point_px) / camera.focal_px
-    return np.c_[slopes, np.ones(len(slopes))] @ camera.camera_from_world.astype(float)
+    grads = (pixels - camera.principal_point_px) / camera.focal_px
+    return np.c_[grads, np.ones(len(grads))] @ camera.camera_from_world.astype(float)
 
 
 def project(camera, points):

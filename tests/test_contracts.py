@@ -357,8 +357,8 @@ def _of(name, dtype):
 def test_float32_stays_float32_where_x64_is_on(name):
     with jax.enable_x64(True):
         one, rows = _of(name, "float32")
-        values, _, slopes = jax.eval_shape(jax.vmap(one), rows)
-    for leaf in (*values, *slopes):
+        values, _, grads = jax.eval_shape(jax.vmap(one), rows)
+    for leaf in (*values, *grads):
         assert leaf.dtype == jnp.float32
 
 

@@ -13,7 +13,7 @@ import rich.console
 from experiments import cli
 from experiments.ablate import measures, results, suites
 from experiments.ablate.log import line, say
-from experiments.ablate.results import Kept
+from experiments.ablate.results import ArmResult
 from experiments.ablate.settings import Ablate
 from nerfies_jax import evaluation, runs
 from nerfies_jax.capture import synthetic
@@ -49,7 +49,7 @@ class Budget(NamedTuple):
         return f"over {self.steps} steps"
 
 
-class Built(NamedTuple):
+class CompiledArm(NamedTuple):
     """An arm ready to train; kept over its seeds, so that it is compiled once."""
 
     representation: Any
@@ -91,7 +91,7 @@ class Job:
             self.budgets.append(Budget(None, asked.seconds, folder))
         for budget in self.budgets:
             budget.folder.mkdir(parents=True, exist_ok=True)
-        self._built: dict[tuple[str, int], Built] = {}
+        self._built: dict[tuple[str, int], CompiledArm] = {}
         self._cache_saved = 0.0
         jax.monitoring.register_event_duration_secs_listener(self._listen)
 
@@ -102,13 +102,17 @@ class Job:
             source.scene in synthetic.PRESETS
         ):
             film = synthetic.PRESETS[source.scene]
-            self.filmed = synthetic.digest(film)
+            self.capture_digest = synthetic.digest(film)
             self.capture, truth = synthetic.cached(film, platform.CACHE / "scenes")
-            self.known = protocol.known(self.capture, truth, asked.frames, asked.tracks)
+            self.known = protocol.ground_truth(
+                self.capture, truth, asked.frames, asked.tracks
+            )
             return
         self.capture = runs.read_capture(source)
-        self.filmed = hashlib.sha256(self.capture.images.tobytes()).hexdigest()[:16]
-        self.known = protocol.filmed(self.capture, asked.frames)
+        self.capture_digest = hashlib.sha256(self.capture.images.tobytes()).hexdigest()[
+            :16
+        ]
+        self.known = protocol.held_out_only(self.capture, asked.frames)
 
     def _listen(self, event, seconds, **_):
         if event == SAVED:
@@ -189,7 +193,7 @@ class Job:
                     "--jobs 2, which gives every arm a process and sets it there"
                 )
 
-    def _train_for(self, name, budget) -> tuple[int, Kept]:
+    def _train_for(self, name, budget) -> tuple[int, ArmResult]:
         """The first seed, over as many steps as can be made in the time given.
 
         What a step costs is seen on the arm's run over --steps where there is one, or
@@ -210,7 +214,7 @@ class Job:
             kept = self._train(name, 0, steps)
         return steps, kept
 
-    def _train(self, name, seed, steps) -> Kept:
+    def _train(self, name, seed, steps) -> ArmResult:
         """Train one arm from the start, and measure where it ends."""
         compiled_before = (name, steps) in self._built
         arm = self._build(name, steps)
@@ -259,9 +263,9 @@ class Job:
             arrays |= {"path": followed.path, "found": followed.found}
             notes["points"] = len(followed.found)
             notes["points_ever_lost"] = int((~followed.found.all(axis=1)).sum())
-        return Kept(numbers, arrays, notes)
+        return ArmResult(numbers, arrays, notes)
 
-    def _build(self, name, steps) -> Built:
+    def _build(self, name, steps) -> CompiledArm:
         """The arm, its step compiled by one step that is thrown away."""
         if (name, steps) not in self._built:
             spec = self.spec(name, steps)
@@ -279,7 +283,7 @@ class Job:
             )
             seconds = first.compile_seconds + self._cache_saved
             renderer = evaluation.Renderer(model, self.capture.size)
-            self._built[name, steps] = Built(
+            self._built[name, steps] = CompiledArm(
                 representation, spec, metadata, model, renderer, seconds
             )
         return self._built[name, steps]
@@ -297,7 +301,7 @@ class Job:
     def _identity(self, name, seed, steps, budget) -> dict[str, Any]:
         """What a kept arm must have been made with to be taken over."""
         return {
-            "scene": self.filmed,
+            "scene": self.capture_digest,
             "arm": name,
             "seed": seed,
             "steps": steps,
@@ -312,7 +316,7 @@ class Job:
         """Where an arm's numbers are when it is finished; its pictures are beside."""
         return budget.folder / f"{name}-{seed}.json"
 
-    def kept(self, name: str, seed: int, budget: Budget) -> Kept | None:
+    def kept(self, name: str, seed: int, budget: Budget) -> ArmResult | None:
         """A finished arm; exit code 2 where it is one of another experiment."""
         path = self.path(name, seed, budget)
         with cli.user_errors():
@@ -327,7 +331,7 @@ class Job:
         """Whether an arm is there for every budget."""
         return all(self.kept(name, seed, b) is not None for b in self.budgets)
 
-    def finished(self, budget: Budget) -> dict[tuple[str, int], Kept]:
+    def finished(self, budget: Budget) -> dict[tuple[str, int], ArmResult]:
         """By arm and seed, what is there."""
         found = {task: self.kept(*task, budget) for task in self.tasks()}
         return {task: kept for task, kept in found.items() if kept is not None}

@@ -1,7 +1,8 @@
 """What an ablation measures of every arm; no JAX."""
 
+import math
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 
 class Measure(NamedTuple):
@@ -93,6 +94,24 @@ LEGENDS = {
     "held-out frame (of all threads, on a CPU);\npeak MB: most memory of the process, "
     "where it made one arm alone.",
 }
+
+
+def stored_means(
+    metrics: Mapping[str, Mapping[str, Any]], spread: bool = False
+) -> dict[str, dict[str, float]]:
+    """Means over the seeds by arm and measure, of what `report.metrics` wrote down.
+
+    Or, with `spread`, their standard deviations. NaN where a number is not known.
+    """
+    found: dict[str, dict[str, float]] = {}
+    for key, row in metrics.items():
+        if key.endswith(".spread") != spread:
+            continue
+        arm, _, name = key.removesuffix(".spread").rpartition(".")
+        if name in MEASURES and arm != "still":
+            value = math.nan if row["value"] is None else row["value"]
+            found.setdefault(arm, dict.fromkeys(MEASURES, math.nan))[name] = value
+    return found
 
 
 def shown(numbers: Mapping[tuple[str, int], Mapping[str, float]]) -> list[str]:

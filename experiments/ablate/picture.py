@@ -12,7 +12,7 @@ import PIL.ImageDraw
 
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation import pictures
-from nerfies_jax.evaluation.protocol import Known
+from nerfies_jax.evaluation.protocol import GroundTruth
 from nerfies_jax.geometry import camera as cameras
 
 WIDTH = 352  # pixels of a panel, at least
@@ -21,7 +21,7 @@ LARGEST_ERROR = 0.2
 TRUE, FOUND, APART = (255, 255, 255), (255, 140, 0), (230, 30, 30)
 
 
-def shown_row(known: Known, capture: Capture) -> int:
+def shown_row(known: GroundTruth, capture: Capture) -> int:
     """Which of the rendered frames to show: where points are farthest from the start.
 
     Without any that move, the middle one.
@@ -36,7 +36,7 @@ def shown_row(known: Known, capture: Capture) -> int:
 
 def draw(
     capture: Capture,
-    known: Known,
+    known: GroundTruth,
     colour: Mapping[str, np.ndarray],
     depth: Mapping[str, np.ndarray],
     path: Mapping[str, np.ndarray | None],

@@ -17,10 +17,10 @@ def write(job, budget, finished) -> None:
     `finished` holds what was kept under this budget, by arm and seed.
     """
     numbers = {key: kept.numbers for key, kept in finished.items()}
-    still = protocol.still_error(job.known)
+    static = protocol.static_error(job.known)
     found = verdicts.verdicts(numbers, judged(job))
     print(f"\n{job.capture.name}, each arm trained {budget.title}:")
-    print(verdicts.table(numbers, still))
+    print(verdicts.table(numbers, static))
     print(measures.legend(measures.shown(numbers)))
     for line in remarks(finished):
         print(line)
@@ -40,7 +40,9 @@ def write(job, budget, finished) -> None:
         "claims": [_claim(verdict) for verdict in found],
         "machine": clock.machine(),
     }
-    clock.write_metrics(budget.folder / "ablation.json", metrics(numbers, still), about)
+    clock.write_metrics(
+        budget.folder / "ablation.json", metrics(numbers, static), about
+    )
     _picture(job, finished, budget.folder / "ablation.png")
     print(f"{budget.folder / 'ablation.png'} and {budget.folder / 'ablation.json'}")
 
@@ -69,9 +71,9 @@ def remarks(finished) -> list[str]:
     return found
 
 
-def metrics(numbers: Numbers, still: float) -> list[Metric]:
+def metrics(numbers: Numbers, static: float) -> list[Metric]:
     """Means over the seeds; their standard deviations where there are several."""
-    found = [Metric("still.track_error", still, "scene units", "equal", 1e-6)]
+    found = [Metric("still.track_error", static, "scene units", "equal", 1e-6)]
     for arm in dict.fromkeys(arm for arm, _ in numbers):
         rows = [row for (name, _), row in numbers.items() if name == arm]
         for name, measure in MEASURES.items():

@@ -17,7 +17,7 @@ from nerfies_jax.capture.json_files import replaced_file, write_json
 from nerfies_jax.training.provenance import provenance
 
 
-class Kept(NamedTuple):
+class ArmResult(NamedTuple):
     """What is left of one arm and seed when it is finished."""
 
     numbers: dict[str, float]
@@ -25,7 +25,7 @@ class Kept(NamedTuple):
     notes: dict[str, Any]  # steps, what stopped it, points that were ever lost
 
 
-def write(path: pathlib.Path, identity: dict[str, Any], kept: Kept) -> None:
+def write(path: pathlib.Path, identity: dict[str, Any], kept: ArmResult) -> None:
     """`path` and its .npz; numbers last: an arm is finished when they are there."""
     with replaced_file(path.with_suffix(".npz")) as partial:
         np.savez_compressed(partial, **kept.arrays)
@@ -41,7 +41,7 @@ def write(path: pathlib.Path, identity: dict[str, Any], kept: Kept) -> None:
     )
 
 
-def read(path: pathlib.Path, identity: dict[str, Any]) -> Kept | None:
+def read(path: pathlib.Path, identity: dict[str, Any]) -> ArmResult | None:
     """A finished arm, None where there is none.
 
     ValueError where it cannot be read, or was made with another identity.
@@ -73,7 +73,7 @@ def read(path: pathlib.Path, identity: dict[str, Any]) -> Kept | None:
             "run it again"
         )
     numbers = {k: math.nan if x is None else x for k, x in numbers.items()}
-    return Kept(numbers, arrays, notes)
+    return ArmResult(numbers, arrays, notes)
 
 
 def steps_of(path: pathlib.Path) -> int | None:

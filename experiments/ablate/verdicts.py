@@ -69,18 +69,18 @@ def _verdict(claim, name, pairs):
     return Verdict(claim, name, better, worse, gain, half, says)
 
 
-def table(numbers: Numbers, still: float) -> str:
+def table(numbers: Numbers, static: float) -> str:
     """Means over the seeds, one row for each arm; after "±" their standard deviation.
 
-    Below them the costs. `still` is the end-point error of points that do not move.
+    Below them the costs. `static` is the end-point error of points that do not move.
     Columns that no arm has a number for are left out.
     """
     names = measures.shown(numbers)
     quality = [name for name in names if name not in measures.COSTS]
     costs = [name for name in names if name in measures.COSTS]
     lines = _rows(numbers, quality)
-    if math.isfinite(still):
-        lines.append(f"still: {still:.4f} scene units")
+    if math.isfinite(static):
+        lines.append(f"still: {static:.4f} scene units")
     return "\n".join([*lines, "", *_rows(numbers, costs)])
 
 

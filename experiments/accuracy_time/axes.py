@@ -105,7 +105,7 @@ AXES = {
         SPLATS,
         **{
             "motion-2x48": "motion.depth=2 motion.width=48 motion.skips=",
-            "motion-8x256": "motion.depth=8 motion.width=256 motion.skips=4",
+            "motion-8x256": "motion.depth=8 motion.width=256 motion.skips=5",
             "time-bands-2": "motion.time.bands=2",
             "time-bands-10": "motion.time.bands=10",
         },

@@ -39,7 +39,7 @@ SPLAT_COLOUR, FIELD_COLOUR = "#0a5fb4", "#c4501b"
 def write(job, asked, finished) -> list[Metric]:
     """accuracy_time.json, front.png and fronts.png; prints the lines of every axis."""
     numbers = {key: kept.numbers for key, kept in finished.items()}
-    still = protocol.still_error(job.known)
+    static = protocol.static_error(job.known)
     print(f"\n{job.capture.name}, every setting trained {job.budgets[0].title}:")
     for name in asked.axes:
         print(f"\n{AXES[name].question} ({name}, against {AXES[name].base})")
@@ -54,7 +54,7 @@ def write(job, asked, finished) -> list[Metric]:
         for name in names:
             row = means[name]
             print(f"    {row[cost]:9.1f}  {row['psnr']:.2f} dB  {name}")
-    metrics = report.metrics(numbers, still)
+    metrics = report.metrics(numbers, static)
     about = {
         "capture": job.capture.name,
         "settings": specs.as_json(asked),
@@ -62,9 +62,10 @@ def write(job, asked, finished) -> list[Metric]:
         "machine": clock.machine(),
     }
     clock.write_metrics(job.out / "accuracy_time.json", metrics, about)
-    save_fronts(job.out / "front.png", job, means, ("psnr",), (seconds, COSTS[0]))
+    of = job.capture.name
+    save_fronts(job.out / "front.png", of, means, ("psnr",), (seconds, COSTS[0]))
     shown = [q for q in QUALITIES if any(math.isfinite(r[q]) for r in means.values())]
-    save_fronts(job.out / "fronts.png", job, means, shown, (seconds, *COSTS))
+    save_fronts(job.out / "fronts.png", of, means, shown, (seconds, *COSTS))
     print(f"\n{job.out / 'front.png'}, fronts.png and accuracy_time.json")
     return metrics
 
@@ -154,7 +155,11 @@ def front(
 
 
 def save_fronts(
-    path: pathlib.Path, job, means, qualities: Sequence[str], costs: Sequence[str]
+    path: pathlib.Path,
+    capture: str,
+    means: Mapping[str, Mapping[str, float]],
+    qualities: Sequence[str],
+    costs: Sequence[str],
 ) -> None:
     """A panel for each pair: all settings as dots, the front as a line with names."""
     rows, columns = len(qualities), len(costs)
@@ -163,9 +168,9 @@ def save_fronts(
     panels = figure.subplots(rows, columns, squeeze=False)
     for quality, line in zip(qualities, panels, strict=True):
         for cost, panel in zip(costs, line, strict=True):
-            _draw_front(panel, job, means, quality, cost)
+            _draw_front(panel, means, quality, cost)
     figure.suptitle(
-        f"{job.capture.name}: settings (blue splats, orange fields) and the front "
+        f"{capture}: settings (blue splats, orange fields) and the front "
         "that none beats in both",
         fontsize=10,
     )
@@ -173,7 +178,7 @@ def save_fronts(
         figure.savefig(partial)
 
 
-def _draw_front(panel, job, means, quality, cost):
+def _draw_front(panel, means, quality, cost):
     for row in means.values():
         if math.isfinite(row[cost]) and math.isfinite(row[quality]):
             splats = math.isfinite(row["gaussians"])

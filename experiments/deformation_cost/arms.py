@@ -22,15 +22,15 @@ KNOTS = 16  # of the tables that are timed; their number hardly changes the time
 
 
 class Way(NamedTuple):
-    """A program that poses Gaussians, and its derivative where it is trained."""
+    """A program that deforms Gaussians, and its derivative where it is trained."""
 
-    pose: Callable  # (*inputs) -> Gaussians
+    deform: Callable  # (*inputs) -> Gaussians
     inputs: tuple[Any, ...]
     gradient: Callable | None = None  # (*inputs) -> slopes
 
 
-class Arm(NamedTuple):
-    """One way to pose Gaussians, as it is used and as the compiler can count it."""
+class Contender(NamedTuple):
+    """One way to deform Gaussians, as it is used and as the compiler can count it."""
 
     name: str
     used: Way
@@ -64,8 +64,8 @@ NETWORKS = (
 )
 
 
-def arms(count: int, still: float) -> list[Arm]:
-    """All of them for `count` Gaussians, of which a share `still` need not be posed."""
+def arms(count: int, still: float) -> list[Contender]:
+    """All of them for `count` Gaussians; a share `still` need not be deformed."""
     made = []
     for network in NETWORKS:
         used = _ways(network, network.spec, count, still)
@@ -75,7 +75,7 @@ def arms(count: int, still: float) -> list[Arm]:
         ]
         for name, way in used.items():
             parts = tuple((weight, ways[name]) for weight, ways in counted)
-            made.append(Arm(f"{network.name}{name}", way, parts))
+            made.append(Contender(f"{network.name}{name}", way, parts))
     return made + _table_arms(count)
 
 
@@ -118,25 +118,25 @@ def _ways(network, spec, count, still):
     effects = (network.effect(spec, 1, FRAMES),)
     params = with_effect(gaussians(count), effects[0])
 
-    def pose(params, time):
+    def deform(params, time):
         ready = deformation.prepare(effects, params)
-        return deformation.pose(effects, params, ready, time)
+        return deformation.deform(effects, params, ready, time)
 
     def loss(params, time):
-        return sum(jnp.sum(jnp.sin(leaf)) for leaf in pose(params, time))
+        return sum(jnp.sum(jnp.sin(leaf)) for leaf in deform(params, time))
 
     def pose_prepared(params, ready, time):
-        return deformation.pose(effects, params, ready, time)
+        return deformation.deform(effects, params, ready, time)
 
     def pose_moving(parts, ready, time):
         def rows(params, time):
-            return deformation.pose(effects, params, ready, time)
+            return deformation.deform(effects, params, ready, time)
 
-        return static_rows.pose(parts, rows, time)
+        return static_rows.deform(parts, rows, time)
 
     prepare = jax.jit(lambda params: deformation.prepare(effects, params))
     ready = prepare(params)
-    ways = {"": Way(pose, (params, time), jax.grad(loss))}
+    ways = {"": Way(deform, (params, time), jax.grad(loss))}
     kept = ", prepared kept" if jax.tree.leaves(ready) else ""
     if kept:
         ways[kept] = Way(pose_prepared, (params, ready, time))
@@ -166,10 +166,10 @@ def _table_arms(count):
     made = []
     for interpolation in time_knots.FEWEST:
 
-        def pose(table, time, interpolation=interpolation):
+        def deform(table, time, interpolation=interpolation):
             return time_knots.at(table, time, interpolation)
 
-        way = Way(pose, (table, jnp.asarray(0.37, jnp.float32)))
+        way = Way(deform, (table, jnp.asarray(0.37, jnp.float32)))
         name = f"{KNOTS} time knots, {interpolation}"
-        made.append(Arm(name, way, ((1.0, way),)))
+        made.append(Contender(name, way, ((1.0, way),)))
     return made

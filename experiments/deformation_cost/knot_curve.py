@@ -24,7 +24,7 @@ class Point(NamedTuple):
 
     interpolation: str
     knots: int
-    ms: float  # median wall time of a pose
+    ms: float  # median wall time of an instant
     cpu_ms: float
     bytes: int
     rms: float  # over all Gaussians that move, and all instants
@@ -39,7 +39,7 @@ class Curve(NamedTuple):
     gaussians: int
     moving: int
     size: float  # the farthest that a mean goes from its middle instant, scene units
-    exact_ms: float  # of a pose by the network
+    exact_ms: float  # of an instant by the network
     exact_cpu_ms: float
     points: list[Point]
 
@@ -49,23 +49,23 @@ def curve(
 ) -> Curve:
     """Tables of so many knots, linear and cubic, against the motion itself."""
     times = jnp.linspace(0, 1, INSTANTS)
-    exact = [jax.device_get(motion.pose(time)) for time in times]
+    exact = [jax.device_get(motion.deform(time)) for time in times]
     drawn = np.linspace(1, INSTANTS - 2, DRAWN).round().astype(int)
     truth = [motion.draw(exact[k], times[k]) for k in drawn]
     tables = {
-        (way, count): time_knots.bake(motion.pose, count, static_threshold)
+        (way, count): time_knots.bake(motion.deform, count, static_threshold)
         for way, fewest in time_knots.FEWEST.items()
         for count in knots
         if count >= fewest
     }
     instant = times[INSTANTS // 3]
-    calls = {"network": lambda: motion.pose(instant)}
+    calls = {"network": lambda: motion.deform(instant)}
     calls |= {
         f"{way} {count}": lambda way=way, table=table: _at(table, instant, way)
         for (way, count), table in tables.items()
     }
     timing = clock.compare(calls, repeats=repeats)
-    paths = np.stack([pose.mean for pose in exact])[:, motion.active]
+    paths = np.stack([deform.mean for deform in exact])[:, motion.active]
     ways = np.linalg.norm(paths - paths[INSTANTS // 2], axis=-1)
     size = float(ways.max())
     if not size > 0:
@@ -75,10 +75,10 @@ def curve(
     moved = ways.max(axis=0) > static_threshold
     points = []
     for (way, count), table in tables.items():
-        posed = [_at(table, time, way) for time in times]
-        found = np.stack([pose.mean for pose in posed])[:, motion.active]
+        deformed = [_at(table, time, way) for time in times]
+        found = np.stack([deform.mean for deform in deformed])[:, motion.active]
         errors = np.linalg.norm(found - paths, axis=-1)[:, moved] / size
-        pictures = [motion.draw(posed[k], times[k]) for k in drawn]
+        pictures = [motion.draw(deformed[k], times[k]) for k in drawn]
         squares = [np.square(a - b) for a, b in zip(pictures, truth, strict=True)]
         points.append(
             Point(
@@ -112,7 +112,7 @@ def text(curve: Curve) -> str:
     lines = [
         f"{curve.name}: {curve.gaussians} Gaussians, of which {curve.moving} move by "
         f"up to {curve.size:.3g} scene units; the network takes "
-        f"{curve.exact_ms:.2f} ms ({curve.exact_cpu_ms:.2f} CPU) a pose",
+        f"{curve.exact_ms:.2f} ms ({curve.exact_cpu_ms:.2f} CPU) an instant",
         f"{'knots':>5s} {'':7s} {'RMS':>9s} {'largest':>9s} {'PSNR dB':>8s} "
         f"{'ms':>7s} {'CPU ms':>7s} {'speed-up':>8s} {'MB':>6s}",
     ]

@@ -45,7 +45,7 @@ def save(path: pathlib.Path, rows: list[dict], curve: Curve) -> None:
         curve.exact_cpu_ms, color="grey", linestyle=":", label="the network"
     )
     quality.set(
-        xlabel="ms of one core for a pose (labels: knots)",
+        xlabel="ms of one core for an instant (labels: knots)",
         xscale="log",
         ylabel="PSNR of the frame against the network's (dB)",
         title=f"{curve.gaussians} Gaussians, {curve.moving} moving",
@@ -78,7 +78,7 @@ def _bars(axes, rows):
     axes.set(
         xscale="log",
         xlabel="ms of one core",
-        title="a pose of 10,000 Gaussians",
+        title="deforming 10,000 Gaussians",
     )
     axes.margins(x=0.15)
     axes.legend(fontsize=8)

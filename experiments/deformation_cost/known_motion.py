@@ -28,7 +28,7 @@ class Moving(NamedTuple):
     """A motion, and a view to draw it from."""
 
     name: str
-    pose: Callable  # time -> Gaussians, compiled
+    deform: Callable  # time -> Gaussians, compiled
     draw: Callable  # (Gaussians, time) -> colour, compiled
     active: np.ndarray  # [gaussians] bool
 
@@ -59,7 +59,7 @@ def of_model(
         )
     stages, params = model.stages, state.params
     prepared = jax.jit(stages.prepare)(params)
-    pose = jax.jit(stages.pose)
+    deform = jax.jit(stages.deform)
 
     @jax.jit
     def draw(params, gaussians, view, step):
@@ -67,8 +67,10 @@ def of_model(
 
     return Moving(
         name,
-        lambda time: pose(params, prepared, time),
-        lambda posed, time: draw(params, posed, view._replace(time=time), state.step),
+        lambda time: deform(params, prepared, time),
+        lambda deformed, time: draw(
+            params, deformed, view._replace(time=time), state.step
+        ),
         np.asarray(splats.active_mask(params.rows["splats"])),
     )
 

@@ -77,7 +77,7 @@ class EffectCost:
                 raise ValueError(f"--{name} {value} must be at least 1")
 
 
-class Arm(NamedTuple):
+class PricedScene(NamedTuple):
     """One scene of a preset's table."""
 
     name: str  # "bare", "only warp", "warp + elastic", "all", "without warp"
@@ -99,10 +99,10 @@ class Priced(NamedTuple):
     wall_seconds: float
 
 
-class Row(NamedTuple):
+class SceneCost(NamedTuple):
     """All that was measured of one scene."""
 
-    arm: Arm
+    arm: PricedScene
     parameters: int
     programs: dict[str, Priced]  # by the names in PROGRAMS
 
@@ -169,7 +169,7 @@ def without(spec: Any, names: tuple[str, ...]) -> Any:
     return dataclasses.replace(spec, **dict.fromkeys(gone & {*effects_in(spec)}))
 
 
-def arms(spec: Any) -> list[Arm]:
+def arms(spec: Any) -> list[PricedScene]:
     """The scenes of a preset's table; ValueError where it has no effect."""
     names = effects_in(spec)
     if not names:
@@ -181,21 +181,25 @@ def arms(spec: Any) -> list[Arm]:
     def only(*kept):
         return without(spec, tuple(name for name in names if name not in kept))
 
-    found = [Arm("bare", None, None, only())]
+    found = [PricedScene("bare", None, None, only())]
     for name in names:
         needed = tuple(x for x in NEEDS.get(name, ()) if x in names)
         base = f"only {needed[0]}" if needed else "bare"
         title = f"{needed[0]} + {name}" if needed else f"only {name}"
-        found.append(Arm(title, name, base, only(name, *needed)))
+        found.append(PricedScene(title, name, base, only(name, *needed)))
     if len(names) == 1:
         return found  # the only one is all there is
-    found.append(Arm("all", None, "bare", spec))
+    found.append(PricedScene("all", None, "bare", spec))
     for name in names:
-        found.append(Arm(f"without {name}", name, "all", without(spec, (name,))))
+        found.append(
+            PricedScene(f"without {name}", name, "all", without(spec, (name,)))
+        )
     return found
 
 
-def measure(preset: str, scenes: list[Arm], at: float, repeats: int) -> list[Row]:
+def measure(
+    preset: str, scenes: list[PricedScene], at: float, repeats: int
+) -> list[SceneCost]:
     """Compile the programs of every scene once and time all of them in turn."""
     from nerfies_jax import runs
     from nerfies_jax.measure import clock
@@ -228,7 +232,7 @@ def measure(preset: str, scenes: list[Arm], at: float, repeats: int) -> list[Row
                 seconds=timing.median_cpu,
                 wall_seconds=timing.median,
             )
-        rows.append(Row(arm, parameters, programs))
+        rows.append(SceneCost(arm, parameters, programs))
     return rows
 
 

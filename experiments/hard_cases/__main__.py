@@ -90,7 +90,7 @@ class Outcome(NamedTuple):
     textbook: tuple[np.ndarray, ...]
 
 
-class Row(NamedTuple):
+class CaseResult(NamedTuple):
     """All that was measured of one case."""
 
     case: Case
@@ -141,7 +141,7 @@ def choose(rooms, names) -> list[tuple[Case, str]]:
     return chosen
 
 
-def measure(case: Case, test: str, numbers: int, repeats: int) -> Row:
+def measure(case: Case, test: str, numbers: int, repeats: int) -> CaseResult:
     """Errors in every precision that is held, and what the stable form costs."""
     outcomes = {}
     for dtype, bounds in case.bounds.items():
@@ -158,7 +158,7 @@ def measure(case: Case, test: str, numbers: int, repeats: int) -> Row:
                 for order in range(len(bounds))
             )
         outcomes[dtype] = Outcome(**found)
-    return Row(case, test, outcomes, *_costs(case, numbers, repeats))
+    return CaseResult(case, test, outcomes, *_costs(case, numbers, repeats))
 
 
 def _costs(case, numbers, repeats):

@@ -25,7 +25,7 @@ from nerfies_jax.training import specs
 FOUND = "inspected.json"
 
 
-class Side(NamedTuple):
+class ArmMeans(NamedTuple):
     """One way to train, over all seeds: means; NaN where not known."""
 
     psnr: float  # dB, held-out frames
@@ -34,7 +34,7 @@ class Side(NamedTuple):
     runs: int
 
 
-class Row(NamedTuple):
+class Comparison(NamedTuple):
     """A preset on a capture against what was advised for it."""
 
     capture: str
@@ -43,8 +43,8 @@ class Row(NamedTuple):
     notes: tuple[str, ...]
     same: bool  # the advice is the preset as it is
     refused: str  # why the preset cannot be built on the capture; empty if it can
-    before: Side | None  # None where not trained
-    after: Side | None
+    before: ArmMeans | None  # None where not trained
+    after: ArmMeans | None
 
 
 def read(
@@ -153,7 +153,7 @@ class Trial:
             return name, str(error)
         return None
 
-    def rows(self) -> list[Row]:
+    def rows(self) -> list[Comparison]:
         """One for each preset, with what has been trained by now."""
         finished = {}
         if self._job is not None:
@@ -163,7 +163,7 @@ class Trial:
         for preset, advised in self.pairs().items():
             before, after = (_side(finished, name) for name in (preset, advised))
             rows.append(
-                Row(
+                Comparison(
                     capture=self.name,
                     preset=preset,
                     advised=advised,
@@ -185,4 +185,4 @@ def _side(finished, name):
         float(np.mean([one.get(key, math.nan) for one in kept]))
         for key in ("psnr", "depth_median", "train_cpu_seconds")
     )
-    return Side(psnr, depth, seconds, len(kept))
+    return ArmMeans(psnr, depth, seconds, len(kept))

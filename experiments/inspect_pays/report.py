@@ -4,7 +4,7 @@ import math
 import pathlib
 from typing import Any
 
-from experiments.inspect_pays.job import Row
+from experiments.inspect_pays.job import Comparison
 from nerfies_jax.capture.json_files import replaced_file
 from nerfies_jax.measure import clock
 from nerfies_jax.measure.clock import Metric
@@ -16,7 +16,7 @@ TIME_SHARE = 0.1
 DEPTH_SHARE = 0.2  # of the median depth error
 
 
-def verdict(row: Row) -> str:
+def verdict(row: Comparison) -> str:
     """Whether the advice paid, by quality and by time, in a few words."""
     if row.same:
         return "nothing to change"
@@ -49,7 +49,7 @@ def _quality(before, after):
     return (-1 if ratio > 1 + DEPTH_SHARE else 0), "depth"
 
 
-def table(rows: list[Row]) -> list[str]:
+def table(rows: list[Comparison]) -> list[str]:
     """Lines of Markdown."""
     heads = ("capture", "preset", "advised", "PSNR", "as advised", "depth error")
     heads += ("as advised", "CPU s", "as advised", "pays")
@@ -66,14 +66,14 @@ def table(rows: list[Row]) -> list[str]:
     return lines
 
 
-def changes(row: Row) -> str:
+def changes(row: Comparison) -> str:
     """What the advice has beside the preset, or instead of it."""
     preset, *overrides = row.advised.split("+")
     words = overrides if preset == row.preset else [preset, *overrides]
     return " ".join(words)
 
 
-def metrics_of(rows: list[Row]) -> list[Metric]:
+def metrics_of(rows: list[Comparison]) -> list[Metric]:
     """What was measured of every pair that was trained."""
     found = []
     for row in rows:
@@ -95,7 +95,7 @@ def metrics_of(rows: list[Row]) -> list[Metric]:
     return found
 
 
-def write(folder: pathlib.Path, asked: Any, rows: list[Row]) -> list[str]:
+def write(folder: pathlib.Path, asked: Any, rows: list[Comparison]) -> list[str]:
     """pays.md and pays.json; returns the lines of the table and the count."""
     about = {
         "presets": list(asked.presets),

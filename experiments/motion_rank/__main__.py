@@ -91,7 +91,7 @@ class MotionRank:
             )
 
 
-class Row(NamedTuple):
+class RankResult(NamedTuple):
     """One model at one K: errors as shares of the RMS displacement, by seed."""
 
     kind: str
@@ -118,7 +118,7 @@ def main(arguments=None):
     return rows
 
 
-def table(asked: MotionRank) -> list[Row]:
+def table(asked: MotionRank) -> list[RankResult]:
     """Every model at every K, for every kind of trajectories."""
     rows = []
     fits = {}  # compiled once for each number of points, which a scene may lack
@@ -135,7 +135,7 @@ def table(asked: MotionRank) -> list[Row]:
     return rows
 
 
-def one_row(asked, fits, kind, model, count, drawn) -> Row:
+def one_row(asked, fits, kind, model, count, drawn) -> RankResult:
     """Fit one model to every draw; `fits` keeps what is compiled."""
     learnt, held_out, floor, seconds = [], [], [], []
     for seed, tracks in enumerate(drawn):
@@ -154,7 +154,7 @@ def one_row(asked, fits, kind, model, count, drawn) -> Row:
         held_out.append(float(np.sqrt(np.mean(off[:, ~keep])) / size))
         if model in FLOORS:
             floor.append(float(FLOORS[model](known.moved, count) / size))
-    return Row(
+    return RankResult(
         kind, model, count, learnt, held_out, floor or None, float(np.median(seconds))
     )
 

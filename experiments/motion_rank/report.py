@@ -4,6 +4,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from experiments import markdown
 from nerfies_jax.capture.json_files import replaced_file, write_json
 from nerfies_jax.measure import clock
 from nerfies_jax.training import specs
@@ -163,6 +164,28 @@ def write(asked, rows) -> None:
     write_json(asked.out / "motion_rank.json", record)
     draw_figure(rows, asked.out / "motion_rank.png")
     print(asked.out / "motion_rank.png")
+
+
+def page(stored) -> str:
+    """The page in docs/results below the docstring, from a motion_rank.json."""
+    heads = ("tracks", "model", "K", "learnt", "±", "held out", "±", "floor", "CPU s")
+    rows = [
+        [
+            row["kind"],
+            row["model"],
+            "" if row["count"] is None else str(row["count"]),
+            *(
+                markdown.number(of(row[name]), 4)
+                for name in ("learnt", "held_out")
+                for of in (np.mean, np.std)
+            ),
+            markdown.number(np.mean(row["floor"]), 4) if row["floor"] else "",
+            markdown.number(row["seconds"], 2),
+        ]
+        for row in stored["rows"]
+    ]
+    said = markdown.bullets(stored["said"])
+    return f"{markdown.table(heads, rows, words=2)}\n\n{said}"
 
 
 def draw_figure(rows, path) -> None:

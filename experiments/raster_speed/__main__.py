@@ -24,11 +24,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import cli
+from experiments import cli, markdown
 from experiments.raster_speed import baselines as raster_baselines
 from gaussians_jax import raster
 from gaussians_jax.projection import Footprints
 from gaussians_jax.raster_spec import GSPLAT
+from nerfies_jax.capture.json_files import write_json
+from nerfies_jax.measure import clock
 
 ALL_CASES = tuple(
     f"{count}@{size}"
@@ -49,6 +51,7 @@ class Settings:
     cameras: int = 0  # also this many cameras under vmap, against as many singles
     cores: tuple[int, ...] = ()  # also in fresh processes that see so many cores
     as_json: bool = False  # one JSON line per case and nothing else
+    out: pathlib.Path | None = None  # JSON of all cases
 
 
 class Case:
@@ -282,18 +285,67 @@ def main(arguments=None) -> None:
     limit = exponential_limit_ns(settings.repeats)
     if not settings.as_json:
         print(f"exp + multiply, in cache: {limit:.2f} ns an element")
+    rows = []
     for text in settings.cases:
-        row = time_case(text, settings, limit)
+        rows.append(row := time_case(text, settings, limit))
         if settings.as_json:
             print(json.dumps(row), flush=True)
         else:
             print("  ".join(show(name, row[name]) for name in row), flush=True)
-    for cores in settings.cores:
-        for text, row in core_times(settings, cores).items():
+    seen = {cores: core_times(settings, cores) for cores in settings.cores}
+    for cores, found in seen.items():
+        for text, row in found.items():
             print(
                 f"{text} seeing {cores} cores: forward+backward "
                 f"{row['forward_backward_ms']:.1f} ms CPU, {row['wall_ms']:.1f} ms wall"
             )
+
+    if settings.out is not None:
+        record = {"machine": clock.machine(), "limit_ns": limit, "rows": rows}
+        write_json(settings.out, record | {"cores": seen})
+
+
+def page(stored) -> str:
+    """The page in docs/results below the docstring, from what `--out` wrote."""
+    columns = {
+        "forward_ms": ("forward, CPU ms", 1),
+        "forward_backward_ms": ("and backward", 1),
+        "evaluations_millions": ("million evaluations", 1),
+        "forward_ns": ("ns an evaluation", 2),
+        "share_of_limit": ("share of the limit", 2),
+        "temporaries_mb": ("temporary MB", 0),
+        "ratio": ("over the yardstick", 2),
+        "cameras_ratio": ("vmap over singles", 2),
+        "lockstep_ms": ("lockstep, ms", 0),
+        "dense_ms": ("dense, ms", 0),
+    }
+    rows = [
+        [
+            row["case"],
+            *(markdown.number(row.get(k), n) for k, (_, n) in columns.items()),
+        ]
+        for row in stored["rows"]
+    ]
+    heads = ("Gaussians@size", *(head for head, _ in columns.values()))
+    parts = [
+        f"The limit of this machine: {stored['limit_ns']:.2f} ns for an exponential "
+        "and a product, in cache.",
+        markdown.table(heads, rows),
+    ]
+    if stored["cores"]:
+        heads = ("Gaussians@size", "cores", "CPU ms", "wall ms")
+        rows = [
+            [
+                text,
+                str(cores),
+                markdown.number(row["forward_backward_ms"], 1),
+                markdown.number(row["wall_ms"], 1),
+            ]
+            for cores, found in stored["cores"].items()
+            for text, row in found.items()
+        ]
+        parts += ["Forward and backward, by cores:", markdown.table(heads, rows)]
+    return "\n\n".join(parts)
 
 
 def show(name, value) -> str:

@@ -25,7 +25,7 @@ from typing import Literal, NamedTuple
 import jax
 import numpy as np
 
-from experiments import cli
+from experiments import cli, markdown
 from experiments.solver_table.problems import LEVENBERG, PROBLEMS, Problem
 from nerfies_jax.measure import clock
 from nerfies_jax.training.fit import CODE_SOLVERS
@@ -60,7 +60,7 @@ class Settings:
             )
 
 
-class Row(NamedTuple):
+class SolverResult(NamedTuple):
     """One solver with so many steps at most, over all held-out frames."""
 
     solver: str
@@ -75,7 +75,7 @@ class Row(NamedTuple):
     converged: int  # frames
 
 
-def table(task: Problem, settings: Settings) -> list[Row]:
+def table(task: Problem, settings: Settings) -> list[SolverResult]:
     """Every solver with every number of steps, best known results included."""
     fits, timings = {}, {}
     for max_steps in settings.steps:
@@ -102,7 +102,7 @@ def table(task: Problem, settings: Settings) -> list[Row]:
     least = np.array([losses[keys[k]][i] for i, k in enumerate(best)])
     where = np.stack([fits[keys[k]][i].value for i, k in enumerate(best)])
     return [
-        Row(
+        SolverResult(
             solver=name,
             max_steps=max_steps,
             steps=float(np.median([f.steps for f in row])),
@@ -119,7 +119,7 @@ def table(task: Problem, settings: Settings) -> list[Row]:
     ]
 
 
-def text(rows: list[Row], frames: int) -> str:
+def text(rows: list[SolverResult], frames: int) -> str:
     head = (
         f"{'solver':<20}{'at most':>8}{'steps':>7}{'ms':>9}{'CPU ms':>9}"
         f"{'loss':>11}{'excess':>10}{'distance':>10}{'done':>7}"
@@ -133,7 +133,26 @@ def text(rows: list[Row], frames: int) -> str:
     return "\n".join([head, *lines])
 
 
-def main(arguments=None) -> list[Row]:
+def page(stored) -> str:
+    """The page in docs/results below the docstring, from what `--out` wrote."""
+    heads = ("solver", "at most", "steps", "ms", "CPU ms", "loss", "excess")
+    heads += ("distance", "converged")
+    rows = [
+        [
+            row["solver"],
+            str(row["max_steps"]),
+            markdown.number(row["steps"], 0),
+            markdown.number(1e3 * row["seconds"], 2),
+            markdown.number(1e3 * row["cpu_seconds"], 2),
+            *(markdown.short(row[name]) for name in ("loss", "excess", "distance")),
+            f"{row['converged']} of {stored['about']['frames']}",
+        ]
+        for row in sorted(stored["rows"], key=lambda r: (r["solver"], r["max_steps"]))
+    ]
+    return f"## Fitting {stored['about']['fit']}\n\n{markdown.table(heads, rows)}"
+
+
+def main(arguments=None) -> list[SolverResult]:
     """Run the job of the command line."""
     settings = cli.parse(Settings, arguments)
     task = PROBLEMS[settings.fit](settings)
@@ -141,7 +160,8 @@ def main(arguments=None) -> list[Row]:
     print(text(rows, settings.frames))
     if settings.out:
         about = dataclasses.asdict(settings) | {"out": str(settings.out)}
-        record = {"about": about, "rows": [row._asdict() for row in rows]}
+        record = {"about": about, "machine": clock.machine()}
+        record["rows"] = [row._asdict() for row in rows]
         settings.out.write_text(json.dumps(record, indent=1) + "\n")
     return rows
 

@@ -4,6 +4,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from experiments import markdown
 from nerfies_jax.capture.json_files import replaced_file, write_json
 from nerfies_jax.measure import clock
 from nerfies_jax.training import specs
@@ -130,6 +131,36 @@ def write(asked, results, waves) -> None:
     write_json(asked.out / "spectral_bias.json", record)
     draw_figure(results, waves, asked.out / "spectral_bias.png")
     print(asked.out / "spectral_bias.png")
+
+
+def page(stored) -> str:
+    """The page in docs/results below the docstring, from a spectral_bias.json."""
+    parts = []
+    for label, components in stored["waves"].items():
+        heads = ("network", "numbers", "rate", "steps", "s", "RMS error", "±")
+        heads += tuple(f"k={name_of(wave)}" for wave in components)
+        for equality, found in stored["results"].items():
+            rows = [
+                [
+                    row["network"],
+                    f"{row['parameters']:,}",
+                    markdown.short(row["rate"]),
+                    f"{row['steps']:,}",
+                    markdown.number(row["seconds"], 2),
+                    markdown.number(np.mean(row["rmse"]), 4),
+                    markdown.number(np.std(row["rmse"]), 4),
+                    *(markdown.number(x, 4) for x in np.mean(row["missing"], axis=0)),
+                ]
+                for row in found
+                if row["signal"] == label
+            ]
+            parts += [f"## {label}, {equality}", markdown.table(heads, rows)]
+    parts += [
+        "Errors are shares of the signal's RMS, means and deviations over the seeds; "
+        "under k, what is missing of each sinusoid.",
+        markdown.bullets(stored["said"]),
+    ]
+    return "\n\n".join(parts)
 
 
 def draw_figure(results, waves, path) -> None:

@@ -33,7 +33,7 @@ def in_blocks(
         padding = [(0, blocks * block - count)] + [(0, 0)] * (leaf.ndim - 1)
         return jnp.pad(leaf, padding).reshape(blocks, block, *leaf.shape[1:])
 
-    def still(*rows):
+    def static(*rows):
         return jax.tree.map(
             lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
             jax.eval_shape(evaluate, *rows),
@@ -43,7 +43,7 @@ def in_blocks(
     # The loop already keeps XLA from merging the two passes.
     @functools.partial(jax.remat, prevent_cse=False)
     def one_block(rows, is_used):
-        return jax.lax.cond(is_used, evaluate, still, *rows)
+        return jax.lax.cond(is_used, evaluate, static, *rows)
 
     pieces = jax.tree.map(cut, rows), cut(active).any(axis=1)
     outputs = jax.lax.map(lambda piece: one_block(*piece), pieces)

@@ -26,7 +26,7 @@ def prepare(effects: Effects, params: Params) -> dict[str, PyTree]:
     }
 
 
-def pose(
+def deform(
     effects: Effects,
     params: Params,
     prepared: dict[str, PyTree],
@@ -41,7 +41,7 @@ def pose(
     return gaussians
 
 
-def pose_in_training(
+def deform_in_training(
     effects: Effects, params: Params, gaussians: Gaussians, condition: FrameCondition
 ) -> Gaussians:
     """`gaussians` as they are at a moment of training.
@@ -70,7 +70,7 @@ def pose_in_training(
     return gaussians
 
 
-def poser(
+def deformer(
     effects: Effects, condition: FrameCondition
 ) -> Callable[[Params, Float[Array, ""]], Gaussians]:
     """A function of rows and of a time near `condition`, for `PenaltyContext`."""
@@ -78,6 +78,6 @@ def poser(
     def at_time(params, time):
         gaussians = splats.activate(params.rows["splats"])
         then = condition._replace(time=time)
-        return pose_in_training(effects, params, gaussians, then)
+        return deform_in_training(effects, params, gaussians, then)
 
     return at_time

@@ -249,7 +249,7 @@ def prepare(
     """What the embeddings add to the first layer, whatever the time. Pure.
 
     4 bytes for each feature of the first layer and Gaussian: 5 MB for 10,000 Gaussians
-    with the default sizes. Measured on one core at 10,000, posing them takes 68 ms with
+    with the default sizes. Measured on one core at 10,000, deforming takes 68 ms with
     nothing kept and 58 with this, 10 and 7 in the small sizes. Rows of blocks without
     an active one are zero.
     """

@@ -110,7 +110,7 @@ class Prepared(NamedTuple):
     """What the canonical means alone decide, a row for each Gaussian.
 
     4 (3 K + base_width) bytes each: 608 with the paper's sizes, 24 MB for its 39,000
-    Gaussians. Measured on one core at 10,000, posing them takes 160 ms with nothing
+    Gaussians. Measured on one core at 10,000, deforming them takes 160 ms with nothing
     kept, 154 with the directions kept, 147 with both; 10.2, 8.5 and 6.8 in the small
     sizes.
     """

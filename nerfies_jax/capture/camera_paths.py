@@ -21,11 +21,11 @@ def path(kind: str, capture: Capture, count: int, turns: float = 1.0) -> Camera:
         picked = np.linspace(0, len(rows) - 1, count).round().astype(int)
         return cameras.take(capture.cameras, rows[picked])
     phase = np.linspace(0, 2 * np.pi * turns, count, endpoint=False)
-    filmed = cameras.take(capture.cameras, capture.train)
-    up = mean_up(filmed) if capture.up is None else np.asarray(capture.up)
-    target = focus_point(filmed, capture.near, capture.far)
-    positions = (_sway if kind == "sway" else _orbit)(filmed, target, up, phase)
-    middle = cameras.take(filmed, len(filmed.focal_px) // 2)
+    train_cameras = cameras.take(capture.cameras, capture.train)
+    up = mean_up(train_cameras) if capture.up is None else np.asarray(capture.up)
+    target = focus_point(train_cameras, capture.near, capture.far)
+    positions = (_sway if kind == "sway" else _orbit)(train_cameras, target, up, phase)
+    middle = cameras.take(train_cameras, len(train_cameras.focal_px) // 2)
     size = capture.size
     looking = cameras.stack(
         [
@@ -44,20 +44,20 @@ def times(count: int, loops: float = 1.0) -> np.ndarray:
     return (1 - np.abs(1 - 2 * phase)).astype(np.float32)
 
 
-def mean_up(filmed: Camera) -> np.ndarray:
+def mean_up(train_cameras: Camera) -> np.ndarray:
     """The mean of the pictures' upward directions, unit length."""
-    up = -filmed.camera_from_world[:, 1, :].astype(np.float64).mean(axis=0)
+    up = -train_cameras.camera_from_world[:, 1, :].astype(np.float64).mean(axis=0)
     return up / np.linalg.norm(up)
 
 
-def focus_point(filmed: Camera, near: float, far: float) -> np.ndarray:
+def focus_point(train_cameras: Camera, near: float, far: float) -> np.ndarray:
     """The point closest to all viewing axes, kept between the near and far planes.
 
     Parallel axes have no closest point; the least-squares system then is singular, and
     the point lies halfway (in inverse depth) along the mean axis instead.
     """
-    axes = filmed.camera_from_world[:, 2, :].astype(np.float64)
-    centres = filmed.position.astype(np.float64)
+    axes = train_cameras.camera_from_world[:, 2, :].astype(np.float64)
+    centres = train_cameras.position.astype(np.float64)
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     system = across.sum(axis=0)
     mean_axis = axes.mean(axis=0) / np.linalg.norm(axes.mean(axis=0))
@@ -73,9 +73,9 @@ def focus_point(filmed: Camera, near: float, far: float) -> np.ndarray:
     return mean_centre + halfway * mean_axis
 
 
-def _sway(filmed, target, up, phase):
+def _sway(train_cameras, target, up, phase):
     """An ellipse through the 70 % span of the filmed positions, facing the target."""
-    centres = filmed.position.astype(np.float64)
+    centres = train_cameras.position.astype(np.float64)
     middle = np.median(centres, axis=0)
     forward = target - middle
     forward /= np.linalg.norm(forward)
@@ -95,9 +95,9 @@ def _sway(filmed, target, up, phase):
     )
 
 
-def _orbit(filmed, target, up, phase):
+def _orbit(train_cameras, target, up, phase):
     """A full circle about the up axis, at the filmed distance and height."""
-    offset = np.median(filmed.position.astype(np.float64), axis=0) - target
+    offset = np.median(train_cameras.position.astype(np.float64), axis=0) - target
     height = (offset @ up) * up
     flat = offset - height
     side = np.cross(up, flat)

@@ -74,7 +74,7 @@ class ExtraFile(msgspec.Struct):
     up: Triple | None = None
 
 
-class Views(NamedTuple):
+class NerfiesViews(NamedTuple):
     """The cameras of a directory and what is known of each, without any picture."""
 
     ids: tuple[str, ...]
@@ -91,7 +91,7 @@ class Views(NamedTuple):
     notes: tuple[str, ...]
 
 
-def read_cameras(path: AnyPath, heldout: int | str | None = None) -> Views:
+def read_cameras(path: AnyPath, heldout: int | str | None = None) -> NerfiesViews:
     """Cameras, times, ids and splits; needs no pictures.
 
     `heldout`: None for what the files say, a number n for every n-th frame, "interp"
@@ -115,7 +115,7 @@ def read_cameras(path: AnyPath, heldout: int | str | None = None) -> Views:
     check_cameras(cameras, ids, size, str(path / "camera"))
     moments, more = _moments(path, ids)
     row = {name: number for number, name in enumerate(ids)}
-    return Views(
+    return NerfiesViews(
         ids=ids,
         cameras=cameras,
         size=size,

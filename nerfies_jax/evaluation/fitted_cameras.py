@@ -173,10 +173,10 @@ def _drawer(model, state, view, size):
             ).colour
         )
     stages, params = model.stages, state.params
-    posed = stages.pose(params, stages.prepare(params), view.time)
+    deformed = stages.deform(params, stages.prepare(params), view.time)
     return lambda camera: (
         stages.draw(
-            params, posed, view._replace(camera=camera), size, state.step
+            params, deformed, view._replace(camera=camera), size, state.step
         ).colour
     )
 

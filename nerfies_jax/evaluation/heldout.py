@@ -12,7 +12,7 @@ from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation import protocol
 from nerfies_jax.evaluation.fitted_cameras import FittedCameras
 from nerfies_jax.evaluation.model_flow import Flow
-from nerfies_jax.evaluation.protocol import Followed, Known
+from nerfies_jax.evaluation.protocol import GroundTruth, PointTracks
 from nerfies_jax.evaluation.scores import Scored
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.measure import geometry_quality, image_quality, perceptual
@@ -94,8 +94,8 @@ def heldout_metrics(
     capture: Capture,
     *,
     lpips: Lpips | None = None,
-    known: Known | None = None,
-    followed: Followed | None = None,
+    known: GroundTruth | None = None,
+    followed: PointTracks | None = None,
     flow: Flow | None = None,
     fitted: FittedCameras | None = None,
 ) -> dict[str, float]:
@@ -115,7 +115,7 @@ def heldout_metrics(
     if known is not None and followed is not None:
         numbers = protocol.score_tracks(known, followed)
         more |= {_TRACKS[name]: value for name, value in numbers.items()}
-        more["tracks.still_epe"] = protocol.still_error(known)
+        more["tracks.still_epe"] = protocol.static_error(known)
     if flow is not None:
         more |= _flow(flow)
     if fitted is not None:

@@ -17,10 +17,10 @@ from nerfies_jax.measure import geometry_quality
 from nerfies_jax.training.model import TrainState
 
 CORRECT_WITHIN = 0.01  # scene units: a quarter of the default cube's half-side
-STILL_POINTS = 500  # of the capture's static points, to see whether they drift
+STATIC_POINTS = 500  # of the capture's static points, to see whether they drift
 
 
-class Known(NamedTuple):
+class GroundTruth(NamedTuple):
     """What all arms are held against; NumPy. Without a truth there are no tracks."""
 
     rows: np.ndarray  # held-out frames of the capture that are rendered
@@ -38,7 +38,7 @@ class Known(NamedTuple):
         return self.path[:, self.start]
 
 
-class Followed(NamedTuple):
+class PointTracks(NamedTuple):
     """Points as a learned warp moves them."""
 
     path: np.ndarray  # [tracks, moments, 3] scene units; the start where not found
@@ -61,7 +61,9 @@ def stored_truth(capture: Capture) -> SceneTruth | None:
     return None if path is None or not path.is_file() else truths.load(path)
 
 
-def known(capture: Capture, truth: SceneTruth, frames: int, tracks: int) -> Known:
+def ground_truth(
+    capture: Capture, truth: SceneTruth, frames: int, tracks: int
+) -> GroundTruth:
     """At most `frames` held-out frames and `tracks` points seen at the start.
 
     Raises ValueError where the truth is not that of the capture.
@@ -84,7 +86,7 @@ def known(capture: Capture, truth: SceneTruth, frames: int, tracks: int) -> Know
     if len(chosen):
         chosen = evaluation.spread(chosen, tracks)
     world = (truth.track_world[chosen] - np.float32(capture.centre)) * capture.scale
-    return Known(
+    return GroundTruth(
         rows=evaluation.spread(capture.heldout, frames),
         moments=moments,
         path=world[:, instants].astype(np.float32),
@@ -93,7 +95,7 @@ def known(capture: Capture, truth: SceneTruth, frames: int, tracks: int) -> Know
     )
 
 
-def filmed(capture: Capture, frames: int) -> Known:
+def held_out_only(capture: Capture, frames: int) -> GroundTruth:
     """What is known of a real capture: how at most `frames` held-out frames look.
 
     Its depths and masks, if it has any, are estimates, and nothing is judged by them.
@@ -104,7 +106,7 @@ def filmed(capture: Capture, frames: int) -> Known:
             "--heldout, as --heldout 8 for every eighth"
         )
     moments = capture.train[np.argsort(capture.times[capture.train], kind="stable")]
-    return Known(
+    return GroundTruth(
         rows=evaluation.spread(capture.heldout, frames),
         moments=moments,
         path=np.zeros((0, len(moments), 3), np.float32),
@@ -114,7 +116,7 @@ def filmed(capture: Capture, frames: int) -> Known:
     )
 
 
-def score_tracks(known: Known, followed: Followed | None) -> dict[str, float]:
+def score_tracks(known: GroundTruth, followed: PointTracks | None) -> dict[str, float]:
     """End-point errors over the seen points of all moments but the start.
 
     Without anything followed, or anything to follow, all are NaN.
@@ -128,13 +130,14 @@ def score_tracks(known: Known, followed: Followed | None) -> dict[str, float]:
     return {name: float(value) for name, value in zip(names, values, strict=True)}
 
 
-def still_error(known: Known) -> float:
+def static_error(known: GroundTruth) -> float:
     """The end-point error of points that are said not to move; NaN without any."""
     if not len(known.path):
         return float("nan")
     return float(
         _endpoints(
-            np.broadcast_to(known.start_points[:, None], known.path.shape), known
+            np.broadcast_to(known.start_points[:, None], known.path.shape),
+            known,
         )[0]
     )
 
@@ -156,4 +159,4 @@ def _endpoints(path, known):
 
 
 # (spec, metadata, state, capture, known) -> None where nothing is warped
-Follow = Callable[[Any, Any, TrainState, Capture, Known], Followed | None]
+Follow = Callable[[Any, Any, TrainState, Capture, GroundTruth], PointTracks | None]

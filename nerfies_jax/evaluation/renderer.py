@@ -22,12 +22,12 @@ class Renderer:
     def __init__(self, model: Model, size: tuple[int, int]):
         self._model = model
         self._programs = {}
-        self._prepared = _Kept()
-        self._posed = _Kept()
+        self._prepared = _Memo()
+        self._deformed = _Memo()
         self.size = size  # width and height in pixels
         self.seconds: list[float] = []  # of every frame, without compiling
         self.cpu_seconds: list[float] = []  # the same, of the processor
-        self.posed_anew: list[bool] = []  # whether that frame's instant was a new one
+        self.deformed_anew: list[bool] = []  # whether its instant was a new one
 
     def __call__(self, state: TrainState, view: View) -> Rendering:
         inputs = state.params, view, state.step
@@ -40,35 +40,35 @@ class Renderer:
         rendering = jax.device_get(rendering)
         self.seconds.append(time.perf_counter() - start)
         self.cpu_seconds.append(time.process_time() - cpu_start)
-        self.posed_anew.append(anew)
+        self.deformed_anew.append(anew)
         return rendering
 
     def _draw(self, programs, params, view, step):
-        """The picture, and whether what is in it had to be posed for it."""
+        """The picture, and whether what is in it had to be deformed for it."""
         if self._model.stages is None:
             return programs(params, view, step), True
         prepared, _ = self._prepared.get(params, None, lambda: programs.prepare(params))
         instant = np.asarray(view.time).tobytes()
-        posed, anew = self._posed.get(
-            params, instant, lambda: programs.pose(params, prepared, view.time)
+        deformed, anew = self._deformed.get(
+            params, instant, lambda: programs.deform(params, prepared, view.time)
         )
-        return programs.draw(params, posed, view, step), anew
+        return programs.draw(params, deformed, view, step), anew
 
     def ms_per_frame(self, frames: int, cpu: bool = False) -> float:
         """What one of the last `frames` frames took, on the wall or of the processor.
 
         The median, of frames at a new instant and of further views of the same instant
         apart, weighted by how many there were of each: the median of both together
-        would leave out the poses altogether as soon as a second view shares them.
+        would leave out deforming altogether as soon as a second view shares them.
         """
         seconds = np.asarray((self.cpu_seconds if cpu else self.seconds)[-frames:])
-        anew = np.asarray(self.posed_anew[-frames:])
+        anew = np.asarray(self.deformed_anew[-frames:])
         parts = [seconds[anew], seconds[~anew]]
         total = sum(len(part) * np.median(part) for part in parts if len(part))
         return 1e3 * float(total) / len(seconds)
 
 
-class _Kept:
+class _Memo:
     """The last result of a function of parameters and a key.
 
     It is right as long as every leaf is the very same array; the leaves are held, so
@@ -99,7 +99,7 @@ class _Programs(NamedTuple):
     """The stages of a model, compiled."""
 
     prepare: Callable
-    pose: Callable
+    deform: Callable
     draw: Callable
 
 
@@ -118,13 +118,13 @@ def _whole(model, size, inputs):
 def _staged(model, size, inputs):
     stages, (params, view, step) = model.stages, inputs
 
-    def draw(params, posed, view, step):
-        return _float32(stages.draw(params, posed, view, size, step))
+    def draw(params, deformed, view, step):
+        return _float32(stages.draw(params, deformed, view, size, step))
 
     prepare = jax.jit(stages.prepare).lower(params)
-    pose = jax.jit(stages.pose).lower(params, prepare.out_info, view.time)
-    drawn = jax.jit(draw).lower(params, pose.out_info, view, step)
-    return _Programs(prepare.compile(), pose.compile(), drawn.compile())
+    deform = jax.jit(stages.deform).lower(params, prepare.out_info, view.time)
+    drawn = jax.jit(draw).lower(params, deform.out_info, view, step)
+    return _Programs(prepare.compile(), deform.compile(), drawn.compile())
 
 
 def as_picture(colour: np.ndarray) -> np.ndarray:

@@ -75,7 +75,7 @@ def sightings(views: Views, points: np.ndarray) -> np.ndarray:
         picture = nd.gaussian_filter(picture, (1, 1, 0))
         place = pixel[inside]
         value = optical_flow.sample(picture, place - 0.5)
-        shown = views.filmed[index][tuple(place[:, ::-1].astype(int).T)]
+        shown = views.valid[index][tuple(place[:, ::-1].astype(int).T)]
         usable = ((value > DARK) & (value < BRIGHT)).all(-1) & shown
         light[index, inside] = np.where(usable[:, None], np.log2(value), np.nan)
     return light

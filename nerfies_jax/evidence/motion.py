@@ -124,8 +124,8 @@ def follow(
     noise = float(np.median(fit.residual[usable])) if usable.any() else np.inf
     strays = usable & (fit.residual > max(MOVES_PX, MOVES_DEVIATIONS * noise))
     strays = nd.binary_opening(strays, iterations=_opening(views))
-    still = usable & (fit.residual < 2 * noise)
-    moving = sweep.confirmed(views, index, paths, strays, still, spans)
+    static = usable & (fit.residual < 2 * noise)
+    moving = sweep.confirmed(views, index, paths, strays, static, spans)
     return Centre(index, paths, fit, usable, moving, noise)
 
 
@@ -220,8 +220,8 @@ def speeds(views: Views, found: list[Film], spans: tuple[float, float]) -> dict:
                 continue
             other = int(film.sequence[at + 1])
             off = _off_epipolar(views, one, other, film.flows[at].forward, spans)
-            still = one.usable & ~one.moving & (one.fit.inverse_depth > 0)
-            depth = 1 / np.median(one.fit.inverse_depth[still]) if still.any() else 0
+            static = one.usable & ~one.moving & (one.fit.inverse_depth > 0)
+            depth = 1 / np.median(one.fit.inverse_depth[static]) if static.any() else 0
             slow.append(off[one.moving])
             units.append(off[one.moving] * depth / views.intrinsics[one.view][0, 0])
     if not slow:

@@ -30,12 +30,12 @@ def outlines(views: Views) -> np.ndarray | None:
 
     None where there is no plain background in all views.
     """
-    shares = 1 - views.filmed.mean((1, 2))
+    shares = 1 - views.valid.mean((1, 2))
     if len(views.row) < FEWEST_VIEWS or np.median(shares) < PLAIN_SHARE:
         return None
     if shares.min() < PLAIN_SHARE / 4:
         return None  # some view is filled by the scene: no outline there
-    return np.stack([nd.binary_fill_holes(one) for one in views.filmed])
+    return np.stack([nd.binary_fill_holes(one) for one in views.valid])
 
 
 def motion(views: Views, shapes: np.ndarray) -> Finding:

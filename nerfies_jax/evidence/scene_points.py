@@ -40,11 +40,11 @@ def followed_points(views: Views, films: list[Film]) -> np.ndarray:
     found = []
     for film in films:
         for one in film.centres:
-            still = one.usable & ~one.moving & (one.fit.inverse_depth > 0)
-            still &= one.fit.residual < 2 * one.noise_px
-            still &= one.fit.count >= 0.75 * len(one.paths.views)
-            depth = 1 / one.fit.inverse_depth[still]
-            ray = view_set.rays(views, one.view)[still]
+            static = one.usable & ~one.moving & (one.fit.inverse_depth > 0)
+            static &= one.fit.residual < 2 * one.noise_px
+            static &= one.fit.count >= 0.75 * len(one.paths.views)
+            depth = 1 / one.fit.inverse_depth[static]
+            ray = view_set.rays(views, one.view)[static]
             found.append(views.position[one.view] + depth[:, None] * ray)
     points = np.concatenate(found) if found else np.zeros((0, 3))
     rng = np.random.default_rng(0)
@@ -65,7 +65,7 @@ def coverage(views: Views, points: np.ndarray) -> float:
         line = np.clip(pixel[inside, 1] * down / height, 0, down - 1).astype(int)
         has = np.zeros((down, across), bool)
         has[line, column] = True
-        lines = np.array_split(views.filmed[index], down, axis=0)
+        lines = np.array_split(views.valid[index], down, axis=0)
         scene = np.array(
             [
                 [cell.mean() > 0.5 for cell in np.array_split(one, across, axis=1)]

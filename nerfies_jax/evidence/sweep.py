@@ -27,12 +27,12 @@ def confirmed(
     index: int,
     paths: Paths,
     strays: np.ndarray,
-    still: np.ndarray,
+    static: np.ndarray,
     spans: tuple[float, float],
 ) -> np.ndarray:
     """`strays` [height, width] without the parts that a still scene explains as well.
 
-    Connected parts are judged as wholes, by what most of their pixels say. `still` are
+    Connected parts are judged as wholes, by what most of their pixels say. `static` are
     pixels that do not stray, from which the noise of a path is taken; `spans` are the
     nearest and farthest z-depth.
     """
@@ -41,7 +41,7 @@ def confirmed(
         return strays
     rng = np.random.default_rng(index)
     tried = _some(rng, strays, MOST_PIXELS)
-    rest = _some(rng, still & ~strays, MOST_PIXELS // 2)
+    rest = _some(rng, static & ~strays, MOST_PIXELS // 2)
     pixels = np.concatenate([tried, rest])
     chosen = np.linspace(0, len(paths.views) - 1, OTHERS).round().astype(int)
     chosen = np.unique(chosen)
@@ -71,7 +71,7 @@ def _costs(views, index, paths, chosen, pixels, spans):
     offsets = np.mgrid[-PATCH : PATCH + 1, -PATCH : PATCH + 1].reshape(2, -1).T[:, ::-1]
     here = np.stack([column, line], -1).astype(float)
     own = _patches(optical_flow.levelled(views.grey[index]), here, offsets)
-    along, still = [], []
+    along, static = [], []
     for at in chosen:
         other = paths.views[at]
         picture = optical_flow.levelled(views.grey[other])
@@ -88,9 +88,9 @@ def _costs(views, index, paths, chosen, pixels, spans):
             place = np.where(inside[:, None], pixel, 0) - 0.5
             cost = np.abs(_patches(picture, place, offsets) - own).mean(-1)
             each.append(np.where(inside, cost, np.nan))
-        still.append(np.where(seen, np.array(each), np.nan))
+        static.append(np.where(seen, np.array(each), np.nan))
     # The better half of the frames: a point at rest may be hidden in the others.
-    return _better_half(np.array(along)), _lowest(_better_half(np.array(still)))
+    return _better_half(np.array(along)), _lowest(_better_half(np.array(static)))
 
 
 def _patches(picture, place, offsets):

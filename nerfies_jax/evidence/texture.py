@@ -28,7 +28,7 @@ def texture(capture: Capture, views: Views, factor: int) -> Finding:
     they are than the capture's own, which may hold finer detail.
     """
     threshold = f"{SMALL} bands, as the fields' small presets have"
-    seen = [one for one in _shown(views) if views.filmed[one].mean() > 0.5]
+    seen = [one for one in _shown(views) if views.valid[one].mean() > 0.5]
     if not seen:
         return cannot_tell(
             EFFECT, "plain background fills most of the views", threshold

@@ -140,7 +140,7 @@ def _lost(views, index, other, there, back):
     stays = ((common >= rim) & (common <= bound)).all(-1)
     bound = np.array([width - 1, height - 1]) - PATCH
     stays &= ((grid >= PATCH) & (grid <= bound)).all(-1)
-    lost = (open_end | changed) & stays & views.filmed[index]
+    lost = (open_end | changed) & stays & views.valid[index]
     return nd.binary_opening(lost, iterations=max(1, round(OPENED_SHARE * width)))
 
 

@@ -33,7 +33,7 @@ class Views(NamedTuple):
     time: np.ndarray  # [frames] in [0, 1]
     image: np.ndarray  # [frames, height, width, 3] uint8 sRGB
     grey: np.ndarray  # [frames, height, width] float32 in [0, 1]
-    filmed: np.ndarray  # [frames, height, width] bool: neither black border nor plain
+    valid: np.ndarray  # [frames, height, width] bool: neither black border nor plain
     textured: np.ndarray  # [frames, height, width] bool: flow can be seen there
     intrinsics: np.ndarray  # [frames, 3, 3]: pixel ~ K @ point in camera
     rotation: np.ndarray  # [frames, 3, 3] camera_from_world
@@ -68,10 +68,10 @@ def look(capture: Capture) -> Views:
     rows = rows[:: math.ceil(len(rows) * math.prod(capture.size) / MOST_PIXELS)]
     image = capture.images[rows]
     grey = np.ascontiguousarray(image.mean(-1) / 255, np.float32)
-    filmed = ~plain(capture, rows)
+    valid = ~plain(capture, rows)
     if capture.valid is not None:
         # What is sampled at the rim of a black corner is half black.
-        filmed &= nd.binary_erosion(
+        valid &= nd.binary_erosion(
             capture.valid[rows], np.ones((1, 5, 5)), border_value=1
         )
     cameras = capture.cameras
@@ -81,8 +81,8 @@ def look(capture: Capture) -> Views:
         time=capture.times[rows].astype(np.float64),
         image=image,
         grey=grey,
-        filmed=filmed,
-        textured=filmed & np.stack([_textured(one) for one in grey]),
+        valid=valid,
+        textured=valid & np.stack([_textured(one) for one in grey]),
         intrinsics=np.stack([_matrix(cameras, row) for row in rows]),
         rotation=cameras.camera_from_world[rows].astype(np.float64),
         position=cameras.position[rows].astype(np.float64),

@@ -110,8 +110,8 @@ def _energy(signed, matrix):
 
 @_energy.defjvp
 def _energy_jvp(signed, primals, tangents):
-    energy, slope = _energy_and_slope(signed, primals[0])
-    return energy, jnp.sum(slope * tangents[0])
+    energy, grad = _energy_and_slope(signed, primals[0])
+    return energy, jnp.sum(grad * tangents[0])
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -121,9 +121,9 @@ def _energy_and_slope(signed, matrix):
 
 def _energy_of(left, values, right):
     """Σ f(σ) and U diag(f'(σ)) Vᵀ."""
-    slope = _diagonal([_log_sq_slope(value) for value in values])
+    grad = _diagonal([_log_sq_slope(value) for value in values])
     energy = sum(_log(value) ** 2 for value in values)
-    return energy, _stacked(_outer(left, slope, right))
+    return energy, _stacked(_outer(left, grad, right))
 
 
 @_energy_and_slope.defjvp
@@ -140,9 +140,9 @@ def _energy_and_slope_jvp(signed, primals, tangents):
     twist = (_log_sq_slope(one) + _log_sq_slope(other)) / total
     flip = _slope_difference(one, other)
     bent = (flip * (turned + turned.T) + twist * (turned - turned.T)) / 2
-    energy, slope = _energy_of(left, values, right)
+    energy, grad = _energy_of(left, values, right)
     change = _stacked(_outer(left, _entries(bent), right))
-    return (energy, slope), (jnp.sum(slope * tangents[0]), change)
+    return (energy, grad), (jnp.sum(grad * tangents[0]), change)
 
 
 @jax.custom_jvp
@@ -153,8 +153,8 @@ def _strain_energy(strain):
 
 @_strain_energy.defjvp
 def _strain_energy_jvp(primals, tangents):
-    energy, slope = _strain_energy_and_slope(primals[0])
-    return energy, jnp.sum(slope * tangents[0])
+    energy, grad = _strain_energy_and_slope(primals[0])
+    return energy, jnp.sum(grad * tangents[0])
 
 
 @jax.custom_jvp
@@ -163,9 +163,9 @@ def _strain_energy_and_slope(strain):
 
 
 def _strain_energy_of(values, basis):
-    slope = _diagonal([jnp.log1p(value) / (2 * (1 + value)) for value in values])
+    grad = _diagonal([jnp.log1p(value) / (2 * (1 + value)) for value in values])
     energy = sum(jnp.log1p(value) ** 2 for value in values) / 4
-    return energy, _stacked(_outer(basis, slope, basis))
+    return energy, _stacked(_outer(basis, grad, basis))
 
 
 @_strain_energy_and_slope.defjvp
@@ -177,9 +177,9 @@ def _strain_energy_and_slope_jvp(primals, tangents):
     bent = turned * _log_quotient_difference(
         jnp.abs(one - other) / (1 + less), jnp.log1p(less), (1 + one) * (1 + other)
     )
-    energy, slope = _strain_energy_of(values, basis)
+    energy, grad = _strain_energy_of(values, basis)
     change = _stacked(_outer(basis, _entries(bent / 2), basis))
-    return (energy, slope), (jnp.sum(slope * tangents[0]), change)
+    return (energy, grad), (jnp.sum(grad * tangents[0]), change)
 
 
 def _log(stretch):

@@ -43,10 +43,10 @@ def _series(order, angle_sq):
 def _series_jvp(order, primals, tangents):
     """c_k' = (k c_{k+2} - c_{k+1}) / 2: shared between orders, never short a term."""
     (angle_sq,), (angle_sq_dot,) = primals, tangents
-    slope = -_series(order + 1, angle_sq) / 2
+    grad = -_series(order + 1, angle_sq) / 2
     if order:
-        slope = slope + order / 2 * _series(order + 2, angle_sq)
-    return _series(order, angle_sq), slope * angle_sq_dot
+        grad = grad + order / 2 * _series(order + 2, angle_sq)
+    return _series(order, angle_sq), grad * angle_sq_dot
 
 
 def _closed(order, angle_sq):

@@ -57,7 +57,8 @@ class MLPSpec:
 
     `heads` pairs names with read-outs; without any the network returns its last hidden
     layer. `skips` counts from 0 and names the layer that reads the concatenation
-    [hidden, input]: (4,) is the NeRF trunk.
+    [hidden, input]: the trunk of NeRF, which joins the input to what its fifth layer
+    answers, is (5,); that of Nerfies, which joins it to the fourth's, is (4,).
     """
 
     inputs: int

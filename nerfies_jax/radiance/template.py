@@ -27,7 +27,7 @@ class TemplateSpec:
     direction: EncodingSpec | None = EncodingSpec(4)
     depth: int = 8
     width: int = 256
-    skips: tuple[int, ...] = (4,)  # layers that read the input again
+    skips: tuple[int, ...] = (5,)  # layers that read the input again; counted from 0
     colour_width: int = 128
     density: str = "softplus"
     density_bias: float = 0.0  # added before the activation; negative starts emptier

@@ -24,7 +24,7 @@ class Evaluations(NamedTuple):
     every_seconds: float  # of training
 
 
-class Film(NamedTuple):
+class FilmPlan(NamedTuple):
     """How many frames of which size, shown how fast."""
 
     frames: int
@@ -53,7 +53,7 @@ def halves(frame_seconds: float, share: float, heldout: int) -> int:
     return _clamped(FIT_SECONDS, frame_seconds * (1 + share), least, heldout)
 
 
-def film(frame_seconds: float, size: tuple[int, int]) -> Film:
+def film(frame_seconds: float, size: tuple[int, int]) -> FilmPlan:
     """A film that renders within its time at `frame_seconds` for a frame of `size`.
 
     Fewer frames first, shown slower; then pictures of half the size, a quarter of the
@@ -62,7 +62,7 @@ def film(frame_seconds: float, size: tuple[int, int]) -> Film:
     while LEAST_FILMED * frame_seconds > FILM_SECONDS and min(size) // 2 >= LEAST_SIDE:
         size, frame_seconds = (size[0] // 2, size[1] // 2), frame_seconds / 4
     frames = _clamped(FILM_SECONDS, frame_seconds, LEAST_FILMED, MOST_FILMED)
-    return Film(frames, size, frames / FILM_LENGTH)
+    return FilmPlan(frames, size, frames / FILM_LENGTH)
 
 
 def _clamped(seconds, frame_seconds, least, most):

@@ -62,15 +62,13 @@ def measure(
     try:
         truth = protocol.stored_truth(capture)
         if truth is not None:
-            known = protocol.known(capture, truth, len(scored.rows), TRACKS)
+            known = protocol.ground_truth(capture, truth, len(scored.rows), TRACKS)
     except ValueError as error:
         notes.append(f"No points were followed: {error}")
     if known is not None:
-        kind, own = run.representation, run.effects
-        followed = kind.follow(
-            run.spec, run.metadata, state, capture, known, effects=own
-        )
-        move = kind.mover(run.spec, run.metadata, effects=own)
+        kind, scene = run.representation, (run.spec, run.metadata)
+        followed = kind.follow(*scene, state, capture, known, effects=run.effects)
+        move = kind.mover(*scene, effects=run.effects)
         if move is not None:
             flow = model_flow.heldout_flow(move, state, capture, scored)
     if extra.camera_fits:

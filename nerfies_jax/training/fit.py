@@ -111,15 +111,15 @@ def refine_camera(
     def unscaled(step):
         return residuals(_stepped(camera, step, spec.unknowns)).reshape(-1)
 
-    slopes = jax.jacfwd(unscaled)(start)
-    if slopes.shape[0] < start.size:
+    grads = jax.jacfwd(unscaled)(start)
+    if grads.shape[0] < start.size:
         raise ValueError(
-            f"{slopes.shape[0]} residuals cannot determine {start.size} unknowns "
+            f"{grads.shape[0]} residuals cannot determine {start.size} unknowns "
             f"{spec.unknowns}; give more, or fewer unknowns"
         )
     # Damping treats all unknowns alike, so they get columns of equal length, and rad,
     # scene units and logarithms of focal length become comparable.
-    lengths = jnp.sqrt(jnp.sum(slopes**2, axis=0))
+    lengths = jnp.sqrt(jnp.sum(grads**2, axis=0))
     largest = jnp.max(lengths)
     unit = jnp.where(largest > 0, largest, 1)
     scale = jnp.where(lengths > 0, unit / jnp.where(lengths > 0, lengths, 1), 1)
@@ -179,8 +179,8 @@ def fit_code(
     reached = flat_loss(found)
     better = jnp.isfinite(reached) & (reached <= flat_loss(flat))
     code = jnp.where(better, found, flat)
-    value, slope = jax.value_and_grad(flat_loss)(code)
-    residual = _length(slope)
+    value, grad = jax.value_and_grad(flat_loss)(code)
+    residual = _length(grad)
     converged = jnp.isfinite(value) & (residual <= tolerance)
     return Fit(rebuild(code), converged, counted(steps), residual)
 
@@ -237,26 +237,26 @@ def _optax(transformation):
         rule = optax.with_extra_args_support(transformation(max_steps))
 
         def unfinished(state):
-            _, _, _, slope, _, step = state
-            return (step < max_steps) & (_length(slope) > tolerance)
+            _, _, _, grad, _, step = state
+            return (step < max_steps) & (_length(grad) > tolerance)
 
         def descend(state):
-            code, memory, value, slope, best, step = state
+            code, memory, value, grad, best, step = state
             updates, memory = rule.update(
-                slope, memory, code, value=value, grad=slope, value_fn=loss
+                grad, memory, code, value=value, grad=grad, value_fn=loss
             )
             code = optax.apply_updates(code, updates)
-            value, slope = jax.value_and_grad(loss)(code)
+            value, grad = jax.value_and_grad(loss)(code)
             # At the rounding floor the loss no longer tells which code is better.
-            better = (value < best[1]) | (_length(slope) <= tolerance)
+            better = (value < best[1]) | (_length(grad) <= tolerance)
             best = (
                 jnp.where(better, code, best[0]),
                 jnp.where(better, value, best[1]),
             )
-            return code, memory, value, slope, best, step + 1
+            return code, memory, value, grad, best, step + 1
 
-        value, slope = jax.value_and_grad(loss)(start)
-        state = start, rule.init(start), value, slope, (start, value), jnp.int32(0)
+        value, grad = jax.value_and_grad(loss)(start)
+        state = start, rule.init(start), value, grad, (start, value), jnp.int32(0)
         *_, best, steps = lax.while_loop(unfinished, descend, state)
         return best[0], steps
 
@@ -292,8 +292,8 @@ def _stepped(camera, step, unknowns):
 
 def _settled(residuals, step, tolerance):
     """Whether the next Gauss-Newton step is small and well determined."""
-    slopes = jax.jacfwd(residuals)(step)
-    basis, triangle = jnp.linalg.qr(slopes)
+    grads = jax.jacfwd(residuals)(step)
+    basis, triangle = jnp.linalg.qr(grads)
     values = jnp.linalg.svd(triangle, compute_uv=False)
     determined = values[-1] > DETERMINED * values[0]
     onward = jax.scipy.linalg.solve_triangular(triangle, basis.T @ residuals(step))

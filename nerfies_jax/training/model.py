@@ -90,12 +90,12 @@ class Event(NamedTuple):
 class Stages(NamedTuple):
     """`Model.render` in three parts, so that nothing is computed twice.
 
-    `draw(params, pose(params, prepare(params), time), view, size, step)` is the picture
+    `draw(params, deform(params, prepare(params), time), view, size, step)` is what
     that `render` gives, to rounding.
     """
 
     prepare: Callable[[PyTree], PyTree]  # once for trained parameters
-    pose: Callable[[PyTree, PyTree, Float[Array, ""]], PyTree]  # once for an instant
+    deform: Callable[[PyTree, PyTree, Float[Array, ""]], PyTree]  # once for an instant
     draw: Callable[[PyTree, PyTree, View, tuple[int, int], Int[Array, ""]], Rendering]
 
 

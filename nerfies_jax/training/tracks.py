@@ -157,8 +157,8 @@ def _is_root(displace, params, canonical_point, point, spec):
 
 
 def _solves(displace, params, canonical_point, point, spec):
-    slopes = jnp.eye(3, dtype=point.dtype) + jax.jacfwd(displace, 1)(params, point)
-    upright = jnp.dot(slopes[0], jnp.cross(slopes[1], slopes[2])) > 0
+    grads = jnp.eye(3, dtype=point.dtype) + jax.jacfwd(displace, 1)(params, point)
+    upright = jnp.dot(grads[0], jnp.cross(grads[1], grads[2])) > 0
     return upright & _is_root(displace, params, canonical_point, point, spec)
 
 
@@ -180,8 +180,8 @@ def _continued(displace, params, canonical_point, steps):
     """One Newton step on x + s d(x) = c for each of `steps` values of s up to 1."""
 
     def step(point, share):
-        move, slopes = displace(params, point), jax.jacfwd(displace, 1)(params, point)
-        jacobian = jnp.eye(3, dtype=point.dtype) + share * slopes
+        move, grads = displace(params, point), jax.jacfwd(displace, 1)(params, point)
+        jacobian = jnp.eye(3, dtype=point.dtype) + share * grads
         excess = point + share * move - canonical_point
         moved = point - jnp.linalg.solve(jacobian, excess)
         # Singular on the way, as a half turn is at s = 1/2, and regular after it.

@@ -137,8 +137,8 @@ def test_other_lenses_are_undistorted_to_where_their_rays_point(tmp_path, lens):
     y, x = np.mgrid[:64, :96] + 0.5
     rays = theirs.cam_from_img(np.stack([x.ravel(), y.ravel()], 1)).reshape(64, 96, 2)
 
-    def colour(slope):  # a slow function of the viewing direction
-        return 128 + 90 * np.sin(np.stack([3 * slope[..., 0], 4 * slope[..., 1]], -1))
+    def colour(grad):  # a slow function of the viewing direction
+        return 128 + 90 * np.sin(np.stack([3 * grad[..., 0], 4 * grad[..., 1]], -1))
 
     pixels = np.zeros((64, 96, 3))
     pixels[..., :2], pixels[..., 2] = colour(rays), 128
@@ -153,7 +153,7 @@ def test_other_lenses_are_undistorted_to_where_their_rays_point(tmp_path, lens):
     assert not one.tangential.any()
     width, height = found.size
     y, x = np.mgrid[:height, :width] + 0.5
-    slope = np.stack(
+    grad = np.stack(
         [
             (x - one.principal_point_px[0, 0]) / one.focal_px[0],
             (y - one.principal_point_px[0, 1])
@@ -163,7 +163,7 @@ def test_other_lenses_are_undistorted_to_where_their_rays_point(tmp_path, lens):
     )
     valid = np.ones((height, width), bool) if found.valid is None else found.valid[1]
     assert valid.mean() > 0.7
-    error = found.images[1][..., :2].astype(float) - colour(slope)
+    error = found.images[1][..., :2].astype(float) - colour(grad)
     # Rounding twice gives 1; the rest is bilinear interpolation of a slow function.
     assert np.abs(error[valid]).max() < 1.6
 

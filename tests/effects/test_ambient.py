@@ -137,14 +137,14 @@ def test_while_shut_the_template_reads_zeros_and_nothing_learns(spec, dtype, rng
         return jax.tree.map(np.asarray, read(params, still.codes, np.int32(step)))
 
     for step in (0, 1000):
-        slopes, lifted = found(step)
+        grads, lifted = found(step)
         assert np.all(lifted == 0)
-        for slope in jax.tree.leaves(slopes):
-            assert np.all(slope == 0)
+        for grad in jax.tree.leaves(grads):
+            assert np.all(grad == 0)
     # and just after it has begun to open, both do
-    slope = found(1500)[0][1][made.tables[0].name]
-    assert np.all(slope != 0)
-    assert np.all(np.isfinite(slope))
+    grad = found(1500)[0][1][made.tables[0].name]
+    assert np.all(grad != 0)
+    assert np.all(np.isfinite(grad))
 
 
 def test_identity_is_never_shut(dtype, rng):

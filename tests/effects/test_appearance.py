@@ -165,8 +165,8 @@ def test_codes_of_every_preset_learn(name):
         )
         return weighted_sum(terms)
 
-    slope = jax.jit(jax.grad(loss))(params["codes"]["appearance"])
-    assert np.all(np.isfinite(slope))
+    grad = jax.jit(jax.grad(loss))(params["codes"]["appearance"])
+    assert np.all(np.isfinite(grad))
     rows = np.unique(frames.appearance[batch.row])
-    assert np.all(np.any(slope[rows] != 0, axis=1)), slope
-    assert np.linalg.norm(slope) > 1e-6
+    assert np.all(np.any(grad[rows] != 0, axis=1)), grad
+    assert np.linalg.norm(grad) > 1e-6

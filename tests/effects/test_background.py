@@ -112,11 +112,11 @@ def test_a_still_warp_costs_nothing_and_has_a_finite_slope(dtype, rng):
             return background.drift(BackgroundSpec(), here)
 
         shift = jnp.full(3, size, dtype)
-        value, slope = jax.jit(jax.value_and_grad(drift))(shift)
+        value, grad = jax.jit(jax.value_and_grad(drift))(shift)
         assert 0 <= value < 1e-25
-        assert np.all(np.isfinite(slope))
+        assert np.all(np.isfinite(grad))
         # ρ is 1e-3 s / (2e-6) there
-        np.testing.assert_allclose(slope, 1e3 * size, rtol=1e-5)
+        np.testing.assert_allclose(grad, 1e3 * size, rtol=1e-5)
 
 
 def test_gradients(float64, rng):

@@ -130,11 +130,11 @@ def test_folds_cost_more_than_any_stretch_and_by_their_volume(name, dtype):
 @pytest.mark.parametrize("name", HARD)
 @pytest.mark.parametrize("spec_name", ["default", "squared"])
 def test_every_jacobian_has_a_finite_cost_and_slope(name, spec_name, dtype):
-    value, slope = of_hard(spec_name, name, dtype)
+    value, grad = of_hard(spec_name, name, dtype)
     assert np.isfinite(value)
-    assert np.all(np.isfinite(slope))
+    assert np.all(np.isfinite(grad))
     if name in ("rank two", "mirror", "turned mirror", "inside out", "just folded"):
-        assert np.linalg.norm(slope) > 1e-3
+        assert np.linalg.norm(grad) > 1e-3
 
 
 @pytest.mark.parametrize("name", ["random", "strong", *FOLDS])
@@ -144,13 +144,13 @@ def test_slopes_of_the_cost(name, robust_width, float64):
     if name in ("mirror", "inside out"):
         matrix = matrix + 0.05 * OTHER  # off the corner that equal σ make of σ3
     spec, at = ElasticSpec(robust_width=robust_width), jnp.asarray(matrix - np.eye(3))
-    _, slope = cost_and_slope(spec, at)
+    _, grad = cost_and_slope(spec, at)
     for seed in range(4):
         along = np.random.default_rng(seed).normal(size=(3, 3))
         step = 1e-6 * along / np.linalg.norm(along)
         difference = float(cost(spec, at + step) - cost(spec, at - step)) / 2
-        error = abs(difference - np.sum(slope * step))
-        assert error < 1e-6 * 1e-6 * np.linalg.norm(slope)
+        error = abs(difference - np.sum(grad * step))
+        assert error < 1e-6 * 1e-6 * np.linalg.norm(grad)
 
 
 @pytest.mark.hard_cases
@@ -159,12 +159,12 @@ def test_a_fold_is_pulled_open_all_the_way(dtype):
 
     Without `fold_cost` a mirror image is at rest and a half-folded one slides there.
     """
-    slope, free = (
+    grad, free = (
         hard_costs(dtype)[name][1][len(HARD) :, 2, 2]
         for name in ("default", "official")
     )
-    assert np.all(slope < 0)
-    assert np.all(slope[STRETCHES < -1e-6] < -0.9)
+    assert np.all(grad < 0)
+    assert np.all(grad[STRETCHES < -1e-6] < -0.9)
     assert np.all(free[(STRETCHES > -0.99) & (STRETCHES < -0.05)] > 0)
 
 
@@ -331,8 +331,8 @@ def test_gradients_reach_the_warp_and_not_the_weights(points, setting):
         step=1e-6,
     )
     assert error < 1e-5
-    slope = jax.jit(jax.grad(total, 2))(setting.params, codes, setting.weight)
-    np.testing.assert_array_equal(slope, 0)
+    grad = jax.jit(jax.grad(total, 2))(setting.params, codes, setting.weight)
+    np.testing.assert_array_equal(grad, 0)
 
 
 @pytest.mark.hard_cases
@@ -351,10 +351,10 @@ def test_a_batch_of_empty_rays_costs_nothing(dtype):
         )
 
     matrix = np.asarray(TURN + 0.1, dtype)
-    (value, folded), slope = jax.jit(jax.value_and_grad(total, has_aux=True))(matrix)
+    (value, folded), grad = jax.jit(jax.value_and_grad(total, has_aux=True))(matrix)
     assert value == 0
     assert folded == 0
-    assert np.all(slope == 0)
+    assert np.all(grad == 0)
 
 
 def test_terms_and_schedule(setting):

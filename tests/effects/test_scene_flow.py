@@ -119,13 +119,13 @@ def slopes_of(params, frames, batch, arrays, gap):
 
 @pytest.mark.hard_cases
 def test_the_first_and_the_last_moment_have_one_neighbour(float64):
-    (_, slope), _ = slopes_of(*scenario("float64"), 1 / 3)
-    strength = {name: np.abs(np.asarray(x)).sum((1, -1)) for name, x in slope.items()}
+    (_, grad), _ = slopes_of(*scenario("float64"), 1 / 3)
+    strength = {name: np.abs(np.asarray(x)).sum((1, -1)) for name, x in grad.items()}
     rows = np.array(ROWS)
     for name, missing in (("flow_forward", MOMENTS - 1), ("flow_backward", 0)):
         assert (strength[name][rows == missing] == 0).all()
         assert (strength[name][rows != missing] > 0).all()
-    hidden = np.abs(np.asarray(slope["disocclusion"])).sum(1)  # rays, sides
+    hidden = np.abs(np.asarray(grad["disocclusion"])).sum(1)  # rays, sides
     assert (hidden[rows == MOMENTS - 1, 0] == 0).all()
     assert (hidden[rows == 0, 1] == 0).all()
 
@@ -135,13 +135,13 @@ def test_a_single_moment_has_no_neighbours_and_no_flow_to_learn(dtype):
     params, frames, batch, arrays = scenario(dtype)
     still = frames._replace(times=np.zeros(MOMENTS, dtype))
     found = slopes_of(params, still, batch, arrays, scene_flow.interval(1))
-    (slope, _), terms = jax.tree.map(np.asarray, found)
+    (grad, _), terms = jax.tree.map(np.asarray, found)
     for name in ("warped", "cycle", "disocclusion", "magnitude", "kinetic", "flow"):
         assert terms[name].value == 0, name
     assert terms["dynamic"].value > 0
-    assert (slope.flow.weight == 0).all()
-    assert (slope.flow.bias == 0).all()
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slope))
+    assert (grad.flow.weight == 0).all()
+    assert (grad.flow.bias == 0).all()
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(grad))
 
 
 def test_interval_of_moments():
@@ -295,9 +295,9 @@ def test_what_is_surely_hidden_keeps_a_slope(dtype):
         found = scene_flow.neighbour(TINY, 1 / 3, params, context, scene_flow.FORWARD)
         return jnp.mean(found.visible)
 
-    value, slope = visible(sure)
+    value, grad = visible(sure)
     np.testing.assert_allclose(value, np.exp(-40.0), rtol=2e-5)
-    np.testing.assert_allclose(slope.disocclusion.bias, [-np.exp(-40.0), 0], rtol=2e-5)
+    np.testing.assert_allclose(grad.disocclusion.bias, [-np.exp(-40.0), 0], rtol=2e-5)
 
 
 @pytest.mark.hard_cases

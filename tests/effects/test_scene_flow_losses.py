@@ -17,9 +17,9 @@ settle = jax.jit(flow_losses.settle)
 @pytest.mark.hard_cases
 def test_a_weighted_mean_of_nothing_is_zero_with_a_slope_of_zero(dtype):
     values, weight = np.ones((3, 2), dtype), np.zeros(3, dtype)
-    value, slope = weighted_mean(values, weight)
+    value, grad = weighted_mean(values, weight)
     assert float(value) == 0
-    assert (np.asarray(slope) == 0).all()
+    assert (np.asarray(grad) == 0).all()
 
 
 @pytest.mark.hard_cases
@@ -43,9 +43,9 @@ def test_rays_that_are_not_present_teach_nothing(float64):
         "kinetic": lambda f: flow_losses.kinetic(f, 0.3 * f, present),
     }
     for name, term in terms.items():
-        slope = jax.grad(term)(flow)
-        assert (slope[1] == 0).all(), name
-        assert (slope[0] != 0).any(), name
+        grad = jax.grad(term)(flow)
+        assert (grad[1] == 0).all(), name
+        assert (grad[0] != 0).any(), name
 
 
 def test_closed_forms_of_a_straight_path():
@@ -76,19 +76,19 @@ def test_magnitude_sums_samples_not_axes(float64):
 def test_what_moves_does_not_turn_transparent_for_it(float64):
     weight, flow = jnp.full((2, 3), 0.3), jnp.ones((2, 3, 3))
     present = jnp.ones(2, bool)
-    slope = jax.grad(lambda w: flow_losses.magnitude(flow, w, present))(weight)
-    assert (slope == 0).all()
+    grad = jax.grad(lambda w: flow_losses.magnitude(flow, w, present))(weight)
+    assert (grad == 0).all()
 
 
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("logit", [-1e4, -100.0, -17.0, 0.0, 17.0, 100.0, 1e4])
 def test_entropy_is_finite_however_sure_it_is(dtype, logit):
-    value, slope = entropy(np.full((1, 1), logit, dtype))
+    value, grad = entropy(np.full((1, 1), logit, dtype))
     share = 1 / (1 + np.exp(-min(max(logit, -600), 600)))
     expected = -share * -np.log1p(np.exp(-min(max(logit, -600), 600)))
     expected = abs(expected)
     np.testing.assert_allclose(value, expected, rtol=1e-5, atol=1e-37)
-    assert np.isfinite(slope).all()
+    assert np.isfinite(grad).all()
 
 
 @pytest.mark.hard_cases
@@ -128,13 +128,13 @@ def test_depth_is_compared_up_to_scale_and_offset(dtype):
 def test_depths_without_a_spread_stay_finite(dtype, depth, count):
     target = np.asarray([1.0, 3.0, 2.0, 5.0], dtype)
     found = normalised_depth(np.asarray(depth, dtype), target, np.arange(4) < count)
-    value, slope = map(np.asarray, found)
+    value, grad = map(np.asarray, found)
     assert np.isfinite(value)
     assert value < 10
-    assert np.abs(slope).max() <= 5 / flow_losses.FLATTEST / max(max(depth), 1e-3)
+    assert np.abs(grad).max() <= 5 / flow_losses.FLATTEST / max(max(depth), 1e-3)
     if count < 2:
         assert value == 0
-        assert (slope == 0).all()
+        assert (grad == 0).all()
 
 
 def test_slopes_are_those_of_differences(float64):

@@ -126,8 +126,8 @@ def test_the_trunk_learns_from_the_transient(float64, rng):
 
     args = (params, found.features, when.codes["transient"])
     assert gradients.directional_error(read, *args, step=1e-6) < 1e-7
-    slope = jax.grad(read, argnums=1)(*args)
-    assert np.all(np.abs(slope) > 1e-4)
+    grad = jax.grad(read, argnums=1)(*args)
+    assert np.all(np.abs(grad) > 1e-4)
 
 
 @pytest.mark.hard_cases
@@ -167,12 +167,12 @@ def test_a_ray_that_meets_no_transient_has_the_least_uncertainty(dtype):
         ), rays
 
     found = jax.jit(jax.grad(loss, argnums=(0, 1), has_aux=True))(weights, beta)
-    slopes, rays = jax.tree.map(np.asarray, found)
+    grads, rays = jax.tree.map(np.asarray, found)
     np.testing.assert_array_equal(rays, np.full(2, 0.03, dtype))
-    assert np.all(np.isfinite(slopes[0]))
-    assert np.all(slopes[1] == 0)
+    assert np.all(np.isfinite(grads[0]))
+    assert np.all(grads[1] == 0)
     # A residual above beta asks for more transient: the medium can come alive
-    assert np.all(slopes[0] < 0)
+    assert np.all(grads[0] < 0)
 
 
 def rays_of(dtype, rng, count=9):
@@ -200,26 +200,26 @@ def test_photometric_holds_from_no_residual_to_a_huge_one(offset, dtype):
     colour = np.full((1, 3), offset, dtype)
     truth = np.zeros((1, 3), dtype)
     beta = np.asarray([0.03], dtype)
-    value, slopes = photometric(colour, truth, beta, np.array([True]))
+    value, grads = photometric(colour, truth, beta, np.array([True]))
     residual, b = float(colour[0, 0]), float(beta[0])
     exact = 3 * residual**2 / (2 * b**2) + math.log(b)
     tolerance = {"float32": 2e-6, "float64": 1e-14}[dtype]
     np.testing.assert_allclose(value, exact, rtol=tolerance)
-    np.testing.assert_allclose(slopes[0], [[residual / b**2] * 3], rtol=tolerance)
+    np.testing.assert_allclose(grads[0], [[residual / b**2] * 3], rtol=tolerance)
     exact = -3 * residual**2 / b**3 + 1 / b
-    np.testing.assert_allclose(slopes[2], [exact], rtol=2 * tolerance)
+    np.testing.assert_allclose(grads[2], [exact], rtol=2 * tolerance)
 
 
 @pytest.mark.hard_cases
 def test_beta_is_best_at_the_length_of_the_residual_and_the_loss_is_bounded(float64):
     residual, zero = np.array([[0.3, 0.0, 0.4]]), np.zeros((1, 3))  # of length 0.5
-    slope = {
+    grad = {
         b: photometric(residual, zero, np.array([b]), None) for b in (0.4, 0.5, 0.6)
     }
-    slope = {b: float(slopes[2][0]) for b, (_, slopes) in slope.items()}
-    assert abs(slope[0.5]) < 1e-14
-    assert slope[0.4] < 0
-    assert slope[0.6] > 0
+    grad = {b: float(grads[2][0]) for b, (_, grads) in grad.items()}
+    assert abs(grad[0.5]) < 1e-14
+    assert grad[0.4] < 0
+    assert grad[0.6] > 0
     least, _ = photometric(zero, zero, np.array([0.03]), None)
     assert abs(float(least) - math.log(0.03)) < 1e-14
 
@@ -233,13 +233,13 @@ def test_unfilmed_pixels_teach_nothing_whatever_they_hold(hole, dtype, rng):
     broken = [leaf.copy() for leaf in whole]
     for leaf in broken:
         leaf[1] = hole
-    value, slopes = jax.tree.map(np.asarray, photometric(*broken, valid))
+    value, grads = jax.tree.map(np.asarray, photometric(*broken, valid))
     np.testing.assert_allclose(
         value, loss_by_hand(colour, truth, beta, valid), rtol=2e-6
     )
-    for slope in slopes:
-        assert np.all(np.isfinite(slope))
-        assert np.all(slope[1] == 0)
+    for grad in grads:
+        assert np.all(np.isfinite(grad))
+        assert np.all(grad[1] == 0)
     nothing, _ = photometric(*broken, np.zeros(3, bool))
     assert float(nothing) == 0
 

@@ -150,15 +150,15 @@ def test_every_warp_starts_as_the_identity(kind, anneal_steps, rng):
             return jnp.sum(squared), jnp.max(squared)
 
         over_steps = jax.vmap(jax.grad(total, has_aux=True), (None, 0))
-        slopes, longest = over_steps(params, jnp.asarray([0, 1000]))
-        return slopes.hidden[-1], jnp.sqrt(longest)
+        grads, longest = over_steps(params, jnp.asarray([0, 1000]))
+        return grads.hidden[-1], jnp.sqrt(longest)
 
     for seed in range(5):
-        slopes, longest = run(started(spec, jax.random.key(seed), FLOAT32))
+        grads, longest = run(started(spec, jax.random.key(seed), FLOAT32))
         assert np.min(longest) > 0
         assert np.max(longest) < 1.2e-4
         # and it is not stuck there
-        assert all(np.any(np.asarray(leaf)[1] != 0) for leaf in jax.tree.leaves(slopes))
+        assert all(np.any(np.asarray(leaf)[1] != 0) for leaf in jax.tree.leaves(grads))
 
 
 @pytest.mark.hard_cases
@@ -236,9 +236,9 @@ def test_time_zero_is_the_template(kind, dtype, rng):
         return pair(*args), jax.jacfwd(moved, 1)(*args)
 
     given = (params, point, np.asarray(0, dtype))
-    (value, slopes), jacobian = jax.tree.map(np.asarray, every(*given))
+    (value, grads), jacobian = jax.tree.map(np.asarray, every(*given))
     assert value == 0
-    assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(slopes))
+    assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(grads))
     np.testing.assert_array_equal(jacobian, 0)
     (after, _), _ = every(params, point, np.asarray(1e-30, dtype))
     assert after > 1e-3
@@ -362,13 +362,13 @@ def test_strain_keeps_its_slopes_through_the_encoding(times_pi, place):
     Far from the origin too, where π rounded in before the sine reduces leaves float32
     slopes of the strain 1e-2 off.
     """
-    slopes = {}
+    grads = {}
     for kind in ("float32", "float64"):
         with jax.enable_x64(kind == "float64"):
             params = bent(encoded(times_pi), "float32")
             point = np.float32(place) * np.array([1.0, -0.7, 0.4], np.float32)
             args = jax.tree.map(lambda x, k=kind: x.astype(k), (params, point))
             found = jax.tree.leaves(strain_slopes(times_pi, *args))
-            slopes[kind] = [np.asarray(x, np.float64) for x in found]
-    for narrow, wide in zip(*slopes.values(), strict=True):
+            grads[kind] = [np.asarray(x, np.float64) for x in found]
+    for narrow, wide in zip(*grads.values(), strict=True):
         assert np.abs(narrow - wide).max() <= 2e-5 * np.abs(wide).max()

@@ -95,7 +95,10 @@ def test_every_number_is_that_of_a_direct_computation(rng, filmed):
     truth = capture.images[rows] / 255
     known = valid[rows] if filmed else np.ones_like(valid[rows])
     moving = capture.moving[rows]
-    for name, mask in (("moving", moving & known), ("still", ~moving & known)):
+    for name, mask in (
+        ("moving", moving & known),
+        ("still", ~moving & known),
+    ):
         frames = zip(picture, truth, mask, strict=True)
         exact = np.mean([psnr(*frame) for frame in frames])
         assert found[f"heldout.{name}_psnr"] == pytest.approx(exact, abs=1e-4)
@@ -266,7 +269,7 @@ def test_a_run_is_held_against_the_truth_of_its_scene(kind, filmed, rng):
     assert set(found) == ALWAYS | MASKED | DEPTHS | TRUTH | strain
 
     truth = protocol.stored_truth(capture)
-    known = protocol.known(capture, truth, 2, quality.TRACKS)
+    known = protocol.ground_truth(capture, truth, 2, quality.TRACKS)
     followed = run.representation.follow(run.spec, run.metadata, state, capture, known)
     assert np.abs(followed.path - known.start_points[:, None]).max() > 1e-3
     seen = known.seen.copy()

@@ -7,7 +7,7 @@ import pytest
 
 from nerfies_jax.capture import synthetic
 from nerfies_jax.evaluation import protocol
-from nerfies_jax.evaluation.protocol import Followed
+from nerfies_jax.evaluation.protocol import PointTracks
 from tests import scenes
 
 SHIFT = np.float32([0.012, 0.0, 0.016])  # 0.02 long
@@ -17,7 +17,7 @@ SHIFT = np.float32([0.012, 0.0, 0.016])  # 0.02 long
 def filmed():
     film = dataclasses.replace(scenes.TINY_FILM, heldout_every=2)
     capture, truth = synthetic.make(film)
-    return capture, truth, protocol.known(capture, truth, 2, 5)
+    return capture, truth, protocol.ground_truth(capture, truth, 2, 5)
 
 
 def test_the_known_paths_are_those_of_points_seen_at_the_start(filmed):
@@ -37,7 +37,7 @@ def test_the_known_paths_are_those_of_points_seen_at_the_start(filmed):
 def test_a_scaled_capture_has_its_paths_in_scene_units(filmed):
     capture, truth, known = filmed
     other = dataclasses.replace(capture, scale=2.0, centre=(0.1, 0.2, -0.3))
-    found = protocol.known(other, truth, 2, 5)
+    found = protocol.ground_truth(other, truth, 2, 5)
     expected = 2 * (known.path - np.float32([0.1, 0.2, -0.3]))
     np.testing.assert_allclose(found.path, expected, atol=1e-6)
 
@@ -45,14 +45,14 @@ def test_a_scaled_capture_has_its_paths_in_scene_units(filmed):
 def test_the_truth_of_another_capture_is_refused(filmed):
     capture, truth, _ = filmed
     with pytest.raises(ValueError, match="other frames than the capture"):
-        protocol.known(capture, truth._replace(ids=truth.ids[1:]), 2, 5)
+        protocol.ground_truth(capture, truth._replace(ids=truth.ids[1:]), 2, 5)
 
 
 def test_tracks_are_scored_by_their_distance_at_all_instants_but_the_start(filmed):
     known = filmed[2]._replace(seen=np.ones_like(filmed[2].seen))
     found = np.ones(known.seen.shape, bool)
     found[0, 4:6] = False
-    right = Followed(known.path, found, 0.1, 0.2)
+    right = PointTracks(known.path, found, 0.1, 0.2)
     later = found[:, 1:].size  # all but one column
     numbers = protocol.score_tracks(known, right)
     assert numbers["track_error"] == 0
@@ -71,7 +71,7 @@ def test_tracks_are_scored_by_their_distance_at_all_instants_but_the_start(filme
     assert numbers["track_error"] == pytest.approx(0.02, rel=1e-4)
     away = np.linalg.norm(known.path - known.path[:, 3:4], axis=-1)
     away = np.delete(away, 3, axis=1)
-    assert protocol.still_error(known) == pytest.approx(away.mean(), rel=1e-5)
+    assert protocol.static_error(known) == pytest.approx(away.mean(), rel=1e-5)
     assert away.mean() > 1e-3
     nothing = protocol.score_tracks(known, None)
     assert np.isnan(list(nothing.values())).all()
@@ -79,14 +79,14 @@ def test_tracks_are_scored_by_their_distance_at_all_instants_but_the_start(filme
 
 def test_a_real_capture_is_judged_by_its_pictures_alone(filmed):
     capture, _, known = filmed
-    found = protocol.filmed(capture, 2)
+    found = protocol.held_out_only(capture, 2)
     np.testing.assert_array_equal(found.rows, known.rows)
     np.testing.assert_array_equal(found.moments, known.moments)
 
     assert np.isnan(list(protocol.score_tracks(found, None).values())).all()
-    assert np.isnan(protocol.still_error(found))
+    assert np.isnan(protocol.static_error(found))
     blind = dataclasses.replace(
         capture, train=np.arange(len(capture.ids)), heldout=np.zeros(0, int)
     )
     with pytest.raises(ValueError, match="no held-out frames to judge by"):
-        protocol.filmed(blind, 2)
+        protocol.held_out_only(blind, 2)

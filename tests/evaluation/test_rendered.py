@@ -81,19 +81,19 @@ class Counted:
             self._count("prepare")
             return {"basis": 2 * params["weight"]}
 
-        def pose(params, prepared, time):
+        def deform(params, prepared, time):
             self._count("pose")
             return params["mean"] + time * prepared["basis"]
 
-        def draw(params, posed, view, size, step):
+        def draw(params, deformed, view, size, step):
             self._count("draw")
-            return flat(jnp.sum(posed), view, size, step)
+            return flat(jnp.sum(deformed), view, size, step)
 
         def render(params, view, size, step):
             del params, view, size, step
             raise AssertionError("a model with stages is drawn by them")
 
-        stages = Stages(prepare, pose, draw)
+        stages = Stages(prepare, deform, draw)
         self.model = MODEL._replace(render=render, stages=stages)
 
     def _count(self, name):
@@ -139,7 +139,7 @@ def test_a_renderer_keeps_what_stays_and_drops_what_changes():
         equal = params | {name: params[name] + 0.0}  # of equal value, but another array
         assert drawn(equal, here) == (1, 1, 1)
         assert drawn(params, later) == (1, 1, 1)
-    assert renderer.posed_anew == [True, False, False, *[True] * 8]
+    assert renderer.deformed_anew == [True, False, False, *[True] * 8]
 
 
 def test_nothing_is_kept_of_arrays_that_can_be_written_into():
@@ -159,7 +159,7 @@ def test_nothing_is_kept_of_arrays_that_can_be_written_into():
 def test_a_frame_costs_what_it_costs_with_its_share_of_the_poses():
     renderer = evaluation.Renderer(MODEL, SIZE)
     renderer.seconds = [9.0, 0.010, 0.002, 0.030, 0.004, 0.010, 0.003]
-    renderer.posed_anew = [True, True, False, True, False, True, False]
+    renderer.deformed_anew = [True, True, False, True, False, True, False]
     # Medians 0.010 of the three new instants and 0.003 of the other three.
     np.testing.assert_allclose(renderer.ms_per_frame(6), (3 * 10 + 3 * 3) / 6)
     np.testing.assert_allclose(renderer.ms_per_frame(1), 3)

@@ -53,15 +53,15 @@ def film(
     width, height = SIZE
     times = np.linspace(0, 1, frames)
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    slope = np.stack([x - width / 2, y - height / 2]) / FOCAL
+    grad = np.stack([x - width / 2, y - height / 2]) / FOCAL
     images = np.zeros((frames, height, width, 3), np.uint8)
     moving = np.zeros((frames, height, width), bool)
     depths = np.full((frames, height, width), FAR, np.float32)
     positions = np.array([camera(time) for time in times], np.float32)
     for row, time in enumerate(times):
         eye = positions[row].astype(float)
-        wall = eye[:2, None, None] + slope * (FAR - eye[2])
-        before = eye[:2, None, None] + slope * (NEAR - eye[2])
+        wall = eye[:2, None, None] + grad * (FAR - eye[2])
+        before = eye[:2, None, None] + grad * (NEAR - eye[2])
         on = before - np.reshape(card(time), (2, 1, 1))
         hit = (np.abs(on) < half).all(0) & shown(time)
         light = np.where(hit[..., None], paint(1, *on), paint(0, *wall)) ** 2.2

@@ -11,11 +11,12 @@ import pytest
 from experiments import cli
 from experiments.ablate import __main__ as ablate
 from experiments.ablate import job as ablate_job
+from experiments.ablate import page as ablate_page
 from experiments.ablate import results, suites
 from experiments.ablate.arms import FIELDS
 from experiments.ablate.job import Job
 from experiments.ablate.measures import MEASURES
-from experiments.ablate.results import Kept
+from experiments.ablate.results import ArmResult
 from experiments.ablate.settings import Ablate
 from nerfies_jax.capture import synthetic
 from nerfies_jax.measure import clock
@@ -147,7 +148,7 @@ def test_several_processes_do_not_share_an_accelerator(tiny, monkeypatch, capsys
 
 def kept(steps, seconds, stopped_by="steps"):
     numbers = dict.fromkeys(MEASURES, 0.0) | {"train_seconds": seconds}
-    return Kept(numbers, {}, {"steps": steps, "stopped_by": stopped_by})
+    return ArmResult(numbers, {}, {"steps": steps, "stopped_by": stopped_by})
 
 
 @pytest.mark.parametrize(
@@ -241,7 +242,10 @@ def test_the_command_measures_arms_and_goes_on_where_it_stopped(
     # Three steps move nothing.
     still = metrics["still.track_error"].value
     assert metrics["nerfies.track_error"].value == pytest.approx(still, rel=0.05)
-    about = json.loads((out / "ablation.json").read_text())["about"]
+    stored = json.loads((out / "ablation.json").read_text())
+    page, about = ablate_page.page(stored), stored["about"]
+    assert f"| `nerfies` | {metrics['nerfies.psnr'].value:.2f} |" in page
+    assert "no spread to hold it against" in page
     assert about["claims"][0]["says"].endswith("no spread to hold it against")
     assert (out / "ablation.png").stat().st_size > 1000
 

@@ -17,7 +17,7 @@ SHIFT = np.float32([0.012, 0.0, 0.016])  # 0.02 long
 def filmed():
     film = dataclasses.replace(scenes.TINY_FILM, heldout_every=2)
     capture, truth = synthetic.make(film)
-    return capture, truth, protocol.known(capture, truth, 2, 5)
+    return capture, truth, protocol.ground_truth(capture, truth, 2, 5)
 
 
 def test_the_picture_shows_how_far_points_are_from_where_they_should_be(filmed):
@@ -47,7 +47,7 @@ def test_the_picture_shows_how_far_points_are_from_where_they_should_be(filmed):
 
 def test_a_real_capture_is_drawn_without_points(filmed):
     capture, _, _ = filmed
-    known = protocol.filmed(capture, 2)
+    known = protocol.held_out_only(capture, 2)
     shown = ablate_picture.shown_row(known, capture)
     row = known.rows[shown]
     picture = ablate_picture.draw(

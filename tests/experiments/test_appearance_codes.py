@@ -75,6 +75,8 @@ def test_a_short_run_writes_figures_and_a_picture(scene, keys, tmp_path):
     assert record["steps"] == 3
     assert keys <= set(record["figures"])
     assert all(np.isfinite(list(record["figures"].values())))
+    for name, value in record["figures"].items():
+        assert f"| {name} | {value:.2f} |" in appearance_codes.page(record)
     with PIL.Image.open(out / "picture.png") as picture:
         assert min(picture.size) > 240
 

@@ -10,6 +10,7 @@ import pytest
 
 from experiments.deformation_cost import __main__ as deformation_cost
 from experiments.deformation_cost import arms, knot_curve, known_motion
+from experiments.deformation_cost import page as deformation_page
 from gaussians_jax.effects import deformation, kan_motion
 from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec
@@ -52,15 +53,15 @@ def swinging(count=30):
     )
     swings = jnp.asarray(np.arange(count) % 3 == 0, jnp.float32)[:, None]
 
-    def pose(time):
+    def deform(time):
         way = swings * 0.5 * jnp.sin(2 * jnp.pi * time) * jnp.asarray([1.0, 0, 0])
         return still._replace(mean=still.mean + way)
 
-    def draw(posed, time):
-        return jnp.broadcast_to(posed.mean.mean(axis=0) / 10 + 0.5, (4, 5, 3))
+    def draw(deformed, time):
+        return jnp.broadcast_to(deformed.mean.mean(axis=0) / 10 + 0.5, (4, 5, 3))
 
     active = np.arange(count) != 3
-    return known_motion.Moving("swing", jax.jit(pose), jax.jit(draw), active)
+    return known_motion.Moving("swing", jax.jit(deform), jax.jit(draw), active)
 
 
 def test_the_curve_is_that_of_the_closed_form():
@@ -94,7 +95,7 @@ def test_the_curve_is_that_of_the_closed_form():
 
 def test_a_motion_that_is_none_is_refused():
     motion = swinging()
-    still = motion._replace(pose=lambda time: motion.pose(jnp.zeros(())))
+    still = motion._replace(deform=lambda time: motion.deform(jnp.zeros(())))
     with pytest.raises(ValueError, match="swing: nothing moves"):
         knot_curve.curve(still, (4,), 0.0, 1)
 
@@ -108,12 +109,12 @@ def test_the_network_learns_the_motion():
     rest = known_motion.ball_and_wall(200).mean
     errors, ways = [], []
     for time in (0.1, 0.4, 0.8):
-        posed = motion.pose(jnp.asarray(time))
+        deformed = motion.deform(jnp.asarray(time))
         exact = known_motion.analytic(rest, jnp.asarray(time)).mean
-        errors.append(np.square(posed.mean - rest - exact).mean())
+        errors.append(np.square(deformed.mean - rest - exact).mean())
         ways.append(np.square(exact).mean())
     assert np.sqrt(np.mean(errors) / np.mean(ways)) < 0.5
-    first, later = (motion.draw(motion.pose(t), t) for t in jnp.asarray([0.2, 0.7]))
+    first, later = (motion.draw(motion.deform(t), t) for t in jnp.asarray([0.2, 0.7]))
     assert first.shape == (120, 160, 3)
     assert np.abs(first - later).max() > 0.1
 
@@ -138,15 +139,15 @@ def test_arms_agree_with_the_network_they_shorten():
     made = {arm.name: arm for arm in arms.arms(40, 0.25)}
     for network in arms.NETWORKS:
         whole = made[network.name].used
-        exact = jax.jit(whole.pose)(*whole.inputs)
+        exact = jax.jit(whole.deform)(*whole.inputs)
         for name in (n for n in made if n.startswith(network.name)):
             way = made[name].used
-            found = jax.jit(way.pose)(*way.inputs)
+            found = jax.jit(way.deform)(*way.inputs)
             off = np.abs(found.mean - exact.mean).max(axis=1) > 1e-6
             # What stands still is at rest instead, not where the network puts it.
             assert off.sum() <= (10 if "still" in name else 0)
-        slopes = jax.jit(whole.gradient)(*whole.inputs)
-        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
+        grads = jax.jit(whole.gradient)(*whole.inputs)
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(grads))
     papers = sum(network.paper for network in arms.NETWORKS)
     assert sum("still" in name for name in made) == papers
     assert sum("kept" in name for name in made) >= 2
@@ -160,12 +161,12 @@ def test_a_loop_over_kernels_is_counted_in_full():
     def flops(spec):
         effect = kan_motion.effect(spec, 1, 4)
 
-        def pose(params):
+        def deform(params):
             ready = {effect.name: effect.prepare(params)}
-            return deformation.pose((effect,), params, ready, time)
+            return deformation.deform((effect,), params, ready, time)
 
         rows = arms.gaussians(count)
-        return clock.cost(pose, arms.with_effect(rows, effect)).flops
+        return clock.cost(deform, arms.with_effect(rows, effect)).flops
 
     whole = dataclasses.replace(spec, block=count)
     two, three, four = (
@@ -197,8 +198,12 @@ def test_the_job_prints_both_tables_and_saves_them(tmp_path, capsys, monkeypatch
         assert (row["both_ms"] is not None) == trained
         if trained:
             assert row["both_flops"] > 2 * row["forward_flops"]
-    assert "1.9 to 13.5 % as published" in text
+    assert "of the deformation's multiply-adds" in text
     assert [point["knots"] for point in kept["knots"]["points"]] == [4, 8, 4, 8]
+    page = deformation_page.page(kept)
+    for row in kept["costs"]:
+        assert f"| {row['name']} | {row['forward_cpu_ms']:.3g} |" in page
+    assert page.count("\n| cubic | ") == 2
     picture, _ = images.read_image(out.with_suffix(".png"))
     assert picture.shape[2] == 3
     assert np.ptp(picture) > 200

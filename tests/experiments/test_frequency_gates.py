@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from experiments import frequency_gates
-from experiments.frequency_gates import Arm, Fitted, FrequencyGates
+from experiments.frequency_gates import Fitted, FrequencyGates, GateSetting
 
 TINY = FrequencyGates(steps=20, seeds=2, most=(0.5,), pixels=8, width=4, bands=2)
-NONE = Arm("none", None)
+NONE = GateSetting("none", None)
 
 
 @pytest.mark.slow
 def test_descent_shuts_the_gates_and_ascent_opens_them():
-    falling = frequency_gates.fit(Arm("learned", 0.5), TINY)
-    rising = frequency_gates.fit(Arm("ascent", 0.5), TINY)
+    falling = frequency_gates.fit(GateSetting("learned", 0.5), TINY)
+    rising = frequency_gates.fit(GateSetting("ascent", 0.5), TINY)
     assert falling.opening.shape == (2, 2, 20)
     np.testing.assert_allclose(falling.opening[..., 0], 0.5, rtol=1e-6)
     np.testing.assert_allclose(rising.opening[..., 0], 0.5, rtol=1e-6)
@@ -25,7 +25,7 @@ def test_descent_shuts_the_gates_and_ascent_opens_them():
 
 def test_every_arm_starts_from_the_same_networks_and_without_a_loss_has_no_gate():
     plain = frequency_gates.fit(NONE, TINY)
-    fixed = frequency_gates.fit(Arm("fixed", 0.5), TINY)
+    fixed = frequency_gates.fit(GateSetting("fixed", 0.5), TINY)
     assert plain.opening is None
     np.testing.assert_allclose(fixed.opening, 0.5, rtol=1e-6)
     np.testing.assert_allclose(plain.psnr[:, 0], fixed.psnr[:, 0], atol=1e-5)
@@ -57,8 +57,8 @@ def planted():
     }
     return {
         NONE: Fitted(psnr["none"], None),
-        Arm("learned", 0.1): Fitted(psnr["learned"], opening),
-        Arm("fixed", 0.1): Fitted(psnr["fixed"], still),
+        GateSetting("learned", 0.1): Fitted(psnr["learned"], opening),
+        GateSetting("fixed", 0.1): Fitted(psnr["fixed"], still),
     }
 
 
@@ -129,3 +129,5 @@ def test_the_command_writes_what_it_prints(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert all(sentence in printed for sentence in record["said"])
     assert (tmp_path / "frequency_gates.png").exists()
+    name, row = next(iter(record["rows"].items()))
+    assert f"| {name} | {row['psnr']:.2f} |" in frequency_gates.page(record)

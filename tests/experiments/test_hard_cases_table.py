@@ -8,7 +8,7 @@ import pytest
 from experiments.hard_cases import __main__ as hard_cases
 from experiments.hard_cases import case as hard_case
 from experiments.hard_cases import report
-from experiments.hard_cases.__main__ import ROOMS, Outcome, Row
+from experiments.hard_cases.__main__ import ROOMS, CaseResult, Outcome
 
 PAGE = f"before\n{report.BEGIN}\nold\n{report.END}\nbehind\n"
 
@@ -87,6 +87,6 @@ def test_a_number_names_what_is_not_finite_and_the_worst_else():
 def test_what_cannot_be_timed_side_by_side_is_not():
     case = ROOMS["encodings"][0][0]._replace(alike=False)
     outcome = Outcome((np.zeros(1),), (np.ones(1),))
-    row = Row(case, "a test", {"float32": outcome}, np.nan, np.nan)
+    row = CaseResult(case, "a test", {"float32": outcome}, np.nan, np.nan)
     assert "not comparable" in report.table([row])
     assert report.summary([row]).endswith("derivative.")

@@ -13,7 +13,7 @@ from experiments.ablate.arms import Arm
 from experiments.inspect_pays import __main__ as inspect_pays
 from experiments.inspect_pays import arms as inspect_arms
 from experiments.inspect_pays import report
-from experiments.inspect_pays.job import Row, Side, Trial, read
+from experiments.inspect_pays.job import ArmMeans, Comparison, Trial, read
 from nerfies_jax import runs
 from nerfies_jax.capture import nerfies_format
 from nerfies_jax.evidence import inspection
@@ -52,12 +52,14 @@ def test_whatever_is_advised_is_an_arm():
 
 
 def side(psnr, seconds, depth=math.nan):
-    return Side(psnr, depth, seconds, 1)
+    return ArmMeans(psnr, depth, seconds, 1)
 
 
 def row(before, after, advised="nerfies-small+appearance.width=4", refused=""):
     same = advised == "nerfies-small"
-    return Row("exposure", "nerfies-small", advised, (), same, refused, before, after)
+    return Comparison(
+        "exposure", "nerfies-small", advised, (), same, refused, before, after
+    )
 
 
 @pytest.mark.parametrize(
@@ -142,7 +144,7 @@ def looked(monkeypatch):
             calls.append(f"train {name}")
             numbers = {"psnr": SCORES.get(name, 22.0), "train_cpu_seconds": 10.0}
             identity = job._identity(name, seed, budget.steps, budget)
-            kept = results.Kept(numbers, {}, {"steps": budget.steps})
+            kept = results.ArmResult(numbers, {}, {"steps": budget.steps})
             results.write(job.path(name, seed, budget), identity, kept)
         return []
 

@@ -36,12 +36,14 @@ def test_the_nearest_kernels_are_the_terms_of_a_loop(float64, rng):
 def test_a_tiny_table(tmp_path, capsys):
     words = "--kernels 6 --nearest 2 4 --points 30 --width 3 --repeats 1 --out"
     kan_local.main([*words.split(), str(tmp_path / "t.json")])
-    rows = json.loads((tmp_path / "t.json").read_text())["rows"]
+    record = json.loads((tmp_path / "t.json").read_text())
+    rows = record["rows"]
     assert [row["nearest"] for row in rows] == ["all", 2, 4]
     dense, two, four = (row["error"] for row in rows)
     assert dense == 0
     assert 0 < four < two / 3
     assert "of dense" in capsys.readouterr().out
+    assert f"| 6 | 2 | {two:.3g} |" in kan_local.page(record)
 
 
 @pytest.mark.parametrize("words", ["--kernels 1", "--nearest 0", "--points 0"])

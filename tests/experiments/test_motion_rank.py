@@ -10,7 +10,7 @@ import pytest
 from experiments.motion_rank import __main__ as motion_rank
 from experiments.motion_rank import report
 from experiments.motion_rank import tracks as motion_tracks
-from experiments.motion_rank.__main__ import MotionRank, Row
+from experiments.motion_rank.__main__ import MotionRank, RankResult
 
 TINY = dict(kinds=("rigid",), counts=(2,), seeds=1, steps=30, points=8, times=12)
 
@@ -127,12 +127,15 @@ def test_a_tiny_run_prints_and_keeps_everything(tmp_path, capsys):
     assert len(record["rows"]) == len(rows)
     assert record["said"]
     assert (tmp_path / "out" / "motion_rank.png").stat().st_size > 10_000
+    page = report.page(record)
+    assert f"| {np.mean(rows[2].held_out):.4f} |" in page
+    assert page.count("\n| rigid | ") == len(rows)
 
 
 def rows_of(**errors):
     names = {"time": "time basis", "moving": "moving basis", "residual": "residual"}
     return [
-        Row("k", names[m], None if m == "residual" else 4, [e], [e], None, 0.1)
+        RankResult("k", names[m], None if m == "residual" else 4, [e], [e], None, 0.1)
         for m, e in errors.items()
     ]
 

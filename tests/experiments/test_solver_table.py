@@ -22,8 +22,11 @@ SMALL = dict(
 
 @pytest.mark.slow
 def test_the_table_holds_solvers_against_the_best_known_code(tmp_path, capsys):
-    settings = solver_table.Settings(steps=(2, 8), out=tmp_path / "t.json", **SMALL)
-    rows = solver_table.main(settings)
+    words = ["--steps", "2", "8", "--out", str(tmp_path / "t.json")]
+    for name, value in SMALL.items():
+        many = value if isinstance(value, tuple) else (value,)
+        words += [f"--{name.replace('_', '-')}", *map(str, many)]
+    rows = solver_table.main(words)
     assert {(r.solver, r.max_steps) for r in rows} == {
         (name, steps) for name in ("lbfgs", "adam") for steps in (2, 8)
     }
@@ -39,6 +42,7 @@ def test_the_table_holds_solvers_against_the_best_known_code(tmp_path, capsys):
     assert len(record["rows"]) == len(rows)
     assert record["about"]["pixels"] == 6
     assert record["rows"][0]["solver"] in capsys.readouterr().out
+    assert f"| adam | 8 | {by['adam', 8].steps:.0f} |" in solver_table.page(record)
 
 
 def test_held_out_pictures_are_not_among_the_known_ones():

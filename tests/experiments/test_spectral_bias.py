@@ -104,12 +104,12 @@ def test_training_is_adam_along_a_cosine_from_points_of_its_own():
             points = jax.random.uniform(
                 jax.random.fold_in(key, step), (16, 1), minval=-1, maxval=1
             )
-            value, slope = jax.value_and_grad(
+            value, grad = jax.value_and_grad(
                 lambda params: jnp.mean(
                     (made.apply(params, points) - SMALL(points)) ** 2
                 )
             )(params)
-            change, memory = rule.update(slope, memory)
+            change, memory = rule.update(grad, memory)
             return optax.apply_updates(params, change), memory, value
 
         for step in range(steps):
@@ -228,3 +228,6 @@ def test_the_command_writes_what_it_prints(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert all(sentence in printed for sentence in record["said"])
     assert (tmp_path / "spectral_bias.png").exists()
+    page = report.page(record)
+    assert page.count("\n| relu + encoding | ") == 2
+    assert f"- {record['said'][0].strip()}" in page

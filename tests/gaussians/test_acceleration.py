@@ -112,16 +112,16 @@ def energy(before, now, after):
 @pytest.mark.parametrize("distance", [0.0, 1e-30, 1e-10, 1.0, 100.0, 1e15])
 def test_slopes_are_finite_at_any_distance_and_free_far_away(distance, dtype):
     now = np.asarray([[distance, 0, 0]], dtype)
-    value, slopes = energy(now - now.dtype.type(0.5), now, now)
+    value, grads = energy(now - now.dtype.type(0.5), now, now)
     assert np.isfinite(value)
-    assert all(np.isfinite(slope).all() for slope in slopes)
+    assert all(np.isfinite(grad).all() for grad in grads)
     if distance < 1e-6:
         np.testing.assert_allclose(value, 0.75 + 0.75 / 4, rtol=1e-6)
     if distance >= 100:
         assert float(value) < 1e-30  # exp(-100) is 4e-44
-    still, slopes = energy(now, now, now)
+    still, grads = energy(now, now, now)
     assert float(still) == 0
-    assert not any(np.asarray(slope).any() for slope in slopes)
+    assert not any(np.asarray(grad).any() for grad in grads)
 
 
 @pytest.mark.hard_cases
@@ -270,19 +270,19 @@ def test_under_a_network_it_waits_for_its_start_and_then_stills_it():
         def at_time(params, time):
             gaussians = rows.activate(params.rows["splats"])
             then = condition._replace(time=time)
-            return deformation.pose_in_training((motion,), params, gaussians, then)
+            return deformation.deform_in_training((motion,), params, gaussians, then)
 
         here = Params(params.rows, {mlp_motion.NAME: net})
         context = PenaltyContext(condition, step, None, here, at_time=at_time)
         return weighted_sum(effect.penalty(None, context))
 
     run = jax.jit(jax.value_and_grad(penalty))
-    value, slopes = run(net, jnp.asarray(3999))
+    value, grads = run(net, jnp.asarray(3999))
     assert value == 0
-    assert not any(np.asarray(leaf).any() for leaf in jax.tree.leaves(slopes))
-    value, slopes = run(net, jnp.asarray(4000))
+    assert not any(np.asarray(leaf).any() for leaf in jax.tree.leaves(grads))
+    value, grads = run(net, jnp.asarray(4000))
     assert value > 0
-    leaves = jax.tree.leaves(slopes)
+    leaves = jax.tree.leaves(grads)
     assert all(np.isfinite(leaf).all() for leaf in leaves)
     assert any(np.asarray(leaf).any() for leaf in leaves)
     tx = optax.chain(scale_by_row_adam(), optax.scale(-2e-3))

@@ -42,9 +42,9 @@ def make(count, dtype="float32", scale=0.01, opacity=0.5):
 
 
 def hot(stats, which, gradient=1.0):
-    slopes, views = np.array(stats.grad2d), np.array(stats.views)
-    slopes[which], views[which] = gradient, 1
-    return stats._replace(grad2d=jnp.asarray(slopes), views=jnp.asarray(views))
+    grads, views = np.array(stats.grad2d), np.array(stats.views)
+    grads[which], views[which] = gradient, 1
+    return stats._replace(grad2d=jnp.asarray(grads), views=jnp.asarray(views))
 
 
 def run(params, moments, stats, spec=None, step=600):

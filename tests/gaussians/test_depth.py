@@ -71,8 +71,8 @@ def test_gradients(kind, float64):
         return depth.FORMS[kind](drawn, truth, known)
 
     assert gradients.directional_error(total, drawn, step=1e-6) < 1e-6
-    slope = jax.jit(jax.grad(total))(drawn)
-    assert not np.asarray(slope)[~np.asarray(known)].any()
+    grad = jax.jit(jax.grad(total))(drawn)
+    assert not np.asarray(grad)[~np.asarray(known)].any()
 
 
 @pytest.mark.hard_cases
@@ -137,9 +137,9 @@ def test_a_depth_turned_inside_out_is_wrong_and_correlation_turns_it_back():
 def test_the_affine_loss_is_level_where_every_pixel_is_on_the_wrong_side(dtype):
     """Then mean |a - b| = mean |a| + mean |b| = 2: what the docstring warns of."""
     truth = np.linspace(1, 3, COUNT, dtype=dtype)
-    value, slope = SLOPES["affine"](5 - truth, truth, EVERYWHERE)
+    value, grad = SLOPES["affine"](5 - truth, truth, EVERYWHERE)
     np.testing.assert_allclose(value, 2, rtol=1e-6)
-    assert np.abs(slope).max() < 1e-6
+    assert np.abs(grad).max() < 1e-6
 
 
 def test_outliers_of_a_guess_bend_the_affine_fit_less(float64):
@@ -195,22 +195,22 @@ def hard_pictures():
 @pytest.mark.parametrize("name", hard_pictures())
 def test_pictures_that_say_little_stay_finite(kind, name, dtype):
     drawn, truth, known = hard_pictures()[name]
-    value, slope = SLOPES[kind](drawn.astype(dtype), truth.astype(dtype), known)
+    value, grad = SLOPES[kind](drawn.astype(dtype), truth.astype(dtype), known)
     assert np.isfinite(value)
-    assert np.isfinite(slope).all()
+    assert np.isfinite(grad).all()
     # Slopes are at most a thousand over the depth of the picture.
-    assert np.abs(slope).max() * np.median(drawn) < 1100
+    assert np.abs(grad).max() * np.median(drawn) < 1100
     if known.sum() < 2 and kind != "metric":
         assert value == 0
-        assert not np.asarray(slope).any()
+        assert not np.asarray(grad).any()
 
 
 @pytest.mark.hard_cases
 def test_a_flat_drawing_is_bent_towards_the_truth(dtype):
     truth = np.linspace(1, 3, COUNT, dtype=dtype)
     for kind in ("affine", "correlation"):
-        slope = SLOPES[kind](np.full(COUNT, 2.0, dtype), truth, EVERYWHERE)[1]
-        assert np.corrcoef(np.asarray(slope), np.asarray(truth))[0, 1] < -0.8
+        grad = SLOPES[kind](np.full(COUNT, 2.0, dtype), truth, EVERYWHERE)[1]
+        assert np.corrcoef(np.asarray(grad), np.asarray(truth))[0, 1] < -0.8
 
 
 @pytest.mark.hard_cases
@@ -264,7 +264,7 @@ def test_what_is_unknown_or_see_through_teaches_nothing(kind, space, dtype):
     shot.rendering.alpha[0, 4:] = 0.4, 0.0
     drawn[4, 0], drawn[0, 5] = np.nan, 0.0
     masked = shot._replace(valid=valid)
-    (value, metrics), slopes = loss_and_slope(spec, masked)
+    (value, metrics), grads = loss_and_slope(spec, masked)
     ours, truth = (
         np.asarray(x, np.float64)[1:4].ravel() for x in (drawn, masked.depth)
     )
@@ -275,9 +275,9 @@ def test_what_is_unknown_or_see_through_teaches_nothing(kind, space, dtype):
     np.testing.assert_allclose(value, 0.3 * expected, rtol=tolerance)
     np.testing.assert_allclose(metrics["error"], expected, rtol=tolerance)
     np.testing.assert_allclose(metrics["known"], 18 / 30, rtol=1e-6)
-    slope, alpha_slope = (np.asarray(x) for x in slopes)
-    assert not slope[[0, 4]].any()
-    assert slope[1:4].any()
+    grad, alpha_slope = (np.asarray(x) for x in grads)
+    assert not grad[[0, 4]].any()
+    assert grad[1:4].any()
     assert not alpha_slope.any()
 
 

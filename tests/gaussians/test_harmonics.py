@@ -46,12 +46,12 @@ def value_and_jacobian(offset):
 def test_unit_direction_keeps_its_digits_at_any_length(length, dtype):
     direction = np.array([0.36, -0.48, 0.8])
     found, jacobian = value_and_jacobian((direction * length).astype(dtype))
-    slope = np.asarray(jacobian, np.float64)[:, 0] * length
+    grad = np.asarray(jacobian, np.float64)[:, 0] * length
     tolerance = {"float32": 3e-7, "float64": 1e-15}[dtype]
     np.testing.assert_allclose(found, direction, atol=tolerance)
     expected = np.array([1, 0, 0]) - direction * direction[0]  # (I - d d^t) e_x
     flushed = length * float(np.finfo(dtype).tiny)  # slopes are 1 / length
-    np.testing.assert_allclose(slope, expected, atol=2 * tolerance + flushed)
+    np.testing.assert_allclose(grad, expected, atol=2 * tolerance + flushed)
 
 
 @pytest.mark.hard_cases

@@ -172,8 +172,8 @@ def slopes_of_sum(params, codes, time, active):
 @pytest.mark.hard_cases
 def test_no_active_row_and_no_row_at_all(dtype):
     params, time = strong(SMALL, dtype), np.asarray(0.5, dtype)
-    slopes = slopes_of_sum(params, embeddings(9, dtype), time, np.zeros(9, bool))
-    assert not any(np.asarray(leaf).any() for leaf in jax.tree.leaves(slopes))
+    grads = slopes_of_sum(params, embeddings(9, dtype), time, np.zeros(9, bool))
+    assert not any(np.asarray(leaf).any() for leaf in jax.tree.leaves(grads))
     nobody = jax.eval_shape(
         lambda codes: together(params, SMALL, codes, jnp.asarray(time)),
         embeddings(0, dtype),
@@ -217,16 +217,14 @@ def test_motion_starts_at_zero_and_does_not_stay_there():
         return sum(jnp.sum((leaf - 1) ** 2) for leaf in offsets), offsets
 
     run = jax.jit(jax.grad(total, (0, 1), has_aux=True))
-    slopes, offsets = run(params, codes)
+    grads, offsets = run(params, codes)
     assert not any(np.asarray(leaf).any() for leaf in offsets)
-    assert all(
-        np.asarray(leaf).any() for leaf in jax.tree.leaves(slopes[0].field.heads)
-    )
-    assert not np.asarray(slopes[1]).any()
-    params = jax.tree.map(lambda p, slope: p - 0.01 * slope, params, slopes[0])
-    slopes, _ = run(params, codes)
-    assert all(np.asarray(row).any() for row in slopes[1])
-    assert np.asarray(slopes[0].times).any()
+    assert all(np.asarray(leaf).any() for leaf in jax.tree.leaves(grads[0].field.heads))
+    assert not np.asarray(grads[1]).any()
+    params = jax.tree.map(lambda p, grad: p - 0.01 * grad, params, grads[0])
+    grads, _ = run(params, codes)
+    assert all(np.asarray(row).any() for row in grads[1])
+    assert np.asarray(grads[0].times).any()
 
 
 @pytest.mark.parametrize("waves", [None, 2.0])
@@ -331,8 +329,8 @@ def test_unusable_quaternions_and_wild_residuals_stay_finite(dtype):
         moved = kan_motion.apply(gaussians, Offsets(wild, wild, wild))
         return jnp.sum(moved.quaternion) + jnp.sum(moved.scale), moved
 
-    slopes, moved = jax.jit(jax.grad(total, (0, 1), has_aux=True))(gaussians, wild)
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((slopes, moved)))
+    grads, moved = jax.jit(jax.grad(total, (0, 1), has_aux=True))(gaussians, wild)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((grads, moved)))
     length = np.linalg.norm(np.asarray(moved.quaternion, np.float64), axis=1)
     np.testing.assert_allclose(length, 1, rtol=1e-5)
 
@@ -343,9 +341,9 @@ def test_equal_and_wild_embeddings_have_finite_slopes(dtype):
     codes = np.asarray(embeddings(9, dtype))
     for scale, time in itertools.product((0.0, 1e-20, 1e4), (0.0, 1.0, 2.0)):
         drawn = codes * codes.dtype.type(scale)
-        slopes = slopes_of_sum(params, drawn, np.asarray(time, dtype), active)
-        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
-        assert np.asarray(slopes[1]).any()
+        grads = slopes_of_sum(params, drawn, np.asarray(time, dtype), active)
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(grads))
+        assert np.asarray(grads[1]).any()
 
 
 def test_the_effect_moves_a_scene_and_leaves_it_alone_in_its_warm_up(float64):
@@ -358,7 +356,7 @@ def test_the_effect_moves_a_scene_and_leaves_it_alone_in_its_warm_up(float64):
     @jax.jit
     def in_training(step):
         condition = FrameCondition(time, step=step, key=jax.random.key(0))
-        return deformation.pose_in_training(effects, params, canonical, condition)
+        return deformation.deform_in_training(effects, params, canonical, condition)
 
     for before, after in zip(canonical, in_training(jnp.asarray(9)), strict=True):
         np.testing.assert_array_equal(before, after)
@@ -368,10 +366,10 @@ def test_the_effect_moves_a_scene_and_leaves_it_alone_in_its_warm_up(float64):
     )
     expected = kan_motion.apply(canonical, offsets)
     prepared = jax.jit(lambda params: deformation.prepare(effects, params))(params)
-    posed = jax.jit(lambda *args: deformation.pose(effects, *args))(
+    deformed = jax.jit(lambda *args: deformation.deform(effects, *args))(
         params, prepared, time
     )
-    for one, other, truth in zip(moved, posed, expected, strict=True):
+    for one, other, truth in zip(moved, deformed, expected, strict=True):
         np.testing.assert_allclose(one, truth, atol=1e-13)
         np.testing.assert_allclose(other, truth, atol=1e-13)
 

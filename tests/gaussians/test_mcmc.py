@@ -221,8 +221,8 @@ def test_penalty_counts_active_rows_only(dtype):
     splats = rows.deactivate(params.rows["splats"], jnp.asarray([False, False, True]))
     expected = 0.01 * 0.375 + 0.01 * np.exp(np.asarray(splats.log_scale[:2])).mean()
     np.testing.assert_allclose(mcmc.penalty(splats, SPEC), expected, rtol=1e-6)
-    slopes = jax.jit(jax.grad(mcmc.penalty), static_argnums=1)(splats, SPEC)
-    assert not any(np.asarray(leaf)[2].any() for leaf in slopes)
+    grads = jax.jit(jax.grad(mcmc.penalty), static_argnums=1)(splats, SPEC)
+    assert not any(np.asarray(leaf)[2].any() for leaf in grads)
     none = rows.deactivate(splats, jnp.ones(3, bool))
     assert mcmc.penalty(none, SPEC) == 0
 

@@ -98,8 +98,8 @@ def test_the_published_network_is_reproduced(name, oracle_dir, dtype):
         mean, quaternion, scale = one(point, time)
         return jnp.sum(mean**2) + jnp.sum(quaternion) * scale[0]
 
-    slopes = jax.jit(jax.vmap(jax.grad(loss, argnums=(0, 1))))(point, time[:, 0])
-    for ours, key in zip(slopes, ("g_x", "g_t"), strict=True):
+    grads = jax.jit(jax.vmap(jax.grad(loss, argnums=(0, 1))))(point, time[:, 0])
+    for ours, key in zip(grads, ("g_x", "g_t"), strict=True):
         theirs = case[key].reshape(ours.shape)
         # Measured 4e-7 in float64; float32 rounds sines of 512 x and their factors 512.
         tolerance = {"float32": 2e-4, "float64": 2e-6}[dtype]
@@ -118,11 +118,11 @@ def test_blocks_change_nothing_but_memory(count, dtype):
         return sum(jnp.sum(leaf**2) for leaf in offsets), offsets
 
     run = jax.jit(jax.value_and_grad(total, has_aux=True), static_argnums=1)
-    (_, blocked), slopes = run(params, SMALL)
+    (_, blocked), grads = run(params, SMALL)
     (_, at_once), expected = run(params, whole)
     tolerance = {"float32": 2e-5, "float64": 1e-13}[dtype]
     for ours, theirs in zip(
-        jax.tree.leaves((blocked, slopes)),
+        jax.tree.leaves((blocked, grads)),
         jax.tree.leaves((at_once, expected)),
         strict=True,
     ):
@@ -182,8 +182,8 @@ def test_no_active_row_and_no_row_at_all(dtype):
         return sum(jnp.sum(leaf) for leaf in deformed(*args))
 
     mean = np.asarray(some_gaussians(9, dtype).mean)
-    slopes = jax.jit(jax.grad(total))(params, mean, np.zeros(9, bool))
-    assert not any(np.asarray(leaf).any() for leaf in jax.tree.leaves(slopes))
+    grads = jax.jit(jax.grad(total))(params, mean, np.zeros(9, bool))
+    assert not any(np.asarray(leaf).any() for leaf in jax.tree.leaves(grads))
     nobody = jax.eval_shape(deformed, params, mean[:0], np.zeros(0, bool))
     assert nobody.quaternion.shape == (0, 4)
 
@@ -249,8 +249,8 @@ def test_unusable_quaternions_and_wild_scales_stay_finite(length, dtype):
     gaussians = some_gaussians(2, dtype)
     quaternion = jnp.full((2, 4), length, dtype)
     wild = jnp.asarray([[100.0] * 3, [-100.0] * 3], dtype)
-    slopes, moved = slopes_by_turn_and_scale(quaternion, wild, gaussians)
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((slopes, moved)))
+    grads, moved = slopes_by_turn_and_scale(quaternion, wild, gaussians)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((grads, moved)))
     np.testing.assert_allclose(
         np.linalg.norm(np.asarray(moved.quaternion, np.float64), axis=1), 1, rtol=1e-5
     )
@@ -296,7 +296,7 @@ def test_warm_up_is_a_branch_without_motion():
 
     def moved(params, step):
         condition = FrameCondition(jnp.asarray(0.5), step=step, key=jax.random.key(0))
-        return deformation.pose_in_training((field,), params, gaussians, condition)
+        return deformation.deform_in_training((field,), params, gaussians, condition)
 
     run = jax.jit(moved)
     before, after = run(params, jnp.asarray(9)), run(params, jnp.asarray(10))
@@ -306,10 +306,10 @@ def test_warm_up_is_a_branch_without_motion():
     def total(params, step):
         return jnp.sum(moved(params, step).mean)
 
-    slope = jax.jit(jax.grad(total))
-    nets = slope(params, jnp.asarray(9)).nets
+    grad = jax.jit(jax.grad(total))
+    nets = grad(params, jnp.asarray(9)).nets
     assert not any(np.asarray(leaf).any() for leaf in jax.tree.leaves(nets))
-    nets = slope(params, jnp.asarray(10)).nets
+    nets = grad(params, jnp.asarray(10)).nets
     assert any(np.asarray(leaf).any() for leaf in jax.tree.leaves(nets))
     # One compiled program holds both: a branch, not a select of two results.
     assert "conditional" in run.lower(params, jnp.asarray(9)).compile().as_text()

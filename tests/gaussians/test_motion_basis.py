@@ -207,9 +207,9 @@ def test_gradients_of_the_field(detach, float64):
         return sum(jnp.sum(jnp.sin(leaf)) for leaf in offsets)
 
     params, time = strong(spec), jnp.asarray(0.4)
-    slope = jax.jit(jax.grad(total, argnums=2))(params, time, mean)
+    grad = jax.jit(jax.grad(total, argnums=2))(params, time, mean)
     if detach:
-        assert not np.asarray(slope).any()
+        assert not np.asarray(grad).any()
         error = gradients.directional_error(
             lambda params, time: total(params, time, mean), params, time, step=1e-6
         )
@@ -242,17 +242,17 @@ def test_bounded_directions_are_at_most_one_long_with_finite_slopes(length, dtyp
     # No weights: every direction along x, of the given length, whatever is encoded.
     params = jax.tree.map(lambda leaf: np.zeros(leaf.shape, dtype), shapes)
     params.heads["directions"].bias[:4] = length
-    vectors, slopes = map(np.asarray, directions_and_slopes(params))
+    vectors, grads = map(np.asarray, directions_and_slopes(params))
 
     expected = np.zeros((3, 4))
     expected[0] = min(length, 1.0)
     tolerance = {"float32": 3e-7, "float64": 1e-15}[dtype]
     np.testing.assert_allclose(vectors, expected, rtol=tolerance)
-    slopes = slopes[0, 0]
+    grads = grads[0, 0]
     # Along itself a short direction grows; a long one does not.
     along = {1.0: (0.0, 1.0)}.get(length, (float(length < 1),) * 2)
-    assert along[0] - 1e-6 <= slopes[0] <= along[1] + 1e-6
-    assert np.isfinite(slopes).all()
+    assert along[0] - 1e-6 <= grads[0] <= along[1] + 1e-6
+    assert np.isfinite(grads).all()
 
 
 def test_the_start_is_still_and_yet_learns(dtype):
@@ -268,15 +268,15 @@ def test_the_start_is_still_and_yet_learns(dtype):
             moved = motion_basis.deform(params, spec, mean, time, ready)
             return jnp.sum(moved.mean), moved
 
-        slopes, offsets = jax.grad(total, has_aux=True)(params)
-        return offsets, ready, slopes.weights.heads["weights"].weight
+        grads, offsets = jax.grad(total, has_aux=True)(params)
+        return offsets, ready, grads.weights.heads["weights"].weight
 
     mean = some_gaussians(50, dtype).mean
-    offsets, ready, slope = first(mean, jnp.asarray(0.5, dtype))
+    offsets, ready, grad = first(mean, jnp.asarray(0.5, dtype))
     assert 0 < max(float(jnp.abs(leaf).max()) for leaf in offsets) < 5e-3
     length = np.linalg.norm(ready.basis, axis=1)
     assert 0.5 < np.median(length) <= length.max() < 1 + 1e-6
-    assert np.abs(slope).max() > 1
+    assert np.abs(grad).max() > 1
 
 
 def test_motion_is_smooth_in_time(float64):
@@ -302,11 +302,11 @@ def test_blocks_change_nothing_but_memory(count, dtype):
         return sum(jnp.sum(leaf**2) for leaf in offsets), offsets
 
     run = jax.jit(jax.value_and_grad(total, has_aux=True), static_argnums=1)
-    (_, blocked), slopes = run(params, SMALL)
+    (_, blocked), grads = run(params, SMALL)
     (_, at_once), expected = run(params, whole)
     tolerance = {"float32": 2e-5, "float64": 1e-13}[dtype]
     for ours, theirs in zip(
-        jax.tree.leaves((blocked, slopes)),
+        jax.tree.leaves((blocked, grads)),
         jax.tree.leaves((at_once, expected)),
         strict=True,
     ):
@@ -333,8 +333,8 @@ def test_rows_beyond_the_active_blocks_are_still(float64):
             jnp.sum(leaf) for leaf in uncached(params, SMALL, mean, time, nobody)
         )
 
-    slopes = jax.jit(jax.grad(total))(params)
-    assert not any(np.asarray(leaf).any() for leaf in jax.tree.leaves(slopes))
+    grads = jax.jit(jax.grad(total))(params)
+    assert not any(np.asarray(leaf).any() for leaf in jax.tree.leaves(grads))
 
 
 def test_moving_gaussians(float64):
@@ -368,8 +368,8 @@ def test_turns_of_every_size_are_rotations_with_finite_slopes(length, angle, dty
     )
     turn = np.asarray([[angle, 0, 0], [0, -0.6 * angle, 0.8 * angle]], dtype)
     wild = np.asarray([[100.0] * 3, [-100.0] * 3], dtype)
-    slopes, moved = slopes_by_turn_and_scale(turn, wild, gaussians)
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((slopes, moved)))
+    grads, moved = slopes_by_turn_and_scale(turn, wild, gaussians)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((grads, moved)))
     tolerance = {"float32": 1e-6, "float64": 1e-14}[dtype]
     np.testing.assert_allclose(
         np.linalg.norm(np.asarray(moved.quaternion, np.float64), axis=1),
@@ -405,7 +405,7 @@ def test_warm_up_and_noise_are_of_training_alone():
     @jax.jit
     def moved(params, step):
         condition = FrameCondition(time, step=step, key=jax.random.key(0))
-        return deformation.pose_in_training((field,), params, gaussians, condition)
+        return deformation.deform_in_training((field,), params, gaussians, condition)
 
     np.testing.assert_array_equal(moved(params, jnp.asarray(9)).mean, gaussians.mean)
     ready = jax.jit(field.prepare)(params)
@@ -426,9 +426,9 @@ def test_warm_up_and_noise_are_of_training_alone():
     def total(params, step):
         return jnp.sum(moved(params, step).mean)
 
-    slope = jax.jit(jax.grad(total))
+    grad = jax.jit(jax.grad(total))
     for step, learns in ((9, False), (10, True)):
-        nets = slope(params, jnp.asarray(step)).nets[motion_basis.NAME]
+        nets = grad(params, jnp.asarray(step)).nets[motion_basis.NAME]
         for part in nets:  # base, basis and weights
             assert any(np.asarray(x).any() for x in jax.tree.leaves(part)) == learns
 
@@ -442,9 +442,9 @@ def test_a_scene_poses_alike_from_what_it_prepared(dtype):
     @jax.jit
     def whole(params):
         ready = deformation.prepare((field,), params)
-        return deformation.pose((field,), params, ready, time)
+        return deformation.deform((field,), params, ready, time)
 
-    ours = jax.jit(lambda p, r: deformation.pose((field,), p, r, time))(params, ready)
+    ours = jax.jit(lambda p, r: deformation.deform((field,), p, r, time))(params, ready)
     tolerance = {"float32": 2e-6, "float64": 1e-14}[dtype]
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, atol=tolerance),

@@ -330,9 +330,9 @@ def spread(spec, rounds=8):
     count = 8
     for _ in range(rounds):
         moves = np.asarray(params.rows["label"])[:count, 0] == 1
-        slope = np.where(moves, 24 / moves.sum(), 96 / (~moves).sum())
+        grad = np.where(moves, 24 / moves.sum(), 96 / (~moves).sum())
         motion = np.where(moves, 5 * TAU, 0.1 * TAU)
-        changed, _ = grown(spec, params, slope * STRATEGY.grow_grad2d, motion)
+        changed, _ = grown(spec, params, grad * STRATEGY.grow_grad2d, motion)
         params, count = changed.params, changed.report.active
     assert changed.report.cloned == 0  # at rest
     moves = np.asarray(params.rows["label"])[:count, 0] == 1

@@ -100,11 +100,11 @@ def test_with_few_active_rows_the_rest_names_itself(active_count, dtype):
     for row in range(8):
         assert listed(graph, row) == (others - {row} if active[row] else set())
         assert (graph.index[row][graph.weight[row] == 0] == row).all()
-    value, slope = value_and_slope(params.rows["code"], graph, active)
+    value, grad = value_and_slope(params.rows["code"], graph, active)
     assert np.isfinite(value)
-    assert np.isfinite(slope).all()
-    assert (active_count >= 2) == bool(np.asarray(slope).any())
-    assert not np.asarray(slope)[~active].any()
+    assert np.isfinite(grad).all()
+    assert (active_count >= 2) == bool(np.asarray(grad).any())
+    assert not np.asarray(grad)[~active].any()
 
 
 @pytest.mark.hard_cases
@@ -177,9 +177,9 @@ def test_slopes_are_finite_and_bounded_where_embeddings_meet(kind, apart):
     kind = jnp.dtype(kind)
     graph = Neighbours(np.int32([[1], [0]]), np.full((2, 1), 0.25, kind))
     code = np.asarray([[0.0, 0.0], [apart, 0.0]], kind)
-    value, slope = value_and_slope(code, graph, np.ones(2, bool))
+    value, grad = value_and_slope(code, graph, np.ones(2, bool))
     assert np.isfinite(np.asarray(value, np.float64))
-    size = np.linalg.norm(np.asarray(slope, np.float64), axis=1)
+    size = np.linalg.norm(np.asarray(grad, np.float64), axis=1)
     # Each row is in two of the pairs, which count 1 / 2 each: sqrt(w) at most.
     assert (size <= 0.5 * 1.01).all()
     assert apart > 0 or not size.any()
@@ -191,9 +191,9 @@ def test_weights_that_vanish_bring_neither_loss_nor_slope(dtype):
     params = scene(places, dtype=dtype)
     graph = neighbours.find(NeighbourSpec(scale="units"), params, extent=1.0)
     assert not np.asarray(graph.weight).any()
-    value, slope = value_and_slope(params.rows["code"], graph, np.ones(3, bool))
+    value, grad = value_and_slope(params.rows["code"], graph, np.ones(3, bool))
     np.testing.assert_allclose(value, 1e-9, rtol=1e-6)  # 20 floors of 2 neighbours
-    assert not np.asarray(slope).any()
+    assert not np.asarray(grad).any()
 
 
 @functools.cache
@@ -236,12 +236,12 @@ def test_the_penalty_draws_neighbours_together_and_leaves_the_far_apart():
         return [float(jnp.std(code[part], axis=0).mean()) for part in halves]
 
     halves = np.arange(12), np.arange(12, 24)
-    slope = jax.grad(lambda code: neighbours.inconsistency(code, graph, active))
+    grad = jax.grad(lambda code: neighbours.inconsistency(code, graph, active))
     active = jnp.ones(24, bool)
     code = params.rows["code"]
     centres = [np.asarray(code[part]).mean(axis=0) for part in halves]
     end = jax.jit(
-        lambda code: jax.lax.fori_loop(0, 3000, lambda _, c: c - 0.1 * slope(c), code)
+        lambda code: jax.lax.fori_loop(0, 3000, lambda _, c: c - 0.1 * grad(c), code)
     )(code)
     for before, after in zip(spread(code), spread(end), strict=True):
         assert after < 0.3 * before

@@ -54,12 +54,12 @@ def partitioned(scale_by_rows=optimiser.scale_by_row_adam):
     return optax.chain(optax.clip_by_global_norm(10.0), optax.partition(each, label))
 
 
-def first_moments(tx, slopes, params):
-    def one_step(slopes, params):
-        return tx.update(slopes, tx.init(params), params)[1]
+def first_moments(tx, grads, params):
+    def one_step(grads, params):
+        return tx.update(grads, tx.init(params), params)[1]
 
     with lenient("standard"):
-        return jax.jit(one_step)(slopes, params)
+        return jax.jit(one_step)(grads, params)
 
 
 PAIRS = {
@@ -76,12 +76,12 @@ def test_it_is_optax_s_while_all_rows_are_as_old(name, dtype):
     step_ours, step_theirs = jax.jit(ours.update), jax.jit(theirs.update)
     for seed in range(8):  # RAdam's length passes the threshold at the sixth
         noise = np.random.default_rng(seed)
-        slopes = jax.tree.map(
+        grads = jax.tree.map(
             lambda p, n=noise: jnp.asarray(n.normal(size=p.shape), p.dtype), params
         )
-        step, state = step_ours(slopes, state)
+        step, state = step_ours(grads, state)
         with lenient("standard"):
-            expected, reference = step_theirs(slopes, reference)
+            expected, reference = step_theirs(grads, reference)
         # optax forms 1 - 0.999^n in float32, which is good to 3e-5 at n = 1, and the
         # length of RAdam to 0.03, so that its first rectified step is 1 % off.
         far = {"adam": 1e-4, "radam": 2e-2}[name]
@@ -138,10 +138,10 @@ def test_radam_switches_exactly_where_its_length_passes_the_threshold(shift, dty
     """Just above the length of the seventh update, the eighth is the first adapted."""
     length = float(exact_length(7, 0.999))
     ours = optimiser.scale_by_row_radam(threshold=length + shift)
-    slopes = np.full((1, 2), 1e-3, dtype)
-    state, update, steps = zeros(ours, slopes), jax.jit(ours.update), []
+    grads = np.full((1, 2), 1e-3, dtype)
+    state, update, steps = zeros(ours, grads), jax.jit(ours.update), []
     for _ in range(9):
-        step, state = update(slopes, state)
+        step, state = update(grads, state)
         steps.append(float(np.asarray(step)[0, 0]))
     first = 7 if shift > 0 else 6
     np.testing.assert_allclose(steps[:first], 1e-3, rtol=2e-5)
@@ -151,13 +151,13 @@ def test_radam_switches_exactly_where_its_length_passes_the_threshold(shift, dty
     )
 
 
-def radam_alone(slopes, b1=0.9, b2=0.999, eps=1e-15):
+def radam_alone(grads, b1=0.9, b2=0.999, eps=1e-15):
     """RAdam of one number, algorithm 2 of the paper with the threshold of its code."""
     first = second = 0.0
     steps = []
-    for age, slope in enumerate(slopes, start=1):
-        first = b1 * first + (1 - b1) * slope
-        second = b2 * second + (1 - b2) * slope**2
+    for age, grad in enumerate(grads, start=1):
+        first = b1 * first + (1 - b1) * grad
+        second = b2 * second + (1 - b2) * grad**2
         mean, square = first / (1 - b1**age), second / (1 - b2**age)
         length = exact_length(age, b2)
         if length < 5:
@@ -170,19 +170,19 @@ def radam_alone(slopes, b1=0.9, b2=0.999, eps=1e-15):
 
 def test_rows_that_start_late_follow_radam_from_their_own_first_step(dtype):
     starts, total = [0, 3, 12], 24
-    slopes = np.random.default_rng(3).normal(size=(total, len(starts)))
+    grads = np.random.default_rng(3).normal(size=(total, len(starts)))
     for row, start in enumerate(starts):
-        slopes[:start, row] = 0
+        grads[:start, row] = 0
     ours = optimiser.scale_by_row_radam()
     state = ours.init(jnp.zeros(len(starts), dtype))
     steps, update = [], jax.jit(ours.update)
-    for slope in slopes:
-        step, state = update(jnp.asarray(slope, dtype), state)
+    for grad in grads:
+        step, state = update(jnp.asarray(grad, dtype), state)
         steps.append(np.asarray(step))
     for row, start in enumerate(starts):
         mine = np.array(steps)[:, row]
         assert not mine[:start].any()
-        expected = radam_alone(slopes[start:, row])
+        expected = radam_alone(grads[start:, row])
         # A mean of slopes of both signs may cancel to a tenth of them.
         tolerance = {"float32": 2e-6, "float64": 1e-12}[dtype]
         np.testing.assert_allclose(mine[start:], expected, rtol=1e-4, atol=tolerance)
@@ -235,12 +235,12 @@ def test_a_late_row_steps_as_if_it_were_alone(dtype):
 def test_a_row_counts_from_its_first_slope(dtype):
     """A band of harmonics or a network that waits does not start too fast."""
     ours = optimiser.scale_by_row_adam()
-    slopes = np.repeat([[0], [1]], 3, axis=1).astype(dtype)
-    state = zeros(ours, slopes)
+    grads = np.repeat([[0], [1]], 3, axis=1).astype(dtype)
+    state = zeros(ours, grads)
     update = jax.jit(ours.update)
     for _ in range(5):
-        step, state = update(slopes, state)
-        np.testing.assert_allclose(step, slopes, rtol=2e-5)
+        step, state = update(grads, state)
+        np.testing.assert_allclose(step, grads, rtol=2e-5)
     assert state.count.tolist() == [0, 5]
     step, state = update(np.ones((2, 3), dtype), state)
     np.testing.assert_allclose(step, 1.0, rtol=2e-5)
@@ -258,17 +258,17 @@ def test_leaves_without_rows_are_plain_adam(dtype):
 
 
 @jax.jit
-def first_step(slopes):
+def first_step(grads):
     ours = optimiser.scale_by_row_adam()
-    return ours.update(slopes, ours.init(slopes))[0]
+    return ours.update(grads, ours.init(grads))[0]
 
 
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("slope", [1e-4, 1e-8, 1e-10, 1e-15])
-def test_steps_do_not_depend_on_the_size_of_the_slope(slope, dtype):
-    step = first_step(np.full((3, 2), slope, dtype))
+def test_steps_do_not_depend_on_the_size_of_the_slope(grad, dtype):
+    step = first_step(np.full((3, 2), grad, dtype))
     # eps = 1e-15 halves the step at 1e-15 and takes 1e-5 at 1e-10.
-    np.testing.assert_allclose(step, slope / (slope + 1e-15), rtol=1e-5)
+    np.testing.assert_allclose(step, grad / (grad + 1e-15), rtol=1e-5)
 
 
 @pytest.mark.hard_cases
@@ -283,18 +283,18 @@ UPDATES = {name: jax.jit(ours().update) for name, (ours, _) in PAIRS.items()}
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("name", PAIRS)
 @pytest.mark.parametrize("slope", [1e19, 1e21, 1e30, np.inf, np.nan])
-def test_a_slope_too_large_to_square_shows_and_spares_the_others(name, slope, dtype):
+def test_a_slope_too_large_to_square_shows_and_spares_the_others(name, grad, dtype):
     """Divided by an infinite square, its row stands still; the loop looks for it."""
     ours = PAIRS[name][0]()
-    slopes = np.ones((3, 2), dtype)
-    state, update = zeros(ours, slopes), UPDATES[name]
+    grads = np.ones((3, 2), dtype)
+    state, update = zeros(ours, grads), UPDATES[name]
     for _ in range(7):  # past RAdam's threshold
-        _, state = update(slopes, state)
-    wild = slopes.copy()
-    wild[1, 0] = slope
+        _, state = update(grads, state)
+    wild = grads.copy()
+    wild[1, 0] = grad
     after = state
-    for hit in (wild, slopes, slopes):
-        usual, state = update(slopes, state)
+    for hit in (wild, grads, grads):
+        usual, state = update(grads, state)
         step, after = jax.tree.map(np.asarray, update(hit, after))
         others = np.ones((3, 2), bool)
         others[1, 0] = False
@@ -302,16 +302,16 @@ def test_a_slope_too_large_to_square_shows_and_spares_the_others(name, slope, dt
         square = after.second[1, 0]
         assert np.isfinite(step[1, 0]) or not np.isfinite(square)
     huge = {"float32": 5e20, "float64": 1e150}[dtype]
-    assert np.isfinite(square) == (slope < huge)
+    assert np.isfinite(square) == (grad < huge)
 
 
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("name", PAIRS)
 def test_float32_stays_float32_where_x64_is_on(name):
     """NumPy's float64 among the coefficients would make the updates float64."""
-    rule, slopes = PAIRS[name][0](), {"w": jnp.ones((3, 2), jnp.float32)}
+    rule, grads = PAIRS[name][0](), {"w": jnp.ones((3, 2), jnp.float32)}
     with jax.enable_x64(True):
-        shapes = jax.eval_shape(rule.update, slopes, jax.eval_shape(rule.init, slopes))
+        shapes = jax.eval_shape(rule.update, grads, jax.eval_shape(rule.init, grads))
     kinds = {leaf.dtype.name for leaf in jax.tree.leaves(shapes)}
     assert kinds == {"float32", "int32"}
 
@@ -332,8 +332,8 @@ def test_parameters_that_small_steps_would_not_move_are_refused(name, narrow):
 @pytest.mark.parametrize("name", PAIRS)
 def test_a_gather_moves_rows_with_their_moments_and_leaves_nets_alone(name):
     params, tx = rows_and_nets(), partitioned(PAIRS[name][0])
-    slopes = jax.tree.map(lambda p: p * 2, params)
-    moments = first_moments(tx, slopes, params)
+    grads = jax.tree.map(lambda p: p * 2, params)
+    moments = first_moments(tx, grads, params)
     rows = jnp.asarray([5, 0, 0, 2, 1, 0, 0, 0])
     fresh = jnp.asarray([0, 0, 1, 0, 0, 0, 0, 0], bool)
     inactive = jnp.arange(8) >= 5

@@ -134,7 +134,7 @@ def test_the_loss_of_a_whole_step_has_the_right_slope(paper, float64):
     condition = FrameCondition(view.time, step=step, key=jax.random.key(5))
 
     def loss(params):
-        moved = deformation.pose_in_training(
+        moved = deformation.deform_in_training(
             effects, params, scene.splats.activate(params.rows["splats"]), condition
         )
         drawn = model.stages.draw(params, moved, view, (40, 30), step)

@@ -74,12 +74,10 @@ def slopes_at(params, step):
     return jax.tree.map(lambda leaf: leaf - aim, params)
 
 
-def descend(optimiser, trained, slopes):
+def descend(optimiser, trained, grads):
     # optax mixes integers and floats in its bias corrections.
     with jax.numpy_dtype_promotion("standard"):
-        directions, moments = optimiser.update(
-            slopes, trained.opt_state, trained.params
-        )
+        directions, moments = optimiser.update(grads, trained.opt_state, trained.params)
     moved = jax.tree.map(lambda p, d: p - RATE * d, trained.params, directions)
     return Trained(moved, moments)
 
@@ -187,9 +185,9 @@ def numpy_adam(params, slopes_of, turns):
     """Float64 Adam whose moments and count only know the group's own steps."""
     first, second = np.zeros_like(params), np.zeros_like(params)
     for count, step in enumerate(np.flatnonzero(turns), start=1):
-        slope = slopes_of(params, step)
-        first = 0.9 * first + 0.1 * slope
-        second = 0.999 * second + 0.001 * slope**2
+        grad = slopes_of(params, step)
+        first = 0.9 * first + 0.1 * grad
+        second = 0.999 * second + 0.001 * grad**2
         mean, square = first / (1 - 0.9**count), second / (1 - 0.999**count)
         params = params - RATE * mean / (np.sqrt(square) + 1e-15)
     return params
@@ -209,8 +207,8 @@ def test_each_group_is_adam_on_its_own_steps(dtype):
 
 
 @jax.jit
-def adam_step(trained, slopes):
-    return descend(scale_by_row_adam(), trained, slopes)
+def adam_step(trained, grads):
+    return descend(scale_by_row_adam(), trained, grads)
 
 
 @jax.jit
@@ -280,7 +278,7 @@ def loss(params, shift, on):
 def test_stopped_gradients_have_the_values_and_the_slopes_of_the_function(dtype):
     params, shift = make(dtype), jnp.asarray(0.3, dtype)
     plain = jax.value_and_grad(lambda params: jnp.sum(wave(params, shift) ** 2))
-    value, slopes = jax.jit(plain)(params)
+    value, grads = jax.jit(plain)(params)
     stop_frozen_gradients = jax.jit(jax.value_and_grad(loss))
     tolerance = {"float32": 1e-5, "float64": 1e-13}[dtype]
     for on in (True, False):
@@ -292,11 +290,11 @@ def test_stopped_gradients_have_the_values_and_the_slopes_of_the_function(dtype)
                     np.testing.assert_allclose, rtol=tolerance, atol=1e-6
                 ),
                 getattr(kept, group),
-                getattr(slopes, group),
+                getattr(grads, group),
             )
         if not on:
             assert not np.asarray(kept.nets["w"]).any()
-            assert np.asarray(slopes.nets["w"]).all()
+            assert np.asarray(grads.nets["w"]).all()
 
 
 def test_stopped_gradients_are_those_of_central_differences(float64):

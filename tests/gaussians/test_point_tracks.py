@@ -23,7 +23,7 @@ from tests import scenes
 def filmed():
     film = dataclasses.replace(scenes.TINY_FILM, heldout_every=2)
     capture, truth = synthetic.make(film)
-    return capture, truth, protocol.known(capture, truth, 2, 5)
+    return capture, truth, protocol.ground_truth(capture, truth, 2, 5)
 
 
 def splat_rows(mean, logit):
@@ -43,18 +43,18 @@ def follow_moved(monkeypatch, filmed, rows, moved):
     """Follow through Gaussians that `moved(mean, time)` poses in closed form."""
     capture, _, known = filmed
 
-    def pose(params, prepared, time):
+    def deform(params, prepared, time):
         splats = params.rows["splats"]
         opacity = jax.nn.sigmoid(splats.opacity_logit)
         mean = moved(splats.mean, time) + 0 * prepared
         return Gaussians(mean, splats.quaternion, jnp.exp(splats.log_scale), opacity)
 
-    stages = Stages(lambda params: jnp.zeros(()), pose, None)
+    stages = Stages(lambda params: jnp.zeros(()), deform, None)
     monkeypatch.setattr(
         splat_scene, "build", lambda *_: types.SimpleNamespace(stages=stages)
     )
-    effects = (types.SimpleNamespace(deform=pose),)
-    monkeypatch.setattr(splat_scene, "effects_of", lambda *_: effects)
+    effects = (types.SimpleNamespace(deform=deform),)
+    monkeypatch.setattr(splat_scene, "all_effects", lambda *_: effects)
     state = types.SimpleNamespace(params=Params({"splats": rows}, {}))
     return point_tracks.follow(None, None, state, capture, known)
 

@@ -184,10 +184,10 @@ HOPELESS = {
 def test_what_cannot_be_drawn_is_finite_without_gradient(name, dtype):
     gaussians = one(dtype, **HOPELESS[name])
     camera = camera_at([0.0, 0.0, 0.0], dtype, turn=0.0)
-    (found, visible), _, slopes = footprint_and_slopes(gaussians, camera)
+    (found, visible), _, grads = footprint_and_slopes(gaussians, camera)
     assert not visible[0]
     assert all(np.isfinite(leaf).all() for leaf in found)
-    for leaf in slopes:
+    for leaf in grads:
         np.testing.assert_array_equal(leaf, np.zeros(leaf.shape))
 
 
@@ -209,9 +209,9 @@ DRAWABLE = {
 def test_extreme_but_valid_gaussians_are_drawn_with_finite_gradient(name, dtype):
     gaussians = one(dtype, **DRAWABLE[name])
     camera = camera_at([0.0, 0.0, 0.0], dtype, turn=0.0)
-    (found, visible), _, slopes = footprint_and_slopes(gaussians, camera)
+    (found, visible), _, grads = footprint_and_slopes(gaussians, camera)
     assert visible[0]
-    for leaf in (*found, *slopes):
+    for leaf in (*found, *grads):
         assert np.isfinite(leaf).all(), name
 
 
@@ -222,10 +222,10 @@ def plain_and_antialiased(gaussians, camera):
         total = jnp.sum(found.mean_px) + jnp.sum(found.whitening)
         return total + jnp.sum(found.opacity + found.depth), found
 
-    slopes, sharp = jax.grad(loss, has_aux=True)(gaussians)
+    grads, sharp = jax.grad(loss, has_aux=True)(gaussians)
     # The antialiased factor may hide a small one: visibility is that of the plain form.
     plain = projection.project(gaussians, camera, SIZE, GSPLAT)
-    return (plain, plain.visible), sharp, slopes
+    return (plain, plain.visible), sharp, grads
 
 
 def footprint_and_slopes(gaussians, camera):

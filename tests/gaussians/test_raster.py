@@ -58,10 +58,10 @@ def picture_and_slopes(footprints, values, size, spec):
         image, left = raster.rasterise(moved, values, size, spec)
         return jnp.sum(jnp.sin(3 * image)) + jnp.sum(left**2), (image, left)
 
-    slopes, picture = jax.grad(loss, argnums=(0, 1, 2, 3), has_aux=True)(
+    grads, picture = jax.grad(loss, argnums=(0, 1, 2, 3), has_aux=True)(
         *footprints[:3], values
     )
-    return picture, slopes
+    return picture, grads
 
 
 def close(found, expected, tolerance):
@@ -164,11 +164,11 @@ def test_nothing_to_draw_leaves_the_background(count, dtype, rng):
     footprints, _ = some_footprints(rng, count, SIZE, dtype)
     footprints = footprints._replace(extent_px=jnp.zeros((count, 2), dtype))
     values = np.ones((count, 3), dtype)
-    (image, left), slopes = picture_and_slopes(footprints, values, SIZE, QUICK)
+    (image, left), grads = picture_and_slopes(footprints, values, SIZE, QUICK)
     np.testing.assert_array_equal(image, np.zeros((*SIZE[::-1], 3)))
     np.testing.assert_array_equal(left, np.ones(SIZE[::-1]))
-    for slope in slopes:
-        np.testing.assert_array_equal(slope, np.zeros(slope.shape))
+    for grad in grads:
+        np.testing.assert_array_equal(grad, np.zeros(grad.shape))
 
 
 @pytest.mark.hard_cases

@@ -23,7 +23,7 @@ def both(devices):
     row = jax.devices()[:devices]
     assert len(row) == devices
 
-    def slopes(draw):
+    def grads(draw):
         def loss(mean_px, opacity, values):
             moved = footprints._replace(mean_px=mean_px, opacity=opacity)
             image, left = draw(moved, values)
@@ -32,8 +32,8 @@ def both(devices):
         differentiate = jax.grad(loss, argnums=(0, 1, 2), has_aux=True)
         return jax.jit(differentiate)(footprints.mean_px, footprints.opacity, values)
 
-    whole = slopes(lambda f, v: raster.rasterise(f, v, SIZE, GSPLAT))
-    bands = slopes(lambda f, v: raster_bands.rasterise_bands(f, v, SIZE, GSPLAT, row))
+    whole = grads(lambda f, v: raster.rasterise(f, v, SIZE, GSPLAT))
+    bands = grads(lambda f, v: raster_bands.rasterise_bands(f, v, SIZE, GSPLAT, row))
     test_raster.close(bands, whole, 1e-12)
 
 

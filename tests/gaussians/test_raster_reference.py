@@ -119,13 +119,13 @@ def test_picture_and_gradients_equal_the_reference(case):
     differentiate = jax.jit(
         jax.value_and_grad(case.loss, argnums=(0, 1, 2, 3), has_aux=True)
     )
-    (_, picture), slopes = differentiate(*args)
+    (_, picture), grads = differentiate(*args)
     assert picture.colour.dtype == case.dtype
     check_picture(case, picture)
-    found = (*slopes[0], *slopes[1:])
+    found = (*grads[0], *grads[1:])
     names = ("means", "quats", "scales", "opacities", "colors", "viewmat", "means2d")
-    for name, slope in zip(names, found, strict=True):
-        check_gradient(case, name, slope)
+    for name, grad in zip(names, found, strict=True):
+        check_gradient(case, name, grad)
 
 
 def check_picture(case, picture):

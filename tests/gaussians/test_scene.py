@@ -110,14 +110,14 @@ def test_descent_scales_each_kind_of_row_by_its_rate():
 
 def test_one_adam_step_is_optax_adam_for_rows_and_networks():
     _, state, _ = started(scenes.TINY_DEFORMABLE)
-    slopes = jax.tree.map(
+    grads = jax.tree.map(
         lambda leaf: jax.random.normal(jax.random.key(1), leaf.shape), state.params
     )
     ours = scale_by_row_adam()
-    directions, _ = jax.jit(ours.update)(slopes, ours.init(state.params))
+    directions, _ = jax.jit(ours.update)(grads, ours.init(state.params))
     reference = optax.scale_by_adam(eps=1e-15)
     with jax.numpy_dtype_promotion("standard"):  # optax mixes ints and floats
-        expected, _ = jax.jit(reference.update)(slopes, reference.init(state.params))
+        expected, _ = jax.jit(reference.update)(grads, reference.init(state.params))
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6),
         directions,

@@ -221,20 +221,20 @@ def values_and_slopes(render, truth, valid):
 @pytest.mark.parametrize("level", [0.0, 1e-42, 1e-20, 0.5])
 def test_slopes_are_finite_where_amplitudes_vanish(level, dtype, rng):
     truth = picture(rng, *PATCH, dtype)
-    _, slope = values_and_slopes(np.full_like(truth, level), truth, EVERYWHERE)[
+    _, grad = values_and_slopes(np.full_like(truth, level), truth, EVERYWHERE)[
         "fourier"
     ]
-    assert np.all(np.isfinite(slope))
+    assert np.all(np.isfinite(grad))
     if level == 0:
-        assert not np.any(slope)
+        assert not np.any(grad)
 
 
 @pytest.mark.hard_cases
 def test_slopes_are_zero_where_the_render_is_right(dtype, rng):
     truth = picture(rng, *PATCH, dtype)
-    for value, slope in values_and_slopes(truth, truth, EVERYWHERE).values():
+    for value, grad in values_and_slopes(truth, truth, EVERYWHERE).values():
         assert float(value) == 0
-        assert not np.any(slope)
+        assert not np.any(grad)
 
 
 @pytest.mark.hard_cases
@@ -252,13 +252,13 @@ def test_pixels_that_are_not_valid_teach_nothing_whatever_they_hold(hole, dtype,
     holed = values_and_slopes(
         np.where(keep, render, render.dtype.type(hole)), truth, valid
     )
-    for name, (value, slope) in whole.items():
+    for name, (value, grad) in whole.items():
         assert float(value) == pytest.approx(float(expected[name]), rel=1e-6)
         found = np.asarray(holed[name][1])
         assert np.all(np.isfinite(found))
         assert np.any(found)
         assert not np.any(np.where(keep, 0, found))
-        np.testing.assert_allclose(found, np.where(keep, slope, 0), atol=1e-7)
+        np.testing.assert_allclose(found, np.where(keep, grad, 0), atol=1e-7)
 
     if not np.isfinite(hole):  # an undistorted truth holds NaN where it saw nothing
         unseen, blackened = (
@@ -310,20 +310,20 @@ def test_the_slope_of_a_learned_gate_is_never_negative_and_the_closed_form(
     slope_of = jax.jit(jax.grad(value))
     for logit in (-9.0, -3.0, 0.0, 3.0, 30.0):
         gates = Gates(jnp.asarray(logit), jnp.asarray(logit))
-        slope = slope_of(gates)
+        grad = slope_of(gates)
         share = 1 / (1 + math.exp(-logit))
         rate = 0.1 * share * (1 - share)
         unweighted = (
             wavelet_loss(spec.wavelet, render, truth),
             fourier_loss(spec.fourier, render, truth),
         )
-        for part, size in zip(slope, unweighted, strict=True):
+        for part, size in zip(grad, unweighted, strict=True):
             assert part >= 0
             assert float(part) == pytest.approx(
                 rate * float(size), rel=1e-12, abs=1e-15
             )
         if logit < 30:  # where the sigmoid is one to rounding nothing is left
-            assert min(slope) > 0
+            assert min(grad) > 0
             assert gradients.directional_error(value, gates) < 1e-6
 
 
@@ -345,9 +345,9 @@ def test_a_shut_gate_keeps_its_least_opening_and_a_finite_slope(
 ):
     spec = SpectralSpec(WaveletSpec(1.0), FourierSpec(1.0), gate=gate)
 
-    value, slope = opening(spec, np.asarray(logit, dtype))
+    value, grad = opening(spec, np.asarray(logit, dtype))
     assert float(value) == pytest.approx(least, rel=1e-6)
-    assert 0 <= float(slope) < 1e-12
+    assert 0 <= float(grad) < 1e-12
 
 
 def test_a_schedule_falls_along_half_a_cosine_to_exactly_nothing():
@@ -390,11 +390,11 @@ def test_the_effect_weighs_logs_and_trains_what_its_gate_has(gate, rng):
         return weighted_sum(terms), values(terms)
 
     both = jax.jit(jax.value_and_grad(value, has_aux=True))
-    (early, _), slope = both(params, step_of(2))
+    (early, _), grad = both(params, step_of(2))
     assert float(early) == 0
-    assert not any(map(float, jax.tree.leaves(slope)))
-    (later, metrics), slope = both(params, step_of(3))
-    assert all(float(part) > 0 for part in jax.tree.leaves(slope))
+    assert not any(map(float, jax.tree.leaves(grad)))
+    (later, metrics), grad = both(params, step_of(3))
+    assert all(float(part) > 0 for part in jax.tree.leaves(grad))
     by_hand = sum(
         float(metrics[f"{name}_weight"]) * float(metrics[name])
         for name in ("wavelet", "fourier")
@@ -421,8 +421,8 @@ def test_the_scenes_optimiser_shuts_a_learned_gate_down_to_its_least(rng):
             terms = made.penalty(params.nets["spectral"], context)
             return weighted_sum(terms), terms["wavelet_weight"].value
 
-        slopes, weight = jax.grad(value, has_aux=True)(params)
-        along, moments = optimiser.update(slopes, moments, params)
+        grads, weight = jax.grad(value, has_aux=True)(params)
+        along, moments = optimiser.update(grads, moments, params)
         rate = Params({}, {"spectral": made.learning_rate(step)})
         return (apply_updates(params, along, rate), moments), weight
 

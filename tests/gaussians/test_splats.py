@@ -64,9 +64,9 @@ def total_and_slope(raw, splats):
 @pytest.mark.parametrize("raw", [-100.0, 100.0, -1e30, 1e30])
 def test_raw_values_far_out_stay_finite_with_their_slopes(raw, dtype):
     splats = some_splats(np.random.default_rng(0), dtype=dtype)
-    value, slope = total_and_slope(jnp.asarray(raw, dtype), splats)
+    value, grad = total_and_slope(jnp.asarray(raw, dtype), splats)
     assert np.isfinite(value)
-    assert np.isfinite(slope)
+    assert np.isfinite(grad)
 
 
 @pytest.mark.hard_cases
@@ -117,9 +117,9 @@ def test_a_traced_degree_hides_the_bands_above_it(degree, rng, dtype):
     def total(rest):
         return jnp.sum(rows.active_harmonics(splats._replace(sh_rest=rest), degree))
 
-    slope = np.asarray(jax.grad(total)(splats.sh_rest))
-    assert (slope[:, : kept - 1] == 1).all()
-    assert not slope[:, kept - 1 :].any()
+    grad = np.asarray(jax.grad(total)(splats.sh_rest))
+    assert (grad[:, : kept - 1] == 1).all()
+    assert not grad[:, kept - 1 :].any()
 
 
 def test_the_degree_grows_on_schedule():
@@ -229,7 +229,7 @@ def test_a_tripod_has_no_extent_of_its_own():
     position = np.tile([[1000.0, 2.0, 3.0]], (5, 1)) + np.float32(6e-5) * np.eye(5, 3)
     with pytest.raises(ValueError, match="stand still"):
         rows.scene_extent(position)
-    assert rows.scene_extent(position, still=2.5) == 2.5
+    assert rows.scene_extent(position, static=2.5) == 2.5
 
 
 @pytest.mark.hard_cases
@@ -251,8 +251,8 @@ def test_inactive_rows_change_neither_the_picture_nor_learn_anything(rng):
         lambda leaf: np.concatenate([leaf[:7], leaf[6:1:-1]]), padded
     )._replace(opacity_logit=padded.opacity_logit)
     run = jax.jit(jax.grad(loss, has_aux=True))
-    slopes, colour = jax.tree.map(np.asarray, run(padded))
+    grads, colour = jax.tree.map(np.asarray, run(padded))
     assert colour.max() > 0.1
     np.testing.assert_array_equal(colour, run(other)[1])
-    assert any(leaf[:7].any() for leaf in slopes)
-    assert not any(leaf[7:].any() for leaf in slopes)
+    assert any(leaf[:7].any() for leaf in grads)
+    assert not any(leaf[7:].any() for leaf in grads)

@@ -88,7 +88,7 @@ def scene(rng, dtype="float32", count=40):
     return splats.pad_rows(params, count + 8)
 
 
-def pose(params, time):
+def deform(params, time):
     """Every Gaussian sways, turns and breathes at its own speed."""
     gaussians = splats.activate(params.rows["splats"])
     swing = params.rows["speed"] * jnp.sin(5 * time)
@@ -102,7 +102,7 @@ def pose(params, time):
 @pytest.mark.parametrize("static_threshold", [0.0, 0.02, 0.3])
 def test_what_is_left_out_is_off_by_no_more_than_the_tolerance(static_threshold, rng):
     params = scene(rng)
-    parts = static_rows.split(params, pose, TIMES, static_threshold)
+    parts = static_rows.split(params, deform, TIMES, static_threshold)
     count = len(parts.dynamic.rows["speed"])
     inactive = ~np.asarray(splats.active_mask(params.rows["splats"]))
     moves = np.asarray(parts.index.moves)
@@ -111,7 +111,7 @@ def test_what_is_left_out_is_off_by_no_more_than_the_tolerance(static_threshold,
     assert moves[1]  # its motion is not a number: not taken for static
     for time in TIMES:
         time = jnp.asarray(time, jnp.float32)
-        found, exact = static_rows.pose(parts, pose, time), pose(params, time)
+        found, exact = static_rows.deform(parts, deform, time), deform(params, time)
         for name in Gaussians._fields:
             np.testing.assert_array_equal(
                 np.asarray(getattr(found, name))[moves],
@@ -127,7 +127,7 @@ def test_what_is_left_out_is_off_by_no_more_than_the_tolerance(static_threshold,
 def test_a_larger_tolerance_leaves_fewer_rows(rng):
     params = scene(rng)
     counts = [
-        len(static_rows.split(params, pose, TIMES, below).dynamic.rows["speed"])
+        len(static_rows.split(params, deform, TIMES, below).dynamic.rows["speed"])
         for below in (0.0, 0.3, 0.6, 1e9)
     ]
     assert counts == sorted(counts, reverse=True)
@@ -137,12 +137,12 @@ def test_a_larger_tolerance_leaves_fewer_rows(rng):
 def test_where_nothing_moves_nothing_is_evaluated(rng):
     params = scene(rng)
     params.rows["speed"] = jnp.zeros_like(params.rows["speed"])
-    parts = static_rows.split(params, pose, TIMES, 0.0)
+    parts = static_rows.split(params, deform, TIMES, 0.0)
 
     def refuse(params, time):
         raise AssertionError("evaluated")
 
-    found = static_rows.pose(parts, refuse, jnp.asarray(0.3))
+    found = static_rows.deform(parts, refuse, jnp.asarray(0.3))
     exact = splats.activate(params.rows["splats"])
     jax.tree.map(np.testing.assert_array_equal, found, exact)
 
@@ -150,13 +150,13 @@ def test_where_nothing_moves_nothing_is_evaluated(rng):
 def test_moving_rows_keep_their_gradients(rng, float64):
     params = scene(rng, float64)
     params.rows["speed"] = jnp.nan_to_num(params.rows["speed"])
-    parts = static_rows.split(params, pose, TIMES, 0.02)
+    parts = static_rows.split(params, deform, TIMES, 0.02)
 
     def loss(speed, time):
         rows = parts.dynamic.rows | {"speed": speed}
         now = parts._replace(dynamic=parts.dynamic._replace(rows=rows))
-        posed = static_rows.pose(now, pose, time)
-        return sum(jnp.sum(jnp.sin(3 * leaf)) for leaf in posed)
+        deformed = static_rows.deform(now, deform, time)
+        return sum(jnp.sum(jnp.sin(3 * leaf)) for leaf in deformed)
 
     speed = parts.dynamic.rows["speed"]
     assert gradients.directional_error(loss, speed, jnp.asarray(0.4)) < 1e-7
@@ -165,9 +165,9 @@ def test_moving_rows_keep_their_gradients(rng, float64):
 @pytest.mark.parametrize("below", [-1e-3, float("nan")])
 def test_a_tolerance_below_zero_is_refused(below, rng):
     with pytest.raises(ValueError, match=r"static_threshold=.* scene units"):
-        static_rows.split(scene(rng), pose, TIMES, below)
+        static_rows.split(scene(rng), deform, TIMES, below)
 
 
 def test_no_times_are_refused(rng):
     with pytest.raises(ValueError, match="no times to look for motion at"):
-        static_rows.split(scene(rng), pose, TIMES[:0], 0.1)
+        static_rows.split(scene(rng), deform, TIMES[:0], 0.1)

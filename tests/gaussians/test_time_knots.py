@@ -93,8 +93,8 @@ def test_the_error_falls_with_the_order_of_the_interpolation(
 
 def catmull_rom(times, values, at):
     """Cubic Hermite with central slopes, and a parabola's at the ends."""
-    slopes = np.gradient(values, times, axis=0, edge_order=2)
-    return scipy.interpolate.CubicHermiteSpline(times, values, slopes)(at)
+    grads = np.gradient(values, times, axis=0, edge_order=2)
+    return scipy.interpolate.CubicHermiteSpline(times, values, grads)(at)
 
 
 @pytest.mark.parametrize("count", [4, 5, 9])
@@ -155,19 +155,19 @@ def constant(quaternion, dtype):
 def test_opposite_quaternions_have_a_rotation_between(ends, interpolation, dtype):
     first, second = (constant(quaternion, dtype) for quaternion in ends)
 
-    def pose(time):  # to and fro at every knot, which is worst for a cubic
+    def deform(time):  # to and fro at every knot, which is worst for a cubic
         odd = jnp.round(5 * time) % 2 == 1
         moved = jax.tree.map(lambda a, b: jnp.where(odd, a, b), first, second)
         return moved._replace(mean=jnp.ones((1, 3), dtype) * time)
 
-    knots = time_knots.bake(pose, 6, dtype=dtype)
+    knots = time_knots.bake(deform, 6, dtype=dtype)
     draw = jax.jit(lambda time: at(knots, time, interpolation))
-    slope = jax.jit(jax.jacfwd(lambda time: draw(time).quaternion))
+    grad = jax.jit(jax.jacfwd(lambda time: draw(time).quaternion))
     for time in np.linspace(0, 1, 41):
         time = jnp.asarray(time, dtype)
         length = np.linalg.norm(draw(time).quaternion)
         np.testing.assert_allclose(length, 1, rtol=1e-6)
-        assert np.isfinite(slope(time)).all()
+        assert np.isfinite(grad(time)).all()
 
 
 def test_a_time_outside_is_held_at_the_nearer_end(dtype):
@@ -183,11 +183,11 @@ def test_a_time_outside_is_held_at_the_nearer_end(dtype):
 
 @pytest.mark.parametrize("size", [0.0, 1e-30, 1e-3, -0.5])
 def test_scales_that_shrink_through_zero_stay_positive_and_finite(size, dtype):
-    def pose(time):
+    def deform(time):
         static = constant([1.0, 0, 0, 0], dtype)
         return static._replace(scale=jnp.ones((1, 3), dtype) + (size - 1) * time)
 
-    knots = time_knots.bake(pose, 4, dtype=dtype)
+    knots = time_knots.bake(deform, 4, dtype=dtype)
     for interpolation in time_knots.FEWEST:
         for time in (0.0, 0.7, 0.9, 1.0):
             scale = at(knots, jnp.asarray(time, dtype), interpolation).scale
@@ -218,8 +218,8 @@ def test_gradients_in_time_and_in_the_knots(float64):
     knots = time_knots.bake(lambda t: moving(t, "float64"), 6, dtype=float64)
 
     def loss(track, time, interpolation):
-        posed = at(knots._replace(track=track), time, interpolation)
-        return sum(jnp.sum(jnp.sin(3 * leaf)) for leaf in posed)
+        deformed = at(knots._replace(track=track), time, interpolation)
+        return sum(jnp.sum(jnp.sin(3 * leaf)) for leaf in deformed)
 
     for interpolation in time_knots.FEWEST:
         for time in (0.05, 0.5, 0.93):  # the first, an inner and the last interval
@@ -257,9 +257,9 @@ def test_a_table_too_short_is_refused(knots, interpolation, words):
 
 
 def test_opacities_that_change_are_refused():
-    def pose(time):
+    def deform(time):
         static = moving(jnp.zeros_like(time))
         return static._replace(opacity=static.opacity * (1 - time / 2))
 
     with pytest.raises(ValueError, match=r"opacities at time 0 .* at 0\.5"):
-        time_knots.bake(pose, 5)
+        time_knots.bake(deform, 5)

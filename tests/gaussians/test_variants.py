@@ -72,23 +72,23 @@ def swaying():
     return model, state_of(params._replace(nets=nets))
 
 
-def poses(model, state, times=(0.0, 0.3, 1.0)):
+def deformed_rows(model, state, times=(0.0, 0.3, 1.0)):
     stages = model.stages
     prepared = stages.prepare(state.params)
-    pose = jax.jit(stages.pose)
+    deform = jax.jit(stages.deform)
     moments = [jnp.asarray(time, jnp.float32) for time in times]
-    return [pose(state.params, prepared, time) for time in moments]
+    return [deform(state.params, prepared, time) for time in moments]
 
 
 def test_a_motion_from_knots_is_met_at_the_knots_and_near_between(swaying):
-    exact = poses(*swaying)
+    exact = deformed_rows(*swaying)
     active = np.asarray(splats.active_mask(swaying[1].params.rows["splats"]))
     shift = np.abs(exact[0].mean - exact[2].mean).max()
     errors = []
     for knots, interpolation in ((4, "linear"), (4, "cubic"), (40, "cubic")):
         made = variants.from_knots(*swaying, knots, interpolation)
         assert f"{knots} knots, {interpolation}, of" in made.summary
-        found = poses(made.model, made.state)
+        found = deformed_rows(made.model, made.state)
         for end in (0, 2):
             met = np.abs(found[end].mean - exact[end].mean)[active]
             assert met.max() < 1e-6
@@ -116,22 +116,22 @@ def test_a_faster_model_draws_what_the_model_draws(swaying):
 
 
 def test_what_stands_still_may_be_left_out(swaying):
-    exact = poses(*swaying)
+    exact = deformed_rows(*swaying)
     made = variants.without_static(*swaying, 0.0)
     active = np.asarray(splats.active_mask(swaying[1].params.rows["splats"]))
-    for found, pose in zip(poses(made.model, made.state), exact, strict=True):
+    for found, deform in zip(deformed_rows(made.model, made.state), exact, strict=True):
         for name in Gaussians._fields:  # a row that is not drawn may be anywhere
-            a, b = (np.asarray(getattr(x, name))[active] for x in (found, pose))
+            a, b = (np.asarray(getattr(x, name))[active] for x in (found, deform))
             np.testing.assert_allclose(a, b, atol=2e-6, err_msg=name)
-    middle, *_, end = poses(*swaying, (0.5, 1.0))
+    middle, *_, end = deformed_rows(*swaying, (0.5, 1.0))
     moved = np.asarray(static_rows.max_displacement(middle, end))[active]
     below = float(np.median(moved))
     made = variants.without_static(*swaying, below)
     left = len(made.state.params[1].dynamic.rows["splats"].mean)
     assert 0 < left < len(moved)
     assert f"{left} of {len(active)} rows that move" in made.summary
-    for found, pose in zip(poses(made.model, made.state), exact, strict=True):
-        error = np.linalg.norm(found.mean - pose.mean, axis=1)[active]
+    for found, deform in zip(deformed_rows(made.model, made.state), exact, strict=True):
+        error = np.linalg.norm(found.mean - deform.mean, axis=1)[active]
         assert 0 < error.max() <= below
         assert (error == 0).sum() >= left
 
@@ -156,7 +156,7 @@ def test_what_moves_may_be_left_out(swaying):
     # Slower, so that all stay in the picture
     nets = jax.tree.map(lambda leaf: 0.5 * leaf, state.params.nets)
     state = state_of(state.params._replace(nets=nets))
-    middle, *ends = poses(model, state, (0.5, 0.0, 1.0))
+    middle, *ends = deformed_rows(model, state, (0.5, 0.0, 1.0))
     distance = np.max(
         [static_rows.max_displacement(middle, end) for end in ends], axis=0
     )

@@ -20,8 +20,8 @@ unproject = jax.jit(jax.vmap(cameras.unproject, (None, 0)))
 @jax.jit
 def seen(camera, point):
     """Pixel, depth, slope of the pixel, and whether there is one."""
-    slope = jax.jacrev(lambda place: cameras.project(camera, place)[0])(point)
-    return *cameras.project(camera, point), slope, cameras.projectable(camera, point)
+    grad = jax.jacrev(lambda place: cameras.project(camera, place)[0])(point)
+    return *cameras.project(camera, point), grad, cameras.projectable(camera, point)
 
 
 def make_camera(dtype, radial=(0.1, -0.2, 0.05), tangential=(1e-3, -2e-3)):
@@ -66,8 +66,8 @@ def oracle_pixel(camera, point):
 def seen_points(rng, camera, count=64):
     """World points that fall well inside the picture."""
     depth = rng.uniform(0.5, 6, count)
-    slopes = rng.uniform(-0.45, 0.45, (count, 2))
-    local = np.concatenate([slopes * depth[:, None], depth[:, None]], axis=1)
+    grads = rng.uniform(-0.45, 0.45, (count, 2))
+    local = np.concatenate([grads * depth[:, None], depth[:, None]], axis=1)
     return local @ np.asarray(camera.camera_from_world) + np.asarray(camera.position)
 
 
@@ -129,12 +129,12 @@ def test_gradients_of_both_directions(float64, rng):
 def test_unprojection_has_the_implicit_second_derivative(float64):
     camera = make_camera("float64")
     pixel = jnp.asarray([400.0, 120.0])
-    slope = jax.jit(jax.grad(lambda p: cameras.unproject(camera, p)[0][0]))
-    hessian = jax.jit(jax.jacfwd(slope))(pixel)
+    grad = jax.jit(jax.grad(lambda p: cameras.unproject(camera, p)[0][0]))
+    hessian = jax.jit(jax.jacfwd(grad))(pixel)
     step = 1e-2
     for axis in range(2):
         along = jnp.zeros(2).at[axis].set(step)
-        difference = (slope(pixel + along) - slope(pixel - along)) / (2 * step)
+        difference = (grad(pixel + along) - grad(pixel - along)) / (2 * step)
         np.testing.assert_allclose(hessian[axis], difference, atol=1e-6 * 1e-3)
 
 

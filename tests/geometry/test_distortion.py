@@ -23,7 +23,7 @@ distort = jax.jit(jax.vmap(distortion.distort, (None, None, 0)))
 undistort = jax.jit(jax.vmap(distortion.undistort, (None, None, 0)))
 one_to_one = jax.jit(jax.vmap(distortion.one_to_one, (None, None, 0)))
 
-slope = jax.jit(jax.jacrev(lambda *lens: distortion.undistort(*lens)[0], argnums=2))
+grad = jax.jit(jax.jacrev(lambda *lens: distortion.undistort(*lens)[0], argnums=2))
 
 
 ROWS = 200  # that every test has, so that programs are shared
@@ -32,9 +32,9 @@ ROWS = 200  # that every test has, so that programs are shared
 def undistorted(radial, tangential, bent):
     """NumPy arrays, `bent` of at most that many rows."""
     padded = np.resize(bent, (ROWS, 2)).astype(radial.dtype)
-    slopes, converged = undistort(radial, tangential, padded)
-    assert slopes.dtype == radial.dtype
-    return np.asarray(slopes)[: len(bent)], np.asarray(converged)[: len(bent)]
+    grads, converged = undistort(radial, tangential, padded)
+    assert grads.dtype == radial.dtype
+    return np.asarray(grads)[: len(bent)], np.asarray(converged)[: len(bent)]
 
 
 def first_branch(radial, targets):
@@ -57,12 +57,12 @@ def test_the_root_is_on_the_axis_branch_or_flagged(name, dtype):
     radial = np.asarray(LENSES[name], np.float64)
     targets = np.linspace(0, 1.5, 61)
     bent = targets[:, None] * [0.6, -0.8]
-    slopes, converged = undistorted(radial.astype(dtype), np.zeros(2, dtype), bent)
-    assert np.all(np.isfinite(slopes))
+    grads, converged = undistorted(radial.astype(dtype), np.zeros(2, dtype), bent)
+    assert np.all(np.isfinite(grads))
     radii, edge = first_branch(radial, targets)
     clear = abs(targets - edge) > 1e-3  # at the fold itself either answer is right
     assert np.array_equal(converged[clear], (targets < edge)[clear])
-    error = np.linalg.norm(slopes, axis=-1) - radii
+    error = np.linalg.norm(grads, axis=-1) - radii
     # the search interpolates in a grid 2e-5 fine
     assert np.max(abs(error[clear & converged])) < 1e-5
 
@@ -86,14 +86,14 @@ def test_plain_newton_would_land_on_another_branch():
 def test_round_trip_with_tangential_terms(name, tangential, dtype, rng):
     radial = np.asarray(LENSES[name], dtype)
     tangential = np.asarray(tangential, dtype)
-    slopes = rng.uniform(-0.6, 0.6, (ROWS, 2)).astype(dtype)
-    slopes[0] = 0
-    bent = np.asarray(distort(radial, tangential, slopes))
+    grads = rng.uniform(-0.6, 0.6, (ROWS, 2)).astype(dtype)
+    grads[0] = 0
+    bent = np.asarray(distort(radial, tangential, grads))
     found, converged = undistorted(radial, tangential, bent)
-    allowed = one_to_one(radial, tangential, slopes)
+    allowed = one_to_one(radial, tangential, grads)
     assert np.array_equal(converged, allowed)
     assert np.mean(converged) > 0.7
-    error = np.abs(found - slopes)[converged]
+    error = np.abs(found - grads)[converged]
     # near the fold an ulp of the distorted point is several of the slope
     assert error.max() < {"float32": 2e-4, "float64": 1e-12}[dtype]
     assert np.median(error) < {"float32": 2e-7, "float64": 1e-15}[dtype]
@@ -104,7 +104,7 @@ def test_round_trip_with_tangential_terms(name, tangential, dtype, rng):
 def test_derivatives_stay_finite_past_the_fold(target, dtype):
     radial = np.asarray([-0.5, 0, 0], dtype)  # folds at 0.5443311
     bent = np.asarray([target, 0], dtype)
-    gradient = np.asarray(slope(radial, np.zeros(2, dtype), bent))
+    gradient = np.asarray(grad(radial, np.zeros(2, dtype), bent))
     assert np.all(np.isfinite(gradient))
     if target > 0.55:
         assert np.all(gradient == 0)

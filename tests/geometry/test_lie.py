@@ -21,9 +21,9 @@ POINT = np.array([0.5, 0.25, -0.75])
 @jax.jit
 def all_orders(*screw):
     """The moved point, its slopes in all three, its curvature in the turn."""
-    slopes = jax.jacrev(lie.transform_point, argnums=(0, 1, 2))
-    bends = jax.jacfwd(lambda turn: slopes(turn, *screw[1:])[0])
-    return lie.transform_point(*screw), slopes(*screw), bends(screw[0])
+    grads = jax.jacrev(lie.transform_point, argnums=(0, 1, 2))
+    bends = jax.jacfwd(lambda turn: grads(turn, *screw[1:])[0])
+    return lie.transform_point(*screw), grads(*screw), bends(screw[0])
 
 
 def screw_matrix(angular, linear):
@@ -66,8 +66,8 @@ def exact_derivatives(angular, linear, point):
 
     first, second = np.zeros((3, 3)), np.zeros((3, 3, 3))
     for i in range(3):
-        slope = (at((i, 1)) - at((i, -1))) / (2 * step)
-        first[:, i] = [float(c) for c in slope]
+        grad = (at((i, 1)) - at((i, -1))) / (2 * step)
+        first[:, i] = [float(c) for c in grad]
         for j in range(3):
             bend = at((i, 1), (j, 1)) - at((i, 1), (j, -1))
             bend = bend - at((i, -1), (j, 1)) + at((i, -1), (j, -1))
@@ -108,8 +108,8 @@ def test_rotation_and_translation_may_vanish_separately(speed, dtype):
     inputs = [np.asarray(x, dtype) for x in (1e-4 * AXIS, speed * LINEAR, POINT)]
     with mpmath.workdps(120):
         _, first, _ = exact_derivatives(*inputs)
-    slope = np.asarray(all_orders(*inputs)[1][0])
-    assert np.max(abs(slope - first)) < {"float32": 2e-7}.get(dtype, 1e-15)
+    grad = np.asarray(all_orders(*inputs)[1][0])
+    assert np.max(abs(grad - first)) < {"float32": 2e-7}.get(dtype, 1e-15)
 
 
 def test_the_textbook_form_fails_where_this_one_does_not():
@@ -124,10 +124,10 @@ def test_the_textbook_form_fails_where_this_one_does_not():
         left = angle * eye + one * turn + two * turn @ turn
         return rotation @ point + left @ (linear / angle)
 
-    slope = jax.jacrev(textbook)
+    grad = jax.jacrev(textbook)
     inputs = [jnp.asarray(x, jnp.float32) for x in (1e-3 * AXIS, LINEAR, POINT)]
-    assert np.max(abs(slope(*inputs) - all_orders(*inputs)[1][0])) > 1e-3
-    assert np.all(np.isnan(slope(jnp.zeros(3), *inputs[1:])))
+    assert np.max(abs(grad(*inputs) - all_orders(*inputs)[1][0])) > 1e-3
+    assert np.all(np.isnan(grad(jnp.zeros(3), *inputs[1:])))
 
 
 def test_nerfies_screws(oracle_dir, float64):
@@ -137,11 +137,11 @@ def test_nerfies_screws(oracle_dir, float64):
     moved = jax.jit(jax.vmap(lie.transform_point))(*inputs)
     truth = "unit/se3/truth64/"
     np.testing.assert_allclose(moved, values[truth + "y"], rtol=1e-12, atol=1e-14)
-    slopes = jax.jit(jax.vmap(jax.jacfwd(lie.transform_point, argnums=(0, 1, 2))))(
+    grads = jax.jit(jax.vmap(jax.jacfwd(lie.transform_point, argnums=(0, 1, 2))))(
         *inputs
     )
-    for slope, name in zip(slopes, ("dw", "dv", "dx"), strict=True):
-        np.testing.assert_allclose(slope, values[truth + name], rtol=1e-12, atol=1e-12)
+    for grad, name in zip(grads, ("dw", "dv", "dx"), strict=True):
+        np.testing.assert_allclose(grad, values[truth + name], rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("angle", [0, 1e-6, 1e-2, 1.0, 3.1, 5.0])
@@ -160,8 +160,8 @@ def test_exponentials_match_scipy(angle, float64):
 @jax.vmap
 def log_and_slope(rotation, angular):
     """Of a rotation, and in w of the logarithm of the exponential of w."""
-    slope = jax.jacfwd(lambda w: lie.log_so3(lie.exp_so3(w)))
-    return lie.log_so3(rotation), slope(angular)
+    grad = jax.jacfwd(lambda w: lie.log_so3(lie.exp_so3(w)))
+    return lie.log_so3(rotation), grad(angular)
 
 
 def logarithms(rotations, angular, dtype):
@@ -185,15 +185,15 @@ def test_logarithm_inverts_the_exponential_up_to_pi(angle, dtype, rng):
     angular = angular.astype(dtype).astype(float)
     # the rotation in float64, rounded: the log's own error, not the exponential's
     exact = scipy.spatial.transform.Rotation.from_rotvec(angular)
-    found, slopes = logarithms(exact.as_matrix(), angular, dtype)
+    found, grads = logarithms(exact.as_matrix(), angular, dtype)
     error = np.linalg.norm(found.astype(np.float64) - angular, axis=1)
     # the matrix itself is rounded to 6e-8 in each entry
     assert error.max() < {"float32": 5e-7, "float64": 2e-15}[dtype]
     # d log(exp w) / dw = 1; near π the matrix's rounding may flip the sign
     if angle < 3.1:
-        assert np.max(abs(slopes - np.eye(3))) < {"float32": 2e-6}.get(dtype, 5e-15)
+        assert np.max(abs(grads - np.eye(3))) < {"float32": 2e-6}.get(dtype, 5e-15)
     else:
-        assert np.all(np.isfinite(slopes))
+        assert np.all(np.isfinite(grads))
 
 
 @pytest.mark.hard_cases

@@ -26,8 +26,8 @@ def decomposed(matrix):
 def all_orders(function, matrix, direction):
     """Value, slope, and Hessian times a direction."""
     pair = jax.value_and_grad(function)
-    (value, slope), (_, bent) = jax.jvp(pair, (matrix,), (direction,))
-    return value, slope, bent
+    (value, grad), (_, bent) = jax.jvp(pair, (matrix,), (direction,))
+    return value, grad, bent
 
 
 @jax.jit
@@ -117,14 +117,14 @@ def test_energy_and_gradient(signed, dtype, rng):
     given = matrices(rng).astype(dtype)
     truth = [exact(matrix, signed) for matrix in given]
     values = np.array([value for value, _ in truth])
-    slopes = np.array([gradient for _, gradient in truth])
+    grads = np.array([gradient for _, gradient in truth])
     # relative to the conditioning: an ulp of the matrix moves σ by as much
     bound = {"float32": 2e-5, "float64": 1e-13}[dtype]
-    found, slope, _ = of_some(energies, given)[signed]
+    found, grad, _ = of_some(energies, given)[signed]
     np.testing.assert_allclose(found, values, rtol=bound, atol=bound)
-    error = np.abs(slope - slopes).max(axis=(1, 2))
+    error = np.abs(grad - grads).max(axis=(1, 2))
     conditions = np.linalg.cond(np.asarray(given, np.float64))
-    assert np.max(error / (1 + np.abs(slopes).max(axis=(1, 2)) * conditions)) < bound
+    assert np.max(error / (1 + np.abs(grads).max(axis=(1, 2)) * conditions)) < bound
 
 
 @pytest.mark.parametrize("signed", [False, pytest.param(True, marks=pytest.mark.slow)])
@@ -235,15 +235,15 @@ def test_stretches_far_apart_keep_their_slopes_and_curvature(signed, dtype):
     for way, (_, i, j) in zip(ways, cases, strict=True):
         way[i, j] = way[j, i] = 1
     given = np.stack([np.diag(stretches) for stretches, _, _ in cases])
-    _, slopes, bent = of_some(energies, given, ways)[signed]
+    _, grads, bent = of_some(energies, given, ways)[signed]
     # below 1e-37 float32 is flushed to zero
     close = {"rtol": {"float32": 2e-6, "float64": 1e-14}[dtype], "atol": 1e-37}
-    for (stretches, i, j), slope, bend in zip(cases, slopes, bent, strict=True):
+    for (stretches, i, j), grad, bend in zip(cases, grads, bent, strict=True):
         with mpmath.workdps(60):
             exact = [mpmath.mpf(float(s)) for s in stretches]
             rate = [_mp_slope(s) for s in exact]
             change = float((rate[i] - rate[j]) / (exact[i] - exact[j]))
-        np.testing.assert_allclose(np.diag(slope), [float(r) for r in rate], **close)
+        np.testing.assert_allclose(np.diag(grad), [float(r) for r in rate], **close)
         np.testing.assert_allclose([bend[i, j], bend[j, i]], [change] * 2, **close)
 
 
@@ -280,8 +280,8 @@ def test_a_reflection_is_free_only_without_the_sign(dtype):
 def test_displacements_far_below_an_ulp_keep_their_energy(size, dtype, rng):
     """From J = 1 + D in float32 a strain of 1e-8 is 100 % wrong."""
     drawn = (size * rng.normal(size=(4, 3, 3))).astype(dtype)
-    values, slopes, _ = of_some(displaced, drawn)
-    for matrix, value, gradient in zip(drawn, values, slopes, strict=True):
+    values, grads, _ = of_some(displaced, drawn)
+    for matrix, value, gradient in zip(drawn, values, grads, strict=True):
         with mpmath.workdps(60):
             d = mpmath.matrix(np.asarray(matrix, np.float64).tolist())
             truth = _mp_energy(d)

@@ -28,8 +28,8 @@ def normalised(q):
 def round_trip(w):
     """The exponential, logarithms of it and of its negative, slope of the first."""
     unit = quaternion.exp(w)
-    slope = jax.jacfwd(lambda w: quaternion.log(quaternion.exp(w)))
-    return unit, quaternion.log(unit), quaternion.log(-unit), slope(w)
+    grad = jax.jacfwd(lambda w: quaternion.log(quaternion.exp(w)))
+    return unit, quaternion.log(unit), quaternion.log(-unit), grad(w)
 
 
 def drawn(rng, count=50):
@@ -75,12 +75,12 @@ def test_any_length_is_the_same_rotation(length, dtype, rng):
 @pytest.mark.parametrize("length", [0, 1e-38, 1e-30, 1e-19, 1e25, 3e38, np.inf])
 def test_normalising_never_makes_what_is_no_rotation(length, dtype):
     given = np.asarray(length * np.array([0.5, -0.5, 0.1, 0.7]), dtype)
-    unit, slope = (np.asarray(found) for found in normalised(given))
+    unit, grad = (np.asarray(found) for found in normalised(given))
     assert abs(np.linalg.norm(unit) - 1) < 1e-6
-    assert np.all(np.isfinite(slope))
+    assert np.all(np.isfinite(grad))
     if length in (0, np.inf):
         assert np.array_equal(unit, [1, 0, 0, 0])
-        assert np.all(slope == 0)
+        assert np.all(grad == 0)
 
 
 @pytest.mark.hard_cases
@@ -108,7 +108,7 @@ def test_matrix_to_quaternion_at_every_pivot(angle, dtype, rng):
 def test_log_inverts_exp_below_pi_for_both_signs(angle, dtype, rng):
     axes = rng.normal(size=(20, 3))
     vectors = np.asarray(angle * axes / np.linalg.norm(axes, axis=-1)[:, None], dtype)
-    unit, *logs, slopes = (np.asarray(found) for found in round_trip(vectors))
+    unit, *logs, grads = (np.asarray(found) for found in round_trip(vectors))
     truth = np.roll(
         Rotation.from_rotvec(np.array(vectors, np.float64)).as_quat(), 1, axis=-1
     )
@@ -117,7 +117,7 @@ def test_log_inverts_exp_below_pi_for_both_signs(angle, dtype, rng):
     bound = {"float32": 1e-6, "float64": 2e-15}[dtype] * max(angle, 1e-8)
     for found in logs:
         assert np.max(abs(found - vectors)) < bound
-    assert np.max(abs(slopes - np.eye(3))) < {"float32": 1e-6, "float64": 2e-15}[dtype]
+    assert np.max(abs(grads - np.eye(3))) < {"float32": 1e-6, "float64": 2e-15}[dtype]
 
 
 @pytest.mark.hard_cases
@@ -143,8 +143,8 @@ def test_slerp_matches_scipy(dtype, rng):
 def test_slerp_between_equal_ends_has_a_gradient(dtype):
     start = np.asarray([1, 0, 0, 0], dtype)
     half = np.asarray(0.5, dtype)
-    slope = np.asarray(jax.jit(jax.jacrev(quaternion.slerp, 1))(start, start, half))
-    np.testing.assert_allclose(slope[1:, 1:], np.eye(3) / 2, atol=1e-6)
+    grad = np.asarray(jax.jit(jax.jacrev(quaternion.slerp, 1))(start, start, half))
+    np.testing.assert_allclose(grad[1:, 1:], np.eye(3) / 2, atol=1e-6)
 
 
 def test_gradients(float64, rng):

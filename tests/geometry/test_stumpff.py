@@ -41,8 +41,8 @@ def every(squared):
     def orders(squared):
         return jnp.stack([stumpff(order, squared) for order in range(6)])
 
-    slope = jax.jacrev(orders)
-    return orders(squared), slope(squared), jax.jacfwd(slope)(squared)
+    grad = jax.jacrev(orders)
+    return orders(squared), grad(squared), jax.jacfwd(grad)(squared)
 
 
 @pytest.mark.hard_cases

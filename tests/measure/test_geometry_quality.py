@@ -57,19 +57,19 @@ def test_exact_depth_has_a_finite_gradient(dtype):
     def total(depth, truth):
         return sum(quality.depth_errors(depth, truth)[:2])
 
-    slope = np.asarray(jax.jit(jax.grad(total))(truth, truth))
-    assert np.all(np.isfinite(slope))
-    assert np.all(slope[2:] == 0)
+    grad = np.asarray(jax.jit(jax.grad(total))(truth, truth))
+    assert np.all(np.isfinite(grad))
+    assert np.all(grad[2:] == 0)
 
 
 def test_aligned_depth_is_numpys_least_squares(dtype, rng):
     depth, truth, mask = depths(rng, dtype)
     line = jax.jit(quality.align_depth)(depth, truth, mask)
     known = np.asarray(quality.known_depth(depth, truth, mask))
-    slope, intercept = np.polyfit(
+    grad, intercept = np.polyfit(
         *(np.asarray(x, float)[known] for x in (depth, truth)), 1
     )
-    assert line.scale == pytest.approx(slope, rel=10 * EXACT[dtype])
+    assert line.scale == pytest.approx(grad, rel=10 * EXACT[dtype])
     assert line.shift == pytest.approx(intercept, rel=10 * EXACT[dtype])
     assert line.determined
 
@@ -120,8 +120,8 @@ def test_missing_flow_is_wrong_and_equal_flow_has_gradient_zero(dtype):
     _, errors = slope_and_errors(missing, truth)
     assert np.isinf(errors.endpoint)
     assert float(errors.outliers) == 0.5
-    slope, _ = slope_and_errors(truth, truth)
-    assert not np.any(slope)
+    grad, _ = slope_and_errors(truth, truth)
+    assert not np.any(grad)
 
 
 @pytest.mark.parametrize("axes", [2, 3])

@@ -57,10 +57,10 @@ psnr_and_slope = jax.jit(jax.value_and_grad(image_quality.psnr))
 @pytest.mark.parametrize(("offset", "decibels"), [(0.0, 100), (1e-6, 100), (1e-4, 80)])
 def test_psnr_is_capped_and_exact_below_the_cap(offset, decibels, dtype):
     flat = np.zeros((8, 8, 3), dtype)
-    value, slope = psnr_and_slope(flat + flat.dtype.type(offset), flat)
+    value, grad = psnr_and_slope(flat + flat.dtype.type(offset), flat)
     assert value == pytest.approx(decibels, abs=1e-4)
-    assert np.all(np.isfinite(slope))
-    assert np.all(slope == 0) == (decibels == 100)
+    assert np.all(np.isfinite(grad))
+    assert np.all(grad == 0) == (decibels == 100)
 
 
 def test_quantised_scores_are_those_of_the_png(dtype, rng):
@@ -92,7 +92,7 @@ def test_ssim_has_the_reference_values(size, padding, dtype, oracle_dir):
     with np.load(oracle_dir / "splatting" / f"ssim_{size}.npz") as reference:
         pictures = [np.moveaxis(reference[f"img{i}"][0], 0, -1) for i in (1, 2)]
         exact = reference[{"valid": "ssim_valid", "zero": "ssim_zero_pad"}[padding]]
-        slope = np.moveaxis(reference["grad_img1"][0], 0, -1)
+        grad = np.moveaxis(reference["grad_img1"][0], 0, -1)
     image, truth = arrays(*pictures, dtype=dtype)
     value, gradient = jax.jit(jax.value_and_grad(image_quality.ssim), static_argnums=2)(
         image, truth, padding
@@ -100,7 +100,7 @@ def test_ssim_has_the_reference_values(size, padding, dtype, oracle_dir):
     # The reference made its window in float32: 2e-6 of its value.
     assert abs(value - exact) < 5e-6
     if padding == "zero":
-        error = np.linalg.norm(gradient - slope) / np.linalg.norm(slope)
+        error = np.linalg.norm(gradient - grad) / np.linalg.norm(grad)
         assert error < 1e-5
 
 
@@ -202,9 +202,9 @@ def ms_ssim_and_slope(image, truth):
 @pytest.mark.hard_cases
 def test_ms_ssim_of_a_negative_picture_is_zero_with_a_finite_gradient(dtype, rng):
     image, _ = arrays(*pair(rng, (*SMALL, 3)), dtype=dtype)
-    value, slope = ms_ssim_and_slope(1 - image, image)
+    value, grad = ms_ssim_and_slope(1 - image, image)
     assert value == 0
-    assert np.all(np.isfinite(slope))
+    assert np.all(np.isfinite(grad))
 
 
 def test_masked_psnr_is_the_psnr_of_the_masked_pixels(dtype, rng):
@@ -289,10 +289,10 @@ def test_nothing_outside_the_mask_matters(name, dtype, rng):
     metric = masked_and_slope[name]
     clean, clean_slope = metric(*arrays(image, truth, mask, dtype=dtype))
     image[~mask], truth[~mask] = np.nan, np.inf
-    value, slope = metric(*arrays(image, truth, mask, dtype=dtype))
+    value, grad = metric(*arrays(image, truth, mask, dtype=dtype))
     assert value == clean
-    np.testing.assert_array_equal(slope, clean_slope)
-    assert np.all(np.asarray(slope)[~mask] == 0)
+    np.testing.assert_array_equal(grad, clean_slope)
+    assert np.all(np.asarray(grad)[~mask] == 0)
 
 
 @pytest.mark.hard_cases
@@ -341,10 +341,10 @@ def test_equal_constant_pictures_score_one_with_gradient_zero(name, dtype):
     }[name]
     for level in (0.0, 0.5, 0.9, 1.0):
         flat = np.full((*SMALL, 3), level, dtype)
-        value, slope = score(flat, flat, *rest)
+        value, grad = score(flat, flat, *rest)
         # The textbook form in float32: 4e-5 low, and a slope 1e5 times rounding.
         assert value == 1.0
-        assert np.abs(slope).max() < 1e-12
+        assert np.abs(grad).max() < 1e-12
 
 
 @pytest.mark.hard_cases

@@ -140,10 +140,10 @@ def test_lpips_is_zero_for_equal_pictures_and_its_gradient_is_finite(tiny, rng):
         return perceptual.lpips(params, TINY, image, truth)
 
     score = jax.jit(jax.value_and_grad(score, argnums=1))
-    value, slope = score(tiny, truth, truth)
+    value, grad = score(tiny, truth, truth)
     # XLA may fuse the two equal branches differently: 6e-16 measured.
     assert value < 1e-12
-    assert np.abs(slope).max() < 1e-6
+    assert np.abs(grad).max() < 1e-6
     # Every channel of every pixel dead, under large negative biases.
     dead = tiny._replace(
         convolutions=tuple(
@@ -151,9 +151,9 @@ def test_lpips_is_zero_for_equal_pictures_and_its_gradient_is_finite(tiny, rng):
             for c in tiny.convolutions
         )
     )
-    value, slope = score(dead, truth / 2, truth)
+    value, grad = score(dead, truth / 2, truth)
     assert float(value) == 0
-    assert not np.any(slope)
+    assert not np.any(grad)
 
 
 @pytest.mark.hard_cases

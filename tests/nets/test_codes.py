@@ -59,9 +59,9 @@ def test_gradients_reach_the_two_rows_only(float64, rng):
 
     progress = jnp.asarray(0.3)
     assert gradients.directional_error(total, table, progress) < 1e-7
-    slope = jax.grad(total)(table, progress)
-    assert np.all(slope[jnp.asarray([1, 3])] == 0)
-    assert np.all(slope[jnp.asarray([0, 2])] != 0)
+    grad = jax.grad(total)(table, progress)
+    assert np.all(grad[jnp.asarray([1, 3])] == 0)
+    assert np.all(grad[jnp.asarray([0, 2])] != 0)
 
 
 @pytest.mark.parametrize(

@@ -87,11 +87,11 @@ def test_gradient_and_curvature(times_pi, float64, rng):
     def value(point, window):
         return encoding.encode(spec, point, window) @ weight
 
-    def slope(point, window):
+    def grad(point, window):
         return jnp.sum(jax.grad(value)(point, window) * weight[:3])
 
     assert gradients.directional_error(value, point, window) < 1e-7
-    assert gradients.directional_error(slope, point, window) < 1e-7
+    assert gradients.directional_error(grad, point, window) < 1e-7
 
 
 @pytest.mark.hard_cases
@@ -100,10 +100,10 @@ def test_the_gradient_of_a_high_band_keeps_its_digits(dtype):
     spec = EncodingSpec(10, identity=False, times_pi=True)
     point = np.asarray([0.7371], dtype)
     jacobian = jax.jacfwd(lambda point: encoding.encode(spec, point, None))
-    slopes = float(jax.jit(jacobian)(point)[-2, 0])
+    grads = float(jax.jit(jacobian)(point)[-2, 0])
     with mpmath.workdps(50):
         truth = 512 * mpmath.pi * mpmath.cospi(512 * mpmath.mpf(float(point[0])))
-    assert abs(slopes / (512 * np.pi) - float(truth) / (512 * np.pi)) < 3e-7
+    assert abs(grads / (512 * np.pi) - float(truth) / (512 * np.pi)) < 3e-7
 
 
 def test_nerfies_features_and_windows(oracle_dir, dtype):
@@ -141,9 +141,9 @@ def test_the_window_is_exact_at_its_ends_and_opens_smoothly(dtype):
     def slope_and_window(alpha):
         return map(np.asarray, both(np.asarray(alpha, dtype)))
 
-    slope, shut = slope_and_window(0)
+    grad, shut = slope_and_window(0)
     assert np.array_equal(shut, np.zeros(6))
-    assert np.all(slope == 0)
+    assert np.all(grad == 0)
     assert np.array_equal(list(slope_and_window(6))[1], np.ones(6))
     opening = np.stack([list(slope_and_window(a))[1] for a in np.linspace(-1, 7, 65)])
     assert np.all(np.diff(opening, axis=0) >= 0)

@@ -284,8 +284,8 @@ def test_slopes_of_trained_kernels_are_equations_9_and_10(float64, rng):
     log_width = np.log(math.sqrt(2) * sigma)
     kernels = Kernels(jnp.asarray(centre[:, None]), jnp.asarray(log_width[:, None]))
     params = curve_params(weights)._replace(kernels=(kernels,))
-    slopes = jax.grad(lambda p: kan.apply(spec, p, jnp.asarray([x]))["y"][0])(params)
-    (found,) = slopes.kernels
+    grads = jax.grad(lambda p: kan.apply(spec, p, jnp.asarray([x]))["y"][0])(params)
+    (found,) = grads.kernels
     psi = np.exp(-((x - centre) ** 2) / (2 * sigma**2))
     by_centre = weights * (x - centre) / sigma**2 * psi
     by_sigma = weights * (x - centre) ** 2 / sigma**3 * psi
@@ -336,9 +336,9 @@ def test_inputs_far_outside_the_grid_stay_alive(grid, base, dtype):
 
     far = np.array([3.0, 5.0, 50.0, 1e4])
     far = np.concatenate([far, -far])
-    slopes = slopes_of_curve(spec, params, far.astype(dtype))
+    grads = slopes_of_curve(spec, params, far.astype(dtype))
     sigma = math.sqrt(0.5) * (grid[1] - grid[0]) / 7
-    for x, slope in zip(far, np.asarray(slopes, np.float64), strict=True):
+    for x, grad in zip(far, np.asarray(grads, np.float64), strict=True):
         excess = (x - grid[1] if x > 0 else grid[0] - x) / sigma
         rate = (1 + 3 * excess) * (1 + 2 * excess + 3 * excess**2) ** -1.5
         offset = held(x, grid, sigma) - np.linspace(*grid, 8)
@@ -347,9 +347,9 @@ def test_inputs_far_outside_the_grid_stay_alive(grid, base, dtype):
         if base:
             logistic = scipy.special.expit(x)
             expected += 0.5 * logistic * (1 + x * scipy.special.expit(-x))
-        assert slope != 0
+        assert grad != 0
         tolerance = {"float32": 1e-4, "float64": 1e-11}[dtype]
-        np.testing.assert_allclose(slope, expected, rtol=tolerance)
+        np.testing.assert_allclose(grad, expected, rtol=tolerance)
 
 
 @jax.jit
@@ -379,9 +379,9 @@ def test_holding_keeps_its_slope_however_far_out(dtype):
     """The square of the distance overflows float32 from 1e19 on: 0, and NaN at 3e38."""
     x = np.array([-1e10, 1e10, 1e15, 1e18, 3e38], dtype)
     exact = (0.3 / x.astype(np.float64)) ** 2 / np.sqrt(3)  # to 1 / x of itself
-    value, slope, curvature = holding(x)
+    value, grad, curvature = holding(x)
     np.testing.assert_allclose(value, [-1.3, *[2.3] * 4], rtol=1e-6)
-    np.testing.assert_allclose(slope, exact, rtol=1e-6, atol=np.finfo(dtype).tiny)
+    np.testing.assert_allclose(grad, exact, rtol=1e-6, atol=np.finfo(dtype).tiny)
     assert np.isfinite(curvature).all()
 
 
@@ -397,11 +397,11 @@ def test_features_of_any_size_are_standardised(size, dtype):
     """In float32 the variance of 1e20 overflows, and every feature would become 0."""
     given = np.array([0.9, -0.3, 0.5, -1.0])
     exact = (given - given.mean()) / np.sqrt(given.var() + 1e-6 / size**2)
-    found, slopes = standardised((size * given).astype(dtype))
+    found, grads = standardised((size * given).astype(dtype))
     np.testing.assert_allclose(found, exact, rtol=1e-6)
     # d z = (1 - 1/n - z zᵀ/n) dx / deviation
     change = (np.eye(4) - 0.25 - np.outer(exact, exact) / 4) / given.std() / size
-    np.testing.assert_allclose(slopes, change, rtol=2e-6, atol=2e-6 / size + 1e-38)
+    np.testing.assert_allclose(grads, change, rtol=2e-6, atol=2e-6 / size + 1e-38)
 
 
 @pytest.mark.hard_cases
@@ -464,8 +464,8 @@ def test_bfloat16_is_finite_and_near(rng):
     spec = dataclasses.replace(HARD_VARIANTS["trained kernels"], base=True)
     params = filled(spec, "bfloat16")
     inputs = rng.normal(size=(16, 5)).astype(jnp.bfloat16)
-    (_, heads), slopes = sum_and_slopes(spec, params, inputs)
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
+    (_, heads), grads = sum_and_slopes(spec, params, inputs)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(grads))
     exact = np.array([by_hand(spec, params, x)["y"] for x in inputs])
     assert heads["y"].dtype == jnp.bfloat16
     # Layers with eight bits; standardised features lose the most.

@@ -202,8 +202,8 @@ def heads_and_slopes(spec, params, inputs):
         found = mlp.apply(spec, params, inputs)
         return sum(jnp.sum(head) for head in found.values()), found
 
-    slopes, found = jax.grad(total, has_aux=True)(params, inputs)
-    return found, slopes
+    grads, found = jax.grad(total, has_aux=True)(params, inputs)
+    return found, grads
 
 
 @pytest.mark.hard_cases
@@ -223,7 +223,7 @@ def test_bfloat16_is_finite_and_near(activation, rng):
     params = jax.tree.map(draw, shapes)
     inputs = rng.normal(size=(32, 5)).astype(jnp.bfloat16)
     wide = jax.tree.map(lambda x: x.astype(np.float32), (params, inputs))
-    (narrow, slopes), (exact, wanted) = (
+    (narrow, grads), (exact, wanted) = (
         jax.tree.map(np.asarray, heads_and_slopes(spec, *args))
         for args in ((params, inputs), wide)
     )
@@ -232,7 +232,7 @@ def test_bfloat16_is_finite_and_near(activation, rng):
         off = np.abs(np.asarray(value, np.float32) - exact[name])
         # Three roundings to 2^-9 on the way
         assert off.max() < 0.03 * np.abs(exact[name]).max()
-    for slope, truth in zip(*map(jax.tree.leaves, (slopes, wanted)), strict=True):
-        assert slope.dtype == jnp.bfloat16
-        off = np.abs(np.asarray(slope, np.float32) - truth)
+    for grad, truth in zip(*map(jax.tree.leaves, (grads, wanted)), strict=True):
+        assert grad.dtype == jnp.bfloat16
+        off = np.abs(np.asarray(grad, np.float32) - truth)
         assert off.max() <= 0.03 * np.abs(truth).max()

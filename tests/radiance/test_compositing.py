@@ -117,9 +117,9 @@ def test_density_at_infinity_has_finite_values_and_slopes(density, dtype):
 @pytest.mark.hard_cases
 def test_an_overflowing_depth_is_opaque(dtype):
     depth = np.asarray([0.1, np.inf, 1.0, np.inf], dtype)
-    weights, slopes = weights_and_slopes(depth, np.ones(4, dtype))
+    weights, grads = weights_and_slopes(depth, np.ones(4, dtype))
     np.testing.assert_allclose(weights, [1 - np.exp(-0.1), np.exp(-0.1), 0, 0], 1e-6)
-    assert np.all(np.isfinite(slopes))
+    assert np.all(np.isfinite(grads))
 
 
 def test_weights_have_the_slopes_of_central_differences(float64, rng):
@@ -184,15 +184,15 @@ def thin_grid(dtype):
     grid = np.meshgrid(DEPTHS, LOGITS, indexing="ij")
     depth, logit = (values.astype(dtype) for values in grid)
     function = jax.value_and_grad(compositing.thinned, argnums=(0, 1))
-    value, slopes = jax.jit(jax.vmap(jax.vmap(function)))(depth, logit)
-    return np.asarray(value, np.float64), np.asarray(slopes, np.float64)
+    value, grads = jax.jit(jax.vmap(jax.vmap(function)))(depth, logit)
+    return np.asarray(value, np.float64), np.asarray(grads, np.float64)
 
 
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("logit", LOGITS)
 @pytest.mark.parametrize("depth", DEPTHS)
 def test_thinned_is_exact_with_finite_slopes(depth, logit, dtype):
-    values, slopes = thin_grid(dtype)
+    values, grads = thin_grid(dtype)
     row, column = DEPTHS.index(depth), LOGITS.index(logit)
     depth, logit = float(np.asarray(depth, dtype)), float(np.asarray(logit, dtype))
     exact = exact_thinned(depth, logit)
@@ -204,9 +204,9 @@ def test_thinned_is_exact_with_finite_slopes(depth, logit, dtype):
         left = 1 - share * (1 - through)
         by_depth = float(share * through / left)
         by_logit = float(share * (1 - share) * (1 - through) / left)
-    for slope, wanted in zip(slopes[:, row, column], (by_depth, by_logit), strict=True):
-        assert np.isfinite(slope)
-        assert abs(slope - wanted) < 3 * ABSOLUTE[dtype] * max(wanted, 1)
+    for grad, wanted in zip(grads[:, row, column], (by_depth, by_logit), strict=True):
+        assert np.isfinite(grad)
+        assert abs(grad - wanted) < 3 * ABSOLUTE[dtype] * max(wanted, 1)
 
 
 @pytest.mark.hard_cases
@@ -304,8 +304,8 @@ def seen_and_slope(weights, colours, distances, background):
         seen = compositing.composite(weights, colours, distances, background)
         return seen.distance, seen
 
-    slope, seen = jax.grad(depth, has_aux=True)(weights)
-    return seen, slope
+    grad, seen = jax.grad(depth, has_aux=True)(weights)
+    return seen, grad
 
 
 @pytest.mark.hard_cases
@@ -314,11 +314,11 @@ def test_an_empty_ray_is_background_at_its_far_end(scale, dtype):
     colours, distances = scene(dtype)
     background = np.asarray([1.0, 0.5, 0.25], dtype)
     weights = (scale * np.array([0.0, 1, 0, 2, 0, 0])).astype(dtype)
-    seen, slopes = seen_and_slope(weights, colours, distances, background)
+    seen, grads = seen_and_slope(weights, colours, distances, background)
     np.testing.assert_allclose(seen.colour, background, atol=1e-7)
     assert abs(float(seen.distance) - 4.5) < 1e-4
     assert float(seen.median_distance) == 4.5
-    assert np.all(np.abs(slopes) <= 4.5 / EMPTY_BELOW)
+    assert np.all(np.abs(grads) <= 4.5 / EMPTY_BELOW)
 
 
 def test_a_single_hit_is_where_it_is(dtype):

@@ -18,7 +18,7 @@ from tests import scenes
 def filmed():
     film = dataclasses.replace(scenes.TINY_FILM, heldout_every=2)
     capture, truth = synthetic.make(film)
-    return capture, truth, protocol.known(capture, truth, 2, 5)
+    return capture, truth, protocol.ground_truth(capture, truth, 2, 5)
 
 
 @pytest.mark.parametrize("lost_at", [None, 2])

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from nerfies_jax import evaluation, presets, scene
+from nerfies_jax.effects import scene_flow, warp
 from nerfies_jax.presets import PRESETS
+from nerfies_jax.radiance import template
 from tests import scenes
 
 # Fields of the effects that count steps.
@@ -69,6 +71,28 @@ def test_presets_differ_only_in_what_their_names_say():
     assert effects["nerfies"] == {"appearance", "warp", "elastic", "background"}
     assert effects["hypernerf"] == {"appearance", "warp", "ambient", "background"}
     assert effects["nsff"] == {"scene_flow"}
+
+
+# Rows of the weights of every layer. The codes of NeRF, D-NeRF and NSFF join the input
+# to what the fifth layer answers, those of Nerfies and HyperNeRF to the fourth's.
+@pytest.mark.parametrize(
+    ("name", "inputs", "layer"),
+    [("nerf", 63, 5), ("nerf-w", 63, 5), ("d-nerf", 63, 5), ("t-nerf", 84, 5),
+     ("nsff", 63, 5), ("nerfies", 51, 4), ("hypernerf", 55, 4)],
+)  # fmt: skip
+def test_the_networks_read_their_input_again_where_the_papers_do(name, inputs, layer):
+    spec, key = PRESETS[name], jax.random.key(0)
+    read = jax.eval_shape(lambda: template.init(spec.template, key, inputs, 27))
+    found = {"template": (read.trunk.hidden, inputs, layer)}
+    if name == "d-nerf":
+        found["warp"] = jax.eval_shape(lambda: warp.init(spec.warp, key)).hidden, 84, 5
+    if name == "nsff":
+        medium = jax.eval_shape(lambda: scene_flow.init(spec.scene_flow, key, 256))
+        found["medium"] = medium.network.trunk.hidden, 84, 5
+    for hidden, width, again in found.values():
+        rows = [width, *[256] * 7]
+        rows[again] += width
+        assert [one.weight.shape for one in hidden] == [(n, 256) for n in rows]
 
 
 @pytest.mark.slow

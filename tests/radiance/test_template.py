@@ -126,11 +126,11 @@ def test_any_raw_density_has_a_finite_value_and_slope(raw, density, dtype):
     params, *inputs = drawn(dtype)
     spec = dataclasses.replace(SMALL, density=density)
     noise = np.asarray(raw, dtype)
-    value, slope = map(float, density_and_slope(spec, params, *inputs, noise))
+    value, grad = map(float, density_and_slope(spec, params, *inputs, noise))
     assert 0 <= value < 1.1e4
-    assert 0 <= slope <= 1
+    assert 0 <= grad <= 1
     if density == "softplus" and raw > -99:
-        assert slope > 0  # a ray of air can still become a surface
+        assert grad > 0  # a ray of air can still become a surface
 
 
 def test_parameters_have_the_sizes_of_the_paper():
@@ -178,10 +178,10 @@ def test_bfloat16_is_finite_and_near():
         found = template.apply(spec, params, features, condition)
         return found.density + jnp.sum(found.colour), found
 
-    (_, found), slopes = jax.jit(jax.value_and_grad(seen, has_aux=True))(params)
-    kinds = {leaf.dtype for leaf in jax.tree.leaves((found, slopes))}
+    (_, found), grads = jax.jit(jax.value_and_grad(seen, has_aux=True))(params)
+    kinds = {leaf.dtype for leaf in jax.tree.leaves((found, grads))}
     assert kinds == {jnp.dtype(jnp.bfloat16)}
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(grads))
     wide = jax.tree.map(lambda x: np.asarray(x, np.float64), (params, features))
     exact = by_hand(spec, *wide, np.asarray(condition, np.float64))
     np.testing.assert_allclose(np.asarray(found.density, float), exact[0], rtol=0.05)

@@ -128,8 +128,8 @@ def photograph(camera):
     )
 
     def colour(pixel):
-        slopes = (pixel - camera.principal_point_px) / camera.focal_px
-        direction = jnp.append(slopes, 1) @ camera.camera_from_world
+        grads = (pixel - camera.principal_point_px) / camera.focal_px
+        direction = jnp.append(grads, 1) @ camera.camera_from_world
         distance = -camera.position[2] / direction[2]
         return texture(camera.position + distance * direction)
 

@@ -138,9 +138,9 @@ def test_a_second_moment_that_overflows_stops_the_run(frames):
             wall = jnp.where(state.step == 8, 1e20, 0.0)
             return jnp.mean(params.nets["weight"] ** 2) + wall * params.nets["bias"][3]
 
-        slope = jax.grad(loss)(state.params)
+        grad = jax.grad(loss)(state.params)
         with jax.numpy_dtype_promotion("standard"):
-            updates, optimiser = toy.OPTIMISER.update(slope, state.optimiser)
+            updates, optimiser = toy.OPTIMISER.update(grad, state.optimiser)
         params = optax.apply_updates(state.params, updates)
         new = state._replace(params=params, optimiser=optimiser, step=state.step + 1)
         return new, {"loss": loss(params) * 0}

@@ -282,8 +282,8 @@ def test_float64_states_stay_float64(frames):
         )
 
         def step(state, frames):
-            slope = jax.grad(lambda p: jnp.sum(p.nets["weight"] ** 2))(state.params)
-            params = jax.tree.map(lambda p, g: p - 0.1 * g, state.params, slope)
+            grad = jax.grad(lambda p: jnp.sum(p.nets["weight"] ** 2))(state.params)
+            params = jax.tree.map(lambda p, g: p - 0.1 * g, state.params, grad)
             new = state._replace(params=params, step=state.step + 1)
             return new, {"loss": jnp.sum(params.nets["weight"] ** 2)}
 

@@ -75,7 +75,7 @@ def test_ssim_and_its_gradient_match_the_reference(name, oracle_dir, dtype):
         jnp.asarray(np.moveaxis(saved[key][0], 0, -1), dtype)
         for key in ("img1", "img2")
     )
-    value, slope = SSIM_SLOPE(image, target)
+    value, grad = SSIM_SLOPE(image, target)
     valid = jax.jit(lambda x, y: losses.ssim(x, y, padding="valid"))(image, target)
     # The reference window was built in float32 and sums to 1 + 1e-7, which variances
     # see as 1e-7 of the squares beside C2 = 9e-4: 2e-6 in the value, 6e-6 in the slope.
@@ -84,7 +84,7 @@ def test_ssim_and_its_gradient_match_the_reference(name, oracle_dir, dtype):
     assert abs(valid - saved["ssim_valid"]) < tolerance
     assert abs(losses.l1(image, target) - saved["l1"]) < 1e-6
     expected = np.moveaxis(saved["grad_img1"][0], 0, -1)
-    error = np.linalg.norm(slope - expected) / np.linalg.norm(expected)
+    error = np.linalg.norm(grad - expected) / np.linalg.norm(expected)
     assert error < 2e-5
 
 
@@ -92,9 +92,9 @@ def test_ssim_and_its_gradient_match_the_reference(name, oracle_dir, dtype):
 @pytest.mark.parametrize("level", [0.0, 0.5, 0.9, 1.0])
 def test_constant_equal_images_are_exactly_alike_without_a_slope(level, dtype):
     image = np.full((16, 20, 3), level, dtype)
-    value, slope = SSIM_SLOPE(image, image)
+    value, grad = SSIM_SLOPE(image, image)
     assert float(value) == 1
-    assert not np.any(slope)
+    assert not np.any(grad)
 
 
 @pytest.mark.hard_cases
@@ -104,12 +104,12 @@ def test_constant_images_a_little_apart_have_the_exact_slope(dtype):
     def loss(x, target):
         return jnp.mean(losses.dssim_map(x, target, padding="valid"))
 
-    slope = np.asarray(jax.jit(jax.grad(loss))(image, target), np.float64)
+    grad = np.asarray(jax.jit(jax.grad(loss))(image, target), np.float64)
     x, y = float(image[0, 0, 0]), float(target[0, 0, 0])
     luminance = x**2 + y**2 + 1e-4
     exact = 2 * (x - y) / luminance - (x - y) ** 2 * 2 * x / luminance**2
     # A uniform shift changes luminance alone; structure must add nothing.
-    assert abs(slope.sum() / exact - 1) < {"float32": 2e-4, "float64": 1e-10}[dtype]
+    assert abs(grad.sum() / exact - 1) < {"float32": 2e-4, "float64": 1e-10}[dtype]
 
 
 @pytest.mark.hard_cases
@@ -154,10 +154,10 @@ def test_dssim_has_second_derivatives(rng, float64):
     image, target = (jnp.asarray(x) for x in images(rng, 12, 11))
     direction = jnp.asarray(rng.normal(size=image.shape))
 
-    def slope(x):
+    def grad(x):
         return jnp.vdot(jax.grad(losses.ssim)(x, target), direction)
 
-    assert gradients.directional_error(slope, image) < 1e-6
+    assert gradients.directional_error(grad, image) < 1e-6
 
 
 def test_dssim_under_vmap_is_the_single_one(rng):
@@ -207,7 +207,7 @@ def test_robust_penalties_keep_their_slopes(name, dtype):
     width = 0.03
     s = np.asarray([0.0, 1e-25, 1e-5, 0.03**2, 1.0, 1e4], dtype)
     exact = np.asarray(s, np.longdouble)
-    slopes = {
+    grads = {
         "charbonnier": 0.5 / np.sqrt(exact + width**2),
         "huber": 0.5 * np.minimum(1, width / np.sqrt(np.maximum(exact, 1e-30))),
         "geman_mcclure": 8 * width**2 / (exact + 4 * width**2) ** 2,
@@ -217,8 +217,8 @@ def test_robust_penalties_keep_their_slopes(name, dtype):
         return ROBUST[name][0](s, width)
 
     orders = jax.value_and_grad(jax.grad(penalty))
-    slope, curvature = jax.jit(jax.vmap(orders))(s)
-    np.testing.assert_allclose(slope, np.float64(slopes[name]), rtol=3 * ULPS[dtype])
+    grad, curvature = jax.jit(jax.vmap(orders))(s)
+    np.testing.assert_allclose(grad, np.float64(grads[name]), rtol=3 * ULPS[dtype])
     assert np.all(np.isfinite(curvature))
 
 
@@ -243,18 +243,18 @@ def test_robust_penalties_of_a_vector_have_a_gradient_at_zero(name, factor):
         return ROBUST[name][0](jnp.sum(x**2), 0.1)
 
     both = jax.jit(lambda x: (jax.grad(penalty)(x), jax.hessian(penalty)(x)))
-    slope, curvature = both(np.zeros(3, np.float32))
-    assert not np.any(slope)
+    grad, curvature = both(np.zeros(3, np.float32))
+    assert not np.any(grad)
     np.testing.assert_allclose(curvature, factor * np.eye(3), rtol=1e-6)
 
 
 @pytest.mark.hard_cases
 def test_geman_mcclure_saturates_at_infinity(dtype):
     both = jax.jit(jax.value_and_grad(lambda s: losses.geman_mcclure(s, 1e-3)))
-    value, slope = map(float, both(np.asarray(3e38, dtype)))
+    value, grad = map(float, both(np.asarray(3e38, dtype)))
     assert value == 2
-    assert np.isfinite(slope)
-    assert slope < 1e-30
+    assert np.isfinite(grad)
+    assert grad < 1e-30
 
 
 @pytest.mark.hard_cases
@@ -307,12 +307,12 @@ def test_masked_pixels_teach_nothing_whatever_they_hold(
     clean = image.astype(dtype), target.astype(dtype), valid
     {"image": image, "target": target}[where][~valid] = poison
     dirty = image.astype(dtype), target.astype(dtype), valid
-    value, slope = jax.tree.map(np.asarray, SLOPES[name](*dirty))
+    value, grad = jax.tree.map(np.asarray, SLOPES[name](*dirty))
     expected, expected_slope = SLOPES[name](*clean)
     assert value == float(expected)
-    np.testing.assert_array_equal(slope, expected_slope)
-    assert np.all(slope[~valid] == 0)
-    assert np.any(slope[valid] != 0)
+    np.testing.assert_array_equal(grad, expected_slope)
+    assert np.all(grad[~valid] == 0)
+    assert np.any(grad[valid] != 0)
 
 
 def test_masked_losses_are_means_over_what_is_valid(rng, dtype):
@@ -329,9 +329,9 @@ def test_masked_losses_are_means_over_what_is_valid(rng, dtype):
 @pytest.mark.parametrize("name", LOSSES)
 def test_a_frame_without_a_valid_pixel_has_no_loss(name, dtype):
     image = np.full((14, 13, 3), np.nan, dtype)
-    value, slope = SLOPES[name](image, image, np.zeros((14, 13), bool))
+    value, grad = SLOPES[name](image, image, np.zeros((14, 13), bool))
     assert float(value) == 0
-    assert not np.any(slope)
+    assert not np.any(grad)
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
@@ -366,9 +366,9 @@ def test_photometric_refuses_a_share_beyond_one():
     ("error", "expected"), [(1e-8, 80.0), (0.0, 100.0), (0.25, 6.0206)]
 )
 def test_psnr_is_finite_and_exact(error, expected, dtype):
-    value, slope = map(float, PSNR_SLOPE(np.asarray(error, dtype)))
+    value, grad = map(float, PSNR_SLOPE(np.asarray(error, dtype)))
     assert abs(value - expected) < 5e-5
-    assert np.isfinite(slope)
+    assert np.isfinite(grad)
 
 
 def test_psnr_counts_in_its_range():

@@ -33,14 +33,14 @@ def waves(params, point):
     return amplitudes.T @ jnp.sin(directions @ point + phases)
 
 
-def wave_params(rng, slope, dtype="float64"):
-    """Waves whose displacement's Jacobian has spectral norms up to about `slope`."""
+def wave_params(rng, grad, dtype="float64"):
+    """Waves whose displacement's Jacobian has spectral norms up to about `grad`."""
     directions = 4 * rng.normal(size=(6, 3))
     phases, amplitudes = rng.uniform(0, 6, 6), rng.normal(size=(6, 3))
     places = rng.uniform(-1, 1, (2000, 3))
     cosines = np.cos(places @ directions.T + phases)
-    slopes = np.einsum("fi,nf,fj->nij", amplitudes, cosines, directions)
-    amplitudes *= slope / np.linalg.norm(slopes, 2, axis=(1, 2)).max()
+    grads = np.einsum("fi,nf,fj->nij", amplitudes, cosines, directions)
+    amplitudes *= grad / np.linalg.norm(grads, 2, axis=(1, 2)).max()
     return tuple(jnp.asarray(x, dtype) for x in (directions, phases, amplitudes))
 
 
@@ -113,8 +113,8 @@ def test_a_flag_is_true_only_at_upright_roots_of_a_folding_warp(float64, rng):
     found = np.asarray(fit.value)
     angles = found @ directions.T + phases
     residual = np.linalg.norm(found + np.sin(angles) @ amplitudes - canonical, axis=1)
-    slopes = np.einsum("fi,nf,fj->nij", amplitudes, np.cos(angles), directions)
-    upright = np.linalg.det(np.eye(3) + slopes) > 0
+    grads = np.einsum("fi,nf,fj->nij", amplitudes, np.cos(angles), directions)
+    upright = np.linalg.det(np.eye(3) + grads) > 0
     np.testing.assert_array_equal(fit.converged, (residual < 1e-5) & upright)
     np.testing.assert_allclose(fit.residual, residual, atol=1e-12)
     before = np.einsum(
@@ -172,16 +172,16 @@ def test_outside_the_image_of_a_warp_there_is_nothing(dtype):
         one_by_one = jnp.eye(6, dtype=dtype).reshape(6, 2, 3)
         return fit, *jax.vmap(pull)(one_by_one)
 
-    fit, by_width, slopes = jax.tree.map(np.asarray, every(half, targets))
-    slopes = slopes.reshape(2, 3, 2, 3)
+    fit, by_width, grads = jax.tree.map(np.asarray, every(half, targets))
+    grads = grads.reshape(2, 3, 2, 3)
     assert fit.converged.tolist() == [False, True]
     assert np.isfinite(fit.value).all()
     np.testing.assert_allclose(
         fit.value[1], np.arctanh(2 * np.asarray(targets[1], float)), atol=2e-6
     )
-    np.testing.assert_array_equal(slopes[0], 0)
+    np.testing.assert_array_equal(grads[0], 0)
     exact = np.diag(2 / (1 - (2 * np.asarray(targets[1], float)) ** 2))
-    np.testing.assert_allclose(slopes[1, :, 1], exact, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(grads[1, :, 1], exact, rtol=1e-5, atol=1e-6)
     np.testing.assert_array_equal(by_width[:3], 0)
 
 

@@ -56,10 +56,10 @@ def step(state, frames):
     row = jax.random.randint(frame_key, (), 0, frames.times.shape[0])
     target = jnp.mean(frames.images[row].astype(jnp.float32)) / 255 + frames.times[row]
     noise = 0.1 * jax.random.normal(noise_key, state.params.rows["mean"].shape)
-    value, slope = jax.value_and_grad(loss)(state.params, target, noise)
+    value, grad = jax.value_and_grad(loss)(state.params, target, noise)
     with jax.numpy_dtype_promotion("standard"):  # optax raises floats to integers
-        updates, optimiser = OPTIMISER.update(slope, state.optimiser)
-    hits = state.aux_state["hits"] + jnp.abs(slope.rows["mean"]).sum(-1)
+        updates, optimiser = OPTIMISER.update(grad, state.optimiser)
+    hits = state.aux_state["hits"] + jnp.abs(grad.rows["mean"]).sum(-1)
     return TrainState(
         optax.apply_updates(state.params, updates),
         optimiser,

@@ -1,0 +1,47 @@
+"""Markdown of measured numbers."""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+
+def number(value: float | int | None, digits: int = 2) -> str:
+    """A number with so many digits behind the point; empty where it is not known."""
+    if value is None or not math.isfinite(value):
+        return ""
+    return f"{value:,.{digits}f}"
+
+
+def short(value: float | int | None) -> str:
+    """A number of any size in three digits, as in 0.0123 or 1e-07."""
+    if value is None or not math.isfinite(value):
+        return ""
+    return f"{value:.3g}"
+
+
+def table(heads: Sequence[str], rows: Iterable[Sequence[str]], words: int = 1) -> str:
+    """A table; so many columns from the left are words, the others are numbers.
+
+    Columns that are empty in every row are left out.
+    """
+    rows = [[cell.replace("|", r"\|") for cell in row] for row in rows]
+    kept = [k for k in range(len(heads)) if not k or any(row[k] for row in rows)]
+    lines = [[heads[k] for k in kept], ["---" if k < words else "---:" for k in kept]]
+    lines += [[row[k] for k in kept] for row in rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def bullets(lines: Iterable[str]) -> str:
+    """A list."""
+    return "\n".join(f"- {line.strip()}" for line in lines)
+
+
+def title_and_text(docstring: str | None) -> tuple[str, str]:
+    """A module's first line as a heading, and the rest of what it says."""
+    title, _, text = (docstring or "").strip().partition("\n")
+    return f"# {title.rstrip('.:')}", text.strip("\n")
+
+
+def machine(about: Mapping[str, Any]) -> str:
+    """Where numbers were taken, as in "AMD EPYC, cpu, JAX 0.10.2"."""
+    return f"{about['cpu']}, {about['backend']}, JAX {about['jax']}"

@@ -1,0 +1,238 @@
+"""The pages of docs/results, written from the numbers that are kept beside the code.
+
+    python -m experiments.results                  # every page whose numbers are there
+    python -m experiments.results effect_cost      # one
+    python -m experiments.results ablate_moba --measured runs/ablation/ablation.json
+
+Nothing is measured here. A page is what its study says of itself, and tables of the
+kept file: `--measured FILE` keeps a new one first. A test holds every page against what
+this writes.
+"""
+
+import dataclasses
+import importlib
+import json
+import pathlib
+import shutil
+from typing import Any, NamedTuple
+
+from experiments import cli, markdown
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+PAGES = ROOT / "docs" / "results"
+INDEX = """\
+# Results
+
+Every number on these pages stands in a file of this repository, and the page is
+written from that file: `python -m experiments.results` writes all of them, and a test
+holds each against its file. The command beside a page measures anew and names the file
+it writes; `python -m experiments.results kan_local --measured kan_local.json`, say,
+keeps that file and renews the page.
+
+{pages}
+
+What has a command and no page has no numbers that are kept yet:
+
+{missing}
+
+The errors and costs of single formulas are in [numerics.md](../numerics.md), which
+`python -m experiments.hard_cases --document docs/numerics.md` renews.
+
+## What is gone
+
+Earlier READMEs had tables of ablations (fields, Sonata, MoBa-GS), of equal training
+time, of deformation, solvers and local kernels. They are gone because no file stood
+behind them: nobody could check them without hours of processor time. The ablations
+said little besides: what moves was found badly by every arm then (points were
+followed with nearly the error of points that do not move at all), so that hardly a
+difference between arms left the spread over seeds. They are to be measured again once
+motion starts from tracks.
+"""
+
+
+class Study(NamedTuple):
+    """What measures the numbers of one page and what writes them down."""
+
+    module: str  # whose docstring opens the page
+    page: str  # module with `page(stored)`, the rest of it, and `draw(stored, path)`
+    measured: str  # the kept file
+    command: str  # that measures
+
+
+def _study(name, words="", module=None, page=None, measured=None):
+    study = name if module is None else module
+    return Study(
+        f"experiments.{study}",
+        f"experiments.{page or study}",
+        measured or f"experiments/measured/{name}.json",
+        f"python -m experiments.{study.removesuffix('.__main__')} {words}".strip(),
+    )
+
+
+def _package(name, words="", page="page", of=None, measured=None):
+    folder = of or name
+    return _study(name, words, f"{folder}.__main__", f"{folder}.{page}", measured)
+
+
+_SPLAT_AXES = "gaussians harmonics dssim raster motion-network kan basis"
+STUDIES = {
+    "accuracy_time": _package(
+        "accuracy_time",
+        f"--axes preset {_SPLAT_AXES} splat-precision --share 0.25 --jobs 4",
+    ),
+    "accuracy_time_bookshelf": _package(
+        "accuracy_time_bookshelf",
+        "CAPTURE --axes preset --max-side 256 --heldout 8 --share 0.2 --frames 4 "
+        "--jobs 2",
+        of="accuracy_time",
+    ),
+    "effect_cost": _package(
+        "effect_cost", measured="nerfies_jax/runs/effect_cost.json"
+    ),
+    "ablate_fields": _package(
+        "ablate_fields", "--suite fields --seeds 3 --jobs 4", of="ablate"
+    ),
+    "ablate_sonata": _package("ablate_sonata", "--suite sonata --jobs 4", of="ablate"),
+    "ablate_moba": _package("ablate_moba", "--suite moba --jobs 4", of="ablate"),
+    "deformation_cost": _package("deformation_cost", "--out deformation_cost.json"),
+    "spectral_bias": _package(
+        "spectral_bias", "--steps 3000 --out spectral_bias", page="report"
+    ),
+    "motion_rank": _package("motion_rank", "--out motion_rank", page="report"),
+    "nerf_speed": _study("nerf_speed", "--out nerf_speed.json"),
+    "solver_table": _package(
+        "solver_table", "--out solver_table.json", page="__main__"
+    ),
+    "solver_table_poses": _package(
+        "solver_table_poses",
+        "--fit poses --out solver_table_poses.json",
+        of="solver_table",
+        page="__main__",
+    ),
+    "elastic_points": _study("elastic_points", "--out elastic_points.json"),
+    "kan_local": _study("kan_local", "--out kan_local.json"),
+    "raster_speed": _package(
+        "raster_speed", "--out raster_speed.json", page="__main__"
+    ),
+    "frequency_gates": _study("frequency_gates", "--out frequency_gates"),
+    "appearance_codes": _study(
+        "appearance_codes", "--scene exposure --out appearance_codes"
+    ),
+    "transient_medium": _study(
+        "transient_medium",
+        "--scene transient --out transient_medium",
+        module="appearance_codes",
+    ),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Results:
+    """Write pages of docs/results from the files of numbers that are kept."""
+
+    pages: cli.Positional[tuple[str, ...]] = ()
+    """Which pages (default: every one whose numbers are there)."""
+    measured: pathlib.Path | None = None
+    """What a study wrote: kept as the numbers of the one page named."""
+
+    def __post_init__(self):
+        unknown = [name for name in self.pages if name not in STUDIES]
+        if unknown:
+            raise ValueError(f"no page {unknown[0]!r}; there are {', '.join(STUDIES)}")
+        if self.measured is not None and len(self.pages) != 1:
+            raise ValueError("--measured is the file of one page: name that page")
+
+
+def main(arguments=None):
+    """Run the job of the command line; exit code 2 where its input is wrong."""
+    with cli.user_errors():
+        asked = cli.parse(Results, arguments)
+        if asked.measured is not None:
+            keep(asked.pages[0], asked.measured)
+        for name in asked.pages or kept():
+            path = PAGES / f"{name}.md"
+            draw(name)
+            path.write_text(page(name))
+            print(path)
+        (PAGES / "README.md").write_text(index())
+
+
+def kept() -> list[str]:
+    """The pages whose numbers are there."""
+    return [name for name, study in STUDIES.items() if (ROOT / study.measured).exists()]
+
+
+def keep(name: str, measured: pathlib.Path) -> None:
+    """Take what a study wrote as the numbers of a page, and its picture with it.
+
+    ValueError where no page can be written from the file.
+    """
+    stored = json.loads(measured.read_text())
+    try:
+        _page_of(name, stored)
+    except (KeyError, TypeError, AttributeError) as error:
+        raise ValueError(
+            f"--measured {measured}: not what {STUDIES[name].command} writes ({error})"
+        ) from error
+    shutil.copyfile(measured, ROOT / STUDIES[name].measured)
+    picture = measured.with_suffix(".png")
+    if picture.exists():
+        shutil.copyfile(picture, PAGES / f"{name}.png")
+
+
+def page(name: str) -> str:
+    """The page, from the kept numbers alone."""
+    return _page_of(name, _stored(name))
+
+
+def draw(name: str) -> None:
+    """The page's picture, where it can be drawn from the kept numbers."""
+    found = importlib.import_module(STUDIES[name].page)
+    if hasattr(found, "draw"):
+        found.draw(_stored(name), PAGES / f"{name}.png")
+
+
+def index() -> str:
+    """The list of pages."""
+    there = kept()
+    rows = [
+        [f"[{name}.md]({name}.md)", f"`{study.command}`", f"`{study.measured}`"]
+        for name, study in STUDIES.items()
+        if name in there
+    ]
+    heads = ("page", "measured by", "kept in")
+    missing = [f"`{s.command}`" for name, s in STUDIES.items() if name not in there]
+    return INDEX.format(
+        pages=markdown.table(heads, rows, words=3), missing=markdown.bullets(missing)
+    )
+
+
+def _stored(name) -> dict[str, Any]:
+    path = ROOT / STUDIES[name].measured
+    try:
+        return json.loads(path.read_text())
+    except FileNotFoundError:
+        raise ValueError(
+            f"{path}: not there; measure with {STUDIES[name].command}, and name what "
+            "it writes with --measured"
+        ) from None
+
+
+def _page_of(name, stored):
+    study = STUDIES[name]
+    title, text = markdown.title_and_text(importlib.import_module(study.module).__doc__)
+    about = stored.get("machine") or stored["about"].get("machine") or stored["about"]
+    parts = [title, text]
+    if (PAGES / f"{name}.png").exists():
+        parts.append(f"![{title.removeprefix('# ')}]({name}.png)")
+    parts.append(importlib.import_module(study.page).page(stored))
+    parts.append(
+        f"Measured by `{study.command}` ({markdown.machine(about)}); the numbers are "
+        f"in `{study.measured}`, and `python -m experiments.results {name}` wrote this "
+        "page from them."
+    )
+    return "\n\n".join(parts) + "\n"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,49 @@
+"""Every command in README and docs is one that its settings accept."""
+
+import importlib
+import pathlib
+import re
+import shlex
+
+import pytest
+
+from experiments import cli
+
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
+COMMAND = re.compile(r"python -m experiments\.([a-z_]+)([^\n#&;]*)")
+
+
+def commands():
+    """Each command once, with the first page that it stands on."""
+    found = {}
+    for page in PAGES:
+        plain, *fenced = re.split(r"^```", page.read_text(), flags=re.M)
+        prose = "".join([plain, *fenced[1::2]])
+        spans = re.findall(r"`([^`]+)`", prose)
+        code = [" ".join(span.split()) for span in spans]
+        code += [*re.sub(r"`[^`]+`", "", prose).splitlines(), *fenced[::2]]
+        for name, words in COMMAND.findall("\n".join(code)):
+            # "..." stands for more options; numerics.md has commands in comments
+            words = words.replace("...", "").replace("-->", "").strip()
+            found.setdefault((name, words), page.name)
+    return [(name, words, page) for (name, words), page in found.items()]
+
+
+class Accepted(Exception):
+    """The settings took the command; nothing is run."""
+
+
+@pytest.mark.parametrize(("name", "words", "page"), commands())
+def test_a_command_of_the_docs_parses(name, words, page, monkeypatch, capsys):
+    parse = cli.parse
+
+    def only_parse(settings, arguments=None):
+        parse(settings, arguments)
+        raise Accepted
+
+    monkeypatch.setattr(cli, "parse", only_parse)
+    folder = (ROOT / "experiments" / name).is_dir()
+    module = importlib.import_module(f"experiments.{name}{'.__main__' * folder}")
+    with pytest.raises(Accepted):
+        module.main(shlex.split(words))

@@ -1,0 +1,67 @@
+"""What README says: a program that runs, numbers that are kept, links that lead on."""
+
+import json
+import pathlib
+import re
+
+import jax
+import PIL.Image
+
+import nerfies_jax as nj
+from tests import scenes
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text()
+PAGES = [path for path in ROOT.glob("*.md")] + sorted(ROOT.glob("docs/**/*.md"))
+UNITS = {
+    "dB": ("psnr", 2, 1),
+    "dB on the bookshelf": ("psnr", 2, 1),
+    "dB of what moves": ("moving_psnr", 2, 1),
+    "s of training": ("train_cpu_seconds", 0, 1),
+    "MB": ("parameters", 2, 2.5e5),
+}
+
+
+def test_the_program_trains_renders_and_scores(tmp_path, monkeypatch, capsys):
+    (program,) = re.findall(r"```python\n(.*?)```", README, re.S)
+    assert len(program.splitlines()) <= 20
+    assert program.count(", 500)") == 1
+    capture = scenes.tiny_capture()
+    monkeypatch.setattr(nj, "built_in_scene", lambda name: capture)
+    monkeypatch.chdir(tmp_path)
+    with jax.numpy_dtype_promotion("standard"):  # JAX's own, as a user has it
+        exec(compile(program.replace(", 500)", ", 2)"), "README.md", "exec"), {})
+    said = re.search(r"(\d+) held-out frames: (\S+) dB", capsys.readouterr().out)
+    assert int(said[1]) == len(capture.heldout)
+    assert 0 < float(said[2]) < 60
+    with PIL.Image.open("held_out.png") as picture:
+        assert picture.size == capture.size
+
+
+def test_the_table_of_presets_shows_kept_numbers():
+    rows = re.findall(r"^\|[^|]+\| `([^`]+)` \| ([\d.]+) ([^|]+) \|$", README, re.M)
+    assert len(rows) >= 5
+    for setting, value, unit in rows:
+        stem = "accuracy_time_bookshelf" if "bookshelf" in unit else "accuracy_time"
+        kept = json.loads((ROOT / f"experiments/measured/{stem}.json").read_text())
+        preset, *changes = setting.replace("--set", "").split()
+        (arm,) = [
+            name
+            for name, arm in kept["about"]["arms"].items()
+            if (arm["preset"], arm["changes"], arm["environment"])
+            == (preset, changes, [])
+        ]
+        measure, digits, by = UNITS[unit]
+        found = kept["metrics"][f"{arm}.{measure}"]["value"] / by
+        assert f"{found:.{digits}f}" == value, setting
+
+
+def test_readme_fits_and_every_link_leads_to_a_file():
+    assert len(README.splitlines()) <= 150
+    dead = [
+        (page.name, target)
+        for page in PAGES
+        for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text())
+        if "://" not in target and not (page.parent / target).exists()
+    ]
+    assert dead == []
