@@ -176,6 +176,17 @@ def test_the_canonical_scene_and_its_depth_are_rendered(run, tmp_path):
 
 
 @pytest.mark.slow
+def test_the_flow_from_picture_to_picture_is_drawn(run, tmp_path):
+    arguments = ["--path", "sway", "--frames", "2", "--formats", "png"]
+    render.main([str(run), *arguments, "--show", "flow", "--out", str(tmp_path)])
+    first, last = (images.read_image(tmp_path / f"000{n}.png")[0] for n in range(2))
+    still, unknown = (np.all(last == level, axis=-1) for level in (255, 128))
+    assert still.any()
+    assert (still | unknown).all()  # nothing follows the last
+    assert (np.ptp(first, axis=-1) > 50).any()  # the camera moves: a full hue
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
