@@ -1,7 +1,7 @@
 """Gaussians and effects put together: a spec becomes a `Model` the loop can train."""
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Int, Key
 
 from gaussians_jax import (
     densification,
+    growth,
     initialisation,
     learning_rates,
     mcmc,
@@ -19,6 +20,7 @@ from gaussians_jax import (
 )
 from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.effects import deformation
+from gaussians_jax.growth import AuxState, states_of
 from gaussians_jax.mcmc import MCMCStrategySpec
 from gaussians_jax.phases import Trained
 from gaussians_jax.spec import (
@@ -45,7 +47,6 @@ from nerfies_jax.training.effects import (
     weighted_sum,
 )
 from nerfies_jax.training.model import (
-    Event,
     Frames,
     Model,
     Rendering,
@@ -58,8 +59,7 @@ from nerfies_jax.training.updates import apply_updates
 
 PyTree = Any
 
-# Streams of the run's key beside those of the steps, which are its 0, 1, 2, ...
-ORDER, EVENT, NOISE = 2**32 - 1, 2**32 - 2, 2**32 - 3
+ORDER = 2**32 - 1  # stream of the run's key, as those in `growth`
 
 
 def metadata_of(capture: Capture) -> SceneMetadata:
@@ -71,22 +71,6 @@ def metadata_of(capture: Capture) -> SceneMetadata:
         background=capture.background or (0.0, 0.0, 0.0),
         frames=len(capture.train),
     )
-
-
-class AuxState(NamedTuple):
-    """What a scene keeps beside its parameters; everything in it has rows."""
-
-    stats: PyTree  # densification.RowStats, or () where no strategy keeps them
-    effects: dict[str, PyTree]  # by the name of the effect
-
-
-def states_of(effects: tuple[Effect, ...], params: Params) -> dict[str, PyTree]:
-    """What each effect keeps from this change of the rows to the next; host side."""
-    return {
-        effect.name: effect.state(params)
-        for effect in effects
-        if effect.state is not None
-    }
 
 
 def all_effects(
@@ -131,7 +115,7 @@ def build(
         init=lambda capture, key: first_state(spec, effects, optimiser, capture, key),
         step=_stepper(spec, metadata, effects, optimiser),
         render=whole_frame,
-        events=_events(spec, metadata, effects, optimiser),
+        events=growth.events(spec, metadata, effects, optimiser),
         counts=count_rows,
         required_data=frozenset().union(*(effect.required_data for effect in effects)),
         stages=stages,
@@ -208,7 +192,10 @@ def _stepper(spec, metadata, effects, optimiser):
         by_part = _learning_rates(spec, metadata, effects, state.step)
         trained = Trained(apply_updates(state.params, updates, by_part), opt_state)
         if isinstance(spec.densification, MCMCStrategySpec):
-            noise_key, rate = _stream(state, NOISE), by_part.rows["splats"].mean
+            noise_key, rate = (
+                growth.stream_key(state, growth.NOISE),
+                by_part.rows["splats"].mean,
+            )
             params = mcmc.shake(noise_key, trained.params, rate, spec.densification)
             trained = trained._replace(params=params)
         if spec.alternation is not None:
@@ -346,74 +333,6 @@ def first_state(spec, effects, optimiser, capture, key) -> TrainState:
     return TrainState(
         params, optimiser.init(params), aux_state, jnp.zeros((), jnp.int32), run_key
     )
-
-
-def _stream(state, name):
-    """A key of this step for something beside `loop.step_key`."""
-    return jax.random.fold_in(jax.random.fold_in(state.key, name), state.step)
-
-
-def _events(spec, metadata, effects, optimiser):
-    if spec.densification is None:
-        return ()
-    plan = spec.densification
-    if isinstance(plan, MCMCStrategySpec):
-        return _mcmc_events(plan, spec.steps, effects, optimiser)
-    last = min(plan.refine_stop_iter, spec.steps)
-
-    def densify(state, frames):
-        del frames
-        stats, states = state.aux_state
-        step = int(state.step)
-        for effect in effects:
-            if effect.grow_score is not None:
-                factor = effect.grow_score(states[effect.name], step)
-                stats = stats._replace(grad2d=stats.grad2d * jnp.asarray(factor))
-        changed = densification.densify(
-            optimiser,
-            state.params,
-            state.optimiser,
-            stats,
-            _stream(state, EVENT),
-            plan,
-            step=step,
-            extent=metadata.extent,
-        )
-        aux_state = AuxState(changed.stats, states_of(effects, changed.params))
-        return state._replace(
-            params=changed.params, optimiser=changed.moments, aux_state=aux_state
-        )
-
-    def reset(state, frames):
-        del frames
-        params, moments = densification.reset_opacity(
-            optimiser, state.params, state.optimiser, plan
-        )
-        return state._replace(params=params, optimiser=moments)
-
-    grow = tuple(range(plan.refine_start_iter, last, plan.refine_every))
-    return (
-        Event("densify", grow, densify),
-        Event(
-            "reset opacity",
-            tuple(range(plan.reset_every, last, plan.reset_every)),
-            reset,
-        ),
-    )
-
-
-def _mcmc_events(plan, steps, effects, optimiser):
-    def refine(state, frames):
-        del frames
-        params, moments, _ = mcmc.refine(
-            optimiser, state.params, state.optimiser, _stream(state, EVENT), plan
-        )
-        aux_state = AuxState((), states_of(effects, params))
-        return state._replace(params=params, optimiser=moments, aux_state=aux_state)
-
-    last = min(plan.refine_stop_iter, steps)
-    when = tuple(range(plan.refine_start_iter, last, plan.refine_every))
-    return (Event("relocate and add", when, refine),)
 
 
 def count_rows(state: TrainState) -> dict[str, int]:

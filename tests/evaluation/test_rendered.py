@@ -75,14 +75,14 @@ class Counted:
     """A model in stages that counts how often each of them really runs."""
 
     def __init__(self):
-        self.calls = {"prepare": 0, "pose": 0, "draw": 0}
+        self.calls = {"prepare": 0, "deform": 0, "draw": 0}
 
         def prepare(params):
             self._count("prepare")
             return {"basis": 2 * params["weight"]}
 
         def deform(params, prepared, time):
-            self._count("pose")
+            self._count("deform")
             return params["mean"] + time * prepared["basis"]
 
         def draw(params, deformed, view, size, step):
@@ -103,7 +103,7 @@ class Counted:
         jax.debug.callback(add)
 
     def since(self, act):
-        """What ran in the meantime, as (prepare, pose, draw)."""
+        """What ran in the meantime, as (prepare, deform, draw)."""
         jax.effects_barrier()
         before = dict(self.calls)
         picture = act()

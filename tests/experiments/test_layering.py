@@ -33,6 +33,7 @@ FLOORS = {
     "nerfies_jax": 10,  # the face of the package
     "gaussians_jax.effects": 7,
     "gaussians_jax.spec": 8,
+    "gaussians_jax.growth": 8,
     "gaussians_jax.scene": 8,
     "gaussians_jax.point_tracks": 8,
     "gaussians_jax.step_time": 8,
