@@ -32,7 +32,7 @@ def test_the_products_of_a_static_field_are_those_of_its_networks(name):
     condition = FrameCondition(zero, {}, jnp.int32(0))
 
     def colours(params):
-        return [level.colour for level in made.trace(params, ray, condition)]
+        return [level.colour for level in made.render_ray(params, ray, condition)]
 
     found = matrix_flops.count(colours, made.init(jax.random.key(0)))
     plan = spec.sampling

@@ -143,7 +143,7 @@ def test_events_grow_the_scene_and_keep_its_picture_learnable():
     again, metrics = jax.jit(eager.step)(after, frames)
     assert np.isfinite(float(metrics["loss"]))
     assert again.params.rows["splats"].mean.shape == (
-        *after.aux_state.stats.alive.shape,
+        *after.aux_state.stats.active.shape,
         3,
     )
 
