@@ -10,6 +10,7 @@ import optax
 import pytest
 
 from gaussians_jax import initialisation, learning_rates, presets, scene, splats
+from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.initialisation import InitSpec
 from gaussians_jax.learning_rates import LearningRateSpec
 from gaussians_jax.optimiser import scale_by_row_adam
@@ -238,7 +239,7 @@ def test_a_rate_that_cannot_decay_is_refused():
 
 # Fields of the parts that count steps.
 COUNTED = {
-    "density": ("start", "stop", "reset_interval"),
+    "densification": ("refine_start_iter", "refine_stop_iter"),
     "motion": ("warm_up",),
     "alternation": ("start", "stop"),
     "annealing": ("after",),
@@ -259,6 +260,9 @@ def test_presets_build_and_stretch_with_their_steps(name):
         whole, short = getattr(spec, part), getattr(half, part)
         for name in fields if whole is not None else ():
             assert getattr(short, name) == round(getattr(whole, name) / 2)
+    if isinstance(spec.densification, DefaultStrategySpec):
+        whole, short = (each.densification.reset_every for each in (spec, half))
+        assert short == round(whole / 2)
     assert half.sh_every == spec.sh_every // 2
     assert scene.build(half, metadata).spec == (half, metadata)
     assert presets.with_steps(spec, spec.steps) == spec
