@@ -64,7 +64,7 @@ def test_the_page_holds_everything_and_fetches_nothing(tmp_path, picture):
         film,
         {"field": 30.0, "rasteriser": 10.0},
         ["LPIPS is not computed, because there are no weights"],
-        [report.Command("Go on", "python -m experiments.render run")],
+        [report.Command("Go on", "nerfies render run")],
     )
     page = Page(path)
     (shown,) = page.find("img")
@@ -81,7 +81,7 @@ def test_the_page_holds_everything_and_fetches_nothing(tmp_path, picture):
         "75 %",
         "40 ms",
         "LPIPS is not computed",
-        "python -m experiments.render run",
+        "nerfies render run",
     ):
         assert words in page.text, words
     assert not page.find("script")

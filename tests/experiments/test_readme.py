@@ -10,7 +10,7 @@ import PIL.Image
 import nerfies_jax as nj
 from tests import scenes
 
-ROOT = pathlib.Path(__file__).resolve().parents[1]
+ROOT = pathlib.Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text()
 PAGES = [path for path in ROOT.glob("*.md")] + sorted(ROOT.glob("docs/**/*.md"))
 UNITS = {
