@@ -29,7 +29,8 @@ class Renderer:
         self.cpu_seconds: list[float] = []  # the same, of the processor
         self.deformed_anew: list[bool] = []  # whether its instant was a new one
 
-    def __call__(self, state: TrainState, view: View) -> Rendering:
+    def __call__(self, state: TrainState, view: View | tuple) -> Rendering:
+        """One picture, of a view or of the tuple that a variant draws in its place."""
         inputs = state.params, view, state.step
         shapes = tuple(jax.typeof(leaf) for leaf in jax.tree.leaves(inputs))
         if shapes not in self._programs:

@@ -82,7 +82,7 @@ def score_halves(
 
 
 def score_right_halves(
-    capture: Capture, rows: np.ndarray, colours: Sequence[np.ndarray]
+    capture: Capture, rows: np.ndarray, colours: np.ndarray | Sequence[np.ndarray]
 ) -> Halves:
     """Scores of the right halves of rendered frames [height, width, 3]."""
     scores = []
