@@ -51,7 +51,7 @@ class FrequencyGates:
     """Of the network's two layers."""
     bands: int = 6
     """Of the encoding of the coordinates."""
-    learning_rate: float = 5e-3
+    rate: float = 5e-3
     """Adam's, for the network; falls to zero along a cosine."""
     out: pathlib.Path | None = None
     """Folder for frequency_gates.png and frequency_gates.json."""

@@ -32,8 +32,10 @@ _CACHE = os.environ.get(
 jax.config.update("jax_compilation_cache_dir", _CACHE)
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
-# A run in the background inherits an ignored SIGINT, and what Ctrl-C does is tested.
+# A run in the background inherits ignored signals, and what they do is tested.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+if hasattr(signal, "SIGHUP"):  # not on Windows
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 SHARED = pathlib.Path(__file__).resolve().parents[2] / "shared"
 

@@ -31,7 +31,7 @@ def test_a_path_that_is_not_there_and_a_film_are_refused(tmp_path):
     with pytest.raises(CaptureError, match="no such folder"):
         room.load(tmp_path / "nowhere")
     (tmp_path / "film.mp4").write_bytes(b"")
-    with pytest.raises(CaptureError, match="a film; "):
+    with pytest.raises(CaptureError, match="a file, not a capture"):
         room.load(tmp_path / "film.mp4")
     assert issubclass(CaptureError, ValueError)
 

@@ -26,7 +26,7 @@ SMALL = WarpSpec(
 )
 
 
-def condition(dtype, time=0.4, width=4, step=0, seed=3):
+def frame(dtype, time=0.4, width=4, step=0, seed=3):
     code = np.random.default_rng(seed).normal(size=width)
     return FrameCondition(
         jnp.asarray(time, dtype), {"motion": jnp.asarray(code, dtype)}, jnp.int32(step)
@@ -104,7 +104,7 @@ def compiled(spec):
 @pytest.mark.parametrize("step", [0, 7, 100])
 def test_points_move_as_the_matrix_exponential_says(kind, condition, step, dtype, rng):
     spec = dataclasses.replace(SMALL, kind=kind, condition=condition, anneal_steps=20)
-    params, when = bent(spec, dtype), condition(dtype, step=step)
+    params, when = bent(spec, dtype), frame(dtype, step=step)
     for point in jnp.asarray(rng.uniform(-1, 1, (4, 3)), dtype):
         moved = compiled(spec)(params, point, when)
         assert moved.dtype == dtype
@@ -118,7 +118,7 @@ def test_points_move_as_the_matrix_exponential_says(kind, condition, step, dtype
 
 def test_samples_of_a_ray_share_the_product_of_their_code(float64, rng):
     spec = SMALL
-    params, when = bent(spec, "float64"), condition("float64")
+    params, when = bent(spec, "float64"), frame("float64")
     points = jnp.asarray(rng.uniform(-1, 1, (7, 3)))
     along = jax.vmap(functools.partial(warp.displace, spec, params), in_axes=(0, None))
     truth = np.stack([by_hand(spec, params, x, when) for x in points])
@@ -136,7 +136,7 @@ def test_samples_of_a_ray_share_the_product_of_their_code(float64, rng):
 def test_every_warp_starts_as_the_identity(kind, anneal_steps, rng):
     spec = WarpSpec(kind=kind, anneal_steps=anneal_steps)
     points = rng.uniform(-1, 1, (300, 3)).astype(np.float32)
-    when = condition("float32", width=8)
+    when = frame("float32", width=8)
     code = np.float32(0.05) * when.codes["motion"]
     displaced = jax.vmap(functools.partial(warp.displace, spec), (None, 0, None))
 
@@ -193,7 +193,7 @@ def test_a_shut_window_leaves_the_point_alone_to_be_read(float64, rng):
     assert warp.window(SMALL, jnp.int32(0), like) is None
     params = bent(spec, "float64")
     point = jnp.asarray(rng.uniform(-1, 1, 3))
-    when = condition("float64", step=0)
+    when = frame("float64", step=0)
     flat = dataclasses.replace(SMALL, position=EncodingSpec(0), anneal_steps=None)
     rows = [0, 1, 2, -4, -3, -2, -1]  # the point's and the code's
 
@@ -275,7 +275,7 @@ def by_biases(w, v, x):
             "angular": blank["angular"]._replace(bias=w),
             "linear": blank["linear"]._replace(bias=v),
         }
-        return warp.displace(spec, params._replace(heads=heads), x, condition(w.dtype))
+        return warp.displace(spec, params._replace(heads=heads), x, frame(w.dtype))
 
     return moved(w, v, x), jax.jacfwd(moved, (0, 1, 2))(w, v, x)
 
@@ -346,7 +346,7 @@ def strain_slopes(times_pi, params, point):
     spec = encoded(times_pi)
 
     def strain(params, point):
-        when = condition(point.dtype)
+        when = frame(point.dtype)
         jacobian = jax.jacfwd(lambda x: warp.displace(spec, params, x, when))(point)
         return jnp.sum(jacobian**2)
 

@@ -38,9 +38,10 @@ def test_arms_differ_from_nerfies_only_in_what_their_name_says():
     }
     for name, fields in changed.items():
         assert specs[name] == dataclasses.replace(whole, **fields)
-    shared = ("steps", "rays", "sampling", "template", "coarse", "extent", "rate")
+    shared = ("steps", "rays", "sampling", "template", "coarse", "extent")
     for spec in specs.values():
         assert all(getattr(spec, x) == getattr(whole, x) for x in shared)
+        assert spec.learning_rate == whole.learning_rate
 
 
 GAUSSIAN = {

@@ -7,6 +7,7 @@ import pytest
 
 from experiments import reconstruct, render
 from nerfies_jax.capture import exr, images, nerfies_format, video
+from nerfies_jax.runs import run_folder
 from tests import scenes
 
 TINY = (
@@ -56,7 +57,7 @@ def pictures(folder):
 
 
 def test_a_field_leaves_the_files_of_a_run_and_no_gaussians(run):
-    left = {path.name for path in run.iterdir()}
+    left = {path.name for path in run.iterdir() if path.name != run_folder.LOCK}
     assert left == {
         "config.json",
         "metrics.json",

@@ -42,7 +42,7 @@ def test_points_are_followed_through_a_warp_in_closed_form(
         codes_at=lambda params, view: {},
         displace=displace,
     )
-    monkeypatch.setattr(scene, "field", lambda spec, metadata: made)
+    monkeypatch.setattr(scene, "field", lambda *_, **__: made)
     state = types.SimpleNamespace(params=velocity, step=jnp.int32(5))
     followed = point_tracks.follow(None, metadata, state, capture, known)
 
