@@ -12,6 +12,7 @@ from gaussians_jax import (
     step_time,
     variants,
 )
+from gaussians_jax.effects.motion_basis import BasisMotionSpec
 from nerfies_jax.evaluation.representation import (
     MODEL,
     Choice,
@@ -38,8 +39,14 @@ def save(
     every = scene.all_effects(spec, metadata, effects)
     if all(effect.deform is None for effect in every):
         return Saved(size)
-    note = "gaussians.ply holds the canonical Gaussians, without their motion."
-    return Saved(size, (note,))
+    notes = ["gaussians.ply holds the canonical Gaussians, without their motion."]
+    if isinstance(spec.motion, BasisMotionSpec):
+        notes.append(
+            f"{MODEL} holds all of the scene in {size / 1e6:.1f} MB. MoBa-GS reports "
+            "11.3 MB and 163 frames per second, on an A100, of other scenes: context, "
+            "no comparison."
+        )
+    return Saved(size, tuple(notes))
 
 
 def advise(wanted: dict[str, bool | None], full: bool) -> Choice:

@@ -13,7 +13,7 @@ from nerfies_jax.capture import camera_paths, exr, video
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.json_files import write_json
 from nerfies_jax.evaluation import Renderer, Scored, heldout, pictures
-from nerfies_jax.evaluation.representation import MODEL, Saved
+from nerfies_jax.evaluation.representation import Saved
 from nerfies_jax.measure import clock
 from nerfies_jax.measure.clock import Metric
 from nerfies_jax.runs import budget, commands, curves, quality, report
@@ -78,7 +78,6 @@ def make(
     )
     notes = [trained.result.message, *run.capture.notes, *left_out, *remarks, *gain]
     notes += saved.notes
-    notes += beside_the_paper(run.config.preset, saved, ms_per_frame)
     following = _next(folder, run, trained)
     page = report.write(
         folder,
@@ -146,18 +145,6 @@ def model_size(saved: Saved) -> list[Metric]:
     """The size of the file that holds all of a scene, where there is one."""
     size = saved.model_bytes
     return [] if size is None else [Metric("file.bytes", size, "bytes", "lower", 1e5)]
-
-
-def beside_the_paper(preset: str, saved: Saved, ms_per_frame: float) -> list[str]:
-    """MoBa-GS's own size and speed beside a run's, as context."""
-    if not preset.startswith("moba") or saved.model_bytes is None:
-        return []
-    return [
-        f"{MODEL} holds all of the scene in {saved.model_bytes / 1e6:.1f} MB, and "
-        f"{1e3 / ms_per_frame:.3g} frames are drawn in a second. MoBa-GS reports "
-        "11.3 MB and 163 frames per second, on an A100 and of other scenes: context, "
-        "no comparison."
-    ]
 
 
 def score_halves(
