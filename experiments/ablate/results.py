@@ -52,7 +52,11 @@ def read(path: pathlib.Path, identity: dict[str, Any]) -> ArmResult | None:
         stored = json.loads(path.read_text())
         # A measure that is younger than the file is not known there.
         numbers = {name: stored["numbers"].get(name) for name in MEASURES}
-        with np.load(path.with_suffix(".npz"), allow_pickle=False) as file:
+        # Opened here: NumPy leaves a damaged archive open.
+        with (
+            path.with_suffix(".npz").open("rb") as stream,
+            np.load(stream, allow_pickle=False) as file,
+        ):
             arrays = dict(file)
         made_with, notes = stored["identity"], stored["notes"]
     except (
