@@ -26,7 +26,7 @@ from nerfies_jax.geometry.precision import near_one
 MIN_COMPENSATION_SQ = 0.005**2
 # px. Rows of the projected square root beyond this are treated as not finite: their
 # squares would overflow float32, and no camera sees such a Gaussian as a shape.
-WIDEST_PX = 1e16
+MAX_EXTENT_PX = 1e16
 
 
 class Footprints(NamedTuple):
@@ -89,7 +89,7 @@ def _project_one(mean, quaternion, scale, opacity, camera, size, spec):
     mean_px, depth, rows = _project_frame(offset, camera, size, spec)
     first, second = _footprint_rows(rows, quaternion, scale)
     widest = jnp.max(jnp.abs(jnp.stack(first + second)))
-    drawn &= (widest < WIDEST_PX) & jnp.all(jnp.isfinite(mean_px))
+    drawn &= (widest < MAX_EXTENT_PX) & jnp.all(jnp.isfinite(mean_px))
     mean_px = jnp.where(drawn, mean_px, 0)
     first = [jnp.where(drawn, x, 0) for x in first]
     second = [jnp.where(drawn, x, 0) for x in second]

@@ -20,7 +20,7 @@ from gaussians_jax.splats import Gaussians
 from gaussians_jax.static_rows import RowIndex
 from nerfies_jax.geometry import quaternion
 
-FEWEST = {"linear": 2, "cubic": 4}  # knots that an interpolation reads at once
+MIN_KNOTS = {"linear": 2, "cubic": 4}  # knots that an interpolation reads at once
 BYTES = 40  # of a moving Gaussian at a knot, in float32
 
 
@@ -59,9 +59,9 @@ def bake(
     `static_threshold` (scene units, from where it is at the middle knot) at any knot
     are static and stored once.
     """
-    if knots < FEWEST["linear"]:
+    if knots < MIN_KNOTS["linear"]:
         raise ValueError(
-            f"knots={knots}: a motion needs at least {FEWEST['linear']}, its first "
+            f"knots={knots}: a motion needs at least {MIN_KNOTS['linear']}, its first "
             "and its last instant"
         )
     times = jnp.linspace(0, 1, knots, dtype=dtype)
@@ -118,13 +118,14 @@ def at(
 
 def check(knots: int, interpolation: str) -> None:
     """Refuse a table too short for its interpolation; host side."""
-    if interpolation not in FEWEST:
+    if interpolation not in MIN_KNOTS:
         raise ValueError(
-            f"unknown interpolation {interpolation!r}; choose from {', '.join(FEWEST)}"
+            f"unknown interpolation {interpolation!r}; choose from "
+            f"{', '.join(MIN_KNOTS)}"
         )
-    if knots < FEWEST[interpolation]:
+    if knots < MIN_KNOTS[interpolation]:
         raise ValueError(
-            f"{interpolation} interpolation reads {FEWEST[interpolation]} knots at "
+            f"{interpolation} interpolation reads {MIN_KNOTS[interpolation]} knots at "
             f"once, got {knots}; take more, or linear"
         )
 

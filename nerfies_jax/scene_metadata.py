@@ -7,7 +7,7 @@ import numpy as np
 
 from nerfies_jax.capture.capture import Capture, point_depths
 
-FEWEST_POINTS = 100  # below, the capture's points do not say where the scene is
+MIN_POINTS = 100  # below, the capture's points do not say where the scene is
 # Share of points on either side that are taken for outliers of structure from motion.
 OUTLIERS = 0.02
 
@@ -70,7 +70,7 @@ def _span(capture):
     depth = point_depths(capture)
     # Those beyond the far plane are not filmed; were all there, near would pass far.
     depth = depth[depth < capture.far]
-    if depth.size < FEWEST_POINTS:
+    if depth.size < MIN_POINTS:
         return float(capture.near), float(capture.far)
     low, high = np.quantile(depth, (OUTLIERS, 1 - OUTLIERS))
     near = max(capture.near, 0.6 * float(low))  # what moves is nearer than its wall
@@ -79,7 +79,7 @@ def _span(capture):
 
 def _box(capture, near, far):
     """Centre and longest half-side of what is filmed."""
-    if capture.points is not None and len(capture.points.position) >= FEWEST_POINTS:
+    if capture.points is not None and len(capture.points.position) >= MIN_POINTS:
         found = capture.points.position
         low, high = np.quantile(found, (OUTLIERS, 1 - OUTLIERS), axis=0)
         # In front of what structure from motion finds there is what moves.

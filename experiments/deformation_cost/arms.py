@@ -164,7 +164,7 @@ def _table_arms(count):
     still = splats.activate(gaussians(count).rows["splats"])
     table = time_knots.bake(lambda t: still._replace(mean=still.mean + t), KNOTS)
     made = []
-    for interpolation in time_knots.FEWEST:
+    for interpolation in time_knots.MIN_KNOTS:
 
         def deform(table, time, interpolation=interpolation):
             return time_knots.at(table, time, interpolation)

@@ -54,7 +54,7 @@ def curve(
     truth = [motion.draw(exact[k], times[k]) for k in drawn]
     tables = {
         (way, count): time_knots.bake(motion.deform, count, static_threshold)
-        for way, fewest in time_knots.FEWEST.items()
+        for way, fewest in time_knots.MIN_KNOTS.items()
         for count in knots
         if count >= fewest
     }

@@ -15,7 +15,7 @@ from nerfies_jax.evidence.view_set import Views
 DEVIATIONS = 5.0  # of both depths
 AT_LEAST = 0.1  # share of the inverse depth: flow is smooth across rims of things
 AROUND = 2  # pixels about the place in the other frame that must all lie behind
-FEWEST_SEERS = 2  # frames that look through a pixel, and more than see it in place
+MIN_SEERS = 2  # frames that look through a pixel, and more than see it in place
 
 
 def looked_through(
@@ -69,7 +69,7 @@ def _through(views, fits, nearest, at):
         through += seen & (here - closest > bound)
         agree += seen & (np.abs(here - closest) <= bound)
     found = np.zeros((height, width), bool)
-    found[line, column] = (through >= FEWEST_SEERS) & (through > agree)
+    found[line, column] = (through >= MIN_SEERS) & (through > agree)
     return found
 
 

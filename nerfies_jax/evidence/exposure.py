@@ -13,7 +13,7 @@ from nerfies_jax.evidence.view_set import Views
 # mean sRGB value of 0.5, twice that in linear light): above what is reached otherwise.
 DRIFT_STOPS = 0.1
 GROUPS = 8  # of points by place: what all of them agree on is the frame's
-FEWEST = 40  # points in a frame and group
+MIN_POINTS = 40  # points in a frame and group
 # Linear light between which a pixel measures gain: sRGB 15 of 255, where a level is
 # 0.1 stop, to where highlights are clipped.
 DARK, BRIGHT = 0.005, 0.9
@@ -23,10 +23,10 @@ POLISHES = 12  # rounds of medians; the gains move by less than 1e-3 afterwards
 def exposure(views: Views, points: np.ndarray) -> Finding:
     """Whether whole frames differ in brightness or colour, by points [points, 3]."""
     threshold = f"{DRIFT_STOPS:g} stops, root mean square over frames and channels"
-    if len(points) < GROUPS * FEWEST:
+    if len(points) < GROUPS * MIN_POINTS:
         return cannot_tell(
             EFFECT,
-            f"{len(points)} points at rest; {GROUPS * FEWEST} are needed",
+            f"{len(points)} points at rest; {GROUPS * MIN_POINTS} are needed",
             threshold,
         )
     light = sightings(views, points)
@@ -89,7 +89,7 @@ def gains(light: np.ndarray) -> np.ndarray:
     """
     gain = np.zeros((len(light), 3))
     seen = np.isfinite(light).all(-1)
-    enough = seen.sum(1) >= FEWEST
+    enough = seen.sum(1) >= MIN_POINTS
     kept = (seen & enough[:, None]).sum(0) >= 2
     light = np.where(enough[:, None, None], light, np.nan)[:, kept]
     if not enough.any() or not kept.any():

@@ -13,8 +13,8 @@ from nerfies_jax.evidence.view_set import Views
 
 REACH = 8  # frames before and after: what moves 0.1 px a frame on shows in them
 CENTRES = 12  # frames whose pixels are followed
-FEWEST_FRAMES = 3  # of one camera: two tell depth, and nothing else
-FEWEST_FOLLOWED = 4  # frames a pixel is followed to; fewer in shorter films
+MIN_FRAMES = 3  # of one camera: two tell depth, and nothing else
+MIN_FOLLOWED = 4  # frames a pixel is followed to; fewer in shorter films
 # A path that a still point misses by so much moves. Still scenes (built-in `static`
 # and `specular`, any seed) leave 0.10 px in the median and 1.5 px in one pixel of a
 # hundred, in slivers along the rims of things; opening by three pixels in a picture 176
@@ -30,7 +30,7 @@ CALM_PX = 2 * MOVES_PX / MOVES_DEVIATIONS
 FOLLOWED_SHARE, TEXTURED_SHARE = 0.3, 0.05
 # And "no" needs nearly all of them, in films of some length: what moves too fast to be
 # followed drops out. Still built-in scenes keep 0.9 to 0.99.
-FOLLOWED_FOR_NO, FEWEST_FOR_NO = 0.8, 9
+FOLLOWED_FOR_NO, MIN_FOR_NO = 0.8, 9
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +62,7 @@ def films(views: Views, spans: tuple[float, float]) -> list[Film]:
     long = [
         sequence
         for sequence in view_set.sequences(views)
-        if len(sequence) >= FEWEST_FRAMES
+        if len(sequence) >= MIN_FRAMES
     ]
     total = sum(len(sequence) for sequence in long)
     found = []
@@ -119,7 +119,7 @@ def follow(
     index = int(sequence[at])
     paths = optical_flow.follow(flows, sequence, at, REACH)
     fit = optical_flow.fit_still(views, index, paths, spans[0])
-    enough = min(FEWEST_FOLLOWED, len(sequence) - 1)
+    enough = min(MIN_FOLLOWED, len(sequence) - 1)
     usable = views.textured[index] & (fit.count >= enough)
     noise = float(np.median(fit.residual[usable])) if usable.any() else np.inf
     strays = usable & (fit.residual > max(MOVES_PX, MOVES_DEVIATIONS * noise))
@@ -134,7 +134,7 @@ def unusable(views: Views, found: list[Film]) -> str | None:
     centres = [centre for film in found for centre in film.centres]
     if not centres:
         return (
-            f"no camera has {FEWEST_FRAMES} frames at different times to follow pixels "
+            f"no camera has {MIN_FRAMES} frames at different times to follow pixels "
             "through"
         )
     textured = np.array([views.textured[centre.view].mean() for centre in centres])
@@ -161,7 +161,7 @@ def _why_not_no(views, found, noise):
     if noise > CALM_PX:
         return f"above {CALM_PX:g} px slow motion would not show"
     longest = max(len(film.sequence) for film in found)
-    if longest < FEWEST_FOR_NO:
+    if longest < MIN_FOR_NO:
         return f"what moves far between {longest} frames cannot be followed"
     kept = _kept(views, [one for film in found for one in film.centres])
     if kept < FOLLOWED_FOR_NO:

@@ -13,7 +13,7 @@ from nerfies_jax.evidence.findings import LIKELY, Finding, cannot_tell, judge
 from nerfies_jax.evidence.findings import MOTION as EFFECT
 from nerfies_jax.evidence.view_set import Views
 
-FEWEST_VIEWS = 8  # fewer cut little away, at rest or not
+MIN_VIEWS = 8  # fewer cut little away, at rest or not
 PLAIN_SHARE = 0.2  # of the pixels in the median view
 SIDE = 96  # cells along the longest side of the box
 # Pixels that an outline is widened by: rims are half background, and a cell of the grid
@@ -31,7 +31,7 @@ def outlines(views: Views) -> np.ndarray | None:
     None where there is no plain background in all views.
     """
     shares = 1 - views.valid.mean((1, 2))
-    if len(views.row) < FEWEST_VIEWS or np.median(shares) < PLAIN_SHARE:
+    if len(views.row) < MIN_VIEWS or np.median(shares) < PLAIN_SHARE:
         return None
     if shares.min() < PLAIN_SHARE / 4:
         return None  # some view is filled by the scene: no outline there

@@ -13,7 +13,7 @@ from nerfies_jax.evidence.findings import (
     judge,
 )
 from nerfies_jax.evidence.motion import Film
-from nerfies_jax.evidence.view_set import FEWEST_POINTS, Views
+from nerfies_jax.evidence.view_set import MIN_POINTS, Views
 
 CELLS = (8, 6)  # across and down: a picture is covered where a cell holds a point
 COVERED = 0.5  # of the cells that show anything
@@ -103,14 +103,14 @@ def moving_coverage(views: Views, films: list[Film], points: np.ndarray) -> floa
 
 def start(capture: Capture, views: Views, films: list[Film], points) -> Finding:
     """Whether the capture's own points are enough to start Gaussians from."""
-    threshold = f"{FEWEST_POINTS} points that cover {COVERED:.0%} of the pictures"
+    threshold = f"{MIN_POINTS} points that cover {COVERED:.0%} of the pictures"
     count = 0 if capture.points is None else len(capture.points.position)
     if count == 0:
         evidence = "the capture has no points: Gaussians start at random"
         return Finding(START, evidence, threshold, False, CERTAIN, {"points": 0.0})
     covered = coverage(views, points)
     inside = moving_coverage(views, films, points)
-    enough = judge(count, FEWEST_POINTS, np.sqrt(count))
+    enough = judge(count, MIN_POINTS, np.sqrt(count))
     spread = judge(covered, COVERED, 0.02)
     # Both must hold; the less sure of two that agree, and whichever refuses.
     wanted, confidence = min(
@@ -141,7 +141,7 @@ def background(
             seen[which] += 1
             agree[which] += stays
     count = int((seen > 0).sum())
-    if count < FEWEST_POINTS:
+    if count < MIN_POINTS:
         return cannot_tell(
             BACKGROUND,
             f"{len(points)} points, but only {count} on pixels that can be followed",

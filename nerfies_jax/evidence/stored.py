@@ -15,14 +15,14 @@ from nerfies_jax.evidence.findings import (
     judge,
 )
 from nerfies_jax.evidence.motion import Film
-from nerfies_jax.evidence.view_set import FEWEST_POINTS, Views
+from nerfies_jax.evidence.view_set import MIN_POINTS, Views
 from nerfies_jax.geometry import distortion
 
 KNOWN_SHARE = 0.2  # of the pixels: fewer depths are points
 DEPTH_ERROR = 0.1  # median share that depth is off what parallax says
 DEPTH_SURE = 0.03  # deviation of a depth from parallax, to be compared with
 MISSED_SHARE = 0.3  # of what is seen to move may lie outside a mask
-FEWEST_MOVING = 200  # pixels over all frames
+MIN_MOVING = 200  # pixels over all frames
 LENS_PX = 0.5  # half a pixel is what cameras are known to
 GRID = 9  # pixels across and down where a lens is asked
 
@@ -44,7 +44,7 @@ def depth(capture: Capture, views: Views, films: list[Film]) -> Finding:
         sure &= fit.inverse_depth * fit.parallax_px * DEPTH_SURE > one.noise_px
         ratios.append((stored[one.view] * fit.inverse_depth)[sure])
     ratio = np.concatenate(ratios) if ratios else np.zeros(0)
-    if len(ratio) < FEWEST_POINTS:
+    if len(ratio) < MIN_POINTS:
         return cannot_tell(
             DEPTH,
             f"depth on {share:.1%} of the pixels, and no parallax to check it by",
@@ -78,7 +78,7 @@ def masks(capture: Capture, views: Views, films: list[Film]) -> Finding:
     evidence = f"masks on {share:.1%} of the pixels"
     if share in (0.0, 1.0):
         return Finding(MASKS, evidence, threshold, False, CERTAIN, numbers)
-    if seen < FEWEST_MOVING:
+    if seen < MIN_MOVING:
         return cannot_tell(
             MASKS, f"{evidence}, and too little seen to move to check them", threshold
         )

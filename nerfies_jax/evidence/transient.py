@@ -26,14 +26,14 @@ MOST_PATCHES = 40  # looked for, of a frame
 # Of the pixels of both frames, beyond what pairs around lose. Built-in scenes in which
 # nothing comes or goes lose up to 1.9 % once and 1.4 % twice, at 60 frames and at 40.
 GONE_SHARE = 0.03
-FEWEST_TIMES = 2  # it came and it went
+MIN_TIMES = 2  # it came and it went
 
 
 def transient(views: Views, films: list[Film]) -> Finding:
     """Whether large parts of pictures are there in one frame and gone in the next."""
     threshold = (
         f"{GONE_SHARE:.0%} of a picture found nowhere near in the next, "
-        f"{FEWEST_TIMES} times"
+        f"{MIN_TIMES} times"
     )
     reason = motion.unusable(views, films)
     if reason is not None:
@@ -41,11 +41,11 @@ def transient(views: Views, films: list[Film]) -> Finding:
     each = [jumps(views, film) for film in films]
     gone = np.concatenate(each)
     worst = np.sort(np.concatenate([_above_neighbours(one) for one in each]))[::-1]
-    if len(worst) <= 2 * FEWEST_TIMES:
+    if len(worst) <= 2 * MIN_TIMES:
         return cannot_tell(EFFECT, f"only {len(worst)} pairs of frames", threshold)
     # What the other pairs lose is the noise of those that jump.
-    usual = float(np.sort(gone)[: -2 * FEWEST_TIMES].mean())
-    value = float(worst[FEWEST_TIMES - 1])
+    usual = float(np.sort(gone)[: -2 * MIN_TIMES].mean())
+    value = float(worst[MIN_TIMES - 1])
     wanted, confidence = judge(value, GONE_SHARE, usual)
     times = int((worst > GONE_SHARE).sum())
     if wanted is False and not _always_there(films):

@@ -10,11 +10,11 @@ import scipy.ndimage as nd
 from nerfies_jax.capture import capture as captures
 from nerfies_jax.capture.capture import Capture
 
-WIDEST = 256  # pixels: pictures are looked at no wider than this
+MAX_SIDE_PX = 256  # pixels: pictures are looked at no wider than this
 MOST_PIXELS = 4_000_000  # of all frames; half a minute of flow on one core
 PLAIN_SHARE = 0.9  # of the border's pixels: then what lies behind has one colour
 PLAIN_LEVELS = 3  # grey levels of 255: JPEG and rounding, not a picture
-FEWEST_POINTS = 300  # that say where the scene is
+MIN_POINTS = 300  # that say where the scene is
 OUTSIDE = 0.02  # share of points on either side taken for outliers
 # Slope in grey levels a pixel, and over what noise alone gives (a Gaussian derivative
 # of 1 px passes a fifth of it); flow over less is a guess of its regulariser.
@@ -54,8 +54,8 @@ class Shrunk:
 
 
 def shrunk(capture: Capture) -> Shrunk:
-    """The capture with pictures no wider than `WIDEST`."""
-    factor = math.ceil(max(capture.size) / WIDEST)
+    """The capture with pictures no wider than `MAX_SIDE_PX`."""
+    factor = math.ceil(max(capture.size) / MAX_SIDE_PX)
     return Shrunk(captures.downscale(capture, factor), factor)
 
 
@@ -159,7 +159,7 @@ def depth_span(
     capture: Capture, views: Views, points: np.ndarray
 ) -> tuple[float, float]:
     """The z-depths between which a scene lies: its points', or the capture's planes."""
-    if len(points) < FEWEST_POINTS:
+    if len(points) < MIN_POINTS:
         return capture.near, capture.far
     depths = []
     for index in range(len(views.row)):

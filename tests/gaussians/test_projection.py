@@ -173,7 +173,7 @@ HOPELESS = {
     "zero quaternion": dict(quaternion=(0, 0, 0, 0)),
     "nan quaternion": dict(quaternion=(1, float("nan"), 0, 0)),
     "infinite scale": dict(scale=(float("inf"), 1, 1)),
-    "scale beyond WIDEST_PX": dict(scale=(1e18, 1, 1)),
+    "scale beyond MAX_EXTENT_PX": dict(scale=(1e18, 1, 1)),
     "nan opacity": dict(opacity=float("nan")),
     "faint": dict(opacity=0.003915),  # between 1/256 and 1/255, where it is cut
 }

@@ -172,7 +172,7 @@ def test_opposite_quaternions_have_a_rotation_between(ends, interpolation, dtype
 
 def test_a_time_outside_is_held_at_the_nearer_end(dtype):
     knots = time_knots.bake(lambda t: moving(t, dtype), 6, dtype=dtype)
-    for interpolation in time_knots.FEWEST:
+    for interpolation in time_knots.MIN_KNOTS:
         for beyond, end in ((-0.3, 0), (-1e30, 0), (1.2, 1), (1e30, 1)):
             found, held = (
                 at(knots, jnp.asarray(time, dtype), interpolation)
@@ -188,7 +188,7 @@ def test_scales_that_shrink_through_zero_stay_positive_and_finite(size, dtype):
         return static._replace(scale=jnp.ones((1, 3), dtype) + (size - 1) * time)
 
     knots = time_knots.bake(deform, 4, dtype=dtype)
-    for interpolation in time_knots.FEWEST:
+    for interpolation in time_knots.MIN_KNOTS:
         for time in (0.0, 0.7, 0.9, 1.0):
             scale = at(knots, jnp.asarray(time, dtype), interpolation).scale
             assert (scale > 0).all()
@@ -221,7 +221,7 @@ def test_gradients_in_time_and_in_the_knots(float64):
         deformed = at(knots._replace(track=track), time, interpolation)
         return sum(jnp.sum(jnp.sin(3 * leaf)) for leaf in deformed)
 
-    for interpolation in time_knots.FEWEST:
+    for interpolation in time_knots.MIN_KNOTS:
         for time in (0.05, 0.5, 0.93):  # the first, an inner and the last interval
             of = functools.partial(loss, interpolation=interpolation)
             inputs = knots.track, jnp.asarray(time)
