@@ -1,5 +1,7 @@
 """The frames of a capture on the device, and views to render."""
 
+from collections.abc import Set
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -10,7 +12,7 @@ from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.training.model import Frames, View, in_default_precision
 
 
-def frames_of(capture: Capture, required_data: frozenset[str] = frozenset()) -> Frames:
+def frames_of(capture: Capture, required_data: Set[str] = frozenset()) -> Frames:
     """The training frames on the device, with what of `required_data` there is."""
     rows = capture.train
     extras = {}
