@@ -37,6 +37,8 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 if hasattr(signal, "SIGHUP"):  # not on Windows
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
+pytest_plugins = ["tests.budget"]
+
 SHARED = pathlib.Path(__file__).resolve().parents[2] / "shared"
 
 
@@ -96,9 +98,9 @@ def forget_programs():
         gc.collect()
 
 
-@pytest.fixture(params=["float32", "float64"])
+@pytest.fixture(params=["float32", pytest.param("float64", marks=pytest.mark.full)])
 def dtype(request):
-    """The precision a test runs in.
+    """The precision a test runs in: float32 in core, both in full.
 
     float32 runs with x64 off, because x64 silently promotes float32 code through
     Python-made constants and so hides its failures; float64 runs with x64 on.
