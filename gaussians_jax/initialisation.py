@@ -12,6 +12,7 @@ from gaussians_jax.splats import Splats
 from nerfies_jax.capture.capture import Capture, point_depths
 
 SOURCES = ("auto", "points", "random")
+MOTIONS = ("tracks", "none")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,9 +43,40 @@ class InitSpec:
             )
 
 
+@dataclasses.dataclass(frozen=True)
+class StartSpec:
+    """How a scene that moves starts.
+
+    `motion` "tracks" fits the motion to tracks before training, where the film allows
+    it; "none" starts from rest. `use_depths` lets paths lean on the capture's depths.
+    """
+
+    motion: str = "none"
+    moving_points: int = 3000  # Gaussians lifted from moving pixels
+    fit_steps: int = 1500
+    fit_rate: float = 5e-3
+    use_depths: bool = False
+
+    def __post_init__(self):
+        if self.motion not in MOTIONS:
+            raise ValueError(f"unknown motion {self.motion!r}; choose from {MOTIONS}")
+        if self.moving_points < 1 or self.fit_steps < 1:
+            raise ValueError(
+                "a start from tracks takes at least one moving point and one step, got "
+                f"moving_points={self.moving_points}, fit_steps={self.fit_steps}"
+            )
+        if self.fit_rate <= 0:
+            raise ValueError(f"fit_rate={self.fit_rate} must be positive")
+
+
+def point_count(capture: Capture) -> int:
+    """How many points the capture has."""
+    return 0 if capture.points is None else len(capture.points.position)
+
+
 def uses_capture_points(spec: InitSpec, capture: Capture) -> bool:
     """Whether the first Gaussians are the capture's own points; host side."""
-    found = 0 if capture.points is None else len(capture.points.position)
+    found = point_count(capture)
     if spec.source == "points" and not found:
         raise ValueError(
             f"{capture.path or capture.name}: the scene shall start from the capture's "

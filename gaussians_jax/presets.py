@@ -14,8 +14,9 @@ from gaussians_jax.effects.mlp_motion import MotionSpec
 from gaussians_jax.effects.motion_basis import SMALL_BASIS_MOTION, BasisMotionSpec
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec
 from gaussians_jax.effects.neighbours import NeighbourSpec
+from gaussians_jax.effects.se3_bases import SE3BasesSpec
 from gaussians_jax.effects.spectral import SpectralSpec
-from gaussians_jax.initialisation import InitSpec
+from gaussians_jax.initialisation import InitSpec, StartSpec
 from gaussians_jax.learning_rates import LearningRateSpec
 from gaussians_jax.mcmc import MCMCStrategySpec
 from gaussians_jax.phases import AlternationSpec, AnnealingSpec
@@ -109,6 +110,12 @@ SMALL_MCMC = dataclasses.replace(
         refine_every=50, refine_start_iter=300, refine_stop_iter=2500, cap_max=10_000
     ),
 )
+SMALL_TRACKED = dataclasses.replace(
+    SMALL_STATIC,
+    init=InitSpec(points=4000, random=5000),
+    motion=SE3BasesSpec(bases=12),
+    start=StartSpec(motion="tracks"),
+)
 SMALL_DEFORMABLE = dataclasses.replace(
     SMALL_STATIC,
     motion=MotionSpec(
@@ -178,6 +185,7 @@ PRESETS = {
     "sonata": SONATA,
     "moba": MOBA,
     "splats-static-small": SMALL_STATIC,
+    "splats-tracked-small": SMALL_TRACKED,
     "splats-mcmc-small": SMALL_MCMC,
     "splats-deformable-small": SMALL_DEFORMABLE,
     "sonata-small": SMALL_SONATA,

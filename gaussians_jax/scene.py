@@ -1,6 +1,8 @@
 """Gaussians and effects put together: a spec becomes a `Model` the loop can train."""
 
+import dataclasses
 import math
+import warnings
 from typing import Any
 
 import jax
@@ -17,10 +19,12 @@ from gaussians_jax import (
     phases,
     rendering,
     splats,
+    track_start,
 )
 from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.effects import deformation
 from gaussians_jax.growth import AuxState, states_of
+from gaussians_jax.initialisation import StartSpec
 from gaussians_jax.mcmc import MCMCStrategySpec
 from gaussians_jax.phases import Trained
 from gaussians_jax.spec import (
@@ -31,7 +35,9 @@ from gaussians_jax.spec import (
     refuse_what_cannot_train,
 )
 from gaussians_jax.splats import Params
+from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.capture.capture import Capture
+from nerfies_jax.evidence import record
 from nerfies_jax.training import loop, losses
 from nerfies_jax.training.effects import (
     FIELD_SEAMS,
@@ -109,16 +115,24 @@ def build(
         deformed = stages.deform(params, stages.prepare(params), view.time)
         return stages.draw(params, deformed, view, size, step)
 
+    def init(capture, key, spec=spec):
+        return first_state(spec, effects, optimiser, capture, key)
+
+    def example(capture, key):
+        at_rest = dataclasses.replace(spec, start=StartSpec(motion="none"))
+        return init(capture, key, at_rest)
+
     return Model(
         # By name alone: a run with other effects of one's own is another run.
         spec=(spec, metadata, *more),
-        init=lambda capture, key: first_state(spec, effects, optimiser, capture, key),
+        init=init,
         step=_stepper(spec, metadata, effects, optimiser),
         render=whole_frame,
         events=growth.events(spec, metadata, effects, optimiser),
         counts=count_rows,
         required_data=frozenset().union(*(effect.required_data for effect in effects)),
         stages=stages,
+        example=example,
     )
 
 
@@ -305,7 +319,11 @@ def first_state(spec, effects, optimiser, capture, key) -> TrainState:
     rendering.refuse_distortion(capture.cameras)
     start_key, run_key = jax.random.split(key)
     seed = int(jax.random.randint(start_key, (), 0, np.iinfo(np.int32).max))
+    tracked, capture = _from_tracks(spec, effects, capture, start_key)
     position, colour = initialisation.initial_points(spec.init, capture, seed)
+    if tracked is not None:
+        position = np.concatenate([position, tracked.position])
+        colour = np.concatenate([colour, tracked.colour])
     rows = splats.from_points(
         position,
         colour,
@@ -324,6 +342,8 @@ def first_state(spec, effects, optimiser, capture, key) -> TrainState:
             params.rows[effect.name] = effect.init_rows(rows_key, rows)
         if effect.init is not None:
             params.nets[effect.name] = effect.init(nets_key)
+    if tracked is not None:
+        params = track_start.put_in(params, effects[0], tracked)
     params = splats.pad_rows(params, splats.capacity_for(count, most))
     params = in_default_precision(params)
     stats = ()
@@ -333,6 +353,32 @@ def first_state(spec, effects, optimiser, capture, key) -> TrainState:
     return TrainState(
         params, optimiser.init(params), aux_state, jnp.zeros((), jnp.int32), run_key
     )
+
+
+def _from_tracks(spec, effects, capture, key):
+    """The start from tracks, and the capture with the points that stand still.
+
+    None, and the capture as it is, where the spec asks for none or the film allows
+    none, which a warning then says.
+    """
+    if spec.start.motion != "tracks":
+        return None, capture
+    evidence = record.cached(capture, CACHE / "evidence", spec.start.use_depths)
+    reason = track_start.unusable(evidence)
+    if reason:
+        warnings.warn(
+            f"{capture.path or capture.name}: the motion starts from rest, for tracks "
+            f"are of no use here: {reason}",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+        return None, capture
+    found = track_start.start(
+        spec.start, effects[0], spec.motion, evidence, capture, key
+    )
+    if len(evidence.still.position) > initialisation.point_count(capture):
+        capture = dataclasses.replace(capture, points=evidence.still)
+    return found, capture
 
 
 def count_rows(state: TrainState) -> dict[str, int]:

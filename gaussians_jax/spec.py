@@ -11,6 +11,7 @@ from gaussians_jax.effects import (
     motion_basis,
     motion_growth,
     neighbours,
+    se3_bases,
     spectral,
 )
 from gaussians_jax.effects.acceleration import AccelerationSpec
@@ -20,8 +21,9 @@ from gaussians_jax.effects.mlp_motion import MotionSpec
 from gaussians_jax.effects.motion_basis import BasisMotionSpec
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec
 from gaussians_jax.effects.neighbours import NeighbourSpec
+from gaussians_jax.effects.se3_bases import SE3BasesSpec
 from gaussians_jax.effects.spectral import SpectralSpec
-from gaussians_jax.initialisation import InitSpec
+from gaussians_jax.initialisation import InitSpec, StartSpec
 from gaussians_jax.learning_rates import LearningRateSpec
 from gaussians_jax.mcmc import MCMCStrategySpec
 from gaussians_jax.optimiser import scale_by_row_adam, scale_by_row_radam
@@ -48,7 +50,8 @@ class SplatScene:
     optimiser: str = "adam"
     alternation: AlternationSpec | None = None
     annealing: AnnealingSpec | None = None
-    motion: MotionSpec | KanMotionSpec | BasisMotionSpec | None = None
+    motion: MotionSpec | KanMotionSpec | BasisMotionSpec | SE3BasesSpec | None = None
+    start: StartSpec = StartSpec()
     acceleration: AccelerationSpec | None = None
     neighbours: NeighbourSpec | None = None
     motion_growth: MotionGrowthSpec | None = None
@@ -87,6 +90,7 @@ def refuse_what_cannot_train(spec: SplatScene) -> None:
     if motion is None:
         named = ("alternation", "acceleration", "motion_growth")
         orphans = [name for name in named if getattr(spec, name) is not None]
+        orphans += ["start.motion"] if spec.start.motion == "tracks" else []
         if orphans:
             raise ValueError(
                 f"{' and '.join(orphans)} without a motion would train nothing; leave "
@@ -117,12 +121,20 @@ MOTIONS = {
 }
 
 
+def motion_of(spec: SplatScene, metadata: SceneMetadata) -> Effect | None:
+    """The motion that the spec asks for."""
+    if spec.motion is None:
+        return None
+    if isinstance(spec.motion, SE3BasesSpec):
+        return se3_bases.effect(spec.motion, spec.steps, metadata.extent)
+    make = MOTIONS[type(spec.motion)]
+    return make(spec.motion, spec.steps, metadata.frames)
+
+
 def effects_of(spec: SplatScene, metadata: SceneMetadata) -> tuple[Effect, ...]:
     """The effects that the spec asks for, in the order in which they act."""
-    effects = []
-    if spec.motion is not None:
-        move = MOTIONS[type(spec.motion)]
-        effects.append(move(spec.motion, spec.steps, metadata.frames))
+    motion = motion_of(spec, metadata)
+    effects = [] if motion is None else [motion]
     if spec.acceleration is not None:
         effects.append(
             acceleration.effect(spec.acceleration, metadata.extent, metadata.frames)

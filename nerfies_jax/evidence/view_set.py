@@ -66,6 +66,16 @@ def look(capture: Capture) -> Views:
     rows = rows[order]
     # A whole stride: uneven steps would look like uneven motion.
     rows = rows[:: math.ceil(len(rows) * math.prod(capture.size) / MOST_PIXELS)]
+    return _views(capture, rows)
+
+
+def in_time_order(capture: Capture, rows: np.ndarray | None = None) -> Views:
+    """Every frame to learn from (or of `rows`), by time, whichever camera filmed it."""
+    rows = capture.train if rows is None else rows
+    return _views(capture, rows[np.lexsort((rows, capture.times[rows]))])
+
+
+def _views(capture, rows):
     image = capture.images[rows]
     grey = np.ascontiguousarray(image.mean(-1) / 255, np.float32)
     valid = ~plain(capture, rows)

@@ -6,17 +6,13 @@ sees, is decided before its first array.
 
 import contextlib
 import os
-import pathlib
 from typing import Literal
+
+from nerfies_jax.capture.cache import CACHE
 
 Device = Literal["auto", "cpu", "gpu", "tpu"]
 # Whether XLA:CPU sees one core or all of them; each representation says which suits it.
 Threads = Literal["one", "all"]
-
-CACHE = (
-    pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache")
-    / "nerfies_jax"
-)
 
 
 def start_jax(device: Device = "auto", threads: Threads = "one") -> None:

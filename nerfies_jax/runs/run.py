@@ -10,12 +10,12 @@ import psutil
 
 from nerfies_jax import capture as captures
 from nerfies_jax.capture import pinholes, synthetic
+from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.json_files import write_json
 from nerfies_jax.evaluation.representation import Representation
 from nerfies_jax.runs import own_effects, representations
 from nerfies_jax.runs.config import CaptureSource, RunConfig
-from nerfies_jax.runs.platform import CACHE
 from nerfies_jax.runs.run_folder import CHECKPOINTS, CONFIG
 from nerfies_jax.training import checkpoint, specs
 from nerfies_jax.training.effects import Effect
@@ -215,4 +215,6 @@ def free_memory() -> int:
 
 def restore(folder: pathlib.Path, run: Run) -> checkpoint.Restored:
     """The newest state saved in a run folder."""
-    return checkpoint.restore(folder / CHECKPOINTS, first_state(run), run.model.spec)
+    model = run.model
+    example = (model.example or model.init)(run.capture, jax.random.key(0))
+    return checkpoint.restore(folder / CHECKPOINTS, example, model.spec)

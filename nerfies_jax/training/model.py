@@ -114,3 +114,5 @@ class Model(NamedTuple):
         frozenset()
     )  # which of "depths", "points", "flow" it reads
     stages: Stages | None = None  # where rendering has parts worth keeping
+    # As `init`, of the same structure and quicker: what a checkpoint is read into.
+    example: Callable[[Any, Any], TrainState] | None = None

@@ -35,6 +35,7 @@ FLOORS = {
     "gaussians_jax.spec": 8,
     "gaussians_jax.growth": 8,
     "gaussians_jax.scene": 8,
+    "gaussians_jax.track_start": 8,
     "gaussians_jax.point_tracks": 8,
     "gaussians_jax.step_time": 8,
     "gaussians_jax.variants": 8,

@@ -1,0 +1,178 @@
+"""Motion as few rigid motions over time, and weights that say who takes part in which.
+
+Each basis is a turn and a shift about a centre of its own at knots in time, with a
+Catmull-Rom spline between them. A Gaussian moves by the mean of the bases under softmax
+weights of its own, one of which stands for staying where it is. The form of Shape of
+Motion (Wang et al. 2024, arXiv:2407.13764), which has a basis for each frame and no
+entry for what is still. Where nothing turns or shifts, nothing moves, exactly.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key
+
+from gaussians_jax.splats import Gaussians, Params, Splats
+from nerfies_jax.geometry import lie, quaternion
+from nerfies_jax.training import schedules
+from nerfies_jax.training.effects import Effect, FrameCondition
+
+NAME = "se3_bases"
+
+
+@dataclasses.dataclass(frozen=True)
+class SE3BasesSpec:
+    """How many bases over how many knots, and how they learn.
+
+    `still_logit` is the first logit of staying; from 4 on points at rest keep 13 % of
+    their neighbours' motion, from 9 on 0.1 %. The rate of shifts is in scene extents.
+    """
+
+    bases: int = 8
+    knots: int = 20  # evenly over the film
+    still_logit: float = 9.0
+    logit_rate: float = 1e-2
+    learning_rate: float = 1e-3  # of turns (rad) and shifts
+    learning_rate_end: float = 1e-4
+    warm_up: int = 0  # steps without motion: none, for it starts from tracks
+
+    def __post_init__(self):
+        if self.bases < 1:
+            raise ValueError(f"bases={self.bases}: a motion has at least one basis")
+        if self.knots < 2:
+            raise ValueError(
+                f"knots={self.knots}: a motion has at least two, its first and its "
+                "last instant"
+            )
+        if self.logit_rate <= 0:
+            raise ValueError(f"logit_rate={self.logit_rate} must be positive")
+        if self.warm_up < 0:
+            raise ValueError(f"warm_up={self.warm_up} must not be negative")
+        schedules.check_falling(self.learning_rate, self.learning_rate_end)
+
+
+class Bases(NamedTuple):
+    """The rigid motions: x goes to centre + R(turn) (x - centre) + shift."""
+
+    turn: Float[Array, "bases knots 3"]  # rotation vectors, rad
+    shift: Float[Array, "bases knots 3"]  # scene units
+    centre: Float[Array, "bases 3"]  # scene units
+
+
+class Motion(NamedTuple):
+    """All bases at one time, as x -> x + linear x + offset."""
+
+    turn: Float[Array, "bases 3"]
+    linear: Float[Array, "bases 3 3"]  # R - 1
+    offset: Float[Array, "bases 3"]
+
+
+def init(key: Key[Array, ""], spec: SE3BasesSpec, dtype=jnp.float32) -> Bases:
+    """Bases that hardly move: were all alike, all would keep the same slopes."""
+    shape = (spec.bases, spec.knots, 3)
+    zero = jnp.zeros(shape, dtype)
+    shift = 1e-3 * jax.random.normal(key, shape, dtype)
+    return Bases(zero, shift, jnp.zeros((spec.bases, 3), dtype))
+
+
+def init_logits(spec: SE3BasesSpec, gaussians: int, dtype=jnp.float32):
+    """[gaussians, 1 + bases]: all stay where they are."""
+    logits = jnp.zeros((gaussians, 1 + spec.bases), dtype)
+    return logits.at[:, 0].set(spec.still_logit)
+
+
+def between_knots(
+    table: Float[Array, "bases knots width"], time: Float[Array, ""]
+) -> Float[Array, "bases width"]:
+    """The Catmull-Rom spline through the knots at a time in [0, 1].
+
+    Continuous with its slope; at a knot it is the knot. The end knots stand for those
+    beyond them, and times outside for the ends.
+    """
+    last = table.shape[1] - 1
+    place = jnp.clip(time, 0, 1) * last
+    left = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, last - 1)
+    part = place - left.astype(place.dtype)
+    rows = jnp.clip(left + jnp.arange(-1, 3, dtype=jnp.int32), 0, last)
+    before, start, end, after = jnp.moveaxis(table[:, rows], 1, 0)
+    # Horner's form about the left knot: the start itself is added last, unrounded.
+    slope = 0.5 * (end - before)
+    curve = before - 2.5 * start + 2 * end - 0.5 * after
+    twist = 0.5 * (after - before) + 1.5 * (start - end)
+    return start + part * (slope + part * (curve + part * twist))
+
+
+def at_time(bases: Bases, time: Float[Array, ""]) -> Motion:
+    """The rigid motions of all bases at one time.
+
+    R - 1 without the 1: a small turn keeps all its digits.
+    """
+    both = jnp.concatenate([bases.turn, bases.shift], axis=-1)
+    now = between_knots(both, time)
+    turn, shift = now[:, :3], now[:, 3:]
+    axes, none = jnp.eye(3, dtype=turn.dtype), jnp.zeros_like(turn[0])
+    turned = jax.vmap(lie.displacement, (None, None, 0))
+    linear = jnp.swapaxes(jax.vmap(turned, (0, None, None))(turn, none, axes), 1, 2)
+    return Motion(turn, linear, shift - jnp.einsum("bij,bj->bi", linear, bases.centre))
+
+
+def deform(
+    motion: Motion, logits: Float[Array, "gaussians weights"], gaussians: Gaussians
+) -> Gaussians:
+    """Gaussians moved by the mean of the bases under their weights.
+
+    Means move by the mean of the rigid motions (linear blend skinning), and turn by the
+    mean of the rotation vectors.
+    """
+    weights = jax.nn.softmax(logits, axis=-1)[:, 1:]
+    rows = len(motion.turn)
+    flat = jnp.concatenate([motion.linear.reshape(rows, 9), motion.offset], axis=-1)
+    mixed = weights @ jnp.concatenate([flat, motion.turn], axis=-1)
+    linear, offset, turn = mixed[:, :9], mixed[:, 9:12], mixed[:, 12:]
+    linear = linear.reshape(-1, 3, 3)
+    mean = gaussians.mean
+    moved = mean + (jnp.einsum("nij,nj->ni", linear, mean) + offset)
+
+    def turned(turn, own):
+        return quaternion.multiply(quaternion.exp(turn), quaternion.normalise(own))
+
+    return gaussians._replace(
+        mean=moved, quaternion=jax.vmap(turned)(turn, gaussians.quaternion)
+    )
+
+
+def effect(spec: SE3BasesSpec, steps: int, extent: float) -> Effect:
+    """The seams that this motion fills, for a run of `steps`.
+
+    `extent`, in scene units, is the measure of shifts, as it is that of the means.
+    """
+    rate = schedules.log_linear(spec.learning_rate, spec.learning_rate_end, steps)
+
+    def init_rows(key, rows: Splats):
+        del key
+        return init_logits(spec, len(rows.mean), rows.mean.dtype)
+
+    def row_rate(step):
+        return jnp.full((), spec.logit_rate)
+
+    def rates(step):
+        # A centre and a shift say the same twice over; centres stay.
+        now = rate(step)
+        return Bases(now, extent * now, jnp.zeros_like(now))
+
+    def moved(params: Params, gaussians: Gaussians, condition: FrameCondition, ready):
+        del ready
+        motion = at_time(params.nets[NAME], condition.time)
+        return deform(motion, params.rows[NAME], gaussians)
+
+    return Effect(
+        name=NAME,
+        init=lambda key: init(key, spec),
+        init_rows=init_rows,
+        row_learning_rate=row_rate,
+        learning_rate=rates,
+        warm_up=spec.warm_up,
+        deform=moved,
+    )

@@ -1,0 +1,140 @@
+"""A motion fitted to known paths of points, before anything is drawn.
+
+Descent on pictures does not find motion of more than a few pixels; paths that come from
+tracks hand it over (`nerfies_jax.evidence`). Every effect that deforms Gaussians can be
+fitted: its networks, its rows and the canonical places of the points are descended
+together on the distance between where it carries the points and where they were seen.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Bool, Float, Key
+
+from gaussians_jax import splats
+from gaussians_jax.splats import Gaussians, Params, Splats
+from nerfies_jax.training.effects import Effect, FrameCondition
+from nerfies_jax.training.updates import apply_updates
+
+PyTree = Any
+FRAMES_AT_ONCE = 12  # of the film in each step
+SOFT = 1e-3  # of the unit: distances below it count squared
+LAST_RATE = 0.02  # of the first
+
+
+class Points(NamedTuple):
+    """What is fitted: points with what the motion keeps for each, and its networks."""
+
+    canonical: Float[Array, "points 3"]  # scene units
+    rows: PyTree  # of the effect, a row for each point; None where it keeps none
+    nets: PyTree  # of the effect; None where it has none
+
+
+class PathFit(NamedTuple):
+    """The fitted points, and the mean distance they are off before and after."""
+
+    points: Points
+    first: float  # scene units
+    last: float
+
+
+def scene_of(effect: Effect, points: Points) -> Params:
+    """The points as Gaussians of a scene that has this effect alone."""
+    count, kind = len(points.canonical), points.canonical.dtype
+    rows = Splats(
+        mean=points.canonical,
+        log_scale=jnp.zeros((count, 3), kind),
+        quaternion=jnp.tile(jnp.asarray([1, 0, 0, 0], kind), (count, 1)),
+        opacity_logit=jnp.zeros(count, kind),
+        sh_dc=jnp.zeros((count, 1, 3), kind),
+        sh_rest=jnp.zeros((count, 0, 3), kind),
+    )
+    own = {} if points.rows is None else {effect.name: points.rows}
+    nets = {} if points.nets is None else {effect.name: points.nets}
+    return Params({"splats": rows, **own}, nets)
+
+
+def places(
+    effect: Effect, points: Points, time: Float[Array, ""]
+) -> Float[Array, "points 3"]:
+    """Where the motion carries the points at a time."""
+    return carried(effect, points, time).mean
+
+
+def carried(effect: Effect, points: Points, time: Float[Array, ""]) -> Gaussians:
+    """The points as Gaussians at a time."""
+    params = scene_of(effect, points)
+    ready = None if effect.prepare is None else effect.prepare(params)
+    still = splats.activate(params.rows["splats"])
+    return effect.deform(params, still, FrameCondition(time), ready)
+
+
+def fit(
+    effect: Effect,
+    start: Points,
+    times: Float[np.ndarray, " frames"],
+    position: Float[np.ndarray, "points frames 3"],
+    known: Bool[np.ndarray, "points frames"],
+    rates: Points,
+    key: Key[Array, ""],
+    *,
+    unit: float = 1.0,
+    steps: int = 1500,
+    penalty: Callable[[Points], Float[Array, ""]] | None = None,
+) -> PathFit:
+    """Descend on the distance to the paths, where they are known.
+
+    `rates` is a prefix of `start` with the learning rate of each part; `unit` is a
+    typical distance of the scene. The distance is softened near zero and not squared,
+    so that single wrong paths bend nothing. `penalty` is added to the mean distance
+    over the unit. ValueError where no place is known.
+    """
+    if not known.any():
+        raise ValueError("no path is known anywhere: nothing to fit a motion to")
+    target = jnp.asarray(np.moveaxis(np.where(known[..., None], position, 0), 1, 0))
+    target = target.astype(start.canonical.dtype)
+    weight = jnp.asarray(known.T, target.dtype)
+    moments = jnp.asarray(times, target.dtype)
+    together = min(FRAMES_AT_ONCE, len(times))
+
+    def distance(points, frames):
+        def one(time, target, weight):
+            off = places(effect, points, time) - target
+            length = jnp.sqrt(jnp.sum(off**2, axis=-1) + (SOFT * unit) ** 2)
+            return jnp.sum(length * weight)
+
+        total = jnp.sum(jax.vmap(one)(moments[frames], target[frames], weight[frames]))
+        return total / jnp.maximum(jnp.sum(weight[frames]), 1)
+
+    def loss(points, frames):
+        value = distance(points, frames) / unit
+        return value if penalty is None else value + penalty(points)
+
+    adam = optax.scale_by_adam()
+
+    def step(state, key_and_count):
+        points, moments_ = state
+        key, count = key_and_count
+        frames = jax.random.choice(key, len(times), (together,), replace=False)
+        grads = jax.grad(loss)(points, frames)
+        updates, moments_ = adam.update(grads, moments_)
+        share = LAST_RATE ** (count.astype(target.dtype) / steps)
+        now = jax.tree.map(lambda rate: rate * share, rates)
+        return (apply_updates(points, updates, now), moments_), None
+
+    @jax.jit
+    def run(points):
+        keys = jax.random.split(key, steps), jnp.arange(steps)
+        (points, _), _ = jax.lax.scan(step, (points, adam.init(points)), keys)
+        return points
+
+    every = jnp.arange(len(times))
+    mean_distance = jax.jit(lambda points: distance(points, every))
+    # optax raises floats to a whole number of steps.
+    with jax.numpy_dtype_promotion("standard"):
+        found = run(start)
+    return PathFit(found, float(mean_distance(start)), float(mean_distance(found)))

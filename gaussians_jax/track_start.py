@@ -1,0 +1,242 @@
+"""The first Gaussians and the first motion, from what tracks say of a film.
+
+What stands still starts from the evidence's dense points. The motion is fitted to the
+paths of moving tracks; then moving pixels of all frames are lifted by the depths of the
+tracks near them, and carried back by that motion to where it has its Gaussians.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial import cKDTree
+
+from gaussians_jax import path_fit
+from gaussians_jax.effects.se3_bases import Bases, SE3BasesSpec
+from gaussians_jax.initialisation import StartSpec
+from gaussians_jax.path_fit import Points
+from gaussians_jax.splats import Params
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.evidence import rigid_groups, view_set
+from nerfies_jax.evidence.record import Evidence
+from nerfies_jax.training.effects import Effect
+
+LEAST_SEEN = 6  # frames in which a path is known
+MEMBER_LOGIT, STILL_LOGIT = 3.0, -6.0  # of a moving point, before the fit
+SMOOTHNESS, TURN_SMOOTHNESS = 0.02, 0.002  # weights of second differences of knots
+DEPTH_TRACKS, DEPTH_REACH_PX = 6, 8.0  # whose depth a moving pixel takes
+CARRIERS = 3  # points of the fit that carry a seed
+FAR = 0.045  # of the unit: a seed farther from every point of the fit is dropped
+GONE = 0.75  # of the unit: a seed carried back farther than that is dropped
+ROUNDS = 8  # of carrying back
+
+
+class TrackStart(NamedTuple):
+    """What a scene starts from; host side."""
+
+    position: np.ndarray  # [moving, 3] canonical, scene units
+    colour: np.ndarray  # [moving, 3] in [0, 1]
+    rows: Any  # of the motion, a row for each; None where it keeps none
+    nets: Any  # of the motion
+    note: str  # how well the motion fits its tracks
+
+
+def unusable(evidence: Evidence) -> str:
+    """Why a motion cannot start from these tracks; empty where it can."""
+    if evidence.unusable:
+        return evidence.unusable
+    if (evidence.paths.known.sum(1) >= LEAST_SEEN).sum() < 2 * LEAST_SEEN:
+        return "hardly any track moves by itself"
+    return ""
+
+
+def scene_unit(evidence: Evidence) -> float:
+    """A typical distance: the median z-depth of points at rest, scene units."""
+    depth = evidence.rest.depth[evidence.tracks.seen]
+    depth = depth[np.isfinite(depth) & (depth > 0)]
+    return float(np.median(depth)) if len(depth) else 1.0
+
+
+def start(
+    spec: StartSpec,
+    effect: Effect,
+    motion: Any,
+    evidence: Evidence,
+    capture: Capture,
+    key: jax.Array,
+) -> TrackStart:
+    """The motion fitted to the evidence's paths, and Gaussians that it carries.
+
+    `motion` is the spec of `effect`. ValueError where `unusable` says why.
+    """
+    reason = unusable(evidence)
+    if reason:
+        raise ValueError(
+            f"{capture.path or capture.name}: no start from tracks: {reason}"
+        )
+    kept = evidence.paths.known.sum(1) >= LEAST_SEEN
+    position, known = evidence.paths.position[kept], evidence.paths.known[kept]
+    times = capture.times[evidence.row].astype(np.float32)
+    unit = scene_unit(evidence)
+    guess, rates, penalty = _guess(motion, effect, position, known, times, unit, key)
+    rates = jax.tree.map(lambda rate: spec.fit_rate * rate, rates)
+    fitted = path_fit.fit(
+        effect,
+        guess,
+        times,
+        position.astype(np.float32),
+        known,
+        rates,
+        key,
+        unit=unit,
+        steps=spec.fit_steps,
+        penalty=penalty,
+    )
+    seeds = _seeds(effect, fitted.points, evidence, capture, times, unit, spec)
+    note = (
+        f"{kept.sum()} tracks move; the motion misses them by "
+        f"{fitted.last / unit:.2%} of the scene's depth ({fitted.first / unit:.2%} "
+        f"before the fit), {len(seeds.position)} Gaussians start on it"
+    )
+    return seeds._replace(note=note)
+
+
+def _guess(motion, effect, position, known, times, unit, key):
+    """Points to fit from, the rates of their parts, and what keeps them smooth."""
+    if isinstance(motion, SE3BasesSpec):
+        return _bases_guess(motion, position, known, times, unit)
+    first = np.array(
+        [path[seen].mean(0) for path, seen in zip(position, known, strict=True)]
+    )
+    canonical = jnp.asarray(first, jnp.float32)
+    rows = nets = None
+    rows_key, nets_key = jax.random.split(key)
+    if effect.init_rows is not None:
+        blank = path_fit.scene_of(effect, Points(canonical, None, None))
+        rows = effect.init_rows(rows_key, blank.rows["splats"])
+    if effect.init is not None:
+        nets = effect.init(nets_key)
+    rates = Points(unit, None if rows is None else 1.0, None if nets is None else 0.4)
+    return Points(canonical, rows, nets), rates, None
+
+
+def _bases_guess(motion, position, known, times, unit):
+    canonical_frame = len(times) // 2
+    label = rigid_groups.labels(position, known, motion.bases)
+    found = rigid_groups.motion(position, known, label, canonical_frame)
+    canonical, middle = rigid_groups.centres(position, known, found)
+    turn = rigid_groups.rotation_vectors(found.rotation, canonical_frame)
+    moved = np.einsum("gtij,gj->gti", found.rotation, middle) + found.shift
+    turn = _at_knots(rigid_groups.smoothed(turn), times, motion)
+    shift = _at_knots(rigid_groups.smoothed(moved - middle[:, None]), times, motion)
+    middle = np.concatenate([middle, np.zeros((motion.bases - len(middle), 3))])
+    bases = Bases(*(jnp.asarray(part, jnp.float32) for part in (turn, shift, middle)))
+    logits = np.zeros((len(position), 1 + motion.bases), np.float32)
+    logits[:, 0] = STILL_LOGIT
+    logits[np.arange(len(position)), 1 + label] = MEMBER_LOGIT
+    guess = Points(jnp.asarray(canonical, jnp.float32), jnp.asarray(logits), bases)
+
+    def penalty(points):
+        def bend(table):
+            return jnp.mean(jnp.abs(table[:, 2:] - 2 * table[:, 1:-1] + table[:, :-2]))
+
+        shift, turn = bend(points.nets.shift) / unit, bend(points.nets.turn)
+        return SMOOTHNESS * shift + TURN_SMOOTHNESS * turn
+
+    return guess, Points(unit, 10.0, Bases(3.0, unit, 0.0)), penalty
+
+
+def _at_knots(track, times, motion):
+    """[bases, knots, 3] values between frames; bases without a group stay at rest."""
+    knots = np.linspace(0, 1, motion.knots)
+    table = np.zeros((motion.bases, motion.knots, 3))
+    for group, one in enumerate(track):
+        for axis in range(3):
+            table[group, :, axis] = np.interp(knots, times, one[:, axis])
+    return table
+
+
+def _seeds(effect, points, evidence, capture, times, unit, spec):
+    """Moving pixels of all frames, lifted, and carried back to the canonical places."""
+    views = view_set.in_time_order(capture)
+    rng = np.random.default_rng(0)
+    depth = moving_depths(evidence)
+    frame, row, column = np.nonzero(depth > 0)
+    # Twice as many as wanted: some are dropped.
+    chosen = rng.permutation(len(frame))[: 2 * spec.moving_points]
+    frame, row, column = frame[chosen], row[chosen], column[chosen]
+    canonical = np.asarray(points.canonical)
+    own = None if points.rows is None else jax.tree.map(np.asarray, points.rows)
+    places = jax.jit(lambda points, time: path_fit.places(effect, points, time))
+    found, colours, rows = [], [], []
+    # All frames share the programs: as many rows as the frame with most.
+    most = int(np.bincount(frame).max()) if len(frame) else 0
+    for here in np.unique(frame):
+        at = np.flatnonzero(frame == here)
+        pixel = np.stack([column[at], row[at]], -1)
+        ray = view_set.rays(views, int(here))[row[at], column[at]]
+        seen = views.position[here] + ray * depth[here][row[at], column[at], None]
+        now = np.asarray(places(points, times[here]))
+        distance, near = cKDTree(now).query(seen, CARRIERS)
+        share = np.exp(-distance / (distance.mean(1, keepdims=True) + 1e-12))
+        share /= share.sum(1, keepdims=True)
+
+        def mixed(leaf, near=near, share=share):
+            return np.einsum("nk,nk...->n...", share, leaf[near]).astype(leaf.dtype)
+
+        mine = None if own is None else jax.tree.map(mixed, own)
+        start = seen + np.einsum("nk,nkc->nc", share, canonical[near] - now[near])
+
+        def padded(leaf):
+            return np.pad(leaf, [(0, most - len(leaf))] + [(0, 0)] * (leaf.ndim - 1))
+
+        padded_rows = None if mine is None else jax.tree.map(padded, mine)
+        back = start.astype(np.float32)
+        for _ in range(ROUNDS):
+            there = Points(padded(back), padded_rows, points.nets)
+            back = back - (np.asarray(places(there, times[here]))[: len(at)] - seen)
+            back = back.astype(np.float32)
+        miss = np.linalg.norm(back - start, axis=1)
+        kept = (distance[:, 0] < FAR * unit) & (miss < GONE * unit)
+        found.append(back[kept])
+        colours.append(views.image[here][pixel[kept, 1], pixel[kept, 0]] / 255)
+        if mine is not None:
+            rows.append(jax.tree.map(lambda leaf, kept=kept: leaf[kept], mine))
+    position, colour = np.concatenate(found), np.concatenate(colours)
+    chosen = np.sort(rng.permutation(len(position))[: spec.moving_points])
+    every = None
+    if rows:
+        every = jax.tree.map(lambda *leaves: np.concatenate(leaves)[chosen], *rows)
+    return TrackStart(position[chosen], colour[chosen], every, points.nets, "")
+
+
+def moving_depths(evidence: Evidence) -> np.ndarray:
+    """[frames, height, width] z-depth of moving pixels by tracks near; 0 unknown."""
+    found = np.zeros(evidence.moving.shape, np.float32)
+    tracks = evidence.tracks.take(evidence.moved)
+    for frame, mask in enumerate(evidence.moving):
+        here = np.flatnonzero(evidence.paths.known[:, frame])
+        row, column = np.nonzero(mask)
+        if len(here) < DEPTH_TRACKS or not len(row):
+            continue
+        tree = cKDTree(tracks.pixel[here, frame])
+        distance, near = tree.query(np.stack([column, row], -1) + 0.5, DEPTH_TRACKS)
+        depth = np.median(evidence.paths.depth[here, frame][near], axis=1)
+        depth[distance[:, 0] > DEPTH_REACH_PX * max(1.0, mask.shape[1] / 176)] = 0
+        found[frame, row, column] = depth
+    return found
+
+
+def put_in(params: Params, motion: Effect, tracked: TrackStart) -> Params:
+    """Parameters with the fitted motion; the tracked Gaussians are the last rows."""
+    rows, nets = dict(params.rows), dict(params.nets)
+    if tracked.nets is not None:
+        nets[motion.name] = jax.tree.map(jnp.asarray, tracked.nets)
+    if tracked.rows is not None:
+
+        def last(leaf, own):
+            return leaf.at[len(leaf) - len(own) :].set(jnp.asarray(own, leaf.dtype))
+
+        rows[motion.name] = jax.tree.map(last, rows[motion.name], tracked.rows)
+    return Params(rows, nets)

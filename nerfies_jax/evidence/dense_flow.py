@@ -1,0 +1,95 @@
+"""Dense optical flow between frames that follow each other in time, both ways.
+
+OpenCV's DIS (Kroeger et al. 2016, arXiv:1603.03590) on pictures brought to one mean and
+contrast. Only neighbours are compared: over longer gaps patterns that repeat are taken
+for each other.
+"""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from nerfies_jax.evidence.view_set import Views
+
+# Small pictures are enlarged first: 0.06 px of median error for 0.10 at 176x132.
+ENLARGED_BELOW_PX, ENLARGED = 320, 2
+# Forward and back must meet: within half a pixel and a fiftieth of the way.
+CLOSED_PX, CLOSED_SHARE = 0.5, 0.02
+
+
+class NeighbourFlow(NamedTuple):
+    """Flow of each frame to the next and to the previous one in time.
+
+    From pixel centres, in pixels right and down; `seen` where going there and back ends
+    at the start. The last frame has no next one, the first none before: zero, unseen.
+    """
+
+    forward: np.ndarray  # [frames, height, width, 2] float32
+    forward_seen: np.ndarray  # [frames, height, width] bool
+    backward: np.ndarray
+    backward_seen: np.ndarray
+
+
+def enlarged(views: Views) -> int:
+    """How many times larger than the views' own the pictures are compared."""
+    return ENLARGED if max(views.size) <= ENLARGED_BELOW_PX else 1
+
+
+def levelled(views: Views) -> np.ndarray:
+    """[frames, height, width] uint8: grey pictures of one mean and spread, enlarged.
+
+    Without it a film of varying exposure has 79 % of its pixels marked as moving.
+    """
+    grey = 255 * views.grey
+    mean, spread = grey.mean((1, 2)), np.maximum(grey.std((1, 2)), 1e-3)
+    scaled = (grey - mean[:, None, None]) / spread[:, None, None]
+    alike = np.clip(scaled * np.median(spread) + np.median(mean), 0, 255)
+    times, (width, height) = enlarged(views), views.size
+    size = (times * width, times * height)
+    pictures = [np.rint(one).astype(np.uint8) for one in alike]
+    if times > 1:
+        pictures = [
+            cv2.resize(one, size, interpolation=cv2.INTER_CUBIC) for one in pictures
+        ]
+    return np.stack(pictures)
+
+
+def between_neighbours(views: Views, pictures: np.ndarray) -> NeighbourFlow:
+    """Flow between all frames that follow each other, both ways, and checked.
+
+    `pictures` are the views' as `levelled` makes them. About 14 ms a pair of 176x132
+    enlarged twice, on one core.
+    """
+    (width, height), frames = views.size, len(views.row)
+    times = pictures.shape[2] // width
+    search = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    search.setFinestScale(0 if times > 1 else 1)
+
+    def flow(one, other):
+        shift = search.calc(pictures[one], pictures[other], None)
+        if times == 1:
+            return shift
+        small = cv2.resize(shift, (width, height), interpolation=cv2.INTER_AREA)
+        return small / times
+
+    shape = (frames, height, width)
+    forward, backward = np.zeros((2, *shape, 2), np.float32)
+    forward_seen, backward_seen = np.zeros((2, *shape), bool)
+    for frame in range(frames - 1):
+        there, back = flow(frame, frame + 1), flow(frame + 1, frame)
+        forward[frame], backward[frame + 1] = there, back
+        forward_seen[frame] = _closed(there, back)
+        backward_seen[frame + 1] = _closed(back, there)
+    return NeighbourFlow(forward, forward_seen, backward, backward_seen)
+
+
+def _closed(there, back):
+    """[height, width]: where `back` leads from the end of `there` to its start."""
+    height, width = there.shape[:2]
+    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height))
+    to = (x + there[..., 0], y.astype(np.float32) + there[..., 1])
+    # Outside nothing leads back.
+    found = cv2.remap(back, *to, cv2.INTER_LINEAR, borderValue=(1e3, 1e3, 1e3, 1e3))
+    gap = np.linalg.norm(there + found, axis=-1)
+    return gap < CLOSED_PX + CLOSED_SHARE * np.linalg.norm(there, axis=-1)

@@ -1,0 +1,158 @@
+"""Paths of moving points in space, from their tracks in the pictures.
+
+The path of least acceleration along the rays of a track: trajectory triangulation (Park
+et al. 2010, "3D reconstruction of a moving point from a series of 2D projections") with
+a penalty in place of a basis. It tells depth where the camera moves at another pace
+than the things. Where it does not, the cost is flat along the rays and the paths lean
+on the depth of what stands around.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+from scipy.spatial import cKDTree
+
+from nerfies_jax.evidence.rest_points import RestPoints, track_rays
+from nerfies_jax.evidence.tracks import Tracks
+from nerfies_jax.evidence.view_set import Views
+
+# On squared acceleration, in units per frame squared, beside squared distances to rays.
+# Penalties from 0.1 to 10 give the same errors in the built-in scenes.
+ACCELERATION = 10.0
+# A track is off by so much; the depth around is right but for this factor. Together
+# they weigh 1e-5 of a ray at a focal length of 200 px: enough for things that drive
+# past, and built-in scenes keep their errors.
+TRACK_PX, AROUND_DEVIATION = 0.3, 0.5
+MEASURED_DEVIATION = 0.03  # of depths that come with the capture
+AROUND = 8  # tracks at rest whose depth is that of what stands around
+AT_REST = 0.3  # tracks of a lower score stand still
+SHORTEST_STEP = 0.1  # of the median time between frames: two at once are no jump
+
+
+class Paths(NamedTuple):
+    """Where points that move are over time."""
+
+    position: (
+        np.ndarray
+    )  # [tracks, frames, 3] scene units; NaN before and after a track
+    known: np.ndarray  # [tracks, frames] bool: seen there, and in front of the camera
+    depth: np.ndarray  # [tracks, frames] z-depth; NaN before and after a track
+    # [tracks]: standard deviation of a common factor of the depths that the film alone
+    # leaves; above about 0.3 the depths are those of what stands around.
+    depth_deviation: np.ndarray
+
+
+def least_acceleration(
+    views: Views,
+    tracks: Tracks,
+    near: float,
+    around: np.ndarray | None = None,
+    measured: np.ndarray | None = None,
+) -> Paths:
+    """Paths along the rays of the tracks; one banded linear system each.
+
+    `around` and `measured` [tracks, frames] are z-depths of what stands around, and of
+    the point itself where the capture has depth; NaN where unknown. `near` is the least
+    z-depth in scene units; a path that comes nearer is not known there.
+    """
+    ray = track_rays(views, tracks)
+    length = np.linalg.norm(ray, axis=-1)
+    unit = ray / length[..., None]
+    focal = np.median(views.intrinsics[:, 0, 0])
+    noise = TRACK_PX / focal
+    pull, target = np.zeros(tracks.seen.shape), np.zeros(tracks.seen.shape)
+    for depth, deviation in (
+        (around, AROUND_DEVIATION),
+        (measured, MEASURED_DEVIATION),
+    ):
+        if depth is not None:
+            there = tracks.seen & np.isfinite(depth)
+            pull = np.where(there, (noise / deviation) ** 2, pull)
+            target = np.where(there, depth, target)
+    position = np.full((*tracks.seen.shape, 3), np.nan)
+    flatness = np.full(len(tracks.seen), np.inf)
+    for row, seen in enumerate(tracks.seen):
+        first, last = np.flatnonzero(seen)[[0, -1]]
+        span = slice(first, last + 1)
+        bands = _bands(views.time[span])
+        along = unit[row, span]
+        weight, pulled = seen[span].astype(float), pull[row, span]
+        across = np.eye(3) - along[:, :, None] * along[:, None, :]
+        onto = along[:, :, None] * along[:, None, :]
+        blocks = weight[:, None, None] * across + pulled[:, None, None] * onto
+        camera = views.position[span]
+        there = camera + ray[row, span] * target[row, span, None]
+        right = weight[:, None] * np.einsum("fij,fj->fi", across, camera)
+        right += pulled[:, None] * np.einsum("fij,fj->fi", onto, there)
+        path = _solved(blocks, bands, right)
+        position[row, span] = path
+        scaled = along * ((path - camera) * along).sum(-1, keepdims=True)
+        bend = np.einsum("kf,fc->kc", _second_differences(views.time[span]), scaled)
+        stiffness = np.sqrt(ACCELERATION * (bend**2).sum())
+        typical = np.median(((path - camera) * along).sum(-1)[seen[span]])
+        flatness[row] = noise * abs(typical) / stiffness if stiffness > 0 else np.inf
+    depth = np.einsum(
+        "fj,nfj->nf", views.rotation[:, 2], position - views.position[None]
+    )
+    known = tracks.seen & (np.nan_to_num(depth, nan=-1.0) > near)
+    return Paths(position, known, depth, flatness)
+
+
+def _second_differences(time):
+    """[frames - 2, frames]: acceleration in units per squared median step."""
+    frames = len(time)
+    if frames < 3:
+        return np.zeros((0, frames))
+    steps = np.diff(time)
+    median = np.median(steps)
+    steps = np.maximum(steps / median if median > 0 else steps + 1.0, SHORTEST_STEP)
+    matrix = np.zeros((frames - 2, frames))
+    at = np.arange(frames - 2)
+    middle = 0.5 * (steps[:-1] + steps[1:])
+    matrix[at, at] = 1 / (steps[:-1] * middle)
+    matrix[at, at + 2] = 1 / (steps[1:] * middle)
+    matrix[at, at + 1] = -matrix[at, at] - matrix[at, at + 2]
+    return matrix
+
+
+def _bands(time):
+    """[3, frames]: diagonals 0, 1 and 2 of the penalty, padded on the right."""
+    matrix = _second_differences(time)
+    product = ACCELERATION * matrix.T @ matrix
+    bands = np.zeros((3, len(time)))
+    for off in range(min(3, len(time))):
+        bands[off, : len(time) - off] = np.diagonal(product, -off)
+    return bands
+
+
+def _solved(blocks, bands, right):
+    """The 3 x 3 blocks plus the penalty on each coordinate, solved for all frames."""
+    frames = len(blocks)
+    lower = np.zeros((7, 3 * frames))
+    for off in range(3):
+        lower[3 * off] = np.repeat(bands[off], 3)
+        for column in range(3 - off):
+            lower[off, column::3] += blocks[:, column + off, column]
+    # Scale-free: a track without any parallax has no depth of its own.
+    lower[0] += 1e-13 * max(lower[0].max(), 1e-30)
+    return scipy.linalg.solveh_banded(lower, right.ravel(), lower=True).reshape(-1, 3)
+
+
+def depth_around(
+    tracks: Tracks, still: Tracks, rest: RestPoints, near: float
+) -> np.ndarray:
+    """[tracks, frames] median z-depth of the nearest tracks at rest; NaN without any.
+
+    `rest` are the points of the `still` tracks.
+    """
+    found = np.full(tracks.seen.shape, np.nan)
+    for frame in range(tracks.seen.shape[1]):
+        here = np.flatnonzero(still.seen[:, frame] & (rest.depth[:, frame] > near))
+        wanted = np.flatnonzero(tracks.seen[:, frame])
+        if len(here) < AROUND or not len(wanted):
+            continue
+        tree = cKDTree(still.pixel[here, frame])
+        _, nearest = tree.query(tracks.pixel[wanted, frame], AROUND)
+        found[wanted, frame] = np.median(rest.depth[here, frame][nearest], axis=1)
+    return found

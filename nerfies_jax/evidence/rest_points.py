@@ -1,0 +1,61 @@
+"""The point at rest that explains a track best, and by how many pixels it misses."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from nerfies_jax.evidence import view_set
+from nerfies_jax.evidence.tracks import Tracks
+from nerfies_jax.evidence.view_set import Views
+
+ROUNDS = 4  # of weights: distances to a ray become pixels by the depth
+FAR_AWAY = 10.0  # times the cameras' spread: depth of what shows no parallax at all
+BEHIND_PX = 1e4  # misses a point that would lie behind the camera
+LEAST_DEPTH = 1e-3  # scene units, for weights alone
+
+
+class RestPoints(NamedTuple):
+    """One point for each track, as if it stood still."""
+
+    position: np.ndarray  # [tracks, 3] scene units
+    residual: np.ndarray  # [tracks, frames] px; NaN where the track is not seen
+    depth: np.ndarray  # [tracks, frames] z-depth of the point
+
+
+def track_rays(views: Views, tracks: Tracks) -> np.ndarray:
+    """[tracks, frames, 3]: world directions through the tracks, of z-depth one."""
+    pixel = tracks.pixel.astype(np.float64)
+    ones = np.ones((*pixel.shape[:2], 1))
+    inverse = np.linalg.inv(views.intrinsics)
+    local = np.einsum("fij,nfj->nfi", inverse, np.concatenate([pixel, ones], -1))
+    return np.einsum("fji,nfj->nfi", views.rotation, local)
+
+
+def fit(views: Views, tracks: Tracks) -> RestPoints:
+    """Least squares of distances to the rays, over depth squared: pixels, nearly."""
+    ray = track_rays(views, tracks)
+    unit = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
+    across = np.eye(3) - unit[..., :, None] * unit[..., None, :]
+    weight = tracks.seen.astype(np.float64)
+    # Where rays are parallel any depth will do, in front of the cameras.
+    apart = np.linalg.norm(np.ptp(views.position, axis=0))
+    ahead = views.position + (FAR_AWAY * apart if apart > 0 else 1.0) * unit
+    seen = np.maximum(tracks.seen.sum(1), 1)[:, None]
+    ahead = (ahead * tracks.seen[..., None]).sum(1) / seen
+    for _ in range(ROUNDS):
+        matrix = np.einsum("nf,nfij->nij", weight, across)
+        ridge = 1e-9 * np.trace(matrix, axis1=1, axis2=2)[:, None, None] + 1e-30
+        right = np.einsum("nf,nfij,fj->ni", weight, across, views.position)
+        right = right + ridge[:, :, 0] * ahead
+        matrix = matrix + ridge * np.eye(3)
+        position = np.linalg.solve(matrix, right[..., None])[..., 0]
+        far = np.linalg.norm(position[:, None] - views.position, axis=-1)
+        weight = tracks.seen / np.maximum(far, LEAST_DEPTH) ** 2
+    residual = np.full(tracks.seen.shape, np.nan)
+    depth = np.zeros(tracks.seen.shape)
+    for frame in range(len(views.row)):
+        pixel, depth[:, frame] = view_set.project(views, frame, position)
+        miss = np.linalg.norm(pixel - tracks.pixel[:, frame], axis=-1)
+        miss = np.where(depth[:, frame] > 0, miss, BEHIND_PX)
+        residual[:, frame] = np.where(tracks.seen[:, frame], miss, np.nan)
+    return RestPoints(position, residual, depth)

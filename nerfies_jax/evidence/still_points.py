@@ -1,0 +1,96 @@
+"""Points that stand still, from flow over many frames: dense enough to start from."""
+
+import numpy as np
+
+from nerfies_jax.capture.capture import PointCloud
+from nerfies_jax.evidence import rest_points
+from nerfies_jax.evidence import tracks as tracking
+from nerfies_jax.evidence.dense_flow import NeighbourFlow
+from nerfies_jax.evidence.rest_points import RestPoints
+from nerfies_jax.evidence.tracks import Tracks
+from nerfies_jax.evidence.view_set import Views
+
+REACH = 8  # frames before and after
+CENTRES = 12  # frames whose pixels are placed
+EVERY_PX = 2
+LEAST_FRAMES = 4
+MISS_PX = 0.5  # at most, in seven frames of ten
+DEPTH_DEVIATION = 0.05  # at most, as a share of the depth
+TRACK_PX = 0.3  # error of a track
+
+
+def dense(views: Views, flow: NeighbourFlow, moving: np.ndarray) -> PointCloud:
+    """Places and colours of pixels at rest in some frames, where flow tells depth.
+
+    `moving` [frames, height, width] are the pixels to leave out, in every frame.
+    """
+    frames = len(views.row)
+    reach = min(REACH, frames - 1)
+    centres = np.linspace(0, frames - 1, min(CENTRES, frames)).round().astype(int)
+    places, colours = [], []
+    for centre in np.unique(centres):
+        span = slice(max(0, centre - reach), min(frames, centre + reach + 1))
+        near = view_slice(views, span)
+        starts = _starts(near, moving[centre], centre - span.start)
+        still = NeighbourFlow(*(part[span] for part in flow))
+        tracks = without(tracking.chain(still, starts), moving[span])
+        enough = tracks.seen.sum(1) >= min(LEAST_FRAMES, reach + 1)
+        tracks = tracks.take(enough)
+        if not len(tracks.seen):
+            continue
+        rest = rest_points.fit(near, tracks)
+        kept = placed(near, tracks, rest)
+        places.append(rest.position[kept])
+        pixel = starts[enough][kept, 1:].astype(int)
+        colours.append(views.image[centre][pixel[:, 1], pixel[:, 0]])
+    if not places:
+        return PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
+    return PointCloud(
+        np.concatenate(places).astype(np.float32), np.concatenate(colours)
+    )
+
+
+def view_slice(views: Views, span: slice) -> Views:
+    """Some of the frames."""
+    return Views(*(part[span] for part in views))
+
+
+def _starts(views, moving, frame):
+    width, height = views.size
+    x, y = np.meshgrid(
+        np.arange(1, width - 1, EVERY_PX), np.arange(1, height - 1, EVERY_PX)
+    )
+    x, y = x.ravel(), y.ravel()
+    shown = (views.valid[frame] & ~moving)[y, x]
+    pixel = np.stack([x, y], -1)[shown] + 0.5
+    return np.concatenate([np.full((len(pixel), 1), frame), pixel], axis=-1)
+
+
+def without(tracks: Tracks, moving: np.ndarray) -> Tracks:
+    """The tracks where they do not lie on moving pixels."""
+    _, height, width = moving.shape
+    at = np.clip(np.floor(tracks.pixel).astype(int), 0, [width - 1, height - 1])
+    frames = np.arange(len(moving))[None]
+    return tracks._replace(seen=tracks.seen & ~moving[frames, at[..., 1], at[..., 0]])
+
+
+def placed(views: Views, tracks: Tracks, rest: RestPoints) -> np.ndarray:
+    """[tracks] bool: explained by their point, whose depth the rays tell."""
+    miss = np.nanquantile(rest.residual, 0.7, axis=1)
+    return (miss < MISS_PX) & (depth_deviation(views, tracks, rest) < DEPTH_DEVIATION)
+
+
+def depth_deviation(views: Views, tracks: Tracks, rest: RestPoints) -> np.ndarray:
+    """[tracks] deviation of the distance, as a share of it; inf without parallax."""
+    offset = rest.position[:, None] - views.position
+    distance = np.maximum(np.linalg.norm(offset, axis=-1), 1e-9)
+    unit = offset / distance[..., None]
+    across = np.eye(3) - unit[..., :, None] * unit[..., None, :]
+    focal = views.intrinsics[:, 0, 0]
+    with np.errstate(divide="ignore"):
+        weight = tracks.seen * (focal / (TRACK_PX * distance)) ** 2
+    information = np.einsum("nf,nfij->nij", weight, across)
+    least = np.linalg.eigvalsh(information)[:, 0]
+    typical = (distance * tracks.seen).sum(1) / np.maximum(tracks.seen.sum(1), 1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(least > 0, 1 / np.sqrt(np.maximum(least, 0)) / typical, np.inf)

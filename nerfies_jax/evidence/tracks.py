@@ -1,0 +1,147 @@
+"""Points of the pictures followed through a film, and aligned with where they began."""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from nerfies_jax.evidence.dense_flow import NeighbourFlow
+from nerfies_jax.evidence.view_set import Views
+
+# Starts: every so many pixels in every third frame, about 10,000 tracks of 60 frames of
+# 176x132; larger pictures get as many.
+GRID_STEPS, EVERY_FRAMES = 29, 3  # across the picture's width
+SHORTEST = 8  # frames: fewer say little of how a point moves
+# Flow's errors add up along a track. Each point is looked up again in the frame where
+# it began: the 95 % quantile of the drift of points at rest falls by half.
+WINDOW_PX, FARTHEST_PX = 9, 1.5
+ROUNDS, PRECISION_PX = 20, 0.01  # of Lucas-Kanade's search, enlarged pixels
+LEAST_EIGENVALUE = 1e-4  # of the window's structure: below it there is nothing to align
+
+
+class Tracks(NamedTuple):
+    """Where points of the pictures lie in each frame."""
+
+    start: np.ndarray  # [tracks] frame in which each began
+    pixel: np.ndarray  # [tracks, frames, 2] float32; 0 where not seen
+    seen: np.ndarray  # [tracks, frames] bool
+
+    def take(self, which: np.ndarray) -> "Tracks":
+        """Those chosen by index or mask."""
+        return Tracks(*(part[which] for part in self))
+
+
+def grid(views: Views, seed: int = 0) -> np.ndarray:
+    """[starts, 3] frame and pixel: an even grid in every third frame, each shifted.
+
+    Not where a picture shows its plain background or was not filmed.
+    """
+    rng = np.random.default_rng(seed)
+    width, height = views.size
+    step = width / GRID_STEPS
+    starts = []
+    for frame in range(0, len(views.row), EVERY_FRAMES):
+        x, y = rng.uniform(1, 1 + step, 2)
+        x, y = np.meshgrid(
+            np.arange(x, width - 1, step), np.arange(y, height - 1, step)
+        )
+        pixel = np.stack([x.ravel(), y.ravel()], axis=-1)
+        shown = views.valid[frame][pixel[:, 1].astype(int), pixel[:, 0].astype(int)]
+        frames = np.full((shown.sum(), 1), frame)
+        starts.append(np.concatenate([frames, pixel[shown]], axis=-1))
+    return np.concatenate(starts)
+
+
+def chain(flow: NeighbourFlow, starts: np.ndarray) -> Tracks:
+    """Points carried from frame to frame until flow cannot be trusted, both ways."""
+    frames = len(flow.forward)
+    count, each = len(starts), np.arange(len(starts))
+    start = starts[:, 0].astype(int)
+    pixel = np.zeros((count, frames, 2), np.float32)
+    seen = np.zeros((count, frames), bool)
+    pixel[each, start], seen[each, start] = starts[:, 1:], True
+    sides = ((1, flow.forward, flow.forward_seen), (-1, *flow[2:]))
+    for sign, shift, usable in sides:
+        for here in range(frames)[::sign]:
+            there = here + sign
+            if not 0 <= there < frames:
+                continue
+            # Only what began on this side: the other direction carries the rest.
+            goes = np.flatnonzero(seen[:, here] & (sign * (here - start) >= 0))
+            moved, kept = _step(pixel[goes, here], shift[here], usable[here])
+            pixel[goes[kept], there], seen[goes[kept], there] = moved[kept], True
+    return Tracks(start, pixel, seen)
+
+
+def _step(pixel, shift, usable):
+    """Pixels moved by the bilinear mean of usable flow; which can be trusted."""
+    height, width = usable.shape
+    bound = np.array([width, height])
+    inside = np.clip(np.floor(pixel).astype(int), 0, bound - 1)
+    kept = usable[inside[:, 1], inside[:, 0]]
+    corner = np.clip(np.floor(pixel - 0.5).astype(int), 0, bound - 2)
+    part = np.clip(pixel - 0.5 - corner, 0, 1)
+    total, sum_of_weights = 0.0, 0.0
+    for right in (0, 1):
+        for down in (0, 1):
+            x, y = corner[:, 0] + right, corner[:, 1] + down
+            weight = np.abs(1 - right - part[:, 0]) * np.abs(1 - down - part[:, 1])
+            weight = (weight * usable[y, x])[:, None]
+            total, sum_of_weights = (
+                total + weight * shift[y, x],
+                sum_of_weights + weight,
+            )
+    moved = pixel + total / np.maximum(sum_of_weights, 1e-6)
+    kept &= ((moved > 0.5) & (moved < bound - 0.5)).all(-1)
+    return moved, kept
+
+
+def long_enough(tracks: Tracks) -> Tracks:
+    """Those seen in `SHORTEST` frames, or in all of a shorter film."""
+    return tracks.take(tracks.seen.sum(1) >= min(SHORTEST, tracks.seen.shape[1]))
+
+
+def realigned(tracks: Tracks, pictures: np.ndarray, size: tuple[int, int]) -> Tracks:
+    """Each point aligned with the picture in which it began; what strays is not seen.
+
+    Lucas-Kanade from the chained place, without a pyramid. `pictures` are enlarged as
+    `dense_flow.levelled` does, `size` is that of the tracks' own.
+    """
+    times = pictures.shape[2] // size[0]
+    pixel, seen = tracks.pixel.copy(), tracks.seen.copy()
+    criteria = cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, ROUNDS, PRECISION_PX
+    for start in np.unique(tracks.start):
+        rows = np.flatnonzero(tracks.start == start)
+        for frame in np.flatnonzero(tracks.seen[rows].any(0)):
+            if frame == start:
+                continue
+            which = rows[tracks.seen[rows, frame]]
+            first = _enlarged(tracks.pixel[which, start], times)
+            guess = _enlarged(tracks.pixel[which, frame], times)
+            place, status, _ = cv2.calcOpticalFlowPyrLK(
+                pictures[start],
+                pictures[frame],
+                first,
+                guess.copy(),
+                winSize=(WINDOW_PX, WINDOW_PX),
+                maxLevel=0,
+                criteria=criteria,
+                flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+                minEigThreshold=LEAST_EIGENVALUE,
+            )
+            moved = np.linalg.norm(place - guess, axis=-1) / times
+            fits = (status.ravel() == 1) & (moved < FARTHEST_PX)
+            pixel[which, frame] = (place + 0.5) / times
+            seen[which[~fits], frame] = False
+    return Tracks(tracks.start, np.where(seen[..., None], pixel, 0), seen)
+
+
+def _enlarged(pixel, times):
+    # OpenCV counts from the centre of the first pixel, here centres lie at +0.5.
+    return np.ascontiguousarray(pixel * times - 0.5, np.float32)
+
+
+def found(views: Views, flow: NeighbourFlow, pictures: np.ndarray) -> Tracks:
+    """All tracks of a film, from an even grid; nothing is known of what moves yet."""
+    tracks = long_enough(chain(flow, grid(views)))
+    return long_enough(realigned(tracks, pictures, views.size))

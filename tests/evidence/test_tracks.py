@@ -1,0 +1,346 @@
+"""Flow, tracks, what moves, and paths in space, on films of two planes."""
+
+import functools
+
+import numpy as np
+import pytest
+import scipy.ndimage as nd
+import scipy.spatial.transform
+
+from nerfies_jax.evidence import (
+    dense_flow,
+    moving,
+    paths,
+    record,
+    rest_points,
+    rigid_groups,
+    still_points,
+    tracks,
+    view_set,
+)
+from nerfies_jax.evidence.dense_flow import NeighbourFlow
+from nerfies_jax.evidence.rest_points import RestPoints
+from nerfies_jax.evidence.tracks import Tracks
+from tests.evidence import films
+
+
+def shaking(t):
+    return 0.3 * t - 0.15 + 0.03 * np.sin(25 * t), 0.04 * np.cos(19 * t), 0.0
+
+
+MOVES = {"card": lambda time: (0.4 * time - 0.2, 0.1 * time), "camera": shaking}
+
+
+@functools.cache
+def gathered(**changes):
+    capture = films.film(**(changes or MOVES), frames=24)
+    return capture, record.gather(capture)
+
+
+def card_path(capture, rows):
+    """[frames, 2] where the middle of the card is, scene units."""
+    return np.array([MOVES["card"](time) for time in capture.times[rows]])
+
+
+@functools.cache
+def hand_held(frames=24):
+    """Views of a camera that shakes, in scene units; pictures are of no matter."""
+    capture = films.film(camera=shaking, frames=frames, blank=True)
+    return view_set.in_time_order(capture)
+
+
+def tracks_of(views, position):
+    """Exact tracks of points [points, frames, 3], seen everywhere."""
+    pixel = np.stack(
+        [
+            view_set.project(views, frame, position[:, frame])[0]
+            for frame in range(position.shape[1])
+        ],
+        axis=1,
+    )
+    start = np.zeros(len(position), int)
+    return Tracks(start, pixel.astype(np.float32), np.ones(pixel.shape[:2], bool))
+
+
+@pytest.mark.parametrize("light", [lambda time: 1.0, lambda time: 1 - 0.6 * time])
+def test_flow_of_a_wall_is_that_of_its_homography_in_any_light(light):
+    capture = films.film(shown=lambda time: False, gain=light, frames=4)
+    views = view_set.in_time_order(capture)
+    flow = dense_flow.between_neighbours(views, dense_flow.levelled(views))
+    ray = view_set.rays(views, 1)
+    point = views.position[1] + films.FAR * ray
+    there, _ = view_set.project(views, 2, point.reshape(-1, 3))
+    height, width = flow.forward.shape[1:3]
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    true = there.reshape(height, width, 2) - np.stack([x, y], -1)
+    inner = np.s_[8:-8, 12:-12]
+    error = np.linalg.norm(flow.forward[1] - true, axis=-1)[inner]
+    assert np.median(error) < 0.12
+    assert flow.forward_seen[1][inner].mean() > 0.9
+    assert not flow.forward_seen[-1].any()
+    assert not flow.backward_seen[0].any()
+
+
+def test_flow_that_does_not_lead_back_is_not_trusted():
+    there = np.zeros((6, 8, 2), np.float32)
+    back = there.copy()
+    back[:, 4:] = 2
+    closed = dense_flow._closed(there, back)
+    np.testing.assert_array_equal(closed, np.arange(8)[None].repeat(6, 0) < 4)
+
+
+def test_chains_follow_flow_both_ways_until_it_ends():
+    shape = (5, 20, 30)
+    shift = np.tile(np.float32([1.25, -0.5]), (*shape, 1))
+    seen = np.ones(shape, bool)
+    seen[3] = False  # nothing leads from the fourth frame to the fifth
+    flow = NeighbourFlow(shift, seen, -shift, np.ones(shape, bool))
+    found = tracks.chain(flow, np.array([[2.0, 10.0, 12.0], [2.0, 29.0, 12.0]]))
+    assert found.seen[0].tolist() == [True] * 4 + [False]
+    steps = np.arange(-2, 2)[:, None]
+    expected = [10, 12] + steps * [1.25, -0.5]
+    np.testing.assert_allclose(found.pixel[0, :4], expected, atol=1e-5)
+    # The other left the picture on its right.
+    assert found.seen[1].tolist() == [True] * 3 + [False] * 2
+
+
+def test_points_are_aligned_with_where_they_began():
+    picture = 255 * films.texture(3).mean(-1)
+    pictures = np.stack([nd.shift(picture, (0.0, k))[:80, 20:140] for k in (0, 3.3)])
+    pictures = np.rint(np.clip(pictures, 0, 255)).astype(np.uint8)
+    pixel = np.float32([[[30, 40], [34, 40]], [[60, 20], [62.8, 20.3]]])
+    drifted = Tracks(np.zeros(2, int), pixel, np.ones((2, 2), bool))
+    found = tracks.realigned(drifted, pictures, (120, 80))
+    assert found.seen.all()
+    np.testing.assert_allclose(found.pixel[:, 1], [[33.3, 40], [63.3, 20]], atol=0.05)
+    lost = drifted._replace(pixel=pixel + np.float32([[0, 0], [9, 9]]))
+    assert not tracks.realigned(lost, pictures, (120, 80)).seen[:, 1].any()
+
+
+def test_points_at_rest_are_found_and_what_moves_misses():
+    views = hand_held()
+    rng = np.random.default_rng(0)
+    point = rng.uniform([-0.3, -0.3, 1.2], [0.3, 0.3, 2], (6, 3))
+    position = np.repeat(point[:, None], len(views.row), axis=1)
+    position[3:] += np.linspace(0, 0.2, len(views.row))[:, None] * [0, 1, 0]
+    found = rest_points.fit(views, tracks_of(views, position))
+    np.testing.assert_allclose(found.position[:3], point[:3], atol=1e-4)
+    assert np.nanmax(found.residual[:3]) < 0.01
+    assert (np.nanquantile(found.residual[3:], 0.7, axis=1) > 1).all()
+
+
+def test_a_camera_in_place_gives_finite_points_at_rest():
+    capture = films.film(camera=lambda t: (0.0, 0.0, 0.0), frames=6, blank=True)
+    views = view_set.in_time_order(capture)
+    position = np.repeat(np.array([[[0.1, 0.0, 1.5]]]), 6, axis=1)
+    one = tracks_of(views, position)
+    found = rest_points.fit(views, one)
+    assert np.isfinite(found.position).all()
+    assert still_points.depth_deviation(views, one, found) > 1
+
+
+def test_what_moves_is_marked_and_little_else():
+    capture, evidence = gathered()
+    true = capture.moving[evidence.row]
+    both = (evidence.moving & true).sum() / (evidence.moving | true).sum()
+    assert both > 0.7
+    assert not evidence.unusable
+
+
+def test_nothing_moves_in_a_still_film():
+    _, evidence = gathered(card=lambda time: (0.1, 0.0))
+    assert evidence.moving.mean() < 0.01
+    assert len(evidence.moved) < 0.01 * len(evidence.score)
+
+
+def test_moving_neighbours_convince_and_a_lonely_track_is_overruled():
+    rng = np.random.default_rng(0)
+    pixel = rng.uniform(0, 60, (300, 1, 2)).astype(np.float32)
+    seen = np.ones((300, 6), bool)
+    pixel = np.repeat(pixel, 6, axis=1)
+    moves = pixel[:, 0, 0] < 20
+    residual = np.where(moves, 3.0, 0.1)
+    inside, outside = np.flatnonzero(moves)[0], np.flatnonzero(~moves)[0]
+    pixel[inside], pixel[outside] = (8, 30), (50, 30)
+    residual[inside], residual[outside] = 0.1, 3.0
+    rest = RestPoints(np.zeros((300, 3)), np.repeat(residual[:, None], 6, 1), None)
+    score = moving.track_scores(Tracks(np.zeros(300, int), pixel, seen), rest)
+    assert score[inside] > 0.5 > score[outside]
+
+
+def test_still_points_lie_on_the_wall_and_have_its_colours():
+    capture, evidence = gathered()
+    cloud = evidence.still
+    assert len(cloud.position) > 2000
+    depth = cloud.position[:, 2]
+    assert abs(np.median(depth) - films.FAR) < 0.01 * films.FAR
+    assert (abs(depth - films.FAR) < 0.1 * films.FAR).mean() > 0.95
+    views = view_set.in_time_order(capture)
+    pixel, _ = view_set.project(views, 12, cloud.position.astype(float))
+    inside = ((pixel > 8) & (pixel < np.array(views.size) - 8)).all(-1)
+    x, y = pixel[inside].astype(int).T
+    still = ~capture.moving[evidence.row[12]][y, x]
+    seen, other = (views.image[12][y, x + off].astype(float) for off in (0, 6))
+    colour = cloud.colour[inside]
+    off, by_chance = (abs(one - colour)[still].mean() for one in (seen, other))
+    assert off < 0.3 * by_chance
+
+
+def test_a_smooth_path_before_a_shaking_camera_has_its_depth():
+    views = hand_held()
+    time = np.linspace(0, 1, len(views.row))[:, None]
+    path = (0.1, -0.1, 1.3) + time * [0.2, 0.1, -0.2]
+    found = paths.least_acceleration(views, tracks_of(views, path[None]), 0.05)
+    assert np.linalg.norm(found.position[0] - path, axis=-1).max() < 0.01
+    assert found.known.all()
+    assert found.depth_deviation[0] < 0.05
+
+
+def test_the_banded_solution_is_the_dense_one():
+    views = hand_held()
+    rng = np.random.default_rng(1)
+    path = np.cumsum(rng.normal(0, 0.01, (24, 3)), axis=0) + np.array([0, 0, 1.4])
+    one = tracks_of(views, path[None])
+    one.seen[0, [0, 1, 9, 10]] = False
+    around = np.full((1, 24), 1.5)
+    found = paths.least_acceleration(views, one, 0.05, around)
+    span = slice(2, 24)
+    ray = rest_points.track_rays(views, one)[0, span]
+    unit = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
+    noise = paths.TRACK_PX / views.intrinsics[0, 0, 0]
+    pull = (noise / paths.AROUND_DEVIATION) ** 2
+    rows, right = [], []
+    for frame, (along, seen) in enumerate(zip(unit, one.seen[0, span], strict=True)):
+        if not seen:
+            continue
+        basis = np.zeros((3, 22, 3))
+        basis[:, frame] = np.eye(3) - np.outer(along, along)
+        rows.append(basis.reshape(3, -1))
+        right.append(basis[:, frame] @ views.position[2 + frame])
+        basis = np.zeros((22, 3))
+        basis[frame] = np.sqrt(pull) * along
+        rows.append(basis.reshape(1, -1))
+        there = views.position[2 + frame] + 1.5 * ray[frame]
+        right.append(np.sqrt(pull) * (along @ there)[None])
+    for frame in range(20):
+        basis = np.zeros((3, 22, 3))
+        for at, factor in ((0, 1), (1, -2), (2, 1)):
+            basis[:, frame + at] = np.sqrt(paths.ACCELERATION) * factor * np.eye(3)
+        rows.append(basis.reshape(3, -1))
+        right.append(np.zeros(3))
+    dense = np.linalg.lstsq(np.concatenate(rows), np.concatenate(right), rcond=None)[0]
+    np.testing.assert_allclose(found.position[0, span], dense.reshape(22, 3), atol=1e-6)
+    assert np.isnan(found.position[0, :2]).all()
+    assert not found.known[0, :2].any()
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("seen", [[7], [7, 8], [0, 23]], ids=["one", "two", "the ends"])
+def test_a_path_of_few_frames_lies_at_the_depth_around(seen):
+    views = hand_held()
+    path = np.repeat(np.array([[[0.1, 0.0, 1.3]]]), 24, axis=1)
+    one = tracks_of(views, path)
+    one.seen[0] = np.isin(np.arange(24), seen)
+    found = paths.least_acceleration(views, one, 0.05, np.full((1, 24), 1.3))
+    np.testing.assert_allclose(found.depth[0, seen], 1.3, rtol=0.02)
+
+
+@pytest.mark.hard_cases
+def test_before_a_camera_in_place_depth_is_that_around_and_said_to_be_unknown():
+    capture = films.film(camera=lambda t: (0.0, 0.0, 0.0), frames=12, blank=True)
+    views = view_set.in_time_order(capture)
+    path = np.array([0, 0, 1.5]) + np.linspace(0, 0.3, 12)[:, None] * [1, 0, 0]
+    one = tracks_of(views, path[None])
+    found = paths.least_acceleration(views, one, 0.05, np.full((1, 12), 1.5))
+    np.testing.assert_allclose(found.depth[0], 1.5, rtol=0.05)
+    assert found.depth_deviation[0] > 1
+    alone = paths.least_acceleration(views, one, 0.05)
+    assert np.isfinite(alone.position).all()
+
+
+def test_the_card_is_where_it_is():
+    capture, evidence = gathered()
+    true = card_path(capture, evidence.row)
+    middle = np.nanmedian(
+        np.where(evidence.paths.known[..., None], evidence.paths.position, np.nan), 0
+    )
+    inner = slice(4, -4)
+    assert np.abs(middle[inner, 2] - films.NEAR).max() < 0.1 * films.NEAR
+    assert np.abs(middle[inner, :2] - true[inner]).max() < 0.06
+
+
+def two_bodies():
+    """[40, 20, 3] points of a body that turns by 300 degrees and of one that shifts."""
+    rng = np.random.default_rng(2)
+    angle = np.linspace(0, np.deg2rad(300), 20)
+    turns = scipy.spatial.transform.Rotation.from_rotvec(
+        angle[:, None] * [0, 0, 1]
+    ).as_matrix()
+    body = rng.normal(0, 0.1, (20, 3))
+    turning = np.einsum("tij,nj->nti", turns, body) + np.array([0.5, 0, 2])
+    other = rng.normal(0, 0.1, (20, 1, 3)) + np.linspace(0, 0.4, 20)[:, None] * [
+        0,
+        1,
+        0,
+    ]
+    return np.concatenate([turning, other + np.array([-0.5, 0, 2])]), angle
+
+
+def test_two_bodies_are_told_apart_and_their_motions_found():
+    position, angle = two_bodies()
+    known = np.ones(position.shape[:2], bool)
+    # No point of the first body lives through the film.
+    for row in range(20):
+        known[row, (row % 10) + 8 :] = False
+        known[row, : max(0, row % 10 - 2)] = False
+    known[0:2, 6:] = True
+    known[10:16, 8:] = True
+    label = rigid_groups.labels(position, known, 2)
+    assert (label == np.repeat(label[[0, 20]], 20)).all()
+    assert label[0] != label[20]
+    found = rigid_groups.motion(position, known, label, 10)
+    canonical, _ = rigid_groups.centres(position, known, found)
+    np.testing.assert_allclose(canonical, position[:, 10], atol=1e-6)
+    turn = rigid_groups.rotation_vectors(found.rotation, 10)[label[0]]
+    np.testing.assert_allclose(turn[:, 2], angle - angle[10], atol=1e-6)
+
+
+def test_procrustes_leaves_out_what_strays():
+    rng = np.random.default_rng(3)
+    source = rng.normal(size=(30, 3))
+    true = scipy.spatial.transform.Rotation.from_rotvec([0.3, -0.5, 1.0]).as_matrix()
+    target = source @ true.T + [1, 2, 3]
+    target[:3] += 5
+    rotation, shift = rigid_groups.procrustes(source, target)
+    np.testing.assert_allclose(rotation, true, atol=0.02)
+    np.testing.assert_allclose(shift, [1, 2, 3], atol=0.05)
+
+
+@pytest.mark.hard_cases
+def test_identical_paths_are_one_body():
+    position = np.repeat(np.linspace(0, 1, 12)[None, :, None], 5, axis=0) * [1, 0, 0]
+    label = rigid_groups.labels(position, np.ones((5, 12), bool), 2)
+    found = rigid_groups.motion(position, np.ones((5, 12), bool), label, 6)
+    assert np.isfinite(found.rotation).all()
+    assert np.isfinite(found.shift).all()
+
+
+def test_what_was_gathered_is_read_again(tmp_path):
+    capture, evidence = gathered()
+    path = tmp_path / "kept.npz"
+    record.save(path, evidence)
+    again = record.load(path)
+    np.testing.assert_array_equal(again.moving, evidence.moving)
+    np.testing.assert_array_equal(again.paths.position, evidence.paths.position)
+    np.testing.assert_allclose(again.flow.forward, evidence.flow.forward, atol=2e-3)
+    assert again.unusable == evidence.unusable
+    assert record.digest(capture) == record.digest(films.film(**MOVES, frames=24))
+    assert record.digest(capture) != record.digest(films.film(frames=24))
+
+
+def test_jumping_views_and_short_films_say_why_they_are_of_no_use():
+    jumps = films.film(
+        card=MOVES["card"], camera=lambda t: (3 * np.sin(400 * t), 0.0, 0.0), frames=12
+    )
+    assert "the camera jumps" in record.gather(jumps).unusable
+    assert "too few" in record.gather(films.film(**MOVES, frames=4)).unusable

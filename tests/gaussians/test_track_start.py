@@ -1,0 +1,194 @@
+"""Motions fitted to paths, and the Gaussians that they carry."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gaussians_jax import path_fit, presets, scene, spec, splats, track_start
+from gaussians_jax.effects.se3_bases import SE3BasesSpec
+from gaussians_jax.initialisation import StartSpec
+from gaussians_jax.path_fit import Points
+from nerfies_jax.evidence import record
+from tests.evidence import films
+from tests.evidence.test_tracks import MOVES
+from tests.gradients import directional_error
+
+FRAMES = 24
+MOTIONS = {
+    "bases": SE3BasesSpec(bases=2, knots=6),
+    "mlp": presets.SMALL_DEFORMABLE.motion,
+    "kan": presets.SMALL_SONATA.motion,
+    "basis": presets.SMALL_MOBA.motion,
+}
+
+
+@functools.cache
+def film_and_evidence():
+    capture = films.film(**MOVES, frames=FRAMES)
+    return capture, record.gather(capture)
+
+
+def turning_body():
+    """[30, FRAMES, 3] points that turn by 80 degrees and shift."""
+    rng = np.random.default_rng(0)
+    time = np.linspace(0, 1, FRAMES)
+    turn = Rotation.from_rotvec(1.4 * time[:, None] * [0, 0.6, 0.8]).as_matrix()
+    points = rng.normal(0, 0.15, (30, 3))
+    path = np.einsum("tij,nj->nti", turn, points) + np.array([0, 0, 1])
+    return path + time[:, None] * [0.3, 0, 0], time.astype(np.float32)
+
+
+def places_of(effect, points, time):
+    return jax.jit(lambda points, time: path_fit.places(effect, points, time))(
+        points, time
+    )
+
+
+def effect_of(motion):
+    scene_spec = spec.SplatScene(steps=100, motion=motion)
+    metadata = spec.SceneMetadata(1.0, (0.0, 0.0, 0.0), FRAMES)
+    return spec.motion_of(scene_spec, metadata)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "bases",
+        *(pytest.param(n, marks=pytest.mark.full) for n in ("mlp", "kan", "basis")),
+    ],
+)
+def test_every_motion_can_be_fitted_to_paths(name):
+    position, time = turning_body()
+    known = np.random.default_rng(1).uniform(size=position.shape[:2]) < 0.6
+    motion, effect = MOTIONS[name], effect_of(MOTIONS[name])
+    key = jax.random.key(0)
+    guess, rates, penalty = track_start._guess(
+        motion, effect, position, known, time, 1.0, key
+    )
+    rates = jax.tree.map(lambda rate: 5e-3 * rate, rates)
+    found = path_fit.fit(
+        effect, guess, time, position.astype(np.float32), known, rates, key,
+        steps=400, penalty=penalty,
+    )  # fmt: skip
+    assert found.last < 0.02
+    middle = places_of(effect, found.points, time[FRAMES // 2])
+    off = np.linalg.norm(middle - position[:, FRAMES // 2], axis=-1)
+    # Also where a path was not known: it moves as its neighbours do.
+    assert np.median(off) < 0.03
+
+
+def test_wrong_paths_bend_nothing():
+    position, time = turning_body()
+    position = position.copy()
+    position[:3] += np.random.default_rng(2).normal(0, 0.5, (3, FRAMES, 3))
+    known = np.ones(position.shape[:2], bool)
+    motion, effect = MOTIONS["bases"], effect_of(MOTIONS["bases"])
+    guess, rates, penalty = track_start._guess(
+        motion, effect, position, known, time, 1.0, jax.random.key(0)
+    )
+    rates = jax.tree.map(lambda rate: 5e-3 * rate, rates)
+    found = path_fit.fit(
+        effect, guess, time, position.astype(np.float32), known, rates,
+        jax.random.key(0), steps=400, penalty=penalty,
+    )  # fmt: skip
+    places = places_of(effect, found.points, time[5])
+    assert np.linalg.norm(places - position[:, 5], axis=-1)[3:].max() < 0.05
+
+
+def test_slopes_of_carried_points_are_those_of_differences(float64):
+    effect = effect_of(MOTIONS["bases"])
+    rng = np.random.default_rng(3)
+    nets = jax.tree.map(
+        lambda leaf: jnp.asarray(leaf, jnp.float64), effect.init(jax.random.key(0))
+    )
+    points = Points(rng.normal(size=(4, 3)), rng.normal(size=(4, 3)), nets)
+
+    def value(points):
+        return jnp.sum(path_fit.places(effect, points, jnp.float64(0.3)) ** 3)
+
+    assert directional_error(value, points) < 1e-7
+
+
+def test_nothing_known_is_refused_by_name():
+    position, time = turning_body()
+    effect = effect_of(MOTIONS["bases"])
+    start = Points(np.zeros((30, 3), np.float32), np.zeros((30, 3), np.float32), None)
+    with pytest.raises(ValueError, match="no path is known"):
+        path_fit.fit(
+            effect, start, time, position, np.zeros(position.shape[:2], bool),
+            Points(1.0, 1.0, None), jax.random.key(0),
+        )  # fmt: skip
+
+
+def test_gaussians_start_on_the_card_and_move_with_it():
+    capture, evidence = film_and_evidence()
+    motion, effect = MOTIONS["bases"], effect_of(MOTIONS["bases"])
+    start = StartSpec(motion="tracks", moving_points=200, fit_steps=300)
+    found = track_start.start(
+        start, effect, motion, evidence, capture, jax.random.key(0)
+    )
+    assert len(found.position) == len(found.colour) == len(found.rows) == 200
+    points = Points(jnp.asarray(found.position), jnp.asarray(found.rows), found.nets)
+    for frame in (4, 12, 20):
+        time = capture.times[evidence.row[frame]]
+        place = np.asarray(places_of(effect, points, time))
+        across, down = MOVES["card"](time)
+        on_card = (np.abs(place[:, :2] - [across, down]) < films.CARD + 0.05).all(-1)
+        near = np.abs(place[:, 2] - films.NEAR) < 0.15
+        assert (on_card & near).mean() > 0.8  # the mask has a rim
+
+
+def small_scene(**changes):
+    return dataclasses.replace(
+        presets.with_steps(presets.SMALL_TRACKED, 30),
+        motion=MOTIONS["bases"],
+        **changes,
+    )
+
+
+def test_a_scene_starts_from_the_evidence(tmp_path, monkeypatch):
+    capture, evidence = film_and_evidence()
+    monkeypatch.setattr(scene, "CACHE", tmp_path)
+    record.save(tmp_path / "evidence" / f"{record.digest(capture)}.npz", evidence)
+    start = StartSpec(motion="tracks", moving_points=150, fit_steps=100)
+    spec_ = small_scene(start=start)
+    model = scene.build(spec_, scene.metadata_of(capture))
+    state = model.init(capture, jax.random.key(0))
+    rows = state.params.rows
+    active = np.asarray(splats.active_mask(rows["splats"]))
+    still = np.asarray(jax.nn.softmax(rows["se3_bases"])[:, 0])
+    assert (still[active] < 0.5).sum() >= 100
+    assert (still[active] > 0.99).sum() == active.sum() - 150
+    wall = np.asarray(rows["splats"].mean)[active & (still > 0.99)]
+    assert abs(np.median(wall[:, 2]) - films.FAR) < 0.05
+    quick = model.example(capture, jax.random.key(0))
+    assert jax.tree.structure(quick) == jax.tree.structure(state)
+
+
+def test_a_film_without_tracks_starts_from_rest_and_says_why(tmp_path, monkeypatch):
+    monkeypatch.setattr(scene, "CACHE", tmp_path)
+    capture = films.film(card=lambda time: (0.1, 0.0), frames=8)
+    model = scene.build(
+        small_scene(start=StartSpec(motion="tracks")), scene.metadata_of(capture)
+    )
+    with pytest.warns(RuntimeWarning, match="hardly any track moves"):
+        model.init(capture, jax.random.key(0))
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"motion": "flow"}, "unknown motion"),
+        ({"moving_points": 0}, "at least one moving point"),
+        ({"fit_steps": 0}, "at least one moving point"),
+        ({"fit_rate": 0.0}, "must be positive"),
+    ],
+)
+def test_starts_that_cannot_be_are_refused(changes, words):
+    with pytest.raises(ValueError, match=words):
+        StartSpec(**changes)
