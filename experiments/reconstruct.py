@@ -17,7 +17,7 @@ from nerfies_jax.runs import commands, platform, representations
 from nerfies_jax.runs.config import MoreMetrics, RunConfig
 from nerfies_jax.training import stopping
 
-DEFAULT_PRESET = "splats-deformable-small"
+DEFAULT_PRESET = "splats-tracked-small"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Reconstruct:
     preset: str | None = None
     """Gaussian splats: splats-static, splats-mcmc, splats-deformable, sonata, moba.
     Radiance fields: nerf, nerf-w, d-nerf, t-nerf, nerfies, hypernerf, nsff. Each with
-    -small is made for a CPU (default: splats-deformable-small)."""
+    -small is made for a CPU (default: splats-tracked-small)."""
     effects: Literal["preset", "auto"] = "preset"
     """auto: look at the capture first and take the effects that it calls for, in the
     representation and size of the preset (see experiments.inspect_scene)."""

@@ -42,6 +42,15 @@ MCMC = SplatScene(
 # the smoothing are defaults of `MotionSpec`.
 DEFORMABLE = SplatScene(steps=40_000, motion=MotionSpec())
 
+# Rigid motions fitted to tracks before training, in the manner of Shape of Motion. Its
+# tracks and depths come from networks, these from optical flow (`evidence`).
+TRACKED = SplatScene(
+    steps=30_000,
+    init=InitSpec(points=50_000),
+    motion=SE3BasesSpec(bases=20, knots=44),
+    start=StartSpec(motion="tracks", moving_points=20_000),
+)
+
 # Sonata. Of what it leaves open, this is as in E-D3DGS, which it descends from: 60,000
 # steps, growth to the end, no opacity reset, rates, a table of half as many moments as
 # frames. This is not: two views a step (here one), the L1 penalty of 1e-4 on opacity
@@ -181,6 +190,7 @@ SMALL_MOBA = dataclasses.replace(
 PRESETS = {
     "splats-static": STATIC,
     "splats-mcmc": MCMC,
+    "splats-tracked": TRACKED,
     "splats-deformable": DEFORMABLE,
     "sonata": SONATA,
     "moba": MOBA,

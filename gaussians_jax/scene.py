@@ -368,7 +368,8 @@ def _from_tracks(spec, effects, capture, key):
     if reason:
         warnings.warn(
             f"{capture.path or capture.name}: the motion starts from rest, for tracks "
-            f"are of no use here: {reason}",
+            f"are of no use here: {reason}; a network finds small motion without them "
+            "(splats-deformable)",
             RuntimeWarning,
             stacklevel=2,
         )

@@ -122,13 +122,16 @@ MOTIONS = {
 
 
 def motion_of(spec: SplatScene, metadata: SceneMetadata) -> Effect | None:
-    """The motion that the spec asks for."""
-    if spec.motion is None:
+    """The motion that the spec asks for; one that starts from tracks moves at once."""
+    motion = spec.motion
+    if motion is None:
         return None
-    if isinstance(spec.motion, SE3BasesSpec):
-        return se3_bases.effect(spec.motion, spec.steps, metadata.extent)
-    make = MOTIONS[type(spec.motion)]
-    return make(spec.motion, spec.steps, metadata.frames)
+    if spec.start.motion == "tracks":
+        motion = dataclasses.replace(motion, warm_up=0)
+    if isinstance(motion, SE3BasesSpec):
+        return se3_bases.effect(motion, spec.steps, metadata.extent)
+    make = MOTIONS[type(motion)]
+    return make(motion, spec.steps, metadata.frames)
 
 
 def effects_of(spec: SplatScene, metadata: SceneMetadata) -> tuple[Effect, ...]:

@@ -39,7 +39,6 @@ class TrackStart(NamedTuple):
     colour: np.ndarray  # [moving, 3] in [0, 1]
     rows: Any  # of the motion, a row for each; None where it keeps none
     nets: Any  # of the motion
-    note: str  # how well the motion fits its tracks
 
 
 def unusable(evidence: Evidence) -> str:
@@ -93,13 +92,7 @@ def start(
         steps=spec.fit_steps,
         penalty=penalty,
     )
-    seeds = _seeds(effect, fitted.points, evidence, capture, times, unit, spec)
-    note = (
-        f"{kept.sum()} tracks move; the motion misses them by "
-        f"{fitted.last / unit:.2%} of the scene's depth ({fitted.first / unit:.2%} "
-        f"before the fit), {len(seeds.position)} Gaussians start on it"
-    )
-    return seeds._replace(note=note)
+    return _seeds(effect, fitted.points, evidence, capture, times, unit, spec)
 
 
 def _guess(motion, effect, position, known, times, unit, key):
@@ -208,7 +201,7 @@ def _seeds(effect, points, evidence, capture, times, unit, spec):
     every = None
     if rows:
         every = jax.tree.map(lambda *leaves: np.concatenate(leaves)[chosen], *rows)
-    return TrackStart(position[chosen], colour[chosen], every, points.nets, "")
+    return TrackStart(position[chosen], colour[chosen], every, points.nets)
 
 
 def moving_depths(evidence: Evidence) -> np.ndarray:
