@@ -186,6 +186,7 @@ def test_the_effect_is_the_mean_over_the_rows_it_draws(time, dtype):
     assert terms["still"].weight is None
 
 
+@pytest.mark.full
 def test_other_steps_draw_other_rows():
     spec, params = AccelerationSpec(samples=3), scene()
     values = {
@@ -200,6 +201,7 @@ def linear(params, time):
     return gaussians._replace(mean=gaussians.mean + swing)
 
 
+@pytest.mark.full
 def test_its_weight_does_not_depend_on_the_unit_of_length(float64):
     spec = AccelerationSpec()
     small, large = (
@@ -253,6 +255,7 @@ def travel(motion, params, net):
     return float(jnp.sqrt(jnp.mean(jnp.square(one - other))))
 
 
+@pytest.mark.full
 def test_under_a_network_it_waits_for_its_start_and_then_stills_it():
     """Through the scene's own seams: smoothing, blocks and a warm-up are in the way."""
     motion = mlp_motion.effect(MOTION, steps=5000, frames=11)

@@ -87,6 +87,7 @@ def test_tiny_slopes_are_not_lost_to_their_squares(dtype):
     np.testing.assert_allclose(stats.grad2d, math.sqrt(2) * 1e-25, rtol=1e-6)
 
 
+@pytest.mark.full
 @pytest.mark.hard_cases
 def test_invisible_rows_may_have_slopes_that_are_not_finite():
     _, _, stats = make(2)
@@ -211,6 +212,7 @@ def test_the_cap_takes_the_largest_gradients_and_says_who_was_refused():
     assert again.report == densification.Report(refused=1, active=8, capacity=8)
 
 
+@pytest.mark.full
 def test_capacity_grows_in_buckets_and_does_not_waver():
     params, moments, stats = make(200)
     changed = run(params, moments, hot(stats, np.arange(100)))
@@ -226,6 +228,7 @@ def test_capacity_grows_in_buckets_and_does_not_waver():
     assert run(*changed[:2], stats).report.capacity == 256
 
 
+@pytest.mark.full
 @pytest.mark.hard_cases
 def test_one_gaussian_and_none():
     params, moments, stats = make(1)
@@ -238,6 +241,7 @@ def test_one_gaussian_and_none():
     assert run(*changed[:3]).report.active == 0
 
 
+@pytest.mark.full
 def test_the_same_key_gives_the_same_rows():
     params, moments, stats = make(3, scale=0.1)
     first, second = (run(params, moments, hot(stats, [0, 1])) for _ in range(2))

@@ -114,6 +114,7 @@ def agreement(one, other):
     return np.corrcoef(np.asarray(one), np.asarray(other))[0, 1]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("seed", [0, 1, 2, 3, 4])
 def test_descent_on_the_correlation_finds_the_truth_s_shape(seed, float64):
     start, truth, _ = two_depths("float64", seed)
@@ -122,6 +123,7 @@ def test_descent_on_the_correlation_finds_the_truth_s_shape(seed, float64):
     assert agreement(end, truth) > 0.999
 
 
+@pytest.mark.full
 def test_a_depth_turned_inside_out_is_wrong_and_correlation_turns_it_back():
     """Least squares would give it a negative scale and no loss."""
     truth = two_depths("float32")[1]
@@ -142,6 +144,7 @@ def test_the_affine_loss_is_level_where_every_pixel_is_on_the_wrong_side(dtype):
     assert np.abs(grad).max() < 1e-6
 
 
+@pytest.mark.full
 def test_outliers_of_a_guess_bend_the_affine_fit_less(float64):
     """Smooth depths fitted to a guess that is wild in a tenth of its pixels."""
     t = np.linspace(-np.pi, np.pi, COUNT)

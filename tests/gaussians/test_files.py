@@ -106,6 +106,7 @@ def edited_ply(path, **columns):
     return data
 
 
+@pytest.mark.full
 def test_the_other_two_byte_orders_and_float64_are_read(tmp_path):
     path = tmp_path / "a.ply"
     data = edited_ply(path, x=np.linspace(0, 1, 20))
@@ -409,6 +410,7 @@ def test_a_signalling_nan_is_a_broken_row_and_no_warning(tmp_path):
     assert files.load(tmp_path / "a.splat", drop_broken=True).dropped == 1
 
 
+@pytest.mark.full
 def test_damage_anywhere_is_a_value_error_of_one_line(tmp_path):
     """Bytes changed, removed and inserted at random; 28 000 cases were tried once."""
     rng = np.random.default_rng(0)

@@ -102,6 +102,7 @@ def test_offsets_are_those_of_the_whole_network(spec, dtype):
             np.testing.assert_allclose(ours, value, atol=tolerance)
 
 
+@pytest.mark.full
 @NETWORKS
 def test_prepared_once_is_prepared_every_time(spec, dtype):
     params, codes = strong(spec, dtype), embeddings(11, dtype)
@@ -129,6 +130,7 @@ def test_gradients_of_the_field(spec, float64):
     assert error < 1e-6
 
 
+@pytest.mark.full
 def test_blocks_change_nothing_but_memory(float64):
     params, codes = strong(SMALL), embeddings(17)
 
@@ -196,6 +198,7 @@ def test_a_residual_that_is_off_has_no_parameters_and_moves_nothing(off, float64
         assert (before is after) == (name == off)
 
 
+@pytest.mark.full
 def test_heads_that_are_off_cost_nothing():
     def flops(spec):
         args = strong(spec, "float32"), embeddings(16, "float32"), jnp.float32(0.3)
@@ -239,6 +242,7 @@ def test_first_embeddings_have_the_promised_spread(dtype, waves):
     assert abs(np.mean(codes)) < (0.002 if waves is None else 0.03)
 
 
+@pytest.mark.full
 def test_codes_as_waves_start_alike_where_gaussians_are_near():
     spec = KanMotionSpec(waves=2.0)
     mean = jax.random.normal(jax.random.key(1), (500, 3))
@@ -335,6 +339,7 @@ def test_unusable_quaternions_and_wild_residuals_stay_finite(dtype):
     np.testing.assert_allclose(length, 1, rtol=1e-5)
 
 
+@pytest.mark.full
 @pytest.mark.hard_cases
 def test_equal_and_wild_embeddings_have_finite_slopes(dtype):
     params, active = strong(SMALL, dtype), np.ones(9, bool)

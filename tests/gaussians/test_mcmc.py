@@ -259,6 +259,7 @@ def same_bits(found, expected):
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.full
 def test_a_moving_scene_grows_to_the_cap_and_resumes_bit_for_bit(tmp_path):
     model, first, _ = built(SCENE)
     straight = train(first, 22)
@@ -291,6 +292,7 @@ def test_an_event_of_a_scene_leaves_no_faint_row():
     assert {*map(bytes, placed)} <= {*map(bytes, seen)}
 
 
+@pytest.mark.full
 def test_a_step_shakes_the_means_and_nothing_else():
     spec = dataclasses.replace(SCENE, alternation=AlternationSpec(1, 3, nets=1))
 

@@ -106,6 +106,7 @@ def test_the_published_network_is_reproduced(name, oracle_dir, dtype):
         np.testing.assert_allclose(ours, theirs, atol=tolerance * np.abs(theirs).max())
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("count", [1, 17])
 def test_blocks_change_nothing_but_memory(count, dtype):
     params = strong(SMALL, dtype)
@@ -315,6 +316,7 @@ def test_warm_up_is_a_branch_without_motion():
     assert "conditional" in run.lower(params, jnp.asarray(9)).compile().as_text()
 
 
+@pytest.mark.full
 def test_a_trained_scene_has_neither_warm_up_nor_noise():
     field = mlp_motion.effect(SMALL, steps=100, frames=20)
     params, gaussians = scene_at()
@@ -330,6 +332,7 @@ def test_a_trained_scene_has_neither_warm_up_nor_noise():
     )
 
 
+@pytest.mark.full
 def test_motion_sets_in_smoothly(dtype):
     @jax.jit
     def first_offsets(mean, time):

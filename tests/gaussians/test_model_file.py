@@ -65,12 +65,14 @@ def test_active_rows_networks_and_settings_come_back_bit_for_bit(trained, saved)
     assert hash(described["spec"]) == hash(about["spec"])
 
 
+@pytest.mark.full
 def test_the_file_is_about_as_large_as_its_numbers(trained, saved):
     loaded, _ = model_file.load(saved)
     numbers = sum(leaf.nbytes for leaf in jax.tree.leaves(loaded))
     assert saved.stat().st_size < 1.05 * numbers + 40_000
 
 
+@pytest.mark.full
 def test_a_frame_is_drawn_from_the_file_alone(trained, saved):
     params, about = trained
     view = evaluation.view_of(scenes.tiny_capture(), 3)
@@ -239,6 +241,7 @@ def test_a_record_of_another_program_does_not_come_back(trained, tmp_path):
     refused(tmp_path / "model.npz", "which is no record or setting")
 
 
+@pytest.mark.full
 def test_whole_numbers_and_lists_keep_their_kind(trained, tmp_path):
     params, about = trained
     nets = {"table": (jnp.arange(4), None, {"inner": jnp.ones((2, 3), bool)})}

@@ -139,6 +139,7 @@ def test_offsets_are_those_of_the_equations(spec, dtype):
     assert {leaf.dtype.name for leaf in offsets} == {dtype}
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("spec", [SMALL, RESIDUAL])
 def test_prepared_ahead_or_in_the_step_is_the_same(spec, dtype):
     params = strong(spec, dtype)
@@ -184,6 +185,7 @@ def test_what_is_prepared_follows_means_and_parameters(float64):
     )
 
 
+@pytest.mark.full
 def test_stale_directions_are_wrong(float64):
     """So reusing what was prepared of other means would show."""
     params, gaussians = strong(SMALL), some_gaussians(9)
@@ -255,6 +257,7 @@ def test_bounded_directions_are_at_most_one_long_with_finite_slopes(length, dtyp
     assert np.isfinite(grads).all()
 
 
+@pytest.mark.full
 def test_the_start_is_still_and_yet_learns(dtype):
     """Weights near zero, directions about one: dp_res = 0 with a slope in w."""
     spec = BasisMotionSpec()
@@ -279,6 +282,7 @@ def test_the_start_is_still_and_yet_learns(dtype):
     assert np.abs(grad).max() > 1
 
 
+@pytest.mark.full
 def test_motion_is_smooth_in_time(float64):
     """C1, as the paper claims and ReLU networks are not: no jump of the velocity."""
     params, mean = strong(SMALL), some_gaussians(3).mean
@@ -290,6 +294,7 @@ def test_motion_is_smooth_in_time(float64):
     assert jump.max() < 20 * np.median(jump)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("count", [0, 1, 17])
 def test_blocks_change_nothing_but_memory(count, dtype):
     params = strong(SMALL, dtype)
@@ -433,6 +438,7 @@ def test_warm_up_and_noise_are_of_training_alone():
             assert any(np.asarray(x).any() for x in jax.tree.leaves(part)) == learns
 
 
+@pytest.mark.full
 def test_a_scene_poses_alike_from_what_it_prepared(dtype):
     field = motion_basis.effect(SMALL, steps=100, frames=20)
     params = scene_of(SMALL, dtype)
@@ -463,6 +469,7 @@ def test_the_networks_are_as_large_as_the_papers_storage_says():
     assert 2.11 < 4 * numbers / 2**20 < 2.26
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("spec", "share"),
     [

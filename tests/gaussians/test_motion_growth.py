@@ -91,6 +91,7 @@ def test_motion_is_the_box_about_the_median_row(count, rng, dtype):
     np.testing.assert_allclose(result, slow_motion(paths, active), atol=tolerance)
 
 
+@pytest.mark.full
 def test_motion_does_not_depend_on_the_order_of_the_frames(rng):
     paths = rng.normal(size=(12, 8, 3)).astype("float32")
     first = seen_motion(paths)
@@ -99,6 +100,7 @@ def test_motion_does_not_depend_on_the_order_of_the_frames(rng):
         np.testing.assert_array_equal(first, seen_motion(rng.permutation(paths)))
 
 
+@pytest.mark.full
 def test_motion_is_near_the_largest_distance_from_the_mean_place(rng):
     swing = np.sin(np.linspace(0, 2 * np.pi, 25))[:, None, None]
     circle = np.stack(
@@ -311,6 +313,7 @@ def test_at_the_threshold_itself_nothing_grows():
     np.testing.assert_array_equal(exact, [0.0])
 
 
+@pytest.mark.full
 def test_hard_growth_is_dead_where_nothing_moves_yet_and_soft_is_not():
     """Random points, motion zero at first: equation 7 never lets them grow."""
     params, gradient = rows_of(20), np.full(20, 20 * STRATEGY.grow_grad2d)
@@ -339,6 +342,7 @@ def spread(spec, rounds=8):
     return int((~moves).sum()), int(moves.sum())
 
 
+@pytest.mark.full
 def test_the_hard_rule_starves_a_static_region_and_the_soft_one_does_not():
     """Rows double while detail / rows is at least 1, or 1 + 4^0.9 = 4.5 if soft."""
     assert spread(None) == (128, 32)

@@ -224,6 +224,7 @@ def test_the_effect_weighs_and_waits_for_its_start():
     assert "conditional" in program
 
 
+@pytest.mark.full
 def test_the_penalty_draws_neighbours_together_and_leaves_the_far_apart():
     """Two groups with mixed embeddings: each ends up with its own."""
     rng = np.random.default_rng(0)

@@ -249,6 +249,7 @@ def test_a_row_counts_from_its_first_slope(dtype):
     assert state.count.tolist() == [2, 7]
 
 
+@pytest.mark.full
 def test_leaves_without_rows_are_plain_adam(dtype):
     ours = optimiser.scale_by_row_adam()
     scalar = jnp.asarray(2.0, dtype)
@@ -368,6 +369,7 @@ def test_a_gather_moves_rows_with_their_moments_and_leaves_nets_alone(name):
         jax.eval_shape(tx.update, taken, moved, taken)
 
 
+@pytest.mark.full
 def test_the_gather_moves_a_plain_adam_too():
     params, tx = rows_and_nets(), optax.adam(1e-3)
     moments = first_moments(tx, params, params)

@@ -243,6 +243,7 @@ def test_what_is_frozen_is_safe_from_values_that_are_not_finite(dtype):
     jax.tree.map(np.testing.assert_array_equal, held, before)
 
 
+@pytest.mark.full
 def test_without_an_alternation_everything_trains():
     before = begun(make())
     after = adam_step(before, before.params)
@@ -320,6 +321,7 @@ def products(jaxpr):
     return count
 
 
+@pytest.mark.full
 def test_the_turn_of_the_rows_leaves_out_the_slopes_of_the_weights():
     params = make()
     program = jax.make_jaxpr(jax.grad(loss))(

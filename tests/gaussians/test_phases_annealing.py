@@ -71,12 +71,14 @@ def test_annealing_counts_steps_beyond_the_integers_of_float32(dtype):
     )
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("step", [800, np.int32(800), np.int64(800), jnp.asarray(800)])
 def test_annealing_takes_any_kind_of_step(step):
     schedule = phases.annealed(MAIN, ANNEALING, 1000)
     np.testing.assert_allclose(schedule(step), exact_rate(800, ANNEALING, 1000), 1e-6)
 
 
+@pytest.mark.full
 def test_an_annealing_without_freezing_trains_to_the_last_step():
     spec = AnnealingSpec(after=0, decay=2.0, freeze_share=0.0)
     schedule = phases.annealed(lambda step: jnp.ones(()), spec, 10)
@@ -103,6 +105,7 @@ def test_only_the_rate_of_the_means_is_annealed():
     assert float(learning_rates.at_step(still, 2.0, 1000, step, ANNEALING).mean) == 0
 
 
+@pytest.mark.full
 def test_at_the_end_the_means_stand_still_bit_for_bit():
     params = Params(
         {"splats": Splats(*(jnp.ones((4, *shape)) for shape in SHAPES))},

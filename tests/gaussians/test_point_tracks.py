@@ -151,6 +151,7 @@ def test_the_weights_of_neighbours_are_a_slow_sum(rng):
     np.testing.assert_allclose(found, [[0.75, 0.25]], rtol=1e-12)
 
 
+@pytest.mark.full
 def test_splats_without_motion_follow_nothing_and_untrained_motion_stays(filmed):
     capture, _, known = filmed
     metadata = splat_scene.metadata_of(capture)

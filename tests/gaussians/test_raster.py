@@ -112,6 +112,7 @@ def test_tiles_cut_by_the_edge_equal_the_dense_compositor(dtype, rng):
     check_against_dense(image, left, footprints, conics, values, SIZE, dtype)
 
 
+@pytest.mark.full
 @pytest.mark.hard_cases
 def test_a_single_pixel_equals_the_dense_compositor(rng):
     footprints, conics = some_footprints(rng, COUNT, (1, 1), "float32")
@@ -179,6 +180,7 @@ def test_a_nan_value_shows_where_its_gaussian_is(dtype):
     assert not np.isnan(left).any()
 
 
+@pytest.mark.full
 def test_cameras_under_vmap_and_scan_equal_single_renders(float64, rng):
     footprints, _ = some_footprints(rng, COUNT, SIZE, "float64")
     values = rng.uniform(size=(COUNT, 3))
@@ -277,6 +279,7 @@ def test_the_ellipse_test_keeps_every_tile_that_shows_a_gaussian(float64, rng):
     assert shows.sum() < 0.5 * int(rects.count.sum())
 
 
+@pytest.mark.full
 def test_forward_and_backward_lower_for_cuda(dtype, rng):
     footprints, _ = some_footprints(rng, 50, (48, 32), dtype)
     values = jnp.ones((50, 4), dtype)

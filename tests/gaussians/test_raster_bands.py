@@ -37,6 +37,7 @@ def both(devices):
     test_raster.close(bands, whole, 1e-12)
 
 
+@pytest.mark.full
 def test_one_device_draws_the_whole_picture(float64):
     both(1)
 

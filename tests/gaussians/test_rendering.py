@@ -149,6 +149,7 @@ def test_render_gradient_equals_central_differences(float64, rng):
     assert gradients.directional_error(loss, gaussians, colours) < 1e-6
 
 
+@pytest.mark.full
 def test_a_depth_that_is_not_asked_for_changes_nothing_else(rng):
     size = (14, 12)
     gaussians = make_gaussians(rng, 6, jnp.float32)

@@ -109,6 +109,7 @@ def test_descent_scales_each_kind_of_row_by_its_rate():
     np.testing.assert_allclose(step.quaternion, 0.2, rtol=1e-5)
 
 
+@pytest.mark.full
 def test_one_adam_step_is_optax_adam_for_rows_and_networks():
     _, state, _ = started(scenes.TINY_DEFORMABLE)
     grads = jax.tree.map(
@@ -149,6 +150,7 @@ def test_events_grow_the_scene_and_keep_its_picture_learnable():
     )
 
 
+@pytest.mark.full
 def test_an_event_is_a_function_of_the_state():
     model, _, frames = started(scenes.TINY_SPLATS)
     state, _ = stepped(scenes.TINY_SPLATS, 10)

@@ -123,6 +123,7 @@ def test_the_wavelet_loss_is_the_mean_square_of_every_high_band(size, dtype, rng
     assert got == pytest.approx(expected, rel=20 * TINY[dtype], abs=1e-30)
 
 
+@pytest.mark.full
 def test_white_noise_costs_the_same_at_every_level(rng):
     noise = rng.normal(size=(128, 128, 3)).astype(np.float32)
     costs = [
@@ -149,6 +150,7 @@ def test_the_half_spectrum_counts_like_the_whole_one(size, dtype, rng):
     )
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("size", SIZES)
 def test_amplitudes_have_the_energy_of_the_picture(size, dtype, rng):
     image = picture(rng, *size, dtype)
@@ -157,6 +159,7 @@ def test_amplitudes_have_the_energy_of_the_picture(size, dtype, rng):
     assert float(cost) == pytest.approx(np.mean(image**2), rel=9 * TINY[dtype])
 
 
+@pytest.mark.full
 def test_the_fourier_loss_does_not_grow_with_the_picture(rng):
     costs = [
         float(
@@ -405,6 +408,7 @@ def test_the_effect_weighs_logs_and_trains_what_its_gate_has(gate, rng):
         np.testing.assert_allclose(filled_in.learning_rate(step_of(5)), 1e-2)
 
 
+@pytest.mark.full
 def test_the_scenes_optimiser_shuts_a_learned_gate_down_to_its_least(rng):
     spec = SpectralSpec(learning_rate=1.0)
     made = spectral.effect(spec, 10)

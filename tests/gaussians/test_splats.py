@@ -202,6 +202,7 @@ def test_random_points_lie_where_a_camera_sees_them(rng):
     assert seen.all()
 
 
+@pytest.mark.full
 def test_one_camera_fills_its_picture_and_its_depth_evenly(rng):
     camera = jax.tree.map(lambda leaf: leaf[0], ring_of_cameras(1))
     points = rows.random_in_views(rng, camera, (64, 48), 1.0, 4.0, 20_000)

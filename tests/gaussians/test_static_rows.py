@@ -124,6 +124,7 @@ def test_what_is_left_out_is_off_by_no_more_than_the_tolerance(static_threshold,
         assert (found <= static_threshold).all()
 
 
+@pytest.mark.full
 def test_a_larger_tolerance_leaves_fewer_rows(rng):
     params = scene(rng)
     counts = [

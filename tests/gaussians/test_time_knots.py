@@ -73,6 +73,7 @@ def test_the_knots_themselves_are_met(interpolation, count, dtype):
         assert found.mean.dtype == dtype
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("interpolation", "order"), [("linear", 2), ("cubic", 3)])
 def test_the_error_falls_with_the_order_of_the_interpolation(
     interpolation, order, float64
@@ -116,6 +117,7 @@ def test_cubic_is_a_hermite_spline_with_central_slopes(count, dtype):
         np.testing.assert_allclose(np.log(found.scale[rows]), log, atol=rounding)
 
 
+@pytest.mark.full
 def test_linear_rotations_follow_the_great_circle(dtype):
     knots = time_knots.bake(lambda t: moving(t, dtype), 40, dtype=dtype)
     rows = np.flatnonzero(knots.index.moves)
@@ -228,6 +230,7 @@ def test_gradients_in_time_and_in_the_knots(float64):
             assert gradients.directional_error(of, *inputs) < 1e-7
 
 
+@pytest.mark.full
 def test_cubic_has_a_continuous_velocity(float64):
     knots = time_knots.bake(lambda t: moving(t, "float64"), 8, dtype=float64)
     for interpolation, smooth in (("linear", False), ("cubic", True)):

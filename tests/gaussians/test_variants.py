@@ -96,6 +96,7 @@ def test_a_motion_from_knots_is_met_at_the_knots_and_near_between(swaying):
     assert 0.2 > errors[0] > errors[1] > 5e-3 > errors[2]
 
 
+@pytest.mark.full
 def test_a_faster_model_draws_what_the_model_draws(swaying):
     model, state = swaying
     view = evaluation.view_of(scenes.tiny_capture(), 0)
@@ -115,6 +116,7 @@ def test_a_faster_model_draws_what_the_model_draws(swaying):
     np.testing.assert_allclose(found, staged, atol=1e-5)
 
 
+@pytest.mark.full
 def test_what_stands_still_may_be_left_out(swaying):
     exact = deformed_rows(*swaying)
     made = variants.without_static(*swaying, 0.0)
@@ -151,6 +153,7 @@ def test_a_faster_motion_that_cannot_be_is_refused(swaying, make, words):
         make(*swaying)
 
 
+@pytest.mark.full
 def test_what_moves_may_be_left_out(swaying):
     model, state = swaying
     # Slower, so that all stay in the picture
