@@ -289,16 +289,3 @@ def test_a_reset_lowers_opacities_and_forgets_their_moments_only(dtype):
     kept = after[0].first.rows["splats"]._replace(opacity_logit=None)
     was = moments[0].first.rows["splats"]._replace(opacity_logit=None)
     jax.tree.map(np.testing.assert_array_equal, kept, was)
-
-
-@pytest.mark.parametrize(
-    ("setting", "message"),
-    [
-        ({"prune_opa": 0.02}, "0 < prune < reset < 1"),
-        ({"refine_every": 0}, "refine_every is at least 1"),
-        ({"shrink": 1.0}, "shrink > 1"),
-    ],
-)
-def test_settings_that_cannot_work_are_refused(setting, message):
-    with pytest.raises(ValueError, match=message):
-        DefaultStrategySpec(**setting)

@@ -298,17 +298,3 @@ def test_the_effect_reads_the_depths():
     truth = np.asarray(shot.depth)
     error = np.abs(np.asarray(shot.rendering.depth) - truth).mean() / truth.mean()
     np.testing.assert_allclose(weighted_sum(terms), 0.1 * error, rtol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("setting", "message"),
-    [
-        ({"kind": "ordinal"}, "kind is one of"),
-        ({"space": "log"}, "space one of"),
-        ({"weight": -1.0}, "not negative"),
-        ({"opaque": 0.0}, "0 < opaque < 1"),
-    ],
-)
-def test_settings_that_cannot_work_are_refused(setting, message):
-    with pytest.raises(ValueError, match=message):
-        DepthSpec(**setting)

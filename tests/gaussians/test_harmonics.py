@@ -87,8 +87,3 @@ def test_colour_gradient_equals_central_differences(float64, rng):
         return jnp.sum(harmonics.colour_towards(*args) * weights)
 
     assert gradients.directional_error(loss, coefficients, mean, position) < 1e-8
-
-
-def test_a_wrong_number_of_coefficients_is_refused():
-    with pytest.raises(ValueError, match="1, 4, 9 or 16 coefficients, got 5"):
-        harmonics.degree_of(5)

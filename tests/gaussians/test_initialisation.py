@@ -70,19 +70,3 @@ def test_random_points_do_not_depend_on_the_points_of_the_capture():
     for a, b in zip(first, second, strict=True):
         np.testing.assert_array_equal(a, b)
     assert (first[0] != third[0]).any()
-
-
-@pytest.mark.parametrize("points", [None, 0])
-def test_a_capture_without_points_is_refused_by_name(points):
-    spec = dataclasses.replace(SPEC, source="points")
-    capture = capture_with(points)
-    for function in (initialisation.uses_capture_points, initialisation.initial_count):
-        with pytest.raises(ValueError, match=r'it has none; choose source="random"'):
-            function(spec, capture)
-    with pytest.raises(ValueError, match=str(capture.path or capture.name)):
-        initialisation.initial_points(spec, capture, 0)
-
-
-def test_an_unknown_source_is_refused():
-    with pytest.raises(ValueError, match="unknown source 'sfm'; choose from"):
-        InitSpec(source="sfm")

@@ -368,20 +368,3 @@ def test_before_its_start_the_factor_is_one(dtype):
         result = an_effect().grow_score(state, step)
         np.testing.assert_allclose(result, np.full(5, factor), rtol=1e-7)
         assert result.dtype.name == dtype
-
-
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda: MotionGrowthSpec(form="firm"), "unknown form 'firm'; choose from"),
-        (lambda: MotionGrowthSpec(start=-1), "start=-1"),
-        (lambda: MotionGrowthSpec(motion=0.0), r"leave this effect out"),
-        (lambda: MotionGrowthSpec(motion=math.inf), "motion=inf"),
-        (lambda: MotionGrowthSpec(beta=1.0), 'use form="hard"'),
-        (lambda: MotionGrowthSpec(beta=math.inf), "beta=inf"),
-        (lambda: motion_growth.effect(SOFT, 0.0), "extent=0.0"),
-    ],
-)
-def test_settings_that_cannot_work_are_refused_with_the_way_out(make, words):
-    with pytest.raises(ValueError, match=words):
-        make()

@@ -257,18 +257,3 @@ def test_missing_rows_are_named():
     effect = neighbours.effect(NeighbourSpec(), extent=1.0, of="kan_motion")
     with pytest.raises(ValueError, match=r"no rows .kan_motion.*code"):
         effect.state(scene(some_places()))
-
-
-@pytest.mark.parametrize(
-    ("setting", "message"),
-    [
-        ({"count": 0}, "count >= 1"),
-        ({"start": -1}, "start >= 0"),
-        ({"gamma": -1.0}, "not negative"),
-        ({"weight": float("nan")}, "not negative"),
-        ({"scale": "metres"}, "unknown scale 'metres'"),
-    ],
-)
-def test_settings_that_cannot_work_are_refused(setting, message):
-    with pytest.raises(ValueError, match=message):
-        NeighbourSpec(**setting)

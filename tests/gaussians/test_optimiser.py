@@ -189,20 +189,6 @@ def test_rows_that_start_late_follow_radam_from_their_own_first_step(dtype):
     assert state.count.tolist() == [total - start for start in starts]
 
 
-@pytest.mark.parametrize(
-    ("setting", "message"),
-    [
-        ({"b2": 0.6}, r"longest length that b2=0.6 allows"),
-        ({"threshold": 3.0}, r"threshold=3.0 must lie in \[4, 1999\)"),
-        ({"b1": 1.0}, "strictly between 0 and 1"),
-        ({"b2": 1.0}, "strictly between 0 and 1"),
-    ],
-)
-def test_settings_under_which_radam_cannot_work_are_refused(setting, message):
-    with pytest.raises(ValueError, match=message):
-        optimiser.scale_by_row_radam(**setting)
-
-
 @pytest.mark.hard_cases
 def test_a_late_row_steps_as_if_it_were_alone(dtype):
     """The reference implementations start it 2.5 to 4.6 times too fast."""

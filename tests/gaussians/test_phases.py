@@ -366,20 +366,3 @@ def test_a_scene_trains_one_group_at_a_time_in_one_program():
     assert steps_at_rest(states, of("nets")) == [0, 1, 2, 6, 9]
     means = steps_at_rest(states, lambda state: [state.params.rows["splats"].mean])
     assert means == [4, 5, 7, 8, 12, 13]
-
-
-@pytest.mark.parametrize(
-    ("make_spec", "words"),
-    [
-        (
-            lambda: AlternationSpec(10, 10),
-            "0 <= start < stop, got start=10 and stop=10",
-        ),
-        (lambda: AlternationSpec(-1, 10), "start=-1"),
-        (lambda: AlternationSpec(1, 10, nets=0), "at least one step, got nets=0"),
-        (lambda: AlternationSpec(1, 10, rows=0), "rows=0"),
-    ],
-)
-def test_settings_that_cannot_work_are_refused_with_their_bound(make_spec, words):
-    with pytest.raises(ValueError, match=words):
-        make_spec()

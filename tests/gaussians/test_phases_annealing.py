@@ -123,18 +123,3 @@ def test_at_the_end_the_means_stand_still_bit_for_bit():
     np.testing.assert_array_equal(after(950).rows["splats"].mean, mean)
     assert (after(949).rows["splats"].mean != mean).any()
     assert (after(950).nets["w"] != params.nets["w"]).all()
-
-
-@pytest.mark.parametrize(
-    ("make_spec", "words"),
-    [
-        (lambda: AnnealingSpec(-1), "after=-1"),
-        (lambda: AnnealingSpec(1, decay=-1.0), "decay=-1.0"),
-        (lambda: AnnealingSpec(1, decay=math.nan), "decay=nan"),
-        (lambda: AnnealingSpec(1, freeze_share=1.0), r"lie in \[0, 1\)"),
-        (lambda: phases.annealed(MAIN, AnnealingSpec(950), 1000), "3/4 of the run"),
-    ],
-)
-def test_settings_that_cannot_work_are_refused_with_their_bound(make_spec, words):
-    with pytest.raises(ValueError, match=words):
-        make_spec()

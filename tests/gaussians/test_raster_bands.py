@@ -57,9 +57,3 @@ def test_three_devices_draw_the_whole_picture():
         env=dict(os.environ, JAX_PLATFORMS="cpu"),
     )
     assert result.returncode == 0, result.stderr[-2000:]
-
-
-def test_no_devices_are_refused(float64, rng):
-    footprints, _ = test_raster.some_footprints(rng, 2, SIZE, float64)
-    with pytest.raises(ValueError, match="at least one device"):
-        raster_bands.rasterise_bands(footprints, jnp.ones((2, 1)), SIZE, GSPLAT, ())

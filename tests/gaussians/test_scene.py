@@ -14,7 +14,7 @@ from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.initialisation import InitSpec
 from gaussians_jax.learning_rates import LearningRateSpec
 from gaussians_jax.optimiser import scale_by_row_adam
-from gaussians_jax.spec import SceneMetadata, SplatScene
+from gaussians_jax.spec import SceneMetadata
 from gaussians_jax.splats import Params, Splats
 from nerfies_jax import evaluation
 from nerfies_jax.training.updates import apply_updates
@@ -214,29 +214,6 @@ def test_facts_take_a_depth_for_the_extent_of_a_camera_that_stands_still():
         capture, cameras=capture.cameras._replace(position=still)
     )
     assert capture.near < scene.metadata_of(capture).extent < capture.far
-
-
-@pytest.mark.parametrize(
-    ("field", "value", "words"),
-    [
-        ("steps", 0, "at least one step"),
-        ("sh_degree", 4, "0, 1, 2 or 3"),
-        ("dssim_weight", 1.5, r"\[0, 1\]"),
-    ],
-)
-def test_wrong_settings_are_refused_with_their_bound(field, value, words):
-    with pytest.raises(ValueError, match=words):
-        SplatScene(**{"steps": 10, field: value})
-
-
-def test_zero_gaussians_are_refused():
-    with pytest.raises(ValueError, match="at least one Gaussian"):
-        InitSpec(points=0)
-
-
-def test_a_rate_that_cannot_decay_is_refused():
-    with pytest.raises(ValueError, match="mean_end"):
-        LearningRateSpec(mean_end=0.0)
 
 
 # Fields of the parts that count steps.

@@ -454,25 +454,3 @@ def test_an_absent_loss_has_no_gate_no_metric_and_no_operation(absent, rng):
         )
     )
     assert ("fft[" in text) == (absent == "wavelet")
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: WaveletSpec(levels=0), "levels=0"),
-        (lambda: WaveletSpec(most=0.0), "most=0.0"),
-        (lambda: WaveletSpec(level_factor=-1.0), "level_factor=-1.0"),
-        (lambda: FourierSpec(dc_weight=-1.0), "dc_weight=-1.0"),
-        (lambda: FourierSpec(most=math.nan), "most=nan"),
-        (lambda: SpectralSpec(None, None), "both None"),
-        (lambda: SpectralSpec(gate="open"), "unknown gate 'open'"),
-        (lambda: SpectralSpec(opening=1.0), "opening=1.0"),
-        (lambda: SpectralSpec(floor=0.5), "floor=0.5"),
-        (lambda: SpectralSpec(learning_rate=0.0), "learning_rate=0.0"),
-        (lambda: SpectralSpec(after=-1), "after=-1"),
-        (lambda: spectral.effect(SpectralSpec(after=10), 10), "after=10"),
-    ],
-)
-def test_wrong_settings_are_refused(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()

@@ -161,14 +161,3 @@ def test_moving_rows_keep_their_gradients(rng, float64):
 
     speed = parts.dynamic.rows["speed"]
     assert gradients.directional_error(loss, speed, jnp.asarray(0.4)) < 1e-7
-
-
-@pytest.mark.parametrize("below", [-1e-3, float("nan")])
-def test_a_tolerance_below_zero_is_refused(below, rng):
-    with pytest.raises(ValueError, match=r"static_threshold=.* scene units"):
-        static_rows.split(scene(rng), deform, TIMES, below)
-
-
-def test_no_times_are_refused(rng):
-    with pytest.raises(ValueError, match="no times to look for motion at"):
-        static_rows.split(scene(rng), deform, TIMES[:0], 0.1)

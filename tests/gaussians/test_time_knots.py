@@ -240,29 +240,3 @@ def test_cubic_has_a_continuous_velocity(float64):
         for knot in knots.times[1:-1]:
             jump = velocity(knot + 1e-9) - velocity(knot - 1e-9)
             assert (np.abs(jump).max() < 1e-5) == smooth
-
-
-@pytest.mark.parametrize(
-    ("knots", "interpolation", "words"),
-    [
-        (1, "linear", "at least 2"),
-        (3, "cubic", "reads 4 knots at once, got 3"),
-        (8, "quintic", "choose from linear, cubic"),
-    ],
-)
-def test_a_table_too_short_is_refused(knots, interpolation, words):
-    def drawn():
-        table = time_knots.bake(moving, knots)
-        return at(table, jnp.asarray(0.5), interpolation)
-
-    with pytest.raises(ValueError, match=words):
-        drawn()
-
-
-def test_opacities_that_change_are_refused():
-    def deform(time):
-        static = moving(jnp.zeros_like(time))
-        return static._replace(opacity=static.opacity * (1 - time / 2))
-
-    with pytest.raises(ValueError, match=r"opacities at time 0 .* at 0\.5"):
-        time_knots.bake(deform, 5)
