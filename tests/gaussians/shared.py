@@ -18,7 +18,12 @@ def full(*rows):
 
 def put(tree, dtype=None):
     """Numbers on the device, for which `jnp.asarray` would compile a program each."""
-    return jax.device_put(jax.tree.map(lambda leaf: np.asarray(leaf, dtype), tree))
+    tree = jax.tree.map(
+        lambda leaf: np.asarray(leaf, dtype),
+        tree,
+        is_leaf=lambda x: isinstance(x, list),
+    )
+    return jax.device_put(tree)
 
 
 def jitted(function, **options):

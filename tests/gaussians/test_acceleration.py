@@ -75,7 +75,7 @@ def test_unrest_is_the_weighed_sum_of_differences(drift, dtype):
 
 def test_gradients_with_the_weight_held(float64):
     rng = np.random.default_rng(0)
-    canonical, *three = put(list(rng.normal(size=(4, 9, 3))))
+    canonical, *three = put(tuple(rng.normal(size=(4, 9, 3))))
     weight = np.exp(-np.linalg.norm(three[1] - np.asarray(canonical), axis=1) / 2)
 
     def held(before, now, after):  # the weight as a constant

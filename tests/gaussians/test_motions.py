@@ -79,63 +79,81 @@ def test_blocks_change_nothing_but_memory(name, count, float64):
 @by_name
 def test_rows_beyond_the_active_blocks_are_still(name, dtype):
     params, reads = strong(name, dtype=dtype), read_by(name, 24, dtype)
-    run = jitted(jax.grad(total_of(name), argnums=(0, 1), has_aux=True))
-
-    def with_active(count):  # in blocks of 8
-        return run(params, reads, np.asarray(0.5, dtype), np.arange(24) < count)
-
-    every, some = with_active(24)[1], with_active(9)[1]
+    every, some = (
+        deformed[name](
+            params, MOTIONS[name].spec, reads, np.asarray(0.5, dtype), active
+        )
+        for active in (np.ones(24, bool), np.arange(24) < 9)  # in blocks of 8
+    )
     for ours, theirs in zip(some, every, strict=True):
         np.testing.assert_array_equal(ours[:16], theirs[:16])
         assert not ours[16:].any()
         assert theirs[16:].any()
-    assert not any_nonzero(with_active(0)[0])
-    nobody = deformed[name](params, MOTIONS[name].spec, reads[:0], put(0.5, dtype))
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("name", ["mlp", *full("kan", "basis")])
+def test_no_active_row_and_no_row_at_all(name, dtype):
+    params, reads = strong(name, dtype=dtype), read_by(name, 9, dtype)
+    slopes = jitted(jax.grad(total_of(name), argnums=(0, 1), has_aux=True))
+    time = np.asarray(0.5, dtype)
+    assert not any_nonzero(slopes(params, reads, time, np.zeros(9, bool)))
+    run = functools.partial(MOTIONS[name].deform, params, MOTIONS[name].spec)
+    nobody = jax.eval_shape(run, reads[:0], time)
     assert all(len(leaf) == 0 for leaf in nobody)
 
 
-@by_name
-def test_a_scene_moves_after_its_warm_up_without_noise_once_trained(name, float64):
-    """What is prepared ahead is what is prepared in the step."""
-    motion = MOTIONS[name]
+def scene_and_effect(name):
+    motion, params = MOTIONS[name], scene_of(name)
     spec = dataclasses.replace(motion.spec, warm_up=10)
-    effects = (motion.module.effect(spec, steps=100, frames=2),)
-    params, time = scene_of(name, spec), put(0.5)
-    network = params.nets[motion.module.NAME]
+    return params, (motion.module.effect(spec, steps=100, frames=2),)
 
-    def moved(params, step):
+
+@pytest.mark.parametrize("name", ["kan", "basis", *full("mlp")])
+def test_a_trained_scene_is_drawn_from_what_was_prepared_without_noise(name, float64):
+    motion, (params, effects) = MOTIONS[name], scene_and_effect(name)
+
+    @jitted
+    def drawn(params, time):
+        ready = deformation.prepare(effects, params)
         canonical = splats.activate(params.rows["splats"])
-        condition = FrameCondition(time, step=step, key=jax.random.key(0))
+        return deformation.deform(effects, params, ready, time), canonical
+
+    found, canonical = drawn(params, np.asarray(0.5))
+    reads = params.rows.get(kan_motion.NAME, canonical.mean)
+    network = params.nets[motion.module.NAME]
+    offsets = deformed[name](network, motion.spec, reads, np.asarray(0.5))
+    close(found, jitted(motion.apply)(canonical, offsets), 1e-13)
+
+
+@pytest.mark.parametrize("name", ["basis", *full("mlp", "kan")])
+def test_a_scene_in_training_moves_with_noise_after_its_warm_up(name, float64):
+    params, effects = scene_and_effect(name)
+
+    def moved(params, step, key):
+        canonical = splats.activate(params.rows["splats"])
+        condition = FrameCondition(jnp.asarray(0.5), step=step, key=key)
         gaussians = deformation.deform_in_training(
             effects, params, canonical, condition
         )
         return jnp.sum(jnp.sin(gaussians.mean)), (gaussians, canonical)
 
-    @jax.jit
-    def as_drawn(params):
-        canonical = splats.activate(params.rows["splats"])
-        reads = params.rows.get(kan_motion.NAME, canonical.mean)
-        offsets = motion.deform(network, spec, reads, time, None)
-        ready = deformation.prepare(effects, params)
-        drawn = deformation.deform(effects, params, ready, time)
-        return drawn, motion.apply(canonical, offsets)
-
-    in_training = jax.jit(jax.grad(moved, has_aux=True))
-    run = jitted(in_training)
-    grads, (still, canonical) = run(params, np.int32(9))
+    run = jax.jit(jax.grad(moved, has_aux=True))
+    key, other = jax.random.key(0), jax.random.key(1)
+    program = run.lower(params, np.int32(9), key).compile()
+    # One compiled program holds both: a branch, not a select of two results.
+    assert "conditional" in program.as_text()
+    grads, (still, canonical) = program(params, np.int32(9), key)
     same_bits(still, canonical)
     assert not any_nonzero(grads.nets)
-    drawn, expected = as_drawn(params)
-    close(drawn, expected, 1e-13)
-    grads, (noisy, _) = run(params, np.int32(10))
-    if name == "basis":  # base, basis and weights
-        assert all(map(any_nonzero, grads.nets[motion.module.NAME]))
-    assert any_nonzero(grads.nets)
-    assert (np.abs(noisy.mean - drawn.mean).max() > 1e-3) == (name != "kan")
-    close(run(params, np.int32(50))[1][0], expected, 1e-13)
-    # One compiled program holds both: a branch, not a select of two results.
-    text = in_training.lower(params, np.int32(9)).compile().as_text()
-    assert "conditional" in text
+    grads, (noisy, _) = program(params, np.int32(10), key)
+    network = grads.nets[MOTIONS[name].module.NAME]
+    assert all(map(any_nonzero, network)) == (name != "mlp")  # it has no code of time
+    assert any_nonzero(network)
+    late, same = (program(params, np.int32(50), k)[1][0] for k in (key, other))
+    same_bits(late, same)
+    apart = np.abs(np.asarray(noisy.mean) - np.asarray(late.mean)).max()
+    assert (apart > 1e-3) == (name != "kan")
 
 
 @pytest.mark.parametrize("name", ["kan", *full("basis")])
