@@ -10,10 +10,8 @@ from gaussians_jax.splats import Gaussians, Params, Splats
 
 def full(*rows):
     """Further rows of a table of parameters, for the full tier alone."""
-    return [
-        pytest.param(*row if isinstance(row, tuple) else (row,), marks=pytest.mark.full)
-        for row in rows
-    ]
+    rows = (row if type(row) is tuple else (row,) for row in rows)
+    return [pytest.param(*row, marks=pytest.mark.full) for row in rows]
 
 
 def put(tree, dtype=None):

@@ -5,17 +5,13 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 
 from gaussians_jax import splats as rows
-from gaussians_jax.effects import acceleration, deformation, mlp_motion
+from gaussians_jax.effects import acceleration
 from gaussians_jax.effects.acceleration import AccelerationSpec
-from gaussians_jax.effects.mlp_motion import MotionSpec
-from gaussians_jax.optimiser import scale_by_row_adam
 from gaussians_jax.splats import Params
-from nerfies_jax.nets.encoding import EncodingSpec
-from nerfies_jax.training.effects import FrameCondition, PenaltyContext, weighted_sum
+from nerfies_jax.training.effects import FrameCondition, PenaltyContext
 from tests import gradients
 from tests.gaussians.shared import any_nonzero, finite, full, jitted, put
 
@@ -184,31 +180,6 @@ def test_the_effect_is_the_mean_over_the_rows_it_draws(time, dtype):
     assert terms["still"].weight is None
 
 
-@pytest.mark.full
-def test_other_steps_draw_other_rows():
-    spec, params = AccelerationSpec(samples=3), scene()
-    values = {
-        float(ask(spec, params, 0.4, seed=seed)["unrest"].value) for seed in range(4)
-    }
-    assert len(values) == 4
-
-
-def linear(params, time):
-    gaussians = rows.activate(params.rows["splats"])
-    swing = params.rows["amplitude"] * jnp.sin(5 * time)
-    return gaussians._replace(mean=gaussians.mean + swing)
-
-
-@pytest.mark.full
-def test_its_weight_does_not_depend_on_the_unit_of_length(float64):
-    spec = AccelerationSpec()
-    small, large = (
-        ask(spec, scene(dtype="float64", size=x), 0.4, at_time=linear, extent=x)
-        for x in (1.0, 1000.0)
-    )
-    np.testing.assert_allclose(small["unrest"].value, large["unrest"].value, rtol=1e-9)
-
-
 def test_gradients_of_the_effect(float64):
     """Through a motion whose displacement, and so the weight, is held at `now`."""
     spec = AccelerationSpec(decay=1e6)  # the weight is 1 to 1e-8
@@ -233,66 +204,3 @@ def test_without_active_rows_there_is_nothing(dtype):
         "unrest": 0,
         "still": 0,
     }
-
-
-MOTION = MotionSpec(
-    position=EncodingSpec(2), time=EncodingSpec(3), depth=2, width=16, skips=()
-)
-
-
-def travel(motion, params, net):
-    """Root mean square distance between the places at two times."""
-    params = Params(params.rows, {mlp_motion.NAME: net})
-
-    def place(params, time):
-        gaussians = rows.activate(params.rows["splats"])
-        return motion.deform(params, gaussians, FrameCondition(time), None).mean
-
-    one, other = (jitted(place)(params, np.float32(time)) for time in (0.3, 0.5))
-    return np.sqrt(np.mean(np.square(one - other)))
-
-
-@pytest.mark.full
-def test_under_a_network_it_waits_for_its_start_and_then_stills_it():
-    """Through the scene's own seams: smoothing, blocks and a warm-up are in the way."""
-    motion = mlp_motion.effect(MOTION, steps=5000, frames=11)
-    params = scene()
-    net = jitted(motion.init)(jax.random.key(1))
-    heads = jax.tree.map(lambda leaf: 300 * leaf, net.trunk.heads)
-    net = net._replace(trunk=net.trunk._replace(heads=heads))
-    params = Params(params.rows, {mlp_motion.NAME: net})
-    spec = AccelerationSpec(start=4000, decay=0.1)
-    effect = acceleration.effect(spec, 1.0, 11)
-
-    def penalty(net, step):
-        condition = FrameCondition(jnp.float32(0.4), step=step, key=jax.random.key(0))
-
-        def at_time(params, time):
-            gaussians = rows.activate(params.rows["splats"])
-            then = condition._replace(time=time)
-            return deformation.deform_in_training((motion,), params, gaussians, then)
-
-        here = Params(params.rows, {mlp_motion.NAME: net})
-        context = PenaltyContext(condition, step, None, here, at_time=at_time)
-        return weighted_sum(effect.penalty(None, context))
-
-    run = jax.jit(jax.value_and_grad(penalty))
-    assert not any_nonzero(run(net, np.int32(3999)))
-    value, grads = run(net, np.int32(4000))
-    assert value > 0
-    assert finite(grads)
-    assert any_nonzero(grads)
-    tx = optax.chain(scale_by_row_adam(), optax.scale(-2e-3))
-
-    def descend(_, carry):
-        net, moments = carry
-        update, moments = tx.update(run(net, jnp.asarray(4000))[1], moments)
-        return optax.apply_updates(net, update), moments
-
-    @jitted
-    def descended(net):
-        return jax.lax.fori_loop(0, 200, descend, (net, tx.init(net)))[0]
-
-    assert travel(motion, params, descended(net)) < 0.3 * travel(motion, params, net)
-    program = run.lower(net, np.int32(0)).compile().as_text()
-    assert "conditional" in program

@@ -7,17 +7,9 @@ import pytest
 
 from gaussians_jax import initialisation
 from gaussians_jax.initialisation import InitSpec
-from tests import scenes
+from tests.gaussians.test_refusals import capture_with
 
 SPEC = InitSpec(points=10**4, random=70, extra_random=30)
-
-
-def capture_with(points):
-    """The small capture with some of its own points, or with none."""
-    capture = scenes.tiny_capture()
-    cloud = capture.points
-    kept = None if points is None else type(cloud)(*(leaf[:points] for leaf in cloud))
-    return dataclasses.replace(capture, points=kept)
 
 
 def own_points(spec, capture):
@@ -41,10 +33,8 @@ def own_points(spec, capture):
         ("auto", 150, 150, 30),
         ("auto", 99, 0, 70),
         ("auto", None, 0, 70),
-        ("points", 150, 150, 30),
         ("points", 1, 1, 30),
         ("random", 150, 0, 70),
-        ("random", None, 0, 70),
     ],
 )
 def test_the_source_decides_whose_points_they_are(source, points, own, drawn):

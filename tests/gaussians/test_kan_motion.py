@@ -13,7 +13,6 @@ import pytest
 from gaussians_jax import splats as rows
 from gaussians_jax.effects import kan_motion
 from gaussians_jax.effects.kan_motion import KanMotion, KanMotionSpec, Offsets
-from nerfies_jax.measure import clock
 from nerfies_jax.nets import kan, mlp
 from tests.gaussians.motions import FRAMES, MOTIONS, deformed, read_by, strong
 from tests.gaussians.motions import KAN as SMALL
@@ -23,7 +22,6 @@ from tests.gaussians.shared import (
     finite,
     full,
     jitted,
-    put,
     some_gaussians,
 )
 
@@ -78,20 +76,6 @@ def test_a_residual_that_is_off_has_no_parameters_and_moves_nothing(off, float64
     for name, leaf in same.items():
         before, after = getattr(gaussians, leaf), getattr(moved, leaf)
         assert np.array_equal(before, after) == (name == off)
-
-
-@pytest.mark.full
-def test_heads_that_are_off_cost_nothing():
-    def flops(spec):
-        args = strong("kan", spec, "float32"), read_by("kan", 16, "float32")
-        return clock.cost(
-            lambda params, *rest: MOTIONS["kan"].deform(params, spec, *rest),
-            *args,
-            put(0.3, "float32"),
-        ).flops
-
-    alone = dataclasses.replace(SMALL, scale=False, rotation=False)
-    assert flops(alone) < flops(SMALL)
 
 
 def test_motion_starts_at_zero_and_does_not_stay_there():

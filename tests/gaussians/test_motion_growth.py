@@ -84,38 +84,6 @@ def test_motion_is_the_box_about_the_median_row(count, rng, dtype):
     np.testing.assert_allclose(result, slow_motion(paths, active), atol=tolerance)
 
 
-@pytest.mark.full
-def test_motion_does_not_depend_on_the_order_of_the_frames(rng):
-    paths = rng.normal(size=(12, 8, 3)).astype("float32")
-    first = seen_motion(paths)
-    assert first.min() > 0
-    for _ in range(3):
-        np.testing.assert_array_equal(first, seen_motion(rng.permutation(paths)))
-
-
-@pytest.mark.full
-def test_motion_is_near_the_largest_distance_from_the_mean_place(rng):
-    swing = np.sin(np.linspace(0, 2 * np.pi, 25))[:, None, None]
-    circle = np.stack(
-        [swing, np.roll(swing[:-1], 6, 0).take(range(25), 0, mode="wrap")]
-    )
-    lines = swing * rng.normal(size=(1, 10, 3))
-    wild = rng.normal(size=(25, 200, 3)).cumsum(axis=0)
-    arcs = circle[0] * rng.normal(size=(1, 10, 3)) + circle[1] * rng.normal(
-        size=(10, 3)
-    )
-    still = np.zeros((25, 401, 3))  # so that the median is at rest
-    for paths, least, most in (
-        (lines, 1 - 1e-6, 1 + 1e-6),
-        (arcs, 0.97, 1.42),
-        (wild, 0.5, math.sqrt(3)),
-    ):
-        farthest = np.linalg.norm(paths - paths.mean(axis=0), axis=2).max(axis=0)
-        every = np.concatenate([paths, still], axis=1).astype("float32")
-        share = seen_motion(every)[: paths.shape[1]] / farthest
-        assert least <= share.min() <= share.max() <= most, (least, most)
-
-
 def test_what_moves_as_a_whole_does_not_count(rng, dtype):
     """Ego motion in the base motion; an object that stays behind does count."""
     camera = rng.normal(size=(10, 1, 3)).astype(dtype)
@@ -127,13 +95,6 @@ def test_what_moves_as_a_whole_does_not_count(rng, dtype):
     assert rest.max() <= {"float32": 1e-6, "float64": 1e-14}[dtype]
     assert motion[7] == pytest.approx(0.05 * math.sqrt(3), rel=1e-4)
     assert motion[8] == pytest.approx(np.linalg.norm(np.ptp(camera, axis=0)) / 2, 1e-4)
-
-
-def test_a_constant_offset_is_no_motion(dtype):
-    """The canonical place need not be one that is ever taken."""
-    paths = np.zeros((5, 3, 3), dtype)
-    paths[:, 1] = 10
-    assert not seen_motion(paths).any()
 
 
 @pytest.mark.hard_cases
@@ -298,48 +259,3 @@ def test_truth_table_of_the_conjunction(spec, step, cloned, dtype):
     changed, labels = grown(spec, params, gradient, motion, step)
     assert labels == cloned
     assert changed.stats.grad2d.dtype.name == dtype
-
-
-@pytest.mark.full
-def test_hard_growth_is_dead_where_nothing_moves_yet_and_soft_is_not():
-    """Random points, motion zero at first: equation 7 never lets them grow."""
-    params, gradient = rows_of(20), np.full(20, 20 * STRATEGY.grow_grad2d)
-    for spec, growth in ((HARD, 0), (SOFT, 20), (None, 20)):
-        changed, _ = grown(spec, params, gradient, np.zeros(20))
-        assert changed.report.cloned == growth
-
-
-def spread(spec, rounds=8):
-    """Rows of a static and a moving region once events no longer change them.
-
-    Both begin with four rows. Their slope, over the threshold, is the region's detail
-    over its rows: the static region has four times as much of it.
-    """
-    params = rows_of(8)
-    params.rows["label"] = put(np.arange(8)[:, None] >= 4, "float32")
-    count = 8
-    for _ in range(rounds):
-        moves = np.asarray(params.rows["label"])[:count, 0] == 1
-        grad = np.where(moves, 24 / moves.sum(), 96 / (~moves).sum())
-        motion = np.where(moves, 5 * TAU, 0.1 * TAU)
-        changed, _ = grown(spec, params, grad * STRATEGY.grow_grad2d, motion)
-        params, count = changed.params, changed.report.active
-    assert changed.report.cloned == 0  # at rest
-    moves = np.asarray(params.rows["label"])[:count, 0] == 1
-    return int((~moves).sum()), int(moves.sum())
-
-
-@pytest.mark.full
-def test_the_hard_rule_starves_a_static_region_and_the_soft_one_does_not():
-    """Rows double while detail / rows is at least 1, or 1 + 4^0.9 = 4.5 if soft."""
-    assert spread(None) == (128, 32)
-    assert spread(SOFT) == (32, 32)
-    assert spread(HARD) == (4, 32)  # what it began with, whatever its detail
-
-
-def test_before_its_start_the_factor_is_one(dtype):
-    state = motion_growth.init_state(rows_of(5, dtype))
-    for step, factor in ((99, 1.0), (100, 0.2)):  # at rest, beta = 4
-        result = motion_growth.effect(SOFT, EXTENT).grow_score(state, step)
-        np.testing.assert_allclose(result, np.full(5, factor), rtol=1e-7)
-        assert result.dtype.name == dtype

@@ -215,27 +215,3 @@ def test_the_effect_weighs_and_waits_for_its_start():
     absent = neighbours.effect(NeighbourSpec(), extent=1.0, of="kan_motion")
     with pytest.raises(ValueError, match=r"no rows .kan_motion.*code"):
         absent.state(params)
-
-
-@pytest.mark.full
-def test_the_penalty_draws_neighbours_together_and_leaves_the_far_apart():
-    """Two groups with mixed embeddings: each ends up with its own."""
-    rng = np.random.default_rng(0)
-    places = rng.normal(size=(24, 3)) * 0.1 + np.repeat([[0.0], [50.0]], 12, axis=0)
-    code, graph = graph_of(NeighbourSpec(count=8, gamma=100.0), places)
-    grad = jax.grad(neighbours.inconsistency)
-
-    @jitted
-    def descended(code, graph, active):
-        return jax.lax.fori_loop(
-            0, 3000, lambda _, c: c - 0.1 * grad(c, graph, active), code
-        )
-
-    before, after = (
-        np.asarray(x).reshape(2, 12, 3)
-        for x in (code, descended(code, graph, np.ones(24, bool)))
-    )
-    spread = (x.std(axis=1).mean(axis=1) for x in (after, before))
-    assert (np.divide(*spread) < 0.3).all()
-    # Slopes of a pair cancel, so a group keeps its centre.
-    np.testing.assert_allclose(after.mean(axis=1), before.mean(axis=1), atol=1e-3)

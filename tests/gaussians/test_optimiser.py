@@ -322,13 +322,3 @@ def test_a_gather_moves_rows_with_their_moments_and_leaves_nets_alone(name):
     same_bits(by_kind["nets"], moments[1].inner_states["nets"])
     with lenient("standard"):  # the state still fits the parameters
         jax.eval_shape(tx.update, taken, moved, taken)
-
-
-@pytest.mark.full
-def test_the_gather_moves_a_plain_adam_too():
-    params, tx = rows_and_nets(), optax.adam(1e-3)
-    moments, none = first_moments(tx, params, params), np.zeros(COUNT, bool)
-    _, moved = gather(tx, params, moments, np.arange(COUNT)[::-1], none, none)
-    expected = moments[0].mu.rows["splats"].quaternion[::-1]
-    np.testing.assert_array_equal(moved[0].mu.rows["splats"].quaternion, expected)
-    np.testing.assert_array_equal(moved[0].mu.nets["w"], moments[0].mu.nets["w"])

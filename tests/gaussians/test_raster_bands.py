@@ -11,15 +11,15 @@ import pytest
 
 from gaussians_jax import raster, raster_bands
 from gaussians_jax.raster_spec import GSPLAT
-from tests.gaussians import test_raster
+from tests.gaussians import shared, test_raster
 
 SIZE = (29, 37)
 
 
 def both(devices):
     rng = np.random.default_rng(0)
-    footprints, _ = test_raster.some_footprints(rng, 80, SIZE, jnp.float64)
-    values = jnp.asarray(rng.uniform(size=(80, 3)))
+    footprints, _ = test_raster.some_footprints(rng, 80, SIZE, "float64")
+    values = rng.uniform(size=(80, 3))
     row = jax.devices()[:devices]
     assert len(row) == devices
 
@@ -34,7 +34,7 @@ def both(devices):
 
     whole = grads(lambda f, v: raster.rasterise(f, v, SIZE, GSPLAT))
     bands = grads(lambda f, v: raster_bands.rasterise_bands(f, v, SIZE, GSPLAT, row))
-    test_raster.close(bands, whole, 1e-12)
+    shared.close(bands, whole, 1e-12)
 
 
 @pytest.mark.full

@@ -9,6 +9,7 @@ from gaussians_jax import harmonics, rendering
 from gaussians_jax.raster_spec import RasterSpec
 from gaussians_jax.splats import Gaussians
 from nerfies_jax.geometry.camera import Camera
+from tests.gaussians.shared import put
 
 QUICK = ["n100_64_sh3_bg_aa"]
 SLOW = [
@@ -61,7 +62,7 @@ class Case:
         )
 
     def array(self, name):
-        return jnp.asarray(self.stored[name], self.dtype)
+        return put(self.stored[name], self.dtype)
 
     def camera(self, view):
         intrinsics = self.stored["K"].astype(np.float64)
@@ -114,7 +115,7 @@ def case(request, dtype, oracle_dir):
 
 
 def test_picture_and_gradients_equal_the_reference(case):
-    offset = jnp.zeros((case.gaussians.mean.shape[0], 2), case.dtype)
+    offset = put(np.zeros((len(case.gaussians.mean), 2)), case.dtype)
     args = (case.gaussians, case.colours, case.view, offset)
     differentiate = jax.jit(
         jax.value_and_grad(case.loss, argnums=(0, 1, 2, 3), has_aux=True)

@@ -14,6 +14,7 @@ from gaussians_jax import (
     phases,
     raster,
     raster_bands,
+    spec,
     splats,
     static_rows,
     time_knots,
@@ -174,6 +175,10 @@ def still(params, time):
     return splats.activate(params.rows["splats"])
 
 
+def moba(**changes):
+    spec.refuse_what_cannot_train(dataclasses.replace(scenes.TINY_MOBA, **changes))
+
+
 BROKEN = np.where(np.arange(18).reshape(6, 3) == 13, np.nan, 1.0)
 FROM_POINTS = InitSpec(source="points")
 CALLS = [
@@ -185,6 +190,15 @@ CALLS = [
      'it has none; choose source="random"'),
     (lambda: kan_motion.init(jax.random.key(0), KanMotionSpec(), 0), "frames=0"),
     (lambda: motion_growth.effect(MotionGrowthSpec(), 0.0), "extent=0.0"),
+    (lambda: moba(motion=None), "without a motion"),
+    (lambda: moba(motion=scenes.TINY_MOTION, neighbours=NeighbourSpec()),
+     "neighbours=none"),
+    (lambda: moba(densification=None), "motion_growth=none"),
+    (lambda: moba(densification=MCMCStrategySpec()), "threshold of Default"),
+    (lambda: moba(motion_growth=MotionGrowthSpec(form="hard", start=3)),
+     "nothing would"),
+    (lambda: moba(motion=None, motion_growth=None, acceleration=None),
+     "alternation without"),
     (lambda: phases.annealed(schedules.log_linear(1e-2, 1e-4, 1000),
                              AnnealingSpec(950), 1000), "3/4 of the run"),
     (lambda: raster.rasterise(*footprints((5, 0))), "at least one pixel"),

@@ -10,79 +10,68 @@ from gaussians_jax.splats import Gaussians
 from nerfies_jax import evaluation
 from nerfies_jax.training.model import TrainState
 from tests import scenes
+from tests.gaussians.shared import jitted, put
 
 SIZE = (20, 15)
 
 
-@pytest.fixture(scope="module")
-def moving():
-    """A deformable scene whose network moves something, and a view of it."""
-    capture = scenes.tiny_capture()
+def parts(size):
+    """A deformable scene whose networks move something: by one amount, or at random."""
+    capture, rng = scenes.tiny_capture(), np.random.default_rng(0)
     metadata = scene.metadata_of(capture)
     model = scene.build(scenes.TINY_DEFORMABLE, metadata)
     params = model.init(capture, jax.random.key(0)).params
-    nets = jax.tree.map(lambda leaf: leaf + 0.05, params.nets)
-    view = evaluation.view_of(capture, int(capture.heldout[0]))
-    return metadata, model, params._replace(nets=nets), view
+    nets = jax.tree.map(lambda leaf: leaf + size(rng, leaf.shape), params.nets)
+    nets = put(jax.tree.map(np.asarray, nets), "float32")
+    return metadata, model, params._replace(nets=nets)
+
+
+@pytest.fixture(scope="module")
+def moving():
+    """All moved alike."""
+    return parts(lambda rng, shape: 0.05)
 
 
 def test_splats_without_motion_are_the_canonical_ones(moving):
-    metadata, model, params, view = moving
-    step = jnp.asarray(20, jnp.int32)
-    draw = variants.without_effects(
+    metadata, model, params = moving
+    without = variants.without_effects(
         scenes.TINY_DEFORMABLE, metadata, ("motion",), False
     )
-    static = scene.build(scenes.TINY_SPLATS, metadata).render
+    static = scene.build(scenes.TINY_SPLATS, metadata)
+    view = evaluation.view_of(scenes.tiny_capture(), 0)
     found, expected, moved = (
-        jax.jit(each, static_argnums=2)(params, view, SIZE, step).colour
-        for each in (draw.render, static, model.render)
+        jitted(each.render, static_argnums=2)(params, view, SIZE, np.int32(20)).colour
+        for each in (without, static, model)
     )
     np.testing.assert_array_equal(found, expected)
     assert np.abs(found - moved).max() > 0.02
 
 
-def test_an_effect_that_is_not_there_cannot_be_left_out(moving):
-    metadata = moving[0]
-    with pytest.raises(ValueError, match=r"--without warp: .* those are: motion"):
-        variants.without_effects(scenes.TINY_DEFORMABLE, metadata, ("warp",), False)
-    with pytest.raises(ValueError, match=r"--without motion: .* those are: none"):
-        variants.without_effects(scenes.TINY_SPLATS, metadata, ("motion",), False)
-
-
-def test_splats_have_no_appearance_to_blend(moving):
-    with pytest.raises(ValueError, match=r"--appearance: splats .* nerf-w"):
-        variants.without_effects(scenes.TINY_SPLATS, moving[0], (), True)
-
-
 def state_of(params):
-    return TrainState(params, (), (), jnp.asarray(20, jnp.int32), None)
+    return TrainState(params, (), (), put(20, "int32"), None)
 
 
 @pytest.fixture(scope="module")
 def swaying():
-    """A deformable scene whose Gaussians move at their own speeds."""
-    capture = scenes.tiny_capture()
-    model = scene.build(scenes.TINY_DEFORMABLE, scene.metadata_of(capture))
-    params = model.init(capture, jax.random.key(0)).params
-    rng = np.random.default_rng(0)
-    nets = jax.tree.map(
-        lambda leaf: leaf + 0.1 * jnp.asarray(rng.normal(size=leaf.shape), leaf.dtype),
-        params.nets,
-    )
-    return model, state_of(params._replace(nets=nets))
+    """Gaussians that move at their own speeds."""
+    drawn = parts(lambda rng, shape: np.float32(0.1 * rng.normal(size=shape)))
+    _, model, params = drawn
+    return model, state_of(params)
+
+
+def active_rows(state):
+    return np.asarray(splats.active_mask(state.params.rows["splats"]))
 
 
 def deformed_rows(model, state, times=(0.0, 0.3, 1.0)):
-    stages = model.stages
-    prepared = stages.prepare(state.params)
-    deform = jax.jit(stages.deform)
-    moments = [jnp.asarray(time, jnp.float32) for time in times]
-    return [deform(state.params, prepared, time) for time in moments]
+    prepared = model.stages.prepare(state.params)
+    deform = jitted(model.stages.deform)
+    return [deform(state.params, prepared, np.float32(time)) for time in times]
 
 
 def test_a_motion_from_knots_is_met_at_the_knots_and_near_between(swaying):
     exact = deformed_rows(*swaying)
-    active = np.asarray(splats.active_mask(swaying[1].params.rows["splats"]))
+    active = active_rows(swaying[1])
     shift = np.abs(exact[0].mean - exact[2].mean).max()
     errors = []
     for knots, interpolation in ((4, "linear"), (4, "cubic"), (40, "cubic")):
@@ -100,7 +89,7 @@ def test_a_motion_from_knots_is_met_at_the_knots_and_near_between(swaying):
 def test_a_faster_model_draws_what_the_model_draws(swaying):
     model, state = swaying
     view = evaluation.view_of(scenes.tiny_capture(), 0)
-    view = view._replace(time=jnp.asarray(0.3))
+    view = view._replace(time=put(0.3, "float32"))
     made = variants.from_knots(model, state, 40, "cubic")
     whole = made.model._replace(stages=None)  # by its `render`
     exact, staged, found = (
@@ -120,7 +109,7 @@ def test_a_faster_model_draws_what_the_model_draws(swaying):
 def test_what_stands_still_may_be_left_out(swaying):
     exact = deformed_rows(*swaying)
     made = variants.without_static(*swaying, 0.0)
-    active = np.asarray(splats.active_mask(swaying[1].params.rows["splats"]))
+    active = active_rows(swaying[1])
     for found, deform in zip(deformed_rows(made.model, made.state), exact, strict=True):
         for name in Gaussians._fields:  # a row that is not drawn may be anywhere
             a, b = (np.asarray(getattr(x, name))[active] for x in (found, deform))
@@ -138,17 +127,38 @@ def test_what_stands_still_may_be_left_out(swaying):
         assert (error == 0).sum() >= left
 
 
+def drawn_still(model, *args):
+    static = variants.without_effects(*model.spec, ("motion",), False)
+    return variants.from_knots(static, *args)
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [
         (lambda *a: variants.from_knots(*a, 1), "reads 2 knots at once, got 1"),
         (lambda *a: variants.from_knots(*a, 3, "cubic"), "take more, or linear"),
         (lambda *a: variants.from_knots(*a, 8, "linear", 1e9), "farther than 1e\\+09"),
+        (lambda *a: drawn_still(*a, 8), "nothing in this run moves farther than 0 "),
         (lambda *a: variants.without_static(*a, 1e9), "nothing in this run moves"),
         (lambda *a: variants.without_static(*a, -1.0), "cannot be negative"),
+        (lambda *a: variants.without_moving(*a, 0.0),
+         r"--hide-moving 0: all .* longer distance"),
+        (lambda m, s: variants.from_knots(m._replace(stages=None), s, 8),
+         "--knots is for runs of Gaussians"),
+        (lambda m, s: variants.without_static(m._replace(stages=None), s, 0.1),
+         "--static-threshold is for runs of Gaussians"),
+        (lambda m, s: variants.without_moving(m._replace(stages=None), s, 0.1),
+         "--hide-moving is for runs of Gaussians"),
+        (lambda m, _: variants.without_effects(*m.spec, ("warp",), False),
+         r"--without warp: .* those are: motion"),
+        (lambda m, _: variants.without_effects(
+            scenes.TINY_SPLATS, m.spec[1], ("motion",), False),
+         r"--without motion: .* those are: none"),
+        (lambda m, _: variants.without_effects(*m.spec, (), True),
+         r"--appearance: splats .* nerf-w"),
     ],
-)
-def test_a_faster_motion_that_cannot_be_is_refused(swaying, make, words):
+)  # fmt: skip
+def test_what_cannot_be_drawn_otherwise_is_refused(swaying, make, words):
     with pytest.raises(ValueError, match=words):
         make(*swaying)
 
@@ -163,11 +173,10 @@ def test_what_moves_may_be_left_out(swaying):
     distance = np.max(
         [static_rows.max_displacement(middle, end) for end in ends], axis=0
     )
-    active = np.asarray(splats.active_mask(state.params.rows["splats"]))
+    active = active_rows(state)
     far = float(np.median(distance[active]))
     left, summary = variants.without_moving(model, state, far)
-    rows = left.params.rows["splats"]
-    shown = np.asarray(splats.active_mask(rows))
+    shown = active_rows(left)
     assert 0 < shown.sum() < active.sum() / 2 + 1
     assert distance[shown].max() <= far
     assert f"{active.sum() - shown.sum()} of {active.sum()} Gaussians" in summary
@@ -181,24 +190,3 @@ def test_what_moves_may_be_left_out(swaying):
     np.testing.assert_allclose(found, expected, atol=1e-6)
     everything = evaluation.Renderer(model, SIZE)(state, view).colour
     assert np.abs(found - everything).max() > 0.02
-
-
-def test_a_static_scene_of_nothing_is_refused(swaying):
-    with pytest.raises(ValueError, match=r"--hide-moving 0: all .* longer distance"):
-        variants.without_moving(*swaying, 0.0)
-    field = swaying[0]._replace(stages=None)
-    with pytest.raises(ValueError, match="--hide-moving is for runs of Gaussians"):
-        variants.without_moving(field, swaying[1], 0.1)
-
-
-def test_fields_and_still_scenes_have_no_knots(moving, swaying):
-    static = variants.without_effects(
-        scenes.TINY_DEFORMABLE, moving[0], ("motion",), False
-    )
-    with pytest.raises(ValueError, match="nothing in this run moves farther than 0 "):
-        variants.from_knots(static, swaying[1], 8)
-    field = static._replace(stages=None)
-    with pytest.raises(ValueError, match="--knots is for runs of Gaussians"):
-        variants.from_knots(field, swaying[1], 8)
-    with pytest.raises(ValueError, match="--static-threshold is for runs of Gaussians"):
-        variants.without_static(field, swaying[1], 0.1)
