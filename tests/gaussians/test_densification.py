@@ -200,19 +200,6 @@ def test_capacity_grows_in_buckets_and_does_not_waver():
     assert run(*changed[:2], stats).report.capacity == 256
 
 
-@pytest.mark.full
-@pytest.mark.hard_cases
-def test_one_gaussian_and_none():
-    params, moments, stats = make(1)
-    changed = run(params, moments, hot(stats, [0]))
-    assert labels(changed) == [0, 0]
-    gone = changed.stats._replace(active=put(np.zeros(256, bool)))
-    changed = run(*changed[:2], gone)
-    assert changed.report.active == 0
-    assert not np.asarray(rows.active_mask(changed.params.rows["splats"])).any()
-    assert run(*changed[:3]).report.active == 0
-
-
 def test_a_revised_clone_and_its_source_hide_what_one_did(dtype):
     params, moments, stats = make(dtype=dtype, opacity=0.8)
     changed = run(

@@ -103,7 +103,7 @@ def test_inactive_rows_stay_behind(tmp_path):
     assert not (tmp_path / "b.ply").exists()
 
 
-def edited_ply(path, **columns):
+def write_ply(path, columns, **kind):
     """A good file with some of its columns replaced; None takes a column out."""
     files.save(path, some_splats())
     table = plyfile.PlyData.read(path)["vertex"].data
@@ -112,28 +112,19 @@ def edited_ply(path, **columns):
     data = np.empty(20, [(name, x.dtype.str) for name, x in kept.items()])
     for name, x in kept.items():
         data[name] = x
-    return data
+    plyfile.PlyData([plyfile.PlyElement.describe(data, "vertex")], **kind).write(path)
 
 
-@pytest.mark.full
-def test_the_other_two_byte_orders_and_float64_are_read(tmp_path):
-    path = tmp_path / "a.ply"
-    data = edited_ply(path, x=np.linspace(0, 1, 20))
-    element = plyfile.PlyElement.describe(data, "vertex")
-    expected = files.load(path).splats
-    for kind in ({"byte_order": ">"}, {"text": True}):
-        plyfile.PlyData([element], **kind).write(path)
-        mean, *_, rest = map(np.asarray, files.load(path).splats)
-        np.testing.assert_allclose(mean[:, 0], np.linspace(0, 1, 20), rtol=1e-6)
-        np.testing.assert_allclose(rest, expected.sh_rest, rtol=1e-6)
-
-
-def test_extra_properties_are_named_and_normals_may_be_missing(tmp_path):
-    path = tmp_path / "a.ply"
-    extra = {"label": np.arange(20, dtype=np.int32), "nx": None, "ny": None, "nz": None}
-    data = edited_ply(path, **extra)
-    plyfile.PlyData([plyfile.PlyElement.describe(data, "vertex")]).write(path)
-    assert files.load(path).notes == ("left out: label",)
+@pytest.mark.parametrize("kind", [{"byte_order": ">"}, {"text": True}])
+def test_the_other_two_byte_orders_and_float64_are_read(kind, tmp_path):
+    path, places = tmp_path / "a.ply", np.linspace(0, 1, 20)
+    more = {"nx": None, "ny": None, "nz": None, "label": places}
+    write_ply(path, {"x": places} | more, **kind)
+    loaded = files.load(path)
+    mean, *_, rest = map(np.asarray, loaded.splats)
+    np.testing.assert_allclose(mean[:, 0], places, rtol=1e-6)
+    np.testing.assert_allclose(rest, some_splats().sh_rest, rtol=1e-6)
+    assert loaded.notes == ("left out: label",)
 
 
 @pytest.mark.parametrize("value", [np.nan, *full(np.inf)])
@@ -141,11 +132,8 @@ def test_a_broken_row_is_named_or_dropped(value, tmp_path):
     path = tmp_path / "a.ply"
     scale = np.zeros(20, np.float32)
     scale[[7, 9]] = value
-    data = edited_ply(path, scale_1=scale)
-    plyfile.PlyData([plyfile.PlyElement.describe(data, "vertex")]).write(path)
-    with pytest.raises(
-        ValueError, match=r"a\.ply: row 7 has a log_scale that is not fin"
-    ):
+    write_ply(path, {"scale_1": scale})
+    with pytest.raises(ValueError, match=r"a\.ply: row 7 has a log_scale that is no"):
         files.load(path)
     loaded = files.load(path, drop_broken=True)
     assert loaded.dropped == 2
@@ -165,11 +153,9 @@ def test_a_broken_row_is_named_or_dropped(value, tmp_path):
     ],
 )
 def test_properties_that_do_not_fit_are_named(change, message, tmp_path):
-    path = tmp_path / "a.ply"
-    data = edited_ply(path, **change)
-    plyfile.PlyData([plyfile.PlyElement.describe(data, "vertex")]).write(path)
+    write_ply(tmp_path / "a.ply", change)
     with pytest.raises(ValueError, match=message):
-        files.load(path)
+        files.load(tmp_path / "a.ply")
 
 
 def test_damaged_files_give_one_line_with_the_path(tmp_path):
@@ -177,16 +163,13 @@ def test_damaged_files_give_one_line_with_the_path(tmp_path):
     files.save(path, some_splats())
     good = path.read_bytes()
     header, body = good.split(b"end_header\n")
+    endless = header + b"comment " + b"x" * 200_000 + b"\nend_header\n" + body
     damaged = {
         "truncated": good[:-10],
         "no vertices": header.replace(b"vertex 20", b"vertex 0") + b"end_header\n",
         "claims too many": good.replace(b"vertex 20", b"vertex 99999999999"),
         "negative": good.replace(b"vertex 20", b"vertex -20"),
-        "endless header": header
-        + b"comment "
-        + b"x" * 200_000
-        + b"\nend_header\n"
-        + body,
+        "endless header": endless,
         "no end of header": header,
         "twice": good.replace(b"float y\n", b"float x\n"),
         "list": good.replace(b"float x\n", b"list uchar float x\n"),
@@ -262,19 +245,14 @@ def test_spz_turns_the_axes_of_means_rotations_and_harmonics():
     np.testing.assert_allclose(found, turned, atol=1e-12)
 
 
-@pytest.mark.parametrize("kind", ["raw", "v2", "v3", "v4"])
+@pytest.mark.parametrize("kind", ["v3", "v4", *full("raw", "v2")])
 def test_spz_files_of_another_tool_hold_the_same_four_gaussians(kind, data_dir):
     if kind == "v4":
         pytest.importorskip("zstandard")
     rows = files.load(data_dir / "splat_files" / f"minimal-{kind}.spz").splats
     splat = files.load(data_dir / "splat_files" / "minimal.splat").splats
     corners = {tuple(map(abs, row)) for row in np.asarray(rows.mean).tolist()}
-    assert corners == {
-        (1.0, 0.0, 1.0),
-        (0.0, 0.0, 1.0),
-        (1.0, 0.0, 0.0),
-        (0.0, 0.0, 0.0),
-    }
+    assert corners == {(1, 0, 1), (0, 0, 1), (1, 0, 0), (0, 0, 0)}
     np.testing.assert_allclose(np.exp(rows.log_scale), 0.1, rtol=0.05)
     np.testing.assert_allclose(np.exp(splat.log_scale), 0.1, rtol=1e-5)
     for opacity in opacities(rows, splat):
@@ -378,28 +356,6 @@ def test_a_signalling_nan_is_a_broken_row_and_no_warning(tmp_path):
     with pytest.raises(ValueError, match="row 1 has a log_scale"):
         files.load(tmp_path / "a.splat")
     assert files.load(tmp_path / "a.splat", drop_broken=True).dropped == 1
-
-
-@pytest.mark.full
-def test_damage_anywhere_is_a_value_error_of_one_line(tmp_path):
-    """Bytes changed, removed and inserted at random; 28 000 cases were tried once."""
-    rng = np.random.default_rng(0)
-    for suffix in files.SUFFIXES:
-        path = tmp_path / f"a{suffix}"
-        files.save(path, some_splats(6, degree=1))
-        good = path.read_bytes()
-        for _ in range(40):
-            data = bytearray(good)
-            for _ in range(3):
-                place = int(rng.integers(min(len(data), 600)))
-                width, insert = rng.integers(0, 8, 2)
-                data[place : place + width] = rng.bytes(int(insert))
-            path.write_bytes(data)
-            try:
-                files.load(path)
-            except ValueError as error:
-                assert str(error).startswith(f"{path}: ")  # noqa: PT017
-                assert "\n" not in str(error)  # noqa: PT017
 
 
 @pytest.mark.hard_cases

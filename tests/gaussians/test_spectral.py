@@ -35,14 +35,8 @@ def picture(rng, height, width, dtype="float64", channels=3):
 
 def haar_matrices(size):
     """Rows of pair sums and pair differences over sqrt 2, by the definition."""
-    half = size // 2
-    sums, differences = np.zeros((half, size)), np.zeros((half, size))
-    for i in range(half):
-        sums[i, 2 * i] = sums[i, 2 * i + 1] = math.sqrt(0.5)
-        differences[i, 2 * i], differences[i, 2 * i + 1] = (
-            math.sqrt(0.5),
-            -math.sqrt(0.5),
-        )
+    sums = np.kron(np.eye(size // 2), [1, 1]) * math.sqrt(0.5)
+    differences = np.kron(np.eye(size // 2), [1, -1]) * math.sqrt(0.5)
     return sums, differences
 
 
@@ -125,14 +119,6 @@ def test_the_fourier_loss_does_not_grow_with_the_picture(rng):
         for side in (32, 128)
     )
     assert large == pytest.approx(small, rel=0.1)
-
-
-def test_the_fourier_loss_is_blind_to_a_roll_and_the_wavelet_loss_is_not(dtype, rng):
-    image = picture(rng, 12, 10, dtype)
-    rolled = np.roll(image, (3, 5), (0, 1))
-    blind = float(fourier_loss(FourierSpec(), rolled, image))
-    assert blind < {"float32": 1e-11, "float64": 1e-28}[dtype]
-    assert float(wavelet_loss(WaveletSpec(), rolled, image)) > 0.1
 
 
 @pytest.mark.parametrize("size", [(7, 5), *full(((1, 1),), ((8, 6),))])
