@@ -7,12 +7,14 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from gaussians_jax import splats
 from gaussians_jax.effects import kan_motion, mlp_motion, motion_basis
 from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec, SmoothingSpec
 from gaussians_jax.effects.motion_basis import BasisMotionSpec
 from gaussians_jax.splats import Params
 from nerfies_jax.nets.encoding import EncodingSpec
+from tests import scenes
 from tests.gaussians.shared import jitted, put, rows_of, some_gaussians
 
 FRAMES = 9
@@ -115,3 +117,14 @@ def scene_of(name, spec=None, dtype="float64", count=9):
     if name == "kan":
         rows[kan_motion.NAME] = read_by(name, count, dtype)
     return Params(rows, {MOTIONS[name].module.NAME: strong(name, spec, dtype)})
+
+
+def moving_scene(noise=0.1):
+    """Parameters of `scenes.TINY_DEFORMABLE`: its capture's points, which all move."""
+    cloud, rng = scenes.tiny_capture().points, np.random.default_rng(0)
+    rows = splats.from_points(cloud.position, cloud.colour / 255, degree=1)
+    init = jitted(mlp_motion.init, static_argnums=1)
+    nets = init(jax.random.key(0), scenes.TINY_MOTION)
+    nets = jax.tree.map(lambda leaf: leaf + noise * rng.normal(size=leaf.shape), nets)
+    params = put(Params({"splats": rows}, {mlp_motion.NAME: nets}), "float32")
+    return jax.jit(splats.pad_rows, static_argnums=1)(params, 256)

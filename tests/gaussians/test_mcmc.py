@@ -261,6 +261,7 @@ def test_a_moving_scene_grows_to_the_cap_and_resumes_bit_for_bit(tmp_path):
     same_bits(again._replace(key=0), straight._replace(key=0))
 
 
+@pytest.mark.full
 def test_an_event_of_a_scene_leaves_no_faint_row():
     model, state, frames = built(SCENE)
     splats = jax.tree.map(np.asarray, state.params.rows["splats"])

@@ -103,15 +103,6 @@ def test_the_time_part_may_be_summed_once(float64):
         np.testing.assert_allclose(getattr(offsets, name), expected, atol=1e-13)
 
 
-def test_no_gradient_reaches_the_means_through_the_field(float64):
-    params = strong("mlp")
-
-    def total(mean):
-        return jnp.sum(mlp_motion.deform(params, SMALL, mean, put(0.4)).mean)
-
-    assert not jitted(jax.grad(total))(some_gaussians(5).mean).any()
-
-
 @pytest.mark.parametrize("rule", ["log", *full("linear")])
 def test_moving_gaussians(rule, float64):
     gaussians = some_gaussians(6)

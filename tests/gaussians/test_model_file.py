@@ -13,6 +13,7 @@ from gaussians_jax import model_file, scene, splats
 from gaussians_jax.splats import Params
 from nerfies_jax import evaluation
 from tests import scenes
+from tests.gaussians.motions import moving_scene
 from tests.gaussians.shared import jitted, put, with_rows
 
 SIZE = (20, 15)
@@ -21,18 +22,15 @@ SIZE = (20, 15)
 @pytest.fixture(scope="module")
 def trained():
     """A deformable scene with inactive rows in between, and what describes it."""
-    capture, spec = scenes.tiny_capture(), scenes.TINY_DEFORMABLE
-    metadata = scene.metadata_of(capture)
-    params = scene.build(spec, metadata).init(capture, jax.random.key(0)).params
-    params = jax.tree.map(np.asarray, params)
+    params = jax.tree.map(np.asarray, moving_scene(0.02))
     rows = params.rows["splats"]
     inactive = np.arange(len(rows.mean)) % 7 == 0
     logit = np.where(inactive, splats.INACTIVE_LOGIT, rows.opacity_logit)
     codes = np.random.default_rng(0).normal(size=(len(rows.mean), 5))
     rows = {"splats": rows._replace(opacity_logit=logit), "codes": codes}
-    nets = jax.tree.map(lambda leaf: leaf + 0.02, params.nets)
-    about = {"spec": spec, "metadata": metadata, "step": 20, "name": "tiny"}
-    return put(Params(rows, nets), "float32"), about
+    metadata = scene.metadata_of(scenes.tiny_capture())
+    about = {"spec": scenes.TINY_DEFORMABLE, "metadata": metadata, "step": 20}
+    return put(params._replace(rows=rows), "float32"), about | {"name": "tiny"}
 
 
 @pytest.fixture

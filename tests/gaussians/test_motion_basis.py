@@ -11,10 +11,9 @@ import pytest
 from gaussians_jax.effects import motion_basis
 from gaussians_jax.effects.motion_basis import BasisMotionSpec, Offsets
 from nerfies_jax.measure import clock
-from tests import gradients
 from tests.gaussians.motions import BASIS as SMALL
 from tests.gaussians.motions import MOTIONS, deformed, strong
-from tests.gaussians.shared import finite, full, jitted, put, some_gaussians
+from tests.gaussians.shared import finite, full, jitted, some_gaussians
 
 RESIDUAL = dataclasses.replace(SMALL, count=None)
 
@@ -96,19 +95,6 @@ def test_prepared_ahead_or_in_the_step_is_the_same(spec, dtype):
             # Rounding only: the two programs may fuse sums differently.
             tolerance = {"float32": 1e-6, "float64": 1e-15}[dtype]
             np.testing.assert_allclose(ours, theirs, atol=tolerance, rtol=tolerance)
-
-
-def test_slopes_reach_the_means_where_they_are_not_detached(float64):
-    params, time, mean = strong("basis"), put(0.4), some_gaussians(5).mean
-
-    def total(params, time, mean, detach=False):
-        spec = dataclasses.replace(SMALL, detach=detach)
-        offsets = MOTIONS["basis"].deform(params, spec, mean, time)
-        return sum(jnp.sum(jnp.sin(leaf)) for leaf in offsets)
-
-    assert gradients.directional_error(total, params, time, mean, step=1e-6) < 1e-6
-    detached = jitted(jax.grad(total, argnums=2), static_argnums=3)
-    assert not detached(params, time, mean, True).any()
 
 
 @jax.jit

@@ -50,15 +50,24 @@ def total_of(name, spec=None):
 
 @by_name
 def test_gradients_of_the_field(name, float64):
-    """Of the parameters and the time, and of the codes that a row has of its own."""
+    """Of the parameters, the time, and what is read where its slopes are not cut."""
     params, reads, time = strong(name), read_by(name, 5), put(0.4)
+    spec = MOTIONS[name].spec
+    if name == "basis":
+        spec = dataclasses.replace(spec, detach=False)
 
     def total(params, time, reads=reads):
-        return total_of(name)(params, reads, time)[0]
+        return total_of(name, spec)(params, reads, time)[0]
 
-    args = (params, time, reads) if name == "kan" else (params, time)
+    args = (params, time) if name == "mlp" else (params, time, reads)
     # ReLU has kinks: the step is short.
     assert gradients.directional_error(total, *args, step=1e-6) < 1e-6
+
+
+@pytest.mark.parametrize("name", ["mlp", *full("basis")])
+def test_no_gradient_reaches_the_means_through_the_field(name, float64):
+    slopes = jitted(jax.grad(total_of(name), argnums=1, has_aux=True))
+    assert not slopes(strong(name), read_by(name, 5), put(0.4))[0].any()
 
 
 @pytest.mark.full
@@ -76,7 +85,7 @@ def test_blocks_change_nothing_but_memory(name, count, float64):
     assert offsets[0].shape == (count, 3)
 
 
-@by_name
+@pytest.mark.parametrize("name", ["basis", *full("mlp", "kan")])
 def test_rows_beyond_the_active_blocks_are_still(name, dtype):
     params, reads = strong(name, dtype=dtype), read_by(name, 24, dtype)
     every, some = (
@@ -109,7 +118,7 @@ def scene_and_effect(name):
     return params, (motion.module.effect(spec, steps=100, frames=2),)
 
 
-@pytest.mark.parametrize("name", ["kan", "basis", *full("mlp")])
+@pytest.mark.parametrize("name", ["kan", *full("mlp", "basis")])
 def test_a_trained_scene_is_drawn_from_what_was_prepared_without_noise(name, float64):
     motion, (params, effects) = MOTIONS[name], scene_and_effect(name)
 

@@ -9,6 +9,7 @@ from gaussians_jax.splats import Gaussians
 from nerfies_jax import evaluation
 from nerfies_jax.training.model import TrainState
 from tests import scenes
+from tests.gaussians.motions import moving_scene
 from tests.gaussians.shared import jitted, put
 
 SIZE = (20, 15)
@@ -35,13 +36,8 @@ def state_of(params):
 @pytest.fixture(scope="module")
 def swaying():
     """A deformable scene whose Gaussians move at their own speeds."""
-    capture, rng = scenes.tiny_capture(), np.random.default_rng(0)
-    model = scene.build(scenes.TINY_DEFORMABLE, scene.metadata_of(capture))
-    params = model.init(capture, jax.random.key(0)).params
-    nets = jax.tree.map(
-        lambda leaf: np.asarray(leaf) + 0.1 * rng.normal(size=leaf.shape), params.nets
-    )
-    return model, state_of(params._replace(nets=put(nets, "float32")))
+    metadata = scene.metadata_of(scenes.tiny_capture())
+    return scene.build(scenes.TINY_DEFORMABLE, metadata), state_of(moving_scene())
 
 
 def active_rows(state):
@@ -52,6 +48,12 @@ def deformed_rows(model, state, times=(0.0, 0.3, 1.0)):
     prepared = model.stages.prepare(state.params)
     deform = jitted(model.stages.deform)
     return [deform(state.params, prepared, np.float32(time)) for time in times]
+
+
+def farthest(model, state):
+    """How far each row is from where it is in the middle, at either end."""
+    middle, *ends = deformed_rows(model, state, (0.5, 0.0, 1.0))
+    return np.max([max_displacement(middle, end) for end in ends], axis=0)
 
 
 def test_a_motion_from_knots_is_met_at_the_knots_and_near_between(swaying):
@@ -93,8 +95,7 @@ def test_what_stands_still_may_be_left_out(swaying):
         for name in Gaussians._fields:  # a row that is not drawn may be anywhere
             a, b = (np.asarray(getattr(x, name))[active] for x in (found, deform))
             np.testing.assert_allclose(a, b, atol=2e-6, err_msg=name)
-    middle, *_, end = deformed_rows(*swaying, (0.5, 1.0))
-    moved = max_displacement(middle, end)[active]
+    moved = farthest(*swaying)[active]
     below = float(np.median(moved))
     made = variants.without_static(*swaying, below)
     left = len(made.state.params[1].dynamic.rows["splats"].mean)
@@ -147,9 +148,7 @@ def test_what_moves_may_be_left_out(swaying):
     # Slower, so that all stay in the picture
     nets = jax.tree.map(lambda leaf: put(np.asarray(leaf) / 2), state.params.nets)
     state = state_of(state.params._replace(nets=nets))
-    middle, *ends = deformed_rows(model, state, (0.5, 0.0, 1.0))
-    distance = np.max([max_displacement(middle, end) for end in ends], axis=0)
-    active = active_rows(state)
+    distance, active = farthest(model, state), active_rows(state)
     far = float(np.median(distance[active]))
     left, summary = variants.without_moving(model, state, far)
     shown = active_rows(left)
