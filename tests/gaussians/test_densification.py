@@ -83,15 +83,6 @@ def test_observe_counts_visible_views_in_ndc_units(dtype):
     assert stats.grad2d.dtype.name == dtype
 
 
-@pytest.mark.full
-@pytest.mark.hard_cases
-def test_tiny_slopes_are_not_lost_to_their_squares(dtype):
-    stats = make(dtype=dtype)[2]
-    gradient, seen = np.full((6, 2), 1e-25, dtype), np.ones(6, dtype)
-    stats = observe(stats, gradient, seen > 0, seen, (2, 2))
-    np.testing.assert_allclose(stats.grad2d, math.sqrt(2) * 1e-25, rtol=1e-6)
-
-
 def test_a_small_row_is_cloned_and_its_clone_starts_without_moments(dtype):
     params, moments, stats = make(dtype=dtype)
     changed = run(params, moments, hot(stats, [2]))
