@@ -5,34 +5,34 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 
 from gaussians_jax import splats as rows
-from gaussians_jax.effects import acceleration, deformation, mlp_motion
+from gaussians_jax.effects import acceleration
 from gaussians_jax.effects.acceleration import AccelerationSpec
-from gaussians_jax.effects.mlp_motion import MotionSpec
-from gaussians_jax.optimiser import scale_by_row_adam
-from gaussians_jax.splats import Params, Splats
-from nerfies_jax.nets.encoding import EncodingSpec
-from nerfies_jax.training.effects import FrameCondition, PenaltyContext, weighted_sum
+from gaussians_jax.splats import Params
+from nerfies_jax.training.effects import FrameCondition, PenaltyContext
 from tests import gradients
+from tests.gaussians.shared import any_nonzero, finite, full, jitted, put
 
-unrest = jax.jit(acceleration.unrest, static_argnums=(4, 5))
-instants = jax.jit(acceleration.instants, static_argnums=1)
+unrest = jitted(acceleration.unrest, static_argnums=(4, 5))
+instants = jitted(jax.vmap(acceleration.instants, (0, None)), static_argnums=1)
+draw_active = jitted(acceleration.draw_active, static_argnums=2)
 
 
 def scene(count=12, active=None, dtype="float32", size=1.0):
     """Gaussians and, under "amplitude", how far each swings."""
     rng = np.random.default_rng(0)
-    leaves = [size * rng.normal(size=(count, 3))]
-    leaves += [np.zeros((count, *shape)) for shape in [(3,), (4,), (), (1, 3), (0, 3)]]
-    splats = Splats(*(jnp.asarray(leaf, dtype) for leaf in leaves))
-    if active is not None:
-        logit = np.where(active, 0, rows.INACTIVE_LOGIT)
-        splats = splats._replace(opacity_logit=jnp.asarray(logit, dtype))
-    amplitude = jnp.asarray(0.02 * size * rng.normal(size=(count, 3)), dtype)
-    return Params({"splats": splats, "amplitude": amplitude}, {})
+    mean = size * rng.normal(size=(count, 3))
+    active = np.ones(count, bool) if active is None else active
+    splats = rows.Splats(
+        mean,
+        *(np.zeros((count, n)) for n in (3, 4)),
+        np.where(active, 0, rows.INACTIVE_LOGIT),
+        *(np.zeros((count, n, 3)) for n in (1, 0)),
+    )
+    amplitude = 0.02 * size * rng.normal(size=(count, 3))
+    return put(Params({"splats": splats, "amplitude": amplitude}, {}), dtype)
 
 
 def swinging(params, time):
@@ -58,11 +58,11 @@ def slow_unrest(canonical, before, now, after, decay, drift):
     return total / len(canonical) / decay**2
 
 
-@pytest.mark.parametrize("drift", [0.0, 0.5])
+@pytest.mark.parametrize("drift", [0.5, *full(0.0)])
 def test_unrest_is_the_weighed_sum_of_differences(drift, dtype):
     rng = np.random.default_rng(0)
     four = rng.normal(size=(4, 9, 3)).astype(dtype)
-    value = unrest(*(jnp.asarray(x) for x in four), 2.0, drift)
+    value = unrest(*four, 2.0, drift)
     expected = slow_unrest(*four.astype(np.float64), 2.0, drift)
     tolerance = {"float32": 1e-6, "float64": 1e-13}[dtype]
     np.testing.assert_allclose(value, expected, rtol=tolerance)
@@ -71,8 +71,8 @@ def test_unrest_is_the_weighed_sum_of_differences(drift, dtype):
 
 def test_gradients_with_the_weight_held(float64):
     rng = np.random.default_rng(0)
-    canonical, before, now, after = (jnp.asarray(x) for x in rng.normal(size=(4, 9, 3)))
-    weight = np.exp(-np.linalg.norm(np.asarray(now - canonical), axis=1) / 2)
+    canonical, *three = put(tuple(rng.normal(size=(4, 9, 3))))
+    weight = np.exp(-np.linalg.norm(three[1] - np.asarray(canonical), axis=1) / 2)
 
     def held(before, now, after):  # the weight as a constant
         second = jnp.sum((after - 2 * now + before) ** 2, axis=1)
@@ -82,13 +82,9 @@ def test_gradients_with_the_weight_held(float64):
     def ours(before, now, after):
         return acceleration.unrest(canonical, before, now, after, 2.0, 0.5)
 
-    assert gradients.directional_error(held, before, now, after) < 1e-8
-    for a, b in zip(
-        jax.jit(jax.grad(ours, (0, 1, 2)))(before, now, after),
-        jax.jit(jax.grad(held, (0, 1, 2)))(before, now, after),
-        strict=True,
-    ):
-        np.testing.assert_allclose(a, b, atol=1e-14)
+    assert gradients.directional_error(held, *three) < 1e-8
+    grads, expected = (jitted(jax.grad(f, (0, 1, 2)))(*three) for f in (ours, held))
+    np.testing.assert_allclose(grads, expected, atol=1e-14)
 
 
 @pytest.mark.hard_cases
@@ -113,64 +109,62 @@ def energy(before, now, after):
 def test_slopes_are_finite_at_any_distance_and_free_far_away(distance, dtype):
     now = np.asarray([[distance, 0, 0]], dtype)
     value, grads = energy(now - now.dtype.type(0.5), now, now)
-    assert np.isfinite(value)
-    assert all(np.isfinite(grad).all() for grad in grads)
+    assert finite((value, grads))
     if distance < 1e-6:
         np.testing.assert_allclose(value, 0.75 + 0.75 / 4, rtol=1e-6)
     if distance >= 100:
         assert float(value) < 1e-30  # exp(-100) is 4e-44
-    still, grads = energy(now, now, now)
-    assert float(still) == 0
-    assert not any(np.asarray(grad).any() for grad in grads)
+    assert not any_nonzero(energy(now, now, now))
 
 
 @pytest.mark.hard_cases
-@pytest.mark.parametrize("interval", [1 / 300, 1 / 7, 0.5, 0.8])
-@pytest.mark.parametrize("time", [0.0, 1e-3, 0.3, 0.5, 1 - 1e-3, 1.0])
-def test_the_three_times_stay_within_the_capture(interval, time, dtype):
-    before, now, after = np.asarray(
-        instants(np.asarray(time, dtype), interval), np.float64
-    )
-    assert 0 <= before < now < after <= 1
+@pytest.mark.parametrize("interval", [1 / 300, 0.5, 0.8, *full(1 / 7)])
+def test_the_three_times_stay_within_the_capture(interval, dtype):
+    times = np.asarray([0.0, 1e-3, 0.3, 0.5, 1 - 1e-3, 1.0], dtype)
+    before, now, after = np.asarray(instants(times, interval), np.float64).T
+    assert ((before >= 0) & (after <= 1)).all()
     step = min(interval, 0.5)
     np.testing.assert_allclose([now - before, after - now], step, rtol=2e-5)
-    if step < time < 1 - step:
-        np.testing.assert_allclose(now, time, rtol=1e-6)
+    inner = (step < times) & (times < 1 - step)
+    np.testing.assert_allclose(now[inner], times[inner], rtol=1e-6)
 
 
-@pytest.mark.parametrize("places", [[3], [0, 11], [1, 2, 5, 8, 9]])
+@pytest.mark.parametrize("places", [[1, 2, 5, 8, 9], *full([3], [0, 11])])
 def test_rows_are_drawn_evenly_from_the_active(places):
-    active = jnp.asarray(np.isin(np.arange(12), places))
-    drawn = jax.jit(acceleration.draw_active, static_argnums=2)(
-        jax.random.key(0), active, 6000
-    )
-    counts = np.bincount(np.asarray(drawn), minlength=12)
+    active = np.isin(np.arange(12), places)
+    drawn = draw_active(jax.random.key(0), active, 6000)
+    counts = np.bincount(drawn, minlength=12)
     assert set(np.flatnonzero(counts)) == set(places)
     share = 6000 / len(places)
     assert np.abs(counts[places] - share).max() < 5 * np.sqrt(share)
 
 
-def ask(spec, params, time, step=0, at_time=swinging, extent=1.0, frames=11, seed=0):
-    effect = acceleration.effect(spec, extent, frames)
-    dtype = params.rows["splats"].mean.dtype
+@functools.cache
+def compiled_penalty(spec, at_time, extent):
+    effect = acceleration.effect(spec, extent, 11)
 
-    @jax.jit
-    def penalty(params, time, step):
+    def penalty(params, time, step, seed):
         condition = FrameCondition(time, step=step, key=jax.random.key(seed))
         context = PenaltyContext(condition, step, None, params, at_time=at_time)
         return effect.penalty(None, context)
 
-    return penalty(params, jnp.asarray(time, dtype), jnp.asarray(step))
+    return jitted(penalty)
 
 
-@pytest.mark.parametrize("time", [0.0, 0.43, 1.0])
+def ask(spec, params, time, step=0, at_time=swinging, extent=1.0, seed=0):
+    time = np.asarray(time, params.rows["splats"].mean.dtype)
+    return compiled_penalty(spec, at_time, extent)(params, time, step, seed)
+
+
+@pytest.mark.parametrize("time", [0.43, *full(0.0, 1.0)])
 def test_the_effect_is_the_mean_over_the_rows_it_draws(time, dtype):
-    spec = AccelerationSpec(weight=0.3, decay=0.02, drift=0.5, interval=2.0)
+    spec = AccelerationSpec(weight=0.3, decay=0.02, drift=0.5, interval=2.0, start=9)
     active = np.arange(12) % 4 != 1
     params = scene(active=active, dtype=dtype)
-    terms = ask(spec, params, time, extent=3.0)
+    before, terms = (ask(spec, params, time, step, extent=3.0) for step in (8, 9))
+    assert before["unrest"].value == 0
     key = jax.random.fold_in(jax.random.key(0), acceleration._STREAM)
-    drawn = np.asarray(acceleration.draw_active(key, jnp.asarray(active), 12))
+    drawn = draw_active(key, active, 12)
     middle = np.clip(time, 0.2, 0.8)
     expected = slow_unrest(
         np.asarray(params.rows["splats"].mean, np.float64)[drawn],
@@ -186,37 +180,12 @@ def test_the_effect_is_the_mean_over_the_rows_it_draws(time, dtype):
     assert terms["still"].weight is None
 
 
-def test_other_steps_draw_other_rows():
-    spec, params = AccelerationSpec(samples=3), scene()
-    values = {
-        float(ask(spec, params, 0.4, seed=seed)["unrest"].value) for seed in range(4)
-    }
-    assert len(values) == 4
-
-
-def linear(params, time):
-    gaussians = rows.activate(params.rows["splats"])
-    swing = params.rows["amplitude"] * jnp.sin(5 * time)
-    return gaussians._replace(mean=gaussians.mean + swing)
-
-
-def test_its_weight_does_not_depend_on_the_unit_of_length(float64):
-    spec = AccelerationSpec()
-    small, large = (
-        ask(spec, scene(dtype="float64", size=x), 0.4, at_time=linear, extent=x)
-        for x in (1.0, 1000.0)
-    )
-    np.testing.assert_allclose(small["unrest"].value, large["unrest"].value, rtol=1e-9)
-
-
 def test_gradients_of_the_effect(float64):
     """Through a motion whose displacement, and so the weight, is held at `now`."""
     spec = AccelerationSpec(decay=1e6)  # the weight is 1 to 1e-8
     params = scene(dtype="float64")
     effect = acceleration.effect(spec, 1.0, 11)
-    condition = FrameCondition(
-        jnp.asarray(0.4), step=jnp.asarray(0), key=jax.random.key(0)
-    )
+    condition = FrameCondition(put(0.4), step=put(0), key=jax.random.key(0))
 
     def total(amplitude):
         swung = params._replace(rows=params.rows | {"amplitude": amplitude})
@@ -235,85 +204,3 @@ def test_without_active_rows_there_is_nothing(dtype):
         "unrest": 0,
         "still": 0,
     }
-
-
-MOTION = MotionSpec(
-    position=EncodingSpec(2), time=EncodingSpec(3), depth=2, width=16, skips=()
-)
-
-
-def travel(motion, params, net):
-    """Root mean square distance between the places at two times."""
-    params = Params(params.rows, {mlp_motion.NAME: net})
-    gaussians = rows.activate(params.rows["splats"])
-    one, other = (
-        motion.deform(params, gaussians, FrameCondition(jnp.asarray(time)), None).mean
-        for time in (0.3, 0.5)
-    )
-    return float(jnp.sqrt(jnp.mean(jnp.square(one - other))))
-
-
-def test_under_a_network_it_waits_for_its_start_and_then_stills_it():
-    """Through the scene's own seams: smoothing, blocks and a warm-up are in the way."""
-    motion = mlp_motion.effect(MOTION, steps=5000, frames=11)
-    params = scene()
-    net = motion.init(jax.random.key(1))
-    heads = jax.tree.map(lambda leaf: 300 * leaf, net.trunk.heads)
-    net = net._replace(trunk=net.trunk._replace(heads=heads))
-    params = Params(params.rows, {mlp_motion.NAME: net})
-    spec = AccelerationSpec(start=4000, decay=0.1)
-    effect = acceleration.effect(spec, 1.0, 11)
-
-    def penalty(net, step):
-        condition = FrameCondition(jnp.asarray(0.4), step=step, key=jax.random.key(0))
-
-        def at_time(params, time):
-            gaussians = rows.activate(params.rows["splats"])
-            then = condition._replace(time=time)
-            return deformation.deform_in_training((motion,), params, gaussians, then)
-
-        here = Params(params.rows, {mlp_motion.NAME: net})
-        context = PenaltyContext(condition, step, None, here, at_time=at_time)
-        return weighted_sum(effect.penalty(None, context))
-
-    run = jax.jit(jax.value_and_grad(penalty))
-    value, grads = run(net, jnp.asarray(3999))
-    assert value == 0
-    assert not any(np.asarray(leaf).any() for leaf in jax.tree.leaves(grads))
-    value, grads = run(net, jnp.asarray(4000))
-    assert value > 0
-    leaves = jax.tree.leaves(grads)
-    assert all(np.isfinite(leaf).all() for leaf in leaves)
-    assert any(np.asarray(leaf).any() for leaf in leaves)
-    tx = optax.chain(scale_by_row_adam(), optax.scale(-2e-3))
-
-    def descend(_, carry):
-        net, moments = carry
-        update, moments = tx.update(run(net, jnp.asarray(4000))[1], moments)
-        return optax.apply_updates(net, update), moments
-
-    stilled, _ = jax.lax.fori_loop(0, 200, descend, (net, tx.init(net)))
-    assert travel(motion, params, stilled) < 0.3 * travel(motion, params, net)
-    program = run.lower(net, jnp.asarray(0)).compile().as_text()
-    assert "conditional" in program
-
-
-@pytest.mark.parametrize(
-    ("setting", "message"),
-    [
-        ({"weight": -1.0}, "weight=-1.0 must be finite and not negative"),
-        ({"drift": float("nan")}, "drift=nan"),
-        ({"decay": 0.0}, "decay=0.0 must be finite and positive"),
-        ({"interval": float("inf")}, "interval=inf"),
-        ({"samples": 0}, "samples >= 1"),
-        ({"start": -1}, "start >= 0"),
-    ],
-)
-def test_settings_that_cannot_work_are_refused(setting, message):
-    with pytest.raises(ValueError, match=message):
-        AccelerationSpec(**setting)
-
-
-def test_a_single_frame_has_no_acceleration():
-    with pytest.raises(ValueError, match="at least two frames"):
-        acceleration.effect(AccelerationSpec(), 1.0, 1)

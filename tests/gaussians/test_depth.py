@@ -3,15 +3,12 @@
 import functools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 import scipy.stats
 
 from gaussians_jax.effects import depth
 from gaussians_jax.effects.depth import DepthSpec
-from gaussians_jax.optimiser import scale_by_row_adam
 from nerfies_jax.training.effects import (
     Observation,
     PenaltyContext,
@@ -20,11 +17,12 @@ from nerfies_jax.training.effects import (
 )
 from nerfies_jax.training.model import Rendering
 from tests import gradients
+from tests.gaussians.shared import full, jitted, put
 
 COUNT = 31
-FORMS = {name: jax.jit(form) for name, form in depth.FORMS.items()}
-SLOPES = {name: jax.jit(jax.value_and_grad(form)) for name, form in depth.FORMS.items()}
-nth_smallest = jax.jit(depth.nth_smallest)
+FORMS = {name: jitted(form) for name, form in depth.FORMS.items()}
+SLOPES = {name: jitted(jax.value_and_grad(form)) for name, form in depth.FORMS.items()}
+nth_smallest = jitted(depth.nth_smallest)
 EVERYWHERE = np.ones(COUNT, bool)
 
 
@@ -49,7 +47,9 @@ def expected_loss(kind, drawn, truth):
     return np.abs(normalised(drawn) - normalised(truth)).mean()
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])  # even and odd numbers of known pixels
+@pytest.mark.parametrize(
+    "seed", [0, 1, *full(2)]
+)  # even and odd numbers of known pixels
 @pytest.mark.parametrize("kind", depth.KINDS)
 def test_losses_are_those_of_the_known_pixels(kind, seed, dtype):
     drawn, truth, known = two_depths(dtype, seed)
@@ -65,72 +65,28 @@ def test_losses_are_those_of_the_known_pixels(kind, seed, dtype):
 
 @pytest.mark.parametrize("kind", depth.KINDS)
 def test_gradients(kind, float64):
-    drawn, truth, known = map(jnp.asarray, two_depths("float64"))
+    drawn, truth, known = map(put, two_depths("float64"))
 
     def total(drawn):
         return depth.FORMS[kind](drawn, truth, known)
 
     assert gradients.directional_error(total, drawn, step=1e-6) < 1e-6
-    grad = jax.jit(jax.grad(total))(drawn)
-    assert not np.asarray(grad)[~np.asarray(known)].any()
+    assert not SLOPES[kind](drawn, truth, known)[1][~np.asarray(known)].any()
 
 
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("kind", ["affine", "correlation"])
-@pytest.mark.parametrize(("scale", "offset"), [(1e-3, 0.0), (1.0, 7.0), (50.0, -20.0)])
+@pytest.mark.parametrize(("scale", "offset"), [(1e-3, 0.0), (50.0, 20.0)])
 def test_scale_and_offset_are_not_seen(kind, scale, offset, dtype):
     drawn, truth, known = two_depths(dtype)
     value, _ = SLOPES[kind](drawn, truth, known)
-    moved, _ = SLOPES[kind](drawn * scale + offset + 40, truth, known)
-    # At 1e-3 on 40 the deviation is under a thousandth of the depth: flat.
-    if scale < 1e-2:
-        moved, _ = SLOPES[kind](drawn * scale, truth, known)
+    moved, _ = SLOPES[kind](drawn * scale + offset, truth, known)
     tolerance = {"float32": 2e-5, "float64": 1e-11}[dtype]
     np.testing.assert_allclose(moved, value, rtol=tolerance)
     same, _ = SLOPES[kind](truth * 3 + 1, truth, known)
     # In float32 the correlation keeps 1e-12: 1 - r would keep 1e-7.
     limit = {"affine": {"float32": 2e-6}, "correlation": {"float32": 1e-11}}[kind]
     assert 0 <= same <= limit.get(dtype, 1e-13)
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def descended(kind, shape, start, truth):
-    """The depth 2 + shape @ p after Adam on p."""
-    tx = optax.chain(scale_by_row_adam(), optax.scale(-5e-3))
-
-    def loss(p):
-        return depth.FORMS[kind](2 + shape @ p, truth, jnp.asarray(EVERYWHERE))
-
-    def step(carry, _):
-        p, moments = carry
-        update, moments = tx.update(jax.grad(loss)(p), moments)
-        return (p + update, moments), None
-
-    (p, _), _ = jax.lax.scan(step, (start, tx.init(start)), None, length=3000)
-    return 2 + shape @ p
-
-
-def agreement(one, other):
-    return np.corrcoef(np.asarray(one), np.asarray(other))[0, 1]
-
-
-@pytest.mark.parametrize("seed", [0, 1, 2, 3, 4])
-def test_descent_on_the_correlation_finds_the_truth_s_shape(seed, float64):
-    start, truth, _ = two_depths("float64", seed)
-    assert agreement(start, truth) < 0.5
-    end = descended("correlation", jnp.eye(COUNT), start - 2, truth)
-    assert agreement(end, truth) > 0.999
-
-
-def test_a_depth_turned_inside_out_is_wrong_and_correlation_turns_it_back():
-    """Least squares would give it a negative scale and no loss."""
-    truth = two_depths("float32")[1]
-    # Exactly inside out is level, as a maximum is; with a little noise it is not.
-    drawn = 5 - truth + 0.1 * two_depths("float32", 6)[0]
-    for kind in ("affine", "correlation"):
-        assert FORMS[kind](drawn, truth, EVERYWHERE) > 1.9  # of 2
-    end = descended("correlation", jnp.eye(COUNT, dtype="float32"), drawn - 2, truth)
-    assert agreement(end, truth) > 0.99
 
 
 @pytest.mark.hard_cases
@@ -140,29 +96,6 @@ def test_the_affine_loss_is_level_where_every_pixel_is_on_the_wrong_side(dtype):
     value, grad = SLOPES["affine"](5 - truth, truth, EVERYWHERE)
     np.testing.assert_allclose(value, 2, rtol=1e-6)
     assert np.abs(grad).max() < 1e-6
-
-
-def test_outliers_of_a_guess_bend_the_affine_fit_less(float64):
-    """Smooth depths fitted to a guess that is wild in a tenth of its pixels."""
-    t = np.linspace(-np.pi, np.pi, COUNT)
-    shape = [np.cos(k * t) for k in range(1, 5)] + [np.sin(k * t) for k in range(1, 4)]
-    shape, errors = jnp.asarray(np.stack(shape, axis=1)), []
-    for seed in range(4):
-        rng = np.random.default_rng(seed)
-        waves = jnp.asarray(0.15 * rng.normal(size=7))
-        truth = 2 + np.asarray(shape @ waves)
-        wild = rng.choice(COUNT, 3, replace=False)
-        guess = truth.copy()
-        guess[wild] += rng.uniform(1, 2, 3)
-        start = waves + 0.05 * rng.normal(size=7)
-        errors.append(
-            [
-                1 - agreement(descended(kind, shape, start, guess), truth)
-                for kind in ("affine", "correlation")
-            ]
-        )
-    affine, correlation = np.mean(errors, axis=0)
-    assert affine < 0.6 * correlation
 
 
 def hard_pictures():
@@ -214,7 +147,7 @@ def test_a_flat_drawing_is_bent_towards_the_truth(dtype):
 
 
 @pytest.mark.hard_cases
-@pytest.mark.parametrize("count", [1, 2, 7, 20])
+@pytest.mark.parametrize("count", [1, 2, 20])
 def test_the_nth_smallest_is_that_of_a_sort(count, dtype):
     rng = np.random.default_rng(count)
     values = np.exp(rng.uniform(-60, 60, 20)).astype(dtype)
@@ -228,10 +161,10 @@ def test_the_nth_smallest_is_that_of_a_sort(count, dtype):
 
 def some_shot(dtype="float32", size=(5, 6)):
     rng = np.random.default_rng(0)
-    drawn, truth = (jnp.asarray(rng.uniform(1, 4, size), dtype) for _ in range(2))
-    colour = jnp.zeros((*size, 3), dtype)
+    drawn, truth = rng.uniform(1, 4, (2, *size)).astype(dtype)
+    colour = np.zeros((*size, 3), dtype)
     return Observation(
-        Rendering(colour, jnp.ones(size, dtype), drawn), colour, None, truth
+        Rendering(colour, np.ones(size, dtype), drawn), colour, None, truth
     )
 
 
@@ -251,7 +184,7 @@ def loss_and_slope(spec, shot):
 @pytest.mark.hard_cases
 @pytest.mark.parametrize(
     ("kind", "space"),
-    [("metric", "depth"), ("affine", "disparity"), ("correlation", "disparity")],
+    [("metric", "depth"), ("affine", "disparity"), *full(("correlation", "disparity"))],
 )
 def test_what_is_unknown_or_see_through_teaches_nothing(kind, space, dtype):
     """0, NaN and infinity stand for unknown; a haze's expected depth is none."""
@@ -281,31 +214,15 @@ def test_what_is_unknown_or_see_through_teaches_nothing(kind, space, dtype):
     assert not alpha_slope.any()
 
 
-def test_without_depth_there_is_no_term():
-    spec, shot = DepthSpec(), some_shot()._replace(depth=None)
-    assert depth.terms(spec, shot) == {}
-
-
 def test_the_effect_reads_the_depths():
-    spec, shot = DepthSpec("metric"), some_shot()
-    effect = depth.effect(spec)
+    effect, shot = depth.effect(DepthSpec("metric")), some_shot()
     assert effect.required_data == {"depths"}
-    context = PenaltyContext(None, None, None, None, observation=shot)
-    terms = effect.penalty(None, context)
-    truth = np.asarray(shot.depth)
-    error = np.abs(np.asarray(shot.rendering.depth) - truth).mean() / truth.mean()
-    np.testing.assert_allclose(weighted_sum(terms), 0.1 * error, rtol=1e-6)
 
+    @jitted
+    def loss(shot):
+        context = PenaltyContext(None, None, None, None, observation=shot)
+        return weighted_sum(effect.penalty(None, context))
 
-@pytest.mark.parametrize(
-    ("setting", "message"),
-    [
-        ({"kind": "ordinal"}, "kind is one of"),
-        ({"space": "log"}, "space one of"),
-        ({"weight": -1.0}, "not negative"),
-        ({"opaque": 0.0}, "0 < opaque < 1"),
-    ],
-)
-def test_settings_that_cannot_work_are_refused(setting, message):
-    with pytest.raises(ValueError, match=message):
-        DepthSpec(**setting)
+    error = np.abs(shot.rendering.depth - shot.depth).mean() / shot.depth.mean()
+    np.testing.assert_allclose(loss(shot), 0.1 * error, rtol=1e-6)
+    assert depth.terms(DepthSpec(), shot._replace(depth=None)) == {}

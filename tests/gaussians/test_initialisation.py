@@ -7,17 +7,9 @@ import pytest
 
 from gaussians_jax import initialisation
 from gaussians_jax.initialisation import InitSpec
-from tests import scenes
+from tests.gaussians.test_refusals import capture_with
 
 SPEC = InitSpec(points=10**4, random=70, extra_random=30)
-
-
-def capture_with(points):
-    """The small capture with some of its own points, or with none."""
-    capture = scenes.tiny_capture()
-    cloud = capture.points
-    kept = None if points is None else type(cloud)(*(leaf[:points] for leaf in cloud))
-    return dataclasses.replace(capture, points=kept)
 
 
 def own_points(spec, capture):
@@ -41,10 +33,8 @@ def own_points(spec, capture):
         ("auto", 150, 150, 30),
         ("auto", 99, 0, 70),
         ("auto", None, 0, 70),
-        ("points", 150, 150, 30),
         ("points", 1, 1, 30),
         ("random", 150, 0, 70),
-        ("random", None, 0, 70),
     ],
 )
 def test_the_source_decides_whose_points_they_are(source, points, own, drawn):
@@ -70,19 +60,3 @@ def test_random_points_do_not_depend_on_the_points_of_the_capture():
     for a, b in zip(first, second, strict=True):
         np.testing.assert_array_equal(a, b)
     assert (first[0] != third[0]).any()
-
-
-@pytest.mark.parametrize("points", [None, 0])
-def test_a_capture_without_points_is_refused_by_name(points):
-    spec = dataclasses.replace(SPEC, source="points")
-    capture = capture_with(points)
-    for function in (initialisation.uses_capture_points, initialisation.initial_count):
-        with pytest.raises(ValueError, match=r'it has none; choose source="random"'):
-            function(spec, capture)
-    with pytest.raises(ValueError, match=str(capture.path or capture.name)):
-        initialisation.initial_points(spec, capture, 0)
-
-
-def test_an_unknown_source_is_refused():
-    with pytest.raises(ValueError, match="unknown source 'sfm'; choose from"):
-        InitSpec(source="sfm")

@@ -11,6 +11,7 @@ import pytest
 
 from gaussians_jax import optimiser
 from gaussians_jax.splats import INACTIVE_LOGIT, Params, Splats
+from tests.gaussians.shared import full, jitted, put, same_bits
 
 COUNT = 6
 # optax 0.2.8 raises a float to an integer power, which strict promotion refuses.
@@ -25,20 +26,11 @@ def zeros(rule, params):
 
 def rows_and_nets(dtype="float32"):
     rng = np.random.default_rng(0)
-
-    def leaf(*shape):
-        return jnp.asarray(rng.normal(size=shape), dtype)
-
-    rows = Splats(
-        leaf(COUNT, 3),
-        leaf(COUNT, 3),
-        leaf(COUNT, 4),
-        leaf(COUNT),
-        leaf(COUNT, 1, 3),
-        leaf(COUNT, 3, 3),
-    )
+    shapes = (COUNT, 3), (COUNT, 3), (COUNT, 4), (COUNT,), (COUNT, 1, 3), (COUNT, 3, 3)
+    rows = Splats(*(rng.normal(size=shape) for shape in shapes))
     # A weight matrix with as many rows as there are Gaussians, to catch guessing.
-    return Params({"splats": rows, "embedding": leaf(COUNT, 2)}, {"w": leaf(COUNT, 5)})
+    code, weight = (rng.normal(size=(COUNT, n)) for n in (2, 5))
+    return put(Params({"splats": rows, "embedding": code}, {"w": weight}), dtype)
 
 
 def partitioned(scale_by_rows=optimiser.scale_by_row_adam):
@@ -59,7 +51,10 @@ def first_moments(tx, grads, params):
         return tx.update(grads, tx.init(params), params)[1]
 
     with lenient("standard"):
-        return jax.jit(one_step)(grads, params)
+        return jitted(one_step)(grads, params)
+
+
+gather = jitted(optimiser.gather_rows, static_argnums=0)
 
 
 PAIRS = {
@@ -72,12 +67,12 @@ PAIRS = {
 def test_it_is_optax_s_while_all_rows_are_as_old(name, dtype):
     params = rows_and_nets(dtype).rows
     ours, theirs = PAIRS[name][0](), PAIRS[name][1]
-    state, reference = ours.init(params), theirs.init(params)
-    step_ours, step_theirs = jax.jit(ours.update), jax.jit(theirs.update)
+    state, reference = zeros(ours, params), zeros(theirs, params)
+    step_ours, step_theirs = jitted(ours.update), jitted(theirs.update)
     for seed in range(8):  # RAdam's length passes the threshold at the sixth
         noise = np.random.default_rng(seed)
         grads = jax.tree.map(
-            lambda p, n=noise: jnp.asarray(n.normal(size=p.shape), p.dtype), params
+            lambda p, n=noise: n.normal(size=p.shape).astype(p.dtype), params
         )
         step, state = step_ours(grads, state)
         with lenient("standard"):
@@ -117,7 +112,7 @@ def lengths_and_factors(ages, b2):
 
 
 @pytest.mark.hard_cases
-@pytest.mark.parametrize("b2", [0.7, 0.9, 0.99, 0.999, 0.9999])
+@pytest.mark.parametrize("b2", [0.7, 0.999, *full(0.9, 0.99, 0.9999)])
 def test_the_moments_length_is_right_from_the_first_update_on(b2, dtype):
     """The printed form is 0.03 off in float32 where RAdam takes its decision."""
     length, factor = lengths_and_factors(np.asarray(AGES, dtype), b2)
@@ -174,11 +169,11 @@ def test_rows_that_start_late_follow_radam_from_their_own_first_step(dtype):
     for row, start in enumerate(starts):
         grads[:start, row] = 0
     ours = optimiser.scale_by_row_radam()
-    state = ours.init(jnp.zeros(len(starts), dtype))
-    steps, update = [], jax.jit(ours.update)
-    for grad in grads:
-        step, state = update(jnp.asarray(grad, dtype), state)
-        steps.append(np.asarray(step))
+    state = zeros(ours, grads[0].astype(dtype))
+    steps, update = [], jitted(ours.update)
+    for grad in grads.astype(dtype):
+        step, state = update(grad, state)
+        steps.append(step)
     for row, start in enumerate(starts):
         mine = np.array(steps)[:, row]
         assert not mine[:start].any()
@@ -187,20 +182,6 @@ def test_rows_that_start_late_follow_radam_from_their_own_first_step(dtype):
         tolerance = {"float32": 2e-6, "float64": 1e-12}[dtype]
         np.testing.assert_allclose(mine[start:], expected, rtol=1e-4, atol=tolerance)
     assert state.count.tolist() == [total - start for start in starts]
-
-
-@pytest.mark.parametrize(
-    ("setting", "message"),
-    [
-        ({"b2": 0.6}, r"longest length that b2=0.6 allows"),
-        ({"threshold": 3.0}, r"threshold=3.0 must lie in \[4, 1999\)"),
-        ({"b1": 1.0}, "strictly between 0 and 1"),
-        ({"b2": 1.0}, "strictly between 0 and 1"),
-    ],
-)
-def test_settings_under_which_radam_cannot_work_are_refused(setting, message):
-    with pytest.raises(ValueError, match=message):
-        optimiser.scale_by_row_radam(**setting)
 
 
 @pytest.mark.hard_cases
@@ -249,40 +230,27 @@ def test_a_row_counts_from_its_first_slope(dtype):
     assert state.count.tolist() == [2, 7]
 
 
-def test_leaves_without_rows_are_plain_adam(dtype):
-    ours = optimiser.scale_by_row_adam()
-    scalar = jnp.asarray(2.0, dtype)
-    step, state = ours.update(scalar, ours.init(scalar))
-    np.testing.assert_allclose(step, 1.0, rtol=2e-5)
-    assert state.count.shape == ()
-
-
-@jax.jit
+@jitted
 def first_step(grads):
     ours = optimiser.scale_by_row_adam()
     return ours.update(grads, ours.init(grads))[0]
 
 
 @pytest.mark.hard_cases
-@pytest.mark.parametrize("grad", [1e-4, 1e-8, 1e-10, 1e-15])
-def test_steps_do_not_depend_on_the_size_of_the_slope(grad, dtype):
-    step = first_step(np.full((3, 2), grad, dtype))
+def test_steps_do_not_depend_on_the_size_of_the_slope(dtype):
+    grads = np.asarray([1e-4, 1e-8, 1e-10, 1e-15, 0], dtype)
     # eps = 1e-15 halves the step at 1e-15 and takes 1e-5 at 1e-10.
-    np.testing.assert_allclose(step, grad / (grad + 1e-15), rtol=1e-5)
+    np.testing.assert_allclose(first_step(grads), grads / (grads + 1e-15), rtol=1e-5)
+    scalar = first_step(np.asarray(2.0, dtype))  # no row: plain Adam
+    np.testing.assert_allclose(scalar, 1.0, rtol=2e-5)
 
 
-@pytest.mark.hard_cases
-def test_no_slope_is_no_step(dtype):
-    step = first_step(np.zeros((3, 2), dtype))
-    assert not np.asarray(step).any()
-
-
-UPDATES = {name: jax.jit(ours().update) for name, (ours, _) in PAIRS.items()}
+UPDATES = {name: jitted(ours().update) for name, (ours, _) in PAIRS.items()}
 
 
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("name", PAIRS)
-@pytest.mark.parametrize("grad", [1e19, 1e21, 1e30, np.inf, np.nan])
+@pytest.mark.parametrize("grad", [1e19, 1e21, np.nan, *full(1e30, np.inf)])
 def test_a_slope_too_large_to_square_shows_and_spares_the_others(name, grad, dtype):
     """Divided by an infinite square, its row stands still; the loop looks for it."""
     ours = PAIRS[name][0]()
@@ -295,10 +263,10 @@ def test_a_slope_too_large_to_square_shows_and_spares_the_others(name, grad, dty
     after = state
     for hit in (wild, grads, grads):
         usual, state = update(grads, state)
-        step, after = jax.tree.map(np.asarray, update(hit, after))
+        step, after = update(hit, after)
         others = np.ones((3, 2), bool)
         others[1, 0] = False
-        np.testing.assert_array_equal(step[others], np.asarray(usual)[others])
+        np.testing.assert_array_equal(step[others], usual[others])
         square = after.second[1, 0]
         assert np.isfinite(step[1, 0]) or not np.isfinite(square)
     huge = {"float32": 5e20, "float64": 1e150}[dtype]
@@ -309,72 +277,48 @@ def test_a_slope_too_large_to_square_shows_and_spares_the_others(name, grad, dty
 @pytest.mark.parametrize("name", PAIRS)
 def test_float32_stays_float32_where_x64_is_on(name):
     """NumPy's float64 among the coefficients would make the updates float64."""
-    rule, grads = PAIRS[name][0](), {"w": jnp.ones((3, 2), jnp.float32)}
+    rule, grads = PAIRS[name][0](), {"w": np.ones((3, 2), np.float32)}
     with jax.enable_x64(True):
         shapes = jax.eval_shape(rule.update, grads, jax.eval_shape(rule.init, grads))
     kinds = {leaf.dtype.name for leaf in jax.tree.leaves(shapes)}
     assert kinds == {"float32", "int32"}
 
 
-@pytest.mark.parametrize("name", PAIRS)
-@pytest.mark.parametrize("narrow", [jnp.bfloat16, jnp.float16])
+@pytest.mark.parametrize("name", ["adam", *full("radam")])
+@pytest.mark.parametrize("narrow", [jnp.bfloat16, *full(jnp.float16)])
 def test_parameters_that_small_steps_would_not_move_are_refused(name, narrow):
     """In bfloat16, 200 steps of 1e-3 leave a parameter of one where it was."""
     one, step = np.asarray([1, 1e-3], jnp.bfloat16)
     assert one - step == one
     params = rows_and_nets()
-    params.nets["w"] = jnp.asarray(np.asarray(params.nets["w"]).astype(narrow))
+    params.nets["w"] = put(params.nets["w"], narrow)
     message = f"nets.w is {jnp.dtype(narrow)}, .* train in float32"
     with pytest.raises(ValueError, match=message):
         PAIRS[name][0]().init(params)
 
 
-@pytest.mark.parametrize("name", PAIRS)
+@pytest.mark.parametrize("name", ["adam", *full("radam")])
 def test_a_gather_moves_rows_with_their_moments_and_leaves_nets_alone(name):
     params, tx = rows_and_nets(), partitioned(PAIRS[name][0])
-    grads = jax.tree.map(lambda p: p * 2, params)
-    moments = first_moments(tx, grads, params)
-    rows = jnp.asarray([5, 0, 0, 2, 1, 0, 0, 0])
-    fresh = jnp.asarray([0, 0, 1, 0, 0, 0, 0, 0], bool)
-    inactive = jnp.arange(8) >= 5
-    taken, moved = jax.jit(optimiser.gather_rows, static_argnums=0)(
-        tx, params, moments, rows, fresh, inactive
-    )
-    np.testing.assert_array_equal(
-        taken.rows["embedding"], params.rows["embedding"][rows]
-    )
+    moments = first_moments(tx, params, params)
+    rows = np.asarray([5, 0, 0, 2, 1, 0, 0, 0])
+    fresh, inactive = np.arange(8) == 2, np.arange(8) >= 5
+    taken, moved = gather(tx, params, moments, rows, fresh, inactive)
+    expected = np.asarray(params.rows["embedding"])[rows]
+    np.testing.assert_array_equal(taken.rows["embedding"], expected)
     assert (taken.rows["splats"].opacity_logit[5:] == INACTIVE_LOGIT).all()
     np.testing.assert_array_equal(taken.nets["w"], params.nets["w"])
 
     by_kind = moved[1].inner_states
     before = moments[1].inner_states["mean"].inner_state[0]
     after = by_kind["mean"].inner_state[0]
-    was = before.first.rows["splats"].mean
-    now = after.first.rows["splats"].mean
-    np.testing.assert_array_equal(
-        now[jnp.asarray([0, 1, 3, 4])], was[rows[jnp.asarray([0, 1, 3, 4])]]
-    )
-    assert not np.asarray(now)[[2, 5, 6, 7]].any()
+    was, now = (x.first.rows["splats"].mean for x in (before, after))
+    np.testing.assert_array_equal(now[[0, 1, 3, 4]], was[rows[[0, 1, 3, 4]]])
+    assert not now[[2, 5, 6, 7]].any()
     assert list(after.count.rows["splats"].mean) == [1, 1, 0, 1, 1, 0, 0, 0]
     rest = by_kind["rest"].inner_state[0].second.rows
     assert rest["embedding"].shape == (8, 2)
     assert rest["splats"].sh_rest.shape == (8, 3, 3)
-    jax.tree.map(
-        np.testing.assert_array_equal,
-        by_kind["nets"],
-        moments[1].inner_states["nets"],
-    )
+    same_bits(by_kind["nets"], moments[1].inner_states["nets"])
     with lenient("standard"):  # the state still fits the parameters
         jax.eval_shape(tx.update, taken, moved, taken)
-
-
-def test_the_gather_moves_a_plain_adam_too():
-    params, tx = rows_and_nets(), optax.adam(1e-3)
-    moments = first_moments(tx, params, params)
-    order = jnp.arange(COUNT)[::-1]
-    none = jnp.zeros(COUNT, bool)
-    gather = jax.jit(optimiser.gather_rows, static_argnums=0)
-    _, moved = gather(tx, params, moments, order, none, none)
-    expected = moments[0].mu.rows["splats"].quaternion[::-1]
-    np.testing.assert_array_equal(moved[0].mu.rows["splats"].quaternion, expected)
-    np.testing.assert_array_equal(moved[0].mu.nets["w"], moments[0].mu.nets["w"])

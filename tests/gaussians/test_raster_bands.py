@@ -11,15 +11,15 @@ import pytest
 
 from gaussians_jax import raster, raster_bands
 from gaussians_jax.raster_spec import GSPLAT
-from tests.gaussians import test_raster
+from tests.gaussians import shared, test_raster
 
 SIZE = (29, 37)
 
 
 def both(devices):
     rng = np.random.default_rng(0)
-    footprints, _ = test_raster.some_footprints(rng, 80, SIZE, jnp.float64)
-    values = jnp.asarray(rng.uniform(size=(80, 3)))
+    footprints, _ = test_raster.some_footprints(rng, 80, SIZE, "float64")
+    values = rng.uniform(size=(80, 3))
     row = jax.devices()[:devices]
     assert len(row) == devices
 
@@ -34,9 +34,10 @@ def both(devices):
 
     whole = grads(lambda f, v: raster.rasterise(f, v, SIZE, GSPLAT))
     bands = grads(lambda f, v: raster_bands.rasterise_bands(f, v, SIZE, GSPLAT, row))
-    test_raster.close(bands, whole, 1e-12)
+    shared.close(bands, whole, 1e-12)
 
 
+@pytest.mark.full
 def test_one_device_draws_the_whole_picture(float64):
     both(1)
 
@@ -56,9 +57,3 @@ def test_three_devices_draw_the_whole_picture():
         env=dict(os.environ, JAX_PLATFORMS="cpu"),
     )
     assert result.returncode == 0, result.stderr[-2000:]
-
-
-def test_no_devices_are_refused(float64, rng):
-    footprints, _ = test_raster.some_footprints(rng, 2, SIZE, float64)
-    with pytest.raises(ValueError, match="at least one device"):
-        raster_bands.rasterise_bands(footprints, jnp.ones((2, 1)), SIZE, GSPLAT, ())

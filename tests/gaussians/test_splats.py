@@ -12,6 +12,7 @@ from gaussians_jax import splats as rows
 from gaussians_jax.splats import Params, Splats
 from nerfies_jax.geometry.camera import Camera
 from tests import gradients
+from tests.gaussians.shared import finite, full, jitted, put, same_bits
 
 
 def some_splats(rng, count=7, dtype="float64", degree=3):
@@ -24,12 +25,12 @@ def some_splats(rng, count=7, dtype="float64", degree=3):
         rng.normal(size=(count, 1, 3)),
         rng.normal(size=(count, rest, 3)),
     )
-    return Splats(*(jnp.asarray(leaf, dtype) for leaf in leaves))
+    return put(Splats(*leaves), dtype)
 
 
 def test_activation_is_exp_and_logistic(rng, dtype):
     splats = some_splats(rng, dtype=dtype)
-    drawn = rows.activate(splats)
+    drawn = jitted(rows.activate)(splats)
     scale = np.exp(np.asarray(splats.log_scale, np.float64))
     opacity = 1 / (1 + np.exp(-np.asarray(splats.opacity_logit, np.float64)))
     tolerance = {"float32": 3e-7, "float64": 1e-15}[dtype]
@@ -39,13 +40,13 @@ def test_activation_is_exp_and_logistic(rng, dtype):
 
 
 def test_activation_gradient(rng, float64):
+    splats = some_splats(rng)
+
     def total(log_scale, logit):
-        splats = some_splats(np.random.default_rng(1))
-        splats = splats._replace(log_scale=log_scale, opacity_logit=logit)
-        drawn = rows.activate(splats)
+        moved = splats._replace(log_scale=log_scale, opacity_logit=logit)
+        drawn = rows.activate(moved)
         return jnp.sum(drawn.scale**2) + jnp.sum(drawn.opacity**3)
 
-    splats = some_splats(rng)
     error = gradients.directional_error(total, splats.log_scale, splats.opacity_logit)
     assert error < 1e-8
 
@@ -64,35 +65,20 @@ def total_and_slope(raw, splats):
 @pytest.mark.parametrize("raw", [-100.0, 100.0, -1e30, 1e30])
 def test_raw_values_far_out_stay_finite_with_their_slopes(raw, dtype):
     splats = some_splats(np.random.default_rng(0), dtype=dtype)
-    value, grad = total_and_slope(jnp.asarray(raw, dtype), splats)
-    assert np.isfinite(value)
-    assert np.isfinite(grad)
-
-
-@pytest.mark.hard_cases
-def test_an_inactive_row_has_no_opacity_and_no_way_back(dtype):
-    inactive = jnp.asarray(rows.INACTIVE_LOGIT, dtype)
-    assert jax.nn.sigmoid(inactive) == 0
-    assert jax.grad(jax.nn.sigmoid)(inactive) == 0
+    assert finite(total_and_slope(np.asarray(raw, dtype), splats))
 
 
 def test_padding_repeats_the_first_row_and_marks_it_inactive(rng, dtype):
     splats = some_splats(rng, dtype=dtype)
-    label = jnp.arange(7)
-    params = Params({"splats": splats, "label": label}, {"weight": jnp.ones((7, 2))})
-    padded = jax.jit(rows.pad_rows, static_argnums=1)(params, 12)
-    assert list(rows.active_mask(padded.rows["splats"])) == [True] * 7 + [False] * 5
+    more = {"splats": splats, "label": np.arange(7)}
+    params = Params(more, {"weight": np.ones((7, 2), dtype)})
+    padded = jitted(rows.pad_rows, static_argnums=1)(params, 12)
+    active = jitted(rows.active_mask)(padded.rows["splats"])
+    assert list(active) == [True] * 7 + [False] * 5
     assert list(padded.rows["label"]) == [0, 1, 2, 3, 4, 5, 6, 0, 0, 0, 0, 0]
     assert padded.nets["weight"].shape == (7, 2)  # as many rows by chance, yet no row
     np.testing.assert_array_equal(padded.rows["splats"].mean[:7], splats.mean)
-    back = jax.jit(rows.take_rows)(padded, jnp.arange(7))
-    jax.tree.map(np.testing.assert_array_equal, back, params)
-
-
-def test_padding_to_less_is_refused(rng):
-    params = Params({"splats": some_splats(rng, dtype="float32")}, {})
-    with pytest.raises(ValueError, match="7 rows cannot be padded to a capacity of 6"):
-        rows.pad_rows(params, 6)
+    same_bits(jitted(rows.take_rows)(padded, np.arange(7)), params)
 
 
 def test_capacities_grow_by_half_and_stop_at_the_cap():
@@ -101,57 +87,52 @@ def test_capacities_grow_by_half_and_stop_at_the_cap():
     assert all(b / a <= 2.0 for a, b in itertools.pairwise(sizes))
     assert all(b / a <= 1.67 for a, b in itertools.pairwise(sizes[2:]))
     assert rows.capacity_for(3073, most=3100) == 3100
-    with pytest.raises(ValueError, match="3101 Gaussians do not fit under the cap"):
-        rows.capacity_for(3101, most=3100)
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("degree", [0, 2, 3, *full(1)])
 def test_a_traced_degree_hides_the_bands_above_it(degree, rng, dtype):
     splats = some_splats(rng, dtype=dtype)
-    shown = jax.jit(rows.active_harmonics)(splats, jnp.asarray(degree))
     kept = (degree + 1) ** 2
+
+    def total(splats, degree):
+        shown = rows.active_harmonics(splats, degree)
+        return jnp.sum(shown), shown
+
+    run = jitted(jax.grad(total, has_aux=True))
+    grads, shown = run(splats, np.int32(degree))
     every = np.concatenate([splats.sh_dc, splats.sh_rest], axis=1)
     np.testing.assert_array_equal(shown[:, :kept], every[:, :kept])
-    assert not np.asarray(shown[:, kept:]).any()
-
-    def total(rest):
-        return jnp.sum(rows.active_harmonics(splats._replace(sh_rest=rest), degree))
-
-    grad = np.asarray(jax.grad(total)(splats.sh_rest))
-    assert (grad[:, : kept - 1] == 1).all()
-    assert not grad[:, kept - 1 :].any()
+    assert not shown[:, kept:].any()
+    assert (grads.sh_rest[:, : kept - 1] == 1).all()
+    assert not grads.sh_rest[:, kept - 1 :].any()
 
 
 def test_the_degree_grows_on_schedule():
-    degrees = [int(rows.active_degree(jnp.asarray(s), 1000, 3)) for s in (0, 999, 1000)]
-    assert degrees == [0, 0, 1]
-    assert int(rows.active_degree(jnp.asarray(90_000), 1000, 3)) == 3
+    active_degree = jitted(rows.active_degree, static_argnums=(1, 2))
+    steps = np.asarray([0, 999, 1000, 90_000], np.int32)
+    assert [active_degree(step, 1000, 3) for step in steps] == [0, 0, 1, 3]
 
 
 def test_first_scales_are_the_root_mean_square_of_three_distances(rng):
     points = rng.normal(size=(40, 3)).astype(np.float32)
-    splats = rows.from_points(points, rng.uniform(size=(40, 3)), degree=2)
+    colours = rng.uniform(size=(40, 3))
+    splats = rows.from_points(points, colours, degree=2)
     gap = np.linalg.norm(points[:, None].astype(float) - points[None], axis=-1)
     nearest = np.sort(gap, axis=1)[:, 1:4]
     expected = np.log(np.sqrt(np.mean(nearest**2, axis=1)))
-    np.testing.assert_allclose(splats.log_scale[:, 0], expected, atol=1e-6)
+    scale, dc = np.asarray(splats.log_scale), np.asarray(splats.sh_dc)
+    np.testing.assert_allclose(scale[:, 0], expected, atol=1e-6)
     assert splats.sh_rest.shape == (40, 8, 3)
-    np.testing.assert_allclose(rows.activate(splats).opacity, 0.1, rtol=1e-6)
-
-
-def test_first_colours_come_back(rng):
-    colours = rng.uniform(size=(5, 3))
-    splats = rows.from_points(rng.normal(size=(5, 3)), colours)
-    seen = 0.5 + 0.28209479177387814 * np.asarray(splats.sh_dc[:, 0])
-    np.testing.assert_allclose(seen, colours, atol=1e-6)
+    np.testing.assert_allclose(splats.opacity_logit, np.log(0.1 / 0.9), rtol=1e-6)
+    np.testing.assert_allclose(0.5 + 0.28209479177387814 * dc[:, 0], colours, atol=1e-6)
 
 
 @pytest.mark.hard_cases
-@pytest.mark.parametrize("distinct", [1, 2, 3, 4])
+@pytest.mark.parametrize("distinct", [1, 2, 3, *full(4)])
 def test_few_points_and_duplicates_have_finite_first_scales(distinct, rng):
     points = np.repeat(rng.normal(size=(distinct, 3)), 4, axis=0)
     splats = rows.from_points(points, np.full_like(points, 0.5), lone_scale=0.25)
-    scale = np.asarray(rows.activate(splats).scale)
+    scale = np.exp(np.asarray(splats.log_scale))
     assert (scale > 1e-3).all()
     if distinct == 1:
         np.testing.assert_allclose(scale, 0.25, rtol=1e-6)
@@ -159,17 +140,6 @@ def test_few_points_and_duplicates_have_finite_first_scales(distinct, rng):
         np.testing.assert_allclose(
             scale, np.linalg.norm(points[0] - points[-1]), rtol=1e-6
         )
-
-
-def test_bad_points_are_refused_by_row(rng):
-    points = rng.normal(size=(6, 3))
-    points[4, 1] = np.nan
-    with pytest.raises(ValueError, match="point 4 is not finite"):
-        rows.from_points(points, np.zeros((6, 3)))
-    with pytest.raises(ValueError, match="no points to start from"):
-        rows.from_points(np.zeros((0, 3)), np.zeros((0, 3)))
-    with pytest.raises(ValueError, match=r"\[n, 3\]"):
-        rows.from_points(np.zeros((4, 3)), np.zeros((4, 4)))
 
 
 def ring_of_cameras(count):
@@ -202,23 +172,6 @@ def test_random_points_lie_where_a_camera_sees_them(rng):
     assert seen.all()
 
 
-def test_one_camera_fills_its_picture_and_its_depth_evenly(rng):
-    camera = jax.tree.map(lambda leaf: leaf[0], ring_of_cameras(1))
-    points = rows.random_in_views(rng, camera, (64, 48), 1.0, 4.0, 20_000)
-    x, y, z = camera.camera_from_world @ (points - camera.position).T
-    u, v = 80 * x / z + 4 * y / z + 30, 100 * y / z + 26
-    for values, low, high in ((u, 0, 64), (v, 0, 48), (z, 1, 4)):
-        share, _ = np.histogram(values, bins=8, range=(low, high))
-        # 2500 expected, standard deviation 47.
-        assert abs(share - 2500).max() < 250
-
-
-@pytest.mark.parametrize(("near", "far"), [(0.0, 1.0), (2.0, 1.0), (1.0, np.inf)])
-def test_impossible_depth_ranges_are_refused(near, far, rng):
-    with pytest.raises(ValueError, match="0 < near < far"):
-        rows.random_in_views(rng, ring_of_cameras(2), (4, 4), near, far, 10)
-
-
 def test_extent_is_the_reach_of_the_cameras():
     position = np.array([[0.0, 0, 0], [4, 0, 0], [2, 3, 0], [2, -3, 0]])
     assert rows.scene_extent(position) == pytest.approx(1.1 * 3)
@@ -235,9 +188,8 @@ def test_a_tripod_has_no_extent_of_its_own():
 @pytest.mark.hard_cases
 def test_inactive_rows_change_neither_the_picture_nor_learn_anything(rng):
     splats = some_splats(rng, dtype="float32", degree=0)
-    camera = jax.tree.map(
-        lambda leaf: jnp.asarray(leaf[0], jnp.float32), ring_of_cameras(1)
-    )
+    camera = jax.tree.map(lambda leaf: leaf[0], ring_of_cameras(1))
+    camera = put(camera, "float32")
 
     def loss(splats):
         colour = rendering.render_harmonics(
@@ -246,12 +198,13 @@ def test_inactive_rows_change_neither_the_picture_nor_learn_anything(rng):
         return jnp.sum(colour**2), colour
 
     # Five rows beyond the active hold numbers of their own, inactive in one of the two.
-    padded = rows.pad_rows(Params({"splats": splats}, {}), 12).rows["splats"]
+    pad = jitted(rows.pad_rows, static_argnums=1)
+    padded = pad(Params({"splats": splats}, {}), 12).rows["splats"]
     other = jax.tree.map(
         lambda leaf: np.concatenate([leaf[:7], leaf[6:1:-1]]), padded
     )._replace(opacity_logit=padded.opacity_logit)
-    run = jax.jit(jax.grad(loss, has_aux=True))
-    grads, colour = jax.tree.map(np.asarray, run(padded))
+    run = jitted(jax.grad(loss, has_aux=True))
+    grads, colour = run(padded)
     assert colour.max() > 0.1
     np.testing.assert_array_equal(colour, run(other)[1])
     assert any(leaf[:7].any() for leaf in grads)

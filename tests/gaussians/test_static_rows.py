@@ -4,54 +4,49 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.spatial.transform
 
 from gaussians_jax import splats, static_rows
 from gaussians_jax.splats import Gaussians, Params
 from tests import gradients
+from tests.gaussians.shared import (
+    full,
+    jitted,
+    put,
+    rotations,
+    same_bits,
+    some_gaussians,
+)
 
 TIMES = np.linspace(0, 1, 9)
-
-
-def some_gaussians(rng, count, dtype):
-    return Gaussians(
-        mean=jnp.asarray(rng.normal(size=(count, 3)), dtype),
-        quaternion=jnp.asarray(rng.normal(size=(count, 4)), dtype),
-        scale=jnp.asarray(rng.uniform(0.1, 1, (count, 3)), dtype),
-        opacity=jnp.asarray(rng.uniform(0.1, 1, count), dtype),
-    )
+max_displacement = jitted(static_rows.max_displacement)
 
 
 def surface_points(gaussians, directions):
     """Points of the one-sigma ellipsoids [gaussians, directions, 3], in float64."""
-    wxyz = np.asarray(gaussians.quaternion, np.float64)
-    turn = scipy.spatial.transform.Rotation.from_quat(wxyz[:, [1, 2, 3, 0]])
+    turn = rotations(gaussians.quaternion).as_matrix()
     scaled = np.asarray(gaussians.scale, np.float64)[:, None] * directions
-    turned = np.einsum("nij,nkj->nki", turn.as_matrix(), scaled)
+    turned = np.einsum("nij,nkj->nki", turn, scaled)
     return turned + np.asarray(gaussians.mean, np.float64)[:, None]
 
 
 def test_no_point_of_a_gaussian_moves_farther_than_its_reach(dtype, rng):
-    before = some_gaussians(rng, 200, dtype)
+    before = jax.tree.map(np.asarray, some_gaussians(200, dtype))
     after = jax.tree.map(
-        lambda x: (
-            x + jnp.asarray(rng.uniform(0, 0.2) * rng.normal(size=x.shape), dtype)
-        ),
+        lambda x: x + (rng.uniform(0, 0.2) * rng.normal(size=x.shape)).astype(dtype),
         before,
     )
-    after = after._replace(scale=jnp.abs(after.scale))
+    after = after._replace(scale=np.abs(after.scale))
     directions = rng.normal(size=(500, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     moved = surface_points(after, directions) - surface_points(before, directions)
     farthest = np.linalg.norm(moved, axis=-1).max(axis=1)
-    found = np.asarray(static_rows.max_displacement(before, after))
+    found = max_displacement(before, after)
     assert (found >= farthest * (1 - 1e-5)).all()
     assert np.median(found / farthest) < 2  # a bound that says something
 
 
-@pytest.mark.parametrize(
-    ("change", "exact"),
-    [
+def test_the_reach_of_a_single_change_is_that_change(dtype):
+    changes = [
         ({"mean": [0.3, -0.4, 0.0]}, 0.5),
         ({"mean": [3e-7, -4e-7, 0.0]}, 5e-7),
         ({"scale": [0.0, 0.25, -0.5]}, 0.5),
@@ -60,20 +55,19 @@ def test_no_point_of_a_gaussian_moves_farther_than_its_reach(dtype, rng):
         ({"quaternion": [-1.0, 0.0, 1.0, 0.0]}, 2 * 2),  # half a turn
         ({"opacity": 0.5}, 0.0),
         ({}, 0.0),
-    ],
-)
-def test_the_reach_of_a_single_change_is_that_change(change, exact, dtype):
-    before = Gaussians(
-        *(
-            jnp.asarray([x], dtype)
-            for x in ([0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [1.0, 0.5, 2.0], 0.5)
-        )
-    )
-    by = {name: jnp.asarray([x], dtype) for name, x in change.items()}
-    after = before._replace(**{name: getattr(before, name) + by[name] for name in by})
+    ]
+    one = Gaussians([0.0, 0, 0], [1.0, 0, 0, 0], [1.0, 0.5, 2], 0.5)
+    before = Gaussians(*(np.array([leaf] * 8, dtype) for leaf in one))
+    after = jax.tree.map(np.copy, before)
+    for row, (change, _) in enumerate(changes):
+        for name, by in change.items():
+            getattr(after, name)[row] += np.asarray(by, dtype)
     rounding = {"float32": 1e-6, "float64": 1e-15}[dtype]
     np.testing.assert_allclose(
-        static_rows.max_displacement(before, after), [exact], rtol=rounding, atol=1e-12
+        max_displacement(before, after),
+        [exact for _, exact in changes],
+        rtol=rounding,
+        atol=1e-12,
     )
 
 
@@ -84,8 +78,8 @@ def scene(rng, dtype="float32", count=40):
     )
     speed = np.where(np.arange(count) % 3, rng.uniform(1e-4, 0.3, count), 0)
     speed[1] = np.nan
-    params = Params({"splats": rows, "speed": jnp.asarray(speed, dtype)}, {})
-    return splats.pad_rows(params, count + 8)
+    params = Params({"splats": rows, "speed": put(speed, dtype)}, {})
+    return jax.jit(splats.pad_rows, static_argnums=1)(params, count + 8)
 
 
 def deform(params, time):
@@ -99,7 +93,11 @@ def deform(params, time):
     )
 
 
-@pytest.mark.parametrize("static_threshold", [0.0, 0.02, 0.3])
+deformed = jitted(deform)
+static_deform = jitted(static_rows.deform, static_argnums=1)
+
+
+@pytest.mark.parametrize("static_threshold", [0.02, *full(0.0, 0.3)])
 def test_what_is_left_out_is_off_by_no_more_than_the_tolerance(static_threshold, rng):
     params = scene(rng)
     parts = static_rows.split(params, deform, TIMES, static_threshold)
@@ -109,47 +107,29 @@ def test_what_is_left_out_is_off_by_no_more_than_the_tolerance(static_threshold,
     assert 0 < count == moves.sum() < len(moves)
     assert not moves[inactive].any()
     assert moves[1]  # its motion is not a number: not taken for static
-    for time in TIMES:
-        time = jnp.asarray(time, jnp.float32)
-        found, exact = static_rows.deform(parts, deform, time), deform(params, time)
-        for name in Gaussians._fields:
-            np.testing.assert_array_equal(
-                np.asarray(getattr(found, name))[moves],
-                np.asarray(getattr(exact, name))[moves],
-                err_msg=name,
-            )
-        found = np.asarray(static_rows.max_displacement(found, exact))[
-            ~moves & ~inactive
-        ]
-        assert (found <= static_threshold).all()
-
-
-def test_a_larger_tolerance_leaves_fewer_rows(rng):
-    params = scene(rng)
-    counts = [
-        len(static_rows.split(params, deform, TIMES, below).dynamic.rows["speed"])
-        for below in (0.0, 0.3, 0.6, 1e9)
-    ]
-    assert counts == sorted(counts, reverse=True)
-    assert counts[0] > counts[1] > counts[2] > counts[3] == 1  # the one with NaN
+    for time in np.float32(TIMES):
+        found, exact = static_deform(parts, deform, time), deformed(params, time)
+        for ours, theirs in zip(found, exact, strict=True):
+            np.testing.assert_array_equal(ours[moves], theirs[moves])
+        apart = max_displacement(found, exact)[~moves & ~inactive]
+        assert (apart <= static_threshold).all()
 
 
 def test_where_nothing_moves_nothing_is_evaluated(rng):
     params = scene(rng)
-    params.rows["speed"] = jnp.zeros_like(params.rows["speed"])
+    params.rows["speed"] = put(np.zeros_like(params.rows["speed"]))
     parts = static_rows.split(params, deform, TIMES, 0.0)
 
     def refuse(params, time):
         raise AssertionError("evaluated")
 
-    found = static_rows.deform(parts, refuse, jnp.asarray(0.3))
-    exact = splats.activate(params.rows["splats"])
-    jax.tree.map(np.testing.assert_array_equal, found, exact)
+    found = static_deform(parts, refuse, np.float32(0.3))
+    same_bits(found, jitted(splats.activate)(params.rows["splats"]))
 
 
 def test_moving_rows_keep_their_gradients(rng, float64):
     params = scene(rng, float64)
-    params.rows["speed"] = jnp.nan_to_num(params.rows["speed"])
+    params.rows["speed"] = put(np.nan_to_num(params.rows["speed"]))
     parts = static_rows.split(params, deform, TIMES, 0.02)
 
     def loss(speed, time):
@@ -159,15 +139,4 @@ def test_moving_rows_keep_their_gradients(rng, float64):
         return sum(jnp.sum(jnp.sin(3 * leaf)) for leaf in deformed)
 
     speed = parts.dynamic.rows["speed"]
-    assert gradients.directional_error(loss, speed, jnp.asarray(0.4)) < 1e-7
-
-
-@pytest.mark.parametrize("below", [-1e-3, float("nan")])
-def test_a_tolerance_below_zero_is_refused(below, rng):
-    with pytest.raises(ValueError, match=r"static_threshold=.* scene units"):
-        static_rows.split(scene(rng), deform, TIMES, below)
-
-
-def test_no_times_are_refused(rng):
-    with pytest.raises(ValueError, match="no times to look for motion at"):
-        static_rows.split(scene(rng), deform, TIMES[:0], 0.1)
+    assert gradients.directional_error(loss, speed, put(0.4)) < 1e-7
