@@ -121,6 +121,7 @@ def same_program(ours, by_hand, *args):
 
 # Every kind of static field: two networks for two levels, one for both, one level, and
 # a coarse network of its own that does not see the direction.
+@pytest.mark.full
 @pytest.mark.parametrize(
     "name",
     [
@@ -147,6 +148,7 @@ def test_there_is_no_other_kind_of_static_field():
     assert {kind(name) for name in field_presets.PRESETS} == held
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "name", ["splats-static-small", pytest.param("sonata", marks=pytest.mark.slow)]
 )
@@ -208,6 +210,7 @@ def test_a_field_without_an_effect_is_one_that_never_had_it(preset, part):
     check_removed(run, started_field, field_spec, hand_made_effects.of_field)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("preset", "part"), removals(splat_presets.PRESETS))
 def test_splats_without_an_effect_are_some_that_never_had_it(preset, part):
     run = started_splats(without(bare_scenes.tiny_splats(preset), part))
@@ -221,6 +224,7 @@ def test_small_presets_have_parts_that_papers_have():
             assert set(parts_of(spec)) <= set(parts_of(paper)), name
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "preset", ["nerf-w", pytest.param("hypernerf", marks=pytest.mark.slow)]
 )
@@ -241,6 +245,7 @@ def test_a_poisoned_effect_cannot_be_built():
         field_spec.effects_of(bare_scenes.tiny_field("d-nerf"), None)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("preset", "part"),
     [
@@ -262,6 +267,7 @@ def test_what_stays_starts_from_the_numbers_it_had(preset, part):
         np.testing.assert_array_equal(rest[path], whole[path], err_msg=str(path))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("start", "spec"),
     [

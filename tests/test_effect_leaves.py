@@ -22,6 +22,7 @@ from nerfies_jax.radiance import template
 from nerfies_jax.scene_metadata import SceneMetadata
 from tests import bare_scenes, scenes
 
+QUICK = ("nerf-w", "hypernerf")
 MOMENTS, EXPOSURES = 5, 3
 METADATA = SceneMetadata(
     near=1.0,
@@ -95,7 +96,13 @@ def removed_from(spec):
         yield dataclasses.replace(spec, scene_flow=None)
 
 
-@pytest.mark.parametrize("preset", field_presets.PRESETS)
+@pytest.mark.parametrize(
+    "preset",
+    [
+        pytest.param(name, marks=() if name in QUICK else pytest.mark.full)
+        for name in field_presets.PRESETS
+    ],
+)
 def test_a_field_has_the_arrays_of_what_it_has_and_no_others(preset):
     for spec in removed_from(field_presets.PRESETS[preset]):
         made = fields.field(spec, METADATA)
@@ -118,7 +125,15 @@ def splats_without(spec):
         yield dataclasses.replace(spec, alternation=None, **dict.fromkeys(leaning))
 
 
-@pytest.mark.parametrize("preset", splat_presets.PRESETS)
+@pytest.mark.parametrize(
+    "preset",
+    [
+        pytest.param(
+            name, marks=() if name == "splats-deformable" else pytest.mark.full
+        )
+        for name in splat_presets.PRESETS
+    ],
+)
 def test_splats_have_the_arrays_of_what_they_have_and_no_others(preset):
     capture = scenes.tiny_capture()
     metadata = splat_scene.metadata_of(capture)

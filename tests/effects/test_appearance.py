@@ -86,6 +86,7 @@ def test_the_condition_is_the_code_itself(dtype, rng):
     np.testing.assert_array_equal(found, code)
 
 
+@pytest.mark.full
 def test_effects_may_share_a_named_table():
     made = appearance.effect(AppearanceSpec(width=3, table="exposure"))
     assert made.tables == (Table("exposure", APPEARANCE, 3),)
@@ -129,6 +130,7 @@ def test_colour_has_the_code_s_slope(float64, rng):
     assert np.all(np.abs(jax.grad(shade)(code)) > 1e-5)
 
 
+@pytest.mark.full
 def test_there_are_presets_with_codes():
     assert {"nerf-w", "nerf-w-small", "nerfies", "hypernerf"} <= set(WITH_CODES)
 
@@ -136,7 +138,9 @@ def test_there_are_presets_with_codes():
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=() if name == "nerf-w" else pytest.mark.slow)
+        pytest.param(
+            name, marks=pytest.mark.full if name == "nerf-w" else pytest.mark.slow
+        )
         for name in WITH_CODES
     ],
 )

@@ -49,7 +49,9 @@ def geman_mcclure(squared, width, scaling):
     return scale * 2 * (squared / width**2) / (squared / width**2 + 4)
 
 
-@pytest.mark.parametrize("scaling", ["paper", "official"])
+@pytest.mark.parametrize(
+    "scaling", ["paper", pytest.param("official", marks=pytest.mark.full)]
+)
 def test_points_are_seen_in_the_field_in_all_frames(scaling, dtype, rng):
     """Each point once where there are few; frames alike often; noise of its size."""
     points = rng.normal(size=(6000, 3)) + CENTRE
@@ -80,6 +82,7 @@ def test_points_are_seen_in_the_field_in_all_frames(scaling, dtype, rng):
     assert abs(np.corrcoef(times, noise[:, 0])[0, 1]) < 0.06
 
 
+@pytest.mark.full
 def test_of_many_points_as_many_as_asked_are_drawn(float64, rng):
     points = np.arange(3000.0).reshape(1000, 3)
     spec = BackgroundSpec(points=400, noise=0.0)
@@ -140,6 +143,7 @@ def test_gradients(float64, rng):
     assert gradients.directional_error(total, params, step=1e-6) < 1e-6
 
 
+@pytest.mark.full
 def test_seams_of_the_effect():
     seams = background.effect(BackgroundSpec())
     assert seams.name == "background"

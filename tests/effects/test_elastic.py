@@ -115,6 +115,7 @@ def test_cost_is_that_of_the_singular_values(name, spec_name, dtype):
     np.testing.assert_allclose(value, truth, rtol=bound, atol=floor)
 
 
+@pytest.mark.full
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("name", FOLDS)
 def test_folds_cost_more_than_any_stretch_and_by_their_volume(name, dtype):
@@ -183,7 +184,9 @@ systematic = jax.jit(elastic.systematic, static_argnums=2)
 
 
 @pytest.mark.parametrize("ray", RAYS)
-@pytest.mark.parametrize("draws", [1, 3, 4])
+@pytest.mark.parametrize(
+    "draws", [3, *(pytest.param(n, marks=pytest.mark.full) for n in (1, 4))]
+)
 def test_draws_are_unbiased(ray, draws, dtype):
     """Over all places of the first mark, each sample stands for its own weight."""
     weight = jnp.asarray(RAYS[ray], dtype)
@@ -284,6 +287,7 @@ def test_energy_of_all_samples_in_a_loop(setting):
     np.testing.assert_allclose(value, slow(unfolded, setting)[0], rtol=1e-7)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("points", [1, 4])
 def test_the_penalty_of_drawn_samples_has_the_mean_of_all(points, setting):
     """By many keys; its deviation is what the table of the experiment says."""
@@ -310,7 +314,7 @@ def test_as_many_points_as_samples_take_each_once(setting):
     np.testing.assert_array_equal(weight, setting.weight)
 
 
-@pytest.mark.parametrize("points", [2, None])
+@pytest.mark.parametrize("points", [2, pytest.param(None, marks=pytest.mark.full)])
 def test_gradients_reach_the_warp_and_not_the_weights(points, setting):
     spec = ElasticSpec(points=points)
 

@@ -60,7 +60,7 @@ def test_weights_are_the_spec_s_and_the_capture_s_own_terms_fade(dtype):
             np.testing.assert_allclose(term.weight, expected, rtol=1e-6, err_msg=name)
 
 
-@pytest.mark.parametrize("step", [0, 250])
+@pytest.mark.parametrize("step", [pytest.param(0, marks=pytest.mark.full), 250])
 def test_the_whole_penalty_has_the_slope_of_its_differences(float64, step):
     params, frames, batch, arrays = scenario("float64")
     # What is held fixed on purpose has no slope to compare: left out, or its weight is
@@ -89,6 +89,7 @@ def test_terms_with_a_weight_of_zero_are_not_there(float64):
 NAMES = tuple(field.name for field in dataclasses.fields(FlowWeights))
 
 
+@pytest.mark.full
 def test_without_depth_and_flow_in_the_capture_their_terms_are_not_there(float64):
     params, frames, batch, arrays = scenario("float64")
     bare = frames._replace(depths=None, flow=None)
@@ -130,6 +131,7 @@ def test_the_first_and_the_last_moment_have_one_neighbour(float64):
     assert (hidden[rows == 0, 1] == 0).all()
 
 
+@pytest.mark.full
 @pytest.mark.hard_cases
 def test_a_single_moment_has_no_neighbours_and_no_flow_to_learn(dtype):
     params, frames, batch, arrays = scenario(dtype)
@@ -242,6 +244,7 @@ def wall_terms(monkeypatch, dtype, **motion):
     return jax.tree.map(float, values())
 
 
+@pytest.mark.full
 def test_the_true_flow_of_a_moving_wall_costs_nothing(monkeypatch, dtype):
     found = wall_terms(monkeypatch, dtype)
     # float32: pixels to a few ulps of the picture's size
@@ -253,6 +256,7 @@ def test_the_true_flow_of_a_moving_wall_costs_nothing(monkeypatch, dtype):
     np.testing.assert_allclose(found["magnitude"], 2 * 0.18 / 3, rtol=1e-5)
 
 
+@pytest.mark.full
 def test_a_wall_that_is_said_to_stand_still_does_not_look_right(monkeypatch, float64):
     found = wall_terms(monkeypatch, "float64", flow=np.zeros(3))
     assert found["warped"] > 1e-2  # squared sRGB

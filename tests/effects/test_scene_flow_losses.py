@@ -32,6 +32,7 @@ def test_weights_count_alike_whatever_their_size(size, dtype):
     np.testing.assert_allclose(value, 5, rtol=1e-6)
 
 
+@pytest.mark.full
 def test_rays_that_are_not_present_teach_nothing(float64):
     flow = jnp.asarray(np.random.default_rng(0).normal(size=(2, 4, 3)))
     weight = jnp.full((2, 4), 0.2)

@@ -96,6 +96,7 @@ def test_left_out_it_is_a_transient_of_no_density(dtype):
     np.testing.assert_allclose(empty.beta, TINY.transient.beta_min, rtol=tolerance)
 
 
+@pytest.mark.full
 def test_left_out_it_is_the_field_that_never_had_one(dtype):
     params, (ray, condition) = params_of(dtype), ray_and_condition(dtype)
     never = dataclasses.replace(TINY, transient=None)

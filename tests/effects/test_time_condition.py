@@ -56,6 +56,7 @@ def test_by_code_it_is_the_frame_s_code(dtype, rng):
     np.testing.assert_array_equal(found, code)
 
 
+@pytest.mark.full
 def test_it_has_no_parameters_and_by_time_no_codes():
     made = time_condition.effect(TimeSpec())
     assert made.name == "time"

@@ -96,6 +96,7 @@ def test_the_medium_is_the_loop_over_its_layers(dtype):
         assert leaf.dtype == dtype
 
 
+@pytest.mark.full
 def test_one_code_for_each_exposure_is_asked_for():
     made = transient.effect(TransientSpec(), 256)
     assert made.name == "transient"

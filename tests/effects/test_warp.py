@@ -35,6 +35,12 @@ def frame(dtype, time=0.4, width=4, step=0, seed=3):
 
 started = jax.jit(warp.init, static_argnums=(0, 2))
 FLOAT32 = jnp.dtype("float32")
+PAIRS = [
+    ("se3", "code"),
+    ("translation", "time"),
+    pytest.param("se3", "time", marks=pytest.mark.full),
+    pytest.param("translation", "code", marks=pytest.mark.full),
+]
 
 
 def bent(spec, dtype, size=0.3, seed=0):
@@ -99,8 +105,7 @@ def compiled(spec):
     return jax.jit(lambda params, x, when: warp.displace(spec, params, x, when))
 
 
-@pytest.mark.parametrize("kind", warp.KINDS)
-@pytest.mark.parametrize("condition", warp.CONDITIONS)
+@pytest.mark.parametrize(("kind", "condition"), PAIRS)
 @pytest.mark.parametrize("step", [0, 7, 100])
 def test_points_move_as_the_matrix_exponential_says(kind, condition, step, dtype, rng):
     spec = dataclasses.replace(SMALL, kind=kind, condition=condition, anneal_steps=20)
@@ -116,6 +121,7 @@ def test_points_move_as_the_matrix_exponential_says(kind, condition, step, dtype
         np.testing.assert_allclose(moved, truth, rtol=0, atol=bound)
 
 
+@pytest.mark.full
 def test_samples_of_a_ray_share_the_product_of_their_code(float64, rng):
     spec = SMALL
     params, when = bent(spec, "float64"), frame("float64")
@@ -131,7 +137,12 @@ def test_samples_of_a_ray_share_the_product_of_their_code(float64, rng):
 
 @pytest.mark.hard_cases
 @pytest.mark.parametrize(
-    ("kind", "anneal_steps"), [("se3", None), ("se3", 100), ("translation", None)]
+    ("kind", "anneal_steps"),
+    [
+        ("se3", 100),
+        pytest.param("se3", None, marks=pytest.mark.full),
+        pytest.param("translation", None, marks=pytest.mark.full),
+    ],
 )
 def test_every_warp_starts_as_the_identity(kind, anneal_steps, rng):
     spec = WarpSpec(kind=kind, anneal_steps=anneal_steps)
@@ -177,6 +188,7 @@ def test_weights_of_bands_that_open_late_start_at_zero():
     np.testing.assert_array_equal(annealed.hidden[1].weight, plain.hidden[1].weight)
 
 
+@pytest.mark.full
 def test_a_shut_window_leaves_the_point_alone_to_be_read(float64, rng):
     """At step 0 bands pass nothing; each opens in turn; at the end all are open."""
     spec = dataclasses.replace(SMALL, anneal_steps=30)
@@ -218,7 +230,9 @@ def test_a_shut_window_leaves_the_point_alone_to_be_read(float64, rng):
 
 
 @pytest.mark.hard_cases
-@pytest.mark.parametrize("kind", warp.KINDS)
+@pytest.mark.parametrize(
+    "kind", ["se3", pytest.param("translation", marks=pytest.mark.full)]
+)
 def test_time_zero_is_the_template(kind, dtype, rng):
     """D-NeRF's canonical frame; a hair later the field is as it is."""
     spec = dataclasses.replace(SMALL, kind=kind, condition="time", depth=2, skips=())
@@ -244,8 +258,7 @@ def test_time_zero_is_the_template(kind, dtype, rng):
     assert after > 1e-3
 
 
-@pytest.mark.parametrize("kind", warp.KINDS)
-@pytest.mark.parametrize("condition", warp.CONDITIONS)
+@pytest.mark.parametrize(("kind", "condition"), PAIRS)
 def test_gradients(kind, condition, float64, rng):
     spec = dataclasses.replace(SMALL, kind=kind, condition=condition, anneal_steps=20)
     params, point = bent(spec, "float64"), jnp.asarray(rng.uniform(-1, 1, 3))
@@ -308,6 +321,7 @@ def test_tiny_turns_keep_their_slopes(angular, linear, dtype):
     np.testing.assert_allclose(by_w, lever, atol=max(4 * angular**2, bound))
 
 
+@pytest.mark.full
 def test_seams_of_the_effect():
     code, time = warp.effect(WarpSpec()), warp.effect(WarpSpec(condition="time"))
     assert code.tables == (Table("motion", MOMENT, 8),)
@@ -354,8 +368,10 @@ def strain_slopes(times_pi, params, point):
 
 
 @pytest.mark.hard_cases
+@pytest.mark.parametrize(
+    "times_pi", [True, pytest.param(False, marks=pytest.mark.full)]
+)
 @pytest.mark.parametrize("place", [0.3, 100.0])
-@pytest.mark.parametrize("times_pi", [False, True])
 def test_strain_keeps_its_slopes_through_the_encoding(times_pi, place):
     """Second derivatives of the features: what an elastic penalty trains on.
 

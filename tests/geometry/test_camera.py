@@ -98,6 +98,7 @@ def test_unprojection_inverts_projection(dtype, rng):
     )
 
 
+@pytest.mark.full
 def test_camera_matrix_and_pose_agree_with_projection(float64, rng):
     camera = make_camera("float64", radial=(0, 0, 0), tangential=(0, 0))
     point = seen_points(rng, camera, 1)[0]
@@ -126,6 +127,7 @@ def test_gradients_of_both_directions(float64, rng):
     assert gradients.directional_error(looked, camera, pixel, step=1e-4) < 1e-5
 
 
+@pytest.mark.full
 def test_unprojection_has_the_implicit_second_derivative(float64):
     camera = make_camera("float64")
     pixel = jnp.asarray([400.0, 120.0])
@@ -202,6 +204,7 @@ def test_look_at_puts_target_in_the_middle_and_up_upwards(dtype):
     assert abs(np.linalg.det(camera.camera_from_world) - 1) < 1e-6
 
 
+@pytest.mark.full
 def test_nerfies_projection_and_rays(oracle_dir, float64):
     """google/nerfies on its own distorted camera; its resize leaves the skew behind."""
     values = np.load(oracle_dir / "nerfies.npz")
@@ -269,6 +272,7 @@ def test_unusable_cameras_are_refused_by_name(changes, message):
         cameras.validate(broken(**changes), SIZE, "left.png")
 
 
+@pytest.mark.full
 def test_usable_cameras_pass_validation():
     cameras.validate(broken(), SIZE)
     cameras.validate(make_camera("float32"), SIZE)

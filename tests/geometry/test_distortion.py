@@ -67,6 +67,7 @@ def test_the_root_is_on_the_axis_branch_or_flagged(name, dtype):
     assert np.max(abs(error[clear & converged])) < 1e-5
 
 
+@pytest.mark.full
 @pytest.mark.hard_cases
 def test_plain_newton_would_land_on_another_branch():
     """The failure that the flag is for: a residual of zero on no ray of light."""
@@ -120,6 +121,7 @@ def test_derivatives_in_the_point_and_the_lens_match_differences(float64):
     assert gradients.directional_error(along, *lens, jnp.asarray([0.3, -0.4])) < 1e-8
 
 
+@pytest.mark.full
 @pytest.mark.hard_cases
 def test_nan_pixels_are_flagged(dtype):
     lens = np.asarray([0.1, 0, 0], dtype), np.zeros(2, dtype)

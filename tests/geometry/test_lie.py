@@ -91,6 +91,7 @@ def test_a_screw_keeps_value_gradient_and_hessian(angle, dtype):
     assert np.max(abs(hessian - second)) < bound
 
 
+@pytest.mark.full
 @pytest.mark.hard_cases
 def test_zero_screw_is_the_identity_and_its_derivative_the_generators(dtype):
     point = np.asarray(POINT, dtype)
@@ -112,6 +113,7 @@ def test_rotation_and_translation_may_vanish_separately(speed, dtype):
     assert np.max(abs(grad - first)) < {"float32": 2e-7}.get(dtype, 1e-15)
 
 
+@pytest.mark.full
 def test_the_textbook_form_fails_where_this_one_does_not():
     """Nerfies' own lines: NaN at zero, 1 % wrong at 1e-3 rad, in float32."""
 
@@ -130,6 +132,7 @@ def test_the_textbook_form_fails_where_this_one_does_not():
     assert np.all(np.isnan(grad(jnp.zeros(3), *inputs[1:])))
 
 
+@pytest.mark.full
 def test_nerfies_screws(oracle_dir, float64):
     """Reference values with their derivatives, from 1e-8 to 6 rad."""
     values = np.load(oracle_dir / "nerfies.npz")

@@ -265,6 +265,7 @@ def test_curvature_at_the_identity_is_that_of_the_strain(dtype):
     np.testing.assert_allclose(small[0], truth, atol=2e-6)
 
 
+@pytest.mark.full
 @pytest.mark.hard_cases
 def test_a_reflection_is_free_only_without_the_sign(dtype):
     """... and the signed energy pushes it back through the collapse."""
@@ -305,6 +306,7 @@ def _mp_energy(displacement):
     return sum(mpmath.log(value) ** 2 for value in singular)
 
 
+@pytest.mark.full
 @pytest.mark.hard_cases
 def test_both_forms_agree_around_the_switch(float64, rng):
     drawn = rng.normal(size=(100, 3, 3))
@@ -316,6 +318,7 @@ def test_both_forms_agree_around_the_switch(float64, rng):
     np.testing.assert_allclose(values, exact, rtol=1e-12)
 
 
+@pytest.mark.full
 @pytest.mark.hard_cases
 def test_strain_of_a_nearly_rigid_screw_survives_float32():
     """Turning by 1e-3 and straining by 1e-5, like a warp at its start."""

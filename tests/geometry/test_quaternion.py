@@ -169,6 +169,7 @@ def test_gradients(float64, rng):
     assert gradients.directional_error(on_sphere, one, other) < 1e-7
 
 
+@pytest.mark.full
 def test_composition_drifts_slowly(rng):
     """A thousand products in float32: the norm drifts, the rotation does not."""
     step = exp(jnp.asarray([[0.01, -0.02, 0.015]]))[0]

@@ -66,6 +66,7 @@ def test_distance_and_depth_convert_both_ways(dtype):
     np.testing.assert_allclose(again, distance, rtol=1e-6)
 
 
+@pytest.mark.full
 def test_nerfies_points_at_depth(oracle_dir, float64):
     """`pixels_to_points` of google/nerfies takes z-depth."""
     values = np.load(oracle_dir / "nerfies.npz")

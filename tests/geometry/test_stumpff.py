@@ -63,6 +63,7 @@ def test_value_and_derivatives_from_zero_to_a_million_radians(order, derivative,
     assert np.all(error < bound), np.max(error / bound)
 
 
+@pytest.mark.full
 def test_a_wrong_switch_would_be_seen(monkeypatch):
     """The closed form below 0.1 rad: the slope of c3 is then wrong by a per cent."""
     monkeypatch.setattr("nerfies_jax.geometry.stumpff.SERIES_BELOW", 1e-5)
@@ -70,6 +71,7 @@ def test_a_wrong_switch_would_be_seen(monkeypatch):
     assert abs(jax.grad(functools.partial(stumpff, 3))(squared) + 1 / 120) > 1e-4
 
 
+@pytest.mark.full
 def test_forward_and_reverse_mode_agree(float64):
     points = jnp.asarray([0.0, 1e-9, 4.0, 8.9, 9.1, 50.0])
     for order in (1, 3):

@@ -112,6 +112,7 @@ def test_timing_is_interleaved_and_warm():
         clock.measure(lambda: None, repeats=0)
 
 
+@pytest.mark.full
 def test_timing_waits_for_the_result():
     matrix = jnp.ones((900, 900))
     chain = jax.jit(lambda x: jax.lax.fori_loop(0, 8, lambda _, y: x @ y * 1e-3, x))
@@ -136,6 +137,7 @@ def test_cost_counts_a_known_product():
     assert found.compile_seconds > 0
 
 
+@pytest.mark.full
 def test_cost_sees_temporaries_and_takes_jitted_functions():
     @jax.jit
     def sorted_twice(x):
@@ -145,6 +147,7 @@ def test_cost_sees_temporaries_and_takes_jitted_functions():
     assert found.temporary_bytes >= 4 * 50_000
 
 
+@pytest.mark.full
 def test_peak_memory_sees_a_large_array():
     code = (
         "from nerfies_jax.measure import clock; import numpy as np;"
@@ -171,6 +174,7 @@ def test_the_machine_describes_itself():
     assert found["cpu"]
 
 
+@pytest.mark.full
 def test_device_memory_is_a_number_or_unknown():
     peak = clock.device_peak_bytes()
     assert peak is None or peak > 0

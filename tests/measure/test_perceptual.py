@@ -156,6 +156,7 @@ def test_lpips_is_zero_for_equal_pictures_and_its_gradient_is_finite(tiny, rng):
     assert not np.any(grad)
 
 
+@pytest.mark.full
 @pytest.mark.hard_cases
 def test_half_precision_pictures_are_compared_in_float32(tiny, rng):
     half = [x.astype(jnp.bfloat16) for x in rng.random((2, 17, 14, 3))]
@@ -176,6 +177,7 @@ def test_gradients_agree_with_central_differences(tiny, float64, rng):
     assert gradients.directional_error(score, params, image, truth, step=1e-7) < 1e-6
 
 
+@pytest.mark.full
 def test_the_map_of_a_coarse_stage_is_enlarged_between_pixel_centres(rng):
     small = jnp.asarray(rng.random((3, 2)), jnp.float32)
     enlarged = np.asarray(jax.image.resize(small, (9, 8), "bilinear"))
@@ -203,6 +205,7 @@ def test_masked_lpips_ignores_what_is_outside_and_averages_inside(tiny, rng):
     assert np.isnan(masked(tiny, TINY, image, truth, jnp.zeros(size, bool)))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("trained", ["alex"], indirect=True)
 def test_a_saved_lpips_module_loads_as_its_two_parts_do(trained, tmp_path):
     network, params, state, _ = trained
@@ -216,6 +219,7 @@ def test_a_saved_lpips_module_loads_as_its_two_parts_do(trained, tmp_path):
     assert jax.tree.all(jax.tree.map(np.array_equal, loaded, params))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("trained", ["alex"], indirect=True)
 def test_weights_are_found_where_their_packages_keep_them(
     trained, tmp_path, monkeypatch
@@ -260,6 +264,7 @@ def test_another_networks_file_is_refused(trained, tmp_path, monkeypatch):
         perceptual.load(network, [tmp_path / "nan.npz"])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", ["alex", "vgg"])
 def test_the_smallest_picture_is_the_smallest(name, rng):
     network = NETWORKS[name]

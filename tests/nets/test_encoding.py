@@ -106,6 +106,7 @@ def test_the_gradient_of_a_high_band_keeps_its_digits(dtype):
     assert abs(grads / (512 * np.pi) - float(truth) / (512 * np.pi)) < 3e-7
 
 
+@pytest.mark.full
 def test_nerfies_features_and_windows(oracle_dir, dtype):
     values = np.load(oracle_dir / "nerfies.npz")
     name = {"float32": "unit", "float64": "unit64"}[dtype]
@@ -154,6 +155,7 @@ def test_the_window_is_exact_at_its_ends_and_opens_smoothly(dtype):
         assert np.all(np.isfinite(next(slope_and_window(alpha))))
 
 
+@pytest.mark.full
 @pytest.mark.hard_cases
 def test_a_shut_window_leaves_the_identity_alone():
     point = np.asarray([0.3, -0.4], np.float32)
@@ -176,12 +178,14 @@ def test_impossible_encodings_are_refused(arguments, message):
         EncodingSpec(**arguments)
 
 
+@pytest.mark.full
 def test_no_bands_is_the_identity():
     assert np.array_equal(
         encoding.encode(EncodingSpec(0), jnp.ones(3), None), np.ones(3)
     )
 
 
+@pytest.mark.full
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("narrow", [jnp.bfloat16, jnp.float16])
 @pytest.mark.parametrize("times_pi", [False, True])

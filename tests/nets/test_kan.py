@@ -30,6 +30,12 @@ VARIANTS = {
     "trained kernels": dataclasses.replace(SPEC, trainable_kernels=True),
     "no hidden": dataclasses.replace(SPEC, hidden=()),
 }
+SOME = [
+    name
+    if name in ("full", "trained kernels")
+    else pytest.param(name, marks=pytest.mark.full)
+    for name in VARIANTS
+]
 CURVE = KANSpec(1, (), (("y", HeadSpec(1)),), kernels=8, base=False)
 
 apply = jax.jit(kan.apply, static_argnums=0)
@@ -103,7 +109,7 @@ def by_hand(spec, params, x):
     return dict(zip(params.heads, outputs, strict=True))
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant", SOME)
 def test_outputs_edge_by_edge(variant, dtype, rng):
     spec = VARIANTS[variant]
     params = filled(spec, dtype)
@@ -116,6 +122,7 @@ def test_outputs_edge_by_edge(variant, dtype, rng):
             np.testing.assert_allclose(batch[name][row], value, rtol=bound, atol=bound)
 
 
+@pytest.mark.full
 def test_one_input_is_a_batch_of_itself(dtype, rng):
     params = filled(SPEC, dtype)
     inputs = jnp.asarray(rng.normal(size=(2, 5)), dtype)
@@ -125,6 +132,7 @@ def test_one_input_is_a_batch_of_itself(dtype, rng):
         np.testing.assert_allclose(one[name], value[1], atol=tolerance)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("kernels", [5, 8, 16])
 def test_the_sum_over_kernels_is_the_three_index_form(kernels, rng):
     """In float32, value and slopes, within 1e-6 of the largest."""
@@ -161,7 +169,9 @@ def test_the_sum_over_kernels_is_the_three_index_form(kernels, rng):
         np.testing.assert_allclose(one, other, atol=1e-6 * np.abs(other).max())
 
 
-@pytest.mark.parametrize("variant", ["full", "no base", "trained kernels"])
+@pytest.mark.parametrize(
+    "variant", ["full", pytest.param("trained kernels", marks=pytest.mark.full)]
+)
 def test_the_first_layer_may_be_summed_in_parts(variant, dtype, rng):
     spec = VARIANTS[variant]
     params = filled(spec, dtype)
@@ -185,7 +195,7 @@ def test_parts_outside_the_inputs_are_refused():
         kan.first_layer_part(SPEC, params, jnp.zeros(3), 4)
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant", SOME)
 def test_gradients(variant, float64, rng):
     spec = VARIANTS[variant]
 
@@ -199,6 +209,7 @@ def test_gradients(variant, float64, rng):
     assert error < 1e-6
 
 
+@pytest.mark.full
 def test_forward_mode_and_reverse_over_forward(float64, rng):
     """The Jacobian of a point, and its slopes: what an elastic penalty asks for."""
     spec = dataclasses.replace(SPEC, hidden=(4,), kernels=3)
@@ -250,6 +261,7 @@ def curve_derivatives():
     return jax.jit(lambda *args: [of_order(order)(*args) for order in range(6)])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("order", range(6))
 def test_derivatives_are_hermite_polynomials(order, float64, rng):
     """Equations 6 to 8: psi^(k) = psi (-1 / w)^k H_k((x - mu) / w), w = √2 sigma."""
@@ -264,6 +276,7 @@ def test_derivatives_are_hermite_polynomials(order, float64, rng):
     np.testing.assert_allclose(ours, expected, atol=1e-13 * w**-order * 2**order)
 
 
+@pytest.mark.full
 def test_the_slope_by_reverse_mode_is_equation_6(dtype, rng):
     weights = np.asarray(rng.normal(size=8), dtype).astype(np.float64)
     x = np.asarray(np.linspace(-1, 1, 9), dtype)  # both ends of the grid among them
@@ -276,6 +289,7 @@ def test_the_slope_by_reverse_mode_is_equation_6(dtype, rng):
     np.testing.assert_allclose(ours, expected, atol=tolerance)
 
 
+@pytest.mark.full
 def test_slopes_of_trained_kernels_are_equations_9_and_10(float64, rng):
     spec = dataclasses.replace(CURVE, trainable_kernels=True)
     weights, x = rng.normal(size=8), 0.37
@@ -293,6 +307,7 @@ def test_slopes_of_trained_kernels_are_equations_9_and_10(float64, rng):
     np.testing.assert_allclose(found.log_width[:, 0], by_sigma * sigma, atol=1e-13)
 
 
+@pytest.mark.full
 def test_the_spectrum_is_an_envelope_times_the_weights_interference(float64, rng):
     """Appendix A.1, equations 20 and 21, with angular frequencies throughout."""
     weights = rng.normal(size=8)
@@ -458,6 +473,7 @@ def test_trained_widths_of_any_size_have_finite_slopes(dtype):
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
 
 
+@pytest.mark.full
 @pytest.mark.hard_cases
 def test_bfloat16_is_finite_and_near(rng):
     """With the norm, SiLU and trained kernels all in."""
@@ -493,6 +509,7 @@ def test_initial_outputs_have_variance_one(dtype):
         assert abs(np.mean(outputs**2) - 1) < 0.25
 
 
+@pytest.mark.full
 def test_both_precisions_start_from_the_same_weights():
     spec = dataclasses.replace(SPEC, hidden=(), trainable_kernels=True)
     with jax.enable_x64(True):
@@ -512,6 +529,7 @@ def test_heads_start_as_they_are_told(rng):
     assert 0 < np.abs(heads["hardly"]).max() < 1e-4 * 6 * 6
 
 
+@pytest.mark.full
 def test_layers_heads_and_base_are_drawn_independently():
     spec = dataclasses.replace(
         SPEC, hidden=(5, 5), heads=(("a", HeadSpec(5)), ("b", HeadSpec(5)))

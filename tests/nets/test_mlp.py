@@ -94,6 +94,7 @@ def test_initial_weights_have_the_promised_spread(dtype):
     assert -1e-4 <= np.min(small) < -0.99e-4  # two-sided
 
 
+@pytest.mark.full
 def test_both_precisions_start_from_the_same_weights():
     with jax.enable_x64(True):
         wide = mlp.init(SPEC, jax.random.key(3), jnp.float64)
@@ -117,6 +118,7 @@ def test_without_hidden_layers_heads_read_the_input():
     np.testing.assert_allclose(out, inputs @ params.heads["out"].weight, rtol=1e-6)
 
 
+@pytest.mark.full
 def test_nerfies_warp_field(oracle_dir, float64):
     """Nerfies' own trained-like screw field, from its weights: points and Jacobians.
 
@@ -180,7 +182,7 @@ def test_impossible_heads_are_refused():
         HeadSpec(1, "one")
 
 
-@pytest.mark.parametrize("skips", [(), (1, 2)])
+@pytest.mark.parametrize("skips", [(1, 2), pytest.param((), marks=pytest.mark.full)])
 def test_inputs_known_beforehand_may_be_summed_once(skips, dtype):
     """Against the network that reads them with every row."""
     heads = (("out", HeadSpec(4)),)
@@ -206,6 +208,7 @@ def heads_and_slopes(spec, params, inputs):
     return found, grads
 
 
+@pytest.mark.full
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("activation", mlp.ACTIVATIONS)
 def test_bfloat16_is_finite_and_near(activation, rng):

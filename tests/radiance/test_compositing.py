@@ -209,6 +209,7 @@ def test_thinned_is_exact_with_finite_slopes(depth, logit, dtype):
         assert abs(grad - wanted) < 3 * ABSOLUTE[dtype] * max(wanted, 1)
 
 
+@pytest.mark.full
 @pytest.mark.hard_cases
 def test_thinned_meets_itself_at_the_switch(dtype):
     """Opacity one quarter: the two forms may not differ by more than they err."""
@@ -229,6 +230,7 @@ def test_thinned_keeps_its_digits_at_any_opacity(dtype):
     np.testing.assert_allclose(found, exact, rtol=6 * np.finfo(dtype).eps)
 
 
+@pytest.mark.full
 def test_thinned_multiplies_the_opacity(dtype, rng):
     depth, logit = rng.uniform(0, 3, 50), rng.normal(size=50)
     thin = thinned(jnp.asarray(depth, dtype), jnp.asarray(logit, dtype))
@@ -244,6 +246,7 @@ def test_thinned_has_the_slopes_of_central_differences(float64, rng):
     assert error < 1e-7
 
 
+@pytest.mark.full
 def test_blended_media_composite_as_nsff_prints_it(float64, rng):
     """T = prod (1 - a_d v) (1 - a_s (1 - v)), opacities a_d v and a_s (1 - v)."""
     depth, logit = rng.uniform(0, 1, (2, 10)), rng.normal(size=10)
@@ -264,6 +267,7 @@ def test_intervals_end_as_told(dtype):
         np.testing.assert_array_equal(got, np.asarray([0.25, 1, last], dtype))
 
 
+@pytest.mark.full
 def test_a_ray_cut_in_two_is_the_ray(dtype, rng):
     """The back part is the background of the front."""
     depth = jnp.asarray(rng.uniform(0, 0.4, 20), dtype)
@@ -387,6 +391,7 @@ def test_faint_rays_have_the_slopes_of_central_differences(float64, rng):
     assert error < 1e-6
 
 
+@pytest.mark.full
 def test_no_light_is_lost_in_half_precision_products(dtype, rng):
     """Colours are summed, not multiplied as matrices: exact against a slow sum."""
     weights = rng.dirichlet(np.ones(64))
@@ -399,6 +404,7 @@ def test_no_light_is_lost_in_half_precision_products(dtype, rng):
     assert abs(float(seen.alpha) - sum(weights[:-1])) < 1e-6
 
 
+@pytest.mark.full
 class TestNerfies:
     """Values of the official code; five rays of ten samples, four modes."""
 
@@ -483,6 +489,7 @@ class TestNerfies:
         assert np.max(np.abs(np.asarray(seen.colour) - theirs)) > 0.05
 
 
+@pytest.mark.full
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("narrow", [jnp.bfloat16, jnp.float16])
 def test_narrow_depths_are_summed_in_float32(narrow, rng):

@@ -29,6 +29,8 @@ from nerfies_jax.radiance.template import Template, TemplateSpec
 from nerfies_jax.training import losses
 from nerfies_jax.training.effects import FrameCondition, PenaltyContext
 
+pytestmark = pytest.mark.full
+
 TEMPLATE = TemplateSpec(position=EncodingSpec(8), skips=(4,))
 WARP = WarpSpec(anneal_steps=32)
 STEP = 17  # of 32 for 8 bands: alpha is 4.25

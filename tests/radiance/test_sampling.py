@@ -287,6 +287,7 @@ def test_wrong_requests_are_refused():
         refine(None, line[:2], line[:2], 4)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("spacing", sampling.SPACINGS)
 def test_nerfies_even_distances(spacing, oracle_dir, dtype):
     values = np.load(oracle_dir / "nerfies.npz")
@@ -297,6 +298,7 @@ def test_nerfies_even_distances(spacing, oracle_dir, dtype):
     np.testing.assert_allclose(got, wanted, {"float32": 5e-7, "float64": 1e-15}[dtype])
 
 
+@pytest.mark.full
 def test_nerfies_inverse(oracle_dir, dtype):
     values = np.load(oracle_dir / "nerfies.npz")
     bins = jnp.asarray(values["unit/pdf/bins"], dtype)
@@ -315,6 +317,7 @@ def test_nerfies_inverse(oracle_dir, dtype):
     np.testing.assert_allclose(invert(None), wanted, atol=5e-5)
 
 
+@pytest.mark.full
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("narrow", [jnp.bfloat16, jnp.float16])
 def test_narrow_rays_keep_their_order_and_their_peaks(narrow):

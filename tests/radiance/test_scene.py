@@ -176,6 +176,7 @@ def waves(x, bands):
     return np.concatenate(parts)
 
 
+@pytest.mark.full
 def test_blocks_of_rays_do_not_show_in_a_picture():
     # 91 pixels in blocks of 97, 10 and 1024
     whole = rendered(STATIC)
@@ -269,6 +270,7 @@ def test_the_filmed_volume_fills_the_box():
     assert own.centre == (0, 0, 0)
 
 
+@pytest.mark.full
 def test_without_its_warp_a_field_shows_the_canonical_scene():
     spec = dataclasses.replace(STATIC, warp=TINY_WARP)
     field, canonical = (
@@ -368,6 +370,7 @@ def test_shared_and_single_levels(levels):
     assert len(found) == levels
 
 
+@pytest.mark.full
 def test_a_step_repeats_itself_and_counts():
     model, state, frames = started(NERFIES)
     step = jax.jit(model.step)
@@ -381,6 +384,7 @@ def test_a_step_repeats_itself_and_counts():
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.full
 def test_an_unfilmed_pixel_teaches_nothing():
     _, state, frames = started(STATIC)
     model = started(STATIC)[0]

@@ -96,6 +96,7 @@ def test_density_does_not_depend_on_where_it_is_seen_from(dtype):
     assert np.all(np.ptp(found.colour, axis=0) > 1e-3)
 
 
+@pytest.mark.full
 def test_the_samples_of_a_ray_share_the_product_of_their_view(float64):
     params, features, condition = drawn("float64")
     points = jnp.stack([features, -features, 2 * features])
@@ -142,6 +143,7 @@ def test_parameters_have_the_sizes_of_the_paper():
     assert sum(x.size for x in jax.tree.leaves(params)) == 595_844
 
 
+@pytest.mark.full
 def test_coarse_and_fine_templates_start_apart():
     one, other = (
         template.init(SMALL, jax.random.key(seed), INPUTS, CONDITION)
@@ -169,6 +171,7 @@ def test_a_field_without_views_reads_codes_alone():
     assert template.trunk_spec(spec, 15).inputs == 15
 
 
+@pytest.mark.full
 @pytest.mark.hard_cases
 def test_bfloat16_is_finite_and_near():
     params, features, condition = drawn("bfloat16")

@@ -60,6 +60,7 @@ def drawn(field, seen, without=(), blended=False):
     return jax.jit(draw.render, static_argnums=2)(params, seen, SIZE, step).colour
 
 
+@pytest.mark.full
 def test_a_field_without_its_warp_is_the_template(field):
     metadata, params, view = field
     found = drawn(field, view, without=("warp",))
@@ -74,6 +75,7 @@ def test_a_field_without_its_warp_is_the_template(field):
     assert np.abs(found - drawn(field, view)).max() > 1e-3
 
 
+@pytest.mark.full
 def test_a_blend_starts_at_one_appearance_and_ends_at_the_other(field):
     view = field[2]
     first, last = (
