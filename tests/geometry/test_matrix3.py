@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scipy.spatial.transform
 
-from nerfies_jax.geometry import lie, matrix3
+from nerfies_jax.geometry import matrix3
 from tests import gradients
 
 Rotation = scipy.spatial.transform.Rotation
@@ -158,12 +158,10 @@ def assert_twice_differentiable(function, points, rng, step):
 
 
 def test_singular_value_gradients_against_differences(float64, rng):
-    weight = jnp.asarray([1.0, -0.5, 2.0])
-    point = jnp.asarray(matrices(rng)[30])
-    error = gradients.directional_error(
-        lambda m: matrix3.singular_values(m) @ weight, point
-    )
-    assert error < 1e-6
+    def total(matrix):
+        return matrix3.singular_values(matrix) @ jnp.asarray([1.0, -0.5, 2.0])
+
+    assert gradients.directional_error(total, matrices(rng)[30]) < 1e-6
 
 
 HARD = {
@@ -265,7 +263,6 @@ def test_curvature_at_the_identity_is_that_of_the_strain(dtype):
     np.testing.assert_allclose(small[0], truth, atol=2e-6)
 
 
-@pytest.mark.full
 @pytest.mark.hard_cases
 def test_a_reflection_is_free_only_without_the_sign(dtype):
     """... and the signed energy pushes it back through the collapse."""
@@ -304,44 +301,6 @@ def test_displacements_far_below_an_ulp_keep_their_energy(size, dtype, rng):
 def _mp_energy(displacement):
     singular = mpmath.svd_r(mpmath.eye(3) + displacement, compute_uv=False)
     return sum(mpmath.log(value) ** 2 for value in singular)
-
-
-@pytest.mark.full
-@pytest.mark.hard_cases
-def test_both_forms_agree_around_the_switch(float64, rng):
-    drawn = rng.normal(size=(100, 3, 3))
-    drawn *= (0.1 * np.linspace(0.9, 1.1, 100) / np.linalg.norm(drawn, axis=(1, 2)))[
-        :, None, None
-    ]
-    values, _, _ = of_some(displaced, drawn)
-    exact, _, _ = of_some(energies, np.eye(3) + drawn)[False]
-    np.testing.assert_allclose(values, exact, rtol=1e-12)
-
-
-@pytest.mark.full
-@pytest.mark.hard_cases
-def test_strain_of_a_nearly_rigid_screw_survives_float32():
-    """Turning by 1e-3 and straining by 1e-5, like a warp at its start."""
-    strain = np.array([[1e-5, 0, 2e-5], [0, -1e-5, 0], [3e-5, 0, 1e-5]], np.float32)
-
-    def displacement(point):
-        rate = jnp.asarray(strain, point.dtype)
-        angular = jnp.asarray([1e-3, -5e-4, 2e-4], point.dtype) + rate @ point
-        return lie.displacement(angular, rate @ point, point)
-
-    @jax.jit
-    @jax.vmap
-    def measured(point):
-        change = jax.jacfwd(displacement)(point)
-        whole = jnp.eye(3, dtype=point.dtype) + change
-        return matrix3.displacement_log_energy(change), matrix3.log_energy(whole)
-
-    points = np.random.default_rng(0).uniform(-1, 1, (8, 3)).astype(np.float32)
-    narrow, rounded = map(np.asarray, measured(points))
-    with jax.enable_x64(True):
-        wide = np.asarray(measured(points.astype(np.float64))[0])
-    assert np.max(abs(narrow / wide - 1)) < 1e-5
-    assert np.max(abs(rounded / wide - 1)) > 1e-3
 
 
 def test_singular_vectors_refuse_to_be_differentiated():
