@@ -158,17 +158,6 @@ def test_splats_without_effects_are_the_static_ones_bit_for_bit(name):
     same_program(run.model.step, step, run.state, run.frames)
 
 
-@pytest.mark.slow
-def test_splats_without_densification_keep_no_statistics_of_it():
-    spec = dataclasses.replace(
-        bare_scenes.tiny_splats("splats-static"), densification=None
-    )
-    run = started_splats(spec)
-    assert jax.tree.leaves(run.state.aux_state) == []
-    step = bare_scenes.splat_step(run.spec, run.metadata, splat_scene.shuffled_row)
-    same_program(run.model.step, step, run.state, run.frames)
-
-
 def check_removed(run, start, owner, make):
     """Nothing is left of what was removed, as if it had never been there."""
     gone = hand_made_effects.absent_modules(run.spec)
@@ -186,32 +175,30 @@ def check_removed(run, start, owner, make):
         same_bits(run.state, upwards.state)
 
 
-# Left to the slow suite: scenes that keep an elastic penalty, whose derivatives are
-# second ones, or whose like is held already.
-# One field and one scene of splats by default; the others run with the slow tests.
-QUICK = {("nerf-w", "appearance"), ("splats-deformable", "motion")}
+def removals(presets, quick):
+    """Each part once, from the first of the papers' presets that has it.
 
-
-def removals(presets):
-    """Each part of each paper's preset; the small ones are those papers' in kind."""
+    Small presets are those papers' in kind.
+    """
+    of = {}
+    for name, spec in presets.items():
+        for part in parts_of(spec) if not name.endswith("-small") else ():
+            of.setdefault(part, name)
     return [
-        pytest.param(
-            name, part, marks=() if (name, part) in QUICK else pytest.mark.slow
-        )
-        for name, spec in presets.items()
-        if not name.endswith("-small")
-        for part in parts_of(spec)
+        pytest.param(name, part, marks=() if part == quick else pytest.mark.slow)
+        for part, name in of.items()
     ]
 
 
-@pytest.mark.parametrize(("preset", "part"), removals(field_presets.PRESETS))
+@pytest.mark.parametrize(
+    ("preset", "part"), removals(field_presets.PRESETS, "appearance")
+)
 def test_a_field_without_an_effect_is_one_that_never_had_it(preset, part):
     run = started_field(without(bare_scenes.tiny_field(preset), part))
     check_removed(run, started_field, field_spec, hand_made_effects.of_field)
 
 
-@pytest.mark.full
-@pytest.mark.parametrize(("preset", "part"), removals(splat_presets.PRESETS))
+@pytest.mark.parametrize(("preset", "part"), removals(splat_presets.PRESETS, None))
 def test_splats_without_an_effect_are_some_that_never_had_it(preset, part):
     run = started_splats(without(bare_scenes.tiny_splats(preset), part))
     check_removed(run, started_splats, splat_scene, hand_made_effects.of_splats)
@@ -250,8 +237,6 @@ def test_a_poisoned_effect_cannot_be_built():
     ("preset", "part"),
     [
         ("nerf-w", "appearance"),
-        pytest.param("nerfies", "elastic", marks=pytest.mark.slow),
-        pytest.param("nerfies", "appearance", marks=pytest.mark.slow),
         pytest.param("hypernerf", "ambient", marks=pytest.mark.slow),
     ],
 )
