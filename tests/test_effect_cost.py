@@ -8,7 +8,6 @@ function of the module of the one that is missing refuses to be called: both low
 the same text, and a compiler that gets the same text makes the same program.
 """
 
-import dataclasses
 import functools
 
 import jax
@@ -24,20 +23,12 @@ from nerfies_jax import scene as field_scene
 from nerfies_jax import spec as field_spec
 from nerfies_jax.measure import clock
 from tests import bare_scenes, hand_made_effects, scenes
+from tests.bare_scenes import parts_of, without
 from tests.hand_made_effects import FIELD_MODULES
 
 # How many layers of a tiny preset read what these add to the template: one in each of
 # two networks, and there again behind the skip.
 WIDENED = {"appearance": 2, "ambient": 4}
-# What cannot be without another.
-LEANS_ON = {
-    "elastic": ("warp",),
-    "background": ("warp",),
-    "alternation": ("motion",),
-    "acceleration": ("motion",),
-    "neighbours": ("motion",),
-    "motion_growth": ("motion", "densification"),
-}
 
 
 class Started:
@@ -75,24 +66,6 @@ def started_field(spec):
 
 def started_splats(spec):
     return Started(spec, splat_scene.build, splat_scene.metadata_of)
-
-
-def parts_of(spec):
-    """The names of what the scene has and could be without."""
-    return [
-        field.name
-        for field in dataclasses.fields(spec)
-        if field.default is None and getattr(spec, field.name) is not None
-        if field.name != "coarse"
-    ]
-
-
-def without(spec, *names):
-    """The scene without these parts and what leans on them."""
-    gone = set(names)
-    gone |= {name for name, on in LEANS_ON.items() if gone & set(on)}
-    fields = {field.name for field in dataclasses.fields(spec)}
-    return dataclasses.replace(spec, **dict.fromkeys(gone & fields))
 
 
 def bare(spec):

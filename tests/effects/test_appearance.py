@@ -48,9 +48,6 @@ CHEAP = {
     "elastic": None,
     "background": None,
 }
-WITH_CODES = sorted(
-    name for name, spec in presets.PRESETS.items() if spec.appearance is not None
-)
 
 
 def ray(dtype):
@@ -114,10 +111,9 @@ def test_colour_has_the_code_s_slope(float64, rng):
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(
-            name, marks=pytest.mark.full if name == "nerf-w" else pytest.mark.slow
-        )
-        for name in WITH_CODES
+        pytest.param("nerf-w", marks=pytest.mark.full),
+        pytest.param("nerfies", marks=pytest.mark.slow),
+        pytest.param("hypernerf", marks=pytest.mark.slow),
     ],
 )
 def test_codes_of_every_preset_learn(name):

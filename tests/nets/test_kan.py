@@ -15,6 +15,7 @@ from nerfies_jax.nets import kan
 from nerfies_jax.nets.kan import KAN, KANLayer, KANSpec, Kernels
 from nerfies_jax.nets.mlp import HeadSpec
 from tests import gradients
+from tests.oracles import networks
 
 SPEC = KANSpec(
     inputs=5,
@@ -78,34 +79,32 @@ def held(x, grid, margin):
 
 
 def by_hand(spec, params, x):
-    """Edge by edge and kernel by kernel in Python floats."""
-    params = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), params)
+    """Kernel by kernel in NumPy float64, each input of each layer by itself."""
+    params = networks.exact(params)
     layers = [[layer] for layer in params.hidden] + [list(params.heads.values())]
-    features = [float(v) for v in x]
+    features = networks.exact(x)
     for index, side_by_side in enumerate(layers):
         grid = spec.hidden_grid if index else spec.grid
-        step = (grid[1] - grid[0]) / (spec.kernels - 1)
-        sigma = spec.width_ratio * step
+        sigma = spec.width_ratio * (grid[1] - grid[0]) / (spec.kernels - 1)
         if index and spec.norm:
-            mean = sum(features) / len(features)
-            variance = sum((v - mean) ** 2 for v in features) / len(features)
-            features = [(v - mean) / math.sqrt(variance + 1e-6) for v in features]
-        outputs = []
-        for layer in side_by_side:
-            sums = list(layer.bias)
-            for o in range(len(sums)):
-                for i, v in enumerate(features):
-                    if spec.base:
-                        sums[o] += layer.base[i, o] * v / (1 + math.exp(-v))
-                    for g in range(spec.kernels):
-                        centre, scale = grid[0] + g * step, math.sqrt(2) * sigma
-                        if spec.trainable_kernels:
-                            centre = params.kernels[index].centre[g, i]
-                            scale = math.exp(params.kernels[index].log_width[g, i])
-                        place = (held(v, grid, sigma) - centre) / scale
-                        sums[o] += layer.kernel[g, i, o] * math.exp(-(place**2))
-            outputs.append(sums)
-        features = [v for sums in outputs for v in sums]
+            features = features - np.mean(features)
+            features = features / np.sqrt(np.mean(features**2) + 1e-6)
+        centre = np.linspace(*grid, spec.kernels)[:, None]
+        scale = math.sqrt(2) * sigma
+        if spec.trainable_kernels:
+            centre = params.kernels[index].centre
+            scale = np.exp(params.kernels[index].log_width)
+        kept = np.array([held(v, grid, sigma) for v in features])
+        psi = np.exp(-(((kept - centre) / scale) ** 2))
+        outputs = [
+            layer.bias + np.einsum("gi,gio->o", psi, layer.kernel)
+            for layer in side_by_side
+        ]
+        if spec.base:
+            silu = features / (1 + np.exp(-features))
+            pairs = zip(outputs, side_by_side, strict=True)
+            outputs = [sums + silu @ layer.base for sums, layer in pairs]
+        features = np.concatenate(outputs)
     return dict(zip(params.heads, outputs, strict=True))
 
 

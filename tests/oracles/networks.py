@@ -32,17 +32,21 @@ def affine(layer, x):
     return x @ weight + bias
 
 
-def trunk(layers, inputs, skips=()):
-    """What the last of the layers answers, with rectified sums."""
+def rectified(x):
+    return np.maximum(x, 0)
+
+
+def trunk(layers, inputs, skips=(), activation=rectified):
+    """What the last of the layers answers."""
     hidden = inputs
     for index, layer in enumerate(layers):
         if index in skips:
             hidden = np.concatenate([hidden, inputs])
-        hidden = np.maximum(affine(layer, hidden), 0)
+        hidden = activation(affine(layer, hidden))
     return hidden
 
 
-def heads(net, inputs, skips=()):
+def heads(net, inputs, skips=(), activation=rectified):
     """Of a multilayer perceptron: the answer of each head, by its name."""
-    hidden = trunk(net.hidden, np.asarray(inputs, np.float64), skips)
+    hidden = trunk(net.hidden, np.asarray(inputs, np.float64), skips, activation)
     return {name: affine(head, hidden) for name, head in net.heads.items()}

@@ -45,7 +45,7 @@ apply = jax.jit(template.apply, static_argnums=0)
     ("density", "condition", "noise"),
     [
         ("softplus", CONDITION, -0.7),
-        pytest.param("relu", CONDITION, None, marks=pytest.mark.full),
+        ("relu", CONDITION, None),
         pytest.param("softplus", 0, None, marks=pytest.mark.full),
     ],
 )
