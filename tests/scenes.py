@@ -102,7 +102,14 @@ def tiny_field():
     """Metadata of `TINY_FIELD`, parameters whose warp and codes show, and a view."""
     capture = tiny_capture()
     metadata = nerf_scene.metadata_of(capture, TINY_FIELD)
-    params = nerf_scene.field(TINY_FIELD, metadata).init(jax.random.key(3))
-    params["warp"] = jax.tree.map(lambda leaf: leaf + 0.1, params["warp"])
-    params["codes"] = jax.tree.map(lambda leaf: 40 * leaf, params["codes"])
+    made = nerf_scene.field(TINY_FIELD, metadata)
+
+    @jax.jit  # or each array is a program
+    def start(key):
+        params = made.init(key)
+        params["warp"] = jax.tree.map(lambda leaf: leaf + 0.1, params["warp"])
+        params["codes"] = jax.tree.map(lambda leaf: 40 * leaf, params["codes"])
+        return params
+
+    params = start(jax.random.key(3))
     return metadata, params, evaluation.view_of(capture, int(capture.heldout[0]))

@@ -58,7 +58,8 @@ def started(spec):
     capture = scenes.tiny_capture()
     model = scene.build(spec, scene.metadata_of(capture, spec))
     frames = evaluation.frames_of(capture, model.required_data)
-    return model, model.init(capture, jax.random.key(3)), frames
+    init = jax.jit(lambda key: model.init(capture, key))  # or each array is a program
+    return model, init(jax.random.key(3)), frames
 
 
 @functools.cache
