@@ -36,6 +36,33 @@ from nerfies_jax.training.updates import apply_updates
 
 FEW = EncodingSpec(2)
 STEPS = 100
+# What cannot be without another.
+LEANS_ON = {
+    "elastic": ("warp",),
+    "background": ("warp",),
+    "alternation": ("motion",),
+    "acceleration": ("motion",),
+    "neighbours": ("motion",),
+    "motion_growth": ("motion", "densification"),
+}
+
+
+def parts_of(spec):
+    """The names of what the scene has and could be without."""
+    return [
+        field.name
+        for field in dataclasses.fields(spec)
+        if field.default is None and getattr(spec, field.name) is not None
+        if field.name != "coarse"
+    ]
+
+
+def without(spec, *names):
+    """The scene without these parts and what leans on them."""
+    gone = set(names)
+    gone |= {name for name, on in LEANS_ON.items() if gone & set(on)}
+    fields = {field.name for field in dataclasses.fields(spec)}
+    return dataclasses.replace(spec, **dict.fromkeys(gone & fields))
 
 
 def shrunk(part, **changes):

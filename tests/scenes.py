@@ -3,6 +3,8 @@
 import dataclasses
 import functools
 
+import jax
+
 from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.effects.acceleration import AccelerationSpec
 from gaussians_jax.effects.depth import DepthSpec
@@ -14,8 +16,14 @@ from gaussians_jax.effects.neighbours import NeighbourSpec
 from gaussians_jax.effects.spectral import SpectralSpec
 from gaussians_jax.phases import AlternationSpec, AnnealingSpec
 from gaussians_jax.spec import SplatScene
+from nerfies_jax import evaluation
+from nerfies_jax import scene as nerf_scene
 from nerfies_jax.capture import synthetic
+from nerfies_jax.effects.appearance import AppearanceSpec
+from nerfies_jax.effects.warp import WarpSpec
 from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.radiance.template import TemplateSpec
+from nerfies_jax.spec import RadianceScene, SamplingSpec
 
 TINY_FILM = dataclasses.replace(
     synthetic.DEFAULT, size=(40, 30), frames=6, supersampling=1, points=200, tracks=8
@@ -72,9 +80,36 @@ TINY_MOBA = dataclasses.replace(
     motion_growth=MotionGrowthSpec(start=5),
     acceleration=AccelerationSpec(start=3, samples=64),
 )
+TINY_FIELD = RadianceScene(
+    steps=10,
+    template=TemplateSpec(
+        EncodingSpec(2), EncodingSpec(1), depth=1, width=8, skips=(), colour_width=8
+    ),
+    sampling=SamplingSpec(4, 0),
+    appearance=AppearanceSpec(width=3),
+    warp=WarpSpec(position=EncodingSpec(2), depth=1, width=8, skips=()),
+)
 
 
 @functools.cache
 def tiny_capture():
     """Six frames of 40x30 of the default scene, two of them held out."""
     return synthetic.make(TINY_FILM)[0]
+
+
+@functools.cache
+def tiny_field():
+    """Metadata of `TINY_FIELD`, parameters whose warp and codes show, and a view."""
+    capture = tiny_capture()
+    metadata = nerf_scene.metadata_of(capture, TINY_FIELD)
+    made = nerf_scene.field(TINY_FIELD, metadata)
+
+    @jax.jit  # or each array is a program
+    def start(key):
+        params = made.init(key)
+        params["warp"] = jax.tree.map(lambda leaf: leaf + 0.1, params["warp"])
+        params["codes"] = jax.tree.map(lambda leaf: 40 * leaf, params["codes"])
+        return params
+
+    params = start(jax.random.key(3))
+    return metadata, params, evaluation.view_of(capture, int(capture.heldout[0]))

@@ -8,7 +8,6 @@ function of the module of the one that is missing refuses to be called: both low
 the same text, and a compiler that gets the same text makes the same program.
 """
 
-import dataclasses
 import functools
 
 import jax
@@ -24,20 +23,12 @@ from nerfies_jax import scene as field_scene
 from nerfies_jax import spec as field_spec
 from nerfies_jax.measure import clock
 from tests import bare_scenes, hand_made_effects, scenes
+from tests.bare_scenes import parts_of, without
 from tests.hand_made_effects import FIELD_MODULES
 
 # How many layers of a tiny preset read what these add to the template: one in each of
 # two networks, and there again behind the skip.
 WIDENED = {"appearance": 2, "ambient": 4}
-# What cannot be without another.
-LEANS_ON = {
-    "elastic": ("warp",),
-    "background": ("warp",),
-    "alternation": ("motion",),
-    "acceleration": ("motion",),
-    "neighbours": ("motion",),
-    "motion_growth": ("motion", "densification"),
-}
 
 
 class Started:
@@ -77,24 +68,6 @@ def started_splats(spec):
     return Started(spec, splat_scene.build, splat_scene.metadata_of)
 
 
-def parts_of(spec):
-    """The names of what the scene has and could be without."""
-    return [
-        field.name
-        for field in dataclasses.fields(spec)
-        if field.default is None and getattr(spec, field.name) is not None
-        if field.name != "coarse"
-    ]
-
-
-def without(spec, *names):
-    """The scene without these parts and what leans on them."""
-    gone = set(names)
-    gone |= {name for name, on in LEANS_ON.items() if gone & set(on)}
-    fields = {field.name for field in dataclasses.fields(spec)}
-    return dataclasses.replace(spec, **dict.fromkeys(gone & fields))
-
-
 def bare(spec):
     return without(spec, *parts_of(spec))
 
@@ -121,6 +94,7 @@ def same_program(ours, by_hand, *args):
 
 # Every kind of static field: two networks for two levels, one for both, one level, and
 # a coarse network of its own that does not see the direction.
+@pytest.mark.full
 @pytest.mark.parametrize(
     "name",
     [
@@ -147,22 +121,12 @@ def test_there_is_no_other_kind_of_static_field():
     assert {kind(name) for name in field_presets.PRESETS} == held
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "name", ["splats-static-small", pytest.param("sonata", marks=pytest.mark.slow)]
 )
 def test_splats_without_effects_are_the_static_ones_bit_for_bit(name):
     run = started_splats(bare(bare_scenes.tiny_splats(name)))
-    step = bare_scenes.splat_step(run.spec, run.metadata, splat_scene.shuffled_row)
-    same_program(run.model.step, step, run.state, run.frames)
-
-
-@pytest.mark.slow
-def test_splats_without_densification_keep_no_statistics_of_it():
-    spec = dataclasses.replace(
-        bare_scenes.tiny_splats("splats-static"), densification=None
-    )
-    run = started_splats(spec)
-    assert jax.tree.leaves(run.state.aux_state) == []
     step = bare_scenes.splat_step(run.spec, run.metadata, splat_scene.shuffled_row)
     same_program(run.model.step, step, run.state, run.frames)
 
@@ -184,31 +148,30 @@ def check_removed(run, start, owner, make):
         same_bits(run.state, upwards.state)
 
 
-# Left to the slow suite: scenes that keep an elastic penalty, whose derivatives are
-# second ones, or whose like is held already.
-# One field and one scene of splats by default; the others run with the slow tests.
-QUICK = {("nerf-w", "appearance"), ("splats-deformable", "motion")}
+def removals(presets, quick):
+    """Each part once, from the first of the papers' presets that has it.
 
-
-def removals(presets):
-    """Each part of each paper's preset; the small ones are those papers' in kind."""
+    Small presets are those papers' in kind.
+    """
+    of = {}
+    for name, spec in presets.items():
+        for part in parts_of(spec) if not name.endswith("-small") else ():
+            of.setdefault(part, name)
     return [
-        pytest.param(
-            name, part, marks=() if (name, part) in QUICK else pytest.mark.slow
-        )
-        for name, spec in presets.items()
-        if not name.endswith("-small")
-        for part in parts_of(spec)
+        pytest.param(name, part, marks=() if part == quick else pytest.mark.slow)
+        for part, name in of.items()
     ]
 
 
-@pytest.mark.parametrize(("preset", "part"), removals(field_presets.PRESETS))
+@pytest.mark.parametrize(
+    ("preset", "part"), removals(field_presets.PRESETS, "appearance")
+)
 def test_a_field_without_an_effect_is_one_that_never_had_it(preset, part):
     run = started_field(without(bare_scenes.tiny_field(preset), part))
     check_removed(run, started_field, field_spec, hand_made_effects.of_field)
 
 
-@pytest.mark.parametrize(("preset", "part"), removals(splat_presets.PRESETS))
+@pytest.mark.parametrize(("preset", "part"), removals(splat_presets.PRESETS, None))
 def test_splats_without_an_effect_are_some_that_never_had_it(preset, part):
     run = started_splats(without(bare_scenes.tiny_splats(preset), part))
     check_removed(run, started_splats, splat_scene, hand_made_effects.of_splats)
@@ -221,6 +184,7 @@ def test_small_presets_have_parts_that_papers_have():
             assert set(parts_of(spec)) <= set(parts_of(paper)), name
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "preset", ["nerf-w", pytest.param("hypernerf", marks=pytest.mark.slow)]
 )
@@ -241,12 +205,11 @@ def test_a_poisoned_effect_cannot_be_built():
         field_spec.effects_of(bare_scenes.tiny_field("d-nerf"), None)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("preset", "part"),
     [
         ("nerf-w", "appearance"),
-        pytest.param("nerfies", "elastic", marks=pytest.mark.slow),
-        pytest.param("nerfies", "appearance", marks=pytest.mark.slow),
         pytest.param("hypernerf", "ambient", marks=pytest.mark.slow),
     ],
 )
@@ -262,6 +225,7 @@ def test_what_stays_starts_from_the_numbers_it_had(preset, part):
         np.testing.assert_array_equal(rest[path], whole[path], err_msg=str(path))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("start", "spec"),
     [

@@ -4,8 +4,6 @@ The expected arrays are counted out here, effect by effect, without the machiner
 puts scenes together; nothing is allocated or compiled for the fields.
 """
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import pytest
@@ -22,6 +20,7 @@ from nerfies_jax.radiance import template
 from nerfies_jax.scene_metadata import SceneMetadata
 from tests import bare_scenes, scenes
 
+QUICK = ("nerf-w", "hypernerf")
 MOMENTS, EXPOSURES = 5, 3
 METADATA = SceneMetadata(
     near=1.0,
@@ -84,18 +83,16 @@ def counted_out(spec):
 
 def removed_from(spec):
     """The preset itself, and without each of what it has."""
-    names = ("appearance", "transient", "time", "ambient", "elastic", "background")
-    yield spec
-    for name in names:
-        if getattr(spec, name) is not None:
-            yield dataclasses.replace(spec, **{name: None})
-    if spec.warp is not None:
-        yield dataclasses.replace(spec, warp=None, elastic=None, background=None)
-    if spec.scene_flow is not None:
-        yield dataclasses.replace(spec, scene_flow=None)
+    return [spec, *(bare_scenes.without(spec, p) for p in bare_scenes.parts_of(spec))]
 
 
-@pytest.mark.parametrize("preset", field_presets.PRESETS)
+@pytest.mark.parametrize(
+    "preset",
+    [
+        pytest.param(name, marks=() if name in QUICK else pytest.mark.full)
+        for name in field_presets.PRESETS
+    ],
+)
 def test_a_field_has_the_arrays_of_what_it_has_and_no_others(preset):
     for spec in removed_from(field_presets.PRESETS[preset]):
         made = fields.field(spec, METADATA)
@@ -104,25 +101,19 @@ def test_a_field_has_the_arrays_of_what_it_has_and_no_others(preset):
         assert shapes(found) == shapes(expected)
 
 
-def splats_without(spec):
-    """The preset itself, and without each of what it has."""
-    yield spec
-    for name in ("neighbours", "spectral", "depth", "acceleration", "motion_growth"):
-        if getattr(spec, name) is not None:
-            yield dataclasses.replace(spec, **{name: None})
-    for name in ("alternation", "annealing"):
-        if getattr(spec, name) is not None:
-            yield dataclasses.replace(spec, **{name: None})
-    if spec.motion is not None:
-        leaning = ("motion", "neighbours", "acceleration", "motion_growth")
-        yield dataclasses.replace(spec, alternation=None, **dict.fromkeys(leaning))
-
-
-@pytest.mark.parametrize("preset", splat_presets.PRESETS)
+@pytest.mark.parametrize(
+    "preset",
+    [
+        pytest.param(
+            name, marks=() if name == "splats-deformable" else pytest.mark.full
+        )
+        for name in splat_presets.PRESETS
+    ],
+)
 def test_splats_have_the_arrays_of_what_they_have_and_no_others(preset):
     capture = scenes.tiny_capture()
     metadata = splat_scene.metadata_of(capture)
-    for spec in splats_without(bare_scenes.tiny_splats(preset)):
+    for spec in removed_from(bare_scenes.tiny_splats(preset)):
         state = splat_scene.build(spec, metadata).init(capture, jax.random.key(0))
         motion, key, nets = spec.motion, jax.random.key(0), {}
         rows, states = {"splats"}, set()

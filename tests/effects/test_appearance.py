@@ -18,7 +18,7 @@ from nerfies_jax.scene import RadianceScene
 from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.spec import SamplingSpec
 from nerfies_jax.training.effects import APPEARANCE, FrameCondition, Table, weighted_sum
-from tests import gradients, scenes
+from tests import drawn, gradients, scenes
 
 TINY = RadianceScene(
     steps=10,
@@ -48,15 +48,11 @@ CHEAP = {
     "elastic": None,
     "background": None,
 }
-WITH_CODES = sorted(
-    name for name, spec in presets.PRESETS.items() if spec.appearance is not None
-)
 
 
 def ray(dtype):
-    origin, direction = ([0.1, -0.2, 0.3], [0.6, 0.0, 0.8])
-    near, far = jnp.asarray(1.0, dtype), jnp.asarray(3.0, dtype)
-    return Ray(jnp.asarray(origin, dtype), jnp.asarray(direction, dtype), near, far)
+    parts = [0.1, -0.2, 0.3], [0.6, 0.0, 0.8], 1.0, 3.0
+    return Ray(*(jnp.asarray(part, dtype) for part in parts))
 
 
 def condition(code):
@@ -71,42 +67,27 @@ def tracer():
 
 
 def params_of(dtype):
-    params = scene.field(TINY, METADATA).init(jax.random.key(0))
-    return jax.tree.map(lambda leaf: leaf.astype(dtype), params)
+    return drawn.params(scene.field(TINY, METADATA).init, dtype)
 
 
-def test_the_condition_is_the_code_itself(dtype, rng):
-    made = appearance.effect(AppearanceSpec(width=3))
-    code = jnp.asarray(rng.normal(size=3), dtype)
-    assert made.name == "appearance"
-    assert made.tables == (Table("appearance", APPEARANCE, 3),)
+@pytest.mark.parametrize("table", ["appearance", "exposure"])
+def test_the_condition_is_the_code_itself(table, rng):
+    made = appearance.effect(AppearanceSpec(width=3, table=table))
+    assert made.tables == (Table(table, APPEARANCE, 3),)
     assert made.condition_width == 3
-    found = made.condition(None, condition(code))
-    assert found.dtype == dtype
-    np.testing.assert_array_equal(found, code)
-
-
-def test_effects_may_share_a_named_table():
-    made = appearance.effect(AppearanceSpec(width=3, table="exposure"))
-    assert made.tables == (Table("exposure", APPEARANCE, 3),)
-    codes = {"exposure": jnp.arange(3.0), "appearance": jnp.zeros(3)}
-    found = made.condition(None, FrameCondition(jnp.asarray(0.0), codes, jnp.int32(0)))
-    np.testing.assert_array_equal(found, np.arange(3.0))
-
-
-@pytest.mark.parametrize("width", [0, -1])
-def test_a_code_without_numbers_is_refused(width):
-    with pytest.raises(ValueError, match=rf"width={width}.*set the effect to none"):
-        AppearanceSpec(width=width)
+    code = rng.normal(size=3).astype(np.float32)
+    codes = {"exposure": code, "appearance": -code} | {table: code}
+    found = made.condition(None, condition(code)._replace(codes=codes))
+    assert found is code
 
 
 def test_codes_change_the_colour_and_never_the_geometry(dtype):
     params = params_of(dtype)
     first, second = (
-        tracer()(params, ray(dtype), condition(jnp.full(3, value, dtype)))
+        tracer()(params, ray(dtype), condition(jnp.asarray([value] * 3, dtype)))
         for value in (0.0, 2.0)
     )
-    for one, other in zip(first, second, strict=True):
+    for one, other in jax.tree.map(np.asarray, [*zip(first, second, strict=True)]):
         np.testing.assert_array_equal(one.static_weight, other.static_weight)
         np.testing.assert_array_equal(one.distances, other.distances)
         assert one.distance == other.distance
@@ -115,29 +96,24 @@ def test_codes_change_the_colour_and_never_the_geometry(dtype):
 
 
 def test_colour_has_the_code_s_slope(float64, rng):
-    params = params_of(float64)
-    pull = jnp.asarray(rng.normal(size=3))
+    params = params_of("float64")
+    pull = rng.normal(size=3)
     plain = dataclasses.replace(TINY, sampling=SamplingSpec(4, 0, jitter=False))
     render = scene.field(plain, METADATA).render_ray
 
     def shade(code):
-        levels = render(params, ray(float64), condition(code))
+        levels = render(params, ray("float64"), condition(code))
         return sum(jnp.sum(pull * level.colour) for level in levels)
 
-    code = jnp.asarray(rng.normal(size=3))
-    assert gradients.directional_error(shade, code) < 1e-8
-    assert np.all(np.abs(jax.grad(shade)(code)) > 1e-5)
-
-
-def test_there_are_presets_with_codes():
-    assert {"nerf-w", "nerf-w-small", "nerfies", "hypernerf"} <= set(WITH_CODES)
+    assert gradients.directional_error(shade, rng.normal(size=3)) < 1e-8
 
 
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=() if name == "nerf-w" else pytest.mark.slow)
-        for name in WITH_CODES
+        pytest.param("nerf-w", marks=pytest.mark.full),
+        pytest.param("nerfies", marks=pytest.mark.slow),
+        pytest.param("hypernerf", marks=pytest.mark.slow),
     ],
 )
 def test_codes_of_every_preset_learn(name):
@@ -157,7 +133,7 @@ def test_codes_of_every_preset_learn(name):
     def loss(codes):
         terms = scene.loss_terms(
             made,
-            params | {"codes": params["codes"] | {"appearance": codes}},
+            params | {"codes": codes},
             frames,
             batch,
             jnp.int32(0),
@@ -165,8 +141,9 @@ def test_codes_of_every_preset_learn(name):
         )
         return weighted_sum(terms)
 
-    grad = jax.jit(jax.grad(loss))(params["codes"]["appearance"])
-    assert np.all(np.isfinite(grad))
+    grads = jax.tree.map(np.asarray, jax.jit(jax.grad(loss))(params["codes"]))
     rows = np.unique(frames.appearance[batch.row])
-    assert np.all(np.any(grad[rows] != 0, axis=1)), grad
-    assert np.linalg.norm(grad) > 1e-6
+    for name in {"appearance", "transient"} & set(grads):
+        assert np.all(np.isfinite(grads[name]))
+        assert np.all(np.any(grads[name][rows] != 0, axis=1)), name
+        assert np.linalg.norm(grads[name]) > 1e-6

@@ -5,11 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nerfies_jax.effects import background, warp
+from nerfies_jax.effects import background
 from nerfies_jax.effects.background import BackgroundSpec
 from nerfies_jax.effects.effect import Box
-from nerfies_jax.effects.warp import WarpSpec
-from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.training.effects import FrameCondition, PenaltyContext
 from nerfies_jax.training.model import Frames
 from tests import gradients
@@ -17,10 +15,10 @@ from tests import gradients
 CENTRE, SCALE = np.array([1.0, -2.0, 3.0]), 0.25
 
 
-def context(displace, points, frames, dtype, key=0):
+def context(displace, points, frames, dtype, key=None):
     """Frame k is at time k / 10."""
     fields = dict.fromkeys(PenaltyContext._fields)
-    times = jnp.arange(frames, dtype=dtype) / 10
+    times = jnp.asarray(np.arange(frames) / 10, dtype)
     seen = Frames(**dict.fromkeys(Frames._fields))
     return PenaltyContext(
         **fields
@@ -29,13 +27,16 @@ def context(displace, points, frames, dtype, key=0):
             "condition_of": lambda row: FrameCondition(times[row], {}, jnp.int32(0)),
             "frames": seen._replace(points=jnp.asarray(points, dtype), times=times),
             "box": Box(jnp.asarray(CENTRE, dtype), jnp.asarray(SCALE, dtype)),
-            "key": jax.random.key(key),
+            "key": jax.random.key(0) if key is None else key,
         }
     )
 
 
 def overheard(asked, x, time):
-    """x; the whole batch of both is appended to `asked`, in float64."""
+    """x; the whole batch of both is appended to `asked`, in float64.
+
+    For float32 alone: the listener's thread knows nothing of x64.
+    """
 
     def listen(x, time):
         asked.append((np.array(x, np.float64), np.array(time, np.float64)))
@@ -49,8 +50,10 @@ def geman_mcclure(squared, width, scaling):
     return scale * 2 * (squared / width**2) / (squared / width**2 + 4)
 
 
-@pytest.mark.parametrize("scaling", ["paper", "official"])
-def test_points_are_seen_in_the_field_in_all_frames(scaling, dtype, rng):
+@pytest.mark.parametrize(
+    "scaling", ["paper", pytest.param("official", marks=pytest.mark.full)]
+)
+def test_points_are_seen_in_the_field_in_all_frames(scaling, rng):
     """Each point once where there are few; frames alike often; noise of its size."""
     points = rng.normal(size=(6000, 3)) + CENTRE
     spec = BackgroundSpec(points=6000, noise=0.5, width=0.2, scaling=scaling)
@@ -60,16 +63,20 @@ def test_points_are_seen_in_the_field_in_all_frames(scaling, dtype, rng):
         x = overheard(asked, x, condition.time)
         return 0.1 * x + condition.time
 
-    here = context(displace, points, 7, dtype)
-    value = background.effect(spec).penalty(None, here)["background"].value
-    jax.block_until_ready(value)
+    made = background.effect(spec)
+    assert made.required_data == {"points"}
+
+    @jax.jit
+    def penalty(key):
+        return made.penalty(None, context(displace, points, 7, "float32", key))
+
+    value = float(penalty(jax.random.key(0))["background"].value)
     ((x, times),) = asked
     assert x.shape == (6000, 3)
     costs = geman_mcclure(
         np.sum((0.1 * x + times[:, None]) ** 2, axis=-1), 0.2, scaling
     )
-    bound = {"float32": 2e-6, "float64": 1e-12}[dtype]
-    np.testing.assert_allclose(value, costs.mean(), rtol=bound)
+    np.testing.assert_allclose(value, costs.mean(), rtol=2e-6)
     frames, counts = np.unique(np.round(times * 10), return_counts=True)
     np.testing.assert_array_equal(frames, np.arange(7))
     assert np.all(np.abs(counts - 6000 / 7) < 5 * np.sqrt(6000 / 7))
@@ -80,19 +87,23 @@ def test_points_are_seen_in_the_field_in_all_frames(scaling, dtype, rng):
     assert abs(np.corrcoef(times, noise[:, 0])[0, 1]) < 0.06
 
 
-def test_of_many_points_as_many_as_asked_are_drawn(float64, rng):
+@pytest.mark.full
+def test_of_many_points_as_many_as_asked_are_drawn():
     points = np.arange(3000.0).reshape(1000, 3)
     spec = BackgroundSpec(points=400, noise=0.0)
-    seen = []
-    for key in range(2):
-        asked = []
+    asked, seen = [], []
 
-        def displace(x, condition, asked=asked):
+    @jax.jit
+    def drift(key):
+        def displace(x, condition):
             return 0 * overheard(asked, x, condition.time)
 
-        assert background.drift(spec, context(displace, points, 3, "float64", key)) == 0
-        rows = asked[0][0] / SCALE + CENTRE
-        np.testing.assert_allclose(rows[:, 1] - rows[:, 0], 1, atol=1e-9)
+        return background.drift(spec, context(displace, points, 3, "float32", key))
+
+    for key in range(2):
+        assert drift(jax.random.key(key)) == 0
+        rows = asked[-1][0] / SCALE + CENTRE
+        np.testing.assert_allclose(rows[:, 1] - rows[:, 0], 1, atol=2e-3)
         seen.append(np.round(rows[:, 0] / 3).astype(int))
         assert len(seen[-1]) == 400
         assert len(np.unique(seen[-1])) > 290  # 1000 (1 - e^-0.4) = 330 are expected
@@ -105,14 +116,15 @@ def test_of_many_points_as_many_as_asked_are_drawn(float64, rng):
 def test_a_still_warp_costs_nothing_and_has_a_finite_slope(dtype, rng):
     """Zero, and displacements whose square underflows."""
     points = rng.normal(size=(20, 3))
+
+    @jax.jit
+    @jax.value_and_grad
+    def drift(shift):
+        here = context(lambda x, _: shift + 0 * x, points, 2, dtype)
+        return background.drift(BackgroundSpec(), here)
+
     for size in (0.0, 1e-25, 1e-15):
-
-        def drift(shift):
-            here = context(lambda x, _: shift + 0 * x, points, 2, dtype)
-            return background.drift(BackgroundSpec(), here)
-
-        shift = jnp.full(3, size, dtype)
-        value, grad = jax.jit(jax.value_and_grad(drift))(shift)
+        value, grad = drift(np.asarray([size] * 3, dtype))
         assert 0 <= value < 1e-25
         assert np.all(np.isfinite(grad))
         # ρ is 1e-3 s / (2e-6) there
@@ -120,44 +132,14 @@ def test_a_still_warp_costs_nothing_and_has_a_finite_slope(dtype, rng):
 
 
 def test_gradients(float64, rng):
-    spec = WarpSpec(
-        condition="time",
-        position=EncodingSpec(2),
-        time=EncodingSpec(2),
-        depth=2,
-        width=8,
-        skips=(),
-    )
-    params = warp.init(spec, jax.random.key(0), jnp.float64)
-    params = jax.tree.map(lambda x: x + 0.05 * rng.normal(size=x.shape), params)
     points = rng.normal(size=(30, 3)) + CENTRE
 
     def total(params):
-        displace = lambda x, condition: warp.displace(spec, params, x, condition)  # noqa: E731
+        def displace(x, condition):
+            return jnp.sin(params @ x + condition.time)
+
         here = context(displace, points, 4, "float64")
         return background.drift(BackgroundSpec(width=0.1, scaling="paper"), here)
 
+    params = 0.1 * rng.normal(size=(3, 3))
     assert gradients.directional_error(total, params, step=1e-6) < 1e-6
-
-
-def test_seams_of_the_effect():
-    seams = background.effect(BackgroundSpec())
-    assert seams.name == "background"
-    assert seams.required_data == {"points"}
-    assert seams.init is None
-    assert seams.tables == ()
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"points": 0}, "points=0"),
-        ({"noise": -1.0}, "noise=-1"),
-        ({"weight": float("nan")}, "weight=nan"),
-        ({"width": 0.0}, "width > 0"),
-        ({"scaling": "twice"}, "'twice'"),
-    ],
-)
-def test_wrong_settings_are_refused(change, message):
-    with pytest.raises(ValueError, match=message):
-        BackgroundSpec(**change)

@@ -68,19 +68,6 @@ def test_the_root_is_on_the_axis_branch_or_flagged(name, dtype):
 
 
 @pytest.mark.hard_cases
-def test_plain_newton_would_land_on_another_branch():
-    """The failure that the flag is for: a residual of zero on no ray of light."""
-    k1, target = -0.5, 0.6
-    radius = target
-    for _ in range(100):
-        excess = radius * (1 + k1 * radius**2) - target
-        radius -= excess / (1 + 3 * k1 * radius**2)
-    assert abs(radius * (1 + k1 * radius**2) - target) < 1e-9
-    lens = np.float32([k1, 0, 0]), np.zeros(2, np.float32)
-    assert not undistorted(*lens, np.array([[target, 0]]))[1]
-
-
-@pytest.mark.hard_cases
 @pytest.mark.parametrize("tangential", [(1e-3, -2e-3), (0.02, 0.03)])
 @pytest.mark.parametrize("name", ["none", "phone", "pincushion"])
 def test_round_trip_with_tangential_terms(name, tangential, dtype, rng):
@@ -112,12 +99,12 @@ def test_derivatives_stay_finite_past_the_fold(target, dtype):
 
 def test_derivatives_in_the_point_and_the_lens_match_differences(float64):
     """The sign of the lens's term is not seen by derivatives in the point alone."""
-    lens = jnp.asarray(LENSES["phone"]), jnp.asarray([1e-3, -2e-3])
+    lens = np.asarray(LENSES["phone"]), np.asarray([1e-3, -2e-3])
 
     def along(radial, tangential, bent):
         return distortion.undistort(radial, tangential, bent)[0] @ jnp.asarray([1, 2.0])
 
-    assert gradients.directional_error(along, *lens, jnp.asarray([0.3, -0.4])) < 1e-8
+    assert gradients.directional_error(along, *lens, np.array([0.3, -0.4])) < 1e-8
 
 
 @pytest.mark.hard_cases

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scipy.spatial.transform
 
-from nerfies_jax.geometry import lie, matrix3
+from nerfies_jax.geometry import matrix3
 from tests import gradients
 
 Rotation = scipy.spatial.transform.Rotation
@@ -127,28 +127,28 @@ def test_energy_and_gradient(signed, dtype, rng):
     assert np.max(error / (1 + np.abs(grads).max(axis=(1, 2)) * conditions)) < bound
 
 
-@pytest.mark.parametrize("signed", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_gradients_against_differences(signed, float64, rng):
+@pytest.mark.parametrize(
+    "name",
+    [
+        "energy",
+        pytest.param("signed", marks=pytest.mark.slow),
+        pytest.param("displacement", marks=pytest.mark.slow),
+    ],
+)
+def test_slopes_and_curvature_are_those_of_differences(name, float64, rng):
     shapes = [matrices(rng)[30], np.diag([1.3, 0.5, 4e-3]), np.diag([2, 1, -0.5])]
-    points = jnp.asarray([np.linalg.qr(rng.normal(size=(3, 3)))[0] @ m for m in shapes])
-    assert_twice_differentiable(ENERGIES[signed], points, rng, 1e-5)
-
-
-@pytest.mark.slow
-def test_displacement_gradients_against_differences(float64, rng):
-    sizes = np.array([1e-2, 0.5])[:, None, None]
-    points = jnp.asarray(sizes * rng.normal(size=(2, 3, 3)))
-    assert_twice_differentiable(matrix3.displacement_log_energy, points, rng, 1e-6)
-
-
-def assert_twice_differentiable(function, points, rng, step):
-    slopes_at = jax.jit(jax.vmap(jax.grad(function)))
+    points = np.array([np.linalg.qr(rng.normal(size=(3, 3)))[0] @ m for m in shapes])
+    function, step = ENERGIES[name == "signed"], 1e-5
+    if name == "displacement":
+        function, step = matrix3.displacement_log_energy, 1e-6
+        points = np.array([[[1e-2]], [[0.5]], [[0.1]]]) * rng.normal(size=points.shape)
+    slopes_at = jax.vmap(jax.grad(function))
     # slopes of folded matrices are ten thousand times others'
-    size = jnp.max(jnp.abs(slopes_at(points)), axis=(1, 2), keepdims=True)
-    weight = jnp.asarray(rng.normal(size=points.shape)) / size
+    size = np.abs(jax.jit(slopes_at)(points)).max((1, 2), keepdims=True)
+    weight = jnp.asarray(rng.normal(size=points.shape) / size)
 
     def total(points):
-        return jnp.sum(jax.vmap(function)(points) / size[:, 0, 0])
+        return jnp.sum(jax.vmap(function)(points) / jnp.asarray(size[:, 0, 0]))
 
     def along(points):
         return jnp.sum(slopes_at(points) * weight)
@@ -157,13 +157,11 @@ def assert_twice_differentiable(function, points, rng, step):
     assert gradients.directional_error(along, points, step=step) < 1e-6
 
 
-def test_singular_value_gradients_against_differences(float64, rng):
-    weight = jnp.asarray([1.0, -0.5, 2.0])
-    point = jnp.asarray(matrices(rng)[30])
-    error = gradients.directional_error(
-        lambda m: matrix3.singular_values(m) @ weight, point
-    )
-    assert error < 1e-6
+def test_slopes_of_singular_values_are_those_of_differences(float64, rng):
+    def total(matrix):
+        return matrix3.singular_values(matrix) @ jnp.asarray([1.0, -0.5, 2.0])
+
+    assert gradients.directional_error(total, matrices(rng)[30]) < 1e-6
 
 
 HARD = {
@@ -303,42 +301,6 @@ def test_displacements_far_below_an_ulp_keep_their_energy(size, dtype, rng):
 def _mp_energy(displacement):
     singular = mpmath.svd_r(mpmath.eye(3) + displacement, compute_uv=False)
     return sum(mpmath.log(value) ** 2 for value in singular)
-
-
-@pytest.mark.hard_cases
-def test_both_forms_agree_around_the_switch(float64, rng):
-    drawn = rng.normal(size=(100, 3, 3))
-    drawn *= (0.1 * np.linspace(0.9, 1.1, 100) / np.linalg.norm(drawn, axis=(1, 2)))[
-        :, None, None
-    ]
-    values, _, _ = of_some(displaced, drawn)
-    exact, _, _ = of_some(energies, np.eye(3) + drawn)[False]
-    np.testing.assert_allclose(values, exact, rtol=1e-12)
-
-
-@pytest.mark.hard_cases
-def test_strain_of_a_nearly_rigid_screw_survives_float32():
-    """Turning by 1e-3 and straining by 1e-5, like a warp at its start."""
-    strain = np.array([[1e-5, 0, 2e-5], [0, -1e-5, 0], [3e-5, 0, 1e-5]], np.float32)
-
-    def displacement(point):
-        rate = jnp.asarray(strain, point.dtype)
-        angular = jnp.asarray([1e-3, -5e-4, 2e-4], point.dtype) + rate @ point
-        return lie.displacement(angular, rate @ point, point)
-
-    @jax.jit
-    @jax.vmap
-    def measured(point):
-        change = jax.jacfwd(displacement)(point)
-        whole = jnp.eye(3, dtype=point.dtype) + change
-        return matrix3.displacement_log_energy(change), matrix3.log_energy(whole)
-
-    points = np.random.default_rng(0).uniform(-1, 1, (8, 3)).astype(np.float32)
-    narrow, rounded = map(np.asarray, measured(points))
-    with jax.enable_x64(True):
-        wide = np.asarray(measured(points.astype(np.float64))[0])
-    assert np.max(abs(narrow / wide - 1)) < 1e-5
-    assert np.max(abs(rounded / wide - 1)) > 1e-3
 
 
 def test_singular_vectors_refuse_to_be_differentiated():

@@ -29,7 +29,7 @@ def make_camera(dtype, **changes):
 
 def test_rays_go_through_pixel_centres(dtype):
     camera = make_camera(dtype)
-    grid = pixel_rays(camera)
+    grid = jax.tree.map(np.asarray, pixel_rays(camera))
     assert grid.direction.shape == (6, 8, 3)
     assert grid.direction.dtype == dtype
     assert np.all(grid.valid)
@@ -55,22 +55,20 @@ def test_pixels_without_a_ray_are_marked(dtype):
     assert np.array_equal(valid, radius < 2 / 3 * np.sqrt(1 / 2.4))
 
 
+@jax.jit
+def depth_and_back(camera, direction, distance):
+    depth = rays.depth_of_distance(camera, direction, distance)
+    return depth, rays.distance_of_depth(camera, direction, depth)
+
+
 def test_distance_and_depth_convert_both_ways(dtype):
     camera = make_camera(dtype)
-    grid = pixel_rays(camera)
-    distance = jnp.full((6, 8), 3, dtype)
-    depth = rays.depth_of_distance(camera, grid.direction, distance)
+    grid = jax.tree.map(np.asarray, pixel_rays(camera))
+    distance = np.full((6, 8), 3, dtype)
+    depth, again = depth_and_back(camera, grid.direction, distance)
     _, projected = seen_at(camera, grid.origin + 3 * grid.direction)
     np.testing.assert_allclose(depth, projected, rtol=1e-5)
-    again = rays.distance_of_depth(camera, grid.direction, depth)
     np.testing.assert_allclose(again, distance, rtol=1e-6)
-
-
-def test_nerfies_points_at_depth(oracle_dir, float64):
-    """`pixels_to_points` of google/nerfies takes z-depth."""
-    values = np.load(oracle_dir / "nerfies.npz")
-    centres = rays.pixel_centres((3, 2), jnp.float32)
-    np.testing.assert_array_equal(centres, values["unit/camera/pixel_centers_tl"])
 
 
 def box_by_sampling(origin, direction, low, high):
@@ -88,7 +86,7 @@ def test_box_span_is_where_samples_are_inside(start, dtype, rng):
         direction /= np.linalg.norm(direction)
         inside = box_by_sampling(np.array(start), direction, low, high)
         enter, leave = box_span(
-            *(jnp.asarray(x, dtype) for x in (start, direction, low, high))
+            *(np.asarray(x, dtype) for x in (start, direction, low, high))
         )
         if len(inside) > 1:
             np.testing.assert_allclose([enter, leave], inside[[0, -1]], atol=2e-4)

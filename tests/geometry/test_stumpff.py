@@ -1,7 +1,5 @@
 """Stumpff functions against 60-digit arithmetic, value and two derivatives."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import mpmath
@@ -61,19 +59,3 @@ def test_value_and_derivatives_from_zero_to_a_million_radians(order, derivative,
     # θ = √s is itself rounded to half an ulp, which the sine sees in full
     bound = {"float32": 3e-7, "float64": 6e-16}[dtype] * (1 + ANGLES / 10)
     assert np.all(error < bound), np.max(error / bound)
-
-
-def test_a_wrong_switch_would_be_seen(monkeypatch):
-    """The closed form below 0.1 rad: the slope of c3 is then wrong by a per cent."""
-    monkeypatch.setattr("nerfies_jax.geometry.stumpff.SERIES_BELOW", 1e-5)
-    squared = jnp.asarray(1e-4, jnp.float32)
-    assert abs(jax.grad(functools.partial(stumpff, 3))(squared) + 1 / 120) > 1e-4
-
-
-def test_forward_and_reverse_mode_agree(float64):
-    points = jnp.asarray([0.0, 1e-9, 4.0, 8.9, 9.1, 50.0])
-    for order in (1, 3):
-        function = functools.partial(stumpff, order)
-        forward = jax.jit(jax.vmap(jax.jacfwd(jax.jacfwd(function))))(points)
-        reverse = jax.jit(jax.vmap(jax.grad(jax.grad(function))))(points)
-        np.testing.assert_allclose(forward, reverse, rtol=1e-13)

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from nerfies_jax.measure import matrix_flops
 
@@ -10,15 +11,17 @@ def product(x, y):
     return x @ y
 
 
-LEFT, RIGHT = jnp.ones((3, 4)), jnp.ones((4, 5))
+def ones(*shape):
+    return np.ones(shape, np.float32)
+
+
+LEFT, RIGHT = ones(3, 4), ones(4, 5)
 
 
 def test_a_matrix_product_has_two_operations_a_multiply_add():
     found = matrix_flops.count(product, LEFT, RIGHT)
     assert found == matrix_flops.Counted(2 * 3 * 4 * 5, False)
-    batched = matrix_flops.count(
-        jax.vmap(product), jnp.ones((7, 3, 4)), jnp.ones((7, 4, 5))
-    )
+    batched = matrix_flops.count(jax.vmap(product), ones(7, 3, 4), ones(7, 4, 5))
     assert batched.flops == 7 * found.flops
     # A vector under vmap is a matrix; what is alike for the batch is computed once.
     row = matrix_flops.count(jax.vmap(product, (0, None)), LEFT, RIGHT)
@@ -39,7 +42,7 @@ def test_every_round_of_a_loop_counts_and_of_branches_the_dearest():
     def rounds(x):
         return jax.lax.map(lambda row: jnp.tanh(row @ RIGHT), x, batch_size=2)
 
-    assert matrix_flops.count(rounds, jnp.ones((6, 4))) == (2 * 6 * 4 * 5, False)
+    assert matrix_flops.count(rounds, ones(6, 4)) == (2 * 6 * 4 * 5, False)
 
     def either(x):
         return jax.lax.cond(
@@ -51,9 +54,7 @@ def test_every_round_of_a_loop_counts_and_of_branches_the_dearest():
 
 def test_a_loop_whose_rounds_nobody_knows_counts_once_and_says_so():
     def until(x):
-        return jax.lax.while_loop(
-            lambda x: x[0, 0] < 9, lambda x: x @ jnp.ones((4, 4)), x
-        )
+        return jax.lax.while_loop(lambda x: x[0, 0] < 9, lambda x: x @ ones(4, 4), x)
 
     assert matrix_flops.count(until, LEFT) == (2 * 3 * 4 * 4, True)
     # Without products there is nothing more to count

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nerfies_jax.geometry import lie
-from nerfies_jax.nets import encoding, mlp
+from nerfies_jax.nets import mlp
 from nerfies_jax.nets.mlp import HeadSpec, MLPSpec
-from tests import gradients
+from tests import drawn, gradients
+from tests.oracles import networks
 
 SPEC = MLPSpec(
     inputs=5,
@@ -24,176 +24,110 @@ SPEC = MLPSpec(
 )
 
 
+EXACT = {
+    "relu": networks.rectified,
+    "softplus": lambda x: np.log1p(np.exp(x)),
+    "silu": lambda x: x / (1 + np.exp(-x)),
+    "tanh": np.tanh,
+    "sine": np.sin,
+    "none": lambda x: x,
+}
+
+
 def by_hand(spec, params, x):
-    """Neuron by neuron in Python floats."""
-    activations = {
-        "relu": lambda v: max(v, 0.0),
-        "softplus": lambda v: math.log1p(math.exp(v)),
-        "silu": lambda v: v / (1 + math.exp(-v)),
-        "tanh": math.tanh,
-        "sine": math.sin,
-        "none": lambda v: v,
-    }
-
-    def affine(layer, values):
-        weight, bias = (np.asarray(leaf, np.float64) for leaf in layer)
-        assert weight.shape[0] == len(values)
-        return [
-            bias[j] + sum(values[i] * weight[i, j] for i in range(len(values)))
-            for j in range(weight.shape[1])
-        ]
-
-    hidden = list(x)
-    for index, layer in enumerate(params.hidden):
-        if index in spec.skips:
-            hidden = hidden + list(x)
-        hidden = [activations[spec.activation](v) for v in affine(layer, hidden)]
-    return {name: affine(layer, hidden) for name, layer in params.heads.items()}
+    return networks.heads(params, x, spec.skips, EXACT[spec.activation])
 
 
-@pytest.mark.parametrize("activation", mlp.ACTIVATIONS)
-def test_outputs_neuron_by_neuron(activation, dtype, rng):
-    spec = dataclasses.replace(SPEC, activation=activation)
-    params = mlp.init(spec, jax.random.key(0), jnp.dtype(dtype))
-    # biases that are not zero, so that a lost bias shows
-    params = jax.tree.map(lambda x: x + jnp.asarray(0.1, dtype), params)
-    inputs = jnp.asarray(rng.normal(size=(6, 5)), dtype)
-    batch = mlp.apply(spec, params, inputs)
+apply = jax.jit(mlp.apply, static_argnums=0)
+
+
+def drawn_net(spec, dtype):
+    """With biases that are not zero, so that a lost one shows."""
+    return drawn.params(lambda key: mlp.init(spec, key), dtype, 0.1)
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [
+        *(dataclasses.replace(SPEC, activation=name) for name in mlp.ACTIVATIONS),
+        dataclasses.replace(SPEC, depth=0, skips=()),
+    ],
+    ids=lambda spec: spec.activation if spec.depth else "no layers",
+)
+def test_outputs_neuron_by_neuron(spec, dtype, rng):
+    params = drawn_net(spec, dtype)
+    inputs = rng.normal(size=(6, 5)).astype(dtype)
+    batch = jax.tree.map(np.asarray, apply(spec, params, inputs))
     for row in range(6):
-        truth = by_hand(spec, params, np.asarray(inputs[row], np.float64))
-        one = mlp.apply(spec, params, inputs[row])
+        truth = by_hand(spec, params, inputs[row].astype(np.float64))
         for name, value in truth.items():
-            assert one[name].dtype == dtype
+            assert batch[name].dtype == dtype
             bound = {"float32": 1e-5, "float64": 1e-13}[dtype]
-            np.testing.assert_allclose(one[name], value, rtol=bound, atol=bound)
             np.testing.assert_allclose(batch[name][row], value, rtol=bound, atol=bound)
 
 
 def test_gradients(float64, rng):
-    params = mlp.init(SPEC, jax.random.key(1), jnp.float64)
-    inputs = jnp.asarray(rng.normal(size=5))
-
     def total(params, inputs):
         heads = mlp.apply(SPEC, params, inputs)
-        return jnp.sum(1e4 * heads["shift"] ** 2) + jnp.sum(heads["density"])
+        return jnp.sum(heads["shift"] ** 2) + jnp.sum(heads["density"])
 
+    params, inputs = drawn_net(SPEC, "float64"), rng.normal(size=5)
     assert gradients.directional_error(total, params, inputs) < 1e-6
 
 
+@functools.partial(jax.jit, static_argnums=(1, 2))
+def four_layers(key, shape, dtype):
+    kinds = ("glorot", "he", "zero", "small")
+    kind = jnp.dtype(dtype)
+    return {name: mlp.init_layer(key, *shape, name, kind) for name in kinds}
+
+
 def test_initial_weights_have_the_promised_spread(dtype):
-    key = jax.random.key(2)
+    layers = four_layers(jax.random.key(2), (400, 200), dtype)
+    layers = jax.tree.map(np.asarray, layers)
     for name, variance in (("glorot", 2 / (400 + 200)), ("he", 2 / 400)):
-        weight, bias = mlp.init_layer(key, 400, 200, name, jnp.dtype(dtype))
+        weight, bias = layers[name]
         assert weight.dtype == bias.dtype == dtype
         assert abs(np.var(weight) / variance - 1) < 0.02  # 80 000 draws
         assert abs(np.mean(weight)) < 4 * math.sqrt(variance / weight.size)
         assert np.all(bias == 0)
-    assert np.all(mlp.init_layer(key, 4, 3, "zero").weight == 0)
-    small = mlp.init_layer(key, 400, 200, "small").weight
+    assert np.all(layers["zero"].weight == 0)
+    small = layers["small"].weight
     assert 0.99e-4 < np.max(small) <= 1e-4
     assert -1e-4 <= np.min(small) < -0.99e-4  # two-sided
 
 
-def test_both_precisions_start_from_the_same_weights():
+@pytest.mark.full
+def test_both_precisions_start_from_the_same_weights_each_its_own():
+    init = jax.jit(mlp.init, static_argnums=(0, 2))
+    spec = dataclasses.replace(SPEC, skips=())
     with jax.enable_x64(True):
-        wide = mlp.init(SPEC, jax.random.key(3), jnp.float64)
-    narrow = mlp.init(SPEC, jax.random.key(3))
+        wide = jax.tree.map(np.asarray, init(spec, jax.random.key(3), jnp.float64))
+    narrow = jax.tree.map(np.asarray, init(spec, jax.random.key(3), jnp.float32))
     for one, other in zip(jax.tree.leaves(wide), jax.tree.leaves(narrow), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-6)
-
-
-def test_layers_are_drawn_independently():
-    params = mlp.init(dataclasses.replace(SPEC, skips=()), jax.random.key(4))
-    first, second = params.hidden[1].weight, params.hidden[2].weight
+    first, second = narrow.hidden[1].weight, narrow.hidden[2].weight
     assert first.shape == second.shape
     assert not np.any(first == second)
 
 
-def test_without_hidden_layers_heads_read_the_input():
-    spec = MLPSpec(inputs=2, depth=0, width=8, heads=(("out", HeadSpec(2)),))
-    params = mlp.init(spec, jax.random.key(0))
-    inputs = jnp.asarray([1.0, -2.0])
-    out = mlp.apply(spec, params, inputs)["out"]
-    np.testing.assert_allclose(out, inputs @ params.heads["out"].weight, rtol=1e-6)
-
-
-def test_nerfies_warp_field(oracle_dir, float64):
-    """Nerfies' own trained-like screw field, from its weights: points and Jacobians.
-
-    Encoding with its window, code, skip, heads and screw, all of these floors at once.
-    """
-    values = np.load(oracle_dir / "nerfies.npz")
-    field = "params/live/warp_field/"
-
-    def layer(name):
-        leaves = (values[f"{field}{name}/{leaf}"] for leaf in ("kernel", "bias"))
-        return mlp.Layer(*(jnp.asarray(np.array(x, np.float64)) for x in leaves))
-
-    heads = tuple((name, HeadSpec(3)) for name in "wv")
-    spec = MLPSpec(inputs=59, depth=6, width=128, heads=heads, skips=(4,))
-    params = mlp.MLP(
-        hidden=tuple(layer(f"trunk/hidden_{i}") for i in range(6)),
-        heads={name: layer(f"branches_{name}/logit") for name in "wv"},
-    )
-    fresh = mlp.init(spec, jax.random.key(0), jnp.float64)
-    assert jax.tree.map(jnp.shape, fresh) == jax.tree.map(jnp.shape, params)
-    table = np.array(values[field + "metadata_encoder/embed/embedding"], np.float64)
-    window = encoding.anneal(8, jnp.asarray(4.25))
-
-    def warp(point, code):
-        features = encoding.encode(encoding.EncodingSpec(8), point, window)
-        screw = mlp.apply(spec, params, jnp.concatenate([features, code]))
-        return lie.transform_point(screw["w"], screw["v"], point)
-
-    points = jnp.asarray(np.array(values["f64/live/coarse/points"])).reshape(-1, 3)
-    ids = np.repeat(values["in/id_warp"][:, 0], 16)
-    chosen = jnp.asarray(table[ids])
-    warped = jax.jit(jax.vmap(warp))(points, chosen)
-    jacobian = jax.jit(jax.vmap(jax.jacfwd(warp)))(points, chosen)
-    truth = values["f64/live/coarse/warped_points"].reshape(-1, 3)
-    np.testing.assert_allclose(warped, truth, rtol=1e-12, atol=1e-13)
-    truth = values["f64/live/coarse/warp_jacobian"].reshape(-1, 3, 3)
-    np.testing.assert_allclose(jacobian, truth, rtol=1e-10, atol=1e-11)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"inputs": 0}, "inputs=0"),
-        ({"depth": -1}, "depth=-1"),
-        ({"skips": (0,)}, "layer 0 is not in 1 .. 3"),
-        ({"skips": (4,)}, "layer 4 is not in 1 .. 3"),
-        ({"activation": "swish"}, "'swish'; choose from"),
-        ({"init": "xavier"}, "'xavier'; choose from"),
-        ({"heads": (("a", HeadSpec(1)), ("a", HeadSpec(2)))}, "different names"),
-    ],
-)
-def test_impossible_networks_are_refused(changes, message):
-    with pytest.raises(ValueError, match=message):
-        dataclasses.replace(SPEC, **changes)
-
-
-def test_impossible_heads_are_refused():
-    with pytest.raises(ValueError, match="width=0"):
-        HeadSpec(0)
-    with pytest.raises(ValueError, match="initialiser"):
-        HeadSpec(1, "one")
-
-
-@pytest.mark.parametrize("skips", [(), (1, 2)])
-def test_inputs_known_beforehand_may_be_summed_once(skips, dtype):
+@pytest.mark.parametrize("skips", [(1, 2), pytest.param((), marks=pytest.mark.full)])
+def test_inputs_known_beforehand_may_be_summed_once(skips, dtype, rng):
     """Against the network that reads them with every row."""
-    heads = (("out", HeadSpec(4)),)
-    spec = MLPSpec(7, 3, 8, heads, skips, "softplus")
-    params = mlp.init(spec, jax.random.key(0), jnp.dtype(dtype))
-    rows = jax.random.normal(jax.random.key(1), (5, 4), dtype)
-    known = jax.random.normal(jax.random.key(2), (3,), dtype)
-    whole = jnp.concatenate([rows, jnp.broadcast_to(known, (5, 3))], axis=1)
-    rest = dataclasses.replace(spec, inputs=4)
-    ours = mlp.apply(rest, mlp.with_known(spec, params, known), rows)["out"]
-    theirs = mlp.apply(spec, params, whole)["out"]
+    spec = MLPSpec(7, 3, 8, (("out", HeadSpec(4)),), skips, "softplus")
+    params = drawn_net(spec, dtype)
+    rows, known = rng.normal(size=(5, 4)).astype(dtype), rng.normal(size=3)
+    known = known.astype(dtype)
+
+    @jax.jit
+    def ours(params, known, rows):
+        rest = dataclasses.replace(spec, inputs=4)
+        return mlp.apply(rest, mlp.with_known(spec, params, known), rows)["out"]
+
+    whole = np.concatenate([rows, np.broadcast_to(known, (5, 3))], axis=1)
+    theirs = [by_hand(spec, params, row.astype(np.float64))["out"] for row in whole]
     tolerance = {"float32": 2e-6, "float64": 1e-14}[dtype]
-    np.testing.assert_allclose(ours, theirs, atol=tolerance)
+    np.testing.assert_allclose(ours(params, known, rows), theirs, atol=tolerance)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -206,21 +140,14 @@ def heads_and_slopes(spec, params, inputs):
     return found, grads
 
 
+@pytest.mark.full
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("activation", mlp.ACTIVATIONS)
 def test_bfloat16_is_finite_and_near(activation, rng):
     """Parameters and inputs of eight bits: outputs as near, slopes finite."""
     heads = (("shift", HeadSpec(3)), ("density", HeadSpec(1)))
     spec = MLPSpec(5, 2, 7, heads, skips=(1,), activation=activation)
-    shapes = jax.eval_shape(lambda key: mlp.init(spec, key), jax.random.key(0))
-
-    def draw(leaf):
-        # As initialised: weights of variance 2 / (inputs + outputs), biases of zero.
-        weights = len(leaf.shape) > 1
-        spread = np.sqrt(2 / sum(leaf.shape)) if weights else 0.0
-        return (spread * rng.normal(size=leaf.shape)).astype(jnp.bfloat16)
-
-    params = jax.tree.map(draw, shapes)
+    params = drawn_net(spec, "bfloat16")
     inputs = rng.normal(size=(32, 5)).astype(jnp.bfloat16)
     wide = jax.tree.map(lambda x: x.astype(np.float32), (params, inputs))
     (narrow, grads), (exact, wanted) = (

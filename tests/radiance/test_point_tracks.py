@@ -21,7 +21,7 @@ def filmed():
     return capture, truth, protocol.ground_truth(capture, truth, 2, 5)
 
 
-@pytest.mark.parametrize("lost_at", [None, 2])
+@pytest.mark.parametrize("lost_at", [None, pytest.param(2, marks=pytest.mark.full)])
 def test_points_are_followed_through_a_warp_in_closed_form(
     filmed, monkeypatch, lost_at
 ):

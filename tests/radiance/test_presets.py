@@ -19,6 +19,7 @@ COUNTED = {
     "elastic": ("hold_steps", "decay_steps"),
     "scene_flow": ("decay_steps",),
 }
+QUICK = ("nerf-w", "nsff")
 PAPERS = ("nerf", "nerf-w", "d-nerf", "t-nerf", "nerfies", "hypernerf", "nsff")
 
 
@@ -26,7 +27,13 @@ def test_every_paper_has_a_small_variant():
     assert set(PRESETS) == {*PAPERS, *(f"{name}-small" for name in PAPERS)}
 
 
-@pytest.mark.parametrize("name", sorted(PRESETS))
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name in QUICK else pytest.mark.full)
+        for name in PAPERS  # small ones train below
+    ],
+)
 def test_a_step_of_every_preset_keeps_its_state(name):
     # Traced, not compiled: shapes, dtypes and promotion of the whole step.
     capture = scenes.tiny_capture()
@@ -41,17 +48,16 @@ def test_a_step_of_every_preset_keeps_its_state(name):
     assert {"loss", "mse", "fine"} <= set(metrics)
 
 
-@pytest.mark.parametrize("name", sorted(PRESETS))
-def test_half_the_steps_halve_the_schedules(name):
-    spec = PRESETS[name]
-    half = presets.with_steps(spec, spec.steps // 2)
-    assert half.steps == spec.steps // 2
-    for effect, fields in COUNTED.items():
-        whole = getattr(spec, effect)
-        for field in fields if whole is not None else ():
-            count = getattr(whole, field)
-            expected = max(1, count // 2) if count else count
-            assert getattr(getattr(half, effect), field) == expected
+def test_half_the_steps_halve_the_schedules():
+    for spec in PRESETS.values():
+        half = presets.with_steps(spec, spec.steps // 2)
+        assert half.steps == spec.steps // 2
+        for effect, fields in COUNTED.items():
+            whole = getattr(spec, effect)
+            for field in fields if whole is not None else ():
+                count = getattr(whole, field)
+                expected = max(1, count // 2) if count else count
+                assert getattr(getattr(half, effect), field) == expected
 
 
 def test_presets_differ_only_in_what_their_names_say():

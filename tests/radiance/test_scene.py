@@ -12,10 +12,7 @@ from nerfies_jax import evaluation, render_ray, scene
 from nerfies_jax.effects.ambient import AmbientSpec
 from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.effects.background import BackgroundSpec
-from nerfies_jax.effects.elastic import ElasticSpec
-from nerfies_jax.effects.time_condition import TimeSpec
 from nerfies_jax.effects.warp import WarpSpec
-from nerfies_jax.nets import codes
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.radiance.template import TemplateSpec
 from nerfies_jax.scene import RadianceScene
@@ -23,7 +20,8 @@ from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.spec import SamplingSpec
 from nerfies_jax.training.effects import FrameCondition, weighted_sum
 from nerfies_jax.training.model import TrainState, View
-from tests import gradients, scenes
+from tests import drawn, gradients, scenes
+from tests.oracles import networks
 
 TINY_TEMPLATE = TemplateSpec(
     position=EncodingSpec(3),
@@ -44,13 +42,6 @@ STATIC = RadianceScene(
 TINY_WARP = WarpSpec(
     position=EncodingSpec(2), depth=2, width=8, skips=(), anneal_steps=10
 )
-NERFIES = dataclasses.replace(
-    STATIC,
-    warp=TINY_WARP,
-    appearance=AppearanceSpec(width=2),
-    elastic=ElasticSpec(points=2),
-    background=BackgroundSpec(points=16),
-)
 METADATA = SceneMetadata(
     near=1.0,
     far=3.0,
@@ -67,18 +58,8 @@ def started(spec):
     capture = scenes.tiny_capture()
     model = scene.build(spec, scene.metadata_of(capture, spec))
     frames = evaluation.frames_of(capture, model.required_data)
-    return model, model.init(capture, jax.random.key(3)), frames
-
-
-@functools.cache
-def stepped(spec, count):
-    model, state, frames = started(spec)
-    step = jax.jit(model.step)
-    trace = []
-    for _ in range(count):
-        state, metrics = step(state, frames)
-        trace.append({name: float(value) for name, value in metrics.items()})
-    return state, trace
+    init = jax.jit(lambda key: model.init(capture, key))  # or each array is a program
+    return model, init(jax.random.key(3)), frames
 
 
 @functools.cache
@@ -103,42 +84,31 @@ def condition_of(dtype, **found):
     return FrameCondition(jnp.asarray(0.4, dtype), found, jnp.int32(0))
 
 
-@pytest.mark.parametrize(
-    "spec",
-    [
-        pytest.param(STATIC, id="static"),
-        pytest.param(NERFIES, id="nerfies", marks=pytest.mark.slow),
-    ],
-)
-def test_training_lowers_the_loss(spec):
-    _, trace = stepped(spec, 40)
-    first = np.mean([row["mse"] for row in trace[:8]])
-    last = np.mean([row["mse"] for row in trace[-8:]])
-    assert last < 0.8 * first, (first, last)
-
-
-def test_a_static_field_has_a_template_and_nothing_else():
+def test_training_a_static_field_lowers_the_loss():
     model, state, frames = started(STATIC)
     assert set(state.params) == {"template", "codes"}
     assert state.params["codes"] == {}
     assert frames.points is None
     assert frames.depths is None
     assert model.required_data == frozenset()
-    _, trace = stepped(STATIC, 40)
-    assert set(trace[0]) == {"loss", "mse", "coarse", "fine"}
+    step, trace = jax.jit(model.step), []
+    for _ in range(40):
+        state, metrics = step(state, frames)
+        trace.append(float(metrics["mse"]))
+    assert set(metrics) == {"loss", "mse", "coarse", "fine"}
+    assert np.mean(trace[-8:]) < 0.8 * np.mean(trace[:8]), trace
 
 
 def test_a_static_level_is_the_plain_nerf(dtype):
-    metadata = METADATA
-    field = scene.field(STATIC, metadata)
-    params = jax.tree.map(lambda x: x.astype(dtype), field.init(jax.random.key(0)))
-    ray = ray_of(dtype)
-    coarse, fine = jax.jit(field.render_ray)(params, ray, condition_of(dtype))
+    field, ray = scene.field(STATIC, METADATA), ray_of(dtype)
+    params = drawn.params(field.init, dtype)
+    found = jax.jit(field.render_ray)(params, ray, condition_of(dtype))
+    coarse, fine = jax.tree.map(np.asarray, found)
     assert fine.colour.dtype == dtype
     expected = plain_nerf(params["template"]["coarse"], ray, np.linspace(0.5, 1.5, 8))
     tolerance = {"float32": 3e-6, "float64": 1e-12}[dtype]
     np.testing.assert_allclose(coarse.colour, expected, atol=tolerance)
-    expected = plain_nerf(params["template"]["fine"], ray, np.asarray(fine.distances))
+    expected = plain_nerf(params["template"]["fine"], ray, fine.distances)
     np.testing.assert_allclose(fine.colour, expected, atol=tolerance)
     assert len(fine.distances) == 16
     assert np.all(np.diff(fine.distances) >= 0)
@@ -146,45 +116,32 @@ def test_a_static_level_is_the_plain_nerf(dtype):
 
 def plain_nerf(net, ray, distances):
     """One ray of the two-layer field in NumPy, white behind, in float64."""
-    net = jax.tree.map(lambda x: np.asarray(x, np.float64), net)
-    origin, direction, _, far = (np.asarray(x, np.float64) for x in ray)
+    origin, direction, _, far = networks.exact(tuple(ray))
     colour, passing = np.zeros(3), 1.0
+    view = networks.waves(TINY_TEMPLATE.direction, direction)
     ends = np.append(distances[1:], far)
     for distance, end in zip(distances, ends, strict=True):
-        hidden = waves(origin + distance * direction, 3)
-        for layer in net.trunk.hidden:
-            hidden = np.maximum(hidden @ layer.weight + layer.bias, 0)
-        heads = {
-            name: hidden @ head.weight + head.bias
-            for name, head in net.trunk.heads.items()
-        }
-        beside = np.concatenate([heads["bottleneck"], waves(direction, 1)])
-        branch = beside @ net.colour.hidden[0].weight + net.colour.hidden[0].bias
-        head = net.colour.heads["colour"]
-        shade = 1 / (1 + np.exp(-(np.maximum(branch, 0) @ head.weight + head.bias)))
-        density = np.logaddexp(0, heads["density"][0])
-        alpha = 1 - np.exp(-density * (end - distance))
+        point = origin + distance * direction
+        heads = networks.heads(net.trunk, networks.waves(TINY_TEMPLATE.position, point))
+        beside = np.concatenate([heads["bottleneck"], view])
+        shade = 1 / (1 + np.exp(-networks.heads(net.colour, beside)["colour"]))
+        alpha = 1 - np.exp(-np.logaddexp(0, heads["density"][0]) * (end - distance))
         colour = colour + passing * alpha * shade
         passing = passing * (1 - alpha)
     return colour + passing
 
 
-def waves(x, bands):
-    parts = [x]
-    for band in range(bands):
-        parts += [np.sin(2**band * x), np.cos(2**band * x)]
-    return np.concatenate(parts)
-
-
+@pytest.mark.full
 def test_blocks_of_rays_do_not_show_in_a_picture():
-    # 91 pixels in blocks of 97, 10 and 1024
-    whole = rendered(STATIC)
-    for block in (10, 1024):
-        plan = dataclasses.replace(STATIC.sampling, block=block)
-        other = rendered(dataclasses.replace(STATIC, sampling=plan))
-        # Another tiling of the matrix products moves last bits
-        np.testing.assert_allclose(whole.colour, other.colour, atol=1e-6)
-        np.testing.assert_allclose(whole.depth, other.depth, rtol=1e-5)
+    # 91 pixels in blocks of 97 and 10
+    plan = dataclasses.replace(STATIC.sampling, block=10)
+    whole, other = (
+        rendered(STATIC),
+        rendered(dataclasses.replace(STATIC, sampling=plan)),
+    )
+    # Another tiling of the matrix products moves last bits
+    np.testing.assert_allclose(whole.colour, other.colour, atol=1e-6)
+    np.testing.assert_allclose(whole.depth, other.depth, rtol=1e-5)
 
 
 @pytest.mark.slow
@@ -217,32 +174,34 @@ def test_depth_is_along_the_viewing_axis_in_scene_units():
     np.testing.assert_allclose(picture.alpha, 1, atol=1e-6)
 
 
+def codes_by(field, dtype):
+    """Tables, and codes at times and for exposures, in one program a field."""
+    params = drawn.params(field.init, dtype)
+    at = jax.jit(
+        jax.vmap(lambda p, *seen: field.codes_at(p, View(None, *seen)), (None, 0, 0))
+    )
+    return jax.tree.map(np.asarray, params["codes"]), lambda times, exposures: at(
+        params, np.asarray(times, dtype), np.asarray(exposures, np.int32)
+    )
+
+
 def test_a_code_is_its_row_at_its_own_time_and_between_rows_elsewhere(dtype):
     spec = dataclasses.replace(STATIC, warp=TINY_WARP)
-    field = scene.field(spec, METADATA)
-    params = jax.tree.map(lambda x: x.astype(dtype), field.init(jax.random.key(0)))
-    table = params["codes"]["motion"]
+    tables, at = codes_by(scene.field(spec, METADATA), dtype)
+    table = tables["motion"]
     assert table.shape == (3, TINY_WARP.code_width)
-
-    def at(time):
-        view = View(None, jnp.asarray(time, dtype), jnp.int32(0))
-        return field.codes_at(params, view)["motion"]
-
-    for row, time in enumerate(METADATA.times):
-        np.testing.assert_array_equal(at(time), table[row])
-    np.testing.assert_allclose(at(0.4), 0.8 * table[1] + 0.2 * table[2], atol=1e-7)
-    np.testing.assert_array_equal(at(-1.0), table[0])
-    np.testing.assert_array_equal(at(7.0), table[2])
+    found = np.asarray(at([*METADATA.times, -1.0, 7.0, 0.4], [0] * 6)["motion"])
+    np.testing.assert_array_equal(found[:5], table[[0, 1, 2, 0, 2]])
+    between = 0.8 * table[1] + 0.2 * table[2]
+    np.testing.assert_allclose(found[5], between, rtol=1e-6)
 
 
 def test_an_exposure_that_was_not_learnt_lies_between_its_neighbours(float64):
     spec = dataclasses.replace(STATIC, appearance=AppearanceSpec(width=2))
-    field = scene.field(spec, METADATA)
-    params = field.init(jax.random.key(0))
-    table = params["codes"]["appearance"]
+    tables, at = codes_by(scene.field(spec, METADATA), "float64")
+    table = tables["appearance"]
     assert table.shape == (2, 2)  # only what is learnt from has a row
-    view = View(None, jnp.asarray(0.0), jnp.int32(2))
-    found = field.codes_at(params, view)["appearance"]
+    (found,) = at([0.0], [2])["appearance"]
     np.testing.assert_allclose(found, 0.75 * table[0] + 0.25 * table[1], atol=1e-7)
 
 
@@ -269,54 +228,25 @@ def test_the_filmed_volume_fills_the_box():
     assert own.centre == (0, 0, 0)
 
 
+@pytest.mark.full
 def test_without_its_warp_a_field_shows_the_canonical_scene():
     spec = dataclasses.replace(STATIC, warp=TINY_WARP)
-    field, canonical = (
-        scene.field(spec, METADATA, without) for without in ((), ("warp",))
+    params = drawn.params(scene.field(spec, METADATA).init, "float32")
+    condition = condition_of("float32", motion=np.ones(TINY_WARP.code_width))
+    bent, straight, plain = (
+        jax.tree.map(
+            np.asarray,
+            jax.jit(field.render_ray)(params, ray_of("float32"), condition)[-1],
+        )
+        for field in (
+            scene.field(spec, METADATA),
+            scene.field(spec, METADATA, ("warp",)),
+            scene.field(STATIC, METADATA),
+        )
     )
-    params = field.init(jax.random.key(0))
-    code = np.ones(TINY_WARP.code_width)
-    condition = condition_of("float32", motion=code)
-    warp = params["warp"]
-    grown = {
-        name: head._replace(weight=head.weight * 1e3)
-        for name, head in warp.heads.items()
-    }
-    params = params | {"warp": warp._replace(heads=grown)}
-    bent = jax.jit(field.render_ray)(params, ray_of("float32"), condition)[-1]
-    straight = jax.jit(canonical.render_ray)(params, ray_of("float32"), condition)[-1]
     assert np.abs(bent.warped - bent.point).max() > 1e-3
     np.testing.assert_array_equal(straight.warped, straight.point)
-    static = scene.field(STATIC, METADATA)
-    plain = jax.jit(static.render_ray)(params, ray_of("float32"), condition)[-1]
     np.testing.assert_array_equal(straight.colour, plain.colour)
-
-
-def test_what_cannot_be_left_out_is_refused():
-    spec = dataclasses.replace(
-        STATIC, warp=TINY_WARP, time=TimeSpec(), appearance=AppearanceSpec()
-    )
-    with pytest.raises(ValueError, match=r"no effect 'elastic'.*warp"):
-        scene.field(spec, METADATA, without=("elastic",))
-    for name in ("time", "appearance"):
-        with pytest.raises(ValueError, match="feeds the template"):
-            scene.field(spec, METADATA, without=(name,))
-
-
-def test_wrong_specs_are_refused_early():
-    with pytest.raises(ValueError, match="there is none"):
-        dataclasses.replace(STATIC, elastic=ElasticSpec())
-    with pytest.raises(ValueError, match="coarse=1"):
-        SamplingSpec(coarse=1)
-    with pytest.raises(ValueError, match="spacing='log'"):
-        SamplingSpec(spacing="log")
-    with pytest.raises(ValueError, match="rays=0"):
-        dataclasses.replace(STATIC, rays=0)
-    with pytest.raises(ValueError, match="learning_rate_end"):
-        dataclasses.replace(STATIC, learning_rate=1e-4, learning_rate_end=1e-3)
-    spec = dataclasses.replace(STATIC, warp=TINY_WARP, background=BackgroundSpec())
-    with pytest.raises(ValueError, match="background=none"):
-        scene.build(spec, METADATA)
 
 
 @pytest.mark.slow
@@ -324,27 +254,19 @@ def test_gradient_of_a_whole_step(float64):
     # One level and no elastic term: where fine samples lie and how elastic samples are
     # weighed depends on the parameters, and by design no gradient says so.
     spec = dataclasses.replace(
-        NERFIES,
+        STATIC,
         sampling=SamplingSpec(8, 0),
-        elastic=None,
+        warp=TINY_WARP,
+        appearance=AppearanceSpec(width=2),
+        background=BackgroundSpec(points=16),
         ambient=AmbientSpec(depth=1, width=4, skips=(), closed_steps=1, anneal_steps=4),
     )
-    model, state, frames = started(spec)
-    metadata = model.spec[1]
-    made = scene.field(spec, metadata)
-    as_float64 = functools.partial(
-        jax.tree.map,
-        lambda x: x.astype(float64) if x.dtype == jnp.float32 else x,
+    model, _, frames = started(spec)
+    made = scene.field(spec, model.spec[1])
+    frames = jax.tree.map(
+        lambda x: x.astype(float64) if x.dtype == jnp.float32 else x, frames
     )
-    frames = as_float64(frames)
     batch = scene.draw_batch(frames, 6, jax.random.key(1))
-    # Not the first state: zero displacements would leave terms without slope.
-    params = jax.tree.map(
-        lambda x: (
-            x + 0.05 * jnp.sin(jnp.arange(x.size, dtype=float64)).reshape(x.shape)
-        ),
-        as_float64(state.params),
-    )
 
     def loss(params):
         terms = scene.loss_terms(
@@ -352,52 +274,34 @@ def test_gradient_of_a_whole_step(float64):
         )
         return weighted_sum(terms)
 
+    # Not the first state: zero displacements would leave terms without slope.
+    params = drawn.params(made.init, "float64", 0.05)
     assert gradients.directional_error(loss, params) < 1e-5
 
 
 @pytest.mark.parametrize("levels", [1, 2])
 def test_shared_and_single_levels(levels):
     plan = SamplingSpec(8, 8 if levels == 2 else 0, shared=levels == 2)
-    spec = dataclasses.replace(STATIC, sampling=plan)
-    field = scene.field(spec, METADATA)
-    params = field.init(jax.random.key(0))
+    field = scene.field(dataclasses.replace(STATIC, sampling=plan), METADATA)
+    params = jax.eval_shape(field.init, jax.random.key(0))
     assert set(params["template"]) == {"fine"}
-    found = jax.jit(field.render_ray)(
-        params, ray_of("float32"), condition_of("float32")
-    )
-    assert len(found) == levels
+    given = ray_of("float32"), condition_of("float32")
+    assert len(jax.eval_shape(field.render_ray, params, *given)) == levels
 
 
+@pytest.mark.full
 def test_a_step_repeats_itself_and_counts():
-    model, state, frames = started(NERFIES)
+    model, state, frames = started(STATIC)
     step = jax.jit(model.step)
-    one, _ = step(state, frames)
-    other, _ = step(state, frames)
+    (one, _), (other, _) = (step(state, frames) for _ in range(2))
     assert isinstance(one, TrainState)
     assert int(one.step) == 1
-    for a, b in zip(
-        jax.tree.leaves(one.params), jax.tree.leaves(other.params), strict=True
-    ):
-        np.testing.assert_array_equal(a, b)
+    jax.tree.map(np.testing.assert_array_equal, one.params, other.params)
 
 
+@pytest.mark.full
 def test_an_unfilmed_pixel_teaches_nothing():
-    _, state, frames = started(STATIC)
-    model = started(STATIC)[0]
-    nothing = frames._replace(valid=jnp.zeros(frames.images.shape[:3], bool))
+    model, state, frames = started(STATIC)
+    nothing = frames._replace(valid=np.zeros(frames.images.shape[:3], bool))
     _, metrics = jax.jit(model.step)(state, nothing)
     assert float(metrics["loss"]) == 0
-
-
-def test_codes_of_one_table_must_agree():
-    wide = dataclasses.replace(TINY_WARP, code_width=5)
-    spec = dataclasses.replace(STATIC, warp=wide, time=TimeSpec(condition="code"))
-    with pytest.raises(ValueError, match="code_width"):
-        scene.field(spec, METADATA)
-
-
-def test_blend_of_codes_is_what_look_up_uses():
-    table = jnp.arange(6.0).reshape(3, 2)
-    np.testing.assert_allclose(
-        codes.blend(table, jnp.int32(0), jnp.int32(2), jnp.float32(0.5)), [2, 3]
-    )

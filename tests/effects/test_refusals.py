@@ -1,0 +1,63 @@
+"""What no effect can be built with, and what is said about it."""
+
+import math
+
+import pytest
+
+from nerfies_jax.effects import scene_flow
+from nerfies_jax.effects.ambient import AmbientSpec
+from nerfies_jax.effects.appearance import AppearanceSpec
+from nerfies_jax.effects.background import BackgroundSpec
+from nerfies_jax.effects.elastic import ElasticSpec
+from nerfies_jax.effects.scene_flow import FlowWeights, SceneFlowSpec
+from nerfies_jax.effects.time_condition import TimeSpec
+from nerfies_jax.effects.transient import TransientSpec
+from nerfies_jax.effects.warp import WarpSpec
+
+REFUSED = [
+    (AmbientSpec, {"kind": "curved"}, "unknown kind of slice 'curved'.*bent"),
+    (AmbientSpec, {"dims": 0}, "dims=0 must be at least 1.*none"),
+    (AmbientSpec, {"code_width": 0}, "code_width=0"),
+    (AmbientSpec, {"anneal_steps": 0}, "anneal_steps=0"),
+    (AmbientSpec, {"closed_steps": -1}, "closed_steps=-1"),
+    (AmbientSpec, {"skips": (9,)}, "layer 9 is not in 1 .. 5"),
+    (AmbientSpec, {"width": 0}, "width=0"),
+    (AppearanceSpec, {"width": 0}, "width=0.*set the effect to none"),
+    (BackgroundSpec, {"points": 0}, "points=0"),
+    (BackgroundSpec, {"noise": -1.0}, "noise=-1"),
+    (BackgroundSpec, {"weight": math.nan}, "weight=nan"),
+    (BackgroundSpec, {"width": 0.0}, "width > 0"),
+    (BackgroundSpec, {"scaling": "twice"}, "'twice'"),
+    (ElasticSpec, {"points": 0}, "points=0.*None"),
+    (ElasticSpec, {"weight": -1.0}, "weight=-1"),
+    (ElasticSpec, {"fold_cost": math.nan}, "fold_cost=nan"),
+    (ElasticSpec, {"robust_width": 0.0}, "width > 0"),
+    (ElasticSpec, {"scaling": "twice"}, "'twice'"),
+    (ElasticSpec, {"decay_steps": 0}, "steps=0"),
+    (SceneFlowSpec, {"flow_bound": 0.0}, "flow_bound=0"),
+    (SceneFlowSpec, {"flow_bound": math.nan}, "flow_bound=nan"),
+    (SceneFlowSpec, {"decay_steps": 0}, "decay_steps=0"),
+    (FlowWeights, {"cycle": -1.0}, "cycle=-1"),
+    (FlowWeights, {"depth": math.inf}, "depth=inf"),
+    (scene_flow.interval, {"moments": 0}, "moments=0"),
+    (TimeSpec, {"condition": "frame"}, "unknown condition 'frame'.*time"),
+    (TimeSpec, {"code_width": 0}, "code_width=0 must be at least 1"),
+    (TransientSpec, {"code_width": 0}, "code_width=0"),
+    (TransientSpec, {"beta_min": 0.0}, r"beta_min=0.0 must be positive.*0\.03"),
+    (TransientSpec, {"beta_min": math.nan}, "beta_min=nan"),
+    (TransientSpec, {"density_weight": -0.1}, "density_weight=-0.1"),
+    (TransientSpec, {"density_weight": math.inf}, "density_weight=inf"),
+    (TransientSpec, {"depth": -1}, "depth=-1"),
+    (WarpSpec, {"kind": "affine"}, "'affine'.*se3"),
+    (WarpSpec, {"condition": "frame"}, "'frame'.*code"),
+    (WarpSpec, {"code_width": 0}, "code_width=0"),
+    (WarpSpec, {"anneal_steps": 0}, "anneal_steps=0.*None"),
+    (WarpSpec, {"skips": (6,)}, "layer 6 is not in"),
+    (WarpSpec, {"width": 0}, "width=0"),
+]
+
+
+@pytest.mark.parametrize(("make", "settings", "words"), REFUSED)
+def test_wrong_settings_are_refused(make, settings, words):
+    with pytest.raises(ValueError, match=words):
+        make(**settings)

@@ -1,0 +1,83 @@
+"""What no template, ray or scene can be built with, and what is said about it."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from nerfies_jax import scene
+from nerfies_jax.effects.appearance import AppearanceSpec
+from nerfies_jax.effects.background import BackgroundSpec
+from nerfies_jax.effects.elastic import ElasticSpec
+from nerfies_jax.effects.time_condition import TimeSpec
+from nerfies_jax.effects.warp import WarpSpec
+from nerfies_jax.radiance import sampling
+from nerfies_jax.radiance.template import TemplateSpec
+from nerfies_jax.scene import RadianceScene
+from nerfies_jax.scene_metadata import SceneMetadata
+from nerfies_jax.spec import SamplingSpec
+
+METADATA = SceneMetadata(
+    near=1.0,
+    far=3.0,
+    centre=(0.5, 0.0, -0.5),
+    scale=0.5,
+    background=None,
+    times=(0.0, 1.0),
+    exposures=((0, 0, 0.0),),
+)
+BENT = RadianceScene(
+    steps=40, warp=WarpSpec(), time=TimeSpec(), appearance=AppearanceSpec()
+)
+ON_POINTS = dataclasses.replace(BENT, background=BackgroundSpec())
+TWO_WIDTHS = dataclasses.replace(
+    BENT, warp=WarpSpec(code_width=5), time=TimeSpec(condition="code")
+)
+LINE = np.linspace(0.1, 1, 5, dtype=np.float32)
+
+
+def stratified(*settings):
+    return sampling.stratified(None, jnp.float32(0.1), jnp.float32(1), *settings)
+
+
+def from_weights(edges, weights, count):
+    return sampling.from_weights(None, jnp.asarray(edges), jnp.asarray(weights), count)
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: TemplateSpec(density="exp"), "'exp'.*softplus"),
+        (lambda: TemplateSpec(colour_width=0), "colour_width=0"),
+        (lambda: SamplingSpec(coarse=1), "coarse=1"),
+        (lambda: SamplingSpec(spacing="log"), "spacing='log'"),
+        (lambda: stratified(1), "count=1"),
+        (lambda: stratified(4, "log"), "'log'"),
+        (lambda: from_weights(LINE, LINE, 4), "5 edges do not bound 5 bins"),
+        (lambda: from_weights(LINE, LINE[1:], 0), "count=0"),
+        (
+            lambda: sampling.refine(None, *[jnp.asarray(LINE[:2])] * 2, 4),
+            "2 distances",
+        ),
+        (lambda: RadianceScene(1, elastic=ElasticSpec()), "there is none"),
+        (lambda: RadianceScene(1, rays=0), "rays=0"),
+        (lambda: RadianceScene(0), "steps=0"),
+        (lambda: RadianceScene(1, extent=0.0), "extent=0"),
+        (
+            lambda: RadianceScene(1, learning_rate=1e-4, learning_rate_end=1e-3),
+            "learning_rate_end",
+        ),
+        (lambda: scene.build(ON_POINTS, METADATA), "background=none"),
+        (lambda: scene.field(TWO_WIDTHS, METADATA), "code_width"),
+        (
+            lambda: scene.field(BENT, METADATA, ("elastic",)),
+            "no effect 'elastic'.*warp",
+        ),
+        (lambda: scene.field(BENT, METADATA, ("time",)), "feeds the template"),
+        (lambda: scene.field(BENT, METADATA, ("appearance",)), "feeds the template"),
+    ],
+)
+def test_wrong_settings_are_refused(call, words):
+    with pytest.raises(ValueError, match=words):
+        call()
