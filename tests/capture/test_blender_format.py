@@ -335,6 +335,7 @@ def test_an_unknown_split_is_refused(tmp_path):
             blender_format.read(tmp_path, heldout=name)
 
 
+@pytest.mark.full
 def test_a_real_scene_has_the_cameras_its_card_lists(data_dir):
     found = room.load(data_dir / "blender_lego_static")
     known = np.load(data_dir / "blender_lego_static/cameras.npz")

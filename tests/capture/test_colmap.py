@@ -313,6 +313,7 @@ def test_a_named_split_and_a_single_pose_are_refused(tmp_path):
         colmap.read(tmp_path / "single")
 
 
+@pytest.mark.full
 def test_pycolmap_leaves_zlib_whole():
     """In a fresh process: `import pycolmap, zlib; zlib.compress(...)` would abort."""
     code = (
@@ -340,6 +341,7 @@ def test_nobody_else_imports_pycolmap():
     assert users == ["colmap_library.py"]
 
 
+@pytest.mark.full
 def test_a_real_capture_projects_its_points_where_they_were_seen(data_dir):
     scene = data_dir / "backpack_clip"
     found = room.load(scene)

@@ -100,6 +100,7 @@ def test_what_cannot_be_written_is_said(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.full
 def test_other_peoples_files(data_dir):
     folder = data_dir / "openexr_samples"
     files = sorted(folder.glob("*/*.exr"))

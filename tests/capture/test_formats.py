@@ -83,6 +83,7 @@ def test_load_passes_its_options_on(monkeypatch, tmp_path):
     }
 
 
+@pytest.mark.full
 def test_importing_the_room_loads_no_decoder():
     code = (
         "import sys, nerfies_jax.capture, nerfies_jax.capture.formats\n"

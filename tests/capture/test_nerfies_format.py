@@ -536,6 +536,7 @@ def test_writing_refuses_a_folder_in_use_and_names_that_climb(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["made"]
 
 
+@pytest.mark.full
 def test_a_real_capture_projects_its_points_where_they_were_seen(data_dir):
     scene = data_dir / "nrnerf_bookshelf"
     found = nerfies_format.read(scene)
@@ -554,6 +555,7 @@ def test_a_real_capture_projects_its_points_where_they_were_seen(data_dir):
     assert np.median(np.linalg.norm(np.concatenate(errors), axis=1)) < 0.43
 
 
+@pytest.mark.full
 def test_a_real_dycheck_capture_has_its_cameras_without_pictures(data_dir):
     scene = data_dir / "dycheck_windmill_cameras"
     views = nerfies_views.read_cameras(scene)

@@ -257,7 +257,9 @@ def started(kind, folder):
     return run, state._replace(params=state.params | {"warp": warp})
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "kind", ["gaussians", pytest.param("radiance", marks=pytest.mark.full)]
+)
 def test_a_run_is_held_against_the_truth_of_its_scene(kind, filmed, rng):
     run, state = started(kind, filmed)
     capture = run.capture
@@ -297,6 +299,7 @@ def test_a_run_is_held_against_the_truth_of_its_scene(kind, filmed, rng):
     assert found["flow.missing"] == pytest.approx(1 - answered.mean(), abs=1e-6)
 
 
+@pytest.mark.full
 def test_a_scene_without_motion_or_truth_has_no_points_to_follow(filmed, rng, tmp_path):
     run, state = started("gaussians", filmed)
     static = dataclasses.replace(KINDS["gaussians"], motion=None)

@@ -87,7 +87,7 @@ def test_a_checkpoint_says_what_made_it(tmp_path):
         assert about["revision"].removesuffix("+changes") == commit
 
 
-@pytest.mark.parametrize("cut", [1, 6, 7, 8, 19])
+@pytest.mark.parametrize("cut", [7, pytest.param(8, marks=pytest.mark.full)])
 def test_a_resumed_run_is_the_straight_run_bit_for_bit(cut, tmp_path, straight):
     first = fit(start(), tmp_path, cut)
     restored = checkpoint.restore(tmp_path, start(), SPEC)  # of the first capacity
@@ -155,11 +155,11 @@ def damage_notes(folder):
 @pytest.mark.parametrize(
     "damage",
     [
-        damage_truncate,
         damage_flip,
-        damage_lose_arrays,
         damage_lose_notes,
-        damage_notes,
+        pytest.param(damage_truncate, marks=pytest.mark.full),
+        pytest.param(damage_lose_arrays, marks=pytest.mark.full),
+        pytest.param(damage_notes, marks=pytest.mark.full),
     ],
 )
 def test_a_damaged_newest_checkpoint_falls_back_to_the_one_before(damage, tmp_path):
@@ -341,6 +341,7 @@ def wait_for_checkpoint(folder, process):
         time.sleep(0.1)
 
 
+@pytest.mark.full
 def test_sigterm_saves_and_a_fresh_process_goes_on_bit_for_bit(tmp_path):
     first = launch(tmp_path, 40, "0.05")
     wait_for_checkpoint(tmp_path, first)

@@ -46,10 +46,15 @@ def make_read_only(folder, patch):
 @pytest.mark.parametrize(
     ("harm", "words", "whole"),
     [
-        (lose_folder, "No such file", "none is whole"),
-        (lose_settings, "config.json is gone", "step 10 is whole"),
         (fill_disk, "no space: it may take 1.0 MB and 0.0 MB are", "step 10 is whole"),
-        (make_read_only, "Read-only file system", "step 10 is whole"),
+        *(
+            pytest.param(*rest, marks=pytest.mark.full)
+            for rest in (
+                (lose_folder, "No such file", "none is whole"),
+                (lose_settings, "config.json is gone", "step 10 is whole"),
+                (make_read_only, "Read-only file system", "step 10 is whole"),
+            )
+        ),
     ],
 )
 def test_training_goes_on_where_saving_fails_and_says_so(

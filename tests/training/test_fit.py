@@ -82,6 +82,7 @@ def test_a_disturbed_camera_is_found_again_from_its_pixels(unknowns, dtype, rng)
         assert found.value.focal_px == start.focal_px
 
 
+@pytest.mark.full
 def test_noisy_pixels_give_the_least_squares_camera_of_scipy(float64, rng):
     truth, points = scene_camera("float64"), scene_points(rng, "float64")
     seen = np.asarray(pixels(truth, points)) + rng.normal(size=(20, 2))
@@ -237,6 +238,7 @@ def test_every_solver_finds_the_ridge_regression(solver, dtype, rng):
 
 
 @pytest.mark.parametrize("solver", sorted(set(CODE_SOLVERS) - {"adam"}))
+@pytest.mark.full
 def test_second_order_solvers_follow_a_bent_valley(solver, float64):
     """Rosenbrock's, against its known minimum; Adam needs thousands of steps."""
 
@@ -273,6 +275,7 @@ def test_a_solve_cut_short_is_flagged_and_no_worse_than_its_start(solver, dtype)
 
 
 @pytest.mark.parametrize("solver", CODE_SOLVERS)
+@pytest.mark.full
 def test_many_codes_are_fitted_as_one_batch(solver, dtype):
     """And the loss may close over what is mapped or traced."""
     targets = jnp.asarray([[0.1, 0.2], [-0.3, 0.4], [0.0, 0.0]], dtype)
@@ -294,6 +297,7 @@ def test_many_codes_are_fitted_as_one_batch(solver, dtype):
 
 
 @pytest.mark.parametrize("solver", CODE_SOLVERS)
+@pytest.mark.full
 def test_float32_codes_stay_float32_with_x64_on(solver, float64):
     found = jax.jit(
         lambda start: fit_code(lambda c: jnp.sum((c - 0.5) ** 2), start, solver, 300)

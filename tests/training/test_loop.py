@@ -60,7 +60,7 @@ def test_a_run_is_the_plain_loop_over_its_steps(frames, straight):
     assert straight.stopped_by == "steps"
 
 
-@pytest.mark.parametrize("cut", [1, 6, 7, 8, 19, 20])
+@pytest.mark.parametrize("cut", [7, pytest.param(19, marks=pytest.mark.full)])
 def test_a_run_cut_in_two_is_the_straight_run_bit_for_bit(cut, frames, straight):
     first = fit(frames, steps=cut)
     second = fit(frames, first.state, steps=20, history=first.history)
@@ -69,7 +69,7 @@ def test_a_run_cut_in_two_is_the_straight_run_bit_for_bit(cut, frames, straight)
     assert second.seconds >= first.seconds
 
 
-@pytest.mark.parametrize("longest", [1, 3, 100])
+@pytest.mark.parametrize("longest", [3, pytest.param(100, marks=pytest.mark.full)])
 def test_chunk_length_does_not_change_a_bit(longest, frames, straight, monkeypatch):
     monkeypatch.setattr(loop, "CHUNK_STEPS", longest)
     result = fit(frames, steps=20)
@@ -179,6 +179,7 @@ def test_a_budget_of_seconds_ends_the_run_and_says_so(frames):
     assert "of 10,000 by seconds: the 0:00 given are over" in result.message
 
 
+@pytest.mark.full
 def test_chunks_of_slow_steps_stay_short_enough_to_interrupt(frames, monkeypatch):
     monkeypatch.setattr(loop, "CHUNK_SECONDS", 0.1)
 
@@ -193,7 +194,16 @@ def test_chunks_of_slow_steps_stay_short_enough_to_interrupt(frames, monkeypatch
     assert len(lengths) < 25
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize(
+    "number",
+    [
+        signal.SIGINT,
+        *(
+            pytest.param(n, marks=pytest.mark.full)
+            for n in (signal.SIGTERM, signal.SIGHUP)
+        ),
+    ],
+)
 def test_a_signal_ends_the_run_after_its_chunk(number, frames, straight):
     def send(state, step):
         if step == 11:
@@ -220,6 +230,7 @@ def test_a_second_interrupt_does_not_wait(frames):
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
+@pytest.mark.full
 def test_a_signal_that_is_to_be_ignored_still_is(frames):
     def send(state, step):
         os.kill(os.getpid(), signal.SIGHUP)
@@ -232,6 +243,7 @@ def test_a_signal_that_is_to_be_ignored_still_is(frames):
     assert result.stopped_by == "steps"
 
 
+@pytest.mark.full
 def test_a_run_outside_the_main_thread_leaves_signals_alone(frames):
     results = []
     thread = threading.Thread(target=lambda: results.append(fit(frames, steps=3)))

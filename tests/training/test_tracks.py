@@ -261,7 +261,9 @@ def moving_truth(params, canonical, times, centre):
     return np.stack(tracks, 1)
 
 
-@pytest.mark.parametrize("row", [None, 4, 8])
+@pytest.mark.parametrize(
+    "row", [4, *(pytest.param(row, marks=pytest.mark.full) for row in (None, 8))]
+)
 def test_tracks_follow_points_through_a_known_motion(row, dtype, rng):
     params = (jnp.asarray([0.0, 2.5, 0.4], dtype), jnp.asarray(0.2, dtype))
     times = np.linspace(0, 1, 9)
