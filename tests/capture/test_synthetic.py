@@ -97,20 +97,12 @@ def test_moving_pixels_are_those_whose_points_move(scene, rng):
     for i in range(len(row)):
         thing = SPEC.things[truth.things[row[i], y[i], x[i]]]
         at = float(capture.times[row[i]])
-        canonical = _canonical(thing, points[i : i + 1], at)
+        canonical = scene_oracle.canonical(thing, points[i : i + 1], at)
         over_time = [
             scene_oracle.observe(thing, canonical, t) for t in (0, 0.2, 0.45, 0.8)
         ]
         travel = np.ptp(np.concatenate(over_time), axis=0).max()
         assert (travel > 1e-4) == capture.moving[row[i], y[i], x[i]]
-
-
-def _canonical(thing, points, time):
-    material = scene_oracle.undeform(
-        thing.shape, scene_oracle.to_body(thing, points, time), time
-    )
-    body = scene_oracle.deform(thing.shape, material, 0.0)
-    return (np.c_[body, np.ones(len(body))] @ scene_oracle.pose(thing, 0.0).T)[:, :3]
 
 
 @pytest.mark.parametrize("step", [1, -1])
@@ -137,7 +129,7 @@ def test_flow_leads_to_where_numpy_sees_the_moved_point(scene, rng, step):
                 cameras.take(capture.cameras, other),
                 float(capture.times[other]),
             )
-            canonical = _canonical(
+            canonical = scene_oracle.canonical(
                 SPEC.things[index], points[i : i + 1], float(capture.times[row[i]])
             )
             moved = scene_oracle.observe(SPEC.things[index], canonical, time)

@@ -133,6 +133,7 @@ def test_a_displaced_camera_is_found_again(capture, rng, turn, shift, most_pixel
     }
 
 
+@pytest.mark.full
 def test_what_is_not_filmed_does_not_count(capture, rng):
     film = displaced(capture, rng, 0.02, 0.01)
     valid = np.ones(film.images.shape[:3], bool)
@@ -198,8 +199,3 @@ def test_the_slope_of_the_error_is_that_of_both_representations(kind, float64):
     # A Gaussian enters or leaves a pixel by less than 1/255 of its colour.
     bound = {"gaussians": 1e-4, "radiance": 1e-6}[kind]
     assert gradients.directional_error(loss, screw, step=1e-6) < bound
-
-
-def test_wrong_settings_are_refused():
-    with pytest.raises(ValueError, match="max_steps=0"):
-        CameraFitSpec(max_steps=0)

@@ -79,12 +79,6 @@ def test_chunk_length_does_not_change_a_bit(longest, frames, straight, monkeypat
     assert 7 in np.cumsum(lengths)  # a chunk ends where an event happens
 
 
-def test_the_same_seed_twice_is_the_same_run_and_another_is_not(frames, straight):
-    assert toy.same(fit(frames, steps=20).state, straight.state)
-    other = fit(frames, MODEL.init(None, jax.random.key(6)), steps=20)
-    assert not toy.same(other.state, straight.state)
-
-
 def test_one_program_serves_every_chunk_of_a_shape(frames):
     model = toy.model(change=lambda state, frames: toy.step(state, frames))
     result = fit(frames, model=model, steps=300)
