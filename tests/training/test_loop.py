@@ -18,9 +18,7 @@ from nerfies_jax.training import chunk, loop
 from nerfies_jax.training.model import Event
 from nerfies_jax.training.progress import duration
 from tests.training import toy
-
-QUIET = rich.console.Console(quiet=True)
-MODEL = toy.model()
+from tests.training.toy import fit, start
 
 
 @pytest.fixture(scope="module")
@@ -31,15 +29,6 @@ def frames():
 @pytest.fixture(scope="module")
 def straight(frames):
     return fit(frames, steps=20)
-
-
-def start():
-    return MODEL.init(None, jax.random.key(5))
-
-
-def fit(frames, state=None, model=MODEL, **settings):
-    state = start() if state is None else state
-    return loop.fit(model, state, frames, console=QUIET, **settings)
 
 
 def test_a_run_is_the_plain_loop_over_its_steps(frames, straight):
@@ -127,6 +116,7 @@ def test_events_happen_in_order_after_their_steps(frames):
     assert len(seen) == 3  # what has happened does not happen again
 
 
+@pytest.mark.full
 def test_an_event_may_put_one_array_in_two_places(frames):
     def share(state, _):
         zero = jnp.zeros(6)
@@ -281,6 +271,7 @@ def test_fewer_steps_than_done_are_refused(frames, straight):
     assert fit(frames, straight.state, steps=20).steps == 20
 
 
+@pytest.mark.full
 def test_float64_states_stay_float64(frames):
     with jax.enable_x64(True):
         wide = jax.tree.map(
@@ -301,13 +292,14 @@ def test_float64_states_stay_float64(frames):
         )
 
 
+@pytest.mark.full
 def test_a_log_file_gets_lines_and_a_terminal_a_bar(frames):
     for terminal in (False, True):
         text = io.StringIO()
         console = rich.console.Console(
             file=text, force_terminal=terminal, width=120, color_system=None
         )
-        loop.fit(MODEL, start(), frames, steps=8, console=console)
+        fit(frames, steps=8, console=console)
         shown = text.getvalue()
         assert "completed 8 steps" in shown
         assert "steps/s  loss" in shown
