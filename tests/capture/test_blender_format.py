@@ -263,6 +263,7 @@ def words(old, new):
     return spoil
 
 
+SHEARED = [[1, 0.5, 0, 0], [0, 0.8660254, 0, 0], [0, 0, 1, 4]]
 MIRRORED = [[-x for x in row[:1]] + row[1:] for row in pose(0)]
 BAD = {
     "no frames": (top_level(frames=[]), "no frames"),
@@ -272,17 +273,9 @@ BAD = {
     "time negative": (first_frame(time=-0.1), "time -0.1"),
     "NaN": (words("4.0", "NaN"), "NaN on line 1"),
     "word in matrix": (words("4.0", '"four"'), "transform_matrix"),
-    "short matrix": (
-        first_frame(transform_matrix=[[1.0, 0.0], [0.0, 1.0]]),
-        "rows [2, 2]",
-    ),
+    "short matrix": (first_frame(transform_matrix=[[1.0, 0.0]] * 2), "rows [2, 2]"),
     "zero matrix": (first_frame(transform_matrix=[[0.0] * 4] * 4), "lengths [0.0"),
-    "sheared": (
-        first_frame(
-            transform_matrix=[[1, 0.5, 0, 0], [0, 0.8660254, 0, 0], [0, 0, 1, 4]]
-        ),
-        "orthonormal",
-    ),
+    "sheared": (first_frame(transform_matrix=SHEARED), "orthonormal"),
     "mirrored": (first_frame(transform_matrix=MIRRORED), "reflection"),
     "no focal length": (top_level(camera_angle_x=None), "no fl_x"),
     "wide angle": (top_level(camera_angle_x=3.5), "camera_angle_x = 3.5"),
@@ -290,10 +283,7 @@ BAD = {
     "size not the camera's": (first_frame(w=8, h=10), "8x10"),
     "fisheye": (top_level(camera_model="OPENCV_FISHEYE"), "OPENCV_FISHEYE"),
     "fourth radial": (first_frame(k4=0.1), "k4"),
-    "same frame twice": (
-        first_frame(file_path="train/r_1"),
-        "'train_r_1' appears 2 times",
-    ),
+    "frame twice": (first_frame(file_path="train/r_1"), "'train_r_1' appears 2 times"),
     "leak": (first_frame(file_path="test/r_1"), "'test_r_1' appears 2 times"),
     "picture cut short": (
         lambda root: (root / "train/r_0.png").write_bytes(

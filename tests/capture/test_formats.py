@@ -1,6 +1,5 @@
 """Recognising what a folder holds, and saying what was looked for."""
 
-import dataclasses
 import inspect
 import subprocess
 import sys
@@ -92,9 +91,3 @@ def test_importing_the_room_loads_no_decoder():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout.strip() in ("[]", "['scipy']"), done.stderr  # jax may load scipy
-
-
-def test_formats_are_told_apart_by_name():
-    names = [each.name for each in formats.FORMATS]
-    assert len(set(names)) == len(names)
-    assert dataclasses.is_dataclass(room.load.__annotations__["return"])
