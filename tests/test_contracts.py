@@ -87,14 +87,12 @@ SETTINGS = {
     "encoding.anneal": {"bands": 4},
     "kan.apply": {"spec": _KAN, "params": _network(functools.partial(kan.init, _KAN))},
     "kan.hold": {"grid": (-1.0, 1.0), "margin": 0.3},
-    "mlp.apply": {"spec": _MLP, "params": _network(functools.partial(mlp.init, _MLP))},
-    "mlp.hidden_features": {
-        "spec": _MLP,
-        "params": _network(functools.partial(mlp.init, _MLP)),
-    },
-    "mlp.with_known": {
-        "spec": _MLP,
-        "params": _network(functools.partial(mlp.init, _MLP)),
+    **{
+        f"mlp.{name}": {
+            "spec": _MLP,
+            "params": _network(functools.partial(mlp.init, _MLP)),
+        }
+        for name in ("apply", "hidden_features", "with_known")
     },
     "mlp.affine": {
         "layer": _network(lambda key, dtype: mlp.init_layer(key, 3, 2, "he", dtype))
@@ -107,9 +105,10 @@ SETTINGS = {
         "density_noise": None,
     },
     "compositing.intervals": {"last": 1e10},
-    "sampling.stratified": {"key": None, "count": 4},
-    "sampling.from_weights": {"key": None, "count": 4},
-    "sampling.refine": {"key": None, "count": 4},
+    **{
+        f"sampling.{name}": {"key": None, "count": 4}
+        for name in ("stratified", "from_weights", "refine")
+    },
     **{
         f"losses.{name}": {"width": 0.1}
         for name in ("charbonnier", "huber", "geman_mcclure")
@@ -122,19 +121,10 @@ SETTINGS = {
 # Lengths of axes; all others are 3. Variadic axes are one axis of 2, but for
 # a batch, which callers make with `vmap`.
 SIZES = {
-    "height": 12,
-    "width": 12,
-    "channels": 2,
-    "samples": 6,
-    "edges": 7,
-    "bins": 6,
-    "dim": 3,
-    "code": 4,
-    "features": 4,
-    "rest": 3,
-    "coefficients": 4,
-    "part": 2,
-    "known": 1,
+    **dict.fromkeys(["height", "width"], 12),
+    **dict.fromkeys(["code", "features", "coefficients"], 4),
+    **dict.fromkeys(["samples", "bins"], 6),
+    **{"edges": 7, "dim": 3, "rest": 3, "channels": 2, "part": 2, "known": 1},
 }
 SIZES_OF = {
     "template.apply": {"inputs": 15, "condition": 3},

@@ -10,7 +10,6 @@ from nerfies_jax.capture import flow as flows
 from nerfies_jax.capture import nerfies_format
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.flow import FrameFlow
-from nerfies_jax.geometry import camera
 from tests import scenes
 from tests.capture.test_capture import make
 
@@ -72,38 +71,6 @@ def test_shrunk_flow_is_the_mean_of_each_block_in_larger_pixels(size, factor):
                 seen = whole.flow.forward_seen[frame, lines, columns]
                 assert small.forward_seen[frame, row, column] == seen.all()
     np.testing.assert_array_equal(small.next_row, whole.flow.next_row)
-
-
-def test_exact_flow_leads_to_where_the_neighbour_sees_the_point():
-    """Static points of the synthetic scene, projected by NumPy; also when shrunk."""
-    whole = scenes.tiny_capture()
-    for capture in (whole, capturing.downscale(whole, 2)):
-        still = whole.moving
-        if capture is not whole:
-            still = still.reshape(len(still), 15, 2, 20, 2).any((2, 4))
-        worst = []
-        for name, shift, seen, rows in flows.sides(capture.flow):
-            row = 0 if name == "forward" else 1
-            other = rows[row]
-            assert other != row
-            assert capture.camera_ids[other] == capture.camera_ids[row]
-            chosen = np.argwhere(seen[row] & ~still[row] & (capture.depths[row] > 0))
-            for line, column in chosen[:: max(1, len(chosen) // 200)]:
-                pixel = np.array([column, line]) + 0.5
-                here = pixel + shift[row, line, column]
-                depth = capture.depths[row, line, column]
-                there = _seen_by(capture, row, other, pixel, depth)
-                worst.append(np.abs(here - there).max())
-        # Blocks over an edge mix depths and flows: one in ten.
-        assert np.quantile(worst, 0.9) < (1e-3 if capture is whole else 0.1)
-
-
-def _seen_by(capture, row, other, pixel, depth):
-    one, two = (camera.take(capture.cameras, k) for k in (row, other))
-    x = (pixel - one.principal_point_px) / one.focal_px
-    point = one.camera_from_world.T @ (depth * np.array([*x, 1.0])) + one.position
-    x, y, z = two.camera_from_world @ (point - two.position)
-    return two.focal_px * np.array([x, y]) / z + two.principal_point_px
 
 
 def test_flow_is_stored_beside_a_nerfies_capture_and_read_back(tmp_path):

@@ -95,10 +95,7 @@ def test_every_number_is_that_of_a_direct_computation(rng, filmed):
     truth = capture.images[rows] / 255
     known = valid[rows] if filmed else np.ones_like(valid[rows])
     moving = capture.moving[rows]
-    for name, mask in (
-        ("moving", moving & known),
-        ("still", ~moving & known),
-    ):
+    for name, mask in (("moving", moving & known), ("still", ~moving & known)):
         frames = zip(picture, truth, mask, strict=True)
         exact = np.mean([psnr(*frame) for frame in frames])
         assert found[f"heldout.{name}_psnr"] == pytest.approx(exact, abs=1e-4)

@@ -9,7 +9,7 @@ import numpy as np
 import optax
 import pytest
 
-from nerfies_jax.training import checkpoint, chunk, guard, loop
+from nerfies_jax.training import chunk, guard
 from nerfies_jax.training.checkpoint import Checkpoints
 from nerfies_jax.training.model import Event
 from tests.hard_cases import hostile
@@ -192,11 +192,7 @@ def test_the_event_that_blew_up_is_named_among_several(frames):
     def harm(state, _):
         return spoilt_at(state, "parameter", np.nan)
 
-    events = [
-        Event("a", (7, 8), note),
-        Event("b", (8,), harm),
-        Event("c", (8,), note),
-    ]
+    events = [Event("a", (7, 8), note), Event("b", (8,), harm), Event("c", (8,), note)]
     result = fit(frames, steps=STEPS, events=events)
     assert result.steps == 7  # right after a copy: nothing is repeated
     assert "event 'b' after step 8" in result.message
@@ -275,16 +271,3 @@ def test_one_number_is_found_wherever_it_hides(value, dtype):
         spoilt = state.copy()
         spoilt[row, row % 59] = value
         assert not all_finite(spoilt)
-
-
-@pytest.mark.full
-def test_what_is_restored_after_a_blow_up_goes_on(frames, tmp_path):
-    model, spoilt = POISONED, poison(frames, "moment", 9)
-    with Checkpoints(tmp_path, model.spec) as checkpoints:
-        fit(spoilt, model=model, steps=STEPS, checkpoints=checkpoints)
-    restored = checkpoint.restore(tmp_path, start(), model.spec)
-    assert restored.step == 8
-    history = loop.History(**restored.record)
-    mended = fit(frames, restored.state, steps=STEPS, history=history)
-    assert toy.same(mended.state, fit(frames, steps=STEPS).state)
-    assert mended.history.rows[0]["step"] == 1

@@ -248,11 +248,7 @@ def test_official_geman_mcclure_is_width_times_the_papers():
     np.testing.assert_allclose(both[1], 0.03 * np.asarray(both[0]), rtol=1e-6)
 
 
-LOSSES = {
-    "l1": losses.l1,
-    "mse": losses.mse,
-    "photometric": losses.photometric,
-}
+LOSSES = {"l1": losses.l1, "mse": losses.mse, "photometric": losses.photometric}
 SLOPES = {name: jax.jit(jax.value_and_grad(loss)) for name, loss in LOSSES.items()}
 
 
