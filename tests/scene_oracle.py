@@ -90,6 +90,13 @@ def observe(thing, canonical, time):
     return (np.c_[body, np.ones(len(body))] @ pose(thing, time).T)[:, :3]
 
 
+def canonical(thing, points, time):
+    """Where the points seen at `time` were at zero."""
+    material = undeform(thing.shape, to_body(thing, points, time), time)
+    body = deform(thing.shape, material, 0.0)
+    return (np.c_[body, np.ones(len(body))] @ pose(thing, 0.0).T)[:, :3]
+
+
 def enters(thing, origin, direction, time):
     """Distance (in lengths of the direction) of one ray's first entry, or infinity."""
     inverse = np.linalg.inv(pose(thing, time))

@@ -17,6 +17,7 @@ from tests import bare_scenes, scenes
 PAGE = pathlib.Path(__file__).parents[1] / "docs" / "own_effect.md"
 
 
+@pytest.mark.full
 def test_the_effects_of_the_page_are_short_and_train(capsys):
     blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.S)
     assert len(blocks) == 2
@@ -61,6 +62,7 @@ def fog(name="fog", beta_min=0.5):
     return Effect(name, medium=medium, beta_min=beta_min)
 
 
+@pytest.mark.full
 def test_a_medium_brings_its_own_least_uncertainty():
     """Of a field without a transient: what a ray's beta is at least, the loss shows."""
     near, far = (of_field(fog(beta_min=b))["colour"] for b in (1e3, 1e4))

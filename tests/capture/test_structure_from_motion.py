@@ -100,10 +100,6 @@ def test_what_cannot_work_is_said_before_it_starts(tmp_path):
     (tmp_path / "masks").mkdir()
     with pytest.raises(CaptureError, match=r"no mask f00\.png\.png"):
         mapping.run_sfm(tmp_path / "more", tmp_path / "out", tmp_path / "masks")
-    with pytest.raises(ValueError, match="features=1 "):
-        mapping.MappingSpec(features=1)
-    with pytest.raises(ValueError, match="at_least=2"):
-        mapping.MappingSpec(at_least=2.0)
 
 
 def test_a_child_that_dies_is_an_error_not_our_end(tmp_path, monkeypatch):

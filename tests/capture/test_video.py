@@ -92,17 +92,3 @@ def test_what_is_no_film_is_refused(tmp_path):
         container.mux(stream.encode())
     with pytest.raises(CaptureError, match="holds no pictures"):
         list(video.read_video(tmp_path / "d.mp4"))
-
-
-def test_what_cannot_be_written_leaves_nothing(tmp_path):
-    with pytest.raises(ValueError, match="no frames"):
-        video.write_video(tmp_path / "a.mp4", [])
-    with pytest.raises(ValueError, match=r"frame 1 is uint8 of shape \(2, 2, 3\)"):
-        video.write_video(
-            tmp_path / "a.mp4", [film()[0], np.zeros((2, 2, 3), np.uint8)]
-        )
-    with pytest.raises(CaptureError, match="cannot be written"):
-        video.write_video(tmp_path / "none/a.mp4", film())
-    with pytest.raises(CaptureError, match="cannot be written"):
-        video.write_video(tmp_path / "a.nonsense", film())
-    assert list(tmp_path.iterdir()) == []

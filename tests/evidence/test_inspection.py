@@ -77,6 +77,7 @@ def test_speed_is_a_lower_bound_of_the_right_size():
     assert 0.3 * truth_px < numbers["speed_px"] < 1.1 * truth_px
 
 
+@pytest.mark.full
 def test_a_static_camera_sees_motion_and_stillness():
     def fixed(time):
         return (0.0, 0.0, 0.0)
@@ -99,6 +100,7 @@ def test_a_drifting_exposure_is_told_from_motion():
     assert stops == pytest.approx(truth, rel=0.06)
 
 
+@pytest.mark.full
 def test_an_even_exposure_is_seen_with_motion_and_without_points():
     assert told(swaying(), "appearance codes") == (False, CERTAIN)
     bare = inspect_job.inspect(films.film(points=0))
@@ -112,6 +114,7 @@ def test_points_of_the_wall_are_fit_for_both_their_uses():
     assert told(still(), "background points")[0]
 
 
+@pytest.mark.full
 def test_points_on_what_moves_are_no_background():
     film = films.film(card=films.swaying)
     rng = np.random.default_rng(3)
@@ -124,16 +127,15 @@ def test_points_on_what_moves_are_no_background():
 @pytest.mark.parametrize(
     "film",
     [
-        functools.partial(films.film, frames=2),
-        functools.partial(
-            films.film, frames=5, card=films.swaying
-        ),  # too fast to be followed
-        functools.partial(films.film, blank=True),
+        {"frames": 2},
+        # too fast to be followed
+        pytest.param({"frames": 5, "card": films.swaying}, marks=pytest.mark.full),
+        pytest.param({"blank": True}, marks=pytest.mark.full),
     ],
     ids=["two frames", "five frames", "nothing to see"],
 )
 def test_what_cannot_be_seen_decides_nothing_and_says_why(film):
-    found = inspect_job.inspect(film()).finding("motion")
+    found = inspect_job.inspect(films.film(**film)).finding("motion")
     assert (found.wanted, found.confidence) == (None, CANNOT_TELL)
     assert len(found.evidence) > 20
 
@@ -217,7 +219,10 @@ def test_the_last_band_is_fast_enough_and_the_one_before_is_not(cycles):
 
 @pytest.mark.parametrize(
     ("turn", "answer"),
-    [(0.0, (False, LIKELY)), (0.9, (True, CERTAIN))],
+    [
+        (0.0, (False, LIKELY)),
+        pytest.param(0.9, (True, CERTAIN), marks=pytest.mark.full),
+    ],
     ids=["at rest", "turning"],
 )
 def test_outlines_tell_motion_where_no_flow_can(turn, answer):

@@ -33,6 +33,7 @@ def module(tmp_path, monkeypatch):
     return "kept_elsewhere"
 
 
+@pytest.mark.full
 def test_a_run_trains_with_effects_named_in_its_config(module, monkeypatch):
     capture = scenes.tiny_capture()
     small = dataclasses.replace(bare_scenes.tiny_field("nerf-small"), steps=1)

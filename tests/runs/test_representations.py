@@ -45,6 +45,7 @@ def test_a_preset_takes_steps_and_settings():
     assert (spec.steps, spec.sh_degree) == (50, 0)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("moving", [False, True])
 def test_a_scene_of_gaussians_is_saved_as_a_model_and_for_viewers(moving, tmp_path):
     kind = representations.named("gaussians")

@@ -1,3 +1,5 @@
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +11,8 @@ from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.training import fit
 from nerfies_jax.training.fit import CODE_SOLVERS, CameraSpec, fit_code, refine_camera
 
+FOCAL = ("focal", "angular", "linear")
+MOVE = jax.jit(fit.move_camera)
 SIZE = (64, 48)
 ANGULAR, LINEAR = np.array([0.03, -0.05, 0.04]), np.array([0.1, -0.06, 0.08])
 
@@ -22,15 +26,21 @@ def scene_camera(dtype, distorted=True):
     camera = cameras.look_at((0.3, -0.4, -3), (0, 0, 0), (0, -1, 0), 80, SIZE, dtype)
     if distorted:
         camera = camera._replace(radial=np.array([-0.1, 0.02, 0], dtype))
-    return jax.tree.map(jnp.asarray, camera)
+    return camera
 
 
 def scene_points(rng, dtype, count=20):
-    return jnp.asarray(rng.uniform(-0.8, 0.8, (count, 3)), dtype)
+    return rng.uniform(-0.8, 0.8, (count, 3)).astype(dtype)
 
 
+@jax.jit
 def pixels(camera, points):
     return jax.vmap(cameras.project, (None, 0))(camera, points)[0]
+
+
+@functools.partial(jax.jit, static_argnums=3)
+def refine(start, points, seen, spec):
+    return refine_camera(lambda c: pixels(c, points) - seen, start, spec)
 
 
 def pose_error(found, truth):
@@ -43,12 +53,11 @@ def pose_error(found, truth):
     return np.linalg.norm(turn - np.eye(3)) / np.sqrt(2), np.linalg.norm(away)
 
 
-@pytest.mark.parametrize("far", [0, 1e4])
-def test_a_camera_moves_as_its_matrix_does(far, float64):
+def test_a_camera_moves_as_its_matrix_does(float64):
     """Against the matrix exponential, also far out, where R x + t cancels."""
     camera = scene_camera("float64")
-    camera = camera._replace(position=camera.position + far)
-    moved = fit.move_camera(camera, jnp.asarray(ANGULAR), jnp.asarray(LINEAR))
+    camera = camera._replace(position=camera.position + 1e4)
+    moved = MOVE(camera, ANGULAR, LINEAR)
     twist = np.zeros((4, 4))
     twist[:3, :3], twist[:3, 3] = hat(ANGULAR), LINEAR
     before = np.asarray(cameras.world_from_camera(camera))
@@ -58,20 +67,15 @@ def test_a_camera_moves_as_its_matrix_does(far, float64):
 
 
 @pytest.mark.parametrize(
-    "unknowns", [("angular", "linear"), ("focal", "angular", "linear")]
+    "unknowns", [FOCAL, pytest.param(("angular", "linear"), marks=pytest.mark.full)]
 )
 def test_a_disturbed_camera_is_found_again_from_its_pixels(unknowns, dtype, rng):
     truth, points = scene_camera(dtype), scene_points(rng, dtype)
     seen = pixels(truth, points)
-    start = fit.move_camera(
-        truth, jnp.asarray(ANGULAR, dtype), jnp.asarray(LINEAR, dtype)
-    )
+    start = MOVE(truth, ANGULAR.astype(dtype), LINEAR.astype(dtype))
     if "focal" in unknowns:
         start = start._replace(focal_px=start.focal_px * 1.2)
-    spec = CameraSpec(unknowns=unknowns)
-    found = jax.jit(
-        lambda c: refine_camera(lambda c: pixels(c, points) - seen, c, spec)
-    )(start)
+    found = refine(start, points, seen, CameraSpec(unknowns=unknowns))
     assert found.converged
     assert found.residual < {"float32": 1e-4, "float64": 1e-7}[dtype]
     # float32: an ulp of a pixel, 4e-6 px, over 80 px per rad, times the conditioning
@@ -82,13 +86,12 @@ def test_a_disturbed_camera_is_found_again_from_its_pixels(unknowns, dtype, rng)
         assert found.value.focal_px == start.focal_px
 
 
+@pytest.mark.full
 def test_noisy_pixels_give_the_least_squares_camera_of_scipy(float64, rng):
     truth, points = scene_camera("float64"), scene_points(rng, "float64")
     seen = np.asarray(pixels(truth, points)) + rng.normal(size=(20, 2))
-    start = fit.move_camera(truth, jnp.asarray(ANGULAR), jnp.asarray(LINEAR))
-    found = jax.jit(
-        lambda start: refine_camera(lambda c: pixels(c, points) - seen, start)
-    )(start)
+    start = MOVE(truth, ANGULAR, LINEAR)
+    found = refine(start, points, seen, CameraSpec())
     assert found.converged
 
     def residuals(step):
@@ -96,9 +99,8 @@ def test_noisy_pixels_give_the_least_squares_camera_of_scipy(float64, rng):
             truth.camera_from_world
         )
         moved = start._replace(camera_from_world=rotation, position=step[3:])
-        return (np.asarray(projected(moved)) - seen).ravel()
+        return (np.asarray(pixels(moved, points)) - seen).ravel()
 
-    projected = jax.jit(lambda camera: pixels(camera, points))
     exact = optimize.least_squares(
         residuals, [0, 0, 0, *start.position], xtol=1e-12, ftol=1e-12, gtol=1e-12
     )
@@ -136,17 +138,16 @@ def photograph(camera):
     return jax.vmap(colour)(centres)
 
 
+@pytest.mark.full
 def test_a_camera_is_found_from_colours_alone_and_wrong_minima_are_flagged(dtype):
     """Eight starts as one batch: near ones come back, far ones are flagged."""
     truth = scene_camera(dtype, distorted=False)
-    seen = photograph(truth)
-    sizes = jnp.asarray([0, 0.2, 0.5, 1, 4, 8, 16, 32], dtype)
+    seen = jax.jit(photograph)(truth)
+    sizes = np.asarray([0, 0.2, 0.5, 1, 4, 8, 16, 32], dtype)
     spec = CameraSpec(max_residual=1e-3)
 
     def refine(size):
-        start = fit.move_camera(
-            truth, size * jnp.asarray(ANGULAR, dtype), size * jnp.asarray(LINEAR, dtype)
-        )
+        start = MOVE(truth, size * ANGULAR.astype(dtype), size * LINEAR.astype(dtype))
         return refine_camera(lambda c: photograph(c) - seen, start, spec)
 
     found = jax.jit(jax.vmap(refine))(sizes)
@@ -161,28 +162,23 @@ def test_a_camera_is_found_from_colours_alone_and_wrong_minima_are_flagged(dtype
 
 def test_what_cannot_determine_a_camera_is_flagged(dtype, rng):
     truth, points = scene_camera(dtype), scene_points(rng, dtype)
-    start = fit.move_camera(
-        truth, jnp.asarray(ANGULAR, dtype), jnp.asarray(LINEAR, dtype)
-    )
-
-    @jax.jit
-    def refine(points, start):
-        seen = pixels(truth, points)
-        return refine_camera(lambda c: pixels(c, points) - seen, start)
-
-    one_point = jnp.tile(points[:1], (8, 1))
-    a_line = jnp.linspace(-1, 1, 8, dtype=dtype)[:, None] * points[0]
+    start = MOVE(truth, ANGULAR.astype(dtype), LINEAR.astype(dtype))
+    spec = CameraSpec(unknowns=FOCAL)
+    one_point = np.tile(points[:1], (20, 1))
+    a_line = np.linspace(-1, 1, 20, dtype=dtype)[:, None] * points[0]
     for degenerate in (one_point, a_line):
-        found = refine(degenerate, start)
+        found = refine(start, degenerate, pixels(truth, degenerate), spec)
         assert found.residual < 1e-3  # it fits, and means nothing
         assert not found.converged
         assert np.isfinite(found.value.position).all()
-    lost = start._replace(position=jnp.full(3, jnp.nan, dtype))
-    assert not refine(points[:8], lost).converged
-    with pytest.raises(ValueError, match="4 residuals cannot determine 6 unknowns"):
-        refine(points[:2], start)
+    lost = start._replace(position=np.full(3, np.nan, dtype))
+    seen = pixels(truth, points)
+    assert not refine(lost, points, seen, spec).converged
+    with pytest.raises(ValueError, match="4 residuals cannot determine 7 unknowns"):
+        refine(start, points[:2], seen[:2], spec)
 
 
+@pytest.mark.full
 def test_a_camera_that_sees_nothing_or_has_no_time_is_flagged(float64):
     start = scene_camera("float64")
     still = jax.jit(lambda c: refine_camera(lambda c: jnp.ones(8), c))(start)
@@ -196,32 +192,25 @@ def test_a_camera_that_sees_nothing_or_has_no_time_is_flagged(float64):
     assert not jax.jit(lambda c: refine_camera(far_away, c, hasty))(start).converged
 
 
-def test_wrong_camera_settings_are_refused():
-    with pytest.raises(ValueError, match="tolerance=-1"):
-        CameraSpec(tolerance=-1.0)
-    with pytest.raises(ValueError, match="different names"):
-        CameraSpec(unknowns=("roll",))
-    with pytest.raises(ValueError, match="max_residual=0"):
-        CameraSpec(max_residual=0.0)
-
-
+FIRST, *OTHERS = CODE_SOLVERS
+ONE_SOLVER = [FIRST, *(pytest.param(name, marks=pytest.mark.full) for name in OTHERS)]
 # Steps and tolerance at which each solver has surely arrived. Adam only creeps there.
 GENEROUS = {name: (200, 1e-3) for name in CODE_SOLVERS} | {"adam": (1000, 1e-2)}
 
 
-@pytest.mark.parametrize("solver", CODE_SOLVERS)
+@pytest.mark.parametrize("solver", ONE_SOLVER)
 def test_every_solver_finds_the_ridge_regression(solver, dtype, rng):
     """Against the normal equations, for a code of two arrays."""
     matrix = rng.normal(size=(30, 8))
     wanted = matrix @ rng.normal(size=8) * 0.3
     exact = np.linalg.solve(matrix.T @ matrix + 0.1 * np.eye(8), matrix.T @ wanted)
-    rows, target = jnp.asarray(matrix, dtype), jnp.asarray(wanted, dtype)
+    rows, target = matrix.astype(dtype), wanted.astype(dtype)
 
     def loss(code):
         flat = jnp.concatenate([code["a"], code["b"].reshape(-1)])
         return jnp.sum((rows @ flat - target) ** 2) + 0.1 * jnp.sum(flat**2)
 
-    start = {"a": jnp.zeros(2, dtype), "b": jnp.zeros((2, 3), dtype)}
+    start = {"a": np.zeros(2, dtype), "b": np.zeros((2, 3), dtype)}
     steps, tolerance = GENEROUS[solver]
     found = jax.jit(lambda start: fit_code(loss, start, solver, steps, tolerance))(
         start
@@ -236,21 +225,9 @@ def test_every_solver_finds_the_ridge_regression(solver, dtype, rng):
     assert np.linalg.norm(code - exact) < tolerance / curvature + 1e-6
 
 
-@pytest.mark.parametrize("solver", sorted(set(CODE_SOLVERS) - {"adam"}))
-def test_second_order_solvers_follow_a_bent_valley(solver, float64):
-    """Rosenbrock's, against its known minimum; Adam needs thousands of steps."""
-
-    def loss(code):
-        return jnp.sum(100 * (code[1:] - code[:-1] ** 2) ** 2 + (1 - code[:-1]) ** 2)
-
-    found = fit_code(loss, jnp.zeros(4), solver, 300, 1e-6)
-    assert found.converged
-    np.testing.assert_allclose(found.value, 1, atol=1e-5)
-
-
-@pytest.mark.parametrize("solver", CODE_SOLVERS)
+@pytest.mark.parametrize("solver", ONE_SOLVER)
 def test_a_bad_start_comes_back_flagged(solver, dtype):
-    start = jnp.asarray([-1.0, 2.0], dtype)
+    start = np.asarray([-1.0, 2.0], dtype)
     found = jax.jit(
         lambda start: fit_code(lambda c: jnp.sum(jnp.log(c)), start, solver, 20)
     )(start)
@@ -258,6 +235,7 @@ def test_a_bad_start_comes_back_flagged(solver, dtype):
     np.testing.assert_array_equal(found.value, start)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("solver", CODE_SOLVERS)
 def test_a_solve_cut_short_is_flagged_and_no_worse_than_its_start(solver, dtype):
     """The loss is finite only left of 1, close to where the descent leads."""
@@ -265,17 +243,19 @@ def test_a_solve_cut_short_is_flagged_and_no_worse_than_its_start(solver, dtype)
     def loss(code):
         return jnp.sum(-jnp.log(1 - code) - 300 * code)
 
-    start = jnp.asarray([0.5, -3.0], dtype)
+    start = np.asarray([0.5, -3.0], dtype)
+    value = jax.jit(loss)
     found = jax.jit(lambda start: fit_code(loss, start, solver, 3, 1e-6))(start)
     assert not found.converged
     assert np.isfinite(found.value).all()
-    assert loss(found.value) <= loss(start)
+    assert value(found.value) <= value(start)
 
 
 @pytest.mark.parametrize("solver", CODE_SOLVERS)
+@pytest.mark.full
 def test_many_codes_are_fitted_as_one_batch(solver, dtype):
     """And the loss may close over what is mapped or traced."""
-    targets = jnp.asarray([[0.1, 0.2], [-0.3, 0.4], [0.0, 0.0]], dtype)
+    targets = np.asarray([[0.1, 0.2], [-0.3, 0.4], [0.0, 0.0]], dtype)
 
     @jax.jit
     def fit_all(targets):
@@ -294,21 +274,11 @@ def test_many_codes_are_fitted_as_one_batch(solver, dtype):
 
 
 @pytest.mark.parametrize("solver", CODE_SOLVERS)
+@pytest.mark.full
 def test_float32_codes_stay_float32_with_x64_on(solver, float64):
     found = jax.jit(
         lambda start: fit_code(lambda c: jnp.sum((c - 0.5) ** 2), start, solver, 300)
-    )(jnp.zeros(3, jnp.float32))
+    )(np.zeros(3, np.float32))
     assert found.value.dtype == found.residual.dtype == jnp.float32
     assert found.converged
     np.testing.assert_allclose(found.value, 0.5, atol=1e-3)
-
-
-def test_wrong_codes_and_solvers_are_refused():
-    with pytest.raises(ValueError, match="unknown solver 'newton'; choose from"):
-        fit_code(jnp.sum, jnp.ones(2), "newton")
-    with pytest.raises(ValueError, match=r"one floating dtype, got \['int32'\]"):
-        fit_code(jnp.sum, jnp.ones(2, jnp.int32))
-    with pytest.raises(ValueError, match="float16"):
-        fit_code(jnp.sum, (jnp.ones(2), jnp.ones(2, jnp.float16)))
-    with pytest.raises(ValueError, match="max_steps=0"):
-        fit_code(jnp.sum, jnp.ones(2), max_steps=0)

@@ -18,9 +18,7 @@ from nerfies_jax.training import chunk, loop
 from nerfies_jax.training.model import Event
 from nerfies_jax.training.progress import duration
 from tests.training import toy
-
-QUIET = rich.console.Console(quiet=True)
-MODEL = toy.model()
+from tests.training.toy import fit, start
 
 
 @pytest.fixture(scope="module")
@@ -31,15 +29,6 @@ def frames():
 @pytest.fixture(scope="module")
 def straight(frames):
     return fit(frames, steps=20)
-
-
-def start():
-    return MODEL.init(None, jax.random.key(5))
-
-
-def fit(frames, state=None, model=MODEL, **settings):
-    state = start() if state is None else state
-    return loop.fit(model, state, frames, console=QUIET, **settings)
 
 
 def test_a_run_is_the_plain_loop_over_its_steps(frames, straight):
@@ -60,7 +49,7 @@ def test_a_run_is_the_plain_loop_over_its_steps(frames, straight):
     assert straight.stopped_by == "steps"
 
 
-@pytest.mark.parametrize("cut", [1, 6, 7, 8, 19, 20])
+@pytest.mark.parametrize("cut", [7, pytest.param(19, marks=pytest.mark.full)])
 def test_a_run_cut_in_two_is_the_straight_run_bit_for_bit(cut, frames, straight):
     first = fit(frames, steps=cut)
     second = fit(frames, first.state, steps=20, history=first.history)
@@ -69,7 +58,7 @@ def test_a_run_cut_in_two_is_the_straight_run_bit_for_bit(cut, frames, straight)
     assert second.seconds >= first.seconds
 
 
-@pytest.mark.parametrize("longest", [1, 3, 100])
+@pytest.mark.parametrize("longest", [3, pytest.param(100, marks=pytest.mark.full)])
 def test_chunk_length_does_not_change_a_bit(longest, frames, straight, monkeypatch):
     monkeypatch.setattr(loop, "CHUNK_STEPS", longest)
     result = fit(frames, steps=20)
@@ -77,12 +66,6 @@ def test_chunk_length_does_not_change_a_bit(longest, frames, straight, monkeypat
     lengths = np.diff([0] + [row["step"] for row in result.history.rows])
     assert lengths.max() <= longest
     assert 7 in np.cumsum(lengths)  # a chunk ends where an event happens
-
-
-def test_the_same_seed_twice_is_the_same_run_and_another_is_not(frames, straight):
-    assert toy.same(fit(frames, steps=20).state, straight.state)
-    other = fit(frames, MODEL.init(None, jax.random.key(6)), steps=20)
-    assert not toy.same(other.state, straight.state)
 
 
 def test_one_program_serves_every_chunk_of_a_shape(frames):
@@ -133,6 +116,7 @@ def test_events_happen_in_order_after_their_steps(frames):
     assert len(seen) == 3  # what has happened does not happen again
 
 
+@pytest.mark.full
 def test_an_event_may_put_one_array_in_two_places(frames):
     def share(state, _):
         zero = jnp.zeros(6)
@@ -179,6 +163,7 @@ def test_a_budget_of_seconds_ends_the_run_and_says_so(frames):
     assert "of 10,000 by seconds: the 0:00 given are over" in result.message
 
 
+@pytest.mark.full
 def test_chunks_of_slow_steps_stay_short_enough_to_interrupt(frames, monkeypatch):
     monkeypatch.setattr(loop, "CHUNK_SECONDS", 0.1)
 
@@ -193,7 +178,16 @@ def test_chunks_of_slow_steps_stay_short_enough_to_interrupt(frames, monkeypatch
     assert len(lengths) < 25
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize(
+    "number",
+    [
+        signal.SIGINT,
+        *(
+            pytest.param(n, marks=pytest.mark.full)
+            for n in (signal.SIGTERM, signal.SIGHUP)
+        ),
+    ],
+)
 def test_a_signal_ends_the_run_after_its_chunk(number, frames, straight):
     def send(state, step):
         if step == 11:
@@ -220,6 +214,7 @@ def test_a_second_interrupt_does_not_wait(frames):
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
+@pytest.mark.full
 def test_a_signal_that_is_to_be_ignored_still_is(frames):
     def send(state, step):
         os.kill(os.getpid(), signal.SIGHUP)
@@ -232,6 +227,7 @@ def test_a_signal_that_is_to_be_ignored_still_is(frames):
     assert result.stopped_by == "steps"
 
 
+@pytest.mark.full
 def test_a_run_outside_the_main_thread_leaves_signals_alone(frames):
     results = []
     thread = threading.Thread(target=lambda: results.append(fit(frames, steps=3)))
@@ -275,6 +271,7 @@ def test_fewer_steps_than_done_are_refused(frames, straight):
     assert fit(frames, straight.state, steps=20).steps == 20
 
 
+@pytest.mark.full
 def test_float64_states_stay_float64(frames):
     with jax.enable_x64(True):
         wide = jax.tree.map(
@@ -295,13 +292,14 @@ def test_float64_states_stay_float64(frames):
         )
 
 
+@pytest.mark.full
 def test_a_log_file_gets_lines_and_a_terminal_a_bar(frames):
     for terminal in (False, True):
         text = io.StringIO()
         console = rich.console.Console(
             file=text, force_terminal=terminal, width=120, color_system=None
         )
-        loop.fit(MODEL, start(), frames, steps=8, console=console)
+        fit(frames, steps=8, console=console)
         shown = text.getvalue()
         assert "completed 8 steps" in shown
         assert "steps/s  loss" in shown

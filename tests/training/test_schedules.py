@@ -5,7 +5,6 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from nerfies_jax.training import schedules
 
@@ -82,36 +81,3 @@ def test_staircase_counts_completed_steps():
     assert list(found) == [0, 0, 1, 2, 3, 3]
     assert found.dtype == jnp.int32
     assert int(schedules.staircase((), start=2)(7)) == 2
-
-
-def test_schedules_run_inside_a_scan_and_as_an_optax_rate():
-    schedule = schedules.log_linear(1e-2, 1e-4, 10)
-
-    def body(step, _):
-        return step + 1, schedule(step)
-
-    _, rates = jax.lax.scan(body, jnp.asarray(0), length=11)
-    np.testing.assert_allclose(rates, 1e-2 * 0.01 ** (np.arange(11) / 10), 1e-6)
-
-
-@pytest.mark.parametrize(
-    ("build", "words"),
-    [
-        (lambda: schedules.log_linear(0.0, 1e-3, 10), "start > 0, got 0.0"),
-        (lambda: schedules.log_linear(1e-3, -1.0, 10), "end > 0, got -1.0"),
-        (lambda: schedules.log_linear(1e-3, math.nan, 10), "end > 0, got nan"),
-        (lambda: schedules.log_linear(1e-3, 1e-4, 0), "steps=0"),
-        (lambda: schedules.log_linear(1.0, 0.1, 9, delay_steps=-1), "delay_steps=-1"),
-        (lambda: schedules.log_linear(1.0, 0.1, 9, delay=0.0), "delay=0.0"),
-        (lambda: schedules.ramp(0.0, math.inf, 10), "finite end, got inf"),
-        (lambda: schedules.ramp(0.0, 1.0, -3), "steps=-3"),
-        (lambda: schedules.cosine(0.0, 1.0, 10, after=-1), "after=-1"),
-        (lambda: schedules.time_noise(0), "frames=0"),
-        (lambda: schedules.time_noise(5, scale=-0.1), "scale=-0.1"),
-        (lambda: schedules.staircase((3, 2)), r"got \(3, 2\)"),
-        (lambda: schedules.staircase((-1, 2)), r"got \(-1, 2\)"),
-    ],
-)
-def test_nonsense_is_refused_when_a_schedule_is_built(build, words):
-    with pytest.raises(ValueError, match=words):
-        build()

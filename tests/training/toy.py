@@ -1,12 +1,14 @@
 """A small model with rows, a net, noise from the step's key and a growth event."""
 
 import dataclasses
+import functools
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+import rich.console
 
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.training import loop
@@ -29,13 +31,19 @@ class Params(NamedTuple):
 
 def frames():
     rng = np.random.default_rng(3)
-    camera = Camera(*(jnp.zeros(()) for _ in Camera._fields))
-    count = jnp.arange(4)
+    camera = Camera(*(np.zeros((), np.float32) for _ in Camera._fields))
     images = rng.integers(0, 255, (4, 2, 3, 3), dtype=np.uint8)
-    return Frames(images, camera, jnp.linspace(0.0, 1.0, 4), count, None)
+    times = np.linspace(0, 1, 4, dtype=np.float32)
+    on_device = (images, camera, times, np.arange(4, dtype=np.int32))
+    return Frames(*jax.device_put(on_device), None)
 
 
 def init(_capture, key, spec=ToySpec()):
+    return _init(key, spec)
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _init(key, spec):
     row_key, net_key = jax.random.split(key)
     params = Params(
         {"mean": jax.random.normal(row_key, (spec.rows, 3))},
@@ -69,6 +77,7 @@ def step(state, frames):
     ), {"loss": value, "psnr": -10 * jnp.log10(value)}
 
 
+@jax.jit
 def grow(state, _frames):
     """Half as many rows again, moments and statistics with them."""
     capacity = state.aux_state["hits"].shape[0]
@@ -91,6 +100,19 @@ def model(spec=ToySpec(), change=None):
     return Model(
         spec, lambda c, k: init(c, k, spec), change or step, None, (event,), counts
     )
+
+
+MODEL = model()
+QUIET = rich.console.Console(quiet=True)
+
+
+def start(seed=5):
+    return init(None, jax.random.key(seed))
+
+
+def fit(frames, state=None, model=MODEL, **settings):
+    state = start() if state is None else state
+    return loop.fit(model, state, frames, **({"console": QUIET} | settings))
 
 
 def same(one, other):
