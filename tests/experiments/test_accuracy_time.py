@@ -122,22 +122,6 @@ def test_a_cost_may_grow_by_a_share_and_a_quality_by_a_number():
     assert measure.allowed(math.nan) == 0
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["--axes", "colour"], "choose from preset"),
-        (["--share", "0"], "--share 0"),
-        (["--check", "/nowhere.json"], "cannot be read"),
-        (["--jobs", "0"], "positive"),
-    ],
-)
-def test_wrong_input_is_refused(arguments, words, capsys):
-    with pytest.raises(SystemExit) as stop:
-        accuracy_time.main(arguments)
-    assert stop.value.code == 2
-    assert words in capsys.readouterr().err
-
-
 @pytest.mark.slow
 def test_a_tiny_plan_runs_resumes_and_is_held_against_itself(tmp_path, capfd):
     small = "rays=8 sampling.coarse=4 sampling.fine=0 template.depth=1 template.width=8"

@@ -22,6 +22,7 @@ def test_names_tell_all_cases_apart():
             assert {"float32", "float64"} <= set(case.bounds)
 
 
+@pytest.mark.full
 def test_the_command_measures_prints_draws_and_renews_the_page(tmp_path, capsys):
     page, out = tmp_path / "page.md", tmp_path / "out"
     page.write_text(PAGE)
@@ -40,22 +41,6 @@ def test_the_command_measures_prints_draws_and_renews_the_page(tmp_path, capsys)
     key = "window_of_a_band_that_opens.float32.slope"
     assert stored[f"{key}.ours"]["value"] < 1e-5 < stored[f"{key}.textbook"]["value"]
     assert (out / "window-of-a-band-that-opens.png").stat().st_size > 5000
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--rooms", "kitchen"], "choose from rotations"),
-        (["--cases", "nothing"], "no such case; there are screw"),
-        (["--numbers", "0"], "at least 1"),
-        (["--document", "nowhere.md"], "no such file, or not both"),
-    ],
-)
-def test_wrong_input_is_refused(words, message, tmp_path, capsys):
-    with pytest.raises(SystemExit) as stop:
-        hard_cases.main([*words, "--out", str(tmp_path / "out")])
-    assert stop.value.code == 2
-    assert message in capsys.readouterr().err
 
 
 def test_errors_are_of_the_largest_entry_and_never_forgiving():

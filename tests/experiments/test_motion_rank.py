@@ -155,20 +155,3 @@ def test_the_sentences_follow_the_numbers():
     )
     assert "2.00 of the moving basis' error" in said
     assert "the basis helps" in said
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("--kinds square", "--kinds square"),
-        ("--counts 0", "each at least 1"),
-        ("--seeds 0", "--seeds 0"),
-        ("--times 4", "--times 4 must be at least 8"),
-        ("--basis-form square", "--basis-form square"),
-    ],
-)
-def test_impossible_settings_are_refused(arguments, message, capsys):
-    with pytest.raises(SystemExit) as stopped:
-        motion_rank.main(arguments.split())
-    assert stopped.value.code == 2
-    assert message in capsys.readouterr().err

@@ -206,22 +206,6 @@ def test_a_render_that_a_run_cannot_give_is_refused(run, capsys, arguments, word
     assert line.count("\n") == 1
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["--interpolation", "cubic"], "is for --knots"),
-        (["--still-below", "-1"], "not negative"),
-    ],
-)
-def test_settings_of_a_faster_motion_that_cannot_be_are_refused(
-    arguments, words, capsys
-):
-    with pytest.raises(SystemExit) as stop:
-        render.main(["nowhere", *arguments])
-    assert stop.value.code == 2
-    assert words in " ".join(capsys.readouterr().err.replace("│", " ").split())
-
-
 @pytest.mark.slow
 def test_a_motion_is_rendered_from_knots(run, capsys):
     for arguments in ([], ["--knots", "6", "--interpolation", "cubic"]):

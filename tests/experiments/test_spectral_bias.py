@@ -87,6 +87,7 @@ def test_sine_networks_start_as_the_paper_says():
     assert 0.1 < float(jnp.std(made.apply(params, points))) < 2
 
 
+@pytest.mark.full
 def test_training_is_adam_along_a_cosine_from_points_of_its_own():
     made = spectral_bias.network("relu", False, SMALL)
     train = jax.jit(spectral_bias.trainer(made, SMALL, 16))
@@ -124,6 +125,7 @@ def test_training_is_adam_along_a_cosine_from_points_of_its_own():
     assert float(loss[0]) == pytest.approx(float(value), rel=0.2)
 
 
+@pytest.mark.full
 def test_one_known_point_is_learnt_and_nothing_else():
     made = spectral_bias.network("relu", False, SMALL)
     train = jax.jit(spectral_bias.trainer(made, SMALL, 4, points=1))
@@ -137,6 +139,7 @@ def test_one_known_point_is_learnt_and_nothing_else():
     assert float(rmse) > 0.3
 
 
+@pytest.mark.full
 def test_the_rate_is_the_best_one_and_time_is_shared_out(monkeypatch):
     monkeypatch.setitem(spectral_bias.SIGNALS, "1-D", SMALL)
     args = SpectralBias(steps=80, seeds=2, rates=(1e-7, 1e-2), batch=16)
@@ -187,6 +190,7 @@ def test_the_sentences_follow_from_the_numbers():
     assert "(sine): worse" in text
 
 
+@pytest.mark.full
 def test_the_table_and_the_figure_show_every_network(tmp_path):
     waves = {"2-D": np.array([[1.0, 1.0], [3.0, -2.0]])}
     text = report.tables(planted(0.1, 0.3), waves)
@@ -197,24 +201,6 @@ def test_the_table_and_the_figure_show_every_network(tmp_path):
     ]  # the last: sqrt(0.09 - 0.025) of the first seed, nothing of the second
     report.draw_figure(planted(0.1, 0.3), waves, tmp_path / "bias.png")
     assert (tmp_path / "bias.png").stat().st_size > 10_000
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("--steps 1", "--steps 1"),
-        ("--signals 3-D", "--signals 3-D"),
-        ("--kinds tanh", "--kinds tanh"),
-        ("--points 0", "--points 0"),
-        ("--pilot 0", "--pilot 0"),
-        ("--rates 0.1 -1", "--rates"),
-    ],
-)
-def test_impossible_settings_are_refused(arguments, message, capsys):
-    with pytest.raises(SystemExit) as stopped:
-        spectral_bias.main(arguments.split())
-    assert stopped.value.code == 2
-    assert message in capsys.readouterr().err
 
 
 @pytest.mark.slow

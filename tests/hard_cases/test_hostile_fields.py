@@ -19,14 +19,14 @@ pytestmark = pytest.mark.hard_cases
 
 
 STARTS = field_starts.OF_FRAMES | field_starts.OF_FILMS | field_starts.OF_PARAMETERS
-# One of the seven in the default suite: a field compiles in 15 to 45 s.
-DEFAULT = ("nerf-w",)
+# A field compiles in 15 to 45 s.
+QUICK = ("nerf-w",)
 
 
 def marked(name, *others):
-    """A case of the default suite, or a slow one."""
-    marks = () if name in DEFAULT else (pytest.mark.slow,)
-    return pytest.param(name, *others, marks=marks)
+    """A full case, or a slow one."""
+    mark = pytest.mark.full if name in QUICK else pytest.mark.slow
+    return pytest.param(name, *others, marks=mark)
 
 
 FIELDS = [marked(name) for name in tiny_fields.PAPERS]

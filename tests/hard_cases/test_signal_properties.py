@@ -16,15 +16,12 @@ from gaussians_jax import harmonics
 from gaussians_jax.effects import depth as depths
 from gaussians_jax.effects import neighbours, spectral
 from gaussians_jax.splats import Params, Splats
-from nerfies_jax.nets import encoding, kan
+from nerfies_jax.nets import encoding
 from nerfies_jax.nets.encoding import EncodingSpec
-from nerfies_jax.nets.kan import KANLayer, KANSpec
-from nerfies_jax.nets.mlp import HeadSpec
-from nerfies_jax.training import losses, schedules
 from tests.hard_cases import properties
 from tests.hard_cases.properties import cast, close, compiled, eps, norm, same
 
-pytestmark = pytest.mark.hard_cases
+pytestmark = [pytest.mark.hard_cases, pytest.mark.full]
 BANDS = 6
 TIMES_PI = EncodingSpec(BANDS, identity=False, times_pi=True)
 encode = compiled(lambda x, window: encoding.encode(TIMES_PI, x, window))
@@ -51,60 +48,6 @@ def test_bands_are_periodic_odd_and_even_to_the_bit(steps, turns, dtype):
     sine, cosine = here[:, 0], here[:, 1]
     close(sine[1:], (2 * sine * cosine)[:-1], 8 * eps(dtype))
     close(cosine[1:], (cosine**2 - sine**2)[:-1], 8 * eps(dtype))
-
-
-@given(alpha=properties.numbers(-1, BANDS + 1), more=properties.magnitudes(high=2))
-def test_windows_open_one_after_the_other_and_never_close(alpha, more, dtype):
-    before, after = (
-        np.asarray(anneal(cast(dtype, np.array(a)))) for a in (alpha, alpha + more)
-    )
-    assert np.all((before >= 0) & (before <= 1))
-    assert np.all(np.diff(before) <= 0)
-    assert np.all(after >= before - 4 * eps(dtype))
-    assert np.sum((before > 0) & (before < 1)) <= 1
-
-
-KAN_SPEC = KANSpec(3, (), (("a", HeadSpec(2)),), kernels=5)
-
-
-@compiled
-def of_kan(params, x):
-    return kan.apply(KAN_SPEC, params, x)["a"]
-
-
-def kan_weights():
-    fields = (properties.many((5, 3, 2), -1, 1), properties.many((3, 2), -1, 1))
-    return st.builds(KANLayer, *fields, properties.many(2, -1, 1))
-
-
-@given(
-    one=kan_weights(),
-    other=kan_weights(),
-    share=properties.numbers(-2, 2),
-    x=properties.many(3, -3, 3),
-)
-def test_a_kan_layer_is_linear_in_its_weights(one, other, share, x, dtype):
-    joint = jax.tree.map(lambda a, b: a + share * b, one, other)
-    values = [
-        np.asarray(of_kan(kan.KAN((), {"a": cast(dtype, w)}, None), cast(dtype, x)))
-        for w in (one, other, joint)
-    ]
-    # 3 inputs of 5 kernels and a SiLU of up to 3, weights of up to 3
-    close(values[2], values[0] + share * values[1], 16 * 4 * 9 * eps(dtype))
-
-
-held = compiled(lambda x: kan.hold(x, (-1.0, 1.0), 0.3))
-
-
-@given(x=properties.many(8, -5, 5), far=properties.magnitudes(1.0, 1e18))
-def test_held_inputs_keep_their_order_and_their_range(x, far, dtype):
-    x = cast(dtype, np.sort([*x, far, -far]))
-    found = np.asarray(held(x))
-    assert np.all(np.diff(found) >= -2 * eps(dtype))
-    assert np.all(np.abs(found) <= 1.3 + 2 * eps(dtype))
-    inside = np.abs(x) <= 1
-    same(found[inside], x[inside])
-    same(np.asarray(held(-x)), -found)
 
 
 split = compiled(lambda image: spectral.haar_pyramid(image, 3))
@@ -165,89 +108,6 @@ def test_spectra_keep_energy_and_their_losses_are_symmetric(image, truth, dtype)
         close(here, there, 32 * eps(dtype) * float(here))
     assert nothing == 0
     assert no_wavelet == 0
-
-
-@compiled
-def compared(image, truth):
-    def how(a, b):
-        return {
-            "ssim": losses.ssim(a, b),
-            "valid": losses.ssim(a, b, padding="valid"),
-            "l1": losses.l1(a, b),
-            "mse": losses.mse(a, b),
-            "photometric": losses.photometric(a, b),
-        }
-
-    return jax.vmap(how)(
-        jnp.stack([image, truth, truth, image[::-1]]),
-        jnp.stack([truth, image, truth, truth[::-1]]),
-    )
-
-
-@given(image=properties.pictures(), truth=properties.pictures())
-def test_image_losses_are_symmetric_and_zero_only_at_equality(image, truth, dtype):
-    image, truth = cast(dtype, image, truth)
-    found = compared(image, truth)
-    apart = bool(np.any(image != truth))
-    for name, (here, swapped, equal, mirrored) in found.items():
-        similarity = name in ("ssim", "valid")
-        assert equal == (1 if similarity else 0), name
-        # Local variances are differences of squares; the least divisor is C2.
-        bound = 64 * eps(dtype) * (1 + 1 / losses.CONTRAST)
-        if not similarity:
-            assert here > 0 or not apart or name == "mse", name
-            bound = 64 * eps(dtype) * (1 + 0.2 / losses.CONTRAST)
-        else:
-            assert -1 - bound <= here <= 1 + bound, name
-        close(swapped, here, bound)
-        close(mirrored, here, bound)
-
-
-ROBUST = {
-    "charbonnier": lambda s: losses.charbonnier(s, 0.1),
-    "huber": lambda s: losses.huber(s, 0.1),
-    "geman_mcclure": lambda s: losses.geman_mcclure(s, 0.1),
-}
-robust = compiled(lambda s: {name: f(s) for name, f in ROBUST.items()})
-
-
-@given(s=st.lists(properties.magnitudes(1e-30, 1e30), min_size=8, max_size=8))
-def test_robust_losses_rise_from_zero_and_stay_below_their_bounds(s, dtype):
-    s = cast(dtype, np.sort([0.0, *s]))
-    found = {name: np.asarray(value) for name, value in robust(s).items()}
-    for name, value in found.items():
-        assert value[0] == 0, name
-        assert np.all((value > 0) | (s == 0)), name
-        assert np.all(np.diff(value) >= -4 * eps(dtype) * value[1:]), name
-    more = 1 + 4 * eps(dtype)
-    assert np.all(found["charbonnier"] <= np.sqrt(s) * more)
-    assert np.all(found["huber"] <= s / 2 * more)
-    assert np.all(found["geman_mcclure"] <= 2 * more)
-
-
-@given(
-    start=properties.magnitudes(1e-8, 1e3).filter(bool),
-    end=properties.magnitudes(1e-8, 1e3).filter(bool),
-    steps=st.integers(1, 2**30),
-    after=st.integers(0, 2**30),
-)
-def test_schedules_are_monotone_between_their_exact_ends(
-    start, end, steps, after, dtype
-):
-    marks = np.array([0, 0.1, 0.5, 0.9, 1, 1.5])
-    at = np.minimum(marks * steps, 2**31 - 1 - after).astype(np.int64)
-    built = {
-        "log_linear": (schedules.log_linear(start, end, steps), at),
-        "ramp": (schedules.ramp(start, end, steps, after=after), at + after),
-        "cosine": (schedules.cosine(start, end, steps, after=after), at + after),
-    }
-    for name, (schedule, when) in built.items():
-        rate = np.asarray(schedule(when.astype(np.int32)), np.float64)
-        rise = np.diff(rate) * np.sign(end - start)
-        assert np.all(rise >= -16 * eps(dtype) * max(start, end)), name
-        slack = 0 if name != "log_linear" else 32 * eps(dtype)
-        close(rate[0], start, (slack + eps(dtype)) * start)
-        close(rate[-1], end, (slack + eps(dtype)) * end)
 
 
 PIXELS = 12

@@ -10,10 +10,9 @@ from hypothesis.extra import numpy as arrays
 
 from gaussians_jax import files, model_file, splats
 from gaussians_jax.splats import SH_DC, Params, Splats
-from tests.hard_cases import properties
 from tests.hard_cases.properties import same
 
-pytestmark = pytest.mark.hard_cases
+pytestmark = [pytest.mark.hard_cases, pytest.mark.full]
 LARGEST = float(np.finfo(np.float32).max)
 
 
@@ -172,14 +171,6 @@ def test_what_is_not_finite_is_never_written(
     with pytest.raises(ValueError, match="finite"):
         model_file.save(tmp_path / "model.npz", Params({"splats": broken}, {}), {})
     assert not (tmp_path / "model.npz").exists()
-
-
-@given(points=properties.many((7, 3), -3, 3), colours=properties.many((7, 3), 0, 1))
-def test_splats_from_points_are_saved_and_drawn_alike(points, colours, tmp_path):
-    made = splats.from_points(points, colours, degree=0)
-    files.save(tmp_path / "a.ply", made)
-    loaded = files.load(tmp_path / "a.ply").splats
-    same(splats.activate(loaded), splats.activate(made))
 
 
 def plain(**fields):

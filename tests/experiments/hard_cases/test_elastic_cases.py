@@ -27,13 +27,24 @@ HALVED = (*ENERGIES, "singular_values", "svd")
 ROWS = 7  # as many matrices as one test asks for at most
 
 
+pytestmark = pytest.mark.hard_cases
+
+
+def test_values_are_held():
+    checks.hold_values(CASES)
+
+
 @checks.by_case(CASES, slow=("float64",))
 def test_held(case, dtype):
     checks.hold(case, dtype)
 
 
-@pytest.mark.hard_cases
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+@pytest.mark.full
+def test_one_alone_is_held():
+    checks.hold_alone(CASES)
+
+
+@checks.each(CASES)
 def test_the_textbook_form_is_caught(case):
     checks.catches_the_textbook(case)
 
@@ -60,7 +71,6 @@ def of_all(matrices, dtype):
     return jax.tree.map(lambda leaf: leaf[: len(matrices)], found)
 
 
-@pytest.mark.hard_cases
 @pytest.mark.parametrize("name", ["log_energy", "signed_log_energy"])
 def test_value_and_slope_are_continuous_where_the_logarithm_becomes_a_tangent(
     name, dtype
@@ -86,7 +96,7 @@ def halved(kind):
     return every(matrix), every(matrix.astype(np.float32))
 
 
-@pytest.mark.hard_cases
+@pytest.mark.full
 @pytest.mark.parametrize("kind", ["bfloat16", "float16"])
 @pytest.mark.parametrize("name", HALVED)
 def test_half_precision_is_rounded_once(name, kind):
@@ -98,7 +108,7 @@ def test_half_precision_is_rounded_once(name, kind):
         assert np.all(off <= 1.001 * half_ulp * np.abs(other) + 6e-8)
 
 
-@pytest.mark.hard_cases
+@pytest.mark.full
 @pytest.mark.parametrize("name", [*ENERGIES, "singular_values"])
 def test_float32_stays_float32_with_x64_on(name):
     matrix = [np.eye(3) + 0.2 * DIRECTIONS[2]]
@@ -116,7 +126,6 @@ def _field(params, point):
     return lie.displacement(turn @ point, shift @ point + jnp.sum(shift), point)
 
 
-@pytest.mark.hard_cases
 @pytest.mark.slow
 def test_the_elastic_gradient_of_a_translating_warp_survives_float32():
     """Through warp, Jacobian and energy; officially 80 % wrong in the turn."""
@@ -150,7 +159,6 @@ axioms = settings(max_examples=40, deadline=None, derandomize=True, database=Non
 
 
 @pytest.mark.slow
-@pytest.mark.hard_cases
 @pytest.mark.parametrize("kind", ["float32", "float64"])
 @axioms
 @given(stretch=triples, one=triples, other=triples)
@@ -179,7 +187,6 @@ def test_turning_before_or_after_costs_nothing(kind, stretch, one, other):
         assert abs(rest) < {"float32": 2e-5, "float64": 4e-14}[kind], name
 
 
-@pytest.mark.hard_cases
 @pytest.mark.parametrize("name", ["log_energy", "signed_log_energy"])
 @pytest.mark.parametrize("stretch", [0, 1e-5, 1e-3, 9e-3])
 def test_a_collapsed_direction_is_pulled_open(name, stretch, dtype):

@@ -13,14 +13,24 @@ from nerfies_jax.measure import geometry_quality, image_quality
 from nerfies_jax.training import losses
 from tests.experiments.hard_cases import checks
 
+pytestmark = pytest.mark.hard_cases
+
+
+def test_values_are_held():
+    checks.hold_values(CASES)
+
 
 @checks.by_case(CASES)
 def test_held(case, dtype):
     checks.hold(case, dtype)
 
 
-@pytest.mark.hard_cases
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+@pytest.mark.full
+def test_one_alone_is_held():
+    checks.hold_alone(CASES)
+
+
+@checks.each(CASES)
 def test_the_textbook_form_is_caught(case):
     checks.catches_the_textbook(case)
 
@@ -80,7 +90,7 @@ def measured():
     return tuple(every_measure(*both, mask) for both in (half, mixed, wide))
 
 
-@pytest.mark.hard_cases
+@pytest.mark.full
 @pytest.mark.parametrize("name", LOSSES)
 def test_losses_of_bfloat16_pictures_are_those_of_their_float32_copies(name):
     """Counted and summed as they are, a masked mean was 1.7 times too large."""
@@ -96,7 +106,7 @@ def test_losses_of_bfloat16_pictures_are_those_of_their_float32_copies(name):
     np.testing.assert_allclose(slope / size, expected_slope / size, atol=5e-3)
 
 
-@pytest.mark.hard_cases
+@pytest.mark.full
 @pytest.mark.parametrize("name", MEASURES)
 def test_measures_of_half_precision_pictures_are_those_of_float32(name):
     *found, expected = (values[name] for values in measured())
@@ -105,7 +115,7 @@ def test_measures_of_half_precision_pictures_are_those_of_float32(name):
         assert abs(value - expected) <= 1e-6 * abs(expected)
 
 
-@pytest.mark.hard_cases
+@pytest.mark.full
 def test_a_loss_of_float16_pictures_is_that_of_float32():
     half, wide, mask = pair("float16")
     loss = jax.jit(losses.l1)
@@ -115,7 +125,6 @@ def test_a_loss_of_float16_pictures_is_that_of_float32():
         assert abs(found - expected) <= 1e-6 * abs(expected)
 
 
-@pytest.mark.hard_cases
 def test_a_float16_picture_may_have_more_pixels_than_float16_counts():
     """70 000 pixels were infinitely many: a mean of 0, and 100 dB."""
     half = np.zeros((700, 100, 1), np.float16), np.ones((700, 100, 1), np.float16)
@@ -124,7 +133,7 @@ def test_a_float16_picture_may_have_more_pixels_than_float16_counts():
     assert jax.jit(image_quality.masked_psnr)(*half, mask) == 0
 
 
-@pytest.mark.hard_cases
+@pytest.mark.full
 @pytest.mark.parametrize("level", [0.5, 1000.0])
 def test_ssim_under_jit_is_about_one_level(level):
     """Contracted in one place and not in another, the mean of the target was two."""
@@ -151,7 +160,7 @@ def geometry_measures(found, truth, mask):
     )
 
 
-@pytest.mark.hard_cases
+@pytest.mark.full
 @pytest.mark.parametrize("kind", ["bfloat16", "float16"])
 def test_depths_flows_and_tracks_in_half_precision_are_counted(kind, rng):
     truth = rng.uniform(1, 5, 900)

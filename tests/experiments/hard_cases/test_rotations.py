@@ -23,13 +23,24 @@ LINEAR, POINT = rotations.LINEAR, rotations.POINT
 WXYZ = np.array([0.5, -0.5, 0.1, 0.7])
 
 
+pytestmark = pytest.mark.hard_cases
+
+
+def test_values_are_held():
+    checks.hold_values(CASES)
+
+
 @checks.by_case(CASES)
 def test_held(case, dtype):
     checks.hold(case, dtype)
 
 
-@pytest.mark.hard_cases
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+@pytest.mark.full
+def test_one_alone_is_held():
+    checks.hold_alone(CASES)
+
+
+@checks.each(CASES)
 def test_the_textbook_form_is_caught(case):
     checks.catches_the_textbook(case)
 
@@ -103,7 +114,7 @@ def joined(results):
     return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(results)])
 
 
-@pytest.mark.hard_cases
+@pytest.mark.full
 @pytest.mark.parametrize("kind", ["bfloat16", "float16"])
 @pytest.mark.parametrize("name", EVERY)
 def test_half_precision_is_rounded_once(name, kind):
@@ -116,7 +127,7 @@ def test_half_precision_is_rounded_once(name, kind):
     assert np.all(off <= 1.001 * half_ulp * np.abs(exact) + 6e-8)
 
 
-@pytest.mark.hard_cases
+@pytest.mark.full
 def test_slopes_in_half_precision_are_rounded_once():
     """At zero and at 1e-3 rad, where 1 - cos θ of bfloat16 is zero."""
     slope = jax.jit(jax.jacrev(lie.displacement))
@@ -128,7 +139,7 @@ def test_slopes_in_half_precision_are_rounded_once():
         assert np.all(off <= 2.0**-8 * np.abs(exact) + 1e-6)
 
 
-@pytest.mark.hard_cases
+@pytest.mark.full
 def test_a_float32_point_moved_by_a_bfloat16_screw_stays_float32():
     screw = [x.astype(jnp.bfloat16) for x in (0.3 * rotations.AXIS, LINEAR)]
     point = POINT.astype(np.float32)
@@ -139,7 +150,7 @@ def test_a_float32_point_moved_by_a_bfloat16_screw_stays_float32():
     assert np.array_equal(moved, wide)
 
 
-@pytest.mark.hard_cases
+@pytest.mark.full
 @pytest.mark.parametrize("name", EVERY)
 def test_float32_stays_float32_with_x64_on_and_every_way_of_calling_agrees(name):
     """Constants made under x64 would turn float32 arguments into float64."""
@@ -163,7 +174,6 @@ def beside_the_switch(dtype):
     return hard_case.evaluate(_every_degree, np.array([[below], [above]]), dtype, 3)
 
 
-@pytest.mark.hard_cases
 @pytest.mark.parametrize("order", [0, 1, 2])
 @pytest.mark.parametrize("degree", range(6))
 def test_stumpff_functions_are_continuous_across_their_switch(degree, order, dtype):
@@ -173,7 +183,6 @@ def test_stumpff_functions_are_continuous_across_their_switch(degree, order, dty
     assert abs(values[1] - values[0]) < 4 * np.finfo(dtype).eps / (1 + order)
 
 
-@pytest.mark.hard_cases
 def test_quaternion_logarithm_is_continuous_across_its_switch(dtype):
     """Scalar and vector just on either side of tan²(θ/2) = 0.04."""
     half = np.arctan(quaternion.SERIES_BELOW**0.5)
@@ -216,7 +225,6 @@ def of_any_length(dtype):
     return hard_case.evaluate(_of_any_length, given, dtype, 3)
 
 
-@pytest.mark.hard_cases
 @pytest.mark.parametrize("name", OF_ANY_LENGTH)
 def test_any_length_has_finite_value_slope_and_curvature(name, dtype):
     """A curvature through |q|³ is NaN from 1e-13 down; an unscaled log at 1e-19."""
@@ -236,7 +244,6 @@ def test_any_length_has_finite_value_slope_and_curvature(name, dtype):
     )
 
 
-@pytest.mark.hard_cases
 def test_lengths_at_the_edge_of_the_range_are_told_apart(dtype):
     """The least normal number is normalised, its neighbour below is the identity."""
     edge = np.finfo(dtype).tiny
@@ -257,7 +264,6 @@ def with_a_residual(own, residual, angular):
     return total(residual), jax.jacrev(total)(residual), turned
 
 
-@pytest.mark.hard_cases
 @pytest.mark.parametrize("rest", [1e-1, 1e-3, 1e-6, 0])
 def test_a_residual_that_nearly_cancels_its_quaternion_gives_a_rotation(rest, dtype):
     """q + dq of length `rest`: rounding decides which, its slope is at most 1/rest.
@@ -279,7 +285,7 @@ def test_a_residual_that_nearly_cancels_its_quaternion_gives_a_rotation(rest, dt
     assert abs(np.linalg.norm(turned) - 1) < TIGHT[dtype]
 
 
-@pytest.mark.hard_cases
+@pytest.mark.full
 def test_ten_thousand_compositions_stay_a_rotation(dtype):
     """Matrices drift from orthogonality and quaternions from length one: 1e-3."""
     turn = np.array([0.01, -0.02, 0.015], dtype)
@@ -335,7 +341,7 @@ def _group(one, two, three, linear, point):
     }
 
 
-@pytest.mark.hard_cases
+@pytest.mark.full
 @both
 @axioms
 @given(one=triples, two=triples, three=triples, linear=triples, point=triples)
