@@ -94,6 +94,7 @@ def test_the_curve_is_that_of_the_closed_form():
         assert by["cubic", knots].psnr > point.psnr > nothing.psnr
 
 
+@pytest.mark.full
 def test_a_motion_that_is_none_is_refused():
     motion = swinging()
     still = motion._replace(deform=lambda time: motion.deform(jnp.zeros(())))

@@ -186,6 +186,7 @@ def test_help_names_the_presets(capsys):
             assert preset.removesuffix("-small") in page
 
 
+@pytest.mark.full
 def test_effects_auto_takes_the_advice_and_the_users_word_comes_last(
     tmp_path, monkeypatch, capsys
 ):

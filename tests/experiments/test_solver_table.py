@@ -1,5 +1,6 @@
 import json
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -77,7 +78,12 @@ def test_the_pose_found_leaves_the_noise_alone():
 
 def test_a_screw_between_cameras_is_that_which_moved_one():
     camera = problems.looking_down_z()
-    screw = jnp.asarray([0.3, -0.2, 0.1, 0.5, -0.4, 0.2])
-    moved = move_camera(camera, screw[:3], screw[3:])
-    found = problems.screw_between(camera, moved)
+    screw = np.float32([0.3, -0.2, 0.1, 0.5, -0.4, 0.2])
+
+    @jax.jit
+    def there_and_back(camera, screw):
+        moved = move_camera(camera, screw[:3], screw[3:])
+        return problems.screw_between(camera, moved)
+
+    found = there_and_back(camera, screw)
     np.testing.assert_allclose(found, screw, atol=1e-6)
