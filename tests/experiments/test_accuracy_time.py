@@ -1,6 +1,5 @@
 """Settings under one clock: which there are, what is said of them, a tiny run of it."""
 
-import dataclasses
 import json
 import math
 import pathlib
@@ -34,14 +33,6 @@ def test_a_setting_that_stands_on_two_axes_is_the_same_on_both():
             assert seen.setdefault(name, arm) == arm
             assert "/" not in name  # it is part of a file's name
     assert seen == SETTINGS.arms
-
-
-def test_a_share_stretches_every_preset_by_itself():
-    args = Ablate(suite="settings", share=0.1)
-    job = types.SimpleNamespace(suite=SETTINGS, args=args)
-    spec = Job.spec(job, "splats-deformable-small", None)
-    assert spec.steps == 300
-    assert spec.motion.warm_up == 60
 
 
 def row(**values):
@@ -86,16 +77,6 @@ def test_the_front_is_what_nothing_beats_in_both():
     }
     found = report.front(means, "psnr", "train_cpu_seconds")
     assert found == ["cheap", "slow and good"]
-
-
-def test_less_error_is_better_on_a_front():
-    means = {
-        "near": row(render_ms=5.0, track_error=0.01),
-        "far": row(render_ms=1.0, track_error=0.03),
-        "farther": row(render_ms=2.0, track_error=0.04),
-    }
-    found = report.front(means, "track_error", "render_ms")
-    assert found == ["far", "near"]
 
 
 def test_a_line_says_what_changed_against_the_base_and_what_it_costs():
@@ -149,9 +130,3 @@ def test_a_tiny_plan_runs_resumes_and_is_held_against_itself(tmp_path, capfd):
     assert stop.value.code == 1
     assert "worse: nerfies-small.psnr" in capfd.readouterr().out
     assert before == {path: path.stat().st_mtime for path in out.glob("*-0.json")}
-
-
-def test_bases_are_trained_first():
-    args = dataclasses.replace(accuracy_time.AccuracyTime(), axes=("harmonics", "warp"))
-    assert args.arms[:2] == ("splats-deformable-small", "nerfies-small")
-    assert len(args.arms) == len(set(args.arms))

@@ -90,23 +90,6 @@ def test_the_sentences_follow_from_the_numbers():
     assert lines[2].split()[2:5] == ["22.00", "0.95", "+1.00"]
 
 
-def test_the_picture_has_coarse_and_fine_parts():
-    image = frequency_gates.picture(64)
-    assert image.shape == (64, 64, 3)
-    assert image.dtype == np.float32
-    assert image.min() >= 0
-    assert image.max() <= 1
-    spectrum = np.abs(np.fft.fft2(image.mean(-1) - image.mean()))[:32, :32] ** 2
-    coarse = spectrum[:6, :6].sum() / spectrum.sum()
-    assert 0.3 < coarse < 0.95
-
-
-@pytest.mark.full
-def test_the_figure_is_drawn(tmp_path):
-    frequency_gates.draw_figure(planted(), tmp_path / "gates.png")
-    assert (tmp_path / "gates.png").stat().st_size > 10_000
-
-
 @pytest.mark.slow
 def test_the_command_writes_what_it_prints(tmp_path, capsys):
     sizes = "--steps 10 --seeds 2 --most 0.5 --pixels 8 --width 4 --bands 2"

@@ -8,7 +8,7 @@ import pytest
 from experiments.hard_cases import __main__ as hard_cases
 from experiments.hard_cases import case as hard_case
 from experiments.hard_cases import report
-from experiments.hard_cases.__main__ import ROOMS, CaseResult, Outcome
+from experiments.hard_cases.__main__ import ROOMS
 
 PAGE = f"before\n{report.BEGIN}\nold\n{report.END}\nbehind\n"
 
@@ -60,18 +60,3 @@ def test_the_truth_of_a_derivative_is_that_of_the_closed_form():
     np.testing.assert_allclose(
         hard_case.truth(case, row, 2), [[[[60.0, 12.0], [12.0, 0.0]]]]
     )
-
-
-def test_a_number_names_what_is_not_finite_and_the_worst_else():
-    assert report.number([0.0]) == "0"
-    assert report.number([1e-7, 3e-7]) == "3e-07"
-    assert report.number([np.inf, 0.3]) == "not finite, 3e-01"
-    assert report.number([np.inf]) == "not finite"
-
-
-def test_what_cannot_be_timed_side_by_side_is_not():
-    case = ROOMS["encodings"][0][0]._replace(alike=False)
-    outcome = Outcome((np.zeros(1),), (np.ones(1),))
-    row = CaseResult(case, "a test", {"float32": outcome}, np.nan, np.nan)
-    assert "not comparable" in report.table([row])
-    assert report.summary([row]).endswith("derivative.")

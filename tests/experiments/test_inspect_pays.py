@@ -177,18 +177,6 @@ def test_what_differs_is_trained_once_and_kept(film, tmp_path, looked, capsys):
     assert "was read otherwise" in capsys.readouterr().err
 
 
-def test_where_the_advice_is_the_preset_nothing_is_trained(film, tmp_path, looked):
-    args = inspect_pays.InspectPays(
-        presets=("splats-static-small",), out=tmp_path, heldout="3"
-    )
-    trial = Trial(args, *read(args, film))
-    assert trial.run() == []
-    assert looked == ["look"]
-    (one,) = trial.rows()
-    assert one.same
-    assert one.advised == "splats-static-small"
-
-
 def test_a_preset_that_needs_what_is_not_there_is_left_out(
     tmp_path, looked, monkeypatch
 ):

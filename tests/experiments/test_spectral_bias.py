@@ -127,20 +127,6 @@ def test_training_is_adam_along_a_cosine_from_points_of_its_own():
 
 
 @pytest.mark.full
-def test_one_known_point_is_learnt_and_nothing_else():
-    made = spectral_bias.network("relu", False, SMALL)
-    train = jax.jit(spectral_bias.trainer(made, SMALL, 4, points=1))
-    with jax.numpy_dtype_promotion("standard"):
-        keys = jax.random.split(jax.random.key(0), 1)
-        params, loss = train(keys, jnp.array([1e-2]), jnp.asarray(2000))
-    assert float(loss[0]) < 1e-6
-    rmse, _ = spectral_bias.errors(
-        lambda x: made.apply(jax.tree.map(lambda leaf: leaf[0], params), x), SMALL
-    )
-    assert float(rmse) > 0.3
-
-
-@pytest.mark.full
 def test_the_rate_is_the_best_one_and_time_is_shared_out(monkeypatch):
     monkeypatch.setitem(spectral_bias.SIGNALS, "1-D", SMALL)
     args = SpectralBias(steps=80, seeds=2, rates=(1e-7, 1e-2), batch=16)
@@ -189,19 +175,6 @@ def test_the_sentences_follow_from_the_numbers():
     text = report.said(planted(0.6, 0.3))
     assert "(relu + encoding): worse" in text
     assert "(sine): worse" in text
-
-
-@pytest.mark.full
-def test_the_table_and_the_figure_show_every_network(tmp_path):
-    waves = {"2-D": np.array([[1.0, 1.0], [3.0, -2.0]])}
-    text = report.tables(planted(0.1, 0.3), waves)
-    assert text.count("k=3,-2") == 2
-    line = next(x for x in text.splitlines() if x.startswith("relu + encoding"))
-    assert line.split()[3:] == [
-        *("100", "0.01", "10", "1.00", "0.3000", "0.0000", "0.2000", "0.3000", "0.1275")
-    ]  # the last: sqrt(0.09 - 0.025) of the first seed, nothing of the second
-    report.draw_figure(planted(0.1, 0.3), waves, tmp_path / "bias.png")
-    assert (tmp_path / "bias.png").stat().st_size > 10_000
 
 
 @pytest.mark.slow

@@ -1,7 +1,5 @@
 """Rotations and screws at their hard points."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -84,30 +82,11 @@ def every(inputs):
     return {name: EVERY[name][0](*args) for name, args in inputs.items()}
 
 
-every_row = jax.jit(jax.vmap(every))
-
-
 def inputs_of(kind):
     return {
         name: tuple(np.asarray(arg).astype(jnp.dtype(kind)) for arg in args)
         for name, (_, args) in EVERY.items()
     }
-
-
-@functools.cache
-def in_half_and_float32(kind):
-    half = inputs_of(kind)
-    return every(half), every(jax.tree.map(lambda x: x.astype(np.float32), half))
-
-
-@functools.cache
-def with_x64_on():
-    """At once, and as the second of two rows."""
-    inputs = inputs_of("float32")
-    with jax.enable_x64(True):
-        return every(inputs), every_row(
-            jax.tree.map(lambda x: np.stack([x, x]), inputs)
-        )
 
 
 def joined(results):
@@ -116,27 +95,18 @@ def joined(results):
 
 @pytest.mark.full
 @pytest.mark.parametrize("kind", ["bfloat16", "float16"])
-@pytest.mark.parametrize("name", EVERY)
-def test_half_precision_is_rounded_once(name, kind):
+def test_half_precision_is_rounded_once(kind):
     """Computed in float32 from the same inputs; in bfloat16 a screw is 3e-2 off."""
-    found, exact = (results[name] for results in in_half_and_float32(kind))
-    assert all(leaf.dtype == kind for leaf in jax.tree.leaves(found))
-    half_ulp, exact = float(jnp.finfo(kind).eps) / 2, joined(exact)
-    off = np.abs(joined(found).astype(np.float32) - exact)
-    # float16's smallest numbers are 6e-8 apart
-    assert np.all(off <= 1.001 * half_ulp * np.abs(exact) + 6e-8)
-
-
-@pytest.mark.full
-def test_slopes_in_half_precision_are_rounded_once():
-    """At zero and at 1e-3 rad, where 1 - cos θ of bfloat16 is zero."""
-    slope = jax.jit(jax.jacrev(lie.displacement))
-    for angle in (0.0, 1e-3, 0.3):
-        args = (angle * rotations.AXIS, LINEAR, POINT)
-        halves = [arg.astype(jnp.bfloat16) for arg in args]
-        exact = np.asarray(slope(*(half.astype(np.float32) for half in halves)))
-        off = np.abs(np.asarray(slope(*halves)).astype(np.float32) - exact)
-        assert np.all(off <= 2.0**-8 * np.abs(exact) + 1e-6)
+    half = inputs_of(kind)
+    found = every(half)
+    exact = every(jax.tree.map(lambda x: x.astype(np.float32), half))
+    half_ulp = float(jnp.finfo(kind).eps) / 2
+    for name, results in found.items():
+        assert all(leaf.dtype == kind for leaf in jax.tree.leaves(results)), name
+        expected = joined(exact[name])
+        off = np.abs(joined(results).astype(np.float32) - expected)
+        # float16's smallest numbers are 6e-8 apart
+        assert np.all(off <= 1.001 * half_ulp * np.abs(expected) + 6e-8), name
 
 
 @pytest.mark.full
@@ -151,36 +121,36 @@ def test_a_float32_point_moved_by_a_bfloat16_screw_stays_float32():
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("name", EVERY)
-def test_float32_stays_float32_with_x64_on_and_every_way_of_calling_agrees(name):
+def test_float32_stays_float32_with_x64_on_and_every_way_of_calling_agrees():
     """Constants made under x64 would turn float32 arguments into float64."""
-    eager = EVERY[name][0](*(jnp.asarray(arg) for arg in inputs_of("float32")[name]))
-    wide, rows = (results[name] for results in with_x64_on())
-    assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves((wide, rows)))
-    rows = jax.tree.map(lambda leaf: np.asarray(leaf)[1], rows)
-    for other in (wide, rows):
-        np.testing.assert_allclose(joined(other), joined(eager), atol=4e-7)
+    inputs = inputs_of("float32")
+    with jax.enable_x64(True):
+        wide = every(inputs)
+        rows = jax.jit(jax.vmap(every))(
+            jax.tree.map(lambda x: np.stack([x, x]), inputs)
+        )
+    for name, (function, _) in EVERY.items():
+        eager = joined(function(*map(jnp.asarray, inputs[name])))
+        row = jax.tree.map(lambda leaf: np.asarray(leaf)[1], rows[name])
+        for other in (wide[name], row):
+            other = joined(other)
+            assert other.dtype == np.float32, name
+            np.testing.assert_allclose(other, eager, atol=4e-7, err_msg=name)
 
 
 def _every_degree(x):
     return jnp.stack([stumpff(degree, x[0]) for degree in range(6)])
 
 
-@functools.cache
-def beside_the_switch(dtype):
-    """Value, slope and curvature of all degrees: [2, 6, ...], below and at it."""
+def test_stumpff_functions_are_continuous_across_their_switch(dtype):
+    """Neighbouring numbers, one by the series and one by the closed form."""
     above = np.asarray(SERIES_BELOW, dtype)
     below = np.nextafter(above, np.asarray(0, dtype))
-    return hard_case.evaluate(_every_degree, np.array([[below], [above]]), dtype, 3)
-
-
-@pytest.mark.parametrize("order", [0, 1, 2])
-@pytest.mark.parametrize("degree", range(6))
-def test_stumpff_functions_are_continuous_across_their_switch(degree, order, dtype):
-    """Neighbouring numbers, one by the series and one by the closed form."""
-    values = beside_the_switch(dtype)[order][:, degree]
-    # c_k(9) are 0.05 to 1; sin and cos of √9 carry an ulp of one
-    assert abs(values[1] - values[0]) < 4 * np.finfo(dtype).eps / (1 + order)
+    ends = np.array([[below], [above]])
+    for order, values in enumerate(hard_case.evaluate(_every_degree, ends, dtype, 3)):
+        # c_k(9) are 0.05 to 1; sin and cos of √9 carry an ulp of one
+        off = np.max(abs(values[1] - values[0]))
+        assert off < 4 * np.finfo(dtype).eps / (1 + order)
 
 
 def test_quaternion_logarithm_is_continuous_across_its_switch(dtype):
@@ -209,28 +179,11 @@ def _of_any_length(q):
     )
 
 
-OF_ANY_LENGTH = {
-    "normalise": slice(4),
-    "to_matrix": slice(4, 13),
-    "log": slice(13, 16),
-    "rotate": slice(16, 19),
-}
-
-
-@functools.cache
-def of_any_length(dtype):
-    """Value, slope and curvature, [LENGTHS and one, 19, ...]; the last: identity."""
+def test_any_length_has_finite_value_slope_and_curvature(dtype):
+    """A curvature through |q|³ is NaN from 1e-13 down; an unscaled log at 1e-19."""
     given = np.array(LENGTHS)[:, None] * WXYZ / np.linalg.norm(WXYZ)
     given = np.concatenate([given, [[1, 0, 0, 0]]])
-    return hard_case.evaluate(_of_any_length, given, dtype, 3)
-
-
-@pytest.mark.parametrize("name", OF_ANY_LENGTH)
-def test_any_length_has_finite_value_slope_and_curvature(name, dtype):
-    """A curvature through |q|³ is NaN from 1e-13 down; an unscaled log at 1e-19."""
-    value, slope, curvature = (
-        found[:, OF_ANY_LENGTH[name]] for found in of_any_length(dtype)
-    )
+    value, slope, curvature = hard_case.evaluate(_of_any_length, given, dtype, 3)
     usual, none = value[LENGTHS.index(1e15)], value[-1]
     for length, row in zip(LENGTHS, value, strict=False):
         # float32 flushes 1e-38 to zero, which is no rotation
@@ -238,10 +191,9 @@ def test_any_length_has_finite_value_slope_and_curvature(name, dtype):
         assert np.max(abs(row - expected)) < TIGHT[dtype]
     assert np.all(np.isfinite(slope))
     # it is 1 / length², which float32 cannot hold from 1e-19 down
-    held = [length == 0 or length >= 1e-18 for length in LENGTHS]
-    assert np.all(
-        np.isfinite(curvature[:-1] if dtype == "float64" else curvature[:-1][held])
-    )
+    least = 0 if dtype == "float64" else 1e-18
+    held = [length == 0 or length >= least for length in LENGTHS]
+    assert np.all(np.isfinite(curvature[:-1][held]))
 
 
 def test_lengths_at_the_edge_of_the_range_are_told_apart(dtype):
