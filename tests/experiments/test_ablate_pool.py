@@ -106,14 +106,6 @@ def test_an_arm_that_fails_is_named_and_the_others_go_on(tmp_path, capsys):
 
 
 @pytest.mark.full
-def test_after_the_budget_nothing_is_begun(tmp_path):
-    job = Job(tmp_path, ["a", "b"], 1, seconds=1.0, jobs=1, budget=1.5)
-    assert pool.run(job) == []
-    assert job.is_finished("a", 0)
-    assert not (tmp_path / "b-0.begun").exists()
-
-
-@pytest.mark.full
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (15, 143)])
 def test_a_signal_ends_every_process(tmp_path, monkeypatch, number, code):
     job = Job(tmp_path, ["a", "b"], 1, seconds=60.0, jobs=2)

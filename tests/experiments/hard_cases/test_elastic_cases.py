@@ -47,12 +47,6 @@ def test_the_textbook_form_is_caught(case):
     checks.catches_the_textbook(case)
 
 
-def neighbours(edge, dtype):
-    """Two adjacent numbers, the lower one below `edge`."""
-    above = np.asarray(edge, dtype)
-    return np.stack([np.nextafter(above, np.asarray(0, dtype)), above])
-
-
 @jax.jit
 @jax.vmap
 def every_way(matrix):
