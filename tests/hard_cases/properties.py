@@ -112,9 +112,6 @@ def many(shape, low: float, high: float):
     )
 
 
-def rounded(vector):
-    """No entry so small that scaling takes it out of the range of floats."""
-    return np.round(vector, 4)
 
 
 def magnitudes(low: float = 1e-30, high: float = 1.0):

@@ -1,4 +1,4 @@
-"""Boxes, weights and samples along a ray: what they keep and cannot depend on.
+"""Weights and samples along a ray: what they keep and cannot depend on.
 
 Bounds count roundings. A weight is the exponential of a sum of n depths, each rounded,
 times a number below one: the derivative of exp(-x) is nowhere more than 1 / x, so a
@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nerfies_jax.geometry import rays
 from nerfies_jax.radiance import compositing, sampling
 from tests.hard_cases import properties
 from tests.hard_cases.properties import cast, close, compiled, eps, same
@@ -19,38 +18,6 @@ from tests.hard_cases.properties import cast, close, compiled, eps, same
 pytestmark = [pytest.mark.hard_cases, pytest.mark.full]
 SAMPLES = 8
 DEPTHS, DISTANCES = properties.optical_depths(), properties.distances()
-
-
-span = compiled(rays.box_span)
-
-
-@given(
-    origin=properties.many(3, -3, 3).map(properties.rounded),
-    direction=properties.directions().map(properties.rounded),
-    corner=properties.many(3, -1, 0).map(properties.rounded),
-    size=properties.many(3, 0, 2).map(properties.rounded),
-    factor=st.sampled_from([2.0**-8, 0.5, 4.0]),
-)
-def test_a_box_is_met_in_order_and_scales_with_the_world(
-    origin, direction, corner, size, factor, dtype
-):
-    """Both ends are on the box's surface, or the ray starts inside, or it misses."""
-    low, high = corner, corner + size
-    origin, direction, low, high = cast(dtype, origin, direction, low, high)
-    enter, leave = span(origin, direction, low, high)
-    same(
-        span(origin * factor, direction, low * factor, high * factor),
-        (enter * factor, leave * factor),
-    )
-    assert enter >= 0
-    assert not np.isnan(leave)
-    if enter < leave:
-        for distance in (enter, leave):
-            point = np.asarray(origin + distance * direction, np.float64)
-            # the distance is off by eps of itself
-            slack = 8 * eps(dtype) * (8 + float(distance))
-            assert np.all(point >= np.asarray(low) - slack)
-            assert np.all(point <= np.asarray(high) + slack)
 
 
 weights = compiled(compositing.weights)
@@ -74,13 +41,6 @@ def test_weights_are_shares_of_the_light(depth, empty, dtype):
     close(np.delete(among, empty)[:SAMPLES], found, SUM * eps(dtype))
     same(np.delete(among, empty)[SAMPLES:], np.zeros(SAMPLES - 1))
     assert among[empty] == 0
-
-
-@compiled
-def seen(depth, colours, distances, background):
-    return compositing.composite(
-        compositing.weights(depth), colours, distances, background
-    )
 
 
 stratified = compiled(sampling.stratified, static_argnums=(3, 4))

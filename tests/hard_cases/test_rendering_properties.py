@@ -19,7 +19,6 @@ from hypothesis import strategies as st
 
 from gaussians_jax import rendering
 from gaussians_jax.raster_spec import RasterSpec
-from gaussians_jax.splats import Gaussians
 from tests.hard_cases import properties
 from tests.hard_cases.properties import (
     GAUSSIANS,
@@ -150,44 +149,6 @@ def test_what_is_out_of_sight_is_as_if_absent_and_has_no_slope(
     for leaf in jax.tree.leaves(gradient[:2]):
         same(leaf[row], np.zeros_like(leaf[row]))
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(gradient))
-
-
-@given(
-    depth=properties.many(GAUSSIANS, 1, 5),
-    opacity=properties.many(GAUSSIANS, 0.01, 0.98),
-    colours=COLOURS,
-    camera=CAMERA,
-    row=st.integers(0, GAUSSIANS - 2),
-)
-def test_one_gaussian_is_two_in_one_place_of_root_transparency(
-    depth, opacity, colours, camera, row, dtype
-):
-    """Where its Gaussian is one: in fog, wider than any picture.
-
-    Elsewhere it is not, by design: two of opacity h leave (1 - h g)² where one leaves
-    1 - (2 h - h²) g.
-    """
-    depth = np.sort(depth) + 0.1 * np.arange(GAUSSIANS)
-    fog = Gaussians(
-        mean=depth[:, None] * [0, 0, 1],
-        quaternion=np.tile([1.0, 0, 0, 0], (GAUSSIANS, 1)),
-        scale=np.full((GAUSSIANS, 3), 1e10),
-        opacity=opacity,
-    )
-    last = GAUSSIANS - 1
-    half = -np.expm1(np.log1p(-opacity[row]) / 2)
-    one = replaced(fog, last, mean=fog.mean[row], opacity=0)
-    two = replaced(replaced(one, row, opacity=half), last, opacity=half)
-    colours[last] = colours[row]
-    here = smooth(*cast(dtype, one, colours, camera))
-    there = smooth(*cast(dtype, two, colours, camera))
-    # Depths reach 6. Compositing by hand, with g = 1, gives the same picture.
-    for found, expected in zip(there, here, strict=True):
-        close(found, expected, 6 * 2 * GAUSSIANS * eps(dtype))
-    opacity = one.opacity.copy()
-    before = np.concatenate([[1], np.cumprod(1 - opacity)[:-1]])
-    exact = (before * opacity) @ colours
-    close(here[0], np.broadcast_to(exact, here[0].shape), 4 * GAUSSIANS * eps(dtype))
 
 
 @in_float32
