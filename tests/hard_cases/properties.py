@@ -112,8 +112,6 @@ def many(shape, low: float, high: float):
     )
 
 
-
-
 def magnitudes(low: float = 1e-30, high: float = 1.0):
     """Zero, or evenly in the logarithm."""
     spread = numbers(math.log10(low), math.log10(high)).map(lambda e: 10.0**e)

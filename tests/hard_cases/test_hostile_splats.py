@@ -1,4 +1,4 @@
-"""Whole steps of every preset of Gaussians, from starts that nobody would choose."""
+"""Whole steps of Gaussians, still and moving, from starts that nobody would choose."""
 
 import dataclasses
 import functools
@@ -23,7 +23,6 @@ pytestmark = [pytest.mark.hard_cases, pytest.mark.full]
 STEPS = 200
 TINY = {
     "splats-static": scenes.TINY_SPLATS,
-    "splats-deformable": scenes.TINY_DEFORMABLE,
     "sonata": scenes.TINY_SONATA,
     "moba": scenes.TINY_MOBA,
 }

@@ -22,8 +22,9 @@ from nerfies_jax.training.model import Frames, Model, Rendering, TrainState
 from tests import scenes
 from tests.hard_cases import hostile
 
-# NeRF is a part of NeRF-W; T-NeRF's time is one more input of a network, as NSFF's.
-PAPERS = ("nerf-w", "d-nerf", "nerfies", "hypernerf", "nsff")
+# NeRF is a part of NeRF-W, and T-NeRF's time is one more input of a network, as NSFF's
+# and HyperNeRF's ambient coordinates.
+PAPERS = ("nerf-w", "d-nerf", "nerfies", "nsff")
 RENDERED = ("d-nerf",)  # its scenes are, before a plain background
 STEPS = 200
 PICTURE = (8, 6)
@@ -57,7 +58,6 @@ def tiny(name: str) -> RadianceScene:
         "warp": {"position": few, "time": few, "depth": 2, "width": 8, "skips": (1,)},
         "transient": {"depth": 1, "width": 8, "code_width": 4},
         "appearance": {"width": 4},
-        "ambient": {"depth": 2, "width": 8, "skips": (1,)},
         "time": {"encoding": few},
         "elastic": {"points": 2},
         "background": {"points": 16},
