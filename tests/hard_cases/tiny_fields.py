@@ -22,8 +22,8 @@ from nerfies_jax.training.model import Frames, Model, Rendering, TrainState
 from tests import scenes
 from tests.hard_cases import hostile
 
-# NeRF is a part of NeRF-W, and T-NeRF's time is one more input of a network, as NSFF's
-# and HyperNeRF's ambient coordinates.
+# Without NeRF, which is a part of NeRF-W, and T-NeRF and HyperNeRF, whose networks have
+# more inputs: a time, as NSFF's has, and ambient coordinates.
 PAPERS = ("nerf-w", "d-nerf", "nerfies", "nsff")
 RENDERED = ("d-nerf",)  # its scenes are, before a plain background
 STEPS = 200
