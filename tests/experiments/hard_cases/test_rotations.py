@@ -179,6 +179,7 @@ def _of_any_length(q):
     )
 
 
+@pytest.mark.full
 def test_any_length_has_finite_value_slope_and_curvature(dtype):
     """A curvature through |q|³ is NaN from 1e-13 down; an unscaled log at 1e-19."""
     given = np.array(LENGTHS)[:, None] * WXYZ / np.linalg.norm(WXYZ)
