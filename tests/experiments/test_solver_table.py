@@ -55,7 +55,7 @@ def test_held_out_pictures_are_not_among_the_known_ones():
     assert apart.min() > 0.05
 
 
-@pytest.mark.full
+@pytest.mark.slow
 def test_the_pose_found_leaves_the_noise_alone():
     task = problems.pose_problem(solver_table.Settings(frames=1))
     pixels = task.unseen[0]
