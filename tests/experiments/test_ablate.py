@@ -119,28 +119,6 @@ def run(*arguments):
     return stop.value.code
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["--arms", "nerfy"], "in --suite fields there are static, t-nerf"),
-        (["--suite", "moba", "--arms", "nerfies"], "there are full, no-basis"),
-        (["--seeds", "0"], "positive"),
-        (["--budget", "-1"], "positive"),
-        (["--seconds", "0"], "positive"),
-        (["--seed", "1", "--jobs", "2"], "one seed from 0 on"),
-        (["--scene", "moon"], "no such built-in scene"),
-        (["--arms", "static", "--set", "colour=red"], "no field 'colour'"),
-        (["--heldout", "8"], "is for captures"),
-        (["--arms", "static", "--seconds", "9", "--seed", "1"], "train it first"),
-    ],
-)
-def test_a_wrong_setting_is_one_line_and_exit_code_two(tiny, capsys, arguments, words):
-    assert run(*tiny, *arguments) == 2
-    error = capsys.readouterr().err.splitlines()
-    assert words in error[-1]
-    assert "Traceback" not in error
-
-
 def test_several_processes_do_not_share_an_accelerator(tiny, monkeypatch, capsys):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert run(*tiny, "--jobs", "2") == 2

@@ -20,6 +20,7 @@ def filmed():
     return capture, truth, protocol.ground_truth(capture, truth, 2, 5)
 
 
+@pytest.mark.full
 def test_the_picture_shows_how_far_points_are_from_where_they_should_be(filmed):
     capture, _, known = filmed
     shown = ablate_picture.shown_row(known, capture)
@@ -43,20 +44,3 @@ def test_the_picture_shows_how_far_points_are_from_where_they_should_be(filmed):
     near, far = apart(known.path + SHIFT), apart(known.path + 4 * SHIFT)
     assert 0 < near < far
     assert apart(None) == apart(np.repeat(known.path[:, 3:4], known.path.shape[1], 1))
-
-
-def test_a_real_capture_is_drawn_without_points(filmed):
-    capture, _, _ = filmed
-    known = protocol.held_out_only(capture, 2)
-    shown = ablate_picture.shown_row(known, capture)
-    row = known.rows[shown]
-    picture = ablate_picture.draw(
-        capture,
-        known,
-        dict.fromkeys("ab", capture.images[row]),
-        dict.fromkeys("ab", capture.depths[row]),
-        dict.fromkeys("ab"),
-        dict.fromkeys("ab", ""),
-        shown,
-    )
-    assert picture.shape[1] > 4 * ablate_picture.WIDTH

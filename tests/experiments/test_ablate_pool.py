@@ -71,6 +71,7 @@ def overlap(job, one, other):
     ) < job.time_of(*one, "ended")
 
 
+@pytest.mark.full
 def test_no_more_run_at_once_than_asked_for_and_what_is_there_is_left(tmp_path, capsys):
     job = Job(tmp_path, ["a", "b", "c"], 1, seconds=1.0, jobs=2)
     (tmp_path / "b-0.ended").write_text("0")
@@ -83,6 +84,7 @@ def test_no_more_run_at_once_than_asked_for_and_what_is_there_is_left(tmp_path, 
     assert (tmp_path / "logs" / "a-0.txt").read_text() == "about to work\n"
 
 
+@pytest.mark.full
 def test_over_seconds_later_seeds_wait_for_the_first_of_their_arm(tmp_path, capsys):
     job = Job(tmp_path, ["a", "bad"], 2, jobs=4)
     job.args = Ablate(jobs=4, seconds=1.0)
@@ -92,6 +94,7 @@ def test_over_seconds_later_seeds_wait_for_the_first_of_their_arm(tmp_path, caps
     assert "bad, seed 1: not begun, seed 0 failed" in error
 
 
+@pytest.mark.full
 def test_an_arm_that_fails_is_named_and_the_others_go_on(tmp_path, capsys):
     job = Job(tmp_path, ["bad", "a"], 2, jobs=2)
     assert sorted(pool.run(job)) == [("bad", 0), ("bad", 1)]
@@ -102,13 +105,7 @@ def test_an_arm_that_fails_is_named_and_the_others_go_on(tmp_path, capsys):
     assert "bad-1.txt ends with: no such luck" in error
 
 
-def test_after_the_budget_nothing_is_begun(tmp_path):
-    job = Job(tmp_path, ["a", "b"], 1, seconds=1.0, jobs=1, budget=1.5)
-    assert pool.run(job) == []
-    assert job.is_finished("a", 0)
-    assert not (tmp_path / "b-0.begun").exists()
-
-
+@pytest.mark.full
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (15, 143)])
 def test_a_signal_ends_every_process(tmp_path, monkeypatch, number, code):
     job = Job(tmp_path, ["a", "b"], 1, seconds=60.0, jobs=2)

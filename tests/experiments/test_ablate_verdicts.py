@@ -84,19 +84,6 @@ def test_columns_without_numbers_are_left_out_with_their_legend():
     assert "scikit-image" in legend
 
 
-def test_compiling_is_the_mean_of_the_seeds_that_did_it():
-    rows = [{"compile_seconds": x} for x in (30.0, math.nan, 34.0)]
-    np.testing.assert_array_equal(verdicts.values_of(rows, "compile_seconds"), [30, 34])
-    rows = [{"psnr": x} for x in (30.0, math.nan)]
-    assert np.isnan(verdicts.values_of(rows, "psnr").mean())
-
-
-def test_the_verdicts_say_how_many_show_by_chance():
-    numbers = numbers_of(nerfies=[0.01, 0.02], translation=[0.02, 0.04])
-    found = verdicts.verdicts(numbers, FIELDS.claims)
-    assert "Of 3 such lines, 0.2 would show" in verdicts.claims_text(found)
-
-
 @pytest.mark.parametrize("name", [*suites.KEPT, "advice"])
 def test_claims_are_about_arms_and_measures_that_there_are(name):
     suite = suites.named(name)

@@ -1,6 +1,5 @@
 """Settings under one clock: which there are, what is said of them, a tiny run of it."""
 
-import dataclasses
 import json
 import math
 import pathlib
@@ -34,14 +33,6 @@ def test_a_setting_that_stands_on_two_axes_is_the_same_on_both():
             assert seen.setdefault(name, arm) == arm
             assert "/" not in name  # it is part of a file's name
     assert seen == SETTINGS.arms
-
-
-def test_a_share_stretches_every_preset_by_itself():
-    args = Ablate(suite="settings", share=0.1)
-    job = types.SimpleNamespace(suite=SETTINGS, args=args)
-    spec = Job.spec(job, "splats-deformable-small", None)
-    assert spec.steps == 300
-    assert spec.motion.warm_up == 60
 
 
 def row(**values):
@@ -88,16 +79,6 @@ def test_the_front_is_what_nothing_beats_in_both():
     assert found == ["cheap", "slow and good"]
 
 
-def test_less_error_is_better_on_a_front():
-    means = {
-        "near": row(render_ms=5.0, track_error=0.01),
-        "far": row(render_ms=1.0, track_error=0.03),
-        "farther": row(render_ms=2.0, track_error=0.04),
-    }
-    found = report.front(means, "track_error", "render_ms")
-    assert found == ["far", "near"]
-
-
 def test_a_line_says_what_changed_against_the_base_and_what_it_costs():
     axis = Axis("", "base", {"base": None, "half": None})
     numbers = {}
@@ -120,22 +101,6 @@ def test_a_cost_may_grow_by_a_share_and_a_quality_by_a_number():
     assert not Metric("a", 460.0, "", "lower", measure.allowed(460.0)).holds(300.0)
     assert MEASURES["psnr"].allowed(30.0) == MEASURES["psnr"].tolerance
     assert measure.allowed(math.nan) == 0
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["--axes", "colour"], "choose from preset"),
-        (["--share", "0"], "--share 0"),
-        (["--check", "/nowhere.json"], "cannot be read"),
-        (["--jobs", "0"], "positive"),
-    ],
-)
-def test_wrong_input_is_refused(arguments, words, capsys):
-    with pytest.raises(SystemExit) as stop:
-        accuracy_time.main(arguments)
-    assert stop.value.code == 2
-    assert words in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -165,9 +130,3 @@ def test_a_tiny_plan_runs_resumes_and_is_held_against_itself(tmp_path, capfd):
     assert stop.value.code == 1
     assert "worse: nerfies-small.psnr" in capfd.readouterr().out
     assert before == {path: path.stat().st_mtime for path in out.glob("*-0.json")}
-
-
-def test_bases_are_trained_first():
-    args = dataclasses.replace(accuracy_time.AccuracyTime(), axes=("harmonics", "warp"))
-    assert args.arms[:2] == ("splats-deformable-small", "nerfies-small")
-    assert len(args.arms) == len(set(args.arms))

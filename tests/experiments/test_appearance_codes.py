@@ -79,10 +79,3 @@ def test_a_short_run_writes_figures_and_a_picture(scene, keys, tmp_path):
         assert f"| {name} | {value:.2f} |" in appearance_codes.page(record)
     with PIL.Image.open(out / "picture.png") as picture:
         assert min(picture.size) > 240
-
-
-def test_no_steps_are_refused(capsys):
-    with pytest.raises(SystemExit) as stop:
-        appearance_codes.main(["--steps", "0"])
-    assert stop.value.code == 2
-    assert "steps=0 must be at least 1" in capsys.readouterr().err

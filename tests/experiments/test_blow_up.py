@@ -14,7 +14,6 @@ from tests.hard_cases import hostile
 
 pytestmark = pytest.mark.slow
 
-SPLATS = ("densification=none", "sh_degree=0")
 FIELD = (
     "rays=16",
     "sampling.coarse=4",
@@ -27,54 +26,41 @@ FIELD = (
 )
 
 
-def reconstruct_at(tmp_path, capsys, preset, *settings):
-    """Exit code, what went to stderr, and the run folder."""
+def reconstruct_at(tmp_path, preset, *settings):
+    """The run folder, whose newest checkpoint is finite, and its steps."""
     filmed, folder = tmp_path / "filmed", tmp_path / "run"
     nerfies_format.write(scenes.tiny_capture(), filmed)
-    arguments = [filmed, "--preset", preset, "--steps", "6", "--out", folder]
+    words = f"{filmed} --preset {preset} --steps 6 --out {folder} --set".split()
     with pytest.raises(SystemExit) as stop:
-        reconstruct.main([*map(str, arguments), "--set", *settings])
-    return stop.value.code, capsys.readouterr(), folder
-
-
-def held(folder):
-    """The newest checkpoint is finite; returns its step."""
-    run = runs.saved_run(folder)
-    restored = runs.restore(folder, run)
+        reconstruct.main([*words, *settings])
+    assert stop.value.code == 1
+    restored = runs.restore(folder, runs.saved_run(folder))
     assert not hostile.not_finite(restored.state)
     assert restored.step == checkpoint.latest(folder / run_folder.CHECKPOINTS)
-    return restored.step
+    return folder, restored.step
 
 
 @pytest.mark.hard_cases
-def test_splats_that_blow_up_say_where_and_exit_with_one(tmp_path, capsys):
+def test_splats_that_blow_up_say_where_and_are_reported(tmp_path, capsys):
     # One update of an opacity by 3e38 stays in float32, the second does not.
-    code, printed, folder = reconstruct_at(
-        tmp_path,
-        capsys,
-        "splats-static-small",
-        "learning_rates.opacity_logit=3e38",
-        *SPLATS,
-    )
-    assert code == 1
+    rate = "learning_rates.opacity_logit=3e38"
+    quick = ("densification=none", "sh_degree=0")
+    folder, step = reconstruct_at(tmp_path, "splats-static-small", rate, *quick)
+    printed = capsys.readouterr()
     last = printed.err.splitlines()[-1]
     assert last.startswith("error: stopped at step ")
     assert "is not finite: params.rows.splats.opacity_logit (" in last
     assert "start anew with lower learning rates" in last
     assert "--resume" not in printed.out  # it would stop at the same step
-    assert (
-        held(folder) == json.loads((folder / "metrics.json").read_text())["train.steps"]
-    )
+    assert json.loads((folder / "metrics.json").read_text())["train.steps"] == step
     assert (folder / "report.html").is_file()
 
 
 def test_a_field_that_draws_no_numbers_leaves_no_report(tmp_path, capsys):
-    code, printed, folder = reconstruct_at(
-        tmp_path, capsys, "nerf-small", "learning_rate=1e38", *FIELD
-    )
-    assert code == 1
-    *_, drawn, last = printed.err.splitlines()
+    rate = "learning_rate=1e38"
+    folder, step = reconstruct_at(tmp_path, "nerf-small", rate, *FIELD)
+    assert step == 1
+    *_, drawn, last = capsys.readouterr().err.splitlines()
     assert drawn.startswith("error: no report: what the state of step 1 draws is not")
     assert last.startswith("error: stopped at step 1 of 6: step 2 is not finite: ")
-    assert held(folder) == 1
     assert not (folder / "report.html").exists()

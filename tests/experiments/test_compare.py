@@ -85,9 +85,3 @@ def test_what_cannot_be_compared_is_refused(damage, words, tmp_path, capsys):
     assert stop.value.code == 2
     assert words in capsys.readouterr().err
     assert not out.exists()
-
-
-def test_one_run_is_no_comparison(tmp_path, capsys):
-    with pytest.raises(SystemExit):
-        compare.main([str(tmp_path)])
-    assert "two or more" in capsys.readouterr().err

@@ -64,6 +64,7 @@ def swinging(count=30):
     return known_motion.Moving("swing", jax.jit(deform), jax.jit(draw), active)
 
 
+@pytest.mark.full
 def test_the_curve_is_that_of_the_closed_form():
     curve = knot_curve.curve(swinging(), (2, 5, 9), 0.0, 1)
     assert (curve.gaussians, curve.moving) == (29, 9)
@@ -93,6 +94,7 @@ def test_the_curve_is_that_of_the_closed_form():
         assert by["cubic", knots].psnr > point.psnr > nothing.psnr
 
 
+@pytest.mark.full
 def test_a_motion_that_is_none_is_refused():
     motion = swinging()
     still = motion._replace(deform=lambda time: motion.deform(jnp.zeros(())))
@@ -207,20 +209,3 @@ def test_the_job_prints_both_tables_and_saves_them(tmp_path, capsys, monkeypatch
     picture, _ = images.read_image(out.with_suffix(".png"))
     assert picture.shape[2] == 3
     assert np.ptp(picture) > 200
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("--gaussians 0", "--gaussians 0 must be at least 1"),
-        ("--still 1", "a share in [0, 1)"),
-        ("--knots 1 8", "at least 2"),
-        ("--static-threshold -1", "cannot be negative"),
-        ("--run nowhere", "no run here"),
-    ],
-)
-def test_what_cannot_be_is_refused(arguments, message, capsys):
-    with pytest.raises(SystemExit) as stopped:
-        deformation_cost.main(arguments.split())
-    assert stopped.value.code == 2
-    assert message in capsys.readouterr().err

@@ -3,7 +3,6 @@
 import json
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -18,8 +17,6 @@ from nerfies_jax.render_ray import Ray
 from nerfies_jax.training.effects import FrameCondition
 from tests import bare_scenes, scenes
 
-LEFT, RIGHT = jnp.ones((3, 4)), jnp.ones((4, 5))
-
 
 @pytest.mark.parametrize("name", ["nerf", "nerf-small", "d-nerf", "nsff"])
 def test_the_products_of_a_static_field_are_those_of_its_networks(name):
@@ -27,14 +24,15 @@ def test_the_products_of_a_static_field_are_those_of_its_networks(name):
     spec = effect_cost.without(preset, tuple(effect_cost.effects_in(preset)))
     metadata = scene.metadata_of(scenes.tiny_capture(), spec)
     made = scene.field(spec, metadata)
-    one, zero = jnp.ones(()), jnp.zeros(())
-    ray = Ray(jnp.zeros(3), jnp.asarray([0.0, 0.0, 1.0]), 0.5 * one, one)
-    condition = FrameCondition(zero, {}, jnp.int32(0))
+    forward, near, far = np.float32([0, 0, 1]), np.float32(0.5), np.float32(1)
+    ray = Ray(*jax.device_put((0 * forward, forward, near, far)))
+    condition = FrameCondition(near, {}, jax.device_put(np.int32(0)))
 
     def colours(params):
         return [level.colour for level in made.render_ray(params, ray, condition)]
 
-    found = matrix_flops.count(colours, made.init(jax.random.key(0)))
+    params = jax.eval_shape(lambda: made.init(jax.random.key(0)))
+    found = matrix_flops.count(colours, params)
     plan = spec.sampling
     expected = network_flops(spec.template, plan.coarse + plan.fine)
     if plan.fine:
@@ -82,27 +80,6 @@ def test_scenes_of_a_preset_stand_behind_those_they_are_compared_with():
             assert by_name.get("all", arms[-1].spec) == spec
 
 
-def test_elastic_alone_is_priced_over_the_warp_it_needs():
-    arms = {a.name: a for a in effect_cost.arms(field_presets.PRESETS["nerfies"])}
-    alone = arms["warp + elastic"]
-    assert alone.base == "only warp"
-    assert effect_cost.effects_in(alone.spec) == ["warp", "elastic"]
-    assert effect_cost.effects_in(arms["without warp"].spec) == ["appearance"]
-    assert effect_cost.effects_in(arms["without elastic"].spec) == [
-        "appearance",
-        "warp",
-        "background",
-    ]
-
-
-def test_a_preset_without_effects_is_refused():
-    with pytest.raises(ValueError, match=r"no effect to be priced.*nerfies-small"):
-        effect_cost.arms(field_presets.PRESETS["nerf"])
-    for wrong in ({"presets": ()}, {"at": 1.0}, {"repeats": 0}, {"rays": 0}):
-        with pytest.raises(ValueError, match=f"--{next(iter(wrong))}"):
-            EffectCost(**wrong)
-
-
 def row(name, base, seconds, flops=2e9):
     step = Priced(flops, 3e6, 4_000_000, 5e8, base is None, 1.5, seconds, 2 * seconds)
     loss = step._replace(seconds=seconds / 4)
@@ -131,17 +108,7 @@ def test_the_table_says_what_an_effect_adds_alone_and_beside_the_others():
     assert "loop's body counts once" in report.heading()
 
 
-def test_the_page_has_a_row_for_every_scene():
-    rows = {"nerfies-small": [*ROWS, row("warp + elastic", "only warp", 0.02)]}
-    metrics = {metric.key: metric for metric in report.metrics_of(rows)}
-    title, _, head, line, bare, alone, *_, both = report.page(metrics)
-    assert title == "### `nerfies-small`"
-    assert head.count("|") == line.count("|") == bare.count("|")
-    assert bare == "| bare | 1,234 | 2000 | 500 | 3 | 4 | 2 | 10 | 1.00 |"
-    assert alone == "| only warp | 1,234 | 2000 | 500 | 3 | 4 | 2 | 16 | 1.60 |"
-    assert both.startswith("| warp + elastic | ")
-
-
+@pytest.mark.full
 def test_what_became_dearer_than_its_tolerance_is_named(tmp_path):
     args = EffectCost(presets=("nerfies-small",))
     report.write(tmp_path, {"nerfies-small": ROWS}, args)
@@ -163,14 +130,6 @@ def test_what_became_dearer_than_its_tolerance_is_named(tmp_path):
     assert {line.split()[1].split(".")[-1] for line in worse} == {"over_bare"}
     with pytest.raises(ValueError, match=r"--check .*none.json"):
         baselines.read(tmp_path / "none.json", "effect_cost.json")
-
-
-def test_tolerances_are_those_of_the_value(tmp_path):
-    for metric in report.metrics_of({"nerfies-small": ROWS}):
-        assert metric.direction == "lower"
-        assert np.isfinite(metric.tolerance), metric
-        assert metric.holds(float(metric.value))
-        assert not metric.holds(metric.value / 2.01), metric.key
 
 
 @pytest.mark.slow

@@ -23,6 +23,7 @@ def test_descent_shuts_the_gates_and_ascent_opens_them():
     assert np.all(np.diff(rising.opening) > 0)
 
 
+@pytest.mark.full
 def test_every_arm_starts_from_the_same_networks_and_without_a_loss_has_no_gate():
     plain = frequency_gates.fit(NONE, TINY)
     fixed = frequency_gates.fit(GateSetting("fixed", 0.5), TINY)
@@ -87,37 +88,6 @@ def test_the_sentences_follow_from_the_numbers():
     lines = frequency_gates.table(rows).splitlines()
     assert len(lines) == 4
     assert lines[2].split()[2:5] == ["22.00", "0.95", "+1.00"]
-
-
-def test_the_picture_has_coarse_and_fine_parts():
-    image = frequency_gates.picture(64)
-    assert image.shape == (64, 64, 3)
-    assert image.dtype == np.float32
-    assert image.min() >= 0
-    assert image.max() <= 1
-    spectrum = np.abs(np.fft.fft2(image.mean(-1) - image.mean()))[:32, :32] ** 2
-    coarse = spectrum[:6, :6].sum() / spectrum.sum()
-    assert 0.3 < coarse < 0.95
-
-
-def test_the_figure_is_drawn(tmp_path):
-    frequency_gates.draw_figure(planted(), tmp_path / "gates.png")
-    assert (tmp_path / "gates.png").stat().st_size > 10_000
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("--steps 3", "--steps 3"),
-        ("--seeds 1", "--seeds 1"),
-        ("--most 0.1 0", "--most (0.1, 0.0)"),
-    ],
-)
-def test_impossible_settings_are_refused(arguments, message, capsys):
-    with pytest.raises(SystemExit) as stopped:
-        frequency_gates.main(arguments.split())
-    assert stopped.value.code == 2
-    assert message in capsys.readouterr().err
 
 
 @pytest.mark.slow

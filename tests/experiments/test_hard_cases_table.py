@@ -8,7 +8,7 @@ import pytest
 from experiments.hard_cases import __main__ as hard_cases
 from experiments.hard_cases import case as hard_case
 from experiments.hard_cases import report
-from experiments.hard_cases.__main__ import ROOMS, CaseResult, Outcome
+from experiments.hard_cases.__main__ import ROOMS
 
 PAGE = f"before\n{report.BEGIN}\nold\n{report.END}\nbehind\n"
 
@@ -22,6 +22,7 @@ def test_names_tell_all_cases_apart():
             assert {"float32", "float64"} <= set(case.bounds)
 
 
+@pytest.mark.full
 def test_the_command_measures_prints_draws_and_renews_the_page(tmp_path, capsys):
     page, out = tmp_path / "page.md", tmp_path / "out"
     page.write_text(PAGE)
@@ -42,22 +43,6 @@ def test_the_command_measures_prints_draws_and_renews_the_page(tmp_path, capsys)
     assert (out / "window-of-a-band-that-opens.png").stat().st_size > 5000
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--rooms", "kitchen"], "choose from rotations"),
-        (["--cases", "nothing"], "no such case; there are screw"),
-        (["--numbers", "0"], "at least 1"),
-        (["--document", "nowhere.md"], "no such file, or not both"),
-    ],
-)
-def test_wrong_input_is_refused(words, message, tmp_path, capsys):
-    with pytest.raises(SystemExit) as stop:
-        hard_cases.main([*words, "--out", str(tmp_path / "out")])
-    assert stop.value.code == 2
-    assert message in capsys.readouterr().err
-
-
 def test_errors_are_of_the_largest_entry_and_never_forgiving():
     case = ROOMS["encodings"][0][0]._replace(floors=(0.0, 0.0, 0.0))
     exact = np.array([[1.0, -4.0], [0.0, 0.0], [0.0, 0.0], [1.0, 1.0]])
@@ -75,18 +60,3 @@ def test_the_truth_of_a_derivative_is_that_of_the_closed_form():
     np.testing.assert_allclose(
         hard_case.truth(case, row, 2), [[[[60.0, 12.0], [12.0, 0.0]]]]
     )
-
-
-def test_a_number_names_what_is_not_finite_and_the_worst_else():
-    assert report.number([0.0]) == "0"
-    assert report.number([1e-7, 3e-7]) == "3e-07"
-    assert report.number([np.inf, 0.3]) == "not finite, 3e-01"
-    assert report.number([np.inf]) == "not finite"
-
-
-def test_what_cannot_be_timed_side_by_side_is_not():
-    case = ROOMS["encodings"][0][0]._replace(alike=False)
-    outcome = Outcome((np.zeros(1),), (np.ones(1),))
-    row = CaseResult(case, "a test", {"float32": outcome}, np.nan, np.nan)
-    assert "not comparable" in report.table([row])
-    assert report.summary([row]).endswith("derivative.")

@@ -107,13 +107,6 @@ def test_the_table_says_what_is_changed():
     assert "`nerf-small appearance.width=4`" in other
 
 
-def test_wrong_wishes_are_refused_with_what_can_be_had():
-    with pytest.raises(ValueError, match=r"--presets moba-small.*nerfies-small"):
-        inspect_pays.check(("moba-small",))
-    with pytest.raises(ValueError, match="--steps"):
-        inspect_pays.InspectPays(steps=0)
-
-
 @pytest.fixture
 def film(tmp_path):
     """A still film with held-out frames, where the light is even."""
@@ -154,6 +147,7 @@ def looked(monkeypatch):
     return calls
 
 
+@pytest.mark.full
 def test_what_differs_is_trained_once_and_kept(film, tmp_path, looked, capsys):
     words = [str(film), "--heldout", "3", "--out", str(tmp_path / "out")]
     words += ["--steps", "7"]
@@ -181,18 +175,6 @@ def test_what_differs_is_trained_once_and_kept(film, tmp_path, looked, capsys):
         inspect_pays.main([*words, "--max-side", "48"])
     assert ended.value.code == 2
     assert "was read otherwise" in capsys.readouterr().err
-
-
-def test_where_the_advice_is_the_preset_nothing_is_trained(film, tmp_path, looked):
-    args = inspect_pays.InspectPays(
-        presets=("splats-static-small",), out=tmp_path, heldout="3"
-    )
-    trial = Trial(args, *read(args, film))
-    assert trial.run() == []
-    assert looked == ["look"]
-    (one,) = trial.rows()
-    assert one.same
-    assert one.advised == "splats-static-small"
 
 
 def test_a_preset_that_needs_what_is_not_there_is_left_out(

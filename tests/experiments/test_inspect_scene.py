@@ -10,6 +10,7 @@ from nerfies_jax.runs import platform
 from tests.evidence import films
 
 
+@pytest.mark.full
 def test_the_command_line_prints_the_table_and_writes_both_files(
     tmp_path, capsys, monkeypatch
 ):
@@ -31,13 +32,3 @@ def test_the_command_line_prints_the_table_and_writes_both_files(
         "gaussians",
         "radiance",
     }
-
-
-def test_a_capture_that_is_not_there_is_one_line_and_exit_code_two(
-    tmp_path, capsys, monkeypatch
-):
-    monkeypatch.setattr(platform, "start_jax", lambda *_: None)
-    with pytest.raises(SystemExit) as stop:
-        inspect_scene.main([str(tmp_path / "none")])
-    assert stop.value.code == 2
-    assert capsys.readouterr().err.count("\n") == 1

@@ -31,25 +31,6 @@ def test_every_preset_has_its_name_on_the_command_line():
     assert typing.get_args(make_scene.Preset) == tuple(synthetic.PRESETS)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["--frames", "1"], "frames=1 must be at least 2"),
-        (["--set", "colour=red"], "no field 'colour'"),
-    ],
-)
-def test_a_wrong_setting_is_one_line_and_exit_code_two(
-    tmp_path, capsys, arguments, words
-):
-    with pytest.raises(SystemExit) as stop:
-        make_scene.main([str(tmp_path / "scene"), *arguments])
-    assert stop.value.code == 2
-    error = capsys.readouterr().err
-    assert words in error
-    assert error.count("\n") == 1
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_folder_in_use_is_refused_before_anything_is_filmed(tmp_path, monkeypatch):
     (tmp_path / "mine").write_text("kept")
 

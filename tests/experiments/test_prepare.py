@@ -57,15 +57,6 @@ def test_rows_can_be_named(tmp_path):
     assert (found.train.size, found.heldout.size) == (3, 4)
 
 
-def test_without_a_sweep_every_eighth_is_held_out(tmp_path):
-    poses = np.stack([pose(angle) for angle in np.arange(20.0)])
-    archive(tmp_path / "a.npz", poses=poses)
-    prepare.main(["npz", str(tmp_path / "a.npz"), str(tmp_path / "out")])
-    found = room.load(tmp_path / "out")
-    assert found.heldout.size == 2
-    assert "val_r_0004" in found.ids
-
-
 BAD = {
     "no focal": (dict(focal=None), [], "'focal'"),
     "focal zero": (dict(focal=np.array(0.0)), [], "focal = 0"),

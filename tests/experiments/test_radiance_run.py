@@ -56,7 +56,7 @@ def pictures(folder):
     return [images.read_image(path)[0] for path in sorted(folder.glob("*.png"))]
 
 
-def test_a_field_leaves_the_files_of_a_run_and_no_gaussians(run):
+def test_a_field_leaves_the_files_and_metrics_of_a_run_and_no_gaussians(run):
     left = {path.name for path in run.iterdir() if path.name != run_folder.LOCK}
     assert left == {
         "config.json",
@@ -70,9 +70,6 @@ def test_a_field_leaves_the_files_of_a_run_and_no_gaussians(run):
         "depth",
     }
     assert json.loads((run / "config.json").read_text())["representation"] == "radiance"
-
-
-def test_the_metrics_of_a_field_are_those_of_splats_and_the_fitted_ones(run):
     metrics = json.loads((run / "metrics.json").read_text())
     assert "gaussians" not in metrics
     wanted = ["heldout.psnr", "heldout.ssim", "heldout.fitted_psnr", "parameters"]
@@ -82,28 +79,12 @@ def test_the_metrics_of_a_field_are_those_of_splats_and_the_fitted_ones(run):
     page = (run / "report.html").read_text()
     assert "codes fitted to the left halves" in page
     assert "rays and optimiser" in page
-
-
-def test_the_depth_of_a_field_is_in_scene_units(run):
     capture = scenes.tiny_capture()
     picture = exr.read_exr(next((run / "depth").glob("*.exr")))
     seen = picture.alpha > 0.1  # twelve steps leave it thin
     assert seen.mean() > 0.5
     inside = (picture.depth > 0.9 * capture.near) & (picture.depth < 1.1 * capture.far)
     assert inside[seen].all()
-
-
-def test_a_stopped_field_resumes_to_the_same_end(run, filmed):
-    out = filmed.parent / "stopped"
-    common = ("--preset", "nerfies", "--steps", "12", "--out", out)
-    assert main(reconstruct, filmed, *common, "--seconds", "0.001", "--set", *TINY) == 0
-    assert json.loads((out / "metrics.json").read_text())["train.steps"] < 12
-    assert main(reconstruct, "--out", out, "--resume") == 0
-    whole, resumed = (
-        json.loads((path / "metrics.json").read_text()) for path in (run, out)
-    )
-    for key in ("train.steps", "heldout.psnr", "heldout.fitted_psnr", "parameters"):
-        assert resumed[key] == whole[key]
 
 
 def test_the_canonical_view_is_rendered(run, tmp_path):

@@ -37,6 +37,7 @@ def test_dense_and_lockstep_draw_the_same_picture_and_slopes(case):
             np.testing.assert_allclose(one, other, atol=2e-4 * scale)
 
 
+@pytest.mark.full
 def test_blended_pairs_are_the_tiles_that_show_a_gaussian(case):
     """With nothing opaque enough to stop a pixel, all of them and no other."""
     faint = case.footprints._replace(opacity=case.footprints.opacity * 0 + 0.02)

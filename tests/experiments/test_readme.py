@@ -6,6 +6,7 @@ import re
 
 import jax
 import PIL.Image
+import pytest
 
 import nerfies_jax as nj
 from tests import scenes
@@ -22,6 +23,7 @@ UNITS = {
 }
 
 
+@pytest.mark.full
 def test_the_program_trains_renders_and_scores(tmp_path, monkeypatch, capsys):
     (program,) = re.findall(r"```python\n(.*?)```", README, re.S)
     assert len(program.splitlines()) <= 20

@@ -112,7 +112,6 @@ def test_a_folder_that_is_no_capture_says_what_was_looked_for(tmp_path, capsys):
         (("--set", "raster.capacity=1000000000000"), "GiB are free"),
         (("--preset", "splats-magic"), "splats-deformable-small"),
         (("--steps", "0"), "at least one step"),
-        (("--resume",), "--out"),
         (("--heldout", "1"), "held"),
         (("--checkpoint-every", "-1"), "--checkpoint-every -1"),
         (("--lpips-weights", "a.npz"), "31 pixels on the shorter side"),
@@ -120,28 +119,13 @@ def test_a_folder_that_is_no_capture_says_what_was_looked_for(tmp_path, capsys):
     ],
 )
 def test_wrong_settings_are_refused(arguments, words, filmed, capsys, tmp_path):
-    out = () if arguments == ("--resume",) else ("--out", tmp_path / "run")
-    assert words in refused(capsys, filmed, *out, *arguments)
-    assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize("option", ["--factor", "--max-side", "--heldout"])
-def test_the_built_in_scene_takes_no_options_of_captures(option, tmp_path, capsys):
-    line = refused(capsys, "--out", tmp_path / "run", option, "2")
-    assert option in line
-    assert "make_scene" in line
+    assert words in refused(capsys, filmed, "--out", tmp_path / "run", *arguments)
     assert not (tmp_path / "run").exists()
 
 
 def test_a_run_folder_that_cannot_be_written_is_refused(filmed, tmp_path, capsys):
     (tmp_path / "file").write_text("")
     assert "--out" in refused(capsys, filmed, "--out", tmp_path / "file" / "run")
-
-
-def test_a_folder_without_a_run_cannot_be_resumed(tmp_path, capsys):
-    line = refused(capsys, "--resume", "--out", tmp_path)
-    assert "no run here" in line
-    assert "without --resume" in line
 
 
 def started(folder, config):
@@ -202,6 +186,7 @@ def test_help_names_the_presets(capsys):
             assert preset.removesuffix("-small") in page
 
 
+@pytest.mark.full
 def test_effects_auto_takes_the_advice_and_the_users_word_comes_last(
     tmp_path, monkeypatch, capsys
 ):

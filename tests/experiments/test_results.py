@@ -1,7 +1,6 @@
 """The pages of docs/results say what the kept numbers say, and link what is there."""
 
 import json
-import re
 
 import pytest
 
@@ -44,11 +43,3 @@ def test_new_numbers_are_kept_only_where_they_make_a_page(
     assert stop.value.code == 2
     assert "not what python -m experiments.kan_local" in capsys.readouterr().err
     assert json.loads((tmp_path / "kept.json").read_text())["rows"] == [row]
-
-
-@pytest.mark.parametrize("words", [["nothing"], ["--measured", "a.json"]])
-def test_wrong_input_is_refused(words, capsys):
-    with pytest.raises(SystemExit) as stop:
-        results.main(words)
-    assert stop.value.code == 2
-    assert re.search("no page 'nothing'|name that page", capsys.readouterr().err)

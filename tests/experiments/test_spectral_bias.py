@@ -13,26 +13,26 @@ from experiments.spectral_bias import __main__ as spectral_bias
 from experiments.spectral_bias import report
 from experiments.spectral_bias.__main__ import Result, Signal, SpectralBias
 
+LABELS = ["1-D", pytest.param("2-D", marks=pytest.mark.full)]
 SMALL = Signal(np.array([[1.0], [3.0]]), np.array([0.3, 1.1]), 60, 2)
 
 
-@pytest.mark.parametrize("label", ["1-D", "2-D"])
+def errors(apply, signal):
+    return jax.jit(lambda: spectral_bias.errors(apply, signal))()
+
+
+@pytest.mark.parametrize("label", LABELS)
 def test_planted_errors_are_found_at_their_frequencies(label):
     signal = spectral_bias.SIGNALS[label]
     waves, amplitude = signal.waves, signal.amplitude
     planted = np.linspace(0.0, 0.4, len(waves))
-    elsewhere = waves[-1] + 1
-
-    def apply(points):
-        x = np.asarray(points, np.float64)
-        off = sum(
-            share * amplitude * np.sin(np.pi * x @ wave + 0.9 * index)
-            for index, (share, wave) in enumerate(zip(planted, waves, strict=True))
-        )
-        off = off + 0.2 * np.cos(np.pi * x @ elsewhere)
-        return signal(points) + jnp.asarray(off, jnp.float32)
-
-    rmse, missing = spectral_bias.errors(apply, signal)
+    x = np.asarray(spectral_bias.grid(waves.shape[1]), np.float64)
+    off = sum(
+        share * amplitude * np.sin(np.pi * x @ wave + 0.9 * index)
+        for index, (share, wave) in enumerate(zip(planted, waves, strict=True))
+    )
+    off = np.float32(off + 0.2 * np.cos(np.pi * x @ (waves[-1] + 1)))
+    rmse, missing = errors(lambda points: signal(points) + off, signal)
     np.testing.assert_allclose(missing, planted, atol=1e-5)
     # Each sinusoid has its share of the signal's power of one; the stray one has 0.02.
     exact = math.sqrt(np.mean(planted**2) + 0.02)
@@ -41,10 +41,10 @@ def test_planted_errors_are_found_at_their_frequencies(label):
     assert report.other(row) == pytest.approx(0.02**0.5, rel=1e-4)
 
 
-@pytest.mark.parametrize("label", ["1-D", "2-D"])
+@pytest.mark.parametrize("label", LABELS)
 def test_nothing_learnt_misses_everything_and_the_signal_has_unit_power(label):
     signal = spectral_bias.SIGNALS[label]
-    rmse, missing = spectral_bias.errors(lambda x: 0 * x[:, 0], signal)
+    rmse, missing = errors(lambda x: 0 * x[:, 0], signal)
     assert float(rmse) == pytest.approx(1, rel=1e-5)
     np.testing.assert_allclose(missing, 1, rtol=1e-5)
     point = np.array([0.3, -0.2][: signal.waves.shape[1]])
@@ -53,7 +53,7 @@ def test_nothing_learnt_misses_everything_and_the_signal_has_unit_power(label):
         * math.sin(math.pi * float(wave @ point) + phase)
         for wave, phase in zip(signal.waves, signal.phase, strict=True)
     )
-    got = signal(jnp.asarray(point[None], jnp.float32))
+    got = jax.jit(lambda x: signal(x))(np.float32(point[None]))
     np.testing.assert_allclose(got, [by_hand], atol=1e-5)
 
 
@@ -74,6 +74,7 @@ def test_networks_have_about_the_same_number_of_parameters(label, kind, encoded)
     assert made.parameters == exact
 
 
+@pytest.mark.full
 def test_sine_networks_start_as_the_paper_says():
     signal = spectral_bias.SIGNALS["2-D"]
     made = spectral_bias.network("sine", False, signal)
@@ -87,6 +88,7 @@ def test_sine_networks_start_as_the_paper_says():
     assert 0.1 < float(jnp.std(made.apply(params, points))) < 2
 
 
+@pytest.mark.full
 def test_training_is_adam_along_a_cosine_from_points_of_its_own():
     made = spectral_bias.network("relu", False, SMALL)
     train = jax.jit(spectral_bias.trainer(made, SMALL, 16))
@@ -124,19 +126,7 @@ def test_training_is_adam_along_a_cosine_from_points_of_its_own():
     assert float(loss[0]) == pytest.approx(float(value), rel=0.2)
 
 
-def test_one_known_point_is_learnt_and_nothing_else():
-    made = spectral_bias.network("relu", False, SMALL)
-    train = jax.jit(spectral_bias.trainer(made, SMALL, 4, points=1))
-    with jax.numpy_dtype_promotion("standard"):
-        keys = jax.random.split(jax.random.key(0), 1)
-        params, loss = train(keys, jnp.array([1e-2]), jnp.asarray(2000))
-    assert float(loss[0]) < 1e-6
-    rmse, _ = spectral_bias.errors(
-        lambda x: made.apply(jax.tree.map(lambda leaf: leaf[0], params), x), SMALL
-    )
-    assert float(rmse) > 0.3
-
-
+@pytest.mark.full
 def test_the_rate_is_the_best_one_and_time_is_shared_out(monkeypatch):
     monkeypatch.setitem(spectral_bias.SIGNALS, "1-D", SMALL)
     args = SpectralBias(steps=80, seeds=2, rates=(1e-7, 1e-2), batch=16)
@@ -185,36 +175,6 @@ def test_the_sentences_follow_from_the_numbers():
     text = report.said(planted(0.6, 0.3))
     assert "(relu + encoding): worse" in text
     assert "(sine): worse" in text
-
-
-def test_the_table_and_the_figure_show_every_network(tmp_path):
-    waves = {"2-D": np.array([[1.0, 1.0], [3.0, -2.0]])}
-    text = report.tables(planted(0.1, 0.3), waves)
-    assert text.count("k=3,-2") == 2
-    line = next(x for x in text.splitlines() if x.startswith("relu + encoding"))
-    assert line.split()[3:] == [
-        *("100", "0.01", "10", "1.00", "0.3000", "0.0000", "0.2000", "0.3000", "0.1275")
-    ]  # the last: sqrt(0.09 - 0.025) of the first seed, nothing of the second
-    report.draw_figure(planted(0.1, 0.3), waves, tmp_path / "bias.png")
-    assert (tmp_path / "bias.png").stat().st_size > 10_000
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("--steps 1", "--steps 1"),
-        ("--signals 3-D", "--signals 3-D"),
-        ("--kinds tanh", "--kinds tanh"),
-        ("--points 0", "--points 0"),
-        ("--pilot 0", "--pilot 0"),
-        ("--rates 0.1 -1", "--rates"),
-    ],
-)
-def test_impossible_settings_are_refused(arguments, message, capsys):
-    with pytest.raises(SystemExit) as stopped:
-        spectral_bias.main(arguments.split())
-    assert stopped.value.code == 2
-    assert message in capsys.readouterr().err
 
 
 @pytest.mark.slow

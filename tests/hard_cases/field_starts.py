@@ -90,10 +90,8 @@ def unfilmed_nan(frames: Frames) -> Frames:
 
 def nothing_filmed(frames: Frames) -> Frames:
     """No pixel at all, and NaN everywhere."""
-    return frames._replace(
-        images=np.full_like(frames.images, np.nan),
-        valid=np.zeros_like(frames.valid),
-    )
+    images = np.full_like(frames.images, np.nan)
+    return frames._replace(images=images, valid=np.zeros_like(frames.valid))
 
 
 def one_exposure(frames: Frames) -> Frames:
@@ -112,26 +110,17 @@ def points_at(factor: float) -> Callable[[Frames], Frames]:
     return change
 
 
-def no_flow(frames: Frames) -> Frames:
-    """Optical flow that is known nowhere."""
-    if frames.flow is None:
-        return frames
-    seen = {
-        name: np.zeros_like(getattr(frames.flow, name))
-        for name in ("forward_seen", "backward_seen")
-    }
-    return frames._replace(flow=frames.flow._replace(**seen))
+def flow_times(factor: float, *names: str) -> Callable[[Frames], Frames]:
+    """These arrays of the optical flow so many times as large."""
 
+    def change(frames):
+        if frames.flow is None:
+            return frames
+        old = {name: getattr(frames.flow, name) for name in names}
+        new = {name: (factor * x).astype(x.dtype) for name, x in old.items()}
+        return frames._replace(flow=frames.flow._replace(**new))
 
-def wild_flow(frames: Frames) -> Frames:
-    """Optical flow of ten thousand times as many pixels."""
-    if frames.flow is None:
-        return frames
-    flow = frames.flow
-    far = {
-        name: np.float32(1e4) * getattr(flow, name) for name in ("forward", "backward")
-    }
-    return frames._replace(flow=flow._replace(**far))
+    return change
 
 
 def denser(raw: float) -> Callable[[PyTree], PyTree]:
@@ -186,6 +175,7 @@ def times(factor: float) -> Callable[[PyTree], PyTree]:
 
 BY_CODE = ("appearance",)  # codes of motion come with them in all these papers
 FLOW = ("scene_flow",)
+SEEN = ("forward_seen", "backward_seen")
 NEEDS = {
     "no depth known": FLOW,
     "constant depth": FLOW,
@@ -200,8 +190,8 @@ OF_FILMS = {
     "unfilmed not a number": Start(frames=unfilmed_nan),
     "nothing filmed": Start(frames=nothing_filmed),
     "one exposure": Start(frames=one_exposure, needs=("appearance",)),
-    "no flow known": Start(frames=no_flow, needs=FLOW),
-    "wild flow": Start(frames=wild_flow, needs=FLOW),
+    "no flow known": Start(frames=flow_times(0, *SEEN), needs=FLOW),
+    "wild flow": Start(frames=flow_times(1e4, "forward", "backward"), needs=FLOW),
     "points in one place": Start(frames=points_at(0.0), needs=("background",)),
     "points at 1e20": Start(frames=points_at(1e20), needs=("background",)),
     "cameras inside": Start(film=inside),

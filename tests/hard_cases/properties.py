@@ -83,11 +83,6 @@ def compiled(function, **static):
     return run_
 
 
-def norm(vector) -> float:
-    """Length in float64, in which squares of float32 do not underflow."""
-    return float(np.linalg.norm(np.asarray(vector, np.float64)))
-
-
 def close(found, expected, bound) -> None:
     """|found - expected| <= bound in every entry; NaN is close to nothing."""
     found, expected = (np.asarray(x, np.float64) for x in (found, expected))
@@ -115,11 +110,6 @@ def many(shape, low: float, high: float):
     return arrays.arrays(
         np.float64, shape, elements=numbers(low, high), fill=st.nothing()
     )
-
-
-def rounded(vector):
-    """No entry so small that scaling takes it out of the range of floats."""
-    return np.round(vector, 4)
 
 
 def magnitudes(low: float = 1e-30, high: float = 1.0):
@@ -173,17 +163,6 @@ def quaternions(draw):
     return 10.0 ** draw(numbers(-5, 5)) * draw(unit_quaternions())
 
 
-class Screw(NamedTuple):
-    """Angular and linear part, drawn apart: either may vanish beside the other."""
-
-    angular: np.ndarray  # [3] rad
-    linear: np.ndarray  # [3] scene units
-
-
-def screws(most: float = 2 * math.pi):
-    return st.builds(Screw, rotation_vectors(most), vectors())
-
-
 class Motion(NamedTuple):
     """A rigid motion of the world, x to R x + t; float64."""
 
@@ -217,14 +196,10 @@ def times(second: np.ndarray, first: np.ndarray) -> np.ndarray:
 
 
 @st.composite
-def cameras(draw, lens: bool = False):
-    """Cameras of `PICTURE` anywhere; with `lens`, distorted as lenses are."""
+def cameras(draw):
+    """Pinholes of `PICTURE` anywhere."""
     width, height = PICTURE
     wanted = numbers(-1, 1)
-    radial, tangential = np.zeros(3), np.zeros(2)
-    if lens:
-        radial = draw(many(3, -1, 1)) * [0.3, 0.1, 0.03]
-        tangential = draw(many(2, -1, 1)) * 0.01
     return Camera(
         camera_from_world=matrix(draw(unit_quaternions())),
         position=draw(vectors()),
@@ -232,8 +207,8 @@ def cameras(draw, lens: bool = False):
         principal_point_px=np.array([width, height]) / 2 + draw(many(2, -4, 4)),
         skew_px=np.array(draw(wanted)),
         pixel_aspect=np.array(2 ** (draw(wanted) / 2)),
-        radial=radial,
-        tangential=tangential,
+        radial=np.zeros(3),
+        tangential=np.zeros(2),
     )
 
 
@@ -284,17 +259,3 @@ def distances(draw, samples: int = 8):
     """Sorted distances along a ray from 0.1; some may be equal."""
     steps = [draw(magnitudes(1e-6, 1.0)) for _ in range(samples)]
     return 0.1 + np.cumsum(steps)
-
-
-@st.composite
-def pictures(draw, height: int = 12, width: int = 13, channels: int = 2):
-    """[height, width, channels] in [0, 1]: flat, faint texture, noise, black and white.
-
-    A drawn number seeds the noise: entries drawn one by one would be too many.
-    """
-    noise = np.random.default_rng(draw(st.integers(0, 2**16)))
-    noise = noise.uniform(-1, 1, (height, width, channels))
-    if draw(st.booleans()):
-        noise = np.sign(noise)
-    base, size = draw(numbers(0, 1)), draw(magnitudes(1e-8, 1.0))
-    return np.clip(base + size * noise, 0, 1)

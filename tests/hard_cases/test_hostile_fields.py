@@ -19,14 +19,14 @@ pytestmark = pytest.mark.hard_cases
 
 
 STARTS = field_starts.OF_FRAMES | field_starts.OF_FILMS | field_starts.OF_PARAMETERS
-# One of the seven in the default suite: a field compiles in 15 to 45 s.
-DEFAULT = ("nerf-w",)
+# A field compiles in 15 to 45 s.
+QUICK = ("nerf-w",)
 
 
 def marked(name, *others):
-    """A case of the default suite, or a slow one."""
-    marks = () if name in DEFAULT else (pytest.mark.slow,)
-    return pytest.param(name, *others, marks=marks)
+    """A full case, or a slow one."""
+    mark = pytest.mark.full if name in QUICK else pytest.mark.slow
+    return pytest.param(name, *others, marks=mark)
 
 
 FIELDS = [marked(name) for name in tiny_fields.PAPERS]
@@ -171,6 +171,7 @@ def test_scene_flow_of_a_single_bare_frame_stays_finite():
         assert ended.last[f"scene_flow/{name}"] == 0  # there is no neighbour
 
 
+@pytest.mark.full
 def test_a_single_frame_has_one_code_at_all_times():
     spec = dataclasses.replace(tiny_fields.tiny("nerfies"), background=None)
     film = bare(scenes.tiny_capture())
@@ -224,17 +225,21 @@ def test_a_scene_without_width_in_float64_is_refused():
 # --- means of what is hardly there ---------------------------------------------------
 
 
+@jax.jit
+def mean_and_slopes(values, logs, scale):
+    def mean(values, logs):
+        # as `visible` is made: the weight's own slope is the weight
+        return flow_losses.weighted_mean(values, scale * jnp.exp(logs))
+
+    return jax.value_and_grad(mean, (0, 1))(values, logs)
+
+
 @pytest.mark.parametrize("scale", [1.0, 1e-12, 1e-18, 1e-22, 2e-30, 1e18])
 def test_a_weighted_mean_keeps_its_slopes_however_small_the_weights(scale, rng, dtype):
     values = rng.normal(size=(5, 4, 3))
     share = rng.uniform(0.1, 1.0, (5, 4))
-
-    def mean(values, logs):
-        # as `visible` is made: the weight's own slope is the weight
-        return flow_losses.weighted_mean(values, jnp.asarray(scale) * jnp.exp(logs))
-
-    given = jnp.asarray(values, dtype), jnp.log(jnp.asarray(share, dtype))
-    value, slopes = jax.jit(jax.value_and_grad(mean, (0, 1)))(*given)
+    given = (np.asarray(x, dtype) for x in (values, np.log(share), scale))
+    value, slopes = mean_and_slopes(*given)
     of_axes = values.mean(-1)
     exact = (share * of_axes).sum() / share.sum()
     by_log = share * (of_axes - exact) / share.sum()
@@ -247,10 +252,7 @@ def test_a_weighted_mean_keeps_its_slopes_however_small_the_weights(scale, rng, 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-31, 1e-37])
 def test_weights_that_are_next_to_nothing_are_none(scale, dtype):
-    def mean(values, weight):
-        return flow_losses.weighted_mean(values, weight)
-
-    given = jnp.ones((4, 3), dtype), jnp.full((4,), scale, dtype)
-    value, slopes = jax.value_and_grad(mean, (0, 1))(*given)
+    ones, zeros = np.ones((5, 4, 3), dtype), np.zeros((5, 4), dtype)
+    value, slopes = mean_and_slopes(ones, zeros, np.asarray(scale, dtype))
     assert value == 0
     assert not any(np.any(slope) for slope in slopes)

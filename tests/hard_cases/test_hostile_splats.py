@@ -1,4 +1,4 @@
-"""Whole steps of every preset of Gaussians, from starts that nobody would choose."""
+"""Whole steps of Gaussians, still and moving, from starts that nobody would choose."""
 
 import dataclasses
 import functools
@@ -18,12 +18,11 @@ from nerfies_jax.training.model import Frames, Model, TrainState, View
 from tests import scenes
 from tests.hard_cases import hostile
 
-pytestmark = pytest.mark.hard_cases
+pytestmark = [pytest.mark.hard_cases, pytest.mark.full]
 
 STEPS = 200
 TINY = {
     "splats-static": scenes.TINY_SPLATS,
-    "splats-deformable": scenes.TINY_DEFORMABLE,
     "sonata": scenes.TINY_SONATA,
     "moba": scenes.TINY_MOBA,
 }
@@ -106,7 +105,9 @@ class Ready(NamedTuple):
     render: object  # (params, view, step) -> Rendering
 
 
-def ready_for(spec, capture) -> Ready:
+@functools.cache
+def ready(name) -> Ready:
+    spec, capture = hostile_spec(name), scenes.tiny_capture()
     metadata = scene.metadata_of(capture)
     model = hurried(scene.build(spec, metadata))
 
@@ -121,11 +122,6 @@ def ready_for(spec, capture) -> Ready:
         effects_of(spec, metadata),
         render,
     )
-
-
-@functools.cache
-def ready(name) -> Ready:
-    return ready_for(hostile_spec(name), scenes.tiny_capture())
 
 
 def started_with(made: Ready, rows):
@@ -252,33 +248,14 @@ def test_splats_train_on_hostile_captures(name, case, tmp_path):
     assert falls(made, frames, trained) < FALLS.get(name, 0.95)
 
 
-def at_ten_times_the_rates(made, frames):
-    start = made.start._replace(
-        aux_state=made.start.aux_state._replace(speed=np.float32(10))
-    )
-    trained = run(made, start, frames)
-    assert trained.result.stopped_by == "steps", trained.result.message
-    return trained
-
-
 @pytest.mark.parametrize("name", PRESETS)
 def test_splats_train_on_two_views_at_ten_times_the_rates(name):
     made = ready(name)
     frames = hostile.CAPTURES["two views"](made.frames)
-    trained = at_ten_times_the_rates(made, frames)
+    hurried_ = made.start.aux_state._replace(speed=np.float32(10))
+    trained = run(made, made.start._replace(aux_state=hurried_), frames)
+    assert trained.result.stopped_by == "steps", trained.result.message
     assert falls(made, frames, trained) < FALLS.get(name, 0.95)
-
-
-# Sonata's table of time codes has one row then; shapes of the others stay as they are.
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["sonata"])
-def test_splats_train_on_two_frames_at_ten_times_the_rates(name):
-    capture = scenes.tiny_capture()
-    capture = dataclasses.replace(capture, train=capture.train[:2])
-    made = ready_for(hostile_spec(name), capture)
-    assert made.frames.times.shape == (2,)
-    trained = at_ten_times_the_rates(made, made.frames)
-    assert falls(made, made.frames, trained) < FALLS.get(name, 0.95)
 
 
 def points_at(position):

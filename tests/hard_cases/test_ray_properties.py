@@ -1,200 +1,23 @@
-"""Cameras, rays, and what is seen along them: what they keep and cannot depend on.
+"""Weights and samples along a ray: what they keep and cannot depend on.
 
-Bounds count roundings. A pixel of a lens with focal length f is known to the residual
-of its inverse, 32 eps (1 + |slopes|), times f; positions of up to 20 units in front of
-a camera at a depth d round to 20 eps f / d. A weight is the exponential of a sum of n
-depths, each rounded, times a number below one: the derivative of exp(-x) is nowhere
-more than 1 / x, so a weight is off by n eps, whatever the depths.
+Bounds count roundings. A weight is the exponential of a sum of n depths, each rounded,
+times a number below one: the derivative of exp(-x) is nowhere more than 1 / x, so a
+weight is off by n eps, whatever the depths.
 """
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import given
 from hypothesis import strategies as st
 
-from nerfies_jax.geometry import camera as cameras
-from nerfies_jax.geometry import distortion, rays
 from nerfies_jax.radiance import compositing, sampling
 from tests.hard_cases import properties
-from tests.hard_cases.properties import PICTURE, cast, close, compiled, eps, norm, same
+from tests.hard_cases.properties import cast, close, compiled, eps, same
 
-pytestmark = pytest.mark.hard_cases
+pytestmark = [pytest.mark.hard_cases, pytest.mark.full]
 SAMPLES = 8
-PINHOLE, LENS = properties.cameras(), properties.cameras(lens=True)
-SLOPES = properties.many(2, -0.8, 0.8)  # 39 degrees off the axis each way
-DEPTH = properties.magnitudes(0.1, 100).filter(lambda depth: depth > 0)
 DEPTHS, DISTANCES = properties.optical_depths(), properties.distances()
-COLOURS = properties.many((SAMPLES, 3), 0, 1)
-PIXEL = properties.many(2, 0, 1).map(lambda share: share * PICTURE)
-
-
-def pixel_error(camera, dtype, slopes, depth):
-    """px. See above; ten roundings of a pixel itself."""
-    focal = 2 * float(camera.focal_px)  # times the aspect
-    world = 1 + norm(camera.position) + depth * (1 + norm(slopes))
-    return eps(dtype) * (focal * (64 * (1 + norm(slopes)) + 4 * world / depth) + 300)
-
-
-@compiled
-def out_and_back(camera, slopes, depth, other):
-    """A point given by slopes and depth in the camera; its pixel; that pixel's ray.
-
-    And the same from another pixel on, at the same depth: the first of each pair is
-    the point's, the second the other pixel's.
-    """
-    in_camera = depth * jnp.concatenate([slopes, jnp.ones_like(slopes[:1])])
-    point = camera.position + in_camera @ camera.camera_from_world
-    pixel, found = cameras.project(camera, point)
-
-    def back(pixel):
-        ray = rays.pixel_ray(camera, pixel)
-        distance = rays.distance_of_depth(camera, ray.direction, depth)
-        again = rays.point_at(ray.origin, ray.direction, distance)
-        at_pixel, at_depth = cameras.project(camera, again)
-        return ray, again, at_pixel, at_depth, cameras.projectable(camera, again)
-
-    ray, again, pixel_again, depth_again, projectable = jax.vmap(back)(
-        jnp.stack([pixel, other])
-    )
-    return {
-        "point": point,
-        "pixel": pixel,
-        "depth": found,
-        "ray": ray,
-        "again": again,
-        "pixel again": pixel_again,
-        "depth again": depth_again,
-        "projectable": projectable,
-        "one to one": distortion.one_to_one(camera.radial, camera.tangential, slopes),
-        "stretch": jax.jacfwd(distortion.distort, argnums=2)(
-            camera.radial, camera.tangential, slopes
-        ),
-    }
-
-
-@given(camera=LENS, slopes=SLOPES, depth=DEPTH)
-def test_points_and_pixels_are_inverse_inside_the_lens(camera, slopes, depth, dtype):
-    """Where the lens is one to one and not about to fold."""
-    found = out_and_back(*cast(dtype, camera, slopes, depth, np.zeros(2)))
-    stretch = np.linalg.svd(np.asarray(found["stretch"], np.float64), compute_uv=False)
-    assume(bool(found["one to one"]) and stretch[-1] > 0.05)
-    bound = pixel_error(camera, dtype, slopes, depth)
-    assert found["ray"].valid[0]
-    assert found["projectable"][0]
-    world = norm(camera.position) + 2 * depth
-    close(found["depth"], depth, 16 * eps(dtype) * (1 + world))
-    close(norm(found["ray"].direction[0]), 1, 8 * eps(dtype))
-    close(found["pixel again"][0], found["pixel"], 4 * bound)
-    # px to slopes by the inverse of the lens, and slopes to units by the depth
-    bound = 2 * bound / camera.focal_px / stretch[-1] * depth
-    close(found["again"][0], found["point"], bound)
-
-
-@given(camera=LENS, pixel=PIXEL, depth=DEPTH)
-def test_a_ray_through_a_pixel_projects_back(camera, pixel, depth, dtype):
-    found = out_and_back(*cast(dtype, camera, np.zeros(2), depth, pixel))
-    assume(found["ray"].valid[1])
-    assert found["depth again"][1] > 0
-    assert found["projectable"][1]
-    # 24 px over a focal length of at least 15 px, and what barrel distortion adds
-    slopes = np.array([3.0, 3.0])
-    close(found["pixel again"][1], pixel, pixel_error(camera, dtype, slopes, depth))
-
-
-project = compiled(cameras.project)
-
-
-@given(camera=LENS, slopes=SLOPES, depth=DEPTH, motion=properties.motions())
-def test_pixels_do_not_see_a_rigid_motion(camera, slopes, depth, motion, dtype):
-    in_camera = depth * np.array([*slopes, 1])
-    point = camera.position + in_camera @ camera.camera_from_world
-    moved = motion.rotation @ point + motion.translation
-    elsewhere = properties.moved_camera(camera, motion)
-    here, near = project(*cast(dtype, camera, point))
-    there, other = project(*cast(dtype, elsewhere, moved))
-    world = norm(camera.position) + norm(motion.translation) + 2 * depth
-    far_out = camera._replace(position=np.array([world, 0, 0]))
-    # a lens of the drawn coefficients stretches slopes of up to 1.2 at most fourfold
-    close(there, here, 4 * pixel_error(far_out, dtype, slopes, depth))
-    close(other, near, 16 * eps(dtype) * (1 + world))
-
-
-@given(
-    camera=LENS,
-    slopes=SLOPES,
-    size=st.tuples(st.integers(1, 4000), st.integers(1, 4000)),
-    corner=properties.many(2, -20, 20),
-)
-def test_resized_and_cropped_cameras_follow_their_pictures(
-    camera, slopes, size, corner, dtype
-):
-    camera, slopes = cast(dtype, camera, slopes)
-    in_camera = np.append(slopes, slopes.dtype.type(1))
-    point = camera.position + in_camera @ camera.camera_from_world
-    pixel, depth = project(camera, point)
-    scale = np.array(size) / PICTURE
-    bound = 32 * eps(dtype) * (1 + np.abs(pixel) + 80)
-    resized = cameras.resize(camera, PICTURE, size)
-    resized = cast(dtype, resized)
-    found, same_depth = project(resized, point)
-    close(found, pixel * scale, bound * scale)
-    same(same_depth, depth)
-    back = cast(dtype, cameras.resize(resized, size, PICTURE))
-    for now, before in zip(back, camera, strict=True):
-        close(now, before, 4 * eps(dtype) * np.abs(before))
-    cropped = cast(dtype, cameras.crop(camera, *map(float, corner)))
-    close(project(cropped, point)[0], np.asarray(pixel) - corner, bound)
-
-
-@compiled
-def by_matrix(camera, point):
-    pose = cameras.world_from_camera(camera)
-    in_camera = (point - pose[:3, 3]) @ pose[:3, :3]
-    homogeneous = cameras.camera_matrix(camera) @ in_camera
-    return homogeneous[:2] / homogeneous[2], cameras.project(camera, point)
-
-
-@given(camera=PINHOLE, slopes=SLOPES, depth=DEPTH)
-def test_a_pinhole_is_its_two_matrices(camera, slopes, depth, dtype):
-    in_camera = depth * np.array([*slopes, 1])
-    point = camera.position + in_camera @ camera.camera_from_world
-    expected, (pixel, found) = by_matrix(*cast(dtype, camera, point))
-    close(pixel, expected, pixel_error(camera, dtype, slopes, depth))
-    assert found > 0
-
-
-span = compiled(rays.box_span)
-
-
-@given(
-    origin=properties.many(3, -3, 3).map(properties.rounded),
-    direction=properties.directions().map(properties.rounded),
-    corner=properties.many(3, -1, 0).map(properties.rounded),
-    size=properties.many(3, 0, 2).map(properties.rounded),
-    factor=st.sampled_from([2.0**-8, 0.5, 4.0]),
-)
-def test_a_box_is_met_in_order_and_scales_with_the_world(
-    origin, direction, corner, size, factor, dtype
-):
-    """Both ends are on the box's surface, or the ray starts inside, or it misses."""
-    low, high = corner, corner + size
-    origin, direction, low, high = cast(dtype, origin, direction, low, high)
-    enter, leave = span(origin, direction, low, high)
-    same(
-        span(origin * factor, direction, low * factor, high * factor),
-        (enter * factor, leave * factor),
-    )
-    assert enter >= 0
-    assert not np.isnan(leave)
-    if enter < leave:
-        for distance in (enter, leave):
-            point = np.asarray(origin + distance * direction, np.float64)
-            # the distance is off by eps of itself
-            slack = 8 * eps(dtype) * (8 + float(distance))
-            assert np.all(point >= np.asarray(low) - slack)
-            assert np.all(point <= np.asarray(high) + slack)
 
 
 weights = compiled(compositing.weights)
@@ -220,121 +43,6 @@ def test_weights_are_shares_of_the_light(depth, empty, dtype):
     assert among[empty] == 0
 
 
-@given(depth=DEPTHS, share=properties.many(SAMPLES, 0, 1), colours=COLOURS)
-def test_cutting_intervals_keeps_the_colour(depth, share, colours, dtype):
-    """Two halves of any lengths and of one density are the whole."""
-    halves = np.stack([depth * share, depth * (1 - share)], axis=1).reshape(-1)
-    whole = np.asarray(weights(cast(dtype, depth)), np.float64)
-    parts = np.asarray(weights(cast(dtype, halves)), np.float64)
-    close(parts.reshape(-1, 2).sum(axis=1), whole, 2 * SUM * eps(dtype))
-    close(parts @ np.repeat(colours, 2, axis=0), whole @ colours, SUM * eps(dtype) * 2)
-
-
-@given(depth=DEPTHS, row=st.integers(0, SAMPLES - 1), more=properties.magnitudes())
-def test_more_density_hides_what_is_behind_it(depth, row, more, dtype):
-    denser = depth.copy()
-    denser[row] += more
-    before, after = (
-        np.asarray(weights(cast(dtype, d)), np.float64) for d in (depth, denser)
-    )
-    same(after[:row], before[:row])
-    rounding = SUM * eps(dtype)
-    assert np.all(after[row + 1 :] <= before[row + 1 :] + rounding)
-    assert after[row] >= before[row] - rounding
-    assert after.sum() >= before.sum() - rounding
-
-
-@compiled
-def many_rays(density, distances):
-    def one(density, distances):
-        spacing = compositing.intervals(distances, 0.5)
-        return compositing.weights(density * spacing)
-
-    return jax.vmap(one)(density, distances)
-
-
-@given(
-    density=properties.many((4, SAMPLES), 0, 5).map(lambda d: np.round(d, 6)),
-    distances_=st.lists(DISTANCES, min_size=4, max_size=4),
-    order=st.permutations(range(4)),
-    factor=st.sampled_from([2.0**-20, 0.25, 2.0, 2.0**30]),
-)
-def test_rays_of_a_batch_do_not_see_each_other_nor_the_unit_of_length(
-    density, distances_, order, factor, dtype
-):
-    density, distances_ = cast(dtype, density, np.stack(distances_))
-    order, factor = np.array(order), density.dtype.type(factor)
-    found = many_rays(density, distances_)
-    same(many_rays(density[order], distances_[order]), found[order])
-    # The last interval, of half a unit, goes with the unit.
-    scaled = np.diff(distances_ * factor, axis=1)
-    last = np.full_like(scaled[:, :1], factor / 2)
-    depth = density / factor * np.concatenate([scaled, last], axis=1)
-    same(np.stack([weights(row) for row in depth]), found)
-
-
-@compiled
-def media(depth, other, logit):
-    nothing = jnp.zeros_like(depth)
-    return (
-        compositing.media_weights(jnp.stack([depth, other])),
-        compositing.media_weights(jnp.stack([other, depth])),
-        compositing.media_weights(jnp.stack([depth, nothing])),
-        compositing.weights(depth),
-        compositing.thinned(depth, logit),
-    )
-
-
-@given(depth=DEPTHS, other=DEPTHS, logit=properties.many(SAMPLES, -40, 40))
-def test_media_share_a_ray_in_any_order(depth, other, logit, dtype):
-    depth, other, logit = cast(dtype, depth, other, logit)
-    both, swapped, alone, weight, thin = media(depth, other, logit)
-    same(both[::-1], swapped)
-    same(alone[1], np.zeros(SAMPLES))
-    close(alone[0], weight, SUM * eps(dtype))
-    assert np.all(np.asarray(both) >= 0)
-    # A thinned medium stops that share of what the whole one would have stopped.
-    share = 1 / (1 + np.exp(-np.asarray(logit, np.float64)))
-    stopped = -np.expm1(-np.asarray(thin, np.float64))
-    whole = -np.expm1(-np.asarray(depth, np.float64))
-    close(stopped, share * whole, 16 * eps(dtype) * share * whole + 2 * eps(dtype))
-    assert np.all(np.asarray(thin) <= np.asarray(depth) * (1 + 8 * eps(dtype)))
-
-
-@compiled
-def seen(depth, colours, distances, background):
-    return compositing.composite(
-        compositing.weights(depth), colours, distances, background
-    )
-
-
-@given(
-    depth=DEPTHS,
-    colours=COLOURS,
-    distances_=DISTANCES,
-    background=properties.many(3, 0, 1),
-    shift=properties.numbers(0, 10),
-)
-def test_what_a_ray_sees_lies_among_what_is_there(
-    depth, colours, distances_, background, shift, dtype
-):
-    inputs = cast(dtype, depth, colours, distances_, background)
-    found = seen(*inputs)
-    rounding = SUM * eps(dtype)
-    there = np.vstack([inputs[1], inputs[3][None]])
-    assert np.all(found.colour >= there.min(axis=0) - rounding)
-    assert np.all(found.colour <= there.max(axis=0) + rounding)
-    near, far = float(inputs[2][0]), float(inputs[2][-1])
-    # Divided by an opacity of at least EMPTY_BELOW, which is itself off by n eps.
-    slack = rounding * far / compositing.EMPTY_BELOW
-    assert near - slack <= found.distance <= far + slack
-    assert near <= found.median_distance <= far
-    later = seen(inputs[0], inputs[1], cast(dtype, distances_ + shift), inputs[3])
-    close(
-        later.distance, float(found.distance) + shift, 12 * slack / far * (far + shift)
-    )
-
-
 stratified = compiled(sampling.stratified, static_argnums=(3, 4))
 from_weights = compiled(sampling.from_weights, static_argnums=3)
 refine = compiled(sampling.refine, static_argnums=3)
@@ -342,20 +50,6 @@ SEEDS = st.integers(0, 2**31 - 1)
 ANY_WEIGHT = st.one_of(
     properties.magnitudes(1e-44, 1e-30), properties.magnitudes(1e-30, 1e30)
 )
-
-
-@given(
-    seed=SEEDS,
-    near=properties.magnitudes(1e-3, 10).filter(lambda near: near > 0),
-    length=properties.magnitudes(1e-9, 1e6),
-    spacing=st.sampled_from(sampling.SPACINGS),
-)
-def test_coarse_samples_are_sorted_and_in_range(seed, near, length, spacing, dtype):
-    near, far = cast(dtype, np.array(near), np.array(near + length))
-    key = jax.random.key(seed)
-    found = stratified(key, near, far, SAMPLES, spacing)
-    assert np.all(np.diff(found) >= 0)
-    assert np.all((found >= near) & (found <= far))
 
 
 @pytest.mark.parametrize("ratio", [1.0, 1 + 1e-6, 10.0, 1e4, 1e7, 1e12])

@@ -9,7 +9,8 @@ import pytest
 from experiments.hard_cases import case as hard_case
 from experiments.hard_cases.case import ORDERS, Case
 
-# Half the time to compile, for what nobody runs and is wrong anyway.
+# Half the time to compile: for textbook forms, which nobody runs, and for values in
+# core, which `hold` holds as they are run.
 ROUGHLY = (("xla_backend_optimization_level", 0),)
 
 
@@ -23,18 +24,18 @@ def by_case(cases: tuple[Case, ...], slow: tuple[str, ...] = ()):
             case,
             dtype,
             id=f"{case.name}-{dtype}",
-            marks=pytest.mark.slow if dtype in slow else (),
+            marks=pytest.mark.slow if dtype in slow else pytest.mark.full,
         )
         for case in cases
         for dtype in case.bounds
     ]
+    return pytest.mark.parametrize(("case", "dtype"), runs)
 
-    def mark(test):
-        return pytest.mark.hard_cases(
-            pytest.mark.parametrize(("case", "dtype"), runs)(test)
-        )
 
-    return mark
+def each(cases: tuple[Case, ...]):
+    """The marks of a test that runs for every case."""
+    runs = [pytest.param(x, id=x.name, marks=pytest.mark.full) for x in cases]
+    return pytest.mark.parametrize("case", runs)
 
 
 @functools.cache
@@ -57,45 +58,52 @@ class _Key:
 
 
 def hold(case: Case, dtype: str) -> None:
-    """Value and derivatives within their bounds, eager, under jit and under vmap."""
-    bounds = case.bounds[dtype]
+    """Value and derivatives within their bounds."""
+    count = len(case.bounds[dtype])
     with jax.enable_x64(dtype == "float64"):
-        every = hard_case.evaluate(case.stable, case.inputs, dtype, len(bounds))
-        for order, (together, bound) in enumerate(zip(every, bounds, strict=True)):
-            exact = _exact(_Key(case), order, dtype)
-            off = hard_case.errors(case, together, exact, order)
-            worst = int(np.argmax(off))
-            assert off[worst] <= bound, (
-                f"{case.name}, {dtype}: {ORDERS[order]} off by {off[worst]:.2e} at "
-                f"{case.axis} = {case.at[worst]:.17g}, bound {bound:.1e}"
-            )
-            if order == 0:
-                # Alone, and without jit, at the ends and at the worst point.
-                some = np.array(sorted({0, worst, len(off) - 1}))
-                size = np.maximum(np.abs(exact).max(axis=1), case.floors[0])
-                _alone(case, dtype, some, together[some], 2 * bound * size[some])
+        every = hard_case.evaluate(case.stable, case.inputs, dtype, count)
+    for order, found in enumerate(every):
+        _within(case, dtype, order, found)
 
 
-def _alone(case, dtype, some, together, bounds):
-    """Values of single inputs, with and without jit, as of all at once.
+def hold_values(cases: tuple[Case, ...]) -> None:
+    """Values of float32 within their bounds, those of a room in one program."""
+    rows = [np.asarray(case.inputs, np.float32) for case in cases]
+    functions = [jax.vmap(case.stable) for case in cases]
+    for case, found in zip(cases, _all(functions, rows, ROUGHLY), strict=True):
+        _within(case, "float32", 0, found)
+
+
+def hold_alone(cases: tuple[Case, ...]) -> None:
+    """Values of single inputs, with and without jit, to the same error as the truth.
 
     Programs are most of a room's time, so derivatives are not compiled alone: every
     public function has its gradient check that does.
     """
-    inputs = [hard_case.constant(row, dtype) for row in case.inputs[some]]
-    for how, function in (("jit", jax.jit(case.stable)), ("eager", case.stable)):
-        found = [function(x) for x in inputs]
-        assert found[0].dtype == together.dtype
-        _alike(case, dtype, how, found, together, bounds)
+    first = [hard_case.constant(case.inputs[0], "float32") for case in cases]
+    jitted = _all([case.stable for case in cases], first)
+    for case, x, one in zip(cases, first, jitted, strict=True):
+        for how, found in (("jit", one), ("eager", case.stable(x))):
+            assert found.dtype == np.float32, f"{case.name}: {how} is {found.dtype}"
+            _within(case, "float32", 0, np.asarray(found)[None], slice(1))
 
 
-def _alike(case, dtype, how, alone, together, bounds):
-    """One by one as all at once, to the same error as the truth."""
-    alone = np.stack([np.asarray(x, np.float64) for x in alone])
-    off = np.abs(alone - np.asarray(together, np.float64))
-    off = off.reshape(len(off), -1).max(axis=1)
-    assert np.all(off <= bounds + np.finfo(np.float64).tiny), (
-        f"{case.name}, {dtype}: {how} differs from vmap by {np.max(off):.2e}"
+def _all(functions, inputs, options=()):
+    """Each of its input, compiled together."""
+
+    def every(inputs):
+        return [f(x) for f, x in zip(functions, inputs, strict=True)]
+
+    return jax.jit(every, compiler_options=dict(options))(inputs)
+
+
+def _within(case, dtype, order, found, rows=slice(None)):
+    exact = _exact(_Key(case), order, dtype)[rows]
+    off = hard_case.errors(case, found, exact, order)
+    worst, bound = int(np.argmax(off)), case.bounds[dtype][order]
+    assert off[worst] <= bound, (
+        f"{case.name}, {dtype}: {ORDERS[order]} off by {off[worst]:.2e} at "
+        f"{case.axis} = {case.at[rows][worst]:.17g}, bound {bound:.1e}"
     )
 
 

@@ -1,7 +1,5 @@
 """The elastic energy at its hard points."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,21 +25,26 @@ HALVED = (*ENERGIES, "singular_values", "svd")
 ROWS = 7  # as many matrices as one test asks for at most
 
 
+pytestmark = pytest.mark.hard_cases
+
+
+def test_values_are_held():
+    checks.hold_values(CASES)
+
+
 @checks.by_case(CASES, slow=("float64",))
 def test_held(case, dtype):
     checks.hold(case, dtype)
 
 
-@pytest.mark.hard_cases
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+@pytest.mark.full
+def test_one_alone_is_held():
+    checks.hold_alone(CASES)
+
+
+@checks.each(CASES)
 def test_the_textbook_form_is_caught(case):
     checks.catches_the_textbook(case)
-
-
-def neighbours(edge, dtype):
-    """Two adjacent numbers, the lower one below `edge`."""
-    above = np.asarray(edge, dtype)
-    return np.stack([np.nextafter(above, np.asarray(0, dtype)), above])
 
 
 @jax.jit
@@ -60,7 +63,6 @@ def of_all(matrices, dtype):
     return jax.tree.map(lambda leaf: leaf[: len(matrices)], found)
 
 
-@pytest.mark.hard_cases
 @pytest.mark.parametrize("name", ["log_energy", "signed_log_energy"])
 def test_value_and_slope_are_continuous_where_the_logarithm_becomes_a_tangent(
     name, dtype
@@ -74,38 +76,27 @@ def test_value_and_slope_are_continuous_where_the_logarithm_becomes_a_tangent(
     assert np.max(abs(slope[1] - slope[0])) < 8 * eps * np.max(abs(slope[0]))
 
 
-@functools.cache
-def halved(kind):
-    """By name what each function makes of a matrix of this kind, and of it in float32.
-
-    One program for all: they share the decomposition.
-    """
-    matrix = np.asarray(0.1 * DIRECTIONS[0], jnp.dtype(kind))
-    functions = {name: getattr(matrix3, name) for name in HALVED}
-    every = jax.jit(lambda x: {name: f(x) for name, f in functions.items()})
-    return every(matrix), every(matrix.astype(np.float32))
-
-
-@pytest.mark.hard_cases
+@pytest.mark.full
 @pytest.mark.parametrize("kind", ["bfloat16", "float16"])
-@pytest.mark.parametrize("name", HALVED)
-def test_half_precision_is_rounded_once(name, kind):
-    found, exact = (jax.tree.leaves(results[name]) for results in halved(kind))
-    for one, other in zip(found, exact, strict=True):
+def test_half_precision_is_rounded_once(kind):
+    # One program for all: they share the decomposition.
+    every = jax.jit(lambda x: {name: getattr(matrix3, name)(x) for name in HALVED})
+    matrix = np.asarray(0.1 * DIRECTIONS[0], jnp.dtype(kind))
+    both = every(matrix), every(matrix.astype(np.float32))
+    half_ulp = float(jnp.finfo(kind).eps) / 2
+    for one, other in zip(*map(jax.tree.leaves, both), strict=True):
         assert one.dtype == kind
         off = np.abs(np.asarray(one, np.float32) - np.asarray(other))
-        half_ulp = float(jnp.finfo(kind).eps) / 2
         assert np.all(off <= 1.001 * half_ulp * np.abs(other) + 6e-8)
 
 
-@pytest.mark.hard_cases
-@pytest.mark.parametrize("name", [*ENERGIES, "singular_values"])
-def test_float32_stays_float32_with_x64_on(name):
+@pytest.mark.full
+def test_float32_stays_float32_with_x64_on():
     matrix = [np.eye(3) + 0.2 * DIRECTIONS[2]]
-    alone = of_all(matrix, "float32")[name]
+    alone = of_all(matrix, "float32")
     with jax.enable_x64(True):
-        wide = of_all(matrix, "float32")[name]
-    for one, other in zip(wide, alone, strict=True):
+        wide = of_all(matrix, "float32")
+    for one, other in zip(*map(jax.tree.leaves, (wide, alone)), strict=True):
         assert one.dtype == other.dtype == np.float32
         np.testing.assert_allclose(one, other, rtol=2e-6)
 
@@ -116,7 +107,6 @@ def _field(params, point):
     return lie.displacement(turn @ point, shift @ point + jnp.sum(shift), point)
 
 
-@pytest.mark.hard_cases
 @pytest.mark.slow
 def test_the_elastic_gradient_of_a_translating_warp_survives_float32():
     """Through warp, Jacobian and energy; officially 80 % wrong in the turn."""
@@ -150,7 +140,6 @@ axioms = settings(max_examples=40, deadline=None, derandomize=True, database=Non
 
 
 @pytest.mark.slow
-@pytest.mark.hard_cases
 @pytest.mark.parametrize("kind", ["float32", "float64"])
 @axioms
 @given(stretch=triples, one=triples, other=triples)
@@ -179,7 +168,6 @@ def test_turning_before_or_after_costs_nothing(kind, stretch, one, other):
         assert abs(rest) < {"float32": 2e-5, "float64": 4e-14}[kind], name
 
 
-@pytest.mark.hard_cases
 @pytest.mark.parametrize("name", ["log_energy", "signed_log_energy"])
 @pytest.mark.parametrize("stretch", [0, 1e-5, 1e-3, 9e-3])
 def test_a_collapsed_direction_is_pulled_open(name, stretch, dtype):

@@ -15,13 +15,24 @@ from tests.experiments.hard_cases import checks
 SIZE = (640, 480)
 
 
+pytestmark = pytest.mark.hard_cases
+
+
+def test_values_are_held():
+    checks.hold_values(CASES)
+
+
 @checks.by_case(CASES)
 def test_held(case, dtype):
     checks.hold(case, dtype)
 
 
-@pytest.mark.hard_cases
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+@pytest.mark.full
+def test_one_alone_is_held():
+    checks.hold_alone(CASES)
+
+
+@checks.each(CASES)
 def test_the_textbook_form_is_caught(case):
     checks.catches_the_textbook(case)
 
@@ -53,7 +64,6 @@ jitted = jax.jit(everything)
 in_rows = jax.jit(jax.vmap(everything, (None, 0, 0)))
 
 
-@pytest.mark.hard_cases
 @pytest.mark.parametrize("kind", ["bfloat16", "float16"])
 def test_cameras_of_half_precision_are_refused(kind):
     """bfloat16 holds a pixel of 1000 to 8 px; nothing computed from it is right."""
@@ -75,7 +85,7 @@ def test_cameras_of_half_precision_are_refused(kind):
             attempt()
 
 
-@pytest.mark.hard_cases
+@pytest.mark.full
 def test_float32_stays_float32_with_x64_on_and_every_way_of_calling_agrees():
     args = (
         some_camera("float32"),
@@ -92,7 +102,6 @@ def test_float32_stays_float32_with_x64_on_and_every_way_of_calling_agrees():
             np.testing.assert_allclose(other, value, rtol=2e-6, atol=1e-6)
 
 
-@pytest.mark.hard_cases
 def test_projection_is_continuous_where_the_depth_is_held(dtype):
     """Adjacent depths on either side of a slope of 1e4."""
     camera = some_camera(dtype)._replace(
@@ -118,16 +127,18 @@ def span_and_slopes(*args):
     return span(*args), jax.jacrev(span, argnums=(0, 1, 2, 3))(*args)
 
 
-@pytest.mark.hard_cases
-@pytest.mark.parametrize("slant", [0, 1e-38, 1e-30, 1e-20, 1e-13, 1e-11, 1e-6])
+SLANTS = [0, 1e-38, 1e-30, 1e-20, 1e-13, 1e-11, 1e-6]
+
+
 @pytest.mark.parametrize("side", [-1, 1])
-def test_slopes_of_a_box_span_are_finite_for_every_slant(slant, side, dtype):
+def test_slopes_of_a_box_span_are_finite_for_every_slant(side, dtype):
     """In direction, origin and box; a slope over slant² overflows at 1e-20."""
-    args = [[1, side * slant, 0], [-3, 0.5, 0.25], [-1] * 3, [1] * 3]
-    span, slopes = span_and_slopes(*(np.asarray(arg, dtype) for arg in args))
-    assert np.allclose(span, [2, 4], rtol=1e-5)
-    for slope in slopes:
-        assert np.all(np.isfinite(slope))
+    for slant in SLANTS:
+        args = [[1, side * slant, 0], [-3, 0.5, 0.25], [-1] * 3, [1] * 3]
+        span, slopes = span_and_slopes(*(np.asarray(arg, dtype) for arg in args))
+        assert np.allclose(span, [2, 4], rtol=1e-5), slant
+        for slope in slopes:
+            assert np.all(np.isfinite(slope)), slant
 
 
 numbers = st.floats(-1, 1, width=32)
@@ -156,7 +167,7 @@ def _views(camera, point, angular, linear):
     }
 
 
-@pytest.mark.hard_cases
+@pytest.mark.full
 @pytest.mark.parametrize("kind", ["float32", "float64"])
 @axioms
 @given(point=triples, angular=triples, linear=triples)

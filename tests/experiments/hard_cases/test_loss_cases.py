@@ -1,7 +1,5 @@
 """Losses and measures at their hard points, and in half precision."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,14 +11,24 @@ from nerfies_jax.measure import geometry_quality, image_quality
 from nerfies_jax.training import losses
 from tests.experiments.hard_cases import checks
 
+pytestmark = pytest.mark.hard_cases
+
+
+def test_values_are_held():
+    checks.hold_values(CASES)
+
 
 @checks.by_case(CASES)
 def test_held(case, dtype):
     checks.hold(case, dtype)
 
 
-@pytest.mark.hard_cases
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+@pytest.mark.full
+def test_one_alone_is_held():
+    checks.hold_alone(CASES)
+
+
+@checks.each(CASES)
 def test_the_textbook_form_is_caught(case):
     checks.catches_the_textbook(case)
 
@@ -66,56 +74,33 @@ def every_measure(image, target, mask):
     return {name: f(image, target, mask) for name, f in MEASURES.items()}
 
 
-@functools.cache
-def slopes_in_half_and_float32():
-    half, wide, mask = pair("bfloat16")
-    return every_slope(*half, mask), every_slope(*wide, mask)
-
-
-@functools.cache
-def measured():
-    """In bfloat16, of a float32 render beside a bfloat16 picture, and in float32."""
-    half, wide, mask = pair("bfloat16")
-    mixed = wide[0], half[1]
-    return tuple(every_measure(*both, mask) for both in (half, mixed, wide))
-
-
-@pytest.mark.hard_cases
-@pytest.mark.parametrize("name", LOSSES)
-def test_losses_of_bfloat16_pictures_are_those_of_their_float32_copies(name):
+@pytest.mark.full
+def test_losses_of_bfloat16_pictures_are_those_of_their_float32_copies():
     """Counted and summed as they are, a masked mean was 1.7 times too large."""
-    (value, slope), (expected, expected_slope) = (
-        found[name] for found in slopes_in_half_and_float32()
-    )
-    assert value.dtype == jnp.float32
-    assert slope.dtype == jnp.bfloat16
-    assert abs(value - expected) <= 1e-6 * expected
-    slope, expected_slope = np.asarray(slope, np.float32), np.asarray(expected_slope)
-    size = np.abs(expected_slope).max()
-    # Slopes come back rounded to eight bits.
-    np.testing.assert_allclose(slope / size, expected_slope / size, atol=5e-3)
+    half, wide, mask = pair("bfloat16")
+    exact = every_slope(*wide, mask)
+    for name, (value, slope) in every_slope(*half, mask).items():
+        expected, expected_slope = exact[name]
+        assert value.dtype == jnp.float32, name
+        assert slope.dtype == jnp.bfloat16, name
+        assert abs(value - expected) <= 1e-6 * expected, name
+        slope, expected_slope = (np.float32(x) for x in (slope, expected_slope))
+        size = np.abs(expected_slope).max()
+        # Slopes come back rounded to eight bits.
+        np.testing.assert_allclose(slope / size, expected_slope / size, atol=5e-3)
 
 
-@pytest.mark.hard_cases
-@pytest.mark.parametrize("name", MEASURES)
-def test_measures_of_half_precision_pictures_are_those_of_float32(name):
-    *found, expected = (values[name] for values in measured())
-    for value in found:
-        assert value.dtype == jnp.float32
-        assert abs(value - expected) <= 1e-6 * abs(expected)
+@pytest.mark.full
+def test_measures_of_half_precision_pictures_are_those_of_float32():
+    """In bfloat16, and of a float32 render beside a bfloat16 picture."""
+    half, wide, mask = pair("bfloat16")
+    exact = every_measure(*wide, mask)
+    for both in (half, (wide[0], half[1])):
+        for name, value in every_measure(*both, mask).items():
+            assert value.dtype == jnp.float32, name
+            assert abs(value - exact[name]) <= 1e-6 * abs(exact[name]), name
 
 
-@pytest.mark.hard_cases
-def test_a_loss_of_float16_pictures_is_that_of_float32():
-    half, wide, mask = pair("float16")
-    loss = jax.jit(losses.l1)
-    expected = loss(*wide, mask)
-    for found in (loss(*half, mask), loss(wide[0], half[1], mask)):
-        assert found.dtype == jnp.float32
-        assert abs(found - expected) <= 1e-6 * abs(expected)
-
-
-@pytest.mark.hard_cases
 def test_a_float16_picture_may_have_more_pixels_than_float16_counts():
     """70 000 pixels were infinitely many: a mean of 0, and 100 dB."""
     half = np.zeros((700, 100, 1), np.float16), np.ones((700, 100, 1), np.float16)
@@ -124,7 +109,7 @@ def test_a_float16_picture_may_have_more_pixels_than_float16_counts():
     assert jax.jit(image_quality.masked_psnr)(*half, mask) == 0
 
 
-@pytest.mark.hard_cases
+@pytest.mark.full
 @pytest.mark.parametrize("level", [0.5, 1000.0])
 def test_ssim_under_jit_is_about_one_level(level):
     """Contracted in one place and not in another, the mean of the target was two."""
@@ -151,7 +136,7 @@ def geometry_measures(found, truth, mask):
     )
 
 
-@pytest.mark.hard_cases
+@pytest.mark.full
 @pytest.mark.parametrize("kind", ["bfloat16", "float16"])
 def test_depths_flows_and_tracks_in_half_precision_are_counted(kind, rng):
     truth = rng.uniform(1, 5, 900)

@@ -1,7 +1,5 @@
 """Rotations and screws at their hard points."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,13 +21,24 @@ LINEAR, POINT = rotations.LINEAR, rotations.POINT
 WXYZ = np.array([0.5, -0.5, 0.1, 0.7])
 
 
+pytestmark = pytest.mark.hard_cases
+
+
+def test_values_are_held():
+    checks.hold_values(CASES)
+
+
 @checks.by_case(CASES)
 def test_held(case, dtype):
     checks.hold(case, dtype)
 
 
-@pytest.mark.hard_cases
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+@pytest.mark.full
+def test_one_alone_is_held():
+    checks.hold_alone(CASES)
+
+
+@checks.each(CASES)
 def test_the_textbook_form_is_caught(case):
     checks.catches_the_textbook(case)
 
@@ -73,9 +82,6 @@ def every(inputs):
     return {name: EVERY[name][0](*args) for name, args in inputs.items()}
 
 
-every_row = jax.jit(jax.vmap(every))
-
-
 def inputs_of(kind):
     return {
         name: tuple(np.asarray(arg).astype(jnp.dtype(kind)) for arg in args)
@@ -83,52 +89,27 @@ def inputs_of(kind):
     }
 
 
-@functools.cache
-def in_half_and_float32(kind):
-    half = inputs_of(kind)
-    return every(half), every(jax.tree.map(lambda x: x.astype(np.float32), half))
-
-
-@functools.cache
-def with_x64_on():
-    """At once, and as the second of two rows."""
-    inputs = inputs_of("float32")
-    with jax.enable_x64(True):
-        return every(inputs), every_row(
-            jax.tree.map(lambda x: np.stack([x, x]), inputs)
-        )
-
-
 def joined(results):
     return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(results)])
 
 
-@pytest.mark.hard_cases
+@pytest.mark.full
 @pytest.mark.parametrize("kind", ["bfloat16", "float16"])
-@pytest.mark.parametrize("name", EVERY)
-def test_half_precision_is_rounded_once(name, kind):
+def test_half_precision_is_rounded_once(kind):
     """Computed in float32 from the same inputs; in bfloat16 a screw is 3e-2 off."""
-    found, exact = (results[name] for results in in_half_and_float32(kind))
-    assert all(leaf.dtype == kind for leaf in jax.tree.leaves(found))
-    half_ulp, exact = float(jnp.finfo(kind).eps) / 2, joined(exact)
-    off = np.abs(joined(found).astype(np.float32) - exact)
-    # float16's smallest numbers are 6e-8 apart
-    assert np.all(off <= 1.001 * half_ulp * np.abs(exact) + 6e-8)
+    half = inputs_of(kind)
+    found = every(half)
+    exact = every(jax.tree.map(lambda x: x.astype(np.float32), half))
+    half_ulp = float(jnp.finfo(kind).eps) / 2
+    for name, results in found.items():
+        assert all(leaf.dtype == kind for leaf in jax.tree.leaves(results)), name
+        expected = joined(exact[name])
+        off = np.abs(joined(results).astype(np.float32) - expected)
+        # float16's smallest numbers are 6e-8 apart
+        assert np.all(off <= 1.001 * half_ulp * np.abs(expected) + 6e-8), name
 
 
-@pytest.mark.hard_cases
-def test_slopes_in_half_precision_are_rounded_once():
-    """At zero and at 1e-3 rad, where 1 - cos θ of bfloat16 is zero."""
-    slope = jax.jit(jax.jacrev(lie.displacement))
-    for angle in (0.0, 1e-3, 0.3):
-        args = (angle * rotations.AXIS, LINEAR, POINT)
-        halves = [arg.astype(jnp.bfloat16) for arg in args]
-        exact = np.asarray(slope(*(half.astype(np.float32) for half in halves)))
-        off = np.abs(np.asarray(slope(*halves)).astype(np.float32) - exact)
-        assert np.all(off <= 2.0**-8 * np.abs(exact) + 1e-6)
-
-
-@pytest.mark.hard_cases
+@pytest.mark.full
 def test_a_float32_point_moved_by_a_bfloat16_screw_stays_float32():
     screw = [x.astype(jnp.bfloat16) for x in (0.3 * rotations.AXIS, LINEAR)]
     point = POINT.astype(np.float32)
@@ -139,41 +120,39 @@ def test_a_float32_point_moved_by_a_bfloat16_screw_stays_float32():
     assert np.array_equal(moved, wide)
 
 
-@pytest.mark.hard_cases
-@pytest.mark.parametrize("name", EVERY)
-def test_float32_stays_float32_with_x64_on_and_every_way_of_calling_agrees(name):
+@pytest.mark.full
+def test_float32_stays_float32_with_x64_on_and_every_way_of_calling_agrees():
     """Constants made under x64 would turn float32 arguments into float64."""
-    eager = EVERY[name][0](*(jnp.asarray(arg) for arg in inputs_of("float32")[name]))
-    wide, rows = (results[name] for results in with_x64_on())
-    assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves((wide, rows)))
-    rows = jax.tree.map(lambda leaf: np.asarray(leaf)[1], rows)
-    for other in (wide, rows):
-        np.testing.assert_allclose(joined(other), joined(eager), atol=4e-7)
+    inputs = inputs_of("float32")
+    with jax.enable_x64(True):
+        wide = every(inputs)
+        rows = jax.jit(jax.vmap(every))(
+            jax.tree.map(lambda x: np.stack([x, x]), inputs)
+        )
+    for name, (function, _) in EVERY.items():
+        eager = joined(function(*map(jnp.asarray, inputs[name])))
+        row = jax.tree.map(lambda leaf: np.asarray(leaf)[1], rows[name])
+        for other in (wide[name], row):
+            other = joined(other)
+            assert other.dtype == np.float32, name
+            np.testing.assert_allclose(other, eager, atol=4e-7, err_msg=name)
 
 
 def _every_degree(x):
     return jnp.stack([stumpff(degree, x[0]) for degree in range(6)])
 
 
-@functools.cache
-def beside_the_switch(dtype):
-    """Value, slope and curvature of all degrees: [2, 6, ...], below and at it."""
+def test_stumpff_functions_are_continuous_across_their_switch(dtype):
+    """Neighbouring numbers, one by the series and one by the closed form."""
     above = np.asarray(SERIES_BELOW, dtype)
     below = np.nextafter(above, np.asarray(0, dtype))
-    return hard_case.evaluate(_every_degree, np.array([[below], [above]]), dtype, 3)
+    ends = np.array([[below], [above]])
+    for order, values in enumerate(hard_case.evaluate(_every_degree, ends, dtype, 3)):
+        # c_k(9) are 0.05 to 1; sin and cos of √9 carry an ulp of one
+        off = np.max(abs(values[1] - values[0]))
+        assert off < 4 * np.finfo(dtype).eps / (1 + order)
 
 
-@pytest.mark.hard_cases
-@pytest.mark.parametrize("order", [0, 1, 2])
-@pytest.mark.parametrize("degree", range(6))
-def test_stumpff_functions_are_continuous_across_their_switch(degree, order, dtype):
-    """Neighbouring numbers, one by the series and one by the closed form."""
-    values = beside_the_switch(dtype)[order][:, degree]
-    # c_k(9) are 0.05 to 1; sin and cos of √9 carry an ulp of one
-    assert abs(values[1] - values[0]) < 4 * np.finfo(dtype).eps / (1 + order)
-
-
-@pytest.mark.hard_cases
 def test_quaternion_logarithm_is_continuous_across_its_switch(dtype):
     """Scalar and vector just on either side of tan²(θ/2) = 0.04."""
     half = np.arctan(quaternion.SERIES_BELOW**0.5)
@@ -200,29 +179,12 @@ def _of_any_length(q):
     )
 
 
-OF_ANY_LENGTH = {
-    "normalise": slice(4),
-    "to_matrix": slice(4, 13),
-    "log": slice(13, 16),
-    "rotate": slice(16, 19),
-}
-
-
-@functools.cache
-def of_any_length(dtype):
-    """Value, slope and curvature, [LENGTHS and one, 19, ...]; the last: identity."""
+@pytest.mark.full
+def test_any_length_has_finite_value_slope_and_curvature(dtype):
+    """A curvature through |q|³ is NaN from 1e-13 down; an unscaled log at 1e-19."""
     given = np.array(LENGTHS)[:, None] * WXYZ / np.linalg.norm(WXYZ)
     given = np.concatenate([given, [[1, 0, 0, 0]]])
-    return hard_case.evaluate(_of_any_length, given, dtype, 3)
-
-
-@pytest.mark.hard_cases
-@pytest.mark.parametrize("name", OF_ANY_LENGTH)
-def test_any_length_has_finite_value_slope_and_curvature(name, dtype):
-    """A curvature through |q|³ is NaN from 1e-13 down; an unscaled log at 1e-19."""
-    value, slope, curvature = (
-        found[:, OF_ANY_LENGTH[name]] for found in of_any_length(dtype)
-    )
+    value, slope, curvature = hard_case.evaluate(_of_any_length, given, dtype, 3)
     usual, none = value[LENGTHS.index(1e15)], value[-1]
     for length, row in zip(LENGTHS, value, strict=False):
         # float32 flushes 1e-38 to zero, which is no rotation
@@ -230,13 +192,11 @@ def test_any_length_has_finite_value_slope_and_curvature(name, dtype):
         assert np.max(abs(row - expected)) < TIGHT[dtype]
     assert np.all(np.isfinite(slope))
     # it is 1 / length², which float32 cannot hold from 1e-19 down
-    held = [length == 0 or length >= 1e-18 for length in LENGTHS]
-    assert np.all(
-        np.isfinite(curvature[:-1] if dtype == "float64" else curvature[:-1][held])
-    )
+    least = 0 if dtype == "float64" else 1e-18
+    held = [length == 0 or length >= least for length in LENGTHS]
+    assert np.all(np.isfinite(curvature[:-1][held]))
 
 
-@pytest.mark.hard_cases
 def test_lengths_at_the_edge_of_the_range_are_told_apart(dtype):
     """The least normal number is normalised, its neighbour below is the identity."""
     edge = np.finfo(dtype).tiny
@@ -257,7 +217,6 @@ def with_a_residual(own, residual, angular):
     return total(residual), jax.jacrev(total)(residual), turned
 
 
-@pytest.mark.hard_cases
 @pytest.mark.parametrize("rest", [1e-1, 1e-3, 1e-6, 0])
 def test_a_residual_that_nearly_cancels_its_quaternion_gives_a_rotation(rest, dtype):
     """q + dq of length `rest`: rounding decides which, its slope is at most 1/rest.
@@ -279,7 +238,7 @@ def test_a_residual_that_nearly_cancels_its_quaternion_gives_a_rotation(rest, dt
     assert abs(np.linalg.norm(turned) - 1) < TIGHT[dtype]
 
 
-@pytest.mark.hard_cases
+@pytest.mark.full
 def test_ten_thousand_compositions_stay_a_rotation(dtype):
     """Matrices drift from orthogonality and quaternions from length one: 1e-3."""
     turn = np.array([0.01, -0.02, 0.015], dtype)
@@ -335,7 +294,7 @@ def _group(one, two, three, linear, point):
     }
 
 
-@pytest.mark.hard_cases
+@pytest.mark.full
 @both
 @axioms
 @given(one=triples, two=triples, three=triples, linear=triples, point=triples)

@@ -26,13 +26,24 @@ ONE_PIXEL = dataclasses.replace(QUICK, transmittance_threshold=1e-3)
 THROUGH = dataclasses.replace(INRIA, tile=4, batch=1, chunk=1)
 
 
+pytestmark = pytest.mark.hard_cases
+
+
+def test_values_are_held():
+    checks.hold_values(CASES)
+
+
 @checks.by_case(CASES)
 def test_held(case, dtype):
     checks.hold(case, dtype)
 
 
-@pytest.mark.hard_cases
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+@pytest.mark.full
+def test_one_alone_is_held():
+    checks.hold_alone(CASES)
+
+
+@checks.each(CASES)
 def test_the_textbook_form_is_caught(case):
     checks.catches_the_textbook(case)
 
@@ -64,7 +75,6 @@ def seen_and_slopes(gaussians, view):
     return found, slopes
 
 
-@pytest.mark.hard_cases
 @pytest.mark.parametrize(
     ("what", "edge", "drawn"),
     [
@@ -84,7 +94,6 @@ def test_what_is_drawn_ends_within_one_step_of_its_edge(what, edge, drawn, dtype
             assert not any(np.any(leaf) for leaf in slopes)
 
 
-@pytest.mark.hard_cases
 @pytest.mark.parametrize("side", [-1, 1])
 def test_the_clamped_tangent_is_continuous_and_its_slope_is_the_clamped_one(
     side, dtype
@@ -145,7 +154,6 @@ def _pixel_and_slopes(alphas, values, spec):
     return found, slopes
 
 
-@pytest.mark.hard_cases
 def test_an_alpha_jumps_at_the_cut_and_nowhere_else(dtype):
     """exp(log o) is an ulp or two off, so the cut is approached to eight ulps."""
     ulps = 8 * float(jnp.finfo(dtype).eps)
@@ -159,8 +167,13 @@ def test_an_alpha_jumps_at_the_cut_and_nowhere_else(dtype):
         assert abs(slope[0] - (0.5 if drawn else 0)) < 4 * ulps
 
 
-@pytest.mark.hard_cases
-@pytest.mark.parametrize("spec", [ONE_PIXEL, THROUGH], ids=["zero", "through"])
+@pytest.mark.parametrize(
+    "spec",
+    [
+        pytest.param(ONE_PIXEL, id="zero"),
+        pytest.param(THROUGH, id="through", marks=pytest.mark.full),
+    ],
+)
 def test_an_alpha_stays_at_its_clamp_and_one_is_finite(spec, dtype):
     ulps = 8 * float(jnp.finfo(dtype).eps)
     values = np.asarray([1.0, 0.25], dtype)
@@ -178,7 +191,6 @@ def test_an_alpha_stays_at_its_clamp_and_one_is_finite(spec, dtype):
         assert np.isfinite(slopes).all()
 
 
-@pytest.mark.hard_cases
 def test_a_pixel_is_done_on_the_side_of_the_stop_its_transmittance_is_on(dtype):
     """T = 0.01 (1 - a): the Gaussian that would take it to the stop is left out."""
     ulps = 64 * float(jnp.finfo(dtype).eps)
@@ -193,7 +205,7 @@ def test_a_pixel_is_done_on_the_side_of_the_stop_its_transmittance_is_on(dtype):
         assert bool(slopes[0][1] != 0) is drawn
 
 
-@pytest.mark.hard_cases
+@pytest.mark.full
 def test_five_thousand_gaussians_on_a_pixel_have_the_slopes_of_float64(rng):
     """Their transmittance underflows after a few hundred; alphas up to 1 among them."""
     spec = dataclasses.replace(QUICK, transmittance_threshold=0.0)
@@ -220,7 +232,6 @@ def test_five_thousand_gaussians_on_a_pixel_have_the_slopes_of_float64(rng):
         assert error.max() < 2e-5 * np.abs(expected).max()
 
 
-@pytest.mark.hard_cases
 @pytest.mark.parametrize("kind", ["bfloat16", "float16"])
 def test_half_precision_gaussians_are_refused_by_name(kind):
     """Eight bits place a pixel to 1 px at 256; Adam's steps do not move such means."""
@@ -234,7 +245,6 @@ def test_half_precision_gaussians_are_refused_by_name(kind):
         splats.from_points(np.eye(3), np.eye(3), dtype=jnp.dtype(kind))
 
 
-@pytest.mark.hard_cases
 @pytest.mark.parametrize("logit", [16.0, 17.0, 37.0, 100.0, 1e4])
 def test_a_saturated_opacity_draws_as_one(logit, dtype):
     """sigmoid is 1 from 17 (37): nothing divides by 1 - o or takes its logarithm."""
@@ -245,7 +255,6 @@ def test_a_saturated_opacity_draws_as_one(logit, dtype):
     assert np.isfinite(slopes).all()
 
 
-@pytest.mark.hard_cases
 def test_colour_at_the_camera_is_finite_with_its_slopes(dtype, rng):
     """A Gaussian in the very place of the camera is seen along z."""
     coefficients = rng.normal(size=(16, 3)).astype(dtype)

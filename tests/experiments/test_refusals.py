@@ -1,0 +1,99 @@
+"""What a command cannot do is said in words, with exit code two."""
+
+import importlib
+import pathlib
+
+import pytest
+
+from nerfies_jax.capture import synthetic
+from nerfies_jax.runs import platform
+from tests import scenes
+
+# OUT is a folder that is not there.
+TABLE = [
+    ("ablate", "--arms nerfy", "in --suite fields there are static, t-nerf"),
+    ("ablate", "--suite moba --arms nerfies", "there are full, no-basis"),
+    ("ablate", "--seeds 0", "positive"),
+    ("ablate", "--budget -1", "positive"),
+    ("ablate", "--seconds 0", "positive"),
+    ("ablate", "--seed 1 --jobs 2", "one seed from 0 on"),
+    ("ablate", "--scene moon", "no such built-in scene"),
+    ("ablate", "--scene tiny --arms static --set colour=red", "no field 'colour'"),
+    ("ablate", "--heldout 8", "is for captures"),
+    ("ablate", "--scene tiny --arms static --seconds 9 --seed 1", "train it first"),
+    ("accuracy_time", "--axes colour", "choose from preset"),
+    ("accuracy_time", "--share 0", "--share 0"),
+    ("accuracy_time", "--check /nowhere.json", "cannot be read"),
+    ("accuracy_time", "--jobs 0", "positive"),
+    ("appearance_codes", "--steps 0", "steps=0 must be at least 1"),
+    ("compare", "OUT", "two or more"),
+    ("deformation_cost", "--gaussians 0", "--gaussians 0 must be at least 1"),
+    ("deformation_cost", "--still 1", "a share in [0, 1)"),
+    ("deformation_cost", "--knots 1 8", "at least 2"),
+    ("deformation_cost", "--static-threshold -1", "cannot be negative"),
+    ("deformation_cost", "--run nowhere", "no run here"),
+    ("effect_cost", "--presets nerf", "no effect to be priced"),
+    ("effect_cost", "--presets", "--presets"),
+    ("effect_cost", "--at 1", "--at"),
+    ("effect_cost", "--repeats 0", "--repeats"),
+    ("effect_cost", "--rays 0", "--rays"),
+    ("elastic_points", "--points 64", "64 samples"),
+    ("elastic_points", "--draws 0", "--draws 0"),
+    ("frequency_gates", "--steps 3", "--steps 3"),
+    ("frequency_gates", "--seeds 1", "--seeds 1"),
+    ("frequency_gates", "--most 0.1 0", "--most (0.1, 0.0)"),
+    ("hard_cases", "--rooms kitchen", "choose from rotations"),
+    ("hard_cases", "--cases nothing", "no such case; there are screw"),
+    ("hard_cases", "--numbers 0", "at least 1"),
+    ("hard_cases", "--document nowhere.md", "no such file, or not both"),
+    ("inspect_pays", "--presets moba-small", "choose from splats-deformable-small"),
+    ("inspect_pays", "--steps 0", "--steps"),
+    ("inspect_scene", "OUT", "OUT"),
+    ("kan_local", "--kernels 1", "--kernels"),
+    ("kan_local", "--nearest 0", "--nearest"),
+    ("kan_local", "--points 0", "--points"),
+    ("make_scene", "OUT --frames 1", "frames=1 must be at least 2"),
+    ("make_scene", "OUT --set colour=red", "no field 'colour'"),
+    ("motion_rank", "--kinds square", "--kinds square"),
+    ("motion_rank", "--counts 0", "each at least 1"),
+    ("motion_rank", "--seeds 0", "--seeds 0"),
+    ("motion_rank", "--times 4", "--times 4 must be at least 8"),
+    ("motion_rank", "--basis-form square", "--basis-form square"),
+    ("reconstruct", "--out OUT --factor 2", "make_scene"),
+    ("reconstruct", "--out OUT --max-side 2", "make_scene"),
+    ("reconstruct", "--out OUT --heldout 2", "make_scene"),
+    ("reconstruct", "--resume", "--out"),
+    ("reconstruct", "--resume --out OUT", "no run here"),
+    ("render", "nowhere --interpolation cubic", "is for --knots"),
+    ("render", "nowhere --still-below -1", "not negative"),
+    ("results", "nothing", "no page 'nothing'"),
+    ("results", "--measured a.json", "name that page"),
+    ("solver_table", "--solvers newton", "must be among"),
+    ("solver_table", "--solvers levenberg-marquardt", "must be among"),
+    ("solver_table", "--frames 0", "at least 1"),
+    ("solver_table", "--steps", "at least 1"),
+    ("spectral_bias", "--steps 1", "--steps 1"),
+    ("spectral_bias", "--signals 3-D", "--signals 3-D"),
+    ("spectral_bias", "--kinds tanh", "--kinds tanh"),
+    ("spectral_bias", "--points 0", "--points 0"),
+    ("spectral_bias", "--pilot 0", "--pilot 0"),
+    ("spectral_bias", "--rates 0.1 -1", "--rates"),
+]
+ROOM = pathlib.Path(__file__).resolve().parents[2] / "experiments"
+
+
+@pytest.mark.parametrize(("name", "words", "said"), TABLE)
+def test_what_cannot_be_is_refused(name, words, said, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(platform, "start_jax", lambda *_: None)
+    monkeypatch.setattr(platform, "CACHE", tmp_path / "cache")
+    monkeypatch.setitem(synthetic.PRESETS, "tiny", scenes.TINY_FILM)
+    monkeypatch.chdir(tmp_path)
+    module = f"experiments.{name}{'.__main__' * (ROOM / name).is_dir()}"
+    out = str(tmp_path / "out")
+    with pytest.raises(SystemExit) as stop:
+        importlib.import_module(module).main(words.replace("OUT", out).split())
+    assert stop.value.code == 2
+    error = " ".join(capsys.readouterr().err.replace("│", " ").split())
+    assert said.replace("OUT", out) in error
+    assert "Traceback" not in error
+    assert not (tmp_path / "out").exists()
