@@ -43,20 +43,15 @@ SHARED = pathlib.Path(__file__).resolve().parents[2] / "shared"
 
 
 # The longest files come first: workers then end together, not half a minute apart.
-# Hostile starts come after three others: one worker compiles what they share, not all
-# at once. They are too long for one worker: what a parameter of the name given stands
+# Hostile starts are too long for one worker: what a parameter of the name given stands
 # for is compiled once, and shared by all tests that have it.
 LONGEST = {
-    "test_rotations.py": (),
-    "test_splat_cases.py": (),
-    "test_elastic_cases.py": (),
+    "test_reconstruct.py": (),
     "test_hostile_fields.py": ("name",),
     "test_hostile_splats.py": ("name",),
-    "test_blow_up.py": (),
-    "test_loss_cases.py": (),
-    "test_rendering_properties.py": (),
-    "test_tracks.py": (),
-    "test_guard.py": (),
+    "test_track_start.py": (),
+    "test_splat_cases.py": (),
+    "test_elastic_cases.py": (),
 }
 
 

@@ -278,7 +278,8 @@ def core_times(settings: Settings, cores: int) -> dict[str, dict]:
 
 def main(arguments=None) -> None:
     """Run the job of the command line."""
-    settings = cli.parse(Settings, arguments)
+    with cli.user_errors():
+        settings = cli.parse(Settings, arguments)
     os.environ.setdefault("PJRT_NPROC", "1")
     os.environ.setdefault("NPROC", "1")
     jax.config.update("jax_numpy_dtype_promotion", "standard")
