@@ -53,19 +53,28 @@ class Settings:
     as_json: bool = False  # one JSON line per case and nothing else
     out: pathlib.Path | None = None  # JSON of all cases
 
+    def __post_init__(self):
+        for case in self.cases:
+            parsed(case)
+
+
+def parsed(case: str) -> tuple[int, int, int]:
+    """Gaussians, width and height of a case; ValueError where it is none."""
+    try:
+        count, size = case.split("@")
+        width, height = size.split("x")
+        return int(count), int(width), int(height)
+    except ValueError:
+        raise ValueError(
+            f"a case is GAUSSIANS@WIDTHxHEIGHT, as 10000@256x256; got {case!r}"
+        ) from None
+
 
 class Case:
     """One scene and the compiled programs that draw it."""
 
     def __init__(self, text: str, scene: dict | None):
-        try:
-            count, size = text.split("@")
-            self.count = int(count)
-            self.width, self.height = (int(part) for part in size.split("x"))
-        except ValueError:
-            raise ValueError(
-                f"a case is GAUSSIANS@WIDTHxHEIGHT, as 10000@256x256; got {text!r}"
-            ) from None
+        self.count, self.width, self.height = parsed(text)
         self.text = text
         self.size = (self.width, self.height)
         scene = scene or make_scene(self.count, self.width, self.height)
