@@ -95,7 +95,6 @@ def displaced(film, rng, turn, shift):
     [
         (0.02, 0.01, 400),
         pytest.param(0.02, 0.0, 5000, marks=pytest.mark.full),
-        pytest.param(0.0, 0.01, 5000, marks=pytest.mark.full),
     ],
 )
 def test_a_displaced_camera_is_found_again(capture, rng, turn, shift, most_pixels):

@@ -32,26 +32,12 @@ NOBODY = TrainState((), (), (), jnp.zeros((), jnp.int32), jax.random.key(0))
 ALWAYS = {"heldout.psnr", "heldout.ssim"}
 MASKED = {f"heldout.{name}" for name in ("moving_psnr", "moving_ssim", "still_psnr")}
 DEPTHS = {
-    f"heldout.{name}"
-    for name in (
-        "depth_abs_rel",
-        "depth_within_delta",
-        "depth_median",
-        "depth_rmse",
-        "moving_depth_median",
-        "moving_depth_rmse",
-    )
+    *(f"heldout.depth_{kind}" for kind in ("abs_rel", "within_delta")),
+    *(f"heldout.{of}depth_{k}" for of in ("", "moving_") for k in ("median", "rmse")),
 }
 TRUTH = {
-    "flow.epe",
-    "flow.outliers",
-    "flow.missing",
-    "flow.moving_epe",
-    "tracks.epe",
-    "tracks.still_epe",
-    "tracks.correct",
-    "tracks.lost",
-    "tracks.drift",
+    *(f"flow.{kind}" for kind in ("epe", "outliers", "missing", "moving_epe")),
+    *(f"tracks.{kind}" for kind in ("epe", "still_epe", "correct", "lost", "drift")),
 }
 
 

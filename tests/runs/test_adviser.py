@@ -10,33 +10,15 @@ from nerfies_jax.runs import adviser, representations
 from nerfies_jax.training import specs
 from tests import scenes
 
-EFFECTS = (
-    "motion",
-    "appearance codes",
-    "transient objects",
-    "start from points",
-    "background points",
-    "depth",
-)
+EFFECTS = ("motion", "appearance_codes", "transient_objects")
+EFFECTS += ("start_from_points", "background_points", "depth")
 
 
 def findings(**wanted):
     """Findings by effect, words joined by underscores; None cannot be told."""
-    return tuple(
-        Finding(
-            name.replace("_", " "),
-            "",
-            "",
-            choice,
-            CANNOT_TELL if choice is None else CERTAIN,
-        )
-        for name, choice in wanted.items()
-    )
-
-
-def decided(choices):
-    names = (name.replace(" ", "_") for name in EFFECTS)
-    return findings(**dict(zip(names, choices, strict=True)))
+    told = {True: CERTAIN, False: CERTAIN, None: CANNOT_TELL}
+    named = ((name.replace("_", " "), choice) for name, choice in wanted.items())
+    return tuple(Finding(name, "", "", choice, told[choice]) for name, choice in named)
 
 
 @pytest.mark.parametrize("full", [False, True])
@@ -46,7 +28,9 @@ def test_all_decisions_lead_to_a_model_that_can_be_built(name, full):
     capture = scenes.tiny_capture()
     built = set()
     for choices in itertools.product((True, False, None), repeat=len(EFFECTS)):
-        advice = adviser.advise(decided(choices), kind, full)
+        advice = adviser.advise(
+            findings(**dict(zip(EFFECTS, choices, strict=True))), kind, full
+        )
         if advice.arguments() in built:
             continue
         built.add(advice.arguments())

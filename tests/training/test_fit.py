@@ -66,24 +66,18 @@ def test_a_camera_moves_as_its_matrix_does(float64):
     np.testing.assert_allclose(cameras.world_from_camera(moved), exact, atol=1e-11)
 
 
-@pytest.mark.parametrize(
-    "unknowns", [FOCAL, pytest.param(("angular", "linear"), marks=pytest.mark.full)]
-)
-def test_a_disturbed_camera_is_found_again_from_its_pixels(unknowns, dtype, rng):
+def test_a_disturbed_camera_is_found_again_from_its_pixels(dtype, rng):
     truth, points = scene_camera(dtype), scene_points(rng, dtype)
     seen = pixels(truth, points)
     start = MOVE(truth, ANGULAR.astype(dtype), LINEAR.astype(dtype))
-    if "focal" in unknowns:
-        start = start._replace(focal_px=start.focal_px * 1.2)
-    found = refine(start, points, seen, CameraSpec(unknowns=unknowns))
+    start = start._replace(focal_px=start.focal_px * 1.2)
+    found = refine(start, points, seen, CameraSpec(unknowns=FOCAL))
     assert found.converged
     assert found.residual < {"float32": 1e-4, "float64": 1e-7}[dtype]
     # float32: an ulp of a pixel, 4e-6 px, over 80 px per rad, times the conditioning
     limit = {"float32": 2e-5, "float64": 1e-7}[dtype]
     assert max(pose_error(found.value, truth)) < limit
     assert abs(found.value.focal_px / truth.focal_px - 1) < limit
-    if "focal" not in unknowns:
-        assert found.value.focal_px == start.focal_px
 
 
 @pytest.mark.full
@@ -106,6 +100,7 @@ def test_noisy_pixels_give_the_least_squares_camera_of_scipy(float64, rng):
     )
     rms = np.sqrt(np.mean(exact.fun**2))
     assert found.residual == pytest.approx(rms, rel=1e-9)
+    assert found.value.focal_px == start.focal_px
     # SciPy's slopes are differences; the optimum is flat to their 1e-6
     np.testing.assert_allclose(found.value.position, exact.x[3:], atol=1e-5)
 
@@ -237,13 +232,13 @@ def test_a_bad_start_comes_back_flagged(solver, dtype):
 
 @pytest.mark.full
 @pytest.mark.parametrize("solver", CODE_SOLVERS)
-def test_a_solve_cut_short_is_flagged_and_no_worse_than_its_start(solver, dtype):
+def test_a_solve_cut_short_is_flagged_and_no_worse_than_its_start(solver):
     """The loss is finite only left of 1, close to where the descent leads."""
 
     def loss(code):
         return jnp.sum(-jnp.log(1 - code) - 300 * code)
 
-    start = np.asarray([0.5, -3.0], dtype)
+    start = np.float32([0.5, -3.0])
     value = jax.jit(loss)
     found = jax.jit(lambda start: fit_code(loss, start, solver, 3, 1e-6))(start)
     assert not found.converged
@@ -253,17 +248,17 @@ def test_a_solve_cut_short_is_flagged_and_no_worse_than_its_start(solver, dtype)
 
 @pytest.mark.parametrize("solver", CODE_SOLVERS)
 @pytest.mark.full
-def test_many_codes_are_fitted_as_one_batch(solver, dtype):
+def test_many_codes_are_fitted_as_one_batch(solver):
     """And the loss may close over what is mapped or traced."""
-    targets = np.asarray([[0.1, 0.2], [-0.3, 0.4], [0.0, 0.0]], dtype)
+    targets = np.float32([[0.1, 0.2], [-0.3, 0.4], [0.0, 0.0]])
 
     @jax.jit
     def fit_all(targets):
         def one(target):
             def loss(code):
-                return jnp.sum((code - target) ** 2 * jnp.asarray([1, 4], dtype))
+                return jnp.sum((code - target) ** 2 * jnp.float32([1, 4]))
 
-            return fit_code(loss, jnp.zeros(2, dtype), solver, 400, 1e-3)
+            return fit_code(loss, jnp.zeros(2), solver, 400, 1e-3)
 
         return jax.vmap(one)(targets)
 
