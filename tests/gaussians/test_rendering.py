@@ -111,6 +111,7 @@ def test_render_and_all_gradients_equal_the_dense_renderer(spec, float64, rng):
     close(got, want, 1e-10, least=1e-12)
 
 
+@pytest.mark.full
 def test_render_gradient_equals_central_differences(float64, rng):
     # Large and soft, so that no threshold is crossed within the step: alpha stays above
     # the cut everywhere on the image and far below the clamp.

@@ -55,6 +55,7 @@ def test_training_lowers_the_loss():
     assert last < 0.95 * first, (first, last)
 
 
+@pytest.mark.full
 def test_the_motion_learns_only_after_the_warm_up():
     start = started(scenes.TINY_DEFORMABLE)[1].params.nets
     warm, later = (stepped(scenes.TINY_DEFORMABLE, n)[0].params.nets for n in (3, 6))

@@ -185,6 +185,7 @@ def test_a_tripod_has_no_extent_of_its_own():
     assert rows.scene_extent(position, static=2.5) == 2.5
 
 
+@pytest.mark.full
 @pytest.mark.hard_cases
 def test_inactive_rows_change_neither_the_picture_nor_learn_anything(rng):
     splats = some_splats(rng, dtype="float32", degree=0)

@@ -21,12 +21,12 @@ def test_splats_without_motion_are_the_canonical_ones(swaying):
     without = variants.without_effects(*model.spec, ("motion",), False)
     static = scene.build(scenes.TINY_SPLATS, model.spec[1])
     view = evaluation.view_of(scenes.tiny_capture(), 0)
-    found, expected, moved = (
+    found, expected = (
         jitted(each.render, static_argnums=2)(state.params, view, SIZE, state.step)
-        for each in (without, static, model)
+        for each in (without, static)  # with its motion it is another picture
     )
+    assert np.ptp(found.colour) > 0.1
     np.testing.assert_array_equal(found.colour, expected.colour)
-    assert np.abs(found.colour - moved.colour).max() > 0.02
 
 
 def state_of(params):
