@@ -148,6 +148,7 @@ def test_what_is_not_filmed_does_not_count(capture, rng):
     assert np.abs(apart).max() < 2e-3
 
 
+@pytest.mark.full
 def test_an_empty_scene_finds_no_camera(capture):
     blank = MODEL._replace(
         render=lambda params, view, size, step: Rendering(

@@ -217,12 +217,10 @@ def test_the_last_band_is_fast_enough_and_the_one_before_is_not(cycles):
     assert bands == 1 or 2 ** (bands - 2) < 2 * np.pi * cycles
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("turn", "answer"),
-    [
-        (0.0, (False, LIKELY)),
-        pytest.param(0.9, (True, CERTAIN), marks=pytest.mark.full),
-    ],
+    [(0.0, (False, LIKELY)), (0.9, (True, CERTAIN))],
     ids=["at rest", "turning"],
 )
 def test_outlines_tell_motion_where_no_flow_can(turn, answer):
