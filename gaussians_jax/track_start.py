@@ -18,7 +18,7 @@ from gaussians_jax.initialisation import StartSpec
 from gaussians_jax.path_fit import Points
 from gaussians_jax.splats import Params
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.evidence import rigid_groups, view_set
+from nerfies_jax.evidence import record, rigid_groups, view_set
 from nerfies_jax.evidence.record import Evidence
 from nerfies_jax.training.effects import Effect
 
@@ -152,7 +152,7 @@ def _at_knots(track, times, motion):
 
 def _seeds(effect, points, evidence, capture, times, unit, spec):
     """Moving pixels of all frames, lifted, and carried back to the canonical places."""
-    views = view_set.in_time_order(capture)
+    views = view_set.in_time_order(record.looked_at(capture, evidence.factor))
     rng = np.random.default_rng(0)
     depth = moving_depths(evidence)
     frame, row, column = np.nonzero(depth > 0)

@@ -7,6 +7,7 @@ paths in space, and points that stand still: host side, one core, no gradients.
 """
 
 import hashlib
+import math
 import os
 import pathlib
 import tempfile
@@ -15,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.ndimage as nd
 
+from nerfies_jax.capture import capture as captures
 from nerfies_jax.capture import pinholes
 from nerfies_jax.capture.capture import Capture, PointCloud
 from nerfies_jax.evidence import (
@@ -36,6 +38,7 @@ VERSION = 1  # of the file; counts up whenever the same pictures would say other
 SHORTEST_PATH, SHORTEST_FILM = 10, 6
 MOVES = 0.5  # score from which a track counts as moving
 MOST_PATHS = 1500
+MOST_PIXELS = 16_000_000  # of all frames: 17 bytes each for the flow between them
 # Where less of the pictures can be carried to the next frame, tracks are chance: a
 # camera that jumps. Films keep 0.85 and more.
 LEAST_CARRIED = 0.4
@@ -54,6 +57,7 @@ class Evidence(NamedTuple):
     paths: Paths
     still: PointCloud
     unusable: str  # why tracks say nothing of the motion; empty where they do
+    factor: int  # of the capture's pixels for one of these
 
 
 def gather(capture: Capture, use_depths: bool = False) -> Evidence:
@@ -61,7 +65,8 @@ def gather(capture: Capture, use_depths: bool = False) -> Evidence:
 
     With `use_depths` paths lean on the capture's own depths where it has them.
     """
-    capture = pinholes.as_pinholes(capture)
+    factor = _factor(capture)
+    capture = looked_at(capture, factor)
     views = view_set.in_time_order(capture)
     pictures = dense_flow.levelled(views)
     flow = dense_flow.between_neighbours(views, pictures)
@@ -86,8 +91,28 @@ def gather(capture: Capture, use_depths: bool = False) -> Evidence:
     )
     dense = still_points.dense(views, flow, mask)
     return Evidence(
-        views.row, flow, mask, tracks, score, rest, which, found, dense, unusable
+        row=views.row,
+        flow=flow,
+        moving=mask,
+        tracks=tracks,
+        score=score,
+        rest=rest,
+        moved=which,
+        paths=found,
+        still=dense,
+        unusable=unusable,
+        factor=factor,
     )
+
+
+def looked_at(capture: Capture, factor: int) -> Capture:
+    """The capture in whose pixels evidence is given: pinholes, made smaller."""
+    return captures.downscale(pinholes.as_pinholes(capture), factor)
+
+
+def _factor(capture):
+    width, height = capture.size
+    return math.ceil(math.sqrt(len(capture.train) * width * height / MOST_PIXELS))
 
 
 def _unusable(views, flow):
@@ -197,7 +222,7 @@ def load(path: pathlib.Path) -> Evidence:
             parts[name] = kinds[name](*(arrays[f"{name}.{key}"] for key in fields))
         else:
             parts[name] = arrays[name]
-    parts["unusable"] = str(parts["unusable"])
+    parts["unusable"], parts["factor"] = str(parts["unusable"]), int(parts["factor"])
     flow = parts["flow"]
     parts["flow"] = flow._replace(
         forward=flow.forward.astype(np.float32),

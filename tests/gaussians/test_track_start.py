@@ -192,3 +192,18 @@ def test_a_film_without_tracks_starts_from_rest_and_says_why(tmp_path, monkeypat
 def test_starts_that_cannot_be_are_refused(changes, words):
     with pytest.raises(ValueError, match=words):
         StartSpec(**changes)
+
+
+@pytest.mark.full
+def test_large_films_are_looked_at_smaller(monkeypatch):
+    monkeypatch.setattr(record, "MOST_PIXELS", FRAMES * 96 * 72 // 3)
+    capture = films.film(**MOVES, frames=FRAMES)
+    evidence = record.gather(capture)
+    assert evidence.factor == 2
+    assert evidence.moving.shape[1:] == (36, 48)
+    effect = effect_of(MOTIONS["bases"])
+    start = StartSpec(motion="tracks", moving_points=50, fit_steps=100)
+    found = track_start.start(
+        start, effect, MOTIONS["bases"], evidence, capture, jax.random.key(0)
+    )
+    assert abs(np.median(found.position[:, 2]) - films.NEAR) < 0.3  # the wall: 0.7
