@@ -198,3 +198,8 @@ def test_the_slope_of_the_error_is_that_of_both_representations(kind, float64):
     # A Gaussian enters or leaves a pixel by less than 1/255 of its colour.
     bound = {"gaussians": 1e-4, "radiance": 1e-6}[kind]
     assert gradients.directional_error(loss, screw, step=1e-6) < bound
+
+
+def test_a_fit_takes_a_step_at_least():
+    with pytest.raises(ValueError, match="max_steps=0"):
+        CameraFitSpec(max_steps=0)

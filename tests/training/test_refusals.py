@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nerfies_jax.evaluation.fitted_cameras import CameraFitSpec
 from nerfies_jax.training import losses, schedules
 from nerfies_jax.training.fit import CameraSpec, fit_code
 from nerfies_jax.training.tracks import InverseSpec, point_tracks
@@ -53,7 +52,6 @@ REFUSED = [
     (lambda: fit_code(jnp.sum, WHOLE), r"one floating dtype, got \['int32'\]"),
     (lambda: fit_code(jnp.sum, (TWO, HALF)), "float16"),
     (lambda: fit_code(jnp.sum, TWO, max_steps=0), "max_steps=0"),
-    (lambda: CameraFitSpec(max_steps=0), "max_steps=0"),
 ]
 
 
