@@ -9,7 +9,7 @@ from nerfies_jax.evidence import inspection
 from nerfies_jax.evidence.findings import CERTAIN
 
 # Two effects that only one scene has, and motion; the rest holds in all of them. Those
-# left out move as the last three do, and slower.
+# left out differ in how things move, not in what is to be decided.
 SCENES = ("static", "fast", "exposure", "transient")
 
 
