@@ -39,6 +39,14 @@ if hasattr(signal, "SIGHUP"):  # not on Windows
 
 pytest_plugins = ["tests.budget"]
 
+# What pytest runs by default. Its programs are compiled roughly, in half the time;
+# all other tests are compiled as users' programs are.
+CORE = "not full and not slow"
+ROUGH = (
+    "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true "
+    "--xla_cpu_use_fusion_emitters=false"
+)
+
 SHARED = pathlib.Path(__file__).resolve().parents[2] / "shared"
 
 
@@ -53,6 +61,12 @@ LONGEST = {
     "test_splat_cases.py": (),
     "test_elastic_cases.py": (),
 }
+
+
+def pytest_configure(config):
+    # The flags are read when the first array is made.
+    if config.getoption("markexpr") == CORE and "XLA_FLAGS" not in os.environ:
+        os.environ["XLA_FLAGS"] = ROUGH
 
 
 # First: xdist reads the groups in its own, later, turn.

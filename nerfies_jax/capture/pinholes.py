@@ -3,7 +3,6 @@
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from nerfies_jax.capture import resampling
@@ -63,6 +62,14 @@ def as_pinholes(capture: Capture) -> Capture:
     )
 
 
+@jax.jit
+def _bent(radial, tangential, slopes):
+    """Distorted slopes, and whether the lens has them once."""
+    each = (None, None, 0)
+    bent = jax.vmap(distortion.distort, each)(radial, tangential, slopes)
+    return bent, jax.vmap(distortion.one_to_one, each)(radial, tangential, slopes)
+
+
 def _source_pixels(camera, size):
     """Where each pinhole pixel lies in the filmed picture, and whether it does.
 
@@ -74,12 +81,8 @@ def _source_pixels(camera, size):
     offset = np.asarray(rays.pixel_centres(size)) - centre
     y = offset[..., 1] / (focal * aspect)
     x = (offset[..., 0] - skew * y) / focal
-    slopes = jnp.asarray(np.stack([x, y], axis=-1).reshape(-1, 2), jnp.float32)
-    radial, tangential = jnp.asarray(camera.radial), jnp.asarray(camera.tangential)
-    bent = jax.vmap(lambda slope: distortion.distort(radial, tangential, slope))(slopes)
-    single = jax.vmap(lambda slope: distortion.one_to_one(radial, tangential, slope))(
-        slopes
-    )
+    slopes = np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float32)
+    bent, single = _bent(camera.radial, camera.tangential, slopes)
     bent = np.where(np.asarray(single)[:, None], np.asarray(bent), np.nan)
     bent = bent.reshape(size[1], size[0], 2)
     across = focal * bent[..., 0] + skew * bent[..., 1]

@@ -5,13 +5,10 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from nerfies_jax.capture import pinholes
 from nerfies_jax.geometry import camera as cameras
 from tests import scenes
-
-pytestmark = pytest.mark.full  # seventy operations, each compiled by itself
 
 
 def through_a_lens(capture, radial, tangential=(0.0, 0.0)):

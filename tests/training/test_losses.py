@@ -94,7 +94,7 @@ def test_constant_images_a_little_apart_have_the_exact_slope(dtype):
     luminance = x**2 + y**2 + 1e-4
     exact = 2 * (x - y) / luminance - (x - y) ** 2 * 2 * x / luminance**2
     # A uniform shift changes luminance alone; structure must add nothing.
-    assert abs(grad.sum() / exact - 1) < {"float32": 2e-4, "float64": 1e-10}[dtype]
+    assert abs(grad.sum() / exact - 1) < {"float32": 3e-4, "float64": 1e-10}[dtype]
 
 
 @pytest.mark.hard_cases
