@@ -46,7 +46,8 @@ def run(tmp_path_factory):
     """A short run on a tiny capture, from the command line to its files."""
     folder = tmp_path_factory.mktemp("main job")
     nerfies_format.write(scenes.tiny_capture(), folder / "filmed")
-    words = (folder / "filmed", "--steps", 12, "--out", folder / "run")
+    words = (folder / "filmed", "--preset", "splats-deformable-small")
+    words = (*words, "--steps", 12, "--out", folder / "run")
     assert ended(*words, "--set", *QUICK) == 0
     return folder / "run"
 
@@ -253,7 +254,15 @@ def test_a_killed_run_resumes_to_the_same_bits(left, run, tmp_path, capsys):
 def test_a_stopped_run_resumes_to_its_end(run, tmp_path, capsys):
     folder = tmp_path / "stopped"
     filmed = runs.saved_run(run).config.source.capture
-    common = [filmed, "--steps", "12", "--out", folder]
+    common = [
+        filmed,
+        "--preset",
+        "splats-deformable-small",
+        "--steps",
+        "12",
+        "--out",
+        folder,
+    ]
     assert ended(*common, "--seconds", "0.001", "--set", *QUICK) == 0
     stopped = json.loads((folder / "metrics.json").read_text())["train.steps"]
     assert stopped < 12
