@@ -23,7 +23,8 @@ from gaussians_jax import learning_rates as splat_rates
 from gaussians_jax import presets as splat_presets
 from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec
-from gaussians_jax.initialisation import InitSpec
+from gaussians_jax.effects.se3_bases import SE3BasesSpec
+from gaussians_jax.initialisation import InitSpec, StartSpec
 from gaussians_jax.splats import Params
 from nerfies_jax import presets as field_presets
 from nerfies_jax.geometry import rays
@@ -120,6 +121,8 @@ def tiny_splats(name):
         motion = shrunk(motion, embedding=4, time_code=3, hidden=(6,), kernels=3)
     elif isinstance(motion, MotionSpec):
         motion = shrunk(motion, position=FEW, time=FEW, depth=1, width=8, skips=())
+    elif isinstance(motion, SE3BasesSpec):
+        motion = shrunk(motion, bases=2, knots=3)
     else:
         motion = shrunk(
             motion,
@@ -136,6 +139,7 @@ def tiny_splats(name):
     return dataclasses.replace(
         spec,
         init=InitSpec(random=100, min_points=1000),
+        start=StartSpec(motion="none"),
         sh_degree=1,
         densification=shrunk(spec.densification, cap_max=256),
         motion=motion,

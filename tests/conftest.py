@@ -39,9 +39,8 @@ if hasattr(signal, "SIGHUP"):  # not on Windows
 
 pytest_plugins = ["tests.budget"]
 
-# What pytest runs by default. Its programs are compiled roughly, in half the time;
-# all other tests are compiled as users' programs are.
-CORE = "not full and not slow"
+# Programs are compiled roughly, in half the time, unless hard cases are asked for:
+# `-m hard_cases` runs all of those, of each tier, as users' programs are compiled.
 ROUGH = (
     "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true "
     "--xla_cpu_use_fusion_emitters=false"
@@ -65,8 +64,8 @@ LONGEST = {
 
 def pytest_configure(config):
     # The flags are read when the first array is made.
-    if config.getoption("markexpr") == CORE and "XLA_FLAGS" not in os.environ:
-        os.environ["XLA_FLAGS"] = ROUGH
+    if config.getoption("markexpr") != "hard_cases":
+        os.environ.setdefault("XLA_FLAGS", ROUGH)
 
 
 # First: xdist reads the groups in its own, later, turn.

@@ -10,9 +10,16 @@ import pytest
 
 from gaussians_jax import presets as splat_presets
 from gaussians_jax import scene as splat_scene
-from gaussians_jax.effects import kan_motion, mlp_motion, motion_basis, spectral
+from gaussians_jax.effects import (
+    kan_motion,
+    mlp_motion,
+    motion_basis,
+    se3_bases,
+    spectral,
+)
 from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec
+from gaussians_jax.effects.se3_bases import SE3BasesSpec
 from nerfies_jax import field as fields
 from nerfies_jax import presets as field_presets
 from nerfies_jax.effects import ambient, scene_flow, transient, warp
@@ -122,6 +129,9 @@ def test_splats_have_the_arrays_of_what_they_have_and_no_others(preset):
         elif isinstance(motion, KanMotionSpec):
             rows.add("kan_motion")
             nets["kan_motion"] = kan_motion.init(key, motion, metadata.frames)
+        elif isinstance(motion, SE3BasesSpec):
+            rows.add("se3_bases")
+            nets["se3_bases"] = se3_bases.init(key, motion)
         elif motion is not None:
             nets["motion_basis"] = motion_basis.init(key, motion)
         if spec.spectral is not None:

@@ -150,6 +150,10 @@ def test_a_depth_that_is_not_asked_for_changes_nothing_else(rng):
 
     blind, seeing = draw(False), draw(True)
     assert blind.rendering.depth is None
-    np.testing.assert_array_equal(blind.rendering.colour, seeing.rendering.colour)
-    np.testing.assert_array_equal(blind.rendering.alpha, seeing.rendering.alpha)
-    np.testing.assert_array_equal(blind.features, seeing.features)
+    for one, other in (
+        (blind.rendering.colour, seeing.rendering.colour),
+        (blind.rendering.alpha, seeing.rendering.alpha),
+        (blind.features, seeing.features),
+    ):
+        # Two programs: the compiler may order their sums otherwise.
+        np.testing.assert_allclose(one, other, atol=1e-6)
