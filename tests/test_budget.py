@@ -10,12 +10,12 @@ GRANTED = {("core", "a.py"): (100, 10.0), ("full", "a.py"): (10, 1.0)}
 @pytest.mark.parametrize(
     ("spent", "words"),
     [
-        ({("core", "a.py"): (145, 29.0)}, []),
+        ({("core", "a.py"): (185, 69.0)}, []),
         (
-            {("core", "a.py"): (146, 29.0)},
-            ["a.py (core): 146 programs for 145 at most"],
+            {("core", "a.py"): (186, 69.0)},
+            ["a.py (core): 186 programs for 185 at most"],
         ),
-        ({("full", "a.py"): (10, 13.0)}, ["a.py (full): 13 processor seconds for 12"]),
+        ({("full", "a.py"): (10, 35.0)}, ["a.py (full): 35 processor seconds for 34"]),
         ({("core", "b.py"): (1, 0.1)}, ["b.py (core) is not in budget.json"]),
     ],
 )
