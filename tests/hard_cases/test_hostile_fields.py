@@ -15,9 +15,6 @@ from tests.hard_cases import field_starts, hostile, linear_warps, tiny_fields
 from tests.hard_cases.field_starts import Start
 from tests.hard_cases.linear_warps import DISPLACEMENTS
 
-pytestmark = pytest.mark.hard_cases
-
-
 STARTS = field_starts.OF_FRAMES | field_starts.OF_FILMS | field_starts.OF_PARAMETERS
 # A field compiles in 15 to 45 s.
 QUICK = ("nerf-w",)

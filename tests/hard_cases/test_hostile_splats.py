@@ -18,7 +18,7 @@ from nerfies_jax.training.model import Frames, Model, TrainState, View
 from tests import scenes
 from tests.hard_cases import hostile
 
-pytestmark = [pytest.mark.hard_cases, pytest.mark.full]
+pytestmark = pytest.mark.full
 
 STEPS = 200
 TINY = {

@@ -15,7 +15,7 @@ from tests.hard_cases import hostile, linear_warps, tiny_fields
 from tests.hard_cases.linear_warps import CORNERS, DISPLACEMENTS
 
 # The derivatives of the Jacobian take ten seconds to compile.
-pytestmark = [pytest.mark.hard_cases, pytest.mark.slow]
+pytestmark = pytest.mark.slow
 
 
 def all_warps(dtype):

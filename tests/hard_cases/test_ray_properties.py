@@ -15,7 +15,7 @@ from nerfies_jax.radiance import compositing, sampling
 from tests.hard_cases import properties
 from tests.hard_cases.properties import cast, close, compiled, eps, same
 
-pytestmark = [pytest.mark.hard_cases, pytest.mark.full]
+pytestmark = pytest.mark.full
 SAMPLES = 8
 DEPTHS, DISTANCES = properties.optical_depths(), properties.distances()
 

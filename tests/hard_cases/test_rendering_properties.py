@@ -30,7 +30,7 @@ from tests.hard_cases.properties import (
     same,
 )
 
-pytestmark = [pytest.mark.hard_cases, pytest.mark.full]
+pytestmark = pytest.mark.full
 # Without jumps: at the cut a Gaussian's edge is as faint as rounding.
 SMOOTH = RasterSpec(
     alpha_threshold=1e-6, transmittance_threshold=0.0, near=1e-9, far=1e12, chunk=2

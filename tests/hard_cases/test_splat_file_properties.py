@@ -12,7 +12,7 @@ from gaussians_jax import files, model_file, splats
 from gaussians_jax.splats import Params, Splats
 from tests.hard_cases.properties import same
 
-pytestmark = [pytest.mark.hard_cases, pytest.mark.full]
+pytestmark = pytest.mark.full
 LARGEST = float(np.finfo(np.float32).max)
 
 
