@@ -10,10 +10,10 @@ GRANTED = {("core", "a.py"): (100, 10.0), ("full", "a.py"): (10, 1.0)}
 @pytest.mark.parametrize(
     ("spent", "words"),
     [
-        ({("core", "a.py"): (185, 69.0)}, []),
+        ({("core", "a.py"): (275, 69.0)}, []),
         (
-            {("core", "a.py"): (186, 69.0)},
-            ["a.py (core): 186 programs for 185 at most"],
+            {("core", "a.py"): (276, 69.0)},
+            ["a.py (core): 276 programs for 275 at most"],
         ),
         ({("full", "a.py"): (10, 35.0)}, ["a.py (full): 35 processor seconds for 34"]),
         ({("core", "b.py"): (1, 0.1)}, ["b.py (core) is not in budget.json"]),
