@@ -12,7 +12,7 @@ from gaussians_jax.splats import Splats
 from nerfies_jax.capture.capture import Capture, point_depths
 
 SOURCES = ("auto", "points", "random")
-MOTIONS = ("tracks", "none")
+STARTS = ("tracks", "none")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,8 +58,8 @@ class StartSpec:
     use_depths: bool = False
 
     def __post_init__(self):
-        if self.motion not in MOTIONS:
-            raise ValueError(f"unknown motion {self.motion!r}; choose from {MOTIONS}")
+        if self.motion not in STARTS:
+            raise ValueError(f"unknown motion {self.motion!r}; choose from {STARTS}")
         if self.moving_points < 1 or self.fit_steps < 1:
             raise ValueError(
                 "a start from tracks takes at least one moving point and one step, got "

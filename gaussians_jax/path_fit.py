@@ -16,7 +16,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Key
 
 from gaussians_jax import splats
-from gaussians_jax.splats import Gaussians, Params, Splats
+from gaussians_jax.splats import Params, Splats
 from nerfies_jax.training.effects import Effect, FrameCondition
 from nerfies_jax.training.updates import apply_updates
 
@@ -62,15 +62,10 @@ def places(
     effect: Effect, points: Points, time: Float[Array, ""]
 ) -> Float[Array, "points 3"]:
     """Where the motion carries the points at a time."""
-    return carried(effect, points, time).mean
-
-
-def carried(effect: Effect, points: Points, time: Float[Array, ""]) -> Gaussians:
-    """The points as Gaussians at a time."""
     params = scene_of(effect, points)
     ready = None if effect.prepare is None else effect.prepare(params)
     still = splats.activate(params.rows["splats"])
-    return effect.deform(params, still, FrameCondition(time), ready)
+    return effect.deform(params, still, FrameCondition(time), ready).mean
 
 
 def fit(

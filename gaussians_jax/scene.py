@@ -305,6 +305,7 @@ def shuffled_row(
 def estimate_memory_bytes(spec: SplatScene, capture: Capture) -> int:
     """Roughly the memory of the first state and step; host side, nothing allocated."""
     count = initialisation.initial_count(spec.init, capture)
+    count += spec.start.moving_points if spec.start.motion == "tracks" else 0
     harmonics = 3 * (spec.sh_degree + 1) ** 2
     # Parameters, two moments, gradient, update; the tables of one projection.
     numbers = count * (5 * (11 + harmonics) + 60)

@@ -114,10 +114,16 @@ def refuse_what_cannot_train(spec: SplatScene) -> None:
         )
 
 
+# Of a motion's spec, the steps of training, and the capture.
 MOTIONS = {
-    MotionSpec: mlp_motion.effect,
-    KanMotionSpec: kan_motion.effect,
-    BasisMotionSpec: motion_basis.effect,
+    MotionSpec: lambda spec, steps, seen: mlp_motion.effect(spec, steps, seen.frames),
+    KanMotionSpec: lambda spec, steps, seen: kan_motion.effect(
+        spec, steps, seen.frames
+    ),
+    BasisMotionSpec: lambda spec, steps, seen: motion_basis.effect(
+        spec, steps, seen.frames
+    ),
+    SE3BasesSpec: lambda spec, steps, seen: se3_bases.effect(spec, steps, seen.extent),
 }
 
 
@@ -128,10 +134,7 @@ def motion_of(spec: SplatScene, metadata: SceneMetadata) -> Effect | None:
         return None
     if spec.start.motion == "tracks":
         motion = dataclasses.replace(motion, warm_up=0)
-    if isinstance(motion, SE3BasesSpec):
-        return se3_bases.effect(motion, spec.steps, metadata.extent)
-    make = MOTIONS[type(motion)]
-    return make(motion, spec.steps, metadata.frames)
+    return MOTIONS[type(motion)](motion, spec.steps, metadata)
 
 
 def effects_of(spec: SplatScene, metadata: SceneMetadata) -> tuple[Effect, ...]:

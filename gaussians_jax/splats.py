@@ -17,6 +17,7 @@ import numpy as np
 import scipy.spatial
 from jaxtyping import Array, Bool, Float, Int
 
+from nerfies_jax.geometry import quaternion as quaternions
 from nerfies_jax.geometry.camera import Camera
 
 PyTree = Any
@@ -85,6 +86,20 @@ def activate(splats: Splats) -> Gaussians:
         scale=jnp.exp(jnp.clip(splats.log_scale, *LOG_SCALE_RANGE)),
         opacity=jax.nn.sigmoid(splats.opacity_logit),
     )
+
+
+def turned(
+    gaussians: Gaussians, turn: Float[Array, "gaussians 3"]
+) -> Float[Array, "gaussians 4"]:
+    """The rotations of Gaussians, each followed by a turn: exp(turn) q / |q|.
+
+    `turn` are rotation vectors (rad, world axes); the quaternions have length 1.
+    """
+
+    def one(turn, own):
+        return quaternions.multiply(quaternions.exp(turn), quaternions.normalise(own))
+
+    return jax.vmap(one)(turn, gaussians.quaternion)
 
 
 def active_mask(splats: Splats) -> Bool[Array, " gaussians"]:

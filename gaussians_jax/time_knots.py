@@ -144,7 +144,7 @@ def _window(
     u = (held - times[left]) / (times[left + 1] - times[left])
     if interpolation == "linear":
         return left, [1 - u, u]
-    before, here, there, after = _catmull_rom(u)
+    before, here, there, after = catmull_rom(u)
     # In the first and the last interval the missing neighbour is the continuation of
     # the parabola through three knots, 3a - 3b + c: its weight goes to those three.
     first, last = left == 0, left == count - 2
@@ -160,8 +160,13 @@ def _window(
     return start, weights
 
 
-def _catmull_rom(u):
-    """Weights of four even knots at the share `u` between the middle two."""
+def catmull_rom(
+    u: Float[Array, ""],
+) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    """Weights of four even knots at the share `u` between the middle two.
+
+    At 0 and 1 exactly those of one knot. Catmull and Rom 1974, tension 1/2.
+    """
     return (
         u * (u * (2 - u) - 1) / 2,
         (u * u * (3 * u - 5) + 2) / 2,

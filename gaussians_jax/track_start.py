@@ -19,6 +19,7 @@ from gaussians_jax.path_fit import Points
 from gaussians_jax.splats import Params
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evidence import record, rigid_groups, view_set
+from nerfies_jax.evidence.moving import picture_scale
 from nerfies_jax.evidence.record import Evidence
 from nerfies_jax.training.effects import Effect
 
@@ -216,7 +217,7 @@ def moving_depths(evidence: Evidence) -> np.ndarray:
         tree = cKDTree(tracks.pixel[here, frame])
         distance, near = tree.query(np.stack([column, row], -1) + 0.5, DEPTH_TRACKS)
         depth = np.median(evidence.paths.depth[here, frame][near], axis=1)
-        depth[distance[:, 0] > DEPTH_REACH_PX * max(1.0, mask.shape[1] / 176)] = 0
+        depth[distance[:, 0] > DEPTH_REACH_PX * picture_scale(mask.shape[1])] = 0
         found[frame, row, column] = depth
     return found
 

@@ -29,6 +29,7 @@ from experiments.hard_cases import (
     geometry,
     losses,
     networks,
+    pictures,
     quaternions,
     report,
     rotations,
@@ -47,7 +48,7 @@ ROOMS = {
     "encodings": (encodings.CASES, "test_encoding_cases.py"),
     "volume": (volume.CASES, "test_volume_cases.py"),
     "networks": (networks.CASES, "test_network_cases.py"),
-    "losses": (losses.CASES, "test_loss_cases.py"),
+    "losses": (losses.CASES + pictures.CASES, "test_loss_cases.py"),
     "splats": (footprints.CASES + splats.CASES, "test_splat_cases.py"),
 }
 JITTER = 1e-3  # of the timed inputs, so that rows differ

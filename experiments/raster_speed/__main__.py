@@ -85,12 +85,16 @@ class Case:
         return (*self.footprints[:3], self.values, self.footprints)
 
     def forward(self, drawing=raster.rasterise, **sizes):
+        """The compiled drawing; takes footprints and values."""
+
         def draw(footprints, values):
             return drawing(footprints, values, self.size, SPEC, **sizes)
 
         return jax.jit(draw).lower(self.footprints, self.values).compile()
 
     def gradient(self, drawing=raster.rasterise, cameras=None, **sizes):
+        """The compiled slopes of the summed picture by all that is drawn."""
+
         def loss(mean_px, whitening, opacity, values, footprints):
             moved = footprints._replace(
                 mean_px=mean_px, whitening=whitening, opacity=opacity
@@ -148,6 +152,7 @@ def footprints_of(scene: dict) -> Footprints:
 
 
 def median_ms(call, *arguments, repeats: int, clock=time.process_time) -> float:
+    """Milliseconds of a call, the median of `repeats` after one that warms up."""
     jax.block_until_ready(call(*arguments))
     times = []
     for _ in range(repeats):
@@ -169,6 +174,7 @@ def exponential_limit_ns(repeats: int) -> float:
 
 
 def yardstick_times(script: pathlib.Path, text: str, scene_file: str) -> dict:
+    """What the other rasteriser took for the scene; `text` is "COUNT@SIZE"."""
     count, size = text.split("@")
     command = [sys.executable, str(script), "--gaussians", count, "--size", size]
     command += ["--scene", scene_file, "--json"]

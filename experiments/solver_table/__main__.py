@@ -120,6 +120,7 @@ def table(task: Problem, settings: Settings) -> list[SolverResult]:
 
 
 def text(rows: list[SolverResult], frames: int) -> str:
+    """The table in plain text, a line for each solver."""
     head = (
         f"{'solver':<20}{'at most':>8}{'steps':>7}{'ms':>9}{'CPU ms':>9}"
         f"{'loss':>11}{'excess':>10}{'distance':>10}{'done':>7}"

@@ -21,7 +21,6 @@ from jaxtyping import Array, Bool, Float, Key
 from gaussians_jax import splats
 from gaussians_jax.effects.blocks import in_blocks
 from gaussians_jax.splats import Gaussians, Params
-from nerfies_jax.geometry import quaternion
 from nerfies_jax.nets import codes, kan, mlp
 from nerfies_jax.nets.kan import KAN, KANSpec
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
@@ -310,12 +309,8 @@ def apply(gaussians: Gaussians, offsets: Offsets) -> Gaussians:
         factor = jnp.exp(jnp.clip(offsets.log_scale, *splats.LOG_SCALE_RANGE))
         gaussians = gaussians._replace(scale=gaussians.scale * factor)
     if offsets.turn is not None:
-
-        def turned(turn, own):
-            return quaternion.multiply(quaternion.exp(turn), quaternion.normalise(own))
-
         gaussians = gaussians._replace(
-            quaternion=jax.vmap(turned)(offsets.turn, gaussians.quaternion)
+            quaternion=splats.turned(gaussians, offsets.turn)
         )
     return gaussians
 

@@ -20,7 +20,6 @@ from gaussians_jax.effects import mlp_motion
 from gaussians_jax.effects.blocks import in_blocks
 from gaussians_jax.effects.mlp_motion import SmoothingSpec
 from gaussians_jax.splats import Gaussians, Params
-from nerfies_jax.geometry import quaternion
 from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
@@ -321,14 +320,10 @@ def apply(gaussians: Gaussians, offsets: Offsets) -> Gaussians:
     q + dq = 0 rounding then decides the rotation (1e-4 rad at |q + dq| = 1e-3). The
     logarithm of the factor of the scale is held to the range of the scale's own.
     """
-
-    def turned(turn, rotation):
-        return quaternion.multiply(quaternion.exp(turn), quaternion.normalise(rotation))
-
     factor = jnp.exp(jnp.clip(offsets.log_scale, *splats.LOG_SCALE_RANGE))
     return Gaussians(
         mean=gaussians.mean + offsets.mean,
-        quaternion=jax.vmap(turned)(offsets.turn, gaussians.quaternion),
+        quaternion=splats.turned(gaussians, offsets.turn),
         scale=gaussians.scale * factor,
         opacity=gaussians.opacity,
     )

@@ -14,8 +14,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
+from gaussians_jax import splats, time_knots
 from gaussians_jax.splats import Gaussians, Params, Splats
-from nerfies_jax.geometry import lie, quaternion
+from nerfies_jax.geometry import lie
 from nerfies_jax.training import schedules
 from nerfies_jax.training.effects import Effect, FrameCondition
 
@@ -96,12 +97,9 @@ def between_knots(
     left = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, last - 1)
     part = place - left.astype(place.dtype)
     rows = jnp.clip(left + jnp.arange(-1, 3, dtype=jnp.int32), 0, last)
-    before, start, end, after = jnp.moveaxis(table[:, rows], 1, 0)
-    # Horner's form about the left knot: the start itself is added last, unrounded.
-    slope = 0.5 * (end - before)
-    curve = before - 2.5 * start + 2 * end - 0.5 * after
-    twist = 0.5 * (after - before) + 1.5 * (start - end)
-    return start + part * (slope + part * (curve + part * twist))
+    read = jnp.moveaxis(table[:, rows], 1, 0)
+    weights = time_knots.catmull_rom(part)
+    return sum(weight * knot for weight, knot in zip(weights, read, strict=True))
 
 
 def at_time(bases: Bases, time: Float[Array, ""]) -> Motion:
@@ -134,13 +132,7 @@ def deform(
     linear = linear.reshape(-1, 3, 3)
     mean = gaussians.mean
     moved = mean + (jnp.einsum("nij,nj->ni", linear, mean) + offset)
-
-    def turned(turn, own):
-        return quaternion.multiply(quaternion.exp(turn), quaternion.normalise(own))
-
-    return gaussians._replace(
-        mean=moved, quaternion=jax.vmap(turned)(turn, gaussians.quaternion)
-    )
+    return gaussians._replace(mean=moved, quaternion=splats.turned(gaussians, turn))
 
 
 def effect(spec: SE3BasesSpec, steps: int, extent: float) -> Effect:

@@ -6,7 +6,7 @@ import scipy.sparse as sparse
 from scipy.spatial import cKDTree
 
 from nerfies_jax.evidence.rest_points import RestPoints
-from nerfies_jax.evidence.tracks import Tracks
+from nerfies_jax.evidence.tracks import Tracks, pixel_of
 from nerfies_jax.evidence.view_set import Views
 
 # A track is as far off a point at rest as in the frames where it is worst but for three
@@ -75,10 +75,9 @@ def mask(views: Views, tracks: Tracks, score: np.ndarray) -> np.ndarray:
         colour = cv2.cvtColor(views.image[frame], cv2.COLOR_RGB2LAB).astype(np.float32)
         own = colour[at[:, 1], at[:, 0]]
         place = tracks.pixel[here, frame]
-        inside = np.clip(np.floor(place).astype(int), 0, [width - 1, height - 1])
-        theirs = colour[inside[:, 1], inside[:, 0]]
+        theirs = colour[pixel_of(place, (height, width))]
         distance, near = cKDTree(place).query(at + 0.5 * part, VOTES)
-        distance = distance / _scale(views)
+        distance = distance / picture_scale(width)
         unlike = np.linalg.norm(own[:, None] - theirs[near], axis=-1) / VOTE_COLOUR
         weight = np.exp(-0.5 * ((distance / VOTE_PX) ** 2 + unlike**2))
         weight = weight + 1e-9 * np.exp(-distance / VOTE_PX)
@@ -89,9 +88,9 @@ def mask(views: Views, tracks: Tracks, score: np.ndarray) -> np.ndarray:
     return found
 
 
-def _scale(views):
-    """Pixels of these views for one of a picture 176 wide, where constants were set."""
-    return max(1.0, views.size[0] / 176)
+def picture_scale(width: int) -> float:
+    """Pixels of such a picture for one of 176 wide, where the constants were set."""
+    return max(1.0, width / 176)
 
 
 def _reduction(views):

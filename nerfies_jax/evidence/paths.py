@@ -13,17 +13,17 @@ import numpy as np
 import scipy.linalg
 from scipy.spatial import cKDTree
 
-from nerfies_jax.evidence.rest_points import RestPoints, track_rays
-from nerfies_jax.evidence.tracks import Tracks
+from nerfies_jax.evidence.rest_points import RestPoints, across_ray, track_rays
+from nerfies_jax.evidence.tracks import TRACK_PX, Tracks
 from nerfies_jax.evidence.view_set import Views
 
 # On squared acceleration, in units per frame squared, beside squared distances to rays.
-# Penalties from 0.1 to 10 give the same errors in the built-in scenes.
+# Penalties from 0.1 to 3 give the same errors in the built-in scenes.
 ACCELERATION = 10.0
-# A track is off by so much; the depth around is right but for this factor. Together
-# they weigh 1e-5 of a ray at a focal length of 200 px: enough for things that drive
-# past, and built-in scenes keep their errors.
-TRACK_PX, AROUND_DEVIATION = 0.3, 0.5
+# The depth around is right but for this factor. With `TRACK_PX` it weighs 1e-5 of a ray
+# at a focal length of 200 px: enough for things that drive past, and built-in scenes
+# keep their errors.
+AROUND_DEVIATION = 0.5
 MEASURED_DEVIATION = 0.03  # of depths that come with the capture
 AROUND = 8  # tracks at rest whose depth is that of what stands around
 AT_REST = 0.3  # tracks of a lower score stand still
@@ -75,20 +75,23 @@ def least_acceleration(
     for row, seen in enumerate(tracks.seen):
         first, last = np.flatnonzero(seen)[[0, -1]]
         span = slice(first, last + 1)
-        bands = _bands(views.time[span])
+        stencils = _second_differences(views.time[span])
         along = unit[row, span]
         weight, pulled = seen[span].astype(float), pull[row, span]
-        across = np.eye(3) - along[:, :, None] * along[:, None, :]
-        onto = along[:, :, None] * along[:, None, :]
+        across = across_ray(along)
+        onto = np.eye(3) - across
         blocks = weight[:, None, None] * across + pulled[:, None, None] * onto
         camera = views.position[span]
         there = camera + ray[row, span] * target[row, span, None]
         right = weight[:, None] * np.einsum("fij,fj->fi", across, camera)
         right += pulled[:, None] * np.einsum("fij,fj->fi", onto, there)
-        path = _solved(blocks, bands, right)
+        path = _solved(blocks, _bands(stencils, len(along)), right)
         position[row, span] = path
         scaled = along * ((path - camera) * along).sum(-1, keepdims=True)
-        bend = np.einsum("kf,fc->kc", _second_differences(views.time[span]), scaled)
+        bend = sum(
+            stencils[:, off, None] * scaled[off : off + len(stencils)]
+            for off in range(3)
+        )
         stiffness = np.sqrt(ACCELERATION * (bend**2).sum())
         typical = np.median(((path - camera) * along).sum(-1)[seen[span]])
         flatness[row] = noise * abs(typical) / stiffness if stiffness > 0 else np.inf
@@ -100,30 +103,28 @@ def least_acceleration(
 
 
 def _second_differences(time):
-    """[frames - 2, frames]: acceleration in units per squared median step."""
-    frames = len(time)
-    if frames < 3:
-        return np.zeros((0, frames))
+    """[frames - 2, 3]: weights of a frame and the two after it in the acceleration.
+
+    Units per squared median step.
+    """
+    if len(time) < 3:
+        return np.zeros((0, 3))
     steps = np.diff(time)
     median = np.median(steps)
     steps = np.maximum(steps / median if median > 0 else steps + 1.0, SHORTEST_STEP)
-    matrix = np.zeros((frames - 2, frames))
-    at = np.arange(frames - 2)
     middle = 0.5 * (steps[:-1] + steps[1:])
-    matrix[at, at] = 1 / (steps[:-1] * middle)
-    matrix[at, at + 2] = 1 / (steps[1:] * middle)
-    matrix[at, at + 1] = -matrix[at, at] - matrix[at, at + 2]
-    return matrix
+    before, after = 1 / (steps[:-1] * middle), 1 / (steps[1:] * middle)
+    return np.stack([before, -before - after, after], axis=-1)
 
 
-def _bands(time):
+def _bands(stencils, frames):
     """[3, frames]: diagonals 0, 1 and 2 of the penalty, padded on the right."""
-    matrix = _second_differences(time)
-    product = ACCELERATION * matrix.T @ matrix
-    bands = np.zeros((3, len(time)))
-    for off in range(min(3, len(time))):
-        bands[off, : len(time) - off] = np.diagonal(product, -off)
-    return bands
+    count = len(stencils)
+    bands = np.zeros((3, frames))
+    for off in range(3):
+        for at in range(3 - off):
+            bands[off, at : at + count] += stencils[:, at] * stencils[:, at + off]
+    return ACCELERATION * bands
 
 
 def _solved(blocks, bands, right):

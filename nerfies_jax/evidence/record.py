@@ -8,9 +8,7 @@ paths in space, and points that stand still: host side, one core, no gradients.
 
 import hashlib
 import math
-import os
 import pathlib
-import tempfile
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +17,7 @@ import scipy.ndimage as nd
 from nerfies_jax.capture import capture as captures
 from nerfies_jax.capture import pinholes
 from nerfies_jax.capture.capture import Capture, PointCloud
+from nerfies_jax.capture.json_files import replaced_file
 from nerfies_jax.evidence import (
     dense_flow,
     moving,
@@ -40,7 +39,7 @@ MOVES = 0.5  # score from which a track counts as moving
 MOST_PATHS = 1500
 MOST_PIXELS = 16_000_000  # of all frames: 17 bytes each for the flow between them
 # Where less of the pictures can be carried to the next frame, tracks are chance: a
-# camera that jumps. Films keep 0.85 and more.
+# camera that jumps.
 LEAST_CARRIED = 0.4
 
 
@@ -146,12 +145,11 @@ def _moved(tracks, score):
 def _measured(capture, views, tracks):
     """z-depths of the tracks where the capture has depth and it does not jump there."""
     found = np.full(tracks.seen.shape, np.nan)
-    bound = np.array(views.size) - 1
     for frame, row in enumerate(views.row):
         here = np.flatnonzero(tracks.seen[:, frame])
-        at = np.clip(np.floor(tracks.pixel[here, frame]).astype(int), 0, bound)
-        depth = steady_depth(capture.depths[row])[at[:, 1], at[:, 0]]
-        found[here, frame] = depth
+        depth = steady_depth(capture.depths[row])
+        at = tracking.pixel_of(tracks.pixel[here, frame], depth.shape)
+        found[here, frame] = depth[at]
     return found
 
 
@@ -199,9 +197,8 @@ def save(path: pathlib.Path, evidence: Evidence) -> None:
     for side in ("forward", "backward"):
         arrays[f"flow.{side}"] = arrays[f"flow.{side}"].astype(np.float16)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as out:
-        np.savez(out, **arrays)
-    os.replace(out.name, path)
+    with replaced_file(path) as partial:
+        np.savez(partial, **arrays)
 
 
 def load(path: pathlib.Path) -> Evidence:

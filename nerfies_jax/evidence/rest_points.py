@@ -31,11 +31,16 @@ def track_rays(views: Views, tracks: Tracks) -> np.ndarray:
     return np.einsum("fji,nfj->nfi", views.rotation, local)
 
 
+def across_ray(unit: np.ndarray) -> np.ndarray:
+    """[..., 3, 3]: what a vector has across the unit direction, 1 - u u^T."""
+    return np.eye(3) - unit[..., :, None] * unit[..., None, :]
+
+
 def fit(views: Views, tracks: Tracks) -> RestPoints:
     """Least squares of distances to the rays, over depth squared: pixels, nearly."""
     ray = track_rays(views, tracks)
     unit = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
-    across = np.eye(3) - unit[..., :, None] * unit[..., None, :]
+    across = across_ray(unit)
     weight = tracks.seen.astype(np.float64)
     # Where rays are parallel any depth will do, in front of the cameras.
     apart = np.linalg.norm(np.ptp(views.position, axis=0))

@@ -7,7 +7,7 @@ from nerfies_jax.evidence import rest_points
 from nerfies_jax.evidence import tracks as tracking
 from nerfies_jax.evidence.dense_flow import NeighbourFlow
 from nerfies_jax.evidence.rest_points import RestPoints
-from nerfies_jax.evidence.tracks import Tracks
+from nerfies_jax.evidence.tracks import TRACK_PX, Tracks
 from nerfies_jax.evidence.view_set import Views
 
 REACH = 8  # frames before and after
@@ -16,7 +16,6 @@ EVERY_PX = 2
 LEAST_FRAMES = 4
 MISS_PX = 0.5  # at most, in seven frames of ten
 DEPTH_DEVIATION = 0.05  # at most, as a share of the depth
-TRACK_PX = 0.3  # error of a track
 
 
 def dense(views: Views, flow: NeighbourFlow, moving: np.ndarray) -> PointCloud:
@@ -68,10 +67,9 @@ def _starts(views, moving, frame):
 
 def without(tracks: Tracks, moving: np.ndarray) -> Tracks:
     """The tracks where they do not lie on moving pixels."""
-    _, height, width = moving.shape
-    at = np.clip(np.floor(tracks.pixel).astype(int), 0, [width - 1, height - 1])
+    row, column = tracking.pixel_of(tracks.pixel, moving.shape[1:])
     frames = np.arange(len(moving))[None]
-    return tracks._replace(seen=tracks.seen & ~moving[frames, at[..., 1], at[..., 0]])
+    return tracks._replace(seen=tracks.seen & ~moving[frames, row, column])
 
 
 def placed(views: Views, tracks: Tracks, rest: RestPoints) -> np.ndarray:
@@ -85,7 +83,7 @@ def depth_deviation(views: Views, tracks: Tracks, rest: RestPoints) -> np.ndarra
     offset = rest.position[:, None] - views.position
     distance = np.maximum(np.linalg.norm(offset, axis=-1), 1e-9)
     unit = offset / distance[..., None]
-    across = np.eye(3) - unit[..., :, None] * unit[..., None, :]
+    across = rest_points.across_ray(unit)
     focal = views.intrinsics[:, 0, 0]
     with np.errstate(divide="ignore"):
         weight = tracks.seen * (focal / (TRACK_PX * distance)) ** 2

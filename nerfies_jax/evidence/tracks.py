@@ -15,6 +15,7 @@ SHORTEST = 8  # frames: fewer say little of how a point moves
 # Flow's errors add up along a track. Each point is looked up again in the frame where
 # it began: the 95 % quantile of the drift of points at rest falls by half.
 WINDOW_PX, FARTHEST_PX = 9, 1.5
+TRACK_PX = 0.3  # error of a track, for weights
 ROUNDS, PRECISION_PX = 20, 0.01  # of Lucas-Kanade's search, enlarged pixels
 LEAST_EIGENVALUE = 1e-4  # of the window's structure: below it there is nothing to align
 
@@ -29,6 +30,14 @@ class Tracks(NamedTuple):
     def take(self, which: np.ndarray) -> "Tracks":
         """Those chosen by index or mask."""
         return Tracks(*(part[which] for part in self))
+
+
+def pixel_of(
+    place: np.ndarray, shape: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Row and column of the pixel in which each place [..., 2] lies, or the nearest."""
+    column, row = np.moveaxis(np.floor(place).astype(int), -1, 0)
+    return np.clip(row, 0, shape[0] - 1), np.clip(column, 0, shape[1] - 1)
 
 
 def grid(views: Views, seed: int = 0) -> np.ndarray:
@@ -77,8 +86,7 @@ def _step(pixel, shift, usable):
     """Pixels moved by the bilinear mean of usable flow; which can be trusted."""
     height, width = usable.shape
     bound = np.array([width, height])
-    inside = np.clip(np.floor(pixel).astype(int), 0, bound - 1)
-    kept = usable[inside[:, 1], inside[:, 0]]
+    kept = usable[pixel_of(pixel, usable.shape)]
     corner = np.clip(np.floor(pixel - 0.5).astype(int), 0, bound - 2)
     part = np.clip(pixel - 0.5 - corner, 0, 1)
     total, sum_of_weights = 0.0, 0.0

@@ -160,6 +160,7 @@ class _View:
         self.shape, self.strides = shape, strides
 
     def array(self):
+        """The tensor's own copy; ValueError where it reaches out of its storage."""
         read, key, dtype = self.storage
         flat = np.frombuffer(read(key), dtype)
         last = self.offset + sum(
@@ -183,6 +184,7 @@ class _Unpickler(pickle.Unpickler):
         self._read, self.dtypes = read, {}
 
     def find_class(self, module, name):
+        """What a file may ask for by name; UnpicklingError for all else."""
         if (module, name) == ("collections", "OrderedDict"):
             return collections.OrderedDict
         if (module, name) == ("torch._utils", "_rebuild_tensor_v2"):
