@@ -114,7 +114,7 @@ STUDIES = {
     "raster_speed": _package(
         "raster_speed", "--out raster_speed.json", page="__main__"
     ),
-    "mutants": _study("mutants"),
+    "mutants": _package("mutants"),
     "frequency_gates": _study("frequency_gates", "--out frequency_gates"),
     "appearance_codes": _study(
         "appearance_codes", "--scene exposure --out appearance_codes"

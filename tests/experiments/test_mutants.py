@@ -1,6 +1,6 @@
 """Faults planted in the source: where, and what they become."""
 
-from experiments import mutants
+from experiments.mutants import faults
 
 SOURCE = '''
 LIMIT = 3
@@ -15,7 +15,7 @@ def f(x, y, *, most=4):
 
 def test_faults_stand_in_bodies_and_neither_in_words_nor_in_settings():
     planted = set()
-    for fault in mutants.places("a.py", SOURCE):
+    for fault in faults.places("a.py", SOURCE):
         wrong = SOURCE[: fault.start] + fault.text + SOURCE[fault.end :]
         compile(wrong, "a.py", "exec")
         planted.add(wrong.splitlines()[fault.line - 1].strip())
@@ -30,6 +30,6 @@ def test_faults_stand_in_bodies_and_neither_in_words_nor_in_settings():
 
 
 def test_the_modules_take_turns():
-    faults = mutants.drawn(30, seed=1)
-    assert len({fault.path for fault in faults}) == 30
-    assert faults == mutants.drawn(30, seed=1)
+    found = faults.drawn(30, seed=1)
+    assert len({fault.path for fault in found}) == 30
+    assert found == faults.drawn(30, seed=1)

@@ -1,0 +1,118 @@
+"""Which tests notice a fault: faults planted at random in both packages, one by one.
+
+    python -m experiments.mutants
+    python -m experiments.mutants --count 12 --seed 3 --only gaussians_jax/raster
+
+A copy of the checkout gets one fault at a time (an operator, a sign, a comparison, a
+number, two swapped arguments, somewhere in a function body; modules take turns), and
+the default tests are run until three fail: first the files that enter the function,
+which a run of each file without a fault says, then all others. A fault that nothing
+notices is shown to the full and slow tests of the room as well. Most of the library's
+faults of old were of these kinds.
+"""
+
+import concurrent.futures
+import dataclasses
+import json
+import pathlib
+import queue
+import subprocess
+import tempfile
+
+from experiments import cli
+from experiments.mutants.faults import ROOT, drawn
+from experiments.mutants.page import page
+from experiments.mutants.witnesses import default_tests, reached_by, tried
+
+
+@dataclasses.dataclass(frozen=True)
+class Mutants:
+    """Plant faults and see which tests fail."""
+
+    count: int = 60
+    """Faults."""
+    seed: int = 0
+    """Of their places."""
+    only: str = ""
+    """Only in files whose path begins so."""
+    jobs: int = 2
+    """Faults tried at the same time."""
+    minutes: float = 10.0
+    """After which a run of tests that does not end counts as failed."""
+    out: pathlib.Path = pathlib.Path("mutants.json")
+    """Where the figures go; what stands there, of the same seed, is gone on with."""
+
+    def __post_init__(self):
+        for name in ("count", "jobs"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"--{name} {getattr(self, name)} must be at least 1")
+        if self.minutes <= 0:
+            raise ValueError(f"--minutes {self.minutes} must be above 0")
+
+
+def main(arguments=None):
+    """Run the job of the command line; exit code 2 where its input is wrong."""
+    with cli.user_errors():
+        args = cli.parse(Mutants, arguments)
+        faults = drawn(args.count, args.seed, args.only)
+    from nerfies_jax.capture.json_files import write_json
+    from nerfies_jax.measure import clock
+
+    rows = _stored(args.out, args.seed)
+    left = [fault for fault in faults if not any(_is_row_of(fault, r) for r in rows)]
+    copies = queue.SimpleQueue()
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        concurrent.futures.ThreadPoolExecutor(args.jobs) as workers,
+    ):
+        for job in range(args.jobs):
+            copies.put(_copied(pathlib.Path(folder) / str(job)))
+
+        def with_copy(call):
+            copy = copies.get()
+            try:
+                return call(copy)
+            finally:
+                copies.put(copy)
+
+        tests = default_tests(ROOT)
+        lists = workers.map(
+            lambda test: with_copy(lambda copy: reached_by(test, copy)), tests
+        )
+        reached = dict(zip(tests, map(set, lists), strict=True))
+        seconds = 60 * args.minutes
+        tries = workers.map(
+            lambda fault: with_copy(lambda copy: tried(fault, copy, reached, seconds)),
+            left,
+        )
+        for row in tries:
+            rows.append(row)
+            print(row["at"], "|", row["after"], "|", row["caught_by"], flush=True)
+            stored = {"machine": clock.machine(), "seed": args.seed, "rows": rows}
+            write_json(args.out, stored)
+    print(page({"rows": rows}))
+
+
+def _is_row_of(fault, row):
+    return row["at"] == f"{fault.path}:{fault.line}" and row["text"] == fault.text
+
+
+def _stored(path, seed):
+    stored = json.loads(path.read_text()) if path.exists() else {}
+    return stored["rows"] if stored.get("seed") == seed else []
+
+
+def _copied(folder):
+    """What git keeps of the checkout, as it stands."""
+    files = subprocess.run(
+        ["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    for name in filter(None, files.stdout.split("\0")):
+        if (ROOT / name).exists():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_bytes((ROOT / name).read_bytes())
+    return folder
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,32 @@
+"""A plugin of pytest: writes which functions of the packages a run enters."""
+
+import json
+import os
+import pathlib
+import sys
+import threading
+
+from experiments.mutants.faults import PACKAGES, ROOT
+
+_entered = set()
+
+
+def _note(frame, _event, _argument):
+    _entered.add(frame.f_code)  # no local tracer comes back: lines are not told
+
+
+def pytest_configure():
+    threading.settrace(_note)
+    sys.settrace(_note)
+
+
+def pytest_unconfigure():
+    sys.settrace(None)
+    threading.settrace(None)
+    found = set()
+    for code in _entered:
+        path = pathlib.Path(code.co_filename)
+        if path.is_relative_to(ROOT) and path.relative_to(ROOT).parts[0] in PACKAGES:
+            found.add(f"{path.relative_to(ROOT)}:{code.co_firstlineno}")
+    told = pathlib.Path(os.environ["MUTANTS_REACHED"])
+    told.write_text(json.dumps(sorted(found)))

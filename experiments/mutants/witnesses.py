@@ -1,0 +1,115 @@
+"""Which tests run a function, and which of them notice a fault in it."""
+
+import json
+import os
+import pathlib
+import re
+import subprocess
+import sys
+import time
+
+from experiments.mutants.faults import Fault
+
+CAUGHT_BY = 3
+DEFAULT = "not full and not slow"
+CORE = ("default tests that run the function", "other default tests")
+FULL = "full and slow tests of its room"
+PYTEST = [sys.executable, "-m", "pytest", "-q", "-n0", "--tb=no"]
+PYTEST += ["-p", "no:cacheprovider"]
+
+
+def default_tests(copy: pathlib.Path) -> list[str]:
+    """The files of tests of a checkout."""
+    tests = (copy / "tests").rglob("test_*.py")
+    return sorted(str(path.relative_to(copy)) for path in tests)
+
+
+def reached_by(test: str, copy: pathlib.Path) -> list[str]:
+    """ "file:line" of every function of the packages that a file of tests enters.
+
+    Its default tests run in a process of their own, so that nothing is compiled before.
+    What a test runs in a process of its own is not seen.
+    """
+    told = copy / f"{test.replace('/', '.')}.reached.json"
+    command = [*PYTEST, "-m", DEFAULT, "-p", "experiments.mutants.reached", test]
+    ran = subprocess.run(
+        command,
+        cwd=copy,
+        capture_output=True,
+        text=True,
+        env=os.environ | {"MUTANTS_REACHED": str(told)},
+    )
+    if ran.returncode not in (0, 5):  # all passed, or there was none
+        raise ValueError(f"{test} fails without any fault:\n{ran.stdout[-2000:]}")
+    return json.loads(told.read_text())
+
+
+def tried(
+    fault: Fault, copy: pathlib.Path, reached: dict[str, list[str]], seconds: float
+) -> dict:
+    """The fault, the tests that notice it, and how far one had to look."""
+    path = copy / fault.path
+    right = path.read_bytes()
+    wrong = right[: fault.start] + fault.text.encode() + right[fault.end :]
+    began = time.monotonic()
+    row = {
+        "at": f"{fault.path}:{fault.line}",
+        "text": fault.text,
+        "before": _line(right, fault.line),
+        "after": _line(wrong, fault.line),
+        "caught_by": [],
+        "looked_in": "",
+    }
+    path.write_bytes(wrong)
+    try:
+        for name, tests, marks in stages(fault, copy, reached):
+            row["looked_in"] = name
+            if tests:
+                row["caught_by"] = _failures(tests, marks, copy, seconds)
+            if row["caught_by"]:
+                break
+    finally:
+        path.write_bytes(right)
+    return row | {"seconds": round(time.monotonic() - began, 1)}
+
+
+def _line(source, line):
+    return source.decode().splitlines()[line - 1].strip()
+
+
+def stages(
+    fault: Fault, copy: pathlib.Path, reached: dict[str, list[str]]
+) -> list[tuple[str, list[str], str]]:
+    """(name, files to run, which marks) in the order in which tests are asked."""
+    file = pathlib.Path(fault.path)
+    package, room = file.parts[0], file.parts[1]
+    if package == "gaussians_jax":
+        room = "gaussians"
+    named = f"test_{file.stem.strip('_')}"
+    place = f"{fault.path}:{fault.function}"
+    run_it = sorted(test for test, places in reached.items() if place in places)
+    # Those that are named after the module first.
+    run_it.sort(key=lambda test: not pathlib.Path(test).name.startswith(named))
+    here = copy / "tests" / room
+    its_room = [f"tests/{room}"] if here.is_dir() else run_it
+    others = [test for test in reached if test not in run_it]
+    return [
+        (CORE[0], run_it, DEFAULT),
+        (CORE[1], others, DEFAULT),
+        (FULL, its_room, "full or slow"),
+    ]
+
+
+def _failures(tests, marks, copy, seconds):
+    """Names of up to three tests that fail; the run itself, where it does not end."""
+    command = [*PYTEST, "-m", marks, "-rfE", f"--maxfail={CAUGHT_BY}", *tests]
+    try:
+        ran = subprocess.run(
+            command, cwd=copy, capture_output=True, text=True, timeout=seconds
+        )
+    except subprocess.TimeoutExpired:
+        return [f"does not end in {seconds:.0f} s"]
+    if ran.returncode in (0, 5):  # all passed, or there was none
+        return []
+    names = re.findall(r"^(?:FAILED|ERROR) tests/(\S+)", ran.stdout, re.MULTILINE)
+    return names or ["the tests cannot be collected"]
