@@ -89,6 +89,7 @@ STUDIES = {
     "effect_cost": _package(
         "effect_cost", measured="nerfies_jax/runs/effect_cost.json"
     ),
+    "evidence": _package("evidence", "--scenes"),
     "ablate_fields": _package(
         "ablate_fields", "--suite fields --seeds 3 --jobs 4", of="ablate"
     ),

@@ -5,6 +5,7 @@ contrast. Only neighbours are compared: over longer gaps patterns that repeat ar
 for each other.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import cv2
@@ -37,7 +38,7 @@ def enlarged(views: Views) -> int:
     return ENLARGED if max(views.size) <= ENLARGED_BELOW_PX else 1
 
 
-def levelled(views: Views) -> np.ndarray:
+def levelled(views: Views, times: int | None = None) -> np.ndarray:
     """[frames, height, width] uint8: grey pictures of one mean and spread, enlarged.
 
     Without it a film of varying exposure has 79 % of its pixels marked as moving.
@@ -46,14 +47,32 @@ def levelled(views: Views) -> np.ndarray:
     mean, spread = grey.mean((1, 2)), np.maximum(grey.std((1, 2)), 1e-3)
     scaled = (grey - mean[:, None, None]) / spread[:, None, None]
     alike = np.clip(scaled * np.median(spread) + np.median(mean), 0, 255)
-    times, (width, height) = enlarged(views), views.size
-    size = (times * width, times * height)
     pictures = [np.rint(one).astype(np.uint8) for one in alike]
-    if times > 1:
-        pictures = [
-            cv2.resize(one, size, interpolation=cv2.INTER_CUBIC) for one in pictures
-        ]
-    return np.stack(pictures)
+    times = enlarged(views) if times is None else times
+    return np.stack([larger(one, times) for one in pictures])
+
+
+def larger(picture: np.ndarray, times: int) -> np.ndarray:
+    """A picture [height, width] uint8 with so many pixels for one of its own."""
+    if times == 1:
+        return picture
+    size = times * picture.shape[1], times * picture.shape[0]
+    return cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC)
+
+
+def reduced(shift: np.ndarray, times: int) -> np.ndarray:
+    """Flow [height, width, 2] between enlarged pictures, in pixels of their own."""
+    if times == 1:
+        return shift
+    size = shift.shape[1] // times, shift.shape[0] // times
+    return cv2.resize(shift, size, interpolation=cv2.INTER_AREA) / times
+
+
+def dis(times: int) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """Finds flow between pictures that were enlarged so many times."""
+    search = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    search.setFinestScale(0 if times > 1 else 1)
+    return lambda one, other: search.calc(one, other, None)
 
 
 def between_neighbours(views: Views, pictures: np.ndarray) -> NeighbourFlow:
@@ -63,15 +82,10 @@ def between_neighbours(views: Views, pictures: np.ndarray) -> NeighbourFlow:
     """
     (width, height), frames = views.size, len(views.row)
     times = pictures.shape[2] // width
-    search = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    search.setFinestScale(0 if times > 1 else 1)
+    search = dis(times)
 
     def flow(one, other):
-        shift = search.calc(pictures[one], pictures[other], None)
-        if times == 1:
-            return shift
-        small = cv2.resize(shift, (width, height), interpolation=cv2.INTER_AREA)
-        return small / times
+        return reduced(search(pictures[one], pictures[other]), times)
 
     shape = (frames, height, width)
     forward, backward = np.zeros((2, *shape, 2), np.float32)

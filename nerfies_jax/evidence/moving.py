@@ -5,13 +5,13 @@ import numpy as np
 import scipy.sparse as sparse
 from scipy.spatial import cKDTree
 
+from nerfies_jax.evidence import rest_points
 from nerfies_jax.evidence.rest_points import RestPoints
 from nerfies_jax.evidence.tracks import Tracks, pixel_of
 from nerfies_jax.evidence.view_set import Views
 
-# A track is as far off a point at rest as in the frames where it is worst but for three
-# of ten; half a pixel of that counts as half certain.
-QUANTILE, HALF_CERTAIN_PX, STEEPNESS = 0.7, 0.5, 3.0
+# Half a pixel off a point at rest counts as half certain.
+HALF_CERTAIN_PX, STEEPNESS = 0.5, 3.0
 # Tracks near each other in shared frames move alike.
 NEIGHBOURS, EVERY_FRAMES, NEAR_PX, NEIGHBOUR_WEIGHT, ROUNDS = 10, 6, 6.0, 3.0, 10
 # A pixel takes after the tracks around it, by place and colour.
@@ -24,7 +24,7 @@ def track_scores(tracks: Tracks, rest: RestPoints) -> np.ndarray:
     count = len(tracks.seen)
     if count == 0:
         return np.zeros(0)
-    far = np.nanquantile(rest.residual, QUANTILE, axis=1)
+    far = rest_points.miss(rest)
     with np.errstate(divide="ignore"):
         odds = STEEPNESS * np.log(np.maximum(far, 1e-3) / HALF_CERTAIN_PX)
     own = 1 / (1 + np.exp(-np.minimum(odds, 50)))

@@ -38,8 +38,8 @@ class Paths(NamedTuple):
     )  # [tracks, frames, 3] scene units; NaN before and after a track
     known: np.ndarray  # [tracks, frames] bool: seen there, and in front of the camera
     depth: np.ndarray  # [tracks, frames] z-depth; NaN before and after a track
-    # [tracks]: standard deviation of a common factor of the depths that the film alone
-    # leaves; above about 0.3 the depths are those of what stands around.
+    # [tracks]: deviation of a common factor of the depths that the film alone leaves;
+    # above about 0.3 the depths are those of what stands around.
     depth_deviation: np.ndarray
 
 
@@ -87,19 +87,36 @@ def least_acceleration(
         right += pulled[:, None] * np.einsum("fij,fj->fi", onto, there)
         path = _solved(blocks, _bands(stencils, len(along)), right)
         position[row, span] = path
-        scaled = along * ((path - camera) * along).sum(-1, keepdims=True)
-        bend = sum(
-            stencils[:, off, None] * scaled[off : off + len(stencils)]
-            for off in range(3)
-        )
-        stiffness = np.sqrt(ACCELERATION * (bend**2).sum())
-        typical = np.median(((path - camera) * along).sum(-1)[seen[span]])
-        flatness[row] = noise * abs(typical) / stiffness if stiffness > 0 else np.inf
+        # Not along the rays: where a track is not seen there is none.
+        offset = path - camera
+        far = np.median(np.linalg.norm(offset, axis=-1)[seen[span]])
+        flatness[row] = _deviation(stencils, path, offset, noise * far)
     depth = np.einsum(
         "fj,nfj->nf", views.rotation[:, 2], position - views.position[None]
     )
     known = tracks.seen & (np.nan_to_num(depth, nan=-1.0) > near)
     return Paths(position, known, depth, flatness)
+
+
+def _deviation(stencils, path, offset, miss):
+    """Of a common factor of the depths, by what the film alone says.
+
+    A factor bends the path as the offsets from the camera bend. What the path bends
+    itself, and a track's error `miss` in scene units, hide it. Neighbouring frames are
+    no independent witnesses: the mean over the path counts, not the sum. In the
+    built-in scenes that is 2 to 4 %, where the true errors are 0.6 to 1.1 %.
+    """
+    if not len(stencils):
+        return np.inf
+
+    def squared_bend(place):
+        count = len(stencils)
+        parts = (stencils[:, k, None] * place[k : k + count] for k in range(3))
+        return (sum(parts) ** 2).sum(-1).mean()
+
+    hidden = squared_bend(path) + miss**2 / (ACCELERATION * len(stencils))
+    shown = squared_bend(offset)
+    return np.sqrt(hidden / shown) if shown > 0 else np.inf
 
 
 def _second_differences(time):

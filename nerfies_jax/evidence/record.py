@@ -9,6 +9,8 @@ paths in space, and points that stand still: host side, one core, no gradients.
 import hashlib
 import math
 import pathlib
+import time
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -31,8 +33,9 @@ from nerfies_jax.evidence.dense_flow import NeighbourFlow
 from nerfies_jax.evidence.paths import Paths
 from nerfies_jax.evidence.rest_points import RestPoints
 from nerfies_jax.evidence.tracks import Tracks
+from nerfies_jax.evidence.view_set import Views
 
-VERSION = 1  # of the file; counts up whenever the same pictures would say otherwise
+VERSION = 2  # of the file; counts up whenever the same pictures would say otherwise
 # A path has as many frames at least, and a film as many; fewer say nothing of motion.
 SHORTEST_PATH, SHORTEST_FILM = 10, 6
 MOVES = 0.5  # score from which a track counts as moving
@@ -41,6 +44,25 @@ MOST_PIXELS = 16_000_000  # of all frames: 17 bytes each for the flow between th
 # Where less of the pictures can be carried to the next frame, tracks are chance: a
 # camera that jumps.
 LEAST_CARRIED = 0.4
+
+
+class Seconds(NamedTuple):
+    """Of the processor, by part."""
+
+    flow: float
+    tracks: float
+    moving: float
+    paths: float
+    still: float
+
+
+PARTS = Seconds(
+    "flow between neighbours",
+    "tracks and the points at rest that explain them best",
+    "what moves",
+    "paths in space",
+    "dense points at rest",
+)
 
 
 class Evidence(NamedTuple):
@@ -57,37 +79,37 @@ class Evidence(NamedTuple):
     still: PointCloud
     unusable: str  # why tracks say nothing of the motion; empty where they do
     factor: int  # of the capture's pixels for one of these
+    seconds: Seconds
 
 
-def gather(capture: Capture, use_depths: bool = False) -> Evidence:
+def gather(
+    capture: Capture,
+    use_depths: bool = False,
+    tell: Callable[[str], None] = lambda part: None,
+) -> Evidence:
     """Everything; about 0.25 s a frame of 176x132 on one core.
 
-    With `use_depths` paths lean on the capture's own depths where it has them.
+    With `use_depths` paths lean on the capture's own depths where it has them. `tell`
+    hears of each of `PARTS` when it begins.
     """
+    watch = _Watch(tell)
+    watch.begin("flow")
     factor = _factor(capture)
     capture = looked_at(capture, factor)
     views = view_set.in_time_order(capture)
     pictures = dense_flow.levelled(views)
     flow = dense_flow.between_neighbours(views, pictures)
+    watch.begin("tracks")
     tracks = tracking.found(views, flow, pictures)
     rest = rest_points.fit(views, tracks)
+    watch.begin("moving")
     score = moving.track_scores(tracks, rest)
     mask = moving.mask(views, tracks, score)
+    watch.begin("paths")
     unusable = _unusable(views, flow)
     which = _moved(tracks, score) if not unusable else np.zeros(0, int)
-    still = score < paths.AT_REST
-    around = paths.depth_around(
-        tracks.take(which),
-        tracks.take(still),
-        RestPoints(*(part[still] for part in rest)),
-        capture.near,
-    )
-    measured = None
-    if use_depths and capture.depths is not None:
-        measured = _measured(capture, views, tracks.take(which))
-    found = paths.least_acceleration(
-        views, tracks.take(which), capture.near, around, measured
-    )
+    found = _paths(capture, views, tracks, rest, score, which, use_depths)
+    watch.begin("still")
     dense = still_points.dense(views, flow, mask)
     return Evidence(
         row=views.row,
@@ -101,7 +123,37 @@ def gather(capture: Capture, use_depths: bool = False) -> Evidence:
         still=dense,
         unusable=unusable,
         factor=factor,
+        seconds=watch.seconds(),
     )
+
+
+class _Watch:
+    """Processor seconds from the beginning of each part to that of the next."""
+
+    def __init__(self, tell):
+        self._tell, self._began = tell, {}
+
+    def begin(self, part):
+        self._began[part] = time.process_time()
+        self._tell(getattr(PARTS, part))
+
+    def seconds(self):
+        times = [*self._began.values(), time.process_time()]
+        return Seconds(**dict(zip(self._began, np.diff(times).tolist(), strict=True)))
+
+
+def _paths(capture, views, tracks, rest, score, which, use_depths):
+    still, moved = score < paths.AT_REST, tracks.take(which)
+    around = paths.depth_around(
+        moved,
+        tracks.take(still),
+        RestPoints(*(part[still] for part in rest)),
+        capture.near,
+    )
+    measured = None
+    if use_depths and capture.depths is not None:
+        measured = _measured(capture, views, moved)
+    return paths.least_acceleration(views, moved, capture.near, around, measured)
 
 
 def looked_at(capture: Capture, factor: int) -> Capture:
@@ -120,15 +172,19 @@ def _unusable(views, flow):
         return f"{frames} frames are too few to follow anything through"
     if np.ptp(views.time) == 0:
         return "all frames have the same time"
-    shown = views.textured[:-1]
-    carried = flow.forward_seen[:-1] & shown
-    share = carried.sum() / max(shown.sum(), 1)
+    share = carried(views, flow)
     if share < LEAST_CARRIED:
         return (
             f"only {share:.0%} of the textured pixels can be carried to the next frame "
             f"(at least {LEAST_CARRIED:.0%} are needed): the camera jumps"
         )
     return ""
+
+
+def carried(views: Views, flow: NeighbourFlow) -> float:
+    """Share of the textured pixels whose flow leads to the next frame and back."""
+    shown = views.textured[:-1]
+    return float((flow.forward_seen[:-1] & shown).sum() / max(shown.sum(), 1))
 
 
 def _moved(tracks, score):
@@ -175,15 +231,25 @@ def digest(capture: Capture, use_depths: bool = False) -> str:
 
 
 def cached(
-    capture: Capture, folder: pathlib.Path, use_depths: bool = False
+    capture: Capture,
+    folder: pathlib.Path,
+    use_depths: bool = False,
+    tell: Callable[[str], None] = lambda part: None,
 ) -> Evidence:
     """`gather`, or what it found before of the same pictures and cameras."""
-    path = folder / f"{digest(capture, use_depths)}.npz"
+    path = file_of(capture, folder, use_depths)
     if path.exists():
         return load(path)
-    evidence = gather(capture, use_depths)
+    evidence = gather(capture, use_depths, tell)
     save(path, evidence)
     return evidence
+
+
+def file_of(
+    capture: Capture, folder: pathlib.Path, use_depths: bool = False
+) -> pathlib.Path:
+    """Where `cached` keeps it."""
+    return folder / f"{digest(capture, use_depths)}.npz"
 
 
 def save(path: pathlib.Path, evidence: Evidence) -> None:
@@ -209,6 +275,7 @@ def load(path: pathlib.Path) -> Evidence:
         "rest": RestPoints,
         "paths": Paths,
         "still": PointCloud,
+        "seconds": Seconds,
     }
     with np.load(path) as stored:
         arrays = {name: stored[name] for name in stored.files}
@@ -219,6 +286,7 @@ def load(path: pathlib.Path) -> Evidence:
             parts[name] = kinds[name](*(arrays[f"{name}.{key}"] for key in fields))
         else:
             parts[name] = arrays[name]
+    parts["seconds"] = Seconds(*(float(part) for part in parts["seconds"]))
     parts["unusable"], parts["factor"] = str(parts["unusable"]), int(parts["factor"])
     flow = parts["flow"]
     parts["flow"] = flow._replace(

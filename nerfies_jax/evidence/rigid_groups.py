@@ -8,10 +8,11 @@ frame 8, 4 or 1 before.
 from typing import NamedTuple
 
 import numpy as np
+import scipy.linalg
 import scipy.ndimage as nd
 import scipy.sparse as sparse
 from scipy.cluster.vq import kmeans2
-from scipy.sparse.linalg import eigsh
+from scipy.sparse.linalg import ArpackNoConvergence, eigsh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -21,6 +22,7 @@ HOPS = (8, 4)  # frames at once where enough points are shared, against drift
 SHARED_POINTS, SHARED_SHARE = 10, 0.6
 FEWEST = 6  # points that tell a turn; fewer tell a shift
 SMOOTHED_FRAMES = 1.0  # deviation, of poses over time
+LANCZOS = 40  # vectors; with 20 it takes ten times as long
 ROUNDS = 3  # of robust Procrustes
 
 
@@ -53,13 +55,23 @@ def labels(position: np.ndarray, known: np.ndarray, count: int) -> np.ndarray:
     where = np.concatenate([first, second]), np.concatenate([second, first])
     graph = sparse.coo_matrix((entries, where), shape=(paths, paths)).tocsr()
     scale = sparse.diags((np.asarray(graph.sum(1)).ravel() + 1e-9) ** -0.5)
-    laplacian = scale @ graph @ scale + 1e-9 * sparse.eye(paths)
-    start = np.ones(paths)
-    _, vectors = eigsh(laplacian, k=count, which="LA", v0=start)
+    vectors = _leading(scale @ graph @ scale + 1e-9 * sparse.eye(paths), count)
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     vectors = vectors / np.maximum(length, 1e-12)
     _, label = kmeans2(vectors, count, minit="++", seed=0, iter=50)
     return label
+
+
+def _leading(matrix, count):
+    """[rows, count] eigenvectors of the largest eigenvalues of a sparse matrix."""
+    rows = matrix.shape[0]
+    start, width = np.ones(rows), min(rows, max(2 * count + 1, LANCZOS))
+    try:
+        return eigsh(matrix, count, which="LA", v0=start, ncv=width, maxiter=100)[1]
+    except ArpackNoConvergence:
+        # Where one body is all there is, eigenvalues lie too close together.
+        last = rows - count, rows - 1
+        return scipy.linalg.eigh(matrix.toarray(), subset_by_index=last)[1]
 
 
 def _pairs(position, known):
@@ -159,6 +171,26 @@ def centres(
     for group in np.unique(found.label):
         middle[group] = np.median(canonical[found.label == group], axis=0)
     return canonical, middle
+
+
+def fewest(
+    position: np.ndarray, known: np.ndarray, within: float, most: int = 8
+) -> tuple[int, float]:
+    """How many groups, up to `most`, explain the paths, and by how much they miss.
+
+    The fewest whose motions miss the known places by less than `within` in the median;
+    `most` where that many do not. In scene units.
+    """
+    for count in range(1, most + 1):
+        label = labels(position, known, count)
+        found = motion(position, known, label, position.shape[1] // 2)
+        canonical, _ = centres(position, known, found)
+        moved = np.einsum("ptij,pj->pti", found.rotation[label], canonical)
+        miss = np.linalg.norm(moved + found.shift[label] - position, axis=-1)
+        typical = float(np.median(miss[known]))
+        if typical < within:
+            break
+    return count, typical
 
 
 def rotation_vectors(rotation: np.ndarray, canonical: int) -> np.ndarray:

@@ -74,8 +74,8 @@ def without(tracks: Tracks, moving: np.ndarray) -> Tracks:
 
 def placed(views: Views, tracks: Tracks, rest: RestPoints) -> np.ndarray:
     """[tracks] bool: explained by their point, whose depth the rays tell."""
-    miss = np.nanquantile(rest.residual, 0.7, axis=1)
-    return (miss < MISS_PX) & (depth_deviation(views, tracks, rest) < DEPTH_DEVIATION)
+    explained = rest_points.miss(rest) < MISS_PX
+    return explained & (depth_deviation(views, tracks, rest) < DEPTH_DEVIATION)
 
 
 def depth_deviation(views: Views, tracks: Tracks, rest: RestPoints) -> np.ndarray:

@@ -39,6 +39,8 @@ TABLE = [
     ("effect_cost", "--rays 0", "--rays"),
     ("elastic_points", "--points 64", "64 samples"),
     ("elastic_points", "--draws 0", "--draws 0"),
+    ("evidence", "--scenes --scene fast", "name no capture beside it"),
+    ("evidence", "OUT", "OUT"),
     ("frequency_gates", "--steps 3", "--steps 3"),
     ("frequency_gates", "--seeds 1", "--seeds 1"),
     ("frequency_gates", "--most 0.1 0", "--most (0.1, 0.0)"),

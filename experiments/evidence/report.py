@@ -1,0 +1,95 @@
+"""One capture looked at: what was found, in words, numbers and a picture."""
+
+import math
+import pathlib
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from nerfies_jax import runs
+from nerfies_jax.capture.capture import Capture, describe
+from nerfies_jax.capture.json_files import write_json
+from nerfies_jax.capture.synthetic import SceneTruth
+from nerfies_jax.evaluation import pictures, protocol
+from nerfies_jax.evidence import (
+    against_truth,
+    contact_sheet,
+    record,
+    summary,
+    view_set,
+)
+from nerfies_jax.evidence.against_truth import LATER, Errors
+from nerfies_jax.evidence.record import Evidence
+from nerfies_jax.runs.config import CaptureSource
+from nerfies_jax.runs.platform import CACHE
+
+
+def look(source: CaptureSource, seed: int, out: pathlib.Path | None) -> None:
+    """Gather, or read what was gathered, and say what it is."""
+    capture = runs.stored_capture(source, seed)
+    for line in describe(capture):
+        print(line)
+    print()
+    path = record.file_of(capture, CACHE / "evidence")
+    if path.exists():
+        print("gathered before, and read again")
+    evidence = record.cached(capture, CACHE / "evidence", tell=_Told())
+    views = view_set.in_time_order(record.looked_at(capture, evidence.factor))
+    found = summary.of(views, evidence)
+    print("\n".join(summary.lines(found, evidence)))
+    stored = {"capture": capture.name, "found": as_json(found._asdict())}
+    truth = protocol.stored_truth(capture)
+    if truth is not None:
+        errors = errors_of(capture, truth, evidence)
+        print("\n".join(error_lines(errors)))
+        stored["errors"] = as_json(errors._asdict())
+    folder = out or pathlib.Path("runs", f"evidence-{capture.name.replace(' ', '-')}")
+    folder.mkdir(parents=True, exist_ok=True)
+    pictures.save(contact_sheet.followed(views, evidence), folder / "tracks.png")
+    write_json(folder / "evidence.json", stored)
+    print(f"frames with tracks: {folder / 'tracks.png'}")
+    print(f"record: {path}")
+
+
+def errors_of(capture: Capture, truth: SceneTruth, evidence: Evidence) -> Errors:
+    """Against the truth of a built-in scene."""
+    points = against_truth.true_points(capture, truth, evidence)
+    return against_truth.errors(capture, evidence, points)
+
+
+def error_lines(errors: Errors) -> list[str]:
+    """For a person."""
+    said = [
+        f"against the truth: {errors.false_share:.2%} of all pixels are marked as "
+        "moving and stand still"
+    ]
+    if math.isfinite(errors.mask_iou):
+        said.append(f"  mask: intersection over union {errors.mask_iou:.3f}")
+    if math.isfinite(errors.track_px):
+        said.append(
+            f"  moving points, {LATER} frames on: {errors.track_px:.2f} px off "
+            f"(median), {errors.track_lost:.0%} lost"
+        )
+    if math.isfinite(errors.path_error):
+        said.append(
+            f"  their places: {errors.path_error:.2%} of the distance off (median)"
+        )
+    return said
+
+
+def as_json(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The same with None for what is not a number."""
+    return {
+        name: None if isinstance(value, float) and not math.isfinite(value) else value
+        for name, value in values.items()
+    }
+
+
+class _Told:
+    """Prints each part as it begins."""
+
+    def __init__(self):
+        self._began = time.perf_counter()
+
+    def __call__(self, part):
+        print(f"{time.perf_counter() - self._began:6.1f} s  {part} ...", flush=True)

@@ -1,0 +1,120 @@
+"""All built-in scenes, whose truth is known, and ways to find flow, as one file."""
+
+import pathlib
+import time
+from typing import NamedTuple
+
+import numpy as np
+from skimage import registration
+
+from experiments.evidence import report
+from nerfies_jax.capture import synthetic
+from nerfies_jax.capture.json_files import write_json
+from nerfies_jax.evidence import (
+    dense_flow,
+    optical_flow,
+    record,
+    summary,
+    view_set,
+)
+from nerfies_jax.measure import clock
+from nerfies_jax.runs.platform import CACHE
+
+FLOW_SCENES = ("default", "fast", "articulated", "exposure")
+PAIRS = 5  # of neighbours in each of these, evenly over the film
+TIMES = (1, 2)  # how many times larger the pictures are made first
+
+
+class FlowRow(NamedTuple):
+    """One way to find flow, over all pairs."""
+
+    method: str
+    enlarged: int
+    still_px: float  # median error of pixels at rest
+    moving_px: float  # and of those that move by themselves
+    far_off: float  # share of all pixels more than 1 px off
+    seconds: float  # of the processor, for a pair, one way
+
+
+def measure(seed: int, folder: pathlib.Path) -> None:
+    """Write evidence.json with all scenes and all ways to find flow."""
+    rows = []
+    for name, spec in synthetic.PRESETS.items():
+        capture, truth = synthetic.cached(spec, CACHE / "scenes", seed)
+        evidence = record.gather(capture)
+        views = view_set.in_time_order(record.looked_at(capture, evidence.factor))
+        found = summary.of(views, evidence)
+        errors = report.errors_of(capture, truth, evidence)
+        both = found._asdict() | errors._asdict()
+        rows.append({"scene": name, **report.as_json(both)})
+        print(f"{name}: {found.seconds:.0f} s", flush=True)
+        print("\n".join(report.error_lines(errors)), flush=True)
+    flows = [report.as_json(row._asdict()) for row in flow_rows(seed)]
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "evidence.json"
+    write_json(path, {"machine": clock.machine(), "scenes": rows, "flows": flows})
+    print(f"saved {path}")
+
+
+def flow_rows(seed: int) -> list[FlowRow]:
+    """Each way to find flow, on the same pairs of frames."""
+    pairs = [pair for name in FLOW_SCENES for pair in _pairs(name, seed)]
+    rows = []
+    for name, method in METHODS.items():
+        for times in TIMES:
+            rows.append(_flow_row(name, method, times, pairs))
+            print(rows[-1], flush=True)
+    return rows
+
+
+def _pairs(name, seed):
+    """Frames [2, height, width], true flow, where it is seen, and what moves."""
+    capture, _ = synthetic.cached(synthetic.PRESETS[name], CACHE / "scenes", seed)
+    views = view_set.in_time_order(capture)
+    pictures = dense_flow.levelled(views, 1)
+    chosen = np.linspace(0, len(views.row) - 2, PAIRS).round().astype(int)
+    for frame in chosen:
+        row = views.row[frame]
+        flow = capture.flow
+        if flow.next_row[row] != views.row[frame + 1]:
+            raise RuntimeError(f"{name}: frames {frame} and after are no neighbours")
+        known = flow.forward[row], flow.forward_seen[row], capture.moving[row]
+        yield pictures[frame : frame + 2], known
+
+
+def _flow_row(name, method, times, pairs):
+    still, moving, began = [], [], time.process_time()
+    for pictures, (true, seen, moves) in pairs:
+        one, other = (dense_flow.larger(picture, times) for picture in pictures)
+        found = dense_flow.reduced(method(times)(one, other), times)
+        error = np.linalg.norm(found - true, axis=-1)
+        still.append(error[seen & ~moves])
+        moving.append(error[seen & moves])
+    seconds = (time.process_time() - began) / len(pairs)
+    still, moving = np.concatenate(still), np.concatenate(moving)
+    return FlowRow(
+        name,
+        times,
+        float(np.median(still)),
+        float(np.median(moving)),
+        float((np.concatenate([still, moving]) > 1).mean()),
+        seconds,
+    )
+
+
+def _of_skimage(method, **settings):
+    def flow(one, other):
+        pictures = one / np.float32(255), other / np.float32(255)
+        down, right = method(*pictures, dtype=np.float32, **settings)
+        return np.stack([right, down], axis=-1)
+
+    return lambda times: flow
+
+
+_TVL1, _ILK = registration.optical_flow_tvl1, registration.optical_flow_ilk
+METHODS = {
+    "DIS (OpenCV, medium)": dense_flow.dis,
+    "ILK (scikit-image)": _of_skimage(_ILK),
+    "TV-L1 (scikit-image)": _of_skimage(_TVL1),
+    "TV-L1, as `inspect_scene` has it": _of_skimage(_TVL1, **optical_flow.FLOW),
+}

@@ -1,0 +1,119 @@
+"""How well a film was followed where the truth is known.
+
+Points of the truth are followed from where they are first seen, by the flow that was
+gathered, aligned, and placed in space, as the tracks of the evidence are.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.capture.synthetic import SceneTruth
+from nerfies_jax.evidence import dense_flow, paths, record, summary, view_set
+from nerfies_jax.evidence import tracks as tracking
+from nerfies_jax.evidence.record import Evidence
+from nerfies_jax.evidence.rest_points import RestPoints
+from nerfies_jax.evidence.tracks import Tracks
+
+LATER = 24  # frames after which a track is held against the truth
+
+
+class TruePoints(NamedTuple):
+    """Points that move, in the frames and pixels of the evidence."""
+
+    pixel: np.ndarray  # [points, frames, 2]
+    seen: np.ndarray  # [points, frames] bool
+    position: np.ndarray  # [points, frames, 3] scene units
+
+
+class Errors(NamedTuple):
+    """NaN where there is nothing to measure."""
+
+    mask_iou: float  # of what moves
+    false_share: float  # of all pixels, marked as moving and at rest
+    track_px: float  # median after `LATER` frames
+    track_lost: float  # share of the points still to be seen then that are lost
+    path_error: float  # median, as a share of the typical distance
+
+
+def true_points(capture: Capture, truth: SceneTruth, evidence: Evidence) -> TruePoints:
+    """The truth's moving points; ValueError where it is not that of the capture."""
+    if truth.ids != capture.ids:
+        raise ValueError(
+            f"{capture.name}: the truth has other frames than the capture; make the "
+            "scene again"
+        )
+    last = truth.track_world.shape[1] - 1
+    instant = np.round(capture.times[evidence.row] * last).astype(int)
+    scale = evidence.moving.shape[2] / truth.things.shape[2]
+    world = (truth.track_world[:, instant] - np.float32(capture.centre)) * capture.scale
+    return TruePoints(
+        truth.track_pixel[:, evidence.row] * scale,
+        truth.track_seen[:, evidence.row],
+        world,
+    )
+
+
+def errors(capture: Capture, evidence: Evidence, points: TruePoints) -> Errors:
+    """Of masks, tracks and paths; `capture` has the true masks of what moves."""
+    small = record.looked_at(capture, evidence.factor)
+    true = small.moving[evidence.row]
+    either = (evidence.moving | true).sum()
+    iou = (evidence.moving & true).sum() / either if true.any() else np.nan
+    track_px = lost = path_error = np.nan
+    rows = np.flatnonzero(points.seen.any(1))
+    if len(rows):
+        points = TruePoints(*(part[rows] for part in points))
+        views = view_set.in_time_order(small)
+        followed = _followed(views, evidence, points)
+        track_px, lost = _track_error(followed, points)
+        path_error = _path_error(capture, views, evidence, followed, points)
+    return Errors(
+        mask_iou=float(iou),
+        false_share=float((evidence.moving & ~true).mean()),
+        track_px=track_px,
+        track_lost=lost,
+        path_error=path_error,
+    )
+
+
+def _followed(views, evidence, points):
+    start = points.seen.argmax(1)
+    place = points.pixel[np.arange(len(start)), start]
+    starts = np.concatenate([start[:, None], place], axis=1)
+    chained = tracking.chain(evidence.flow, starts)
+    return tracking.realigned(chained, dense_flow.levelled(views), views.size)
+
+
+def _track_error(followed: Tracks, points):
+    later = followed.start + LATER
+    rows = np.flatnonzero(later < points.seen.shape[1])
+    rows = rows[points.seen[rows, later[rows]]]
+    if not len(rows):
+        return np.nan, np.nan
+    kept = rows[followed.seen[rows, later[rows]]]
+    off = followed.pixel[kept, later[kept]] - points.pixel[kept, later[kept]]
+    error = np.linalg.norm(off, axis=-1)
+    median = float(np.median(error)) if len(error) else np.nan
+    return median, 1 - len(kept) / len(rows)
+
+
+def _path_error(capture, views, evidence, followed, points):
+    long = followed.seen.sum(1) >= min(record.SHORTEST_PATH, len(views.row))
+    followed = followed.take(long)
+    if not long.any():
+        return np.nan
+    still = evidence.score < paths.AT_REST
+    around = paths.depth_around(
+        followed,
+        evidence.tracks.take(still),
+        RestPoints(*(part[still] for part in evidence.rest)),
+        capture.near,
+    )
+    found = paths.least_acceleration(views, followed, capture.near, around)
+    error = np.linalg.norm(found.position - points.position[long], axis=-1)
+    known = found.known & points.seen[long]
+    if not known.any():
+        return np.nan
+    return float(np.median(error[known]) / summary.typical_distance(evidence))

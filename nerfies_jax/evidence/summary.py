@@ -1,0 +1,126 @@
+"""What was gathered of a capture, in numbers and in plain words."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from nerfies_jax.evidence import record, rigid_groups, still_points
+from nerfies_jax.evidence.record import MOVES, PARTS, Evidence
+from nerfies_jax.evidence.view_set import Views
+
+# Above it a path's depth is that of what stands around it; half of it is a good depth.
+UNCERTAIN = 0.3
+# Deviation of the depth of points at rest, as a share: the film has no parallax.
+NO_PARALLAX = 0.3
+EXPLAINED = 0.01  # of the typical distance: a rigid group's paths are its motion
+
+
+class Summary(NamedTuple):
+    """NaN where there is nothing to measure."""
+
+    frames: int
+    size: tuple[int, int]  # as looked at, px
+    factor: int
+    carried: float  # share of the textured pixels whose flow can be trusted
+    moving: float  # share of the pixels
+    tracks: int
+    track_frames: float  # median length
+    moving_tracks: int
+    paths: int
+    path_deviation: float  # median, of a path's depth, as a share of it
+    rest_deviation: float  # median, of the depth of tracks at rest, as a share of it
+    points: int  # dense, at rest
+    groups: int  # of rigid motion
+    group_miss: float  # median, of the paths, as a share of the typical distance
+    seconds: float  # of the processor
+    unusable: str
+
+
+def of(views: Views, evidence: Evidence) -> Summary:
+    """The numbers; `views` are those that were looked at."""
+    tracks, paths = evidence.tracks, evidence.paths
+    still = np.flatnonzero(evidence.score < MOVES)
+    points = type(evidence.rest)(*(part[still] for part in evidence.rest))
+    parallax = still_points.depth_deviation(views, tracks.take(still), points)
+    distance = typical_distance(evidence)
+    groups, miss = 0, np.nan
+    kept = paths.known.any(1)
+    if kept.any():
+        place, known = paths.position[kept], paths.known[kept]
+        groups, miss = rigid_groups.fewest(place, known, EXPLAINED * distance)
+    return Summary(
+        frames=len(evidence.row),
+        size=views.size,
+        factor=evidence.factor,
+        carried=record.carried(views, evidence.flow),
+        moving=float(evidence.moving.mean()),
+        tracks=len(evidence.score),
+        track_frames=_median(tracks.seen.sum(1)),
+        moving_tracks=int((evidence.score > MOVES).sum()),
+        paths=len(evidence.moved),
+        path_deviation=_median(paths.depth_deviation),
+        rest_deviation=_median(parallax),
+        points=len(evidence.still.position),
+        groups=groups,
+        group_miss=miss / distance,
+        seconds=sum(evidence.seconds),
+        unusable=evidence.unusable,
+    )
+
+
+def typical_distance(evidence: Evidence) -> float:
+    """Median z-depth of the points that explain the tracks; scene units."""
+    depth = evidence.rest.depth[evidence.tracks.seen]
+    depth = depth[np.isfinite(depth) & (depth > 0)]
+    return float(np.median(depth)) if len(depth) else 1.0
+
+
+def lines(found: Summary, evidence: Evidence) -> list[str]:
+    """For a person."""
+    width, height = found.size
+    smaller = f", made {found.factor} times smaller" if found.factor > 1 else ""
+    said = [
+        f"{found.frames} frames of {width}x{height}{smaller}",
+        f"{found.carried:.0%} of the textured pixels can be carried to the next frame",
+        f"{found.moving:.1%} of the pixels move by themselves",
+        f"{found.tracks:,} tracks, seen in {found.track_frames:.0f} frames (median); "
+        f"{found.moving_tracks:,} of them move by themselves",
+    ]
+    if found.paths:
+        said.append(f"{found.paths:,} paths in space: {_depth_words(found)}")
+        said.append(
+            f"{found.groups} group(s) of rigid motion explain the paths to "
+            f"{found.group_miss:.1%} of the distance"
+        )
+    said.append(f"{found.points:,} dense points at rest{_rest_words(found)}")
+    parts = [
+        f"{words} {seconds:.1f}"
+        for words, seconds in zip(PARTS, evidence.seconds, strict=True)
+    ]
+    said.append(f"{found.seconds:.0f} s of the processor: " + ", ".join(parts))
+    if found.unusable:
+        said.append(f"nothing to follow: {found.unusable}")
+    elif not found.paths:
+        said.append("nothing to follow: no track moves by itself for long enough")
+    return said
+
+
+def _depth_words(found):
+    share = found.path_deviation
+    if share > UNCERTAIN:
+        return (
+            "the film does not tell their depth (the camera gives no parallax, or "
+            "moves at the pace of the things); it is that of what stands around"
+        )
+    sure = "certain" if share < UNCERTAIN / 2 else "rough"
+    return f"their depth is {sure}, to {share:.1%} (median)"
+
+
+def _rest_words(found):
+    if found.rest_deviation > NO_PARALLAX:
+        return ": the camera gives no parallax, so no depth can be told"
+    return f"; the depth of tracks at rest is known to {found.rest_deviation:.1%}"
+
+
+def _median(values):
+    return float(np.median(values)) if len(values) else np.nan
