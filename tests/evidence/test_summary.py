@@ -13,7 +13,6 @@ from nerfies_jax.evidence import (
     view_set,
 )
 from nerfies_jax.evidence.against_truth import TruePoints
-from nerfies_jax.evidence.paths import Paths
 from tests.evidence import films
 from tests.evidence.test_tracks import MOVES, card_path, gathered
 
