@@ -14,9 +14,14 @@ from nerfies_jax.evidence.view_set import Views
 HALF_CERTAIN_PX, STEEPNESS = 0.5, 3.0
 # Tracks near each other in shared frames move alike.
 NEIGHBOURS, EVERY_FRAMES, NEAR_PX, NEIGHBOUR_WEIGHT, ROUNDS = 10, 6, 6.0, 3.0, 10
-# A pixel takes after the tracks around it, by place and colour.
+# A pixel takes after the tracks around it, by place and colour. What none is near to
+# may have come too quickly to be followed: a still scene's colours have the last word.
 VOTES, VOTE_PX, VOTE_COLOUR, REACH_PX = 8, 4.0, 20.0, 8.0
-LONGEST_SIDE_PX = 256  # masks of larger pictures are made this small and enlarged
+FAR_FROM_TRACKS = 0.3
+# What may move is left out of the still scene that pictures are held against.
+OPEN, RIM_PX = 0.3, 8
+SUREST = 0.02  # votes are no surer than that
+SMOOTH_REACH, SMOOTH_PX, SMOOTH_COLOUR = 4, 3.0, 15.0
 
 
 def track_scores(tracks: Tracks, rest: RestPoints) -> np.ndarray:
@@ -57,41 +62,92 @@ def _neighbourhood(tracks):
     return one_way + one_way.T
 
 
-def mask(views: Views, tracks: Tracks, score: np.ndarray) -> np.ndarray:
-    """[frames, height, width] bool: pixels whose nearest tracks move.
+def votes(views: Views, tracks: Tracks, score: np.ndarray) -> np.ndarray:
+    """[frames, height, width] in 0..1 that a pixel moves, by the tracks near it.
 
     Tracks that lie near and on a pixel of like colour count most; a pixel far from all
-    of them counts as still.
+    of them is as likely as `FAR_FROM_TRACKS`.
     """
     frames = len(views.row)
-    (width, height), part = views.size, _reduction(views)
-    x, y = np.meshgrid(np.arange(0, width, part), np.arange(0, height, part))
+    width, height = views.size
+    x, y = np.meshgrid(np.arange(width), np.arange(height))
     at = np.stack([x, y], axis=-1).reshape(-1, 2)
-    found = np.zeros((frames, height, width), bool)
+    found = np.full((frames, height, width), FAR_FROM_TRACKS, np.float32)
     for frame in range(frames):
         here = np.flatnonzero(tracks.seen[:, frame])
         if len(here) < VOTES:
             continue
         colour = cv2.cvtColor(views.image[frame], cv2.COLOR_RGB2LAB).astype(np.float32)
-        own = colour[at[:, 1], at[:, 0]]
         place = tracks.pixel[here, frame]
         theirs = colour[pixel_of(place, (height, width))]
-        distance, near = cKDTree(place).query(at + 0.5 * part, VOTES)
-        distance = distance / picture_scale(width)
-        unlike = np.linalg.norm(own[:, None] - theirs[near], axis=-1) / VOTE_COLOUR
-        weight = np.exp(-0.5 * ((distance / VOTE_PX) ** 2 + unlike**2))
-        weight = weight + 1e-9 * np.exp(-distance / VOTE_PX)
-        votes = (weight * score[here][near]).sum(1) / weight.sum(1)
-        votes[distance[:, 0] > REACH_PX] = 0
-        small = votes.reshape(x.shape).astype(np.float32)
-        found[frame] = cv2.resize(small, (width, height)) > 0.5
+        distance, near = cKDTree(place).query(at + 0.5, VOTES)
+        distance = (distance / picture_scale(width)).astype(np.float32)
+        unlike = colour.reshape(-1, 1, 3) - theirs[near]
+        unlike = np.einsum("pvc,pvc->pv", unlike, unlike) / VOTE_COLOUR**2
+        weight = np.exp(-0.5 * ((distance / VOTE_PX) ** 2 + unlike))
+        weight += 1e-9 * np.exp(-distance / VOTE_PX)
+        share = (weight * score[here][near]).sum(1) / weight.sum(1)
+        share[distance[:, 0] > REACH_PX] = FAR_FROM_TRACKS
+        found[frame] = share.reshape(x.shape)
     return found
+
+
+def may_move(share: np.ndarray) -> np.ndarray:
+    """[frames, height, width] bool: all that votes leave open, and a rim around it."""
+    size = 2 * round(RIM_PX * picture_scale(share.shape[2])) + 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    return np.stack([cv2.dilate(np.uint8(one > OPEN), disc) > 0 for one in share])
+
+
+def mask(views: Views, share: np.ndarray, odds: np.ndarray) -> np.ndarray:
+    """[frames, height, width] bool: votes and what colours say, alike where these are.
+
+    `odds` are those of `still_pictures.log_odds`.
+    """
+    share = np.clip(share, SUREST, 1 - SUREST)
+    total = np.log(share / (1 - share)) + odds
+    found = np.zeros(total.shape, bool)
+    for frame, one in enumerate(total):
+        colour = cv2.cvtColor(views.image[frame], cv2.COLOR_RGB2LAB).astype(np.float32)
+        found[frame] = _smooth(one.astype(np.float32), colour) > 0
+    return found
+
+
+def settled(tracks: Tracks, score: np.ndarray, moving: np.ndarray) -> np.ndarray:
+    """[tracks] no more certain to move than the share of its frames on moving pixels.
+
+    Flow drags along what lies beside a moving edge: in the built-in scenes up to a
+    fifth of the tracks that seem to move, and hardly one afterwards.
+    """
+    row, column = pixel_of(tracks.pixel, moving.shape[1:])
+    on = moving[np.arange(len(moving)), row, column] & tracks.seen
+    return np.minimum(score, on.sum(1) / np.maximum(tracks.seen.sum(1), 1))
+
+
+def _smooth(values, colour):
+    """[height, width] mean over pixels near and of like colour (a bilateral filter)."""
+    height, width = values.shape
+    values, colour = (
+        cv2.copyMakeBorder(one, *(SMOOTH_REACH,) * 4, cv2.BORDER_REFLECT)
+        for one in (values, colour)
+    )
+    own = colour[SMOOTH_REACH:-SMOOTH_REACH, SMOOTH_REACH:-SMOOTH_REACH]
+    total, weights = np.zeros((2, height, width), np.float32)
+    reach = range(-SMOOTH_REACH, SMOOTH_REACH + 1)
+    for down, right in ((i, j) for i in reach for j in reach if (i + j) % 2 == 0):
+        there = np.s_[
+            SMOOTH_REACH + down : SMOOTH_REACH + down + height,
+            SMOOTH_REACH + right : SMOOTH_REACH + right + width,
+        ]
+        unlike = colour[there] - own
+        unlike = np.einsum("hwc,hwc->hw", unlike, unlike) / SMOOTH_COLOUR**2
+        near = (down**2 + right**2) / SMOOTH_PX**2
+        weight = np.exp(-0.5 * (unlike + np.float32(near)))
+        total += weight * values[there]
+        weights += weight
+    return total / weights
 
 
 def picture_scale(width: int) -> float:
     """Pixels of such a picture for one of 176 wide, where the constants were set."""
     return max(1.0, width / 176)
-
-
-def _reduction(views):
-    return max(1, round(max(views.size) / LONGEST_SIDE_PX))

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import scipy.ndimage as nd
 
@@ -25,6 +26,7 @@ from nerfies_jax.evidence import (
     moving,
     paths,
     rest_points,
+    still_pictures,
     still_points,
     view_set,
 )
@@ -38,6 +40,7 @@ from nerfies_jax.evidence.view_set import Views
 VERSION = 2  # of the file; counts up whenever the same pictures would say otherwise
 # A path has as many frames at least, and a film as many; fewer say nothing of motion.
 SHORTEST_PATH, SHORTEST_FILM = 10, 6
+LONGEST_SIDE_PX = 256  # masks of larger pictures are made this small and enlarged
 MOVES = 0.5  # score from which a track counts as moving
 MOST_PATHS = 1500
 MOST_PIXELS = 16_000_000  # of all frames: 17 bytes each for the flow between them
@@ -104,7 +107,8 @@ def gather(
     rest = rest_points.fit(views, tracks)
     watch.begin("moving")
     score = moving.track_scores(tracks, rest)
-    mask = moving.mask(views, tracks, score)
+    mask = _mask(views, flow, tracks, score)
+    score = moving.settled(tracks, score, mask)
     watch.begin("paths")
     unusable = _unusable(views, flow)
     which = _moved(tracks, score) if not unusable else np.zeros(0, int)
@@ -140,6 +144,27 @@ class _Watch:
     def seconds(self):
         times = [*self._began.values(), time.process_time()]
         return Seconds(**dict(zip(self._began, np.diff(times).tolist(), strict=True)))
+
+
+def _mask(views, flow, tracks, score):
+    """Which pixels move, found in small pictures and enlarged."""
+    (width, height), part = views.size, math.ceil(max(views.size) / LONGEST_SIDE_PX)
+    small, near = (
+        view_set.smaller(views, part),
+        tracks._replace(pixel=tracks.pixel / part),
+    )
+    share = moving.votes(small, near, score)
+    open_to_doubt = _enlarged(moving.may_move(share), height, width)
+    still = still_points.dense(views, flow, open_to_doubt)
+    found = moving.mask(small, share, still_pictures.log_odds(small, still))
+    return _enlarged(found, height, width)
+
+
+def _enlarged(masks, height, width):
+    if masks.shape[1:] == (height, width):
+        return masks
+    enlarged = [cv2.resize(np.float32(one), (width, height)) > 0.5 for one in masks]
+    return np.stack(enlarged)
 
 
 def _paths(capture, views, tracks, rest, score, which, use_depths):

@@ -4,6 +4,7 @@ import dataclasses
 import math
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import scipy.ndimage as nd
 
@@ -96,6 +97,30 @@ def _views(capture, rows):
         intrinsics=np.stack([_matrix(cameras, row) for row in rows]),
         rotation=cameras.camera_from_world[rows].astype(np.float64),
         position=cameras.position[rows].astype(np.float64),
+    )
+
+
+def smaller(views: Views, factor: int) -> Views:
+    """The same frames with pixels so many times larger; a rest at the rim stays out."""
+    if factor == 1:
+        return views
+    width, height = (side // factor for side in views.size)
+    trimmed = np.s_[:, : height * factor, : width * factor]
+
+    def shrunk(pictures):
+        parts = [
+            cv2.resize(one, (width, height), interpolation=cv2.INTER_AREA)
+            for one in pictures[trimmed]
+        ]
+        return np.stack(parts)
+
+    scale = np.diag([1 / factor, 1 / factor, 1.0])
+    return views._replace(
+        image=shrunk(views.image),
+        grey=shrunk(views.grey),
+        valid=shrunk(np.uint8(views.valid)) > 0,
+        textured=shrunk(np.uint8(views.textured)) > 0,
+        intrinsics=scale @ views.intrinsics,
     )
 
 
