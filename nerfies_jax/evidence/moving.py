@@ -17,6 +17,7 @@ NEIGHBOURS, EVERY_FRAMES, NEAR_PX, NEIGHBOUR_WEIGHT, ROUNDS = 10, 6, 6.0, 3.0, 1
 # A pixel takes after the tracks around it, by place and colour. What none is near to
 # may have come too quickly to be followed: a still scene's colours have the last word.
 VOTES, VOTE_PX, VOTE_COLOUR, REACH_PX = 8, 4.0, 20.0, 8.0
+VOTE_STEP = 2  # pixels of a side that vote as one does; the sum is smoothed anyway
 FAR_FROM_TRACKS = 0.3
 # What may move is left out of the still scene that pictures are held against.
 OPEN, RIM_PX = 0.3, 8
@@ -70,7 +71,7 @@ def votes(views: Views, tracks: Tracks, score: np.ndarray) -> np.ndarray:
     """
     frames = len(views.row)
     width, height = views.size
-    x, y = np.meshgrid(np.arange(width), np.arange(height))
+    x, y = np.meshgrid(np.arange(0, width, VOTE_STEP), np.arange(0, height, VOTE_STEP))
     at = np.stack([x, y], axis=-1).reshape(-1, 2)
     found = np.full((frames, height, width), FAR_FROM_TRACKS, np.float32)
     for frame in range(frames):
@@ -80,15 +81,17 @@ def votes(views: Views, tracks: Tracks, score: np.ndarray) -> np.ndarray:
         colour = cv2.cvtColor(views.image[frame], cv2.COLOR_RGB2LAB).astype(np.float32)
         place = tracks.pixel[here, frame]
         theirs = colour[pixel_of(place, (height, width))]
-        distance, near = cKDTree(place).query(at + 0.5, VOTES)
+        distance, near = cKDTree(place).query(at + 0.5 * VOTE_STEP, VOTES)
         distance = (distance / picture_scale(width)).astype(np.float32)
-        unlike = colour.reshape(-1, 1, 3) - theirs[near]
+        unlike = colour[at[:, 1], at[:, 0], None] - theirs[near]
         unlike = np.einsum("pvc,pvc->pv", unlike, unlike) / VOTE_COLOUR**2
         weight = np.exp(-0.5 * ((distance / VOTE_PX) ** 2 + unlike))
         weight += 1e-9 * np.exp(-distance / VOTE_PX)
         share = (weight * score[here][near]).sum(1) / weight.sum(1)
         share[distance[:, 0] > REACH_PX] = FAR_FROM_TRACKS
-        found[frame] = share.reshape(x.shape)
+        share = share.reshape(x.shape)
+        share = share.repeat(VOTE_STEP, 0).repeat(VOTE_STEP, 1)
+        found[frame] = share[:height, :width]
     return found
 
 

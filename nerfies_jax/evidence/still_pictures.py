@@ -111,7 +111,8 @@ def _unlike(views, colour, depth, frame):
         x, y, z = _places(views, frame, other, pixel, far).reshape(3, height, width)
         there = cv2.remap(colour[other], x, y, cv2.INTER_LINEAR, borderValue=OUTSIDE)
         before = cv2.remap(depth[other], x, y, cv2.INTER_NEAREST, borderValue=0)
-        unlike = np.abs(there - colour[frame]).max(-1)
+        red, green, blue = np.moveaxis(np.abs(there - colour[frame]), -1, 0)
+        unlike = np.maximum(np.maximum(red, green), blue)
         unlike[(z <= 0) | (before < HIDDEN * z)] = np.nan
         found.append(unlike)
     if len(found) < LEAST_FRAMES:
