@@ -12,6 +12,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from nerfies_jax.capture.given import GivenFiles
 from nerfies_jax.runs.config import CaptureSource, MoreMetrics
 
 Positional = tyro.conf.Positional
@@ -25,6 +26,7 @@ class NamedSource(CaptureSource):
     """Folder in Nerfies, HyperNeRF, Blender, D-NeRF or COLMAP layout."""
     scene: str | None = None
     """Which built-in scene, where no capture is given (default: default)."""
+    files: Annotated[GivenFiles, tyro.conf.arg(name="")] = GivenFiles()
 
 
 # Their fields stand among the other options of a command.
@@ -40,7 +42,8 @@ def plain(source: CaptureSource) -> CaptureSource:
 
 def given(source: CaptureSource) -> dict[str, Any]:
     """What the command line says of the source, by field."""
-    return {name: value for name, value in vars(source).items() if value is not None}
+    unsaid = (None, GivenFiles())
+    return {name: value for name, value in vars(source).items() if value not in unsaid}
 
 
 def parse(settings_class, arguments=None):

@@ -8,7 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from nerfies_jax.capture import flow as flows
+from nerfies_jax.capture import given as givens
 from nerfies_jax.capture.flow import FrameFlow
+from nerfies_jax.capture.given import Given
 from nerfies_jax.geometry import camera
 from nerfies_jax.geometry.camera import Camera
 
@@ -54,6 +56,7 @@ class Capture:
         None  # [frames, height, width] float32 z-depth; 0 unknown
     )
     flow: FrameFlow | None = None  # to the next and previous frame, in pixels
+    given: Given | None = None  # what other tools found, in place of our evidence
     points: PointCloud | None = None
     background: tuple[float, float, float] | None = None  # what lies behind, if known
     scale: float = 1.0
@@ -265,6 +268,7 @@ def select(capture: Capture, rows: np.ndarray) -> Capture:
         moving=take(capture.moving),
         depths=take(capture.depths),
         flow=None if capture.flow is None else flows.take(capture.flow, rows),
+        given=None if capture.given is None else givens.take(capture.given, rows),
     )
 
 

@@ -93,12 +93,12 @@ def between_neighbours(views: Views, pictures: np.ndarray) -> NeighbourFlow:
     for frame in range(frames - 1):
         there, back = flow(frame, frame + 1), flow(frame + 1, frame)
         forward[frame], backward[frame + 1] = there, back
-        forward_seen[frame] = _closed(there, back)
-        backward_seen[frame + 1] = _closed(back, there)
+        forward_seen[frame] = closed(there, back)
+        backward_seen[frame + 1] = closed(back, there)
     return NeighbourFlow(forward, forward_seen, backward, backward_seen)
 
 
-def _closed(there, back):
+def closed(there: np.ndarray, back: np.ndarray) -> np.ndarray:
     """[height, width]: where `back` leads from the end of `there` to its start."""
     height, width = there.shape[:2]
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height))

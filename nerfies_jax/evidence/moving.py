@@ -122,9 +122,14 @@ def settled(tracks: Tracks, score: np.ndarray, moving: np.ndarray) -> np.ndarray
     Flow drags along what lies beside a moving edge: in the built-in scenes up to a
     fifth of the tracks that seem to move, and hardly one afterwards.
     """
+    return np.minimum(score, share_on(tracks, moving))
+
+
+def share_on(tracks: Tracks, moving: np.ndarray) -> np.ndarray:
+    """[tracks] share of the frames in which each lies on moving pixels."""
     row, column = pixel_of(tracks.pixel, moving.shape[1:])
     on = moving[np.arange(len(moving)), row, column] & tracks.seen
-    return np.minimum(score, on.sum(1) / np.maximum(tracks.seen.sum(1), 1))
+    return on.sum(1) / np.maximum(tracks.seen.sum(1), 1)
 
 
 def _smooth(values, colour):

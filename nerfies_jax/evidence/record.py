@@ -20,14 +20,17 @@ import scipy.ndimage as nd
 from nerfies_jax.capture import capture as captures
 from nerfies_jax.capture import pinholes
 from nerfies_jax.capture.capture import Capture, PointCloud
+from nerfies_jax.capture.given import Given
 from nerfies_jax.capture.json_files import replaced_file
 from nerfies_jax.evidence import (
     dense_flow,
+    given_depth,
     moving,
     paths,
     rest_points,
     still_pictures,
     still_points,
+    taken,
     view_set,
 )
 from nerfies_jax.evidence import tracks as tracking
@@ -37,7 +40,7 @@ from nerfies_jax.evidence.rest_points import RestPoints
 from nerfies_jax.evidence.tracks import Tracks
 from nerfies_jax.evidence.view_set import Views
 
-VERSION = 2  # of the file; counts up whenever the same pictures would say otherwise
+VERSION = 3  # of the file; counts up whenever the same pictures would say otherwise
 # A path has as many frames at least, and a film as many; fewer say nothing of motion.
 SHORTEST_PATH, SHORTEST_FILM = 10, 6
 LONGEST_SIDE_PX = 256  # masks of larger pictures are made this small and enlarged
@@ -92,27 +95,37 @@ def gather(
 ) -> Evidence:
     """Everything; about 0.25 s a frame of 176x132 on one core.
 
-    With `use_depths` paths lean on the capture's own depths where it has them. `tell`
-    hears of each of `PARTS` when it begins.
+    With `use_depths` paths lean on the capture's own depths where it has them. What
+    other tools found (`capture.given`) takes the place of what would be found here.
+    `tell` hears of each of `PARTS` when it begins.
     """
     watch = _Watch(tell)
     watch.begin("flow")
-    factor = _factor(capture)
+    factor, given = _factor(capture), capture.given or Given(capture.size)
     capture = looked_at(capture, factor)
     views = view_set.in_time_order(capture)
     pictures = dense_flow.levelled(views)
-    flow = dense_flow.between_neighbours(views, pictures)
+    flow = taken.flow(given, views)
+    if flow is None:
+        flow = dense_flow.between_neighbours(views, pictures)
     watch.begin("tracks")
-    tracks = tracking.found(views, flow, pictures)
+    tracks, first = _tracks(given, views, flow, pictures)
     rest = rest_points.fit(views, tracks)
     watch.begin("moving")
-    score = moving.track_scores(tracks, rest)
-    mask = _mask(views, flow, tracks, score)
-    score = moving.settled(tracks, score, mask)
+    mask = taken.moving(given, views)
+    if mask is None:
+        score = moving.track_scores(tracks, rest)
+        mask = _mask(views, flow, tracks, score)
+        score = moving.settled(tracks, score, mask)
+    else:
+        score = moving.share_on(tracks, mask)
     watch.begin("paths")
     unusable = _unusable(views, flow)
-    which = _moved(tracks, score) if not unusable else np.zeros(0, int)
-    found = _paths(capture, views, tracks, rest, score, which, use_depths)
+    which = np.zeros(0, int)
+    if not unusable:
+        which = _moved(tracks, score, first)
+    measured = _depths(capture, given, views, tracks, rest, score, use_depths)
+    found = _paths(capture, views, tracks, rest, score, which, measured)
     watch.begin("still")
     dense = still_points.dense(views, flow, mask)
     return Evidence(
@@ -146,6 +159,19 @@ class _Watch:
         return Seconds(**dict(zip(self._began, np.diff(times).tolist(), strict=True)))
 
 
+def _tracks(given, views, flow, pictures):
+    """All tracks, and the first of those whose paths are wanted.
+
+    Given ones stand behind our own, which still say what stands still: other tools may
+    have followed nothing but what moves.
+    """
+    own, others = tracking.found(views, flow, pictures), taken.tracks(given, views)
+    if others is None:
+        return own, 0
+    both = zip(own, others, strict=True)
+    return Tracks(*(np.concatenate(parts) for parts in both)), len(own.seen)
+
+
 def _mask(views, flow, tracks, score):
     """Which pixels move, found in small pictures and enlarged."""
     (width, height), part = views.size, math.ceil(max(views.size) / LONGEST_SIDE_PX)
@@ -167,7 +193,25 @@ def _enlarged(masks, height, width):
     return np.stack(enlarged)
 
 
-def _paths(capture, views, tracks, rest, score, which, use_depths):
+def _depths(capture, given, views, tracks, rest, score, use_depths):
+    """[frames, height, width] z-depths to lean on; None where there are none."""
+    depth = taken.depth(given, views)
+    if depth is None:
+        own = use_depths and capture.depths is not None
+        return capture.depths[views.row] if own else None
+    still = score < paths.AT_REST
+    points = RestPoints(*(part[still] for part in rest))
+    depth, miss = given_depth.aligned(depth, tracks.take(still), points)
+    if miss > given_depth.USABLE:
+        raise ValueError(
+            f"{capture.path or capture.name}: the given depths, or their inverse, miss "
+            f"the points at rest by {miss:.0%} (median), more than "
+            f"{given_depth.USABLE:.0%}; give those of these frames, or leave them out"
+        )
+    return depth
+
+
+def _paths(capture, views, tracks, rest, score, which, depths):
     still, moved = score < paths.AT_REST, tracks.take(which)
     around = paths.depth_around(
         moved,
@@ -175,9 +219,7 @@ def _paths(capture, views, tracks, rest, score, which, use_depths):
         RestPoints(*(part[still] for part in rest)),
         capture.near,
     )
-    measured = None
-    if use_depths and capture.depths is not None:
-        measured = _measured(capture, views, moved)
+    measured = None if depths is None else _measured(depths, moved)
     return paths.least_acceleration(views, moved, capture.near, around, measured)
 
 
@@ -212,9 +254,10 @@ def carried(views: Views, flow: NeighbourFlow) -> float:
     return float((flow.forward_seen[:-1] & shown).sum() / max(shown.sum(), 1))
 
 
-def _moved(tracks, score):
+def _moved(tracks, score, first):
     long = tracks.seen.sum(1) >= min(SHORTEST_PATH, tracks.seen.shape[1])
-    which = np.flatnonzero(long & (score > MOVES))
+    wanted = np.arange(len(score)) >= first
+    which = np.flatnonzero(long & wanted & (score > MOVES))
     if len(which) > MOST_PATHS:
         # Long ones say most, but every place is to have some.
         chance = tracks.seen[which].sum(1).astype(float)
@@ -223,12 +266,12 @@ def _moved(tracks, score):
     return np.sort(which)
 
 
-def _measured(capture, views, tracks):
-    """z-depths of the tracks where the capture has depth and it does not jump there."""
+def _measured(depths, tracks):
+    """z-depths of the tracks where they are known and do not jump."""
     found = np.full(tracks.seen.shape, np.nan)
-    for frame, row in enumerate(views.row):
+    for frame, picture in enumerate(depths):
         here = np.flatnonzero(tracks.seen[:, frame])
-        depth = steady_depth(capture.depths[row])
+        depth = steady_depth(picture)
         at = tracking.pixel_of(tracks.pixel[here, frame], depth.shape)
         found[here, frame] = depth[at]
     return found
@@ -247,7 +290,10 @@ def digest(capture: Capture, use_depths: bool = False) -> str:
     parts = [capture.images[capture.train], capture.times, capture.train]
     parts += [np.asarray([capture.near]), *capture.cameras]
     depths = capture.depths if use_depths else None
-    parts += [part for part in (capture.valid, depths) if part is not None]
+    given = () if capture.given is None else capture.given
+    for name, part in zip(Given._fields, given, strict=False):
+        found.update(f"{name} {part is None}".encode())
+    parts += [part for part in (capture.valid, depths, *given) if part is not None]
     for part in parts:
         part = np.ascontiguousarray(part)
         found.update(f"{part.dtype}{part.shape}".encode())

@@ -119,6 +119,8 @@ def _depth_words(found):
 def _rest_words(found):
     if found.rest_deviation > NO_PARALLAX:
         return ": the camera gives no parallax, so no depth can be told"
+    if not np.isfinite(found.rest_deviation):
+        return "; no track stands still"
     return f"; the depth of tracks at rest is known to {found.rest_deviation:.1%}"
 
 

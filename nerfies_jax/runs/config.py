@@ -4,6 +4,8 @@ import dataclasses
 import pathlib
 from typing import Literal
 
+from nerfies_jax.capture.given import GivenFiles
+
 
 @dataclasses.dataclass(frozen=True)
 class CaptureSource:
@@ -19,6 +21,8 @@ class CaptureSource:
     """Read the pictures with no side longer than this, in pixels."""
     heldout: str | None = None
     """Which frames to score: n for every n-th, or the name of a split."""
+    files: GivenFiles = GivenFiles()
+    """What other tools found in the pictures."""
 
     def __post_init__(self):
         if self.capture is not None:  # one folder has one name, wherever it is opened
@@ -28,11 +32,12 @@ class CaptureSource:
     @property
     def arguments(self) -> tuple[str, ...]:
         """The pictures as named on a command line, not quoted."""
-        if self.capture is None:
-            return ("--scene", self.scene)
-        words = [str(self.capture)]
-        for name in ("factor", "max_side", "heldout"):
-            value = getattr(self, name)
+        words = ["--scene", self.scene]
+        if self.capture is not None:
+            words = [str(self.capture)]
+        fields = {**vars(self), **vars(self.files)}
+        for name in ("factor", "max_side", "heldout", *vars(self.files)):
+            value = fields[name]
             if value is not None:
                 words += [f"--{name.replace('_', '-')}", str(value)]
         return tuple(words)

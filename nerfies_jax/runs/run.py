@@ -14,6 +14,7 @@ from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.json_files import write_json
 from nerfies_jax.evaluation.representation import Representation
+from nerfies_jax.evidence import given_files
 from nerfies_jax.runs import own_effects, representations
 from nerfies_jax.runs.config import CaptureSource, RunConfig
 from nerfies_jax.runs.run_folder import CHECKPOINTS, CONFIG
@@ -114,6 +115,10 @@ def stored_capture(source: CaptureSource, seed: int = 0) -> Capture:
 
     `seed` makes a built-in scene. Raises ValueError where it cannot be read as asked.
     """
+    return given_files.attached(_filmed(source, seed), source.files)
+
+
+def _filmed(source, seed):
     if source.capture is None:
         return _built_in(source, seed)
     heldout = source.heldout

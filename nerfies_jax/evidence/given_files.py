@@ -1,0 +1,277 @@
+"""Files of other tools: tracks, masks, depths and flow, checked against a capture.
+
+Each has as many frames as the capture, or as it has frames to learn from; either way in
+order of time. What a file does not fit in is said with the file, the bound and the way
+out.
+"""
+
+import dataclasses
+import pathlib
+import zipfile
+from collections.abc import Sequence
+
+import numpy as np
+
+from nerfies_jax.capture import exr, frames, images
+from nerfies_jax.capture.capture import Capture, CaptureError
+from nerfies_jax.capture.given import Given, GivenFiles
+
+MOST_NUMBERS = 2_000_000_000  # of one file
+# Names of tracks and of where they are seen, and which axis counts the frames where
+# the shape leaves it open: TAPIR, CoTracker.
+TRACK_NAMES = (("tracks", "visibles", 1), ("pred_tracks", "pred_visibility", 0))
+LEAST_INSIDE = 0.5  # of what is seen must lie in the pictures
+SEEN = 0.5  # of a visibility between 0 and 1
+FLO_MAGIC = 202021.25  # of Middlebury's .flo
+PICTURES, DEPTHS = (".png",), (".exr", ".png", ".npy")
+
+
+def attached(capture: Capture, files: GivenFiles) -> Capture:
+    """The capture with what the files hold; CaptureError for what does not fit."""
+    if files == GivenFiles():
+        return capture
+    if capture.cameras.radial.any() or capture.cameras.tangential.any():
+        raise CaptureError(
+            f"{capture.path or capture.name}: its lens bends the pictures, so files of "
+            "other tools are of other pixels than those looked at; undistort the "
+            "capture first, as COLMAP's image_undistorter does"
+        )
+    parts = {}
+    if files.tracks is not None:
+        parts |= _tracks(files.tracks, capture)
+    if files.masks is not None:
+        parts["moving"] = _masks(files.masks, capture)
+    if files.depths is not None:
+        parts["depth"] = _depths(files.depths, capture)
+    if files.flow is not None:
+        parts |= _flow(files.flow, capture)
+    return dataclasses.replace(capture, given=Given(capture.size, **parts))
+
+
+def _rows(count, capture, path, what):
+    """The capture's rows that so many frames are."""
+    learnt = capture.train[np.argsort(capture.times[capture.train], kind="stable")]
+    every = np.argsort(capture.times, kind="stable")
+    for rows in (learnt, every):
+        if count == len(rows):
+            return rows
+    raise CaptureError(
+        f"{path}: {what} of {count} frames; the capture has {len(every)}, "
+        f"{len(learnt)} of them to learn from: give one for each, in order of time"
+    )
+
+
+def _arrays(path):
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+        reason = " ".join(str(error).split())
+        raise CaptureError(
+            f"{path}: not a readable npz ({reason}); save it with numpy.savez"
+        ) from None
+    for name, array in arrays.items():
+        if array.dtype.kind not in "fiub" or array.size > MOST_NUMBERS:
+            raise CaptureError(
+                f"{path}: {name} is {array.dtype} of shape {array.shape}; expected at "
+                f"most {MOST_NUMBERS} numbers"
+            )
+    return arrays
+
+
+def _tracks(path, capture):
+    arrays = _arrays(path)
+    for names in TRACK_NAMES:
+        if names[0] in arrays and names[1] in arrays:
+            break
+    else:
+        wanted = " or ".join(f"{one} and {two}" for one, two, _ in TRACK_NAMES)
+        raise CaptureError(
+            f"{path}: holds {', '.join(arrays) or 'nothing'}; expected {wanted}"
+        )
+    pixel, seen = arrays[names[0]], arrays[names[1]]
+    if pixel.ndim == 4 and len(pixel) == 1:  # CoTracker's batch
+        pixel, seen = pixel[0], seen.reshape(seen.shape[1:])
+    if pixel.ndim != 3 or pixel.shape[2] != 2 or seen.shape[:2] != pixel.shape[:2]:
+        raise CaptureError(
+            f"{path}: {names[0]} of shape {pixel.shape} and {names[1]} of "
+            f"{seen.shape}; expected [tracks, frames, 2] and [tracks, frames], or "
+            "frames first"
+        )
+    seen = seen.reshape(pixel.shape[:2])
+    counts = {len(capture.train), len(capture.ids)}
+    fits = [axis for axis in (0, 1) if pixel.shape[axis] in counts]
+    if len(fits) != 1:
+        fits = [names[2]]
+    pixel, seen = np.moveaxis(pixel, fits[0], 0), np.moveaxis(seen, fits[0], 0)
+    rows = _rows(len(pixel), capture, path, "tracks")
+    pixel = pixel.astype(np.float32) + 0.5  # these count from the centre of a pixel
+    seen = (seen > SEEN) & np.isfinite(pixel).all(-1)
+    if "size" in arrays:
+        pixel = pixel * (np.asarray(capture.size) / arrays["size"]).astype(np.float32)
+    inside = ((pixel > 0) & (pixel < np.asarray(capture.size))).all(-1)
+    if not seen.any() or (inside & seen).sum() < LEAST_INSIDE * seen.sum():
+        width, height = capture.size
+        raise CaptureError(
+            f"{path}: {(inside & seen).sum()} of {seen.sum()} places that are seen lie "
+            f"in the pictures of {width}x{height}, at least half must; if other "
+            "pictures were tracked, save their width and height beside as size"
+        )
+    seen &= inside
+    found = np.zeros((len(capture.ids), pixel.shape[1], 2), np.float32)
+    there = np.zeros(found.shape[:2], bool)
+    found[rows], there[rows] = np.where(seen[..., None], pixel, 0), seen
+    return {"track_pixel": found, "track_seen": there}
+
+
+def _files(folder, suffixes, capture, what):
+    """Files of a folder and their rows: by the frames' names, or by their number."""
+    if not folder.is_dir():
+        raise CaptureError(f"{folder}: no such folder of {what}; check the path")
+    paths = [one for one in folder.iterdir() if one.suffix.lower() in suffixes]
+    paths.sort(key=lambda one: frames.natural(one.name))
+    by_name = {one.name.partition(".")[0]: one for one in paths}
+    named = [row for row, name in enumerate(capture.ids) if name in by_name]
+    if set(capture.train) <= set(named):
+        return [by_name[capture.ids[row]] for row in named], np.array(named)
+    if not paths:
+        raise CaptureError(
+            f"{folder}: no file that ends in {' or '.join(suffixes)}; export {what}"
+        )
+    return paths, _rows(len(paths), capture, folder, what)
+
+
+def _masks(folder, capture):
+    paths, rows = _files(folder, PICTURES, capture, "masks")
+    found = np.zeros(capture.images.shape[:3], bool)
+    for path, row in zip(paths, rows, strict=True):
+        mask = images.read_mask(path)
+        found[row] = _fitted(mask, capture, path, "mask")
+    if not found.any():
+        raise CaptureError(
+            f"{folder}: no white pixel in any mask; white marks what moves"
+        )
+    return found
+
+
+def _fitted(array, capture, path, what):
+    """The nearest pixels of an array of the pictures' shape, whatever its size."""
+    width, height = capture.size
+    tall, wide = array.shape[:2]
+    # To within a pixel of the smaller of the two.
+    if abs(wide * height - tall * width) > max(width, height, wide, tall):
+        raise CaptureError(
+            f"{path}: a {what} of {wide}x{tall} pixels for pictures of "
+            f"{width}x{height}; their sides must have one ratio: export it uncropped"
+        )
+    row = ((np.arange(height) + 0.5) * tall / height).astype(int)
+    column = ((np.arange(width) + 0.5) * wide / width).astype(int)
+    return array[row[:, None], column]
+
+
+def _depths(path, capture):
+    if path.is_dir():
+        paths, rows = _files(path, DEPTHS, capture, "depths")
+        pictures = [_depth_picture(one) for one in paths]
+    else:
+        paths, pictures = [path], _stack(path)
+        rows = _rows(len(pictures), capture, path, "depths")
+        paths = paths * len(rows)
+    found = np.full(capture.images.shape[:3], np.nan, np.float32)
+    for where, picture, row in zip(paths, pictures, rows, strict=True):
+        known = np.isfinite(picture) & (picture > 0)
+        if not known.any():
+            raise CaptureError(
+                f"{where}: no depth above zero for frame {capture.ids[row]!r}; leave "
+                "the frame's file as the tool wrote it"
+            )
+        depth = np.where(known, picture, np.nan)
+        found[row] = _fitted(depth, capture, where, "depth")
+    return found
+
+
+def _depth_picture(path):
+    if path.suffix.lower() == ".npy":
+        picture = frames.load_array(path, images.MAX_PIXELS).squeeze()
+    elif path.suffix.lower() == ".exr":
+        stored = exr.read_exr(path)
+        picture = stored.depth
+        if picture is None and stored.colour is not None:
+            picture = stored.colour[..., 0]
+    else:
+        picture = images.read_pixels(path)
+        picture = picture[..., 0] if picture.ndim == 3 else picture
+    if picture is None or picture.ndim != 2:
+        raise CaptureError(f"{path}: no picture of depths; expected one channel")
+    return picture.astype(np.float32)
+
+
+def _stack(path):
+    if path.suffix == ".npy":
+        return _checked_stack(frames.load_array(path, MOST_NUMBERS), path, "it")
+    arrays = _arrays(path)
+    name = "depths" if "depths" in arrays else next(iter(arrays), "depths")
+    return _checked_stack(arrays.get(name, np.zeros(0)), path, name)
+
+
+def _checked_stack(array, path, name):
+    array = array[..., 0] if array.ndim == 4 and array.shape[3] == 1 else array
+    if array.ndim != 3:
+        raise CaptureError(
+            f"{path}: {name} has shape {array.shape}; expected [frames, height, width]"
+        )
+    return array.astype(np.float32)
+
+
+def _flow(path, capture):
+    if path.is_dir():
+        sides = {
+            side: np.stack([_flo(one) for one in _flo_files(path / side)])
+            for side in ("forward", "backward")
+        }
+    else:
+        arrays = _arrays(path)
+        missing = {"forward", "backward"} - set(arrays)
+        if missing:
+            raise CaptureError(
+                f"{path}: no {sorted(missing)[0]!r}; flow is needed both ways, to tell "
+                "where it can be trusted"
+            )
+        sides = {side: arrays[side] for side in ("forward", "backward")}
+    width, height = capture.size
+    learnt = capture.train[np.argsort(capture.times[capture.train], kind="stable")]
+    expected = (len(learnt) - 1, height, width, 2)
+    for side, array in sides.items():
+        if array.shape != expected or not np.isfinite(array).all():
+            raise CaptureError(
+                f"{path}: {side} flow of shape {array.shape}; expected {expected}, "
+                "finite: between neighbours of the frames to learn from, in order of "
+                "time, in pixels of the pictures as they are read"
+            )
+    forward, backward = np.zeros((2, len(capture.ids), height, width, 2), np.float32)
+    forward[learnt[:-1]], backward[learnt[1:]] = sides["forward"], sides["backward"]
+    return {"forward": forward, "backward": backward}
+
+
+def _flo_files(folder) -> Sequence[pathlib.Path]:
+    found = sorted(folder.glob("*.flo"), key=lambda one: frames.natural(one.name))
+    if not found:
+        raise CaptureError(
+            f"{folder}: no .flo file; flow is needed both ways, in folders forward and "
+            "backward"
+        )
+    return found
+
+
+def _flo(path):
+    """Middlebury's .flo: a magic number, width, height, and right, down by pixel."""
+    raw = path.read_bytes()
+    head = np.frombuffer(raw[:12].ljust(12, b"\0"), "<i4")
+    width, height = int(head[1]), int(head[2])
+    right_magic = np.frombuffer(raw[:4].ljust(4, b"\0"), "<f4")[0] == FLO_MAGIC
+    if not right_magic or len(raw) != 12 + 8 * width * height:
+        raise CaptureError(
+            f"{path}: {len(raw)} bytes and no .flo file of {width}x{height}; write it "
+            "again"
+        )
+    return np.frombuffer(raw[12:], "<f4").reshape(height, width, 2)

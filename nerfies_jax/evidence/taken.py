@@ -1,0 +1,67 @@
+"""What other tools found, in the frames and pixels that are looked at."""
+
+import cv2
+import numpy as np
+
+from nerfies_jax.capture.given import Given
+from nerfies_jax.evidence import dense_flow
+from nerfies_jax.evidence import tracks as tracking
+from nerfies_jax.evidence.dense_flow import NeighbourFlow
+from nerfies_jax.evidence.tracks import Tracks
+from nerfies_jax.evidence.view_set import Views
+
+
+def flow(given: Given, views: Views) -> NeighbourFlow | None:
+    """Checked both ways, as our own is."""
+    if given.forward is None:
+        return None
+    forward, backward = (
+        np.stack([_resized_flow(one, views.size) for one in side[views.row]])
+        for side in (given.forward, given.backward)
+    )
+    seen = np.zeros((2, *forward.shape[:3]), bool)
+    for frame in range(len(views.row) - 1):
+        there, back = forward[frame], backward[frame + 1]
+        seen[0, frame] = dense_flow.closed(there, back)
+        seen[1, frame + 1] = dense_flow.closed(back, there)
+    return NeighbourFlow(forward, seen[0], backward, seen[1])
+
+
+def tracks(given: Given, views: Views) -> Tracks | None:
+    """Those that are long enough; each begins where it is first seen."""
+    if given.track_pixel is None:
+        return None
+    scale = np.divide(views.size, given.size, dtype=np.float32)
+    pixel = np.moveaxis(given.track_pixel[views.row], 0, 1) * scale
+    seen = np.moveaxis(given.track_seen[views.row], 0, 1)
+    found = Tracks(seen.argmax(1), np.where(seen[..., None], pixel, 0), seen)
+    return tracking.long_enough(found)
+
+
+def moving(given: Given, views: Views) -> np.ndarray | None:
+    """[frames, height, width] bool."""
+    if given.moving is None:
+        return None
+    masks = [_resized(np.float32(one), views.size) for one in given.moving[views.row]]
+    return np.stack(masks) > 0.5
+
+
+def depth(given: Given, views: Views) -> np.ndarray | None:
+    """[frames, height, width] of whatever scale it has; NaN unknown."""
+    if given.depth is None:
+        return None
+    nearest = cv2.INTER_NEAREST
+    return np.stack(
+        [_resized(one, views.size, nearest) for one in given.depth[views.row]]
+    )
+
+
+def _resized(picture, size, how=cv2.INTER_AREA):
+    if picture.shape[1::-1] == size:
+        return picture
+    return cv2.resize(picture, size, interpolation=how)
+
+
+def _resized_flow(shift, size):
+    scale = np.divide(size, shift.shape[1::-1], dtype=np.float32)
+    return _resized(shift, size) * scale
