@@ -46,6 +46,7 @@ def advise(wanted: dict[str, bool | None], full: bool) -> Choice:
 RADIANCE = Representation(
     name="radiance",
     threads="all",  # matrix products, which every core makes faster
+    traces_lenses=True,
     spec_type=scene.RadianceScene,
     presets=presets.PRESETS,
     with_steps=presets.with_steps,

@@ -52,6 +52,9 @@ class Representation(NamedTuple):
     name: str
     # How many cores XLA:CPU should see: "one" where its own threading slows the loops.
     threads: Literal["one", "all"]
+    # Whether rays are traced through the lens; else pictures are drawn of pinholes, and
+    # held-out ones are bent as the lens does before they are scored.
+    traces_lenses: bool
     spec_type: type
     presets: dict[str, Spec]
     with_steps: Callable[[Spec, int], Spec]  # schedules stretch with the steps

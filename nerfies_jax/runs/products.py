@@ -16,7 +16,7 @@ from nerfies_jax.evaluation import Renderer, Scored, heldout, pictures
 from nerfies_jax.evaluation.representation import Saved
 from nerfies_jax.measure import clock
 from nerfies_jax.measure.clock import Metric
-from nerfies_jax.runs import budget, commands, curves, quality, report
+from nerfies_jax.runs import budget, commands, curves, floors_text, quality, report
 from nerfies_jax.runs.run import Run
 from nerfies_jax.runs.run_folder import CONFIG
 from nerfies_jax.runs.train import Trained
@@ -40,7 +40,7 @@ def make(
     """
     state, renderer = trained.result.state, trained.renderer
     rows, left_out = frames_to_score(run, trained)
-    scored = evaluation.score(renderer, state, run.capture, rows)
+    scored = evaluation.score(trained.draw, state, run.filmed, rows)
     if not np.isfinite(scored.colour).all():
         raise FloatingPointError(
             f"no report: what the state of step {trained.result.steps:,} draws is not "
@@ -49,7 +49,7 @@ def make(
     ms_per_frame = renderer.ms_per_frame(len(scored.rows))
     figures = [
         report.Figure(
-            save_comparison(folder / "comparison.png", run.capture, scored),
+            save_comparison(folder / "comparison.png", run.filmed, scored),
             "Held-out frames: what was filmed, what was rendered, how far they are "
             "apart, and the depth.",
         )
@@ -68,7 +68,9 @@ def make(
     )
     frames = evaluation.frames_of(run.capture, run.model.required_data)
     fitted, gain = score_halves(run, state, scored, ms_per_frame / 1e3)
-    found, remarks = quality.measure(run, state, renderer, scored, extra)
+    found, remarks = quality.measure(
+        run, state, trained.draw, scored, extra, ms_per_frame / 1e3
+    )
     metrics = heldout.metrics(found)
     metrics += [*measured(run, trained, scored, ms_per_frame, began), *fitted]
     metrics += model_size(saved)
@@ -76,8 +78,9 @@ def make(
         folder / "metrics.json",
         {m.key: m.value if math.isfinite(m.value) else None for m in metrics},
     )
-    notes = [trained.result.message, *run.capture.notes, *left_out, *remarks, *gain]
-    notes += saved.notes
+    warnings = floors_text.warnings(found)
+    notes = [*warnings, trained.result.message, *_capture_notes(run), *left_out]
+    notes += [*remarks, *gain, *saved.notes]
     following = _next(folder, run, trained)
     page = report.write(
         folder,
@@ -92,7 +95,12 @@ def make(
         notes,
         following,
     )
-    _say(folder, page, metrics, following)
+    _say(folder, page, metrics, [*floors_text.lines(found), *warnings], following)
+
+
+def _capture_notes(run):
+    """Of what was learnt from, and of what scores are of."""
+    return dict.fromkeys([*run.capture.notes, *run.filmed.notes])
 
 
 def frames_to_score(run: Run, trained: Trained) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -269,7 +277,7 @@ def _next(folder, run, trained):
     return [looked, report.Command("Train it twice as long:", line)]
 
 
-def _say(folder, page, metrics, following):
+def _say(folder, page, metrics, floors, following):
     value = {metric.key: metric.value for metric in metrics}
     print(
         f"held out: {value['heldout.psnr']:.2f} dB, SSIM {value['heldout.ssim']:.3f} "
@@ -283,6 +291,8 @@ def _say(folder, page, metrics, following):
             f"points:   {value['tracks.epe']:.4f} scene units from where they are, "
             f"{value['tracks.still_epe']:.4f} if they stood still"
         )
+    for line in floors:
+        print(line)
     print(f"report:     {page}")
     print(f"comparison: {folder / 'comparison.png'}")
     print(f"film:       {folder / 'scene.mp4'}")

@@ -13,7 +13,10 @@ from nerfies_jax.capture import pinholes, synthetic
 from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.json_files import write_json
+from nerfies_jax.evaluation import Renderer
+from nerfies_jax.evaluation.lens import ThroughLens
 from nerfies_jax.evaluation.representation import Representation
+from nerfies_jax.evaluation.scores import Draw
 from nerfies_jax.runs import own_effects, representations
 from nerfies_jax.runs.config import CaptureSource, RunConfig
 from nerfies_jax.runs.run_folder import CHECKPOINTS, CONFIG
@@ -35,7 +38,8 @@ class Run(NamedTuple):
     """Everything that a run is made of before its first step."""
 
     config: RunConfig
-    capture: Capture
+    capture: Capture  # what is learnt from: with pinholes where only they are drawn
+    filmed: Capture  # what held-out frames are scored against (`pinholes.scorable`)
     representation: Representation
     spec: Any  # of the representation's `spec_type`
     metadata: Any  # what the scene must know of the capture
@@ -59,11 +63,20 @@ def open_run(
     stored: Capture | None = None,
 ) -> Run:
     """Read the capture and build the model."""
-    capture = pinholes.as_pinholes(stored or stored_capture(config.source, config.seed))
+    stored = stored or stored_capture(config.source, config.seed)
+    filmed = pinholes.scorable(stored, representation.traces_lenses)
+    capture = filmed if representation.traces_lenses else pinholes.as_pinholes(stored)
     metadata = representation.metadata_of(capture, spec)
     effects = own_effects.load(config.effects, metadata)
     model = representation.build(spec, metadata, effects=effects)
-    return Run(config, capture, representation, spec, metadata, model, effects)
+    return Run(config, capture, filmed, representation, spec, metadata, model, effects)
+
+
+def drawer(run: Run, renderer: Renderer) -> Draw:
+    """What draws the views of `run.filmed`: the renderer, through a lens if need be."""
+    if run.representation.traces_lenses or run.filmed is run.capture:
+        return renderer
+    return ThroughLens(renderer, run.filmed.size)
 
 
 def scene_spec(config: RunConfig) -> Any:

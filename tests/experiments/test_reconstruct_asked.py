@@ -132,7 +132,7 @@ def started(folder, config):
     """A run folder with its settings and nothing else."""
     kind = representations.of_preset(config.preset)
     spec = runs.scene_spec(config)
-    runs.save_config(folder, runs.Run(config, None, kind, spec, None, None))
+    runs.save_config(folder, runs.Run(config, None, None, kind, spec, None, None))
 
 
 @pytest.mark.parametrize(

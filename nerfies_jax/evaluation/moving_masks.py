@@ -1,0 +1,77 @@
+"""Which pixels of the held-out frames move, where a capture does not say it itself."""
+
+import dataclasses
+import math
+import pathlib
+
+import numpy as np
+
+from nerfies_jax.capture import capture as captures
+from nerfies_jax.capture import pinholes, resampling
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.evidence import record
+from nerfies_jax.geometry import camera as cameras
+
+MOST_PIXELS = 4_000_000  # of all frames looked at: 45 s on one core
+
+
+def with_masks(filmed: Capture, folder: pathlib.Path) -> tuple[Capture, str]:
+    """A capture with masks of what moves, and a note where they are not its own.
+
+    They are those of `evidence.record` of the frames that scores are of and of those
+    learnt from together, kept in `folder`. Held-out pictures enter it, so it is for
+    scores alone, never for training. Only the masks of held-out rows are to be read.
+    Without masks where the capture has none and flow cannot follow it.
+    """
+    if filmed.moving is not None or not len(filmed.heldout):
+        return filmed, ""
+    rows = _film(filmed)
+    factor = math.ceil(math.sqrt(len(rows) * math.prod(filmed.size) / MOST_PIXELS))
+    small = captures.downscale(captures.select(filmed, rows), factor)
+    all_of_it = dataclasses.replace(
+        small, train=np.arange(len(rows)), heldout=np.zeros(0, int), depths=None
+    )
+    found = record.cached(all_of_it, folder)
+    if found.unusable:
+        return filmed, f"What moves is not scored apart: {found.unusable}."
+    moving = np.zeros(filmed.images.shape[:3], bool)
+    for row, mask in zip(rows[found.row], found.moving, strict=True):
+        moving[row] = _enlarged(mask, factor * found.factor, filmed.size)
+    share = moving[filmed.heldout].mean()
+    note = (
+        f"What moves is where tracks do ({share:.1%} of the held-out pixels): the "
+        "capture has no masks of its own."
+    )
+    return dataclasses.replace(filmed, moving=_bent(moving, filmed)), note
+
+
+def _film(capture):
+    """Rows of the cameras that film what is held out, where each is a film; else all.
+
+    Between the cameras of a rig, pictures jump; frames that each have a camera of
+    their own are one film.
+    """
+    scored = np.unique(capture.camera_ids[capture.heldout])
+    used = np.sort(np.concatenate([capture.train, capture.heldout]))
+    own = used[np.isin(capture.camera_ids[used], scored)]
+    counts = [(capture.camera_ids[own] == camera).sum() for camera in scored]
+    return own if min(counts) >= record.SHORTEST_FILM else used
+
+
+def _enlarged(mask, factor, size):
+    """Each pixel `factor` times as wide and high; what was trimmed is like its edge."""
+    mask = mask.repeat(factor, 0).repeat(factor, 1)
+    width, height = size
+    short = (0, height - mask.shape[0]), (0, width - mask.shape[1])
+    return np.pad(mask, short, mode="edge")
+
+
+def _bent(moving, filmed):
+    """Masks of the pinholes' pictures in the pixels of the filmed ones."""
+    if not pinholes.has_lens(filmed.cameras):
+        return moving
+    maps = pinholes.Maps(pinholes.pinhole_places, filmed.size)
+    for row in filmed.heldout:
+        place, inside = maps.of(cameras.take(filmed.cameras, row))
+        moving[row] = inside & resampling.nearest(moving[row], place)
+    return moving
