@@ -72,11 +72,11 @@ def scorable(filmed: Capture, traced: bool) -> Capture:
             for row in range(len(filmed.ids))
         ]
     )
-    if drawn.all():
-        return filmed
     depths = filmed.depths
     valid = drawn if filmed.valid is None else filmed.valid & drawn
     before = 1.0 if filmed.valid is None else filmed.valid.mean()
+    if valid.mean() == before:
+        return filmed
     what = "have no ray" if traced else "lie beyond the pinhole that is drawn"
     note = f"{before - valid.mean():.2%} of the pixels {what}, and are not scored"
     return dataclasses.replace(

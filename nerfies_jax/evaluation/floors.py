@@ -43,7 +43,8 @@ def neighbour_rows(capture: Capture, row: int | np.integer) -> np.ndarray:
     same = rows[capture.camera_ids[rows] == capture.camera_ids[row]]
     rows = np.sort(same if len(same) >= NEIGHBOURS else rows)
     apart = np.abs(capture.times[rows].astype(np.float64) - float(capture.times[row]))
-    return rows[np.argsort(apart, kind="stable")[:NEIGHBOURS]]
+    # Times are float32: a tie is within 1e-6.
+    return rows[np.argsort(np.round(apart, 6), kind="stable")[:NEIGHBOURS]]
 
 
 def neighbour_means(capture: Capture, rows: np.ndarray) -> Averages | None:

@@ -27,22 +27,21 @@ def with_masks(filmed: Capture, folder: pathlib.Path) -> tuple[Capture, str]:
         return filmed, ""
     rows = _film(filmed)
     factor = math.ceil(math.sqrt(len(rows) * math.prod(filmed.size) / MOST_PIXELS))
-    small = captures.downscale(captures.select(filmed, rows), factor)
-    all_of_it = dataclasses.replace(
-        small, train=np.arange(len(rows)), heldout=np.zeros(0, int), depths=None
-    )
-    found = record.cached(all_of_it, folder)
+    film = dataclasses.replace(filmed, train=rows, heldout=np.zeros(0, int))
+    film = captures.downscale(captures.select(film, rows), factor)
+    found = record.cached(film, folder)
     if found.unusable:
         return filmed, f"What moves is not scored apart: {found.unusable}."
     moving = np.zeros(filmed.images.shape[:3], bool)
     for row, mask in zip(rows[found.row], found.moving, strict=True):
         moving[row] = _enlarged(mask, factor * found.factor, filmed.size)
+    moving = _bent(moving, filmed)
     share = moving[filmed.heldout].mean()
     note = (
         f"What moves is where tracks do ({share:.1%} of the held-out pixels): the "
         "capture has no masks of its own."
     )
-    return dataclasses.replace(filmed, moving=_bent(moving, filmed)), note
+    return dataclasses.replace(filmed, moving=moving), note
 
 
 def _film(capture):

@@ -15,8 +15,8 @@ from experiments import compare, reconstruct, render
 from gaussians_jax import model_file, scene, step_time
 from nerfies_jax import evaluation, runs
 from nerfies_jax.capture import exr, images, nerfies_format, video
-from nerfies_jax.evaluation import pictures
-from nerfies_jax.runs import commands, products, train
+from nerfies_jax.evaluation import floors, pictures
+from nerfies_jax.runs import commands, products, quality, train
 from nerfies_jax.runs.run_folder import CHECKPOINTS
 from nerfies_jax.training.model import TrainState
 from tests import scenes
@@ -65,16 +65,34 @@ PRODUCTS = (
 )
 
 
-def test_a_capture_becomes_splats_and_a_report(tmp_path, monkeypatch):
+def test_a_capture_becomes_splats_and_a_report(tmp_path, monkeypatch, capsys):
     # The run below times the parts of a step, half of all there is to compile.
     monkeypatch.setattr(step_time, "part_ms", lambda *_: 1.0)
+    monkeypatch.setattr(quality, "CACHE", tmp_path / "cache")
     nerfies_format.write(scenes.tiny_capture(), tmp_path / "filmed")
     out = tmp_path / "run"
     words = (tmp_path / "filmed", "--preset", "splats-static-small", "--steps", 2)
     quick = ("densification=none", "sh_degree=0", "init.extra_random=0")
     assert ended(*words, "--out", out, "--set", *quick) == 0
     assert {path.name for path in out.iterdir()} >= {*PRODUCTS}
-    assert 0 < json.loads((out / "metrics.json").read_text())["heldout.psnr"] < 60
+    found = json.loads((out / "metrics.json").read_text())
+    assert 0 < found["heldout.psnr"] < 60
+    # Nothing moves in it, so its renders over time are all one picture.
+    assert found["motion.worth"] == 0
+    np.testing.assert_allclose(found["floor.still"], found["heldout.psnr"], atol=1e-4)
+    capture = scenes.tiny_capture()
+    means = floors.neighbour_means(capture, capture.heldout).colour
+    error = np.square(
+        np.round(255 * means) / 255 - capture.images[capture.heldout] / 255
+    )
+    exact = np.mean(-10 * np.log10(error.mean(axis=(1, 2, 3))))
+    np.testing.assert_allclose(found["floor.neighbours"], exact, atol=1e-3)
+    assert found["heldout.psnr"] < exact  # two steps
+    page, said = (out / "report.html").read_text(), capsys.readouterr().out
+    for words in ("is below the", f"{exact:.2f} dB"):
+        assert words in page
+        assert words in said
+    assert "motion:   is worth +0.00 dB" in said
 
 
 @pytest.mark.slow
