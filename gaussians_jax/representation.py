@@ -24,6 +24,10 @@ from nerfies_jax.evidence.findings import DEPTH, LIGHT, MOTION, START, TRANSIENT
 from nerfies_jax.training.effects import Effect
 from nerfies_jax.training.model import TrainState
 
+# Built-in scene, splats-static-small over 600 steps: 4500 Gaussians and 26 ms at first,
+# 8379 and 30 ms at the end, 42 ms while many of them are new and large.
+GROWN_STEP = 1.4
+
 
 def save(
     folder: pathlib.Path,
@@ -75,6 +79,7 @@ GAUSSIANS = Representation(
     spec_type=scene.SplatScene,
     presets=presets.PRESETS,
     with_steps=presets.with_steps,
+    growth=lambda spec: 1.0 if spec.densification is None else GROWN_STEP,
     metadata_of=lambda capture, spec: scene.metadata_of(capture),
     build=scene.build,
     estimate_memory_bytes=scene.estimate_memory_bytes,

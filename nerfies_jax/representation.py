@@ -50,6 +50,7 @@ RADIANCE = Representation(
     spec_type=scene.RadianceScene,
     presets=presets.PRESETS,
     with_steps=presets.with_steps,
+    growth=lambda spec: 1.0,
     metadata_of=scene.metadata_of,
     build=scene.build,
     estimate_memory_bytes=scene.estimate_memory_bytes,

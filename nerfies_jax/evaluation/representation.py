@@ -58,6 +58,8 @@ class Representation(NamedTuple):
     spec_type: type
     presets: dict[str, Spec]
     with_steps: Callable[[Spec, int], Spec]  # schedules stretch with the steps
+    # How many times a step of the first state one takes on average over a run.
+    growth: Callable[[Spec], float]
     metadata_of: Callable[[Capture, Spec], Any]
     build: Callable[..., Model]  # (spec, metadata, effects=()) -> model
     estimate_memory_bytes: Callable[[Spec, Capture], int]  # of the first state and step

@@ -1,5 +1,6 @@
 """A run: which capture, which scene, and the folder that holds what came of it."""
 
+import dataclasses
 import json
 import os
 import pathlib
@@ -66,6 +67,17 @@ def open_run(
     stored = stored or stored_capture(config.source, config.seed)
     filmed = pinholes.scorable(stored, representation.traces_lenses)
     capture = filmed if representation.traces_lenses else pinholes.as_pinholes(stored)
+    return _built(config, representation, spec, capture, filmed)
+
+
+def with_steps(run: Run, steps: int) -> Run:
+    """The run over another number of steps, of the same pictures."""
+    config = dataclasses.replace(run.config, steps=steps)
+    spec = scene_spec(config)
+    return _built(config, run.representation, spec, run.capture, run.filmed)
+
+
+def _built(config, representation, spec, capture, filmed):
     metadata = representation.metadata_of(capture, spec)
     effects = own_effects.load(config.effects, metadata)
     model = representation.build(spec, metadata, effects=effects)
