@@ -11,7 +11,7 @@ from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation.model_flow import Mover
 from nerfies_jax.evaluation.protocol import Follow
 from nerfies_jax.evaluation.scores import Halves
-from nerfies_jax.training.model import Model
+from nerfies_jax.training.model import Model, TrainState
 
 Spec = Any
 MODEL = "model.npz"  # in a run folder: all of a trained scene of Gaussians
@@ -59,7 +59,7 @@ class Representation(NamedTuple):
     presets: dict[str, Spec]
     with_steps: Callable[[Spec, int], Spec]  # schedules stretch with the steps
     # How many times a step of the first state one takes on average over a run.
-    growth: Callable[[Spec], float]
+    growth: Callable[[Spec, TrainState], float]
     metadata_of: Callable[[Capture, Spec], Any]
     build: Callable[..., Model]  # (spec, metadata, effects=()) -> model
     estimate_memory_bytes: Callable[[Spec, Capture], int]  # of the first state and step

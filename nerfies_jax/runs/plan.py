@@ -21,9 +21,9 @@ def with_seconds(run: Run, state: TrainState, seconds: float | int) -> tuple[Run
     """
     frames = evaluation.frames_of(run.capture, run.model.required_data)
     step = rate.step_time(run.model, state, frames, run.spec.steps)
-    growth = run.representation.growth(run.spec)
+    growth = run.representation.growth(run.spec, state)
     steps = rounded(seconds / (step.seconds * growth))
-    grown = f", {growth:g} times that as it grows" if growth > 1 else ""
+    grown = f", {growth:.2g} times that as it grows" if growth > 1 else ""
     line = (
         f"plan: {steps:,} steps for {seconds:g} s of training "
         f"({1e3 * step.seconds:.3g} ms a step now{grown}; measured after compiling for "

@@ -18,6 +18,7 @@ from nerfies_jax.capture import exr, images, nerfies_format, video
 from nerfies_jax.evaluation import floors, pictures
 from nerfies_jax.runs import commands, products, quality, train
 from nerfies_jax.runs.run_folder import CHECKPOINTS
+from nerfies_jax.training import rate
 from nerfies_jax.training.model import TrainState
 from tests import scenes
 
@@ -71,11 +72,14 @@ def test_a_capture_becomes_splats_and_a_report(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(quality, "CACHE", tmp_path / "cache")
     nerfies_format.write(scenes.tiny_capture(), tmp_path / "filmed")
     out = tmp_path / "run"
-    words = (tmp_path / "filmed", "--preset", "splats-static-small", "--steps", 2)
+    # Two steps are what the seconds allow.
+    monkeypatch.setattr(rate, "step_time", lambda *_: rate.StepTime(100.0, 0.0))
+    words = (tmp_path / "filmed", "--preset", "splats-static-small", "--seconds", 250)
     quick = ("densification=none", "sh_degree=0", "init.extra_random=0")
     assert ended(*words, "--out", out, "--set", *quick) == 0
     assert {path.name for path in out.iterdir()} >= {*PRODUCTS}
     found = json.loads((out / "metrics.json").read_text())
+    assert found["train.steps"] == runs.saved_run(out).config.steps == 2
     assert 0 < found["heldout.psnr"] < 60
     # Nothing moves in it, so its renders over time are all one picture.
     assert found["motion.worth"] == 0
@@ -92,6 +96,7 @@ def test_a_capture_becomes_splats_and_a_report(tmp_path, monkeypatch, capsys):
     for words in ("is below the", f"{exact:.2f} dB"):
         assert words in page
         assert words in said
+    assert "plan: 2 steps for 250 s of training" in said
     assert "motion:   is worth +0.00 dB" in said
 
 
