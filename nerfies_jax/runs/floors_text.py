@@ -16,8 +16,8 @@ def lines(found: Mapping[str, float]) -> list[str]:
     if "motion.worth" in found:
         where = ""
         if "motion.moving_worth" in found:
-            where = f", {found['motion.moving_worth']:+.2f} dB where something moves"
-        said.append(f"motion:   is worth {found['motion.worth']:+.2f} dB{where}")
+            where = f", {_signed(found['motion.moving_worth'])} where something moves"
+        said.append(f"motion:   is worth {_signed(found['motion.worth'])}{where}")
     return said
 
 
@@ -37,3 +37,8 @@ def warnings(found: Mapping[str, float]) -> list[str]:
             f"{LONGER}, one that stands still (splats-static, nerf) if nothing moves"
         )
     return said
+
+
+def _signed(decibels):
+    """With two digits, and no sign of minus before nothing."""
+    return f"{round(decibels, 2) + 0.0:+.2f} dB"
