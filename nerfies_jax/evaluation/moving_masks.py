@@ -25,14 +25,17 @@ def with_masks(filmed: Capture, folder: pathlib.Path) -> tuple[Capture, str]:
     """
     if filmed.moving is not None or not len(filmed.heldout):
         return filmed, ""
-    rows = _film(filmed)
-    factor = math.ceil(math.sqrt(len(rows) * math.prod(filmed.size) / MOST_PIXELS))
-    film = dataclasses.replace(filmed, train=rows, heldout=np.zeros(0, int))
-    film = captures.downscale(captures.select(film, rows), factor)
-    found = record.cached(film, folder)
-    if found.unusable:
-        return filmed, f"What moves is not scored apart: {found.unusable}."
-    moving = np.zeros(filmed.images.shape[:3], bool)
+    moving, unusable = np.zeros(filmed.images.shape[:3], bool), ""
+    for rows in _films(filmed):
+        factor = math.ceil(math.sqrt(len(rows) * math.prod(filmed.size) / MOST_PIXELS))
+        film = dataclasses.replace(filmed, train=rows, heldout=np.zeros(0, int))
+        film = captures.downscale(captures.select(film, rows), factor)
+        found = record.cached(film, folder)
+        if not found.unusable:
+            break
+        unusable = unusable or found.unusable
+    else:
+        return filmed, f"What moves is not scored apart: {unusable}."
     for row, mask in zip(rows[found.row], found.moving, strict=True):
         moving[row] = _enlarged(mask, factor * found.factor, filmed.size)
     moving = _bent(moving, filmed)
@@ -44,17 +47,18 @@ def with_masks(filmed: Capture, folder: pathlib.Path) -> tuple[Capture, str]:
     return dataclasses.replace(filmed, moving=moving), note
 
 
-def _film(capture):
-    """Rows of the cameras that film what is held out, where each is a film; else all.
+def _films(capture):
+    """Rows to follow points through: all, then those of the cameras that are scored.
 
-    Between the cameras of a rig, pictures jump; frames that each have a camera of
-    their own are one film.
+    The second where pictures jump between the cameras of a rig. Held-out frames of the
+    built-in scene, filmed by a camera beside that learnt from: the masks overlap the
+    true ones to 0.72 in the first way (0.79 where frames are learnt from), and to 0.40
+    in the second, whose frames are four times as far apart.
     """
-    scored = np.unique(capture.camera_ids[capture.heldout])
     used = np.sort(np.concatenate([capture.train, capture.heldout]))
+    scored = np.unique(capture.camera_ids[capture.heldout])
     own = used[np.isin(capture.camera_ids[used], scored)]
-    counts = [(capture.camera_ids[own] == camera).sum() for camera in scored]
-    return own if min(counts) >= record.SHORTEST_FILM else used
+    return (used,) if len(own) == len(used) else (used, own)
 
 
 def _enlarged(mask, factor, size):

@@ -215,12 +215,20 @@ def test_masks_of_what_moves_come_from_all_frames(lens, tmp_path, monkeypatch):
     np.testing.assert_array_equal(moving, expected)
     assert f"({moving.mean():.1%} of the held-out" in note
     assert moving_masks.with_masks(found, tmp_path) == (found, "")
-    # A rig whose held-out camera films on its own: only its frames are one film.
+    # Where pictures jump from camera to camera, that of the scored frames is a film.
     ids = np.zeros(12, np.int32)
     ids[:6] = 1
     rig = dataclasses.replace(capture, camera_ids=ids)
-    moving_masks.with_masks(rig, tmp_path)
-    assert looked[-1].ids == capture.ids[:6]
+
+    def jumping(film, folder):
+        found = cached(film, folder)
+        jumps = len(np.unique(film.camera_ids)) > 1
+        return found._replace(unusable="the camera jumps" if jumps else "")
+
+    monkeypatch.setattr(record, "cached", jumping)
+    found, _ = moving_masks.with_masks(rig, tmp_path)
+    assert [film.ids for film in looked[-2:]] == [capture.ids, capture.ids[:6]]
+    np.testing.assert_array_equal(found.moving[5], moving)
     monkeypatch.setattr(
         record,
         "cached",
