@@ -161,10 +161,9 @@ def fit_cameras(
     cameras = jax.tree.map(
         lambda *leaves: np.stack([np.asarray(x, np.float32) for x in leaves]), *moved
     )
-    posed = _with_poses(capture if filmed is None else filmed, rows, cameras)
-    return FittedCameras(
-        cameras, np.asarray(converged), score(draw, state, posed, rows)
-    )
+    posed = _with_poses(filmed or capture, rows, cameras)
+    scored = score(draw, state, posed, rows)
+    return FittedCameras(cameras, np.asarray(converged), scored)
 
 
 def _drawer(model, state, view, size):

@@ -24,6 +24,10 @@ from nerfies_jax.training import losses
 from nerfies_jax.training.model import TrainState
 
 SHOWN = 4  # held-out frames in the comparison
+COMPARED = (
+    "Held-out frames: what was filmed, what was rendered, how far they are apart, and "
+    "the depth."
+)
 
 
 def make(
@@ -47,13 +51,8 @@ def make(
             "finite"
         )
     ms_per_frame = renderer.ms_per_frame(len(scored.rows))
-    figures = [
-        report.Figure(
-            save_comparison(folder / "comparison.png", run.filmed, scored),
-            "Held-out frames: what was filmed, what was rendered, how far they are "
-            "apart, and the depth.",
-        )
-    ]
+    comparison = save_comparison(folder / "comparison.png", run.filmed, scored)
+    figures = [report.Figure(comparison, COMPARED)]
     watched = [run.capture.ids[row] for row in trained.watched]
     curves.write(folder, trained.result.history, watched)
     curve = save_curve(folder / "psnr_over_time.png", run, trained)
@@ -74,10 +73,7 @@ def make(
     metrics = heldout.metrics(found)
     metrics += [*measured(run, trained, scored, ms_per_frame, began), *fitted]
     metrics += model_size(saved)
-    write_json(
-        folder / "metrics.json",
-        {m.key: m.value if math.isfinite(m.value) else None for m in metrics},
-    )
+    save_metrics(folder / "metrics.json", metrics)
     warnings = floors_text.warnings(found)
     notes = [*warnings, trained.result.message, *_capture_notes(run), *left_out]
     notes += [*remarks, *gain, *saved.notes]
@@ -96,6 +92,13 @@ def make(
         following,
     )
     _say(folder, page, metrics, [*floors_text.lines(found), *warnings], following)
+
+
+def save_metrics(path: pathlib.Path, metrics: list[Metric]) -> None:
+    """Values by key; null for what is not finite."""
+    write_json(
+        path, {m.key: m.value if math.isfinite(m.value) else None for m in metrics}
+    )
 
 
 def _capture_notes(run):

@@ -104,15 +104,14 @@ def measure(
         followed=followed,
         flow=flow,
         fitted=fitted,
-        floors=Floors(
-            floors.neighbour_means(run.filmed, scored.rows),
-            floors.time_averages(
-                draw,
-                state,
-                run.filmed,
-                scored.rows,
-                *budget.still(frame_seconds, len(scored.rows), run.filmed.size),
-            ),
-        ),
+        floors=_floors(run, state, draw, scored.rows, frame_seconds),
     )
     return found, notes
+
+
+def _floors(run, state, draw, rows, frame_seconds):
+    frames, moments = budget.still(frame_seconds, len(rows), run.filmed.size)
+    return Floors(
+        floors.neighbour_means(run.filmed, rows),
+        floors.time_averages(draw, state, run.filmed, rows, frames, moments),
+    )

@@ -173,32 +173,48 @@ def test_rays_through_a_lens_are_scored_but_where_it_has_none():
     assert "have no ray" in found.notes[-1]
 
 
+@pytest.fixture
+def looked(tmp_path, monkeypatch):
+    """Films that are looked at: the upper left quarter moves from 5/11 of the time on.
+
+    Where there are two cameras the film is of no use.
+    """
+    found = []
+
+    def cached(film, folder):
+        found.append(film)
+        assert folder == tmp_path
+        order = film.train[np.argsort(film.times[film.train], kind="stable")]
+        mask = np.zeros((len(order), *film.size[::-1]), bool)
+        mask[:, : film.size[1] // 2, : film.size[0] // 2] = True
+        mask[film.times[order] < np.float32(4.5 / 11)] = False
+        jumps = len(np.unique(film.camera_ids)) > 1
+        return record.Evidence(
+            **dict.fromkeys(record.Evidence._fields)
+            | {"row": order, "moving": mask, "factor": 1}
+            | {"unusable": "the camera jumps" if jumps else ""}
+        )
+
+    monkeypatch.setattr(record, "cached", cached)
+    width, height = films.SIZE
+    monkeypatch.setattr(moving_masks, "MOST_PIXELS", 12 * width * height // 4)
+    return found
+
+
+def without_masks(**changes):
+    """A film of which one frame is held out."""
+    film = films.film(frames=12, train=np.r_[0:5, 6:12], heldout=np.r_[5:6])
+    return dataclasses.replace(film, moving=None, **changes)
+
+
 @pytest.mark.parametrize("lens", [False, True])
-def test_masks_of_what_moves_come_from_all_frames(lens, tmp_path, monkeypatch):
-    capture = dataclasses.replace(
-        films.film(frames=12), moving=None, train=np.r_[0:5, 6:12], heldout=np.r_[5:6]
-    )
+def test_masks_of_what_moves_come_from_all_frames(lens, looked, tmp_path):
+    capture = without_masks()
     if lens:
         radial = np.tile(np.float32([-0.2, 0.03, 0.0]), (12, 1))
         bent = capture.cameras._replace(radial=radial)
         capture = dataclasses.replace(capture, cameras=bent)
     width, height = capture.size
-    looked = []
-
-    def cached(film, folder):
-        looked.append(film)
-        assert folder == tmp_path
-        order = film.train[np.argsort(film.times[film.train], kind="stable")]
-        mask = np.zeros((len(order), *film.size[::-1]), bool)
-        mask[:, : film.size[1] // 2, : film.size[0] // 2] = True
-        mask[film.times[order] < capture.times[5]] = False
-        return record.Evidence(
-            **dict.fromkeys(record.Evidence._fields)
-            | {"row": order, "moving": mask, "unusable": "", "factor": 1}
-        )
-
-    monkeypatch.setattr(record, "cached", cached)
-    monkeypatch.setattr(moving_masks, "MOST_PIXELS", 12 * width * height // 4)
     found, note = moving_masks.with_masks(capture, tmp_path)
     assert looked[0].size == (width // 2, height // 2)
     assert len(looked[0].train) == 12
@@ -215,27 +231,17 @@ def test_masks_of_what_moves_come_from_all_frames(lens, tmp_path, monkeypatch):
     np.testing.assert_array_equal(moving, expected)
     assert f"({moving.mean():.1%} of the held-out" in note
     assert moving_masks.with_masks(found, tmp_path) == (found, "")
-    # Where pictures jump from camera to camera, that of the scored frames is a film.
-    ids = np.zeros(12, np.int32)
-    ids[:6] = 1
-    rig = dataclasses.replace(capture, camera_ids=ids)
 
-    def jumping(film, folder):
-        found = cached(film, folder)
-        jumps = len(np.unique(film.camera_ids)) > 1
-        return found._replace(unusable="the camera jumps" if jumps else "")
 
-    monkeypatch.setattr(record, "cached", jumping)
+def test_pictures_that_jump_between_cameras_are_followed_in_one(looked, tmp_path):
+    ids = np.repeat(np.int32([1, 0]), 6)
+    rig = without_masks(camera_ids=ids)
     found, _ = moving_masks.with_masks(rig, tmp_path)
-    assert [film.ids for film in looked[-2:]] == [capture.ids, capture.ids[:6]]
-    np.testing.assert_array_equal(found.moving[5], moving)
-    monkeypatch.setattr(
-        record,
-        "cached",
-        lambda *_: record.Evidence(
-            **dict.fromkeys(record.Evidence._fields) | {"unusable": "the camera jumps"}
-        ),
-    )
-    found, note = moving_masks.with_masks(capture, tmp_path)
-    assert found.moving is None
-    assert "not scored apart: the camera jumps" in note
+    assert [film.ids for film in looked] == [rig.ids, rig.ids[:6]]
+    assert found.moving[5].any()
+    looked.clear()
+    both = dataclasses.replace(rig, train=np.r_[0:5, 7:12], heldout=np.r_[5:7])
+    found, note = moving_masks.with_masks(both, tmp_path)
+    assert len(looked) == 1
+    assert found is both
+    assert note == "What moves is not scored apart: the camera jumps."
