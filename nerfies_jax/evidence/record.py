@@ -32,7 +32,7 @@ from nerfies_jax.evidence.paths import Paths
 from nerfies_jax.evidence.rest_points import RestPoints
 from nerfies_jax.evidence.tracks import Tracks
 
-VERSION = 1  # of the file; counts up whenever the same pictures would say otherwise
+VERSION = 2  # of the file; counts up whenever the same pictures would say otherwise
 # A path has as many frames at least, and a film as many; fewer say nothing of motion.
 SHORTEST_PATH, SHORTEST_FILM = 10, 6
 MOVES = 0.5  # score from which a track counts as moving
