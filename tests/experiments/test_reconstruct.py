@@ -6,20 +6,17 @@ import os
 import pathlib
 import shutil
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib import colormaps
 
 from experiments import compare, reconstruct, render
-from gaussians_jax import model_file, scene, step_time
-from nerfies_jax import evaluation, runs
+from gaussians_jax import step_time
 from nerfies_jax.capture import exr, images, nerfies_format, video
 from nerfies_jax.evaluation import floors, pictures
-from nerfies_jax.runs import commands, products, quality, train
+from nerfies_jax.runs import products, quality, train
 from nerfies_jax.runs.run_folder import CHECKPOINTS
 from nerfies_jax.training import rate
-from nerfies_jax.training.model import TrainState
 from tests import scenes
 
 QUICK = (
@@ -153,20 +150,6 @@ def test_a_run_leaves_its_metrics_depth_and_report(run):
 
 
 @pytest.mark.slow
-def test_the_model_file_is_enough_to_draw_a_frame(run):
-    params, about = model_file.load(run / "model.npz")
-    model = scene.build(about["spec"], about["metadata"])
-    state = TrainState(params, (), (), jnp.asarray(about["step"], jnp.int32), None)
-    capture = scenes.tiny_capture()
-    filmed = runs.saved_run(run)
-    renderer = evaluation.Renderer(model, filmed.capture.size)
-    found = evaluation.score(renderer, state, filmed.capture, filmed.capture.heldout)
-    metrics = json.loads((run / "metrics.json").read_text())
-    np.testing.assert_allclose(found.psnr.mean(), metrics["heldout.psnr"], atol=1e-3)
-    assert found.colour.shape[1:3] == capture.size[::-1]
-
-
-@pytest.mark.slow
 def test_a_run_is_rendered_at_other_times_and_places(run, tmp_path):
     arguments = [str(run), "--path", "orbit", "--frames", "3", "--freeze", "0.5"]
     formats = ["--formats", "png", "mp4", "exr", "--max-side", "32"]
@@ -271,27 +254,6 @@ def test_a_killed_run_resumes_to_the_same_bits(left, run, tmp_path, capsys):
     for key in ("train.steps", "heldout.psnr", "gaussians"):
         assert resumed[key] == whole[key]
     assert (folder / "model.npz").is_file()
-
-
-@pytest.mark.slow
-def test_a_stopped_run_resumes_to_its_end(run, tmp_path, capsys):
-    folder = tmp_path / "stopped"
-    filmed = runs.saved_run(run).config.source.capture
-    common = [
-        filmed,
-        "--preset",
-        "splats-deformable-small",
-        "--steps",
-        "12",
-        "--out",
-        folder,
-    ]
-    assert ended(*common, "--seconds", "0.001", "--set", *QUICK) == 0
-    stopped = json.loads((folder / "metrics.json").read_text())["train.steps"]
-    assert stopped < 12
-    assert commands.resume(folder) in capsys.readouterr().out
-    assert ended("--out", folder, "--resume") == 0
-    assert last_bits(folder) == last_bits(run)
 
 
 @pytest.mark.slow
