@@ -49,15 +49,6 @@ def test_a_run_is_the_plain_loop_over_its_steps(frames, straight):
     assert straight.stopped_by == "steps"
 
 
-@pytest.mark.parametrize("cut", [7, pytest.param(19, marks=pytest.mark.full)])
-def test_a_run_cut_in_two_is_the_straight_run_bit_for_bit(cut, frames, straight):
-    first = fit(frames, steps=cut)
-    second = fit(frames, first.state, steps=20, history=first.history)
-    assert toy.same(second.state, straight.state)
-    assert second.history.rows[-1]["step"] == 20
-    assert second.seconds >= first.seconds
-
-
 @pytest.mark.parametrize("longest", [3, pytest.param(100, marks=pytest.mark.full)])
 def test_chunk_length_does_not_change_a_bit(longest, frames, straight, monkeypatch):
     monkeypatch.setattr(loop, "CHUNK_STEPS", longest)
@@ -303,27 +294,6 @@ def test_fewer_steps_than_done_are_refused(frames, straight):
     with pytest.raises(ValueError, match="20 steps behind it and was asked for 10"):
         fit(frames, straight.state, steps=10)
     assert fit(frames, straight.state, steps=20).steps == 20
-
-
-@pytest.mark.full
-def test_float64_states_stay_float64(frames):
-    with jax.enable_x64(True):
-        wide = jax.tree.map(
-            lambda x: x.astype(jnp.float64) if x.dtype == jnp.float32 else x, start()
-        )
-
-        def step(state, frames):
-            grad = jax.grad(lambda p: jnp.sum(p.nets["weight"] ** 2))(state.params)
-            params = jax.tree.map(lambda p, g: p - 0.1 * g, state.params, grad)
-            new = state._replace(params=params, step=state.step + 1)
-            return new, {"loss": jnp.sum(params.nets["weight"] ** 2)}
-
-        result = fit(frames, wide, toy.model(change=step), steps=5)
-        assert result.state.params.nets["weight"].dtype == jnp.float64
-        expected = wide.params.nets["weight"] * 0.8**5
-        np.testing.assert_allclose(
-            result.state.params.nets["weight"], expected, rtol=1e-14
-        )
 
 
 @pytest.mark.full
