@@ -12,6 +12,7 @@ from matplotlib import colormaps
 
 from experiments import compare, reconstruct, render
 from gaussians_jax import step_time
+from nerfies_jax import runs
 from nerfies_jax.capture import exr, images, nerfies_format, video
 from nerfies_jax.evaluation import floors, pictures
 from nerfies_jax.runs import products, quality, train
