@@ -120,7 +120,7 @@ def build(
         render=whole_frame,
         events=(),
         counts=count_parameters,
-        required_data=read & metadata.available_data,
+        required_data=read,
         example=example,
     )
 

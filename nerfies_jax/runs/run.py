@@ -18,6 +18,7 @@ from nerfies_jax.evaluation import Renderer
 from nerfies_jax.evaluation.lens import ThroughLens
 from nerfies_jax.evaluation.representation import Representation
 from nerfies_jax.evaluation.scores import Draw
+from nerfies_jax.evidence import frame_flow
 from nerfies_jax.runs import own_effects, representations
 from nerfies_jax.runs.config import CaptureSource, RunConfig
 from nerfies_jax.runs.run_folder import CHECKPOINTS, CONFIG
@@ -67,7 +68,21 @@ def open_run(
     stored = stored or stored_capture(config.source, config.seed)
     filmed = pinholes.scorable(stored, representation.traces_lenses)
     capture = filmed if representation.traces_lenses else pinholes.as_pinholes(stored)
+    run = _built(config, representation, spec, capture, filmed)
+    capture = _completed(capture, run.model.required_data)
+    if capture is run.capture:
+        return run
     return _built(config, representation, spec, capture, filmed)
+
+
+def _completed(capture, wanted):
+    """With flow found in the pictures where it is wanted; what else lacks is noted."""
+    if "flow" in wanted and capture.flow is None:
+        capture = frame_flow.with_flow(capture)
+    if "depths" in wanted and capture.depths is None:
+        note = "this preset learns from depth as well, and the capture has none"
+        capture = dataclasses.replace(capture, notes=(*capture.notes, note))
+    return capture
 
 
 def with_steps(run: Run, steps: int) -> Run:
