@@ -227,10 +227,10 @@ def draw(path: pathlib.Path, compared, count: int) -> None:
     for each in compared:
         run = runs.saved_run(each.folder)
         state = runs.restore(each.folder, run).state
-        rows = evaluation.spread(run.capture.heldout, count)
-        renderer = evaluation.Renderer(run.model, run.capture.size)
-        scored.append(evaluation.score(renderer, state, run.capture, rows))
-        capture = run.capture
+        rows = evaluation.spread(run.filmed.heldout, count)
+        draw = runs.drawer(run, evaluation.Renderer(run.model, run.capture.size))
+        scored.append(evaluation.score(draw, state, run.filmed, rows))
+        capture = run.filmed
     panels, captions = [], []
     for place, row in enumerate(scored[0].rows):
         truth = capture.images[row]

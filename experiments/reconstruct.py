@@ -35,7 +35,8 @@ class Reconstruct:
     steps: int | None = None
     """Steps of training; schedules stretch with them."""
     seconds: float | None = None
-    """Stop training after so many seconds, whatever the step."""
+    """Train for so many seconds, without compiling: schedules stretch with the steps
+    that fit. With --steps or --resume: stop after them, whatever the step."""
     out: pathlib.Path | None = None
     """Run folder (default: runs/CAPTURE-PRESET)."""
     resume: bool = False

@@ -10,9 +10,9 @@ import scipy.spatial
 from gaussians_jax import splats
 from gaussians_jax.splats import Splats
 from nerfies_jax.capture.capture import Capture, point_depths
+from nerfies_jax.training.track_start import TrackStartSpec
 
 SOURCES = ("auto", "points", "random")
-STARTS = ("tracks", "none")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,29 +44,19 @@ class InitSpec:
 
 
 @dataclasses.dataclass(frozen=True)
-class StartSpec:
-    """How a scene that moves starts.
+class StartSpec(TrackStartSpec):
+    """How a scene of Gaussians that moves starts."""
 
-    `motion` "tracks" fits the motion to tracks before training, where the film allows
-    it; "none" starts from rest. `use_depths` lets paths lean on the capture's depths.
-    """
-
-    motion: str = "none"
-    moving_points: int = 3000  # Gaussians lifted from moving pixels
-    fit_steps: int = 1500
     fit_rate: float = 5e-3
-    use_depths: bool = False
+    moving_points: int = 3000  # Gaussians lifted from moving pixels
 
     def __post_init__(self):
-        if self.motion not in STARTS:
-            raise ValueError(f"unknown motion {self.motion!r}; choose from {STARTS}")
-        if self.moving_points < 1 or self.fit_steps < 1:
+        super().__post_init__()
+        if self.moving_points < 1:
             raise ValueError(
-                "a start from tracks takes at least one moving point and one step, got "
-                f"moving_points={self.moving_points}, fit_steps={self.fit_steps}"
+                "a start from tracks takes at least one moving point, got "
+                f"moving_points={self.moving_points}"
             )
-        if self.fit_rate <= 0:
-            raise ValueError(f"fit_rate={self.fit_rate} must be positive")
 
 
 def point_count(capture: Capture) -> int:

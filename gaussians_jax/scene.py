@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-import warnings
 from typing import Any
 
 import jax
@@ -35,9 +34,8 @@ from gaussians_jax.spec import (
     refuse_what_cannot_train,
 )
 from gaussians_jax.splats import Params
-from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.evidence import record
+from nerfies_jax.evidence import usable_paths
 from nerfies_jax.training import loop, losses
 from nerfies_jax.training.effects import (
     FIELD_SEAMS,
@@ -359,21 +357,10 @@ def first_state(spec, effects, optimiser, capture, key) -> TrainState:
 def _from_tracks(spec, effects, capture, key):
     """The start from tracks, and the capture with the points that stand still.
 
-    None, and the capture as it is, where the spec asks for none or the film allows
-    none, which a warning then says.
+    None, and the capture as it is, where there is no such start.
     """
-    if spec.start.motion != "tracks":
-        return None, capture
-    evidence = record.cached(capture, CACHE / "evidence", spec.start.use_depths)
-    reason = track_start.unusable(evidence)
-    if reason:
-        warnings.warn(
-            f"{capture.path or capture.name}: the motion starts from rest, for tracks "
-            f"are of no use here: {reason}; a network finds small motion without them "
-            "(splats-deformable)",
-            RuntimeWarning,
-            stacklevel=2,
-        )
+    evidence = usable_paths.evidence_to_start_from(capture, spec.start)
+    if evidence is None:
         return None, capture
     found = track_start.start(
         spec.start, effects[0], spec.motion, evidence, capture, key

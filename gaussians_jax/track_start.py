@@ -18,12 +18,11 @@ from gaussians_jax.initialisation import StartSpec
 from gaussians_jax.path_fit import Points
 from gaussians_jax.splats import Params
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.evidence import record, rigid_groups, view_set
+from nerfies_jax.evidence import record, rigid_groups, usable_paths, view_set
 from nerfies_jax.evidence.moving import picture_scale
 from nerfies_jax.evidence.record import Evidence
 from nerfies_jax.training.effects import Effect
 
-LEAST_SEEN = 6  # frames in which a path is known
 MEMBER_LOGIT, STILL_LOGIT = 3.0, -6.0  # of a moving point, before the fit
 SMOOTHNESS, TURN_SMOOTHNESS = 0.02, 0.002  # weights of second differences of knots
 DEPTH_TRACKS, DEPTH_REACH_PX = 6, 8.0  # whose depth a moving pixel takes
@@ -42,22 +41,6 @@ class TrackStart(NamedTuple):
     nets: Any  # of the motion
 
 
-def unusable(evidence: Evidence) -> str:
-    """Why a motion cannot start from these tracks; empty where it can."""
-    if evidence.unusable:
-        return evidence.unusable
-    if (evidence.paths.known.sum(1) >= LEAST_SEEN).sum() < 2 * LEAST_SEEN:
-        return "hardly any track moves by itself"
-    return ""
-
-
-def scene_unit(evidence: Evidence) -> float:
-    """A typical distance: the median z-depth of points at rest, scene units."""
-    depth = evidence.rest.depth[evidence.tracks.seen]
-    depth = depth[np.isfinite(depth) & (depth > 0)]
-    return float(np.median(depth)) if len(depth) else 1.0
-
-
 def start(
     spec: StartSpec,
     effect: Effect,
@@ -68,17 +51,16 @@ def start(
 ) -> TrackStart:
     """The motion fitted to the evidence's paths, and Gaussians that it carries.
 
-    `motion` is the spec of `effect`. ValueError where `unusable` says why.
+    `motion` is the spec of `effect`. ValueError where `usable_paths.unusable` says why.
     """
-    reason = unusable(evidence)
+    reason = usable_paths.unusable(evidence)
     if reason:
         raise ValueError(
             f"{capture.path or capture.name}: no start from tracks: {reason}"
         )
-    kept = evidence.paths.known.sum(1) >= LEAST_SEEN
-    position, known = evidence.paths.position[kept], evidence.paths.known[kept]
+    position, known = usable_paths.known_paths(evidence)
     times = capture.times[evidence.row].astype(np.float32)
-    unit = scene_unit(evidence)
+    unit = usable_paths.scene_unit(evidence)
     guess, rates, penalty = _guess(motion, effect, position, known, times, unit, key)
     rates = jax.tree.map(lambda rate: spec.fit_rate * rate, rates)
     fitted = path_fit.fit(

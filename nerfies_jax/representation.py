@@ -46,9 +46,11 @@ def advise(wanted: dict[str, bool | None], full: bool) -> Choice:
 RADIANCE = Representation(
     name="radiance",
     threads="all",  # matrix products, which every core makes faster
+    traces_lenses=True,
     spec_type=scene.RadianceScene,
     presets=presets.PRESETS,
     with_steps=presets.with_steps,
+    growth=lambda spec, state: 1.0,
     metadata_of=scene.metadata_of,
     build=scene.build,
     estimate_memory_bytes=scene.estimate_memory_bytes,

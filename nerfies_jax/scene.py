@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Key
 
-from nerfies_jax import render_ray, scene_metadata
+from nerfies_jax import path_fit, render_ray, scene_metadata
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.effects import transient
 from nerfies_jax.effects.effect import Batch, Box, RayOutput
+from nerfies_jax.evidence import usable_paths
 from nerfies_jax.field import Field, field
 from nerfies_jax.geometry import rays
 from nerfies_jax.nets import codes
@@ -94,9 +95,20 @@ def build(
             capture.appearance_ids, len(metadata.exposures), "appearance_ids"
         )
         start_key, run_key = jax.random.split(key)
-        params = in_default_precision(made.init(start_key))
+        params = made.init(start_key)
+        evidence = usable_paths.evidence_to_start_from(capture, spec.start)
+        if evidence is not None:
+            paths = path_fit.film_paths(made, capture, evidence)
+            params = path_fit.fit(made, params, paths, start_key, spec.start).params
+        return first_state(params, run_key)
+
+    def example(_, key):
+        return first_state(made.init(key), key)
+
+    def first_state(params, key):
+        params = in_default_precision(params)
         return TrainState(
-            params, optimiser.init(params), (), jnp.zeros((), jnp.int32), run_key
+            params, optimiser.init(params), (), jnp.zeros((), jnp.int32), key
         )
 
     read = frozenset().union(*(effect.required_data for effect in made.effects))
@@ -108,7 +120,8 @@ def build(
         render=whole_frame,
         events=(),
         counts=count_parameters,
-        required_data=read & metadata.available_data,
+        required_data=read,
+        example=example,
     )
 
 

@@ -24,6 +24,7 @@ from nerfies_jax.radiance.template import TemplateSpec
 from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.training import schedules
 from nerfies_jax.training.effects import Effect, Table
+from nerfies_jax.training.track_start import TrackStartSpec
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,6 +80,7 @@ class RadianceScene:
     elastic: ElasticSpec | None = None
     background: BackgroundSpec | None = None
     scene_flow: SceneFlowSpec | None = None
+    start: TrackStartSpec = TrackStartSpec()
 
     def __post_init__(self):
         if self.steps < 1 or self.rays < 1:
@@ -95,6 +97,11 @@ class RadianceScene:
                     f"{name} holds the warp in check, and there is none; set warp or "
                     f"{name}=none"
                 )
+        if self.start.motion == "tracks" and self.warp is None:
+            raise ValueError(
+                'start.motion="tracks" fits a warp to tracks, and there is none; set '
+                "warp or start.motion=none"
+            )
 
 
 def effects_of(spec: RadianceScene, metadata: SceneMetadata) -> tuple[Effect, ...]:
@@ -103,6 +110,10 @@ def effects_of(spec: RadianceScene, metadata: SceneMetadata) -> tuple[Effect, ..
     def flow(one):
         return scene_flow.effect(one, len(metadata.times), spec.template.width)
 
+    bent = spec.warp
+    if bent is not None and spec.start.motion == "tracks":
+        # Fitted with all bands open, and closing them would undo it.
+        bent = dataclasses.replace(bent, anneal_steps=None)
     built = (
         (spec.appearance, appearance.effect),
         (
@@ -110,7 +121,7 @@ def effects_of(spec: RadianceScene, metadata: SceneMetadata) -> tuple[Effect, ..
             lambda one: transient.effect(one, spec.template.width),
         ),
         (spec.time, time_condition.effect),
-        (spec.warp, warp.effect),
+        (bent, warp.effect),
         (spec.ambient, ambient.effect),
         (spec.elastic, elastic.effect),
         (spec.background, background.effect),

@@ -18,6 +18,7 @@ from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.radiance.template import TemplateSpec
 from nerfies_jax.training.effects import FrameCondition, PenaltyContext
 from nerfies_jax.training.model import Frames
+from tests.oracles import networks
 
 TINY = SceneFlowSpec(
     network=TemplateSpec(
@@ -142,32 +143,24 @@ def scenario(dtype):
     return params, frames, batch, arrays
 
 
-def encode(bands, x):
-    waves = [w(2.0**k * x) for k in range(bands) for w in (np.sin, np.cos)]
-    return np.concatenate([x, *waves])
-
-
 def sigmoid(x):
     return 1 / (1 + np.exp(-x))
 
 
 def dynamic(params, point, direction, time):
     """Density, colour, flow [2, 3], disocclusion [2] by the published network."""
-    features = np.concatenate([encode(2, point), encode(1, np.array([2 * time - 1]))])
-    first, second = params.network.trunk.hidden
-    hidden = np.maximum(features @ first.weight + first.bias, 0)
-    hidden = np.concatenate([hidden, features])
-    hidden = np.maximum(hidden @ second.weight + second.bias, 0)
-    heads = params.network.trunk.heads
-    raw = (hidden @ heads["density"].weight + heads["density"].bias)[0]
-    bottleneck = hidden @ heads["bottleneck"].weight + heads["bottleneck"].bias
-    branch = np.concatenate([bottleneck, encode(1, direction)])
-    layer, head = params.network.colour.hidden[0], params.network.colour.heads["colour"]
-    branch = np.maximum(branch @ layer.weight + layer.bias, 0)
-    colour = sigmoid(branch @ head.weight + head.bias)
-    flow = 0.3 * np.tanh(hidden @ params.flow.weight + params.flow.bias)
-    hidden_share = hidden @ params.disocclusion.weight + params.disocclusion.bias
-    return np.log1p(np.exp(raw)), colour, flow.reshape(2, 3), sigmoid(hidden_share)
+    read = TINY.network
+    places = networks.waves(read.position, point)
+    inputs = np.concatenate([places, networks.waves(TINY.time, 2 * time - 1)])
+    trunk, colour = params.network.trunk, params.network.colour
+    hidden = networks.trunk(trunk.hidden, inputs, read.skips)
+    heads = {name: networks.affine(x, hidden) for name, x in trunk.heads.items()}
+    seen = networks.waves(read.direction, direction)
+    shade = networks.heads(colour, np.concatenate([heads["bottleneck"], seen]))
+    flow = TINY.flow_bound * np.tanh(networks.affine(params.flow, hidden))
+    hidden_share = networks.affine(params.disocclusion, hidden)
+    density = np.log1p(np.exp(heads["density"][0]))
+    return density, sigmoid(shade["colour"]), flow.reshape(2, 3), sigmoid(hidden_share)
 
 
 def composite(density, distance):

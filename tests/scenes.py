@@ -21,6 +21,7 @@ from nerfies_jax import scene as nerf_scene
 from nerfies_jax.capture import synthetic
 from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.effects.warp import WarpSpec
+from nerfies_jax.evaluation import protocol
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.radiance.template import TemplateSpec
 from nerfies_jax.spec import RadianceScene, SamplingSpec
@@ -113,3 +114,11 @@ def tiny_field():
 
     params = start(jax.random.key(3))
     return metadata, params, evaluation.view_of(capture, int(capture.heldout[0]))
+
+
+@functools.cache
+def tiny_tracks():
+    """A film of which half is held out, its truth and five tracks through it."""
+    film = dataclasses.replace(TINY_FILM, heldout_every=2)
+    capture, truth = synthetic.make(film)
+    return capture, truth, protocol.ground_truth(capture, truth, 2, 5)

@@ -45,6 +45,54 @@ WHOLE = ("psnr", "ssim")  # judged by where nothing but pictures is known
 MOVING = ("psnr", "moving_psnr", "moving_ssim")
 TRACKED = (*MOVING, "track_error")
 
+FROM_TRACKS = "start.motion=tracks"
+
+START = Suite(
+    arms={
+        "bases": Arm("splats-tracked-small"),
+        "mlp": Arm("splats-deformable-small", (FROM_TRACKS,)),
+        "kan": Arm("sonata-small", (FROM_TRACKS,)),
+        "basis": Arm("moba-small", (FROM_TRACKS,)),
+        "bases-from-rest": Arm("splats-tracked-small", ("start.motion=none",)),
+        "mlp-from-rest": Arm("splats-deformable-small"),
+        "kan-from-rest": Arm("sonata-small"),
+        "basis-from-rest": Arm("moba-small"),
+        "static": Arm("splats-static-small"),
+    },
+    claims=(
+        *(
+            Claim(
+                f"Tracks find motion that descent on pictures does not ({what})",
+                name,
+                f"{name}-from-rest",
+                TRACKED,
+            )
+            for name, what in (
+                ("bases", "SE(3) bases"),
+                ("mlp", "deformable 3DGS"),
+                ("kan", "Sonata"),
+                ("basis", "MoBa-GS"),
+            )
+        ),
+        *(
+            Claim(
+                f"From tracks, few rigid motions carry more than {what}",
+                "bases",
+                name,
+                TRACKED,
+            )
+            for name, what in (
+                ("mlp", "an MLP"),
+                ("kan", "an RBF-KAN on embeddings"),
+                ("basis", "spatially varying bases"),
+            )
+        ),
+    ),
+    seeds=3,
+    pictured=("bases", "mlp", "kan", "basis", "mlp-from-rest"),
+    context="",
+)
+
 FIELDS = Suite(
     arms={
         "static": Arm("nerf-small"),

@@ -16,8 +16,9 @@ from experiments.ablate.log import line, say
 from experiments.ablate.results import ArmResult
 from experiments.ablate.settings import Ablate
 from nerfies_jax import evaluation, runs
-from nerfies_jax.capture import synthetic
+from nerfies_jax.capture import pinholes, synthetic
 from nerfies_jax.evaluation import heldout, protocol
+from nerfies_jax.evaluation.lens import ThroughLens
 from nerfies_jax.measure import clock
 from nerfies_jax.runs import platform, representations
 from nerfies_jax.runs.config import CaptureSource
@@ -104,14 +105,17 @@ class Job:
             film = synthetic.PRESETS[source.scene]
             self.capture_digest = synthetic.digest(film)
             self.capture, truth = synthetic.cached(film, platform.CACHE / "scenes")
+            self.filmed = self.capture
             self.known = protocol.ground_truth(
                 self.capture, truth, args.frames, args.tracks
             )
             return
-        self.capture = runs.read_capture(source)
-        self.capture_digest = hashlib.sha256(self.capture.images.tobytes()).hexdigest()[
-            :16
-        ]
+        stored = runs.stored_capture(source)
+        # All arms learn from pinholes' pictures, and are scored as it was filmed.
+        self.capture = pinholes.as_pinholes(stored)
+        self.filmed = pinholes.scorable(stored, traced=False)
+        images = self.filmed.images.tobytes()
+        self.capture_digest = hashlib.sha256(images).hexdigest()[:16]
         self.known = protocol.held_out_only(self.capture, args.frames)
 
     def _listen(self, event, seconds, **_):
@@ -229,14 +233,13 @@ class Job:
         if result.stopped_by.startswith("SIG"):
             print(f"stopped; go on with the same command and --out {self.out}")
             raise SystemExit(130 if result.stopped_by == "SIGINT" else 143)
-        scored = evaluation.score(
-            arm.renderer, result.state, self.capture, self.known.rows
-        )
+        draw = ThroughLens(arm.renderer, self.filmed.size)
+        scored = evaluation.score(draw, result.state, self.filmed, self.known.rows)
         followed = arm.representation.follow(
             arm.spec, arm.metadata, result.state, self.capture, self.known
         )
         found = heldout.heldout_metrics(
-            scored, self.capture, known=self.known, followed=followed
+            scored, self.filmed, known=self.known, followed=followed
         )
         counts = arm.model.counts(result.state)
         numbers = {

@@ -115,7 +115,7 @@ def _picture(job, finished, path):
         first.setdefault(name, kept)
     few = [name for name in job.suite.pictured if name in first]
     first = {name: first[name] for name in few or list(first)}
-    shown = picture.shown_row(job.known, job.capture)
+    shown = picture.shown_row(job.known, job.filmed)
     captions = {}
     for name, kept in first.items():
         error = kept.numbers["track_error"]
@@ -124,7 +124,7 @@ def _picture(job, finished, path):
             captions[name] = "no motion: points stay"
     picture.save(
         picture.draw(
-            job.capture,
+            job.filmed,
             job.known,
             {name: kept.arrays["colour"][shown] for name, kept in first.items()},
             {name: kept.arrays["depth"][shown] for name, kept in first.items()},

@@ -13,9 +13,10 @@ from nerfies_jax.runs.config import CaptureSource
 class Ablate:
     """Compare ways to reconstruct a moving scene with and without their parts."""
 
-    suite: Literal["fields", "sonata", "moba", "settings", "advice"] = "fields"
-    """Radiance fields, the ablations of Sonata or MoBa-GS, the settings of
-    experiments.accuracy_time, or what experiments.inspect_scene can advise."""
+    suite: Literal["fields", "start", "sonata", "moba", "settings", "advice"] = "fields"
+    """Radiance fields; motions of splats from tracks and from rest; the ablations of
+    Sonata or MoBa-GS; the settings of experiments.accuracy_time; or what
+    experiments.inspect_scene can advise."""
     arms: tuple[str, ...] = ()
     """Which arms of the suite (default: all)."""
     source: cli.SourceOptions = CaptureSource()

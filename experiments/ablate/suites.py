@@ -2,10 +2,16 @@
 
 import functools
 
-from experiments.ablate.arms import FIELDS, MOBA, SONATA, Suite
+from experiments.ablate.arms import FIELDS, MOBA, SONATA, START, Suite
 from experiments.accuracy_time.axes import SETTINGS
 
-KEPT = {"fields": FIELDS, "sonata": SONATA, "moba": MOBA, "settings": SETTINGS}
+KEPT = {
+    "fields": FIELDS,
+    "start": START,
+    "sonata": SONATA,
+    "moba": MOBA,
+    "settings": SETTINGS,
+}
 
 
 @functools.cache

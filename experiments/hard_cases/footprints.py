@@ -140,7 +140,7 @@ ANTIALIASED = Case(
     stable=lambda x: _footprint(x, SHARP).opacity,
     textbook=_antialiased_textbook,
     exact=_exact_antialiased,
-    bounds={"float32": (1e-6, 1e-6), "float64": (1e-15, 1e-15)},
+    bounds={"float32": (1e-6, 1e-6, 9e-7), "float64": (1e-15, 1e-15, 2e-15)},
     caught=(("float32", "value"), ("float64", "value"), ("float32", "slope")),
     timed=np.array(_needle(2.5, 0.25)),
 )
@@ -193,7 +193,7 @@ FAR_MEAN = Case(
     stable=_mean_px,
     textbook=_mean_px_textbook,
     exact=_exact_mean_px,
-    bounds={"float32": (1e-6, 1e-6), "float64": (1e-15, 1e-15)},
+    bounds={"float32": (1e-6, 1e-6, 6e-7), "float64": (1e-15, 1e-15, 1e-15)},
     caught=(("float32", "value"),),
     alike=False,  # a whole footprint against its centre
 )

@@ -67,7 +67,7 @@ FAR_CAMERA = Case(
     stable=_far_pixel,
     textbook=_textbook_far_pixel,
     exact=_exact_far_pixel,
-    bounds={"float32": (1e-6, 1e-6), "float64": (2e-15, 2e-15)},
+    bounds={"float32": (1e-6, 1e-6, 3e-7), "float64": (2e-15, 2e-15, 1e-15)},
     caught=(("float32", "value"), ("float64", "value"), ("float32", "slope")),
 )
 
@@ -98,7 +98,7 @@ NEAR_PLANE = Case(
     stable=_near_pixel,
     textbook=lambda point: _on_plane(point[:2], point[2]),
     exact=_exact_near_pixel,
-    bounds={"float32": (1e-6, 1e-6), "float64": (2e-15, 2e-15)},
+    bounds={"float32": (1e-6, 1e-6, 4e-7), "float64": (2e-15, 2e-15, 1e-15)},
     caught=(("float32", "value"), ("float32", "slope"), ("float64", "value")),
     timed=np.array([1, -0.5, 2]),
 )
@@ -140,7 +140,7 @@ LENS_FOLD = Case(
     stable=_undistorted,
     textbook=_fixed_point,
     exact=_exact_undistorted,
-    bounds={"float32": (4e-6, 2e-4), "float64": (4e-15, 1e-13)},
+    bounds={"float32": (4e-6, 2e-4, 3e-4), "float64": (4e-15, 1e-13, 2e-13)},
     caught=(("float32", "value"), ("float32", "slope"), ("float64", "value")),
     timed=0.3 * np.array([0.6, -0.8]),
 )

@@ -74,7 +74,7 @@ CHARBONNIER = Case(
     stable=lambda r: losses.charbonnier(jnp.sum(r**2), WIDTH)[None],
     textbook=_charbonnier_by_difference,
     exact=_exact_charbonnier,
-    bounds={kind: bounds[:2] for kind, bounds in PENALTY.items()},
+    bounds=PENALTY,
     caught=(("float32", "value"), ("float64", "value")),
     timed=0.01 * AXIS,
 )
@@ -102,7 +102,7 @@ HUBER = Case(
     stable=lambda r: losses.huber(jnp.sum(r**2), WIDTH)[None],
     textbook=_huber_of_length,
     exact=_exact_huber,
-    bounds={kind: bounds[:2] for kind, bounds in PENALTY.items()},
+    bounds=PENALTY,
     caught=(("float32", "slope"), ("float64", "slope")),
     timed=0.01 * AXIS,
 )
@@ -121,7 +121,7 @@ PSNR = Case(
     stable=losses.psnr,
     textbook=lambda mse: -10 * jnp.log10(mse + 1e-10),
     exact=lambda mse: [-10 * mpmath.log10(max(mse[0], mpmath.mpf(losses.LEAST_MSE)))],
-    bounds={"float32": (1e-6, 1e-6), "float64": (1e-15, 1e-15)},
+    bounds={"float32": (1e-6, 1e-6, 6e-7), "float64": (1e-15, 1e-15, 1e-15)},
     floors=(10.0, 0.0, 0.0),
     caught=(
         ("float32", "value"),
@@ -168,7 +168,7 @@ NERF_W = Case(
     stable=_uncertain,
     textbook=_uncertain_textbook,
     exact=_exact_uncertain,
-    bounds={"float32": (1e-6, 2e-6), "float64": (2e-15, 5e-15)},
+    bounds={"float32": (1e-6, 2e-6, 7e-7), "float64": (2e-15, 5e-15, 2e-13)},
     floors=(1.0, 0.0, 0.0),
     caught=(("float32", "value"), ("float64", "value"), ("float32", "slope")),
 )
@@ -198,7 +198,7 @@ SRGB = Case(
     stable=texture.srgb,
     textbook=_srgb_textbook,
     exact=_exact_srgb,
-    bounds={"float32": (1e-6, 1e-6), "float64": (2e-15, 2e-15)},
+    bounds={"float32": (1e-6, 1e-6, 2e-6), "float64": (2e-15, 2e-15, 2e-15)},
     caught=(("float32", "slope"), ("float64", "slope")),
     timed=np.array([0.2]),
 )

@@ -161,10 +161,10 @@ WIDTH = Case(
     exact=_exact_trained,
     bounds={
         "bfloat16": (6e-3, 6e-3),
-        "float32": (1e-6, 2e-6),
-        "float64": (2e-15, 4e-15),
+        "float32": (1e-6, 2e-6, 1e-6),
+        "float64": (2e-15, 4e-15, 3e-15),
     },
-    floors=(1, 1),
+    floors=(1, 1, 0),
     caught=(
         ("bfloat16", "value"),
         ("float32", "value"),

@@ -198,7 +198,7 @@ CORRELATION = Case(
     ],
     textbook=_pearson_textbook,
     exact=_exact_pearson,
-    bounds={"float32": (1e-3, 1e-3), "float64": (1e-11, 1e-11)},
+    bounds={"float32": (1e-3, 1e-3, 8e-7), "float64": (1e-11, 1e-11, 2e-15)},
     caught=(("float32", "value"),),
 )
 

@@ -50,7 +50,7 @@ LOGARITHM = Case(
     stable=quaternion.log,
     textbook=_textbook_log,
     exact=_exact_log,
-    bounds={"float32": (1e-6, 1e-6), "float64": (2e-15, 2e-15)},
+    bounds={"float32": (1e-6, 1e-6, 3e-6), "float64": (2e-15, 2e-15, 3e-15)},
     caught=(("float32", "value"), ("float32", "slope"), ("float64", "slope")),
     timed=_half_turns([1.0])[0],
 )
@@ -89,7 +89,8 @@ MATRIX_LOGARITHM = Case(
     stable=lambda w: lie.log_so3(_turned(w)),
     textbook=_textbook_matrix_log,
     exact=_exact_wrapped,
-    bounds={"float32": (1e-6, 1e-6), "float64": (2e-15, 2e-15)},
+    bounds={"float32": (1e-6, 1e-6, 2e-6), "float64": (2e-15, 2e-15, 2e-15)},
+    floors=(0, 0, 1),
     caught=(("float32", "value"), ("float32", "slope"), ("float64", "value")),
     timed=AXIS,
 )
@@ -183,7 +184,7 @@ SLERP = Case(
     stable=_slerp,
     textbook=_textbook_slerp,
     exact=_exact_slerp,
-    bounds={"float32": (1e-6, 1e-6), "float64": (2e-15, 2e-15)},
+    bounds={"float32": (1e-6, 1e-6, 4e-5), "float64": (2e-15, 2e-15, 3e-14)},
     caught=(("float32", "value"), ("float32", "slope"), ("float64", "slope")),
     timed=AXIS,
 )

@@ -182,7 +182,7 @@ LOG_SCALE = Case(
     stable=_variance,
     textbook=lambda s: jnp.exp(s) ** 2,
     exact=_exact_variance,
-    bounds={"float32": (3e-6, 3e-6), "float64": (1e-14, 1e-14)},
+    bounds={"float32": (3e-6, 3e-6, 4e-7), "float64": (1e-14, 1e-14, 2e-15)},
     caught=(("float32", "value"), ("float64", "value"), ("float32", "slope")),
     alike=False,  # all of a row is activated, not one scale
 )

@@ -1,6 +1,7 @@
-"""Take the lens out of the pictures, for renderers that draw pinholes."""
+"""Take the lens out of the pictures, for renderers that draw pinholes, and back in."""
 
 import dataclasses
+from collections.abc import Callable
 
 import jax
 import numpy as np
@@ -9,6 +10,7 @@ from nerfies_jax.capture import resampling
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry import distortion, rays
+from nerfies_jax.geometry.camera import Camera
 
 
 def as_pinholes(capture: Capture) -> Capture:
@@ -19,8 +21,7 @@ def as_pinholes(capture: Capture) -> Capture:
     masks and depth from the nearest pixel. Z-depth needs no change: a ray keeps its
     points. Flow is left out: both its ends would move.
     """
-    lens = np.concatenate([capture.cameras.radial, capture.cameras.tangential], axis=1)
-    if not lens.any():
+    if not has_lens(capture.cameras):
         return capture
     images = np.empty_like(capture.images)
     filmed = np.empty(images.shape[:3], bool)
@@ -28,14 +29,9 @@ def as_pinholes(capture: Capture) -> Capture:
         name: None if array is None else np.empty_like(array)
         for name, array in (("moving", capture.moving), ("depths", capture.depths))
     }
-    maps: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
+    maps = Maps(_source_pixels, capture.size)
     for row in range(len(images)):
-        camera = cameras.take(capture.cameras, row)
-        # Frames of one physical camera share one map; the pose does not enter it.
-        key = b"".join(np.asarray(leaf).tobytes() for leaf in camera[2:])
-        if key not in maps:
-            maps[key] = _source_pixels(camera, capture.size)
-        place, inside = maps[key]
+        place, inside = maps.of(cameras.take(capture.cameras, row))
         images[row] = resampling.bilinear(capture.images[row], place)
         images[row][~inside] = 0
         filmed[row] = inside
@@ -52,14 +48,101 @@ def as_pinholes(capture: Capture) -> Capture:
         capture,
         images=images,
         valid=None if filmed.all() else filmed,
-        cameras=capture.cameras._replace(
-            radial=np.zeros_like(capture.cameras.radial),
-            tangential=np.zeros_like(capture.cameras.tangential),
-        ),
+        cameras=pinhole(capture.cameras),
         flow=None,
         notes=(*capture.notes, note),
         **masks,
     )
+
+
+def scorable(filmed: Capture, traced: bool) -> Capture:
+    """The capture as it was filmed, to hold renders against; itself without a lens.
+
+    The pictures stay. Pixels that no renderer can say anything of are no longer
+    `valid`, and their depth is unknown: where the lens model has no ray or, unless
+    rays are `traced` through the lens, where the pinhole of the same focal length and
+    size, which is drawn in its place, does not look.
+    """
+    if not has_lens(filmed.cameras):
+        return filmed
+    maps = Maps(_rays_exist if traced else pinhole_places, filmed.size)
+    drawn = np.stack(
+        [
+            maps.of(cameras.take(filmed.cameras, row))[1]
+            for row in range(len(filmed.ids))
+        ]
+    )
+    depths = filmed.depths
+    valid = drawn if filmed.valid is None else filmed.valid & drawn
+    before = 1.0 if filmed.valid is None else filmed.valid.mean()
+    if valid.mean() == before:
+        return filmed
+    what = "have no ray" if traced else "lie beyond the pinhole that is drawn"
+    note = f"{before - valid.mean():.2%} of the pixels {what}, and are not scored"
+    return dataclasses.replace(
+        filmed,
+        valid=valid,
+        notes=(*filmed.notes, note),
+        depths=None if depths is None else np.where(drawn, depths, np.float32(0)),
+    )
+
+
+def has_lens(camera: Camera) -> bool:
+    """Whether a camera, or any of a batch, bends what a pinhole draws straight."""
+    return bool(np.any(camera.radial) or np.any(camera.tangential))
+
+
+def pinhole(camera: Camera) -> Camera:
+    """The camera, or a batch of them, without lens distortion."""
+    return camera._replace(radial=0 * camera.radial, tangential=0 * camera.tangential)
+
+
+class Maps:
+    """Places in a picture for cameras of one size, kept by lens and intrinsics.
+
+    Frames of one physical camera share one map; the pose does not enter it.
+    """
+
+    def __init__(self, places: Callable, size: tuple[int, int]):
+        self._places, self._size = places, size
+        self._kept: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
+
+    def of(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """What `places(camera, size)` finds: array coordinates and where there are."""
+        key = b"".join(np.asarray(leaf).tobytes() for leaf in camera[2:])
+        if key not in self._kept:
+            self._kept[key] = self._places(camera, self._size)
+        return self._kept[key]
+
+
+def pinhole_places(
+    camera: Camera, size: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where each filmed pixel lies in the pinhole's picture, and whether it does.
+
+    Array coordinates [2, height, width], as of `resampling.array_places`; the pinhole
+    has the focal length, the principal point and the size of the filmed picture.
+    """
+    slopes, single = _straight(*_lens(camera), _slopes(camera, size))
+    slopes = np.where(np.asarray(single)[:, None], np.asarray(slopes), np.nan)
+    return resampling.array_places(_pixels(camera, slopes, size), size)
+
+
+def _rays_exist(camera, size):
+    """The pixels themselves, and whether the lens model has a ray for each."""
+    _, single = _straight(*_lens(camera), _slopes(camera, size))
+    place = np.indices(size[::-1], np.float32)
+    return place, np.asarray(single).reshape(size[::-1])
+
+
+def _lens(camera):
+    return (np.asarray(part, np.float32) for part in (camera.radial, camera.tangential))
+
+
+@jax.jit
+def _straight(radial, tangential, bent):
+    """Slopes of the rays that the lens bends to these, and whether there are any."""
+    return jax.vmap(distortion.undistort, (None, None, 0))(radial, tangential, bent)
 
 
 @jax.jit
@@ -75,16 +158,26 @@ def _source_pixels(camera, size):
 
     Where the lens model folds back there is no pixel at all.
     """
-    centre = np.asarray(camera.principal_point_px)
-    focal = float(camera.focal_px)
-    aspect, skew = float(camera.pixel_aspect), float(camera.skew_px)
-    offset = np.asarray(rays.pixel_centres(size)) - centre
-    y = offset[..., 1] / (focal * aspect)
-    x = (offset[..., 0] - skew * y) / focal
-    slopes = np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float32)
-    bent, single = _bent(camera.radial, camera.tangential, slopes)
+    bent, single = _bent(*_lens(camera), _slopes(camera, size))
     bent = np.where(np.asarray(single)[:, None], np.asarray(bent), np.nan)
-    bent = bent.reshape(size[1], size[0], 2)
-    across = focal * bent[..., 0] + skew * bent[..., 1]
-    down = focal * aspect * bent[..., 1]
-    return resampling.array_places(np.stack([across, down], axis=-1) + centre, size)
+    return resampling.array_places(_pixels(camera, bent, size), size)
+
+
+def _slopes(camera, size):
+    """Image-plane slopes [pixels, 2] of the pixel centres, the lens left aside."""
+    focal, skew = float(camera.focal_px), float(camera.skew_px)
+    offset = np.asarray(rays.pixel_centres(size)) - np.asarray(
+        camera.principal_point_px
+    )
+    y = offset[..., 1] / (focal * float(camera.pixel_aspect))
+    x = (offset[..., 0] - skew * y) / focal
+    return np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float32)
+
+
+def _pixels(camera, slopes, size):
+    """Pixel positions [height, width, 2] of image-plane slopes [pixels, 2]."""
+    focal, skew = float(camera.focal_px), float(camera.skew_px)
+    slopes = slopes.reshape(size[1], size[0], 2)
+    across = focal * slopes[..., 0] + skew * slopes[..., 1]
+    down = focal * float(camera.pixel_aspect) * slopes[..., 1]
+    return np.stack([across, down], axis=-1) + np.asarray(camera.principal_point_px)

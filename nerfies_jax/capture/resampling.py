@@ -22,14 +22,15 @@ def array_places(
 
 
 def bilinear(picture: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """uint8 colour [height, width, channels] at array coordinates, rounded."""
+    """Colour [height, width, channels] at array coordinates; uint8 is rounded."""
     channels = [
         scipy.ndimage.map_coordinates(
             picture[..., channel].astype(np.float32), place, order=1, mode="nearest"
         )
         for channel in range(picture.shape[-1])
     ]
-    return np.round(np.stack(channels, axis=-1)).astype(np.uint8)
+    found = np.stack(channels, axis=-1)
+    return np.round(found).astype(np.uint8) if picture.dtype == np.uint8 else found
 
 
 def nearest(picture: np.ndarray, place: np.ndarray) -> np.ndarray:

@@ -16,8 +16,7 @@ from jaxtyping import Array, Bool, Float, UInt8
 
 from nerfies_jax.capture.capture import Capture, blocks, shrink
 from nerfies_jax.evaluation.frames import resized, view_of
-from nerfies_jax.evaluation.renderer import Renderer
-from nerfies_jax.evaluation.scores import Scored, score
+from nerfies_jax.evaluation.scores import Draw, Scored, score
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.training import fit, losses
 from nerfies_jax.training.fit import Fit
@@ -107,13 +106,18 @@ def fit_camera(
 
 def fit_cameras(
     model: Model,
-    renderer: Renderer,
+    draw: Draw,
     state: TrainState,
     capture: Capture,
     rows: np.ndarray,
     spec: CameraFitSpec = CameraFitSpec(),
+    filmed: Capture | None = None,
 ) -> FittedCameras:
-    """Fit the cameras of some rows of a capture, and score these frames with them."""
+    """Fit the cameras of some rows of a capture, and score these frames with them.
+
+    `draw` and the scores are of `filmed`, the capture with its lens where `capture` is
+    of the pinholes that the model draws; the same capture by default.
+    """
     factor = 1
     while capture.images[0, ::factor, ::factor].size > 3 * spec.most_pixels:
         factor += 1
@@ -157,11 +161,9 @@ def fit_cameras(
     cameras = jax.tree.map(
         lambda *leaves: np.stack([np.asarray(x, np.float32) for x in leaves]), *moved
     )
-    return FittedCameras(
-        cameras,
-        np.asarray(converged),
-        score(renderer, state, _with_cameras(capture, rows, cameras), rows),
-    )
+    posed = _with_poses(filmed or capture, rows, cameras)
+    scored = score(draw, state, posed, rows)
+    return FittedCameras(cameras, np.asarray(converged), scored)
 
 
 def _drawer(model, state, view, size):
@@ -186,12 +188,11 @@ def _moved(camera, screw_px, depth):
     return fit.move_camera(camera, angle[:3], depth * angle[3:])
 
 
-def _with_cameras(capture, rows, cameras):
-    def replaced(old, new):
-        old = np.array(old)
-        old[rows] = new
+def _with_poses(capture, rows, cameras):
+    def replaced(name):
+        old = np.array(getattr(capture.cameras, name))
+        old[rows] = getattr(cameras, name)
         return old
 
-    return dataclasses.replace(
-        capture, cameras=jax.tree.map(replaced, capture.cameras, cameras)
-    )
+    poses = {name: replaced(name) for name in ("camera_from_world", "position")}
+    return dataclasses.replace(capture, cameras=capture.cameras._replace(**poses))

@@ -11,6 +11,7 @@ import numpy as np
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation import protocol
 from nerfies_jax.evaluation.fitted_cameras import FittedCameras
+from nerfies_jax.evaluation.floors import Floors
 from nerfies_jax.evaluation.model_flow import Flow
 from nerfies_jax.evaluation.protocol import GroundTruth, PointTracks
 from nerfies_jax.evaluation.scores import Scored
@@ -39,6 +40,11 @@ MEASURES = {
     "heldout.moving_psnr": Measure("dB", "higher", 0.3),
     "heldout.moving_ssim": Measure("", "higher", 0.02),
     "heldout.still_psnr": Measure("dB", "higher", 0.2),
+    "heldout.unscored": Measure("", "lower", 0.01),
+    "floor.neighbours": Measure("dB", "equal", 0.05),
+    "floor.still": Measure("dB", "higher", 0.3),
+    "motion.worth": Measure("dB", "higher", 0.2),
+    "motion.moving_worth": Measure("dB", "higher", 0.3),
     "heldout.depth_abs_rel": Measure("", "lower", 0.01),
     "heldout.depth_within_delta": Measure("", "higher", 0.02),
     "heldout.depth_median": Measure("scene units", "lower", 0.002),
@@ -98,18 +104,23 @@ def heldout_metrics(
     followed: PointTracks | None = None,
     flow: Flow | None = None,
     fitted: FittedCameras | None = None,
+    floors: Floors = Floors(None, None),
 ) -> dict[str, float]:
     """Everything that can be measured, by the keys of `MEASURES`.
 
     PSNR and SSIM are always there; anything else where the capture has what it is held
     against (masks of what moves, depths), or where it is passed: `known` and `followed`
-    points, `flow`, `fitted` cameras. What has nothing to be a mean of is left out.
+    points, `flow`, `fitted` cameras, `floors`. What has nothing to be a mean of is left
+    out.
     """
     found = {
         "heldout.psnr": float(scored.psnr.mean()),
         "heldout.ssim": float(scored.ssim.mean()),
     }
     more = _pictures(scored, capture, lpips)
+    if capture.valid is not None:
+        more["heldout.unscored"] = 1 - capture.valid[scored.rows].mean()
+    more |= _floors(floors, scored, capture)
     if capture.depths is not None:
         more |= _depths(scored, capture)
     if known is not None and followed is not None:
@@ -147,6 +158,48 @@ def _pictures(scored, capture, lpips):
             parts.setdefault(key, []).append(value)
     # A frame without anything that moves has no score of it, and none is all moving.
     return {key: _mean(np.asarray(values)) for key, values in parts.items()}
+
+
+def _floors(floors, scored, capture):
+    """PSNR of pictures that cost nothing, and how far motion is above the second."""
+    found = {}
+    if floors.neighbours is not None:
+        own = _floor_psnr(floors.neighbours, scored, capture)
+        found["floor.neighbours"] = _mean(own[:, 0])
+    if floors.still is not None:
+        own = _floor_psnr(floors.still, scored, capture)
+        drawn = floors.still._replace(colour=scored.colour[floors.still.places])
+        worth = _floor_psnr(drawn, scored, capture) - own
+        found["floor.still"] = _mean(own[:, 0])
+        found["motion.worth"] = _mean(worth[:, 0])
+        found["motion.moving_worth"] = _mean(worth[:, 1])
+    return found
+
+
+def _floor_psnr(averages, scored, capture):
+    """[places, 2] PSNR of all that was filmed and of what of it moves; NaN of none."""
+    found = []
+    for number, (place, colour) in enumerate(
+        zip(averages.places, averages.colour, strict=True)
+    ):
+        row = scored.rows[place]
+        mask = np.ones(colour.shape[:2], bool)
+        for part in (
+            None if capture.valid is None else capture.valid[row],
+            None if averages.known is None else averages.known[number],
+        ):
+            mask = mask if part is None else mask & part
+        none = np.zeros_like(mask)
+        moving = none if capture.moving is None else mask & capture.moving[row]
+        found.append(_masked_psnrs(colour, capture.images[row], mask, moving))
+    return np.asarray(jax.device_get(found))
+
+
+@jax.jit
+def _masked_psnrs(colour, truth, mask, moving):
+    picture = image_quality.quantise(colour)
+    truth = truth.astype(colour.dtype) / 255
+    return [image_quality.masked_psnr(picture, truth, one) for one in (mask, moving)]
 
 
 @jax.jit

@@ -11,7 +11,7 @@ from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation.model_flow import Mover
 from nerfies_jax.evaluation.protocol import Follow
 from nerfies_jax.evaluation.scores import Halves
-from nerfies_jax.training.model import Model
+from nerfies_jax.training.model import Model, TrainState
 
 Spec = Any
 MODEL = "model.npz"  # in a run folder: all of a trained scene of Gaussians
@@ -52,9 +52,14 @@ class Representation(NamedTuple):
     name: str
     # How many cores XLA:CPU should see: "one" where its own threading slows the loops.
     threads: Literal["one", "all"]
+    # Whether rays are traced through the lens; else pictures are drawn of pinholes, and
+    # held-out ones are bent as the lens does before they are scored.
+    traces_lenses: bool
     spec_type: type
     presets: dict[str, Spec]
     with_steps: Callable[[Spec, int], Spec]  # schedules stretch with the steps
+    # How many times a step of the first state one takes on average over a run.
+    growth: Callable[[Spec, TrainState], float]
     metadata_of: Callable[[Capture, Spec], Any]
     build: Callable[..., Model]  # (spec, metadata, effects=()) -> model
     estimate_memory_bytes: Callable[[Spec, Capture], int]  # of the first state and step

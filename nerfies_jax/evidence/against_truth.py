@@ -10,11 +10,12 @@ import numpy as np
 
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.synthetic import SceneTruth
-from nerfies_jax.evidence import dense_flow, paths, record, summary, view_set
+from nerfies_jax.evidence import dense_flow, paths, record, view_set
 from nerfies_jax.evidence import tracks as tracking
 from nerfies_jax.evidence.record import Evidence
 from nerfies_jax.evidence.rest_points import RestPoints
 from nerfies_jax.evidence.tracks import Tracks
+from nerfies_jax.evidence.usable_paths import scene_unit
 
 LATER = 24  # frames after which a track is held against the truth
 
@@ -116,4 +117,4 @@ def _path_error(capture, views, evidence, followed, points):
     known = found.known & points.seen[long]
     if not known.any():
         return np.nan
-    return float(np.median(error[known]) / summary.typical_distance(evidence))
+    return float(np.median(error[known]) / scene_unit(evidence))

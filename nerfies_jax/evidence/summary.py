@@ -6,6 +6,7 @@ import numpy as np
 
 from nerfies_jax.evidence import record, rigid_groups, still_points
 from nerfies_jax.evidence.record import MOVES, PARTS, Evidence
+from nerfies_jax.evidence.usable_paths import scene_unit
 from nerfies_jax.evidence.view_set import Views
 
 # Above it a path's depth is that of what stands around it; half of it is a good depth.
@@ -42,7 +43,7 @@ def of(views: Views, evidence: Evidence) -> Summary:
     still = np.flatnonzero(evidence.score < MOVES)
     points = type(evidence.rest)(*(part[still] for part in evidence.rest))
     parallax = still_points.depth_deviation(views, tracks.take(still), points)
-    distance = typical_distance(evidence)
+    distance = scene_unit(evidence)
     groups, miss = 0, np.nan
     kept = paths.known.any(1)
     if kept.any():
@@ -66,13 +67,6 @@ def of(views: Views, evidence: Evidence) -> Summary:
         seconds=sum(evidence.seconds),
         unusable=evidence.unusable,
     )
-
-
-def typical_distance(evidence: Evidence) -> float:
-    """Median z-depth of the points that explain the tracks; scene units."""
-    depth = evidence.rest.depth[evidence.tracks.seen]
-    depth = depth[np.isfinite(depth) & (depth > 0)]
-    return float(np.median(depth)) if len(depth) else 1.0
 
 
 def lines(found: Summary, evidence: Evidence) -> list[str]:

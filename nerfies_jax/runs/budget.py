@@ -11,6 +11,9 @@ SCORE_SECONDS = 240.0  # for the held-out frames at the end
 LEAST_SCORED = 8
 FIT_SECONDS = 60.0  # for fitting codes to held-out frames and drawing them again
 LEAST_FITTED = 2
+STILL_SECONDS = 30.0  # for what scored frames show at other moments
+STILL_PIXELS = 10_000_000  # of these frames together, 24 bytes each
+LEAST_STILL, LEAST_MOMENTS, MOST_MOMENTS = 2, 4, 16
 FILM_SECONDS = 45.0  # of rendering
 FILM_LENGTH = 4.0  # seconds that the film plays
 MOST_FILMED, LEAST_FILMED = 96, 24
@@ -51,6 +54,19 @@ def halves(frame_seconds: float, share: float, heldout: int) -> int:
     """How many held-out frames to fit codes to; a fit costs `share` of a frame."""
     least = min(LEAST_FITTED, heldout)
     return _clamped(FIT_SECONDS, frame_seconds * (1 + share), least, heldout)
+
+
+def still(frame_seconds: float, scored: int, size: tuple[int, int]) -> tuple[int, int]:
+    """How many scored frames to average over time, and over how many moments.
+
+    All frames over many moments, where time and memory allow; fewer moments first,
+    then fewer frames.
+    """
+    scored = min(scored, max(LEAST_STILL, STILL_PIXELS // (size[0] * size[1])))
+    renders = STILL_SECONDS / frame_seconds if frame_seconds > 0 else float("inf")
+    moments = min(max(renders / scored, LEAST_MOMENTS), MOST_MOMENTS)
+    frames = min(max(renders / moments, min(LEAST_STILL, scored)), scored)
+    return int(frames), int(moments)
 
 
 def film(frame_seconds: float, size: tuple[int, int]) -> FilmPlan:

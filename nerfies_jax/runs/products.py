@@ -16,7 +16,7 @@ from nerfies_jax.evaluation import Renderer, Scored, heldout, pictures
 from nerfies_jax.evaluation.representation import Saved
 from nerfies_jax.measure import clock
 from nerfies_jax.measure.clock import Metric
-from nerfies_jax.runs import budget, commands, curves, quality, report
+from nerfies_jax.runs import budget, commands, curves, floors_text, quality, report
 from nerfies_jax.runs.run import Run
 from nerfies_jax.runs.run_folder import CONFIG
 from nerfies_jax.runs.train import Trained
@@ -24,6 +24,10 @@ from nerfies_jax.training import losses
 from nerfies_jax.training.model import TrainState
 
 SHOWN = 4  # held-out frames in the comparison
+COMPARED = (
+    "Held-out frames: what was filmed, what was rendered, how far they are apart, and "
+    "the depth."
+)
 
 
 def make(
@@ -40,20 +44,15 @@ def make(
     """
     state, renderer = trained.result.state, trained.renderer
     rows, left_out = frames_to_score(run, trained)
-    scored = evaluation.score(renderer, state, run.capture, rows)
+    scored = evaluation.score(trained.draw, state, run.filmed, rows)
     if not np.isfinite(scored.colour).all():
         raise FloatingPointError(
             f"no report: what the state of step {trained.result.steps:,} draws is not "
             "finite"
         )
     ms_per_frame = renderer.ms_per_frame(len(scored.rows))
-    figures = [
-        report.Figure(
-            save_comparison(folder / "comparison.png", run.capture, scored),
-            "Held-out frames: what was filmed, what was rendered, how far they are "
-            "apart, and the depth.",
-        )
-    ]
+    comparison = save_comparison(folder / "comparison.png", run.filmed, scored)
+    figures = [report.Figure(comparison, COMPARED)]
     watched = [run.capture.ids[row] for row in trained.watched]
     curves.write(folder, trained.result.history, watched)
     curve = save_curve(folder / "psnr_over_time.png", run, trained)
@@ -68,16 +67,16 @@ def make(
     )
     frames = evaluation.frames_of(run.capture, run.model.required_data)
     fitted, gain = score_halves(run, state, scored, ms_per_frame / 1e3)
-    found, remarks = quality.measure(run, state, renderer, scored, extra)
+    found, remarks = quality.measure(
+        run, state, trained.draw, scored, extra, ms_per_frame / 1e3
+    )
     metrics = heldout.metrics(found)
     metrics += [*measured(run, trained, scored, ms_per_frame, began), *fitted]
     metrics += model_size(saved)
-    write_json(
-        folder / "metrics.json",
-        {m.key: m.value if math.isfinite(m.value) else None for m in metrics},
-    )
-    notes = [trained.result.message, *run.capture.notes, *left_out, *remarks, *gain]
-    notes += saved.notes
+    save_metrics(folder / "metrics.json", metrics)
+    warnings = floors_text.warnings(found)
+    notes = [*warnings, trained.result.message, *_capture_notes(run), *left_out]
+    notes += [*remarks, *gain, *saved.notes]
     following = _next(folder, run, trained)
     page = report.write(
         folder,
@@ -92,7 +91,19 @@ def make(
         notes,
         following,
     )
-    _say(folder, page, metrics, following)
+    _say(folder, page, metrics, [*floors_text.lines(found), *warnings], following)
+
+
+def save_metrics(path: pathlib.Path, metrics: list[Metric]) -> None:
+    """Values by key; null for what is not finite."""
+    write_json(
+        path, {m.key: m.value if math.isfinite(m.value) else None for m in metrics}
+    )
+
+
+def _capture_notes(run):
+    """Of what was learnt from, and of what scores are of."""
+    return dict.fromkeys([*run.capture.notes, *run.filmed.notes])
 
 
 def frames_to_score(run: Run, trained: Trained) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -269,7 +280,7 @@ def _next(folder, run, trained):
     return [looked, report.Command("Train it twice as long:", line)]
 
 
-def _say(folder, page, metrics, following):
+def _say(folder, page, metrics, floors, following):
     value = {metric.key: metric.value for metric in metrics}
     print(
         f"held out: {value['heldout.psnr']:.2f} dB, SSIM {value['heldout.ssim']:.3f} "
@@ -283,6 +294,8 @@ def _say(folder, page, metrics, following):
             f"points:   {value['tracks.epe']:.4f} scene units from where they are, "
             f"{value['tracks.still_epe']:.4f} if they stood still"
         )
+    for line in floors:
+        print(line)
     print(f"report:     {page}")
     print(f"comparison: {folder / 'comparison.png'}")
     print(f"film:       {folder / 'scene.mp4'}")

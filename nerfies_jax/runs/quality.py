@@ -5,16 +5,21 @@ from typing import NamedTuple
 import numpy as np
 
 from nerfies_jax import evaluation
+from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.evaluation import (
-    Renderer,
     Scored,
     fitted_cameras,
+    floors,
     heldout,
     model_flow,
+    moving_masks,
     protocol,
 )
+from nerfies_jax.evaluation.floors import Floors
 from nerfies_jax.evaluation.heldout import Lpips
+from nerfies_jax.evaluation.scores import Draw
 from nerfies_jax.measure import perceptual
+from nerfies_jax.runs import budget
 from nerfies_jax.runs.config import MoreMetrics
 from nerfies_jax.runs.run import Run
 from nerfies_jax.training.model import TrainState
@@ -48,17 +53,19 @@ def prepared(more: MoreMetrics, size: tuple[int, int]) -> Extra:
 def measure(
     run: Run,
     state: TrainState,
-    renderer: Renderer,
+    draw: Draw,
     scored: Scored,
     extra: Extra = NOTHING,
+    frame_seconds: float = 0.0,
 ) -> tuple[dict[str, float], list[str]]:
     """Numbers by the keys of `heldout.MEASURES`, and notes for the reader.
 
-    Points and flow are held against the truth of a built-in scene.
+    Points and flow are held against the truth of a built-in scene. What one frame
+    takes to render says how many are drawn for the floors.
     """
-    capture = run.capture
     known = followed = flow = fitted = None
-    notes = []
+    capture, note = moving_masks.with_masks(run.filmed, CACHE / "evidence")
+    notes = [note] if note else []
     try:
         truth = protocol.stored_truth(capture)
         if truth is not None:
@@ -74,7 +81,12 @@ def measure(
     if extra.camera_fits:
         places = evaluation.spread(np.arange(len(scored.rows)), extra.camera_fits)
         fitted = fitted_cameras.fit_cameras(
-            run.model, renderer, state, capture, scored.rows[places]
+            run.model,
+            draw,
+            state,
+            run.capture,
+            scored.rows[places],
+            filmed=run.filmed,
         )
         notes.append(
             f"Cameras fitted to {len(places)} held-out frames: "
@@ -92,5 +104,14 @@ def measure(
         followed=followed,
         flow=flow,
         fitted=fitted,
+        floors=_floors(run, state, draw, scored.rows, frame_seconds),
     )
     return found, notes
+
+
+def _floors(run, state, draw, rows, frame_seconds):
+    frames, moments = budget.still(frame_seconds, len(rows), run.filmed.size)
+    return Floors(
+        floors.neighbour_means(run.filmed, rows),
+        floors.time_averages(draw, state, run.filmed, rows, frames, moments),
+    )

@@ -1,6 +1,7 @@
 """The main job as a call: a filmed scene in, a run folder out, and on from a cut."""
 
 import contextlib
+import dataclasses
 import pathlib
 import time
 from collections.abc import Iterator, Mapping
@@ -8,7 +9,7 @@ from typing import Any, Literal, NamedTuple
 
 from nerfies_jax.capture.capture import CaptureError, describe
 from nerfies_jax.evidence import inspection
-from nerfies_jax.runs import adviser, products, quality, run_folder, train
+from nerfies_jax.runs import adviser, plan, products, quality, run_folder, train
 from nerfies_jax.runs.config import MoreMetrics, RunConfig
 from nerfies_jax.runs.run import (
     Run,
@@ -53,9 +54,10 @@ def reconstruct(
 
     Everything goes into the new folder `out`, by default `runs/CAPTURE-PRESET`, and
     from its first moment on `resume` continues the run that is in there. `effects`
-    "auto" looks at the capture first and takes those that it calls for. `seconds` ends
-    the training early; an evaluation follows after `evaluate_every` seconds of it, a
-    checkpoint after `checkpoint_every` seconds. `more` is measured at the end. Raises
+    "auto" looks at the capture first and takes those that it calls for. `seconds` of
+    training say how many steps there are or, where the steps are given, end it early;
+    an evaluation follows after `evaluate_every` seconds of it, a checkpoint after
+    `checkpoint_every` seconds. `more` is measured at the end. Raises
     Refused where it cannot begin.
     """
     began = time.perf_counter()
@@ -69,6 +71,11 @@ def reconstruct(
             _describe(run)
             extra = quality.prepared(more, run.capture.size)
             state = first_state(run)
+            if seconds is not None and not _steps_given(run.config):
+                run, line = plan.with_seconds(run, state, seconds)
+                print(line)
+                state = first_state(run)
+                pace = dataclasses.replace(pace, seconds=plan.OVERRUN * seconds)
             stem = "-".join(run.capture.name.split()) + "-" + run.config.preset
             folder = run_folder.new_run_folder(out, stem)
             held.enter_context(run_folder.owned(folder))
@@ -116,6 +123,12 @@ def _refusing() -> Iterator[None]:
         yield
     except (ValueError, OSError) as error:
         raise Refused(str(error)) from error
+
+
+def _steps_given(config):
+    """Whether the length of a run is the user's own word."""
+    given = any(words.startswith("steps=") for words in config.overrides)
+    return given or config.steps is not None
 
 
 def _new_run(config, effects):

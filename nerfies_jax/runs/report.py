@@ -25,6 +25,8 @@ HEADLINES = {
     "heldout.ssim": "SSIM, held out",
     "heldout.moving_psnr": "PSNR, what moves",
     "heldout.still_psnr": "PSNR, what stands still",
+    "floor.neighbours": "PSNR, mean of the neighbouring frames",
+    "motion.worth": "what motion is worth",
     "train.seconds": "training",
     "render.ms_per_frame": "a frame",
     "file.bytes": "the model file",

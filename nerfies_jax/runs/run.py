@@ -1,5 +1,6 @@
 """A run: which capture, which scene, and the folder that holds what came of it."""
 
+import dataclasses
 import json
 import os
 import pathlib
@@ -13,8 +14,11 @@ from nerfies_jax.capture import pinholes, synthetic
 from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.json_files import write_json
+from nerfies_jax.evaluation import Renderer
+from nerfies_jax.evaluation.lens import ThroughLens
 from nerfies_jax.evaluation.representation import Representation
-from nerfies_jax.evidence import given_files
+from nerfies_jax.evaluation.scores import Draw
+from nerfies_jax.evidence import frame_flow, given_files
 from nerfies_jax.runs import own_effects, representations
 from nerfies_jax.runs.config import CaptureSource, RunConfig
 from nerfies_jax.runs.run_folder import CHECKPOINTS, CONFIG
@@ -36,7 +40,8 @@ class Run(NamedTuple):
     """Everything that a run is made of before its first step."""
 
     config: RunConfig
-    capture: Capture
+    capture: Capture  # what is learnt from: with pinholes where only they are drawn
+    filmed: Capture  # what held-out frames are scored against (`pinholes.scorable`)
     representation: Representation
     spec: Any  # of the representation's `spec_type`
     metadata: Any  # what the scene must know of the capture
@@ -60,11 +65,45 @@ def open_run(
     stored: Capture | None = None,
 ) -> Run:
     """Read the capture and build the model."""
-    capture = pinholes.as_pinholes(stored or stored_capture(config.source, config.seed))
+    stored = stored or stored_capture(config.source, config.seed)
+    filmed = pinholes.scorable(stored, representation.traces_lenses)
+    capture = filmed if representation.traces_lenses else pinholes.as_pinholes(stored)
+    run = _built(config, representation, spec, capture, filmed)
+    capture = _completed(capture, run.model.required_data)
+    if capture is run.capture:
+        return run
+    return _built(config, representation, spec, capture, filmed)
+
+
+def _completed(capture, wanted):
+    """With flow found in the pictures where it is wanted; what else lacks is noted."""
+    if "flow" in wanted and capture.flow is None:
+        capture = frame_flow.with_flow(capture)
+    if "depths" in wanted and capture.depths is None:
+        note = "this preset learns from depth as well, and the capture has none"
+        capture = dataclasses.replace(capture, notes=(*capture.notes, note))
+    return capture
+
+
+def with_steps(run: Run, steps: int) -> Run:
+    """The run over another number of steps, of the same pictures."""
+    config = dataclasses.replace(run.config, steps=steps)
+    spec = scene_spec(config)
+    return _built(config, run.representation, spec, run.capture, run.filmed)
+
+
+def _built(config, representation, spec, capture, filmed):
     metadata = representation.metadata_of(capture, spec)
     effects = own_effects.load(config.effects, metadata)
     model = representation.build(spec, metadata, effects=effects)
-    return Run(config, capture, representation, spec, metadata, model, effects)
+    return Run(config, capture, filmed, representation, spec, metadata, model, effects)
+
+
+def drawer(run: Run, renderer: Renderer) -> Draw:
+    """What draws the views of `run.filmed`: the renderer, through a lens if need be."""
+    if run.representation.traces_lenses or run.filmed is run.capture:
+        return renderer
+    return ThroughLens(renderer, run.filmed.size)
 
 
 def scene_spec(config: RunConfig) -> Any:

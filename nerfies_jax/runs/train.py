@@ -8,8 +8,9 @@ import numpy as np
 
 from nerfies_jax import evaluation
 from nerfies_jax.evaluation import Renderer
+from nerfies_jax.evaluation.scores import Draw
 from nerfies_jax.runs import budget, run_folder
-from nerfies_jax.runs.run import Run
+from nerfies_jax.runs.run import Run, drawer
 from nerfies_jax.training import loop
 from nerfies_jax.training.checkpoint import Checkpoints
 from nerfies_jax.training.loop import FitResult, History, Hook
@@ -39,6 +40,7 @@ class Trained(NamedTuple):
 
     result: FitResult
     renderer: Renderer
+    draw: Draw  # the same, of the frames as they were filmed
     watched: np.ndarray  # rows of the held-out frames that its curve is of
 
 
@@ -57,6 +59,7 @@ def train(
 ) -> Trained:
     """Fit the model; its PSNR and SSIM on a few held-out frames go into the history."""
     renderer = Renderer(run.model, run.capture.size)
+    draw = drawer(run, renderer)
     few, evaluate_every = run.capture.heldout, pace.evaluate_every
     if len(few):
         renderer(
@@ -68,7 +71,7 @@ def train(
 
     def held_out(state, step):
         del step
-        scored = evaluation.score(renderer, state, run.capture, few)
+        scored = evaluation.score(draw, state, run.filmed, few)
         return {"psnr": scored.psnr.mean(), "ssim": scored.ssim.mean()}
 
     hooks = [Hook("held out", held_out, every_seconds=evaluate_every)]
@@ -83,4 +86,4 @@ def train(
         checkpoint_seconds=pace.checkpoint_every,
         history=History() if record is None else History(**record),
     )
-    return Trained(result, renderer, few)
+    return Trained(result, renderer, draw, few)

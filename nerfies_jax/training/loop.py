@@ -87,7 +87,8 @@ def fit(
 ) -> FitResult:
     """Train until `steps` steps are completed in all, from wherever `state` is.
 
-    `seconds` bounds the time of this call. Ctrl-C, SIGTERM, SIGHUP and a number that is
+    `seconds` bounds the training of this call: chunks and events, neither compiling nor
+    hooks. Ctrl-C, SIGTERM, SIGHUP and a number that is
     not finite, in a metric or anywhere in the state, end it too; whatever ends it, the
     last good state is saved to `checkpoints` and returned. A save that fails is told
     and tried again with the next; it ends nothing. An event happens when its
@@ -100,6 +101,7 @@ def fit(
     run = _Run(model, state, frames, steps, (*model.events, *events), tuple(hooks))
     run.history, run.checkpoints = history, checkpoints
     run.limits = (math.inf if seconds is None else seconds, checkpoint_seconds)
+    run.trained_before = history.seconds
     with StopRequests() as requests, Progress(console, run.step, steps) as progress:
         run.progress = progress
         reason = run.go(requests)
@@ -119,8 +121,7 @@ class _Run:
             )
         self.events = _by_step(events)
         self.frames = jax.tree.map(jnp.asarray, frames)
-        self.began = time.monotonic()
-        self.saved_at = self.began
+        self.saved_at = time.monotonic()
         self.step_seconds = math.inf  # not known yet: the first chunk is one step
         self.called = {hook.name: [self.step, None] for hook in hooks}
         self.detail = ""
@@ -139,7 +140,7 @@ class _Run:
         while self.step < self.steps:
             if requests.name is not None:
                 return requests.name
-            if time.monotonic() - self.began >= self.limits[0]:
+            if self._left() <= 0:
                 return "seconds"
             program, compile_seconds = compiled(
                 self.model.step, self.state, self.frames
@@ -209,9 +210,12 @@ class _Run:
         for hook in self.hooks:
             if hook.every_steps is not None:
                 stops.append((self.step // hook.every_steps + 1) * hook.every_steps)
-        left = self.limits[0] - (time.monotonic() - self.began)
-        affordable = min(CHUNK_SECONDS, left) / self.step_seconds
+        affordable = min(CHUNK_SECONDS, self._left()) / self.step_seconds
         return max(1, min(min(stops) - self.step, int(affordable)))
+
+    def _left(self) -> float:
+        """Seconds of training that this call may still take."""
+        return self.limits[0] - (self.history.seconds - self.trained_before)
 
     def _after_chunk(self) -> None:
         """Hooks, checkpoint and display; none of it is training time."""
@@ -226,7 +230,7 @@ class _Run:
             row = self.history.rows[-1]
             metrics = {k: v for k, v in row.items() if k not in ("step", "seconds")}
             left = (self.steps - self.step) * self.step_seconds
-            left = min(left, self.limits[0] - (time.monotonic() - self.began))
+            left = min(left, self._left())
             counts = self.model.counts(self.state)
             rate = 1 / self.step_seconds
             self.progress.update(self.step, rate, metrics, counts, max(left, 0.0))

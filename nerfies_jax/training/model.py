@@ -110,9 +110,8 @@ class Model(NamedTuple):
     render: Callable[[PyTree, View, tuple[int, int], Int[Array, ""]], Rendering]
     events: tuple[Event, ...]
     counts: Callable[[TrainState], dict[str, int]]  # {"gaussians": n, ...}
-    required_data: frozenset[str] = (
-        frozenset()
-    )  # which of "depths", "points", "flow" it reads
+    # Which of "depths", "points", "flow" it reads, where a capture has them.
+    required_data: frozenset[str] = frozenset()
     stages: Stages | None = None  # where rendering has parts worth keeping
     # As `init`, of the same structure and quicker: what a checkpoint is read into.
     example: Callable[[Any, Any], TrainState] | None = None

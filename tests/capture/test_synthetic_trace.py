@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nerfies_jax.capture.synthetic import film, motion, presets, texture, trace
+from nerfies_jax.capture.synthetic import film, presets, texture, trace
 from nerfies_jax.capture.synthetic.spec import SceneSpec
 from nerfies_jax.geometry import camera as cameras
 from tests import gradients, scene_oracle
@@ -199,37 +199,6 @@ def test_normals_are_those_of_the_surface(float64, rng):
     # All but the few rays that fall across an edge of a box.
     assert np.quantile(np.abs(cosine), 0.02) > 1 - 1e-4
     assert np.all(np.sum(np.asarray(hits[0].normal) * along, -1) <= 0)
-
-
-def test_squash_keeps_volume_and_foot_and_cloth_keeps_volume_and_edge(float64):
-    ball, cloth = presets.BALL.shape, presets.CLOTH.shape
-    held = np.array([[0, -ball.radius, 0], [0.05, cloth.half_height, 0]])
-    for shape, fixed in zip((ball, cloth), held, strict=True):
-        moved_and_slope = jax.jit(
-            lambda p, q, t, shape=shape: (
-                shape.deform(p, t),
-                jax.jacfwd(shape.deform)(q, t),
-            )
-        )
-        for time in (0.1, 0.4):
-            inside = np.array([0.02, 0.01, 0.0])
-            moved, slope = moved_and_slope(fixed, inside, np.asarray(time))
-            assert abs(np.linalg.det(slope) - 1) < 1e-12
-            assert np.abs(moved - fixed).max() < 1e-15
-
-
-def test_the_last_hinge_of_an_arm_does_not_move_its_pivot(float64):
-    arm = presets.FOREARM
-    elbow = np.array(arm.motion.hinges[1].pivot) - np.array(arm.place)
-    upper = dataclasses.replace(arm, motion=motion.Arm(arm.motion.hinges[:1]))
-
-    @jax.jit
-    def ends(elbow, time):
-        poses = [motion.pose(one.motion, one.place, time) for one in (arm, upper)]
-        return [motion.to_world(pose, elbow) for pose in poses]
-
-    ends = ends(elbow, np.asarray(0.3))
-    assert np.abs(ends[0] - ends[1]).max() < 1e-15
 
 
 def test_value_noise_is_the_blend_of_hashed_corners(dtype, rng):

@@ -78,23 +78,6 @@ def test_a_bent_slice_is_the_loop_over_its_layers(dtype, rng):
 
 
 @pytest.mark.hard_cases
-def test_the_window_follows_a_traced_step_and_ends_exactly(dtype):
-    steps = np.asarray([0, 999, 1000, 1001, 6000, 10_999, 11_000, 10**6], np.int32)
-    opened = jax.jit(
-        jax.vmap(lambda step: ambient.window(BENT, step, jnp.zeros(2, dtype)))
-    )(steps)
-    opened = np.asarray(opened)
-    assert opened.dtype == dtype
-    exact = [window_by_hand(BENT, int(step)) for step in steps]
-    tolerance = {"float32": 3e-7, "float64": 1e-13}[dtype]
-    np.testing.assert_allclose(opened, exact, atol=tolerance)
-    assert np.all(opened[:3] == 0)
-    # HyperNeRF's alpha goes to the number of bands: band one is half open at its half
-    np.testing.assert_allclose(opened[4], [1, 0], atol=tolerance)
-    assert np.all(opened[6:] == 1)
-
-
-@pytest.mark.hard_cases
 @pytest.mark.parametrize("spec", [BENT, PLANE], ids=["bent", "plane"])
 def test_while_shut_the_template_reads_zeros_and_nothing_learns(spec, dtype, rng):
     made = ambient.effect(spec)

@@ -273,25 +273,6 @@ def test_energy_of_all_samples_in_a_loop(setting):
     np.testing.assert_allclose(found[1][0], slow(unfolded, setting)[0], rtol=1e-7)
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("points", [1, 4])
-def test_the_penalty_of_drawn_samples_has_the_mean_of_all(points, setting):
-    """By many keys; its deviation is what the table of the experiment says."""
-
-    def value(spec, key):
-        here = context(
-            field(setting.params), setting.point, setting.weight, setting.conditions
-        )._replace(key=key)
-        return elastic.energy(spec, here)[0]
-
-    every = jax.jit(lambda: value(ElasticSpec(points=None), jax.random.key(0)))()
-    keys = jax.random.split(jax.random.key(1), 2000)
-    drawn = jax.jit(jax.vmap(lambda key: value(ElasticSpec(points=points), key)))(keys)
-    error = np.std(drawn) / math.sqrt(2000)
-    assert error > 0
-    assert abs(np.mean(drawn) - every) < 4 * error
-
-
 def test_as_many_points_as_samples_take_each_once(setting):
     drawn_all = jax.jit(lambda *seen: elastic.draw(8, level(*seen), jax.random.key(0)))
     eight, weight = drawn_all(setting.point, setting.weight)

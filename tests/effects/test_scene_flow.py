@@ -139,11 +139,6 @@ def test_a_single_moment_has_no_neighbours_and_no_flow_to_learn(dtype):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(grad))
 
 
-def test_interval_of_moments():
-    assert scene_flow.interval(11) == 0.1
-    assert scene_flow.interval(1) > 1
-
-
 # --- the medium
 
 

@@ -27,8 +27,6 @@ TINY = RadianceScene(
     appearance=AppearanceSpec(width=2),
     transient=TransientSpec(code_width=3, depth=1, width=8),
 )
-# softplus(-1e4) is zero in both precisions: a medium that is nowhere.
-NOWHERE = -1e4
 
 
 @functools.cache
@@ -45,39 +43,12 @@ def params_of(dtype):
     return drawn.params(scene.field(TINY, metadata()).init, dtype, 0.1, 2)
 
 
-def emptied(params):
-    """The same field with a transient of no density."""
-    net = params["transient"]
-    head = net.heads["density"]
-    gone = head._replace(
-        weight=np.zeros_like(head.weight), bias=np.full_like(head.bias, NOWHERE)
-    )
-    return params | {"transient": net._replace(heads=net.heads | {"density": gone})}
-
-
 def ray_and_condition(dtype):
     parts = [0.1, 0.2, 2.0], [0.0, -0.28, -0.96], 1.0, 3.0
     ray = Ray(*(jnp.asarray(part, dtype) for part in parts))
     codes = {"appearance": [0.3, -0.2], "transient": [0.5, -1.0, 2.0]}
     codes = {name: jnp.asarray(code, dtype) for name, code in codes.items()}
     return ray, FrameCondition(jnp.asarray(0.4, dtype), codes, jnp.int32(0))
-
-
-def test_left_out_it_is_a_transient_of_no_density(dtype):
-    params, (ray, condition) = params_of(dtype), ray_and_condition(dtype)
-    coarse, left_out = tracer("transient")(params, ray, condition)
-    same_coarse, empty = tracer()(emptied(params), ray, condition)
-    empty = jax.tree.map(np.asarray, empty)
-    # Two programs: the last bits of a product may differ.
-    tolerance = {"float32": 1e-6, "float64": 1e-14}[dtype]
-    assert np.all(empty.media_weight["transient"] == 0)
-    assert left_out.media == {}
-    assert left_out.beta is None
-    for name in ("colour", "alpha", "distance", "static_weight", "distances"):
-        one, other = getattr(left_out, name), getattr(empty, name)
-        np.testing.assert_allclose(one, other, atol=tolerance, err_msg=name)
-    np.testing.assert_allclose(coarse.colour, same_coarse.colour, atol=tolerance)
-    np.testing.assert_allclose(empty.beta, TINY.transient.beta_min, rtol=tolerance)
 
 
 def test_with_it_the_ray_sees_both_through_one_transmittance(dtype):

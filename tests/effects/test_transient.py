@@ -169,20 +169,6 @@ def test_photometric_holds_from_no_residual_to_a_huge_one(offset, dtype):
 
 
 @pytest.mark.hard_cases
-def test_beta_is_best_at_the_length_of_the_residual_and_the_loss_is_bounded(float64):
-    residual, zero = np.array([[0.3, 0.0, 0.4]]), np.zeros((1, 3))  # of length 0.5
-    grad = {
-        b: photometric(residual, zero, np.array([b]), None) for b in (0.4, 0.5, 0.6)
-    }
-    grad = {b: float(grads[2][0]) for b, (_, grads) in grad.items()}
-    assert abs(grad[0.5]) < 1e-14
-    assert grad[0.4] < 0
-    assert grad[0.6] > 0
-    least, _ = photometric(zero, zero, np.array([0.03]), None)
-    assert abs(float(least) - math.log(0.03)) < 1e-14
-
-
-@pytest.mark.hard_cases
 @pytest.mark.parametrize("hole", [math.nan, math.inf, -math.inf])
 def test_unfilmed_pixels_teach_nothing_whatever_they_hold(hole, dtype, rng):
     colour, truth, beta = whole = rays_of(dtype, rng, 3)[:3]

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from gaussians_jax import scene as splat_scene
 from nerfies_jax import evaluation, scene
+from nerfies_jax.capture import pinholes
 from nerfies_jax.evaluation import fitted_cameras, heldout
 from nerfies_jax.evaluation.fitted_cameras import CameraFitSpec
 from nerfies_jax.geometry import camera as cameras
@@ -104,7 +105,26 @@ def test_a_displaced_camera_is_found_again(capture, rng, turn, shift, most_pixel
     rows = film.heldout[:3]
     before = evaluation.score(renderer, state, film, rows)
     spec = CameraFitSpec(max_steps=200, tolerance=3e-3, most_pixels=most_pixels)
-    found = fitted_cameras.fit_cameras(MODEL, renderer, state, film, rows, spec)
+    # Scored through the lens that filmed, with the poses that were fitted without.
+    lens = film.cameras._replace(radial=film.cameras.radial + np.float32(0.1))
+    scored = []
+
+    def draw(state, view):
+        scored.append(view.camera)
+        return renderer(state, view._replace(camera=pinholes.pinhole(view.camera)))
+
+    found = fitted_cameras.fit_cameras(
+        MODEL,
+        draw,
+        state,
+        film,
+        rows,
+        spec,
+        filmed=dataclasses.replace(film, cameras=lens),
+    )
+    assert [float(camera.radial[0]) for camera in scored] == [np.float32(0.1)] * 3
+    for camera, position in zip(scored, found.cameras.position, strict=True):
+        np.testing.assert_allclose(camera.position, position, atol=1e-6)
     assert found.converged.all()
     apart = np.linalg.norm(
         found.cameras.position - capture.cameras.position[rows], axis=1

@@ -12,6 +12,7 @@ from nerfies_jax import evaluation, runs, scene
 from nerfies_jax.capture import synthetic
 from nerfies_jax.effects.warp import WarpSpec
 from nerfies_jax.evaluation import heldout, model_flow, protocol
+from nerfies_jax.evaluation.floors import Averages, Floors
 from nerfies_jax.evaluation.heldout import heldout_metrics
 from nerfies_jax.evaluation.model_flow import Flow, Moved
 from nerfies_jax.evaluation.scores import Scored
@@ -31,6 +32,10 @@ FILM = dataclasses.replace(scenes.TINY_FILM, heldout_every=2)
 NOBODY = TrainState((), (), (), jnp.zeros((), jnp.int32), jax.random.key(0))
 ALWAYS = {"heldout.psnr", "heldout.ssim"}
 MASKED = {f"heldout.{name}" for name in ("moving_psnr", "moving_ssim", "still_psnr")}
+FLOORS = {
+    *(f"floor.{name}" for name in ("neighbours", "still")),
+    *(f"motion.{name}" for name in ("worth", "moving_worth")),
+}
 DEPTHS = {
     *(f"heldout.depth_{kind}" for kind in ("abs_rel", "within_delta")),
     *(f"heldout.{of}depth_{k}" for of in ("", "moving_") for k in ("median", "rmse")),
@@ -73,8 +78,13 @@ def test_every_number_is_that_of_a_direct_computation(rng, filmed):
     if filmed:
         capture = dataclasses.replace(capture, valid=valid)
     scored = drawn(capture, rng)
-    found = heldout_metrics(scored, capture)
-    assert set(found) == ALWAYS | MASKED | DEPTHS
+    places = np.array([len(scored.rows) - 1])
+    grey = Averages(places, np.full_like(scored.colour[places], 0.4), None)
+    floors = Floors(grey._replace(known=~valid[scored.rows[places]]), grey)
+    found = heldout_metrics(scored, capture, floors=floors)
+    unscored = {"heldout.unscored"} if filmed else set()
+    lost = {"floor.neighbours"} if filmed else set()  # what is known was not filmed
+    assert set(found) == (ALWAYS | MASKED | DEPTHS | FLOORS | unscored) - lost
     assert found["heldout.psnr"] == pytest.approx(scored.psnr.mean())
     rows = capture.heldout
     picture = np.round(scored.colour.astype(float) * 255) / 255
@@ -85,6 +95,13 @@ def test_every_number_is_that_of_a_direct_computation(rng, filmed):
         frames = zip(picture, truth, mask, strict=True)
         exact = np.mean([psnr(*frame) for frame in frames])
         assert found[f"heldout.{name}_psnr"] == pytest.approx(exact, abs=1e-4)
+    for key, mask in (("worth", known[-1]), ("moving_worth", (moving & known)[-1])):
+        own = psnr(picture[-1], truth[-1], mask)
+        gain = own - psnr(np.full_like(truth[-1], 102 / 255), truth[-1], mask)
+        assert found[f"motion.{key}"] == pytest.approx(gain, abs=1e-4)
+    if filmed:
+        share = 1 - valid[rows].mean()
+        assert found["heldout.unscored"] == pytest.approx(share)
     ssim = [
         masked_ssim(np.float32(a), np.float32(b), m)
         for a, b, m in zip(picture, truth, moving & known, strict=True)
@@ -249,7 +266,7 @@ def test_a_run_is_held_against_the_truth_of_its_scene(kind, filmed, rng):
     found, notes = quality.measure(run, state, renderer, scored)
     assert notes == []
     strain = {"tracks.strain"} if kind == "radiance" else set()
-    assert set(found) == ALWAYS | MASKED | DEPTHS | TRUTH | strain
+    assert set(found) == ALWAYS | MASKED | FLOORS | DEPTHS | TRUTH | strain
 
     truth = protocol.stored_truth(capture)
     known = protocol.ground_truth(capture, truth, 2, quality.TRACKS)
@@ -297,15 +314,13 @@ def test_a_scene_without_motion_or_truth_has_no_points_to_follow(filmed, rng, tm
     scored = drawn(run.capture, rng)
     elsewhere = dataclasses.replace(run.capture, path=None)
     found, notes = quality.measure(
-        run._replace(capture=elsewhere), state, renderer, scored
+        run._replace(filmed=elsewhere), state, renderer, scored
     )
     assert notes == []
-    assert set(found) == ALWAYS | MASKED | DEPTHS
+    assert set(found) == ALWAYS | MASKED | FLOORS | DEPTHS
     # A truth of another scene is no reason to lose what was trained.
     (tmp_path / synthetic.TRUTH_FILE).write_bytes(b"cut short")
     broken = dataclasses.replace(run.capture, path=tmp_path)
-    found, notes = quality.measure(
-        run._replace(capture=broken), state, renderer, scored
-    )
-    assert set(found) == ALWAYS | MASKED | DEPTHS
+    found, notes = quality.measure(run._replace(filmed=broken), state, renderer, scored)
+    assert set(found) == ALWAYS | MASKED | FLOORS | DEPTHS
     assert "no scene truth" in notes[0]

@@ -5,7 +5,6 @@ import dataclasses
 import numpy as np
 import pytest
 
-from nerfies_jax.capture import synthetic
 from nerfies_jax.evaluation import protocol
 from nerfies_jax.evaluation.protocol import PointTracks
 from tests import scenes
@@ -13,15 +12,8 @@ from tests import scenes
 SHIFT = np.float32([0.012, 0.0, 0.016])  # 0.02 long
 
 
-@pytest.fixture(scope="module")
-def filmed():
-    film = dataclasses.replace(scenes.TINY_FILM, heldout_every=2)
-    capture, truth = synthetic.make(film)
-    return capture, truth, protocol.ground_truth(capture, truth, 2, 5)
-
-
-def test_the_known_paths_are_those_of_points_seen_at_the_start(filmed):
-    capture, truth, known = filmed
+def test_the_known_paths_are_those_of_points_seen_at_the_start():
+    capture, truth, known = scenes.tiny_tracks()
     assert known.path.shape == (5, len(capture.train), 3)
     assert len(known.rows) == 2
     assert set(known.rows) <= set(capture.heldout)
@@ -34,22 +26,23 @@ def test_the_known_paths_are_those_of_points_seen_at_the_start(filmed):
         np.testing.assert_array_equal(seen, truth.track_seen[track][known.moments])
 
 
-def test_a_scaled_capture_has_its_paths_in_scene_units(filmed):
-    capture, truth, known = filmed
+def test_a_scaled_capture_has_its_paths_in_scene_units():
+    capture, truth, known = scenes.tiny_tracks()
     other = dataclasses.replace(capture, scale=2.0, centre=(0.1, 0.2, -0.3))
     found = protocol.ground_truth(other, truth, 2, 5)
     expected = 2 * (known.path - np.float32([0.1, 0.2, -0.3]))
     np.testing.assert_allclose(found.path, expected, atol=1e-6)
 
 
-def test_the_truth_of_another_capture_is_refused(filmed):
-    capture, truth, _ = filmed
+def test_the_truth_of_another_capture_is_refused():
+    capture, truth, _ = scenes.tiny_tracks()
     with pytest.raises(ValueError, match="other frames than the capture"):
         protocol.ground_truth(capture, truth._replace(ids=truth.ids[1:]), 2, 5)
 
 
-def test_tracks_are_scored_by_their_distance_at_all_instants_but_the_start(filmed):
-    known = filmed[2]._replace(seen=np.ones_like(filmed[2].seen))
+def test_tracks_are_scored_by_their_distance_at_all_instants_but_the_start():
+    known = scenes.tiny_tracks()[2]
+    known = known._replace(seen=np.ones_like(known.seen))
     found = np.ones(known.seen.shape, bool)
     found[0, 4:6] = False
     right = PointTracks(known.path, found, 0.1, 0.2)
@@ -77,8 +70,8 @@ def test_tracks_are_scored_by_their_distance_at_all_instants_but_the_start(filme
     assert np.isnan(list(nothing.values())).all()
 
 
-def test_a_real_capture_is_judged_by_its_pictures_alone(filmed):
-    capture, _, known = filmed
+def test_a_real_capture_is_judged_by_its_pictures_alone():
+    capture, _, known = scenes.tiny_tracks()
     found = protocol.held_out_only(capture, 2)
     np.testing.assert_array_equal(found.rows, known.rows)
     np.testing.assert_array_equal(found.moments, known.moments)

@@ -1,5 +1,6 @@
 """Flow, tracks, what moves, and paths in space, on films of two planes."""
 
+import dataclasses
 import functools
 
 import numpy as np
@@ -189,6 +190,16 @@ def test_nothing_moves_in_a_still_film():
     _, evidence = gathered(card=lambda time: (0.1, 0.0))
     assert evidence.moving.mean() < 0.01
     assert len(evidence.moved) < 0.01 * len(evidence.score)
+
+
+def test_cameras_that_are_off_by_a_pixel_set_no_wall_in_motion():
+    capture = films.film(**MOVES, frames=24)
+    noise = np.random.default_rng(0).normal(0, 0.7 * films.FAR / films.FOCAL, (24, 3))
+    told = capture.cameras.position + (noise * [1, 1, 0]).astype(np.float32)
+    cameras = capture.cameras._replace(position=told)
+    evidence = record.gather(dataclasses.replace(capture, cameras=cameras))
+    assert evidence.moving[~capture.moving].mean() < 0.1
+    assert evidence.moving[capture.moving].mean() > 0.5
 
 
 def test_moving_neighbours_convince_and_a_lonely_track_is_overruled():

@@ -10,7 +10,6 @@ import pytest
 
 from experiments import cli
 from experiments.ablate import __main__ as ablate
-from experiments.ablate import job as ablate_job
 from experiments.ablate import page as ablate_page
 from experiments.ablate import results, suites
 from experiments.ablate.arms import FIELDS
@@ -42,65 +41,6 @@ def test_arms_differ_from_nerfies_only_in_what_their_name_says():
     for spec in specs.values():
         assert all(getattr(spec, x) == getattr(whole, x) for x in shared)
         assert spec.learning_rate == whole.learning_rate
-
-
-GAUSSIAN = {
-    "sonata": {
-        "no-position": {"motion.position": False},
-        "no-scale": {"motion.scale": False},
-        "no-rotation": {"motion.rotation": False},
-        "mlp": {"motion.network": "mlp"},
-        "no-frequency": {"spectral": None},
-        "no-depth": {"depth": None},
-        "no-neighbours": {"neighbours": None},
-    },
-    "moba": {
-        "no-basis": {"motion.count": None},
-        "no-annealing": {"annealing": None},
-        "no-motion-growth": {"motion_growth": None},
-        "hard-growth": {"motion_growth.form": "hard"},
-        "no-alternation": {"alternation": None},
-        "no-acceleration": {"acceleration": None},
-        "k2": {"motion.count": 2},
-        "k4": {"motion.count": 4},
-        "k16": {"motion.count": 16},
-        "k32": {"motion.count": 32},
-    },
-}
-
-
-def plain(spec, path=""):
-    """The fields of a spec by their dotted names, a removed part as None."""
-    found = {}
-    for field in dataclasses.fields(spec):
-        value = getattr(spec, field.name)
-        if dataclasses.is_dataclass(value):
-            found |= plain(value, f"{path}{field.name}.")
-        else:
-            found[path + field.name] = value
-    return found
-
-
-@pytest.mark.parametrize("suite", GAUSSIAN)
-@pytest.mark.parametrize("steps", [ablate_job.PILOT_STEPS, 3000])
-def test_arms_of_a_paper_differ_from_the_whole_only_in_what_their_name_says(
-    suite, steps
-):
-    job = types.SimpleNamespace(suite=suites.named(suite), args=Ablate())
-    specs = {name: Job.spec(job, name, steps) for name in suites.named(suite).arms}
-    assert {spec.steps for spec in specs.values()} == {steps}
-    whole = plain(specs["full"])
-    for name, expected in GAUSSIAN[suite].items():
-        found = plain(specs[name])
-        changed = {key for key in found if found[key] != whole.get(key, "absent")}
-        assert changed == set(expected), name
-        assert {key: found[key] for key in changed} == expected
-        gone = {key.split(".")[0] for key in whole.keys() - found.keys()}
-        assert gone == {key for key, value in expected.items() if value is None} - {
-            "motion.count"
-        }
-    assert set(specs) == {"full", "deformable", "static", *GAUSSIAN[suite]}
-    assert (specs["static"].motion, specs["deformable"].motion is None) == (None, False)
 
 
 @pytest.fixture

@@ -1,28 +1,17 @@
 """The ablation's picture."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
 from experiments.ablate import picture as ablate_picture
-from nerfies_jax.capture import synthetic
-from nerfies_jax.evaluation import protocol
 from tests import scenes
 
 SHIFT = np.float32([0.012, 0.0, 0.016])  # 0.02 long
 
 
-@pytest.fixture(scope="module")
-def filmed():
-    film = dataclasses.replace(scenes.TINY_FILM, heldout_every=2)
-    capture, truth = synthetic.make(film)
-    return capture, truth, protocol.ground_truth(capture, truth, 2, 5)
-
-
 @pytest.mark.full
-def test_the_picture_shows_how_far_points_are_from_where_they_should_be(filmed):
-    capture, _, known = filmed
+def test_the_picture_shows_how_far_points_are_from_where_they_should_be():
+    capture, _, known = scenes.tiny_tracks()
     shown = ablate_picture.shown_row(known, capture)
     row = known.rows[shown]
     colour = {"a": capture.images[row]}

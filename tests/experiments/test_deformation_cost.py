@@ -13,11 +13,9 @@ from experiments.deformation_cost import arms, knot_curve, known_motion
 from experiments.deformation_cost import page as deformation_page
 from gaussians_jax.effects import deformation, kan_motion
 from gaussians_jax.effects.kan_motion import KanMotionSpec
-from gaussians_jax.effects.mlp_motion import MotionSpec
 from gaussians_jax.splats import Gaussians
 from nerfies_jax.capture import images
 from nerfies_jax.measure import clock
-from nerfies_jax.nets.encoding import EncodingSpec
 from tests import scenes
 
 
@@ -100,25 +98,6 @@ def test_a_motion_that_is_none_is_refused():
     still = motion._replace(deform=lambda time: motion.deform(jnp.zeros(())))
     with pytest.raises(ValueError, match="swing: nothing moves"):
         knot_curve.curve(still, (4,), 0.0, 1)
-
-
-@pytest.mark.slow
-def test_the_network_learns_the_motion():
-    spec = MotionSpec(
-        position=EncodingSpec(3), time=EncodingSpec(3), depth=2, width=32, skips=()
-    )
-    motion = known_motion.fitted(200, spec, 300)
-    rest = known_motion.ball_and_wall(200).mean
-    errors, ways = [], []
-    for time in (0.1, 0.4, 0.8):
-        deformed = motion.deform(jnp.asarray(time))
-        exact = known_motion.analytic(rest, jnp.asarray(time)).mean
-        errors.append(np.square(deformed.mean - rest - exact).mean())
-        ways.append(np.square(exact).mean())
-    assert np.sqrt(np.mean(errors) / np.mean(ways)) < 0.5
-    first, later = (motion.draw(motion.deform(t), t) for t in jnp.asarray([0.2, 0.7]))
-    assert first.shape == (120, 160, 3)
-    assert np.abs(first - later).max() > 0.1
 
 
 def test_a_run_of_fields_has_no_motion_to_tabulate():

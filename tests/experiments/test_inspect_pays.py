@@ -3,12 +3,10 @@
 import itertools
 import json
 import math
-import pathlib
 
 import pytest
 
 from experiments.ablate import pool, results
-from experiments.ablate import settings as ablate
 from experiments.ablate.arms import Arm
 from experiments.inspect_pays import __main__ as inspect_pays
 from experiments.inspect_pays import arms as inspect_arms
@@ -192,21 +190,6 @@ def test_a_preset_that_needs_what_is_not_there_is_left_out(
     (one,) = trial.rows()
     assert "background=none" in one.refused
     assert report.verdict(one) == "yes: the preset cannot be built"
-
-
-def test_a_process_can_take_the_settings_of_what_is_trained(
-    film, tmp_path, looked, monkeypatch
-):
-    jobs = []
-    monkeypatch.setattr(pool, "run", lambda job: jobs.append(job) or [])
-    args = inspect_pays.InspectPays(out=tmp_path, heldout="3", steps=7)
-    Trial(args, *read(args, film)).run()
-    name = "nerf-small+appearance.width=4"
-    ablate.check(jobs[0].args)
-    (jobs[0].out / "logs").mkdir()
-    taken = json.loads(pathlib.Path(pool.command(jobs[0], name, 0)[-1]).read_text())
-    assert (taken["suite"], taken["arms"], taken["seed"]) == ("advice", [name], 0)
-    assert taken["source"]["capture"] == str(film)
 
 
 def test_a_capture_without_held_out_frames_is_refused(tmp_path, monkeypatch):

@@ -24,6 +24,7 @@ FLOORS = {
     "nerfies_jax.field": 8,
     "nerfies_jax.scene": 8,
     "nerfies_jax.held_out_codes": 8,
+    "nerfies_jax.path_fit": 8,
     "nerfies_jax.point_tracks": 8,
     "nerfies_jax.step_time": 8,
     "nerfies_jax.variants": 8,

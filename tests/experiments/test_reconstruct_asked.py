@@ -1,15 +1,13 @@
 """What the main job is asked: wrong input, other settings, commands to paste."""
 
-import json
 import re
 import shlex
 
-import numpy as np
 import pytest
 
 from experiments import cli, reconstruct
 from nerfies_jax import runs
-from nerfies_jax.capture import images, nerfies_format
+from nerfies_jax.capture import nerfies_format
 from nerfies_jax.runs import (
     commands,
     platform,
@@ -39,70 +37,12 @@ def refused(capsys, *arguments):
     return line
 
 
-def edit(path, **values):
-    stored = json.loads(path.read_text())
-    path.write_text(json.dumps(stored | values))
-
-
-def one_picture(filmed):
-    return sorted((filmed / "rgb").rglob("*.png"))[0]
-
-
-def damage(filmed, kind):
-    """Break a capture in one way; returns words that the error must hold."""
-    picture = one_picture(filmed)
-    camera = filmed / "camera" / f"{picture.stem}.json"
-    if kind == "missing picture":
-        picture.unlink()
-    elif kind == "truncated picture":
-        picture.write_bytes(picture.read_bytes()[:200])
-    elif kind == "picture of another size":
-        images.write_png(picture, np.zeros((20, 33, 3), np.uint8))
-    elif kind == "camera that is not a number":
-        camera.write_text(camera.read_text().replace("focal_length", "focal_lenght"))
-    elif kind == "camera with NaN":
-        edit(camera, position=[float("nan"), 0.0, 0.0])
-    elif kind == "id out of range":
-        path = filmed / "metadata.json"
-        table = json.loads(path.read_text())
-        table[picture.stem]["warp_id"] = -3
-        path.write_text(json.dumps(table))
-    elif kind == "a single frame":
-        edit(
-            filmed / "dataset.json",
-            ids=[picture.stem],
-            train_ids=[picture.stem],
-            val_ids=[],
-            count=1,
-            num_exemplars=1,
-        )
-    return picture.stem
-
-
-@pytest.mark.parametrize(
-    "kind",
-    [
-        "missing picture",
-        "truncated picture",
-        "picture of another size",
-        "camera that is not a number",
-        "camera with NaN",
-        "id out of range",
-        "a single frame",
-    ],
-)
-def test_a_broken_capture_is_refused_by_name(kind, filmed, tmp_path, capsys):
-    stem = damage(filmed, kind)
+def test_a_broken_capture_is_refused_by_name(filmed, tmp_path, capsys):
+    camera = min((filmed / "camera").iterdir())
+    camera.write_text(camera.read_text().replace("focal_length", "focal_lenght"))
     line = refused(capsys, filmed, "--out", tmp_path / "run")
-    assert str(filmed) in line or stem in line
+    assert str(camera) in line
     assert not (tmp_path / "run").exists()
-
-
-def test_a_folder_that_is_no_capture_says_what_was_looked_for(tmp_path, capsys):
-    line = refused(capsys, tmp_path, "--out", tmp_path / "run")
-    assert "scene.json" in line
-    assert "transforms" in line
-    assert "cameras.bin" in line
 
 
 @pytest.mark.parametrize(
@@ -132,7 +72,7 @@ def started(folder, config):
     """A run folder with its settings and nothing else."""
     kind = representations.of_preset(config.preset)
     spec = runs.scene_spec(config)
-    runs.save_config(folder, runs.Run(config, None, kind, spec, None, None))
+    runs.save_config(folder, runs.Run(config, None, None, kind, spec, None, None))
 
 
 @pytest.mark.parametrize(

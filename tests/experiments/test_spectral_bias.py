@@ -6,7 +6,6 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 
 from experiments.spectral_bias import __main__ as spectral_bias
@@ -41,22 +40,6 @@ def test_planted_errors_are_found_at_their_frequencies(label):
     assert report.other(row) == pytest.approx(0.02**0.5, rel=1e-4)
 
 
-@pytest.mark.parametrize("label", LABELS)
-def test_nothing_learnt_misses_everything_and_the_signal_has_unit_power(label):
-    signal = spectral_bias.SIGNALS[label]
-    rmse, missing = errors(lambda x: 0 * x[:, 0], signal)
-    assert float(rmse) == pytest.approx(1, rel=1e-5)
-    np.testing.assert_allclose(missing, 1, rtol=1e-5)
-    point = np.array([0.3, -0.2][: signal.waves.shape[1]])
-    by_hand = sum(
-        math.sqrt(2 / len(signal.waves))
-        * math.sin(math.pi * float(wave @ point) + phase)
-        for wave, phase in zip(signal.waves, signal.phase, strict=True)
-    )
-    got = jax.jit(lambda x: signal(x))(np.float32(point[None]))
-    np.testing.assert_allclose(got, [by_hand], atol=1e-5)
-
-
 @pytest.mark.parametrize("label", ["1-D", "2-D"])
 @pytest.mark.parametrize("kind", spectral_bias.KINDS)
 @pytest.mark.parametrize("encoded", [False, True])
@@ -86,44 +69,6 @@ def test_sine_networks_start_as_the_paper_says():
     # What the paper designs for: values of every layer spread alike.
     points = jax.random.uniform(jax.random.key(1), (500, 2), minval=-1, maxval=1)
     assert 0.1 < float(jnp.std(made.apply(params, points))) < 2
-
-
-@pytest.mark.full
-def test_training_is_adam_along_a_cosine_from_points_of_its_own():
-    made = spectral_bias.network("relu", False, SMALL)
-    train = jax.jit(spectral_bias.trainer(made, SMALL, 16))
-    key, rate, steps = jax.random.key(5), 1e-2, 4
-    with jax.numpy_dtype_promotion("standard"):
-        keys = jnp.stack([key, key, jax.random.key(6)])
-        params, loss = train(keys, jnp.array([rate, 1e-3, rate]), jnp.asarray(steps))
-
-        by_hand = made.init(key)
-        rule = optax.adam(optax.cosine_decay_schedule(rate, steps))
-        memory = rule.init(by_hand)
-
-        @jax.jit
-        def one(params, memory, step):
-            points = jax.random.uniform(
-                jax.random.fold_in(key, step), (16, 1), minval=-1, maxval=1
-            )
-            value, grad = jax.value_and_grad(
-                lambda params: jnp.mean(
-                    (made.apply(params, points) - SMALL(points)) ** 2
-                )
-            )(params)
-            change, memory = rule.update(grad, memory)
-            return optax.apply_updates(params, change), memory, value
-
-        for step in range(steps):
-            by_hand, memory, value = one(by_hand, memory, jnp.asarray(step))
-    trained, exact = jax.tree.leaves(params), jax.tree.leaves(by_hand)
-    for got, expected in zip(trained, exact, strict=True):
-        np.testing.assert_allclose(got[0], expected, atol=1e-6)
-    weight = np.asarray(params.hidden[1].weight)
-    for other in (1, 2):  # another rate, another key
-        assert np.abs(weight[0] - weight[other]).max() > 1e-3
-    # In a run this short, 50 / 53 of the mean is the last loss.
-    assert float(loss[0]) == pytest.approx(float(value), rel=0.2)
 
 
 @pytest.mark.full

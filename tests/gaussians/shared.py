@@ -56,6 +56,15 @@ def rows_of(gaussians, opacity_logit=0.0, rest=0):
     return put(Splats(*leaves), mean.dtype)
 
 
+def rows_and_nets(count, dtype="float32"):
+    """Parameters of each kind, and a weight matrix with as many rows as Gaussians."""
+    rng = np.random.default_rng(0)
+    shapes = (count, 3), (count, 3), (count, 4), (count,), (count, 1, 3), (count, 3, 3)
+    rows = Splats(*(rng.normal(size=shape) for shape in shapes))
+    code, weight = (rng.normal(size=(count, n)) for n in (2, 5))
+    return put(Params({"splats": rows, "code": code}, {"w": weight}), dtype)
+
+
 def with_rows(params, **leaves):
     """The same parameters with leaves of their splats replaced."""
     splats = params.rows["splats"]._replace(**leaves)

@@ -180,23 +180,6 @@ def test_the_effect_is_the_mean_over_the_rows_it_draws(time, dtype):
     assert terms["still"].weight is None
 
 
-def test_gradients_of_the_effect(float64):
-    """Through a motion whose displacement, and so the weight, is held at `now`."""
-    spec = AccelerationSpec(decay=1e6)  # the weight is 1 to 1e-8
-    params = scene(dtype="float64")
-    effect = acceleration.effect(spec, 1.0, 11)
-    condition = FrameCondition(put(0.4), step=put(0), key=jax.random.key(0))
-
-    def total(amplitude):
-        swung = params._replace(rows=params.rows | {"amplitude": amplitude})
-        context = PenaltyContext(
-            condition, condition.step, None, swung, at_time=swinging
-        )
-        return 1e14 * effect.penalty(None, context)["unrest"].value
-
-    assert gradients.directional_error(total, params.rows["amplitude"]) < 1e-6
-
-
 @pytest.mark.hard_cases
 def test_without_active_rows_there_is_nothing(dtype):
     terms = ask(AccelerationSpec(), scene(active=np.zeros(12, bool), dtype=dtype), 0.4)

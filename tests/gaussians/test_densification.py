@@ -179,18 +179,6 @@ def test_the_cap_takes_the_largest_gradients_and_says_who_was_refused():
     assert again.report == densification.Report(refused=1, active=8, capacity=8)
 
 
-@pytest.mark.full
-def test_capacity_grows_in_buckets_and_does_not_waver():
-    params, moments, stats = make(200)
-    changed = run(params, moments, hot(stats, np.arange(100)))
-    assert changed.report.capacity == 512
-    stats = changed.stats._replace(active=put(np.arange(512) < 240))
-    changed = run(*changed[:2], stats)
-    assert changed.report.capacity == 512  # 256 would do
-    stats = changed.stats._replace(active=put(np.arange(512) < 200))
-    assert run(*changed[:2], stats).report.capacity == 256
-
-
 def test_a_revised_clone_and_its_source_hide_what_one_did(dtype):
     params, moments, stats = make(dtype=dtype, opacity=0.8)
     changed = run(
@@ -200,24 +188,6 @@ def test_a_revised_clone_and_its_source_hide_what_one_did(dtype):
     half = 1 - math.sqrt(0.2)
     expected = [0.8, half, *[0.8] * 4, half]
     np.testing.assert_allclose(1 / (1 + np.exp(-logit)), expected, rtol=1e-6)
-
-
-halve_opacity = jax.jit(densification.halve_opacity)
-
-
-@pytest.mark.hard_cases
-def test_halved_opacity_is_right_where_the_opacity_saturates(dtype):
-    mpmath = pytest.importorskip("mpmath")
-    logits = np.asarray([-30.0, -1.0, 0.0, 8.0, 17.0, 40.0, 100.0], dtype)
-    exact = []
-    with mpmath.workdps(120):
-        for logit in logits:
-            clear = 1 / (1 + mpmath.exp(mpmath.mpf(float(logit))))
-            half = mpmath.log((1 - mpmath.sqrt(clear)) / mpmath.sqrt(clear))
-            exact.append(float(half))
-    tolerance = {"float32": 2e-6, "float64": 1e-14}[dtype]
-    error = np.abs(halve_opacity(logits) - np.asarray(exact))
-    assert (error < tolerance * np.maximum(1, np.abs(exact))).all()
 
 
 def test_a_reset_lowers_opacities_and_forgets_their_moments_only(dtype):

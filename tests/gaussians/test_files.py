@@ -9,8 +9,8 @@ import numpy as np
 import plyfile
 import pytest
 
-from gaussians_jax import files, harmonics, spz
-from gaussians_jax.splats import INACTIVE_LOGIT, Splats
+from gaussians_jax import files, harmonics, model_file, spz
+from gaussians_jax.splats import INACTIVE_LOGIT, Params, Splats
 from tests.gaussians.shared import full, put, rotations, same_bits
 
 
@@ -371,3 +371,28 @@ def test_saturated_zero_and_extreme_rows_survive_every_format(tmp_path):
         back = files.load(tmp_path / f"a{suffix}").splats
         np.testing.assert_allclose(*opacities(back), [1, 0, 0.5, 1], atol=2.1e-3)
         assert all(np.isfinite(leaf).all() for leaf in back)
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("suffix", [*files.SUFFIXES, ".npz"])
+def test_a_row_of_nan_opacity_is_refused_and_not_taken_for_inactive(suffix, tmp_path):
+    path = tmp_path / f"a{suffix}"
+    broken = edited(some_splats(), opacity_logit=(1, np.nan))
+    save, what = files.save, (broken,)
+    if suffix == ".npz":
+        save, what = model_file.save, (Params({"splats": broken}, {}), {})
+    with pytest.raises(ValueError, match="opacity_logit"):
+        save(path, *what)
+    assert not path.exists()
+
+
+@pytest.mark.hard_cases
+def test_the_largest_harmonics_are_held_and_do_not_overflow(tmp_path):
+    """Above 2e36 scaling them in float32 overflowed, which warnings make an error."""
+    size = float(np.finfo(np.float32).max) * np.array([1.0, -1.0, 0.0])
+    rows = edited(some_splats(), sh_dc=(..., size), sh_rest=(..., size))
+    files.save(tmp_path / "a.spz", rows, spz_version=3)
+    found = files.load(tmp_path / "a.spz").splats
+    ends = np.array([127.5, -127.5]) / 255 / 0.15
+    np.testing.assert_allclose(found.sh_dc[0, 0, :2], ends, atol=0.5001 / 255 / 0.15)
+    assert np.all(np.abs(found.sh_rest[..., :2]) >= 1 - 8 / 128)

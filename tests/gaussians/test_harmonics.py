@@ -43,19 +43,6 @@ def value_and_jacobian(offset):
 
 
 @pytest.mark.hard_cases
-@pytest.mark.parametrize("length", [1e-30, 1e-3, 1.0, 1e30, 3e38])
-def test_unit_direction_keeps_its_digits_at_any_length(length, dtype):
-    direction = np.array([0.36, -0.48, 0.8])
-    found, jacobian = value_and_jacobian((direction * length).astype(dtype))
-    grad = np.asarray(jacobian, np.float64)[:, 0] * length
-    tolerance = {"float32": 3e-7, "float64": 1e-15}[dtype]
-    np.testing.assert_allclose(found, direction, atol=tolerance)
-    expected = np.array([1, 0, 0]) - direction * direction[0]  # (I - d d^t) e_x
-    flushed = length * float(np.finfo(dtype).tiny)  # slopes are 1 / length
-    np.testing.assert_allclose(grad, expected, atol=2 * tolerance + flushed)
-
-
-@pytest.mark.hard_cases
 def test_zero_direction_looks_along_z_and_has_no_gradient(dtype):
     value, jacobian = value_and_jacobian(np.zeros(3, dtype))
     np.testing.assert_array_equal(value, [0, 0, 1])

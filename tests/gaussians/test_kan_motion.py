@@ -18,7 +18,6 @@ from tests.gaussians.motions import FRAMES, MOTIONS, deformed, read_by, strong
 from tests.gaussians.motions import KAN as SMALL
 from tests.gaussians.shared import (
     any_nonzero,
-    close,
     finite,
     full,
     jitted,
@@ -50,18 +49,6 @@ def test_offsets_are_those_of_the_whole_network(spec, dtype):
             ours = getattr(offsets, name)
             assert ours.dtype == dtype
             np.testing.assert_allclose(ours, value, atol=tolerance)
-
-
-@NETWORKS
-@pytest.mark.full
-def test_prepared_once_is_prepared_every_time(spec, dtype):
-    params, codes = strong("kan", spec, dtype), read_by("kan", 11, dtype)
-    prepared = jitted(kan_motion.prepare, static_argnums=1)(params, spec, codes)
-    deform = jitted(kan_motion.deform, static_argnums=1)
-    for time in np.asarray([0.0, 0.61], dtype):
-        cached = deform(params, spec, time, prepared)
-        fresh = uncached(params, spec, codes, time)
-        close(cached, fresh, {"float32": 1e-6, "float64": 1e-15}[dtype], least=1e-30)
 
 
 @pytest.mark.parametrize("off", ["position", "scale", "rotation"])

@@ -262,23 +262,6 @@ def test_a_moving_scene_grows_to_the_cap_and_resumes_bit_for_bit(tmp_path):
 
 
 @pytest.mark.full
-def test_an_event_of_a_scene_leaves_no_faint_row():
-    model, state, frames = built(SCENE)
-    splats = jax.tree.map(np.asarray, state.params.rows["splats"])
-    active = splats.opacity_logit != rows.INACTIVE_LOGIT
-    faint = active & (np.arange(len(splats.mean)) % 3 == 0)
-    logit = put(np.where(faint, -9.0, splats.opacity_logit), "float32")
-    state = state._replace(params=with_rows(state.params, opacity_logit=logit))
-    (event,) = model.events
-    assert event.steps == (4, 8, 12, 16, 20, 24, 28)
-    after = event.apply(state, frames).params.rows["splats"]
-    shown = np.asarray(rows.active_mask(after))
-    assert shown.sum() == 210
-    seen, placed = splats.mean[active & ~faint], np.asarray(after.mean)[shown]
-    assert {*map(bytes, placed)} <= {*map(bytes, seen)}
-
-
-@pytest.mark.full
 def test_a_step_shakes_the_means_and_nothing_else():
     spec = dataclasses.replace(SCENE, alternation=AlternationSpec(1, 3, nets=1))
 

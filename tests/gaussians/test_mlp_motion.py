@@ -17,6 +17,7 @@ from tests import gradients
 from tests.gaussians.motions import MLP as SMALL
 from tests.gaussians.motions import deformed, strong
 from tests.gaussians.shared import finite, full, jitted, put, some_gaussians
+from tests.oracles import networks
 
 
 def reference_case(oracle_dir, name, dtype):
@@ -82,25 +83,13 @@ def test_the_time_part_may_be_summed_once(float64):
     spec = dataclasses.replace(SMALL, time_code=5)
     params = jax.tree.map(np.asarray, strong("mlp", spec))
     mean, time = some_gaussians(6).mean, 0.7
-    t = np.array(
-        [time, *np.ravel([[np.sin(k * time), np.cos(k * time)] for k in (1, 2)])]
-    )
-    (first,), code = params.time.hidden, params.time.heads["code"]
-    t = np.maximum(t @ first.weight + first.bias, 0) @ code.weight + code.bias
-    x = np.asarray(mean)
-    x = np.concatenate(
-        [x] + [f(2**k * x) for k in range(3) for f in (np.sin, np.cos)], 1
-    )
-    inputs = np.concatenate([x, np.tile(t, (6, 1))], axis=1)
-    hidden = inputs
-    for index, layer in enumerate(params.trunk.hidden):
-        if index == 2:
-            hidden = np.concatenate([hidden, inputs], axis=1)
-        hidden = np.maximum(hidden @ layer.weight + layer.bias, 0)
+    code = networks.heads(params.time, networks.waves(spec.time, time))["code"]
     offsets = deformed["mlp"](params, spec, mean, time)
-    for name, head in params.trunk.heads.items():
-        expected = hidden @ head.weight + head.bias
-        np.testing.assert_allclose(getattr(offsets, name), expected, atol=1e-13)
+    for row, point in enumerate(mean):
+        inputs = np.concatenate([networks.waves(spec.position, point), code])
+        for name, exact in networks.heads(params.trunk, inputs, spec.skips).items():
+            found = getattr(offsets, name)[row]
+            np.testing.assert_allclose(found, exact, atol=1e-13)
 
 
 @pytest.mark.parametrize("rule", ["log", *full("linear")])
@@ -165,16 +154,3 @@ def test_smoothing_fades_linearly_and_then_leaves_the_time_alone(dtype):
     np.testing.assert_allclose(later.std(), 0.1 / 50 / 4, rtol=0.05)
     assert not last.any()
     assert not after.any()
-
-
-@pytest.mark.full
-def test_motion_sets_in_smoothly(dtype):
-    @jitted
-    def first_offsets(mean, time):
-        params = mlp_motion.init(jax.random.key(0), MotionSpec(), jnp.dtype(dtype))
-        return mlp_motion.deform(params, MotionSpec(), mean, time)
-
-    mean = some_gaussians(50, dtype).mean
-    offsets = first_offsets(mean, np.asarray(0.5, dtype))
-    assert 0 < max(np.abs(leaf).max() for leaf in offsets) < 5e-3
-    assert {leaf.dtype.name for leaf in offsets} == {dtype}

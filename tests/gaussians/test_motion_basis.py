@@ -14,47 +14,33 @@ from nerfies_jax.measure import clock
 from tests.gaussians.motions import BASIS as SMALL
 from tests.gaussians.motions import MOTIONS, deformed, strong
 from tests.gaussians.shared import finite, full, jitted, some_gaussians
+from tests.oracles import networks
 
 RESIDUAL = dataclasses.replace(SMALL, count=None)
 
 
 uncached = deformed["basis"]
-prepare = jitted(motion_basis.prepare, static_argnums=1)
-deform = jitted(motion_basis.deform, static_argnums=1)
 
 
 # Equations 3 to 6 in NumPy, one Gaussian at a time.
 
 
-def features(values, bands):
-    waves = [f(2**k * values) for k in range(bands) for f in (np.sin, np.cos)]
-    return np.concatenate([values, *waves])
-
-
-def network(params, inputs, skips=()):
-    hidden = inputs
-    for index, layer in enumerate(params.hidden):
-        if index in skips:
-            hidden = np.concatenate([hidden, inputs])
-        hidden = hidden @ np.asarray(layer.weight) + np.asarray(layer.bias)
-        hidden = hidden / (1 + np.exp(-hidden))
-    return {
-        name: hidden @ np.asarray(head.weight) + np.asarray(head.bias)
-        for name, head in params.heads.items()
-    }
+def silu(x):
+    return x / (1 + np.exp(-x))
 
 
 def by_the_book(params, spec, point, time):
-    p, t = np.asarray(point), np.asarray([time])
-    slow = network(
-        params.base,
-        np.concatenate([features(p, spec.position.bands), features(t, 1)]),
-    )["mean"]
-    inputs = [features(p + slow, spec.position.bands), features(t, spec.time.bands)]
-    found = network(params.weights, np.concatenate(inputs), spec.skips)
+    placed = networks.waves(spec.position, point)
+    base = np.concatenate([placed, networks.waves(spec.base_time, time)])
+    slow = networks.heads(params.base, base, activation=silu)["mean"]
+    inputs = [networks.waves(spec.position, point + slow)]
+    inputs.append(networks.waves(spec.time, time))
+    found = networks.heads(
+        params.weights, np.concatenate(inputs), spec.skips, activation=silu
+    )
     if spec.count is None:
         return slow + found["weights"], found["turn"], found["log_scale"]
-    raw = network(params.basis, features(p, spec.position.bands))["directions"]
+    raw = networks.heads(params.basis, placed, activation=silu)["directions"]
     residual = np.zeros(3)
     for k, direction in enumerate(raw.reshape(3, spec.count).T):
         if spec.basis_form == "bounded":
@@ -78,23 +64,6 @@ def test_offsets_are_those_of_the_equations(spec, dtype):
             tolerance = {"float32": 2e-5, "float64": 1e-13}[dtype]
             np.testing.assert_allclose(ours[row], theirs, atol=tolerance)
     assert {leaf.dtype.name for leaf in offsets} == {dtype}
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("spec", [SMALL, RESIDUAL])
-def test_prepared_ahead_or_in_the_step_is_the_same(spec, dtype):
-    params = strong("basis", spec, dtype)
-    mean = some_gaussians(17, dtype).mean
-    ahead = prepare(params, spec, mean)
-    for time in np.asarray([0.0, 0.4, 1.0], dtype):
-        for ours, theirs in zip(
-            deform(params, spec, mean, time, ahead),
-            uncached(params, spec, mean, time),
-            strict=True,
-        ):
-            # Rounding only: the two programs may fuse sums differently.
-            tolerance = {"float32": 1e-6, "float64": 1e-15}[dtype]
-            np.testing.assert_allclose(ours, theirs, atol=tolerance, rtol=tolerance)
 
 
 @jax.jit

@@ -13,7 +13,7 @@ from gaussians_jax.raster_spec import GSPLAT
 from gaussians_jax.splats import Gaussians
 from nerfies_jax.geometry.camera import Camera
 from tests import gradients
-from tests.gaussians.shared import finite, full, jitted, put
+from tests.gaussians.shared import finite, jitted, put
 from tests.oracles import dense_splats
 
 SIZE = (64, 48)
@@ -114,49 +114,6 @@ def projected(gaussians, camera):
     return jax.tree.map(lambda leaf: leaf[:count], found)
 
 
-@pytest.mark.hard_cases
-@pytest.mark.parametrize("length_px", [10_000, *full(100, 1000, 3000)])
-@pytest.mark.parametrize("angle", [0.0, 1e-4, 0.785398, *full(0.3, 1.5707963)])
-def test_needles_keep_their_shape(length_px, angle, dtype, rng):
-    focal, depth = 60.0, 2.0
-    scale = np.array([length_px, 0.02, 0.02]) * depth / focal
-    quaternion = [np.cos(angle / 2), 0, 0, np.sin(angle / 2)]
-    camera = camera_at([0.0, 0.0, 0.0], dtype, turn=0.0, skew=0.0, focal=focal)
-    camera = camera._replace(pixel_aspect=np.asarray(1.0, dtype))
-    gaussians = one(dtype, (0, 0, depth), quaternion, scale)
-    found = projected(gaussians, camera)
-    # Pixels along the needle inside an image of 1000 px and up to 3 px beside it.
-    along, across = rng.uniform(-500, 500, 500), rng.uniform(-3, 3, 500)
-    # The exact axis of the stored quaternion, not of the angle it was made from.
-    w, _, _, z = np.asarray(gaussians.quaternion, np.float64)[0]
-    length = w * w + z * z
-    axis = np.array([w * w - z * z, 2 * w * z]) / length
-    dx = (along * axis[0] - across * axis[1]).astype(dtype)
-    dy = (along * axis[1] + across * axis[0]).astype(dtype)
-    a, b = np.asarray(gaussians.scale, np.float64)[0, :2] * focal / depth
-    exact_along = (dx.astype(float) * axis[0] + dy.astype(float) * axis[1]) ** 2
-    exact_across = (dy.astype(float) * axis[0] - dx.astype(float) * axis[1]) ** 2
-    exact = np.exp(
-        -exact_along / (2 * (a * a + 0.3)) - exact_across / (2 * (b * b + 0.3))
-    )
-    p, k, r = found.whitening[0]
-    value = np.exp(-((p * dx) ** 2) - (r * (dy - k * dx)) ** 2)
-    assert float(value.max()) <= 1
-    # dy - k dx cancels: a few ulps of 500 px over a width of 0.55 px.
-    tolerance = {"float32": 3e-4, "float64": 1e-11}[dtype]
-    assert np.abs(value - exact).max() < tolerance
-
-
-@pytest.mark.hard_cases
-def test_an_explicit_conic_would_lose_a_needle():
-    """The form not used: negative exponents in float32, so the tests above can fail."""
-    a, b = np.float32(1e8 * 0.5), np.float32(1e8 * 0.5)
-    covariance = np.array([[a + np.float32(0.3), b], [b, a + np.float32(0.3)]])
-    with np.errstate(all="ignore"):
-        det = covariance[0, 0] * covariance[1, 1] - covariance[0, 1] ** 2
-    assert not 0.9 < det / 0.6e8 < 1.1
-
-
 HOPELESS = {
     "z zero": dict(mean=(0.1, 0.1, 0.0)),
     "z 1e-30": dict(mean=(0.1, 0.1, 1e-30)),
@@ -226,35 +183,8 @@ def footprint_and_slopes(gaussians, camera):
 
 
 @pytest.mark.hard_cases
-def test_means_far_from_the_origin_keep_their_pixels(dtype, rng):
-    position = np.array([1e4, -1e4, 1e4])
-    mean = np.float32(position + [0.25, -0.5, 2.0] + rng.normal(size=(ROWS, 3)) * 0.2)
-    count = len(mean)
-    gaussians = some_gaussians(rng, count, dtype)._replace(mean=mean.astype(dtype))
-    camera = camera_at(position, dtype, turn=0.0, skew=0.0)
-    found = projected(gaussians, camera)
-    here = mean.astype(np.float64) - position  # exact in both: the inputs are float32
-    expected = np.array([60.0, 72.0]) * here[:, :2] / here[:, 2:] + [29.0, 27.0]
-    tolerance = {"float32": 1e-4, "float64": 1e-11}[dtype]
-    assert np.abs(found.mean_px - expected).max() < tolerance
-
-
-@pytest.mark.hard_cases
 def test_edge_on_disc_keeps_the_least_compensation(dtype):
     gaussians = one(dtype, scale=(0.0, 1.0, 1.0), opacity=1.0)
     camera = camera_at([0.0, 0.0, 0.0], dtype, turn=0.0)
     _, found, _ = footprint_and_slopes(gaussians, camera)
     np.testing.assert_allclose(found.opacity, [0.005], rtol=1e-6)
-
-
-@pytest.mark.hard_cases
-def test_the_jacobian_is_clamped_beside_the_image(dtype):
-    """Unclamped, a ball at 89 degrees would smear over 1e5 px."""
-    gaussians = one(dtype, mean=(50.0, 0.0, 0.5))
-    camera = camera_at([0.0, 0.0, 0.0], dtype, turn=0.0)
-    found = projected(gaussians, camera)
-    # sigma 0.1 at z 0.5, tangent at most (64 - 29)/60 + 0.3 * 32/60
-    tangent = (64 - 29 + 0.3 * 32) / 60
-    expected = np.sqrt((60 * 0.1 / 0.5) ** 2 * (1 + tangent**2) + 0.3)
-    sigma = 1 / (np.sqrt(2) * float(found.whitening[0, 0]))
-    assert abs(sigma - expected) < 0.5  # the skew of 2 px adds the rest

@@ -132,28 +132,3 @@ def test_render_gradient_equals_central_differences(float64, rng):
         return jnp.sum(picture.colour * toward) + jnp.sum(picture.depth)
 
     assert gradients.directional_error(loss, gaussians, colours) < 1e-6
-
-
-@pytest.mark.full
-def test_a_depth_that_is_not_asked_for_changes_nothing_else(rng):
-    size = (14, 12)
-    gaussians = make_gaussians(rng, 6, "float32")
-    camera = make_camera("float32", size)
-    colours, features = (put(rng.uniform(size=(6, n)), "float32") for n in (3, 2))
-
-    def draw(depth):
-        return jax.jit(
-            lambda *scene: rendering.render(
-                *scene, camera, size, features=features, depth=depth
-            )
-        )(gaussians, colours)
-
-    blind, seeing = draw(False), draw(True)
-    assert blind.rendering.depth is None
-    for one, other in (
-        (blind.rendering.colour, seeing.rendering.colour),
-        (blind.rendering.alpha, seeing.rendering.alpha),
-        (blind.features, seeing.features),
-    ):
-        # Two programs: the compiler may order their sums otherwise.
-        np.testing.assert_allclose(one, other, atol=1e-6)

@@ -1,6 +1,5 @@
 """Haar pyramid, Fourier amplitudes, gates: matrices, np.fft and hard cases."""
 
-import dataclasses
 import functools
 import math
 
@@ -149,26 +148,6 @@ def values_and_slopes(render, truth, valid):
         "fourier": lambda x: spectral.fourier_loss(FourierSpec(), x, truth, valid),
     }
     return {name: jax.value_and_grad(form)(render) for name, form in forms.items()}
-
-
-@pytest.mark.hard_cases
-@pytest.mark.parametrize("level", [0.0, 1e-42, *full(1e-20, 0.5)])
-def test_slopes_are_finite_where_amplitudes_vanish(level, dtype, rng):
-    truth = picture(rng, *PATCH, dtype)
-    _, grad = values_and_slopes(np.full_like(truth, level), truth, EVERYWHERE)[
-        "fourier"
-    ]
-    assert np.all(np.isfinite(grad))
-    if level == 0:
-        assert not np.any(grad)
-
-
-@pytest.mark.hard_cases
-def test_slopes_are_zero_where_the_render_is_right(dtype, rng):
-    truth = picture(rng, *PATCH, dtype)
-    for value, grad in values_and_slopes(truth, truth, EVERYWHERE).values():
-        assert float(value) == 0
-        assert not np.any(grad)
 
 
 @pytest.mark.hard_cases
@@ -322,20 +301,3 @@ def test_the_effect_weighs_logs_and_trains_what_its_gate_has(gate, rng):
     np.testing.assert_allclose(metrics["wavelet_weight"], 0.05, rtol=1e-6)
     if learned:
         np.testing.assert_allclose(made.learning_rate(put(5)), 1e-2)
-
-
-@pytest.mark.parametrize("absent", ["wavelet", "fourier"])
-def test_an_absent_loss_has_no_gate_no_metric_and_no_operation(absent, rng):
-    spec = dataclasses.replace(SpectralSpec(), **{absent: None})
-    made, shot = spectral.effect(spec, 10), shot_of(rng)
-    gates = put(made.init(jax.random.key(0)), "float32")
-    assert getattr(gates, absent) is None
-
-    def terms(gates):
-        context = PenaltyContext(None, jnp.int32(1), None, None, observation=shot)
-        return values(made.penalty(gates, context))
-
-    program, found = jax.make_jaxpr(terms, return_shape=True)(gates)
-    other = {"wavelet": "fourier", "fourier": "wavelet"}[absent]
-    assert set(found) == {other, f"{other}_weight"}
-    assert ("fft[" in str(program)) == (absent == "wavelet")

@@ -13,7 +13,7 @@ from gaussians_jax import path_fit, presets, scene, spec, splats, track_start
 from gaussians_jax.effects.se3_bases import SE3BasesSpec
 from gaussians_jax.initialisation import StartSpec
 from gaussians_jax.path_fit import Points
-from nerfies_jax.evidence import record
+from nerfies_jax.evidence import record, usable_paths
 from tests.evidence import films
 from tests.evidence.test_tracks import MOVES
 from tests.gradients import directional_error
@@ -153,7 +153,7 @@ def small_scene(**changes):
 
 def test_a_scene_starts_from_the_evidence(tmp_path, monkeypatch):
     capture, evidence = film_and_evidence()
-    monkeypatch.setattr(scene, "CACHE", tmp_path)
+    monkeypatch.setattr(usable_paths, "CACHE", tmp_path)
     record.save(tmp_path / "evidence" / f"{record.digest(capture)}.npz", evidence)
     start = StartSpec(motion="tracks", moving_points=150, fit_steps=100)
     spec_ = small_scene(start=start)
@@ -171,7 +171,7 @@ def test_a_scene_starts_from_the_evidence(tmp_path, monkeypatch):
 
 
 def test_a_film_without_tracks_starts_from_rest_and_says_why(tmp_path, monkeypatch):
-    monkeypatch.setattr(scene, "CACHE", tmp_path)
+    monkeypatch.setattr(usable_paths, "CACHE", tmp_path)
     capture = films.film(card=lambda time: (0.1, 0.0), frames=8)
     model = scene.build(
         small_scene(start=StartSpec(motion="tracks")), scene.metadata_of(capture)
@@ -185,7 +185,7 @@ def test_a_film_without_tracks_starts_from_rest_and_says_why(tmp_path, monkeypat
     [
         ({"motion": "flow"}, "unknown motion"),
         ({"moving_points": 0}, "at least one moving point"),
-        ({"fit_steps": 0}, "at least one moving point"),
+        ({"fit_steps": 0}, "at least one step"),
         ({"fit_rate": 0.0}, "must be positive"),
     ],
 )

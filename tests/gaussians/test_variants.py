@@ -72,21 +72,6 @@ def test_a_motion_from_knots_is_met_at_the_knots_and_near_between(swaying):
     assert 0.2 > errors[0] > errors[1] > 5e-3 > errors[2]
 
 
-@pytest.mark.full
-def test_a_faster_model_draws_what_the_model_draws(swaying):
-    model, state = swaying
-    view = evaluation.view_of(scenes.tiny_capture(), 0)
-    view = view._replace(time=put(0.3, "float32"))
-    made = variants.from_knots(model, state, 40, "cubic")
-    whole = made.model._replace(stages=None)  # by its `render`
-    exact, staged, found = (
-        evaluation.Renderer(model, SIZE)(state, view).colour
-        for model, state in ((model, state), made[:2], (whole, made.state))
-    )
-    np.testing.assert_allclose(staged, exact, atol=1e-3)
-    np.testing.assert_allclose(found, staged, atol=1e-5)
-
-
 def test_what_stands_still_may_be_left_out(swaying):
     exact = deformed_rows(*swaying)
     made = variants.without_static(*swaying, 0.0)

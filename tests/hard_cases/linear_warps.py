@@ -22,8 +22,6 @@ DISPLACEMENTS = {
     "a fold by a little": np.diag([-1.001, 0.0, 0.0]),
     "huge": 1e4 * (SHEAR + np.diag([1.0, -2.0, 3.0])),
 }
-# Where the cost has a corner: the determinant is zero, and a fold costs its volume.
-CORNERS = ("a plane", "a line", "a point")
 
 
 def linear_warp(params, displacement):

@@ -1,52 +1,24 @@
 """State dicts of every kind come out as arrays; nothing in them is executed."""
 
-import base64
 import json
+import pathlib
 import pickle
 import struct
-import zlib
 
 import numpy as np
 import pytest
 
 from nerfies_jax.measure import weight_files
 
-# Saved by PyTorch 2.13, zlib-compressed: {a: arange(6)/4 as [2, 3], b: arange(4) in
+# state_*.pth are saved by PyTorch 2.13: {a: arange(6)/4 as [2, 3], b: arange(4) in
 # float16, t: a transposed view of a, p: a Parameter of ones, slice: arange(10)[3:7:2]}.
-ZIP = """
-eNqlVUlv00AUntiJkxroBqULUHYI0KaJ3TYJW5GFLCQjkRqBKg5EbuI2Fm7S50yKgEulkgI34IA4IQ6Iv8CBX8GB
-C+KAxCZOXLnBjO2ktqM0ahlp8rLMt7zJe885hQ0jFIuhltWL+pFmFUrGij5R1LCWWL5jylI3uuVbq0yhUDFNvYCN
-SrnKX7OKuqUXLxsFzAM6pUIoPhciZBowBVwhbIl8DRtmlc9b+nzNMIt5rJerFSu/IvDAxuNzUXK4Sk5qizqEHQgv
-mxUNX3e+5CFiEyaBm2NJLCzXIKpwGGKzClIYhV2HLoVVQuvAPylRAzsw7FRhlw2ah+4SESk1iK9o5kKTt8c+koLe
-UlQJY+ijfOE69CuhOux2uPZgGFBhr30Qw6DDVYqUuJJtYYhCWIVZh2ElRJ2MOLB9GParcMCGLcNom4tY1ixtSce6
-xcPBBrMNEeAQ4WcwHLZTrMMRaumow30Mw3EVTjy2P5x8BHEVTs1F6CWaRkGH0758r1bKi818z9jkIowRch7D+Cy1
-XocEfZlwyJMYUioItUROicbeLtys/SAQunNtq2YQDTSrJrFQsZY0nF/RrSqpDlnqCxQPWSlK/e735zVqhu721CMo
-vUHt1kheM43F8pJexrIktrJ3XtOT1MDMXfjFEAlmUwN9aKZpYP4e1iu02GXp3HZ0G8s0MDZ16qF+4eswR1S4TT10
-o4u+rpxIytLZ/zDgsK5eJC8zCF0ie5Xs1zPUkfr958Eh8sNQB0djfkcpWYqjLeifR5eQRPWen3z/iwrEOuid9+sJ
-spRB289/1c6Z6j+d5T5uQ1/8P31nhdzIuJF1Y9iNETdyboy6sWGwy400jzff6rdz9P2mefQgsZlHs0MntpqIyFPF
-D68Wb3Tun1EkbDSwfXVV3TJIB9/X6NMjbxRlKbFFA6lkOp2ZFtJCNp3NZqYmU9PCVDIrZLPplDiZFDOCmJkShakM
-dflw399PceIjbrsM2Vfd8Omdbr0tzoPPwSDaO8AGfchpBrWbh0ES7xAa8ZE885K0TL4gj3eQ9Pl4+lnUOsCCcG/X
-d/vgL1gUmD1BrLeD/dh4OIBNBbHe7vNjXwaxQhDrrXg/digSwIpBrLd2e3zYLx5sm//MW1KjPrDKoQ7FnlM4bqzR
-Gux4E8kH4po7E/5wjRbn7O5/0LUxOnJKhHMwvH3eOfsPRQockQ==
-"""
-LEGACY = """
-eNp1kttu00AQhn1K0i60lDPlWM7mFJzEoYmESIWqCmk51dz4Blmus9RGxvbYm0ogVcpNQuEZuOCSV+MRkLhg1nYq
-GcJKntGuZ//v39kdK19J+Pvb1q+19z9erzbHyoufKsZ9kHR7RZKkJI157MWhs8fSLIgjkLHAXsI/YcB5yBwWDQM3
-AuXAJrjIPybMyYJPLAN1HzTdruFi5scphxpVbBVnQcShTjVbExpxtAsNqo1GyPQQEzKPIyUjr9IhS9lwM/A4AemO
-BbJuy7jDBcXjcer5TWfEgzAjTsp2RkE4dDiLsjh19toEVF23GwKMle4uA63YQrbC2OVvikUCNXsZa/rmer/X6/S7
-fdMwDKjnHr1khLbqLzksbFOJKlSdwiJVqTwF8sUXdo5wOGrBUu5pB5Z9RPozzDM3fHdIOVal9DqPkLLi46FR/bhQ
-1yZwgsoTOFkon+Jw2oIzuTKHs4WyP9fsOb8wuSpkVKpM4TyVhdcLhdRFDpcsuJxLJXDlP41L3NT9wDhLCaz9S1vv
-dlrdbssw4SrSFKRdy1sygevC9I2CdJPDLQtuH+QT/TNgvFvcfRh4DO5V+vMcb/2wP/crqHbP6JomPEAUQVRzWxxr
-Ag9FMApUi0Pbgo54MW/FK53jVJ6nqcy7CHVeWzXWVKTZGA/ER6TqkMs8q1PLrJW5VuZ6mRtlXijz4l/1OB5LG9LT
-eoUyfoIB+RuDwsf3wR/tRtdj
-"""
 
 
 @pytest.fixture(params=["zip", "legacy"])
 def saved(request, tmp_path):
+    name = f"state_{request.param}.pth"
     path = tmp_path / "state.pth"
-    encoded = {"zip": ZIP, "legacy": LEGACY}[request.param]
-    path.write_bytes(zlib.decompress(base64.b64decode(encoded)))
+    path.write_bytes(pathlib.Path(__file__).with_name(name).read_bytes())
     return path
 
 

@@ -10,7 +10,6 @@ from nerfies_jax.nets import encoding
 from nerfies_jax.nets.encoding import EncodingSpec
 from tests import gradients
 
-sincospi = jax.jit(encoding.sincospi)
 encode = jax.jit(encoding.encode, static_argnums=0)
 anneal = jax.jit(encoding.anneal, static_argnums=0)
 
@@ -49,26 +48,6 @@ def test_features_band_by_band(spec, dtype, rng):
     )
 
 
-@pytest.mark.hard_cases
-@pytest.mark.parametrize("size", [1, 10, 1e3, 1e4])
-def test_half_turns_stay_exact_for_large_arguments(size, dtype, rng):
-    """sin(2^15 π x) rounded before the reduction is off by 6e-3, at 1e4 by 1."""
-    seams = np.arange(-7, 8, 2) / 4
-    x = np.concatenate([seams * (1 - 1e-6), seams, seams * (1 + 1e-6)])
-    x = np.concatenate([x, 2.0**15 * size * rng.uniform(-1, 1, 176)]).astype(dtype)
-    with mpmath.workdps(50):
-        exact = [mpmath.mpf(float(value)) for value in x]
-        truth = np.array(
-            [[mpmath.sinpi(v), mpmath.cospi(v)] for v in exact], np.float64
-        )
-    error = np.abs(np.stack(sincospi(x), axis=1) - truth)
-    assert error.max() < {"float32": 1.5e-7, "float64": 3e-16}[dtype]
-    quarters = np.arange(200) - 100  # on the axes without any error
-    sine, cosine = sincospi((quarters / 2).astype(dtype))
-    assert np.array_equal(sine, np.array([0, 1, 0, -1])[quarters % 4])
-    assert np.array_equal(cosine, np.array([1, 0, -1, 0])[quarters % 4])
-
-
 @pytest.mark.parametrize(
     "times_pi", [pytest.param(False, marks=pytest.mark.full), True]
 )
@@ -85,18 +64,6 @@ def test_gradient_and_curvature(times_pi, float64, rng):
         return value(point, window) + jnp.sum(grad * weight[:3])
 
     assert gradients.directional_error(both, point, window) < 1e-7
-
-
-@pytest.mark.hard_cases
-def test_the_gradient_of_a_high_band_keeps_its_digits(dtype):
-    """π 2⁹ cos(2⁹ π x): the naive product is 1e-4 off in float32."""
-    spec = EncodingSpec(10, identity=False, times_pi=True)
-    point = np.asarray([0.7371], dtype)
-    jacobian = jax.jacfwd(lambda point: encoding.encode(spec, point, None))
-    grads = float(jax.jit(jacobian)(point)[-2, 0])
-    with mpmath.workdps(50):
-        truth = 512 * mpmath.pi * mpmath.cospi(512 * mpmath.mpf(float(point[0])))
-    assert abs(grads / (512 * np.pi) - float(truth) / (512 * np.pi)) < 3e-7
 
 
 @pytest.mark.hard_cases

@@ -9,10 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.special
 
 from nerfies_jax.nets import kan
-from nerfies_jax.nets.kan import KAN, KANLayer, KANSpec, Kernels
+from nerfies_jax.nets.kan import KANSpec, Kernels
 from nerfies_jax.nets.mlp import HeadSpec
 from tests import gradients
 from tests.oracles import networks
@@ -37,7 +36,6 @@ SOME = [
     else pytest.param(name, marks=pytest.mark.full)
     for name in VARIANTS
 ]
-CURVE = KANSpec(1, (), (("y", HeadSpec(1)),), kernels=8, base=False)
 
 apply = jax.jit(kan.apply, static_argnums=0)
 
@@ -121,57 +119,6 @@ def test_outputs_edge_by_edge(variant, dtype, rng):
             np.testing.assert_allclose(batch[name][row], value, rtol=bound, atol=bound)
 
 
-@pytest.mark.full
-def test_the_sum_over_kernels_is_the_three_index_form(rng):
-    """In float32, value and slopes, within 1e-6 of the largest."""
-    spec = KANSpec(6, (), (("y", HeadSpec(9)),), kernels=16)
-    params, centre = filled(spec, "float32"), jnp.linspace(-1, 1, 16)
-    x = rng.uniform(-1, 1, (32, 6)).astype(np.float32)
-    weigh = rng.normal(size=(32, 9)).astype(np.float32)
-
-    def plain(params, x):
-        basis = jnp.exp(-(((x[..., None] - centre) * 15 / 2) ** 2))
-        head = params.heads["y"]
-        sums = jnp.einsum("nig,gio->no", basis, head.kernel)
-        return sums + jax.nn.silu(x) @ head.base + head.bias
-
-    def ours(params, x):
-        return kan.apply(spec, params, x)["y"]
-
-    def value_and_slopes(function):
-        def total(*args):
-            outputs = function(*args)
-            return jnp.vdot(outputs, weigh), outputs
-
-        found = jax.jit(jax.grad(total, argnums=(0, 1), has_aux=True))(params, x)
-        return jax.tree.leaves(jax.tree.map(np.asarray, found))
-
-    for one, other in zip(*map(value_and_slopes, (ours, plain)), strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-6 * np.abs(other).max())
-
-
-@pytest.mark.parametrize(
-    "variant", ["full", pytest.param("trained kernels", marks=pytest.mark.full)]
-)
-def test_the_first_layer_may_be_summed_in_parts(variant, dtype, rng):
-    spec = VARIANTS[variant]
-    params = filled(spec, dtype)
-    inputs = rng.normal(size=(6, 5)).astype(dtype)
-    inputs[:, 3:] = inputs[0, 3:]
-
-    @jax.jit
-    def in_parts(params, inputs):
-        points = kan.first_layer_part(spec, params, inputs[:, :3], 0)
-        time = kan.first_layer_part(spec, params, inputs[0, 3:], 3)  # same for all
-        return kan.after_first_layer(spec, params, points + time)
-
-    found = jax.tree.map(np.asarray, in_parts(params, inputs))
-    tolerance = {"float32": 2e-5, "float64": 1e-13}[dtype]
-    for row in range(6):
-        for name, value in by_hand(spec, params, inputs[row]).items():
-            np.testing.assert_allclose(found[name][row], value, atol=tolerance)
-
-
 @pytest.mark.parametrize("variant", SOME)
 def test_gradients(variant, float64, rng):
     spec = VARIANTS[variant]
@@ -184,81 +131,6 @@ def test_gradients(variant, float64, rng):
     inputs = rng.normal(size=(3, 5))
     error = gradients.directional_error(total, filled(spec, "float64"), inputs)
     assert error < 1e-6
-
-
-def curve_params(weights, dtype="float64"):
-    kernel = np.asarray(weights, dtype)[:, None, None]
-    return KAN((), {"y": KANLayer(kernel, None, np.zeros(1, dtype))}, None)
-
-
-def curve(params, x):
-    return kan.apply(CURVE, params, x[None])["y"][0]
-
-
-SIGMA = math.sqrt(0.5) * 2 / 7
-CENTRES = np.linspace(-1, 1, 8)
-
-
-@jax.jit
-def curve_derivatives(params, x):
-    """The curve and its derivatives up to the fifth, of all inputs, in one program."""
-    function, found = curve, []
-    for _ in range(6):
-        found.append(jax.vmap(function, (None, 0))(params, x))
-        function = jax.jacfwd(function, argnums=1)
-    return found
-
-
-@pytest.mark.full
-def test_derivatives_are_hermite_polynomials(float64, rng):
-    """Equations 6 to 8: psi^(k) = psi (-1 / w)^k H_k((x - mu) / w), w = √2 sigma."""
-    weights, w = rng.normal(size=8), math.sqrt(2) * SIGMA
-    x = np.linspace(-0.99, 0.99, 11)
-    place = (x[:, None] - CENTRES) / w
-    for order, ours in enumerate(curve_derivatives(curve_params(weights), x)):
-        kernels = np.exp(-(place**2)) * (-1 / w) ** order
-        expected = (scipy.special.eval_hermite(order, place) * kernels) @ weights
-        np.testing.assert_allclose(ours, expected, atol=1e-13 * w**-order * 2**order)
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def slopes_of_curve(spec, params, x):
-    def value(x):
-        return kan.apply(spec, params, x[None])["y"][0]
-
-    return jax.vmap(jax.grad(value))(x)
-
-
-@pytest.mark.hard_cases
-@pytest.mark.parametrize(
-    ("grid", "base"),
-    [((-1.0, 1.0), True), ((-1.0, 1.0), False), ((0.0, 2.5), False)],
-)
-def test_inputs_far_outside_the_grid_stay_alive(grid, base, dtype):
-    """Their slopes are those of the closed form, to rounding, and not zero."""
-    spec = dataclasses.replace(CURVE, grid=grid, base=base)
-    weights = np.linspace(1, 2, 8)
-    params = curve_params(weights, dtype)
-    if base:
-        head = params.heads["y"]._replace(base=np.full((1, 1), 0.5, dtype))
-        params = params._replace(heads={"y": head})
-
-    far = np.array([3.0, 5.0, 50.0, 1e4])
-    far = np.concatenate([far, -far])
-    grads = slopes_of_curve(spec, params, far.astype(dtype))
-    sigma = math.sqrt(0.5) * (grid[1] - grid[0]) / 7
-    for x, grad in zip(far, np.asarray(grads, np.float64), strict=True):
-        excess = (x - grid[1] if x > 0 else grid[0] - x) / sigma
-        rate = (1 + 3 * excess) * (1 + 2 * excess + 3 * excess**2) ** -1.5
-        offset = held(x, grid, sigma) - np.linspace(*grid, 8)
-        psi = np.exp(-(offset**2) / (2 * sigma**2))
-        expected = rate * np.sum(-offset / sigma**2 * psi * weights)
-        if base:
-            logistic = scipy.special.expit(x)
-            expected += 0.5 * logistic * (1 + x * scipy.special.expit(-x))
-        assert grad != 0
-        tolerance = {"float32": 1e-4, "float64": 1e-11}[dtype]
-        np.testing.assert_allclose(grad, expected, rtol=tolerance)
 
 
 @jax.jit
@@ -343,20 +215,6 @@ def test_any_input_has_finite_slopes(variant, dtype):
     still = jax.tree.map(np.zeros_like, params)  # hidden features without spread
     for values, x in itertools.product((params, still), (0.0, -1e20, 1e30)):
         found = sum_and_slopes(spec, values, np.full(5, x, dtype))
-        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
-
-
-@pytest.mark.hard_cases
-def test_trained_widths_of_any_size_have_finite_slopes(dtype):
-    spec = HARD_VARIANTS["trained kernels"]
-    params = filled(spec, dtype)
-    x = params.kernels[0].centre[2]  # at a centre, where 0 meets 1 / width
-    for log_width in (-200.0, 200.0):
-        kernels = tuple(
-            layer._replace(log_width=np.full_like(layer.log_width, log_width))
-            for layer in params.kernels
-        )
-        found = sum_and_slopes(spec, params._replace(kernels=kernels), x)
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
 
 

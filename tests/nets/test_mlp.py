@@ -97,39 +97,6 @@ def test_initial_weights_have_the_promised_spread(dtype):
     assert -1e-4 <= np.min(small) < -0.99e-4  # two-sided
 
 
-@pytest.mark.full
-def test_both_precisions_start_from_the_same_weights_each_its_own():
-    init = jax.jit(mlp.init, static_argnums=(0, 2))
-    spec = dataclasses.replace(SPEC, skips=())
-    with jax.enable_x64(True):
-        wide = jax.tree.map(np.asarray, init(spec, jax.random.key(3), jnp.float64))
-    narrow = jax.tree.map(np.asarray, init(spec, jax.random.key(3), jnp.float32))
-    for one, other in zip(jax.tree.leaves(wide), jax.tree.leaves(narrow), strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-6)
-    first, second = narrow.hidden[1].weight, narrow.hidden[2].weight
-    assert first.shape == second.shape
-    assert not np.any(first == second)
-
-
-@pytest.mark.parametrize("skips", [(1, 2), pytest.param((), marks=pytest.mark.full)])
-def test_inputs_known_beforehand_may_be_summed_once(skips, dtype, rng):
-    """Against the network that reads them with every row."""
-    spec = MLPSpec(7, 3, 8, (("out", HeadSpec(4)),), skips, "softplus")
-    params = drawn_net(spec, dtype)
-    rows, known = rng.normal(size=(5, 4)).astype(dtype), rng.normal(size=3)
-    known = known.astype(dtype)
-
-    @jax.jit
-    def ours(params, known, rows):
-        rest = dataclasses.replace(spec, inputs=4)
-        return mlp.apply(rest, mlp.with_known(spec, params, known), rows)["out"]
-
-    whole = np.concatenate([rows, np.broadcast_to(known, (5, 3))], axis=1)
-    theirs = [by_hand(spec, params, row.astype(np.float64))["out"] for row in whole]
-    tolerance = {"float32": 2e-6, "float64": 1e-14}[dtype]
-    np.testing.assert_allclose(ours(params, known, rows), theirs, atol=tolerance)
-
-
 @functools.partial(jax.jit, static_argnums=0)
 def heads_and_slopes(spec, params, inputs):
     def total(params, inputs):

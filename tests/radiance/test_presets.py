@@ -60,25 +60,6 @@ def test_half_the_steps_halve_the_schedules():
                 assert getattr(getattr(half, effect), field) == expected
 
 
-def test_presets_differ_only_in_what_their_names_say():
-    effects = {
-        name: {
-            field.name
-            for field in dataclasses.fields(spec)
-            if dataclasses.is_dataclass(getattr(spec, field.name))
-            and field.name not in ("template", "coarse", "sampling")
-        }
-        for name, spec in PRESETS.items()
-    }
-    assert effects["nerf"] == set()
-    assert effects["nerf-w"] == {"appearance", "transient"}
-    assert effects["d-nerf"] == {"warp"}
-    assert effects["t-nerf"] == {"time"}
-    assert effects["nerfies"] == {"appearance", "warp", "elastic", "background"}
-    assert effects["hypernerf"] == {"appearance", "warp", "ambient", "background"}
-    assert effects["nsff"] == {"scene_flow"}
-
-
 # Rows of the weights of every layer. The codes of NeRF, D-NeRF and NSFF join the input
 # to what the fifth layer answers, those of Nerfies and HyperNeRF to the fourth's.
 @pytest.mark.parametrize(

@@ -104,6 +104,19 @@ def test_distances_never_step_back_however_short_the_ray(spacing, dtype):
             assert gap < 0 or np.all(got >= float(near))
 
 
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("ratio", [1.0, 1 + 1e-6, 1e4, 1e7, 1e12])
+def test_the_last_sample_in_disparity_is_the_far_end(ratio, dtype):
+    """Written 1 / near + (1 / far - 1 / near) share it was 18 % short at 1e7 nears."""
+    near, far = np.asarray(1e-3, dtype), np.asarray(1e-3 * ratio, dtype)
+    found = np.asarray(stratified(None, near, far, 64, "disparity"), np.float64)
+    share = np.linspace(0, 1, 64)
+    exact = 1 / ((1 - share) / float(near) + share / float(far))
+    # share is rounded, and 1 - share magnifies that up to 63 times before the last
+    np.testing.assert_allclose(found, exact, rtol=64 * np.finfo(dtype).eps)
+    assert np.all(np.diff(found) >= 0)
+
+
 def test_distances_follow_near_and_far(float64):
     key = jax.random.key(2)
 

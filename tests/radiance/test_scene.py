@@ -19,7 +19,7 @@ from nerfies_jax.scene import RadianceScene
 from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.spec import SamplingSpec
 from nerfies_jax.training.effects import FrameCondition, weighted_sum
-from nerfies_jax.training.model import TrainState, View
+from nerfies_jax.training.model import View
 from tests import drawn, gradients, scenes
 from tests.oracles import networks
 
@@ -228,27 +228,6 @@ def test_the_filmed_volume_fills_the_box():
     assert own.centre == (0, 0, 0)
 
 
-@pytest.mark.full
-def test_without_its_warp_a_field_shows_the_canonical_scene():
-    spec = dataclasses.replace(STATIC, warp=TINY_WARP)
-    params = drawn.params(scene.field(spec, METADATA).init, "float32")
-    condition = condition_of("float32", motion=np.ones(TINY_WARP.code_width))
-    bent, straight, plain = (
-        jax.tree.map(
-            np.asarray,
-            jax.jit(field.render_ray)(params, ray_of("float32"), condition)[-1],
-        )
-        for field in (
-            scene.field(spec, METADATA),
-            scene.field(spec, METADATA, ("warp",)),
-            scene.field(STATIC, METADATA),
-        )
-    )
-    assert np.abs(bent.warped - bent.point).max() > 1e-3
-    np.testing.assert_array_equal(straight.warped, straight.point)
-    np.testing.assert_array_equal(straight.colour, plain.colour)
-
-
 @pytest.mark.slow
 def test_gradient_of_a_whole_step(float64):
     # One level and no elastic term: where fine samples lie and how elastic samples are
@@ -287,16 +266,6 @@ def test_shared_and_single_levels(levels):
     assert set(params["template"]) == {"fine"}
     given = ray_of("float32"), condition_of("float32")
     assert len(jax.eval_shape(field.render_ray, params, *given)) == levels
-
-
-@pytest.mark.full
-def test_a_step_repeats_itself_and_counts():
-    model, state, frames = started(STATIC)
-    step = jax.jit(model.step)
-    (one, _), (other, _) = (step(state, frames) for _ in range(2))
-    assert isinstance(one, TrainState)
-    assert int(one.step) == 1
-    jax.tree.map(np.testing.assert_array_equal, one.params, other.params)
 
 
 @pytest.mark.full

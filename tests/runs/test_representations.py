@@ -69,7 +69,7 @@ def opened(monkeypatch):
     """What `saved_run` opens, without reading a capture."""
 
     def unread(config, kind, spec):
-        return runs.Run(config, None, kind, spec, None, None)
+        return runs.Run(config, None, None, kind, spec, None, None)
 
     monkeypatch.setattr(run, "open_run", unread)
 
@@ -78,7 +78,7 @@ def save(folder, preset):
     config = RunConfig(preset, CaptureSource(folder, max_side=9), overrides=("a=1",))
     kind = representations.of_preset(preset)
     spec = kind.presets[preset]
-    runs.save_config(folder, runs.Run(config, None, kind, spec, None, None))
+    runs.save_config(folder, runs.Run(config, None, None, kind, spec, None, None))
     return config, spec
 
 

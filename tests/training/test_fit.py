@@ -248,28 +248,6 @@ def test_a_solve_cut_short_is_flagged_and_no_worse_than_its_start(solver):
 
 @pytest.mark.parametrize("solver", CODE_SOLVERS)
 @pytest.mark.full
-def test_many_codes_are_fitted_as_one_batch(solver):
-    """And the loss may close over what is mapped or traced."""
-    targets = np.float32([[0.1, 0.2], [-0.3, 0.4], [0.0, 0.0]])
-
-    @jax.jit
-    def fit_all(targets):
-        def one(target):
-            def loss(code):
-                return jnp.sum((code - target) ** 2 * jnp.float32([1, 4]))
-
-            return fit_code(loss, jnp.zeros(2), solver, 400, 1e-3)
-
-        return jax.vmap(one)(targets)
-
-    found = fit_all(targets)
-    assert found.converged.all()
-    assert found.steps[2] <= found.steps[0]
-    np.testing.assert_allclose(found.value, targets, atol=1e-3)
-
-
-@pytest.mark.parametrize("solver", CODE_SOLVERS)
-@pytest.mark.full
 def test_float32_codes_stay_float32_with_x64_on(solver, float64):
     found = jax.jit(
         lambda start: fit_code(lambda c: jnp.sum((c - 0.5) ** 2), start, solver, 300)

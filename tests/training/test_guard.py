@@ -116,16 +116,6 @@ def test_a_step_that_blows_up_is_named_and_undone(where, at, frames, tmp_path):
     assert toy.same(result.state, good.state if good else start())
 
 
-@pytest.mark.parametrize("value", [np.inf, -np.inf])
-@pytest.mark.parametrize("where", NAMES)
-@pytest.mark.full
-def test_infinities_are_not_finite_either(value, where, frames):
-    spoilt = poison(frames, where, 5, value)
-    result = fit(spoilt, model=POISONED, steps=STEPS)
-    assert result.steps == 4
-    assert re.search(f"step 5 is not finite: {NAMES[where]}", result.message)
-
-
 def test_a_second_moment_that_overflows_stops_the_run(frames):
     """Its row would never move again, while every parameter stays finite."""
 
@@ -180,23 +170,6 @@ def test_an_event_that_blows_up_is_named_and_undone(where, at, frames, tmp_path)
     held(tmp_path, result, MODEL)
     straight = fit(frames, steps=STEPS)
     assert toy.same(fit(frames, result.state, steps=STEPS).state, straight.state)
-
-
-def test_the_event_that_blew_up_is_named_among_several(frames):
-    seen = []
-
-    def note(state, _):
-        seen.append(int(state.step))
-        return state
-
-    def harm(state, _):
-        return spoilt_at(state, "parameter", np.nan)
-
-    events = [Event("a", (7, 8), note), Event("b", (8,), harm), Event("c", (8,), note)]
-    result = fit(frames, steps=STEPS, events=events)
-    assert result.steps == 7  # right after a copy: nothing is repeated
-    assert "event 'b' after step 8" in result.message
-    assert seen == [7, 8]
 
 
 @pytest.mark.parametrize("where", [name for name in NAMES if name != "metric"])

@@ -54,25 +54,6 @@ def test_dssim_is_the_textbook_five_window_form(padding, rng, dtype):
     np.testing.assert_allclose(found, expected, atol=tolerance)
 
 
-@pytest.mark.parametrize("name", ["ssim_64x48", "ssim_480x270"])
-@pytest.mark.full
-def test_ssim_and_its_gradient_match_the_reference(name, oracle_dir, dtype):
-    saved = np.load(oracle_dir / "splatting" / f"{name}.npz")
-    image, target = (
-        np.moveaxis(saved[key][0], 0, -1).astype(dtype) for key in ("img1", "img2")
-    )
-    value, grad = SSIM_SLOPE(image, target)
-    valid = jax.jit(lambda x, y: losses.ssim(x, y, padding="valid"))(image, target)
-    # The reference window was built in float32 and sums to 1 + 1e-7, which variances
-    # see as 1e-7 of the squares beside C2 = 9e-4: 2e-6 in the value, 6e-6 in the slope.
-    tolerance = 3e-6
-    assert abs(value - saved["ssim_zero_pad"]) < tolerance
-    assert abs(valid - saved["ssim_valid"]) < tolerance
-    expected = np.moveaxis(saved["grad_img1"][0], 0, -1)
-    error = np.linalg.norm(grad - expected) / np.linalg.norm(expected)
-    assert error < 2e-5
-
-
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("level", [0.0, pytest.param(0.9, marks=pytest.mark.full)])
 def test_constant_equal_images_are_exactly_alike_without_a_slope(level, dtype):
@@ -80,43 +61,6 @@ def test_constant_equal_images_are_exactly_alike_without_a_slope(level, dtype):
     value, grad = SSIM_SLOPE(image, image)
     assert float(value) == 1
     assert not np.any(grad)
-
-
-@pytest.mark.hard_cases
-def test_constant_images_a_little_apart_have_the_exact_slope(dtype):
-    image, target = (np.full((16, 20, 3), level, dtype) for level in (0.9, 0.89))
-
-    def loss(x, target):
-        return jnp.mean(losses.dssim_map(x, target, padding="valid"))
-
-    grad = np.asarray(jax.jit(jax.grad(loss))(image, target), np.float64)
-    x, y = float(image[0, 0, 0]), float(target[0, 0, 0])
-    luminance = x**2 + y**2 + 1e-4
-    exact = 2 * (x - y) / luminance - (x - y) ** 2 * 2 * x / luminance**2
-    # A uniform shift changes luminance alone; structure must add nothing.
-    assert abs(grad.sum() / exact - 1) < {"float32": 3e-4, "float64": 1e-10}[dtype]
-
-
-@pytest.mark.hard_cases
-def test_dssim_of_bright_low_contrast_images_keeps_its_digits(rng, dtype):
-    image = np.asarray(1000 + rng.normal(size=(24, 19, 3)), np.float32)
-    target = np.asarray(image + 0.5 * rng.normal(size=image.shape), np.float32)
-    found = DSSIM(image.astype(dtype), target.astype(dtype), padding="valid")
-    expected = reference_dssim(image, target, "valid")
-    # In float64 the uncentred reference is the less exact of the two.
-    tolerance = {"float32": 1e-6, "float64": 1e-8}[dtype]
-    np.testing.assert_allclose(found, expected, atol=tolerance)
-
-
-@pytest.mark.hard_cases
-@pytest.mark.full
-def test_dssim_of_half_precision_images_is_computed_in_float32(rng):
-    image, target = images(rng)
-    half = [x.astype(jnp.bfloat16) for x in (image, target)]
-    found = DSSIM(*half)
-    assert found.dtype == jnp.float32
-    expected = reference_dssim(*(np.asarray(x, np.float64) for x in half), "zero")
-    np.testing.assert_allclose(found, expected, atol=2e-5)
 
 
 @pytest.mark.parametrize(
@@ -130,17 +74,6 @@ def test_dssim_gradient_is_the_slope(padding, rng, float64):
         return jnp.sum(weight * losses.dssim_map(x, y, padding=padding))
 
     assert gradients.directional_error(loss, image, target) < 1e-7
-
-
-@pytest.mark.full
-def test_dssim_has_second_derivatives(rng, float64):
-    image, target = (jnp.asarray(x) for x in images(rng, 12, 11))
-    direction = jnp.asarray(rng.normal(size=image.shape))
-
-    def grad(x):
-        return jnp.vdot(jax.grad(losses.ssim)(x, target), direction)
-
-    assert gradients.directional_error(grad, image) < 1e-6
 
 
 ROBUST = {
@@ -169,27 +102,6 @@ def test_robust_penalties_hold_from_nothing_to_the_largest_residual(name, dtype)
         )
 
 
-@pytest.mark.hard_cases
-@pytest.mark.parametrize("name", ROBUST)
-def test_robust_penalties_keep_their_slopes(name, dtype):
-    width = 0.03
-    s = np.asarray([0.0, 1e-25, 1e-5, 0.03**2, 1.0, 1e4], dtype)
-    exact = np.asarray(s, np.longdouble)
-    grads = {
-        "charbonnier": 0.5 / np.sqrt(exact + width**2),
-        "huber": 0.5 * np.minimum(1, width / np.sqrt(np.maximum(exact, 1e-30))),
-        "geman_mcclure": 8 * width**2 / (exact + 4 * width**2) ** 2,
-    }
-
-    def penalty(s):
-        return ROBUST[name][0](s, width)
-
-    orders = jax.value_and_grad(jax.grad(penalty))
-    grad, curvature = jax.jit(jax.vmap(orders))(s)
-    np.testing.assert_allclose(grad, np.float64(grads[name]), rtol=3 * ULPS[dtype])
-    assert np.all(np.isfinite(curvature))
-
-
 @pytest.mark.parametrize("name", ROBUST)
 def test_robust_penalty_gradients_are_their_slopes(name, rng, float64):
     residual = jnp.asarray(rng.normal(size=(5, 3)))
@@ -198,22 +110,6 @@ def test_robust_penalty_gradients_are_their_slopes(name, rng, float64):
         return jnp.sum(ROBUST[name][0](jnp.sum(x**2, axis=-1), 0.7))
 
     assert gradients.directional_error(penalty, residual) < 1e-8
-
-
-@pytest.mark.hard_cases
-@pytest.mark.parametrize(
-    # All three are half squares at zero, times 2 rho'(0).
-    ("name", "factor"),
-    [("charbonnier", 10.0), ("huber", 1.0), ("geman_mcclure", 100.0)],
-)
-def test_robust_penalties_of_a_vector_have_a_gradient_at_zero(name, factor):
-    def penalty(x):
-        return ROBUST[name][0](jnp.sum(x**2), 0.1)
-
-    both = jax.jit(lambda x: (jax.grad(penalty)(x), jax.hessian(penalty)(x)))
-    grad, curvature = both(np.zeros(3, np.float32))
-    assert not np.any(grad)
-    np.testing.assert_allclose(curvature, factor * np.eye(3), rtol=1e-6)
 
 
 @pytest.mark.hard_cases

@@ -9,13 +9,13 @@ import pytest
 from experiments.hard_cases import case as hard_case
 from experiments.hard_cases.case import ORDERS, Case
 
-# Half the time to compile: for textbook forms, which nobody runs, and for values in
-# core, which `hold` holds as they are run.
+# Half the time to compile: for textbook forms, which nobody runs, and for core,
+# whose values and slopes `hold` holds as they are run.
 ROUGHLY = (("xla_backend_optimization_level", 0),)
 
 
 def by_case(cases: tuple[Case, ...], slow: tuple[str, ...] = ()):
-    """The marks of a test that runs for every case in every precision.
+    """Tests of a room: every case in every precision, and its textbook form.
 
     Precisions in `slow` run with the slow tests: for cases that take long to compile.
     """
@@ -29,13 +29,30 @@ def by_case(cases: tuple[Case, ...], slow: tuple[str, ...] = ()):
         for case in cases
         for dtype in case.bounds
     ]
-    return pytest.mark.parametrize(("case", "dtype"), runs)
+    each = [pytest.param(x, id=x.name, marks=pytest.mark.full) for x in cases]
+
+    @pytest.mark.parametrize(("case", "dtype"), runs)
+    def test_held(case, dtype):
+        hold(case, dtype)
+
+    @pytest.mark.parametrize("case", each)
+    def test_the_textbook_form_is_caught(case):
+        catches_the_textbook(case)
+
+    return test_held, test_the_textbook_form_is_caught
 
 
-def each(cases: tuple[Case, ...]):
-    """The marks of a test that runs for every case."""
-    runs = [pytest.param(x, id=x.name, marks=pytest.mark.full) for x in cases]
-    return pytest.mark.parametrize("case", runs)
+def in_float32(cases: tuple[Case, ...]):
+    """Tests of a room as a whole: its values and slopes together, single inputs."""
+
+    def test_values_and_slopes_are_held():
+        hold_slopes(cases)
+
+    @pytest.mark.full
+    def test_one_alone_is_held():
+        hold_alone(cases)
+
+    return test_values_and_slopes_are_held, test_one_alone_is_held
 
 
 @functools.cache
@@ -66,12 +83,17 @@ def hold(case: Case, dtype: str) -> None:
         _within(case, dtype, order, found)
 
 
-def hold_values(cases: tuple[Case, ...]) -> None:
-    """Values of float32 within their bounds, those of a room in one program."""
+def hold_slopes(cases: tuple[Case, ...]) -> None:
+    """Values and slopes of float32 within their bounds, a room in one program."""
     rows = [np.asarray(case.inputs, np.float32) for case in cases]
-    functions = [jax.vmap(case.stable) for case in cases]
-    for case, found in zip(cases, _all(functions, rows, ROUGHLY), strict=True):
-        _within(case, "float32", 0, found)
+    counts = [min(2, len(case.bounds["float32"])) for case in cases]
+    functions = [
+        jax.vmap(hard_case.derivatives(case.stable, count))
+        for case, count in zip(cases, counts, strict=True)
+    ]
+    for case, every in zip(cases, _all(functions, rows, ROUGHLY), strict=True):
+        for order, found in enumerate(every):
+            _within(case, "float32", order, np.asarray(found))
 
 
 def hold_alone(cases: tuple[Case, ...]) -> None:

@@ -5,10 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.spatial.transform
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from experiments.hard_cases.elastic import CASES, DIRECTIONS
+from experiments.hard_cases.elastic import CASES
 from nerfies_jax.effects import elastic
 from nerfies_jax.geometry import lie, matrix3
 from tests.experiments.hard_cases import checks
@@ -21,30 +19,11 @@ ENERGIES = {
 }
 TURN = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
 BACK = Rotation.from_rotvec([-1, 0.4, 0.7]).as_matrix()
-HALVED = (*ENERGIES, "singular_values", "svd")
 ROWS = 7  # as many matrices as one test asks for at most
 
-
 pytestmark = pytest.mark.hard_cases
-
-
-def test_values_are_held():
-    checks.hold_values(CASES)
-
-
-@checks.by_case(CASES, slow=("float64",))
-def test_held(case, dtype):
-    checks.hold(case, dtype)
-
-
-@pytest.mark.full
-def test_one_alone_is_held():
-    checks.hold_alone(CASES)
-
-
-@checks.each(CASES)
-def test_the_textbook_form_is_caught(case):
-    checks.catches_the_textbook(case)
+test_values_and_slopes_are_held, test_one_alone_is_held = checks.in_float32(CASES)
+test_held, test_the_textbook_form_is_caught = checks.by_case(CASES, slow=("float64",))
 
 
 @jax.jit
@@ -74,31 +53,6 @@ def test_value_and_slope_are_continuous_where_the_logarithm_becomes_a_tangent(
     eps = np.finfo(dtype).eps
     assert abs(value[1] - value[0]) < 8 * eps * value[0]
     assert np.max(abs(slope[1] - slope[0])) < 8 * eps * np.max(abs(slope[0]))
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("kind", ["bfloat16", "float16"])
-def test_half_precision_is_rounded_once(kind):
-    # One program for all: they share the decomposition.
-    every = jax.jit(lambda x: {name: getattr(matrix3, name)(x) for name in HALVED})
-    matrix = np.asarray(0.1 * DIRECTIONS[0], jnp.dtype(kind))
-    both = every(matrix), every(matrix.astype(np.float32))
-    half_ulp = float(jnp.finfo(kind).eps) / 2
-    for one, other in zip(*map(jax.tree.leaves, both), strict=True):
-        assert one.dtype == kind
-        off = np.abs(np.asarray(one, np.float32) - np.asarray(other))
-        assert np.all(off <= 1.001 * half_ulp * np.abs(other) + 6e-8)
-
-
-@pytest.mark.full
-def test_float32_stays_float32_with_x64_on():
-    matrix = [np.eye(3) + 0.2 * DIRECTIONS[2]]
-    alone = of_all(matrix, "float32")
-    with jax.enable_x64(True):
-        wide = of_all(matrix, "float32")
-    for one, other in zip(*map(jax.tree.leaves, (wide, alone)), strict=True):
-        assert one.dtype == other.dtype == np.float32
-        np.testing.assert_allclose(one, other, rtol=2e-6)
 
 
 def _field(params, point):
@@ -132,40 +86,6 @@ def test_the_elastic_gradient_of_a_translating_warp_survives_float32():
     for one, other in zip(found, exact, strict=True):
         one, other = np.asarray(one, np.float64), np.asarray(other)
         assert np.max(abs(one - other)) < 1e-5 * np.max(abs(other))
-
-
-numbers = st.floats(-1, 1, width=32)
-triples = st.tuples(numbers, numbers, numbers)
-axioms = settings(max_examples=40, deadline=None, derandomize=True, database=None)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["float32", "float64"])
-@axioms
-@given(stretch=triples, one=triples, other=triples)
-def test_turning_before_or_after_costs_nothing(kind, stretch, one, other):
-    """Nor does undoing or transposing; stretches from 1/e to e."""
-    matrix = TURN @ np.diag(np.exp(stretch)) @ BACK
-    one, other = (Rotation.from_rotvec(turn).as_matrix() for turn in (one, other))
-    still, turned = np.eye(3), one @ matrix @ other
-    undone = np.linalg.inv(matrix)
-    given = [matrix, turned, matrix.T, -matrix, undone, matrix - still, one - still]
-    with jax.enable_x64(kind == "float64"):
-        found = {name: value for name, (value, _) in of_all(given, kind).items()}
-    energy, signed = found["log_energy"], found["signed_log_energy"]
-    displaced = found["displacement_log_energy"]
-    rests = {
-        "turned": energy[1] - energy[0],
-        "turned, signed": signed[1] - signed[0],
-        "turned over": energy[2] - energy[0],
-        "mirrored": energy[3] - energy[0],
-        "undone": energy[4] - energy[0],
-        "displaced": displaced[5] - energy[0],
-        "rigid": displaced[6],
-    }
-    for name, rest in rests.items():
-        # energies to 3, by matrices of condition up to e²
-        assert abs(rest) < {"float32": 2e-5, "float64": 4e-14}[kind], name
 
 
 @pytest.mark.parametrize("name", ["log_energy", "signed_log_energy"])

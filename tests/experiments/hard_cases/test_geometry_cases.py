@@ -4,37 +4,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from experiments.hard_cases.geometry import CASES
 from nerfies_jax.geometry import camera as cameras
-from nerfies_jax.geometry import distortion, lie, rays
+from nerfies_jax.geometry import distortion, rays
 from tests.experiments.hard_cases import checks
 
 SIZE = (640, 480)
 
-
 pytestmark = pytest.mark.hard_cases
-
-
-def test_values_are_held():
-    checks.hold_values(CASES)
-
-
-@checks.by_case(CASES)
-def test_held(case, dtype):
-    checks.hold(case, dtype)
-
-
-@pytest.mark.full
-def test_one_alone_is_held():
-    checks.hold_alone(CASES)
-
-
-@checks.each(CASES)
-def test_the_textbook_form_is_caught(case):
-    checks.catches_the_textbook(case)
+test_values_and_slopes_are_held, test_one_alone_is_held = checks.in_float32(CASES)
+test_held, test_the_textbook_form_is_caught = checks.by_case(CASES)
 
 
 def some_camera(dtype):
@@ -43,25 +23,6 @@ def some_camera(dtype):
         radial=np.asarray([0.1, -0.2, 0.05], dtype),
         tangential=np.asarray([1e-3, -2e-3], dtype),
     )
-
-
-def everything(camera, point, pixel):
-    ends = jnp.full(3, -1, point.dtype), jnp.full(3, 1, point.dtype)
-    seen, depth = cameras.project(camera, point)
-    ray = rays.pixel_ray(camera, pixel)
-    span = rays.box_span(ray.origin, ray.direction, *ends)
-    distance = rays.distance_of_depth(camera, ray.direction, depth)
-    return {
-        "pixel": seen / 500,
-        "depth": depth,
-        "direction": ray.direction,
-        "span": jnp.stack(span),
-        "distance": distance,
-    }
-
-
-jitted = jax.jit(everything)
-in_rows = jax.jit(jax.vmap(everything, (None, 0, 0)))
 
 
 @pytest.mark.parametrize("kind", ["bfloat16", "float16"])
@@ -83,23 +44,6 @@ def test_cameras_of_half_precision_are_refused(kind):
     for attempt in attempts:
         with pytest.raises(ValueError, match=f"is {kind}.*px.*cast it to float32"):
             attempt()
-
-
-@pytest.mark.full
-def test_float32_stays_float32_with_x64_on_and_every_way_of_calling_agrees():
-    args = (
-        some_camera("float32"),
-        np.float32([0.2, 0.1, -0.3]),
-        np.float32([300.0, 100.0]),
-    )
-    eager = everything(*jax.tree.map(jnp.asarray, args))
-    with jax.enable_x64(True):
-        wide = jitted(*args)
-        rows = in_rows(args[0], *(np.stack([x, x]) for x in args[1:]))
-    for name, value in eager.items():
-        assert wide[name].dtype == rows[name].dtype == jnp.float32, name
-        for other in (wide[name], np.asarray(rows[name])[1]):
-            np.testing.assert_allclose(other, value, rtol=2e-6, atol=1e-6)
 
 
 def test_projection_is_continuous_where_the_depth_is_held(dtype):
@@ -139,46 +83,3 @@ def test_slopes_of_a_box_span_are_finite_for_every_slant(side, dtype):
         assert np.allclose(span, [2, 4], rtol=1e-5), slant
         for slope in slopes:
             assert np.all(np.isfinite(slope)), slant
-
-
-numbers = st.floats(-1, 1, width=32)
-triples = st.tuples(numbers, numbers, numbers)
-axioms = settings(max_examples=40, deadline=None, derandomize=True, database=None)
-
-
-@jax.jit
-def _views(camera, point, angular, linear):
-    """One point, seen by one camera; then both moved, and both made larger."""
-    rotation, shift = lie.exp_se3(angular, linear)
-    moved = camera._replace(
-        camera_from_world=camera.camera_from_world @ rotation.T,
-        position=rotation @ camera.position + shift,
-    )
-    larger = camera._replace(position=4 * camera.position)
-    seen, depth = cameras.project(camera, point)
-    along, found = cameras.unproject(camera, seen)
-    straight = point - camera.position
-    return {
-        "moved": cameras.project(moved, rotation @ point + shift)[0] - seen,
-        "larger": cameras.project(larger, 4 * point)[0] - seen,
-        "back": 500 * (along - straight / jnp.sqrt(jnp.sum(straight**2))),
-        "found": 1.0 - found.astype(depth.dtype),
-        "depth": depth - rays.depth_per_distance(camera, straight),
-    }
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("kind", ["float32", "float64"])
-@axioms
-@given(point=triples, angular=triples, linear=triples)
-def test_pixels_know_neither_the_world_s_frame_nor_its_unit(
-    kind, point, angular, linear
-):
-    with jax.enable_x64(kind == "float64"):
-        args = [np.asarray(x, kind) for x in (point, angular, linear)]
-        for name, rest in _views(some_camera(kind), *args).items():
-            # px; pixels to 600 and points two units away, over a few operations
-            assert (
-                np.max(abs(np.asarray(rest)))
-                < {"float32": 2e-3, "float64": 5e-12}[kind]
-            ), name

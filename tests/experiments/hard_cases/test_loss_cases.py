@@ -14,25 +14,8 @@ from tests.experiments.hard_cases import checks
 
 pytestmark = pytest.mark.hard_cases
 CASES = loss_cases.CASES + picture_cases.CASES
-
-
-def test_values_are_held():
-    checks.hold_values(CASES)
-
-
-@checks.by_case(CASES)
-def test_held(case, dtype):
-    checks.hold(case, dtype)
-
-
-@pytest.mark.full
-def test_one_alone_is_held():
-    checks.hold_alone(CASES)
-
-
-@checks.each(CASES)
-def test_the_textbook_form_is_caught(case):
-    checks.catches_the_textbook(case)
+test_values_and_slopes_are_held, test_one_alone_is_held = checks.in_float32(CASES)
+test_held, test_the_textbook_form_is_caught = checks.by_case(CASES)
 
 
 WAVELET, FOURIER = spectral.WaveletSpec(), spectral.FourierSpec()

@@ -10,7 +10,7 @@ import pytest
 
 from experiments.hard_cases import footprints as hard_footprints
 from experiments.hard_cases import splats as hard_splats
-from gaussians_jax import harmonics, projection, raster, splats
+from gaussians_jax import projection, raster, splats
 from gaussians_jax.projection import Footprints
 from gaussians_jax.raster_spec import GSPLAT, INRIA
 from gaussians_jax.splats import Gaussians
@@ -25,27 +25,9 @@ NEARBY = dataclasses.replace(GSPLAT, far=1e3)
 ONE_PIXEL = dataclasses.replace(QUICK, transmittance_threshold=1e-3)
 THROUGH = dataclasses.replace(INRIA, tile=4, batch=1, chunk=1)
 
-
 pytestmark = pytest.mark.hard_cases
-
-
-def test_values_are_held():
-    checks.hold_values(CASES)
-
-
-@checks.by_case(CASES)
-def test_held(case, dtype):
-    checks.hold(case, dtype)
-
-
-@pytest.mark.full
-def test_one_alone_is_held():
-    checks.hold_alone(CASES)
-
-
-@checks.each(CASES)
-def test_the_textbook_form_is_caught(case):
-    checks.catches_the_textbook(case)
+test_values_and_slopes_are_held, test_one_alone_is_held = checks.in_float32(CASES)
+test_held, test_the_textbook_form_is_caught = checks.by_case(CASES)
 
 
 def camera(dtype):
@@ -205,33 +187,6 @@ def test_a_pixel_is_done_on_the_side_of_the_stop_its_transmittance_is_on(dtype):
         assert bool(slopes[0][1] != 0) is drawn
 
 
-@pytest.mark.full
-def test_five_thousand_gaussians_on_a_pixel_have_the_slopes_of_float64(rng):
-    """Their transmittance underflows after a few hundred; alphas up to 1 among them."""
-    spec = dataclasses.replace(QUICK, transmittance_threshold=0.0)
-    count = 5000
-    alphas = np.float32(rng.uniform(0, 0.99, count) ** 4)
-    alphas[[3, 700]] = 1.0
-    values = np.float32(rng.uniform(-1, 1, count))
-    found, slopes = pixel_and_slopes(alphas, values, spec)
-
-    seen = np.minimum(
-        np.where(alphas < GSPLAT.alpha_threshold, 0, alphas), 0.99
-    ).astype(np.float64)
-    before = np.concatenate([[1], np.cumprod(1 - seen)[:-1]])
-    weight = before * seen
-    behind, by_alpha = 0.5, np.zeros(count)  # half of what is left counts, too
-    for k in reversed(range(count)):
-        by_alpha[k] = before[k] * (values[k] - behind)
-        behind = seen[k] * values[k] + (1 - seen[k]) * behind
-    by_alpha[(alphas > 0.99) | (alphas < GSPLAT.alpha_threshold)] = 0
-    assert abs(found[0] - weight @ values) < 1e-6
-    assert abs(found[1] - np.prod(1 - seen)) < 1e-6
-    for slope, expected in zip(slopes, (by_alpha, weight), strict=True):
-        error = np.abs(np.asarray(slope, np.float64) - expected)
-        assert error.max() < 2e-5 * np.abs(expected).max()
-
-
 @pytest.mark.parametrize("kind", ["bfloat16", "float16"])
 def test_half_precision_gaussians_are_refused_by_name(kind):
     """Eight bits place a pixel to 1 px at 256; Adam's steps do not move such means."""
@@ -243,34 +198,3 @@ def test_half_precision_gaussians_are_refused_by_name(kind):
         raster.rasterise(half, half.whitening, SIZE, GSPLAT)
     with pytest.raises(ValueError, match=f"{kind}.*float32"):
         splats.from_points(np.eye(3), np.eye(3), dtype=jnp.dtype(kind))
-
-
-@pytest.mark.parametrize("logit", [16.0, 17.0, 37.0, 100.0, 1e4])
-def test_a_saturated_opacity_draws_as_one(logit, dtype):
-    """sigmoid is 1 from 17 (37): nothing divides by 1 - o or takes its logarithm."""
-    opacity = np.asarray(jax.nn.sigmoid(jnp.asarray([logit], dtype)))
-    (colour, left), slopes = pixel_and_slopes(opacity, np.ones(1, dtype), ONE_PIXEL)
-    assert abs(colour - 0.99) < 1e-6
-    assert abs(left - 0.01) < 1e-6
-    assert np.isfinite(slopes).all()
-
-
-def test_colour_at_the_camera_is_finite_with_its_slopes(dtype, rng):
-    """A Gaussian in the very place of the camera is seen along z."""
-    coefficients = rng.normal(size=(16, 3)).astype(dtype)
-    place = np.asarray([1.0, 2.0, 3.0], dtype)
-
-    def colour(mean, coefficients):
-        seen = harmonics.colour_towards(coefficients, mean, jnp.asarray(place))
-        return jnp.sum(seen**2)
-
-    both = jax.jit(jax.value_and_grad(colour, (0, 1)))
-    expected, (_, expected_slope) = both(
-        place + np.eye(3, dtype=dtype)[2], coefficients
-    )
-    for step in (0.0, 1e-6, 1e-3):
-        mean = place + np.asarray([0, 0, step], dtype)
-        value, (by_mean, by_coefficient) = both(mean, coefficients)
-        assert abs(value - expected) <= 1e-6 * abs(expected)
-        np.testing.assert_allclose(by_coefficient, expected_slope, atol=1e-5)
-        assert np.isfinite(by_mean).all()

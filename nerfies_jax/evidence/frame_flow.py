@@ -1,0 +1,39 @@
+"""Optical flow for a capture that came without, between frames to learn from."""
+
+import dataclasses
+
+import numpy as np
+
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.capture.flow import FrameFlow
+from nerfies_jax.evidence import dense_flow, view_set
+
+
+def with_flow(capture: Capture) -> Capture:
+    """The capture with flow to the next and the previous frame of the same camera.
+
+    Frames that are held out neither give nor get any: what they show is not known while
+    training. As `dense_flow` finds it, in the pictures as they are.
+    """
+    width, height = capture.size
+    count = len(capture.images)
+    shape = (count, height, width)
+    own = np.arange(count, dtype=np.int32)
+    flow = FrameFlow(
+        np.zeros((*shape, 2), np.float32), np.zeros(shape, bool), own.copy(),
+        np.zeros((*shape, 2), np.float32), np.zeros(shape, bool), own.copy(),
+    )  # fmt: skip
+    for camera in np.unique(capture.camera_ids[capture.train]):
+        mine = capture.train[capture.camera_ids[capture.train] == camera]
+        if len(mine) < 2:
+            continue
+        views = view_set.in_time_order(capture, mine)
+        found = dense_flow.between_neighbours(views, dense_flow.levelled(views))
+        flow.forward[views.row] = found.forward
+        flow.forward_seen[views.row] = found.forward_seen & views.valid
+        flow.next_row[views.row[:-1]] = views.row[1:]
+        flow.backward[views.row] = found.backward
+        flow.backward_seen[views.row] = found.backward_seen & views.valid
+        flow.previous_row[views.row[1:]] = views.row[:-1]
+    note = "optical flow between neighbouring frames found in the pictures"
+    return dataclasses.replace(capture, flow=flow, notes=(*capture.notes, note))

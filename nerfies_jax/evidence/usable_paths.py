@@ -1,0 +1,65 @@
+"""What a motion can start from: the paths that are known long enough."""
+
+import warnings
+from typing import NamedTuple
+
+import numpy as np
+
+from nerfies_jax.capture.cache import CACHE
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.evidence import record
+from nerfies_jax.evidence.record import Evidence
+from nerfies_jax.training.track_start import TrackStartSpec
+
+LEAST_SEEN = 6  # frames in which a path is known
+LEAST_PATHS = 12
+
+
+class KnownPaths(NamedTuple):
+    """Where points that move were seen to be, over the frames of the evidence."""
+
+    position: np.ndarray  # [paths, frames, 3] scene units; any value where not known
+    known: np.ndarray  # [paths, frames] bool
+
+
+def evidence_to_start_from(capture: Capture, start: TrackStartSpec) -> Evidence | None:
+    """What the pictures say of the motion, gathered or read from the cache.
+
+    None where `start` asks for none, or the film allows none, which a warning says.
+    """
+    if start.motion != "tracks":
+        return None
+    evidence = record.cached(capture, CACHE / "evidence", start.use_depths)
+    reason = unusable(evidence)
+    if not reason:
+        return evidence
+    warnings.warn(
+        f"{capture.path or capture.name}: the motion starts from rest, for tracks are "
+        f"of no use here: {reason}; what moves by more than a few pixels will not be "
+        "found",
+        RuntimeWarning,
+        stacklevel=2,
+    )
+    return None
+
+
+def unusable(evidence: Evidence) -> str:
+    """Why a motion cannot start from these tracks; empty where it can."""
+    if evidence.unusable:
+        return evidence.unusable
+    if len(known_paths(evidence).known) < LEAST_PATHS:
+        return "hardly any track moves by itself"
+    return ""
+
+
+def known_paths(evidence: Evidence) -> KnownPaths:
+    """The paths known in `LEAST_SEEN` frames and more."""
+    kept = evidence.paths.known.sum(1) >= LEAST_SEEN
+    return KnownPaths(evidence.paths.position[kept], evidence.paths.known[kept])
+
+
+def scene_unit(evidence: Evidence) -> float:
+    """A typical distance: the median z-depth of points at rest, scene units."""
+    depth = evidence.rest.depth[evidence.tracks.seen]
+    depth = depth[np.isfinite(depth) & (depth > 0)]
+    return float(np.median(depth)) if len(depth) else 1.0

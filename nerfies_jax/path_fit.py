@@ -1,0 +1,169 @@
+"""The warp of a field fitted to known paths of points, before any ray is traced.
+
+A warp maps what is observed back to the template; points that were followed through the
+film say where it must lead: the places of one point at all times to one place of the
+template, and points at rest to where they are. Descent on pictures does not find that
+for motion of more than a few pixels.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Bool, Float, Key
+
+from nerfies_jax.evidence import usable_paths
+from nerfies_jax.evidence.record import Evidence
+from nerfies_jax.field import Field
+from nerfies_jax.training.effects import FrameCondition
+from nerfies_jax.training.model import View
+from nerfies_jax.training.track_start import TrackStartSpec
+from nerfies_jax.training.updates import apply_updates
+
+PyTree = Any
+FRAMES_AT_ONCE, POINTS_AT_ONCE, STILL_AT_ONCE = 12, 256, 128  # of each step
+SOFT = 1e-3  # field units: distances below it count squared
+LAST_RATE = 0.02  # of the first
+
+
+class FilmPaths(NamedTuple):
+    """Points followed through a film, in units of the field."""
+
+    time: Float[np.ndarray, " frames"]
+    appearance: np.ndarray  # [frames] ids, for codes that go by them
+    position: Float[np.ndarray, "points frames 3"]  # any value where not known
+    known: Bool[np.ndarray, "points frames"]
+    still: Float[np.ndarray, "still 3"]  # points that nothing moves
+
+
+class WarpFit(NamedTuple):
+    """What the fit found, and the mean distance from one place before and after."""
+
+    params: PyTree  # of the whole field
+    canonical: Float[Array, "points 3"]  # field units: places in the template
+    first: float  # field units
+    last: float
+
+
+def film_paths(made: Field, capture, evidence: Evidence) -> FilmPaths:
+    """The evidence's paths and points at rest in units of the field; host side."""
+    metadata = made.metadata
+
+    def inside(place):
+        return ((place - np.asarray(metadata.centre)) * metadata.scale).astype(
+            np.float32
+        )
+
+    position, known = usable_paths.known_paths(evidence)
+    return FilmPaths(
+        capture.times[evidence.row].astype(np.float32),
+        capture.appearance_ids[evidence.row],
+        inside(np.where(known[..., None], position, 0)),
+        known,
+        inside(evidence.still.position),
+    )
+
+
+def fit(
+    made: Field,
+    params: PyTree,
+    paths: FilmPaths,
+    key: Key[Array, ""],
+    start: TrackStartSpec,
+) -> WarpFit:
+    """Descend on how far the warp carries one point's places from one another.
+
+    What descends are the warps, the codes they read, and the places in the template,
+    which begin where the points are in the middle of their own time. Points at rest
+    are held where they are. ValueError where no place is known.
+    """
+    if not paths.known.any():
+        raise ValueError("no path is known anywhere: nothing to fit a warp to")
+    names = [effect.name for effect in made.effects if effect.displace is not None]
+    moved = {name: params[name] for name in (*names, "codes")}
+    canonical = jnp.asarray(_first_places(paths))
+    position = jnp.asarray(np.moveaxis(paths.position, 1, 0))
+    weight = jnp.asarray(paths.known.T, position.dtype)
+    together = min(FRAMES_AT_ONCE, len(paths.time))
+
+    def condition_of(own, frame):
+        view = View(None, jnp.asarray(paths.time)[frame], appearance[frame])
+        return FrameCondition(view.time, made.codes_at(params | own, view), trained)
+
+    appearance = jnp.asarray(paths.appearance)
+    trained = jnp.asarray(made.spec.steps)  # all bands of the warp are open
+
+    def off(own, canonical, frames, rows, still):
+        def one(frame):
+            condition = condition_of(own, frame)
+
+            def carried(point):
+                return made.displace(params | own, point, condition)
+
+            here = position[frame][rows]
+            gap = here + jax.vmap(carried)(here) - canonical[rows]
+            return _length(gap), _length(jax.vmap(carried)(still))
+
+        moving, resting = jax.vmap(one)(frames)
+        counted = weight[frames][:, rows]
+        total = jnp.sum(moving * counted) / jnp.maximum(jnp.sum(counted), 1)
+        return total, jnp.sum(resting) / max(resting.size, 1)
+
+    def loss(free, key):
+        frame_key, row_key, still_key = jax.random.split(key, 3)
+        frames = jax.random.choice(
+            frame_key, len(paths.time), (together,), replace=False
+        )
+        rows = jax.random.randint(row_key, (POINTS_AT_ONCE,), 0, len(paths.known))
+        moving, resting = off(*free, frames, rows, _some(paths.still, still_key))
+        return moving + resting
+
+    adam = optax.scale_by_adam()
+    rate = start.fit_rate
+
+    def step(state, key_and_count):
+        free, moments = state
+        key, count = key_and_count
+        grads = jax.grad(loss)(free, key)
+        updates, moments = adam.update(grads, moments)
+        share = rate * LAST_RATE ** (count.astype(position.dtype) / start.fit_steps)
+        return (apply_updates(free, updates, share), moments), None
+
+    @jax.jit
+    def run(free):
+        keys = jax.random.split(key, start.fit_steps), jnp.arange(start.fit_steps)
+        (free, _), _ = jax.lax.scan(step, (free, adam.init(free)), keys)
+        return free
+
+    @jax.jit
+    def mean_distance(free):
+        every = jnp.arange(len(paths.time)), jnp.arange(len(paths.known))
+        return off(*free, *every, jnp.zeros((1, 3), position.dtype))[0]
+
+    # optax raises floats to a whole number of steps.
+    with jax.numpy_dtype_promotion("standard"):
+        free = moved, canonical
+        found = run(free)
+    first, last = float(mean_distance(free)), float(mean_distance(found))
+    return WarpFit(params | found[0], found[1], first, last)
+
+
+def _length(gap):
+    return jnp.sqrt(jnp.sum(gap**2, axis=-1) + SOFT**2)
+
+
+def _some(still, key):
+    if not len(still):
+        return jnp.zeros((0, 3), still.dtype)
+    return jnp.asarray(still)[jax.random.randint(key, (STILL_AT_ONCE,), 0, len(still))]
+
+
+def _first_places(paths):
+    """[points, 3]: each where it is known nearest to the middle of its own time."""
+    found = np.zeros((len(paths.known), 3), np.float32)
+    for row, known in enumerate(paths.known):
+        seen = np.flatnonzero(known)
+        found[row] = paths.position[row, seen[len(seen) // 2]]
+    return found

@@ -1,0 +1,51 @@
+"""What a step of training takes, measured before a run is planned by it."""
+
+import time
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from nerfies_jax.training.chunk import compiled
+from nerfies_jax.training.model import Frames, Model, TrainState
+
+# Shares of a run at which its step is timed: before a warm-up is over, a motion may
+# cost nothing, and a penalty that begins late is seen by the first steps alone never.
+PHASES = (1 / 8, 3 / 8, 5 / 8, 7 / 8)
+PHASE_SECONDS = 0.4  # of steps that are timed at each
+MOST_STEPS = 200
+
+
+class StepTime(NamedTuple):
+    """Seconds of one step, and of making its program; on the wall."""
+
+    seconds: float
+    compile_seconds: float
+
+
+def step_time(model: Model, state: TrainState, frames: Frames, steps: int) -> StepTime:
+    """The mean over a run of `steps` steps of what one takes with the first state.
+
+    `state` is left as it is. Of every phase of the run, the first step is not timed.
+    Whatever grows later is not seen.
+    """
+    frames = jax.tree.map(jnp.asarray, frames)
+    program, compile_seconds = compiled(model.step, state, frames)
+
+    def timed(start, count):
+        began = time.perf_counter()
+        left, outcome = program(start, frames, np.int32(count))
+        done = max(int(outcome.done), 1)  # waits; fewer where one is not finite
+        return left, (time.perf_counter() - began) / done
+
+    found = []
+    for share in PHASES:
+        # The program overwrites what it is given.
+        start = jax.tree.map(jnp.copy, state)
+        start = start._replace(step=jnp.full_like(state.step, int(share * steps)))
+        start, _ = timed(start, 1)
+        start, guess = timed(start, 2)
+        count = min(max(round(PHASE_SECONDS / guess), 1), MOST_STEPS)
+        found.append(timed(start, count)[1])
+    return StepTime(float(np.mean(found)), compile_seconds)

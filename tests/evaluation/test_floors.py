@@ -1,0 +1,247 @@
+"""Pictures that cost nothing against slow loops, and renders through a lens."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from nerfies_jax import evaluation
+from nerfies_jax.capture import pinholes
+from nerfies_jax.evaluation import floors, moving_masks
+from nerfies_jax.evaluation.lens import ThroughLens
+from nerfies_jax.evidence import record
+from nerfies_jax.geometry import camera as cameras
+from nerfies_jax.runs import floors_text
+from nerfies_jax.training.model import Rendering, TrainState
+from tests.capture.test_pinholes import pattern, through_a_lens
+from tests.evidence import films
+
+SIZE = (24, 18)
+NOBODY = TrainState((), (), (), jnp.zeros((), jnp.int32), None)
+
+
+def film(frames=12, **changes):
+    """A small film in which every frame has its own level, every third held out."""
+    rows = np.arange(frames)
+    images = np.zeros((frames, *SIZE[::-1], 3), np.uint8)
+    images += (10 * rows[:, None, None, None]).astype(np.uint8)
+    bare = films.film(frames=frames, points=0)
+    return dataclasses.replace(
+        bare,
+        images=images,
+        moving=None,
+        depths=None,
+        cameras=cameras.resize(bare.cameras, bare.size, SIZE),
+        train=rows[rows % 3 != 1],
+        heldout=rows[rows % 3 == 1],
+        **changes,
+    )
+
+
+def test_neighbours_are_the_nearest_in_time_of_the_same_camera():
+    capture = film()
+    assert sorted(floors.neighbour_rows(capture, 4)) == [3, 5]
+    assert list(floors.neighbour_rows(capture, 10)) == [9, 11]
+    # Of the camera's own frames, however far, if it has two; else of all.
+    ids = np.zeros(12, np.int32)
+    ids[[0, 4, 11]] = 1
+    rig = dataclasses.replace(capture, camera_ids=ids)
+    assert list(floors.neighbour_rows(rig, 4)) == [0, 11]
+    ids[11] = 0
+    assert sorted(floors.neighbour_rows(rig, 4)) == [3, 5]
+    # By their times, not by their rows; of equally near ones the first.
+    turned = dataclasses.replace(capture, times=capture.times[::-1].copy())
+    assert sorted(floors.neighbour_rows(turned, 1)) == [0, 2]
+    still = dataclasses.replace(capture, times=np.zeros(12, np.float32))
+    assert list(floors.neighbour_rows(still, 4)) == [0, 2]
+
+
+def test_a_mean_of_neighbours_is_of_those_that_filmed_a_pixel():
+    valid = np.ones((12, *SIZE[::-1]), bool)
+    valid[3, :, :5] = False
+    valid[[3, 5], 0] = False
+    capture = film(valid=valid)
+    found = floors.neighbour_means(capture, np.array([4, 7]))
+    expected = np.full((*SIZE[::-1], 3), 40 / 255)
+    expected[:, :5] = 50 / 255
+    expected[0] = 0
+    np.testing.assert_allclose(found.colour[0], expected, atol=1e-6)
+    np.testing.assert_allclose(found.colour[1], 70 / 255, atol=1e-6)
+    np.testing.assert_array_equal(found.known[0], expected[..., 0] > 0)
+    assert found.known[1].all()
+    at_once = dataclasses.replace(capture, times=np.zeros(12, np.float32))
+    assert floors.neighbour_means(at_once, capture.heldout) is None
+    single = dataclasses.replace(capture, train=capture.train[:1])
+    assert floors.neighbour_means(single, capture.heldout) is None
+
+
+def test_an_average_over_time_leaves_the_rest_of_a_view():
+    capture, order = film(), []
+
+    def draw(state, view):
+        level = float(view.time) + float(view.camera.position[0])
+        order.append(float(view.time))
+        shape = SIZE[::-1]
+        colour = np.full((*shape, 3), 2 * level, np.float32)
+        return Rendering(colour, np.ones(shape), np.ones(shape))
+
+    rows = capture.heldout
+    found = floors.time_averages(draw, NOBODY, capture, rows, frames=2, moments=3)
+    np.testing.assert_array_equal(found.places, [0, 3])
+    times = capture.times[capture.train]
+    times = times[[0, round((len(times) - 1) / 2), -1]]
+    assert order == [t for t in times for _ in range(2)]  # an instant serves all views
+    for place, colour in zip(found.places, found.colour, strict=True):
+        position = capture.cameras.position[rows[place], 0]
+        exact = np.mean(np.clip(2 * (times.astype(float) + position), 0, 1))
+        np.testing.assert_allclose(colour, exact, atol=1e-6)
+    with pytest.raises(ValueError, match="frames=0 and moments=3"):
+        floors.time_averages(draw, NOBODY, capture, rows, frames=0, moments=3)
+
+
+def test_a_run_below_a_floor_is_told_what_to_do():
+    found = {"heldout.psnr": 20.0, "floor.neighbours": 19.0, "floor.still": 19.5}
+    found |= {"motion.worth": 0.5}
+    assert floors_text.warnings(found) == []
+    assert "19.00 dB the mean of two" in floors_text.lines(found)[0]
+    assert "+0.50 dB" in floors_text.lines(found)[1]
+    below, worse = floors_text.warnings(
+        found | {"floor.neighbours": 22.7, "motion.worth": -0.25}
+    )
+    assert "20.00 dB is below the 22.70 dB" in below
+    assert "0.25 dB worse" in worse
+    assert "--steps" in below
+    assert "splats-static" in worse
+    assert floors_text.lines({"heldout.psnr": 20.0}) == []
+    assert floors_text.warnings({"heldout.psnr": 20.0}) == []
+
+
+# Barrel distortion shows more than the pinhole, pincushion less.
+@pytest.mark.parametrize("bulge", [-0.2, 0.2])
+def test_a_pinhole_s_render_is_bent_as_the_lens_films(bulge):
+    capture = films.film(frames=3)
+    bent = through_a_lens(capture, (bulge, 0.03, 0.0), (0.003, -0.002))
+    bent = dataclasses.replace(bent, depths=capture.depths)
+    width, height = capture.size
+    x = np.tile(np.arange(width, dtype=np.float32), (height, 1))
+
+    def draw(state, view):
+        assert not pinholes.has_lens(view.camera)
+        colour = (
+            pattern(cameras.take(capture.cameras, 0), capture).astype(np.float32) / 255
+        )
+        return Rendering(colour, np.ones((height, width)), x)
+
+    judged = pinholes.scorable(bent, traced=False)
+    found = ThroughLens(draw, capture.size)(NOBODY, evaluation.view_of(bent, 0))
+    seen = np.ones((height, width), bool) if judged.valid is None else judged.valid[0]
+    assert seen[5:-5, 5:-5].mean() > 0.8
+    assert (seen.mean() < 0.99) == (bulge < 0)
+    # Rounding to levels, and bilinear sampling of a smooth pattern.
+    away = np.abs(255 * found.colour - bent.images[0])[seen]
+    assert away.max() <= 1.01
+    assert (
+        np.abs(
+            255 * draw(NOBODY, evaluation.view_of(capture, 0)).colour - bent.images[0]
+        ).max()
+        > 5
+    )
+    assert not found.colour[~seen].any()
+    assert not judged.depths[0][~seen].any()
+    np.testing.assert_array_equal(found.alpha, seen)
+    assert set(np.unique(found.depth)) <= set(x[0])  # never between two surfaces
+    np.testing.assert_array_equal(judged.images, bent.images)
+    if bulge < 0:
+        lost = 1 - judged.valid.mean()
+        assert f"{lost:.2%} of the pixels lie beyond" in judged.notes[-1]
+
+
+def test_rays_through_a_lens_are_scored_but_where_it_has_none():
+    capture = films.film(frames=3)
+    assert pinholes.scorable(capture, traced=False) is capture
+    lens = np.tile(np.float32([-0.2, 0.03, 0.0]), (3, 1))
+    bent = dataclasses.replace(capture, cameras=capture.cameras._replace(radial=lens))
+    assert pinholes.scorable(bent, traced=True) is bent
+    # A fold inside the picture: beyond it no ray is bent there.
+    lens = np.tile(np.float32([-3.0, 0.0, 0.0]), (3, 1))
+    bent = dataclasses.replace(capture, cameras=capture.cameras._replace(radial=lens))
+    found = pinholes.scorable(bent, traced=True)
+    width, height = capture.size
+    assert not found.valid[0, 0, 0]
+    assert found.valid[0, height // 2, width // 2]
+    assert "have no ray" in found.notes[-1]
+
+
+@pytest.fixture
+def looked(tmp_path, monkeypatch):
+    """Films that are looked at: the upper left quarter moves from 5/11 of the time on.
+
+    Where there are two cameras the film is of no use.
+    """
+    found = []
+
+    def cached(film, folder):
+        found.append(film)
+        assert folder == tmp_path
+        order = film.train[np.argsort(film.times[film.train], kind="stable")]
+        mask = np.zeros((len(order), *film.size[::-1]), bool)
+        mask[:, : film.size[1] // 2, : film.size[0] // 2] = True
+        mask[film.times[order] < np.float32(4.5 / 11)] = False
+        jumps = len(np.unique(film.camera_ids)) > 1
+        return record.Evidence(
+            **dict.fromkeys(record.Evidence._fields)
+            | {"row": order, "moving": mask, "factor": 1}
+            | {"unusable": "the camera jumps" if jumps else ""}
+        )
+
+    monkeypatch.setattr(record, "cached", cached)
+    width, height = films.SIZE
+    monkeypatch.setattr(moving_masks, "MOST_PIXELS", 12 * width * height // 4)
+    return found
+
+
+def without_masks(**changes):
+    """A film of which one frame is held out."""
+    film = films.film(frames=12, train=np.r_[0:5, 6:12], heldout=np.r_[5:6])
+    return dataclasses.replace(film, moving=None, **changes)
+
+
+@pytest.mark.parametrize("lens", [False, True])
+def test_masks_of_what_moves_come_from_all_frames(lens, looked, tmp_path):
+    capture = without_masks()
+    if lens:
+        radial = np.tile(np.float32([-0.2, 0.03, 0.0]), (12, 1))
+        bent = capture.cameras._replace(radial=radial)
+        capture = dataclasses.replace(capture, cameras=bent)
+    width, height = capture.size
+    found, note = moving_masks.with_masks(capture, tmp_path)
+    assert looked[0].size == (width // 2, height // 2)
+    assert len(looked[0].train) == 12
+    moving = found.moving[5]
+    if lens:
+        place, inside = pinholes.pinhole_places(
+            cameras.take(capture.cameras, 5), capture.size
+        )
+        row, column = np.round(place).astype(int)
+        expected = inside & (row < height // 2) & (column < width // 2)
+    else:
+        expected = np.zeros((height, width), bool)
+        expected[: height // 2, : width // 2] = True
+    np.testing.assert_array_equal(moving, expected)
+    assert f"({moving.mean():.1%} of the held-out" in note
+    assert moving_masks.with_masks(found, tmp_path) == (found, "")
+
+
+def test_pictures_that_jump_between_cameras_are_followed_in_one(looked, tmp_path):
+    ids = np.repeat(np.int32([1, 0]), 6)
+    rig = without_masks(camera_ids=ids)
+    found, _ = moving_masks.with_masks(rig, tmp_path)
+    assert [film.ids for film in looked] == [rig.ids, rig.ids[:6]]
+    assert found.moving[5].any()
+    looked.clear()
+    both = dataclasses.replace(rig, train=np.r_[0:5, 7:12], heldout=np.r_[5:7])
+    found, note = moving_masks.with_masks(both, tmp_path)
+    assert len(looked) == 1
+    assert found is both
+    assert note == "What moves is not scored apart: the camera jumps."

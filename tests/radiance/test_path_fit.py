@@ -1,0 +1,98 @@
+"""Warps of fields fitted to known paths."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from nerfies_jax import path_fit, presets, scene
+from nerfies_jax.path_fit import FilmPaths
+from nerfies_jax.training.effects import FrameCondition
+from nerfies_jax.training.model import View
+from nerfies_jax.training.track_start import TrackStartSpec
+
+FRAMES = 16
+TRACKS = TrackStartSpec("tracks", fit_steps=300, fit_rate=2e-3)
+
+
+def turning_body(points=40):
+    """[points, FRAMES, 3] places of a body that turns by a radian and shifts."""
+    rng = np.random.default_rng(0)
+    time = np.linspace(0, 1, FRAMES, dtype=np.float32)
+    turn = Rotation.from_rotvec(time[:, None] * [0, 0.6, 0.8]).as_matrix()
+    body = rng.normal(0, 0.15, (points, 3))
+    path = np.einsum("tij,nj->nti", turn, body) + time[:, None] * [0.4, 0, 0]
+    return path.astype(np.float32), time
+
+
+def film(known=None, still=200):
+    path, time = turning_body()
+    if known is None:
+        known = np.random.default_rng(1).uniform(size=path.shape[:2]) < 0.6
+    rest = np.random.default_rng(2).uniform(-1, 1, (still, 3)).astype(np.float32)
+    rest[:, 2] = 1
+    return FilmPaths(time, np.zeros(FRAMES, int), path, known, rest)
+
+
+def field_of(name):
+    spec = dataclasses.replace(presets.PRESETS[name], start=TRACKS)
+    metadata = scene.SceneMetadata(
+        0.1, 2.0, (0.0, 0.0, 0.0), 1.0, None,
+        tuple(np.linspace(0, 1, FRAMES).tolist()), ((0, 0, 0.0),),
+    )  # fmt: skip
+    return scene.field(spec, metadata)
+
+
+def carried(made, params, time, points):
+    def one(point, view):
+        codes = made.codes_at(params, view)
+        condition = FrameCondition(view.time, codes, jnp.int32(made.spec.steps))
+        return point + made.displace(params, point, condition)
+
+    view = View(None, np.float32(time), np.int32(0))
+    return jax.jit(jax.vmap(one, (0, None)))(points, view)
+
+
+@pytest.mark.parametrize(
+    "name", ["nerfies-small", pytest.param("d-nerf-small", marks=pytest.mark.full)]
+)
+def test_a_fitted_warp_brings_a_body_to_one_place_and_moves_no_wall(name):
+    made, paths = field_of(name), film()
+    params = made.init(jax.random.key(0))
+    found = path_fit.fit(made, params, paths, jax.random.key(0), TRACKS)
+    assert found.first > 0.1
+    assert found.last < 0.03
+    for frame in (3, 12):
+        back = carried(made, found.params, paths.time[frame], paths.position[:, frame])
+        # Also where a path was not known.
+        off = np.linalg.norm(back - found.canonical, axis=-1)
+        assert np.median(off) < 0.04
+        wall = carried(made, found.params, paths.time[frame], paths.still)
+        assert np.median(np.linalg.norm(wall - paths.still, axis=-1)) < 0.03
+
+
+@pytest.mark.parametrize("still", [0, pytest.param(200, marks=pytest.mark.full)])
+def test_points_seen_once_leave_everything_where_it_is(still):
+    """Each has one place: there is no motion to find, with or without a wall."""
+    known = np.zeros((40, FRAMES), bool)
+    known[np.arange(40), np.arange(40) % FRAMES] = True
+    made, paths = field_of("nerfies-small"), film(known, still)
+    params = made.init(jax.random.key(0))
+    found = path_fit.fit(made, params, paths, jax.random.key(0), TRACKS)
+    assert found.last < 5e-3
+    places = paths.position[known]
+    assert np.abs(carried(made, found.params, 0.5, places) - places).max() < 0.03
+
+
+def test_what_cannot_be_fitted_is_refused_by_name():
+    made = field_of("nerfies-small")
+    params = made.init(jax.random.key(0))
+    with pytest.raises(ValueError, match="no path is known"):
+        path_fit.fit(
+            made, params, film(np.zeros((40, FRAMES), bool)), jax.random.key(0), TRACKS
+        )
+    with pytest.raises(ValueError, match=r'start\.motion="tracks" fits a warp'):
+        dataclasses.replace(presets.PRESETS["nerf-small"], start=TRACKS)

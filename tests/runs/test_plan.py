@@ -1,0 +1,70 @@
+"""Seconds become steps: whose schedules stretch, by how much, and what is told."""
+
+import dataclasses
+
+import jax
+import pytest
+
+from nerfies_jax import runs
+from nerfies_jax.capture import nerfies_format
+from nerfies_jax.runs import plan, representations
+from nerfies_jax.runs.config import CaptureSource, RunConfig
+from nerfies_jax.training import rate
+from nerfies_jax.training.rate import StepTime
+from tests import scenes
+
+
+@pytest.mark.parametrize(
+    ("steps", "kept"),
+    [(0.3, 1), (7.9, 7), (99, 99), (101, 100), (1279.9, 1200), (98_765, 98_000)],
+)
+def test_steps_keep_two_digits_and_are_never_more(steps, kept):
+    assert plan.rounded(steps) == kept
+
+
+@pytest.mark.parametrize("growing", [True, False])
+def test_seconds_are_the_steps_that_they_allow(growing, tmp_path, monkeypatch):
+    nerfies_format.write(scenes.tiny_capture(), tmp_path / "filmed")
+    overrides = ("sh_degree=1", "densification.cap_max=400", "init.extra_random=0")
+    if not growing:
+        overrides = ("densification=none",)
+    config = RunConfig(
+        "splats-static-small", CaptureSource(tmp_path / "filmed"), None, overrides
+    )
+    run = runs.new_run(config)
+    state = run.model.init(run.capture, jax.random.key(0))
+    asked = []
+
+    def step_time(model, state, frames, steps):
+        asked.append((model, steps))
+        return StepTime(0.01, 3.0)
+
+    monkeypatch.setattr(rate, "step_time", step_time)
+    found, line = plan.with_seconds(run, state, 10)
+    assert asked == [(run.model, 3000)]
+    # 200 static points may become 400.
+    steps = 1000 / 2**0.5 if growing else 1000
+    assert found.spec.steps == found.config.steps == plan.rounded(steps)
+    assert found.spec == runs.scene_spec(found.config)
+    assert found.spec.sh_every == round(found.spec.steps / 3)
+    assert found.capture is run.capture
+    assert found.filmed is run.filmed
+    assert line.startswith(f"plan: {found.spec.steps:,} steps for 10 s of training (10")
+    assert ("1.4 times that" in line) == growing
+    if growing:
+        stop = found.spec.densification.refine_stop_iter
+        assert stop == round(2000 * found.spec.steps / 3000)
+
+
+def test_growth_is_expected_within_bounds():
+    kind = representations.named("gaussians")
+    capture, spec = scenes.tiny_capture(), scenes.TINY_SPLATS
+    model = kind.build(spec, kind.metadata_of(capture, spec))
+    state = model.init(capture, jax.random.key(0))
+    at_first = model.counts(state)["gaussians"]
+    for cap, growth in ((at_first // 2, 1), (2 * at_first, 2**0.5), (10**6, 2)):
+        density = dataclasses.replace(spec.densification, cap_max=cap)
+        found = kind.growth(dataclasses.replace(spec, densification=density), state)
+        assert found == pytest.approx(growth)
+    assert kind.growth(dataclasses.replace(spec, densification=None), state) == 1
+    assert representations.named("radiance").growth(None, state) == 1
