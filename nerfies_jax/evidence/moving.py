@@ -13,8 +13,8 @@ from nerfies_jax.evidence.view_set import Views
 # Half a pixel off a point at rest counts as half certain.
 HALF_CERTAIN_PX, STEEPNESS = 0.5, 3.0
 # Cameras of real films are off by a pixel themselves: at least so many times what the
-# stillest quarter of the tracks is off. Without it 55 % of a film of a hand before
-# books counted as moving, with it 12 %: the hand.
+# stillest quarter of the tracks is off. Without it 21 % of a film of a hand before
+# books counts as moving, with it 7 %: the hand.
 STILLEST, OVER_NOISE = 0.25, 3.0
 # Tracks near each other in shared frames move alike.
 NEIGHBOURS, EVERY_FRAMES, NEAR_PX, NEIGHBOUR_WEIGHT, ROUNDS = 10, 6, 6.0, 3.0, 10

@@ -183,7 +183,7 @@ def _mask(views, flow, tracks, score):
     open_to_doubt = _enlarged(moving.may_move(share), height, width)
     still = still_points.dense(views, flow, open_to_doubt)
     found = moving.mask(small, share, still_pictures.log_odds(small, still))
-    return _enlarged(found, height, width)
+    return _enlarged(found, height, width) & views.valid
 
 
 def _enlarged(masks, height, width):
