@@ -2,7 +2,8 @@
 
 OpenCV's DIS (Kroeger et al. 2016, arXiv:1603.03590) on pictures brought to one mean and
 contrast. Only neighbours are compared: over longer gaps patterns that repeat are taken
-for each other.
+for each other. Where an area is lost even so, it is looked for where its last motion
+would take it.
 """
 
 from collections.abc import Callable
@@ -18,6 +19,11 @@ from nerfies_jax.evidence.view_set import Views
 ENLARGED_BELOW_PX, ENLARGED = 320, 2
 # Forward and back must meet: within half a pixel and a fiftieth of the way.
 CLOSED_PX, CLOSED_SHARE = 0.5, 0.02
+
+# Of the width: the side of an area whose flow is looked for again where it was carried
+# to a frame and is lost there. Patterns that repeat are taken for each other in some
+# frames: the turning cube of the built-in scenes lost all its tracks in one of them.
+LOST_SHARE = 0.06
 
 
 class NeighbourFlow(NamedTuple):
@@ -68,11 +74,14 @@ def reduced(shift: np.ndarray, times: int) -> np.ndarray:
     return cv2.resize(shift, size, interpolation=cv2.INTER_AREA) / times
 
 
-def dis(times: int) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """Finds flow between pictures that were enlarged so many times."""
+def dis(times: int) -> Callable[..., np.ndarray]:
+    """Finds flow between pictures that were enlarged so many times.
+
+    A third argument is a guess of it, in pixels of the enlarged pictures.
+    """
     search = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     search.setFinestScale(0 if times > 1 else 1)
-    return lambda one, other: search.calc(one, other, None)
+    return lambda one, other, guess=None: search.calc(one, other, guess)
 
 
 def between_neighbours(views: Views, pictures: np.ndarray) -> NeighbourFlow:
@@ -95,7 +104,42 @@ def between_neighbours(views: Views, pictures: np.ndarray) -> NeighbourFlow:
         forward[frame], backward[frame + 1] = there, back
         forward_seen[frame] = closed(there, back)
         backward_seen[frame + 1] = closed(back, there)
-    return NeighbourFlow(forward, forward_seen, backward, backward_seen)
+    found = NeighbourFlow(forward, forward_seen, backward, backward_seen)
+    for frame in range(1, frames - 1):
+        if _lost(found, frame):
+            _go_on(found, frame, pictures, search)
+    return found
+
+
+def _lost(flow, frame):
+    """Whether a coherent area was carried to a frame and not from there."""
+    area = flow.backward_seen[frame] & ~flow.forward_seen[frame]
+    side = 2 * round(LOST_SHARE * area.shape[1] / 2) + 1
+    # Nothing lies outside: strips at the border leave the picture.
+    outside = {"borderType": cv2.BORDER_CONSTANT, "borderValue": 0}
+    return cv2.erode(np.uint8(area), np.ones((side, side)), **outside).any()
+
+
+def _go_on(flow, frame, pictures, search):
+    """Look again, from the guess that all goes on as it came; keep what closes."""
+    height, width = flow.forward.shape[1:3]
+    times = pictures.shape[2] // width
+    size = times * width, times * height
+
+    def again(one, other, guess):
+        guess = times * cv2.resize(np.ascontiguousarray(guess), size)
+        return reduced(search(pictures[one], pictures[other], guess), times)
+
+    there = again(frame, frame + 1, -flow.backward[frame])
+    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height))
+    at = x - there[..., 0], y.astype(np.float32) - there[..., 1]
+    back = again(frame + 1, frame, -cv2.remap(there, *at, cv2.INTER_LINEAR))
+    for here, shift, seen, new, other in (
+        (frame, flow.forward, flow.forward_seen, there, back),
+        (frame + 1, flow.backward, flow.backward_seen, back, there),
+    ):
+        better = closed(new, other) & ~seen[here]
+        shift[here][better], seen[here][better] = new[better], True
 
 
 def closed(there: np.ndarray, back: np.ndarray) -> np.ndarray:

@@ -6,7 +6,6 @@ import functools
 import numpy as np
 import pytest
 import scipy.ndimage as nd
-import scipy.spatial.transform
 
 from nerfies_jax.capture.capture import PointCloud
 from nerfies_jax.evidence import (
@@ -15,7 +14,6 @@ from nerfies_jax.evidence import (
     paths,
     record,
     rest_points,
-    rigid_groups,
     still_pictures,
     still_points,
     tracks,
@@ -90,6 +88,28 @@ def test_flow_that_does_not_lead_back_is_not_trusted():
     back[:, 4:] = 2
     closed = dense_flow.closed(there, back)
     np.testing.assert_array_equal(closed, np.arange(8)[None].repeat(6, 0) < 4)
+
+
+def test_flow_that_a_thing_lost_is_found_from_how_it_came():
+    capture = films.film(shown=lambda time: False, frames=6)
+    views = view_set.in_time_order(capture)
+    pictures = dense_flow.levelled(views)
+    true = dense_flow.between_neighbours(views, pictures)
+    flow = NeighbourFlow(*(part.copy() for part in true))
+    area = np.s_[20:50, 30:70]
+    for frame, shift, seen in ((2, *flow[:2]), (3, *flow[2:])):
+        shift[frame][area], seen[frame][area] = 9.0, False
+    assert dense_flow._lost(flow, 2)
+    assert not dense_flow._lost(true, 2)
+    search = dense_flow.dis(pictures.shape[2] // views.size[0])
+    dense_flow._go_on(flow, 2, pictures, search)
+    for frame, found, exact in ((2, flow[:2], true[:2]), (3, flow[2:], true[2:])):
+        assert found[1][frame][area].mean() > 0.9
+        off = np.abs(found[0][frame] - exact[0][frame])[area][found[1][frame][area]]
+        assert np.median(off) < 0.1
+        kept = exact[1][frame].copy()
+        kept[area] = False
+        np.testing.assert_array_equal(found[0][frame][kept], exact[0][frame][kept])
 
 
 def test_chains_follow_flow_both_ways_until_it_ends():
@@ -316,62 +336,6 @@ def test_the_card_is_where_it_is():
     inner = slice(4, -4)
     assert np.abs(middle[inner, 2] - films.NEAR).max() < 0.1 * films.NEAR
     assert np.abs(middle[inner, :2] - true[inner]).max() < 0.06
-
-
-def two_bodies():
-    """[40, 20, 3] points of a body that turns by 300 degrees and of one that shifts."""
-    rng = np.random.default_rng(2)
-    angle = np.linspace(0, np.deg2rad(300), 20)
-    turns = scipy.spatial.transform.Rotation.from_rotvec(
-        angle[:, None] * [0, 0, 1]
-    ).as_matrix()
-    body = rng.normal(0, 0.1, (20, 3))
-    turning = np.einsum("tij,nj->nti", turns, body) + np.array([0.5, 0, 2])
-    other = rng.normal(0, 0.1, (20, 1, 3)) + np.linspace(0, 0.4, 20)[:, None] * [
-        0,
-        1,
-        0,
-    ]
-    return np.concatenate([turning, other + np.array([-0.5, 0, 2])]), angle
-
-
-def test_two_bodies_are_told_apart_and_their_motions_found():
-    position, angle = two_bodies()
-    known = np.ones(position.shape[:2], bool)
-    # No point of the first body lives through the film.
-    for row in range(20):
-        known[row, (row % 10) + 8 :] = False
-        known[row, : max(0, row % 10 - 2)] = False
-    known[0:2, 6:] = True
-    known[10:16, 8:] = True
-    label = rigid_groups.labels(position, known, 2)
-    assert (label == np.repeat(label[[0, 20]], 20)).all()
-    assert label[0] != label[20]
-    found = rigid_groups.motion(position, known, label, 10)
-    canonical, _ = rigid_groups.centres(position, known, found)
-    np.testing.assert_allclose(canonical, position[:, 10], atol=1e-6)
-    turn = rigid_groups.rotation_vectors(found.rotation, 10)[label[0]]
-    np.testing.assert_allclose(turn[:, 2], angle - angle[10], atol=1e-6)
-
-
-def test_procrustes_leaves_out_what_strays():
-    rng = np.random.default_rng(3)
-    source = rng.normal(size=(30, 3))
-    true = scipy.spatial.transform.Rotation.from_rotvec([0.3, -0.5, 1.0]).as_matrix()
-    target = source @ true.T + [1, 2, 3]
-    target[:3] += 5
-    rotation, shift = rigid_groups.procrustes(source, target)
-    np.testing.assert_allclose(rotation, true, atol=0.02)
-    np.testing.assert_allclose(shift, [1, 2, 3], atol=0.05)
-
-
-@pytest.mark.hard_cases
-def test_identical_paths_are_one_body():
-    position = np.repeat(np.linspace(0, 1, 12)[None, :, None], 5, axis=0) * [1, 0, 0]
-    label = rigid_groups.labels(position, np.ones((5, 12), bool), 2)
-    found = rigid_groups.motion(position, np.ones((5, 12), bool), label, 6)
-    assert np.isfinite(found.rotation).all()
-    assert np.isfinite(found.shift).all()
 
 
 def test_what_was_gathered_is_read_again(tmp_path):
