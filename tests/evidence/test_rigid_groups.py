@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import scipy.spatial.transform
+from scipy.sparse.linalg import ArpackNoConvergence
 
 from nerfies_jax.evidence import rigid_groups
 
@@ -61,3 +62,16 @@ def test_identical_paths_are_one_body():
     found = rigid_groups.motion(position, np.ones((5, 12), bool), label, 6)
     assert np.isfinite(found.rotation).all()
     assert np.isfinite(found.shift).all()
+
+
+def test_bodies_are_told_apart_where_iterations_give_up(monkeypatch):
+    def give_up(*_, **__):
+        raise ArpackNoConvergence("no convergence", np.zeros(0), np.zeros((0, 0)))
+
+    monkeypatch.setattr(rigid_groups, "eigsh", give_up)
+    position, _ = two_bodies()
+    known = np.ones(position.shape[:2], bool)
+    label = rigid_groups.labels(position, known, 2)
+    assert (label == np.repeat(label[[0, 20]], 20)).all()
+    assert label[0] != label[20]
+    assert rigid_groups.fewest(position, known, 1e-6) == (2, pytest.approx(0, abs=1e-6))
