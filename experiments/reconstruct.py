@@ -17,8 +17,6 @@ from nerfies_jax.runs import commands, platform, representations
 from nerfies_jax.runs.config import MoreMetrics, RunConfig
 from nerfies_jax.training import stopping
 
-DEFAULT_PRESET = "splats-tracked-small"
-
 
 @dataclasses.dataclass(frozen=True)
 class Reconstruct:
@@ -26,9 +24,11 @@ class Reconstruct:
 
     source: cli.Source = cli.NamedSource()
     preset: str | None = None
-    """Gaussian splats: splats-static, splats-mcmc, splats-deformable, sonata, moba.
-    Radiance fields: nerf, nerf-w, d-nerf, t-nerf, nerfies, hypernerf, nsff. Each with
-    -small is made for a CPU (default: splats-tracked-small)."""
+    """Gaussian splats: splats-static, splats-mcmc, splats-tracked, splats-deformable,
+    sonata, moba. Radiance fields: nerf, nerf-w, d-nerf, t-nerf, nerfies, hypernerf,
+    nsff. Each with -small is made for a CPU (default: splats-tracked-small;
+    splats-static-small where nothing moves, splats-deformable-small where what moves
+    cannot be followed)."""
     effects: Literal["preset", "auto"] = "preset"
     """auto: look at the capture first and take the effects that it calls for, in the
     representation and size of the preset (see experiments.inspect_scene)."""
@@ -99,7 +99,7 @@ def _outcome(args):
                 **common,
             )
     config = RunConfig(
-        preset=_preset(args),
+        preset=args.preset,
         source=cli.plain(args.source),
         steps=args.steps,
         overrides=args.set,
@@ -124,11 +124,11 @@ def _check_resumed(args):
 def _threads(args):
     """How many cores the representation wants XLA to see."""
     found = representations.of_run(args.out) if args.resume else None
-    return (found or representations.of_preset(_preset(args))).threads
-
-
-def _preset(args):
-    return args.preset or DEFAULT_PRESET
+    if found is None:
+        if args.preset is None:  # what is chosen by the capture are splats
+            return representations.named("gaussians").threads
+        found = representations.of_preset(args.preset)
+    return found.threads
 
 
 def _expected(args):

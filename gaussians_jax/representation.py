@@ -13,6 +13,9 @@ from gaussians_jax import (
     variants,
 )
 from gaussians_jax.effects.motion_basis import BasisMotionSpec
+from nerfies_jax.capture import pinholes
+from nerfies_jax.capture.cache import CACHE
+from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation.representation import (
     MODEL,
     Choice,
@@ -20,6 +23,7 @@ from nerfies_jax.evaluation.representation import (
     Representation,
     Saved,
 )
+from nerfies_jax.evidence import record, usable_paths
 from nerfies_jax.evidence.findings import DEPTH, LIGHT, MOTION, START, TRANSIENT
 from nerfies_jax.training.effects import Effect
 from nerfies_jax.training.model import TrainState
@@ -66,7 +70,9 @@ def advise(wanted: dict[str, bool | None], full: bool) -> Choice:
     """The preset and its changes for what a capture calls for."""
     del full  # no effect of splats has another size in the papers' presets
     overrides, notes = [], []
-    preset = "splats-static" if wanted.get(MOTION) is False else "splats-deformable"
+    preset = "splats-deformable"
+    if wanted.get(MOTION) is not None:
+        preset = "splats-tracked" if wanted[MOTION] else "splats-static"
     if wanted.get(LIGHT):
         notes.append(f"{LIGHT}: splats have none; prefer the field")
     if wanted.get(TRANSIENT) and preset == "splats-static":
@@ -76,6 +82,22 @@ def advise(wanted: dict[str, bool | None], full: bool) -> Choice:
     if wanted.get(DEPTH):
         overrides.append("depth.weight=0.1")
     return Choice(preset, tuple(overrides), tuple(notes))
+
+
+def default_preset(capture: Capture) -> Choice:
+    """The small preset by what tracks say of the capture, gathered or from the cache.
+
+    Few rigid motions where tracks tell them, no motion where nothing moves, and a
+    network where tracks are of no use: without tracks the former come out worse.
+    """
+    pictures = pinholes.as_pinholes(capture)
+    evidence = record.cached(pictures, CACHE / "evidence")
+    reason = usable_paths.unusable(evidence)
+    if not reason:
+        return Choice("splats-tracked-small")
+    if usable_paths.stands_still(evidence, capture.times):
+        return Choice("splats-static-small", notes=(reason,))
+    return Choice("splats-deformable-small", notes=(f"tracks are of no use: {reason}",))
 
 
 GAUSSIANS = Representation(
@@ -101,6 +123,7 @@ GAUSSIANS = Representation(
     follow=point_tracks.follow,
     mover=point_tracks.mover,
     advise=advise,
+    default_preset=default_preset,
     prices={
         MOTION: Pair("splats-deformable-small", "only_motion"),
         DEPTH: Pair("sonata-small", "only_depth"),

@@ -62,6 +62,7 @@ RADIANCE = Representation(
     save=lambda *_, **__: Saved(),  # the checkpoint holds all there is
     follow=point_tracks.follow,
     mover=point_tracks.mover,
+    default_preset=None,
     advise=advise,
     # Motion brings the elastic penalty along.
     prices={

@@ -5,6 +5,7 @@ import itertools
 from experiments.ablate.arms import Arm, Suite
 from nerfies_jax.evidence.findings import (
     BACKGROUND,
+    CANNOT_TELL,
     CERTAIN,
     DEPTH,
     LIGHT,
@@ -30,11 +31,16 @@ def advice() -> Suite:
 
 
 def _arms():
-    """What is undecided keeps what one of the decisions leads to: two are enough."""
+    """What is undecided keeps what one of the decisions leads to, but for motion."""
     kinds = representations.installed().values()
     for full, kind in itertools.product((False, True), kinds):
-        for choices in itertools.product((True, False), repeat=len(DECIDING)):
+        choices_of = [(True, False)] * len(DECIDING)
+        choices_of[DECIDING.index(MOTION)] = (True, False, None)
+        for choices in itertools.product(*choices_of):
             decided = zip(DECIDING, choices, strict=True)
-            findings = tuple(Finding(x, "", "", y, CERTAIN) for x, y in decided)
+            findings = tuple(
+                Finding(x, "", "", y, CANNOT_TELL if y is None else CERTAIN)
+                for x, y in decided
+            )
             advised = adviser.advise(findings, kind, full)
             yield name_of(advised), Arm(advised.preset, advised.overrides)

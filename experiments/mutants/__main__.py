@@ -13,6 +13,7 @@ faults of old were of these kinds.
 
 import concurrent.futures
 import dataclasses
+import hashlib
 import json
 import pathlib
 import queue
@@ -75,11 +76,7 @@ def main(arguments=None):
             finally:
                 copies.put(copy)
 
-        tests = default_tests(ROOT)
-        lists = workers.map(
-            lambda test: with_copy(lambda copy: reached_by(test, copy)), tests
-        )
-        reached = dict(zip(tests, map(set, lists), strict=True))
+        reached = _reached(args.out, workers, with_copy)
         seconds = 60 * args.minutes
         tries = workers.map(
             lambda fault: with_copy(lambda copy: tried(fault, copy, reached, seconds)),
@@ -93,6 +90,44 @@ def main(arguments=None):
     print(page({"rows": rows}))
 
 
+def _reached(out, workers, with_copy):
+    """What each file of tests enters, kept beside `out` for this very source."""
+    from nerfies_jax.capture.json_files import write_json
+
+    path = out.with_suffix(".reached.json")
+    digest = hashlib.blake2b(b"".join(sorted(map(_told, _files())))).hexdigest()
+    stored = json.loads(path.read_text()) if path.exists() else {}
+    found = stored["reached"] if stored.get("digest") == digest else {}
+
+    def run(test):
+        return test, with_copy(lambda copy: reached_by(test, copy))
+
+    left = [test for test in default_tests(ROOT) if test not in found]
+    jobs = [workers.submit(run, test) for test in left]
+    try:
+        for job in concurrent.futures.as_completed(jobs):
+            test, places = job.result()
+            found[test] = places
+            write_json(path, {"digest": digest, "reached": found})
+    finally:
+        for job in jobs:
+            job.cancel()
+    return {test: set(places) for test, places in found.items()}
+
+
+def _told(name):
+    return name.encode() + (ROOT / name).read_bytes()
+
+
+def _files():
+    """What git keeps of the checkout and is there."""
+    files = subprocess.run(
+        ["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    names = filter(None, files.stdout.split("\0"))
+    return [name for name in names if (ROOT / name).exists()]
+
+
 def _is_row_of(fault, row):
     return row["at"] == f"{fault.path}:{fault.line}" and row["text"] == fault.text
 
@@ -103,14 +138,9 @@ def _stored(path, seed):
 
 
 def _copied(folder):
-    """What git keeps of the checkout, as it stands."""
-    files = subprocess.run(
-        ["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    for name in filter(None, files.stdout.split("\0")):
-        if (ROOT / name).exists():
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (folder / name).write_bytes((ROOT / name).read_bytes())
+    for name in _files():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes((ROOT / name).read_bytes())
     return folder
 
 

@@ -25,11 +25,14 @@ class Saved(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """A preset, by its name without "-small", and what to change in it."""
+    """A preset, and what to change in it.
+
+    Advice names it without "-small", a default preset as it is.
+    """
 
     preset: str
-    overrides: tuple[str, ...]
-    notes: tuple[str, ...]  # what could not be decided or done
+    overrides: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # what could not be decided or done
 
 
 class Pair(NamedTuple):
@@ -79,6 +82,8 @@ class Representation(NamedTuple):
     mover: Mover
     # ({effect: whether it is called for, None unknown}, papers' sizes) -> what to take
     advise: Callable[[dict[str, bool | None], bool], Choice]
+    # What to take for a capture where the user names no preset.
+    default_preset: Callable[[Capture], Choice] | None
     prices: dict[str, Pair]  # by effect, as in `nerfies_jax.evidence.findings`
 
 

@@ -13,6 +13,7 @@ from nerfies_jax.training.track_start import TrackStartSpec
 
 LEAST_SEEN = 6  # frames in which a path is known
 LEAST_PATHS = 12
+LEAST_MOVING = 0.005  # of the pixels: films of still scenes have up to 0.4 % marked
 
 
 class KnownPaths(NamedTuple):
@@ -47,9 +48,24 @@ def unusable(evidence: Evidence) -> str:
     """Why a motion cannot start from these tracks; empty where it can."""
     if evidence.unusable:
         return evidence.unusable
-    if len(known_paths(evidence).known) < LEAST_PATHS:
-        return "hardly any track moves by itself"
+    if _hardly_moves(evidence):
+        return f"only {evidence.moving.mean():.1%} of the pixels move by themselves"
     return ""
+
+
+def stands_still(evidence: Evidence, times: np.ndarray) -> bool:
+    """Whether there is nothing to move: one moment, or tracks that all stand still.
+
+    `times` are the capture's, of all its frames.
+    """
+    if np.ptp(times[evidence.row]) == 0:
+        return True
+    return not evidence.unusable and _hardly_moves(evidence)
+
+
+def _hardly_moves(evidence):
+    few = len(known_paths(evidence).known) < LEAST_PATHS
+    return few or float(evidence.moving.mean()) < LEAST_MOVING
 
 
 def known_paths(evidence: Evidence) -> KnownPaths:

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation.representation import Representation
 from nerfies_jax.evidence.findings import Finding, table
 from nerfies_jax.runs import prices, representations
@@ -58,6 +59,20 @@ def advise_for(findings: tuple[Finding, ...], preset: str) -> Advice:
     """In the representation and size of a preset."""
     full = not preset.endswith("-small")
     return advise(findings, representations.of_preset(preset), full)
+
+
+def by_tracks(config: RunConfig, capture: Capture) -> tuple[RunConfig, list[str]]:
+    """A config that names no preset with the one its capture calls for, and why."""
+    chooses = [
+        each.default_preset
+        for each in representations.installed().values()
+        if each.default_preset is not None
+    ]
+    if not chooses:
+        raise ValueError("name a preset: nothing that is installed has a default one")
+    choice = chooses[0](capture)
+    lines = [f"preset: {choice.preset}" + "".join(f" ({n})" for n in choice.notes)]
+    return dataclasses.replace(config, preset=choice.preset), lines
 
 
 def follow(

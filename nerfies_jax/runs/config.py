@@ -47,7 +47,8 @@ class CaptureSource:
 class RunConfig:
     """What fixes a run: kept in its `config.json` and enough to open it again."""
 
-    preset: str
+    # None: what the capture calls for, by its tracks; a saved run names it.
+    preset: str | None = None
     source: CaptureSource = CaptureSource()
     steps: int | None = None  # the preset's own; schedules stretch with them
     overrides: tuple[str, ...] = ()  # of the preset's fields, as for --set

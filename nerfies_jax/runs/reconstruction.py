@@ -132,12 +132,17 @@ def _steps_given(config):
 
 
 def _new_run(config, effects):
-    if effects == "preset":
-        return new_run(config)
-    scene_spec(config)  # refuses a wrong preset before half a minute's look
+    if config.preset is not None:
+        scene_spec(config)  # refuses a wrong preset before half a minute's look
+        if effects == "preset":
+            return new_run(config)
     stored = stored_capture(config.source, config.seed)
-    found = inspection.inspect(stored)
-    config, lines = adviser.follow(config, found.findings)
+    lines = []
+    if config.preset is None:
+        config, lines = adviser.by_tracks(config, stored)
+    if effects == "auto":
+        found = inspection.inspect(stored)
+        config, lines = adviser.follow(config, found.findings)
     print("\n".join(lines))
     return new_run(config, stored)
 

@@ -176,7 +176,7 @@ def test_a_film_without_tracks_starts_from_rest_and_says_why(tmp_path, monkeypat
     model = scene.build(
         small_scene(start=StartSpec(motion="tracks")), scene.metadata_of(capture)
     )
-    with pytest.warns(RuntimeWarning, match="hardly any track moves"):
+    with pytest.warns(RuntimeWarning, match="of the pixels move by themselves"):
         model.init(capture, jax.random.key(0))
 
 

@@ -1,0 +1,34 @@
+"""The preset that a capture calls for where the user names none."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from gaussians_jax import representation
+from tests.evidence import films
+from tests.evidence.test_tracks import MOVES
+
+SPLATS = "splats-{}-small"
+
+
+def jumping():
+    """Every picture of its own: nothing can be carried from one to the next."""
+    film = films.film(frames=12)
+    noise = np.random.default_rng(0).integers(0, 255, film.images.shape, np.uint8)
+    return dataclasses.replace(film, images=noise)
+
+
+@pytest.mark.parametrize(
+    ("make", "kind", "words"),
+    [
+        (lambda: films.film(**MOVES, frames=24), "tracked", ""),
+        (lambda: films.film(frames=24), "static", "of the pixels move by themselves"),
+        (jumping, "deformable", "the camera jumps"),
+    ],
+)
+def test_motion_is_chosen_by_what_tracks_say(make, kind, words, tmp_path, monkeypatch):
+    monkeypatch.setattr(representation, "CACHE", tmp_path)
+    choice = representation.default_preset(make())
+    assert choice.preset == SPLATS.format(kind)
+    assert words in "".join(choice.notes)
