@@ -81,55 +81,27 @@ def fit(
     """
     if not paths.known.any():
         raise ValueError("no path is known anywhere: nothing to fit a warp to")
-    names = [effect.name for effect in made.effects if effect.displace is not None]
-    moved = {name: params[name] for name in (*names, "codes")}
-    canonical = jnp.asarray(_first_places(paths))
-    position = jnp.asarray(np.moveaxis(paths.position, 1, 0))
-    weight = jnp.asarray(paths.known.T, position.dtype)
-    together = min(FRAMES_AT_ONCE, len(paths.time))
-
-    def condition_of(own, frame):
-        view = View(None, jnp.asarray(paths.time)[frame], appearance[frame])
-        return FrameCondition(view.time, made.codes_at(params | own, view), trained)
-
-    appearance = jnp.asarray(paths.appearance)
-    trained = jnp.asarray(made.spec.steps)  # all bands of the warp are open
-
-    def off(own, canonical, frames, rows, still):
-        def one(frame):
-            condition = condition_of(own, frame)
-
-            def carried(point):
-                return made.displace(params | own, point, condition)
-
-            here = position[frame][rows]
-            gap = here + jax.vmap(carried)(here) - canonical[rows]
-            return _length(gap), _length(jax.vmap(carried)(still))
-
-        moving, resting = jax.vmap(one)(frames)
-        counted = weight[frames][:, rows]
-        total = jnp.sum(moving * counted) / jnp.maximum(jnp.sum(counted), 1)
-        return total, jnp.sum(resting) / max(resting.size, 1)
+    distances = _distances(made, params, paths)
+    frames, points = len(paths.time), len(paths.known)
+    together = min(FRAMES_AT_ONCE, frames)
 
     def loss(free, key):
         frame_key, row_key, still_key = jax.random.split(key, 3)
-        frames = jax.random.choice(
-            frame_key, len(paths.time), (together,), replace=False
-        )
-        rows = jax.random.randint(row_key, (POINTS_AT_ONCE,), 0, len(paths.known))
-        moving, resting = off(*free, frames, rows, _some(paths.still, still_key))
-        return moving + resting
+        chosen = jax.random.choice(frame_key, frames, (together,), replace=False)
+        rows = jax.random.randint(row_key, (POINTS_AT_ONCE,), 0, points)
+        still = _some(paths.still, still_key)
+        return sum(distances(*free, chosen, rows, still))
 
     adam = optax.scale_by_adam()
-    rate = start.fit_rate
 
     def step(state, key_and_count):
         free, moments = state
         key, count = key_and_count
         grads = jax.grad(loss)(free, key)
         updates, moments = adam.update(grads, moments)
-        share = rate * LAST_RATE ** (count.astype(position.dtype) / start.fit_steps)
-        return (apply_updates(free, updates, share), moments), None
+        share = LAST_RATE ** (count.astype(paths.position.dtype) / start.fit_steps)
+        free = apply_updates(free, updates, start.fit_rate * share)
+        return (free, moments), None
 
     @jax.jit
     def run(free):
@@ -139,15 +111,51 @@ def fit(
 
     @jax.jit
     def mean_distance(free):
-        every = jnp.arange(len(paths.time)), jnp.arange(len(paths.known))
-        return off(*free, *every, jnp.zeros((1, 3), position.dtype))[0]
+        nothing = jnp.zeros((0, 3), paths.position.dtype)
+        return distances(*free, jnp.arange(frames), jnp.arange(points), nothing)[0]
 
+    names = [effect.name for effect in made.effects if effect.displace is not None]
+    free = (
+        {name: params[name] for name in (*names, "codes")},
+        jnp.asarray(_first_places(paths)),
+    )
     # optax raises floats to a whole number of steps.
     with jax.numpy_dtype_promotion("standard"):
-        free = moved, canonical
         found = run(free)
     first, last = float(mean_distance(free)), float(mean_distance(found))
     return WarpFit(params | found[0], found[1], first, last)
+
+
+def _distances(made, params, paths):
+    """(parts of params, places in the template, frames, rows, points at rest) ->
+
+    mean distances of the rows' points from their places, and of those at rest from
+    where they are, field units.
+    """
+    position = jnp.asarray(np.moveaxis(paths.position, 1, 0))
+    weight = jnp.asarray(paths.known.T, position.dtype)
+    time, appearance = jnp.asarray(paths.time), jnp.asarray(paths.appearance)
+    trained = jnp.asarray(made.spec.steps)  # all bands of the warp are open
+
+    def distances(own, canonical, frames, rows, still):
+        def one(frame):
+            view = View(None, time[frame], appearance[frame])
+            codes = made.codes_at(params | own, view)
+            condition = FrameCondition(view.time, codes, trained)
+
+            def moved(point):
+                return made.displace(params | own, point, condition)
+
+            here = position[frame][rows]
+            gap = here + jax.vmap(moved)(here) - canonical[rows]
+            return _length(gap), _length(jax.vmap(moved)(still))
+
+        moving, resting = jax.vmap(one)(frames)
+        counted = weight[frames][:, rows]
+        total = jnp.sum(moving * counted) / jnp.maximum(jnp.sum(counted), 1)
+        return total, jnp.sum(resting) / max(resting.size, 1)
+
+    return distances
 
 
 def _length(gap):
