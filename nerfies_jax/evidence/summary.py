@@ -73,9 +73,18 @@ def lines(found: Summary, evidence: Evidence) -> list[str]:
     """For a person."""
     width, height = found.size
     smaller = f", made {found.factor} times smaller" if found.factor > 1 else ""
+    parts = [
+        f"{words} {seconds:.1f}"
+        for words, seconds in zip(PARTS, evidence.seconds, strict=True)
+    ]
+    took = f"{found.seconds:.0f} s of the processor: " + ", ".join(parts)
     said = [
         f"{found.frames} frames of {width}x{height}{smaller}",
         f"{found.carried:.0%} of the textured pixels can be carried to the next frame",
+    ]
+    if found.unusable:
+        return [*said, took, f"nothing to follow: {found.unusable}"]
+    said += [
         f"{found.moving:.1%} of the pixels move by themselves",
         f"{found.tracks:,} tracks, seen in {found.track_frames:.0f} frames (median); "
         f"{found.moving_tracks:,} of them move by themselves",
@@ -87,14 +96,8 @@ def lines(found: Summary, evidence: Evidence) -> list[str]:
             f"{found.group_miss:.1%} of the distance"
         )
     said.append(f"{found.points:,} dense points at rest{_rest_words(found)}")
-    parts = [
-        f"{words} {seconds:.1f}"
-        for words, seconds in zip(PARTS, evidence.seconds, strict=True)
-    ]
-    said.append(f"{found.seconds:.0f} s of the processor: " + ", ".join(parts))
-    if found.unusable:
-        said.append(f"nothing to follow: {found.unusable}")
-    elif not found.paths:
+    said.append(took)
+    if not found.paths:
         said.append("nothing to follow: no track moves by itself for long enough")
     return said
 
