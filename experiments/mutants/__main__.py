@@ -5,10 +5,9 @@
 
 A copy of the checkout gets one fault at a time (an operator, a sign, a comparison, a
 number, two swapped arguments, somewhere in a function body; modules take turns), and
-the default tests are run until three fail: first the files that enter the function,
-which a run of each file without a fault says, then all others. A fault that nothing
-notices is shown to the full and slow tests of the room as well. Most of the library's
-faults of old were of these kinds.
+the default tests of the files that enter the function are run until three fail; which
+files those are, a run of each without a fault says. What only a process of its own
+enters is not seen. Most of the library's faults of old were of these kinds.
 """
 
 import concurrent.futures

@@ -3,9 +3,8 @@
 import collections
 
 from experiments import markdown
-from experiments.mutants.witnesses import CORE
 
-HARMLESS, NOBODY = "nothing to notice", "nobody"
+NOTICED, HARMLESS, NOBODY = "noticed", "nothing to notice", "nobody"
 # What changes no result, though the source differs: (file, line after the change), why.
 SAME: dict[tuple[str, str], str] = {}
 
@@ -13,22 +12,21 @@ SAME: dict[tuple[str, str], str] = {}
 def page(stored: dict) -> str:
     """The faults, which tests noticed each, and what became of those none noticed."""
     rows = stored["rows"]
-    counts = collections.Counter(_fate(row) for row in rows)
-    seen = sum(counts[name] for name in CORE)
+    counts = collections.Counter(map(_fate, rows))
     faults = len(rows) - counts[HARMLESS]
     heads = ("file and line", "before", "after", "noticed by")
     table = markdown.table(heads, [_cells(row) for row in rows], words=4)
-    fates = markdown.bullets([f"{name}: {count}" for name, count in counts.items()])
+    share = 100 * counts[NOTICED] / max(faults, 1)
+    same = f"; {counts[HARMLESS]} more change no result" if counts[HARMLESS] else ""
     return (
-        f"The default tests notice {seen} of {faults} faults "
-        f"({100 * seen / max(faults, 1):.0f} %); so many by whom, of all {len(rows)}:"
-        f"\n\n{fates}\n\n{table}"
+        f"The default tests notice {counts[NOTICED]} of {faults} faults ({share:.0f} %)"
+        f"{same}. Of the tests that notice a fault up to three are named.\n\n{table}"
     )
 
 
 def _fate(row):
     if row["caught_by"]:
-        return row["looked_in"]
+        return NOTICED
     return HARMLESS if _key(row) in SAME else NOBODY
 
 

@@ -12,8 +12,6 @@ from experiments.mutants.faults import Fault
 
 CAUGHT_BY = 3
 DEFAULT = "not full and not slow"
-CORE = ("default tests that run the function", "other default tests")
-FULL = "full and slow tests of its room"
 PYTEST = [sys.executable, "-m", "pytest", "-q", "-n0", "--tb=no"]
 PYTEST += ["-p", "no:cacheprovider"]
 
@@ -45,64 +43,46 @@ def reached_by(test: str, copy: pathlib.Path) -> list[str]:
 
 
 def tried(
-    fault: Fault, copy: pathlib.Path, reached: dict[str, list[str]], seconds: float
+    fault: Fault, copy: pathlib.Path, reached: dict[str, set[str]], seconds: float
 ) -> dict:
-    """The fault, the tests that notice it, and how far one had to look."""
+    """The fault, and up to three of the default tests that notice it."""
     path = copy / fault.path
     right = path.read_bytes()
     wrong = right[: fault.start] + fault.text.encode() + right[fault.end :]
     began = time.monotonic()
-    row = {
+    tests = asked(fault, reached)
+    path.write_bytes(wrong)
+    try:
+        caught_by = _failures(tests, copy, seconds) if tests else []
+    finally:
+        path.write_bytes(right)
+    return {
         "at": f"{fault.path}:{fault.line}",
         "text": fault.text,
         "before": _line(right, fault.line),
         "after": _line(wrong, fault.line),
-        "caught_by": [],
-        "looked_in": "",
+        "files": len(tests),
+        "caught_by": caught_by,
+        "seconds": round(time.monotonic() - began, 1),
     }
-    path.write_bytes(wrong)
-    try:
-        for name, tests, marks in stages(fault, copy, reached):
-            row["looked_in"] = name
-            if tests:
-                row["caught_by"] = _failures(tests, marks, copy, seconds)
-            if row["caught_by"]:
-                break
-    finally:
-        path.write_bytes(right)
-    return row | {"seconds": round(time.monotonic() - began, 1)}
 
 
 def _line(source, line):
     return source.decode().splitlines()[line - 1].strip()
 
 
-def stages(
-    fault: Fault, copy: pathlib.Path, reached: dict[str, list[str]]
-) -> list[tuple[str, list[str], str]]:
-    """(name, files to run, which marks) in the order in which tests are asked."""
-    file = pathlib.Path(fault.path)
-    package, room = file.parts[0], file.parts[1]
-    if package == "gaussians_jax":
-        room = "gaussians"
-    named = f"test_{file.stem.strip('_')}"
+def asked(fault: Fault, reached: dict[str, set[str]]) -> list[str]:
+    """Files of tests that enter the function, those named after its module first."""
+    named = f"test_{pathlib.Path(fault.path).stem.strip('_')}"
     place = f"{fault.path}:{fault.function}"
-    run_it = sorted(test for test, places in reached.items() if place in places)
-    # Those that are named after the module first.
-    run_it.sort(key=lambda test: not pathlib.Path(test).name.startswith(named))
-    here = copy / "tests" / room
-    its_room = [f"tests/{room}"] if here.is_dir() else run_it
-    others = [test for test in reached if test not in run_it]
-    return [
-        (CORE[0], run_it, DEFAULT),
-        (CORE[1], others, DEFAULT),
-        (FULL, its_room, "full or slow"),
-    ]
+    found = sorted(test for test, places in reached.items() if place in places)
+    found.sort(key=lambda test: not pathlib.Path(test).name.startswith(named))
+    return found
 
 
-def _failures(tests, marks, copy, seconds):
+def _failures(tests, copy, seconds):
     """Names of up to three tests that fail; the run itself, where it does not end."""
-    command = [*PYTEST, "-m", marks, "-rfE", f"--maxfail={CAUGHT_BY}", *tests]
+    command = [*PYTEST, "-m", DEFAULT, "-rfE", f"--maxfail={CAUGHT_BY}", *tests]
     try:
         ran = subprocess.run(
             command, cwd=copy, capture_output=True, text=True, timeout=seconds
