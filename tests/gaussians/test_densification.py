@@ -83,6 +83,13 @@ def test_observe_counts_visible_views_in_ndc_units(dtype):
     assert stats.grad2d.dtype.name == dtype
 
 
+@pytest.mark.parametrize(("active", "capacity"), [(200, 256), (500, 1024)])
+def test_buckets_shrink_once_less_than_four_ninths_are_in_use(active, capacity):
+    logit = np.where(np.arange(1024) < active, 0.0, rows.INACTIVE_LOGIT)
+    changed = run(*make(1024, opacity_logit=logit))
+    assert changed.report == densification.Report(active=active, capacity=capacity)
+
+
 def test_a_small_row_is_cloned_and_its_clone_starts_without_moments(dtype):
     params, moments, stats = make(dtype=dtype)
     changed = run(params, moments, hot(stats, [2]))

@@ -244,6 +244,15 @@ def train(state, steps, **settings):
     return loop.fit(model, state, frames, steps=steps, console=QUIET, **settings).state
 
 
+def test_the_event_of_a_scene_adds_rows_and_makes_effects_look_again():
+    model, state, frames = built(SCENE)
+    (event,) = model.events
+    assert event.steps[0] == 4
+    after = event.apply(state, frames)
+    assert model.counts(after)["gaussians"] == 210
+    assert jax.tree.structure(after) == jax.tree.structure(state)
+
+
 @pytest.mark.full
 def test_a_moving_scene_grows_to_the_cap_and_resumes_bit_for_bit(tmp_path):
     model, first, _ = built(SCENE)

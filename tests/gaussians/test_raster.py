@@ -77,6 +77,18 @@ def test_the_capacity_never_changes_picture_or_gradient(float64, rng):
     whole = picture_and_slopes(footprints, values, SIZE, QUICK)
     spec = dataclasses.replace(QUICK, capacity=5, kept_chunks=3)
     close(picture_and_slopes(footprints, values, SIZE, spec), whole, 1e-12)
+    # Slopes by each column of the whitening, against differences.
+    for column in range(3):
+        along = np.zeros_like(whitening)
+        along[:, column] = rng.normal(size=COUNT) * whitening[:, column]
+
+        def at(step, along=along):
+            moved = footprints._replace(whitening=whitening + step * along)
+            image, left = picture_and_slopes(moved, values, SIZE, QUICK)[0]
+            return np.sin(3 * image).sum() + (left**2).sum()
+
+        slope = (at(1e-6) - at(-1e-6)) / 2e-6
+        assert (whole[1][1] * along).sum() == pytest.approx(slope, rel=1e-5, abs=1e-6)
 
 
 def check_against_dense(image, left, footprints, conics, values, size, dtype):

@@ -37,6 +37,20 @@ def both(devices):
     shared.close(bands, whole, 1e-12)
 
 
+def test_bands_have_the_size_of_the_picture():
+    footprints, _ = test_raster.some_footprints(
+        np.random.default_rng(0), 80, SIZE, "float32"
+    )
+    values = np.zeros((80, 5), np.float32)
+    image, left = jax.eval_shape(
+        lambda f, v: raster_bands.rasterise_bands(f, v, SIZE, GSPLAT, jax.devices()),
+        footprints,
+        values,
+    )
+    assert image.shape == (*SIZE[::-1], 5)
+    assert left.shape == SIZE[::-1]
+
+
 @pytest.mark.full
 def test_one_device_draws_the_whole_picture(float64):
     both(1)

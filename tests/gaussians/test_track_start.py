@@ -13,6 +13,7 @@ from gaussians_jax import path_fit, presets, scene, spec, splats, track_start
 from gaussians_jax.effects.se3_bases import SE3BasesSpec
 from gaussians_jax.initialisation import StartSpec
 from gaussians_jax.path_fit import Points
+from nerfies_jax import evaluation
 from nerfies_jax.evidence import record, usable_paths
 from tests.evidence import films
 from tests.evidence.test_tracks import MOVES
@@ -168,6 +169,9 @@ def test_a_scene_starts_from_the_evidence(tmp_path, monkeypatch):
     assert abs(np.median(wall[:, 2]) - films.FAR) < 0.05
     quick = model.example(capture, jax.random.key(0))
     assert jax.tree.structure(quick) == jax.tree.structure(state)
+    # It moves from its first step on.
+    once, _ = jax.eval_shape(model.step, state, evaluation.frames_of(capture))
+    assert jax.tree.structure(once) == jax.tree.structure(state)
 
 
 def test_a_film_without_tracks_starts_from_rest_and_says_why(tmp_path, monkeypatch):

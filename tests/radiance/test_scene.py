@@ -12,6 +12,7 @@ from nerfies_jax import evaluation, render_ray, scene
 from nerfies_jax.effects.ambient import AmbientSpec
 from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.effects.background import BackgroundSpec
+from nerfies_jax.effects.scene_flow import SceneFlowSpec
 from nerfies_jax.effects.warp import WarpSpec
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.radiance.template import TemplateSpec
@@ -274,3 +275,34 @@ def test_an_unfilmed_pixel_teaches_nothing():
     nothing = frames._replace(valid=np.zeros(frames.images.shape[:3], bool))
     _, metrics = jax.jit(model.step)(state, nothing)
     assert float(metrics["loss"]) == 0
+
+
+@pytest.mark.parametrize(("logit", "without"), [(-60.0, ("scene_flow",)), (60.0, ())])
+def test_a_medium_has_the_share_that_it_is_given(logit, without):
+    """All to what is static is the static field; all to the medium hides that."""
+    spec = dataclasses.replace(
+        STATIC, scene_flow=SceneFlowSpec(network=TINY_TEMPLATE, time=EncodingSpec(2))
+    )
+    metadata = scene.metadata_of(scenes.tiny_capture(), spec)
+    made = scene.field(spec, metadata)
+    ray = render_ray.field_ray(
+        metadata, *(jnp.asarray(x) for x in ([0.0, 0, 0], [0.0, 0, 1])), jnp.float32(1)
+    )
+    condition = FrameCondition(jnp.float32(0.3), {}, jnp.int32(0))
+
+    @jax.jit
+    def both(key):
+        params = made.init(key)
+        flow = params["scene_flow"]
+        blend = flow.blend._replace(bias=jnp.full_like(flow.blend.bias, logit))
+        params["scene_flow"] = flow._replace(blend=blend)
+        other = scene.field(spec, metadata, without)
+        moved = jax.tree.map(lambda leaf: leaf + 1, params["template"])
+        changed = params if without else params | {"template": moved}
+        return (
+            made.render_ray(params, ray, condition)[-1].colour,
+            other.render_ray(changed, ray, condition)[-1].colour,
+        )
+
+    # Samples go where the changed coarse level sends them.
+    np.testing.assert_allclose(*both(jax.random.key(0)), atol=1e-3)

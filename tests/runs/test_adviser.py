@@ -7,6 +7,7 @@ import pytest
 from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.evidence.findings import CANNOT_TELL, CERTAIN, Finding
 from nerfies_jax.runs import adviser, representations
+from nerfies_jax.runs.config import RunConfig
 from nerfies_jax.training import specs
 from tests import scenes
 
@@ -50,6 +51,16 @@ def test_a_still_scene_gets_no_motion_and_a_moving_one_gets_it():
     assert spec_of("gaussians", motion=True)[0].motion is not None
     assert spec_of("radiance", motion=False)[0].warp is None
     assert spec_of("radiance", motion=True)[0].warp is not None
+
+
+def test_advice_is_followed_but_for_what_the_user_sets():
+    asked = RunConfig("splats-static-small", overrides=("depth.weight=0.5",))
+    found = findings(motion=True, depth=True)
+    config, lines = adviser.follow(asked, found)
+    assert config.preset == "splats-tracked-small"
+    assert config.overrides == ("depth.weight=0.1", "depth.weight=0.5")
+    assert any(line.split()[:3] == ["motion", "yes", "certain"] for line in lines)
+    assert "effects: --preset splats-tracked-small --set depth.weight=0.1" in lines
 
 
 def test_what_cannot_be_told_keeps_the_default_that_moves():
