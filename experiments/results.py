@@ -116,7 +116,8 @@ STUDIES = {
     "raster_speed": _package(
         "raster_speed", "--out raster_speed.json", page="__main__"
     ),
-    "mutants": _package("mutants"),
+    "mutants": _package("mutants", "--count 44"),
+    "mutants_unseen": _package("mutants_unseen", "--count 24 --seed 1", of="mutants"),
     "frequency_gates": _study("frequency_gates", "--out frequency_gates"),
     "appearance_codes": _study(
         "appearance_codes", "--scene exposure --out appearance_codes"

@@ -86,7 +86,7 @@ def main(arguments=None):
             print(row["at"], "|", row["after"], "|", row["caught_by"], flush=True)
             stored = {"machine": clock.machine(), "seed": args.seed, "rows": rows}
             write_json(args.out, stored)
-    print(page({"rows": rows}))
+    print(page({"rows": rows, "seed": args.seed}))
 
 
 def _reached(out, workers, with_copy):
