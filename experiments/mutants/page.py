@@ -22,15 +22,14 @@ def page(stored: dict) -> str:
     heads = ("file and line", "before", "after", "noticed by")
     table = markdown.table(heads, [_cells(row) for row in rows], words=4)
     share = 100 * counts[NOTICED] / max(faults, 1)
-    seed = (
-        "Core was strengthened until it noticed most of these faults."
-        if stored["seed"] == 0
-        else "No test was written because of these faults: so much core notices of any."
-    )
+    seed = "No test was written because of these: so much of any faults is noticed."
+    if stored["seed"] == 0:
+        seed = "Core was strengthened until it noticed most of these."
     same = f"; {counts[HARMLESS]} more change no result" if counts[HARMLESS] else ""
     return (
         f"The default tests notice {counts[NOTICED]} of {faults} faults ({share:.0f} %)"
-        f"{same}. {seed} Of the tests that notice a fault up to three are named.\n\n{table}"
+        f"{same}. {seed} Of the tests that notice a fault up to three are named."
+        f"\n\n{table}"
     )
 
 
