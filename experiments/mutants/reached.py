@@ -16,11 +16,13 @@ def _note(frame, _event, _argument):
 
 
 def pytest_configure():
+    """Note every function that is entered from now on."""
     threading.settrace(_note)
     sys.settrace(_note)
 
 
 def pytest_unconfigure():
+    """Write those of the packages as "file:line" of where they begin."""
     sys.settrace(None)
     threading.settrace(None)
     found = set()

@@ -13,7 +13,6 @@ from nerfies_jax.capture.synthetic import SceneTruth
 from nerfies_jax.evidence import dense_flow, paths, record, view_set
 from nerfies_jax.evidence import tracks as tracking
 from nerfies_jax.evidence.record import Evidence
-from nerfies_jax.evidence.rest_points import RestPoints
 from nerfies_jax.evidence.tracks import Tracks
 from nerfies_jax.evidence.usable_paths import scene_unit
 
@@ -107,10 +106,7 @@ def _path_error(capture, views, evidence, followed, points):
         return np.nan
     still = evidence.score < paths.AT_REST
     around = paths.depth_around(
-        followed,
-        evidence.tracks.take(still),
-        RestPoints(*(part[still] for part in evidence.rest)),
-        capture.near,
+        followed, evidence.tracks.take(still), evidence.rest.take(still), capture.near
     )
     found = paths.least_acceleration(views, followed, capture.near, around)
     error = np.linalg.norm(found.position - points.position[long], axis=-1)

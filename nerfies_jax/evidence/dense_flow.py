@@ -96,19 +96,28 @@ def between_neighbours(views: Views, pictures: np.ndarray) -> NeighbourFlow:
     def flow(one, other):
         return reduced(search(pictures[one], pictures[other]), times)
 
-    shape = (frames, height, width)
-    forward, backward = np.zeros((2, *shape, 2), np.float32)
-    forward_seen, backward_seen = np.zeros((2, *shape), bool)
+    forward, backward = np.zeros((2, frames, height, width, 2), np.float32)
     for frame in range(frames - 1):
-        there, back = flow(frame, frame + 1), flow(frame + 1, frame)
-        forward[frame], backward[frame + 1] = there, back
-        forward_seen[frame] = closed(there, back)
-        backward_seen[frame + 1] = closed(back, there)
-    found = NeighbourFlow(forward, forward_seen, backward, backward_seen)
+        forward[frame] = flow(frame, frame + 1)
+        backward[frame + 1] = flow(frame + 1, frame)
+    found = checked(forward, backward)
     for frame in range(1, frames - 1):
         if _lost(found, frame):
             _go_on(found, frame, pictures, search)
     return found
+
+
+def checked(forward: np.ndarray, backward: np.ndarray) -> NeighbourFlow:
+    """Flow [frames, height, width, 2] to the next and the previous frame, as `closed`.
+
+    The last frame's forward flow and the first one's backward flow are not seen.
+    """
+    forward_seen, backward_seen = np.zeros((2, *forward.shape[:3]), bool)
+    for frame in range(len(forward) - 1):
+        there, back = forward[frame], backward[frame + 1]
+        forward_seen[frame] = closed(there, back)
+        backward_seen[frame + 1] = closed(back, there)
+    return NeighbourFlow(forward, forward_seen, backward, backward_seen)
 
 
 def _lost(flow, frame):

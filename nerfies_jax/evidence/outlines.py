@@ -11,6 +11,7 @@ import scipy.ndimage as nd
 from nerfies_jax.evidence import view_set
 from nerfies_jax.evidence.findings import LIKELY, Finding, cannot_tell, judge
 from nerfies_jax.evidence.findings import MOTION as EFFECT
+from nerfies_jax.evidence.rest_points import across_ray
 from nerfies_jax.evidence.view_set import Views
 
 MIN_VIEWS = 8  # fewer cut little away, at rest or not
@@ -106,7 +107,7 @@ def _box(views, shapes):
     A coarse grid is cut first; None where nothing is left.
     """
     axes = views.rotation[:, 2]
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    across = across_ray(axes)
     pull = np.einsum("nij,nj->i", across, views.position)
     aim = np.linalg.lstsq(across.sum(0), pull, rcond=None)[0]
     reach = np.median(np.linalg.norm(views.position - aim, axis=1))

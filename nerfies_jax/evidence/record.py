@@ -200,8 +200,7 @@ def _depths(capture, given, views, tracks, rest, score, use_depths):
         own = use_depths and capture.depths is not None
         return capture.depths[views.row] if own else None
     still = score < paths.AT_REST
-    points = RestPoints(*(part[still] for part in rest))
-    depth, miss = given_depth.aligned(depth, tracks.take(still), points)
+    depth, miss = given_depth.aligned(depth, tracks.take(still), rest.take(still))
     if miss > given_depth.USABLE:
         raise ValueError(
             f"{capture.path or capture.name}: the given depths, or their inverse, miss "
@@ -214,10 +213,7 @@ def _depths(capture, given, views, tracks, rest, score, use_depths):
 def _paths(capture, views, tracks, rest, score, which, depths):
     still, moved = score < paths.AT_REST, tracks.take(which)
     around = paths.depth_around(
-        moved,
-        tracks.take(still),
-        RestPoints(*(part[still] for part in rest)),
-        capture.near,
+        moved, tracks.take(still), rest.take(still), capture.near
     )
     measured = None if depths is None else _measured(depths, moved)
     return paths.least_acceleration(views, moved, capture.near, around, measured)

@@ -22,6 +22,10 @@ class RestPoints(NamedTuple):
     residual: np.ndarray  # [tracks, frames] px; NaN where the track is not seen
     depth: np.ndarray  # [tracks, frames] z-depth of the point
 
+    def take(self, which: np.ndarray) -> "RestPoints":
+        """Those chosen by index or mask."""
+        return RestPoints(*(part[which] for part in self))
+
 
 def track_rays(views: Views, tracks: Tracks) -> np.ndarray:
     """[tracks, frames, 3]: world directions through the tracks, of z-depth one."""

@@ -41,8 +41,9 @@ def of(views: Views, evidence: Evidence) -> Summary:
     """The numbers; `views` are those that were looked at."""
     tracks, paths = evidence.tracks, evidence.paths
     still = np.flatnonzero(evidence.score < MOVES)
-    points = type(evidence.rest)(*(part[still] for part in evidence.rest))
-    parallax = still_points.depth_deviation(views, tracks.take(still), points)
+    parallax = still_points.depth_deviation(
+        views, tracks.take(still), evidence.rest.take(still)
+    )
     distance = scene_unit(evidence)
     groups, miss = 0, np.nan
     kept = paths.known.any(1)

@@ -19,12 +19,7 @@ def flow(given: Given, views: Views) -> NeighbourFlow | None:
         np.stack([_resized_flow(one, views.size) for one in side[views.row]])
         for side in (given.forward, given.backward)
     )
-    seen = np.zeros((2, *forward.shape[:3]), bool)
-    for frame in range(len(views.row) - 1):
-        there, back = forward[frame], backward[frame + 1]
-        seen[0, frame] = dense_flow.closed(there, back)
-        seen[1, frame + 1] = dense_flow.closed(back, there)
-    return NeighbourFlow(forward, seen[0], backward, seen[1])
+    return dense_flow.checked(forward, backward)
 
 
 def tracks(given: Given, views: Views) -> Tracks | None:
