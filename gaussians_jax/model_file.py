@@ -188,4 +188,4 @@ def _put_together(structure, archive):
     fields = {
         key: _put_together(item, archive) for key, item in structure["fields"].items()
     }
-    return specs.made(record, fields)
+    return specs.build_record(record, fields)

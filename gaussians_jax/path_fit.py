@@ -131,5 +131,5 @@ def fit(
     mean_distance = jax.jit(lambda points: distance(points, every))
     # optax raises floats to a whole number of steps.
     with jax.numpy_dtype_promotion("standard"):
-        found = run(start)
-    return PathFit(found, float(mean_distance(start)), float(mean_distance(found)))
+        fitted = run(start)
+    return PathFit(fitted, float(mean_distance(start)), float(mean_distance(fitted)))

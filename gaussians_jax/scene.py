@@ -362,12 +362,12 @@ def _from_tracks(spec, effects, capture, key):
     evidence = usable_paths.evidence_to_start_from(capture, spec.start)
     if evidence is None:
         return None, capture
-    found = track_start.start(
+    seeds = track_start.start(
         spec.start, effects[0], spec.motion, evidence, capture, key
     )
     if len(evidence.still.position) > initialisation.point_count(capture):
         capture = dataclasses.replace(capture, points=evidence.still)
-    return found, capture
+    return seeds, capture
 
 
 def count_rows(state: TrainState) -> dict[str, int]:

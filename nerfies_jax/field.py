@@ -162,7 +162,7 @@ def look_up(
     appearance: Int[Array, ""],
 ) -> Codes:
     """The codes of one frame: between rows where its time was not learnt from."""
-    found = {}
+    frame_codes = {}
     for table in tables:
         rows = params["codes"][table.name]
         place = (
@@ -170,8 +170,8 @@ def look_up(
             if table.by == MOMENT
             else _place_of_exposure(metadata, appearance, rows.dtype)
         )
-        found[table.name] = codes.blend(rows, *place)
-    return found
+        frame_codes[table.name] = codes.blend(rows, *place)
+    return frame_codes
 
 
 def _place_in_time(metadata, time):

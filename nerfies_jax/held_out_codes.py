@@ -45,22 +45,22 @@ def score(
     whole = scene.field(spec, metadata, effects=effects)
     names = {effect.name for effect in whole.effects}
     passing = tuple(sorted({"transient"} & names))
-    made = scene.field(spec, metadata, passing, effects)
-    tables = _tables(made)
+    field = scene.field(spec, metadata, passing, effects)
+    tables = _tables(field)
     if not tables:
         return None
     params, step = state.params, state.step
-    draw = jax.jit(made.render, static_argnums=4)
+    draw = jax.jit(field.render, static_argnums=4)
 
     @jax.jit
     def solve(params, view, pixels, colours, step):
-        codes = made.codes_at(params, view)
+        codes = field.codes_at(params, view)
 
         def loss(fitted):
             condition = FrameCondition(view.time, codes | fitted, step)
             seen = jax.vmap(
                 lambda pixel: (
-                    made.render_ray(
+                    field.render_ray(
                         params,
                         render_ray.field_ray_through(metadata, view.camera, pixel)[0],
                         condition,
@@ -70,13 +70,13 @@ def score(
             return losses.mse(seen(pixels), colours)
 
         start = {name: codes[name] for name in tables}
-        found = fit.fit_code(loss, start, max_steps=MOST_STEPS, tolerance=TOLERANCE)
-        return codes | found.value
+        solution = fit.fit_code(loss, start, max_steps=MOST_STEPS, tolerance=TOLERANCE)
+        return codes | solution.value
 
     def fit_code(view: View, left: np.ndarray, valid: np.ndarray | None) -> Any:
         place = np.argwhere(np.ones(left.shape[:2], bool) if valid is None else valid)
         if not len(place):  # nothing to go by
-            return made.codes_at(params, view)
+            return field.codes_at(params, view)
         # With repeats: one shape, however little of the half was filmed.
         line, column = place[np.random.default_rng(0).integers(len(place), size=RAYS)].T
         pixels = in_default_precision(np.stack([column, line], axis=1) + 0.5)
@@ -89,6 +89,6 @@ def score(
     return evaluation.score_halves(fit_code, render, capture, rows)
 
 
-def _tables(made):
-    tables = [table for effect in made.effects for table in effect.tables]
+def _tables(field):
+    tables = [table for effect in field.effects for table in effect.tables]
     return sorted({table.name for table in tables if table.by == APPEARANCE})

@@ -47,9 +47,9 @@ class WarpFit(NamedTuple):
     last: float
 
 
-def film_paths(made: Field, capture, evidence: Evidence) -> FilmPaths:
+def film_paths(field: Field, capture, evidence: Evidence) -> FilmPaths:
     """The evidence's paths and points at rest in units of the field; host side."""
-    metadata = made.metadata
+    metadata = field.metadata
 
     def inside(place):
         return ((place - np.asarray(metadata.centre)) * metadata.scale).astype(
@@ -67,7 +67,7 @@ def film_paths(made: Field, capture, evidence: Evidence) -> FilmPaths:
 
 
 def fit(
-    made: Field,
+    field: Field,
     params: PyTree,
     paths: FilmPaths,
     key: Key[Array, ""],
@@ -81,7 +81,7 @@ def fit(
     """
     if not paths.known.any():
         raise ValueError("no path is known anywhere: nothing to fit a warp to")
-    distances = _distances(made, params, paths)
+    distances = _distances(field, params, paths)
     frames, points = len(paths.time), len(paths.known)
     together = min(FRAMES_AT_ONCE, frames)
 
@@ -114,19 +114,19 @@ def fit(
         nothing = jnp.zeros((0, 3), paths.position.dtype)
         return distances(*free, jnp.arange(frames), jnp.arange(points), nothing)[0]
 
-    names = [effect.name for effect in made.effects if effect.displace is not None]
+    names = [effect.name for effect in field.effects if effect.displace is not None]
     free = (
         {name: params[name] for name in (*names, "codes")},
         jnp.asarray(_first_places(paths)),
     )
     # optax raises floats to a whole number of steps.
     with jax.numpy_dtype_promotion("standard"):
-        found = run(free)
-    first, last = float(mean_distance(free)), float(mean_distance(found))
-    return WarpFit(params | found[0], found[1], first, last)
+        fitted = run(free)
+    first, last = float(mean_distance(free)), float(mean_distance(fitted))
+    return WarpFit(params | fitted[0], fitted[1], first, last)
 
 
-def _distances(made, params, paths):
+def _distances(field, params, paths):
     """(parts of params, places in the template, frames, rows, points at rest) ->
 
     mean distances of the rows' points from their places, and of those at rest from
@@ -135,16 +135,16 @@ def _distances(made, params, paths):
     position = jnp.asarray(np.moveaxis(paths.position, 1, 0))
     weight = jnp.asarray(paths.known.T, position.dtype)
     time, appearance = jnp.asarray(paths.time), jnp.asarray(paths.appearance)
-    trained = jnp.asarray(made.spec.steps)  # all bands of the warp are open
+    trained = jnp.asarray(field.spec.steps)  # all bands of the warp are open
 
     def distances(own, canonical, frames, rows, still):
         def one(frame):
             view = View(None, time[frame], appearance[frame])
-            codes = made.codes_at(params | own, view)
+            codes = field.codes_at(params | own, view)
             condition = FrameCondition(view.time, codes, trained)
 
             def moved(point):
-                return made.displace(params | own, point, condition)
+                return field.displace(params | own, point, condition)
 
             here = position[frame][rows]
             gap = here + jax.vmap(moved)(here) - canonical[rows]
@@ -170,8 +170,8 @@ def _some(still, key):
 
 def _first_places(paths):
     """[points, 3]: each where it is known nearest to the middle of its own time."""
-    found = np.zeros((len(paths.known), 3), np.float32)
+    places = np.zeros((len(paths.known), 3), np.float32)
     for row, known in enumerate(paths.known):
         seen = np.flatnonzero(known)
-        found[row] = paths.position[row, seen[len(seen) // 2]]
-    return found
+        places[row] = paths.position[row, seen[len(seen) // 2]]
+    return places

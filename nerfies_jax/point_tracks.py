@@ -21,8 +21,8 @@ def follow(spec, metadata, state, capture, known, effects=()) -> PointTracks | N
     warp of every other moment.
     """
 
-    made = scene.field(spec, metadata, effects=effects)
-    if all(effect.displace is None for effect in made.effects) or not len(known.path):
+    field = scene.field(spec, metadata, effects=effects)
+    if all(effect.displace is None for effect in field.effects) or not len(known.path):
         return None
     views = [evaluation.view_of(capture, int(row)) for row in known.moments]
     views = jax.tree.map(lambda *leaves: jnp.stack(leaves), *views)
@@ -38,15 +38,15 @@ def follow(spec, metadata, state, capture, known, effects=()) -> PointTracks | N
     @jax.jit
     def solve(params, step, start, true, static):
         def condition_of(view):
-            return FrameCondition(view.time, made.codes_at(params, view), step)
+            return FrameCondition(view.time, field.codes_at(params, view), step)
 
         conditions = jax.vmap(condition_of)(views)
         followed = tracks.point_tracks(
-            made.displace, params, start, conditions, known.start
+            field.displace, params, start, conditions, known.start
         )
-        each = jax.vmap(made.displace, (None, 0, None))  # point
+        each = jax.vmap(field.displace, (None, 0, None))  # point
         moved = jax.vmap(each, (None, None, 0))(params, static, conditions)
-        grad = jax.vmap(jax.jacfwd(made.displace, 1), (None, 0, None))
+        grad = jax.vmap(jax.jacfwd(field.displace, 1), (None, 0, None))
         grads = jax.vmap(grad, (None, 1, 0))(params, true, conditions)
         apart = jnp.linalg.norm(moved - jnp.mean(moved, axis=0), axis=-1)
         return followed, apart, grads
@@ -75,27 +75,27 @@ def follow(spec, metadata, state, capture, known, effects=()) -> PointTracks | N
 
 def mover(spec, metadata, effects=()) -> Move | None:
     """What takes points of one view's moment to another's; None without a warp."""
-    made = scene.field(spec, metadata, effects=effects)
-    if all(effect.displace is None for effect in made.effects):
+    field = scene.field(spec, metadata, effects=effects)
+    if all(effect.displace is None for effect in field.effects):
         return None
     centre = np.asarray(metadata.centre, np.float32)
 
     @jax.jit
     def solve(params, step, points, here, there):
         def condition_of(view):
-            return FrameCondition(view.time, made.codes_at(params, view), step)
+            return FrameCondition(view.time, field.codes_at(params, view), step)
 
         views = jax.tree.map(lambda *leaves: jnp.stack(leaves), here, there)
         conditions = jax.vmap(condition_of)(views)
-        found = tracks.point_tracks(made.displace, params, points, conditions, 0)
-        return found.points[:, 1], found.converged[:, 1]
+        tracked = tracks.point_tracks(field.displace, params, points, conditions, 0)
+        return tracked.points[:, 1], tracked.converged[:, 1]
 
     def move(state, points, here, there):
         inside = in_default_precision((points - centre) * np.float32(metadata.scale))
-        found, known = jax.device_get(
+        reached, known = jax.device_get(
             solve(state.params, state.step, inside, here, there)
         )
-        moved = found / np.float32(metadata.scale) + centre
+        moved = reached / np.float32(metadata.scale) + centre
         return Moved(np.where(known[:, None], moved, points), known)
 
     return move

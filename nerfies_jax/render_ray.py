@@ -66,9 +66,9 @@ def field_ray_through(
     metadata: SceneMetadata, camera: Camera, pixel: Float[Array, "2"]
 ) -> tuple[Ray, Scalar]:
     """The field's ray through one pixel position, and its z-depth per distance."""
-    found = rays.pixel_ray(camera, pixel)
-    cosine = rays.depth_per_distance(camera, found.direction)
-    return field_ray(metadata, found.origin, found.direction, cosine), cosine
+    ray = rays.pixel_ray(camera, pixel)
+    cosine = rays.depth_per_distance(camera, ray.direction)
+    return field_ray(metadata, ray.origin, ray.direction, cosine), cosine
 
 
 def displacement(bound: Bound, point: Vector, condition: FrameCondition) -> Vector:

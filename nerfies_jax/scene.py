@@ -57,7 +57,7 @@ def build(
     `effects` act behind those of the spec. Raises ValueError where an effect needs what
     the capture does not have.
     """
-    made = field(spec, metadata, effects=effects)
+    radiance = field(spec, metadata, effects=effects)
     if spec.background is not None and "points" not in metadata.available_data:
         raise ValueError(
             "the background effect holds static points still, and this capture has "
@@ -73,37 +73,37 @@ def build(
         batch = draw_batch(frames, spec.rays, batch_key)
 
         def loss(params):
-            terms = loss_terms(made, params, frames, batch, state.step, field_key)
+            terms = loss_terms(radiance, params, frames, batch, state.step, field_key)
             return weighted_sum(terms), values(terms)
 
         (value, logged), grads = jax.value_and_grad(loss, has_aux=True)(state.params)
         # optax counts in int32 and multiplies float32 by it.
         with jax.numpy_dtype_promotion("standard"):
             updates, moments = optimiser.update(grads, state.optimiser)
-        rates = learning_rates(made.effects, schedule, state.params, state.step)
+        rates = learning_rates(radiance.effects, schedule, state.params, state.step)
         params = apply_updates(state.params, updates, rates)
         metrics = {"loss": value, "mse": logged["fine"], **logged}
         state = TrainState(params, moments, state.aux_state, state.step + 1, state.key)
         return state, metrics
 
     def whole_frame(params, view: View, size, step):
-        found = made.codes_at(params, view)
-        return made.render(params, view.camera, view.time, found, size, step)
+        view_codes = radiance.codes_at(params, view)
+        return radiance.render(params, view.camera, view.time, view_codes, size, step)
 
     def init(capture, key):
         codes.check_ids(
             capture.appearance_ids, len(metadata.exposures), "appearance_ids"
         )
         start_key, run_key = jax.random.split(key)
-        params = made.init(start_key)
+        params = radiance.init(start_key)
         evidence = usable_paths.evidence_to_start_from(capture, spec.start)
         if evidence is not None:
-            paths = path_fit.film_paths(made, capture, evidence)
-            params = path_fit.fit(made, params, paths, start_key, spec.start).params
+            paths = path_fit.film_paths(radiance, capture, evidence)
+            params = path_fit.fit(radiance, params, paths, start_key, spec.start).params
         return first_state(params, run_key)
 
     def example(_, key):
-        return first_state(made.init(key), key)
+        return first_state(radiance.init(key), key)
 
     def first_state(params, key):
         params = in_default_precision(params)
@@ -111,7 +111,7 @@ def build(
             params, optimiser.init(params), (), jnp.zeros((), jnp.int32), key
         )
 
-    read = frozenset().union(*(effect.required_data for effect in made.effects))
+    read = frozenset().union(*(effect.required_data for effect in radiance.effects))
     return Model(
         # By name alone: a run with other effects of one's own is another run.
         spec=(spec, metadata, *(effect.name for effect in effects)),
@@ -143,20 +143,20 @@ def draw_batch(frames: Frames, count: int, key: Key[Array, ""]) -> Batch:
     line = jax.random.randint(line_key, (count,), 0, height)
     camera = jax.tree.map(lambda leaf: leaf[row], frames.cameras)
     pixel = jnp.stack([column, line], axis=1).astype(camera.position.dtype) + 0.5
-    found = jax.vmap(rays.pixel_ray)(camera, pixel)
+    ray = jax.vmap(rays.pixel_ray)(camera, pixel)
     colour = frames.images[row, line, column].astype(pixel.dtype) / 255
-    valid = found.valid
+    valid = ray.valid
     if frames.valid is not None:
         valid = valid & frames.valid[row, line, column]
     # Chosen here, once for all losses: what was not filmed may hold NaN, which stays
     # NaN under a weight of zero.
     colour = jnp.where(valid[:, None], colour, 0)
-    cosine = jax.vmap(rays.depth_per_distance)(camera, found.direction)
-    return Batch(row, pixel, found.origin, found.direction, cosine, colour, valid)
+    cosine = jax.vmap(rays.depth_per_distance)(camera, ray.direction)
+    return Batch(row, pixel, ray.origin, ray.direction, cosine, colour, valid)
 
 
 def loss_terms(
-    made: Field,
+    radiance: Field,
     params: PyTree,
     frames: Frames,
     batch: Batch,
@@ -169,7 +169,7 @@ def loss_terms(
     log-likelihood where a transient medium says how uncertain it is.
     """
     ray_key, penalty_key = jax.random.split(key)
-    metadata = made.metadata
+    metadata = radiance.metadata
 
     def condition_of(row):
         view = View(
@@ -177,14 +177,14 @@ def loss_terms(
             frames.times[row],
             frames.appearance[row],
         )
-        return FrameCondition(view.time, made.codes_at(params, view), step)
+        return FrameCondition(view.time, radiance.codes_at(params, view), step)
 
     conditions = jax.vmap(condition_of)(batch.row)
     lines = jax.vmap(lambda *ray: render_ray.field_ray(metadata, *ray))(
         batch.origin, batch.direction, batch.cosine
     )
     keys = jax.random.split(ray_key, len(batch.row))
-    levels = jax.vmap(lambda *ray: made.render_ray(params, *ray))(
+    levels = jax.vmap(lambda *ray: radiance.render_ray(params, *ray))(
         lines, conditions, keys
     )
     centre = jnp.asarray(metadata.centre, batch.origin.dtype)
@@ -193,7 +193,7 @@ def loss_terms(
         step=step,
         key=penalty_key,
         params=params,
-        displace=functools.partial(made.displace, params),
+        displace=functools.partial(radiance.displace, params),
         condition_of=condition_of,
         batch=batch,
         levels=levels,
@@ -201,7 +201,7 @@ def loss_terms(
         box=Box(centre, jnp.asarray(metadata.scale, batch.origin.dtype)),
     )
     terms = _colour_terms(levels, batch)
-    return terms | penalty_terms(made.effects, params, context, {})
+    return terms | penalty_terms(radiance.effects, params, context, {})
 
 
 def _colour_terms(levels: tuple[RayOutput, ...], batch: Batch) -> dict[str, Term]:

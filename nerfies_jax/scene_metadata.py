@@ -80,8 +80,8 @@ def _span(capture):
 def _box(capture, near, far):
     """Centre and longest half-side of what is filmed."""
     if capture.points is not None and len(capture.points.position) >= MIN_POINTS:
-        found = capture.points.position
-        low, high = np.quantile(found, (OUTLIERS, 1 - OUTLIERS), axis=0)
+        positions = capture.points.position
+        low, high = np.quantile(positions, (OUTLIERS, 1 - OUTLIERS), axis=0)
         # In front of what structure from motion finds there is what moves.
         near_points = _frustum_points(capture, near, near)
         low = np.minimum(low, np.quantile(near_points, 0.1, axis=0))

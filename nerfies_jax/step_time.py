@@ -18,12 +18,12 @@ def parts(
     effects: tuple[Effect, ...] = (),
 ) -> dict[str, float]:
     """Milliseconds of each part of one step of a radiance field; medians, warm."""
-    made = scene.field(spec, metadata, effects=effects)
+    field = scene.field(spec, metadata, effects=effects)
     batch_key, loss_key = jax.random.split(loop.step_key(state))
     batch = jax.jit(scene.draw_batch, static_argnums=1)(frames, spec.rays, batch_key)
 
     def loss(params, frames, batch):
-        terms = scene.loss_terms(made, params, frames, batch, state.step, loss_key)
+        terms = scene.loss_terms(field, params, frames, batch, state.step, loss_key)
         return weighted_sum(terms)
 
     forward = part_ms(loss, state.params, frames, batch)

@@ -38,8 +38,8 @@ def without_effects(
         and effect.lift is None
     ]
     check_there(without, drawn)
-    made = scene.field(spec, metadata, without, effects)
-    tables = [table for effect in made.effects for table in effect.tables]
+    field = scene.field(spec, metadata, without, effects)
+    tables = [table for effect in field.effects for table in effect.tables]
     if blended and all(table.by != APPEARANCE for table in tables):
         raise ValueError(
             "--appearance: this field has no appearance codes; reconstruct with a "
@@ -47,16 +47,16 @@ def without_effects(
         )
 
     def plain(params, view, size, step):
-        codes = made.codes_at(params, view)
-        return made.render(params, view.camera, view.time, codes, size, step)
+        codes = field.codes_at(params, view)
+        return field.render(params, view.camera, view.time, codes, size, step)
 
     def blend(params, between, size, step):
         view, share = between.view, between.share
-        start = made.codes_at(params, view)
-        end = made.codes_at(params, view._replace(appearance=between.towards))
+        start = field.codes_at(params, view)
+        end = field.codes_at(params, view._replace(appearance=between.towards))
         # Codes of the moment are the same at both ends and stay as they are.
         codes = {name: (1 - share) * start[name] + share * end[name] for name in start}
-        return made.render(params, view.camera, view.time, codes, size, step)
+        return field.render(params, view.camera, view.time, codes, size, step)
 
     render = blend if blended else plain
     return scene.build(spec, metadata, effects)._replace(render=render, stages=None)

@@ -148,14 +148,14 @@ def nth_smallest(
     integer = jnp.dtype(f"int{size}")
     bits = jax.lax.bitcast_convert_type(values, integer)
 
-    def settle(turn, found):
+    def settle(turn, settled):
         one = jnp.ones((), integer)
-        higher = found | (one << (size - 2 - turn).astype(integer))
+        higher = settled | (one << (size - 2 - turn).astype(integer))
         below = jnp.sum(known & (bits < higher))
-        return jnp.where(below <= rank, higher, found)
+        return jnp.where(below <= rank, higher, settled)
 
-    found = jax.lax.fori_loop(0, size - 1, settle, jnp.zeros((), integer))
-    return jax.lax.bitcast_convert_type(found, values.dtype)
+    settled = jax.lax.fori_loop(0, size - 1, settle, jnp.zeros((), integer))
+    return jax.lax.bitcast_convert_type(settled, values.dtype)
 
 
 FORMS = {"affine": affine, "correlation": correlation, "metric": metric}

@@ -175,7 +175,7 @@ def parameter_count(spec: KANSpec | MLPSpec) -> int:
         widths = (spec.inputs, *(spec.width,) * spec.depth)
     outputs = (*widths[1:], sum(head.width for _, head in spec.heads))
     return trained + sum(
-        each * read * made + made for read, made in zip(widths, outputs, strict=True)
+        each * read * out + out for read, out in zip(widths, outputs, strict=True)
     )
 
 
@@ -268,13 +268,13 @@ def deform(
     """Offsets of every Gaussian at one time; zero in blocks without an active row."""
     code = codes.at_time(params.times, time)
     share = _first_layer_part(spec, params.field, code, spec.embedding)
-    found = in_blocks(
+    heads = in_blocks(
         lambda rows: _after_first_layer(spec, params.field, rows + share),
         (prepared,),
         active,
         spec.block,
     )
-    return Offsets(*(found.get(name) for name in Offsets._fields))
+    return Offsets(*(heads.get(name) for name in Offsets._fields))
 
 
 def _first_layer_part(spec, field, part, start):

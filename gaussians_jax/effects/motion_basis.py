@@ -261,11 +261,11 @@ def offsets_at_time(
 ) -> Offsets:
     """Equations 3, 5 and 6 of one Gaussian, from its row of `Prepared`."""
     slow = base_displacement(at_time.base, spec, prepared.base)
-    found = residual(at_time.weights, spec, point + slow)
-    fast = found["weights"]
+    heads = residual(at_time.weights, spec, point + slow)
+    fast = heads["weights"]
     if prepared.basis is not None:
         fast = prepared.basis @ fast
-    return Offsets(slow + fast, found["turn"], found["log_scale"])
+    return Offsets(slow + fast, heads["turn"], heads["log_scale"])
 
 
 def prepare(

@@ -300,7 +300,7 @@ def terms(
     valid: Bool[Array, "height width"] | None = None,
 ) -> dict[str, Term]:
     """Those of equation 17, and their weights to log."""
-    found = {}
+    weighed = {}
     parts = (
         ("wavelet", wavelet_loss, spec.wavelet, weight.wavelet),
         ("fourier", fourier_loss, spec.fourier, weight.fourier),
@@ -309,9 +309,9 @@ def terms(
         if part is None:
             continue
         size = unweighted(part, render, truth, valid)
-        found[name] = Term(size, factor.astype(size.dtype))
-        found[f"{name}_weight"] = Term(factor, None)
-    return found
+        weighed[name] = Term(size, factor.astype(size.dtype))
+        weighed[f"{name}_weight"] = Term(factor, None)
+    return weighed
 
 
 def effect(spec: SpectralSpec, steps: int) -> Effect:

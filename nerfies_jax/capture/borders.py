@@ -20,17 +20,19 @@ def black_borders(images: np.ndarray) -> np.ndarray | None:
     """
     brightest = images.max(-1)
     dark = brightest <= BLACK
-    found = np.zeros(dark.shape, bool)
+    borders = np.zeros(dark.shape, bool)
     for row in np.flatnonzero(_rim(dark).any(-1)):
         labels = skimage.measure.label(dark[row], connectivity=1)
         for label in np.unique(_rim(labels)[_rim(labels) > 0]):
             region = labels == label
             empty = brightest[row][region].mean() <= EMPTY
             if empty and SMALLEST <= region.mean() <= LARGEST:
-                found[row] |= region
-        if found[row].any():
-            found[row] = skimage.morphology.dilation(found[row], np.ones((5, 5), bool))
-    return found if found.any() else None
+                borders[row] |= region
+        if borders[row].any():
+            borders[row] = skimage.morphology.dilation(
+                borders[row], np.ones((5, 5), bool)
+            )
+    return borders if borders.any() else None
 
 
 def _rim(pictures):

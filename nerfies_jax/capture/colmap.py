@@ -59,14 +59,14 @@ def read(
             "every "
             "n-th frame"
         )
-    available, found = _find_pictures(path, model)
+    available, paths = _find_pictures(path, model)
     full = (model.lenses[0].width, model.lenses[0].height)
     source, shrink_by = frames.choose_source(
         available, full, factor, max_side, str(path)
     )
-    rows, lost = frames.keep_found(found[source], model.names, missing, str(path))
+    rows, lost = frames.keep_found(paths[source], model.names, missing, str(path))
     model = _take(model, rows)
-    files = [found[source][row] for row in rows]
+    files = [paths[source][row] for row in rows]
     # COLMAP reads pixels as they lie in the file, whatever the EXIF orientation says.
     images, alpha = frames.read_frames(files, shrink_by, orientation="stored")
     images, valid, moving, lenses, more = _as_pinholes(
@@ -220,7 +220,7 @@ def _best_model(path):
 def _find_pictures(path, model):
     """For each reduction stored, its folder and the file of each picture or None."""
     first = model.lenses[0]
-    available, found = {}, {}
+    available, paths = {}, {}
     for place in PICTURES:
         folder = path / place
         files = [_find(folder, name, path) for name in model.names]
@@ -239,13 +239,13 @@ def _find_pictures(path, model):
                 "that"
             )
         if ratio not in available:
-            available[ratio], found[ratio] = folder, files
+            available[ratio], paths[ratio] = folder, files
     if not available:
         raise CaptureError(
             f"{path}: a COLMAP model but none of its pictures ({model.names[0]}, ...); "
             f"looked in {', '.join(place or 'the folder itself' for place in PICTURES)}"
         )
-    return available, found
+    return available, paths
 
 
 def _find(folder, name, path):
@@ -269,13 +269,13 @@ def _masks(path, names, size, shrink_by):
     folder = path / "masks"
     if not folder.is_dir():
         return None
-    found = [
+    paths = [
         frames.find_picture(folder, f"{name}.png") or _find(folder, name, path)
         for name in names
     ]
-    if not any(found):
+    if not any(paths):
         return None
-    return frames.read_masks(found, size, shrink_by) < 1
+    return frames.read_masks(paths, size, shrink_by) < 1
 
 
 def _scaled(lens, stored, size, path):

@@ -72,7 +72,7 @@ def find_picture(folder: pathlib.Path, name: str) -> pathlib.Path | None:
 
 
 def keep_found(
-    found: Sequence[pathlib.Path | None],
+    paths: Sequence[pathlib.Path | None],
     names: Sequence[str],
     missing: str,
     where: str,
@@ -80,8 +80,8 @@ def keep_found(
     """Rows whose file is there, and a note; an error unless `missing` is "skip"."""
     if missing not in ("refuse", "skip"):
         raise CaptureError(f'{where}: missing={missing!r}; expected "refuse" or "skip"')
-    rows = np.array([row for row, path in enumerate(found) if path is not None], int)
-    lost = [name for name, path in zip(names, found, strict=True) if path is None]
+    rows = np.array([row for row, path in enumerate(paths) if path is not None], int)
+    lost = [name for name, path in zip(names, paths, strict=True) if path is None]
     if not lost:
         return rows, ()
     listed = ", ".join(lost[:5]) + (", ..." if len(lost) > 5 else "")

@@ -42,12 +42,12 @@ def read(
     path = pathlib.Path(path)
     views = read_cameras(path, heldout)
     folder, source, shrink_by, notes = _stored_pictures(path, views, factor, max_side)
-    found = [frames.find_picture(folder, name) for name in views.ids]
-    rows, lost = frames.keep_found(found, views.ids, missing, str(folder))
+    paths = [frames.find_picture(folder, name) for name in views.ids]
+    rows, lost = frames.keep_found(paths, views.ids, missing, str(folder))
     views = only(views, rows)
-    images, alpha = frames.read_frames([found[row] for row in rows], shrink_by)
+    images, alpha = frames.read_frames([paths[row] for row in rows], shrink_by)
     total = source * shrink_by
-    _check_picture_size(found[rows[0]], views.size, source)
+    _check_picture_size(paths[rows[0]], views.size, source)
     cameras = camera.resize(views.cameras, (total, total), (1, 1))
     size = (images.shape[2], images.shape[1])
     valid = _masks(path / "valid", views.ids, size, total)
@@ -258,11 +258,11 @@ def _masks(kind, ids, size, total):
         return None
     files = [folder / f"{name}.png.png" for name in ids]
     plain = [folder / f"{name}.png" for name in ids]
-    found = [
+    paths = [
         double if double.is_file() else single if single.is_file() else None
         for double, single in zip(files, plain, strict=True)
     ]
-    return frames.read_masks(found, size, shrink_by) if any(found) else None
+    return frames.read_masks(paths, size, shrink_by) if any(paths) else None
 
 
 def _depths(path, views, size, total):

@@ -29,8 +29,8 @@ def bilinear(picture: np.ndarray, place: np.ndarray) -> np.ndarray:
         )
         for channel in range(picture.shape[-1])
     ]
-    found = np.stack(channels, axis=-1)
-    return np.round(found).astype(np.uint8) if picture.dtype == np.uint8 else found
+    blended = np.stack(channels, axis=-1)
+    return np.round(blended).astype(np.uint8) if picture.dtype == np.uint8 else blended
 
 
 def nearest(picture: np.ndarray, place: np.ndarray) -> np.ndarray:

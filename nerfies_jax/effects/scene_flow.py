@@ -175,10 +175,10 @@ def dynamic(
     condition = jnp.zeros(0, point.dtype)
     if one.direction is not None:
         condition = encoding.encode(one.direction, direction, None)
-    found = template.apply(one, params.network, jnp.concatenate(features), condition)
-    flow = spec.flow_bound * jnp.tanh(mlp.affine(params.flow, found.features))
-    logits = mlp.affine(params.disocclusion, found.features)
-    return Dynamic(found.density, found.colour, flow.reshape(2, 3), logits)
+    sample = template.apply(one, params.network, jnp.concatenate(features), condition)
+    flow = spec.flow_bound * jnp.tanh(mlp.affine(params.flow, sample.features))
+    logits = mlp.affine(params.disocclusion, sample.features)
+    return Dynamic(sample.density, sample.colour, flow.reshape(2, 3), logits)
 
 
 def medium(
@@ -191,14 +191,14 @@ def medium(
             f"the blending reads {width} features of the template, whose trunk has "
             f"{sample.features.shape[0]}; build the effect with the trunk's width"
         )
-    found = dynamic(spec, params, sample.point, sample.direction, condition.time)
+    own = dynamic(spec, params, sample.point, sample.direction, condition.time)
     share = mlp.affine(params.blend, sample.features)[0]
     extras = {
-        "flow_forward": found.flow[FORWARD],
-        "flow_backward": found.flow[BACKWARD],
-        "disocclusion": found.disocclusion,
+        "flow_forward": own.flow[FORWARD],
+        "flow_backward": own.flow[BACKWARD],
+        "disocclusion": own.disocclusion,
     }
-    return Medium(found.density, found.colour, share=share, extras=extras)
+    return Medium(own.density, own.colour, share=share, extras=extras)
 
 
 def neighbour(

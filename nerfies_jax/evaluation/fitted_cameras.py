@@ -95,12 +95,12 @@ def fit_camera(
     """
     loss = photometric_loss(model, state, view, picture, valid, depth)
     start = jnp.zeros(6, view.camera.position.dtype)
-    found = fit.fit_code(
+    fitted = fit.fit_code(
         loss, start, max_steps=spec.max_steps, tolerance=spec.tolerance
     )
-    return found._replace(
-        value=_moved(view.camera, found.value, depth),
-        converged=found.converged & (found.residual > 0),  # rounding leaves some slope
+    return fitted._replace(
+        value=_moved(view.camera, fitted.value, depth),
+        converged=fitted.converged & (fitted.residual > 0),  # rounding leaves a slope
     )
 
 
@@ -143,7 +143,7 @@ def fit_cameras(
         valid = None
         if capture.valid is not None:
             valid = jnp.asarray(blocks(capture.valid[row], factor).all((-3, -1)))
-        found = program(
+        fitted = program(
             state.params,
             state.step,
             resized(view, whole, size),
@@ -153,11 +153,11 @@ def fit_cameras(
         )
         moved.append(
             view.camera._replace(
-                camera_from_world=found.value.camera_from_world,
-                position=found.value.position,
+                camera_from_world=fitted.value.camera_from_world,
+                position=fitted.value.position,
             )
         )
-        converged.append(bool(found.converged))
+        converged.append(bool(fitted.converged))
     cameras = jax.tree.map(
         lambda *leaves: np.stack([np.asarray(x, np.float32) for x in leaves]), *moved
     )

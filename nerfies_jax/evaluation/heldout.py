@@ -113,7 +113,7 @@ def heldout_metrics(
     points, `flow`, `fitted` cameras, `floors`. What has nothing to be a mean of is left
     out.
     """
-    found = {
+    scores = {
         "heldout.psnr": float(scored.psnr.mean()),
         "heldout.ssim": float(scored.ssim.mean()),
     }
@@ -131,15 +131,15 @@ def heldout_metrics(
         more |= _flow(flow)
     if fitted is not None:
         more |= _cameras(fitted, capture, exact=known is not None)
-    return found | {key: float(x) for key, x in more.items() if not np.isnan(x)}
+    return scores | {key: float(x) for key, x in more.items() if not np.isnan(x)}
 
 
-def metrics(found: Mapping[str, float]) -> list[Metric]:
+def metrics(numbers: Mapping[str, float]) -> list[Metric]:
     """Numbers by the keys of `MEASURES` as metrics, in its order."""
     return [
-        Metric(key, found[key], *measure)
+        Metric(key, numbers[key], *measure)
         for key, measure in MEASURES.items()
-        if key in found
+        if key in numbers
     ]
 
 
@@ -162,23 +162,23 @@ def _pictures(scored, capture, lpips):
 
 def _floors(floors, scored, capture):
     """PSNR of pictures that cost nothing, and how far motion is above the second."""
-    found = {}
+    numbers = {}
     if floors.neighbours is not None:
         own = _floor_psnr(floors.neighbours, scored, capture)
-        found["floor.neighbours"] = _mean(own[:, 0])
+        numbers["floor.neighbours"] = _mean(own[:, 0])
     if floors.still is not None:
         own = _floor_psnr(floors.still, scored, capture)
         drawn = floors.still._replace(colour=scored.colour[floors.still.places])
         worth = _floor_psnr(drawn, scored, capture) - own
-        found["floor.still"] = _mean(own[:, 0])
-        found["motion.worth"] = _mean(worth[:, 0])
-        found["motion.moving_worth"] = _mean(worth[:, 1])
-    return found
+        numbers["floor.still"] = _mean(own[:, 0])
+        numbers["motion.worth"] = _mean(worth[:, 0])
+        numbers["motion.moving_worth"] = _mean(worth[:, 1])
+    return numbers
 
 
 def _floor_psnr(averages, scored, capture):
     """[places, 2] PSNR of all that was filmed and of what of it moves; NaN of none."""
-    found = []
+    psnrs = []
     for number, (place, colour) in enumerate(
         zip(averages.places, averages.colour, strict=True)
     ):
@@ -191,8 +191,8 @@ def _floor_psnr(averages, scored, capture):
             mask = mask if part is None else mask & part
         none = np.zeros_like(mask)
         moving = none if capture.moving is None else mask & capture.moving[row]
-        found.append(_masked_psnrs(colour, capture.images[row], mask, moving))
-    return np.asarray(jax.device_get(found))
+        psnrs.append(_masked_psnrs(colour, capture.images[row], mask, moving))
+    return np.asarray(jax.device_get(psnrs))
 
 
 @jax.jit
@@ -206,17 +206,21 @@ def _masked_psnrs(colour, truth, mask, moving):
 def _score(colour, truth, valid, moving):
     picture = image_quality.quantise(colour)
     truth = truth.astype(colour.dtype) / 255
-    found = {}
+    numbers = {}
     if moving is not None:
         still = ~moving
         if valid is not None:
             moving, still = moving & valid, still & valid
-        found["heldout.moving_psnr"] = image_quality.masked_psnr(picture, truth, moving)
-        found["heldout.moving_ssim"] = image_quality.masked_ssim(picture, truth, moving)
-        found["heldout.still_psnr"] = image_quality.masked_psnr(picture, truth, still)
+        numbers["heldout.moving_psnr"] = image_quality.masked_psnr(
+            picture, truth, moving
+        )
+        numbers["heldout.moving_ssim"] = image_quality.masked_ssim(
+            picture, truth, moving
+        )
+        numbers["heldout.still_psnr"] = image_quality.masked_psnr(picture, truth, still)
     if valid is None and min(picture.shape[:2]) > MS_SSIM_SIDE:
-        found["heldout.ms_ssim"] = image_quality.ms_ssim(picture, truth)
-    return found
+        numbers["heldout.ms_ssim"] = image_quality.ms_ssim(picture, truth)
+    return numbers
 
 
 @functools.partial(jax.jit, static_argnums=1)
@@ -235,27 +239,27 @@ def _depths(scored, capture):
     masks = {"": None}
     if capture.moving is not None:
         masks["moving_"] = jnp.asarray(capture.moving[scored.rows])
-    found = {}
+    numbers = {}
     for name, mask in masks.items():
         compared = np.asarray(geometry_quality.known_depth(depth, truth, mask))
         error = np.abs(np.asarray(depth - truth))[compared]
         errors = geometry_quality.depth_errors(depth, truth, mask)
-        found[f"heldout.{name}depth_median"] = _mean(error, np.median)
-        found[f"heldout.{name}depth_rmse"] = errors.rmse
+        numbers[f"heldout.{name}depth_median"] = _mean(error, np.median)
+        numbers[f"heldout.{name}depth_rmse"] = errors.rmse
         if mask is None:
-            found["heldout.depth_abs_rel"] = errors.abs_rel
-            found["heldout.depth_within_delta"] = errors.within_delta
-    return found
+            numbers["heldout.depth_abs_rel"] = errors.abs_rel
+            numbers["heldout.depth_within_delta"] = errors.within_delta
+    return numbers
 
 
 def _flow(flow):
     """End-point errors of the pixels that have an answer; none is an outlier, too."""
-    answered = np.isfinite(flow.found).all(axis=-1)
+    answered = np.isfinite(flow.predicted).all(axis=-1)
 
     def errors(mask=None):
         mask = None if mask is None else jnp.asarray(mask)
-        found, truth = jnp.asarray(flow.found), jnp.asarray(flow.truth)
-        return geometry_quality.flow_errors(found, truth, mask)
+        predicted, truth = jnp.asarray(flow.predicted), jnp.asarray(flow.truth)
+        return geometry_quality.flow_errors(predicted, truth, mask)
 
     numbers = {
         "flow.epe": errors(answered).endpoint,

@@ -35,7 +35,7 @@ Mover = Callable[..., Move | None]
 class Flow(NamedTuple):
     """Flow of a few pixels of a few frames, in pixels right and down; NumPy."""
 
-    found: np.ndarray  # [pixels, 2]; NaN where the model has no answer
+    predicted: np.ndarray  # [pixels, 2]; NaN where the model has no answer
     truth: np.ndarray  # [pixels, 2]
     moving: np.ndarray | None  # [pixels] bool: shows what moves by itself
 
@@ -66,9 +66,9 @@ def pixel_flow(
 def _surface(
     camera: Camera, pixels: Float[Array, "pixels 2"], depth: Float[Array, " pixels"]
 ) -> Float[Array, "pixels 3"]:
-    found = jax.vmap(lambda pixel: rays.pixel_ray(camera, pixel))(pixels)
-    distance = rays.distance_of_depth(camera, found.direction, depth)
-    return jax.vmap(rays.point_at)(found.origin, found.direction, distance)
+    ray = jax.vmap(lambda pixel: rays.pixel_ray(camera, pixel))(pixels)
+    distance = rays.distance_of_depth(camera, ray.direction, depth)
+    return jax.vmap(rays.point_at)(ray.origin, ray.direction, distance)
 
 
 @jax.jit
@@ -93,11 +93,11 @@ def heldout_flow(
     places = np.flatnonzero(seen.any(axis=(1, 2)))
     if not len(places):
         return None
-    found, truth, moving = [], [], []
+    predicted, truth, moving = [], [], []
     for place in spread(places, FRAMES):
         row = int(scored.rows[place])
         line, column = spread(np.argwhere(seen[place]), PIXELS).T
-        found.append(
+        predicted.append(
             pixel_flow(
                 move,
                 state,
@@ -111,7 +111,7 @@ def heldout_flow(
         if capture.moving is not None:
             moving.append(capture.moving[row, line, column])
     return Flow(
-        np.concatenate(found),
+        np.concatenate(predicted),
         np.concatenate(truth),
         np.concatenate(moving) if moving else None,
     )

@@ -30,14 +30,14 @@ def with_masks(filmed: Capture, folder: pathlib.Path) -> tuple[Capture, str]:
         factor = math.ceil(math.sqrt(len(rows) * math.prod(filmed.size) / MOST_PIXELS))
         film = dataclasses.replace(filmed, train=rows, heldout=np.zeros(0, int))
         film = captures.downscale(captures.select(film, rows), factor)
-        found = record.cached(film, folder)
-        if not found.unusable:
+        evidence = record.cached(film, folder)
+        if not evidence.unusable:
             break
-        unusable = unusable or found.unusable
+        unusable = unusable or evidence.unusable
     else:
         return filmed, f"What moves is not scored apart: {unusable}."
-    for row, mask in zip(rows[found.row], found.moving, strict=True):
-        moving[row] = _enlarged(mask, factor * found.factor, filmed.size)
+    for row, mask in zip(rows[evidence.row], evidence.moving, strict=True):
+        moving[row] = _enlarged(mask, factor * evidence.factor, filmed.size)
     moving = _bent(moving, filmed)
     share = moving[filmed.heldout].mean()
     note = (

@@ -35,18 +35,18 @@ def _of_jaxpr(jaxpr) -> Counted:
             continue
         read |= _variables(equation.invars)
         name = equation.primitive.name
-        found = [_of_jaxpr(inner) for inner in _inner(equation.params)]
-        inner = sum(one.flops for one in found)
+        counts = [_of_jaxpr(inner) for inner in _inner(equation.params)]
+        inner = sum(one.flops for one in counts)
         if name == "dot_general":
             inner = _product(equation)
         elif name == "scan":
             inner *= equation.params["length"]
         elif name == "cond":
-            inner = max(one.flops for one in found)
+            inner = max(one.flops for one in counts)
         elif name == "while":
             at_least |= inner > 0
         flops += inner
-        at_least |= any(one.at_least for one in found)
+        at_least |= any(one.at_least for one in counts)
     return Counted(flops, at_least)
 
 

@@ -224,15 +224,15 @@ def load(network: Network, files: Iterable[str | pathlib.Path] = ()) -> LpipsPar
     files, tensors = tuple(files), {}
     for path in files:
         tensors.update(weight_files.read_tensors(path))
-    for part, names, found in (
+    for part, names, fallback in (
         ("classifier", _classifier_names(network)[0], _cached_classifier(network)),
         ("heads", _head_names(0), _installed_heads(network)),
     ):
         if any(f"{name}.weight" in tensors for name in names):
             continue
-        if found is None:
+        if fallback is None:
             raise WeightsMissing(_missing(network, part, files))
-        tensors.update(weight_files.read_tensors(found))
+        tensors.update(weight_files.read_tensors(fallback))
     return _params(network, tensors)
 
 

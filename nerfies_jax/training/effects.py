@@ -212,8 +212,8 @@ def penalty_terms(
             key=jax.random.fold_in(context.key, stream(effect.name)),
             state=states.get(effect.name),
         )
-        found = effect.penalty(own_params.get(effect.name), own)
-        terms |= {f"{effect.name}/{name}": term for name, term in found.items()}
+        own_terms = effect.penalty(own_params.get(effect.name), own)
+        terms |= {f"{effect.name}/{name}": term for name, term in own_terms.items()}
     return terms
 
 

@@ -174,11 +174,11 @@ def fit_code(
 
     # jaxopt and optax add steps to floats; the loss is also traced outside, strictly.
     with jax.numpy_dtype_promotion("standard"):
-        found, steps = CODE_SOLVERS[solver](flat_loss, flat, max_steps, tolerance)
-    found = lax.stop_gradient(found)
-    reached = flat_loss(found)
+        minimum, steps = CODE_SOLVERS[solver](flat_loss, flat, max_steps, tolerance)
+    minimum = lax.stop_gradient(minimum)
+    reached = flat_loss(minimum)
     better = jnp.isfinite(reached) & (reached <= flat_loss(flat))
-    code = jnp.where(better, found, flat)
+    code = jnp.where(better, minimum, flat)
     value, grad = jax.value_and_grad(flat_loss)(code)
     residual = _length(grad)
     converged = jnp.isfinite(value) & (residual <= tolerance)

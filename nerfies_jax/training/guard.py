@@ -103,12 +103,12 @@ def listed(names):
 
 def bad_arrays(state):
     """Paths of the arrays of a state that are not finite, and how much of them."""
-    found = []
+    descriptions = []
     for path, leaf in jax.tree_util.tree_flatten_with_path(state)[0]:
         if not jnp.issubdtype(leaf.dtype, jnp.inexact):
             continue
         bad = ~np.isfinite(np.asarray(leaf))
         if bad.any():
             name = jax.tree_util.keystr(path, simple=True, separator=".")
-            found.append(f"{name} ({bad.sum():,} of {bad.size:,} values)")
-    return found
+            descriptions.append(f"{name} ({bad.sum():,} of {bad.size:,} values)")
+    return descriptions

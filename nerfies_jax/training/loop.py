@@ -259,7 +259,7 @@ class _Run:
 
     def _tell_failed_save(self, failure) -> None:
         if failure is not None:
-            self.progress.say(f"warning: {failure}; training goes on")
+            self.progress.log(f"warning: {failure}; training goes on")
 
     def _save(self) -> None:
         self._tell_failed_save(self.checkpoints.failure(wait=True))
@@ -293,7 +293,7 @@ class _Run:
                 message += f"; saved in {self.checkpoints.folder}"
                 if reason not in ("steps", "non-finite"):
                     message += ", resume from there to go on"
-        self.progress.say(message)
+        self.progress.log(message)
         unsaved = "" if failure is None else f"the last state is not saved: {failure}"
         return FitResult(self.state, self.history, self.step, reason, message, unsaved)
 

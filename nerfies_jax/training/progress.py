@@ -63,9 +63,9 @@ class Progress:
         if self._bar is not None:
             self._bar.update(self._task, completed=step, text="  ".join(parts))
         else:
-            self.say(f"step {step:,} of {self._total:,}  " + "  ".join(parts))
+            self.log(f"step {step:,} of {self._total:,}  " + "  ".join(parts))
 
-    def say(self, text: str) -> None:
+    def log(self, text: str) -> None:
         """One line that stays."""
         # A terminal that was closed must not keep its run from being saved.
         with contextlib.suppress(OSError):

@@ -39,7 +39,7 @@ def step_time(model: Model, state: TrainState, frames: Frames, steps: int) -> St
         done = max(int(outcome.done), 1)  # waits; fewer where one is not finite
         return left, (time.perf_counter() - began) / done
 
-    found = []
+    seconds = []
     for share in PHASES:
         # The program overwrites what it is given.
         start = jax.tree.map(jnp.copy, state)
@@ -47,5 +47,5 @@ def step_time(model: Model, state: TrainState, frames: Frames, steps: int) -> St
         start, _ = timed(start, 1)
         start, guess = timed(start, 2)
         count = min(max(round(PHASE_SECONDS / guess), 1), MOST_STEPS)
-        found.append(timed(start, count)[1])
-    return StepTime(float(np.mean(found)), compile_seconds)
+        seconds.append(timed(start, count)[1])
+    return StepTime(float(np.mean(seconds)), compile_seconds)

@@ -79,10 +79,10 @@ def from_json(stored: Any, packages: tuple[str, ...] = PACKAGES) -> Any:
     }
     if TYPE not in stored:
         return fields
-    return made(type_named(stored[TYPE], packages), fields)
+    return build_record(type_named(stored[TYPE], packages), fields)
 
 
-def made(kind: type, fields: dict[str, Any]) -> Any:
+def build_record(kind: type, fields: dict[str, Any]) -> Any:
     """A record of its fields; ValueError where they are not those of this version."""
     if dataclasses.is_dataclass(kind):
         wanted = {field.name for field in dataclasses.fields(kind)}

@@ -122,20 +122,20 @@ def point_tracks(
         if row is None:
             canonical = point
             fit = inverse_warp(at_moment, (params, here), canonical, spec=spec)
-            found, known = fit.value, fit.converged
+            middle, known = fit.value, fit.converged
         else:
             canonical = point + displace(params, point, here)
-            found, known = point, jnp.all(jnp.isfinite(canonical))
+            middle, known = point, jnp.all(jnp.isfinite(canonical))
 
         def onward(place, moment):
             fit = inverse_warp(at_moment, (params, moment), canonical, place, spec)
             place = jnp.where(fit.converged, fit.value, place)
             return place, (place, fit.converged)
 
-        _, (back, back_known) = lax.scan(onward, found, before)
-        _, (ahead, ahead_known) = lax.scan(onward, found, after)
+        _, (back, back_known) = lax.scan(onward, middle, before)
+        _, (ahead, ahead_known) = lax.scan(onward, middle, after)
         return Tracks(
-            jnp.concatenate([back[::-1], found[None], ahead]),
+            jnp.concatenate([back[::-1], middle[None], ahead]),
             jnp.concatenate([back_known[::-1], known[None], ahead_known]),
         )
 

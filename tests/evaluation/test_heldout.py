@@ -213,12 +213,12 @@ def test_the_flow_of_a_known_motion_is_the_true_one():
     scored = drawn(capture, np.random.default_rng(0))
     scored = scored._replace(depth=capture.depths[capture.heldout])
     flow = model_flow.heldout_flow(move, NOBODY, capture, scored)
-    assert np.isnan(flow.found[lost]).all()
-    known = np.isfinite(flow.found).all(axis=1)
+    assert np.isnan(flow.predicted[lost]).all()
+    known = np.isfinite(flow.predicted).all(axis=1)
     assert known.mean() > 0.95
     assert flow.moving.any()
     assert np.abs(flow.truth[flow.moving]).max() > 1
-    np.testing.assert_allclose(flow.found[known], flow.truth[known], atol=0.02)
+    np.testing.assert_allclose(flow.predicted[known], flow.truth[known], atol=0.02)
 
 
 FIELD = RadianceScene(
@@ -291,7 +291,7 @@ def test_a_run_is_held_against_the_truth_of_its_scene(kind, filmed, rng):
     assert both.any()
     np.testing.assert_allclose(moved.points[both], followed.path[both, -1], atol=1e-5)
     flow = model_flow.heldout_flow(move, state, capture, scored)
-    away = np.linalg.norm(flow.found - flow.truth, axis=1)
+    away = np.linalg.norm(flow.predicted - flow.truth, axis=1)
     answered = np.isfinite(away)
     assert found["flow.epe"] == pytest.approx(away[answered].mean(), rel=1e-4)
     assert found["flow.missing"] == pytest.approx(1 - answered.mean(), abs=1e-6)

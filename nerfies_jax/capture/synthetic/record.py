@@ -125,8 +125,8 @@ def _points(spec, plan, images, hits, moving, seed):
     """
     rng = np.random.default_rng([seed, 4])
     still = (hits.thing != trace.NOTHING) & ~moving
-    found = np.flatnonzero(still & plan.learn[:, None, None])
-    chosen = rng.choice(found, min(spec.points, len(found)), replace=False)
+    candidates = np.flatnonzero(still & plan.learn[:, None, None])
+    chosen = rng.choice(candidates, min(spec.points, len(candidates)), replace=False)
     row = chosen // still[0].size
     directions = jax.vmap(film.view_direction)(
         cameras.take(plan.cameras, row), _centres_of(chosen, spec.size)

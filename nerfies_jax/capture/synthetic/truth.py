@@ -100,9 +100,9 @@ def tracks(spec: SceneSpec, plan: Schedule, hits: trace.Hit, seed: int):
     rng = np.random.default_rng([seed, 3])
     moving = np.array([thing.moves() for thing in spec.things])
     eligible = np.isin(hits.thing, np.flatnonzero(moving)) & plan.learn[:, None, None]
-    found = np.flatnonzero(eligible)
+    candidates = np.flatnonzero(eligible)
     # Few moving pixels give few tracks, never the same one twice.
-    chosen = rng.choice(found, min(spec.tracks, len(found)), replace=False)
+    chosen = rng.choice(candidates, min(spec.tracks, len(candidates)), replace=False)
     thing = hits.thing.reshape(-1)[chosen].astype(np.int32)
     material = hits.material.reshape(-1, 3)[chosen]
     times = np.linspace(0, 1, spec.frames).astype(np.float32)
