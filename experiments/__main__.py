@@ -16,11 +16,11 @@ def commands() -> dict[str, str]:
     """By name, the first line of what its module says; nothing is imported."""
     files = {path.stem: path for path in HERE.glob("*.py")}
     files |= {path.parent.name: path for path in HERE.glob("*/__main__.py")}
-    found = {}
+    summaries = {}
     for name in sorted(files.keys() - {*NOT_COMMANDS}):
         text = ast.get_docstring(ast.parse(files[name].read_text())) or ""
-        found[name] = text.partition("\n")[0]
-    return found
+        summaries[name] = text.partition("\n")[0]
+    return summaries
 
 
 def main(arguments: list[str] | None = None) -> None:

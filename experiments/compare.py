@@ -167,29 +167,29 @@ def _cell(value, digits, unit):
 
 def remarks(compared) -> list[str]:
     """What a reader must know before he believes the table."""
-    found = []
+    sentences = []
     first = compared[0]
     for run in compared[1:]:
         for key in ("cpu", "cores", "xla_cores", "jax"):
             here, there = run.curve.machine.get(key), first.curve.machine.get(key)
             if here != there:
-                found.append(
+                sentences.append(
                     f"Seconds do not compare: {key} is {there} in {first.name} and "
                     f"{here} in {run.name}."
                 )
         if run.curve.frames != first.curve.frames:
-            found.append(
+            sentences.append(
                 f"The curves of {first.name} and {run.name} are of different held-out "
                 f"frames ({len(first.curve.frames)} and {len(run.curve.frames)}): "
                 "times to a PSNR compare roughly."
             )
         counts = [each.metrics.get("heldout.frames") for each in (first, run)]
         if counts[0] != counts[1]:
-            found.append(
+            sentences.append(
                 f"PSNR and SSIM of {first.name} are of {counts[0]} frames, those of "
                 f"{run.name} of {counts[1]}."
             )
-    return found
+    return sentences
 
 
 def save(folder: pathlib.Path, compared, goals) -> None:

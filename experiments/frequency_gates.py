@@ -95,10 +95,10 @@ class Fitted(NamedTuple):
 
 def arms(args: FrequencyGates) -> list[GateSetting]:
     """No spectral loss, every gate at every weight, warnings at the largest."""
-    found = [GateSetting("none", None)]
+    settings = [GateSetting("none", None)]
     for most in args.most:
-        found += [GateSetting(gate, most) for gate in spectral.GATES]
-    return found + [GateSetting(rule, max(args.most)) for rule in WARNINGS]
+        settings += [GateSetting(gate, most) for gate in spectral.GATES]
+    return settings + [GateSetting(rule, max(args.most)) for rule in WARNINGS]
 
 
 def picture(pixels: int) -> np.ndarray:
@@ -193,8 +193,8 @@ def numbers(fitted: dict[GateSetting, Fitted]) -> dict[str, dict[str, float | No
     """
     plain = fitted[GateSetting("none", None)].psnr[:, -1]
     rows = {}
-    for arm, found in fitted.items():
-        last = found.psnr[:, -1]
+    for arm, fits in fitted.items():
+        last = fits.psnr[:, -1]
         gain = last - plain
         row = {
             "psnr": last.mean(),
@@ -204,17 +204,17 @@ def numbers(fitted: dict[GateSetting, Fitted]) -> dict[str, dict[str, float | No
         }
         for index, name in enumerate(("wavelet", "fourier")):
             for when in ("start", "mid", "end"):
-                row[f"{name}_{when}"] = _opening(found, index, when)
+                row[f"{name}_{when}"] = _opening(fits, index, when)
         rows[arm.name] = {k: None if x is None else float(x) for k, x in row.items()}
     return rows
 
 
-def _opening(found, index, when):
-    if found.opening is None:
+def _opening(fits, index, when):
+    if fits.opening is None:
         return None
-    steps = found.opening.shape[-1]
+    steps = fits.opening.shape[-1]
     at = {"start": 0, "mid": steps // 2, "end": steps - 1}[when]
-    return found.opening[:, index, at].mean()
+    return fits.opening[:, index, at].mean()
 
 
 def table(rows: dict[str, dict[str, float | None]]) -> str:
@@ -237,7 +237,7 @@ def table(rows: dict[str, dict[str, float | None]]) -> str:
     return "\n".join(lines)
 
 
-def said(rows: dict[str, dict[str, float | None]]) -> str:
+def format_conclusions(rows: dict[str, dict[str, float | None]]) -> str:
     """What the numbers show, in sentences."""
     sentences = []
     for name, row in rows.items():
@@ -300,19 +300,19 @@ def draw_figure(fitted: dict[GateSetting, Fitted], path: pathlib.Path) -> None:
         zip(RULES, [f"C{i}" for i in range(len(RULES))], strict=True), none="0.4"
     )
     for (gates, quality), most in zip(axes, weights, strict=True):
-        for arm, found in fitted.items():
+        for arm, fits in fitted.items():
             if arm.most not in (None, most):
                 continue
-            step = np.arange(found.psnr.shape[1])
+            step = np.arange(fits.psnr.shape[1])
             style = dict(
                 color=colours[arm.rule],
                 label=arm.rule,
                 linestyle="--" if arm.rule in WARNINGS else "-",
             )
-            if found.opening is not None:
-                gates.plot(step, found.opening[:, 0].mean(0), **style)
-            quality.plot(step, found.psnr.mean(0), **style)
-            edges = found.psnr.min(0), found.psnr.max(0)
+            if fits.opening is not None:
+                gates.plot(step, fits.opening[:, 0].mean(0), **style)
+            quality.plot(step, fits.psnr.mean(0), **style)
+            edges = fits.psnr.min(0), fits.psnr.max(0)
             quality.fill_between(
                 step, *edges, color=style["color"], alpha=0.12, linewidth=0
             )
@@ -345,7 +345,7 @@ def main(arguments=None):
     rows = numbers(fitted)
     print(table(rows))
     print()
-    print(said(rows))
+    print(format_conclusions(rows))
     if args.out is not None:
         from nerfies_jax.capture.json_files import write_json
         from nerfies_jax.measure import clock
@@ -354,7 +354,7 @@ def main(arguments=None):
             "settings": specs.as_json(args),
             "machine": clock.machine(),
             "rows": rows,
-            "said": said(rows).split("\n"),
+            "said": format_conclusions(rows).split("\n"),
         }
         write_json(args.out / "frequency_gates.json", record)
         draw_figure(fitted, args.out / "frequency_gates.png")

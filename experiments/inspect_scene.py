@@ -44,48 +44,48 @@ def main(arguments=None):
         capture = runs.stored_capture(source, args.seed)
         for line in describe(capture):
             print(line)
-        found = inspection.inspect(capture)
-        advice = adviser.advise_all(found.findings, args.full)
-        for line in report(found, advice, source):
+        inspected = inspection.inspect(capture)
+        advice = adviser.advise_all(inspected.findings, args.full)
+        for line in report(inspected, advice, source):
             print(line)
         path = args.picture or pathlib.Path("runs", f"inspect-{_name(capture)}.png")
         path.parent.mkdir(parents=True, exist_ok=True)
-        pictures.save(found.sheet, path)
+        pictures.save(inspected.sheet, path)
         print(f"contact sheet: {path}")
         if args.json is not None:
-            write_json(args.json, as_json(capture, found, advice))
+            write_json(args.json, as_json(capture, inspected, advice))
             print(f"findings: {args.json}")
 
 
-def report(found, advice, source):
+def report(inspected, advice, source):
     """Lines for a person: the table, then the commands."""
     from nerfies_jax.evidence import findings
     from nerfies_jax.runs import commands, prices
     from nerfies_jax.runs.config import RunConfig
 
-    costs = prices.told(found.findings)
-    lines = ["", *findings.table(found.findings, costs), ""]
+    costs = prices.told(inspected.findings)
+    lines = ["", *findings.table(inspected.findings, costs), ""]
     lines += [prices.legend(), ""]
     for one in advice:
         lines.append(f"{one.representation}:")
         config = RunConfig(one.preset, source, overrides=one.overrides)
         lines.append(f"  {commands.reconstruct(config)}")
         lines += [f"  note: {note}" for note in one.notes]
-    lines.append(f"looked for {found.seconds:.0f} s")
+    lines.append(f"looked for {inspected.seconds:.0f} s")
     return lines
 
 
-def as_json(capture, found, advice):
+def as_json(capture, inspected, advice):
     """The same as plain data."""
     from nerfies_jax.runs import prices
 
     return {
         "capture": capture.name,
-        "findings": [dataclasses.asdict(one) for one in found.findings],
-        "cost per step": prices.as_json(found.findings),
+        "findings": [dataclasses.asdict(one) for one in inspected.findings],
+        "cost per step": prices.as_json(inspected.findings),
         "advice": [dataclasses.asdict(one) for one in advice],
-        "pictures made smaller by": found.factor,
-        "seconds": found.seconds,
+        "pictures made smaller by": inspected.factor,
+        "seconds": inspected.seconds,
     }
 
 

@@ -101,8 +101,10 @@ def main(arguments=None):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
         args = cli.parse(Render, arguments)
-        found = representations.of_run(args.run)
-        platform.start_jax(args.device, "all" if found is None else found.threads)
+        representation = representations.of_run(args.run)
+        platform.start_jax(
+            args.device, "all" if representation is None else representation.threads
+        )
         from nerfies_jax import evaluation, runs
 
         run = runs.saved_run(args.run)
@@ -175,15 +177,15 @@ def _faster(args, model, state):
 
     static_threshold = 0.0 if args.static_threshold is None else args.static_threshold
     if args.knots is not None:
-        made = variants.from_knots(
+        variant = variants.from_knots(
             model, state, args.knots, args.interpolation, static_threshold
         )
     elif args.static_threshold is not None:
-        made = variants.without_static(model, state, static_threshold)
+        variant = variants.without_static(model, state, static_threshold)
     else:
         return model, state
-    print(made.summary)
-    return made.model, made.state
+    print(variant.summary)
+    return variant.model, variant.state
 
 
 def _seen(args, run, size, views):

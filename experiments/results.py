@@ -191,9 +191,9 @@ def page(name: str) -> str:
 
 def draw(name: str) -> None:
     """The page's picture, where it can be drawn from the kept numbers."""
-    found = importlib.import_module(STUDIES[name].page)
-    if hasattr(found, "draw"):
-        found.draw(_stored(name), PAGES / f"{name}.png")
+    module = importlib.import_module(STUDIES[name].page)
+    if hasattr(module, "draw"):
+        module.draw(_stored(name), PAGES / f"{name}.png")
 
 
 def index() -> str:

@@ -12,7 +12,7 @@ import rich.console
 
 from experiments import cli
 from experiments.ablate import measures, results, suites
-from experiments.ablate.log import line, say
+from experiments.ablate.log import line, log
 from experiments.ablate.results import ArmResult
 from experiments.ablate.settings import Ablate
 from nerfies_jax import evaluation, runs
@@ -144,7 +144,7 @@ class Job:
 
             cores = len(os.sched_getaffinity(0))
             if self.args.jobs > cores:
-                say(f"{cores} cores for {self.args.jobs} jobs: their times will tell")
+                log(f"{cores} cores for {self.args.jobs} jobs: their times will tell")
             return pool.run(self)
         began, longest = time.monotonic(), 0.0
         tasks = self.tasks()
@@ -154,7 +154,7 @@ class Job:
             spent = time.monotonic() - began
             if self.is_over(spent, longest):
                 break
-            say(f"[{number}/{len(tasks)}] {name}, seed {seed}, after {spent:.0f} s")
+            log(f"[{number}/{len(tasks)}] {name}, seed {seed}, after {spent:.0f} s")
             for budget in self.budgets:
                 self.make(name, seed, budget)
             longest = max(longest, time.monotonic() - began - spent)
@@ -170,7 +170,7 @@ class Job:
         path = self.path(name, seed, budget)
         with results.claimed(path) as ours:
             if not ours:
-                say(f"    {path}: another process is making it; left to that one")
+                log(f"    {path}: another process is making it; left to that one")
                 return
             if self.kept(name, seed, budget) is not None:
                 return
@@ -187,7 +187,7 @@ class Job:
                 kept = self._train(name, seed, steps)
             identity = self._identity(name, seed, steps, budget)
             results.write(path, identity, kept)
-        say("    " + line(kept.numbers))
+        log("    " + line(kept.numbers))
 
     def _check_environment(self, name):
         for variable, value in self.suite.arms[name].variables.items():
@@ -213,7 +213,7 @@ class Job:
         took = kept.numbers["train_seconds"]
         missed = abs(took / budget.seconds - 1) > NEAR_ENOUGH
         if missed and kept.notes["stopped_by"] == "steps":
-            say(f"    {steps} steps took {took:.1f} s: once more, with a better guess")
+            log(f"    {steps} steps took {took:.1f} s: once more, with a better guess")
             steps = _affordable(kept, budget.seconds, pilot)
             kept = self._train(name, 0, steps)
         return steps, kept
@@ -238,12 +238,12 @@ class Job:
         followed = arm.representation.follow(
             arm.spec, arm.metadata, result.state, self.capture, self.known
         )
-        found = heldout.heldout_metrics(
+        scores = heldout.heldout_metrics(
             scored, self.filmed, known=self.known, followed=followed
         )
         counts = arm.model.counts(result.state)
         numbers = {
-            **measures.quality(found, self.known.exact),
+            **measures.quality(scores, self.known.exact),
             "gaussians": float(counts.get("gaussians", float("nan"))),
             "parameters": float(counts["parameters"]),
             "steps": float(result.steps),
@@ -336,8 +336,8 @@ class Job:
 
     def finished(self, budget: Budget) -> dict[tuple[str, int], ArmResult]:
         """By arm and seed, what is there."""
-        found = {task: self.kept(*task, budget) for task in self.tasks()}
-        return {task: kept for task, kept in found.items() if kept is not None}
+        stored = {task: self.kept(*task, budget) for task in self.tasks()}
+        return {task: kept for task, kept in stored.items() if kept is not None}
 
     def missing(self) -> list[tuple[str, int]]:
         """Arms and seeds that are not finished."""

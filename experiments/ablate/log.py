@@ -5,7 +5,7 @@ import sys
 from experiments.ablate.measures import MEASURES
 
 
-def say(text: str) -> None:
+def log(text: str) -> None:
     """To the user, beside the results."""
     print(text, file=sys.stderr, flush=True)
 

@@ -65,9 +65,9 @@ KEYS = {
 ESTIMATED = tuple(KEYS)[2:8]  # where not exact, and nothing is judged by estimates
 
 
-def quality(found: Mapping[str, float], exact: bool) -> dict[str, float]:
+def quality(scores: Mapping[str, float], exact: bool) -> dict[str, float]:
     """The measures of quality of an arm; NaN for what is not known."""
-    numbers = {name: found.get(key, float("nan")) for name, key in KEYS.items()}
+    numbers = {name: scores.get(key, float("nan")) for name, key in KEYS.items()}
     if not exact:
         numbers |= dict.fromkeys(ESTIMATED, float("nan"))
     return numbers
@@ -103,15 +103,15 @@ def stored_means(
 
     Or, with `spread`, their standard deviations. NaN where a number is not known.
     """
-    found: dict[str, dict[str, float]] = {}
+    means: dict[str, dict[str, float]] = {}
     for key, row in metrics.items():
         if key.endswith(".spread") != spread:
             continue
         arm, _, name = key.removesuffix(".spread").rpartition(".")
         if name in MEASURES and arm != "still":
             value = math.nan if row["value"] is None else row["value"]
-            found.setdefault(arm, dict.fromkeys(MEASURES, math.nan))[name] = value
-    return found
+            means.setdefault(arm, dict.fromkeys(MEASURES, math.nan))[name] = value
+    return means
 
 
 def shown(numbers: Mapping[tuple[str, int], Mapping[str, float]]) -> list[str]:

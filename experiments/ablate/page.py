@@ -36,7 +36,7 @@ def page(stored) -> str:
 
 def _trained(about):
     budget = about["budget"]
-    told = [
+    limits = [
         f"{value:,g} {unit}" for unit, value in budget.items() if value is not None
     ] or ["the steps of its preset"]
     count = max(map(len, about["seeds"].values()))
@@ -44,7 +44,7 @@ def _trained(about):
     if count == 1:
         seeds = "one seed, which has no spread"
     return (
-        f"Every arm was trained over {' or '.join(told)}, with {seeds}. The last "
+        f"Every arm was trained over {' or '.join(limits)}, with {seeds}. The last "
         "iterate counts."
     )
 

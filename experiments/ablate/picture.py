@@ -104,15 +104,15 @@ def _tracks(capture, known, path, row):
         if path is None:
             path = np.broadcast_to(known.start_points[:, None], known.path.shape)
         camera = jax.tree.map(jnp.asarray, cameras.take(capture.cameras, row))
-        true, found = (
+        true, followed = (
             factor * np.asarray(_pixels(camera, points[few]))
             for points in (known.path, path)
         )
         # The truth last: a point that is followed well is white.
-        for points, colour in ((found, FOUND), (true, TRUE)):
+        for points, colour in ((followed, FOUND), (true, TRUE)):
             for line in points:
                 pen.line([tuple(p) for p in line.tolist()], fill=colour, width=1)
-        for there, here in zip(true[:, now], found[:, now], strict=True):
+        for there, here in zip(true[:, now], followed[:, now], strict=True):
             pen.line([*there.tolist(), *here.tolist()], fill=APART, width=2)
             _dot(pen, here.tolist(), FOUND)
             _dot(pen, there.tolist(), TRUE)

@@ -10,7 +10,7 @@ import sys
 import time
 from typing import NamedTuple
 
-from experiments.ablate.log import line, say
+from experiments.ablate.log import line, log
 from nerfies_jax.capture.json_files import write_json
 from nerfies_jax.training import specs
 
@@ -51,7 +51,7 @@ def run(job) -> list[tuple[str, int]]:
                     waiting.remove(task)
                     running[task] = start(job, *task)
                     number = every.index(task) + 1
-                    say(f"[{number}/{len(every)}] {_name(task)}, after {spent:.0f} s")
+                    log(f"[{number}/{len(every)}] {_name(task)}, after {spent:.0f} s")
                     continue
                 for task in [
                     t for t in running if running[t].process.poll() is not None
@@ -68,8 +68,8 @@ def run(job) -> list[tuple[str, int]]:
 
 def start(job, name: str, seed: int) -> Running:
     """A process for one arm and seed, with all it prints in a file of its own."""
-    log = job.out / "logs" / f"{name}-{seed}.txt"
-    log.parent.mkdir(exist_ok=True)
+    log_path = job.out / "logs" / f"{name}-{seed}.txt"
+    log_path.parent.mkdir(exist_ok=True)
     path = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
     environment = os.environ | {
         "PJRT_NPROC": "1",
@@ -77,7 +77,7 @@ def start(job, name: str, seed: int) -> Running:
         "COLUMNS": "88",
         **job.suite.arms[name].variables,
     }
-    with log.open("w") as file:
+    with log_path.open("w") as file:
         process = subprocess.Popen(
             command(job, name, seed),
             stdin=subprocess.DEVNULL,
@@ -87,7 +87,7 @@ def start(job, name: str, seed: int) -> Running:
             # Ctrl-C reaches this process alone, which passes it on once.
             start_new_session=True,
         )
-    return Running(process, time.monotonic(), log)
+    return Running(process, time.monotonic(), log_path)
 
 
 def command(job, name: str, seed: int) -> list[str]:
@@ -113,7 +113,7 @@ def _skip_orphans(job, waiting, failed):
     if job.args.seconds is None:
         return
     for task in [t for t in waiting if (t[0], 0) in failed]:
-        say(f"{_name(task)}: not begun, seed 0 failed and finds its steps")
+        log(f"{_name(task)}: not begun, seed 0 failed and finds its steps")
         waiting.remove(task)
         failed.append(task)
 
@@ -124,11 +124,11 @@ def _is_well(job, task, ended):
     code = ended.process.returncode
     if code == 0 and job.is_finished(name, seed):
         kept = job.kept(name, seed, job.budgets[-1])
-        say(f"    {_name(task)}: {line(kept.numbers)}; {took:.0f} s in all")
+        log(f"    {_name(task)}: {line(kept.numbers)}; {took:.0f} s in all")
         return True
     reason = f"exit code {code}" if code else "made by another process, not yet there"
     last = ended.log.read_text(errors="replace").strip().splitlines()[-1:]
-    say(f"    {_name(task)} failed ({reason}); {ended.log} ends with: {''.join(last)}")
+    log(f"    {_name(task)} failed ({reason}); {ended.log} ends with: {''.join(last)}")
     return False
 
 
@@ -147,7 +147,7 @@ def _ended_by_signals():
     try:
         yield
     except KeyboardInterrupt:
-        say("stopped; the same command goes on")
+        log("stopped; the same command goes on")
         raise SystemExit(130) from None
     finally:
         for number, handler in before.items():

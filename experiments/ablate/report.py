@@ -18,14 +18,14 @@ def write(job, budget, finished) -> None:
     """
     numbers = {key: kept.numbers for key, kept in finished.items()}
     static = protocol.static_error(job.known)
-    found = verdicts.verdicts(numbers, judged(job))
+    judged_claims = verdicts.verdicts(numbers, judged(job))
     print(f"\n{job.capture.name}, each arm trained {budget.title}:")
     print(verdicts.table(numbers, static))
     print(measures.legend(measures.shown(numbers)))
     for line in remarks(finished):
         print(line)
     print()
-    print(verdicts.claims_text(found) or "no claim has both of its arms here")
+    print(verdicts.claims_text(judged_claims) or "no claim has both of its arms here")
     if job.suite.context:
         print("\n" + job.suite.context)
     about = {
@@ -37,7 +37,7 @@ def write(job, budget, finished) -> None:
             name: [s for other, s in finished if other == name]
             for name in dict.fromkeys(name for name, _ in finished)
         },
-        "claims": [_claim(verdict) for verdict in found],
+        "claims": [_claim(verdict) for verdict in judged_claims],
         "machine": clock.machine(),
     }
     clock.write_metrics(
@@ -56,36 +56,36 @@ def judged(job) -> list:
 
 def remarks(finished) -> list[str]:
     """What the table does not show: runs that ended early, points that were lost."""
-    found = []
+    sentences = []
     for (name, seed), kept in finished.items():
         if kept.notes["stopped_by"] != "steps":
-            found.append(
+            sentences.append(
                 f"{name}, seed {seed}: stopped at step {kept.notes['steps']} by "
                 f"{kept.notes['stopped_by']}"
             )
         if kept.notes.get("points_ever_lost"):
-            found.append(
+            sentences.append(
                 f"{name}, seed {seed}: {kept.notes['points_ever_lost']} of "
                 f"{kept.notes['points']} points were not found at some instant"
             )
-    return found
+    return sentences
 
 
 def metrics(numbers: Numbers, static: float) -> list[Metric]:
     """Means over the seeds; their standard deviations where there are several."""
-    found = [Metric("still.track_error", static, "scene units", "equal", 1e-6)]
+    measured = [Metric("still.track_error", static, "scene units", "equal", 1e-6)]
     for arm in dict.fromkeys(arm for arm, _ in numbers):
         rows = [row for (name, _), row in numbers.items() if name == arm]
         for name, measure in MEASURES.items():
             values = verdicts.values_of(rows, name)
             mean = float(values.mean())
             allowed = measure.allowed(mean)
-            found.append(
+            measured.append(
                 Metric(f"{arm}.{name}", mean, measure.unit, measure.direction, allowed)
             )
             if len(values) > 1:
                 spread = float(values.std(ddof=1))
-                found.append(
+                measured.append(
                     Metric(
                         f"{arm}.{name}.spread",
                         spread,
@@ -94,7 +94,7 @@ def metrics(numbers: Numbers, static: float) -> list[Metric]:
                         allowed,
                     )
                 )
-    return found
+    return measured
 
 
 def _claim(verdict):

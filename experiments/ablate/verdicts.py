@@ -35,7 +35,7 @@ def verdicts(numbers: Numbers, claims: Sequence[Claim]) -> list[Verdict]:
     shows where Student's interval of the mean difference leaves zero out; one seed has
     no spread, and so cannot show any.
     """
-    found = []
+    judged = []
     for claim in claims:
         seeds = [s for arm, s in numbers if arm == claim.better]
         seeds = [s for s in seeds if (claim.worse, s) in numbers]
@@ -44,8 +44,8 @@ def verdicts(numbers: Numbers, claims: Sequence[Claim]) -> list[Verdict]:
                 [numbers[arm, seed][name] for arm in (claim.better, claim.worse)]
                 for seed in seeds
             ]
-            found.append(_verdict(claim, name, np.asarray(pairs, float)))
-    return found
+            judged.append(_verdict(claim, name, np.asarray(pairs, float)))
+    return judged
 
 
 def _verdict(claim, name, pairs):
@@ -122,10 +122,10 @@ def _cell(value, digits, width):
     return f"{value:{width}.{digits}f}" if math.isfinite(value) else f"{'-':>{width}s}"
 
 
-def claims_text(found: Sequence[Verdict]) -> str:
+def claims_text(judged: Sequence[Verdict]) -> str:
     """Every claim, and what each measure says of it."""
     lines, last = [], None
-    for verdict in found:
+    for verdict in judged:
         if verdict.claim is not last:
             last = verdict.claim
             lines.append(f"{last.statement}: {last.better} against {last.worse}")
@@ -139,7 +139,7 @@ def claims_text(found: Sequence[Verdict]) -> str:
             f"{verdict.worse:.4g}{unit}, gain {verdict.gain:+.3g}{spread}: "
             f"{verdict.says}"
         )
-    tested = sum(math.isfinite(verdict.half_width) for verdict in found)
+    tested = sum(math.isfinite(verdict.half_width) for verdict in judged)
     if tested:
         lines.append(
             f"± of a gain: its {CONFIDENCE:.0%} interval (Student, seeds paired). Of "

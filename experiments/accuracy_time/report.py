@@ -122,10 +122,10 @@ def _quality(name, base, measure, numbers, row):
     if name == base:
         return value
     claim = Claim("", name, base, (measure,))
-    found = verdicts.verdicts(numbers, [claim])
-    if not found or not math.isfinite(found[0].gain):
+    verdict = verdicts.verdicts(numbers, [claim])
+    if not verdict or not math.isfinite(verdict[0].gain):
         return value
-    gain, half = found[0].gain, found[0].half_width
+    gain, half = verdict[0].gain, verdict[0].half_width
     sign = -1 if MEASURES[measure].direction == "lower" else 1
     change = f"{sign * gain:+.{MEASURES[measure].digits}f}"
     if math.isnan(half):
@@ -146,12 +146,12 @@ def front(
         for place, (name, row) in enumerate(means.items())
         if math.isfinite(row[cost]) and math.isfinite(row[quality])
     ]
-    best, found = math.inf, []
+    best, unbeaten = math.inf, []
     for _, loss, _, name in sorted(known):
         if loss < best:
             best = loss
-            found.append(name)
-    return found
+            unbeaten.append(name)
+    return unbeaten
 
 
 def save_fronts(

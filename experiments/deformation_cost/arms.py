@@ -66,7 +66,7 @@ NETWORKS = (
 
 def arms(count: int, still: float) -> list[Contender]:
     """All of them for `count` Gaussians; a share `still` need not be deformed."""
-    made = []
+    contenders = []
     for network in NETWORKS:
         used = _ways(network, network.spec, count, still)
         counted = [
@@ -75,8 +75,8 @@ def arms(count: int, still: float) -> list[Contender]:
         ]
         for name, way in used.items():
             parts = tuple((weight, ways[name]) for weight, ways in counted)
-            made.append(Contender(f"{network.name}{name}", way, parts))
-    return made + _table_arms(count)
+            contenders.append(Contender(f"{network.name}{name}", way, parts))
+    return contenders + _table_arms(count)
 
 
 def in_one_turn(spec: Any, count: int) -> list[tuple[float, Any]]:
@@ -163,7 +163,7 @@ def _table_arms(count):
     """From a table, every Gaussian moving: the time does not depend on the network."""
     still = splats.activate(gaussians(count).rows["splats"])
     table = time_knots.bake(lambda t: still._replace(mean=still.mean + t), KNOTS)
-    made = []
+    contenders = []
     for interpolation in time_knots.MIN_KNOTS:
 
         def deform(table, time, interpolation=interpolation):
@@ -171,5 +171,5 @@ def _table_arms(count):
 
         way = Way(deform, (table, jnp.asarray(0.37, jnp.float32)))
         name = f"{KNOTS} time knots, {interpolation}"
-        made.append(Contender(name, way, ((1.0, way),)))
-    return made
+        contenders.append(Contender(name, way, ((1.0, way),)))
+    return contenders

@@ -76,8 +76,8 @@ def curve(
     points = []
     for (way, count), table in tables.items():
         deformed = [_at(table, time, way) for time in times]
-        found = np.stack([deform.mean for deform in deformed])[:, motion.active]
-        errors = np.linalg.norm(found - paths, axis=-1)[:, moved] / size
+        positions = np.stack([deform.mean for deform in deformed])[:, motion.active]
+        errors = np.linalg.norm(positions - paths, axis=-1)[:, moved] / size
         pictures = [motion.draw(deformed[k], times[k]) for k in drawn]
         squares = [np.square(a - b) for a, b in zip(pictures, truth, strict=True)]
         points.append(

@@ -138,16 +138,16 @@ def fit(spec: MotionSpec, steps: int) -> Motion:
     params = mlp_motion.init(key, spec)
 
     def error(params, points, time):
-        found = mlp_motion.deform(params, spec, points, time)
+        offsets = mlp_motion.deform(params, spec, points, time)
         exact = analytic(points, time)
         half = exact.angle / 2
         turn = jnp.stack(
             [jnp.cos(half) - 1, 0 * half, 0 * half, jnp.sin(half)], axis=-1
         )
         return (
-            jnp.mean((found.mean - exact.mean) ** 2)
-            + jnp.mean((found.quaternion - turn) ** 2)
-            + jnp.mean((found.scale - exact.growth[:, None]) ** 2)
+            jnp.mean((offsets.mean - exact.mean) ** 2)
+            + jnp.mean((offsets.quaternion - turn) ** 2)
+            + jnp.mean((offsets.scale - exact.growth[:, None]) ** 2)
         )
 
     def loss(params, key):

@@ -181,20 +181,20 @@ def arms(spec: Any) -> list[PricedScene]:
     def only(*kept):
         return without(spec, tuple(name for name in names if name not in kept))
 
-    found = [PricedScene("bare", None, None, only())]
+    priced = [PricedScene("bare", None, None, only())]
     for name in names:
         needed = tuple(x for x in NEEDS.get(name, ()) if x in names)
         base = f"only {needed[0]}" if needed else "bare"
         title = f"{needed[0]} + {name}" if needed else f"only {name}"
-        found.append(PricedScene(title, name, base, only(name, *needed)))
+        priced.append(PricedScene(title, name, base, only(name, *needed)))
     if len(names) == 1:
-        return found  # the only one is all there is
-    found.append(PricedScene("all", None, "bare", spec))
+        return priced  # the only one is all there is
+    priced.append(PricedScene("all", None, "bare", spec))
     for name in names:
-        found.append(
+        priced.append(
             PricedScene(f"without {name}", name, "all", without(spec, (name,)))
         )
-    return found
+    return priced
 
 
 def measure(

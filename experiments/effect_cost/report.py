@@ -93,9 +93,9 @@ def _number(value):
 def metrics_of(rows) -> list[Metric]:
     """Every number of every table; `rows` by preset."""
     metrics = []
-    for preset, found in rows.items():
-        bare = found[0]
-        for row in found:
+    for preset, scenes in rows.items():
+        bare = scenes[0]
+        for row in scenes:
             stem = f"{preset}.{row.arm.name.replace(' + ', '_and_').replace(' ', '_')}"
             metrics.append(
                 Metric(f"{stem}.parameters", row.parameters, "numbers", "lower")
@@ -171,25 +171,25 @@ def write(folder: pathlib.Path, rows, args) -> list[Metric]:
 
 def save_figure(path: pathlib.Path, rows) -> None:
     """Bars of processor time: a panel for each preset, a pair of bars for a scene."""
-    heights = [len(found) for found in rows.values()]
+    heights = [len(scenes) for scenes in rows.values()]
     figure = Figure(figsize=(8, 0.32 * sum(heights) + 0.9 * len(rows)))
     figure.set_layout_engine("constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(
         len(rows), 1, squeeze=False, gridspec_kw={"height_ratios": heights}
     )[:, 0]
-    for panel, (preset, found) in zip(panels, rows.items(), strict=True):
-        places = np.arange(len(found))
+    for panel, (preset, scenes) in zip(panels, rows.items(), strict=True):
+        places = np.arange(len(scenes))
         for offset, name in ((-0.2, "loss"), (0.2, "step")):
-            times = [1e3 * row.programs[name].seconds for row in found]
+            times = [1e3 * row.programs[name].seconds for row in scenes]
             panel.barh(places + offset, times, 0.4, color=COLOURS[name], label=name)
-        base = found[0].programs["step"].seconds
-        for place, row in zip(places, found, strict=True):
+        base = scenes[0].programs["step"].seconds
+        for place, row in zip(places, scenes, strict=True):
             step = row.programs["step"].seconds
             panel.text(
                 1e3 * step, place + 0.2, f" x{step / base:.2f}", va="center", fontsize=8
             )
-        panel.set_yticks(places, [row.arm.name for row in found], fontsize=8)
+        panel.set_yticks(places, [row.arm.name for row in scenes], fontsize=8)
         panel.invert_yaxis()
         panel.margins(x=0.12)
         panel.set_title(preset, loc="left", fontsize=10)

@@ -148,17 +148,17 @@ def measure(case: Case, test: str, numbers: int, repeats: int) -> CaseResult:
     for dtype, bounds in case.bounds.items():
         inputs = hard_case.rounded(case.inputs, dtype)
         exact = [hard_case.truth(case, inputs, order) for order in range(len(bounds))]
-        found = {}
+        errors = {}
         for form in Outcome._fields:
             with jax.enable_x64(dtype == "float64"):
                 got = hard_case.evaluate(
                     getattr(case, form), case.inputs, dtype, len(bounds)
                 )
-            found[form] = tuple(
+            errors[form] = tuple(
                 hard_case.errors(case, got[order], exact[order], order)
                 for order in range(len(bounds))
             )
-        outcomes[dtype] = Outcome(**found)
+        outcomes[dtype] = Outcome(**errors)
     return CaseResult(case, test, outcomes, *_costs(case, numbers, repeats))
 
 

@@ -69,18 +69,18 @@ def derivatives(function: Callable, count: int) -> Callable:
     """
 
     def value(x):
-        found = function(x)
-        return found, (found,)
+        result = function(x)
+        return result, (result,)
 
     def slope(x):
-        found, pull = jax.vjp(function, x)
-        unit = np.eye(found.shape[0], dtype=found.dtype)
+        result, pull = jax.vjp(function, x)
+        unit = np.eye(result.shape[0], dtype=result.dtype)
         slopes = jax.vmap(lambda cotangent: pull(cotangent)[0])(unit)
-        return slopes, (found, slopes)
+        return slopes, (result, slopes)
 
     def curvature(x):
-        bends, found = jax.jacfwd(slope, has_aux=True)(x)
-        return bends, (*found, bends)
+        bends, lower = jax.jacfwd(slope, has_aux=True)(x)
+        return bends, (*lower, bends)
 
     highest = (value, slope, curvature)[count - 1]
     return lambda x: highest(x)[1]
@@ -166,8 +166,8 @@ def evaluate(
     # Cases of one function share a program: as many rows, the last one repeated.
     more = -len(given) % ROWS
     padded = np.concatenate([given, np.repeat(given[-1:], more, axis=0)])
-    found = _program(function, count, options)(padded)
-    return tuple(np.asarray(one)[: len(given)] for one in found)
+    results = _program(function, count, options)(padded)
+    return tuple(np.asarray(one)[: len(given)] for one in results)
 
 
 @functools.cache

@@ -16,10 +16,10 @@ TOP = 2.0 ** (BANDS - 1)  # of the last band, whose slopes and bends are the lar
 
 def _sides(edge):
     """The neighbours of an edge in both precisions, and itself."""
-    found = [edge]
+    places = [edge]
     for kind in (np.float32, np.float64):
-        found += [float(np.nextafter(kind(edge), kind(to))) for to in (-9, 9)]
-    return sorted(found)
+        places += [float(np.nextafter(kind(edge), kind(to))) for to in (-9, 9)]
+    return sorted(places)
 
 
 def _with_negatives(places):

@@ -56,10 +56,10 @@ def _exact_edge(x, first=0):
 
 def _sides(edge):
     """The neighbours of an edge in both precisions, and itself."""
-    found = [edge]
+    places = [edge]
     for kind in (np.float32, np.float64):
-        found += [float(np.nextafter(kind(edge), kind(to))) for to in (-9e9, 9e9)]
-    return sorted(found)
+        places += [float(np.nextafter(kind(edge), kind(to))) for to in (-9e9, 9e9)]
+    return sorted(places)
 
 
 _PLACES = np.array(

@@ -23,7 +23,7 @@ def _amplitudes_textbook(pixels):
 
 
 def _exact_amplitudes(pixels):
-    found = []
+    amplitudes = []
     for k in range(2):
         for j in range(2):
             turns = [
@@ -36,8 +36,8 @@ def _exact_amplitudes(pixels):
             imag = sum(
                 p * mpmath.sinpi(2 * t) for p, t in zip(pixels, turns, strict=True)
             )
-            found.append(mpmath.sqrt((real**2 + imag**2) / 6))
-    return found
+            amplitudes.append(mpmath.sqrt((real**2 + imag**2) / 6))
+    return amplitudes
 
 
 AMPLITUDE = Case(

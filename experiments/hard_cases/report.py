@@ -60,19 +60,20 @@ def summary(rows) -> str:
         any(worst(x) > 1e-2 for o in row.outcomes.values() for x in o.textbook)
         for row in rows
     )
-    said = (
+    verdict = (
         f"{broken} of {len(rows)} textbook forms are wrong by more than one per cent "
         f"somewhere, in value or derivative."
     )
     timed = [row for row in rows if row.case.alike]
     if not timed:
-        return said
+        return verdict
     value = np.median([row.value_cost for row in timed])
     slope = np.median([row.slope_cost for row in timed])
     dear = max(timed, key=lambda row: row.slope_cost)
     return (
-        f"{said}\nMedian time of ours over the textbook's: value {value:.2f}, gradient "
-        f"{slope:.2f}; dearest gradient {dear.slope_cost:.2f} ({dear.case.name})."
+        f"{verdict}\nMedian time of ours over the textbook's: value {value:.2f}, "
+        f"gradient {slope:.2f}; dearest gradient {dear.slope_cost:.2f} "
+        f"({dear.case.name})."
     )
 
 
@@ -111,13 +112,13 @@ def _errors(outcome):
 def parts(path) -> tuple[str, str]:
     """What stands before and behind the table; ValueError without both markers."""
     text = path.read_text() if path.is_file() else ""
-    found = re.search(f"(.*{BEGIN}\n)(.*)({END}.*)", text, re.DOTALL)
-    if found is None:
+    match = re.search(f"(.*{BEGIN}\n)(.*)({END}.*)", text, re.DOTALL)
+    if match is None:
         raise ValueError(
             f"--document {path}: no such file, or not both of the lines {BEGIN} and "
             f"{END} in it"
         )
-    return found[1], found[3]
+    return match[1], match[3]
 
 
 def renew(path, rows) -> None:
@@ -159,9 +160,9 @@ def save_figure(folder, row) -> None:
     places = np.arange(len(row.case.at))
     for order, panel in enumerate(panels):
         for dtype, outcome in row.outcomes.items():
-            for form, found in zip(("stable", "textbook"), outcome, strict=True):
-                if order < len(found):
-                    shown = np.clip(found[order], LEAST, MOST)
+            for form, errors in zip(("stable", "textbook"), outcome, strict=True):
+                if order < len(errors):
+                    shown = np.clip(errors[order], LEAST, MOST)
                     panel.semilogy(
                         places,
                         shown,

@@ -161,10 +161,10 @@ def _exact_thinned(x):
 
 def _sides(edge):
     """Below and above an edge, by its neighbours in both precisions and by 1e-6."""
-    found = [edge * (1 - 1e-6), edge, edge * (1 + 1e-6)]
+    places = [edge * (1 - 1e-6), edge, edge * (1 + 1e-6)]
     for kind in (np.float32, np.float64):
-        found += [float(np.nextafter(kind(edge), kind(to))) for to in (-9, 9)]
-    return sorted(found)
+        places += [float(np.nextafter(kind(edge), kind(to))) for to in (-9, 9)]
+    return sorted(places)
 
 
 # A share of 3/4 of an opacity of 2/3 is one half.

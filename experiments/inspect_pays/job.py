@@ -9,7 +9,7 @@ import numpy as np
 
 from experiments import cli, inspect_scene
 from experiments.ablate import pool
-from experiments.ablate.job import Job, say
+from experiments.ablate.job import Job, log
 from experiments.ablate.settings import Ablate
 from experiments.inspect_pays import arms
 from nerfies_jax import runs
@@ -94,13 +94,13 @@ class Trial:
                 )
             self._found = tuple(Finding(**one) for one in kept["findings"])
             return self._found
-        say(f"{self.name}: looking at it")
-        found = inspection.inspect(self._stored)
-        pictures.save(found.sheet, self.folder / "inspected.png")
-        advice = adviser.advise_all(found.findings)
-        told = inspect_scene.as_json(self._stored, found, advice)
-        write_json(path, {"read as": args, **told})
-        self._found = found.findings
+        log(f"{self.name}: looking at it")
+        inspected = inspection.inspect(self._stored)
+        pictures.save(inspected.sheet, self.folder / "inspected.png")
+        advice = adviser.advise_all(inspected.findings)
+        findings = inspect_scene.as_json(self._stored, inspected, advice)
+        write_json(path, {"read as": args, **findings})
+        self._found = inspected.findings
         return self._found
 
     def advice(self, preset: str) -> adviser.Advice:
@@ -138,8 +138,8 @@ class Trial:
         self._refused = dict(filter(None, map(self._reason, names)))
         self._job.names = tuple(name for name in names if name not in self._refused)
         for name, reason in self._refused.items():
-            say(f"{self.name}: {name} cannot be built: {reason}")
-        say(f"{self.name}: {', '.join(self._job.names)}")
+            log(f"{self.name}: {name} cannot be built: {reason}")
+        log(f"{self.name}: {', '.join(self._job.names)}")
         return pool.run(self._job)
 
     def _reason(self, name):

@@ -75,14 +75,14 @@ def changes(row: Comparison) -> str:
 
 def metrics_of(rows: list[Comparison]) -> list[Metric]:
     """What was measured of every pair that was trained."""
-    found = []
+    metrics = []
     for row in rows:
         if row.same or row.before is None or row.after is None:
             continue
         stem = f"{row.capture}.{row.preset}"
         gain = row.after.psnr - row.before.psnr
         ratio = row.after.seconds / row.before.seconds
-        found += [
+        metrics += [
             Metric(f"{stem}.psnr", row.before.psnr, "dB", "higher", 0.5),
             Metric(f"{stem}.advised_psnr", row.after.psnr, "dB", "higher", 0.5),
             Metric(f"{stem}.gain", gain, "dB", "higher", 2 * PSNR_DB),
@@ -92,7 +92,7 @@ def metrics_of(rows: list[Comparison]) -> list[Metric]:
             ),
             Metric(f"{stem}.time_ratio", ratio, "", "lower", TIME_SHARE),
         ]
-    return found
+    return metrics
 
 
 def write(folder: pathlib.Path, args: Any, rows: list[Comparison]) -> list[str]:
@@ -106,8 +106,8 @@ def write(folder: pathlib.Path, args: Any, rows: list[Comparison]) -> list[str]:
         **clock.machine(),
     }
     clock.write_metrics(folder / "pays.json", metrics_of(rows), about)
-    said = [verdict(row) for row in rows]
-    counts = [f"{said.count(one)} {one}" for one in dict.fromkeys(said)]
+    verdicts = [verdict(row) for row in rows]
+    counts = [f"{verdicts.count(one)} {one}" for one in dict.fromkeys(verdicts)]
     lines = [*table(rows), "", f"{len(rows)} pairs: {'; '.join(counts)}."]
     with replaced_file(folder / "pays.md") as partial:
         partial.write_text("\n".join(lines) + "\n")

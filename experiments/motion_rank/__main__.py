@@ -112,7 +112,7 @@ def main(arguments=None):
             args.out.mkdir(parents=True, exist_ok=True)
     rows = table(args)
     print(report.text(rows))
-    print(report.said(rows))
+    print(report.format_conclusions(rows))
     if args.out is not None:
         report.write(args, rows)
     return rows
@@ -146,10 +146,10 @@ def one_row(args, fits, kind, model, count, drawn) -> RankResult:
         if name not in fits:
             fits[name] = compiled_fit(args, model, count, given)
         began = time.process_time()
-        found = np.asarray(fits[name](jax.random.key(seed), *given), np.float64)
+        predicted = np.asarray(fits[name](jax.random.key(seed), *given), np.float64)
         seconds.append(time.process_time() - began)
         size = np.sqrt(np.mean(np.sum(tracks.moved**2, axis=-1)))
-        off = np.sum((found - tracks.moved) ** 2, axis=-1)
+        off = np.sum((predicted - tracks.moved) ** 2, axis=-1)
         learnt.append(float(np.sqrt(np.mean(off[:, keep])) / size))
         held_out.append(float(np.sqrt(np.mean(off[:, ~keep])) / size))
         if model in FLOORS:
@@ -200,8 +200,8 @@ def compiled_fit(args: MotionRank, model: str, count: int | None, given):
         init_key, batch_key = jax.random.split(key)
 
         def loss(params, rows):
-            found = chosen.apply(params, rest, times[rows])
-            return jnp.mean(jnp.sum((found - moved[:, rows]) ** 2, axis=-1))
+            predicted = chosen.apply(params, rest, times[rows])
+            return jnp.mean(jnp.sum((predicted - moved[:, rows]) ** 2, axis=-1))
 
         def step(state, key):
             params, memory = state

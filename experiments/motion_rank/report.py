@@ -46,7 +46,7 @@ def text(rows) -> str:
     return "\n".join(lines)
 
 
-def said(rows) -> str:
+def format_conclusions(rows) -> str:
     """What the numbers show, in sentences."""
     sentences = [""]
     for kind in dict.fromkeys(row.kind for row in rows):
@@ -159,7 +159,7 @@ def write(args, rows) -> None:
         "settings": specs.as_json(args),
         "machine": clock.machine(),
         "rows": [row._asdict() for row in rows],
-        "said": said(rows).strip().split("\n"),
+        "said": format_conclusions(rows).strip().split("\n"),
     }
     write_json(args.out / "motion_rank.json", record)
     draw_figure(rows, args.out / "motion_rank.png")
@@ -184,8 +184,8 @@ def page(stored) -> str:
         ]
         for row in stored["rows"]
     ]
-    said = markdown.bullets(stored["said"])
-    return f"{markdown.table(heads, rows, words=2)}\n\n{said}"
+    conclusions = markdown.bullets(stored["said"])
+    return f"{markdown.table(heads, rows, words=2)}\n\n{conclusions}"
 
 
 def draw_figure(rows, path) -> None:

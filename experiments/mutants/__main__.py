@@ -96,22 +96,22 @@ def _reached(out, workers, with_copy):
     path = out.with_suffix(".reached.json")
     digest = hashlib.blake2b(b"".join(sorted(map(_told, _files())))).hexdigest()
     stored = json.loads(path.read_text()) if path.exists() else {}
-    found = stored["reached"] if stored.get("digest") == digest else {}
+    entered = stored["reached"] if stored.get("digest") == digest else {}
 
     def run(test):
         return test, with_copy(lambda copy: reached_by(test, copy))
 
-    left = [test for test in default_tests(ROOT) if test not in found]
+    left = [test for test in default_tests(ROOT) if test not in entered]
     jobs = [workers.submit(run, test) for test in left]
     try:
         for job in concurrent.futures.as_completed(jobs):
             test, places = job.result()
-            found[test] = places
-            write_json(path, {"digest": digest, "reached": found})
+            entered[test] = places
+            write_json(path, {"digest": digest, "reached": entered})
     finally:
         for job in jobs:
             job.cancel()
-    return {test: set(places) for test, places in found.items()}
+    return {test: set(places) for test, places in entered.items()}
 
 
 def _told(name):

@@ -50,11 +50,11 @@ def drawn(count: int, seed: int, only: str = "") -> list[Fault]:
             if faults:
                 by_module.append(faults)
     chance.shuffle(by_module)
-    found = []
-    while by_module and len(found) < count:
-        found += [faults.pop() for faults in by_module]
+    chosen = []
+    while by_module and len(chosen) < count:
+        chosen += [faults.pop() for faults in by_module]
         by_module = [faults for faults in by_module if faults]
-    return found[:count]
+    return chosen[:count]
 
 
 def places(path: str, source: str) -> list[Fault]:
@@ -66,16 +66,16 @@ def places(path: str, source: str) -> list[Fault]:
     def at(line, column):
         return starts[line - 1] + column
 
-    found = []
+    changed = []
     for function in ast.walk(ast.parse(source)):
         if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef):
             marks = [function.lineno] + [d.lineno for d in function.decorator_list]
             for statement in function.body:
                 changes = _changes(statement, source.encode(), at)
-                found += [(min(marks), *change) for change in changes]
+                changed += [(min(marks), *change) for change in changes]
     # Outer functions come first: what stands in an inner one is of that.
     unique = {
-        (start, end): (line, first, text) for first, line, start, end, text in found
+        (start, end): (line, first, text) for first, line, start, end, text in changed
     }
     return [
         Fault(path, line, first, *span, text)

@@ -45,5 +45,5 @@ def _key(row):
 
 def _cells(row):
     tests = [test.partition("@")[0] for test in row["caught_by"]]
-    told = ", ".join(f"`{test}`" for test in tests) or SAME.get(_key(row), NOBODY)
-    return [row["at"], f"`{row['before']}`", f"`{row['after']}`", told]
+    witnesses = ", ".join(f"`{test}`" for test in tests) or SAME.get(_key(row), NOBODY)
+    return [row["at"], f"`{row['before']}`", f"`{row['after']}`", witnesses]

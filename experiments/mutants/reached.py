@@ -25,10 +25,10 @@ def pytest_unconfigure():
     """Write those of the packages as "file:line" of where they begin."""
     sys.settrace(None)
     threading.settrace(None)
-    found = set()
+    entered = set()
     for code in _entered:
         path = pathlib.Path(code.co_filename)
         if path.is_relative_to(ROOT) and path.relative_to(ROOT).parts[0] in PACKAGES:
-            found.add(f"{path.relative_to(ROOT)}:{code.co_firstlineno}")
-    told = pathlib.Path(os.environ["MUTANTS_REACHED"])
-    told.write_text(json.dumps(sorted(found)))
+            entered.add(f"{path.relative_to(ROOT)}:{code.co_firstlineno}")
+    answer = pathlib.Path(os.environ["MUTANTS_REACHED"])
+    answer.write_text(json.dumps(sorted(entered)))

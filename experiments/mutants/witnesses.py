@@ -28,18 +28,18 @@ def reached_by(test: str, copy: pathlib.Path) -> list[str]:
     Its default tests run in a process of their own, so that nothing is compiled before.
     What a test runs in a process of its own is not seen.
     """
-    told = copy / f"{test.replace('/', '.')}.reached.json"
+    answer = copy / f"{test.replace('/', '.')}.reached.json"
     command = [*PYTEST, "-m", DEFAULT, "-p", "experiments.mutants.reached", test]
     ran = subprocess.run(
         command,
         cwd=copy,
         capture_output=True,
         text=True,
-        env=os.environ | {"MUTANTS_REACHED": str(told)},
+        env=os.environ | {"MUTANTS_REACHED": str(answer)},
     )
     if ran.returncode not in (0, 5):  # all passed, or there was none
         raise ValueError(f"{test} fails without any fault:\n{ran.stdout[-2000:]}")
-    return json.loads(told.read_text())
+    return json.loads(answer.read_text())
 
 
 def tried(
@@ -50,7 +50,7 @@ def tried(
     right = path.read_bytes()
     wrong = right[: fault.start] + fault.text.encode() + right[fault.end :]
     began = time.monotonic()
-    tests = asked(fault, reached)
+    tests = tests_that_enter(fault, reached)
     path.write_bytes(wrong)
     try:
         caught_by = _failures(tests, copy, seconds) if tests else []
@@ -71,13 +71,13 @@ def _line(source, line):
     return source.decode().splitlines()[line - 1].strip()
 
 
-def asked(fault: Fault, reached: dict[str, set[str]]) -> list[str]:
+def tests_that_enter(fault: Fault, reached: dict[str, set[str]]) -> list[str]:
     """Files of tests that enter the function, those named after its module first."""
     named = f"test_{pathlib.Path(fault.path).stem.strip('_')}"
     place = f"{fault.path}:{fault.function}"
-    found = sorted(test for test, places in reached.items() if place in places)
-    found.sort(key=lambda test: not pathlib.Path(test).name.startswith(named))
-    return found
+    entering = sorted(test for test, places in reached.items() if place in places)
+    entering.sort(key=lambda test: not pathlib.Path(test).name.startswith(named))
+    return entering
 
 
 def _failures(tests, copy, seconds):

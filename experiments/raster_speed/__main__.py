@@ -309,8 +309,8 @@ def main(arguments=None) -> None:
         else:
             print("  ".join(show(name, row[name]) for name in row), flush=True)
     seen = {cores: core_times(settings, cores) for cores in settings.cores}
-    for cores, found in seen.items():
-        for text, row in found.items():
+    for cores, times in seen.items():
+        for text, row in times.items():
             print(
                 f"{text} seeing {cores} cores: forward+backward "
                 f"{row['forward_backward_ms']:.1f} ms CPU, {row['wall_ms']:.1f} ms wall"
@@ -357,8 +357,8 @@ def page(stored) -> str:
                 markdown.number(row["forward_backward_ms"], 1),
                 markdown.number(row["wall_ms"], 1),
             ]
-            for cores, found in stored["cores"].items()
-            for text, row in found.items()
+            for cores, times in stored["cores"].items()
+            for text, row in times.items()
         ]
         parts += ["Forward and backward, by cores:", markdown.table(heads, rows)]
     return "\n\n".join(parts)

@@ -190,7 +190,7 @@ def count_of(spec: KANSpec | MLPSpec) -> int:
     return sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(shapes))
 
 
-def trainer(made: Network, signal: Signal, batch: int, points: int | None = None):
+def trainer(model: Network, signal: Signal, batch: int, points: int | None = None):
     """A function (keys [lanes], rates [lanes], steps) -> (parameters, training loss)
     that trains as many networks side by side; the steps are traced.
     """
@@ -201,14 +201,14 @@ def trainer(made: Network, signal: Signal, batch: int, points: int | None = None
         points = draw(jax.random.fold_in(key, step))
         truth = signal(points)
         loss, slope = jax.value_and_grad(
-            lambda params: jnp.mean((made.apply(params, points) - truth) ** 2)
+            lambda params: jnp.mean((model.apply(params, points) - truth) ** 2)
         )(params)
         direction, memory = adam.update(slope, memory)
         params = jax.tree.map(lambda p, d: p - rate * d, params, direction)
         return params, memory, loss
 
     def train(keys, rates, steps):
-        params = jax.vmap(made.init)(keys)
+        params = jax.vmap(model.init)(keys)
         state = params, jax.vmap(adam.init)(params), jnp.zeros(len(keys))
 
         def step(index, state):
@@ -267,8 +267,8 @@ def measure(
 ) -> list[Result]:
     """One network: at equal steps and, if `budget` seconds are given, in that time."""
     signal = SIGNALS[label]
-    made = network(kind, encoded, signal)
-    train = trainer(made, signal, args.batch, args.points)
+    model = network(kind, encoded, signal)
+    train = trainer(model, signal, args.batch, args.points)
     lanes = max(args.seeds, len(args.rates))
     shapes = (
         jax.eval_shape(lambda: jax.random.split(jax.random.key(0), lanes)),
@@ -279,7 +279,7 @@ def measure(
     with jax.numpy_dtype_promotion("standard"):
         compiled = jax.jit(train).lower(*shapes).compile()
     score = jax.jit(
-        jax.vmap(lambda params: errors(lambda x: made.apply(params, x), signal))
+        jax.vmap(lambda params: errors(lambda x: model.apply(params, x), signal))
     )
     tried = jnp.asarray(np.resize(args.rates, lanes), jnp.float32)
     same = jnp.stack([jax.random.key(1)] * lanes)
@@ -298,7 +298,7 @@ def measure(
         return Result(
             label,
             name,
-            made.parameters,
+            model.parameters,
             float(rate),
             steps,
             seconds,
@@ -306,10 +306,10 @@ def measure(
             missing.tolist(),
         )
 
-    found = [run(args.steps)]
+    results = [run(args.steps)]
     if budget is not None:
-        found.append(run(max(2, round(args.steps * budget / found[0].seconds))))
-    return found
+        results.append(run(max(2, round(args.steps * budget / results[0].seconds))))
+    return results
 
 
 def all_results(args: SpectralBias) -> tuple[list[Result], list[Result]]:
@@ -319,12 +319,12 @@ def all_results(args: SpectralBias) -> tuple[list[Result], list[Result]]:
         budget = None
         for kind in args.kinds:
             for encoded in (False, True):
-                found = measure(args, label, kind, encoded, budget)
-                equal_steps.append(found[0])
-                equal_time.append(found[-1])
+                results = measure(args, label, kind, encoded, budget)
+                equal_steps.append(results[0])
+                equal_time.append(results[-1])
                 if budget is None:
-                    budget = found[0].seconds
-                print(report.progress(found), flush=True)
+                    budget = results[0].seconds
+                print(report.progress(results), flush=True)
     return equal_steps, equal_time
 
 
@@ -338,7 +338,7 @@ def main(arguments=None):
     results = dict(zip(("equal steps", "equal time"), all_results(args), strict=True))
     waves = {label: SIGNALS[label].waves for label in args.signals}
     print(report.tables(results, waves))
-    print(report.said(results))
+    print(report.format_conclusions(results))
     if args.out is not None:
         report.write(args, results, waves)
 

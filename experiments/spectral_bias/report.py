@@ -14,9 +14,9 @@ from nerfies_jax.training import specs
 GATE = 0.5
 
 
-def progress(found) -> str:
+def progress(results) -> str:
     """One line for a network that is done."""
-    first = found[0]
+    first = results[0]
     return (
         f"{first.signal} {first.network}: rmse {np.mean(first.rmse):.4f} in "
         f"{first.steps} steps, {first.seconds:.2f} s"
@@ -63,7 +63,7 @@ def tables(results, waves) -> str:
     return "\n".join(blocks)
 
 
-def said(results) -> str:
+def format_conclusions(results) -> str:
     """What the numbers show, in sentences."""
     sentences = [""]
     for equality, rows in results.items():
@@ -121,12 +121,12 @@ def write(args, results, waves) -> None:
     record = {
         "settings": specs.as_json(args),
         "machine": clock.machine(),
-        "waves": {label: found.tolist() for label, found in waves.items()},
+        "waves": {label: components.tolist() for label, components in waves.items()},
         "results": {
             equality: [row._asdict() for row in rows]
             for equality, rows in results.items()
         },
-        "said": said(results).strip().split("\n"),
+        "said": format_conclusions(results).strip().split("\n"),
     }
     write_json(args.out / "spectral_bias.json", record)
     draw_figure(results, waves, args.out / "spectral_bias.png")
@@ -139,7 +139,7 @@ def page(stored) -> str:
     for label, components in stored["waves"].items():
         heads = ("network", "numbers", "rate", "steps", "s", "RMS error", "±")
         heads += tuple(f"k={name_of(wave)}" for wave in components)
-        for equality, found in stored["results"].items():
+        for equality, results in stored["results"].items():
             rows = [
                 [
                     row["network"],
@@ -151,7 +151,7 @@ def page(stored) -> str:
                     markdown.number(np.std(row["rmse"]), 4),
                     *(markdown.number(x, 4) for x in np.mean(row["missing"], axis=0)),
                 ]
-                for row in found
+                for row in results
                 if row["signal"] == label
             ]
             parts += [f"## {label}, {equality}", markdown.table(heads, rows)]

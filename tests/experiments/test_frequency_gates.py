@@ -71,13 +71,13 @@ def test_gains_are_paired_by_seed():
 
 def test_the_sentences_follow_from_the_numbers():
     rows = frequency_gates.numbers(planted())
-    text = frequency_gates.said(rows)
+    text = frequency_gates.format_conclusions(rows)
     assert "learned 0.1: the gates only fall, to 0.200 (wavelet) and 0.200" in text
     assert "better than no spectral loss: learned 0.1." in text
     assert "within 2 standard errors of no spectral loss: fixed 0.1." in text
     assert "Highest PSNR: learned 0.1, 22.00 dB" in text
     rows["learned 0.1"]["wavelet_end"] = 0.4
-    assert "DO NOT only fall" in frequency_gates.said(rows)
+    assert "DO NOT only fall" in frequency_gates.format_conclusions(rows)
     lines = frequency_gates.table(rows).splitlines()
     assert len(lines) == 4
     assert lines[2].split()[2:5] == ["22.00", "0.95", "+1.00"]

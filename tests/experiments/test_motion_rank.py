@@ -118,15 +118,15 @@ def rows_of(**errors):
 
 def test_the_sentences_follow_the_numbers():
     """Also where they contradict the paper."""
-    said = report.said(rows_of(time=1.0, moving=0.4, residual=0.3))
+    said = report.format_conclusions(rows_of(time=1.0, moving=0.4, residual=0.3))
     assert "0.40 of the time basis' error" in said
     assert "0.5 shows" in said
     assert "0.75 of the moving basis' error" in said
     assert "the basis is not what helps" in said
-    said = report.said(rows_of(time=1.0, moving=0.9, residual=1.8))
+    said = report.format_conclusions(rows_of(time=1.0, moving=0.9, residual=1.8))
     assert "0.5 DOES NOT SHOW" in said
     assert "better one" not in said
-    assert "better one, on held-out times, at K=4." in report.said(
+    assert "better one, on held-out times, at K=4." in report.format_conclusions(
         rows_of(time=0.1, moving=0.9)
     )
     assert "2.00 of the moving basis' error" in said

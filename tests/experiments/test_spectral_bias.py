@@ -108,16 +108,16 @@ def planted(kan, relu):
 
 
 def test_the_sentences_follow_from_the_numbers():
-    text = report.said(planted(0.1, 0.3))
+    text = report.format_conclusions(planted(0.1, 0.3))
     assert (
         "2-D, equal steps: best is kan (0.1000), then relu + encoding (0.3000)" in text
     )
     assert "has 0.33 of the error" in text
     assert "2-D signal: holds" in text
-    text = report.said(planted(0.2, 0.3))
+    text = report.format_conclusions(planted(0.2, 0.3))
     assert "has 0.67 of the error" in text
     assert "DOES NOT HOLD" in text
-    text = report.said(planted(0.6, 0.3))
+    text = report.format_conclusions(planted(0.6, 0.3))
     assert "(relu + encoding): worse" in text
     assert "(sine): worse" in text
 
