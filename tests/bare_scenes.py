@@ -162,14 +162,14 @@ def field_loss(spec, metadata, params, batch, key):
             features = encoding.encode(one.position, point, None)
             return template.apply(one, params["template"][name], features, condition)
 
-        found = jax.vmap(ask)(distance)
+        answers = jax.vmap(ask)(distance)
         behind, end = None, compositing.AT_INFINITY
         if metadata.background is not None:
             behind = jnp.asarray(metadata.background, distance.dtype)
             end = jnp.maximum(far - distance[-1], 0)
-        optical_depth = found.density * compositing.intervals(distance, end)
+        optical_depth = answers.density * compositing.intervals(distance, end)
         weights = compositing.weights(optical_depth)
-        whole = compositing.composite(weights, found.colour, distance, behind)
+        whole = compositing.composite(weights, answers.colour, distance, behind)
         return weights, whole.colour
 
     def ray(origin, direction, cosine, key):

@@ -53,48 +53,48 @@ MOTION_MODULES = {
 def of_field(spec, metadata):
     """The effects of a field, asked one by one from their own modules."""
     width = spec.template.width
-    made = []
+    effects = []
     if spec.appearance is not None:
-        made.append(appearance.effect(spec.appearance))
+        effects.append(appearance.effect(spec.appearance))
     if spec.transient is not None:
-        made.append(transient.effect(spec.transient, width))
+        effects.append(transient.effect(spec.transient, width))
     if spec.time is not None:
-        made.append(time_condition.effect(spec.time))
+        effects.append(time_condition.effect(spec.time))
     if spec.warp is not None:
-        made.append(warp.effect(spec.warp))
+        effects.append(warp.effect(spec.warp))
     if spec.ambient is not None:
-        made.append(ambient.effect(spec.ambient))
+        effects.append(ambient.effect(spec.ambient))
     if spec.elastic is not None:
-        made.append(elastic.effect(spec.elastic))
+        effects.append(elastic.effect(spec.elastic))
     if spec.background is not None:
-        made.append(background.effect(spec.background))
+        effects.append(background.effect(spec.background))
     if spec.scene_flow is not None:
         moments = len(metadata.times)
-        made.append(scene_flow.effect(spec.scene_flow, moments, width))
-    return tuple(made)
+        effects.append(scene_flow.effect(spec.scene_flow, moments, width))
+    return tuple(effects)
 
 
 def of_splats(spec, metadata):
     """The effects of a scene of Gaussians, asked one by one from their own modules."""
-    made, extent, frames = [], metadata.extent, metadata.frames
+    effects, extent, frames = [], metadata.extent, metadata.frames
     motion = spec.motion
     if isinstance(motion, mlp_motion.MotionSpec):
-        made.append(mlp_motion.effect(motion, spec.steps, frames))
+        effects.append(mlp_motion.effect(motion, spec.steps, frames))
     if isinstance(motion, kan_motion.KanMotionSpec):
-        made.append(kan_motion.effect(motion, spec.steps, frames))
+        effects.append(kan_motion.effect(motion, spec.steps, frames))
     if isinstance(motion, motion_basis.BasisMotionSpec):
-        made.append(motion_basis.effect(motion, spec.steps, frames))
+        effects.append(motion_basis.effect(motion, spec.steps, frames))
     if spec.acceleration is not None:
-        made.append(acceleration.effect(spec.acceleration, extent, frames))
+        effects.append(acceleration.effect(spec.acceleration, extent, frames))
     if spec.neighbours is not None:
-        made.append(neighbours.effect(spec.neighbours, extent, "kan_motion"))
+        effects.append(neighbours.effect(spec.neighbours, extent, "kan_motion"))
     if spec.motion_growth is not None:
-        made.append(motion_growth.effect(spec.motion_growth, extent))
+        effects.append(motion_growth.effect(spec.motion_growth, extent))
     if spec.spectral is not None:
-        made.append(spectral.effect(spec.spectral, spec.steps))
+        effects.append(spectral.effect(spec.spectral, spec.steps))
     if spec.depth is not None:
-        made.append(depth.effect(spec.depth))
-    return tuple(made)
+        effects.append(depth.effect(spec.depth))
+    return tuple(effects)
 
 
 def absent_modules(spec):

@@ -110,10 +110,10 @@ def enters(thing, origin, direction, time):
         points = start + np.atleast_1d(s)[:, None] * along
         return undeform(shape, points, time)
 
-    found = {"Sphere": _ball, "Box": _box, "Sheet": _sheet}[type(shape).__name__](
+    distances = {"Sphere": _ball, "Box": _box, "Sheet": _sheet}[type(shape).__name__](
         shape, start, along, material
     )
-    return min((s for s in found if s > 0), default=np.inf)
+    return min((s for s in distances if s > 0), default=np.inf)
 
 
 def _ball(shape, start, along, material):

@@ -103,11 +103,11 @@ def tiny_field():
     """Metadata of `TINY_FIELD`, parameters whose warp and codes show, and a view."""
     capture = tiny_capture()
     metadata = nerf_scene.metadata_of(capture, TINY_FIELD)
-    made = nerf_scene.field(TINY_FIELD, metadata)
+    field = nerf_scene.field(TINY_FIELD, metadata)
 
     @jax.jit  # or each array is a program
     def start(key):
-        params = made.init(key)
+        params = field.init(key)
         params["warp"] = jax.tree.map(lambda leaf: leaf + 0.1, params["warp"])
         params["codes"] = jax.tree.map(lambda leaf: 40 * leaf, params["codes"])
         return params

@@ -397,10 +397,10 @@ def test_rotations_and_strains_of_half_precision_are_rounded_once(kind):
     names = [name for name in FUNCTIONS if name.split(".")[0] in rooms]
     drawn = {name: _rows(FUNCTIONS[name], "float32") for name in names}
     half = jax.tree.map(lambda rows: rows[0].astype(jnp.dtype(kind)), drawn)
-    found = _every_rotation_and_strain(half)
+    rounded = _every_rotation_and_strain(half)
     exact = _every_rotation_and_strain(jax.tree.map(np.float32, half))
     half_ulp = float(jnp.finfo(kind).eps) / 2
-    for one, other in zip(*map(jax.tree.leaves, (found, exact)), strict=True):
+    for one, other in zip(*map(jax.tree.leaves, (rounded, exact)), strict=True):
         assert one.dtype == kind
         off = np.abs(np.asarray(one, np.float32) - np.asarray(other))
         # float16's smallest numbers are 6e-8 apart

@@ -72,12 +72,12 @@ def bare(spec):
     return without(spec, *parts_of(spec))
 
 
-def same_bits(found, expected):
-    found, expected = (
-        jax.tree_util.tree_flatten_with_path(x)[0] for x in (found, expected)
+def same_bits(result, expected):
+    result, expected = (
+        jax.tree_util.tree_flatten_with_path(x)[0] for x in (result, expected)
     )
-    assert [path for path, _ in found] == [path for path, _ in expected]
-    for (path, one), (_, other) in zip(found, expected, strict=True):
+    assert [path for path, _ in result] == [path for path, _ in expected]
+    for (path, one), (_, other) in zip(result, expected, strict=True):
         if jnp.issubdtype(one.dtype, jax.dtypes.prng_key):
             one, other = jax.random.key_data(one), jax.random.key_data(other)
         np.testing.assert_array_equal(one, other, err_msg=jax.tree_util.keystr(path))
@@ -86,9 +86,9 @@ def same_bits(found, expected):
 def same_program(ours, by_hand, *args):
     """Equal cost as compiled, and bitwise equal results."""
     ours, by_hand = jax.jit(ours), jax.jit(by_hand)
-    found, expected = clock.cost(ours, *args), clock.cost(by_hand, *args)
-    assert found._replace(compile_seconds=0) == expected._replace(compile_seconds=0)
-    assert found.flops > 0
+    cost, expected = clock.cost(ours, *args), clock.cost(by_hand, *args)
+    assert cost._replace(compile_seconds=0) == expected._replace(compile_seconds=0)
+    assert cost.flops > 0
     same_bits(ours(*args), by_hand(*args))
 
 

@@ -102,10 +102,10 @@ def removed_from(spec):
 )
 def test_a_field_has_the_arrays_of_what_it_has_and_no_others(preset):
     for spec in removed_from(field_presets.PRESETS[preset]):
-        made = fields.field(spec, METADATA)
-        found = jax.eval_shape(made.init, jax.random.key(0))
+        field = fields.field(spec, METADATA)
+        arrays = jax.eval_shape(field.init, jax.random.key(0))
         expected = jax.eval_shape(lambda spec=spec: counted_out(spec))
-        assert shapes(found) == shapes(expected)
+        assert shapes(arrays) == shapes(expected)
 
 
 @pytest.mark.parametrize(

@@ -58,8 +58,8 @@ def test_float64_starts_alike_and_stays_float64(name):
         start, shapes = one_step(name)
     with jax.enable_x64(True):
         wide_start, wide_shapes = one_step(name)
-    for precision, found in (("float32", shapes), ("float64", wide_shapes)):
-        kinds = {str(leaf.dtype) for leaf in floats(found).values()}
+    for precision, arrays in (("float32", shapes), ("float64", wide_shapes)):
+        kinds = {str(leaf.dtype) for leaf in floats(arrays).values()}
         assert kinds == {precision}
     start, same = floats(start), floats(wide_start)
     assert start.keys() == same.keys()

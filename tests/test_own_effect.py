@@ -40,14 +40,14 @@ def of_field(*effects):
     """The terms of a step of a tiny field with these effects, by name."""
     capture, spec = scenes.tiny_capture(), bare_scenes.tiny_field("nerf-small")
     metadata = scene.metadata_of(capture, spec)
-    made = scene.field(spec, metadata, effects=effects)
+    field = scene.field(spec, metadata, effects=effects)
     frames = evaluation.frames_of(capture)
 
     @jax.jit
     def values(key):
-        params = made.init(key)
+        params = field.init(key)
         batch = scene.draw_batch(frames, 4, key)
-        terms = scene.loss_terms(made, params, frames, batch, jnp.int32(0), key)
+        terms = scene.loss_terms(field, params, frames, batch, jnp.int32(0), key)
         return {name: term.value for name, term in terms.items()}
 
     return values(jax.random.key(0))

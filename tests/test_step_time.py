@@ -23,10 +23,10 @@ def test_parts_of_a_field_are_differences_and_none_is_negative(
     model = field_scene.build(scenes.TINY_FIELD, metadata)
     state = model.example(None, jax.random.key(0))._replace(params=params)
     frames = evaluation.frames_of(scenes.tiny_capture())
-    found = nerfies_jax.step_time.parts(
+    parts = nerfies_jax.step_time.parts(
         scenes.TINY_FIELD, metadata, model, state, frames
     )
-    assert found == {"forward": 2.0, "backward": 3.0, "rays and optimiser": rest}
+    assert parts == {"forward": 2.0, "backward": 3.0, "rays and optimiser": rest}
 
 
 def test_what_parts_of_splats_leave_of_a_step_is_the_optimisers(monkeypatch):
@@ -36,9 +36,9 @@ def test_what_parts_of_splats_leave_of_a_step_is_the_optimisers(monkeypatch):
     metadata = splat_scene.metadata_of(capture)
     model = splat_scene.build(spec, metadata)
     state = model.init(capture, jax.random.key(0))
-    found = gaussians_jax.step_time.parts(
+    parts = gaussians_jax.step_time.parts(
         spec, metadata, model, state, evaluation.frames_of(capture)
     )
-    assert found["optimiser and statistics"] == 2.0
-    assert list(found)[:2] == ["project and blend", "loss"]
-    assert sum(found.values()) == 9.0
+    assert parts["optimiser and statistics"] == 2.0
+    assert list(parts)[:2] == ["project and blend", "loss"]
+    assert sum(parts.values()) == 9.0

@@ -56,32 +56,34 @@ def make(root, splits=None, times=True, radius=4.0, top=None, **extra):
 
 
 def test_everything_in_the_files_arrives(tmp_path):
-    found = room.load(make(tmp_path / "lego"))
-    assert (found.name, found.source) == ("lego", "blender")
-    assert found.ids[:4] == ("train_r_0", "train_r_1", "train_r_2", "train_r_3")
-    assert found.ids[4:] == ("test_r_0", "test_r_1", "test_r_2")
-    assert found.train.tolist() == [0, 1, 2, 3]
-    assert found.heldout.tolist() == [4, 5, 6]
-    np.testing.assert_allclose(found.times, [0, 1 / 3, 2 / 3, 1, 0, 0.5, 1], atol=1e-7)
-    assert found.warp_ids.tolist() == [0, 1, 3, 4, 0, 2, 4]  # equal times, one moment
+    capture = room.load(make(tmp_path / "lego"))
+    assert (capture.name, capture.source) == ("lego", "blender")
+    assert capture.ids[:4] == ("train_r_0", "train_r_1", "train_r_2", "train_r_3")
+    assert capture.ids[4:] == ("test_r_0", "test_r_1", "test_r_2")
+    assert capture.train.tolist() == [0, 1, 2, 3]
+    assert capture.heldout.tolist() == [4, 5, 6]
+    np.testing.assert_allclose(
+        capture.times, [0, 1 / 3, 2 / 3, 1, 0, 0.5, 1], atol=1e-7
+    )
+    assert capture.warp_ids.tolist() == [0, 1, 3, 4, 0, 2, 4]  # equal times, one moment
     pixels = picture(2).astype(float)
     cover = pixels[..., 3:] / 255
     white = pixels[..., :3] * cover + 255 * (1 - cover)
-    assert (np.abs(found.images[2] - white) <= 0.501).all()
-    assert found.background == (1.0, 1.0, 1.0)
-    assert (found.near, found.far) == (2.0, 6.0)
-    assert (found.scale, found.centre) == (1.0, (0.0, 0.0, 0.0))
+    assert (np.abs(capture.images[2] - white) <= 0.501).all()
+    assert capture.background == (1.0, 1.0, 1.0)
+    assert (capture.near, capture.far) == (2.0, 6.0)
+    assert (capture.scale, capture.centre) == (1.0, (0.0, 0.0, 0.0))
     np.testing.assert_allclose(
-        found.cameras.focal_px, 0.5 * 10 / math.tan(0.5 * ANGLE), rtol=1e-6
+        capture.cameras.focal_px, 0.5 * 10 / math.tan(0.5 * ANGLE), rtol=1e-6
     )
-    np.testing.assert_array_equal(found.cameras.principal_point_px, [[5, 4]] * 7)
+    np.testing.assert_array_equal(capture.cameras.principal_point_px, [[5, 4]] * 7)
 
 
 def test_the_picture_is_upright_and_unmirrored(tmp_path):
-    found = room.load(make(tmp_path))
+    capture = room.load(make(tmp_path))
     # Camera 0 stands at (4, 0, 0) and looks along -x: z is up, y is to its right.
     points = np.float32([[0, 0, 0], [0, 0, 0.5], [0, 0.5, 0]])
-    pixel, depth, seen = frames.pixels_of(found.cameras, 0, points, (10, 8))
+    pixel, depth, seen = frames.pixels_of(capture.cameras, 0, points, (10, 8))
     assert seen.all()
     np.testing.assert_allclose(depth, 4, rtol=1e-6)
     np.testing.assert_allclose(pixel[0], [5, 4], atol=1e-5)
@@ -101,23 +103,23 @@ def test_the_picture_is_upright_and_unmirrored(tmp_path):
     ],
 )
 def test_which_split_is_held_out(tmp_path, splits, heldout, expected):
-    found = blender_format.read(make(tmp_path, splits), heldout=heldout)
-    assert found.ids[found.heldout[0]] == expected
+    capture = blender_format.read(make(tmp_path, splits), heldout=heldout)
+    assert capture.ids[capture.heldout[0]] == expected
 
 
 def test_a_single_file_can_be_named(tmp_path):
     make(tmp_path, {"train": 16, "test": 2})
-    found = room.load(tmp_path / "transforms_train.json", heldout=8)
-    assert len(found.ids) == 16
+    capture = room.load(tmp_path / "transforms_train.json", heldout=8)
+    assert len(capture.ids) == 16
 
 
 def test_background_and_smaller_pictures(tmp_path):
-    found = blender_format.read(make(tmp_path), background=(0.0, 0.0, 0.0), factor=2)
+    capture = blender_format.read(make(tmp_path), background=(0.0, 0.0, 0.0), factor=2)
     pixels = picture(0).astype(float)
     black = np.round(pixels[..., :3] * pixels[..., 3:] / 255)
-    assert found.size == (5, 4)
-    assert abs(found.images[0, 0, 0, 0] - black[:2, :2, 0].mean()) <= 0.5
-    np.testing.assert_array_equal(found.cameras.principal_point_px[0], [2.5, 2])
+    assert capture.size == (5, 4)
+    assert abs(capture.images[0, 0, 0, 0] - black[:2, :2, 0].mean()) <= 0.5
+    np.testing.assert_array_equal(capture.cameras.principal_point_px[0], [2.5, 2])
 
 
 def test_times_that_are_missing(tmp_path):
@@ -138,8 +140,8 @@ def test_times_that_are_missing(tmp_path):
 
 
 def test_cameras_further_away_see_further(tmp_path):
-    found = blender_format.read(make(tmp_path, radius=10.0))
-    assert (found.near, found.far) == pytest.approx((5, 15))
+    capture = blender_format.read(make(tmp_path, radius=10.0))
+    assert (capture.near, capture.far) == pytest.approx((5, 15))
     own = blender_format.read(tmp_path, near=1.0, far=20.0)
     assert (own.near, own.far) == (1.0, 20.0)
 
@@ -151,8 +153,8 @@ LENS = {
 
 
 def test_nerfstudio_lens_scales_with_the_pictures(tmp_path):
-    found = blender_format.read(make(tmp_path, {"": 9}, top=LENS))
-    cameras = found.cameras
+    capture = blender_format.read(make(tmp_path, {"": 9}, top=LENS))
+    cameras = capture.cameras
     np.testing.assert_allclose(
         cameras.focal_px, 20, rtol=1e-6
     )  # pictures are half size
@@ -160,10 +162,10 @@ def test_nerfstudio_lens_scales_with_the_pictures(tmp_path):
     np.testing.assert_allclose(cameras.principal_point_px, [[5.5, 3.5]] * 9)
     np.testing.assert_allclose(cameras.radial[0], [0.1, 0.02, 0], rtol=1e-6)
     np.testing.assert_allclose(cameras.tangential[0], [0.003, 0.004], rtol=1e-6)
-    assert any("scaled to pictures" in note for note in found.notes)
+    assert any("scaled to pictures" in note for note in capture.notes)
     # All cameras look at the origin from 4 away; that becomes the unit.
     np.testing.assert_allclose(np.linalg.norm(cameras.position, axis=1), 1, rtol=1e-5)
-    assert found.scale == pytest.approx(0.25)
+    assert capture.scale == pytest.approx(0.25)
 
 
 def test_a_frame_may_have_its_own_lens(tmp_path):
@@ -172,8 +174,8 @@ def test_a_frame_may_have_its_own_lens(tmp_path):
     table = json.loads(file.read_text())
     table["frames"][3]["fl_x"] = 80.0
     dump(file, table)
-    found = blender_format.read(tmp_path)
-    focal = dict(zip(found.ids, found.cameras.focal_px, strict=True))
+    capture = blender_format.read(tmp_path)
+    focal = dict(zip(capture.ids, capture.cameras.focal_px, strict=True))
     assert focal["images_r_3"] == pytest.approx(40)
     assert focal["images_r_2"] == pytest.approx(20)
 
@@ -213,17 +215,17 @@ def test_nerfstudio_points_masks_and_lists(tmp_path):
     plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")]).write(
         tmp_path / "sparse.ply"
     )
-    found = blender_format.read(tmp_path)
-    assert found.ids[found.heldout[0]] == "images_r_8"
-    assert (~found.valid).sum() == 1
-    assert not found.valid[0, 1, 2]
-    assert found.points.colour[7].tolist() == [0, 200, 0]
-    world = found.points.position / found.scale + found.centre
+    capture = blender_format.read(tmp_path)
+    assert capture.ids[capture.heldout[0]] == "images_r_8"
+    assert (~capture.valid).sum() == 1
+    assert not capture.valid[0, 1, 2]
+    assert capture.points.colour[7].tolist() == [0, 200, 0]
+    world = capture.points.position / capture.scale + capture.centre
     np.testing.assert_allclose(world[:, 0], rows["x"], atol=1e-5)
     # Depths seen lie within 4 +- 0.9 of the world; near and far lie around them.
-    assert 2 < found.near / found.scale < 3.7
-    assert 4.3 < found.far / found.scale < 6.5
-    corners = np.concatenate([found.points.position, found.cameras.position])
+    assert 2 < capture.near / capture.scale < 3.7
+    assert 4.3 < capture.far / capture.scale < 6.5
+    corners = np.concatenate([capture.points.position, capture.cameras.position])
     assert np.linalg.norm(np.ptp(corners, axis=0)) < 1.2  # unit diagonal but outliers
 
 
@@ -233,9 +235,9 @@ def test_missing_pictures_are_listed_or_left_out(tmp_path):
     (tmp_path / "test/r_0.png").unlink()
     with pytest.raises(CaptureError, match=r"2 of 7 .* \(train_r_1, test_r_0\)"):
         blender_format.read(tmp_path)
-    found = room.load(tmp_path, missing="skip")
-    assert found.train.tolist() == [0, 1, 2]
-    assert found.heldout.tolist() == [3, 4]
+    capture = room.load(tmp_path, missing="skip")
+    assert capture.train.tolist() == [0, 1, 2]
+    assert capture.heldout.tolist() == [3, 4]
 
 
 def first_frame(**changes):
@@ -309,9 +311,9 @@ BAD = {
 @pytest.mark.parametrize("case", BAD)
 def test_broken_files_are_refused_in_one_line(tmp_path, case):
     make(tmp_path)
-    spoil, said = BAD[case]
+    spoil, refusal = BAD[case]
     spoil(tmp_path)
-    refused(blender_format.read, tmp_path, said)
+    refused(blender_format.read, tmp_path, refusal)
 
 
 def test_an_unknown_split_is_refused(tmp_path):
@@ -323,19 +325,19 @@ def test_an_unknown_split_is_refused(tmp_path):
 
 @pytest.mark.full
 def test_a_real_scene_has_the_cameras_its_card_lists(data_dir):
-    found = room.load(data_dir / "blender_lego_static")
+    capture = room.load(data_dir / "blender_lego_static")
     known = np.load(data_dir / "blender_lego_static/cameras.npz")
     ids = [str(name).replace("/", "_").removesuffix(".png") for name in known["names"]]
-    rows = [found.ids.index(name) for name in ids]
-    assert (len(rows), found.train.size, found.heldout.size) == (125, 100, 25)
+    rows = [capture.ids.index(name) for name in ids]
+    assert (len(rows), capture.train.size, capture.heldout.size) == (125, 100, 25)
     pose_known = known["c2w_opencv"]
-    rotation = found.cameras.camera_from_world[rows].swapaxes(1, 2)
+    rotation = capture.cameras.camera_from_world[rows].swapaxes(1, 2)
     np.testing.assert_allclose(rotation, pose_known[:, :, :3], atol=3e-7)
     np.testing.assert_allclose(
-        found.cameras.position[rows], pose_known[:, :, 3], atol=1e-6
+        capture.cameras.position[rows], pose_known[:, :, 3], atol=1e-6
     )
     np.testing.assert_allclose(
-        found.cameras.focal_px[rows], known["K"][:, 0, 0], rtol=1e-6
+        capture.cameras.focal_px[rows], known["K"][:, 0, 0], rtol=1e-6
     )
-    centre = found.cameras.principal_point_px[rows]
+    centre = capture.cameras.principal_point_px[rows]
     np.testing.assert_allclose(centre, known["K"][:, :2, 2], rtol=1e-6)

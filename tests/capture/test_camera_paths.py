@@ -23,8 +23,8 @@ def rig(target, count=8):
 
 def test_the_focus_is_where_all_axes_meet():
     target = np.array([0.3, -0.1, 0.2])
-    found = camera_paths.focus_point(rig(target), 0.5, 10.0)
-    np.testing.assert_allclose(found, target, atol=1e-5)
+    focus = camera_paths.focus_point(rig(target), 0.5, 10.0)
+    np.testing.assert_allclose(focus, target, atol=1e-5)
 
 
 def test_parallel_axes_focus_halfway_in_inverse_depth():
@@ -32,8 +32,8 @@ def test_parallel_axes_focus_halfway_in_inverse_depth():
     row = cameras.stack(
         [one._replace(position=np.float32([x, 0, 0])) for x in (-1.0, 0.0, 1.0)]
     )
-    found = camera_paths.focus_point(row, 1.0, 4.0)
-    np.testing.assert_allclose(found, [0, 0, 1.6], atol=1e-6)
+    focus = camera_paths.focus_point(row, 1.0, 4.0)
+    np.testing.assert_allclose(focus, [0, 0, 1.6], atol=1e-6)
 
 
 def test_axes_that_meet_behind_the_cameras_are_not_believed():
@@ -42,8 +42,8 @@ def test_axes_that_meet_behind_the_cameras_are_not_believed():
         camera_from_world=away.camera_from_world
         * np.float32([[-1], [1], [-1]])  # turned around: the axes meet behind
     )
-    found = camera_paths.focus_point(flipped, 0.5, 2.0)
-    offset = found - flipped.position.mean(axis=0)
+    focus = camera_paths.focus_point(flipped, 0.5, 2.0)
+    offset = focus - flipped.position.mean(axis=0)
     assert offset @ flipped.camera_from_world[:, 2, :].mean(axis=0) > 0
 
 

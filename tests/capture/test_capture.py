@@ -81,8 +81,8 @@ def test_downscale_averages_each_block(size, factor):
 
 def test_describe_says_what_was_found():
     text = "\n".join(capturing.describe(make(notes=("mended a thing",))))
-    for said in ("4 frames of 6x4", "3 to learn from", "1 held out", "mended a thing"):
-        assert said in text
+    for words in ("4 frames of 6x4", "3 to learn from", "1 held out", "mended a thing"):
+        assert words in text
     bare = dataclasses.replace(
         make(), valid=None, moving=None, depths=None, points=None
     )
@@ -97,7 +97,7 @@ def test_depths_of_points_are_those_of_a_loop_over_the_filmed_views():
         for point in capture.points.position:
             depth = (turn @ (point - capture.cameras.position[row]))[2]
             expected.extend([depth] if depth > capture.near else [])
-    found = capturing.point_depths(capture)
-    np.testing.assert_allclose(np.sort(found), np.sort(expected), rtol=1e-5)
+    depths = capturing.point_depths(capture)
+    np.testing.assert_allclose(np.sort(depths), np.sort(expected), rtol=1e-5)
     without = dataclasses.replace(capture, points=None)
     assert capturing.point_depths(without).size == 0

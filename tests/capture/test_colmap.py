@@ -64,35 +64,37 @@ def make(
 
 
 def test_everything_in_the_files_arrives(tmp_path):
-    found = room.load(make(tmp_path))
-    assert found.source == "colmap"
-    assert found.ids == tuple(f"f_{row:03d}" for row in range(9))
-    assert found.heldout.tolist() == [4]
-    np.testing.assert_allclose(found.times, np.linspace(0, 1, 9), atol=1e-7)
+    capture = room.load(make(tmp_path))
+    assert capture.source == "colmap"
+    assert capture.ids == tuple(f"f_{row:03d}" for row in range(9))
+    assert capture.heldout.tolist() == [4]
+    np.testing.assert_allclose(capture.times, np.linspace(0, 1, 9), atol=1e-7)
     for row in range(9):
-        np.testing.assert_array_equal(found.images[row], picture(row))
+        np.testing.assert_array_equal(capture.images[row], picture(row))
         np.testing.assert_allclose(
-            found.cameras.camera_from_world[row], rotation(row).as_matrix(), atol=1e-6
+            capture.cameras.camera_from_world[row], rotation(row).as_matrix(), atol=1e-6
         )
-        world = found.cameras.position[row] / found.scale + found.centre
+        world = capture.cameras.position[row] / capture.scale + capture.centre
         np.testing.assert_allclose(world, position(row), atol=3e-6)
-    np.testing.assert_allclose(found.cameras.focal_px, 30)
-    np.testing.assert_allclose(found.cameras.pixel_aspect, 1.1, rtol=1e-6)
-    np.testing.assert_allclose(found.cameras.principal_point_px[0], [12.5, 7.75])
-    order = np.argsort(found.points.colour[:, 0])
-    world = found.points.position[order] / found.scale + found.centre
+    np.testing.assert_allclose(capture.cameras.focal_px, 30)
+    np.testing.assert_allclose(capture.cameras.pixel_aspect, 1.1, rtol=1e-6)
+    np.testing.assert_allclose(capture.cameras.principal_point_px[0], [12.5, 7.75])
+    order = np.argsort(capture.points.colour[:, 0])
+    world = capture.points.position[order] / capture.scale + capture.centre
     np.testing.assert_allclose(world, WORLD, atol=1e-5)
-    assert found.points.colour[order][7].tolist() == [7, 20, 30]
+    assert capture.points.colour[order][7].tolist() == [7, 20, 30]
 
 
 def test_the_scene_has_unit_size_and_its_depths_lie_between_near_and_far(tmp_path):
-    found = room.load(make(tmp_path))
-    corners = np.concatenate([found.points.position, found.cameras.position])
+    capture = room.load(make(tmp_path))
+    corners = np.concatenate([capture.points.position, capture.cameras.position])
     assert 0.95 < np.linalg.norm(np.ptp(corners, axis=0)) < 1.2
     for row in range(9):
-        _, depth, _ = frames.pixels_of(found.cameras, row, found.points.position, SIZE)
-        assert found.near < depth.min() < depth.max() < found.far
-    assert found.up[1] < -0.99  # the cameras' down axis is y
+        _, depth, _ = frames.pixels_of(
+            capture.cameras, row, capture.points.position, SIZE
+        )
+        assert capture.near < depth.min() < depth.max() < capture.far
+    assert capture.up[1] < -0.99  # the cameras' down axis is y
 
 
 LENSES = [
@@ -107,7 +109,7 @@ LENSES = [
 
 @pytest.mark.parametrize("lens", LENSES)
 def test_our_cameras_project_as_colmap_does(tmp_path, lens):
-    found = room.load(make(tmp_path, lens=lens))
+    capture = room.load(make(tmp_path, lens=lens))
     name, width, height, *numbers = lens.split()
     theirs = library().Camera(
         model=name,
@@ -116,8 +118,10 @@ def test_our_cameras_project_as_colmap_does(tmp_path, lens):
         params=[float(number) for number in numbers],
     )
     for row in (0, 8):
-        pixel, *_ = frames.pixels_of(found.cameras, row, found.points.position, SIZE)
-        world = found.points.position.astype(float) / found.scale + found.centre
+        pixel, *_ = frames.pixels_of(
+            capture.cameras, row, capture.points.position, SIZE
+        )
+        world = capture.points.position.astype(float) / capture.scale + capture.centre
         inner = rotation(row).apply(world - position(row))
         np.testing.assert_allclose(pixel, theirs.img_from_cam(inner), atol=2e-4)
 
@@ -147,12 +151,12 @@ def test_other_lenses_are_undistorted_to_where_their_rays_point(tmp_path, lens):
         PIL.Image.fromarray(np.round(pixels).astype(np.uint8)).save(
             tmp_path / f"images/f_{row:03d}.png"
         )
-    found = room.load(tmp_path)
-    assert any("undistorted" in note for note in found.notes)
-    one = found.cameras
+    capture = room.load(tmp_path)
+    assert any("undistorted" in note for note in capture.notes)
+    one = capture.cameras
     assert not one.radial.any()
     assert not one.tangential.any()
-    width, height = found.size
+    width, height = capture.size
     y, x = np.mgrid[:height, :width] + 0.5
     grad = np.stack(
         [
@@ -162,9 +166,11 @@ def test_other_lenses_are_undistorted_to_where_their_rays_point(tmp_path, lens):
         ],
         axis=-1,
     )
-    valid = np.ones((height, width), bool) if found.valid is None else found.valid[1]
+    valid = (
+        np.ones((height, width), bool) if capture.valid is None else capture.valid[1]
+    )
     assert valid.mean() > 0.7
-    error = found.images[1][..., :2].astype(float) - colour(grad)
+    error = capture.images[1][..., :2].astype(float) - colour(grad)
     # Rounding twice gives 1; the rest is bilinear interpolation of a slow function.
     assert np.abs(error[valid]).max() < 1.6
 
@@ -177,13 +183,13 @@ def test_masks_follow_their_pictures_through_undistortion(tmp_path):
     mask[:, :48] = 0  # black moves: the left half, and the middle stays the middle
     for row in range(3):
         PIL.Image.fromarray(mask).save(tmp_path / f"masks/f_{row:03d}.png.png")
-    found = room.load(tmp_path)
-    width = found.size[0]
-    middle = found.size[1] // 2
-    assert found.moving[0, middle, width // 4]
-    assert not found.moving[0, middle, 3 * width // 4]
-    edge = np.flatnonzero(np.diff(found.moving[0, middle].astype(int)) == -1)
-    assert abs(edge[0] + 1 - found.cameras.principal_point_px[0, 0]) <= 1
+    capture = room.load(tmp_path)
+    width = capture.size[0]
+    middle = capture.size[1] // 2
+    assert capture.moving[0, middle, width // 4]
+    assert not capture.moving[0, middle, 3 * width // 4]
+    edge = np.flatnonzero(np.diff(capture.moving[0, middle].astype(int)) == -1)
+    assert abs(edge[0] + 1 - capture.cameras.principal_point_px[0, 0]) <= 1
 
 
 @pytest.mark.parametrize(
@@ -200,11 +206,13 @@ def test_pictures_may_be_fractions_of_the_model(
     tmp_path, folder, size, options, expected
 ):
     make(tmp_path, folder=folder, size=size, ending="jpg")  # found under another ending
-    found = colmap.read(tmp_path, **options)
-    assert found.size == expected
-    np.testing.assert_allclose(found.cameras.focal_px, 30 * expected[0] / 24, rtol=1e-6)
+    capture = colmap.read(tmp_path, **options)
+    assert capture.size == expected
+    np.testing.assert_allclose(
+        capture.cameras.focal_px, 30 * expected[0] / 24, rtol=1e-6
+    )
     centre = np.array([12.5, 7.75]) * expected[0] / 24
-    np.testing.assert_allclose(found.cameras.principal_point_px[0], centre, rtol=1e-6)
+    np.testing.assert_allclose(capture.cameras.principal_point_px[0], centre, rtol=1e-6)
 
 
 def test_the_largest_of_several_models_is_read(tmp_path):
@@ -212,9 +220,9 @@ def test_the_largest_of_several_models_is_read(tmp_path):
     make(tmp_path / "large")
     (tmp_path / "large/sparse/0").rename(tmp_path / "large/sparse/1")
     (tmp_path / "small/sparse/0").rename(tmp_path / "large/sparse/0")
-    found = room.load(tmp_path / "large")
-    assert len(found.ids) == 9
-    assert any("0: 3, 1: 9" in note for note in found.notes)
+    capture = room.load(tmp_path / "large")
+    assert len(capture.ids) == 9
+    assert any("0: 3, 1: 9" in note for note in capture.notes)
 
 
 def test_times_follow_the_numbers_when_frames_are_missing(tmp_path):
@@ -222,8 +230,8 @@ def test_times_follow_the_numbers_when_frames_are_missing(tmp_path):
     (tmp_path / "images/f_002.png").unlink()
     with pytest.raises(CaptureError, match=r"1 of 9 .*f_002"):
         colmap.read(tmp_path)
-    found = colmap.read(tmp_path, missing="skip")
-    np.testing.assert_allclose(found.times, np.delete(np.arange(9), 2) / 8, atol=1e-7)
+    capture = colmap.read(tmp_path, missing="skip")
+    np.testing.assert_allclose(capture.times, np.delete(np.arange(9), 2) / 8, atol=1e-7)
 
 
 def test_black_wedges_at_the_rim_are_not_filmed():
@@ -232,12 +240,12 @@ def test_black_wedges_at_the_rim_are_not_filmed():
     images[1, 20:24, 20:24] = 0  # a dark thing inside
     images[2] = 0  # a dark scene
     images[3, :6, 10:40] = np.random.default_rng(0).integers(0, 3, (6, 30, 3))  # cloth
-    found = black_borders(images)
-    assert not found[0].any()
-    assert not found[2:].any()
+    borders = black_borders(images)
+    assert not borders[0].any()
+    assert not borders[2:].any()
     expected = np.zeros((40, 50), bool)
     expected[:8, 8:42] = True  # and two pixels around
-    np.testing.assert_array_equal(found[1], expected)
+    np.testing.assert_array_equal(borders[1], expected)
     assert black_borders(images[:1]) is None
 
 
@@ -295,9 +303,9 @@ BAD = {
 @pytest.mark.parametrize("case", BAD)
 def test_broken_models_are_refused_in_one_line(tmp_path, case):
     make(tmp_path)
-    spoil, said = BAD[case]
+    spoil, refusal = BAD[case]
     spoil(tmp_path)
-    refused(colmap.read, tmp_path, said)
+    refused(colmap.read, tmp_path, refusal)
 
 
 def test_a_named_split_and_a_single_pose_are_refused(tmp_path):

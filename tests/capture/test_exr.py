@@ -20,22 +20,22 @@ def test_float_channels_come_back_bit_for_bit(tmp_path):
         tmp_path / "a.exr", colour, DEPTH / 1000, DEPTH, {"flow.x": flow, "id": counts}
     )
     np.testing.assert_array_equal(colour, COLOUR)  # OpenEXR keeps hands off our arrays
-    found = exr.read_exr(tmp_path / "a.exr")
-    np.testing.assert_array_equal(found.colour, COLOUR)
-    np.testing.assert_array_equal(found.alpha, DEPTH / 1000)
-    np.testing.assert_array_equal(found.depth, DEPTH)
-    np.testing.assert_array_equal(found.extra["flow.x"], flow)
-    np.testing.assert_array_equal(found.extra["id"], counts)
-    assert found.finite.all()
+    picture = exr.read_exr(tmp_path / "a.exr")
+    np.testing.assert_array_equal(picture.colour, COLOUR)
+    np.testing.assert_array_equal(picture.alpha, DEPTH / 1000)
+    np.testing.assert_array_equal(picture.depth, DEPTH)
+    np.testing.assert_array_equal(picture.extra["flow.x"], flow)
+    np.testing.assert_array_equal(picture.extra["id"], counts)
+    assert picture.finite.all()
     assert [p.name for p in tmp_path.iterdir()] == ["a.exr"]
 
 
 @pytest.mark.hard_cases
 def test_half_rounds_colour_but_not_depth(tmp_path):
     exr.write_exr(tmp_path / "a.exr", COLOUR, depth=DEPTH, half=True)
-    found = exr.read_exr(tmp_path / "a.exr")
-    np.testing.assert_array_equal(found.colour, COLOUR.astype(np.float16))
-    np.testing.assert_array_equal(found.depth, DEPTH)
+    picture = exr.read_exr(tmp_path / "a.exr")
+    np.testing.assert_array_equal(picture.colour, COLOUR.astype(np.float16))
+    np.testing.assert_array_equal(picture.depth, DEPTH)
 
 
 @pytest.mark.hard_cases
@@ -43,25 +43,25 @@ def test_nan_and_infinity_are_zeroed_and_marked(tmp_path):
     depth = DEPTH.copy()
     depth[1, 2], depth[3, 4] = np.nan, np.inf
     exr.write_exr(tmp_path / "a.exr", COLOUR, depth=depth)
-    found = exr.read_exr(tmp_path / "a.exr")
+    picture = exr.read_exr(tmp_path / "a.exr")
     bad = ~np.isfinite(depth)
-    np.testing.assert_array_equal(found.finite, ~bad)
-    np.testing.assert_array_equal(found.depth, np.where(bad, 0, DEPTH))
+    np.testing.assert_array_equal(picture.finite, ~bad)
+    np.testing.assert_array_equal(picture.depth, np.where(bad, 0, DEPTH))
 
 
 def test_a_strided_view_is_written_as_it_looks(tmp_path):
     exr.write_exr(tmp_path / "a.exr", COLOUR[::2, ::-1])
-    found = exr.read_exr(tmp_path / "a.exr")
-    np.testing.assert_array_equal(found.colour, COLOUR[::2, ::-1])
+    picture = exr.read_exr(tmp_path / "a.exr")
+    np.testing.assert_array_equal(picture.colour, COLOUR[::2, ::-1])
 
 
 def test_a_file_without_our_channels(tmp_path):
     with OpenEXR.File({}, {"Y": DEPTH.copy(), "mask": DEPTH.copy()}) as file:
         file.write(str(tmp_path / "a.exr"))
-    found = exr.read_exr(tmp_path / "a.exr")
-    np.testing.assert_array_equal(found.colour[..., 2], DEPTH)
-    assert (found.alpha, found.depth) == (None, None)
-    assert list(found.extra) == ["mask"]
+    picture = exr.read_exr(tmp_path / "a.exr")
+    np.testing.assert_array_equal(picture.colour[..., 2], DEPTH)
+    assert (picture.alpha, picture.depth) == (None, None)
+    assert list(picture.extra) == ["mask"]
 
 
 @pytest.mark.parametrize("kept", [0, 4, 300, 0.9])
@@ -94,9 +94,9 @@ def test_other_peoples_files(data_dir):
     files = sorted(folder.glob("*/*.exr"))
     assert len(files) >= 16
     for file in files:
-        found = exr.read_exr(file)
-        assert found.colour is not None or found.extra, file
-        assert found.finite.any()
+        picture = exr.read_exr(file)
+        assert picture.colour is not None or picture.extra, file
+        assert picture.finite.any()
     ball = exr.read_exr(folder / "Beachball/singlepart.0001.exr")
     assert ball.origin == (654, 245)
     assert ball.colour.shape == (876, 911, 3)

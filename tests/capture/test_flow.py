@@ -43,11 +43,11 @@ def test_selected_frames_keep_their_neighbours_and_lose_those_that_went():
 
 def test_training_flow_counts_the_frames_that_are_learnt_from():
     whole = make(flow=some_flow(), train=np.array([1, 2]), heldout=np.array([0, 3]))
-    found = flows.training_flow(whole)
-    assert found.next_row.tolist() == [1, 1]
-    assert found.previous_row.tolist() == [0, 0]
-    assert found.forward_seen[0].any()
-    assert not found.forward_seen[1].any()
+    flow = flows.training_flow(whole)
+    assert flow.next_row.tolist() == [1, 1]
+    assert flow.previous_row.tolist() == [0, 0]
+    assert flow.forward_seen[0].any()
+    assert not flow.forward_seen[1].any()
     assert flows.training_flow(make()) is None
 
 
@@ -80,8 +80,8 @@ def test_flow_is_stored_beside_a_nerfies_capture_and_read_back(tmp_path):
     for one, other in zip(first.flow, second.flow, strict=True):
         np.testing.assert_array_equal(one, other)
     stored = nerfies_format.read(tmp_path / "copy", factor=2).flow
-    made = capturing.downscale(first, 2).flow
-    for one, other in zip(stored, made, strict=True):
+    smaller = capturing.downscale(first, 2).flow
+    for one, other in zip(stored, smaller, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-6)
     shrunk = nerfies_format.read(tmp_path / "copy", factor=4).flow  # 2x, averaged
     assert shrunk.forward.shape == (len(first.ids), 7, 10, 2)

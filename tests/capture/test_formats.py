@@ -17,13 +17,13 @@ def test_a_folder_that_is_no_capture_lists_what_was_looked_for(tmp_path):
     with pytest.raises(CaptureError) as caught:
         room.load(tmp_path)
     message = str(caught.value)
-    for said in (
+    for words in (
         str(tmp_path),
         "scene.json",
         "transforms*.json",
         "sparse/0/cameras.bin",
     ):
-        assert said in message
+        assert words in message
     assert "\n" not in message
 
 
@@ -107,15 +107,15 @@ def test_importing_the_room_loads_no_decoder():
 def test_a_real_capture_projects_its_points_where_they_were_seen(
     name, size, splits, within_px, data_dir
 ):
-    found = room.load(data_dir / name)
-    assert found.size == size
-    assert splits in (None, (found.train.size, found.heldout.size))
-    assert splits or any("black borders" in note for note in found.notes)
+    capture = room.load(data_dir / name)
+    assert capture.size == size
+    assert splits in (None, (capture.train.size, capture.heldout.size))
+    assert splits or any("black borders" in note for note in capture.notes)
     seen = np.load(data_dir / name / "points_tri.npz")
-    position = np.float32((seen["xyz"] - np.array(found.centre)) * found.scale)
+    position = np.float32((seen["xyz"] - np.array(capture.centre)) * capture.scale)
     errors = []
-    for row in range(len(found.ids)):
-        pixel, *_ = frames.pixels_of(found.cameras, row, position, size)
+    for row in range(len(capture.ids)):
+        pixel, *_ = frames.pixels_of(capture.cameras, row, position, size)
         here = seen["obs_image"] == row
         errors.append(pixel[seen["obs_point"][here]] - seen["obs_xy"][here])
     assert np.median(np.linalg.norm(np.concatenate(errors), axis=1)) < within_px

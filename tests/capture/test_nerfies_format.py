@@ -76,17 +76,24 @@ def edit(file, **changes):
 
 
 def test_everything_in_the_files_arrives(tmp_path):
-    found = nerfies_format.read(make(tmp_path / "scene"))
-    assert found.name == "scene"
-    assert found.ids == ("000", "001", "002", "003", "004", "005")
+    capture = nerfies_format.read(make(tmp_path / "scene"))
+    assert capture.name == "scene"
+    assert capture.ids == ("000", "001", "002", "003", "004", "005")
     for row in range(6):
-        np.testing.assert_array_equal(found.images[row], picture(row))
-    assert found.train.tolist() == [0, 2, 4]
-    assert found.heldout.tolist() == [1, 3, 5]
-    assert found.warp_ids.tolist() == [0, 1, 2, 3, 4, 5]  # re-indexed from 10, 12, ...
-    assert found.camera_ids.tolist() == [0, 1, 0, 1, 0, 1]
-    np.testing.assert_allclose(found.times, [0, 0.2, 0.4, 0.6, 0.8, 1], atol=1e-7)
-    cameras = found.cameras
+        np.testing.assert_array_equal(capture.images[row], picture(row))
+    assert capture.train.tolist() == [0, 2, 4]
+    assert capture.heldout.tolist() == [1, 3, 5]
+    assert capture.warp_ids.tolist() == [
+        0,
+        1,
+        2,
+        3,
+        4,
+        5,
+    ]  # re-indexed from 10, 12, ...
+    assert capture.camera_ids.tolist() == [0, 1, 0, 1, 0, 1]
+    np.testing.assert_allclose(capture.times, [0, 0.2, 0.4, 0.6, 0.8, 1], atol=1e-7)
+    cameras = capture.cameras
     # (position - centre) * scale, by hand
     np.testing.assert_allclose(
         cameras.position, [[row * 0.5, 0, 0.25] for row in range(6)], atol=1e-7
@@ -94,14 +101,14 @@ def test_everything_in_the_files_arrives(tmp_path):
     np.testing.assert_allclose(
         cameras.camera_from_world[3], orientation(0.3), atol=1e-7
     )
-    assert (found.near, found.far) == (0.2, 1.5)  # already in scene units
+    assert (capture.near, capture.far) == (0.2, 1.5)  # already in scene units
     np.testing.assert_array_equal(cameras.focal_px, np.float32([20] * 6))
     np.testing.assert_array_equal(cameras.pixel_aspect, np.float32([1.25] * 6))
     np.testing.assert_array_equal(cameras.skew_px, np.float32([0.5] * 6))
     np.testing.assert_array_equal(cameras.radial[2], np.float32([0.1, 0.01, 0.001]))
     np.testing.assert_array_equal(cameras.tangential[2], np.float32([0.02, 0.03]))
     assert all(leaf.dtype == np.float32 for leaf in cameras)
-    np.testing.assert_allclose(found.up, [0, -1, 0], atol=1e-7)  # rows: right, down
+    np.testing.assert_allclose(capture.up, [0, -1, 0], atol=1e-7)  # rows: right, down
 
 
 @pytest.mark.parametrize(
@@ -118,18 +125,18 @@ def test_everything_in_the_files_arrives(tmp_path):
 def test_a_factor_is_read_or_made_and_points_keep_their_place(
     tmp_path, stored, options, size
 ):
-    found = nerfies_format.read(make(tmp_path, factors=stored), **options)
-    assert found.size == size
+    capture = nerfies_format.read(make(tmp_path, factors=stored), **options)
+    assert capture.size == size
     full = nerfies_format.read_cameras(tmp_path)
     ratio = size[0] / SIZE[0]
     point = np.float32([[0.1, 0.2, 2.0]])
-    pixel, *_ = frames.pixels_of(found.cameras, 0, point, size)
+    pixel, *_ = frames.pixels_of(capture.cameras, 0, point, size)
     whole, *_ = frames.pixels_of(full.cameras, 0, point, SIZE)
     np.testing.assert_allclose(pixel, whole * ratio, rtol=1e-6)
     if max(stored) == 1 and size != SIZE:
         step = SIZE[0] // size[0]
         block = picture(0)[:step, :step].reshape(-1, 3).mean(0)
-        assert (np.abs(found.images[0, 0, 0] - block) <= 0.5).all()
+        assert (np.abs(capture.images[0, 0, 0] - block) <= 0.5).all()
 
 
 def test_ids_written_as_numbers_are_names(tmp_path):
@@ -165,13 +172,23 @@ def test_splits(tmp_path, dataset, heldout, train, scored):
             for key, rows in dataset.items()
         }
         dump(tmp_path / "dataset.json", names)
-    found = nerfies_format.read(tmp_path, heldout=heldout)
-    assert found.train.size == train
+    capture = nerfies_format.read(tmp_path, heldout=heldout)
+    assert capture.train.size == train
     if scored is not None:
-        assert found.heldout.tolist() == scored
+        assert capture.heldout.tolist() == scored
     else:  # HyperNeRF: every fourth is learnt from, those half-way are scored
-        assert [found.ids[row] for row in found.train] == ["000", "004", "008", "012"]
-        assert [found.ids[row] for row in found.heldout] == ["002", "006", "010", "014"]
+        assert [capture.ids[row] for row in capture.train] == [
+            "000",
+            "004",
+            "008",
+            "012",
+        ]
+        assert [capture.ids[row] for row in capture.heldout] == [
+            "002",
+            "006",
+            "010",
+            "014",
+        ]
 
 
 def test_dycheck_splits_come_in_pairs(tmp_path):
@@ -199,10 +216,10 @@ def test_hypernerf_triples_and_time_ids(tmp_path):
     table = {f"00{row}": {"warp_id": row, "time_id": row**2} for row in range(6)}
     table["003"]["warp_id"] = [2, 4, 0.25]
     dump(tmp_path / "metadata.json", table)
-    found = nerfies_format.read(tmp_path)
-    np.testing.assert_allclose(found.times, np.arange(6) ** 2 / 25, atol=1e-7)
-    assert found.warp_ids.tolist() == [0, 1, 2, 3, 4, 5]
-    assert any("between two moments" in note for note in found.notes)
+    capture = nerfies_format.read(tmp_path)
+    np.testing.assert_allclose(capture.times, np.arange(6) ** 2 / 25, atol=1e-7)
+    assert capture.warp_ids.tolist() == [0, 1, 2, 3, 4, 5]
+    assert any("between two moments" in note for note in capture.notes)
 
 
 @pytest.mark.parametrize("ending", [".png.png", ".png"])
@@ -213,10 +230,10 @@ def test_nerf_ds_masks_are_black_where_it_moves(tmp_path, ending):
         mask[2:4, 3:7] = 0
         target = tmp_path / "resized_mask" / "1x" / f"00{row}{ending}"
         save_picture(target, mask)
-    found = nerfies_format.read(tmp_path)
+    capture = nerfies_format.read(tmp_path)
     expected = np.zeros((8, 12), bool)
     expected[2:4, 3:7] = True
-    np.testing.assert_array_equal(found.moving[5], expected)
+    np.testing.assert_array_equal(capture.moving[5], expected)
     small = nerfies_format.read(tmp_path, factor=2)
     np.testing.assert_array_equal(
         small.moving[5], expected.reshape(4, 2, 6, 2).any((1, 3))
@@ -225,8 +242,10 @@ def test_nerf_ds_masks_are_black_where_it_moves(tmp_path, ending):
 
 def test_dycheck_alpha_marks_pixels_that_were_filmed(tmp_path):
     make(tmp_path, channels=4)
-    found = nerfies_format.read(tmp_path)
-    np.testing.assert_array_equal(found.valid[2], picture(2, channels=4)[..., 3] == 255)
+    capture = nerfies_format.read(tmp_path)
+    np.testing.assert_array_equal(
+        capture.valid[2], picture(2, channels=4)[..., 3] == 255
+    )
 
 
 def test_dycheck_depth_is_scaled_and_may_be_absent(tmp_path):
@@ -235,11 +254,11 @@ def test_dycheck_depth_is_scaled_and_may_be_absent(tmp_path):
     depth[0, 0], depth[0, 1], depth[0, 2] = 0, np.nan, -1
     (tmp_path / "depth/1x").mkdir(parents=True)
     np.save(tmp_path / "depth/1x/002.npy", depth)
-    found = nerfies_format.read(tmp_path)
+    capture = nerfies_format.read(tmp_path)
     expected = depth[..., 0] * np.float32(0.5)
     expected[0, :3] = 0
-    np.testing.assert_array_equal(found.depths[2], expected)
-    assert not found.depths[[0, 1, 3, 4, 5]].any()
+    np.testing.assert_array_equal(capture.depths[2], expected)
+    assert not capture.depths[[0, 1, 3, 4, 5]].any()
     half = nerfies_format.read(tmp_path, factor=2).depths[2]
     corner = expected[:2, :2]
     assert half[0, 0] == pytest.approx(corner[corner > 0].mean())
@@ -254,13 +273,15 @@ def test_points_are_scaled_and_coloured_from_the_pictures(tmp_path):
         )
     world = np.array([[1.0, -2.0, 5.0], [1.0, -2.0, -9.0], [np.nan, 0, 0]])
     np.save(tmp_path / "points.npy", world)
-    found = nerfies_format.read(tmp_path)
+    capture = nerfies_format.read(tmp_path)
     np.testing.assert_allclose(
-        found.points.position, [[0, 0, 1], [0, 0, -6]], atol=1e-7
+        capture.points.position, [[0, 0, 1], [0, 0, -6]], atol=1e-7
     )
-    assert found.points.colour[0, 0] in range(40, 46)
-    assert found.points.colour[1].tolist() == [frames.UNSEEN] * 3  # behind every camera
-    assert any("1 points are not finite" in note for note in found.notes)
+    assert capture.points.colour[0, 0] in range(40, 46)
+    assert (
+        capture.points.colour[1].tolist() == [frames.UNSEEN] * 3
+    )  # behind every camera
+    assert any("1 points are not finite" in note for note in capture.notes)
 
 
 def test_no_pictures_is_an_error_that_offers_the_cameras(tmp_path):
@@ -278,11 +299,11 @@ def test_missing_pictures_are_listed_or_left_out(tmp_path):
         (tmp_path / f"rgb/1x/{name}.png").unlink()
     with pytest.raises(CaptureError, match=r"2 of 6 pictures are missing \(001, 004\)"):
         nerfies_format.read(tmp_path)
-    found = nerfies_format.read(tmp_path, missing="skip")
-    assert found.ids == ("000", "002", "003", "005")
-    assert found.train.tolist() == [0, 1]
-    assert found.heldout.tolist() == [2, 3]
-    assert any("001, 004" in note for note in found.notes)
+    capture = nerfies_format.read(tmp_path, missing="skip")
+    assert capture.ids == ("000", "002", "003", "005")
+    assert capture.train.tolist() == [0, 1]
+    assert capture.heldout.tolist() == [2, 3]
+    assert any("001, 004" in note for note in capture.notes)
 
 
 def truncate(path):
@@ -390,9 +411,9 @@ BAD = {
 @pytest.mark.parametrize("case", BAD)
 def test_a_broken_directory_is_refused_in_one_line(tmp_path, case):
     make(tmp_path)
-    spoil, said = BAD[case]
+    spoil, refusal = BAD[case]
     spoil(tmp_path)
-    refused(nerfies_format.read, tmp_path, said)
+    refused(nerfies_format.read, tmp_path, refusal)
 
 
 def test_a_symbolic_link_out_of_the_capture_is_refused(tmp_path):
@@ -405,11 +426,11 @@ def test_a_symbolic_link_out_of_the_capture_is_refused(tmp_path):
 
 
 def full_capture(tmp_path):
-    found = nerfies_format.read(make(tmp_path / "made", channels=4))
+    capture = nerfies_format.read(make(tmp_path / "made", channels=4))
     rng = np.random.default_rng(3)
-    moving = rng.random(found.valid.shape) < 0.3
+    moving = rng.random(capture.valid.shape) < 0.3
     return dataclasses.replace(
-        found,
+        capture,
         times=np.sort(rng.random(6)).astype(np.float32),
         moving=moving,
         depths=np.where(moving, 0, rng.uniform(0.3, 1, moving.shape)).astype(
@@ -447,8 +468,8 @@ def test_reductions_can_be_written_too(tmp_path):
     first = full_capture(tmp_path)
     nerfies_format.write(first, tmp_path / "copy", factors=(1, 2))
     stored = nerfies_format.read(tmp_path / "copy", factor=2)
-    made = nerfies_format.read(tmp_path / "made", factor=2)
-    np.testing.assert_array_equal(stored.images, made.images)
+    reduced = nerfies_format.read(tmp_path / "made", factor=2)
+    np.testing.assert_array_equal(stored.images, reduced.images)
     assert sorted(p.name for p in (tmp_path / "copy/resized_mask").iterdir()) == [
         "1x",
         "2x",

@@ -112,12 +112,12 @@ CAPTURES = [
 ]
 
 
-@pytest.mark.parametrize(("changes", "said"), CAPTURES)
-def test_a_capture_that_cannot_be_right_is_refused_in_one_line(changes, said):
+@pytest.mark.parametrize(("changes", "refusal"), CAPTURES)
+def test_a_capture_that_cannot_be_right_is_refused_in_one_line(changes, refusal):
     with pytest.raises(CaptureError) as caught:
         make(**changes)
     message = str(caught.value)
-    assert said in message
+    assert refusal in message
     assert message.startswith("test: ")
     assert "\n" not in message
 

@@ -50,12 +50,14 @@ def film(folder, count, plain=False):
     return cameras
 
 
-def aligned(found, true):
+def aligned(fitted, true):
     """Error of camera centres after the best similarity, relative to their spread."""
-    found, true = found - found.mean(0), true - true.mean(0)
-    u, values, v = np.linalg.svd(true.T @ found)
-    scale = values.sum() / (found**2).sum()
-    return np.linalg.norm(true - scale * found @ (u @ v).T, axis=1).max() / np.ptp(true)
+    fitted, true = fitted - fitted.mean(0), true - true.mean(0)
+    u, values, v = np.linalg.svd(true.T @ fitted)
+    scale = values.sum() / (fitted**2).sum()
+    return np.linalg.norm(true - scale * fitted @ (u @ v).T, axis=1).max() / np.ptp(
+        true
+    )
 
 
 @pytest.mark.slow
@@ -71,13 +73,13 @@ def test_cameras_of_a_textured_room_are_found(tmp_path):
         camera_model="SIMPLE_PINHOLE", first_octave=-1, threads=2
     )
     out = mapping.run_sfm(tmp_path / "pictures", tmp_path / "out", masks, spec)
-    found = room.load(out)
-    assert len(found.ids) == 8
+    capture = room.load(out)
+    assert len(capture.ids) == 8
     true = np.array([one.position for one in cameras], float)
-    assert aligned(found.cameras.position.astype(float), true) < 0.02
-    np.testing.assert_allclose(found.cameras.focal_px, FOCAL, rtol=0.05)
-    assert found.moving[:, :20].all()
-    assert not found.moving[:, 20:].any()
+    assert aligned(capture.cameras.position.astype(float), true) < 0.02
+    np.testing.assert_allclose(capture.cameras.focal_px, FOCAL, rtol=0.05)
+    assert capture.moving[:, :20].all()
+    assert not capture.moving[:, 20:].any()
     # No feature lies under a mask: every point projects below it where it was seen.
     assert sorted(p.name for p in out.iterdir()) == ["images", "masks", "sparse"]
 

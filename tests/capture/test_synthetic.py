@@ -41,8 +41,8 @@ def small():
 def pixels_of(capture, truth, rng, count, among=None):
     """Random (row, y, x), the world points seen there and the pixel centres."""
     shown = truth.things >= 0 if among is None else among
-    found = rng.choice(np.flatnonzero(shown), count, replace=False)
-    row, y, x = np.unravel_index(found, shown.shape)
+    places = rng.choice(np.flatnonzero(shown), count, replace=False)
+    row, y, x = np.unravel_index(places, shown.shape)
     centres = np.stack([x, y], -1) + 0.5
     points = np.empty((count, 3))
     for i in range(count):
@@ -159,9 +159,9 @@ def test_tracks_follow_numpy_s_map_and_meet_their_own_material(scene):
         pixel = scene_oracle.project(cameras.take(capture.cameras, row), points)
         assert np.abs(truth.track_pixel[:, row] - pixel).max() < 1e-3
     assert 0.3 < truth.track_seen.mean() < 1
-    row, found = 4, np.flatnonzero(truth.track_seen[:, 4])
-    x, y = truth.track_pixel[found, row].astype(int).T
-    assert np.mean(truth.things[row, y, x] == truth.track_thing[found]) > 0.9
+    row, seen = 4, np.flatnonzero(truth.track_seen[:, 4])
+    x, y = truth.track_pixel[seen, row].astype(int).T
+    assert np.mean(truth.things[row, y, x] == truth.track_thing[seen]) > 0.9
 
 
 def test_static_points_have_the_same_colour_for_both_cameras(scene, rng):

@@ -104,13 +104,13 @@ def test_cloth_seen_edge_on_is_missed_by_few_rays(float64, rng):
             for o, d in zip(origin, along, strict=True)
         ]
     )
-    found = np.asarray(hit.distance)
+    distance = np.asarray(hit.distance)
     met = np.isfinite(exact)
     assert met.sum() > 200
-    wrong = np.abs(np.where(np.isfinite(found), found, -1) - exact) > 1e-9
+    wrong = np.abs(np.where(np.isfinite(distance), distance, -1) - exact) > 1e-9
     # Two crossings between two probes are lost: 0.3% measured.
     assert np.mean(wrong[met]) < 0.01
-    assert not np.isfinite(found[~met]).any()
+    assert not np.isfinite(distance[~met]).any()
 
 
 def test_a_ray_along_a_face_or_through_nothing_gives_no_nan(dtype):
@@ -225,10 +225,10 @@ def test_value_noise_is_the_blend_of_hashed_corners(dtype, rng):
         return total
 
     points = rng.uniform(-40, 40, (50, 3)).astype(dtype)
-    found = jax.jit(jax.vmap(lambda p: texture.value_noise(p, 5)))(points)
+    noise = jax.jit(jax.vmap(lambda p: texture.value_noise(p, 5)))(points)
     exact = [slow(point.astype(float), 5) for point in points]
     assert (
-        np.abs(np.asarray(found) - exact).max()
+        np.abs(np.asarray(noise) - exact).max()
         < {"float32": 1e-4, "float64": 1e-12}[dtype]
     )
     assert np.std(exact) > 0.2

@@ -17,10 +17,10 @@ def film(count=8, size=(31, 45)):
 def test_colours_and_times_survive_odd_sizes(tmp_path):
     frames = film()
     video.write_video(tmp_path / "a.mp4", iter(frames), 12.5, quality=2)
-    found = list(video.read_video(tmp_path / "a.mp4"))
-    assert len(found) == 8
-    assert found[0][1].shape == (32, 46, 3)  # padded to even
-    for number, (seconds, frame) in enumerate(found):
+    decoded = list(video.read_video(tmp_path / "a.mp4"))
+    assert len(decoded) == 8
+    assert decoded[0][1].shape == (32, 46, 3)  # padded to even
+    for number, (seconds, frame) in enumerate(decoded):
         assert seconds == pytest.approx(number / 12.5, abs=1e-4)
         error = np.abs(frame[:31, :45].astype(int) - frames[number])
         # Chroma is halved and everything quantised: 2 levels on smooth pictures.
@@ -65,10 +65,10 @@ def test_a_phones_rotation_is_carried_out(tmp_path, turn, expected, mark):
             picture = av.VideoFrame.from_ndarray(frame, format="rgb24")
             container.mux(stream.encode(picture))
         container.mux(stream.encode())
-    _, found = next(iter(video.read_video(tmp_path / "a.mp4")))
-    assert found.shape[:2] == expected
-    assert found[mark].min() > 200
-    assert found[-mark[0], mark[1]].max() < 60
+    _, decoded = next(iter(video.read_video(tmp_path / "a.mp4")))
+    assert decoded.shape[:2] == expected
+    assert decoded[mark].min() > 200
+    assert decoded[-mark[0], mark[1]].max() < 60
 
 
 def test_what_is_no_film_is_refused(tmp_path):

@@ -67,10 +67,10 @@ def test_a_bent_slice_is_the_loop_over_its_layers(dtype, rng):
     params, when = bent_params(dtype), condition(dtype)
     point = rng.uniform(-1, 1, 3).astype(dtype)
     exact = slice_by_hand(params, point, when)
-    found, lifted = slices(params, point, when)
+    ambient_point, lifted = slices(params, point, when)
     tolerance = {"float32": 3e-6, "float64": 1e-13}[dtype]
-    assert found.dtype == lifted.dtype == dtype
-    np.testing.assert_allclose(found, exact, atol=tolerance)
+    assert ambient_point.dtype == lifted.dtype == dtype
+    np.testing.assert_allclose(ambient_point, exact, atol=tolerance)
     assert lifted.shape == (len(STEPS), ambient.effect(BENT).lift_width)
     opened = [window_by_hand(BENT, int(step)) for step in STEPS]
     features = [networks.waves(BENT.encoding, exact, shares) for shares in opened]
@@ -80,83 +80,83 @@ def test_a_bent_slice_is_the_loop_over_its_layers(dtype, rng):
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("spec", [BENT, PLANE], ids=["bent", "plane"])
 def test_while_shut_the_template_reads_zeros_and_nothing_learns(spec, dtype, rng):
-    made = ambient.effect(spec)
+    effect = ambient.effect(spec)
     params = bent_params(dtype) if spec.kind == "bent" else None
     point = jnp.asarray(rng.uniform(-1, 1, 3), dtype)
-    pull = jnp.asarray(rng.normal(size=made.lift_width), dtype)
+    pull = jnp.asarray(rng.normal(size=effect.lift_width), dtype)
     still = condition(dtype)
 
     @jax.jit
     def read(params, codes, step):
         def total(params, codes):
-            lifted = made.lift(params, point, FrameCondition(still.time, codes, step))
+            lifted = effect.lift(params, point, FrameCondition(still.time, codes, step))
             return pull @ lifted, lifted
 
         return jax.grad(total, argnums=(0, 1), has_aux=True)(params, codes)
 
-    def found(step):
+    def slopes_at(step):
         return jax.tree.map(np.asarray, read(params, still.codes, np.int32(step)))
 
     for step in (0, 1000):
-        grads, lifted = found(step)
+        grads, lifted = slopes_at(step)
         assert np.all(lifted == 0)
         for grad in jax.tree.leaves(grads):
             assert np.all(grad == 0)
     # and just after it has begun to open, both do
-    grad = found(1500)[0][1][made.tables[0].name]
+    grad = slopes_at(1500)[0][1][effect.tables[0].name]
     assert np.all(grad != 0)
     assert np.all(np.isfinite(grad))
 
 
 def test_a_plane_has_one_ambient_point_for_all_points(dtype, rng):
-    made = ambient.effect(PLANE)
-    assert made.init is None
-    assert made.tables == (Table("ambient", MOMENT, 3),)
+    effect = ambient.effect(PLANE)
+    assert effect.init is None
+    assert effect.tables == (Table("ambient", MOMENT, 3),)
     when = condition(dtype)
 
     @jax.jit
     @jax.vmap
     def seen(point):
-        return ambient.ambient_point(PLANE, None, point, when), made.lift(
+        return ambient.ambient_point(PLANE, None, point, when), effect.lift(
             None, point, when
         )
 
-    found, lifted = seen(rng.normal(size=(5, 3)).astype(dtype))
+    ambient_points, lifted = seen(rng.normal(size=(5, 3)).astype(dtype))
     code = when.codes["ambient"]
-    np.testing.assert_array_equal(found, np.tile(code, (5, 1)))
+    np.testing.assert_array_equal(ambient_points, np.tile(code, (5, 1)))
     exact = networks.waves(PLANE.encoding, code)
     np.testing.assert_allclose(lifted, np.tile(exact, (5, 1)), atol=1e-6)
 
 
 def test_a_bent_slice_shares_the_code_of_the_warp_and_starts_flat(rng):
     spec = AmbientSpec()
-    made = ambient.effect(spec)
-    assert made.tables == (Table("motion", MOMENT, 8),)
+    effect = ambient.effect(spec)
+    assert effect.tables == (Table("motion", MOMENT, 8),)
     points = rng.uniform(-1, 1, (200, 3)).astype(np.float32)
     codes = {"motion": jnp.asarray(np.full(8, 0.05, np.float32))}
     when = FrameCondition(jnp.float32(0), codes, jnp.int32(0))
 
     @jax.jit
     def start(key):
-        params = made.init(key)
+        params = effect.init(key)
         one = jax.vmap(lambda x: ambient.ambient_point(spec, params, x, when))
         return params.heads["ambient"].weight, one(points)
 
-    weight, found = map(np.asarray, start(jax.random.key(0)))
+    weight, ambient_points = map(np.asarray, start(jax.random.key(0)))
     # of 128 numbers the deviation is known to 6 %
     assert abs(np.std(weight) / 1e-5 - 1) < 0.2
     # 64 features of size one, each times 1e-5, of random sign
-    assert 0 < np.abs(found).max() < 1e-3
+    assert 0 < np.abs(ambient_points).max() < 1e-3
 
 
 def test_a_slice_has_its_slopes_in_point_code_and_weights(float64, rng):
     params, when = bent_params("float64"), condition("float64", 7000)
-    made = ambient.effect(BENT)
-    pull = rng.normal(size=made.lift_width)
+    effect = ambient.effect(BENT)
+    pull = rng.normal(size=effect.lift_width)
 
     def read(params, point, code):
         seen = when._replace(codes={"motion": code})
-        return pull @ made.lift(params, point, seen)
+        return pull @ effect.lift(params, point, seen)
 
     point = rng.uniform(-1, 1, 3)
     error = gradients.directional_error(

@@ -72,13 +72,13 @@ def params_of(dtype):
 
 @pytest.mark.parametrize("table", ["appearance", "exposure"])
 def test_the_condition_is_the_code_itself(table, rng):
-    made = appearance.effect(AppearanceSpec(width=3, table=table))
-    assert made.tables == (Table(table, APPEARANCE, 3),)
-    assert made.condition_width == 3
+    effect = appearance.effect(AppearanceSpec(width=3, table=table))
+    assert effect.tables == (Table(table, APPEARANCE, 3),)
+    assert effect.condition_width == 3
     code = rng.normal(size=3).astype(np.float32)
     codes = {"exposure": code, "appearance": -code} | {table: code}
-    found = made.condition(None, condition(code)._replace(codes=codes))
-    assert found is code
+    read = effect.condition(None, condition(code)._replace(codes=codes))
+    assert read is code
 
 
 def test_codes_change_the_colour_and_never_the_geometry(dtype):
@@ -124,15 +124,15 @@ def test_codes_of_every_preset_learn(name):
         spec = dataclasses.replace(spec, warp=warp)
     capture = scenes.tiny_capture()
     metadata = scene.metadata_of(capture, spec)
-    made = scene.field(spec, metadata)
+    field = scene.field(spec, metadata)
     frames = evaluation.frames_of(capture, scene.build(spec, metadata).required_data)
-    params = made.init(jax.random.key(0))
+    params = field.init(jax.random.key(0))
     keys = jax.random.split(jax.random.key(1))
     batch = scene.draw_batch(frames, spec.rays, keys[0])
 
     def loss(codes):
         terms = scene.loss_terms(
-            made,
+            field,
             params | {"codes": codes},
             frames,
             batch,

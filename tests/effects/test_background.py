@@ -32,14 +32,14 @@ def context(displace, points, frames, dtype, key=None):
     )
 
 
-def overheard(asked, x, time):
-    """x; the whole batch of both is appended to `asked`, in float64.
+def overheard(heard, x, time):
+    """x; the whole batch of both is appended to `heard`, in float64.
 
     For float32 alone: the listener's thread knows nothing of x64.
     """
 
     def listen(x, time):
-        asked.append((np.array(x, np.float64), np.array(time, np.float64)))
+        heard.append((np.array(x, np.float64), np.array(time, np.float64)))
         return np.asarray(x)
 
     return jax.pure_callback(listen, x, x, time, vmap_method="broadcast_all")
@@ -57,21 +57,21 @@ def test_points_are_seen_in_the_field_in_all_frames(scaling, rng):
     """Each point once where there are few; frames alike often; noise of its size."""
     points = rng.normal(size=(6000, 3)) + CENTRE
     spec = BackgroundSpec(points=6000, noise=0.5, width=0.2, scaling=scaling)
-    asked = []
+    heard = []
 
     def displace(x, condition):
-        x = overheard(asked, x, condition.time)
+        x = overheard(heard, x, condition.time)
         return 0.1 * x + condition.time
 
-    made = background.effect(spec)
-    assert made.required_data == {"points"}
+    effect = background.effect(spec)
+    assert effect.required_data == {"points"}
 
     @jax.jit
     def penalty(key):
-        return made.penalty(None, context(displace, points, 7, "float32", key))
+        return effect.penalty(None, context(displace, points, 7, "float32", key))
 
     value = float(penalty(jax.random.key(0))["background"].value)
-    ((x, times),) = asked
+    ((x, times),) = heard
     assert x.shape == (6000, 3)
     costs = geman_mcclure(
         np.sum((0.1 * x + times[:, None]) ** 2, axis=-1), 0.2, scaling
@@ -91,18 +91,18 @@ def test_points_are_seen_in_the_field_in_all_frames(scaling, rng):
 def test_of_many_points_as_many_as_asked_are_drawn():
     points = np.arange(3000.0).reshape(1000, 3)
     spec = BackgroundSpec(points=400, noise=0.0)
-    asked, seen = [], []
+    heard, seen = [], []
 
     @jax.jit
     def drift(key):
         def displace(x, condition):
-            return 0 * overheard(asked, x, condition.time)
+            return 0 * overheard(heard, x, condition.time)
 
         return background.drift(spec, context(displace, points, 3, "float32", key))
 
     for key in range(2):
         assert drift(jax.random.key(key)) == 0
-        rows = asked[-1][0] / SCALE + CENTRE
+        rows = heard[-1][0] / SCALE + CENTRE
         np.testing.assert_allclose(rows[:, 1] - rows[:, 0], 1, atol=2e-3)
         seen.append(np.round(rows[:, 0] / 3).astype(int))
         assert len(seen[-1]) == 400

@@ -266,11 +266,13 @@ def test_energy_of_all_samples_in_a_loop(setting):
     here = context(
         field(setting.params), setting.point, setting.weight, setting.conditions
     )
-    found = jax.jit(lambda: [elastic.energy(one, here) for one in (spec, unfolded)])()
+    energies = jax.jit(
+        lambda: [elastic.energy(one, here) for one in (spec, unfolded)]
+    )()
     truth, share = slow(spec, setting)
     assert 0 < share < 1  # both kinds are among the samples
-    np.testing.assert_allclose(found[0], (truth, share), rtol=1e-7)
-    np.testing.assert_allclose(found[1][0], slow(unfolded, setting)[0], rtol=1e-7)
+    np.testing.assert_allclose(energies[0], (truth, share), rtol=1e-7)
+    np.testing.assert_allclose(energies[1][0], slow(unfolded, setting)[0], rtol=1e-7)
 
 
 def test_as_many_points_as_samples_take_each_once(setting):

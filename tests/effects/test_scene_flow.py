@@ -34,12 +34,12 @@ def terms_of(spec, params, frames, batch, arrays, step):
 @pytest.mark.parametrize("step", [0, 250])
 def test_terms_are_sums_over_rays_and_samples_one_by_one(dtype, step):
     given = scenario(dtype)
-    found = terms_of(TINY, *given, step)
+    terms = terms_of(TINY, *given, step)
     expected = oracle(*given, step)
-    assert set(found) == set(expected)
+    assert set(terms) == set(expected)
     for name, value in expected.items():
         # float32 rounds a few ulps of the coordinates, and divides by a deviation
-        error = abs(float(found[name].value) - value)
+        error = abs(float(terms[name].value) - value)
         assert error < {"float32": 3e-5, "float64": 1e-11}[dtype] * max(1, value), name
 
 
@@ -78,13 +78,13 @@ def test_terms_without_a_weight_or_data_are_not_there():
     assert scene_flow.effect(TINY, 4, FEATURES).required_data == {"flow", "depths"}
     params, frames, batch, arrays = given
     bare = frames._replace(depths=None, flow=None)
-    found = jax.eval_shape(
+    terms = jax.eval_shape(
         lambda *given: scene_flow.penalty(
             TINY, 1 / 3, params, context_of(TINY, *given)
         ),
         *(params, bare, batch, *arrays, 0),
     )
-    assert set(found) == set(NAMES) - {"depth", "flow"}
+    assert set(terms) == set(NAMES) - {"depth", "flow"}
 
 
 NAMES = tuple(field.name for field in dataclasses.fields(FlowWeights))
@@ -129,8 +129,8 @@ def test_the_first_and_the_last_moment_have_one_neighbour(float64):
 def test_a_single_moment_has_no_neighbours_and_no_flow_to_learn(dtype):
     params, frames, batch, arrays = scenario(dtype)
     still = frames._replace(times=np.zeros(MOMENTS, dtype))
-    found = slopes_of(params, still, batch, arrays, scene_flow.interval(1))
-    (grad, _), terms = jax.tree.map(np.asarray, found)
+    slopes_and_terms = slopes_of(params, still, batch, arrays, scene_flow.interval(1))
+    (grad, _), terms = jax.tree.map(np.asarray, slopes_and_terms)
     for name in ("warped", "cycle", "disocclusion", "magnitude", "kinetic", "flow"):
         assert terms[name].value == 0, name
     assert terms["dynamic"].value > 0
@@ -153,11 +153,11 @@ def test_the_medium_starts_still_and_undecided(dtype):
         params = scene_flow.init(TINY, key, FEATURES, jnp.dtype(dtype))
         return scene_flow.medium(TINY, params, sample, condition)
 
-    found = jax.tree.map(np.asarray, start(jax.random.key(0)))
-    assert np.abs(found.extras["flow_forward"]).max() < 1e-3 * TINY.flow_bound
-    assert np.abs(found.extras["disocclusion"]).max() < 1e-2
-    assert abs(found.share) < 1e-2
-    assert found.density >= 0
+    start_medium = jax.tree.map(np.asarray, start(jax.random.key(0)))
+    assert np.abs(start_medium.extras["flow_forward"]).max() < 1e-3 * TINY.flow_bound
+    assert np.abs(start_medium.extras["disocclusion"]).max() < 1e-2
+    assert abs(start_medium.share) < 1e-2
+    assert start_medium.density >= 0
 
 
 @pytest.mark.hard_cases
@@ -174,8 +174,8 @@ def test_what_is_surely_hidden_keeps_a_slope(dtype):
     @jax.value_and_grad
     def visible(params):
         context = context_of(TINY, params, frames, batch, *arrays, 0)
-        found = scene_flow.neighbour(TINY, 1 / 3, params, context, scene_flow.FORWARD)
-        return jnp.mean(found.visible)
+        there = scene_flow.neighbour(TINY, 1 / 3, params, context, scene_flow.FORWARD)
+        return jnp.mean(there.visible)
 
     value, grad = visible(sure)
     np.testing.assert_allclose(value, np.exp(-40.0), rtol=2e-5)
@@ -188,8 +188,8 @@ def test_flow_stays_within_its_bound(dtype):
     wild = params._replace(flow=params.flow._replace(bias=np.full(6, 1e4, dtype)))
     x = np.zeros(3, dtype)
     dynamic = jax.jit(scene_flow.dynamic, static_argnums=0)
-    found = dynamic(TINY, wild, x, x, np.zeros((), dtype))
-    np.testing.assert_allclose(found.flow, 0.3, rtol=1e-6)
+    sample = dynamic(TINY, wild, x, x, np.zeros((), dtype))
+    np.testing.assert_allclose(sample.flow, 0.3, rtol=1e-6)
 
 
 def test_the_blending_says_what_width_it_was_built_for():

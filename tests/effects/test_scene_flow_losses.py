@@ -47,8 +47,8 @@ def test_magnitude_sums_samples_not_axes():
     across = np.float32([[[1, -1, 0]] * 4])
     weight = np.full((1, 4), 0.25, np.float32)
     assert of_flow(along, along, weight)["magnitude"] == 0
-    found = of_flow(across, across, weight)["magnitude"]
-    np.testing.assert_allclose(found, 2 / 3, rtol=1e-6)
+    magnitude = of_flow(across, across, weight)["magnitude"]
+    np.testing.assert_allclose(magnitude, 2 / 3, rtol=1e-6)
 
 
 @pytest.mark.hard_cases
@@ -98,8 +98,10 @@ def test_depth_is_compared_up_to_scale_and_offset(dtype):
 )
 def test_depths_without_a_spread_stay_finite(dtype, depth, count):
     target = np.asarray([1.0, 3.0, 2.0, 5.0], dtype)
-    found = normalised_depth(np.asarray(depth, dtype), target, np.arange(4) < count)
-    value, grad = map(np.asarray, found)
+    value_and_grad = normalised_depth(
+        np.asarray(depth, dtype), target, np.arange(4) < count
+    )
+    value, grad = map(np.asarray, value_and_grad)
     assert np.isfinite(value)
     assert value < 10
     assert np.abs(grad).max() <= 5 / flow_losses.FLATTEST / max(max(depth), 1e-3)

@@ -24,44 +24,44 @@ def condition(dtype, time, code=()):
     "encoding", [EncodingSpec(10, times_pi=True), EncodingSpec(3, identity=False)]
 )
 def test_the_template_reads_the_encoded_time(encoding, dtype):
-    made = time_condition.effect(TimeSpec(encoding))
-    assert made.init is None
-    assert made.tables == ()
+    effect = time_condition.effect(TimeSpec(encoding))
+    assert effect.init is None
+    assert effect.tables == ()
     times = np.asarray([0.0, 0.37, 1.0, -0.5], dtype)
 
     @jax.jit
     @jax.vmap
     def lift(time):
-        return made.lift(None, jnp.zeros(3, dtype), condition(dtype, time))
+        return effect.lift(None, jnp.zeros(3, dtype), condition(dtype, time))
 
-    found = lift(times)
-    assert found.dtype == dtype
-    assert found.shape == (4, made.lift_width)
+    lifted = lift(times)
+    assert lifted.dtype == dtype
+    assert lifted.shape == (4, effect.lift_width)
     exact = [networks.waves(encoding, time) for time in times]
     # float32: sines of arguments up to 512π, rounded once more by the reduction
     tolerance = {"float32": 3e-7, "float64": 1e-12}[dtype]
-    np.testing.assert_allclose(found, exact, atol=tolerance)
+    np.testing.assert_allclose(lifted, exact, atol=tolerance)
 
 
 def test_by_code_it_is_the_frame_s_code(dtype, rng):
-    made = time_condition.effect(BY_CODE)
+    effect = time_condition.effect(BY_CODE)
     code = rng.normal(size=5).astype(dtype)
-    assert made.tables == (Table("motion", MOMENT, 5),)
-    assert made.lift_width == 5
-    found = made.lift(None, code[:3], condition(dtype, 0.2, code))
-    assert found.dtype == dtype
-    np.testing.assert_array_equal(found, code)
+    assert effect.tables == (Table("motion", MOMENT, 5),)
+    assert effect.lift_width == 5
+    lifted = effect.lift(None, code[:3], condition(dtype, 0.2, code))
+    assert lifted.dtype == dtype
+    np.testing.assert_array_equal(lifted, code)
 
 
 def test_time_has_a_slope(float64, rng):
     pull = jnp.asarray(rng.normal(size=TimeSpec().width))
 
     def read(times):
-        found = jax.vmap(
+        features = jax.vmap(
             lambda time: time_condition.features(
                 TimeSpec(), condition("float64", 0)._replace(time=time)
             )
         )(times)
-        return jnp.sum(found @ pull)
+        return jnp.sum(features @ pull)
 
     assert gradients.directional_error(read, np.array([0.3, 0.0])) < 1e-8

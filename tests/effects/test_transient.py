@@ -41,9 +41,9 @@ def params_of(dtype):
     return drawn.params(lambda key: transient.init(SPEC, key, FEATURES), dtype, 0.1)
 
 
-def medium_by_hand(params, found, when):
+def medium_by_hand(params, met, when):
     raw = networks.heads(
-        params, np.concatenate([found.features, when.codes["transient"]])
+        params, np.concatenate([met.features, when.codes["transient"]])
     )
     return (
         math.log1p(math.exp(raw["density"][0])),
@@ -60,10 +60,10 @@ def loss_by_hand(colour, truth, beta, valid):
 
 
 def test_the_medium_is_the_loop_over_its_layers(dtype):
-    params, found, when = params_of(dtype), sample(dtype), condition(dtype)
-    medium = medium_of(SPEC, params, found, when)
+    params, met, when = params_of(dtype), sample(dtype), condition(dtype)
+    medium = medium_of(SPEC, params, met, when)
     tolerance = {"float32": 2e-6, "float64": 1e-14}[dtype]
-    density, colour, beta = medium_by_hand(params, found, when)
+    density, colour, beta = medium_by_hand(params, met, when)
     np.testing.assert_allclose(medium.density, density, rtol=tolerance)
     np.testing.assert_allclose(medium.colour, colour, rtol=tolerance)
     np.testing.assert_allclose(medium.beta, beta, rtol=tolerance)
@@ -74,20 +74,20 @@ def test_the_medium_is_the_loop_over_its_layers(dtype):
 
 def test_the_trunk_learns_from_the_transient(float64, rng):
     """The gradient is not stopped, and it is right, for features, code and weights."""
-    params, found, when = (of("float64") for of in (params_of, sample, condition))
+    params, met, when = (of("float64") for of in (params_of, sample, condition))
     pull = jnp.asarray(rng.normal(size=5))
 
     def read(params, features, code):
         medium = transient.medium(
             SPEC,
             params,
-            found._replace(features=features),
+            met._replace(features=features),
             when._replace(codes={"transient": code}),
         )
         values = [medium.density[None], medium.colour, medium.beta[None]]
         return pull @ jnp.concatenate(values)
 
-    args = (params, found.features, when.codes["transient"])
+    args = (params, met.features, when.codes["transient"])
     assert gradients.directional_error(read, *args, step=1e-6) < 1e-7
     grad = np.asarray(jax.jit(jax.grad(read, argnums=1))(*args))
     assert np.all(np.abs(grad) > 1e-4)
@@ -98,8 +98,8 @@ def test_the_trunk_learns_from_the_transient(float64, rng):
 def test_wild_features_leave_the_medium_finite_and_not_negative(size, dtype):
     params, when = params_of(dtype), condition(dtype)
     for sign in (-1, 1):
-        found = sample(dtype)._replace(features=np.full(FEATURES, sign * size, dtype))
-        medium = jax.tree.map(np.asarray, medium_of(SPEC, params, found, when))
+        met = sample(dtype)._replace(features=np.full(FEATURES, sign * size, dtype))
+        medium = jax.tree.map(np.asarray, medium_of(SPEC, params, met, when))
         for leaf in (medium.density, medium.colour, medium.beta):
             assert np.all(np.isfinite(leaf))
             assert np.all(leaf >= 0)
@@ -108,11 +108,11 @@ def test_wild_features_leave_the_medium_finite_and_not_negative(size, dtype):
 
 def test_uncertainty_is_the_least_plus_what_is_met(dtype, rng):
     weights, beta = rng.uniform(size=(2, 4, 7)).astype(dtype)
-    found = jax.jit(transient.uncertainty, static_argnums=0)(0.03, weights, beta)
-    assert found.dtype == dtype
+    beta_of_ray = jax.jit(transient.uncertainty, static_argnums=0)(0.03, weights, beta)
+    assert beta_of_ray.dtype == dtype
     exact = 0.03 + np.sum(networks.exact(weights) * beta, axis=1)
     tolerance = {"float32": 1e-6, "float64": 1e-14}[dtype]
-    np.testing.assert_allclose(found, exact, rtol=tolerance)
+    np.testing.assert_allclose(beta_of_ray, exact, rtol=tolerance)
 
 
 @pytest.mark.hard_cases
@@ -126,8 +126,10 @@ def test_a_ray_that_meets_no_transient_has_the_least_uncertainty(dtype):
             jnp.full((2, 3), 0.5, dtype), jnp.full((2, 3), 0.4, dtype), rays, None
         ), rays
 
-    found = jax.jit(jax.grad(loss, argnums=(0, 1), has_aux=True))(weights, beta)
-    grads, rays = jax.tree.map(np.asarray, found)
+    slopes_and_rays = jax.jit(jax.grad(loss, argnums=(0, 1), has_aux=True))(
+        weights, beta
+    )
+    grads, rays = jax.tree.map(np.asarray, slopes_and_rays)
     np.testing.assert_array_equal(rays, np.full(2, 0.03, dtype))
     assert np.all(np.isfinite(grads[0]))
     assert np.all(grads[1] == 0)
@@ -146,10 +148,10 @@ def test_photometric_is_the_mean_of_the_valid_rays_alone(dtype, rng):
     assert 0 < np.sum(valid) < len(valid)
     tolerance = {"float32": 2e-6, "float64": 1e-14}[dtype]
     for mask, counted in ((valid, valid), (None, valid | True)):
-        found, _ = photometric(colour, truth, beta, mask)
-        assert found.dtype == dtype
+        loss, _ = photometric(colour, truth, beta, mask)
+        assert loss.dtype == dtype
         exact = loss_by_hand(colour, truth, beta, counted)
-        np.testing.assert_allclose(found, exact, rtol=tolerance)
+        np.testing.assert_allclose(loss, exact, rtol=tolerance)
 
 
 @pytest.mark.hard_cases
@@ -209,11 +211,11 @@ def context(dtype, density, valid):
 
 
 def test_the_penalty_is_the_mean_density_of_the_fine_samples(dtype):
-    made = transient.effect(SPEC, FEATURES)
+    effect = transient.effect(SPEC, FEATURES)
 
     @jax.jit
     def penalty(density):
-        return made.penalty(None, context(dtype, density, [True, True, False]))
+        return effect.penalty(None, context(dtype, density, [True, True, False]))
 
     density = np.array([[0.0, 1.0, 2.0], [5.0, 4.0, 0.0], [1e6, 1.0, 1.0]], dtype)
     terms = penalty(density)

@@ -82,9 +82,9 @@ def test_points_move_as_the_matrix_exponential_says(kind, condition, step, dtype
     assert warp.effect(spec).tables == tables
     params, when = bent(spec, dtype), frame(dtype, step=step)
     points = rng.uniform(-1, 1, (4, 3)).astype(dtype)
-    found = compiled(spec)(params, points, when)
-    assert found.dtype == dtype
-    for point, moved in zip(points, np.asarray(found), strict=True):
+    warped = compiled(spec)(params, points, when)
+    assert warped.dtype == dtype
+    for point, moved in zip(points, np.asarray(warped), strict=True):
         truth = by_hand(spec, params, point, when) - np.asarray(point, np.float64)
         scale = max(np.abs(truth).max(), 1)
         assert scale < 100

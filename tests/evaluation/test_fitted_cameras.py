@@ -113,7 +113,7 @@ def test_a_displaced_camera_is_found_again(capture, rng, turn, shift, most_pixel
         scored.append(view.camera)
         return renderer(state, view._replace(camera=pinholes.pinhole(view.camera)))
 
-    found = fitted_cameras.fit_cameras(
+    fitted = fitted_cameras.fit_cameras(
         MODEL,
         draw,
         state,
@@ -123,15 +123,15 @@ def test_a_displaced_camera_is_found_again(capture, rng, turn, shift, most_pixel
         filmed=dataclasses.replace(film, cameras=lens),
     )
     assert [float(camera.radial[0]) for camera in scored] == [np.float32(0.1)] * 3
-    for camera, position in zip(scored, found.cameras.position, strict=True):
+    for camera, position in zip(scored, fitted.cameras.position, strict=True):
         np.testing.assert_allclose(camera.position, position, atol=1e-6)
-    assert found.converged.all()
+    assert fitted.converged.all()
     apart = np.linalg.norm(
-        found.cameras.position - capture.cameras.position[rows], axis=1
+        fitted.cameras.position - capture.cameras.position[rows], axis=1
     )
     turns = np.einsum(
         "nij,nkj->nik",
-        found.cameras.camera_from_world.astype(float),
+        fitted.cameras.camera_from_world.astype(float),
         capture.cameras.camera_from_world[rows].astype(float),
     )
     angles = Rotation.from_matrix(turns).magnitude()
@@ -141,13 +141,13 @@ def test_a_displaced_camera_is_found_again(capture, rng, turn, shift, most_pixel
     bound = 1e-3 if most_pixels == 5000 else 6e-3
     assert apart.max() < bound
     assert angles.max() < bound
-    assert found.scored.psnr.min() > 55
-    assert (found.scored.psnr > before.psnr + 5).all()
+    assert fitted.scored.psnr.min() > 55
+    assert (fitted.scored.psnr > before.psnr + 5).all()
     # Held against the exact path, the errors are those of the fitted cameras.
-    numbers = heldout._cameras(found, capture, exact=True)
+    numbers = heldout._cameras(fitted, capture, exact=True)
     assert numbers["cameras.ate"] < bound
     assert numbers["cameras.rotation_error"] < 2 * np.degrees(bound)
-    assert set(heldout._cameras(found, capture, exact=False)) == {
+    assert set(heldout._cameras(fitted, capture, exact=False)) == {
         "heldout.camera_fitted_psnr"
     }
 
@@ -162,9 +162,9 @@ def test_what_is_not_filmed_does_not_count(capture, rng):
     film = dataclasses.replace(film, valid=valid, images=spoilt)
     renderer, state = evaluation.Renderer(MODEL, film.size), state_of(capture)
     rows = film.heldout[:2]
-    found = fitted_cameras.fit_cameras(MODEL, renderer, state, film, rows)
-    assert found.converged.all()
-    apart = found.cameras.position - capture.cameras.position[rows]
+    fitted = fitted_cameras.fit_cameras(MODEL, renderer, state, film, rows)
+    assert fitted.converged.all()
+    apart = fitted.cameras.position - capture.cameras.position[rows]
     assert np.abs(apart).max() < 2e-3
 
 
@@ -177,12 +177,12 @@ def test_an_empty_scene_finds_no_camera(capture):
     )
     renderer = evaluation.Renderer(blank, capture.size)
     rows = capture.heldout[:1]
-    found = fitted_cameras.fit_cameras(
+    fitted = fitted_cameras.fit_cameras(
         blank, renderer, state_of(capture), capture, rows
     )
-    assert not found.converged.any()
+    assert not fitted.converged.any()
     np.testing.assert_array_equal(
-        found.cameras.position, capture.cameras.position[rows]
+        fitted.cameras.position, capture.cameras.position[rows]
     )
 
 

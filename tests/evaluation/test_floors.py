@@ -62,14 +62,14 @@ def test_a_mean_of_neighbours_is_of_those_that_filmed_a_pixel():
     valid[3, :, :5] = False
     valid[[3, 5], 0] = False
     capture = film(valid=valid)
-    found = floors.neighbour_means(capture, np.array([4, 7]))
+    means = floors.neighbour_means(capture, np.array([4, 7]))
     expected = np.full((*SIZE[::-1], 3), 40 / 255)
     expected[:, :5] = 50 / 255
     expected[0] = 0
-    np.testing.assert_allclose(found.colour[0], expected, atol=1e-6)
-    np.testing.assert_allclose(found.colour[1], 70 / 255, atol=1e-6)
-    np.testing.assert_array_equal(found.known[0], expected[..., 0] > 0)
-    assert found.known[1].all()
+    np.testing.assert_allclose(means.colour[0], expected, atol=1e-6)
+    np.testing.assert_allclose(means.colour[1], 70 / 255, atol=1e-6)
+    np.testing.assert_array_equal(means.known[0], expected[..., 0] > 0)
+    assert means.known[1].all()
     at_once = dataclasses.replace(capture, times=np.zeros(12, np.float32))
     assert floors.neighbour_means(at_once, capture.heldout) is None
     single = dataclasses.replace(capture, train=capture.train[:1])
@@ -87,12 +87,12 @@ def test_an_average_over_time_leaves_the_rest_of_a_view():
         return Rendering(colour, np.ones(shape), np.ones(shape))
 
     rows = capture.heldout
-    found = floors.time_averages(draw, NOBODY, capture, rows, frames=2, moments=3)
-    np.testing.assert_array_equal(found.places, [0, 3])
+    averages = floors.time_averages(draw, NOBODY, capture, rows, frames=2, moments=3)
+    np.testing.assert_array_equal(averages.places, [0, 3])
     times = capture.times[capture.train]
     times = times[[0, round((len(times) - 1) / 2), -1]]
     assert order == [t for t in times for _ in range(2)]  # an instant serves all views
-    for place, colour in zip(found.places, found.colour, strict=True):
+    for place, colour in zip(averages.places, averages.colour, strict=True):
         position = capture.cameras.position[rows[place], 0]
         exact = np.mean(np.clip(2 * (times.astype(float) + position), 0, 1))
         np.testing.assert_allclose(colour, exact, atol=1e-6)
@@ -101,13 +101,13 @@ def test_an_average_over_time_leaves_the_rest_of_a_view():
 
 
 def test_a_run_below_a_floor_is_told_what_to_do():
-    found = {"heldout.psnr": 20.0, "floor.neighbours": 19.0, "floor.still": 19.5}
-    found |= {"motion.worth": 0.5}
-    assert floors_text.warnings(found) == []
-    assert "19.00 dB the mean of two" in floors_text.lines(found)[0]
-    assert "+0.50 dB" in floors_text.lines(found)[1]
+    numbers = {"heldout.psnr": 20.0, "floor.neighbours": 19.0, "floor.still": 19.5}
+    numbers |= {"motion.worth": 0.5}
+    assert floors_text.warnings(numbers) == []
+    assert "19.00 dB the mean of two" in floors_text.lines(numbers)[0]
+    assert "+0.50 dB" in floors_text.lines(numbers)[1]
     below, worse = floors_text.warnings(
-        found | {"floor.neighbours": 22.7, "motion.worth": -0.25}
+        numbers | {"floor.neighbours": 22.7, "motion.worth": -0.25}
     )
     assert "20.00 dB is below the 22.70 dB" in below
     assert "0.25 dB worse" in worse
@@ -134,12 +134,12 @@ def test_a_pinhole_s_render_is_bent_as_the_lens_films(bulge):
         return Rendering(colour, np.ones((height, width)), x)
 
     judged = pinholes.scorable(bent, traced=False)
-    found = ThroughLens(draw, capture.size)(NOBODY, evaluation.view_of(bent, 0))
+    render = ThroughLens(draw, capture.size)(NOBODY, evaluation.view_of(bent, 0))
     seen = np.ones((height, width), bool) if judged.valid is None else judged.valid[0]
     assert seen[5:-5, 5:-5].mean() > 0.8
     assert (seen.mean() < 0.99) == (bulge < 0)
     # Rounding to levels, and bilinear sampling of a smooth pattern.
-    away = np.abs(255 * found.colour - bent.images[0])[seen]
+    away = np.abs(255 * render.colour - bent.images[0])[seen]
     assert away.max() <= 1.01
     assert (
         np.abs(
@@ -147,10 +147,10 @@ def test_a_pinhole_s_render_is_bent_as_the_lens_films(bulge):
         ).max()
         > 5
     )
-    assert not found.colour[~seen].any()
+    assert not render.colour[~seen].any()
     assert not judged.depths[0][~seen].any()
-    np.testing.assert_array_equal(found.alpha, seen)
-    assert set(np.unique(found.depth)) <= set(x[0])  # never between two surfaces
+    np.testing.assert_array_equal(render.alpha, seen)
+    assert set(np.unique(render.depth)) <= set(x[0])  # never between two surfaces
     np.testing.assert_array_equal(judged.images, bent.images)
     if bulge < 0:
         lost = 1 - judged.valid.mean()
@@ -166,11 +166,11 @@ def test_rays_through_a_lens_are_scored_but_where_it_has_none():
     # A fold inside the picture: beyond it no ray is bent there.
     lens = np.tile(np.float32([-3.0, 0.0, 0.0]), (3, 1))
     bent = dataclasses.replace(capture, cameras=capture.cameras._replace(radial=lens))
-    found = pinholes.scorable(bent, traced=True)
+    scored = pinholes.scorable(bent, traced=True)
     width, height = capture.size
-    assert not found.valid[0, 0, 0]
-    assert found.valid[0, height // 2, width // 2]
-    assert "have no ray" in found.notes[-1]
+    assert not scored.valid[0, 0, 0]
+    assert scored.valid[0, height // 2, width // 2]
+    assert "have no ray" in scored.notes[-1]
 
 
 @pytest.fixture
@@ -179,10 +179,10 @@ def looked(tmp_path, monkeypatch):
 
     Where there are two cameras the film is of no use.
     """
-    found = []
+    looked_at = []
 
     def cached(film, folder):
-        found.append(film)
+        looked_at.append(film)
         assert folder == tmp_path
         order = film.train[np.argsort(film.times[film.train], kind="stable")]
         mask = np.zeros((len(order), *film.size[::-1]), bool)
@@ -198,7 +198,7 @@ def looked(tmp_path, monkeypatch):
     monkeypatch.setattr(record, "cached", cached)
     width, height = films.SIZE
     monkeypatch.setattr(moving_masks, "MOST_PIXELS", 12 * width * height // 4)
-    return found
+    return looked_at
 
 
 def without_masks(**changes):
@@ -215,10 +215,10 @@ def test_masks_of_what_moves_come_from_all_frames(lens, looked, tmp_path):
         bent = capture.cameras._replace(radial=radial)
         capture = dataclasses.replace(capture, cameras=bent)
     width, height = capture.size
-    found, note = moving_masks.with_masks(capture, tmp_path)
+    masked, note = moving_masks.with_masks(capture, tmp_path)
     assert looked[0].size == (width // 2, height // 2)
     assert len(looked[0].train) == 12
-    moving = found.moving[5]
+    moving = masked.moving[5]
     if lens:
         place, inside = pinholes.pinhole_places(
             cameras.take(capture.cameras, 5), capture.size
@@ -230,18 +230,18 @@ def test_masks_of_what_moves_come_from_all_frames(lens, looked, tmp_path):
         expected[: height // 2, : width // 2] = True
     np.testing.assert_array_equal(moving, expected)
     assert f"({moving.mean():.1%} of the held-out" in note
-    assert moving_masks.with_masks(found, tmp_path) == (found, "")
+    assert moving_masks.with_masks(masked, tmp_path) == (masked, "")
 
 
 def test_pictures_that_jump_between_cameras_are_followed_in_one(looked, tmp_path):
     ids = np.repeat(np.int32([1, 0]), 6)
     rig = without_masks(camera_ids=ids)
-    found, _ = moving_masks.with_masks(rig, tmp_path)
+    masked, _ = moving_masks.with_masks(rig, tmp_path)
     assert [film.ids for film in looked] == [rig.ids, rig.ids[:6]]
-    assert found.moving[5].any()
+    assert masked.moving[5].any()
     looked.clear()
     both = dataclasses.replace(rig, train=np.r_[0:5, 7:12], heldout=np.r_[5:7])
-    found, note = moving_masks.with_masks(both, tmp_path)
+    masked, note = moving_masks.with_masks(both, tmp_path)
     assert len(looked) == 1
-    assert found is both
+    assert masked is both
     assert note == "What moves is not scored apart: the camera jumps."

@@ -81,11 +81,11 @@ def test_every_number_is_that_of_a_direct_computation(rng, filmed):
     places = np.array([len(scored.rows) - 1])
     grey = Averages(places, np.full_like(scored.colour[places], 0.4), None)
     floors = Floors(grey._replace(known=~valid[scored.rows[places]]), grey)
-    found = heldout_metrics(scored, capture, floors=floors)
+    numbers = heldout_metrics(scored, capture, floors=floors)
     unscored = {"heldout.unscored"} if filmed else set()
     lost = {"floor.neighbours"} if filmed else set()  # what is known was not filmed
-    assert set(found) == (ALWAYS | MASKED | DEPTHS | FLOORS | unscored) - lost
-    assert found["heldout.psnr"] == pytest.approx(scored.psnr.mean())
+    assert set(numbers) == (ALWAYS | MASKED | DEPTHS | FLOORS | unscored) - lost
+    assert numbers["heldout.psnr"] == pytest.approx(scored.psnr.mean())
     rows = capture.heldout
     picture = np.round(scored.colour.astype(float) * 255) / 255
     truth = capture.images[rows] / 255
@@ -94,31 +94,31 @@ def test_every_number_is_that_of_a_direct_computation(rng, filmed):
     for name, mask in (("moving", moving & known), ("still", ~moving & known)):
         frames = zip(picture, truth, mask, strict=True)
         exact = np.mean([psnr(*frame) for frame in frames])
-        assert found[f"heldout.{name}_psnr"] == pytest.approx(exact, abs=1e-4)
+        assert numbers[f"heldout.{name}_psnr"] == pytest.approx(exact, abs=1e-4)
     for key, mask in (("worth", known[-1]), ("moving_worth", (moving & known)[-1])):
         own = psnr(picture[-1], truth[-1], mask)
         gain = own - psnr(np.full_like(truth[-1], 102 / 255), truth[-1], mask)
-        assert found[f"motion.{key}"] == pytest.approx(gain, abs=1e-4)
+        assert numbers[f"motion.{key}"] == pytest.approx(gain, abs=1e-4)
     if filmed:
         share = 1 - valid[rows].mean()
-        assert found["heldout.unscored"] == pytest.approx(share)
+        assert numbers["heldout.unscored"] == pytest.approx(share)
     ssim = [
         masked_ssim(np.float32(a), np.float32(b), m)
         for a, b, m in zip(picture, truth, moving & known, strict=True)
     ]
-    assert found["heldout.moving_ssim"] == pytest.approx(np.mean(ssim), abs=1e-5)
+    assert numbers["heldout.moving_ssim"] == pytest.approx(np.mean(ssim), abs=1e-5)
     depth = capture.depths[rows]
     for name, mask in (("", depth > 0), ("moving_", (depth > 0) & moving)):
         error = np.abs(scored.depth - depth)[mask]
         exact = {"median": np.median(error), "rmse": np.sqrt(np.mean(error**2))}
         for kind, value in exact.items():
             key = f"heldout.{name}depth_{kind}"
-            assert found[key] == pytest.approx(value, rel=1e-4)
+            assert numbers[key] == pytest.approx(value, rel=1e-4)
     ratio = (scored.depth / depth)[depth > 0]
-    assert found["heldout.depth_abs_rel"] == pytest.approx(
+    assert numbers["heldout.depth_abs_rel"] == pytest.approx(
         np.abs(ratio - 1).mean(), rel=1e-4
     )
-    assert found["heldout.depth_within_delta"] == pytest.approx(
+    assert numbers["heldout.depth_within_delta"] == pytest.approx(
         np.mean(np.maximum(ratio, 1 / ratio) < 1.25), abs=1e-3
     )
 
@@ -128,11 +128,11 @@ def test_what_a_capture_has_not_is_not_among_the_numbers(rng):
     bare = dataclasses.replace(capture, moving=None, depths=None)
     assert set(heldout_metrics(drawn(bare, rng), bare)) == ALWAYS
     still = dataclasses.replace(capture, moving=np.zeros_like(capture.moving))
-    found = heldout_metrics(drawn(still, rng), still)
-    assert "heldout.still_psnr" in found
-    assert not [key for key in found if "moving" in key]
-    listed = {metric.key: metric.value for metric in heldout.metrics(found)}
-    assert listed == found
+    numbers = heldout_metrics(drawn(still, rng), still)
+    assert "heldout.still_psnr" in numbers
+    assert not [key for key in numbers if "moving" in key]
+    listed = {metric.key: metric.value for metric in heldout.metrics(numbers)}
+    assert listed == numbers
 
 
 @pytest.mark.full
@@ -151,35 +151,35 @@ def test_large_pictures_get_ms_ssim_and_weights_lpips(rng, tmp_path):
     np.savez(tmp_path / "tiny.npz", **state_dict("tiny", rng))
     lpips = heldout.load_lpips(TINY, [tmp_path / "tiny.npz"], capture.size)
     scored = drawn(capture, rng)
-    found = heldout_metrics(scored, capture, lpips=lpips)
-    assert set(found) == ALWAYS | {"heldout.ms_ssim", "heldout.lpips"}
+    numbers = heldout_metrics(scored, capture, lpips=lpips)
+    assert set(numbers) == ALWAYS | {"heldout.ms_ssim", "heldout.lpips"}
     picture = np.round(scored.colour[0] * 255) / np.float32(255)
     truth = np.float32(capture.images[rows[0]] / 255)
     exact = jax.jit(image_quality.ms_ssim)(picture, truth)
-    assert found["heldout.ms_ssim"] == pytest.approx(float(exact), abs=1e-5)
+    assert numbers["heldout.ms_ssim"] == pytest.approx(float(exact), abs=1e-5)
     exact = jax.jit(perceptual.lpips, static_argnums=1)(
         lpips.params, TINY, picture, truth
     )
-    assert found["heldout.lpips"] == pytest.approx(float(exact), rel=1e-4)
+    assert numbers["heldout.lpips"] == pytest.approx(float(exact), rel=1e-4)
 
     filmed = np.ones(capture.images.shape[:3], bool)
     filmed[:, :, 100:] = False
     capture = dataclasses.replace(capture, valid=filmed)
-    found = heldout_metrics(scored, capture, lpips=lpips)
-    assert "heldout.ms_ssim" not in found  # it has no masked form
+    numbers = heldout_metrics(scored, capture, lpips=lpips)
+    assert "heldout.ms_ssim" not in numbers  # it has no masked form
     exact = jax.jit(perceptual.masked_lpips, static_argnums=1)(
         lpips.params, TINY, picture, truth, filmed[rows[0]]
     )
-    assert found["heldout.lpips"] == pytest.approx(float(exact), rel=1e-4)
+    assert numbers["heldout.lpips"] == pytest.approx(float(exact), rel=1e-4)
     with pytest.raises(ValueError, match="9 pixels on the shorter side"):
         heldout.load_lpips(TINY, [], (40, 8))
 
 
 def test_flow_is_scored_where_there_is_an_answer():
     truth = np.zeros((5, 2))
-    found = np.array([[3, 4], [0, 1], [np.nan, 0], [0, 0], [0, 2.0]])
+    predicted = np.array([[3, 4], [0, 1], [np.nan, 0], [0, 0], [0, 2.0]])
     moving = np.array([True, False, True, False, True])
-    scored = heldout._flow(Flow(found, truth, moving))
+    scored = heldout._flow(Flow(predicted, truth, moving))
     assert scored["flow.epe"] == pytest.approx((5 + 1 + 0 + 2) / 4)
     assert scored["flow.moving_epe"] == pytest.approx((5 + 2) / 2)
     assert scored["flow.outliers"] == pytest.approx(2 / 5)
@@ -206,9 +206,9 @@ def test_the_flow_of_a_known_motion_is_the_true_one():
             thing, here_too = FILM.things[one], things == one
             then = scene_oracle.canonical(thing, points[here_too], float(here.time))
             moved[here_too] = scene_oracle.observe(thing, then, float(there.time))
-        found = np.ones(len(points), bool)
-        found[lost] = False
-        return Moved(moved, found)
+        known = np.ones(len(points), bool)
+        known[lost] = False
+        return Moved(moved, known)
 
     scored = drawn(capture, np.random.default_rng(0))
     scored = scored._replace(depth=capture.depths[capture.heldout])
@@ -263,10 +263,10 @@ def test_a_run_is_held_against_the_truth_of_its_scene(kind, filmed, rng):
     capture = run.capture
     scored = drawn(capture, rng)
     renderer = evaluation.Renderer(run.model, run.capture.size)
-    found, notes = quality.measure(run, state, renderer, scored)
+    numbers, notes = quality.measure(run, state, renderer, scored)
     assert notes == []
     strain = {"tracks.strain"} if kind == "radiance" else set()
-    assert set(found) == ALWAYS | MASKED | FLOORS | DEPTHS | TRUTH | strain
+    assert set(numbers) == ALWAYS | MASKED | FLOORS | DEPTHS | TRUTH | strain
 
     truth = protocol.stored_truth(capture)
     known = protocol.ground_truth(capture, truth, 2, quality.TRACKS)
@@ -279,7 +279,7 @@ def test_a_run_is_held_against_the_truth_of_its_scene(kind, filmed, rng):
         ("tracks.still_epe", known.start_points[:, None]),
     ):
         away = np.linalg.norm(path - known.path, axis=-1)[seen]
-        assert found[key] == pytest.approx(away.mean(), rel=1e-4)
+        assert numbers[key] == pytest.approx(away.mean(), rel=1e-4)
     # The flow is that of the same motion: points of the start at the last moment.
     move = run.representation.mover(run.spec, run.metadata)
     here, there = (
@@ -293,8 +293,8 @@ def test_a_run_is_held_against_the_truth_of_its_scene(kind, filmed, rng):
     flow = model_flow.heldout_flow(move, state, capture, scored)
     away = np.linalg.norm(flow.predicted - flow.truth, axis=1)
     answered = np.isfinite(away)
-    assert found["flow.epe"] == pytest.approx(away[answered].mean(), rel=1e-4)
-    assert found["flow.missing"] == pytest.approx(1 - answered.mean(), abs=1e-6)
+    assert numbers["flow.epe"] == pytest.approx(away[answered].mean(), rel=1e-4)
+    assert numbers["flow.missing"] == pytest.approx(1 - answered.mean(), abs=1e-6)
 
 
 @pytest.mark.full
@@ -313,14 +313,16 @@ def test_a_scene_without_motion_or_truth_has_no_points_to_follow(filmed, rng, tm
     renderer = evaluation.Renderer(run.model, run.capture.size)
     scored = drawn(run.capture, rng)
     elsewhere = dataclasses.replace(run.capture, path=None)
-    found, notes = quality.measure(
+    numbers, notes = quality.measure(
         run._replace(filmed=elsewhere), state, renderer, scored
     )
     assert notes == []
-    assert set(found) == ALWAYS | MASKED | FLOORS | DEPTHS
+    assert set(numbers) == ALWAYS | MASKED | FLOORS | DEPTHS
     # A truth of another scene is no reason to lose what was trained.
     (tmp_path / synthetic.TRUTH_FILE).write_bytes(b"cut short")
     broken = dataclasses.replace(run.capture, path=tmp_path)
-    found, notes = quality.measure(run._replace(filmed=broken), state, renderer, scored)
-    assert set(found) == ALWAYS | MASKED | FLOORS | DEPTHS
+    numbers, notes = quality.measure(
+        run._replace(filmed=broken), state, renderer, scored
+    )
+    assert set(numbers) == ALWAYS | MASKED | FLOORS | DEPTHS
     assert "no scene truth" in notes[0]

@@ -29,9 +29,9 @@ def test_the_known_paths_are_those_of_points_seen_at_the_start():
 def test_a_scaled_capture_has_its_paths_in_scene_units():
     capture, truth, known = scenes.tiny_tracks()
     other = dataclasses.replace(capture, scale=2.0, centre=(0.1, 0.2, -0.3))
-    found = protocol.ground_truth(other, truth, 2, 5)
+    scaled = protocol.ground_truth(other, truth, 2, 5)
     expected = 2 * (known.path - np.float32([0.1, 0.2, -0.3]))
-    np.testing.assert_allclose(found.path, expected, atol=1e-6)
+    np.testing.assert_allclose(scaled.path, expected, atol=1e-6)
 
 
 def test_the_truth_of_another_capture_is_refused():
@@ -43,10 +43,10 @@ def test_the_truth_of_another_capture_is_refused():
 def test_tracks_are_scored_by_their_distance_at_all_instants_but_the_start():
     known = scenes.tiny_tracks()[2]
     known = known._replace(seen=np.ones_like(known.seen))
-    found = np.ones(known.seen.shape, bool)
-    found[0, 4:6] = False
-    right = PointTracks(known.path, found, 0.1, 0.2)
-    later = found[:, 1:].size  # all but one column
+    answered = np.ones(known.seen.shape, bool)
+    answered[0, 4:6] = False
+    right = PointTracks(known.path, answered, 0.1, 0.2)
+    later = answered[:, 1:].size  # all but one column
     numbers = protocol.score_tracks(known, right)
     assert numbers["track_error"] == 0
     assert numbers["track_correct"] == 1
@@ -72,12 +72,12 @@ def test_tracks_are_scored_by_their_distance_at_all_instants_but_the_start():
 
 def test_a_real_capture_is_judged_by_its_pictures_alone():
     capture, _, known = scenes.tiny_tracks()
-    found = protocol.held_out_only(capture, 2)
-    np.testing.assert_array_equal(found.rows, known.rows)
-    np.testing.assert_array_equal(found.moments, known.moments)
+    halved = protocol.held_out_only(capture, 2)
+    np.testing.assert_array_equal(halved.rows, known.rows)
+    np.testing.assert_array_equal(halved.moments, known.moments)
 
-    assert np.isnan(list(protocol.score_tracks(found, None).values())).all()
-    assert np.isnan(protocol.static_error(found))
+    assert np.isnan(list(protocol.score_tracks(halved, None).values())).all()
+    assert np.isnan(protocol.static_error(halved))
     blind = dataclasses.replace(
         capture, train=np.arange(len(capture.ids)), heldout=np.zeros(0, int)
     )

@@ -189,10 +189,10 @@ def test_a_scene_in_stages_is_drawn_as_in_one(moving):
     first, last = (whole(state, view).colour for view in (views[0], views[-1]))
     assert np.abs(first - last).max() > 0.05
     for view in views:
-        found, expected = staged(state, view), whole(state, view)
+        picture, expected = staged(state, view), whole(state, view)
         for name in Rendering._fields:
             np.testing.assert_allclose(
-                getattr(found, name), getattr(expected, name), atol=3e-6, err_msg=name
+                getattr(picture, name), getattr(expected, name), atol=3e-6, err_msg=name
             )
 
 
@@ -245,8 +245,8 @@ def test_the_code_sees_the_left_half_and_the_score_the_right(masked):
         picture[:, :20] = 5.0  # what is wrong on the left costs nothing
         return Rendering(picture, None, None)
 
-    found = evaluation.score_halves(fit_code, render, capture, capture.heldout)
-    np.testing.assert_array_equal(found.rows, capture.heldout)
+    scored = evaluation.score_halves(fit_code, render, capture, capture.heldout)
+    np.testing.assert_array_equal(scored.rows, capture.heldout)
     for place, row in enumerate(capture.heldout):
         time, left, filmed = seen[place]
         assert time == capture.times[row]
@@ -255,5 +255,5 @@ def test_the_code_sees_the_left_half_and_the_score_the_right(masked):
         level = np.round(left.mean()) / 255
         right = capture.images[row, :, 20 : 36 if masked else 40] / 255
         exact = -10 * np.log10(np.mean((right - level) ** 2))
-        np.testing.assert_allclose(found.psnr[place], exact, atol=1e-3)
-        assert 0 < found.ssim[place] < 1
+        np.testing.assert_allclose(scored.psnr[place], exact, atol=1e-3)
+        assert 0 < scored.ssim[place] < 1

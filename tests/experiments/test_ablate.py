@@ -81,16 +81,16 @@ def test_the_steps_are_what_the_time_allows(tiny, cost, runs, monkeypatch):
     """A step costs the more the longer the run: one more try comes near enough."""
     settled = cli.parse(Ablate, [*tiny, "--seconds", "60"])
     job = Job(settled)
-    made = []
+    trained = []
 
     def train(name, seed, steps):
-        made.append(steps)
+        trained.append(steps)
         return kept(steps, cost(steps))
 
     monkeypatch.setattr(job, "_train", train)
-    steps, found = job._train_for("static", job.budgets[0])
-    assert made == runs
-    assert steps == runs[-1] == found.notes["steps"]
+    steps, result = job._train_for("static", job.budgets[0])
+    assert trained == runs
+    assert steps == runs[-1] == result.notes["steps"]
     assert abs(cost(steps) / 60 - 1) < 0.05
 
 
@@ -99,17 +99,17 @@ def test_over_steps_and_seconds_the_run_over_steps_is_the_pilot(tiny, monkeypatc
         Ablate, [*tiny, "--steps", "40", "--seconds", "3", "--arms", "static"]
     )
     job = Job(settled)
-    made = []
+    trained = []
 
     def train(name, seed, steps):
-        made.append((seed, steps))
+        trained.append((seed, steps))
         return kept(steps, 0.05 * steps)
 
     monkeypatch.setattr(job, "_train", train)
     for seed in (0, 1):
         for budget in job.budgets:
             job.make("static", seed, budget)
-    assert made == [(0, 40), (0, 60), (1, 40), (1, 60)]
+    assert trained == [(0, 40), (0, 60), (1, 40), (1, 60)]
     assert [len(job.finished(budget)) for budget in job.budgets] == [1, 1]  # one seed
     by_time = job.path("static", 1, job.budgets[1])
     assert json.loads(by_time.read_text())["identity"]["seconds"] == 3
@@ -133,10 +133,10 @@ def test_arms_that_need_depth_are_not_run_without_it(tiny, monkeypatch):
     monkeypatch.setattr(suites, "named", lambda _: FIELDS._replace(arms=arms))
     settled = cli.parse(Ablate, tiny)
     assert Job(settled).names == ("all", "less")
-    made = synthetic.cached
+    scene_of = synthetic.cached
 
     def blind(*arguments):
-        capture, truth = made(*arguments)
+        capture, truth = scene_of(*arguments)
         return dataclasses.replace(capture, depths=None), truth
 
     monkeypatch.setattr(synthetic, "cached", blind)

@@ -34,10 +34,10 @@ def numbers_of(**pairs):
 )
 def test_a_claim_is_held_against_the_spread_over_seeds(nerfies, translation, says):
     numbers = numbers_of(nerfies=nerfies, translation=translation)
-    found = verdicts.verdicts(numbers, FIELDS.claims)
-    assert {verdict.claim.worse for verdict in found} == {"translation"}
+    judged = verdicts.verdicts(numbers, FIELDS.claims)
+    assert {verdict.claim.worse for verdict in judged} == {"translation"}
     # A lower error and a higher PSNR are both a gain.
-    by_measure = {verdict.measure: verdict for verdict in found}
+    by_measure = {verdict.measure: verdict for verdict in judged}
     for name in ("track_error", "moving_psnr"):
         assert by_measure[name].says.startswith(says)
     verdict = by_measure["track_error"]
@@ -47,7 +47,7 @@ def test_a_claim_is_held_against_the_spread_over_seeds(nerfies, translation, say
         interval = scipy.stats.ttest_1samp(gains, 0).confidence_interval(0.95)
         width = (interval.high - interval.low) / 2
         assert verdict.half_width == pytest.approx(width, rel=1e-9)
-    assert says in verdicts.claims_text(found)
+    assert says in verdicts.claims_text(judged)
 
 
 def test_only_seeds_that_both_arms_have_are_compared():
@@ -98,10 +98,10 @@ def test_claims_are_about_arms_and_measures_that_there_are(name):
 
 
 def test_what_is_estimated_of_a_real_capture_judges_nothing():
-    found = dict.fromkeys(measures.KEYS.values(), 1.0)
-    exact = measures.quality(found, exact=True)
+    scores = dict.fromkeys(measures.KEYS.values(), 1.0)
+    exact = measures.quality(scores, exact=True)
     assert exact == dict.fromkeys(measures.KEYS, 1.0)
-    estimated = measures.quality(found, exact=False)
+    estimated = measures.quality(scores, exact=False)
     known = {name for name, value in estimated.items() if value == 1}
     assert known == {"psnr", "ssim"} | {n for n in measures.KEYS if "track" in n} | {
         "drift",

@@ -75,8 +75,8 @@ def test_the_front_is_what_nothing_beats_in_both():
         "as good, dearer": row(train_cpu_seconds=2.0, psnr=20.0),
         "unknown": row(train_cpu_seconds=0.1),
     }
-    found = report.front(means, "psnr", "train_cpu_seconds")
-    assert found == ["cheap", "slow and good"]
+    front = report.front(means, "psnr", "train_cpu_seconds")
+    assert front == ["cheap", "slow and good"]
 
 
 def test_a_line_says_what_changed_against_the_base_and_what_it_costs():

@@ -37,9 +37,9 @@ class _Device:
 
 def test_every_command_is_listed_with_a_line(capsys):
     every.main([])
-    told = capsys.readouterr().out
+    printed = capsys.readouterr().out
     for name in ("reconstruct", "render", "prepare", "ablate", "hard_cases"):
-        assert f"\n{name} " in told
+        assert f"\n{name} " in printed
     assert all(line.endswith((".", "?")) for line in every.commands().values())
 
 

@@ -117,21 +117,21 @@ def _field(capture):
 @pytest.mark.slow
 @pytest.mark.usefixtures("small")
 def test_arms_agree_with_the_network_they_shorten():
-    made = {arm.name: arm for arm in arms.arms(40, 0.25)}
+    by_name = {arm.name: arm for arm in arms.arms(40, 0.25)}
     for network in arms.NETWORKS:
-        whole = made[network.name].used
+        whole = by_name[network.name].used
         exact = jax.jit(whole.deform)(*whole.inputs)
-        for name in (n for n in made if n.startswith(network.name)):
-            way = made[name].used
-            found = jax.jit(way.deform)(*way.inputs)
-            off = np.abs(found.mean - exact.mean).max(axis=1) > 1e-6
+        for name in (n for n in by_name if n.startswith(network.name)):
+            way = by_name[name].used
+            offsets = jax.jit(way.deform)(*way.inputs)
+            off = np.abs(offsets.mean - exact.mean).max(axis=1) > 1e-6
             # What stands still is at rest instead, not where the network puts it.
             assert off.sum() <= (10 if "still" in name else 0)
         grads = jax.jit(whole.gradient)(*whole.inputs)
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(grads))
     papers = sum(network.paper for network in arms.NETWORKS)
-    assert sum("still" in name for name in made) == papers
-    assert sum("kept" in name for name in made) >= 2
+    assert sum("still" in name for name in by_name) == papers
+    assert sum("kept" in name for name in by_name) >= 2
 
 
 @pytest.mark.slow
@@ -155,11 +155,11 @@ def test_a_loop_over_kernels_is_counted_in_full():
     )
     np.testing.assert_allclose(three, (two + four) / 2, rtol=0.01)  # a line
     parts = arms.in_one_turn(spec, count)
-    found = sum(weight * flops(part) for weight, part in parts)
-    np.testing.assert_allclose(found, four + 8 * (four - three), rtol=0.05)
+    counted = sum(weight * flops(part) for weight, part in parts)
+    np.testing.assert_allclose(counted, four + 8 * (four - three), rtol=0.05)
     products = 2 * (5 * 7 + 7 * 6 + 6 * 9)  # of one Gaussian and one kernel
-    assert 12 * products * count < found
-    assert flops(whole) < 0.8 * found  # the compiler's own count
+    assert 12 * products * count < counted
+    assert flops(whole) < 0.8 * counted  # the compiler's own count
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ COMMAND = re.compile(r"python -m experiments\.([a-z_]+)([^\n#&;]*)")
 
 def commands():
     """Each command once, with the first page that it stands on."""
-    found = {}
+    first_page = {}
     for page in PAGES:
         plain, *fenced = re.split(r"^```", page.read_text(), flags=re.M)
         prose = "".join([plain, *fenced[1::2]])
@@ -26,8 +26,8 @@ def commands():
         for name, words in COMMAND.findall("\n".join(code)):
             # "..." stands for more options; numerics.md has commands in comments
             words = words.replace("...", "").replace("-->", "").strip()
-            found.setdefault((name, words), page.name)
-    return [(name, words, page) for (name, words), page in found.items()]
+            first_page.setdefault((name, words), page.name)
+    return [(name, words, page) for (name, words), page in first_page.items()]
 
 
 class Accepted(Exception):

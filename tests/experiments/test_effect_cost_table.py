@@ -23,23 +23,23 @@ def test_the_products_of_a_static_field_are_those_of_its_networks(name):
     preset = bare_scenes.tiny_field(name)
     spec = effect_cost.without(preset, tuple(effect_cost.effects_in(preset)))
     metadata = scene.metadata_of(scenes.tiny_capture(), spec)
-    made = scene.field(spec, metadata)
+    field = scene.field(spec, metadata)
     forward, near, far = np.float32([0, 0, 1]), np.float32(0.5), np.float32(1)
     ray = Ray(*jax.device_put((0 * forward, forward, near, far)))
     condition = FrameCondition(near, {}, jax.device_put(np.int32(0)))
 
     def colours(params):
-        return [level.colour for level in made.render_ray(params, ray, condition)]
+        return [level.colour for level in field.render_ray(params, ray, condition)]
 
-    params = jax.eval_shape(lambda: made.init(jax.random.key(0)))
-    found = matrix_flops.count(colours, params)
+    params = jax.eval_shape(lambda: field.init(jax.random.key(0)))
+    counted = matrix_flops.count(colours, params)
     plan = spec.sampling
     expected = network_flops(spec.template, plan.coarse + plan.fine)
     if plan.fine:
         shared = plan.shared or spec.coarse is None
         first = spec.template if shared else spec.coarse
         expected += network_flops(first, plan.coarse)
-    assert found == (expected, False)
+    assert counted == (expected, False)
 
 
 def network_flops(one, samples):

@@ -22,10 +22,10 @@ def test_the_command_line_says_draws_and_keeps_what_it_finds(
     nerfies_format.write(films.film(**MOVES), tmp_path / "film")
     words = [str(tmp_path / "film"), "--out", str(tmp_path / "out")]
     evidence.main(words)
-    said = capsys.readouterr().out
-    assert "what moves ..." in said
+    printed = capsys.readouterr().out
+    assert "what moves ..." in printed
     (kept,) = (tmp_path / "cache" / "evidence").glob("*.npz")
-    assert f"record: {kept}" in said
+    assert f"record: {kept}" in printed
     assert (tmp_path / "out" / "tracks.png").stat().st_size > 10_000
     stored = json.loads((tmp_path / "out" / "evidence.json").read_text())
     assert stored["found"]["tracks"] == len(record.load(kept).score)
@@ -37,8 +37,8 @@ def test_the_command_line_says_draws_and_keeps_what_it_finds(
 
 def test_the_page_leaves_out_what_was_not_measured():
     errors = dict.fromkeys(("mask_iou", "track_px", "track_lost", "path_error"))
-    found = {"tracks": 9, "paths": 0, "groups": 0, "points": 5, "seconds": 1.0}
-    still = {"scene": "still", **errors, **found, "path_deviation": None}
+    counts = {"tracks": 9, "paths": 0, "groups": 0, "points": 5, "seconds": 1.0}
+    still = {"scene": "still", **errors, **counts, "path_deviation": None}
     row = {"method": "DIS", "enlarged": 2, "still_px": 0.1, "moving_px": 0.2}
     row |= {"far_off": 0.01, "seconds": 0.5}
     text = page.page({"scenes": [still | {"false_share": 0.002}], "flows": [row]})

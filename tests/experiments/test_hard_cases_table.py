@@ -47,8 +47,8 @@ def test_errors_are_of_the_largest_entry_and_never_forgiving():
     case = ROOMS["encodings"][0][0]._replace(floors=(0.0, 0.0, 0.0))
     exact = np.array([[1.0, -4.0], [0.0, 0.0], [0.0, 0.0], [1.0, 1.0]])
     got = np.array([[1.0, -3.0], [0.0, 0.0], [0.0, 1e-9], [1.0, np.nan]])
-    found = hard_case.errors(case, got, exact, 0)
-    np.testing.assert_array_equal(found, [0.25, 0.0, np.inf, np.inf])
+    errors = hard_case.errors(case, got, exact, 0)
+    np.testing.assert_array_equal(errors, [0.25, 0.0, np.inf, np.inf])
     floored = hard_case.errors(case._replace(floors=(2.0,)), got, exact, 0)
     np.testing.assert_allclose(floored, [0.25, 0.0, 5e-10, np.inf])
 

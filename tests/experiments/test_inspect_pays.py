@@ -39,9 +39,9 @@ def test_whatever_is_advised_is_an_arm():
     suite = inspect_arms.advice().arms
     for full, kind in itertools.product((False, True), kinds):
         for choices in itertools.product((True, False, None), repeat=6):
-            told = zip(inspect_arms.DECIDING, choices, strict=True)
-            found = tuple(finding(*one) for one in told)
-            advice = adviser.advise(found, kind, full)
+            decisions = zip(inspect_arms.DECIDING, choices, strict=True)
+            findings = tuple(finding(*one) for one in decisions)
+            advice = adviser.advise(findings, kind, full)
             name = inspect_arms.name_of(advice)
             assert suite[name] == Arm(advice.preset, advice.overrides)
             arms.add(name)
@@ -61,7 +61,7 @@ def row(before, after, advised="nerfies-small+appearance.width=4", refused=""):
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "said"),
+    ("before", "after", "expected"),
     [
         ((25.0, 60.0), (26.0, 80.0), "yes: better pictures"),
         ((25.0, 60.0), (26.0, 40.0), "yes: better pictures, quicker"),
@@ -77,8 +77,8 @@ def row(before, after, advised="nerfies-small+appearance.width=4", refused=""):
         ((25.0, 60.0), (math.nan, 60.0), "a run blew up"),
     ],
 )
-def test_quality_comes_first_and_then_time(before, after, said):
-    assert report.verdict(row(side(*before), side(*after))) == said
+def test_quality_comes_first_and_then_time(before, after, expected):
+    assert report.verdict(row(side(*before), side(*after))) == expected
 
 
 def test_what_is_the_same_or_not_there_is_not_judged():
@@ -160,10 +160,10 @@ def test_what_differs_is_trained_once_and_kept(film, tmp_path, looked, capsys):
         "train nerfies-small",
         "train nerf-small+appearance.width=4",
     ]
-    said = capsys.readouterr().out
-    assert "| 20.00 | 24.00 | - | - | 10 | 10 | yes: better pictures |" in said
-    assert "2 pairs: 1 yes: better pictures; 1 neither way." in said
-    assert (tmp_path / "out/pays.md").read_text() in said
+    printed = capsys.readouterr().out
+    assert "| 20.00 | 24.00 | - | - | 10 | 10 | yes: better pictures |" in printed
+    assert "2 pairs: 1 yes: better pictures; 1 neither way." in printed
+    assert (tmp_path / "out/pays.md").read_text() in printed
     stored = clock.read_metrics(tmp_path / "out/pays.json")
     assert stored["film.splats-deformable-small.gain"].value == 4.0
     kept = json.loads((tmp_path / "out/film/inspected.json").read_text())

@@ -33,8 +33,8 @@ def test_the_nearest_kernels_are_the_terms_of_a_loop(float64, rng):
                 for g in close:
                     height = np.exp(-(((x[n, i] - centres[g]) / width) ** 2))
                     truth[n] += height * np.asarray(layer.kernel)[g, i]
-        found = local(layer, x, nearest)
-        np.testing.assert_allclose(found, truth, rtol=0, atol=1e-13)
+        nearby = local(layer, x, nearest)
+        np.testing.assert_allclose(nearby, truth, rtol=0, atol=1e-13)
 
 
 @pytest.mark.full

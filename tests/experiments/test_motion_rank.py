@@ -96,9 +96,9 @@ def test_a_tiny_run_prints_and_keeps_everything(tmp_path, capsys):
         assert len(row.learnt) == len(row.held_out) == 2
         assert np.isfinite(row.learnt + row.held_out).all()
         assert (row.floor is not None) == (row.model in motion_rank.FLOORS)
-    said = capsys.readouterr().out
-    assert "without a basis" in said.lower()
-    assert "K=4: the moving basis has" in said
+    printed = capsys.readouterr().out
+    assert "without a basis" in printed.lower()
+    assert "K=4: the moving basis has" in printed
     record = json.loads((tmp_path / "out" / "motion_rank.json").read_text())
     assert len(record["rows"]) == len(rows)
     assert record["said"]
@@ -118,16 +118,16 @@ def rows_of(**errors):
 
 def test_the_sentences_follow_the_numbers():
     """Also where they contradict the paper."""
-    said = report.format_conclusions(rows_of(time=1.0, moving=0.4, residual=0.3))
-    assert "0.40 of the time basis' error" in said
-    assert "0.5 shows" in said
-    assert "0.75 of the moving basis' error" in said
-    assert "the basis is not what helps" in said
-    said = report.format_conclusions(rows_of(time=1.0, moving=0.9, residual=1.8))
-    assert "0.5 DOES NOT SHOW" in said
-    assert "better one" not in said
+    text = report.format_conclusions(rows_of(time=1.0, moving=0.4, residual=0.3))
+    assert "0.40 of the time basis' error" in text
+    assert "0.5 shows" in text
+    assert "0.75 of the moving basis' error" in text
+    assert "the basis is not what helps" in text
+    text = report.format_conclusions(rows_of(time=1.0, moving=0.9, residual=1.8))
+    assert "0.5 DOES NOT SHOW" in text
+    assert "better one" not in text
     assert "better one, on held-out times, at K=4." in report.format_conclusions(
         rows_of(time=0.1, moving=0.9)
     )
-    assert "2.00 of the moving basis' error" in said
-    assert "the basis helps" in said
+    assert "2.00 of the moving basis' error" in text
+    assert "the basis helps" in text

@@ -36,16 +36,16 @@ def test_a_tripod_sweep_is_held_out(tmp_path, capsys):
     arrays = archive(tmp_path / "a.npz")
     prepare.main(["npz", str(tmp_path / "a.npz"), str(tmp_path / "out")])
     assert "4 rows after them left out" in capsys.readouterr().out
-    found = room.load(tmp_path / "out")
-    assert (found.train.size, found.heldout.size) == (10, 6)
-    np.testing.assert_allclose(found.times, arrays["times"][:16], atol=1e-7)
+    capture = room.load(tmp_path / "out")
+    assert (capture.train.size, capture.heldout.size) == (10, 6)
+    np.testing.assert_allclose(capture.times, arrays["times"][:16], atol=1e-7)
     exact = arrays["images"][:16] * 255
-    assert np.abs(found.images - exact).max() <= 0.5001
-    np.testing.assert_allclose(found.cameras.focal_px, 12, rtol=1e-6)
+    assert np.abs(capture.images - exact).max() <= 0.5001
+    np.testing.assert_allclose(capture.cameras.focal_px, 12, rtol=1e-6)
     np.testing.assert_allclose(
-        found.cameras.position, arrays["poses"][:16, :3, 3], atol=1e-6
+        capture.cameras.position, arrays["poses"][:16, :3, 3], atol=1e-6
     )
-    assert found.background == (0.0, 0.0, 0.0)
+    assert capture.background == (0.0, 0.0, 0.0)
     assert not list(tmp_path.glob(".*"))
 
 
@@ -53,8 +53,8 @@ def test_rows_can_be_named(tmp_path):
     archive(tmp_path / "a.npz", times=None)
     command = ["npz", str(tmp_path / "a.npz"), str(tmp_path / "out")]
     prepare.main([*command, "--heldout", "16:20", "--train", "0:3"])
-    found = room.load(tmp_path / "out")
-    assert (found.train.size, found.heldout.size) == (3, 4)
+    capture = room.load(tmp_path / "out")
+    assert (capture.train.size, capture.heldout.size) == (3, 4)
 
 
 BAD = {
@@ -74,13 +74,13 @@ BAD = {
 
 @pytest.mark.parametrize("case", BAD)
 def test_bad_archives_end_with_code_2_and_leave_nothing(tmp_path, capsys, case):
-    changes, options, said = BAD[case]
+    changes, options, refusal = BAD[case]
     archive(tmp_path / "a.npz", **changes)
     with pytest.raises(SystemExit) as caught:
         prepare.main(["npz", str(tmp_path / "a.npz"), str(tmp_path / "out"), *options])
     assert caught.value.code == 2
     error = capsys.readouterr().err
-    assert said in error
+    assert refusal in error
     assert error.count("\n") == 1
     assert [p.name for p in tmp_path.iterdir()] == ["a.npz"]
 
@@ -142,11 +142,11 @@ def test_a_real_film_becomes_a_capture(data_dir, tmp_path):
     video.write_video(tmp_path / "a.mp4", frames, 15, quality=6)
     out = tmp_path / "out"
     prepare.main(["video", str(tmp_path / "a.mp4"), str(out), "--frames", "30"])
-    found = room.load(out)
-    assert len(found.ids) >= 25
+    capture = room.load(out)
+    assert len(capture.ids) >= 25
     known = room.load(data_dir / "nrnerf_bookshelf")
-    rows = [round(int(name.removeprefix("ms")) * 15 / 1000) for name in found.ids]
-    one = found.cameras.position.astype(float)
+    rows = [round(int(name.removeprefix("ms")) * 15 / 1000) for name in capture.ids]
+    one = capture.cameras.position.astype(float)
     other = known.cameras.position[rows].astype(float)
     one, other = one - one.mean(0), other - other.mean(0)
     u, values, v = np.linalg.svd(other.T @ one)
@@ -159,12 +159,12 @@ def test_a_real_film_becomes_a_capture(data_dir, tmp_path):
 def test_the_tiny_lego_archive(data_dir, tmp_path):
     source = data_dir / "dnerf_lego_tiny/tiny_dnerf_data.npz"
     prepare.main(["npz", str(source), str(tmp_path / "out")])
-    found = room.load(tmp_path / "out")
-    assert (found.train.size, found.heldout.size) == (50, 11)  # rows 0-49 and 50-60
+    capture = room.load(tmp_path / "out")
+    assert (capture.train.size, capture.heldout.size) == (50, 11)  # rows 0-49 and 50-60
     known = np.load(data_dir / "dnerf_lego_tiny/cameras.npz")
     poses = known["c2w_opencv"][:61]
-    np.testing.assert_allclose(found.cameras.position, poses[:, :, 3], atol=1e-6)
-    rotation = found.cameras.camera_from_world.swapaxes(1, 2)
+    np.testing.assert_allclose(capture.cameras.position, poses[:, :, 3], atol=1e-6)
+    rotation = capture.cameras.camera_from_world.swapaxes(1, 2)
     np.testing.assert_allclose(rotation, poses[:, :, :3], atol=3e-7)
-    assert found.cameras.focal_px[0] == pytest.approx(known["K"][0, 0, 0], rel=1e-6)
-    np.testing.assert_allclose(found.times, known["time"][:61], atol=1e-6)
+    assert capture.cameras.focal_px[0] == pytest.approx(known["K"][0, 0, 0], rel=1e-6)
+    np.testing.assert_allclose(capture.times, known["time"][:61], atol=1e-6)

@@ -31,8 +31,8 @@ def test_dense_and_lockstep_draw_the_same_picture_and_slopes(case):
         picture = case.forward(drawing, **sizes)(case.footprints, case.values)
         np.testing.assert_allclose(picture[0], image, atol=2e-5)
         np.testing.assert_allclose(picture[1], left, atol=2e-5)
-        found = case.gradient(drawing, **sizes)(*case.arguments())
-        for one, other in zip(found, expected, strict=True):
+        drawn = case.gradient(drawing, **sizes)(*case.arguments())
+        for one, other in zip(drawn, expected, strict=True):
             scale = float(jnp.max(jnp.abs(other)))
             np.testing.assert_allclose(one, other, atol=2e-4 * scale)
 
@@ -53,8 +53,8 @@ def test_blended_pairs_are_the_tiles_that_show_a_gaussian(case):
     shows = 0.02 * np.exp(-((p * dx) ** 2) - (r * (dy - k * dx)) ** 2) >= 1 / 255
     expected = shows.reshape(150, 3, 8, 5, 8).any((2, 4)).sum()
     spec = dataclasses.replace(raster_speed.SPEC, capacity=128)
-    found = jax.jit(lambda f: raster.blended_pairs(f, (40, 24), spec))(faint)
-    assert abs(int(found) - expected) <= 1  # a pixel on the cut itself
+    pairs = jax.jit(lambda f: raster.blended_pairs(f, (40, 24), spec))(faint)
+    assert abs(int(pairs) - expected) <= 1  # a pixel on the cut itself
 
 
 @pytest.mark.slow

@@ -33,9 +33,9 @@ def test_the_program_trains_renders_and_scores(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     with jax.numpy_dtype_promotion("standard"):  # JAX's own, as a user has it
         exec(compile(program.replace(", 500)", ", 2)"), "README.md", "exec"), {})
-    said = re.search(r"(\d+) held-out frames: (\S+) dB", capsys.readouterr().out)
-    assert int(said[1]) == len(capture.heldout)
-    assert 0 < float(said[2]) < 60
+    scores = re.search(r"(\d+) held-out frames: (\S+) dB", capsys.readouterr().out)
+    assert int(scores[1]) == len(capture.heldout)
+    assert 0 < float(scores[2]) < 60
     with PIL.Image.open("held_out.png") as picture:
         assert picture.size == capture.size
 
@@ -54,8 +54,8 @@ def test_the_table_of_presets_shows_kept_numbers():
             == (preset, changes, [])
         ]
         measure, digits, by = UNITS[unit]
-        found = kept["metrics"][f"{arm}.{measure}"]["value"] / by
-        assert f"{found:.{digits}f}" == value, setting
+        number = kept["metrics"][f"{arm}.{measure}"]["value"] / by
+        assert f"{number:.{digits}f}" == value, setting
 
 
 def test_readme_fits_and_every_link_leads_to_a_file():

@@ -76,26 +76,28 @@ def test_a_capture_becomes_splats_and_a_report(tmp_path, monkeypatch, capsys):
     quick = ("densification=none", "sh_degree=0", "init.extra_random=0")
     assert ended(*words, "--out", out, "--set", *quick) == 0
     assert {path.name for path in out.iterdir()} >= {*PRODUCTS}
-    found = json.loads((out / "metrics.json").read_text())
-    assert found["train.steps"] == runs.saved_run(out).config.steps == 2
-    assert 0 < found["heldout.psnr"] < 60
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["train.steps"] == runs.saved_run(out).config.steps == 2
+    assert 0 < metrics["heldout.psnr"] < 60
     # Nothing moves in it, so its renders over time are all one picture.
-    assert found["motion.worth"] == 0
-    np.testing.assert_allclose(found["floor.still"], found["heldout.psnr"], atol=1e-4)
+    assert metrics["motion.worth"] == 0
+    np.testing.assert_allclose(
+        metrics["floor.still"], metrics["heldout.psnr"], atol=1e-4
+    )
     capture = scenes.tiny_capture()
     means = floors.neighbour_means(capture, capture.heldout).colour
     error = np.square(
         np.round(255 * means) / 255 - capture.images[capture.heldout] / 255
     )
     exact = np.mean(-10 * np.log10(error.mean(axis=(1, 2, 3))))
-    np.testing.assert_allclose(found["floor.neighbours"], exact, atol=1e-3)
-    assert found["heldout.psnr"] < exact  # two steps
-    page, said = (out / "report.html").read_text(), capsys.readouterr().out
+    np.testing.assert_allclose(metrics["floor.neighbours"], exact, atol=1e-3)
+    assert metrics["heldout.psnr"] < exact  # two steps
+    page, printed = (out / "report.html").read_text(), capsys.readouterr().out
     for words in ("is below the", f"{exact:.2f} dB"):
         assert words in page
-        assert words in said
-    assert "plan: 2 steps for 250 s of training" in said
-    assert "motion:   is worth +0.00 dB" in said
+        assert words in printed
+    assert "plan: 2 steps for 250 s of training" in printed
+    assert "motion:   is worth +0.00 dB" in printed
 
 
 @pytest.mark.slow
@@ -112,8 +114,8 @@ def test_runs_are_drawn_beside_each_other(run, tmp_path, monkeypatch, capsys):
     out = tmp_path / "beside"
     folders = [str(run), str(tmp_path / "again")]
     compare.main([*folders, "--frames", "1", "--out", str(out)])
-    said = capsys.readouterr().out
-    assert str(out) in said
+    printed = capsys.readouterr().out
+    assert str(out) in printed
     truth, one, other, _, error, same = laid["panels"]
     assert laid["columns"] == 3
     capture = scenes.tiny_capture()
@@ -212,14 +214,14 @@ def test_a_motion_is_rendered_from_knots(run, capsys):
     for arguments in ([], ["--knots", "6", "--interpolation", "cubic"]):
         render.main([str(run), "--formats", "png", *arguments])
     assert "6 knots, cubic" in capsys.readouterr().out
-    found, exact = (
+    rendered, exact = (
         [images.read_image(path)[0].astype(int) for path in sorted(where.glob("*.png"))]
         for where in (
             run / "renders" / "heldout-knots-6-cubic",
             run / "renders/heldout",
         )
     )
-    assert np.abs(np.subtract(found, exact)).max() <= 2
+    assert np.abs(np.subtract(rendered, exact)).max() <= 2
     capture = scenes.tiny_capture()
     names = {pathlib.Path(capture.ids[row]).name for row in capture.heldout}
     assert {path.stem for path in (run / "renders/heldout").glob("*.png")} == names
@@ -282,9 +284,9 @@ def test_a_run_that_cannot_be_drawn_or_kept_says_so_and_ends(
 
     monkeypatch.setattr(train, "train", losing)
     assert ended("--out", folder, "--resume") == 1
-    told = capsys.readouterr()
+    output = capsys.readouterr()
     assert (
         f"error: the last state is not saved: cannot write checkpoints to {folder}"
-        in (told.err)
+        in (output.err)
     )
-    assert "saved in" not in told.err
+    assert "saved in" not in output.err

@@ -112,8 +112,8 @@ def test_a_command_that_is_printed_keeps_all_options(source):
     assert words[:3] == ["python", "-m", "experiments.reconstruct"]
     args = cli.parse(reconstruct.Reconstruct, words[3:])
     assert cli.plain(args.source) == source
-    found = (args.preset, args.steps, args.set, args.seed)
-    assert found == (config.preset, config.steps, config.overrides, config.seed)
+    settings = (args.preset, args.steps, args.set, args.seed)
+    assert settings == (config.preset, config.steps, config.overrides, config.seed)
 
 
 def test_help_names_the_presets(capsys):

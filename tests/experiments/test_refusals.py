@@ -86,8 +86,8 @@ TABLE = [
 ROOM = pathlib.Path(__file__).resolve().parents[2] / "experiments"
 
 
-@pytest.mark.parametrize(("name", "words", "said"), TABLE)
-def test_what_cannot_be_is_refused(name, words, said, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize(("name", "words", "refusal"), TABLE)
+def test_what_cannot_be_is_refused(name, words, refusal, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(platform, "start_jax", lambda *_: None)
     monkeypatch.setattr(platform, "CACHE", tmp_path / "cache")
     monkeypatch.setitem(synthetic.PRESETS, "tiny", scenes.TINY_FILM)
@@ -98,6 +98,6 @@ def test_what_cannot_be_is_refused(name, words, said, tmp_path, monkeypatch, cap
         importlib.import_module(module).main(words.replace("OUT", out).split())
     assert stop.value.code == 2
     error = " ".join(capsys.readouterr().err.replace("│", " ").split())
-    assert said.replace("OUT", out) in error
+    assert refusal.replace("OUT", out) in error
     assert "Traceback" not in error
     assert not (tmp_path / "out").exists()

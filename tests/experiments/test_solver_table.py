@@ -63,5 +63,5 @@ def test_a_screw_between_cameras_is_that_which_moved_one():
         moved = move_camera(camera, screw[:3], screw[3:])
         return problems.screw_between(camera, moved)
 
-    found = there_and_back(camera, screw)
-    np.testing.assert_allclose(found, screw, atol=1e-6)
+    back = there_and_back(camera, screw)
+    np.testing.assert_allclose(back, screw, atol=1e-6)

@@ -45,30 +45,30 @@ def test_planted_errors_are_found_at_their_frequencies(label):
 @pytest.mark.parametrize("encoded", [False, True])
 def test_networks_have_about_the_same_number_of_parameters(label, kind, encoded):
     signal = spectral_bias.SIGNALS[label]
-    made = spectral_bias.network(kind, encoded, signal)
-    assert made.parameters == pytest.approx(signal.parameters, rel=0.05)
+    network = spectral_bias.network(kind, encoded, signal)
+    assert network.parameters == pytest.approx(signal.parameters, rel=0.05)
     dimensions = signal.waves.shape[1]
     n = dimensions * (2 * signal.bands + 1) if encoded else dimensions
-    w = made.width
+    w = network.width
     if kind == "kan":  # eight kernels and a base for each edge
         exact = 9 * (n * w + w * w + w) + 2 * w + 1
     else:
         exact = (n * w + w) + 2 * (w * w + w) + (w + 1)
-    assert made.parameters == exact
+    assert network.parameters == exact
 
 
 @pytest.mark.full
 def test_sine_networks_start_as_the_paper_says():
     signal = spectral_bias.SIGNALS["2-D"]
-    made = spectral_bias.network("sine", False, signal)
-    params = made.init(jax.random.key(0))
-    bounds = [15.0] + 2 * [math.sqrt(6 / made.width)]
+    network = spectral_bias.network("sine", False, signal)
+    params = network.init(jax.random.key(0))
+    bounds = [15.0] + 2 * [math.sqrt(6 / network.width)]
     for layer, bound in zip(params.hidden, bounds, strict=True):
         largest = float(jnp.max(jnp.abs(layer.weight)))
         assert 0.9 * bound < largest <= bound
     # What the paper designs for: values of every layer spread alike.
     points = jax.random.uniform(jax.random.key(1), (500, 2), minval=-1, maxval=1)
-    assert 0.1 < float(jnp.std(made.apply(params, points))) < 2
+    assert 0.1 < float(jnp.std(network.apply(params, points))) < 2
 
 
 @pytest.mark.full

@@ -85,12 +85,12 @@ def any_nonzero(tree):
     return any(np.asarray(leaf).any() for leaf in jax.tree.leaves(tree))
 
 
-def close(found, expected, tolerance, least=1.0):
+def close(result, expected, tolerance, least=1.0):
     """Leaf by leaf, to a share of the largest number of the leaf, or of `least`."""
-    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+    for a, b in zip(jax.tree.leaves(result), jax.tree.leaves(expected), strict=True):
         scale = np.abs(b).max(initial=least)
         np.testing.assert_allclose(a, b, rtol=0, atol=tolerance * scale)
 
 
-def same_bits(found, expected):
-    jax.tree.map(np.testing.assert_array_equal, found, expected)
+def same_bits(result, expected):
+    jax.tree.map(np.testing.assert_array_equal, result, expected)

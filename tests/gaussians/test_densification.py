@@ -120,8 +120,8 @@ def test_a_large_row_becomes_two_that_are_drawn_from_it(rng):
     assert changed.report.split == 4000
     assert changed.report.active == 8000
     child = jax.tree.map(lambda leaf: np.asarray(leaf)[:8000], changed.params).rows
-    found = np.exp(child["splats"].log_scale)
-    np.testing.assert_allclose(found, np.tile(scale, (8000, 1)) / 1.6, 1e-5)
+    scales = np.exp(child["splats"].log_scale)
+    np.testing.assert_allclose(scales, np.tile(scale, (8000, 1)) / 1.6, 1e-5)
     turn = rotations(quaternion).as_matrix()
     # Standard error of a variance over 8000 draws: 1.6 %.
     spread = np.cov((child["splats"].mean - mean) @ turn, rowvar=False)
@@ -205,8 +205,8 @@ def test_a_reset_lowers_opacities_and_forgets_their_moments_only(dtype):
     lowered, after = reset(TX, params, moments, DefaultStrategySpec())
     least = math.log(0.01 / 0.99)
     expected = [least, -6.0, rows.INACTIVE_LOGIT, least, least, least]
-    found = lowered.rows["splats"].opacity_logit
-    np.testing.assert_allclose(found, np.asarray(expected, dtype), 1e-6)
+    logits = lowered.rows["splats"].opacity_logit
+    np.testing.assert_allclose(logits, np.asarray(expected, dtype), 1e-6)
     assert not np.asarray(after[0].first.rows["splats"].opacity_logit).any()
     assert not np.asarray(after[0].count.rows["splats"].opacity_logit).any()
     kept = after[0].first.rows["splats"]._replace(opacity_logit=None)

@@ -241,8 +241,8 @@ def test_spz_turns_the_axes_of_means_rotations_and_harmonics():
     np.testing.assert_allclose(there[1:], sign * here[1:], atol=1e-6)
     q = np.array([0.1, 0.7, -0.5, 0.5])
     turned = np.diag(flip) @ rotations(q).as_matrix() @ np.diag(flip)
-    found = rotations(q * spz._TURN_SIGN).as_matrix()
-    np.testing.assert_allclose(found, turned, atol=1e-12)
+    matrices = rotations(q * spz._TURN_SIGN).as_matrix()
+    np.testing.assert_allclose(matrices, turned, atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", ["v3", "v4", *full("raw", "v2")])
@@ -392,7 +392,7 @@ def test_the_largest_harmonics_are_held_and_do_not_overflow(tmp_path):
     size = float(np.finfo(np.float32).max) * np.array([1.0, -1.0, 0.0])
     rows = edited(some_splats(), sh_dc=(..., size), sh_rest=(..., size))
     files.save(tmp_path / "a.spz", rows, spz_version=3)
-    found = files.load(tmp_path / "a.spz").splats
+    loaded = files.load(tmp_path / "a.spz").splats
     ends = np.array([127.5, -127.5]) / 255 / 0.15
-    np.testing.assert_allclose(found.sh_dc[0, 0, :2], ends, atol=0.5001 / 255 / 0.15)
-    assert np.all(np.abs(found.sh_rest[..., :2]) >= 1 - 8 / 128)
+    np.testing.assert_allclose(loaded.sh_dc[0, 0, :2], ends, atol=0.5001 / 255 / 0.15)
+    assert np.all(np.abs(loaded.sh_rest[..., :2]) >= 1 - 8 / 128)

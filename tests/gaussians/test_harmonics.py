@@ -29,11 +29,11 @@ def test_basis_equals_scipy(degree, dtype, rng):
     direction = rng.normal(size=(200, 3))
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
     evaluate = jitted(lambda d: jnp.stack(harmonics.basis(d, degree), -1))
-    found = evaluate(direction.astype(dtype))
-    assert found.dtype == dtype
+    basis = evaluate(direction.astype(dtype))
+    assert basis.dtype == dtype
     # Cubic terms of coefficients up to 2.9: ten ulps.
     tolerance = {"float32": 2e-6, "float64": 5e-15}[dtype]
-    np.testing.assert_allclose(found, scipy_basis(direction, degree), atol=tolerance)
+    np.testing.assert_allclose(basis, scipy_basis(direction, degree), atol=tolerance)
 
 
 @jax.jit
@@ -52,7 +52,7 @@ def test_zero_direction_looks_along_z_and_has_no_gradient(dtype):
 def test_colour_is_clamped_at_zero_from_below(dtype, rng):
     coefficients = rng.normal(size=(50, 16, 3)).astype(dtype)
     mean, position = rng.normal(size=(50, 3)), np.array([0.5, -2.0, 1.0])
-    found = jitted(harmonics.colour_towards)(
+    colour = jitted(harmonics.colour_towards)(
         coefficients, mean.astype(dtype), position.astype(dtype)
     )
     direction = mean - position
@@ -62,7 +62,7 @@ def test_colour_is_clamped_at_zero_from_below(dtype, rng):
     )
     assert (expected < -0.5).any()
     tolerance = {"float32": 1e-5, "float64": 1e-13}[dtype]
-    np.testing.assert_allclose(found, np.maximum(expected + 0.5, 0), atol=tolerance)
+    np.testing.assert_allclose(colour, np.maximum(expected + 0.5, 0), atol=tolerance)
 
 
 def test_colour_gradient_equals_central_differences(float64, rng):

@@ -142,11 +142,11 @@ def test_the_mlp_has_as_many_parameters(changes):
         counted = sum(leaf.size for leaf in jax.tree.leaves(shapes))
         assert kan_motion.parameter_count(network) == counted
     goal, width = kan_motion.parameter_count(learnt), other.width
-    found, wider, narrower = (
+    chosen, wider, narrower = (
         abs(kan_motion.parameter_count(dataclasses.replace(other, width=w)) - goal)
         for w in (width, width + 1, width - 1)
     )
-    assert found <= min(wider, narrower)
+    assert chosen <= min(wider, narrower)
     assert (other.depth, other.heads) == (len(spec.hidden), learnt.heads)
 
 

@@ -265,8 +265,8 @@ def test_a_moving_scene_grows_to_the_cap_and_resumes_bit_for_bit(tmp_path):
     # Stopped between two events, of which the later one draws anew where rows go.
     with checkpoint.Checkpoints(tmp_path, model.spec) as checkpoints:
         train(first, 14, checkpoints=checkpoints)
-    found = checkpoint.restore(tmp_path, first, model.spec)
-    again = train(found.state, 22)
+    restored = checkpoint.restore(tmp_path, first, model.spec)
+    again = train(restored.state, 22)
     same_bits(again._replace(key=0), straight._replace(key=0))
 
 

@@ -88,8 +88,8 @@ def test_the_time_part_may_be_summed_once(float64):
     for row, point in enumerate(mean):
         inputs = np.concatenate([networks.waves(spec.position, point), code])
         for name, exact in networks.heads(params.trunk, inputs, spec.skips).items():
-            found = getattr(offsets, name)[row]
-            np.testing.assert_allclose(found, exact, atol=1e-13)
+            offset = getattr(offsets, name)[row]
+            np.testing.assert_allclose(offset, exact, atol=1e-13)
 
 
 @pytest.mark.parametrize("rule", ["log", *full("linear")])

@@ -48,9 +48,9 @@ def test_active_rows_networks_and_settings_come_back_bit_for_bit(trained, saved)
     expected = jax.jit(splats.take_rows)(params, active)
     assert 0 < len(active) < len(params.rows["codes"])
     assert jax.tree.structure(loaded) == jax.tree.structure(expected)
-    for found, exact in zip(*map(jax.tree.leaves, (loaded, expected)), strict=True):
-        assert found.dtype == exact.dtype == jnp.float32
-        np.testing.assert_array_equal(found, exact)
+    for leaf, exact in zip(*map(jax.tree.leaves, (loaded, expected)), strict=True):
+        assert leaf.dtype == exact.dtype == jnp.float32
+        np.testing.assert_array_equal(leaf, exact)
     assert described == about
     assert hash(described["spec"]) == hash(about["spec"])
 

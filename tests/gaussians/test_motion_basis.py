@@ -35,18 +35,18 @@ def by_the_book(params, spec, point, time):
     slow = networks.heads(params.base, base, activation=silu)["mean"]
     inputs = [networks.waves(spec.position, point + slow)]
     inputs.append(networks.waves(spec.time, time))
-    found = networks.heads(
+    heads = networks.heads(
         params.weights, np.concatenate(inputs), spec.skips, activation=silu
     )
     if spec.count is None:
-        return slow + found["weights"], found["turn"], found["log_scale"]
+        return slow + heads["weights"], heads["turn"], heads["log_scale"]
     raw = networks.heads(params.basis, placed, activation=silu)["directions"]
     residual = np.zeros(3)
     for k, direction in enumerate(raw.reshape(3, spec.count).T):
         if spec.basis_form == "bounded":
             direction = direction / max(np.linalg.norm(direction), 1)
-        residual += found["weights"][k] * direction
-    return slow + residual, found["turn"], found["log_scale"]
+        residual += heads["weights"][k] * direction
+    return slow + residual, heads["turn"], heads["log_scale"]
 
 
 @pytest.mark.parametrize(

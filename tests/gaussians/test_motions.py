@@ -129,11 +129,11 @@ def test_a_trained_scene_is_drawn_from_what_was_prepared_without_noise(name, flo
         canonical = splats.activate(params.rows["splats"])
         return deformation.deform(effects, params, ready, time), canonical
 
-    found, canonical = drawn(params, np.asarray(0.5))
+    rows, canonical = drawn(params, np.asarray(0.5))
     reads = params.rows.get(kan_motion.NAME, canonical.mean)
     network = params.nets[motion.module.NAME]
     offsets = deformed[name](network, motion.spec, reads, np.asarray(0.5))
-    close(found, jitted(motion.apply)(canonical, offsets), 1e-13)
+    close(rows, jitted(motion.apply)(canonical, offsets), 1e-13)
 
 
 @pytest.mark.parametrize("name", ["basis", *full("mlp", "kan")])

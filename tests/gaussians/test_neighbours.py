@@ -206,11 +206,11 @@ def test_the_effect_weighs_and_waits_for_its_start():
     program = jax.jit(penalty).lower(params, graph, np.int32(9)).compile()
     assert "conditional" in program.as_text()
     assert program(params, graph, np.int32(9))[0] == 0
-    loss, found = program(params, graph, np.int32(10))
+    loss, linked_term = program(params, graph, np.int32(10))
     expected, _ = value_and_slope(params.rows["code"], graph, np.ones(40, bool))
     np.testing.assert_allclose(loss, 0.5 * expected, rtol=1e-6)
     linked = np.mean(np.asarray(graph.weight) > 1e-3)
-    np.testing.assert_allclose(found, linked, rtol=1e-6)
+    np.testing.assert_allclose(linked_term, linked, rtol=1e-6)
     assert linked > 0.5
     absent = neighbours.effect(NeighbourSpec(), extent=1.0, of="kan_motion")
     with pytest.raises(ValueError, match=r"no rows .kan_motion.*code"):

@@ -24,7 +24,7 @@ def metadata():
 
 
 @functools.cache
-def made(paper):
+def scene_of(paper):
     capture = scenes.tiny_capture()
     model = scene.build(PAPERS[paper], metadata())
     frames = evaluation.frames_of(capture, model.required_data)
@@ -32,11 +32,11 @@ def made(paper):
 
 
 def start(paper):
-    return made(paper)[0].init(scenes.tiny_capture(), jax.random.key(3))
+    return scene_of(paper)[0].init(scenes.tiny_capture(), jax.random.key(3))
 
 
 def train(paper, state, steps, **settings):
-    model, frames = made(paper)
+    model, frames = scene_of(paper)
     return loop.fit(model, state, frames, steps=steps, console=QUIET, **settings)
 
 
@@ -48,14 +48,14 @@ def straight(paper):
 
 def psnr(paper, state):
     capture = scenes.tiny_capture()
-    renderer = evaluation.Renderer(made(paper)[0], capture.size)
+    renderer = evaluation.Renderer(scene_of(paper)[0], capture.size)
     return evaluation.score(renderer, state, capture, capture.train).psnr.mean()
 
 
 @pytest.mark.slow
 @by_paper
 def test_a_run_with_every_part_learns_and_stays_finite(paper):
-    model, result = made(paper)[0], straight(paper)
+    model, result = scene_of(paper)[0], straight(paper)
     assert result.stopped_by == "steps"
     names = {effect.name for effect in effects_of(PAPERS[paper], metadata())}
     silent = {"kan_motion", "motion_basis", "motion_growth"}  # add nothing to the loss

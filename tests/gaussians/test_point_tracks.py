@@ -133,16 +133,18 @@ def test_what_cannot_be_seen_carries_nothing(filmed, monkeypatch, cloud):
 def test_the_weights_of_neighbours_are_a_slow_sum(rng):
     distance = np.sort(rng.uniform(size=(4, 8)), axis=1)
     opacity = rng.uniform(0.1, 1, size=(4, 8))
-    found = point_tracks.neighbour_weights(distance, opacity)
+    weights = point_tracks.neighbour_weights(distance, opacity)
     for row in range(4):
         expected = [
             opacity[row, k] / np.exp(2 * (distance[row, k] / distance[row, 7]) ** 2)
             for k in range(8)
         ]
-        np.testing.assert_allclose(found[row], expected / np.sum(expected), rtol=1e-12)
+        np.testing.assert_allclose(
+            weights[row], expected / np.sum(expected), rtol=1e-12
+        )
     # All at the point itself: by opacity alone.
-    found = point_tracks.neighbour_weights(np.zeros((1, 2)), np.array([[0.3, 0.1]]))
-    np.testing.assert_allclose(found, [[0.75, 0.25]], rtol=1e-12)
+    weights = point_tracks.neighbour_weights(np.zeros((1, 2)), np.array([[0.3, 0.1]]))
+    np.testing.assert_allclose(weights, [[0.75, 0.25]], rtol=1e-12)
 
 
 @pytest.mark.full

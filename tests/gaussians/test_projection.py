@@ -68,25 +68,27 @@ def textbook(gaussians, camera, spec):
 def test_footprints_equal_the_textbook_with_skew_aspect_and_offset(spec, dtype, rng):
     gaussians = some_gaussians(rng, 300, dtype)
     camera = camera_at([0.2, 0.1, -2.0], dtype)
-    found = project(gaussians, camera, SIZE, spec)
-    assert all(leaf.dtype == dtype for leaf in found)
+    footprint = project(gaussians, camera, SIZE, spec)
+    assert all(leaf.dtype == dtype for leaf in footprint)
     with jax.enable_x64(True):
         exact, exact_camera = put((gaussians, camera), "float64")
         mean_px, covariance, depth, opacity = textbook(exact, exact_camera, spec)
     drawn = (depth > 0.02) & (opacity > 1.01 / 255)
-    assert np.asarray(found.extent_px)[drawn].all()
+    assert np.asarray(footprint.extent_px)[drawn].all()
     dilated = covariance + spec.eps2d * np.eye(2)
     size = np.trace(dilated, axis1=1, axis2=2)[:, None, None]
     # Relative: depths down to 0.02 magnify the rounding of x - c in float32.
     tolerance = {"float32": 2e-4, "float64": 1e-12}[dtype]
-    error = np.abs(covariance_of(found.whitening) - dilated) / size
+    error = np.abs(covariance_of(footprint.whitening) - dilated) / size
     assert error[drawn].max() < tolerance
-    shift = np.abs(found.mean_px - mean_px) / (np.abs(mean_px) + 1)
+    shift = np.abs(footprint.mean_px - mean_px) / (np.abs(mean_px) + 1)
     assert shift[drawn].max() < tolerance
-    np.testing.assert_allclose(found.opacity[drawn], opacity[drawn], rtol=tolerance)
+    np.testing.assert_allclose(footprint.opacity[drawn], opacity[drawn], rtol=tolerance)
     ln = 2 * np.log(opacity * 255)[:, None]
     box = np.sqrt(np.maximum(ln, 0) * np.stack([dilated[:, 0, 0], dilated[:, 1, 1]], 1))
-    np.testing.assert_allclose(found.extent_px[drawn], box[drawn], rtol=50 * tolerance)
+    np.testing.assert_allclose(
+        footprint.extent_px[drawn], box[drawn], rtol=50 * tolerance
+    )
 
 
 def test_projection_gradient_equals_central_differences(float64, rng):
@@ -95,9 +97,11 @@ def test_projection_gradient_equals_central_differences(float64, rng):
     weights = rng.normal(size=(6, 7))
 
     def loss(gaussians, camera):
-        found = projection.project(gaussians, camera, SIZE, SHARP)
-        fields = (found.mean_px, found.whitening, found.opacity[:, None])
-        return jnp.sum(jnp.concatenate([*fields, found.depth[:, None]], 1) * weights)
+        footprint = projection.project(gaussians, camera, SIZE, SHARP)
+        fields = (footprint.mean_px, footprint.whitening, footprint.opacity[:, None])
+        return jnp.sum(
+            jnp.concatenate([*fields, footprint.depth[:, None]], 1) * weights
+        )
 
     assert gradients.directional_error(loss, gaussians, camera) < 1e-7
 
@@ -110,8 +114,8 @@ def projected(gaussians, camera):
     count = len(gaussians.opacity)
     rows = np.minimum(np.arange(ROWS), count - 1)
     filled = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], gaussians)
-    found = project(filled, camera, SIZE, GSPLAT)
-    return jax.tree.map(lambda leaf: leaf[:count], found)
+    footprint = project(filled, camera, SIZE, GSPLAT)
+    return jax.tree.map(lambda leaf: leaf[:count], footprint)
 
 
 HOPELESS = {
@@ -138,9 +142,9 @@ HOPELESS = {
 def test_what_cannot_be_drawn_is_finite_without_gradient(name, dtype):
     gaussians = one(dtype, **HOPELESS[name])
     camera = camera_at([0.0, 0.0, 0.0], dtype, turn=0.0)
-    (found, visible), _, grads = footprint_and_slopes(gaussians, camera)
+    (footprint, visible), _, grads = footprint_and_slopes(gaussians, camera)
     assert not visible[0]
-    assert finite(found)
+    assert finite(footprint)
     assert not any(leaf.any() for leaf in grads)
 
 
@@ -162,9 +166,9 @@ DRAWABLE = {
 def test_extreme_but_valid_gaussians_are_drawn_with_finite_gradient(name, dtype):
     gaussians = one(dtype, **DRAWABLE[name])
     camera = camera_at([0.0, 0.0, 0.0], dtype, turn=0.0)
-    (found, visible), _, grads = footprint_and_slopes(gaussians, camera)
+    (footprint, visible), _, grads = footprint_and_slopes(gaussians, camera)
     assert visible[0]
-    assert finite((found, grads))
+    assert finite((footprint, grads))
 
 
 @jitted
@@ -172,9 +176,9 @@ def footprint_and_slopes(gaussians, camera):
     """Plain footprint with its visibility, antialiased one with its slopes."""
 
     def loss(gaussians):
-        found = projection.project(gaussians, camera, SIZE, SHARP)
-        total = jnp.sum(found.mean_px) + jnp.sum(found.whitening)
-        return total + jnp.sum(found.opacity + found.depth), found
+        footprint = projection.project(gaussians, camera, SIZE, SHARP)
+        total = jnp.sum(footprint.mean_px) + jnp.sum(footprint.whitening)
+        return total + jnp.sum(footprint.opacity + footprint.depth), footprint
 
     grads, sharp = jax.grad(loss, has_aux=True)(gaussians)
     # The antialiased factor may hide a small one: visibility is that of the plain form.
@@ -186,5 +190,5 @@ def footprint_and_slopes(gaussians, camera):
 def test_edge_on_disc_keeps_the_least_compensation(dtype):
     gaussians = one(dtype, scale=(0.0, 1.0, 1.0), opacity=1.0)
     camera = camera_at([0.0, 0.0, 0.0], dtype, turn=0.0)
-    _, found, _ = footprint_and_slopes(gaussians, camera)
-    np.testing.assert_allclose(found.opacity, [0.005], rtol=1e-6)
+    _, footprint, _ = footprint_and_slopes(gaussians, camera)
+    np.testing.assert_allclose(footprint.opacity, [0.005], rtol=1e-6)

@@ -105,9 +105,9 @@ def check_against_dense(image, left, footprints, conics, values, size, dtype):
     assert image.shape == (height, width, 3)
     assert image.dtype == left.dtype == dtype
     tolerance = {"float32": 1e-5, "float64": 1e-13}[dtype]
-    for found, wanted in zip((image, left), expected, strict=True):
-        wanted = np.asarray(wanted).reshape(found.shape)
-        np.testing.assert_allclose(found, wanted, atol=tolerance)
+    for result, wanted in zip((image, left), expected, strict=True):
+        wanted = np.asarray(wanted).reshape(result.shape)
+        np.testing.assert_allclose(result, wanted, atol=tolerance)
 
 
 @pytest.mark.hard_cases
@@ -205,9 +205,9 @@ def test_depth_order_is_a_stable_sort(count, dtype, rng):
         rng.integers(-3, 3, count),
     ):
         depth = depth.astype(dtype)
-        found = depth_order(depth, drawn.astype(np.int32))
+        order = depth_order(depth, drawn.astype(np.int32))
         expected = np.argsort(np.where(drawn, depth, np.inf), kind="stable")
-        np.testing.assert_array_equal(found, expected)
+        np.testing.assert_array_equal(order, expected)
 
 
 @pytest.mark.hard_cases
@@ -259,15 +259,15 @@ def test_the_ellipse_test_keeps_every_tile_that_shows_a_gaussian(float64, rng):
         return rects, isects
 
     rects, isects = first_intersections(footprints)
-    found = np.zeros((60, grid.tiles), bool)
+    kept = np.zeros((60, grid.tiles), bool)
     for tile in range(grid.tiles):
-        found[isects.ranks[isects.starts[tile] : isects.ends[tile]], tile] = True
+        kept[isects.ranks[isects.starts[tile] : isects.ends[tile]], tile] = True
     y, x = np.mgrid[:64, :96] + 0.5
     offset = np.stack([x, y], -1)[None] - np.asarray(footprints.mean_px)[:, None, None]
     exponent = np.einsum("nhwi,nij,nhwj->nhw", offset, np.asarray(conics), offset) / 2
     alpha = np.asarray(footprints.opacity)[:, None, None] * np.exp(-exponent)
     shows = (alpha >= 1 / 255).reshape(60, 8, 8, 12, 8).any((2, 4)).reshape(60, -1)
-    np.testing.assert_array_equal(found, shows)
+    np.testing.assert_array_equal(kept, shows)
     assert shows.sum() < 0.5 * int(rects.count.sum())
 
 

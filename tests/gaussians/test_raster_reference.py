@@ -115,9 +115,9 @@ def test_picture_and_gradients_equal_the_reference(name, dtype, oracle_dir):
     (_, picture), grads = differentiate(*args)
     assert picture.colour.dtype == case.dtype
     check_picture(case, picture)
-    found = (*grads[0], *grads[1:])
+    ours = (*grads[0], *grads[1:])
     names = ("means", "quats", "scales", "opacities", "colors", "viewmat", "means2d")
-    for name, grad in zip(names, found, strict=True):
+    for name, grad in zip(names, ours, strict=True):
         check_gradient(case, name, grad)
 
 
@@ -127,17 +127,17 @@ def check_picture(case, picture):
     pairs = [("render64", picture.colour), ("alpha64", picture.alpha[..., None])]
     if "ED64" in case.stored:
         pairs.append(("ED64", picture.depth[..., None]))
-    for name, found in pairs:
+    for name, ours in pairs:
         expected = case.stored[name]
-        error = np.abs(np.asarray(found, np.float64) - expected)
+        error = np.abs(np.asarray(ours, np.float64) - expected)
         error /= max(1.0, np.abs(expected).max())
         assert np.quantile(error, 0.995) < typical, name
         assert error.max() < 5e-3, name
 
 
-def check_gradient(case, name, found):
+def check_gradient(case, name, ours):
     """In float64 measured 1e-15 to 2e-13; in float32 flipped thresholds dominate."""
     expected = case.stored[f"g_{name}64"]
-    error = np.linalg.norm(np.asarray(found, np.float64) - expected)
+    error = np.linalg.norm(np.asarray(ours, np.float64) - expected)
     error /= np.linalg.norm(expected)
     assert error < {"float32": 1e-3, "float64": 1e-11}[str(case.dtype)], (name, error)

@@ -49,7 +49,7 @@ def splined(table, time):
 @pytest.mark.parametrize("time", [0.0, 0.37, 0.4, 1.0])
 def test_gaussians_move_by_the_mean_of_rigid_motions(dtype, time):
     bases, logits, gaussians = draw(dtype)
-    found = moved(bases, logits, gaussians, np.asarray(time, dtype))
+    carried = moved(bases, logits, gaussians, np.asarray(time, dtype))
     weights = np.exp(logits) / np.exp(logits).sum(1, keepdims=True)
     expected = np.zeros((ROWS, 3))
     turns = np.zeros((ROWS, 3))
@@ -63,13 +63,13 @@ def test_gaussians_move_by_the_mean_of_rigid_motions(dtype, time):
             expected[row] += weights[row, 1 + k] * (there - mean)
             turns[row] += weights[row, 1 + k] * turn
     tolerance = 2e-6 if dtype == "float32" else 1e-13
-    np.testing.assert_allclose(found.mean, expected, atol=tolerance)
+    np.testing.assert_allclose(carried.mean, expected, atol=tolerance)
     w, *xyz = gaussians.quaternion.T.astype(float)
     own = Rotation.from_quat(np.stack([*xyz, w], -1))
     x, y, z, w = (Rotation.from_rotvec(turns) * own).as_quat().T
-    same = np.abs(np.sum(np.stack([w, x, y, z], -1) * found.quaternion, -1))
+    same = np.abs(np.sum(np.stack([w, x, y, z], -1) * carried.quaternion, -1))
     np.testing.assert_allclose(same, 1, atol=tolerance)
-    assert found.mean.dtype == dtype
+    assert carried.mean.dtype == dtype
 
 
 def test_slopes_are_those_of_differences(float64):

@@ -167,11 +167,11 @@ def test_pixels_that_are_not_valid_teach_nothing_whatever_they_hold(hole, dtype,
     )
     for name, (value, grad) in whole.items():
         assert float(value) == pytest.approx(float(expected[name]), rel=1e-6)
-        found = np.asarray(holed[name][1])
-        assert np.all(np.isfinite(found))
-        assert np.any(found)
-        assert not np.any(np.where(keep, 0, found))
-        np.testing.assert_allclose(found, np.where(keep, grad, 0), atol=1e-7)
+        slope = np.asarray(holed[name][1])
+        assert np.all(np.isfinite(slope))
+        assert np.any(slope)
+        assert not np.any(np.where(keep, 0, slope))
+        np.testing.assert_allclose(slope, np.where(keep, grad, 0), atol=1e-7)
 
     if not np.isfinite(hole):  # an undistorted truth holds NaN where it saw nothing
         unseen, blackened = (
@@ -264,10 +264,10 @@ def test_a_schedule_falls_along_half_a_cosine_to_exactly_nothing():
     weights = [
         weights_at(spec, None, np.int32(i), 100) for i in (0, 19, 20, 40, 100, 200)
     ]
-    found = [float(weight.wavelet) for weight in weights]
+    factors = [float(weight.wavelet) for weight in weights]
     exact = [0, 0, 0.5, 0.25 * (1 + math.cos(math.pi / 4)), 0, 0]
-    np.testing.assert_allclose(found, exact, atol=1e-7)
-    assert found[0] == found[1] == found[-2] == found[-1] == 0
+    np.testing.assert_allclose(factors, exact, atol=1e-7)
+    assert factors[0] == factors[1] == factors[-2] == factors[-1] == 0
     assert weights[0].fourier is None
 
 
@@ -280,16 +280,16 @@ def shot_of(rng, size=(6, 6)):
 @pytest.mark.parametrize("gate", spectral.GATES)
 def test_the_effect_weighs_logs_and_trains_what_its_gate_has(gate, rng):
     spec = SpectralSpec(gate=gate, after=3)
-    made, shot = spectral.effect(spec, 10), shot_of(rng)
+    effect, shot = spectral.effect(spec, 10), shot_of(rng)
     learned = gate in spectral.LEARNED
-    assert (made.init is not None) == (made.learning_rate is not None) == learned
-    gates = put(made.init(jax.random.key(0)), "float32") if learned else None
+    assert (effect.init is not None) == (effect.learning_rate is not None) == learned
+    gates = put(effect.init(jax.random.key(0)), "float32") if learned else None
 
     @jitted
     @functools.partial(jax.value_and_grad, has_aux=True)
     def both(gates, step):
         context = PenaltyContext(None, step, None, None, observation=shot)
-        terms = made.penalty(gates, context)
+        terms = effect.penalty(gates, context)
         return weighted_sum(terms), values(terms)
 
     (early, _), grad = both(gates, np.int32(2))
@@ -300,4 +300,4 @@ def test_the_effect_weighs_logs_and_trains_what_its_gate_has(gate, rng):
     assert later == pytest.approx(by_hand, rel=1e-6)
     np.testing.assert_allclose(metrics["wavelet_weight"], 0.05, rtol=1e-6)
     if learned:
-        np.testing.assert_allclose(made.learning_rate(put(5)), 1e-2)
+        np.testing.assert_allclose(effect.learning_rate(put(5)), 1e-2)

@@ -40,9 +40,9 @@ def test_no_point_of_a_gaussian_moves_farther_than_its_reach(dtype, rng):
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     moved = surface_points(after, directions) - surface_points(before, directions)
     farthest = np.linalg.norm(moved, axis=-1).max(axis=1)
-    found = max_displacement(before, after)
-    assert (found >= farthest * (1 - 1e-5)).all()
-    assert np.median(found / farthest) < 2  # a bound that says something
+    bound = max_displacement(before, after)
+    assert (bound >= farthest * (1 - 1e-5)).all()
+    assert np.median(bound / farthest) < 2  # a bound that says something
 
 
 def test_the_reach_of_a_single_change_is_that_change(dtype):
@@ -108,10 +108,10 @@ def test_what_is_left_out_is_off_by_no_more_than_the_tolerance(static_threshold,
     assert not moves[inactive].any()
     assert moves[1]  # its motion is not a number: not taken for static
     for time in np.float32(TIMES):
-        found, exact = static_deform(parts, deform, time), deformed(params, time)
-        for ours, theirs in zip(found, exact, strict=True):
+        assembled, exact = static_deform(parts, deform, time), deformed(params, time)
+        for ours, theirs in zip(assembled, exact, strict=True):
             np.testing.assert_array_equal(ours[moves], theirs[moves])
-        apart = max_displacement(found, exact)[~moves & ~inactive]
+        apart = max_displacement(assembled, exact)[~moves & ~inactive]
         assert (apart <= static_threshold).all()
 
 
@@ -123,8 +123,8 @@ def test_where_nothing_moves_nothing_is_evaluated(rng):
     def refuse(params, time):
         raise AssertionError("evaluated")
 
-    found = static_deform(parts, refuse, np.float32(0.3))
-    same_bits(found, jitted(splats.activate)(params.rows["splats"]))
+    assembled = static_deform(parts, refuse, np.float32(0.3))
+    same_bits(assembled, jitted(splats.activate)(params.rows["splats"]))
 
 
 def test_moving_rows_keep_their_gradients(rng, float64):

@@ -56,18 +56,18 @@ def exact_at_all(dtype):
     return jitted(jax.vmap(lambda time: moving(time, dtype)))
 
 
-def angles(found, exact):
-    found, exact = (rotations(x.quaternion.reshape(-1, 4)) for x in (found, exact))
-    return (found.inv() * exact).magnitude()
+def angles(ours, exact):
+    ours, exact = (rotations(x.quaternion.reshape(-1, 4)) for x in (ours, exact))
+    return (ours.inv() * exact).magnitude()
 
 
-def differences(found, exact):
+def differences(ours, exact):
     """Largest error of the means, of the logarithms of the scales, and of angles."""
     return np.array(
         [
-            np.abs(found.mean - exact.mean).max(),
-            np.abs(np.log(found.scale) - np.log(exact.scale)).max(),
-            angles(found, exact).max(),
+            np.abs(ours.mean - exact.mean).max(),
+            np.abs(np.log(ours.scale) - np.log(exact.scale)).max(),
+            angles(ours, exact).max(),
         ]
     )
 
@@ -79,11 +79,11 @@ def test_the_knots_themselves_are_met(interpolation, count, dtype):
     assert knots.track.mean.shape == (count, COUNT // 2, 3)
     for time in np.asarray(knots.times):
         exact = moving(time, dtype)
-        found = at(knots, time, interpolation)
+        interpolated = at(knots, time, interpolation)
         rounding = {"float32": 1e-6, "float64": 1e-14}[dtype]
-        assert (differences(found, exact) < [1e-30, rounding, rounding]).all()
-        np.testing.assert_array_equal(found.opacity, exact.opacity)
-        assert found.mean.dtype == dtype
+        assert (differences(interpolated, exact) < [1e-30, rounding, rounding]).all()
+        np.testing.assert_array_equal(interpolated.opacity, exact.opacity)
+        assert interpolated.mean.dtype == dtype
 
 
 @pytest.mark.full
@@ -94,8 +94,8 @@ def test_the_error_falls_with_the_order_of_the_interpolation(
     times, errors = np.linspace(0, 1, 301), []
     for count in (17, 33, 65):
         knots = time_knots.bake(lambda t: moving(t, "float64"), count, dtype=float64)
-        found = at_all(knots, times, interpolation)
-        errors.append(differences(found, exact_at_all("float64")(times)))
+        interpolated = at_all(knots, times, interpolation)
+        errors.append(differences(interpolated, exact_at_all("float64")(times)))
     observed = np.log2(np.divide(errors[:-1], errors[1:]))
     # Doubled knots, over the whole of [0, 1]: the end intervals are of that order too.
     assert (observed > order - 0.35).all(), observed
@@ -112,14 +112,20 @@ def test_cubic_is_a_hermite_spline_with_central_slopes(count, dtype):
     knots = time_knots.bake(lambda t: moving(t, dtype), count, dtype=dtype)
     times, even = np.linspace(0, 1, 57), np.linspace(0, 1, count)
     rows = np.flatnonzero(knots.index.moves)
-    found = at_all(knots, times, "cubic")
+    interpolated = at_all(knots, times, "cubic")
     rounding = {"float32": 1e-5, "float64": 1e-13}[dtype]
-    for leaf, ours in zip(knots.track, (found.mean, np.log(found.scale)), strict=False):
+    for leaf, ours in zip(
+        knots.track, (interpolated.mean, np.log(interpolated.scale)), strict=False
+    ):
         exact = catmull_rom(even, np.asarray(leaf, np.float64), times)
         np.testing.assert_allclose(ours[:, rows], exact, atol=rounding)
     place = np.asarray(knots.track.mean, np.float64)[:, 0, 0]
-    found = at_all(knots, times).mean[:, rows[0], 0]  # linear, which is the default
-    np.testing.assert_allclose(found, np.interp(times, even, place), atol=rounding)
+    interpolated = at_all(knots, times).mean[
+        :, rows[0], 0
+    ]  # linear, which is the default
+    np.testing.assert_allclose(
+        interpolated, np.interp(times, even, place), atol=rounding
+    )
 
 
 def constant(quaternion, dtype):
@@ -152,12 +158,12 @@ def test_opposite_quaternions_have_a_rotation_between(ends, interpolation, dtype
     knots = time_knots.bake(deform, 6, dtype=dtype)
 
     def turn(time):
-        found = time_knots.at(knots, time, interpolation).quaternion
-        return found, found
+        quaternion = time_knots.at(knots, time, interpolation).quaternion
+        return quaternion, quaternion
 
     run = jitted(jax.vmap(jax.jacfwd(turn, has_aux=True)))
-    slope, found = run(np.linspace(0, 1, 41, dtype=dtype))
-    np.testing.assert_allclose(np.linalg.norm(found, axis=-1), 1, rtol=1e-6)
+    slope, quaternions = run(np.linspace(0, 1, 41, dtype=dtype))
+    np.testing.assert_allclose(np.linalg.norm(quaternions, axis=-1), 1, rtol=1e-6)
     assert finite(slope)
 
 
@@ -165,9 +171,9 @@ def test_a_time_outside_is_held_at_the_nearer_end(dtype):
     knots = time_knots.bake(lambda t: moving(t, dtype), 7, dtype=dtype)
     times = np.asarray([-0.3, -1e30, 0, 1.2, 1e30, 1], dtype)
     for interpolation in time_knots.MIN_KNOTS:
-        found = [at(knots, time, interpolation) for time in times]
+        held = [at(knots, time, interpolation) for time in times]
         for beyond, end in ((0, 2), (1, 2), (3, 5), (4, 5)):
-            same_bits(found[beyond], found[end])
+            same_bits(held[beyond], held[end])
 
 
 @pytest.mark.parametrize("size", [0.0, -0.5, *full(1e-30, 1e-3)])

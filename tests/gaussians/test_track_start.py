@@ -72,12 +72,12 @@ def test_every_motion_can_be_fitted_to_paths(name):
         motion, effect, position, known, time, 1.0, key
     )
     rates = jax.tree.map(lambda rate: 5e-3 * rate, rates)
-    found = path_fit.fit(
+    fitted = path_fit.fit(
         effect, guess, time, position.astype(np.float32), known, rates, key,
         steps=400, penalty=penalty,
     )  # fmt: skip
-    assert found.last < 0.02
-    middle = places_of(effect, found.points, time[FRAMES // 2])
+    assert fitted.last < 0.02
+    middle = places_of(effect, fitted.points, time[FRAMES // 2])
     off = np.linalg.norm(middle - position[:, FRAMES // 2], axis=-1)
     # Also where a path was not known: it moves as its neighbours do.
     assert np.median(off) < 0.03
@@ -93,11 +93,11 @@ def test_wrong_paths_bend_nothing():
         motion, effect, position, known, time, 1.0, jax.random.key(0)
     )
     rates = jax.tree.map(lambda rate: 5e-3 * rate, rates)
-    found = path_fit.fit(
+    fitted = path_fit.fit(
         effect, guess, time, position.astype(np.float32), known, rates,
         jax.random.key(0), steps=400, penalty=penalty,
     )  # fmt: skip
-    places = places_of(effect, found.points, time[5])
+    places = places_of(effect, fitted.points, time[5])
     assert np.linalg.norm(places - position[:, 5], axis=-1)[3:].max() < 0.05
 
 
@@ -130,11 +130,13 @@ def test_gaussians_start_on_the_card_and_move_with_it():
     capture, evidence = film_and_evidence()
     motion, effect = MOTIONS["bases"], effect_of(MOTIONS["bases"])
     start = StartSpec(motion="tracks", moving_points=200, fit_steps=300)
-    found = track_start.start(
+    started = track_start.start(
         start, effect, motion, evidence, capture, jax.random.key(0)
     )
-    assert len(found.position) == len(found.colour) == len(found.rows) == 200
-    points = Points(jnp.asarray(found.position), jnp.asarray(found.rows), found.nets)
+    assert len(started.position) == len(started.colour) == len(started.rows) == 200
+    points = Points(
+        jnp.asarray(started.position), jnp.asarray(started.rows), started.nets
+    )
     for frame in (4, 12, 20):
         time = capture.times[evidence.row[frame]]
         place = np.asarray(places_of(effect, points, time))
@@ -207,7 +209,7 @@ def test_large_films_are_looked_at_smaller(monkeypatch):
     assert evidence.moving.shape[1:] == (36, 48)
     effect = effect_of(MOTIONS["bases"])
     start = StartSpec(motion="tracks", moving_points=50, fit_steps=100)
-    found = track_start.start(
+    started = track_start.start(
         start, effect, MOTIONS["bases"], evidence, capture, jax.random.key(0)
     )
-    assert abs(np.median(found.position[:, 2]) - films.NEAR) < 0.3  # the wall: 0.7
+    assert abs(np.median(started.position[:, 2]) - films.NEAR) < 0.3  # the wall: 0.7

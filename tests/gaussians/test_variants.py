@@ -21,12 +21,12 @@ def test_splats_without_motion_are_the_canonical_ones(swaying):
     without = variants.without_effects(*model.spec, ("motion",), False)
     static = scene.build(scenes.TINY_SPLATS, model.spec[1])
     view = evaluation.view_of(scenes.tiny_capture(), 0)
-    found, expected = (
+    picture, expected = (
         jitted(each.render, static_argnums=2)(state.params, view, SIZE, state.step)
         for each in (without, static)  # with its motion it is another picture
     )
-    assert np.ptp(found.colour) > 0.1
-    np.testing.assert_array_equal(found.colour, expected.colour)
+    assert np.ptp(picture.colour) > 0.1
+    np.testing.assert_array_equal(picture.colour, expected.colour)
 
 
 def state_of(params):
@@ -62,32 +62,36 @@ def test_a_motion_from_knots_is_met_at_the_knots_and_near_between(swaying):
     shift = np.abs(exact[0].mean - exact[2].mean).max()
     errors = []
     for knots, interpolation in ((4, "linear"), (4, "cubic"), (40, "cubic")):
-        made = variants.from_knots(*swaying, knots, interpolation)
-        assert f"{knots} knots, {interpolation}, of" in made.summary
-        found = deformed_rows(made.model, made.state)
+        variant = variants.from_knots(*swaying, knots, interpolation)
+        assert f"{knots} knots, {interpolation}, of" in variant.summary
+        deforms = deformed_rows(variant.model, variant.state)
         for end in (0, 2):
-            met = np.abs(found[end].mean - exact[end].mean)[active]
+            met = np.abs(deforms[end].mean - exact[end].mean)[active]
             assert met.max() < 1e-6
-        errors.append(np.abs(found[1].mean - exact[1].mean)[active].max() / shift)
+        errors.append(np.abs(deforms[1].mean - exact[1].mean)[active].max() / shift)
     assert 0.2 > errors[0] > errors[1] > 5e-3 > errors[2]
 
 
 def test_what_stands_still_may_be_left_out(swaying):
     exact = deformed_rows(*swaying)
-    made = variants.without_static(*swaying, 0.0)
+    variant = variants.without_static(*swaying, 0.0)
     active = active_rows(swaying[1])
-    for found, deform in zip(deformed_rows(made.model, made.state), exact, strict=True):
+    for left_out, deform in zip(
+        deformed_rows(variant.model, variant.state), exact, strict=True
+    ):
         for name in Gaussians._fields:  # a row that is not drawn may be anywhere
-            a, b = (np.asarray(getattr(x, name))[active] for x in (found, deform))
+            a, b = (np.asarray(getattr(x, name))[active] for x in (left_out, deform))
             np.testing.assert_allclose(a, b, atol=2e-6, err_msg=name)
     moved = farthest(*swaying)[active]
     below = float(np.median(moved))
-    made = variants.without_static(*swaying, below)
-    left = len(made.state.params[1].dynamic.rows["splats"].mean)
+    variant = variants.without_static(*swaying, below)
+    left = len(variant.state.params[1].dynamic.rows["splats"].mean)
     assert 0 < left < len(moved)
-    assert f"{left} of {len(active)} rows that move" in made.summary
-    for found, deform in zip(deformed_rows(made.model, made.state), exact, strict=True):
-        error = np.linalg.norm(found.mean - deform.mean, axis=1)[active]
+    assert f"{left} of {len(active)} rows that move" in variant.summary
+    for left_out, deform in zip(
+        deformed_rows(variant.model, variant.state), exact, strict=True
+    ):
+        error = np.linalg.norm(left_out.mean - deform.mean, axis=1)[active]
         assert 0 < error.max() <= below
         assert (error == 0).sum() >= left
 
@@ -143,10 +147,10 @@ def test_what_moves_may_be_left_out(swaying):
     # What is left is drawn as it was, wherever it still moves a little
     alone = jax.jit(splats.take_rows)(state.params, np.flatnonzero(shown))
     view = evaluation.view_of(scenes.tiny_capture(), 0)
-    found, expected = (
+    picture, expected = (
         evaluation.Renderer(model, SIZE)(one, view).colour
         for one in (left, state._replace(params=alone))
     )
-    np.testing.assert_allclose(found, expected, atol=1e-6)
+    np.testing.assert_allclose(picture, expected, atol=1e-6)
     everything = evaluation.Renderer(model, SIZE)(state, view).colour
-    assert np.abs(found - everything).max() > 0.02
+    assert np.abs(picture - everything).max() > 0.02

@@ -142,8 +142,8 @@ def test_points_at_and_behind_the_camera_stay_finite(dtype):
     depths = [0.0, 1e-30, -1e-30, 1e-20, 1e-6, -1.0, -1e20]
     for depth, lateral in itertools.product(depths, (0.0, 1e-20, 1.0, 1e20)):
         point = np.asarray([lateral, -lateral / 2, depth], dtype)
-        found = (np.asarray(leaf) for leaf in seen(camera, point))
-        pixel, z_depth, gradient, projectable = found
+        seen_and_slopes = (np.asarray(leaf) for leaf in seen(camera, point))
+        pixel, z_depth, gradient, projectable = seen_and_slopes
         assert np.all(np.isfinite(pixel))
         assert np.all(np.isfinite(gradient))
         assert z_depth == point[2] or abs(depth) < 1e-29  # XLA flushes denormals

@@ -76,11 +76,11 @@ def test_round_trip_with_tangential_terms(name, tangential, dtype, rng):
     grads = rng.uniform(-0.6, 0.6, (ROWS, 2)).astype(dtype)
     grads[0] = 0
     bent = np.asarray(distort(radial, tangential, grads))
-    found, converged = undistorted(radial, tangential, bent)
+    undone, converged = undistorted(radial, tangential, bent)
     allowed = one_to_one(radial, tangential, grads)
     assert np.array_equal(converged, allowed)
     assert np.mean(converged) > 0.7
-    error = np.abs(found - grads)[converged]
+    error = np.abs(undone - grads)[converged]
     # near the fold an ulp of the distorted point is several of the slope
     assert error.max() < {"float32": 2e-4, "float64": 1e-12}[dtype]
     assert np.median(error) < {"float32": 2e-7, "float64": 1e-15}[dtype]

@@ -53,7 +53,7 @@ def logarithms(rotations, angular, dtype):
     """
     rows = np.arange(5) % len(rotations)
     given = (np.asarray(x, dtype)[rows] for x in (rotations, angular))
-    return [np.asarray(found)[: len(rotations)] for found in log_and_slope(*given)]
+    return [np.asarray(leaf)[: len(rotations)] for leaf in log_and_slope(*given)]
 
 
 @pytest.mark.hard_cases
@@ -67,8 +67,8 @@ def test_logarithm_inverts_the_exponential_up_to_pi(angle, dtype, rng):
     angular = angular.astype(dtype).astype(float)
     # the rotation in float64, rounded: the log's own error, not the exponential's
     exact = scipy.spatial.transform.Rotation.from_rotvec(angular)
-    found, grads = logarithms(exact.as_matrix(), angular, dtype)
-    error = np.linalg.norm(found.astype(np.float64) - angular, axis=1)
+    logs, grads = logarithms(exact.as_matrix(), angular, dtype)
+    error = np.linalg.norm(logs.astype(np.float64) - angular, axis=1)
     # the matrix itself is rounded to 6e-8 in each entry
     assert error.max() < {"float32": 5e-7, "float64": 2e-15}[dtype]
     # d log(exp w) / dw = 1; near π the matrix's rounding may flip the sign
@@ -83,8 +83,8 @@ def test_logarithm_inverts_the_exponential_up_to_pi(angle, dtype, rng):
 def test_logarithm_of_a_half_turn(axis, dtype):
     """No sign to choose and no digits to lose: exactly π about ± the axis."""
     turn = 2 * np.outer(axis, axis) - np.eye(3)
-    found = logarithms([turn], [np.pi * axis], dtype)[0][0]
-    assert np.min([np.max(abs(found - s * np.pi * axis)) for s in (1, -1)]) < 1e-6
+    log = logarithms([turn], [np.pi * axis], dtype)[0][0]
+    assert np.min([np.max(abs(log - s * np.pi * axis)) for s in (1, -1)]) < 1e-6
 
 
 screw_and_back = jax.jit(lambda *screw: lie.log_se3(*lie.exp_se3(*screw)))
@@ -94,10 +94,10 @@ screw_and_back = jax.jit(lambda *screw: lie.log_se3(*lie.exp_se3(*screw)))
 @pytest.mark.parametrize("angle", [0, 1e-8, 1e-3, 1.0, 3.0])
 def test_screw_logarithm_inverts_the_exponential(angle, dtype):
     angular, linear = (np.asarray(x, dtype) for x in (angle * AXIS, LINEAR))
-    found = screw_and_back(angular, linear)
+    logs = screw_and_back(angular, linear)
     bound = {"float32": 2e-6, "float64": 5e-15}[dtype]  # times θ/2 cot(θ/2) near π
-    assert np.max(abs(np.asarray(found[0]) - angular)) < bound
-    assert np.max(abs(np.asarray(found[1]) - linear)) < bound
+    assert np.max(abs(np.asarray(logs[0]) - angular)) < bound
+    assert np.max(abs(np.asarray(logs[1]) - linear)) < bound
 
 
 @jax.jit
@@ -137,10 +137,8 @@ def test_gradients_of_every_map(float64, rng):
         moved = jnp.concatenate(lie.log_se3(*lie.exp_se3(angular, linear)))
         both = lie.left_jacobian_se3(angular, linear) * weight
         inverse = lie.inverse_left_jacobian(angular) * weight[:3, :3]
-        found = moved @ weight[0] + jnp.sum(moved[:3] ** 3)
-        found += (
-            lie.transform_point(angular, linear, jnp.asarray(POINT)) @ weight[1, :3]
-        )
-        return found + jnp.sum(both) + jnp.sum(inverse)
+        loss = moved @ weight[0] + jnp.sum(moved[:3] ** 3)
+        loss += lie.transform_point(angular, linear, jnp.asarray(POINT)) @ weight[1, :3]
+        return loss + jnp.sum(both) + jnp.sum(inverse)
 
     assert gradients.directional_error(total, 0.7 * AXIS, LINEAR) < 1e-7

@@ -43,8 +43,8 @@ def of_some(function, matrices, direction=None):
     ways = (
         np.zeros_like(given) if direction is None else np.resize(direction, (100, 3, 3))
     )
-    found = jax.tree.map(np.asarray, function(given, ways.astype(given.dtype)))
-    return jax.tree.map(lambda leaf: leaf[: len(matrices)], found)
+    results = jax.tree.map(np.asarray, function(given, ways.astype(given.dtype)))
+    return jax.tree.map(lambda leaf: leaf[: len(matrices)], results)
 
 
 def exact(matrix, signed):
@@ -77,7 +77,7 @@ def matrices(rng):
 @pytest.mark.parametrize("size", [1e-25, 1e-10, 1.0, 1e15, 1e25])
 def test_decomposition_restores_the_matrix(size, dtype, rng):
     given = (size * matrices(rng)).astype(dtype)
-    vectors, found = decomposed(given)
+    vectors, singular_values = decomposed(given)
     left, values, right = (np.asarray(x, np.float64) for x in vectors)
     restored = (left * values[:, None]) @ np.swapaxes(right, 1, 2)
     scale = np.abs(np.asarray(given, np.float64)).max(axis=(1, 2))
@@ -88,7 +88,7 @@ def test_decomposition_restores_the_matrix(size, dtype, rng):
     assert np.min(np.linalg.det(left)) > 0.99
     assert np.min(np.linalg.det(right)) > 0.99
     assert np.array_equal(np.sign(values[:, 2]), np.sign(np.linalg.det(given / size)))
-    np.testing.assert_allclose(found, np.abs(values), rtol=1e-6)
+    np.testing.assert_allclose(singular_values, np.abs(values), rtol=1e-6)
 
 
 @pytest.mark.hard_cases
@@ -98,12 +98,12 @@ def test_many_nearly_rigid_matrices_are_decomposed_at_once(dtype, rng):
     ulps = np.repeat([0, 4, 100, 1e4], 25)[:, None, None]
     strain = ulps * np.finfo(dtype).eps * rng.normal(size=(100, 3, 3))
     given = (turns @ (np.eye(3) + strain)).astype(dtype)
-    (left, values, right), found = jax.tree.map(np.asarray, decomposed(given))
+    (left, values, right), singular_values = jax.tree.map(np.asarray, decomposed(given))
     restored = (left * values[:, None]) @ np.swapaxes(right, 1, 2)
     bound = {"float32": 2e-6, "float64": 1e-14}[dtype]
     assert np.max(np.abs(restored - given)) < bound
     truth = np.linalg.svd(given.astype(np.float64))[1]
-    assert np.max(np.abs(found - truth)) < bound
+    assert np.max(np.abs(singular_values - truth)) < bound
 
 
 @pytest.mark.parametrize("signed", [False, True])
@@ -114,8 +114,8 @@ def test_energy_and_gradient(signed, dtype, rng):
     grads = np.array([gradient for _, gradient in truth])
     # relative to the conditioning: an ulp of the matrix moves σ by as much
     bound = {"float32": 2e-5, "float64": 1e-13}[dtype]
-    found, grad, _ = of_some(energies, given)[signed]
-    np.testing.assert_allclose(found, values, rtol=bound, atol=bound)
+    energy, grad, _ = of_some(energies, given)[signed]
+    np.testing.assert_allclose(energy, values, rtol=bound, atol=bound)
     error = np.abs(grad - grads).max(axis=(1, 2))
     conditions = np.linalg.cond(np.asarray(given, np.float64))
     assert np.max(error / (1 + np.abs(grads).max(axis=(1, 2)) * conditions)) < bound
@@ -184,9 +184,9 @@ DIRECTION = np.random.default_rng(0).normal(size=(3, 3))
 def hard_energies(dtype):
     """By sign and name: value, slope, and Hessian times `DIRECTION`."""
     given = np.asarray(list(HARD.values()), dtype)
-    found = of_some(energies, given, DIRECTION)
+    results = of_some(energies, given, DIRECTION)
     return {
-        signed: dict(zip(HARD, zip(*found[signed], strict=True), strict=True))
+        signed: dict(zip(HARD, zip(*results[signed], strict=True), strict=True))
         for signed in (False, True)
     }
 
@@ -196,8 +196,8 @@ def hard_energies(dtype):
 @pytest.mark.parametrize("name", HARD)
 def test_hard_matrices_have_finite_energy_slope_and_curvature(name, signed, dtype):
     value, _ = exact(HARD[name].astype(dtype), signed)
-    found, gradient, bent = hard_energies(dtype)[signed][name]
-    np.testing.assert_allclose(found, value, rtol=2e-6, atol=1e-12)
+    energy, gradient, bent = hard_energies(dtype)[signed][name]
+    np.testing.assert_allclose(energy, value, rtol=2e-6, atol=1e-12)
     assert np.all(np.isfinite(gradient))
     assert np.all(np.isfinite(bent))
     if name in {"zero", "rank one", "rank two", "tiny", "collapsing"}:

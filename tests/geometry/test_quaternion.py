@@ -66,7 +66,7 @@ def test_matrices_products_and_rotated_vectors_match_scipy(dtype, rng):
 @pytest.mark.parametrize("length", [0, 1e-38, 1e-30, 1e-19, 1e25, 3e38, np.inf])
 def test_normalising_never_makes_what_is_no_rotation(length, dtype):
     given = np.asarray(length * np.array([0.5, -0.5, 0.1, 0.7]), dtype)
-    unit, grad = (np.asarray(found) for found in normalised(given))
+    unit, grad = (np.asarray(leaf) for leaf in normalised(given))
     assert abs(np.linalg.norm(unit) - 1) < 1e-6
     assert np.all(np.isfinite(grad))
     if length in (0, np.inf):
@@ -85,9 +85,9 @@ def test_matrix_to_quaternion_at_every_pivot(angle, dtype, rng):
     axes = np.concatenate([np.eye(3), -np.eye(3), rng.normal(size=(20, 3))])
     axes /= np.linalg.norm(axes, axis=-1, keepdims=True)
     truth = Rotation.from_rotvec(angle * axes)
-    found = np.asarray(from_matrix(np.asarray(truth.as_matrix(), dtype)))
-    assert np.all(found[:, 0] >= 0)
-    error = (scipy_of(found).inv() * truth).magnitude()
+    quaternions = np.asarray(from_matrix(np.asarray(truth.as_matrix(), dtype)))
+    assert np.all(quaternions[:, 0] >= 0)
+    error = (scipy_of(quaternions).inv() * truth).magnitude()
     assert error.max() < {"float32": 6e-7, "float64": 2e-15}[dtype]
 
 
@@ -99,15 +99,15 @@ def test_matrix_to_quaternion_at_every_pivot(angle, dtype, rng):
 def test_log_inverts_exp_below_pi_for_both_signs(angle, dtype, rng):
     axes = rng.normal(size=(20, 3))
     vectors = np.asarray(angle * axes / np.linalg.norm(axes, axis=-1)[:, None], dtype)
-    unit, *logs, grads = (np.asarray(found) for found in round_trip(vectors))
+    unit, *logs, grads = (np.asarray(log) for log in round_trip(vectors))
     truth = np.roll(
         Rotation.from_rotvec(np.array(vectors, np.float64)).as_quat(), 1, axis=-1
     )
     assert np.max(abs(unit - truth)) < TOLERANCE[dtype]
     # float32 keeps the angle near π through w = 5e-7, hence to an ulp of the sine: 1e-7
     bound = {"float32": 1e-6, "float64": 2e-15}[dtype] * max(angle, 1e-8)
-    for found in logs:
-        assert np.max(abs(found - vectors)) < bound
+    for log in logs:
+        assert np.max(abs(log - vectors)) < bound
     assert np.max(abs(grads - np.eye(3))) < {"float32": 1e-6, "float64": 2e-15}[dtype]
 
 
@@ -117,8 +117,8 @@ def test_slerp_matches_scipy(dtype, rng):
     shares = np.repeat([0.0, 0.2, 0.7, 1.0], 2)
     start, end = (np.tile(x, (8, 1)).astype(dtype) for x in ends)
     end[1::2] *= -1
-    found = slerp(start, end, shares.astype(dtype))
-    error = (scipy_of(found).inv() * line(shares)).magnitude()
+    between = slerp(start, end, shares.astype(dtype))
+    error = (scipy_of(between).inv() * line(shares)).magnitude()
     assert error.max() < {"float32": 1e-6, "float64": 3e-15}[dtype]
 
 

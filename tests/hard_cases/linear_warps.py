@@ -51,8 +51,10 @@ def linear_warp(params, displacement):
         layer._replace(weight=weight, bias=offset)
         for layer, weight, offset in zip(params.hidden, hidden, offsets, strict=True)
     ]
-    made = params._replace(hidden=tuple(layers), heads=heads)
-    return jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), made, params)
+    warp_params = params._replace(hidden=tuple(layers), heads=heads)
+    return jax.tree.map(
+        lambda new, old: jnp.asarray(new, old.dtype), warp_params, params
+    )
 
 
 def cost(spec, displacement):

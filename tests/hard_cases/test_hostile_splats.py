@@ -89,14 +89,14 @@ def ready(name) -> Ready:
     )
 
 
-def started_with(made: Ready, rows):
+def started_with(prepared: Ready, rows):
     """The first state with these rows, and what is made of the rows made anew."""
-    params, rows = made.start.params, jax.device_put(rows)
+    params, rows = prepared.start.params, jax.device_put(rows)
     params = params._replace(rows=params.rows | {"splats": rows})
     aux_state = AuxState(
-        densification.empty_stats(rows), scene.states_of(made.effects, params)
+        densification.empty_stats(rows), scene.states_of(prepared.effects, params)
     )
-    return made.start._replace(params=params, aux_state=aux_state)
+    return prepared.start._replace(params=params, aux_state=aux_state)
 
 
 def one_point(rows):
@@ -156,29 +156,29 @@ ROWS = {
 }
 
 
-def run(made, start, frames, folder=None):
+def run(prepared, start, frames, folder=None):
     """Train, hold the run to its promises and look at its picture."""
-    steps = made.model.spec[0].steps
-    trained = hostile.train(made.model, start, frames, folder, steps=steps)
-    picture = drawn(made, trained.result.state, frames, 0)
+    steps = prepared.model.spec[0].steps
+    trained = hostile.train(prepared.model, start, frames, folder, steps=steps)
+    picture = drawn(prepared, trained.result.state, frames, 0)
     for name, leaf in picture._asdict().items():
         assert np.isfinite(np.asarray(leaf)).all(), name
     return trained
 
 
-def drawn(made, state, frames, row):
+def drawn(prepared, state, frames, row):
     """The view of that frame."""
     camera = jax.tree.map(lambda leaf: leaf[row], frames.cameras)
     view = View(camera, frames.times[row], frames.appearance[row])
-    return made.render(*hostile.on_device((state.params, view, state.step)))
+    return prepared.render(*hostile.on_device((state.params, view, state.step)))
 
 
-def falls(made, frames, trained):
+def falls(prepared, frames, trained):
     """The last frame's mean squared error after training, over that before it."""
     truth = np.float32(frames.images[-1]) / 255
     before, after = (
-        np.mean((np.asarray(drawn(made, state, frames, -1).colour) - truth) ** 2)
-        for state in (made.start, trained.result.state)
+        np.mean((np.asarray(drawn(prepared, state, frames, -1).colour) - truth) ** 2)
+        for state in (prepared.start, trained.result.state)
     )
     return after / before
 
@@ -186,11 +186,11 @@ def falls(made, frames, trained):
 @pytest.mark.parametrize("case", ROWS)
 @pytest.mark.parametrize("name", PRESETS)
 def test_splats_train_from_hostile_rows(name, case, tmp_path):
-    made = ready(name)
-    rows = jax.tree.map(np.asarray, made.start.params.rows["splats"])
-    start = started_with(made, ROWS[case](rows))
+    prepared = ready(name)
+    rows = jax.tree.map(np.asarray, prepared.start.params.rows["splats"])
+    start = started_with(prepared, ROWS[case](rows))
     stops = case in STOPS
-    trained = run(made, start, made.frames, tmp_path if stops else None)
+    trained = run(prepared, start, prepared.frames, tmp_path if stops else None)
     if stops:
         assert trained.result.stopped_by == "non-finite"
         assert STOPS[case] in trained.result.message
@@ -203,12 +203,12 @@ def test_splats_train_from_hostile_rows(name, case, tmp_path):
 @pytest.mark.parametrize("case", hostile.CAPTURES)
 @pytest.mark.parametrize("name", PRESETS)
 def test_splats_train_on_hostile_captures(name, case, tmp_path):
-    made = ready(name)
-    frames = hostile.CAPTURES[case](made.frames)
+    prepared = ready(name)
+    frames = hostile.CAPTURES[case](prepared.frames)
     folder = tmp_path if case == "as filmed" else None
-    trained = run(made, made.start, frames, folder)
+    trained = run(prepared, prepared.start, frames, folder)
     assert trained.result.stopped_by == "steps", trained.result.message
-    assert falls(made, frames, trained) < FALLS.get(name, 0.95)
+    assert falls(prepared, frames, trained) < FALLS.get(name, 0.95)
 
 
 def points_at(position):

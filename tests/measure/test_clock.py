@@ -23,10 +23,10 @@ def test_metrics_survive_a_file(tmp_path):
     ]
     path = tmp_path / "metrics.json"
     clock.write_metrics(path, metrics, {"seed": 3})
-    found = clock.read_metrics(path)
-    assert found["heldout.psnr"] == metrics[0]
-    assert found["train.seconds"] == metrics[1]
-    assert math.isnan(found["broken"].value)
+    stored = clock.read_metrics(path)
+    assert stored["heldout.psnr"] == metrics[0]
+    assert stored["train.seconds"] == metrics[1]
+    assert math.isnan(stored["broken"].value)
     text = json.loads(path.read_text())  # strict JSON: no NaN, no Infinity
     assert text["about"] == {"seed": 3}
     assert text["metrics"]["broken"]["value"] is None
@@ -126,18 +126,18 @@ def test_timing_waits_for_the_result():
 
 def test_cost_counts_a_known_product():
     left, right = np.ones((64, 32), np.float32), np.ones((32, 48), np.float32)
-    found = clock.cost(lambda x, y: x @ y, left, right)
-    assert found.flops == pytest.approx(2 * 64 * 32 * 48, rel=0.05)
-    assert found.argument_bytes == 4 * (64 * 32 + 32 * 48)
-    assert found.output_bytes == 4 * 64 * 48
-    assert found.bytes_accessed >= found.argument_bytes + found.output_bytes
-    assert found.compile_seconds > 0
+    counted = clock.cost(lambda x, y: x @ y, left, right)
+    assert counted.flops == pytest.approx(2 * 64 * 32 * 48, rel=0.05)
+    assert counted.argument_bytes == 4 * (64 * 32 + 32 * 48)
+    assert counted.output_bytes == 4 * 64 * 48
+    assert counted.bytes_accessed >= counted.argument_bytes + counted.output_bytes
+    assert counted.compile_seconds > 0
     # and of what is between
     twice = jax.jit(
         lambda x: jnp.sort(jnp.sort(x)[::-1] * jnp.arange(1.0 * x.size))[:3]
     )
-    found = clock.cost(twice, np.ones(50_000, np.float32))
-    assert found.temporary_bytes >= 4 * 50_000
+    counted = clock.cost(twice, np.ones(50_000, np.float32))
+    assert counted.temporary_bytes >= 4 * 50_000
 
 
 @pytest.mark.full
@@ -158,12 +158,12 @@ def test_peak_memory_sees_a_large_array():
 
 
 def test_the_machine_describes_itself():
-    found = clock.machine()
-    assert json.loads(json.dumps(found)) == found
-    assert found["jax"] == jax.__version__
-    assert found["cores"] >= 1
-    assert found["backend"] == jax.default_backend()
-    assert found["memory_bytes"] > 1e8
-    assert found["cpu"]
+    machine = clock.machine()
+    assert json.loads(json.dumps(machine)) == machine
+    assert machine["jax"] == jax.__version__
+    assert machine["cores"] >= 1
+    assert machine["backend"] == jax.default_backend()
+    assert machine["memory_bytes"] > 1e8
+    assert machine["cpu"]
     peak = clock.device_peak_bytes()
     assert (peak is None) == (jax.devices()[0].memory_stats() is None)

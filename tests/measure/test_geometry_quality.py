@@ -160,7 +160,7 @@ def test_alignment_is_the_minimum_scipy_finds(scaled, rng):
     points = rng.normal(size=(12, 3))
     scale, rotation, shift = motion(rng)
     truth = scale * points @ rotation.T + shift + 0.3 * rng.normal(size=points.shape)
-    found = quality.align_points(points, truth, scaled)
+    alignment = quality.align_points(points, truth, scaled)
 
     def residual(x):
         size = np.exp(x[6]) if scaled else 1.0
@@ -169,10 +169,12 @@ def test_alignment_is_the_minimum_scipy_finds(scaled, rng):
 
     start = np.r_[Rotation.from_matrix(rotation).as_rotvec(), shift, 0.0]
     best = scipy.optimize.least_squares(residual, start, xtol=1e-15, ftol=1e-15)
-    mine = found.scale * points @ found.rotation.T + found.translation - truth
+    mine = (
+        alignment.scale * points @ alignment.rotation.T + alignment.translation - truth
+    )
     assert np.sum(mine**2) == pytest.approx(2 * best.cost, rel=1e-9)
-    assert np.linalg.det(found.rotation) == pytest.approx(1)
-    assert (found.rank, found.determined) == (3, True)
+    assert np.linalg.det(alignment.rotation) == pytest.approx(1)
+    assert (alignment.rank, alignment.determined) == (3, True)
 
 
 @pytest.mark.hard_cases
@@ -181,11 +183,11 @@ def test_a_known_motion_comes_back_from_far_away(distance, rng):
     points = rng.normal(size=(30, 3)) + distance
     scale, rotation, shift = motion(rng, distance=distance)
     truth = scale * points @ rotation.T + shift
-    found = quality.align_points(points, truth, True)
+    alignment = quality.align_points(points, truth, True)
     # float32 gives a scale of 2.5028 and a rotation 6e-3 off at 1e6.
-    assert found.scale == pytest.approx(scale, rel=1e-8)
-    np.testing.assert_allclose(found.rotation, rotation, atol=1e-8)
-    assert found.determined
+    assert alignment.scale == pytest.approx(scale, rel=1e-8)
+    np.testing.assert_allclose(alignment.rotation, rotation, atol=1e-8)
+    assert alignment.determined
     assert quality.path_errors(points, truth, scaled=False).rmse > 0.1
     points[4] += 0.5
     errors = quality.path_errors(points, truth)
@@ -211,8 +213,8 @@ def test_degenerate_paths_are_finite_and_say_so(kind, rank, rng):
 @pytest.mark.hard_cases
 def test_a_mirrored_path_is_never_explained_by_a_reflection(rng):
     points = rng.normal(size=(10, 3)) * [3, 2, 1]
-    found = quality.align_points(points, points * [1, 1, -1], True)
-    assert np.linalg.det(found.rotation) == pytest.approx(1)
+    alignment = quality.align_points(points, points * [1, 1, -1], True)
+    assert np.linalg.det(alignment.rotation) == pytest.approx(1)
     assert quality.path_errors(points, points * [1, 1, -1]).rmse > 0.1
     # Mirrored with equal spreads, the axis of the flip is anybody's guess.
     cube = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T

@@ -19,13 +19,13 @@ LEFT, RIGHT = ones(3, 4), ones(4, 5)
 
 
 def test_a_matrix_product_has_two_operations_a_multiply_add():
-    found = matrix_flops.count(product, LEFT, RIGHT)
-    assert found == matrix_flops.Counted(2 * 3 * 4 * 5, False)
+    counted = matrix_flops.count(product, LEFT, RIGHT)
+    assert counted == matrix_flops.Counted(2 * 3 * 4 * 5, False)
     batched = matrix_flops.count(jax.vmap(product), ones(7, 3, 4), ones(7, 4, 5))
-    assert batched.flops == 7 * found.flops
+    assert batched.flops == 7 * counted.flops
     # A vector under vmap is a matrix; what is alike for the batch is computed once.
     row = matrix_flops.count(jax.vmap(product, (0, None)), LEFT, RIGHT)
-    assert row.flops == found.flops
+    assert row.flops == counted.flops
 
 
 def test_a_gradient_has_a_product_for_each_side():

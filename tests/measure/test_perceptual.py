@@ -164,9 +164,9 @@ def test_lpips_is_zero_for_equal_pictures_and_its_gradient_is_finite(tiny, rng):
 def test_half_precision_pictures_are_compared_in_float32(tiny, rng):
     half = [x.astype(jnp.bfloat16) for x in rng.random((2, 17, 14, 3))]
     wide = [x.astype(np.float32) for x in half]
-    found, expected = (compiled(tiny, TINY, *pair) for pair in (half, wide))
-    assert found.dtype == jnp.float32
-    assert float(found) == float(expected)
+    distance, expected = (compiled(tiny, TINY, *pair) for pair in (half, wide))
+    assert distance.dtype == jnp.float32
+    assert float(distance) == float(expected)
 
 
 def test_gradients_agree_with_central_differences(tiny, float64, rng):
@@ -187,8 +187,8 @@ def test_masked_lpips_ignores_what_is_outside_and_averages_inside(tiny, rng):
 
     @jax.jit
     def masked(params, image, truth, mask):
-        found = perceptual.masked_lpips(params, TINY, image, truth, mask)
-        return found, jnp.mean(perceptual.lpips_map(params, TINY, image, truth))
+        distance = perceptual.masked_lpips(params, TINY, image, truth, mask)
+        return distance, jnp.mean(perceptual.lpips_map(params, TINY, image, truth))
 
     value, _ = masked(tiny, image, truth, mask)
     hidden = np.where(mask[..., None], image, np.float32(np.nan))

@@ -26,10 +26,10 @@ at_time = jax.jit(jax.vmap(codes.at_time, (None, 0)))
 def test_blending_walks_from_one_code_to_the_other(dtype, rng):
     table = rng.normal(size=(4, 3)).astype(dtype)
     for progress in (0.0, 0.25, 1.0):
-        found = blend(table, 1, 3, np.asarray(progress, dtype))
+        blended = blend(table, 1, 3, np.asarray(progress, dtype))
         truth = table[1] * (1 - progress) + table[3] * progress
-        np.testing.assert_allclose(found, truth, rtol=1e-6)
-    assert np.array_equal(found, table[3])  # arrives exactly
+        np.testing.assert_allclose(blended, truth, rtol=1e-6)
+    assert np.array_equal(blended, table[3])  # arrives exactly
 
 
 def test_time_interpolates_like_numpy(dtype, rng):

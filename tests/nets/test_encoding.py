@@ -69,8 +69,8 @@ def test_gradient_and_curvature(times_pi, float64, rng):
 @pytest.mark.hard_cases
 def test_the_window_is_exact_at_its_ends_and_opens_smoothly(dtype):
     def window(alpha):
-        found = encoding.anneal(6, alpha)
-        return found, found
+        weights = encoding.anneal(6, alpha)
+        return weights, weights
 
     both = jax.jit(jax.jacfwd(window, has_aux=True))
 

@@ -148,10 +148,10 @@ def holding(x):
 def test_holding_is_twice_differentiable_at_the_ends(float64):
     ends = np.array([-1.0, 2.0])
     places = (ends + np.array([[-1e-9], [0.0], [1e-9]])).reshape(-1)
-    for found, expected in zip(holding(places), (ends, [1, 1], [0, 0]), strict=True):
-        found = np.asarray(found).reshape(3, 2)
-        np.testing.assert_array_equal(found[1], expected)
-        np.testing.assert_allclose(found, np.tile(expected, (3, 1)), atol=1e-6)
+    for leaf, expected in zip(holding(places), (ends, [1, 1], [0, 0]), strict=True):
+        leaf = np.asarray(leaf).reshape(3, 2)
+        np.testing.assert_array_equal(leaf[1], expected)
+        np.testing.assert_allclose(leaf, np.tile(expected, (3, 1)), atol=1e-6)
 
 
 @pytest.mark.hard_cases
@@ -177,8 +177,8 @@ def test_features_of_any_size_are_standardised(size, dtype):
     """In float32 the variance of 1e20 overflows, and every feature would become 0."""
     given = np.array([0.9, -0.3, 0.5, -1.0])
     exact = (given - given.mean()) / np.sqrt(given.var() + 1e-6 / size**2)
-    found, grads = standardised((size * given).astype(dtype))
-    np.testing.assert_allclose(found, exact, rtol=1e-6)
+    standard, grads = standardised((size * given).astype(dtype))
+    np.testing.assert_allclose(standard, exact, rtol=1e-6)
     # d z = (1 - 1/n - z zᵀ/n) dx / deviation
     change = (np.eye(4) - 0.25 - np.outer(exact, exact) / 4) / given.std() / size
     np.testing.assert_allclose(grads, change, rtol=2e-6, atol=2e-6 / size + 1e-38)
@@ -214,8 +214,8 @@ def test_any_input_has_finite_slopes(variant, dtype):
     params = filled(spec, dtype)
     still = jax.tree.map(np.zeros_like, params)  # hidden features without spread
     for values, x in itertools.product((params, still), (0.0, -1e20, 1e30)):
-        found = sum_and_slopes(spec, values, np.full(5, x, dtype))
-        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
+        leaves = sum_and_slopes(spec, values, np.full(5, x, dtype))
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(leaves))
 
 
 @pytest.mark.full
@@ -264,9 +264,9 @@ def test_networks_start_as_they_are_told(rng):
         return params, kan.apply(spec, params, inputs)
 
     given = jax.random.key(4), rng.normal(size=(9, 5)).astype(np.float32)
-    params, found = jax.tree.map(np.asarray, start(*given))
-    assert not found["still"].any()
-    assert 0 < np.abs(found["hardly"]).max() < 1e-4 * 6 * 6
+    params, answers = jax.tree.map(np.asarray, start(*given))
+    assert not answers["still"].any()
+    assert 0 < np.abs(answers["hardly"]).max() < 1e-4 * 6 * 6
     one, two, three = (
         layer.kernel for layer in (*params.hidden, params.heads["b"])
     )  # drawn independently

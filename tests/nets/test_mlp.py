@@ -100,11 +100,11 @@ def test_initial_weights_have_the_promised_spread(dtype):
 @functools.partial(jax.jit, static_argnums=0)
 def heads_and_slopes(spec, params, inputs):
     def total(params, inputs):
-        found = mlp.apply(spec, params, inputs)
-        return sum(jnp.sum(head) for head in found.values()), found
+        heads = mlp.apply(spec, params, inputs)
+        return sum(jnp.sum(head) for head in heads.values()), heads
 
-    grads, found = jax.grad(total, has_aux=True)(params, inputs)
-    return found, grads
+    grads, heads = jax.grad(total, has_aux=True)(params, inputs)
+    return heads, grads
 
 
 @pytest.mark.full

@@ -87,8 +87,8 @@ def weights_and_slopes(density, spacing):
 def test_infinite_spacing_and_depth_have_finite_values_and_slopes(dtype):
     spacing = np.asarray([1.0, 2.0, 4.0, 1e10], dtype)
     for density in (0.0, 1e-12, 1.0, 1e6):
-        found = weights_and_slopes(np.full(4, density, dtype), spacing)
-        assert all(np.all(np.isfinite(leaf)) for leaf in found)
+        results = weights_and_slopes(np.full(4, density, dtype), spacing)
+        assert all(np.all(np.isfinite(leaf)) for leaf in results)
     depth = np.asarray([0.1, np.inf, 1.0, np.inf], dtype)
     weights, grads = weights_and_slopes(depth, np.ones(4, dtype))
     np.testing.assert_allclose(weights, [1 - np.exp(-0.1), np.exp(-0.1), 0, 0], 1e-6)
@@ -137,9 +137,9 @@ def test_thinned_keeps_its_digits_at_any_opacity(dtype):
     depth, logit = np.meshgrid([0.3, 1.0, 8.0], np.linspace(-2, 2, 41))
     depth, logit = depth.astype(dtype).ravel(), logit.astype(dtype).ravel()
     exact = [exact_thinned(*pair) for pair in zip(depth, logit, strict=True)]
-    found = np.asarray(thinned(depth, logit), np.float64)
+    thin = np.asarray(thinned(depth, logit), np.float64)
     # twice what was measured
-    np.testing.assert_allclose(found, exact, rtol=6 * np.finfo(dtype).eps)
+    np.testing.assert_allclose(thin, exact, rtol=6 * np.finfo(dtype).eps)
 
 
 def test_intervals_end_as_told(dtype):
@@ -226,16 +226,16 @@ def test_narrow_depths_are_summed_in_float32(narrow, rng):
     """A running sum of 128 depths in bfloat16 loses a hundredth of the light."""
     depth = rng.uniform(0, 0.1, 128).astype(narrow)
     exact = exact_weights(np.asarray(depth, np.float64)[None])[0]
-    found = weights_of(depth)
+    weights = weights_of(depth)
     joint = media_weights_of(np.stack([depth, depth]) / narrow(2))
-    assert found.dtype == joint.dtype == narrow
+    assert weights.dtype == joint.dtype == narrow
     unit = float(jnp.finfo(narrow).eps)
     near = {"rtol": unit, "atol": 2.0**-24}  # of which float16 has no less
-    np.testing.assert_allclose(np.asarray(found, np.float64), exact, **near)
+    np.testing.assert_allclose(np.asarray(weights, np.float64), exact, **near)
     both = np.sum(np.asarray(joint, np.float64), axis=0)
     # Two halves of the opacity of one sample overlap.
     wanted = exact * 2 * -np.expm1(-np.asarray(depth, np.float64) / 2)
     wanted /= -np.expm1(-np.asarray(depth, np.float64))
     np.testing.assert_allclose(both, wanted, **near)
     middle = np.searchsorted(np.cumsum(exact), 0.5)
-    assert abs(int(median_indices(found[None])[0]) - middle) <= 1
+    assert abs(int(median_indices(weights[None])[0]) - middle) <= 1

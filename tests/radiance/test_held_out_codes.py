@@ -17,12 +17,12 @@ from tests.scenes import TINY_FIELD
 def repainted(rows):
     """The capture as the field itself would film it, in appearances it never learnt."""
     capture, (metadata, params, _) = scenes.tiny_capture(), scenes.tiny_field()
-    made = nerf_scene.field(TINY_FIELD, metadata)
-    draw = jax.jit(made.render, static_argnums=4)
+    field = nerf_scene.field(TINY_FIELD, metadata)
+    draw = jax.jit(field.render, static_argnums=4)
     step, pictures = jnp.asarray(10, jnp.int32), capture.images.copy()
     for row in rows:
         view = evaluation.view_of(capture, int(row))
-        codes = made.codes_at(params, view)
+        codes = field.codes_at(params, view)
         codes["appearance"] = jnp.asarray([3.0, -4.0, 2.0])
         colour = draw(params, view.camera, view.time, codes, capture.size, step).colour
         pictures[row] = evaluation.as_picture(np.asarray(colour))
@@ -44,19 +44,19 @@ def test_a_code_is_found_again_from_half_a_picture_if_that_was_filmed():
             held_out_codes.score(TINY_FIELD, metadata, state, capture, rows),
         )
 
-    before, found = before_and_found(filmed)
+    before, after = before_and_found(filmed)
     assert before.psnr[0] < 35
-    assert found.psnr[0] > 48  # the truth has 8 bits: 59 dB is all there is
-    assert found.ssim[0] > 0.99
+    assert after.psnr[0] > 48  # the truth has 8 bits: 59 dB is all there is
+    assert after.ssim[0] > 0.99
     valid = np.ones(filmed.images.shape[:3], bool)
     valid[:, :, :20] = False
-    before, found = before_and_found(dataclasses.replace(filmed, valid=valid))
-    np.testing.assert_allclose(found.psnr, before.psnr, atol=1e-3)
+    before, after = before_and_found(dataclasses.replace(filmed, valid=valid))
+    np.testing.assert_allclose(after.psnr, before.psnr, atol=1e-3)
 
 
 def test_a_field_without_codes_has_none_to_fit():
     metadata, params, _ = scenes.tiny_field()
     plain = dataclasses.replace(TINY_FIELD, appearance=None)
     capture, state = scenes.tiny_capture(), TrainState(params, (), (), None, None)
-    found = held_out_codes.score(plain, metadata, state, capture, capture.heldout)
-    assert found is None
+    scored = held_out_codes.score(plain, metadata, state, capture, capture.heldout)
+    assert scored is None

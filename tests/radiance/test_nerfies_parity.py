@@ -159,8 +159,8 @@ def total(flat, rays, colour, static, static_ids, places):
     loss = error + 1e-3 * strained + drift
     along = jax.vmap(jax.jacfwd(displacement(flat)), (0, None))
     bent = {name: jax.vmap(along)(at, when) for name, at in places.items()}
-    found = {"elastic_weight": strained, "background_loss": drift, "total_loss": loss}
-    return loss, (found, seen, bent)
+    terms = {"elastic_weight": strained, "background_loss": drift, "total_loss": loss}
+    return loss, (terms, seen, bent)
 
 
 slopes = jax.jit(jax.grad(total, has_aux=True))
@@ -193,8 +193,8 @@ def computed(file, name):
     flat = branch(recorded, f"params/{name}/")
     flat = {path: value.astype(np.float64) for path, value in flat.items()}
     places = {key: truth[f"{key}/points"] for key in ("coarse", "fine")}
-    found = slopes(flat, rays, real["rgb"], static, ids["bg_ids"], places)
-    return *jax.tree.map(np.asarray, found), truth
+    results = slopes(flat, rays, real["rgb"], static, ids["bg_ids"], places)
+    return *jax.tree.map(np.asarray, results), truth
 
 
 @pytest.fixture(params=["init", "live"])
@@ -203,9 +203,9 @@ def both(request, float64, oracle_dir):
     return request.param, *computed(oracle_dir / "nerfies.npz", request.param)
 
 
-def close(found, truth, bound):
+def close(value, truth, bound):
     scale = max(np.abs(truth).max(), 1)
-    np.testing.assert_allclose(found, truth, rtol=0, atol=bound * scale)
+    np.testing.assert_allclose(value, truth, rtol=0, atol=bound * scale)
 
 
 def test_what_every_ray_sees(both):
@@ -233,17 +233,17 @@ def test_elastic_energies_sample_by_sample(both):
             "det": losses.geman_mcclure(jnp.square(off), 0.03, "official"),
         }
 
-    for kind, found in energies(truth["coarse/warp_jacobian"] - np.eye(3)).items():
+    for kind, energy in energies(truth["coarse/warp_jacobian"] - np.eye(3)).items():
         recorded = truth[f"elastic/{kind}/per_sample"]
-        close(found, recorded, 1e-14)
+        close(energy, recorded, 1e-14)
         if name == "init" and kind == "log_svals":
             # of every digit the strain has, not of an absolute bound
-            np.testing.assert_allclose(found, recorded, rtol=1e-9)
+            np.testing.assert_allclose(energy, recorded, rtol=1e-9)
 
 
 def test_losses_and_gradients(both):
-    name, grads, (found, _, _), truth = both
-    for key, value in found.items():
+    name, grads, (terms, _, _), truth = both
+    for key, value in terms.items():
         close(value, truth[key], 1e-12)
         # relative, of numbers that are themselves 1e-5 and 4e-4
         np.testing.assert_allclose(value, truth[key], rtol=1e-10)

@@ -46,11 +46,11 @@ def field_of(name):
     return scene.field(spec, metadata)
 
 
-def carried(made, params, time, points):
+def carried(field, params, time, points):
     def one(point, view):
-        codes = made.codes_at(params, view)
-        condition = FrameCondition(view.time, codes, jnp.int32(made.spec.steps))
-        return point + made.displace(params, point, condition)
+        codes = field.codes_at(params, view)
+        condition = FrameCondition(view.time, codes, jnp.int32(field.spec.steps))
+        return point + field.displace(params, point, condition)
 
     view = View(None, np.float32(time), np.int32(0))
     return jax.jit(jax.vmap(one, (0, None)))(points, view)
@@ -60,17 +60,19 @@ def carried(made, params, time, points):
     "name", ["nerfies-small", pytest.param("d-nerf-small", marks=pytest.mark.full)]
 )
 def test_a_fitted_warp_brings_a_body_to_one_place_and_moves_no_wall(name):
-    made, paths = field_of(name), film()
-    params = made.init(jax.random.key(0))
-    found = path_fit.fit(made, params, paths, jax.random.key(0), TRACKS)
-    assert found.first > 0.1
-    assert found.last < 0.03
+    field, paths = field_of(name), film()
+    params = field.init(jax.random.key(0))
+    fitted = path_fit.fit(field, params, paths, jax.random.key(0), TRACKS)
+    assert fitted.first > 0.1
+    assert fitted.last < 0.03
     for frame in (3, 12):
-        back = carried(made, found.params, paths.time[frame], paths.position[:, frame])
+        back = carried(
+            field, fitted.params, paths.time[frame], paths.position[:, frame]
+        )
         # Also where a path was not known.
-        off = np.linalg.norm(back - found.canonical, axis=-1)
+        off = np.linalg.norm(back - fitted.canonical, axis=-1)
         assert np.median(off) < 0.04
-        wall = carried(made, found.params, paths.time[frame], paths.still)
+        wall = carried(field, fitted.params, paths.time[frame], paths.still)
         assert np.median(np.linalg.norm(wall - paths.still, axis=-1)) < 0.03
 
 
@@ -79,20 +81,20 @@ def test_points_seen_once_leave_everything_where_it_is(still):
     """Each has one place: there is no motion to find, with or without a wall."""
     known = np.zeros((40, FRAMES), bool)
     known[np.arange(40), np.arange(40) % FRAMES] = True
-    made, paths = field_of("nerfies-small"), film(known, still)
-    params = made.init(jax.random.key(0))
-    found = path_fit.fit(made, params, paths, jax.random.key(0), TRACKS)
-    assert found.last < 5e-3
+    field, paths = field_of("nerfies-small"), film(known, still)
+    params = field.init(jax.random.key(0))
+    fitted = path_fit.fit(field, params, paths, jax.random.key(0), TRACKS)
+    assert fitted.last < 5e-3
     places = paths.position[known]
-    assert np.abs(carried(made, found.params, 0.5, places) - places).max() < 0.03
+    assert np.abs(carried(field, fitted.params, 0.5, places) - places).max() < 0.03
 
 
 def test_what_cannot_be_fitted_is_refused_by_name():
-    made = field_of("nerfies-small")
-    params = made.init(jax.random.key(0))
+    field = field_of("nerfies-small")
+    params = field.init(jax.random.key(0))
     with pytest.raises(ValueError, match="no path is known"):
         path_fit.fit(
-            made, params, film(np.zeros((40, FRAMES), bool)), jax.random.key(0), TRACKS
+            field, params, film(np.zeros((40, FRAMES), bool)), jax.random.key(0), TRACKS
         )
     with pytest.raises(ValueError, match=r'start\.motion="tracks" fits a warp'):
         dataclasses.replace(presets.PRESETS["nerf-small"], start=TRACKS)

@@ -37,12 +37,12 @@ def test_points_are_followed_through_a_warp_in_closed_form(
             return moved
         return jnp.where(abs(moment.time - times[lost_at]) < 1e-3, jnp.nan, moved)
 
-    made = types.SimpleNamespace(
+    stub = types.SimpleNamespace(
         effects=(Effect("warp", displace=displace),),
         codes_at=lambda params, view: {},
         displace=displace,
     )
-    monkeypatch.setattr(scene, "field", lambda *_, **__: made)
+    monkeypatch.setattr(scene, "field", lambda *_, **__: stub)
     state = types.SimpleNamespace(params=velocity, step=jnp.int32(5))
     followed = point_tracks.follow(None, metadata, state, capture, known)
 

@@ -70,13 +70,17 @@ def test_half_the_steps_halve_the_schedules():
 def test_the_networks_read_their_input_again_where_the_papers_do(name, inputs, layer):
     spec, key = PRESETS[name], jax.random.key(0)
     read = jax.eval_shape(lambda: template.init(spec.template, key, inputs, 27))
-    found = {"template": (read.trunk.hidden, inputs, layer)}
+    networks = {"template": (read.trunk.hidden, inputs, layer)}
     if name == "d-nerf":
-        found["warp"] = jax.eval_shape(lambda: warp.init(spec.warp, key)).hidden, 84, 5
+        networks["warp"] = (
+            jax.eval_shape(lambda: warp.init(spec.warp, key)).hidden,
+            84,
+            5,
+        )
     if name == "nsff":
         medium = jax.eval_shape(lambda: scene_flow.init(spec.scene_flow, key, 256))
-        found["medium"] = medium.network.trunk.hidden, 84, 5
-    for hidden, width, again in found.values():
+        networks["medium"] = medium.network.trunk.hidden, 84, 5
+    for hidden, width, again in networks.values():
         rows = [width, *[256] * 7]
         rows[again] += width
         assert [one.weight.shape for one in hidden] == [(n, 256) for n in rows]

@@ -109,12 +109,12 @@ def test_distances_never_step_back_however_short_the_ray(spacing, dtype):
 def test_the_last_sample_in_disparity_is_the_far_end(ratio, dtype):
     """Written 1 / near + (1 / far - 1 / near) share it was 18 % short at 1e7 nears."""
     near, far = np.asarray(1e-3, dtype), np.asarray(1e-3 * ratio, dtype)
-    found = np.asarray(stratified(None, near, far, 64, "disparity"), np.float64)
+    samples = np.asarray(stratified(None, near, far, 64, "disparity"), np.float64)
     share = np.linspace(0, 1, 64)
     exact = 1 / ((1 - share) / float(near) + share / float(far))
     # share is rounded, and 1 - share magnifies that up to 63 times before the last
-    np.testing.assert_allclose(found, exact, rtol=64 * np.finfo(dtype).eps)
-    assert np.all(np.diff(found) >= 0)
+    np.testing.assert_allclose(samples, exact, rtol=64 * np.finfo(dtype).eps)
+    assert np.all(np.diff(samples) >= 0)
 
 
 def test_distances_follow_near_and_far(float64):
@@ -160,13 +160,13 @@ EDGES = np.linspace(2, 4, 17)
 def test_weights_of_any_size_share_alike_and_peaks_draw_all(dtype):
     """But the ends u = 0 and 1 of the even shares, which are the ends of the range."""
     weights = np.stack(list(HARD.values())).astype(dtype)
-    found = [
+    draws = [
         np.asarray(from_many_weights(drawn, EDGES.astype(dtype), weights, 34))
         for drawn in (None, key(1))
     ]
     # 16 floors of one rounding unit on a sum of one, on bins of 1/8
     tolerance = {"float32": 3e-6, "float64": 1e-13}[dtype]
-    for case, given, even, drawn in zip(HARD, HARD.values(), *found, strict=True):
+    for case, given, even, drawn in zip(HARD, HARD.values(), *draws, strict=True):
         for got in (even, drawn):
             assert got.dtype == dtype
             assert np.all((got >= 2) & (got <= 4)), case  # and so finite
@@ -262,12 +262,12 @@ def test_narrow_rays_keep_their_order_and_their_peaks(narrow):
     peak = (np.arange(64) == 40).astype(narrow)
     # A rounding unit of bfloat16 in each of 64 bins would be a third of the weight.
     drawn = from_weights(key(0), edges, peak, 64)
-    for found in (even, drawn):
-        assert found.dtype == narrow
-        found = np.asarray(found, np.float64)
-        assert np.all(np.diff(found) >= 0)
-        assert np.all((found >= 2) & (found <= 4))
-    assert np.all((found >= float(edges[40])) & (found <= float(edges[41])))
+    for samples in (even, drawn):
+        assert samples.dtype == narrow
+        samples = np.asarray(samples, np.float64)
+        assert np.all(np.diff(samples) >= 0)
+        assert np.all((samples >= 2) & (samples <= 4))
+    assert np.all((samples >= float(edges[40])) & (samples <= float(edges[41])))
 
 
 @pytest.mark.hard_cases

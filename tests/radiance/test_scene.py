@@ -80,9 +80,9 @@ def ray_of(dtype):
     )
 
 
-def condition_of(dtype, **found):
-    found = {name: jnp.asarray(code, dtype) for name, code in found.items()}
-    return FrameCondition(jnp.asarray(0.4, dtype), found, jnp.int32(0))
+def condition_of(dtype, **codes):
+    codes = {name: jnp.asarray(code, dtype) for name, code in codes.items()}
+    return FrameCondition(jnp.asarray(0.4, dtype), codes, jnp.int32(0))
 
 
 def test_training_a_static_field_lowers_the_loss():
@@ -103,8 +103,8 @@ def test_training_a_static_field_lowers_the_loss():
 def test_a_static_level_is_the_plain_nerf(dtype):
     field, ray = scene.field(STATIC, METADATA), ray_of(dtype)
     params = drawn.params(field.init, dtype)
-    found = jax.jit(field.render_ray)(params, ray, condition_of(dtype))
-    coarse, fine = jax.tree.map(np.asarray, found)
+    levels = jax.jit(field.render_ray)(params, ray, condition_of(dtype))
+    coarse, fine = jax.tree.map(np.asarray, levels)
     assert fine.colour.dtype == dtype
     expected = plain_nerf(params["template"]["coarse"], ray, np.linspace(0.5, 1.5, 8))
     tolerance = {"float32": 3e-6, "float64": 1e-12}[dtype]
@@ -191,10 +191,10 @@ def test_a_code_is_its_row_at_its_own_time_and_between_rows_elsewhere(dtype):
     tables, at = codes_by(scene.field(spec, METADATA), dtype)
     table = tables["motion"]
     assert table.shape == (3, TINY_WARP.code_width)
-    found = np.asarray(at([*METADATA.times, -1.0, 7.0, 0.4], [0] * 6)["motion"])
-    np.testing.assert_array_equal(found[:5], table[[0, 1, 2, 0, 2]])
+    codes = np.asarray(at([*METADATA.times, -1.0, 7.0, 0.4], [0] * 6)["motion"])
+    np.testing.assert_array_equal(codes[:5], table[[0, 1, 2, 0, 2]])
     between = 0.8 * table[1] + 0.2 * table[2]
-    np.testing.assert_allclose(found[5], between, rtol=1e-6)
+    np.testing.assert_allclose(codes[5], between, rtol=1e-6)
 
 
 def test_an_exposure_that_was_not_learnt_lies_between_its_neighbours(float64):
@@ -202,8 +202,8 @@ def test_an_exposure_that_was_not_learnt_lies_between_its_neighbours(float64):
     tables, at = codes_by(scene.field(spec, METADATA), "float64")
     table = tables["appearance"]
     assert table.shape == (2, 2)  # only what is learnt from has a row
-    (found,) = at([0.0], [2])["appearance"]
-    np.testing.assert_allclose(found, 0.75 * table[0] + 0.25 * table[1], atol=1e-7)
+    (code,) = at([0.0], [2])["appearance"]
+    np.testing.assert_allclose(code, 0.75 * table[0] + 0.25 * table[1], atol=1e-7)
 
 
 def test_facts_place_held_out_exposures_by_time():
@@ -242,7 +242,7 @@ def test_gradient_of_a_whole_step(float64):
         ambient=AmbientSpec(depth=1, width=4, skips=(), closed_steps=1, anneal_steps=4),
     )
     model, _, frames = started(spec)
-    made = scene.field(spec, model.spec[1])
+    field = scene.field(spec, model.spec[1])
     frames = jax.tree.map(
         lambda x: x.astype(float64) if x.dtype == jnp.float32 else x, frames
     )
@@ -250,12 +250,12 @@ def test_gradient_of_a_whole_step(float64):
 
     def loss(params):
         terms = scene.loss_terms(
-            made, params, frames, batch, jnp.int32(4), jax.random.key(2)
+            field, params, frames, batch, jnp.int32(4), jax.random.key(2)
         )
         return weighted_sum(terms)
 
     # Not the first state: zero displacements would leave terms without slope.
-    params = drawn.params(made.init, "float64", 0.05)
+    params = drawn.params(field.init, "float64", 0.05)
     assert gradients.directional_error(loss, params) < 1e-5
 
 
@@ -284,7 +284,7 @@ def test_a_medium_has_the_share_that_it_is_given(logit, without):
         STATIC, scene_flow=SceneFlowSpec(network=TINY_TEMPLATE, time=EncodingSpec(2))
     )
     metadata = scene.metadata_of(scenes.tiny_capture(), spec)
-    made = scene.field(spec, metadata)
+    field = scene.field(spec, metadata)
     ray = render_ray.field_ray(
         metadata, *(jnp.asarray(x) for x in ([0.0, 0, 0], [0.0, 0, 1])), jnp.float32(1)
     )
@@ -292,7 +292,7 @@ def test_a_medium_has_the_share_that_it_is_given(logit, without):
 
     @jax.jit
     def both(key):
-        params = made.init(key)
+        params = field.init(key)
         flow = params["scene_flow"]
         blend = flow.blend._replace(bias=jnp.full_like(flow.blend.bias, logit))
         params["scene_flow"] = flow._replace(blend=blend)
@@ -300,7 +300,7 @@ def test_a_medium_has_the_share_that_it_is_given(logit, without):
         moved = jax.tree.map(lambda leaf: leaf + 1, params["template"])
         changed = params if without else params | {"template": moved}
         return (
-            made.render_ray(params, ray, condition)[-1].colour,
+            field.render_ray(params, ray, condition)[-1].colour,
             other.render_ray(changed, ray, condition)[-1].colour,
         )
 

@@ -53,21 +53,21 @@ def test_density_colour_and_features_layer_by_layer(density, condition, noise, d
     spec = dataclasses.replace(SMALL, density=density, density_bias=2.0)
     params, *inputs = drawn(dtype, condition=condition)
     added = None if noise is None else np.asarray(noise, dtype)
-    found = apply(spec, params, *inputs, added)
+    answer = apply(spec, params, *inputs, added)
     truth = by_hand(spec, params, *inputs, noise or 0.0)
     bound = {"float32": 3e-6, "float64": 1e-13}[dtype]
-    for value, exact in zip(found, truth, strict=True):
+    for value, exact in zip(answer, truth, strict=True):
         assert value.dtype == dtype
         np.testing.assert_allclose(value, exact, rtol=bound, atol=bound)
-    assert found.density > 0
+    assert answer.density > 0
 
 
 def test_gradients(float64):
     params, features, condition = drawn("float64")
 
     def total(params, features, condition):
-        found = template.apply(SMALL, params, features, condition)
-        return found.density**2 + jnp.sum(found.colour) + jnp.sum(found.features**2)
+        answer = template.apply(SMALL, params, features, condition)
+        return answer.density**2 + jnp.sum(answer.colour) + jnp.sum(answer.features**2)
 
     error = gradients.directional_error(total, params, features, condition, step=1e-6)
     assert error < 1e-6
@@ -78,10 +78,10 @@ def test_density_does_not_depend_on_where_it_is_seen_from(dtype):
     params, features, condition = drawn(dtype)
     views = np.stack([condition, -condition, 9 * condition])
     seen = jax.jit(jax.vmap(functools.partial(template.apply, SMALL), (None, None, 0)))
-    found = jax.tree.map(np.asarray, seen(params, features, views))
-    assert np.all(found.density == found.density[0])
-    assert np.all(found.features == found.features[0])
-    assert np.all(np.ptp(found.colour, axis=0) > 1e-3)
+    answer = jax.tree.map(np.asarray, seen(params, features, views))
+    assert np.all(answer.density == answer.density[0])
+    assert np.all(answer.features == answer.features[0])
+    assert np.all(np.ptp(answer.colour, axis=0) > 1e-3)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -122,15 +122,15 @@ def test_bfloat16_is_finite_and_near():
     spec = dataclasses.replace(SMALL, density="softplus")
 
     def seen(params, *inputs):
-        found = template.apply(spec, params, *inputs)
-        return found.density + jnp.sum(found.colour), found
+        answer = template.apply(spec, params, *inputs)
+        return answer.density + jnp.sum(answer.colour), answer
 
     slope = jax.jit(jax.value_and_grad(seen, has_aux=True))
-    (_, found), grads = slope(params, features, condition)
-    kinds = {leaf.dtype for leaf in jax.tree.leaves((found, grads))}
+    (_, answer), grads = slope(params, features, condition)
+    kinds = {leaf.dtype for leaf in jax.tree.leaves((answer, grads))}
     assert kinds == {jnp.dtype(jnp.bfloat16)}
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(grads))
     wide = jax.tree.map(lambda x: np.asarray(x, np.float64), (params, features))
     exact = by_hand(spec, *wide, np.asarray(condition, np.float64))
-    np.testing.assert_allclose(np.asarray(found.density, float), exact[0], rtol=0.05)
-    np.testing.assert_allclose(np.asarray(found.colour, float), exact[1], atol=0.02)
+    np.testing.assert_allclose(np.asarray(answer.density, float), exact[0], rtol=0.05)
+    np.testing.assert_allclose(np.asarray(answer.colour, float), exact[1], atol=0.02)

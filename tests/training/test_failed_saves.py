@@ -78,20 +78,20 @@ def test_training_goes_on_where_saving_fails_and_says_so(
                     folder.mkdir(exist_ok=True)
                     settings.touch()
 
-            said = io.StringIO()
+            printed = io.StringIO()
             result = toy.fit(
                 toy.frames(),
                 steps=20,
-                console=rich.console.Console(file=said),
+                console=rich.console.Console(file=printed),
                 hooks=[loop.Hook("disturb", disturb, every_steps=1)],
                 checkpoints=checkpoints,
                 checkpoint_seconds=0.0,
             )
         assert toy.same(result.state, straight.state)
         warned = f"warning: cannot write checkpoints to {folder}: "
-        assert warned in said.getvalue()
-        assert words in said.getvalue()
-        assert f"{whole}; training goes on" in said.getvalue()
+        assert warned in printed.getvalue()
+        assert words in printed.getvalue()
+        assert f"{whole}; training goes on" in printed.getvalue()
         if passes:
             assert result.unsaved == ""
             assert checkpoint.latest(folder) == 20

@@ -43,13 +43,13 @@ def refine(start, points, seen, spec):
     return refine_camera(lambda c: pixels(c, points) - seen, start, spec)
 
 
-def pose_error(found, truth):
+def pose_error(camera, truth):
     """Angle (rad) and distance (scene units) between two cameras."""
     turn = (
-        np.asarray(found.camera_from_world, float)
+        np.asarray(camera.camera_from_world, float)
         @ np.asarray(truth.camera_from_world, float).T
     )
-    away = np.asarray(found.position, float) - np.asarray(truth.position, float)
+    away = np.asarray(camera.position, float) - np.asarray(truth.position, float)
     return np.linalg.norm(turn - np.eye(3)) / np.sqrt(2), np.linalg.norm(away)
 
 
@@ -71,13 +71,13 @@ def test_a_disturbed_camera_is_found_again_from_its_pixels(dtype, rng):
     seen = pixels(truth, points)
     start = MOVE(truth, ANGULAR.astype(dtype), LINEAR.astype(dtype))
     start = start._replace(focal_px=start.focal_px * 1.2)
-    found = refine(start, points, seen, CameraSpec(unknowns=FOCAL))
-    assert found.converged
-    assert found.residual < {"float32": 1e-4, "float64": 1e-7}[dtype]
+    refined = refine(start, points, seen, CameraSpec(unknowns=FOCAL))
+    assert refined.converged
+    assert refined.residual < {"float32": 1e-4, "float64": 1e-7}[dtype]
     # float32: an ulp of a pixel, 4e-6 px, over 80 px per rad, times the conditioning
     limit = {"float32": 2e-5, "float64": 1e-7}[dtype]
-    assert max(pose_error(found.value, truth)) < limit
-    assert abs(found.value.focal_px / truth.focal_px - 1) < limit
+    assert max(pose_error(refined.value, truth)) < limit
+    assert abs(refined.value.focal_px / truth.focal_px - 1) < limit
 
 
 @pytest.mark.full
@@ -85,8 +85,8 @@ def test_noisy_pixels_give_the_least_squares_camera_of_scipy(float64, rng):
     truth, points = scene_camera("float64"), scene_points(rng, "float64")
     seen = np.asarray(pixels(truth, points)) + rng.normal(size=(20, 2))
     start = MOVE(truth, ANGULAR, LINEAR)
-    found = refine(start, points, seen, CameraSpec())
-    assert found.converged
+    refined = refine(start, points, seen, CameraSpec())
+    assert refined.converged
 
     def residuals(step):
         rotation = scipy.linalg.expm(hat(step[:3])) @ np.asarray(
@@ -99,10 +99,10 @@ def test_noisy_pixels_give_the_least_squares_camera_of_scipy(float64, rng):
         residuals, [0, 0, 0, *start.position], xtol=1e-12, ftol=1e-12, gtol=1e-12
     )
     rms = np.sqrt(np.mean(exact.fun**2))
-    assert found.residual == pytest.approx(rms, rel=1e-9)
-    assert found.value.focal_px == start.focal_px
+    assert refined.residual == pytest.approx(rms, rel=1e-9)
+    assert refined.value.focal_px == start.focal_px
     # SciPy's slopes are differences; the optimum is flat to their 1e-6
-    np.testing.assert_allclose(found.value.position, exact.x[3:], atol=1e-5)
+    np.testing.assert_allclose(refined.value.position, exact.x[3:], atol=1e-5)
 
 
 def texture(point):
@@ -145,14 +145,14 @@ def test_a_camera_is_found_from_colours_alone_and_wrong_minima_are_flagged(dtype
         start = MOVE(truth, size * ANGULAR.astype(dtype), size * LINEAR.astype(dtype))
         return refine_camera(lambda c: photograph(c) - seen, start, spec)
 
-    found = jax.jit(jax.vmap(refine))(sizes)
+    refined = jax.jit(jax.vmap(refine))(sizes)
     right = []
     for row in range(8):
-        error = max(pose_error(cameras.take(found.value, row), truth))
+        error = max(pose_error(cameras.take(refined.value, row), truth))
         right.append(error < {"float32": 1e-4, "float64": 1e-6}[dtype])
     assert all(right[:4])
     assert not all(right)
-    np.testing.assert_array_equal(found.converged, right)
+    np.testing.assert_array_equal(refined.converged, right)
 
 
 def test_what_cannot_determine_a_camera_is_flagged(dtype, rng):
@@ -162,10 +162,10 @@ def test_what_cannot_determine_a_camera_is_flagged(dtype, rng):
     one_point = np.tile(points[:1], (20, 1))
     a_line = np.linspace(-1, 1, 20, dtype=dtype)[:, None] * points[0]
     for degenerate in (one_point, a_line):
-        found = refine(start, degenerate, pixels(truth, degenerate), spec)
-        assert found.residual < 1e-3  # it fits, and means nothing
-        assert not found.converged
-        assert np.isfinite(found.value.position).all()
+        refined = refine(start, degenerate, pixels(truth, degenerate), spec)
+        assert refined.residual < 1e-3  # it fits, and means nothing
+        assert not refined.converged
+        assert np.isfinite(refined.value.position).all()
     lost = start._replace(position=np.full(3, np.nan, dtype))
     seen = pixels(truth, points)
     assert not refine(lost, points, seen, spec).converged
@@ -207,14 +207,14 @@ def test_every_solver_finds_the_ridge_regression(solver, dtype, rng):
 
     start = {"a": np.zeros(2, dtype), "b": np.zeros((2, 3), dtype)}
     steps, tolerance = GENEROUS[solver]
-    found = jax.jit(lambda start: fit_code(loss, start, solver, steps, tolerance))(
+    solved = jax.jit(lambda start: fit_code(loss, start, solver, steps, tolerance))(
         start
     )
-    assert found.converged
-    assert 1 < found.steps <= steps
-    assert found.residual <= tolerance
-    assert found.value["b"].shape == (2, 3)
-    code = np.concatenate([found.value["a"], np.ravel(found.value["b"])])
+    assert solved.converged
+    assert 1 < solved.steps <= steps
+    assert solved.residual <= tolerance
+    assert solved.value["b"].shape == (2, 3)
+    code = np.concatenate([solved.value["a"], np.ravel(solved.value["b"])])
     # the gradient is the Hessian times the distance
     curvature = 2 * np.linalg.eigvalsh(matrix.T @ matrix + 0.1 * np.eye(8))[0]
     assert np.linalg.norm(code - exact) < tolerance / curvature + 1e-6
@@ -223,11 +223,11 @@ def test_every_solver_finds_the_ridge_regression(solver, dtype, rng):
 @pytest.mark.parametrize("solver", ONE_SOLVER)
 def test_a_bad_start_comes_back_flagged(solver, dtype):
     start = np.asarray([-1.0, 2.0], dtype)
-    found = jax.jit(
+    solved = jax.jit(
         lambda start: fit_code(lambda c: jnp.sum(jnp.log(c)), start, solver, 20)
     )(start)
-    assert not found.converged
-    np.testing.assert_array_equal(found.value, start)
+    assert not solved.converged
+    np.testing.assert_array_equal(solved.value, start)
 
 
 @pytest.mark.full
@@ -240,18 +240,18 @@ def test_a_solve_cut_short_is_flagged_and_no_worse_than_its_start(solver):
 
     start = np.float32([0.5, -3.0])
     value = jax.jit(loss)
-    found = jax.jit(lambda start: fit_code(loss, start, solver, 3, 1e-6))(start)
-    assert not found.converged
-    assert np.isfinite(found.value).all()
-    assert value(found.value) <= value(start)
+    solved = jax.jit(lambda start: fit_code(loss, start, solver, 3, 1e-6))(start)
+    assert not solved.converged
+    assert np.isfinite(solved.value).all()
+    assert value(solved.value) <= value(start)
 
 
 @pytest.mark.parametrize("solver", CODE_SOLVERS)
 @pytest.mark.full
 def test_float32_codes_stay_float32_with_x64_on(solver, float64):
-    found = jax.jit(
+    solved = jax.jit(
         lambda start: fit_code(lambda c: jnp.sum((c - 0.5) ** 2), start, solver, 300)
     )(np.zeros(3, np.float32))
-    assert found.value.dtype == found.residual.dtype == jnp.float32
-    assert found.converged
-    np.testing.assert_allclose(found.value, 0.5, atol=1e-3)
+    assert solved.value.dtype == solved.residual.dtype == jnp.float32
+    assert solved.converged
+    np.testing.assert_allclose(solved.value, 0.5, atol=1e-3)

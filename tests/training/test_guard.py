@@ -107,10 +107,10 @@ def test_a_step_that_blows_up_is_named_and_undone(where, at, frames, tmp_path):
                 checkpoint_seconds=every,
             )
         assert result.steps == at - 1
-        said = (
+        message = (
             rf"stopped at step {at - 1} of 20: step {at} is not finite: {NAMES[where]}"
         )
-        assert re.match(said, result.message), result.message
+        assert re.match(message, result.message), result.message
         held(folder, result, model)
     good = fit(spoilt, model=model, steps=at - 1) if at > 1 else None
     assert toy.same(result.state, good.state if good else start())
@@ -165,8 +165,8 @@ def test_an_event_that_blows_up_is_named_and_undone(where, at, frames, tmp_path)
         )
     # Before the step after which it happens: a resumed run must not leave it out.
     assert result.steps == at - 1
-    said = rf"event 'harm' after step {at} is not finite: {NAMES[where]}"
-    assert re.search(said, result.message), result.message
+    message = rf"event 'harm' after step {at} is not finite: {NAMES[where]}"
+    assert re.search(message, result.message), result.message
     held(tmp_path, result, MODEL)
     straight = fit(frames, steps=STEPS)
     assert toy.same(fit(frames, result.state, steps=STEPS).state, straight.state)

@@ -186,9 +186,9 @@ def test_the_time_of_a_step_is_that_of_the_whole_schedule(frames):
         return toy.step(state, frames)
 
     state = start()
-    found = rate.step_time(toy.model(change=late), state, frames, 100)
-    assert 0.03 <= found.seconds < 0.05  # three of four phases
-    assert found.compile_seconds > 0
+    measured = rate.step_time(toy.model(change=late), state, frames, 100)
+    assert 0.03 <= measured.seconds < 0.05  # three of four phases
+    assert measured.compile_seconds > 0
     assert int(state.step) == 0
     assert toy.same(state, start())
 

@@ -46,12 +46,12 @@ def reference_dssim(image, target, padding, value_range=1.0):
 @pytest.mark.parametrize("padding", ["zero", "valid"])
 def test_dssim_is_the_textbook_five_window_form(padding, rng, dtype):
     image, target = images(rng)
-    found = DSSIM(image.astype(dtype), target.astype(dtype), padding=padding)
-    assert found.dtype == dtype
+    loss = DSSIM(image.astype(dtype), target.astype(dtype), padding=padding)
+    assert loss.dtype == dtype
     expected = reference_dssim(image, target, padding)
     # The float64 images are rounded to float32 before: 6e-8 of noise beside C2 = 9e-4.
     tolerance = {"float32": 5e-6, "float64": 1e-13}[dtype]
-    np.testing.assert_allclose(found, expected, atol=tolerance)
+    np.testing.assert_allclose(loss, expected, atol=tolerance)
 
 
 @pytest.mark.hard_cases
@@ -96,9 +96,9 @@ def test_robust_penalties_hold_from_nothing_to_the_largest_residual(name, dtype)
         expected = closed(extended, np.longdouble(width))
         if name == "charbonnier":  # 80 bits still cancel at 1e-30
             expected = extended / (np.sqrt(extended + width**2) + width)
-        found = jax.jit(function, static_argnums=1)(squares.astype(dtype), width)
+        penalty = jax.jit(function, static_argnums=1)(squares.astype(dtype), width)
         np.testing.assert_allclose(
-            found, np.asarray(expected, np.float64), rtol=ULPS[dtype], atol=0
+            penalty, np.asarray(expected, np.float64), rtol=ULPS[dtype], atol=0
         )
 
 
@@ -195,8 +195,8 @@ def test_photometric_loss_mixes_l1_and_dssim(weight, rng, float64):
     expected = (1 - weight) * np.abs(image - target).mean()
     expected += weight * reference_dssim(image, target, "zero").mean()
     loss = functools.partial(losses.photometric, dssim_weight=weight)
-    found = jax.jit(loss)(image, target)
-    assert abs(found - expected) < 1e-12
+    value = jax.jit(loss)(image, target)
+    assert abs(value - expected) < 1e-12
 
 
 @pytest.mark.parametrize("name", LOSSES)

@@ -39,8 +39,8 @@ def test_log_linear_warms_up_as_mip_nerf_does(dtype):
 
 def test_ramp_is_exact_at_its_ends_and_straight_between(dtype):
     schedule = schedules.ramp(0.3, 8.1, 7, after=3)
-    found = evaluate(schedule, [0, 3, 10, 11, 10**6], dtype)
-    assert list(found) == [np.asarray(x, dtype) for x in (0.3, 0.3, 8.1, 8.1, 8.1)]
+    values = evaluate(schedule, [0, 3, 10, 11, 10**6], dtype)
+    assert list(values) == [np.asarray(x, dtype) for x in (0.3, 0.3, 8.1, 8.1, 8.1)]
     between = evaluate(schedule, [4, 6], dtype)
     np.testing.assert_allclose(between, [0.3 + 7.8 / 7, 0.3 + 7.8 * 3 / 7], RTOL[dtype])
 
@@ -48,8 +48,8 @@ def test_ramp_is_exact_at_its_ends_and_straight_between(dtype):
 def test_a_ramp_late_in_a_long_run_keeps_its_steps():
     schedule = schedules.ramp(0.0, 4.0, 4, after=2**24)
     # float32 has no 2^24 + 1: the middle values need integer arithmetic.
-    found = evaluate(schedule, [2**24 + k for k in range(5)], "float32")
-    assert list(found) == [0, 1, 2, 3, 4]
+    values = evaluate(schedule, [2**24 + k for k in range(5)], "float32")
+    assert list(values) == [0, 1, 2, 3, 4]
 
 
 def test_cosine_is_the_elastic_weight_of_nerfies(dtype):
@@ -61,24 +61,24 @@ def test_cosine_is_the_elastic_weight_of_nerfies(dtype):
         risen = math.sin(math.pi / 2 * t) ** 2
         left = math.cos(math.pi / 2 * t) ** 2
         expected.append(1e-2 * left + 1e-8 * risen)
-    found = evaluate(schedule, steps, dtype)
+    values = evaluate(schedule, steps, dtype)
     # float32: cos^2 near pi/2 squares a share that is a difference from one.
     rtol = {"float32": 2e-4, "float64": 1e-12}[dtype]
-    np.testing.assert_allclose(found, expected, rtol)
-    assert found[-1] == np.asarray(1e-8, dtype)
-    assert np.all(np.diff(found) <= 0)
+    np.testing.assert_allclose(values, expected, rtol)
+    assert values[-1] == np.asarray(1e-8, dtype)
+    assert np.all(np.diff(values) <= 0)
 
 
 def test_time_noise_is_a_tenth_of_a_frame_and_ends(dtype):
     schedule = schedules.time_noise(frames=50, steps=1000)
-    found = evaluate(schedule, [0, 500, 1000, 2000], dtype)
-    np.testing.assert_allclose(found, [0.002, 0.001, 0, 0], RTOL[dtype])
+    values = evaluate(schedule, [0, 500, 1000, 2000], dtype)
+    np.testing.assert_allclose(values, [0.002, 0.001, 0, 0], RTOL[dtype])
 
 
 def test_staircase_counts_completed_steps():
     schedule = schedules.staircase((1000, 2000, 3000))
     steps = np.int32([0, 999, 1000, 2500, 3000, 9000])
-    found = np.asarray(jax.jit(schedule)(steps))
-    assert list(found) == [0, 0, 1, 2, 3, 3]
-    assert found.dtype == jnp.int32
+    values = np.asarray(jax.jit(schedule)(steps))
+    assert list(values) == [0, 0, 1, 2, 3, 3]
+    assert values.dtype == jnp.int32
     assert int(jax.jit(schedules.staircase((), start=2))(np.int32(7))) == 2

@@ -82,8 +82,8 @@ def solved(screws, plane_waves, canonical, dtype):
     count = len(canonical)
     rows = np.minimum(np.arange(LANES), count - 1)
     screws = np.broadcast_to(np.asarray(screws, dtype), (count, 2, 3))[rows]
-    found = _solved((screws[:, 0], screws[:, 1]), plane_waves, canonical[rows])
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[:count], found)
+    solution = _solved((screws[:, 0], screws[:, 1]), plane_waves, canonical[rows])
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[:count], solution)
 
 
 def waved(params, points):
@@ -128,9 +128,9 @@ def test_a_flag_is_true_only_at_upright_roots_of_a_folding_warp(float64, rng):
     directions, phases, amplitudes = params
     canonical = waved(params, points)
     fit = solved(SCREWS[0], params, canonical, "float64")
-    found = fit.value
-    angles = found @ directions.T + phases
-    residual = np.linalg.norm(waved(params, found) - canonical, axis=1)
+    place = fit.value
+    angles = place @ directions.T + phases
+    residual = np.linalg.norm(waved(params, place) - canonical, axis=1)
     grads = np.einsum("fi,nf,fj->nij", amplitudes, np.cos(angles), directions)
     upright = np.linalg.det(np.eye(3) + grads) > 0
     np.testing.assert_array_equal(fit.converged, (residual < 1e-5) & upright)
@@ -226,8 +226,8 @@ def test_gradients_are_those_of_the_implicit_function(float64, rng):
         "phases": -np.einsum("ij,fj,f->if", inverse, amplitudes, cosine),
         "amplitudes": -np.einsum("ij,f->ifj", inverse, sine),
     }
-    for found, slope in zip(by_params, exact.values(), strict=True):
-        np.testing.assert_allclose(found, slope, rtol=1e-10, atol=1e-12)
+    for grad, slope in zip(by_params, exact.values(), strict=True):
+        np.testing.assert_allclose(grad, slope, rtol=1e-10, atol=1e-12)
     np.testing.assert_allclose(by_target, inverse, rtol=1e-10, atol=1e-12)
 
 

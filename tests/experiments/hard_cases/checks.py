@@ -79,8 +79,8 @@ def hold(case: Case, dtype: str) -> None:
     count = len(case.bounds[dtype])
     with jax.enable_x64(dtype == "float64"):
         every = hard_case.evaluate(case.stable, case.inputs, dtype, count)
-    for order, found in enumerate(every):
-        _within(case, dtype, order, found)
+    for order, result in enumerate(every):
+        _within(case, dtype, order, result)
 
 
 def hold_slopes(cases: tuple[Case, ...]) -> None:
@@ -92,8 +92,8 @@ def hold_slopes(cases: tuple[Case, ...]) -> None:
         for case, count in zip(cases, counts, strict=True)
     ]
     for case, every in zip(cases, _all(functions, rows, ROUGHLY), strict=True):
-        for order, found in enumerate(every):
-            _within(case, "float32", order, np.asarray(found))
+        for order, result in enumerate(every):
+            _within(case, "float32", order, np.asarray(result))
 
 
 def hold_alone(cases: tuple[Case, ...]) -> None:
@@ -105,9 +105,9 @@ def hold_alone(cases: tuple[Case, ...]) -> None:
     first = [hard_case.constant(case.inputs[0], "float32") for case in cases]
     jitted = _all([case.stable for case in cases], first)
     for case, x, one in zip(cases, first, jitted, strict=True):
-        for how, found in (("jit", one), ("eager", case.stable(x))):
-            assert found.dtype == np.float32, f"{case.name}: {how} is {found.dtype}"
-            _within(case, "float32", 0, np.asarray(found)[None], slice(1))
+        for how, result in (("jit", one), ("eager", case.stable(x))):
+            assert result.dtype == np.float32, f"{case.name}: {how} is {result.dtype}"
+            _within(case, "float32", 0, np.asarray(result)[None], slice(1))
 
 
 def _all(functions, inputs, options=()):
@@ -119,9 +119,9 @@ def _all(functions, inputs, options=()):
     return jax.jit(every, compiler_options=dict(options))(inputs)
 
 
-def _within(case, dtype, order, found, rows=slice(None)):
+def _within(case, dtype, order, result, rows=slice(None)):
     exact = _exact(_Key(case), order, dtype)[rows]
-    off = hard_case.errors(case, found, exact, order)
+    off = hard_case.errors(case, result, exact, order)
     worst, bound = int(np.argmax(off)), case.bounds[dtype][order]
     assert off[worst] <= bound, (
         f"{case.name}, {dtype}: {ORDERS[order]} off by {off[worst]:.2e} at "
@@ -134,16 +134,16 @@ def catches_the_textbook(case: Case) -> None:
     highest = {}
     for dtype, name in case.caught:
         highest[dtype] = max(ORDERS.index(name), highest.get(dtype, 0))
-    found = {}
+    results = {}
     for dtype, order in highest.items():
         with jax.enable_x64(dtype == "float64"):
-            found[dtype] = hard_case.evaluate(
+            results[dtype] = hard_case.evaluate(
                 case.textbook, case.inputs, dtype, order + 1, ROUGHLY
             )
     for dtype, name in case.caught:
         order = ORDERS.index(name)
         exact = _exact(_Key(case), order, dtype)
-        off = hard_case.errors(case, found[dtype][order], exact, order).max()
+        off = hard_case.errors(case, results[dtype][order], exact, order).max()
         assert off > 10 * case.bounds[dtype][order], (
             f"{case.name}, {dtype}: the textbook {name} is off by {off:.2e} only"
         )

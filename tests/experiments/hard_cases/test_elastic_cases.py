@@ -38,8 +38,8 @@ def every_way(matrix):
 def of_all(matrices, dtype):
     """`every_way` of a few matrices; more rows than asked for share the program."""
     rows = np.resize(np.asarray(matrices, dtype), (ROWS, 3, 3))
-    found = jax.tree.map(np.asarray, every_way(rows))
-    return jax.tree.map(lambda leaf: leaf[: len(matrices)], found)
+    results = jax.tree.map(np.asarray, every_way(rows))
+    return jax.tree.map(lambda leaf: leaf[: len(matrices)], results)
 
 
 @pytest.mark.parametrize("name", ["log_energy", "signed_log_energy"])
@@ -79,11 +79,11 @@ def test_the_elastic_gradient_of_a_translating_warp_survives_float32():
     shift[0] += 0.4  # scene units of plain translation beside it
     points = rng.uniform(-1, 1, (16, 3))
     inputs = [np.asarray(x, np.float32) for x in (turn, shift, points)]
-    found = slopes(tuple(inputs[:2]), inputs[2])
+    results = slopes(tuple(inputs[:2]), inputs[2])
     with jax.enable_x64(True):
         wide = [np.asarray(x, np.float64) for x in inputs]
         exact = slopes(tuple(wide[:2]), wide[2])
-    for one, other in zip(found, exact, strict=True):
+    for one, other in zip(results, exact, strict=True):
         one, other = np.asarray(one, np.float64), np.asarray(other)
         assert np.max(abs(one - other)) < 1e-5 * np.max(abs(other))
 

@@ -100,22 +100,22 @@ def test_ssim_under_jit_is_about_one_level(level):
     """Contracted in one place and not in another, the mean of the target was two."""
     rng = np.random.default_rng(0)
     both = level + 0.5 * rng.integers(-2, 3, (2, 12, 13, 1))
-    found = jax.jit(losses.dssim_map)(*np.float32(both))
+    similarity = jax.jit(losses.dssim_map)(*np.float32(both))
     with jax.enable_x64(True):
         exact = jax.jit(losses.dssim_map)(*both)
-    np.testing.assert_allclose(found, exact, atol=1e-6)
+    np.testing.assert_allclose(similarity, exact, atol=1e-6)
     valid = jax.jit(image_quality.ms_ssim, static_argnames="scales")
-    found = valid(*np.float32(both), scales=1)
+    similarity = valid(*np.float32(both), scales=1)
     expected = 1 - np.asarray(exact)[5:-5, 5:-5].mean()
-    assert abs(found - expected) < 1e-6
+    assert abs(similarity - expected) < 1e-6
 
 
 @jax.jit
-def geometry_measures(found, truth, mask):
-    pixels = found.reshape(450, 2), truth.reshape(450, 2)
+def geometry_measures(estimate, truth, mask):
+    pixels = estimate.reshape(450, 2), truth.reshape(450, 2)
     return (
-        geometry_quality.depth_errors(found, truth, mask),
-        geometry_quality.align_depth(found, truth, mask),
+        geometry_quality.depth_errors(estimate, truth, mask),
+        geometry_quality.align_depth(estimate, truth, mask),
         geometry_quality.flow_errors(*pixels, mask[:450]),
         geometry_quality.track_errors(*pixels, mask[:450], 0.3),
     )
@@ -125,9 +125,9 @@ def geometry_measures(found, truth, mask):
 @pytest.mark.parametrize("kind", ["bfloat16", "float16"])
 def test_depths_flows_and_tracks_in_half_precision_are_counted(kind, rng):
     truth = rng.uniform(1, 5, 900)
-    found = truth + 0.2 * rng.normal(size=900)
+    estimate = truth + 0.2 * rng.normal(size=900)
     mask = rng.random(900) < 0.6
-    half = [x.astype(jnp.dtype(kind)) for x in (found, truth)]
+    half = [x.astype(jnp.dtype(kind)) for x in (estimate, truth)]
     wide = [x.astype(np.float32) for x in half]
     for value, expected in zip(
         jax.tree.leaves(geometry_measures(*half, mask)),

@@ -120,6 +120,6 @@ def test_ten_thousand_compositions_stay_a_rotation(dtype):
     total = np.asarray(compose(turn))
     assert abs(np.linalg.norm(total) - 1) < 2 * np.finfo(dtype).eps
     truth = Rotation.from_rotvec(10_000 * np.float64(turn))
-    found = Rotation.from_quat(np.roll(np.asarray(total, np.float64), -1))
+    rotation = Rotation.from_quat(np.roll(np.asarray(total, np.float64), -1))
     # half an ulp of the step's angle, ten thousand times
-    assert (found.inv() * truth).magnitude() < 10_000 * 2 * np.finfo(dtype).eps
+    assert (rotation.inv() * truth).magnitude() < 10_000 * 2 * np.finfo(dtype).eps

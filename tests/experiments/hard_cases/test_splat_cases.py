@@ -49,12 +49,12 @@ def neighbours(value, dtype):
 @jax.jit
 def seen_and_slopes(gaussians, view):
     def loss(gaussians):
-        found = projection.project(gaussians, view, SIZE, NEARBY)
-        total = jnp.sum(found.mean_px) + jnp.sum(found.whitening)
-        return total + jnp.sum(found.opacity + found.depth), found
+        footprint = projection.project(gaussians, view, SIZE, NEARBY)
+        total = jnp.sum(footprint.mean_px) + jnp.sum(footprint.whitening)
+        return total + jnp.sum(footprint.opacity + footprint.depth), footprint
 
-    slopes, found = jax.grad(loss, has_aux=True)(gaussians)
-    return found, slopes
+    slopes, footprint = jax.grad(loss, has_aux=True)(gaussians)
+    return footprint, slopes
 
 
 @pytest.mark.parametrize(
@@ -68,9 +68,9 @@ def seen_and_slopes(gaussians, view):
 def test_what_is_drawn_ends_within_one_step_of_its_edge(what, edge, drawn, dtype):
     for value, expected in zip(neighbours(edge, dtype), drawn, strict=True):
         place = {"opacity": value} if what == "opacity" else {"mean": (0, 0, value)}
-        found, slopes = seen_and_slopes(one(dtype, **place), camera(dtype))
-        assert bool(found.visible[0]) is expected
-        for leaf in (*found, *slopes):
+        footprint, slopes = seen_and_slopes(one(dtype, **place), camera(dtype))
+        assert bool(footprint.visible[0]) is expected
+        for leaf in (*footprint, *slopes):
             assert np.isfinite(leaf).all()
         if not expected:
             assert not any(np.any(leaf) for leaf in slopes)
@@ -82,14 +82,14 @@ def test_the_clamped_tangent_is_continuous_and_its_slope_is_the_clamped_one(
 ):
     """At x/z of half an image and 0.3 beyond: J alone stops there, the mean goes on."""
     limit = side * (32 + 0.3 * 32) / 64
-    found = []
+    places = []
     for share in (1 - 1e-4, 1 + 1e-4, 2.0):
         gaussians = one(dtype, mean=(2 * limit * share, 0, 2))
         footprint, slopes = jax.tree.map(
             np.asarray, seen_and_slopes(gaussians, camera(dtype))
         )
-        found.append((footprint, slopes.mean[0, 0], share))
-    inside, outside, beyond = found
+        places.append((footprint, slopes.mean[0, 0], share))
+    inside, outside, beyond = places
     for field, tolerance in (("mean_px", 1e-2), ("whitening", 1e-4)):
         a, b = (getattr(pair[0], field) for pair in (inside, outside))
         np.testing.assert_allclose(a, b, rtol=0, atol=tolerance)
@@ -120,10 +120,10 @@ def pixel(alphas, values, spec):
 def pixel_and_slopes(alphas, values, spec):
     """Colour and what is left, and slopes in `alphas` and `values`; one or two rows."""
     hidden = (0, max(0, 2 - len(alphas)))  # what is not drawn behind a single one
-    found, slopes = _pixel_and_slopes(
+    drawn, slopes = _pixel_and_slopes(
         np.pad(alphas, hidden), np.pad(values, hidden), spec
     )
-    return found, [np.asarray(slope)[: len(alphas)] for slope in slopes]
+    return drawn, [np.asarray(slope)[: len(alphas)] for slope in slopes]
 
 
 @functools.partial(jax.jit, static_argnums=2)
@@ -132,8 +132,8 @@ def _pixel_and_slopes(alphas, values, spec):
         colour, left = pixel(alphas, values, spec)
         return colour + left / 2, (colour, left)
 
-    slopes, found = jax.grad(loss, (0, 1), has_aux=True)(alphas, values)
-    return found, slopes
+    slopes, drawn = jax.grad(loss, (0, 1), has_aux=True)(alphas, values)
+    return drawn, slopes
 
 
 def test_an_alpha_jumps_at_the_cut_and_nowhere_else(dtype):
