@@ -43,7 +43,9 @@ EXCUSED = {
         ["camera.resize", "camera.crop", "camera.pinhole", "camera.look_at"], "host"
     ),
     **dict.fromkeys(["camera.stack", "camera.take", "camera.validate"], "host"),
-    **dict.fromkeys(["codes.check_ids", "splats.rows_to_write"], "host"),
+    **dict.fromkeys(
+        ["rays.across_ray", "codes.check_ids", "splats.rows_to_write"], "host"
+    ),
     "losses.check_geman_mcclure": "settings",
     **dict.fromkeys(["splats.from_points"], "host"),
     **dict.fromkeys(["splats.random_in_views", "splats.scene_extent"], "host"),

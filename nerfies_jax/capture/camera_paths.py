@@ -5,6 +5,7 @@ import numpy as np
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry.camera import Camera
+from nerfies_jax.geometry.rays import across_ray
 
 KINDS = ("sway", "orbit", "captured")
 
@@ -58,7 +59,7 @@ def focus_point(train_cameras: Camera, near: float, far: float) -> np.ndarray:
     """
     axes = train_cameras.camera_from_world[:, 2, :].astype(np.float64)
     centres = train_cameras.position.astype(np.float64)
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    across = across_ray(axes)
     system = across.sum(axis=0)
     mean_axis = axes.mean(axis=0) / np.linalg.norm(axes.mean(axis=0))
     mean_centre = centres.mean(axis=0)

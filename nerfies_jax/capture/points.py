@@ -9,6 +9,7 @@ import plyfile
 from nerfies_jax.capture.capture import CaptureError, PointCloud
 from nerfies_jax.capture.frames import UNSEEN
 from nerfies_jax.geometry.camera import Camera
+from nerfies_jax.geometry.rays import across_ray
 
 MAX_POINTS = 50_000_000
 MAX_HEADER = 65_536  # bytes; plyfile hangs on a header line of 100 MB
@@ -57,7 +58,7 @@ def place_by_cameras(cameras: Camera) -> Placement:
     """
     axes = cameras.camera_from_world[:, 2].astype(np.float64)
     positions = cameras.position.astype(np.float64)
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # projects an axis away
+    across = across_ray(axes)
     matrix, right = across.sum(0), np.einsum("nij,nj->i", across, positions)
     # Parallel axes meet nowhere; then the cameras' own spread sets the size.
     meets = np.linalg.svd(matrix, compute_uv=False)[-1] > 1e-3 * len(axes)

@@ -11,8 +11,8 @@ import scipy.ndimage as nd
 from nerfies_jax.evidence import view_set
 from nerfies_jax.evidence.findings import LIKELY, Finding, cannot_tell, judge
 from nerfies_jax.evidence.findings import MOTION as EFFECT
-from nerfies_jax.evidence.rest_points import across_ray
 from nerfies_jax.evidence.view_set import Views
+from nerfies_jax.geometry.rays import across_ray
 
 MIN_VIEWS = 8  # fewer cut little away, at rest or not
 PLAIN_SHARE = 0.2  # of the pixels in the median view

@@ -13,9 +13,10 @@ import numpy as np
 import scipy.linalg
 from scipy.spatial import cKDTree
 
-from nerfies_jax.evidence.rest_points import RestPoints, across_ray, track_rays
+from nerfies_jax.evidence.rest_points import RestPoints, track_rays
 from nerfies_jax.evidence.tracks import TRACK_PX, Tracks
 from nerfies_jax.evidence.view_set import Views
+from nerfies_jax.geometry.rays import across_ray
 
 # On squared acceleration, in units per frame squared, beside squared distances to rays.
 # Penalties from 0.1 to 3 give the same errors in the built-in scenes.

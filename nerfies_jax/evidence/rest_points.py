@@ -7,6 +7,7 @@ import numpy as np
 from nerfies_jax.evidence import view_set
 from nerfies_jax.evidence.tracks import Tracks
 from nerfies_jax.evidence.view_set import Views
+from nerfies_jax.geometry.rays import across_ray
 
 ROUNDS = 4  # of weights: distances to a ray become pixels by the depth
 FAR_AWAY = 10.0  # times the cameras' spread: depth of what shows no parallax at all
@@ -34,11 +35,6 @@ def track_rays(views: Views, tracks: Tracks) -> np.ndarray:
     inverse = np.linalg.inv(views.intrinsics)
     local = np.einsum("fij,nfj->nfi", inverse, np.concatenate([pixel, ones], -1))
     return np.einsum("fji,nfj->nfi", views.rotation, local)
-
-
-def across_ray(unit: np.ndarray) -> np.ndarray:
-    """[..., 3, 3]: what a vector has across the unit direction, 1 - u u^T."""
-    return np.eye(3) - unit[..., :, None] * unit[..., None, :]
 
 
 def fit(views: Views, tracks: Tracks) -> RestPoints:

@@ -9,6 +9,7 @@ from nerfies_jax.evidence.dense_flow import NeighbourFlow
 from nerfies_jax.evidence.rest_points import RestPoints
 from nerfies_jax.evidence.tracks import TRACK_PX, Tracks
 from nerfies_jax.evidence.view_set import Views
+from nerfies_jax.geometry.rays import across_ray
 
 REACH = 8  # frames before and after
 CENTRES = 12  # frames whose pixels are placed
@@ -83,7 +84,7 @@ def depth_deviation(views: Views, tracks: Tracks, rest: RestPoints) -> np.ndarra
     offset = rest.position[:, None] - views.position
     distance = np.maximum(np.linalg.norm(offset, axis=-1), 1e-9)
     unit = offset / distance[..., None]
-    across = rest_points.across_ray(unit)
+    across = across_ray(unit)
     focal = views.intrinsics[:, 0, 0]
     with np.errstate(divide="ignore"):
         weight = tracks.seen * (focal / (TRACK_PX * distance)) ** 2

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from nerfies_jax.geometry import camera as cameras
@@ -54,6 +55,11 @@ def point_at(
 ) -> Float[Array, "3"]:
     """The point at one distance along one ray."""
     return origin + distance * direction
+
+
+def across_ray(unit: Float[np.ndarray, "*rays 3"]) -> Float[np.ndarray, "*rays 3 3"]:
+    """What a vector has across the unit direction, 1 - u uᵀ; host side, in float64."""
+    return np.eye(3) - unit[..., :, None] * unit[..., None, :]
 
 
 def depth_per_distance(
