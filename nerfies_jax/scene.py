@@ -43,6 +43,8 @@ __all__ = ["Field", "RadianceScene", "SceneMetadata", "build", "field", "metadat
 
 PyTree = Any
 
+OPTIMISER = optax.scale_by_adam()
+
 
 def metadata_of(capture: Capture, spec: RadianceScene) -> SceneMetadata:
     """What the field must know of a capture; host side."""
@@ -63,28 +65,6 @@ def build(
             "the background effect holds static points still, and this capture has "
             "none; leave it out with --set background=none"
         )
-    optimiser = optax.scale_by_adam()
-    schedule = schedules.log_linear(
-        spec.learning_rate, spec.learning_rate_end, spec.steps
-    )
-
-    def step(state: TrainState, frames: Frames):
-        batch_key, field_key = jax.random.split(loop.step_key(state))
-        batch = draw_batch(frames, spec.rays, batch_key)
-
-        def loss(params):
-            terms = loss_terms(radiance, params, frames, batch, state.step, field_key)
-            return weighted_sum(terms), values(terms)
-
-        (value, logged), grads = jax.value_and_grad(loss, has_aux=True)(state.params)
-        # optax counts in int32 and multiplies float32 by it.
-        with jax.numpy_dtype_promotion("standard"):
-            updates, moments = optimiser.update(grads, state.optimiser)
-        rates = learning_rates(radiance.effects, schedule, state.params, state.step)
-        params = apply_updates(state.params, updates, rates)
-        metrics = {"loss": value, "mse": logged["fine"], **logged}
-        state = TrainState(params, moments, state.aux_state, state.step + 1, state.key)
-        return state, metrics
 
     def whole_frame(params, view: View, size, step):
         view_codes = radiance.codes_at(params, view)
@@ -108,7 +88,7 @@ def build(
     def first_state(params, key):
         params = in_default_precision(params)
         return TrainState(
-            params, optimiser.init(params), (), jnp.zeros((), jnp.int32), key
+            params, OPTIMISER.init(params), (), jnp.zeros((), jnp.int32), key
         )
 
     read = frozenset().union(*(effect.required_data for effect in radiance.effects))
@@ -116,13 +96,50 @@ def build(
         # By name alone: a run with other effects of one's own is another run.
         spec=(spec, metadata, *(effect.name for effect in effects)),
         init=init,
-        step=step,
+        step=_stepper(spec, radiance),
         render=whole_frame,
         events=(),
         counts=count_parameters,
         required_data=read,
         example=example,
     )
+
+
+def _stepper(spec, radiance):
+    """One update from one batch of rays: (state, frames) -> (state, metrics), pure."""
+    schedule = common_rate(spec)
+
+    def step(state: TrainState, frames: Frames):
+        batch_key, field_key = jax.random.split(loop.step_key(state))
+        batch = draw_batch(frames, spec.rays, batch_key)
+
+        def loss(params):
+            terms = loss_terms(radiance, params, frames, batch, state.step, field_key)
+            return weighted_sum(terms), values(terms)
+
+        (value, logged), grads = jax.value_and_grad(loss, has_aux=True)(state.params)
+        params, moments = descend(radiance.effects, schedule, state, grads)
+        metrics = {"loss": value, "mse": logged["fine"], **logged}
+        state = TrainState(params, moments, state.aux_state, state.step + 1, state.key)
+        return state, metrics
+
+    return step
+
+
+def common_rate(spec: RadianceScene) -> Schedule:
+    """The learning rate of all that has none of its own."""
+    return schedules.log_linear(spec.learning_rate, spec.learning_rate_end, spec.steps)
+
+
+def descend(
+    effects: tuple[Effect, ...], schedule: Schedule, state: TrainState, grads: PyTree
+) -> tuple[PyTree, optax.OptState]:
+    """The parameters and moments after one update along `grads`."""
+    # optax counts in int32 and multiplies float32 by it.
+    with jax.numpy_dtype_promotion("standard"):
+        updates, moments = OPTIMISER.update(grads, state.optimiser)
+    rates = learning_rates(effects, schedule, state.params, state.step)
+    return apply_updates(state.params, updates, rates), moments
 
 
 def learning_rates(
