@@ -15,10 +15,10 @@ OVERRUN = 1.5
 def with_seconds(run: Run, state: TrainState, seconds: float | int) -> tuple[Run, str]:
     """The run over as many steps as take `seconds` of training, and the plan in words.
 
-    Its schedules stretch with the steps. What a step takes is measured with the first
-    state (`rate.step_time`); what is expected of growth is the representation's word.
-    Two digits of the steps are kept: the program of another run as long is then found
-    in the compilation cache.
+    Its schedules stretch with the steps; its first state does not know of them and
+    stays `state`, with which is measured what a step takes (`rate.step_time`). What is
+    expected of growth is the representation's word. Two digits of the steps are kept:
+    the program of another run as long is then found in the compilation cache.
     """
     frames = evaluation.frames_of(run.capture, run.model.required_data)
     step = rate.step_time(run.model, state, frames, run.spec.steps)

@@ -74,7 +74,6 @@ def reconstruct(
             if seconds is not None and not _steps_given(run.config):
                 run, line = plan.with_seconds(run, state, seconds)
                 print(line)
-                state = first_state(run)
                 pace = dataclasses.replace(pace, seconds=plan.OVERRUN * seconds)
             stem = "-".join(run.capture.name.split()) + "-" + run.config.preset
             folder = run_folder.new_run_folder(out, stem)

@@ -3,6 +3,7 @@
 import dataclasses
 
 import jax
+import numpy as np
 import pytest
 
 from nerfies_jax import runs
@@ -47,6 +48,8 @@ def test_seconds_are_the_steps_that_they_allow(growing, tmp_path, monkeypatch):
     assert found.spec.steps == found.config.steps == plan.rounded(steps)
     assert found.spec == runs.scene_spec(found.config)
     assert found.spec.sh_every == round(found.spec.steps / 3)
+    longer = found.model.init(found.capture, jax.random.key(0))
+    jax.tree.map(np.testing.assert_array_equal, longer.params, state.params)
     assert found.capture is run.capture
     assert found.filmed is run.filmed
     assert line.startswith(f"plan: {found.spec.steps:,} steps for 10 s of training (10")
