@@ -33,7 +33,7 @@ def look(source: CaptureSource, seed: int, out: pathlib.Path | None) -> None:
     path = record.file_of(capture, CACHE / "evidence")
     if path.exists():
         print("gathered before, and read again")
-    evidence = record.cached(capture, CACHE / "evidence", tell=_Told())
+    evidence = record.cached(capture, CACHE / "evidence", tell=_Progress())
     views = view_set.in_time_order(record.looked_at(capture, evidence.factor))
     counted = summary.of(views, evidence)
     print("\n".join(summary.lines(counted, evidence)))
@@ -86,7 +86,7 @@ def as_json(values: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-class _Told:
+class _Progress:
     """Prints each part as it begins."""
 
     def __init__(self):

@@ -76,14 +76,14 @@ class Trial:
         self._stored = stored
         self.folder = args.out / name
         self.folder.mkdir(parents=True, exist_ok=True)
-        self._found: tuple[Finding, ...] | None = None
+        self._findings: tuple[Finding, ...] | None = None
         self._job: Job | None = None
         self._refused: dict[str, str] = {}  # arms that cannot be built, and why
 
     def findings(self) -> tuple[Finding, ...]:
         """As kept, or looked for now; ValueError where another capture's are kept."""
-        if self._found is not None:
-            return self._found
+        if self._findings is not None:
+            return self._findings
         path = self.folder / FOUND
         args = specs.as_json(self._source)
         if path.is_file():
@@ -92,16 +92,16 @@ class Trial:
                 raise ValueError(
                     f"{path}: the capture was read otherwise; name another --out"
                 )
-            self._found = tuple(Finding(**one) for one in kept["findings"])
-            return self._found
+            self._findings = tuple(Finding(**one) for one in kept["findings"])
+            return self._findings
         log(f"{self.name}: looking at it")
         inspected = inspection.inspect(self._stored)
         pictures.save(inspected.sheet, self.folder / "inspected.png")
         advice = adviser.advise_all(inspected.findings)
         findings = inspect_scene.as_json(self._stored, inspected, advice)
         write_json(path, {"read as": args, **findings})
-        self._found = inspected.findings
-        return self._found
+        self._findings = inspected.findings
+        return self._findings
 
     def advice(self, preset: str) -> adviser.Advice:
         """In the representation and size of a preset."""

@@ -94,7 +94,9 @@ def _reached(out, workers, with_copy):
     from nerfies_jax.capture.json_files import write_json
 
     path = out.with_suffix(".reached.json")
-    digest = hashlib.blake2b(b"".join(sorted(map(_told, _files())))).hexdigest()
+    digest = hashlib.blake2b(
+        b"".join(sorted(map(_name_and_bytes, _files())))
+    ).hexdigest()
     stored = json.loads(path.read_text()) if path.exists() else {}
     entered = stored["reached"] if stored.get("digest") == digest else {}
 
@@ -114,7 +116,7 @@ def _reached(out, workers, with_copy):
     return {test: set(places) for test, places in entered.items()}
 
 
-def _told(name):
+def _name_and_bytes(name):
     return name.encode() + (ROOT / name).read_bytes()
 
 

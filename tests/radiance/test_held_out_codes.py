@@ -37,20 +37,20 @@ def test_a_code_is_found_again_from_half_a_picture_if_that_was_filmed():
     state = TrainState(params, (), (), jnp.asarray(10, jnp.int32), jax.random.key(0))
     renderer = evaluation.Renderer(nerf_scene.build(TINY_FIELD, metadata), filmed.size)
 
-    def before_and_found(capture):
+    def before_and_after(capture):
         colour = evaluation.score(renderer, state, capture, rows).colour
         return (
             evaluation.score_right_halves(capture, rows, colour),
             held_out_codes.score(TINY_FIELD, metadata, state, capture, rows),
         )
 
-    before, after = before_and_found(filmed)
+    before, after = before_and_after(filmed)
     assert before.psnr[0] < 35
     assert after.psnr[0] > 48  # the truth has 8 bits: 59 dB is all there is
     assert after.ssim[0] > 0.99
     valid = np.ones(filmed.images.shape[:3], bool)
     valid[:, :, :20] = False
-    before, after = before_and_found(dataclasses.replace(filmed, valid=valid))
+    before, after = before_and_after(dataclasses.replace(filmed, valid=valid))
     np.testing.assert_allclose(after.psnr, before.psnr, atol=1e-3)
 
 
