@@ -13,19 +13,18 @@ from gaussians_jax import (
     densification,
     growth,
     initialisation,
-    learning_rates,
     mcmc,
     phases,
     rendering,
     splats,
     track_start,
+    update,
 )
 from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.effects import deformation
 from gaussians_jax.growth import AuxState, states_of
 from gaussians_jax.initialisation import StartSpec
 from gaussians_jax.mcmc import MCMCStrategySpec
-from gaussians_jax.phases import Trained
 from gaussians_jax.spec import (
     OPTIMISERS,
     SceneMetadata,
@@ -34,6 +33,7 @@ from gaussians_jax.spec import (
     refuse_what_cannot_train,
 )
 from gaussians_jax.splats import Params
+from gaussians_jax.update import Drawn
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evidence import usable_paths
 from nerfies_jax.training import loop, losses
@@ -59,7 +59,6 @@ from nerfies_jax.training.model import (
     View,
     in_default_precision,
 )
-from nerfies_jax.training.updates import apply_updates
 
 PyTree = Any
 
@@ -174,16 +173,14 @@ def _stepper(spec, metadata, effects, optimiser):
         size = frames.images.shape[2], frames.images.shape[1]
         degree = splats.active_degree(state.step, spec.sh_every, spec.sh_degree)
         condition = FrameCondition(view.time, step=state.step, key=loop.step_key(state))
-        mask = phases.update_mask(spec.alternation, state.step)
 
         def deform(params, gaussians):
             return deformation.deform_in_training(effects, params, gaussians, condition)
 
         if spec.alternation is not None:
+            mask = phases.update_mask(spec.alternation, state.step)
             deform = phases.stop_frozen_gradients(mask, deform)
-        # A channel that nothing reads is still blended: 4 % of a step.
-        read = any("depths" in effect.required_data for effect in effects)
-        depth = read and frames.depths is not None
+        depth = draws_depth(effects, frames)
 
         def loss(params, probe):
             canonical = splats.activate(params.rows["splats"])
@@ -197,36 +194,24 @@ def _stepper(spec, metadata, effects, optimiser):
             return value, (metrics, frame.footprints, canonical, moved)
 
         probe = jnp.zeros_like(state.params.rows["splats"].mean[:, :2])
-        (value, (metrics, footprints, *drawn)), (grads, mean2d_grad) = (
-            jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)(state.params, probe)
+        (value, (metrics, *drawn)), (grads, mean2d_grad) = jax.value_and_grad(
+            loss, argnums=(0, 1), has_aux=True
+        )(state.params, probe)
+        trained = update.descend(spec, metadata, effects, optimiser, state, grads)
+        drawn = Drawn(mean2d_grad, *drawn)
+        aux_state = update.gather(
+            spec, effects, state.aux_state, drawn, condition, size
         )
-        updates, opt_state = optimiser.update(grads, state.optimiser, state.params)
-        by_part = _learning_rates(spec, metadata, effects, state.step)
-        trained = Trained(apply_updates(state.params, updates, by_part), opt_state)
-        if isinstance(spec.densification, MCMCStrategySpec):
-            noise_key, rate = (
-                growth.stream_key(state, growth.NOISE),
-                by_part.rows["splats"].mean,
-            )
-            params = mcmc.shake(noise_key, trained.params, rate, spec.densification)
-            trained = trained._replace(params=params)
-        if spec.alternation is not None:
-            before = Trained(state.params, state.optimiser)
-            trained = phases.freeze(optimiser, mask, before, trained)
-        stats, states = state.aux_state
-        if isinstance(spec.densification, DefaultStrategySpec):
-            radius_px = jnp.max(footprints.extent_px, axis=1)
-            stats = densification.observe(
-                stats, mean2d_grad, footprints.visible, radius_px, size
-            )
-        for effect in effects:
-            if effect.update_state is not None:
-                own = effect.update_state(states[effect.name], *drawn, condition)
-                states = states | {effect.name: own}
-        state = TrainState(*trained, AuxState(stats, states), state.step + 1, state.key)
+        state = TrainState(*trained, aux_state, state.step + 1, state.key)
         return state, {"loss": value, **metrics}
 
     return step
+
+
+def draws_depth(effects: tuple[Effect, ...], frames: Frames) -> bool:
+    """Whether a step draws depths: a channel that nothing reads costs 4 % of it."""
+    read = any("depths" in effect.required_data for effect in effects)
+    return read and frames.depths is not None
 
 
 def loss_of(
@@ -274,22 +259,6 @@ def observe(
 def _view(frames, row):
     camera = jax.tree.map(lambda leaf: leaf[row], frames.cameras)
     return View(camera, frames.times[row], frames.appearance[row])
-
-
-def _learning_rates(spec, metadata, effects, step):
-    """A prefix of `Params` with the learning rate of everything below each leaf."""
-    rows = {
-        "splats": learning_rates.at_step(
-            spec.learning_rates, metadata.extent, spec.steps, step, spec.annealing
-        )
-    }
-    nets = {}
-    for effect in effects:
-        if effect.init_rows is not None:
-            rows[effect.name] = effect.row_learning_rate(step)
-        if effect.init is not None:
-            nets[effect.name] = effect.learning_rate(step)
-    return Params(rows, nets)
 
 
 def shuffled_row(

@@ -3,8 +3,10 @@
 import jax
 import jax.numpy as jnp
 
-from gaussians_jax import rendering, scene, splats
+from gaussians_jax import rendering, scene, splats, update
 from gaussians_jax.effects import deformation
+from gaussians_jax.spec import OPTIMISERS
+from gaussians_jax.update import Drawn
 from nerfies_jax.measure.part_time import part_ms
 from nerfies_jax.training import losses
 from nerfies_jax.training.effects import (
@@ -27,55 +29,98 @@ def parts(
 ) -> dict[str, float]:
     """Milliseconds of each part of one step, forward and backward; medians, warm.
 
-    Each part is timed by itself on the first frame. What is left of the whole step is
-    the optimiser and the statistics for the density control.
+    Each part is timed by itself on the first frame; "rest" is what they leave of the
+    whole step.
     """
-    params = state.params
-    size = frames.images.shape[2], frames.images.shape[1]
+    effects = scene.all_effects(spec, metadata, effects)
+    condition = FrameCondition(frames.times[0], step=state.step, key=state.key)
+    drawing, footprints = _drawing(spec, effects, state, frames)
+    timed = {
+        **drawing,
+        **_own_of_effects(effects, state, frames, condition),
+        **_update(spec, metadata, effects, state, footprints, condition, frames),
+    }
+    whole = part_ms(model.step, state, frames)
+    return timed | {"rest": max(whole - sum(timed.values()), 0.0)}
+
+
+def _drawing(spec, effects, state, frames):
+    """What the picture and its loss take, and the footprints that are drawn."""
     camera = jax.tree.map(lambda leaf: leaf[0], frames.cameras)
     observation = scene.observe(frames, 0, None)
-    condition = FrameCondition(frames.times[0], step=state.step, key=state.key)
-    effects = scene.all_effects(spec, metadata, effects)
 
-    def draw(gaussians, coefficients):
+    def draw(gaussians, coefficients, probe):
         frame = rendering.render_harmonics(
-            gaussians, coefficients, camera, size, spec.raster
+            gaussians,
+            coefficients,
+            camera,
+            _size(frames),
+            spec.raster,
+            mean2d_offset=probe,
+            depth=scene.draws_depth(effects, frames),
         )
-        return jnp.sum(frame.rendering.colour)
+        drawn = jax.tree.leaves(frame.rendering)
+        return sum(jnp.sum(leaf) for leaf in drawn), frame.footprints
 
     def compare(colour):
         return losses.photometric(
             colour, observation.truth, observation.valid, dssim_weight=spec.dssim_weight
         )
 
-    gaussians = splats.activate(params.rows["splats"])
-    coefficients = splats.active_harmonics(params.rows["splats"], spec.sh_degree)
+    rows = state.params.rows["splats"]
+    gaussians = splats.activate(rows)
+    coefficients = splats.active_harmonics(rows, spec.sh_degree)
+    args = gaussians, coefficients, jnp.zeros_like(gaussians.mean[:, :2])
     timed = {
-        "project and blend": part_ms(jax.grad(draw, (0, 1)), gaussians, coefficients),
+        "project and blend": part_ms(jax.grad(draw, (0, 1, 2), has_aux=True), *args),
         "loss": part_ms(jax.grad(compare), observation.truth),
     }
+    return timed, jax.jit(draw)(*args)[1]
+
+
+def _own_of_effects(effects, state, frames, condition):
+    """What each effect that deforms or penalises takes."""
+    observation, timed = scene.observe(frames, 0, None), {}
+    drawn = Rendering(
+        observation.truth, *(jnp.ones(observation.truth.shape[:2]) for _ in "ad")
+    )
     for effect in effects:
+        # The step is an input, too: a warm-up that is compiled in costs nothing.
+        def one(params, rendering, kept, condition, effect=effect):
+            seen = observation._replace(rendering=rendering)
+            return _sum_of_effect(effect, effects, params, seen, condition, kept)
 
-        def one(params, rendering, state, effect=effect):
-            return _sum_of_effect(
-                effect,
-                effects,
-                params,
-                observation._replace(rendering=rendering),
-                condition,
-                state,
-            )
-
-        kept = state.aux_state.effects.get(effect.name)
-        drawn = Rendering(
-            observation.truth, *(jnp.ones(observation.truth.shape[:2]) for _ in "ad")
-        )
         if {effect.deform, effect.penalty} != {None}:
+            kept = state.aux_state.effects.get(effect.name)
             grads = jax.grad(one, (0, 1))
-            timed[effect.name.replace("_", " ")] = part_ms(grads, params, drawn, kept)
-    whole = part_ms(model.step, state, frames)
-    timed["optimiser and statistics"] = max(whole - sum(timed.values()), 0.0)
+            name = effect.name.replace("_", " ")
+            timed[name] = part_ms(grads, state.params, drawn, kept, condition)
     return timed
+
+
+def _update(spec, metadata, effects, state, footprints, condition, frames):
+    """What follows the gradient, with parameters for gradients of their shape."""
+    optimiser = OPTIMISERS[spec.optimiser]()
+
+    def descend(state, grads):
+        return update.descend(spec, metadata, effects, optimiser, state, grads)
+
+    def gather(aux_state, *drawn):
+        drawn = Drawn(*drawn)
+        return update.gather(spec, effects, aux_state, drawn, condition, _size(frames))
+
+    timed = {"optimiser": part_ms(descend, state, state.params)}
+    if update.has_statistics(spec, effects):
+        gaussians = splats.activate(state.params.rows["splats"])
+        slope = jnp.zeros_like(gaussians.mean[:, :2])
+        timed["statistics"] = part_ms(
+            gather, state.aux_state, slope, footprints, gaussians, gaussians
+        )
+    return timed
+
+
+def _size(frames):
+    return frames.images.shape[2], frames.images.shape[1]
 
 
 def _sum_of_effect(effect, effects, params, observation, condition, state):

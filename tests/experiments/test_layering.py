@@ -39,6 +39,7 @@ FLOORS = {
     "gaussians_jax.track_start": 8,
     "gaussians_jax.point_tracks": 8,
     "gaussians_jax.step_time": 8,
+    "gaussians_jax.update": 8,
     "gaussians_jax.variants": 8,
     "gaussians_jax.presets": 8,
     "gaussians_jax.representation": 8,

@@ -68,7 +68,7 @@ def test_a_field_leaves_the_files_and_metrics_of_a_run_and_no_gaussians(run):
     assert metrics["train.steps"] == 12
     page = (run / "report.html").read_text()
     assert "codes fitted to the left halves" in page
-    assert "rays and optimiser" in page
+    assert "backward" in page
     capture = scenes.tiny_capture()
     picture = exr.read_exr(next((run / "depth").glob("*.exr")))
     seen = picture.alpha > 0.1  # twelve steps leave it thin
