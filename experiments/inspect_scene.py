@@ -63,7 +63,7 @@ def report(inspected, advice, source):
     from nerfies_jax.runs import commands, prices
     from nerfies_jax.runs.config import RunConfig
 
-    costs = prices.told(inspected.findings)
+    costs = prices.format_prices(inspected.findings)
     lines = ["", *findings.table(inspected.findings, costs), ""]
     lines += [prices.legend(), ""]
     for one in advice:

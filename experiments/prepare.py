@@ -272,10 +272,10 @@ def _reconstruct(scratch, pictures, masks, out):
     from nerfies_jax.capture.capture import describe
     from nerfies_jax.capture.structure_from_motion import run_sfm
 
-    found = colmap.read(run_sfm(pictures, scratch / "model", masks))
-    found = dataclasses.replace(found, name=pathlib.Path(out).name, path=None)
-    nerfies_format.write(found, out)
-    return list(describe(found))
+    capture = colmap.read(run_sfm(pictures, scratch / "model", masks))
+    capture = dataclasses.replace(capture, name=pathlib.Path(out).name, path=None)
+    nerfies_format.write(capture, out)
+    return list(describe(capture))
 
 
 CONVERTERS = {Npz: convert_npz, Video: convert_video, Pictures: convert_pictures}

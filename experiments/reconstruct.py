@@ -123,19 +123,19 @@ def _check_resumed(args):
 
 def _threads(args):
     """How many cores the representation wants XLA to see."""
-    found = representations.of_run(args.out) if args.resume else None
-    if found is None:
+    representation = representations.of_run(args.out) if args.resume else None
+    if representation is None:
         if args.preset is None:  # what is chosen by the capture are splats
             return representations.named("gaussians").threads
-        found = representations.of_preset(args.preset)
-    return found.threads
+        representation = representations.of_preset(args.preset)
+    return representation.threads
 
 
 def _expected(args):
     """What the command line says of the run that it continues, by field."""
-    said = {"preset": args.preset, "seed": args.seed, "effects": args.effect or None}
-    said = {name: value for name, value in said.items() if value is not None}
-    return {**cli.given(args.source), **said}
+    options = {"preset": args.preset, "seed": args.seed, "effects": args.effect or None}
+    options = {name: value for name, value in options.items() if value is not None}
+    return {**cli.given(args.source), **options}
 
 
 if __name__ == "__main__":

@@ -66,15 +66,15 @@ def point_count(capture: Capture) -> int:
 
 def uses_capture_points(spec: InitSpec, capture: Capture) -> bool:
     """Whether the first Gaussians are the capture's own points; host side."""
-    found = point_count(capture)
-    if spec.source == "points" and not found:
+    points = point_count(capture)
+    if spec.source == "points" and not points:
         raise ValueError(
             f"{capture.path or capture.name}: the scene shall start from the capture's "
             'own points, and it has none; choose source="random", or "auto" for random '
             "ones only where there are no others"
         )
     enough = 1 if spec.source == "points" else max(spec.min_points, 1)
-    return spec.source != "random" and found >= enough
+    return spec.source != "random" and points >= enough
 
 
 def initial_count(spec: InitSpec, capture: Capture) -> int:

@@ -100,10 +100,10 @@ def _guess(motion, effect, position, known, times, unit, key):
 def _bases_guess(motion, position, known, times, unit):
     canonical_frame = len(times) // 2
     label = rigid_groups.labels(position, known, motion.bases)
-    found = rigid_groups.motion(position, known, label, canonical_frame)
-    canonical, middle = rigid_groups.centres(position, known, found)
-    turn = rigid_groups.rotation_vectors(found.rotation, canonical_frame)
-    moved = np.einsum("gtij,gj->gti", found.rotation, middle) + found.shift
+    bodies = rigid_groups.motion(position, known, label, canonical_frame)
+    canonical, middle = rigid_groups.centres(position, known, bodies)
+    turn = rigid_groups.rotation_vectors(bodies.rotation, canonical_frame)
+    moved = np.einsum("gtij,gj->gti", bodies.rotation, middle) + bodies.shift
     turn = _at_knots(rigid_groups.smoothed(turn), times, motion)
     shift = _at_knots(rigid_groups.smoothed(moved - middle[:, None]), times, motion)
     middle = np.concatenate([middle, np.zeros((motion.bases - len(middle), 3))])
@@ -145,7 +145,7 @@ def _seeds(effect, points, evidence, capture, times, unit, spec):
     canonical = np.asarray(points.canonical)
     own = None if points.rows is None else jax.tree.map(np.asarray, points.rows)
     places = jax.jit(lambda points, time: path_fit.places(effect, points, time))
-    found, colours, rows = [], [], []
+    positions, colours, rows = [], [], []
     # All frames share the programs: as many rows as the frame with most.
     most = int(np.bincount(frame).max()) if len(frame) else 0
     for here in np.unique(frame):
@@ -175,11 +175,11 @@ def _seeds(effect, points, evidence, capture, times, unit, spec):
             back = back.astype(np.float32)
         miss = np.linalg.norm(back - start, axis=1)
         kept = (distance[:, 0] < FAR * unit) & (miss < GONE * unit)
-        found.append(back[kept])
+        positions.append(back[kept])
         colours.append(views.image[here][pixel[kept, 1], pixel[kept, 0]] / 255)
         if mine is not None:
             rows.append(jax.tree.map(lambda leaf, kept=kept: leaf[kept], mine))
-    position, colour = np.concatenate(found), np.concatenate(colours)
+    position, colour = np.concatenate(positions), np.concatenate(colours)
     chosen = np.sort(rng.permutation(len(position))[: spec.moving_points])
     every = None
     if rows:
@@ -189,7 +189,7 @@ def _seeds(effect, points, evidence, capture, times, unit, spec):
 
 def moving_depths(evidence: Evidence) -> np.ndarray:
     """[frames, height, width] z-depth of moving pixels by tracks near; 0 unknown."""
-    found = np.zeros(evidence.moving.shape, np.float32)
+    depths = np.zeros(evidence.moving.shape, np.float32)
     tracks = evidence.tracks.take(evidence.moved)
     for frame, mask in enumerate(evidence.moving):
         here = np.flatnonzero(evidence.paths.known[:, frame])
@@ -200,8 +200,8 @@ def moving_depths(evidence: Evidence) -> np.ndarray:
         distance, near = tree.query(np.stack([column, row], -1) + 0.5, DEPTH_TRACKS)
         depth = np.median(evidence.paths.depth[here, frame][near], axis=1)
         depth[distance[:, 0] > DEPTH_REACH_PX * picture_scale(mask.shape[1])] = 0
-        found[frame, row, column] = depth
-    return found
+        depths[frame, row, column] = depth
+    return depths
 
 
 def put_in(params: Params, motion: Effect, tracked: TrackStart) -> Params:

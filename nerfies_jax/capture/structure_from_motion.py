@@ -109,10 +109,12 @@ def _in_own_process(folder, masked, spec):
         ) from None
     last = done.stdout.strip().splitlines()[-1:] or [""]
     if done.returncode != 0 or not last[0].startswith("{"):
-        said = [line for line in done.stderr.strip().splitlines() if line.strip()][-1:]
+        last_words = [
+            line for line in done.stderr.strip().splitlines() if line.strip()
+        ][-1:]
         raise CaptureError(
             f"{folder.name}: COLMAP ended with code {done.returncode} "
-            f"({' '.join(said)[:200]}); try fewer features or smaller pictures"
+            f"({' '.join(last_words)[:200]}); try fewer features or smaller pictures"
         )
     return json.loads(last[0])
 
@@ -168,8 +170,8 @@ def _reconstruct(folder: pathlib.Path, masked: bool, spec: MappingSpec) -> int:
 
 
 if __name__ == "__main__":
-    asked = json.load(sys.stdin)
+    job = json.load(sys.stdin)
     registered = _reconstruct(
-        pathlib.Path(asked["folder"]), asked["masked"], MappingSpec(**asked["spec"])
+        pathlib.Path(job["folder"]), job["masked"], MappingSpec(**job["spec"])
     )
     print(json.dumps({"registered": registered}))

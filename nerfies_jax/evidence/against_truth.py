@@ -108,9 +108,9 @@ def _path_error(capture, views, evidence, followed, points):
     around = paths.depth_around(
         followed, evidence.tracks.take(still), evidence.rest.take(still), capture.near
     )
-    found = paths.least_acceleration(views, followed, capture.near, around)
-    error = np.linalg.norm(found.position - points.position[long], axis=-1)
-    known = found.known & points.seen[long]
+    fitted = paths.least_acceleration(views, followed, capture.near, around)
+    error = np.linalg.norm(fitted.position - points.position[long], axis=-1)
+    known = fitted.known & points.seen[long]
     if not known.any():
         return np.nan
     return float(np.median(error[known]) / scene_unit(evidence))

@@ -100,11 +100,11 @@ def between_neighbours(views: Views, pictures: np.ndarray) -> NeighbourFlow:
     for frame in range(frames - 1):
         forward[frame] = flow(frame, frame + 1)
         backward[frame + 1] = flow(frame + 1, frame)
-    found = checked(forward, backward)
+    checked_flow = checked(forward, backward)
     for frame in range(1, frames - 1):
-        if _lost(found, frame):
-            _go_on(found, frame, pictures, search)
-    return found
+        if _lost(checked_flow, frame):
+            _go_on(checked_flow, frame, pictures, search)
+    return checked_flow
 
 
 def checked(forward: np.ndarray, backward: np.ndarray) -> NeighbourFlow:
@@ -157,6 +157,8 @@ def closed(there: np.ndarray, back: np.ndarray) -> np.ndarray:
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height))
     to = (x + there[..., 0], y.astype(np.float32) + there[..., 1])
     # Outside nothing leads back.
-    found = cv2.remap(back, *to, cv2.INTER_LINEAR, borderValue=(1e3, 1e3, 1e3, 1e3))
-    gap = np.linalg.norm(there + found, axis=-1)
+    back_there = cv2.remap(
+        back, *to, cv2.INTER_LINEAR, borderValue=(1e3, 1e3, 1e3, 1e3)
+    )
+    gap = np.linalg.norm(there + back_there, axis=-1)
     return gap < CLOSED_PX + CLOSED_SHARE * np.linalg.norm(there, axis=-1)

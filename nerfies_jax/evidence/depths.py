@@ -68,9 +68,9 @@ def _through(views, fits, nearest, at):
         seen = inside & known
         through += seen & (here - closest > bound)
         agree += seen & (np.abs(here - closest) <= bound)
-    found = np.zeros((height, width), bool)
-    found[line, column] = (through >= MIN_SEERS) & (through > agree)
-    return found
+    passed = np.zeros((height, width), bool)
+    passed[line, column] = (through >= MIN_SEERS) & (through > agree)
+    return passed
 
 
 def _slant(views, index, view):

@@ -28,12 +28,12 @@ def with_flow(capture: Capture) -> Capture:
         if len(mine) < 2:
             continue
         views = view_set.in_time_order(capture, mine)
-        found = dense_flow.between_neighbours(views, dense_flow.levelled(views))
-        flow.forward[views.row] = found.forward
-        flow.forward_seen[views.row] = found.forward_seen & views.valid
+        neighbours = dense_flow.between_neighbours(views, dense_flow.levelled(views))
+        flow.forward[views.row] = neighbours.forward
+        flow.forward_seen[views.row] = neighbours.forward_seen & views.valid
         flow.next_row[views.row[:-1]] = views.row[1:]
-        flow.backward[views.row] = found.backward
-        flow.backward_seen[views.row] = found.backward_seen & views.valid
+        flow.backward[views.row] = neighbours.backward
+        flow.backward_seen[views.row] = neighbours.backward_seen & views.valid
         flow.previous_row[views.row[1:]] = views.row[:-1]
     note = "optical flow between neighbouring frames found in the pictures"
     return dataclasses.replace(capture, flow=flow, notes=(*capture.notes, note))

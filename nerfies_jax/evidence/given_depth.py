@@ -27,7 +27,7 @@ def aligned(
     NaN where it is unknown, and in frames that show too few points at rest. `tracks`
     and `rest` are of what stands still, in the pixels of `depth`.
     """
-    found, misses = [], []
+    placements, misses = [], []
     for inverse in (False, True):
         placed = np.full(depth.shape, np.nan, np.float32)
         off = []
@@ -47,10 +47,10 @@ def aligned(
                 placed[frame] = 1 / mapped if inverse else mapped
                 off.append(abs(placed[frame][place][known] / true[known] - 1))
             placed[frame][~(mapped > 0)] = np.nan
-        found.append(placed)
+        placements.append(placed)
         misses.append(np.nanmedian(np.concatenate(off)) if off else np.inf)
     best = int(misses[1] + SAME < misses[0])
-    return found[best], float(misses[best])
+    return placements[best], float(misses[best])
 
 
 def _line(own, wanted):

@@ -118,10 +118,10 @@ def _tracks(path, capture):
             "pictures were tracked, save their width and height beside as size"
         )
     seen &= inside
-    found = np.zeros((len(capture.ids), pixel.shape[1], 2), np.float32)
-    there = np.zeros(found.shape[:2], bool)
-    found[rows], there[rows] = np.where(seen[..., None], pixel, 0), seen
-    return {"track_pixel": found, "track_seen": there}
+    pixels = np.zeros((len(capture.ids), pixel.shape[1], 2), np.float32)
+    there = np.zeros(pixels.shape[:2], bool)
+    pixels[rows], there[rows] = np.where(seen[..., None], pixel, 0), seen
+    return {"track_pixel": pixels, "track_seen": there}
 
 
 def _files(folder, suffixes, capture, what):
@@ -143,15 +143,15 @@ def _files(folder, suffixes, capture, what):
 
 def _masks(folder, capture):
     paths, rows = _files(folder, PICTURES, capture, "masks")
-    found = np.zeros(capture.images.shape[:3], bool)
+    masks = np.zeros(capture.images.shape[:3], bool)
     for path, row in zip(paths, rows, strict=True):
         mask = images.read_mask(path)
-        found[row] = _fitted(mask, capture, path, "mask")
-    if not found.any():
+        masks[row] = _fitted(mask, capture, path, "mask")
+    if not masks.any():
         raise CaptureError(
             f"{folder}: no white pixel in any mask; white marks what moves"
         )
-    return found
+    return masks
 
 
 def _fitted(array, capture, path, what):
@@ -177,7 +177,7 @@ def _depths(path, capture):
         paths, pictures = [path], _stack(path)
         rows = _rows(len(pictures), capture, path, "depths")
         paths = paths * len(rows)
-    found = np.full(capture.images.shape[:3], np.nan, np.float32)
+    depths = np.full(capture.images.shape[:3], np.nan, np.float32)
     for where, picture, row in zip(paths, pictures, rows, strict=True):
         known = np.isfinite(picture) & (picture > 0)
         if not known.any():
@@ -186,8 +186,8 @@ def _depths(path, capture):
                 "the frame's file as the tool wrote it"
             )
         depth = np.where(known, picture, np.nan)
-        found[row] = _fitted(depth, capture, where, "depth")
-    return found
+        depths[row] = _fitted(depth, capture, where, "depth")
+    return depths
 
 
 def _depth_picture(path):
@@ -254,13 +254,13 @@ def _flow(path, capture):
 
 
 def _flo_files(folder) -> Sequence[pathlib.Path]:
-    found = sorted(folder.glob("*.flo"), key=lambda one: frames.natural(one.name))
-    if not found:
+    files = sorted(folder.glob("*.flo"), key=lambda one: frames.natural(one.name))
+    if not files:
         raise CaptureError(
             f"{folder}: no .flo file; flow is needed both ways, in folders forward and "
             "backward"
         )
-    return found
+    return files
 
 
 def _flo(path):

@@ -77,9 +77,9 @@ def _motion(views, films, spans):
             False,
             CERTAIN,
         )
-    found = motion.motion(views, films, spans)
-    if found.wanted is None:
+    finding = motion.motion(views, films, spans)
+    if finding.wanted is None:
         shapes = outlines.outlines(views)
         if shapes is not None:
             return outlines.motion(views, shapes)
-    return found
+    return finding

@@ -65,20 +65,20 @@ def films(views: Views, spans: tuple[float, float]) -> list[Film]:
         if len(sequence) >= MIN_FRAMES
     ]
     total = sum(len(sequence) for sequence in long)
-    found = []
+    every_film = []
     for sequence in long:
         flows = optical_flow.steps(views, sequence)
         count = max(1, round(CENTRES * len(sequence) / total))
         ends = min(2, (len(sequence) - 1) // 2)  # followed one way only beyond
         at = np.linspace(ends, len(sequence) - 1 - ends, count).round().astype(int)
         centres = [follow(views, sequence, flows, one, spans) for one in np.unique(at)]
-        found.append(Film(sequence, flows, centres))
-    return _with_depths(views, found)
+        every_film.append(Film(sequence, flows, centres))
+    return _with_depths(views, every_film)
 
 
-def _with_depths(views, found):
+def _with_depths(views, every_film):
     """What other times look through moves as well."""
-    centres = [one for film in found for one in film.centres]
+    centres = [one for film in every_film for one in film.centres]
     fits = [(one.view, one.fit, one.usable, one.noise_px) for one in centres]
     through = dict(
         zip(
@@ -100,7 +100,7 @@ def _with_depths(views, found):
                 for one in film.centres
             ],
         )
-        for film in found
+        for film in every_film
     ]
 
 
@@ -129,9 +129,9 @@ def follow(
     return Centre(index, paths, fit, usable, moving, noise)
 
 
-def unusable(views: Views, found: list[Film]) -> str | None:
+def unusable(views: Views, every_film: list[Film]) -> str | None:
     """Why flow says nothing about this capture; None where it does."""
-    centres = [centre for film in found for centre in film.centres]
+    centres = [centre for film in every_film for centre in film.centres]
     if not centres:
         return (
             f"no camera has {MIN_FRAMES} frames at different times to follow pixels "
@@ -156,30 +156,30 @@ def _kept(views, centres):
     )
 
 
-def _why_not_no(views, found, noise):
+def _why_not_no(views, every_film, noise):
     """Why motion may be there and not show; None where it would."""
     if noise > CALM_PX:
         return f"above {CALM_PX:g} px slow motion would not show"
-    longest = max(len(film.sequence) for film in found)
+    longest = max(len(film.sequence) for film in every_film)
     if longest < MIN_FOR_NO:
         return f"what moves far between {longest} frames cannot be followed"
-    kept = _kept(views, [one for film in found for one in film.centres])
+    kept = _kept(views, [one for film in every_film for one in film.centres])
     if kept < FOLLOWED_FOR_NO:
         return f"what is fast may be among the {1 - kept:.0%} that cannot be followed"
     return None
 
 
-def motion(views: Views, found: list[Film], spans: tuple[float, float]) -> Finding:
+def motion(views: Views, every_film: list[Film], spans: tuple[float, float]) -> Finding:
     """Whether anything moves by itself."""
-    reason = unusable(views, found)
+    reason = unusable(views, every_film)
     threshold = f"{MOVING_SHARE:.1%} of the pixels that can be followed"
     if reason is not None:
         return cannot_tell(EFFECT, reason, threshold)
-    centres = [centre for film in found for centre in film.centres]
+    centres = [centre for film in every_film for centre in film.centres]
     shares = np.array([one.moving.sum() / one.usable.sum() for one in centres])
     noise = float(np.median([one.noise_px for one in centres]))
     wanted, confidence = judge(float(shares.mean()), MOVING_SHARE, FALSE_SHARE)
-    lost = _why_not_no(views, found, noise) if wanted is False else None
+    lost = _why_not_no(views, every_film, noise) if wanted is False else None
     if lost is not None:
         wanted, confidence = None, CANNOT_TELL
     numbers = {
@@ -195,7 +195,7 @@ def motion(views: Views, found: list[Film], spans: tuple[float, float]) -> Findi
     if lost is not None:
         evidence += f"; {lost}"
     if wanted:
-        speed = speeds(views, found, spans)
+        speed = speeds(views, every_film, spans)
         numbers |= speed
         evidence += (
             f"; at least {speed['speed_px']:.2g} px "
@@ -205,14 +205,14 @@ def motion(views: Views, found: list[Film], spans: tuple[float, float]) -> Findi
     return Finding(EFFECT, evidence, threshold, wanted, confidence, numbers)
 
 
-def speeds(views: Views, found: list[Film], spans: tuple[float, float]) -> dict:
+def speeds(views: Views, every_film: list[Film], spans: tuple[float, float]) -> dict:
     """How fast the moving pixels move, at least: off what depth alone could do.
 
     From one frame to the next, in pixels of the small pictures and in scene units at
     the depth of the still scene around.
     """
     slow, units = [], []
-    for film in found:
+    for film in every_film:
         place = {int(index): at for at, index in enumerate(film.sequence)}
         for one in film.centres:
             at = place[one.view]

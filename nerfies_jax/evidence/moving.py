@@ -78,7 +78,7 @@ def votes(views: Views, tracks: Tracks, score: np.ndarray) -> np.ndarray:
     width, height = views.size
     x, y = np.meshgrid(np.arange(0, width, VOTE_STEP), np.arange(0, height, VOTE_STEP))
     at = np.stack([x, y], axis=-1).reshape(-1, 2)
-    found = np.full((frames, height, width), FAR_FROM_TRACKS, np.float32)
+    shares = np.full((frames, height, width), FAR_FROM_TRACKS, np.float32)
     for frame in range(frames):
         here = np.flatnonzero(tracks.seen[:, frame])
         if len(here) < VOTES:
@@ -96,8 +96,8 @@ def votes(views: Views, tracks: Tracks, score: np.ndarray) -> np.ndarray:
         share[distance[:, 0] > REACH_PX] = FAR_FROM_TRACKS
         share = share.reshape(x.shape)
         share = share.repeat(VOTE_STEP, 0).repeat(VOTE_STEP, 1)
-        found[frame] = share[:height, :width]
-    return found
+        shares[frame] = share[:height, :width]
+    return shares
 
 
 def may_move(share: np.ndarray) -> np.ndarray:
@@ -114,11 +114,11 @@ def mask(views: Views, share: np.ndarray, odds: np.ndarray) -> np.ndarray:
     """
     share = np.clip(share, SUREST, 1 - SUREST)
     total = np.log(share / (1 - share)) + odds
-    found = np.zeros(total.shape, bool)
+    moving = np.zeros(total.shape, bool)
     for frame, one in enumerate(total):
         colour = cv2.cvtColor(views.image[frame], cv2.COLOR_RGB2LAB).astype(np.float32)
-        found[frame] = _smooth(one.astype(np.float32), colour) > 0
-    return found
+        moving[frame] = _smooth(one.astype(np.float32), colour) > 0
+    return moving
 
 
 def settled(tracks: Tracks, score: np.ndarray, moving: np.ndarray) -> np.ndarray:

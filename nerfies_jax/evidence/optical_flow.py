@@ -83,7 +83,7 @@ def follow(
     height, width = flows[0].forward.shape[:2]
     bound = np.array([width - 1, height - 1])
     grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).astype(float)
-    found, place, followed = [], [], []
+    others, place, followed = [], [], []
     for direction in (-1, 1):
         here, kept = grid, np.ones((height, width), bool)
         for other in range(at + direction, at + direction * (reach + 1), direction):
@@ -98,10 +98,10 @@ def follow(
             gap = np.linalg.norm(move + sample(back, here), axis=-1)
             closed = gap < CLOSED_PX + CLOSED_SHARE * np.linalg.norm(move, axis=-1)
             kept = kept & closed & ((here >= 0) & (here <= bound)).all(-1)
-            found.append(int(sequence[other]))
+            others.append(int(sequence[other]))
             place.append(here + 0.5)
             followed.append(kept)
-    return Paths(found, np.array(place), np.array(followed))
+    return Paths(others, np.array(place), np.array(followed))
 
 
 def sample(picture: np.ndarray, place: np.ndarray) -> np.ndarray:

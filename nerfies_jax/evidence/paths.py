@@ -165,7 +165,7 @@ def depth_around(
 
     `rest` are the points of the `still` tracks.
     """
-    found = np.full(tracks.seen.shape, np.nan)
+    depth = np.full(tracks.seen.shape, np.nan)
     for frame in range(tracks.seen.shape[1]):
         here = np.flatnonzero(still.seen[:, frame] & (rest.depth[:, frame] > near))
         wanted = np.flatnonzero(tracks.seen[:, frame])
@@ -173,5 +173,5 @@ def depth_around(
             continue
         tree = cKDTree(still.pixel[here, frame])
         _, nearest = tree.query(tracks.pixel[wanted, frame], AROUND)
-        found[wanted, frame] = np.median(rest.depth[here, frame][nearest], axis=1)
-    return found
+        depth[wanted, frame] = np.median(rest.depth[here, frame][nearest], axis=1)
+    return depth

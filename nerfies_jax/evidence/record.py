@@ -125,7 +125,7 @@ def gather(
     if not unusable:
         which = _moved(tracks, score, first)
     measured = _depths(capture, given, views, tracks, rest, score, use_depths)
-    found = _paths(capture, views, tracks, rest, score, which, measured)
+    measured_paths = _paths(capture, views, tracks, rest, score, which, measured)
     watch.begin("still")
     dense = still_points.dense(views, flow, mask)
     return Evidence(
@@ -136,7 +136,7 @@ def gather(
         score=score,
         rest=rest,
         moved=which,
-        paths=found,
+        paths=measured_paths,
         still=dense,
         unusable=unusable,
         factor=factor,
@@ -165,7 +165,7 @@ def _tracks(given, views, flow, pictures):
     Given ones stand behind our own, which still say what stands still: other tools may
     have followed nothing but what moves.
     """
-    own, others = tracking.found(views, flow, pictures), taken.tracks(given, views)
+    own, others = tracking.from_flow(views, flow, pictures), taken.tracks(given, views)
     if others is None:
         return own, 0
     both = zip(own, others, strict=True)
@@ -182,8 +182,8 @@ def _mask(views, flow, tracks, score):
     share = moving.votes(small, near, score)
     open_to_doubt = _enlarged(moving.may_move(share), height, width)
     still = still_points.dense(views, flow, open_to_doubt)
-    found = moving.mask(small, share, still_pictures.log_odds(small, still))
-    return _enlarged(found, height, width) & views.valid
+    small_mask = moving.mask(small, share, still_pictures.log_odds(small, still))
+    return _enlarged(small_mask, height, width) & views.valid
 
 
 def _enlarged(masks, height, width):
@@ -264,13 +264,13 @@ def _moved(tracks, score, first):
 
 def _measured(depths, tracks):
     """z-depths of the tracks where they are known and do not jump."""
-    found = np.full(tracks.seen.shape, np.nan)
+    at_tracks = np.full(tracks.seen.shape, np.nan)
     for frame, picture in enumerate(depths):
         here = np.flatnonzero(tracks.seen[:, frame])
         depth = steady_depth(picture)
         at = tracking.pixel_of(tracks.pixel[here, frame], depth.shape)
-        found[here, frame] = depth[at]
-    return found
+        at_tracks[here, frame] = depth[at]
+    return at_tracks
 
 
 def steady_depth(depth: np.ndarray, jump: float = 0.06) -> np.ndarray:
@@ -281,20 +281,20 @@ def steady_depth(depth: np.ndarray, jump: float = 0.06) -> np.ndarray:
 
 def digest(capture: Capture, use_depths: bool = False) -> str:
     """Of all that `gather` looks at."""
-    found = hashlib.blake2b(digest_size=12)
-    found.update(f"evidence {VERSION} {use_depths}".encode())
+    hashed = hashlib.blake2b(digest_size=12)
+    hashed.update(f"evidence {VERSION} {use_depths}".encode())
     parts = [capture.images[capture.train], capture.times, capture.train]
     parts += [np.asarray([capture.near]), *capture.cameras]
     depths = capture.depths if use_depths else None
     given = () if capture.given is None else capture.given
     for name, part in zip(Given._fields, given, strict=False):
-        found.update(f"{name} {part is None}".encode())
+        hashed.update(f"{name} {part is None}".encode())
     parts += [part for part in (capture.valid, depths, *given) if part is not None]
     for part in parts:
         part = np.ascontiguousarray(part)
-        found.update(f"{part.dtype}{part.shape}".encode())
-        found.update(part.data)
-    return found.hexdigest()
+        hashed.update(f"{part.dtype}{part.shape}".encode())
+        hashed.update(part.data)
+    return hashed.hexdigest()
 
 
 def cached(

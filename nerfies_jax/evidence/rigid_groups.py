@@ -75,7 +75,7 @@ def _leading(matrix, count):
 
 
 def _pairs(position, known):
-    found = set()
+    edges = set()
     for frame in range(0, known.shape[1], EVERY_FRAMES):
         here = np.flatnonzero(known[:, frame])
         if len(here) < 3:
@@ -87,8 +87,8 @@ def _pairs(position, known):
         mine = np.repeat(here, wanted)
         theirs = here[near[:, 1:]].ravel()
         low, high = np.minimum(mine, theirs), np.maximum(mine, theirs)
-        found.update(zip(low.tolist(), high.tolist(), strict=True))
-    first, second = np.array(sorted(found), int).reshape(-1, 2).T
+        edges.update(zip(low.tolist(), high.tolist(), strict=True))
+    first, second = np.array(sorted(edges), int).reshape(-1, 2).T
     both = known[first] & known[second]
     kept = both.sum(1) >= min(SHARED_FRAMES, known.shape[1])
     return first[kept], second[kept], both[kept]
@@ -158,18 +158,18 @@ def procrustes(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def centres(
-    position: np.ndarray, known: np.ndarray, found: RigidMotion
+    position: np.ndarray, known: np.ndarray, bodies: RigidMotion
 ) -> tuple[np.ndarray, np.ndarray]:
     """Where each path is in the canonical frame, and each group's middle there."""
     canonical = np.zeros((len(position), 3))
-    for row, group in enumerate(found.label):
+    for row, group in enumerate(bodies.label):
         at = np.flatnonzero(known[row])
-        back = position[row, at] - found.shift[group, at]
-        turned = np.einsum("tji,tj->ti", found.rotation[group, at], back)
+        back = position[row, at] - bodies.shift[group, at]
+        turned = np.einsum("tji,tj->ti", bodies.rotation[group, at], back)
         canonical[row] = np.median(turned, axis=0)
-    middle = np.zeros((len(found.rotation), 3))
-    for group in np.unique(found.label):
-        middle[group] = np.median(canonical[found.label == group], axis=0)
+    middle = np.zeros((len(bodies.rotation), 3))
+    for group in np.unique(bodies.label):
+        middle[group] = np.median(canonical[bodies.label == group], axis=0)
     return canonical, middle
 
 
@@ -183,10 +183,10 @@ def fewest(
     """
     for count in range(1, most + 1):
         label = labels(position, known, count)
-        found = motion(position, known, label, position.shape[1] // 2)
-        canonical, _ = centres(position, known, found)
-        moved = np.einsum("ptij,pj->pti", found.rotation[label], canonical)
-        miss = np.linalg.norm(moved + found.shift[label] - position, axis=-1)
+        bodies = motion(position, known, label, position.shape[1] // 2)
+        canonical, _ = centres(position, known, bodies)
+        moved = np.einsum("ptij,pj->pti", bodies.rotation[label], canonical)
+        miss = np.linalg.norm(moved + bodies.shift[label] - position, axis=-1)
         typical = float(np.median(miss[known]))
         if typical < within:
             break
@@ -196,20 +196,20 @@ def fewest(
 def rotation_vectors(rotation: np.ndarray, canonical: int) -> np.ndarray:
     """[groups, frames, 3] rad, smooth over time: turns beyond half a turn go on."""
     groups, frames = rotation.shape[:2]
-    found = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec()
-    found = found.reshape(groups, frames, 3)
+    vectors = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec()
+    vectors = vectors.reshape(groups, frames, 3)
     onward = [(frame, frame - 1) for frame in range(canonical + 1, frames)]
     back = [(frame, frame + 1) for frame in range(canonical - 1, -1, -1)]
     for group in range(groups):
         for frame, before in onward + back:
-            here = found[group, frame]
+            here = vectors[group, frame]
             angle = np.linalg.norm(here)
             if angle > 1e-6:
                 turns = [here * (1 + 2 * np.pi * k / angle) for k in (-1, 0, 1)]
-                last = found[group, before]
+                last = vectors[group, before]
                 near = [np.linalg.norm(turn - last) for turn in turns]
-                found[group, frame] = turns[int(np.argmin(near))]
-    return found
+                vectors[group, frame] = turns[int(np.argmin(near))]
+    return vectors
 
 
 def smoothed(track: np.ndarray) -> np.ndarray:

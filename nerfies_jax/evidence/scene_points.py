@@ -37,7 +37,7 @@ def own_points(capture: Capture) -> np.ndarray:
 
 def followed_points(views: Views, films: list[Film]) -> np.ndarray:
     """Points at rest [points, 3] found by following pixels, at most `MOST`."""
-    found = []
+    places = []
     for film in films:
         for one in film.centres:
             static = one.usable & ~one.moving & (one.fit.inverse_depth > 0)
@@ -45,8 +45,8 @@ def followed_points(views: Views, films: list[Film]) -> np.ndarray:
             static &= one.fit.count >= 0.75 * len(one.paths.views)
             depth = 1 / one.fit.inverse_depth[static]
             ray = view_set.rays(views, one.view)[static]
-            found.append(views.position[one.view] + depth[:, None] * ray)
-    points = np.concatenate(found) if found else np.zeros((0, 3))
+            places.append(views.position[one.view] + depth[:, None] * ray)
+    points = np.concatenate(places) if places else np.zeros((0, 3))
     rng = np.random.default_rng(0)
     if len(points) > MOST:
         points = points[np.sort(rng.choice(len(points), MOST, replace=False))]

@@ -39,15 +39,15 @@ def log_odds(views: Views, still: PointCloud) -> np.ndarray:
     depth = [
         _depth(views, frame, still.position.astype(float)) for frame in range(frames)
     ]
-    found = np.zeros(views.grey.shape, np.float32)
+    clipped = np.zeros(views.grey.shape, np.float32)
     for frame in range(frames):
         unlike = _unlike(views, colour, depth, frame)
         slope = _slope(colour[frame])
         even = EVEN * spread + EVEN_SLOPE * slope
         with np.errstate(invalid="ignore"):
             odds = STEEPNESS * np.log((unlike + 1) / (even + 1))
-        found[frame] = np.clip(np.nan_to_num(odds, nan=0.0), -MOST, MOST)
-    return found
+        clipped[frame] = np.clip(np.nan_to_num(odds, nan=0.0), -MOST, MOST)
+    return clipped
 
 
 def _levelled(views):
@@ -82,17 +82,17 @@ def _depth(views, frame, position):
     if not inside.any():
         return None
     column, row = (pixel[inside] / CELL).astype(int).T
-    found = np.full(rows * columns, np.inf)
-    np.minimum.at(found, row * columns + column, depth[inside])
-    found = found.reshape(rows, columns)
-    near = nd.minimum_filter(found, 3)
-    found = np.where(NEARER * found > near, near, found)
-    gap = ~np.isfinite(found)
+    nearest = np.full(rows * columns, np.inf)
+    np.minimum.at(nearest, row * columns + column, depth[inside])
+    nearest = nearest.reshape(rows, columns)
+    near = nd.minimum_filter(nearest, 3)
+    nearest = np.where(NEARER * nearest > near, near, nearest)
+    gap = ~np.isfinite(nearest)
     row, column = nd.distance_transform_edt(
         gap, return_distances=False, return_indices=True
     )
-    found = found[row, column].astype(np.float32).repeat(CELL, 0).repeat(CELL, 1)
-    return np.ascontiguousarray(found[:height, :width])
+    nearest = nearest[row, column].astype(np.float32).repeat(CELL, 0).repeat(CELL, 1)
+    return np.ascontiguousarray(nearest[:height, :width])
 
 
 def _unlike(views, colour, depth, frame):
@@ -104,7 +104,7 @@ def _unlike(views, colour, depth, frame):
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     pixel = np.stack([x, y, np.ones_like(x)]).reshape(3, -1)
     far = depth[frame].reshape(-1)
-    found = []
+    differences = []
     for other in (frame + sign * off for off in OTHERS for sign in (-1, 1)):
         if not 0 <= other < len(depth) or depth[other] is None:
             continue
@@ -114,10 +114,10 @@ def _unlike(views, colour, depth, frame):
         red, green, blue = np.moveaxis(np.abs(there - colour[frame]), -1, 0)
         unlike = np.maximum(np.maximum(red, green), blue)
         unlike[(z <= 0) | (before < HIDDEN * z)] = np.nan
-        found.append(unlike)
-    if len(found) < LEAST_FRAMES:
+        differences.append(unlike)
+    if len(differences) < LEAST_FRAMES:
         return blank
-    order = np.sort(found, axis=0)  # NaN come last
+    order = np.sort(differences, axis=0)  # NaN come last
     count = np.isfinite(order).sum(0)
     place = np.floor(QUANTILE * np.maximum(count - 1, 0)).astype(int)
     chosen = np.take_along_axis(order, place[None], axis=0)[0]

@@ -115,7 +115,7 @@ def _lowest(cost):
 
 
 def _some(rng, mask, most):
-    found = np.argwhere(mask)
-    if len(found) > most:
-        found = found[np.sort(rng.choice(len(found), most, replace=False))]
-    return found
+    pixels = np.argwhere(mask)
+    if len(pixels) > most:
+        pixels = pixels[np.sort(rng.choice(len(pixels), most, replace=False))]
+    return pixels

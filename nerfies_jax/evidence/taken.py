@@ -29,8 +29,8 @@ def tracks(given: Given, views: Views) -> Tracks | None:
     scale = np.divide(views.size, given.size, dtype=np.float32)
     pixel = np.moveaxis(given.track_pixel[views.row], 0, 1) * scale
     seen = np.moveaxis(given.track_seen[views.row], 0, 1)
-    found = Tracks(seen.argmax(1), np.where(seen[..., None], pixel, 0), seen)
-    return tracking.long_enough(found)
+    followed = Tracks(seen.argmax(1), np.where(seen[..., None], pixel, 0), seen)
+    return tracking.long_enough(followed)
 
 
 def moving(given: Given, views: Views) -> np.ndarray | None:

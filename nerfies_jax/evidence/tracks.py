@@ -149,7 +149,7 @@ def _enlarged(pixel, times):
     return np.ascontiguousarray(pixel * times - 0.5, np.float32)
 
 
-def found(views: Views, flow: NeighbourFlow, pictures: np.ndarray) -> Tracks:
+def from_flow(views: Views, flow: NeighbourFlow, pictures: np.ndarray) -> Tracks:
     """All tracks of a film, from an even grid; nothing is known of what moves yet."""
     tracks = long_enough(chain(flow, grid(views)))
     return long_enough(realigned(tracks, pictures, views.size))

@@ -153,12 +153,12 @@ def plain(capture: Capture, rows: np.ndarray) -> np.ndarray:
 
 def sequences(views: Views) -> list[np.ndarray]:
     """Indices of frames of one camera in order of time, each time once."""
-    found = []
+    by_camera = []
     for camera in np.unique(views.camera):
         index = np.flatnonzero(views.camera == camera)
         _, first = np.unique(views.time[index], return_index=True)
-        found.append(index[first])
-    return found
+        by_camera.append(index[first])
+    return by_camera
 
 
 def rays(views: Views, index: int) -> np.ndarray:

@@ -83,7 +83,10 @@ def follow(
     The preset asked for says which representation and which size.
     """
     advice = advise_for(findings, config.preset)
-    lines = [*table(findings, prices.told(findings)), f"effects: {advice.arguments()}"]
+    lines = [
+        *table(findings, prices.format_prices(findings)),
+        f"effects: {advice.arguments()}",
+    ]
     lines += [f"note: {note}" for note in advice.notes]
     overrides = (*advice.overrides, *config.overrides)
     changed = dataclasses.replace(config, preset=advice.preset, overrides=overrides)

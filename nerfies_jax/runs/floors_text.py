@@ -5,38 +5,40 @@ from collections.abc import Mapping
 LONGER = "train longer (--seconds, --steps) or take another preset"
 
 
-def lines(found: Mapping[str, float]) -> list[str]:
+def lines(numbers: Mapping[str, float]) -> list[str]:
     """Both floors and what motion is worth, for the end of a run."""
     parts = []
-    if "floor.neighbours" in found:
-        parts.append(f"{found['floor.neighbours']:.2f} dB the mean of two neighbours")
-    if "floor.still" in found:
-        parts.append(f"{found['floor.still']:.2f} dB its own renders averaged in time")
-    said = [f"floors:   {', '.join(parts)}"] if parts else []
-    if "motion.worth" in found:
+    if "floor.neighbours" in numbers:
+        parts.append(f"{numbers['floor.neighbours']:.2f} dB the mean of two neighbours")
+    if "floor.still" in numbers:
+        parts.append(
+            f"{numbers['floor.still']:.2f} dB its own renders averaged in time"
+        )
+    text = [f"floors:   {', '.join(parts)}"] if parts else []
+    if "motion.worth" in numbers:
         where = ""
-        if "motion.moving_worth" in found:
-            where = f", {_signed(found['motion.moving_worth'])} where something moves"
-        said.append(f"motion:   is worth {_signed(found['motion.worth'])}{where}")
-    return said
+        if "motion.moving_worth" in numbers:
+            where = f", {_signed(numbers['motion.moving_worth'])} where something moves"
+        text.append(f"motion:   is worth {_signed(numbers['motion.worth'])}{where}")
+    return text
 
 
-def warnings(found: Mapping[str, float]) -> list[str]:
+def warnings(numbers: Mapping[str, float]) -> list[str]:
     """One line for each floor that the run is below."""
-    psnr, said = found["heldout.psnr"], []
-    if psnr < found.get("floor.neighbours", psnr):
-        said.append(
-            f"warning: {psnr:.2f} dB is below the {found['floor.neighbours']:.2f} dB "
+    psnr, sentences = numbers["heldout.psnr"], []
+    if psnr < numbers.get("floor.neighbours", psnr):
+        sentences.append(
+            f"warning: {psnr:.2f} dB is below the {numbers['floor.neighbours']:.2f} dB "
             f"of two neighbouring frames laid over each other: {LONGER} "
             "(python -m experiments.inspect_scene says which)"
         )
-    if found.get("motion.worth", 0.0) < 0:
-        said.append(
-            f"warning: held-out frames are {-found['motion.worth']:.2f} dB worse than "
-            f"the mean of the scene's own renders over time: its motion is wrong; "
+    if numbers.get("motion.worth", 0.0) < 0:
+        sentences.append(
+            f"warning: held-out frames are {-numbers['motion.worth']:.2f} dB worse "
+            "than the mean of the scene's own renders over time: its motion is wrong; "
             f"{LONGER}, one that stands still (splats-static, nerf) if nothing moves"
         )
-    return said
+    return sentences
 
 
 def _signed(decibels):

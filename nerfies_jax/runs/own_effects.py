@@ -27,14 +27,14 @@ def _load(name, metadata):
             f"--effect {name}: {module_name} cannot be imported ({error}); run where "
             "it lies, or name its folder in PYTHONPATH"
         ) from error
-    found = getattr(module, attribute, None)
-    if found is None:
+    named = getattr(module, attribute, None)
+    if named is None:
         raise ValueError(f"--effect {name}: {module_name} has no {attribute!r}")
     # An effect is a tuple, which nobody can call.
-    made = found(metadata) if callable(found) else found
-    if not isinstance(made, Effect):
+    effect = named(metadata) if callable(named) else named
+    if not isinstance(effect, Effect):
         raise ValueError(
-            f"--effect {name}: a {type(made).__name__}, and neither an Effect nor a "
+            f"--effect {name}: a {type(effect).__name__}, and neither an Effect nor a "
             "function that returns one (docs/own_effect.md)"
         )
-    return made
+    return effect

@@ -40,7 +40,7 @@ def price(effect: str, measured: Mapping[str, Metric]) -> Price:
     }
 
 
-def told(findings: tuple[Finding, ...]) -> dict[str, str]:
+def format_prices(findings: tuple[Finding, ...]) -> dict[str, str]:
     """By effect, what it costs a step, for a table."""
     return {
         one.effect: " / ".join(

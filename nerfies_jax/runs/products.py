@@ -67,14 +67,14 @@ def make(
     )
     frames = evaluation.frames_of(run.capture, run.model.required_data)
     fitted, gain = score_halves(run, state, scored, ms_per_frame / 1e3)
-    found, remarks = quality.measure(
+    numbers, remarks = quality.measure(
         run, state, trained.draw, scored, extra, ms_per_frame / 1e3
     )
-    metrics = heldout.metrics(found)
+    metrics = heldout.metrics(numbers)
     metrics += [*measured(run, trained, scored, ms_per_frame, began), *fitted]
     metrics += model_size(saved)
     save_metrics(folder / "metrics.json", metrics)
-    warnings = floors_text.warnings(found)
+    warnings = floors_text.warnings(numbers)
     notes = [*warnings, trained.result.message, *_capture_notes(run), *left_out]
     notes += [*remarks, *gain, *saved.notes]
     following = _next(folder, run, trained)
@@ -91,7 +91,7 @@ def make(
         notes,
         following,
     )
-    _say(folder, page, metrics, [*floors_text.lines(found), *warnings], following)
+    _log(folder, page, metrics, [*floors_text.lines(numbers), *warnings], following)
 
 
 def save_metrics(path: pathlib.Path, metrics: list[Metric]) -> None:
@@ -280,7 +280,7 @@ def _next(folder, run, trained):
     return [looked, report.Command("Train it twice as long:", line)]
 
 
-def _say(folder, page, metrics, floors, following):
+def _log(folder, page, metrics, floors, following):
     value = {metric.key: metric.value for metric in metrics}
     print(
         f"held out: {value['heldout.psnr']:.2f} dB, SSIM {value['heldout.ssim']:.3f} "

@@ -96,7 +96,7 @@ def measure(
         )
     if extra.lpips is not None:
         notes.append(f"LPIPS is that of {extra.lpips.network.name}, version 0.1.")
-    found = heldout.heldout_metrics(
+    numbers = heldout.heldout_metrics(
         scored,
         capture,
         lpips=extra.lpips,
@@ -106,7 +106,7 @@ def measure(
         fitted=fitted,
         floors=_floors(run, state, draw, scored.rows, frame_seconds),
     )
-    return found, notes
+    return numbers, notes
 
 
 def _floors(run, state, draw, rows, frame_seconds):

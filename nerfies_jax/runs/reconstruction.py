@@ -140,8 +140,8 @@ def _new_run(config, effects):
     if config.preset is None:
         config, lines = adviser.by_tracks(config, stored)
     if effects == "auto":
-        found = inspection.inspect(stored)
-        config, lines = adviser.follow(config, found.findings)
+        inspected = inspection.inspect(stored)
+        config, lines = adviser.follow(config, inspected.findings)
     print("\n".join(lines))
     return new_run(config, stored)
 
@@ -174,8 +174,8 @@ def _restored(folder, run):
     """
     if checkpoint.latest(folder / run_folder.CHECKPOINTS) is None:
         return first_state(run), None, None
-    found = restore(folder, run)
-    return found.state, found.record, found.step
+    restored = restore(folder, run)
+    return restored.state, restored.record, restored.step
 
 
 def _opened(held, folder, run, state, after):

@@ -19,13 +19,13 @@ def installed() -> dict[str, "Representation"]:
     """All representations by name, in the order of their names."""
     points = importlib.metadata.entry_points(group=GROUP)
     # A checkout that is installed and also stands on the path is found twice.
-    found = {point.name: point for point in points}
-    if not found:
+    by_name = {point.name: point for point in points}
+    if not by_name:
         raise ValueError(
             f"no entry point of the group {GROUP}: install this project, as with "
             "pip install -e ."
         )
-    return {name: found[name].load() for name in sorted(found)}
+    return {name: by_name[name].load() for name in sorted(by_name)}
 
 
 def named(name: str) -> "Representation":

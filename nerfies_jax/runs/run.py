@@ -208,8 +208,8 @@ def saved_run(folder: pathlib.Path, overrides: tuple[str, ...] = ()) -> Run:
     Raises ValueError where `overrides` would change them.
     """
     config, kind, spec = read_settings(folder)
-    asked = specs.override(spec, overrides)
-    changed = specs.differences(specs.as_json(spec), specs.as_json(asked))
+    wanted = specs.override(spec, overrides)
+    changed = specs.differences(specs.as_json(spec), specs.as_json(wanted))
     if changed:
         raise ValueError(
             f"{folder}: the run was started with other settings: {'; '.join(changed)}; "

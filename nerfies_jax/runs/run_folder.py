@@ -80,8 +80,8 @@ def owned(folder: pathlib.Path) -> Iterator[None]:
 
 def _owner(folder):
     try:
-        found = json.loads((folder / OWNER).read_text())
-        return f"process {found['pid']} on {found['host']} (since {found['since']})"
+        owner = json.loads((folder / OWNER).read_text())
+        return f"process {owner['pid']} on {owner['host']} (since {owner['since']})"
     except (OSError, ValueError, KeyError, TypeError):  # it is just writing it
         return "another process"
 

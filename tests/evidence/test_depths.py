@@ -25,12 +25,12 @@ def test_only_what_was_gone_at_other_times_is_looked_through():
     assert not np.any(there)
     gone = film.depths.copy()
     gone[1:] = films.FAR
-    found = depths.looked_through(views, fits_of(gone))[0]
-    assert found[card].mean() > 0.9
-    assert not found[~card].any()
+    through = depths.looked_through(views, fits_of(gone))[0]
+    assert through[card].mean() > 0.9
+    assert not through[~card].any()
 
 
 def test_the_better_half_counts_what_is_known():
     cost = np.array([[3.0, np.nan, np.nan], [1.0, 5.0, np.nan], [8.0, np.nan, np.nan]])
-    found = sweep._better_half(cost)
-    np.testing.assert_array_equal(found, [2.0, 5.0, np.nan])
+    better = sweep._better_half(cost)
+    np.testing.assert_array_equal(better, [2.0, 5.0, np.nan])

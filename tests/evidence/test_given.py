@@ -70,8 +70,8 @@ def test_tracks_of_larger_pictures_are_brought_to_those_that_are_read(tmp_path):
     _, points = tapir(tmp_path / "t.npz")
     size = 4 * np.array(films.SIZE)
     path, _ = tapir(tmp_path / "t.npz", tracks=4 * points.pixel - 0.5, size=size)
-    found = with_files(tracks=path).given
-    place = np.moveaxis(found.track_pixel, 0, 1)[points.seen]
+    given = with_files(tracks=path).given
+    place = np.moveaxis(given.track_pixel, 0, 1)[points.seen]
     np.testing.assert_allclose(place, points.pixel[points.seen], atol=1e-3)
 
 
@@ -86,10 +86,10 @@ def test_depths_of_any_scale_are_brought_to_the_points_at_rest(inverse):
     row, column = pixel_of(pixel, true.shape[1:])
     depth = true[np.arange(3), row, column].astype(float)
     depth[:8] *= 3  # points that are wrong
-    found, miss = given_depth.aligned(given, tracks, RestPoints(None, None, depth))
+    aligned, miss = given_depth.aligned(given, tracks, RestPoints(None, None, depth))
     # The penalty of the offset is what is left.
-    np.testing.assert_allclose(found[:, 2:], true[:, 2:], rtol=0.03)
-    assert np.isnan(found[:, :2]).all()
+    np.testing.assert_allclose(aligned[:, 2:], true[:, 2:], rtol=0.03)
+    assert np.isnan(aligned[:, :2]).all()
     assert miss < 0.01
     noise = np.float32(rng.uniform(1, 4, true.shape))
     assert given_depth.aligned(noise, tracks, RestPoints(None, None, depth))[1] > 0.1
@@ -119,14 +119,16 @@ def test_flow_given_is_taken_and_checked_both_ways(tmp_path):
             head = np.float32(202021.25).tobytes()
             head += np.array(one.shape[1::-1], "<i4").tobytes()
             (tmp_path / side / f"{number}.flo").write_bytes(head + one.tobytes())
-    found = record.gather(with_files(capture, flow=tmp_path))
-    np.testing.assert_array_equal(found.flow.forward, own.flow.forward)
-    assert not found.flow.forward_seen[3].any()
-    np.testing.assert_array_equal(found.flow.forward_seen[4], own.flow.forward_seen[4])
+    evidence = record.gather(with_files(capture, flow=tmp_path))
+    np.testing.assert_array_equal(evidence.flow.forward, own.flow.forward)
+    assert not evidence.flow.forward_seen[3].any()
+    np.testing.assert_array_equal(
+        evidence.flow.forward_seen[4], own.flow.forward_seen[4]
+    )
 
 
-def refused(said, **files):
-    with pytest.raises(captures.CaptureError, match=said):
+def refused(refusal, **files):
+    with pytest.raises(captures.CaptureError, match=refusal):
         with_files(**files)
 
 

@@ -20,7 +20,7 @@ def test_no_decision_on_a_built_in_scene_is_wrong(name):
         synthetic.PRESETS[name], size=(112, 84), frames=40, heldout_every=20
     )
     capture, _ = synthetic.make(small, seed=5)
-    found = inspection.inspect(capture)
+    inspected = inspection.inspect(capture)
     truth = {
         "motion": name != "static",
         "appearance codes": name == "exposure",
@@ -31,10 +31,12 @@ def test_no_decision_on_a_built_in_scene_is_wrong(name):
         "masks of what moves": name != "static",
         "lens distortion": False,
     }
-    told = {one.effect: one.wanted for one in found.findings if one.effect in truth}
+    answers = {
+        one.effect: one.wanted for one in inspected.findings if one.effect in truth
+    }
     # At 40 frames the camera pans half again as fast as at 60, and what leaves between
     # two frames looks like what goes: it may abstain, never be wrong.
-    if not truth["transient objects"] and told["transient objects"] is None:
-        told["transient objects"] = False
-    assert told == truth
-    assert found.finding("motion").confidence == CERTAIN
+    if not truth["transient objects"] and answers["transient objects"] is None:
+        answers["transient objects"] = False
+    assert answers == truth
+    assert inspected.finding("motion").confidence == CERTAIN

@@ -37,10 +37,10 @@ def test_two_bodies_are_told_apart_and_their_motions_found():
     label = rigid_groups.labels(position, known, 2)
     assert (label == np.repeat(label[[0, 20]], 20)).all()
     assert label[0] != label[20]
-    found = rigid_groups.motion(position, known, label, 10)
-    canonical, _ = rigid_groups.centres(position, known, found)
+    bodies = rigid_groups.motion(position, known, label, 10)
+    canonical, _ = rigid_groups.centres(position, known, bodies)
     np.testing.assert_allclose(canonical, position[:, 10], atol=1e-6)
-    turn = rigid_groups.rotation_vectors(found.rotation, 10)[label[0]]
+    turn = rigid_groups.rotation_vectors(bodies.rotation, 10)[label[0]]
     np.testing.assert_allclose(turn[:, 2], angle - angle[10], atol=1e-6)
 
 
@@ -59,9 +59,9 @@ def test_procrustes_leaves_out_what_strays():
 def test_identical_paths_are_one_body():
     position = np.repeat(np.linspace(0, 1, 12)[None, :, None], 5, axis=0) * [1, 0, 0]
     label = rigid_groups.labels(position, np.ones((5, 12), bool), 2)
-    found = rigid_groups.motion(position, np.ones((5, 12), bool), label, 6)
-    assert np.isfinite(found.rotation).all()
-    assert np.isfinite(found.shift).all()
+    bodies = rigid_groups.motion(position, np.ones((5, 12), bool), label, 6)
+    assert np.isfinite(bodies.rotation).all()
+    assert np.isfinite(bodies.shift).all()
 
 
 def test_bodies_are_told_apart_where_iterations_give_up(monkeypatch):

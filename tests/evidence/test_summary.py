@@ -40,11 +40,11 @@ def test_errors_are_those_of_what_was_followed(monkeypatch):
     monkeypatch.setattr(against_truth, "LATER", 8)
     capture, evidence = gathered()
     points = card_points(capture, evidence.row)
-    found = against_truth.errors(capture, evidence, points)
-    assert found.mask_iou > 0.7
-    assert found.track_px < 0.5
-    assert found.track_lost < 0.5
-    assert found.path_error < 0.05
+    errors = against_truth.errors(capture, evidence, points)
+    assert errors.mask_iou > 0.7
+    assert errors.track_px < 0.5
+    assert errors.track_lost < 0.5
+    assert errors.path_error < 0.05
     # What is said to be two pixels and a tenth of the distance away is that far off.
     shifted = points.pixel + np.linspace(0, 3, len(evidence.row))[:, None] * [0, 1]
     moved = points.position * 1.1
@@ -61,25 +61,25 @@ def test_errors_are_those_of_what_was_followed(monkeypatch):
 
 def test_words_say_what_there_is_and_what_cannot_be_told():
     capture, evidence = gathered()
-    found = summary.of(views_of(capture), evidence)
-    said = "\n".join(summary.lines(found, evidence))
-    assert found.groups == 1
-    assert "their depth is certain" in said
-    assert "nothing to follow" not in said
+    counted = summary.of(views_of(capture), evidence)
+    text = "\n".join(summary.lines(counted, evidence))
+    assert counted.groups == 1
+    assert "their depth is certain" in text
+    assert "nothing to follow" not in text
     held = films.film(card=MOVES["card"], camera=lambda t: (0.0, 0.0, 0.0), frames=24)
     evidence = record.gather(held)
-    found = summary.of(views_of(held), evidence)
-    said = "\n".join(summary.lines(found, evidence))
-    assert "gives no parallax, so no depth can be told" in said
-    assert found.paths > 20
-    assert "the film does not tell their depth" in said
+    counted = summary.of(views_of(held), evidence)
+    text = "\n".join(summary.lines(counted, evidence))
+    assert "gives no parallax, so no depth can be told" in text
+    assert counted.paths > 20
+    assert "the film does not tell their depth" in text
     still, evidence = gathered(card=lambda time: (0.1, 0.0))
     none = evidence._replace(
         moved=np.zeros(0, int),
         paths=type(evidence.paths)(*(p[:0] for p in evidence.paths)),
     )
-    said = summary.lines(summary.of(views_of(still), none), none)
-    assert said[-1].startswith("nothing to follow: no track")
+    text = summary.lines(summary.of(views_of(still), none), none)
+    assert text[-1].startswith("nothing to follow: no track")
 
 
 def test_the_sheet_shows_what_moves_and_its_tracks():

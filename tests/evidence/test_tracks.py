@@ -103,13 +103,20 @@ def test_flow_that_a_thing_lost_is_found_from_how_it_came():
     assert not dense_flow._lost(true, 2)
     search = dense_flow.dis(pictures.shape[2] // views.size[0])
     dense_flow._go_on(flow, 2, pictures, search)
-    for frame, found, exact in ((2, flow[:2], true[:2]), (3, flow[2:], true[2:])):
-        assert found[1][frame][area].mean() > 0.9
-        off = np.abs(found[0][frame] - exact[0][frame])[area][found[1][frame][area]]
+    for frame, flow_of_frame, exact in (
+        (2, flow[:2], true[:2]),
+        (3, flow[2:], true[2:]),
+    ):
+        assert flow_of_frame[1][frame][area].mean() > 0.9
+        off = np.abs(flow_of_frame[0][frame] - exact[0][frame])[area][
+            flow_of_frame[1][frame][area]
+        ]
         assert np.median(off) < 0.1
         kept = exact[1][frame].copy()
         kept[area] = False
-        np.testing.assert_array_equal(found[0][frame][kept], exact[0][frame][kept])
+        np.testing.assert_array_equal(
+            flow_of_frame[0][frame][kept], exact[0][frame][kept]
+        )
 
 
 def test_chains_follow_flow_both_ways_until_it_ends():
@@ -118,13 +125,13 @@ def test_chains_follow_flow_both_ways_until_it_ends():
     seen = np.ones(shape, bool)
     seen[3] = False  # nothing leads from the fourth frame to the fifth
     flow = NeighbourFlow(shift, seen, -shift, np.ones(shape, bool))
-    found = tracks.chain(flow, np.array([[2.0, 10.0, 12.0], [2.0, 29.0, 12.0]]))
-    assert found.seen[0].tolist() == [True] * 4 + [False]
+    chained = tracks.chain(flow, np.array([[2.0, 10.0, 12.0], [2.0, 29.0, 12.0]]))
+    assert chained.seen[0].tolist() == [True] * 4 + [False]
     steps = np.arange(-2, 2)[:, None]
     expected = [10, 12] + steps * [1.25, -0.5]
-    np.testing.assert_allclose(found.pixel[0, :4], expected, atol=1e-5)
+    np.testing.assert_allclose(chained.pixel[0, :4], expected, atol=1e-5)
     # The other left the picture on its right.
-    assert found.seen[1].tolist() == [True] * 3 + [False] * 2
+    assert chained.seen[1].tolist() == [True] * 3 + [False] * 2
 
 
 def test_points_are_aligned_with_where_they_began():
@@ -133,9 +140,9 @@ def test_points_are_aligned_with_where_they_began():
     pictures = np.rint(np.clip(pictures, 0, 255)).astype(np.uint8)
     pixel = np.float32([[[30, 40], [34, 40]], [[60, 20], [62.8, 20.3]]])
     drifted = Tracks(np.zeros(2, int), pixel, np.ones((2, 2), bool))
-    found = tracks.realigned(drifted, pictures, (120, 80))
-    assert found.seen.all()
-    np.testing.assert_allclose(found.pixel[:, 1], [[33.3, 40], [63.3, 20]], atol=0.05)
+    aligned = tracks.realigned(drifted, pictures, (120, 80))
+    assert aligned.seen.all()
+    np.testing.assert_allclose(aligned.pixel[:, 1], [[33.3, 40], [63.3, 20]], atol=0.05)
     lost = drifted._replace(pixel=pixel + np.float32([[0, 0], [9, 9]]))
     assert not tracks.realigned(lost, pictures, (120, 80)).seen[:, 1].any()
 
@@ -146,10 +153,10 @@ def test_points_at_rest_are_found_and_what_moves_misses():
     point = rng.uniform([-0.3, -0.3, 1.2], [0.3, 0.3, 2], (6, 3))
     position = np.repeat(point[:, None], len(views.row), axis=1)
     position[3:] += np.linspace(0, 0.2, len(views.row))[:, None] * [0, 1, 0]
-    found = rest_points.fit(views, tracks_of(views, position))
-    np.testing.assert_allclose(found.position[:3], point[:3], atol=1e-4)
-    assert np.nanmax(found.residual[:3]) < 0.01
-    assert (np.nanquantile(found.residual[3:], 0.7, axis=1) > 1).all()
+    fitted = rest_points.fit(views, tracks_of(views, position))
+    np.testing.assert_allclose(fitted.position[:3], point[:3], atol=1e-4)
+    assert np.nanmax(fitted.residual[:3]) < 0.01
+    assert (np.nanquantile(fitted.residual[3:], 0.7, axis=1) > 1).all()
 
 
 def test_a_camera_in_place_gives_finite_points_at_rest():
@@ -157,9 +164,9 @@ def test_a_camera_in_place_gives_finite_points_at_rest():
     views = view_set.in_time_order(capture)
     position = np.repeat(np.array([[[0.1, 0.0, 1.5]]]), 6, axis=1)
     one = tracks_of(views, position)
-    found = rest_points.fit(views, one)
-    assert np.isfinite(found.position).all()
-    assert still_points.depth_deviation(views, one, found) > 1
+    fitted = rest_points.fit(views, one)
+    assert np.isfinite(fitted.position).all()
+    assert still_points.depth_deviation(views, one, fitted) > 1
 
 
 def test_what_moves_is_marked_and_little_else():
@@ -215,8 +222,8 @@ def test_nothing_moves_in_a_still_film():
 def test_cameras_that_are_off_by_a_pixel_set_no_wall_in_motion():
     capture = films.film(**MOVES, frames=24)
     noise = np.random.default_rng(0).normal(0, 0.7 * films.FAR / films.FOCAL, (24, 3))
-    told = capture.cameras.position + (noise * [1, 1, 0]).astype(np.float32)
-    cameras = capture.cameras._replace(position=told)
+    position = capture.cameras.position + (noise * [1, 1, 0]).astype(np.float32)
+    cameras = capture.cameras._replace(position=position)
     evidence = record.gather(dataclasses.replace(capture, cameras=cameras))
     assert evidence.moving[~capture.moving].mean() < 0.1
     assert evidence.moving[capture.moving].mean() > 0.5
@@ -259,10 +266,10 @@ def test_a_smooth_path_before_a_shaking_camera_has_its_depth():
     views = hand_held()
     time = np.linspace(0, 1, len(views.row))[:, None]
     path = (0.1, -0.1, 1.3) + time * [0.2, 0.1, -0.2]
-    found = paths.least_acceleration(views, tracks_of(views, path[None]), 0.05)
-    assert np.linalg.norm(found.position[0] - path, axis=-1).max() < 0.01
-    assert found.known.all()
-    assert found.depth_deviation[0] < 0.05
+    fitted = paths.least_acceleration(views, tracks_of(views, path[None]), 0.05)
+    assert np.linalg.norm(fitted.position[0] - path, axis=-1).max() < 0.01
+    assert fitted.known.all()
+    assert fitted.depth_deviation[0] < 0.05
 
 
 def test_the_banded_solution_is_the_dense_one():
@@ -272,7 +279,7 @@ def test_the_banded_solution_is_the_dense_one():
     one = tracks_of(views, path[None])
     one.seen[0, [0, 1, 9, 10]] = False
     around = np.full((1, 24), 1.5)
-    found = paths.least_acceleration(views, one, 0.05, around)
+    fitted = paths.least_acceleration(views, one, 0.05, around)
     span = slice(2, 24)
     ray = rest_points.track_rays(views, one)[0, span]
     unit = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
@@ -298,9 +305,11 @@ def test_the_banded_solution_is_the_dense_one():
         rows.append(basis.reshape(3, -1))
         right.append(np.zeros(3))
     dense = np.linalg.lstsq(np.concatenate(rows), np.concatenate(right), rcond=None)[0]
-    np.testing.assert_allclose(found.position[0, span], dense.reshape(22, 3), atol=1e-6)
-    assert np.isnan(found.position[0, :2]).all()
-    assert not found.known[0, :2].any()
+    np.testing.assert_allclose(
+        fitted.position[0, span], dense.reshape(22, 3), atol=1e-6
+    )
+    assert np.isnan(fitted.position[0, :2]).all()
+    assert not fitted.known[0, :2].any()
 
 
 @pytest.mark.hard_cases
@@ -310,8 +319,8 @@ def test_a_path_of_few_frames_lies_at_the_depth_around(seen):
     path = np.repeat(np.array([[[0.1, 0.0, 1.3]]]), 24, axis=1)
     one = tracks_of(views, path)
     one.seen[0] = np.isin(np.arange(24), seen)
-    found = paths.least_acceleration(views, one, 0.05, np.full((1, 24), 1.3))
-    np.testing.assert_allclose(found.depth[0, seen], 1.3, rtol=0.02)
+    fitted = paths.least_acceleration(views, one, 0.05, np.full((1, 24), 1.3))
+    np.testing.assert_allclose(fitted.depth[0, seen], 1.3, rtol=0.02)
 
 
 @pytest.mark.hard_cases
@@ -320,9 +329,9 @@ def test_before_a_camera_in_place_depth_is_that_around_and_said_to_be_unknown():
     views = view_set.in_time_order(capture)
     path = np.array([0, 0, 1.5]) + np.linspace(0, 0.3, 12)[:, None] * [1, 0, 0]
     one = tracks_of(views, path[None])
-    found = paths.least_acceleration(views, one, 0.05, np.full((1, 12), 1.5))
-    np.testing.assert_allclose(found.depth[0], 1.5, rtol=0.05)
-    assert found.depth_deviation[0] > 1
+    fitted = paths.least_acceleration(views, one, 0.05, np.full((1, 12), 1.5))
+    np.testing.assert_allclose(fitted.depth[0], 1.5, rtol=0.05)
+    assert fitted.depth_deviation[0] > 1
     alone = paths.least_acceleration(views, one, 0.05)
     assert np.isfinite(alone.position).all()
 

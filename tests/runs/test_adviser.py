@@ -17,9 +17,11 @@ EFFECTS += ("start_from_points", "background_points", "depth")
 
 def findings(**wanted):
     """Findings by effect, words joined by underscores; None cannot be told."""
-    told = {True: CERTAIN, False: CERTAIN, None: CANNOT_TELL}
+    confidence = {True: CERTAIN, False: CERTAIN, None: CANNOT_TELL}
     named = ((name.replace("_", " "), choice) for name, choice in wanted.items())
-    return tuple(Finding(name, "", "", choice, told[choice]) for name, choice in named)
+    return tuple(
+        Finding(name, "", "", choice, confidence[choice]) for name, choice in named
+    )
 
 
 @pytest.mark.parametrize("full", [False, True])
@@ -54,9 +56,9 @@ def test_a_still_scene_gets_no_motion_and_a_moving_one_gets_it():
 
 
 def test_advice_is_followed_but_for_what_the_user_sets():
-    asked = RunConfig("splats-static-small", overrides=("depth.weight=0.5",))
-    found = findings(motion=True, depth=True)
-    config, lines = adviser.follow(asked, found)
+    wanted = RunConfig("splats-static-small", overrides=("depth.weight=0.5",))
+    answers = findings(motion=True, depth=True)
+    config, lines = adviser.follow(wanted, answers)
     assert config.preset == "splats-tracked-small"
     assert config.overrides == ("depth.weight=0.1", "depth.weight=0.5")
     assert any(line.split()[:3] == ["motion", "yes", "certain"] for line in lines)

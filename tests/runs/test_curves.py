@@ -42,10 +42,10 @@ def test_a_curve_comes_back_as_it_was_written(tmp_path):
     )
     history = History(({"step": 1, "seconds": 1.0, "loss": 0.1},), rows, 3.0, 2.0)
     curves.write(tmp_path, history, ["frame 3"])
-    found = curves.read(tmp_path)
-    assert found.seconds == (1.0, 3.0)
-    assert found.psnr[0] == 12.5
-    assert np.isnan(found.psnr[1])
-    assert found.frames == ("frame 3",)
-    assert found.compile_seconds == 2.0
-    assert "jax" in found.machine
+    stored = curves.read(tmp_path)
+    assert stored.seconds == (1.0, 3.0)
+    assert stored.psnr[0] == 12.5
+    assert np.isnan(stored.psnr[1])
+    assert stored.frames == ("frame 3",)
+    assert stored.compile_seconds == 2.0
+    assert "jax" in stored.machine

@@ -34,29 +34,31 @@ def test_seconds_are_the_steps_that_they_allow(growing, tmp_path, monkeypatch):
     )
     run = runs.new_run(config)
     state = run.model.init(run.capture, jax.random.key(0))
-    asked = []
+    measured = []
 
     def step_time(model, state, frames, steps):
-        asked.append((model, steps))
+        measured.append((model, steps))
         return StepTime(0.01, 3.0)
 
     monkeypatch.setattr(rate, "step_time", step_time)
-    found, line = plan.with_seconds(run, state, 10)
-    assert asked == [(run.model, 3000)]
+    planned, line = plan.with_seconds(run, state, 10)
+    assert measured == [(run.model, 3000)]
     # 200 static points may become 400.
     steps = 1000 / 2**0.5 if growing else 1000
-    assert found.spec.steps == found.config.steps == plan.rounded(steps)
-    assert found.spec == runs.scene_spec(found.config)
-    assert found.spec.sh_every == round(found.spec.steps / 3)
-    longer = found.model.init(found.capture, jax.random.key(0))
+    assert planned.spec.steps == planned.config.steps == plan.rounded(steps)
+    assert planned.spec == runs.scene_spec(planned.config)
+    assert planned.spec.sh_every == round(planned.spec.steps / 3)
+    longer = planned.model.init(planned.capture, jax.random.key(0))
     jax.tree.map(np.testing.assert_array_equal, longer.params, state.params)
-    assert found.capture is run.capture
-    assert found.filmed is run.filmed
-    assert line.startswith(f"plan: {found.spec.steps:,} steps for 10 s of training (10")
+    assert planned.capture is run.capture
+    assert planned.filmed is run.filmed
+    assert line.startswith(
+        f"plan: {planned.spec.steps:,} steps for 10 s of training (10"
+    )
     assert ("1.4 times that" in line) == growing
     if growing:
-        stop = found.spec.densification.refine_stop_iter
-        assert stop == round(2000 * found.spec.steps / 3000)
+        stop = planned.spec.densification.refine_stop_iter
+        assert stop == round(2000 * planned.spec.steps / 3000)
 
 
 def test_growth_is_expected_within_bounds():
@@ -67,7 +69,9 @@ def test_growth_is_expected_within_bounds():
     at_first = model.counts(state)["gaussians"]
     for cap, growth in ((at_first // 2, 1), (2 * at_first, 2**0.5), (10**6, 2)):
         density = dataclasses.replace(spec.densification, cap_max=cap)
-        found = kind.growth(dataclasses.replace(spec, densification=density), state)
-        assert found == pytest.approx(growth)
+        growth_of_scene = kind.growth(
+            dataclasses.replace(spec, densification=density), state
+        )
+        assert growth_of_scene == pytest.approx(growth)
     assert kind.growth(dataclasses.replace(spec, densification=None), state) == 1
     assert representations.named("radiance").growth(None, state) == 1

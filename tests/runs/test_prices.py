@@ -65,9 +65,9 @@ NONE = math.nan  # no step takes longer
     ],
 )
 def test_a_price_is_what_an_effect_adds_in_bare_steps(effect, gaussians, radiance):
-    found = prices.price(effect, MEASURED)
+    price = prices.price(effect, MEASURED)
     expected = {"gaussians": gaussians, "radiance": radiance}
-    assert found == pytest.approx(expected, nan_ok=True)
+    assert price == pytest.approx(expected, nan_ok=True)
 
 
 def test_the_kept_baseline_prices_every_decision():
@@ -115,7 +115,7 @@ def test_the_table_and_the_json_have_the_price():
     column = head.index("cost per step")
     assert motion[column:].startswith("x2.50 / x2.20  it moves")
     assert start[column:].startswith("- / -")
-    assert prices.told(findings)[START] == "- / -"
+    assert prices.format_prices(findings)[START] == "- / -"
     stored = prices.as_json(findings)
     assert stored[START] == {"gaussians": None, "radiance": None}
     assert all(math.isfinite(factor) for factor in stored[MOTION].values())

@@ -18,13 +18,13 @@ THREADS = {"gaussians": "one", "radiance": "all"}
 
 @pytest.mark.parametrize("name", THREADS)
 def test_every_preset_finds_its_representation(name):
-    found = representations.named(name)
-    assert (found.name, found.threads) == (name, THREADS[name])
-    assert found.presets
-    for preset, spec in found.presets.items():
-        assert representations.of_preset(preset) is found
-        assert isinstance(spec, found.spec_type)
-        assert found.with_steps(spec, 77).steps == 77
+    kind = representations.named(name)
+    assert (kind.name, kind.threads) == (name, THREADS[name])
+    assert kind.presets
+    for preset, spec in kind.presets.items():
+        assert representations.of_preset(preset) is kind
+        assert isinstance(spec, kind.spec_type)
+        assert kind.with_steps(spec, 77).steps == 77
 
 
 def test_preset_names_are_unique_over_all_representations():
@@ -87,9 +87,9 @@ def save(folder, preset):
 def test_a_run_folder_knows_its_representation(name, tmp_path):
     preset, *_ = representations.named(name).presets
     saved = save(tmp_path, preset)
-    found = runs.saved_run(tmp_path)
-    assert (found.config, found.spec) == saved
-    kind = found.representation
+    saved_run = runs.saved_run(tmp_path)
+    assert (saved_run.config, saved_run.spec) == saved
+    kind = saved_run.representation
     assert kind is representations.of_run(tmp_path) is representations.named(name)
 
 

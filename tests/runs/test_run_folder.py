@@ -47,12 +47,12 @@ def test_a_folder_has_one_owner_for_the_life_of_its_process(end, tmp_path):
     )
     try:
         assert owner.stdout.readline() == b"mine\n"
-        told = (
+        refusal = (
             rf"process {owner.pid} on .* \(since 20.*\) is at work in this run folder"
         )
-        with pytest.raises(ValueError, match=told):
+        with pytest.raises(ValueError, match=refusal):
             run_folder.new_run_folder(tmp_path, "x")
-        with pytest.raises(ValueError, match=told), run_folder.owned(tmp_path):
+        with pytest.raises(ValueError, match=refusal), run_folder.owned(tmp_path):
             pytest.fail("owned twice")
     finally:
         if end == "killed":
