@@ -3,16 +3,20 @@
 import pathlib
 from typing import Any
 
+import numpy as np
+
 from gaussians_jax import (
     files,
     model_file,
     point_tracks,
     presets,
     scene,
+    splats,
     step_time,
     variants,
 )
 from gaussians_jax.effects.motion_basis import BasisMotionSpec
+from gaussians_jax.player import page
 from nerfies_jax.capture import pinholes
 from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.capture.capture import Capture
@@ -20,13 +24,14 @@ from nerfies_jax.evaluation.representation import (
     MODEL,
     Choice,
     Pair,
+    Player,
     Representation,
     Saved,
 )
 from nerfies_jax.evidence import record, usable_paths
 from nerfies_jax.evidence.findings import DEPTH, LIGHT, MOTION, START, TRANSIENT
 from nerfies_jax.training.effects import Effect
-from nerfies_jax.training.model import TrainState
+from nerfies_jax.training.model import Model, TrainState
 
 
 def growth(spec: Any, state: TrainState) -> float:
@@ -64,6 +69,20 @@ def save(
             "no comparison."
         )
     return Saved(size, tuple(notes))
+
+
+def player(
+    path: pathlib.Path,
+    title: str,
+    spec: Any,
+    model: Model,
+    state: TrainState,
+    capture: Capture,
+    poster: np.ndarray,
+) -> Player:
+    """`player.html`; the poster is uint8 [height, width, 3]."""
+    degree = splats.active_degree(state.step, spec.sh_every, spec.sh_degree)
+    return page.write(path, title, model, spec.raster, degree, state, capture, poster)
 
 
 def advise(wanted: dict[str, bool | None], full: bool) -> Choice:
@@ -120,6 +139,7 @@ GAUSSIANS = Representation(
     score_halves=lambda *_, **__: None,
     fitted_rays=0,
     save=save,
+    player=player,
     follow=point_tracks.follow,
     mover=point_tracks.mover,
     advise=advise,

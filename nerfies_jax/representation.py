@@ -60,6 +60,7 @@ RADIANCE = Representation(
     score_halves=held_out_codes.score,
     fitted_rays=held_out_codes.RAYS * held_out_codes.EVALUATIONS,
     save=lambda *_, **__: Saved(),  # the checkpoint holds all there is
+    player=None,  # a picture takes seconds
     follow=point_tracks.follow,
     mover=point_tracks.mover,
     default_preset=None,

@@ -4,6 +4,7 @@
 "nerfies_jax.representations", so it imports no package that has one.
 """
 
+import pathlib
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
@@ -22,6 +23,13 @@ class Saved(NamedTuple):
 
     model_bytes: int | None = None  # of the one file that holds all of it
     notes: tuple[str, ...] = ()  # what the reader should know of them
+
+
+class Player(NamedTuple):
+    """A page that plays a trained scene by itself, and what is in it."""
+
+    path: pathlib.Path
+    about: str
 
 
 class Choice(NamedTuple):
@@ -78,6 +86,9 @@ class Representation(NamedTuple):
     fitted_rays: int  # rendered to fit the codes of one frame
     # (folder, spec, metadata, state, effects=()) -> what it wrote beside the checkpoint
     save: Callable[..., Saved]
+    # (path, title, spec, model, state, capture, poster) -> a page that shows the scene
+    # from anywhere at any time; None where nothing plays it in a browser.
+    player: Callable[..., Player] | None
     follow: Follow
     mover: Mover
     # ({effect: whether it is called for, None unknown}, papers' sizes) -> what to take

@@ -61,6 +61,7 @@ def make(
             report.Figure(curve, "PSNR of a few held-out frames while it trained.")
         )
     film = save_film(folder / "scene.mp4", run, renderer, state, ms_per_frame / 1e3)
+    player, unplayed = save_player(folder, run, trained)
     save_depth(folder / "depth", run.capture, scored)
     saved = run.representation.save(
         folder, run.spec, run.metadata, state, effects=run.effects
@@ -76,14 +77,14 @@ def make(
     save_metrics(folder / "metrics.json", metrics)
     warnings = floors_text.warnings(numbers)
     notes = [*warnings, trained.result.message, *_capture_notes(run), *left_out]
-    notes += [*remarks, *gain, *saved.notes]
+    notes += [*remarks, *gain, *saved.notes, *unplayed]
     following = _next(folder, run, trained)
     page = report.write(
         folder,
         f"{run.capture.name}: {run.config.preset}",
         metrics,
         json.loads((folder / CONFIG).read_text()),
-        figures,
+        [*player, *figures],
         film,
         run.representation.time_parts(
             run.spec, run.metadata, run.model, state, frames, effects=run.effects
@@ -255,6 +256,38 @@ def save_film(
     )
     video.write_video(path, frames, film.rate)
     return path
+
+
+def save_player(
+    folder: pathlib.Path, run: Run, trained: Trained
+) -> tuple[list[report.Figure], list[str]]:
+    """A page that plays the scene, linked by its first picture; else a note why not."""
+    write = run.representation.player
+    if write is None:
+        return [], [
+            f"The {run.representation.name} representation has no player; scene.mp4 "
+            "shows it from a moving camera."
+        ]
+    first = evaluation.view_of(run.capture, int(run.capture.train[0]))
+    try:
+        state = trained.result.state
+        poster = evaluation.as_picture(trained.renderer(state, first).colour)
+        made = write(
+            folder / "player.html",
+            f"{run.capture.name}: {run.config.preset}",
+            run.spec,
+            run.model,
+            state,
+            run.capture,
+            poster,
+        )
+        picture = folder / "player.png"
+        pictures.save(poster, picture)
+    except Exception as error:  # whatever it is, the run keeps all its other products
+        return [], [f"There is no player: {type(error).__name__}: {error}"]
+    print(f"player:     {made.path} ({made.about})")
+    caption = f"Play it, look from elsewhere: {made.path.name}. {made.about}"
+    return [report.Figure(picture, caption, made.path.name)], []
 
 
 def save_depth(folder: pathlib.Path, capture: Capture, scored: Scored) -> None:

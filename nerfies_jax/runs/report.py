@@ -43,6 +43,7 @@ class Figure(NamedTuple):
 
     path: pathlib.Path  # PNG or JPEG
     caption: str
+    link: str = ""  # a file beside the page that the picture leads to
 
 
 class Command(NamedTuple):
@@ -157,6 +158,8 @@ def _figure(figure):
         )
     else:
         picture = f'<img {shape} alt="{caption}" src="{source}">'
+    if figure.link:
+        picture = f'<a href="{_safe(figure.link)}">{picture}</a>'
     return f"<figure>{picture}<figcaption>{caption}</figcaption></figure>"
 
 

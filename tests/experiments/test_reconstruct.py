@@ -60,6 +60,7 @@ PRODUCTS = (
     "scene.mp4",
     "gaussians.ply",
     "model.npz",
+    "player.html",
     "report.html",
 )
 
@@ -102,9 +103,10 @@ def test_a_capture_becomes_splats_and_a_report(tmp_path, monkeypatch, capsys):
     np.testing.assert_allclose(metrics["floor.neighbours"], exact, atol=1e-3)
     assert metrics["heldout.psnr"] < exact  # two steps
     page, printed = (out / "report.html").read_text(), capsys.readouterr().out
-    for words in ("is below the", f"{exact:.2f} dB"):
+    for words in ("is below the", f"{exact:.2f} dB", "player.html"):
         assert words in page
         assert words in printed
+    assert "There is no player" not in page
     assert "plan: 2 steps for 250 s of training" in printed
     assert "motion:   is worth +0.00 dB" in printed
 

@@ -1,10 +1,40 @@
-"""What a run tells of its size and speed."""
+"""What a run tells of its size and speed, and what it keeps where a part fails."""
+
+import types
+
+import numpy as np
 
 from nerfies_jax.evaluation.representation import Saved
-from nerfies_jax.runs import products
+from nerfies_jax.runs import products, representations
+from nerfies_jax.runs.config import RunConfig
+from nerfies_jax.runs.run import Run
+from nerfies_jax.runs.train import Trained
+from nerfies_jax.training.model import Rendering
+from tests import scenes
 
 
 def test_the_size_of_a_model_is_a_metric_where_there_is_one():
     (size,) = products.model_size(Saved(2_345_678))
     assert (size.key, size.value) == ("file.bytes", 2_345_678)
     assert products.model_size(Saved()) == []
+
+
+def test_a_player_that_fails_loses_nothing_but_itself(tmp_path):
+    def write(*_):
+        raise KeyError("mean")
+
+    capture = scenes.tiny_capture()
+    kind = representations.named("gaussians")._replace(player=write)
+    config = RunConfig("splats-static-small")
+    run = Run(config, capture, capture, kind, None, None, None)
+    black = Rendering(np.zeros((30, 40, 3), np.float32), None, None)
+    result = types.SimpleNamespace(state=None)
+    trained = Trained(result, lambda *_: black, None, None)
+    assert products.save_player(tmp_path, run, trained) == (
+        [],
+        ["There is no player: KeyError: 'mean'"],
+    )
+    run = run._replace(representation=kind._replace(player=None))
+    figures, (note,) = products.save_player(tmp_path, run, trained)
+    assert (figures, "has no player" in note) == ([], True)
+    assert not list(tmp_path.iterdir())

@@ -60,7 +60,7 @@ def test_the_page_holds_everything_and_fetches_nothing(tmp_path, picture):
         "a run",
         METRICS,
         {"seed": 3, "spec": {"motion": {"width": 128}, "extras": {}}},
-        [report.Figure(picture, "held-out frames")],
+        [report.Figure(picture, "held-out frames", "player.html")],
         film,
         {"field": 30.0, "rasteriser": 10.0},
         ["LPIPS is not computed, because there are no weights"],
@@ -86,8 +86,8 @@ def test_the_page_holds_everything_and_fetches_nothing(tmp_path, picture):
         assert words in page.text, words
     assert not page.find("script")
     assert not page.find("link")
-    links = [a[k] for _, a in page.tags for k in ("src", "href") if k in a]
-    assert all(link.startswith("data:") for link in links)
+    assert page.find("a") == [{"href": "player.html"}]
+    assert all(a["src"].startswith("data:") for _, a in page.tags if "src" in a)
     assert "url(" not in path.read_text()
     assert "@import" not in path.read_text()
 

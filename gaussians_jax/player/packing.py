@@ -1,0 +1,101 @@
+"""Gaussians at a few instants as few bytes: whole numbers, and only what moves twice.
+
+A field (mean, quaternion, ...) is stored once, at rest, and for the rows that change
+as offsets from there, one for each instant, in steps of the row's own. Rest is the
+middle of a row's range, so that no offset is longer than half of it.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gaussians_jax import splats
+from gaussians_jax.player.instants import Instants
+
+# Offsets shorter than this stay out: a tenth of a pixel in the nearest training view
+# for the means, and what changes a picture by less than one of 255 for the others.
+STILL_PX = 0.1
+STILL = {"quaternion": 5e-3, "log_scale": 1e-2, "opacity": 4e-3}
+BRIGHTEST = 4.0  # of a colour, 1 being white
+OFFSET_TYPES = {
+    "mean": np.int16,
+    "quaternion": np.int8,  # 1/254 of how far the row turns: 0.2 degrees of 60
+    "log_scale": np.int8,
+    "opacity": np.int8,
+}
+
+
+class Packed(NamedTuple):
+    """Arrays one behind the other, and where each is."""
+
+    entries: dict[str, dict[str, Any]]  # value = shift + scale * stored number
+    data: bytes
+
+
+def pack(instants: Instants, still_distance: np.ndarray) -> Packed:
+    """The instants in bytes; a mean stands still within `still_distance` [gaussians].
+
+    In scene units. Means at rest are float32, so that one Gaussian far away costs the
+    near ones nothing; 16 bits for rotations, scales and colours, 8 for opacity.
+    """
+    low, high = splats.LOG_SCALE_RANGE
+    quantisers = {
+        "mean": (np.float32, 1.0, 0.0),
+        "quaternion": (np.int16, 1 / 32767, 0.0),
+        "log_scale": (np.uint16, (high - low) / 65535, low),
+        "opacity": (np.uint8, 1 / 255, 0.0),
+    }
+    arrays = _Arrays()
+    # A Gaussian may be brighter than white where others lie before it.
+    colour = np.round(np.minimum(instants.colour / BRIGHTEST, 1) * 65535)
+    arrays.add("colour", colour.astype(np.uint16), BRIGHTEST / 65535)
+    for name, (kind, scale, shift) in quantisers.items():
+        values = getattr(instants, name).astype(np.float64)
+        values = values.reshape(*values.shape[:2], -1)
+        rest = (values.min(axis=0) + values.max(axis=0)) / 2
+        stored = (rest - shift) / scale
+        stored = stored if kind is np.float32 else np.round(stored)
+        stored = stored.astype(kind)
+        # From what is stored, so that the offsets make up for its rounding as well.
+        offset = values - (shift + scale * stored.astype(np.float64))
+        least = still_distance if name == "mean" else STILL[name]
+        (rows,) = np.nonzero(np.abs(values - rest).max(axis=(0, 2)) > least)
+        most = np.iinfo(OFFSET_TYPES[name]).max
+        step = (np.abs(offset[:, rows]).max(axis=(0, 2)) / most).astype(np.float32)
+        steps = np.maximum(step, np.finfo(np.float32).tiny)[None, :, None]
+        change = np.clip(np.round(offset[:, rows] / steps), -most, most)
+        arrays.add(name, stored, scale, shift)
+        arrays.add(f"{name}.rows", rows.astype(np.uint32))
+        arrays.add(f"{name}.step", step)
+        arrays.add(f"{name}.change", change.astype(OFFSET_TYPES[name]))
+    return arrays.packed()
+
+
+class _Arrays:
+    """Bytes of arrays, each beginning at a multiple of four."""
+
+    def __init__(self):
+        self._entries, self._parts, self._size = {}, [], 0
+
+    def add(self, name, array, scale=1.0, shift=0.0):
+        content = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<"))
+        content = content.tobytes()
+        self._entries[name] = {
+            "type": array.dtype.name,
+            "shape": list(array.shape),
+            "offset": self._size,
+            "scale": scale,
+            "shift": shift,
+        }
+        content += bytes(-len(content) % 4)
+        self._parts.append(content)
+        self._size += len(content)
+
+    def packed(self):
+        return Packed(self._entries, b"".join(self._parts))
+
+
+def moving_rows(packed: Packed) -> int:
+    """How many Gaussians change over time, in whatever way (at least)."""
+    names = [name for name in packed.entries if name.endswith(".rows")]
+    return max(packed.entries[name]["shape"][0] for name in names)

@@ -1,0 +1,149 @@
+"""`player.html`: a trained moving scene in one file that any browser plays.
+
+Nothing is fetched: Gaussians, program and poster are inside. What is drawn has one
+colour from everywhere, the mean of what the training cameras see, and straight motion
+between the instants.
+"""
+
+import base64
+import html
+import importlib.resources
+import io
+import json
+import pathlib
+import re
+
+import numpy as np
+import PIL.Image
+from jaxtyping import Array, Int
+
+from gaussians_jax.player import packing
+from gaussians_jax.player.instants import Instants, gathered
+from gaussians_jax.raster_spec import RasterSpec
+from nerfies_jax.capture import camera_paths
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.capture.json_files import replaced_file
+from nerfies_jax.evaluation.representation import Player
+from nerfies_jax.geometry import camera as cameras
+from nerfies_jax.training.model import Model, TrainState
+
+SECONDS = 4.0  # that a film plays whose rate is not known
+SHORTEST, LONGEST = 1.0, 60.0
+# What the page's own project() reads; the sizes that only cost time stay here.
+RASTER = (
+    *("alpha_threshold", "alpha_max", "eps2d", "antialiased", "near", "far"),
+    "tangent_margin",
+)
+LARGEST = 1e30  # for an infinite far plane, which JSON has not
+
+
+def write(
+    path: pathlib.Path,
+    title: str,
+    model: Model,
+    raster: RasterSpec,
+    degree: Int[Array, ""],
+    state: TrainState,
+    capture: Capture,
+    poster: np.ndarray,
+) -> Player:
+    """Write the page, which opens with the first training camera.
+
+    `degree` is that of the harmonics in use; `poster` (uint8 [height, width, 3]) is
+    shown until the first frame is drawn, and where nothing can be.
+    """
+    instants = gathered(model, raster, degree, state, capture)
+    packed = packing.pack(instants, still_distance(instants, capture))
+    about = _about(instants, packed, capture)
+    background = capture.background or (0.0, 0.0, 0.0)
+    parts = {
+        "title": html.escape(title),
+        "about": html.escape(about),
+        "background": "#" + bytes(round(255 * part) for part in background).hex(),
+        "poster": _data_url(poster),
+        # A "</script>" in a name must not end the header.
+        "header": json.dumps(header(packed, raster, capture)).replace("<", "\\u003c"),
+        "data": base64.b64encode(packed.data).decode("ascii"),
+        "splats": _file("splats.js"),
+        "player": _file("player.js"),
+    }
+    # In one pass: what stands in a name is never taken for a part.
+    page = re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], _file("player.html"))
+    with replaced_file(path) as partial:
+        partial.write_text(page, encoding="utf-8")
+    return Player(path, f"{about} {path.stat().st_size / 1e6:.1f} MB.")
+
+
+def header(packed: packing.Packed, raster: RasterSpec, capture: Capture) -> dict:
+    """What the page must know beside the Gaussians, as JSON."""
+    train = cameras.take(capture.cameras, capture.train)
+    first = cameras.take(train, 0)
+    forward = first.camera_from_world[2].astype(np.float64)
+    focus = camera_paths.focus_point(train, capture.near, capture.far)
+    away = float(np.clip((focus - first.position) @ forward, capture.near, capture.far))
+    up = camera_paths.mean_up(train) if capture.up is None else capture.up
+    view = {
+        "rotation": first.camera_from_world.ravel(),
+        "position": first.position,
+        "focal": first.focal_px,
+        "aspect": first.pixel_aspect,
+        "centre": first.principal_point_px,
+        "size": capture.size,
+        # On the viewing axis, so that turning about it begins with the first picture.
+        "target": first.position + away * forward,
+    }
+    return {
+        "instants": packed.entries["mean.change"]["shape"][0],
+        "seconds": seconds(capture),
+        "up": np.asarray(up, np.float64).tolist(),
+        "world_units": 1 / capture.scale,
+        "view": {name: np.asarray(part).tolist() for name, part in view.items()},
+        "raster": {
+            name: min(getattr(raster, name), LARGEST)
+            if name == "far"
+            else getattr(raster, name)
+            for name in RASTER
+        },
+        "arrays": packed.entries,
+    }
+
+
+def seconds(capture: Capture) -> float:
+    """How long the scene took, where the rate of the footage is known."""
+    if capture.frames_per_second is None:
+        return SECONDS
+    moments = len(np.unique(capture.times))
+    return float(np.clip(moments / capture.frames_per_second, SHORTEST, LONGEST))
+
+
+def still_distance(instants: Instants, capture: Capture) -> np.ndarray:
+    """How far a Gaussian may move unnoticed, scene units: a tenth of a pixel.
+
+    In the training camera that comes nearest to where it is at first.
+    """
+    train = cameras.take(capture.cameras, capture.train)
+    nearest = np.full(instants.mean.shape[1], np.inf)
+    for position, focal in zip(train.position, train.focal_px, strict=True):
+        away = np.linalg.norm(instants.mean[0] - position, axis=1)
+        nearest = np.minimum(nearest, away / focal)
+    return packing.STILL_PX * nearest
+
+
+def _about(instants, packed, capture):
+    count = instants.mean.shape[1]
+    return (
+        f"{count:,} Gaussians, {packing.moving_rows(packed):,} of them moving, at "
+        f"{len(instants.mean)} instants; {instants.left_out:,} that no camera saw are "
+        f"left out; one unit is {1 / capture.scale:.3g} of the capture's world."
+    )
+
+
+def _data_url(picture):
+    content = io.BytesIO()
+    PIL.Image.fromarray(picture).save(content, "JPEG", quality=85)
+    return "data:image/jpeg;base64," + base64.b64encode(content.getvalue()).decode()
+
+
+def _file(name):
+    place = importlib.resources.files("gaussians_jax.player").joinpath(name)
+    return place.read_text(encoding="utf-8")
