@@ -174,7 +174,7 @@ function start(header, buffer) {
     if (sideways) return change(moved(view, -dx * unit, -dy * unit));
     const right = view.rotation.slice(0, 3);
     const about = turned(view, header.up, -dx * 0.006);
-    change(turned(about, right, dy * 0.006));
+    change(turned(about, right, -dy * 0.006));
   }
 
   const held = new Map();
