@@ -8,7 +8,7 @@ import contextlib
 import dataclasses
 import pathlib
 import sys
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -23,9 +23,11 @@ class NamedSource(CaptureSource):
     """Which pictures, the folder named without an option."""
 
     capture: Positional[pathlib.Path | None] = None
-    """Folder in Nerfies, HyperNeRF, Blender, D-NeRF or COLMAP layout."""
+    """Folder in Nerfies, HyperNeRF, Blender, D-NeRF, COLMAP or LLFF layout."""
     scene: str | None = None
     """Which built-in scene, where no capture is given (default: default)."""
+    missing: Literal["refuse", "skip"] | None = None
+    """What to do with frames whose picture is missing (default: refuse)."""
     files: Annotated[GivenFiles, tyro.conf.arg(name="")] = GivenFiles()
 
 

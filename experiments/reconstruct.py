@@ -2,6 +2,7 @@
 
     python -m experiments.reconstruct              # the built-in scene
     python -m experiments.reconstruct CAPTURE      # your own
+    python -m experiments.reconstruct CLIP.mp4     # a film, its cameras found first
 
 Leaves a run folder with checkpoints, metrics, pictures, a video and a report.
 """
@@ -14,7 +15,7 @@ from typing import Literal
 
 from experiments import cli
 from nerfies_jax.runs import commands, platform, representations
-from nerfies_jax.runs.config import MoreMetrics, RunConfig
+from nerfies_jax.runs.config import MoreMetrics, Preparation, RunConfig
 from nerfies_jax.training import stopping
 
 
@@ -55,6 +56,8 @@ class Reconstruct:
     checkpoint_every: float = 60.0
     """Seconds between two checkpoints; a run that is killed loses no more than that."""
     more: cli.More = MoreMetrics()
+    prepare: Preparation = Preparation()
+    """Of a film, or a folder of pictures without cameras."""
 
 
 def main(arguments=None):
@@ -107,7 +110,9 @@ def _outcome(args):
         seed=args.seed or 0,
     )
     with cli.user_errors((runs.Refused,)):
-        return runs.reconstruct(config, args.out, effects=args.effects, **common)
+        return runs.reconstruct(
+            config, args.out, effects=args.effects, prepare=args.prepare, **common
+        )
 
 
 def _check_resumed(args):

@@ -102,7 +102,7 @@ def read(
 def _name(file_path):
     """One id, unique over the splits and fit for a file name: train_r_0."""
     plain = pathlib.PurePosixPath(file_path)
-    stem = plain.with_suffix("") if plain.suffix in frames.SUFFIXES else plain
+    stem = plain.with_suffix("") if plain.suffix.lower() in frames.SUFFIXES else plain
     return "_".join(part for part in stem.parts if part not in (".", "/"))
 
 

@@ -1,7 +1,6 @@
 """COLMAP reconstructions: read them through pycolmap."""
 
 import pathlib
-import re
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -76,7 +75,7 @@ def read(
     placement = place_by_points(model.points, model.positions, model.depths)
     centre, scale = np.array(placement.centre), placement.scale
     cameras = _cameras(lenses, model.rotations, (model.positions - centre) * scale)
-    times = frames.spread(_clock(model.names))
+    times = frames.spread(frames.clock([name_of(name) for name in model.names]))
     train, scored = frames.hold_out_every(
         len(rows), heldout or frames.HELD_OUT, str(path)
     )
@@ -329,11 +328,3 @@ def _cameras(lenses, rotations, positions):
         radial=radial,
         tangential=tangential,
     )
-
-
-def _clock(names):
-    """The frame numbers at the end of the names, or their order if they have none."""
-    split = [re.fullmatch(r"(.*?)(\d+)", name_of(name)) for name in names]
-    if all(split) and len({match.group(1) for match in split}) == 1:
-        return [int(match.group(2)) for match in split]
-    return list(range(len(names)))

@@ -20,7 +20,7 @@ MAX_FRAMES = 100_000
 MAX_BYTES = 16 * 2**30  # of decoded pictures
 HELD_OUT = 8  # every 8th frame where the files say nothing, as LLFF and Mip-NeRF 360
 UNSEEN = 128  # grey of a point that no frame shows
-SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+SUFFIXES = (".png", ".jpg", ".jpeg")  # in small letters; files may have others
 
 
 def natural(name: str) -> tuple:
@@ -64,7 +64,7 @@ def choose_source(
 
 def find_picture(folder: pathlib.Path, name: str) -> pathlib.Path | None:
     """`folder / name` as it is or with a picture's ending; None if there is none."""
-    for suffix in ("", *SUFFIXES):
+    for suffix in ("", *SUFFIXES, *map(str.upper, SUFFIXES)):
         path = folder / (name + suffix)
         if path.is_file():
             return path
@@ -186,6 +186,14 @@ def hold_out_every(count: int, every: int, where: str) -> tuple[np.ndarray, np.n
 def dense(values: ArrayLike) -> np.ndarray:
     """0..n-1 in the order of the values, equal for equal ones; int32."""
     return np.unique(np.asarray(values), return_inverse=True)[1].astype(np.int32)
+
+
+def clock(stems: Sequence[str]) -> list[int]:
+    """The frame numbers at the end of the names, or their order if they have none."""
+    split = [re.fullmatch(r"(.*?)(\d+)", stem) for stem in stems]
+    if all(split) and len({match.group(1) for match in split}) == 1:
+        return [int(match.group(2)) for match in split]
+    return list(range(len(stems)))
 
 
 def spread(values: ArrayLike) -> np.ndarray:

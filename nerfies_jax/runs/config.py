@@ -12,7 +12,7 @@ class CaptureSource:
     """Which pictures to read: a folder's, or those of a built-in scene."""
 
     capture: pathlib.Path | str | None = None  # a path, once it is made
-    """Folder in Nerfies, HyperNeRF, Blender, D-NeRF or COLMAP layout."""
+    """Folder in Nerfies, HyperNeRF, Blender, D-NeRF, COLMAP or LLFF layout."""
     scene: str = "default"
     """Which built-in scene, where no capture is given."""
     factor: int | None = None
@@ -21,6 +21,8 @@ class CaptureSource:
     """Read the pictures with no side longer than this, in pixels."""
     heldout: str | None = None
     """Which frames to score: n for every n-th, or the name of a split."""
+    missing: Literal["refuse", "skip"] = "refuse"
+    """What to do with frames whose picture is missing."""
     files: GivenFiles = GivenFiles()
     """What other tools found in the pictures."""
 
@@ -40,6 +42,8 @@ class CaptureSource:
             value = fields[name]
             if value is not None:
                 words += [f"--{name.replace('_', '-')}", str(value)]
+        if self.missing != "refuse":
+            words += ["--missing", self.missing]
         return tuple(words)
 
 
@@ -54,6 +58,33 @@ class RunConfig:
     overrides: tuple[str, ...] = ()  # of the preset's fields, as for --set
     effects: tuple[str, ...] = ()  # of the user's own, as MODULE:NAME
     seed: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Preparation:
+    """How a film or pictures without cameras become a capture."""
+
+    frames: int | None = None
+    """How many frames of a film to keep, evenly spread over it (default: 100)."""
+    fps: float | None = None
+    """How many frames to keep of each second of a film, in place of a number."""
+    max_side: int = 960
+    """Longest side of the pictures in pixels."""
+    masks: pathlib.Path | None = None
+    """Masks of what moves by itself, black: NAME.png for every picture NAME, or one for
+    every frame of a film, in order. Without them it is found in the pictures."""
+    passes: Literal[1, 2] = 2
+    """2: look with the first cameras for what moves, and for the cameras once more
+    without it. 1: take the first cameras."""
+    camera_model: Literal[
+        "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"
+    ] = "OPENCV"
+    """COLMAP's name for the lens, the same for all pictures."""
+    matcher: Literal["auto", "sequential", "exhaustive"] = "auto"
+    """Which pictures to compare: neighbours, or all with all (auto: neighbours of more
+    than 40 pictures)."""
+    threads: int | None = None
+    """How many cores to use (default: all)."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,8 +9,16 @@ from typing import Any, Literal, NamedTuple
 
 from nerfies_jax.capture.capture import CaptureError, describe
 from nerfies_jax.evidence import inspection
-from nerfies_jax.runs import adviser, plan, products, quality, run_folder, train
-from nerfies_jax.runs.config import MoreMetrics, RunConfig
+from nerfies_jax.runs import (
+    adviser,
+    plan,
+    preparation,
+    products,
+    quality,
+    run_folder,
+    train,
+)
+from nerfies_jax.runs.config import MoreMetrics, Preparation, RunConfig
 from nerfies_jax.runs.run import (
     Run,
     first_state,
@@ -49,9 +57,12 @@ def reconstruct(
     evaluate_every: float | int = 20.0,
     checkpoint_every: float | int = 60.0,
     more: MoreMetrics = MoreMetrics(),
+    prepare: Preparation = Preparation(),
 ) -> Outcome:
     """Train a run from its first step, and score, draw and film what came of it.
 
+    Where its source is a film, or pictures without cameras, these are made a capture
+    first as `prepare` says: a folder beside `out` that is kept, `OUT-capture`.
     Everything goes into the new folder `out`, by default `runs/CAPTURE-PRESET`, and
     from its first moment on `resume` continues the run that is in there. `effects`
     "auto" looks at the capture first and takes those that it calls for. `seconds` of
@@ -67,6 +78,7 @@ def reconstruct(
             if out is not None:
                 out = pathlib.Path(out)
                 run_folder.check_free(out)
+            config = _with_cameras(config, out, prepare)
             run = _new_run(config, effects)
             _describe(run)
             extra = quality.prepared(more, run.capture.size)
@@ -122,6 +134,17 @@ def _refusing() -> Iterator[None]:
         yield
     except (ValueError, OSError) as error:
         raise Refused(str(error)) from error
+
+
+def _with_cameras(config, out, how):
+    """The config, its source a capture: prepared now, or before, if it was none."""
+    source = config.source.capture
+    if source is None or not preparation.needed(source):
+        return config
+    out = out or pathlib.Path("runs") / source.stem
+    folder = preparation.prepared(source, out.with_name(f"{out.name}-capture"), how)
+    named = dataclasses.replace(config.source, capture=folder)
+    return dataclasses.replace(config, source=named)
 
 
 def _steps_given(config):

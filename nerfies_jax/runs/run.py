@@ -168,6 +168,7 @@ def _filmed(source, seed):
         factor=source.factor,
         max_side=source.max_side,
         heldout=heldout,
+        missing=source.missing,
     )
 
 

@@ -50,18 +50,16 @@ def film(folder, count, plain=False):
     return cameras
 
 
-def aligned(fitted, true):
+def aligned(found, true):
     """Error of camera centres after the best similarity, relative to their spread."""
-    fitted, true = fitted - fitted.mean(0), true - true.mean(0)
-    u, values, v = np.linalg.svd(true.T @ fitted)
-    scale = values.sum() / (fitted**2).sum()
-    return np.linalg.norm(true - scale * fitted @ (u @ v).T, axis=1).max() / np.ptp(
-        true
-    )
+    found, true = found - found.mean(0), true - true.mean(0)
+    u, values, v = np.linalg.svd(true.T @ found)
+    scale = values.sum() / (found**2).sum()
+    return np.linalg.norm(true - scale * found @ (u @ v).T, axis=1).max() / np.ptp(true)
 
 
 @pytest.mark.slow
-def test_cameras_of_a_textured_room_are_found(tmp_path):
+def test_cameras_of_a_textured_room_are_found(tmp_path, monkeypatch):
     cameras = film(tmp_path / "pictures", 8)
     masks = tmp_path / "masks"
     masks.mkdir()
@@ -72,16 +70,26 @@ def test_cameras_of_a_textured_room_are_found(tmp_path):
     spec = mapping.MappingSpec(
         camera_model="SIMPLE_PINHOLE", first_octave=-1, threads=2
     )
-    out = mapping.run_sfm(tmp_path / "pictures", tmp_path / "out", masks, spec)
-    capture = room.load(out)
-    assert len(capture.ids) == 8
+    monkeypatch.chdir(tmp_path)  # the child runs elsewhere
+    monkeypatch.setattr(mapping, "TELL_SECONDS", 0.0)
+    lines = []
+    poses = mapping.run_sfm("pictures", "out", "masks", spec, lines.append)
+    found = room.load(poses.folder)
+    assert len(found.ids) == 8
     true = np.array([one.position for one in cameras], float)
-    assert aligned(capture.cameras.position.astype(float), true) < 0.02
-    np.testing.assert_allclose(capture.cameras.focal_px, FOCAL, rtol=0.05)
-    assert capture.moving[:, :20].all()
-    assert not capture.moving[:, 20:].any()
-    # No feature lies under a mask: every point projects below it where it was seen.
-    assert sorted(p.name for p in out.iterdir()) == ["images", "masks", "sparse"]
+    assert aligned(found.cameras.position.astype(float), true) < 0.02
+    np.testing.assert_allclose(found.cameras.focal_px, FOCAL, rtol=0.05)
+    assert found.moving[:, :20].all()
+    assert not found.moving[:, 20:].any()
+    files = sorted(path.name for path in poses.folder.iterdir())
+    assert files == ["images", "masks", "sparse"]
+    assert (poses.pictures, poses.placed) == (8, 8)
+    assert 0 < poses.error_px < 1
+    # The farthest two of eight cameras, 1.8 apart, look at 3 to 4 units away.
+    assert 5 < poses.angle_deg < 40
+    assert len(poses.lines()) == 1
+    stages = {line.split()[1] for line in lines}
+    assert {"features", "matches"} <= stages, lines
 
 
 @pytest.mark.slow
@@ -104,9 +112,25 @@ def test_what_cannot_work_is_said_before_it_starts(tmp_path):
         mapping.run_sfm(tmp_path / "more", tmp_path / "out", tmp_path / "masks")
 
 
+def test_doubtful_cameras_say_what_to_do():
+    good = mapping.Poses(None, 100, 95, 3000, 0.5, 6.0)
+    assert len(good.lines()) == 1
+    _, *doubts = good._replace(placed=60, error_px=2.5, angle_deg=0.4).lines()
+    for doubt, words in zip(doubts, ("2.50 px", "0.4 degrees", "40 pict"), strict=True):
+        assert words in doubt
+    assert "--frames 200" in doubts[2]
+
+
 def test_a_child_that_dies_is_an_error_not_our_end(tmp_path, monkeypatch):
     film(tmp_path / "pictures", 2)
     monkeypatch.setattr(mapping.sys, "executable", "/bin/false")
     with pytest.raises(CaptureError, match="ended with code 1"):
         mapping.run_sfm(tmp_path / "pictures", tmp_path / "out")
-    assert [p.name for p in tmp_path.iterdir()] == ["pictures"]
+    slow = tmp_path / "slow"
+    slow.write_text("#!/bin/sh\nexec sleep 60\n")
+    slow.chmod(0o755)
+    monkeypatch.setattr(mapping.sys, "executable", str(slow))
+    spec = mapping.MappingSpec(seconds=0.2)
+    with pytest.raises(CaptureError, match=r"no cameras after 0\.2 s"):
+        mapping.run_sfm(tmp_path / "pictures", tmp_path / "out", spec=spec)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["pictures", "slow"]

@@ -5,7 +5,7 @@ import pytest
 
 from experiments import prepare
 from nerfies_jax import capture as room
-from nerfies_jax.capture import video
+from nerfies_jax.capture import npz_archive, video
 
 
 def pose(angle):
@@ -90,36 +90,11 @@ def test_an_archive_cut_short_and_a_place_in_use(tmp_path):
     data = (tmp_path / "a.npz").read_bytes()
     (tmp_path / "b.npz").write_bytes(data[: len(data) // 2])
     with pytest.raises(ValueError, match=r"b\.npz: not a readable"):
-        prepare.convert_npz(prepare.Npz(tmp_path / "b.npz", tmp_path / "out"))
+        npz_archive.convert(tmp_path / "b.npz", tmp_path / "out")
     (tmp_path / "out").mkdir()
     (tmp_path / "out/mine.txt").touch()
     with pytest.raises(ValueError, match="already there"):
-        prepare.convert_npz(prepare.Npz(tmp_path / "a.npz", tmp_path / "out"))
-
-
-def test_the_sharpest_of_each_stretch_is_kept():
-    rng = np.random.default_rng(0)
-    scores = rng.uniform(80, 120, 60)
-    scores[30:] *= 20  # a part of the film with much more texture
-    scores[12:18] = 5  # one whole stretch is blurred
-    kept, blurred = prepare.sharp_rows(scores, 10)
-    assert blurred == 1
-    assert len(kept) == 9
-    for stretch in range(10):
-        rows = np.arange(6 * stretch, 6 * stretch + 6)
-        assert (rows[np.argmax(scores[rows])] in kept) == (stretch != 2)
-
-
-def test_sharpness_falls_with_blur():
-    import scipy.ndimage
-
-    noise = np.random.default_rng(0).integers(0, 256, (60, 80, 3)).astype(np.uint8)
-    values = [
-        prepare.sharpness(scipy.ndimage.gaussian_filter(noise, (blur, blur, 0)))
-        for blur in (0, 1, 2, 4)
-    ]
-    assert values == sorted(values, reverse=True)
-    assert values[3] < 0.01 * values[0]
+        npz_archive.convert(tmp_path / "a.npz", tmp_path / "out")
 
 
 @pytest.mark.slow

@@ -1,0 +1,297 @@
+"""Pictures without cameras: a film's sharpest frames, or photographs set upright.
+
+Either becomes a folder of PNG files of one size, and masks beside them where they are
+given.
+"""
+
+import collections
+import contextlib
+import importlib
+import math
+import pathlib
+import warnings
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import PIL.Image
+import PIL.ImageOps
+import scipy.ndimage
+
+from nerfies_jax.capture import images
+from nerfies_jax.capture.capture import CaptureError, blocks, shrink
+from nerfies_jax.capture.frames import natural
+from nerfies_jax.capture.images import MAX_PIXELS, write_png
+from nerfies_jax.capture.video import read_video
+
+FILMS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".3gp")
+PLAIN = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
+HEIC = (".heic", ".heif")  # read where pillow-heif is installed
+FRAMES = 100  # kept of a film
+BLURRED = 0.4  # of the usual sharpness around it; planted blurs came out below 0.2
+_ORIENTATION, _EXIF, _FOCAL_35MM = 0x0112, 0x8769, 0xA405
+FULL_FRAME_MM = 36.0  # the longer side that the 35 mm equivalent refers to
+
+
+class Taken(NamedTuple):
+    """What was taken of a film or of a folder of photographs."""
+
+    names: tuple[str, ...]  # of the files written, in order
+    notes: tuple[str, ...]  # what was left out, and why
+    seconds: float | None = None  # from the first frame of a film to the last
+    focal: float | None = None  # in longest sides of the picture, where files say it
+
+
+def kind_of(path: pathlib.Path) -> str | None:
+    """ "film", "pictures" (a folder with two or more), or None."""
+    if path.is_file() and path.suffix.lower() in FILMS:
+        return "film"
+    if path.is_dir() and len(pictures_in(path)) >= 2:
+        return "pictures"
+    return None
+
+
+def pictures_in(folder: pathlib.Path) -> list[pathlib.Path]:
+    """Files of a folder that are pictures by their ending, in natural order."""
+    endings = (*PLAIN, *HEIC)
+    found = [file for file in folder.iterdir() if file.suffix.lower() in endings]
+    return sorted(found, key=lambda file: natural(file.name))
+
+
+def from_film(
+    film: pathlib.Path,
+    out: pathlib.Path,
+    count: int | None = None,
+    per_second: float | None = None,
+    max_side: int = 960,
+    masks: pathlib.Path | None = None,
+) -> Taken:
+    """Write the film's sharpest frames into `out/images`, evenly spread in time.
+
+    `count` of them or so many `per_second` of the film; names keep the milliseconds.
+    `masks` is a folder with one PNG for each frame of the film, black where something
+    moves by itself; those of the frames taken go to `out/masks`.
+    """
+    moments, scores = [], []
+    for seconds, frame in read_video(film):
+        moments.append(seconds)
+        scores.append(sharpness(frame))
+    moments, scores = np.array(moments), np.array(scores)
+    count = _wanted(film, moments, count, per_second)
+    kept, blurred = sharp_rows(scores, moments, count)
+    sources = None if masks is None else _masks_of_film(masks, len(moments))
+    wanted, names = set(kept.tolist()), []
+    for row, (seconds, frame) in enumerate(read_video(film)):
+        if row not in wanted:
+            continue
+        factor = _factor(frame.shape[1::-1], max_side)
+        names.append(f"ms{round(seconds * 1000):08d}.png")  # the name keeps the time
+        _write(out / "images" / names[-1], shrink(frame, factor))
+        if sources is not None:
+            mask = images.read_mask(sources[row])
+            _write_mask(out, names[-1], mask, frame.shape, factor, sources[row])
+    notes = f"{len(kept)} of {len(scores)} frames kept, {blurred} too blurred"
+    return Taken(tuple(names), (notes,), float(np.ptp(moments[kept])))
+
+
+def _wanted(film, moments, count, per_second):
+    if per_second is not None:
+        if count is not None:
+            raise ValueError("give the frames of a film or so many a second, not both")
+        count = round(per_second * np.ptp(moments)) + 1
+    count = FRAMES if count is None else count
+    if count < 2:
+        raise ValueError(
+            f"{film}: {count} frames to keep; a reconstruction needs at least 2"
+        )
+    return count
+
+
+def _masks_of_film(folder, frames):
+    files = pictures_in(folder)
+    if len(files) != frames:
+        raise CaptureError(
+            f"{folder}: {len(files)} masks for a film of {frames} frames; there must "
+            "be one for each, in the order of their names"
+        )
+    return files
+
+
+def from_pictures(
+    folder: pathlib.Path,
+    out: pathlib.Path,
+    max_side: int = 960,
+    masks: pathlib.Path | None = None,
+) -> Taken:
+    """Write the pictures of a folder into `out/images`, upright and of one size.
+
+    `masks` holds NAME.png (or NAME.jpg.png) for every picture NAME.jpg, black where
+    something moves by itself. What cannot be read or has another size than most is left
+    out, and named.
+    """
+    readable, notes = _readable(folder)
+    sizes = {file: _upright_size(file) for file in readable}
+    usual = collections.Counter(sizes.values()).most_common(1)[0][0]
+    taken = [file for file in readable if sizes[file] == usual]
+    others = [file.name for file in readable if sizes[file] != usual]
+    notes += _left_out(others, f"not of {usual[0]}x{usual[1]} pixels like most")
+    stems = collections.Counter(file.stem for file in taken)
+    stem, times = stems.most_common(1)[0]
+    if times > 1:
+        raise CaptureError(f"{folder}: {times} pictures are named {stem}; keep one")
+    factor = _factor(usual, max_side)
+    for file in taken:
+        colour = _upright(file)
+        _write(out / "images" / f"{file.stem}.png", shrink(colour, factor))
+        if masks is not None:
+            source = _mask_of(masks, file)
+            mask = _upright(source).mean(-1) >= 128
+            _write_mask(out, f"{file.stem}.png", mask, colour.shape, factor, source)
+    names = tuple(f"{file.stem}.png" for file in taken)
+    return Taken(names, notes, focal=_focal(taken))
+
+
+def _readable(folder):
+    """The pictures that can be opened here, and a note of the others."""
+    files = pictures_in(folder)
+    photographs = [file.name for file in files if file.suffix.lower() in HEIC]
+    notes = ()
+    if photographs and not _heif():
+        notes = _left_out(
+            photographs, "HEIC, which pillow-heif reads (pip install pillow-heif)"
+        )
+        files = [file for file in files if file.name not in photographs]
+    if len(files) < 2:
+        raise CaptureError(
+            f"{folder}: {len(files)} pictures; a reconstruction needs at least 2"
+            + "".join(f" ({note})" for note in notes)
+        )
+    return files, notes
+
+
+def _left_out(names, reason):
+    if not names:
+        return ()
+    listed = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
+    return (f"{len(names)} pictures left out, {reason}: {listed}",)
+
+
+def _heif():
+    """Whether HEIC can be read; Pillow learns it from a package of its own."""
+    try:
+        importlib.import_module("pillow_heif").register_heif_opener()
+    except ImportError:
+        return False
+    return True
+
+
+@contextlib.contextmanager
+def _opened(file):
+    """The picture as it lies in the file; whatever is wrong with it in one line."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", PIL.Image.DecompressionBombWarning)
+            with PIL.Image.open(file) as picture:
+                if picture.width * picture.height > MAX_PIXELS:
+                    raise CaptureError(
+                        f"{file}: {picture.width}x{picture.height} pixels, more than "
+                        f"{MAX_PIXELS}; make the picture smaller first"
+                    )
+                yield picture
+    except CaptureError:
+        raise
+    except (OSError, ValueError, SyntaxError, Warning) as error:
+        reason = " ".join(str(error).split())
+        raise CaptureError(
+            f"{file}: not a readable picture ({reason}); copy it again or remove it"
+        ) from None
+
+
+def _upright_size(file):
+    with _opened(file) as picture:
+        turned = picture.getexif().get(_ORIENTATION, 1) >= 5  # by a quarter
+        return picture.size[::-1] if turned else picture.size
+
+
+def _upright(file):
+    with _opened(file) as picture:
+        picture = PIL.ImageOps.exif_transpose(picture)
+        if picture.mode.startswith("I"):  # 16 bits of grey
+            values = np.asarray(picture).astype(np.uint32) // 257
+            return np.repeat(values.astype(np.uint8)[..., None], 3, axis=2)
+        return np.asarray(picture.convert("RGB"))
+
+
+def _focal(files: Sequence[pathlib.Path]) -> float | None:
+    """The median focal length that the files tell, in longest sides of the picture."""
+    told = []
+    for file in files:
+        with _opened(file) as picture:
+            value = picture.getexif().get_ifd(_EXIF).get(_FOCAL_35MM)
+        if value:
+            told.append(float(value) / FULL_FRAME_MM)
+    return float(np.median(told)) if told else None
+
+
+def _mask_of(folder, picture):
+    for name in (f"{picture.stem}.png", f"{picture.name}.png"):
+        if (folder / name).is_file():
+            return folder / name
+    raise CaptureError(
+        f"{folder}: no mask {picture.stem}.png; name each after its picture"
+    )
+
+
+def _factor(size, max_side):
+    if max_side < 16:
+        raise ValueError(f"max_side={max_side}; expected at least 16 pixels")
+    return max(1, math.ceil(max(size) / max_side))
+
+
+def _write(path, picture):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_png(path, np.ascontiguousarray(picture))
+
+
+def _write_mask(out, name, mask, shape, factor, source):
+    if mask.shape != shape[:2]:
+        raise CaptureError(
+            f"{source}: a mask of {mask.shape[1]}x{mask.shape[0]} pixels for pictures "
+            f"of {shape[1]}x{shape[0]}; they must agree"
+        )
+    _write(out / "masks" / f"{name}.png", blocks(mask, factor).all((-3, -1)))
+
+
+def sharpness(frame: np.ndarray) -> float:
+    """Variance of the Laplacian of the grey picture: high where edges are sharp."""
+    grey = frame.mean(-1, dtype=np.float32)
+    step = max(1, max(grey.shape) // 480)
+    return float(scipy.ndimage.laplace(grey[::step, ::step]).var())
+
+
+def sharp_rows(
+    scores: np.ndarray, seconds: np.ndarray, count: int
+) -> tuple[np.ndarray, int]:
+    """The sharpest of each of `count` stretches of time, and how many were too blurred.
+
+    Not a global threshold: a film may be sharper where the scene has more texture. (The
+    filter in Nerfies' notebook removes the sharpest frames instead.)
+    """
+    share = (seconds - seconds[0]) / max(np.ptp(seconds), np.finfo(float).tiny)
+    # A frame stands for the time until the next one: the last has a stretch as well.
+    stretch = np.floor(share * (1 - 1 / len(seconds)) * count + 1e-9).astype(int)
+    best = np.array(
+        [
+            rows[np.argmax(scores[rows])]
+            for rows in (np.flatnonzero(stretch == k) for k in np.unique(stretch))
+        ]
+    )
+    own = scores[best]
+    clear = np.array([own[i] >= BLURRED * _usual(own, i) for i in range(len(own))])
+    return best[clear], int((~clear).sum())
+
+
+def _usual(scores, row):
+    """The lower of the medians just before and just after; texture may jump between."""
+    sides = scores[max(0, row - 5) : row], scores[row + 1 : row + 6]
+    return min((np.median(side) for side in sides if side.size), default=0.0)

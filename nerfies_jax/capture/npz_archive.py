@@ -1,0 +1,151 @@
+"""A capture out of an archive of arrays: images, poses, times and focal in one .npz."""
+
+import math
+import pathlib
+import zipfile
+
+import numpy as np
+
+from nerfies_jax.capture import formats
+from nerfies_jax.capture.capture import CaptureError, describe
+from nerfies_jax.capture.frames import HELD_OUT, MAX_BYTES, hold_out_every
+from nerfies_jax.capture.images import write_png
+from nerfies_jax.capture.json_files import AnyPath, new_folder, write_json
+
+SAME_POSE = 1e-6  # of matrix entries; a camera on a tripod repeats its matrix exactly
+TRIPOD_ROWS = 5  # fewer rows of one pose are no validation sweep
+
+
+def convert(
+    file: AnyPath, out: AnyPath, heldout: str | None = None, train: str | None = None
+) -> list[str]:
+    """Write transforms_train.json and transforms_val.json with their pictures.
+
+    The archive holds `images`, `poses` (OpenGL camera to world), `focal` and `times`.
+    Rows to score on and to learn from are named as "first:last+1". Where none are, and
+    rows in a row share one pose, those are a validation sweep: they are held out, the
+    rows before them are learnt from and the rows after them are left out. Returns what
+    to say of it.
+    """
+    images, poses, times, focal = read_npz(pathlib.Path(file))
+    train, heldout, note = rows_of(poses, heldout, train, str(file))
+    common = {"camera_angle_x": 2 * math.atan(images.shape[2] / 2 / focal)}
+    behind = background_of(images)
+    if behind is not None:
+        common["background"] = behind
+    with new_folder(out) as folder:
+        for name, rows in (("train", train), ("val", heldout)):
+            (folder / name).mkdir()
+            entries = []
+            for row in rows:
+                write_png(folder / name / f"r_{row:04d}.png", images[row])
+                entry = {
+                    "file_path": f"./{name}/r_{row:04d}",
+                    "transform_matrix": poses[row].tolist(),
+                }
+                if times is not None:
+                    entry["time"] = float(times[row])
+                entries.append(entry)
+            file = folder / f"transforms_{name}.json"
+            write_json(file, common | {"frames": entries})
+        formats.load(folder)  # refused now rather than when it is used
+    return [*describe(formats.load(out)), note]
+
+
+def read_npz(path):
+    """uint8 images, poses, times or None, and the focal length in pixels."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+        if size > 4 * MAX_BYTES:  # float32 pictures
+            raise CaptureError(f"{path}: unpacks to {size} bytes; split it first")
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
+        if isinstance(error, CaptureError):
+            raise
+        raise CaptureError(
+            f"{path}: not a readable .npz ({' '.join(str(error).split())}); save it "
+            "again with numpy.savez"
+        ) from None
+    absent = {"images", "poses", "focal"} - set(arrays)
+    if absent:
+        raise CaptureError(
+            f"{path}: no array {min(absent)!r}; there are {sorted(arrays)}"
+        )
+    images, poses, times = arrays["images"], arrays["poses"], arrays.get("times")
+    count = len(images)
+    if (
+        images.ndim != 4
+        or images.shape[3] != 3
+        or poses.shape[1:] not in ((4, 4), (3, 4))
+    ):
+        raise CaptureError(
+            f"{path}: images {images.shape} and poses {poses.shape}; expected "
+            "[n, height, width, 3] and [n, 4, 4]"
+        )
+    if len(poses) != count or (times is not None and times.shape != (count,)):
+        raise CaptureError(
+            f"{path}: {count} images but another number of poses or times"
+        )
+    if not all(np.isfinite(a).all() for a in (images, poses, arrays["focal"])):
+        raise CaptureError(f"{path}: holds NaN or infinity; mend or remove those rows")
+    focal = float(np.asarray(arrays["focal"]).ravel()[0])
+    if not focal > 0:
+        raise CaptureError(f"{path}: focal = {focal:g}; it must be positive")
+    if images.dtype != np.uint8:
+        if images.min() < 0 or images.max() > 1:
+            raise CaptureError(
+                f"{path}: images from {images.min():g} to {images.max():g}; expected "
+                "uint8, or floats from 0 to 1"
+            )
+        images = np.round(images * 255).astype(np.uint8)
+    return images, poses.astype(float), times, focal
+
+
+def rows_of(poses, heldout, train, where):
+    """Rows to learn from, rows to score on, and why."""
+    count = len(poses)
+    if heldout is not None:
+        scored = _range(heldout, count, "--heldout")
+        others = np.setdiff1d(np.arange(count), scored)
+        learnt = others if train is None else _range(train, count, "--train")
+        return learnt, scored, "rows as asked for"
+    if train is not None:
+        raise ValueError("--train needs --heldout too, so that both are known")
+    same = np.abs(np.diff(poses, axis=0)).max((1, 2)) < SAME_POSE
+    best, first = (0, 0), 0
+    for row in range(1, count + 1):
+        if row == count or not same[row - 1]:
+            best = max(best, (row - first, -first))
+            first = row
+    length, start = best[0], -best[1]
+    if TRIPOD_ROWS <= length < count and start > 0:
+        rest = count - start - length
+        return (
+            np.arange(start),
+            np.arange(start, start + length),
+            f"rows {start} to {start + length - 1} share one pose: held out; "
+            f"{rest} rows after them left out",
+        )
+    learnt, scored = hold_out_every(count, HELD_OUT, where)
+    return learnt, scored, f"every {HELD_OUT}th row is held out"
+
+
+def _range(text, count, name):
+    try:
+        first, last = (int(part) for part in text.split(":"))
+    except ValueError:
+        raise ValueError(f"{name} {text}: expected first:last+1, as in 50:61") from None
+    if not 0 <= first < last <= count:
+        raise ValueError(f"{name} {text}: the archive has rows 0 to {count - 1}")
+    return np.arange(first, last)
+
+
+def background_of(images):
+    """The colour [0, 1] of the corners, if nearly all corners have the same."""
+    corners = images[:, [0, 0, -1, -1], [0, -1, 0, -1]].reshape(-1, 3)
+    usual = np.median(corners, axis=0)
+    if (corners == usual).all(1).mean() < 0.95:
+        return None
+    return (usual / 255).tolist()

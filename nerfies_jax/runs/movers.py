@@ -1,0 +1,28 @@
+"""What moves by itself in pictures whose cameras were found, or not yet."""
+
+import dataclasses
+
+import numpy as np
+
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.evidence import record
+
+LEAST_SHARE = 0.005  # of the pixels: cameras hardly notice less
+
+
+def masks_of(pictures: Capture) -> np.ndarray | None:
+    """[frames, height, width] bool, True where something moves; None where nothing.
+
+    Frames are those of the capture, whose cameras may be off: tracks that its points
+    at rest do not explain are taken to move.
+    """
+    rows = np.arange(len(pictures.ids))
+    every = dataclasses.replace(pictures, train=rows, heldout=rows[:0])
+    evidence = record.gather(every)
+    if evidence.unusable or evidence.moving.mean() < LEAST_SHARE:
+        return None
+    found = np.zeros((len(rows), *pictures.images.shape[1:3]), bool)
+    enlarged = np.kron(evidence.moving, np.ones((1, *2 * (evidence.factor,)), bool))
+    height, width = np.minimum(found.shape[1:], enlarged.shape[1:])  # whole blocks
+    found[evidence.row, :height, :width] = enlarged[:, :height, :width]
+    return found

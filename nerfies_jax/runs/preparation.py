@@ -1,0 +1,197 @@
+"""A film, or pictures without cameras, becomes a capture that is kept.
+
+Cameras are found in two passes: the second without what moves, which the first tells.
+"""
+
+import dataclasses
+import json
+import os
+import pathlib
+import shutil
+from collections.abc import Callable
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from nerfies_jax.capture import colmap, footage, formats, nerfies_format
+from nerfies_jax.capture.capture import Capture, CaptureError, describe
+from nerfies_jax.capture.footage import Taken
+from nerfies_jax.capture.images import write_png
+from nerfies_jax.capture.json_files import AnyPath, scratch_folder, write_json
+from nerfies_jax.capture.structure_from_motion import MappingSpec, Poses, run_sfm
+from nerfies_jax.runs import movers
+from nerfies_jax.runs.config import Preparation
+from nerfies_jax.training import specs
+
+RECORD = "prepared.json"  # in the capture: of what it was made, and how
+# Masks are of a pinhole and features lie beside edges: this share of the longer side
+# is masked around what moves as well.
+RIM = 0.01
+# Cameras of the second pass are kept where they place so many of the first's pictures.
+AS_MANY = 0.9
+
+Tell = Callable[[str], None]
+
+
+class Solved(NamedTuple):
+    """Cameras, and the masks that they were found with."""
+
+    poses: Poses
+    masked: bool
+    lines: tuple[str, ...]  # what to say of how they were found
+
+
+def prepare(
+    source: AnyPath,
+    out: AnyPath,
+    how: Preparation = Preparation(),
+    tell: Tell = lambda line: None,
+) -> Capture:
+    """Write a film or a folder of pictures as a Nerfies directory with cameras.
+
+    All or nothing; `colmap` in it is COLMAP's model, `masks_found` what was taken to
+    move, white, and `prepared.json` what was done. Raises ValueError where the cameras
+    cannot be found, with what to change.
+    """
+    source, out = pathlib.Path(source), pathlib.Path(out)
+    kind = footage.kind_of(source)
+    if kind is None:
+        raise CaptureError(
+            f"{source}: neither a film ({', '.join(footage.FILMS)}) nor a folder with "
+            f"two or more pictures ({', '.join((*footage.PLAIN, *footage.HEIC))})"
+        )
+    if kind == "pictures" and (how.frames or how.fps):
+        raise ValueError("frames and fps choose from a film; a folder is taken whole")
+    with scratch_folder(out) as scratch:
+        taken = _taken(kind, source, scratch, how)
+        for line in taken.notes:
+            tell(line)
+        solved = _solve(scratch, taken, how, tell)
+        for line in solved.lines:
+            tell(line)
+        found = colmap.read(solved.poses.folder)
+        rate = None
+        if taken.seconds:
+            rate = (len(taken.names) - 1) / taken.seconds
+        if how.masks is None:  # what was found is no truth to be scored by
+            found = dataclasses.replace(found, moving=None)
+        found = dataclasses.replace(
+            found, name=out.name, path=None, frames_per_second=rate
+        )
+        made = scratch / "capture"
+        nerfies_format.write(found, made)
+        shutil.copytree(solved.poses.folder / "sparse", made / "colmap" / "sparse")
+        if solved.masked and how.masks is None:
+            (scratch / "found").rename(made / "masks_found")
+        write_json(made / RECORD, _record(source, how, solved))
+        os.replace(made, out)
+    for line in describe(found):
+        tell(line)
+    return found
+
+
+def _taken(kind, source, scratch, how) -> Taken:
+    if kind == "film":
+        return footage.from_film(
+            source, scratch, how.frames, how.fps, how.max_side, how.masks
+        )
+    return footage.from_pictures(source, scratch, how.max_side, how.masks)
+
+
+def _solve(scratch, taken, how, tell) -> Solved:
+    """The cameras of the pictures in `scratch/images`, in one pass or two."""
+    spec = MappingSpec(
+        camera_model=how.camera_model, matcher=how.matcher, threads=how.threads
+    )
+    if taken.focal is not None:
+        spec = dataclasses.replace(spec, focal=taken.focal)
+    pictures, given = scratch / "images", scratch / "masks"
+    if how.masks is not None:
+        poses = run_sfm(pictures, scratch / "only", given, spec, tell)
+        return Solved(poses, True, tuple(poses.lines()))
+    first = run_sfm(pictures, scratch / "first", None, spec, tell)
+    if how.passes == 1:
+        return Solved(first, False, tuple(first.lines()))
+    tell(f"{first.lines()[0]}; looking for what moves")
+    capture = colmap.read(first.folder)
+    moving = movers.masks_of(capture)
+    if moving is None:
+        lines = ("nothing was found to move: these are the cameras", *first.lines())
+        return Solved(first, False, lines)
+    _write_masks(scratch, taken.names, capture, moving)
+    share = f"{moving.mean():.1%} of the pixels move; the cameras again without them"
+    tell(share)
+    try:
+        second = run_sfm(pictures, scratch / "second", scratch / "black", spec, tell)
+    except CaptureError as error:
+        kept = f"without what moves there are no cameras ({error}); the first are kept"
+        return Solved(first, False, (kept, *first.lines()))
+    if second.placed < AS_MANY * first.placed:
+        kept = f"without what moves only {second.placed} are placed; the first are kept"
+        return Solved(first, False, (kept, *first.lines()))
+    return Solved(second, True, tuple(second.lines()))
+
+
+def _write_masks(scratch, names, capture, moving):
+    """For people white on what moves, for COLMAP black, with a rim."""
+    row_of = {f"{name}.png": row for row, name in enumerate(capture.ids)}
+    width, height = capture.size
+    rim = 2 * round(RIM * max(width, height)) + 1
+    (scratch / "found").mkdir()
+    (scratch / "black").mkdir()
+    for name in names:
+        row = row_of.get(name)
+        moves = np.zeros((height, width), bool) if row is None else moving[row]
+        wide = cv2.dilate(moves.astype(np.uint8), np.ones((rim, rim), np.uint8)) > 0
+        write_png(scratch / "found" / name, moves)
+        write_png(scratch / "black" / f"{name}.png", ~wide)
+
+
+def _record(source, how, solved):
+    poses = solved.poses._asdict()
+    del poses["folder"]
+    return {**_made_of(source, how), "masked": solved.masked, "poses": poses}
+
+
+def _made_of(source, how):
+    """What tells a capture from one that would come out otherwise."""
+    files = [source] if source.is_file() else sorted(source.iterdir())
+    return {
+        "source": str(source.resolve()),
+        "bytes": sum(file.stat().st_size for file in files if file.is_file()),
+        "how": specs.as_json(how),
+    }
+
+
+def needed(path: AnyPath) -> bool:
+    """Whether a path names a film or pictures without cameras, and no capture."""
+    path = pathlib.Path(path)
+    if footage.kind_of(path) is None:
+        return False
+    return path.is_file() or not any(each.recognise(path) for each in formats.FORMATS)
+
+
+def prepared(
+    source: AnyPath, out: AnyPath, how: Preparation = Preparation(), tell: Tell = print
+) -> pathlib.Path:
+    """The folder `out` with the capture made of `source`, now or before.
+
+    One that is there is taken as it is where it was made of the same files in the same
+    way; ValueError where it was not.
+    """
+    source, out = pathlib.Path(source), pathlib.Path(out)
+    if not (out / RECORD).is_file():
+        tell(f"preparing {source} as {out}, which is kept")
+        prepare(source, out, how, tell)
+        return out
+    made_of = json.loads((out / RECORD).read_text())
+    wanted = json.loads(json.dumps(_made_of(source, how)))
+    differ = [name for name, value in wanted.items() if made_of.get(name) != value]
+    if differ:
+        raise ValueError(
+            f"{out}: a capture prepared otherwise ({', '.join(differ)} differ); remove "
+            "it, or name another --out"
+        )
+    tell(f"{source} was prepared before: {out}")
+    return out

@@ -1,0 +1,140 @@
+"""Films and photographs become pictures of one size, upright and in order."""
+
+from fractions import Fraction
+
+import av
+import numpy as np
+import PIL.Image
+import pytest
+import scipy.ndimage
+
+from nerfies_jax.capture import footage, images
+from nerfies_jax.capture.capture import CaptureError
+
+
+def test_the_sharpest_of_each_stretch_is_kept():
+    rng = np.random.default_rng(0)
+    scores = rng.uniform(80, 120, 60)
+    scores[30:] *= 20  # a part of the film with much more texture
+    scores[12:18] = 5  # one whole stretch is blurred
+    kept, blurred = footage.sharp_rows(scores, np.arange(60) / 30, 10)
+    assert blurred == 1
+    assert len(kept) == 9
+    for stretch in range(10):
+        rows = np.arange(6 * stretch, 6 * stretch + 6)
+        assert (rows[np.argmax(scores[rows])] in kept) == (stretch != 2)
+
+
+def test_stretches_are_of_time_and_not_of_frames():
+    seconds = np.concatenate([np.arange(0, 1, 0.1), np.arange(1, 2.01, 0.02)])
+    kept, _ = footage.sharp_rows(np.ones(len(seconds)), seconds, 10)
+    gaps = np.diff(seconds[kept])
+    assert len(kept) == 10
+    # By number of frames, six to a stretch, the first two would be 0.6 s apart.
+    assert gaps.max() < 0.31
+
+
+def test_sharpness_falls_with_blur():
+    noise = np.random.default_rng(0).integers(0, 256, (60, 80, 3)).astype(np.uint8)
+    values = [
+        footage.sharpness(scipy.ndimage.gaussian_filter(noise, (blur, blur, 0)))
+        for blur in (0, 1, 2, 4)
+    ]
+    assert values == sorted(values, reverse=True)
+    assert values[3] < 0.01 * values[0]
+
+
+def film(path, milliseconds, shape=(32, 48)):
+    """A film whose frame k, shown at its own time, is grey 10 k."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("h264", rate=30, options={"crf": "0"})
+        stream.height, stream.width = shape
+        stream.pix_fmt, stream.codec_context.time_base = "yuv444p", Fraction(1, 1000)
+        for number, moment in enumerate(milliseconds):
+            grey = np.full((*shape, 3), 10 * number, np.uint8)
+            frame = av.VideoFrame.from_ndarray(grey, format="rgb24")
+            frame.pts, frame.time_base = moment, Fraction(1, 1000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+
+
+def test_a_film_keeps_its_own_times_and_the_masks_of_the_frames_taken(tmp_path):
+    moments = [0, 40, 80, 500, 510, 520, 1000]
+    film(tmp_path / "a.mp4", moments)
+    (tmp_path / "given").mkdir()
+    for number in range(7):
+        mask = np.arange(48) >= 6 * number
+        mask = np.repeat(mask[None], 32, 0)
+        images.write_png(tmp_path / f"given/{number}.png", mask)
+    taken = footage.from_film(
+        tmp_path / "a.mp4", tmp_path, 3, max_side=16, masks=tmp_path / "given"
+    )
+    times = [int(name[2:10]) for name in taken.names]
+    assert set(times) <= set(moments)
+    assert [time // 400 for time in times] == [0, 1, 2]
+    assert taken.seconds == pytest.approx((times[-1] - times[0]) / 1000)
+    for name, time in zip(taken.names, times, strict=True):
+        number = moments.index(time)
+        picture = images.read_pixels(tmp_path / "images" / name)
+        assert picture.shape == (10, 16, 3)
+        assert abs(picture.astype(int) - 10 * number).max() <= 3
+        mask = images.read_mask(tmp_path / "masks" / f"{name}.png")
+        assert mask.shape == (10, 16)
+        assert mask[0].sum() == 16 - 2 * number
+    (tmp_path / "given/6.png").unlink()
+    with pytest.raises(CaptureError, match="7 frames"):
+        footage.from_film(tmp_path / "a.mp4", tmp_path, 3, masks=tmp_path / "given")
+    assert len(footage.from_film(tmp_path / "a.mp4", tmp_path / "b").names) == 7
+    half = footage.from_film(tmp_path / "a.mp4", tmp_path / "c", per_second=2.0)
+    assert len(half.names) == 3
+    with pytest.raises(ValueError, match="1 frames to keep"):
+        footage.from_film(tmp_path / "a.mp4", tmp_path / "d", 1)
+
+
+def test_photographs_come_upright_of_one_size_whatever_their_ending(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(footage, "_heif", lambda: False)
+    rng = np.random.default_rng(0)
+    upright = rng.integers(0, 256, (5, 8, 8, 3)).astype(np.uint8)
+    upright = upright.repeat(4, 1).repeat(8, 2)  # 64 x 32, flat blocks
+    stored = [
+        np.rot90(picture, k)
+        for picture, k in zip(upright, (0, 1, 0, 0, 0), strict=True)
+    ]
+    turned = PIL.Image.Exif()
+    turned[0x0112] = 6  # a viewer turns it by a quarter to the right
+    turned.get_ifd(0x8769)[0xA405] = 27  # mm on 36
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    best = {"quality": 100, "subsampling": 0}
+    options = {"1.JPG": {"exif": turned, **best}, "2.WebP": {"lossless": True}}
+    names = ("0.PNG", "1.JPG", "2.WebP", "10.tif", "3.png")
+    for picture, name in zip(stored, names, strict=True):
+        PIL.Image.fromarray(picture).save(folder / name, **options.get(name, {}))
+    PIL.Image.fromarray(upright[0, :, :16]).save(folder / "small.png")
+    (folder / "4.HEIC").write_bytes(b"")
+    (folder / "notes.txt").touch()
+    taken = footage.from_pictures(folder, tmp_path / "out", max_side=32)
+    assert taken.names == ("0.png", "1.png", "2.png", "3.png", "10.png")
+    assert taken.focal == 27 / 36
+    left_out = " ".join(taken.notes)
+    assert "4.HEIC" in left_out
+    assert "small.png" in left_out
+    assert "notes.txt" not in left_out
+    for name, row in zip(taken.names, (0, 1, 2, 4, 3), strict=True):
+        found = images.read_pixels(tmp_path / "out/images" / name)
+        exact = upright[row].reshape(16, 2, 32, 2, 3).mean((1, 3))
+        assert found.shape == (16, 32, 3)
+        assert np.abs(found - exact).max() <= (4 if name == "1.png" else 1), name
+
+
+def test_a_folder_is_told_by_what_is_in_it(tmp_path):
+    assert footage.kind_of(tmp_path) is None
+    (tmp_path / "a.MOV").touch()
+    assert footage.kind_of(tmp_path / "a.MOV") == "film"
+    for name in ("a.jpg", "b.JPG"):
+        (tmp_path / name).write_bytes(b"broken")
+    assert footage.kind_of(tmp_path) == "pictures"
+    with pytest.raises(CaptureError, match=r"a\.jpg: not a readable picture"):
+        footage.from_pictures(tmp_path, tmp_path / "out")

@@ -1,0 +1,139 @@
+"""Two passes of cameras, what is kept of them, and what a second call does."""
+
+import dataclasses
+import shutil
+
+import numpy as np
+import pytest
+
+from nerfies_jax import capture as room
+from nerfies_jax.capture import images, video
+from nerfies_jax.capture.capture import CaptureError
+from nerfies_jax.capture.structure_from_motion import Poses
+from nerfies_jax.runs import movers, preparation, reconstruction
+from nerfies_jax.runs.config import CaptureSource, Preparation, RunConfig
+from tests.capture import test_colmap as models
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """COLMAP, which here writes a model by hand; its `calls`, each with its masks.
+
+    Where it `fails`, the second call places three pictures fewer.
+    """
+    calls = []
+
+    def run_sfm(pictures, out, masks, spec, tell):
+        del tell
+        names = sorted(path.name for path in pictures.iterdir())
+        models.make(out, count=len(names))
+        text = (out / "sparse/0/images.txt").read_text()
+        for row, name in enumerate(names):
+            text = text.replace(f"f_{row:03d}.png", name)
+            (out / f"images/f_{row:03d}.png").unlink()
+            (out / "images" / name).write_bytes((pictures / name).read_bytes())
+        (out / "sparse/0/images.txt").write_text(text)
+        black = None
+        if masks is not None:
+            shutil.copytree(masks, out / "masks")
+            black = [~images.read_mask(masks / f"{name}.png") for name in names]
+        calls.append((spec, black))
+        placed = len(names) - (3 if len(calls) == 2 and run_sfm.fails else 0)
+        return Poses(out, len(names), placed, 40, 0.5, 6.0)
+
+    run_sfm.fails, run_sfm.calls = False, calls
+    monkeypatch.setattr(preparation, "run_sfm", run_sfm)
+    return run_sfm
+
+
+@pytest.fixture
+def moving(monkeypatch):
+    """Masks that are found: a corner in the third picture."""
+    found = np.zeros((9, 16, 24), bool)
+    found[2, 10:, 15:] = True
+    monkeypatch.setattr(movers, "masks_of", lambda capture: found)
+    return found
+
+
+@pytest.fixture
+def pictures(tmp_path):
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    for row in range(9):
+        images.write_png(folder / f"p{row}.png", models.picture(row))
+    return folder
+
+
+def test_the_second_pass_goes_without_what_the_first_saw_move(
+    pictures, tmp_path, asked, moving
+):
+    how = Preparation(camera_model="RADIAL", matcher="exhaustive", threads=1)
+    found = preparation.prepare(pictures, tmp_path / "out", how)
+    (spec, black), (_, masked) = asked.calls
+    assert black is None
+    assert (spec.camera_model, spec.matcher, spec.threads) == (
+        "RADIAL",
+        "exhaustive",
+        1,
+    )
+    for row, mask in enumerate(masked):
+        assert mask[moving[row]].all()
+        assert mask.any() == moving[row].any()
+        assert mask.sum() <= 1.5 * moving[row].sum()  # the rim
+    stored = room.load(tmp_path / "out")
+    np.testing.assert_array_equal(stored.images, found.images)
+    assert stored.moving is None  # found, and no truth
+    shown = images.read_mask(tmp_path / "out/masks_found/p2.png")
+    np.testing.assert_array_equal(shown, moving[2])
+    assert (tmp_path / "out/colmap/sparse/0/images.txt").is_file()
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_a_second_pass_that_loses_pictures_is_not_taken(
+    pictures, tmp_path, asked, moving
+):
+    del moving
+    asked.fails, said = True, []
+    preparation.prepare(pictures, tmp_path / "out", tell=said.append)
+    assert any("only 6 are placed; the first are kept" in line for line in said)
+    assert not (tmp_path / "out/masks_found").exists()
+
+
+def test_given_masks_take_one_pass_and_are_kept(pictures, tmp_path, asked):
+    (tmp_path / "masks").mkdir()
+    for row in range(9):
+        mask = np.ones((16, 24), bool)
+        mask[:, : row + 1] = False
+        images.write_png(tmp_path / f"masks/p{row}.png", mask)
+    how = Preparation(masks=tmp_path / "masks")
+    preparation.prepare(pictures, tmp_path / "out", how)
+    ((_, black),) = asked.calls
+    assert [mask[0].sum() for mask in black] == list(range(1, 10))
+    np.testing.assert_array_equal(room.load(tmp_path / "out").moving, black)
+
+
+def test_a_run_of_a_film_prepares_it_once_beside_the_run(tmp_path, asked, monkeypatch):
+    monkeypatch.setattr(movers, "masks_of", lambda capture: None)
+    frames = [models.picture(row).repeat(2, 0).repeat(2, 1) for row in range(9)]
+    video.write_video(tmp_path / "clip.mp4", frames, 30)
+    config = RunConfig(source=CaptureSource(tmp_path / "clip.mp4", heldout="4"))
+    how = Preparation(frames=9, max_side=24)
+    for _ in range(2):
+        found = reconstruction._with_cameras(config, tmp_path / "run", how)
+        assert found.source.capture == tmp_path / "run-capture"
+        assert found.source.heldout == "4"
+    assert len(asked.calls) == 1
+    capture = room.load(tmp_path / "run-capture")
+    assert capture.frames_per_second == pytest.approx(30, abs=0.2)
+    assert reconstruction._with_cameras(found, tmp_path / "run", how) is found
+    other = dataclasses.replace(how, passes=1)
+    with pytest.raises(ValueError, match=r"run-capture: .*how differ.*--out"):
+        reconstruction._with_cameras(config, tmp_path / "run", other)
+
+
+def test_what_cannot_be_prepared_is_refused_and_leaves_nothing(pictures, tmp_path):
+    with pytest.raises(CaptureError, match="neither a film"):
+        preparation.prepare(tmp_path / "nothing", tmp_path / "out")
+    with pytest.raises(ValueError, match="choose from a film"):
+        preparation.prepare(pictures, tmp_path / "out", Preparation(frames=5))
+    assert [path.name for path in tmp_path.iterdir()] == ["photographs"]
