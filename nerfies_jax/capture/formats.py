@@ -35,6 +35,10 @@ def _is_colmap(path):
     ) or any(path.glob("**/sparse/*/cameras.bin"))
 
 
+def _is_llff(path):
+    return (path / "poses_bounds.npy").is_file()
+
+
 FORMATS = (
     Format(
         "nerfies",
@@ -54,7 +58,20 @@ FORMATS = (
         _is_colmap,
         "nerfies_jax.capture.colmap",
     ),
+    # After COLMAP: its folders hold the model that the poses came from, with points.
+    Format(
+        "llff",
+        "poses_bounds.npy (LLFF, NSFF)",
+        _is_llff,
+        "nerfies_jax.capture.llff_format",
+    ),
 )
+
+
+def _pictures_in(path):
+    from nerfies_jax.capture import footage  # loads decoders
+
+    return len(footage.pictures_in(path)) if path.is_dir() else 0
 
 
 def recognise(path: AnyPath) -> Format:
@@ -63,13 +80,20 @@ def recognise(path: AnyPath) -> Format:
     if not path.exists():
         raise CaptureError(f"{path}: no such folder; check the path")
     if path.is_file() and path.suffix != ".json":
+        verb = "npz" if path.suffix == ".npz" else "video"
         raise CaptureError(
             f"{path}: a file, not a capture; pass a capture's folder, or make one with "
-            "python -m experiments.prepare"
+            f"python -m experiments.prepare {verb} {path} OUT"
         )
     for each in FORMATS:
         if each.recognise(path):
             return each
+    pictures = _pictures_in(path)
+    if pictures >= 2:
+        raise CaptureError(
+            f"{path}: {pictures} pictures without cameras; find those with python -m "
+            f"experiments.prepare pictures {path} OUT"
+        )
     wanted = "; ".join(each.looks_for for each in FORMATS)
     raise CaptureError(f"{path}: no capture here; looked for {wanted}")
 

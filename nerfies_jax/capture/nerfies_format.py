@@ -8,7 +8,7 @@ import pathlib
 
 import numpy as np
 
-from nerfies_jax.capture import flow_files, frames
+from nerfies_jax.capture import flow_files, frames, nerfies_colmap
 from nerfies_jax.capture import images as pictures
 from nerfies_jax.capture.capture import (
     Capture,
@@ -302,7 +302,7 @@ def _flow(path, views, size, total):
 def _points(path, images, cameras, views, moving):
     file = path / "points.npy"
     if not file.exists():
-        return None, ()
+        return nerfies_colmap.points_beside(path, views)
     world = frames.load_array(file, 3 * MAX_POINTS)
     if world.ndim != 2 or world.shape[1] != 3:
         raise CaptureError(f"{file}: shape {world.shape}; expected [points, 3]")

@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 
 from nerfies_jax import capture as room
-from nerfies_jax.capture import blender_format, colmap, formats, frames, nerfies_format
+from nerfies_jax.capture import (
+    blender_format,
+    colmap,
+    formats,
+    frames,
+    llff_format,
+    nerfies_format,
+)
 from nerfies_jax.capture.capture import CaptureError
 
 
@@ -27,13 +34,17 @@ def test_a_folder_that_is_no_capture_lists_what_was_looked_for(tmp_path):
     assert "\n" not in message
 
 
-def test_a_path_that_is_not_there_and_a_film_are_refused(tmp_path):
+def test_what_is_no_capture_yet_is_refused_with_the_way_out(tmp_path):
     with pytest.raises(CaptureError, match="no such folder"):
         room.load(tmp_path / "nowhere")
     (tmp_path / "film.mp4").write_bytes(b"")
     with pytest.raises(CaptureError, match="a file, not a capture"):
         room.load(tmp_path / "film.mp4")
     assert issubclass(CaptureError, ValueError)
+    for name in ("a.jpg", "b.HEIC"):
+        (tmp_path / name).touch()
+    with pytest.raises(CaptureError, match=r"2 pictures without.*prepare pictures"):
+        room.load(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -48,6 +59,9 @@ def test_a_path_that_is_not_there_and_a_film_are_refused(tmp_path):
         (("colmap/sparse/0/cameras.bin",), "colmap"),
         (("sparse/1/cameras.bin",), "colmap"),
         (("cameras.bin",), "colmap"),
+        (("poses_bounds.npy",), "llff"),
+        # LLFF's folders may hold the model that their poses came from.
+        (("poses_bounds.npy", "sparse/0/cameras.bin"), "colmap"),
     ],
 )
 def test_what_is_recognised(tmp_path, files, expected):
@@ -59,7 +73,7 @@ def test_what_is_recognised(tmp_path, files, expected):
 
 def test_every_reader_takes_the_common_options():
     common = set(inspect.signature(formats.load).parameters) - {"options"}
-    for reader in (nerfies_format, blender_format, colmap):
+    for reader in (nerfies_format, blender_format, colmap, llff_format):
         assert common <= set(inspect.signature(reader.read).parameters)
 
 

@@ -1,0 +1,174 @@
+"""LLFF: `poses_bounds.npy` with pictures in `images`, `images_2`, and so on."""
+
+import pathlib
+from typing import NamedTuple
+
+import numpy as np
+
+from nerfies_jax.capture import frames
+from nerfies_jax.capture import images as pictures
+from nerfies_jax.capture.borders import black_borders
+from nerfies_jax.capture.capture import Capture, CaptureError
+from nerfies_jax.capture.json_files import AnyPath
+from nerfies_jax.capture.points import place_by_points
+from nerfies_jax.geometry import camera
+
+POSES = "poses_bounds.npy"
+MOST_NUMBERS = 17 * frames.MAX_FRAMES
+
+
+class Poses(NamedTuple):
+    """What the file says of each picture, in world units and full-size pixels."""
+
+    rotations: np.ndarray  # [frames, 3, 3] camera from world
+    positions: np.ndarray  # [frames, 3]
+    size: tuple[int, int]  # width and height of the full-size pictures
+    focal_px: np.ndarray  # [frames]
+    bounds: np.ndarray  # [frames, 2] nearest and farthest depth
+
+
+def read(
+    path: AnyPath,
+    factor: int | None = None,
+    max_side: int | None = None,
+    heldout: int | str | None = None,
+    missing: str = "refuse",
+) -> Capture:
+    """The capture in a folder of LLFF (Mildenhall et al. 2019), NSFF and others.
+
+    Poses belong to the pictures in the order of their names, so none may be missing,
+    whatever `missing` says. `factor` is relative to the full-size pictures, of which
+    the file has the size. The pose's columns are the camera's down, right and backward
+    axes; the principal point is the picture's centre. Times as for COLMAP's pictures;
+    `heldout` is a number n for every n-th frame, 8 if not given.
+    """
+    path = pathlib.Path(path)
+    if missing not in ("refuse", "skip"):
+        raise CaptureError(f'{path}: missing={missing!r}; expected "refuse" or "skip"')
+    if isinstance(heldout, str):
+        raise CaptureError(
+            f"{path}: LLFF has no split {heldout!r}; pass a number n to hold out every "
+            "n-th frame"
+        )
+    poses = read_poses(path / POSES)
+    available = _folders(path, poses)
+    source, shrink_by = frames.choose_source(
+        available, poses.size, factor, max_side, str(path)
+    )
+    files = _files(available[source])
+    images, alpha = frames.read_frames(files, shrink_by, orientation="stored")
+    valid = None if alpha is None else alpha == 255
+    blacked, notes = black_borders(images), ()
+    if blacked is not None:
+        valid = ~blacked if valid is None else valid & ~blacked
+        notes = ("some frames have black borders: taken as not filmed",)
+    placed = _placed(poses)
+    cameras = _cameras(poses, placed, (images.shape[2], images.shape[1]))
+    names = tuple(file.stem for file in files)
+    times = frames.spread(frames.clock(names))
+    every = heldout or frames.HELD_OUT
+    train, scored = frames.hold_out_every(len(files), every, str(path))
+    return Capture(
+        name=path.resolve().name,
+        source="llff",
+        ids=names,
+        images=images,
+        cameras=cameras,
+        times=times,
+        train=train,
+        heldout=scored,
+        near=placed.near,
+        far=placed.far,
+        warp_ids=frames.dense(times),
+        appearance_ids=np.arange(len(files), dtype=np.int32),
+        camera_ids=np.zeros(len(files), np.int32),
+        valid=valid,
+        scale=placed.scale,
+        centre=placed.centre,
+        up=frames.up_direction(cameras),
+        path=path,
+        notes=(*notes, f"every {every}th frame is held out"),
+    )
+
+
+def _placed(poses):
+    """What lies ahead of the cameras, at its bounds, stands in for scene points."""
+    ahead = poses.rotations[:, None, 2] * poses.bounds[..., None]
+    box = (poses.positions[:, None] + ahead).reshape(-1, 3)
+    return place_by_points(box, poses.positions, poses.bounds.ravel())
+
+
+def _cameras(poses, placed, size):
+    positions = (poses.positions - np.array(placed.centre)) * placed.scale
+    full = [
+        camera.pinhole(rotation, position, focal, poses.size)
+        for rotation, position, focal in zip(
+            poses.rotations, positions, poses.focal_px, strict=True
+        )
+    ]
+    return camera.resize(camera.stack(full), poses.size, size)
+
+
+def read_poses(path: pathlib.Path) -> Poses:
+    """The poses, turned to axes right, down and forward."""
+    table = frames.load_array(path, MOST_NUMBERS)
+    if table.ndim != 2 or table.shape[1] != 17 or len(table) < 2:
+        raise CaptureError(
+            f"{path}: shape {table.shape}; expected [pictures, 17], at least two: a "
+            "3x5 matrix and two bounds each"
+        )
+    if not np.isfinite(table).all():
+        row = int(np.argmin(np.isfinite(table).all(1)))
+        raise CaptureError(
+            f"{path}: row {row} is not finite; leave that picture and its row out"
+        )
+    pose, bounds = table[:, :15].reshape(-1, 3, 5).astype(float), table[:, 15:]
+    down, right, back, position, shape = np.moveaxis(pose, -1, 0)
+    if np.ptp(shape[:, :2], axis=0).any():
+        raise CaptureError(f"{path}: pictures of several sizes; keep those of one")
+    if not ((bounds > 0).all() and (bounds[:, 0] < bounds[:, 1]).all()):
+        row = int(np.argmin((bounds[:, 0] > 0) & (bounds[:, 0] < bounds[:, 1])))
+        raise CaptureError(
+            f"{path}: row {row} has bounds {bounds[row].tolist()}; expected 0 < near < "
+            "far"
+        )
+    height, width = shape[0, :2]
+    rotations = np.stack([right, down, -back], axis=1)
+    return Poses(
+        rotations, position, (round(width), round(height)), shape[:, 2], bounds
+    )
+
+
+def _files(folder):
+    """In the order of LLFF's script, which sorts names letter by letter."""
+    return sorted(
+        file for file in folder.iterdir() if file.suffix.lower() in frames.SUFFIXES
+    )
+
+
+def _folders(path, poses):
+    """Reduction -> folder with as many pictures as there are poses."""
+    available = {}
+    for folder in sorted(path.glob("images*")):
+        files = _files(folder) if folder.is_dir() else []
+        if not files:
+            continue
+        if len(files) != len(poses.positions):
+            raise CaptureError(
+                f"{folder}: {len(files)} pictures for {len(poses.positions)} poses in "
+                f"{POSES}; they belong together in the order of the names, so restore "
+                "what is missing or remove what is too much"
+            )
+        width, height = pictures.read_header(files[0]).size
+        ratio = max(1, round(poses.size[0] / width))
+        trimmed = abs(np.array(poses.size) / ratio - (width, height))
+        if trimmed.max() > 1:
+            raise CaptureError(
+                f"{files[0]}: {width}x{height} pixels, but {POSES} is of "
+                f"{poses.size[0]}x{poses.size[1]}; pictures must be a whole fraction "
+                "of that"
+            )
+        available.setdefault(ratio, folder)
+    if not available:
+        raise CaptureError(f"{path}: {POSES} but no pictures; put them into images")
+    return available
