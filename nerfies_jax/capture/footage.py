@@ -158,7 +158,7 @@ def _readable(folder):
     notes = ()
     if photographs and not _heif():
         notes = _left_out(
-            photographs, "HEIC, which pillow-heif reads (pip install pillow-heif)"
+            photographs, "HEIC, which needs pillow-heif (pip install pillow-heif)"
         )
         files = [file for file in files if file.name not in photographs]
     if len(files) < 2:

@@ -45,6 +45,17 @@ def test_a_broken_capture_is_refused_by_name(filmed, tmp_path, capsys):
     assert not (tmp_path / "run").exists()
 
 
+def test_frames_without_their_picture_are_left_out_where_asked(
+    filmed, tmp_path, capsys
+):
+    lost = min((filmed / "rgb/1x").iterdir())
+    lost.unlink()
+    assert "--missing skip" in refused(capsys, filmed, "--out", tmp_path / "run")
+    source = CaptureSource(filmed, missing="skip")
+    assert lost.stem not in runs.stored_capture(source).ids
+    assert source.arguments == (str(filmed), "--missing", "skip")
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -85,6 +96,7 @@ def started(folder, config):
         (["--scene", "wheel"], "scene: saved default, now wheel"),
         (["--preset", "nerf"], "preset: saved splats-static, now nerf"),
         (["--seed", "0"], "seed: saved 3, now 0"),
+        (["--missing", "skip"], "missing: saved refuse, now skip"),
         (["--steps", "70"], "spec.steps: saved 60, now 70"),
         (["--set", "sh_degree=2"], "spec.sh_degree: saved 1, now 2"),
         (["--effects", "auto"], "--effects auto"),
