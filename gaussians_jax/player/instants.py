@@ -1,5 +1,6 @@
 """A trained scene at a few instants: what a player that knows no model can draw."""
 
+import math
 from typing import NamedTuple
 
 import jax
@@ -16,6 +17,7 @@ from nerfies_jax.training.model import Model, TrainState, View, in_default_preci
 
 LEAST_INSTANTS, MOST_INSTANTS = 24, 48
 MOST_VIEWS = 48  # training views that say what was seen, and in which colour
+MOST_SIDE_PX = 320  # of them: larger pictures take long and say the same
 # Pixels' worth of picture, in the view that shows most of it: what shows less is left
 # out. Built-in scene, `splats-tracked-small`, 300 steps: this
 # leaves out 436 of 10,000, and held-out frames are 56.6 dB from the model's own; 0.3
@@ -41,18 +43,8 @@ class Seen(NamedTuple):
     colour: np.ndarray  # [gaussians, 3], mean over the views by how much they show
 
 
-def gathered(
-    model: Model,
-    raster: RasterSpec,
-    degree: Int[Array, ""],
-    state: TrainState,
-    capture: Capture,
-) -> Instants:
-    """The scene at 24 to 48 instants, as many as there are moments; host side.
-
-    `degree` is that of the harmonics in use.
-    """
-    seen = seen_in_training(model, raster, degree, state, capture)
+def gathered(model: Model, state: TrainState, seen: Seen, count: int) -> Instants:
+    """The scene at `count` instants; host side."""
     # NaN compares false: it is left out.
     (kept,) = np.nonzero(seen.most >= LEAST_SEEN_PX)
     if not kept.size:
@@ -60,8 +52,6 @@ def gathered(
             f"none of the {len(seen.most)} Gaussians is to be seen from a training "
             "camera; train for more steps"
         )
-    moments = len(np.unique(capture.times[capture.train]))
-    count = int(np.clip(moments, LEAST_INSTANTS, MOST_INSTANTS))
     prepared = jax.jit(model.stages.prepare)(state.params)
     posed = jax.jit(
         lambda params, prepared, time: jax.tree.map(
@@ -84,6 +74,12 @@ def gathered(
     )
 
 
+def count_for(capture: Capture) -> int:
+    """24 to 48 instants, as many as there are moments."""
+    moments = len(np.unique(capture.times[capture.train]))
+    return int(np.clip(moments, LEAST_INSTANTS, MOST_INSTANTS))
+
+
 def seen_in_training(
     model: Model,
     raster: RasterSpec,
@@ -93,10 +89,13 @@ def seen_in_training(
 ) -> Seen:
     """How much of the training pictures each Gaussian makes up, and in which colour.
 
-    A picture is a sum of colours with weights, so the weights of a Gaussian, summed
-    over the pixels, are the slope of the picture's sum in the Gaussian's colour.
+    `degree` is that of the harmonics in use. A picture is a sum of colours with
+    weights, so the weights of a Gaussian, summed over the pixels, are the slope of the
+    picture's sum in the Gaussian's colour.
     """
     rows = evaluation.spread(capture.train, MOST_VIEWS)
+    factor = math.ceil(max(capture.size) / MOST_SIDE_PX)
+    size = (max(1, capture.size[0] // factor), max(1, capture.size[1] // factor))
     prepared = jax.jit(model.stages.prepare)(state.params)
     coefficients = splats.active_harmonics(state.params.rows["splats"], degree)
 
@@ -106,7 +105,7 @@ def seen_in_training(
 
         def total(colours: Float[Array, "gaussians 3"]):
             frame = rendering.render(
-                gaussians, colours, view.camera, capture.size, raster, depth=False
+                gaussians, colours, view.camera, size, raster, depth=False
             )
             return jnp.sum(frame.rendering.colour)
 
@@ -118,9 +117,9 @@ def seen_in_training(
 
     most, total, colour = 0.0, 0.0, 0.0
     for row in rows:
-        view = evaluation.view_of(capture, row)
+        view = evaluation.resized(evaluation.view_of(capture, row), capture.size, size)
         weight, coloured = jax.device_get(shown(state.params, prepared, view))
-        most = np.maximum(most, weight)
+        most = np.maximum(most, weight * factor**2)
         total, colour = total + weight, colour + coloured
     seen = np.maximum(total, np.finfo(np.float32).tiny)
     return Seen(most, colour / seen[:, None])

@@ -18,7 +18,12 @@ import PIL.Image
 from jaxtyping import Array, Int
 
 from gaussians_jax.player import packing
-from gaussians_jax.player.instants import Instants, gathered
+from gaussians_jax.player.instants import (
+    Instants,
+    count_for,
+    gathered,
+    seen_in_training,
+)
 from gaussians_jax.raster_spec import RasterSpec
 from nerfies_jax.capture import camera_paths
 from nerfies_jax.capture.capture import Capture
@@ -29,6 +34,9 @@ from nerfies_jax.training.model import Model, TrainState
 
 SECONDS = 4.0  # that a film plays whose rate is not known
 SHORTEST, LONGEST = 1.0, 60.0
+# A larger page takes a browser seconds to open; a scene that needs more gets fewer
+# instants, as far as motion is still to be told from them.
+MOST_BYTES, FEWEST_INSTANTS = 48 * 2**20, 8
 # What the page's own project() reads; the sizes that only cost time stay here.
 RASTER = (
     *("alpha_threshold", "alpha_max", "eps2d", "antialiased", "near", "far"),
@@ -52,8 +60,13 @@ def write(
     `degree` is that of the harmonics in use; `poster` (uint8 [height, width, 3]) is
     shown until the first frame is drawn, and where nothing can be.
     """
-    instants = gathered(model, raster, degree, state, capture)
-    packed = packing.pack(instants, still_distance(instants, capture))
+    seen = seen_in_training(model, raster, degree, state, capture)
+    count = count_for(capture)
+    instants, packed = _packed(model, state, capture, seen, count)
+    if len(packed.data) > MOST_BYTES:
+        fewer = int(count * MOST_BYTES / len(packed.data))
+        count = max(fewer, FEWEST_INSTANTS)
+        instants, packed = _packed(model, state, capture, seen, count)
     about = _about(instants, packed, capture)
     background = capture.background or (0.0, 0.0, 0.0)
     parts = {
@@ -72,6 +85,11 @@ def write(
     with replaced_file(path) as partial:
         partial.write_text(page, encoding="utf-8")
     return Player(path, f"{about} {path.stat().st_size / 1e6:.1f} MB.")
+
+
+def _packed(model, state, capture, seen, count):
+    instants = gathered(model, state, seen, count)
+    return instants, packing.pack(instants, still_distance(instants, capture))
 
 
 def header(packed: packing.Packed, raster: RasterSpec, capture: Capture) -> dict:

@@ -77,6 +77,10 @@ def from_film(
         moments.append(seconds)
         scores.append(sharpness(frame))
     moments, scores = np.array(moments), np.array(scores)
+    if len(np.unique(np.round(1000 * moments))) < len(moments):  # as names keep them
+        raise CaptureError(
+            f"{film}: its frames have no times of their own; encode it again"
+        )
     count = _wanted(film, moments, count, per_second)
     kept, blurred = sharp_rows(scores, moments, count)
     sources = None if masks is None else _masks_of_film(masks, len(moments))

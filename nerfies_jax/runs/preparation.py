@@ -7,6 +7,7 @@ extent, turned by 0.40 and 0.57 degrees (medians; 89 s on one busy core); 86 of 
 0.72 and 0.59 px, 0.31 and 0.28 %, 0.26 and 0.32 degrees (115 s).
 """
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -67,7 +68,7 @@ def prepare(
         )
     if kind == "pictures" and (how.frames or how.fps):
         raise ValueError("frames and fps choose from a film; a folder is taken whole")
-    with scratch_folder(out) as scratch:
+    with scratch_folder(out) as scratch, _named(scratch, source):
         taken = _taken(kind, source, scratch, how)
         for line in taken.notes:
             tell(line)
@@ -93,6 +94,16 @@ def prepare(
     for line in describe(found):
         tell(line)
     return found
+
+
+@contextlib.contextmanager
+def _named(scratch, source):
+    """Errors about the pictures in the scratch folder, which goes, name the source."""
+    try:
+        yield
+    except CaptureError as error:
+        hidden = str(scratch.resolve() / "images")
+        raise CaptureError(str(error).replace(hidden, str(source))) from error
 
 
 def _taken(kind, source, scratch, how) -> Taken:
@@ -129,7 +140,8 @@ def _solve(scratch, taken, how, tell) -> Solved:
     try:
         second = run_sfm(pictures, scratch / "second", scratch / "black", spec, tell)
     except CaptureError as error:
-        kept = f"without what moves there are no cameras ({error}); the first are kept"
+        reason = str(error).partition(": ")[2]
+        kept = f"without what moves, {reason}; the first cameras are kept"
         return Solved(first, False, (kept, *first.lines()))
     if second.placed < AS_MANY * first.placed:
         kept = f"without what moves only {second.placed} are placed; the first are kept"

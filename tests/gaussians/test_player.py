@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 from gaussians_jax import projection, rendering, representation, scene, splats
-from gaussians_jax.player import instants
+from gaussians_jax.player import instants, packing
+from gaussians_jax.player import page as player_page
 from gaussians_jax.splats import Gaussians
 from nerfies_jax import evaluation
 from nerfies_jax.capture import images
@@ -151,6 +152,29 @@ def test_what_is_in_the_page_draws_as_the_model_does(page, time):
         assert psnr(picture, drawn(int(row), time)) > 60
     active = int(splats.active_mask(state.params.rows["splats"]).sum())
     assert len(colours) <= active - BEHIND
+
+
+def test_a_scene_too_large_for_a_page_gets_fewer_instants(tmp_path, monkeypatch):
+    model, state, capture = moving_scene()
+    monkeypatch.setattr(packing, "pack", pack := Packing(packing.pack))
+    monkeypatch.setattr(player_page, "MOST_BYTES", 12_000)
+    path, poster = tmp_path / "player.html", np.zeros((30, 40, 3), np.uint8)
+    representation.player(path, "", SPEC, model, state, capture, poster)
+    assert pack.instants[0] == instants.LEAST_INSTANTS
+    assert player_page.FEWEST_INSTANTS <= pack.instants[1] < pack.instants[0]
+    header = json.loads(inside(path, "header"))
+    assert header["instants"] == pack.instants[1]
+
+
+class Packing:
+    """Packs, and remembers how many instants there were."""
+
+    def __init__(self, pack):
+        self._pack, self.instants = pack, []
+
+    def __call__(self, found, still):
+        self.instants.append(len(found.mean))
+        return self._pack(found, still)
 
 
 def test_one_rotation_keeps_one_sign():
