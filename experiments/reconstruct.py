@@ -21,7 +21,11 @@ from nerfies_jax.training import stopping
 
 @dataclasses.dataclass(frozen=True)
 class Reconstruct:
-    """Reconstruct a filmed, moving scene; without a capture, the built-in one."""
+    """Reconstruct a filmed, moving scene; without a capture, the built-in one.
+
+    A film, or a folder of pictures without cameras, becomes a capture first: a folder
+    beside the run's, which is kept.
+    """
 
     source: cli.Source = cli.NamedSource()
     preset: str | None = None

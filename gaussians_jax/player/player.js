@@ -218,8 +218,9 @@ function start(header, buffer) {
 }
 
 function bytesOf(text) {
-  const packed = atob(text.trim());
-  return Uint8Array.from(packed, (letter) => letter.charCodeAt(0)).buffer;
+  const packed = atob(text.trim()), bytes = new Uint8Array(packed.length);
+  for (let i = 0; i < bytes.length; i++) bytes[i] = packed.charCodeAt(i);
+  return bytes.buffer;
 }
 
 try {

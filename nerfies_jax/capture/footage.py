@@ -43,7 +43,7 @@ class Taken(NamedTuple):
 
 
 def kind_of(path: pathlib.Path) -> str | None:
-    """ "film", "pictures" (a folder with two or more), or None."""
+    """What a path names: "film", "pictures" (a folder with two at least), or None."""
     if path.is_file() and path.suffix.lower() in FILMS:
         return "film"
     if path.is_dir() and len(pictures_in(path)) >= 2:

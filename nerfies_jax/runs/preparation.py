@@ -69,6 +69,8 @@ def prepare(
     if kind == "pictures" and (how.frames or how.fps):
         raise ValueError("frames and fps choose from a film; a folder is taken whole")
     with scratch_folder(out) as scratch, _named(scratch, source):
+        if kind == "film":
+            tell(f"looking for sharp frames in {source}")
         taken = _taken(kind, source, scratch, how)
         for line in taken.notes:
             tell(line)

@@ -195,7 +195,8 @@ f.pose(scene, 0.9);
 f.pose(scene, time);
 const view = page.header.view, up = page.header.up;
 console.log(JSON.stringify({
-  footprints: Array.from(f.project(scene, camera, page.header.raster)),
+  footprints: [false, true].map((antialiased) => Array.from(
+    f.project(scene, camera, { ...page.header.raster, antialiased }))),
   order: Array.from(f.order(Float32Array.from([3, 1e-30, 70000, 3, 2.5, 1e9, 2.5]))),
   turned: f.turned(f.turned(view, up, 0.4), view.rotation.slice(0, 3), -0.3),
   moved: f.moved(view, 0.2, 0.1),
@@ -232,12 +233,14 @@ def by_node(page):
 
 
 @needs_node
-def test_the_page_projects_as_the_library(page, by_node):
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_the_page_projects_as_the_library(page, by_node, antialiased):
     one, found = by_node
     size = moving_scene()[2].size
     gaussians, colours = unpacked(page, 0.3)
+    raster = dataclasses.replace(SPEC.raster, antialiased=antialiased)
     expected = jitted(projection.project, static_argnums=(2, 3))(
-        gaussians, put(one, "float32"), size, SPEC.raster
+        gaussians, put(one, "float32"), size, raster
     )
     low, high = (expected.mean_px + sign * expected.extent_px for sign in (-1, 1))
     shown = (
@@ -253,7 +256,7 @@ def test_the_page_projects_as_the_library(page, by_node):
         colours,
     )
     exact = np.concatenate([np.asarray(part)[shown] for part in parts], axis=1)
-    footprints = np.reshape(found["footprints"], (-1, 11))
+    footprints = np.reshape(found["footprints"][antialiased], (-1, 11))
     assert len(footprints) == len(exact) > 100
     places = [np.lexsort(table[:, :2].T.round(2)) for table in (footprints, exact)]
     one, other = footprints[places[0]], exact[places[1]]
