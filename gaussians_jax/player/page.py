@@ -114,7 +114,6 @@ def header(packed: packing.Packed, raster: RasterSpec, capture: Capture) -> dict
         "instants": packed.entries["mean.change"]["shape"][0],
         "seconds": seconds(capture),
         "up": np.asarray(up, np.float64).tolist(),
-        "world_units": 1 / capture.scale,
         "view": {name: np.asarray(part).tolist() for name, part in view.items()},
         "raster": {
             name: min(getattr(raster, name), LARGEST)

@@ -159,7 +159,8 @@ def _figure(figure):
     else:
         picture = f'<img {shape} alt="{caption}" src="{source}">'
     if figure.link:
-        picture = f'<a href="{_safe(figure.link)}">{picture}</a>'
+        before = f'<a href="{_safe(figure.link)}">'
+        picture, caption = f"{before}{picture}</a>", f"{before}{caption}</a>"
     return f"<figure>{picture}<figcaption>{caption}</figcaption></figure>"
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import shutil
+import types
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.structure_from_motion import Poses
 from nerfies_jax.runs import movers, preparation, reconstruction
 from nerfies_jax.runs.config import CaptureSource, Preparation, RunConfig
+from tests import scenes
 from tests.capture import test_colmap as models
 
 
@@ -87,6 +89,28 @@ def test_the_second_pass_goes_without_what_the_first_saw_move(
     np.testing.assert_array_equal(shown, moving[2])
     assert (tmp_path / "out/colmap/sparse/0/images.txt").is_file()
     assert not list(tmp_path.glob(".*"))
+
+
+def test_masks_are_of_every_frame_and_of_its_size(monkeypatch):
+    capture = scenes.tiny_capture()
+    order = np.array([3, 0, 6, 5, 1, 4, 2])
+    small = np.random.default_rng(0).random((7, 7, 10)) < 0.2  # a quarter, and 2 rest
+    found = types.SimpleNamespace(unusable="", moving=small, row=order, factor=4)
+
+    def gather(asked):
+        assert asked.train.tolist() == list(range(7))  # held-out ones too
+        return found
+
+    monkeypatch.setattr(movers.record, "gather", gather)
+    masks = movers.masks_of(capture)
+    assert masks.shape == capture.images.shape[:3]
+    for row, mask in zip(order, small, strict=True):
+        np.testing.assert_array_equal(masks[row, 2:28:4, 1::4], mask)
+        assert not masks[row, 28:].any()
+    found.unusable = "the camera jumps"
+    assert movers.masks_of(capture) is None
+    found.unusable, found.moving = "", np.zeros_like(small)
+    assert movers.masks_of(capture) is None
 
 
 def test_a_second_pass_that_loses_pictures_is_not_taken(
