@@ -123,6 +123,11 @@ def _check_resumed(args):
     """Raise ValueError where options do not go with --resume."""
     if args.out is None:
         raise ValueError("--resume continues the run in a folder: name it with --out")
+    if args.prepare != Preparation():
+        raise ValueError(
+            "--prepare says how a film becomes a capture, and this run has one; leave "
+            "it out with --resume"
+        )
     if args.effects == "auto":
         raise ValueError(
             "--effects auto chooses what a new run begins with; leave it out with "

@@ -140,6 +140,11 @@ def _with_cameras(config, out, how):
     """The config, its source a capture: prepared now, or before, if it was none."""
     source = config.source.capture
     if source is None or not preparation.needed(source):
+        if how != Preparation():
+            raise ValueError(
+                "--prepare is for films and pictures without cameras, and "
+                f"{source or 'a built-in scene'} has its own; leave it out"
+            )
         return config
     out = out or pathlib.Path("runs") / source.stem
     folder = preparation.prepared(source, out.with_name(f"{out.name}-capture"), how)

@@ -64,6 +64,7 @@ def test_frames_without_their_picture_are_left_out_where_asked(
         (("--preset", "splats-magic"), "splats-deformable-small"),
         (("--steps", "0"), "at least one step"),
         (("--heldout", "1"), "held"),
+        (("--prepare.frames", "9"), "has its own"),
         (("--checkpoint-every", "-1"), "--checkpoint-every -1"),
         (("--lpips-weights", "a.npz"), "31 pixels on the shorter side"),
         (("--lpips-weights", "a.npz", "--lpips-network", "vgg"), "a.npz: no such file"),
@@ -100,6 +101,7 @@ def started(folder, config):
         (["--steps", "70"], "spec.steps: saved 60, now 70"),
         (["--set", "sh_degree=2"], "spec.sh_degree: saved 1, now 2"),
         (["--effects", "auto"], "--effects auto"),
+        (["--prepare.frames", "9"], "--prepare"),
     ],
 )
 def test_a_run_is_not_continued_as_another_one(arguments, words, tmp_path, capsys):

@@ -149,7 +149,7 @@ def test_a_run_of_a_film_prepares_it_once_beside_the_run(tmp_path, asked, monkey
     assert len(asked.calls) == 1
     capture = room.load(tmp_path / "run-capture")
     assert capture.frames_per_second == pytest.approx(30, abs=0.2)
-    assert reconstruction._with_cameras(found, tmp_path / "run", how) is found
+    assert reconstruction._with_cameras(found, None, Preparation()) is found
     other = dataclasses.replace(how, passes=1)
     with pytest.raises(ValueError, match=r"run-capture: .*how differ.*--out"):
         reconstruction._with_cameras(config, tmp_path / "run", other)
