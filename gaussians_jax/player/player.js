@@ -44,6 +44,7 @@ void main() {
   vec4 front = texelFetch(picture, ivec2(gl_FragCoord.xy), 0);
   drawn = vec4(front.rgb + (1.0 - front.a) * background, 1.0);
 }`;
+const RADIANS = 0.006; // that the view turns for a pixel
 // Of a footprint, in the order of the shader's inputs 1 to 4.
 const PARTS = [2, 4, 2, 3];
 
@@ -126,9 +127,8 @@ function painter(canvas, raster) {
 function start(header, buffer) {
   const one = (id) => document.getElementById(id);
   const canvas = one("scene"), slider = one("time"), button = one("play");
-  const scene = unpack(header, buffer), first = header.view;
-  const paint = painter(canvas, header.raster);
-  let view = first, playing = !location.hash, stale = true, before = 0;
+  const scene = unpack(header, buffer), paint = painter(canvas, header.raster);
+  let view = header.view, playing = !location.hash, stale = true, before = 0;
   slider.value = parseFloat(location.hash.slice(1)) || 0; // player.html#0.5: that time
 
   function draw() {
@@ -168,16 +168,36 @@ function start(header, buffer) {
     button.textContent = yes ? "Pause" : "Play";
   }
 
+  steer(canvas, header.up, () => view, change);
+  button.addEventListener("click", () => play(!playing));
+  one("first").addEventListener("click", () => change(header.view));
+  for (const id of ["time", "background"]) {
+    one(id).addEventListener("input", () => { stale = true; });
+  }
+  slider.addEventListener("pointerdown", () => play(false));
+  window.addEventListener("resize", () => { stale = true; });
+  window.addEventListener("keydown", (event) => {
+    if (event.key !== " " || event.target === button) return;
+    event.preventDefault();
+    play(!playing);
+  });
+  play(playing);
+  requestAnimationFrame((now) => { before = now; tick(now); });
+}
+
+// Pointers and wheel on the canvas change the view: `get` has it, `change` takes it.
+function steer(canvas, up, get, change) {
+  const held = new Map();
+
   function drag(dx, dy, sideways) {
+    const view = get();
     const away = Math.hypot(...view.position.map((x, k) => x - view.target[k]));
     const unit = away / fitted(view, canvas.clientWidth, canvas.clientHeight).focal;
     if (sideways) return change(moved(view, -dx * unit, -dy * unit));
-    const right = view.rotation.slice(0, 3);
-    const about = turned(view, header.up, -dx * 0.006);
-    change(turned(about, right, -dy * 0.006));
+    const about = turned(view, up, -dx * RADIANS);
+    change(turned(about, about.rotation.slice(0, 3), -dy * RADIANS));
   }
 
-  const held = new Map();
   canvas.addEventListener("pointerdown", (event) => {
     canvas.setPointerCapture(event.pointerId);
     held.set(event.pointerId, event);
@@ -194,27 +214,14 @@ function start(header, buffer) {
     const other = [...held.values()].find((each) => each.pointerId !== event.pointerId);
     const apart = (a) => Math.hypot(a.clientX - other.clientX, a.clientY - other.clientY);
     drag(dx / 2, dy / 2, true);
-    change(nearer(view, apart(last) / Math.max(apart(event), 1)));
+    change(nearer(get(), apart(last) / Math.max(apart(event), 1)));
   });
   canvas.addEventListener("contextmenu", (event) => event.preventDefault());
   canvas.addEventListener("wheel", (event) => {
     event.preventDefault();
-    change(nearer(view, Math.exp(event.deltaY * (event.deltaMode ? 0.03 : 0.001))));
+    const lines = event.deltaMode ? 30 : 1; // px, or lines of about 30
+    change(nearer(get(), Math.exp(event.deltaY * lines * 0.001)));
   }, { passive: false });
-  button.addEventListener("click", () => play(!playing));
-  one("first").addEventListener("click", () => change(first));
-  for (const id of ["time", "background"]) {
-    one(id).addEventListener("input", () => { stale = true; });
-  }
-  slider.addEventListener("pointerdown", () => play(false));
-  window.addEventListener("resize", () => { stale = true; });
-  window.addEventListener("keydown", (event) => {
-    if (event.key !== " " || event.target === button) return;
-    event.preventDefault();
-    play(!playing);
-  });
-  play(playing);
-  requestAnimationFrame((now) => { before = now; tick(now); });
 }
 
 function bytesOf(text) {

@@ -36,6 +36,10 @@ function unpack(header, buffer) {
     };
   }
   scene.scale = scene.fields.log_scale.rest.map(Math.exp);
+  scene.room = { // for every frame the same: to make it anew takes a quarter of one
+    footprints: new Float32Array(scene.count * FLOATS),
+    depths: new Float32Array(scene.count),
+  };
   return scene;
 }
 
@@ -74,9 +78,8 @@ function project(scene, camera, raster) {
   const fx = camera.focal, fy = camera.focal * camera.aspect;
   const marginX = raster.tangent_margin * 0.5 * size[0];
   const marginY = raster.tangent_margin * 0.5 * size[1];
-  const footprints = new Float32Array(scene.count * FLOATS);
-  const depths = new Float32Array(scene.count);
-  const first = [0, 0, 0], second = [0, 0, 0];
+  const { footprints, depths } = scene.room;
+  const first = [0, 0, 0], second = [0, 0, 0], axes = new Float64Array(9);
   let seen = 0;
   for (let i = 0; i < scene.count; i++) {
     const dx = mean[3 * i] - at[0], dy = mean[3 * i + 1] - at[1];
@@ -92,9 +95,9 @@ function project(scene, camera, raster) {
     // Rows of T = J W R diag(scale), tangents clamped in J alone.
     tanX = clamp(tanX, -(centre[0] + marginX) / fx, (size[0] - centre[0] + marginX) / fx);
     tanY = clamp(tanY, -(centre[1] + marginY) / fy, (size[1] - centre[1] + marginY) / fy);
-    const axes = columns(quaternion, 4 * i);
+    columns(quaternion, 4 * i, axes);
     for (let k = 0; k < 3; k++) {
-      const [a, b, c] = axes[k];
+      const a = axes[3 * k], b = axes[3 * k + 1], c = axes[3 * k + 2];
       const right = w[0] * a + w[1] * b + w[2] * c;
       const down = w[3] * a + w[4] * b + w[5] * c;
       const ahead = w[6] * a + w[7] * b + w[8] * c;
@@ -120,22 +123,20 @@ function project(scene, camera, raster) {
     if (!inside) continue; // also where a number is NaN
 
     depths[seen] = z;
-    const to = FLOATS * seen++;
-    footprints[to] = x;
-    footprints[to + 1] = y;
-    footprints[to + 2] = p;
-    footprints[to + 3] = k;
-    footprints[to + 4] = r;
-    footprints[to + 5] = opacity;
-    footprints[to + 6] = across;
-    footprints[to + 7] = along;
-    for (let c = 0; c < 3; c++) footprints[to + 8 + c] = scene.colour[3 * i + c];
+    let to = FLOATS * seen++;
+    for (const part of [x, y, p, k, r, opacity, across, along]) footprints[to++] = part;
+    for (let c = 0; c < 3; c++) footprints[to++] = scene.colour[3 * i + c];
   }
-  const sorted = new Float32Array(seen * FLOATS);
-  order(depths.subarray(0, seen)).forEach((row, place) => {
-    const from = FLOATS * row;
-    sorted.set(footprints.subarray(from, from + FLOATS), FLOATS * (seen - 1 - place));
-  });
+  return farthestFirst(footprints, depths.subarray(0, seen));
+}
+
+function farthestFirst(footprints, depths) {
+  const sorted = new Float32Array(depths.length * FLOATS);
+  let to = sorted.length;
+  for (const row of order(depths)) {
+    to -= FLOATS;
+    for (let i = 0; i < FLOATS; i++) sorted[to + i] = footprints[FLOATS * row + i];
+  }
   return sorted;
 }
 
@@ -143,16 +144,20 @@ function dot(a, b) {
   return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 }
 
-// The three axes that a quaternion of any length turns x, y and z to.
-function columns(quaternion, at) {
+// The axes that a quaternion of any length turns x, y and z to, one behind the other.
+function columns(quaternion, at, axes) {
   const w = quaternion[at], x = quaternion[at + 1];
   const y = quaternion[at + 2], z = quaternion[at + 3];
   const double = 2 / (w * w + x * x + y * y + z * z);
-  return [
-    [1 - double * (y * y + z * z), double * (x * y + w * z), double * (x * z - w * y)],
-    [double * (x * y - w * z), 1 - double * (x * x + z * z), double * (y * z + w * x)],
-    [double * (x * z + w * y), double * (y * z - w * x), 1 - double * (x * x + y * y)],
-  ];
+  axes[0] = 1 - double * (y * y + z * z);
+  axes[1] = double * (x * y + w * z);
+  axes[2] = double * (x * z - w * y);
+  axes[3] = double * (x * y - w * z);
+  axes[4] = 1 - double * (x * x + z * z);
+  axes[5] = double * (y * z + w * x);
+  axes[6] = double * (x * z + w * y);
+  axes[7] = double * (y * z - w * x);
+  axes[8] = 1 - double * (x * x + y * y);
 }
 
 // Rows from the nearest to the farthest, equal ones as they came. Positive floats are
