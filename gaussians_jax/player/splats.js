@@ -36,7 +36,7 @@ function unpack(header, buffer) {
     };
   }
   scene.scale = scene.fields.log_scale.rest.map(Math.exp);
-  scene.room = { // for every frame the same: to make it anew takes a quarter of one
+  scene.room = { // for every frame the same: to make it anew takes a fifth of one
     footprints: new Float32Array(scene.count * FLOATS),
     depths: new Float32Array(scene.count),
   };
