@@ -81,7 +81,7 @@ def write(
         "player": _file("player.js"),
     }
     # In one pass: what stands in a name is never taken for a part.
-    page = re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], _file("player.html"))
+    page = re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], _file("player.html"))
     with replaced_file(path) as partial:
         partial.write_text(page, encoding="utf-8")
     return Player(path, f"{about} {path.stat().st_size / 1e6:.1f} MB.")

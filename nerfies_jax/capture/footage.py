@@ -54,8 +54,8 @@ def kind_of(path: pathlib.Path) -> str | None:
 def pictures_in(folder: pathlib.Path) -> list[pathlib.Path]:
     """Files of a folder that are pictures by their ending, in natural order."""
     endings = (*PLAIN, *HEIC)
-    found = [file for file in folder.iterdir() if file.suffix.lower() in endings]
-    return sorted(found, key=lambda file: natural(file.name))
+    files = [file for file in folder.iterdir() if file.suffix.lower() in endings]
+    return sorted(files, key=lambda file: natural(file.name))
 
 
 def from_film(
@@ -228,13 +228,13 @@ def _upright(file):
 
 def _focal(files: Sequence[pathlib.Path]) -> float | None:
     """The median focal length that the files tell, in longest sides of the picture."""
-    told = []
+    focals = []
     for file in files:
         with _opened(file) as picture:
             value = picture.getexif().get_ifd(_EXIF).get(_FOCAL_35MM)
         if value:
-            told.append(float(value) / FULL_FRAME_MM)
-    return float(np.median(told)) if told else None
+            focals.append(float(value) / FULL_FRAME_MM)
+    return float(np.median(focals)) if focals else None
 
 
 def _mask_of(folder, picture):

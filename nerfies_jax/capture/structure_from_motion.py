@@ -150,8 +150,8 @@ def run_sfm(
         shutil.copytree(images, folder / "images")
         if masks is not None:
             shutil.copytree(masks, folder / "masks")
-        found = _in_own_process(folder, masks is not None, spec, tell)
-        poses = Poses(out, len(names), **found)
+        judged = _in_own_process(folder, masks is not None, spec, tell)
+        poses = Poses(out, len(names), **judged)
         if poses.placed < max(2, spec.at_least * len(names)):
             raise CaptureError(
                 f"{images}: only {poses.placed} of {len(names)} pictures found "
@@ -211,16 +211,16 @@ STAGES = (
 
 def _follow(lines, log, tell):
     """Keep the last lines of the child's log, and tell now and then where it is."""
-    told = time.monotonic()
+    logged = time.monotonic()
     for line in filter(None, map(str.strip, lines)):
         log.append(line)
-        if time.monotonic() - told < TELL_SECONDS:
+        if time.monotonic() - logged < TELL_SECONDS:
             continue
         for pattern, words in STAGES:
             where = pattern.search(line)
             if where:
                 tell("cameras: " + words.format(*where.groups()))
-                told = time.monotonic()
+                logged = time.monotonic()
 
 
 def _reconstruct(folder: pathlib.Path, masked: bool, spec: MappingSpec) -> dict:
@@ -303,7 +303,7 @@ def _judged(model) -> dict:
 
 
 if __name__ == "__main__":
-    asked = json.load(sys.stdin)
-    spec = MappingSpec(**asked["spec"])
-    found = _reconstruct(pathlib.Path(asked["folder"]), asked["masked"], spec)
-    print(json.dumps(found))
+    job = json.load(sys.stdin)
+    spec = MappingSpec(**job["spec"])
+    judged = _reconstruct(pathlib.Path(job["folder"]), job["masked"], spec)
+    print(json.dumps(judged))

@@ -21,8 +21,8 @@ def masks_of(pictures: Capture) -> np.ndarray | None:
     evidence = record.gather(every)
     if evidence.unusable or evidence.moving.mean() < LEAST_SHARE:
         return None
-    found = np.zeros((len(rows), *pictures.images.shape[1:3]), bool)
+    masks = np.zeros((len(rows), *pictures.images.shape[1:3]), bool)
     enlarged = np.kron(evidence.moving, np.ones((1, *2 * (evidence.factor,)), bool))
-    height, width = np.minimum(found.shape[1:], enlarged.shape[1:])  # whole blocks
-    found[evidence.row, :height, :width] = enlarged[:, :height, :width]
-    return found
+    height, width = np.minimum(masks.shape[1:], enlarged.shape[1:])  # whole blocks
+    masks[evidence.row, :height, :width] = enlarged[:, :height, :width]
+    return masks

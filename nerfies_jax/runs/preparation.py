@@ -77,25 +77,25 @@ def prepare(
         solved = _solve(scratch, taken, how, tell)
         for line in solved.lines:
             tell(line)
-        found = colmap.read(solved.poses.folder)
+        capture = colmap.read(solved.poses.folder)
         rate = None
         if taken.seconds:
             rate = (len(taken.names) - 1) / taken.seconds
         if how.masks is None:  # what was found is no truth to be scored by
-            found = dataclasses.replace(found, moving=None)
-        found = dataclasses.replace(
-            found, name=out.name, path=None, frames_per_second=rate
+            capture = dataclasses.replace(capture, moving=None)
+        capture = dataclasses.replace(
+            capture, name=out.name, path=None, frames_per_second=rate
         )
-        made = scratch / "capture"
-        nerfies_format.write(found, made)
-        shutil.copytree(solved.poses.folder / "sparse", made / "colmap" / "sparse")
+        written = scratch / "capture"
+        nerfies_format.write(capture, written)
+        shutil.copytree(solved.poses.folder / "sparse", written / "colmap" / "sparse")
         if solved.masked and how.masks is None:
-            (scratch / "found").rename(made / "masks_found")
-        write_json(made / RECORD, _record(source, how, solved))
-        os.replace(made, out)
-    for line in describe(found):
+            (scratch / "found").rename(written / "masks_found")
+        write_json(written / RECORD, _record(source, how, solved))
+        os.replace(written, out)
+    for line in describe(capture):
         tell(line)
-    return found
+    return capture
 
 
 @contextlib.contextmanager

@@ -272,7 +272,7 @@ def save_player(
     try:
         state = trained.result.state
         poster = evaluation.as_picture(trained.renderer(state, first).colour)
-        made = write(
+        player = write(
             folder / "player.html",
             f"{run.capture.name}: {run.config.preset}",
             run.spec,
@@ -285,9 +285,9 @@ def save_player(
         pictures.save(poster, picture)
     except Exception as error:  # whatever it is, the run keeps all its other products
         return [], [f"There is no player: {type(error).__name__}: {error}"]
-    print(f"player:     {made.path} ({made.about})")
-    caption = f"Play it, look from elsewhere: {made.path.name}. {made.about}"
-    return [report.Figure(picture, caption, made.path.name)], []
+    print(f"player:     {player.path} ({player.about})")
+    caption = f"Play it, look from elsewhere: {player.path.name}. {player.about}"
+    return [report.Figure(picture, caption, player.path.name)], []
 
 
 def save_depth(folder: pathlib.Path, capture: Capture, scored: Scored) -> None:

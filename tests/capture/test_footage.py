@@ -123,10 +123,10 @@ def test_photographs_come_upright_of_one_size_whatever_their_ending(
     assert "small.png" in left_out
     assert "notes.txt" not in left_out
     for name, row in zip(taken.names, (0, 1, 2, 4, 3), strict=True):
-        found = images.read_pixels(tmp_path / "out/images" / name)
+        pixels = images.read_pixels(tmp_path / "out/images" / name)
         exact = upright[row].reshape(16, 2, 32, 2, 3).mean((1, 3))
-        assert found.shape == (16, 32, 3)
-        assert np.abs(found - exact).max() <= (4 if name == "1.png" else 1), name
+        assert pixels.shape == (16, 32, 3)
+        assert np.abs(pixels - exact).max() <= (4 if name == "1.png" else 1), name
 
 
 def test_a_folder_is_told_by_what_is_in_it(tmp_path):

@@ -45,19 +45,19 @@ def world(capture):
 
 
 def test_the_cameras_are_those_of_the_colmap_model(tmp_path):
-    found = room.load(make(tmp_path / "llff"))
+    capture = room.load(make(tmp_path / "llff"))
     lens = "PINHOLE 24 16 30 30 12 8"
     known = room.load(models.make(tmp_path / "colmap", lens=lens))
-    assert found.source == "llff"
-    assert found.ids == known.ids
-    np.testing.assert_array_equal(found.images, known.images)
-    np.testing.assert_allclose(world(found), world(known), atol=1e-5)
+    assert capture.source == "llff"
+    assert capture.ids == known.ids
+    np.testing.assert_array_equal(capture.images, known.images)
+    np.testing.assert_allclose(world(capture), world(known), atol=1e-5)
     for name in ("camera_from_world", "focal_px", "principal_point_px", "pixel_aspect"):
-        one, other = (getattr(each.cameras, name) for each in (found, known))
+        one, other = (getattr(each.cameras, name) for each in (capture, known))
         np.testing.assert_allclose(one, other, atol=1e-6, err_msg=name)
-    np.testing.assert_array_equal(found.times, known.times)
-    assert found.heldout.tolist() == [4]
-    near, far = found.near / found.scale, found.far / found.scale
+    np.testing.assert_array_equal(capture.times, known.times)
+    assert capture.heldout.tolist() == [4]
+    near, far = capture.near / capture.scale, capture.far / capture.scale
     np.testing.assert_allclose([near, far], [0.8 * 4, 1.2 * 9], rtol=1e-5)
 
 
@@ -89,8 +89,8 @@ BROKEN = {
 
 @pytest.mark.parametrize("case", BROKEN)
 def test_a_broken_folder_is_refused(tmp_path, case):
-    options, said = BROKEN[case]
-    refused(llff_format.read, make(tmp_path / "llff", **options), said)
+    options, words = BROKEN[case]
+    refused(llff_format.read, make(tmp_path / "llff", **options), words)
 
 
 def test_a_nerfies_directory_takes_the_points_of_the_model_beside_it(tmp_path):
@@ -99,13 +99,15 @@ def test_a_nerfies_directory_takes_the_points_of_the_model_beside_it(tmp_path):
     assert room.load(tmp_path / "out").points is None
     beside = tmp_path / "out/colmap/sparse/0"
     shutil.copytree(tmp_path / "model/sparse/0", beside)
-    found = room.load(tmp_path / "out")
-    np.testing.assert_allclose(found.points.position, known.points.position, atol=1e-6)
-    np.testing.assert_array_equal(found.points.colour, known.points.colour)
+    capture = room.load(tmp_path / "out")
+    np.testing.assert_allclose(
+        capture.points.position, known.points.position, atol=1e-6
+    )
+    np.testing.assert_array_equal(capture.points.colour, known.points.colour)
     file = tmp_path / "out/camera/f_000.json"
     one = json.loads(file.read_text())
     one["position"][0] += 0.1
     file.write_text(json.dumps(one))
-    found = room.load(tmp_path / "out")
-    assert found.points is None
-    assert any("has other cameras" in note for note in found.notes)
+    capture = room.load(tmp_path / "out")
+    assert capture.points is None
+    assert any("has other cameras" in note for note in capture.notes)

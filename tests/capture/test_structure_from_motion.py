@@ -50,12 +50,12 @@ def film(folder, count, plain=False):
     return cameras
 
 
-def aligned(found, true):
+def aligned(guess, true):
     """Error of camera centres after the best similarity, relative to their spread."""
-    found, true = found - found.mean(0), true - true.mean(0)
-    u, values, v = np.linalg.svd(true.T @ found)
-    scale = values.sum() / (found**2).sum()
-    return np.linalg.norm(true - scale * found @ (u @ v).T, axis=1).max() / np.ptp(true)
+    guess, true = guess - guess.mean(0), true - true.mean(0)
+    u, values, v = np.linalg.svd(true.T @ guess)
+    scale = values.sum() / (guess**2).sum()
+    return np.linalg.norm(true - scale * guess @ (u @ v).T, axis=1).max() / np.ptp(true)
 
 
 @pytest.mark.slow
@@ -74,13 +74,13 @@ def test_cameras_of_a_textured_room_are_found(tmp_path, monkeypatch):
     monkeypatch.setattr(mapping, "TELL_SECONDS", 0.0)
     lines = []
     poses = mapping.run_sfm("pictures", "out", "masks", spec, lines.append)
-    found = room.load(poses.folder)
-    assert len(found.ids) == 8
+    capture = room.load(poses.folder)
+    assert len(capture.ids) == 8
     true = np.array([one.position for one in cameras], float)
-    assert aligned(found.cameras.position.astype(float), true) < 0.02
-    np.testing.assert_allclose(found.cameras.focal_px, FOCAL, rtol=0.05)
-    assert found.moving[:, :20].all()
-    assert not found.moving[:, 20:].any()
+    assert aligned(capture.cameras.position.astype(float), true) < 0.02
+    np.testing.assert_allclose(capture.cameras.focal_px, FOCAL, rtol=0.05)
+    assert capture.moving[:, :20].all()
+    assert not capture.moving[:, 20:].any()
     files = sorted(path.name for path in poses.folder.iterdir())
     assert files == ["images", "masks", "sparse"]
     assert (poses.pictures, poses.placed) == (8, 8)

@@ -172,17 +172,17 @@ class Packing:
     def __init__(self, pack):
         self._pack, self.instants = pack, []
 
-    def __call__(self, found, still):
-        self.instants.append(len(found.mean))
-        return self._pack(found, still)
+    def __call__(self, gaussians, still):
+        self.instants.append(len(gaussians.mean))
+        return self._pack(gaussians, still)
 
 
 def test_one_rotation_keeps_one_sign():
     angle = np.linspace(0, 3 * np.pi, 30)  # to and fro over the double cover
     true = np.stack([np.cos(angle), np.sin(angle), 0 * angle, 0 * angle], -1)[:, None]
     flipped = true * np.where(np.arange(30) % 3 == 0, -2, 1)[:, None, None]
-    found = instants.steady(flipped)
-    np.testing.assert_allclose(found, -true, atol=1e-12)
+    quaternions = instants.steady(flipped)
+    np.testing.assert_allclose(quaternions, -true, atol=1e-12)
 
 
 PROJECT = """
@@ -226,16 +226,16 @@ def by_node(page):
         "header": json.loads(inside(page, "header")),
         "data": inside(page, "data"),
     }
-    asked = json.dumps([program, content, camera, 0.3])
+    request = json.dumps([program, content, camera, 0.3])
     run = functools.partial(subprocess.run, capture_output=True, text=True, check=True)
-    done = run(["node", "-e", PROJECT], input=asked)
+    done = run(["node", "-e", PROJECT], input=request)
     return one, json.loads(done.stdout)
 
 
 @needs_node
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_the_page_projects_as_the_library(page, by_node, antialiased):
-    one, found = by_node
+    one, answer = by_node
     size = moving_scene()[2].size
     gaussians, colours = unpacked(page, 0.3)
     raster = dataclasses.replace(SPEC.raster, antialiased=antialiased)
@@ -256,7 +256,7 @@ def test_the_page_projects_as_the_library(page, by_node, antialiased):
         colours,
     )
     exact = np.concatenate([np.asarray(part)[shown] for part in parts], axis=1)
-    footprints = np.reshape(found["footprints"][antialiased], (-1, 11))
+    footprints = np.reshape(answer["footprints"][antialiased], (-1, 11))
     assert len(footprints) == len(exact) > 100
     places = [np.lexsort(table[:, :2].T.round(2)) for table in (footprints, exact)]
     one, other = footprints[places[0]], exact[places[1]]
@@ -264,26 +264,26 @@ def test_the_page_projects_as_the_library(page, by_node, antialiased):
     depth = np.empty(len(exact))
     depth[places[0]] = expected.depth[shown][places[1]]
     assert (np.diff(depth) < 1e-6).all()  # the farthest first
-    assert found["order"] == [1, 4, 6, 0, 3, 2, 5]
+    assert answer["order"] == [1, 4, 6, 0, 3, 2, 5]
 
 
 @needs_node
 def test_views_turn_about_their_target(page, by_node):
-    _, found = by_node
+    _, answer = by_node
     view = json.loads(inside(page, "header"))["view"]
     target, start = np.array(view["target"]), np.array(view["position"])
-    turned = found["turned"]
+    turned = answer["turned"]
     rotation = np.reshape(turned["rotation"], (3, 3))
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
-    for one in (turned, found["nearer"], found["moved"]):
+    for one in (turned, answer["nearer"], answer["moved"]):
         rotation = np.reshape(one["rotation"], (3, 3))
         offset = np.array(one["target"]) - one["position"]
-        away = np.linalg.norm(target - start) * (0.5 if one is found["nearer"] else 1)
+        away = np.linalg.norm(target - start) * (0.5 if one is answer["nearer"] else 1)
         np.testing.assert_allclose(rotation @ offset, [0, 0, away], atol=1e-6)
-    moved = np.array(found["moved"]["position"]) - start
+    moved = np.array(answer["moved"]["position"]) - start
     rotation = np.reshape(view["rotation"], (3, 3))
     np.testing.assert_allclose(rotation @ moved, [0.2, 0.1, 0], atol=1e-6)
-    fitted = found["fitted"]  # a picture of 40 x 30 in one of 200 x 90
+    fitted = answer["fitted"]  # a picture of 40 x 30 in one of 200 x 90
     assert (fitted["enlarged"], fitted["size"]) == (3, [200, 90])
     assert fitted["focal"] == pytest.approx(3 * view["focal"])
     place = 3 * (np.array(view["centre"]) - (20, 15)) + (100, 45)
@@ -313,7 +313,7 @@ def test_a_browser_draws_what_the_model_does(page, tmp_path, time):
     options += (f"--screenshot={shot}", f"--user-data-dir={tmp_path / 'profile'}")
     address = f"file://{tmp_path / 'page.html'}#0.5"
     subprocess.run([CHROMIUM, *options, address], capture_output=True, timeout=120)
-    found = images.read_image(shot)[0][:30, :40] / 255
-    assert psnr(found, drawn(0, time)) > 50  # 8 bits alone leave 59
+    picture = images.read_image(shot)[0][:30, :40] / 255
+    assert psnr(picture, drawn(0, time)) > 50  # 8 bits alone leave 59
     other = drawn(0, 1.0 - time)
-    assert psnr(found, other) < 30
+    assert psnr(picture, other) < 30

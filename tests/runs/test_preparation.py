@@ -18,7 +18,7 @@ from tests.capture import test_colmap as models
 
 
 @pytest.fixture
-def asked(monkeypatch):
+def mapper(monkeypatch):
     """COLMAP, which here writes a model by hand; its `calls`, each with its masks.
 
     Where it `fails`, the second call places three pictures fewer.
@@ -50,11 +50,11 @@ def asked(monkeypatch):
 
 @pytest.fixture
 def moving(monkeypatch):
-    """Masks that are found: a corner in the third picture."""
-    found = np.zeros((9, 16, 24), bool)
-    found[2, 10:, 15:] = True
-    monkeypatch.setattr(movers, "masks_of", lambda capture: found)
-    return found
+    """What is taken to move: a corner in the third picture."""
+    moving = np.zeros((9, 16, 24), bool)
+    moving[2, 10:, 15:] = True
+    monkeypatch.setattr(movers, "masks_of", lambda capture: moving)
+    return moving
 
 
 @pytest.fixture
@@ -67,11 +67,11 @@ def pictures(tmp_path):
 
 
 def test_the_second_pass_goes_without_what_the_first_saw_move(
-    pictures, tmp_path, asked, moving
+    pictures, tmp_path, mapper, moving
 ):
     how = Preparation(camera_model="RADIAL", matcher="exhaustive", threads=1)
-    found = preparation.prepare(pictures, tmp_path / "out", how)
-    (spec, black), (_, masked) = asked.calls
+    capture = preparation.prepare(pictures, tmp_path / "out", how)
+    (spec, black), (_, masked) = mapper.calls
     assert black is None
     assert (spec.camera_model, spec.matcher, spec.threads) == (
         "RADIAL",
@@ -83,7 +83,7 @@ def test_the_second_pass_goes_without_what_the_first_saw_move(
         assert mask.any() == moving[row].any()
         assert mask.sum() <= 1.5 * moving[row].sum()  # the rim
     stored = room.load(tmp_path / "out")
-    np.testing.assert_array_equal(stored.images, found.images)
+    np.testing.assert_array_equal(stored.images, capture.images)
     assert stored.moving is None  # found, and no truth
     shown = images.read_mask(tmp_path / "out/masks_found/p2.png")
     np.testing.assert_array_equal(shown, moving[2])
@@ -95,11 +95,11 @@ def test_masks_are_of_every_frame_and_of_its_size(monkeypatch):
     capture = scenes.tiny_capture()
     order = np.array([3, 0, 6, 5, 1, 4, 2])
     small = np.random.default_rng(0).random((7, 7, 10)) < 0.2  # a quarter, and 2 rest
-    found = types.SimpleNamespace(unusable="", moving=small, row=order, factor=4)
+    moving = types.SimpleNamespace(unusable="", moving=small, row=order, factor=4)
 
-    def gather(asked):
-        assert asked.train.tolist() == list(range(7))  # held-out ones too
-        return found
+    def gather(mapper):
+        assert mapper.train.tolist() == list(range(7))  # held-out ones too
+        return moving
 
     monkeypatch.setattr(movers.record, "gather", gather)
     masks = movers.masks_of(capture)
@@ -107,23 +107,23 @@ def test_masks_are_of_every_frame_and_of_its_size(monkeypatch):
     for row, mask in zip(order, small, strict=True):
         np.testing.assert_array_equal(masks[row, 2:28:4, 1::4], mask)
         assert not masks[row, 28:].any()
-    found.unusable = "the camera jumps"
+    moving.unusable = "the camera jumps"
     assert movers.masks_of(capture) is None
-    found.unusable, found.moving = "", np.zeros_like(small)
+    moving.unusable, moving.moving = "", np.zeros_like(small)
     assert movers.masks_of(capture) is None
 
 
 def test_a_second_pass_that_loses_pictures_is_not_taken(
-    pictures, tmp_path, asked, moving
+    pictures, tmp_path, mapper, moving
 ):
     del moving
-    asked.fails, said = True, []
+    mapper.fails, said = True, []
     preparation.prepare(pictures, tmp_path / "out", tell=said.append)
     assert any("only 6 are placed; the first are kept" in line for line in said)
     assert not (tmp_path / "out/masks_found").exists()
 
 
-def test_given_masks_take_one_pass_and_are_kept(pictures, tmp_path, asked):
+def test_given_masks_take_one_pass_and_are_kept(pictures, tmp_path, mapper):
     (tmp_path / "masks").mkdir()
     for row in range(9):
         mask = np.ones((16, 24), bool)
@@ -131,25 +131,25 @@ def test_given_masks_take_one_pass_and_are_kept(pictures, tmp_path, asked):
         images.write_png(tmp_path / f"masks/p{row}.png", mask)
     how = Preparation(masks=tmp_path / "masks")
     preparation.prepare(pictures, tmp_path / "out", how)
-    ((_, black),) = asked.calls
+    ((_, black),) = mapper.calls
     assert [mask[0].sum() for mask in black] == list(range(1, 10))
     np.testing.assert_array_equal(room.load(tmp_path / "out").moving, black)
 
 
-def test_a_run_of_a_film_prepares_it_once_beside_the_run(tmp_path, asked, monkeypatch):
+def test_a_run_of_a_film_prepares_it_once_beside_the_run(tmp_path, mapper, monkeypatch):
     monkeypatch.setattr(movers, "masks_of", lambda capture: None)
     frames = [models.picture(row).repeat(2, 0).repeat(2, 1) for row in range(9)]
     video.write_video(tmp_path / "clip.mp4", frames, 30)
     config = RunConfig(source=CaptureSource(tmp_path / "clip.mp4", heldout="4"))
     how = Preparation(frames=9, max_side=24)
     for _ in range(2):
-        found = reconstruction._with_cameras(config, tmp_path / "run", how)
-        assert found.source.capture == tmp_path / "run-capture"
-        assert found.source.heldout == "4"
-    assert len(asked.calls) == 1
+        moving = reconstruction._with_cameras(config, tmp_path / "run", how)
+        assert moving.source.capture == tmp_path / "run-capture"
+        assert moving.source.heldout == "4"
+    assert len(mapper.calls) == 1
     capture = room.load(tmp_path / "run-capture")
     assert capture.frames_per_second == pytest.approx(30, abs=0.2)
-    assert reconstruction._with_cameras(found, None, Preparation()) is found
+    assert reconstruction._with_cameras(moving, None, Preparation()) is moving
     other = dataclasses.replace(how, passes=1)
     with pytest.raises(ValueError, match=r"run-capture: .*how differ.*--out"):
         reconstruction._with_cameras(config, tmp_path / "run", other)
