@@ -39,12 +39,13 @@ def main(arguments=None):
         from nerfies_jax.evaluation import pictures
         from nerfies_jax.evidence import inspection
         from nerfies_jax.runs import adviser
+        from nerfies_jax.runs.platform import CACHE
 
         source = cli.plain(args.source)
         capture = runs.stored_capture(source, args.seed)
         for line in describe(capture):
             print(line)
-        inspected = inspection.inspect(capture)
+        inspected = inspection.inspect(capture, CACHE / "evidence")
         advice = adviser.advise_all(inspected.findings, args.full)
         for line in report(inspected, advice, source):
             print(line)

@@ -12,7 +12,6 @@ from nerfies_jax.capture import synthetic
 from nerfies_jax.capture.json_files import write_json
 from nerfies_jax.evidence import (
     dense_flow,
-    optical_flow,
     record,
     summary,
     view_set,
@@ -102,10 +101,10 @@ def _flow_row(name, method, times, pairs):
     )
 
 
-def _of_skimage(method, **settings):
+def _of_skimage(method):
     def flow(one, other):
         pictures = one / np.float32(255), other / np.float32(255)
-        down, right = method(*pictures, dtype=np.float32, **settings)
+        down, right = method(*pictures, dtype=np.float32)
         return np.stack([right, down], axis=-1)
 
     return lambda times: flow
@@ -116,5 +115,4 @@ METHODS = {
     "DIS (OpenCV, medium)": dense_flow.dis,
     "ILK (scikit-image)": _of_skimage(_ILK),
     "TV-L1 (scikit-image)": _of_skimage(_TVL1),
-    "TV-L1, as `inspect_scene` has it": _of_skimage(_TVL1, **optical_flow.FLOW),
 }

@@ -13,6 +13,7 @@ from experiments.ablate.job import Job, log
 from experiments.ablate.settings import Ablate
 from experiments.inspect_pays import arms
 from nerfies_jax import runs
+from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.json_files import write_json
 from nerfies_jax.evaluation import pictures
@@ -95,7 +96,7 @@ class Trial:
             self._findings = tuple(Finding(**one) for one in kept["findings"])
             return self._findings
         log(f"{self.name}: looking at it")
-        inspected = inspection.inspect(self._stored)
+        inspected = inspection.inspect(self._stored, CACHE / "evidence")
         pictures.save(inspected.sheet, self.folder / "inspected.png")
         advice = adviser.advise_all(inspected.findings)
         findings = inspect_scene.as_json(self._stored, inspected, advice)

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from nerfies_jax.evidence import wide_steps
 from nerfies_jax.evidence.view_set import Views
 
 # Small pictures are enlarged first: 0.06 px of median error for 0.10 at 176x132, where
@@ -74,27 +75,61 @@ def reduced(shift: np.ndarray, times: int) -> np.ndarray:
     return cv2.resize(shift, size, interpolation=cv2.INTER_AREA) / times
 
 
+def enlarged_flow(shift: np.ndarray, times: int) -> np.ndarray:
+    """The reverse."""
+    size = times * shift.shape[1], times * shift.shape[0]
+    return times * cv2.resize(np.ascontiguousarray(shift), size)
+
+
+def _smaller(picture, times):
+    size = picture.shape[1] // times, picture.shape[0] // times
+    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+
+
 def dis(times: int) -> Callable[..., np.ndarray]:
     """Finds flow between pictures that were enlarged so many times.
 
     A third argument is a guess of it, in pixels of the enlarged pictures.
     """
-    search = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    search.setFinestScale(0 if times > 1 else 1)
-    return lambda one, other, guess=None: search.calc(one, other, guess)
+    # Two: after a search from a guess, OpenCV 4.x finds something else without one.
+    plain, guided = (
+        cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM) for _ in range(2)
+    )
+    for search in (plain, guided):
+        search.setFinestScale(0 if times > 1 else 1)
+
+    def flow(one, other, guess=None):
+        return (plain if guess is None else guided).calc(one, other, guess)
+
+    return flow
 
 
-def between_neighbours(views: Views, pictures: np.ndarray) -> NeighbourFlow:
+def between_neighbours(
+    views: Views, pictures: np.ndarray, span: tuple[float, float] | None = None
+) -> NeighbourFlow:
     """Flow between all frames that follow each other, both ways, and checked.
 
-    `pictures` are the views' as `levelled` makes them.
+    `pictures` are the views' as `levelled` makes them. With `span`, the nearest and
+    farthest z-depth, wide steps are looked at again from where a still scene would be.
     """
     (width, height), frames = views.size, len(views.row)
     times = pictures.shape[2] // width
     search = dis(times)
 
     def flow(one, other):
-        return reduced(search(pictures[one], pictures[other]), times)
+        pair = pictures[one], pictures[other]
+        found = reduced(search(*pair), times)
+        if span is None or not wide_steps.is_wide(found):
+            return found
+        small = tuple(_smaller(picture, times) for picture in pair)
+        return wide_steps.improved(
+            views,
+            small,
+            (one, other),
+            found,
+            lambda guess: reduced(search(*pair, enlarged_flow(guess, times)), times),
+            span,
+        )
 
     forward, backward = np.zeros((2, frames, height, width, 2), np.float32)
     for frame in range(frames - 1):
@@ -133,10 +168,9 @@ def _go_on(flow, frame, pictures, search):
     """Look again, from the guess that all goes on as it came; keep what closes."""
     height, width = flow.forward.shape[1:3]
     times = pictures.shape[2] // width
-    size = times * width, times * height
 
     def again(one, other, guess):
-        guess = times * cv2.resize(np.ascontiguousarray(guess), size)
+        guess = enlarged_flow(guess, times)
         return reduced(search(pictures[one], pictures[other], guess), times)
 
     there = again(frame, frame + 1, -flow.backward[frame])

@@ -1,10 +1,10 @@
 """Exposure and colour: whether points at rest look alike in all frames."""
 
+import cv2
 import numpy as np
-import scipy.ndimage as nd
 
 from nerfies_jax.capture.synthetic import texture
-from nerfies_jax.evidence import optical_flow, view_set
+from nerfies_jax.evidence import view_set
 from nerfies_jax.evidence.findings import LIGHT as EFFECT
 from nerfies_jax.evidence.findings import Finding, cannot_tell, judge
 from nerfies_jax.evidence.view_set import Views
@@ -29,7 +29,7 @@ def exposure(views: Views, points: np.ndarray) -> Finding:
             f"{len(points)} points at rest; {GROUPS * MIN_POINTS} are needed",
             threshold,
         )
-    light = sightings(views, points)
+    light = sightings(view_set.smaller(views, view_set.times_smaller(views)), points)
     groups = np.array_split(np.argsort(_along_widest(points)), GROUPS)
     each = np.stack([gains(light[:, group]) for group in groups])
     known = np.isfinite(each).all(-1).sum(0) >= GROUPS // 2
@@ -70,11 +70,12 @@ def sightings(views: Views, points: np.ndarray) -> np.ndarray:
     for index in range(len(views.row)):
         pixel, depth = view_set.project(views, index, points)
         inside = view_set.in_picture(views, pixel, depth, 2)
-        picture = texture.linear(views.image[index] / 255)
+        picture = texture.linear(np.float32(views.image[index] / 255))
         # A pixel's blur: points are known to a fraction of one.
-        picture = nd.gaussian_filter(picture, (1, 1, 0))
+        picture = cv2.GaussianBlur(picture, (0, 0), 1)
         place = pixel[inside]
-        value = optical_flow.sample(picture, place - 0.5)
+        at = np.float32(place - 0.5)[:, None]
+        value = cv2.remap(picture, at, None, cv2.INTER_LINEAR)[:, 0]
         shown = views.valid[index][tuple(place[:, ::-1].astype(int).T)]
         usable = ((value > DARK) & (value < BRIGHT)).all(-1) & shown
         light[index, inside] = np.where(usable[:, None], np.log2(value), np.nan)

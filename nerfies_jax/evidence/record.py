@@ -40,16 +40,16 @@ from nerfies_jax.evidence.rest_points import RestPoints
 from nerfies_jax.evidence.tracks import Tracks
 from nerfies_jax.evidence.view_set import Views
 
-VERSION = 3  # of the file; counts up whenever the same pictures would say otherwise
+VERSION = 4  # of the file; counts up whenever the same pictures would say otherwise
 # A path has as many frames at least, and a film as many; fewer say nothing of motion.
 SHORTEST_PATH, SHORTEST_FILM = 10, 6
-LONGEST_SIDE_PX = 256  # masks of larger pictures are made this small and enlarged
 MOVES = 0.5  # score from which a track counts as moving
 MOST_PATHS = 1500
 MOST_PIXELS = 16_000_000  # of all frames: 17 bytes each for the flow between them
 # Where less of the pictures can be carried to the next frame, tracks are chance: a
 # camera that jumps.
 LEAST_CARRIED = 0.4
+LEAST_TEXTURED = 0.05  # of the pixels: too little to tell anything by
 
 
 class Seconds(NamedTuple):
@@ -107,7 +107,8 @@ def gather(
     pictures = dense_flow.levelled(views)
     flow = taken.flow(given, views)
     if flow is None:
-        flow = dense_flow.between_neighbours(views, pictures)
+        span = view_set.depth_span(capture, views)
+        flow = dense_flow.between_neighbours(views, pictures, span)
     watch.begin("tracks")
     tracks, first = _tracks(given, views, flow, pictures)
     rest = rest_points.fit(views, tracks)
@@ -174,7 +175,7 @@ def _tracks(given, views, flow, pictures):
 
 def _mask(views, flow, tracks, score):
     """Which pixels move, found in small pictures and enlarged."""
-    (width, height), part = views.size, math.ceil(max(views.size) / LONGEST_SIDE_PX)
+    (width, height), part = views.size, view_set.times_smaller(views)
     small, near = (
         view_set.smaller(views, part),
         tracks._replace(pixel=tracks.pixel / part),
@@ -235,6 +236,9 @@ def _unusable(views, flow):
         return f"{frames} frames are too few to follow anything through"
     if np.ptp(views.time) == 0:
         return "all frames have the same time"
+    textured = views.textured.mean()
+    if textured < LEAST_TEXTURED:
+        return f"only {textured:.1%} of the pixels have texture to follow"
     share = carried(views, flow)
     if share < LEAST_CARRIED:
         return (
@@ -303,7 +307,12 @@ def cached(
     use_depths: bool = False,
     tell: Callable[[str], None] = lambda part: None,
 ) -> Evidence:
-    """`gather`, or what it found before of the same pictures and cameras."""
+    """`gather`, or what it found before of the same pictures and cameras.
+
+    Of a capture with a lens, what its pinholes' pictures say: with and without the lens
+    it is one record.
+    """
+    capture = pinholes.as_pinholes(capture)
     path = file_of(capture, folder, use_depths)
     if path.exists():
         return load(path)
@@ -316,6 +325,7 @@ def file_of(
     capture: Capture, folder: pathlib.Path, use_depths: bool = False
 ) -> pathlib.Path:
     """Where `cached` keeps it."""
+    capture = pinholes.as_pinholes(capture)
     return folder / f"{digest(capture, use_depths)}.npz"
 
 

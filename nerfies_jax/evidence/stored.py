@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from nerfies_jax.capture.capture import Capture
+from nerfies_jax.evidence import still_points
 from nerfies_jax.evidence.findings import (
     CERTAIN,
     DEPTH,
@@ -14,7 +15,9 @@ from nerfies_jax.evidence.findings import (
     cannot_tell,
     judge,
 )
-from nerfies_jax.evidence.motion import Film
+from nerfies_jax.evidence.paths import AT_REST
+from nerfies_jax.evidence.record import MOVES, Evidence
+from nerfies_jax.evidence.tracks import pixel_of
 from nerfies_jax.evidence.view_set import MIN_POINTS, Views
 from nerfies_jax.geometry import distortion
 
@@ -22,28 +25,22 @@ KNOWN_SHARE = 0.2  # of the pixels: fewer depths are points
 DEPTH_ERROR = 0.1  # median share that depth is off what parallax says
 DEPTH_SURE = 0.03  # deviation of a depth from parallax, to be compared with
 MISSED_SHARE = 0.3  # of what is seen to move may lie outside a mask
-MIN_MOVING = 200  # pixels over all frames
+MIN_MOVING = 200  # sightings of tracks, over all frames
 LENS_PX = 0.5  # half a pixel is what cameras are known to
 GRID = 9  # pixels across and down where a lens is asked
 
 
-def depth(capture: Capture, views: Views, films: list[Film]) -> Finding:
+def depth(capture: Capture, views: Views, evidence: Evidence) -> Finding:
     """Whether the capture's depth pictures say what parallax says, up to one scale."""
     threshold = f"{KNOWN_SHARE:.0%} of the pixels, off parallax by {DEPTH_ERROR:.0%}"
     if capture.depths is None:
         return Finding(DEPTH, "the capture has none", threshold, False, CERTAIN)
-    stored = capture.depths[views.row]
-    share = float((stored > 0).mean())
+    pictures = capture.depths[views.row]
+    share = float((pictures > 0).mean())
     if share < KNOWN_SHARE:
-        evidence = f"depth on {share:.1%} of the pixels"
-        return Finding(DEPTH, evidence, threshold, False, CERTAIN, {"share": share})
-    ratios = []
-    for one in (centre for film in films for centre in film.centres):
-        fit = one.fit
-        sure = one.usable & ~one.moving & (stored[one.view] > 0)
-        sure &= fit.inverse_depth * fit.parallax_px * DEPTH_SURE > one.noise_px
-        ratios.append((stored[one.view] * fit.inverse_depth)[sure])
-    ratio = np.concatenate(ratios) if ratios else np.zeros(0)
+        said = f"depth on {share:.1%} of the pixels"
+        return Finding(DEPTH, said, threshold, False, CERTAIN, {"share": share})
+    ratio = _over_parallax(pictures, views, evidence)
     if len(ratio) < MIN_POINTS:
         return cannot_tell(
             DEPTH,
@@ -53,43 +50,54 @@ def depth(capture: Capture, views: Views, films: list[Film]) -> Finding:
     scale = float(np.median(ratio))
     error = float(np.median(np.abs(ratio / scale - 1)))
     wrong, confidence = judge(error, DEPTH_ERROR, 0.0)
-    evidence = (
+    said = (
         f"depth on {share:.1%} of the pixels, {error:.1%} off parallax in the median "
         f"once scaled by {1 / scale:.3g}"
     )
     numbers = {"share": share, "error_share": error, "scale": 1 / scale}
     wanted = None if wrong is None else not wrong
-    return Finding(DEPTH, evidence, threshold, wanted, confidence, numbers)
+    return Finding(DEPTH, said, threshold, wanted, confidence, numbers)
 
 
-def masks(capture: Capture, views: Views, films: list[Film]) -> Finding:
+def _over_parallax(pictures, views, evidence):
+    """[sightings] stored depth over that of the points of tracks at rest."""
+    still = np.flatnonzero((evidence.score < AT_REST) & (not evidence.unusable))
+    tracks, rest = evidence.tracks.take(still), evidence.rest.take(still)
+    sure = still_points.depth_deviation(views, tracks, rest) < DEPTH_SURE
+    tracks, rest = tracks.take(sure), rest.take(sure)
+    row, column = pixel_of(tracks.pixel, pictures.shape[1:])
+    own = pictures[np.arange(len(pictures)), row, column]
+    known = tracks.seen & (own > 0) & (rest.depth > 0)
+    return own[known] / rest.depth[known]
+
+
+def masks(capture: Capture, evidence: Evidence) -> Finding:
     """Whether the capture's masks hold what is seen to move."""
     threshold = f"at most {MISSED_SHARE:.0%} of what is seen to move outside them"
     if capture.moving is None:
         return Finding(MASKS, "the capture has none", threshold, False, CERTAIN)
-    moving = capture.moving[views.row]
+    moving = capture.moving[evidence.row]
     share = float(moving.mean())
-    seen = missed = frames = 0
-    for one in (centre for film in films for centre in film.centres):
-        seen += one.moving.sum()
-        missed += (one.moving & ~moving[one.view]).sum()
-        frames += one.moving.any()
     numbers = {"share": share}
-    evidence = f"masks on {share:.1%} of the pixels"
+    said = f"masks on {share:.1%} of the pixels"
     if share in (0.0, 1.0):
-        return Finding(MASKS, evidence, threshold, False, CERTAIN, numbers)
+        return Finding(MASKS, said, threshold, False, CERTAIN, numbers)
+    tracks = evidence.tracks.take((evidence.score > MOVES) & (not evidence.unusable))
+    seen, frames = int(tracks.seen.sum()), int(tracks.seen.any(0).sum())
     if seen < MIN_MOVING:
         return cannot_tell(
-            MASKS, f"{evidence}, and too little seen to move to check them", threshold
+            MASKS, f"{said}, and too little seen to move to check them", threshold
         )
-    part = float(missed / seen)
+    row, column = pixel_of(tracks.pixel, moving.shape[1:])
+    inside = moving[np.arange(len(moving)), row, column] & tracks.seen
+    part = 1 - float(inside.sum() / seen)
     # Whole regions are in or out: one region a frame.
     error = np.sqrt(part * (1 - part) / frames)
     wrong, confidence = judge(part, MISSED_SHARE, float(error))
     wanted = None if wrong is None else not wrong
-    evidence += f"; {part:.1%} of what is seen to move lies outside"
+    said += f"; {part:.1%} of what is seen to move lies outside"
     return Finding(
-        MASKS, evidence, threshold, wanted, confidence, numbers | {"missed": part}
+        MASKS, said, threshold, wanted, confidence, numbers | {"missed": part}
     )
 
 
@@ -118,7 +126,7 @@ def lens(capture: Capture) -> Finding:
         moved = np.linalg.norm((np.asarray(bent) - slope) * focal, axis=-1)
         worst = max(worst, float(moved.max()))
     wanted, confidence = judge(worst, LENS_PX, 0.0)
-    evidence = f"the lens moves pixels by up to {worst:.2g} px"
+    said = f"the lens moves pixels by up to {worst:.2g} px"
     if wanted:
-        evidence += "; it is taken out when the pictures are read"
-    return Finding(LENS, evidence, threshold, wanted, confidence, {"most_px": worst})
+        said += "; splats learn from pictures without it and are scored with it"
+    return Finding(LENS, said, threshold, wanted, confidence, {"most_px": worst})

@@ -6,7 +6,7 @@ import numpy as np
 
 from nerfies_jax import scene_metadata
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.evidence import scene_points, view_set
+from nerfies_jax.evidence import view_set
 from nerfies_jax.evidence.findings import CERTAIN, LIKELY, Finding, cannot_tell
 from nerfies_jax.evidence.findings import TEXTURE as EFFECT
 from nerfies_jax.evidence.view_set import Views
@@ -34,8 +34,7 @@ def texture(capture: Capture, views: Views, factor: int) -> Finding:
             EFFECT, "plain background fills most of the views", threshold
         )
     cycles = float(np.median([_finest(views.grey[one]) for one in seen]))
-    points = scene_points.own_points(capture)
-    near, far = view_set.depth_span(capture, views, points)
+    near, far = view_set.depth_span(capture, views)
     depth = math.sqrt(near * far)
     scale = scene_metadata.metadata_of(capture, 1.0).scale
     per_unit = cycles * views.intrinsics[0, 0, 0] / depth / scale

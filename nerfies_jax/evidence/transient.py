@@ -5,14 +5,18 @@ another thing comes out as a strip. What is no part of the scene, in captures wh
 frames are photographs or whose film was cut together, is suddenly there or gone.
 """
 
+from typing import NamedTuple
+
+import cv2
 import numpy as np
 import scipy.ndimage as nd
 import skimage.feature
 
-from nerfies_jax.evidence import motion, optical_flow
+from nerfies_jax.evidence import dense_flow, motion, view_set
+from nerfies_jax.evidence.dense_flow import NeighbourFlow
 from nerfies_jax.evidence.findings import TRANSIENT as EFFECT
 from nerfies_jax.evidence.findings import Finding, cannot_tell, judge
-from nerfies_jax.evidence.motion import Film
+from nerfies_jax.evidence.record import Evidence
 from nerfies_jax.evidence.view_set import Views
 
 LOST_PX, LOST_SHARE = 1.0, 0.1  # forward and back must meet, of the way
@@ -27,35 +31,46 @@ MOST_PATCHES = 40  # looked for, of a frame
 # nothing comes or goes lose up to 1.9 % once and 1.4 % twice, at 60 frames and at 40.
 GONE_SHARE = 0.03
 MIN_TIMES = 2  # it came and it went
+# Pairs of frames that carry less show other things to begin with, as photographs do and
+# the last and first of cameras that take turns: they say nothing, and where more than
+# so many are like that, neither does the film.
+LEAST_CARRIED, MOST_APART = 0.4, 0.1
+LOCAL_PX = 12  # deviation of the local mean
 
 
-def transient(views: Views, films: list[Film]) -> Finding:
+def transient(views: Views, evidence: Evidence) -> Finding:
     """Whether large parts of pictures are there in one frame and gone in the next."""
     threshold = (
         f"{GONE_SHARE:.0%} of a picture found nowhere near in the next, "
         f"{MIN_TIMES} times"
     )
-    reason = motion.unusable(views, films)
-    if reason is not None:
-        return cannot_tell(EFFECT, reason, threshold)
-    each = [jumps(views, film) for film in films]
-    gone = np.concatenate(each)
-    worst = np.sort(np.concatenate([_above_neighbours(one) for one in each]))[::-1]
-    if len(worst) <= 2 * MIN_TIMES:
-        return cannot_tell(EFFECT, f"only {len(worst)} pairs of frames", threshold)
+    if evidence.unusable:
+        return cannot_tell(EFFECT, evidence.unusable, threshold)
+    gone, carried = jumps(views, evidence.flow)
+    apart = float((carried < LEAST_CARRIED).mean())
+    if apart > MOST_APART:
+        return cannot_tell(
+            EFFECT,
+            f"{apart:.0%} of the neighbouring frames are too far apart to tell what "
+            "goes from what is passed by",
+            threshold,
+        )
+    gone = gone[carried >= LEAST_CARRIED]
+    if len(gone) <= 2 * MIN_TIMES:
+        return cannot_tell(EFFECT, f"only {len(gone)} pairs of frames", threshold)
     # What the other pairs lose is the noise of those that jump.
     usual = float(np.sort(gone)[: -2 * MIN_TIMES].mean())
-    value = float(worst[MIN_TIMES - 1])
-    wanted, confidence = judge(value, GONE_SHARE, usual)
+    worst = np.sort(_above_neighbours(gone))[::-1]
+    wanted, confidence = judge(float(worst[MIN_TIMES - 1]), GONE_SHARE, usual)
     times = int((worst > GONE_SHARE).sum())
-    if wanted is False and not _always_there(films):
+    if wanted is False and not _always_there(evidence):
         return cannot_tell(
             EFFECT,
             "nothing comes or goes at once, but what moves is there in less than half "
             "of the frames",
             threshold,
         )
-    evidence = (
+    said = (
         f"between {times} of {len(gone)} pairs of frames parts of the picture come or "
         f"go (most: {worst[0]:.1%} of the pixels; usual: {usual:.2%})"
     )
@@ -64,7 +79,7 @@ def transient(views: Views, films: list[Film]) -> Finding:
         "largest_share": float(worst[0]),
         "usual_share": usual,
     }
-    return Finding(EFFECT, evidence, threshold, wanted, confidence, numbers)
+    return Finding(EFFECT, said, threshold, wanted, confidence, numbers)
 
 
 def _above_neighbours(gone):
@@ -76,79 +91,106 @@ def _above_neighbours(gone):
     return np.array(above)
 
 
-def _always_there(films):
+def _always_there(evidence):
     """Whether something moves in most frames, or in none."""
-    there = [one.moving.any() for film in films for one in film.centres]
-    return np.mean(there) > 0.5 or not any(there)
+    there = motion.frame_shares(evidence) > motion.MOVING_SHARE
+    return there.mean() > 0.5 or not there.any()
 
 
-def jumps(views: Views, film: Film) -> np.ndarray:
-    """[pairs]: the lesser share of pixels that one frame shows and the other does not.
+def jumps(views: Views, flow: NeighbourFlow) -> tuple[np.ndarray, np.ndarray]:
+    """[pairs]: shares of pixels that one frame shows and the next does not, or reverse.
 
-    The lesser of both directions: what comes hides what was there.
+    The lesser of both directions: what comes hides what was there. And the shares of
+    the textured pixels that flow carries to the next frame.
     """
+    part = view_set.times_smaller(views)
+    shown = views.textured[:-1] & flow.forward_seen[:-1]
+    carried = shown.sum((1, 2)) / np.maximum(views.textured[:-1].sum((1, 2)), 1)
+    views = view_set.smaller(views, part)
+    pictures = [_levelled(grey) for grey in views.grey]
     shares = []
-    for at, flow in enumerate(film.flows):
-        one, other = (int(film.sequence[at + step]) for step in (0, 1))
+    for one in range(len(views.row) - 1):
+        there = _way(flow.forward[one], flow.forward_seen[one], part)
+        back = _way(flow.backward[one + 1], flow.backward_seen[one + 1], part)
         shares.append(
             min(
-                gone(views, one, other, flow.forward, flow.backward),
-                gone(views, other, one, flow.backward, flow.forward),
+                _gone(views, pictures, (one, one + 1), there, back.flow),
+                _gone(views, pictures, (one + 1, one), back, there.flow),
             )
         )
-    return np.array(shares)
+    return np.array(shares), carried
 
 
-def gone(views: Views, index: int, other: int, there, back) -> float:
+class _Way(NamedTuple):
+    """From one frame to another, and where what is not carried there is looked for.
+
+    By the flow that closes alone: of what is gone it is anything.
+    """
+
+    flow: np.ndarray  # [height, width, 2] px
+    shift: np.ndarray  # [2] px, the camera's own turn: the median
+    reach: int  # px around it
+
+
+def _way(flow, seen, part):
+    """Both in pixels so many times larger."""
+    flow = dense_flow.reduced(flow, part)
+    seen = cv2.resize(np.uint8(seen), flow.shape[1::-1]) > 0
+    usual = flow[seen] if seen.any() else flow.reshape(-1, 2)
+    shift = np.median(usual, axis=0)
+    off = np.linalg.norm(usual - shift, axis=-1)
+    low, high = (share * flow.shape[1] for share in REACH_SHARES)
+    reach = round(float(np.clip(2 * np.quantile(off, 0.9), low, high)))
+    return _Way(flow, shift, reach)
+
+
+def _levelled(grey):
+    """The picture less its local mean, over its contrast: exposure taken out."""
+    detail = grey - cv2.GaussianBlur(grey, (0, 0), LOCAL_PX)
+    spread = np.sqrt(np.mean(detail**2))
+    return detail / (5 * spread) if spread > 0 else detail
+
+
+def _gone(views, pictures, pair, there, back):
     """The share of a frame's pixels whose surroundings are nowhere near in another."""
-    lost = _lost(views, index, other, there, back)
-    if not lost.any():
-        return 0.0
-    reach = _reach(views, there)
-    tried = np.argwhere(lost & views.textured[index])
+    picture, target = (pictures[index] for index in pair)
+    lost = _lost(views, pair[0], picture, target, there, back)
+    tried = np.argwhere(lost & views.textured[pair[0]])
     if not len(tried):
         return 0.0
-    rng = np.random.default_rng(index)
+    rng = np.random.default_rng(pair[0])
     if len(tried) > MOST_PATCHES:
         tried = tried[rng.choice(len(tried), MOST_PATCHES, replace=False)]
-    picture = optical_flow.levelled(views.grey[index])
-    target = optical_flow.levelled(views.grey[other])
-    # The camera's own turn first: what is left is looked for around.
-    shift = np.median(there.reshape(-1, 2), axis=0).round().astype(int)
+    shift = there.shift.round().astype(int)
     missing = sum(
-        not _found(picture, target, line, column, shift, reach)
+        not _found(picture, target, line, column, shift, there.reach)
         for line, column in tried
     )
     return float(lost.mean() * missing / len(tried))
 
 
-def _lost(views, index, other, there, back):
+def _lost(views, index, picture, target, there, back):
     """[height, width]: not on a path to the other frame, though it should be there."""
     width, height = views.size
-    grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).astype(float)
-    end = grid + there
-    gap = np.linalg.norm(there + optical_flow.sample(back, end), axis=-1)
-    open_end = gap > LOST_PX + LOST_SHARE * np.linalg.norm(there, axis=-1)
-    one, two = (optical_flow.levelled(views.grey[i]) for i in (index, other))
-    colour = np.abs(one - optical_flow.sample(two[..., None], end)[..., 0])
-    changed = nd.gaussian_filter(colour, 1.5) > LOST_COLOUR
+    grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1)
+    end = np.moveaxis(grid + there.flow, -1, 0).astype(np.float32)
+    led_back, colour = (
+        cv2.remap(one, *end, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        for one in (back, target)
+    )
+    gap = np.linalg.norm(there.flow + led_back, axis=-1)
+    open_end = gap > LOST_PX + LOST_SHARE * np.linalg.norm(there.flow, axis=-1)
+    changed = cv2.GaussianBlur(np.abs(picture - colour), (0, 0), 1.5) > LOST_COLOUR
     # Beyond the edge of the other picture under the common shift, and the patch's own.
     # What is near moves more than the rest, and leaves where the rest stays.
-    rim = PATCH + _reach(views, there)
-    common = grid + np.median(there.reshape(-1, 2), axis=0)
+    rim = PATCH + there.reach
+    common = grid + there.shift
     bound = np.array([width - 1, height - 1]) - rim
     stays = ((common >= rim) & (common <= bound)).all(-1)
     bound = np.array([width - 1, height - 1]) - PATCH
     stays &= ((grid >= PATCH) & (grid <= bound)).all(-1)
     lost = (open_end | changed) & stays & views.valid[index]
     return nd.binary_opening(lost, iterations=max(1, round(OPENED_SHARE * width)))
-
-
-def _reach(views, there):
-    """How far from the common shift anything is looked for, px."""
-    off = np.linalg.norm(there - np.median(there.reshape(-1, 2), axis=0), axis=-1)
-    low, high = (share * views.size[0] for share in REACH_SHARES)
-    return round(float(np.clip(2 * np.quantile(off, 0.9), low, high)))
 
 
 def _found(picture, target, line, column, shift, reach):

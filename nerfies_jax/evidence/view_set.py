@@ -1,6 +1,5 @@
 """The frames of a capture as an inspection looks at them: small, in order, in NumPy."""
 
-import dataclasses
 import math
 from typing import NamedTuple
 
@@ -8,14 +7,13 @@ import cv2
 import numpy as np
 import scipy.ndimage as nd
 
-from nerfies_jax.capture import capture as captures
 from nerfies_jax.capture.capture import Capture
 
-MAX_SIDE_PX = 256  # pixels: pictures are looked at no wider than this
-MOST_PIXELS = 4_000_000  # of all frames; half a minute of flow on one core
+LONGEST_SIDE_PX = 256  # of pictures in which what need not be sharp is looked for
 PLAIN_SHARE = 0.9  # of the border's pixels: then what lies behind has one colour
 PLAIN_LEVELS = 3  # grey levels of 255: JPEG and rounding, not a picture
 MIN_POINTS = 300  # that say where the scene is
+MOST_POINTS = 4000  # that are looked at
 OUTSIDE = 0.02  # share of points on either side taken for outliers
 # Slope in grey levels a pixel, and over what noise alone gives (a Gaussian derivative
 # of 1 px passes a fifth of it); flow over less is a guess of its regulariser.
@@ -23,7 +21,7 @@ LEAST_GRADIENT, LEAST_OVER_NOISE, NOISE_PASSED = 0.4, 3.0, 0.2
 
 
 class Views(NamedTuple):
-    """Frames to learn from, by camera and then by time.
+    """Frames to learn from.
 
     Pinholes in float64. Pixels are those of the small pictures, whose centres lie
     at +0.5.
@@ -44,30 +42,6 @@ class Views(NamedTuple):
     def size(self) -> tuple[int, int]:
         """Width and height in pixels."""
         return self.grey.shape[2], self.grey.shape[1]
-
-
-@dataclasses.dataclass(frozen=True)
-class Shrunk:
-    """A capture made small, and by how much."""
-
-    capture: Capture
-    factor: int  # of its own pixels for one of these
-
-
-def shrunk(capture: Capture) -> Shrunk:
-    """The capture with pictures no wider than `MAX_SIDE_PX`."""
-    factor = math.ceil(max(capture.size) / MAX_SIDE_PX)
-    return Shrunk(captures.downscale(capture, factor), factor)
-
-
-def look(capture: Capture) -> Views:
-    """The frames to learn from, as many as `MOST_PIXELS` allow, evenly."""
-    rows = capture.train
-    order = np.lexsort((rows, capture.times[rows], capture.camera_ids[rows]))
-    rows = rows[order]
-    # A whole stride: uneven steps would look like uneven motion.
-    rows = rows[:: math.ceil(len(rows) * math.prod(capture.size) / MOST_PIXELS)]
-    return _views(capture, rows)
 
 
 def in_time_order(capture: Capture, rows: np.ndarray | None = None) -> Views:
@@ -124,6 +98,11 @@ def smaller(views: Views, factor: int) -> Views:
     )
 
 
+def times_smaller(views: Views) -> int:
+    """How many times smaller no side is longer than `LONGEST_SIDE_PX`."""
+    return math.ceil(max(views.size) / LONGEST_SIDE_PX)
+
+
 def plain(capture: Capture, rows: np.ndarray) -> np.ndarray:
     """[rows, height, width]: where a picture shows one colour behind everything.
 
@@ -149,16 +128,6 @@ def plain(capture: Capture, rows: np.ndarray) -> np.ndarray:
         seeds[[0, -1]], seeds[:, [0, -1]] = True, True
         kept[row] = nd.binary_propagation(seeds & one, mask=one)
     return kept
-
-
-def sequences(views: Views) -> list[np.ndarray]:
-    """Indices of frames of one camera in order of time, each time once."""
-    by_camera = []
-    for camera in np.unique(views.camera):
-        index = np.flatnonzero(views.camera == camera)
-        _, first = np.unique(views.time[index], return_index=True)
-        by_camera.append(index[first])
-    return by_camera
 
 
 def rays(views: Views, index: int) -> np.ndarray:
@@ -190,10 +159,26 @@ def in_picture(
         return (depth > 0) & ((pixel > rim) & (pixel < bounds)).all(-1)
 
 
-def depth_span(
-    capture: Capture, views: Views, points: np.ndarray
-) -> tuple[float, float]:
+def own_points(capture: Capture) -> np.ndarray:
+    """At most `MOST_POINTS` of the capture's points [points, 3]; empty without any."""
+    if capture.points is None:
+        return np.zeros((0, 3))
+    return some(capture.points.position)
+
+
+def some(position: np.ndarray) -> np.ndarray:
+    """At most `MOST_POINTS` of the points [points, 3], in float64."""
+    position = position.astype(np.float64)
+    rng = np.random.default_rng(0)
+    if len(position) > MOST_POINTS:
+        which = rng.choice(len(position), MOST_POINTS, replace=False)
+        position = position[np.sort(which)]
+    return position
+
+
+def depth_span(capture: Capture, views: Views) -> tuple[float, float]:
     """The z-depths between which a scene lies: its points', or the capture's planes."""
+    points = own_points(capture)
     if len(points) < MIN_POINTS:
         return capture.near, capture.far
     depths = []

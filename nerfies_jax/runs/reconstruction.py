@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal, NamedTuple
 
+from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.capture.capture import CaptureError, describe
 from nerfies_jax.evidence import inspection
 from nerfies_jax.runs import (
@@ -168,7 +169,7 @@ def _new_run(config, effects):
     if config.preset is None:
         config, lines = adviser.by_tracks(config, stored)
     if effects == "auto":
-        inspected = inspection.inspect(stored)
+        inspected = inspection.inspect(stored, CACHE / "evidence")
         config, lines = adviser.follow(config, inspected.findings)
     print("\n".join(lines))
     return new_run(config, stored)

@@ -12,8 +12,8 @@ from tests.evidence.test_tracks import MOVES
 SPLATS = "splats-{}-small"
 
 
-def jumping():
-    """Every picture of its own: nothing can be carried from one to the next."""
+def noisy():
+    """Every picture of its own: there is nothing to carry from one to the next."""
     film = films.film(frames=12)
     noise = np.random.default_rng(0).integers(0, 255, film.images.shape, np.uint8)
     return dataclasses.replace(film, images=noise)
@@ -24,7 +24,7 @@ def jumping():
     [
         (lambda: films.film(**MOVES, frames=24), "tracked", ""),
         (lambda: films.film(frames=24), "static", "of the pixels move by themselves"),
-        (jumping, "deformable", "the camera jumps"),
+        (noisy, "deformable", "have texture to follow"),
     ],
 )
 def test_motion_is_chosen_by_what_tracks_say(make, kind, words, tmp_path, monkeypatch):

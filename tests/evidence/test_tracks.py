@@ -10,6 +10,7 @@ import scipy.ndimage as nd
 from nerfies_jax.capture.capture import PointCloud
 from nerfies_jax.evidence import (
     dense_flow,
+    motion,
     moving,
     paths,
     record,
@@ -345,6 +346,10 @@ def test_the_card_is_where_it_is():
     inner = slice(4, -4)
     assert np.abs(middle[inner, 2] - films.NEAR).max() < 0.1 * films.NEAR
     assert np.abs(middle[inner, :2] - true[inner]).max() < 0.06
+    speed = motion.speeds(view_set.in_time_order(capture), evidence)
+    step = np.median(np.linalg.norm(np.diff(true, axis=0), axis=1))
+    assert speed["speed_units"] == pytest.approx(step, rel=0.1)
+    assert speed["speed_px"] == pytest.approx(step / films.NEAR * films.FOCAL, rel=0.1)
 
 
 def test_what_was_gathered_is_read_again(tmp_path):

@@ -14,7 +14,7 @@ from experiments.inspect_pays import report
 from experiments.inspect_pays.job import ArmMeans, Comparison, Trial, read
 from nerfies_jax import runs
 from nerfies_jax.capture import nerfies_format
-from nerfies_jax.evidence import inspection
+from nerfies_jax.evidence import inspection, record, view_set
 from nerfies_jax.evidence.findings import (
     BACKGROUND,
     CANNOT_TELL,
@@ -23,7 +23,6 @@ from nerfies_jax.evidence.findings import (
     MOTION,
     Finding,
 )
-from nerfies_jax.evidence.view_set import look
 from nerfies_jax.measure import clock
 from nerfies_jax.runs import adviser, platform, representations
 from tests.evidence import films
@@ -122,10 +121,11 @@ def looked(monkeypatch):
     """Nothing is looked at and nothing trained: both are known beforehand."""
     calls = []
 
-    def inspect(capture):
+    def inspect(capture, folder):
         calls.append("look")
         sheet = films.texture(1).astype("uint8")
-        return inspection.Inspection(FOUND, sheet, 1, 0.0, look(capture), [])
+        views, evidence = view_set.in_time_order(capture), record.gather(capture)
+        return inspection.Inspection(FOUND, sheet, 1, 0.0, views, evidence)
 
     def train(job):
         (budget,) = job.budgets
