@@ -135,6 +135,29 @@ def test_chains_follow_flow_both_ways_until_it_ends():
     assert chained.seen[1].tolist() == [True] * 3 + [False] * 2
 
 
+def test_wide_steps_are_found_from_where_a_still_scene_would_be():
+    # 18 px of 96 from frame to frame
+    capture = films.film(camera=lambda t: (1.2 * t - 0.6, 0.0, 0.0), frames=4)
+    views = view_set.in_time_order(capture)
+    pictures = dense_flow.levelled(views)
+    height, width = views.grey.shape[1:]
+    x, y = np.meshgrid(np.arange(width), np.arange(height))
+    shares = []
+    for span in (None, view_set.depth_span(capture, views)):
+        flow = dense_flow.between_neighbours(views, pictures, span)
+        far_off = []
+        for frame, depth in enumerate(capture.depths[:-1]):
+            step = (views.position[frame] - views.position[frame + 1])[:2]
+            true = films.FOCAL * step / depth[..., None]
+            at = np.stack([x, y], -1) + true
+            inside = ((at > 3) & (at < np.array(views.size) - 4)).all(-1)
+            error = np.linalg.norm(flow.forward[frame] - true, axis=-1)
+            far_off.append(error[inside] > 1)
+        shares.append(np.concatenate(far_off).mean())
+    assert shares[0] > 0.5
+    assert shares[1] < 0.05
+
+
 def test_points_are_aligned_with_where_they_began():
     picture = 255 * films.texture(3).mean(-1)
     pictures = np.stack([nd.shift(picture, (0.0, k))[:80, 20:140] for k in (0, 3.3)])
