@@ -27,6 +27,9 @@ class EvidenceOptions:
     """Measure all built-in scenes and ways to find flow instead of one capture."""
     seed: int = 0
     """Of the built-in scenes."""
+    seconds: float = 600.0
+    """When most of them are gone, what is not needed most is left out; such a record is
+    not kept."""
     out: pathlib.Path | None = None
     """Folder for tracks.png and evidence.json (default: runs/evidence-CAPTURE)."""
 
@@ -35,6 +38,8 @@ class EvidenceOptions:
             raise ValueError(
                 "--scenes measures every built-in scene: name no capture beside it"
             )
+        if not self.seconds > 0:
+            raise ValueError(f"--seconds {self.seconds:g} must be more than zero")
 
 
 def main(arguments=None):
@@ -47,7 +52,7 @@ def main(arguments=None):
         if args.scenes:
             scenes.measure(args.seed, args.out or pathlib.Path("runs", "evidence"))
         else:
-            report.look(cli.plain(args.source), args.seed, args.out)
+            report.look(cli.plain(args.source), args.seed, args.seconds, args.out)
 
 
 if __name__ == "__main__":

@@ -24,7 +24,9 @@ from nerfies_jax.runs.config import CaptureSource
 from nerfies_jax.runs.platform import CACHE
 
 
-def look(source: CaptureSource, seed: int, out: pathlib.Path | None) -> None:
+def look(
+    source: CaptureSource, seed: int, seconds: float, out: pathlib.Path | None
+) -> None:
     """Gather, or read what was gathered, and say what it is."""
     capture = runs.stored_capture(source, seed)
     for line in describe(capture):
@@ -33,11 +35,12 @@ def look(source: CaptureSource, seed: int, out: pathlib.Path | None) -> None:
     path = record.file_of(capture, CACHE / "evidence")
     if path.exists():
         print("gathered before, and read again")
-    evidence = record.cached(capture, CACHE / "evidence", tell=_Progress())
+    folder = CACHE / "evidence"
+    evidence = record.cached(capture, folder, tell=_Told(), seconds=seconds)
     views = view_set.in_time_order(record.looked_at(capture, evidence.factor))
-    counted = summary.of(views, evidence)
-    print("\n".join(summary.lines(counted, evidence)))
-    stored = {"capture": capture.name, "found": as_json(counted._asdict())}
+    found = summary.of(views, evidence)
+    print("\n".join(summary.lines(found, evidence)))
+    stored = {"capture": capture.name, "found": as_json(found._asdict())}
     truth = protocol.stored_truth(capture)
     # What other tools found is theirs to judge.
     if truth is not None and capture.given is None:
@@ -49,7 +52,8 @@ def look(source: CaptureSource, seed: int, out: pathlib.Path | None) -> None:
     pictures.save(contact_sheet.followed(views, evidence), folder / "tracks.png")
     write_json(folder / "evidence.json", stored)
     print(f"frames with tracks: {folder / 'tracks.png'}")
-    print(f"record: {path}")
+    kept = "not kept, for want of time" if evidence.left_out else path
+    print(f"record: {kept}")
 
 
 def errors_of(capture: Capture, truth: SceneTruth, evidence: Evidence) -> Errors:
@@ -60,22 +64,22 @@ def errors_of(capture: Capture, truth: SceneTruth, evidence: Evidence) -> Errors
 
 def error_lines(errors: Errors) -> list[str]:
     """For a person."""
-    lines = [
+    said = [
         f"against the truth: {errors.false_share:.2%} of all pixels are marked as "
         "moving and stand still"
     ]
     if math.isfinite(errors.mask_iou):
-        lines.append(f"  mask: intersection over union {errors.mask_iou:.3f}")
+        said.append(f"  mask: intersection over union {errors.mask_iou:.3f}")
     if math.isfinite(errors.track_px):
-        lines.append(
+        said.append(
             f"  moving points, {LATER} frames on: {errors.track_px:.2f} px off "
             f"(median), {errors.track_lost:.0%} lost"
         )
     if math.isfinite(errors.path_error):
-        lines.append(
+        said.append(
             f"  their places: {errors.path_error:.2%} of the distance off (median)"
         )
-    return lines
+    return said
 
 
 def as_json(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -86,7 +90,7 @@ def as_json(values: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-class _Progress:
+class _Told:
     """Prints each part as it begins."""
 
     def __init__(self):

@@ -21,6 +21,7 @@ ENLARGED_BELOW_PX, ENLARGED = 320, 2
 # Forward and back must meet: within half a pixel and a fiftieth of the way.
 CLOSED_PX, CLOSED_SHARE = 0.5, 0.02
 
+FOR_WIDE_STEPS = 0.4  # of the time: then none is left to look at them again
 # Of the width: the side of an area whose flow is looked for again where it was carried
 # to a frame and is lost there. Patterns that repeat are taken for each other in some
 # frames: the turning cube of the built-in scenes lost all its tracks in one of them.
@@ -105,12 +106,16 @@ def dis(times: int) -> Callable[..., np.ndarray]:
 
 
 def between_neighbours(
-    views: Views, pictures: np.ndarray, span: tuple[float, float] | None = None
+    views: Views,
+    pictures: np.ndarray,
+    span: tuple[float, float] | None = None,
+    has_time: Callable[[float, str], bool] = lambda share, what: True,
 ) -> NeighbourFlow:
     """Flow between all frames that follow each other, both ways, and checked.
 
     `pictures` are the views' as `levelled` makes them. With `span`, the nearest and
-    farthest z-depth, wide steps are looked at again from where a still scene would be.
+    farthest z-depth, wide steps are looked at again from where a still scene would be;
+    `has_time` is asked whether less than a share of the time is gone.
     """
     (width, height), frames = views.size, len(views.row)
     times = pictures.shape[2] // width
@@ -120,6 +125,8 @@ def between_neighbours(
         pair = pictures[one], pictures[other]
         found = reduced(search(*pair), times)
         if span is None or not wide_steps.is_wide(found):
+            return found
+        if not has_time(FOR_WIDE_STEPS, "a second look at wide steps"):
             return found
         small = tuple(_smaller(picture, times) for picture in pair)
         return wide_steps.improved(

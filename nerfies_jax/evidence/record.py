@@ -9,7 +9,6 @@ paths in space, and points that stand still: host side, one core, no gradients.
 import hashlib
 import math
 import pathlib
-import time
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -39,8 +38,9 @@ from nerfies_jax.evidence.paths import Paths
 from nerfies_jax.evidence.rest_points import RestPoints
 from nerfies_jax.evidence.tracks import Tracks
 from nerfies_jax.evidence.view_set import Views
+from nerfies_jax.evidence.watch import ENOUGH_SECONDS, Seconds, Watch
 
-VERSION = 4  # of the file; counts up whenever the same pictures would say otherwise
+VERSION = 5  # of the file; counts up whenever the same pictures would say otherwise
 # A path has as many frames at least, and a film as many; fewer say nothing of motion.
 SHORTEST_PATH, SHORTEST_FILM = 10, 6
 MOVES = 0.5  # score from which a track counts as moving
@@ -49,26 +49,9 @@ MOST_PIXELS = 16_000_000  # of all frames: 17 bytes each for the flow between th
 # Where less of the pictures can be carried to the next frame, tracks are chance: a
 # camera that jumps.
 LEAST_CARRIED = 0.4
+# Shares of the time after which there is none left for a part.
+FOR_TRACKS, FOR_COLOURS, FOR_POINTS = 0.5, 0.6, 0.8
 LEAST_TEXTURED = 0.05  # of the pixels: too little to tell anything by
-
-
-class Seconds(NamedTuple):
-    """Of the processor, by part."""
-
-    flow: float
-    tracks: float
-    moving: float
-    paths: float
-    still: float
-
-
-PARTS = Seconds(
-    "flow between neighbours",
-    "tracks and the points at rest that explain them best",
-    "what moves",
-    "paths in space",
-    "dense points at rest",
-)
 
 
 class Evidence(NamedTuple):
@@ -85,6 +68,7 @@ class Evidence(NamedTuple):
     still: PointCloud
     unusable: str  # why tracks say nothing of the motion; empty where they do
     factor: int  # of the capture's pixels for one of these
+    left_out: str  # what there was no time for; empty where there was enough
     seconds: Seconds
 
 
@@ -92,14 +76,16 @@ def gather(
     capture: Capture,
     use_depths: bool = False,
     tell: Callable[[str], None] = lambda part: None,
+    seconds: float = ENOUGH_SECONDS,
 ) -> Evidence:
-    """Everything; about 0.25 s a frame of 176x132 on one core.
+    """Everything; about 0.25 s a frame of 176x132 or 480x270 on one core.
 
     With `use_depths` paths lean on the capture's own depths where it has them. What
     other tools found (`capture.given`) takes the place of what would be found here.
-    `tell` hears of each of `PARTS` when it begins.
+    `tell` hears of each of `PARTS` when it begins, and of what there is no time for:
+    when much of the `seconds` is gone, what is not needed most is left out.
     """
-    watch = _Watch(tell)
+    watch = Watch(tell, seconds)
     watch.begin("flow")
     factor, given = _factor(capture), capture.given or Given(capture.size)
     capture = looked_at(capture, factor)
@@ -108,15 +94,16 @@ def gather(
     flow = taken.flow(given, views)
     if flow is None:
         span = view_set.depth_span(capture, views)
-        flow = dense_flow.between_neighbours(views, pictures, span)
+        flow = dense_flow.between_neighbours(views, pictures, span, watch.has_time)
     watch.begin("tracks")
-    tracks, first = _tracks(given, views, flow, pictures)
+    few = not watch.has_time(FOR_TRACKS, "half of the tracks")
+    tracks, first = _tracks(given, views, flow, pictures, 2 if few else 1)
     rest = rest_points.fit(views, tracks)
     watch.begin("moving")
     mask = taken.moving(given, views)
     if mask is None:
         score = moving.track_scores(tracks, rest)
-        mask = _mask(views, flow, tracks, score)
+        mask = _mask(views, flow, tracks, score, watch)
         score = moving.settled(tracks, score, mask)
     else:
         score = moving.share_on(tracks, mask)
@@ -126,9 +113,11 @@ def gather(
     if not unusable:
         which = _moved(tracks, score, first)
     measured = _depths(capture, given, views, tracks, rest, score, use_depths)
-    measured_paths = _paths(capture, views, tracks, rest, score, which, measured)
+    found = _paths(capture, views, tracks, rest, score, which, measured)
     watch.begin("still")
-    dense = still_points.dense(views, flow, mask)
+    dense = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
+    if watch.has_time(FOR_POINTS, "dense points at rest"):
+        dense = still_points.dense(views, flow, mask)
     return Evidence(
         row=views.row,
         flow=flow,
@@ -137,43 +126,30 @@ def gather(
         score=score,
         rest=rest,
         moved=which,
-        paths=measured_paths,
+        paths=found,
         still=dense,
         unusable=unusable,
         factor=factor,
+        left_out=watch.left_out,
         seconds=watch.seconds(),
     )
 
 
-class _Watch:
-    """Processor seconds from the beginning of each part to that of the next."""
-
-    def __init__(self, tell):
-        self._tell, self._began = tell, {}
-
-    def begin(self, part):
-        self._began[part] = time.process_time()
-        self._tell(getattr(PARTS, part))
-
-    def seconds(self):
-        times = [*self._began.values(), time.process_time()]
-        return Seconds(**dict(zip(self._began, np.diff(times).tolist(), strict=True)))
-
-
-def _tracks(given, views, flow, pictures):
+def _tracks(given, views, flow, pictures, sparser):
     """All tracks, and the first of those whose paths are wanted.
 
     Given ones stand behind our own, which still say what stands still: other tools may
     have followed nothing but what moves.
     """
-    own, others = tracking.from_flow(views, flow, pictures), taken.tracks(given, views)
+    own = tracking.found(views, flow, pictures, sparser)
+    others = taken.tracks(given, views)
     if others is None:
         return own, 0
     both = zip(own, others, strict=True)
     return Tracks(*(np.concatenate(parts) for parts in both)), len(own.seen)
 
 
-def _mask(views, flow, tracks, score):
+def _mask(views, flow, tracks, score, watch):
     """Which pixels move, found in small pictures and enlarged."""
     (width, height), part = views.size, view_set.times_smaller(views)
     small, near = (
@@ -182,9 +158,12 @@ def _mask(views, flow, tracks, score):
     )
     share = moving.votes(small, near, score)
     open_to_doubt = _enlarged(moving.may_move(share), height, width)
-    still = still_points.dense(views, flow, open_to_doubt)
-    small_mask = moving.mask(small, share, still_pictures.log_odds(small, still))
-    return _enlarged(small_mask, height, width) & views.valid
+    odds = np.zeros(share.shape, np.float32)
+    if watch.has_time(FOR_COLOURS, "what colours say of what moves"):
+        still = still_points.dense(views, flow, open_to_doubt)
+        odds = still_pictures.log_odds(small, still)
+    found = moving.mask(small, share, odds)
+    return _enlarged(found, height, width) & views.valid
 
 
 def _enlarged(masks, height, width):
@@ -268,13 +247,13 @@ def _moved(tracks, score, first):
 
 def _measured(depths, tracks):
     """z-depths of the tracks where they are known and do not jump."""
-    at_tracks = np.full(tracks.seen.shape, np.nan)
+    found = np.full(tracks.seen.shape, np.nan)
     for frame, picture in enumerate(depths):
         here = np.flatnonzero(tracks.seen[:, frame])
         depth = steady_depth(picture)
         at = tracking.pixel_of(tracks.pixel[here, frame], depth.shape)
-        at_tracks[here, frame] = depth[at]
-    return at_tracks
+        found[here, frame] = depth[at]
+    return found
 
 
 def steady_depth(depth: np.ndarray, jump: float = 0.06) -> np.ndarray:
@@ -285,20 +264,20 @@ def steady_depth(depth: np.ndarray, jump: float = 0.06) -> np.ndarray:
 
 def digest(capture: Capture, use_depths: bool = False) -> str:
     """Of all that `gather` looks at."""
-    hashed = hashlib.blake2b(digest_size=12)
-    hashed.update(f"evidence {VERSION} {use_depths}".encode())
+    found = hashlib.blake2b(digest_size=12)
+    found.update(f"evidence {VERSION} {use_depths}".encode())
     parts = [capture.images[capture.train], capture.times, capture.train]
     parts += [np.asarray([capture.near]), *capture.cameras]
     depths = capture.depths if use_depths else None
     given = () if capture.given is None else capture.given
     for name, part in zip(Given._fields, given, strict=False):
-        hashed.update(f"{name} {part is None}".encode())
+        found.update(f"{name} {part is None}".encode())
     parts += [part for part in (capture.valid, depths, *given) if part is not None]
     for part in parts:
         part = np.ascontiguousarray(part)
-        hashed.update(f"{part.dtype}{part.shape}".encode())
-        hashed.update(part.data)
-    return hashed.hexdigest()
+        found.update(f"{part.dtype}{part.shape}".encode())
+        found.update(part.data)
+    return found.hexdigest()
 
 
 def cached(
@@ -306,18 +285,20 @@ def cached(
     folder: pathlib.Path,
     use_depths: bool = False,
     tell: Callable[[str], None] = lambda part: None,
+    seconds: float = ENOUGH_SECONDS,
 ) -> Evidence:
     """`gather`, or what it found before of the same pictures and cameras.
 
     Of a capture with a lens, what its pinholes' pictures say: with and without the lens
-    it is one record.
+    it is one record. What was left out for want of time is not kept.
     """
     capture = pinholes.as_pinholes(capture)
     path = file_of(capture, folder, use_depths)
     if path.exists():
         return load(path)
-    evidence = gather(capture, use_depths, tell)
-    save(path, evidence)
+    evidence = gather(capture, use_depths, tell, seconds)
+    if not evidence.left_out:
+        save(path, evidence)
     return evidence
 
 
@@ -364,7 +345,8 @@ def load(path: pathlib.Path) -> Evidence:
         else:
             parts[name] = arrays[name]
     parts["seconds"] = Seconds(*(float(part) for part in parts["seconds"]))
-    parts["unusable"], parts["factor"] = str(parts["unusable"]), int(parts["factor"])
+    for name, kind in (("unusable", str), ("left_out", str), ("factor", int)):
+        parts[name] = kind(parts[name])
     flow = parts["flow"]
     parts["flow"] = flow._replace(
         forward=flow.forward.astype(np.float32),

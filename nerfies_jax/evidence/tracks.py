@@ -40,8 +40,10 @@ def pixel_of(
     return np.clip(row, 0, shape[0] - 1), np.clip(column, 0, shape[1] - 1)
 
 
-def grid(views: Views, seed: int = 0) -> np.ndarray:
+def grid(views: Views, sparser: int = 1, seed: int = 0) -> np.ndarray:
     """[starts, 3] frame and pixel: an even grid in every third frame, each shifted.
+
+    In as many frames fewer as it is to be `sparser`.
 
     Not where a picture shows its plain background or was not filmed.
     """
@@ -49,7 +51,7 @@ def grid(views: Views, seed: int = 0) -> np.ndarray:
     width, height = views.size
     step = width / GRID_STEPS
     starts = []
-    for frame in range(0, len(views.row), EVERY_FRAMES):
+    for frame in range(0, len(views.row), sparser * EVERY_FRAMES):
         x, y = rng.uniform(1, 1 + step, 2)
         x, y = np.meshgrid(
             np.arange(x, width - 1, step), np.arange(y, height - 1, step)
@@ -149,7 +151,9 @@ def _enlarged(pixel, times):
     return np.ascontiguousarray(pixel * times - 0.5, np.float32)
 
 
-def from_flow(views: Views, flow: NeighbourFlow, pictures: np.ndarray) -> Tracks:
+def found(
+    views: Views, flow: NeighbourFlow, pictures: np.ndarray, sparser: int = 1
+) -> Tracks:
     """All tracks of a film, from an even grid; nothing is known of what moves yet."""
-    tracks = long_enough(chain(flow, grid(views)))
+    tracks = long_enough(chain(flow, grid(views, sparser)))
     return long_enough(realigned(tracks, pictures, views.size))

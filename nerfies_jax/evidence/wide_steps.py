@@ -18,7 +18,7 @@ from nerfies_jax.evidence.view_set import Views
 # film of `static` at 112x84 and 40 frames takes such steps, and had 6.6 % of its pixels
 # marked as moving, a checkered cube that is 15 % off in each.
 WIDE_SHARE = 0.03
-# From one plane to the next, of the width, and how many at most. Twice as far apart, and
+# From one plane to the next, of the width, and how many at most. Twice as far apart and
 # three at most, that film keeps 5 % marked; with six it has 0.8 %. Groups of features
 # that a similarity takes to the next frame (SIFT, RANSAC) are no better to begin from:
 # of every sixth frame of `fast` 79 % of the moving points are lost with and without.
