@@ -50,6 +50,25 @@ def in_time_order(capture: Capture, rows: np.ndarray | None = None) -> Views:
     return _views(capture, rows[np.lexsort((rows, capture.times[rows]))])
 
 
+def without_cameras(images: np.ndarray) -> Views:
+    """Pictures [frames, height, width, 3] uint8 in order of time; cameras are NaN."""
+    frames, height, width = images.shape[:3]
+    grey = np.ascontiguousarray(images.mean(-1) / 255, np.float32)
+    unknown = np.full((frames, 3, 3), np.nan)
+    return Views(
+        row=np.arange(frames),
+        camera=np.zeros(frames, int),
+        time=np.linspace(0, 1, frames),
+        image=images,
+        grey=grey,
+        valid=np.ones((frames, height, width), bool),
+        textured=np.stack([_textured(one) for one in grey]),
+        intrinsics=unknown,
+        rotation=unknown,
+        position=unknown[:, 0],
+    )
+
+
 def _views(capture, rows):
     image = capture.images[rows]
     grey = np.ascontiguousarray(image.mean(-1) / 255, np.float32)
