@@ -124,7 +124,7 @@ def between_neighbours(
     def flow(one, other):
         pair = pictures[one], pictures[other]
         found = reduced(search(*pair), times)
-        if span is None or not wide_steps.is_wide(found):
+        if span is None or not wide_steps.is_wide(views, (one, other), found):
             return found
         if not has_time(FOR_WIDE_STEPS, "a second look at wide steps"):
             return found

@@ -93,7 +93,9 @@ def gather(
     pictures = dense_flow.levelled(views)
     flow = taken.flow(given, views)
     if flow is None:
-        span = view_set.depth_span(capture, views)
+        # Pictures of one moment are no film: there is nothing to search twice for.
+        film = np.ptp(views.time) > 0
+        span = view_set.depth_span(capture, views) if film else None
         flow = dense_flow.between_neighbours(views, pictures, span, watch.has_time)
     watch.begin("tracks")
     few = not watch.has_time(FOR_TRACKS, "half of the tracks")

@@ -18,6 +18,7 @@ from nerfies_jax.evidence.view_set import Views
 # film of `static` at 112x84 and 40 frames takes such steps, and had 6.6 % of its pixels
 # marked as moving, a checkered cube that is 15 % off in each.
 WIDE_SHARE = 0.03
+MOST_TURN_RAD = 0.8  # between viewing axes: then hardly anything looks alike
 # From one plane to the next, of the width, and how many at most. Twice as far apart and
 # three at most, that film keeps 5 % marked; with six it has 0.8 %. Groups of features
 # that a similarity takes to the next frame (SIFT, RANSAC) are no better to begin from:
@@ -29,8 +30,11 @@ OWN = 0.9  # the first search keeps a pixel unless another looks so much more al
 Search = Callable[..., np.ndarray]  # flow from one frame to another, from a guess
 
 
-def is_wide(flow: np.ndarray) -> bool:
+def is_wide(views: Views, pair: tuple[int, int], flow: np.ndarray) -> bool:
     """Whether a pair's flow [height, width, 2] calls for another search."""
+    one, other = (views.rotation[index, 2] for index in pair)
+    if one @ other < np.cos(MOST_TURN_RAD):
+        return False
     length = np.linalg.norm(flow[::4, ::4], axis=-1)
     return float(np.median(length)) > WIDE_SHARE * flow.shape[1]
 
