@@ -143,7 +143,7 @@ def _tracks(given, views, flow, pictures, sparser):
     Given ones stand behind our own, which still say what stands still: other tools may
     have followed nothing but what moves.
     """
-    own = tracking.found(views, flow, pictures, sparser)
+    own = tracking.from_flow(views, flow, pictures, sparser)
     others = taken.tracks(given, views)
     if others is None:
         return own, 0

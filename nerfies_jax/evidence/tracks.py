@@ -151,7 +151,7 @@ def _enlarged(pixel, times):
     return np.ascontiguousarray(pixel * times - 0.5, np.float32)
 
 
-def found(
+def from_flow(
     views: Views, flow: NeighbourFlow, pictures: np.ndarray, sparser: int = 1
 ) -> Tracks:
     """All tracks of a film, from an even grid; nothing is known of what moves yet."""
