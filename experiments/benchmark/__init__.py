@@ -1,0 +1,1 @@
+"""How well the main job does, and how sure that is."""

@@ -1,0 +1,125 @@
+"""How well the main job does on a capture: over seeds, beside doing nothing.
+
+    python -m experiments.benchmark --out runs/benchmark
+    python -m experiments.benchmark --scene fast --out runs/benchmark
+    python -m experiments.benchmark CAPTURE --max-side 256 --out runs/benchmark
+
+Each seed is a run of `experiments.reconstruct` in a process of its own, one to a core.
+The seed draws the first Gaussians and the order of the frames; that of a built-in scene
+draws the hand that holds the camera as well. A run that is complete is not made again,
+and the numbers of other captures in OUT/benchmark.json stay.
+"""
+
+import concurrent.futures
+import dataclasses
+import json
+import multiprocessing
+import pathlib
+import re
+
+from experiments import cli
+from experiments.benchmark import job
+from nerfies_jax.capture.json_files import write_json
+from nerfies_jax.runs.config import RunConfig
+
+STORED = "benchmark.json"
+
+
+@dataclasses.dataclass(frozen=True)
+class Benchmark:
+    """Run the main job on one capture with several seeds."""
+
+    source: cli.Source = cli.NamedSource()
+    preset: str | None = None
+    """Which preset (default: what the capture calls for, by its tracks)."""
+    steps: int | None = None
+    """Steps of training (default: the preset's own)."""
+    seconds: float | None = None
+    """Train for so many seconds, without compiling, instead."""
+    set: tuple[str, ...] = ()
+    """Fields of the preset, as for experiments.reconstruct."""
+    seeds: int = 3
+    """So many, from 0 on."""
+    jobs: int = 1
+    """Runs at a time; more than there are cores make all of them slow."""
+    out: pathlib.Path = pathlib.Path("runs/benchmark")
+    """Folder for the runs and benchmark.json."""
+
+    def __post_init__(self):
+        for name in ("seeds", "jobs"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}={getattr(self, name)}: at least 1")
+
+
+def main(arguments=None):
+    """Run all seeds and keep what they scored; exit code 2 where input is wrong."""
+    with cli.user_errors():
+        args = cli.parse(Benchmark, arguments)
+        args.out.mkdir(parents=True, exist_ok=True)
+        label = _label(args)
+        configs = {seed: _config(args, seed) for seed in range(args.seeds)}
+    # Not forked: JAX has threads, and each run chooses its platform anew.
+    spawned = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(
+        args.jobs, spawned, max_tasks_per_child=1
+    ) as pool:
+        runs = {
+            pool.submit(
+                job.score, config, args.out / f"{_stem(args)}-{seed}", args.seconds
+            ): seed
+            for seed, config in configs.items()
+        }
+        for run in concurrent.futures.as_completed(runs):
+            keep(args.out / STORED, label, runs[run], run.result())
+            print(f"{label}, seed {runs[run]}: {_line(run.result())}", flush=True)
+    print(f"kept in {args.out / STORED}")
+
+
+def keep(path: pathlib.Path, label: str, seed: int, scored: dict) -> None:
+    """Add one run to the kept numbers, in the place of an older one."""
+    stored = json.loads(path.read_text()) if path.exists() else {"runs": {}}
+    scored = dict(scored)
+    stored["machine"] = scored.pop("machine")
+    stored["runs"].setdefault(label, {})[str(seed)] = scored
+    write_json(path, stored)
+
+
+def _config(args, seed):
+    return RunConfig(
+        preset=args.preset,
+        source=cli.plain(args.source),
+        steps=args.steps,
+        overrides=args.set,
+        seed=seed,
+    )
+
+
+def _label(args):
+    """What was run, without where it lies."""
+    source = cli.plain(args.source)
+    words = list(source.arguments)
+    if source.capture is not None:
+        words[0] = source.capture.name
+    for name in ("preset", "steps", "seconds"):
+        if getattr(args, name) is not None:
+            words += [f"--{name}", f"{getattr(args, name)}"]
+    if args.set:
+        words += ["--set", *args.set]
+    return " ".join(words)
+
+
+def _stem(args):
+    return re.sub(r"[^\w.=]+", "-", _label(args)).strip("-")
+
+
+def _line(scored):
+    metrics = scored["metrics"]
+    return (
+        f"{scored['preset']}, {metrics['heldout.psnr']:.2f} dB, "
+        f"{metrics.get('heldout.moving_psnr', float('nan')):.2f} dB moving, "
+        f"{metrics['train.seconds']:.0f} s"
+    )
+
+
+if __name__ == "__main__":
+    main()

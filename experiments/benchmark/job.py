@@ -1,0 +1,28 @@
+"""One run of the benchmark, in a process of its own."""
+
+import json
+import pathlib
+from typing import Any
+
+from nerfies_jax.capture.json_files import write_json
+from nerfies_jax.runs import platform
+from nerfies_jax.runs.config import RunConfig
+
+
+def score(
+    config: RunConfig, folder: pathlib.Path, seconds: float | None
+) -> dict[str, Any]:
+    """Preset, machine and metrics of one run, made in `folder` unless it is there."""
+    metrics = folder / "metrics.json"
+    if not metrics.exists():
+        platform.start_jax("cpu", "one")
+        from nerfies_jax import runs
+        from nerfies_jax.measure import clock
+
+        outcome = runs.reconstruct(config, folder, seconds=seconds)
+        if outcome.errors:
+            raise RuntimeError(f"{folder}: {outcome.errors[0]}")
+        about = {"preset": outcome.run.config.preset, "machine": clock.machine()}
+        write_json(folder / "about.json", about)
+    about = json.loads((folder / "about.json").read_text())
+    return about | {"metrics": json.loads(metrics.read_text())}
