@@ -33,6 +33,8 @@ from nerfies_jax.evidence.findings import DEPTH, LIGHT, MOTION, START, TRANSIENT
 from nerfies_jax.training.effects import Effect
 from nerfies_jax.training.model import Model, TrainState
 
+SMALL_PIXELS = 176 * 132  # for which the counts of the small presets were chosen
+
 
 def growth(spec: Any, state: TrainState) -> float:
     """How much longer than one of the first steps those of a whole run take.
@@ -112,11 +114,33 @@ def default_preset(capture: Capture) -> Choice:
     pictures = pinholes.as_pinholes(capture)
     evidence = record.cached(pictures, CACHE / "evidence")
     reason = usable_paths.unusable(evidence)
-    if not reason:
-        return Choice("splats-tracked-small")
-    if usable_paths.stands_still(evidence, capture.times):
-        return Choice("splats-static-small", notes=(reason,))
-    return Choice("splats-deformable-small", notes=(f"tracks are of no use: {reason}",))
+    name, notes = "splats-tracked-small", []
+    if reason and usable_paths.stands_still(evidence, capture.times):
+        name, notes = "splats-static-small", [reason]
+    elif reason:
+        name, notes = "splats-deformable-small", [f"tracks are of no use: {reason}"]
+    overrides = capacity(presets.PRESETS[name], capture.size)
+    if overrides:
+        notes.append(f"for pictures of {'x'.join(map(str, capture.size))}")
+    return Choice(name, overrides, tuple(notes))
+
+
+def capacity(spec: Any, size: tuple[int, int]) -> tuple[str, ...]:
+    """Overrides that let a small scene have more Gaussians where pictures are large.
+
+    With the root of the pixels beyond those of the built-in scene, to two digits:
+    detail grows with the pixels, the time of a step with both.
+    """
+    share = (size[0] * size[1] / SMALL_PIXELS) ** 0.5
+    if share <= 1:
+        return ()
+    counts = {
+        "densification.cap_max": spec.densification.cap_max,
+        "init.points": spec.init.points,
+    }
+    if spec.start.motion == "tracks":
+        counts["start.moving_points"] = spec.start.moving_points
+    return tuple(f"{k}={float(f'{share * n:.2g}'):.0f}" for k, n in counts.items())
 
 
 GAUSSIANS = Representation(

@@ -71,8 +71,11 @@ def by_tracks(config: RunConfig, capture: Capture) -> tuple[RunConfig, list[str]
     if not chooses:
         raise ValueError("name a preset: nothing that is installed has a default one")
     choice = chooses[0](capture)
-    lines = [f"preset: {choice.preset}" + "".join(f" ({n})" for n in choice.notes)]
-    return dataclasses.replace(config, preset=choice.preset), lines
+    words = [choice.preset, *(["--set"] if choice.overrides else []), *choice.overrides]
+    lines = [f"preset: {' '.join(words)}" + "".join(f" ({n})" for n in choice.notes)]
+    overrides = (*choice.overrides, *config.overrides)
+    changed = dataclasses.replace(config, preset=choice.preset, overrides=overrides)
+    return changed, lines
 
 
 def follow(

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from gaussians_jax import representation
+from gaussians_jax.presets import PRESETS
+from nerfies_jax.training import specs
 from tests.evidence import films
 from tests.evidence.test_tracks import MOVES
 
@@ -32,3 +34,15 @@ def test_motion_is_chosen_by_what_tracks_say(make, kind, words, tmp_path, monkey
     choice = representation.default_preset(make())
     assert choice.preset == SPLATS.format(kind)
     assert words in "".join(choice.notes)
+
+
+@pytest.mark.parametrize("kind", ["tracked", "static", "deformable"])
+def test_larger_pictures_get_more_gaussians(kind):
+    spec = PRESETS[SPLATS.format(kind)]
+    assert representation.capacity(spec, (176, 132)) == ()
+    assert representation.capacity(spec, (88, 66)) == ()
+    larger = specs.override(spec, representation.capacity(spec, (352, 264)))
+    assert larger.densification.cap_max == 2 * spec.densification.cap_max
+    assert larger.init.points == 2 * spec.init.points
+    moving = larger.start.moving_points / spec.start.moving_points
+    assert moving == (2 if kind == "tracked" else 1)
