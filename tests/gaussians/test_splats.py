@@ -87,6 +87,8 @@ def test_capacities_grow_by_half_and_stop_at_the_cap():
     assert all(b / a <= 2.0 for a, b in itertools.pairwise(sizes))
     assert all(b / a <= 1.67 for a, b in itertools.pairwise(sizes[2:]))
     assert rows.capacity_for(3073, most=3100) == 3100
+    assert rows.capacity_for(4500, most=10_000) == 4608
+    assert rows.capacity_for(6500, most=10_000) == 10_000
 
 
 @pytest.mark.parametrize("degree", [0, 2, 3, *full(1)])
