@@ -23,6 +23,7 @@ from nerfies_jax.effects.time_condition import TimeSpec
 from nerfies_jax.effects.transient import TransientSpec
 from nerfies_jax.effects.warp import WarpSpec
 from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.nets.grids import HashGridSpec
 from nerfies_jax.radiance.template import TemplateSpec
 from nerfies_jax.spec import RadianceScene, SamplingSpec
 from nerfies_jax.training import step_counts
@@ -181,6 +182,27 @@ SMALL_NSFF = dataclasses.replace(
     ),
 )
 
+
+# A grid of features in the place of waves, and a network that only has to read it.
+GRID = TemplateSpec(
+    HashGridSpec(), EncodingSpec(2), depth=1, width=64, skips=(), colour_width=64
+)
+SMALL_NERF_GRID = dataclasses.replace(
+    SMALL_NERF,
+    rays=2048,
+    template=GRID,
+    coarse=TemplateSpec(
+        HashGridSpec(levels=3, coarsest=16, finest=48, rows=2**17),
+        None,
+        depth=1,
+        width=16,
+        skips=(),
+        colour_width=16,
+    ),
+    learning_rate=1e-2,
+    learning_rate_end=1e-3,
+)
+
 PRESETS = {
     "nerf": NERF,
     "nerf-w": NERF_W,
@@ -190,6 +212,7 @@ PRESETS = {
     "hypernerf": HYPERNERF,
     "nsff": NSFF,
     "nerf-small": SMALL_NERF,
+    "nerf-grid-small": SMALL_NERF_GRID,
     "nerf-w-small": SMALL_NERF_W,
     "d-nerf-small": SMALL_D_NERF,
     "t-nerf-small": SMALL_T_NERF,

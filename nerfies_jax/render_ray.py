@@ -179,7 +179,7 @@ def _radiance(bound, name, ray, condition, samples, noise):
     net = bound.params["template"][name]
 
     def ask(warped, lifted, noise):
-        encoded = encoding.encode(one.position, warped, None)
+        encoded = template.encode(one, net, warped, condition.step)
         features = jnp.concatenate([encoded, *lifted])
         return template.apply(one, net, features, colour_inputs, noise)
 

@@ -20,8 +20,9 @@ import numpy as np
 import pytest
 
 from gaussians_jax.raster_spec import GSPLAT
-from nerfies_jax.nets import kan, mlp
+from nerfies_jax.nets import grids, kan, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.nets.grids import HashGridSpec
 from nerfies_jax.nets.kan import KANSpec
 from nerfies_jax.nets.mlp import HeadSpec, MLPSpec
 from nerfies_jax.radiance import template
@@ -32,6 +33,7 @@ MODULES = (
     *(f"nerfies_jax.geometry.{name}" for name in ("matrix3", "camera", "distortion")),
     *("nerfies_jax.geometry.rays", "nerfies_jax.geometry.precision"),
     *(f"nerfies_jax.nets.{name}" for name in ("codes", "encoding", "kan", "mlp")),
+    "nerfies_jax.nets.grids",
     *(f"nerfies_jax.radiance.{name}" for name in ("compositing", "sampling")),
     *("nerfies_jax.radiance.template", "nerfies_jax.training.losses"),
     *("gaussians_jax.projection", "gaussians_jax.splats", "gaussians_jax.harmonics"),
@@ -54,7 +56,7 @@ EXCUSED = {
     **dict.fromkeys(["template.trunk_spec", "template.colour_spec"], "settings"),
     **dict.fromkeys(["quaternion.identity", "rays.pixel_centres"], "constants"),
     **dict.fromkeys(["codes.init", "kan.init", "mlp.init", "mlp.init_layer"], "draws"),
-    "template.init": "draws",
+    **dict.fromkeys(["template.init", "grids.init"], "draws"),
     **dict.fromkeys(["precision.at_least_float32", "precision.refuse_half"], "types"),
     "splats.refuse_half": "types",
     **dict.fromkeys(["splats.take_rows", "splats.pad_rows"], "moves rows of any tree"),
@@ -81,7 +83,26 @@ def _network(make):
     return lambda dtype: jax.tree.map(lambda x: x.astype(dtype), drawn(dtype))
 
 
+_GRID = HashGridSpec(levels=2, coarsest=1, finest=2, rows=20)
 SETTINGS = {
+    "grids.encode": {
+        "spec": _GRID,
+        # A tuple of arrays is looked into, and NumPy's are none of JAX's.
+        "tables": lambda dtype: tuple(
+            map(jnp.asarray, _network(functools.partial(grids.init, _GRID))(dtype))
+        ),
+    },
+    "grids.unit_place": {"spec": _GRID},
+    "grids.level_features": {"cells": 2},
+    "grids.vertex_row": {"cells": 2, "rows": 20},
+    "grids.total_variation": {"cells": 2},
+    "template.encode": {
+        "spec": _TEMPLATE,
+        "params": _network(
+            lambda key, dtype: template.init(_TEMPLATE, key, 15, 3, dtype)
+        ),
+        "step": None,
+    },
     "stumpff.stumpff": {"order": 2},
     "rays.pixel_rays": {"size": (3, 2)},
     "precision.near_one": {"axis": -1},
@@ -131,6 +152,8 @@ SIZES = {
 SIZES_OF = {
     "template.apply": {"inputs": 15, "condition": 3},
     "kan.standardise": {"features": 5},
+    "grids.level_features": {"rows": 27},
+    "grids.total_variation": {"rows": 27},
 }
 
 
@@ -171,7 +194,7 @@ DRAWS = {
     "focal_px": (_near(10.0), False),
     "pixel_aspect": (_near(1.0), False),
     **dict.fromkeys(["skew_px", "radial", "tangential"], (_near(0.0, 0.01), False)),
-    "fraction": (_positive, False),
+    **dict.fromkeys(["fraction", "place"], (_positive, False)),
 }
 
 
@@ -246,11 +269,12 @@ REACH = {
     # products of two inputs
     **dict.fromkeys(["quaternion.exp", "quaternion.multiply", "splats.turned"], 0.45),
     **dict.fromkeys(["compositing.composite", "compositing.expected_distance"], 0.45),
-    "losses.mse": 0.45,
+    **dict.fromkeys(["losses.mse", "grids.total_variation"], 0.45),
     "distortion.distort": 0.1,  # seventh powers of the radius, and their slopes
     "losses.dssim_map": 0.2,  # variances over squared means
     # sums of more than four, or multiples
     **dict.fromkeys(["codes.blend", "encoding.encode", "losses.l1"], 0.9),
+    "template.encode": 0.9,
 }
 # Relative to the largest entry, between two orders of the same operations. Measured in
 # float32: 4e-7 for the polynomial of the lens, 8e-7 for dssim_map, 2e-7 for the others.

@@ -168,7 +168,7 @@ def dynamic(
     """The medium at one point and time, seen along one direction."""
     one = spec.network
     features = [
-        encoding.encode(one.position, point, None),
+        template.encode(one, params.network, point, None),
         # time runs from -1 to 1 like the axes of the box
         encoding.encode(spec.time, 2 * time[None] - 1, None),
     ]

@@ -5,13 +5,16 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Int, Key
 
-from nerfies_jax.nets import mlp
+from nerfies_jax.nets import encoding, grids, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.nets.grids import HashGridSpec
 from nerfies_jax.nets.mlp import HeadSpec, MLPSpec
+from nerfies_jax.training import schedules
+from nerfies_jax.training.step_counts import steps
 
-DENSITIES = ("softplus", "relu")
+DENSITIES = {"softplus": jax.nn.softplus, "relu": jax.nn.relu}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,9 +24,11 @@ class TemplateSpec:
     `direction` is None where colour does not depend on the view. "relu" densities are
     the first paper's; a ray that starts with none of them positive never learns, and
     under an interval at infinity the slope is 1e10 (softplus: at most 6e-3).
+    `anneal_steps` opens the bands of the position, or the levels of its grid, one by
+    one, coarse to fine, as Nerfies those of its warp; None has all open.
     """
 
-    position: EncodingSpec = EncodingSpec(10)
+    position: EncodingSpec | HashGridSpec = EncodingSpec(10)
     direction: EncodingSpec | None = EncodingSpec(4)
     depth: int = 8
     width: int = 256
@@ -31,14 +36,21 @@ class TemplateSpec:
     colour_width: int = 128
     density: str = "softplus"
     density_bias: float = 0.0  # added before the activation; negative starts emptier
+    anneal_steps: int | None = steps(None)
 
     def __post_init__(self):
         if self.density not in DENSITIES:
             raise ValueError(
-                f"unknown density activation {self.density!r}; choose from {DENSITIES}"
+                f"unknown density activation {self.density!r}; choose from "
+                f"{sorted(DENSITIES)}"
             )
         if self.colour_width < 1:
             raise ValueError(f"colour_width={self.colour_width} must be at least 1")
+        if self.anneal_steps is not None and self.anneal_steps < 1:
+            raise ValueError(
+                f"anneal_steps={self.anneal_steps} must be at least 1; None opens all "
+                "from the first step"
+            )
 
 
 class Template(NamedTuple):
@@ -46,6 +58,7 @@ class Template(NamedTuple):
 
     trunk: mlp.MLP  # heads "density" and "bottleneck"
     colour: mlp.MLP  # reads [bottleneck, condition]; head "colour"
+    tables: grids.Tables | None = None  # of a grid of features, where there is one
 
 
 class Radiance(NamedTuple):
@@ -77,10 +90,37 @@ def init(
 ) -> Template:
     """Glorot weights; `inputs` and `condition` are the widths that `apply` will get."""
     trunk_key, colour_key = jax.random.split(key)
+    tables = None
+    if isinstance(spec.position, HashGridSpec):
+        tables_key = jax.random.fold_in(key, 2)  # the others are as without
+        tables = grids.init(spec.position, tables_key, dtype)
     return Template(
         mlp.init(trunk_spec(spec, inputs), trunk_key, dtype),
         mlp.init(colour_spec(spec, condition), colour_key, dtype),
+        tables,
     )
+
+
+def encode(
+    spec: TemplateSpec,
+    params: Template,
+    point: Float[Array, "3"],
+    step: Int[Array, ""] | None,
+) -> Float[Array, " features"]:
+    """What the trunk reads of a point in units of the field.
+
+    `step` says how far the bands or levels are open; None opens all.
+    """
+    position = spec.position
+    grid = isinstance(position, HashGridSpec)
+    parts = position.levels if grid else position.bands
+    window = None
+    if spec.anneal_steps is not None and step is not None and parts:
+        opened = schedules.ramp(0.0, float(parts), spec.anneal_steps)(step)
+        window = encoding.anneal(parts, opened.astype(point.dtype))
+    if grid:
+        return grids.encode(position, params.tables, point, window)
+    return encoding.encode(position, point, window)
 
 
 def apply(
@@ -108,5 +148,5 @@ def apply(
     branch = bottleneck @ first.weight[: spec.width]
     branch = branch + (condition @ first.weight[spec.width :] + first.bias)
     colour = mlp.affine(params.colour.heads["colour"], jax.nn.relu(branch))
-    activation = jax.nn.softplus if spec.density == "softplus" else jax.nn.relu
+    activation = DENSITIES[spec.density]
     return Radiance(activation(raw), jax.nn.sigmoid(colour), hidden)

@@ -1,0 +1,182 @@
+"""Features of a point from tables: multi-resolution grids, dense or hashed.
+
+Functions of one point; callers `jax.vmap`. A network that reads features of its own
+for each place learns a scene in a tenth of the steps of one that reads waves. On a CPU
+the tables cost what XLA gathers and scatters: 2 floats a row take 3.9 and 2.4 ns a row,
+16 floats 19 and 66, so rows are narrow and levels many.
+"""
+
+import dataclasses
+import itertools
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key
+
+# Multipliers of the coordinates of a vertex (Müller et al. 2022, equation 4).
+PRIMES = (1, 2654435761, 805459861)
+FIRST = 1e-4  # half-width of the first features, as published
+MAX_CELLS = 2**20  # along an axis: float32 places a point in a cell of that to 1/8
+
+Tables = tuple[Float[Array, "_ features"], ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class HashGridSpec:
+    """Levels of a grid over a box, each finer than the last by the same factor.
+
+    Müller et al. 2022, arXiv:2201.05989, section 3. A level whose vertices fit into
+    `rows` has a row for each; finer ones share rows by a hash of the vertex, and the
+    network sorts out who meant what. The box is [-half_side, half_side] in units of the
+    field. Beyond it space is contracted into twice the box (Barron et al. 2022,
+    arXiv:2111.12077, equation 10, in the maximum norm) or, where `contract` is false,
+    a point has the features of the nearest point in the box.
+    """
+
+    levels: int = 7
+    features: int = 2  # floats of a row
+    coarsest: int = 16  # cells along an axis of the first level
+    finest: int = 256  # of the last
+    rows: int = 2**16  # at most, of each level
+    half_side: float = 1.0
+    contract: bool = True
+
+    def __post_init__(self):
+        if self.levels < 1 or self.features < 1 or self.rows < 8:
+            raise ValueError(
+                "a hash grid needs levels >= 1, features >= 1 and rows >= 8, got "
+                f"levels={self.levels}, features={self.features}, rows={self.rows}"
+            )
+        if not 1 <= self.coarsest <= self.finest <= MAX_CELLS:
+            raise ValueError(
+                f"need 1 <= coarsest <= finest <= {MAX_CELLS}, got "
+                f"coarsest={self.coarsest} and finest={self.finest}"
+            )
+        if not 0 < self.half_side < math.inf:
+            raise ValueError(f"half_side={self.half_side} must be positive and finite")
+
+    def width(self, dimensions: int) -> int:
+        """Features made of a point, which has three coordinates."""
+        if dimensions != 3:
+            raise ValueError(f"a hash grid is of 3 dimensions, not of {dimensions}")
+        return self.levels * self.features
+
+    def cells(self) -> tuple[int, ...]:
+        """Along an axis of each level, from coarse to fine."""
+        return tuple(
+            round(float(cells))
+            for cells in np.geomspace(self.coarsest, self.finest, self.levels)
+        )
+
+
+def init(spec: HashGridSpec, key: Key[Array, ""], dtype=jnp.float32) -> Tables:
+    """Nearly nothing anywhere; a level has as many rows as vertices, or `spec.rows`."""
+    keys = jax.random.split(key, spec.levels)
+    shapes = [(min((n + 1) ** 3, spec.rows), spec.features) for n in spec.cells()]
+    return tuple(
+        jax.random.uniform(key, shape, jnp.float32, -FIRST, FIRST).astype(dtype)
+        for key, shape in zip(keys, shapes, strict=True)
+    )
+
+
+def encode(
+    spec: HashGridSpec,
+    tables: Tables,
+    point: Float[Array, "3"],
+    window: Float[Array, " levels"] | None = None,
+) -> Float[Array, " encoded"]:
+    """Features of one point in units of the field, the coarsest level first.
+
+    `window` weighs the levels (`encoding.anneal`); None leaves them all open.
+    """
+    place = unit_place(spec, point)
+    found = [
+        level_features(table, place, cells)
+        for table, cells in zip(tables, spec.cells(), strict=True)
+    ]
+    if window is not None:
+        found = [part * window[level] for level, part in enumerate(found)]
+    return jnp.concatenate(found)
+
+
+def unit_place(spec: HashGridSpec, point: Float[Array, "3"]) -> Float[Array, "3"]:
+    """The point in [0, 1]^3 over the box, or over its contracted surroundings."""
+    scaled = point / spec.half_side
+    if spec.contract:
+        return (contract(scaled) + 2) / 4
+    return (jnp.clip(scaled, -1, 1) + 1) / 2
+
+
+def contract(point: Float[Array, "3"]) -> Float[Array, "3"]:
+    """All of space into the cube [-2, 2]^3; the cube [-1, 1]^3 stays as it is.
+
+    Barron et al. 2022, arXiv:2111.12077, equation 10: (2 - 1/|x|) x/|x| beyond a norm
+    of one, with the largest coordinate for a norm, so that cubes stay cubes. Its slope
+    is continuous along a ray from the centre; a point at infinity has none.
+    """
+    # The norm is held out of the branch that is not taken, where it may be zero.
+    size = jnp.max(jnp.abs(point))
+    beyond = jnp.maximum(size, 1)
+    return jnp.where(size > 1, (2 - 1 / beyond) * (point / beyond), point)
+
+
+def level_features(
+    table: Float[Array, "rows features"], place: Float[Array, "3"], cells: int
+) -> Float[Array, " features"]:
+    """Trilinear between the eight vertices around a place in [0, 1]^3.
+
+    Exact at a vertex and continuous across the sides of a cell; the slope jumps there,
+    and at a side it is that of the cell above.
+    """
+    scaled = place * cells
+    # A place at the far end belongs to the last cell.
+    corner = jnp.clip(jnp.floor(scaled), 0, cells - 1)
+    above = scaled - corner
+    share = (1 - above, above)
+    corner = corner.astype(jnp.int32)
+    total = jnp.zeros_like(table[0])
+    # Summed one by one: as a product of eight weights with eight rows it takes twice
+    # the time (65,536 points, 7 levels, forward: 37 for 19 ms of one core).
+    for x, y, z in itertools.product((0, 1), repeat=3):
+        row = vertex_row(corner + np.array([x, y, z], np.int32), cells, len(table))
+        total = total + share[x][0] * share[y][1] * share[z][2] * table[row]
+    return total
+
+
+def vertex_row(
+    vertex: Int[Array, "*batch 3"], cells: int, rows: int
+) -> Int[Array, "*batch"]:
+    """The row of a vertex: its own where there are enough, else that of its hash.
+
+    Müller et al. 2022, equation 4; their tables have a power of two of rows, these any
+    number.
+    """
+    vertices = cells + 1
+    if rows >= vertices**3:
+        strides = jnp.asarray([1, vertices, vertices**2], jnp.int32)
+        return jnp.sum(vertex * strides, axis=-1, dtype=jnp.int32)
+    x, y, z = (
+        vertex[..., axis].astype(jnp.uint32) * jnp.uint32(prime)
+        for axis, prime in enumerate(PRIMES)
+    )
+    return ((x ^ y ^ z) % jnp.uint32(rows)).astype(jnp.int32)
+
+
+def total_variation(
+    table: Float[Array, "rows features"], cells: int
+) -> Float[Array, ""]:
+    """Mean squared difference of neighbouring vertices of a level that is not hashed.
+
+    Features squared for each pair of neighbours along an axis. ValueError where
+    vertices share rows.
+    """
+    vertices = cells + 1
+    if len(table) != vertices**3:
+        raise ValueError(
+            f"{len(table)} rows are not the {vertices}^3 vertices of {cells} cells: "
+            "a hashed level has no neighbours"
+        )
+    grid = table.reshape(vertices, vertices, vertices, -1)
+    return sum(jnp.mean(jnp.diff(grid, axis=axis) ** 2) for axis in range(3)) / 3
