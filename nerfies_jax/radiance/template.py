@@ -14,7 +14,12 @@ from nerfies_jax.nets.mlp import HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
 from nerfies_jax.training.step_counts import steps
 
-DENSITIES = {"softplus": jax.nn.softplus, "relu": jax.nn.relu}
+LARGEST_LOG = 15.0  # of a density, whose exponent and its square are then finite
+DENSITIES = {
+    "softplus": jax.nn.softplus,
+    "relu": jax.nn.relu,
+    "exp": lambda raw: jnp.exp(jnp.minimum(raw, LARGEST_LOG)),
+}
 
 
 @dataclasses.dataclass(frozen=True)
