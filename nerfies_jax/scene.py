@@ -36,7 +36,6 @@ from nerfies_jax.training.model import (
     View,
     in_default_precision,
 )
-from nerfies_jax.training.schedules import Schedule
 from nerfies_jax.training.updates import apply_updates
 
 __all__ = ["Field", "RadianceScene", "SceneMetadata", "build", "field", "metadata_of"]
@@ -107,7 +106,6 @@ def build(
 
 def _stepper(spec, radiance):
     """One update from one batch of rays: (state, frames) -> (state, metrics), pure."""
-    schedule = common_rate(spec)
 
     def step(state: TrainState, frames: Frames):
         batch_key, field_key = jax.random.split(loop.step_key(state))
@@ -118,7 +116,7 @@ def _stepper(spec, radiance):
             return weighted_sum(terms), values(terms)
 
         (value, logged), grads = jax.value_and_grad(loss, has_aux=True)(state.params)
-        params, moments = descend(radiance.effects, schedule, state, grads)
+        params, moments = descend(spec, radiance.effects, state, grads)
         metrics = {"loss": value, "mse": logged["fine"], **logged}
         state = TrainState(params, moments, state.aux_state, state.step + 1, state.key)
         return state, metrics
@@ -126,29 +124,27 @@ def _stepper(spec, radiance):
     return step
 
 
-def common_rate(spec: RadianceScene) -> Schedule:
-    """The learning rate of all that has none of its own."""
-    return schedules.log_linear(spec.learning_rate, spec.learning_rate_end, spec.steps)
-
-
 def descend(
-    effects: tuple[Effect, ...], schedule: Schedule, state: TrainState, grads: PyTree
+    spec: RadianceScene, effects: tuple[Effect, ...], state: TrainState, grads: PyTree
 ) -> tuple[PyTree, optax.OptState]:
     """The parameters and moments after one update along `grads`."""
     # optax counts in int32 and multiplies float32 by it.
     with jax.numpy_dtype_promotion("standard"):
         updates, moments = OPTIMISER.update(grads, state.optimiser)
-    rates = learning_rates(effects, schedule, state.params, state.step)
+    rates = learning_rates(spec, effects, state.params, state.step)
     return apply_updates(state.params, updates, rates), moments
 
 
 def learning_rates(
-    effects: tuple[Effect, ...], schedule: Schedule, params: PyTree, step: Array
+    spec: RadianceScene, effects: tuple[Effect, ...], params: PyTree, step: Array
 ) -> dict[str, Array]:
     """Of each part of the parameters: the effect's own, or that of the schedule."""
     own = {e.name: e.learning_rate for e in effects if e.learning_rate is not None}
-    common = schedule(step)
-    return {name: own[name](step) if name in own else common for name in params}
+    common = schedules.log_linear(
+        spec.learning_rate, spec.learning_rate_end, spec.steps
+    )(step)
+    rates = {name: own[name](step) if name in own else common for name in params}
+    return rates | {"template": spec.template_rate * common}
 
 
 def draw_batch(frames: Frames, count: int, key: Key[Array, ""]) -> Batch:

@@ -71,6 +71,7 @@ class RadianceScene:
         5e-4  # of Adam, falling to `learning_rate_end` along a line in the logarithm
     )
     learning_rate_end: float = 5e-5
+    template_rate: float = 1.0  # times that: of the template, for tables learn faster
     density_noise: float = 0.0  # standard deviation, while training
     appearance: AppearanceSpec | None = None
     transient: TransientSpec | None = None
@@ -88,6 +89,8 @@ class RadianceScene:
                 f"train for at least one step of one ray, got steps={self.steps}, "
                 f"rays={self.rays}"
             )
+        if not self.template_rate > 0:
+            raise ValueError(f"template_rate={self.template_rate} must be positive")
         if self.extent is not None and not self.extent > 0:
             raise ValueError(f"extent={self.extent} must be positive, or none")
         schedules.check_falling(self.learning_rate, self.learning_rate_end)

@@ -24,13 +24,12 @@ def parts(
     field = scene.field(spec, metadata, effects=effects)
     batch_key, loss_key = jax.random.split(loop.step_key(state))
     batch = jax.jit(scene.draw_batch, static_argnums=1)(frames, spec.rays, batch_key)
-    schedule = scene.common_rate(spec)
 
     def draw(frames, key):
         return scene.draw_batch(frames, spec.rays, key)
 
     def descend(state, grads):
-        return scene.descend(field.effects, schedule, state, grads)
+        return scene.descend(spec, field.effects, state, grads)
 
     def loss(params, frames, batch):
         terms = scene.loss_terms(field, params, frames, batch, state.step, loss_key)
