@@ -14,12 +14,22 @@ from nerfies_jax.nets.mlp import HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
 from nerfies_jax.training.step_counts import steps
 
-LARGEST_LOG = 15.0  # of a density, whose exponent and its square are then finite
-DENSITIES = {
-    "softplus": jax.nn.softplus,
-    "relu": jax.nn.relu,
-    "exp": lambda raw: jnp.exp(jnp.minimum(raw, LARGEST_LOG)),
-}
+# Of a density: beyond it the exponential goes on along its tangent, finite and with a
+# slope that brings it back.
+LARGEST_LOG = 15.0
+
+
+def exponential(raw: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """exp(raw) up to e^15, and its tangent from there on; per unit of the field.
+
+    The density of Müller et al. 2022, arXiv:2201.05989, whose code clips the slope
+    there and not the value.
+    """
+    beyond = jnp.maximum(raw - LARGEST_LOG, 0)
+    return jnp.exp(jnp.minimum(raw, LARGEST_LOG)) * (1 + beyond)
+
+
+DENSITIES = {"softplus": jax.nn.softplus, "relu": jax.nn.relu, "exp": exponential}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,7 +38,8 @@ class TemplateSpec:
 
     `direction` is None where colour does not depend on the view. "relu" densities are
     the first paper's; a ray that starts with none of them positive never learns, and
-    under an interval at infinity the slope is 1e10 (softplus: at most 6e-3).
+    under an interval at infinity the slope is 1e10 (softplus: at most 6e-3). "exp"
+    becomes a wall in the fewest steps, which is what a grid of features wants.
     `anneal_steps` opens the bands of the position, or the levels of its grid, one by
     one, coarse to fine, as Nerfies those of its warp; None has all open.
     """

@@ -48,7 +48,7 @@ def from_weights(edges, weights, count):
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda: TemplateSpec(density="exp"), "'exp'.*softplus"),
+        (lambda: TemplateSpec(density="sine"), "'sine'.*softplus"),
         (lambda: TemplateSpec(colour_width=0), "colour_width=0"),
         (lambda: SamplingSpec(coarse=1), "coarse=1"),
         (lambda: SamplingSpec(spacing="log"), "spacing='log'"),
