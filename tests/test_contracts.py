@@ -274,7 +274,7 @@ REACH = {
     "losses.dssim_map": 0.2,  # variances over squared means
     # sums of more than four, or multiples
     **dict.fromkeys(["codes.blend", "encoding.encode", "losses.l1"], 0.9),
-    "template.encode": 0.9,
+    **dict.fromkeys(["template.encode", "template.exponential"], 0.8),
 }
 # Relative to the largest entry, between two orders of the same operations. Measured in
 # float32: 4e-7 for the polynomial of the lens, 8e-7 for dssim_map, 2e-7 for the others.
