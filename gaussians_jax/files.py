@@ -257,9 +257,15 @@ def _read_splat(path):
 
 
 def _splat_bytes(rows):
+    # Viewers draw such a file while it loads: what covers most comes first. Opacity
+    # times volume, as logarithms, which cannot overflow.
+    seen = -np.logaddexp(0, -rows.opacity_logit.astype(np.float64))
+    log_scale = np.clip(rows.log_scale.astype(np.float64), *splats.LOG_SCALE_RANGE)
+    largest_first = np.argsort(-(seen + log_scale.sum(axis=1)), kind="stable")
+    rows = Splats(*(leaf[largest_first] for leaf in rows))
+    log_scale = log_scale[largest_first]
     table = np.zeros(len(rows.mean), _SPLAT_ROW)
     table["mean"] = rows.mean
-    log_scale = np.clip(rows.log_scale.astype(np.float64), *splats.LOG_SCALE_RANGE)
     table["scale"] = np.exp(log_scale)
     logit = np.clip(rows.opacity_logit.astype(np.float64), -700, 700)
     rgba = np.concatenate(

@@ -111,6 +111,54 @@ def new_folder(path: AnyPath):
         os.replace(partial, path)
 
 
+def refuse_existing(path: AnyPath, overwrite: bool) -> None:
+    """Raise where something is at `path` already and may not be written over."""
+    path = pathlib.Path(path)
+    empty = path.is_dir() and not any(path.iterdir())
+    if not overwrite and path.exists() and not empty:
+        raise CaptureError(
+            f"{path}: already there; choose another name or add --overwrite"
+        )
+
+
+@contextlib.contextmanager
+def replaced_folder(path: AnyPath, overwrite: bool = False):
+    """`new_folder`, which with `overwrite` takes the place of an earlier one.
+
+    An earlier folder goes once the new one is whole, and only where every file in it
+    has its like in the new one, up to the numbers in its name: nothing else is lost.
+    """
+    path = pathlib.Path(path)
+    refuse_existing(path, overwrite)
+    if not path.is_dir() or not any(path.iterdir()):
+        with new_folder(path) as partial:
+            yield partial
+        return
+    with scratch_folder(path.with_name(f".{path.name}.replaced")) as scratch:
+        new, old = scratch / "new", scratch / "old"
+        new.mkdir()
+        yield new
+        written = set(_kinds(new))
+        for kind, name in _kinds(path).items():
+            if kind not in written:
+                raise CaptureError(
+                    f"{path}: holds {name}, which would be lost; choose another name "
+                    "or move it away"
+                )
+        os.replace(path, old)
+        try:
+            os.replace(new, path)
+        except OSError:
+            os.replace(old, path)
+            raise
+
+
+def _kinds(folder):
+    """The files below a folder, by their paths with the numbers left out."""
+    paths = (p.relative_to(folder) for p in folder.rglob("*") if not p.is_dir())
+    return {re.sub(r"\d+", "#", str(path)): path for path in paths}
+
+
 @contextlib.contextmanager
 def scratch_folder(path: AnyPath):
     """A temporary folder beside the new folder `path`, gone when the block ends."""

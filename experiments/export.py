@@ -1,0 +1,108 @@
+"""Export a finished run for other programs: Gaussians of an instant or a sequence.
+
+python -m experiments.export RUN ply --time 0.4          # the scene at one instant
+python -m experiments.export RUN ply --frames 48         # a numbered sequence
+python -m experiments.export RUN splat
+python -m experiments.export RUN spz --units world
+"""
+
+import dataclasses
+import pathlib
+from typing import Any, Literal
+
+from experiments import cli
+from nerfies_jax.runs import platform, representations
+
+EXPORTS = "exports"  # in the run folder, where no other place is named
+# Which options each format knows, beside --out, --overwrite and --device.
+GAUSSIANS = ("time", "frames", "units")
+OPTIONS = {"ply": GAUSSIANS, "splat": GAUSSIANS, "spz": GAUSSIANS}
+
+
+@dataclasses.dataclass(frozen=True)
+class Export:
+    """Write what a run learned in the formats of other programs (docs/formats.md)."""
+
+    run: cli.Positional[pathlib.Path]
+    """Run folder that experiments.reconstruct made."""
+    format: cli.Positional[Literal["ply", "splat", "spz"]]
+    """What to write."""
+    time: float | None = None
+    """Gaussians as they are at this time in [0, 1] (default: 0)."""
+    frames: int | None = None
+    """Gaussians: a folder of so many numbered files over the whole time."""
+    units: Literal["scene", "world"] | None = None
+    """Lengths as in the run's own files, or as in those of the capture (default:
+    scene)."""
+    out: pathlib.Path | None = None
+    """File or folder to write (default: in RUN/exports)."""
+    overwrite: bool = False
+    """Replace what is there."""
+    device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
+    """Where to compute."""
+
+    def __post_init__(self):
+        names = {name for known in OPTIONS.values() for name in known}
+        for name in sorted(names - set(OPTIONS[self.format])):
+            if getattr(self, name) is not None:
+                fits = ", ".join(key for key, known in OPTIONS.items() if name in known)
+                raise ValueError(
+                    f"--{name.replace('_', '-')} is not for {self.format}, but for "
+                    f"{fits}"
+                )
+        if self.time is not None and self.frames is not None:
+            raise ValueError("--time and --frames: one instant, or a sequence of them")
+        if self.time is not None and not 0 <= self.time <= 1:
+            raise ValueError(f"--time {self.time}: the capture runs from 0 to 1")
+        if self.frames is not None and self.frames < 2:
+            raise ValueError(f"--frames {self.frames}: a sequence has at least two")
+
+    @property
+    def place(self) -> pathlib.Path:
+        """Where to write."""
+        name = self.format
+        if self.format in ("ply", "splat", "spz"):
+            name = f"at-{self.time or 0:g}.{self.format}"
+            if self.frames is not None:
+                name = f"{self.format}-{self.frames}"
+        return self.out or self.run / EXPORTS / name
+
+
+def main(arguments=None):
+    """Run the job of the command line; exit code 2 where its input is wrong."""
+    with cli.user_errors():
+        args = cli.parse(Export, arguments)
+        representation = representations.of_run(args.run)
+        platform.start_jax(
+            args.device, "all" if representation is None else representation.threads
+        )
+        from nerfies_jax import runs
+        from nerfies_jax.capture.json_files import refuse_existing
+
+        refuse_existing(args.place, args.overwrite)
+        run = runs.saved_run(args.run)
+        state = runs.restore(args.run, run).state
+        args.place.parent.mkdir(parents=True, exist_ok=True)
+        print(f"{_gaussians(args, run, state)}: {args.place}")
+
+
+def _gaussians(args: Export, run: Any, state: Any) -> str:
+    from gaussians_jax import files, instants
+
+    in_scene = instants.splats_at(run.model, state)
+
+    def at(time):
+        rows = in_scene(time)
+        return instants.in_world(rows, run.capture) if args.units == "world" else rows
+
+    if args.frames is None:
+        count = files.save(args.place, at(args.time or 0.0))
+        return f"{count} Gaussians at time {args.time or 0:g}"
+    instants.save_sequence(
+        args.place, at, args.frames, f".{args.format}", overwrite=args.overwrite
+    )
+    return f"Gaussians at {args.frames} instants"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,107 @@
+"""A trained scene as the Gaussians of single instants, for files that know no time.
+
+Means, rotations and scales are those of the instant. The harmonics are as trained and
+do not turn with the Gaussians: that is how `rendering` draws them, by the direction in
+the world, so a viewer shows what this package renders.
+"""
+
+import math
+import os
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gaussians_jax import files, splats
+from gaussians_jax.splats import Gaussians, Splats
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.capture.json_files import replaced_folder
+from nerfies_jax.training.model import Model, TrainState
+
+NUMBERED = "frame_{:04d}"  # viewers play files whose names differ in a number alone
+
+
+def check_time(time: float) -> None:
+    """Raise ValueError for an instant outside the capture."""
+    if not 0 <= time <= 1:
+        raise ValueError(f"time {time:g}: the capture runs from 0 to 1")
+
+
+def splats_at(model: Model, state: TrainState) -> Callable[[float], Splats]:
+    """A function of the time in [0, 1] that gives the rows as they are then; host side.
+
+    Which rows are active, and their order, is the same at all times.
+    """
+    if model.stages is None:
+        raise ValueError(
+            "Gaussian files are for runs of Gaussians; a radiance field has none, so "
+            "export its cameras, pictures or tracks"
+        )
+    stages, params = model.stages, state.params
+    rows = params.rows["splats"]
+    prepared = jax.jit(stages.prepare)(params)
+    deform = jax.jit(stages.deform)
+    as_rows = jax.jit(_as_rows)
+
+    def at(time: float) -> Splats:
+        check_time(time)
+        instant = jnp.asarray(time, rows.mean.dtype)
+        return as_rows(rows, deform(params, prepared, instant))
+
+    return at
+
+
+def _as_rows(rows: Splats, deformed: Gaussians) -> Splats:
+    """What would be activated to the deformed Gaussians."""
+    trained = splats.activate(rows)
+    # What the motion leaves alone keeps its trained number: the logit of an opacity
+    # that rounded to 1 would be infinite, and that of 0 marks a row as inactive, which
+    # no motion changes.
+    eps = jnp.finfo(deformed.opacity.dtype).eps
+    opacity = jnp.clip(deformed.opacity, jnp.finfo(eps.dtype).tiny, 1 - eps)
+    logit = jnp.log(opacity) - jnp.log1p(-opacity)
+    smallest = math.exp(splats.LOG_SCALE_RANGE[0])
+    log_scale = jnp.log(jnp.maximum(deformed.scale, smallest))
+    kept = (deformed.opacity == trained.opacity) | ~splats.active_mask(rows)
+    return rows._replace(
+        mean=deformed.mean,
+        quaternion=deformed.quaternion,
+        log_scale=jnp.where(deformed.scale == trained.scale, rows.log_scale, log_scale),
+        opacity_logit=jnp.where(kept, rows.opacity_logit, logit),
+    )
+
+
+def in_world(rows: Splats, capture: Capture) -> Splats:
+    """The rows in the units of the capture's own files; host side.
+
+    A uniform scale changes no direction, so rotations and harmonics stay.
+    """
+    mean = np.asarray(rows.mean, np.float64) / capture.scale + capture.centre
+    log_scale = np.asarray(rows.log_scale, np.float64) - math.log(capture.scale)
+    return rows._replace(
+        mean=jnp.asarray(mean, rows.mean.dtype),
+        log_scale=jnp.asarray(log_scale, rows.mean.dtype),
+    )
+
+
+def save_sequence(
+    folder: str | os.PathLike,
+    at: Callable[[float], Splats],
+    count: int,
+    suffix: str,
+    *,
+    overwrite: bool = False,
+) -> np.ndarray:
+    """`count` numbered files of evenly spread instants, 0 and 1 among them.
+
+    The folder appears whole or not at all; returns the instants.
+    """
+    if count < 2:
+        raise ValueError(f"{count} frame(s) are no sequence; export a time instead")
+    times = np.linspace(0, 1, count)
+    with replaced_folder(folder, overwrite=overwrite) as partial:
+        for number, time in enumerate(times):
+            rows = at(float(time))
+            files.save(partial / (NUMBERED.format(number) + suffix), rows)
+    return times

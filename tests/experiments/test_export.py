@@ -1,0 +1,79 @@
+"""A finished run through the command line into the files of other programs."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import plyfile
+import pytest
+
+from experiments import export
+from nerfies_jax import runs
+from nerfies_jax.capture import nerfies_format
+from nerfies_jax.runs import train
+from nerfies_jax.runs.config import CaptureSource, RunConfig
+from tests import scenes
+
+CENTRE = (1.0, -2.0, 3.0)  # of the world, which is twice as large as the scene
+SPLATS = ("sh_degree=1", "densification=none", "init.extra_random=0")
+SPLATS += ("motion.width=8", "motion.depth=2", "motion.skips=")
+
+
+def saved(folder, preset, overrides, shaken):
+    """A run of the tiny capture that was saved before it learned anything.
+
+    `shaken` are the networks whose numbers are drawn anew, so that something moves.
+    """
+    capture = dataclasses.replace(scenes.tiny_capture(), scale=0.5, centre=CENTRE)
+    nerfies_format.write(capture, folder / "filmed")
+    source = CaptureSource(capture=folder / "filmed")
+    run = runs.new_run(RunConfig(preset, source, steps=12, overrides=overrides))
+    state, rng = runs.first_state(run), np.random.default_rng(0)
+    params = shaken(state.params, lambda leaf: leaf + 0.1 * rng.normal(size=leaf.shape))
+    state = state._replace(params=jax.tree.map(np.float32, params))
+    out = folder / "run"
+    out.mkdir()
+    runs.save_config(out, run)
+    with train.open_checkpoints(out, run, None) as checkpoints:
+        checkpoints.save(state, 0, {})
+    return out
+
+
+@pytest.fixture(scope="module")
+def splats(tmp_path_factory):
+    def shaken(params, shake):
+        return params._replace(nets=jax.tree.map(shake, params.nets))
+
+    folder = tmp_path_factory.mktemp("splats")
+    return saved(folder, "splats-deformable-small", SPLATS, shaken)
+
+
+def main(*words):
+    """Run the command; its exit code."""
+    try:
+        export.main([str(word) for word in words])
+    except SystemExit as stop:
+        return stop.code
+    return 0
+
+
+def test_gaussians_leave_at_an_instant_and_as_a_sequence(splats, tmp_path, capsys):
+    assert main(splats, "ply", "--time", "0.4") == 0
+    path = splats / "exports" / "at-0.4.ply"
+    assert str(path) in capsys.readouterr().out
+    x = plyfile.PlyData.read(path)["vertex"]["x"]
+    assert main(splats, "splat", "--frames", 2, "--out", tmp_path / "two") == 0
+    first, last = (
+        np.fromfile(tmp_path / "two" / f"frame_000{number}.splat", "<f4").reshape(-1, 8)
+        for number in range(2)
+    )
+    assert len(first) == len(x)
+    # Other places of the same Gaussians
+    assert np.abs(np.sort(first[:, 0]) - np.sort(last[:, 0])).max() > 1e-3
+    before = path.read_bytes()
+    assert main(splats, "ply", "--time", "0.4") == 2
+    assert "already there" in capsys.readouterr().err
+    assert path.read_bytes() == before
+    assert main(splats, "ply", "--time", "0.4", "--overwrite", "--units", "world") == 0
+    in_world = plyfile.PlyData.read(path)["vertex"]["x"]
+    np.testing.assert_allclose(in_world, 2 * x + CENTRE[0], rtol=1e-6)
