@@ -1,9 +1,12 @@
-"""Export a finished run for other programs: Gaussians of an instant or a sequence.
+"""Export a finished run for other programs: Gaussians, cameras and points.
 
 python -m experiments.export RUN ply --time 0.4          # the scene at one instant
 python -m experiments.export RUN ply --frames 48         # a numbered sequence
 python -m experiments.export RUN splat
 python -m experiments.export RUN spz --units world
+python -m experiments.export RUN transforms              # cameras, pictures, points
+python -m experiments.export RUN colmap --units world
+python -m experiments.export RUN nerfies
 """
 
 import dataclasses
@@ -16,7 +19,10 @@ from nerfies_jax.runs import platform, representations
 EXPORTS = "exports"  # in the run folder, where no other place is named
 # Which options each format knows, beside --out, --overwrite and --device.
 GAUSSIANS = ("time", "frames", "units")
-OPTIONS = {"ply": GAUSSIANS, "splat": GAUSSIANS, "spz": GAUSSIANS}
+OPTIONS = {
+    **{"ply": GAUSSIANS, "splat": GAUSSIANS, "spz": GAUSSIANS},
+    **{"transforms": ("units",), "colmap": ("units",), "nerfies": ()},
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,8 +31,11 @@ class Export:
 
     run: cli.Positional[pathlib.Path]
     """Run folder that experiments.reconstruct made."""
-    format: cli.Positional[Literal["ply", "splat", "spz"]]
-    """What to write."""
+    format: cli.Positional[
+        Literal["ply", "splat", "spz", "transforms", "colmap", "nerfies"]
+    ]
+    """Gaussians as ply, splat or spz; the pictures learned from with their cameras and
+    points as nerfstudio's transforms, a colmap model or a nerfies directory."""
     time: float | None = None
     """Gaussians as they are at this time in [0, 1] (default: 0)."""
     frames: int | None = None
@@ -61,7 +70,7 @@ class Export:
     def place(self) -> pathlib.Path:
         """Where to write."""
         name = self.format
-        if self.format in ("ply", "splat", "spz"):
+        if OPTIONS[self.format] == GAUSSIANS:
             name = f"at-{self.time or 0:g}.{self.format}"
             if self.frames is not None:
                 name = f"{self.format}-{self.frames}"
@@ -81,14 +90,16 @@ def main(arguments=None):
 
         refuse_existing(args.place, args.overwrite)
         run = runs.saved_run(args.run)
-        state = runs.restore(args.run, run).state
         args.place.parent.mkdir(parents=True, exist_ok=True)
-        print(f"{_gaussians(args, run, state)}: {args.place}")
+        written = _gaussians if OPTIONS[args.format] == GAUSSIANS else _cameras
+        print(f"{written(args, run)}: {args.place}")
 
 
-def _gaussians(args: Export, run: Any, state: Any) -> str:
+def _gaussians(args: Export, run: Any) -> str:
     from gaussians_jax import files, instants
+    from nerfies_jax import runs
 
+    state = runs.restore(args.run, run).state
     in_scene = instants.splats_at(run.model, state)
 
     def at(time):
@@ -102,6 +113,21 @@ def _gaussians(args: Export, run: Any, state: Any) -> str:
         args.place, at, args.frames, f".{args.format}", overwrite=args.overwrite
     )
     return f"Gaussians at {args.frames} instants"
+
+
+def _cameras(args: Export, run: Any) -> str:
+    """The capture as the run learned from it: of splats without the lens."""
+    from nerfies_jax.capture import colmap_writer, nerfies_format, transforms_writer
+    from nerfies_jax.capture.json_files import replaced_folder
+
+    capture = run.capture
+    if args.format == "nerfies":
+        with replaced_folder(args.place, args.overwrite) as folder:
+            nerfies_format.write(capture, folder)
+    else:
+        writer = transforms_writer if args.format == "transforms" else colmap_writer
+        writer.write(capture, args.place, args.units or "scene", args.overwrite)
+    return f"{len(capture.ids)} frames with their cameras"
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """A finished run through the command line into the files of other programs."""
 
 import dataclasses
+import json
 
 import jax
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 
 from experiments import export
 from nerfies_jax import runs
-from nerfies_jax.capture import nerfies_format
+from nerfies_jax.capture import load, nerfies_format
 from nerfies_jax.runs import train
 from nerfies_jax.runs.config import CaptureSource, RunConfig
 from tests import scenes
@@ -55,6 +56,23 @@ def main(*words):
     except SystemExit as stop:
         return stop.code
     return 0
+
+
+def test_cameras_leave_with_pictures_in_three_layouts(splats, tmp_path, capsys):
+    capture = scenes.tiny_capture()
+    for layout in ("transforms", "colmap", "nerfies"):
+        assert main(splats, layout) == 0
+        read = load(splats / "exports" / layout)
+        pictures = sorted(image.tobytes() for image in read.images)
+        assert pictures == sorted(image.tobytes() for image in capture.images)
+    # The same folder once more, and the cameras of the world
+    assert main(splats, "transforms", "--units", "world", "--overwrite") == 0
+    table = (splats / "exports" / "transforms" / "transforms.json").read_text()
+    pose = np.array(json.loads(table)["frames"][2]["transform_matrix"])
+    place = 2 * capture.cameras.position[2] + CENTRE
+    np.testing.assert_allclose(pose[:3, 3], place, rtol=1e-6)
+    assert main(splats, "colmap", "--time", 0.5) == 2
+    assert "--time is not for colmap, but for ply, splat" in capsys.readouterr().err
 
 
 def test_gaussians_leave_at_an_instant_and_as_a_sequence(splats, tmp_path, capsys):

@@ -1,0 +1,134 @@
+"""A capture as nerfstudio reads it: transforms.json, pictures and points."""
+
+import pathlib
+from typing import Any
+
+import numpy as np
+import plyfile
+
+from nerfies_jax.capture import images as pictures
+from nerfies_jax.capture.capture import Capture, CaptureError
+from nerfies_jax.capture.json_files import AnyPath, replaced_folder, write_json
+from nerfies_jax.capture.units import Units, places_in
+from nerfies_jax.geometry.camera import Camera
+
+POINTS = "points.ply"
+_OPENGL = np.diag([1.0, -1.0, -1.0])  # right, up, back, from right, down, forward
+
+
+def write(
+    capture: Capture, path: AnyPath, units: Units = "scene", overwrite: bool = False
+) -> None:
+    """The folder of transforms.json, `images`, `masks` and points, or nothing of it.
+
+    All frames are in it, with their times; `train_filenames` names those learnt from,
+    `val_filenames` and `test_filenames` those held out. Masks are black where nothing
+    was filmed. Axes are the capture's, whichever of them is up.
+    """
+    check_names(capture, path)
+    refuse_skew(capture, path, "transforms.json")
+    with replaced_folder(path, overwrite) as folder:
+        (folder / "images").mkdir()
+        for name, image in zip(capture.ids, capture.images, strict=True):
+            pictures.write_png(folder / "images" / f"{name}.png", image)
+        if capture.valid is not None:
+            (folder / "masks").mkdir()
+            for name, filmed in zip(capture.ids, capture.valid, strict=True):
+                pictures.write_png(folder / "masks" / f"{name}.png", filmed)
+        if capture.points is not None:
+            write_points(folder / POINTS, capture, units)
+        write_json(folder / "transforms.json", _transforms(capture, units))
+
+
+def check_names(capture: Capture, path: AnyPath) -> None:
+    """Raise where a frame's name cannot be that of a file."""
+    for name in capture.ids:
+        if name in ("", ".", "..") or set(name) & set("/\\\0"):
+            raise CaptureError(
+                f"{path}: frame {name!r} cannot be a file name; rename it without "
+                "slashes"
+            )
+
+
+def refuse_skew(capture: Capture, path: AnyPath, what: str) -> None:
+    """Raise for cameras whose pixel axes are not at right angles."""
+    if np.any(capture.cameras.skew_px != 0):
+        raise CaptureError(
+            f"{path}: a skew of {np.abs(capture.cameras.skew_px).max():g} px has no "
+            f"place in {what}; export nerfies, which has one"
+        )
+
+
+def write_points(path: pathlib.Path, capture: Capture, units: Units) -> None:
+    """The scene's points and their colours as .ply."""
+    cloud = capture.points
+    # World coordinates may be large: metres of a map need more than float32 has.
+    kind = "f4" if units == "scene" else "f8"
+    fields = [(axis, kind) for axis in "xyz"]
+    fields += [(name, "u1") for name in ("red", "green", "blue")]
+    table = np.empty(len(cloud.position), fields)
+    position = places_in(units, capture, cloud.position)
+    for column, axis in enumerate("xyz"):
+        table[axis] = position[:, column]
+    for column, name in enumerate(("red", "green", "blue")):
+        table[name] = cloud.colour[:, column]
+    plyfile.PlyData([plyfile.PlyElement.describe(table, "vertex")]).write(str(path))
+
+
+def opengl_pose(camera_from_world: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """World from camera [4, 4], the camera's axes right, up and back; float64."""
+    pose = np.eye(4)
+    pose[:3, :3] = camera_from_world.T.astype(np.float64) @ _OPENGL
+    pose[:3, 3] = position
+    return pose
+
+
+def _transforms(capture, units):
+    width, height = capture.size
+    cameras = capture.cameras
+    lenses = [_lens(cameras, row) for row in range(len(capture.ids))]
+    one = all(lens == lenses[0] for lens in lenses)
+    bent = np.any(cameras.radial != 0) or np.any(cameras.tangential != 0)
+    table: dict[str, Any] = {
+        "camera_model": "OPENCV" if bent else "PINHOLE",
+        "w": width,
+        "h": height,
+    }
+    if one:
+        table |= lenses[0]
+    if capture.points is not None:
+        table["ply_file_path"] = POINTS
+    if capture.background is not None:
+        table["background"] = [float(x) for x in capture.background]
+    positions = places_in(units, capture, cameras.position)
+    table["frames"] = [
+        {
+            "file_path": f"images/{name}.png",
+            **({} if capture.valid is None else {"mask_path": f"masks/{name}.png"}),
+            "time": float(capture.times[row]),
+            **({} if one else lenses[row]),
+            "transform_matrix": opengl_pose(
+                cameras.camera_from_world[row], positions[row]
+            ).tolist(),
+        }
+        for row, name in enumerate(capture.ids)
+    ]
+    if len(capture.heldout):
+        for split in ("train", "val", "test"):
+            rows = capture.train if split == "train" else capture.heldout
+            files = [f"images/{capture.ids[row]}.png" for row in rows]
+            table[f"{split}_filenames"] = files
+    return table
+
+
+def _lens(cameras: Camera, row: int) -> dict[str, float]:
+    """Intrinsics by nerfstudio's names, in pixels."""
+    focal = float(cameras.focal_px[row])
+    names = ("cx", "cy", "k1", "k2", "k3", "p1", "p2")
+    values = (
+        *cameras.principal_point_px[row],
+        *cameras.radial[row],
+        *cameras.tangential[row],
+    )
+    lens = {"fl_x": focal, "fl_y": focal * float(cameras.pixel_aspect[row])}
+    return lens | {n: float(v) for n, v in zip(names, values, strict=True)}
