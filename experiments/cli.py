@@ -58,6 +58,24 @@ def formerly(option):
     return tyro.conf.arg(aliases=[option])
 
 
+RATE = 24.0  # frames per second of films and camera paths
+# Those of `nerfies_jax.capture.camera_paths`, which loads JAX.
+PATHS = ("sway", "orbit", "lemniscate", "stabilised", "captured")
+
+
+def check_frames(frames: int | None, path: str) -> None:
+    """Raise for a number of pictures that a camera path cannot have."""
+    if frames is None:
+        return
+    if frames < 1:
+        raise ValueError(f"--frames {frames}: render at least one")
+    if path not in PATHS:
+        raise ValueError(
+            f"--frames {frames}: --path {path} has its own number of frames; it is for "
+            + ", ".join(PATHS)
+        )
+
+
 @contextlib.contextmanager
 def user_errors(kinds: tuple[type[Exception], ...] = (ValueError, OSError)):
     """Wrong input in one line and exit code 2; our own bugs keep their traceback.

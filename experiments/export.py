@@ -7,6 +7,8 @@ python -m experiments.export RUN spz --units world
 python -m experiments.export RUN transforms              # cameras, pictures, points
 python -m experiments.export RUN colmap --units world
 python -m experiments.export RUN nerfies
+python -m experiments.export RUN path --path stabilised  # camera_path.json, with times
+python -m experiments.export RUN nerfies-path --path sway --frames 48
 """
 
 import dataclasses
@@ -19,9 +21,11 @@ from nerfies_jax.runs import platform, representations
 EXPORTS = "exports"  # in the run folder, where no other place is named
 # Which options each format knows, beside --out, --overwrite and --device.
 GAUSSIANS = ("time", "frames", "units")
+PATHS = ("frames", "path")
 OPTIONS = {
     **{"ply": GAUSSIANS, "splat": GAUSSIANS, "spz": GAUSSIANS},
     **{"transforms": ("units",), "colmap": ("units",), "nerfies": ()},
+    **{"path": PATHS, "nerfies-path": PATHS},
 }
 
 
@@ -32,14 +36,21 @@ class Export:
     run: cli.Positional[pathlib.Path]
     """Run folder that experiments.reconstruct made."""
     format: cli.Positional[
-        Literal["ply", "splat", "spz", "transforms", "colmap", "nerfies"]
+        Literal[
+            *("ply", "splat", "spz", "transforms", "colmap", "nerfies"),
+            *("path", "nerfies-path"),
+        ]
     ]
     """Gaussians as ply, splat or spz; the pictures learned from with their cameras and
-    points as nerfstudio's transforms, a colmap model or a nerfies directory."""
+    points as nerfstudio's transforms, a colmap model or a nerfies directory; a camera
+    path as nerfstudio's camera_path.json (path) or Nerfies' folder (nerfies-path)."""
     time: float | None = None
     """Gaussians as they are at this time in [0, 1] (default: 0)."""
     frames: int | None = None
-    """Gaussians: a folder of so many numbered files over the whole time."""
+    """Gaussians: a folder of so many numbered files over the whole time. Otherwise the
+    pictures along a path (default: 96)."""
+    path: str | None = None
+    """Where the camera goes, as for experiments.render (default: sway)."""
     units: Literal["scene", "world"] | None = None
     """Lengths as in the run's own files, or as in those of the capture (default:
     scene)."""
@@ -63,17 +74,27 @@ class Export:
             raise ValueError("--time and --frames: one instant, or a sequence of them")
         if self.time is not None and not 0 <= self.time <= 1:
             raise ValueError(f"--time {self.time}: the capture runs from 0 to 1")
-        if self.frames is not None and self.frames < 2:
+        cli.check_frames(self.frames, self.path or cli.PATHS[0])
+        if self.gaussians and self.frames == 1:
             raise ValueError(f"--frames {self.frames}: a sequence has at least two")
+
+    @property
+    def gaussians(self) -> bool:
+        """Whether it is Gaussians that are written."""
+        return OPTIONS[self.format] == GAUSSIANS
 
     @property
     def place(self) -> pathlib.Path:
         """Where to write."""
         name = self.format
-        if OPTIONS[self.format] == GAUSSIANS:
+        if self.gaussians:
             name = f"at-{self.time or 0:g}.{self.format}"
             if self.frames is not None:
                 name = f"{self.format}-{self.frames}"
+        if self.path is not None:
+            name = f"{self.format}-{pathlib.PurePath(self.path).stem}"
+        if self.format == "path":
+            name += ".json"
         return self.out or self.run / EXPORTS / name
 
 
@@ -91,7 +112,9 @@ def main(arguments=None):
         refuse_existing(args.place, args.overwrite)
         run = runs.saved_run(args.run)
         args.place.parent.mkdir(parents=True, exist_ok=True)
-        written = _gaussians if OPTIONS[args.format] == GAUSSIANS else _cameras
+        written = _gaussians if args.gaussians else _cameras
+        if args.format in ("path", "nerfies-path"):
+            written = _path
         print(f"{written(args, run)}: {args.place}")
 
 
@@ -128,6 +151,21 @@ def _cameras(args: Export, run: Any) -> str:
         writer = transforms_writer if args.format == "transforms" else colmap_writer
         writer.write(capture, args.place, args.units or "scene", args.overwrite)
     return f"{len(capture.ids)} frames with their cameras"
+
+
+def _path(args: Export, run: Any) -> str:
+    """With times: those of the path, or there and back as `experiments.render` goes."""
+    from nerfies_jax.capture import camera_paths, path_files
+
+    planned = path_files.named(args.path or cli.PATHS[0], run.capture, args.frames)
+    count = len(planned.cameras.focal_px)
+    if planned.times is None:
+        planned = planned._replace(times=camera_paths.times(count))
+    if args.format == "path":
+        path_files.write_nerfstudio(args.place, planned, cli.RATE, args.overwrite)
+    else:
+        path_files.write_nerfies(args.place, planned, run.capture, args.overwrite)
+    return f"{count} cameras"
 
 
 if __name__ == "__main__":

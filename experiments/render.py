@@ -3,6 +3,8 @@
 python -m experiments.render RUN                         # the held-out frames
 python -m experiments.render RUN --path orbit            # mp4 of the moving scene
 python -m experiments.render RUN --path sway --freeze 0.5
+python -m experiments.render RUN --path stabilised       # as filmed, without the shake
+python -m experiments.render RUN --path camera_path.json # as nerfstudio writes it
 python -m experiments.render RUN --path sway --show depth
 python -m experiments.render RUN --path sway --show flow
 python -m experiments.render RUN --without warp          # the canonical scene
@@ -22,8 +24,6 @@ import numpy as np
 from experiments import cli
 from nerfies_jax.runs import platform, representations
 
-RATE = 24.0  # frames per second of the films
-
 
 @dataclasses.dataclass(frozen=True)
 class Render:
@@ -31,11 +31,13 @@ class Render:
 
     run: cli.Positional[pathlib.Path]
     """Run folder that experiments.reconstruct made."""
-    path: Literal["heldout", "sway", "orbit", "captured"] = "heldout"
-    """Held-out frames, or a camera moving within the filmed span, in a circle, or as it
-    was filmed."""
-    frames: int = 96
-    """Pictures along a camera path."""
+    path: str = "heldout"
+    """heldout: the held-out frames. Or a camera moving within the filmed span (sway,
+    lemniscate), in a circle (orbit), as it was filmed (captured), or so without its
+    shake (stabilised). Or a file: nerfstudio's camera_path.json, or a folder of
+    Nerfies' camera files."""
+    frames: int | None = None
+    """Pictures along a camera path (default: 96; a file has its own)."""
     freeze: float | None = None
     """Stop the scene at this time in [0, 1]; the camera goes on."""
     slow: float = 1.0
@@ -71,8 +73,7 @@ class Render:
     """Where to compute."""
 
     def __post_init__(self):
-        if self.frames < 1:
-            raise ValueError(f"--frames {self.frames}: render at least one")
+        cli.check_frames(self.frames, self.path)
         if self.freeze is not None and not 0 <= self.freeze <= 1:
             raise ValueError(f"--freeze {self.freeze}: the time lies in [0, 1]")
         if not self.slow > 0:
@@ -110,11 +111,12 @@ def main(arguments=None):
         run = runs.saved_run(args.run)
         move = _mover(args, run)
         state = _shown(args, run.model, runs.restore(args.run, run).state)
-        size = _size(run.capture.size, args.max_side)
         trained = state
         model, state = _faster(args, _model(args, run), state)
-        names, views = _views(args, run)
-        views = _seen(args, run, size, views)
+        names, views, own_size = _views(args, run)
+        size = _size(own_size, args.max_side)
+        views = [evaluation.resized(view, own_size, size) for view in views]
+        views = _blended(args, run, views)
         out = args.out or args.run / "renders" / _name(args)
         out.mkdir(parents=True, exist_ok=True)
     picture_of = _Pictures(args.show, move, trained, size, views)
@@ -126,6 +128,7 @@ def _name(args):
     frozen = "" if args.freeze is None else f"-at-{args.freeze:g}"
     slow = "" if args.slow == 1 else f"-slow-{args.slow:g}"
     without = "".join(f"-without-{name}" for name in args.without)
+    path = pathlib.PurePath(args.path).stem
     named = [pathlib.PurePath(name).name for name in args.appearance or ()]
     blended = "" if not named else f"-from-{named[0]}-to-{named[1]}"
     knots = "" if args.knots is None else f"-knots-{args.knots}"
@@ -135,7 +138,7 @@ def _name(args):
     if args.hide_moving is not None:
         knots += f"-hide-moving-{args.hide_moving:g}"
     depth = "" if args.show == "colour" else f"-{args.show}"
-    return f"{args.path}{frozen}{slow}{without}{blended}{knots}{depth}"
+    return f"{path}{frozen}{slow}{without}{blended}{knots}{depth}"
 
 
 def _model(args, run):
@@ -188,14 +191,13 @@ def _faster(args, model, state):
     return variant.model, variant.state
 
 
-def _seen(args, run, size, views):
-    """Views of the size asked for, each with its share of the two appearances."""
+def _blended(args, run, views):
+    """Views with, where that is wanted, each its share of the two appearances."""
     import jax.numpy as jnp
 
-    from nerfies_jax import evaluation, variants
+    from nerfies_jax import variants
     from nerfies_jax.training.model import in_default_precision
 
-    views = [evaluation.resized(view, run.capture.size, size) for view in views]
     if args.appearance is None:
         return views
     start, end = (
@@ -212,9 +214,9 @@ def _seen(args, run, size, views):
 
 
 def _views(args, run):
-    """Names and views of all pictures."""
+    """Names and views of all pictures, and their size."""
     from nerfies_jax import evaluation
-    from nerfies_jax.capture import camera_paths
+    from nerfies_jax.capture import camera_paths, path_files, pinholes
 
     if args.path == "heldout":
         rows = run.capture.heldout
@@ -223,15 +225,20 @@ def _views(args, run):
         if args.freeze is not None:
             time = views[0].time.dtype.type(args.freeze)
             views = [view._replace(time=time) for view in views]
-        return names, views
-    path = camera_paths.path(args.path, run.capture, args.frames)
-    if args.freeze is None:
-        times = camera_paths.times(args.frames, loops=1 / args.slow)
+        return names, views, run.capture.size
+    path = path_files.named(args.path, run.capture, args.frames)
+    if not run.representation.traces_lenses:
+        path = path._replace(cameras=pinholes.pinhole(path.cameras))
+    count = len(path.cameras.focal_px)
+    if args.freeze is not None:
+        times = np.full(count, args.freeze, np.float32)
+    elif path.times is not None:
+        times = path.times / np.float32(args.slow)
     else:
-        times = np.full(args.frames, args.freeze, np.float32)
+        times = camera_paths.times(count, loops=1 / args.slow)
     like = evaluation.view_of(run.capture, int(run.capture.train[0]))
-    names = [f"{number:04d}" for number in range(args.frames)]
-    return names, evaluation.path_views(path, times, like)
+    names = [f"{number:04d}" for number in range(count)]
+    return names, evaluation.path_views(path.cameras, times, like), path.size
 
 
 def _write(args, out, renderer, state, names, views, picture_of):
@@ -254,7 +261,7 @@ def _write(args, out, renderer, state, names, views, picture_of):
             yield picture
 
     if "mp4" in args.formats:
-        video.write_video(out / "film.mp4", pictures(), RATE)
+        video.write_video(out / "film.mp4", pictures(), cli.RATE)
     else:
         for _ in pictures():
             pass

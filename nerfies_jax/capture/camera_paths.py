@@ -1,5 +1,7 @@
 """Camera paths for videos: where the camera goes, and at which time of the scene."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from nerfies_jax.capture.capture import Capture
@@ -7,25 +9,52 @@ from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.geometry.rays import across_ray
 
-KINDS = ("sway", "orbit", "captured")
+KINDS = ("sway", "orbit", "lemniscate", "stabilised", "captured")
+# Standard deviation of the smoothing of a stabilised path, as a share of the capture:
+# half a second of ten, which takes out a hand's shake and keeps its walk.
+SMOOTHED_OVER = 0.05
+
+
+class CameraPath(NamedTuple):
+    """Where a camera goes, and when; NumPy."""
+
+    cameras: Camera  # [frames], scene units
+    size: tuple[int, int]  # width and height of the pictures, in pixels
+    # [frames] in [0, 1]; None where the path leaves them to whoever renders it.
+    times: np.ndarray | None = None
+
+
+def planned(kind: str, capture: Capture, count: int) -> CameraPath:
+    """A path of one of the `KINDS`, with the times that belong to its cameras."""
+    times = None
+    if kind == "captured":
+        times = capture.times[_replayed(capture, count)]
+    elif kind == "stabilised":
+        times = _filmed_span(capture, count)
+    return CameraPath(path(kind, capture, count), capture.size, times)
 
 
 def path(kind: str, capture: Capture, count: int, turns: float = 1.0) -> Camera:
     """`count` cameras moving around what the capture looks at.
 
     `sway` keeps to the span of the filmed positions, where a monocular reconstruction
-    can be trusted; `orbit` circles the focus point in full; `captured` repeats the
-    training cameras in the order of their times.
+    can be trusted, and so does `lemniscate`, a lying figure of eight; `orbit` circles
+    the focus point in full; `captured` repeats the training cameras in the order of
+    their times, and `stabilised` does so without their shake.
     """
+    if kind not in KINDS:
+        raise ValueError(f"no camera path {kind!r}; there are {', '.join(KINDS)}")
     if kind == "captured":
-        rows = capture.train[np.argsort(capture.times[capture.train], kind="stable")]
-        picked = np.linspace(0, len(rows) - 1, count).round().astype(int)
-        return cameras.take(capture.cameras, rows[picked])
-    phase = np.linspace(0, 2 * np.pi * turns, count, endpoint=False)
+        return cameras.take(capture.cameras, _replayed(capture, count))
     train_cameras = cameras.take(capture.cameras, capture.train)
+    if kind == "stabilised":
+        when = capture.times[capture.train].astype(np.float64)
+        return smoothed(train_cameras, when, _filmed_span(capture, count))
+    phase = np.linspace(0, 2 * np.pi * turns, count, endpoint=False)
     up = mean_up(train_cameras) if capture.up is None else np.asarray(capture.up)
     target = focus_point(train_cameras, capture.near, capture.far)
-    positions = (_sway if kind == "sway" else _orbit)(train_cameras, target, up, phase)
+    shapes = {"sway": _sway, "orbit": _orbit, "lemniscate": _lemniscate}
+    positions = shapes[kind](train_cameras, target, up, phase)
     middle = cameras.take(train_cameras, len(train_cameras.focal_px) // 2)
     size = capture.size
     looking = cameras.stack(
@@ -36,6 +65,51 @@ def path(kind: str, capture: Capture, count: int, turns: float = 1.0) -> Camera:
     )
     return looking._replace(
         pixel_aspect=np.broadcast_to(middle.pixel_aspect, (count,)).copy()
+    )
+
+
+def _replayed(capture, count):
+    """Training rows in the order of their times, evenly picked."""
+    rows = capture.train[np.argsort(capture.times[capture.train], kind="stable")]
+    return rows[np.linspace(0, len(rows) - 1, count).round().astype(int)]
+
+
+def _filmed_span(capture, count):
+    when = capture.times[capture.train]
+    return np.linspace(when.min(), when.max(), count, dtype=np.float32)
+
+
+def smoothed(filmed: Camera, when: np.ndarray, times: np.ndarray) -> Camera:
+    """Cameras filmed at `when`, without their shake, at `times`; pinholes.
+
+    Positions and orientations are lines fitted to the frames around each time, weighted
+    by a Gaussian `SMOOTHED_OVER` wide, or one and a half times the largest gap between
+    frames; a fitted matrix becomes the nearest rotation. A line, not a mean, which
+    would stop short of where the film begins and ends. The lens is the middle one's.
+    """
+    gaps = np.diff(np.unique(when))
+    width = max(SMOOTHED_OVER, 1.5 * gaps.max(initial=0))
+    count = len(filmed.focal_px)
+    poses = np.concatenate(
+        [filmed.position, filmed.camera_from_world.reshape(count, 9)], axis=1
+    ).astype(np.float64)
+    fitted = np.empty((len(times), 12))
+    for row, time in enumerate(np.asarray(times, np.float64)):
+        since = when - time
+        # The root, since least squares squares it.
+        weight = np.exp(-((since / (2 * width)) ** 2))
+        line = np.stack([np.ones(count), since], axis=1) * weight[:, None]
+        fitted[row] = np.linalg.lstsq(line, poses * weight[:, None], rcond=1e-9)[0][0]
+    left, _, right = np.linalg.svd(fitted[:, 3:].reshape(-1, 3, 3))
+    flip = np.ones((len(times), 3))
+    flip[:, 2] = np.linalg.det(left @ right)  # a rotation, not a reflection
+    lens = cameras.take(filmed, np.full(len(times), count // 2))
+    return lens._replace(
+        camera_from_world=((left * flip[:, None]) @ right).astype(np.float32),
+        position=fitted[:, :3].astype(np.float32),
+        skew_px=np.zeros_like(lens.skew_px),
+        radial=np.zeros_like(lens.radial),
+        tangential=np.zeros_like(lens.tangential),
     )
 
 
@@ -74,8 +148,15 @@ def focus_point(train_cameras: Camera, near: float, far: float) -> np.ndarray:
     return mean_centre + halfway * mean_axis
 
 
-def _sway(train_cameras, target, up, phase):
-    """An ellipse through the 70 % span of the filmed positions, facing the target."""
+class _Window(NamedTuple):
+    """The middle of the filmed positions, and how far they reach across the view."""
+
+    middle: np.ndarray
+    right: np.ndarray  # half of the 70 % span, as a vector
+    upward: np.ndarray
+
+
+def _window(train_cameras, target, up):
     centres = train_cameras.position.astype(np.float64)
     middle = np.median(centres, axis=0)
     forward = target - middle
@@ -88,12 +169,19 @@ def _sway(train_cameras, target, up, phase):
     high = np.quantile(np.abs(offset @ upward), 0.7)
     # A camera that hardly moved still sways a little, to show depth.
     least = 0.03 * np.linalg.norm(target - middle)
-    wide, high = max(wide, least), max(high, least / 2)
-    return (
-        middle
-        + np.sin(phase)[:, None] * wide * right
-        + np.cos(phase)[:, None] * high * upward
-    )
+    return _Window(middle, max(wide, least) * right, max(high, least / 2) * upward)
+
+
+def _sway(train_cameras, target, up, phase):
+    """An ellipse through the 70 % span of the filmed positions, facing the target."""
+    middle, right, upward = _window(train_cameras, target, up)
+    return middle + np.sin(phase)[:, None] * right + np.cos(phase)[:, None] * upward
+
+
+def _lemniscate(train_cameras, target, up, phase):
+    """Gerono's, through the same span: twice through the middle of what was filmed."""
+    middle, right, upward = _window(train_cameras, target, up)
+    return middle + np.sin(phase)[:, None] * right + np.sin(2 * phase)[:, None] * upward
 
 
 def _orbit(train_cameras, target, up, phase):

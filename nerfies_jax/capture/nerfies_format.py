@@ -19,7 +19,7 @@ from nerfies_jax.capture.capture import (
     shrink_depth,
 )
 from nerfies_jax.capture.json_files import AnyPath, new_folder, write_json
-from nerfies_jax.capture.nerfies_views import only, read_cameras
+from nerfies_jax.capture.nerfies_views import camera_entry, only, read_cameras
 from nerfies_jax.geometry import camera
 
 MAX_POINTS = 50_000_000
@@ -134,7 +134,9 @@ def write(capture: Capture, path: AnyPath, factors: tuple[int, ...] = (1,)):
         _write_tables(capture, folder)
         (folder / "camera").mkdir()
         for row, name in enumerate(capture.ids):
-            write_json(folder / "camera" / f"{name}.json", _camera_entry(capture, row))
+            one = camera.take(capture.cameras, row)
+            entry = camera_entry(one, capture, capture.size)
+            write_json(folder / "camera" / f"{name}.json", entry)
         for factor in factors:
             _write_pictures(capture, folder, factor)
             if capture.flow is not None:
@@ -187,22 +189,6 @@ def _write_tables(capture, folder):
         write_json(
             folder / "extra.json", {k: v for k, v in extra.items() if v is not None}
         )
-
-
-def _camera_entry(capture, row):
-    one = camera.take(capture.cameras, row)
-    position = one.position.astype(np.float64) / capture.scale + capture.centre
-    return {
-        "orientation": one.camera_from_world.tolist(),
-        "position": position.tolist(),
-        "focal_length": float(one.focal_px),
-        "principal_point": one.principal_point_px.tolist(),
-        "skew": float(one.skew_px),
-        "pixel_aspect_ratio": float(one.pixel_aspect),
-        "radial_distortion": one.radial.tolist(),
-        "tangential_distortion": one.tangential.tolist(),
-        "image_size": list(capture.size),
-    }
 
 
 def _write_pictures(capture, folder, factor):

@@ -1,13 +1,19 @@
 """The cameras, moments and splits of a Nerfies directory, without its pictures."""
 
 import pathlib
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
 from nerfies_jax.capture import frames
-from nerfies_jax.capture.capture import MAX_ID, CaptureError, check_cameras
+from nerfies_jax.capture.capture import (
+    MAX_ID,
+    Capture,
+    CaptureError,
+    check_cameras,
+)
 from nerfies_jax.capture.json_files import AnyPath, inside, read_json
 from nerfies_jax.geometry import camera
 from nerfies_jax.geometry.camera import Camera
@@ -29,6 +35,7 @@ class CameraFile(msgspec.Struct):
     radial_distortion: Triple = (0.0, 0.0, 0.0)
     tangential_distortion: Pair | None = None
     tangential: Pair | None = None  # the name that early files use
+    time: float | None = None  # ours, in [0, 1]: of a camera path
 
 
 class SceneFile(msgspec.Struct):
@@ -111,7 +118,7 @@ def read_cameras(path: AnyPath, heldout: int | str | None = None) -> NerfiesView
     ids = tuple(sorted(chosen, key=frames.natural))
     files = [_camera_file(path, name) for name in ids]
     size = _common_size(path, ids, files)
-    cameras = _cameras(files, scene)
+    cameras = cameras_of(files, scene.scale, scene.center)
     check_cameras(cameras, ids, size, str(path / "camera"))
     moments, more = _moments(path, ids)
     row = {name: number for number, name in enumerate(ids)}
@@ -197,7 +204,11 @@ def _common_size(path, ids, files):
     return round(size[0]), round(size[1])
 
 
-def _cameras(files, scene):
+def cameras_of(
+    files: Sequence[CameraFile], scale: float, centre: Sequence[float]
+) -> Camera:
+    """Cameras in scene units from those of the files, which are in world units."""
+
     def column(values, dtype=np.float32):
         return np.array(values, dtype)
 
@@ -207,7 +218,7 @@ def _cameras(files, scene):
     ]
     return Camera(
         camera_from_world=column([file.orientation for file in files]),
-        position=((world - scene.center) * scene.scale).astype(np.float32),
+        position=((world - np.asarray(centre)) * scale).astype(np.float32),
         focal_px=column([file.focal_length for file in files]),
         principal_point_px=column([file.principal_point for file in files]),
         skew_px=column([file.skew for file in files]),
@@ -215,6 +226,22 @@ def _cameras(files, scene):
         radial=column([file.radial_distortion for file in files]),
         tangential=column(tangential),
     )
+
+
+def camera_entry(one: Camera, capture: Capture, size: tuple[int, int]) -> dict:
+    """What `camera/<id>.json` says of one camera of pictures of `size`."""
+    position = one.position.astype(np.float64) / capture.scale + capture.centre
+    return {
+        "orientation": one.camera_from_world.tolist(),
+        "position": position.tolist(),
+        "focal_length": float(one.focal_px),
+        "principal_point": one.principal_point_px.tolist(),
+        "skew": float(one.skew_px),
+        "pixel_aspect_ratio": float(one.pixel_aspect),
+        "radial_distortion": one.radial.tolist(),
+        "tangential_distortion": one.tangential.tolist(),
+        "image_size": list(size),
+    }
 
 
 def _when(number):

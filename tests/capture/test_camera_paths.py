@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+import scipy.spatial.transform
 
 from nerfies_jax.capture import camera_paths
 from nerfies_jax.geometry import camera as cameras
@@ -88,3 +89,64 @@ def test_times_play_forwards_and_back():
     quarter = camera_paths.times(8, loops=0.25)
     assert quarter.max() < 0.5
     assert (np.diff(quarter) > 0).all()
+
+
+def test_a_stabilised_path_keeps_a_walk_and_loses_its_shake():
+    rng, times = np.random.default_rng(0), np.linspace(0, 1, 120)
+    angle = 0.8 * times - 0.4  # a steady turn about a vertical axis, and a steady walk
+    walk = np.stack([2 * times, 0.1 * times, -3 + 0.5 * times], axis=1)
+    shake = scipy.spatial.transform.Rotation.from_rotvec(
+        rng.normal(scale=0.02, size=(120, 3))
+    )
+    turn = scipy.spatial.transform.Rotation.from_rotvec(
+        np.stack([0 * angle, angle, 0 * angle], axis=1)
+    )
+    filmed = cameras.stack(
+        [
+            cameras.pinhole(rotation, place, 40.0, (40, 30))
+            for rotation, place in zip(
+                (shake * turn).as_matrix(),
+                walk + rng.normal(scale=0.03, size=(120, 3)),
+                strict=True,
+            )
+        ]
+    )
+    path = camera_paths.smoothed(filmed, times, times)
+    cameras.validate(path, (40, 30))
+    # Ends included: a mean of what is around them would cut the walk short there.
+    off = np.linalg.norm(path.position - walk, axis=1)
+    assert off.max() < 0.04  # 0.03 a coordinate before; some 12 frames are weighed
+    assert off.mean() < 0.02
+    smooth = scipy.spatial.transform.Rotation.from_matrix(path.camera_from_world)
+    assert (smooth * turn.inv()).magnitude().mean() < 0.012
+    steps = np.linalg.norm(np.diff(path.position, n=2, axis=0), axis=1)
+    shaken = np.linalg.norm(np.diff(filmed.position, n=2, axis=0), axis=1)
+    assert steps.mean() < 0.05 * shaken.mean()
+
+
+def test_a_path_along_the_film_is_there_when_the_film_was():
+    capture = scenes.tiny_capture()
+    filmed = np.sort(capture.times[capture.train])
+    captured = camera_paths.planned("captured", capture, len(filmed))
+    np.testing.assert_array_equal(captured.times, filmed)
+    stabilised = camera_paths.planned("stabilised", capture, 7).times
+    np.testing.assert_allclose(stabilised, np.linspace(filmed[0], filmed[-1], 7), 1e-6)
+    assert camera_paths.planned("sway", capture, 7).times is None
+
+
+def test_a_lemniscate_meets_its_middle_twice_and_stays_in_the_span_of_the_sway():
+    capture = scenes.tiny_capture()
+    around, eight = (
+        camera_paths.path(kind, capture, 16).position for kind in ("sway", "lemniscate")
+    )
+    middle = np.median(capture.cameras.position[capture.train], axis=0)
+    np.testing.assert_allclose(eight[[0, 8]], [middle, middle], atol=1e-6)
+    reach = np.linalg.norm(around - middle, axis=1).max()
+    assert np.linalg.norm(eight - middle, axis=1).max() < 1.5 * reach
+    # Mirrored in its middle, which an ellipse is at other phases.
+    np.testing.assert_allclose(eight[2] + eight[14], 2 * middle, atol=1e-6)
+
+
+def test_an_unknown_path_is_refused():
+    with pytest.raises(ValueError, match="no camera path 'spiral'; there are sway"):
+        camera_paths.path("spiral", scenes.tiny_capture(), 3)

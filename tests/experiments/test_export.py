@@ -8,9 +8,9 @@ import numpy as np
 import plyfile
 import pytest
 
-from experiments import export
+from experiments import cli, export
 from nerfies_jax import runs
-from nerfies_jax.capture import load, nerfies_format
+from nerfies_jax.capture import camera_paths, load, nerfies_format
 from nerfies_jax.runs import train
 from nerfies_jax.runs.config import CaptureSource, RunConfig
 from tests import scenes
@@ -73,6 +73,28 @@ def test_cameras_leave_with_pictures_in_three_layouts(splats, tmp_path, capsys):
     np.testing.assert_allclose(pose[:3, 3], place, rtol=1e-6)
     assert main(splats, "colmap", "--time", 0.5) == 2
     assert "--time is not for colmap, but for ply, splat" in capsys.readouterr().err
+
+
+def test_a_path_leaves_with_its_times(splats, capsys):
+    assert cli.PATHS == camera_paths.KINDS
+    assert main(splats, "path", "--path", "stabilised", "--frames", 5) == 0
+    path = splats / "exports" / "path-stabilised.json"
+    times = [
+        each["render_time"] for each in json.loads(path.read_text())["camera_path"]
+    ]
+    filmed = scenes.tiny_capture().times[scenes.tiny_capture().train]
+    np.testing.assert_allclose(times, np.linspace(filmed.min(), filmed.max(), 5), 1e-6)
+    # In the one form and out in the other; and the times of a path that has none.
+    assert main(splats, "nerfies-path", "--path", path) == 0
+    folder = splats / "exports" / "nerfies-path-path-stabilised"
+    again = [json.loads(place.read_text()) for place in sorted(folder.iterdir())]
+    assert [each["time"] for each in again] == times
+    assert main(splats, "path", "--frames", 4) == 0
+    table = json.loads((splats / "exports" / "path.json").read_text())
+    assert [e["render_time"] for e in table["camera_path"]] == [0, 0.5, 1, 0.5]
+    assert main(splats, "path", "--path", path, "--frames", 4) == 2
+    error = " ".join(capsys.readouterr().err.split())
+    assert "own number of frames" in error
 
 
 def test_gaussians_leave_at_an_instant_and_as_a_sequence(splats, tmp_path, capsys):

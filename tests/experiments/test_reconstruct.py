@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from matplotlib import colormaps
 
-from experiments import compare, reconstruct, render
+from experiments import compare, export, reconstruct, render
 from gaussians_jax import step_time
 from nerfies_jax import runs
 from nerfies_jax.capture import exr, images, nerfies_format, video
@@ -165,16 +165,22 @@ def test_a_run_leaves_its_metrics_depth_and_report(run):
 
 @pytest.mark.slow
 def test_a_run_is_rendered_at_other_times_and_places(run, tmp_path):
-    arguments = [str(run), "--path", "orbit", "--frames", "3", "--freeze", "0.5"]
+    path = tmp_path / "path.json"
+    words = ["path", "--path", "orbit", "--frames", "3", "--out", str(path)]
+    export.main([str(run), *words])
+    table = json.loads(path.read_text())
+    table |= {"render_width": 64, "render_height": 32}  # not as it was filmed
+    path.write_text(json.dumps(table))
+    arguments = [str(run), "--path", str(path), "--freeze", "0.5"]
     formats = ["--formats", "png", "mp4", "exr", "--max-side", "32"]
     render.main([*arguments, *formats, "--out", str(tmp_path)])
     assert sorted(path.name for path in tmp_path.glob("*.png")) == [
         f"{number:04d}.png" for number in range(3)
     ]
     picture, _ = images.read_image(tmp_path / "0000.png")
-    assert picture.shape == (24, 32, 3)
+    assert picture.shape == (16, 32, 3)
     assert len(list(video.read_video(tmp_path / "film.mp4"))) == 3
-    assert exr.read_exr(tmp_path / "0001.exr").depth.shape == (24, 32)
+    assert exr.read_exr(tmp_path / "0001.exr").depth.shape == (16, 32)
 
 
 @pytest.mark.slow

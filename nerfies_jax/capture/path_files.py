@@ -1,0 +1,192 @@
+"""Camera paths in files: nerfstudio's camera_path.json and Nerfies' folder of cameras.
+
+nerfstudio's is in scene units, with a vertical field of view and centred pinholes of
+square pixels alone. Nerfies' is in world units and has whole cameras.
+"""
+
+import math
+import pathlib
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from nerfies_jax.capture import camera_paths, frames
+from nerfies_jax.capture.camera_paths import CameraPath
+from nerfies_jax.capture.capture import Capture, CaptureError
+from nerfies_jax.capture.images import MAX_PIXELS
+from nerfies_jax.capture.json_files import (
+    AnyPath,
+    read_json,
+    refuse_existing,
+    replaced_folder,
+    write_json,
+)
+from nerfies_jax.capture.nerfies_views import CameraFile, camera_entry, cameras_of
+from nerfies_jax.capture.transforms_writer import opengl_pose
+from nerfies_jax.geometry import camera
+
+FRAMES = 96  # of a path that is no file, where nothing is said
+
+
+class PathCamera(msgspec.Struct):
+    """One picture of `camera_path.json`."""
+
+    camera_to_world: list[float]  # 4x4, row by row; right, up, back
+    fov: float  # vertical, degrees
+    render_time: float | None = None  # in [0, 1]
+
+
+class PathFile(msgspec.Struct):
+    """`camera_path.json`, as far as pictures depend on it."""
+
+    camera_path: list[PathCamera]
+    render_width: float
+    render_height: float
+    camera_type: str = "perspective"
+
+
+def named(name: str, capture: Capture, count: int | None) -> CameraPath:
+    """A path of one of the `KINDS`, of `count` pictures, or one in a file."""
+    if name in camera_paths.KINDS:
+        return camera_paths.planned(name, capture, count or FRAMES)
+    if not pathlib.Path(name).exists():
+        raise CaptureError(
+            f"--path {name}: no such file, and no camera path of that name; there are "
+            + ", ".join(camera_paths.KINDS)
+        )
+    return read(name, capture)
+
+
+def read(path: AnyPath, capture: Capture) -> CameraPath:
+    """The path in a file of nerfstudio's or a folder of Nerfies', in scene units.
+
+    Times must be there for all pictures or for none.
+    """
+    path = pathlib.Path(path)
+    if path.is_dir():
+        cameras, size, times = _nerfies(path, capture)
+    else:
+        cameras, size, times = _nerfstudio(path)
+    if not 1 <= min(size) <= max(size) <= MAX_PIXELS // min(size):
+        raise CaptureError(
+            f"{path}: pictures of {size[0]}x{size[1]} pixels; expected 1 to "
+            f"{MAX_PIXELS} in all"
+        )
+    try:
+        camera.validate(cameras, size, str(path))
+    except ValueError as error:
+        raise CaptureError(str(error)) from None
+    return CameraPath(cameras, size, _times(path, times))
+
+
+def _times(path, times):
+    lacking = sum(time is None for time in times)
+    if lacking == len(times):
+        return None
+    if lacking:
+        raise CaptureError(
+            f"{path}: {lacking} of {len(times)} cameras have no time; give one to all "
+            "or to none"
+        )
+    times = np.array(times, np.float32)
+    bad = ~((times >= 0) & (times <= 1))
+    if bad.any():
+        row = int(np.argmax(bad))
+        raise CaptureError(
+            f"{path}: camera {row} has time {times[row]:g}; times run from 0 to 1"
+        )
+    return times
+
+
+def _nerfstudio(path):
+    table = read_json(path, PathFile)
+    if table.camera_type != "perspective":
+        raise CaptureError(
+            f"{path}: camera_type {table.camera_type}; only perspective is rendered"
+        )
+    if not table.camera_path:
+        raise CaptureError(f"{path}: no cameras in it; add some under camera_path")
+    size = round(table.render_width), round(table.render_height)
+    single = []
+    for row, each in enumerate(table.camera_path):
+        if len(each.camera_to_world) != 16 or not 0 < each.fov < 180:
+            raise CaptureError(
+                f"{path}: camera {row} has {len(each.camera_to_world)} numbers in "
+                f"camera_to_world and a fov of {each.fov:g}; expected 16, and degrees "
+                "between 0 and 180"
+            )
+        pose = np.reshape(each.camera_to_world, (4, 4))
+        rotation = (pose[:3, :3] * [1, -1, -1]).T
+        focal = 0.5 * size[1] / math.tan(math.radians(each.fov) / 2)
+        single.append(camera.pinhole(rotation, pose[:3, 3], focal, size))
+    return camera.stack(single), size, [each.render_time for each in table.camera_path]
+
+
+def _nerfies(path, capture):
+    places = sorted(path.glob("*.json"), key=lambda place: frames.natural(place.name))
+    if not places:
+        raise CaptureError(f"{path}: no camera files (*.json) in it")
+    files = [read_json(place, CameraFile) for place in places]
+    first = files[0].image_size
+    for place, file in zip(places, files, strict=True):
+        if file.image_size != first:
+            raise CaptureError(
+                f"{place}: image_size {file.image_size}, but {places[0].name} has "
+                f"{first}; a film has one size"
+            )
+    size = round(first[0]), round(first[1])
+    cameras = cameras_of(files, capture.scale, capture.centre)
+    return cameras, size, [file.time for file in files]
+
+
+def write_nerfstudio(
+    path: AnyPath, planned: CameraPath, rate: float, overwrite: bool = False
+) -> None:
+    """`camera_path.json`, for nerfstudio's renderer and ours.
+
+    `rate` is in frames per second. Poses, times and the vertical field of view are
+    kept; what else a lens has is not.
+    """
+    refuse_existing(path, overwrite)
+    width, height = planned.size
+    count = len(planned.cameras.focal_px)
+    entries: list[dict[str, Any]] = []
+    for row in range(count):
+        one = camera.take(planned.cameras, row)
+        focal = float(one.focal_px) * float(one.pixel_aspect)
+        pose = opengl_pose(one.camera_from_world, one.position)
+        entry = {
+            "camera_to_world": pose.ravel().tolist(),
+            "fov": math.degrees(2 * math.atan2(height, 2 * focal)),
+            "aspect": width / height,
+        }
+        if planned.times is not None:
+            entry["render_time"] = float(planned.times[row])
+        entries.append(entry)
+    table = {
+        "camera_type": "perspective",
+        "render_width": width,
+        "render_height": height,
+        "fps": rate,
+        "seconds": count / rate,
+        "keyframes": [],
+        "camera_path": entries,
+    }
+    write_json(path, table)
+
+
+def write_nerfies(
+    path: AnyPath, planned: CameraPath, capture: Capture, overwrite: bool = False
+) -> None:
+    """A folder of numbered camera files, in world units, for Nerfies and ours.
+
+    `time` is a key of ours, which others pass over.
+    """
+    with replaced_folder(path, overwrite) as folder:
+        for row in range(len(planned.cameras.focal_px)):
+            one = camera.take(planned.cameras, row)
+            entry = camera_entry(one, capture, planned.size)
+            if planned.times is not None:
+                entry["time"] = float(planned.times[row])
+            write_json(folder / f"{row:06d}.json", entry)

@@ -1,0 +1,117 @@
+"""Camera paths in the files of other programs."""
+
+import json
+
+import numpy as np
+import pytest
+
+from nerfies_jax.capture import frames, path_files
+from nerfies_jax.capture.camera_paths import CameraPath
+from nerfies_jax.capture.capture import CaptureError
+from nerfies_jax.geometry import camera
+from nerfies_jax.geometry.camera import Camera
+from tests.capture.test_camera_files import filmed
+
+SIZE = (64, 36)
+TIMES = np.float32([0, 0.25, 1])
+
+
+def a_path(**lens):
+    places = [(0.1, 0.2, -2), (0.3, 0.1, -2.1), (0.2, -0.3, -1.9)]
+    cameras = camera.stack(
+        [camera.look_at(place, (0, 0, 0), (0, 1, 0), 50.0, SIZE) for place in places]
+    )
+    return CameraPath(cameras._replace(**lens), SIZE, TIMES)
+
+
+def test_a_nerfstudio_path_is_drawn_by_nerfstudio_as_by_us(tmp_path):
+    """Pixels by the formulas of its renderer: OpenGL axes, a vertical field of view."""
+    planned = a_path(pixel_aspect=np.float32([1.1, 1.1, 1.1]))
+    path_files.write_nerfstudio(tmp_path / "a.json", planned, 24.0)
+    table = json.loads((tmp_path / "a.json").read_text())
+    assert (table["render_width"], table["render_height"]) == SIZE
+    assert table["seconds"] * table["fps"] == pytest.approx(3)
+    point = np.array([0.2, -0.1, 0.3])
+    read = path_files.read(tmp_path / "a.json", filmed(frames=3))
+    np.testing.assert_array_equal(read.times, TIMES)
+    assert read.size == SIZE
+    for row, entry in enumerate(table["camera_path"]):
+        assert entry["render_time"] == TIMES[row]
+        pose = np.reshape(entry["camera_to_world"], (4, 4))
+        x, y, z = pose[:3, :3].T @ (point - pose[:3, 3])
+        focal = SIZE[1] / 2 / np.tan(np.radians(entry["fov"]) / 2)
+        theirs = focal * np.array([x, -y]) / -z + np.divide(SIZE, 2)
+        ours, back = (
+            frames.pixels_of(cameras, row, np.float32(point)[None], SIZE)[0][0]
+            for cameras in (planned.cameras, read.cameras)
+        )
+        # Square pixels are all it has: of ours it keeps the height.
+        assert theirs[1] == pytest.approx(ours[1], abs=1e-4)
+        np.testing.assert_allclose(back, theirs, atol=1e-4)
+
+
+def test_a_nerfies_path_keeps_the_whole_camera_and_the_world(tmp_path):
+    lens = {
+        "principal_point_px": np.float32([[30, 20], [31, 21], [32, 17]]),
+        "radial": np.float32([[0.1, 0.01, 0.001]] * 3),
+        "skew_px": np.float32([0.5, 0.25, 0]),
+    }
+    capture, planned = filmed(frames=3), a_path(**lens)
+    path_files.write_nerfies(tmp_path / "path", planned, capture)
+    read = path_files.read(tmp_path / "path", capture)
+    for field in Camera._fields:
+        exact = getattr(planned.cameras, field)
+        np.testing.assert_allclose(getattr(read.cameras, field), exact, atol=2e-6)
+    np.testing.assert_array_equal(read.times, TIMES)
+    assert read.size == SIZE
+    entry = json.loads((tmp_path / "path" / "000001.json").read_text())
+    place = planned.cameras.position[1] / capture.scale + capture.centre
+    np.testing.assert_allclose(entry["position"], place, rtol=1e-6)
+
+
+def test_a_path_without_times_leaves_them_to_whoever_renders_it(tmp_path):
+    planned = a_path()._replace(times=None)
+    path_files.write_nerfstudio(tmp_path / "a.json", planned, 24.0)
+    assert path_files.read(tmp_path / "a.json", filmed(frames=3)).times is None
+
+
+def change(table, **first):
+    table["camera_path"][0] |= first
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda t: change(t, render_time=1.5), "camera 0 has time 1.5"),
+        (lambda t: t["camera_path"][1].pop("render_time"), "1 of 3 cameras have no"),
+        (lambda t: change(t, fov=180), "degrees between 0 and 180"),
+        (lambda t: change(t, camera_to_world=[1, 0]), "has 2 numbers"),
+        (lambda t: change(t, camera_to_world=[2.0] * 16), "not orthonormal"),
+        (lambda t: t.update(camera_type="equirectangular"), "only perspective"),
+        (lambda t: t.update(camera_path=[]), "no cameras in it"),
+        (lambda t: t.update(render_width=1e9), "1000000000x36 pixels"),
+        (lambda t: t.pop("camera_path"), "missing required field `camera_path`"),
+    ],
+)
+def test_a_path_that_cannot_be_rendered_is_refused(spoil, words, tmp_path):
+    path_files.write_nerfstudio(tmp_path / "a.json", a_path(), 24.0)
+    table = json.loads((tmp_path / "a.json").read_text())
+    spoil(table)
+    (tmp_path / "a.json").write_text(json.dumps(table))
+    with pytest.raises(CaptureError, match=words) as caught:
+        path_files.read(tmp_path / "a.json", filmed(frames=3))
+    assert str(caught.value).startswith(str(tmp_path / "a.json"))
+
+
+def test_folders_of_no_cameras_or_of_several_sizes_are_refused(tmp_path):
+    capture = filmed(frames=3)
+    with pytest.raises(CaptureError, match="no camera files"):
+        path_files.read(tmp_path, capture)
+    path_files.write_nerfies(tmp_path / "path", a_path(), capture)
+    entry = tmp_path / "path" / "000002.json"
+    table = json.loads(entry.read_text()) | {"image_size": [32, 36]}
+    entry.write_text(json.dumps(table))
+    with pytest.raises(CaptureError, match="a film has one size"):
+        path_files.read(tmp_path / "path", capture)
+    with pytest.raises(CaptureError, match="no camera path of that name; there are s"):
+        path_files.named(str(tmp_path / "nowhere"), capture, None)
