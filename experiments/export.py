@@ -1,4 +1,4 @@
-"""Export a finished run for other programs: Gaussians, cameras and points.
+"""Export a finished run for other programs: Gaussians, cameras, tracks, EXR.
 
 python -m experiments.export RUN ply --time 0.4          # the scene at one instant
 python -m experiments.export RUN ply --frames 48         # a numbered sequence
@@ -9,6 +9,8 @@ python -m experiments.export RUN colmap --units world
 python -m experiments.export RUN nerfies
 python -m experiments.export RUN path --path stabilised  # camera_path.json, with times
 python -m experiments.export RUN nerfies-path --path sway --frames 48
+python -m experiments.export RUN tracks --points 500     # what is seen, followed
+python -m experiments.export RUN exr --path stabilised   # colour, alpha, depth, flow
 """
 
 import dataclasses
@@ -25,7 +27,8 @@ PATHS = ("frames", "path")
 OPTIONS = {
     **{"ply": GAUSSIANS, "splat": GAUSSIANS, "spz": GAUSSIANS},
     **{"transforms": ("units",), "colmap": ("units",), "nerfies": ()},
-    **{"path": PATHS, "nerfies-path": PATHS},
+    **{"path": PATHS, "nerfies-path": PATHS, "exr": PATHS},
+    "tracks": ("time", "frames", "units", "points"),
 }
 
 
@@ -38,17 +41,22 @@ class Export:
     format: cli.Positional[
         Literal[
             *("ply", "splat", "spz", "transforms", "colmap", "nerfies"),
-            *("path", "nerfies-path"),
+            *("path", "nerfies-path", "tracks", "exr"),
         ]
     ]
     """Gaussians as ply, splat or spz; the pictures learned from with their cameras and
     points as nerfstudio's transforms, a colmap model or a nerfies directory; a camera
-    path as nerfstudio's camera_path.json (path) or Nerfies' folder (nerfies-path)."""
+    path as nerfstudio's camera_path.json (path) or Nerfies' folder (nerfies-path);
+    tracks of points of a moving scene (npz); exr pictures with camera and motion."""
     time: float | None = None
-    """Gaussians as they are at this time in [0, 1] (default: 0)."""
+    """Gaussians as they are at this time in [0, 1] (default: 0). Tracks: of what is
+    seen then (default: 0.5)."""
     frames: int | None = None
-    """Gaussians: a folder of so many numbered files over the whole time. Otherwise the
-    pictures along a path (default: 96)."""
+    """Gaussians: a folder of so many numbered files over the whole time. Tracks: over
+    so many of the frames learned from (default: 96 at most). Otherwise the pictures
+    along a path (default: 96)."""
+    points: int | None = None
+    """How many points to track (default: 1000)."""
     path: str | None = None
     """Where the camera goes, as for experiments.render (default: sway)."""
     units: Literal["scene", "world"] | None = None
@@ -70,13 +78,18 @@ class Export:
                     f"--{name.replace('_', '-')} is not for {self.format}, but for "
                     f"{fits}"
                 )
-        if self.time is not None and self.frames is not None:
+        if self.gaussians and None not in (self.time, self.frames):
             raise ValueError("--time and --frames: one instant, or a sequence of them")
         if self.time is not None and not 0 <= self.time <= 1:
             raise ValueError(f"--time {self.time}: the capture runs from 0 to 1")
         cli.check_frames(self.frames, self.path or cli.PATHS[0])
-        if self.gaussians and self.frames == 1:
+        if self.frames == 1 and (self.gaussians or self.format == "tracks"):
             raise ValueError(f"--frames {self.frames}: a sequence has at least two")
+        suffix = self.suffix
+        if self.out is not None and suffix and self.out.suffix.lower() != suffix:
+            raise ValueError(f"--out {self.out}: such a file ends in {suffix}")
+        if self.points is not None and self.points < 1:
+            raise ValueError(f"--points {self.points}: track at least one")
 
     @property
     def gaussians(self) -> bool:
@@ -84,18 +97,23 @@ class Export:
         return OPTIONS[self.format] == GAUSSIANS
 
     @property
+    def suffix(self) -> str:
+        """Of the file; empty where a folder is written."""
+        if self.gaussians:
+            return f".{self.format}" if self.frames is None else ""
+        return {"path": ".json", "tracks": ".npz"}.get(self.format, "")
+
+    @property
     def place(self) -> pathlib.Path:
         """Where to write."""
         name = self.format
-        if self.gaussians:
-            name = f"at-{self.time or 0:g}.{self.format}"
-            if self.frames is not None:
-                name = f"{self.format}-{self.frames}"
-        if self.path is not None:
+        if self.gaussians and self.frames is None:
+            name = f"at-{self.time or 0:g}"
+        elif self.gaussians:
+            name = f"{self.format}-{self.frames}"
+        elif self.path is not None:
             name = f"{self.format}-{pathlib.PurePath(self.path).stem}"
-        if self.format == "path":
-            name += ".json"
-        return self.out or self.run / EXPORTS / name
+        return self.out or self.run / EXPORTS / (name + self.suffix)
 
 
 def main(arguments=None):
@@ -112,10 +130,7 @@ def main(arguments=None):
         refuse_existing(args.place, args.overwrite)
         run = runs.saved_run(args.run)
         args.place.parent.mkdir(parents=True, exist_ok=True)
-        written = _gaussians if args.gaussians else _cameras
-        if args.format in ("path", "nerfies-path"):
-            written = _path
-        print(f"{written(args, run)}: {args.place}")
+        print(f"{WRITERS[args.format](args, run)}: {args.place}")
 
 
 def _gaussians(args: Export, run: Any) -> str:
@@ -154,19 +169,84 @@ def _cameras(args: Export, run: Any) -> str:
 
 
 def _path(args: Export, run: Any) -> str:
-    """With times: those of the path, or there and back as `experiments.render` goes."""
-    from nerfies_jax.capture import camera_paths, path_files
+    from nerfies_jax.capture import path_files
 
-    planned = path_files.named(args.path or cli.PATHS[0], run.capture, args.frames)
-    count = len(planned.cameras.focal_px)
-    if planned.times is None:
-        planned = planned._replace(times=camera_paths.times(count))
+    planned = _planned(args, run)
     if args.format == "path":
         path_files.write_nerfstudio(args.place, planned, cli.RATE, args.overwrite)
     else:
         path_files.write_nerfies(args.place, planned, run.capture, args.overwrite)
-    return f"{count} cameras"
+    return f"{len(planned.times)} cameras"
 
+
+def _planned(args: Export, run: Any) -> Any:
+    """A path with times: its own, or there and back as `experiments.render` goes."""
+    from nerfies_jax.capture import camera_paths, path_files, pinholes
+
+    planned = path_files.named(args.path or cli.PATHS[0], run.capture, args.frames)
+    if not run.representation.traces_lenses:
+        planned = planned._replace(cameras=pinholes.pinhole(planned.cameras))
+    if planned.times is None:
+        count = len(planned.cameras.focal_px)
+        planned = planned._replace(times=camera_paths.times(count))
+    return planned
+
+
+def _tracks(args: Export, run: Any) -> str:
+    from nerfies_jax import evaluation, runs
+    from nerfies_jax.evaluation import surface_tracks
+
+    move = _mover(run)
+    if move is None:
+        raise ValueError(
+            f"{args.run}: nothing in this run moves points, so there are no tracks; it "
+            "needs a warp or motion"
+        )
+    tracks = surface_tracks.follow(
+        move,
+        evaluation.Renderer(run.model, run.capture.size),
+        runs.restore(args.run, run).state,
+        run.capture,
+        args.points or 1000,
+        args.frames or min(96, len(run.capture.train)),
+        0.5 if args.time is None else args.time,
+    )
+    surface_tracks.write(
+        args.place, tracks, run.capture, args.units or "scene", args.overwrite
+    )
+    points, frames = tracks.visible.shape
+    return f"{points} points over {frames} frames, {tracks.visible.mean():.0%} visible"
+
+
+def _mover(run: Any):
+    return run.representation.mover(run.spec, run.metadata, effects=run.effects)
+
+
+def _exr(args: Export, run: Any) -> str:
+    from nerfies_jax import evaluation, runs
+    from nerfies_jax.evaluation import exr_series
+
+    planned = _planned(args, run)
+    like = evaluation.view_of(run.capture, int(run.capture.train[0]))
+    move = _mover(run)
+    exr_series.write(
+        args.place,
+        evaluation.Renderer(run.model, planned.size),
+        runs.restore(args.run, run).state,
+        evaluation.path_views(planned.cameras, planned.times, like),
+        move,
+        args.overwrite,
+    )
+    flow = "without flow, since nothing moves points" if move is None else "and flow"
+    return f"{len(planned.times)} pictures: colour, alpha, depth {flow}"
+
+
+WRITERS = {
+    **dict.fromkeys(("ply", "splat", "spz"), _gaussians),
+    **dict.fromkeys(("transforms", "colmap", "nerfies"), _cameras),
+    **dict.fromkeys(("path", "nerfies-path"), _path),
+    **{"tracks": _tracks, "exr": _exr},
+}
 
 if __name__ == "__main__":
     main()

@@ -119,7 +119,7 @@ def main(arguments=None):
         views = _blended(args, run, views)
         out = args.out or args.run / "renders" / _name(args)
         out.mkdir(parents=True, exist_ok=True)
-    picture_of = _Pictures(args.show, move, trained, size, views)
+    picture_of = _Pictures(args.show, move, trained, views)
     renderer = evaluation.Renderer(model, size)
     _write(args, out, renderer, state, names, views, picture_of)
 
@@ -243,7 +243,8 @@ def _views(args, run):
 
 def _write(args, out, renderer, state, names, views, picture_of):
     """Render view after view and write each as it comes."""
-    from nerfies_jax.capture import exr, images, video
+    from nerfies_jax.capture import images, video
+    from nerfies_jax.evaluation import exr_series
 
     def pictures():
         for place, (name, view) in enumerate(zip(names, views, strict=True)):
@@ -252,12 +253,8 @@ def _write(args, out, renderer, state, names, views, picture_of):
             if "png" in args.formats:
                 images.write_png(out / f"{name}.png", picture)
             if "exr" in args.formats:
-                exr.write_exr(
-                    out / f"{name}.exr",
-                    colour=images.linear_from_srgb(np.clip(rendering.colour, 0, 1)),
-                    alpha=rendering.alpha,
-                    depth=rendering.depth,
-                )
+                seen = getattr(view, "view", view)  # of a `variants.Between`
+                exr_series.write_frame(out / f"{name}.exr", rendering, seen)
             yield picture
 
     if "mp4" in args.formats:
@@ -278,10 +275,9 @@ class _Pictures:
     Depths and flows are all over the range of the first that has any.
     """
 
-    def __init__(self, show, move, state, size, views):
+    def __init__(self, show, move, state, views):
         self.show, self.limits = show, None
         self._move, self._state, self._views = move, state, views
-        self._size = size
 
     def __call__(self, rendering, place):
         from nerfies_jax import evaluation
@@ -289,30 +285,24 @@ class _Pictures:
 
         if self.show == "colour":
             return evaluation.as_picture(rendering.colour)
-        known = rendering.alpha > 0.5
         if self.show == "flow":
-            flow = self._flow(np.where(known, rendering.depth, 0), place)
-            coloured = pictures.colour_flow(flow, self.limits)
-            if np.nanmax(np.abs(flow), initial=0) > 0:
-                self.limits = coloured.high
-            return coloured.picture
+            return self._drawn_flow(rendering, place)
+        known = rendering.alpha > 0.5
         coloured = pictures.colour_depth(rendering.depth, known, self.limits)
         if known.any():
             self.limits = coloured.low, coloured.high
         return coloured.picture
 
-    def _flow(self, depth, place):
+    def _drawn_flow(self, rendering, place):
         """To the next picture; the last one has none, and stands still."""
-        from nerfies_jax.evaluation import model_flow
+        from nerfies_jax.evaluation import model_flow, pictures
 
-        width, height = self._size
-        column, line = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-        pixels = np.stack([column.ravel(), line.ravel()], axis=1)
         here, there = self._views[place], self._views[place : place + 2][-1]
-        flow = model_flow.pixel_flow(
-            self._move, self._state, here, there, pixels, depth.ravel()
-        )
-        return flow.reshape(height, width, 2)
+        flow = model_flow.picture_flow(self._move, self._state, here, there, rendering)
+        coloured = pictures.colour_flow(flow, self.limits)
+        if np.nanmax(np.abs(flow), initial=0) > 0:
+            self.limits = coloured.high
+        return coloured.picture
 
 
 def _size(size, max_side):

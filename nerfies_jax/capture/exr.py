@@ -2,7 +2,7 @@
 
 import pathlib
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import OpenEXR
@@ -121,8 +121,11 @@ def write_exr(
     depth: np.ndarray | None = None,
     extra: Mapping[str, np.ndarray] | None = None,
     half: bool = False,
+    header: Mapping[str, Any] | None = None,
 ):
     """Lossless (ZIP), atomically; `colour` [height, width, 3] is linear light.
+
+    `header` are more attributes: numbers, texts, vectors and matrices of float32.
 
     `half` stores colour and alpha in 16 bits; depth and the extra channels keep 32,
     because a half has 11 bits and a depth map would fall into steps.
@@ -154,7 +157,8 @@ def write_exr(
             f"{path}: channels of shapes {sorted(shapes)}; expected at least one, all "
             "[height, width]"
         )
-    header = {
+    every = {
+        **(header or {}),
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
     }
@@ -162,7 +166,7 @@ def write_exr(
     # ours alone. It also wants them contiguous.
     contiguous = {name: np.ascontiguousarray(array) for name, array in channels.items()}
     try:
-        with replaced_file(path) as partial, OpenEXR.File(header, contiguous) as file:
+        with replaced_file(path) as partial, OpenEXR.File(every, contiguous) as file:
             file.write(str(partial))
     except RuntimeError as error:
         reason = " ".join(str(error).split())

@@ -13,7 +13,12 @@ from nerfies_jax.evaluation.scores import Scored
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry import rays
 from nerfies_jax.geometry.camera import Camera
-from nerfies_jax.training.model import TrainState, View, in_default_precision
+from nerfies_jax.training.model import (
+    Rendering,
+    TrainState,
+    View,
+    in_default_precision,
+)
 
 PIXELS = 500  # of a frame whose flow is scored, evenly spread
 FRAMES = 4
@@ -55,11 +60,33 @@ def pixel_flow(
     """
     known = np.isfinite(depth) & (depth > 0)
     pixels = np.asarray(in_default_precision(pixels))
-    depth = np.asarray(in_default_precision(np.where(known, depth, 1)))
-    moved = move(state, np.asarray(_surface(here.camera, pixels, depth)), here, there)
+    points = surface(here.camera, pixels, np.where(known, depth, 1))
+    moved = move(state, points, here, there)
     place, ahead = _project(there.camera, in_default_precision(moved.points))
     known = known & moved.found & np.asarray(ahead)
     return np.where(known[:, None], np.asarray(place) - pixels, np.nan)
+
+
+def picture_flow(
+    move: Move, state: TrainState, here: View, there: View, rendering: Rendering
+) -> np.ndarray:
+    """Flow [height, width, 2] of a whole drawn picture to another view.
+
+    NaN where less than half of a pixel is drawn, beside where `pixel_flow` is.
+    """
+    height, width = rendering.alpha.shape
+    column, line = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    pixels = np.stack([column.ravel(), line.ravel()], axis=1)
+    depth = np.where(rendering.alpha > 0.5, rendering.depth, 0)
+    flow = pixel_flow(move, state, here, there, pixels, depth.ravel())
+    return flow.reshape(height, width, 2)
+
+
+def surface(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """Points [pixels, 3] at z-depths `depth` [pixels] behind pixels [pixels, 2]."""
+    return np.asarray(
+        _surface(camera, in_default_precision(pixels), in_default_precision(depth))
+    )
 
 
 @jax.jit

@@ -4,8 +4,9 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from nerfies_jax.capture import exr
+from nerfies_jax.capture import exr, exr_camera, frames
 from nerfies_jax.capture.capture import CaptureError
+from nerfies_jax.geometry import camera
 
 RNG = np.random.default_rng(0)
 COLOUR = RNG.uniform(0, 50, (5, 7, 3)).astype(np.float32)
@@ -28,6 +29,34 @@ def test_float_channels_come_back_bit_for_bit(tmp_path):
     np.testing.assert_array_equal(picture.extra["id"], counts)
     assert picture.finite.all()
     assert [p.name for p in tmp_path.iterdir()] == ["a.exr"]
+
+
+def test_a_header_takes_points_of_the_world_to_the_picture(tmp_path):
+    size = (7, 5)
+    one = camera.look_at((0.3, 0.2, -2), (0, 0.1, 0), (0, 1, 0), 9.0, size)
+    one = one._replace(
+        principal_point_px=np.float32([3.1, 2.7]),
+        pixel_aspect=np.float32(1.2),
+        skew_px=np.float32(0.5),
+    )
+    header = exr_camera.attributes(one, size, 0.25)
+    exr.write_exr(tmp_path / "a.exr", COLOUR, header=header)
+    with OpenEXR.File(str(tmp_path / "a.exr"), header_only=True) as file:
+        read = dict(file.header())
+    points = RNG.uniform(-0.5, 0.5, (20, 3))
+    rows = np.append(points, np.ones((20, 1)), axis=1)
+    inside = rows @ read["worldToCamera"]
+    exact = (points - one.position) @ one.camera_from_world.T
+    np.testing.assert_allclose(inside[:, :3], exact, atol=1e-6)
+    flat = rows @ read["worldToNDC"]
+    pixel, depth, _ = frames.pixels_of(
+        camera.stack([one]), 0, points.astype(np.float32), size
+    )
+    places = flat[:, :2] / flat[:, 3:] * size
+    np.testing.assert_allclose(places, pixel, atol=1e-5)
+    np.testing.assert_allclose(flat[:, 3], depth, rtol=1e-6)
+    assert read["sceneTime"] == 0.25
+    assert read["compression"] == OpenEXR.ZIP_COMPRESSION
 
 
 @pytest.mark.hard_cases

@@ -5,12 +5,13 @@ import json
 
 import jax
 import numpy as np
+import OpenEXR
 import plyfile
 import pytest
 
 from experiments import cli, export
 from nerfies_jax import runs
-from nerfies_jax.capture import camera_paths, load, nerfies_format
+from nerfies_jax.capture import camera_paths, exr, load, nerfies_format
 from nerfies_jax.runs import train
 from nerfies_jax.runs.config import CaptureSource, RunConfig
 from tests import scenes
@@ -18,6 +19,10 @@ from tests import scenes
 CENTRE = (1.0, -2.0, 3.0)  # of the world, which is twice as large as the scene
 SPLATS = ("sh_degree=1", "densification=none", "init.extra_random=0")
 SPLATS += ("motion.width=8", "motion.depth=2", "motion.skips=")
+FIELD = ("elastic=none", "background=none", "rays=32", "template.skips=")
+FIELD += ("template.depth=1", "template.width=8", "template.colour_width=8")
+FIELD += ("sampling.coarse=4", "sampling.fine=4")
+FIELD += ("warp.skips=", "warp.depth=1", "warp.width=8")
 
 
 def saved(folder, preset, overrides, shaken):
@@ -117,3 +122,74 @@ def test_gaussians_leave_at_an_instant_and_as_a_sequence(splats, tmp_path, capsy
     assert main(splats, "ply", "--time", "0.4", "--overwrite", "--units", "world") == 0
     in_world = plyfile.PlyData.read(path)["vertex"]["x"]
     np.testing.assert_allclose(in_world, 2 * x + CENTRE[0], rtol=1e-6)
+
+
+def test_pictures_leave_with_their_camera_and_motion(splats, capsys):
+    path = ("--path", "captured", "--frames", 3)
+    assert main(splats, "exr", *path) == 0
+    assert "and flow" in capsys.readouterr().out
+    pictures = sorted((splats / "exports" / "exr-captured").iterdir())
+    assert [picture.name for picture in pictures] == [
+        "0000.exr",
+        "0001.exr",
+        "0002.exr",
+    ]
+    first, _, last = (exr.read_exr(picture) for picture in pictures)
+    capture = scenes.tiny_capture()
+    assert first.depth.shape == capture.images.shape[1:3]
+    assert first.finite.all()
+    known = first.extra["flow.A"] == 1
+    assert known.any()
+    assert np.abs(first.extra["flow.x"][known]).max() > 0.1
+    # Nothing follows the last: to rounding, it stands still.
+    assert np.abs([last.extra["flow.x"], last.extra["flow.y"]]).max() < 1e-3
+    with OpenEXR.File(str(pictures[0]), header_only=True) as file:
+        header = dict(file.header())
+    row = capture.train[np.argmin(capture.times[capture.train])]
+    assert header["sceneTime"] == capture.times[row]
+    place = np.append(capture.cameras.position[row], 1) @ header["worldToCamera"]
+    np.testing.assert_allclose(place, [0, 0, 0, 1], atol=1e-6)
+
+
+def test_tracks_leave_in_the_units_that_are_wanted(splats, capsys):
+    assert main(splats, "tracks", "--points", 30, "--frames", 3) == 0
+    with np.load(splats / "exports" / "tracks.npz") as stored:
+        tracks = dict(stored)
+    assert {name: array.shape for name, array in tracks.items()} == {
+        "positions": (30, 3, 3),
+        "visible": (30, 3),
+        "times": (3,),
+        "pixels": (30, 3, 2),
+        "frames": (3,),
+    }
+    assert tracks["visible"].any()
+    assert np.abs(np.diff(tracks["positions"], axis=1)).max() > 1e-3
+    words = ("--points", 30, "--frames", 3, "--units", "world", "--overwrite")
+    assert main(splats, "tracks", *words) == 0
+    with np.load(splats / "exports" / "tracks.npz") as stored:
+        world = 2 * tracks["positions"] + CENTRE
+        np.testing.assert_allclose(stored["positions"], world, atol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def field(tmp_path_factory):
+    def shaken(params, shake):
+        return params | {"warp": jax.tree.map(shake, params["warp"])}
+
+    folder = tmp_path_factory.mktemp("field")
+    return saved(folder, "nerfies", FIELD, shaken)
+
+
+@pytest.mark.slow
+def test_a_field_leaves_as_pictures_tracks_and_cameras_alone(field, capsys):
+    assert main(field, "exr", "--frames", 2) == 0
+    picture = exr.read_exr(field / "exports" / "exr" / "0000.exr")
+    assert {"flow.x", "flow.y", "flow.A"} == {*picture.extra}
+    assert main(field, "path") == 0
+    assert main(field, "transforms") == 0
+    assert main(field, "tracks", "--points", 5, "--frames", 2) == 0
+    capsys.readouterr()
+    assert main(field, "ply") == 2
+    error = capsys.readouterr().err
+    assert "a radiance field has none" in error
+    assert error.count("\n") == 1

@@ -1,0 +1,45 @@
+"""The camera of a picture as attributes of an OpenEXR header."""
+
+from typing import Any
+
+import numpy as np
+
+from nerfies_jax.geometry.camera import Camera
+
+AXES = "x right, y down, z forward"
+
+
+def attributes(camera: Camera, size: tuple[int, int], time: float) -> dict[str, Any]:
+    """What says from where and when a picture of `size` (width, height) was taken.
+
+    `worldToCamera` and `worldToNDC` are OpenEXR's own: they act on rows, (x, y, z, 1) M
+    divided by its fourth number, and NDC runs from (0, 0), upper left, to (1, 1). They
+    leave out the lens's distortion. Lengths are in scene units, `time` in [0, 1].
+    """
+    turn = np.asarray(camera.camera_from_world, np.float64)
+    focal, aspect = float(camera.focal_px), float(camera.pixel_aspect)
+    centre = np.asarray(camera.principal_point_px, np.float64)
+    from_world = np.eye(4)
+    from_world[:3, :3] = turn
+    from_world[:3, 3] = -turn @ np.asarray(camera.position, np.float64)
+    # Rows: pixels over the size, z, and z again to divide by.
+    ndc = np.zeros((4, 4))
+    ndc[0, :3] = np.array([focal, float(camera.skew_px), centre[0]]) / size[0]
+    ndc[1, 1:3] = np.array([focal * aspect, centre[1]]) / size[1]
+    ndc[2:, 2] = 1
+
+    def on_rows(matrix):
+        # OpenEXR takes the numbers as they lie in memory.
+        return np.ascontiguousarray(matrix.T, np.float32)
+
+    return {
+        "worldToCamera": on_rows(from_world),
+        "worldToNDC": on_rows(ndc @ from_world),
+        "cameraAxes": AXES,
+        "sceneTime": float(time),
+        "focalLengthPx": np.float32([focal, focal * aspect]),
+        "principalPointPx": centre.astype(np.float32),
+        "skewPx": float(camera.skew_px),
+        "radialDistortion": np.asarray(camera.radial, np.float32),
+        "tangentialDistortion": np.asarray(camera.tangential, np.float32),
+    }

@@ -1,0 +1,58 @@
+"""Pictures of a trained scene for compositing: OpenEXR with camera and motion."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from nerfies_jax.capture import exr, exr_camera, images
+from nerfies_jax.capture.json_files import AnyPath, replaced_folder
+from nerfies_jax.evaluation import model_flow
+from nerfies_jax.evaluation.model_flow import Move
+from nerfies_jax.evaluation.scores import Draw
+from nerfies_jax.training.model import Rendering, TrainState, View
+
+
+def write(
+    folder: AnyPath,
+    draw: Draw,
+    state: TrainState,
+    views: Sequence[View],
+    move: Move | None = None,
+    overwrite: bool = False,
+) -> None:
+    """`0000.exr`, ... of the views in turn, or none of them; with flow given a `move`.
+
+    Flow goes to the next picture; that of the last is zero.
+    """
+    with replaced_folder(folder, overwrite) as partial:
+        for place, view in enumerate(views):
+            rendering = draw(state, view)
+            flow = None
+            if move is not None:
+                there = views[min(place + 1, len(views) - 1)]
+                flow = model_flow.picture_flow(move, state, view, there, rendering)
+            write_frame(partial / f"{place:04d}.exr", rendering, view, flow)
+
+
+def write_frame(
+    path: AnyPath, rendering: Rendering, view: View, flow: np.ndarray | None = None
+) -> None:
+    """Linear colour (RGB), alpha (A) and z-depth (Z), and what saw it in the header.
+
+    `flow` [height, width, 2], pixels right and down, goes to `flow.x` and `flow.y`;
+    where it is NaN they are 0, and so is `flow.A`.
+    """
+    extra = {}
+    if flow is not None:
+        known = np.isfinite(flow).all(axis=-1)
+        right, down = np.moveaxis(np.where(known[..., None], flow, 0), -1, 0)
+        extra = {"flow.x": right, "flow.y": down, "flow.A": known.astype(np.float32)}
+    height, width = rendering.alpha.shape
+    exr.write_exr(
+        path,
+        colour=images.linear_from_srgb(np.clip(rendering.colour, 0, 1)),
+        alpha=rendering.alpha,
+        depth=rendering.depth,
+        extra=extra,
+        header=exr_camera.attributes(view.camera, (width, height), float(view.time)),
+    )
