@@ -35,8 +35,11 @@ def saved(folder, preset, overrides, shaken):
     source = CaptureSource(capture=folder / "filmed")
     run = runs.new_run(RunConfig(preset, source, steps=12, overrides=overrides))
     state, rng = runs.first_state(run), np.random.default_rng(0)
-    params = shaken(state.params, lambda leaf: leaf + 0.1 * rng.normal(size=leaf.shape))
-    state = state._replace(params=jax.tree.map(np.float32, params))
+
+    def shake(leaf):
+        return leaf + np.asarray(0.1 * rng.normal(size=leaf.shape), leaf.dtype)
+
+    state = state._replace(params=shaken(state.params, shake))
     out = folder / "run"
     out.mkdir()
     runs.save_config(out, run)
