@@ -19,7 +19,6 @@ import re
 
 from experiments import cli
 from experiments.benchmark import job
-from nerfies_jax.capture.json_files import write_json
 from nerfies_jax.runs.config import RunConfig
 
 STORED = "benchmark.json"
@@ -77,6 +76,8 @@ def main(arguments=None):
 
 def keep(path: pathlib.Path, label: str, seed: int, scored: dict) -> None:
     """Add one run to the kept numbers, in the place of an older one."""
+    from nerfies_jax.capture.json_files import write_json
+
     stored = json.loads(path.read_text()) if path.exists() else {"runs": {}}
     scored = dict(scored)
     stored["machine"] = scored.pop("machine")

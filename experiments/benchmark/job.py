@@ -4,7 +4,6 @@ import json
 import pathlib
 from typing import Any
 
-from nerfies_jax.capture.json_files import write_json
 from nerfies_jax.runs import platform
 from nerfies_jax.runs.config import RunConfig
 
@@ -17,6 +16,7 @@ def score(
     if not metrics.exists():
         platform.start_jax("cpu", "one")
         from nerfies_jax import runs
+        from nerfies_jax.capture.json_files import write_json
         from nerfies_jax.measure import clock
 
         outcome = runs.reconstruct(config, folder, seconds=seconds)
