@@ -1,11 +1,11 @@
-"""Hard cases of Fourier features and of the window that opens their bands."""
+"""Hard cases of Fourier features, of the window of their bands, and of grids."""
 
 import jax.numpy as jnp
 import mpmath
 import numpy as np
 
 from experiments.hard_cases.case import Case
-from nerfies_jax.nets import encoding
+from nerfies_jax.nets import encoding, grids
 from nerfies_jax.nets.encoding import EncodingSpec
 
 BANDS = 10
@@ -144,4 +144,45 @@ WINDOW = Case(
     timed=np.array([0.3]),
 )
 
-CASES = (HALF_TURNS, PLAIN_WAVES, WINDOW)
+_RAY = (1.0, 0.3, -0.2)
+
+
+def _contracted(contract):
+    return lambda x: contract(x[0] * jnp.asarray(_RAY, x.dtype))
+
+
+def _contracted_as_printed(point):
+    """Both branches of the paper's equation are differentiated, also at the centre."""
+    size = jnp.max(jnp.abs(point))
+    return jnp.where(size > 1, (2 - 1 / size) * (point / size), point)
+
+
+def _exact_contraction(x):
+    size = abs(x[0])
+    factor = (2 - 1 / size) / size if size > 1 else 1
+    return [factor * x[0] * mpmath.mpf(part) for part in _RAY]
+
+
+_DISTANCES = _with_negatives([0, 1e-30, 1e-8, 0.5, *_sides(1.0), 2, 100, 1e8, 1e30])
+CONTRACTION = Case(
+    name="contraction of space",
+    breaks="(2 - 1/|x|) x/|x| in the branch not taken: NaN slope at the centre",
+    formula="the norm held at one there, x / |x| before the factor",
+    switch="the box, |x| = 1",
+    axis="|x|",
+    at=_DISTANCES,
+    inputs=_DISTANCES[:, None],
+    stable=_contracted(grids.contract),
+    textbook=_contracted(_contracted_as_printed),
+    exact=_exact_contraction,
+    bounds={
+        "bfloat16": (1e-2, 2e-2),
+        "float32": (2e-7, 4e-7),
+        "float64": (4e-16, 8e-16),
+    },
+    floors=(1, 1),
+    caught=(("bfloat16", "slope"), ("float32", "slope"), ("float64", "slope")),
+    timed=np.array([0.5]),
+)
+
+CASES = (HALF_TURNS, PLAIN_WAVES, WINDOW, CONTRACTION)
