@@ -36,11 +36,11 @@ def look(
     if path.exists():
         print("gathered before, and read again")
     folder = CACHE / "evidence"
-    evidence = record.cached(capture, folder, tell=_Told(), seconds=seconds)
+    evidence = record.cached(capture, folder, tell=_PartLog(), seconds=seconds)
     views = view_set.in_time_order(record.looked_at(capture, evidence.factor))
-    found = summary.of(views, evidence)
-    print("\n".join(summary.lines(found, evidence)))
-    stored = {"capture": capture.name, "found": as_json(found._asdict())}
+    numbers = summary.of(views, evidence)
+    print("\n".join(summary.lines(numbers, evidence)))
+    stored = {"capture": capture.name, "found": as_json(numbers._asdict())}
     truth = protocol.stored_truth(capture)
     # What other tools found is theirs to judge.
     if truth is not None and capture.given is None:
@@ -64,22 +64,22 @@ def errors_of(capture: Capture, truth: SceneTruth, evidence: Evidence) -> Errors
 
 def error_lines(errors: Errors) -> list[str]:
     """For a person."""
-    said = [
+    lines = [
         f"against the truth: {errors.false_share:.2%} of all pixels are marked as "
         "moving and stand still"
     ]
     if math.isfinite(errors.mask_iou):
-        said.append(f"  mask: intersection over union {errors.mask_iou:.3f}")
+        lines.append(f"  mask: intersection over union {errors.mask_iou:.3f}")
     if math.isfinite(errors.track_px):
-        said.append(
+        lines.append(
             f"  moving points, {LATER} frames on: {errors.track_px:.2f} px off "
             f"(median), {errors.track_lost:.0%} lost"
         )
     if math.isfinite(errors.path_error):
-        said.append(
+        lines.append(
             f"  their places: {errors.path_error:.2%} of the distance off (median)"
         )
-    return said
+    return lines
 
 
 def as_json(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -90,7 +90,7 @@ def as_json(values: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-class _Told:
+class _PartLog:
     """Prints each part as it begins."""
 
     def __init__(self):

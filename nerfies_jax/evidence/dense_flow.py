@@ -123,17 +123,17 @@ def between_neighbours(
 
     def flow(one, other):
         pair = pictures[one], pictures[other]
-        found = reduced(search(*pair), times)
-        if span is None or not wide_steps.is_wide(views, (one, other), found):
-            return found
+        unguided = reduced(search(*pair), times)
+        if span is None or not wide_steps.is_wide(views, (one, other), unguided):
+            return unguided
         if not has_time(FOR_WIDE_STEPS, "a second look at wide steps"):
-            return found
+            return unguided
         small = tuple(_smaller(picture, times) for picture in pair)
         return wide_steps.improved(
             views,
             small,
             (one, other),
-            found,
+            unguided,
             lambda guess: reduced(search(*pair, enlarged_flow(guess, times)), times),
             span,
         )

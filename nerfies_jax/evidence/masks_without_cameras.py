@@ -44,11 +44,11 @@ def moving_masks(images: np.ndarray) -> np.ndarray:
     unplaced = np.zeros((len(off), 3)), off, np.zeros_like(off)
     score = moving.track_scores(tracks, RestPoints(*unplaced))
     share = moving.votes(views, tracks, score)
-    found = moving.mask(views, share, np.zeros_like(share))
+    moves = moving.mask(views, share, np.zeros_like(share))
     width, height = whole.size
     side = 2 * round(RIM_SHARE * width) + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
-    enlarged = (cv2.resize(np.float32(one), (width, height)) > 0.5 for one in found)
+    enlarged = (cv2.resize(np.float32(one), (width, height)) > 0.5 for one in moves)
     return np.stack([cv2.dilate(np.uint8(one), disc) > 0 for one in enlarged])
 
 

@@ -40,14 +40,14 @@ def motion(views: Views, evidence: Evidence) -> Finding:
             CERTAIN,
         )
     if evidence.unusable:
-        found = cannot_tell(EFFECT, evidence.unusable, _threshold())
+        finding = cannot_tell(EFFECT, evidence.unusable, _threshold())
     else:
-        found = _by_tracks(views, evidence)
-    if found.wanted is None:
+        finding = _by_tracks(views, evidence)
+    if finding.wanted is None:
         shapes = outlines.outlines(views)
         if shapes is not None:
             return outlines.motion(views, shapes)
-    return found
+    return finding
 
 
 def _threshold():
@@ -68,21 +68,21 @@ def _by_tracks(views, evidence):
         "masked_share": masked,
         "noise_px": noise,
     }
-    said = (
+    measurement = (
         f"{share:.1%} of what tracks see (up to {shares.max():.1%} of a frame) and "
         f"{masked:.1%} of the pixels move as no still point does; tracks at rest are "
         f"explained to {noise:.2f} px"
     )
     if lost is not None:
-        said += f"; {lost}"
+        measurement += f"; {lost}"
     speed = speeds(views, evidence) if wanted else {}
     if speed:
         numbers |= speed
-        said += (
+        measurement += (
             f"; {speed['speed_px']:.2g} px ({speed['speed_units']:.2g} scene units) a "
             f"frame in the median, {speed['speed_px_fast']:.2g} px the fastest tenth"
         )
-    return Finding(EFFECT, said, _threshold(), wanted, confidence, numbers)
+    return Finding(EFFECT, measurement, _threshold(), wanted, confidence, numbers)
 
 
 def frame_shares(evidence: Evidence) -> np.ndarray:

@@ -115,7 +115,7 @@ def gather(
     if not unusable:
         which = _moved(tracks, score, first)
     measured = _depths(capture, given, views, tracks, rest, score, use_depths)
-    found = _paths(capture, views, tracks, rest, score, which, measured)
+    moved_paths = _paths(capture, views, tracks, rest, score, which, measured)
     watch.begin("still")
     dense = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
     if watch.has_time(FOR_POINTS, "dense points at rest"):
@@ -128,7 +128,7 @@ def gather(
         score=score,
         rest=rest,
         moved=which,
-        paths=found,
+        paths=moved_paths,
         still=dense,
         unusable=unusable,
         factor=factor,
@@ -164,8 +164,8 @@ def _mask(views, flow, tracks, score, watch):
     if watch.has_time(FOR_COLOURS, "what colours say of what moves"):
         still = still_points.dense(views, flow, open_to_doubt)
         odds = still_pictures.log_odds(small, still)
-    found = moving.mask(small, share, odds)
-    return _enlarged(found, height, width) & views.valid
+    masks = moving.mask(small, share, odds)
+    return _enlarged(masks, height, width) & views.valid
 
 
 def _enlarged(masks, height, width):
@@ -249,13 +249,13 @@ def _moved(tracks, score, first):
 
 def _measured(depths, tracks):
     """z-depths of the tracks where they are known and do not jump."""
-    found = np.full(tracks.seen.shape, np.nan)
+    measured = np.full(tracks.seen.shape, np.nan)
     for frame, picture in enumerate(depths):
         here = np.flatnonzero(tracks.seen[:, frame])
         depth = steady_depth(picture)
         at = tracking.pixel_of(tracks.pixel[here, frame], depth.shape)
-        found[here, frame] = depth[at]
-    return found
+        measured[here, frame] = depth[at]
+    return measured
 
 
 def steady_depth(depth: np.ndarray, jump: float = 0.06) -> np.ndarray:
@@ -266,20 +266,20 @@ def steady_depth(depth: np.ndarray, jump: float = 0.06) -> np.ndarray:
 
 def digest(capture: Capture, use_depths: bool = False) -> str:
     """Of all that `gather` looks at."""
-    found = hashlib.blake2b(digest_size=12)
-    found.update(f"evidence {VERSION} {use_depths}".encode())
+    checksum = hashlib.blake2b(digest_size=12)
+    checksum.update(f"evidence {VERSION} {use_depths}".encode())
     parts = [capture.images[capture.train], capture.times, capture.train]
     parts += [np.asarray([capture.near]), *capture.cameras]
     depths = capture.depths if use_depths else None
     given = () if capture.given is None else capture.given
     for name, part in zip(Given._fields, given, strict=False):
-        found.update(f"{name} {part is None}".encode())
+        checksum.update(f"{name} {part is None}".encode())
     parts += [part for part in (capture.valid, depths, *given) if part is not None]
     for part in parts:
         part = np.ascontiguousarray(part)
-        found.update(f"{part.dtype}{part.shape}".encode())
-        found.update(part.data)
-    return found.hexdigest()
+        checksum.update(f"{part.dtype}{part.shape}".encode())
+        checksum.update(part.data)
+    return checksum.hexdigest()
 
 
 def cached(

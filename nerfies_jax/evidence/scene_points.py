@@ -90,8 +90,8 @@ def start(
     threshold = f"{MIN_POINTS} points that cover {COVERED:.0%} of the pictures"
     count = 0 if capture.points is None else len(capture.points.position)
     if count == 0:
-        said = "the capture has no points: Gaussians start at random"
-        return Finding(START, said, threshold, False, CERTAIN, {"points": 0.0})
+        measurement = "the capture has no points: Gaussians start at random"
+        return Finding(START, measurement, threshold, False, CERTAIN, {"points": 0.0})
     covered = coverage(views, points)
     inside = moving_coverage(views, evidence, points)
     enough = judge(count, MIN_POINTS, np.sqrt(count))
@@ -100,22 +100,22 @@ def start(
     wanted, confidence = min(
         (enough, spread), key=lambda one: (one[0] is not False, one[1] == CERTAIN)
     )
-    said = (
+    measurement = (
         f"{count} points in {covered:.0%} of the pictures' {CELLS[0]}x{CELLS[1]} cells"
     )
     numbers = {"points": float(count), "covered_share": covered}
     if np.isfinite(inside):
         numbers["moving_covered_share"] = float(inside)
-        said += f", and on what moves in {inside:.0%} of its cells"
-    return Finding(START, said, threshold, wanted, confidence, numbers)
+        measurement += f", and on what moves in {inside:.0%} of its cells"
+    return Finding(START, measurement, threshold, wanted, confidence, numbers)
 
 
 def background(views: Views, evidence: Evidence, points: np.ndarray) -> Finding:
     """Whether the capture's points stay put, as the background prior needs."""
     threshold = f"{STILL_SHARE:.0%} of them within {AGREES_PX:g} px of the film's paths"
     if not len(points):
-        said = "the capture has no points"
-        return Finding(BACKGROUND, said, threshold, False, CERTAIN)
+        measurement = "the capture has no points"
+        return Finding(BACKGROUND, measurement, threshold, False, CERTAIN)
     seen, agree = np.zeros(len(points)), np.zeros(len(points))
     if not evidence.unusable:
         for frame in _looked_from(views):
@@ -136,9 +136,9 @@ def background(views: Views, evidence: Evidence, points: np.ndarray) -> Finding:
         1 - share, 1 - STILL_SHARE, np.sqrt(share * (1 - share) / count)
     )
     wanted = None if moved is None else not moved
-    said = f"{share:.1%} of {count} points stay with the film's paths"
+    measurement = f"{share:.1%} of {count} points stay with the film's paths"
     numbers = {"still_share": share}
-    return Finding(BACKGROUND, said, threshold, wanted, confidence, numbers)
+    return Finding(BACKGROUND, measurement, threshold, wanted, confidence, numbers)
 
 
 def _stays(views, evidence, frame, points):

@@ -38,8 +38,8 @@ def depth(capture: Capture, views: Views, evidence: Evidence) -> Finding:
     pictures = capture.depths[views.row]
     share = float((pictures > 0).mean())
     if share < KNOWN_SHARE:
-        said = f"depth on {share:.1%} of the pixels"
-        return Finding(DEPTH, said, threshold, False, CERTAIN, {"share": share})
+        measurement = f"depth on {share:.1%} of the pixels"
+        return Finding(DEPTH, measurement, threshold, False, CERTAIN, {"share": share})
     ratio = _over_parallax(pictures, views, evidence)
     if len(ratio) < MIN_POINTS:
         return cannot_tell(
@@ -50,13 +50,13 @@ def depth(capture: Capture, views: Views, evidence: Evidence) -> Finding:
     scale = float(np.median(ratio))
     error = float(np.median(np.abs(ratio / scale - 1)))
     wrong, confidence = judge(error, DEPTH_ERROR, 0.0)
-    said = (
+    measurement = (
         f"depth on {share:.1%} of the pixels, {error:.1%} off parallax in the median "
         f"once scaled by {1 / scale:.3g}"
     )
     numbers = {"share": share, "error_share": error, "scale": 1 / scale}
     wanted = None if wrong is None else not wrong
-    return Finding(DEPTH, said, threshold, wanted, confidence, numbers)
+    return Finding(DEPTH, measurement, threshold, wanted, confidence, numbers)
 
 
 def _over_parallax(pictures, views, evidence):
@@ -79,14 +79,16 @@ def masks(capture: Capture, evidence: Evidence) -> Finding:
     moving = capture.moving[evidence.row]
     share = float(moving.mean())
     numbers = {"share": share}
-    said = f"masks on {share:.1%} of the pixels"
+    measurement = f"masks on {share:.1%} of the pixels"
     if share in (0.0, 1.0):
-        return Finding(MASKS, said, threshold, False, CERTAIN, numbers)
+        return Finding(MASKS, measurement, threshold, False, CERTAIN, numbers)
     tracks = evidence.tracks.take((evidence.score > MOVES) & (not evidence.unusable))
     seen, frames = int(tracks.seen.sum()), int(tracks.seen.any(0).sum())
     if seen < MIN_MOVING:
         return cannot_tell(
-            MASKS, f"{said}, and too little seen to move to check them", threshold
+            MASKS,
+            f"{measurement}, and too little seen to move to check them",
+            threshold,
         )
     row, column = pixel_of(tracks.pixel, moving.shape[1:])
     inside = moving[np.arange(len(moving)), row, column] & tracks.seen
@@ -95,9 +97,9 @@ def masks(capture: Capture, evidence: Evidence) -> Finding:
     error = np.sqrt(part * (1 - part) / frames)
     wrong, confidence = judge(part, MISSED_SHARE, float(error))
     wanted = None if wrong is None else not wrong
-    said += f"; {part:.1%} of what is seen to move lies outside"
+    measurement += f"; {part:.1%} of what is seen to move lies outside"
     return Finding(
-        MASKS, said, threshold, wanted, confidence, numbers | {"missed": part}
+        MASKS, measurement, threshold, wanted, confidence, numbers | {"missed": part}
     )
 
 
@@ -126,7 +128,7 @@ def lens(capture: Capture) -> Finding:
         moved = np.linalg.norm((np.asarray(bent) - slope) * focal, axis=-1)
         worst = max(worst, float(moved.max()))
     wanted, confidence = judge(worst, LENS_PX, 0.0)
-    said = f"the lens moves pixels by up to {worst:.2g} px"
+    measurement = f"the lens moves pixels by up to {worst:.2g} px"
     if wanted:
-        said += "; splats learn from pictures without it and are scored with it"
-    return Finding(LENS, said, threshold, wanted, confidence, {"most_px": worst})
+        measurement += "; splats learn from pictures without it and are scored with it"
+    return Finding(LENS, measurement, threshold, wanted, confidence, {"most_px": worst})

@@ -71,43 +71,44 @@ def of(views: Views, evidence: Evidence) -> Summary:
     )
 
 
-def lines(found: Summary, evidence: Evidence) -> list[str]:
+def lines(summary: Summary, evidence: Evidence) -> list[str]:
     """For a person."""
-    width, height = found.size
-    smaller = f", made {found.factor} times smaller" if found.factor > 1 else ""
+    width, height = summary.size
+    smaller = f", made {summary.factor} times smaller" if summary.factor > 1 else ""
     parts = [
         f"{words} {seconds:.1f}"
         for words, seconds in zip(PARTS, evidence.seconds, strict=True)
     ]
-    took = f"{found.seconds:.0f} s of the processor: " + ", ".join(parts)
-    said = [
-        f"{found.frames} frames of {width}x{height}{smaller}",
-        f"{found.carried:.0%} of the textured pixels can be carried to the next frame",
+    took = f"{summary.seconds:.0f} s of the processor: " + ", ".join(parts)
+    sentences = [
+        f"{summary.frames} frames of {width}x{height}{smaller}",
+        f"{summary.carried:.0%} of the textured pixels can be carried to the next "
+        "frame",
     ]
     if evidence.left_out:
         took += f"; there was no time for {evidence.left_out}"
-    if found.unusable:
-        return [*said, took, f"nothing to follow: {found.unusable}"]
-    said += [
-        f"{found.moving:.1%} of the pixels move by themselves",
-        f"{found.tracks:,} tracks, seen in {found.track_frames:.0f} frames (median); "
-        f"{found.moving_tracks:,} of them move by themselves",
+    if summary.unusable:
+        return [*sentences, took, f"nothing to follow: {summary.unusable}"]
+    sentences += [
+        f"{summary.moving:.1%} of the pixels move by themselves",
+        f"{summary.tracks:,} tracks, seen in {summary.track_frames:.0f} frames "
+        f"(median); {summary.moving_tracks:,} of them move by themselves",
     ]
-    if found.paths:
-        said.append(f"{found.paths:,} paths in space: {_depth_words(found)}")
-        said.append(
-            f"{found.groups} group(s) of rigid motion explain the paths to "
-            f"{found.group_miss:.1%} of the distance"
+    if summary.paths:
+        sentences.append(f"{summary.paths:,} paths in space: {_depth_words(summary)}")
+        sentences.append(
+            f"{summary.groups} group(s) of rigid motion explain the paths to "
+            f"{summary.group_miss:.1%} of the distance"
         )
-    said.append(f"{found.points:,} dense points at rest{_rest_words(found)}")
-    said.append(took)
-    if not found.paths:
-        said.append("nothing to follow: no track moves by itself for long enough")
-    return said
+    sentences.append(f"{summary.points:,} dense points at rest{_rest_words(summary)}")
+    sentences.append(took)
+    if not summary.paths:
+        sentences.append("nothing to follow: no track moves by itself for long enough")
+    return sentences
 
 
-def _depth_words(found):
-    share = found.path_deviation
+def _depth_words(summary):
+    share = summary.path_deviation
     if share > UNCERTAIN:
         return (
             "the film does not tell their depth (the camera gives no parallax, or "
@@ -117,12 +118,12 @@ def _depth_words(found):
     return f"their depth is {sure}, to {share:.1%} (median)"
 
 
-def _rest_words(found):
-    if found.rest_deviation > NO_PARALLAX:
+def _rest_words(summary):
+    if summary.rest_deviation > NO_PARALLAX:
         return ": the camera gives no parallax, so no depth can be told"
-    if not np.isfinite(found.rest_deviation):
+    if not np.isfinite(summary.rest_deviation):
         return "; no track stands still"
-    return f"; the depth of tracks at rest is known to {found.rest_deviation:.1%}"
+    return f"; the depth of tracks at rest is known to {summary.rest_deviation:.1%}"
 
 
 def _median(values):

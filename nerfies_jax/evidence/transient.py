@@ -70,7 +70,7 @@ def transient(views: Views, evidence: Evidence) -> Finding:
             "of the frames",
             threshold,
         )
-    said = (
+    measurement = (
         f"between {times} of {len(gone)} pairs of frames parts of the picture come or "
         f"go (most: {worst[0]:.1%} of the pixels; usual: {usual:.2%})"
     )
@@ -79,7 +79,7 @@ def transient(views: Views, evidence: Evidence) -> Finding:
         "largest_share": float(worst[0]),
         "usual_share": usual,
     }
-    return Finding(EFFECT, said, threshold, wanted, confidence, numbers)
+    return Finding(EFFECT, measurement, threshold, wanted, confidence, numbers)
 
 
 def _above_neighbours(gone):

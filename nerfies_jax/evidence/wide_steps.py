@@ -59,10 +59,10 @@ def improved(
     inverse = share / span[0] + (1 - share) / span[1]
     best, lowest = flow.copy(), OWN * _unlike(pictures, flow)
     for depth in 1 / inverse:
-        found = search(plane_flow(views, pair, depth))
-        cost = _unlike(pictures, found)
+        guided = search(plane_flow(views, pair, depth))
+        cost = _unlike(pictures, guided)
         better = cost < lowest
-        best[better], lowest[better] = found[better], cost[better]
+        best[better], lowest[better] = guided[better], cost[better]
     return best
 
 

@@ -22,11 +22,11 @@ def test_a_folder_gets_masks_that_are_black_on_what_moves(tmp_path):
         images.write_png(film / f"{row:03d}.png", capture.images[row])
     share = masks_without_cameras.write_masks(film, masks)
     read = [images.read_mask(masks / f"{row:03d}.png.png") for row in rows]
-    found, true = ~np.stack(read), capture.moving[rows]
-    assert share == pytest.approx(found.mean())
+    masked, true = ~np.stack(read), capture.moving[rows]
+    assert share == pytest.approx(masked.mean())
     assert true.mean() > 0.15
-    assert found[true].mean() > 0.5
-    assert (~found[~true]).mean() > 0.85
+    assert masked[true].mean() > 0.5
+    assert (~masked[~true]).mean() > 0.85
 
 
 def test_too_few_pictures_say_how_many_it_takes(tmp_path):

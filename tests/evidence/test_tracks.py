@@ -391,11 +391,11 @@ def test_what_was_gathered_is_read_again(tmp_path):
 def test_what_there_is_no_time_for_is_left_out_and_not_kept(tmp_path):
     capture, evidence = gathered()
     assert not evidence.left_out
-    told = []
-    hasty = record.cached(capture, tmp_path, tell=told.append, seconds=1e-6)
+    log = []
+    hasty = record.cached(capture, tmp_path, tell=log.append, seconds=1e-6)
     assert not list(tmp_path.iterdir())
     assert "dense points" in hasty.left_out
-    assert "no time for dense points at rest" in told
+    assert "no time for dense points at rest" in log
     assert not len(hasty.still.position)
     assert 0.3 < len(hasty.score) / len(evidence.score) < 0.7
     true = capture.moving[hasty.row]

@@ -17,17 +17,17 @@ def test_the_command_line_prints_the_table_and_writes_both_files(
     monkeypatch.setattr(platform, "start_jax", lambda *_: None)
     monkeypatch.setattr(platform, "CACHE", tmp_path / "cache")
     nerfies_format.write(films.film(), tmp_path / "film")
-    names = ("sheet.png", "found.json")
-    sheet, found = (tmp_path / name for name in names)
+    names = ("sheet.png", "findings.json")
+    sheet, findings = (tmp_path / name for name in names)
     inspect_scene.main(
-        [str(tmp_path / "film"), "--picture", str(sheet), "--json", str(found)]
+        [str(tmp_path / "film"), "--picture", str(sheet), "--json", str(findings)]
     )
-    said = capsys.readouterr().out
-    assert "splats-static-small" in said
-    assert "nerf-small" in said
+    printed = capsys.readouterr().out
+    assert "splats-static-small" in printed
+    assert "nerf-small" in printed
     assert sheet.stat().st_size > 10_000
     assert len(list((tmp_path / "cache" / "evidence").glob("*.npz"))) == 1
-    stored = json.loads(found.read_text())
+    stored = json.loads(findings.read_text())
     by_name = {one["effect"]: one for one in stored["findings"]}
     assert by_name["motion"]["wanted"] is False
     assert {one["representation"] for one in stored["advice"]} == {

@@ -117,9 +117,9 @@ def test_a_second_pass_that_loses_pictures_is_not_taken(
     pictures, tmp_path, mapper, moving
 ):
     del moving
-    mapper.fails, said = True, []
-    preparation.prepare(pictures, tmp_path / "out", tell=said.append)
-    assert any("only 6 are placed; the first are kept" in line for line in said)
+    mapper.fails, log = True, []
+    preparation.prepare(pictures, tmp_path / "out", tell=log.append)
+    assert any("only 6 are placed; the first are kept" in line for line in log)
     assert not (tmp_path / "out/masks_found").exists()
 
 
