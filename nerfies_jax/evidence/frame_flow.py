@@ -13,7 +13,8 @@ def with_flow(capture: Capture) -> Capture:
     """The capture with flow to the next and the previous frame of the same camera.
 
     Frames that are held out neither give nor get any: what they show is not known while
-    training. As `dense_flow` finds it, in the pictures as they are.
+    training. As `dense_flow` finds it, in the pictures as they are; wide steps of a film
+    are searched again from where a still scene would be.
     """
     width, height = capture.size
     count = len(capture.images)
@@ -28,7 +29,11 @@ def with_flow(capture: Capture) -> Capture:
         if len(mine) < 2:
             continue
         views = view_set.in_time_order(capture, mine)
-        neighbours = dense_flow.between_neighbours(views, dense_flow.levelled(views))
+        # Pictures of one moment are no film: there is nothing to search twice for.
+        film = np.ptp(views.time) > 0
+        span = view_set.depth_span(capture, views) if film else None
+        pictures = dense_flow.levelled(views)
+        neighbours = dense_flow.between_neighbours(views, pictures, span)
         flow.forward[views.row] = neighbours.forward
         flow.forward_seen[views.row] = neighbours.forward_seen & views.valid
         flow.next_row[views.row[:-1]] = views.row[1:]
