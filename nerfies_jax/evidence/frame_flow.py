@@ -13,8 +13,8 @@ def with_flow(capture: Capture) -> Capture:
     """The capture with flow to the next and the previous frame of the same camera.
 
     Frames that are held out neither give nor get any: what they show is not known while
-    training. As `dense_flow` finds it, in the pictures as they are; wide steps of a film
-    are searched again from where a still scene would be.
+    training. As `dense_flow` finds it, in the pictures as they are; wide steps of a
+    film are searched again from where a still scene would be.
     """
     width, height = capture.size
     count = len(capture.images)
