@@ -34,6 +34,10 @@ from nerfies_jax.training.effects import Effect
 from nerfies_jax.training.model import Model, TrainState
 
 SMALL_PIXELS = 176 * 132  # for which the counts of the small presets were chosen
+# Between these advice chooses by whether anything moves.
+ADVISED = ("splats-static", "splats-tracked", "splats-deformable")
+# Of a scene's spec: the motion, and what is nothing without one.
+MOTION_PARTS = ("motion", "neighbours", "alternation", "acceleration", "motion_growth")
 
 
 def growth(spec: Any, state: TrainState) -> float:
@@ -87,22 +91,42 @@ def player(
     return page.write(path, title, model, spec.raster, degree, state, capture, poster)
 
 
-def advise(wanted: dict[str, bool | None], full: bool) -> Choice:
-    """The preset and its changes for what a capture calls for."""
-    del full  # no effect of splats has another size in the papers' presets
+def advise(
+    wanted: dict[str, bool | None], full: bool, family: str | None = None
+) -> Choice:
+    """The preset and its changes for what a capture calls for.
+
+    A `family` that is none of `ADVISED` stays, unless it cannot move and should.
+    """
     overrides, notes = [], []
+    moves = wanted.get(MOTION)
     preset = "splats-deformable"
-    if wanted.get(MOTION) is not None:
-        preset = "splats-tracked" if wanted[MOTION] else "splats-static"
+    if moves is not None:
+        preset = "splats-tracked" if moves else "splats-static"
+    if family is not None and family not in ADVISED:
+        if moves and _spec_of(family, full).motion is None:
+            notes.append(f"{MOTION}: {family} has none; {preset} is taken")
+        else:
+            preset = family
+    spec = _spec_of(preset, full)
+    if moves is False:
+        present = (name for name in MOTION_PARTS if getattr(spec, name) is not None)
+        overrides += [f"{name}=none" for name in present]
     if wanted.get(LIGHT):
         notes.append(f"{LIGHT}: splats have none; prefer the field")
-    if wanted.get(TRANSIENT) and preset == "splats-static":
+    if wanted.get(TRANSIENT) and (moves is False or spec.motion is None):
         notes.append(f"{TRANSIENT}: splats have no medium for it; prefer the field")
     if wanted.get(START) is False:
         overrides.append("init.source=random")
-    if wanted.get(DEPTH):
+    if wanted.get(DEPTH) and spec.depth is None:
         overrides.append("depth.weight=0.1")
+    if wanted.get(DEPTH) is False and spec.depth is not None:
+        overrides.append("depth=none")
     return Choice(preset, tuple(overrides), tuple(notes))
+
+
+def _spec_of(family, full):
+    return presets.PRESETS[family if full else f"{family}-small"]
 
 
 def default_preset(capture: Capture) -> Choice:

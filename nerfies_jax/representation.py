@@ -16,31 +16,61 @@ from nerfies_jax.evaluation.representation import (
 )
 from nerfies_jax.evidence.findings import BACKGROUND, LIGHT, MOTION, TRANSIENT
 
+# Between these advice chooses by whether anything moves.
+ADVISED = ("nerf", "nerfies")
+MOTIONS = ("warp", "time", "scene_flow")
+# What goes with them, in the order in which each can be taken out.
+MOTION_PARTS = ("elastic", "background", "ambient", *MOTIONS)
 
-def advise(wanted: dict[str, bool | None], full: bool) -> Choice:
-    """The preset and its changes for what a capture calls for."""
+
+def advise(
+    wanted: dict[str, bool | None], full: bool, family: str | None = None
+) -> Choice:
+    """The preset and its changes for what a capture calls for.
+
+    A `family` that is none of `ADVISED` stays, unless it cannot move and should.
+    """
     overrides, notes = [], []
     drifts, passes = wanted.get(LIGHT), wanted.get(TRANSIENT)
     preset = "nerf" if wanted.get(MOTION) is False else "nerfies"
-    has_codes = preset == "nerfies" and full
+    if family is not None and family not in ADVISED:
+        if wanted.get(MOTION) and not _parts(_spec_of(family, full), MOTIONS):
+            notes.append(f"{MOTION}: {family} has none; {preset} is taken")
+        else:
+            preset = family
+    spec = _spec_of(preset, full)
+    moves = wanted.get(MOTION) is not False and bool(_parts(spec, MOTIONS))
+    if not moves:
+        overrides += [f"{name}=none" for name in _parts(spec, MOTION_PARTS)]
+    has_codes = spec.appearance is not None
     if drifts and not has_codes:
         overrides.append(f"appearance.width={48 if full else 4}")
     if drifts is False and has_codes:
         overrides.append("appearance=none")
-    if passes and preset == "nerfies":
+    if passes and moves:
         # The medium takes over what moves: on the built-in scene of this name it costs
         # 1.7 dB after 1000 steps, and without a warp it brings 0.9 dB after 700.
         notes.append(
             f"{TRANSIENT}: a medium for it beside a warp was not measured to pay; "
             "what passes is left to the warp"
         )
-    elif passes:
+    elif passes and spec.transient is None:
         size = (16, 4, 128) if full else (8, 2, 48)  # of NeRF-W and of its small preset
         names = ("code_width", "depth", "width")
         overrides += [f"transient.{n}={v}" for n, v in zip(names, size, strict=True)]
-    if preset == "nerfies" and wanted.get(BACKGROUND) is False:
+    if passes is False and spec.transient is not None:
+        overrides.append("transient=none")
+    if moves and spec.background is not None and wanted.get(BACKGROUND) is False:
         overrides.append("background=none")
     return Choice(preset, tuple(overrides), tuple(notes))
+
+
+def _spec_of(family, full):
+    return presets.PRESETS[family if full else f"{family}-small"]
+
+
+def _parts(spec, names):
+    return [name for name in names if getattr(spec, name) is not None]
 
 
 RADIANCE = Representation(

@@ -91,8 +91,9 @@ class Representation(NamedTuple):
     player: Callable[..., Player] | None
     follow: Follow
     mover: Mover
-    # ({effect: whether it is called for, None unknown}, papers' sizes) -> what to take
-    advise: Callable[[dict[str, bool | None], bool], Choice]
+    # ({effect: whether it is called for, None unknown}, papers' sizes, the preset that
+    # the user names, without "-small", or None) -> what to take
+    advise: Callable[[dict[str, bool | None], bool, str | None], Choice]
     # What to take for a capture where the user names no preset.
     default_preset: Callable[[Capture], Choice] | None
     prices: dict[str, Pair]  # by effect, as in `nerfies_jax.evidence.findings`

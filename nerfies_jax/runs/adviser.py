@@ -25,9 +25,14 @@ class Advice:
 
 
 def advise(
-    findings: tuple[Finding, ...], representation: Representation, full: bool = False
+    findings: tuple[Finding, ...],
+    representation: Representation,
+    full: bool = False,
+    family: str | None = None,
 ) -> Advice:
     """What to reconstruct with; `full` takes the papers' sizes, not those for a CPU.
+
+    `family`, a preset without "-small", is kept where it can do what is called for.
 
     What cannot be told keeps what the preset has. Where motion itself cannot be told,
     that is a model that moves: on a still scene it costs time, on a moving one a model
@@ -39,7 +44,7 @@ def advise(
         for effect, choice in wanted.items()
         if choice is None
     ]
-    choice = representation.advise(wanted, full)
+    choice = representation.advise(wanted, full, family)
     return Advice(
         representation.name,
         choice.preset if full else f"{choice.preset}-small",
@@ -56,9 +61,10 @@ def advise_all(findings: tuple[Finding, ...], full: bool = False) -> list[Advice
 
 
 def advise_for(findings: tuple[Finding, ...], preset: str) -> Advice:
-    """In the representation and size of a preset."""
-    full = not preset.endswith("-small")
-    return advise(findings, representations.of_preset(preset), full)
+    """In the family and size of a preset."""
+    family = preset.removesuffix("-small")
+    kind = representations.of_preset(preset)
+    return advise(findings, kind, full=family == preset, family=family)
 
 
 def by_tracks(config: RunConfig, capture: Capture) -> tuple[RunConfig, list[str]]:
@@ -83,7 +89,7 @@ def follow(
 ) -> tuple[RunConfig, list[str]]:
     """A config as advised, and what to tell; the user's own settings come last.
 
-    The preset asked for says which representation and which size.
+    The preset asked for says which representation, which family and which size.
     """
     advice = advise_for(findings, config.preset)
     lines = [

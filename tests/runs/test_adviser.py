@@ -65,6 +65,40 @@ def test_advice_is_followed_but_for_what_the_user_sets():
     assert "effects: --preset splats-tracked-small --set depth.weight=0.1" in lines
 
 
+@pytest.mark.parametrize(
+    ("preset", "motion", "expected"),
+    [
+        ("sonata-small", True, "sonata-small"),
+        ("moba-small", False, "moba-small"),
+        ("hypernerf", None, "hypernerf"),
+        ("nerf-w-small", None, "nerf-w-small"),
+        ("nerf-w-small", True, "nerfies-small"),  # it has no motion
+        ("splats-mcmc-small", True, "splats-tracked-small"),
+    ],
+)
+def test_the_family_stays_where_it_has_what_is_called_for(preset, motion, expected):
+    answers = findings(motion=motion, depth=False, transient_objects=False)
+    config, lines = adviser.follow(RunConfig(preset), answers)
+    assert config.preset == expected
+    family = preset.removesuffix("-small")
+    noted = any(f"motion: {family} has none" in line for line in lines)
+    assert noted == (preset != expected)
+
+
+def test_every_family_can_be_built_with_its_effects_on_and_off():
+    capture = scenes.tiny_capture()
+    for kind in representations.installed().values():
+        for preset in kind.presets:
+            for choice in (True, False):
+                wanted = findings(**dict.fromkeys(EFFECTS, choice))
+                advice = adviser.advise_for(wanted, preset)
+                spec = specs.override(kind.presets[advice.preset], advice.overrides)
+                kind.build(spec, kind.metadata_of(capture, spec))
+                moving = ("motion", "warp", "time", "scene_flow", "ambient")
+                moves = any(getattr(spec, name, None) is not None for name in moving)
+                assert moves == choice, preset
+
+
 def test_what_cannot_be_told_keeps_the_default_that_moves():
     spec, advice = spec_of("gaussians", motion=None)
     assert spec.motion is not None
