@@ -23,6 +23,7 @@ from gaussians_jax.effects.se3_bases import SE3BasesSpec
 from nerfies_jax import field as fields
 from nerfies_jax import presets as field_presets
 from nerfies_jax.effects import ambient, scene_flow, transient, warp
+from nerfies_jax.nets.grids import HashGridSpec
 from nerfies_jax.radiance import template
 from nerfies_jax.scene_metadata import SceneMetadata
 from tests import bare_scenes, scenes
@@ -81,7 +82,11 @@ def counted_out(spec):
         nets["coarse"] = spec.coarse or spec.template
     own["template"] = {}
     for name, one in nets.items():
-        point = 3 * (1 + 2 * one.position.bands) + lifted
+        point = lifted
+        if isinstance(one.position, HashGridSpec):
+            point += one.position.levels * one.position.features
+        else:
+            point += 3 * (1 + 2 * one.position.bands)
         view = 0 if one.direction is None else 3 * (1 + 2 * one.direction.bands)
         own["template"][name] = template.init(one, key, point, view + beside)
     own["codes"] = {name: jnp.zeros(shape) for name, shape in tables.items()}
