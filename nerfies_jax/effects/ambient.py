@@ -144,8 +144,10 @@ def window(
     spec: AmbientSpec, step: Int[Array, ""], like: Float[Array, "..."]
 ) -> Float[Array, " bands"]:
     """How far the bands of the ambient encoding are open after `step` steps."""
-    bands = spec.encoding.bands
-    alpha = schedules.ramp(
-        0.0, float(bands), spec.anneal_steps, after=spec.closed_steps
-    )(step)
-    return encoding.anneal(bands, alpha.astype(like.dtype))
+    return schedules.band_window(
+        spec.encoding.bands,
+        spec.anneal_steps,
+        step,
+        like.dtype,
+        after=spec.closed_steps,
+    )

@@ -135,8 +135,7 @@ def window(
     if spec.anneal_steps is None or spec.position.bands == 0:
         return None
     bands = spec.position.bands
-    alpha = schedules.ramp(0.0, float(bands), spec.anneal_steps)(step)
-    return encoding.anneal(bands, alpha.astype(like.dtype))
+    return schedules.band_window(bands, spec.anneal_steps, step, like.dtype)
 
 
 def _move(spec, params, point, encoded, condition):

@@ -132,8 +132,7 @@ def encode(
     parts = position.levels if grid else position.bands
     window = None
     if spec.anneal_steps is not None and step is not None and parts:
-        opened = schedules.ramp(0.0, float(parts), spec.anneal_steps)(step)
-        window = encoding.anneal(parts, opened.astype(point.dtype))
+        window = schedules.band_window(parts, spec.anneal_steps, step, point.dtype)
     if grid:
         return grids.encode(position, params.tables, point, window)
     return encoding.encode(position, point, window)

@@ -9,7 +9,10 @@ import math
 from collections.abc import Callable
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jax.typing import DTypeLike
+from jaxtyping import Array, Float, Int
+
+from nerfies_jax.nets import encoding
 
 Schedule = Callable[..., Float[Array, "*steps"]]  # of an integer step
 
@@ -66,6 +69,17 @@ def ramp(start: float, end: float, steps: int, *, after: int = 0) -> Schedule:
         return _with_ends(share, start + share * (end - start), start, end)
 
     return schedule
+
+
+def band_window(
+    bands: int, steps: int, step: Int[Array, ""], dtype: DTypeLike, *, after: int = 0
+) -> Float[Array, " bands"]:
+    """Weights of bands, or levels, that open one by one over `steps`, from `after` on.
+
+    Nerfies, equation 14 (Park et al. 2021), coarse to fine; at least one band.
+    """
+    alpha = ramp(0.0, float(bands), steps, after=after)(step)
+    return encoding.anneal(bands, alpha.astype(dtype))
 
 
 def cosine(start: float, end: float, steps: int, *, after: int = 0) -> Schedule:
