@@ -35,6 +35,21 @@ def black_borders(images: np.ndarray) -> np.ndarray | None:
     return borders if borders.any() else None
 
 
+def without_black_borders(
+    images: np.ndarray, valid: np.ndarray | None
+) -> tuple[np.ndarray | None, tuple[str, ...]]:
+    """The mask of filmed pixels without black borders, and a note where there are any.
+
+    None, of all pixels, stays None where no frame has one.
+    """
+    blacked = black_borders(images)
+    if blacked is None:
+        return valid, ()
+    touched = int(blacked.any((1, 2)).sum())
+    notes = (f"{touched} frames have black borders: taken as not filmed",)
+    return ~blacked if valid is None else valid & ~blacked, notes
+
+
 def _rim(pictures):
     """The outermost pixels of [..., height, width] along one axis."""
     sides = (

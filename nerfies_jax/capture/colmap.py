@@ -7,7 +7,7 @@ import numpy as np
 
 from nerfies_jax.capture import frames
 from nerfies_jax.capture import images as pictures
-from nerfies_jax.capture.borders import black_borders
+from nerfies_jax.capture.borders import without_black_borders
 from nerfies_jax.capture.capture import Capture, CaptureError, PointCloud
 from nerfies_jax.capture.colmap_lenses import undistort
 from nerfies_jax.capture.colmap_library import library
@@ -109,15 +109,10 @@ def read(
 
 def _as_pinholes(path, model, files, images, alpha, shrink_by):
     """Pictures, masks and lenses as a capture holds them, and what was done to them."""
-    notes = ()
     size = (images.shape[2], images.shape[1])
     valid = None if alpha is None else alpha == 255
     moving = _masks(path, model.names, size, shrink_by)
-    blacked = black_borders(images)
-    if blacked is not None:
-        valid = ~blacked if valid is None else valid & ~blacked
-        touched = int(blacked.any((1, 2)).sum())
-        notes += (f"{touched} frames have black borders: taken as not filmed",)
+    valid, notes = without_black_borders(images, valid)
     stored = pictures.read_header(files[0]).size
     lenses = [_scaled(lens, stored, size, path) for lens in model.lenses]
     if not all(map(_is_ours, lenses)):

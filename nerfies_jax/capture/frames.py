@@ -71,6 +71,17 @@ def find_picture(folder: pathlib.Path, name: str) -> pathlib.Path | None:
     return None
 
 
+def pictures_in(folder: pathlib.Path) -> list[pathlib.Path]:
+    """Files of a folder that captures are read from, sorted letter by letter."""
+    return sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES)
+
+
+def check_missing(missing: str, where: str) -> None:
+    """Raise for another word than those of `missing`."""
+    if missing not in ("refuse", "skip"):
+        raise CaptureError(f'{where}: missing={missing!r}; expected "refuse" or "skip"')
+
+
 def keep_found(
     paths: Sequence[pathlib.Path | None],
     names: Sequence[str],
@@ -78,8 +89,7 @@ def keep_found(
     where: str,
 ) -> tuple[np.ndarray, tuple[str, ...]]:
     """Rows whose file is there, and a note; an error unless `missing` is "skip"."""
-    if missing not in ("refuse", "skip"):
-        raise CaptureError(f'{where}: missing={missing!r}; expected "refuse" or "skip"')
+    check_missing(missing, where)
     rows = np.array([row for row, path in enumerate(paths) if path is not None], int)
     lost = [name for name, path in zip(names, paths, strict=True) if path is None]
     if not lost:

@@ -7,7 +7,7 @@ import numpy as np
 
 from nerfies_jax.capture import frames
 from nerfies_jax.capture import images as pictures
-from nerfies_jax.capture.borders import black_borders
+from nerfies_jax.capture.borders import without_black_borders
 from nerfies_jax.capture.capture import Capture, CaptureError
 from nerfies_jax.capture.json_files import AnyPath
 from nerfies_jax.capture.points import place_by_points
@@ -43,8 +43,7 @@ def read(
     `heldout` is a number n for every n-th frame, 8 if not given.
     """
     path = pathlib.Path(path)
-    if missing not in ("refuse", "skip"):
-        raise CaptureError(f'{path}: missing={missing!r}; expected "refuse" or "skip"')
+    frames.check_missing(missing, str(path))
     if isinstance(heldout, str):
         raise CaptureError(
             f"{path}: LLFF has no split {heldout!r}; pass a number n to hold out every "
@@ -55,13 +54,11 @@ def read(
     source, shrink_by = frames.choose_source(
         available, poses.size, factor, max_side, str(path)
     )
-    files = _files(available[source])
+    # LLFF's script sorts names letter by letter, too.
+    files = frames.pictures_in(available[source])
     images, alpha = frames.read_frames(files, shrink_by, orientation="stored")
     valid = None if alpha is None else alpha == 255
-    blacked, notes = black_borders(images), ()
-    if blacked is not None:
-        valid = ~blacked if valid is None else valid & ~blacked
-        notes = ("some frames have black borders: taken as not filmed",)
+    valid, notes = without_black_borders(images, valid)
     placed = _placed(poses)
     cameras = _cameras(poses, placed, (images.shape[2], images.shape[1]))
     names = tuple(file.stem for file in files)
@@ -139,18 +136,11 @@ def read_poses(path: pathlib.Path) -> Poses:
     )
 
 
-def _files(folder):
-    """In the order of LLFF's script, which sorts names letter by letter."""
-    return sorted(
-        file for file in folder.iterdir() if file.suffix.lower() in frames.SUFFIXES
-    )
-
-
 def _folders(path, poses):
     """Reduction -> folder with as many pictures as there are poses."""
     available = {}
     for folder in sorted(path.glob("images*")):
-        files = _files(folder) if folder.is_dir() else []
+        files = frames.pictures_in(folder) if folder.is_dir() else []
         if not files:
             continue
         if len(files) != len(poses.positions):

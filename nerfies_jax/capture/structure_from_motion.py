@@ -20,9 +20,9 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from nerfies_jax.capture import frames
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.colmap_library import library
-from nerfies_jax.capture.frames import SUFFIXES
 from nerfies_jax.capture.json_files import AnyPath, new_folder
 
 EXHAUSTIVE_UP_TO = 40  # pictures; above, matching every pair takes most of the time
@@ -130,9 +130,7 @@ def run_sfm(
     images, out = pathlib.Path(images).resolve(), pathlib.Path(out).resolve()
     if not images.is_dir():
         raise CaptureError(f"{images}: no such folder; pass a folder with pictures")
-    names = sorted(
-        file.name for file in images.iterdir() if file.suffix.lower() in SUFFIXES
-    )
+    names = [file.name for file in frames.pictures_in(images)]
     if len(names) < 2:
         raise CaptureError(
             f"{images}: {len(names)} pictures; a reconstruction needs at least 2"

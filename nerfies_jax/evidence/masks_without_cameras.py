@@ -13,8 +13,8 @@ import pathlib
 import cv2
 import numpy as np
 
+from nerfies_jax.capture import frames
 from nerfies_jax.capture import images as pictures_of
-from nerfies_jax.capture.structure_from_motion import SUFFIXES
 from nerfies_jax.evidence import dense_flow, moving, view_set
 from nerfies_jax.evidence import tracks as tracking
 from nerfies_jax.evidence.rest_points import RestPoints
@@ -57,7 +57,7 @@ def write_masks(pictures: pathlib.Path, masks: pathlib.Path) -> float:
 
     As `structure_from_motion.run_sfm` takes them. The share that is black is returned.
     """
-    names = sorted(file.name for file in pictures.iterdir() if file.suffix in SUFFIXES)
+    names = [file.name for file in frames.pictures_in(pictures)]
     if len(names) <= min(LATER):
         raise ValueError(
             f"{pictures}: {len(names)} pictures; what moves shows in more than "
