@@ -120,10 +120,7 @@ def main(arguments=None):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
         args = cli.parse(Export, arguments)
-        representation = representations.of_run(args.run)
-        platform.start_jax(
-            args.device, "all" if representation is None else representation.threads
-        )
+        platform.start_jax(args.device, representations.threads_of_run(args.run))
         from nerfies_jax import runs
         from nerfies_jax.capture.json_files import refuse_existing
 

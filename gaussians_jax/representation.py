@@ -17,7 +17,6 @@ from gaussians_jax import (
 )
 from gaussians_jax.effects.motion_basis import BasisMotionSpec
 from gaussians_jax.player import page
-from nerfies_jax.capture import pinholes
 from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation.representation import (
@@ -135,8 +134,7 @@ def default_preset(capture: Capture) -> Choice:
     Few rigid motions where tracks tell them, no motion where nothing moves, and a
     network where tracks are of no use: without tracks the former come out worse.
     """
-    pictures = pinholes.as_pinholes(capture)
-    evidence = record.cached(pictures, CACHE / "evidence")
+    evidence = record.cached(capture, CACHE / "evidence")
     reason = usable_paths.unusable(evidence)
     name, notes = "splats-tracked-small", []
     if reason and usable_paths.stands_still(evidence, capture.times):

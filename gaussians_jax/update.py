@@ -41,10 +41,8 @@ def descend(
     by_part = _learning_rates(spec, metadata, effects, state.step)
     trained = Trained(apply_updates(state.params, updates, by_part), opt_state)
     if isinstance(spec.densification, MCMCStrategySpec):
-        noise_key, rate = (
-            growth.stream_key(state, growth.NOISE),
-            by_part.rows["splats"].mean,
-        )
+        noise_key = growth.stream_key(state, growth.NOISE)
+        rate = by_part.rows["splats"].mean
         params = mcmc.shake(noise_key, trained.params, rate, spec.densification)
         trained = trained._replace(params=params)
     if spec.alternation is not None:

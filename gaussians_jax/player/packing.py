@@ -78,6 +78,7 @@ class _Arrays:
         self._entries, self._parts, self._size = {}, [], 0
 
     def add(self, name, array, scale=1.0, shift=0.0):
+        """Behind those before; a value is `shift + scale * array`."""
         content = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<"))
         content = content.tobytes()
         self._entries[name] = {
@@ -92,6 +93,7 @@ class _Arrays:
         self._size += len(content)
 
     def packed(self):
+        """All of them."""
         return Packed(self._entries, b"".join(self._parts))
 
 

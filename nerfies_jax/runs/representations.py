@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:  # a record is loaded when it is asked for, not with this module
     from nerfies_jax.evaluation.representation import Representation
 
+from nerfies_jax.runs.platform import Threads
 from nerfies_jax.runs.run_folder import CONFIG
 
 GROUP = "nerfies_jax.representations"
@@ -55,3 +56,9 @@ def of_run(folder: pathlib.Path) -> "Representation | None":
         return named(stored["representation"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
+
+
+def threads_of_run(folder: pathlib.Path) -> Threads:
+    """How many cores XLA:CPU should see for the run in a folder; all if it is none."""
+    representation = of_run(folder)
+    return "all" if representation is None else representation.threads
