@@ -36,7 +36,7 @@ from gaussians_jax.splats import Params
 from gaussians_jax.update import Drawn
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evidence import usable_paths
-from nerfies_jax.training import loop, losses
+from nerfies_jax.training import data_parallel, loop, losses
 from nerfies_jax.training.effects import (
     FIELD_SEAMS,
     Effect,
@@ -107,6 +107,7 @@ def build(
     # Counts updates per row; for the networks, whose rows are never born, it is plain.
     optimiser = OPTIMISERS[spec.optimiser]()
     stages = _stages(spec, metadata, effects)
+    devices = data_parallel.device_count(spec.batch_size)
 
     def whole_frame(params, view, size, step):
         deformed = stages.deform(params, stages.prepare(params), view.time)
@@ -123,13 +124,14 @@ def build(
         # By name alone: a run with other effects of one's own is another run.
         spec=(spec, metadata, *more),
         init=init,
-        step=_stepper(spec, metadata, effects, optimiser),
+        step=_stepper(spec, metadata, effects, optimiser, devices),
         render=whole_frame,
         events=growth.events(spec, metadata, effects, optimiser),
         counts=count_rows,
         required_data=frozenset().union(*(effect.required_data for effect in effects)),
         stages=stages,
         example=example,
+        devices=devices,
     )
 
 
@@ -164,48 +166,77 @@ def _draw(
     )
 
 
-def _stepper(spec, metadata, effects, optimiser):
-    """One update from one frame: (state, frames) -> (state, metrics), pure."""
+def _stepper(spec, metadata, effects, optimiser, devices):
+    """One update from `batch_size` frames: (state, frames) -> (state, metrics), pure."""
+
+    def one_view(index, state, frames):
+        seen = _condition(spec, state, frames, index)
+        return _gradients(spec, metadata, effects, state, frames, *seen)
 
     def step(state: TrainState, frames: Frames):
-        row = shuffled_row(state.key, state.step, len(frames.times))
-        view = _view(frames, row)
         size = frames.images.shape[2], frames.images.shape[1]
-        degree = splats.active_degree(state.step, spec.sh_every, spec.sh_degree)
-        condition = FrameCondition(view.time, step=state.step, key=loop.step_key(state))
-
-        def deform(params, gaussians):
-            return deformation.deform_in_training(effects, params, gaussians, condition)
-
-        if spec.alternation is not None:
-            mask = phases.update_mask(spec.alternation, state.step)
-            deform = phases.stop_frozen_gradients(mask, deform)
-        depth = draws_depth(effects, frames)
-
-        def loss(params, probe):
-            canonical = splats.activate(params.rows["splats"])
-            moved = deform(params, canonical)
-            frame = _draw(
-                spec, metadata, params, moved, view, size, degree, probe, depth
+        if spec.batch_size == 1:
+            each = [one_view(0, state, frames)]
+            means = each[0][:2]
+        else:
+            stacked = data_parallel.on_devices(
+                one_view, spec.batch_size, devices, state, frames
             )
-            seen = observe(frames, row, frame.rendering)
-            states = state.aux_state.effects
-            value, metrics = loss_of(spec, effects, params, seen, condition, states)
-            return value, (metrics, frame.footprints, canonical, moved)
-
-        probe = jnp.zeros_like(state.params.rows["splats"].mean[:, :2])
-        (value, (metrics, *drawn)), (grads, mean2d_grad) = jax.value_and_grad(
-            loss, argnums=(0, 1), has_aux=True
-        )(state.params, probe)
+            means = jax.tree.map(lambda leaf: leaf.mean(0), stacked[:2])
+            each = [
+                jax.tree.map(lambda leaf, index=index: leaf[index], stacked)
+                for index in range(spec.batch_size)
+            ]
+        metrics, grads = means
         trained = update.descend(spec, metadata, effects, optimiser, state, grads)
-        drawn = Drawn(mean2d_grad, *drawn)
-        aux_state = update.gather(
-            spec, effects, state.aux_state, drawn, condition, size
-        )
+        aux_state = state.aux_state
+        for index, (_, _, drawn) in enumerate(each):
+            _, condition = _condition(spec, state, frames, index)
+            aux_state = update.gather(spec, effects, aux_state, drawn, condition, size)
         state = TrainState(*trained, aux_state, state.step + 1, state.key)
-        return state, {"loss": value, **metrics}
+        return state, metrics
 
     return step
+
+
+def _condition(spec, state, frames, index):
+    """The frame that is the `index`-th of a step's batch, and its condition."""
+    visit = state.step * spec.batch_size + index
+    row = shuffled_row(state.key, visit, len(frames.times))
+    key = loop.step_key(state)
+    if spec.batch_size > 1:
+        key = jax.random.fold_in(key, index)
+    return row, FrameCondition(frames.times[row], step=state.step, key=key)
+
+
+def _gradients(spec, metadata, effects, state, frames, row, condition):
+    """Metrics, slopes and what was drawn of one frame."""
+    view = _view(frames, row)
+    size = frames.images.shape[2], frames.images.shape[1]
+    degree = splats.active_degree(state.step, spec.sh_every, spec.sh_degree)
+
+    def deform(params, gaussians):
+        return deformation.deform_in_training(effects, params, gaussians, condition)
+
+    if spec.alternation is not None:
+        mask = phases.update_mask(spec.alternation, state.step)
+        deform = phases.stop_frozen_gradients(mask, deform)
+    depth = draws_depth(effects, frames)
+
+    def loss(params, probe):
+        canonical = splats.activate(params.rows["splats"])
+        moved = deform(params, canonical)
+        frame = _draw(spec, metadata, params, moved, view, size, degree, probe, depth)
+        seen = observe(frames, row, frame.rendering)
+        states = state.aux_state.effects
+        value, metrics = loss_of(spec, effects, params, seen, condition, states)
+        return value, (metrics, frame.footprints, canonical, moved)
+
+    probe = jnp.zeros_like(state.params.rows["splats"].mean[:, :2])
+    (value, (metrics, *drawn)), (grads, mean2d_grad) = jax.value_and_grad(
+        loss, argnums=(0, 1), has_aux=True
+    )(state.params, probe)
+    return {"loss": value, **metrics}, grads, Drawn(mean2d_grad, *drawn)
 
 
 def draws_depth(effects: tuple[Effect, ...], frames: Frames) -> bool:

@@ -40,6 +40,7 @@ class SplatScene:
     """Which scene of Gaussians; `None` for an effect means that it is not there."""
 
     steps: int
+    batch_size: int = 1  # views a step
     init: InitSpec = InitSpec()
     sh_degree: int = 3
     sh_every: int = steps(1000)  # steps between one degree and the next
@@ -61,6 +62,8 @@ class SplatScene:
     def __post_init__(self):
         if self.steps < 1:
             raise ValueError(f"steps={self.steps}: train for at least one step")
+        if self.batch_size < 1:
+            raise ValueError(f"batch_size={self.batch_size}: a step takes a view")
         if not 0 <= self.sh_degree <= 3:
             raise ValueError(f"sh_degree={self.sh_degree} must be 0, 1, 2 or 3")
         if not 0 <= self.dssim_weight <= 1:

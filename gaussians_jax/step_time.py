@@ -8,7 +8,7 @@ from gaussians_jax.effects import deformation
 from gaussians_jax.spec import OPTIMISERS
 from gaussians_jax.update import Drawn
 from nerfies_jax.measure.part_time import part_ms
-from nerfies_jax.training import losses
+from nerfies_jax.training import data_parallel, losses
 from nerfies_jax.training.effects import (
     Effect,
     FrameCondition,
@@ -29,18 +29,19 @@ def parts(
 ) -> dict[str, float]:
     """Milliseconds of each part of one step, forward and backward; medians, warm.
 
-    Each part is timed by itself on the first frame; "rest" is what they leave of the
-    whole step.
+    Each part is timed by itself on the first frame and one device, and counted for as
+    many views as a device draws in a step; "rest" is what they leave of the whole step.
     """
     effects = scene.all_effects(spec, metadata, effects)
     condition = FrameCondition(frames.times[0], step=state.step, key=state.key)
     drawing, footprints = _drawing(spec, effects, state, frames)
-    timed = {
-        **drawing,
-        **_own_of_effects(effects, state, frames, condition),
-        **_update(spec, metadata, effects, state, footprints, condition, frames),
-    }
-    whole = part_ms(model.step, state, frames)
+    a_view = drawing | _own_of_effects(effects, state, frames, condition)
+    views = spec.batch_size // model.devices
+    timed = {name: views * each for name, each in a_view.items()}
+    timed |= _update(spec, metadata, effects, state, footprints, condition, frames)
+    whole = part_ms(
+        model.step, *data_parallel.replicate((state, frames), model.devices)
+    )
     return timed | {"rest": max(whole - sum(timed.values()), 0.0)}
 
 

@@ -27,6 +27,7 @@ from nerfies_jax.evidence import (
     moving,
     paths,
     rest_points,
+    rigid_bodies,
     still_pictures,
     still_points,
     taken,
@@ -40,7 +41,7 @@ from nerfies_jax.evidence.tracks import Tracks
 from nerfies_jax.evidence.view_set import Views
 from nerfies_jax.evidence.watch import ENOUGH_SECONDS, Seconds, Watch
 
-VERSION = 5  # of the file; counts up whenever the same pictures would say otherwise
+VERSION = 6  # of the file; counts up whenever the same pictures would say otherwise
 # A path has as many frames at least, and a film as many; fewer say nothing of motion.
 SHORTEST_PATH, SHORTEST_FILM = 10, 6
 MOVES = 0.5  # score from which a track counts as moving
@@ -197,8 +198,11 @@ def _paths(capture, views, tracks, rest, score, which, depths):
     around = paths.depth_around(
         moved, tracks.take(still), rest.take(still), capture.near
     )
-    measured = None if depths is None else _measured(depths, moved)
-    return paths.least_acceleration(views, moved, capture.near, around, measured)
+    if depths is not None:
+        measured = _measured(depths, moved)
+        return paths.least_acceleration(views, moved, capture.near, around, measured)
+    alone = paths.least_acceleration(views, moved, capture.near, around)
+    return rigid_bodies.refined(views, moved, alone)
 
 
 def looked_at(capture: Capture, factor: int) -> Capture:

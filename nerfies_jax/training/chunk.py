@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from nerfies_jax.training import data_parallel
+
 
 class Outcome(NamedTuple):
     """What a chunk reports beside its state; scalars."""
@@ -92,10 +94,12 @@ def _check_same(before, after):
             )
 
 
-def compiled(step, state, frames):
+def compiled(step, state, frames, devices=1):
     """The program for these shapes, and the seconds it took to make it (0 if kept).
 
-    Called with (state, frames, count); the state given to it is overwritten.
+    Called with (state, frames, count); the state given to it is overwritten. Of a step
+    that works on several devices, state and outcome are on the first of them, `frames`
+    on all (`data_parallel.replicate`).
     """
     programs = _programs(step)
     leaves, structure = jax.tree.flatten((state, frames))
@@ -104,7 +108,17 @@ def compiled(step, state, frames):
         return programs[key], 0.0
     began = time.perf_counter()
     chunk = jax.jit(functools.partial(_run_chunk, step), donate_argnums=0)
-    programs[key] = chunk.lower(state, frames, np.int32(1)).compile()
+    spread = data_parallel.replicate(state, devices)
+    program = chunk.lower(spread, frames, np.int32(1)).compile()
+    if devices == 1:
+        programs[key] = program
+    else:
+
+        def on_all(state, frames, count):
+            state = data_parallel.replicate(state, devices)
+            return data_parallel.first_copy(program(state, frames, count), devices)
+
+        programs[key] = on_all
     return programs[key], time.perf_counter() - began
 
 

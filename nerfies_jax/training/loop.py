@@ -11,6 +11,7 @@ import numpy as np
 import rich.console
 from jaxtyping import Array, Key
 
+from nerfies_jax.training import data_parallel
 from nerfies_jax.training.checkpoint import Checkpoints
 from nerfies_jax.training.chunk import compiled
 from nerfies_jax.training.guard import Snapshot, bad_arrays, last_good, listed
@@ -121,6 +122,7 @@ class _Run:
             )
         self.events = _by_step(events)
         self.frames = jax.tree.map(jnp.asarray, frames)
+        self.spread_frames = data_parallel.replicate(self.frames, model.devices)
         self.saved_at = time.monotonic()
         self.step_seconds = math.inf  # not known yet: the first chunk is one step
         self.called = {hook.name: [self.step, None] for hook in hooks}
@@ -143,7 +145,7 @@ class _Run:
             if self._left() <= 0:
                 return "seconds"
             program, compile_seconds = compiled(
-                self.model.step, self.state, self.frames
+                self.model.step, self.state, self.spread_frames, self.model.devices
             )
             self._add(compile_seconds=compile_seconds)
             if not self._chunk(program):
@@ -155,12 +157,12 @@ class _Run:
         """Run one chunk and the events at its end; false where something blew up."""
         count = self._count()
         began = time.perf_counter()
-        self.state, outcome = program(self.state, self.frames, np.int32(count))
+        self.state, outcome = program(self.state, self.spread_frames, np.int32(count))
         outcome = jax.device_get(outcome)  # waits
         done = int(outcome.done)
         if not outcome.finite:
             self.state, self.step, self.detail = last_good(
-                program, self.snapshot, self.frames, self.step, self.step + done
+                program, self.snapshot, self.spread_frames, self.step, self.step + done
             )
             return False
         if int(outcome.step) != self.step + done:
@@ -175,7 +177,7 @@ class _Run:
             count = np.int32(self.step + done - 1 - self.snapshot.step)
             self.state, self.step = self.snapshot.state(), self.step + done - 1
             if count:
-                self.state, _ = program(self.state, self.frames, count)
+                self.state, _ = program(self.state, self.spread_frames, count)
             return False
         self.step += done
         self.step_seconds = elapsed / done

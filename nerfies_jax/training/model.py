@@ -115,3 +115,4 @@ class Model(NamedTuple):
     stages: Stages | None = None  # where rendering has parts worth keeping
     # As `init`, of the same structure and quicker: what a checkpoint is read into.
     example: Callable[[Any, Any], TrainState] | None = None
+    devices: int = 1  # on which `step` works, by `data_parallel`

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from nerfies_jax.training import data_parallel
 from nerfies_jax.training.chunk import compiled
 from nerfies_jax.training.model import Frames, Model, TrainState
 
@@ -31,7 +32,8 @@ def step_time(model: Model, state: TrainState, frames: Frames, steps: int) -> St
     Whatever grows later is not seen.
     """
     frames = jax.tree.map(jnp.asarray, frames)
-    program, compile_seconds = compiled(model.step, state, frames)
+    frames = data_parallel.replicate(frames, model.devices)
+    program, compile_seconds = compiled(model.step, state, frames, model.devices)
 
     def timed(start, count):
         began = time.perf_counter()

@@ -1,0 +1,210 @@
+"""One rigid thing seen by cameras that are known: its points and its pose per frame.
+
+Bundle adjustment (Triggs et al. 2000, "Bundle adjustment - a modern synthesis") by
+Levenberg and Marquardt, points eliminated by Schur's complement. What is found is right
+but for one factor of all distances to the cameras, which stays nearly as it was given.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from nerfies_jax.evidence.tracks import Tracks
+from nerfies_jax.evidence.view_set import Views
+
+ROUNDS = 40
+SOFT_PX = 0.5  # misses beyond it count less and less (Cauchy)
+# Of the second differences of the poses, in pixels over the distance: next to nothing,
+# and enough where nothing of the thing is seen.
+BEND_PX = 0.1
+POINT_PRIOR = 1e-3  # of what the observations of a typical point say
+DAMPING, LEAST_DAMPING, TRIES = 1e-4, 1e-8, 8
+CONVERGED = 1e-5  # share of the cost that a round still gains
+NEAR = 1e-6  # z-depth over the typical one: what comes nearer is held there
+
+
+class Body(NamedTuple):
+    """Points of a thing, and where it is: world = rotation @ body + shift."""
+
+    point: np.ndarray  # [points, 3] scene units, body axes
+    rotation: np.ndarray  # [frames, 3, 3]
+    shift: np.ndarray  # [frames, 3] scene units
+
+    def world(self) -> np.ndarray:
+        """[points, frames, 3]."""
+        return np.einsum("fij,nj->nfi", self.rotation, self.point) + self.shift
+
+
+class Sight(NamedTuple):
+    """Where tracks were seen, one entry for each track and frame."""
+
+    track: np.ndarray  # [entries]
+    frame: np.ndarray  # [entries]
+    place: np.ndarray  # [entries, 2] px, from the principal point
+    to_px: np.ndarray  # [entries, 2, 3] camera axes to pixels times depth
+
+
+def sight(views: Views, tracks: Tracks, known: np.ndarray) -> Sight:
+    """Of the tracks where they are `known` [tracks, frames]."""
+    track, frame = np.nonzero(known)
+    centre = views.intrinsics[frame, :2, 2]
+    to_px = views.intrinsics[frame, :2].copy()
+    to_px[:, :, 2] = 0
+    return Sight(track, frame, tracks.pixel[track, frame] - centre, to_px)
+
+
+def misses(views: Views, seen: Sight, body: Body) -> np.ndarray:
+    """[entries] px."""
+    return np.linalg.norm(_projected(views, seen, body)[0], axis=-1)
+
+
+def _projected(views, seen, body):
+    """[entries, 2] px off, and the slope [entries, 2, 3] by the place in the world."""
+    turned = np.einsum("oij,oj->oi", body.rotation[seen.frame], body.point[seen.track])
+    away = turned + (body.shift - views.position)[seen.frame]
+    local = np.einsum("oij,oj->oi", views.rotation[seen.frame], away)
+    depth = np.maximum(local[:, 2], NEAR * np.median(np.abs(local[:, 2])))
+    pixel = np.einsum("oij,oj->oi", seen.to_px, local) / depth[:, None]
+    slope = seen.to_px.copy()
+    slope[:, :, 2] = -pixel
+    slope = slope / depth[:, None, None] @ views.rotation[seen.frame]
+    return pixel - seen.place, slope, turned
+
+
+def adjusted(views: Views, seen: Sight, body: Body) -> Body:
+    """The body that fits what was seen of it, from one nearby."""
+    bend = _bend(views, body)
+    cost, damping = _cost(views, seen, body, bend), DAMPING
+    for _ in range(ROUNDS):
+        system = _system(views, seen, body, bend)
+        for _ in range(TRIES):
+            moved = _moved(body, system, damping)
+            new = _cost(views, seen, moved, bend)
+            if new < cost:
+                break
+            damping *= 10
+        else:
+            break
+        gained, cost, body = cost - new, new, moved
+        damping = max(damping / 10, LEAST_DAMPING)
+        if gained < CONVERGED * cost:
+            break
+    return body
+
+
+def _bend(views, body):
+    """[frames, frames] weight of second differences of shifts and turns."""
+    frames = len(body.shift)
+    second = np.diff(np.eye(frames), 2, axis=0)
+    distance = np.median(np.linalg.norm(body.shift - views.position, axis=-1))
+    return (BEND_PX / max(distance, 1e-30)) ** 2 * second.T @ second
+
+
+def _cost(views, seen, body, bend):
+    miss_sq = (_projected(views, seen, body)[0] ** 2).sum(-1)
+    robust = SOFT_PX**2 * np.log1p(miss_sq / SOFT_PX**2).sum()
+    return robust + np.einsum("fi,fg,gi->", body.shift, bend, body.shift)
+
+
+class _System(NamedTuple):
+    poses: np.ndarray  # [6 frames, 6 frames]
+    points: np.ndarray  # [points, 3, 3]
+    both: np.ndarray  # [points, 6 frames, 3]
+    pose_slope: np.ndarray  # [6 frames]
+    point_slope: np.ndarray  # [points, 3]
+
+
+def _system(views, seen, body, bend):
+    """The normal equations of one round, weights as the misses are."""
+    miss, slope, turned = _projected(views, seen, body)
+    weight = 1 / (1 + (miss**2).sum(-1) / SOFT_PX**2)
+    by_turn = np.cross(turned[:, None], slope)
+    by_pose = np.concatenate([slope, by_turn], axis=-1)
+    by_point = slope @ body.rotation[seen.frame]
+    frames, points = len(body.shift), len(body.point)
+
+    def gathered(left, right, rows, where):
+        """Sums of left' weight right over the entries of each row."""
+        product = np.einsum("o,oki,okj->oij", weight, left, right)
+        total = np.zeros((rows, *product.shape[1:]))
+        np.add.at(total, where, product)
+        return total
+
+    own = gathered(by_pose, by_pose, frames, seen.frame)
+    poses = np.zeros((frames, 6, frames, 6))
+    poses[np.arange(frames), :, np.arange(frames)] = own
+    for part in range(6):
+        poses[:, part, :, part] += bend
+    both = np.zeros((points, frames, 6, 3))
+    both[seen.track, seen.frame] = np.einsum(
+        "o,oki,okj->oij", weight, by_pose, by_point
+    )
+    off = miss[..., None]
+    pose_slope = gathered(by_pose, off, frames, seen.frame)[..., 0]
+    pose_slope[:, :3] += bend @ body.shift
+    return _System(
+        poses.reshape(6 * frames, 6 * frames),
+        gathered(by_point, by_point, points, seen.track),
+        both.reshape(points, 6 * frames, 3),
+        pose_slope.ravel(),
+        gathered(by_point, off, points, seen.track)[..., 0],
+    )
+
+
+def _moved(body, system, damping):
+    size = np.einsum("nii->n", system.points) / 3
+    ridge = damping * size + POINT_PRIOR * max(np.median(size), 1e-30)
+    inverse = np.linalg.inv(system.points + ridge[:, None, None] * np.eye(3))
+    matrix = system.poses.copy()
+    diagonal = np.diagonal(matrix)
+    ridge = damping * diagonal + 1e-6 * np.median(diagonal) + 1e-30
+    matrix[np.diag_indices(len(matrix))] += ridge
+    onto = system.both @ inverse
+    flat = (len(matrix), -1)
+    matrix -= onto.transpose(1, 0, 2).reshape(flat) @ (
+        system.both.transpose(1, 0, 2).reshape(flat).T
+    )
+    right = np.einsum("nij,nj->i", onto, system.point_slope) - system.pose_slope
+    pose = np.linalg.solve(matrix, right)
+    back = system.point_slope + np.einsum("nij,i->nj", system.both, pose)
+    point = body.point - np.einsum("nij,nj->ni", inverse, back)
+    pose = pose.reshape(-1, 6)
+    turn = Rotation.from_rotvec(pose[:, 3:]).as_matrix()
+    return Body(point, turn @ body.rotation, body.shift + pose[:, :3])
+
+
+def placed(views: Views, seen: Sight, body: Body) -> Body:
+    """The points that fit best where the thing is taken to be."""
+    point = body.point.copy()
+    for _ in range(ROUNDS // 4):
+        miss, slope, _ = _projected(views, seen, body._replace(point=point))
+        weight = 1 / (1 + (miss**2).sum(-1) / SOFT_PX**2)
+        by_point = slope @ body.rotation[seen.frame]
+        matrix, right = np.zeros((len(point), 3, 3)), np.zeros((len(point), 3))
+        np.add.at(
+            matrix, seen.track, np.einsum("o,oki,okj->oij", weight, by_point, by_point)
+        )
+        np.add.at(
+            right, seen.track, np.einsum("o,oki,ok->oi", weight, by_point, miss)
+        )
+        size = np.einsum("nii->n", matrix) / 3
+        ridge = POINT_PRIOR * (size + max(np.median(size), 1e-30))
+        matrix += ridge[:, None, None] * np.eye(3)
+        point = point - np.linalg.solve(matrix, right[..., None])[..., 0]
+    return body._replace(point=point)
+
+
+def scaled(views: Views, body: Body, factor: float) -> Body:
+    """The same pictures from a thing so many times as large and as far away."""
+    shift = views.position + factor * (body.shift - views.position)
+    return Body(factor * body.point, body.rotation, shift)
+
+
+def typical_misses(seen: Sight, miss: np.ndarray, tracks: int) -> np.ndarray:
+    """[tracks] the median of each track's misses, px; infinite where never seen."""
+    ordered = np.lexsort((miss, seen.track))
+    count = np.bincount(seen.track, minlength=tracks)
+    first = np.concatenate([[0], np.cumsum(count)[:-1]])
+    at = np.minimum(first + count // 2, len(miss) - 1)
+    return np.where(count > 0, miss[ordered][at], np.inf)

