@@ -2,8 +2,8 @@
 
 OpenCV's DIS (Kroeger et al. 2016, arXiv:1603.03590) on pictures brought to one mean and
 contrast. Only neighbours are compared: over longer gaps patterns that repeat are taken
-for each other. Where an area is lost even so, it is looked for where its last motion
-would take it.
+for each other. Where an area is lost even so, or jumps, it is looked for where its last
+motion would take it.
 """
 
 from collections.abc import Callable
@@ -26,6 +26,9 @@ FOR_WIDE_STEPS = 0.4  # of the time: then none is left to look at them again
 # to a frame and is lost there. Patterns that repeat are taken for each other in some
 # frames: the turning cube of the built-in scenes lost all its tracks in one of them.
 LOST_SHARE = 0.06
+# Of the width, from one frame to the next: what turns that sharply is looked at again,
+# and goes on as it came where that looks as alike. A checker of the fast cube is 0.06.
+JUMP_SHARE, AS_ALIKE = 0.03, 1.1
 
 
 class NeighbourFlow(NamedTuple):
@@ -144,7 +147,7 @@ def between_neighbours(
         backward[frame + 1] = flow(frame + 1, frame)
     checked_flow = checked(forward, backward)
     for frame in range(1, frames - 1):
-        if _lost(checked_flow, frame):
+        if _lost(checked_flow, frame) or _jumps(checked_flow, frame):
             _go_on(checked_flow, frame, pictures, search)
     return checked_flow
 
@@ -164,7 +167,17 @@ def checked(forward: np.ndarray, backward: np.ndarray) -> NeighbourFlow:
 
 def _lost(flow, frame):
     """Whether a coherent area was carried to a frame and not from there."""
-    area = flow.backward_seen[frame] & ~flow.forward_seen[frame]
+    return _is_wide(flow.backward_seen[frame] & ~flow.forward_seen[frame])
+
+
+def _jumps(flow, frame):
+    """Whether a coherent area leaves a frame otherwise than it came."""
+    turned = np.linalg.norm(flow.forward[frame] + flow.backward[frame], axis=-1)
+    both = flow.backward_seen[frame] & flow.forward_seen[frame]
+    return _is_wide(both & (turned > JUMP_SHARE * turned.shape[1]))
+
+
+def _is_wide(area):
     side = 2 * round(LOST_SHARE * area.shape[1] / 2) + 1
     # Nothing lies outside: strips at the border leave the picture.
     outside = {"borderType": cv2.BORDER_CONSTANT, "borderValue": 0}
@@ -184,11 +197,15 @@ def _go_on(flow, frame, pictures, search):
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height))
     at = x - there[..., 0], y.astype(np.float32) - there[..., 1]
     back = again(frame + 1, frame, -cv2.remap(there, *at, cv2.INTER_LINEAR))
+    small = [_smaller(pictures[index], times) for index in (frame, frame + 1)]
     for here, shift, seen, new, other in (
         (frame, flow.forward, flow.forward_seen, there, back),
         (frame + 1, flow.backward, flow.backward_seen, back, there),
     ):
-        better = closed(new, other) & ~seen[here]
+        old, pair = shift[here], small if here == frame else small[::-1]
+        apart = np.linalg.norm(new - old, axis=-1) > JUMP_SHARE * width
+        alike = wide_steps.unlike(pair, new) < AS_ALIKE * wide_steps.unlike(pair, old)
+        better = closed(new, other) & (~seen[here] | (apart & alike))
         shift[here][better], seen[here][better] = new[better], True
 
 

@@ -23,6 +23,7 @@ WITHIN_PX = 2 * TRACK_PX  # of a track that is on a body; half of them within on
 # paths are as good as its body.
 BADLY_TOLD = 0.05
 FEWEST_SEEN = 6  # tracks in a frame in which a body's place is known
+GROWTHS = 5  # rounds in which a body is followed into more frames
 LEAST_KNOWN = 6  # frames in which a path is known
 
 
@@ -44,15 +45,11 @@ def refined(views: Views, tracks: Tracks, paths: Paths) -> Paths:
         own = np.flatnonzero((label == group) & left)
         if len(own) < FEWEST or np.median(paths.depth_deviation[own]) < BADLY_TOLD:
             continue
-        body = _body(views, tracks, paths, own)
-        if body is None:
-            continue
         rows = np.flatnonzero(left)
-        body, miss = _on(views, tracks, paths, body, rows)
-        fits = miss < WITHIN_PX
-        if np.median(miss[fits]) > TRACK_PX:
+        grown = _grown(views, tracks, paths, own, rows)
+        if grown is None:
             continue
-        own, body = rows[fits], body._replace(point=body.point[fits])
+        own, body = grown
         position[own], known[own] = _at_paths_scale(views, paths, own, body)
         left[own] = False
     depth = np.einsum(
@@ -61,10 +58,35 @@ def refined(views: Views, tracks: Tracks, paths: Paths) -> Paths:
     return Paths(position, known, depth, paths.depth_deviation)
 
 
+def _grown(views, tracks, paths, own, rows):
+    """Which of the paths are on the rigid thing that `own` are on, and the thing.
+
+    None where they are on none. From the frames in which it is known, it is followed
+    into others by the tracks that it shares with them.
+    """
+    body = None
+    for _ in range(GROWTHS):
+        found = _body(views, tracks, paths, own)
+        if found is None:
+            break
+        own, body = found
+        there = paths.known[own].sum(0) >= FEWEST_SEEN
+        fits = _on(views, tracks, paths, body, rows, there)[1] < WITHIN_PX
+        if fits.sum() <= len(own):
+            break
+        own = rows[fits]
+    if body is None:
+        return None
+    body, miss = _on(views, tracks, paths, body, rows, there)
+    fits = miss < WITHIN_PX
+    if fits.sum() < FEWEST or np.median(miss[fits]) > TRACK_PX:
+        return None
+    return rows[fits], body._replace(point=body.point[fits])
+
+
 def _body(views, tracks, paths, own):
-    """What the tracks are on, if they are on one rigid thing; None otherwise."""
-    if len(own) > MOST:
-        own = own[np.argsort(-paths.known[own].sum(1), kind="stable")[:MOST]]
+    """The one rigid thing that most of the tracks are on, and those; None for none."""
+    own = _fewer(paths, own)
     for _ in range(2):  # once more without those that are on something else
         body = _first(paths, own)
         seen = bundle.sight(views, tracks.take(own), paths.known[own])
@@ -76,7 +98,13 @@ def _body(views, tracks, paths, own):
         if fits.all():
             break
         own = own[fits]
-    return body
+    return own[fits], body
+
+
+def _fewer(paths, own):
+    """At most `MOST`, those first that are seen where few are."""
+    rare = paths.known[own] / np.maximum(paths.known[own].sum(0), 1)
+    return own[np.argsort(-rare.sum(1), kind="stable")[:MOST]]
 
 
 def _first(paths, own):
@@ -89,14 +117,20 @@ def _first(paths, own):
     return Body(point - middle, motion.rotation[0], shift)
 
 
-def _on(views, tracks, paths, body, rows):
-    """The body with a point for each of the paths, and by how much they miss, px."""
+def _on(views, tracks, paths, body, rows, there):
+    """The body with a point for each of the paths, and by how much they miss, px.
+
+    By the frames that are `there`; infinite where a path is known in too few of them.
+    """
+    known = paths.known[rows] & there
     local = paths.position[rows] - body.shift
     local = np.einsum("fji,nfj->nfi", body.rotation, local)
-    local = np.where(paths.known[rows][..., None], local, np.nan)
-    whole = body._replace(point=np.nanmedian(local, axis=1))
-    seen = bundle.sight(views, tracks.take(rows), paths.known[rows])
-    whole = bundle.placed(views, seen, whole)
+    local = np.where(known[..., None], local, np.nan)
+    enough = known.sum(1) >= LEAST_KNOWN
+    point = np.zeros((len(rows), 3))
+    point[enough] = np.nanmedian(local[enough], axis=1)
+    seen = bundle.sight(views, tracks.take(rows), known & enough[:, None])
+    whole = bundle.placed(views, seen, body._replace(point=point))
     miss = bundle.misses(views, seen, whole)
     return whole, bundle.typical_misses(seen, miss, len(rows))
 

@@ -57,10 +57,10 @@ def improved(
     count = int(np.clip(np.ceil(apart / (STEP_SHARE * flow.shape[1])), 1, MOST_PLANES))
     share = (np.arange(count) + 0.5) / count
     inverse = share / span[0] + (1 - share) / span[1]
-    best, lowest = flow.copy(), OWN * _unlike(pictures, flow)
+    best, lowest = flow.copy(), OWN * unlike(pictures, flow)
     for depth in 1 / inverse:
         guided = search(plane_flow(views, pair, depth))
-        cost = _unlike(pictures, guided)
+        cost = unlike(pictures, guided)
         better = cost < lowest
         best[better], lowest[better] = guided[better], cost[better]
     return best
@@ -81,7 +81,7 @@ def plane_flow(views: Views, pair: tuple[int, int], depth: float) -> np.ndarray:
     )
 
 
-def _unlike(pictures, flow):
+def unlike(pictures, flow):
     """[height, width] grey levels by which surroundings differ along the flow."""
     one, other = pictures
     height, width = one.shape
