@@ -18,6 +18,8 @@ from nerfies_jax.runs import commands, platform, representations
 from nerfies_jax.runs.config import MoreMetrics, Preparation, RunConfig
 from nerfies_jax.training import stopping
 
+USUAL_PRESET = "splats-tracked-small"  # where none is named, and the film allows it
+
 
 @dataclasses.dataclass(frozen=True)
 class Reconstruct:
@@ -91,7 +93,7 @@ def _outcome(args):
     with cli.user_errors():
         if args.resume:
             _check_resumed(args)
-        platform.start_jax(args.device, _threads(args))
+        platform.start_jax(args.device, *_cores(args))
     from nerfies_jax import runs
 
     common = {
@@ -137,14 +139,12 @@ def _check_resumed(args):
         )
 
 
-def _threads(args):
-    """How many cores the representation wants XLA to see."""
-    representation = representations.of_run(args.out) if args.resume else None
-    if representation is None:
-        if args.preset is None:  # what is chosen by the capture are splats
-            return representations.named("gaussians").threads
-        representation = representations.of_preset(args.preset)
-    return representation.threads
+def _cores(args):
+    """How many cores the representation wants XLA to see, and the shares of a step."""
+    if args.resume:
+        return representations.cores_of_run(args.out)
+    preset = args.preset or USUAL_PRESET
+    return representations.cores(preset, args.set if args.preset else ())
 
 
 def _expected(args):

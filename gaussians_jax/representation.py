@@ -171,6 +171,7 @@ GAUSSIANS = Representation(
     # nothing: 87 to 94 ms a training step with one, 94 to 109 with four (10,000
     # Gaussians, 176x132). With one, the bits do not depend on the core count either.
     threads="one",
+    shares=lambda spec: spec.batch_size,
     traces_lenses=False,
     spec_type=scene.SplatScene,
     presets=presets.PRESETS,

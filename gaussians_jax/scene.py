@@ -167,7 +167,7 @@ def _draw(
 
 
 def _stepper(spec, metadata, effects, optimiser, devices):
-    """One update from `batch_size` frames: (state, frames) -> (state, metrics), pure."""
+    """One update from a batch of frames: (state, frames) -> (state, metrics), pure."""
 
     def one_view(index, state, frames):
         seen = _condition(spec, state, frames, index)

@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
@@ -87,7 +88,10 @@ def gather(
 
 
 def _learning_rates(spec, metadata, effects, step):
-    """A prefix of `Params` with the learning rate of everything below each leaf."""
+    """A prefix of `Params` with the learning rate of everything below each leaf.
+
+    Times the root of the views in a step: their mean is that much less noisy.
+    """
     rows = {
         "splats": learning_rates.at_step(
             spec.learning_rates, metadata.extent, spec.steps, step, spec.annealing
@@ -99,4 +103,5 @@ def _learning_rates(spec, metadata, effects, step):
             rows[effect.name] = effect.row_learning_rate(step)
         if effect.init is not None:
             nets[effect.name] = effect.learning_rate(step)
-    return Params(rows, nets)
+    root = spec.batch_size**0.5
+    return jax.tree.map(lambda rate: root * rate, Params(rows, nets))

@@ -76,6 +76,7 @@ def _parts(spec, names):
 RADIANCE = Representation(
     name="radiance",
     threads="all",  # matrix products, which every core makes faster
+    shares=lambda spec: spec.micro_batches,
     traces_lenses=True,
     spec_type=scene.RadianceScene,
     presets=presets.PRESETS,

@@ -19,7 +19,7 @@ from nerfies_jax.geometry import rays
 from nerfies_jax.nets import codes
 from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.spec import RadianceScene
-from nerfies_jax.training import loop, losses, schedules
+from nerfies_jax.training import data_parallel, loop, losses, schedules
 from nerfies_jax.training.effects import (
     Effect,
     FrameCondition,
@@ -65,6 +65,8 @@ def build(
             "none; leave it out with --set background=none"
         )
 
+    devices = data_parallel.device_count(spec.micro_batches)
+
     def whole_frame(params, view: View, size, step):
         view_codes = radiance.codes_at(params, view)
         return radiance.render(params, view.camera, view.time, view_codes, size, step)
@@ -95,27 +97,40 @@ def build(
         # By name alone: a run with other effects of one's own is another run.
         spec=(spec, metadata, *(effect.name for effect in effects)),
         init=init,
-        step=_stepper(spec, radiance),
+        step=_stepper(spec, radiance, devices),
         render=whole_frame,
         events=(),
         counts=count_parameters,
         required_data=read,
         example=example,
+        devices=devices,
     )
 
 
-def _stepper(spec, radiance):
+def _stepper(spec, radiance, devices):
     """One update from one batch of rays: (state, frames) -> (state, metrics), pure."""
 
-    def step(state: TrainState, frames: Frames):
-        batch_key, field_key = jax.random.split(loop.step_key(state))
-        batch = draw_batch(frames, spec.rays, batch_key)
+    def part(index, state, frames):
+        key = loop.step_key(state)
+        if spec.micro_batches > 1:
+            key = jax.random.fold_in(key, index)
+        batch_key, field_key = jax.random.split(key)
+        batch = draw_batch(frames, spec.rays // spec.micro_batches, batch_key)
 
         def loss(params):
             terms = loss_terms(radiance, params, frames, batch, state.step, field_key)
             return weighted_sum(terms), values(terms)
 
-        (value, logged), grads = jax.value_and_grad(loss, has_aux=True)(state.params)
+        return jax.value_and_grad(loss, has_aux=True)(state.params)
+
+    def step(state: TrainState, frames: Frames):
+        if spec.micro_batches == 1:
+            (value, logged), grads = part(0, state, frames)
+        else:
+            each = data_parallel.on_devices(
+                part, spec.micro_batches, devices, state, frames
+            )
+            (value, logged), grads = jax.tree.map(lambda leaf: leaf.mean(0), each)
         params, moments = descend(spec, radiance.effects, state, grads)
         metrics = {"loss": value, "mse": logged["fine"], **logged}
         state = TrainState(params, moments, state.aux_state, state.step + 1, state.key)
@@ -241,7 +256,8 @@ def estimate_memory_bytes(spec: RadianceScene, capture: Capture) -> int:
     if spec.warp is not None:
         widths += spec.warp.depth * spec.warp.width
     # Every layer's output is kept for the backward pass, beside its gradient.
-    activations = 3 * spec.rays * samples * widths
+    rays_at_once = spec.rays // spec.micro_batches
+    activations = 3 * rays_at_once * samples * widths
     return 4 * activations + capture.images.nbytes
 
 

@@ -64,6 +64,8 @@ class RadianceScene:
     coarse: TemplateSpec | None = None  # of the coarse level; None is like the fine one
     sampling: SamplingSpec = SamplingSpec()
     rays: int = 1024  # in a step
+    # In so many equal parts, on as many devices or one after the other: less memory.
+    micro_batches: int = 1
     # Longest half-side of the filmed volume in units of the field; None keeps the
     # capture's own coordinates.
     extent: float | None = 1.0
@@ -88,6 +90,11 @@ class RadianceScene:
             raise ValueError(
                 f"train for at least one step of one ray, got steps={self.steps}, "
                 f"rays={self.rays}"
+            )
+        if self.micro_batches < 1 or self.rays % self.micro_batches:
+            raise ValueError(
+                f"rays={self.rays} cannot be split into micro_batches="
+                f"{self.micro_batches} equal parts"
             )
         if not self.template_rate > 0:
             raise ValueError(f"template_rate={self.template_rate} must be positive")

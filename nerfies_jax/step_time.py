@@ -4,7 +4,7 @@ import jax
 
 from nerfies_jax import scene
 from nerfies_jax.measure.part_time import part_ms
-from nerfies_jax.training import loop
+from nerfies_jax.training import data_parallel, loop
 from nerfies_jax.training.effects import Effect, weighted_sum
 from nerfies_jax.training.model import Frames, Model, TrainState
 
@@ -23,10 +23,11 @@ def parts(
     """
     field = scene.field(spec, metadata, effects=effects)
     batch_key, loss_key = jax.random.split(loop.step_key(state))
-    batch = jax.jit(scene.draw_batch, static_argnums=1)(frames, spec.rays, batch_key)
+    rays = spec.rays // model.devices  # that a device takes
+    batch = jax.jit(scene.draw_batch, static_argnums=1)(frames, rays, batch_key)
 
     def draw(frames, key):
-        return scene.draw_batch(frames, spec.rays, key)
+        return scene.draw_batch(frames, rays, key)
 
     def descend(state, grads):
         return scene.descend(spec, field.effects, state, grads)
@@ -43,5 +44,7 @@ def parts(
         "backward": max(both - forward, 0.0),
         "optimiser": part_ms(descend, state, state.params),
     }
-    whole = part_ms(model.step, state, frames)
+    whole = part_ms(
+        model.step, *data_parallel.replicate((state, frames), model.devices)
+    )
     return timed | {"rest": max(whole - sum(timed.values()), 0.0)}

@@ -63,6 +63,8 @@ class Representation(NamedTuple):
     name: str
     # How many cores XLA:CPU should see: "one" where its own threading slows the loops.
     threads: Literal["one", "all"]
+    # Of a spec: into how many equal shares its step falls, for as many devices.
+    shares: Callable[[Spec], int]
     # Whether rays are traced through the lens; else pictures are drawn of pinholes, and
     # held-out ones are bent as the lens does before they are scored.
     traces_lenses: bool

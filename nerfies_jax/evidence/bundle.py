@@ -185,9 +185,7 @@ def placed(views: Views, seen: Sight, body: Body) -> Body:
         np.add.at(
             matrix, seen.track, np.einsum("o,oki,okj->oij", weight, by_point, by_point)
         )
-        np.add.at(
-            right, seen.track, np.einsum("o,oki,ok->oi", weight, by_point, miss)
-        )
+        np.add.at(right, seen.track, np.einsum("o,oki,ok->oi", weight, by_point, miss))
         size = np.einsum("nii->n", matrix) / 3
         ridge = POINT_PRIOR * (size + max(np.median(size), 1e-30))
         matrix += ridge[:, None, None] * np.eye(3)

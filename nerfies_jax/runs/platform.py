@@ -8,26 +8,35 @@ import contextlib
 import os
 from typing import Literal
 
+import psutil
+
 from nerfies_jax.capture.cache import CACHE
 
 Device = Literal["auto", "cpu", "gpu", "tpu"]
 # Whether XLA:CPU sees one core or all of them; each representation says which suits it.
 Threads = Literal["one", "all"]
+_AFFINITY = hasattr(psutil.Process, "cpu_affinity")  # not on macOS
 VECTOR_WIDTH = "--xla_cpu_prefer_vector_width"  # XLA:CPU's own is 256 bits
 
 
-def start_jax(device: Device = "auto", threads: Threads = "one") -> None:
+def start_jax(
+    device: Device = "auto", threads: Threads = "one", shares: int = 1
+) -> None:
     """Choose the platform, how many cores XLA:CPU sees, and the compilation cache.
 
-    Call it before the first array is made; it is too late afterwards. `PJRT_NPROC` in
-    the environment has the last word, as has `XLA_FLAGS` on the width of vectors: 512
-    bits where the processor has them. Raises ValueError where the device is not there.
+    Steps that fall into equal `shares` get as many CPU devices, where there are so many
+    cores (`data_parallel`). Call it before the first array is made; it is too late
+    afterwards. `PJRT_NPROC` and `JAX_NUM_CPU_DEVICES` in the environment have the last
+    word, as has `XLA_FLAGS` on the width of vectors: 512 bits where the processor has
+    them. Raises ValueError where the device is not there.
     """
     if threads == "one":
         os.environ.setdefault("PJRT_NPROC", "1")
     _prefer_wide_vectors()
     import jax
 
+    if "JAX_NUM_CPU_DEVICES" not in os.environ:
+        jax.config.update("jax_num_cpu_devices", min(shares, cores()))
     if device != "auto":
         name = {"gpu": "cuda"}.get(device, device)
         os.environ["JAX_PLATFORMS"] = name  # of the processes that this one starts
@@ -46,6 +55,11 @@ def start_jax(device: Device = "auto", threads: Threads = "one") -> None:
         with contextlib.suppress(OSError):  # a cache that cannot be kept is no error
             folder.mkdir(parents=True, exist_ok=True)
             jax.config.update("jax_compilation_cache_dir", str(folder))
+
+
+def cores() -> int:
+    """How many cores this process may use."""
+    return len(psutil.Process().cpu_affinity()) if _AFFINITY else os.cpu_count() or 1
 
 
 def _prefer_wide_vectors():

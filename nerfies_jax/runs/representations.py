@@ -4,13 +4,14 @@ import functools
 import importlib.metadata
 import json
 import pathlib
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:  # a record is loaded when it is asked for, not with this module
     from nerfies_jax.evaluation.representation import Representation
 
 from nerfies_jax.runs.platform import Threads
 from nerfies_jax.runs.run_folder import CONFIG
+from nerfies_jax.training import specs
 
 GROUP = "nerfies_jax.representations"
 
@@ -56,6 +57,33 @@ def of_run(folder: pathlib.Path) -> "Representation | None":
         return named(stored["representation"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
+
+
+class Cores(NamedTuple):
+    """What `platform.start_jax` is told of a scene that is to be trained."""
+
+    threads: Threads
+    shares: int
+
+
+def cores(preset: str, overrides: tuple[str, ...] = ()) -> Cores:
+    """Of a preset with fields changed; ValueError where there are no such."""
+    representation = of_preset(preset)
+    spec = specs.override(representation.presets[preset], overrides)
+    return Cores(representation.threads, representation.shares(spec))
+
+
+def cores_of_run(folder: pathlib.Path) -> Cores:
+    """Of the run in a folder; of none where none can be read."""
+    representation = of_run(folder)
+    if representation is None:
+        return Cores("all", 1)
+    try:
+        stored = json.loads((folder / CONFIG).read_text())["spec"]
+        shares = representation.shares(specs.from_json(stored, specs.PACKAGES))
+    except (OSError, ValueError, KeyError, TypeError):
+        shares = 1
+    return Cores(representation.threads, shares)
 
 
 def threads_of_run(folder: pathlib.Path) -> Threads:

@@ -1,0 +1,74 @@
+"""Equal shares of a step: the same state from one device and from several."""
+
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from nerfies_jax.training import data_parallel
+from tests.training import toy
+
+
+def shared_step(devices):
+    """The toy's step from the mean of four noisy slopes."""
+
+    def part(index, state, frames):
+        key = jax.random.fold_in(state.key, index)
+        noise = 0.1 * jax.random.normal(key, state.params.rows["mean"].shape)
+        target = frames.times[index % 4]
+        return jax.value_and_grad(toy.loss)(state.params, target, noise)
+
+    def step(state, frames):
+        each = data_parallel.on_devices(part, 4, devices, state, frames)
+        value, grad = jax.tree.map(lambda leaf: leaf.mean(0), each)
+        params = jax.tree.map(lambda p, g: p - 0.1 * g, state.params, grad)
+        state = state._replace(params=params, step=state.step + 1)
+        return state, {"loss": value}
+
+    return step
+
+
+def trained(devices):
+    model = toy.model(change=shared_step(devices))._replace(devices=devices)
+    return toy.fit(toy.frames(), model=model, steps=8)  # an event after seven
+
+
+def both(devices):
+    assert jax.local_device_count() == devices
+    one, several = trained(1), trained(devices)
+    for ours, plain in zip(
+        *map(jax.tree.leaves, (several.state, one.state)), strict=True
+    ):
+        assert ours.sharding.num_devices == 1
+        if not jnp.issubdtype(plain.dtype, jax.dtypes.prng_key):
+            np.testing.assert_allclose(ours, plain, rtol=1e-5, atol=1e-7)
+    # Chunks are cut by the clock: the last row alone is of the same steps.
+    last = [run.history.rows[-1]["loss"] for run in (several, one)]
+    np.testing.assert_allclose(*last, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("shares", "most", "used"), [(4, 3, 2), (4, 9, 4), (5, 3, 1)])
+def test_devices_take_equal_shares(shares, most, used, monkeypatch):
+    monkeypatch.setattr(jax, "local_device_count", lambda: most)
+    assert data_parallel.device_count(shares) == used
+
+
+@pytest.mark.slow
+def test_two_devices_train_what_one_does():
+    code = (
+        "import jax; jax.config.update('jax_num_cpu_devices', 2);"
+        "jax.config.update('jax_numpy_dtype_promotion', 'strict');"
+        "from tests.training import test_data_parallel as t; t.both(2)"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=dict(os.environ, JAX_PLATFORMS="cpu"),
+    )
+    assert result.returncode == 0, result.stderr[-2000:]
