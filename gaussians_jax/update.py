@@ -103,5 +103,5 @@ def _learning_rates(spec, metadata, effects, step):
             rows[effect.name] = effect.row_learning_rate(step)
         if effect.init is not None:
             nets[effect.name] = effect.learning_rate(step)
-    root = spec.batch_size**0.5
-    return jax.tree.map(lambda rate: root * rate, Params(rows, nets))
+    rates, root = Params(rows, nets), spec.batch_size**0.5
+    return rates if root == 1 else jax.tree.map(lambda rate: root * rate, rates)

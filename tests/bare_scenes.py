@@ -101,6 +101,7 @@ def tiny_field(name):
         coarse=tiny_template(spec.coarse),
         sampling=shrunk(spec.sampling, coarse=6, fine=6 if spec.sampling.fine else 0),
         rays=16,
+        micro_batches=1,
         extent=1.0,
         appearance=shrunk(spec.appearance, width=3),
         transient=shrunk(spec.transient, depth=1, width=8, code_width=4),
@@ -138,6 +139,7 @@ def tiny_splats(name):
         )
     return dataclasses.replace(
         spec,
+        batch_size=1,
         init=InitSpec(random=100, min_points=1000),
         start=StartSpec(motion="none"),
         sh_degree=1,

@@ -55,6 +55,19 @@ def test_training_lowers_the_loss():
     assert last < 0.95 * first, (first, last)
 
 
+@pytest.mark.full
+def test_a_step_of_two_views_goes_down_the_mean_of_both():
+    _, state, frames = started(scenes.TINY_SPLATS)
+    pair, trace = stepped(dataclasses.replace(scenes.TINY_SPLATS, batch_size=2), 1)
+    later = state._replace(step=state.step + 1)  # of the same parameters
+    one, other = (compiled_step(scenes.TINY_SPLATS)(s, frames) for s in (state, later))
+    losses = [float(metrics["loss"]) for _, metrics in (one, other)]
+    np.testing.assert_allclose(trace[0]["loss"], np.mean(losses), rtol=1e-5)
+    seen = [each[0].aux_state.stats.views for each in (one, other)]
+    np.testing.assert_array_equal(pair.aux_state.stats.views, sum(seen))
+    assert int(pair.step) == 1
+
+
 def test_every_epoch_shows_every_frame_once_in_its_own_order():
     rows = jitted(jax.vmap(scene.shuffled_row, (None, 0, None)), static_argnums=2)
     epochs = rows(jax.random.key(0), np.arange(21, dtype=np.int32), 7).reshape(3, 7)

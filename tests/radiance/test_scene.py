@@ -19,6 +19,7 @@ from nerfies_jax.radiance.template import TemplateSpec
 from nerfies_jax.scene import RadianceScene
 from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.spec import SamplingSpec
+from nerfies_jax.training import loop
 from nerfies_jax.training.effects import FrameCondition, weighted_sum
 from nerfies_jax.training.model import View
 from tests import drawn, gradients, scenes
@@ -306,3 +307,34 @@ def test_a_medium_has_the_share_that_it_is_given(logit, without):
 
     # Samples go where the changed coarse level sends them.
     np.testing.assert_allclose(*both(jax.random.key(0)), atol=1e-3)
+
+
+@pytest.mark.full
+def test_micro_batches_go_down_the_mean_of_all_rays():
+    _, state, frames = started(STATIC)
+    field = scene.field(STATIC, METADATA)
+
+    def mean_slope(parts):
+        spec = dataclasses.replace(STATIC, micro_batches=parts)
+        model = scene.build(spec, METADATA)
+        after, metrics = jax.jit(model.step)(state, frames)
+        return after.optimiser.mu, metrics["loss"]
+
+    def part(index):
+        key = jax.random.fold_in(loop.step_key(state), index)
+        batch_key, field_key = jax.random.split(key)
+        batch = scene.draw_batch(frames, STATIC.rays // 2, batch_key)
+
+        def loss(params):
+            return weighted_sum(
+                scene.loss_terms(field, params, frames, batch, state.step, field_key)
+            )
+
+        return jax.jit(jax.value_and_grad(loss))(state.params)
+
+    moment, loss = mean_slope(2)
+    (one, first), (other, second) = part(0), part(1)
+    np.testing.assert_allclose(loss, (one + other) / 2, rtol=1e-5)
+    for found, a, b in zip(*map(jax.tree.leaves, (moment, first, second)), strict=True):
+        # Adam's first moment after one step is a tenth of the slope.
+        np.testing.assert_allclose(found, 0.05 * (a + b), rtol=1e-4, atol=1e-7)
