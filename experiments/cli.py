@@ -59,6 +59,7 @@ def formerly(option):
 
 
 RATE = 24.0  # frames per second of films and camera paths
+VIEW_PORT = 8080
 # Those of `nerfies_jax.capture.camera_paths`, which loads JAX.
 PATHS = ("sway", "orbit", "lemniscate", "stabilised", "captured")
 
@@ -74,6 +75,20 @@ def check_frames(frames: int | None, path: str) -> None:
             f"--frames {frames}: --path {path} has its own number of frames; it is for "
             + ", ".join(PATHS)
         )
+
+
+def check_port(port: int) -> None:
+    """Raise for a number that is no port anybody may listen at."""
+    if not 1024 <= port <= 65535:
+        raise ValueError(f"--port {port}: choose one from 1024 to 65535")
+
+
+def sized(size: tuple[int, int], max_side: int | None) -> tuple[int, int]:
+    """A width and height as they are, or with `max_side` as the longer one."""
+    if max_side is None:
+        return size
+    factor = max_side / max(size)
+    return max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
 
 
 @contextlib.contextmanager

@@ -18,9 +18,8 @@ import pathlib
 from typing import Any, Literal
 
 from experiments import cli
-from nerfies_jax.runs import platform, representations
+from nerfies_jax.runs import platform, representations, run_folder
 
-EXPORTS = "exports"  # in the run folder, where no other place is named
 # Which options each format knows, beside --out, --overwrite and --device.
 GAUSSIANS = ("time", "frames", "units")
 PATHS = ("frames", "path")
@@ -113,7 +112,7 @@ class Export:
             name = f"{self.format}-{self.frames}"
         elif self.path is not None:
             name = f"{self.format}-{pathlib.PurePath(self.path).stem}"
-        return self.out or self.run / EXPORTS / (name + self.suffix)
+        return self.out or self.run / run_folder.EXPORTS / (name + self.suffix)
 
 
 def main(arguments=None):

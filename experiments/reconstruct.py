@@ -8,6 +8,7 @@ Leaves a run folder with checkpoints, metrics, pictures, a video and a report.
 """
 
 import dataclasses
+import functools
 import pathlib
 import signal
 import sys
@@ -63,6 +64,9 @@ class Reconstruct:
     """Seconds of training between two points of the PSNR curve."""
     checkpoint_every: float = 60.0
     """Seconds between two checkpoints; a run that is killed loses no more than that."""
+    view: bool = False
+    """Look around in the scene while it is trained, in the browser of this machine, as
+    experiments.view does afterwards; training waits for what is drawn."""
     more: cli.More = MoreMetrics()
     prepare: Preparation = Preparation()
     """Of a film, or a folder of pictures without cameras."""
@@ -94,6 +98,7 @@ def _outcome(args):
         if args.resume:
             _check_resumed(args)
         platform.start_jax(args.device, *_cores(args))
+        watched = _watched(args)
     from nerfies_jax import runs
 
     common = {
@@ -107,6 +112,7 @@ def _outcome(args):
                 args.out,
                 expected=_expected(args),
                 overrides=(*steps, *args.set),
+                watched=watched,
                 **common,
             )
     config = RunConfig(
@@ -119,8 +125,23 @@ def _outcome(args):
     )
     with cli.user_errors((runs.Refused,)):
         return runs.reconstruct(
-            config, args.out, effects=args.effects, prepare=args.prepare, **common
+            config,
+            args.out,
+            effects=args.effects,
+            prepare=args.prepare,
+            watched=watched,
+            **common,
         )
+
+
+def _watched(args):
+    """What opens the page of --view, or None; ValueError where it cannot be had."""
+    if not args.view:
+        return None
+    from nerfies_jax.runs import viewer
+
+    viewer.check_installed()
+    return functools.partial(viewer.live, port=cli.VIEW_PORT)
 
 
 def _check_resumed(args):

@@ -111,7 +111,7 @@ def main(arguments=None):
         trained = state
         model, state = _faster(args, _model(args, run), state)
         names, views, own_size = _views(args, run)
-        size = _size(own_size, args.max_side)
+        size = cli.sized(own_size, args.max_side)
         views = [evaluation.resized(view, own_size, size) for view in views]
         views = _blended(args, run, views)
         out = args.out or args.run / "renders" / _name(args)
@@ -300,13 +300,6 @@ class _Pictures:
         if np.nanmax(np.abs(flow), initial=0) > 0:
             self.limits = coloured.high
         return coloured.picture
-
-
-def _size(size, max_side):
-    if max_side is None:
-        return size
-    factor = max_side / max(size)
-    return max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
 
 
 if __name__ == "__main__":

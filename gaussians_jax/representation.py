@@ -183,6 +183,7 @@ GAUSSIANS = Representation(
     memory_hint="lower init.points, init.random or raster.capacity with --set",
     time_parts=step_time.parts,
     variant=variants.without_effects,
+    parts=variants.parts,
     score_halves=lambda *_, **__: None,
     fitted_rays=0,
     save=save,

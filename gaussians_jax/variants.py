@@ -7,11 +7,19 @@ import jax
 import numpy as np
 
 from gaussians_jax import scene, splats, static_rows, time_knots
-from nerfies_jax.evaluation.representation import check_there
+from nerfies_jax.evaluation.representation import Parts, check_there
 from nerfies_jax.training.effects import Effect
 from nerfies_jax.training.model import Model, Stages, TrainState
 
 INSTANTS = 33  # at which rows are looked for that move
+
+
+def parts(spec, metadata, effects: tuple[Effect, ...] = ()) -> Parts:
+    """The motion, and the user's own that move Gaussians, can be left out."""
+    del metadata
+    own = tuple(effect.name for effect in effects if effect.deform is not None)
+    motion = () if spec.motion is None else ("motion",)
+    return Parts((*motion, *own), appearance=False)
 
 
 def without_effects(
@@ -27,10 +35,8 @@ def without_effects(
             "--appearance: splats have no appearance codes; reconstruct with a preset "
             "that has them, as nerf-w or nerfies"
         )
-    own = [effect.name for effect in effects if effect.deform is not None]
-    there = [name for name in ("motion",) if getattr(spec, name) is not None]
-    check_there(without, [*there, *own])
-    left = {name: None for name in there if name in without}
+    check_there(without, parts(spec, metadata, effects).removable)
+    left = {"motion": None} if "motion" in without and spec.motion is not None else {}
     kept = tuple(effect for effect in effects if effect.name not in without)
     return scene.build(dataclasses.replace(spec, **left), metadata, kept)
 

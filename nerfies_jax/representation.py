@@ -88,6 +88,7 @@ RADIANCE = Representation(
     memory_hint="lower rays, sampling.coarse or sampling.fine with --set",
     time_parts=step_time.parts,
     variant=variants.without_effects,
+    parts=variants.parts,
     score_halves=held_out_codes.score,
     fitted_rays=held_out_codes.RAYS * held_out_codes.EVALUATIONS,
     save=lambda *_, **__: Saved(),  # the checkpoint holds all there is

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float, Int
 
 from nerfies_jax import scene
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.evaluation.representation import check_there
+from nerfies_jax.evaluation.representation import Parts, check_there
 from nerfies_jax.training.effects import APPEARANCE, Effect
 from nerfies_jax.training.model import Model, View
 
@@ -20,6 +20,25 @@ class Between(NamedTuple):
     share: Float[Array, ""]  # in [0, 1]
 
 
+def parts(spec, metadata, effects: tuple[Effect, ...] = ()) -> Parts:
+    """What displaces points or lies before the scene can be left out."""
+    whole = scene.field(spec, metadata, effects=effects)
+    # What feeds the network's inputs is part of it; a penalty draws nothing.
+    removable = tuple(
+        effect.name
+        for effect in whole.effects
+        if (effect.displace is not None or effect.medium is not None)
+        and effect.condition is None
+        and effect.lift is None
+    )
+    return Parts(removable, _has_appearance(whole))
+
+
+def _has_appearance(field):
+    tables = [table for effect in field.effects for table in effect.tables]
+    return any(table.by == APPEARANCE for table in tables)
+
+
 def without_effects(
     spec,
     metadata,
@@ -28,19 +47,9 @@ def without_effects(
     effects: tuple[Effect, ...] = (),
 ) -> Model:
     """The model with some effects left out of its pictures, or drawing a `Between`."""
-    whole = scene.field(spec, metadata, effects=effects)
-    # What feeds the network's inputs is part of it; a penalty draws nothing.
-    drawn = [
-        effect.name
-        for effect in whole.effects
-        if (effect.displace is not None or effect.medium is not None)
-        and effect.condition is None
-        and effect.lift is None
-    ]
-    check_there(without, drawn)
+    check_there(without, parts(spec, metadata, effects).removable)
     field = scene.field(spec, metadata, without, effects)
-    tables = [table for effect in field.effects for table in effect.tables]
-    if blended and all(table.by != APPEARANCE for table in tables):
+    if blended and not _has_appearance(field):
         raise ValueError(
             "--appearance: this field has no appearance codes; reconstruct with a "
             "preset that has them, as nerf-w or nerfies"

@@ -32,8 +32,6 @@ from nerfies_jax.evaluation.representation import Player
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.training.model import Model, TrainState
 
-SECONDS = 4.0  # that a film plays whose rate is not known
-SHORTEST, LONGEST = 1.0, 60.0
 # A larger page takes a browser seconds to open; a scene that needs more gets fewer
 # instants, as far as motion is still to be told from them.
 MOST_BYTES, FEWEST_INSTANTS = 48 * 2**20, 8
@@ -99,7 +97,6 @@ def header(packed: packing.Packed, raster: RasterSpec, capture: Capture) -> dict
     forward = first.camera_from_world[2].astype(np.float64)
     focus = camera_paths.focus_point(train, capture.near, capture.far)
     away = float(np.clip((focus - first.position) @ forward, capture.near, capture.far))
-    up = camera_paths.mean_up(train) if capture.up is None else capture.up
     view = {
         "rotation": first.camera_from_world.ravel(),
         "position": first.position,
@@ -112,8 +109,8 @@ def header(packed: packing.Packed, raster: RasterSpec, capture: Capture) -> dict
     }
     return {
         "instants": packed.entries["mean.change"]["shape"][0],
-        "seconds": seconds(capture),
-        "up": np.asarray(up, np.float64).tolist(),
+        "seconds": camera_paths.playing_seconds(capture),
+        "up": camera_paths.up_axis(capture).tolist(),
         "view": {name: np.asarray(part).tolist() for name, part in view.items()},
         "raster": {
             name: min(getattr(raster, name), LARGEST)
@@ -123,14 +120,6 @@ def header(packed: packing.Packed, raster: RasterSpec, capture: Capture) -> dict
         },
         "arrays": packed.entries,
     }
-
-
-def seconds(capture: Capture) -> float:
-    """How long the scene took, where the rate of the footage is known."""
-    if capture.frames_per_second is None:
-        return SECONDS
-    moments = len(np.unique(capture.times))
-    return float(np.clip(moments / capture.frames_per_second, SHORTEST, LONGEST))
 
 
 def still_distance(instants: Instants, capture: Capture) -> np.ndarray:

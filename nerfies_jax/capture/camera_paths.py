@@ -13,6 +13,8 @@ KINDS = ("sway", "orbit", "lemniscate", "stabilised", "captured")
 # Standard deviation of the smoothing of a stabilised path, as a share of the capture:
 # half a second of ten, which takes out a hand's shake and keeps its walk.
 SMOOTHED_OVER = 0.05
+SECONDS = 4.0  # that a film plays whose rate is not known
+SHORTEST, LONGEST = 1.0, 60.0
 
 
 class CameraPath(NamedTuple):
@@ -51,7 +53,7 @@ def path(kind: str, capture: Capture, count: int, turns: float = 1.0) -> Camera:
         when = capture.times[capture.train].astype(np.float64)
         return smoothed(train_cameras, when, _filmed_span(capture, count))
     phase = np.linspace(0, 2 * np.pi * turns, count, endpoint=False)
-    up = mean_up(train_cameras) if capture.up is None else np.asarray(capture.up)
+    up = up_axis(capture)
     target = focus_point(train_cameras, capture.near, capture.far)
     shapes = {"sway": _sway, "orbit": _orbit, "lemniscate": _lemniscate}
     positions = shapes[kind](train_cameras, target, up, phase)
@@ -117,6 +119,21 @@ def times(count: int, loops: float = 1.0) -> np.ndarray:
     """Instants in [0, 1] that play the scene forwards and back, `loops` times."""
     phase = np.linspace(0, loops, count, endpoint=False) % 1
     return (1 - np.abs(1 - 2 * phase)).astype(np.float32)
+
+
+def playing_seconds(capture: Capture) -> float:
+    """How long the scene took, where the rate of the footage is known."""
+    if capture.frames_per_second is None:
+        return SECONDS
+    moments = len(np.unique(capture.times))
+    return float(np.clip(moments / capture.frames_per_second, SHORTEST, LONGEST))
+
+
+def up_axis(capture: Capture) -> np.ndarray:
+    """The capture's own upward direction, or that of its training pictures."""
+    if capture.up is not None:
+        return np.asarray(capture.up, np.float64)
+    return mean_up(cameras.take(capture.cameras, capture.train))
 
 
 def mean_up(train_cameras: Camera) -> np.ndarray:

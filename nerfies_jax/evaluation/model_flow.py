@@ -74,12 +74,34 @@ def picture_flow(
 
     NaN where less than half of a pixel is drawn, beside where `pixel_flow` is.
     """
-    height, width = rendering.alpha.shape
-    column, line = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    pixels = np.stack([column.ravel(), line.ravel()], axis=1)
+    pixels = _pixels(rendering)
     depth = np.where(rendering.alpha > 0.5, rendering.depth, 0)
     flow = pixel_flow(move, state, here, there, pixels, depth.ravel())
-    return flow.reshape(height, width, 2)
+    return flow.reshape(*rendering.alpha.shape, 2)
+
+
+def picture_distance(
+    move: Move, state: TrainState, here: View, there: View, rendering: Rendering
+) -> np.ndarray:
+    """How far what a drawn picture shows is from where it is in another view.
+
+    [height, width] in scene units, at the times of the two views. NaN where less than
+    half of a pixel is drawn, or the point is lost.
+    """
+    depth = rendering.depth.ravel()
+    known = (rendering.alpha.ravel() > 0.5) & np.isfinite(depth) & (depth > 0)
+    points = surface(here.camera, _pixels(rendering), np.where(known, depth, 1))
+    moved = move(state, points, here, there)
+    distance = np.linalg.norm(moved.points - points, axis=1)
+    distance = np.where(known & moved.found, distance, np.nan)
+    return distance.reshape(rendering.alpha.shape)
+
+
+def _pixels(rendering):
+    """The centres [height * width, 2] of its pixels, row after row."""
+    height, width = rendering.alpha.shape
+    column, line = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    return np.stack([column.ravel(), line.ravel()], axis=1)
 
 
 def surface(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:

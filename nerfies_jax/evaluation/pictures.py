@@ -85,6 +85,17 @@ def colour_error(
     )
 
 
+def colour_distance(distance: np.ndarray, at_least: float | int = 0.0) -> Coloured:
+    """How far things moved, scene units: black is not at all, grey is unknown.
+
+    Light yellow is the 99th percentile, or `at_least` where that is farther.
+    """
+    shown = np.isfinite(distance)
+    largest = max(float(at_least), _limits(distance[shown])[1] if shown.any() else 0.0)
+    unit = np.where(shown, distance, 0) / _span(0.0, largest)
+    return Coloured(_mapped(unit, shown, ERROR_MAP), 0.0, largest)
+
+
 def colour_flow(flow: np.ndarray, largest: float | int | None = None) -> Coloured:
     """Image motion [..., height, width, 2]: direction as hue, length as saturation.
 

@@ -54,6 +54,13 @@ class Pair(NamedTuple):
     without: str = "bare"
 
 
+class Parts(NamedTuple):
+    """What of a trained scene can be chosen when it is drawn."""
+
+    removable: tuple[str, ...]  # effects that it can be drawn without
+    appearance: bool  # whether it looks otherwise for each appearance id
+
+
 class Representation(NamedTuple):
     """How its scenes are named, built, followed, timed and saved.
 
@@ -82,6 +89,7 @@ class Representation(NamedTuple):
     # (spec, metadata, names left out, whether appearances are blended, effects=()) ->
     # model; it draws a `nerfies_jax.variants.Between` instead of a view where they are.
     variant: Callable[..., Model]
+    parts: Callable[..., Parts]  # (spec, metadata, effects=())
     # (spec, metadata, state, capture, rows, effects=()), codes fitted to half a frame;
     # None where the scene has no codes of its own for each frame.
     score_halves: Callable[..., Halves | None]
@@ -101,7 +109,7 @@ class Representation(NamedTuple):
     prices: dict[str, Pair]  # by effect, as in `nerfies_jax.evidence.findings`
 
 
-def check_there(without: tuple[str, ...], there: list[str]) -> None:
+def check_there(without: tuple[str, ...], there: tuple[str, ...]) -> None:
     """Raise ValueError for effects that a trained scene cannot be drawn without."""
     for name in without:
         if name not in there:

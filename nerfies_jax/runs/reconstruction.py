@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import pathlib
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Literal, NamedTuple
 
 from nerfies_jax.capture.cache import CACHE
@@ -33,7 +33,10 @@ from nerfies_jax.runs.run import (
 )
 from nerfies_jax.runs.train import Pace
 from nerfies_jax.training import checkpoint
-from nerfies_jax.training.loop import FitResult
+from nerfies_jax.training.loop import FitResult, Hook
+
+# (run, its folder) -> what is called between chunks of steps while the run is trained
+Watched = Callable[[Run, pathlib.Path], contextlib.AbstractContextManager[Hook]]
 
 
 class Refused(ValueError):
@@ -59,6 +62,7 @@ def reconstruct(
     checkpoint_every: float | int = 60.0,
     more: MoreMetrics = MoreMetrics(),
     prepare: Preparation = Preparation(),
+    watched: Watched | None = None,
 ) -> Outcome:
     """Train a run from its first step, and score, draw and film what came of it.
 
@@ -69,8 +73,8 @@ def reconstruct(
     "auto" looks at the capture first and takes those that it calls for. `seconds` of
     training say how many steps there are or, where the steps are given, end it early;
     an evaluation follows after `evaluate_every` seconds of it, a checkpoint after
-    `checkpoint_every` seconds. `more` is measured at the end. Raises
-    Refused where it cannot begin.
+    `checkpoint_every` seconds. `more` is measured at the end, and `watched`
+    looks on until then (`viewer.live`). Raises Refused where it cannot begin.
     """
     began = time.perf_counter()
     with contextlib.ExitStack() as held:
@@ -93,7 +97,9 @@ def reconstruct(
             held.enter_context(run_folder.owned(folder))
             save_config(folder, run)
             checkpoints = _opened(held, folder, run, state, None)
-        return _finished(folder, run, state, None, checkpoints, pace, began, extra)
+            hooks = _watching(held, watched, run, folder)
+        start = state, None, checkpoints
+        return _finished(folder, run, start, pace, hooks, began, extra)
 
 
 def resume(
@@ -105,6 +111,7 @@ def resume(
     evaluate_every: float | int = 20.0,
     checkpoint_every: float | int = 60.0,
     more: MoreMetrics = MoreMetrics(),
+    watched: Watched | None = None,
 ) -> Outcome:
     """Continue the run in a folder from its last checkpoint, to the same bits.
 
@@ -125,7 +132,9 @@ def resume(
             extra = quality.prepared(more, run.capture.size)
             state, record, after = _restored(folder, run)
             checkpoints = _opened(held, folder, run, state, after)
-        return _finished(folder, run, state, record, checkpoints, pace, began, extra)
+            hooks = _watching(held, watched, run, folder)
+        start = state, record, checkpoints
+        return _finished(folder, run, start, pace, hooks, began, extra)
 
 
 @contextlib.contextmanager
@@ -216,9 +225,14 @@ def _opened(held, folder, run, state, after):
     return checkpoints
 
 
-def _finished(folder, run, state, record, checkpoints, pace, began, extra):
+def _watching(held, watched, run, folder):
+    """The hooks of who looks on, for as long as `held` is."""
+    return () if watched is None else (held.enter_context(watched(run, folder)),)
+
+
+def _finished(folder, run, start, pace, hooks, began, extra):
     """The outcome of training to the end, with what is to be seen of it written."""
-    trained = train.train(run, state, record, checkpoints, pace)
+    trained = train.train(run, *start, pace, hooks)
     result = trained.result
     errors = [result.unsaved] if result.unsaved else []
     if result.stopped_by in ("steps", "seconds", "non-finite"):

@@ -13,6 +13,7 @@ import filelock
 
 CONFIG = "config.json"  # which capture and which scene, and the whole of its spec
 CHECKPOINTS = "checkpoints"
+EXPORTS = "exports"  # files for other programs, where no other place is named
 LOCK = ".lock"
 OWNER = ".owner.json"  # beside the lock: Windows lets nobody read a locked file
 

@@ -55,7 +55,12 @@ def open_checkpoints(folder: pathlib.Path, run: Run, after: int | None) -> Check
 
 
 def train(
-    run: Run, state: Any, record: dict | None, checkpoints: Checkpoints, pace: Pace
+    run: Run,
+    state: Any,
+    record: dict | None,
+    checkpoints: Checkpoints,
+    pace: Pace,
+    hooks: tuple[Hook, ...] = (),
 ) -> Trained:
     """Fit the model; its PSNR and SSIM on a few held-out frames go into the history."""
     renderer = Renderer(run.model, run.capture.size)
@@ -74,13 +79,14 @@ def train(
         scored = evaluation.score(draw, state, run.filmed, few)
         return {"psnr": scored.psnr.mean(), "ssim": scored.ssim.mean()}
 
-    hooks = [Hook("held out", held_out, every_seconds=evaluate_every)]
+    if len(few):
+        hooks = (Hook("held out", held_out, every_seconds=evaluate_every), *hooks)
     result = loop.fit(
         run.model,
         state,
         evaluation.frames_of(run.capture, run.model.required_data),
         steps=run.spec.steps,
-        hooks=hooks if len(few) else [],
+        hooks=hooks,
         seconds=pace.seconds,
         checkpoints=checkpoints,
         checkpoint_seconds=pace.checkpoint_every,

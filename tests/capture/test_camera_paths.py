@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import scipy.spatial.transform
 
-from nerfies_jax.capture import camera_paths
+from nerfies_jax.capture import camera_paths, keyframes
+from nerfies_jax.capture.keyframes import Keyframe
 from nerfies_jax.geometry import camera as cameras
 from tests import scenes
 
@@ -150,3 +151,26 @@ def test_a_lemniscate_meets_its_middle_twice_and_stays_in_the_span_of_the_sway()
 def test_an_unknown_path_is_refused():
     with pytest.raises(ValueError, match="no camera path 'spiral'; there are sway"):
         camera_paths.path("spiral", scenes.tiny_capture(), 3)
+
+
+def test_a_path_passes_its_keyframes_and_overshoots_nothing():
+    chosen = cameras.take(rig(np.zeros(3)), [0, 3, 4, 7])
+    times = [0.0, 0.8, 0.8, 0.2]
+    frames = [
+        Keyframe(cameras.take(chosen, row), time) for row, time in enumerate(times)
+    ]
+    path = keyframes.through(frames, (40, 30), 31)
+    at = [0, 10, 20, 30]
+    np.testing.assert_allclose(path.cameras.position[at], chosen.position, atol=1e-6)
+    np.testing.assert_allclose(
+        path.cameras.camera_from_world[at], chosen.camera_from_world, atol=1e-6
+    )
+    np.testing.assert_allclose(path.times[at], times, atol=1e-7)
+    # A plain cubic spline goes to 0.9 between the two keyframes at 0.8.
+    assert path.times.max() <= np.float32(0.8) + 1e-6
+    assert (np.diff(path.times[:11]) > 0).all()
+    cameras.validate(path.cameras, path.size)
+    with pytest.raises(ValueError, match=r"1 keyframe\(s\) are no path"):
+        keyframes.through(frames[:1], (40, 30), 31)
+    with pytest.raises(ValueError, match="choose 4 to"):
+        keyframes.through(frames, (40, 30), 3)

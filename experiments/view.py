@@ -1,0 +1,64 @@
+"""Look around in a run, in the browser: any view, any time, effects on and off.
+
+python -m experiments.view RUN                # and open the address it prints
+python -m experiments.view RUN --max-side 640
+"""
+
+import dataclasses
+import pathlib
+import time
+from typing import Literal
+
+from experiments import cli
+from nerfies_jax.runs import platform, representations, run_folder
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """Look around in a run, in the browser of this machine.
+
+    Orbit with the mouse; time, what is shown, effects and a camera path are on the
+    page. Pictures are drawn here: coarse while the view moves, then finer, as far as
+    the run can be drawn in a few seconds.
+    """
+
+    run: cli.Positional[pathlib.Path]
+    """Run folder that experiments.reconstruct made, or is making: then as it was last
+    saved."""
+    port: int = cli.VIEW_PORT
+    """Where to listen, on this machine alone; the next one that is free is taken."""
+    max_side: int | None = None
+    """Longest side of the finest pictures, in pixels (default: as trained)."""
+    device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
+    """Where to compute."""
+
+    def __post_init__(self):
+        cli.check_port(self.port)
+        if self.max_side is not None and self.max_side < 1:
+            raise ValueError(f"--max-side {self.max_side}: draw at least one pixel")
+
+
+def main(arguments=None):
+    """Run the job of the command line; exit code 2 where its input is wrong."""
+    with cli.user_errors():
+        args = cli.parse(View, arguments)
+        platform.start_jax(args.device, representations.threads_of_run(args.run))
+        from nerfies_jax import runs
+        from nerfies_jax.runs import viewer
+
+        viewer.check_installed()
+        run = runs.saved_run(args.run)
+        restored = runs.restore(args.run, run)
+        size = cli.sized(run.capture.size, args.max_side)
+        page = viewer.Viewer(run, size, args.port, args.run / run_folder.EXPORTS)
+    print(f"look around at {page.address} (Ctrl-C ends)", flush=True)
+    try:
+        while True:
+            page.serve(restored.state, restored.step, seconds=1.0)
+            time.sleep(viewer.IDLE_SECONDS)
+    except KeyboardInterrupt:
+        page.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,61 @@
+"""A camera path through a few chosen cameras, each at a time of its own."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+from scipy.spatial.transform import Rotation, RotationSpline
+
+from nerfies_jax.capture.camera_paths import CameraPath
+from nerfies_jax.geometry import camera as cameras
+from nerfies_jax.geometry.camera import Camera
+
+MAX_PICTURES = 100_000  # an hour of film, which nobody asks for on purpose
+
+
+class Keyframe(NamedTuple):
+    """A camera, and which moment of the scene it shows; NumPy."""
+
+    camera: Camera  # pinhole, scene units
+    time: float  # in [0, 1]
+
+
+def through(keyframes: list[Keyframe], size: tuple[int, int], count: int) -> CameraPath:
+    """`count` cameras through all keyframes, the first and the last among them.
+
+    As long from each to the next. Places, focal lengths and times follow monotone cubic
+    curves, which overshoot nothing: time does not run backwards between two keyframes,
+    and stands still between two of the same. Orientations follow a spline whose turning
+    is smooth.
+    """
+    if len(keyframes) < 2:
+        raise ValueError(
+            f"{len(keyframes)} keyframe(s) are no path; add at least two, each where "
+            "the camera is to pass"
+        )
+    if not len(keyframes) <= count <= MAX_PICTURES:
+        raise ValueError(
+            f"{count} pictures through {len(keyframes)} keyframes; choose "
+            f"{len(keyframes)} to {MAX_PICTURES}"
+        )
+    knots = np.arange(len(keyframes), dtype=np.float64)
+    at = np.linspace(0, knots[-1], count)
+    chosen = cameras.stack([keyframe.camera for keyframe in keyframes])
+    turns = Rotation.from_matrix(chosen.camera_from_world.astype(np.float64))
+    curve = np.column_stack(
+        [
+            chosen.position,
+            np.log(chosen.focal_px),
+            [keyframe.time for keyframe in keyframes],
+        ]
+    )
+    x, y, z, log_focal, time = PchipInterpolator(knots, curve)(at).T
+    lens = cameras.take(chosen, np.zeros(count, int))
+    path = lens._replace(
+        camera_from_world=RotationSpline(knots, turns)(at)
+        .as_matrix()
+        .astype(np.float32),
+        position=np.stack([x, y, z], axis=1).astype(np.float32),
+        focal_px=np.exp(log_focal).astype(np.float32),
+    )
+    return CameraPath(path, size, np.clip(time, 0, 1).astype(np.float32))
