@@ -1,8 +1,8 @@
-"""A trained scene as the Gaussians of single instants, for files that know no time.
+"""A trained scene at single instants; as rows of them, for files that know no time.
 
-Means, rotations and scales are those of the instant. The harmonics are as trained and
-do not turn with the Gaussians: that is how `rendering` draws them, by the direction in
-the world, so a viewer shows what this package renders.
+Means, rotations and scales are those of the instant. In rows the harmonics are as
+trained and do not turn with the Gaussians: that is how `rendering` draws them, by the
+direction in the world, so a viewer shows what this package renders.
 """
 
 import math
@@ -28,28 +28,35 @@ def check_time(time: float) -> None:
         raise ValueError(f"time {time:g}: the capture runs from 0 to 1")
 
 
-def splats_at(model: Model, state: TrainState) -> Callable[[float], Splats]:
-    """A function of the time in [0, 1] that gives the rows as they are then; host side.
+def gaussians_at(model: Model, state: TrainState) -> Callable[[float], Gaussians]:
+    """A function of the time in [0, 1] that gives all Gaussians then; host side.
 
-    Which rows are active, and their order, is the same at all times.
+    What does not change with time is computed once, now.
     """
     if model.stages is None:
         raise ValueError(
             "Gaussian files are for runs of Gaussians; a radiance field has none, so "
             "export its cameras, pictures or tracks"
         )
-    stages, params = model.stages, state.params
-    rows = params.rows["splats"]
-    prepared = jax.jit(stages.prepare)(params)
-    deform = jax.jit(stages.deform)
-    as_rows = jax.jit(_as_rows)
+    params = state.params
+    prepared = jax.jit(model.stages.prepare)(params)
+    deform = jax.jit(model.stages.deform)
 
-    def at(time: float) -> Splats:
+    def at(time: float) -> Gaussians:
         check_time(time)
-        instant = jnp.asarray(time, rows.mean.dtype)
-        return as_rows(rows, deform(params, prepared, instant))
+        instant = jnp.asarray(time, params.rows["splats"].mean.dtype)
+        return deform(params, prepared, instant)
 
     return at
+
+
+def splats_at(model: Model, state: TrainState) -> Callable[[float], Splats]:
+    """As `gaussians_at`, as rows that a file can be written from.
+
+    Which rows are active, and their order, is the same at all times.
+    """
+    deformed_at, as_rows = gaussians_at(model, state), jax.jit(_as_rows)
+    return lambda time: as_rows(state.params.rows["splats"], deformed_at(time))
 
 
 def _as_rows(rows: Splats, deformed: Gaussians) -> Splats:

@@ -17,8 +17,9 @@ import numpy as np
 import PIL.Image
 from jaxtyping import Array, Int
 
+from gaussians_jax.instants import gaussians_at
 from gaussians_jax.player import packing
-from gaussians_jax.player.instants import (
+from gaussians_jax.player.sampled import (
     Instants,
     count_for,
     gathered,
@@ -58,13 +59,14 @@ def write(
     `degree` is that of the harmonics in use; `poster` (uint8 [height, width, 3]) is
     shown until the first frame is drawn, and where nothing can be.
     """
-    seen = seen_in_training(model, raster, degree, state, capture)
+    at, rows = gaussians_at(model, state), state.params.rows["splats"]
+    seen = seen_in_training(at, rows, raster, degree, capture)
     count = count_for(capture)
-    instants, packed = _packed(model, state, capture, seen, count)
+    instants, packed = _packed(at, rows, capture, seen, count)
     if len(packed.data) > MOST_BYTES:
         fewer = int(count * MOST_BYTES / len(packed.data))
         count = max(fewer, FEWEST_INSTANTS)
-        instants, packed = _packed(model, state, capture, seen, count)
+        instants, packed = _packed(at, rows, capture, seen, count)
     about = _about(instants, packed, capture)
     background = capture.background or (0.0, 0.0, 0.0)
     parts = {
@@ -85,8 +87,8 @@ def write(
     return Player(path, f"{about} {path.stat().st_size / 1e6:.1f} MB.")
 
 
-def _packed(model, state, capture, seen, count):
-    instants = gathered(model, state, seen, count)
+def _packed(at, rows, capture, seen, count):
+    instants = gathered(at, rows, seen, count)
     return instants, packing.pack(instants, still_distance(instants, capture))
 
 

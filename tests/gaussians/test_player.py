@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from gaussians_jax import projection, rendering, representation, scene, splats
-from gaussians_jax.player import instants, packing
+from gaussians_jax.player import packing, sampled
 from gaussians_jax.player import page as player_page
 from gaussians_jax.splats import Gaussians
 from nerfies_jax import evaluation
@@ -160,7 +160,7 @@ def test_a_scene_too_large_for_a_page_gets_fewer_instants(tmp_path, monkeypatch)
     monkeypatch.setattr(player_page, "MOST_BYTES", 12_000)
     path, poster = tmp_path / "player.html", np.zeros((30, 40, 3), np.uint8)
     representation.player(path, "", SPEC, model, state, capture, poster)
-    assert pack.instants[0] == instants.LEAST_INSTANTS
+    assert pack.instants[0] == sampled.LEAST_INSTANTS
     assert player_page.FEWEST_INSTANTS <= pack.instants[1] < pack.instants[0]
     header = json.loads(inside(path, "header"))
     assert header["instants"] == pack.instants[1]
@@ -181,7 +181,7 @@ def test_one_rotation_keeps_one_sign():
     angle = np.linspace(0, 3 * np.pi, 30)  # to and fro over the double cover
     true = np.stack([np.cos(angle), np.sin(angle), 0 * angle, 0 * angle], -1)[:, None]
     flipped = true * np.where(np.arange(30) % 3 == 0, -2, 1)[:, None, None]
-    quaternions = instants.steady(flipped)
+    quaternions = sampled.steady(flipped)
     np.testing.assert_allclose(quaternions, -true, atol=1e-12)
 
 
@@ -221,7 +221,7 @@ def by_node(page):
         "centre": one.principal_point_px.tolist(),
         "size": capture.size,
     }
-    program = pathlib.Path(instants.__file__).with_name("splats.js").read_text()
+    program = pathlib.Path(sampled.__file__).with_name("splats.js").read_text()
     content = {
         "header": json.loads(inside(page, "header")),
         "data": inside(page, "data"),

@@ -1,6 +1,7 @@
 """A trained scene at a few instants: what a player that knows no model can draw."""
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -10,10 +11,13 @@ from jaxtyping import Array, Float, Int
 
 from gaussians_jax import harmonics, rendering, splats
 from gaussians_jax.raster_spec import RasterSpec
-from gaussians_jax.splats import Gaussians
+from gaussians_jax.splats import Gaussians, Splats
 from nerfies_jax import evaluation
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.training.model import Model, TrainState, View, in_default_precision
+from nerfies_jax.geometry.camera import Camera
+
+# The Gaussians at a time in [0, 1] (`instants.gaussians_at`).
+At = Callable[[float], Gaussians]
 
 LEAST_INSTANTS, MOST_INSTANTS = 24, 48
 MOST_VIEWS = 48  # training views that say what was seen, and in which colour
@@ -43,8 +47,8 @@ class Seen(NamedTuple):
     colour: np.ndarray  # [gaussians, 3], mean over the views by how much they show
 
 
-def gathered(model: Model, state: TrainState, seen: Seen, count: int) -> Instants:
-    """The scene at `count` instants; host side."""
+def gathered(at: At, rows: Splats, seen: Seen, count: int) -> Instants:
+    """The scene at `count` instants; host side. `rows` say which are active."""
     # NaN compares false: it is left out.
     (kept,) = np.nonzero(seen.most >= LEAST_SEEN_PX)
     if not kept.size:
@@ -52,15 +56,10 @@ def gathered(model: Model, state: TrainState, seen: Seen, count: int) -> Instant
             f"none of the {len(seen.most)} Gaussians is to be seen from a training "
             "camera; train for more steps"
         )
-    prepared = jax.jit(model.stages.prepare)(state.params)
-    posed = jax.jit(
-        lambda params, prepared, time: jax.tree.map(
-            lambda leaf: leaf[kept], model.stages.deform(params, prepared, time)
-        )
+    poses = [jax.device_get(at(float(time))) for time in np.linspace(0, 1, count)]
+    stacked = Gaussians(
+        *(np.stack([leaf[kept] for leaf in each]) for each in zip(*poses, strict=True))
     )
-    times = in_default_precision(np.linspace(0, 1, count))
-    poses = [jax.device_get(posed(state.params, prepared, time)) for time in times]
-    stacked = Gaussians(*(np.stack(leaves) for leaves in zip(*poses, strict=True)))
     return Instants(
         mean=stacked.mean,
         quaternion=steady(stacked.quaternion),
@@ -70,7 +69,7 @@ def gathered(model: Model, state: TrainState, seen: Seen, count: int) -> Instant
         ),
         opacity=stacked.opacity,
         colour=seen.colour[kept],
-        left_out=int(splats.active_mask(state.params.rows["splats"]).sum()) - kept.size,
+        left_out=int(splats.active_mask(rows).sum()) - kept.size,
     )
 
 
@@ -81,10 +80,10 @@ def count_for(capture: Capture) -> int:
 
 
 def seen_in_training(
-    model: Model,
+    at: At,
+    rows: Splats,
     raster: RasterSpec,
     degree: Int[Array, ""],
-    state: TrainState,
     capture: Capture,
 ) -> Seen:
     """How much of the training pictures each Gaussian makes up, and in which colour.
@@ -93,32 +92,29 @@ def seen_in_training(
     weights, so the weights of a Gaussian, summed over the pixels, are the slope of the
     picture's sum in the Gaussian's colour.
     """
-    rows = evaluation.spread(capture.train, MOST_VIEWS)
     factor = math.ceil(max(capture.size) / MOST_SIDE_PX)
     size = (max(1, capture.size[0] // factor), max(1, capture.size[1] // factor))
-    prepared = jax.jit(model.stages.prepare)(state.params)
-    coefficients = splats.active_harmonics(state.params.rows["splats"], degree)
+    coefficients = splats.active_harmonics(rows, degree)
 
     @jax.jit
-    def shown(params, prepared, view: View):
-        gaussians = model.stages.deform(params, prepared, view.time)
-
+    def shown(gaussians: Gaussians, camera: Camera):
         def total(colours: Float[Array, "gaussians 3"]):
             frame = rendering.render(
-                gaussians, colours, view.camera, size, raster, depth=False
+                gaussians, colours, camera, size, raster, depth=False
             )
             return jnp.sum(frame.rendering.colour)
 
         weight = jax.grad(total)(jnp.zeros_like(gaussians.mean))[:, 0]
         towards = harmonics.colour_towards(
-            coefficients, gaussians.mean, view.camera.position
+            coefficients, gaussians.mean, camera.position
         )
         return weight, weight[:, None] * towards
 
     most, total, colour = 0.0, 0.0, 0.0
-    for row in rows:
+    for row in evaluation.spread(capture.train, MOST_VIEWS):
         view = evaluation.resized(evaluation.view_of(capture, row), capture.size, size)
-        weight, coloured = jax.device_get(shown(state.params, prepared, view))
+        deformed = at(float(view.time))
+        weight, coloured = jax.device_get(shown(deformed, view.camera))
         most = np.maximum(most, weight * factor**2)
         total, colour = total + weight, colour + coloured
     seen = np.maximum(total, np.finfo(np.float32).tiny)
