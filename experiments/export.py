@@ -4,6 +4,7 @@ python -m experiments.export RUN ply --time 0.4          # the scene at one inst
 python -m experiments.export RUN ply --frames 48         # a numbered sequence
 python -m experiments.export RUN splat
 python -m experiments.export RUN spz --units world
+python -m experiments.export RUN splatv                  # all times in one file
 python -m experiments.export RUN transforms              # cameras, pictures, points
 python -m experiments.export RUN colmap --units world
 python -m experiments.export RUN nerfies
@@ -25,7 +26,8 @@ GAUSSIANS = ("time", "frames", "units")
 PATHS = ("frames", "path")
 OPTIONS = {
     **{"ply": GAUSSIANS, "splat": GAUSSIANS, "spz": GAUSSIANS},
-    **{"transforms": ("units",), "colmap": ("units",), "nerfies": ()},
+    **{"splatv": (), "nerfies": ()},
+    **{"transforms": ("units",), "colmap": ("units",)},
     **{"path": PATHS, "nerfies-path": PATHS, "exr": PATHS},
     "tracks": ("time", "frames", "units", "points"),
 }
@@ -39,14 +41,15 @@ class Export:
     """Run folder that experiments.reconstruct made."""
     format: cli.Positional[
         Literal[
-            *("ply", "splat", "spz", "transforms", "colmap", "nerfies"),
+            *("ply", "splat", "spz", "splatv", "transforms", "colmap", "nerfies"),
             *("path", "nerfies-path", "tracks", "exr"),
         ]
     ]
-    """Gaussians as ply, splat or spz; the pictures learned from with their cameras and
-    points as nerfstudio's transforms, a colmap model or a nerfies directory; a camera
-    path as nerfstudio's camera_path.json (path) or Nerfies' folder (nerfies-path);
-    tracks of points of a moving scene (npz); exr pictures with camera and motion."""
+    """Gaussians as ply, splat or spz, or with their motion, on cubics, as splatv; the
+    pictures learned from with their cameras and points as nerfstudio's transforms, a
+    colmap model or a nerfies directory; a camera path as nerfstudio's camera_path.json
+    (path) or Nerfies' folder (nerfies-path); tracks of points of a moving scene (npz);
+    exr pictures with camera and motion."""
     time: float | None = None
     """Gaussians as they are at this time in [0, 1] (default: 0). Tracks: of what is
     seen then (default: 0.5)."""
@@ -100,7 +103,8 @@ class Export:
         """Of the file; empty where a folder is written."""
         if self.gaussians:
             return f".{self.format}" if self.frames is None else ""
-        return {"path": ".json", "tracks": ".npz"}.get(self.format, "")
+        suffixes = {"path": ".json", "tracks": ".npz", "splatv": ".splatv"}
+        return suffixes.get(self.format, "")
 
     @property
     def place(self) -> pathlib.Path:
@@ -147,6 +151,32 @@ def _gaussians(args: Export, run: Any) -> str:
         args.place, at, args.frames, f".{args.format}", overwrite=args.overwrite
     )
     return f"Gaussians at {args.frames} instants"
+
+
+def _splatv(args: Export, run: Any) -> str:
+    from gaussians_jax import instants, splats, splatv
+    from gaussians_jax.player import sampled
+    from nerfies_jax import evaluation, runs
+
+    state, spec, capture = runs.restore(args.run, run).state, run.spec, run.capture
+    at, rows = instants.gaussians_at(run.model, state), state.params.rows["splats"]
+    degree = splats.active_degree(state.step, spec.sh_every, spec.sh_degree)
+    seen = sampled.seen_in_training(at, rows, spec.raster, degree, capture)
+    learned = sampled.gathered(at, rows, seen, sampled.MOST_INSTANTS)
+    curves = splatv.write(args.place, learned, capture)
+    draw = evaluation.Renderer(run.model, capture.size)
+    fit = splatv.measured(curves, learned, draw, state, spec.raster, capture)
+    said = (
+        f"{len(curves.position)} Gaussians on cubics in time, off by {fit.rms:.2g} "
+        f"scene units (rms; {fit.most:.2g} for the worst of 99 in 100); pictures "
+        f"{fit.psnr:.1f} dB from the run's own ({fit.views} views)"
+    )
+    if capture.near < splatv.NEAREST:
+        said += (
+            f"; what is nearer than {splatv.NEAREST:g} scene units is not drawn by "
+            f"that viewer, and this scene begins at {capture.near:.2g}"
+        )
+    return said
 
 
 def _cameras(args: Export, run: Any) -> str:
@@ -239,6 +269,7 @@ def _exr(args: Export, run: Any) -> str:
 
 WRITERS = {
     **dict.fromkeys(("ply", "splat", "spz"), _gaussians),
+    "splatv": _splatv,
     **dict.fromkeys(("transforms", "colmap", "nerfies"), _cameras),
     **dict.fromkeys(("path", "nerfies-path"), _path),
     **{"tracks": _tracks, "exr": _exr},

@@ -19,6 +19,8 @@ from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.json_files import replaced_folder
 from nerfies_jax.training.model import Model, TrainState
 
+# The Gaussians at a time in [0, 1].
+At = Callable[[float], Gaussians]
 NUMBERED = "frame_{:04d}"  # viewers play files whose names differ in a number alone
 
 
@@ -28,7 +30,7 @@ def check_time(time: float) -> None:
         raise ValueError(f"time {time:g}: the capture runs from 0 to 1")
 
 
-def gaussians_at(model: Model, state: TrainState) -> Callable[[float], Gaussians]:
+def gaussians_at(model: Model, state: TrainState) -> At:
     """A function of the time in [0, 1] that gives all Gaussians then; host side.
 
     What does not change with time is computed once, now.

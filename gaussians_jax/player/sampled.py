@@ -1,7 +1,6 @@
 """A trained scene at a few instants: what a player that knows no model can draw."""
 
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -10,14 +9,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from gaussians_jax import harmonics, rendering, splats
+from gaussians_jax.instants import At
 from gaussians_jax.raster_spec import RasterSpec
 from gaussians_jax.splats import Gaussians, Splats
 from nerfies_jax import evaluation
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.geometry.camera import Camera
-
-# The Gaussians at a time in [0, 1] (`instants.gaussians_at`).
-At = Callable[[float], Gaussians]
 
 LEAST_INSTANTS, MOST_INSTANTS = 24, 48
 MOST_VIEWS = 48  # training views that say what was seen, and in which colour

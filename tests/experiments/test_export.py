@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 
 import jax
 import numpy as np
@@ -10,6 +11,7 @@ import plyfile
 import pytest
 
 from experiments import cli, export
+from gaussians_jax import splatv
 from nerfies_jax import runs
 from nerfies_jax.capture import camera_paths, exr, load, nerfies_format
 from nerfies_jax.runs import train
@@ -125,6 +127,20 @@ def test_gaussians_leave_at_an_instant_and_as_a_sequence(splats, tmp_path, capsy
     assert main(splats, "ply", "--time", "0.4", "--overwrite", "--units", "world") == 0
     in_world = plyfile.PlyData.read(path)["vertex"]["x"]
     np.testing.assert_allclose(in_world, 2 * x + CENTRE[0], rtol=1e-6)
+
+
+@pytest.mark.full
+def test_a_scene_leaves_with_all_its_motion_and_how_far_it_is_off(splats, capsys):
+    assert main(splats, "splatv") == 0
+    said = capsys.readouterr().out
+    path = splats / "exports" / "splatv.splatv"
+    assert str(path) in said
+    told = re.search(r"off by (\S+) scene units.* pictures (\S+) dB", said)
+    assert 0 < float(told[1]) < 0.1
+    assert 20 < float(told[2]) < 100
+    assert len(splatv.decode(path.read_bytes()).position) > 100
+    assert main(splats, "splatv", "--frames", 2) == 2
+    assert "--frames is not for splatv" in capsys.readouterr().err
 
 
 def test_pictures_leave_with_their_camera_and_motion(splats, capsys):
