@@ -22,7 +22,7 @@ from nerfies_jax.capture import images
 from nerfies_jax.capture.capture import CaptureError, blocks, shrink
 from nerfies_jax.capture.frames import natural
 from nerfies_jax.capture.images import MAX_PIXELS, write_png
-from nerfies_jax.capture.video import read_video
+from nerfies_jax.capture.video import read_video, transfer_of
 
 FILMS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".3gp")
 PLAIN = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
@@ -94,8 +94,11 @@ def from_film(
         if sources is not None:
             mask = images.read_mask(sources[row])
             _write_mask(out, names[-1], mask, frame.shape, factor, sources[row])
-    notes = f"{len(kept)} of {len(scores)} frames kept, {blurred} too blurred"
-    return Taken(tuple(names), (notes,), float(np.ptp(moments[kept])))
+    notes = [f"{len(kept)} of {len(scores)} frames kept, {blurred} too blurred"]
+    transfer = transfer_of(film)
+    if transfer is not None:
+        notes.append(f"filmed in high dynamic range ({transfer}), tone-mapped to sRGB")
+    return Taken(tuple(names), tuple(notes), float(np.ptp(moments[kept])))
 
 
 def _wanted(film, moments, count, per_second):

@@ -9,6 +9,12 @@ import av
 import numpy as np
 
 from nerfies_jax.capture.capture import CaptureError
+from nerfies_jax.capture.high_dynamic_range import (
+    CODES,
+    TRANSFERS,
+    Transfer,
+    tone_mapped,
+)
 from nerfies_jax.capture.images import MAX_PIXELS
 from nerfies_jax.capture.json_files import AnyPath, replaced_file
 
@@ -68,13 +74,36 @@ def _encode(partial, path, first, frames, frames_per_second, quality):
         container.mux(stream.encode())
 
 
+def transfer_of(path: AnyPath) -> Transfer | None:
+    """How the brightness of a film of high dynamic range is coded; None of others.
+
+    Also where there is no film to be read: `read_video` says what is wrong with it.
+    """
+    try:
+        with av.open(str(path)) as container:
+            frame = next(container.decode(video=0), None)
+            return None if frame is None else TRANSFERS.get(int(frame.color_trc))
+    except (av.FFmpegError, OSError, IndexError):
+        return None
+
+
+def _pixels(frame):
+    """uint8 sRGB [height, width, 3]."""
+    transfer = TRANSFERS.get(int(frame.color_trc))
+    if transfer is None:
+        return frame.to_ndarray(format="rgb24")
+    # ffmpeg's white is 255/256 of what 16 bits hold.
+    code = frame.to_ndarray(format="rgb48le").astype(np.uint32) * 257 // 256
+    return tone_mapped(np.minimum(code, CODES - 1).astype(np.uint16), transfer)
+
+
 def read_video(
     path: AnyPath, stride: int = 1, most: int = 2**31
 ) -> Iterator[tuple[float, np.ndarray]]:
     """Seconds and uint8 sRGB [height, width, 3] of every `stride`-th frame, upright.
 
     Times are the film's own, so a variable frame rate stays true. A phone's rotation
-    tag is carried out. High dynamic range is not tone-mapped.
+    tag is carried out, and high dynamic range is tone-mapped.
     """
     path = pathlib.Path(path)
     if not path.is_file():
@@ -98,12 +127,8 @@ def read_video(
                     return
                 shown += 1
                 turns = round((frame.rotation or 0) / 90)
-                yield (
-                    float(frame.time or 0.0),
-                    np.ascontiguousarray(
-                        np.rot90(frame.to_ndarray(format="rgb24"), turns)
-                    ),
-                )
+                upright = np.rot90(_pixels(frame), turns)
+                yield float(frame.time or 0.0), np.ascontiguousarray(upright)
     except (av.FFmpegError, OSError) as error:
         reason = " ".join(str(error.strerror or error).split())
         raise CaptureError(

@@ -4,7 +4,7 @@ import av
 import numpy as np
 import pytest
 
-from nerfies_jax.capture import video
+from nerfies_jax.capture import footage, high_dynamic_range, video
 from nerfies_jax.capture.capture import CaptureError
 
 
@@ -69,6 +69,78 @@ def test_a_phones_rotation_is_carried_out(tmp_path, turn, expected, mark):
     assert decoded.shape[:2] == expected
     assert decoded[mark].min() > 200
     assert decoded[-mark[0], mark[1]].max() < 60
+
+
+def pq_code(nits):
+    """SMPTE ST 2084, forwards, as it is printed there."""
+    power = (np.asarray(nits) / 10_000) ** 0.1593017578125
+    return ((0.8359375 + 18.8515625 * power) / (1 + 18.6875 * power)) ** 78.84375
+
+
+def srgb(linear):
+    return np.where(
+        linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055
+    )
+
+
+def test_high_dynamic_range_keeps_what_is_no_brighter_than_half_of_white():
+    """Colours of sRGB at 95 nits and less, coded as PQ in the primaries of BT.2020."""
+    colours = np.array([[1, 1, 1], [0.9, 0.1, 0.05], [0.1, 0.5, 1], [0, 0, 0]])
+    # ITU-R BT.2087-0, equation for linear BT.709 to linear BT.2020
+    to_wide = [
+        [0.6274, 0.3293, 0.0433],
+        [0.0691, 0.9195, 0.0114],
+        [0.0164, 0.0880, 0.8956],
+    ]
+    for nits in (95, 30, 2):
+        code = np.round(65535 * pq_code(nits * colours @ np.transpose(to_wide)))
+        shown = high_dynamic_range.tone_mapped(code.astype(np.uint16), "PQ")
+        expected = 255 * srgb(nits / 203 * colours)
+        # A level of rounding, and one of matrices of four digits at dark colours
+        assert np.abs(shown - expected).max() < 2
+    grey = np.repeat(np.linspace(0, 1, 4001)[:, None], 3, axis=1)
+    for transfer in ("PQ", "HLG"):
+        ramp = high_dynamic_range.tone_mapped(
+            np.round(65535 * grey).astype(np.uint16), transfer
+        )
+        assert (np.diff(ramp[:, 1].astype(int)) >= 0).all()
+        assert (ramp[0].max(), ramp[-1].min()) == (0, 255)
+        assert np.ptp(ramp.astype(int), axis=1).max() <= 1
+    # White paper has the code 0.75 of HLG and 0.5807 of PQ (BT.2408-7, table 1).
+    paper = [
+        high_dynamic_range.tone_mapped(np.uint16([round(65535 * code)] * 3), transfer)
+        for code, transfer in ((0.75, "HLG"), (0.5807, "PQ"))
+    ]
+    assert np.abs(paper[0].astype(int) - paper[1]).max() <= 1
+    assert 215 < paper[0].min() < 240
+
+
+def test_a_film_of_high_dynamic_range_is_told_and_tone_mapped(tmp_path):
+    luma = np.full((32, 48), 64, np.uint16)  # 10 bits: black, and a code of 0.75
+    luma[:, 24:] = 64 + 0.75 * 876
+    with av.open(str(tmp_path / "a.mp4"), "w") as container:
+        stream = container.add_stream("libx264", rate=10, options={"crf": "2"})
+        stream.width, stream.height, stream.pix_fmt = 48, 32, "yuv420p10le"
+        context = stream.codec_context
+        context.color_primaries, context.color_trc = 9, 18  # BT.2020, HLG
+        context.colorspace, context.color_range = 9, 1
+        for _ in range(2):
+            picture = av.VideoFrame(48, 32, "yuv420p10le")
+            for plane, values in zip(picture.planes, (luma, 512, 512), strict=True):
+                rows = np.frombuffer(memoryview(plane), np.uint16)
+                rows = rows.reshape(plane.height, -1)
+                rows[:, : plane.width] = values
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode())
+    _, decoded = next(iter(video.read_video(tmp_path / "a.mp4")))
+    code = np.uint16([round(0.75 * 65535)] * 3)
+    paper = high_dynamic_range.tone_mapped(code, "HLG")
+    assert np.abs(decoded[16, 40].astype(int) - paper).max() <= 1
+    assert decoded[16, 8].max() <= 1
+    taken = footage.from_film(tmp_path / "a.mp4", tmp_path / "out")
+    assert "high dynamic range (HLG), tone-mapped" in taken.notes[-1]
+    video.write_video(tmp_path / "b.mp4", film())
+    assert video.transfer_of(tmp_path / "b.mp4") is None
 
 
 def test_what_is_no_film_is_refused(tmp_path):
