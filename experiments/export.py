@@ -164,7 +164,13 @@ def _splatv(args: Export, run: Any) -> str:
     seen = sampled.seen_in_training(at, rows, spec.raster, degree, capture)
     learned = sampled.gathered(at, rows, seen, sampled.MOST_INSTANTS)
     curves = splatv.write(args.place, learned, capture)
-    draw = evaluation.Renderer(run.model, capture.size)
+    model = run.model
+    if spec.exposure is not None:  # of which the file has none
+        neutral = ("exposure",)
+        model = run.representation.variant(
+            spec, run.metadata, neutral, False, effects=run.effects
+        )
+    draw = evaluation.Renderer(model, capture.size)
     fit = splatv.measured(curves, learned, draw, state, spec.raster, capture)
     said = (
         f"{len(curves.position)} Gaussians on cubics in time, off by {fit.rms:.2g} "

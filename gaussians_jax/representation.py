@@ -7,6 +7,7 @@ import numpy as np
 
 from gaussians_jax import (
     files,
+    held_out_exposure,
     model_file,
     point_tracks,
     presets,
@@ -112,7 +113,7 @@ def advise(
         present = (name for name in MOTION_PARTS if getattr(spec, name) is not None)
         overrides += [f"{name}=none" for name in present]
     if wanted.get(LIGHT):
-        notes.append(f"{LIGHT}: splats have none; prefer the field")
+        notes.append(f"{LIGHT}: --set exposure.learning_rate=0.01 learns it")
     if wanted.get(TRANSIENT) and (moves is False or spec.motion is None):
         notes.append(f"{TRANSIENT}: splats have no medium for it; prefer the field")
     if wanted.get(START) is False:
@@ -184,7 +185,7 @@ GAUSSIANS = Representation(
     time_parts=step_time.parts,
     variant=variants.without_effects,
     parts=variants.parts,
-    score_halves=lambda *_, **__: None,
+    score_halves=held_out_exposure.score,
     fitted_rays=0,
     save=save,
     player=player,

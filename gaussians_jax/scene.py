@@ -36,6 +36,7 @@ from gaussians_jax.splats import Params
 from gaussians_jax.update import Drawn
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evidence import usable_paths
+from nerfies_jax.scene_metadata import exposures
 from nerfies_jax.training import data_parallel, loop, losses
 from nerfies_jax.training.effects import (
     FIELD_SEAMS,
@@ -73,6 +74,7 @@ def metadata_of(capture: Capture) -> SceneMetadata:
         extent=splats.scene_extent(positions, static=halfway),
         background=capture.background or (0.0, 0.0, 0.0),
         frames=len(capture.train),
+        exposures=exposures(capture),
     )
 
 
@@ -146,7 +148,8 @@ def _stages(spec, metadata, effects):
 
     def draw(params, deformed, view, size, step):
         degree = splats.active_degree(step, spec.sh_every, spec.sh_degree)
-        return _draw(spec, metadata, params, deformed, view, size, degree).rendering
+        drawn = _draw(spec, metadata, params, deformed, view, size, degree).rendering
+        return _exposed(effects, params, drawn, view)
 
     return Stages(prepare, deform, draw)
 
@@ -164,6 +167,16 @@ def _draw(
         mean2d_offset=probe,
         depth=depth,
     )
+
+
+def _exposed(effects, params, drawn, view):
+    """What was drawn, as it was filmed in the light of the view."""
+    for effect in effects:
+        if effect.expose is not None:
+            own = params.nets.get(effect.name)
+            colour = effect.expose(own, drawn.colour, view.appearance)
+            drawn = drawn._replace(colour=colour)
+    return drawn
 
 
 def _stepper(spec, metadata, effects, optimiser, devices):
@@ -227,7 +240,8 @@ def _gradients(spec, metadata, effects, state, frames, row, condition):
         canonical = splats.activate(params.rows["splats"])
         moved = deform(params, canonical)
         frame = _draw(spec, metadata, params, moved, view, size, degree, probe, depth)
-        seen = observe(frames, row, frame.rendering)
+        exposed = _exposed(effects, params, frame.rendering, view)
+        seen = observe(frames, row, exposed)
         states = state.aux_state.effects
         value, metrics = loss_of(spec, effects, params, seen, condition, states)
         return value, (metrics, frame.footprints, canonical, moved)

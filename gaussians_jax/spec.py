@@ -6,6 +6,7 @@ from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.effects import (
     acceleration,
     depth,
+    exposure,
     kan_motion,
     mlp_motion,
     motion_basis,
@@ -16,6 +17,7 @@ from gaussians_jax.effects import (
 )
 from gaussians_jax.effects.acceleration import AccelerationSpec
 from gaussians_jax.effects.depth import DepthSpec
+from gaussians_jax.effects.exposure import ExposureSpec
 from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec
 from gaussians_jax.effects.motion_basis import BasisMotionSpec
@@ -58,6 +60,7 @@ class SplatScene:
     motion_growth: MotionGrowthSpec | None = None
     spectral: SpectralSpec | None = None
     depth: DepthSpec | None = None
+    exposure: ExposureSpec | None = None
 
     def __post_init__(self):
         if self.steps < 1:
@@ -82,6 +85,8 @@ class SceneMetadata:
     extent: float  # scene units: how far the cameras spread
     background: tuple[float, float, float]
     frames: int  # to learn from
+    # As in `nerfies_jax.scene_metadata`: the rows between which an exposure lies.
+    exposures: tuple[tuple[int, int, float], ...] = ((0, 0, 0.0),)
 
 
 def refuse_what_cannot_train(spec: SplatScene) -> None:
@@ -157,4 +162,6 @@ def effects_of(spec: SplatScene, metadata: SceneMetadata) -> tuple[Effect, ...]:
         effects.append(spectral.effect(spec.spectral, spec.steps))
     if spec.depth is not None:
         effects.append(depth.effect(spec.depth))
+    if spec.exposure is not None:
+        effects.append(exposure.effect(spec.exposure, spec.steps, metadata.exposures))
     return tuple(effects)

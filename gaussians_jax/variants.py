@@ -11,15 +11,17 @@ from nerfies_jax.evaluation.representation import Parts, check_there
 from nerfies_jax.training.effects import Effect
 from nerfies_jax.training.model import Model, Stages, TrainState
 
+REMOVABLE = ("motion", "exposure")  # of the settings, those that show in a picture
 INSTANTS = 33  # at which rows are looked for that move
 
 
 def parts(spec, metadata, effects: tuple[Effect, ...] = ()) -> Parts:
-    """The motion, and the user's own that move Gaussians, can be left out."""
+    """Motion and exposure can be left out, and such of the user's own."""
     del metadata
-    own = tuple(effect.name for effect in effects if effect.deform is not None)
-    motion = () if spec.motion is None else ("motion",)
-    return Parts((*motion, *own), appearance=False)
+    seams = ("deform", "expose")
+    own = [e.name for e in effects if any(getattr(e, seam) for seam in seams)]
+    there = [name for name in REMOVABLE if getattr(spec, name) is not None]
+    return Parts((*there, *own), appearance=spec.exposure is not None)
 
 
 def without_effects(
@@ -36,7 +38,7 @@ def without_effects(
             "that has them, as nerf-w or nerfies"
         )
     check_there(without, parts(spec, metadata, effects).removable)
-    left = {"motion": None} if "motion" in without and spec.motion is not None else {}
+    left = {name: None for name in REMOVABLE if name in without}
     kept = tuple(effect for effect in effects if effect.name not in without)
     return scene.build(dataclasses.replace(spec, **left), metadata, kept)
 

@@ -56,7 +56,7 @@ def metadata_of(capture: Capture, extent: float | None) -> SceneMetadata:
         scale=float(scale),
         background=capture.background,
         times=tuple(float(time) for time in times),
-        exposures=_exposures(capture),
+        exposures=exposures(capture),
         available_data=frozenset(available_data),
     )
 
@@ -121,8 +121,8 @@ def _frustum_points(capture, near, far, depths=8):
     return np.concatenate(points)
 
 
-def _exposures(capture):
-    """Rows of the table for every id; one row for each id that is learnt from."""
+def exposures(capture: Capture) -> tuple[tuple[int, int, float], ...]:
+    """`SceneMetadata.exposures`; one row for each id that is learnt from."""
     ids = np.asarray(capture.appearance_ids)
     learnt = np.unique(ids[capture.train])
     row_of = {int(learnt_id): row for row, learnt_id in enumerate(learnt)}

@@ -47,6 +47,7 @@ SPLAT_SEAMS = (
     "state",
     "update_state",
     "grow_score",
+    "expose",
 )
 
 
@@ -150,6 +151,9 @@ class Effect(NamedTuple):
     prepare: Callable[[Any], PyTree] | None = None
     # (scene, `Gaussians`, condition, what `prepare` returned or None) -> `Gaussians`
     deform: Callable[[Any, Any, FrameCondition, PyTree], Any] | None = None
+    # (params, picture [height, width, 3] sRGB, appearance id) -> the picture as it was
+    # filmed; of all that is drawn, in training and afterwards
+    expose: Callable[[PyTree, Any, Int[Array, ""]], Any] | None = None
     # scene -> state, arrays only; host side, at the start and after every change of the
     # rows, up to the next
     state: Callable[[Any], PyTree] | None = None

@@ -35,6 +35,7 @@ FLOORS = {
     "gaussians_jax.effects": 7,
     "gaussians_jax.spec": 8,
     "gaussians_jax.growth": 8,
+    "gaussians_jax.held_out_exposure": 8,
     "gaussians_jax.scene": 8,
     "gaussians_jax.track_start": 8,
     "gaussians_jax.point_tracks": 8,

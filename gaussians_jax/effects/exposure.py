@@ -1,0 +1,112 @@
+"""An affine change of colour for each exposure: what light and camera did to a frame.
+
+The picture of a frame is `(1 + linear) colour + offset` of what the Gaussians show, as
+in the exposure compensation of 3D Gaussian splatting (Kerbl et al. 2023, in its code
+since 2024). The
+mean over all exposures is held to no change, or Gaussians could be of any colour.
+"""
+
+import dataclasses
+import math
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key
+
+from nerfies_jax.nets import codes
+from nerfies_jax.training import schedules
+from nerfies_jax.training.effects import Effect, PenaltyContext, Term
+
+NAME = "exposure"
+# For each appearance id the rows it lies between, and where, as in
+# `nerfies_jax.scene_metadata.exposures`.
+Places = tuple[tuple[int, int, float], ...]
+HELD = 1e-6  # squared error a pixel that a change of one in one number counts for
+
+
+@dataclasses.dataclass(frozen=True)
+class ExposureSpec:
+    """How fast exposures are learnt, and how firmly their mean is held to no change.
+
+    Each row of the table learns from its own frames alone, once in so many steps as
+    there are frames; Adam's step then counts some eight times.
+    """
+
+    learning_rate: float = 1e-2
+    learning_rate_end: float = 1e-3
+    neutral: float = 1.0
+
+    def __post_init__(self):
+        schedules.check_falling(self.learning_rate, self.learning_rate_end)
+        if not 0 <= self.neutral < math.inf:
+            raise ValueError(
+                f"neutral={self.neutral} must be finite and not negative; 1 holds the "
+                "mean exposure where it is"
+            )
+
+
+def init(key: Key[Array, ""], exposures: int) -> Float[Array, "exposures 3 4"]:
+    """No change: zero linear part and offset."""
+    del key
+    return jnp.zeros((exposures, 3, 4), jnp.float32)
+
+
+def of_id(
+    table: Float[Array, "exposures 3 4"], places: Places, appearance: Int[Array, ""]
+) -> Float[Array, "3 4"]:
+    """The change of one appearance id; of one never learnt from, between two in time.
+
+    An id that no capture had is that of the nearest number.
+    """
+    left, right, progress = (np.asarray(column) for column in zip(*places, strict=True))
+    one = jnp.clip(appearance, 0, len(places) - 1)
+    share = jnp.asarray(progress, table.dtype)[one]
+    flat = table.reshape(len(table), 12)
+    rows = (jnp.asarray(side, jnp.int32)[one] for side in (left, right))
+    return codes.blend(flat, *rows, share).reshape(3, 4)
+
+
+def changed(
+    picture: Float[Array, "*pixels 3"], change: Float[Array, "3 4"]
+) -> Float[Array, "*pixels 3"]:
+    """Colours after a change, sRGB; not clipped."""
+    mixed = jnp.matmul(picture, change[:, :3].T, precision="highest")
+    return picture + mixed + change[:, 3]
+
+
+def effect(spec: ExposureSpec, steps: int, places: Places) -> Effect:
+    """The effect on a scene of Gaussians that is trained for so many steps."""
+    count = 1 + max(max(left, right) for left, right, _ in places)
+
+    def expose(table, picture, appearance):
+        return changed(picture, of_id(table, places, appearance))
+
+    def penalty(table, context: PenaltyContext):
+        del context
+        return {"neutral": Term(jnp.sum(jnp.mean(table, axis=0) ** 2), spec.neutral)}
+
+    return Effect(
+        NAME,
+        init=lambda key: init(key, count),
+        learning_rate=schedules.log_linear(
+            spec.learning_rate, spec.learning_rate_end, steps
+        ),
+        penalty=penalty,
+        expose=expose,
+    )
+
+
+def fitted(
+    picture: np.ndarray, filmed: np.ndarray, valid: np.ndarray | None
+) -> np.ndarray:
+    """The change [3, 4] that brings a picture nearest to what was filmed.
+
+    Floats [height, width, 3] in sRGB, least squares over the pixels that are `valid`.
+    """
+    keep = np.ones(picture.shape[:2], bool) if valid is None else valid
+    seen, truth = picture[keep].astype(np.float64), filmed[keep].astype(np.float64)
+    inputs = np.concatenate([seen, np.ones((len(seen), 1))], axis=1)
+    # Where a picture has one colour only, what cannot be told stays as it is.
+    held = HELD * max(len(seen), 1) * np.eye(4)
+    squares = inputs.T @ inputs + held
+    return np.linalg.solve(squares, inputs.T @ (truth - seen)).T

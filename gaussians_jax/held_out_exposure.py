@@ -1,0 +1,46 @@
+"""Exposures of frames that were never learnt from, fitted to half of each.
+
+The protocol of NeRF-W (Martin-Brualla et al. 2021, section 5), as for the codes of
+fields: the scene stays as it is, and the other half is scored.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from gaussians_jax import scene
+from gaussians_jax.effects import exposure
+from nerfies_jax import evaluation
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.training.effects import Effect
+from nerfies_jax.training.model import Rendering, TrainState, View
+
+
+def score(
+    spec,
+    metadata,
+    state: TrainState,
+    capture: Capture,
+    rows: np.ndarray,
+    effects: tuple[Effect, ...] = (),
+) -> evaluation.Halves | None:
+    """Scores of the right halves of frames, their exposure fitted to the left ones.
+
+    None where the scene has no exposures.
+    """
+    if spec.exposure is None:
+        return None
+    neutral = dataclasses.replace(spec, exposure=None)
+    model = scene.build(neutral, metadata, effects)
+    renderer = evaluation.Renderer(model, capture.size)
+
+    def fit_code(view: View, left: np.ndarray, valid: np.ndarray | None) -> np.ndarray:
+        drawn = renderer(state, view).colour[:, : left.shape[1]]
+        return exposure.fitted(drawn, left.astype(np.float32) / 255, valid)
+
+    def render(view: View, change: np.ndarray) -> Rendering:
+        drawn = renderer(state, view)
+        colour = drawn.colour + drawn.colour @ change[:, :3].T + change[:, 3]
+        return drawn._replace(colour=colour.astype(np.float32))
+
+    return evaluation.score_halves(fit_code, render, capture, rows)

@@ -1,0 +1,98 @@
+"""Light that changes from frame to frame, beside a scene of Gaussians that does not."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gaussians_jax import held_out_exposure, scene, variants
+from gaussians_jax.effects import exposure
+from gaussians_jax.effects.exposure import ExposureSpec
+from nerfies_jax import evaluation
+from tests import scenes
+
+SPEC = dataclasses.replace(scenes.TINY_SPLATS, exposure=ExposureSpec())
+EVEN = scenes.tiny_capture()
+# Each frame in a light of its own, the one held out between two others in time.
+CAPTURE = dataclasses.replace(
+    EVEN,
+    appearance_ids=np.arange(7, dtype=np.int32),
+    times=np.where(np.arange(7) == EVEN.heldout[0], np.float32(0.5), EVEN.times),
+)
+# Warmer, brighter, and a little lifted
+CHANGE = np.array([[0.3, 0.05, 0, 0.02], [0, 0.1, 0, 0], [0, 0.05, -0.2, 0.01]])
+
+
+@pytest.fixture(scope="module")
+def built():
+    """A model, and a state whose exposures change the colours of some frames."""
+    metadata = scene.metadata_of(CAPTURE)
+    model = scene.build(SPEC, metadata)
+    state = model.init(CAPTURE, jax.random.key(0))
+    scale = jnp.arange(len(CAPTURE.train), dtype=jnp.float32)[:, None, None]
+    table = scale * jnp.asarray(CHANGE, jnp.float32)
+    params = state.params._replace(nets={"exposure": table})
+    return model, metadata, state._replace(params=params)
+
+
+def pictures(model, state, rows):
+    renderer = evaluation.Renderer(model, CAPTURE.size)
+    views = [evaluation.view_of(CAPTURE, row) for row in rows]
+    return np.stack([renderer(state, view).colour for view in views])
+
+
+def test_a_frame_is_drawn_in_its_light_and_one_never_seen_between_its_neighbours(built):
+    model, metadata, state = built
+    rows = [int(row) for row in CAPTURE.train]
+    between = int(CAPTURE.heldout[0])
+    neutral = variants.without_effects(SPEC, metadata, ("exposure",), False)
+    plain = pictures(neutral, state, [*rows, between])
+    assert plain.max() > 0.1
+    drawn = pictures(model, state, [*rows, between])
+    shares = [*range(6), 2.5]
+    for picture, shown, share in zip(plain, drawn, shares, strict=True):
+        expected = picture + share * (picture @ CHANGE[:, :3].T + CHANGE[:, 3])
+        np.testing.assert_allclose(shown, expected, atol=2e-6)
+    assert variants.parts(SPEC, metadata).appearance
+
+
+def test_a_step_teaches_the_exposure_of_its_frame_and_holds_the_mean(built):
+    model, _, state = built
+    frames = evaluation.frames_of(CAPTURE)
+    after, metrics = jax.jit(model.step)(state, frames)
+    table = np.asarray(state.params.nets["exposure"])
+    moved = np.abs(np.asarray(after.params.nets["exposure"]) - table)
+    assert (moved > 0).any()
+    mean = table.mean(axis=0)
+    assert metrics["exposure/neutral"] == pytest.approx((mean**2).sum(), rel=1e-5)
+    # Without that, a frame's step is of its own row alone.
+    free = dataclasses.replace(SPEC, exposure=ExposureSpec(neutral=0.0))
+    after, _ = jax.jit(scene.build(free, scene.metadata_of(CAPTURE)).step)(
+        state, frames
+    )
+    moved = np.abs(np.asarray(after.params.nets["exposure"]) - table)
+    assert sorted((moved > 0).any(axis=(1, 2))) == [False] * 5 + [True]
+
+
+def test_half_a_frame_tells_the_light_of_the_other_half(built):
+    _, metadata, state = built
+    neutral = variants.without_effects(SPEC, metadata, ("exposure",), False)
+    plain = pictures(neutral, state, CAPTURE.heldout)
+    lit = plain * 0.7 + 0.2 + plain @ CHANGE[:, :3].T
+    images = CAPTURE.images.copy()
+    images[CAPTURE.heldout] = np.round(255 * lit.clip(0, 1))
+    filmed = dataclasses.replace(CAPTURE, images=images)
+    halves = held_out_exposure.score(SPEC, metadata, state, filmed, filmed.heldout)
+    # 8 bits of both pictures leave 56 dB; nothing else is between them
+    assert halves.psnr.min() > 50
+    still = dataclasses.replace(SPEC, exposure=None)
+    score = held_out_exposure.score
+    assert score(still, metadata, state, filmed, filmed.heldout) is None
+    # Of a black picture nothing can be told but the offset.
+    black = np.zeros((4, 5, 3))
+    change = exposure.fitted(black, black + 0.25, None)
+    np.testing.assert_allclose(change, [[0, 0, 0, 0.25]] * 3, atol=1e-5)
+    with pytest.raises(ValueError, match=r"neutral=-1\.0"):
+        ExposureSpec(neutral=-1.0)
