@@ -112,8 +112,10 @@ def advise(
     if moves is False:
         present = (name for name in MOTION_PARTS if getattr(spec, name) is not None)
         overrides += [f"{name}=none" for name in present]
-    if wanted.get(LIGHT):
-        notes.append(f"{LIGHT}: --set exposure.learning_rate=0.01 learns it")
+    if wanted.get(LIGHT) and spec.exposure is None:
+        overrides.append("exposure.learning_rate=0.01")
+    if wanted.get(LIGHT) is False and spec.exposure is not None:
+        overrides.append("exposure=none")
     if wanted.get(TRANSIENT) and (moves is False or spec.motion is None):
         notes.append(f"{TRANSIENT}: splats have no medium for it; prefer the field")
     if wanted.get(START) is False:
@@ -196,5 +198,6 @@ GAUSSIANS = Representation(
     prices={
         MOTION: Pair("splats-deformable-small", "only_motion"),
         DEPTH: Pair("sonata-small", "only_depth"),
+        LIGHT: Pair("splats-static-small", "only_exposure"),
     },
 )

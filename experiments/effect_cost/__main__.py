@@ -32,7 +32,10 @@ PRESETS = (
     "splats-deformable-small",
     "sonata-small",
     "moba-small",
+    "splats-static-small",
 )
+# Effects that no preset has, as paths of --set, and the preset they are priced beside.
+BESIDE = {"splats-static-small": ("exposure.learning_rate=0.01",)}
 # Without these the effect on the left cannot be there, or does nothing.
 NEEDS = {
     "elastic": ("warp",),
@@ -139,8 +142,10 @@ def main(arguments=None):
 
 def _spec(name, args):
     from nerfies_jax.runs import representations
+    from nerfies_jax.training import specs
 
-    spec = representations.of_preset(name).presets[name]
+    preset = representations.of_preset(name).presets[name]
+    spec = specs.override(preset, BESIDE.get(name, ()))
     if args.rays is not None and hasattr(spec, "rays"):
         spec = dataclasses.replace(spec, rays=args.rays)
     if args.rows is not None and hasattr(spec, "init"):

@@ -30,7 +30,8 @@ Nerfies without background points, and not Nerfies with a term of weight zero.
 One training step of each preset on the built-in scene, at {at:.0%} of its steps,
 where every warm-up is over. *bare* is the preset without its effects, *only X* has
 one, *X + Y* one and what it cannot be without, *all* is the preset, *without X* the
-preset that lost one (and what needs it).
+preset that lost one (and what needs it). `splats-static-small` has none of its own; it
+stands for what no preset has{apart}.
 
 - *Mflop* and *MB* are the compiler's count, in which the body of a loop counts once,
   however often it runs: what blends Gaussians, and networks that move them in blocks,
@@ -85,8 +86,16 @@ def page(stored) -> str:
     }
     return "\n\n".join(
         [
-            OFF.format(at=about["at"], repeats=about["repeats"], kept=KEPT),
+            OFF.format(
+                at=about["at"], repeats=about["repeats"], kept=KEPT, apart=_apart(about)
+            ),
             WORTH.format(**quoted),
             "\n".join(report.page(metrics)),
         ]
     )
+
+
+def _apart(about):
+    """Which processor, where a preset was not measured on that of the others."""
+    cpu = about.get("apart", {}).get("splats-static-small")
+    return "" if cpu is None else f", measured apart on {cpu}"

@@ -41,6 +41,8 @@ MEASURED = measured(
         "nerf-w-small.bare": 1.0,
         "nerf-w-small.only_appearance": 1.05,
         "nerf-w-small.only_transient": 1.5,
+        "splats-static-small.bare": 1.0,
+        "splats-static-small.only_exposure": 1.02,
         "splats-deformable-small.bare": 1.0,
         "splats-deformable-small.only_motion": 2.5,
         "sonata-small.bare": 1.0,
@@ -54,7 +56,7 @@ NONE = math.nan  # no step takes longer
     ("effect", "gaussians", "radiance"),
     [
         (MOTION, 2.5, 2.2),
-        (LIGHT, NONE, 1.05),
+        (LIGHT, 1.02, 1.05),
         (TRANSIENT, NONE, 1.5),
         (BACKGROUND, NONE, 1.1),  # of a bare step, though it needs the warp
         (DEPTH, 1.05, NONE),
