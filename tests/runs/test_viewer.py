@@ -2,6 +2,9 @@
 
 import contextlib
 import io
+import re
+import sys
+import time
 
 import jax
 import msgspec
@@ -15,6 +18,7 @@ from nerfies_jax.capture import path_files
 from nerfies_jax.evaluation.interactive import Eye, Look
 from nerfies_jax.runs import representations, screen, viewer
 from nerfies_jax.runs.config import CaptureSource, RunConfig
+from nerfies_jax.training import loop
 from tests import scenes
 
 viser = pytest.importorskip("viser")
@@ -200,3 +204,32 @@ def test_a_browser_gets_pictures_and_leaves_a_path_to_render(tmp_path, capsys):
         path.cameras.position[ends], CAPTURE.cameras.position[rows], atol=1e-5
     )
     assert f"--path {saved}" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_who_looks_on_changes_nothing_of_what_is_learnt(tmp_path, capsys):
+    run, state = a_run("gaussians")
+    frames = evaluation.frames_of(CAPTURE, run.model.required_data)
+    alone = loop.fit(run.model, state, frames, steps=3)
+    with viewer.live(run, tmp_path, 8190) as hook:
+        address = re.search(r"trains: (\S+)", capsys.readouterr().out)[1]
+        browser = Browser(address)
+        try:
+            browser.look(eye_of(int(CAPTURE.train[0])))
+            time.sleep(0.5)  # until the server's thread has read it
+            seen = loop.fit(run.model, state, frames, steps=3, hooks=[hook])
+            browser.receive(0.5)
+        finally:
+            browser.close()
+    assert browser.picture.shape == (*CAPTURE.size[::-1], 3)
+    assert seen.stopped_by == "steps"
+    for one, other in zip(
+        *(jax.tree.leaves(each.state.params) for each in (alone, seen)), strict=True
+    ):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_without_viser_one_line_names_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(ValueError, match=r"pip install 'nerfies-jax\[view\]'"):
+        viewer.check_installed()
