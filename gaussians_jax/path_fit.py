@@ -34,12 +34,54 @@ class Points(NamedTuple):
     nets: PyTree  # of the effect; None where it has none
 
 
+class Paths(NamedTuple):
+    """Where points were seen over a film; host side."""
+
+    times: Float[np.ndarray, " frames"]  # in [0, 1]
+    position: Float[np.ndarray, "points frames 3"]  # scene units
+    known: Bool[np.ndarray, "points frames"]
+    unit: float  # a typical distance of the scene, scene units
+
+
+class Guess(NamedTuple):
+    """What a fit starts from: `Effect.fit_to_paths` of a motion that knows better."""
+
+    points: Points
+    rates: Points  # a prefix of `points`, in units of `StartSpec.fit_rate`
+    penalty: Callable[[Points], Float[Array, ""]] | None = None
+
+
 class PathFit(NamedTuple):
     """The fitted points, and the mean distance they are off before and after."""
 
     points: Points
     first: float  # scene units
     last: float
+
+
+def mean_places(paths: Paths) -> Float[np.ndarray, "points 3"]:
+    """The mean of the places where each point is known."""
+    weight = paths.known[..., None].astype(float)
+    total = np.sum(np.where(weight > 0, paths.position, 0), axis=1)
+    return total / np.maximum(np.sum(weight, axis=1), 1)
+
+
+def guess(effect: Effect, paths: Paths, key: Key[Array, ""]) -> Guess:
+    """The effect's own guess; of one that has none, points at rest in mean places."""
+    if effect.fit_to_paths is not None:
+        return effect.fit_to_paths(paths, key)
+    canonical = jnp.asarray(mean_places(paths), jnp.float32)
+    rows = nets = None
+    rows_key, nets_key = jax.random.split(key)
+    if effect.init_rows is not None:
+        blank = scene_of(effect, Points(canonical, None, None))
+        rows = effect.init_rows(rows_key, blank.rows["splats"])
+    if effect.init is not None:
+        nets = effect.init(nets_key)
+    rates = Points(
+        paths.unit, None if rows is None else 1.0, None if nets is None else 0.4
+    )
+    return Guess(Points(canonical, rows, nets), rates)
 
 
 def scene_of(effect: Effect, points: Points) -> Params:
@@ -70,26 +112,23 @@ def places(
 
 def fit(
     effect: Effect,
-    start: Points,
-    times: Float[np.ndarray, " frames"],
-    position: Float[np.ndarray, "points frames 3"],
-    known: Bool[np.ndarray, "points frames"],
-    rates: Points,
+    paths: Paths,
     key: Key[Array, ""],
     *,
-    unit: float = 1.0,
+    rate: float = 5e-3,
     steps: int = 1500,
-    penalty: Callable[[Points], Float[Array, ""]] | None = None,
 ) -> PathFit:
-    """Descend on the distance to the paths, where they are known.
+    """Descend on the distance to the paths, where they are known, from a guess.
 
-    `rates` is a prefix of `start` with the learning rate of each part; `unit` is a
-    typical distance of the scene. The distance is softened near zero and not squared,
-    so that single wrong paths bend nothing. `penalty` is added to the mean distance
-    over the unit. ValueError where no place is known.
+    The distance is softened near zero and not squared, so that single wrong paths bend
+    nothing. The guess's penalty is added to the mean distance over the unit. ValueError
+    where no place is known.
     """
+    times, position, known, unit = paths
     if not known.any():
         raise ValueError("no path is known anywhere: nothing to fit a motion to")
+    start, rates, penalty = guess(effect, paths, key)
+    rates = jax.tree.map(lambda share: rate * share, rates)
     target = jnp.asarray(np.moveaxis(np.where(known[..., None], position, 0), 1, 0))
     target = target.astype(start.canonical.dtype)
     weight = jnp.asarray(known.T, target.dtype)

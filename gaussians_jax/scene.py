@@ -376,9 +376,7 @@ def _from_tracks(spec, effects, capture, key):
     evidence = usable_paths.evidence_to_start_from(capture, spec.start)
     if evidence is None:
         return None, capture
-    seeds = track_start.start(
-        spec.start, effects[0], spec.motion, evidence, capture, key
-    )
+    seeds = track_start.start(spec.start, effects[0], evidence, capture, key)
     if len(evidence.still.position) > initialisation.point_count(capture):
         capture = dataclasses.replace(capture, points=evidence.still)
     return seeds, capture

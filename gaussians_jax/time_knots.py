@@ -175,6 +175,22 @@ def catmull_rom(
     )
 
 
+def spline_weights(knots: int, time: Float[Array, ""]) -> Float[Array, " knots"]:
+    """What each of some even knots over [0, 1] counts in a Catmull-Rom spline.
+
+    Continuous with its slope; at a knot exactly that knot. The end knots stand for
+    those beyond them, and times outside for the ends. All weights at once, four of them
+    not zero: a product with a table of few knots is cheaper than reading four of its
+    columns and adding to them in the gradient.
+    """
+    last = knots - 1
+    place = jnp.clip(time, 0, 1) * last
+    left = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, last - 1)
+    part = place - left.astype(place.dtype)
+    rows = jnp.clip(left + jnp.arange(-1, 3, dtype=jnp.int32), 0, last)
+    return jnp.zeros(knots, place.dtype).at[rows].add(jnp.stack(catmull_rom(part)))
+
+
 @jax.jit
 def _track(gaussians):
     """Gaussians as rows of the table."""

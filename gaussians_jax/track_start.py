@@ -13,18 +13,15 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gaussians_jax import path_fit
-from gaussians_jax.effects.se3_bases import Bases, SE3BasesSpec
 from gaussians_jax.initialisation import StartSpec
-from gaussians_jax.path_fit import Points
+from gaussians_jax.path_fit import Paths, Points
 from gaussians_jax.splats import Params
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.evidence import record, rigid_groups, usable_paths, view_set
+from nerfies_jax.evidence import record, usable_paths, view_set
 from nerfies_jax.evidence.moving import picture_scale
 from nerfies_jax.evidence.record import Evidence
 from nerfies_jax.training.effects import Effect
 
-MEMBER_LOGIT, STILL_LOGIT = 3.0, -6.0  # of a moving point, before the fit
-SMOOTHNESS, TURN_SMOOTHNESS = 0.02, 0.002  # weights of second differences of knots
 DEPTH_TRACKS, DEPTH_REACH_PX = 6, 8.0  # whose depth a moving pixel takes
 CARRIERS = 3  # points of the fit that carry a seed
 FAR = 0.045  # of the unit: a seed farther from every point of the fit is dropped
@@ -44,14 +41,13 @@ class TrackStart(NamedTuple):
 def start(
     spec: StartSpec,
     effect: Effect,
-    motion: Any,
     evidence: Evidence,
     capture: Capture,
     key: jax.Array,
 ) -> TrackStart:
     """The motion fitted to the evidence's paths, and Gaussians that it carries.
 
-    `motion` is the spec of `effect`. ValueError where `usable_paths.unusable` says why.
+    ValueError where `usable_paths.unusable` says why.
     """
     reason = usable_paths.unusable(evidence)
     if reason:
@@ -61,76 +57,14 @@ def start(
     position, known = usable_paths.known_paths(evidence)
     times = capture.times[evidence.row].astype(np.float32)
     unit = usable_paths.scene_unit(evidence)
-    guess, rates, penalty = _guess(motion, effect, position, known, times, unit, key)
-    rates = jax.tree.map(lambda rate: spec.fit_rate * rate, rates)
     fitted = path_fit.fit(
         effect,
-        guess,
-        times,
-        position.astype(np.float32),
-        known,
-        rates,
+        Paths(times, position.astype(np.float32), known, unit),
         key,
-        unit=unit,
+        rate=spec.fit_rate,
         steps=spec.fit_steps,
-        penalty=penalty,
     )
     return _seeds(effect, fitted.points, evidence, capture, times, unit, spec)
-
-
-def _guess(motion, effect, position, known, times, unit, key):
-    """Points to fit from, the rates of their parts, and what keeps them smooth."""
-    if isinstance(motion, SE3BasesSpec):
-        return _bases_guess(motion, position, known, times, unit)
-    first = np.array(
-        [path[seen].mean(0) for path, seen in zip(position, known, strict=True)]
-    )
-    canonical = jnp.asarray(first, jnp.float32)
-    rows = nets = None
-    rows_key, nets_key = jax.random.split(key)
-    if effect.init_rows is not None:
-        blank = path_fit.scene_of(effect, Points(canonical, None, None))
-        rows = effect.init_rows(rows_key, blank.rows["splats"])
-    if effect.init is not None:
-        nets = effect.init(nets_key)
-    rates = Points(unit, None if rows is None else 1.0, None if nets is None else 0.4)
-    return Points(canonical, rows, nets), rates, None
-
-
-def _bases_guess(motion, position, known, times, unit):
-    canonical_frame = len(times) // 2
-    label = rigid_groups.labels(position, known, motion.bases)
-    bodies = rigid_groups.motion(position, known, label, canonical_frame)
-    canonical, middle = rigid_groups.centres(position, known, bodies)
-    turn = rigid_groups.rotation_vectors(bodies.rotation, canonical_frame)
-    moved = np.einsum("gtij,gj->gti", bodies.rotation, middle) + bodies.shift
-    turn = _at_knots(rigid_groups.smoothed(turn), times, motion)
-    shift = _at_knots(rigid_groups.smoothed(moved - middle[:, None]), times, motion)
-    middle = np.concatenate([middle, np.zeros((motion.bases - len(middle), 3))])
-    bases = Bases(*(jnp.asarray(part, jnp.float32) for part in (turn, shift, middle)))
-    logits = np.zeros((len(position), 1 + motion.bases), np.float32)
-    logits[:, 0] = STILL_LOGIT
-    logits[np.arange(len(position)), 1 + label] = MEMBER_LOGIT
-    guess = Points(jnp.asarray(canonical, jnp.float32), jnp.asarray(logits), bases)
-
-    def penalty(points):
-        def bend(table):
-            return jnp.mean(jnp.abs(table[:, 2:] - 2 * table[:, 1:-1] + table[:, :-2]))
-
-        shift, turn = bend(points.nets.shift) / unit, bend(points.nets.turn)
-        return SMOOTHNESS * shift + TURN_SMOOTHNESS * turn
-
-    return guess, Points(unit, 10.0, Bases(3.0, unit, 0.0)), penalty
-
-
-def _at_knots(track, times, motion):
-    """[bases, knots, 3] values between frames; bases without a group stay at rest."""
-    knots = np.linspace(0, 1, motion.knots)
-    table = np.zeros((motion.bases, motion.knots, 3))
-    for group, one in enumerate(track):
-        for axis in range(3):
-            table[group, :, axis] = np.interp(knots, times, one[:, axis])
-    return table
 
 
 def _seeds(effect, points, evidence, capture, times, unit, spec):

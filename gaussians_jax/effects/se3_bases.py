@@ -12,15 +12,20 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Key
 
 from gaussians_jax import splats, time_knots
+from gaussians_jax.path_fit import Guess, Paths, Points
 from gaussians_jax.splats import Gaussians, Params, Splats
+from nerfies_jax.evidence import rigid_groups
 from nerfies_jax.geometry import lie
 from nerfies_jax.training import schedules
 from nerfies_jax.training.effects import Effect, FrameCondition
 
 NAME = "se3_bases"
+MEMBER_LOGIT, STILL_LOGIT = 3.0, -6.0  # of a moving point, before the fit to paths
+SMOOTHNESS, TURN_SMOOTHNESS = 0.02, 0.002  # weights of second differences of knots
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,31 +91,14 @@ def init_logits(spec: SE3BasesSpec, gaussians: int, dtype=jnp.float32):
     return logits.at[:, 0].set(spec.still_logit)
 
 
-def between_knots(
-    table: Float[Array, "bases knots width"], time: Float[Array, ""]
-) -> Float[Array, "bases width"]:
-    """The Catmull-Rom spline through the knots at a time in [0, 1].
-
-    Continuous with its slope; at a knot it is the knot. The end knots stand for those
-    beyond them, and times outside for the ends.
-    """
-    last = table.shape[1] - 1
-    place = jnp.clip(time, 0, 1) * last
-    left = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, last - 1)
-    part = place - left.astype(place.dtype)
-    rows = jnp.clip(left + jnp.arange(-1, 3, dtype=jnp.int32), 0, last)
-    read = jnp.moveaxis(table[:, rows], 1, 0)
-    weights = time_knots.catmull_rom(part)
-    return sum(weight * knot for weight, knot in zip(weights, read, strict=True))
-
-
 def at_time(bases: Bases, time: Float[Array, ""]) -> Motion:
     """The rigid motions of all bases at one time.
 
     R - 1 without the 1: a small turn keeps all its digits.
     """
     both = jnp.concatenate([bases.turn, bases.shift], axis=-1)
-    now = between_knots(both, time)
+    weights = time_knots.spline_weights(both.shape[1], time)
+    now = jnp.einsum("k,bkc->bc", weights, both)
     turn, shift = now[:, :3], now[:, 3:]
     axes, none = jnp.eye(3, dtype=turn.dtype), jnp.zeros_like(turn[0])
     turned = jax.vmap(lie.displacement, (None, None, 0))
@@ -135,6 +123,44 @@ def deform(
     mean = gaussians.mean
     moved = mean + (jnp.einsum("nij,nj->ni", linear, mean) + offset)
     return gaussians._replace(mean=moved, quaternion=splats.turned(gaussians, turn))
+
+
+def fit_to_paths(spec: SE3BasesSpec, paths: Paths) -> Guess:
+    """Groups of points that move as rigid bodies, a basis for each; host side."""
+    times, position, known, unit = paths
+    canonical_frame = len(times) // 2
+    label = rigid_groups.labels(position, known, spec.bases)
+    bodies = rigid_groups.motion(position, known, label, canonical_frame)
+    canonical, middle = rigid_groups.centres(position, known, bodies)
+    turn = rigid_groups.rotation_vectors(bodies.rotation, canonical_frame)
+    moved = np.einsum("gtij,gj->gti", bodies.rotation, middle) + bodies.shift
+    turn = _at_knots(rigid_groups.smoothed(turn), times, spec)
+    shift = _at_knots(rigid_groups.smoothed(moved - middle[:, None]), times, spec)
+    middle = np.concatenate([middle, np.zeros((spec.bases - len(middle), 3))])
+    bases = Bases(*(jnp.asarray(part, jnp.float32) for part in (turn, shift, middle)))
+    logits = np.zeros((len(position), 1 + spec.bases), np.float32)
+    logits[:, 0] = STILL_LOGIT
+    logits[np.arange(len(position)), 1 + label] = MEMBER_LOGIT
+    guess = Points(jnp.asarray(canonical, jnp.float32), jnp.asarray(logits), bases)
+
+    def penalty(points):
+        def bend(table):
+            return jnp.mean(jnp.abs(table[:, 2:] - 2 * table[:, 1:-1] + table[:, :-2]))
+
+        shift, turn = bend(points.nets.shift) / unit, bend(points.nets.turn)
+        return SMOOTHNESS * shift + TURN_SMOOTHNESS * turn
+
+    return Guess(guess, Points(unit, 10.0, Bases(3.0, unit, 0.0)), penalty)
+
+
+def _at_knots(track, times, spec):
+    """[bases, knots, 3] values between frames; bases without a group stay at rest."""
+    knots = np.linspace(0, 1, spec.knots)
+    table = np.zeros((spec.bases, spec.knots, 3))
+    for group, one in enumerate(track):
+        for axis in range(3):
+            table[group, :, axis] = np.interp(knots, times, one[:, axis])
+    return table
 
 
 def effect(spec: SE3BasesSpec, steps: int, extent: float) -> Effect:
@@ -169,4 +195,5 @@ def effect(spec: SE3BasesSpec, steps: int, extent: float) -> Effect:
         learning_rate=rates,
         warm_up=spec.warm_up,
         deform=moved,
+        fit_to_paths=lambda paths, key: fit_to_paths(spec, paths),
     )

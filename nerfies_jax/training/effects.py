@@ -44,6 +44,7 @@ SPLAT_SEAMS = (
     "warm_up",
     "prepare",
     "deform",
+    "fit_to_paths",
     "state",
     "update_state",
     "grow_score",
@@ -154,6 +155,9 @@ class Effect(NamedTuple):
     # (params, picture [height, width, 3] sRGB, appearance id) -> the picture as it was
     # filmed; of all that is drawn, in training and afterwards
     expose: Callable[[PyTree, Any, Int[Array, ""]], Any] | None = None
+    # (`path_fit.Paths`, key) -> `path_fit.Guess`, from which the motion is fitted to
+    # tracks; host side. None: it is fitted from where `init` starts it.
+    fit_to_paths: Callable[[Any, Key[Array, ""]], Any] | None = None
     # scene -> state, arrays only; host side, at the start and after every change of the
     # rows, up to the next
     state: Callable[[Any], PyTree] | None = None

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from gaussians_jax import path_fit, presets, scene, spec, splats, track_start
 from gaussians_jax.effects.se3_bases import SE3BasesSpec
 from gaussians_jax.initialisation import StartSpec
-from gaussians_jax.path_fit import Points
+from gaussians_jax.path_fit import Paths, Points
 from nerfies_jax import evaluation
 from nerfies_jax.evidence import record, usable_paths
 from tests.evidence import films
@@ -66,16 +66,9 @@ def effect_of(motion):
 def test_every_motion_can_be_fitted_to_paths(name):
     position, time = turning_body()
     known = np.random.default_rng(1).uniform(size=position.shape[:2]) < 0.6
-    motion, effect = MOTIONS[name], effect_of(MOTIONS[name])
-    key = jax.random.key(0)
-    guess, rates, penalty = track_start._guess(
-        motion, effect, position, known, time, 1.0, key
-    )
-    rates = jax.tree.map(lambda rate: 5e-3 * rate, rates)
-    fitted = path_fit.fit(
-        effect, guess, time, position.astype(np.float32), known, rates, key,
-        steps=400, penalty=penalty,
-    )  # fmt: skip
+    effect = effect_of(MOTIONS[name])
+    paths = Paths(time, position.astype(np.float32), known, 1.0)
+    fitted = path_fit.fit(effect, paths, jax.random.key(0), steps=400)
     assert fitted.last < 0.02
     middle = places_of(effect, fitted.points, time[FRAMES // 2])
     off = np.linalg.norm(middle - position[:, FRAMES // 2], axis=-1)
@@ -88,15 +81,9 @@ def test_wrong_paths_bend_nothing():
     position = position.copy()
     position[:3] += np.random.default_rng(2).normal(0, 0.5, (3, FRAMES, 3))
     known = np.ones(position.shape[:2], bool)
-    motion, effect = MOTIONS["bases"], effect_of(MOTIONS["bases"])
-    guess, rates, penalty = track_start._guess(
-        motion, effect, position, known, time, 1.0, jax.random.key(0)
-    )
-    rates = jax.tree.map(lambda rate: 5e-3 * rate, rates)
-    fitted = path_fit.fit(
-        effect, guess, time, position.astype(np.float32), known, rates,
-        jax.random.key(0), steps=400, penalty=penalty,
-    )  # fmt: skip
+    effect = effect_of(MOTIONS["bases"])
+    paths = Paths(time, position.astype(np.float32), known, 1.0)
+    fitted = path_fit.fit(effect, paths, jax.random.key(0), steps=400)
     places = places_of(effect, fitted.points, time[5])
     assert np.linalg.norm(places - position[:, 5], axis=-1)[3:].max() < 0.05
 
@@ -117,22 +104,16 @@ def test_slopes_of_carried_points_are_those_of_differences(float64):
 
 def test_nothing_known_is_refused_by_name():
     position, time = turning_body()
-    effect = effect_of(MOTIONS["bases"])
-    start = Points(np.zeros((30, 3), np.float32), np.zeros((30, 3), np.float32), None)
+    paths = Paths(time, position, np.zeros(position.shape[:2], bool), 1.0)
     with pytest.raises(ValueError, match="no path is known"):
-        path_fit.fit(
-            effect, start, time, position, np.zeros(position.shape[:2], bool),
-            Points(1.0, 1.0, None), jax.random.key(0),
-        )  # fmt: skip
+        path_fit.fit(effect_of(MOTIONS["bases"]), paths, jax.random.key(0))
 
 
 def test_gaussians_start_on_the_card_and_move_with_it():
     capture, evidence = film_and_evidence()
-    motion, effect = MOTIONS["bases"], effect_of(MOTIONS["bases"])
+    effect = effect_of(MOTIONS["bases"])
     start = StartSpec(motion="tracks", moving_points=200, fit_steps=300)
-    started = track_start.start(
-        start, effect, motion, evidence, capture, jax.random.key(0)
-    )
+    started = track_start.start(start, effect, evidence, capture, jax.random.key(0))
     assert len(started.position) == len(started.colour) == len(started.rows) == 200
     points = Points(
         jnp.asarray(started.position), jnp.asarray(started.rows), started.nets
@@ -209,7 +190,5 @@ def test_large_films_are_looked_at_smaller(monkeypatch):
     assert evidence.moving.shape[1:] == (36, 48)
     effect = effect_of(MOTIONS["bases"])
     start = StartSpec(motion="tracks", moving_points=50, fit_steps=100)
-    started = track_start.start(
-        start, effect, MOTIONS["bases"], evidence, capture, jax.random.key(0)
-    )
+    started = track_start.start(start, effect, evidence, capture, jax.random.key(0))
     assert abs(np.median(started.position[:, 2]) - films.NEAR) < 0.3  # the wall: 0.7
