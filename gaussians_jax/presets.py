@@ -14,8 +14,11 @@ from gaussians_jax.effects.mlp_motion import MotionSpec
 from gaussians_jax.effects.motion_basis import SMALL_BASIS_MOTION, BasisMotionSpec
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec
 from gaussians_jax.effects.neighbours import NeighbourSpec
+from gaussians_jax.effects.polynomial_motion import PolynomialMotionSpec
 from gaussians_jax.effects.se3_bases import SE3BasesSpec
 from gaussians_jax.effects.spectral import SpectralSpec
+from gaussians_jax.effects.spline_motion import SplineMotionSpec
+from gaussians_jax.effects.time_basis import SMALL_TIME_BASIS, TimeBasisSpec
 from gaussians_jax.initialisation import InitSpec, StartSpec
 from gaussians_jax.learning_rates import LearningRateSpec
 from gaussians_jax.mcmc import MCMCStrategySpec
@@ -86,6 +89,26 @@ MOBA = SplatScene(
     acceleration=AccelerationSpec(start=3000),
 )
 
+# DynMF: ten trajectories, sparse coefficients that are alike among neighbours. What the
+# paper leaves open is as in 3D-GS and Deformable 3DGS.
+DYNMF = SplatScene(
+    steps=30_000, motion=TimeBasisSpec(), neighbours=NeighbourSpec(start=3000)
+)
+
+# Spacetime Gaussians: cubic motion, opacity over time. Not here: features and a small
+# network for colours (this is its "lite" model), sampling guided by errors.
+SPACETIME = SplatScene(steps=30_000, motion=PolynomialMotionSpec())
+
+# The motion of SplineGS, from tracks as it starts there; its tracks and depths come
+# from networks, these from optical flow. It also finds the cameras, which here a
+# capture has, and takes control points away, which here stay.
+SPLINE = SplatScene(
+    steps=20_000,
+    init=InitSpec(points=50_000),
+    motion=SplineMotionSpec(),
+    start=StartSpec(motion="tracks", moving_points=20_000),
+)
+
 # For a CPU: the same parts with fewer Gaussians, a smaller network, a shorter run.
 # Measured on the built-in scene at 2000 steps (held-out PSNR and SSIM, one seed):
 #   motion from 10 % of the run on, network rate 2e-3   18.20 / 0.466, worse than static
@@ -145,6 +168,13 @@ SMALL_TRACKED = dataclasses.replace(
     motion=SE3BasesSpec(bases=12),
     start=StartSpec(motion="tracks"),
 )
+SMALL_DYNMF = dataclasses.replace(
+    SMALL_TRACKED,
+    motion=dataclasses.replace(SMALL_TIME_BASIS, warm_up=600),
+    neighbours=NeighbourSpec(start=600),
+)
+SMALL_SPACETIME = dataclasses.replace(SMALL_TRACKED, motion=PolynomialMotionSpec())
+SMALL_SPLINE = dataclasses.replace(SMALL_TRACKED, motion=SplineMotionSpec())
 SMALL_DEFORMABLE = dataclasses.replace(
     SMALL_STATIC,
     motion=MotionSpec(
@@ -214,12 +244,18 @@ PRESETS = {
     "splats-deformable": DEFORMABLE,
     "sonata": SONATA,
     "moba": MOBA,
+    "dynmf": DYNMF,
+    "spacetime": SPACETIME,
+    "spline": SPLINE,
     "splats-static-small": SMALL_STATIC,
     "splats-tracked-small": SMALL_TRACKED,
     "splats-mcmc-small": SMALL_MCMC,
     "splats-deformable-small": SMALL_DEFORMABLE,
     "sonata-small": SMALL_SONATA,
     "moba-small": SMALL_MOBA,
+    "dynmf-small": SMALL_DYNMF,
+    "spacetime-small": SMALL_SPACETIME,
+    "spline-small": SMALL_SPLINE,
 }
 
 

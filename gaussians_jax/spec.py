@@ -12,8 +12,11 @@ from gaussians_jax.effects import (
     motion_basis,
     motion_growth,
     neighbours,
+    polynomial_motion,
     se3_bases,
     spectral,
+    spline_motion,
+    time_basis,
 )
 from gaussians_jax.effects.acceleration import AccelerationSpec
 from gaussians_jax.effects.depth import DepthSpec
@@ -23,8 +26,11 @@ from gaussians_jax.effects.mlp_motion import MotionSpec
 from gaussians_jax.effects.motion_basis import BasisMotionSpec
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec
 from gaussians_jax.effects.neighbours import NeighbourSpec
+from gaussians_jax.effects.polynomial_motion import PolynomialMotionSpec
 from gaussians_jax.effects.se3_bases import SE3BasesSpec
 from gaussians_jax.effects.spectral import SpectralSpec
+from gaussians_jax.effects.spline_motion import SplineMotionSpec
+from gaussians_jax.effects.time_basis import TimeBasisSpec
 from gaussians_jax.initialisation import InitSpec, StartSpec
 from gaussians_jax.learning_rates import LearningRateSpec
 from gaussians_jax.mcmc import MCMCStrategySpec
@@ -35,6 +41,17 @@ from nerfies_jax.training.effects import Effect
 from nerfies_jax.training.step_counts import steps
 
 OPTIMISERS = {"adam": scale_by_row_adam, "radam": scale_by_row_radam}
+MotionOf = (
+    MotionSpec
+    | KanMotionSpec
+    | BasisMotionSpec
+    | SE3BasesSpec
+    | TimeBasisSpec
+    | PolynomialMotionSpec
+    | SplineMotionSpec
+)
+# Motions with a vector for each Gaussian that neighbours may be kept alike in.
+EMBEDDED = {KanMotionSpec: kan_motion.NAME, TimeBasisSpec: time_basis.NAME}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,7 +70,7 @@ class SplatScene:
     optimiser: str = "adam"
     alternation: AlternationSpec | None = None
     annealing: AnnealingSpec | None = None
-    motion: MotionSpec | KanMotionSpec | BasisMotionSpec | SE3BasesSpec | None = None
+    motion: MotionOf | None = None
     start: StartSpec = StartSpec()
     acceleration: AccelerationSpec | None = None
     neighbours: NeighbourSpec | None = None
@@ -104,10 +121,11 @@ def refuse_what_cannot_train(spec: SplatScene) -> None:
                 f"{' and '.join(orphans)} without a motion would train nothing; leave "
                 "them out as well, or choose a preset that moves"
             )
-    if spec.neighbours is not None and not isinstance(motion, KanMotionSpec):
+    if spec.neighbours is not None and type(motion) not in EMBEDDED:
         raise ValueError(
-            "neighbours keep embeddings alike, and this motion has none; leave them "
-            "out (neighbours=none), or choose a preset with a KAN motion"
+            "neighbours keep embeddings or coefficients alike, and this motion has "
+            "none; leave them out (neighbours=none), or choose a preset with a KAN "
+            "motion or a time basis"
         )
     if growth is not None and not isinstance(spec.densification, DefaultStrategySpec):
         raise ValueError(
@@ -132,6 +150,15 @@ MOTIONS = {
         spec, steps, seen.frames
     ),
     SE3BasesSpec: lambda spec, steps, seen: se3_bases.effect(spec, steps, seen.extent),
+    TimeBasisSpec: lambda spec, steps, seen: time_basis.effect(
+        spec, steps, seen.extent
+    ),
+    PolynomialMotionSpec: lambda spec, steps, seen: polynomial_motion.effect(
+        spec, steps, seen.extent
+    ),
+    SplineMotionSpec: lambda spec, steps, seen: spline_motion.effect(
+        spec, steps, seen.extent
+    ),
 }
 
 
@@ -154,7 +181,7 @@ def effects_of(spec: SplatScene, metadata: SceneMetadata) -> tuple[Effect, ...]:
             acceleration.effect(spec.acceleration, metadata.extent, metadata.frames)
         )
     if spec.neighbours is not None:
-        of = kan_motion.NAME  # the only rows that are an embedding
+        of = EMBEDDED[type(spec.motion)]
         effects.append(neighbours.effect(spec.neighbours, metadata.extent, of))
     if spec.motion_growth is not None:
         effects.append(motion_growth.effect(spec.motion_growth, metadata.extent))

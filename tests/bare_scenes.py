@@ -24,6 +24,7 @@ from gaussians_jax import presets as splat_presets
 from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec
 from gaussians_jax.effects.se3_bases import SE3BasesSpec
+from gaussians_jax.effects.time_basis import TimeBasisSpec
 from gaussians_jax.initialisation import InitSpec, StartSpec
 from gaussians_jax.splats import Params
 from nerfies_jax import presets as field_presets
@@ -124,6 +125,8 @@ def tiny_splats(name):
         motion = shrunk(motion, position=FEW, time=FEW, depth=1, width=8, skips=())
     elif isinstance(motion, SE3BasesSpec):
         motion = shrunk(motion, bases=2, knots=3)
+    elif isinstance(motion, TimeBasisSpec):
+        motion = shrunk(motion, count=2, time=FEW, depth=1, width=8)
     else:
         motion = shrunk(
             motion,

@@ -12,7 +12,11 @@ from gaussians_jax.effects import (
     motion_basis,
     motion_growth,
     neighbours,
+    polynomial_motion,
+    se3_bases,
     spectral,
+    spline_motion,
+    time_basis,
 )
 from nerfies_jax.effects import (
     ambient,
@@ -47,6 +51,15 @@ MOTION_MODULES = {
     mlp_motion.MotionSpec: mlp_motion,
     kan_motion.KanMotionSpec: kan_motion,
     motion_basis.BasisMotionSpec: motion_basis,
+    se3_bases.SE3BasesSpec: se3_bases,
+    time_basis.TimeBasisSpec: time_basis,
+    polynomial_motion.PolynomialMotionSpec: polynomial_motion,
+    spline_motion.SplineMotionSpec: spline_motion,
+}
+BY_FRAMES = {  # the others ask for the scene's extent
+    mlp_motion.MotionSpec,
+    kan_motion.KanMotionSpec,
+    motion_basis.BasisMotionSpec,
 }
 
 
@@ -78,16 +91,14 @@ def of_splats(spec, metadata):
     """The effects of a scene of Gaussians, asked one by one from their own modules."""
     effects, extent, frames = [], metadata.extent, metadata.frames
     motion = spec.motion
-    if isinstance(motion, mlp_motion.MotionSpec):
-        effects.append(mlp_motion.effect(motion, spec.steps, frames))
-    if isinstance(motion, kan_motion.KanMotionSpec):
-        effects.append(kan_motion.effect(motion, spec.steps, frames))
-    if isinstance(motion, motion_basis.BasisMotionSpec):
-        effects.append(motion_basis.effect(motion, spec.steps, frames))
+    if motion is not None:
+        measure = frames if type(motion) in BY_FRAMES else extent
+        module = MOTION_MODULES[type(motion)]
+        effects.append(module.effect(motion, spec.steps, measure))
     if spec.acceleration is not None:
         effects.append(acceleration.effect(spec.acceleration, extent, frames))
     if spec.neighbours is not None:
-        effects.append(neighbours.effect(spec.neighbours, extent, "kan_motion"))
+        effects.append(neighbours.effect(spec.neighbours, extent, effects[0].name))
     if spec.motion_growth is not None:
         effects.append(motion_growth.effect(spec.motion_growth, extent))
     if spec.spectral is not None:

@@ -16,10 +16,14 @@ from gaussians_jax.effects import (
     motion_basis,
     se3_bases,
     spectral,
+    time_basis,
 )
 from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec
+from gaussians_jax.effects.polynomial_motion import PolynomialMotionSpec
 from gaussians_jax.effects.se3_bases import SE3BasesSpec
+from gaussians_jax.effects.spline_motion import SplineMotionSpec
+from gaussians_jax.effects.time_basis import TimeBasisSpec
 from nerfies_jax import field as fields
 from nerfies_jax import presets as field_presets
 from nerfies_jax.effects import ambient, scene_flow, transient, warp
@@ -137,6 +141,13 @@ def test_splats_have_the_arrays_of_what_they_have_and_no_others(preset):
         elif isinstance(motion, SE3BasesSpec):
             rows.add("se3_bases")
             nets["se3_bases"] = se3_bases.init(key, motion)
+        elif isinstance(motion, TimeBasisSpec):
+            rows.add("time_basis")
+            nets["time_basis"] = time_basis.init(key, motion)
+        elif isinstance(motion, PolynomialMotionSpec):
+            rows.add("polynomial_motion")
+        elif isinstance(motion, SplineMotionSpec):
+            rows.add("spline_motion")
         elif motion is not None:
             nets["motion_basis"] = motion_basis.init(key, motion)
         if spec.spectral is not None:

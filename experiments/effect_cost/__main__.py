@@ -33,6 +33,9 @@ PRESETS = (
     "sonata-small",
     "moba-small",
     "splats-static-small",
+    "dynmf-small",
+    "spacetime-small",
+    "spline-small",
 )
 # Effects that no preset has, as paths of --set, and the preset they are priced beside.
 BESIDE = {"splats-static-small": ("exposure.learning_rate=0.01",)}

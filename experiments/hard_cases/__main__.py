@@ -28,6 +28,7 @@ from experiments.hard_cases import (
     footprints,
     geometry,
     losses,
+    motions,
     networks,
     pictures,
     quaternions,
@@ -49,6 +50,7 @@ ROOMS = {
     "volume": (volume.CASES, "test_volume_cases.py"),
     "networks": (networks.CASES, "test_network_cases.py"),
     "losses": (losses.CASES + pictures.CASES, "test_loss_cases.py"),
+    "motions": (motions.CASES, "test_motion_cases.py"),
     "splats": (footprints.CASES + splats.CASES, "test_splat_cases.py"),
 }
 JITTER = 1e-3  # of the timed inputs, so that rows differ

@@ -25,6 +25,9 @@ MOTIONS = {
     "mlp": presets.SMALL_DEFORMABLE.motion,
     "kan": presets.SMALL_SONATA.motion,
     "basis": presets.SMALL_MOBA.motion,
+    "trajectories": presets.SMALL_DYNMF.motion,
+    "polynomial": presets.SMALL_SPACETIME.motion,
+    "spline": presets.SMALL_SPLINE.motion,
 }
 
 
@@ -59,8 +62,8 @@ def effect_of(motion):
 @pytest.mark.parametrize(
     "name",
     [
-        "bases",
-        *(pytest.param(n, marks=pytest.mark.full) for n in ("mlp", "kan", "basis")),
+        pytest.param(name, marks=() if name == "bases" else pytest.mark.full)
+        for name in MOTIONS
     ],
 )
 def test_every_motion_can_be_fitted_to_paths(name):

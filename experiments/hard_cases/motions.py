@@ -1,0 +1,81 @@
+"""Hard cases of motions by rows: coefficients at rest, opacities over time."""
+
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+
+from experiments.hard_cases.case import Case, constant
+from gaussians_jax.effects import polynomial_motion, time_basis
+
+NEAR = 1e-6  # how close to a switch its two sides are tried, as a share of it
+_SHARES = np.array([1.0, -0.25, 0.125])
+_SIZES = np.array([0, 1e-30, 1e-12, 1e-6, 1e-3, 1e-2, 0.3, 1, 100, 1e6])
+
+
+def _sparsity(x):
+    return time_basis.sparsity(x[None], constant(np.ones(1, bool), bool))[None]
+
+
+def _quotient(x):
+    size = jnp.abs(x)
+    return (jnp.sum(size) / jnp.max(size))[None]
+
+
+def _exact_sparsity(x):
+    size = [abs(one) for one in x]
+    return [mpmath.fsum(size) / (max(size) + mpmath.mpf(time_basis.REST))]
+
+
+SPARSITY = Case(
+    name="trajectories that a Gaussian at rest uses",
+    breaks="sum |c| / max |c| is 0/0; its slope at 1e-12 is 1e12",
+    formula="1e-3, which moves nothing, added to the denominator",
+    axis="largest coefficient",
+    at=_SIZES,
+    inputs=_SIZES[:, None] * _SHARES,
+    stable=_sparsity,
+    textbook=_quotient,
+    exact=_exact_sparsity,
+    bounds={"float32": (1e-6, 2e-6), "float64": (2e-15, 4e-15)},
+    floors=(1.0, 1.0, 0.0),
+    caught=(("float32", "value"), ("float32", "slope"), ("float64", "value")),
+)
+
+_LOW, _HIGH = polynomial_motion.LOG_WIDTH_RANGE
+_EDGES = [end * (1 + side) for end in (_LOW, _HIGH) for side in (-NEAR, NEAR)]
+_WIDTHS = np.array(
+    [
+        [since, width]
+        for width in sorted([-1e4, -400, -100, *_EDGES, -4, -1, 0, 3, 100, 1e4])
+        for since in (0, 1e-3, 0.4)
+    ]
+)
+
+
+def _visible(x):
+    return polynomial_motion.visible_share(x[0], x[1])[None]
+
+
+def _exact_visible(x):
+    held = max(min(x[1], mpmath.mpf(_HIGH)), mpmath.mpf(_LOW))
+    return [mpmath.exp(-((x[0] * mpmath.exp(-held)) ** 2))]
+
+
+VISIBLE = Case(
+    name="opacity over time of any width",
+    breaks="s / w is 0/0 once the width has underflowed, at -104 (-745)",
+    formula="exp(-(s e^-w)²), the logarithm of the width held to ±9",
+    switch="-9 and 9",
+    axis="logarithm of the width, films",
+    at=_WIDTHS[:, 1],
+    inputs=_WIDTHS,
+    stable=_visible,
+    textbook=lambda x: jnp.exp(-jnp.square(x[0] / jnp.exp(x[1])))[None],
+    exact=_exact_visible,
+    bounds={"float32": (2e-6, 4e-6), "float64": (2e-15, 4e-15)},
+    floors=(1.0, 1.0, 0.0),
+    caught=(("float32", "value"), ("float32", "slope"), ("float64", "value")),
+    timed=np.array([0.4, 0.0]),
+)
+
+CASES = (SPARSITY, VISIBLE)

@@ -1,0 +1,179 @@
+"""Motion of each Gaussian as a polynomial of the time of its own.
+
+Spacetime Gaussians (Li et al. 2024, arXiv:2312.16812): a Gaussian has a time of its own
+m, at which it is where its row says; s = t - m later its mean is off by a cubic in s,
+its rotation by a turn that grows with s, and its opacity is exp(-(s / w)^2) of its own,
+with a width w that is learnt. No network, and nothing shared. As the paper has it but
+for the turn, here a rotation vector, where there a quaternion grows linearly.
+"""
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key
+
+from gaussians_jax import path_fit, splats
+from gaussians_jax.path_fit import Guess, Paths
+from gaussians_jax.splats import Gaussians, Params, Splats
+from nerfies_jax.training import schedules
+from nerfies_jax.training.effects import Effect, FrameCondition
+from nerfies_jax.training.step_counts import steps
+
+NAME = "polynomial_motion"
+# Of the width of the opacity over time, in films: from a ten-thousandth to longer than
+# any. Outside it has no slope, and the quotient s / w stays finite.
+LOG_WIDTH_RANGE = (-9.0, 9.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class FadingSpec:
+    """How opacities come and go; the first width is in films.
+
+    One film of width leaves 1/e of the opacity at its far end: the published start.
+    Times of their own are drawn over the film; without fading all are its middle.
+    """
+
+    width: float = 1.0
+    width_rate: float = 3e-2  # of the logarithm
+    time_rate: float = 1e-4  # of the time of its own, in films
+
+    def __post_init__(self):
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if not 0 < value < math.inf:
+                raise ValueError(f"{field.name}={value} must be positive and finite")
+
+
+@dataclasses.dataclass(frozen=True)
+class PolynomialMotionSpec:
+    """The degree, and how coefficients learn; rates of means are in scene extents."""
+
+    degree: int = 3
+    fading: FadingSpec | None = FadingSpec()
+    warm_up: int = steps(0)  # steps without motion
+    learning_rate: float = 5e-4
+    learning_rate_end: float = 5e-6
+    turn_rate: float = 1e-3  # rad for each film
+
+    def __post_init__(self):
+        if not 1 <= self.degree <= 8:
+            raise ValueError(
+                f"degree={self.degree} must be 1 to 8; what a cubic cannot follow "
+                "takes a spline (SplineMotionSpec)"
+            )
+        if self.warm_up < 0:
+            raise ValueError(f"warm_up={self.warm_up} must not be negative")
+        if not 0 < self.turn_rate < math.inf:
+            raise ValueError(f"turn_rate={self.turn_rate} must be positive and finite")
+        schedules.check_falling(self.learning_rate, self.learning_rate_end)
+
+
+class Fading(NamedTuple):
+    """When a Gaussian is to be seen."""
+
+    time: Float[Array, " gaussians"]  # of its own, in films from the first frame
+    log_width: Float[Array, " gaussians"]  # of films
+
+
+class Polynomials(NamedTuple):
+    """What is kept of each Gaussian."""
+
+    shift: Float[Array, "gaussians degree 3"]  # scene units a film, a film squared, ...
+    turn: Float[Array, "gaussians 3"]  # rotation vector, rad a film, in world axes
+    fading: Fading | None
+
+
+def init(key: Key[Array, ""], spec: PolynomialMotionSpec, gaussians: int, dtype):
+    """Nothing moves yet."""
+    fading = None
+    if spec.fading is not None:
+        drawn = jax.random.uniform(key, (gaussians,), jnp.float32).astype(dtype)
+        width = jnp.full(gaussians, math.log(spec.fading.width), dtype)
+        fading = Fading(drawn, width)
+    return Polynomials(
+        jnp.zeros((gaussians, spec.degree, 3), dtype),
+        jnp.zeros((gaussians, 3), dtype),
+        fading,
+    )
+
+
+def deform(
+    rows: Polynomials, gaussians: Gaussians, time: Float[Array, ""]
+) -> Gaussians:
+    """Gaussians as they are at one time in [0, 1]."""
+    own = 0.5 if rows.fading is None else rows.fading.time
+    since = time - own
+    # Horner's rule, without powers: a power has no slope of its own at zero.
+    shift = jnp.zeros_like(gaussians.mean)
+    for degree in reversed(range(rows.shift.shape[1])):
+        shift = (shift + rows.shift[:, degree]) * since[..., None]
+    opacity = gaussians.opacity
+    if rows.fading is not None:
+        opacity = opacity * visible_share(since, rows.fading.log_width)
+    return gaussians._replace(
+        mean=gaussians.mean + shift,
+        quaternion=splats.turned(gaussians, rows.turn * since[..., None]),
+        opacity=opacity,
+    )
+
+
+def visible_share(
+    since: Float[Array, "*gaussians"], log_width: Float[Array, "*gaussians"]
+) -> Float[Array, "*gaussians"]:
+    """exp(-(s / w)^2) of a time s from the middle, w = exp(`log_width`), in films.
+
+    Finite with its slopes whatever the width: the published exponential of a width that
+    is not held is 0/0 at s = 0 once the width has underflowed.
+    """
+    held = jnp.clip(log_width, *LOG_WIDTH_RANGE)
+    return jnp.exp(-jnp.square(since * jnp.exp(-held)))
+
+
+def fit_to_paths(spec: PolynomialMotionSpec, paths: Paths) -> Guess:
+    """Each path by its own least squares, in closed form, to be seen all the time."""
+    since = paths.times.astype(float) - 0.5
+    powers = since[:, None] ** range(spec.degree + 1)
+    fitted = jnp.asarray(path_fit.combination(powers, paths), jnp.float32)
+    count = len(fitted)
+    fading = rate = None
+    if spec.fading is not None:
+        width = jnp.full(count, LOG_WIDTH_RANGE[1] / 2, jnp.float32)
+        fading = Fading(jnp.full(count, 0.5, jnp.float32), width)
+        rate = 0.0
+    rows = Polynomials(fitted[:, 1:], jnp.zeros((count, 3), jnp.float32), fading)
+    points = path_fit.Points(fitted[:, 0], rows, None)
+    rates = Polynomials(paths.unit, 0.0, rate)
+    return Guess(points, path_fit.Points(paths.unit, rates, None))
+
+
+def effect(spec: PolynomialMotionSpec, run_steps: int, extent: float) -> Effect:
+    """The seams that this motion fills, for a run of so many steps.
+
+    `extent`, in scene units, is the measure of shifts, as it is that of the means.
+    """
+    rate = schedules.log_linear(spec.learning_rate, spec.learning_rate_end, run_steps)
+
+    def init_rows(key, rows: Splats):
+        return init(key, spec, len(rows.mean), rows.mean.dtype)
+
+    def row_rates(step):
+        fading = None
+        if spec.fading is not None:
+            fading = Fading(spec.fading.time_rate, spec.fading.width_rate)
+        return Polynomials(extent * rate(step), spec.turn_rate, fading)
+
+    def moved(params: Params, gaussians: Gaussians, condition: FrameCondition, ready):
+        del ready
+        return deform(params.rows[NAME], gaussians, condition.time)
+
+    return Effect(
+        name=NAME,
+        init_rows=init_rows,
+        row_learning_rate=row_rates,
+        warm_up=spec.warm_up,
+        deform=moved,
+        fit_to_paths=lambda paths, key: fit_to_paths(spec, paths),
+    )

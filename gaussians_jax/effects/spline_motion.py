@@ -1,0 +1,104 @@
+"""Motion of each Gaussian along a cubic spline of its own.
+
+SplineGS (Park et al. 2025, arXiv:2412.09982), its motion-adaptive spline: control
+points at even times, and between them a cubic Hermite polynomial whose slopes are those
+of the chord between the neighbours, which is Catmull-Rom. All Gaussians have as many
+control points here; the paper takes away those that hardly matter. Turns have control
+points, too: rotation vectors, interpolated alike.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from gaussians_jax import path_fit, splats, time_knots
+from gaussians_jax.path_fit import Guess, Paths, Points
+from gaussians_jax.splats import Gaussians, Params, Splats
+from nerfies_jax.training import schedules
+from nerfies_jax.training.effects import Effect, FrameCondition
+from nerfies_jax.training.step_counts import steps
+
+NAME = "spline_motion"
+
+
+@dataclasses.dataclass(frozen=True)
+class SplineMotionSpec:
+    """How many control points, and how they learn; shifts in scene extents."""
+
+    knots: int = 12  # evenly over the film
+    warm_up: int = steps(0)  # steps without motion
+    learning_rate: float = 1e-3  # of turns (rad) and shifts
+    learning_rate_end: float = 1e-5
+
+    def __post_init__(self):
+        if self.knots < 2:
+            raise ValueError(
+                f"knots={self.knots}: a motion has at least two, its first and its "
+                "last instant"
+            )
+        if self.warm_up < 0:
+            raise ValueError(f"warm_up={self.warm_up} must not be negative")
+        schedules.check_falling(self.learning_rate, self.learning_rate_end)
+
+
+class Splines(NamedTuple):
+    """What is kept of each Gaussian."""
+
+    shift: Float[Array, "gaussians knots 3"]  # from the mean of its row, scene units
+    turn: Float[Array, "gaussians knots 3"]  # rotation vectors, rad, in world axes
+
+
+def init(spec: SplineMotionSpec, gaussians: int, dtype=jnp.float32) -> Splines:
+    """Nothing moves yet."""
+    zero = jnp.zeros((gaussians, spec.knots, 3), dtype)
+    return Splines(zero, zero)
+
+
+def deform(rows: Splines, gaussians: Gaussians, time: Float[Array, ""]) -> Gaussians:
+    """Gaussians as they are at one time in [0, 1]; outside it, at its nearer end."""
+    weights = time_knots.spline_weights(rows.shift.shape[1], time)
+    shift, turn = (jnp.einsum("k,nkc->nc", weights, leaf) for leaf in rows)
+    return gaussians._replace(
+        mean=gaussians.mean + shift, quaternion=splats.turned(gaussians, turn)
+    )
+
+
+def fit_to_paths(spec: SplineMotionSpec, paths: Paths) -> Guess:
+    """Each path by its own least squares, in closed form."""
+    weights = np.stack(
+        [time_knots.spline_weights(spec.knots, jnp.asarray(t)) for t in paths.times]
+    )
+    fitted = path_fit.combination(weights, paths)
+    mean = fitted.mean(axis=1)
+    shift = jnp.asarray(fitted - mean[:, None], jnp.float32)
+    rows = Splines(shift, jnp.zeros_like(shift))
+    points = Points(jnp.asarray(mean, jnp.float32), rows, None)
+    return Guess(points, Points(paths.unit, Splines(paths.unit, 0.0), None))
+
+
+def effect(spec: SplineMotionSpec, run_steps: int, extent: float) -> Effect:
+    """The seams that this motion fills, for a run of so many steps.
+
+    `extent`, in scene units, is the measure of shifts, as it is that of the means.
+    """
+    rate = schedules.log_linear(spec.learning_rate, spec.learning_rate_end, run_steps)
+
+    def init_rows(key, rows: Splats):
+        del key
+        return init(spec, len(rows.mean), rows.mean.dtype)
+
+    def moved(params: Params, gaussians: Gaussians, condition: FrameCondition, ready):
+        del ready
+        return deform(params.rows[NAME], gaussians, condition.time)
+
+    return Effect(
+        name=NAME,
+        init_rows=init_rows,
+        row_learning_rate=lambda step: Splines(extent * rate(step), rate(step)),
+        warm_up=spec.warm_up,
+        deform=moved,
+        fit_to_paths=lambda paths, key: fit_to_paths(spec, paths),
+    )

@@ -1,0 +1,180 @@
+"""Motion along a few trajectories that all Gaussians share, each in its own measure.
+
+DynMF (Kratimenos et al. 2024, arXiv:2312.00112): a tiny network of the time alone makes
+K trajectories b_k(t), a Gaussian keeps K coefficients c_k, and is at p + sum_k c_k
+b_k(t). The factorisation of all paths into K is that of a singular value decomposition,
+so a scene of few bodies needs few. Like the paper, one coefficient stands for all parts
+of a trajectory, here a shift and a turn; coefficients are sparse (`sparsity`) and
+alike among neighbours (`effects.neighbours`). A Gaussian whose coefficients are zero
+does not move, exactly.
+"""
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Key
+
+from gaussians_jax import splats
+from gaussians_jax.splats import Gaussians, Params, Splats
+from nerfies_jax.nets import encoding, mlp
+from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
+from nerfies_jax.training import schedules
+from nerfies_jax.training.effects import Effect, FrameCondition, PenaltyContext, Term
+from nerfies_jax.training.step_counts import steps
+
+NAME = "time_basis"
+# A row whose largest coefficient is well below this counts as one at rest: it would
+# move by 1e-3 of a trajectory.
+REST = 1e-3
+
+
+@dataclasses.dataclass(frozen=True)
+class TimeBasisSpec:
+    """How many trajectories, the network that makes them, and how both learn.
+
+    Trajectories are in scene extents (shifts) and rad (turns), coefficients are
+    numbers. Ten trajectories are published, their network is called tiny and costs the
+    same however many Gaussians there are: its size, the weight of the sparsity and the
+    rates are our choice, for no code of the paper is public.
+    """
+
+    count: int = 10
+    time: EncodingSpec = EncodingSpec(6, times_pi=True)
+    depth: int = 3
+    width: int = 128
+    sparsity: float | None = 1e-3  # weight; None leaves it out
+    warm_up: int = steps(3000)  # steps without motion
+    learning_rate: float = 8e-4  # of the network
+    learning_rate_end: float = 1.6e-6
+    coefficient_rate: float = 1e-3
+    coefficient_rate_end: float = 1e-5
+
+    def __post_init__(self):
+        if self.count < 1:
+            raise ValueError(
+                f"count={self.count}: a time basis has at least one trajectory"
+            )
+        if self.sparsity is not None and not 0 <= self.sparsity < math.inf:
+            raise ValueError(
+                f"sparsity={self.sparsity} is a weight, finite and not negative; None "
+                "leaves it out"
+            )
+        if self.warm_up < 0:
+            raise ValueError(f"warm_up={self.warm_up} must not be negative")
+        schedules.check_falling(self.learning_rate, self.learning_rate_end)
+        schedules.check_falling(self.coefficient_rate, self.coefficient_rate_end)
+        network_spec(self)  # checks its sizes
+
+
+class Trajectories(NamedTuple):
+    """All trajectories at one time."""
+
+    shift: Float[Array, "count 3"]  # scene units
+    turn: Float[Array, "count 3"]  # rotation vectors, rad, in world axes
+
+
+def network_spec(spec: TimeBasisSpec) -> MLPSpec:
+    """From the encoded time to all trajectories.
+
+    They start about as long as one: coefficients start at zero, and were both zero,
+    neither would get a gradient.
+    """
+    heads = (
+        ("shift", HeadSpec(3 * spec.count)),
+        ("turn", HeadSpec(3 * spec.count)),
+    )
+    inputs = spec.time.width(1)
+    return MLPSpec(inputs, spec.depth, spec.width, heads, (), "silu", "he")
+
+
+SMALL_TIME_BASIS = TimeBasisSpec(time=EncodingSpec(4, times_pi=True), depth=2, width=64)
+
+
+def init(key: Key[Array, ""], spec: TimeBasisSpec, dtype=jnp.float32) -> MLP:
+    """A network whose trajectories are all different."""
+    return mlp.init(network_spec(spec), key, dtype)
+
+
+def init_coefficients(spec: TimeBasisSpec, gaussians: int, dtype=jnp.float32):
+    """[gaussians, count]: all stay where they are."""
+    return jnp.zeros((gaussians, spec.count), dtype)
+
+
+def at_time(
+    params: MLP, spec: TimeBasisSpec, extent: float, time: Float[Array, ""]
+) -> Trajectories:
+    """The trajectories at one time; `extent`, in scene units, is their unit."""
+    encoded = encoding.encode(spec.time, time[None], None)
+    made = mlp.apply(network_spec(spec), params, encoded)
+    shift, turn = (made[name].reshape(spec.count, 3) for name in ("shift", "turn"))
+    return Trajectories(extent * shift, turn)
+
+
+def deform(
+    trajectories: Trajectories,
+    coefficients: Float[Array, "gaussians count"],
+    gaussians: Gaussians,
+) -> Gaussians:
+    """Gaussians moved along the trajectories in their own measure."""
+    moved = coefficients @ jnp.concatenate(trajectories, axis=-1)
+    return gaussians._replace(
+        mean=gaussians.mean + moved[:, :3],
+        quaternion=splats.turned(gaussians, moved[:, 3:]),
+    )
+
+
+def sparsity(
+    coefficients: Float[Array, "gaussians count"], active: Bool[Array, " gaussians"]
+) -> Float[Array, ""]:
+    """Mean over the active rows of sum_k |c_k| / max_k |c_k|: how many are in use.
+
+    The sparsity term of DynMF. It does not see how far a Gaussian moves, only along how
+    many trajectories: from one, where a single coefficient is not zero, to K. The
+    published quotient is 0/0 for a Gaussian at rest; with `REST` added to its
+    denominator it falls to zero there, and its slope is at most K / REST.
+    """
+    # Not `abs`, whose slope at zero is one: all that rests would be pushed one way.
+    size = coefficients * jnp.sign(coefficients)
+    used = jnp.sum(size, axis=-1) / (jnp.max(size, axis=-1) + REST)
+    number = jnp.sum(active, dtype=jnp.int32)
+    share = jnp.where(active, used, 0) / jnp.maximum(number, 1).astype(used.dtype)
+    return jnp.sum(share)
+
+
+def effect(spec: TimeBasisSpec, run_steps: int, extent: float) -> Effect:
+    """The seams that this motion fills, for a run of so many steps.
+
+    `extent`, in scene units, is the measure of shifts, as it is that of the means.
+    """
+
+    def init_rows(key, rows: Splats):
+        del key
+        return init_coefficients(spec, len(rows.mean), rows.mean.dtype)
+
+    def moved(params: Params, gaussians: Gaussians, condition: FrameCondition, ready):
+        del ready
+        trajectories = at_time(params.nets[NAME], spec, extent, condition.time)
+        return deform(trajectories, params.rows[NAME], gaussians)
+
+    def penalty(_, context: PenaltyContext) -> dict[str, Term]:
+        rows = context.params.rows
+        value = sparsity(rows[NAME], splats.active_mask(rows["splats"]))
+        return {"sparsity": Term(value, spec.sparsity)}
+
+    return Effect(
+        name=NAME,
+        init=lambda key: init(key, spec),
+        init_rows=init_rows,
+        row_learning_rate=schedules.log_linear(
+            spec.coefficient_rate, spec.coefficient_rate_end, run_steps
+        ),
+        learning_rate=schedules.log_linear(
+            spec.learning_rate, spec.learning_rate_end, run_steps
+        ),
+        penalty=None if spec.sparsity is None else penalty,
+        warm_up=spec.warm_up,
+        deform=moved,
+    )
