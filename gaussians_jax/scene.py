@@ -75,6 +75,7 @@ def metadata_of(capture: Capture) -> SceneMetadata:
         background=capture.background or (0.0, 0.0, 0.0),
         frames=len(capture.train),
         exposures=exposures(capture),
+        box=initialisation.filmed_box(capture),
     )
 
 

@@ -12,6 +12,7 @@ from gaussians_jax.effects import (
     motion_basis,
     motion_growth,
     neighbours,
+    plane_motion,
     polynomial_motion,
     se3_bases,
     spectral,
@@ -26,6 +27,7 @@ from gaussians_jax.effects.mlp_motion import MotionSpec
 from gaussians_jax.effects.motion_basis import BasisMotionSpec
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec
 from gaussians_jax.effects.neighbours import NeighbourSpec
+from gaussians_jax.effects.plane_motion import PlaneMotionSpec
 from gaussians_jax.effects.polynomial_motion import PolynomialMotionSpec
 from gaussians_jax.effects.se3_bases import SE3BasesSpec
 from gaussians_jax.effects.spectral import SpectralSpec
@@ -49,6 +51,7 @@ MotionOf = (
     | TimeBasisSpec
     | PolynomialMotionSpec
     | SplineMotionSpec
+    | PlaneMotionSpec
 )
 # Motions with a vector for each Gaussian that neighbours may be kept alike in.
 EMBEDDED = {KanMotionSpec: kan_motion.NAME, TimeBasisSpec: time_basis.NAME}
@@ -104,6 +107,8 @@ class SceneMetadata:
     frames: int  # to learn from
     # As in `nerfies_jax.scene_metadata`: the rows between which an exposure lies.
     exposures: tuple[tuple[int, int, float], ...] = ((0, 0, 0.0),)
+    # Low and high corner of what was filmed, scene units; None: nobody asks for it.
+    box: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
 
 def refuse_what_cannot_train(spec: SplatScene) -> None:
@@ -158,6 +163,9 @@ MOTIONS = {
     ),
     SplineMotionSpec: lambda spec, steps, seen: spline_motion.effect(
         spec, steps, seen.extent
+    ),
+    PlaneMotionSpec: lambda spec, steps, seen: plane_motion.effect(
+        spec, steps, seen.extent, seen.box
     ),
 }
 

@@ -23,6 +23,7 @@ from gaussians_jax import learning_rates as splat_rates
 from gaussians_jax import presets as splat_presets
 from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec
+from gaussians_jax.effects.plane_motion import PlaneMotionSpec
 from gaussians_jax.effects.se3_bases import SE3BasesSpec
 from gaussians_jax.effects.time_basis import TimeBasisSpec
 from gaussians_jax.initialisation import InitSpec, StartSpec
@@ -125,6 +126,9 @@ def tiny_splats(name):
         motion = shrunk(motion, position=FEW, time=FEW, depth=1, width=8, skips=())
     elif isinstance(motion, SE3BasesSpec):
         motion = shrunk(motion, bases=2, knots=3)
+    elif isinstance(motion, PlaneMotionSpec):
+        few = shrunk(motion.planes, vertices=4, multiples=(1, 2), moments=3, features=2)
+        motion = shrunk(motion, planes=few, width=8)
     elif isinstance(motion, TimeBasisSpec):
         motion = shrunk(motion, count=2, time=FEW, depth=1, width=8)
     else:

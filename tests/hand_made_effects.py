@@ -12,6 +12,7 @@ from gaussians_jax.effects import (
     motion_basis,
     motion_growth,
     neighbours,
+    plane_motion,
     polynomial_motion,
     se3_bases,
     spectral,
@@ -55,6 +56,7 @@ MOTION_MODULES = {
     time_basis.TimeBasisSpec: time_basis,
     polynomial_motion.PolynomialMotionSpec: polynomial_motion,
     spline_motion.SplineMotionSpec: spline_motion,
+    plane_motion.PlaneMotionSpec: plane_motion,
 }
 BY_FRAMES = {  # the others ask for the scene's extent
     mlp_motion.MotionSpec,
@@ -92,9 +94,11 @@ def of_splats(spec, metadata):
     effects, extent, frames = [], metadata.extent, metadata.frames
     motion = spec.motion
     if motion is not None:
-        measure = frames if type(motion) in BY_FRAMES else extent
+        seen = (frames,) if type(motion) in BY_FRAMES else (extent,)
+        if isinstance(motion, plane_motion.PlaneMotionSpec):
+            seen = (extent, metadata.box)
         module = MOTION_MODULES[type(motion)]
-        effects.append(module.effect(motion, spec.steps, measure))
+        effects.append(module.effect(motion, spec.steps, *seen))
     if spec.acceleration is not None:
         effects.append(acceleration.effect(spec.acceleration, extent, frames))
     if spec.neighbours is not None:

@@ -20,11 +20,12 @@ import numpy as np
 import pytest
 
 from gaussians_jax.raster_spec import GSPLAT
-from nerfies_jax.nets import grids, kan, mlp
+from nerfies_jax.nets import grids, kan, mlp, planes
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.grids import HashGridSpec
 from nerfies_jax.nets.kan import KANSpec
 from nerfies_jax.nets.mlp import HeadSpec, MLPSpec
+from nerfies_jax.nets.planes import PlanesSpec
 from nerfies_jax.radiance import template
 from nerfies_jax.radiance.template import TemplateSpec
 
@@ -33,7 +34,7 @@ MODULES = (
     *(f"nerfies_jax.geometry.{name}" for name in ("matrix3", "camera", "distortion")),
     *("nerfies_jax.geometry.rays", "nerfies_jax.geometry.precision"),
     *(f"nerfies_jax.nets.{name}" for name in ("codes", "encoding", "kan", "mlp")),
-    "nerfies_jax.nets.grids",
+    *("nerfies_jax.nets.grids", "nerfies_jax.nets.planes"),
     *(f"nerfies_jax.radiance.{name}" for name in ("compositing", "sampling")),
     *("nerfies_jax.radiance.template", "nerfies_jax.training.losses"),
     *("gaussians_jax.projection", "gaussians_jax.splats", "gaussians_jax.harmonics"),
@@ -56,7 +57,7 @@ EXCUSED = {
     **dict.fromkeys(["template.trunk_spec", "template.colour_spec"], "settings"),
     **dict.fromkeys(["quaternion.identity", "rays.pixel_centres"], "constants"),
     **dict.fromkeys(["codes.init", "kan.init", "mlp.init", "mlp.init_layer"], "draws"),
-    **dict.fromkeys(["template.init", "grids.init"], "draws"),
+    **dict.fromkeys(["template.init", "grids.init", "planes.init"], "draws"),
     **dict.fromkeys(["precision.at_least_float32", "precision.refuse_half"], "types"),
     "splats.refuse_half": "types",
     **dict.fromkeys(["splats.take_rows", "splats.pad_rows"], "moves rows of any tree"),
@@ -84,7 +85,27 @@ def _network(make):
 
 
 _GRID = HashGridSpec(levels=2, coarsest=1, finest=2, rows=20)
+_PLANES = PlanesSpec(vertices=3, multiples=(1, 2), moments=3, features=2)
+
+
+def _levels(dtype):
+    """Planes, each leaf an array of JAX, as the check of tuples wants it."""
+    drawn = _network(functools.partial(planes.init, _PLANES))(dtype)
+    return jax.tree.map(jnp.asarray, drawn)
+
+
 SETTINGS = {
+    "planes.encode": {"spec": _PLANES, "levels": _levels},
+    "planes.space_features": {"spec": _PLANES, "levels": _levels},
+    "planes.at_time": {"levels": _levels},
+    "planes.time_features": {
+        "spec": _PLANES,
+        "lines": lambda dtype: jax.tree.map(
+            lambda plane: plane[0],
+            tuple(level.time for level in _levels(dtype)),
+        ),
+    },
+    "planes.features": {"spec": _PLANES},
     "grids.encode": {
         "spec": _GRID,
         # A tuple of arrays is looked into, and NumPy's are none of JAX's.
@@ -154,6 +175,7 @@ SIZES_OF = {
     "kan.standardise": {"features": 5},
     "grids.level_features": {"rows": 27},
     "grids.total_variation": {"rows": 27},
+    "planes.encode": {"dimensions": 4},
 }
 
 
@@ -272,8 +294,11 @@ REACH = {
     **dict.fromkeys(["losses.mse", "grids.total_variation"], 0.45),
     "distortion.distort": 0.1,  # seventh powers of the radius, and their slopes
     "losses.dssim_map": 0.2,  # variances over squared means
+    **dict.fromkeys(["planes.total_variation", "planes.bend"], 0.45),
+    "planes.features": 0.45,
     # sums of more than four, or multiples
     **dict.fromkeys(["codes.blend", "encoding.encode", "losses.l1"], 0.9),
+    **dict.fromkeys(["planes.bilinear", "planes.linear", "planes.unrest"], 0.9),
     **dict.fromkeys(["template.encode", "template.exponential"], 0.8),
 }
 # Relative to the largest entry, between two orders of the same operations. Measured in

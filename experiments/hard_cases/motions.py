@@ -1,4 +1,4 @@
-"""Hard cases of motions by rows: coefficients at rest, opacities over time."""
+"""Hard cases of motions: coefficients and planes at rest, opacities over time."""
 
 import jax.numpy as jnp
 import mpmath
@@ -6,6 +6,7 @@ import numpy as np
 
 from experiments.hard_cases.case import Case, constant
 from gaussians_jax.effects import polynomial_motion, time_basis
+from nerfies_jax.nets import planes
 
 NEAR = 1e-6  # how close to a switch its two sides are tried, as a share of it
 _SHARES = np.array([1.0, -0.25, 0.125])
@@ -78,4 +79,21 @@ VISIBLE = Case(
     timed=np.array([0.4, 0.0]),
 )
 
-CASES = (SPARSITY, VISIBLE)
+_PLACES = np.array([0.0, 0.5, 1 - 2.0**-20, 1.0, 1 + 2.0**-20, 1.5, 1e6])
+UNREST = Case(
+    name="distance of a plane of time from one",
+    breaks="planes start at one, where |1 - p| has the slope 1: all go the same way",
+    formula="(p - 1) sign(p - 1), whose slope there is 0",
+    switch="1",
+    axis="feature",
+    at=_PLACES,
+    inputs=_PLACES[:, None],
+    stable=lambda x: planes.unrest(x[None, None])[None],
+    textbook=lambda x: jnp.mean(jnp.abs(1 - x))[None],
+    exact=lambda x: [abs(x[0] - 1)],
+    bounds={"float32": (1e-6, 1e-6), "float64": (1e-15, 1e-15)},
+    floors=(0.0, 1.0, 0.0),
+    caught=(("float32", "slope"), ("float64", "slope")),
+)
+
+CASES = (SPARSITY, VISIBLE, UNREST)

@@ -28,7 +28,9 @@ MOTIONS = {
     "trajectories": presets.SMALL_DYNMF.motion,
     "polynomial": presets.SMALL_SPACETIME.motion,
     "spline": presets.SMALL_SPLINE.motion,
+    "planes": presets.SMALL_FOUR_D.motion,
 }
+BOX = ((-1.0, -1.0, 0.0), (1.0, 1.0, 2.0))
 
 
 @functools.cache
@@ -55,7 +57,7 @@ def places_of(effect, points, time):
 
 def effect_of(motion):
     scene_spec = spec.SplatScene(steps=100, motion=motion)
-    metadata = spec.SceneMetadata(1.0, (0.0, 0.0, 0.0), FRAMES)
+    metadata = spec.SceneMetadata(1.0, (0.0, 0.0, 0.0), FRAMES, BOX)
     return spec.motion_of(scene_spec, metadata)
 
 

@@ -1,0 +1,206 @@
+"""Motion of all Gaussians from planes over space and time, read by a tiny network.
+
+4DGS (Wu et al. 2024, arXiv:2310.08528): six planes at several resolutions are read at
+the canonical mean and the time, and a small network makes of the features how far mean,
+rotation and scale are from their canonical values. Planes of space are kept smooth,
+those of time steady and near one. Its coarse stage, in which nothing moves, is the
+`warm_up`.
+
+As the paper has it but for: the heads are linear read-outs of one network, there each
+has a hidden layer of its own; turns are rotation vectors, there they are added to the
+quaternion; the time has all of its planes, of which the published code uses the half
+above their middle; and `variation` is the total variation, where that code has second
+differences along one axis.
+"""
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key
+
+from gaussians_jax import splats
+from gaussians_jax.splats import Gaussians, Params
+from nerfies_jax.nets import mlp, planes
+from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
+from nerfies_jax.nets.planes import Level, PlanesSpec
+from nerfies_jax.training import schedules
+from nerfies_jax.training.effects import Effect, FrameCondition, Term
+from nerfies_jax.training.step_counts import steps
+
+NAME = "plane_motion"
+Vertices3 = tuple[float, float, float]
+Features = Float[Array, "gaussians levels features"]
+
+
+@dataclasses.dataclass(frozen=True)
+class PlaneMotionSpec:
+    """Planes, network, and what keeps the planes smooth; sizes as for HyperNeRF scenes.
+
+    Rates of planes do not depend on the scene's unit, heads answer in its extents.
+    Weights are of the sums over planes and levels.
+    """
+
+    planes: PlanesSpec = PlanesSpec(moments=150)
+    depth: int = 1
+    width: int = 128
+    variation: float = 2e-4  # weight, planes of space
+    bend: float = 1e-3  # weight, planes of time
+    unrest: float = 1e-4  # weight, planes of time
+    warm_up: int = steps(3000)  # steps without motion
+    plane_rate: float = 1.6e-3
+    plane_rate_end: float = 1.6e-5
+    learning_rate: float = 1.6e-4  # of the network
+    learning_rate_end: float = 1.6e-6
+
+    def __post_init__(self):
+        if self.planes.moments is None or self.planes.combination != "product":
+            raise ValueError(
+                "a motion takes planes with moments that are multiplied, got moments="
+                f"{self.planes.moments} and {self.planes.combination!r}"
+            )
+        for name in ("variation", "bend", "unrest"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(
+                    f"{name}={getattr(self, name)} is a weight, finite and not negative"
+                )
+        if self.warm_up < 0:
+            raise ValueError(f"warm_up={self.warm_up} must not be negative")
+        schedules.check_falling(self.plane_rate, self.plane_rate_end)
+        schedules.check_falling(self.learning_rate, self.learning_rate_end)
+        network_spec(self)  # checks its sizes
+
+
+class Motion(NamedTuple):
+    """Parameters of the field."""
+
+    planes: tuple[Level, ...]
+    network: MLP
+
+
+class Offsets(NamedTuple):
+    """How far Gaussians are from their canonical state."""
+
+    mean: Float[Array, "gaussians 3"]  # scene units
+    turn: Float[Array, "gaussians 3"]  # rotation vector, rad, in world axes
+    log_scale: Float[Array, "gaussians 3"]  # added to the logarithm
+
+
+def network_spec(spec: PlaneMotionSpec) -> MLPSpec:
+    """From the features of a place at a time to the offsets, small at first."""
+    heads = tuple((name, HeadSpec(3, "small")) for name in Offsets._fields)
+    inputs = spec.planes.width(4)
+    return MLPSpec(inputs, spec.depth, spec.width, heads, (), "relu", "he")
+
+
+# One core, forward and backward, 10,000 Gaussians: SMALL_COST
+SMALL_PLANE_MOTION = PlaneMotionSpec(
+    planes=PlanesSpec(vertices=32, multiples=(1, 2), moments=24, features=8),
+    width=64,
+)
+
+
+def init(key: Key[Array, ""], spec: PlaneMotionSpec, dtype=jnp.float32) -> Motion:
+    """A field that hardly moves anything yet."""
+    planes_key, network_key = jax.random.split(key)
+    return Motion(
+        planes.init(spec.planes, planes_key, dtype),
+        mlp.init(network_spec(spec), network_key, dtype),
+    )
+
+
+def places(
+    box: tuple[Vertices3, Vertices3], mean: Float[Array, "gaussians 3"]
+) -> Float[Array, "gaussians 3"]:
+    """Means in the unit cube over the box (its low and its high corner)."""
+    low, high = (jnp.asarray(corner, mean.dtype) for corner in box)
+    return (mean - low) / (high - low)
+
+
+def prepare(
+    params: Motion, spec: PlaneMotionSpec, place: Float[Array, "gaussians 3"]
+) -> Features:
+    """What the planes of space say, for all times the same while parameters are."""
+    return jax.vmap(lambda one: planes.space_features(spec.planes, params.planes, one))(
+        place
+    )
+
+
+def offsets(
+    params: Motion,
+    spec: PlaneMotionSpec,
+    place: Float[Array, "gaussians 3"],
+    time: Float[Array, ""],
+    ready: Features,
+) -> Offsets:
+    """Offsets at one time of Gaussians at places in the unit cube; means in extents.
+
+    `ready` is what `prepare` made of the same places.
+    """
+    lines = planes.at_time(params.planes, time)
+
+    def features(one, space):
+        now = planes.time_features(spec.planes, lines, one)
+        return planes.features(spec.planes, space, now)
+
+    encoded = jax.vmap(features)(place, ready)
+    return Offsets(**mlp.apply(network_spec(spec), params.network, encoded))
+
+
+def apply(gaussians: Gaussians, off: Offsets) -> Gaussians:
+    """Gaussians moved by their offsets: exp(turn) q / |q|, and scales by a factor."""
+    factor = jnp.exp(jnp.clip(off.log_scale, *splats.LOG_SCALE_RANGE))
+    return gaussians._replace(
+        mean=gaussians.mean + off.mean,
+        quaternion=splats.turned(gaussians, off.turn),
+        scale=gaussians.scale * factor,
+    )
+
+
+def smoothness(spec: PlaneMotionSpec, levels: tuple[Level, ...]) -> dict[str, Term]:
+    """Total variation in space, steadiness in time, and how far time is from one."""
+    space = [plane for level in levels for plane in level.space]
+    time = [plane for level in levels for plane in level.time]
+    return {
+        "variation": Term(sum(map(planes.total_variation, space)), spec.variation),
+        "bend": Term(sum(map(planes.bend, time)), spec.bend),
+        "unrest": Term(sum(map(planes.unrest, time)), spec.unrest),
+    }
+
+
+def effect(
+    spec: PlaneMotionSpec,
+    run_steps: int,
+    extent: float,
+    box: tuple[Vertices3, Vertices3],
+) -> Effect:
+    """The seams that this motion fills, for a run of so many steps.
+
+    `box` are the low and the high corner of what was filmed, in scene units, in which
+    the planes lie.
+    """
+    plane_rate = schedules.log_linear(spec.plane_rate, spec.plane_rate_end, run_steps)
+    rate = schedules.log_linear(spec.learning_rate, spec.learning_rate_end, run_steps)
+
+    def prepared(params: Params) -> Features:
+        place = places(box, params.rows["splats"].mean)
+        return prepare(params.nets[NAME], spec, place)
+
+    def moved(
+        params: Params, gaussians: Gaussians, condition: FrameCondition, ready: Features
+    ) -> Gaussians:
+        place = places(box, params.rows["splats"].mean)
+        off = offsets(params.nets[NAME], spec, place, condition.time, ready)
+        return apply(gaussians, off._replace(mean=extent * off.mean))
+
+    return Effect(
+        name=NAME,
+        init=lambda key: init(key, spec),
+        learning_rate=lambda step: Motion(plane_rate(step), rate(step)),
+        penalty=lambda params, context: smoothness(spec, params.planes),
+        warm_up=spec.warm_up,
+        prepare=prepared,
+        deform=moved,
+    )
