@@ -116,6 +116,10 @@ def advise(
         overrides.append("exposure.learning_rate=0.01")
     if wanted.get(LIGHT) is False and spec.exposure is not None:
         overrides.append("exposure=none")
+        if spec.motion is not None and spec.start.motion == "tracks":
+            overrides.append("start.motion=none")
+    if wanted.get(LIGHT):
+        notes.append(f"{LIGHT}: splats have none; prefer the field")
     if wanted.get(TRANSIENT) and (moves is False or spec.motion is None):
         notes.append(f"{TRANSIENT}: splats have no medium for it; prefer the field")
     if wanted.get(START) is False:

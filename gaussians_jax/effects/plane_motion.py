@@ -95,7 +95,8 @@ def network_spec(spec: PlaneMotionSpec) -> MLPSpec:
     return MLPSpec(inputs, spec.depth, spec.width, heads, (), "relu", "he")
 
 
-# One core, forward and backward, 10,000 Gaussians: SMALL_COST
+# One core, forward and backward, 10,000 Gaussians: 10 ms to read the planes and 5 for
+# the network; 120 ms for the paper's size, and 12 for its penalties.
 SMALL_PLANE_MOTION = PlaneMotionSpec(
     planes=PlanesSpec(vertices=32, multiples=(1, 2), moments=24, features=8),
     width=64,

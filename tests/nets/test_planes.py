@@ -177,7 +177,7 @@ def test_the_reference_values_of_4dgs_are_met(dtype):
         return jax.vmap(lambda place: planes.encode(spec, levels, place))(places)
 
     x = stored["x"].astype(dtype)
-    # Of features up to 0.4 and slopes up to 0.17; theirs are computed in float32.
+    # Of features up to 0.1 and slopes up to 0.17; theirs are computed in float32.
     atol = {"float32": 2e-6, "float64": 5e-7}[dtype]
     np.testing.assert_allclose(field(x), stored["y"], rtol=0, atol=atol)
     slope = jax.jit(jax.grad(lambda x: jnp.sum(field(x) ** 2)))(x)
