@@ -43,7 +43,7 @@ from nerfies_jax.training.effects import Effect
 from nerfies_jax.training.step_counts import steps
 
 OPTIMISERS = {"adam": scale_by_row_adam, "radam": scale_by_row_radam}
-MotionOf = (
+AnyMotion = (
     MotionSpec
     | KanMotionSpec
     | BasisMotionSpec
@@ -73,7 +73,7 @@ class SplatScene:
     optimiser: str = "adam"
     alternation: AlternationSpec | None = None
     annealing: AnnealingSpec | None = None
-    motion: MotionOf | None = None
+    motion: AnyMotion | None = None
     start: StartSpec = StartSpec()
     acceleration: AccelerationSpec | None = None
     neighbours: NeighbourSpec | None = None

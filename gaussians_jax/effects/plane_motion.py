@@ -31,7 +31,7 @@ from nerfies_jax.training.effects import Effect, FrameCondition, Term
 from nerfies_jax.training.step_counts import steps
 
 NAME = "plane_motion"
-Vertices3 = tuple[float, float, float]
+Corner = tuple[float, float, float]
 Features = Float[Array, "gaussians levels features"]
 
 
@@ -113,7 +113,7 @@ def init(key: Key[Array, ""], spec: PlaneMotionSpec, dtype=jnp.float32) -> Motio
 
 
 def places(
-    box: tuple[Vertices3, Vertices3], mean: Float[Array, "gaussians 3"]
+    box: tuple[Corner, Corner], mean: Float[Array, "gaussians 3"]
 ) -> Float[Array, "gaussians 3"]:
     """Means in the unit cube over the box (its low and its high corner)."""
     low, high = (jnp.asarray(corner, mean.dtype) for corner in box)
@@ -175,13 +175,18 @@ def effect(
     spec: PlaneMotionSpec,
     run_steps: int,
     extent: float,
-    box: tuple[Vertices3, Vertices3],
+    box: tuple[Corner, Corner] | None,
 ) -> Effect:
     """The seams that this motion fills, for a run of so many steps.
 
     `box` are the low and the high corner of what was filmed, in scene units, in which
     the planes lie.
     """
+    if box is None or not all(a < b for a, b in zip(*box, strict=True)):
+        raise ValueError(
+            f"the planes of a motion lie in a box of the scene, got box={box}; give "
+            "SceneMetadata its low and its high corner, as scene.metadata_of does"
+        )
     plane_rate = schedules.log_linear(spec.plane_rate, spec.plane_rate_end, run_steps)
     rate = schedules.log_linear(spec.learning_rate, spec.learning_rate_end, run_steps)
 

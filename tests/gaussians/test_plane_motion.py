@@ -136,3 +136,9 @@ def test_the_box_holds_what_was_filmed():
 def test_no_motion_of_nothing(changes, words):
     with pytest.raises(ValueError, match=words):
         dataclasses.replace(MOTION, **changes)
+
+
+@pytest.mark.parametrize("box", [None, (BOX[1], BOX[0])])
+def test_planes_without_a_box_are_refused(box):
+    with pytest.raises(ValueError, match="its low and its high corner"):
+        plane_motion.effect(MOTION, 100, EXTENT, box)
