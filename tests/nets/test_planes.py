@@ -11,7 +11,6 @@ import scipy.interpolate
 from nerfies_jax.nets import planes
 from nerfies_jax.nets.planes import Level, PlanesSpec
 from tests import gradients
-from tests.conftest import SHARED
 
 SPECS = {
     "hexplane": PlanesSpec(vertices=3, multiples=(1, 2), moments=4, features=2),
@@ -146,12 +145,9 @@ def test_planes_that_start_have_nothing_to_smooth_in_time_and_no_slope(dtype):
         assert not np.any(slope)
 
 
-def test_the_reference_values_of_4dgs_are_met(dtype):
+def test_the_reference_values_of_4dgs_are_met(dtype, oracle_dir):
     """Features, the slope of the sum of their squares, and the three regularisers."""
-    path = SHARED / "oracle" / "splatting" / "4dgs_hexplane.npz"
-    if not path.exists():
-        pytest.skip("no reference values")
-    stored = np.load(path, allow_pickle=False)
+    stored = np.load(oracle_dir / "splatting" / "4dgs_hexplane.npz", allow_pickle=False)
     pairs = ("0", "1", "3"), ("2", "4", "5")  # theirs: xy, xz, xt, yz, yt, zt
 
     def plane(level, name):
