@@ -112,14 +112,12 @@ def advise(
     if moves is False:
         present = (name for name in MOTION_PARTS if getattr(spec, name) is not None)
         overrides += [f"{name}=none" for name in present]
+        if spec.motion is not None and spec.start.motion == "tracks":
+            overrides.append("start.motion=none")
     if wanted.get(LIGHT) and spec.exposure is None:
         overrides.append("exposure.learning_rate=0.01")
     if wanted.get(LIGHT) is False and spec.exposure is not None:
         overrides.append("exposure=none")
-        if spec.motion is not None and spec.start.motion == "tracks":
-            overrides.append("start.motion=none")
-    if wanted.get(LIGHT):
-        notes.append(f"{LIGHT}: splats have none; prefer the field")
     if wanted.get(TRANSIENT) and (moves is False or spec.motion is None):
         notes.append(f"{TRANSIENT}: splats have no medium for it; prefer the field")
     if wanted.get(START) is False:

@@ -150,7 +150,6 @@ def _spec(name, args):
 
     preset = representations.of_preset(name).presets[name]
     spec = specs.override(preset, BESIDE.get(name, ()))
-    spec = representations.of_preset(name).presets[name]
     if hasattr(spec, "start"):  # of no step; and tracks take a minute to be found
         spec = dataclasses.replace(
             spec, start=dataclasses.replace(spec.start, motion="none")

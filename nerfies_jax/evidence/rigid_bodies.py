@@ -95,10 +95,10 @@ def _body(views, tracks, paths, own):
         fits = bundle.typical_misses(seen, miss, len(own)) < WITHIN_PX
         if fits.mean() < LEAST_SHARE or fits.sum() < FEWEST:
             return None
-        if fits.all():
+        own, all_fit = own[fits], fits.all()
+        if all_fit:
             break
-        own = own[fits]
-    return own[fits], body
+    return own, body
 
 
 def _fewer(paths, own):
