@@ -94,9 +94,15 @@ STUDIES = {
     "ablate_fields": _package(
         "ablate_fields", "--suite fields --seeds 3 --jobs 4", of="ablate"
     ),
-    "ablate_start": _package("ablate_start", "--suite start --jobs 2", of="ablate"),
-    "ablate_sonata": _package("ablate_sonata", "--suite sonata --jobs 4", of="ablate"),
-    "ablate_moba": _package("ablate_moba", "--suite moba --jobs 4", of="ablate"),
+    "ablate_start": _package(
+        "ablate_start", "--suite start --steps 900 --jobs 2", of="ablate"
+    ),
+    "ablate_sonata": _package(
+        "ablate_sonata", "--suite sonata --steps 900 --jobs 2", of="ablate"
+    ),
+    "ablate_moba": _package(
+        "ablate_moba", "--suite moba --steps 900 --jobs 2", of="ablate"
+    ),
     "deformation_cost": _package("deformation_cost", "--out deformation_cost.json"),
     "spectral_bias": _package(
         "spectral_bias", "--steps 3000 --out spectral_bias", page="report"

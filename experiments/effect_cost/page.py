@@ -31,7 +31,7 @@ One training step of each preset on the built-in scene, at {at:.0%} of its steps
 where every warm-up is over. *bare* is the preset without its effects, *only X* has
 one, *X + Y* one and what it cannot be without, *all* is the preset, *without X* the
 preset that lost one (and what needs it). `splats-static-small` has none of its own; it
-stands for what no preset has{apart}.
+stands for what no preset has.{apart}
 
 - *Mflop* and *MB* are the compiler's count, in which the body of a loop counts once,
   however often it runs: what blends Gaussians, and networks that move them in blocks,
@@ -96,6 +96,10 @@ def page(stored) -> str:
 
 
 def _apart(about):
-    """Which processor, where a preset was not measured on that of the others."""
-    cpu = about.get("apart", {}).get("splats-static-small")
-    return "" if cpu is None else f", measured apart on {cpu}"
+    """Which presets another processor than that below was asked for."""
+    apart = about.get("apart", {})
+    names = [f"`{name}`" for name in apart]
+    if not names:
+        return ""
+    cpus = " and ".join(sorted(set(apart.values())))
+    return f"\n{', '.join(names)} were\nmeasured apart, on {cpus}."

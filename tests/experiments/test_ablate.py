@@ -20,6 +20,7 @@ from experiments.ablate.settings import Ablate
 from nerfies_jax.capture import synthetic
 from nerfies_jax.measure import clock
 from nerfies_jax.runs import platform
+from nerfies_jax.training.track_start import TrackStartSpec
 from tests import scenes
 
 
@@ -32,7 +33,11 @@ def test_arms_differ_from_nerfies_only_in_what_their_name_says():
     changed = {
         "no-elastic": {"elastic": None},
         "no-background": {"background": None},
-        "coarse-to-fine": {"warp": dataclasses.replace(whole.warp, anneal_steps=300)},
+        "from-rest": {"start": TrackStartSpec()},
+        "coarse-to-fine": {
+            "start": TrackStartSpec(),
+            "warp": dataclasses.replace(whole.warp, anneal_steps=300),
+        },
         "translation": {"warp": dataclasses.replace(whole.warp, kind="translation")},
     }
     for name, fields in changed.items():
