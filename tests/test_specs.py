@@ -7,10 +7,11 @@ import math
 import pytest
 
 from gaussians_jax import presets
+from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.mcmc import MCMCStrategySpec
 from gaussians_jax.raster_spec import INRIA
 from nerfies_jax import presets as fields
-from nerfies_jax.training import specs
+from nerfies_jax.training import spec_fields, specs
 
 
 def test_an_override_reaches_a_nested_field_with_its_type():
@@ -48,7 +49,8 @@ def test_a_tuple_is_read_by_its_items():
 @pytest.mark.parametrize(
     ("assignment", "words"),
     [
-        ("densification.cap_mxa=3", "has no field 'cap_mxa'; it has .*cap_max"),
+        ("densification.cap_mxa=3", r"no field 'cap_mxa'; did you mean cap_max\?"),
+        ("cap_max=3", r"SplatScene has no .*; did you mean densification.cap_max\?"),
         ("densification.cap_max=many", "cannot be read as"),
         ("densification=MCMC", "one of DefaultStrategySpec, MCMCStrategySpec"),
         ("alternation.nets=3", "no defaults for start and stop"),
@@ -61,6 +63,27 @@ def test_a_tuple_is_read_by_its_items():
 def test_a_wrong_override_names_itself_and_the_way_out(assignment, words):
     with pytest.raises(ValueError, match=words):
         specs.override(presets.SMALL_STATIC, (assignment,))
+
+
+@pytest.mark.parametrize("name", sorted(presets.PRESETS | fields.PRESETS))
+def test_every_field_that_is_listed_can_be_set_to_what_it_is(name):
+    spec = (presets.PRESETS | fields.PRESETS)[name]
+    listed = list(spec_fields.fields_of(spec))
+    # One that holds settings is changed by their fields, which are listed after it.
+    lines = [f"{f.path}={f.value}" for f in listed if not f.value[0:1].isupper()]
+    assert specs.override(spec, lines) == spec
+    assert {f.path for f in listed} >= {f.name for f in dataclasses.fields(spec)}
+
+
+def test_a_field_is_listed_with_its_words_and_default():
+    listed = {f.path: f for f in spec_fields.fields_of(presets.SMALL_STATIC)}
+    every = listed["densification.refine_every"]
+    assert (every.default, every.kind, every.about) == ("100", "int", "steps")
+    assert every.holder is DefaultStrategySpec
+    assert listed["densification"].kind.endswith("MCMCStrategySpec or none")
+    start = spec_fields.fields_of(fields.SMALL_NERFIES)
+    (jitter,) = (f.about for f in start if f.path == "elastic.points")
+    assert jitter.startswith("`points` samples of each ray are drawn by their weights")
 
 
 def there_and_back(value):

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from nerfies_jax.capture.capture import Capture
+from nerfies_jax.capture.nearest import known_names
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.geometry.rays import across_ray
@@ -45,7 +46,7 @@ def path(kind: str, capture: Capture, count: int, turns: float = 1.0) -> Camera:
     their times, and `stabilised` does so without their shake.
     """
     if kind not in KINDS:
-        raise ValueError(f"no camera path {kind!r}; there are {', '.join(KINDS)}")
+        raise ValueError(f"no camera path {kind!r}; {known_names(kind, KINDS)}")
     if kind == "captured":
         return cameras.take(capture.cameras, _replayed(capture, count))
     train_cameras = cameras.take(capture.cameras, capture.train)

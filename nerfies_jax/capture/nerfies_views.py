@@ -15,6 +15,7 @@ from nerfies_jax.capture.capture import (
     check_cameras,
 )
 from nerfies_jax.capture.json_files import AnyPath, inside, read_json
+from nerfies_jax.capture.nearest import known_names
 from nerfies_jax.geometry import camera
 from nerfies_jax.geometry.camera import Camera
 
@@ -180,7 +181,7 @@ def _named_split(path, heldout):
     file = inside(folder, f"{heldout}.json", folder)
     if not file.is_file():
         known = sorted(f.stem for f in folder.glob("*.json"))
-        raise CaptureError(f"{file}: no such split; there are {known}")
+        raise CaptureError(f"{file}: no such split; {known_names(heldout, known)}")
     # DyCheck pairs its splits: val_intl belongs to train_intl.
     partner = folder / f"{heldout.replace('val', 'train', 1)}.json"
     if partner == file or not partner.is_file():

@@ -22,6 +22,7 @@ from nerfies_jax.capture.json_files import (
     replaced_folder,
     write_json,
 )
+from nerfies_jax.capture.nearest import known_names
 from nerfies_jax.capture.nerfies_views import CameraFile, camera_entry, cameras_of
 from nerfies_jax.capture.transforms_writer import opengl_pose
 from nerfies_jax.geometry import camera
@@ -52,8 +53,8 @@ def named(name: str, capture: Capture, count: int | None) -> CameraPath:
         return camera_paths.planned(name, capture, count or FRAMES)
     if not pathlib.Path(name).exists():
         raise CaptureError(
-            f"--path {name}: no such file, and no camera path of that name; there are "
-            + ", ".join(camera_paths.KINDS)
+            f"--path {name}: no such file, and no camera path of that name; "
+            + known_names(name, camera_paths.KINDS)
         )
     return read(name, capture)
 

@@ -7,6 +7,7 @@ import msgspec
 from nerfies_jax.capture import frames
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.json_files import read_json
+from nerfies_jax.capture.nearest import known_names
 
 
 class Lens(msgspec.Struct, kw_only=True):
@@ -68,7 +69,8 @@ def read_split(path: pathlib.Path, heldout: int | str | None) -> Split:
         raise CaptureError(f"{file}: no frames; list them under frames")
     if isinstance(heldout, str) and heldout not in ("val", "test"):
         raise CaptureError(
-            f'{file}: heldout={heldout!r}; expected "val", "test" or a number'
+            f"{file}: no split {heldout!r}; {known_names(heldout, ('val', 'test'))}, "
+            "or a number n holds out every n-th frame"
         )
     wanted = ("test", "val") if heldout is None else (heldout,)
     if transforms.train_filenames is not None:  # nerfstudio's lists in one file

@@ -9,11 +9,23 @@ from typing import TYPE_CHECKING, NamedTuple
 if TYPE_CHECKING:  # a record is loaded when it is asked for, not with this module
     from nerfies_jax.evaluation.representation import Representation
 
+from nerfies_jax.capture.nearest import known_names
 from nerfies_jax.runs.platform import Threads
 from nerfies_jax.runs.run_folder import CONFIG
 from nerfies_jax.training import specs
 
 GROUP = "nerfies_jax.representations"
+# What our own two have, for command lines, which do not load JAX to be read.
+PRESETS = (
+    *("splats-static", "splats-mcmc", "splats-tracked", "splats-deformable"),
+    *("sonata", "moba", "nerf", "nerf-w", "d-nerf", "t-nerf", "nerfies", "hypernerf"),
+    *("nsff", "splats-static-small", "splats-mcmc-small", "splats-tracked-small"),
+    *("splats-deformable-small", "sonata-small", "moba-small", "nerf-small"),
+    *("nerf-w-small", "d-nerf-small", "t-nerf-small", "nerfies-small"),
+    *("hypernerf-small", "nsff-small", "nerf-grid-small", "nerf-w-grid-small"),
+    *("d-nerf-grid-small", "nerfies-grid-small", "hypernerf-grid-small"),
+    "nsff-grid-small",
+)
 
 
 @functools.cache
@@ -33,8 +45,8 @@ def installed() -> dict[str, "Representation"]:
 def named(name: str) -> "Representation":
     """The representation of that name; ValueError where there is none."""
     if name not in installed():
-        known = ", ".join(installed())
-        raise ValueError(f"no representation {name!r}; there are {known}")
+        known = known_names(name, installed())
+        raise ValueError(f"no representation {name!r}; {known}")
     return installed()[name]
 
 
@@ -44,7 +56,7 @@ def of_preset(preset: str) -> "Representation":
         if preset in representation.presets:
             return representation
     known = sorted(p for each in installed().values() for p in each.presets)
-    raise ValueError(f"--preset {preset}: no such preset; there are {', '.join(known)}")
+    raise ValueError(f"--preset {preset}: no such preset; {known_names(preset, known)}")
 
 
 def of_run(folder: pathlib.Path) -> "Representation | None":

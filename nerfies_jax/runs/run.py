@@ -14,6 +14,7 @@ from nerfies_jax.capture import pinholes, synthetic
 from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.json_files import write_json
+from nerfies_jax.capture.nearest import known_names
 from nerfies_jax.evaluation import Renderer
 from nerfies_jax.evaluation.lens import ThroughLens
 from nerfies_jax.evaluation.representation import Representation
@@ -175,8 +176,8 @@ def _filmed(source, seed):
 def _built_in(source, seed):
     if source.scene not in synthetic.PRESETS:
         raise ValueError(
-            f"--scene {source.scene}: no such built-in scene; there are "
-            + ", ".join(synthetic.PRESETS)
+            f"--scene {source.scene}: no such built-in scene; "
+            + known_names(source.scene, synthetic.PRESETS)
         )
     for name in ("factor", "max_side", "heldout"):
         if getattr(source, name) is not None:

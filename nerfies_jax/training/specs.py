@@ -7,6 +7,7 @@ that the reader allows.
 
 import contextlib
 import dataclasses
+import difflib
 import importlib
 import json
 import math
@@ -14,6 +15,9 @@ import pathlib
 import typing
 from collections.abc import Iterable, Iterator
 from typing import Any
+
+from nerfies_jax.capture.nearest import known_names
+from nerfies_jax.training import spec_fields
 
 TYPE = "type"  # a spec's, in JSON; no field can have this name
 NUMBER = "number"  # around an infinity or NaN, which JSON does not have
@@ -166,17 +170,17 @@ def override(spec: Any, assignments: Iterable[str]) -> Any:
         path, equals, text = assignment.partition("=")
         if not equals:
             raise ValueError(f"--set {assignment}: expected path.to.field=value")
-        spec = _assign(spec, path.split("."), text, path)
+        spec = _assign(spec, path.split("."), text, path, spec)
     return spec
 
 
-def _assign(spec, names, text, path):
+def _assign(spec, names, text, path, outermost):
     fields = {field.name for field in dataclasses.fields(spec)}
     name, rest = names[0], names[1:]
     if name not in fields:
         raise ValueError(
             f"--set {path}: {type(spec).__name__} has no field {name!r}; "
-            f"it has {', '.join(sorted(fields))}"
+            + _meant(names[-1], sorted(fields), outermost)
         )
     if rest:
         inner = getattr(spec, name)
@@ -184,9 +188,22 @@ def _assign(spec, names, text, path):
             inner = _absent(spec, name)
         if not dataclasses.is_dataclass(inner):
             raise ValueError(f"--set {path}: {name!r} is {inner!r} and has no fields")
-        return dataclasses.replace(spec, **{name: _assign(inner, rest, text, path)})
+        return dataclasses.replace(
+            spec, **{name: _assign(inner, rest, text, path, outermost)}
+        )
     kind = typing.get_type_hints(type(spec))[name]
     return dataclasses.replace(spec, **{name: _read(kind, text, path)})
+
+
+def _meant(name, fields, outermost):
+    """The fields there are, and where the one named last is, if it is elsewhere."""
+    paths = [field.path for field in spec_fields.fields_of(outermost)]
+    last = [path.rpartition(".")[2] for path in paths]
+    near = difflib.get_close_matches(name, [*fields, *last], n=1)
+    if not near or near[0] in fields:
+        return known_names(name, fields)
+    meant = [path for path, end in zip(paths, last, strict=True) if end == near[0]]
+    return f"did you mean {' or '.join(meant)}? here are {', '.join(fields)}"
 
 
 def _absent(spec, name):

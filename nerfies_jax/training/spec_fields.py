@@ -1,0 +1,113 @@
+"""What a spec has to set: each field's path, value and default, and what it is."""
+
+import ast
+import dataclasses
+import functools
+import inspect
+import io
+import itertools
+import re
+import textwrap
+import tokenize
+import typing
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+
+class SpecField(NamedTuple):
+    """One field of a spec, or of a spec in it."""
+
+    path: str  # from the outermost spec, with dots
+    value: str  # as `specs.override` reads it
+    default: str  # of the class, or of the field above it; "" where it has none
+    kind: str  # what it can be
+    about: str  # the words beside it in the source
+    holder: type  # the class that has the field
+
+
+def fields_of(spec: Any, prefix: str = "") -> Iterator[SpecField]:
+    """Each field of `spec`, and below one that holds a spec those of that."""
+    kinds, words = typing.get_type_hints(type(spec)), field_words(type(spec))
+    for field in dataclasses.fields(spec):
+        value, path = getattr(spec, field.name), prefix + field.name
+        yield SpecField(
+            path,
+            as_text(value),
+            "" if field.default is dataclasses.MISSING else as_text(field.default),
+            _kind_text(kinds[field.name]),
+            words[field.name] or _sentences_on(field.name, type(spec)),
+            type(spec),
+        )
+        if dataclasses.is_dataclass(value):
+            yield from fields_of(value, f"{path}.")
+
+
+def as_text(value: Any) -> str:
+    """A value as one writes it in `path.to.field=value`."""
+    if value is None or isinstance(value, bool):
+        return str(value).lower()
+    if dataclasses.is_dataclass(value):
+        return type(value).__name__
+    if isinstance(value, tuple):
+        return ",".join(map(as_text, value))
+    return str(value)
+
+
+def _kind_text(kind):
+    """A type as a person reads it: `int or none`, `adam or radam`."""
+    if typing.get_origin(kind) is typing.Literal:
+        return " or ".join(map(str, typing.get_args(kind)))
+    if typing.get_origin(kind) is tuple:
+        return f"{_kind_text(typing.get_args(kind)[0])},..."
+    if kind is type(None):
+        return "none"
+    parts = typing.get_args(kind)
+    return " or ".join(map(_kind_text, parts)) if parts else kind.__name__
+
+
+def field_words(kind: type) -> dict[str, str]:
+    """What the source says beside each field of a dataclass, in one line; "" for none.
+
+    The docstring below it, else the comment above and beside it.
+    """
+    words = {}
+    for each in reversed(kind.__mro__):
+        if dataclasses.is_dataclass(each):
+            words |= _own_words(each)
+    return words
+
+
+@functools.cache
+def _own_words(kind):
+    source = textwrap.dedent(inspect.getsource(kind))
+    tokens = tokenize.generate_tokens(io.StringIO(source).readline)
+    comments = {
+        token.start[0]: token.string.lstrip("# ")
+        for token in tokens
+        if token.type == tokenize.COMMENT
+    }
+    rows = source.splitlines()
+    alone = {line for line in comments if rows[line - 1].lstrip().startswith("#")}
+    (tree,) = ast.parse(source).body
+    words = {}
+    for field, below in itertools.pairwise([*tree.body, None]):
+        if not isinstance(field, ast.AnnAssign):
+            continue
+        docstring = getattr(getattr(below, "value", None), "value", None)
+        if isinstance(below, ast.Expr) and isinstance(docstring, str):
+            words[field.target.id] = " ".join(docstring.split())
+            continue
+        first = field.lineno
+        while first - 1 in alone:
+            first -= 1
+        lines = range(first, field.end_lineno + 1)
+        said = " ".join(comments[line] for line in lines if line in comments)
+        words[field.target.id] = said
+    return words
+
+
+def _sentences_on(name, kind):
+    """Those of the class's docstring that have the field's name in backticks."""
+    text = " ".join(inspect.cleandoc(kind.__doc__ or "").split())
+    sentences = re.split(r'(?<=[^.\s][.:;])\s(?=[A-Z`"])', text)
+    return " ".join(one for one in sentences if f"`{name}`" in one).rstrip(";:")
