@@ -4,12 +4,21 @@
 """
 
 import ast
+import functools
 import importlib
+import operator
 import pathlib
 import sys
+from collections.abc import Callable
+from typing import Annotated
+
+import tyro
+
+from experiments import options
+from nerfies_jax.capture.nearest import known_names
 
 HERE = pathlib.Path(__file__).resolve().parent
-NOT_COMMANDS = ("__init__", "__main__", "cli", "markdown")
+NOT_COMMANDS = ("__init__", "__main__", "cli", "markdown", "options")
 
 
 def commands() -> dict[str, str]:
@@ -32,18 +41,34 @@ def main(arguments: list[str] | None = None) -> None:
         print("usage: nerfies NAME ...   or   python -m experiments.NAME ...\n")
         print("\n".join(f"{name:{width}}  {line}" for name, line in known.items()))
         return
+    if words[0].startswith(options.COMPLETION):
+        print_completion(words)
+        return
     name, *rest = words
     if name not in known:
-        print(
-            f"error: no command {name!r}; there are {', '.join(known)}", file=sys.stderr
-        )
+        meant = known_names(name, known)
+        print(f"error: no command {name!r}; {meant}", file=sys.stderr)
         raise SystemExit(2)
-    package = (HERE / name).is_dir()
-    module = f"experiments.{name}.__main__" if package else f"experiments.{name}"
-    sys.argv[0] = f"nerfies {name}"  # as --help shows it
     if "" not in sys.path:  # as python -m does: --effect finds what lies here
         sys.path.insert(0, "")
-    importlib.import_module(module).main(rest)
+    main_of(name)(rest)
+
+
+def main_of(name: str) -> Callable:
+    """The function that runs a command; its `settings` are what it is asked for."""
+    package = (HERE / name).is_dir()
+    module = f"experiments.{name}.__main__" if package else f"experiments.{name}"
+    return importlib.import_module(module).main
+
+
+def print_completion(words: list[str]) -> None:
+    """What a shell completes `nerfies` by: all commands, their options and choices."""
+    kinds = [
+        Annotated[options.offered(main_of(name).settings), tyro.conf.subcommand(name)]
+        for name in commands()
+    ]
+    union = functools.reduce(operator.or_, kinds)
+    tyro.cli(union, prog="nerfies", args=words, config=options.READ_BY)
 
 
 if __name__ == "__main__":

@@ -42,9 +42,9 @@ class AppearanceCodes:
     """Where to train."""
 
 
-def main(arguments=None):
+@cli.command(AppearanceCodes)
+def main(args):
     """Run the job of the command line; exit code 2 where its input is wrong."""
-    args = cli.parse(AppearanceCodes, arguments)
     with cli.user_errors():
         if args.steps < 1:
             raise ValueError(f"steps={args.steps} must be at least 1")
@@ -52,7 +52,7 @@ def main(arguments=None):
         compare = {"exposure": compare_exposure, "transient": compare_transient}
         film = filmed(args.scene, args.size)
         figures, picture = compare[args.scene](film, args.steps, args.seed)
-        _write(args, figures, picture)
+        return _write(args, figures, picture)
 
 
 def filmed(scene, size):
@@ -185,6 +185,7 @@ def _write(args, figures, picture):
     for name, value in figures.items():
         print(f"{name:52} {value:8.2f}")
     print(f"{folder / 'figures.json'}, {folder / 'picture.png'}")
+    return record
 
 
 def page(stored) -> str:

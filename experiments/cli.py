@@ -6,16 +6,29 @@ platform.
 
 import contextlib
 import dataclasses
+import functools
+import json
+import os
 import pathlib
 import sys
-from typing import Annotated, Any, Literal
+from collections.abc import Callable, Iterator
+from typing import Annotated, Any, Literal, NamedTuple
 
 import tyro
 
+from experiments import options
 from nerfies_jax.capture.given import GivenFiles
 from nerfies_jax.runs.config import CaptureSource, MoreMetrics
+from nerfies_jax.runs.representations import PRESETS
 
 Positional = tyro.conf.Positional
+# Those of `nerfies_jax.capture.synthetic`, which loads JAX.
+SCENES = (
+    *("default", "static", "rigid", "fast", "non-rigid", "articulated"),
+    *("exposure", "transient", "specular"),
+)
+Preset = Annotated[str | None, options.Known(PRESETS), tyro.conf.arg(metavar="NAME")]
+Overrides = Annotated[tuple[str, ...], tyro.conf.arg(metavar="FIELD=VALUE ...")]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,17 +37,22 @@ class NamedSource(CaptureSource):
 
     capture: Positional[pathlib.Path | None] = None
     """Folder in Nerfies, HyperNeRF, Blender, D-NeRF, COLMAP or LLFF layout."""
-    scene: str | None = None
+    scene: Annotated[str | None, options.Known(SCENES)] = None
     """Which built-in scene, where no capture is given (default: default)."""
     missing: Literal["refuse", "skip"] | None = None
     """What to do with frames whose picture is missing (default: refuse)."""
     files: Annotated[GivenFiles, tyro.conf.arg(name="")] = GivenFiles()
 
 
-# Their fields stand among the other options of a command.
-Source = Annotated[NamedSource, tyro.conf.arg(name="")]
-More = Annotated[MoreMetrics, tyro.conf.arg(name="")]
+def _headed(name: str) -> tuple:
+    """For `Annotated`: fields of settings by their own names, under a heading."""
+    return tyro.conf.OmitArgPrefixes, tyro.conf.arg(name=name)
+
+
+Source = Annotated[(NamedSource, *_headed("capture"))]
+# Here what other tools found keeps its prefix: --tracks is something else.
 SourceOptions = Annotated[CaptureSource, tyro.conf.arg(name="")]
+More = Annotated[(MoreMetrics, *_headed("scoring"))]
 
 
 def plain(source: CaptureSource) -> CaptureSource:
@@ -48,9 +66,90 @@ def given(source: CaptureSource) -> dict[str, Any]:
     return {name: value for name, value in vars(source).items() if value not in unsaid}
 
 
-def parse(settings_class, arguments=None):
+class Ended(NamedTuple):
+    """The result of a command that says itself with which exit code it ends."""
+
+    result: Any
+    code: int
+
+
+def command(settings: Any) -> Callable[[Callable], Callable]:
+    """Make `main(arguments)` of a function of settings; it returns the result as JSON.
+
+    With `--json` that is printed as one document, and everything else that is printed,
+    also by processes that are started, goes to standard error. Wrong settings end it
+    with exit code 2.
+    """
+
+    def decorate(run):
+        @functools.wraps(run)
+        def main(arguments=None):
+            words = sys.argv[1:] if arguments is None else list(arguments)
+            as_json = options.JSON in words
+            words = [word for word in words if word != options.JSON]
+            with user_errors():
+                args = parse(settings, words, _called(run))
+            aside = _words_aside() if as_json else contextlib.nullcontext()
+            with aside, _ended_by_reader():
+                result = run(args)
+            ended = result if isinstance(result, Ended) else None
+            result = result if ended is None else ended.result
+            if as_json:
+                print(json.dumps(result, indent=1, allow_nan=False, default=str))
+            if ended is not None:
+                raise SystemExit(ended.code)
+            return result
+
+        main.settings = settings
+        return main
+
+    return decorate
+
+
+def parse(settings: Any, arguments: list[str] | None = None, prog: str = "") -> Any:
     """A frozen dataclass from the command line; its docstrings are the help text."""
-    return tyro.cli(settings_class, args=arguments)
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    return options.parse(settings, words, prog or "nerfies")
+
+
+def _called(run):
+    """How a person calls the command whose `main` this is."""
+    name = run.__module__
+    if name != "__main__":
+        return f"nerfies {name.removesuffix('.__main__').removeprefix('experiments.')}"
+    found = sys.modules[name].__spec__
+    name = pathlib.Path(sys.argv[0]).stem if found is None else found.name
+    return f"python -m {name.removesuffix('.__main__')}"
+
+
+@contextlib.contextmanager
+def _words_aside() -> Iterator[None]:
+    """Standard output is standard error, for this process and those it starts."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
+
+
+@contextlib.contextmanager
+def _ended_by_reader() -> Iterator[None]:
+    """End quietly where what reads our words, `head` say, has read enough."""
+    try:
+        yield
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        raise SystemExit(0) from None
+
+
+def stored(path: pathlib.Path) -> Any:
+    """What was written to a JSON file, or None where nothing was."""
+    return json.loads(path.read_text()) if path.is_file() else None
 
 
 def formerly(option):

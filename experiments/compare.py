@@ -68,10 +68,10 @@ class Compared(NamedTuple):
     curve: Any  # curves.Curve
 
 
-def main(arguments=None):
+@cli.command(Compare)
+def main(args):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        args = cli.parse(Compare, arguments)
         compared = read(args.runs)
         folder = run_folder.new_run_folder(args.out, "compare")
         goals = args.psnr or default_goals(compared)
@@ -86,6 +86,7 @@ def main(arguments=None):
             platform.start_jax(args.device, "all" if "all" in threads else "one")
             draw(folder / "pictures.png", compared, args.frames)
     print(f"saved in {folder}")
+    return cli.stored(folder / "compare.json")
 
 
 def read(folders) -> list[Compared]:

@@ -36,10 +36,10 @@ class ElasticPoints:
     """cpu, gpu, or whatever JAX finds."""
 
 
-def main(arguments=None):
+@cli.command(ElasticPoints)
+def main(args):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        args = cli.parse(ElasticPoints, arguments)
         for name in ("rays", "samples", "draws", "repeats"):
             if getattr(args, name) < 1:
                 raise ValueError(f"--{name} {getattr(args, name)} must be at least 1")
@@ -52,11 +52,13 @@ def main(arguments=None):
         platform.start_jax(args.device, "all")
     figures = estimator_table(args)
     print(table(figures))
-    if args.out is not None:
-        from nerfies_jax.capture.json_files import write_json
-        from nerfies_jax.measure import clock
+    from nerfies_jax.capture.json_files import write_json
+    from nerfies_jax.measure import clock
 
-        write_json(args.out, {"machine": clock.machine(), "rows": figures})
+    record = {"machine": clock.machine(), "rows": figures}
+    if args.out is not None:
+        write_json(args.out, record)
+    return record
 
 
 def estimator_table(args: ElasticPoints) -> dict[str, dict[str, float]]:

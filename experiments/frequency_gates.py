@@ -330,10 +330,10 @@ def draw_figure(fitted: dict[GateSetting, Fitted], path: pathlib.Path) -> None:
         figure.savefig(partial)
 
 
-def main(arguments=None):
+@cli.command(FrequencyGates)
+def main(args):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        args = cli.parse(FrequencyGates, arguments)
         if args.out is not None:
             args.out.mkdir(parents=True, exist_ok=True)
         platform.start_jax(args.device)
@@ -346,19 +346,20 @@ def main(arguments=None):
     print(table(rows))
     print()
     print(format_conclusions(rows))
-    if args.out is not None:
-        from nerfies_jax.capture.json_files import write_json
-        from nerfies_jax.measure import clock
+    from nerfies_jax.capture.json_files import write_json
+    from nerfies_jax.measure import clock
 
-        record = {
-            "settings": specs.as_json(args),
-            "machine": clock.machine(),
-            "rows": rows,
-            "said": format_conclusions(rows).split("\n"),
-        }
+    record = {
+        "settings": specs.as_json(args),
+        "machine": clock.machine(),
+        "rows": rows,
+        "said": format_conclusions(rows).split("\n"),
+    }
+    if args.out is not None:
         write_json(args.out / "frequency_gates.json", record)
         draw_figure(fitted, args.out / "frequency_gates.png")
         print(args.out / "frequency_gates.png")
+    return record
 
 
 if __name__ == "__main__":

@@ -24,13 +24,13 @@ class InspectScene:
     """Advise presets of the papers' sizes instead of those for a CPU."""
     picture: pathlib.Path | None = None
     """Contact sheet, PNG (default: runs/inspect-CAPTURE.png)."""
-    json: pathlib.Path | None = None
+    findings: pathlib.Path | None = None
     """Write findings and advice to this file as well."""
 
 
-def main(arguments=None):
+@cli.command(InspectScene)
+def main(args):
     """Inspect what the command line names; exit code 2 where its input is wrong."""
-    args = cli.parse(InspectScene, arguments)
     with cli.user_errors():
         platform.start_jax("cpu")
         from nerfies_jax import runs
@@ -53,9 +53,11 @@ def main(arguments=None):
         path.parent.mkdir(parents=True, exist_ok=True)
         pictures.save(inspected.sheet, path)
         print(f"contact sheet: {path}")
-        if args.json is not None:
-            write_json(args.json, as_json(capture, inspected, advice))
-            print(f"findings: {args.json}")
+        record = as_json(capture, inspected, advice)
+        if args.findings is not None:
+            write_json(args.findings, record)
+            print(f"findings: {args.findings}")
+    return record
 
 
 def report(inspected, advice, source):

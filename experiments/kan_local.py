@@ -45,18 +45,20 @@ class KanLocal:
             raise ValueError(f"--nearest {self.nearest}: sum at least one")
 
 
-def main(arguments=None):
+@cli.command(KanLocal)
+def main(args):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        args = cli.parse(KanLocal, arguments)
         platform.start_jax(args.device, "one")
     figures = measured(args)
     print(table(figures))
-    if args.out is not None:
-        from nerfies_jax.capture.json_files import write_json
-        from nerfies_jax.measure import clock
+    from nerfies_jax.capture.json_files import write_json
+    from nerfies_jax.measure import clock
 
-        write_json(args.out, {"machine": clock.machine(), "rows": figures})
+    record = {"machine": clock.machine(), "rows": figures}
+    if args.out is not None:
+        write_json(args.out, record)
+    return record
 
 
 def measured(args: KanLocal) -> list[dict]:

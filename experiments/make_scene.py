@@ -11,18 +11,6 @@ from experiments import cli
 from nerfies_jax.runs import platform
 from nerfies_jax.training import specs
 
-Preset = Literal[
-    "default",
-    "static",
-    "rigid",
-    "fast",
-    "non-rigid",
-    "articulated",
-    "exposure",
-    "transient",
-    "specular",
-]
-
 
 @dataclasses.dataclass(frozen=True)
 class MakeScene:
@@ -33,7 +21,7 @@ class MakeScene:
 
     out: cli.Positional[pathlib.Path]
     """Folder to write; must not hold anything yet."""
-    preset: Preset = "default"
+    preset: Literal[cli.SCENES] = "default"
     """Which scene."""
     frames: int | None = None
     """Instants to film; the preset's own number if not given."""
@@ -41,15 +29,15 @@ class MakeScene:
     """Width and height in pixels; the preset's own if not given."""
     seed: int = 0
     """Moves the hand and the exposure, and draws the points; not the things."""
-    set: tuple[str, ...] = ()
+    set: cli.Overrides = ()
     """Any other setting of the scene, as path.to.field=value."""
     device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
     """Where to trace the rays."""
 
 
-def main(arguments=None):
+@cli.command(MakeScene)
+def main(args):
     """Parse, film, write, and say where it is."""
-    args = cli.parse(MakeScene, arguments)
     with cli.user_errors():
         platform.start_jax(args.device)
         from nerfies_jax.capture import synthetic
@@ -65,6 +53,7 @@ def main(arguments=None):
         f"truth in {args.out / synthetic.TRUTH_FILE}\n"
         f"next: python -m experiments.reconstruct {args.out}"
     )
+    return {"folder": str(args.out), "scene": specs.as_json(spec), "seed": args.seed}
 
 
 if __name__ == "__main__":

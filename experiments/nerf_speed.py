@@ -43,10 +43,10 @@ class NerfSpeed:
     """cpu, gpu, or whatever JAX finds."""
 
 
-def main(arguments=None):
+@cli.command(NerfSpeed)
+def main(args):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        args = cli.parse(NerfSpeed, arguments)
         platform.start_jax(args.device, "all")
         unknown = set(args.rows) - set(specs())
         if unknown:
@@ -54,11 +54,13 @@ def main(arguments=None):
         rows = args.rows or tuple(specs())
     figures = measured(rows, args.repeats)
     print(table(figures))
-    if args.out is not None:
-        from nerfies_jax.capture.json_files import write_json
-        from nerfies_jax.measure import clock
+    from nerfies_jax.capture.json_files import write_json
+    from nerfies_jax.measure import clock
 
-        write_json(args.out, {"machine": clock.machine(), "rows": figures})
+    record = {"machine": clock.machine(), "rows": figures}
+    if args.out is not None:
+        write_json(args.out, record)
+    return record
 
 
 def specs():

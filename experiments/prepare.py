@@ -14,7 +14,7 @@ import tyro
 from experiments import cli
 from nerfies_jax.runs.config import Preparation
 
-How = Annotated[Preparation, tyro.conf.arg(name="")]
+How = Annotated[Preparation, tyro.conf.OmitArgPrefixes]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,9 +57,10 @@ class Pictures:
     how: How = Preparation()
 
 
-def main(arguments=None):
+@cli.command(Npz | Video | Pictures)
+def main(args):
     """Parse, convert, and say what came out."""
-    args = cli.parse(Npz | Video | Pictures, arguments)
+    record = None  # of arrays, whose cameras need not be found
     with cli.user_errors():
         if isinstance(args, Npz):
             from nerfies_jax.capture import npz_archive
@@ -70,7 +71,9 @@ def main(arguments=None):
             from nerfies_jax.runs import preparation
 
             preparation.prepare(args.file, args.out, args.how, print)
+            record = cli.stored(args.out / preparation.RECORD)
     print(f"next: python -m experiments.reconstruct {args.out}")
+    return {"folder": str(args.out), "prepared": record}
 
 
 if __name__ == "__main__":

@@ -12,10 +12,12 @@ import functools
 import pathlib
 import signal
 import sys
-from typing import Literal
+from typing import Annotated, ClassVar, Literal
+
+import tyro
 
 from experiments import cli
-from nerfies_jax.runs import commands, platform, representations
+from nerfies_jax.runs import commands, platform, representations, run_folder
 from nerfies_jax.runs.config import MoreMetrics, Preparation, RunConfig
 from nerfies_jax.training import stopping
 
@@ -30,8 +32,13 @@ class Reconstruct:
     beside the run's, which is kept.
     """
 
+    GROUPS: ClassVar = {
+        "model": ("preset", "effects", "set", "effect"),
+        "training": ("steps", "seconds", "seed", "evaluate_every", "checkpoint_every"),
+    }
+
     source: cli.Source = cli.NamedSource()
-    preset: str | None = None
+    preset: cli.Preset = None
     """Gaussian splats: splats-static, splats-mcmc, splats-tracked, splats-deformable,
     sonata, moba, dynmf, spacetime, spline, 4dgs. Radiance fields: nerf, nerf-w,
     d-nerf, t-nerf, nerfies, hypernerf, nsff. Each with -small is made for a CPU; only
@@ -50,14 +57,16 @@ class Reconstruct:
     out: pathlib.Path | None = None
     """Run folder (default: runs/CAPTURE-PRESET)."""
     resume: bool = False
-    """Continue the run in --out from its last checkpoint."""
+    """Continue the run in --out from its last checkpoint; without --out the newest run
+    of the capture or film that is named, in the folder runs."""
     device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
     """Where to compute."""
     seed: int | None = None
     """Of everything random (default: 0)."""
-    set: tuple[str, ...] = ()
-    """Fields of the preset: densification.cap_max=20000 motion.width=128 warp=none."""
-    effect: tuple[str, ...] = ()
+    set: cli.Overrides = ()
+    """Fields of the preset, densification.cap_max=20000 motion.width=128 warp=none,
+    say; experiments.settings lists those there are."""
+    effect: Annotated[tuple[str, ...], tyro.conf.arg(metavar="MODULE:NAME ...")] = ()
     """Effects of your own beside those of the preset, as MODULE:NAME: an Effect, or a
     function that makes one from the scene's metadata (docs/own_effect.md)."""
     evaluate_every: float = 20.0
@@ -72,14 +81,15 @@ class Reconstruct:
     """Of a film, or a folder of pictures without cameras."""
 
 
-def main(arguments=None):
+@cli.command(Reconstruct)
+def main(args):
     """Run the job of the command line.
 
     Exit code 0 where all went well, 1 where training blew up or could not be saved or
     drawn, 2 where the input is wrong, and 128 and more for a signal.
     """
     try:
-        outcome = _outcome(cli.parse(Reconstruct, arguments))
+        outcome = _outcome(args)
     except KeyboardInterrupt as stop:
         print(str(stop) or "interrupted while no step was running", file=sys.stderr)
         raise SystemExit(130) from None
@@ -90,12 +100,24 @@ def main(arguments=None):
     if stopped_by in stopping.NAMES:
         print(f"continue with: {commands.resume(outcome.folder)}")
         code = code or 128 + signal.Signals[stopped_by]
-    raise SystemExit(code)
+    return cli.Ended(_result(outcome), code)
+
+
+def _result(outcome):
+    """Where it ended, and what `metrics.json` has where it came so far."""
+    return {
+        "folder": str(outcome.folder),
+        "preset": outcome.run.config.preset,
+        "stopped_by": outcome.result.stopped_by,
+        "errors": list(outcome.errors),
+        "metrics": cli.stored(outcome.folder / "metrics.json"),
+    }
 
 
 def _outcome(args):
     with cli.user_errors():
         if args.resume:
+            args = _with_folder(args)
             _check_resumed(args)
         platform.start_jax(args.device, *_cores(args))
         watched = _watched(args)
@@ -144,10 +166,23 @@ def _watched(args):
     return functools.partial(viewer.live, port=cli.VIEW_PORT)
 
 
+def _with_folder(args):
+    """The same with --out, where it is said by what was filmed."""
+    if args.out is not None:
+        return args
+    capture = args.source.capture
+    if capture is None:
+        raise ValueError(
+            "--resume continues the run in a folder: name it with --out, or name the "
+            "capture or film that it was made of"
+        )
+    folder = run_folder.newest_of(capture)
+    print(f"the newest run of {capture}: {folder}")
+    return dataclasses.replace(args, out=folder)
+
+
 def _check_resumed(args):
     """Raise ValueError where options do not go with --resume."""
-    if args.out is None:
-        raise ValueError("--resume continues the run in a folder: name it with --out")
     if args.prepare != Preparation():
         raise ValueError(
             "--prepare says how a film becomes a capture, and this run has one; leave "

@@ -17,9 +17,10 @@ python -m experiments.render RUN --path sway --static-threshold 1e-4
 import dataclasses
 import math
 import pathlib
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
+import tyro
 
 from experiments import cli
 from nerfies_jax.runs import platform, representations
@@ -28,6 +29,13 @@ from nerfies_jax.runs import platform, representations
 @dataclasses.dataclass(frozen=True)
 class Render:
     """Render a finished run, as PNG, mp4 and EXR."""
+
+    GROUPS: ClassVar = {
+        "camera": ("path", "frames", "freeze", "slow"),
+        "scene": ("without", "appearance", "hide_moving"),
+        "speed": ("knots", "interpolation", "static_threshold"),
+        "pictures": ("show", "out", "formats", "max_side"),
+    }
 
     run: cli.Positional[pathlib.Path]
     """Run folder that experiments.reconstruct made."""
@@ -42,10 +50,12 @@ class Render:
     """Stop the scene at this time in [0, 1]; the camera goes on."""
     slow: float = 1.0
     """Play so many times slower: 4 shows a quarter of the scene in the same frames."""
-    without: tuple[str, ...] = ()
+    without: Annotated[tuple[str, ...], tyro.conf.arg(metavar="EFFECT ...")] = ()
     """Effects to leave out: warp or motion shows the canonical scene, transient or
     scene_flow only what is static."""
-    appearance: tuple[str, str] | None = None
+    appearance: Annotated[tuple[str, str] | None, tyro.conf.arg(metavar="FROM TO")] = (
+        None
+    )
     """Go from one appearance to another along the pictures: two frame names, or two
     appearance ids."""
     knots: int | None = None
@@ -98,10 +108,10 @@ class Render:
             raise ValueError("--formats: name at least one of png, mp4, exr")
 
 
-def main(arguments=None):
+@cli.command(Render)
+def main(args):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        args = cli.parse(Render, arguments)
         platform.start_jax(args.device, representations.threads_of_run(args.run))
         from nerfies_jax import evaluation, runs
 
@@ -118,7 +128,7 @@ def main(arguments=None):
         out.mkdir(parents=True, exist_ok=True)
     picture_of = _Pictures(args.show, move, trained, views)
     renderer = evaluation.Renderer(model, size)
-    _write(args, out, renderer, state, names, views, picture_of)
+    return _write(args, out, renderer, state, names, views, picture_of)
 
 
 def _name(args):
@@ -260,10 +270,11 @@ def _write(args, out, renderer, state, names, views, picture_of):
         for _ in pictures():
             pass
     width, height = renderer.size
-    print(
-        f"{len(names)} pictures of {width}x{height}, "
-        f"{renderer.ms_per_frame(len(names)):.0f} ms each, in {out}"
-    )
+    ms = renderer.ms_per_frame(len(names))
+    print(f"{len(names)} pictures of {width}x{height}, {ms:.0f} ms each, in {out}")
+    files = sorted(str(path) for path in out.iterdir() if path.is_file())
+    size = list(renderer.size)
+    return {"folder": str(out), "size": size, "ms_per_frame": ms, "files": files}
 
 
 class _Pictures:

@@ -154,18 +154,19 @@ class Results:
             raise ValueError("--measured is the file of one page: name that page")
 
 
-def main(arguments=None):
+@cli.command(Results)
+def main(args):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        args = cli.parse(Results, arguments)
         if args.measured is not None:
             keep(args.pages[0], args.measured)
-        for name in args.pages or kept():
-            path = PAGES / f"{name}.md"
+        written = {name: PAGES / f"{name}.md" for name in args.pages or kept()}
+        for name, path in written.items():
             draw(name)
             path.write_text(page(name))
             print(path)
         (PAGES / "README.md").write_text(index())
+    return {"pages": {name: str(path) for name, path in written.items()}}
 
 
 def kept() -> list[str]:

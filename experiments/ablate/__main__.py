@@ -19,10 +19,10 @@ from experiments.ablate.settings import Ablate
 from nerfies_jax.runs import platform, representations
 
 
-def main(arguments=None):
+@cli.command(Ablate)
+def main(args):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        args = cli.parse(Ablate, arguments)
         settings.check(args)
         arms = suites.named(args.suite).arms
         kinds = {
@@ -34,18 +34,20 @@ def main(arguments=None):
 
         job = Job(args)
     failed = job.run()
-    if args.seed is None:
-        _report(job)
-    raise SystemExit(1 if failed else 0)
+    reports = _report(job) if args.seed is None else {}
+    return cli.Ended(reports, 1 if failed else 0)
 
 
 def _report(job):
+    """What ablation.json has, by the budget that the arms were trained under."""
+    reports = {}
     for budget in job.budgets:
         finished = job.finished(budget)
         if finished:
             from experiments.ablate import report
 
             report.write(job, budget, finished)
+            reports[budget.title] = cli.stored(budget.folder / "ablation.json")
     missing = job.missing()
     if missing:
         print(
@@ -53,6 +55,7 @@ def _report(job):
             + ", ".join(f"{name} {seed}" for name, seed in missing)
             + f"; the same command with --out {job.out} goes on"
         )
+    return reports
 
 
 if __name__ == "__main__":

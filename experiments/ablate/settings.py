@@ -2,7 +2,7 @@
 
 import dataclasses
 import pathlib
-from typing import Literal
+from typing import ClassVar, Literal
 
 from experiments import cli
 from experiments.ablate import suites
@@ -12,6 +12,12 @@ from nerfies_jax.runs.config import CaptureSource
 @dataclasses.dataclass(frozen=True)
 class Ablate:
     """Compare ways to reconstruct a moving scene with and without their parts."""
+
+    GROUPS: ClassVar = {
+        "arms": ("suite", "arms", "set"),
+        "training": ("steps", "share", "seconds", "seeds", "seed"),
+        "measuring": ("frames", "tracks"),
+    }
 
     suite: Literal["fields", "start", "sonata", "moba", "settings", "advice"] = "fields"
     """Radiance fields; motions of splats from tracks and from rest; the ablations of
@@ -43,7 +49,7 @@ class Ablate:
     """Held-out frames to render, evenly over the time."""
     tracks: int = 200
     """Points to follow, at most."""
-    set: tuple[str, ...] = ()
+    set: cli.Overrides = ()
     """Fields changed in every arm, as densification.cap_max=5000 template.depth=4."""
     device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
     """Where to compute."""

@@ -46,7 +46,7 @@ class AccuracyTime:
     """An earlier accuracy_time.json: says what got worse since, exit code 1 if any."""
     frames: int = 6
     """Held-out frames to render, evenly over the time."""
-    set: tuple[str, ...] = ()
+    set: cli.Overrides = ()
     """Fields that are changed in every setting, as rays=256."""
     device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
     """Where to compute."""
@@ -68,10 +68,10 @@ class AccuracyTime:
         return tuple(dict.fromkeys([*bases, *(n for a in chosen for n in a.settings)]))
 
 
-def main(arguments=None):
+@cli.command(AccuracyTime)
+def main(args):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        args = cli.parse(AccuracyTime, arguments)
         from nerfies_jax.measure import baselines
 
         before = None
@@ -84,9 +84,10 @@ def main(arguments=None):
     failed = pool.run(job)
     (budget,) = job.budgets
     finished = job.finished(budget)
-    worse = []
+    worse, result = [], None
     if finished:
         metrics = report.write(job, args, finished)
+        result = cli.stored(job.out / "accuracy_time.json")
         if before is not None:
             worse = baselines.changes(metrics, before)
             print("\n".join(worse) or f"nothing is worse than in {args.check}")
@@ -94,7 +95,7 @@ def main(arguments=None):
     if missing:
         print(f"{missing} of {len(job.tasks())} runs are not there; the same command "
               "goes on")  # fmt: skip
-    raise SystemExit(1 if failed or worse else 0)
+    return cli.Ended(result, 1 if failed or worse else 0)
 
 
 def _job(args):

@@ -29,13 +29,13 @@ class Benchmark:
     """Run the main job on one capture with several seeds."""
 
     source: cli.Source = cli.NamedSource()
-    preset: str | None = None
+    preset: cli.Preset = None
     """Which preset (default: what the capture calls for, by its tracks)."""
     steps: int | None = None
     """Steps of training (default: the preset's own)."""
     seconds: float | None = None
     """Train for so many seconds, without compiling, instead."""
-    set: tuple[str, ...] = ()
+    set: cli.Overrides = ()
     """Fields of the preset, as for experiments.reconstruct."""
     seeds: int = 3
     """So many, from 0 on."""
@@ -50,10 +50,10 @@ class Benchmark:
                 raise ValueError(f"{name}={getattr(self, name)}: at least 1")
 
 
-def main(arguments=None):
+@cli.command(Benchmark)
+def main(args):
     """Run all seeds and keep what they scored; exit code 2 where input is wrong."""
     with cli.user_errors():
-        args = cli.parse(Benchmark, arguments)
         args.out.mkdir(parents=True, exist_ok=True)
         label = _label(args)
         configs = {seed: _config(args, seed) for seed in range(args.seeds)}
@@ -72,6 +72,7 @@ def main(arguments=None):
             keep(args.out / STORED, label, runs[run], run.result())
             print(f"{label}, seed {runs[run]}: {_line(run.result())}", flush=True)
     print(f"kept in {args.out / STORED}")
+    return cli.stored(args.out / STORED)
 
 
 def keep(path: pathlib.Path, label: str, seed: int, scored: dict) -> None:

@@ -59,10 +59,10 @@ class DeformationCost:
             )
 
 
-def main(arguments=None):
+@cli.command(DeformationCost)
+def main(args):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        args = cli.parse(DeformationCost, arguments)
         platform.start_jax(args.device, "one")
         from experiments.deformation_cost import knot_curve
 
@@ -76,8 +76,10 @@ def main(arguments=None):
         print(line)
     print()
     print(knot_curve.text(curve))
+    record = _record(rows, curve)
     if args.out is not None:
-        _save(args.out, rows, curve)
+        _save(args.out, record, curve)
+    return record
 
 
 def _motion(args):
@@ -173,23 +175,25 @@ def spared() -> list[str]:
     return lines
 
 
-def _save(path, rows, curve):
-    from experiments.deformation_cost import knot_picture
-    from nerfies_jax.capture.json_files import write_json
+def _record(rows, curve):
     from nerfies_jax.measure import clock
 
     points = [point._asdict() for point in curve.points]
-    write_json(
-        path,
-        {
-            "machine": clock.machine(),
-            "costs": rows,
-            "spared": spared(),
-            "knots": curve._replace(points=points)._asdict(),
-        },
-    )
+    return {
+        "machine": clock.machine(),
+        "costs": rows,
+        "spared": spared(),
+        "knots": curve._replace(points=points)._asdict(),
+    }
+
+
+def _save(path, record, curve):
+    from experiments.deformation_cost import knot_picture
+    from nerfies_jax.capture.json_files import write_json
+
+    write_json(path, record)
     picture = path.with_suffix(".png")
-    knot_picture.save(picture, rows, curve)
+    knot_picture.save(picture, record["costs"], curve)
     print(f"figures: {path}\npicture: {picture}")
 
 

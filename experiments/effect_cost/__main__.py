@@ -114,10 +114,10 @@ class SceneCost(NamedTuple):
     programs: dict[str, Priced]  # by the names in PROGRAMS
 
 
-def main(arguments=None):
+@cli.command(EffectCost)
+def main(args):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        args = cli.parse(EffectCost, arguments)
         platform.start_jax(args.device, "one")
         import jax
 
@@ -141,7 +141,7 @@ def main(arguments=None):
     worse = [] if before is None else baselines.changes(metrics, before)
     if before is not None:
         print("\n".join(worse) or f"nothing is worse than in {args.check}")
-    raise SystemExit(1 if worse else 0)
+    return cli.Ended(cli.stored(folder / "effect_cost.json"), 1 if worse else 0)
 
 
 def _spec(name, args):

@@ -42,17 +42,17 @@ class EvidenceOptions:
             raise ValueError(f"--seconds {self.seconds:g} must be more than zero")
 
 
-def main(arguments=None):
+@cli.command(EvidenceOptions)
+def main(args):
     """Look at what the command line names; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        args = cli.parse(EvidenceOptions, arguments)
         platform.start_jax("cpu")
         from experiments.evidence import report, scenes
 
         if args.scenes:
-            scenes.measure(args.seed, args.out or pathlib.Path("runs", "evidence"))
-        else:
-            report.look(cli.plain(args.source), args.seed, args.seconds, args.out)
+            out = args.out or pathlib.Path("runs", "evidence")
+            return scenes.measure(args.seed, out)
+        return report.look(cli.plain(args.source), args.seed, args.seconds, args.out)
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ from nerfies_jax.runs.platform import CACHE
 
 def look(
     source: CaptureSource, seed: int, seconds: float, out: pathlib.Path | None
-) -> None:
+) -> dict[str, Any]:
     """Gather, or read what was gathered, and say what it is."""
     capture = runs.stored_capture(source, seed)
     for line in describe(capture):
@@ -54,6 +54,7 @@ def look(
     print(f"frames with tracks: {folder / 'tracks.png'}")
     kept = "not kept, for want of time" if evidence.left_out else path
     print(f"record: {kept}")
+    return stored
 
 
 def errors_of(capture: Capture, truth: SceneTruth, evidence: Evidence) -> Errors:

@@ -2,7 +2,7 @@
 
 import pathlib
 import time
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from skimage import registration
@@ -35,7 +35,7 @@ class FlowRow(NamedTuple):
     seconds: float  # of the processor, for a pair, one way
 
 
-def measure(seed: int, folder: pathlib.Path) -> None:
+def measure(seed: int, folder: pathlib.Path) -> dict[str, Any]:
     """Write evidence.json with all scenes and all ways to find flow."""
     rows = []
     for name, spec in synthetic.PRESETS.items():
@@ -51,8 +51,10 @@ def measure(seed: int, folder: pathlib.Path) -> None:
     flows = [report.as_json(row._asdict()) for row in flow_rows(seed)]
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "evidence.json"
-    write_json(path, {"machine": clock.machine(), "scenes": rows, "flows": flows})
+    stored = {"machine": clock.machine(), "scenes": rows, "flows": flows}
+    write_json(path, stored)
     print(f"saved {path}")
+    return stored
 
 
 def flow_rows(seed: int) -> list[FlowRow]:

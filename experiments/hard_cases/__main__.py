@@ -105,10 +105,10 @@ class CaseResult(NamedTuple):
     slope_cost: float
 
 
-def main(arguments=None):
+@cli.command(HardCases)
+def main(args):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        args = cli.parse(HardCases, arguments)
         chosen = choose(args.rooms, args.cases)
         folder = run_folder.new_run_folder(args.out, "hard_cases")
         if args.document is not None:
@@ -124,6 +124,7 @@ def main(arguments=None):
     if args.document is not None:
         report.renew(args.document, rows)
         print(f"renewed the table in {args.document}")
+    return cli.stored(folder / "hard_cases.json")
 
 
 def choose(rooms, names) -> list[tuple[Case, str]]:

@@ -42,7 +42,7 @@ class InspectPays:
     """Frames of the captures to judge by: n for every n-th, or a split's name."""
     frames: int = 6
     """Held-out frames to render, evenly over the time."""
-    set: tuple[str, ...] = ()
+    set: cli.Overrides = ()
     """Fields that are changed in every run, as rays=256."""
     out: pathlib.Path = pathlib.Path("runs", "inspect_pays")
     """Folder of results; may hold finished runs."""
@@ -56,11 +56,11 @@ class InspectPays:
             )
 
 
-def main(arguments=None):
+@cli.command(InspectPays)
+def main(args):
     """Run the job of the command line; exit code 1 where a run failed, 2 where its
     input is wrong."""
     with cli.user_errors():
-        args = cli.parse(InspectPays, arguments)
         platform.start_jax("cpu")
         check(args.presets)
         from experiments.inspect_pays import report
@@ -76,7 +76,7 @@ def main(arguments=None):
         rows += trial.rows()
     lines = report.write(args.out, args, rows)
     print("\n".join(lines))
-    raise SystemExit(1 if failed else 0)
+    return cli.Ended(cli.stored(args.out / "pays.json"), 1 if failed else 0)
 
 
 def check(presets: tuple[str, ...]) -> None:

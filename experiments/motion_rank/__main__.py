@@ -103,19 +103,20 @@ class RankResult(NamedTuple):
     seconds: float  # of processor time for one fit, without compiling
 
 
-def main(arguments=None):
+@cli.command(MotionRank)
+def main(args):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        args = cli.parse(MotionRank, arguments)
         platform.start_jax(args.device)
         if args.out is not None:
             args.out.mkdir(parents=True, exist_ok=True)
     rows = table(args)
     print(report.text(rows))
     print(report.format_conclusions(rows))
+    record = report.record(args, rows)
     if args.out is not None:
-        report.write(args, rows)
-    return rows
+        report.write(args.out, record, rows)
+    return record
 
 
 def table(args: MotionRank) -> list[RankResult]:

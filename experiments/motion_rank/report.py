@@ -1,5 +1,7 @@
 """Table, sentences and the figure of `experiments.motion_rank`."""
 
+from typing import Any
+
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -153,17 +155,21 @@ def _floors(own):
             )
 
 
-def write(args, rows) -> None:
-    """motion_rank.json and motion_rank.png in the folder asked for."""
-    record = {
+def record(args, rows) -> dict[str, Any]:
+    """What is kept of the study."""
+    return {
         "settings": specs.as_json(args),
         "machine": clock.machine(),
         "rows": [row._asdict() for row in rows],
         "said": format_conclusions(rows).strip().split("\n"),
     }
-    write_json(args.out / "motion_rank.json", record)
-    draw_figure(rows, args.out / "motion_rank.png")
-    print(args.out / "motion_rank.png")
+
+
+def write(out, record, rows) -> None:
+    """motion_rank.json and motion_rank.png in a folder."""
+    write_json(out / "motion_rank.json", record)
+    draw_figure(rows, out / "motion_rank.png")
+    print(out / "motion_rank.png")
 
 
 def page(stored) -> str:

@@ -50,10 +50,10 @@ class Mutants:
             raise ValueError(f"--minutes {self.minutes} must be above 0")
 
 
-def main(arguments=None):
+@cli.command(Mutants)
+def main(args):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        args = cli.parse(Mutants, arguments)
         faults = drawn(args.count, args.seed, args.only)
     from nerfies_jax.capture.json_files import write_json
     from nerfies_jax.measure import clock
@@ -87,6 +87,7 @@ def main(arguments=None):
             stored = {"machine": clock.machine(), "seed": args.seed, "rows": rows}
             write_json(args.out, stored)
     print(page({"rows": rows, "seed": args.seed}))
+    return cli.stored(args.out)
 
 
 def _reached(out, workers, with_copy):

@@ -50,7 +50,6 @@ class Settings:
     yardstick: pathlib.Path | None = None
     cameras: int = 0  # also this many cameras under vmap, against as many singles
     cores: tuple[int, ...] = ()  # also in fresh processes that see so many cores
-    as_json: bool = False  # one JSON line per case and nothing else
     out: pathlib.Path | None = None  # JSON of all cases
 
     def __post_init__(self):
@@ -278,7 +277,7 @@ def longest_tile(case) -> tuple[int, int]:
 
 def core_times(settings: Settings, cores: int) -> dict[str, dict]:
     """The same cases in a fresh process that sees `cores` cores."""
-    command = [sys.executable, "-m", "experiments.raster_speed", "--as-json", "--cases"]
+    command = [sys.executable, "-m", "experiments.raster_speed", "--json", "--cases"]
     environment = dict(os.environ, PJRT_NPROC=str(cores), NPROC=str(cores))
     answer = subprocess.run(
         [*command, *settings.cases, "--repeats", str(settings.repeats)],
@@ -287,27 +286,21 @@ def core_times(settings: Settings, cores: int) -> dict[str, dict]:
         check=True,
         env=environment,
     )
-    rows = [json.loads(line) for line in answer.stdout.splitlines()]
-    return {row["case"]: row for row in rows}
+    return {row["case"]: row for row in json.loads(answer.stdout)["rows"]}
 
 
-def main(arguments=None) -> None:
+@cli.command(Settings)
+def main(settings):
     """Run the job of the command line."""
-    with cli.user_errors():
-        settings = cli.parse(Settings, arguments)
     os.environ.setdefault("PJRT_NPROC", "1")
     os.environ.setdefault("NPROC", "1")
     jax.config.update("jax_numpy_dtype_promotion", "standard")
     limit = exponential_limit_ns(settings.repeats)
-    if not settings.as_json:
-        print(f"exp + multiply, in cache: {limit:.2f} ns an element")
+    print(f"exp + multiply, in cache: {limit:.2f} ns an element")
     rows = []
     for text in settings.cases:
         rows.append(row := time_case(text, settings, limit))
-        if settings.as_json:
-            print(json.dumps(row), flush=True)
-        else:
-            print("  ".join(show(name, row[name]) for name in row), flush=True)
+        print("  ".join(show(name, row[name]) for name in row), flush=True)
     seen = {cores: core_times(settings, cores) for cores in settings.cores}
     for cores, times in seen.items():
         for text, row in times.items():
@@ -316,9 +309,11 @@ def main(arguments=None) -> None:
                 f"{row['forward_backward_ms']:.1f} ms CPU, {row['wall_ms']:.1f} ms wall"
             )
 
+    record = {"machine": clock.machine(), "limit_ns": limit, "rows": rows}
+    record["cores"] = seen
     if settings.out is not None:
-        record = {"machine": clock.machine(), "limit_ns": limit, "rows": rows}
-        write_json(settings.out, record | {"cores": seen})
+        write_json(settings.out, record)
+    return record
 
 
 def page(stored) -> str:

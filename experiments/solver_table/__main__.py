@@ -153,18 +153,18 @@ def page(stored) -> str:
     return f"## Fitting {stored['about']['fit']}\n\n{markdown.table(heads, rows)}"
 
 
-def main(arguments=None) -> list[SolverResult]:
+@cli.command(Settings)
+def main(settings):
     """Run the job of the command line."""
-    settings = cli.parse(Settings, arguments)
     task = PROBLEMS[settings.fit](settings)
     rows = table(task, settings)
     print(text(rows, settings.frames))
+    about = dataclasses.asdict(settings) | {"out": str(settings.out)}
+    record = {"about": about, "machine": clock.machine()}
+    record["rows"] = [row._asdict() for row in rows]
     if settings.out:
-        about = dataclasses.asdict(settings) | {"out": str(settings.out)}
-        record = {"about": about, "machine": clock.machine()}
-        record["rows"] = [row._asdict() for row in rows]
         settings.out.write_text(json.dumps(record, indent=1) + "\n")
-    return rows
+    return record
 
 
 if __name__ == "__main__":

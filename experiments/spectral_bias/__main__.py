@@ -328,10 +328,10 @@ def all_results(args: SpectralBias) -> tuple[list[Result], list[Result]]:
     return equal_steps, equal_time
 
 
-def main(arguments=None):
+@cli.command(SpectralBias)
+def main(args):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        args = cli.parse(SpectralBias, arguments)
         if args.out is not None:
             args.out.mkdir(parents=True, exist_ok=True)
         platform.start_jax(args.device)
@@ -339,8 +339,10 @@ def main(arguments=None):
     waves = {label: SIGNALS[label].waves for label in args.signals}
     print(report.tables(results, waves))
     print(report.format_conclusions(results))
+    record = report.record(args, results, waves)
     if args.out is not None:
-        report.write(args, results, waves)
+        report.write(args.out, record, results, waves)
+    return record
 
 
 if __name__ == "__main__":

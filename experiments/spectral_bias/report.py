@@ -1,5 +1,7 @@
 """Tables, sentences and the figure of `experiments.spectral_bias`."""
 
+from typing import Any
+
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -116,9 +118,9 @@ def _against_kan(label, equality, error):
         )
 
 
-def write(args, results, waves) -> None:
-    """spectral_bias.json and spectral_bias.png in the folder asked for."""
-    record = {
+def record(args, results, waves) -> dict[str, Any]:
+    """What is kept of the study."""
+    return {
         "settings": specs.as_json(args),
         "machine": clock.machine(),
         "waves": {label: components.tolist() for label, components in waves.items()},
@@ -128,9 +130,13 @@ def write(args, results, waves) -> None:
         },
         "said": format_conclusions(results).strip().split("\n"),
     }
-    write_json(args.out / "spectral_bias.json", record)
-    draw_figure(results, waves, args.out / "spectral_bias.png")
-    print(args.out / "spectral_bias.png")
+
+
+def write(out, record, results, waves) -> None:
+    """spectral_bias.json and spectral_bias.png in a folder."""
+    write_json(out / "spectral_bias.json", record)
+    draw_figure(results, waves, out / "spectral_bias.png")
+    print(out / "spectral_bias.png")
 
 
 def page(stored) -> str:

@@ -27,9 +27,9 @@ from nerfies_jax.capture.json_files import AnyPath, scratch_folder, write_json
 from nerfies_jax.capture.structure_from_motion import MappingSpec, Poses, run_sfm
 from nerfies_jax.runs import movers
 from nerfies_jax.runs.config import Preparation
+from nerfies_jax.runs.run_folder import PREPARED as RECORD
 from nerfies_jax.training import specs
 
-RECORD = "prepared.json"  # in the capture: of what it was made, and how
 # Masks are of a pinhole and features lie beside edges: this share of the longer side
 # is masked around what moves as well.
 RIM = 0.01

@@ -193,6 +193,9 @@ def _check_expected(folder, expected):
     """Raise ValueError naming both values where a run was started with others."""
     config = read_settings(folder).config
     stored = {**vars(config), **vars(config.source)}
+    there, source = stored["capture"], expected.get("capture")
+    if there is not None and source is not None and run_folder.is_of(there, source):
+        expected = {**expected, "capture": there}  # or a film that it was made of
     unlike = [
         f"{name.replace('_', '-')}: saved {stored[name]}, now {value}"
         for name, value in expected.items()

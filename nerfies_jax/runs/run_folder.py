@@ -14,6 +14,7 @@ import filelock
 CONFIG = "config.json"  # which capture and which scene, and the whole of its spec
 CHECKPOINTS = "checkpoints"
 EXPORTS = "exports"  # files for other programs, where no other place is named
+PREPARED = "prepared.json"  # in a capture: of what it was made, and how
 LOCK = ".lock"
 OWNER = ".owner.json"  # beside the lock: Windows lets nobody read a locked file
 
@@ -31,6 +32,36 @@ def new_run_folder(out: pathlib.Path | None, stem: str) -> pathlib.Path:
         with tempfile.TemporaryFile(dir=out):
             pass
     return out
+
+
+def newest_of(source: pathlib.Path, above: pathlib.Path | None = None) -> pathlib.Path:
+    """The run in `above` (runs) that was begun last of a capture, or of a film.
+
+    Raises ValueError where there is none.
+    """
+    above = pathlib.Path("runs") if above is None else above
+    found = []
+    for path in above.glob(f"*/{CONFIG}"):
+        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+            capture = json.loads(path.read_text())["config"]["source"]["capture"]
+            if capture is not None and is_of(pathlib.Path(capture), source):
+                found.append((path.stat().st_mtime_ns, path.parent))
+    if not found:
+        raise ValueError(
+            f"{source}: no run of it in {above}; name the run's folder with --out, or "
+            "leave out --resume to begin one"
+        )
+    return max(found)[1]
+
+
+def is_of(capture: pathlib.Path, source: pathlib.Path) -> bool:
+    """Whether a capture is what `source` names, or was prepared of that."""
+    if capture.absolute() == source.absolute():
+        return True
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+        record = json.loads((capture / PREPARED).read_text())
+        return record["source"] == str(source.resolve())
+    return False
 
 
 def check_free(out: pathlib.Path) -> None:

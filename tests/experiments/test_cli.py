@@ -1,14 +1,18 @@
 """Wrong input ends in one line; every command is listed and answers."""
 
 import dataclasses
+import json
+import pathlib
+import re
 import subprocess
 import sys
-from typing import Literal
+from typing import ClassVar, Literal
 
 import pytest
 
 from experiments import __main__ as every
 from experiments import cli
+from nerfies_jax.runs import representations
 
 
 def test_user_errors_are_one_line_and_exit_code_two(capsys):
@@ -23,16 +27,77 @@ def test_our_own_bugs_keep_their_traceback():
         raise KeyError("bug")
 
 
-def test_an_unknown_device_is_refused():
-    with pytest.raises(SystemExit):
-        cli.parse(_Device, ["--device", "abacus"])
+@dataclasses.dataclass(frozen=True)
+class _Inner:
+    """What lies within."""
+
+    masks: pathlib.Path | str | None = None
+    """Where they are
+    (default: beside it)."""
 
 
 @dataclasses.dataclass(frozen=True)
-class _Device:
-    """A device."""
+class _Settings:
+    """Do nothing."""
 
-    device: Literal["cpu", "gpu"] = "cpu"
+    GROUPS: ClassVar = {"place": ("device",)}
+
+    device: Literal["cpu", "gpu"] = "cpu"  # where
+    count: int | None = None
+    """How
+    many."""
+    wet: bool = False
+    inner: _Inner = _Inner()
+    names: tuple[str, ...] = ()
+
+    def __post_init__(self):
+        if self.count == 0:
+            raise ValueError("--count 0: at least one")
+
+
+@cli.command(_Settings)
+def _said(args):
+    print("words")
+    subprocess.run(["echo", "more"], check=True)
+    if args.wet:
+        return cli.Ended({"wet": pathlib.Path("sea")}, 3)
+    return {"count": args.count}
+
+
+def test_settings_come_back_from_where_the_help_has_them():
+    words = ["--device", "gpu", "--inner.masks", "m", "--names", "a", "b", "--wet"]
+    settled = cli.parse(_Settings, words)
+    assert settled == _Settings(
+        "gpu", None, True, _Inner(pathlib.Path("m")), ("a", "b")
+    )
+    with pytest.raises(SystemExit):
+        cli.parse(_Settings, ["--device", "abacus"])
+    with pytest.raises(ValueError, match="--count 0: at least one"):
+        cli.parse(_Settings, ["--count", "0"])
+
+
+def test_help_reads_well(capsys):
+    with pytest.raises(SystemExit):
+        _said(["--help"])
+    page = re.sub(r"[\s│╭╮╰╯─]+", " ", capsys.readouterr().out)
+    assert "--device {cpu,gpu} where (default: cpu)" in page.split("place options")[1]
+    assert "--count INT How many. --wet" in page
+    assert "--inner.masks PATH Where they are. (default: beside it)" in page
+    assert "None" not in page
+    assert "/" not in page.split("Do nothing")[0]  # no path of this machine
+
+
+def test_json_alone_is_on_standard_output(capfd):
+    assert _said([]) == {"count": None}
+    assert capfd.readouterr().out == "words\nmore\n"
+    _said(["--count", "2", "--json"])
+    printed = capfd.readouterr()
+    assert json.loads(printed.out) == {"count": 2}
+    assert sorted(printed.err.split()) == ["more", "words"]
+    with pytest.raises(SystemExit) as stop:
+        _said(["--json", "--wet"])
+    assert stop.value.code == 3
+    assert json.loads(capfd.readouterr().out) == {"wet": "sea"}
 
 
 def test_every_command_is_listed_with_a_line(capsys):
@@ -60,7 +125,9 @@ for name in sys.argv[1:]:
         with contextlib.redirect_stdout(io.StringIO()) as page:
             every.main([name, "--help"])
     except SystemExit as stop:
-        if stop.code or "usage: nerfies" not in page.getvalue():
+        said = page.getvalue()
+        told = "subcommands" in said or "--json" in said
+        if stop.code or not told or f"usage: nerfies {name}" not in said:
             sys.exit(f"{name} --help does not help")
     if "jax" in sys.modules:
         sys.exit(f"{name} --help imports JAX")
@@ -78,4 +145,18 @@ def test_an_unknown_command_names_those_there_are(capsys):
     with pytest.raises(SystemExit) as stop:
         every.main(["reconstrct"])
     assert stop.value.code == 2
-    assert "there are ablate, " in capsys.readouterr().err
+    assert "did you mean reconstruct? there are ablate, " in capsys.readouterr().err
+
+
+@pytest.mark.full
+def test_a_shell_completes_commands_options_and_presets(capsys):
+    with pytest.raises(SystemExit):
+        every.main(["--tyro-print-completion", "bash"])
+    script = capsys.readouterr().out
+    assert set(representations.PRESETS) == {
+        preset
+        for each in representations.installed().values()
+        for preset in each.presets
+    }
+    for word in (*every.commands(), "--json", "--resume", *representations.PRESETS):
+        assert f"'{word}'" in script or f'"{word}"' in script, word

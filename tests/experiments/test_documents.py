@@ -38,8 +38,8 @@ class Accepted(Exception):
 def test_a_command_of_the_docs_parses(name, words, page, monkeypatch, capsys):
     parse = cli.parse
 
-    def only_parse(settings, arguments=None):
-        parse(settings, arguments)
+    def only_parse(*words):
+        parse(*words)
         raise Accepted
 
     monkeypatch.setattr(cli, "parse", only_parse)

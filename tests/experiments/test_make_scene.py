@@ -1,10 +1,8 @@
 """The built-in scenes from the command line."""
 
-import typing
-
 import pytest
 
-from experiments import make_scene
+from experiments import cli, make_scene
 from nerfies_jax import capture
 from nerfies_jax.capture import synthetic
 from nerfies_jax.capture.synthetic import truth
@@ -28,7 +26,7 @@ def test_a_scene_is_written_and_loads_as_a_capture(tmp_path, capsys):
 
 
 def test_every_preset_has_its_name_on_the_command_line():
-    assert typing.get_args(make_scene.Preset) == tuple(synthetic.PRESETS)
+    assert tuple(synthetic.PRESETS) == cli.SCENES
 
 
 def test_a_folder_in_use_is_refused_before_anything_is_filmed(tmp_path, monkeypatch):

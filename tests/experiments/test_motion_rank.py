@@ -87,7 +87,8 @@ def test_rigid_groups_keep_their_shape():
 @pytest.mark.slow
 def test_a_tiny_run_prints_and_keeps_everything(tmp_path, capsys):
     sizes = "--kinds rigid --counts 4 --seeds 2 --steps 4 --points 8 --times 8"
-    rows = motion_rank.main([*sizes.split(), "--out", str(tmp_path / "out")])
+    words = [*sizes.split(), "--out", str(tmp_path / "out")]
+    rows = [motion_rank.RankResult(**row) for row in motion_rank.main(words)["rows"]]
     assert [(row.model, row.count) for row in rows] == [
         *(("time basis", 4), ("separable", 4)),
         *(("moving basis", 4), ("residual", None)),

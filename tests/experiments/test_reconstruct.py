@@ -83,7 +83,7 @@ def test_a_capture_becomes_splats_and_a_report(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(reconstruction, "first_state", counted)
     words = (tmp_path / "filmed", "--preset", "splats-static-small", "--seconds", 250)
     quick = ("densification=none", "sh_degree=0", "init.extra_random=0")
-    assert ended(*words, "--out", out, "--set", *quick) == 0
+    assert ended(*words, "--out", out, "--json", "--set", *quick) == 0
     assert len(states) == 1
     assert {path.name for path in out.iterdir()} >= {*PRODUCTS}
     metrics = json.loads((out / "metrics.json").read_text())
@@ -102,7 +102,10 @@ def test_a_capture_becomes_splats_and_a_report(tmp_path, monkeypatch, capsys):
     exact = np.mean(-10 * np.log10(error.mean(axis=(1, 2, 3))))
     np.testing.assert_allclose(metrics["floor.neighbours"], exact, atol=1e-3)
     assert metrics["heldout.psnr"] < exact  # two steps
-    page, printed = (out / "report.html").read_text(), capsys.readouterr().out
+    document, printed = capsys.readouterr()
+    assert json.loads(document)["metrics"] == metrics
+    assert json.loads(document)["folder"] == str(out)
+    page = (out / "report.html").read_text()
     for words in ("is below the", f"{exact:.2f} dB", "player.html"):
         assert words in page
         assert words in printed

@@ -1,5 +1,6 @@
 """What the main job is asked: wrong input, other settings, commands to paste."""
 
+import json
 import re
 import shlex
 
@@ -110,6 +111,25 @@ def test_a_run_is_not_continued_as_another_one(arguments, words, tmp_path, capsy
     started(tmp_path, config)
     line = refused(capsys, *arguments, "--resume", "--out", tmp_path)
     assert words in line
+
+
+def test_a_run_is_found_by_what_was_filmed(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    clip = tmp_path / "clip.mp4"
+    record = {"source": str(clip.resolve())}
+    for name in ("clip-capture", "other"):  # the second is of something else
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "prepared.json").write_text(json.dumps(record))
+        record = {"source": "elsewhere"}
+        (tmp_path / "runs" / name).mkdir(parents=True)
+        config = RunConfig("splats-static", CaptureSource(tmp_path / name), 60)
+        started(tmp_path / "runs" / name, config)
+    # Found by the clip, and taken for that run's: what differs is the seed alone.
+    line = refused(capsys, clip, "--resume", "--seed", 7)
+    assert "runs/clip-capture: the run was started" in line
+    assert "seed: saved 0, now 7;" in line
+    assert "capture" not in line.partition("settings: ")[2]
+    assert "no run of it in runs" in refused(capsys, tmp_path / "new", "--resume")
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,8 @@ def test_the_table_holds_solvers_against_the_best_known_code(tmp_path, capsys):
     for name, value in SMALL.items():
         many = value if isinstance(value, tuple) else (value,)
         words += [f"--{name.replace('_', '-')}", *map(str, many)]
-    rows = solver_table.main(words)
+    rows = solver_table.main(words)["rows"]
+    rows = [solver_table.SolverResult(**row) for row in rows]
     assert {(r.solver, r.max_steps) for r in rows} == {
         (name, steps) for name in ("lbfgs", "adam") for steps in (2, 8)
     }

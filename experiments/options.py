@@ -1,0 +1,160 @@
+"""The fields of a settings class as options: read by tyro, helped as a page reads.
+
+A class may say in `GROUPS` which of its fields stand together, by the heading; all
+others stand with `--help`. Docstrings are the help; what they give as "(default: ...)"
+is said in the place of the value that the class holds.
+"""
+
+import dataclasses
+import functools
+import inspect
+import itertools
+import operator
+import pathlib
+import re
+import typing
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from nerfies_jax.training.spec_fields import field_words
+
+READ_BY = (tyro.conf.DisallowNone, tyro.conf.PositionalMetavarFromFieldName)
+DEFAULT = re.compile(r"\s*\((default: [^()]*)\)")
+JSON = "--json"
+JSON_HELP = "Print the result as one JSON document, and words to standard error."
+COMPLETION = "--tyro-print-completion"
+
+
+@dataclasses.dataclass(frozen=True)
+class Known:
+    """For `Annotated`: the names that a shell offers; the command refuses others."""
+
+    names: tuple[str, ...]
+
+
+def parse(settings: Any, arguments: list[str], prog: str) -> Any:
+    """The settings that a command line says.
+
+    `settings` is a frozen dataclass, or a union of those that are commands of their
+    own. Raises ValueError where the settings do; tyro ends the process where the words
+    are no options.
+    """
+    offering = any(word.startswith(COMPLETION) for word in arguments)
+    by_shown = {shown(kind, offering): kind for kind in _kinds(settings)}
+    union = functools.reduce(operator.or_, by_shown)
+    parsed = tyro.cli(union, prog=prog, args=arguments, config=READ_BY)
+    return _settled(by_shown[type(parsed)], parsed)
+
+
+def offered(settings: Any) -> type:
+    """What a shell is told of a command that is one of many."""
+    kinds = [shown(kind, offering=True) for kind in _kinds(settings)]
+    if len(kinds) == 1:
+        return kinds[0]
+    marks = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
+    union = Annotated[(functools.reduce(operator.or_, kinds), *marks)]
+    return _made("Several", [("kind", union, dataclasses.field())], "")
+
+
+def _kinds(settings):
+    return typing.get_args(settings) or (settings,)
+
+
+@functools.cache
+def shown(settings: type, offering: bool = False, top: bool = True) -> type:
+    """The same fields as tyro is to show them, with `--json` beside a command's own.
+
+    Nested settings keep their defaults of the class. `offering` is for a shell, which
+    is told the names that are known.
+    """
+    heading_of, docs = _headings(settings), field_words(settings)
+    parts, under = [], {heading: [] for heading in heading_of.values()}
+    for field, kind, marks in _fields(settings):
+        if dataclasses.is_dataclass(kind):
+            kind = shown(kind, offering, top=False)
+            entry = dataclasses.field(default_factory=kind)
+            words = {"help": docs[field.name]} if docs[field.name] else {}
+        else:
+            entry = dataclasses.field(default=field.default)
+            words = _words(docs.get(field.name, ""), field)
+            kind = _plain(kind, marks, offering)
+        if field.default is False:
+            marks = (*marks, tyro.conf.FlagCreatePairsOff)
+        annotated = Annotated[(kind, tyro.conf.arg(**words), *marks)]
+        place = under.get(heading_of.get(field.name), parts)
+        place.append((field.name, annotated, entry))
+    if top:
+        asked = tyro.conf.arg(help=JSON_HELP, help_behavior_hint="")
+        flag = Annotated[bool, asked, tyro.conf.FlagCreatePairsOff]
+        parts.append((JSON.strip("-"), flag, dataclasses.field(default=False)))
+    groups = list(itertools.starmap(_group, under.items()))
+    doc = inspect.cleandoc(settings.__doc__ or "")
+    return _made(settings.__name__, [*groups, *parts], doc)
+
+
+def _group(heading, entries):
+    inner = _made(heading, entries, "")
+    marks = (tyro.conf.OmitArgPrefixes, tyro.conf.arg(help=""))
+    entry = dataclasses.field(default_factory=inner)
+    return heading, Annotated[(inner, *marks)], entry
+
+
+def _made(name, parts, doc):
+    made = dataclasses.make_dataclass(name, parts, frozen=True, kw_only=True)
+    made.__doc__ = doc
+    return made
+
+
+def _fields(settings):
+    """Each field with its bare type and the marks that it is annotated with."""
+    hints = typing.get_type_hints(settings, include_extras=True)
+    for field in dataclasses.fields(settings):
+        kind, marks = hints[field.name], ()
+        if typing.get_origin(kind) is Annotated:
+            kind, *marks = typing.get_args(kind)
+        yield field, kind, marks
+
+
+def _headings(settings):
+    groups = getattr(settings, "GROUPS", {})
+    return {name: heading for heading, names in groups.items() for name in names}
+
+
+def _plain(kind, marks, offering):
+    """The type as a command line has it: a path is not a string besides."""
+    known = next((mark for mark in marks if isinstance(mark, Known)), None)
+    if offering and known is not None:
+        return Literal[known.names] | None
+    parts = typing.get_args(kind)
+    if pathlib.Path in parts and str in parts:
+        return pathlib.Path | None if type(None) in parts else pathlib.Path
+    if typing.get_origin(kind) is tuple and Ellipsis in parts:
+        return tuple[_plain(parts[0], (), offering), ...]
+    return kind
+
+
+def _words(doc, field):
+    """Help and default of an option, for `tyro.conf.arg`."""
+    said = DEFAULT.search(doc)
+    words = {"help": DEFAULT.sub("", doc)}
+    if said is not None:
+        words["help_behavior_hint"] = f"({said[1]})"
+    elif field.default in (None, (), False):
+        words["help_behavior_hint"] = ""
+    return words
+
+
+def _settled(settings, parsed):
+    """The settings themselves, of what tyro made of those that are shown."""
+    heading_of = _headings(settings)
+    values = {}
+    for field, kind, _ in _fields(settings):
+        heading = heading_of.get(field.name)
+        value = getattr(
+            parsed if heading is None else getattr(parsed, heading), field.name
+        )
+        values[field.name] = (
+            _settled(kind, value) if dataclasses.is_dataclass(kind) else value
+        )
+    return settings(**values)

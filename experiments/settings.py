@@ -1,0 +1,101 @@
+"""All fields of a preset that `--set` can change: value, default, meaning and source.
+
+    python -m experiments.settings splats-tracked-small
+    python -m experiments.settings nerfies-small --json
+
+A line is what `--set` takes, and what it has now. Where a field holds one of several
+kinds of settings, or none, the kinds are named: `--set densification=MCMCStrategySpec`.
+"""
+
+import dataclasses
+import inspect
+import textwrap
+from typing import Any
+
+from experiments import cli
+from nerfies_jax.runs import platform, representations
+
+WIDTH, COLUMN = 88, 40  # of the page, and where words begin beside a field
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """List the fields of a preset that --set can change."""
+
+    preset: cli.Positional[cli.Preset]
+    """As for experiments.reconstruct."""
+
+
+@cli.command(Settings)
+def main(args):
+    """Print the fields; exit code 2 where there is no such preset."""
+    with cli.user_errors():
+        platform.start_jax("cpu")
+        kind = representations.of_preset(args.preset)
+    described = described_preset(kind, args.preset)
+    print("\n".join(lines(described)))
+    return described
+
+
+def described_preset(kind: Any, preset: str) -> dict[str, Any]:
+    """The preset's source and, by path, each field."""
+    from nerfies_jax.training import spec_fields
+
+    spec = kind.presets[preset]
+    fields = {}
+    for field in spec_fields.fields_of(spec):
+        # One that always holds the same kind of settings is changed by their fields.
+        if field.kind == field.value and field.kind[0].isupper():
+            continue
+        fields[field.path] = {
+            "value": field.value,
+            "default": field.default,
+            "kind": field.kind,
+            "about": field.about,
+            "source": _place(field.holder),
+            "of": _first_line(field.holder),
+        }
+    return {"preset": preset, "source": _place(type(spec)), "fields": fields}
+
+
+def lines(described: dict[str, Any]) -> list[str]:
+    """For a person: fields under the settings that have them."""
+    groups = {}
+    for path, field in described["fields"].items():
+        above = path.rpartition(".")[0]
+        groups.setdefault((above, field["source"]), []).append((path, field))
+    shown = [f"{described['preset']}, as --set takes it:"]
+    for (above, source), fields in groups.items():
+        title = f"{above or 'the scene'}: {fields[0][1]['of']}"
+        shown += ["", *textwrap.wrap(title, WIDTH), f"({source})"]
+        for path, field in fields:
+            shown += _entry(f"{path}={field['value']}", field)
+    return shown
+
+
+def _entry(assignment, field):
+    """The assignment, and beside it what the field can be and what it is."""
+    said = [field["kind"]]
+    if field["default"] not in ("", field["value"]):
+        said.append(f"default {field['default']}")
+    words = ", ".join(said) + (f"; {field['about']}" if field["about"] else "")
+    beside = textwrap.wrap(words, WIDTH - COLUMN)
+    if len(assignment) + 4 > COLUMN:
+        beside.insert(0, "")
+    heads = [f"  {assignment}", *[""] * (len(beside) - 1)]
+    return [
+        f"{head:{COLUMN}}{text}".rstrip()
+        for head, text in zip(heads, beside, strict=True)
+    ]
+
+
+def _place(kind):
+    return f"{kind.__module__}.{kind.__qualname__}"
+
+
+def _first_line(kind):
+    return inspect.cleandoc(kind.__doc__ or "").partition("\n\n")[0].replace("\n", " ")
+
+
+if __name__ == "__main__":
+    main()
