@@ -119,10 +119,10 @@ class Export:
         return self.out or self.run / run_folder.EXPORTS / (name + self.suffix)
 
 
-def main(arguments=None):
+@cli.command(Export)
+def main(args):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        args = cli.parse(Export, arguments)
         platform.start_jax(args.device, representations.threads_of_run(args.run))
         from nerfies_jax import runs
         from nerfies_jax.capture.json_files import refuse_existing
@@ -130,7 +130,9 @@ def main(arguments=None):
         refuse_existing(args.place, args.overwrite)
         run = runs.saved_run(args.run)
         args.place.parent.mkdir(parents=True, exist_ok=True)
-        print(f"{WRITERS[args.format](args, run)}: {args.place}")
+        said = WRITERS[args.format](args, run)
+        print(f"{said}: {args.place}")
+    return {"written": str(args.place), "format": args.format, "said": said}
 
 
 def _gaussians(args: Export, run: Any) -> str:
