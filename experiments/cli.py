@@ -17,6 +17,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import tyro
 
 from experiments import options
+from nerfies_jax.capture.extras import MissingExtra
 from nerfies_jax.capture.given import GivenFiles
 from nerfies_jax.runs.config import CaptureSource, MoreMetrics
 from nerfies_jax.runs.representations import PRESETS
@@ -90,7 +91,7 @@ def command(settings: Any) -> Callable[[Callable], Callable]:
             with user_errors():
                 args = parse(settings, words, _called(run))
             aside = _words_aside() if as_json else contextlib.nullcontext()
-            with aside, _ended_by_reader():
+            with aside, _ended_by_reader(), user_errors((MissingExtra,)):
                 result = run(args)
             ended = result if isinstance(result, Ended) else None
             result = result if ended is None else ended.result

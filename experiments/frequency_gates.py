@@ -286,15 +286,12 @@ def page(stored) -> str:
 
 def draw_figure(fitted: dict[GateSetting, Fitted], path: pathlib.Path) -> None:
     """For each weight: the wavelet gate and the PSNR against the step."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     from nerfies_jax.capture.json_files import replaced_file
+    from nerfies_jax.evaluation import figures
 
     weights = sorted({arm.most for arm in fitted if arm.most is not None})
     size = 10, 1 + 3 * len(weights)
-    figure = Figure(figsize=size, dpi=120, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = figures.new_figure(figsize=size, dpi=120, layout="constrained")
     axes = figure.subplots(len(weights), 2, squeeze=False)
     colours = dict(
         zip(RULES, [f"C{i}" for i in range(len(RULES))], strict=True), none="0.4"

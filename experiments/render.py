@@ -114,7 +114,10 @@ def main(args):
     with cli.user_errors():
         platform.start_jax(args.device, representations.threads_of_run(args.run))
         from nerfies_jax import evaluation, runs
+        from nerfies_jax.capture import video
 
+        if "mp4" in args.formats:
+            video.library()  # missing, it is said before anything is rendered
         run = runs.saved_run(args.run)
         move = _mover(args, run)
         state = _shown(args, run.model, runs.restore(args.run, run).state)

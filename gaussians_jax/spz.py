@@ -7,7 +7,6 @@ PLY files of 3D Gaussian splatting, are right, down, front.
 """
 
 import gzip
-import importlib
 import math
 import struct
 import zlib
@@ -16,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gaussians_jax.splats import LOG_SCALE_RANGE
+from nerfies_jax.capture import extras
 
 MAGIC = b"NGSP"
 COLOUR_SCALE = 0.15  # of the constant harmonic's coefficient, to a byte from 0 to 1
@@ -285,10 +285,4 @@ def _pack_smallest_three(quaternion):
 
 
 def _zstandard():
-    try:
-        return importlib.import_module("zstandard")
-    except ImportError as error:
-        raise ValueError(
-            "SPZ version 4 needs the package zstandard (pip install zstandard); "
-            "versions 2 and 3 do not"
-        ) from error
+    return extras.library("zstandard", "spz")  # versions 2 and 3 need none

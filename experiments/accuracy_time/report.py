@@ -5,15 +5,13 @@ import pathlib
 from collections.abc import Mapping, Sequence
 
 import jax
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from experiments.ablate import report, verdicts
 from experiments.ablate.arms import Claim
 from experiments.ablate.measures import MEASURES
 from experiments.accuracy_time.axes import AXES
 from nerfies_jax.capture.json_files import replaced_file
-from nerfies_jax.evaluation import protocol
+from nerfies_jax.evaluation import figures, protocol
 from nerfies_jax.measure import clock
 from nerfies_jax.measure.clock import Metric
 from nerfies_jax.training import specs
@@ -163,8 +161,8 @@ def save_fronts(
 ) -> None:
     """A panel for each pair: all settings as dots, the front as a line with names."""
     rows, columns = len(qualities), len(costs)
-    figure = Figure(figsize=(5.4 * columns, 4.0 * rows), dpi=100, layout="constrained")
-    FigureCanvasAgg(figure)
+    size = (5.4 * columns, 4.0 * rows)
+    figure = figures.new_figure(figsize=size, dpi=100, layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False)
     for quality, line in zip(qualities, panels, strict=True):
         for cost, panel in zip(costs, line, strict=True):

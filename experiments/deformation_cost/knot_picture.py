@@ -2,20 +2,16 @@
 
 import pathlib
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator
-
 from experiments.deformation_cost.knot_curve import Curve
 from nerfies_jax.capture.json_files import replaced_file
+from nerfies_jax.evaluation import figures
 
 COLOURS = {"linear": "tab:orange", "cubic": "tab:blue"}
 
 
 def save(path: pathlib.Path, rows: list[dict], curve: Curve) -> None:
     """Times of all arms, and error and picture quality against the number of knots."""
-    figure = Figure(figsize=(15, 5), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = figures.new_figure(figsize=(15, 5), layout="constrained")
     bars, errors, quality = figure.subplots(1, 3, width_ratios=(1.5, 1, 1))
     _bars(bars, rows)
     for way, colour in COLOURS.items():
@@ -50,7 +46,8 @@ def save(path: pathlib.Path, rows: list[dict], curve: Curve) -> None:
         ylabel="PSNR of the frame against the network's (dB)",
         title=f"{curve.gaussians} Gaussians, {curve.moving} moving",
     )
-    quality.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    ticks = figures.library("matplotlib.ticker").LogLocator(subs=(1, 2, 5))
+    quality.xaxis.set_major_locator(ticks)
     quality.xaxis.set_major_formatter("{x:g}")
     quality.xaxis.set_minor_formatter("")
     for axes in (errors, quality):

@@ -4,10 +4,9 @@ import pathlib
 from collections.abc import Mapping
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from nerfies_jax.capture.json_files import replaced_file
+from nerfies_jax.evaluation import figures
 from nerfies_jax.measure import clock
 from nerfies_jax.measure.clock import Metric
 
@@ -172,9 +171,8 @@ def write(folder: pathlib.Path, rows, args) -> list[Metric]:
 def save_figure(path: pathlib.Path, rows) -> None:
     """Bars of processor time: a panel for each preset, a pair of bars for a scene."""
     heights = [len(scenes) for scenes in rows.values()]
-    figure = Figure(figsize=(8, 0.32 * sum(heights) + 0.9 * len(rows)))
+    figure = figures.new_figure(figsize=(8, 0.32 * sum(heights) + 0.9 * len(rows)))
     figure.set_layout_engine("constrained")
-    FigureCanvasAgg(figure)
     panels = figure.subplots(
         len(rows), 1, squeeze=False, gridspec_kw={"height_ratios": heights}
     )[:, 0]

@@ -3,11 +3,10 @@
 import re
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from experiments.hard_cases.case import ORDERS
 from nerfies_jax.capture.json_files import replaced_file
+from nerfies_jax.evaluation import figures
 from nerfies_jax.measure import clock
 from nerfies_jax.measure.clock import Metric
 
@@ -154,8 +153,7 @@ def save_numbers(folder, rows, args) -> None:
 def save_figure(folder, row) -> None:
     """Errors over the sweep, one panel for value, slope and curvature."""
     orders = row.case.orders
-    figure = Figure(figsize=(4.2 * orders, 3.4), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = figures.new_figure(figsize=(4.2 * orders, 3.4), layout="constrained")
     panels = figure.subplots(1, orders, squeeze=False)[0]
     places = np.arange(len(row.case.at))
     for order, panel in enumerate(panels):

@@ -3,11 +3,10 @@
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from experiments import markdown
 from nerfies_jax.capture.json_files import replaced_file, write_json
+from nerfies_jax.evaluation import figures
 from nerfies_jax.measure import clock
 from nerfies_jax.training import specs
 
@@ -197,8 +196,8 @@ def page(stored) -> str:
 def draw_figure(rows, path) -> None:
     """Error against K for each kind of tracks, learnt above and held out below."""
     kinds = list(dict.fromkeys(row.kind for row in rows))
-    figure = Figure(figsize=(3.6 * len(kinds) + 2, 6.4), dpi=120, layout="constrained")
-    FigureCanvasAgg(figure)  # no pyplot: it keeps every figure and a global state
+    size = (3.6 * len(kinds) + 2, 6.4)
+    figure = figures.new_figure(figsize=size, dpi=120, layout="constrained")
     axes = figure.subplots(2, len(kinds), squeeze=False, sharey=True)
     counts = sorted({row.count for row in rows if row.count is not None})
     for line, part in zip(axes, ("learnt", "held_out"), strict=True):

@@ -3,11 +3,10 @@
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from experiments import markdown
 from nerfies_jax.capture.json_files import replaced_file, write_json
+from nerfies_jax.evaluation import figures
 from nerfies_jax.measure import clock
 from nerfies_jax.training import specs
 
@@ -172,8 +171,7 @@ def page(stored) -> str:
 def draw_figure(results, waves, path) -> None:
     """What is missing of each sinusoid: colour a network, dashes an encoding."""
     size = 6 * len(results) + 1.5, 3.6 * len(waves)
-    figure = Figure(figsize=size, dpi=120, layout="constrained")
-    FigureCanvasAgg(figure)  # no pyplot: it keeps every figure and a global state
+    figure = figures.new_figure(figsize=size, dpi=120, layout="constrained")
     axes = figure.subplots(len(waves), len(results), squeeze=False, sharey="row")
     for line, (label, components) in zip(axes, waves.items(), strict=True):
         for panel, (equality, rows) in zip(line, results.items(), strict=True):

@@ -174,8 +174,9 @@ def read_model(folder: pathlib.Path) -> Model:
 
 
 def _reconstruction(folder):
+    pycolmap = library()
     try:
-        return library().Reconstruction(str(folder))
+        return pycolmap.Reconstruction(str(folder))
     except (ValueError, RuntimeError, IndexError, KeyError, MemoryError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise CaptureError(

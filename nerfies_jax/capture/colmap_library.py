@@ -7,9 +7,12 @@ pointer". Loaded before it, libz stays whole; hence the first import below.
 
 import zlib  # noqa: F401
 
+from nerfies_jax.capture import extras
+
 
 def library():
-    """The pycolmap module; imported on first use, because it takes 0.2 s."""
-    import pycolmap
+    """The pycolmap module; imported on first use, because it takes 0.2 s.
 
-    return pycolmap
+    Raises MissingExtra where it is not installed.
+    """
+    return extras.library("pycolmap", "sfm")

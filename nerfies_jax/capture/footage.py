@@ -165,7 +165,7 @@ def _readable(folder):
     notes = ()
     if photographs and not _heif():
         notes = _left_out(
-            photographs, "HEIC, which needs pillow-heif (pip install pillow-heif)"
+            photographs, "HEIC, which needs pip install 'nerfies-jax[heic]'"
         )
         files = [file for file in files if file.name not in photographs]
     if len(files) < 2:

@@ -5,6 +5,7 @@ import pathlib
 import numpy as np
 
 from nerfies_jax.capture.capture import CaptureError, PointCloud
+from nerfies_jax.capture.extras import MissingExtra
 from nerfies_jax.capture.nerfies_views import NerfiesViews
 
 PLACES = ("colmap/sparse/0", "colmap/sparse", "colmap", "sparse/0", "sparse")
@@ -31,7 +32,7 @@ def points_beside(
 
     try:
         model = colmap.read_model(folders[0])
-    except CaptureError as error:
+    except (CaptureError, MissingExtra) as error:
         return None, (f"no points: {error}",)
     row_of = {name: row for row, name in enumerate(views.ids)}
     pairs = [

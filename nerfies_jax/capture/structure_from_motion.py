@@ -20,7 +20,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from nerfies_jax.capture import frames
+from nerfies_jax.capture import extras, frames
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.colmap_library import library
 from nerfies_jax.capture.json_files import AnyPath, new_folder
@@ -126,6 +126,7 @@ def run_sfm(
     times further off. The pictures are copied to `out/images`, so `out` can be loaded.
     `tell` hears now and then how far it is.
     """
+    extras.check("pycolmap", "sfm")  # here, not in the child, whose last line is told
     # The child runs elsewhere.
     images, out = pathlib.Path(images).resolve(), pathlib.Path(out).resolve()
     if not images.is_dir():

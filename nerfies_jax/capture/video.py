@@ -1,13 +1,13 @@
-"""Film in and out, by PyAV."""
+"""Film in and out, by PyAV, which comes with the extra `video`."""
 
 import itertools
 import pathlib
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
 
-import av
 import numpy as np
 
+from nerfies_jax.capture import extras
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.high_dynamic_range import (
     CODES,
@@ -17,6 +17,11 @@ from nerfies_jax.capture.high_dynamic_range import (
 )
 from nerfies_jax.capture.images import MAX_PIXELS
 from nerfies_jax.capture.json_files import AnyPath, replaced_file
+
+
+def library():
+    """PyAV; raises MissingExtra where it is not installed."""
+    return extras.library("av", "video")
 
 
 def write_video(
@@ -34,20 +39,21 @@ def write_video(
     path = pathlib.Path(path)
     if path.suffix not in (".mp4", ".mov", ".mkv"):
         raise CaptureError(f"{path}: cannot be written; end its name in .mp4")
+    av = library()
     frames = iter(frames)
     first = next(frames, None)
     if first is None:
         raise ValueError(f"{path}: no frames to write; pass at least one")
     try:
         with replaced_file(path) as partial:
-            _encode(partial, path, first, frames, frames_per_second, quality)
+            _encode(av, partial, path, first, frames, frames_per_second, quality)
     except av.FFmpegError as error:
         raise CaptureError(
             f"{path}: cannot be written ({error.strerror}); choose another place"
         ) from None
 
 
-def _encode(partial, path, first, frames, frames_per_second, quality):
+def _encode(av, partial, path, first, frames, frames_per_second, quality):
     height, width = first.shape[:2]
     with av.open(str(partial), "w") as container:
         rate = Fraction(frames_per_second).limit_denominator(1001)
@@ -108,7 +114,7 @@ def read_video(
     path = pathlib.Path(path)
     if not path.is_file():
         raise CaptureError(f"{path}: no such film; check the path")
-    shown = 0
+    shown, av = 0, library()
     try:
         with av.open(str(path)) as container:
             if not container.streams.video:

@@ -9,24 +9,24 @@ import pathlib
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-import matplotlib
-import matplotlib.colors
 import numpy as np
 import PIL.Image
 import PIL.ImageDraw
 import PIL.ImageFont
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+import skimage.color
 
 from nerfies_jax.capture import images
 from nerfies_jax.capture.json_files import replaced_file
+from nerfies_jax.evaluation import figures
 
 PANEL_WIDTH = 240  # pixels at least: smaller pictures are enlarged so labels fit
 GAP = 6  # pixels between panels
 TEXT_HEIGHT = 20
 INK, PAPER, FADED = (32, 33, 36), (255, 255, 255), (110, 113, 120)
 UNKNOWN = (128, 128, 128)  # grey is in none of the colour maps
-ERROR_MAP, DEPTH_MAP = "inferno", "viridis"
+# Rows of colour_maps.png, 256 colours each, which are matplotlib's inferno and viridis
+# (CC0): a run is looked at without matplotlib.
+ERROR_MAP, DEPTH_MAP = 0, 1
 # The share of depths beyond each end of the shown range; one stray splat in front of
 # the camera would otherwise turn the whole picture into one colour.
 STRAY_SHARE = 0.01
@@ -113,7 +113,7 @@ def colour_flow(flow: np.ndarray, largest: float | int | None = None) -> Coloure
         )
     hue = np.arctan2(flow[..., 1], flow[..., 0]) / (2 * np.pi) % 1
     saturation = np.clip(length / (largest or 1), 0, 1)
-    colour = matplotlib.colors.hsv_to_rgb(
+    colour = skimage.color.hsv2rgb(
         np.stack([hue, saturation, np.ones_like(hue)], axis=-1)
     )
     picture = np.where(shown[..., None], as_bytes(colour), np.uint8(UNKNOWN))
@@ -147,7 +147,7 @@ def comparison(
     columns = [_enlarged(column) for column in columns]
     width = columns[0].shape[2]
     titles = ("truth", "render", "error", "depth")
-    rows = [_beside([_text(title, width, bold=True) for title in titles])]
+    rows = [_beside([_text(title, width) for title in titles])]
     for frame, caption in enumerate(captions):
         rows.append(_text(caption, 4 * width + 3 * GAP, colour=FADED))
         rows.append(_beside([column[frame] for column in columns]))
@@ -194,8 +194,7 @@ def curve(histories: Mapping[str, History], path: str | pathlib.Path):
     """
     if not any(len(history.seconds) for history in histories.values()):
         raise ValueError(f"{path}: no evaluation to draw; evaluate at least once")
-    figure = Figure(figsize=(7.2, 4.2), dpi=130, layout="constrained")
-    FigureCanvasAgg(figure)  # no pyplot: it keeps every figure and a global state
+    figure = figures.new_figure(figsize=(7.2, 4.2), dpi=130, layout="constrained")
     axes = figure.add_subplot()
     for name, history in histories.items():
         (line,) = axes.plot(
@@ -253,36 +252,35 @@ def _span(low, high):
     return high - low if high > low else 1.0  # a flat depth has one colour
 
 
-def _mapped(unit, shown, name):
-    table = _table(name)
+def _mapped(unit, shown, row):
+    table = _tables()[row]
     index = np.round(np.clip(unit, 0, 1) * 255).astype(np.uint8)
     return np.where(shown[..., None], table[index], np.uint8(UNKNOWN))
 
 
 @functools.cache
-def _table(name):
-    return as_bytes(matplotlib.colormaps[name](np.arange(256))[:, :3])
+def _tables():
+    file = pathlib.Path(__file__).with_name("colour_maps.png")
+    with PIL.Image.open(file) as picture:
+        return np.asarray(picture)
 
 
 @functools.cache
-def _font(bold):
-    # The one font that is certainly installed: matplotlib brings it along.
-    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
-    path = pathlib.Path(matplotlib.get_data_path()) / "fonts" / "ttf" / name
-    return PIL.ImageFont.truetype(str(path), 16)
+def _font():
+    return PIL.ImageFont.load_default(15)  # the one that Pillow brings along
 
 
-def _text(words, width, colour=INK, bold=False, align="left"):
+def _text(words, width, colour=INK, align="left"):
     strip = PIL.Image.new("RGB", (width, TEXT_HEIGHT), PAPER)
     draw = PIL.ImageDraw.Draw(strip)
-    at = 0 if align == "left" else width - draw.textlength(words, font=_font(bold))
-    draw.text((at, 0), words, fill=colour, font=_font(bold))
+    at = 0 if align == "left" else width - draw.textlength(words, font=_font())
+    draw.text((at, 0), words, fill=colour, font=_font())
     return np.asarray(strip)
 
 
-def _bar(name, left, right, width):
+def _bar(row, left, right, width):
     """The colour map from its low to its high end, with the two values below it."""
-    ramp = _table(name)[np.linspace(0, 255, width).astype(int)]
+    ramp = _tables()[row][np.linspace(0, 255, width).astype(int)]
     ends = np.minimum(_text(left, width), _text(right, width, align="right"))
     return _stacked([np.repeat(ramp[None], TEXT_HEIGHT, 0), ends])
 

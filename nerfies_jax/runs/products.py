@@ -5,12 +5,14 @@ import json
 import math
 import pathlib
 import time
+from collections.abc import Callable
 
 import numpy as np
 
 from nerfies_jax import evaluation
 from nerfies_jax.capture import camera_paths, exr, video
 from nerfies_jax.capture.capture import Capture
+from nerfies_jax.capture.extras import MissingExtra
 from nerfies_jax.capture.json_files import write_json
 from nerfies_jax.evaluation import Renderer, Scored, heldout, pictures
 from nerfies_jax.evaluation.representation import Saved
@@ -55,12 +57,14 @@ def make(
     figures = [report.Figure(comparison, COMPARED)]
     watched = [run.capture.ids[row] for row in trained.watched]
     curves.write(folder, trained.result.history, watched)
-    curve = save_curve(folder / "psnr_over_time.png", run, trained)
+    curve = with_extra(save_curve, folder / "psnr_over_time.png", run, trained)
     if curve is not None:
         figures.append(
             report.Figure(curve, "PSNR of a few held-out frames while it trained.")
         )
-    film = save_film(folder / "scene.mp4", run, renderer, state, ms_per_frame / 1e3)
+    film = with_extra(
+        save_film, folder / "scene.mp4", run, renderer, state, ms_per_frame / 1e3
+    )
     player, unplayed = save_player(folder, run, trained)
     save_depth(folder / "depth", run.capture, scored)
     saved = run.representation.save(
@@ -93,6 +97,15 @@ def make(
         following,
     )
     _log(folder, page, metrics, [*floors_text.lines(numbers), *warnings], following)
+
+
+def with_extra(save: Callable[..., pathlib.Path | None], path: pathlib.Path, *words):
+    """What `save` writes; None, and a line, where that needs an extra."""
+    try:
+        return save(path, *words)
+    except MissingExtra as error:
+        print(f"no {path.name}: {error}")
+        return None
 
 
 def save_metrics(path: pathlib.Path, metrics: list[Metric]) -> None:
@@ -331,7 +344,8 @@ def _log(folder, page, metrics, floors, following):
         print(line)
     print(f"report:     {page}")
     print(f"comparison: {folder / 'comparison.png'}")
-    print(f"film:       {folder / 'scene.mp4'}")
+    if (folder / "scene.mp4").exists():
+        print(f"film:       {folder / 'scene.mp4'}")
     for command in following:
         print(f"{command.purpose}\n  {command.line}")
 

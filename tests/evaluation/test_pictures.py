@@ -1,10 +1,13 @@
 """Pictures that mean what they show: colours decoded by hand, sizes, hard inputs."""
 
+import sys
+
 import matplotlib
 import numpy as np
 import pytest
 import skimage.io
 
+from nerfies_jax.capture import extras
 from nerfies_jax.evaluation import pictures
 
 GREY = (128, 128, 128)
@@ -137,6 +140,18 @@ def test_drawing_leaves_no_figure_behind(tmp_path):
 
     pictures.curve({"one": pictures.History([0], [20])}, tmp_path / "psnr.png")
     assert matplotlib.pyplot.get_fignums() == []
+
+
+def test_colours_are_matplotlibs_and_only_the_curve_needs_it(tmp_path, monkeypatch):
+    ramp = np.linspace(0, 1, 256)[None]
+    truth = np.zeros((1, 256, 3))
+    error = pictures.colour_error(truth + ramp[..., None], truth, 1.0).picture
+    np.testing.assert_array_equal(error[0], [mapped("inferno", i) for i in range(256)])
+    depth = pictures.colour_depth(2 - ramp, limits=(1.0, 2.0)).picture
+    np.testing.assert_array_equal(depth[0], [mapped("viridis", i) for i in range(256)])
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(extras.MissingExtra, match=r"matplotlib.*nerfies-jax\[report\]"):
+        pictures.curve({"one": pictures.History([0], [20])}, tmp_path / "psnr.png")
 
 
 def test_saving_keeps_the_pixels(tmp_path, rng):

@@ -134,6 +134,25 @@ for name in sys.argv[1:]:
 """
 
 
+WITHOUT_EXTRAS = """
+import importlib, pathlib, sys
+for name in ("av", "matplotlib", "pycolmap", "viser", "pillow_heif", "zstandard"):
+    sys.modules[name] = None
+for package in ("nerfies_jax", "gaussians_jax", "experiments"):
+    for path in sorted(pathlib.Path(package).rglob("*.py")):
+        if path.stem != "worker":  # does its work when it is loaded
+            importlib.import_module(".".join(path.with_suffix("").parts))
+"""
+
+
+@pytest.mark.full
+def test_everything_loads_without_the_extras():
+    root = pathlib.Path(every.__file__).parents[1]
+    words = [sys.executable, "-c", WITHOUT_EXTRAS]
+    done = subprocess.run(words, capture_output=True, text=True, cwd=root)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_help_is_quick():
     names = sorted(every.commands().keys() - NEED_JAX)
     words = [sys.executable, "-c", ASK_FOR_HELP, *names]
