@@ -1,0 +1,91 @@
+"""Build the API reference, a page for each module, from the docstrings.
+
+    python -m experiments.reference                # into build/reference
+
+Written by pdoc (extra `docs`). Exit code 1 where a public name is on no page.
+"""
+
+import ast
+import dataclasses
+import pathlib
+import sys
+
+from experiments import cli
+from nerfies_jax.capture import extras
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+PACKAGES = ("nerfies_jax", "gaussians_jax")
+
+
+@dataclasses.dataclass(frozen=True)
+class Reference:
+    """Build the API reference."""
+
+    out: pathlib.Path = pathlib.Path("build/reference")
+    """Folder for its pages; index.html is the first."""
+
+
+@cli.command(Reference)
+def main(args):
+    """Write the pages; exit code 1 where one lacks a public name."""
+    pdoc = extras.library("pdoc", "docs")
+    render = extras.library("pdoc.render", "docs")
+    render.configure(docformat="markdown", math=True)
+    names = public_names()
+    # A package without a face of its own brings its modules along.
+    shown = [module for module in names if _has_face(module.rpartition(".")[0])]
+    pdoc.pdoc(*shown, output_directory=args.out)
+    missing = [
+        f"{module}.{name}"
+        for module, there in names.items()
+        for name in there
+        if f'id="{name}"' not in page(args.out, module).read_text()
+    ]
+    for name in missing:
+        print(f"error: {name} is on no page of the reference", file=sys.stderr)
+    print(f"{len(names)} modules: {args.out / 'index.html'}")
+    result = {"folder": str(args.out), "modules": len(names), "missing": missing}
+    return cli.Ended(result, 1 if missing else 0)
+
+
+def page(folder: pathlib.Path, module: str) -> pathlib.Path:
+    """Where the reference has a module."""
+    return folder.joinpath(*module.split(".")).with_suffix(".html")
+
+
+def public_names() -> dict[str, list[str]]:
+    """By module, the functions and classes it defines, or the face that it has."""
+    names = {}
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            parts = path.relative_to(ROOT).with_suffix("").parts
+            module = ".".join(part for part in parts if part != "__init__")
+            face = path.with_suffix(".pyi")
+            tree = ast.parse((face if face.exists() else path).read_text())
+            names[module] = list(_public(tree))
+    return names
+
+
+def _has_face(package):
+    """Whether the names of a package are listed, and those of its modules are not."""
+    path = ROOT.joinpath(*package.split("."), "__init__.py")
+    return not package or "__all__" in path.read_text()
+
+
+def _public(tree):
+    for node in tree.body:
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
+            yield from ast.literal_eval(node.value)
+            return
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            if not node.name.startswith("_"):
+                yield node.name
+        elif isinstance(node, ast.ImportFrom):  # of a face: `from .a import b as b`
+            for alias in node.names:
+                if alias.asname == alias.name:
+                    yield alias.name
+
+
+if __name__ == "__main__":
+    main()
