@@ -67,6 +67,10 @@ class MappingSpec:
             raise ValueError(f"threads={self.threads}; use at least 1")
 
 
+class FewPlaced(CaptureError):
+    """Too few of the pictures found their place."""
+
+
 class Poses(NamedTuple):
     """Cameras that were found, and what the points at rest say of them."""
 
@@ -152,7 +156,7 @@ def run_sfm(
         judged = _in_own_process(folder, masks is not None, spec, tell)
         poses = Poses(out, len(names), **judged)
         if poses.placed < max(2, spec.at_least * len(names)):
-            raise CaptureError(
+            raise FewPlaced(
                 f"{images}: only {poses.placed} of {len(names)} pictures found "
                 f"their place; {_more(len(names))}"
             )

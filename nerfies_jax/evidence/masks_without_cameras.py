@@ -52,10 +52,10 @@ def moving_masks(images: np.ndarray) -> np.ndarray:
     return np.stack([cv2.dilate(np.uint8(one), disc) > 0 for one in enlarged])
 
 
-def write_masks(pictures: pathlib.Path, masks: pathlib.Path) -> float:
-    """Write `<picture name>.png` for each picture of a folder, black where it moves.
+def moving_in(pictures: pathlib.Path) -> dict[str, np.ndarray]:
+    """[height, width] bool by the name of each picture of a folder: what moves.
 
-    As `structure_from_motion.run_sfm` takes them. The share that is black is returned.
+    Names follow the film. ValueError where they are too few, or of several sizes.
     """
     names = [file.name for file in frames.pictures_in(pictures)]
     if len(names) <= min(LATER):
@@ -70,13 +70,7 @@ def write_masks(pictures: pathlib.Path, masks: pathlib.Path) -> float:
             f"{pictures}: pictures of {len(sizes)} sizes; a film has one, so bring "
             "them to it"
         )
-    moves = moving_masks(np.stack(read))
-    masks.mkdir(parents=True, exist_ok=True)
-    for name, one in zip(names, moves, strict=True):
-        pictures_of.write_png(
-            masks / f"{name}.png", np.where(one, 0, 255).astype(np.uint8)
-        )
-    return float(moves.mean())
+    return dict(zip(names, moving_masks(np.stack(read)), strict=True))
 
 
 def _off_the_camera_motion(tracks, within):

@@ -24,7 +24,13 @@ from nerfies_jax.capture.capture import Capture, CaptureError, describe
 from nerfies_jax.capture.footage import Taken
 from nerfies_jax.capture.images import write_png
 from nerfies_jax.capture.json_files import AnyPath, scratch_folder, write_json
-from nerfies_jax.capture.structure_from_motion import MappingSpec, Poses, run_sfm
+from nerfies_jax.capture.structure_from_motion import (
+    FewPlaced,
+    MappingSpec,
+    Poses,
+    run_sfm,
+)
+from nerfies_jax.evidence import masks_without_cameras
 from nerfies_jax.runs import movers
 from nerfies_jax.runs.config import Preparation
 from nerfies_jax.runs.run_folder import PREPARED as RECORD
@@ -127,7 +133,12 @@ def _solve(scratch, taken, how, tell) -> Solved:
     if how.masks is not None:
         poses = run_sfm(pictures, scratch / "only", given, spec, tell)
         return Solved(poses, True, tuple(poses.lines()))
-    first = run_sfm(pictures, scratch / "first", None, spec, tell)
+    try:
+        first = run_sfm(pictures, scratch / "first", None, spec, tell)
+    except FewPlaced as error:
+        if how.passes == 1:
+            raise
+        return _solve_without_movers(scratch, spec, error, tell)
     if how.passes == 1:
         return Solved(first, False, tuple(first.lines()))
     tell(f"{first.lines()[0]}; looking for what moves")
@@ -136,7 +147,10 @@ def _solve(scratch, taken, how, tell) -> Solved:
     if moving is None:
         lines = ("nothing was found to move: these are the cameras", *first.lines())
         return Solved(first, False, lines)
-    _write_masks(scratch, taken.names, capture, moving)
+    row_of = {f"{name}.png": row for row, name in enumerate(capture.ids)}
+    still = np.zeros(moving.shape[1:], bool)  # of what found no place
+    moves = {n: moving[row_of[n]] if n in row_of else still for n in taken.names}
+    _write_masks(scratch, moves)
     share = f"{moving.mean():.1%} of the pixels move; the cameras again without them"
     tell(share)
     try:
@@ -151,16 +165,30 @@ def _solve(scratch, taken, how, tell) -> Solved:
     return Solved(second, True, tuple(second.lines()))
 
 
-def _write_masks(scratch, names, capture, moving):
-    """For people white on what moves, for COLMAP black, with a rim."""
-    row_of = {f"{name}.png": row for row, name in enumerate(capture.ids)}
-    width, height = capture.size
-    rim = 2 * round(RIM * max(width, height)) + 1
+def _solve_without_movers(scratch, spec, error, tell):
+    """The cameras without what seems to move, where with it too few were placed."""
+    tell(f"{str(error).partition(': ')[2]}; looking for what moves")
+    try:
+        moves = masks_without_cameras.moving_in(scratch / "images")
+    except ValueError as reason:
+        raise error from reason
+    share = np.mean([one.mean() for one in moves.values()])
+    if share == 0:
+        raise error
+    _write_masks(scratch, moves)
+    tell(f"{share:.1%} of the pixels seem to move; the cameras again without them")
+    poses = run_sfm(
+        scratch / "images", scratch / "second", scratch / "black", spec, tell
+    )
+    return Solved(poses, True, tuple(poses.lines()))
+
+
+def _write_masks(scratch, moving):
+    """Of each picture, for people white on what moves, for COLMAP black with a rim."""
     (scratch / "found").mkdir()
     (scratch / "black").mkdir()
-    for name in names:
-        row = row_of.get(name)
-        moves = np.zeros((height, width), bool) if row is None else moving[row]
+    for name, moves in moving.items():
+        rim = 2 * round(RIM * max(moves.shape)) + 1
         wide = cv2.dilate(moves.astype(np.uint8), np.ones((rim, rim), np.uint8)) > 0
         write_png(scratch / "found" / name, moves)
         write_png(scratch / "black" / f"{name}.png", ~wide)

@@ -10,7 +10,8 @@ import pytest
 from nerfies_jax import capture as room
 from nerfies_jax.capture import images, video
 from nerfies_jax.capture.capture import CaptureError
-from nerfies_jax.capture.structure_from_motion import Poses
+from nerfies_jax.capture.structure_from_motion import FewPlaced, Poses
+from nerfies_jax.evidence import masks_without_cameras
 from nerfies_jax.runs import movers, preparation, reconstruction
 from nerfies_jax.runs.config import CaptureSource, Preparation, RunConfig
 from tests import scenes
@@ -121,6 +122,32 @@ def test_a_second_pass_that_loses_pictures_is_not_taken(
     preparation.prepare(pictures, tmp_path / "out", tell=log.append)
     assert any("only 6 are placed; the first are kept" in line for line in log)
     assert not (tmp_path / "out/masks_found").exists()
+
+
+def test_where_too_few_are_placed_what_moves_is_masked_before(
+    pictures, tmp_path, mapper, monkeypatch
+):
+    moves = {f"p{row}.png": np.zeros((16, 24), bool) for row in range(9)}
+    moves["p2.png"][10:, 15:] = True
+    monkeypatch.setattr(masks_without_cameras, "moving_in", lambda folder: moves)
+
+    def too_few_unmasked(pictures, out, masks, spec, tell):
+        if masks is None:
+            raise FewPlaced(f"{pictures}: only 1 of 9 pictures found their place")
+        return mapper(pictures, out, masks, spec, tell)
+
+    monkeypatch.setattr(preparation, "run_sfm", too_few_unmasked)
+    log = []
+    preparation.prepare(pictures, tmp_path / "out", tell=log.append)
+    ((_, black),) = mapper.calls
+    assert [mask.any() for mask in black] == [row == 2 for row in range(9)]
+    shown = images.read_mask(tmp_path / "out/masks_found/p2.png")
+    np.testing.assert_array_equal(shown, moves["p2.png"])
+    assert log[0].startswith("only 1 of 9")
+    moves["p2.png"][:] = False  # nothing to leave out: the first reason is told
+    for how in (Preparation(), Preparation(passes=1)):
+        with pytest.raises(CaptureError, match="only 1 of 9"):
+            preparation.prepare(pictures, tmp_path / "again", how)
 
 
 def test_given_masks_take_one_pass_and_are_kept(pictures, tmp_path, mapper):

@@ -1,0 +1,148 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # From a film to a page that plays it
+#
+# A film has no cameras, and something in it moves. This goes the whole way: sharp
+# frames, cameras by COLMAP in two passes (the second without what moves), a look at
+# what was found, Gaussians that move, held-out scores, and `player.html`, in which the
+# scene can be seen from anywhere. `nerfies reconstruct clip.mp4` does all of it in one
+# command; here the steps are apart, so that each can be looked at. (Extras `sfm`,
+# `video` and `report`.)
+
+# %%
+import dataclasses
+import pathlib
+import tempfile
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+import nerfies_jax as nj
+from nerfies_jax import runs
+from nerfies_jax.capture import synthetic, video
+from nerfies_jax.runs import preparation
+from nerfies_jax.runs.config import CaptureSource, Preparation, RunConfig
+
+CLIP = None  # a film of yours; None films the built-in scene
+FRAMES = 24
+STEPS = 600
+PASSES = 2
+PRESET = "splats-deformable-small"
+OUT = pathlib.Path(tempfile.mkdtemp(prefix="film-to-page-"))
+
+# %% [markdown]
+# ## A film
+#
+# Without one of yours the built-in scene is filmed, by its first camera alone, into an
+# mp4. Nothing of what is known of it is used below but, at the end, to say how good the
+# cameras are.
+
+# %%
+clip, filmed = CLIP, None
+if clip is None:
+    film = dataclasses.replace(
+        synthetic.PRESETS["default"],
+        size=(320, 240),
+        frames=FRAMES,
+        supersampling=1,
+    )
+    filmed, _ = synthetic.make(film)
+    order = np.argsort(filmed.times, kind="stable")
+    order = order[filmed.camera_ids[order] == 0]
+    clip = OUT / "clip.mp4"
+    video.write_video(clip, (filmed.images[row] for row in order), 12)
+print(clip)
+
+# %% [markdown]
+# ## Cameras
+#
+# `prepare` keeps the sharpest frame of each stretch of the film, asks COLMAP for the
+# cameras, looks with these for what moves, and asks again without it. What it says on
+# the way is worth reading: how many pictures found their place, and by how many pixels
+# the points at rest are off.
+
+# %%
+how = Preparation(frames=FRAMES, max_side=320, passes=PASSES)
+capture = preparation.prepare(clip, OUT / "capture", how, tell=print)
+
+# %% [markdown]
+# COLMAP's world has no unit and no up, so cameras are compared after the similarity
+# that fits best (Umeyama 1991). What is left is how far the path is off, over its
+# length.
+
+
+# %%
+def path_error(found, true):
+    """RMS distance after the best similarity, over the RMS extent of the true path."""
+    found, true = found - found.mean(0), true - true.mean(0)
+    left, stretch, right = np.linalg.svd(true.T @ found)
+    flip = np.diag([1, 1, np.sign(np.linalg.det(left @ right))])
+    scale = (stretch * np.diag(flip)).sum() / (found**2).sum()
+    off = true - scale * found @ (left @ flip @ right).T
+    return np.sqrt((off**2).sum() / (true**2).sum())
+
+
+if filmed is not None:
+    placed = np.argsort(capture.times, kind="stable")
+    # Frames are named by their place in the film: those that were kept and placed.
+    kept = order[np.round(capture.times[placed] * (len(order) - 1)).astype(int)]
+    error = path_error(
+        np.asarray(capture.cameras.position, float)[placed],
+        np.asarray(filmed.cameras.position, float)[kept],
+    )
+    print(f"the path is off by {error:.1%} of its extent")
+    assert error < 0.2
+
+# %% [markdown]
+# ## Train
+#
+# A run folder, as the command makes it: settings, checkpoints, scores, pictures, a film
+# from a moving camera, the page. Every eighth frame is held out and never learnt from.
+
+# %%
+config = RunConfig(PRESET, CaptureSource(OUT / "capture"), steps=STEPS)
+outcome = runs.reconstruct(config, OUT / "run")
+print(*sorted(path.name for path in outcome.folder.iterdir()), sep="\n")
+
+# %% [markdown]
+# ## Look at it
+#
+# Held-out frames, above as filmed and below as drawn. Scores want company: beside them
+# the run prints what two neighbouring frames laid over each other would score.
+
+# %%
+run = outcome.run
+renderer = nj.Renderer(run.model, run.capture.size)
+rows = run.capture.heldout
+scored = nj.score(renderer, outcome.result.state, run.capture, rows)
+figure, axes = plt.subplots(2, len(rows), figsize=(4 * len(rows), 6), squeeze=False)
+for column, (row, colour) in enumerate(zip(rows, scored.colour, strict=True)):
+    axes[0, column].imshow(run.capture.images[row])
+    axes[0, column].set_title(f"frame {run.capture.ids[row]}")
+    axes[1, column].imshow(np.clip(colour, 0, 1))
+    axes[1, column].set_title(f"{scored.psnr[column]:.1f} dB")
+for axis in axes.flat:
+    axis.axis("off")
+plt.show()
+
+# %% [markdown]
+# The page holds everything, the Gaussians and their motion; it can be mailed, and needs
+# no server.
+
+# %%
+page = outcome.folder / "player.html"
+print(f"open {page} ({page.stat().st_size / 1e6:.1f} MB)")
+assert not outcome.errors
+assert page.stat().st_size > 1e5
+assert np.isfinite(scored.psnr).all()

@@ -1,0 +1,38 @@
+"""The notebooks run to their end, and their own checks hold, made small."""
+
+import os
+import pathlib
+import re
+import subprocess
+import sys
+
+import pytest
+
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+# Constants of each, small. COLMAP finds the cameras of no fewer and smaller pictures.
+SMALL = {
+    "fit_a_picture": {"GAUSSIANS": 300, "STEPS": 40, "WIDTH": 64},
+    "own_effect": {"STEPS": 8, "SIZE": (48, 36), "FRAMES": 8},
+    "film_to_page": {"STEPS": 20, "PASSES": 1, "PRESET": "splats-static-small"},
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", sorted((ROOT / "docs/notebooks").glob("*.py")))
+def test_a_notebook_runs(path, tmp_path):
+    program = path.read_text()
+    for name, value in SMALL[path.stem].items():
+        program, count = re.subn(
+            rf"^{name} = [^#\n]*", f"{name} = {value!r}  ", program, flags=re.M
+        )
+        assert count == 1
+    (tmp_path / path.name).write_text(program)
+    folders = {"PYTHONPATH": str(ROOT), "TMPDIR": str(tmp_path), "MPLBACKEND": "agg"}
+    done = subprocess.run(
+        [sys.executable, path.name],
+        cwd=tmp_path,
+        env=os.environ | folders,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
