@@ -75,7 +75,8 @@ class Preparation:
     every frame of a film, in order. Without them it is found in the pictures."""
     passes: Literal[1, 2] = 2
     """2: look with the first cameras for what moves, and for the cameras once more
-    without it. 1: take the first cameras."""
+    without it; without cameras, where too few pictures are placed. 1: take the first
+    cameras."""
     camera_model: Literal[
         "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"
     ] = "OPENCV"

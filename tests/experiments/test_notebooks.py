@@ -13,7 +13,12 @@ ROOT = pathlib.Path(__file__).resolve().parents[2]
 SMALL = {
     "fit_a_picture": {"GAUSSIANS": 300, "STEPS": 40, "WIDTH": 64},
     "own_effect": {"STEPS": 8, "SIZE": (48, 36), "FRAMES": 8},
-    "film_to_page": {"STEPS": 20, "PASSES": 1, "PRESET": "splats-static-small"},
+    "film_to_page": {
+        "FRAMES": 14,
+        "STEPS": 20,
+        "PASSES": 1,
+        "PRESET": "splats-static-small",
+    },
 }
 
 
