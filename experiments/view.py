@@ -38,10 +38,10 @@ class View:
             raise ValueError(f"--max-side {self.max_side}: draw at least one pixel")
 
 
-def main(arguments=None):
+@cli.command(View)
+def main(args):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        args = cli.parse(View, arguments)
         platform.start_jax(args.device, representations.threads_of_run(args.run))
         from nerfies_jax import runs
         from nerfies_jax.runs import viewer
@@ -58,6 +58,7 @@ def main(arguments=None):
             time.sleep(viewer.IDLE_SECONDS)
     except KeyboardInterrupt:
         page.close()
+    return {"run": args.run, "step": restored.step, "address": page.address}
 
 
 if __name__ == "__main__":

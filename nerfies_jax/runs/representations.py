@@ -18,7 +18,9 @@ GROUP = "nerfies_jax.representations"
 # What our own two have, for command lines, which do not load JAX to be read.
 PRESETS = (
     *("splats-static", "splats-mcmc", "splats-tracked", "splats-deformable"),
-    *("sonata", "moba", "nerf", "nerf-w", "d-nerf", "t-nerf", "nerfies", "hypernerf"),
+    *("sonata", "moba", "dynmf", "spacetime", "spline", "4dgs"),
+    *("dynmf-small", "spacetime-small", "spline-small", "4dgs-small"),
+    *("nerf", "nerf-w", "d-nerf", "t-nerf", "nerfies", "hypernerf"),
     *("nsff", "splats-static-small", "splats-mcmc-small", "splats-tracked-small"),
     *("splats-deformable-small", "sonata-small", "moba-small", "nerf-small"),
     *("nerf-w-small", "d-nerf-small", "t-nerf-small", "nerfies-small"),

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from nerfies_jax import evaluation
-from nerfies_jax.capture import camera_paths, keyframes, path_files
+from nerfies_jax.capture import camera_paths, extras, keyframes, path_files
 from nerfies_jax.capture.keyframes import Keyframe
 from nerfies_jax.evaluation import interactive
 from nerfies_jax.evaluation.interactive import Eye, Look
@@ -41,13 +41,8 @@ JPEG_QUALITY = 90
 
 
 def check_installed() -> None:
-    """Raise ValueError where viser is not installed."""
-    try:
-        import viser  # noqa: F401
-    except ImportError:
-        raise ValueError(
-            "looking around in the browser needs viser: pip install 'nerfies-jax[view]'"
-        ) from None
+    """Raise MissingExtra, which names the extra, where viser is not installed."""
+    extras.check("viser", "view")
 
 
 @dataclasses.dataclass
