@@ -85,6 +85,7 @@ def transfer_of(path: AnyPath) -> Transfer | None:
 
     Also where there is no film to be read: `read_video` says what is wrong with it.
     """
+    av = library()
     try:
         with av.open(str(path)) as container:
             frame = next(container.decode(video=0), None)

@@ -35,8 +35,9 @@ def start_jax(
     _prefer_wide_vectors()
     import jax
 
-    if "JAX_NUM_CPU_DEVICES" not in os.environ:
-        jax.config.update("jax_num_cpu_devices", min(shares, cores()))
+    if shares > 1 and "JAX_NUM_CPU_DEVICES" not in os.environ:
+        with contextlib.suppress(RuntimeError):  # where JAX has begun, as it is
+            jax.config.update("jax_num_cpu_devices", min(shares, cores()))
     if device != "auto":
         name = {"gpu": "cuda"}.get(device, device)
         os.environ["JAX_PLATFORMS"] = name  # of the processes that this one starts
