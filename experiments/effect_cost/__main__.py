@@ -33,6 +33,7 @@ PRESETS = (
     "sonata-small",
     "moba-small",
     "splats-static-small",
+    "splats-tracked-small",
     "dynmf-small",
     "spacetime-small",
     "spline-small",

@@ -1,5 +1,7 @@
 """The page of `experiments.effect_cost` in docs/results."""
 
+import textwrap
+
 from experiments.effect_cost import report
 from nerfies_jax.measure.clock import Metric
 
@@ -98,8 +100,8 @@ def page(stored) -> str:
 def _apart(about):
     """Which presets another processor than that below was asked for."""
     apart = about.get("apart", {})
-    names = [f"`{name}`" for name in apart]
-    if not names:
+    if not apart:
         return ""
+    names = ", ".join(f"`{name}`" for name in apart)
     cpus = " and ".join(sorted(set(apart.values())))
-    return f"\n{', '.join(names)} were\nmeasured apart, on {cpus}."
+    return "\n" + textwrap.fill(f"Measured apart, on {cpus}: {names}.", 88)

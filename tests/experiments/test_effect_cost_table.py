@@ -62,7 +62,6 @@ def test_every_default_preset_has_effects_and_every_paper_is_there():
         assert effect_cost.effects_in(effect_cost._spec(name, EffectCost())), name
     left_out = {"nerf-small", "d-nerf-small", "t-nerf-small"}
     left_out |= {"splats-mcmc-small"}
-    left_out |= {"splats-tracked-small"}  # its motion is a product of 13 x 16 numbers
     small = {n for n in presets if n.endswith("-small")}
     left_out |= {n for n in small if "-grid-" in n}  # the same effects once more
     assert small - set(effect_cost.PRESETS) == left_out  # nothing, or the warp alone
