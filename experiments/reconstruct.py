@@ -21,8 +21,6 @@ from nerfies_jax.runs import commands, platform, representations, run_folder
 from nerfies_jax.runs.config import MoreMetrics, Preparation, RunConfig
 from nerfies_jax.training import stopping
 
-USUAL_PRESET = "splats-tracked-small"  # where none is named, and the film allows it
-
 
 @dataclasses.dataclass(frozen=True)
 class Reconstruct:
@@ -199,8 +197,7 @@ def _cores(args):
     """How many cores the representation wants XLA to see, and the shares of a step."""
     if args.resume:
         return representations.cores_of_run(args.out)
-    preset = args.preset or USUAL_PRESET
-    return representations.cores(preset, args.set if args.preset else ())
+    return representations.cores(args.preset, args.set)
 
 
 def _expected(args):

@@ -76,7 +76,7 @@ def _package(name, words="", page="page", of=None, measured=None):
 
 _SPLAT_AXES = "gaussians harmonics dssim raster motion-network kan basis"
 STUDIES = {
-    "benchmark": _package("benchmark", "--seeds 3 --jobs 2"),
+    "benchmark": _package("benchmark", "--seeds 3"),
     "accuracy_time": _package(
         "accuracy_time",
         f"--axes preset {_SPLAT_AXES} splat-precision --share 0.25 --jobs 4",

@@ -40,7 +40,7 @@ class Benchmark:
     seeds: int = 3
     """So many, from 0 on."""
     jobs: int = 1
-    """Runs at a time; more than there are cores make all of them slow."""
+    """Runs at a time, one core each from two on; one alone takes all it can use."""
     out: pathlib.Path = pathlib.Path("runs/benchmark")
     """Folder for the runs and benchmark.json."""
 
@@ -64,7 +64,11 @@ def main(args):
     ) as pool:
         runs = {
             pool.submit(
-                job.score, config, args.out / f"{_stem(args)}-{seed}", args.seconds
+                job.score,
+                config,
+                args.out / f"{_stem(args)}-{seed}",
+                args.seconds,
+                alone=args.jobs == 1,
             ): seed
             for seed, config in configs.items()
         }

@@ -4,17 +4,21 @@ import json
 import pathlib
 from typing import Any
 
-from nerfies_jax.runs import platform
+from nerfies_jax.runs import platform, representations
 from nerfies_jax.runs.config import RunConfig
 
 
 def score(
-    config: RunConfig, folder: pathlib.Path, seconds: float | None
+    config: RunConfig, folder: pathlib.Path, seconds: float | None, alone: bool
 ) -> dict[str, Any]:
-    """Preset, machine and metrics of one run, made in `folder` unless it is there."""
+    """Preset, machine and metrics of one run, made in `folder` unless it is there.
+
+    One that is `alone` on the machine takes the cores that its preset wants.
+    """
     metrics = folder / "metrics.json"
     if not metrics.exists():
-        platform.start_jax("cpu", "one")
+        wanted = representations.cores(config.preset, config.overrides)
+        platform.start_jax("cpu", *(wanted if alone else ("one",)))
         from nerfies_jax import runs
         from nerfies_jax.capture.json_files import write_json
         from nerfies_jax.measure import clock

@@ -15,6 +15,7 @@ from nerfies_jax.runs.run_folder import CONFIG
 from nerfies_jax.training import specs
 
 GROUP = "nerfies_jax.representations"
+USUAL = "splats-tracked-small"  # where none is named, and tracks tell a motion
 # What our own two have, for command lines, which do not load JAX to be read.
 PRESETS = (
     *("splats-static", "splats-mcmc", "splats-tracked", "splats-deformable"),
@@ -80,8 +81,13 @@ class Cores(NamedTuple):
     shares: int
 
 
-def cores(preset: str, overrides: tuple[str, ...] = ()) -> Cores:
-    """Of a preset with fields changed; ValueError where there are no such."""
+def cores(preset: str | None, overrides: tuple[str, ...] = ()) -> Cores:
+    """Of a preset with fields changed; ValueError where there are no such.
+
+    Of None, for which each capture has its own: the usual one, unchanged.
+    """
+    if preset is None:
+        preset, overrides = USUAL, ()
     representation = of_preset(preset)
     spec = specs.override(representation.presets[preset], overrides)
     return Cores(representation.threads, representation.shares(spec))
