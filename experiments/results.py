@@ -120,6 +120,7 @@ STUDIES = {
     ),
     "elastic_points": _study("elastic_points", "--out elastic_points.json"),
     "kan_local": _study("kan_local", "--out kan_local.json"),
+    "speed": _package("speed", "--job --yardstick PATH/run.py --out speed"),
     "raster_speed": _package(
         "raster_speed", "--out raster_speed.json", page="__main__"
     ),

@@ -4,7 +4,8 @@
     python -m experiments.benchmark --scene fast --out runs/benchmark
     python -m experiments.benchmark CAPTURE --max-side 256 --out runs/benchmark
 
-Each seed is a run of `experiments.reconstruct` in a process of its own, one to a core.
+Each seed is a run of `experiments.reconstruct` in a process of its own; one at a time
+takes the cores that its preset wants, several one each.
 The seed draws the first Gaussians and the order of the frames; that of a built-in scene
 draws the hand that holds the camera as well. A run that is complete is not made again,
 and the numbers of other captures in OUT/benchmark.json stay.

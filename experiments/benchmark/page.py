@@ -25,7 +25,7 @@ of the mean of the two training pictures before and after, *time average* that o
 run's own renders averaged over time: a run that does not stand above both did nothing.
 *EPE* is how far points that are followed are from where they truly are, in scene units,
 *EPE at rest* the same if none of them moved. Each number is the median over seeds,
-with the least and the largest in brackets. Seconds are wall clock of one core, and
+with the least and the largest in brackets. Seconds are wall clock, and
 whatever else the machine did is in them: *training* without compiling, *all* from the
 command to the report, with what the pictures say before training where it was not kept
 yet."""

@@ -30,7 +30,9 @@ MOTION = PlaneMotionSpec(
 @functools.cache
 def effect():
     scene = spec.SplatScene(steps=100, motion=MOTION)
-    return spec.motion_of(scene, spec.SceneMetadata(EXTENT, (0.0, 0.0, 0.0), 9, BOX))
+    return spec.motion_of(
+        scene, spec.SceneMetadata(EXTENT, (0.0, 0.0, 0.0), 9, box=BOX)
+    )
 
 
 def params_of(gaussians, dtype, size=0.5):

@@ -57,7 +57,7 @@ def places_of(effect, points, time):
 
 def effect_of(motion):
     scene_spec = spec.SplatScene(steps=100, motion=motion)
-    metadata = spec.SceneMetadata(1.0, (0.0, 0.0, 0.0), FRAMES, BOX)
+    metadata = spec.SceneMetadata(1.0, (0.0, 0.0, 0.0), FRAMES, box=BOX)
     return spec.motion_of(scene_spec, metadata)
 
 

@@ -1,0 +1,125 @@
+"""How long a step, a frame, a compilation and the main job take, on this machine.
+
+    python -m experiments.speed --out speed
+    python -m experiments.speed --presets splats-tracked-small --out speed
+    python -m experiments.speed --job --yardstick PATH/run.py --out speed
+
+Every preset is timed in two fresh processes, one that sees one core and one that has
+the cores its steps are made for. `--job` also times the README's first command, from an
+empty cache of programs and of evidence. `--yardstick` times the rasteriser beside
+another (`experiments.raster_speed`). Times are wall clock: leave the machine alone.
+What was measured before stays in OUT/speed.json where it is not measured anew.
+"""
+
+import concurrent.futures
+import dataclasses
+import json
+import multiprocessing
+import os
+import pathlib
+import subprocess
+import sys
+import tempfile
+import time
+
+from experiments import cli
+from experiments.speed import job
+from nerfies_jax.runs import representations
+
+STORED = "speed.json"
+# Of the yardstick's cases, those that its page bounds.
+CASES = ("10000@256x256", "50000@480x270", "200000@800x800")
+
+
+@dataclasses.dataclass(frozen=True)
+class Speed:
+    """Time presets, the main job, and the rasteriser beside another."""
+
+    presets: tuple[str, ...] = ()
+    """Which presets (default: all small ones)."""
+    job: bool = False
+    """Also the main job, from the command to its report."""
+    yardstick: pathlib.Path | None = None
+    """Also the rasteriser, beside the one that this script times."""
+    out: pathlib.Path = pathlib.Path("runs/speed")
+    """Folder for speed.json."""
+
+    def __post_init__(self):
+        for name in self.presets:
+            if name not in representations.PRESETS:
+                raise ValueError(f"--presets {name}: no such preset")
+
+
+@cli.command(Speed)
+def main(args):
+    """Measure and keep; exit code 2 where input is wrong."""
+    with cli.user_errors():
+        args.out.mkdir(parents=True, exist_ok=True)
+    path = args.out / STORED
+    small = tuple(n for n in representations.PRESETS if n.endswith("-small"))
+    for preset in args.presets or small:
+        for cores in ("one", "all"):
+            record = _apart(job.measure, preset, cores == "all")
+            keep(path, record.pop("machine"), ("presets", preset, cores), record)
+            print(f"{preset}, {cores}: {record['step_ms']:.1f} ms a step", flush=True)
+    if args.job:
+        record = main_job()
+        keep(path, record.pop("machine"), ("job",), record)
+        print(f"main job: {record['seconds']:.0f} s", flush=True)
+    if args.yardstick is not None:
+        record = _raster(args.yardstick)
+        keep(path, record["machine"], ("raster",), {"rows": record["rows"]})
+    print(f"kept in {path}")
+    return cli.stored(path)
+
+
+def keep(path: pathlib.Path, machine: dict, keys: tuple[str, ...], record) -> None:
+    """Put a record in its place in the file, which keeps all others."""
+    from nerfies_jax.capture.json_files import write_json
+
+    stored = json.loads(path.read_text()) if path.exists() else {}
+    stored["machine"], inner = machine, stored
+    for key in keys[:-1]:
+        inner = inner.setdefault(key, {})
+    inner[keys[-1]] = record
+    write_json(path, stored)
+
+
+def _apart(work, *arguments):
+    """The work's result, from a fresh process."""
+    spawned = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(1, spawned) as pool:
+        return pool.submit(work, *arguments).result()
+
+
+def main_job() -> dict:
+    """Seconds of the README's first command, with nothing kept from before."""
+    with tempfile.TemporaryDirectory() as folder:
+        run = pathlib.Path(folder) / "run"
+        environment = dict(os.environ, XDG_CACHE_HOME=f"{folder}/cache")
+        for name in ("JAX_COMPILATION_CACHE_DIR", "PJRT_NPROC", "NPROC"):
+            environment.pop(name, None)
+        command = [sys.executable, "-m", "experiments.reconstruct", "--out", str(run)]
+        began = time.perf_counter()
+        subprocess.run(command, check=True, env=environment, capture_output=True)
+        seconds = time.perf_counter() - began
+        metrics = json.loads((run / "metrics.json").read_text())
+    from nerfies_jax.measure import clock
+
+    wanted = ("train.seconds", "train.compile_seconds", "heldout.psnr")
+    return {
+        "seconds": seconds,
+        **{name: metrics[name] for name in (*wanted, "heldout.moving_psnr")},
+        "machine": clock.machine(),
+    }
+
+
+def _raster(yardstick):
+    command = [sys.executable, "-m", "experiments.raster_speed", "--json"]
+    command += ["--cases", *CASES, "--yardstick", str(yardstick)]
+    answer = subprocess.run(command, check=True, capture_output=True, text=True)
+    return json.loads(answer.stdout)
+
+
+if __name__ == "__main__":
+    main()

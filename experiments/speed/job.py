@@ -1,0 +1,52 @@
+"""One preset timed in a process of its own."""
+
+import dataclasses
+from typing import Any
+
+from nerfies_jax.runs import platform, representations
+
+FRAMES = 5  # rendered, after one that compiles
+
+
+def measure(preset: str, all_cores: bool) -> dict[str, Any]:
+    """Seconds and bytes of a preset on the built-in scene, from its first state.
+
+    With `all_cores` the step has the cores that its preset wants, otherwise one.
+    Motions start from rest: how they started changes nothing of what a step costs.
+    """
+    wanted = representations.cores(preset)
+    platform.start_jax("cpu", *(wanted if all_cores else ("one",)))
+    import jax
+
+    # As it is the first time.
+    jax.config.update("jax_enable_compilation_cache", False)
+
+    from nerfies_jax import evaluation, runs
+    from nerfies_jax.evaluation import Renderer
+    from nerfies_jax.measure import clock
+    from nerfies_jax.training.rate import step_time
+
+    representation = representations.of_preset(preset)
+    spec = representation.presets[preset]
+    spec = dataclasses.replace(
+        spec, start=dataclasses.replace(spec.start, motion="none")
+    )
+    capture = runs.built_in_scene("default")
+    metadata = representation.metadata_of(capture, spec)
+    model = representation.build(spec, metadata)
+    state = model.init(capture, jax.random.key(0))
+    frames = evaluation.frames_of(capture, model.required_data)
+    step = step_time(model, state, frames, spec.steps)
+    record = {
+        "step_ms": 1e3 * step.seconds,
+        "compile_seconds": step.compile_seconds,
+        "devices": model.devices,
+        "parts": representation.time_parts(spec, metadata, model, state, frames),
+    }
+    renderer = Renderer(model, capture.size)
+    for row in capture.heldout[: FRAMES + 1]:
+        renderer(state, evaluation.view_of(capture, row))
+    record["frame_ms"] = renderer.ms_per_frame(FRAMES)
+    record["peak_mb"] = clock.peak_bytes() / 1e6
+    record["machine"] = clock.machine()
+    return record

@@ -1,0 +1,92 @@
+"""The page of `experiments.speed` in docs/results."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from experiments import markdown
+
+READING = """\
+One step of each preset on the built-in scene (176x132), the mean over a run's phases
+from its first state. A step of splats draws `batch_size` views, one of a field `rays`
+rays, so steps of different presets are not alike. *One core* is a process that sees
+one, *all* one that spreads a step over as many as its preset has shares for. *Compile*
+is the training program alone, from an empty cache; *frame* one picture on one core;
+*peak* all memory of the one-core process, JAX and the capture included."""
+
+
+def page(stored: Mapping[str, Any]) -> str:
+    """The tables: presets, where their time goes, the main job, the rasteriser."""
+    parts = [READING, _presets(stored["presets"]), "## Where a step's time goes"]
+    parts.append("Milliseconds on one core, each part by itself.")
+    parts.append(_parts(stored["presets"]))
+    if "job" in stored:
+        parts += ["## The main job", _job(stored["job"])]
+    if "raster" in stored:
+        parts += ["## The rasteriser beside a tuned C++ one", RASTER]
+        parts.append(_raster(stored["raster"]["rows"]))
+    return "\n\n".join(parts)
+
+
+def _presets(presets):
+    heads = ("preset", "one core, ms a step", "all, ms a step", "times as fast")
+    heads += ("compile s", "frame ms", "peak MB")
+    rows = []
+    for name, record in presets.items():
+        one, every = record["one"], record["all"]
+        rows.append(
+            [
+                f"`{name}`",
+                markdown.number(one["step_ms"], 1),
+                markdown.number(every["step_ms"], 1),
+                markdown.number(one["step_ms"] / every["step_ms"], 2),
+                markdown.number(one["compile_seconds"], 1),
+                markdown.number(one["frame_ms"], 0),
+                markdown.number(one["peak_mb"], 0),
+            ]
+        )
+    return markdown.table(heads, rows)
+
+
+def _parts(presets):
+    names = list(
+        dict.fromkeys(part for r in presets.values() for part in r["one"]["parts"])
+    )
+    rows = [
+        [
+            f"`{name}`",
+            *(markdown.number(record["one"]["parts"].get(part), 1) for part in names),
+        ]
+        for name, record in presets.items()
+    ]
+    return markdown.table(("preset", *names), rows)
+
+
+def _job(job):
+    return (
+        f"The README's first command, with nothing kept from before: "
+        f"{job['seconds']:.0f} s from the command to its report, of which training "
+        f"{job['train.seconds']:.0f} s and compiling it "
+        f"{job['train.compile_seconds']:.0f} s; {job['heldout.psnr']:.2f} dB held out, "
+        f"{job['heldout.moving_psnr']:.2f} dB where something moves."
+    )
+
+
+RASTER = """\
+Forward and backward, CPU milliseconds on one core, in one sitting: the other rasteriser
+before and after ours, the mean of both."""
+
+
+def _raster(rows):
+    heads = ("case", "ours", "theirs", "times as long")
+    names = ("forward_backward_ms", "yardstick_forward_backward_ms")
+    return markdown.table(
+        heads,
+        [
+            [
+                row["case"],
+                *(markdown.number(row[name], 1) for name in names),
+                markdown.number(row["ratio"], 2),
+            ]
+            for row in rows
+        ],
+    )
