@@ -119,6 +119,7 @@ STUDIES = {
         page="__main__",
     ),
     "elastic_points": _study("elastic_points", "--out elastic_points.json"),
+    "camera_masks": _study("camera_masks", "--out camera_masks.json"),
     "kan_local": _study("kan_local", "--out kan_local.json"),
     "speed": _package("speed", "--job --yardstick PATH/run.py --out speed"),
     "raster_speed": _package(
