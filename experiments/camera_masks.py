@@ -3,12 +3,12 @@
     python -m experiments.camera_masks --out camera_masks.json
     python -m experiments.camera_masks --half 0.1 --seeds 1
 
-The built-in scene is filmed with a cube so large that it fills much of the picture,
-and its pictures go to `experiments.prepare` without their cameras: in one pass, in two
+The built-in scene is filmed with a cube so large that it fills much of the picture, and
+its pictures go to `experiments.prepare` without their cameras: in one pass, in two
 (what moves is found with the first cameras and left out for the second), and with the
-true masks. Positions are compared with the truth after the best similarity, as shares of the
-path's extent; turns are those between neighbouring frames. The hand that holds the
-camera is drawn by the seed.
+true masks. Positions are compared with the truth after the best similarity, as shares
+of the path's extent; turns are those between neighbouring frames. The hand that holds
+the camera is drawn by the seed.
 """
 
 import dataclasses
