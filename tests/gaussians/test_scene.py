@@ -179,7 +179,8 @@ COUNTED = {
 )
 def test_presets_build_and_stretch_with_their_steps(name):
     spec = presets.PRESETS[name]
-    metadata = SceneMetadata(extent=1.0, background=(0.0, 0.0, 0.0), frames=10)
+    box = ((-1.0,) * 3, (1.0,) * 3)
+    metadata = SceneMetadata(1.0, (0.0, 0.0, 0.0), frames=10, box=box)
     half = presets.with_steps(spec, spec.steps // 2)
     assert half.steps == spec.steps // 2
     for part, fields in COUNTED.items():
