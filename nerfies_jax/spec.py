@@ -94,7 +94,8 @@ class RadianceScene:
         if self.micro_batches < 1 or self.rays % self.micro_batches:
             raise ValueError(
                 f"rays={self.rays} cannot be split into micro_batches="
-                f"{self.micro_batches} equal parts"
+                f"{self.micro_batches} equal parts; choose a multiple, or "
+                "micro_batches=1"
             )
         if not self.template_rate > 0:
             raise ValueError(f"template_rate={self.template_rate} must be positive")

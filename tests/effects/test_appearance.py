@@ -42,6 +42,7 @@ METADATA = SceneMetadata(
 CHEAP = {
     "steps": 10,
     "rays": 4,
+    "micro_batches": 1,
     "sampling": SamplingSpec(4, 3),
     "template": TINY.template,
     "coarse": None,
