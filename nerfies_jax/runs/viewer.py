@@ -180,7 +180,10 @@ class Viewer:
         start.look_at = first.position + away * first.camera_from_world[2]
         start.up = -first.camera_from_world[1]
         start.fov = _vertical_fov(first, capture.size)
-        self._frusta = server.scene.add_frame("/cameras", show_axes=False)
+        # At the start one stands among them: their lines would hide the picture.
+        self._frusta = server.scene.add_frame(
+            "/cameras", show_axes=False, visible=False
+        )
         # Not that of the start itself, whose frame would fill the window.
         for row in evaluation.spread(capture.train[1:], FRUSTA):
             one = cameras.take(capture.cameras, row)
@@ -214,7 +217,7 @@ class Viewer:
             made["appearance"] = gui.add_slider(
                 "appearance", 0, len(known) - 1, 1, known.index(first)
             )
-        frusta = gui.add_checkbox("cameras", True)
+        frusta = gui.add_checkbox("cameras", False)
         frusta.on_update(lambda _: setattr(self._frusta, "visible", frusta.value))
         with gui.add_folder("effects", visible=bool(self.screen.parts.removable)):
             made["effects"] = {
