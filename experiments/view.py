@@ -42,7 +42,7 @@ class View:
 def main(args):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        platform.start_jax(args.device, representations.threads_of_run(args.run))
+        platform.start_jax(args.device, representations.cores_of_run(args.run).threads)
         from nerfies_jax import runs
         from nerfies_jax.runs import viewer
 

@@ -40,7 +40,8 @@ def score(
 
     def render(view: View, change: np.ndarray) -> Rendering:
         drawn = renderer(state, view)
-        colour = drawn.colour + drawn.colour @ change[:, :3].T + change[:, 3]
-        return drawn._replace(colour=colour.astype(np.float32))
+        change = change.astype(drawn.colour.dtype)
+        colour = exposure.changed(drawn.colour, change)
+        return drawn._replace(colour=np.asarray(colour))
 
     return evaluation.score_halves(fit_code, render, capture, rows)

@@ -118,38 +118,44 @@ class _System(NamedTuple):
 def _system(views, seen, body, bend):
     """The normal equations of one round, weights as the misses are."""
     miss, slope, turned = _projected(views, seen, body)
-    weight = 1 / (1 + (miss**2).sum(-1) / SOFT_PX**2)
+    weight = _weights(miss)
     by_turn = np.cross(turned[:, None], slope)
     by_pose = np.concatenate([slope, by_turn], axis=-1)
     by_point = slope @ body.rotation[seen.frame]
     frames, points = len(body.shift), len(body.point)
-
-    def gathered(left, right, rows, where):
-        """Sums of left' weight right over the entries of each row."""
-        product = np.einsum("o,oki,okj->oij", weight, left, right)
-        total = np.zeros((rows, *product.shape[1:]))
-        np.add.at(total, where, product)
-        return total
-
-    own = gathered(by_pose, by_pose, frames, seen.frame)
+    own = _summed(_products(weight, by_pose, by_pose), seen.frame, frames)
     poses = np.zeros((frames, 6, frames, 6))
     poses[np.arange(frames), :, np.arange(frames)] = own
     for part in range(6):
         poses[:, part, :, part] += bend
     both = np.zeros((points, frames, 6, 3))
-    both[seen.track, seen.frame] = np.einsum(
-        "o,oki,okj->oij", weight, by_pose, by_point
-    )
+    both[seen.track, seen.frame] = _products(weight, by_pose, by_point)
     off = miss[..., None]
-    pose_slope = gathered(by_pose, off, frames, seen.frame)[..., 0]
+    pose_slope = _summed(_products(weight, by_pose, off), seen.frame, frames)[..., 0]
     pose_slope[:, :3] += bend @ body.shift
     return _System(
         poses.reshape(6 * frames, 6 * frames),
-        gathered(by_point, by_point, points, seen.track),
+        _summed(_products(weight, by_point, by_point), seen.track, points),
         both.reshape(points, 6 * frames, 3),
         pose_slope.ravel(),
-        gathered(by_point, off, points, seen.track)[..., 0],
+        _summed(_products(weight, by_point, off), seen.track, points)[..., 0],
     )
+
+
+def _weights(miss):
+    """Of observations [entries] in the next round, by how far off [entries, 2] px."""
+    return 1 / (1 + (miss**2).sum(-1) / SOFT_PX**2)
+
+
+def _products(weight, left, right):
+    return np.einsum("o,oki,okj->oij", weight, left, right)
+
+
+def _summed(product, where, rows):
+    """[rows, ...] sums of the entries of each row."""
+    total = np.zeros((rows, *product.shape[1:]))
+    np.add.at(total, where, product)
+    return total
 
 
 def _moved(body, system, damping):
@@ -179,17 +185,16 @@ def placed(views: Views, seen: Sight, body: Body) -> Body:
     point = body.point.copy()
     for _ in range(ROUNDS // 4):
         miss, slope, _ = _projected(views, seen, body._replace(point=point))
-        weight = 1 / (1 + (miss**2).sum(-1) / SOFT_PX**2)
+        weight = _weights(miss)
         by_point = slope @ body.rotation[seen.frame]
-        matrix, right = np.zeros((len(point), 3, 3)), np.zeros((len(point), 3))
-        np.add.at(
-            matrix, seen.track, np.einsum("o,oki,okj->oij", weight, by_point, by_point)
+        matrix, right = (
+            _summed(_products(weight, by_point, other), seen.track, len(point))
+            for other in (by_point, miss[..., None])
         )
-        np.add.at(right, seen.track, np.einsum("o,oki,ok->oi", weight, by_point, miss))
         size = np.einsum("nii->n", matrix) / 3
         ridge = POINT_PRIOR * (size + max(np.median(size), 1e-30))
         matrix += ridge[:, None, None] * np.eye(3)
-        point = point - np.linalg.solve(matrix, right[..., None])[..., 0]
+        point = point - np.linalg.solve(matrix, right)[..., 0]
     return body._replace(point=point)
 
 

@@ -167,17 +167,17 @@ def checked(forward: np.ndarray, backward: np.ndarray) -> NeighbourFlow:
 
 def _lost(flow, frame):
     """Whether a coherent area was carried to a frame and not from there."""
-    return _is_wide(flow.backward_seen[frame] & ~flow.forward_seen[frame])
+    return _covers_patch(flow.backward_seen[frame] & ~flow.forward_seen[frame])
 
 
 def _jumps(flow, frame):
     """Whether a coherent area leaves a frame otherwise than it came."""
     turned = np.linalg.norm(flow.forward[frame] + flow.backward[frame], axis=-1)
     both = flow.backward_seen[frame] & flow.forward_seen[frame]
-    return _is_wide(both & (turned > JUMP_SHARE * turned.shape[1]))
+    return _covers_patch(both & (turned > JUMP_SHARE * turned.shape[1]))
 
 
-def _is_wide(area):
+def _covers_patch(area):
     side = 2 * round(LOST_SHARE * area.shape[1] / 2) + 1
     # Nothing lies outside: strips at the border leave the picture.
     outside = {"borderType": cv2.BORDER_CONSTANT, "borderValue": 0}

@@ -92,9 +92,7 @@ def least_acceleration(
         offset = path - camera
         far = np.median(np.linalg.norm(offset, axis=-1)[seen[span]])
         flatness[row] = _deviation(stencils, path, offset, noise * far)
-    depth = np.einsum(
-        "fj,nfj->nf", views.rotation[:, 2], position - views.position[None]
-    )
+    depth = views.depth_of(position)
     known = tracks.seen & (np.nan_to_num(depth, nan=-1.0) > near)
     return Paths(position, known, depth, flatness)
 

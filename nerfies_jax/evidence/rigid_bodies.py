@@ -52,9 +52,7 @@ def refined(views: Views, tracks: Tracks, paths: Paths) -> Paths:
         own, body = grown
         position[own], known[own] = _at_paths_scale(views, paths, own, body)
         left[own] = False
-    depth = np.einsum(
-        "fj,nfj->nf", views.rotation[:, 2], position - views.position[None]
-    )
+    depth = views.depth_of(position)
     return Paths(position, known, depth, paths.depth_deviation)
 
 
@@ -139,8 +137,7 @@ def _at_paths_scale(views, paths, own, body):
     """Places of the body's points over time, in the median as far as their paths."""
     enough = paths.known[own].sum(0) >= FEWEST_SEEN
     known = paths.known[own] & enough
-    offset = body.world() - views.position
-    depth = np.einsum("fj,nfj->nf", views.rotation[:, 2], offset)
+    depth = views.depth_of(body.world())
     known &= depth > 0
     factor = np.median(paths.depth[own][known] / depth[known])
     return bundle.scaled(views, body, factor).world(), known

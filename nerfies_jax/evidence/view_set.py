@@ -43,6 +43,11 @@ class Views(NamedTuple):
         """Width and height in pixels."""
         return self.grey.shape[2], self.grey.shape[1]
 
+    def depth_of(self, position: np.ndarray) -> np.ndarray:
+        """Z-depth [points, frames] of places [points, frames, 3], scene units."""
+        offset = position - self.position
+        return np.einsum("fj,nfj->nf", self.rotation[:, 2], offset)
+
 
 def in_time_order(capture: Capture, rows: np.ndarray | None = None) -> Views:
     """Every frame to learn from (or of `rows`), by time, whichever camera filmed it."""

@@ -99,10 +99,12 @@ def make(
     _log(folder, page, metrics, [*floors_text.lines(numbers), *warnings], following)
 
 
-def with_extra(save: Callable[..., pathlib.Path | None], path: pathlib.Path, *words):
+def with_extra(
+    save: Callable[..., pathlib.Path | None], path: pathlib.Path, *arguments
+):
     """What `save` writes; None, and a line, where that needs an extra."""
     try:
-        return save(path, *words)
+        return save(path, *arguments)
     except MissingExtra as error:
         print(f"no {path.name}: {error}")
         return None

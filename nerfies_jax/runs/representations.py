@@ -104,9 +104,3 @@ def cores_of_run(folder: pathlib.Path) -> Cores:
     except (OSError, ValueError, KeyError, TypeError):
         shares = 1
     return Cores(representation.threads, shares)
-
-
-def threads_of_run(folder: pathlib.Path) -> Threads:
-    """How many cores XLA:CPU should see for the run in a folder; all if it is none."""
-    representation = of_run(folder)
-    return "all" if representation is None else representation.threads

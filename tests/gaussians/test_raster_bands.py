@@ -1,9 +1,5 @@
 """Bands over devices equal the whole picture."""
 
-import os
-import subprocess
-import sys
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +7,7 @@ import pytest
 
 from gaussians_jax import raster, raster_bands
 from gaussians_jax.raster_spec import GSPLAT
+from tests import fresh_process
 from tests.gaussians import shared, test_raster
 
 SIZE = (29, 37)
@@ -58,16 +55,8 @@ def test_one_device_draws_the_whole_picture(float64):
 
 @pytest.mark.slow
 def test_three_devices_draw_the_whole_picture():
-    code = (
+    fresh_process.run(
         "import jax; jax.config.update('jax_enable_x64', True);"
         "jax.config.update('jax_num_cpu_devices', 3);"
         "from tests.gaussians import test_raster_bands; test_raster_bands.both(3)"
     )
-    result = subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        check=False,
-        env=dict(os.environ, JAX_PLATFORMS="cpu"),
-    )
-    assert result.returncode == 0, result.stderr[-2000:]

@@ -1,15 +1,12 @@
 """Equal shares of a step: the same state from one device and from several."""
 
-import os
-import subprocess
-import sys
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from nerfies_jax.training import data_parallel
+from tests import fresh_process
 from tests.training import toy
 
 
@@ -59,16 +56,8 @@ def test_devices_take_equal_shares(shares, most, used, monkeypatch):
 
 @pytest.mark.slow
 def test_two_devices_train_what_one_does():
-    code = (
+    fresh_process.run(
         "import jax; jax.config.update('jax_num_cpu_devices', 2);"
         "jax.config.update('jax_numpy_dtype_promotion', 'strict');"
         "from tests.training import test_data_parallel as t; t.both(2)"
     )
-    result = subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        check=False,
-        env=dict(os.environ, JAX_PLATFORMS="cpu"),
-    )
-    assert result.returncode == 0, result.stderr[-2000:]
