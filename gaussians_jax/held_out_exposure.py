@@ -6,6 +6,7 @@ fields: the scene stays as it is, and the other half is scored.
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 
 from gaussians_jax import scene
@@ -40,8 +41,8 @@ def score(
 
     def render(view: View, change: np.ndarray) -> Rendering:
         drawn = renderer(state, view)
-        change = change.astype(drawn.colour.dtype)
-        colour = exposure.changed(drawn.colour, change)
+        picture = jnp.asarray(drawn.colour)
+        colour = exposure.changed(picture, jnp.asarray(change, picture.dtype))
         return drawn._replace(colour=np.asarray(colour))
 
     return evaluation.score_halves(fit_code, render, capture, rows)
