@@ -1,4 +1,4 @@
-"""Some steps of training as one compiled program."""
+"""Steps of training as compiled scans."""
 
 import functools
 import time
@@ -6,10 +6,15 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 
 from nerfies_jax.training import data_parallel
+from nerfies_jax.training.model import Frames, TrainState
+
+LENGTH = 10  # steps of a scan
+# Fewer steps than these in all, or more work in each (a tenth of a second on a core),
+# are not worth a scan of several steps: it cannot be interrupted.
+FEW_STEPS, LARGE_FLOPS = 100, 5e9
 
 
 class Outcome(NamedTuple):
@@ -21,44 +26,41 @@ class Outcome(NamedTuple):
     step: Any
 
 
-def _run_chunk(step, state, frames, count):
-    """`count` steps, fewer if a metric stops being finite.
+def scan_steps(step, state, frames, length):
+    """The state after `length` steps, and the metrics of each, stacked.
 
-    A `while` with a traced bound, not a `scan` of one length: one program for every
-    chunk is compiled once per shape, not once per shape and length, and gives a step
-    the same bits wherever chunks begin and end. With metrics and parameters checked it
-    costs 1.03 times a scan for Adam over 200 000 x 59 rows and 1 us more than 10 us for
-    a toy; steps compiled one by one cost 1.8 times and 15 times as much.
-
-    The state is looked at as a whole, once: a second moment that overflows leaves the
-    parameters finite, and a row that never moves again. Of those rows it takes 40 ms,
-    of the parameters alone 6, in a chunk of half a second.
+    `step(state, frames) -> (state, metrics)` is pure: so is this, and it can be
+    differentiated. ValueError where a step changes the shape or dtype of an array.
     """
-    # Traced once for both uses: twice took 1.7 times as long to lower.
-    step = jax.jit(step, inline=True)
-    _, metrics = jax.eval_shape(step, state, frames)
     accumulate = jnp.result_type(float)
-    total = {name: jnp.zeros((), accumulate) for name in metrics}
 
-    def unfinished(carry):
-        done, finite, _, _ = carry
-        return (done < count) & finite
-
-    def advance(carry):
-        done, _, state, total = carry
+    def advance(state, _):
         new, metrics = step(state, frames)
         _check_same(state, new)
-        new = jax.tree.map(_strong, new)
         metrics = {k: jnp.asarray(v).astype(accumulate) for k, v in metrics.items()}
-        # Means, not sums: a hundred large metrics must not overflow together.
-        share = count.astype(accumulate)
-        total = {name: total[name] + metrics[name] / share for name in total}
-        finite = _all_finite(metrics)
-        return done + 1, finite, new, total
+        return jax.tree.map(_strong, new), metrics
 
-    start = (jnp.zeros((), jnp.int32), jnp.asarray(True), state, total)
-    done, finite, state, total = lax.while_loop(unfinished, advance, start)
-    return state, Outcome(done, total, finite & _all_finite(state), state.step)
+    return lax.scan(advance, state, length=length)
+
+
+def _run_scan(step, length, state, frames):
+    """A scan and its outcome.
+
+    The state is looked at as a whole, once: a second moment that overflows leaves the
+    parameters finite, and a row that never moves again. Of 200 000 x 59 rows it takes
+    40 ms, of the parameters alone 6.
+    """
+    state, metrics = scan_steps(step, state, frames, length)
+    finite = functools.reduce(
+        jnp.logical_and,
+        [jnp.isfinite(x) for x in metrics.values()],
+        jnp.ones(length, bool),
+    )
+    all_finite = jnp.all(finite)
+    done = jnp.where(all_finite, length, 1 + jnp.argmin(finite))
+    # Means, not sums: a hundred large metrics must not overflow together.
+    mean = {name: jnp.sum(x / length) for name, x in metrics.items()}
+    return state, Outcome(done, mean, all_finite & _all_finite(state), state.step)
 
 
 def _all_finite(tree):
@@ -94,31 +96,85 @@ def _check_same(before, after):
             )
 
 
-def compiled(step, state, frames, devices=1):
-    """The program for these shapes, and the seconds it took to make it (0 if kept).
+class Program:
+    """Any number of steps for arrays of the same shapes: scans, and single steps.
 
-    Called with (state, frames, count); the state given to it is overwritten. Of a step
-    that works on several devices, state and outcome are on the first of them, `frames`
-    on all (`data_parallel.replicate`).
+    Compiled are one scan of LENGTH steps and, only where there is a remainder, one of a
+    single step: a step has the same bits wherever chunks of LENGTH end. (A scan of each
+    length would be compiled anew; one that skips steps copies the state for each.)
+    Called with (state, frames, count) it gives the state and the `Outcome`; the state
+    given is overwritten. Of a step that works on several devices, state and outcome are
+    on the first of them, `frames` on all (`data_parallel.replicate`).
     """
+
+    def __init__(self, step, state: TrainState, frames: Frames, steps: int, devices=1):
+        # Traced once for both lengths, which takes most of the time to lower.
+        self._step, self._devices = jax.jit(step, inline=True), devices
+        self._shapes = jax.tree.map(_abstract, (self._on_all(state), frames))
+        self._lowered, self._programs = {}, {}
+        self.length = 1
+        if steps >= FEW_STEPS:
+            counted = self._lower(LENGTH).cost_analysis() or {}
+            if counted.get("flops", 0.0) < LARGE_FLOPS:
+                self.length = LENGTH
+
+    def _lower(self, length):
+        if length not in self._lowered:
+            scan = functools.partial(_run_scan, self._step, length)
+            scan = jax.jit(scan, donate_argnums=0)
+            self._lowered[length] = scan.lower(*self._shapes)
+        return self._lowered[length]
+
+    def _on_all(self, state):
+        return data_parallel.replicate(state, self._devices)
+
+    def prepare(self, count: int) -> float:
+        """Seconds of compiling what so many steps need; 0 where it is there."""
+        missing = set(self._lengths(count)) - self._programs.keys()
+        if not missing:
+            return 0.0
+        began = time.perf_counter()
+        for length in missing:
+            self._programs[length] = self._lower(length).compile()
+        return time.perf_counter() - began
+
+    def _lengths(self, count):
+        scans, singles = divmod(count, self.length)
+        return [self.length] * scans + [1] * singles
+
+    def __call__(self, state: TrainState, frames: Frames, count: int):
+        """The state after `count` steps, or after one not finite, and the outcome."""
+        self.prepare(count)
+        state = self._on_all(state)
+        done, total, outcome = 0, {}, None
+        for length in self._lengths(count):
+            state, outcome = self._programs[length](state, frames)
+            outcome = jax.device_get(outcome)
+            done += int(outcome.done)
+            for name, mean in outcome.metrics.items():
+                total[name] = total.get(name, 0.0) + mean * (length / count)
+            if not outcome.finite:
+                break
+        state = data_parallel.first_copy(state, self._devices)
+        return state, outcome._replace(done=done, metrics=total)
+
+
+def _abstract(leaf):
+    return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=leaf.sharding)
+
+
+def program(
+    step, state: TrainState, frames: Frames, steps: int, devices: int = 1
+) -> tuple[Program, float]:
+    """For these shapes and a run of `steps` in all, and the seconds of lowering it."""
     programs = _programs(step)
     leaves, structure = jax.tree.flatten((state, frames))
-    key = structure, tuple((x.shape, x.dtype, x.sharding) for x in leaves)
+    shapes = tuple((x.shape, x.dtype, x.sharding) for x in leaves)
+    key = structure, shapes, steps >= FEW_STEPS
     if key in programs:
         return programs[key], 0.0
     began = time.perf_counter()
-    chunk = jax.jit(functools.partial(_run_chunk, step), donate_argnums=0)
-    spread = data_parallel.replicate(state, devices)
-    program = chunk.lower(spread, frames, np.int32(1)).compile()
-    if devices == 1:
-        programs[key] = program
-    else:
-
-        def on_all(state, frames, count):
-            state = data_parallel.replicate(state, devices)
-            return data_parallel.first_copy(program(state, frames, count), devices)
-
-        programs[key] = on_all
+    programs[key] = Program(step, state, frames, steps, devices)
     return programs[key], time.perf_counter() - began
 
 

@@ -68,9 +68,7 @@ def last_good(program, snapshot, frames, good_step, bad_step):
     def replay(step):
         if step == snapshot.step:
             return snapshot.state(), True, {}
-        count = np.int32(step - snapshot.step)
-        state, outcome = program(snapshot.state(), frames, count)
-        outcome = jax.device_get(outcome)
+        state, outcome = program(snapshot.state(), frames, step - snapshot.step)
         return state, bool(outcome.finite), outcome.metrics
 
     good, bad = good_step, bad_step

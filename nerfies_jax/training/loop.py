@@ -7,19 +7,17 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import rich.console
 from jaxtyping import Array, Key
 
-from nerfies_jax.training import data_parallel
+from nerfies_jax.training import chunk, data_parallel
 from nerfies_jax.training.checkpoint import Checkpoints
-from nerfies_jax.training.chunk import compiled
 from nerfies_jax.training.guard import Snapshot, bad_arrays, last_good, listed
 from nerfies_jax.training.model import Event, Frames, Model, TrainState
 from nerfies_jax.training.progress import Progress, duration
 from nerfies_jax.training.stopping import StopRequests
 
-CHUNK_STEPS = 100  # longer ones gain nothing: scan(100) costs 0.96 of scan(1000)
+CHUNK_STEPS = 100  # longer ones gain nothing
 CHUNK_SECONDS = 0.5  # a chunk cannot be interrupted: Ctrl-C acts within this time
 
 
@@ -97,7 +95,8 @@ def fit(
     uninterrupted one bit for bit (on XLA:CPU with the same PJRT_NPROC). Pass the
     restored history on.
 
-    One program with a traced number of steps serves every chunk of a shape.
+    Steps are scanned; one program serves all chunks of a shape, and a second one what
+    is left over where events or the end fall between them (`chunk.Program`).
     """
     run = _Run(model, state, frames, steps, (*model.events, *events), tuple(hooks))
     run.history, run.checkpoints = history, checkpoints
@@ -142,24 +141,27 @@ class _Run:
         while self.step < self.steps:
             if requests.name is not None:
                 return requests.name
-            if self._left() <= 0:
-                return "seconds"
-            program, compile_seconds = compiled(
-                self.model.step, self.state, self.spread_frames, self.model.devices
+            program, lower_seconds = chunk.program(
+                self.model.step,
+                self.state,
+                self.spread_frames,
+                self.steps,
+                self.model.devices,
             )
-            self._add(compile_seconds=compile_seconds)
-            if not self._chunk(program):
+            if self._left() <= self._half_a_scan(program.length):
+                return "seconds"
+            count = self._count(program.length)
+            self._add(compile_seconds=lower_seconds + program.prepare(count))
+            if not self._chunk(program, count):
                 return "non-finite"
             self._after_chunk()
         return "steps"
 
-    def _chunk(self, program) -> bool:
+    def _chunk(self, program, count) -> bool:
         """Run one chunk and the events at its end; false where something blew up."""
-        count = self._count()
         began = time.perf_counter()
-        self.state, outcome = program(self.state, self.spread_frames, np.int32(count))
-        outcome = jax.device_get(outcome)  # waits
-        done = int(outcome.done)
+        self.state, outcome = program(self.state, self.spread_frames, count)
+        done = outcome.done
         if not outcome.finite:
             self.state, self.step, self.detail = last_good(
                 program, self.snapshot, self.spread_frames, self.step, self.step + done
@@ -174,7 +176,7 @@ class _Run:
         happening = self.events.get(self.step + done, ())
         if not self._happen(happening, self.step + done):
             # Before that step: a run that is resumed must not leave the event out.
-            count = np.int32(self.step + done - 1 - self.snapshot.step)
+            count = self.step + done - 1 - self.snapshot.step
             self.state, self.step = self.snapshot.state(), self.step + done - 1
             if count:
                 self.state, _ = program(self.state, self.spread_frames, count)
@@ -205,19 +207,29 @@ class _Run:
                 return False
         return True
 
-    def _count(self) -> int:
-        """Steps of the next chunk: up to the next event, not too long to wait for."""
+    def _count(self, length: int) -> int:
+        """Steps of the next chunk: up to the next event, not too long to wait for.
+
+        Of scans as many as there is time for, of single steps those that are left over.
+        """
         stops = [self.steps, self.step + CHUNK_STEPS]
         stops += [step for step in self.events if step > self.step]
         for hook in self.hooks:
             if hook.every_steps is not None:
                 stops.append((self.step // hook.every_steps + 1) * hook.every_steps)
         affordable = min(CHUNK_SECONDS, self._left()) / self.step_seconds
-        return max(1, min(min(stops) - self.step, int(affordable)))
+        distance = min(stops) - self.step
+        if distance < length:
+            return distance
+        return length * max(1, min(distance, int(affordable)) // length)
 
     def _left(self) -> float:
         """Seconds of training that this call may still take."""
         return self.limits[0] - (self.history.seconds - self.trained_before)
+
+    def _half_a_scan(self, length: int) -> float:
+        """Seconds; with less time left than this, no other scan is begun."""
+        return length * self.step_seconds / 2 if self.step_seconds < math.inf else 0.0
 
     def _after_chunk(self) -> None:
         """Hooks, checkpoint and display; none of it is training time."""

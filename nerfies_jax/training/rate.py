@@ -7,8 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nerfies_jax.training import data_parallel
-from nerfies_jax.training.chunk import compiled
+from nerfies_jax.training import chunk, data_parallel
 from nerfies_jax.training.model import Frames, Model, TrainState
 
 # Shares of a run at which its step is timed: before a warm-up is over, a motion may
@@ -33,12 +32,16 @@ def step_time(model: Model, state: TrainState, frames: Frames, steps: int) -> St
     """
     frames = jax.tree.map(jnp.asarray, frames)
     frames = data_parallel.replicate(frames, model.devices)
-    program, compile_seconds = compiled(model.step, state, frames, model.devices)
+    program, compile_seconds = chunk.program(
+        model.step, state, frames, steps, model.devices
+    )
+    length = program.length
+    compile_seconds += program.prepare(length)
 
     def timed(start, count):
         began = time.perf_counter()
-        left, outcome = program(start, frames, np.int32(count))
-        done = max(int(outcome.done), 1)  # waits; fewer where one is not finite
+        left, outcome = program(start, frames, count)
+        done = max(outcome.done, 1)  # fewer where one is not finite
         return left, (time.perf_counter() - began) / done
 
     seconds = []
@@ -46,8 +49,9 @@ def step_time(model: Model, state: TrainState, frames: Frames, steps: int) -> St
         # The program overwrites what it is given.
         start = jax.tree.map(jnp.copy, state)
         start = start._replace(step=jnp.full_like(state.step, int(share * steps)))
-        start, _ = timed(start, 1)
-        start, guess = timed(start, 2)
-        count = min(max(round(PHASE_SECONDS / guess), 1), MOST_STEPS)
+        start, _ = timed(start, length)
+        start, guess = timed(start, length)
+        scans = round(PHASE_SECONDS / (length * guess))
+        count = length * min(max(scans, 1), MOST_STEPS // length)
         seconds.append(timed(start, count)[1])
     return StepTime(float(np.mean(seconds)), compile_seconds)
