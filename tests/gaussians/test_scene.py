@@ -186,11 +186,11 @@ def test_presets_build_and_stretch_with_their_steps(name):
     for part, fields in COUNTED.items():
         whole, short = getattr(spec, part), getattr(half, part)
         for name in fields if whole is not None else ():
-            assert getattr(short, name) == round(getattr(whole, name) / 2)
+            assert getattr(short, name) == 10 * round(getattr(whole, name) / 20)
     if isinstance(spec.densification, DefaultStrategySpec):
         whole, short = (each.densification.reset_every for each in (spec, half))
-        assert short == round(whole / 2)
-    assert half.sh_every == spec.sh_every // 2
+        assert short == 10 * round(whole / 20)
+    assert half.sh_every == 10 * round(spec.sh_every / 20)
     assert scene.build(half, metadata).spec == (half, metadata)
     assert presets.with_steps(spec, spec.steps) == spec
 

@@ -47,7 +47,7 @@ def test_seconds_are_the_steps_that_they_allow(growing, tmp_path, monkeypatch):
     steps = 1000 / 2**0.5 if growing else 1000
     assert planned.spec.steps == planned.config.steps == plan.rounded(steps)
     assert planned.spec == runs.scene_spec(planned.config)
-    assert planned.spec.sh_every == round(planned.spec.steps / 3)
+    assert planned.spec.sh_every == 10 * round(planned.spec.steps / 30)
     longer = planned.model.init(planned.capture, jax.random.key(0))
     jax.tree.map(np.testing.assert_array_equal, longer.params, state.params)
     assert planned.capture is run.capture
@@ -58,7 +58,7 @@ def test_seconds_are_the_steps_that_they_allow(growing, tmp_path, monkeypatch):
     assert ("1.4 times that" in line) == growing
     if growing:
         stop = planned.spec.densification.refine_stop_iter
-        assert stop == round(2000 * planned.spec.steps / 3000)
+        assert stop == 10 * round(200 * planned.spec.steps / 3000)
 
 
 def test_growth_is_expected_within_bounds():
