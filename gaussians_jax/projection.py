@@ -64,7 +64,17 @@ def project(
     def one(mean, quaternion, scale, opacity):
         return _project_one(mean, quaternion, scale, opacity, camera, size, spec)
 
-    return jax.vmap(one)(*gaussians)
+    # By columns, which fill whole vectors: 1.6 ms for 2.5 with the gradient of 10,000
+    # rows on one core. The barrier keeps XLA from reading them out of the rows.
+    mean, quaternion, scale, opacity = gaussians
+    columns = lax.optimization_barrier((mean.T, quaternion.T, scale.T))
+    by_column = Footprints(1, 1, 0, 0, 1)
+    drawn = jax.vmap(one, (1, 1, 1, 0), by_column)(*columns, opacity)
+    return drawn._replace(
+        mean_px=drawn.mean_px.T,
+        whitening=drawn.whitening.T,
+        extent_px=drawn.extent_px.T,
+    )
 
 
 def _project_one(mean, quaternion, scale, opacity, camera, size, spec):
