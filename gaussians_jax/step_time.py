@@ -8,7 +8,7 @@ from gaussians_jax.effects import deformation
 from gaussians_jax.spec import OPTIMISERS
 from gaussians_jax.update import Drawn
 from nerfies_jax.measure.part_time import part_ms
-from nerfies_jax.training import data_parallel, losses
+from nerfies_jax.training import losses, rate
 from nerfies_jax.training.effects import (
     Effect,
     FrameCondition,
@@ -39,9 +39,7 @@ def parts(
     views = spec.batch_size // model.devices
     timed = {name: views * each for name, each in a_view.items()}
     timed |= _update(spec, metadata, effects, state, footprints, condition, frames)
-    whole = part_ms(
-        model.step, *data_parallel.replicate((state, frames), model.devices)
-    )
+    whole = rate.step_ms(model, state, frames, spec.steps)
     return timed | {"rest": max(whole - sum(timed.values()), 0.0)}
 
 

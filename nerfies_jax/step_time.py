@@ -4,7 +4,7 @@ import jax
 
 from nerfies_jax import scene
 from nerfies_jax.measure.part_time import part_ms
-from nerfies_jax.training import data_parallel, loop
+from nerfies_jax.training import loop, rate
 from nerfies_jax.training.effects import Effect, weighted_sum
 from nerfies_jax.training.model import Frames, Model, TrainState
 
@@ -44,7 +44,5 @@ def parts(
         "backward": max(both - forward, 0.0),
         "optimiser": part_ms(descend, state, state.params),
     }
-    whole = part_ms(
-        model.step, *data_parallel.replicate((state, frames), model.devices)
-    )
+    whole = rate.step_ms(model, state, frames, spec.steps)
     return timed | {"rest": max(whole - sum(timed.values()), 0.0)}

@@ -8,10 +8,11 @@ import nerfies_jax.step_time
 from gaussians_jax import scene as splat_scene
 from nerfies_jax import evaluation
 from nerfies_jax import scene as field_scene
+from nerfies_jax.training import rate
 from tests import scenes
 
 
-def clock(monkeypatch, module, *times):
+def clock(monkeypatch, module, *times, whole):
     """Each part takes the next of the times, and can be traced as it is called."""
     left = iter(times)
 
@@ -20,6 +21,7 @@ def clock(monkeypatch, module, *times):
         return next(left)
 
     monkeypatch.setattr(module, "part_ms", part_ms)
+    monkeypatch.setattr(rate, "step_ms", lambda *run: whole)
 
 
 @pytest.mark.parametrize(
@@ -28,7 +30,7 @@ def clock(monkeypatch, module, *times):
 def test_what_parts_of_a_field_leave_of_a_step_is_never_negative(
     whole, rest, monkeypatch
 ):
-    clock(monkeypatch, nerfies_jax.step_time, 2.0, 5.0, 0.5, 0.25, whole)
+    clock(monkeypatch, nerfies_jax.step_time, 2.0, 5.0, 0.5, 0.25, whole=whole)
     metadata, params, _ = scenes.tiny_field()
     model = field_scene.build(scenes.TINY_FIELD, metadata)
     state = model.example(None, jax.random.key(0))._replace(params=params)
@@ -46,7 +48,7 @@ def test_what_parts_of_a_field_leave_of_a_step_is_never_negative(
 
 
 def test_every_part_of_a_step_of_splats_is_measured(monkeypatch):
-    clock(monkeypatch, gaussians_jax.step_time, 2.0, 1.0, 4.0, 0.5, 0.25, 9.0)
+    clock(monkeypatch, gaussians_jax.step_time, 2.0, 1.0, 4.0, 0.5, 0.25, whole=9.0)
     capture, spec = scenes.tiny_capture(), scenes.TINY_DEFORMABLE
     metadata = splat_scene.metadata_of(capture)
     model = splat_scene.build(spec, metadata)

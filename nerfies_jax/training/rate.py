@@ -15,6 +15,7 @@ from nerfies_jax.training.model import Frames, Model, TrainState
 PHASES = (1 / 8, 3 / 8, 5 / 8, 7 / 8)
 PHASE_SECONDS = 0.4  # of steps that are timed at each
 MOST_STEPS = 200
+REPEATS, REPEAT_SECONDS = 5, 1.0  # of the scans that tell what a step takes
 
 
 class StepTime(NamedTuple):
@@ -55,3 +56,20 @@ def step_time(model: Model, state: TrainState, frames: Frames, steps: int) -> St
         count = length * min(max(scans, 1), MOST_STEPS // length)
         seconds.append(timed(start, count)[1])
     return StepTime(float(np.mean(seconds)), compile_seconds)
+
+
+def step_ms(model: Model, state: TrainState, frames: Frames, steps: int) -> float:
+    """Median milliseconds of a step from `state` on, which is left as it is.
+
+    By the program of a run of `steps` steps: where that has trained, none is compiled.
+    """
+    frames = jax.tree.map(jnp.asarray, frames)
+    frames = data_parallel.replicate(frames, model.devices)
+    program, _ = chunk.program(model.step, state, frames, steps, model.devices)
+    program.prepare(program.length)
+    left, seconds = jax.tree.map(jnp.copy, state), []
+    while len(seconds) < REPEATS and sum(seconds) < REPEAT_SECONDS:
+        began = time.perf_counter()
+        left, _ = program(left, frames, program.length)  # waits
+        seconds.append(time.perf_counter() - began)
+    return 1e3 * float(np.median(seconds)) / program.length

@@ -219,6 +219,15 @@ def test_the_time_of_a_step_is_that_of_the_whole_schedule(frames):
     assert toy.same(state, start())
 
 
+def test_a_step_is_timed_by_the_program_that_trained(frames):
+    model = slow_model(0.02)
+    trained = fit(frames, model=model, steps=100, seconds=0.1).state
+    programs = dict(chunk._programs(model.step))
+    assert 20 <= rate.step_ms(model, trained, frames, 100) < 40
+    assert chunk._programs(model.step) == programs
+    assert int(trained.step) < 100
+
+
 @pytest.mark.full
 def test_chunks_of_slow_steps_stay_short_enough_to_interrupt(frames, monkeypatch):
     monkeypatch.setattr(loop, "CHUNK_SECONDS", 0.1)
