@@ -62,8 +62,8 @@ TRACKED = SplatScene(
 # rate of the network that grows with the scene, growth of a coarse and a fine stage
 # apart, and its two tables of time (here one). Turns are rotation vectors. Depth counts
 # only where a capture has it, and by correlation, which the paper leaves open. Codes
-# start as waves, not as zeros: see `SMALL_SONATA`. There is no B-spline KAN (the
-# paper's equation 4) to compare with.
+# start as waves, not as zeros: see `SMALL_SONATA`. The KAN of the paper's equation 4 is
+# `motion.network=bspline`.
 SONATA = SplatScene(
     steps=60_000,
     optimiser="radam",

@@ -29,7 +29,7 @@ from nerfies_jax.training.effects import Effect, FrameCondition
 from nerfies_jax.training.step_counts import steps
 
 NAME = "kan_motion"
-NETWORKS = ("kan", "mlp")
+NETWORKS = ("kan", "mlp", "bspline")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,9 +37,11 @@ class KanMotionSpec:
     """Sizes and schedule; the paper gives only the embedding's, the rest is E-D3DGS'.
 
     `position`, `scale` and `rotation` say which residuals there are (the paper's
-    ablation): a head that is off has no parameters. `network` "mlp" is the paper's
-    ablation of the KAN: ReLU layers of the same inputs and heads, as many, and as wide
-    as makes the number of parameters equal, unless `mlp_width` says otherwise.
+    ablation): a head that is off has no parameters. `network` "bspline" is the KAN that
+    the paper argues against, with cubic B-splines for Gaussians (equations 4 and 5);
+    "mlp" is its ablation of the KAN: ReLU layers of the same inputs and heads, as many,
+    and as wide as makes the number of parameters equal, unless `mlp_width` says
+    otherwise.
     """
 
     embedding: int = 32
@@ -120,7 +122,7 @@ def field_spec(spec: KanMotionSpec) -> KANSpec | MLPSpec:
     Its heads start at zero, and so does the motion.
     """
     kan_spec = _kan_spec(spec)
-    if spec.network == "kan":
+    if spec.network != "mlp":
         return kan_spec
     width = spec.mlp_width
     if width is None:
@@ -145,6 +147,7 @@ def _kan_spec(spec):
         base=spec.base,
         norm=spec.norm,
         trainable_kernels=spec.trainable_kernels,
+        basis="bspline" if spec.network == "bspline" else "rbf",
     )
 
 
