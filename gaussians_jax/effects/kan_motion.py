@@ -3,8 +3,8 @@
 "Sonata", equation 11: a learnt embedding of each Gaussian and a learnt code of the time
 go through an RBF-KAN to residuals of position, scale and rotation. Where the paper is
 silent this follows Bae et al. 2024, "Per-Gaussian embedding-based deformation",
-arXiv:2404.03613 (E-D3DGS), whose inputs, neighbours and constants it shares. Of its two
-time tables, a coarse and a fine one that grows in training, there is one here.
+arXiv:2404.03613 (E-D3DGS), whose inputs, neighbours and constants it shares. Its two
+networks, a coarse and a fine one, are in `embedding_motion`.
 
 The first layer of the network is a sum over its inputs. What the embeddings add to it
 is the same at all times (`prepare`), what the time adds the same for all Gaussians.
@@ -221,20 +221,27 @@ def _random_waves(key, spec, places, width):
     return spec.spread * math.sqrt(2) * jnp.cos(angle)
 
 
+def init_times(
+    key: Key[Array, ""], spec: KanMotionSpec, frames: int, dtype=jnp.float32
+) -> Float[Array, "moments code"]:
+    """The table of codes over time, started as the embeddings are."""
+    if frames < 1:
+        raise ValueError(f"frames={frames}: a motion is learnt from at least one frame")
+    moments = -(-frames // spec.frames_per_code)
+    if spec.waves is None:
+        scale = math.sqrt(3) * spec.spread  # of a uniform draw
+        return codes.init(key, moments, spec.time_code, scale, dtype)
+    # Half the capture is to a moment what the mean radius is to a place.
+    moment = jnp.linspace(-2, 2, moments, dtype=dtype)[:, None]
+    return _random_waves(key, spec, moment, spec.time_code)
+
+
 def init(
     key: Key[Array, ""], spec: KanMotionSpec, frames: int, dtype=jnp.float32
 ) -> KanMotion:
     """A field that moves nothing yet, for a capture of `frames` to learn from."""
-    if frames < 1:
-        raise ValueError(f"frames={frames}: a motion is learnt from at least one frame")
     times_key, field_key = jax.random.split(key)
-    moments = -(-frames // spec.frames_per_code)
-    if spec.waves is None:
-        scale = math.sqrt(3) * spec.spread  # of a uniform draw
-        times = codes.init(times_key, moments, spec.time_code, scale, dtype)
-    else:  # half the capture is to a moment what the mean radius is to a place
-        moment = jnp.linspace(-2, 2, moments, dtype=dtype)[:, None]
-        times = _random_waves(times_key, spec, moment, spec.time_code)
+    times = init_times(times_key, spec, frames, dtype)
     network = field_spec(spec)
     init_field = kan.init if isinstance(network, KANSpec) else mlp.init
     return KanMotion(times, init_field(network, field_key, dtype))
