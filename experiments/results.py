@@ -125,6 +125,7 @@ STUDIES = {
     "raster_speed": _package(
         "raster_speed", "--out raster_speed.json", page="__main__"
     ),
+    "league": _package("league", "--jobs 2 --keep"),
     "mutants": _package("mutants", "--count 44"),
     "mutants_unseen": _package("mutants_unseen", "--count 24 --seed 1", of="mutants"),
     "frequency_gates": _study("frequency_gates", "--out frequency_gates"),

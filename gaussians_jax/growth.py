@@ -47,12 +47,29 @@ def events(
     effects: tuple[Effect, ...],
     optimiser: optax.GradientTransformation,
 ) -> tuple[Event, ...]:
-    """When rows are born, die and are reset; none without a strategy."""
-    if spec.densification is None:
-        return ()
+    """When rows are born, die and are reset, and effects revise what they learn."""
+    revisions = tuple(_revision(effect, spec.steps) for effect in effects
+                      if effect.revise is not None)  # fmt: skip
     plan = spec.densification
+    if plan is None:
+        return revisions
     if isinstance(plan, MCMCStrategySpec):
-        return _mcmc_events(plan, spec.steps, effects, optimiser)
+        return _mcmc_events(plan, spec.steps, effects, optimiser) + revisions
+    return _default_events(plan, spec, metadata, effects, optimiser) + revisions
+
+
+def _revision(effect, steps):
+    def revise(state, frames):
+        del frames
+        own = effect.revise(state.params.nets[effect.name], int(state.step))
+        nets = state.params.nets | {effect.name: own}
+        return state._replace(params=state.params._replace(nets=nets))
+
+    when = tuple(step for step in effect.revise_at if step < steps)
+    return Event(f"revise {effect.name}", when, revise)
+
+
+def _default_events(plan, spec, metadata, effects, optimiser):
     last = min(plan.refine_stop_iter, spec.steps)
 
     def densify(state, frames):

@@ -6,6 +6,7 @@ from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.effects import (
     acceleration,
     depth,
+    embedding_motion,
     exposure,
     kan_motion,
     mlp_motion,
@@ -21,6 +22,7 @@ from gaussians_jax.effects import (
 )
 from gaussians_jax.effects.acceleration import AccelerationSpec
 from gaussians_jax.effects.depth import DepthSpec
+from gaussians_jax.effects.embedding_motion import EmbeddingMotionSpec
 from gaussians_jax.effects.exposure import ExposureSpec
 from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec
@@ -52,9 +54,14 @@ AnyMotion = (
     | PolynomialMotionSpec
     | SplineMotionSpec
     | PlaneMotionSpec
+    | EmbeddingMotionSpec
 )
 # Motions with a vector for each Gaussian that neighbours may be kept alike in.
-EMBEDDED = {KanMotionSpec: kan_motion.NAME, TimeBasisSpec: time_basis.NAME}
+EMBEDDED = {
+    KanMotionSpec: kan_motion.NAME,
+    TimeBasisSpec: time_basis.NAME,
+    EmbeddingMotionSpec: embedding_motion.NAME,
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,6 +173,9 @@ MOTIONS = {
     ),
     PlaneMotionSpec: lambda spec, steps, seen: plane_motion.effect(
         spec, steps, seen.extent, seen.box
+    ),
+    EmbeddingMotionSpec: lambda spec, steps, seen: embedding_motion.effect(
+        spec, steps, seen.frames
     ),
 }
 

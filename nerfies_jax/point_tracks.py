@@ -1,12 +1,14 @@
-"""Points followed through time by the warp of a radiance field."""
+"""Points followed through time by the warp or the scene flow of a radiance field."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from nerfies_jax import evaluation, scene
+from nerfies_jax.effects import scene_flow
 from nerfies_jax.evaluation.model_flow import Move, Moved
 from nerfies_jax.evaluation.protocol import STATIC_POINTS, PointTracks
+from nerfies_jax.render_ray import Bound, mean_flow
 from nerfies_jax.training import tracks
 from nerfies_jax.training.effects import FrameCondition
 from nerfies_jax.training.model import in_default_precision
@@ -18,12 +20,15 @@ def follow(spec, metadata, state, capture, known, effects=()) -> PointTracks | N
     """Points of the start at all other moments, through the template of a field.
 
     A point goes to the template by the warp of the start, and from there by the inverse
-    warp of every other moment.
+    warp of every other moment. Without a warp, a scene flow takes it from each moment
+    to the next, and nothing says how it strains.
     """
 
     field = scene.field(spec, metadata, effects=effects)
-    if all(effect.displace is None for effect in field.effects) or not len(known.path):
+    if not len(known.path):
         return None
+    if all(effect.displace is None for effect in field.effects):
+        return _follow_flow(field, state, capture, known)
     views = [evaluation.view_of(capture, int(row)) for row in known.moments]
     views = jax.tree.map(lambda *leaves: jnp.stack(leaves), *views)
     centre = np.asarray(metadata.centre, np.float32)
@@ -31,9 +36,7 @@ def follow(spec, metadata, state, capture, known, effects=()) -> PointTracks | N
     def to_field(points):
         return in_default_precision((points - centre) * np.float32(metadata.scale))
 
-    static = np.zeros((0, 3), np.float32)
-    if capture.points is not None:
-        static = capture.points.position[:STATIC_POINTS]
+    static = _static_points(capture)
 
     @jax.jit
     def solve(params, step, start, true, static):
@@ -73,11 +76,84 @@ def follow(spec, metadata, state, capture, known, effects=()) -> PointTracks | N
     )
 
 
+def _static_points(capture):
+    if capture.points is None:
+        return np.zeros((0, 3), np.float32)
+    return capture.points.position[:STATIC_POINTS]
+
+
+def _follow_flow(field, state, capture, known):
+    """From the start outward, moment by moment; None without a scene flow."""
+    move = _flow_mover(field)
+    if move is None:
+        return None
+    views = [evaluation.view_of(capture, int(row)) for row in known.moments]
+    static = _static_points(capture)
+    begin = np.concatenate([known.start_points, static])
+    places = {known.start: Moved(begin, np.ones(len(begin), bool))}
+    last = len(views) - 1
+    for step, stop in ((1, last), (-1, 0)):
+        for here in range(known.start, stop, step):
+            before, there = places[here], here + step
+            moved = move(state, before.points, views[here], views[there])
+            places[there] = Moved(moved.points, before.found & moved.found)
+    count = len(known.path)
+    path, found = (
+        np.stack(each, axis=1)
+        for each in zip(*(places[k] for k in range(len(views))), strict=True)
+    )
+    still = path[count:]
+    apart = np.linalg.norm(still - still.mean(axis=1, keepdims=True), axis=-1)
+    lost = ~found[:count, :, None]
+    return PointTracks(
+        path=np.where(lost, known.start_points[:, None], path[:count]).astype("f4"),
+        found=found[:count],
+        drift=float(apart.mean()) if apart.size else float("nan"),
+        strain=float("nan"),
+    )
+
+
+def _flow_mover(field) -> Move | None:
+    """By scene flow, one interval of the capture after the other.
+
+    Between two views that are no whole number of intervals apart, each hop is that much
+    shorter or longer than what the flow says. A point that runs to no finite place is
+    lost.
+    """
+    if all(effect.name != scene_flow.NAME for effect in field.effects):
+        return None
+    metadata = field.metadata
+    centre = np.asarray(metadata.centre, np.float32)
+    gap = scene_flow.interval(len(metadata.times))
+
+    @jax.jit
+    def hop(params, step, points, view, side, length):
+        condition = FrameCondition(view.time, field.codes_at(params, view), step)
+        bound = Bound(field.spec, metadata, field.effects, params)
+        flow = jax.vmap(lambda point: mean_flow(bound, point, condition))(points)
+        return points + length * flow[:, side]
+
+    def move(state, points, here, there):
+        begin, end = float(here.time), float(there.time)
+        hops = max(round(abs(end - begin) / gap), 1)
+        length = in_default_precision(np.float32(abs(end - begin) / (hops * gap)))
+        side = scene_flow.FORWARD if end >= begin else scene_flow.BACKWARD
+        place = in_default_precision((points - centre) * np.float32(metadata.scale))
+        for time in np.linspace(begin, end, hops, endpoint=False):
+            view = here._replace(time=jnp.asarray(time, here.time.dtype))
+            place = hop(state.params, state.step, place, view, side, length)
+        reached = np.asarray(place) / np.float32(metadata.scale) + centre
+        known = np.isfinite(reached).all(axis=1)
+        return Moved(np.where(known[:, None], reached, points), known)
+
+    return move
+
+
 def mover(spec, metadata, effects=()) -> Move | None:
-    """What takes points of one view's moment to another's; None without a warp."""
+    """What takes points of one view's moment to another's; None without a motion."""
     field = scene.field(spec, metadata, effects=effects)
     if all(effect.displace is None for effect in field.effects):
-        return None
+        return _flow_mover(field)
     centre = np.asarray(metadata.centre, np.float32)
 
     @jax.jit

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from nerfies_jax.effects import transient
+from nerfies_jax.effects import scene_flow, transient
 from nerfies_jax.effects.effect import Medium, RayOutput, Sample
 from nerfies_jax.geometry import rays
 from nerfies_jax.geometry.camera import Camera
@@ -79,6 +79,28 @@ def displacement(bound: Bound, point: Vector, condition: FrameCondition) -> Vect
             moved = effect.displace(bound.own(effect), point + total, condition)
             total = total + moved
     return total
+
+
+def mean_flow(
+    bound: Bound, point: Vector, condition: FrameCondition
+) -> Float[Array, "2 3"]:
+    """Where what is at a point goes to by the next moment, and was before, minus it.
+
+    The medium of the scene flow says it of itself, and what is static stays: the mean
+    of both by their opacity there. Zero where nothing is. In units of the field.
+    """
+    ray = Ray(point, jnp.asarray((0, 0, 1), point.dtype), *jnp.zeros(2, point.dtype))
+    samples = _samples(bound, ray, condition, jnp.zeros(1, point.dtype))
+    radiance = _radiance(bound, "fine", ray, condition, samples, None)
+    flowing = [effect for effect in bound.effects if effect.name == scene_flow.NAME]
+    media = _media(bound, flowing, ray, condition, samples, radiance)
+    (medium,) = media.values()
+    moving = (jax.nn.sigmoid(medium.share) * medium.density)[0]
+    static = (jax.nn.sigmoid(-medium.share) * radiance.density)[0]
+    there = moving + static > 0
+    share = jnp.where(there, moving / jnp.where(there, moving + static, 1), 0)
+    names = ("flow_forward", "flow_backward")
+    return share * jnp.stack([medium.extras[name][0] for name in names])
 
 
 class _Samples(NamedTuple):

@@ -21,6 +21,7 @@ from gaussians_jax import (
 )
 from gaussians_jax import learning_rates as splat_rates
 from gaussians_jax import presets as splat_presets
+from gaussians_jax.effects.embedding_motion import EmbeddingMotionSpec
 from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec
 from gaussians_jax.effects.plane_motion import PlaneMotionSpec
@@ -122,6 +123,8 @@ def tiny_splats(name):
     motion = spec.motion
     if isinstance(motion, KanMotionSpec):
         motion = shrunk(motion, embedding=4, time_code=3, hidden=(6,), kernels=3)
+    elif isinstance(motion, EmbeddingMotionSpec):
+        motion = shrunk(motion, embedding=4, time_code=3, width=6)
     elif isinstance(motion, MotionSpec):
         motion = shrunk(motion, position=FEW, time=FEW, depth=1, width=8, skips=())
     elif isinstance(motion, SE3BasesSpec):

@@ -7,6 +7,7 @@ import pytest
 from gaussians_jax.effects import (
     acceleration,
     depth,
+    embedding_motion,
     kan_motion,
     mlp_motion,
     motion_basis,
@@ -57,11 +58,13 @@ MOTION_MODULES = {
     polynomial_motion.PolynomialMotionSpec: polynomial_motion,
     spline_motion.SplineMotionSpec: spline_motion,
     plane_motion.PlaneMotionSpec: plane_motion,
+    embedding_motion.EmbeddingMotionSpec: embedding_motion,
 }
 BY_FRAMES = {  # the others ask for the scene's extent
     mlp_motion.MotionSpec,
     kan_motion.KanMotionSpec,
     motion_basis.BasisMotionSpec,
+    embedding_motion.EmbeddingMotionSpec,
 }
 
 
@@ -121,6 +124,8 @@ def absent_modules(spec):
     gone += [m for kind, m in MOTION_MODULES.items() if not isinstance(motion, kind)]
     if isinstance(motion, motion_basis.BasisMotionSpec):
         gone.remove(mlp_motion)
+    if isinstance(motion, embedding_motion.EmbeddingMotionSpec):
+        gone.remove(kan_motion)
     return gone
 
 

@@ -11,6 +11,7 @@ import pytest
 from gaussians_jax import presets as splat_presets
 from gaussians_jax import scene as splat_scene
 from gaussians_jax.effects import (
+    embedding_motion,
     kan_motion,
     mlp_motion,
     motion_basis,
@@ -19,6 +20,7 @@ from gaussians_jax.effects import (
     spectral,
     time_basis,
 )
+from gaussians_jax.effects.embedding_motion import EmbeddingMotionSpec
 from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec
 from gaussians_jax.effects.plane_motion import PlaneMotionSpec
@@ -140,6 +142,10 @@ def test_splats_have_the_arrays_of_what_they_have_and_no_others(preset):
         elif isinstance(motion, KanMotionSpec):
             rows.add("kan_motion")
             nets["kan_motion"] = kan_motion.init(key, motion, metadata.frames)
+        elif isinstance(motion, EmbeddingMotionSpec):
+            rows.add("embedding_motion")
+            own = embedding_motion.init(key, motion, metadata.frames)
+            nets["embedding_motion"] = own
         elif isinstance(motion, SE3BasesSpec):
             rows.add("se3_bases")
             nets["se3_bases"] = se3_bases.init(key, motion)

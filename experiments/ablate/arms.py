@@ -182,6 +182,7 @@ SONATA = Suite(
             "no-scale": Arm("sonata-small", ("motion.scale=false",)),
             "no-rotation": Arm("sonata-small", ("motion.rotation=false",)),
             "mlp": Arm("sonata-small", ("motion.network=mlp",)),
+            "bspline": Arm("sonata-small", ("motion.network=bspline",)),
             "no-frequency": Arm("sonata-small", ("spectral=none",)),
             "no-depth": Arm("sonata-small", ("depth=none",), needs="depths"),
             "no-neighbours": Arm("sonata-small", ("neighbours=none",)),
@@ -220,6 +221,13 @@ SONATA = Suite(
             "full",
             "mlp",
             TRACKED,
+        ),
+        Claim(
+            "Gaussians are cheaper than B-splines in a KAN and at least as good "
+            "(equations 5 and 4)",
+            "full",
+            "bspline",
+            (*TRACKED, "train_cpu_seconds"),
         ),
         Claim(
             "An RBF-KAN on embeddings beats deformable 3DGS (the paper's own 'w/ MLP': "

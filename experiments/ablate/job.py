@@ -4,6 +4,7 @@ import hashlib
 import math
 import os
 import pathlib
+import tempfile
 import time
 from typing import Any, NamedTuple
 
@@ -37,17 +38,24 @@ class Budget(NamedTuple):
     seconds: float | None
     folder: pathlib.Path
     share: float | None = None  # of the preset's own steps
+    clock: str = "wall"  # whose seconds
 
     @property
     def title(self) -> str:
         """As in "each arm trained ..."."""
         if self.seconds is not None:
-            return f"for {self.seconds:g} s, in as many steps as that allows"
+            whose = "processor seconds" if self.clock == "processor" else "s"
+            return f"for {self.seconds:g} {whose}, in as many steps as that allows"
         if self.share is not None:
             return f"over {self.share:g} of its preset's own steps"
         if self.steps is None:
             return "over its preset's own steps"
         return f"over {self.steps} steps"
+
+    @property
+    def measure(self) -> str:
+        """Which measure of an arm the seconds limit."""
+        return "train_cpu_seconds" if self.clock == "processor" else "train_seconds"
 
 
 class CompiledArm(NamedTuple):
@@ -88,8 +96,9 @@ class Job:
         if args.seconds is None or args.steps is not None:
             self.budgets.append(Budget(args.steps, None, self.out, args.share))
         if args.seconds is not None:
-            folder = self.out / f"seconds-{args.seconds:g}"
-            self.budgets.append(Budget(None, args.seconds, folder))
+            kind = "processor-seconds" if args.clock == "processor" else "seconds"
+            folder = self.out / f"{kind}-{args.seconds:g}"
+            self.budgets.append(Budget(None, args.seconds, folder, clock=args.clock))
         for budget in self.budgets:
             budget.folder.mkdir(parents=True, exist_ok=True)
         self._built: dict[tuple[str, int], CompiledArm] = {}
@@ -163,6 +172,7 @@ class Job:
     def is_over(self, spent: float, longest: float) -> bool:
         """Whether another arm might end after the --budget."""
         minutes = self.args.budget
+        longest = max(longest, self.args.seconds or 0)
         return minutes is not None and spent + longest > 60 * minutes
 
     def make(self, name: str, seed: int, budget: Budget) -> None:
@@ -208,13 +218,13 @@ class Job:
         if self.budgets[0] is not budget:
             other = self.kept(name, 0, self.budgets[0])
         pilot = other or self._train(name, 0, PILOT_STEPS)
-        steps = _affordable(pilot, budget.seconds)
+        steps = _affordable(pilot, budget)
         kept = self._train(name, 0, steps)
-        took = kept.numbers["train_seconds"]
+        took = kept.numbers[budget.measure]
         missed = abs(took / budget.seconds - 1) > NEAR_ENOUGH
         if missed and kept.notes["stopped_by"] == "steps":
             log(f"    {steps} steps took {took:.1f} s: once more, with a better guess")
-            steps = _affordable(kept, budget.seconds, pilot)
+            steps = _affordable(kept, budget, pilot)
             kept = self._train(name, 0, steps)
         return steps, kept
 
@@ -255,6 +265,7 @@ class Job:
                 len(self.known.rows), cpu=jax.default_backend() == "cpu"
             ),
             "peak_mb": clock.peak_bytes() / 1e6,
+            "model_mb": _model_bytes(arm, result.state) / 1e6,
         }
         if compiled_before:  # most of it in this very process
             numbers["compile_seconds"] = float("nan")
@@ -309,6 +320,8 @@ class Job:
             "seed": seed,
             "steps": steps,
             "seconds": budget.seconds,
+            # As those that were kept before there was a choice.
+            **({"clock": budget.clock} if budget.clock != "wall" else {}),
             "spec": specs.as_json(self.spec(name, steps)),
             "rows": self.known.rows.tolist(),
             "tracks": len(self.known.path),
@@ -344,17 +357,27 @@ class Job:
         return [task for task in self.tasks() if not self.is_finished(*task)]
 
 
-def _affordable(kept, seconds, shorter=None):
-    """Steps that take so many seconds, from what one run took, or two.
+def _model_bytes(arm, state):
+    """Of the file that holds a trained scene, or of its parameters where none does."""
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = pathlib.Path(scratch)
+        saved = arm.representation.save(folder, arm.spec, arm.metadata, state)
+    if saved.model_bytes is not None:
+        return saved.model_bytes
+    return sum(leaf.nbytes for leaf in jax.tree.leaves(state.params))
+
+
+def _affordable(kept, budget, shorter=None):
+    """Steps that take the seconds of a budget, from what one run took, or two.
 
     Longer runs grow more Gaussians: between two runs the time is a power of the steps.
     """
-    done, took = max(kept.notes["steps"], 1), kept.numbers["train_seconds"]
+    done, took = max(kept.notes["steps"], 1), kept.numbers[budget.measure]
     power = 1.0
     if shorter is not None:
-        before, earlier = shorter.notes["steps"], shorter.numbers["train_seconds"]
+        before, earlier = shorter.notes["steps"], shorter.numbers[budget.measure]
         if before != done and earlier > 0:
             power = math.log(took / earlier) / math.log(done / before)
     # Outside it is the machine's other work that was timed.
     power = min(max(power, 1.0), 2.0)
-    return max(1, round(done * (seconds / took) ** (1 / power)))
+    return max(1, round(done * (budget.seconds / took) ** (1 / power)))

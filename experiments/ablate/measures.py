@@ -42,6 +42,7 @@ MEASURES = {
     "compile_seconds": Measure("compile", "s", "lower", 5.0, 1, 0.33),
     "render_ms": Measure("frame ms", "ms", "lower", 10.0, 0, 0.33),
     "peak_mb": Measure("peak MB", "MB", "lower", 100.0, 0, 0.2),
+    "model_mb": Measure("model MB", "MB", "lower", 0.1, 2, 0.1),
 }
 
 COSTS = tuple(MEASURES)[tuple(MEASURES).index("gaussians") :]  # the others are quality
@@ -93,6 +94,8 @@ LEGENDS = {
     "without a cache (what one from it once took\nis added); frame ms: rendering a "
     "held-out frame (of all threads, on a CPU);\npeak MB: most memory of the process, "
     "where it made one arm alone.",
+    "model_mb": "model MB: the one file of a trained scene; of a field its "
+    "parameters, without\nthe optimiser.",
 }
 
 

@@ -15,14 +15,16 @@ class Ablate:
 
     GROUPS: ClassVar = {
         "arms": ("suite", "arms", "set"),
-        "training": ("steps", "share", "seconds", "seeds", "seed"),
+        "training": ("steps", "share", "seconds", "clock", "seeds", "seed"),
         "measuring": ("frames", "tracks"),
     }
 
-    suite: Literal["fields", "start", "sonata", "moba", "settings", "advice"] = "fields"
+    suite: Literal[
+        "fields", "start", "sonata", "moba", "settings", "advice", "league"
+    ] = "fields"
     """Radiance fields; motions of splats from tracks and from rest; the ablations of
-    Sonata or MoBa-GS; the settings of experiments.accuracy_time; or what
-    experiments.inspect_scene can advise."""
+    Sonata or MoBa-GS; the settings of experiments.accuracy_time; what
+    experiments.inspect_scene can advise; or every small preset."""
     arms: tuple[str, ...] = ()
     """Which arms of the suite (default: all)."""
     source: cli.SourceOptions = CaptureSource()
@@ -33,6 +35,9 @@ class Ablate:
     seconds: float | None = None
     """Seconds of training of every arm instead, or, with --steps, as well: each gets
     the steps that it can make in this time here, and its schedules stretch to them."""
+    clock: Literal["wall", "processor"] = "wall"
+    """Whose seconds --seconds are: the processor's are those of all threads, and what
+    else the machine does is not in them."""
     seeds: int | None = None
     """How many seeds (default: 1 for fields, otherwise 3); from two on, differences
     are held against their spread."""

@@ -21,4 +21,8 @@ def named(name: str) -> Suite:
         from experiments.inspect_pays.arms import advice
 
         return advice()
+    if name == "league":
+        from experiments.league.rows import suite
+
+        return suite()
     return KEPT[name]

@@ -217,6 +217,46 @@ NORM = Case(
 )
 
 
+def _truncated_cubes(x):
+    """The cubic B-spline as divided differences of truncated powers have it."""
+    return sum(
+        (-1) ** k * math.comb(4, k) * jnp.maximum(x + 2 - k, 0) ** 3 / 6
+        for k in range(5)
+    )
+
+
+def _exact_spline(x):
+    distance = abs(x[0])
+    if distance < 1:
+        return [mpmath.mpf(2) / 3 - distance**2 + distance**3 / 2]
+    return [max(2 - distance, 0) ** 3 / 6]
+
+
+_FROM_KNOT = np.array(
+    [-1.999, -1.5, -1, -0.25, 0.5, *_sides(1.0), 1.25, 1.9, 1.99, 1.999]
+)
+SPLINE = Case(
+    name="cubic B-spline where it ends",
+    breaks="a sum of truncated cubes cancels: noise of 1e-6 where the spline is 1e-10",
+    formula="2/3 - x² + |x|³/2 within an interval of the middle knot, (2 - |x|)³/6",
+    switch="|x| = 1",
+    axis="x in intervals",
+    at=_FROM_KNOT,
+    inputs=_FROM_KNOT[:, None],
+    stable=kan.cubic_bspline,
+    textbook=_truncated_cubes,
+    exact=_exact_spline,
+    bounds={"float32": (1e-6, 1e-6, 1e-6), "float64": (2e-15, 2e-15, 2e-15)},
+    caught=(
+        ("float32", "value"),
+        ("float32", "slope"),
+        ("float64", "value"),
+        ("float64", "slope"),
+    ),
+    timed=np.array([1.3]),
+)
+
+
 B1, B2 = 0.9, 0.999
 
 
@@ -318,4 +358,4 @@ SIZE = NEWBORN._replace(
     floors=(1,),  # of a full step; squares below 1e-38 are 0 in float32
 )
 
-CASES = (OUTSIDE, FAR_AWAY, WIDTH, NORM, LENGTH, NEWBORN, BIAS, SIZE)
+CASES = (OUTSIDE, FAR_AWAY, WIDTH, NORM, SPLINE, LENGTH, NEWBORN, BIAS, SIZE)

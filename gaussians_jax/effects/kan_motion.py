@@ -3,8 +3,8 @@
 "Sonata", equation 11: a learnt embedding of each Gaussian and a learnt code of the time
 go through an RBF-KAN to residuals of position, scale and rotation. Where the paper is
 silent this follows Bae et al. 2024, "Per-Gaussian embedding-based deformation",
-arXiv:2404.03613 (E-D3DGS), whose inputs, neighbours and constants it shares. Of its two
-time tables, a coarse and a fine one that grows in training, there is one here.
+arXiv:2404.03613 (E-D3DGS), whose inputs, neighbours and constants it shares. Its two
+networks, a coarse and a fine one, are in `embedding_motion`.
 
 The first layer of the network is a sum over its inputs. What the embeddings add to it
 is the same at all times (`prepare`), what the time adds the same for all Gaussians.
@@ -29,7 +29,7 @@ from nerfies_jax.training.effects import Effect, FrameCondition
 from nerfies_jax.training.step_counts import steps
 
 NAME = "kan_motion"
-NETWORKS = ("kan", "mlp")
+NETWORKS = ("kan", "mlp", "bspline")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,9 +37,11 @@ class KanMotionSpec:
     """Sizes and schedule; the paper gives only the embedding's, the rest is E-D3DGS'.
 
     `position`, `scale` and `rotation` say which residuals there are (the paper's
-    ablation): a head that is off has no parameters. `network` "mlp" is the paper's
-    ablation of the KAN: ReLU layers of the same inputs and heads, as many, and as wide
-    as makes the number of parameters equal, unless `mlp_width` says otherwise.
+    ablation): a head that is off has no parameters. `network` "bspline" is the KAN that
+    the paper argues against, with cubic B-splines for Gaussians (equations 4 and 5);
+    "mlp" is its ablation of the KAN: ReLU layers of the same inputs and heads, as many,
+    and as wide as makes the number of parameters equal, unless `mlp_width` says
+    otherwise.
     """
 
     embedding: int = 32
@@ -120,7 +122,7 @@ def field_spec(spec: KanMotionSpec) -> KANSpec | MLPSpec:
     Its heads start at zero, and so does the motion.
     """
     kan_spec = _kan_spec(spec)
-    if spec.network == "kan":
+    if spec.network != "mlp":
         return kan_spec
     width = spec.mlp_width
     if width is None:
@@ -145,6 +147,7 @@ def _kan_spec(spec):
         base=spec.base,
         norm=spec.norm,
         trainable_kernels=spec.trainable_kernels,
+        basis="bspline" if spec.network == "bspline" else "rbf",
     )
 
 
@@ -218,20 +221,27 @@ def _random_waves(key, spec, places, width):
     return spec.spread * math.sqrt(2) * jnp.cos(angle)
 
 
+def init_times(
+    key: Key[Array, ""], spec: KanMotionSpec, frames: int, dtype=jnp.float32
+) -> Float[Array, "moments code"]:
+    """The table of codes over time, started as the embeddings are."""
+    if frames < 1:
+        raise ValueError(f"frames={frames}: a motion is learnt from at least one frame")
+    moments = -(-frames // spec.frames_per_code)
+    if spec.waves is None:
+        scale = math.sqrt(3) * spec.spread  # of a uniform draw
+        return codes.init(key, moments, spec.time_code, scale, dtype)
+    # Half the capture is to a moment what the mean radius is to a place.
+    moment = jnp.linspace(-2, 2, moments, dtype=dtype)[:, None]
+    return _random_waves(key, spec, moment, spec.time_code)
+
+
 def init(
     key: Key[Array, ""], spec: KanMotionSpec, frames: int, dtype=jnp.float32
 ) -> KanMotion:
     """A field that moves nothing yet, for a capture of `frames` to learn from."""
-    if frames < 1:
-        raise ValueError(f"frames={frames}: a motion is learnt from at least one frame")
     times_key, field_key = jax.random.split(key)
-    moments = -(-frames // spec.frames_per_code)
-    if spec.waves is None:
-        scale = math.sqrt(3) * spec.spread  # of a uniform draw
-        times = codes.init(times_key, moments, spec.time_code, scale, dtype)
-    else:  # half the capture is to a moment what the mean radius is to a place
-        moment = jnp.linspace(-2, 2, moments, dtype=dtype)[:, None]
-        times = _random_waves(times_key, spec, moment, spec.time_code)
+    times = init_times(times_key, spec, frames, dtype)
     network = field_spec(spec)
     init_field = kan.init if isinstance(network, KANSpec) else mlp.init
     return KanMotion(times, init_field(network, field_key, dtype))

@@ -72,3 +72,21 @@ def at_time(table: Table, time: Float[Array, ""]) -> Float[Array, " code"]:
     left = jnp.clip(jnp.floor(place), 0, max(table.shape[0] - 2, 0))
     index = left.astype(jnp.int32)
     return blend(table, index, index + 1, place - left)
+
+
+def at_time_of(
+    table: Table, rows: Float[Array, ""], time: Float[Array, ""]
+) -> Float[Array, " code"]:
+    """As `at_time`, of the table resampled to so many rows first; `rows` at least 2.
+
+    Ends stay ends. With as many rows as it has, or more, it is the table itself. The
+    number may be traced: nothing is made of that size. E-D3DGS, arXiv:2404.03613,
+    reads its codes so.
+    """
+    rows = jnp.clip(rows, min(2, table.shape[0]), table.shape[0])
+    last = jnp.maximum(rows - 1, 1)
+    place = jnp.clip(time, 0, 1) * last
+    left = jnp.clip(jnp.floor(place), 0, last - 1)
+    progress = place - left
+    start, end = (at_time(table, row / last) for row in (left, left + 1))
+    return (1 - progress) * start + progress * end

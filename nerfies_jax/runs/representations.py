@@ -20,6 +20,7 @@ USUAL = "splats-tracked-small"  # where none is named, and tracks tell a motion
 PRESETS = (
     *("splats-static", "splats-mcmc", "splats-tracked", "splats-deformable"),
     *("sonata", "moba", "dynmf", "spacetime", "spline", "4dgs"),
+    *("e-d3dgs", "e-d3dgs-small"),
     *("dynmf-small", "spacetime-small", "spline-small", "4dgs-small"),
     *("nerf", "nerf-w", "d-nerf", "t-nerf", "nerfies", "hypernerf"),
     *("nsff", "splats-static-small", "splats-mcmc-small", "splats-tracked-small"),

@@ -48,6 +48,8 @@ SPLAT_SEAMS = (
     "state",
     "update_state",
     "grow_score",
+    "revise",
+    "revise_at",
     "expose",
 )
 
@@ -166,6 +168,9 @@ class Effect(NamedTuple):
     # (state, step) -> [rows] factor of the gradient that the density control compares
     # with its threshold; host side
     grow_score: Callable[[PyTree, int], Any] | None = None
+    # (params, step) -> params of the same shapes, after each of these steps; host side
+    revise: Callable[[PyTree, int], PyTree] | None = None
+    revise_at: tuple[int, ...] = ()
 
 
 def stream(name: str) -> int:

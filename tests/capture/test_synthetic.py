@@ -302,6 +302,39 @@ def test_a_specular_surface_adds_light_to_its_own_thing_alone(small):
     assert difference[inner].max() == 0
 
 
+def test_lumps_merge_and_part_and_a_shutter_opens_and_shuts():
+    spec = dataclasses.replace(
+        presets.TOPOLOGY, size=(88, 66), frames=9, heldout_every=8, supersampling=1
+    )
+    capture, truth = synthetic.make(spec)
+    film = capture.camera_ids == 0
+
+    def parts(*names):
+        """Connected parts of these things in each picture of the first camera."""
+        shown = np.isin(truth.things[film], [spec.id_of(name) for name in names])
+        return [scipy.ndimage.label(picture)[1] for picture in shown]
+
+    # At eighths of the film: the lumps are one twice, the shutter at its middle and
+    # both ends.
+    assert parts("left lump", "right lump") == [2, 1, 2, 2, 2, 1, 2, 2, 2]
+    assert parts("left shutter", "right shutter") == [1, 2, 2, 2, 1, 2, 2, 2, 1]
+    # What one ball has inside the other is a surface before and after, not then.
+    lumps = [spec.id_of(name) for name in ("left lump", "right lump")]
+    radius = [spec.things[lump].shape.radius for lump in lumps]
+    time = capture.times[film]
+    vanished = 0
+    for lump, other, reach in zip(lumps, lumps[::-1], radius[::-1], strict=True):
+        centre = np.stack(
+            [scene_oracle.pose(spec.things[other], t)[:3, 3] for t in time]
+        )
+        mine = truth.track_thing == lump
+        apart = np.linalg.norm(truth.track_world[mine] - centre, axis=-1) - reach
+        seen = truth.track_seen[mine][:, film]
+        assert not seen[apart < -1e-3].any()
+        vanished += ((apart < -1e-3).any(1) & seen[:, [0, 4, 8]].any(1)).sum()
+    assert vanished > 20
+
+
 @pytest.mark.full
 def test_a_still_scene_has_no_moving_pixels_and_no_tracks():
     still = dataclasses.replace(presets.CUBE, motion=None)

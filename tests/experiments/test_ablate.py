@@ -71,26 +71,30 @@ def test_several_processes_do_not_share_an_accelerator(tiny, monkeypatch, capsys
 
 
 def kept(steps, seconds, stopped_by="steps"):
-    numbers = dict.fromkeys(MEASURES, 0.0) | {"train_seconds": seconds}
+    both = dict.fromkeys(("train_seconds", "train_cpu_seconds"), seconds)
+    numbers = dict.fromkeys(MEASURES, 0.0) | both
     return ArmResult(numbers, {}, {"steps": steps, "stopped_by": stopped_by})
 
 
 @pytest.mark.parametrize(
-    ("cost", "runs"),
+    ("clock", "cost", "runs"),
     [
-        (lambda steps: 0.1 * steps, [150, 600]),  # 60 s
-        (lambda steps: 0.1 * steps + 0.0005 * steps**2, [150, 343, 257]),
+        ("wall", lambda steps: 0.1 * steps, [150, 600]),  # 60 s
+        ("processor", lambda steps: 0.1 * steps, [150, 600]),
+        ("wall", lambda steps: 0.1 * steps + 0.0005 * steps**2, [150, 343, 257]),
     ],
 )
-def test_the_steps_are_what_the_time_allows(tiny, cost, runs, monkeypatch):
+def test_the_steps_are_what_the_time_allows(tiny, clock, cost, runs, monkeypatch):
     """A step costs the more the longer the run: one more try comes near enough."""
-    settled = cli.parse(Ablate, [*tiny, "--seconds", "60"])
+    settled = cli.parse(Ablate, [*tiny, "--seconds", "60", "--clock", clock])
     job = Job(settled)
     trained = []
 
     def train(name, seed, steps):
         trained.append(steps)
-        return kept(steps, cost(steps))
+        result = kept(steps, 3 * cost(steps))  # of the other clock
+        result.numbers[job.budgets[0].measure] = cost(steps)
+        return result
 
     monkeypatch.setattr(job, "_train", train)
     steps, result = job._train_for("static", job.budgets[0])

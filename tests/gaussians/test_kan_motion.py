@@ -148,6 +148,9 @@ def test_the_mlp_has_as_many_parameters(changes):
     )
     assert chosen <= min(wider, narrower)
     assert (other.depth, other.heads) == (len(spec.hidden), learnt.heads)
+    if not spec.trainable_kernels:
+        splines = kan_motion.field_spec(dataclasses.replace(spec, network="bspline"))
+        assert splines == dataclasses.replace(learnt, basis="bspline")
 
 
 @pytest.mark.hard_cases

@@ -23,6 +23,7 @@ from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.effects import acceleration, kan_motion, motion_growth, spectral
 from gaussians_jax.effects.acceleration import AccelerationSpec
 from gaussians_jax.effects.depth import DepthSpec
+from gaussians_jax.effects.embedding_motion import EmbeddingMotionSpec
 from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec, SmoothingSpec
 from gaussians_jax.effects.motion_basis import BasisMotionSpec
@@ -78,6 +79,10 @@ SETTINGS = [
     (InitSpec, dict(points=0), "at least one Gaussian"),
     (InitSpec, dict(source="sfm"), "unknown source 'sfm'; choose from"),
     (KanMotionSpec, dict(embedding=0), "embedding=0"),
+    (EmbeddingMotionSpec, dict(embedding=0), "embedding=0"),
+    (EmbeddingMotionSpec, dict(coarser=0), "coarser=0"),
+    (EmbeddingMotionSpec, dict(opacity=-1.0), "opacity=-1.0"),
+    (EmbeddingMotionSpec, dict(grow_until=-1), "grow_until=-1"),
     (KanMotionSpec, dict(time_code=0), "time_code=0"),
     (KanMotionSpec, dict(hidden=()), r"hidden=\(\)"),
     (KanMotionSpec, dict(block=0), "block=0"),

@@ -32,6 +32,23 @@ def test_blending_walks_from_one_code_to_the_other(dtype, rng):
     assert np.array_equal(blended, table[3])  # arrives exactly
 
 
+def test_a_table_is_read_as_if_of_fewer_rows(dtype, rng):
+    """As NumPy resamples it to so many rows, and then interpolates between those."""
+    table = rng.normal(size=(7, 2)).astype(dtype)
+    times = np.linspace(-0.1, 1.1, 25).astype(dtype)
+    read = jax.jit(jax.vmap(codes.at_time_of, (None, None, 0)))
+    for rows in (2, 3, 5, 7, 40):
+        count = min(rows, 7)
+        own, few = np.linspace(0, 1, 7), np.linspace(0, 1, count)
+        truth = [
+            np.interp(times, few, np.interp(few, own, column)) for column in table.T
+        ]
+        answers = read(table, np.asarray(rows, dtype), times)
+        np.testing.assert_allclose(answers, np.transpose(truth), atol=3e-6)
+    alone = read(table[:1], np.asarray(5, dtype), times)
+    np.testing.assert_allclose(alone, np.tile(table[:1], (25, 1)), rtol=1e-6)
+
+
 def test_time_interpolates_like_numpy(dtype, rng):
     table = rng.normal(size=(5, 2)).astype(dtype)
     times = np.asarray([-0.5, 0.0, 0.1, 0.25, 0.6, 1.0, 1.5], dtype)

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.interpolate
 
 from nerfies_jax.nets import kan
 from nerfies_jax.nets.kan import KANSpec, Kernels
@@ -29,10 +30,11 @@ VARIANTS = {
     "no norm": dataclasses.replace(SPEC, norm=False),
     "trained kernels": dataclasses.replace(SPEC, trainable_kernels=True),
     "no hidden": dataclasses.replace(SPEC, hidden=()),
+    "B-splines": dataclasses.replace(SPEC, basis="bspline", kernels=6),
 }
 SOME = [
     name
-    if name in ("full", "trained kernels")
+    if name in ("full", "trained kernels", "B-splines")
     else pytest.param(name, marks=pytest.mark.full)
     for name in VARIANTS
 ]
@@ -76,6 +78,18 @@ def held(x, grid, margin):
     return high + risen if x > high else low - risen
 
 
+def splines(features, grid, count):
+    """SciPy's B-splines, whose inputs are held within an interval of the grid."""
+    step = (grid[1] - grid[0]) / (count - 3)
+    knots = grid[0] + step * np.arange(-3, count + 1)
+    kept = np.array([held(v, grid, step) for v in features])
+    rows = (
+        scipy.interpolate.BSpline.basis_element(knots[k : k + 5], False)(kept)
+        for k in range(count)
+    )
+    return np.nan_to_num(np.stack(list(rows)))  # outside its own knots it says NaN
+
+
 def by_hand(spec, params, x):
     """Kernel by kernel in NumPy float64, each input of each layer by itself."""
     params = networks.exact(params)
@@ -92,8 +106,11 @@ def by_hand(spec, params, x):
         if spec.trainable_kernels:
             centre = params.kernels[index].centre
             scale = np.exp(params.kernels[index].log_width)
-        kept = np.array([held(v, grid, sigma) for v in features])
-        psi = np.exp(-(((kept - centre) / scale) ** 2))
+        if spec.basis == "bspline":
+            psi = splines(features, grid, spec.kernels)
+        else:
+            kept = np.array([held(v, grid, sigma) for v in features])
+            psi = np.exp(-(((kept - centre) / scale) ** 2))
         outputs = [
             layer.bias + np.einsum("gi,gio->o", psi, layer.kernel)
             for layer in side_by_side
@@ -237,7 +254,8 @@ def test_bfloat16_is_finite_and_near(rng):
 def test_initial_outputs_have_variance_one(dtype, rng):
     """Over inputs spread over the grid, whatever their number and the kernels'."""
     init = jax.jit(kan.init, static_argnums=(0, 2))
-    for inputs, kernels, ratio in ((2, 8, 0.7), (48, 5, 0.5), (200, 16, 1.0)):
+    cases = ((2, 8, 0.7, "rbf"), (48, 5, 0.5, "rbf"), (200, 16, 1.0, "rbf"))
+    for inputs, kernels, ratio, basis in (*cases, (48, 9, 0.7, "bspline")):
         spec = KANSpec(
             inputs,
             (),
@@ -245,6 +263,7 @@ def test_initial_outputs_have_variance_one(dtype, rng):
             kernels=kernels,
             width_ratio=ratio,
             base=False,
+            basis=basis,
         )
         params = init(spec, jax.random.key(0), jnp.dtype(dtype))
         assert not np.asarray(params.heads["y"].bias).any()
@@ -271,6 +290,35 @@ def test_networks_start_as_they_are_told(rng):
         layer.kernel for layer in (*params.hidden, params.heads["b"])
     )  # drawn independently
     assert not any(np.any(a == b) for a, b in ((one, two), (one, three), (two, three)))
+
+
+@pytest.mark.hard_cases
+def test_a_b_spline_is_scipy_s_at_its_knots_between_and_beyond(dtype):
+    """Value, slope and curvature; nothing beyond, where SciPy has no answer."""
+    knots = np.arange(-2.0, 3.0)
+    near = [np.nextafter(knots, -9), knots, np.nextafter(knots, 9)]
+    x = np.concatenate([*near, np.linspace(-2, 2, 41)]).astype(dtype)
+    exact = scipy.interpolate.BSpline.basis_element(knots, False)
+    orders = [kan.cubic_bspline]
+    for _ in range(2):
+        orders.append(jax.grad(orders[-1]))
+    beyond = np.array([-np.inf, -3e38, 2, 3, np.inf], dtype)
+    every = jax.jit(lambda x: [jax.vmap(order)(x) for order in orders])
+    bound = {"float32": 4e-7, "float64": 1e-15}[dtype]
+    for number, answers in enumerate(every(np.concatenate([x, beyond]))):
+        answers = np.asarray(answers)
+        expected = np.nan_to_num(exact(x.astype(float), number))
+        expected = np.where(np.abs(x) < 2, expected, 0)
+        np.testing.assert_allclose(answers[: len(x)], expected, atol=bound)
+        assert not answers[len(x) :].any()
+
+
+def test_b_splines_sum_to_one_on_their_grid(float64):
+    spec = dataclasses.replace(VARIANTS["B-splines"], grid=(-1.0, 2.0))
+    x = np.linspace(-1, 2, 31)[:, None]
+    apart = (x - np.asarray(kan.centres(spec, 0, float))) / kan.spacing(spec, 0)
+    values = jax.jit(kan.cubic_bspline)(apart)
+    np.testing.assert_allclose(np.asarray(values).sum(1), 1, rtol=1e-14)
 
 
 def test_what_is_off_has_no_parameters():

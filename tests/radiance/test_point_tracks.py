@@ -1,14 +1,17 @@
-"""Points followed by the warp of a field, against closed forms."""
+"""Points followed by the warp or the flow of a field, against closed forms."""
 
 import dataclasses
 import types
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.spatial
 
 from nerfies_jax import point_tracks, presets, scene
 from nerfies_jax.capture import synthetic
+from nerfies_jax.effects.effect import Medium
 from nerfies_jax.evaluation import protocol
 from nerfies_jax.training.effects import Effect
 from tests import scenes
@@ -65,7 +68,58 @@ def test_points_are_followed_through_a_warp_in_closed_form(
         assert followed.drift == pytest.approx(drift, rel=1e-4)
 
 
-def test_a_field_without_a_warp_follows_nothing(filmed):
+@pytest.mark.parametrize(("moving", "every"), [(0.75, 1), (1.0, 2)])
+def test_points_are_followed_along_a_flow_in_closed_form(filmed, moving, every):
+    """A turn about an axis, by so much in each interval, of a share of what is there.
+
+    With `every` second moment known, the flow is followed over two intervals at once.
+    """
+    capture, _, known = filmed
+    chosen = np.arange(known.start % every, len(known.moments), every)
+    known = known._replace(
+        moments=known.moments[chosen],
+        path=known.path[:, chosen],
+        seen=known.seen[:, chosen],
+        start=known.start // every,
+    )
+    spec = dataclasses.replace(presets.PRESETS["nsff-small"], scene_flow=None)
+    metadata = scene.metadata_of(capture, spec)
+    turn = scipy.spatial.transform.Rotation.from_rotvec([0.02, -0.05, 0.03]).as_matrix()
+    both = jnp.asarray(np.stack([turn, turn.T]) - np.eye(3), jnp.float32)
+
+    def medium(_, sample, __):
+        # All weights of the template are zero below: its density is softplus(0).
+        density = jnp.log(2.0) * (moving / (1 - moving) if moving < 1 else 1.0)
+        forward, backward = both @ sample.point
+        return Medium(
+            density,
+            jnp.zeros(3),
+            share=jnp.float32(0.0 if moving < 1 else 99.0),
+            extras={"flow_forward": forward, "flow_backward": backward},
+        )
+
+    effect = Effect("scene_flow", medium=medium)
+    field = scene.field(spec, metadata, effects=(effect,))
+    shapes = jax.eval_shape(field.init, jax.random.key(0))
+    params = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
+    state = types.SimpleNamespace(params=params, step=jnp.int32(0))
+    followed = point_tracks.follow(
+        spec, metadata, state, capture, known, effects=(effect,)
+    )
+    centre = np.asarray(metadata.centre)
+    for column, row in enumerate(chosen):
+        hops = int(row) - int(chosen[known.start])
+        each = np.eye(3) + moving * ((turn if hops >= 0 else turn.T) - np.eye(3))
+        step = np.linalg.matrix_power(each, abs(hops))
+        expected = (known.start_points - centre) @ step.T + centre
+        np.testing.assert_allclose(followed.path[:, column], expected, atol=2e-6)
+    assert followed.found.all()
+    assert followed.drift > 0.01
+    errors = protocol.score_tracks(known, followed)
+    assert 0 < errors["track_error"] != protocol.static_error(known)
+
+
+def test_a_field_without_a_motion_follows_nothing(filmed):
     capture, _, known = filmed
     spec = presets.PRESETS["t-nerf-small"]
     metadata = scene.metadata_of(capture, spec)

@@ -158,6 +158,36 @@ FOREARM = Thing(
     CUBE.texture,
     Arm((_SHOULDER, _ELBOW)),
 )
+# Two balls of dough that swing through each other: one lump for two fifths of the
+# time, and what of one lies inside the other is no surface then.
+_APART = Path(sway=(0.035, 0.0, 0.0), cycles=(2.0, 1.0, 1.0))
+LEFT_LUMP = Thing(
+    "left lump", Sphere(0.045), (-0.07, -0.05, 0.08), CUBE.texture, _APART
+)
+RIGHT_LUMP = Thing(
+    "right lump",
+    Sphere(0.04),
+    (0.03, -0.05, 0.08),
+    BALL.texture,
+    dataclasses.replace(_APART, sway=(-0.035, 0.0, 0.0)),
+)
+# Halves of a shutter: shut at times 0, 1/2 and 1, when nobody can tell that the slit
+# and the inner faces exist; between them it opens by 0.08 onto the wall behind.
+_SLIDE = Path(sway=(0.02, 0.0, 0.0), cycles=(2.0, 1.0, 1.0), phase=(-0.25, 0.0, 0.0))
+LEFT_SHUTTER = Thing(
+    "left shutter",
+    Box((0.04, 0.09, 0.015)),
+    (0.09, 0.03, -0.07),
+    CLOTH.texture,
+    dataclasses.replace(_SLIDE, sway=(-0.02, 0.0, 0.0)),
+)
+RIGHT_SHUTTER = Thing(
+    "right shutter",
+    Box((0.04, 0.09, 0.015)),
+    (0.21, 0.03, -0.07),
+    CLOTH.texture,
+    _SLIDE,
+)
 PASSER = Thing(
     "passer",
     Box((0.035, 0.25, 0.02)),
@@ -185,6 +215,10 @@ SHINY = dataclasses.replace(
     STATIC, name="specular", specular=Specular("globe", strength=0.8, sharpness=20.0)
 )
 
+TOPOLOGY = SceneSpec(
+    "lumps and shutter", (*STAGE, LEFT_LUMP, RIGHT_LUMP, LEFT_SHUTTER, RIGHT_SHUTTER)
+)
+
 PRESETS = {
     "default": DEFAULT,
     "static": STATIC,
@@ -195,4 +229,5 @@ PRESETS = {
     "exposure": EXPOSED,
     "transient": PASSED,
     "specular": SHINY,
+    "topology": TOPOLOGY,
 }

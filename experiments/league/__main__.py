@@ -1,0 +1,50 @@
+"""Every small preset by one protocol: equal processor seconds, seeds, paired verdicts.
+
+    python -m experiments.league --jobs 2 --budget 600
+    python -m experiments.league CAPTURE CAPTURE --heldout 8 --own-steps --jobs 2
+    python -m experiments.league --presets sonata-small --budgets 20 --seeds 1
+
+Both representations learn the same frames of the built-in scenes, and of the captures
+that are named, from the same seeds. A row is a preset as it is, or with its motion
+started the other way: fitted to tracks before training, or from rest; tracks are made
+once for a film, and finding them is not in the seconds. Each row gets as many steps as
+it can make in so many processor seconds on one core, without compiling. A cell is one
+row, film, length and seed, trained in a process of its own: all cells of the first seed
+come first, and short lengths before long ones. What is finished is kept in --out, and
+the same command goes on where it was stopped or where --budget ended it. Writes
+league.json and league.png there; rows that lose stay in.
+"""
+
+from experiments import cli
+from experiments.league import rows
+from experiments.league.settings import League
+from nerfies_jax.runs import platform
+
+
+@cli.command(League)
+def main(args):
+    """Run the job of the command line; exit code 2 where its input is wrong."""
+    with cli.user_errors():
+        arms = rows.of_presets(args.presets)
+        platform.start_jax(args.device)
+        from experiments.league import contests
+
+        every = contests.opened(args, arms)
+    failed = contests.run(args, every)
+    path = args.out / "league.json"
+    stored = contests.record(args, every)
+    contests.write(path, stored)
+    from experiments.league import page
+
+    page.draw(stored, path.with_suffix(".png"))
+    print("\n" + page.page(stored))
+    print(f"\n{path} and {path.with_suffix('.png')}")
+    if args.keep:
+        from experiments import results
+
+        results.main(["league", "--measured", str(path)])
+    return cli.Ended(stored, 1 if failed else 0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,92 @@
+"""The parts of a league, one film and length of training each, as ablations."""
+
+import copy
+import dataclasses
+import math
+import pathlib
+import time
+from typing import Any
+
+from experiments.ablate import pool
+from experiments.ablate.job import Job
+from experiments.ablate.log import log
+from experiments.league.settings import League
+from nerfies_jax.capture.json_files import write_json
+from nerfies_jax.evaluation import protocol
+from nerfies_jax.measure import clock
+from nerfies_jax.training import specs
+
+
+def opened(args: League, arms: tuple[str, ...]) -> list[Job]:
+    """A job for each length and film, the short ones of all films first."""
+    return [
+        Job(args.ablation(name, seconds, arms))
+        for seconds in args.limits
+        for name in args.sources
+    ]
+
+
+def run(args: League, jobs: list[Job]) -> list[tuple[str, int]]:
+    """Make what is not there, seed by seed over all jobs; returns what failed."""
+    began, failed = time.monotonic(), []
+    for seed in range(args.seeds):
+        for job in jobs:
+            one = _of_seed(job, seed)
+            if args.budget is not None:
+                left = args.budget - (time.monotonic() - began) / 60
+                one.args = dataclasses.replace(job.args, budget=left)
+            if not all(one.is_finished(*task) for task in one.tasks()):
+                log(f"{job.capture.name}, {job.budgets[0].title}, seed {seed}:")
+                failed += pool.run(one)
+    return failed
+
+
+def _of_seed(job, seed):
+    """The cells of one seed; over seconds, seed 0 finds the steps of the others."""
+    one = copy.copy(job)
+    one.seeds = (seed,)
+    if seed and job.args.seconds is not None:
+        one.names = tuple(name for name in job.names if job.is_finished(name, 0))
+    return one
+
+
+def record(args: League, jobs: list[Job]) -> dict[str, Any]:
+    """What is kept: the numbers of every finished cell, and which were asked for."""
+    return {
+        "machine": clock.machine(),
+        "settings": specs.as_json(args),
+        "contests": [_contest(job) for job in jobs],
+    }
+
+
+def _contest(job):
+    still = protocol.static_error(job.known)
+    finished = job.finished(job.budgets[0])
+    return {
+        "film": job.out.name,
+        "seconds": job.args.seconds,
+        "exact": job.known.exact,
+        "still": still if math.isfinite(still) else None,
+        "seeds": list(job.seeds),
+        "rows": {
+            name: {
+                "preset": job.suite.arms[name].preset,
+                "changes": list(job.suite.arms[name].changes),
+                "cells": {
+                    str(seed): _plain(finished[name, seed].numbers)
+                    for seed in job.seeds
+                    if (name, seed) in finished
+                },
+            }
+            for name in job.names
+        },
+    }
+
+
+def _plain(numbers):
+    return {k: x if math.isfinite(x) else None for k, x in numbers.items()}
+
+
+def write(path: pathlib.Path, stored: dict[str, Any]) -> None:
+    """As JSON, whole or not at all."""
+    write_json(path, stored)

@@ -1,0 +1,171 @@
+"""The page of `experiments.league` in docs/results, and its picture."""
+
+import math
+import pathlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from experiments import markdown
+from experiments.ablate import verdicts
+from experiments.ablate.measures import MEASURES
+from experiments.league import margins, standings
+from experiments.league.rows import JUDGED, against_best
+from nerfies_jax.capture.json_files import replaced_file
+from nerfies_jax.evaluation import figures
+
+QUALITIES = ("psnr", "ssim", "moving_psnr", "track_error", "depth_median")
+COSTS = ("steps", "gaussians", "train_cpu_seconds", "train_seconds")
+COSTS += ("compile_seconds", "render_ms", "model_mb")
+READING = """\
+## How to read
+
+- *PSNR* (dB) and *SSIM* are those of held-out pictures, *moving* the PSNR of pixels
+  that show what moves; *EPE* is how far points that are followed are from where they
+  truly are, *depth* the median error of depth, both in scene units. A film that is no
+  built-in scene has pictures alone.
+- *CPU s* is what the lengths are of: seconds of all threads of a process with one core,
+  without compiling and without finding tracks; *train s* is the same by the clock on
+  the wall, *compile* what compiling takes without a cache, *frame ms* a held-out frame,
+  *model MB* the file of a trained scene (of a field its parameters).
+- ± is the standard deviation over seeds; without it there was one seed, and one seed
+  has no spread to hold a difference against.
+- *best* is the row of most PSNR among those with most seeds. A gain over another row is
+  the mean over the seeds that both have, each against itself, positive where the best
+  is better, and ± there is its 95 % interval (Student, seeds paired): *shows* where it
+  leaves zero out, *opposite* where it does against the best, *none* otherwise. The best
+  was chosen by these numbers, and of so many comparisons one in twenty shows by chance:
+  near rows are a tie.
+- `+tracks` is a preset whose motion is fitted to tracks before training, `+rest` one
+  that would be and is not."""
+
+
+def page(stored: Mapping[str, Any]) -> str:
+    """Everything below the docstring, from a league.json, however much is there."""
+    contests = [standings.of_stored(one) for one in stored["contests"]]
+    parts = [_progress(contests), READING]
+    for contest in contests:
+        parts.append(f"## {contest.title}")
+        if contest.numbers:
+            parts += _standings(contest)
+        if contest.missing:
+            parts.append(f"Not run yet: {_missing(contest)}.")
+    return "\n\n".join([*parts, margins.section(contests)])
+
+
+def _progress(contests):
+    there = sum(len(contest.numbers) for contest in contests)
+    missing = sum(map(len, (s for c in contests for s in c.missing.values())))
+    seeds = sorted({seed for c in contests for _, seed in c.numbers})
+    counted = f"**{there} of {there + missing} cells** (row, film, length and seed)"
+    if not there:
+        return f"{counted} are there."
+    which = f"seeds so far: {', '.join(map(str, seeds))}"
+    if missing:
+        return (
+            f"{counted} are there; {which}. What is missing is named below, and "
+            "nothing is said of it."
+        )
+    return f"{counted} are there, all that were asked for; {which}."
+
+
+def _missing(contest):
+    """Rows without any cell by name, others with their seeds."""
+    done = {name for name, _ in contest.numbers}
+    return ", ".join(
+        f"`{name}`" + (f" (seed {', '.join(map(str, seeds))})" if name in done else "")
+        for name, seeds in contest.missing.items()
+    )
+
+
+def _standings(contest):
+    """Rows from best to worst, what they cost, and the best against each."""
+    means = standings.means(contest)
+    order = sorted(means, key=lambda name: -standings.sortable(means[name]["psnr"]))
+    best = standings.best_of(contest)
+    parts = [_table(contest, order, QUALITIES)]
+    if contest.still is not None:
+        parts.append(f"Points that do not move have an EPE of {contest.still:.4f}.")
+    parts.append(_table(contest, order, COSTS))
+    others = [name for name in order if name != best]
+    if others:
+        parts.append(_against(contest, best, others))
+    return parts
+
+
+def _table(contest, order, names):
+    rows = []
+    for name in order:
+        cells = [f"`{name}`", str(len(standings.seeds_of(contest, name)))]
+        for key in names:
+            mean, spread = standings.mean_and_spread(contest, name, key)
+            digits = MEASURES[key].digits
+            cell = markdown.number(mean, digits)
+            if cell and math.isfinite(spread):
+                cell += f" ± {markdown.number(spread, digits)}"
+            cells.append(cell)
+        rows.append(cells)
+    heads = ("row", "seeds", *(MEASURES[key].heading for key in names))
+    return markdown.table(heads, rows)
+
+
+def _against(contest, best, others):
+    judged = verdicts.verdicts(contest.numbers, against_best(best, others))
+    cells: dict[str, dict[str, str]] = {name: {} for name in others}
+    for verdict in judged:
+        cells[verdict.claim.worse][verdict.measure] = standings.gain(verdict)
+    rows = [
+        [f"`{name}`", *(row.get(key, "") for key in JUDGED)]
+        for name, row in cells.items()
+    ]
+    heads = [f"gain in {MEASURES[key].heading}" for key in JUDGED]
+    return markdown.table((f"best, `{best}`, against", *heads), rows)
+
+
+def draw(stored: Mapping[str, Any], path: pathlib.Path) -> None:
+    """A panel for each film: PSNR of every row, a colour for each length."""
+    contests = [
+        one for one in map(standings.of_stored, stored["contests"]) if one.numbers
+    ]
+    films = dict.fromkeys(contest.film for contest in contests)
+    if not films:
+        return
+    tallest = max(len(standings.means(contest)) for contest in contests)
+    figure = figures.new_figure(
+        figsize=(5.2 * len(films), 1.2 + 0.22 * max(tallest, 4)),
+        dpi=100,
+        layout="constrained",
+    )
+    panels = figure.subplots(1, len(films), squeeze=False)[0]
+    for film, panel in zip(films, panels, strict=True):
+        _draw_film(panel, film, [c for c in contests if c.film == film])
+    title = "held-out PSNR / dB: a dot for each seed, a bar for the mean"
+    figure.suptitle(title, fontsize=9)
+    with replaced_file(path) as partial:
+        figure.savefig(partial, format="png")
+
+
+def _draw_film(panel, film, contests):
+    """Rows from worst to best of the longest length that has them."""
+    latest = {}
+    for contest in contests:
+        latest |= {name: row["psnr"] for name, row in standings.means(contest).items()}
+    order = sorted(latest, key=lambda name: standings.sortable(latest[name]))
+    for number, contest in enumerate(contests):
+        colour = f"C{number}"
+        for name in standings.means(contest):
+            values = [
+                contest.numbers[name, seed]["psnr"]
+                for seed in standings.seeds_of(contest, name)
+            ]
+            height = order.index(name) + 0.22 * (number - (len(contests) - 1) / 2)
+            panel.plot(values, [height] * len(values), ".", color=colour, ms=4)
+            panel.plot(np.mean(values), height, "|", color=colour, ms=8)
+        label = contest.title.partition(", ")[2]
+        panel.plot([], [], ".", color=colour, label=label)
+    panel.set_yticks(range(len(order)), order, fontsize=7)
+    panel.set_title(film)
+    panel.legend(fontsize=7)
+    panel.grid(alpha=0.3)
+    panel.spines[["top", "right"]].set_visible(False)

@@ -1,0 +1,123 @@
+"""The league: which rows there are, in which order they run, what its page says."""
+
+import itertools
+import json
+import math
+
+import pytest
+
+from experiments import cli
+from experiments.ablate import pool, results
+from experiments.ablate.measures import MEASURES
+from experiments.ablate.results import ArmResult
+from experiments.league import contests, page, rows
+from experiments.league.settings import League
+from nerfies_jax.capture import synthetic
+from nerfies_jax.runs import platform, representations
+from tests import scenes
+
+
+def test_every_small_preset_is_a_row_and_each_motion_has_both_starts():
+    arms = rows.suite().arms
+    small = [name for name in representations.PRESETS if name.endswith("-small")]
+    assert dict.fromkeys(arm.preset for arm in arms.values()) == dict.fromkeys(small)
+    starts = {name: [n for n in arms if arms[n].preset == name] for name in small}
+    for still in ("nerf-small", "t-nerf-small", "nsff-small", "splats-mcmc-small"):
+        assert starts[still] == [still]
+    assert starts["moba-small"] == ["moba-small", "moba-small+tracks"]
+    assert starts["4dgs-small"] == ["4dgs-small", "4dgs-small+rest"]
+    with pytest.raises(ValueError, match="--presets moba: choose from"):
+        rows.of_presets(("moba",))
+
+
+def cell(**values):
+    numbers = dict.fromkeys(MEASURES, math.nan) | values
+    return {k: x if math.isfinite(x) else None for k, x in numbers.items()}
+
+
+def contest(names, **more):
+    made = {name: {"cells": {}} for name in names}
+    blank = {"film": "fast", "seconds": 90.0, "still": 0.02, "seeds": [0, 1, 2]}
+    return blank | {"rows": made} | more
+
+
+def test_the_page_of_a_part_says_what_is_there_and_what_is_missing():
+    part = contest(["sonata-small+tracks", "splats-deformable-small+tracks", "nerf"])
+    for seed, (one, other) in enumerate([(30.0, 29.0), (30.2, 29.1), (30.4, 29.5)]):
+        part["rows"]["sonata-small+tracks"]["cells"][str(seed)] = cell(psnr=one)
+        other_cells = part["rows"]["splats-deformable-small+tracks"]["cells"]
+        other_cells[str(seed)] = cell(psnr=other)
+    # A lucky first seed does not crown a row that has no other.
+    part["rows"]["nerf"]["cells"]["0"] = cell(psnr=40.0)
+    empty = contest(["nerf"], film="kitchen", seconds=None)
+    text = page.page({"contests": [part, empty]})
+    assert text.startswith("**7 of 12 cells**")
+    assert "seeds so far: 0, 1, 2" in text
+    assert "Not run yet: `nerf` (seed 1, 2)." in text
+    assert "Not run yet: `nerf`.\n" in text
+    assert "best, `sonata-small+tracks`, against" in text
+    assert "| `nerf` | -10.00, one seed |" in text
+    # Student's 95 % of gains 1.0, 1.1 and 0.9, by hand: 4.303 * 0.1 / sqrt(3).
+    assert "| `splats-deformable-small+tracks` | +1.00 ± 0.25, shows |" in text
+    margin = next(line for line in text.splitlines() if "| tracks | +0.31 |" in line)
+    assert margin.endswith("| +1.00 ± 0.25, shows |")
+
+
+def test_a_page_of_nothing_says_so():
+    text = page.page({"contests": [contest(["nerf"])]})
+    assert "**0 of 3 cells**" in text
+    assert "No pair of these rows is there yet." in text
+
+
+@pytest.fixture
+def league(tmp_path, monkeypatch):
+    """Three rows of the tiny scene, trained by writing down numbers."""
+    monkeypatch.setattr(platform, "CACHE", tmp_path / "cache")
+    monkeypatch.setitem(synthetic.PRESETS, "tiny", scenes.TINY_FILM)
+    monkeypatch.setattr(cli, "SCENES", (*cli.SCENES, "tiny"))
+    trained = []
+
+    def train(job):
+        (budget,) = job.budgets
+        for name, seed in job.tasks():
+            if job.is_finished(name, seed) or (name, seed) == ("nerf-small", 0):
+                continue
+            trained.append((budget.seconds, name, seed))
+            identity = job._identity(name, seed, job.spec(name, 7).steps, budget)
+            if budget.seconds is not None:
+                identity["steps"] = 7
+            kept = ArmResult(dict.fromkeys(MEASURES, float(seed)), {}, {"steps": 7})
+            results.write(job.path(name, seed, budget), identity, kept)
+        return [("nerf-small", 0)] if job.seeds == (0,) else []
+
+    monkeypatch.setattr(pool, "run", train)
+    settled = League(
+        scenes=("tiny",),
+        presets=("nerf-small", "d-nerf-small"),
+        budgets=(30.0, 9.0),
+        seeds=2,
+        frames=1,
+        out=tmp_path / "out",
+    )
+    return settled, trained
+
+
+def test_first_seeds_come_first_and_no_seed_waits_for_a_first_that_failed(league):
+    settled, trained = league
+    jobs = contests.opened(settled, rows.of_presets(settled.presets))
+    assert contests.run(settled, jobs) == [("nerf-small", 0)] * 2
+    names = ("d-nerf-small", "d-nerf-small+tracks")
+    expected = itertools.product((0, 1), (9.0, 30.0), names)
+    assert trained == [(seconds, name, seed) for seed, seconds, name in expected]
+    stored = json.loads(json.dumps(contests.record(settled, jobs), allow_nan=False))
+    assert [one["seconds"] for one in stored["contests"]] == [9.0, 30.0]
+    cells = {n: row["cells"] for n, row in stored["contests"][0]["rows"].items()}
+    assert [list(cells[n]) for n in ("nerf-small", *names)] == [[], *[["0", "1"]] * 2]
+    assert cells["d-nerf-small+tracks"]["1"]["psnr"] == 1.0
+    page.draw(stored, settled.out / "league.png")
+    assert (settled.out / "league.png").read_bytes().startswith(b"\x89PNG")
+    # The processor's seconds are kept apart from the wall's, and both resume.
+    assert all(job.budgets[0].folder.name.startswith("processor") for job in jobs)
+    trained.clear()
+    contests.run(settled, jobs)
+    assert trained == []

@@ -1,0 +1,130 @@
+"""A coarse and a fine network over codes: by hand, how they grow, what they cost."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gaussians_jax import scene, splats
+from gaussians_jax.effects import embedding_motion
+from gaussians_jax.effects.embedding_motion import EmbeddingMotionSpec
+from gaussians_jax.effects.neighbours import NeighbourSpec
+from gaussians_jax.spec import effects_of
+from gaussians_jax.splats import Params
+from nerfies_jax.training.effects import PenaltyContext
+from tests import gradients, scenes
+from tests.gaussians.shared import rows_of, some_gaussians
+
+FRAMES = 19
+SPEC = EmbeddingMotionSpec(
+    embedding=3, time_code=4, width=5, coarser=4, grow_until=100, block=2
+)
+SCENE = dataclasses.replace(
+    scenes.TINY_SPLATS,
+    batch_size=2,
+    motion=dataclasses.replace(SPEC, frames_per_code=1, grow_until=20),
+    neighbours=NeighbourSpec(count=4),
+)
+
+
+def filled(dtype):
+    """Parameters that all matter, the fine network at six of ten rows."""
+    shapes = jax.eval_shape(
+        lambda key: embedding_motion.init(key, SPEC, FRAMES), jax.random.key(0)
+    )
+    rng = np.random.default_rng(3)
+    params = jax.tree.map(
+        lambda leaf: rng.normal(size=leaf.shape).astype(dtype), shapes
+    )
+    return params._replace(rows=np.full(1, 6, dtype))
+
+
+def moved(params, embedding, time):
+    prepared = embedding_motion.prepare(params, SPEC, embedding)
+    return embedding_motion.deform(params, SPEC, time, prepared)
+
+
+def test_offsets_are_those_of_both_networks_by_hand(dtype, rng):
+    params = filled(dtype)
+    embedding, time = rng.normal(size=(3, 3)).astype(dtype), np.asarray(0.37, dtype)
+    offsets = jax.jit(moved)(params, embedding, time)
+    table = np.asarray(params.times, np.float64)
+    expected = {name: np.zeros((3, 3)) for name in offsets._fields}
+    for network, rows in ((params.coarse, 3), (params.fine, 6)):
+        few, own = np.linspace(0, 1, rows), np.linspace(0, 1, len(table))
+        code = [np.interp(time, few, np.interp(few, own, c)) for c in table.T]
+        for row in range(3):
+            reads = np.concatenate([embedding[row], code])
+            first = np.maximum(reads @ network.first.weight + network.first.bias, 0)
+            for name, head in network.heads.items():
+                (layer,), out = head.hidden, head.heads["out"]
+                hidden = np.maximum(first @ layer.weight + layer.bias, 0)
+                expected[name][row] += hidden @ out.weight + out.bias
+    bound = {"float32": 2e-5, "float64": 1e-12}[dtype]
+    for name, value in expected.items():
+        np.testing.assert_allclose(
+            getattr(offsets, name), value, rtol=bound, atol=bound
+        )
+
+
+def test_all_but_the_number_of_rows_has_its_slope(float64, rng):
+    params, embedding = filled("float64"), rng.normal(size=(3, 3))
+
+    def total(learnt, embedding, time):
+        whole = learnt._replace(rows=params.rows)
+        return sum(jnp.sum(jnp.sin(leaf)) for leaf in moved(whole, embedding, time))
+
+    learnt, time = params._replace(rows=np.zeros(0)), np.asarray(0.37)
+    assert gradients.directional_error(total, learnt, embedding, time) < 1e-6
+    slope = jax.jit(jax.grad(lambda *given: jnp.sum(moved(*given).position)))
+    slopes = slope(params, embedding, time)
+    assert not slopes.rows.any()
+    assert slopes.times.any()
+
+
+def test_the_fine_network_reads_ever_more_rows():
+    reads = [embedding_motion.fine_rows(SPEC, 10, step) for step in (0, 50, 99, 100)]
+    assert reads == [3, 6, 9, 10]
+    steps = embedding_motion.growth_steps(SPEC, 10)
+    assert len(steps) == 7
+    assert steps[-1] == 100
+    at_once = dataclasses.replace(SPEC, grow_until=0)
+    assert embedding_motion.fine_rows(at_once, 10, 0) == 10
+    assert embedding_motion.growth_steps(at_once, 10) == ()
+    # A film of one moment has one code, and nothing grows.
+    assert embedding_motion.coarse_rows(SPEC, 1) == 1
+    assert embedding_motion.growth_steps(SPEC, 1) == ()
+
+
+def test_an_event_lets_the_rows_of_a_scene_grow():
+    capture = scenes.tiny_capture()
+    model = scene.build(SCENE, scene.metadata_of(capture))
+    state = model.init(capture, jax.random.key(0))
+    (event,) = [one for one in model.events if one.name.startswith("revise")]
+    count = len(state.params.nets["embedding_motion"].times)
+    assert count == len(capture.train)
+    assert state.params.nets["embedding_motion"].rows == 2
+    assert len(event.steps) == count - 2
+    for step in (event.steps[0], event.steps[-1]):
+        state = event.apply(state._replace(step=jnp.int32(step)), None)
+    own = state.params.nets["embedding_motion"]
+    assert own.rows == count
+    assert own.rows.dtype == own.times.dtype
+
+
+def test_opacity_and_bends_of_the_codes_cost_what_they_are(rng):
+    effects = effects_of(SCENE, scene.metadata_of(scenes.tiny_capture()))
+    logit = np.array([-3, 0.2, splats.INACTIVE_LOGIT, 1, 9])
+    params = Params({"splats": rows_of(some_gaussians(5, np.float32), logit)}, {})
+    times = rng.normal(size=(6, 4)).astype(np.float32)
+    own = filled("float32")._replace(times=times)
+    own = jax.tree.map(jnp.asarray, own)
+    terms = effects[0].penalty(own, PenaltyContext(None, None, None, params))
+    opacity = np.mean(1 / (1 + np.exp(-np.delete(logit, 2))))
+    np.testing.assert_allclose(terms["opacity"].value, opacity, rtol=1e-6)
+    bend = times[2:] - 2 * times[1:-1] + times[:-2]
+    np.testing.assert_allclose(terms["smoothness"].value, np.mean(bend**2), rtol=1e-5)
+    assert {term.weight for term in terms.values()} == {1e-4}
+    short = embedding_motion.second_differences(jnp.asarray(times[:2]))
+    assert short == 0
