@@ -18,6 +18,11 @@ from gaussians_jax.effects.mlp_motion import MotionSpec
 from gaussians_jax.effects.motion_basis import SMALL_BASIS_MOTION, BasisMotionSpec
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec
 from gaussians_jax.effects.neighbours import NeighbourSpec
+from gaussians_jax.effects.node_motion import (
+    SMALL_NODE_MOTION,
+    MaskSpec,
+    NodeMotionSpec,
+)
 from gaussians_jax.effects.plane_motion import SMALL_PLANE_MOTION, PlaneMotionSpec
 from gaussians_jax.effects.polynomial_motion import PolynomialMotionSpec
 from gaussians_jax.effects.se3_bases import SE3BasesSpec
@@ -140,6 +145,26 @@ FOUR_D = SplatScene(
     motion=PlaneMotionSpec(),
 )
 
+# SC-GS: 512 nodes and 80,000 steps. Its first 10,000 steps, which train the nodes as
+# Gaussians, are replaced by a start from tracks.
+SC_GS = SplatScene(
+    steps=80_000,
+    init=InitSpec(points=50_000),
+    motion=NodeMotionSpec(),
+    start=StartSpec(motion="tracks", moving_points=20_000),
+)
+
+# The motion of EDGS: anchors, and a mask of those that move; nothing asks for rigidity.
+# Its anchors are the cells of a grid that hold points and make the looks of their
+# Gaussians; here they are spread over the points and carry alone. Their number and the
+# steps are our choice.
+EDGS = SplatScene(
+    steps=40_000,
+    init=InitSpec(points=50_000),
+    motion=NodeMotionSpec(nodes=2048, rigidity=None, mask=MaskSpec()),
+    start=StartSpec(motion="tracks", moving_points=20_000),
+)
+
 # For a CPU: the same parts with fewer Gaussians, a smaller network, a shorter run.
 # Measured on the built-in scene at 2000 steps (held-out PSNR and SSIM, one seed):
 #   motion from 10 % of the run on, network rate 2e-3   18.20 / 0.466, worse than static
@@ -229,6 +254,16 @@ SMALL_E_D3DGS = dataclasses.replace(
     ),
     neighbours=NeighbourSpec(start=600),
 )
+SMALL_SC_GS = dataclasses.replace(
+    SMALL_TRACKED,
+    motion=dataclasses.replace(SMALL_NODE_MOTION, warm_up=600),
+)
+SMALL_EDGS = dataclasses.replace(
+    SMALL_TRACKED,
+    motion=dataclasses.replace(
+        SMALL_NODE_MOTION, rigidity=None, mask=MaskSpec(), warm_up=600
+    ),
+)
 SMALL_DEFORMABLE = dataclasses.replace(
     SMALL_STATIC,
     motion=MotionSpec(
@@ -303,6 +338,8 @@ PRESETS = {
     "spline": SPLINE,
     "4dgs": FOUR_D,
     "e-d3dgs": E_D3DGS,
+    "sc-gs": SC_GS,
+    "edgs": EDGS,
     "splats-static-small": SMALL_STATIC,
     "splats-tracked-small": SMALL_TRACKED,
     "splats-mcmc-small": SMALL_MCMC,
@@ -314,6 +351,8 @@ PRESETS = {
     "spline-small": SMALL_SPLINE,
     "4dgs-small": SMALL_FOUR_D,
     "e-d3dgs-small": SMALL_E_D3DGS,
+    "sc-gs-small": SMALL_SC_GS,
+    "edgs-small": SMALL_EDGS,
 }
 
 

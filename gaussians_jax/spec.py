@@ -13,6 +13,7 @@ from gaussians_jax.effects import (
     motion_basis,
     motion_growth,
     neighbours,
+    node_motion,
     plane_motion,
     polynomial_motion,
     se3_bases,
@@ -29,6 +30,7 @@ from gaussians_jax.effects.mlp_motion import MotionSpec
 from gaussians_jax.effects.motion_basis import BasisMotionSpec
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec
 from gaussians_jax.effects.neighbours import NeighbourSpec
+from gaussians_jax.effects.node_motion import NodeMotionSpec
 from gaussians_jax.effects.plane_motion import PlaneMotionSpec
 from gaussians_jax.effects.polynomial_motion import PolynomialMotionSpec
 from gaussians_jax.effects.se3_bases import SE3BasesSpec
@@ -55,6 +57,7 @@ AnyMotion = (
     | SplineMotionSpec
     | PlaneMotionSpec
     | EmbeddingMotionSpec
+    | NodeMotionSpec
 )
 # Motions with a vector for each Gaussian that neighbours may be kept alike in.
 EMBEDDED = {
@@ -176,6 +179,9 @@ MOTIONS = {
     ),
     EmbeddingMotionSpec: lambda spec, steps, seen: embedding_motion.effect(
         spec, steps, seen.frames
+    ),
+    NodeMotionSpec: lambda spec, steps, seen: node_motion.effect(
+        spec, steps, seen.extent
     ),
 }
 

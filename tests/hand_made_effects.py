@@ -13,6 +13,7 @@ from gaussians_jax.effects import (
     motion_basis,
     motion_growth,
     neighbours,
+    node_motion,
     plane_motion,
     polynomial_motion,
     se3_bases,
@@ -59,6 +60,7 @@ MOTION_MODULES = {
     spline_motion.SplineMotionSpec: spline_motion,
     plane_motion.PlaneMotionSpec: plane_motion,
     embedding_motion.EmbeddingMotionSpec: embedding_motion,
+    node_motion.NodeMotionSpec: node_motion,
 }
 BY_FRAMES = {  # the others ask for the scene's extent
     mlp_motion.MotionSpec,
