@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
+from nerfies_jax import skipping
 from nerfies_jax import spec as specs
 from nerfies_jax.effects.effect import RayOutput
 from nerfies_jax.geometry import rays
@@ -35,6 +36,7 @@ from nerfies_jax.training.model import Rendering, View
 PyTree = Any
 Vector = Float[Array, "3"]
 Scalar = Float[Array, ""]
+Occupancy = skipping.Occupancy
 Codes = dict[str, Float[Array, " code"]]
 
 
@@ -53,6 +55,10 @@ class Field(NamedTuple):
     displace: Callable[[PyTree, Vector, FrameCondition], Vector]
     # (params, camera, time, codes, size, step) -> whole frame
     render: Callable[..., Rendering]
+    # (params, step) -> `skipping.Occupancy`; None where space cannot be skipped
+    survey: Callable[[PyTree, Int[Array, ""]], Occupancy] | None
+    # `render` behind an occupancy, without slopes
+    render_occupied: Callable[..., Rendering]
 
 
 def field(
@@ -103,7 +109,30 @@ def field(
         )
         return jax.tree.map(lambda x: x.reshape(height, width, *x.shape[1:]), flat)
 
-    return Field(spec, metadata, active, init, codes_at, levels_of, displace, render)
+    def survey(params, step):
+        def condition_at(time):
+            frame_codes = look_up(tables, metadata, params, time, jnp.int32(0))
+            return FrameCondition(time, frame_codes, step)
+
+        return skipping.survey(Bound(spec, metadata, active, params), condition_at)
+
+    def render_occupied(params, occupied, camera, time, codes, size, step):
+        bound = Bound(spec, metadata, active, params)
+        condition = FrameCondition(time, codes, step)
+        return skipping.draw(bound, occupied, camera, condition, size)
+
+    return Field(
+        spec,
+        metadata,
+        active,
+        init,
+        codes_at,
+        levels_of,
+        displace,
+        render,
+        survey if skipping.usable(spec, active) else None,
+        render_occupied,
+    )
 
 
 def _active(effects, without):

@@ -20,6 +20,7 @@ from nerfies_jax.training.effects import Effect, FrameCondition
 PyTree = Any
 Vector = Float[Array, "3"]
 Scalar = Float[Array, ""]
+Features = Float[Array, " _"]
 
 
 class Ray(NamedTuple):
@@ -112,20 +113,30 @@ class _Samples(NamedTuple):
     lifted: tuple[Float[Array, "samples features"], ...]
 
 
-def _samples(bound, ray, condition, distance):
-    effects = bound.effects
+def is_moved(bound: Bound) -> bool:
+    """Whether the template is asked elsewhere, or of more, than where a point is."""
+    return any(e.displace is not None or e.lift is not None for e in bound.effects)
 
+
+def asked_at(
+    bound: Bound, point: Vector, condition: FrameCondition
+) -> tuple[Vector, tuple[Features, ...]]:
+    """Where the template is asked for an observed point, and what lifts add to it."""
+    warped = point
+    if any(effect.displace is not None for effect in bound.effects):
+        warped = point + displacement(bound, point, condition)
+    lifted = tuple(
+        effect.lift(bound.own(effect), point, condition)
+        for effect in bound.effects
+        if effect.lift is not None
+    )
+    return warped, lifted
+
+
+def _samples(bound, ray, condition, distance):
     def one(distance):
         point = rays.point_at(ray.origin, ray.direction, distance)
-        warped = point
-        if any(effect.displace is not None for effect in effects):
-            warped = point + displacement(bound, point, condition)
-        lifted = tuple(
-            effect.lift(bound.own(effect), point, condition)
-            for effect in effects
-            if effect.lift is not None
-        )
-        return _Samples(distance, point, warped, lifted)
+        return _Samples(distance, point, *asked_at(bound, point, condition))
 
     return jax.vmap(one)(distance)
 
@@ -176,7 +187,7 @@ def render_ray(
         coarse.weight[1:-1],
         plan.fine,
     )
-    if all(effect.displace is None and effect.lift is None for effect in bound.effects):
+    if not is_moved(bound):
         both = _samples(bound, ray, condition, sampling.union(distance, drawn))
     else:
         more = _samples(bound, ray, condition, drawn)
@@ -186,24 +197,44 @@ def render_ray(
     return coarse, level("fine", both, last, 1)
 
 
-def _radiance(bound, name, ray, condition, samples, noise):
-    """What the template of one level says at the samples of one ray."""
+def colour_inputs(
+    bound: Bound, name: str, direction: Vector, condition: FrameCondition
+) -> Features:
+    """What the colour branch of one level reads, the same along a ray."""
     one = template_of(bound.spec, name)
-    colour_inputs = []
+    inputs = []
     if one.direction is not None:
-        colour_inputs.append(encoding.encode(one.direction, ray.direction, None))
-    colour_inputs += [
+        inputs.append(encoding.encode(one.direction, direction, None))
+    inputs += [
         effect.condition(bound.own(effect), condition)
         for effect in bound.effects
         if effect.condition is not None
     ]
-    colour_inputs = jnp.concatenate([*colour_inputs, jnp.zeros(0, ray.direction.dtype)])
-    net = bound.params["template"][name]
+    return jnp.concatenate([*inputs, jnp.zeros(0, direction.dtype)])
+
+
+def radiance_at(
+    bound: Bound,
+    name: str,
+    place: tuple[Vector, tuple[Features, ...]],
+    inputs: Features,
+    condition: FrameCondition,
+    noise: Scalar | None = None,
+) -> template.Radiance:
+    """What the template of one level says where it is asked, by `asked_at`."""
+    warped, lifted = place
+    one, net = template_of(bound.spec, name), bound.params["template"][name]
+    encoded = template.encode(one, net, warped, condition.step)
+    features = jnp.concatenate([encoded, *lifted])
+    return template.apply(one, net, features, inputs, noise)
+
+
+def _radiance(bound, name, ray, condition, samples, noise):
+    """What the template of one level says at the samples of one ray."""
+    inputs = colour_inputs(bound, name, ray.direction, condition)
 
     def ask(warped, lifted, noise):
-        encoded = template.encode(one, net, warped, condition.step)
-        features = jnp.concatenate([encoded, *lifted])
-        return template.apply(one, net, features, colour_inputs, noise)
+        return radiance_at(bound, name, (warped, lifted), inputs, condition, noise)
 
     return jax.vmap(ask, (0, 0, None if noise is None else 0))(
         samples.warped, samples.lifted, noise

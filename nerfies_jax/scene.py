@@ -2,6 +2,7 @@
 
 import functools
 import math
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -14,7 +15,7 @@ from nerfies_jax.capture.capture import Capture
 from nerfies_jax.effects import transient
 from nerfies_jax.effects.effect import Batch, Box, RayOutput
 from nerfies_jax.evidence import usable_paths
-from nerfies_jax.field import Field, field
+from nerfies_jax.field import Codes, Field, field
 from nerfies_jax.geometry import rays
 from nerfies_jax.nets import codes
 from nerfies_jax.scene_metadata import SceneMetadata
@@ -32,6 +33,7 @@ from nerfies_jax.training.effects import (
 from nerfies_jax.training.model import (
     Frames,
     Model,
+    Surveyed,
     TrainState,
     View,
     in_default_precision,
@@ -59,6 +61,7 @@ def build(
     the capture does not have.
     """
     radiance = field(spec, metadata, effects=effects)
+    codes_at = radiance.codes_at
     if spec.background is not None and "points" not in metadata.available_data:
         raise ValueError(
             "the background effect holds static points still, and this capture has "
@@ -66,10 +69,6 @@ def build(
         )
 
     devices = data_parallel.device_count(spec.micro_batches)
-
-    def whole_frame(params, view: View, size, step):
-        view_codes = radiance.codes_at(params, view)
-        return radiance.render(params, view.camera, view.time, view_codes, size, step)
 
     def init(capture, key):
         codes.check_ids(
@@ -98,13 +97,33 @@ def build(
         spec=(spec, metadata, *(effect.name for effect in effects)),
         init=init,
         step=_stepper(spec, radiance, devices),
-        render=whole_frame,
         events=(),
+        **drawing(radiance, lambda params, view: (view, codes_at(params, view))),
         counts=count_parameters,
         required_data=read,
         example=example,
         devices=devices,
     )
+
+
+def drawing(radiance: Field, seen: Callable[..., tuple[View, Codes]]) -> dict[str, Any]:
+    """How a model draws a field: its `render` and `surveyed`.
+
+    `seen(params, what is to be drawn)` is a view and the codes of its frame.
+    """
+
+    def render(params, given, size, step):
+        view, frame_codes = seen(params, given)
+        return radiance.render(params, view.camera, view.time, frame_codes, size, step)
+
+    def draw(params, occupied, given, size, step):
+        view, frame_codes = seen(params, given)
+        return radiance.render_occupied(
+            params, occupied, view.camera, view.time, frame_codes, size, step
+        )
+
+    surveyed = None if radiance.survey is None else Surveyed(radiance.survey, draw)
+    return {"render": render, "surveyed": surveyed}
 
 
 def _stepper(spec, radiance, devices):

@@ -55,20 +55,19 @@ def without_effects(
             "preset that has them, as nerf-w or nerfies"
         )
 
-    def plain(params, view, size, step):
-        codes = field.codes_at(params, view)
-        return field.render(params, view.camera, view.time, codes, size, step)
+    def plain(params, view):
+        return view, field.codes_at(params, view)
 
-    def blend(params, between, size, step):
+    def blend(params, between):
         view, share = between.view, between.share
         start = field.codes_at(params, view)
         end = field.codes_at(params, view._replace(appearance=between.towards))
         # Codes of the moment are the same at both ends and stay as they are.
         codes = {name: (1 - share) * start[name] + share * end[name] for name in start}
-        return field.render(params, view.camera, view.time, codes, size, step)
+        return view, codes
 
-    render = blend if blended else plain
-    return scene.build(spec, metadata, effects)._replace(render=render, stages=None)
+    model = scene.build(spec, metadata, effects)
+    return model._replace(**scene.drawing(field, blend if blended else plain))
 
 
 def appearance_id(capture: Capture, name: str) -> int:

@@ -8,7 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nerfies_jax.training.model import Model, Rendering, TrainState, View
+from nerfies_jax.training.model import (
+    Model,
+    Rendering,
+    Surveyed,
+    TrainState,
+    View,
+)
 
 
 class Renderer:
@@ -16,7 +22,7 @@ class Renderer:
 
     Where the model is drawn in stages, what stays as it was is not computed again:
     the first stage as long as the parameters are the very same arrays, the second for
-    all views of the same instant.
+    all views of the same instant. A survey, too, is kept with the parameters.
     """
 
     def __init__(self, model: Model, size: tuple[int, int]):
@@ -34,8 +40,7 @@ class Renderer:
         inputs = state.params, view, state.step
         shapes = tuple(jax.typeof(leaf) for leaf in jax.tree.leaves(inputs))
         if shapes not in self._programs:
-            compiled = _whole if self._model.stages is None else _staged
-            self._programs[shapes] = compiled(self._model, self.size, inputs)
+            self._programs[shapes] = _compiled(self._model, self.size, inputs)
         start, cpu_start = time.perf_counter(), time.process_time()
         rendering, anew = self._draw(self._programs[shapes], *inputs)
         rendering = jax.device_get(rendering)
@@ -46,6 +51,13 @@ class Renderer:
 
     def _draw(self, programs, params, view, step):
         """The picture, and whether what is in it had to be deformed for it."""
+        if isinstance(programs, Surveyed):
+            known, _ = self._prepared.get(
+                params,
+                np.asarray(step).tobytes(),
+                lambda: programs.survey(params, step),
+            )
+            return programs.draw(params, known, view, step), True
         if self._model.stages is None:
             return programs(params, view, step), True
         prepared, _ = self._prepared.get(params, None, lambda: programs.prepare(params))
@@ -107,6 +119,23 @@ class _Programs(NamedTuple):
 def _float32(rendering):
     """A picture needs no more, whatever precision it was computed in."""
     return jax.tree.map(lambda leaf: leaf.astype(jnp.float32), rendering)
+
+
+def _compiled(model, size, inputs):
+    if model.surveyed is not None:
+        return _surveyed(model, size, inputs)
+    return (_whole if model.stages is None else _staged)(model, size, inputs)
+
+
+def _surveyed(model, size, inputs):
+    params, view, step = inputs
+
+    def draw(params, known, view, step):
+        return _float32(model.surveyed.draw(params, known, view, size, step))
+
+    survey = jax.jit(model.surveyed.survey).lower(params, step)
+    drawn = jax.jit(draw).lower(params, survey.out_info, view, step)
+    return Surveyed(survey.compile(), drawn.compile())
 
 
 def _whole(model, size, inputs):

@@ -99,6 +99,17 @@ class Stages(NamedTuple):
     draw: Callable[[PyTree, PyTree, View, tuple[int, int], Int[Array, ""]], Rendering]
 
 
+class Surveyed(NamedTuple):
+    """`Model.render` for pictures, which need no slopes, once space is surveyed.
+
+    `draw(params, survey(params, step), view, size, step)` is what `render` gives but
+    for a small, tested difference.
+    """
+
+    survey: Callable[[PyTree, Int[Array, ""]], PyTree]  # once for trained parameters
+    draw: Callable[[PyTree, PyTree, View, tuple[int, int], Int[Array, ""]], Rendering]
+
+
 class Model(NamedTuple):
     """A representation: pure functions closed over a static spec."""
 
@@ -113,6 +124,7 @@ class Model(NamedTuple):
     # Which of "depths", "points", "flow" it reads, where a capture has them.
     required_data: frozenset[str] = frozenset()
     stages: Stages | None = None  # where rendering has parts worth keeping
+    surveyed: Surveyed | None = None  # where a survey makes pictures quicker
     # As `init`, of the same structure and quicker: what a checkpoint is read into.
     example: Callable[[Any, Any], TrainState] | None = None
     devices: int = 1  # on which `step` works, by `data_parallel`

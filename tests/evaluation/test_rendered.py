@@ -11,7 +11,7 @@ import skimage.metrics
 from gaussians_jax import scene
 from nerfies_jax import evaluation
 from nerfies_jax.geometry import camera as cameras
-from nerfies_jax.training.model import Model, Rendering, Stages, TrainState
+from nerfies_jax.training.model import Model, Rendering, Stages, Surveyed, TrainState
 from tests import scenes
 
 SIZE = (40, 30)
@@ -140,6 +140,33 @@ def test_a_renderer_keeps_what_stays_and_drops_what_changes():
         assert drawn(equal, here) == (1, 1, 1)
         assert drawn(params, later) == (1, 1, 1)
     assert renderer.deformed_anew == [True, False, False, *[True] * 8]
+
+
+def test_a_survey_is_made_once_for_trained_parameters_and_their_step():
+    surveyed = []
+
+    def survey(params, step):
+        jax.debug.callback(lambda: surveyed.append(None))
+        return params + step.astype(params.dtype)
+
+    def draw(params, known, view, size, step):
+        return flat(known - step.astype(params.dtype), view, size, step)
+
+    model = MODEL._replace(render=None, surveyed=Surveyed(survey, draw))
+    renderer, view = (
+        evaluation.Renderer(model, SIZE),
+        evaluation.view_of(scenes.tiny_capture(), 0),
+    )
+    first, other = jnp.asarray(0.1), jnp.asarray(0.1)
+    for number, (params, step) in enumerate(
+        [(first, 0), (first, 0), (first, 7), (other, 7), (other, 7)]
+    ):
+        state = TrainState(params, (), (), jnp.int32(step), None)
+        picture = renderer(state, view).colour
+        expected = 0.1 + float(view.time) / 10 + step / 100
+        np.testing.assert_allclose(picture, expected, atol=1e-6)
+        jax.effects_barrier()
+        assert len(surveyed) == [1, 1, 2, 3, 3][number]
 
 
 def test_nothing_is_kept_of_arrays_that_can_be_written_into():

@@ -1,0 +1,149 @@
+"""A frame behind its occupancy is the frame of the full quadrature."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from nerfies_jax import evaluation, scene, skipping, variants
+from nerfies_jax.effects.ambient import AmbientSpec
+from nerfies_jax.effects.appearance import AppearanceSpec
+from nerfies_jax.effects.transient import TransientSpec
+from nerfies_jax.effects.warp import WarpSpec
+from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.nets.grids import HashGridSpec
+from nerfies_jax.radiance import occupancy
+from nerfies_jax.radiance.template import TemplateSpec
+from nerfies_jax.scene import RadianceScene
+from nerfies_jax.spec import SamplingSpec
+from tests import scenes
+
+SIZE = (23, 17)
+STEP = jnp.int32(30)
+GRID = TemplateSpec(
+    HashGridSpec(levels=1, coarsest=8, finest=8),
+    EncodingSpec(1),
+    depth=1,
+    width=8,
+    skips=(),
+    colour_width=8,
+    density="exp",
+    density_bias=-12.0,
+)
+STILL = RadianceScene(
+    steps=30, template=GRID, sampling=SamplingSpec(10, 7), learning_rate=5e-3
+)
+MOVING = dataclasses.replace(
+    STILL,
+    sampling=SamplingSpec(8, 9, shared=True),
+    appearance=AppearanceSpec(2),
+    warp=WarpSpec(position=EncodingSpec(2), depth=1, width=8, skips=()),
+    ambient=AmbientSpec(depth=1, width=8, skips=(), closed_steps=1, anneal_steps=9),
+)
+ONE_LEVEL = dataclasses.replace(STILL, sampling=SamplingSpec(24, 0))
+
+
+@functools.cache
+def full_of_holes(spec, background):
+    """A model and parameters of things and gaps, as large as a cell of the grid."""
+    capture = scenes.tiny_capture()
+    metadata = dataclasses.replace(
+        scene.metadata_of(capture, spec), background=background
+    )
+    field = scene.field(spec, metadata)
+    params = jax.jit(field.init)(jax.random.key(7))
+    if spec.warp is not None:  # motions of a tenth of the box, not of 1e-4
+        params["warp"] = jax.tree.map(lambda x: 3 * x, params["warp"])
+        params["codes"] = jax.tree.map(lambda x: 20 * x, params["codes"])
+    params["template"] = {
+        name: net._replace(tables=jax.tree.map(lambda x: 4e5 * x, net.tables))
+        for name, net in params["template"].items()
+    }
+    return scene.build(spec, metadata), params
+
+
+ORANGE = (1.0, 0.5, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("spec", "background"),
+    [(STILL, None), (MOVING, ORANGE), (ONE_LEVEL, ORANGE)],
+    ids=["still", "moving", "one level"],
+)
+def test_skipping_changes_a_frame_by_no_more_than_it_may(spec, background):
+    model, params = full_of_holes(spec, background)
+    view = evaluation.view_of(scenes.tiny_capture(), 3)
+    occupied = jax.jit(model.surveyed.survey)(params, STEP)
+    assert all(0.02 < cells.mean() < 0.8 for cells in occupied.values())
+    draw = jax.jit(model.surveyed.draw, static_argnums=3)
+    skipped = draw(params, occupied, view, SIZE, STEP)
+    whole = jax.jit(model.render, static_argnums=2)(params, view, SIZE, STEP)
+    assert 0.1 < whole.alpha.mean() < 0.98
+    most = skipping.SKIPPED_DEPTH + np.exp(-skipping.OPAQUE_DEPTH)
+    for name in ("colour", "alpha"):
+        error = np.abs(getattr(skipped, name) - getattr(whole, name))
+        assert np.sqrt(np.mean(error**2)) < most, name  # 39 dB
+        if not spec.sampling.fine:  # else samples move where coarse weights change
+            assert error.max() < most, name
+    span = model.spec[1].far - model.spec[1].near
+    seen = whole.alpha > 0.5
+    assert np.abs(skipped.depth - whole.depth)[seen].mean() < most * span
+    # Were nothing occupied, samples would be skipped that the picture is made of.
+    nothing = jax.tree.map(jnp.zeros_like, occupied)
+    bare = draw(params, nothing, view, SIZE, STEP)
+    assert np.abs(bare.colour - whole.colour).max() > 10 * most
+
+
+@pytest.mark.parametrize("pixels", [SIZE, (40, 30)])
+def test_a_frame_does_not_depend_on_how_it_is_cut(pixels, monkeypatch):
+    """Blocks, stages and batches are of memory alone."""
+    model, params = full_of_holes(MOVING, ORANGE)
+    view = evaluation.view_of(scenes.tiny_capture(), 3)
+    occupied = jax.jit(model.surveyed.survey)(params, STEP)
+    pictures = []
+    for block, batch, stages in ((16384, 2048, 4), (100, 37, 1)):
+        for name, value in (("BLOCK", block), ("BATCH", batch), ("STAGES", stages)):
+            monkeypatch.setattr(skipping, name, value)
+        draw = jax.jit(functools.partial(model.surveyed.draw), static_argnums=3)
+        pictures.append(draw(params, occupied, view, pixels, STEP))
+    limit = np.exp(-skipping.OPAQUE_DEPTH)
+    np.testing.assert_allclose(pictures[0].colour, pictures[1].colour, atol=limit)
+
+
+def test_a_survey_finds_a_small_thing_whichever_cell_it_is_in():
+    """Points of a cell lie in it, and what touches it is occupied as well."""
+    cells = 12
+    index = jnp.arange(cells**3, dtype=jnp.int32)
+    for number in range(3):
+        key = jax.random.key(number)
+        point = occupancy.random_points(key, index, cells, 0.3, jnp.float32)
+        assert np.abs(point).max() > 0.5  # up to twice the half-side
+        for one in (0, 777, cells**3 - 1):
+            only = jnp.zeros(cells**3, bool).at[one].set(True)
+            grid = only.reshape((cells,) * 3)
+            np.testing.assert_array_equal(occupancy.at(grid, point, 0.3), only)
+            around = occupancy.dilated(grid)
+            near = np.abs(
+                np.stack(np.unravel_index(index, (cells,) * 3))
+                - np.stack(np.unravel_index(one, (cells,) * 3))[:, None]
+            )
+            np.testing.assert_array_equal(around.ravel(), near.max(axis=0) <= 1)
+    far = jnp.asarray([[0.61, 0.0, 0.0], [0.0, -9.0, 0.1]])
+    assert occupancy.at(jnp.zeros((cells,) * 3, bool), far, 0.3).all()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"transient": TransientSpec(depth=1, width=8)}, {"extent": None}],
+    ids=["transient", "no extent"],
+)
+def test_without_a_survey_a_frame_is_the_full_quadrature(change):
+    spec = dataclasses.replace(STILL, **change)
+    metadata = scene.metadata_of(scenes.tiny_capture(), spec)
+    assert scene.build(spec, metadata).surveyed is None
+    if spec.transient is not None:  # what is left can be surveyed
+        static = variants.without_effects(spec, metadata, ("transient",), False)
+        assert static.surveyed is not None
