@@ -29,6 +29,7 @@ MARGINS = (
     Margin(
         "Sonata", HYPERNERF, 25.78, 22.40, "sonata-small", "splats-deformable-small"
     ),
+    Margin("Sonata", HYPERNERF, 25.78, 25.43, "sonata-small", "e-d3dgs-small"),
     Margin("Sonata", HYPERNERF, 25.78, 25.17, "sonata-small", "4dgs-small"),
     Margin("Sonata", HYPERNERF, 25.78, 22.29, "sonata-small", "hypernerf-small"),
     Margin("Sonata", HYPERNERF, 25.78, 22.23, "sonata-small", "nerfies-small"),

@@ -275,8 +275,7 @@ def effect(spec: EmbeddingMotionSpec, steps: int, frames: int) -> Effect:
     )
 
 
-# With half as many frames as the built-in scene has, 30 codes: the coarse network reads
-# six, the fine one six to 30.
+# 30 codes for the built-in scene: the coarse network reads six, the fine one six to 30.
 SMALL_EMBEDDING_MOTION = EmbeddingMotionSpec(
     time_code=16, width=64, waves=2.0, spread=0.5, grow_until=1300
 )
