@@ -45,6 +45,7 @@ class Paths(NamedTuple):
     position: Float[np.ndarray, "points frames 3"]  # scene units
     known: Bool[np.ndarray, "points frames"]
     unit: float  # a typical distance of the scene, scene units
+    still: Float[np.ndarray, "still 3"] | None = None  # points at rest, scene units
 
 
 class Guess(NamedTuple):
@@ -150,7 +151,7 @@ def fit(
     nothing. The guess's penalty is added to the mean distance over the unit. ValueError
     where no place is known.
     """
-    times, position, known, unit = paths
+    times, position, known, unit, _ = paths
     if not known.any():
         raise ValueError("no path is known anywhere: nothing to fit a motion to")
     start, rates, penalty = guess(effect, paths, key)

@@ -14,6 +14,7 @@ from gaussians_jax.effects.mlp_motion import MotionSpec
 from gaussians_jax.effects.motion_basis import SMALL_BASIS_MOTION, BasisMotionSpec
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec
 from gaussians_jax.effects.neighbours import NeighbourSpec
+from gaussians_jax.effects.node_motion import SMALL_NODE_MOTION, NodeMotionSpec
 from gaussians_jax.effects.plane_motion import SMALL_PLANE_MOTION, PlaneMotionSpec
 from gaussians_jax.effects.polynomial_motion import PolynomialMotionSpec
 from gaussians_jax.effects.se3_bases import SE3BasesSpec
@@ -122,6 +123,15 @@ FOUR_D = SplatScene(
     motion=PlaneMotionSpec(),
 )
 
+# SC-GS: 512 nodes and 80,000 steps. Its first 10,000 steps, which train the nodes as
+# Gaussians, are replaced by a start from tracks.
+SC_GS = SplatScene(
+    steps=80_000,
+    init=InitSpec(points=50_000),
+    motion=NodeMotionSpec(),
+    start=StartSpec(motion="tracks", moving_points=20_000),
+)
+
 # For a CPU: the same parts with fewer Gaussians, a smaller network, a shorter run.
 # Measured on the built-in scene at 2000 steps (held-out PSNR and SSIM, one seed):
 #   motion from 10 % of the run on, network rate 2e-3   18.20 / 0.466, worse than static
@@ -199,6 +209,10 @@ SMALL_FOUR_D = dataclasses.replace(
     SMALL_TRACKED,
     motion=dataclasses.replace(SMALL_PLANE_MOTION, warm_up=600),
 )
+SMALL_SC_GS = dataclasses.replace(
+    SMALL_TRACKED,
+    motion=dataclasses.replace(SMALL_NODE_MOTION, warm_up=600),
+)
 SMALL_DEFORMABLE = dataclasses.replace(
     SMALL_STATIC,
     motion=MotionSpec(
@@ -272,6 +286,7 @@ PRESETS = {
     "spacetime": SPACETIME,
     "spline": SPLINE,
     "4dgs": FOUR_D,
+    "sc-gs": SC_GS,
     "splats-static-small": SMALL_STATIC,
     "splats-tracked-small": SMALL_TRACKED,
     "splats-mcmc-small": SMALL_MCMC,
@@ -282,6 +297,7 @@ PRESETS = {
     "spacetime-small": SMALL_SPACETIME,
     "spline-small": SMALL_SPLINE,
     "4dgs-small": SMALL_FOUR_D,
+    "sc-gs-small": SMALL_SC_GS,
 }
 
 

@@ -230,7 +230,9 @@ def _gradients(spec, metadata, effects, state, frames, row, condition):
     degree = splats.active_degree(state.step, spec.sh_every, spec.sh_degree)
 
     def deform(params, gaussians):
-        return deformation.deform_in_training(effects, params, gaussians, condition)
+        return deformation.deform_in_training(
+            effects, params, gaussians, condition, state.aux_state.effects
+        )
 
     if spec.alternation is not None:
         mask = phases.update_mask(spec.alternation, state.step)
@@ -356,6 +358,9 @@ def first_state(spec, effects, optimiser, capture, key) -> TrainState:
             params.rows[effect.name] = effect.init_rows(rows_key, rows)
         if effect.init is not None:
             params.nets[effect.name] = effect.init(nets_key)
+        if effect.place is not None:
+            placed = effect.place(params.nets[effect.name], rows)
+            params.nets[effect.name] = placed
     if tracked is not None:
         params = track_start.put_in(params, effects[0], tracked)
     params = splats.pad_rows(params, splats.capacity_for(count, most))

@@ -12,6 +12,7 @@ from gaussians_jax.effects import (
     motion_basis,
     motion_growth,
     neighbours,
+    node_motion,
     plane_motion,
     polynomial_motion,
     se3_bases,
@@ -27,6 +28,7 @@ from gaussians_jax.effects.mlp_motion import MotionSpec
 from gaussians_jax.effects.motion_basis import BasisMotionSpec
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec
 from gaussians_jax.effects.neighbours import NeighbourSpec
+from gaussians_jax.effects.node_motion import NodeMotionSpec
 from gaussians_jax.effects.plane_motion import PlaneMotionSpec
 from gaussians_jax.effects.polynomial_motion import PolynomialMotionSpec
 from gaussians_jax.effects.se3_bases import SE3BasesSpec
@@ -52,6 +54,7 @@ AnyMotion = (
     | PolynomialMotionSpec
     | SplineMotionSpec
     | PlaneMotionSpec
+    | NodeMotionSpec
 )
 # Motions with a vector for each Gaussian that neighbours may be kept alike in.
 EMBEDDED = {KanMotionSpec: kan_motion.NAME, TimeBasisSpec: time_basis.NAME}
@@ -166,6 +169,9 @@ MOTIONS = {
     ),
     PlaneMotionSpec: lambda spec, steps, seen: plane_motion.effect(
         spec, steps, seen.extent, seen.box
+    ),
+    NodeMotionSpec: lambda spec, steps, seen: node_motion.effect(
+        spec, steps, seen.extent
     ),
 }
 

@@ -234,7 +234,7 @@ def from_points(
             )
     if not 0 < scale < math.inf:
         raise ValueError(f"the first scale must be positive and finite, got {scale}")
-    distance = _neighbour_distance(points, lone_scale)
+    distance = neighbour_distance(points, lone_scale)
     log_scale = np.clip(np.log(scale * distance), *LOG_SCALE_RANGE)
     count, rest = len(points), (degree + 1) ** 2 - 1
     return Splats(
@@ -247,8 +247,13 @@ def from_points(
     )
 
 
-def _neighbour_distance(points, lone_scale):
-    """Root mean square distance to the three nearest points that lie elsewhere."""
+def neighbour_distance(
+    points: Float[np.ndarray, "points 3"], lone_scale: float
+) -> Float[np.ndarray, " points"]:
+    """Root mean square distance to the three nearest points that lie elsewhere.
+
+    Of two or three points, to those there are; of one, `lone_scale`. Host side.
+    """
     # Distinct in float32, the precision they are trained in.
     distinct, place = np.unique(points.astype(np.float32), axis=0, return_inverse=True)
     neighbours = min(3, len(distinct) - 1)

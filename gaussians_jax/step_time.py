@@ -129,7 +129,9 @@ def _sum_of_effect(effect, effects, params, observation, condition, state):
     total = jnp.zeros(())
     if effect.deform is not None:
         gaussians = splats.activate(params.rows["splats"])
-        moved = deformation.deform_in_training((effect,), params, gaussians, condition)
+        moved = deformation.deform_in_training(
+            (effect,), params, gaussians, condition, {effect.name: state}
+        )
         total += sum(jnp.sum(leaf) for leaf in moved)
     context = PenaltyContext(
         condition=condition,

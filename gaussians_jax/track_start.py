@@ -57,9 +57,10 @@ def start(
     position, known = usable_paths.known_paths(evidence)
     times = capture.times[evidence.row].astype(np.float32)
     unit = usable_paths.scene_unit(evidence)
+    still = np.asarray(evidence.still.position, np.float32)
     fitted = path_fit.fit(
         effect,
-        Paths(times, position.astype(np.float32), known, unit),
+        Paths(times, position.astype(np.float32), known, unit, still),
         key,
         rate=spec.fit_rate,
         steps=spec.fit_steps,

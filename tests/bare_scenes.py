@@ -23,6 +23,7 @@ from gaussians_jax import learning_rates as splat_rates
 from gaussians_jax import presets as splat_presets
 from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec
+from gaussians_jax.effects.node_motion import NodeMotionSpec
 from gaussians_jax.effects.plane_motion import PlaneMotionSpec
 from gaussians_jax.effects.se3_bases import SE3BasesSpec
 from gaussians_jax.effects.time_basis import TimeBasisSpec
@@ -126,6 +127,9 @@ def tiny_splats(name):
         motion = shrunk(motion, position=FEW, time=FEW, depth=1, width=8, skips=())
     elif isinstance(motion, SE3BasesSpec):
         motion = shrunk(motion, bases=2, knots=3)
+    elif isinstance(motion, NodeMotionSpec):
+        few = {"position": FEW, "time": FEW, "depth": 1, "width": 8, "skips": ()}
+        motion = shrunk(motion, nodes=6, links=2, **few)
     elif isinstance(motion, PlaneMotionSpec):
         few = shrunk(motion.planes, vertices=4, multiples=(1, 2), moments=3, features=2)
         motion = shrunk(motion, planes=few, width=8)

@@ -12,6 +12,7 @@ from gaussians_jax.effects import (
     motion_basis,
     motion_growth,
     neighbours,
+    node_motion,
     plane_motion,
     polynomial_motion,
     se3_bases,
@@ -57,6 +58,7 @@ MOTION_MODULES = {
     polynomial_motion.PolynomialMotionSpec: polynomial_motion,
     spline_motion.SplineMotionSpec: spline_motion,
     plane_motion.PlaneMotionSpec: plane_motion,
+    node_motion.NodeMotionSpec: node_motion,
 }
 BY_FRAMES = {  # the others ask for the scene's extent
     mlp_motion.MotionSpec,

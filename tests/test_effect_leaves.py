@@ -14,6 +14,7 @@ from gaussians_jax.effects import (
     kan_motion,
     mlp_motion,
     motion_basis,
+    node_motion,
     plane_motion,
     se3_bases,
     spectral,
@@ -21,6 +22,7 @@ from gaussians_jax.effects import (
 )
 from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec
+from gaussians_jax.effects.node_motion import NodeMotionSpec
 from gaussians_jax.effects.plane_motion import PlaneMotionSpec
 from gaussians_jax.effects.polynomial_motion import PolynomialMotionSpec
 from gaussians_jax.effects.se3_bases import SE3BasesSpec
@@ -146,6 +148,9 @@ def test_splats_have_the_arrays_of_what_they_have_and_no_others(preset):
         elif isinstance(motion, TimeBasisSpec):
             rows.add("time_basis")
             nets["time_basis"] = time_basis.init(key, motion)
+        elif isinstance(motion, NodeMotionSpec):
+            nets["node_motion"] = node_motion.init(key, motion)
+            states.add("node_motion")
         elif isinstance(motion, PlaneMotionSpec):
             nets["plane_motion"] = plane_motion.init(key, motion)
         elif isinstance(motion, PolynomialMotionSpec):

@@ -42,19 +42,29 @@ def deform(
 
 
 def deform_in_training(
-    effects: Effects, params: Params, gaussians: Gaussians, condition: FrameCondition
+    effects: Effects,
+    params: Params,
+    gaussians: Gaussians,
+    condition: FrameCondition,
+    states: dict[str, PyTree] | None = None,
 ) -> Gaussians:
     """`gaussians` as they are at a moment of training.
 
-    An effect is not evaluated before its warm-up is over: under the loop's scan the
-    switch is a branch, and such a step costs what it costs without the effect.
+    `states` are those of effects that are `ready_by_state`; without them these are
+    prepared anew. An effect is not evaluated before its warm-up is over: under the
+    loop's scan the switch is a branch, and such a step costs what it costs without the
+    effect.
     """
     for effect in effects:
         if effect.deform is None:
             continue
 
         def moved(params, gaussians, effect=effect):
-            ready = None if effect.prepare is None else effect.prepare(params)
+            ready = None
+            if effect.ready_by_state and states is not None:
+                ready = states[effect.name]
+            elif effect.prepare is not None:
+                ready = effect.prepare(params)
             return effect.deform(params, gaussians, condition, ready)
 
         if not effect.warm_up:

@@ -127,7 +127,7 @@ def deform(
 
 def fit_to_paths(spec: SE3BasesSpec, paths: Paths) -> Guess:
     """Groups of points that move as rigid bodies, a basis for each; host side."""
-    times, position, known, unit = paths
+    times, position, known, unit, _ = paths
     canonical_frame = len(times) // 2
     label = rigid_groups.labels(position, known, spec.bases)
     bodies = rigid_groups.motion(position, known, label, canonical_frame)

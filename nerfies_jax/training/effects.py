@@ -42,10 +42,12 @@ SPLAT_SEAMS = (
     "init_rows",
     "row_learning_rate",
     "warm_up",
+    "place",
     "prepare",
     "deform",
     "fit_to_paths",
     "state",
+    "ready_by_state",
     "update_state",
     "grow_score",
     "expose",
@@ -147,6 +149,9 @@ class Effect(NamedTuple):
     # (key, `splats.Splats`) -> leaves with a row for each Gaussian
     init_rows: Callable[[Key[Array, ""], Any], PyTree] | None = None
     row_learning_rate: Schedule | None = None  # needed where there are rows
+    # (what `init` returned, `splats.Splats`) -> the same, put where the first Gaussians
+    # are; host side
+    place: Callable[[PyTree, Any], PyTree] | None = None
     warm_up: int = 0  # steps before which it does not deform
     # scene -> what stays as it is while the parameters do, whatever the time
     prepare: Callable[[Any], PyTree] | None = None
@@ -161,6 +166,9 @@ class Effect(NamedTuple):
     # scene -> state, arrays only; host side, at the start and after every change of the
     # rows, up to the next
     state: Callable[[Any], PyTree] | None = None
+    # Whether in training `deform` gets the state for what `prepare` returns: where that
+    # is dear, and good enough until the rows change.
+    ready_by_state: bool = False
     # (state, canonical `Gaussians`, moved, condition) -> state; pure, in every step
     update_state: Callable[[PyTree, Any, Any, FrameCondition], PyTree] | None = None
     # (state, step) -> [rows] factor of the gradient that the density control compares

@@ -29,6 +29,7 @@ MOTIONS = {
     "polynomial": presets.SMALL_SPACETIME.motion,
     "spline": presets.SMALL_SPLINE.motion,
     "planes": presets.SMALL_FOUR_D.motion,
+    "nodes": presets.SMALL_SC_GS.motion,
 }
 BOX = ((-1.0, -1.0, 0.0), (1.0, 1.0, 2.0))
 

@@ -1,0 +1,282 @@
+"""Motion of all Gaussians by a few control nodes that a network moves as rigid bodies.
+
+SC-GS (Huang et al. 2024, CVPR, arXiv:2312.14937, "Sparse-Controlled Gaussian
+Splatting"): nodes with a place and a radius of influence, a network that makes a turn
+and a shift of each node and the time, and linear blend skinning from the nodes near a
+Gaussian (`effects.skinning`). Nodes that stay near each other are asked to move as one
+rigid body. The network is asked for the nodes alone, so it costs the same however many
+Gaussians there are.
+
+What is not as in the paper: turns are rotation vectors, where it has quaternions; which
+nodes are near is found when rows change and not in every step; the rigid term is a mean
+and not a sum, over a fixed number of links and not those within a radius; and nodes
+start among the first Gaussians, or from tracks half on what moves and half on what is
+at rest, where the paper first trains them as Gaussians of their own. The published
+code's further coordinates of nodes and Gaussians are not there.
+"""
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key
+
+from gaussians_jax import path_fit, splats
+from gaussians_jax.effects import skinning
+from gaussians_jax.effects.skinning import Links, Moves
+from gaussians_jax.path_fit import Guess, Paths, Points
+from gaussians_jax.splats import Gaussians, Params, Splats
+from nerfies_jax.evidence import rigid_groups
+from nerfies_jax.geometry import quaternion
+from nerfies_jax.nets import encoding, mlp
+from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
+from nerfies_jax.training import schedules
+from nerfies_jax.training.effects import Effect, FrameCondition, PenaltyContext, Term
+from nerfies_jax.training.step_counts import steps
+
+NAME = "node_motion"
+MOMENTS = 8  # of the film, at which the paths of nodes are compared
+# Of a start from tracks: bodies by which paths are brought to one moment, and what the
+# motion of nodes at rest costs in the fit, one length of the scene costing one.
+BODIES, REST = 8, 1.0
+
+
+@dataclasses.dataclass(frozen=True)
+class NodeMotionSpec:
+    """How many nodes, how many carry a Gaussian, and the network that moves them.
+
+    Nodes, nearest nodes and the network are the paper's; the number of links and the
+    weight of the rigid term, of squared scene extents, are our choice. `moving_share`
+    of the nodes lie on what moves where a motion starts from tracks. Rates of places
+    and the answers of the network are in scene extents.
+    """
+
+    nodes: int = 512
+    near: int = 3  # nodes that carry a Gaussian
+    position: EncodingSpec = EncodingSpec(10)
+    time: EncodingSpec = EncodingSpec(10)
+    depth: int = 8
+    width: int = 256
+    skips: tuple[int, ...] = (5,)  # layers that read the input again
+    links: int = 8  # of each node, to nodes that it is to be rigid with
+    rigidity: float | None = 0.1  # weight; None leaves it out
+    moving_share: float = 0.5
+    warm_up: int = steps(3000)  # steps without motion
+    learning_rate: float = 8e-4  # of the network
+    learning_rate_end: float = 1.6e-6
+    place_rate: float = 1.6e-4  # both fall as the network's does
+    radius_rate: float = 1e-3  # of the logarithm
+
+    def __post_init__(self):
+        for name in ("nodes", "near", "links"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}={getattr(self, name)} must be at least 1")
+        if self.rigidity is not None and not 0 <= self.rigidity < math.inf:
+            raise ValueError(
+                f"rigidity={self.rigidity} is a weight, finite and not negative; None "
+                "leaves it out"
+            )
+        if not 0 < self.moving_share <= 1:
+            raise ValueError(f"moving_share={self.moving_share} must lie in (0, 1]")
+        if self.warm_up < 0:
+            raise ValueError(f"warm_up={self.warm_up} must not be negative")
+        for name in ("place_rate", "radius_rate"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(
+                    f"{name}={getattr(self, name)} is finite and not negative"
+                )
+        schedules.check_falling(self.learning_rate, self.learning_rate_end)
+        network_spec(self)  # checks its sizes
+
+
+class Nodes(NamedTuple):
+    """What is trained of the nodes, and the network that moves them."""
+
+    position: Float[Array, "nodes 3"]  # scene units
+    log_radius: Float[Array, " nodes"]  # of the influence, scene units
+    network: MLP
+
+
+class Found(NamedTuple):
+    """What is found when rows change and kept until they do again."""
+
+    near: Int[Array, "gaussians near"]
+    links: Links | None  # None where nothing asks for them
+
+
+def network_spec(spec: NodeMotionSpec) -> MLPSpec:
+    """From [encoded place, encoded time] of a node to its turn and shift."""
+    heads = (("turn", HeadSpec(3, "small")), ("shift", HeadSpec(3, "small")))
+    inputs = spec.position.width(3) + spec.time.width(1)
+    return MLPSpec(inputs, spec.depth, spec.width, heads, spec.skips, "relu", "he")
+
+
+SMALL_NODE_MOTION = NodeMotionSpec(
+    nodes=128,
+    position=EncodingSpec(5),
+    time=EncodingSpec(6),
+    depth=4,
+    width=96,
+    skips=(2,),
+)
+
+
+def init(key: Key[Array, ""], spec: NodeMotionSpec, dtype=jnp.float32) -> Nodes:
+    """Nodes that hardly move anything yet, all at the origin until they are placed."""
+    return Nodes(
+        position=jnp.zeros((spec.nodes, 3), dtype),
+        log_radius=jnp.zeros(spec.nodes, dtype),
+        network=mlp.init(network_spec(spec), key, dtype),
+    )
+
+
+def placed(nodes: Nodes, position: Float[np.ndarray, "places 3"]) -> Nodes:
+    """The nodes at these places, each as wide as its neighbours are far; host side.
+
+    Fewer places than nodes are taken in turn: nodes that coincide share the influence.
+    """
+    count, kind = len(nodes.position), nodes.position.dtype
+    everywhere = position[np.arange(count) % len(position)]
+    radius = splats.neighbour_distance(everywhere, 1.0)
+    return nodes._replace(
+        position=jnp.asarray(everywhere, kind),
+        log_radius=jnp.asarray(np.log(radius), kind),
+    )
+
+
+def moves(
+    nodes: Nodes, spec: NodeMotionSpec, extent: float, time: Float[Array, ""]
+) -> Moves:
+    """How the nodes stand at a time; `extent` is the unit of shifts, scene units."""
+    place = jax.vmap(lambda one: encoding.encode(spec.position, one, None))
+    moment = encoding.encode(spec.time, time[None], None)
+    features = place(nodes.position)
+    moment = jnp.broadcast_to(moment, (len(features), len(moment)))
+    made = mlp.apply(
+        network_spec(spec), nodes.network, jnp.concatenate([features, moment], axis=1)
+    )
+    return Moves(jax.vmap(quaternion.exp)(made["turn"]), extent * made["shift"])
+
+
+def find(
+    nodes: Nodes, spec: NodeMotionSpec, extent: float, mean: Float[Array, "gaussians 3"]
+) -> Found:
+    """The nodes near each Gaussian, and which nodes stay near each other."""
+    near = skinning.nearest(mean, nodes.position, spec.near)
+    if spec.rigidity is None:
+        return Found(near, None)
+    moments = jnp.linspace(0, 1, MOMENTS, dtype=mean.dtype)
+    shifts = jax.vmap(lambda time: moves(nodes, spec, extent, time).shift)(moments)
+    paths = jnp.swapaxes(nodes.position + shifts, 0, 1)
+    return Found(near, skinning.links(paths, nodes.log_radius, spec.links))
+
+
+def unrigidity(
+    nodes: Nodes,
+    spec: NodeMotionSpec,
+    extent: float,
+    linked: Links,
+    times: tuple[Float[Array, ""], Float[Array, ""]],
+) -> Float[Array, ""]:
+    """How far linked nodes are from moving as one body, in squared extents."""
+    places = [nodes.position + moves(nodes, spec, extent, time).shift for time in times]
+    return skinning.bending(*(place / extent for place in places), linked)
+
+
+def fit_to_paths(
+    spec: NodeMotionSpec, extent: float, paths: Paths, key: Key[Array, ""]
+) -> Guess:
+    """Nodes spread over what moves and over what is at rest; host side.
+
+    Paths are brought to the middle of the film by the rigid bodies they belong to. The
+    network starts from no motion, and is asked for none at the nodes at rest.
+    """
+    times, position, known, unit, still = paths
+    canonical = _at_one_moment(position, known, len(times) // 2)
+    still = np.zeros((0, 3)) if still is None else np.asarray(still, np.float64)
+    moving = spec.nodes if not len(still) else round(spec.moving_share * spec.nodes)
+    moving_nodes = canonical[skinning.spread_out(canonical, max(moving, 1))]
+    resting = still[skinning.spread_out(still, spec.nodes - len(moving_nodes))]
+    nodes = placed(init(key, spec), np.concatenate([moving_nodes, resting]))
+    at_rest = slice(len(moving_nodes), len(moving_nodes) + len(resting))
+    moments = jnp.linspace(0, 1, MOMENTS, dtype=jnp.float32)
+
+    def penalty(points):
+        def unrest(time):
+            now = moves(points.nets, spec, extent, time)
+            turn, shift = now.turn[at_rest, 1:], now.shift[at_rest] / unit
+            total = jnp.sum(turn**2, axis=1) + jnp.sum(shift**2, axis=1)
+            return jnp.mean(jnp.sqrt(total + path_fit.SOFT**2))
+
+        return REST * jnp.mean(jax.vmap(unrest)(moments))
+
+    start = Points(jnp.asarray(canonical, jnp.float32), None, nodes)
+    rates = Points(unit, None, Nodes(0.0, 1.0, 0.4))
+    return Guess(start, rates, penalty if len(resting) else None)
+
+
+def _at_one_moment(position, known, frame):
+    label = rigid_groups.labels(position, known, BODIES)
+    bodies = rigid_groups.motion(position, known, label, frame)
+    return rigid_groups.centres(position, known, bodies)[0]
+
+
+def effect(spec: NodeMotionSpec, run_steps: int, extent: float) -> Effect:
+    """The seams that this motion fills, for a run of so many steps.
+
+    `extent`, in scene units, is the measure of shifts, as it is that of the means.
+    """
+    rate = schedules.log_linear(spec.learning_rate, spec.learning_rate_end, run_steps)
+
+    def rates(step):
+        now = rate(step)
+        share = now / spec.learning_rate
+        return Nodes(extent * spec.place_rate * share, spec.radius_rate * share, now)
+
+    def place(nodes, rows: Splats):
+        means = np.asarray(rows.mean)
+        return placed(nodes, means[skinning.spread_out(means, spec.nodes)])
+
+    def prepared(params: Params) -> Found:
+        means = params.rows["splats"].mean
+        near = skinning.nearest(means, params.nets[NAME].position, spec.near)
+        return Found(near, None)
+
+    @jax.jit
+    def found(params: Params) -> Found:
+        means = params.rows["splats"].mean
+        return find(params.nets[NAME], spec, extent, means)
+
+    def moved(
+        params: Params, gaussians: Gaussians, condition: FrameCondition, ready: Found
+    ) -> Gaussians:
+        nodes = params.nets[NAME]
+        now = moves(nodes, spec, extent, condition.time)
+        return skinning.carried(
+            nodes.position, nodes.log_radius, now, ready.near, gaussians
+        )
+
+    def penalty(nodes: Nodes, context: PenaltyContext) -> dict[str, Term]:
+        time = context.condition.time
+        times = time, jax.random.uniform(context.key, (), time.dtype)
+        linked = context.state.links
+        value = unrigidity(nodes, spec, extent, linked, times)
+        return {"unrigidity": Term(value, spec.rigidity)}
+
+    return Effect(
+        name=NAME,
+        init=lambda key: init(key, spec),
+        place=place,
+        learning_rate=rates,
+        penalty=None if spec.rigidity is None else penalty,
+        warm_up=spec.warm_up,
+        prepare=prepared,
+        deform=moved,
+        fit_to_paths=lambda paths, key: fit_to_paths(spec, extent, paths, key),
+        state=found,
+        ready_by_state=True,
+    )
