@@ -39,6 +39,7 @@ PRESETS = (
     "spline-small",
     "4dgs-small",
     "sc-gs-small",
+    "edgs-small",
 )
 # Effects that no preset has, as paths of --set, and the preset they are priced beside.
 BESIDE = {"splats-static-small": ("exposure.learning_rate=0.01",)}

@@ -5,7 +5,7 @@ import mpmath
 import numpy as np
 
 from experiments.hard_cases.case import Case, constant
-from gaussians_jax.effects import polynomial_motion, time_basis
+from gaussians_jax.effects import polynomial_motion, skinning, time_basis
 from nerfies_jax.nets import planes
 
 NEAR = 1e-6  # how close to a switch its two sides are tried, as a share of it
@@ -96,4 +96,47 @@ UNREST = Case(
     caught=(("float32", "slope"), ("float64", "slope")),
 )
 
-CASES = (SPARSITY, VISIBLE, UNREST)
+_ROW, _SLANT = np.array([0.0, 1.0, 2.0]), np.array([0.0, 0.125, -0.25])
+_AWAY = np.array([0, 0.1, 1, 5, 12, 14, 40, 100, 1e3, 1e4])
+_RADII = np.array([-30.0, -20 * (1 + NEAR), -20 * (1 - NEAR), -2.0, 0.0, 3.0])
+
+
+def _shares(x):
+    """Of three nodes a unit apart in a row, from some distance along it."""
+    row, slant = (constant(values, x.dtype) for values in (_ROW, _SLANT))
+    return skinning.weights(jnp.square(x[0] + row), x[1] + slant)
+
+
+def _quotients(x):
+    row, slant = (constant(values, x.dtype) for values in (_ROW, _SLANT))
+    near = jnp.exp(-jnp.square((x[0] + row) / jnp.exp(x[1] + slant)) / 2)
+    return near / jnp.sum(near)
+
+
+def _exact_shares(x):
+    scores = []
+    for place, slant in zip(_ROW, _SLANT, strict=True):
+        held = max(x[1] + mpmath.mpf(slant), mpmath.mpf(-20))
+        scores.append(-(((x[0] + mpmath.mpf(place)) * mpmath.exp(-held)) ** 2) / 2)
+    shares = [mpmath.exp(one - max(scores)) for one in scores]
+    return [one / mpmath.fsum(shares) for one in shares]
+
+
+SHARES = Case(
+    name="nodes far from what they carry",
+    breaks="exp(-d²/2r²) over their sum is 0/0 from 13 radii (38) on",
+    formula="softmax of -d² e^-2l / 2, l = log r held to -20 .. 15",
+    switch="-20 and 15",
+    axis="distance, in distances of nodes",
+    at=np.repeat(_AWAY, len(_RADII)),
+    inputs=np.array([[away, radius] for away in _AWAY for radius in _RADII]),
+    stable=_shares,
+    textbook=_quotients,
+    exact=_exact_shares,
+    bounds={"float32": (1e-4, 1e-4), "float64": (1e-12, 1e-12)},
+    floors=(1.0, 1.0, 0.0),
+    caught=(("float32", "value"), ("float32", "slope"), ("float64", "value")),
+    timed=np.array([0.4, 0.0]),
+)
+
+CASES = (SPARSITY, VISIBLE, UNREST, SHARES)

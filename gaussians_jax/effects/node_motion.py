@@ -7,7 +7,13 @@ Gaussian (`effects.skinning`). Nodes that stay near each other are asked to move
 rigid body. The network is asked for the nodes alone, so it costs the same however many
 Gaussians there are.
 
-What is not as in the paper: turns are rotation vectors, where it has quaternions; which
+With a mask (`MaskSpec`) it is the motion of EDGS (Kong et al. 2025, AAAI,
+arXiv:2502.20378): sparse anchors carry Gaussians by a radial kernel, and a mask that is
+learnt along says which of them move. The network is asked for those alone, and
+Gaussians that only resting anchors carry are passed over. Its anchors also make the
+looks of their Gaussians, which here keep their own.
+
+What is not as in SC-GS: turns are rotation vectors, where it has quaternions; which
 nodes are near is found when rows change and not in every step; the rigid term is a mean
 and not a sum, over a fixed number of links and not those within a radius; and nodes
 start among the first Gaussians, or from tracks half on what moves and half on what is
@@ -22,10 +28,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from gaussians_jax import path_fit, splats
 from gaussians_jax.effects import skinning
+from gaussians_jax.effects.blocks import in_blocks
 from gaussians_jax.effects.skinning import Links, Moves
 from gaussians_jax.path_fit import Guess, Paths, Points
 from gaussians_jax.splats import Gaussians, Params, Splats
@@ -43,6 +50,29 @@ MOMENTS = 8  # of the film, at which the paths of nodes are compared
 # Of a start from tracks: bodies by which paths are brought to one moment, and what the
 # motion of nodes at rest costs in the fit, one length of the scene costing one.
 BODIES, REST = 8, 1.0
+STRETCH = 1.2  # of a mask, see `openness`
+ROWS_AT_ONCE, NODES_AT_ONCE = 512, 32  # blocks that are passed over where nothing moves
+
+
+@dataclasses.dataclass(frozen=True)
+class MaskSpec:
+    """A learnt mask of nodes: which of them move at all (EDGS).
+
+    Each node keeps a number of its own, where EDGS has a small network of an anchor's
+    feature; its kernel and loss were not at hand. Sizes and weights are our choice.
+    """
+
+    sparsity: float = 3e-3  # weight of the mean of the logistic function of the mask
+    rate: float = 1e-2  # of the mask's number
+    moving: float = 2.0  # where it starts: 96 % open
+    still: float = -1.0  # of a node at rest, where tracks tell: 22 % open
+
+    def __post_init__(self):
+        for name in ("sparsity", "rate"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(
+                    f"{name}={getattr(self, name)} is finite and not negative"
+                )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,6 +95,7 @@ class NodeMotionSpec:
     links: int = 8  # of each node, to nodes that it is to be rigid with
     rigidity: float | None = 0.1  # weight; None leaves it out
     moving_share: float = 0.5
+    mask: MaskSpec | None = None  # of the nodes that move; None: all may
     warm_up: int = steps(3000)  # steps without motion
     learning_rate: float = 8e-4  # of the network
     learning_rate_end: float = 1.6e-6
@@ -99,6 +130,7 @@ class Nodes(NamedTuple):
     position: Float[Array, "nodes 3"]  # scene units
     log_radius: Float[Array, " nodes"]  # of the influence, scene units
     network: MLP
+    mask: Float[Array, " nodes"] | None  # see `openness`
 
 
 class Found(NamedTuple):
@@ -106,6 +138,7 @@ class Found(NamedTuple):
 
     near: Int[Array, "gaussians near"]
     links: Links | None  # None where nothing asks for them
+    moving: Bool[Array, " gaussians"] | None  # None: all of them may
 
 
 def network_spec(spec: NodeMotionSpec) -> MLPSpec:
@@ -131,7 +164,20 @@ def init(key: Key[Array, ""], spec: NodeMotionSpec, dtype=jnp.float32) -> Nodes:
         position=jnp.zeros((spec.nodes, 3), dtype),
         log_radius=jnp.zeros(spec.nodes, dtype),
         network=mlp.init(network_spec(spec), key, dtype),
+        mask=None
+        if spec.mask is None
+        else jnp.full(spec.nodes, spec.mask.moving, dtype),
     )
+
+
+def openness(mask: Float[Array, " nodes"]) -> Float[Array, " nodes"]:
+    """How much of its motion a node has, in [0, 1]: a logistic function, stretched.
+
+    Exactly zero where that function is below 1/12 (and one above 11/12), without a
+    slope from there on: such a node stays at rest and nothing is computed for it. The
+    stretch is that of Louizos et al. 2018, arXiv:1712.01312, without its noise.
+    """
+    return jnp.clip(STRETCH * jax.nn.sigmoid(mask) - (STRETCH - 1) / 2, 0, 1)
 
 
 def placed(nodes: Nodes, position: Float[np.ndarray, "places 3"]) -> Nodes:
@@ -156,23 +202,52 @@ def moves(
     moment = encoding.encode(spec.time, time[None], None)
     features = place(nodes.position)
     moment = jnp.broadcast_to(moment, (len(features), len(moment)))
-    made = mlp.apply(
-        network_spec(spec), nodes.network, jnp.concatenate([features, moment], axis=1)
-    )
-    return Moves(jax.vmap(quaternion.exp)(made["turn"]), extent * made["shift"])
+    inputs = jnp.concatenate([features, moment], axis=1)
+
+    def network(inputs):
+        return mlp.apply(network_spec(spec), nodes.network, inputs)
+
+    if spec.mask is None:
+        made = network(inputs)
+        turn, shift = made["turn"], made["shift"]
+    else:
+        share = openness(nodes.mask)
+        made = in_blocks(network, (inputs,), share > 0, NODES_AT_ONCE)
+        turn, shift = (share[:, None] * made[name] for name in ("turn", "shift"))
+    return Moves(jax.vmap(quaternion.exp)(turn), extent * shift)
 
 
 def find(
-    nodes: Nodes, spec: NodeMotionSpec, extent: float, mean: Float[Array, "gaussians 3"]
+    nodes: Nodes,
+    spec: NodeMotionSpec,
+    extent: float,
+    mean: Float[Array, "gaussians 3"],
+    linked: bool = True,
 ) -> Found:
-    """The nodes near each Gaussian, and which nodes stay near each other."""
+    """The nodes near each Gaussian, and where asked for which stay near each other."""
     near = skinning.nearest(mean, nodes.position, spec.near)
-    if spec.rigidity is None:
-        return Found(near, None)
+    moving = None
+    if spec.mask is not None:
+        moving = jnp.any((openness(nodes.mask) > 0)[near], axis=1)
+    if spec.rigidity is None or not linked:
+        return Found(near, None, moving)
     moments = jnp.linspace(0, 1, MOMENTS, dtype=mean.dtype)
     shifts = jax.vmap(lambda time: moves(nodes, spec, extent, time).shift)(moments)
     paths = jnp.swapaxes(nodes.position + shifts, 0, 1)
-    return Found(near, skinning.links(paths, nodes.log_radius, spec.links))
+    return Found(near, skinning.links(paths, nodes.log_radius, spec.links), moving)
+
+
+def displaced(
+    nodes: Nodes, now: Moves, found: Found, mean: Float[Array, "gaussians 3"]
+) -> skinning.Displaced:
+    """What the nodes do to Gaussians; blocks in which none moves are passed over."""
+
+    def evaluate(near, mean):
+        return skinning.displaced(nodes.position, nodes.log_radius, now, near, mean)
+
+    if found.moving is None:
+        return evaluate(found.near, mean)
+    return in_blocks(evaluate, (found.near, mean), found.moving, ROWS_AT_ONCE)
 
 
 def unrigidity(
@@ -203,19 +278,27 @@ def fit_to_paths(
     resting = still[skinning.spread_out(still, spec.nodes - len(moving_nodes))]
     nodes = placed(init(key, spec), np.concatenate([moving_nodes, resting]))
     at_rest = slice(len(moving_nodes), len(moving_nodes) + len(resting))
+    if spec.mask is not None:
+        nodes = nodes._replace(mask=nodes.mask.at[at_rest].set(spec.mask.still))
     moments = jnp.linspace(0, 1, MOMENTS, dtype=jnp.float32)
 
     def penalty(points):
+        every = points.nets
+        those = every._replace(position=every.position[at_rest])
+        if every.mask is not None:
+            those = those._replace(mask=every.mask[at_rest])
+
         def unrest(time):
-            now = moves(points.nets, spec, extent, time)
-            turn, shift = now.turn[at_rest, 1:], now.shift[at_rest] / unit
+            now = moves(those, spec, extent, time)
+            turn, shift = now.turn[:, 1:], now.shift / unit
             total = jnp.sum(turn**2, axis=1) + jnp.sum(shift**2, axis=1)
             return jnp.mean(jnp.sqrt(total + path_fit.SOFT**2))
 
         return REST * jnp.mean(jax.vmap(unrest)(moments))
 
     start = Points(jnp.asarray(canonical, jnp.float32), None, nodes)
-    rates = Points(unit, None, Nodes(0.0, 1.0, 0.4))
+    mask = None if spec.mask is None else 1.0
+    rates = Points(unit, None, Nodes(0.0, 1.0, 0.4, mask))
     return Guess(start, rates, penalty if len(resting) else None)
 
 
@@ -235,7 +318,9 @@ def effect(spec: NodeMotionSpec, run_steps: int, extent: float) -> Effect:
     def rates(step):
         now = rate(step)
         share = now / spec.learning_rate
-        return Nodes(extent * spec.place_rate * share, spec.radius_rate * share, now)
+        mask = None if spec.mask is None else spec.mask.rate * share
+        place, radius = extent * spec.place_rate * share, spec.radius_rate * share
+        return Nodes(place, radius, now, mask)
 
     def place(nodes, rows: Splats):
         means = np.asarray(rows.mean)
@@ -243,8 +328,7 @@ def effect(spec: NodeMotionSpec, run_steps: int, extent: float) -> Effect:
 
     def prepared(params: Params) -> Found:
         means = params.rows["splats"].mean
-        near = skinning.nearest(means, params.nets[NAME].position, spec.near)
-        return Found(near, None)
+        return find(params.nets[NAME], spec, extent, means, linked=False)
 
     @jax.jit
     def found(params: Params) -> Found:
@@ -256,23 +340,25 @@ def effect(spec: NodeMotionSpec, run_steps: int, extent: float) -> Effect:
     ) -> Gaussians:
         nodes = params.nets[NAME]
         now = moves(nodes, spec, extent, condition.time)
-        return skinning.carried(
-            nodes.position, nodes.log_radius, now, ready.near, gaussians
-        )
+        return skinning.apply(gaussians, displaced(nodes, now, ready, gaussians.mean))
 
     def penalty(nodes: Nodes, context: PenaltyContext) -> dict[str, Term]:
-        time = context.condition.time
-        times = time, jax.random.uniform(context.key, (), time.dtype)
-        linked = context.state.links
-        value = unrigidity(nodes, spec, extent, linked, times)
-        return {"unrigidity": Term(value, spec.rigidity)}
+        terms, time = {}, context.condition.time
+        if spec.rigidity is not None:
+            times = time, jax.random.uniform(context.key, (), time.dtype)
+            value = unrigidity(nodes, spec, extent, context.state.links, times)
+            terms["unrigidity"] = Term(value, spec.rigidity)
+        if spec.mask is not None:
+            used = jnp.mean(jax.nn.sigmoid(nodes.mask))
+            terms["moving"] = Term(used, spec.mask.sparsity)
+        return terms
 
     return Effect(
         name=NAME,
         init=lambda key: init(key, spec),
         place=place,
         learning_rate=rates,
-        penalty=None if spec.rigidity is None else penalty,
+        penalty=None if spec.rigidity is None and spec.mask is None else penalty,
         warm_up=spec.warm_up,
         prepare=prepared,
         deform=moved,

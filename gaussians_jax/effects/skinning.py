@@ -29,6 +29,13 @@ class Moves(NamedTuple):
     shift: Float[Array, "nodes 3"]  # scene units
 
 
+class Displaced(NamedTuple):
+    """What nodes do to the Gaussians they carry; zero is nothing."""
+
+    offset: Float[Array, "gaussians 3"]  # scene units
+    turn: Float[Array, "gaussians 4"]  # quaternion, less the identity
+
+
 class Links(NamedTuple):
     """Which nodes are asked to move as one body, and how much each pair counts."""
 
@@ -68,14 +75,14 @@ def weights(
     return jax.nn.softmax(-distance_sq * jnp.exp(-2 * held) / 2, axis=-1)
 
 
-def carried(
+def displaced(
     position: Float[Array, "nodes 3"],
     log_radius: Float[Array, " nodes"],
     moves: Moves,
     near: Int[Array, "gaussians near"],
-    gaussians: Gaussians,
-) -> Gaussians:
-    """Gaussians that follow the nodes near them.
+    mean: Float[Array, "gaussians 3"],
+) -> Displaced:
+    """How the nodes near them displace and turn Gaussians.
 
     Means go to the weighted mean of where each node would carry them, rotations are
     followed by the weighted mean of the nodes' quaternions, each with the sign that is
@@ -87,7 +94,7 @@ def carried(
     # scatter nothing: 6 ms with 64 nodes, 78 ms with 512.
     table = jnp.concatenate([position, log_radius[:, None], *moves], axis=1)
     rows = [table[near[:, k]] for k in range(near.shape[1])]
-    from_node = [gaussians.mean - row[:, :3] for row in rows]
+    from_node = [mean - row[:, :3] for row in rows]
     distance_sq = jnp.stack([jnp.sum(d * d, axis=1) for d in from_node], axis=1)
     radius = jnp.stack([row[:, 3] for row in rows], axis=1)
     share = weights(distance_sq, radius)
@@ -96,9 +103,18 @@ def carried(
         for k, row in enumerate(rows)
     )
     turn = blended([row[:, 4:8] for row in rows], share)
+    return Displaced(offset, turn - quaternions.identity(turn.dtype))
+
+
+def apply(gaussians: Gaussians, by: Displaced) -> Gaussians:
+    """Gaussians that were displaced and turned; rotations come out normalised."""
+
+    def turned(extra, own):
+        return quaternions.normalise(own + quaternions.multiply(extra, own))
+
     return gaussians._replace(
-        mean=gaussians.mean + offset,
-        quaternion=jax.vmap(_followed)(turn, gaussians.quaternion),
+        mean=gaussians.mean + by.offset,
+        quaternion=jax.vmap(turned)(by.turn, gaussians.quaternion),
     )
 
 
@@ -127,10 +143,6 @@ def _swept(turn, vector):
     scalar, axis = turn[:, :1], turn[:, 1:]
     swept = jnp.cross(axis, vector)
     return 2 * (scalar * swept + jnp.cross(axis, swept))
-
-
-def _followed(turn, own):
-    return quaternions.normalise(quaternions.multiply(turn, own))
 
 
 def links(

@@ -19,9 +19,9 @@ USUAL = "splats-tracked-small"  # where none is named, and tracks tell a motion
 # What our own two have, for command lines, which do not load JAX to be read.
 PRESETS = (
     *("splats-static", "splats-mcmc", "splats-tracked", "splats-deformable"),
-    *("sonata", "moba", "dynmf", "spacetime", "spline", "4dgs", "sc-gs"),
+    *("sonata", "moba", "dynmf", "spacetime", "spline", "4dgs", "sc-gs", "edgs"),
     *("dynmf-small", "spacetime-small", "spline-small", "4dgs-small"),
-    "sc-gs-small",
+    *("sc-gs-small", "edgs-small"),
     *("nerf", "nerf-w", "d-nerf", "t-nerf", "nerfies", "hypernerf"),
     *("nsff", "splats-static-small", "splats-mcmc-small", "splats-tracked-small"),
     *("splats-deformable-small", "sonata-small", "moba-small", "nerf-small"),

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from gaussians_jax import path_fit, spec, splats
 from gaussians_jax.effects import deformation, node_motion, skinning
-from gaussians_jax.effects.node_motion import NodeMotionSpec, Nodes
+from gaussians_jax.effects.node_motion import MaskSpec, NodeMotionSpec
 from gaussians_jax.effects.skinning import Links, Moves
 from gaussians_jax.path_fit import Paths
 from gaussians_jax.splats import Params
@@ -32,29 +32,36 @@ MOTION = NodeMotionSpec(
 )
 
 
+MASKED = dataclasses.replace(MOTION, mask=MaskSpec(), rigidity=None)
+OF = {"nodes": MOTION, "masked": MASKED}
+by_name = pytest.mark.parametrize("name", OF)
+
+
 @functools.cache
-def effect():
-    scene = spec.SplatScene(steps=100, motion=MOTION)
+def effect(name="nodes"):
+    scene = spec.SplatScene(steps=100, motion=OF[name])
     return spec.motion_of(scene, spec.SceneMetadata(EXTENT, (0.0, 0.0, 0.0), 9))
 
 
-def params_of(gaussians, dtype, size=0.5):
-    shapes = jax.eval_shape(lambda: effect().init(jax.random.key(0)))
+def params_of(gaussians, dtype, size=0.5, name="nodes"):
+    shapes = jax.eval_shape(lambda: effect(name).init(jax.random.key(0)))
     rng = np.random.default_rng(0)
     nets = jax.tree.map(lambda leaf: size * rng.normal(size=leaf.shape), shapes)
     return Params({"splats": rows_of(gaussians)}, {NAME: put(nets, dtype)})
 
 
-@jax.jit
-def moved(params, gaussians, time):
-    ready = effect().prepare(params)
-    return effect().deform(params, gaussians, FrameCondition(time), ready)
+@functools.partial(jax.jit, static_argnames="name")
+def moved(params, gaussians, time, name="nodes"):
+    ready = effect(name).prepare(params)
+    return effect(name).deform(params, gaussians, FrameCondition(time), ready)
 
 
 def poses(nodes, time):
     """Rotation and shift of each node: the network by hand, in float64."""
-    poses = []
-    for place in nodes.position:
+    poses, share = [], np.ones(NODES)
+    if nodes.mask is not None:
+        share = np.clip(1.2 / (1 + np.exp(-nodes.mask)) - 0.1, 0, 1)
+    for place, one in zip(nodes.position, share, strict=True):
         features = [place, np.sin(place), np.cos(place), [time, np.sin(time)]]
         hidden = np.concatenate([*features, [np.cos(time)]])
         for layer in nodes.network.hidden:
@@ -63,7 +70,7 @@ def poses(nodes, time):
             hidden @ nodes.network.heads[name].weight + nodes.network.heads[name].bias
             for name in ("turn", "shift")
         )
-        poses.append((Rotation.from_rotvec(turn), EXTENT * shift))
+        poses.append((Rotation.from_rotvec(one * turn), EXTENT * one * shift))
     return poses
 
 
@@ -92,11 +99,12 @@ def host(tree):
     return jax.tree.map(lambda leaf: np.asarray(leaf).astype(float), tree)
 
 
-@pytest.mark.parametrize("time", [0.0, 0.4, 1.0])
-def test_gaussians_go_where_the_nodes_near_them_carry_them(time, dtype):
+@by_name
+@pytest.mark.parametrize("time", [0.0, 0.4])
+def test_gaussians_go_where_the_nodes_near_them_carry_them(time, name, dtype):
     gaussians = some_gaussians(ROWS, dtype)
-    params = params_of(gaussians, dtype)
-    there = moved(params, gaussians, put(time, dtype))
+    params = params_of(gaussians, dtype, name=name)
+    there = moved(params, gaussians, put(time, dtype), name)
     means, quaternions = expected(host(params.nets[NAME]), host(gaussians), time)
     atol = {"float32": 1e-5, "float64": 1e-13}[dtype]
     np.testing.assert_allclose(there.mean, means, rtol=0, atol=atol)
@@ -106,11 +114,12 @@ def test_gaussians_go_where_the_nodes_near_them_carry_them(time, dtype):
     assert {leaf.dtype for leaf in there} == {np.dtype(dtype)}
 
 
-def test_slopes_are_those_of_differences(float64):
+@by_name
+def test_slopes_are_those_of_differences(name, float64):
     gaussians = some_gaussians(ROWS, "float64")
-    params = params_of(gaussians, "float64")
+    params = params_of(gaussians, "float64", name=name)
     weights = np.random.default_rng(1).normal(size=(ROWS, 7))
-    found = effect().state(params)
+    found = effect(name).state(params)
     context = PenaltyContext(
         FrameCondition(put(0.3, "float64")), None, jax.random.key(0), None, state=found
     )
@@ -118,9 +127,11 @@ def test_slopes_are_those_of_differences(float64):
     def value(nodes, mean, time):
         rows = params.rows["splats"]._replace(mean=mean)
         scene = Params({"splats": rows}, {NAME: nodes})
-        there = moved(scene, gaussians._replace(mean=mean), time)
+        there = moved(scene, gaussians._replace(mean=mean), time, name)
         drawn = jnp.sum(weights * jnp.concatenate([there.mean, there.quaternion], -1))
-        return drawn + effect().penalty(nodes, context)["unrigidity"].value
+        terms = effect(name).penalty(nodes, context)
+        assert set(terms) == {{"nodes": "unrigidity", "masked": "moving"}[name]}
+        return drawn + sum(term.value for term in terms.values())
 
     args = params.nets[NAME], gaussians.mean, put(0.47, "float64")
     assert directional_error(value, *args, step=1e-6) < 1e-6
@@ -132,7 +143,8 @@ def carry(position, log_radius, moves, mean, dtype):
     near = jnp.arange(len(position), dtype=jnp.int32)[None]
 
     def run(position, log_radius, moves, still):
-        return skinning.carried(position, log_radius, moves, near, still)
+        by = skinning.displaced(position, log_radius, moves, near, still.mean)
+        return skinning.apply(still, by)
 
     args = *put((position, log_radius), dtype), put(moves, dtype), still
 
@@ -331,9 +343,46 @@ def test_nodes_at_rest_stay_at_rest_when_others_are_fitted_to_paths():
     assert splats.neighbour_distance(still, 1.0).min() > 0
 
 
+def test_nothing_is_computed_for_what_only_resting_nodes_carry():
+    """Two blocks of rows, the second far away on nodes that are closed."""
+    rows = 2 * node_motion.ROWS_AT_ONCE
+    gaussians = some_gaussians(rows, "float32")
+    far = np.repeat([0.0, 50.0], node_motion.ROWS_AT_ONCE)[:, None]
+    near = 0.1 * np.asarray(gaussians.mean) + far
+    gaussians = gaussians._replace(mean=put(near, "float32"))
+    nodes = params_of(gaussians, "float32", name="masked").nets[NAME]
+    away = np.array([0, 0, 50, 50, 50.0])
+    shut = np.array([1, 0, -2.5, -10, -1e30])
+    nodes = nodes._replace(
+        position=put(np.asarray(nodes.position) + away[:, None], "float32"),
+        mask=put(shut, "float32"),
+    )
+    two = node_motion.effect(dataclasses.replace(MASKED, near=2), 100, EXTENT)
+    params = Params({"splats": rows_of(gaussians)}, {NAME: nodes})
+
+    @jax.jit
+    def run(params):
+        ready = two.prepare(params)
+        there = two.deform(params, gaussians, FrameCondition(jnp.float32(0.3)), ready)
+        return there.mean
+
+    there, mean = np.asarray(run(params)), np.asarray(gaussians.mean)
+    moving = np.asarray(two.state(params).moving)
+    np.testing.assert_array_equal(moving, far[:, 0] == 0)
+    np.testing.assert_array_equal(there[~moving], mean[~moving])
+    assert (there[moving] != mean[moving]).any(axis=1).all()
+    # A block that is passed over does not even see what is no number.
+    broken = nodes._replace(log_radius=nodes.log_radius.at[2:].set(jnp.nan))
+    there = np.asarray(run(params._replace(nets={NAME: broken})))
+    np.testing.assert_array_equal(there[~moving], mean[~moving])
+    slope = jax.grad(lambda mask: jnp.sum(node_motion.openness(mask)))(nodes.mask)
+    assert (np.asarray(slope) > 0).tolist() == [True, True, False, False, False]
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
+        ({"sparsity": -1.0}, "sparsity=-1.0 is finite"),
         ({"nodes": 0}, "nodes=0 must be at least 1"),
         ({"near": 0}, "near=0 must be at least 1"),
         ({"rigidity": -1.0}, "None leaves it out"),
@@ -345,15 +394,15 @@ def test_nodes_at_rest_stay_at_rest_when_others_are_fitted_to_paths():
     ],
 )
 def test_no_motion_of_nothing(changes, words):
+    of = MASKED.mask if "sparsity" in changes else MOTION
     with pytest.raises(ValueError, match=words):
-        dataclasses.replace(MOTION, **changes)
+        dataclasses.replace(of, **changes)
 
 
-def test_without_rigidity_nothing_is_linked_and_nothing_costs():
+def test_without_rigidity_and_mask_nothing_is_found_for_them_and_nothing_costs():
     plain = dataclasses.replace(MOTION, rigidity=None)
     motion = node_motion.effect(plain, 100, EXTENT)
     assert motion.penalty is None
-    gaussians = some_gaussians(ROWS, "float32")
-    state = motion.state(params_of(gaussians, "float32"))
+    state = motion.state(params_of(some_gaussians(ROWS, "float32"), "float32"))
     assert state.links is None
-    assert isinstance(params_of(gaussians, "float32").nets[NAME], Nodes)
+    assert state.moving is None
