@@ -120,6 +120,9 @@ STUDIES = {
     ),
     "elastic_points": _study("elastic_points", "--out elastic_points.json"),
     "camera_masks": _study("camera_masks", "--out camera_masks.json"),
+    "field_speed": _study(
+        "field_speed", "--captures CAPTURE CAPTURE --out field_speed.json"
+    ),
     "kan_local": _study("kan_local", "--out kan_local.json"),
     "speed": _package("speed", "--job --yardstick PATH/run.py --out speed"),
     "raster_speed": _package(

@@ -51,6 +51,8 @@ TABLE = [
     ("export", "nowhere tracks --points 0", "track at least one"),
     ("export", "nowhere exr --path spiral --frames 2", "has its own number of frames"),
     ("export", "nowhere colmap --path sway", "--path is not for colmap, but for path"),
+    ("field_speed", "--seconds 2 1", "--seconds: positive and rising"),
+    ("field_speed", "--presets nothing", "--presets nothing"),
     ("frequency_gates", "--steps 3", "--steps 3"),
     ("frequency_gates", "--seeds 1", "--seeds 1"),
     ("frequency_gates", "--most 0.1 0", "--most (0.1, 0.0)"),

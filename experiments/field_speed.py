@@ -1,0 +1,165 @@
+"""What grids and MLPs of small fields reach in equal processor time, and how they draw.
+
+    python -m experiments.field_speed --captures CAPTURE CAPTURE --out field_speed.json
+    python -m experiments.field_speed --captures CAPTURE --presets nerf-grid-small
+
+Each preset is trained once on each capture, its schedules as they are, and stops at
+each of the given processor seconds to be scored on frames that it does not learn from;
+compiling counts nothing. At the end a frame is drawn behind the survey of its empty
+space (`nerfies_jax.skipping`) and by the full quadrature: milliseconds are medians of
+the processor over five frames, without the survey, which has a column of its own, and
+decibels are of the difference between the two. What is in `--out` already is not
+measured again.
+"""
+
+import dataclasses
+import json
+import math
+import pathlib
+import time
+
+from experiments import cli, markdown
+from nerfies_jax.runs import platform, representations
+
+PRESETS = ("nerf-small", "nerf-grid-small", "nerfies-small", "nerfies-grid-small")
+FRAMES = 5  # timed, after one that makes the survey
+CHUNK = 25  # steps between two looks at the clock
+
+
+@dataclasses.dataclass(frozen=True)
+class FieldSpeed:
+    """Train small fields for equal processor seconds, and time their frames."""
+
+    captures: tuple[pathlib.Path, ...] = ()
+    """Folders (default: the built-in scene)."""
+    presets: tuple[str, ...] = PRESETS
+    """Small radiance fields."""
+    seconds: tuple[float, ...] = (60.0, 120.0, 300.0)
+    """Of the processor, rising, after which each is scored."""
+    size: tuple[int, int] = (256, 192)
+    """Of the frames that are timed, pixels."""
+    out: pathlib.Path = pathlib.Path("field_speed.json")
+    """Keeps the numbers."""
+
+    def __post_init__(self):
+        for name in self.presets:
+            if name not in representations.PRESETS:
+                raise ValueError(f"--presets {name}: no such preset")
+        rising = list(self.seconds) == sorted(set(self.seconds))
+        if not self.seconds or not rising or self.seconds[0] <= 0:
+            raise ValueError("--seconds: positive and rising, as 60 120 300")
+
+
+@cli.command(FieldSpeed)
+def main(args):
+    """Measure what is missing and keep it; exit code 2 where input is wrong."""
+    with cli.user_errors():
+        platform.start_jax("cpu")
+        captures = _captures(args.captures)
+    from nerfies_jax.capture.json_files import write_json
+    from nerfies_jax.measure import clock
+
+    stored = json.loads(args.out.read_text()) if args.out.exists() else {}
+    rows = stored.get("rows", [])
+    for name, capture in captures.items():
+        for preset in args.presets:
+            cell = {"capture": name, "preset": preset, "size": list(args.size)}
+            cell["seconds"] = list(args.seconds)
+            if any(cell.items() <= row.items() for row in rows):
+                continue
+            rows.append(cell | measured(capture, preset, args.seconds, args.size))
+            stored = {"machine": clock.machine(), "rows": rows}
+            write_json(args.out, stored)
+            print("  ".join(f"{k} {v}" for k, v in rows[-1].items()), flush=True)
+    return stored
+
+
+def _captures(folders):
+    from nerfies_jax import runs
+
+    if not folders:
+        return {"default": runs.built_in_scene("default")}
+    return {folder.name: runs.load_capture(folder) for folder in folders}
+
+
+def measured(capture, preset: str, seconds, size: tuple[int, int]) -> dict:
+    """Scores at each of the seconds, and what a frame takes after the last."""
+    import jax
+    import numpy as np
+
+    from nerfies_jax import evaluation
+    from nerfies_jax.training.chunk import compiled
+
+    representation = representations.of_preset(preset)
+    spec = representation.presets[preset]
+    model = representation.build(spec, representation.metadata_of(capture, spec))
+    state = model.init(capture, jax.random.key(0))
+    frames = evaluation.frames_of(capture, model.required_data)
+    program, _ = compiled(model.step, state, frames, model.devices)
+    renderer = evaluation.Renderer(model, capture.size)
+    scores, steps, spent = [], [], 0.0
+    for limit in seconds:
+        while spent < limit and int(state.step) < spec.steps:
+            began = time.process_time()
+            count = min(CHUNK, spec.steps - int(state.step))
+            state, outcome = program(state, frames, np.int32(count))
+            jax.block_until_ready(outcome)
+            spent += time.process_time() - began
+        scored = evaluation.score(renderer, state, capture, capture.heldout)
+        scores.append(float(scored.psnr.mean()))
+        steps.append(int(state.step))
+    return {"psnr": scores, "steps": steps} | drawn(model, state, capture, size)
+
+
+def drawn(model, state, capture, size: tuple[int, int]) -> dict:
+    """Milliseconds of a frame with and without a survey, and how alike the two are."""
+    import numpy as np
+
+    from nerfies_jax import evaluation
+    from nerfies_jax.evaluation.frames import resized, spread
+
+    rows = spread(capture.heldout, FRAMES)
+    views = [
+        resized(evaluation.view_of(capture, row), capture.size, size)
+        for row in (rows[0], *rows)
+    ]
+    record, pictures = {}, {}
+    for name, one in (("skipped", model), ("full", model._replace(surveyed=None))):
+        renderer = evaluation.Renderer(one, size)
+        pictures[name] = [renderer(state, view).colour for view in views]
+        ms = 1e3 * np.asarray(renderer.cpu_seconds)
+        record[f"{name}_ms"] = float(np.median(ms[1:]))
+        if name == "skipped":
+            record["survey_ms"] = float(ms[0] - record["skipped_ms"])
+    pairs = zip(pictures["skipped"], pictures["full"], strict=True)
+    worst = max(float(np.mean((one - other) ** 2)) for one, other in pairs)
+    record["alike_db"] = None if worst == 0 else -10 * math.log10(worst)
+    return record
+
+
+def page(stored) -> str:
+    """The page in docs/results below the docstring."""
+    heads = ("capture", "preset", "s", "steps", "PSNR", "frame, ms", "full, ms")
+    heads += ("survey, ms", "alike, dB")
+    rows = []
+    for row in stored["rows"]:
+        last = len(row["seconds"]) - 1
+        for place, seconds in enumerate(row["seconds"]):
+            names = ("skipped_ms", "full_ms", "survey_ms", "alike_db")
+            frame = [row[name] if place == last else None for name in names]
+            rows.append(
+                [
+                    row["capture"],
+                    row["preset"],
+                    f"{seconds:g}",
+                    str(row["steps"][place]),
+                    markdown.number(row["psnr"][place], 2),
+                    *(markdown.number(number, 0) for number in frame[:3]),
+                    markdown.number(frame[3], 1),
+                ]
+            )
+    return markdown.table(heads, rows, words=2)
+
+
+if __name__ == "__main__":
+    main()
