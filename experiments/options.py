@@ -124,12 +124,14 @@ def _headings(settings):
 def _plain(kind, marks, offering):
     """The type as a command line has it: a path is not a string besides."""
     known = next((mark for mark in marks if isinstance(mark, Known)), None)
+    several = typing.get_origin(kind) is tuple
     if offering and known is not None:
-        return Literal[known.names] | None
+        name = Literal[known.names]
+        return tuple[name, ...] if several else name | None
     parts = typing.get_args(kind)
     if pathlib.Path in parts and str in parts:
         return pathlib.Path | None if type(None) in parts else pathlib.Path
-    if typing.get_origin(kind) is tuple and Ellipsis in parts:
+    if several and Ellipsis in parts:
         return tuple[_plain(parts[0], (), offering), ...]
     return kind
 
