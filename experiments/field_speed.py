@@ -23,7 +23,6 @@ from nerfies_jax.runs import platform, representations
 
 PRESETS = ("nerf-small", "nerf-grid-small", "nerfies-small", "nerfies-grid-small")
 FRAMES = 5  # timed, after one that makes the survey
-CHUNK = 25  # steps between two looks at the clock
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,25 +84,23 @@ def _captures(folders):
 def measured(capture, preset: str, seconds, size: tuple[int, int]) -> dict:
     """Scores at each of the seconds, and what a frame takes after the last."""
     import jax
-    import numpy as np
 
     from nerfies_jax import evaluation
-    from nerfies_jax.training.chunk import compiled
+    from nerfies_jax.training import chunk
 
     representation = representations.of_preset(preset)
     spec = representation.presets[preset]
     model = representation.build(spec, representation.metadata_of(capture, spec))
     state = model.init(capture, jax.random.key(0))
     frames = evaluation.frames_of(capture, model.required_data)
-    program, _ = compiled(model.step, state, frames, model.devices)
+    program, _ = chunk.program(model.step, state, frames, spec.steps, model.devices)
+    program.prepare(program.length)
     renderer = evaluation.Renderer(model, capture.size)
     scores, steps, spent = [], [], 0.0
     for limit in seconds:
         while spent < limit and int(state.step) < spec.steps:
             began = time.process_time()
-            count = min(CHUNK, spec.steps - int(state.step))
-            state, outcome = program(state, frames, np.int32(count))
-            jax.block_until_ready(outcome)
+            state, _ = program(state, frames, program.length)  # waits
             spent += time.process_time() - began
         scored = evaluation.score(renderer, state, capture, capture.heldout)
         scores.append(float(scored.psnr.mean()))

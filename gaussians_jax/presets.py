@@ -255,11 +255,9 @@ SMALL_E_D3DGS = dataclasses.replace(
     neighbours=NeighbourSpec(start=600),
 )
 # Built-in scene, 600 steps of one view each, one seed (held-out PSNR, and where it
-# moves): without the rigid term 28.59 / 24.49, with a weight of 1 and another penalty
-# of nodes at rest 28.28 / 23.93, `SMALL_TRACKED` 29.66 / 26.72; a weight of 0.1 was not
-# tried. The network's fit to the tracks falls short: 0.47 % of the scene's depth after
-# its 1500 steps (0.51 % after 500 with eight bands for five of the place), bases 0.17
-# %.
+# moves): 28.69 / 24.54, without the rigid term 28.59 / 24.49, with a weight of 1 28.28
+# / 23.93. `SMALL_EDGS` has 28.85 / 24.83, `SMALL_TRACKED` 29.66 / 26.72: the network's
+# fit to the tracks is off by 0.47 % of the scene's depth, that of bases by 0.17 %.
 SMALL_SC_GS = dataclasses.replace(
     SMALL_TRACKED,
     motion=dataclasses.replace(SMALL_NODE_MOTION, warm_up=600),
