@@ -30,6 +30,8 @@ MOTIONS = {
     "spline": presets.SMALL_SPLINE.motion,
     "planes": presets.SMALL_FOUR_D.motion,
     "nodes": presets.SMALL_SC_GS.motion,
+    "masked nodes": presets.SMALL_EDGS.motion,
+    "embedding": presets.SMALL_E_D3DGS.motion,
 }
 BOX = ((-1.0, -1.0, 0.0), (1.0, 1.0, 2.0))
 
