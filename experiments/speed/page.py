@@ -14,10 +14,15 @@ is the training program alone, from an empty cache; *frame* one picture on one c
 *peak* all memory of the one-core process, JAX and the capture included."""
 
 
+PARTS = """\
+Milliseconds on one core, each part by itself on the first state: of fields they are
+more than the step, which works through its rays in micro-batches."""
+
+
 def page(stored: Mapping[str, Any]) -> str:
     """The tables: presets, where their time goes, the main job, the rasteriser."""
     parts = [READING, _presets(stored["presets"]), "## Where a step's time goes"]
-    parts.append("Milliseconds on one core, each part by itself.")
+    parts.append(PARTS)
     parts.append(_parts(stored["presets"]))
     if "job" in stored:
         parts += ["## The main job", _job(stored["job"])]
