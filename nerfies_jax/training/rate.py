@@ -31,13 +31,8 @@ def step_time(model: Model, state: TrainState, frames: Frames, steps: int) -> St
     `state` is left as it is. Of every phase of the run, the first step is not timed.
     Whatever grows later is not seen.
     """
-    frames = jax.tree.map(jnp.asarray, frames)
-    frames = data_parallel.replicate(frames, model.devices)
-    program, compile_seconds = chunk.program(
-        model.step, state, frames, steps, model.devices
-    )
+    program, frames, compile_seconds = _scan_of(model, state, frames, steps)
     length = program.length
-    compile_seconds += program.prepare(length)
 
     def timed(start, count):
         began = time.perf_counter()
@@ -63,13 +58,18 @@ def step_ms(model: Model, state: TrainState, frames: Frames, steps: int) -> floa
 
     By the program of a run of `steps` steps: where that has trained, none is compiled.
     """
-    frames = jax.tree.map(jnp.asarray, frames)
-    frames = data_parallel.replicate(frames, model.devices)
-    program, _ = chunk.program(model.step, state, frames, steps, model.devices)
-    program.prepare(program.length)
+    program, frames, _ = _scan_of(model, state, frames, steps)
     left, seconds = jax.tree.map(jnp.copy, state), []
     while len(seconds) < REPEATS and sum(seconds) < REPEAT_SECONDS:
         began = time.perf_counter()
         left, _ = program(left, frames, program.length)  # waits
         seconds.append(time.perf_counter() - began)
     return 1e3 * float(np.median(seconds)) / program.length
+
+
+def _scan_of(model, state, frames, steps):
+    """The program of a run, its scan compiled; what it reads; seconds of making it."""
+    frames = jax.tree.map(jnp.asarray, frames)
+    frames = data_parallel.replicate(frames, model.devices)
+    program, seconds = chunk.program(model.step, state, frames, steps, model.devices)
+    return program, frames, seconds + program.prepare(program.length)
