@@ -8,7 +8,7 @@ import numpy as np
 
 from experiments.hard_cases.case import Case, constant
 from gaussians_jax import optimiser
-from nerfies_jax.nets import kan
+from nerfies_jax.nets import bsplines, kan
 from nerfies_jax.nets.kan import KAN, KANLayer, KANSpec, Kernels
 from nerfies_jax.nets.mlp import HeadSpec
 
@@ -243,7 +243,7 @@ SPLINE = Case(
     axis="x in intervals",
     at=_FROM_KNOT,
     inputs=_FROM_KNOT[:, None],
-    stable=kan.cubic_bspline,
+    stable=bsplines.cubic,
     textbook=_truncated_cubes,
     exact=_exact_spline,
     bounds={"float32": (1e-6, 1e-6, 1e-6), "float64": (2e-15, 2e-15, 2e-15)},

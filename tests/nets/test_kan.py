@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import scipy.interpolate
 
-from nerfies_jax.nets import kan
+from nerfies_jax.nets import bsplines, kan
 from nerfies_jax.nets.kan import KANSpec, Kernels
 from nerfies_jax.nets.mlp import HeadSpec
 from tests import gradients
@@ -299,7 +299,7 @@ def test_a_b_spline_is_scipy_s_at_its_knots_between_and_beyond(dtype):
     near = [np.nextafter(knots, -9), knots, np.nextafter(knots, 9)]
     x = np.concatenate([*near, np.linspace(-2, 2, 41)]).astype(dtype)
     exact = scipy.interpolate.BSpline.basis_element(knots, False)
-    orders = [kan.cubic_bspline]
+    orders = [bsplines.cubic]
     for _ in range(2):
         orders.append(jax.grad(orders[-1]))
     beyond = np.array([-np.inf, -3e38, 2, 3, np.inf], dtype)
@@ -317,7 +317,7 @@ def test_b_splines_sum_to_one_on_their_grid(float64):
     spec = dataclasses.replace(VARIANTS["B-splines"], grid=(-1.0, 2.0))
     x = np.linspace(-1, 2, 31)[:, None]
     apart = (x - np.asarray(kan.centres(spec, 0, float))) / kan.spacing(spec, 0)
-    values = jax.jit(kan.cubic_bspline)(apart)
+    values = jax.jit(bsplines.cubic)(apart)
     np.testing.assert_allclose(np.asarray(values).sum(1), 1, rtol=1e-14)
 
 
