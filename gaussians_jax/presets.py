@@ -28,6 +28,7 @@ from gaussians_jax.effects.polynomial_motion import PolynomialMotionSpec
 from gaussians_jax.effects.se3_bases import SE3BasesSpec
 from gaussians_jax.effects.spectral import SpectralSpec
 from gaussians_jax.effects.spline_motion import SplineMotionSpec
+from gaussians_jax.effects.temporal_opacity import TemporalOpacitySpec
 from gaussians_jax.effects.time_basis import SMALL_TIME_BASIS, TimeBasisSpec
 from gaussians_jax.initialisation import InitSpec, StartSpec
 from gaussians_jax.learning_rates import LearningRateSpec
@@ -61,6 +62,7 @@ TRACKED = SplatScene(
     steps=30_000,
     init=InitSpec(points=50_000),
     motion=SE3BasesSpec(bases=20, knots=44),
+    temporal_opacity=TemporalOpacitySpec(),
     start=StartSpec(motion="tracks", moving_points=20_000),
 )
 
@@ -222,6 +224,7 @@ SMALL_TRACKED = dataclasses.replace(
         refine_stop_iter=1300,
     ),
     motion=SE3BasesSpec(bases=12),
+    temporal_opacity=TemporalOpacitySpec(),
     start=StartSpec(motion="tracks"),
 )
 # Other motions from tracks. Built-in scene, one seed, as many steps as fitted into a

@@ -37,7 +37,14 @@ SMALL_PIXELS = 176 * 132  # for which the counts of the small presets were chose
 # Between these advice chooses by whether anything moves.
 ADVISED = ("splats-static", "splats-tracked", "splats-deformable")
 # Of a scene's spec: the motion, and what is nothing without one.
-MOTION_PARTS = ("motion", "neighbours", "alternation", "acceleration", "motion_growth")
+MOTION_PARTS = (
+    "motion",
+    "temporal_opacity",
+    "neighbours",
+    "alternation",
+    "acceleration",
+    "motion_growth",
+)
 
 
 def growth(spec: Any, state: TrainState) -> float:

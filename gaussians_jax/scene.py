@@ -362,7 +362,7 @@ def first_state(spec, effects, optimiser, capture, key) -> TrainState:
             placed = effect.place(params.nets[effect.name], rows)
             params.nets[effect.name] = placed
     if tracked is not None:
-        params = track_start.put_in(params, effects[0], tracked)
+        params = track_start.put_in(params, effects, tracked)
     params = splats.pad_rows(params, splats.capacity_for(count, most))
     params = in_default_precision(params)
     stats = ()

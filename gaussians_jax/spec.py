@@ -19,6 +19,7 @@ from gaussians_jax.effects import (
     se3_bases,
     spectral,
     spline_motion,
+    temporal_opacity,
     time_basis,
 )
 from gaussians_jax.effects.acceleration import AccelerationSpec
@@ -36,6 +37,7 @@ from gaussians_jax.effects.polynomial_motion import PolynomialMotionSpec
 from gaussians_jax.effects.se3_bases import SE3BasesSpec
 from gaussians_jax.effects.spectral import SpectralSpec
 from gaussians_jax.effects.spline_motion import SplineMotionSpec
+from gaussians_jax.effects.temporal_opacity import TemporalOpacitySpec
 from gaussians_jax.effects.time_basis import TimeBasisSpec
 from gaussians_jax.initialisation import InitSpec, StartSpec
 from gaussians_jax.learning_rates import LearningRateSpec
@@ -84,6 +86,7 @@ class SplatScene:
     alternation: AlternationSpec | None = None
     annealing: AnnealingSpec | None = None
     motion: AnyMotion | None = None
+    temporal_opacity: TemporalOpacitySpec | None = None
     start: StartSpec = StartSpec()
     acceleration: AccelerationSpec | None = None
     neighbours: NeighbourSpec | None = None
@@ -128,7 +131,7 @@ def refuse_what_cannot_train(spec: SplatScene) -> None:
     """
     motion, growth = spec.motion, spec.motion_growth
     if motion is None:
-        named = ("alternation", "acceleration", "motion_growth")
+        named = ("temporal_opacity", "alternation", "acceleration", "motion_growth")
         orphans = [name for name in named if getattr(spec, name) is not None]
         orphans += ["start.motion"] if spec.start.motion == "tracks" else []
         if orphans:
@@ -200,6 +203,8 @@ def effects_of(spec: SplatScene, metadata: SceneMetadata) -> tuple[Effect, ...]:
     """The effects that the spec asks for, in the order in which they act."""
     motion = motion_of(spec, metadata)
     effects = [] if motion is None else [motion]
+    if spec.temporal_opacity is not None:
+        effects.append(temporal_opacity.effect(spec.temporal_opacity))
     if spec.acceleration is not None:
         effects.append(
             acceleration.effect(spec.acceleration, metadata.extent, metadata.frames)

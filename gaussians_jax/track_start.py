@@ -36,6 +36,8 @@ class TrackStart(NamedTuple):
     colour: np.ndarray  # [moving, 3] in [0, 1]
     rows: Any  # of the motion, a row for each; None where it keeps none
     nets: Any  # of the motion
+    time: np.ndarray  # [moving] of the picture that each was lifted from, in films
+    followed: np.ndarray  # [moving] for how long tracks near it were, in films
 
 
 def start(
@@ -65,12 +67,14 @@ def start(
         rate=spec.fit_rate,
         steps=spec.fit_steps,
     )
-    return _seeds(effect, fitted.points, evidence, capture, times, unit, spec)
+    followed = known.mean(axis=1).astype(np.float32)
+    return _seeds(effect, fitted.points, followed, evidence, capture, unit, spec)
 
 
-def _seeds(effect, points, evidence, capture, times, unit, spec):
+def _seeds(effect, points, followed, evidence, capture, unit, spec):
     """Moving pixels of all frames, lifted, and carried back to the canonical places."""
     views = view_set.in_time_order(record.looked_at(capture, evidence.factor))
+    times = capture.times[evidence.row].astype(np.float32)
     rng = np.random.default_rng(0)
     depth = moving_depths(evidence)
     frame, row, column = np.nonzero(depth > 0)
@@ -80,7 +84,7 @@ def _seeds(effect, points, evidence, capture, times, unit, spec):
     canonical = np.asarray(points.canonical)
     own = None if points.rows is None else jax.tree.map(np.asarray, points.rows)
     places = jax.jit(lambda points, time: path_fit.places(effect, points, time))
-    positions, colours, rows = [], [], []
+    positions, colours, rows, spans = [], [], [], []
     # All frames share the programs: as many rows as the frame with most.
     most = int(np.bincount(frame).max()) if len(frame) else 0
     for here in np.unique(frame):
@@ -111,6 +115,8 @@ def _seeds(effect, points, evidence, capture, times, unit, spec):
         miss = np.linalg.norm(back - start, axis=1)
         kept = (distance[:, 0] < FAR * unit) & (miss < GONE * unit)
         positions.append(back[kept])
+        here_for = np.full(int(kept.sum()), times[here])
+        spans.append(np.stack([here_for, mixed(followed)[kept]]))
         colours.append(views.image[here][pixel[kept, 1], pixel[kept, 0]] / 255)
         if mine is not None:
             rows.append(jax.tree.map(lambda leaf, kept=kept: leaf[kept], mine))
@@ -119,7 +125,8 @@ def _seeds(effect, points, evidence, capture, times, unit, spec):
     every = None
     if rows:
         every = jax.tree.map(lambda *leaves: np.concatenate(leaves)[chosen], *rows)
-    return TrackStart(position[chosen], colour[chosen], every, points.nets)
+    span = np.concatenate(spans, axis=1)[:, chosen]
+    return TrackStart(position[chosen], colour[chosen], every, points.nets, *span)
 
 
 def moving_depths(evidence: Evidence) -> np.ndarray:
@@ -139,15 +146,23 @@ def moving_depths(evidence: Evidence) -> np.ndarray:
     return depths
 
 
-def put_in(params: Params, motion: Effect, tracked: TrackStart) -> Params:
-    """Parameters with the fitted motion; the tracked Gaussians are the last rows."""
+def put_in(params: Params, effects: tuple[Effect, ...], tracked: TrackStart) -> Params:
+    """Parameters with the fitted motion, the first of the effects.
+
+    The tracked Gaussians are the last rows.
+    """
     rows, nets = dict(params.rows), dict(params.nets)
+
+    def last(leaf, own):
+        return leaf.at[len(leaf) - len(own) :].set(jnp.asarray(own, leaf.dtype))
+
+    motion, *others = effects
     if tracked.nets is not None:
         nets[motion.name] = jax.tree.map(jnp.asarray, tracked.nets)
     if tracked.rows is not None:
-
-        def last(leaf, own):
-            return leaf.at[len(leaf) - len(own) :].set(jnp.asarray(own, leaf.dtype))
-
         rows[motion.name] = jax.tree.map(last, rows[motion.name], tracked.rows)
+    for effect in others:
+        if effect.lifted_rows is not None:
+            own = effect.lifted_rows(tracked.time, tracked.followed)
+            rows[effect.name] = jax.tree.map(last, rows[effect.name], own)
     return Params(rows, nets)

@@ -165,6 +165,8 @@ def test_splats_have_the_arrays_of_what_they_have_and_no_others(preset):
             rows.add("spline_motion")
         elif motion is not None:
             nets["motion_basis"] = motion_basis.init(key, motion)
+        if spec.temporal_opacity is not None:
+            rows.add("temporal_opacity")
         if spec.spectral is not None:
             nets["spectral"] = spectral.init(spec.spectral)
         if spec.neighbours is not None:

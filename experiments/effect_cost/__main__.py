@@ -48,6 +48,7 @@ BESIDE = {"splats-static-small": ("exposure.learning_rate=0.01",)}
 NEEDS = {
     "elastic": ("warp",),
     "background": ("warp",),
+    "temporal_opacity": ("motion",),
     "alternation": ("motion",),
     "acceleration": ("motion",),
     "neighbours": ("motion",),

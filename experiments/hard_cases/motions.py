@@ -5,7 +5,7 @@ import mpmath
 import numpy as np
 
 from experiments.hard_cases.case import Case, constant
-from gaussians_jax.effects import polynomial_motion, skinning, time_basis
+from gaussians_jax.effects import skinning, temporal_opacity, time_basis
 from nerfies_jax.nets import planes
 
 NEAR = 1e-6  # how close to a switch its two sides are tried, as a share of it
@@ -42,7 +42,7 @@ SPARSITY = Case(
     caught=(("float32", "value"), ("float32", "slope"), ("float64", "value")),
 )
 
-_LOW, _HIGH = polynomial_motion.LOG_WIDTH_RANGE
+_LOW, _HIGH = temporal_opacity.LOG_WIDTH_RANGE
 _EDGES = [end * (1 + side) for end in (_LOW, _HIGH) for side in (-NEAR, NEAR)]
 _WIDTHS = np.array(
     [
@@ -54,7 +54,7 @@ _WIDTHS = np.array(
 
 
 def _visible(x):
-    return polynomial_motion.visible_share(x[0], x[1])[None]
+    return temporal_opacity.visible_share(x[0], x[1])[None]
 
 
 def _exact_visible(x):

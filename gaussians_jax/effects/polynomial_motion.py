@@ -16,6 +16,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from gaussians_jax import path_fit, splats
+from gaussians_jax.effects import temporal_opacity
+from gaussians_jax.effects.temporal_opacity import Fading
 from gaussians_jax.path_fit import Guess, Paths
 from gaussians_jax.splats import Gaussians, Params, Splats
 from nerfies_jax.training import schedules
@@ -23,9 +25,6 @@ from nerfies_jax.training.effects import Effect, FrameCondition
 from nerfies_jax.training.step_counts import steps
 
 NAME = "polynomial_motion"
-# Of the width of the opacity over time, in films: from a ten-thousandth to longer than
-# any. Outside it has no slope, and the quotient s / w stays finite.
-LOG_WIDTH_RANGE = (-9.0, 9.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,13 +70,6 @@ class PolynomialMotionSpec:
         schedules.check_falling(self.learning_rate, self.learning_rate_end)
 
 
-class Fading(NamedTuple):
-    """When a Gaussian is to be seen."""
-
-    time: Float[Array, " gaussians"]  # of its own, in films from the first frame
-    log_width: Float[Array, " gaussians"]  # of films
-
-
 class Polynomials(NamedTuple):
     """What is kept of each Gaussian."""
 
@@ -110,26 +102,12 @@ def deform(
     shift = jnp.zeros_like(gaussians.mean)
     for degree in reversed(range(rows.shift.shape[1])):
         shift = (shift + rows.shift[:, degree]) * since[..., None]
-    opacity = gaussians.opacity
     if rows.fading is not None:
-        opacity = opacity * visible_share(since, rows.fading.log_width)
+        gaussians = temporal_opacity.faded(rows.fading, gaussians, time)
     return gaussians._replace(
         mean=gaussians.mean + shift,
         quaternion=splats.turned(gaussians, rows.turn * since[..., None]),
-        opacity=opacity,
     )
-
-
-def visible_share(
-    since: Float[Array, "*gaussians"], log_width: Float[Array, "*gaussians"]
-) -> Float[Array, "*gaussians"]:
-    """exp(-(s / w)^2) of a time s from the middle, w = exp(`log_width`), in films.
-
-    Finite with its slopes whatever the width: the published exponential of a width that
-    is not held is 0/0 at s = 0 once the width has underflowed.
-    """
-    held = jnp.clip(log_width, *LOG_WIDTH_RANGE)
-    return jnp.exp(-jnp.square(since * jnp.exp(-held)))
 
 
 def fit_to_paths(spec: PolynomialMotionSpec, paths: Paths) -> Guess:
@@ -140,8 +118,7 @@ def fit_to_paths(spec: PolynomialMotionSpec, paths: Paths) -> Guess:
     count = len(fitted)
     fading = rate = None
     if spec.fading is not None:
-        width = jnp.full(count, LOG_WIDTH_RANGE[1] / 2, jnp.float32)
-        fading = Fading(jnp.full(count, 0.5, jnp.float32), width)
+        fading = temporal_opacity.always(count, jnp.float32)
         rate = 0.0
     rows = Polynomials(fitted[:, 1:], jnp.zeros((count, 3), jnp.float32), fading)
     points = path_fit.Points(fitted[:, 0], rows, None)

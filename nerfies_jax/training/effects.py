@@ -41,6 +41,7 @@ FIELD_SEAMS = (
 SPLAT_SEAMS = (
     "init_rows",
     "row_learning_rate",
+    "lifted_rows",
     "warm_up",
     "place",
     "prepare",
@@ -151,6 +152,9 @@ class Effect(NamedTuple):
     # (key, `splats.Splats`) -> leaves with a row for each Gaussian
     init_rows: Callable[[Key[Array, ""], Any], PyTree] | None = None
     row_learning_rate: Schedule | None = None  # needed where there are rows
+    # (time of the picture, for how long tracks near were followed) [gaussians] each, in
+    # films -> the rows of those lifted from moving pixels; host side
+    lifted_rows: Callable[[Any, Any], PyTree] | None = None
     # (what `init` returned, `splats.Splats`) -> the same, put where the first Gaussians
     # are; host side
     place: Callable[[PyTree, Any], PyTree] | None = None

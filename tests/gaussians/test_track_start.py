@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gaussians_jax import path_fit, presets, scene, spec, splats, track_start
+from gaussians_jax.effects import temporal_opacity
 from gaussians_jax.effects.se3_bases import SE3BasesSpec
 from gaussians_jax.initialisation import StartSpec
 from gaussians_jax.path_fit import Paths, Points
@@ -158,6 +159,10 @@ def test_a_scene_starts_from_the_evidence(tmp_path, monkeypatch):
     assert (still[active] > 0.99).sum() == active.sum() - 150
     wall = np.asarray(rows["splats"].mean)[active & (still > 0.99)]
     assert abs(np.median(wall[:, 2]) - films.FAR) < 0.05
+    fading = jax.tree.map(np.asarray, rows["temporal_opacity"])
+    lifted = active & (fading.log_width < temporal_opacity.ALWAYS)
+    np.testing.assert_array_equal(lifted, active & (still < 0.99))
+    assert np.isin(fading.time[lifted], capture.times.astype(np.float32)).all()
     quick = model.example(capture, jax.random.key(0))
     assert jax.tree.structure(quick) == jax.tree.structure(state)
     # It moves from its first step on.

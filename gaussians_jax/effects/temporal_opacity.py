@@ -1,0 +1,111 @@
+"""Gaussians that are there for a part of the film only.
+
+The temporal opacity of Spacetime Gaussians (Li et al. 2024, arXiv:2312.16812, equation
+7) by itself, beside any motion: what turns its back on the camera need not be the same
+Gaussians as what it shows then, and a track that is lost need not be found again. One
+that was lifted from a moving pixel is first seen around the time of that picture, for
+about as long as tracks there were followed; any other one all the time, until training
+finds a time for it.
+"""
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key
+
+from gaussians_jax.splats import Gaussians, Params, Splats
+from nerfies_jax.training.effects import Effect, FrameCondition
+
+NAME = "temporal_opacity"
+# Of the width of the opacity over time, in films: from a ten-thousandth to longer than
+# any. Outside it has no slope, and the quotient s / w stays finite.
+LOG_WIDTH_RANGE = (-9.0, 9.0)
+ALWAYS = LOG_WIDTH_RANGE[1] / 2  # 90 films: the least share of one film is 0.99997
+
+
+@dataclasses.dataclass(frozen=True)
+class TemporalOpacitySpec:
+    """How long a Gaussian is first seen, and how that is learnt.
+
+    `width` is over the time for which tracks near it were followed: 1/e of the opacity
+    is left so far from its own time.
+    """
+
+    width: float = 0.5
+    width_rate: float = 3e-2  # of the logarithm
+    time_rate: float = 1e-3  # of the time of its own, in films
+
+    def __post_init__(self):
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if not 0 < value < math.inf:
+                raise ValueError(f"{field.name}={value} must be positive and finite")
+
+
+class Fading(NamedTuple):
+    """When a Gaussian is to be seen."""
+
+    time: Float[Array, " gaussians"]  # of its own, in films from the first frame
+    log_width: Float[Array, " gaussians"]  # of films
+
+
+def visible_share(
+    since: Float[Array, "*gaussians"], log_width: Float[Array, "*gaussians"]
+) -> Float[Array, "*gaussians"]:
+    """exp(-(s / w)^2) of a time s from the middle, w = exp(`log_width`), in films.
+
+    Finite with its slopes whatever the width: the published exponential of a width that
+    is not held is 0/0 at s = 0 once the width has underflowed.
+    """
+    held = jnp.clip(log_width, *LOG_WIDTH_RANGE)
+    return jnp.exp(-jnp.square(since * jnp.exp(-held)))
+
+
+def faded(rows: Fading, gaussians: Gaussians, time: Float[Array, ""]) -> Gaussians:
+    """Gaussians with the share of their opacity that is left at a time in [0, 1]."""
+    share = visible_share(time - rows.time, rows.log_width)
+    return gaussians._replace(opacity=gaussians.opacity * share)
+
+
+def always(gaussians: int, dtype) -> Fading:
+    """Seen all the time."""
+    own = jnp.full(gaussians, 0.5, dtype)
+    return Fading(own, jnp.full(gaussians, ALWAYS, dtype))
+
+
+def around(
+    spec: TemporalOpacitySpec,
+    time: Float[np.ndarray, " gaussians"],
+    followed: Float[np.ndarray, " gaussians"],
+) -> Fading:
+    """Seen around a time, for as long as tracks near were followed; both in films.
+
+    Host side.
+    """
+    least = math.exp(LOG_WIDTH_RANGE[0])
+    return Fading(time, np.log(np.maximum(spec.width * followed, least)))
+
+
+def effect(spec: TemporalOpacitySpec) -> Effect:
+    """The seams that it fills; behind every motion, for motions may set opacities."""
+
+    def init_rows(key: Key[Array, ""], rows: Splats):
+        del key
+        return always(len(rows.mean), rows.mean.dtype)
+
+    def deform(params: Params, gaussians: Gaussians, condition: FrameCondition, ready):
+        del ready
+        return faded(params.rows[NAME], gaussians, condition.time)
+
+    return Effect(
+        name=NAME,
+        init_rows=init_rows,
+        row_learning_rate=lambda step: Fading(
+            jnp.full((), spec.time_rate), jnp.full((), spec.width_rate)
+        ),
+        deform=deform,
+        lifted_rows=lambda time, followed: around(spec, time, followed),
+    )
