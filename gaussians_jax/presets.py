@@ -211,7 +211,8 @@ SMALL_MCMC = dataclasses.replace(
     ),
 )
 # Two views a step, on a core each: 37 ms for 32 (10,000 Gaussians, 256x192).
-SMALL_TRACKED = dataclasses.replace(
+# What the small scenes that start from tracks share.
+SMALL_FROM_TRACKS = dataclasses.replace(
     SMALL_STATIC,
     steps=2000,
     batch_size=2,
@@ -223,9 +224,12 @@ SMALL_TRACKED = dataclasses.replace(
         refine_start_iter=200,
         refine_stop_iter=1300,
     ),
+    start=StartSpec(motion="tracks"),
+)
+SMALL_TRACKED = dataclasses.replace(
+    SMALL_FROM_TRACKS,
     motion=SE3BasesSpec(bases=12),
     temporal_opacity=TemporalOpacitySpec(),
-    start=StartSpec(motion="tracks"),
 )
 # Other motions from tracks. Built-in scene, one seed, as many steps as fitted into a
 # minute or two of a shared core (held-out PSNR, and where it moves):
@@ -235,19 +239,19 @@ SMALL_TRACKED = dataclasses.replace(
 #    649 steps: 4dgs       28.39 / 25.03    306, from rest: 20.32 / 13.90
 # A cubic is too stiff for the cloth and the box of this scene: its edges are soft.
 SMALL_DYNMF = dataclasses.replace(
-    SMALL_TRACKED,
+    SMALL_FROM_TRACKS,
     motion=dataclasses.replace(SMALL_TIME_BASIS, warm_up=600),
     neighbours=NeighbourSpec(start=600),
 )
-SMALL_SPACETIME = dataclasses.replace(SMALL_TRACKED, motion=PolynomialMotionSpec())
-SMALL_SPLINE = dataclasses.replace(SMALL_TRACKED, motion=SplineMotionSpec())
+SMALL_SPACETIME = dataclasses.replace(SMALL_FROM_TRACKS, motion=PolynomialMotionSpec())
+SMALL_SPLINE = dataclasses.replace(SMALL_FROM_TRACKS, motion=SplineMotionSpec())
 SMALL_FOUR_D = dataclasses.replace(
-    SMALL_TRACKED,
+    SMALL_FROM_TRACKS,
     motion=dataclasses.replace(SMALL_PLANE_MOTION, warm_up=600),
 )
 # From tracks as the others above, which the paper does not know; D-SSIM as there.
 SMALL_E_D3DGS = dataclasses.replace(
-    SMALL_TRACKED,
+    SMALL_FROM_TRACKS,
     motion=dataclasses.replace(
         SMALL_EMBEDDING_MOTION,
         warm_up=600,
@@ -262,11 +266,11 @@ SMALL_E_D3DGS = dataclasses.replace(
 # / 23.93. `SMALL_EDGS` has 28.85 / 24.83, `SMALL_TRACKED` 29.66 / 26.72: the network's
 # fit to the tracks is off by 0.47 % of the scene's depth, that of bases by 0.17 %.
 SMALL_SC_GS = dataclasses.replace(
-    SMALL_TRACKED,
+    SMALL_FROM_TRACKS,
     motion=dataclasses.replace(SMALL_NODE_MOTION, warm_up=600),
 )
 SMALL_EDGS = dataclasses.replace(
-    SMALL_TRACKED,
+    SMALL_FROM_TRACKS,
     motion=dataclasses.replace(
         SMALL_NODE_MOTION, rigidity=None, mask=MaskSpec(), warm_up=600
     ),
