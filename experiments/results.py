@@ -98,6 +98,9 @@ STUDIES = {
     "ablate_start": _package(
         "ablate_start", "--suite start --steps 900 --jobs 2", of="ablate"
     ),
+    "ablate_tracked": _package(
+        "ablate_tracked", "--suite tracked --steps 900 --jobs 2", of="ablate"
+    ),
     "ablate_sonata": _package(
         "ablate_sonata", "--suite sonata --steps 900 --jobs 2", of="ablate"
     ),

@@ -46,7 +46,8 @@ MOVING = ("psnr", "moving_psnr", "moving_ssim")
 TRACKED = (*MOVING, "track_error")
 
 FROM_TRACKS = "start.motion=tracks"
-ONE_VIEW = ("batch_size=1",)  # a step, as the presets beside it
+# One view a step and Gaussians that are always there, as in the presets beside it.
+BASES_ALONE = ("batch_size=1", "temporal_opacity=none")
 STILL = ("splats-static-small", "nerf-small", "t-nerf-small")  # have nothing to fit
 
 
@@ -62,12 +63,12 @@ def from_tracks(arms: dict[str, Arm]) -> dict[str, Arm]:
 
 START = Suite(
     arms={
-        "bases": Arm("splats-tracked-small", ONE_VIEW),
+        "bases": Arm("splats-tracked-small", BASES_ALONE),
         "mlp": Arm("splats-deformable-small", (FROM_TRACKS,)),
         "kan": Arm("sonata-small", (FROM_TRACKS,)),
         "basis": Arm("moba-small", (FROM_TRACKS,)),
         "bases-from-rest": Arm(
-            "splats-tracked-small", (*ONE_VIEW, "start.motion=none")
+            "splats-tracked-small", (*BASES_ALONE, "start.motion=none")
         ),
         "mlp-from-rest": Arm("splats-deformable-small"),
         "kan-from-rest": Arm("sonata-small"),
@@ -105,6 +106,28 @@ START = Suite(
     ),
     seeds=3,
     pictured=("bases", "mlp", "kan", "basis", "mlp-from-rest"),
+    context="",
+)
+
+TRACKED_PARTS = Suite(
+    arms={
+        "full": Arm("splats-tracked-small"),
+        "always-there": Arm("splats-tracked-small", ("temporal_opacity=none",)),
+        "k6": Arm("splats-tracked-small", ("motion.bases=6",)),
+        "k20": Arm("splats-tracked-small", ("motion.bases=20",)),
+    },
+    claims=(
+        Claim(
+            "Gaussians that are there for a part of the film show more",
+            "full",
+            "always-there",
+            TRACKED,
+        ),
+        Claim("Twelve bases beat six", "full", "k6", TRACKED),
+        Claim("Twelve bases beat twenty", "full", "k20", TRACKED),
+    ),
+    seeds=3,
+    pictured=("full", "always-there", "k6", "k20"),
     context="",
 )
 

@@ -20,11 +20,19 @@ class Ablate:
     }
 
     suite: Literal[
-        "fields", "start", "sonata", "moba", "settings", "advice", "league"
+        "fields",
+        "start",
+        "tracked",
+        "sonata",
+        "moba",
+        "settings",
+        "advice",
+        "league",
     ] = "fields"
-    """Radiance fields; motions of splats from tracks and from rest; the ablations of
-    Sonata or MoBa-GS; the settings of experiments.accuracy_time; what
-    experiments.inspect_scene can advise; or every small preset."""
+    """Radiance fields; motions of splats from tracks and from rest; the parts of
+    splats-tracked-small; the ablations of Sonata or MoBa-GS; the settings of
+    experiments.accuracy_time; what experiments.inspect_scene can advise; or every small
+    preset."""
     arms: tuple[str, ...] = ()
     """Which arms of the suite (default: all)."""
     source: cli.SourceOptions = CaptureSource()

@@ -2,12 +2,13 @@
 
 import functools
 
-from experiments.ablate.arms import FIELDS, MOBA, SONATA, START, Suite
+from experiments.ablate.arms import FIELDS, MOBA, SONATA, START, TRACKED_PARTS, Suite
 from experiments.accuracy_time.axes import SETTINGS
 
 KEPT = {
     "fields": FIELDS,
     "start": START,
+    "tracked": TRACKED_PARTS,
     "sonata": SONATA,
     "moba": MOBA,
     "settings": SETTINGS,
