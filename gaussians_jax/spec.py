@@ -5,6 +5,7 @@ import dataclasses
 from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.effects import (
     acceleration,
+    carried,
     depth,
     embedding_motion,
     exposure,
@@ -22,6 +23,7 @@ from gaussians_jax.effects import (
     time_basis,
 )
 from gaussians_jax.effects.acceleration import AccelerationSpec
+from gaussians_jax.effects.carried import CarriedSpec
 from gaussians_jax.effects.depth import DepthSpec
 from gaussians_jax.effects.embedding_motion import EmbeddingMotionSpec
 from gaussians_jax.effects.exposure import ExposureSpec
@@ -84,6 +86,7 @@ class SplatScene:
     alternation: AlternationSpec | None = None
     annealing: AnnealingSpec | None = None
     motion: AnyMotion | None = None
+    carried: CarriedSpec | None = None  # what is drawn of each row; None: the row
     start: StartSpec = StartSpec()
     acceleration: AccelerationSpec | None = None
     neighbours: NeighbourSpec | None = None
@@ -141,6 +144,12 @@ def refuse_what_cannot_train(spec: SplatScene) -> None:
             "neighbours keep embeddings or coefficients alike, and this motion has "
             "none; leave them out (neighbours=none), or choose a preset with a KAN "
             "motion or a time basis"
+        )
+    if spec.carried is not None and isinstance(spec.densification, MCMCStrategySpec):
+        raise ValueError(
+            "MCMCStrategySpec shares the opacity of a Gaussian among its copies, and "
+            "rows that carry several (carried) have none of their own; choose "
+            "DefaultStrategySpec, or leave carried out (carried=none)"
         )
     if growth is not None and not isinstance(spec.densification, DefaultStrategySpec):
         raise ValueError(
@@ -200,6 +209,10 @@ def effects_of(spec: SplatScene, metadata: SceneMetadata) -> tuple[Effect, ...]:
     """The effects that the spec asks for, in the order in which they act."""
     motion = motion_of(spec, metadata)
     effects = [] if motion is None else [motion]
+    if spec.carried is not None:
+        # What is carried turns by itself from when on the rows move.
+        still = 0 if motion is None else motion.warm_up
+        effects.append(carried.effect(spec.carried, spec.steps, still))
     if spec.acceleration is not None:
         effects.append(
             acceleration.effect(spec.acceleration, metadata.extent, metadata.frames)

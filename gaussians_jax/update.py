@@ -23,10 +23,10 @@ from nerfies_jax.training.updates import apply_updates
 class Drawn(NamedTuple):
     """What one frame showed of the Gaussians."""
 
-    mean2d_grad: Float[Array, "gaussians 2"]  # of the loss, per pixel
+    mean2d_grad: Float[Array, "drawn 2"]  # of the loss, per pixel
     footprints: Footprints
-    canonical: Gaussians
-    moved: Gaussians  # as they stood at the frame's time
+    canonical: Gaussians  # the rows
+    moved: Gaussians  # the rows as they stood at the frame's time
 
 
 def descend(

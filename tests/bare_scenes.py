@@ -154,6 +154,7 @@ def tiny_splats(name):
     return dataclasses.replace(
         spec,
         batch_size=1,
+        carried=shrunk(spec.carried, count=2),
         init=InitSpec(random=100, min_points=1000),
         start=StartSpec(motion="none"),
         sh_degree=1,

@@ -6,6 +6,7 @@ import pytest
 
 from gaussians_jax.effects import (
     acceleration,
+    carried,
     depth,
     embedding_motion,
     kan_motion,
@@ -44,6 +45,7 @@ FIELD_MODULES = {
     "scene_flow": scene_flow,
 }
 SPLAT_MODULES = {
+    "carried": carried,
     "acceleration": acceleration,
     "neighbours": neighbours,
     "motion_growth": motion_growth,
@@ -104,6 +106,9 @@ def of_splats(spec, metadata):
             seen = (extent, metadata.box)
         module = MOTION_MODULES[type(motion)]
         effects.append(module.effect(motion, spec.steps, *seen))
+    if spec.carried is not None:
+        still = 0 if motion is None else motion.warm_up
+        effects.append(carried.effect(spec.carried, spec.steps, still))
     if spec.acceleration is not None:
         effects.append(acceleration.effect(spec.acceleration, extent, frames))
     if spec.neighbours is not None:

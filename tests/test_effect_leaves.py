@@ -11,6 +11,7 @@ import pytest
 from gaussians_jax import presets as splat_presets
 from gaussians_jax import scene as splat_scene
 from gaussians_jax.effects import (
+    carried,
     embedding_motion,
     kan_motion,
     mlp_motion,
@@ -33,6 +34,7 @@ from gaussians_jax.effects.time_basis import TimeBasisSpec
 from nerfies_jax import field as fields
 from nerfies_jax import presets as field_presets
 from nerfies_jax.effects import ambient, scene_flow, transient, warp
+from nerfies_jax.nets import mlp
 from nerfies_jax.nets.grids import HashGridSpec
 from nerfies_jax.radiance import template
 from nerfies_jax.scene_metadata import SceneMetadata
@@ -165,6 +167,10 @@ def test_splats_have_the_arrays_of_what_they_have_and_no_others(preset):
             rows.add("spline_motion")
         elif motion is not None:
             nets["motion_basis"] = motion_basis.init(key, motion)
+        if spec.carried is not None:
+            rows.add("carried")
+            turns = carried.network_spec(spec.carried.turns)
+            nets["carried"] = mlp.init(turns, key)
         if spec.spectral is not None:
             nets["spectral"] = spectral.init(spec.spectral)
         if spec.neighbours is not None:

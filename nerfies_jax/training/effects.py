@@ -45,6 +45,8 @@ SPLAT_SEAMS = (
     "place",
     "prepare",
     "deform",
+    "derive_rows",
+    "derive",
     "fit_to_paths",
     "state",
     "ready_by_state",
@@ -159,6 +161,13 @@ class Effect(NamedTuple):
     prepare: Callable[[Any], PyTree] | None = None
     # (scene, `Gaussians`, condition, what `prepare` returned or None) -> `Gaussians`
     deform: Callable[[Any, Any, FrameCondition, PyTree], Any] | None = None
+    # What is drawn in the place of the rows, where each of them carries several
+    # Gaussians, those of the first row first; one effect of a scene at most.
+    # (scene, condition or None once trained) -> `splats.Splats`, at rest
+    derive_rows: Callable[[Any, FrameCondition | None], Any] | None = None
+    # (scene, what `derive_rows` returned, rows as `Gaussians` where `deform` left them,
+    # condition) -> `Gaussians`; what is drawn has the looks and opacities of the former
+    derive: Callable[[Any, Any, Any, FrameCondition], Any] | None = None
     # (params, picture [height, width, 3] sRGB, appearance id) -> the picture as it was
     # filmed; of all that is drawn, in training and afterwards
     expose: Callable[[PyTree, Any, Int[Array, ""]], Any] | None = None
