@@ -109,6 +109,7 @@ def observe(
     visible: Bool[Array, " drawn"],
     radius_px: Float[Array, " drawn"],
     size: tuple[int, int],
+    significance: Float[Array, " drawn"] | None = None,
 ) -> RowStats:
     """One more view, whose picture is `size` = (width, height); pure.
 
@@ -117,7 +118,8 @@ def observe(
     absolute slopes over the pixels. A pixel is 2/width of the NDC range, so the slope
     per NDC unit is width/2 and height/2 times larger; the thresholds are in that unit.
     Where rows carry several Gaussians each, these say what happened to those: a row
-    counts the mean slope of its visible ones and the largest radius.
+    counts the mean slope of its visible ones, by their `significance` where it is
+    given, and the largest radius.
     """
     width, height = size
     per_ndc = jnp.asarray([width / 2, height / 2], mean2d_gradient_px.dtype)
@@ -130,8 +132,13 @@ def observe(
         norm, visible, radius_px = (
             leaf.reshape(rows, -1) for leaf in (norm, visible, radius_px)
         )
-        seen = jnp.maximum(jnp.sum(visible, axis=1), 1).astype(norm.dtype)
-        norm, visible = jnp.sum(norm, axis=1) / seen, jnp.any(visible, axis=1)
+        weight = visible.astype(norm.dtype)
+        if significance is not None:
+            weight = weight * significance.reshape(rows, -1)
+        total = jnp.sum(weight, axis=1)
+        # None that is seen, or counts: no slope.
+        norm = jnp.sum(weight * norm, axis=1) / jnp.where(total > 0, total, 1)
+        visible = jnp.any(visible, axis=1)
         radius_px = jnp.max(radius_px, axis=1)
     return RowStats(
         active=stats.active,

@@ -11,7 +11,7 @@ from gaussians_jax import densification, initialisation, rendering, splats, trac
 from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.effects import deformation
 from gaussians_jax.growth import AuxState, states_of
-from gaussians_jax.spec import SplatScene, refuse_what_cannot_train
+from gaussians_jax.spec import SplatScene, carried_count, refuse_what_cannot_train
 from gaussians_jax.splats import Params
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evidence import usable_paths
@@ -23,7 +23,7 @@ def estimate_memory_bytes(spec: SplatScene, capture: Capture) -> int:
     """Roughly the memory of the first state and step; host side, nothing allocated."""
     count = initialisation.initial_count(spec.init, capture)
     count += spec.start.moving_points if spec.start.motion == "tracks" else 0
-    count *= 1 if spec.carried is None else 1 + spec.carried.count
+    count *= 1 + (carried_count(spec) or 0)
     harmonics = 3 * (spec.sh_degree + 1) ** 2
     # Parameters, two moments, gradient, update; the tables of one projection.
     numbers = count * (5 * (11 + harmonics) + 60)

@@ -17,7 +17,8 @@ from gaussians_jax import (
     step_time,
     variants,
 )
-from gaussians_jax.effects import deformation
+from gaussians_jax.effects import anchor_motion, deformation
+from gaussians_jax.effects.anchors import AnchorMotionSpec
 from gaussians_jax.effects.motion_basis import BasisMotionSpec
 from gaussians_jax.player import page
 from nerfies_jax.capture.cache import CACHE
@@ -71,6 +72,13 @@ def save(
     if all(effect.deform is None for effect in every):
         return Saved(size)
     notes = ["gaussians.ply holds the canonical Gaussians, without their motion."]
+    if isinstance(spec.motion, AnchorMotionSpec):
+        features, others = anchor_motion.kept_bytes(state.params, spec.motion)
+        notes.append(
+            f"The features of its anchors are {features / 1e6:.2f} MB by their bits "
+            f"under the learnt law, all else {others / 1e6:.2f} MB at 32 bits a number "
+            f"({MODEL} holds all at 32 bits)."
+        )
     if isinstance(spec.motion, BasisMotionSpec):
         notes.append(
             f"{MODEL} holds all of the scene in {size / 1e6:.1f} MB. MoBa-GS reports "

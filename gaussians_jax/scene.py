@@ -252,7 +252,8 @@ def _gradients(spec, metadata, effects, state, frames, row, condition):
         seen = observe(frames, row, exposed)
         states = state.aux_state.effects
         value, metrics = loss_of(spec, effects, params, seen, condition, states)
-        return value, (metrics, frame.footprints, canonical, moved)
+        weight = deformation.significance(effects, drawn)
+        return value, (metrics, frame.footprints, canonical, moved, weight)
 
     probe = deformation.probe(effects, state.params)
     (value, (metrics, *drawn)), (grads, mean2d_grad) = jax.value_and_grad(

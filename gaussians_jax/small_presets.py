@@ -4,6 +4,7 @@ import dataclasses
 
 from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.effects.acceleration import AccelerationSpec
+from gaussians_jax.effects.anchors import AnchorMotionSpec, RateSpec
 from gaussians_jax.effects.carried import CarriedSpec, TurnSpec
 from gaussians_jax.effects.depth import DepthSpec
 from gaussians_jax.effects.embedding_motion import SMALL_EMBEDDING_MOTION
@@ -158,6 +159,23 @@ SMALL_D_MISO = dataclasses.replace(
         quaternion_rate=2e-3,
         sh_dc_rate=5e-3,
         sh_rest_rate=2.5e-4,
+    ),
+)
+
+# A tenth of the rows, and ten Gaussians of each.
+SMALL_ADC_GS = dataclasses.replace(
+    SMALL_TRACKED,
+    init=InitSpec(points=700, random=600),
+    start=StartSpec(motion="tracks", moving_points=400),
+    sh_degree=0,
+    densification=dataclasses.replace(SMALL_TRACKED.densification, cap_max=1000),
+    motion=AnchorMotionSpec(
+        time_code=16,
+        width=64,
+        rate=RateSpec(start=700, learning_rate=1e-2, learning_rate_end=1e-4),
+        warm_up=600,
+        learning_rate=1e-3,
+        learning_rate_end=1e-5,
     ),
 )
 

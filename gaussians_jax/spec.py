@@ -5,6 +5,7 @@ import dataclasses
 from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.effects import (
     acceleration,
+    anchor_motion,
     carried,
     depth,
     embedding_motion,
@@ -23,6 +24,7 @@ from gaussians_jax.effects import (
     time_basis,
 )
 from gaussians_jax.effects.acceleration import AccelerationSpec
+from gaussians_jax.effects.anchors import AnchorMotionSpec
 from gaussians_jax.effects.carried import CarriedSpec
 from gaussians_jax.effects.depth import DepthSpec
 from gaussians_jax.effects.embedding_motion import EmbeddingMotionSpec
@@ -60,6 +62,7 @@ AnyMotion = (
     | PlaneMotionSpec
     | EmbeddingMotionSpec
     | NodeMotionSpec
+    | AnchorMotionSpec
 )
 # Motions with a vector for each Gaussian that neighbours may be kept alike in.
 EMBEDDED = {
@@ -124,6 +127,13 @@ class SceneMetadata:
     box: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
 
+def carried_count(spec: SplatScene) -> int | None:
+    """How many Gaussians each row carries; None where rows are what is drawn."""
+    if isinstance(spec.motion, AnchorMotionSpec):
+        return spec.motion.count
+    return None if spec.carried is None else spec.carried.count
+
+
 def refuse_what_cannot_train(spec: SplatScene) -> None:
     """Raise ValueError where parts that are asked for need others that are not.
 
@@ -145,11 +155,13 @@ def refuse_what_cannot_train(spec: SplatScene) -> None:
             "none; leave them out (neighbours=none), or choose a preset with a KAN "
             "motion or a time basis"
         )
-    if spec.carried is not None and isinstance(spec.densification, MCMCStrategySpec):
+    carry = carried_count(spec) is not None
+    if carry and isinstance(spec.densification, MCMCStrategySpec):
         raise ValueError(
             "MCMCStrategySpec shares the opacity of a Gaussian among its copies, and "
-            "rows that carry several (carried) have none of their own; choose "
-            "DefaultStrategySpec, or leave carried out (carried=none)"
+            "rows that carry several have none of their own; choose "
+            "DefaultStrategySpec, or leave out what they carry (carried=none, or "
+            "another motion than that of anchors)"
         )
     if growth is not None and not isinstance(spec.densification, DefaultStrategySpec):
         raise ValueError(
@@ -191,6 +203,9 @@ MOTIONS = {
     ),
     NodeMotionSpec: lambda spec, steps, seen: node_motion.effect(
         spec, steps, seen.extent
+    ),
+    AnchorMotionSpec: lambda spec, steps, seen: anchor_motion.effect(
+        spec, steps, seen.frames
     ),
 }
 

@@ -27,6 +27,8 @@ class Drawn(NamedTuple):
     footprints: Footprints
     canonical: Gaussians  # the rows
     moved: Gaussians  # the rows as they stood at the frame's time
+    # How much each of what was drawn counts for its row; None: all alike.
+    significance: Float[Array, " drawn"] | None = None
 
 
 def descend(
@@ -76,7 +78,12 @@ def gather(
         footprints = drawn.footprints
         radius_px = jnp.max(footprints.extent_px, axis=1)
         stats = densification.observe(
-            stats, drawn.mean2d_grad, footprints.visible, radius_px, size
+            stats,
+            drawn.mean2d_grad,
+            footprints.visible,
+            radius_px,
+            size,
+            drawn.significance,
         )
     for effect in effects:
         if effect.update_state is not None:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gaussians_jax import scene, splats, static_rows, time_knots
+from gaussians_jax.effects.anchors import AnchorMotionSpec
 from nerfies_jax.evaluation.representation import Parts, check_there
 from nerfies_jax.training.effects import Effect
 from nerfies_jax.training.model import Model, Stages, TrainState
@@ -40,6 +41,9 @@ def without_effects(
         )
     check_there(without, parts(spec, metadata, effects).removable)
     left = {name: None for name in REMOVABLE if name in without}
+    if "motion" in left and isinstance(spec.motion, AnchorMotionSpec):
+        # Of the same features as the motion is what anchors carry at rest.
+        left["motion"] = dataclasses.replace(spec.motion, moves=False)
     kept = tuple(effect for effect in effects if effect.name not in without)
     return scene.build(dataclasses.replace(spec, **left), metadata, kept)
 

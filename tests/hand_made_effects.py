@@ -6,6 +6,8 @@ import pytest
 
 from gaussians_jax.effects import (
     acceleration,
+    anchor_motion,
+    anchors,
     carried,
     depth,
     embedding_motion,
@@ -63,12 +65,14 @@ MOTION_MODULES = {
     plane_motion.PlaneMotionSpec: plane_motion,
     embedding_motion.EmbeddingMotionSpec: embedding_motion,
     node_motion.NodeMotionSpec: node_motion,
+    anchors.AnchorMotionSpec: anchor_motion,
 }
 BY_FRAMES = {  # the others ask for the scene's extent
     mlp_motion.MotionSpec,
     kan_motion.KanMotionSpec,
     motion_basis.BasisMotionSpec,
     embedding_motion.EmbeddingMotionSpec,
+    anchors.AnchorMotionSpec,
 }
 
 
@@ -133,6 +137,9 @@ def absent_modules(spec):
         gone.remove(mlp_motion)
     if isinstance(motion, embedding_motion.EmbeddingMotionSpec):
         gone.remove(kan_motion)
+    if isinstance(motion, anchors.AnchorMotionSpec):
+        gone.remove(kan_motion)
+        gone.remove(carried)
     return gone
 
 

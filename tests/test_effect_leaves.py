@@ -11,6 +11,7 @@ import pytest
 from gaussians_jax import presets as splat_presets
 from gaussians_jax import scene as splat_scene
 from gaussians_jax.effects import (
+    anchors,
     carried,
     embedding_motion,
     kan_motion,
@@ -22,6 +23,7 @@ from gaussians_jax.effects import (
     spectral,
     time_basis,
 )
+from gaussians_jax.effects.anchors import AnchorMotionSpec
 from gaussians_jax.effects.embedding_motion import EmbeddingMotionSpec
 from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec
@@ -159,6 +161,9 @@ def test_splats_have_the_arrays_of_what_they_have_and_no_others(preset):
         elif isinstance(motion, NodeMotionSpec):
             nets["node_motion"] = node_motion.init(key, motion)
             states.add("node_motion")
+        elif isinstance(motion, AnchorMotionSpec):
+            rows.add("anchor_motion")
+            nets["anchor_motion"] = anchors.init(key, motion, metadata.frames)
         elif isinstance(motion, PlaneMotionSpec):
             nets["plane_motion"] = plane_motion.init(key, motion)
         elif isinstance(motion, PolynomialMotionSpec):

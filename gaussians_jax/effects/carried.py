@@ -223,9 +223,11 @@ def effect(spec: CarriedSpec, steps: int, warm_up: int) -> Effect:
             spec.sh_rest_rate,
         )
 
-    def derive_rows(params: Params, condition: FrameCondition | None) -> Splats:
+    def derive_rows(
+        params: Params, condition: FrameCondition | None
+    ) -> tuple[Splats, None]:
         del condition
-        return at_rest(params.rows["splats"], params.rows[NAME])
+        return at_rest(params.rows["splats"], params.rows[NAME]), None
 
     def turn_of(params, condition):
         own = params.rows[NAME]
@@ -244,10 +246,13 @@ def effect(spec: CarriedSpec, steps: int, warm_up: int) -> Effect:
         )
 
     def derive(
-        params: Params, still: Splats, rows: Gaussians, condition: FrameCondition
+        params: Params,
+        derived: tuple[Splats, None],
+        rows: Gaussians,
+        condition: FrameCondition,
     ) -> Gaussians:
         turn = None if spec.turns is None else turn_of(params, condition)
-        return posed(params.rows[NAME], turn, still, rows)
+        return posed(params.rows[NAME], turn, derived[0], rows)
 
     own = Effect(
         name=NAME,
@@ -268,4 +273,5 @@ def effect(spec: CarriedSpec, steps: int, warm_up: int) -> Effect:
 
 def _flat(leaf):
     """[rows, carried, ...] as [rows * carried, ...]."""
-    return leaf.reshape(-1, *leaf.shape[2:])
+    rows, carried, *rest = leaf.shape  # of which the last may be none
+    return leaf.reshape(rows * carried, *rest)

@@ -42,7 +42,7 @@ def deform(
     by = derives(effects)
     if by is None:
         return moved
-    return by.derive(params, drawn_rows(effects, params), moved, FrameCondition(time))
+    return by.derive(params, by.derive_rows(params, None), moved, FrameCondition(time))
 
 
 def deform_rows(
@@ -80,22 +80,33 @@ def check_derived(effects: Effects) -> None:
             )
 
 
-def drawn_rows(
-    effects: Effects, params: Params, condition: FrameCondition | None = None
-) -> Splats:
-    """What is drawn, at rest and as rows: the rows themselves, or what they carry."""
+def drawn_rows(effects: Effects, params: Params) -> Splats:
+    """What is drawn once trained, as rows at rest: the rows, or what they carry."""
     by = derives(effects)
     if by is None:
         return params.rows["splats"]
-    return by.derive_rows(params, condition)
+    return by.derive_rows(params, None)[0]
 
 
 def drawn(
     effects: Effects, params: Params, moved: Gaussians, condition: FrameCondition
 ) -> tuple[Splats, Gaussians]:
     """What is drawn of moved rows in training: as rows at rest, and as it stands."""
-    rows, by = drawn_rows(effects, params, condition), derives(effects)
-    return rows, moved if by is None else by.derive(params, rows, moved, condition)
+    by = derives(effects)
+    if by is None:
+        return params.rows["splats"], moved
+    derived = by.derive_rows(params, condition)
+    return derived[0], by.derive(params, derived, moved, condition)
+
+
+def significance(
+    effects: Effects, gaussians: Gaussians
+) -> Float[Array, " gaussians"] | None:
+    """How much each of what is drawn counts for its row; None: all alike."""
+    by = derives(effects)
+    if by is None or by.significance is None:
+        return None
+    return by.significance(gaussians)
 
 
 def carried_by_each(effects: Effects, params: Params) -> int:

@@ -23,6 +23,7 @@ PRESETS = (
     *("e-d3dgs", "e-d3dgs-small"),
     *("dynmf-small", "spacetime-small", "spline-small", "4dgs-small"),
     *("sc-gs-small", "edgs-small", "d-miso", "d-miso-small"),
+    *("adc-gs", "adc-gs-small"),
     *("nerf", "nerf-w", "d-nerf", "t-nerf", "nerfies", "hypernerf"),
     *("nsff", "splats-static-small", "splats-mcmc-small", "splats-tracked-small"),
     *("splats-deformable-small", "sonata-small", "moba-small", "nerf-small"),

@@ -90,8 +90,8 @@ def test_what_is_carried_follows_its_row_and_turns_by_itself(time, dtype):
 
     def run(params, moved, time):
         condition = FrameCondition(time)
-        still = effect.derive_rows(params, None)
-        return effect.derive(params, still, moved, condition)
+        derived = effect.derive_rows(params, None)
+        return effect.derive(params, derived, moved, condition)
 
     found = jitted(run)(params, moved, put(time, dtype))
     mean, turn, scale, opacity = by_hand(host(params), host(moved), time)
