@@ -161,7 +161,8 @@ def _splatv(args: Export, run: Any) -> str:
     from nerfies_jax import evaluation, runs
 
     state, spec, capture = runs.restore(args.run, run).state, run.spec, run.capture
-    at, rows = instants.gaussians_at(run.model, state), state.params.rows["splats"]
+    at = instants.gaussians_at(run.model, state)
+    rows = run.model.stages.rows(state.params)
     degree = splats.active_degree(state.step, spec.sh_every, spec.sh_degree)
     seen = sampled.seen_in_training(at, rows, spec.raster, degree, capture)
     learned = sampled.gathered(at, rows, seen, sampled.MOST_INSTANTS)

@@ -105,10 +105,11 @@ def empty_stats(rows: Splats) -> RowStats:
 
 def observe(
     stats: RowStats,
-    mean2d_gradient_px: Float[Array, "gaussians 2"],
-    visible: Bool[Array, " gaussians"],
-    radius_px: Float[Array, " gaussians"],
+    mean2d_gradient_px: Float[Array, "drawn 2"],
+    visible: Bool[Array, " drawn"],
+    radius_px: Float[Array, " drawn"],
     size: tuple[int, int],
+    significance: Float[Array, " drawn"] | None = None,
 ) -> RowStats:
     """One more view, whose picture is `size` = (width, height); pure.
 
@@ -116,17 +117,34 @@ def observe(
     batch) by the projected means in pixels; for the absolute variant, the sum of the
     absolute slopes over the pixels. A pixel is 2/width of the NDC range, so the slope
     per NDC unit is width/2 and height/2 times larger; the thresholds are in that unit.
+    Where rows carry several Gaussians each, these say what happened to those: a row
+    counts the mean slope of its visible ones, by their `significance` where it is
+    given, and the largest radius.
     """
     width, height = size
     per_ndc = jnp.asarray([width / 2, height / 2], mean2d_gradient_px.dtype)
     grad = mean2d_gradient_px * per_ndc
     # Summed squares underflow in float32 below 1e-19; hypot does not.
-    norm = jnp.hypot(grad[:, 0], grad[:, 1])
+    norm = jnp.where(visible, jnp.hypot(grad[:, 0], grad[:, 1]), 0)
+    radius_px = jnp.where(visible, radius_px, 0)
+    rows = stats.active.shape[0]
+    if len(norm) != rows:
+        norm, visible, radius_px = (
+            leaf.reshape(rows, -1) for leaf in (norm, visible, radius_px)
+        )
+        weight = visible.astype(norm.dtype)
+        if significance is not None:
+            weight = weight * significance.reshape(rows, -1)
+        total = jnp.sum(weight, axis=1)
+        # None that is seen, or counts: no slope.
+        norm = jnp.sum(weight * norm, axis=1) / jnp.where(total > 0, total, 1)
+        visible = jnp.any(visible, axis=1)
+        radius_px = jnp.max(radius_px, axis=1)
     return RowStats(
         active=stats.active,
-        grad2d=stats.grad2d + jnp.where(visible, norm, 0),
+        grad2d=stats.grad2d + norm,
         views=stats.views + visible.astype(jnp.int32),
-        radius_px=jnp.maximum(stats.radius_px, jnp.where(visible, radius_px, 0)),
+        radius_px=jnp.maximum(stats.radius_px, radius_px),
     )
 
 

@@ -43,11 +43,11 @@ def gaussians_at(model: Model, state: TrainState) -> At:
     params = state.params
     prepared = jax.jit(model.stages.prepare)(params)
     deform = jax.jit(model.stages.deform)
+    dtype = params.rows["splats"].mean.dtype
 
     def at(time: float) -> Gaussians:
         check_time(time)
-        instant = jnp.asarray(time, params.rows["splats"].mean.dtype)
-        return deform(params, prepared, instant)
+        return deform(params, prepared, jnp.asarray(time, dtype))
 
     return at
 
@@ -58,7 +58,8 @@ def splats_at(model: Model, state: TrainState) -> Callable[[float], Splats]:
     Which rows are active, and their order, is the same at all times.
     """
     deformed_at, as_rows = gaussians_at(model, state), jax.jit(_as_rows)
-    return lambda time: as_rows(state.params.rows["splats"], deformed_at(time))
+    rows = model.stages.rows(state.params)
+    return lambda time: as_rows(rows, deformed_at(time))
 
 
 def _as_rows(rows: Splats, deformed: Gaussians) -> Splats:

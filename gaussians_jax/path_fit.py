@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Key
 
 from gaussians_jax import splats
 from gaussians_jax.splats import Params, Splats
+from nerfies_jax.evidence import rigid_groups
 from nerfies_jax.training.effects import Effect, FrameCondition
 from nerfies_jax.training.updates import apply_updates
 
@@ -27,6 +28,10 @@ LAST_RATE = 0.02  # of the first
 # What second and first differences from frame to frame cost in a fit in closed form, a
 # path that is off by as much costing one: what is not known goes on straight and slows.
 BEND, DRIFT = 0.1, 1e-3
+BODIES = 8  # by which paths are brought to one moment
+# What the motion of what is at rest costs in a fit, one length of the scene costing
+# one, and at how many moments of the film it is looked at.
+REST, MOMENTS = 1.0, 8
 RIDGE = 1e-9  # of the trace: a basis may have a direction that changes nothing
 
 
@@ -69,6 +74,29 @@ def mean_places(paths: Paths) -> Float[np.ndarray, "points 3"]:
     weight = paths.known[..., None].astype(float)
     total = np.sum(np.where(weight > 0, paths.position, 0), axis=1)
     return total / np.maximum(np.sum(weight, axis=1), 1)
+
+
+def places_at_one_moment(paths: Paths) -> Float[np.ndarray, "points 3"]:
+    """Where each point is in the middle of the film, as a part of a rigid body.
+
+    Means over a path lie together where a body turns; these are as far apart as the
+    points are. Host side.
+    """
+    label = rigid_groups.labels(paths.position, paths.known, BODIES)
+    middle = len(paths.times) // 2
+    bodies = rigid_groups.motion(paths.position, paths.known, label, middle)
+    return rigid_groups.centres(paths.position, paths.known, bodies)[0]
+
+
+def unrest(
+    turn: Float[Array, "points turn"], shift: Float[Array, "points 3"], unit: float
+) -> Float[Array, ""]:
+    """How far points are from rest on the mean: turns in rad, shifts in units.
+
+    Softened near zero as the distances of `fit` are.
+    """
+    total = jnp.sum(turn**2, axis=1) + jnp.sum((shift / unit) ** 2, axis=1)
+    return jnp.mean(jnp.sqrt(total + SOFT**2))
 
 
 def combination(

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import scipy.spatial
 
-from gaussians_jax import scene, splats
+from gaussians_jax import scene
 from nerfies_jax.evaluation.model_flow import Move, Moved
 from nerfies_jax.evaluation.protocol import STATIC_POINTS, PointTracks
 from nerfies_jax.training.model import in_default_precision
@@ -38,7 +38,7 @@ def follow(spec, metadata, state, capture, known, effects=()) -> PointTracks | N
         [np.asarray(deform(state.params, prepared, time).mean) for time in times]
     )
     first = deform(state.params, prepared, times[known.start])
-    opacity = _seen_opacity(state, first)
+    opacity = np.asarray(first.opacity)
     path = carried(known.start_points, means, opacity, known.start)
     drift = float("nan")
     if capture.points is not None:
@@ -71,16 +71,10 @@ def mover(spec, metadata, effects=()) -> Move | None:
     def move(state, points, here, there):
         first, last = (deform(state.params, view.time) for view in (here, there))
         means = np.stack([np.asarray(first.mean), np.asarray(last.mean)])
-        path = carried(points, means, _seen_opacity(state, first), 0)
+        path = carried(points, means, np.asarray(first.opacity), 0)
         return Moved(path[:, 1].astype(points.dtype), np.ones(len(points), bool))
 
     return move
-
-
-def _seen_opacity(state, deformed):
-    """[gaussians] opacity of deformed Gaussians, 0 for rows that are not active."""
-    active = np.asarray(splats.active_mask(state.params.rows["splats"]))
-    return np.where(active, np.asarray(deformed.opacity), 0.0)
 
 
 def carried(
@@ -89,6 +83,7 @@ def carried(
     """Where Gaussians carry points [points, 3] to: [points, moments, 3].
 
     `means` [moments, gaussians, 3] are theirs; the points are given at moment `start`.
+    Rows that are not active have no opacity, and so carry nothing.
     Where no Gaussian can be seen, points stay.
     """
     rows = np.flatnonzero(opacity > LEAST_OPACITY)

@@ -1,4 +1,4 @@
-"""Named scenes: a paper's numbers, and variants that train on a CPU in minutes.
+"""Named scenes: a paper's numbers; those for a CPU are in `small_presets`.
 
 Where a preset leaves its paper, that is said beside it. None of the full sizes was ever
 trained to its end: they want a GPU.
@@ -8,34 +8,44 @@ import dataclasses
 
 from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.effects.acceleration import AccelerationSpec
+from gaussians_jax.effects.anchors import AnchorMotionSpec
+from gaussians_jax.effects.carried import CarriedSpec
 from gaussians_jax.effects.depth import DepthSpec
-from gaussians_jax.effects.embedding_motion import (
-    SMALL_EMBEDDING_MOTION,
-    EmbeddingMotionSpec,
-)
-from gaussians_jax.effects.kan_motion import SMALL_KAN_MOTION, KanMotionSpec
+from gaussians_jax.effects.embedding_motion import EmbeddingMotionSpec
+from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec
-from gaussians_jax.effects.motion_basis import SMALL_BASIS_MOTION, BasisMotionSpec
+from gaussians_jax.effects.motion_basis import BasisMotionSpec
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec
 from gaussians_jax.effects.neighbours import NeighbourSpec
-from gaussians_jax.effects.node_motion import (
-    SMALL_NODE_MOTION,
-    MaskSpec,
-    NodeMotionSpec,
-)
-from gaussians_jax.effects.plane_motion import SMALL_PLANE_MOTION, PlaneMotionSpec
+from gaussians_jax.effects.node_motion import MaskSpec, NodeMotionSpec
+from gaussians_jax.effects.plane_motion import PlaneMotionSpec
 from gaussians_jax.effects.polynomial_motion import PolynomialMotionSpec
 from gaussians_jax.effects.se3_bases import SE3BasesSpec
 from gaussians_jax.effects.spectral import SpectralSpec
 from gaussians_jax.effects.spline_motion import SplineMotionSpec
 from gaussians_jax.effects.temporal_opacity import TemporalOpacitySpec
-from gaussians_jax.effects.time_basis import SMALL_TIME_BASIS, TimeBasisSpec
+from gaussians_jax.effects.time_basis import TimeBasisSpec
 from gaussians_jax.initialisation import InitSpec, StartSpec
-from gaussians_jax.learning_rates import LearningRateSpec
 from gaussians_jax.mcmc import MCMCStrategySpec
 from gaussians_jax.phases import AlternationSpec, AnnealingSpec
+from gaussians_jax.small_presets import (
+    SMALL_ADC_GS,
+    SMALL_D_MISO,
+    SMALL_DEFORMABLE,
+    SMALL_DYNMF,
+    SMALL_E_D3DGS,
+    SMALL_EDGS,
+    SMALL_FOUR_D,
+    SMALL_MCMC,
+    SMALL_MOBA,
+    SMALL_SC_GS,
+    SMALL_SONATA,
+    SMALL_SPACETIME,
+    SMALL_SPLINE,
+    SMALL_STATIC,
+    SMALL_TRACKED,
+)
 from gaussians_jax.spec import SplatScene
-from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.training import step_counts
 
 # Kerbl et al. 2023, arXiv:2308.04079: every other number is a default of its spec.
@@ -167,174 +177,33 @@ EDGS = SplatScene(
     start=StartSpec(motion="tracks", moving_points=20_000),
 )
 
-# For a CPU: the same parts with fewer Gaussians, a smaller network, a shorter run.
-# Measured on the built-in scene at 2000 steps (held-out PSNR and SSIM, one seed):
-#   motion from 10 % of the run on, network rate 2e-3   18.20 / 0.466, worse than static
-#   motion from 35 % on, rate 8e-4                      20.36 / 0.740
-#   and random points beside the static ones            21.61 / 0.802
-#   and 96 wide, 6 bands of time, no smoothing          21.89 / 0.807
-# A field that may move everything before the static part stands bends the background to
-# follow the camera; without points of its own, what moves is painted onto the walls.
-SMALL_STATIC = SplatScene(
-    steps=3000,
-    init=InitSpec(points=4000, random=5000, extra_random=2000),
-    sh_degree=1,
-    sh_every=1000,
-    densification=DefaultStrategySpec(
-        refine_every=200,
-        refine_start_iter=300,
-        refine_stop_iter=2000,
-        reset_every=100_000,
-        cap_max=10_000,
-    ),
-    # Looks and shapes learn twice as fast as published, for a tenth of the steps. At
-    # 1500 steps, one seed: built-in still scene 32.29 -> 33.02 dB, `SMALL_TRACKED` on
-    # the default one 30.39 -> 30.74, on a film of 256x192 36.22 -> 36.65; four times as
-    # fast 36.69 there, opacities, too 36.57, means alone (4e-4) 36.24.
-    learning_rates=LearningRateSpec(
-        mean_end=3.2e-6,
-        log_scale=1e-2,
-        quaternion=2e-3,
-        sh_dc=5e-3,
-        sh_rest=2.5e-4,
-    ),
-)
-# Built-in scene, 1500 steps, up to 10,000 Gaussians (held-out PSNR and SSIM, one seed):
-#   clone and split (`SMALL_STATIC`)              22.41 / 0.816
-#   this                                          22.04 / 0.799
-#   with the paper's first opacity and scale      21.92 / 0.797
-#   and events every 100 steps (7692 Gaussians)   21.93 / 0.795
-SMALL_MCMC = dataclasses.replace(
-    SMALL_STATIC,
-    densification=MCMCStrategySpec(
-        refine_every=50, refine_start_iter=300, refine_stop_iter=2500, cap_max=10_000
-    ),
-)
-# Two views a step, on a core each: 37 ms for 32 (10,000 Gaussians, 256x192).
-# What the small scenes that start from tracks share.
-SMALL_FROM_TRACKS = dataclasses.replace(
-    SMALL_STATIC,
-    steps=2000,
-    batch_size=2,
-    init=InitSpec(points=4000, random=5000),
-    sh_every=700,
-    densification=dataclasses.replace(
-        SMALL_STATIC.densification,
-        refine_every=130,
-        refine_start_iter=200,
-        refine_stop_iter=1300,
-    ),
-    start=StartSpec(motion="tracks"),
-)
-SMALL_TRACKED = dataclasses.replace(
-    SMALL_FROM_TRACKS,
-    motion=SE3BasesSpec(bases=12),
-    temporal_opacity=TemporalOpacitySpec(),
-)
-# Other motions from tracks. Built-in scene, one seed, as many steps as fitted into a
-# minute or two of a shared core (held-out PSNR, and where it moves):
-#   1300 steps: dynmf      29.83 / 26.51    738, from rest: 20.28 / 13.83
-#    940 steps: spline     28.57 / 26.28   1562, from rest: 20.04 / 13.81
-#   1600 steps: spacetime  28.63 / 24.03    700, from rest: 20.42 / 13.95
-#    649 steps: 4dgs       28.39 / 25.03    306, from rest: 20.32 / 13.90
-# A cubic is too stiff for the cloth and the box of this scene: its edges are soft.
-SMALL_DYNMF = dataclasses.replace(
-    SMALL_FROM_TRACKS,
-    motion=dataclasses.replace(SMALL_TIME_BASIS, warm_up=600),
-    neighbours=NeighbourSpec(start=600),
-)
-SMALL_SPACETIME = dataclasses.replace(SMALL_FROM_TRACKS, motion=PolynomialMotionSpec())
-SMALL_SPLINE = dataclasses.replace(SMALL_FROM_TRACKS, motion=SplineMotionSpec())
-SMALL_FOUR_D = dataclasses.replace(
-    SMALL_FROM_TRACKS,
-    motion=dataclasses.replace(SMALL_PLANE_MOTION, warm_up=600),
-)
-# From tracks as the others above, which the paper does not know; D-SSIM as there.
-SMALL_E_D3DGS = dataclasses.replace(
-    SMALL_FROM_TRACKS,
-    motion=dataclasses.replace(
-        SMALL_EMBEDDING_MOTION,
-        warm_up=600,
-        learning_rate=1e-3,
-        learning_rate_end=1e-5,
-        embedding_rate=1e-3,
-    ),
-    neighbours=NeighbourSpec(start=600),
-)
-# Built-in scene, 600 steps of one view each, one seed (held-out PSNR, and where it
-# moves): 28.69 / 24.54, without the rigid term 28.59 / 24.49, with a weight of 1 28.28
-# / 23.93. `SMALL_EDGS` has 28.85 / 24.83, `SMALL_TRACKED` 29.66 / 26.72: the network's
-# fit to the tracks is off by 0.47 % of the scene's depth, that of bases by 0.17 %.
-SMALL_SC_GS = dataclasses.replace(
-    SMALL_FROM_TRACKS,
-    motion=dataclasses.replace(SMALL_NODE_MOTION, warm_up=600),
-)
-SMALL_EDGS = dataclasses.replace(
-    SMALL_FROM_TRACKS,
-    motion=dataclasses.replace(
-        SMALL_NODE_MOTION, rigidity=None, mask=MaskSpec(), warm_up=600
-    ),
-)
-SMALL_DEFORMABLE = dataclasses.replace(
-    SMALL_STATIC,
-    motion=MotionSpec(
-        position=EncodingSpec(5),
-        time=EncodingSpec(6),
-        depth=4,
-        width=96,
-        skips=(2,),
-        warm_up=600,
-        smoothing=None,
-        learning_rate=5e-4,
-        learning_rate_end=5e-6,
-    ),
+# D-MiSo: 80,000 steps, four views in each, cores that grow for 5000 steps (to some 3000
+# there; at most so many here) and carry 25 Gaussians each. Where the paper draws cores
+# alone for those steps, what they carry is here from the start (`effects.carried`); its
+# network reads all three corners of a core's triangle, this one the first.
+D_MISO = SplatScene(
+    steps=80_000,
+    batch_size=4,
+    init=InitSpec(points=4000),
+    densification=DefaultStrategySpec(refine_stop_iter=5000, cap_max=10_000),
+    motion=MotionSpec(warm_up=2000, smoothing=None),
+    carried=CarriedSpec(),
 )
 
-# Measured (held-out PSNR and SSIM, one seed):
-#   built-in, 1000 steps: RAdam                          21.84 / 0.755
-#                         Adam, network rate 2e-3        22.67 / 0.817
-#                         Adam, network, embedding 1e-3  22.77 / 0.822
-#   D-NeRF lego, 1500:    codes drawn one by one         19.4
-#                         codes as waves over space      19.4
-#                         and over time                  20.1 (deformable 20.7)
-# Per-row RAdam takes 0.15 of Adam's step after 50 updates of a newborn row and 0.5
-# after 556, which a short run cannot afford. Codes that start alike for what is near
-# in space and time let the first steps move more than one Gaussian in one frame.
-SMALL_SONATA = dataclasses.replace(
-    SMALL_STATIC,
-    motion=dataclasses.replace(
-        SMALL_KAN_MOTION,
-        waves=2.0,
-        spread=0.5,
-        warm_up=600,
-        learning_rate=1e-3,
-        learning_rate_end=1e-5,
-        embedding_rate=1e-3,
+# ADC-GS, its code's numbers for HyperNeRF's films: ten Gaussians of an anchor, two
+# views a step, no D-SSIM, one colour from everywhere, growth to step 50,000, no resets.
+# It has a price on opacity, and a codec for the places of anchors; these are not here.
+# The number of steps was not to be found: it is that over which its rates fall.
+ADC_GS = SplatScene(
+    steps=80_000,
+    batch_size=2,
+    dssim_weight=0.0,
+    init=InitSpec(points=2000, random=2000),
+    sh_degree=0,
+    densification=DefaultStrategySpec(
+        refine_stop_iter=50_000, reset_every=6_000_000, cap_max=100_000
     ),
-    neighbours=NeighbourSpec(start=600),
-    spectral=SpectralSpec(),
-    depth=DepthSpec(),
-)
-# D-NeRF lego at 3000 steps: 20.96 dB with networks 32 and 48 wide and four bands of
-# time, 21.90 with these.
-SMALL_MOBA = dataclasses.replace(
-    SMALL_STATIC,
-    densification=dataclasses.replace(
-        SMALL_STATIC.densification, refine_stop_iter=1500
-    ),
-    motion=dataclasses.replace(
-        SMALL_BASIS_MOTION,
-        time=EncodingSpec(6),
-        base_width=64,
-        width=96,
-        warm_up=600,
-        learning_rate=5e-4,
-        learning_rate_end=5e-6,
-    ),
-    alternation=AlternationSpec(1500, 2250),
-    annealing=AnnealingSpec(2250),
-    motion_growth=MotionGrowthSpec(start=900),
-    acceleration=AccelerationSpec(start=600),
+    motion=AnchorMotionSpec(),
 )
 
 PRESETS = {
@@ -351,6 +220,8 @@ PRESETS = {
     "e-d3dgs": E_D3DGS,
     "sc-gs": SC_GS,
     "edgs": EDGS,
+    "d-miso": D_MISO,
+    "adc-gs": ADC_GS,
     "splats-static-small": SMALL_STATIC,
     "splats-tracked-small": SMALL_TRACKED,
     "splats-mcmc-small": SMALL_MCMC,
@@ -364,6 +235,8 @@ PRESETS = {
     "e-d3dgs-small": SMALL_E_D3DGS,
     "sc-gs-small": SMALL_SC_GS,
     "edgs-small": SMALL_EDGS,
+    "d-miso-small": SMALL_D_MISO,
+    "adc-gs-small": SMALL_ADC_GS,
 }
 
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from gaussians_jax import (
     files,
+    first_state,
     held_out_exposure,
     model_file,
     point_tracks,
@@ -16,6 +17,8 @@ from gaussians_jax import (
     step_time,
     variants,
 )
+from gaussians_jax.effects import anchor_motion, deformation
+from gaussians_jax.effects.anchors import AnchorMotionSpec
 from gaussians_jax.effects.motion_basis import BasisMotionSpec
 from gaussians_jax.player import page
 from nerfies_jax.capture.cache import CACHE
@@ -56,7 +59,7 @@ def growth(spec: Any, state: TrainState) -> float:
     """
     if spec.densification is None:
         return 1.0
-    first = scene.count_rows(state)["gaussians"]
+    first = int(splats.active_mask(state.params.rows["splats"]).sum())
     return min(max(spec.densification.cap_max / first, 1.0) ** 0.5, 2.0)
 
 
@@ -70,11 +73,19 @@ def save(
     """`model.npz`, all of the scene, and `gaussians.ply` for viewers."""
     about = {"spec": spec, "metadata": metadata, "step": int(state.step)}
     size = model_file.save(folder / MODEL, state.params, about)
-    files.save(folder / "gaussians.ply", state.params.rows["splats"])
     every = scene.all_effects(spec, metadata, effects)
+    drawn = deformation.drawn_rows(every, state.params)
+    files.save(folder / "gaussians.ply", drawn)
     if all(effect.deform is None for effect in every):
         return Saved(size)
     notes = ["gaussians.ply holds the canonical Gaussians, without their motion."]
+    if isinstance(spec.motion, AnchorMotionSpec):
+        features, others = anchor_motion.kept_bytes(state.params, spec.motion)
+        notes.append(
+            f"The features of its anchors are {features / 1e6:.2f} MB by their bits "
+            f"under the learnt law, all else {others / 1e6:.2f} MB at 32 bits a number "
+            f"({MODEL} holds all at 32 bits)."
+        )
     if isinstance(spec.motion, BasisMotionSpec):
         notes.append(
             f"{MODEL} holds all of the scene in {size / 1e6:.1f} MB. MoBa-GS reports "
@@ -191,7 +202,7 @@ GAUSSIANS = Representation(
     growth=growth,
     metadata_of=lambda capture, spec: scene.metadata_of(capture),
     build=scene.build,
-    estimate_memory_bytes=scene.estimate_memory_bytes,
+    estimate_memory_bytes=first_state.estimate_memory_bytes,
     memory_hint="lower init.points, init.random or raster.capacity with --set",
     time_parts=step_time.parts,
     variant=variants.without_effects,

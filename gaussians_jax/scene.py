@@ -1,7 +1,6 @@
 """Gaussians and effects put together: a spec becomes a `Model` the loop can train."""
 
 import dataclasses
-import math
 from typing import Any
 
 import jax
@@ -10,19 +9,16 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from gaussians_jax import (
-    densification,
     growth,
     initialisation,
     mcmc,
     phases,
     rendering,
     splats,
-    track_start,
     update,
 )
-from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.effects import deformation
-from gaussians_jax.growth import AuxState, states_of
+from gaussians_jax.first_state import count_rows, first_state
 from gaussians_jax.initialisation import StartSpec
 from gaussians_jax.mcmc import MCMCStrategySpec
 from gaussians_jax.spec import (
@@ -30,12 +26,10 @@ from gaussians_jax.spec import (
     SceneMetadata,
     SplatScene,
     effects_of,
-    refuse_what_cannot_train,
 )
-from gaussians_jax.splats import Params
+from gaussians_jax.splats import Params, Splats
 from gaussians_jax.update import Drawn
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.evidence import usable_paths
 from nerfies_jax.scene_metadata import exposures
 from nerfies_jax.training import data_parallel, loop, losses
 from nerfies_jax.training.effects import (
@@ -47,7 +41,6 @@ from nerfies_jax.training.effects import (
     Term,
     joined,
     penalty_terms,
-    stream,
     values,
     weighted_sum,
 )
@@ -58,7 +51,6 @@ from nerfies_jax.training.model import (
     Stages,
     TrainState,
     View,
-    in_default_precision,
 )
 
 PyTree = Any
@@ -95,6 +87,7 @@ def all_effects(
                     f"the effect {effect.name!r} has {seam} and no {rate}, so what it "
                     f"starts would not train; give it a {rate}, a function of the step"
                 )
+    deformation.check_derived(every)
     return every
 
 
@@ -130,7 +123,7 @@ def build(
         step=_stepper(spec, metadata, effects, optimiser, devices),
         render=whole_frame,
         events=growth.events(spec, metadata, effects, optimiser),
-        counts=count_rows,
+        counts=lambda state: count_rows(effects, state),
         required_data=frozenset().union(*(effect.required_data for effect in effects)),
         stages=stages,
         example=example,
@@ -147,20 +140,31 @@ def _stages(spec, metadata, effects):
     def deform(params, prepared, time):
         return deformation.deform(effects, params, prepared, time)
 
+    def rows(params):
+        return deformation.drawn_rows(effects, params)
+
     def draw(params, deformed, view, size, step):
         degree = splats.active_degree(step, spec.sh_every, spec.sh_degree)
-        drawn = _draw(spec, metadata, params, deformed, view, size, degree).rendering
-        return _exposed(effects, params, drawn, view)
+        drawn = _draw(spec, metadata, rows(params), deformed, view, size, degree)
+        return _exposed(effects, params, drawn.rendering, view)
 
-    return Stages(prepare, deform, draw)
+    return Stages(prepare, deform, draw, rows)
 
 
 def _draw(
-    spec, metadata, params, gaussians, view, size, degree, probe=None, depth=True
+    spec,
+    metadata,
+    rows: Splats,
+    gaussians,
+    view,
+    size,
+    degree,
+    probe=None,
+    depth=True,
 ):
     return rendering.render_harmonics(
         gaussians,
-        splats.active_harmonics(params.rows["splats"], degree),
+        splats.active_harmonics(rows, degree),
         view.camera,
         size,
         spec.raster,
@@ -242,14 +246,16 @@ def _gradients(spec, metadata, effects, state, frames, row, condition):
     def loss(params, probe):
         canonical = splats.activate(params.rows["splats"])
         moved = deform(params, canonical)
-        frame = _draw(spec, metadata, params, moved, view, size, degree, probe, depth)
+        rows, drawn = deformation.drawn(effects, params, moved, condition)
+        frame = _draw(spec, metadata, rows, drawn, view, size, degree, probe, depth)
         exposed = _exposed(effects, params, frame.rendering, view)
         seen = observe(frames, row, exposed)
         states = state.aux_state.effects
         value, metrics = loss_of(spec, effects, params, seen, condition, states)
-        return value, (metrics, frame.footprints, canonical, moved)
+        weight = deformation.significance(effects, drawn)
+        return value, (metrics, frame.footprints, canonical, moved, weight)
 
-    probe = jnp.zeros_like(state.params.rows["splats"].mean[:, :2])
+    probe = deformation.probe(effects, state.params)
     (value, (metrics, *drawn)), (grads, mean2d_grad) = jax.value_and_grad(
         loss, argnums=(0, 1), has_aux=True
     )(state.params, probe)
@@ -315,85 +321,3 @@ def shuffled_row(
     """The frame of a step: every epoch visits each frame once, in a new order."""
     epoch = jax.random.fold_in(jax.random.fold_in(key, ORDER), step // frames)
     return jax.random.permutation(epoch, frames)[step % frames]
-
-
-def estimate_memory_bytes(spec: SplatScene, capture: Capture) -> int:
-    """Roughly the memory of the first state and step; host side, nothing allocated."""
-    count = initialisation.initial_count(spec.init, capture)
-    count += spec.start.moving_points if spec.start.motion == "tracks" else 0
-    harmonics = 3 * (spec.sh_degree + 1) ** 2
-    # Parameters, two moments, gradient, update; the tables of one projection.
-    numbers = count * (5 * (11 + harmonics) + 60)
-    # A chunk holds keys, rows and blending inputs of every pair.
-    numbers += 16 * (spec.raster.capacity or 0)
-    return 4 * numbers + capture.images.nbytes
-
-
-def first_state(spec, effects, optimiser, capture, key) -> TrainState:
-    """Parameters, moments and statistics before the first step; host side."""
-    refuse_what_cannot_train(spec)
-    rendering.refuse_distortion(capture.cameras)
-    start_key, run_key = jax.random.split(key)
-    seed = int(jax.random.randint(start_key, (), 0, np.iinfo(np.int32).max))
-    tracked, capture = _from_tracks(spec, effects, capture, start_key)
-    position, colour = initialisation.initial_points(spec.init, capture, seed)
-    if tracked is not None:
-        position = np.concatenate([position, tracked.position])
-        colour = np.concatenate([colour, tracked.colour])
-    rows = splats.from_points(
-        position,
-        colour,
-        degree=spec.sh_degree,
-        opacity=spec.init.opacity,
-        scale=spec.init.scale,
-    )
-    rows = initialisation.clamp_scales(rows, capture, spec.init.max_scale)
-    count = len(position)
-    most = None if spec.densification is None else spec.densification.cap_max
-    params = Params({"splats": rows}, {})
-    for effect in effects:
-        effect_key = jax.random.fold_in(start_key, stream(effect.name))
-        rows_key, nets_key = jax.random.split(effect_key)
-        if effect.init_rows is not None:
-            params.rows[effect.name] = effect.init_rows(rows_key, rows)
-        if effect.init is not None:
-            params.nets[effect.name] = effect.init(nets_key)
-        if effect.place is not None:
-            placed = effect.place(params.nets[effect.name], rows)
-            params.nets[effect.name] = placed
-    if tracked is not None:
-        params = track_start.put_in(params, effects, tracked)
-    params = splats.pad_rows(params, splats.capacity_for(count, most))
-    params = in_default_precision(params)
-    stats = ()
-    if isinstance(spec.densification, DefaultStrategySpec):
-        stats = densification.empty_stats(params.rows["splats"])
-    aux_state = AuxState(stats, states_of(effects, params))
-    return TrainState(
-        params, optimiser.init(params), aux_state, jnp.zeros((), jnp.int32), run_key
-    )
-
-
-def _from_tracks(spec, effects, capture, key):
-    """The start from tracks, and the capture with the points that stand still.
-
-    None, and the capture as it is, where there is no such start.
-    """
-    evidence = usable_paths.evidence_to_start_from(capture, spec.start)
-    if evidence is None:
-        return None, capture
-    seeds = track_start.start(spec.start, effects[0], evidence, capture, key)
-    if len(evidence.still.position) > initialisation.point_count(capture):
-        capture = dataclasses.replace(capture, points=evidence.still)
-    return seeds, capture
-
-
-def count_rows(state: TrainState) -> dict[str, int]:
-    """Active Gaussians, and `parameters`: the numbers of them and the networks."""
-    counts = {"gaussians": int(splats.active_mask(state.params.rows["splats"]).sum())}
-    rows = jax.tree.leaves(state.params.rows)
-    nets = jax.tree.leaves(state.params.nets)
-    each = sum(math.prod(leaf.shape[1:]) for leaf in rows)
-    counts["parameters"] = counts["gaussians"] * each
-    counts["parameters"] += sum(math.prod(leaf.shape) for leaf in nets)
-    return counts

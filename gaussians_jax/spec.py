@@ -5,6 +5,8 @@ import dataclasses
 from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.effects import (
     acceleration,
+    anchor_motion,
+    carried,
     depth,
     embedding_motion,
     exposure,
@@ -23,6 +25,8 @@ from gaussians_jax.effects import (
     time_basis,
 )
 from gaussians_jax.effects.acceleration import AccelerationSpec
+from gaussians_jax.effects.anchors import AnchorMotionSpec
+from gaussians_jax.effects.carried import CarriedSpec
 from gaussians_jax.effects.depth import DepthSpec
 from gaussians_jax.effects.embedding_motion import EmbeddingMotionSpec
 from gaussians_jax.effects.exposure import ExposureSpec
@@ -60,6 +64,7 @@ AnyMotion = (
     | PlaneMotionSpec
     | EmbeddingMotionSpec
     | NodeMotionSpec
+    | AnchorMotionSpec
 )
 # Motions with a vector for each Gaussian that neighbours may be kept alike in.
 EMBEDDED = {
@@ -87,6 +92,7 @@ class SplatScene:
     annealing: AnnealingSpec | None = None
     motion: AnyMotion | None = None
     temporal_opacity: TemporalOpacitySpec | None = None
+    carried: CarriedSpec | None = None  # what is drawn of each row; None: the row
     start: StartSpec = StartSpec()
     acceleration: AccelerationSpec | None = None
     neighbours: NeighbourSpec | None = None
@@ -124,6 +130,13 @@ class SceneMetadata:
     box: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
 
+def carried_count(spec: SplatScene) -> int | None:
+    """How many Gaussians each row carries; None where rows are what is drawn."""
+    if isinstance(spec.motion, AnchorMotionSpec):
+        return spec.motion.count
+    return None if spec.carried is None else spec.carried.count
+
+
 def refuse_what_cannot_train(spec: SplatScene) -> None:
     """Raise ValueError where parts that are asked for need others that are not.
 
@@ -144,6 +157,14 @@ def refuse_what_cannot_train(spec: SplatScene) -> None:
             "neighbours keep embeddings or coefficients alike, and this motion has "
             "none; leave them out (neighbours=none), or choose a preset with a KAN "
             "motion or a time basis"
+        )
+    carry = carried_count(spec) is not None
+    if carry and isinstance(spec.densification, MCMCStrategySpec):
+        raise ValueError(
+            "MCMCStrategySpec shares the opacity of a Gaussian among its copies, and "
+            "rows that carry several have none of their own; choose "
+            "DefaultStrategySpec, or leave out what they carry (carried=none, or "
+            "another motion than that of anchors)"
         )
     if growth is not None and not isinstance(spec.densification, DefaultStrategySpec):
         raise ValueError(
@@ -186,6 +207,9 @@ MOTIONS = {
     NodeMotionSpec: lambda spec, steps, seen: node_motion.effect(
         spec, steps, seen.extent
     ),
+    AnchorMotionSpec: lambda spec, steps, seen: anchor_motion.effect(
+        spec, steps, seen.frames
+    ),
 }
 
 
@@ -205,6 +229,10 @@ def effects_of(spec: SplatScene, metadata: SceneMetadata) -> tuple[Effect, ...]:
     effects = [] if motion is None else [motion]
     if spec.temporal_opacity is not None:
         effects.append(temporal_opacity.effect(spec.temporal_opacity))
+    if spec.carried is not None:
+        # What is carried turns by itself from when on the rows move.
+        still = 0 if motion is None else motion.warm_up
+        effects.append(carried.effect(spec.carried, spec.steps, still))
     if spec.acceleration is not None:
         effects.append(
             acceleration.effect(spec.acceleration, metadata.extent, metadata.frames)

@@ -103,8 +103,18 @@ def split(
     for time in times:
         now = deformed(params, jnp.asarray(time, dtype))
         moves |= dynamic_mask(static, now, static_threshold)
-    rows = jnp.asarray(np.flatnonzero(moves), jnp.int32)
-    return StaticDynamicSplit(static, row_index(moves), splats.take_rows(params, rows))
+    carrying = of_rows(params, moves)
+    rows = jnp.asarray(np.flatnonzero(carrying), jnp.int32)
+    every = np.repeat(carrying, len(moves) // len(carrying))
+    return StaticDynamicSplit(static, row_index(every), splats.take_rows(params, rows))
+
+
+def of_rows(params: Params, drawn: np.ndarray) -> np.ndarray:
+    """[rows] bool: the rows of which something in `drawn` [gaussians] is; host side.
+
+    The rows themselves where these are what is drawn.
+    """
+    return np.asarray(drawn).reshape(len(params.rows["splats"].mean), -1).any(axis=1)
 
 
 def deform(

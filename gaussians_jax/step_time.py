@@ -34,7 +34,7 @@ def parts(
     """
     effects = scene.all_effects(spec, metadata, effects)
     condition = FrameCondition(frames.times[0], step=state.step, key=state.key)
-    drawing, footprints = _drawing(spec, effects, state, frames)
+    drawing, footprints = _drawing(spec, effects, state, frames, condition)
     a_view = drawing | _own_of_effects(effects, state, frames, condition)
     views = spec.batch_size // model.devices
     timed = {name: views * each for name, each in a_view.items()}
@@ -43,7 +43,7 @@ def parts(
     return timed | {"rest": max(whole - sum(timed.values()), 0.0)}
 
 
-def _drawing(spec, effects, state, frames):
+def _drawing(spec, effects, state, frames, condition):
     """What the picture and its loss take, and the footprints that are drawn."""
     camera = jax.tree.map(lambda leaf: leaf[0], frames.cameras)
     observation = scene.observe(frames, 0, None)
@@ -66,8 +66,9 @@ def _drawing(spec, effects, state, frames):
             colour, observation.truth, observation.valid, dssim_weight=spec.dssim_weight
         )
 
-    rows = state.params.rows["splats"]
-    gaussians = splats.activate(rows)
+    params = state.params
+    still = splats.activate(params.rows["splats"])
+    rows, gaussians = deformation.drawn(effects, params, still, condition)
     coefficients = splats.active_harmonics(rows, spec.sh_degree)
     args = gaussians, coefficients, jnp.zeros_like(gaussians.mean[:, :2])
     timed = {
@@ -89,7 +90,7 @@ def _own_of_effects(effects, state, frames, condition):
             seen = observation._replace(rendering=rendering)
             return _sum_of_effect(effect, effects, params, seen, condition, kept)
 
-        if {effect.deform, effect.penalty} != {None}:
+        if {effect.deform, effect.derive, effect.penalty} != {None}:
             kept = state.aux_state.effects.get(effect.name)
             grads = jax.grad(one, (0, 1))
             name = effect.name.replace("_", " ")
@@ -111,7 +112,7 @@ def _update(spec, metadata, effects, state, footprints, condition, frames):
     timed = {"optimiser": part_ms(descend, state, state.params)}
     if update.has_statistics(spec, effects):
         gaussians = splats.activate(state.params.rows["splats"])
-        slope = jnp.zeros_like(gaussians.mean[:, :2])
+        slope = deformation.probe(effects, state.params)
         timed["statistics"] = part_ms(
             gather, state.aux_state, slope, footprints, gaussians, gaussians
         )
@@ -131,6 +132,10 @@ def _sum_of_effect(effect, effects, params, observation, condition, state):
             (effect,), params, gaussians, condition, {effect.name: state}
         )
         total += sum(jnp.sum(leaf) for leaf in moved)
+    if effect.derive is not None:
+        still = splats.activate(params.rows["splats"])
+        rows, drawn = deformation.drawn((effect,), params, still, condition)
+        total += sum(jnp.sum(leaf) for leaf in (*rows, *drawn))
     context = PenaltyContext(
         condition=condition,
         step=condition.step,

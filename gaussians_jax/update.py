@@ -23,10 +23,12 @@ from nerfies_jax.training.updates import apply_updates
 class Drawn(NamedTuple):
     """What one frame showed of the Gaussians."""
 
-    mean2d_grad: Float[Array, "gaussians 2"]  # of the loss, per pixel
+    mean2d_grad: Float[Array, "drawn 2"]  # of the loss, per pixel
     footprints: Footprints
-    canonical: Gaussians
-    moved: Gaussians  # as they stood at the frame's time
+    canonical: Gaussians  # the rows
+    moved: Gaussians  # the rows as they stood at the frame's time
+    # How much each of what was drawn counts for its row; None: all alike.
+    significance: Float[Array, " drawn"] | None = None
 
 
 def descend(
@@ -76,7 +78,12 @@ def gather(
         footprints = drawn.footprints
         radius_px = jnp.max(footprints.extent_px, axis=1)
         stats = densification.observe(
-            stats, drawn.mean2d_grad, footprints.visible, radius_px, size
+            stats,
+            drawn.mean2d_grad,
+            footprints.visible,
+            radius_px,
+            size,
+            drawn.significance,
         )
     for effect in effects:
         if effect.update_state is not None:

@@ -4,14 +4,16 @@ import dataclasses
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from gaussians_jax import scene, splats, static_rows, time_knots
+from gaussians_jax.effects.anchors import AnchorMotionSpec
 from nerfies_jax.evaluation.representation import Parts, check_there
 from nerfies_jax.training.effects import Effect
 from nerfies_jax.training.model import Model, Stages, TrainState
 
-REMOVABLE = ("motion", "exposure")  # of the settings, those that show in a picture
+REMOVABLE = ("motion", "carried", "exposure")  # what shows in a picture
 INSTANTS = 33  # at which rows are looked for that move
 
 
@@ -39,6 +41,9 @@ def without_effects(
         )
     check_there(without, parts(spec, metadata, effects).removable)
     left = {name: None for name in REMOVABLE if name in without}
+    if "motion" in left and isinstance(spec.motion, AnchorMotionSpec):
+        # Of the same features as the motion is what anchors carry at rest.
+        left["motion"] = dataclasses.replace(spec.motion, moves=False)
     kept = tuple(effect for effect in effects if effect.name not in without)
     return scene.build(dataclasses.replace(spec, **left), metadata, kept)
 
@@ -81,6 +86,7 @@ def from_knots(
                 both[1], time, interpolation
             ),
             draw=lambda both, *rest: stages.draw(both[0], *rest),
+            rows=lambda both: stages.rows(both[0]),
         ),
         summary,
     )
@@ -113,6 +119,7 @@ def without_static(model: Model, state: TrainState, static_threshold: float) -> 
             prepare=lambda both: stages.prepare(both[1].dynamic),
             deform=deform,
             draw=lambda both, *rest: stages.draw(both[0], *rest),
+            rows=lambda both: stages.rows(both[0]),
         ),
         f"the deformation of {_moving(parts.index, static_threshold)}",
     )
@@ -134,7 +141,7 @@ def without_moving(
 
     times = np.linspace(0, 1, INSTANTS)
     parts = static_rows.split(state.params, deform_rows, times, farther_than)
-    moves = parts.index.moves
+    moves = static_rows.of_rows(state.params, np.asarray(parts.index.moves))
     rows = state.params.rows
     active = int(splats.active_mask(rows["splats"]).sum())
     if int(moves.sum()) == active:
@@ -142,7 +149,7 @@ def without_moving(
             f"--hide-moving {farther_than:g}: all {active} Gaussians move farther than "
             "that, and nothing would be left; give a longer distance"
         )
-    shown = rows | {"splats": splats.deactivate(rows["splats"], moves)}
+    shown = rows | {"splats": splats.deactivate(rows["splats"], jnp.asarray(moves))}
     params = state.params._replace(rows=shown)
     summary = f"{int(moves.sum())} of {active} Gaussians move and are left out"
     return state._replace(params=params), summary

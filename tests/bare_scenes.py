@@ -21,6 +21,7 @@ from gaussians_jax import (
 )
 from gaussians_jax import learning_rates as splat_rates
 from gaussians_jax import presets as splat_presets
+from gaussians_jax.effects.anchors import AnchorMotionSpec
 from gaussians_jax.effects.embedding_motion import EmbeddingMotionSpec
 from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec
@@ -133,6 +134,9 @@ def tiny_splats(name):
     elif isinstance(motion, NodeMotionSpec):
         few = {"position": FEW, "time": FEW, "depth": 1, "width": 8, "skips": ()}
         motion = shrunk(motion, nodes=6, links=2, **few)
+    elif isinstance(motion, AnchorMotionSpec):
+        few = {"count": 2, "reference": 3, "residual": 2, "time_code": 3}
+        motion = shrunk(motion, width=6, make_width=6, **few)
     elif isinstance(motion, PlaneMotionSpec):
         few = shrunk(motion.planes, vertices=4, multiples=(1, 2), moments=3, features=2)
         motion = shrunk(motion, planes=few, width=8)
@@ -154,6 +158,7 @@ def tiny_splats(name):
     return dataclasses.replace(
         spec,
         batch_size=1,
+        carried=shrunk(spec.carried, count=2),
         init=InitSpec(random=100, min_points=1000),
         start=StartSpec(motion="none"),
         sh_degree=1,

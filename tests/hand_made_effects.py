@@ -6,6 +6,9 @@ import pytest
 
 from gaussians_jax.effects import (
     acceleration,
+    anchor_motion,
+    anchors,
+    carried,
     depth,
     embedding_motion,
     kan_motion,
@@ -44,6 +47,7 @@ FIELD_MODULES = {
     "scene_flow": scene_flow,
 }
 SPLAT_MODULES = {
+    "carried": carried,
     "acceleration": acceleration,
     "neighbours": neighbours,
     "motion_growth": motion_growth,
@@ -61,12 +65,14 @@ MOTION_MODULES = {
     plane_motion.PlaneMotionSpec: plane_motion,
     embedding_motion.EmbeddingMotionSpec: embedding_motion,
     node_motion.NodeMotionSpec: node_motion,
+    anchors.AnchorMotionSpec: anchor_motion,
 }
 BY_FRAMES = {  # the others ask for the scene's extent
     mlp_motion.MotionSpec,
     kan_motion.KanMotionSpec,
     motion_basis.BasisMotionSpec,
     embedding_motion.EmbeddingMotionSpec,
+    anchors.AnchorMotionSpec,
 }
 
 
@@ -104,6 +110,9 @@ def of_splats(spec, metadata):
             seen = (extent, metadata.box)
         module = MOTION_MODULES[type(motion)]
         effects.append(module.effect(motion, spec.steps, *seen))
+    if spec.carried is not None:
+        still = 0 if motion is None else motion.warm_up
+        effects.append(carried.effect(spec.carried, spec.steps, still))
     if spec.acceleration is not None:
         effects.append(acceleration.effect(spec.acceleration, extent, frames))
     if spec.neighbours is not None:
@@ -128,6 +137,9 @@ def absent_modules(spec):
         gone.remove(mlp_motion)
     if isinstance(motion, embedding_motion.EmbeddingMotionSpec):
         gone.remove(kan_motion)
+    if isinstance(motion, anchors.AnchorMotionSpec):
+        gone.remove(kan_motion)
+        gone.remove(carried)
     return gone
 
 

@@ -34,11 +34,11 @@ MODULES = (
     *(f"nerfies_jax.geometry.{name}" for name in ("matrix3", "camera", "distortion")),
     *("nerfies_jax.geometry.rays", "nerfies_jax.geometry.precision"),
     *(f"nerfies_jax.nets.{name}" for name in ("codes", "encoding", "kan", "mlp")),
-    *("nerfies_jax.nets.grids", "nerfies_jax.nets.planes"),
+    *("nerfies_jax.nets.grids", "nerfies_jax.nets.planes", "nerfies_jax.nets.entropy"),
     *(f"nerfies_jax.radiance.{name}" for name in ("compositing", "sampling")),
     *("nerfies_jax.radiance.template", "nerfies_jax.training.losses"),
     *("gaussians_jax.projection", "gaussians_jax.splats", "gaussians_jax.harmonics"),
-    "gaussians_jax.blending",
+    *("gaussians_jax.blending", "gaussians_jax.faces"),
 )
 # No function of arrays alone, or held where the reason says.
 EXCUSED = {
@@ -160,6 +160,7 @@ SETTINGS = {
     "projection.project": {"size": (8, 8), "spec": GSPLAT},
     "splats.active_degree": {"every": 10, "degree": 3},
     "harmonics.basis": {"degree": 3},
+    "entropy.noisy": {"key": lambda dtype: jax.random.key(0)},
 }
 
 # Lengths of axes; all others are 3. Variadic axes are one axis of 2, but for
@@ -216,7 +217,7 @@ DRAWS = {
     "focal_px": (_near(10.0), False),
     "pixel_aspect": (_near(1.0), False),
     **dict.fromkeys(["skew_px", "radial", "tangential"], (_near(0.0, 0.01), False)),
-    **dict.fromkeys(["fraction", "place"], (_positive, False)),
+    **dict.fromkeys(["fraction", "place", "step"], (_positive, False)),
 }
 
 
@@ -296,6 +297,8 @@ REACH = {
     "losses.dssim_map": 0.2,  # variances over squared means
     **dict.fromkeys(["planes.total_variation", "planes.bend"], 0.45),
     "planes.features": 0.45,
+    "entropy.bits": 0.1,  # squares of what is divided by a deviation as small as e^-12
+    **dict.fromkeys(["entropy.rounded", "faces.gaussians"], 0.9),  # in steps; lengths
     # sums of more than four, or multiples
     **dict.fromkeys(["codes.blend", "encoding.encode", "losses.l1"], 0.9),
     **dict.fromkeys(["planes.bilinear", "planes.linear", "planes.unrest"], 0.9),

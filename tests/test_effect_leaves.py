@@ -11,6 +11,8 @@ import pytest
 from gaussians_jax import presets as splat_presets
 from gaussians_jax import scene as splat_scene
 from gaussians_jax.effects import (
+    anchors,
+    carried,
     embedding_motion,
     kan_motion,
     mlp_motion,
@@ -21,6 +23,7 @@ from gaussians_jax.effects import (
     spectral,
     time_basis,
 )
+from gaussians_jax.effects.anchors import AnchorMotionSpec
 from gaussians_jax.effects.embedding_motion import EmbeddingMotionSpec
 from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec
@@ -33,6 +36,7 @@ from gaussians_jax.effects.time_basis import TimeBasisSpec
 from nerfies_jax import field as fields
 from nerfies_jax import presets as field_presets
 from nerfies_jax.effects import ambient, scene_flow, transient, warp
+from nerfies_jax.nets import mlp
 from nerfies_jax.nets.grids import HashGridSpec
 from nerfies_jax.radiance import template
 from nerfies_jax.scene_metadata import SceneMetadata
@@ -157,6 +161,9 @@ def test_splats_have_the_arrays_of_what_they_have_and_no_others(preset):
         elif isinstance(motion, NodeMotionSpec):
             nets["node_motion"] = node_motion.init(key, motion)
             states.add("node_motion")
+        elif isinstance(motion, AnchorMotionSpec):
+            rows.add("anchor_motion")
+            nets["anchor_motion"] = anchors.init(key, motion, metadata.frames)
         elif isinstance(motion, PlaneMotionSpec):
             nets["plane_motion"] = plane_motion.init(key, motion)
         elif isinstance(motion, PolynomialMotionSpec):
@@ -167,6 +174,10 @@ def test_splats_have_the_arrays_of_what_they_have_and_no_others(preset):
             nets["motion_basis"] = motion_basis.init(key, motion)
         if spec.temporal_opacity is not None:
             rows.add("temporal_opacity")
+        if spec.carried is not None:
+            rows.add("carried")
+            turns = carried.network_spec(spec.carried.turns)
+            nets["carried"] = mlp.init(turns, key)
         if spec.spectral is not None:
             nets["spectral"] = spectral.init(spec.spectral)
         if spec.neighbours is not None:

@@ -41,6 +41,8 @@ PRESETS = (
     "e-d3dgs-small",
     "sc-gs-small",
     "edgs-small",
+    "d-miso-small",
+    "adc-gs-small",
 )
 # Effects that no preset has, as paths of --set, and the preset they are priced beside.
 BESIDE = {"splats-static-small": ("exposure.learning_rate=0.01",)}

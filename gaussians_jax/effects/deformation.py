@@ -1,13 +1,18 @@
-"""The motion of a scene: every effect that deforms, one after the other."""
+"""The motion of a scene: every effect that deforms, one after the other.
+
+Effects deform the rows. Where one of them has rows that carry several Gaussians each
+(`derive_rows`, `derive`), those are what is drawn; without one it is the rows.
+"""
 
 from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from gaussians_jax import splats
-from gaussians_jax.splats import Gaussians, Params
+from gaussians_jax.splats import Gaussians, Params, Splats
 from nerfies_jax.training.effects import Effect, FrameCondition
 
 PyTree = Any
@@ -32,13 +37,91 @@ def deform(
     prepared: dict[str, PyTree],
     time: Float[Array, ""],
 ) -> Gaussians:
-    """The trained Gaussians as they are at one time, from what `prepare` returned."""
+    """What is drawn at one time of a trained scene, from what `prepare` returned."""
+    moved = deform_rows(effects, params, prepared, time)
+    by = derives(effects)
+    if by is None:
+        return moved
+    return by.derive(params, by.derive_rows(params, None), moved, FrameCondition(time))
+
+
+def deform_rows(
+    effects: Effects,
+    params: Params,
+    prepared: dict[str, PyTree],
+    time: Float[Array, ""],
+) -> Gaussians:
+    """The rows of a trained scene as they are at one time."""
     gaussians = splats.activate(params.rows["splats"])
     for effect in effects:
         if effect.deform is not None:
             ready = prepared.get(effect.name)
             gaussians = effect.deform(params, gaussians, FrameCondition(time), ready)
     return gaussians
+
+
+def derives(effects: Effects) -> Effect | None:
+    """The effect by which rows carry what is drawn; None where they are drawn."""
+    return next((effect for effect in effects if effect.derive is not None), None)
+
+
+def check_derived(effects: Effects) -> None:
+    """Raise ValueError where more than one effect says what is drawn, or half of it."""
+    named = [e.name for e in effects if e.derive is not None]
+    if len(named) > 1:
+        raise ValueError(
+            f"{' and '.join(named)} each say what rows carry; leave all but one out"
+        )
+    for effect in effects:
+        if (effect.derive is None) != (effect.derive_rows is None):
+            raise ValueError(
+                f"the effect {effect.name!r} fills one of derive and derive_rows; what "
+                "rows carry needs both, at rest and at a time"
+            )
+
+
+def drawn_rows(effects: Effects, params: Params) -> Splats:
+    """What is drawn once trained, as rows at rest: the rows, or what they carry."""
+    by = derives(effects)
+    if by is None:
+        return params.rows["splats"]
+    return by.derive_rows(params, None)[0]
+
+
+def drawn(
+    effects: Effects, params: Params, moved: Gaussians, condition: FrameCondition
+) -> tuple[Splats, Gaussians]:
+    """What is drawn of moved rows in training: as rows at rest, and as it stands."""
+    by = derives(effects)
+    if by is None:
+        return params.rows["splats"], moved
+    derived = by.derive_rows(params, condition)
+    return derived[0], by.derive(params, derived, moved, condition)
+
+
+def significance(
+    effects: Effects, gaussians: Gaussians
+) -> Float[Array, " gaussians"] | None:
+    """How much each of what is drawn counts for its row; None: all alike."""
+    by = derives(effects)
+    if by is None or by.significance is None:
+        return None
+    return by.significance(gaussians)
+
+
+def carried_by_each(effects: Effects, params: Params) -> int:
+    """How many Gaussians are drawn of each row."""
+    if derives(effects) is None:
+        return 1
+    drawn = jax.eval_shape(lambda params: drawn_rows(effects, params), params)
+    return drawn.mean.shape[0] // params.rows["splats"].mean.shape[0]
+
+
+def probe(effects: Effects, params: Params) -> Float[Array, "gaussians 2"]:
+    """Zeros whose slope is that of the places in the picture of what is drawn, px."""
+    mean = params.rows["splats"].mean
+    count = carried_by_each(effects, params) * mean.shape[0]
+    return jnp.zeros((count, 2), mean.dtype)
 
 
 def deform_in_training(
@@ -48,7 +131,7 @@ def deform_in_training(
     condition: FrameCondition,
     states: dict[str, PyTree] | None = None,
 ) -> Gaussians:
-    """`gaussians` as they are at a moment of training.
+    """`gaussians`, a scene's rows, as they are at a moment of training.
 
     `states` are those of effects that are `ready_by_state`; without them these are
     prepared anew. An effect is not evaluated before its warm-up is over: under the

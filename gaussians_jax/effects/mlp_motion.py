@@ -11,10 +11,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from gaussians_jax import splats
+from gaussians_jax import path_fit, splats
 from gaussians_jax.effects.blocks import in_blocks
+from gaussians_jax.path_fit import Guess, Paths, Points
 from gaussians_jax.splats import Gaussians, Params
 from nerfies_jax.geometry import quaternion
 from nerfies_jax.nets import encoding, mlp
@@ -26,6 +28,7 @@ from nerfies_jax.training.step_counts import steps
 
 NAME = "mlp_motion"
 SCALE_RULES = ("log", "linear")
+RESTING = 256  # points at rest that a fit to tracks looks at
 _STREAM = zlib.crc32(NAME.encode()) >> 1  # of the step's key, for the noise on the time
 
 
@@ -227,6 +230,31 @@ def smooth_time(
     return time + noise * deviation.astype(time.dtype)
 
 
+def fit_to_paths(spec: MotionSpec, paths: Paths, key: Key[Array, ""]) -> Guess:
+    """Points where they are in the middle of the film, and no motion where all rests.
+
+    Without what is known to be at rest the network would move that as well, and the
+    scene bend to follow. Host side.
+    """
+    points = path_fit.places_at_one_moment(paths)
+    start = Points(jnp.asarray(points, jnp.float32), None, init(key, spec))
+    rates = Points(paths.unit, None, 0.4)
+    if paths.still is None or not len(paths.still):
+        return Guess(start, rates)
+    chosen = np.random.default_rng(0).permutation(len(paths.still))[:RESTING]
+    still = jnp.asarray(paths.still[chosen], jnp.float32)
+    moments = jnp.linspace(0, 1, path_fit.MOMENTS, dtype=jnp.float32)
+
+    def penalty(points):
+        def unrest(time):
+            offsets = deform(points.nets, spec, still, time)
+            return path_fit.unrest(offsets.quaternion, offsets.mean, paths.unit)
+
+        return path_fit.REST * jnp.mean(jax.vmap(unrest)(moments))
+
+    return Guess(start, rates, penalty)
+
+
 def effect(spec: MotionSpec, steps: int, frames: int) -> Effect:
     """The seams that this motion fills, for a run of `steps` over `frames`."""
 
@@ -253,4 +281,5 @@ def effect(spec: MotionSpec, steps: int, frames: int) -> Effect:
         ),
         warm_up=spec.warm_up,
         deform=moved,
+        fit_to_paths=lambda paths, key: fit_to_paths(spec, paths, key),
     )

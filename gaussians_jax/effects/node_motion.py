@@ -36,7 +36,6 @@ from gaussians_jax.effects.blocks import in_blocks
 from gaussians_jax.effects.skinning import Links, Moves
 from gaussians_jax.path_fit import Guess, Paths, Points
 from gaussians_jax.splats import Gaussians, Params, Splats
-from nerfies_jax.evidence import rigid_groups
 from nerfies_jax.geometry import quaternion
 from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
@@ -47,9 +46,6 @@ from nerfies_jax.training.step_counts import steps
 
 NAME = "node_motion"
 MOMENTS = 8  # of the film, at which the paths of nodes are compared
-# Of a start from tracks: bodies by which paths are brought to one moment, and what the
-# motion of nodes at rest costs in the fit, one length of the scene costing one.
-BODIES, REST = 8, 1.0
 STRETCH = 1.2  # of a mask, see `openness`
 ROWS_AT_ONCE, NODES_AT_ONCE = 512, 32  # blocks that are passed over where nothing moves
 
@@ -270,9 +266,10 @@ def fit_to_paths(
     Paths are brought to the middle of the film by the rigid bodies they belong to. The
     network starts from no motion, and is asked for none at the nodes at rest.
     """
-    times, position, known, unit, still = paths
-    canonical = _at_one_moment(position, known, len(times) // 2)
-    still = np.zeros((0, 3)) if still is None else np.asarray(still, np.float64)
+    unit, canonical = paths.unit, path_fit.places_at_one_moment(paths)
+    still = np.zeros((0, 3))
+    if paths.still is not None:
+        still = np.asarray(paths.still, np.float64)
     moving = spec.nodes if not len(still) else round(spec.moving_share * spec.nodes)
     moving_nodes = canonical[skinning.spread_out(canonical, max(moving, 1))]
     resting = still[skinning.spread_out(still, spec.nodes - len(moving_nodes))]
@@ -290,22 +287,14 @@ def fit_to_paths(
 
         def unrest(time):
             now = moves(those, spec, extent, time)
-            turn, shift = now.turn[:, 1:], now.shift / unit
-            total = jnp.sum(turn**2, axis=1) + jnp.sum(shift**2, axis=1)
-            return jnp.mean(jnp.sqrt(total + path_fit.SOFT**2))
+            return path_fit.unrest(now.turn[:, 1:], now.shift, unit)
 
-        return REST * jnp.mean(jax.vmap(unrest)(moments))
+        return path_fit.REST * jnp.mean(jax.vmap(unrest)(moments))
 
     start = Points(jnp.asarray(canonical, jnp.float32), None, nodes)
     mask = None if spec.mask is None else 1.0
     rates = Points(unit, None, Nodes(0.0, 1.0, 0.4, mask))
     return Guess(start, rates, penalty if len(resting) else None)
-
-
-def _at_one_moment(position, known, frame):
-    label = rigid_groups.labels(position, known, BODIES)
-    bodies = rigid_groups.motion(position, known, label, frame)
-    return rigid_groups.centres(position, known, bodies)[0]
 
 
 def effect(spec: NodeMotionSpec, run_steps: int, extent: float) -> Effect:

@@ -59,7 +59,7 @@ def write(
     `degree` is that of the harmonics in use; `poster` (uint8 [height, width, 3]) is
     shown until the first frame is drawn, and where nothing can be.
     """
-    at, rows = gaussians_at(model, state), state.params.rows["splats"]
+    at, rows = gaussians_at(model, state), model.stages.rows(state.params)
     seen = seen_in_training(at, rows, raster, degree, capture)
     count = count_for(capture)
     instants, packed = _packed(at, rows, capture, seen, count)

@@ -157,7 +157,7 @@ def with_known(spec: MLPSpec, params: MLP, known: Float[Array, " known"]) -> MLP
     """The network once the last of its inputs are known: one of the others alone.
 
     What a layer makes of them is the same for a whole batch; here it is summed once,
-    into the bias of each layer that reads the input.
+    into the bias of each layer that reads the input: without hidden ones, each head.
     """
 
     def fold(index, layer):
@@ -167,7 +167,10 @@ def with_known(spec: MLPSpec, params: MLP, known: Float[Array, " known"]) -> MLP
         return Layer(layer.weight[: -len(known)], layer.bias + known @ read)
 
     hidden = tuple(fold(*item) for item in enumerate(params.hidden))
-    return params._replace(hidden=hidden)
+    heads = params.heads
+    if not hidden:
+        heads = {name: fold(0, layer) for name, layer in heads.items()}
+    return MLP(hidden, heads)
 
 
 def _fan_in(spec, layer):

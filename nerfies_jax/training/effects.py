@@ -46,6 +46,9 @@ SPLAT_SEAMS = (
     "place",
     "prepare",
     "deform",
+    "derive_rows",
+    "derive",
+    "significance",
     "fit_to_paths",
     "state",
     "ready_by_state",
@@ -163,6 +166,19 @@ class Effect(NamedTuple):
     prepare: Callable[[Any], PyTree] | None = None
     # (scene, `Gaussians`, condition, what `prepare` returned or None) -> `Gaussians`
     deform: Callable[[Any, Any, FrameCondition, PyTree], Any] | None = None
+    # What is drawn in the place of the rows, where each of them carries several
+    # Gaussians, those of the first row first; one effect of a scene at most.
+    # (scene, condition or None once trained) -> `splats.Splats` at rest, and what else
+    # `derive` reads
+    derive_rows: Callable[[Any, FrameCondition | None], tuple[Any, PyTree]] | None = (
+        None
+    )
+    # (scene, what `derive_rows` returned, rows as `Gaussians` where `deform` left them,
+    # condition) -> `Gaussians`; what is drawn has the looks at rest
+    derive: Callable[[Any, tuple[Any, PyTree], Any, FrameCondition], Any] | None = None
+    # what `derive` returned -> how much the slope of each counts in that of its row,
+    # which the density control compares; None: all that is seen alike
+    significance: Callable[[Any], Any] | None = None
     # (params, picture [height, width, 3] sRGB, appearance id) -> the picture as it was
     # filmed; of all that is drawn, in training and afterwards
     expose: Callable[[PyTree, Any, Int[Array, ""]], Any] | None = None

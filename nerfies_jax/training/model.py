@@ -88,15 +88,17 @@ class Event(NamedTuple):
 
 
 class Stages(NamedTuple):
-    """`Model.render` in three parts, so that nothing is computed twice.
+    """`Model.render` in parts, so that nothing is computed twice.
 
     `draw(params, deform(params, prepare(params), time), view, size, step)` is what
-    that `render` gives, to rounding.
+    that `render` gives, to rounding. `rows(params)` is what a file holds of what
+    `deform` returns, in the same order.
     """
 
     prepare: Callable[[PyTree], PyTree]  # once for trained parameters
     deform: Callable[[PyTree, PyTree, Float[Array, ""]], PyTree]  # once for an instant
     draw: Callable[[PyTree, PyTree, View, tuple[int, int], Int[Array, ""]], Rendering]
+    rows: Callable[[PyTree], PyTree] | None = None
 
 
 class Surveyed(NamedTuple):

@@ -35,6 +35,7 @@ FLOORS = {
     "nerfies_jax": 10,  # the face of the package
     "gaussians_jax.effects": 7,
     "gaussians_jax.spec": 8,
+    "gaussians_jax.first_state": 8,
     "gaussians_jax.growth": 8,
     "gaussians_jax.held_out_exposure": 8,
     "gaussians_jax.scene": 8,
@@ -44,6 +45,7 @@ FLOORS = {
     "gaussians_jax.update": 8,
     "gaussians_jax.variants": 8,
     "gaussians_jax.presets": 8,
+    "gaussians_jax.small_presets": 8,
     "gaussians_jax.representation": 8,
     "gaussians_jax": 6,
     "experiments": 11,

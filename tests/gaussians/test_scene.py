@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from gaussians_jax import initialisation, learning_rates, presets, scene
+from gaussians_jax import first_state, initialisation, learning_rates, presets, scene
 from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.initialisation import InitSpec
 from gaussians_jax.learning_rates import LearningRateSpec
@@ -197,9 +197,9 @@ def test_presets_build_and_stretch_with_their_steps(name):
 
 def test_estimate_memory_counts_rows_and_capacity():
     capture = scenes.tiny_capture()
-    small = scene.estimate_memory_bytes(scenes.TINY_SPLATS, capture)
+    small = first_state.estimate_memory_bytes(scenes.TINY_SPLATS, capture)
     slab = dataclasses.replace(scenes.TINY_SPLATS.raster, capacity=10**12)
-    large = scene.estimate_memory_bytes(
+    large = first_state.estimate_memory_bytes(
         dataclasses.replace(scenes.TINY_SPLATS, raster=slab), capture
     )
     assert small < 10**7

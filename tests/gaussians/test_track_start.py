@@ -33,6 +33,7 @@ MOTIONS = {
     "nodes": presets.SMALL_SC_GS.motion,
     "masked nodes": presets.SMALL_EDGS.motion,
     "embedding": presets.SMALL_E_D3DGS.motion,
+    "anchors": presets.SMALL_ADC_GS.motion,
 }
 BOX = ((-1.0, -1.0, 0.0), (1.0, 1.0, 2.0))
 

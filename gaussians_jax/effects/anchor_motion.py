@@ -1,0 +1,269 @@
+"""Anchors with features, from which the Gaussians they carry and all motion are made.
+
+ADC-GS (Huang et al. 2025, IJCAI, arXiv:2505.08196, "Anchor-driven deformable and
+compressed Gaussian splatting"): an anchor has a place, scales, a turn and a colour, a
+reference feature, and a residual feature for each of the ten Gaussians it carries. A
+network makes these of the features, against the anchor; a coarse network of reference
+feature and time moves the anchor, a fine one of residual feature and time each of what
+it carries. Features are kept rounded: they are trained with noise as wide as a step,
+and their bits under a learnt law are part of the loss.
+
+Read were the paper's abstract, a summary of its method and the settings of its code;
+what they leave open is settled so. Half of a residual feature makes a Gaussian, half
+moves it, as in the code, whose fine stage is switched off; here it is on. The law of a
+reference feature is normal, with a mean and a deviation for each channel (there with
+a hyperprior), that of the residual ones is normal as a network makes it of the former.
+Places, scales, turns, opacities and colours of anchors are kept as they are, at 32 bits
+a number, where the code has a codec for points. Colours and opacities do not change
+over time. Growth clones or splits anchors by the slopes of what they carry, weighted by
+how much of it is to be seen when (`significance`), where the code puts a new anchor at
+each carried Gaussian of a steep slope.
+"""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key
+
+from gaussians_jax import path_fit, splats
+from gaussians_jax.effects import carried, kan_motion
+from gaussians_jax.effects.anchors import (
+    AnchorMotionSpec,
+    Anchors,
+    Features,
+    bits,
+    coarse_spec,
+    fine_spec,
+    init,
+    init_features,
+    kept,
+    made,
+    noised,
+)
+from gaussians_jax.effects.blocks import in_blocks
+from gaussians_jax.effects.carried import Carried
+from gaussians_jax.effects.kan_motion import Offsets
+from gaussians_jax.path_fit import Guess, Paths, Points
+from gaussians_jax.splats import Gaussians, Params, Splats
+from nerfies_jax.nets import codes, mlp
+from nerfies_jax.nets.mlp import MLP, MLPSpec
+from nerfies_jax.training import schedules
+from nerfies_jax.training.effects import (
+    Effect,
+    FrameCondition,
+    PenaltyContext,
+    Term,
+    stream,
+)
+
+NAME = "anchor_motion"
+RESTING = 256  # features at rest that a fit to tracks looks at
+# Of the volumes, where one counts as large, and how little smaller ones lose (the
+# code's); at most so many give that volume.
+LARGE, VOLUME_POWER, VOLUME_ROWS = 0.8, 0.01, 512
+NUMBER_BITS = 32  # of what has no law
+
+
+def kept_bytes(params: Params, spec: AnchorMotionSpec) -> tuple[float, float]:
+    """Of a trained scene: bytes of the features, and of all else; host side.
+
+    Features by their bits, where there is a law, everything else at 32 bits a number.
+    """
+    own, net = params.rows[NAME], params.nets[NAME]
+    active = np.asarray(splats.active_mask(params.rows["splats"]))
+    plain = sum(leaf[active].size for leaf in params.rows["splats"])
+    plain += sum(leaf.size for leaf in jax.tree.leaves(params.nets))
+    if net.law is None:
+        numbers = sum(leaf[active].size for leaf in own)
+        return numbers * NUMBER_BITS / 8, plain * NUMBER_BITS / 8
+    each = bits(kept(own, net.law, spec), net.law, spec)
+    total = sum(float(np.asarray(leaf, np.float64)[active].sum()) for leaf in each)
+    return total / 8, plain * NUMBER_BITS / 8
+
+
+def offsets(
+    network: MLP,
+    spec: MLPSpec,
+    features: Float[Array, "*rows reads"],
+    code: Float[Array, " code"],
+) -> Offsets:
+    """What a moving network says of features at the time of a code."""
+    at_time = mlp.with_known(spec, network, code)
+    alone = dataclasses.replace(spec, inputs=features.shape[-1])
+    return Offsets(**mlp.apply(alone, at_time, features))
+
+
+def posed(
+    net: Anchors,
+    spec: AnchorMotionSpec,
+    derived: tuple[Splats, tuple[Carried, Features]],
+    rows: Gaussians,
+    code: Float[Array, " code"] | None,
+) -> Gaussians:
+    """What anchors carry where the anchors are now, moved finely at the time of a code.
+
+    Anchors moved by hand take it along; None leaves the fine motion out.
+    """
+    still, (own, features) = derived
+    if code is None:
+        return carried.posed(own, None, still, rows)
+    reads = features.residual[..., spec.residual // 2 :]
+    fine = offsets(net.fine, fine_spec(spec), reads, code)
+    own = own._replace(
+        offset=own.offset + fine.position, log_scale=own.log_scale + fine.log_scale
+    )
+    return carried.posed(own, fine.turn, still, rows)
+
+
+def significance(gaussians: Gaussians) -> Float[Array, " gaussians"]:
+    """How much of each is to be seen: its opacity, a little less where it is small.
+
+    Opacity times the volume over one that is large among all, to a small power.
+    """
+    volume = jnp.prod(gaussians.scale, axis=1)
+    every = -(-len(volume) // VOLUME_ROWS)
+    large = jnp.quantile(volume[::every], LARGE)
+    share = jnp.clip(volume / jnp.where(large > 0, large, 1), 0, 1)
+    weight = gaussians.opacity * share**VOLUME_POWER
+    return jax.lax.stop_gradient(weight)
+
+
+def fit_to_paths(
+    spec: AnchorMotionSpec, frames: int, paths: Paths, key: Key[Array, ""]
+) -> Guess:
+    """Anchors where points are in the middle of the film, their features as drawn.
+
+    Features of anchors that no path tells of are asked to be at rest. Host side.
+    """
+    rows_key, nets_key, rest_key = jax.random.split(key, 3)
+    points = jnp.asarray(path_fit.places_at_one_moment(paths), jnp.float32)
+    rest = init_features(rest_key, spec, RESTING)
+    moments = jnp.linspace(0, 1, path_fit.MOMENTS, dtype=jnp.float32)
+
+    def penalty(points):
+        net = points.nets
+
+        def unrest(time):
+            code = codes.at_time(net.times, time)
+            by = offsets(net.coarse, coarse_spec(spec), rest.reference, code)
+            return path_fit.unrest(by.turn, by.position, paths.unit)
+
+        return path_fit.REST * jnp.mean(jax.vmap(unrest)(moments))
+
+    rows = init_features(rows_key, spec, len(points))
+    start = Points(points, rows, init(nets_key, spec, frames))
+    return Guess(start, Points(paths.unit, 1.0, 0.4), penalty)
+
+
+def effect(spec: AnchorMotionSpec, run_steps: int, frames: int) -> Effect:
+    """The seams that this motion fills, for a run of so many steps over `frames`."""
+
+    def falling(of, name):
+        first, last = getattr(of, name), getattr(of, f"{name}_end")
+        return schedules.log_linear(first, last, run_steps)
+
+    make, move = falling(spec, "make_rate"), falling(spec, "learning_rate")
+    law = None if spec.rate is None else falling(spec.rate, "learning_rate")
+
+    def rates(step):
+        moving, of_law = move(step), None if law is None else law(step)
+        return Anchors(moving, make(step), moving, moving, of_law)
+
+    def features_of(scene, condition):
+        """As they are read: with noise in training, kept afterwards."""
+        own, net = scene.rows[NAME], scene.nets[NAME]
+        if spec.rate is None:
+            return own
+        if condition is None or condition.step is None:
+            return kept(own, net.law, spec)
+        key = jax.random.fold_in(condition.key, stream(NAME))
+        return jax.lax.cond(
+            condition.step < spec.rate.start,
+            lambda own, law: own,
+            lambda own, law: noised(key, own, law),
+            own,
+            net.law,
+        )
+
+    def moved(
+        scene: Params, gaussians: Gaussians, condition: FrameCondition, _
+    ) -> Gaussians:
+        net = scene.nets[NAME]
+        code = codes.at_time(net.times, condition.time)
+        active = splats.active_mask(scene.rows["splats"])
+        by = in_blocks(
+            lambda reads: offsets(net.coarse, coarse_spec(spec), reads, code),
+            (features_of(scene, condition).reference,),
+            active,
+            spec.block,
+        )
+        return kan_motion.apply(gaussians, by)
+
+    def derive_rows(
+        scene: Params, condition: FrameCondition | None
+    ) -> tuple[Splats, tuple[Carried, Features]]:
+        features = features_of(scene, condition)
+        rows = scene.rows["splats"]
+        own = made(scene.nets[NAME], spec, features, rows.sh_rest.shape[1])
+        return carried.at_rest(rows, own), (own, features)
+
+    def derive(
+        scene: Params,
+        derived: tuple[Splats, tuple[Carried, Features]],
+        rows: Gaussians,
+        condition: FrameCondition,
+    ) -> Gaussians:
+        net = scene.nets[NAME]
+        if not spec.moves:
+            return posed(net, spec, derived, rows, None)
+        code = codes.at_time(net.times, condition.time)
+        if not spec.warm_up or condition.step is None:
+            return posed(net, spec, derived, rows, code)
+        return jax.lax.cond(
+            condition.step < spec.warm_up,
+            lambda net, derived, rows: posed(net, spec, derived, rows, None),
+            lambda net, derived, rows: posed(net, spec, derived, rows, code),
+            net,
+            derived,
+            rows,
+        )
+
+    def penalty(net: Anchors, context: PenaltyContext) -> dict[str, Term]:
+        scene = context.params
+        active = splats.active_mask(scene.rows["splats"])
+
+        def evaluate(scene):
+            features = features_of(scene, context.condition)
+            first, others = bits(features, scene.nets[NAME].law, spec)
+            total = jnp.sum(first, axis=1) + jnp.sum(others, axis=(1, 2))
+            count = jnp.maximum(jnp.sum(active), 1) * numbers
+            return jnp.sum(jnp.where(active, total, 0)) / count.astype(total.dtype)
+
+        numbers = spec.reference + spec.count * spec.residual
+        value = jax.lax.cond(
+            context.step < spec.rate.start,
+            lambda scene: jnp.zeros((), scene.rows["splats"].mean.dtype),
+            evaluate,
+            scene,
+        )
+        return {"bits": Term(value, spec.rate.weight)}
+
+    return Effect(
+        name=NAME,
+        init_rows=lambda key, rows: init_features(
+            key, spec, len(rows.mean), rows.mean.dtype
+        ),
+        init=functools.partial(init, spec=spec, frames=frames),
+        row_learning_rate=falling(spec, "feature_rate"),
+        learning_rate=rates,
+        warm_up=spec.warm_up,
+        deform=moved if spec.moves else None,
+        derive_rows=derive_rows,
+        derive=derive,
+        significance=significance,
+        penalty=None if spec.rate is None else penalty,
+        fit_to_paths=functools.partial(fit_to_paths, spec, frames),
+    )

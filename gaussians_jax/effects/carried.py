@@ -1,0 +1,277 @@
+"""Gaussians that rows carry: each row is a core, and what is drawn moves with it.
+
+D-MiSo (Waczynska et al. 2024, NeurIPS, arXiv:2405.14276, "Multi-Gaussian soup"): a core
+Gaussian carries k sub-Gaussians in its own coordinates (its equation 2), and these
+alone are drawn. A motion moves the cores; a second network, the paper's Sub-Rot, turns
+what they carry. A core moved by hand takes what it carries along (`posed`), and a core
+is a triangle as well (`gaussians_jax.faces`).
+
+What is not as in the paper. Places count in the scales of the core (m + R S a, there
+m + R a), so that what is split, or enlarged by hand, takes along what it carries. Cores
+have three scales, where the paper's are flat. Looks, opacities, scales and turns are
+against those of the core (in its code scales and turns are), and so the density control
+of the rows, which clones, splits and prunes cores, needs to know nothing of them. There
+is no first stage in which the cores themselves are drawn: what is carried starts spread
+about its core with the core's looks.
+"""
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key
+
+from gaussians_jax import splats
+from gaussians_jax.splats import Gaussians, Params, Splats
+from nerfies_jax.geometry import quaternion
+from nerfies_jax.nets import encoding, mlp
+from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
+from nerfies_jax.training import schedules
+from nerfies_jax.training.effects import Effect, FrameCondition
+
+NAME = "carried"
+
+
+@dataclasses.dataclass(frozen=True)
+class TurnSpec:
+    """The network that turns what is carried, from its own turn and the time.
+
+    The paper's has one layer (`depth` 0) and its code answers with a quaternion; here
+    the answer is a rotation vector, and starts near zero.
+    """
+
+    time: EncodingSpec = EncodingSpec(10)
+    depth: int = 0
+    width: int = 32  # of hidden layers
+    learning_rate: float = 8e-4
+    learning_rate_end: float = 1.6e-6
+
+    def __post_init__(self):
+        schedules.check_falling(self.learning_rate, self.learning_rate_end)
+        network_spec(self)  # checks its sizes
+
+
+def network_spec(spec: TurnSpec) -> MLPSpec:
+    """From [turn as a unit quaternion, encoded time] to a rotation vector."""
+    heads = (("turn", HeadSpec(3, "small")),)
+    inputs = 4 + spec.time.width(1)
+    return MLPSpec(inputs, spec.depth, spec.width, heads, (), "relu", "he")
+
+
+@dataclasses.dataclass(frozen=True)
+class CarriedSpec:
+    """How many Gaussians a row carries, where they start, and how fast they learn.
+
+    25 is the paper's number; it starts all of them in the middle of the core, where
+    slopes alone tell them apart, and as large as it. Rates are those of its code, of
+    offsets in scales of the core.
+    """
+
+    count: int = 25
+    spread: float = 0.7  # standard deviation of first offsets, in scales of the core
+    first_scale: float = 0.5  # over the core's
+    turns: TurnSpec | None = TurnSpec()  # None: what is carried does not turn by itself
+    offset_rate: float = 1e-2
+    log_scale_rate: float = 5e-3
+    quaternion_rate: float = 1e-3
+    opacity_rate: float = 5e-2
+    sh_dc_rate: float = 2.5e-3
+    sh_rest_rate: float = 1.25e-4
+
+    def __post_init__(self):
+        if self.count < 1:
+            raise ValueError(f"count={self.count}: a row carries at least one Gaussian")
+        if not 0 <= self.spread < math.inf:
+            raise ValueError(
+                f"spread={self.spread} must be finite and not negative; 0 starts all "
+                "in the middle of the core"
+            )
+        if not 0 < self.first_scale < math.inf:
+            raise ValueError(
+                f"first_scale={self.first_scale} must be positive and finite; 1 starts "
+                "them as large as the core"
+            )
+        for field in dataclasses.fields(self):
+            rate = getattr(self, field.name)
+            if field.name.endswith("_rate") and not 0 <= rate < math.inf:
+                raise ValueError(f"{field.name}={rate} is finite and not negative")
+
+
+class Carried(NamedTuple):
+    """What each row carries, against itself: in its axes, its scales and its looks."""
+
+    offset: Float[Array, "rows carried 3"]  # of the mean, in scales of the row
+    log_scale: Float[Array, "rows carried 3"]  # added to the logarithm
+    quaternion: Float[Array, "rows carried 4"]  # wxyz, in the row's axes; any length
+    opacity_logit: Float[Array, "rows carried"]  # added
+    sh_dc: Float[Array, "rows carried 1 3"]  # added
+    sh_rest: Float[Array, "rows carried rest 3"]  # added
+
+
+def init_rows(key: Key[Array, ""], spec: CarriedSpec, rows: Splats) -> Carried:
+    """What rows carry at first: smaller copies of themselves, spread about."""
+    shape, kind = (len(rows.mean), spec.count), rows.mean.dtype
+    drawn = jax.random.normal(key, (*shape, 3), jnp.float32).astype(kind)
+    return Carried(
+        offset=spec.spread * drawn,
+        log_scale=jnp.full((*shape, 3), math.log(spec.first_scale), kind),
+        quaternion=jnp.broadcast_to(quaternion.identity(kind), (*shape, 4)),
+        opacity_logit=jnp.zeros(shape, kind),
+        sh_dc=jnp.zeros((*shape, 1, 3), kind),
+        sh_rest=jnp.zeros((*shape, *rows.sh_rest.shape[1:]), kind),
+    )
+
+
+def at_rest(rows: Splats, own: Carried) -> Splats:
+    """What rows carry, those of the first row first, as rows of their own.
+
+    An inactive row carries inactive ones, as long as `own.opacity_logit` is below 250.
+    """
+    mean, turned, _ = _standing(own, None, splats.activate(rows))
+    return Splats(
+        mean=mean,
+        log_scale=_flat(rows.log_scale[:, None] + own.log_scale),
+        quaternion=turned,
+        opacity_logit=_flat(rows.opacity_logit[:, None] + own.opacity_logit),
+        sh_dc=_flat(rows.sh_dc[:, None] + own.sh_dc),
+        sh_rest=_flat(rows.sh_rest[:, None] + own.sh_rest),
+    )
+
+
+def posed(
+    own: Carried,
+    turn: Float[Array, "rows carried 3"] | None,
+    still: Splats,
+    rows: Gaussians,
+) -> Gaussians:
+    """What rows carry where the rows are now, moved by a network or by hand. Pure.
+
+    `turn` are rotation vectors (rad) in the axes of the row, after what is carried has
+    its own turn; `still` is `at_rest`, for the opacities. A row of no size has all in
+    its middle; one without a direction (a quaternion of zero) the axes of the world.
+    """
+    mean, turned, scale = _standing(own, turn, rows)
+    return Gaussians(mean, turned, scale, jax.nn.sigmoid(still.opacity_logit))
+
+
+def _standing(own, turn, rows):
+    """Means, rotations and scales of what rows carry, one after the other."""
+    axes = jax.vmap(quaternion.to_matrix)(rows.quaternion)
+    places = jnp.einsum("nij,nkj->nki", axes, rows.scale[:, None] * own.offset)
+    growth = jnp.exp(jnp.clip(own.log_scale, *splats.LOG_SCALE_RANGE))
+
+    def turned(row, one, turn):
+        one = quaternion.normalise(one)
+        if turn is not None:
+            one = quaternion.multiply(quaternion.exp(turn), one)
+        return quaternion.multiply(row, one)
+
+    unit = jax.vmap(quaternion.normalise)(rows.quaternion)
+    each = None if turn is None else 0
+    over_rows = jax.vmap(jax.vmap(turned, (None, 0, each)), (0, 0, each))
+    return (
+        _flat(rows.mean[:, None] + places),
+        _flat(over_rows(unit, own.quaternion, turn)),
+        _flat(rows.scale[:, None] * growth),
+    )
+
+
+def turns(
+    network: MLP, spec: TurnSpec, own: Carried, time: Float[Array, ""]
+) -> Float[Array, "rows carried 3"]:
+    """How what is carried turns at a time by itself, rad, in the axes of its row."""
+    moment = encoding.encode(spec.time, time[None], None)
+    at_time = mlp.with_known(network_spec(spec), network, moment)
+    unit = jax.vmap(jax.vmap(quaternion.normalise))(own.quaternion)
+    alone = dataclasses.replace(network_spec(spec), inputs=4)
+    return mlp.apply(alone, at_time, unit)["turn"]
+
+
+def follow(
+    params: Params, spec: CarriedSpec, rows: Gaussians, time: Float[Array, ""]
+) -> Gaussians:
+    """What is drawn at a time of rows that stand anywhere: of a scene edited by hand.
+
+    `rows` are those of `deformation.deform_rows`, moved, turned or enlarged.
+    """
+    own = params.rows[NAME]
+    still = at_rest(params.rows["splats"], own)
+    turn = None
+    if spec.turns is not None:
+        turn = turns(params.nets[NAME], spec.turns, own, time)
+    return posed(own, turn, still, rows)
+
+
+def effect(spec: CarriedSpec, steps: int, warm_up: int) -> Effect:
+    """The seams that this fills, for a run of `steps`; nothing turns before `warm_up`.
+
+    Opacities and looks are those at rest: a motion of the rows that changes opacities
+    has no say in them.
+    """
+
+    def rates(step):
+        del step
+        return Carried(
+            spec.offset_rate,
+            spec.log_scale_rate,
+            spec.quaternion_rate,
+            spec.opacity_rate,
+            spec.sh_dc_rate,
+            spec.sh_rest_rate,
+        )
+
+    def derive_rows(
+        params: Params, condition: FrameCondition | None
+    ) -> tuple[Splats, None]:
+        del condition
+        return at_rest(params.rows["splats"], params.rows[NAME]), None
+
+    def turn_of(params, condition):
+        own = params.rows[NAME]
+
+        def evaluate(network, own):
+            return turns(network, spec.turns, own, condition.time)
+
+        if not warm_up or condition.step is None:
+            return evaluate(params.nets[NAME], own)
+        return jax.lax.cond(
+            condition.step < warm_up,
+            lambda _, own: jnp.zeros_like(own.offset),
+            evaluate,
+            params.nets[NAME],
+            own,
+        )
+
+    def derive(
+        params: Params,
+        derived: tuple[Splats, None],
+        rows: Gaussians,
+        condition: FrameCondition,
+    ) -> Gaussians:
+        turn = None if spec.turns is None else turn_of(params, condition)
+        return posed(params.rows[NAME], turn, derived[0], rows)
+
+    own = Effect(
+        name=NAME,
+        init_rows=lambda key, rows: init_rows(key, spec, rows),
+        row_learning_rate=rates,
+        derive_rows=derive_rows,
+        derive=derive,
+    )
+    if spec.turns is None:
+        return own
+    return own._replace(
+        init=lambda key: mlp.init(network_spec(spec.turns), key),
+        learning_rate=schedules.log_linear(
+            spec.turns.learning_rate, spec.turns.learning_rate_end, steps
+        ),
+    )
+
+
+def _flat(leaf):
+    """[rows, carried, ...] as [rows * carried, ...]."""
+    rows, carried, *rest = leaf.shape  # of which the last may be none
+    return leaf.reshape(rows * carried, *rest)

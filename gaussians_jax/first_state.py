@@ -1,0 +1,110 @@
+"""A scene before its first step: parameters, moments and statistics; host side."""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gaussians_jax import densification, initialisation, rendering, splats, track_start
+from gaussians_jax.densification import DefaultStrategySpec
+from gaussians_jax.effects import deformation
+from gaussians_jax.growth import AuxState, states_of
+from gaussians_jax.spec import SplatScene, carried_count, refuse_what_cannot_train
+from gaussians_jax.splats import Params
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.evidence import usable_paths
+from nerfies_jax.training.effects import Effect, stream
+from nerfies_jax.training.model import TrainState, in_default_precision
+
+
+def estimate_memory_bytes(spec: SplatScene, capture: Capture) -> int:
+    """Roughly the memory of the first state and step; host side, nothing allocated."""
+    count = initialisation.initial_count(spec.init, capture)
+    count += spec.start.moving_points if spec.start.motion == "tracks" else 0
+    count *= 1 + (carried_count(spec) or 0)
+    harmonics = 3 * (spec.sh_degree + 1) ** 2
+    # Parameters, two moments, gradient, update; the tables of one projection.
+    numbers = count * (5 * (11 + harmonics) + 60)
+    # A chunk holds keys, rows and blending inputs of every pair.
+    numbers += 16 * (spec.raster.capacity or 0)
+    return 4 * numbers + capture.images.nbytes
+
+
+def first_state(spec, effects, optimiser, capture, key) -> TrainState:
+    """Parameters, moments and statistics before the first step; host side."""
+    refuse_what_cannot_train(spec)
+    rendering.refuse_distortion(capture.cameras)
+    start_key, run_key = jax.random.split(key)
+    seed = int(jax.random.randint(start_key, (), 0, np.iinfo(np.int32).max))
+    tracked, capture = _from_tracks(spec, effects, capture, start_key)
+    position, colour = initialisation.initial_points(spec.init, capture, seed)
+    if tracked is not None:
+        position = np.concatenate([position, tracked.position])
+        colour = np.concatenate([colour, tracked.colour])
+    rows = splats.from_points(
+        position,
+        colour,
+        degree=spec.sh_degree,
+        opacity=spec.init.opacity,
+        scale=spec.init.scale,
+    )
+    rows = initialisation.clamp_scales(rows, capture, spec.init.max_scale)
+    count = len(position)
+    most = None if spec.densification is None else spec.densification.cap_max
+    params = Params({"splats": rows}, {})
+    for effect in effects:
+        effect_key = jax.random.fold_in(start_key, stream(effect.name))
+        rows_key, nets_key = jax.random.split(effect_key)
+        if effect.init_rows is not None:
+            params.rows[effect.name] = effect.init_rows(rows_key, rows)
+        if effect.init is not None:
+            params.nets[effect.name] = effect.init(nets_key)
+        if effect.place is not None:
+            placed = effect.place(params.nets[effect.name], rows)
+            params.nets[effect.name] = placed
+    if tracked is not None:
+        params = track_start.put_in(params, effects, tracked)
+    params = splats.pad_rows(params, splats.capacity_for(count, most))
+    params = in_default_precision(params)
+    stats = ()
+    if isinstance(spec.densification, DefaultStrategySpec):
+        stats = densification.empty_stats(params.rows["splats"])
+    aux_state = AuxState(stats, states_of(effects, params))
+    return TrainState(
+        params, optimiser.init(params), aux_state, jnp.zeros((), jnp.int32), run_key
+    )
+
+
+def _from_tracks(spec, effects, capture, key):
+    """The start from tracks, and the capture with the points that stand still.
+
+    None, and the capture as it is, where there is no such start.
+    """
+    evidence = usable_paths.evidence_to_start_from(capture, spec.start)
+    if evidence is None:
+        return None, capture
+    seeds = track_start.start(spec.start, effects[0], evidence, capture, key)
+    if len(evidence.still.position) > initialisation.point_count(capture):
+        capture = dataclasses.replace(capture, points=evidence.still)
+    return seeds, capture
+
+
+def count_rows(effects: tuple[Effect, ...], state: TrainState) -> dict[str, int]:
+    """Active Gaussians, and `parameters`: the numbers of rows and the networks.
+
+    Where rows carry what is drawn, `gaussians` are those that are drawn and `rows`
+    those that carry.
+    """
+    params = state.params
+    active = int(splats.active_mask(params.rows["splats"]).sum())
+    each = sum(math.prod(leaf.shape[1:]) for leaf in jax.tree.leaves(params.rows))
+    nets = sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(params.nets))
+    counts = {
+        "gaussians": active * deformation.carried_by_each(effects, params),
+        "parameters": active * each + nets,
+    }
+    if deformation.derives(effects) is not None:
+        counts["rows"] = active
+    return counts

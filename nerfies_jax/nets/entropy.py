@@ -1,0 +1,51 @@
+"""What learnt numbers cost to keep: bits under a normal law, noise for rounding.
+
+Balle et al. 2017, "End-to-end optimized image compression", arXiv:1611.01704: what is
+kept is rounded to a step, and while it is trained noise as wide as the step stands in
+for that. The bits are those of an ideal coder that knows the law.
+"""
+
+import math
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key
+
+# Laws and steps may be those of channels, for many values each.
+Numbers = Float[Array, "*#batch"]
+# Of standard deviations and steps, as logarithms: what lies outside counts as the end.
+LOG_RANGE = (-12.0, 8.0)
+FLAT = 0.02  # of a standard deviation: a step below it is as good as a line
+
+
+def noisy(key: Key[Array, ""], values: Numbers, step: Numbers) -> Numbers:
+    """Values as far off as rounding could take them: even noise, one step wide."""
+    noise = jax.random.uniform(key, values.shape, jnp.float32, -0.5, 0.5)
+    return values + noise.astype(values.dtype) * step
+
+
+def rounded(values: Numbers, mean: Numbers, step: Numbers) -> Numbers:
+    """Values as they are kept: whole steps from the mean of their law."""
+    return mean + step * jnp.round((values - mean) / step)
+
+
+def bits(values: Numbers, mean: Numbers, log_scale: Numbers, step: Numbers) -> Numbers:
+    """-log2 of the share of a normal law that lies within half a step of each value.
+
+    Both ends are taken on the side of the law where shares are small, as logarithms: as
+    a difference of shares float32 has 0, and so infinitely many bits, from 5.5 standard
+    deviations on. `step` is positive.
+    """
+    scale = jnp.exp(jnp.clip(log_scale, *LOG_RANGE))
+    # By the size of the distance, whose slope at zero is zero as the answer's is.
+    away = (values - mean) / scale
+    away, wide = away * jnp.sign(away), step / scale
+    # Between two ends that all but meet float32 sees nothing: there the law is flat.
+    flat = wide < FLAT
+    held = jnp.where(flat, 1.0, wide)
+    near = jax.scipy.special.log_ndtr(held / 2 - away)
+    far = jax.scipy.special.log_ndtr(-held / 2 - away)
+    between = near + jnp.log(-jnp.expm1(far - near))
+    density = -away * away / 2 - math.log(2 * math.pi) / 2
+    level = jnp.log(jnp.where(flat, wide, 1.0)) + density
+    return -jnp.where(flat, level, between) / math.log(2)
