@@ -153,14 +153,11 @@ def _active(effects, without):
 
 
 def _init(spec, metadata, effects, key):
-    single = spec.sampling.fine == 0 or spec.sampling.shared
-    names = ("fine",) if single else ("coarse", "fine")
     lifted = sum(effect.lift_width for effect in effects)
     condition = sum(effect.condition_width for effect in effects)
     nets = {}
     keys = jax.random.split(key, 3)
-    for number, name in enumerate(names):
-        one = specs.template_of(spec, name)
+    for number, (name, one) in enumerate(specs.templates_of(spec).items()):
         extras = 0 if one.direction is None else one.direction.width(3)
         nets[name] = template.init(
             one,

@@ -8,7 +8,9 @@ from nerfies_jax.effects import (
     background,
     elastic,
     scene_flow,
+    smoothness,
     time_condition,
+    time_warp,
     transient,
     warp,
 )
@@ -17,7 +19,9 @@ from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.effects.background import BackgroundSpec
 from nerfies_jax.effects.elastic import ElasticSpec
 from nerfies_jax.effects.scene_flow import SceneFlowSpec
+from nerfies_jax.effects.smoothness import SmoothnessSpec
 from nerfies_jax.effects.time_condition import TimeSpec
+from nerfies_jax.effects.time_warp import TimeWarpSpec
 from nerfies_jax.effects.transient import TransientSpec
 from nerfies_jax.effects.warp import WarpSpec
 from nerfies_jax.radiance.template import TemplateSpec
@@ -25,6 +29,8 @@ from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.training import schedules
 from nerfies_jax.training.effects import Effect, Table
 from nerfies_jax.training.track_start import TrackStartSpec
+
+WARPS = {WarpSpec: warp.effect, TimeWarpSpec: time_warp.effect}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,15 +80,17 @@ class RadianceScene:
     )
     learning_rate_end: float = 5e-5
     template_rate: float = 1.0  # times that: of the template, for tables learn faster
+    table_rate: float = 1.0  # times that again: of the tables alone
     density_noise: float = 0.0  # standard deviation, while training
     appearance: AppearanceSpec | None = None
     transient: TransientSpec | None = None
     time: TimeSpec | None = None
-    warp: WarpSpec | None = None
+    warp: WarpSpec | TimeWarpSpec | None = None
     ambient: AmbientSpec | None = None
     elastic: ElasticSpec | None = None
     background: BackgroundSpec | None = None
     scene_flow: SceneFlowSpec | None = None
+    smoothness: SmoothnessSpec | None = None
     start: TrackStartSpec = TrackStartSpec()
 
     def __post_init__(self):
@@ -97,8 +105,9 @@ class RadianceScene:
                 f"{self.micro_batches} equal parts; choose a multiple, or "
                 "micro_batches=1"
             )
-        if not self.template_rate > 0:
-            raise ValueError(f"template_rate={self.template_rate} must be positive")
+        for name in ("template_rate", "table_rate"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}={getattr(self, name)} must be positive")
         if self.extent is not None and not self.extent > 0:
             raise ValueError(f"extent={self.extent} must be positive, or none")
         schedules.check_falling(self.learning_rate, self.learning_rate_end)
@@ -121,8 +130,11 @@ def effects_of(spec: RadianceScene, metadata: SceneMetadata) -> tuple[Effect, ..
     def flow(one):
         return scene_flow.effect(one, len(metadata.times), spec.template.width)
 
+    def smooth(one):
+        return smoothness.effect(one, templates_of(spec))
+
     bent = spec.warp
-    if bent is not None and spec.start.motion == "tracks":
+    if isinstance(bent, WarpSpec) and spec.start.motion == "tracks":
         # Fitted with all bands open, and closing them would undo it.
         bent = dataclasses.replace(bent, anneal_steps=None)
     built = (
@@ -132,11 +144,12 @@ def effects_of(spec: RadianceScene, metadata: SceneMetadata) -> tuple[Effect, ..
             lambda one: transient.effect(one, spec.template.width),
         ),
         (spec.time, time_condition.effect),
-        (bent, warp.effect),
+        (bent, WARPS.get(type(bent))),
         (spec.ambient, ambient.effect),
         (spec.elastic, elastic.effect),
         (spec.background, background.effect),
         (spec.scene_flow, flow),
+        (spec.smoothness, smooth),
     )
     return tuple(make(one) for one, make in built if one is not None)
 
@@ -152,6 +165,13 @@ def tables_of(effects: tuple[Effect, ...]) -> tuple[Table, ...]:
                     f"{tables[table.name]} and {table}; give them one code_width"
                 )
     return tuple(tables.values())
+
+
+def templates_of(spec: RadianceScene) -> dict[str, TemplateSpec]:
+    """The networks of all levels that have one, by name."""
+    single = spec.sampling.fine == 0 or spec.sampling.shared
+    names = ("fine",) if single else ("coarse", "fine")
+    return {name: template_of(spec, name) for name in names}
 
 
 def template_of(spec: RadianceScene, level: str) -> TemplateSpec:

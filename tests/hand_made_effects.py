@@ -27,11 +27,14 @@ from nerfies_jax.effects import (
     background,
     elastic,
     scene_flow,
+    smoothness,
     time_condition,
+    time_warp,
     transient,
     warp,
 )
-from nerfies_jax.spec import RadianceScene
+from nerfies_jax.effects.time_warp import TimeWarpSpec
+from nerfies_jax.spec import RadianceScene, templates_of
 
 FIELD_MODULES = {
     "appearance": appearance,
@@ -42,6 +45,7 @@ FIELD_MODULES = {
     "elastic": elastic,
     "background": background,
     "scene_flow": scene_flow,
+    "smoothness": smoothness,
 }
 SPLAT_MODULES = {
     "acceleration": acceleration,
@@ -80,7 +84,9 @@ def of_field(spec, metadata):
         effects.append(transient.effect(spec.transient, width))
     if spec.time is not None:
         effects.append(time_condition.effect(spec.time))
-    if spec.warp is not None:
+    if isinstance(spec.warp, TimeWarpSpec):
+        effects.append(time_warp.effect(spec.warp))
+    elif spec.warp is not None:
         effects.append(warp.effect(spec.warp))
     if spec.ambient is not None:
         effects.append(ambient.effect(spec.ambient))
@@ -91,6 +97,8 @@ def of_field(spec, metadata):
     if spec.scene_flow is not None:
         moments = len(metadata.times)
         effects.append(scene_flow.effect(spec.scene_flow, moments, width))
+    if spec.smoothness is not None:
+        effects.append(smoothness.effect(spec.smoothness, templates_of(spec)))
     return tuple(effects)
 
 
@@ -120,7 +128,10 @@ def of_splats(spec, metadata):
 def absent_modules(spec):
     """Modules whose effect is not in the scene, and that no other one builds on."""
     if isinstance(spec, RadianceScene):
-        return [m for name, m in FIELD_MODULES.items() if getattr(spec, name) is None]
+        gone = [m for name, m in FIELD_MODULES.items() if getattr(spec, name) is None]
+        if not isinstance(spec.warp, TimeWarpSpec):
+            return [*gone, time_warp]
+        return [*gone, warp]
     gone = [m for name, m in SPLAT_MODULES.items() if getattr(spec, name) is None]
     motion = spec.motion
     gone += [m for kind, m in MOTION_MODULES.items() if not isinstance(motion, kind)]

@@ -32,8 +32,10 @@ from gaussians_jax.effects.spline_motion import SplineMotionSpec
 from gaussians_jax.effects.time_basis import TimeBasisSpec
 from nerfies_jax import field as fields
 from nerfies_jax import presets as field_presets
-from nerfies_jax.effects import ambient, scene_flow, transient, warp
+from nerfies_jax.effects import ambient, scene_flow, time_warp, transient, warp
+from nerfies_jax.effects.time_warp import TimeWarpSpec
 from nerfies_jax.nets.grids import HashGridSpec
+from nerfies_jax.nets.voxels import VoxelGridSpec
 from nerfies_jax.radiance import template
 from nerfies_jax.scene_metadata import SceneMetadata
 from tests import bare_scenes, scenes
@@ -77,7 +79,10 @@ def counted_out(spec):
         own["transient"] = transient.init(spec.transient, key, width)
     if spec.time is not None:
         lifted += 1 + 2 * spec.time.encoding.bands  # of the time itself
-    if spec.warp is not None:
+    if isinstance(spec.warp, TimeWarpSpec):
+        own["warp"] = time_warp.init(spec.warp, key)
+        lifted += 3 * (1 + 2 * spec.warp.position.bands) + spec.warp.embedding
+    elif spec.warp is not None:
         own["warp"] = warp.init(spec.warp, key)
         if spec.warp.condition == "code":
             tables["motion"] = (MOMENTS, spec.warp.code_width)
@@ -95,6 +100,9 @@ def counted_out(spec):
         point = lifted
         if isinstance(one.position, HashGridSpec):
             point += one.position.levels * one.position.features
+        elif isinstance(one.position, VoxelGridSpec):
+            waves = 1 + 2 * one.position.bands
+            point += len(one.position.strides) * one.position.features * waves
         else:
             point += 3 * (1 + 2 * one.position.bands)
         view = 0 if one.direction is None else 3 * (1 + 2 * one.direction.bands)

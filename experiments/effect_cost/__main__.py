@@ -29,6 +29,7 @@ PRESETS = (
     "nerfies-small",
     "hypernerf-small",
     "nsff-small",
+    "tineuvox-small",
     "splats-deformable-small",
     "sonata-small",
     "moba-small",

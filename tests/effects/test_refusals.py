@@ -10,7 +10,9 @@ from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.effects.background import BackgroundSpec
 from nerfies_jax.effects.elastic import ElasticSpec
 from nerfies_jax.effects.scene_flow import FlowWeights, SceneFlowSpec
+from nerfies_jax.effects.smoothness import SmoothnessSpec
 from nerfies_jax.effects.time_condition import TimeSpec
+from nerfies_jax.effects.time_warp import TimeWarpSpec
 from nerfies_jax.effects.transient import TransientSpec
 from nerfies_jax.effects.warp import WarpSpec
 
@@ -40,6 +42,10 @@ REFUSED = [
     (FlowWeights, {"cycle": -1.0}, "cycle=-1"),
     (FlowWeights, {"depth": math.inf}, "depth=inf"),
     (scene_flow.interval, {"moments": 0}, "moments=0"),
+    (SmoothnessSpec, {"weight": -1.0}, "weight=-1.0"),
+    (SmoothnessSpec, {"until": 0}, "until=0.*none"),
+    (TimeWarpSpec, {"embedding": 0}, "embedding=0"),
+    (TimeWarpSpec, {"depth": -1}, "depth=-1"),
     (TimeSpec, {"condition": "frame"}, "unknown condition 'frame'.*time"),
     (TimeSpec, {"code_width": 0}, "code_width=0 must be at least 1"),
     (TransientSpec, {"code_width": 0}, "code_width=0"),
