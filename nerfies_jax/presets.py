@@ -18,8 +18,10 @@ from nerfies_jax.effects.ambient import AmbientSpec
 from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.effects.background import BackgroundSpec
 from nerfies_jax.effects.elastic import ElasticSpec
+from nerfies_jax.effects.moving_mask import MovingMaskSpec
 from nerfies_jax.effects.scene_flow import SceneFlowSpec
 from nerfies_jax.effects.smoothness import SmoothnessSpec
+from nerfies_jax.effects.surface import SurfaceSpec
 from nerfies_jax.effects.time_condition import TimeSpec
 from nerfies_jax.effects.time_warp import TimeWarpSpec
 from nerfies_jax.effects.transient import TransientSpec
@@ -110,6 +112,26 @@ HYPERNERF = dataclasses.replace(
     warp=WarpSpec(position=EncodingSpec(6), anneal_steps=80_000),
     ambient=AmbientSpec(),
     elastic=None,
+)
+
+# Yan, Li and Lee 2023, arXiv:2303.14435, and its code's `nerf_ds.gin`: HyperNeRF with
+# four bands of warp, an ambient slice that is open from the start, 64 and 64 samples,
+# 512 rays, and neither appearance codes nor points at rest. Encodings are without
+# identity there. Its price on displacements (1e-3) and its ever sharper weights of the
+# mask are not there.
+NERF_DS = dataclasses.replace(
+    HYPERNERF,
+    rays=512,
+    micro_batches=1,
+    sampling=SamplingSpec(64, 64),
+    learning_rate=1e-3,
+    learning_rate_end=1e-5,
+    appearance=None,
+    background=None,
+    warp=WarpSpec(position=EncodingSpec(4), anneal_steps=50_000),
+    ambient=AmbientSpec(closed_steps=0, anneal_steps=1),
+    mask=MovingMaskSpec(),
+    surface=SurfaceSpec(),
 )
 
 # Li et al. 2021, arXiv:2011.13084, and its code: one level of 128 samples, 1024 rays.
@@ -203,6 +225,15 @@ SMALL_HYPERNERF = dataclasses.replace(
     ),
     elastic=None,
 )
+SMALL_NERF_DS = dataclasses.replace(
+    SMALL_NERF,
+    warp=SMALL_WARP,
+    ambient=AmbientSpec(depth=3, width=32, skips=(), closed_steps=0, anneal_steps=1),
+    mask=MovingMaskSpec(depth=3, width=32, skips=()),
+    surface=SurfaceSpec(
+        EncodingSpec(2), EncodingSpec(2), closed_steps=300, anneal_steps=600
+    ),
+)
 SMALL_NSFF = dataclasses.replace(
     SMALL_NERF,
     sampling=SamplingSpec(48, 0),
@@ -279,6 +310,7 @@ PRESETS = {
     "hypernerf": HYPERNERF,
     "nsff": NSFF,
     "tineuvox": TINEUVOX,
+    "nerf-ds": NERF_DS,
     "nerf-small": SMALL_NERF,
     "nerf-w-small": SMALL_NERF_W,
     "d-nerf-small": SMALL_D_NERF,
@@ -287,6 +319,7 @@ PRESETS = {
     "hypernerf-small": SMALL_HYPERNERF,
     "nsff-small": SMALL_NSFF,
     "tineuvox-small": SMALL_TINEUVOX,
+    "nerf-ds-small": SMALL_NERF_DS,
     "nerf-grid-small": SMALL_NERF_GRID,
     "nerf-w-grid-small": _on_grid(SMALL_NERF_W),
     "d-nerf-grid-small": _on_grid(SMALL_D_NERF),

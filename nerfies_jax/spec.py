@@ -7,8 +7,10 @@ from nerfies_jax.effects import (
     appearance,
     background,
     elastic,
+    moving_mask,
     scene_flow,
     smoothness,
+    surface,
     time_condition,
     time_warp,
     transient,
@@ -18,8 +20,10 @@ from nerfies_jax.effects.ambient import AmbientSpec
 from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.effects.background import BackgroundSpec
 from nerfies_jax.effects.elastic import ElasticSpec
+from nerfies_jax.effects.moving_mask import MovingMaskSpec
 from nerfies_jax.effects.scene_flow import SceneFlowSpec
 from nerfies_jax.effects.smoothness import SmoothnessSpec
+from nerfies_jax.effects.surface import SurfaceSpec
 from nerfies_jax.effects.time_condition import TimeSpec
 from nerfies_jax.effects.time_warp import TimeWarpSpec
 from nerfies_jax.effects.transient import TransientSpec
@@ -91,6 +95,8 @@ class RadianceScene:
     background: BackgroundSpec | None = None
     scene_flow: SceneFlowSpec | None = None
     smoothness: SmoothnessSpec | None = None
+    mask: MovingMaskSpec | None = None
+    surface: SurfaceSpec | None = None
     start: TrackStartSpec = TrackStartSpec()
 
     def __post_init__(self):
@@ -117,6 +123,11 @@ class RadianceScene:
                     f"{name} holds the warp in check, and there is none; set warp or "
                     f"{name}=none"
                 )
+        if self.mask is not None and not isinstance(self.warp, WarpSpec):
+            raise ValueError(
+                "a mask of what moves guides a warp, and there is none that reads it; "
+                "set warp=WarpSpec or mask=none"
+            )
         if self.start.motion == "tracks" and self.warp is None:
             raise ValueError(
                 'start.motion="tracks" fits a warp to tracks, and there is none; set '
@@ -133,10 +144,16 @@ def effects_of(spec: RadianceScene, metadata: SceneMetadata) -> tuple[Effect, ..
     def smooth(one):
         return smoothness.effect(one, templates_of(spec))
 
-    bent = spec.warp
+    def surfaces(one):
+        widths = {name: net.width for name, net in templates_of(spec).items()}
+        return surface.effect(one, widths)
+
+    bent, slice_ = spec.warp, spec.ambient
     if isinstance(bent, WarpSpec) and spec.start.motion == "tracks":
         # Fitted with all bands open, and closing them would undo it.
         bent = dataclasses.replace(bent, anneal_steps=None)
+    if spec.mask is not None:
+        bent, slice_ = guided(bent), guided(slice_)
     built = (
         (spec.appearance, appearance.effect),
         (
@@ -145,13 +162,22 @@ def effects_of(spec: RadianceScene, metadata: SceneMetadata) -> tuple[Effect, ..
         ),
         (spec.time, time_condition.effect),
         (bent, WARPS.get(type(bent))),
-        (spec.ambient, ambient.effect),
+        (slice_, ambient.effect),
         (spec.elastic, elastic.effect),
         (spec.background, background.effect),
         (spec.scene_flow, flow),
         (spec.smoothness, smooth),
+        (spec.mask, moving_mask.effect),
+        (spec.surface, surfaces),
     )
     return tuple(make(one) for one, make in built if one is not None)
+
+
+def guided(one: WarpSpec | AmbientSpec | None) -> WarpSpec | AmbientSpec | None:
+    """The same warp or slice, reading the mask of what moves as well."""
+    if one is None or moving_mask.NAME in one.guides:
+        return one
+    return dataclasses.replace(one, guides=(*one.guides, moving_mask.NAME))
 
 
 def tables_of(effects: tuple[Effect, ...]) -> tuple[Table, ...]:

@@ -46,6 +46,7 @@ STEPS = 100
 LEANS_ON = {
     "elastic": ("warp",),
     "background": ("warp",),
+    "mask": ("warp",),
     "alternation": ("motion",),
     "acceleration": ("motion",),
     "neighbours": ("motion",),
@@ -120,6 +121,8 @@ def tiny_field(name):
         elastic=shrunk(spec.elastic, points=2),
         background=shrunk(spec.background, points=16),
         scene_flow=flow,
+        mask=shrunk(spec.mask, **net),
+        surface=shrunk(spec.surface, position=FEW, normal=FEW),
     )
 
 

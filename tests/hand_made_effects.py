@@ -1,6 +1,7 @@
 """Effects asked one by one from their own modules, and modules that do not answer."""
 
 import contextlib
+import dataclasses
 
 import pytest
 
@@ -26,8 +27,10 @@ from nerfies_jax.effects import (
     appearance,
     background,
     elastic,
+    moving_mask,
     scene_flow,
     smoothness,
+    surface,
     time_condition,
     time_warp,
     transient,
@@ -46,6 +49,8 @@ FIELD_MODULES = {
     "background": background,
     "scene_flow": scene_flow,
     "smoothness": smoothness,
+    "mask": moving_mask,
+    "surface": surface,
 }
 SPLAT_MODULES = {
     "acceleration": acceleration,
@@ -78,6 +83,7 @@ def of_field(spec, metadata):
     """The effects of a field, asked one by one from their own modules."""
     width = spec.template.width
     effects = []
+    guides = () if spec.mask is None else ("mask",)
     if spec.appearance is not None:
         effects.append(appearance.effect(spec.appearance))
     if spec.transient is not None:
@@ -87,9 +93,10 @@ def of_field(spec, metadata):
     if isinstance(spec.warp, TimeWarpSpec):
         effects.append(time_warp.effect(spec.warp))
     elif spec.warp is not None:
-        effects.append(warp.effect(spec.warp))
+        effects.append(warp.effect(dataclasses.replace(spec.warp, guides=guides)))
     if spec.ambient is not None:
-        effects.append(ambient.effect(spec.ambient))
+        bent = dataclasses.replace(spec.ambient, guides=guides)
+        effects.append(ambient.effect(bent))
     if spec.elastic is not None:
         effects.append(elastic.effect(spec.elastic))
     if spec.background is not None:
@@ -99,6 +106,11 @@ def of_field(spec, metadata):
         effects.append(scene_flow.effect(spec.scene_flow, moments, width))
     if spec.smoothness is not None:
         effects.append(smoothness.effect(spec.smoothness, templates_of(spec)))
+    if spec.mask is not None:
+        effects.append(moving_mask.effect(spec.mask))
+    if spec.surface is not None:
+        widths = {name: one.width for name, one in templates_of(spec).items()}
+        effects.append(surface.effect(spec.surface, widths))
     return tuple(effects)
 
 

@@ -60,6 +60,7 @@ EXCUSED = {
     **dict.fromkeys(["codes.init", "kan.init", "mlp.init", "mlp.init_layer"], "draws"),
     **dict.fromkeys(["template.init", "grids.init", "planes.init"], "draws"),
     "voxels.init": "zeros",
+    **dict.fromkeys(["template.raw_density", "template.coloured"], "template.apply"),
     **dict.fromkeys(["precision.at_least_float32", "precision.refuse_half"], "types"),
     "splats.refuse_half": "types",
     **dict.fromkeys(["splats.take_rows", "splats.pad_rows"], "moves rows of any tree"),

@@ -4,6 +4,8 @@ The expected arrays are counted out here, effect by effect, without the machiner
 puts scenes together; nothing is allocated or compiled for the fields.
 """
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import pytest
@@ -32,7 +34,15 @@ from gaussians_jax.effects.spline_motion import SplineMotionSpec
 from gaussians_jax.effects.time_basis import TimeBasisSpec
 from nerfies_jax import field as fields
 from nerfies_jax import presets as field_presets
-from nerfies_jax.effects import ambient, scene_flow, time_warp, transient, warp
+from nerfies_jax.effects import (
+    ambient,
+    moving_mask,
+    scene_flow,
+    surface,
+    time_warp,
+    transient,
+    warp,
+)
 from nerfies_jax.effects.time_warp import TimeWarpSpec
 from nerfies_jax.nets.grids import HashGridSpec
 from nerfies_jax.nets.voxels import VoxelGridSpec
@@ -71,6 +81,7 @@ def counted_out(spec):
     key, width = jax.random.key(0), spec.template.width
     lifted = beside = 0
     tables, own = {}, {}
+    guides = () if spec.mask is None else ("mask",)
     if spec.appearance is not None:
         beside += spec.appearance.width
         tables["appearance"] = (EXPOSURES, spec.appearance.width)
@@ -83,11 +94,13 @@ def counted_out(spec):
         own["warp"] = time_warp.init(spec.warp, key)
         lifted += 3 * (1 + 2 * spec.warp.position.bands) + spec.warp.embedding
     elif spec.warp is not None:
-        own["warp"] = warp.init(spec.warp, key)
+        bent = dataclasses.replace(spec.warp, guides=guides)
+        own["warp"] = warp.init(bent, key)
         if spec.warp.condition == "code":
             tables["motion"] = (MOMENTS, spec.warp.code_width)
     if spec.ambient is not None:
-        own["ambient"] = ambient.init(spec.ambient, key)
+        bent = dataclasses.replace(spec.ambient, guides=guides)
+        own["ambient"] = ambient.init(bent, key)
         tables["motion"] = (MOMENTS, spec.ambient.code_width)
         lifted += 2 * spec.ambient.encoding.bands * spec.ambient.dims
     if spec.scene_flow is not None:
@@ -95,6 +108,13 @@ def counted_out(spec):
     nets = {"fine": spec.template}
     if spec.sampling.fine and not spec.sampling.shared:
         nets["coarse"] = spec.coarse or spec.template
+    if spec.mask is not None:
+        own["mask"] = moving_mask.init(spec.mask, key)
+        tables["motion"] = (MOMENTS, spec.mask.code_width)
+    if spec.surface is not None:
+        own["surface"] = surface.init({n: one.width for n, one in nets.items()}, key)
+        for one in (spec.surface.position, spec.surface.normal):
+            beside += 3 * (1 + 2 * one.bands)
     own["template"] = {}
     for name, one in nets.items():
         point = lifted

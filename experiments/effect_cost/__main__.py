@@ -30,6 +30,7 @@ PRESETS = (
     "hypernerf-small",
     "nsff-small",
     "tineuvox-small",
+    "nerf-ds-small",
     "splats-deformable-small",
     "sonata-small",
     "moba-small",
@@ -49,6 +50,7 @@ BESIDE = {"splats-static-small": ("exposure.learning_rate=0.01",)}
 NEEDS = {
     "elastic": ("warp",),
     "background": ("warp",),
+    "mask": ("warp",),
     "alternation": ("motion",),
     "acceleration": ("motion",),
     "neighbours": ("motion",),

@@ -140,6 +140,16 @@ def encode(
     return encoding.encode(position, point, window)
 
 
+def raw_density(
+    spec: TemplateSpec, params: Template, features: Float[Array, " inputs"]
+) -> tuple[Float[Array, ""], Float[Array, " width"]]:
+    """The density before its activation, and the trunk's last layer."""
+    trunk = trunk_spec(spec, features.shape[-1])
+    hidden = mlp.hidden_features(trunk, params.trunk, features)
+    raw = mlp.affine(params.trunk.heads["density"], hidden)[0] + spec.density_bias
+    return raw, hidden
+
+
 def apply(
     spec: TemplateSpec,
     params: Template,
@@ -153,17 +163,31 @@ def apply(
     encoded view direction and codes, the same along a ray. `density_noise` is added
     before the activation. The density never depends on `condition`.
     """
-    trunk = trunk_spec(spec, features.shape[-1])
-    hidden = mlp.hidden_features(trunk, params.trunk, features)
-    raw = mlp.affine(params.trunk.heads["density"], hidden)[0] + spec.density_bias
+    raw, hidden = raw_density(spec, params, features)
     if density_noise is not None:
         raw = raw + density_noise
+    return coloured(spec, params, raw, hidden, condition)
+
+
+def coloured(
+    spec: TemplateSpec,
+    params: Template,
+    raw: Float[Array, ""],
+    hidden: Float[Array, " width"],
+    condition: Float[Array, " condition"],
+    more: Float[Array, " more"] | None = None,
+) -> Radiance:
+    """What `raw_density` found, with its colour; `more` is read behind `condition`."""
     bottleneck = mlp.affine(params.trunk.heads["bottleneck"], hidden)
     # Two products, not one of [bottleneck, condition]: under vmap over the samples of a
     # ray the second is then computed once for the ray.
     first = params.colour.hidden[0]
     branch = bottleneck @ first.weight[: spec.width]
-    branch = branch + (condition @ first.weight[spec.width :] + first.bias)
+    rest = first.weight[spec.width :]
+    if more is not None:
+        rest, last = jnp.split(rest, [len(rest) - len(more)])
+        branch = branch + more @ last
+    branch = branch + (condition @ rest + first.bias)
     colour = mlp.affine(params.colour.heads["colour"], jax.nn.relu(branch))
     activation = DENSITIES[spec.density]
     return Radiance(activation(raw), jax.nn.sigmoid(colour), hidden)

@@ -24,7 +24,7 @@ PRESETS = (
     *("dynmf-small", "spacetime-small", "spline-small", "4dgs-small"),
     *("sc-gs-small", "edgs-small"),
     *("nerf", "nerf-w", "d-nerf", "t-nerf", "nerfies", "hypernerf"),
-    *("tineuvox", "tineuvox-small"),
+    *("tineuvox", "tineuvox-small", "nerf-ds", "nerf-ds-small"),
     *("nsff", "splats-static-small", "splats-mcmc-small", "splats-tracked-small"),
     *("splats-deformable-small", "sonata-small", "moba-small", "nerf-small"),
     *("nerf-w-small", "d-nerf-small", "t-nerf-small", "nerfies-small"),

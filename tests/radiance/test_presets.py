@@ -19,11 +19,12 @@ COUNTED = {
     "elastic": ("hold_steps", "decay_steps"),
     "scene_flow": ("decay_steps",),
     "smoothness": ("until",),
+    "surface": ("closed_steps", "anneal_steps"),
     "template": ("anneal_steps",),
 }
 QUICK = ("nerf-w", "nsff")
 PAPERS = ("nerf", "nerf-w", "d-nerf", "t-nerf", "nerfies", "hypernerf", "nsff")
-PAPERS += ("tineuvox",)
+PAPERS += ("tineuvox", "nerf-ds")
 
 
 def test_every_paper_has_a_small_variant():
