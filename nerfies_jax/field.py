@@ -144,23 +144,21 @@ def _active(effects, without):
                 f"{', '.join(names) or 'none'}"
             )
         effect = effects[names.index(name)]
-        if effect.lift is not None or effect.condition is not None:
+        seams = (effect.lift, effect.condition, effect.mark, effect.surface)
+        if any(seam is not None for seam in seams):
             raise ValueError(
-                f"{name!r} feeds the template and cannot be left out of a trained "
-                "field; train one without it"
+                f"{name!r} feeds the template or a warp and cannot be left out of a "
+                "trained field; train one without it"
             )
     return tuple(effect for effect in effects if effect.name not in without)
 
 
 def _init(spec, metadata, effects, key):
-    single = spec.sampling.fine == 0 or spec.sampling.shared
-    names = ("fine",) if single else ("coarse", "fine")
     lifted = sum(effect.lift_width for effect in effects)
-    condition = sum(effect.condition_width for effect in effects)
+    condition = sum(e.condition_width + e.surface_width for e in effects)
     nets = {}
     keys = jax.random.split(key, 3)
-    for number, name in enumerate(names):
-        one = specs.template_of(spec, name)
+    for number, (name, one) in enumerate(specs.templates_of(spec).items()):
         extras = 0 if one.direction is None else one.direction.width(3)
         nets[name] = template.init(
             one,

@@ -18,12 +18,17 @@ from nerfies_jax.effects.ambient import AmbientSpec
 from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.effects.background import BackgroundSpec
 from nerfies_jax.effects.elastic import ElasticSpec
+from nerfies_jax.effects.moving_mask import MovingMaskSpec
 from nerfies_jax.effects.scene_flow import SceneFlowSpec
+from nerfies_jax.effects.smoothness import SmoothnessSpec
+from nerfies_jax.effects.surface import SurfaceSpec
 from nerfies_jax.effects.time_condition import TimeSpec
+from nerfies_jax.effects.time_warp import TimeWarpSpec
 from nerfies_jax.effects.transient import TransientSpec
 from nerfies_jax.effects.warp import WarpSpec
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.grids import HashGridSpec
+from nerfies_jax.nets.voxels import VoxelGridSpec
 from nerfies_jax.radiance.template import TemplateSpec
 from nerfies_jax.spec import RadianceScene, SamplingSpec
 from nerfies_jax.training import step_counts
@@ -109,6 +114,26 @@ HYPERNERF = dataclasses.replace(
     elastic=None,
 )
 
+# Yan, Li and Lee 2023, arXiv:2303.14435, and its code's `nerf_ds.gin`: HyperNeRF with
+# four bands of warp, an ambient slice that is open from the start, 64 and 64 samples,
+# 512 rays, and neither appearance codes nor points at rest. Encodings are without
+# identity there. Its price on displacements (1e-3) and its ever sharper weights of the
+# mask are not there.
+NERF_DS = dataclasses.replace(
+    HYPERNERF,
+    rays=512,
+    micro_batches=1,
+    sampling=SamplingSpec(64, 64),
+    learning_rate=1e-3,
+    learning_rate_end=1e-5,
+    appearance=None,
+    background=None,
+    warp=WarpSpec(position=EncodingSpec(4), anneal_steps=50_000),
+    ambient=AmbientSpec(closed_steps=0, anneal_steps=1),
+    mask=MovingMaskSpec(),
+    surface=SurfaceSpec(),
+)
+
 # Li et al. 2021, arXiv:2011.13084, and its code: one level of 128 samples, 1024 rays.
 # Not in its normalised device coordinates, which fit forward-facing captures alone, so
 # that the bound on the flow is one unit of the field. The kinetic term counts once; the
@@ -120,6 +145,36 @@ NSFF = dataclasses.replace(
     rays=1024,
     sampling=SamplingSpec(128, 0),
     scene_flow=SceneFlowSpec(),
+)
+
+# Fang et al. 2022, arXiv:2205.15285, the code's larger model for HyperNeRF's captures.
+# Its grid grows at four steps; here the strides open one after the other over the first
+# 6000, coarse to fine, so that the program and the checkpoints keep their shapes: until
+# the finest opens, only the vertices of a grid of a quarter (then half) of the cells
+# learn. It marches through the box by half a cell and skips what is empty; here samples
+# go where a first look found weight. Densities are exponential and begin as thin as
+# there (1e-3 of opacity in half a cell). A weight of 40 gives its slope of 1e-5 for
+# each difference. Its losses of each sample's colour and of the last transmittance, its
+# points at rest and its codes of cameras are not there.
+TINEUVOX = RadianceScene(
+    steps=20_000,
+    rays=4096,
+    micro_batches=4,
+    sampling=SamplingSpec(64, 128, shared=True),
+    template=TemplateSpec(
+        VoxelGridSpec(),
+        EncodingSpec(4),
+        depth=1,
+        skips=(),
+        density="exp",
+        density_bias=-2.5,
+        anneal_steps=6000,
+    ),
+    learning_rate=1e-3,
+    learning_rate_end=1e-4,
+    table_rate=100.0,
+    warp=TimeWarpSpec(),
+    smoothness=SmoothnessSpec(weight=40.0, until=10_000),
 )
 
 # For a CPU: a thin coarse level, a small network, few rays.
@@ -170,6 +225,15 @@ SMALL_HYPERNERF = dataclasses.replace(
     ),
     elastic=None,
 )
+SMALL_NERF_DS = dataclasses.replace(
+    SMALL_NERF,
+    warp=SMALL_WARP,
+    ambient=AmbientSpec(depth=3, width=32, skips=(), closed_steps=0, anneal_steps=1),
+    mask=MovingMaskSpec(depth=3, width=32, skips=()),
+    surface=SurfaceSpec(
+        EncodingSpec(2), EncodingSpec(2), closed_steps=300, anneal_steps=600
+    ),
+)
 SMALL_NSFF = dataclasses.replace(
     SMALL_NERF,
     sampling=SamplingSpec(48, 0),
@@ -218,6 +282,17 @@ SMALL_NERF_GRID = dataclasses.replace(
     template_rate=6.0,
 )
 
+SMALL_TINEUVOX = dataclasses.replace(
+    SMALL_NERF_GRID,
+    template=dataclasses.replace(
+        GRID_TEMPLATE, position=VoxelGridSpec(cells=96, features=4, bands=1)
+    ),
+    warp=TimeWarpSpec(
+        position=EncodingSpec(4), time=EncodingSpec(4), embedding=8, width=64
+    ),
+    smoothness=SmoothnessSpec(weight=1.0, until=1500),
+)
+
 
 def _on_grid(preset: RadianceScene) -> RadianceScene:
     """A small preset with its template on a grid."""
@@ -234,6 +309,8 @@ PRESETS = {
     "nerfies": NERFIES,
     "hypernerf": HYPERNERF,
     "nsff": NSFF,
+    "tineuvox": TINEUVOX,
+    "nerf-ds": NERF_DS,
     "nerf-small": SMALL_NERF,
     "nerf-w-small": SMALL_NERF_W,
     "d-nerf-small": SMALL_D_NERF,
@@ -241,6 +318,8 @@ PRESETS = {
     "nerfies-small": SMALL_NERFIES,
     "hypernerf-small": SMALL_HYPERNERF,
     "nsff-small": SMALL_NSFF,
+    "tineuvox-small": SMALL_TINEUVOX,
+    "nerf-ds-small": SMALL_NERF_DS,
     "nerf-grid-small": SMALL_NERF_GRID,
     "nerf-w-grid-small": _on_grid(SMALL_NERF_W),
     "d-nerf-grid-small": _on_grid(SMALL_D_NERF),

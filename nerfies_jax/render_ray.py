@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from nerfies_jax.effects import scene_flow, transient
-from nerfies_jax.effects.effect import Medium, RayOutput, Sample
+from nerfies_jax.effects.effect import Medium, RayOutput, Sample, Surface
 from nerfies_jax.geometry import rays
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.nets import encoding
@@ -74,6 +74,19 @@ def field_ray_through(
 
 def displacement(bound: Bound, point: Vector, condition: FrameCondition) -> Vector:
     """Template point minus observed point: what all warps do, one after the other."""
+    return _displaced(bound, point, _marked(bound, point, condition))
+
+
+def _marked(bound, point, condition):
+    """The condition with the codes of an observed point beside those of the frame."""
+    marks = {}
+    for effect in bound.effects:
+        if effect.mark is not None:
+            marks |= effect.mark(bound.own(effect), point, condition)
+    return condition._replace(codes=condition.codes | marks) if marks else condition
+
+
+def _displaced(bound, point, condition):
     total = jnp.zeros_like(point)
     for effect in bound.effects:
         if effect.displace is not None:
@@ -92,7 +105,7 @@ def mean_flow(
     """
     ray = Ray(point, jnp.asarray((0, 0, 1), point.dtype), *jnp.zeros(2, point.dtype))
     samples = _samples(bound, ray, condition, jnp.zeros(1, point.dtype))
-    radiance = _radiance(bound, "fine", ray, condition, samples, None)
+    radiance, _ = _radiance(bound, "fine", ray, condition, samples, None)
     flowing = [effect for effect in bound.effects if effect.name == scene_flow.NAME]
     media = _media(bound, flowing, ray, condition, samples, radiance)
     (medium,) = media.values()
@@ -122,9 +135,9 @@ def asked_at(
     bound: Bound, point: Vector, condition: FrameCondition
 ) -> tuple[Vector, tuple[Features, ...]]:
     """Where the template is asked for an observed point, and what lifts add to it."""
-    warped = point
+    warped, condition = point, _marked(bound, point, condition)
     if any(effect.displace is not None for effect in bound.effects):
-        warped = point + displacement(bound, point, condition)
+        warped = point + _displaced(bound, point, condition)
     lifted = tuple(
         effect.lift(bound.own(effect), point, condition)
         for effect in bound.effects
@@ -171,9 +184,10 @@ def render_ray(
                 samples.distance.dtype,
             )
             noise = spec.density_noise * drawn
-        radiance = _radiance(bound, name, ray, condition, samples, noise)
+        radiance, looks = _radiance(bound, name, ray, condition, samples, noise)
         media = _media(bound, media_of, ray, condition, samples, radiance)
-        return _composite(bound, ray, samples, radiance, media)
+        seen = _composite(bound, ray, samples, radiance, media)
+        return seen._replace(looks=looks)
 
     # Media are on the last level only: one that guides the samples needs no more.
     last = [effect for effect in bound.effects if effect.medium is not None]
@@ -230,15 +244,57 @@ def radiance_at(
 
 
 def _radiance(bound, name, ray, condition, samples, noise):
-    """What the template of one level says at the samples of one ray."""
+    """What the template of one level says at the samples of one ray, and what surfaces
+    there look like, by effect.
+    """
     inputs = colour_inputs(bound, name, ray.direction, condition)
+    surfaces = [effect for effect in bound.effects if effect.surface is not None]
 
-    def ask(warped, lifted, noise):
-        return radiance_at(bound, name, (warped, lifted), inputs, condition, noise)
+    def ask(point, warped, lifted, noise):
+        place = warped, lifted
+        if surfaces:
+            seen = point, place, inputs
+            return _surface_at(bound, name, surfaces, seen, condition, noise)
+        return radiance_at(bound, name, place, inputs, condition, noise), {}
 
-    return jax.vmap(ask, (0, 0, None if noise is None else 0))(
-        samples.warped, samples.lifted, noise
+    return jax.vmap(ask, (0, 0, 0, None if noise is None else 0))(
+        samples.point, samples.warped, samples.lifted, noise
     )
+
+
+def _surface_at(bound, name, surfaces, seen, condition, noise):
+    """As `radiance_at`, with what these effects say of the surface at a point."""
+    point, (warped, lifted), inputs = seen
+    one, net = template_of(bound.spec, name), bound.params["template"][name]
+
+    def density(net, warped, lifted):
+        encoded = template.encode(one, net, warped, condition.step)
+        return template.raw_density(one, net, jnp.concatenate([encoded, *lifted]))
+
+    raw, hidden = density(net, warped, lifted)
+    fixed = dataclasses.replace(bound, params=jax.lax.stop_gradient(bound.params))
+    still = jax.lax.stop_gradient((net, warped, lifted))
+
+    def turned(normal):
+        def moved(point):
+            return point + displacement(fixed, point, jax.lax.stop_gradient(condition))
+
+        # Of the density in the observation, f(x) = F(x + d(x)), the slope is JᵀF'.
+        return jax.vjp(moved, still_point)[1](normal)[0]
+
+    def outward():
+        return -jax.grad(lambda place: density(still[0], place, still[2])[0])(still[1])
+
+    still_point = jax.lax.stop_gradient(point)
+    surface = Surface(point, hidden, turned, outward)
+    looks = {
+        effect.name: effect.surface(bound.own(effect), name, surface, condition)
+        for effect in surfaces
+    }
+    more = jnp.concatenate([look.features for look in looks.values()])
+    raw = raw if noise is None else raw + noise
+    radiance = template.coloured(one, net, raw, hidden, inputs, more)
+    return radiance, {name: look.found for name, look in looks.items()}
 
 
 def _media(bound, effects, ray, condition, samples, radiance) -> dict[str, Medium]:

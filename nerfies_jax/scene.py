@@ -171,14 +171,21 @@ def descend(
 
 def learning_rates(
     spec: RadianceScene, effects: tuple[Effect, ...], params: PyTree, step: Array
-) -> dict[str, Array]:
+) -> dict[str, PyTree]:
     """Of each part of the parameters: the effect's own, or that of the schedule."""
     own = {e.name: e.learning_rate for e in effects if e.learning_rate is not None}
     common = schedules.log_linear(
         spec.learning_rate, spec.learning_rate_end, spec.steps
     )(step)
     rates = {name: own[name](step) if name in own else common for name in params}
-    return rates | {"template": spec.template_rate * common}
+    template = spec.template_rate * common
+    if spec.table_rate != 1:
+        tables = spec.table_rate * template
+        template = {
+            name: net._replace(trunk=template, colour=template, tables=tables)
+            for name, net in params["template"].items()
+        }
+    return rates | {"template": template}
 
 
 def draw_batch(frames: Frames, count: int, key: Key[Array, ""]) -> Batch:

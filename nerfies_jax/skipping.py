@@ -45,13 +45,14 @@ STAGES = 4  # in which a ray is followed; behind what is opaque no further one i
 def usable(spec, effects) -> bool:
     """Whether a field can be surveyed before its frames are drawn.
 
-    Not where a second medium shares its rays, where motion depends on the exposure, or
-    where nothing says how large what was filmed is.
+    Not where a second medium shares its rays, where colour reads of surfaces, where
+    motion depends on the exposure, or where nothing says how large what was filmed is.
     """
     moving = [e for e in effects if e.displace is not None or e.lift is not None]
     return (
         spec.extent is not None
         and all(effect.medium is None for effect in effects)
+        and all(effect.surface is None for effect in effects)
         and all(table.by == MOMENT for effect in moving for table in effect.tables)
     )
 

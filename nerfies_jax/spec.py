@@ -7,8 +7,12 @@ from nerfies_jax.effects import (
     appearance,
     background,
     elastic,
+    moving_mask,
     scene_flow,
+    smoothness,
+    surface,
     time_condition,
+    time_warp,
     transient,
     warp,
 )
@@ -16,8 +20,12 @@ from nerfies_jax.effects.ambient import AmbientSpec
 from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.effects.background import BackgroundSpec
 from nerfies_jax.effects.elastic import ElasticSpec
+from nerfies_jax.effects.moving_mask import MovingMaskSpec
 from nerfies_jax.effects.scene_flow import SceneFlowSpec
+from nerfies_jax.effects.smoothness import SmoothnessSpec
+from nerfies_jax.effects.surface import SurfaceSpec
 from nerfies_jax.effects.time_condition import TimeSpec
+from nerfies_jax.effects.time_warp import TimeWarpSpec
 from nerfies_jax.effects.transient import TransientSpec
 from nerfies_jax.effects.warp import WarpSpec
 from nerfies_jax.radiance.template import TemplateSpec
@@ -25,6 +33,8 @@ from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.training import schedules
 from nerfies_jax.training.effects import Effect, Table
 from nerfies_jax.training.track_start import TrackStartSpec
+
+WARPS = {WarpSpec: warp.effect, TimeWarpSpec: time_warp.effect}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,15 +84,19 @@ class RadianceScene:
     )
     learning_rate_end: float = 5e-5
     template_rate: float = 1.0  # times that: of the template, for tables learn faster
+    table_rate: float = 1.0  # times that again: of the tables alone
     density_noise: float = 0.0  # standard deviation, while training
     appearance: AppearanceSpec | None = None
     transient: TransientSpec | None = None
     time: TimeSpec | None = None
-    warp: WarpSpec | None = None
+    warp: WarpSpec | TimeWarpSpec | None = None
     ambient: AmbientSpec | None = None
     elastic: ElasticSpec | None = None
     background: BackgroundSpec | None = None
     scene_flow: SceneFlowSpec | None = None
+    smoothness: SmoothnessSpec | None = None
+    mask: MovingMaskSpec | None = None
+    surface: SurfaceSpec | None = None
     start: TrackStartSpec = TrackStartSpec()
 
     def __post_init__(self):
@@ -97,8 +111,9 @@ class RadianceScene:
                 f"{self.micro_batches} equal parts; choose a multiple, or "
                 "micro_batches=1"
             )
-        if not self.template_rate > 0:
-            raise ValueError(f"template_rate={self.template_rate} must be positive")
+        for name in ("template_rate", "table_rate"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}={getattr(self, name)} must be positive")
         if self.extent is not None and not self.extent > 0:
             raise ValueError(f"extent={self.extent} must be positive, or none")
         schedules.check_falling(self.learning_rate, self.learning_rate_end)
@@ -108,6 +123,11 @@ class RadianceScene:
                     f"{name} holds the warp in check, and there is none; set warp or "
                     f"{name}=none"
                 )
+        if self.mask is not None and not isinstance(self.warp, WarpSpec):
+            raise ValueError(
+                "a mask of what moves guides a warp, and there is none that reads it; "
+                "set warp=WarpSpec or mask=none"
+            )
         if self.start.motion == "tracks" and self.warp is None:
             raise ValueError(
                 'start.motion="tracks" fits a warp to tracks, and there is none; set '
@@ -121,10 +141,19 @@ def effects_of(spec: RadianceScene, metadata: SceneMetadata) -> tuple[Effect, ..
     def flow(one):
         return scene_flow.effect(one, len(metadata.times), spec.template.width)
 
-    bent = spec.warp
-    if bent is not None and spec.start.motion == "tracks":
+    def smooth(one):
+        return smoothness.effect(one, templates_of(spec))
+
+    def surfaces(one):
+        widths = {name: net.width for name, net in templates_of(spec).items()}
+        return surface.effect(one, widths)
+
+    bent, slice_ = spec.warp, spec.ambient
+    if isinstance(bent, WarpSpec) and spec.start.motion == "tracks":
         # Fitted with all bands open, and closing them would undo it.
         bent = dataclasses.replace(bent, anneal_steps=None)
+    if spec.mask is not None:
+        bent, slice_ = guided(bent), guided(slice_)
     built = (
         (spec.appearance, appearance.effect),
         (
@@ -132,13 +161,23 @@ def effects_of(spec: RadianceScene, metadata: SceneMetadata) -> tuple[Effect, ..
             lambda one: transient.effect(one, spec.template.width),
         ),
         (spec.time, time_condition.effect),
-        (bent, warp.effect),
-        (spec.ambient, ambient.effect),
+        (bent, WARPS.get(type(bent))),
+        (slice_, ambient.effect),
         (spec.elastic, elastic.effect),
         (spec.background, background.effect),
         (spec.scene_flow, flow),
+        (spec.smoothness, smooth),
+        (spec.mask, moving_mask.effect),
+        (spec.surface, surfaces),
     )
     return tuple(make(one) for one, make in built if one is not None)
+
+
+def guided(one: WarpSpec | AmbientSpec | None) -> WarpSpec | AmbientSpec | None:
+    """The same warp or slice, reading the mask of what moves as well."""
+    if one is None or moving_mask.NAME in one.guides:
+        return one
+    return dataclasses.replace(one, guides=(*one.guides, moving_mask.NAME))
 
 
 def tables_of(effects: tuple[Effect, ...]) -> tuple[Table, ...]:
@@ -152,6 +191,13 @@ def tables_of(effects: tuple[Effect, ...]) -> tuple[Table, ...]:
                     f"{tables[table.name]} and {table}; give them one code_width"
                 )
     return tuple(tables.values())
+
+
+def templates_of(spec: RadianceScene) -> dict[str, TemplateSpec]:
+    """The networks of all levels that have one, by name."""
+    single = spec.sampling.fine == 0 or spec.sampling.shared
+    names = ("fine",) if single else ("coarse", "fine")
+    return {name: template_of(spec, name) for name in names}
 
 
 def template_of(spec: RadianceScene, level: str) -> TemplateSpec:

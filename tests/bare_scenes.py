@@ -35,6 +35,7 @@ from nerfies_jax import presets as field_presets
 from nerfies_jax.geometry import rays
 from nerfies_jax.nets import encoding
 from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.nets.voxels import VoxelGridSpec
 from nerfies_jax.radiance import compositing, sampling, template
 from nerfies_jax.training import losses, schedules
 from nerfies_jax.training.model import TrainState
@@ -46,6 +47,7 @@ STEPS = 100
 LEANS_ON = {
     "elastic": ("warp",),
     "background": ("warp",),
+    "mask": ("warp",),
     "alternation": ("motion",),
     "acceleration": ("motion",),
     "neighbours": ("motion",),
@@ -82,9 +84,12 @@ def shrunk(part, **changes):
 def tiny_template(spec):
     """The same kind of network, two layers of eight."""
     direction = None if spec is None or spec.direction is None else EncodingSpec(1)
+    position = EncodingSpec(3)
+    if spec is not None and isinstance(spec.position, VoxelGridSpec):
+        position = shrunk(spec.position, cells=4, features=2)
     return shrunk(
         spec,
-        position=EncodingSpec(3),
+        position=position,
         direction=direction,
         depth=2,
         width=8,
@@ -97,6 +102,7 @@ def tiny_field(name):
     """A preset of `nerfies_jax` with networks of eight and 16 rays."""
     spec = field_presets.with_steps(field_presets.PRESETS[name], STEPS)
     net = {"depth": 2, "width": 8, "skips": (), "position": FEW, "time": FEW}
+    net |= {"embedding": 4}
     flow = spec.scene_flow
     if flow is not None:
         flow = shrunk(flow, network=tiny_template(flow.network), time=FEW)
@@ -116,6 +122,8 @@ def tiny_field(name):
         elastic=shrunk(spec.elastic, points=2),
         background=shrunk(spec.background, points=16),
         scene_flow=flow,
+        mask=shrunk(spec.mask, **net),
+        surface=shrunk(spec.surface, position=FEW, normal=FEW),
     )
 
 

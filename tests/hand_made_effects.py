@@ -1,6 +1,7 @@
 """Effects asked one by one from their own modules, and modules that do not answer."""
 
 import contextlib
+import dataclasses
 
 import pytest
 
@@ -29,12 +30,17 @@ from nerfies_jax.effects import (
     appearance,
     background,
     elastic,
+    moving_mask,
     scene_flow,
+    smoothness,
+    surface,
     time_condition,
+    time_warp,
     transient,
     warp,
 )
-from nerfies_jax.spec import RadianceScene
+from nerfies_jax.effects.time_warp import TimeWarpSpec
+from nerfies_jax.spec import RadianceScene, templates_of
 
 FIELD_MODULES = {
     "appearance": appearance,
@@ -45,6 +51,9 @@ FIELD_MODULES = {
     "elastic": elastic,
     "background": background,
     "scene_flow": scene_flow,
+    "smoothness": smoothness,
+    "mask": moving_mask,
+    "surface": surface,
 }
 SPLAT_MODULES = {
     "carried": carried,
@@ -80,16 +89,20 @@ def of_field(spec, metadata):
     """The effects of a field, asked one by one from their own modules."""
     width = spec.template.width
     effects = []
+    guides = () if spec.mask is None else ("mask",)
     if spec.appearance is not None:
         effects.append(appearance.effect(spec.appearance))
     if spec.transient is not None:
         effects.append(transient.effect(spec.transient, width))
     if spec.time is not None:
         effects.append(time_condition.effect(spec.time))
-    if spec.warp is not None:
-        effects.append(warp.effect(spec.warp))
+    if isinstance(spec.warp, TimeWarpSpec):
+        effects.append(time_warp.effect(spec.warp))
+    elif spec.warp is not None:
+        effects.append(warp.effect(dataclasses.replace(spec.warp, guides=guides)))
     if spec.ambient is not None:
-        effects.append(ambient.effect(spec.ambient))
+        bent = dataclasses.replace(spec.ambient, guides=guides)
+        effects.append(ambient.effect(bent))
     if spec.elastic is not None:
         effects.append(elastic.effect(spec.elastic))
     if spec.background is not None:
@@ -97,6 +110,13 @@ def of_field(spec, metadata):
     if spec.scene_flow is not None:
         moments = len(metadata.times)
         effects.append(scene_flow.effect(spec.scene_flow, moments, width))
+    if spec.smoothness is not None:
+        effects.append(smoothness.effect(spec.smoothness, templates_of(spec)))
+    if spec.mask is not None:
+        effects.append(moving_mask.effect(spec.mask))
+    if spec.surface is not None:
+        widths = {name: one.width for name, one in templates_of(spec).items()}
+        effects.append(surface.effect(spec.surface, widths))
     return tuple(effects)
 
 
@@ -129,7 +149,10 @@ def of_splats(spec, metadata):
 def absent_modules(spec):
     """Modules whose effect is not in the scene, and that no other one builds on."""
     if isinstance(spec, RadianceScene):
-        return [m for name, m in FIELD_MODULES.items() if getattr(spec, name) is None]
+        gone = [m for name, m in FIELD_MODULES.items() if getattr(spec, name) is None]
+        if not isinstance(spec.warp, TimeWarpSpec):
+            return [*gone, time_warp]
+        return [*gone, warp]
     gone = [m for name, m in SPLAT_MODULES.items() if getattr(spec, name) is None]
     motion = spec.motion
     gone += [m for kind, m in MOTION_MODULES.items() if not isinstance(motion, kind)]

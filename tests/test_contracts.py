@@ -26,6 +26,7 @@ from nerfies_jax.nets.grids import HashGridSpec
 from nerfies_jax.nets.kan import KANSpec
 from nerfies_jax.nets.mlp import HeadSpec, MLPSpec
 from nerfies_jax.nets.planes import PlanesSpec
+from nerfies_jax.nets.voxels import VoxelGridSpec
 from nerfies_jax.radiance import template
 from nerfies_jax.radiance.template import TemplateSpec
 
@@ -34,7 +35,8 @@ MODULES = (
     *(f"nerfies_jax.geometry.{name}" for name in ("matrix3", "camera", "distortion")),
     *("nerfies_jax.geometry.rays", "nerfies_jax.geometry.precision"),
     *(f"nerfies_jax.nets.{name}" for name in ("codes", "encoding", "kan", "mlp")),
-    *("nerfies_jax.nets.grids", "nerfies_jax.nets.planes", "nerfies_jax.nets.entropy"),
+    *("nerfies_jax.nets.grids", "nerfies_jax.nets.planes", "nerfies_jax.nets.voxels"),
+    "nerfies_jax.nets.entropy",
     *(f"nerfies_jax.radiance.{name}" for name in ("compositing", "sampling")),
     *("nerfies_jax.radiance.template", "nerfies_jax.training.losses"),
     *("gaussians_jax.projection", "gaussians_jax.splats", "gaussians_jax.harmonics"),
@@ -58,6 +60,8 @@ EXCUSED = {
     **dict.fromkeys(["quaternion.identity", "rays.pixel_centres"], "constants"),
     **dict.fromkeys(["codes.init", "kan.init", "mlp.init", "mlp.init_layer"], "draws"),
     **dict.fromkeys(["template.init", "grids.init", "planes.init"], "draws"),
+    "voxels.init": "zeros",
+    **dict.fromkeys(["template.raw_density", "template.coloured"], "template.apply"),
     **dict.fromkeys(["precision.at_least_float32", "precision.refuse_half"], "types"),
     "splats.refuse_half": "types",
     **dict.fromkeys(["splats.take_rows", "splats.pad_rows"], "moves rows of any tree"),
@@ -113,7 +117,13 @@ SETTINGS = {
             map(jnp.asarray, _network(functools.partial(grids.init, _GRID))(dtype))
         ),
     },
-    "grids.unit_place": {"spec": _GRID},
+    "grids.unit_place": {"half_side": 1.0, "contracted": True},
+    "voxels.encode": {
+        "spec": VoxelGridSpec(cells=2, features=2, strides=(2, 1), bands=1),
+        "tables": lambda dtype: (
+            jnp.asarray(np.random.default_rng(0).normal(size=(27, 2)), dtype),
+        ),
+    },
     "grids.level_features": {"cells": 2},
     "grids.vertex_row": {"cells": 2, "rows": 20},
     "grids.total_variation": {"cells": 2},

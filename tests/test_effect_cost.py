@@ -239,7 +239,8 @@ def test_a_picture_without_effects_asks_none(start, spec):
     view = evaluation.view_of(run.capture, 0)
     modules = hand_made_effects.absent_modules(spec)
     every = {
-        True: hand_made_effects.FIELD_MODULES,
+        True: hand_made_effects.FIELD_MODULES
+        | {"time_warp": hand_made_effects.time_warp},
         False: hand_made_effects.SPLAT_MODULES | hand_made_effects.MOTION_MODULES,
     }
     assert modules == [*every[start is started_field].values()]

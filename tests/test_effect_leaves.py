@@ -4,6 +4,8 @@ The expected arrays are counted out here, effect by effect, without the machiner
 puts scenes together; nothing is allocated or compiled for the fields.
 """
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import pytest
@@ -35,9 +37,19 @@ from gaussians_jax.effects.spline_motion import SplineMotionSpec
 from gaussians_jax.effects.time_basis import TimeBasisSpec
 from nerfies_jax import field as fields
 from nerfies_jax import presets as field_presets
-from nerfies_jax.effects import ambient, scene_flow, transient, warp
+from nerfies_jax.effects import (
+    ambient,
+    moving_mask,
+    scene_flow,
+    surface,
+    time_warp,
+    transient,
+    warp,
+)
+from nerfies_jax.effects.time_warp import TimeWarpSpec
 from nerfies_jax.nets import mlp
 from nerfies_jax.nets.grids import HashGridSpec
+from nerfies_jax.nets.voxels import VoxelGridSpec
 from nerfies_jax.radiance import template
 from nerfies_jax.scene_metadata import SceneMetadata
 from tests import bare_scenes, scenes
@@ -73,6 +85,7 @@ def counted_out(spec):
     key, width = jax.random.key(0), spec.template.width
     lifted = beside = 0
     tables, own = {}, {}
+    guides = () if spec.mask is None else ("mask",)
     if spec.appearance is not None:
         beside += spec.appearance.width
         tables["appearance"] = (EXPOSURES, spec.appearance.width)
@@ -81,12 +94,17 @@ def counted_out(spec):
         own["transient"] = transient.init(spec.transient, key, width)
     if spec.time is not None:
         lifted += 1 + 2 * spec.time.encoding.bands  # of the time itself
-    if spec.warp is not None:
-        own["warp"] = warp.init(spec.warp, key)
+    if isinstance(spec.warp, TimeWarpSpec):
+        own["warp"] = time_warp.init(spec.warp, key)
+        lifted += 3 * (1 + 2 * spec.warp.position.bands) + spec.warp.embedding
+    elif spec.warp is not None:
+        bent = dataclasses.replace(spec.warp, guides=guides)
+        own["warp"] = warp.init(bent, key)
         if spec.warp.condition == "code":
             tables["motion"] = (MOMENTS, spec.warp.code_width)
     if spec.ambient is not None:
-        own["ambient"] = ambient.init(spec.ambient, key)
+        bent = dataclasses.replace(spec.ambient, guides=guides)
+        own["ambient"] = ambient.init(bent, key)
         tables["motion"] = (MOMENTS, spec.ambient.code_width)
         lifted += 2 * spec.ambient.encoding.bands * spec.ambient.dims
     if spec.scene_flow is not None:
@@ -94,11 +112,21 @@ def counted_out(spec):
     nets = {"fine": spec.template}
     if spec.sampling.fine and not spec.sampling.shared:
         nets["coarse"] = spec.coarse or spec.template
+    if spec.mask is not None:
+        own["mask"] = moving_mask.init(spec.mask, key)
+        tables["motion"] = (MOMENTS, spec.mask.code_width)
+    if spec.surface is not None:
+        own["surface"] = surface.init({n: one.width for n, one in nets.items()}, key)
+        for one in (spec.surface.position, spec.surface.normal):
+            beside += 3 * (1 + 2 * one.bands)
     own["template"] = {}
     for name, one in nets.items():
         point = lifted
         if isinstance(one.position, HashGridSpec):
             point += one.position.levels * one.position.features
+        elif isinstance(one.position, VoxelGridSpec):
+            waves = 1 + 2 * one.position.bands
+            point += len(one.position.strides) * one.position.features * waves
         else:
             point += 3 * (1 + 2 * one.position.bands)
         view = 0 if one.direction is None else 3 * (1 + 2 * one.direction.bands)

@@ -39,7 +39,7 @@ class AmbientSpec:
 
     The template reads the ambient point encoded by `encoding`, whose bands are shut for
     `closed_steps` and open over the next `anneal_steps`. Without identity the template
-    has no ambient dimensions until then.
+    has no ambient dimensions until then. `guides` are as those of the warp.
     """
 
     kind: str = "bent"
@@ -53,6 +53,7 @@ class AmbientSpec:
     encoding: EncodingSpec = EncodingSpec(1, identity=False)
     closed_steps: int = steps(1000)
     anneal_steps: int = steps(10_000)
+    guides: tuple[str, ...] = ()
 
     def __post_init__(self):
         if self.kind not in KINDS:
@@ -80,7 +81,7 @@ class AmbientSpec:
 def network(spec: AmbientSpec) -> MLPSpec:
     """What reads [encoded point, code] and answers a bent slice's ambient point."""
     return MLPSpec(
-        inputs=spec.position.width(3) + spec.code_width,
+        inputs=spec.position.width(3) + spec.code_width + len(spec.guides),
         depth=spec.depth,
         width=spec.width,
         heads=(("ambient", HeadSpec(spec.dims, "small")),),
@@ -136,7 +137,8 @@ def ambient_point(
     if spec.kind == "plane":
         return condition.codes[PLANE_TABLE]
     encoded = encoding.encode(spec.position, point, None)
-    inputs = jnp.concatenate([encoded, condition.codes[spec.table]])
+    guides = [condition.codes[name] for name in spec.guides]
+    inputs = jnp.concatenate([encoded, condition.codes[spec.table], *guides])
     return mlp.apply(network(spec), params, inputs)["ambient"]
 
 

@@ -7,6 +7,7 @@ that the filmed volume fills a box around the origin. Functions of a point are w
 for one point and vmapped by the scene.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from jaxtyping import Array, Bool, Float, Int
@@ -36,6 +37,24 @@ class Medium(NamedTuple):
     extras: dict[str, Array] = {}  # noqa: RUF012  what the penalty needs again
 
 
+class Surface(NamedTuple):
+    """One sample of one ray, as colour sees it; slopes reach none of the parameters."""
+
+    point: Vector  # where it was observed
+    features: Float[Array, " width"]  # last hidden layer of the level's trunk there
+    # A normal in the template as one in the observation: by the transpose of the
+    # Jacobian of all warps, so of another length.
+    turned: Callable[[Vector], Vector]
+    outward: Callable[[], Vector]  # against the slope of the template's density
+
+
+class Look(NamedTuple):
+    """What an effect found at a surface."""
+
+    features: Float[Array, " features"]  # that colour reads
+    found: dict[str, Array] = {}  # noqa: RUF012  what the penalty needs again
+
+
 class RayOutput(NamedTuple):
     """One ray (or a batch) as one level of sampling renders it."""
 
@@ -50,6 +69,8 @@ class RayOutput(NamedTuple):
     distance: Float[Array, "*rays"]  # expected, units of the field
     median_distance: Float[Array, "*rays"]
     beta: Float[Array, "*rays"] | None  # standard deviation of the colour, or None
+    # What surfaces found, by effect, leaves with leading axes rays and samples.
+    looks: dict[str, dict[str, Array]] = {}  # noqa: RUF012
 
     @property
     def weight(self) -> Float[Array, "*rays samples"]:

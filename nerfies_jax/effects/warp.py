@@ -34,7 +34,8 @@ class WarpSpec:
     the encoded time, and then time 0 is the template itself (D-NeRF). `anneal_steps`
     opens the bands of `position` one by one over so many steps (equation 14); None has
     them open from the start. Without identity in `position`, step 0 of an annealed warp
-    moves all points of a frame alike.
+    moves all points of a frame alike. `guides` names codes of a point, one number each,
+    that it reads as well: a field with a mask of what moves adds it.
     """
 
     kind: str = "se3"
@@ -47,6 +48,7 @@ class WarpSpec:
     width: int = 128
     skips: tuple[int, ...] = (4,)
     anneal_steps: int | None = steps(None)
+    guides: tuple[str, ...] = ()
 
     def __post_init__(self):
         if self.kind not in KINDS:
@@ -74,7 +76,7 @@ def network(spec: WarpSpec) -> MLPSpec:
     condition = spec.code_width if spec.condition == "code" else spec.time.width(1)
     names = ("angular", "linear") if spec.kind == "se3" else ("linear",)
     return MLPSpec(
-        inputs=spec.position.width(3) + condition,
+        inputs=spec.position.width(3) + condition + len(spec.guides),
         depth=spec.depth,
         width=spec.width,
         heads=tuple((name, HeadSpec(3, "small")) for name in names),
@@ -121,10 +123,12 @@ def displace(
 ) -> Vector:
     """Template point minus observed point, in units of the field."""
     encoded = encoding.encode(spec.position, point, window(spec, condition.step, point))
+    guides = [condition.codes[name] for name in spec.guides]
     if spec.condition == "code":
-        return _move(spec, params, point, encoded, condition.codes[spec.table])
+        code = jnp.concatenate([condition.codes[spec.table], *guides])
+        return _move(spec, params, point, encoded, code)
     time = encoding.encode(spec.time, condition.time[None], None)
-    moved = _move(spec, params, point, encoded, time)
+    moved = _move(spec, params, point, encoded, jnp.concatenate([time, *guides]))
     return jnp.where(condition.time == 0, 0, moved)
 
 

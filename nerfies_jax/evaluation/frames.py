@@ -22,6 +22,8 @@ def frames_of(capture: Capture, required_data: Set[str] = frozenset()) -> Frames
         extras["points"] = capture.points.position
     if "flow" in required_data and capture.flow is not None:
         extras["flow"] = training_flow(capture)
+    if "moving" in required_data and capture.moving is not None:
+        extras["moving"] = capture.moving[rows]
     frames = Frames(
         images=capture.images[rows],
         cameras=cameras.take(capture.cameras, rows),

@@ -9,7 +9,7 @@ import numpy as np
 from nerfies_jax.capture import capture as captures
 from nerfies_jax.capture import pinholes, resampling
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.evidence import record
+from nerfies_jax.evidence import frame_masks, record
 from nerfies_jax.geometry import camera as cameras
 
 MOST_PIXELS = 4_000_000  # of all frames looked at: 45 s on one core
@@ -37,7 +37,8 @@ def with_masks(filmed: Capture, folder: pathlib.Path) -> tuple[Capture, str]:
     else:
         return filmed, f"What moves is not scored apart: {unusable}."
     for row, mask in zip(rows[evidence.row], evidence.moving, strict=True):
-        moving[row] = _enlarged(mask, factor * evidence.factor, filmed.size)
+        times = factor * evidence.factor
+        moving[row] = frame_masks.enlarged(mask, times, filmed.size)
     moving = _bent(moving, filmed)
     share = moving[filmed.heldout].mean()
     note = (
@@ -59,14 +60,6 @@ def _films(capture):
     scored = np.unique(capture.camera_ids[capture.heldout])
     own = used[np.isin(capture.camera_ids[used], scored)]
     return (used,) if len(own) == len(used) else (used, own)
-
-
-def _enlarged(mask, factor, size):
-    """Each pixel `factor` times as wide and high; what was trimmed is like its edge."""
-    mask = mask.repeat(factor, 0).repeat(factor, 1)
-    width, height = size
-    short = (0, height - mask.shape[0]), (0, width - mask.shape[1])
-    return np.pad(mask, short, mode="edge")
 
 
 def _bent(moving, filmed):

@@ -7,10 +7,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
-from nerfies_jax.nets import encoding, grids, mlp
+from nerfies_jax.nets import encoding, grids, mlp, voxels
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.grids import HashGridSpec
 from nerfies_jax.nets.mlp import HeadSpec, MLPSpec
+from nerfies_jax.nets.voxels import VoxelGridSpec
 from nerfies_jax.training import schedules
 from nerfies_jax.training.step_counts import steps
 
@@ -29,6 +30,8 @@ def exponential(raw: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     return jnp.exp(jnp.minimum(raw, LARGEST_LOG)) * (1 + beyond)
 
 
+# Encodings with tables of their own, by the module that reads them.
+GRIDS = {HashGridSpec: grids, VoxelGridSpec: voxels}
 DENSITIES = {"softplus": jax.nn.softplus, "relu": jax.nn.relu, "exp": exponential}
 
 
@@ -44,7 +47,7 @@ class TemplateSpec:
     one, coarse to fine, as Nerfies those of its warp; None has all open.
     """
 
-    position: EncodingSpec | HashGridSpec = EncodingSpec(10)
+    position: EncodingSpec | HashGridSpec | VoxelGridSpec = EncodingSpec(10)
     direction: EncodingSpec | None = EncodingSpec(4)
     depth: int = 8
     width: int = 256
@@ -106,10 +109,10 @@ def init(
 ) -> Template:
     """Glorot weights; `inputs` and `condition` are the widths that `apply` will get."""
     trunk_key, colour_key = jax.random.split(key)
-    tables = None
-    if isinstance(spec.position, HashGridSpec):
+    tables, grid = None, GRIDS.get(type(spec.position))
+    if grid is not None:
         tables_key = jax.random.fold_in(key, 2)  # the others are as without
-        tables = grids.init(spec.position, tables_key, dtype)
+        tables = grid.init(spec.position, tables_key, dtype)
     return Template(
         mlp.init(trunk_spec(spec, inputs), trunk_key, dtype),
         mlp.init(colour_spec(spec, condition), colour_key, dtype),
@@ -127,15 +130,24 @@ def encode(
 
     `step` says how far the bands or levels are open; None opens all.
     """
-    position = spec.position
-    grid = isinstance(position, HashGridSpec)
-    parts = position.levels if grid else position.bands
+    position, grid = spec.position, GRIDS.get(type(spec.position))
+    parts = position.bands if grid is None else position.levels
     window = None
     if spec.anneal_steps is not None and step is not None and parts:
         window = schedules.band_window(parts, spec.anneal_steps, step, point.dtype)
-    if grid:
-        return grids.encode(position, params.tables, point, window)
+    if grid is not None:
+        return grid.encode(position, params.tables, point, window)
     return encoding.encode(position, point, window)
+
+
+def raw_density(
+    spec: TemplateSpec, params: Template, features: Float[Array, " inputs"]
+) -> tuple[Float[Array, ""], Float[Array, " width"]]:
+    """The density before its activation, and the trunk's last layer."""
+    trunk = trunk_spec(spec, features.shape[-1])
+    hidden = mlp.hidden_features(trunk, params.trunk, features)
+    raw = mlp.affine(params.trunk.heads["density"], hidden)[0] + spec.density_bias
+    return raw, hidden
 
 
 def apply(
@@ -151,17 +163,31 @@ def apply(
     encoded view direction and codes, the same along a ray. `density_noise` is added
     before the activation. The density never depends on `condition`.
     """
-    trunk = trunk_spec(spec, features.shape[-1])
-    hidden = mlp.hidden_features(trunk, params.trunk, features)
-    raw = mlp.affine(params.trunk.heads["density"], hidden)[0] + spec.density_bias
+    raw, hidden = raw_density(spec, params, features)
     if density_noise is not None:
         raw = raw + density_noise
+    return coloured(spec, params, raw, hidden, condition)
+
+
+def coloured(
+    spec: TemplateSpec,
+    params: Template,
+    raw: Float[Array, ""],
+    hidden: Float[Array, " width"],
+    condition: Float[Array, " condition"],
+    more: Float[Array, " more"] | None = None,
+) -> Radiance:
+    """What `raw_density` found, with its colour; `more` is read behind `condition`."""
     bottleneck = mlp.affine(params.trunk.heads["bottleneck"], hidden)
     # Two products, not one of [bottleneck, condition]: under vmap over the samples of a
     # ray the second is then computed once for the ray.
     first = params.colour.hidden[0]
     branch = bottleneck @ first.weight[: spec.width]
-    branch = branch + (condition @ first.weight[spec.width :] + first.bias)
+    rest = first.weight[spec.width :]
+    if more is not None:
+        rest, last = jnp.split(rest, [len(rest) - len(more)])
+        branch = branch + more @ last
+    branch = branch + (condition @ rest + first.bias)
     colour = mlp.affine(params.colour.heads["colour"], jax.nn.relu(branch))
     activation = DENSITIES[spec.density]
     return Radiance(activation(raw), jax.nn.sigmoid(colour), hidden)

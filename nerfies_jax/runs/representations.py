@@ -25,6 +25,7 @@ PRESETS = (
     *("sc-gs-small", "edgs-small", "d-miso", "d-miso-small"),
     *("adc-gs", "adc-gs-small"),
     *("nerf", "nerf-w", "d-nerf", "t-nerf", "nerfies", "hypernerf"),
+    *("tineuvox", "tineuvox-small", "nerf-ds", "nerf-ds-small"),
     *("nsff", "splats-static-small", "splats-mcmc-small", "splats-tracked-small"),
     *("splats-deformable-small", "sonata-small", "moba-small", "nerf-small"),
     *("nerf-w-small", "d-nerf-small", "t-nerf-small", "nerfies-small"),

@@ -19,7 +19,7 @@ from nerfies_jax.evaluation import Renderer
 from nerfies_jax.evaluation.lens import ThroughLens
 from nerfies_jax.evaluation.representation import Representation
 from nerfies_jax.evaluation.scores import Draw
-from nerfies_jax.evidence import frame_flow, given_files
+from nerfies_jax.evidence import frame_flow, frame_masks, given_files
 from nerfies_jax.runs import own_effects, representations
 from nerfies_jax.runs.config import CaptureSource, RunConfig
 from nerfies_jax.runs.run_folder import CHECKPOINTS, CONFIG
@@ -77,9 +77,13 @@ def open_run(
 
 
 def _completed(capture, wanted):
-    """With flow found in the pictures where it is wanted; what else lacks is noted."""
+    """With flow and masks found in the pictures where they are wanted; what else lacks
+    is noted.
+    """
     if "flow" in wanted and capture.flow is None:
         capture = frame_flow.with_flow(capture)
+    if "moving" in wanted and capture.moving is None:
+        capture = frame_masks.with_masks(capture)
     if "depths" in wanted and capture.depths is None:
         note = "this preset learns from depth as well, and the capture has none"
         capture = dataclasses.replace(capture, notes=(*capture.notes, note))

@@ -35,6 +35,9 @@ FIELD_SEAMS = (
     "displace",
     "lift",
     "lift_width",
+    "mark",
+    "surface",
+    "surface_width",
     "medium",
     "beta_min",
 )
@@ -107,6 +110,7 @@ class PenaltyContext(NamedTuple):
     box: Any = None  # `effect.Box`, from scene units to those of the field
     # On Gaussians: the frame of the step, and the scene at other times.
     observation: Observation | None = None
+    row: Int[Array, ""] | None = None  # of the frame of the step, in `frames`
     # (rows as by `splats.take_rows`, time) -> `Gaussians`
     at_time: Callable[[Any, Scalar], Any] | None = None
     state: PyTree = None  # of this effect, where it keeps one
@@ -134,7 +138,8 @@ class Effect(NamedTuple):
     learning_rate: Schedule | None = None
     # (params, context) -> terms, logged as `effect/term`
     penalty: Callable[[PyTree, PenaltyContext], dict[str, Term]] | None = None
-    # Of "depths", "points" and "flow" in `Frames`, each None where a capture has none.
+    # Of "depths", "points", "flow" and "moving" in `Frames`, each None where a capture
+    # has none.
     # Gaussians are drawn with depth where one asks for "depths".
     required_data: frozenset[str] = frozenset()
     # Of radiance fields, all in units of the field, for one point of one ray.
@@ -147,6 +152,13 @@ class Effect(NamedTuple):
     # (params, observed point, condition) -> features the trunk reads beside the point's
     lift: Callable[[PyTree, Vector, FrameCondition], Features] | None = None
     lift_width: int = 0
+    # (params, observed point, condition) -> codes of the point by name, which join
+    # those of the frame for every `displace` and `lift`
+    mark: Callable[[PyTree, Vector, FrameCondition], dict[str, Features]] | None = None
+    # (params, level, `effect.Surface`, condition) -> `effect.Look`: what colour reads
+    # of each sample, so many features
+    surface: Callable[[PyTree, str, Any, FrameCondition], Any] | None = None
+    surface_width: int = 0
     # (params, `effect.Sample`, condition) -> `effect.Medium`; on the last level only
     medium: Callable[[PyTree, Any, FrameCondition], Any] | None = None
     # Least standard deviation of a ray's colour, where the medium has a `beta`.

@@ -27,6 +27,7 @@ class Frames(NamedTuple):
     )
     points: Any = None  # [points, 3] float32 static scene points, scene units
     flow: FrameFlow | None = None  # rows count the frames that are learnt from
+    moving: Any = None  # [frames, height, width] bool: moves by itself
 
 
 class View(NamedTuple):
@@ -123,7 +124,7 @@ class Model(NamedTuple):
     render: Callable[[PyTree, View, tuple[int, int], Int[Array, ""]], Rendering]
     events: tuple[Event, ...]
     counts: Callable[[TrainState], dict[str, int]]  # {"gaussians": n, ...}
-    # Which of "depths", "points", "flow" it reads, where a capture has them.
+    # Which of "depths", "points", "flow", "moving" it reads, where a capture has them.
     required_data: frozenset[str] = frozenset()
     stages: Stages | None = None  # where rendering has parts worth keeping
     surveyed: Surveyed | None = None  # where a survey makes pictures quicker

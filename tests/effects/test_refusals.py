@@ -9,8 +9,12 @@ from nerfies_jax.effects.ambient import AmbientSpec
 from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.effects.background import BackgroundSpec
 from nerfies_jax.effects.elastic import ElasticSpec
+from nerfies_jax.effects.moving_mask import MovingMaskSpec
 from nerfies_jax.effects.scene_flow import FlowWeights, SceneFlowSpec
+from nerfies_jax.effects.smoothness import SmoothnessSpec
+from nerfies_jax.effects.surface import SurfaceSpec
 from nerfies_jax.effects.time_condition import TimeSpec
+from nerfies_jax.effects.time_warp import TimeWarpSpec
 from nerfies_jax.effects.transient import TransientSpec
 from nerfies_jax.effects.warp import WarpSpec
 
@@ -34,12 +38,21 @@ REFUSED = [
     (ElasticSpec, {"robust_width": 0.0}, "width > 0"),
     (ElasticSpec, {"scaling": "twice"}, "'twice'"),
     (ElasticSpec, {"decay_steps": 0}, "steps=0"),
+    (MovingMaskSpec, {"code_width": 0}, "code_width=0"),
+    (MovingMaskSpec, {"weight": -0.1}, "weight=-0.1"),
+    (MovingMaskSpec, {"skips": (9,)}, "layer 9 is not in"),
+    (SurfaceSpec, {"anneal_steps": 0}, "anneal_steps=0"),
+    (SurfaceSpec, {"back_facing": math.inf}, "back_facing=inf"),
     (SceneFlowSpec, {"flow_bound": 0.0}, "flow_bound=0"),
     (SceneFlowSpec, {"flow_bound": math.nan}, "flow_bound=nan"),
     (SceneFlowSpec, {"decay_steps": 0}, "decay_steps=0"),
     (FlowWeights, {"cycle": -1.0}, "cycle=-1"),
     (FlowWeights, {"depth": math.inf}, "depth=inf"),
     (scene_flow.interval, {"moments": 0}, "moments=0"),
+    (SmoothnessSpec, {"weight": -1.0}, "weight=-1.0"),
+    (SmoothnessSpec, {"until": 0}, "until=0.*none"),
+    (TimeWarpSpec, {"embedding": 0}, "embedding=0"),
+    (TimeWarpSpec, {"depth": -1}, "depth=-1"),
     (TimeSpec, {"condition": "frame"}, "unknown condition 'frame'.*time"),
     (TimeSpec, {"code_width": 0}, "code_width=0 must be at least 1"),
     (TransientSpec, {"code_width": 0}, "code_width=0"),

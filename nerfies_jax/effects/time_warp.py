@@ -1,0 +1,117 @@
+"""TiNeuVox's motion: a small network shifts points by an embedding of the time.
+
+Fang et al. 2022, arXiv:2205.15285, "coordinate deformation" and "radiance network": a
+network embeds the encoded time; another, small one reads the embedding and the encoded
+point and answers the shift to the template. The radiance network reads the embedding
+and the encoded point as it was observed, too, and so makes up for what so small a
+deformation gets wrong. The time 0 is a time like any other.
+"""
+
+import dataclasses
+import functools
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key
+
+from nerfies_jax.effects.effect import Scalar, Vector
+from nerfies_jax.nets import encoding, mlp
+from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
+from nerfies_jax.training.effects import Effect, FrameCondition
+
+
+@dataclasses.dataclass(frozen=True)
+class TimeWarpSpec:
+    """Sizes; the defaults are those of the paper's larger model, by its code.
+
+    `embedding` is the width of what is made of the time, through one hidden layer of
+    `width`; the shift has `depth` of them.
+    """
+
+    position: EncodingSpec = EncodingSpec(10)
+    time: EncodingSpec = EncodingSpec(8)
+    embedding: int = 30
+    depth: int = 2
+    width: int = 256
+
+    def __post_init__(self):
+        if self.embedding < 1:
+            raise ValueError(
+                f"embedding={self.embedding} must be at least 1: all times would be "
+                "alike"
+            )
+        shift_network(self)  # refuses wrong depths and widths
+
+
+class TimeWarp(NamedTuple):
+    """Parameters."""
+
+    time: MLP  # head "embedding"
+    shift: MLP  # of [encoded point, embedding]; head "linear"
+
+
+def time_network(spec: TimeWarpSpec) -> MLPSpec:
+    """What embeds the encoded time."""
+    heads = (("embedding", HeadSpec(spec.embedding)),)
+    return MLPSpec(spec.time.width(1), 1, spec.width, heads)
+
+
+def shift_network(spec: TimeWarpSpec) -> MLPSpec:
+    """What reads [encoded point, embedding] and answers the shift."""
+    inputs = spec.position.width(3) + spec.embedding
+    heads = (("linear", HeadSpec(3, "small")),)
+    return MLPSpec(inputs, spec.depth, spec.width, heads)
+
+
+def effect(spec: TimeWarpSpec) -> Effect:
+    """The seams of `spec`."""
+    return Effect(
+        "warp",
+        init=lambda key: init(spec, key),
+        displace=functools.partial(displace, spec),
+        lift=functools.partial(features, spec),
+        lift_width=spec.position.width(3) + spec.embedding,
+    )
+
+
+def init(spec: TimeWarpSpec, key: Key[Array, ""], dtype=jnp.float32) -> TimeWarp:
+    """Nearly the identity: no point of a box of side two moves by more than 1e-4."""
+    time_key, shift_key = jax.random.split(key)
+    network = shift_network(spec)
+    shift = mlp.init(network, shift_key, dtype)
+    head = shift.heads["linear"]
+    # mlp.SMALL bounds what each feature adds; their sum has random signs.
+    head = head._replace(weight=head.weight / math.sqrt(network.features))
+    shift = shift._replace(heads={"linear": head})
+    return TimeWarp(mlp.init(time_network(spec), time_key, dtype), shift)
+
+
+def embed(
+    spec: TimeWarpSpec, params: TimeWarp, time: Scalar
+) -> Float[Array, " embedding"]:
+    """What both networks read of a time in [0, 1]."""
+    encoded = encoding.encode(spec.time, time[None], None)
+    return mlp.apply(time_network(spec), params.time, encoded)["embedding"]
+
+
+def displace(
+    spec: TimeWarpSpec, params: TimeWarp, point: Vector, condition: FrameCondition
+) -> Vector:
+    """Template point minus observed point, in units of the field."""
+    network = shift_network(spec)
+    # Under vmap over the samples of a ray the time's product is made once.
+    known = embed(spec, params, condition.time)
+    at_time = mlp.with_known(network, params.shift, known)
+    encoded = encoding.encode(spec.position, point, None)
+    return mlp.apply(network, at_time, encoded)["linear"]
+
+
+def features(
+    spec: TimeWarpSpec, params: TimeWarp, point: Vector, condition: FrameCondition
+) -> Float[Array, " features"]:
+    """What the radiance network reads beside the grid: observed point and time."""
+    encoded = encoding.encode(spec.position, point, None)
+    return jnp.concatenate([encoded, embed(spec, params, condition.time)])
