@@ -187,7 +187,9 @@ def render_ray(
         coarse.weight[1:-1],
         plan.fine,
     )
-    if not is_moved(bound):
+    if not plan.union:
+        both = _samples(bound, ray, condition, drawn)
+    elif not is_moved(bound):
         both = _samples(bound, ray, condition, sampling.union(distance, drawn))
     else:
         more = _samples(bound, ray, condition, drawn)

@@ -152,7 +152,7 @@ def _block(bound, occupied, camera, condition, position):
             edges = (distance[1:] + distance[:-1]) / 2
             weights = compositing.weights(depth)[1:-1]
             drawn = sampling.from_weights(None, edges, weights, plan.fine)
-            return sampling.union(distance, drawn)
+            return sampling.union(distance, drawn) if plan.union else drawn
 
         distance = jax.vmap(refined)(distance, depth)
     depth, colour = ask("fine", distance, 4)
