@@ -18,8 +18,9 @@ from nerfies_jax.evidence import usable_paths
 from nerfies_jax.field import Codes, Field, field
 from nerfies_jax.geometry import rays
 from nerfies_jax.nets import codes
+from nerfies_jax.radiance import template
 from nerfies_jax.scene_metadata import SceneMetadata
-from nerfies_jax.spec import RadianceScene
+from nerfies_jax.spec import RadianceScene, template_of
 from nerfies_jax.training import data_parallel, loop, losses, schedules
 from nerfies_jax.training.effects import (
     Effect,
@@ -216,6 +217,7 @@ def loss_terms(
     log-likelihood where a transient medium says how uncertain it is.
     """
     ray_key, penalty_key = jax.random.split(key)
+    terms = _variation_terms(radiance.spec, params, penalty_key)
     metadata = radiance.metadata
 
     def condition_of(row):
@@ -247,8 +249,20 @@ def loss_terms(
         frames=frames,
         box=Box(centre, jnp.asarray(metadata.scale, batch.origin.dtype)),
     )
-    terms = _colour_terms(levels, batch)
+    terms = _colour_terms(levels, batch) | terms
     return terms | penalty_terms(radiance.effects, params, context, {})
+
+
+def _variation_terms(spec, params, key):
+    """How uneven the tables of each level are, where that counts."""
+    terms = {}
+    for number, (name, net) in enumerate(params["template"].items()):
+        one = template_of(spec, name)
+        if one.variation > 0:
+            own = jax.random.fold_in(key, number)
+            value = template.variation(one, net, own)
+            terms[f"{name}_variation"] = Term(value, one.variation)
+    return terms
 
 
 def _colour_terms(levels: tuple[RayOutput, ...], batch: Batch) -> dict[str, Term]:
@@ -270,7 +284,8 @@ def _colour_terms(levels: tuple[RayOutput, ...], batch: Batch) -> dict[str, Term
 
 def estimate_memory_bytes(spec: RadianceScene, capture: Capture) -> int:
     """Roughly the memory of the first state and step; host side, nothing allocated."""
-    samples = 2 * spec.sampling.coarse + spec.sampling.fine
+    plan = spec.sampling
+    samples = (1 + plan.union) * plan.coarse + plan.fine
     widths = spec.template.depth * spec.template.width + spec.template.colour_width
     if spec.warp is not None:
         widths += spec.warp.depth * spec.warp.width

@@ -58,6 +58,7 @@ EXCUSED = {
     **dict.fromkeys(["quaternion.identity", "rays.pixel_centres"], "constants"),
     **dict.fromkeys(["codes.init", "kan.init", "mlp.init", "mlp.init_layer"], "draws"),
     **dict.fromkeys(["template.init", "grids.init", "planes.init"], "draws"),
+    **dict.fromkeys(["grids.variation_at_random", "template.variation"], "draws"),
     **dict.fromkeys(["precision.at_least_float32", "precision.refuse_half"], "types"),
     "splats.refuse_half": "types",
     **dict.fromkeys(["splats.take_rows", "splats.pad_rows"], "moves rows of any tree"),

@@ -1,22 +1,27 @@
 """The template: a network from an encoded point to density and colour."""
 
 import dataclasses
+import math
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
-from nerfies_jax.nets import encoding, grids, mlp
+from nerfies_jax.nets import encoding, grids, mlp, planes
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.grids import HashGridSpec
 from nerfies_jax.nets.mlp import HeadSpec, MLPSpec
+from nerfies_jax.nets.planes import PlanesSpec
 from nerfies_jax.training import schedules
 from nerfies_jax.training.step_counts import steps
 
 # Of a density: beyond it the exponential goes on along its tangent, finite and with a
 # slope that brings it back.
 LARGEST_LOG = 15.0
+VARIED = (
+    1024  # vertices of each level of a grid whose neighbours are compared in a step
+)
 
 
 def exponential(raw: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
@@ -40,11 +45,15 @@ class TemplateSpec:
     the first paper's; a ray that starts with none of them positive never learns, and
     under an interval at infinity the slope is 1e10 (softplus: at most 6e-3). "exp"
     becomes a wall in the fewest steps, which is what a grid of features wants.
-    `anneal_steps` opens the bands of the position, or the levels of its grid, one by
+    `anneal_steps` opens the bands of the position, or the levels of its tables, one by
     one, coarse to fine, as Nerfies those of its warp; None has all open.
+
+    A position may be read from tables: of a grid, or of planes without a time, which
+    span the cube [-1, 1]^3 of the field and, contracted, all space around it.
+    `variation` is the weight of the mean squared difference of neighbours in them.
     """
 
-    position: EncodingSpec | HashGridSpec = EncodingSpec(10)
+    position: EncodingSpec | HashGridSpec | PlanesSpec = EncodingSpec(10)
     direction: EncodingSpec | None = EncodingSpec(4)
     depth: int = 8
     width: int = 256
@@ -53,8 +62,16 @@ class TemplateSpec:
     density: str = "softplus"
     density_bias: float = 0.0  # added before the activation; negative starts emptier
     anneal_steps: int | None = steps(None)
+    variation: float = 0.0
 
     def __post_init__(self):
+        self.position.width(3)  # refuses planes of other dimensions
+        tables = isinstance(self.position, HashGridSpec | PlanesSpec)
+        if not 0 <= self.variation < math.inf or (self.variation and not tables):
+            raise ValueError(
+                f"variation={self.variation} must be a finite weight of at least 0, "
+                "and 0 where the position is read from no tables, as from a grid"
+            )
         if self.density not in DENSITIES:
             raise ValueError(
                 f"unknown density activation {self.density!r}; choose from "
@@ -74,7 +91,8 @@ class Template(NamedTuple):
 
     trunk: mlp.MLP  # heads "density" and "bottleneck"
     colour: mlp.MLP  # reads [bottleneck, condition]; head "colour"
-    tables: grids.Tables | None = None  # of a grid of features, where there is one
+    # Of a grid or of planes, where there are any.
+    tables: grids.Tables | tuple[planes.Level, ...] | None = None
 
 
 class Radiance(NamedTuple):
@@ -110,6 +128,8 @@ def init(
     if isinstance(spec.position, HashGridSpec):
         tables_key = jax.random.fold_in(key, 2)  # the others are as without
         tables = grids.init(spec.position, tables_key, dtype)
+    elif isinstance(spec.position, PlanesSpec):
+        tables = planes.init(spec.position, jax.random.fold_in(key, 2), dtype)
     return Template(
         mlp.init(trunk_spec(spec, inputs), trunk_key, dtype),
         mlp.init(colour_spec(spec, condition), colour_key, dtype),
@@ -128,14 +148,38 @@ def encode(
     `step` says how far the bands or levels are open; None opens all.
     """
     position = spec.position
-    grid = isinstance(position, HashGridSpec)
-    parts = position.levels if grid else position.bands
+    if isinstance(position, EncodingSpec):
+        parts = position.bands
+    elif isinstance(position, HashGridSpec):
+        parts = position.levels
+    else:
+        parts = len(position.multiples)
     window = None
     if spec.anneal_steps is not None and step is not None and parts:
         window = schedules.band_window(parts, spec.anneal_steps, step, point.dtype)
-    if grid:
+    if isinstance(position, EncodingSpec):
+        return encoding.encode(position, point, window)
+    if isinstance(position, HashGridSpec):
         return grids.encode(position, params.tables, point, window)
-    return encoding.encode(position, point, window)
+    found = planes.encode(position, params.tables, (grids.contract(point) + 2) / 4)
+    if window is not None:
+        found = found * jnp.repeat(window, position.features)
+    return found
+
+
+def variation(
+    spec: TemplateSpec, params: Template, key: Key[Array, ""]
+) -> Float[Array, ""]:
+    """Mean squared difference of neighbours in the tables, features squared.
+
+    Of a grid at random vertices, the mean over its levels; of planes all of them.
+    """
+    if isinstance(spec.position, HashGridSpec):
+        return grids.variation_at_random(spec.position, params.tables, key, VARIED)
+    every = [
+        planes.total_variation(plane) for of in params.tables for plane in of.space
+    ]
+    return sum(every) / (2 * len(every))  # the mean over both axes as well
 
 
 def apply(

@@ -15,6 +15,7 @@ from nerfies_jax.effects.background import BackgroundSpec
 from nerfies_jax.effects.scene_flow import SceneFlowSpec
 from nerfies_jax.effects.warp import WarpSpec
 from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.nets.grids import HashGridSpec
 from nerfies_jax.radiance.template import TemplateSpec
 from nerfies_jax.scene import RadianceScene
 from nerfies_jax.scene_metadata import SceneMetadata
@@ -101,8 +102,29 @@ def test_training_a_static_field_lowers_the_loss():
     assert np.mean(trace[-8:]) < 0.8 * np.mean(trace[:8]), trace
 
 
-def test_a_static_level_is_the_plain_nerf(dtype):
-    field, ray = scene.field(STATIC, METADATA), ray_of(dtype)
+def test_uneven_tables_count_with_the_weight_of_their_level():
+    grid = HashGridSpec(levels=1, coarsest=4, finest=4)
+    even = dataclasses.replace(TINY_TEMPLATE, position=grid)
+    uneven = dataclasses.replace(even, variation=1e6)  # of tables of 1e-4
+    model, state, frames = started(
+        dataclasses.replace(STATIC, template=uneven, coarse=even)
+    )
+    _, metrics = jax.jit(model.step)(state, frames)
+    assert set(metrics) == {"loss", "mse", "coarse", "fine", "fine_variation"}
+    rest = metrics["coarse"] + metrics["fine"]
+    np.testing.assert_allclose(
+        metrics["loss"], rest + 1e6 * metrics["fine_variation"], rtol=1e-6
+    )
+    tables = state.params["template"]["fine"].tables[0].reshape(5, 5, 5, 2)
+    pairs = [np.mean(np.diff(tables, axis=axis) ** 2) for axis in range(3)]
+    assert abs(metrics["fine_variation"] / np.mean(pairs) - 1) < 0.1  # three sigmas
+
+
+@pytest.mark.parametrize("union", [True, False])
+def test_a_static_level_is_the_plain_nerf(union, dtype):
+    plan = dataclasses.replace(STATIC.sampling, union=union)
+    field = scene.field(dataclasses.replace(STATIC, sampling=plan), METADATA)
+    ray = ray_of(dtype)
     params = drawn.params(field.init, dtype)
     levels = jax.jit(field.render_ray)(params, ray, condition_of(dtype))
     coarse, fine = jax.tree.map(np.asarray, levels)
@@ -112,7 +134,7 @@ def test_a_static_level_is_the_plain_nerf(dtype):
     np.testing.assert_allclose(coarse.colour, expected, atol=tolerance)
     expected = plain_nerf(params["template"]["fine"], ray, fine.distances)
     np.testing.assert_allclose(fine.colour, expected, atol=tolerance)
-    assert len(fine.distances) == 16
+    assert len(fine.distances) == (16 if union else 8)
     assert np.all(np.diff(fine.distances) >= 0)
 
 
