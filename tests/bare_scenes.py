@@ -203,7 +203,9 @@ def field_loss(spec, metadata, params, batch, key):
             distance = sampling.refine(second, distance, weights, plan.fine)
         else:
             edges = (distance[1:] + distance[:-1]) / 2
-            distance = sampling.from_weights(second, edges, weights[1:-1], plan.fine)
+            drawn = sampling.from_weights(second, edges, weights[1:-1], plan.fine)
+            last = () if metadata.background is not None else (distance[-1:],)
+            distance = jnp.concatenate([drawn, *last])
         return coarse, level("fine", origin, direction, far, distance)[1]
 
     keys = jax.random.split(jax.random.split(key)[0], len(batch.origin))
