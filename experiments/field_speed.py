@@ -2,20 +2,24 @@
 
     python -m experiments.field_speed --captures CAPTURE CAPTURE --out field_speed.json
     python -m experiments.field_speed --captures CAPTURE --presets nerf-grid-small
+    python -m experiments.field_speed --captures CAPTURE --seeds 3
 
-Each preset is trained once on each capture, its schedules as they are, and stops at
-each of the given processor seconds to be scored on frames that it does not learn from;
-compiling counts nothing. At the end a frame is drawn behind the survey of its empty
-space (`nerfies_jax.skipping`) and by the full quadrature: milliseconds are medians of
-the processor over five frames, without the survey, which has a column of its own, and
-decibels are of the difference between the two. What is in `--out` already is not
-measured again.
+Each preset is trained on each capture, once for each seed, its schedules as they are,
+and stops at each of the given processor seconds to be scored on frames that it does not
+learn from; compiling counts nothing. At the end a frame is drawn behind the survey of
+its empty space (`nerfies_jax.skipping`) and by the full quadrature: milliseconds are
+medians of the processor over five frames, without the survey, which has a column of its
+own, and decibels are of the difference between the two. Over several seeds the table
+has means, and beside a PSNR its standard deviation. What is in `--out` already is not
+measured again: an interrupted run goes on, and more `--seeds` add those that it lacks.
 """
 
 import dataclasses
+import itertools
 import json
 import math
 import pathlib
+import statistics
 import time
 
 from experiments import cli, markdown
@@ -23,6 +27,7 @@ from nerfies_jax.runs import platform, representations
 
 PRESETS = ("nerf-small", "nerf-grid-small", "nerfies-small", "nerfies-grid-small")
 FRAMES = 5  # timed, after one that makes the survey
+TIMES = ("skipped_ms", "full_ms", "survey_ms")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,6 +42,8 @@ class FieldSpeed:
     """Of the processor, rising, after which each is scored."""
     size: tuple[int, int] = (256, 192)
     """Of the frames that are timed, pixels."""
+    seeds: int = 1
+    """Trainings of each preset on each capture, from keys 0, 1, ..."""
     out: pathlib.Path = pathlib.Path("field_speed.json")
     """Keeps the numbers."""
 
@@ -47,6 +54,8 @@ class FieldSpeed:
         rising = list(self.seconds) == sorted(set(self.seconds))
         if not self.seconds or not rising or self.seconds[0] <= 0:
             raise ValueError("--seconds: positive and rising, as 60 120 300")
+        if self.seeds < 1:
+            raise ValueError(f"--seeds {self.seeds}: train at least once")
 
 
 @cli.command(FieldSpeed)
@@ -60,16 +69,18 @@ def main(args):
 
     stored = json.loads(args.out.read_text()) if args.out.exists() else {}
     rows = stored.get("rows", [])
-    for name, capture in captures.items():
-        for preset in args.presets:
-            cell = {"capture": name, "preset": preset, "size": list(args.size)}
-            cell["seconds"] = list(args.seconds)
-            if any(cell.items() <= row.items() for row in rows):
-                continue
-            rows.append(cell | measured(capture, preset, args.seconds, args.size))
-            stored = {"machine": clock.machine(), "rows": rows}
-            write_json(args.out, stored)
-            print("  ".join(f"{k} {v}" for k, v in rows[-1].items()), flush=True)
+    for seed, name, preset in itertools.product(
+        range(args.seeds), captures, args.presets
+    ):
+        cell = {"capture": name, "preset": preset, "size": list(args.size)}
+        cell |= {"seconds": list(args.seconds), "seed": seed}
+        if any(cell.items() <= row.items() for row in rows):
+            continue
+        found = measured(captures[name], preset, args.seconds, args.size, seed)
+        rows.append(cell | found)
+        stored = {"machine": clock.machine(), "rows": rows}
+        write_json(args.out, stored)
+        print("  ".join(f"{k} {v}" for k, v in rows[-1].items()), flush=True)
     return stored
 
 
@@ -81,7 +92,7 @@ def _captures(folders):
     return {folder.name: runs.load_capture(folder) for folder in folders}
 
 
-def measured(capture, preset: str, seconds, size: tuple[int, int]) -> dict:
+def measured(capture, preset: str, seconds, size: tuple[int, int], seed: int) -> dict:
     """Scores at each of the seconds, and what a frame takes after the last."""
     import jax
 
@@ -91,7 +102,7 @@ def measured(capture, preset: str, seconds, size: tuple[int, int]) -> dict:
     representation = representations.of_preset(preset)
     spec = representation.presets[preset]
     model = representation.build(spec, representation.metadata_of(capture, spec))
-    state = model.init(capture, jax.random.key(0))
+    state = model.init(capture, jax.random.key(seed))
     frames = evaluation.frames_of(capture, model.required_data)
     program, _ = chunk.program(model.step, state, frames, spec.steps, model.devices)
     program.prepare(program.length)
@@ -136,26 +147,45 @@ def drawn(model, state, capture, size: tuple[int, int]) -> dict:
 
 def page(stored) -> str:
     """The page in docs/results below the docstring."""
-    heads = ("capture", "preset", "s", "steps", "PSNR", "frame, ms", "full, ms")
-    heads += ("survey, ms", "alike, dB")
-    rows = []
+    heads = ("capture", "preset", "s", "seeds", "steps", "PSNR", "frame, ms")
+    heads += ("full, ms", "survey, ms", "alike, dB")
+    cells = {}
     for row in stored["rows"]:
-        last = len(row["seconds"]) - 1
-        for place, seconds in enumerate(row["seconds"]):
-            names = ("skipped_ms", "full_ms", "survey_ms", "alike_db")
-            frame = [row[name] if place == last else None for name in names]
+        key = row["capture"], row["preset"], *row["size"], *row["seconds"]
+        cells.setdefault(key, []).append(row)
+    rows = []
+    for seeds in cells.values():
+        one = seeds[0]
+        for place, limit in enumerate(one["seconds"]):
+            last = place == len(one["seconds"]) - 1
+            times = [_mean(seeds, name) if last else None for name in TIMES]
+            steps = statistics.fmean(row["steps"][place] for row in seeds)
             rows.append(
                 [
-                    row["capture"],
-                    row["preset"],
-                    f"{seconds:g}",
-                    str(row["steps"][place]),
-                    markdown.number(row["psnr"][place], 2),
-                    *(markdown.number(number, 0) for number in frame[:3]),
-                    markdown.number(frame[3], 1),
+                    one["capture"],
+                    one["preset"],
+                    f"{limit:g}",
+                    str(len(seeds)),
+                    markdown.number(steps, 0),
+                    _with_spread([row["psnr"][place] for row in seeds]),
+                    *(markdown.number(number, 0) for number in times),
+                    markdown.number(_mean(seeds, "alike_db") if last else None, 1),
                 ]
             )
     return markdown.table(heads, rows, words=2)
+
+
+def _mean(rows, name):
+    """Over seeds, None where none has a number: frames that are alike to the bit."""
+    there = [row[name] for row in rows if row[name] is not None]
+    return statistics.fmean(there) if there else None
+
+
+def _with_spread(values):
+    mean = markdown.number(statistics.fmean(values), 2)
+    if len(values) == 1:
+        return mean
+    return f"{mean} ± {markdown.number(statistics.stdev(values), 2)}"
 
 
 if __name__ == "__main__":

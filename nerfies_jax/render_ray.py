@@ -201,14 +201,32 @@ def render_ray(
         coarse.weight[1:-1],
         plan.fine,
     )
-    if not is_moved(bound):
-        both = _samples(bound, ray, condition, sampling.union(distance, drawn))
+    if not (plan.union and is_moved(bound)):
+        every = fine_distances(bound, distance, drawn)
+        both = _samples(bound, ray, condition, every)
     else:
         more = _samples(bound, ray, condition, drawn)
         both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), samples, more)
         order = jnp.argsort(both.distance)
         both = jax.tree.map(lambda x: x[order], both)
     return coarse, level("fine", both, last, 1)
+
+
+def fine_distances(
+    bound: Bound,
+    coarse: Float[Array, " coarse"],
+    drawn: Float[Array, " fine"],
+) -> Float[Array, " samples"]:
+    """Where on a ray the fine level is asked: at all, or at what was drawn alone.
+
+    The last coarse sample is among them in any case where it stands for all behind it:
+    drawn where a surface is, the last one would hold the background behind its back.
+    """
+    if bound.spec.sampling.union:
+        return sampling.union(coarse, drawn)
+    if bound.metadata.background is None:
+        return jnp.concatenate([drawn, coarse[-1:]])
+    return drawn
 
 
 def colour_inputs(

@@ -277,7 +277,8 @@ def _colour_terms(levels: tuple[RayOutput, ...], batch: Batch) -> dict[str, Term
 
 def estimate_memory_bytes(spec: RadianceScene, capture: Capture) -> int:
     """Roughly the memory of the first state and step; host side, nothing allocated."""
-    samples = 2 * spec.sampling.coarse + spec.sampling.fine
+    plan = spec.sampling
+    samples = (1 + plan.union) * plan.coarse + plan.fine
     widths = spec.template.depth * spec.template.width + spec.template.colour_width
     if spec.warp is not None:
         widths += spec.warp.depth * spec.warp.width

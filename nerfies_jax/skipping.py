@@ -21,6 +21,7 @@ from nerfies_jax.render_ray import (
     asked_at,
     colour_inputs,
     field_ray_through,
+    fine_distances,
     is_moved,
     radiance_at,
 )
@@ -153,7 +154,7 @@ def _block(bound, occupied, camera, condition, position):
             edges = (distance[1:] + distance[:-1]) / 2
             weights = compositing.weights(depth)[1:-1]
             drawn = sampling.from_weights(None, edges, weights, plan.fine)
-            return sampling.union(distance, drawn)
+            return fine_distances(bound, distance, drawn)
 
         distance = jax.vmap(refined)(distance, depth)
     depth, colour = ask("fine", distance, 4)

@@ -41,9 +41,10 @@ WARPS = {WarpSpec: warp.effect, TimeWarpSpec: time_warp.effect}
 class SamplingSpec:
     """Where along a ray the field is asked; the defaults are Mildenhall et al. 2020.
 
-    `fine` samples are drawn where the coarse level found weight, and the fine level
-    sees both; 0 leaves one level. `block` rays are rendered at a time when a whole
-    frame is: memory does not grow with the picture.
+    `fine` samples are drawn where the coarse level found weight; 0 leaves one level.
+    The fine level sees both, or those alone where `union` is false: then half as many
+    are asked of the larger network, and few of them of empty space. `block` rays are
+    rendered at a time when a whole frame is: memory does not grow with the picture.
     """
 
     coarse: int = 64
@@ -51,6 +52,7 @@ class SamplingSpec:
     spacing: str = "linear"  # or "disparity"
     jitter: bool = True  # while training
     shared: bool = False  # one network for both levels (D-NeRF)
+    union: bool = True  # the fine level sees the coarse samples too
     block: int = 1024
 
     def __post_init__(self):

@@ -92,14 +92,16 @@ def same_program(ours, by_hand, *args):
     same_bits(ours(*args), by_hand(*args))
 
 
-# Every kind of static field: two networks for two levels, one for both, one level, and
-# a coarse network of its own that does not see the direction.
+# Every kind of static field: two networks for two levels, one for both, one level, a
+# coarse network of its own that does not see the direction, and a fine level that sees
+# its own samples alone.
 @pytest.mark.full
 @pytest.mark.parametrize(
     "name",
     [
         "nerf-small",
         *(pytest.param(n, marks=pytest.mark.slow) for n in ("nerf", "d-nerf", "nsff")),
+        pytest.param("nerf-grid-small", marks=pytest.mark.slow),
     ],
 )
 def test_a_field_without_effects_is_the_static_one_bit_for_bit(name):
@@ -114,9 +116,12 @@ def test_there_is_no_other_kind_of_static_field():
         plan, coarse = spec.sampling, spec.coarse
         two = plan.fine > 0
         blind = two and coarse is not None and coarse.direction is None
-        return two, plan.shared, blind, plan.spacing, plan.jitter, spec.density_noise
+        union = plan.union or not two
+        ways = plan.shared, union, plan.spacing, plan.jitter, spec.density_noise
+        return two, blind, *ways
 
-    held = {kind(name) for name in ("nerf-small", "nerf", "d-nerf", "nsff")}
+    few = "nerf-small", "nerf", "d-nerf", "nsff", "nerf-grid-small"
+    held = {kind(name) for name in few}
     # SMALL_D_NERF has two networks, and NSFF's levels are one
     assert {kind(name) for name in field_presets.PRESETS} == held
 

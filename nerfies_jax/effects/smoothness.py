@@ -1,23 +1,28 @@
-"""Smooth grids: features of neighbouring vertices may not differ for nothing.
+"""Smooth grids and planes: features of neighbours may not differ for nothing.
 
 The total variation that Fang et al. 2022 (TiNeuVox), arXiv:2205.15285, put on their
 voxel grid for real captures. Their code descends a Huber cost of every difference; here
-it is the mean of their squares, as in K-Planes and HexPlane.
+it is the mean of their squares, as in K-Planes and HexPlane. Of a hashed grid some
+vertices are drawn in every step.
 """
 
 import dataclasses
 import math
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Key
 
 from nerfies_jax.effects.effect import Scalar
-from nerfies_jax.nets import grids
+from nerfies_jax.nets import grids, planes
+from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.grids import HashGridSpec
 from nerfies_jax.nets.voxels import VoxelGridSpec
 from nerfies_jax.radiance.template import Template, TemplateSpec
 from nerfies_jax.training.effects import Effect, PenaltyContext, Term
 from nerfies_jax.training.step_counts import steps
+
+VARIED = 1024  # vertices of each level of a hashed grid that are drawn in a step
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,16 +46,18 @@ class SmoothnessSpec:
 
 def effect(spec: SmoothnessSpec, templates: dict[str, TemplateSpec]) -> Effect:
     """The seams of `spec` for the templates of a field, by level."""
-    smooth = {name: one for name, one in templates.items() if levels_of(one)}
-    if not smooth:
+    tabled = {name: one for name, one in templates.items() if has_tables(one)}
+    if not tabled:
         raise ValueError(
-            "smoothness is of grids that are not hashed, and no template has one; set "
+            "smoothness is of grids and planes, and no template has one; set "
             "smoothness=none, or choose a preset on a grid"
         )
 
     def penalty(_, context: PenaltyContext) -> dict[str, Term]:
-        nets = context.params["template"]
-        found = [variation(one, nets[name]) for name, one in smooth.items()]
+        nets, found = context.params["template"], []
+        for number, (name, one) in enumerate(tabled.items()):
+            key = jax.random.fold_in(context.key, number)
+            found.append(variation(one, nets[name], key))
         weight = spec.weight
         if spec.until is not None:
             weight = jnp.where(context.step < spec.until, weight, 0)
@@ -59,23 +66,21 @@ def effect(spec: SmoothnessSpec, templates: dict[str, TemplateSpec]) -> Effect:
     return Effect("smoothness", penalty=penalty)
 
 
-def levels_of(spec: TemplateSpec) -> tuple[tuple[int, int], ...]:
-    """Number and cells of the levels with a row for each vertex."""
-    position = spec.position
+def has_tables(spec: TemplateSpec) -> bool:
+    """Whether the template reads a point from tables."""
+    return not isinstance(spec.position, EncodingSpec)
+
+
+def variation(spec: TemplateSpec, params: Template, key: Key[Array, ""]) -> Scalar:
+    """Mean squared difference of neighbours in the tables, features squared.
+
+    The mean over the levels of a hashed grid, at `VARIED` vertices of each, and over
+    all planes.
+    """
+    position, tables = spec.position, params.tables
     if isinstance(position, VoxelGridSpec):
-        return ((0, position.cells),)
-    if not isinstance(position, HashGridSpec):
-        return ()
-    return tuple(
-        (number, cells)
-        for number, cells in enumerate(position.cells())
-        if (cells + 1) ** 3 <= position.rows
-    )
-
-
-def variation(spec: TemplateSpec, params: Template) -> Scalar:
-    """Mean over the levels of the total variation of each, features squared."""
-    levels = levels_of(spec)
-    tables: tuple[Float[Array, "rows features"], ...] = params.tables
-    found = [grids.total_variation(tables[level], cells) for level, cells in levels]
-    return sum(found) / len(found)
+        return grids.total_variation(tables[0], position.cells)
+    if isinstance(position, HashGridSpec):
+        return grids.variation_at_random(position, tables, key, VARIED)
+    every = [planes.total_variation(plane) for level in tables for plane in level.space]
+    return sum(every) / (2 * len(every))  # the mean over both axes as well

@@ -172,6 +172,30 @@ def vertex_row(
     return ((x ^ y ^ z) % jnp.uint32(rows)).astype(jnp.int32)
 
 
+def variation_at_random(
+    spec: HashGridSpec, tables: Tables, key: Key[Array, ""], count: int
+) -> Float[Array, ""]:
+    """`total_variation` guessed from `count` vertices a level; the mean over levels.
+
+    Without bias. A hashed level counts as well: rows of neighbours, whoever else shares
+    them. Squares, not lengths, so what is even has a slope of zero and not a NaN.
+    """
+
+    def of_level(key, table, cells):
+        vertex = jax.random.randint(key, (count, 1, 3), 0, cells + 1, jnp.int32)
+        # From the far end there is no next one: it is held against itself, and so many
+        # of the differences are none.
+        beyond = jnp.minimum(vertex + np.eye(3, dtype=np.int32), cells)
+        here, there = (
+            table[vertex_row(v, cells, len(table))] for v in (vertex, beyond)
+        )
+        return jnp.mean((there - here) ** 2) * ((cells + 1) / cells)
+
+    keys = jax.random.split(key, spec.levels)
+    levels = zip(keys, tables, spec.cells(), strict=True)
+    return sum(of_level(*level) for level in levels) / spec.levels
+
+
 def total_variation(
     table: Float[Array, "rows features"], cells: int
 ) -> Float[Array, ""]:

@@ -69,6 +69,11 @@ class PlanesSpec:
                     f"unknown {name} {getattr(self, name)!r}; choose from {options}"
                 )
 
+    @property
+    def levels(self) -> int:
+        """What is opened one by one, coarse to fine."""
+        return len(self.multiples)
+
     def width(self, dimensions: int) -> int:
         """Features made of a point, which has three coordinates, or four with time."""
         wanted = 3 if self.moments is None else 4

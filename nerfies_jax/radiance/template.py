@@ -7,10 +7,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
-from nerfies_jax.nets import encoding, grids, mlp, voxels
+from nerfies_jax.nets import encoding, grids, mlp, planes, voxels
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.grids import HashGridSpec
 from nerfies_jax.nets.mlp import HeadSpec, MLPSpec
+from nerfies_jax.nets.planes import PlanesSpec
 from nerfies_jax.nets.voxels import VoxelGridSpec
 from nerfies_jax.training import schedules
 from nerfies_jax.training.step_counts import steps
@@ -31,7 +32,7 @@ def exponential(raw: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
 
 
 # Encodings with tables of their own, by the module that reads them.
-GRIDS = {HashGridSpec: grids, VoxelGridSpec: voxels}
+GRIDS = {HashGridSpec: grids, VoxelGridSpec: voxels, PlanesSpec: planes}
 DENSITIES = {"softplus": jax.nn.softplus, "relu": jax.nn.relu, "exp": exponential}
 
 
@@ -43,11 +44,16 @@ class TemplateSpec:
     the first paper's; a ray that starts with none of them positive never learns, and
     under an interval at infinity the slope is 1e10 (softplus: at most 6e-3). "exp"
     becomes a wall in the fewest steps, which is what a grid of features wants.
-    `anneal_steps` opens the bands of the position, or the levels of its grid, one by
+    `anneal_steps` opens the bands of the position, or the levels of its tables, one by
     one, coarse to fine, as Nerfies those of its warp; None has all open.
+
+    A position may be read from tables: of a grid, or of planes without a time, which
+    span the cube [-1, 1]^3 of the field and, contracted, all space around it.
     """
 
-    position: EncodingSpec | HashGridSpec | VoxelGridSpec = EncodingSpec(10)
+    position: EncodingSpec | HashGridSpec | VoxelGridSpec | PlanesSpec = EncodingSpec(
+        10
+    )
     direction: EncodingSpec | None = EncodingSpec(4)
     depth: int = 8
     width: int = 256
@@ -58,6 +64,7 @@ class TemplateSpec:
     anneal_steps: int | None = steps(None)
 
     def __post_init__(self):
+        self.position.width(3)  # refuses planes of other dimensions
         if self.density not in DENSITIES:
             raise ValueError(
                 f"unknown density activation {self.density!r}; choose from "
@@ -77,7 +84,8 @@ class Template(NamedTuple):
 
     trunk: mlp.MLP  # heads "density" and "bottleneck"
     colour: mlp.MLP  # reads [bottleneck, condition]; head "colour"
-    tables: grids.Tables | None = None  # of a grid of features, where there is one
+    # Of a grid or of planes, where there are any.
+    tables: grids.Tables | tuple[planes.Level, ...] | None = None
 
 
 class Radiance(NamedTuple):
@@ -135,9 +143,14 @@ def encode(
     window = None
     if spec.anneal_steps is not None and step is not None and parts:
         window = schedules.band_window(parts, spec.anneal_steps, step, point.dtype)
-    if grid is not None:
+    if grid is None:
+        return encoding.encode(position, point, window)
+    if grid is not planes:
         return grid.encode(position, params.tables, point, window)
-    return encoding.encode(position, point, window)
+    found = planes.encode(position, params.tables, (grids.contract(point) + 2) / 4)
+    if window is not None:
+        found = found * jnp.repeat(window, position.features)
+    return found
 
 
 def raw_density(

@@ -7,14 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nerfies_jax.effects import smoothness, time_warp
-from nerfies_jax.effects.smoothness import SmoothnessSpec
+from nerfies_jax.effects import time_warp
 from nerfies_jax.effects.time_warp import TimeWarpSpec
 from nerfies_jax.nets.encoding import EncodingSpec
-from nerfies_jax.nets.grids import HashGridSpec
-from nerfies_jax.nets.voxels import VoxelGridSpec
-from nerfies_jax.radiance.template import Template, TemplateSpec
-from nerfies_jax.training.effects import FrameCondition, PenaltyContext
+from nerfies_jax.training.effects import FrameCondition
 from tests import drawn, gradients
 from tests.oracles import networks
 
@@ -83,54 +79,3 @@ def test_gradients(float64, rng):
 
     point = rng.uniform(-1, 1, 3)
     assert gradients.directional_error(total, params, point, np.float64(0.3)) < 1e-6
-
-
-TEMPLATES = {
-    "coarse": TemplateSpec(HashGridSpec(levels=3, coarsest=2, finest=8, rows=130)),
-    "fine": TemplateSpec(VoxelGridSpec(cells=4, features=3)),
-}
-
-
-def tables(dtype, rng):
-    shapes = {"coarse": [(27, 2), (125, 2), (130, 2)], "fine": [(125, 3)]}
-    return {
-        name: tuple(jnp.asarray(rng.normal(size=one), dtype) for one in shape)
-        for name, shape in shapes.items()
-    }
-
-
-def roughness(effect, found, step):
-    nets = {name: Template(None, None, one) for name, one in found.items()}
-    context = PenaltyContext(None, jnp.int32(step), None, {"template": nets})
-    return effect.penalty(None, context)["variation"]
-
-
-def test_smoothness_is_the_mean_square_between_neighbours(dtype, rng):
-    effect = smoothness.effect(SmoothnessSpec(2.0, until=5), TEMPLATES)
-    found = tables(dtype, rng)
-    term = roughness(effect, found, 4)
-    assert term.value.dtype == dtype
-
-    def of(table, vertices):
-        grid = np.asarray(table, np.float64).reshape(*[vertices] * 3, -1)
-        return np.mean([np.mean(np.diff(grid, axis=a) ** 2) for a in range(3)])
-
-    coarse = [of(found["coarse"][0], 3), of(found["coarse"][1], 5)]  # 8 cells hashed
-    expected = np.mean(coarse) + of(found["fine"][0], 5)
-    np.testing.assert_allclose(term.value, expected, rtol=3e-6)
-    assert term.weight == 2
-    assert roughness(effect, found, 5).weight == 0
-
-
-@pytest.mark.hard_cases
-def test_a_level_grid_has_neither_roughness_nor_slope(dtype, rng):
-    effect = smoothness.effect(SmoothnessSpec(), TEMPLATES)
-    level = jax.tree.map(lambda x: 0 * x + 7, tables(dtype, rng))
-    value, slopes = jax.value_and_grad(lambda t: roughness(effect, t, 0).value)(level)
-    assert value == 0
-    assert not any(leaf.any() for leaf in jax.tree.leaves(slopes))
-
-
-def test_smoothness_needs_a_grid():
-    with pytest.raises(ValueError, match="no template has one; set smoothness=none"):
-        smoothness.effect(SmoothnessSpec(), {"fine": TemplateSpec()})

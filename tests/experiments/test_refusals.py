@@ -53,6 +53,7 @@ TABLE = [
     ("export", "nowhere colmap --path sway", "--path is not for colmap, but for path"),
     ("field_speed", "--seconds 2 1", "--seconds: positive and rising"),
     ("field_speed", "--presets nothing", "--presets nothing"),
+    ("field_speed", "--seeds 0", "--seeds 0"),
     ("frequency_gates", "--steps 3", "--steps 3"),
     ("frequency_gates", "--seeds 1", "--seeds 1"),
     ("frequency_gates", "--most 0.1 0", "--most (0.1, 0.0)"),

@@ -1,5 +1,7 @@
 """Features from tables against SciPy and plain integers, and where cells meet."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -111,6 +113,37 @@ def test_total_variation_is_the_mean_over_neighbours(float64, rng):
     np.testing.assert_allclose(found, np.mean(pairs), rtol=1e-14)
     with pytest.raises(ValueError, match="a hashed level has no neighbours"):
         grids.total_variation(jnp.asarray(table[:20]), 2)
+
+
+def test_variation_at_random_is_that_of_every_level_hashed_or_not(float64):
+    """Every pair of neighbours of each level in a loop; the last one is hashed."""
+    tables, key = filled(SPEC, np.float64), jax.random.key(0)
+    pairs = []
+    for table, cells in zip(tables, SPEC.cells(), strict=True):
+        side = range(cells + 1)
+        own = len(table) >= (cells + 1) ** 3
+
+        def row(*v, own=own, cells=cells, rows=len(table)):
+            along = v[0] + (cells + 1) * (v[1] + (cells + 1) * v[2])
+            return along if own else hashed(v, rows)
+
+        level = []
+        for vertex in itertools.product(side, side, side):
+            for axis in range(3):
+                beyond = [v + (k == axis) for k, v in enumerate(vertex)]
+                if max(beyond) <= cells:
+                    level.append((table[row(*vertex)] - table[row(*beyond)]) ** 2)
+        pairs.append(np.mean(level))
+    vary = jax.jit(grids.variation_at_random, static_argnums=(0, 3))
+    found = vary(SPEC, tables, key, 20_000)
+    assert abs(found / np.mean(pairs) - 1) < 0.02  # six sigmas
+
+    def few(tables):
+        return grids.variation_at_random(SPEC, tables, key, 5)
+
+    assert gradients.directional_error(few, tables) < 1e-7
+    even = jax.tree.map(jnp.ones_like, tables)
+    assert all((slope == 0).all() for slope in jax.jit(jax.grad(few))(even))
 
 
 @pytest.mark.parametrize(

@@ -101,27 +101,37 @@ def test_training_a_static_field_lowers_the_loss():
     assert np.mean(trace[-8:]) < 0.8 * np.mean(trace[:8]), trace
 
 
-def test_a_static_level_is_the_plain_nerf(dtype):
-    field, ray = scene.field(STATIC, METADATA), ray_of(dtype)
+@pytest.mark.parametrize(
+    ("union", "behind", "asked"),
+    [(True, (1.0, 1.0, 1.0), 16), (False, (0.0, 1.0, 0.5), 8), (False, None, 9)],
+)
+def test_a_static_level_is_the_plain_nerf(union, behind, asked, dtype):
+    plan = dataclasses.replace(STATIC.sampling, union=union)
+    metadata = dataclasses.replace(METADATA, background=behind)
+    field = scene.field(dataclasses.replace(STATIC, sampling=plan), metadata)
+    ray = ray_of(dtype)
     params = drawn.params(field.init, dtype)
     levels = jax.jit(field.render_ray)(params, ray, condition_of(dtype))
     coarse, fine = jax.tree.map(np.asarray, levels)
     assert fine.colour.dtype == dtype
-    expected = plain_nerf(params["template"]["coarse"], ray, np.linspace(0.5, 1.5, 8))
+    even = np.linspace(0.5, 1.5, 8)
+    expected = plain_nerf(params["template"]["coarse"], ray, even, behind)
     tolerance = {"float32": 3e-6, "float64": 1e-12}[dtype]
     np.testing.assert_allclose(coarse.colour, expected, atol=tolerance)
-    expected = plain_nerf(params["template"]["fine"], ray, fine.distances)
+    expected = plain_nerf(params["template"]["fine"], ray, fine.distances, behind)
     np.testing.assert_allclose(fine.colour, expected, atol=tolerance)
-    assert len(fine.distances) == 16
+    assert len(fine.distances) == asked
+    if behind is None:
+        assert fine.distances[-1] == ray.far
     assert np.all(np.diff(fine.distances) >= 0)
 
 
-def plain_nerf(net, ray, distances):
-    """One ray of the two-layer field in NumPy, white behind, in float64."""
+def plain_nerf(net, ray, distances, behind):
+    """One ray of the two-layer field in NumPy, in float64; `behind` it a colour."""
     origin, direction, _, far = networks.exact(tuple(ray))
     colour, passing = np.zeros(3), 1.0
     view = networks.waves(TINY_TEMPLATE.direction, direction)
-    ends = np.append(distances[1:], far)
+    ends = np.append(distances[1:], 1e10 if behind is None else far)
     for distance, end in zip(distances, ends, strict=True):
         point = origin + distance * direction
         heads = networks.heads(net.trunk, networks.waves(TINY_TEMPLATE.position, point))
@@ -130,7 +140,7 @@ def plain_nerf(net, ray, distances):
         alpha = 1 - np.exp(-np.logaddexp(0, heads["density"][0]) * (end - distance))
         colour = colour + passing * alpha * shade
         passing = passing * (1 - alpha)
-    return colour + passing
+    return colour if behind is None else colour + passing * np.asarray(behind)
 
 
 @pytest.mark.full

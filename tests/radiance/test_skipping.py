@@ -38,7 +38,7 @@ STILL = RadianceScene(
 )
 MOVING = dataclasses.replace(
     STILL,
-    sampling=SamplingSpec(8, 9, shared=True),
+    sampling=SamplingSpec(8, 12, shared=True, union=False),
     appearance=AppearanceSpec(2),
     warp=WarpSpec(position=EncodingSpec(2), depth=1, width=8, skips=()),
     ambient=AmbientSpec(depth=1, width=8, skips=(), closed_steps=1, anneal_steps=9),

@@ -8,7 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.interpolate
 
+from nerfies_jax.nets.planes import PlanesSpec
 from nerfies_jax.radiance import template
 from nerfies_jax.radiance.template import TemplateSpec
 from tests import drawn as values
@@ -83,6 +85,67 @@ def test_density_does_not_depend_on_where_it_is_seen_from(dtype):
     assert np.all(answer.density == answer.density[0])
     assert np.all(answer.features == answer.features[0])
     assert np.all(np.ptp(answer.colour, axis=0) > 1e-3)
+
+
+PLANES = dataclasses.replace(
+    SMALL,
+    position=PlanesSpec(vertices=3, multiples=(1, 2), features=2),
+    anneal_steps=40,
+)
+
+
+def planes_drawn(dtype):
+    return values.params(
+        lambda key: template.init(PLANES, key, PLANES.position.width(3), 1), dtype, 0.1
+    )
+
+
+def product_of_planes(level, place):
+    """Of one place by SciPy's interpolation of the three planes of a level."""
+    sides = ((0, 1), (0, 2), (1, 2))
+    found = 1
+    for pair, plane in zip(sides, level.space, strict=True):
+        axes = [np.linspace(0, 1, side) for side in plane.shape[:2]]
+        oracle = scipy.interpolate.RegularGridInterpolator(axes, np.asarray(plane))
+        found = found * oracle(place[list(pair)])[0]
+    return found
+
+
+@pytest.mark.parametrize(
+    ("point", "place"),
+    [((0.3, -0.2, 0.9), (0.575, 0.45, 0.725)), ((-4, 1, 0), (0.0625, 0.609375, 0.5))],
+    ids=["in the box", "contracted"],
+)
+def test_planes_say_where_a_point_is(point, place, dtype):
+    """Half-way through the annealing the fine level is shut."""
+    params, place = planes_drawn(dtype), np.asarray(place)
+    levels = [product_of_planes(level, place) for level in params.tables]
+    read = jax.jit(template.encode, static_argnums=0)
+    at = functools.partial(read, PLANES, params, np.asarray(point, dtype))
+    atol = {"float32": 1e-6, "float64": 1e-14}[dtype]
+    np.testing.assert_allclose(at(None), np.concatenate(levels), rtol=0, atol=atol)
+    shut = np.concatenate([levels[0], 0 * levels[1]])
+    np.testing.assert_allclose(at(jnp.int32(20)), shut, rtol=0, atol=atol)
+
+
+def test_gradients_of_planes(float64):
+    params, point = planes_drawn("float64"), np.array([0.31, -0.23, 1.7])
+
+    def total(params, point):
+        return jnp.sum(template.encode(PLANES, params, point, None) ** 2)
+
+    assert gradients.directional_error(total, params, point) < 1e-7
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"position": PlanesSpec(moments=4)}, "4 dimensions, not of 3"),
+    ],
+)
+def test_a_wrong_template_is_refused(wrong, words):
+    with pytest.raises(ValueError, match=words):
+        TemplateSpec(**wrong)
 
 
 @functools.partial(jax.jit, static_argnums=0)

@@ -1,0 +1,30 @@
+"""Which cells are measured, and what their table says; nothing is trained."""
+
+import json
+
+from experiments import field_speed
+
+NUMBERS = {"steps": [9, 19], "skipped_ms": 30.0, "full_ms": 90.0, "survey_ms": 8.0}
+
+
+def test_only_seeds_that_are_missing_are_measured_and_all_are_in_the_table(
+    tmp_path, monkeypatch
+):
+    asked = []
+
+    def measured(capture, preset, seconds, size, seed):
+        asked.append((preset, seed))
+        return {"psnr": [20 + seed, 22 + 2 * seed], "alike_db": 60.0} | NUMBERS
+
+    monkeypatch.setattr(field_speed, "measured", measured)
+    monkeypatch.setattr(field_speed, "_captures", lambda folders: {"one": None})
+    out = tmp_path / "out.json"
+    presets = ["nerf-small", "nerf-grid-small"]
+    for seeds in (1, 2, 2):
+        command = f"--seconds 1 2 --seeds {seeds} --out {out} --presets"
+        field_speed.main([*command.split(), *presets])
+    assert asked == [(preset, seed) for seed in (0, 1) for preset in presets]
+    page = field_speed.page(json.loads(out.read_text())).splitlines()
+    assert page[2] == "| one | nerf-small | 1 | 2 | 9 | 20.50 ± 0.71 |  |  |  |  |"
+    last = "| one | nerf-grid-small | 2 | 2 | 19 | 23.00 ± 1.41 | 30 | 90 | 8 | 60.0 |"
+    assert page[5] == last
