@@ -108,10 +108,11 @@ class RadianceScene:
                     f"{name} holds the warp in check, and there is none; set warp or "
                     f"{name}=none"
                 )
-        if self.start.motion == "tracks" and self.warp is None:
+        moves = self.warp is not None or self.scene_flow is not None
+        if self.start.motion == "tracks" and not moves:
             raise ValueError(
-                'start.motion="tracks" fits a warp to tracks, and there is none; set '
-                "warp or start.motion=none"
+                'start.motion="tracks" fits a warp or a scene flow to tracks, and '
+                "there is neither; set one of them, or start.motion=none"
             )
 
 
