@@ -1,11 +1,13 @@
-"""The warp of a field fitted to known paths of points, before any ray is traced.
+"""The motion of a field fitted to known paths of points, before any ray is traced.
 
 A warp maps what is observed back to the template; points that were followed through the
 film say where it must lead: the places of one point at all times to one place of the
-template, and points at rest to where they are. Descent on pictures does not find that
-for motion of more than a few pixels.
+template, and points at rest to where they are. A scene flow must lead from a point's
+place to its next one and its last one, and nowhere from points at rest. Descent on
+pictures does not find that for motion of more than a few pixels.
 """
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -14,6 +16,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
+from nerfies_jax.effects import scene_flow
 from nerfies_jax.evidence import usable_paths
 from nerfies_jax.evidence.record import Evidence
 from nerfies_jax.field import Field
@@ -25,6 +28,7 @@ from nerfies_jax.training.updates import apply_updates
 PyTree = Any
 FRAMES_AT_ONCE, POINTS_AT_ONCE, STILL_AT_ONCE = 12, 256, 128  # of each step
 SOFT = 1e-3  # field units: distances below it count squared
+SOFT_FLOW = 0.05  # the same for flow, over the mean flow that is known
 LAST_RATE = 0.02  # of the first
 
 
@@ -44,6 +48,14 @@ class WarpFit(NamedTuple):
     params: PyTree  # of the whole field
     canonical: Float[Array, "points 3"]  # field units: places in the template
     first: float  # field units
+    last: float
+
+
+class FlowFit(NamedTuple):
+    """What the fit found, and how far the flow is off on average before and after."""
+
+    params: PyTree  # of the whole field
+    first: float  # field units from one moment to the next
     last: float
 
 
@@ -92,23 +104,6 @@ def fit(
         still = _some(paths.still, still_key)
         return sum(distances(*free, chosen, rows, still))
 
-    adam = optax.scale_by_adam()
-
-    def step(state, key_and_count):
-        free, moments = state
-        key, count = key_and_count
-        grads = jax.grad(loss)(free, key)
-        updates, moments = adam.update(grads, moments)
-        share = LAST_RATE ** (count.astype(paths.position.dtype) / start.fit_steps)
-        free = apply_updates(free, updates, start.fit_rate * share)
-        return (free, moments), None
-
-    @jax.jit
-    def run(free):
-        keys = jax.random.split(key, start.fit_steps), jnp.arange(start.fit_steps)
-        (free, _), _ = jax.lax.scan(step, (free, adam.init(free)), keys)
-        return free
-
     @jax.jit
     def mean_distance(free):
         nothing = jnp.zeros((0, 3), paths.position.dtype)
@@ -119,11 +114,109 @@ def fit(
         {name: params[name] for name in (*names, "codes")},
         jnp.asarray(_first_places(paths)),
     )
-    # optax raises floats to a whole number of steps.
-    with jax.numpy_dtype_promotion("standard"):
-        fitted = run(free)
+    fitted = _descended(loss, free, key, start)
     first, last = float(mean_distance(free)), float(mean_distance(fitted))
     return WarpFit(params | fitted[0], fitted[1], first, last)
+
+
+def _descended(loss, free, key, start):
+    """What Adam on `loss(free, key)` leads to, over the steps of `start`."""
+    adam = optax.scale_by_adam()
+
+    def step(state, key_and_count):
+        free, moments = state
+        key, count = key_and_count
+        grads = jax.grad(loss)(free, key)
+        updates, moments = adam.update(grads, moments)
+        share = LAST_RATE ** (count.astype(jnp.result_type(float)) / start.fit_steps)
+        free = apply_updates(free, updates, start.fit_rate * share)
+        return (free, moments), None
+
+    @jax.jit
+    def run(free):
+        keys = jax.random.split(key, start.fit_steps), jnp.arange(start.fit_steps)
+        (free, _), _ = jax.lax.scan(step, (free, adam.init(free)), keys)
+        return free
+
+    # optax raises floats to a whole number of steps.
+    with jax.numpy_dtype_promotion("standard"):
+        return run(free)
+
+
+def fit_flow(
+    field: Field,
+    params: PyTree,
+    paths: FilmPaths,
+    key: Key[Array, ""],
+    start: TrackStartSpec,
+) -> FlowFit:
+    """Descend on how far the scene flow is from what one point did between two frames.
+
+    Frames that are more or less than one moment apart say the flow in proportion. What
+    descends is the network of the medium, with all that its flow reads. ValueError
+    where no point is known in two frames that follow each other.
+    """
+    both = paths.known[:, 1:] & paths.known[:, :-1]
+    if not both.any():
+        raise ValueError(
+            "no path is known in two frames that follow each other: nothing to fit a "
+            "scene flow to"
+        )
+    moments = np.diff(paths.time) / scene_flow.interval(len(field.metadata.times))
+    shift = np.diff(paths.position, axis=1) / moments[:, None]
+    unit = max(float(np.linalg.norm(shift, axis=-1)[both].mean()), 1e-12)
+    away = _flow_distances(field, paths, shift, both)
+    frames, points = len(moments), len(paths.known)
+    together = min(FRAMES_AT_ONCE, frames)
+
+    def loss(own, key):
+        frame_key, row_key, still_key = jax.random.split(key, 3)
+        chosen = jax.random.choice(frame_key, frames, (together,), replace=False)
+        rows = jax.random.randint(row_key, (POINTS_AT_ONCE,), 0, points)
+        still = _some(paths.still, still_key)
+        return sum(away(own, chosen, rows, still, SOFT_FLOW * unit)) / unit
+
+    @jax.jit
+    def mean_distance(own):
+        nothing = jnp.zeros((0, 3), paths.position.dtype)
+        return away(own, jnp.arange(frames), jnp.arange(points), nothing, 0.0)[0]
+
+    own = params[scene_flow.NAME]
+    fitted = _descended(loss, own, key, start)
+    first, last = float(mean_distance(own)), float(mean_distance(fitted))
+    return FlowFit(params | {scene_flow.NAME: fitted}, first, last)
+
+
+def _flow_distances(field, paths, shift, both):
+    """(medium, frames, rows, points at rest, where distances count squared) ->
+
+    mean distances of the rows' flow, to the next moment and back, from what they did,
+    and of the flow at rest from none; field units.
+    """
+    spec, time = field.spec.scene_flow, jnp.asarray(paths.time)
+    position = jnp.asarray(np.moveaxis(paths.position, 1, 0))
+    target = jnp.asarray(np.moveaxis(np.where(both[..., None], shift, 0), 1, 0))
+    weight = jnp.asarray(both.T, position.dtype)
+
+    def away(own, frames, rows, still, soft):
+        @functools.partial(jax.vmap, in_axes=(0, None))
+        def flow(point, time):
+            return scene_flow.dynamic(spec, own, point, jnp.zeros(3), time).flow
+
+        def one(frame):
+            there = frame + 1
+            ahead = flow(position[frame][rows], time[frame])[:, scene_flow.FORWARD]
+            back = flow(position[there][rows], time[there])[:, scene_flow.BACKWARD]
+            goal = target[frame][rows]
+            moving = (_length(ahead - goal, soft) + _length(back + goal, soft)) / 2
+            return moving, _length(flow(still, time[frame]), soft)
+
+        moving, resting = jax.vmap(one)(frames)
+        counted = weight[frames][:, rows]
+        total = jnp.sum(moving * counted) / jnp.maximum(jnp.sum(counted), 1)
+        return total, jnp.sum(resting) / max(resting.size, 1)
+
+    return away
 
 
 def _distances(field, params, paths):
@@ -158,8 +251,8 @@ def _distances(field, params, paths):
     return distances
 
 
-def _length(gap):
-    return jnp.sqrt(jnp.sum(gap**2, axis=-1) + SOFT**2)
+def _length(gap, soft=SOFT):
+    return jnp.sqrt(jnp.sum(gap**2, axis=-1) + soft**2)
 
 
 def _some(still, key):

@@ -79,7 +79,8 @@ def build(
         evidence = usable_paths.evidence_to_start_from(capture, spec.start)
         if evidence is not None:
             paths = path_fit.film_paths(radiance, capture, evidence)
-            params = path_fit.fit(radiance, params, paths, start_key, spec.start).params
+            fit = path_fit.fit_flow if spec.warp is None else path_fit.fit
+            params = fit(radiance, params, paths, start_key, spec.start).params
         return first_state(params, run_key)
 
     def example(_, key):

@@ -130,10 +130,11 @@ class RadianceScene:
                 "a mask of what moves guides a warp, and there is none that reads it; "
                 "set warp=WarpSpec or mask=none"
             )
-        if self.start.motion == "tracks" and self.warp is None:
+        moves = self.warp is not None or self.scene_flow is not None
+        if self.start.motion == "tracks" and not moves:
             raise ValueError(
-                'start.motion="tracks" fits a warp to tracks, and there is none; set '
-                "warp or start.motion=none"
+                'start.motion="tracks" fits a warp or a scene flow to tracks, and '
+                "there is neither; set one of them, or start.motion=none"
             )
 
 

@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nerfies_jax import path_fit, presets, scene
+from nerfies_jax.effects import scene_flow
 from nerfies_jax.path_fit import FilmPaths
 from nerfies_jax.training.effects import FrameCondition
 from nerfies_jax.training.model import View
@@ -76,6 +77,38 @@ def test_a_fitted_warp_brings_a_body_to_one_place_and_moves_no_wall(name):
         assert np.median(np.linalg.norm(wall - paths.still, axis=-1)) < 0.03
 
 
+def test_a_fitted_flow_leads_from_one_place_to_the_next_and_from_no_wall():
+    """Against the body's own velocity; also where frames are two moments apart."""
+    field, paths = field_of("nsff-small"), film()
+    kept = np.array([*range(0, 8), *range(9, FRAMES)])
+    paths = paths._replace(
+        time=paths.time[kept],
+        appearance=paths.appearance[kept],
+        position=paths.position[:, kept],
+        known=paths.known[:, kept],
+    )
+    params = field.init(jax.random.key(0))
+    fitted = path_fit.fit_flow(field, params, paths, jax.random.key(0), TRACKS)
+    path, time = turning_body()
+    assert fitted.last < 0.3 * fitted.first
+    medium = fitted.params["scene_flow"]
+
+    def flow(point, time):
+        spec, towards = field.spec.scene_flow, jnp.zeros(3)
+        return scene_flow.dynamic(spec, medium, point, towards, time).flow
+
+    ask = jax.jit(jax.vmap(flow, (0, None)))
+    for frame in (3, 8, 12):  # the ninth was never filmed
+        ahead, back = np.moveaxis(np.asarray(ask(path[:, frame], time[frame])), 1, 0)
+        true = path[:, frame + 1] - path[:, frame]
+        size = np.linalg.norm(true, axis=-1).mean()
+        assert np.linalg.norm(ahead - true, axis=-1).mean() < 0.3 * size
+        true = path[:, frame - 1] - path[:, frame]
+        assert np.linalg.norm(back - true, axis=-1).mean() < 0.3 * size
+        wall = np.asarray(ask(paths.still, time[frame]))
+        assert np.linalg.norm(wall, axis=-1).mean() < 0.1 * size
+
+
 @pytest.mark.parametrize("still", [0, pytest.param(200, marks=pytest.mark.full)])
 def test_points_seen_once_leave_everything_where_it_is(still):
     """Each has one place: there is no motion to find, with or without a wall."""
@@ -95,6 +128,12 @@ def test_what_cannot_be_fitted_is_refused_by_name():
     with pytest.raises(ValueError, match="no path is known"):
         path_fit.fit(
             field, params, film(np.zeros((40, FRAMES), bool)), jax.random.key(0), TRACKS
+        )
+    alone = np.zeros((40, FRAMES), bool)
+    alone[:, 4] = True
+    with pytest.raises(ValueError, match="in two frames that follow each other"):
+        path_fit.fit_flow(
+            field_of("nsff-small"), params, film(alone), jax.random.key(0), TRACKS
         )
     with pytest.raises(ValueError, match=r'start\.motion="tracks" fits a warp'):
         dataclasses.replace(presets.PRESETS["nerf-small"], start=TRACKS)
