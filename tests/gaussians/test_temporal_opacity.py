@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import presets, scene, spec, track_start
+from gaussians_jax import presets, spec, track_start
 from gaussians_jax.effects import temporal_opacity
 from gaussians_jax.effects.temporal_opacity import Fading, TemporalOpacitySpec
 from gaussians_jax.splats import Params
@@ -87,4 +87,4 @@ def test_what_cannot_be_is_refused():
         presets.SMALL_STATIC, temporal_opacity=TemporalOpacitySpec()
     )
     with pytest.raises(ValueError, match="temporal_opacity without a motion"):
-        scene.refuse_what_cannot_train(still)
+        spec.refuse_what_cannot_train(still)
