@@ -356,7 +356,7 @@ def test_a_row_counts_the_mean_slope_of_what_is_seen_of_it():
     for row in range(ROWS):
         seen = np.flatnonzero(visible[row])
         norms = np.linalg.norm(np.asarray(slope)[EACH * row + seen] * [10, 5], axis=1)
-        assert stats.views[row] == (len(seen) > 0)
+        assert int(stats.views[row]) == int(len(seen) > 0)
         np.testing.assert_allclose(
             stats.grad2d[row], norms.mean() if len(seen) else 0, rtol=1e-5
         )
