@@ -16,6 +16,7 @@ from gaussians_jax.effects.embedding_motion import (
 from gaussians_jax.effects.kan_motion import SMALL_KAN_MOTION, KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec
 from gaussians_jax.effects.motion_basis import SMALL_BASIS_MOTION, BasisMotionSpec
+from gaussians_jax.effects.motion_flow import FlowSpec
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec
 from gaussians_jax.effects.neighbours import NeighbourSpec
 from gaussians_jax.effects.node_motion import (
@@ -54,6 +55,17 @@ MCMC = SplatScene(
 # Yang et al. 2023, arXiv:2309.13101, for real captures: the network, the warm-up and
 # the smoothing are defaults of `MotionSpec`.
 DEFORMABLE = SplatScene(steps=40_000, motion=MotionSpec())
+
+# Zhu et al. 2024, arXiv:2410.07707, and its code's numbers: Deformable 3DGS with flow
+# that is not the camera's. Its flow comes from a network, this from `evidence`; frames
+# come in any order, where its come one after the other; and its cameras are refined
+# while it trains (an option there), while here they are the capture's.
+MOTION_GS = SplatScene(
+    steps=20_000,
+    learning_rates=LearningRateSpec(log_scale=1e-3),
+    motion=MotionSpec(),
+    flow=FlowSpec(),
+)
 
 # Rigid motions fitted to tracks before training, in the manner of Shape of Motion. Its
 # tracks and depths come from networks, these from optical flow (`evidence`).
@@ -283,6 +295,10 @@ SMALL_DEFORMABLE = dataclasses.replace(
     ),
 )
 
+SMALL_MOTION_GS = dataclasses.replace(
+    SMALL_TRACKED, motion=SMALL_DEFORMABLE.motion, flow=FlowSpec(start=600)
+)
+
 # Measured (held-out PSNR and SSIM, one seed):
 #   built-in, 1000 steps: RAdam                          21.84 / 0.755
 #                         Adam, network rate 2e-3        22.67 / 0.817
@@ -344,6 +360,7 @@ PRESETS = {
     "e-d3dgs": E_D3DGS,
     "sc-gs": SC_GS,
     "edgs": EDGS,
+    "motion-gs": MOTION_GS,
     "splats-static-small": SMALL_STATIC,
     "splats-tracked-small": SMALL_TRACKED,
     "splats-mcmc-small": SMALL_MCMC,
@@ -357,6 +374,7 @@ PRESETS = {
     "e-d3dgs-small": SMALL_E_D3DGS,
     "sc-gs-small": SMALL_SC_GS,
     "edgs-small": SMALL_EDGS,
+    "motion-gs-small": SMALL_MOTION_GS,
 }
 
 

@@ -243,8 +243,7 @@ def _gradients(spec, metadata, effects, state, frames, row, condition):
         canonical = splats.activate(params.rows["splats"])
         moved = deform(params, canonical)
         frame = _draw(spec, metadata, params, moved, view, size, degree, probe, depth)
-        exposed = _exposed(effects, params, frame.rendering, view)
-        seen = observe(frames, row, exposed)
+        seen = observe(frames, row, _exposed(effects, params, frame.rendering, view))
         states = state.aux_state.effects
         value, metrics = loss_of(spec, effects, params, seen, condition, states)
         return value, (metrics, frame.footprints, canonical, moved)
@@ -301,6 +300,8 @@ def observe(
         frames.images[row].astype(frames.times.dtype) / 255,
         None if frames.valid is None else frames.valid[row],
         None if frames.depths is None else frames.depths[row],
+        frames,
+        row,
     )
 
 
@@ -391,8 +392,7 @@ def _from_tracks(spec, effects, capture, key):
 def count_rows(state: TrainState) -> dict[str, int]:
     """Active Gaussians, and `parameters`: the numbers of them and the networks."""
     counts = {"gaussians": int(splats.active_mask(state.params.rows["splats"]).sum())}
-    rows = jax.tree.leaves(state.params.rows)
-    nets = jax.tree.leaves(state.params.nets)
+    rows, nets = map(jax.tree.leaves, state.params)
     each = sum(math.prod(leaf.shape[1:]) for leaf in rows)
     counts["parameters"] = counts["gaussians"] * each
     counts["parameters"] += sum(math.prod(leaf.shape) for leaf in nets)

@@ -12,6 +12,7 @@ from gaussians_jax.effects import (
     kan_motion,
     mlp_motion,
     motion_basis,
+    motion_flow,
     motion_growth,
     neighbours,
     node_motion,
@@ -58,6 +59,7 @@ SPLAT_MODULES = {
     "motion_growth": motion_growth,
     "spectral": spectral,
     "depth": depth,
+    "flow": motion_flow,
 }
 MOTION_MODULES = {
     mlp_motion.MotionSpec: mlp_motion,
@@ -134,6 +136,8 @@ def of_splats(spec, metadata):
         effects.append(spectral.effect(spec.spectral, spec.steps))
     if spec.depth is not None:
         effects.append(depth.effect(spec.depth))
+    if spec.flow is not None:
+        effects.append(motion_flow.effect(spec.flow, spec.raster))
     return tuple(effects)
 
 

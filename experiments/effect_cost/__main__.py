@@ -43,6 +43,7 @@ PRESETS = (
     "e-d3dgs-small",
     "sc-gs-small",
     "edgs-small",
+    "motion-gs-small",
 )
 # Effects that no preset has, as paths of --set, and the preset they are priced beside.
 BESIDE = {"splats-static-small": ("exposure.learning_rate=0.01",)}
@@ -55,6 +56,7 @@ NEEDS = {
     "acceleration": ("motion",),
     "neighbours": ("motion",),
     "motion_growth": ("motion",),
+    "flow": ("motion",),
 }
 PROGRAMS = ("loss", "step")
 

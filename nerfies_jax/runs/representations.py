@@ -22,7 +22,7 @@ PRESETS = (
     *("sonata", "moba", "dynmf", "spacetime", "spline", "4dgs", "sc-gs", "edgs"),
     *("e-d3dgs", "e-d3dgs-small"),
     *("dynmf-small", "spacetime-small", "spline-small", "4dgs-small"),
-    *("sc-gs-small", "edgs-small"),
+    *("sc-gs-small", "edgs-small", "motion-gs", "motion-gs-small"),
     *("nerf", "nerf-w", "d-nerf", "t-nerf", "nerfies", "hypernerf"),
     *("tineuvox", "tineuvox-small", "nerf-ds", "nerf-ds-small"),
     *("nsff", "splats-static-small", "splats-mcmc-small", "splats-tracked-small"),
