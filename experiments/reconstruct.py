@@ -39,12 +39,12 @@ class Reconstruct:
     preset: cli.Preset = None
     """Gaussian splats: splats-static, splats-mcmc, splats-tracked, splats-deformable,
     sonata, moba, dynmf, spacetime, spline, 4dgs, e-d3dgs, sc-gs, edgs, d-miso,
-    adc-gs. Radiance fields: nerf, nerf-w, d-nerf, t-nerf, nerfies, hypernerf, nsff,
-    tineuvox, nerf-ds.
-    Each with -small is made for a CPU; only so there are nerf-grid, nerf-w-grid,
-    d-nerf-grid, nerfies-grid, hypernerf-grid, nsff-grid, on a grid of features
-    (default: splats-tracked-small; splats-static-small where nothing moves,
-    splats-deformable-small where what moves cannot be followed)."""
+    adc-gs, motion-gs. Radiance fields: nerf, nerf-w, d-nerf, t-nerf, nerfies,
+    hypernerf, nsff, tineuvox, nerf-ds. Each with -small is made for a CPU; only so
+    there are nerf-grid, nerf-w-grid, d-nerf-grid, nerfies-grid, hypernerf-grid,
+    nsff-grid, on a grid of features (default: splats-tracked-small;
+    splats-static-small where nothing moves, splats-deformable-small where what moves
+    cannot be followed)."""
     effects: Literal["preset", "auto"] = "preset"
     """auto: look at the capture first and take the effects that it calls for, in the
     representation and size of the preset (see experiments.inspect_scene)."""

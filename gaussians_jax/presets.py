@@ -15,6 +15,7 @@ from gaussians_jax.effects.embedding_motion import EmbeddingMotionSpec
 from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec
 from gaussians_jax.effects.motion_basis import BasisMotionSpec
+from gaussians_jax.effects.motion_flow import FlowSpec
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec
 from gaussians_jax.effects.neighbours import NeighbourSpec
 from gaussians_jax.effects.node_motion import MaskSpec, NodeMotionSpec
@@ -38,6 +39,7 @@ from gaussians_jax.small_presets import (
     SMALL_FOUR_D,
     SMALL_MCMC,
     SMALL_MOBA,
+    SMALL_MOTION_GS,
     SMALL_SC_GS,
     SMALL_SONATA,
     SMALL_SPACETIME,
@@ -65,6 +67,17 @@ MCMC = SplatScene(
 # Yang et al. 2023, arXiv:2309.13101, for real captures: the network, the warm-up and
 # the smoothing are defaults of `MotionSpec`.
 DEFORMABLE = SplatScene(steps=40_000, motion=MotionSpec())
+
+# Zhu et al. 2024, arXiv:2410.07707, and its code's numbers: Deformable 3DGS with flow
+# that is not the camera's. Its flow comes from a network, this from `evidence`; frames
+# come in any order, where its come one after the other; and its cameras are refined
+# while it trains (an option there), while here they are the capture's.
+MOTION_GS = SplatScene(
+    steps=20_000,
+    learning_rates=LearningRateSpec(log_scale=1e-3),
+    motion=MotionSpec(),
+    flow=FlowSpec(),
+)
 
 # Rigid motions fitted to tracks before training, in the manner of Shape of Motion. Its
 # tracks and depths come from networks, these from optical flow (`evidence`).
@@ -222,6 +235,7 @@ PRESETS = {
     "edgs": EDGS,
     "d-miso": D_MISO,
     "adc-gs": ADC_GS,
+    "motion-gs": MOTION_GS,
     "splats-static-small": SMALL_STATIC,
     "splats-tracked-small": SMALL_TRACKED,
     "splats-mcmc-small": SMALL_MCMC,
@@ -237,6 +251,7 @@ PRESETS = {
     "edgs-small": SMALL_EDGS,
     "d-miso-small": SMALL_D_MISO,
     "adc-gs-small": SMALL_ADC_GS,
+    "motion-gs-small": SMALL_MOTION_GS,
 }
 
 

@@ -144,7 +144,9 @@ def _raster_forward(layout, rects, table):
         return _stream(layout, rects, table)
 
     state, residuals = forward(rects, table)
-    return jnp.abs(state), (rects, table, state, residuals)
+    # Of the transmittance alone, whose sign says "done"; channels may be negative.
+    shown = jnp.concatenate([jnp.abs(state[:, :1]), state[:, 1:]], axis=1)
+    return shown, (rects, table, state, residuals)
 
 
 def _raster_backward(layout, residuals, cotangent):

@@ -307,6 +307,8 @@ def observe(
         frames.images[row].astype(frames.times.dtype) / 255,
         None if frames.valid is None else frames.valid[row],
         None if frames.depths is None else frames.depths[row],
+        frames,
+        row,
     )
 
 

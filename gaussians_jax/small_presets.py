@@ -11,6 +11,7 @@ from gaussians_jax.effects.embedding_motion import SMALL_EMBEDDING_MOTION
 from gaussians_jax.effects.kan_motion import SMALL_KAN_MOTION
 from gaussians_jax.effects.mlp_motion import MotionSpec
 from gaussians_jax.effects.motion_basis import SMALL_BASIS_MOTION
+from gaussians_jax.effects.motion_flow import FlowSpec
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec
 from gaussians_jax.effects.neighbours import NeighbourSpec
 from gaussians_jax.effects.node_motion import SMALL_NODE_MOTION, MaskSpec
@@ -230,4 +231,7 @@ SMALL_MOBA = dataclasses.replace(
     annealing=AnnealingSpec(2250),
     motion_growth=MotionGrowthSpec(start=900),
     acceleration=AccelerationSpec(start=600),
+)
+SMALL_MOTION_GS = dataclasses.replace(
+    SMALL_FROM_TRACKS, motion=SMALL_DEFORMABLE.motion, flow=FlowSpec(start=600)
 )

@@ -13,6 +13,7 @@ from gaussians_jax.effects import (
     kan_motion,
     mlp_motion,
     motion_basis,
+    motion_flow,
     motion_growth,
     neighbours,
     node_motion,
@@ -33,6 +34,7 @@ from gaussians_jax.effects.exposure import ExposureSpec
 from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec
 from gaussians_jax.effects.motion_basis import BasisMotionSpec
+from gaussians_jax.effects.motion_flow import FlowSpec
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec
 from gaussians_jax.effects.neighbours import NeighbourSpec
 from gaussians_jax.effects.node_motion import NodeMotionSpec
@@ -100,6 +102,7 @@ class SplatScene:
     spectral: SpectralSpec | None = None
     depth: DepthSpec | None = None
     exposure: ExposureSpec | None = None
+    flow: FlowSpec | None = None
 
     def __post_init__(self):
         if self.steps < 1:
@@ -144,7 +147,13 @@ def refuse_what_cannot_train(spec: SplatScene) -> None:
     """
     motion, growth = spec.motion, spec.motion_growth
     if motion is None:
-        named = ("temporal_opacity", "alternation", "acceleration", "motion_growth")
+        named = (
+            "temporal_opacity",
+            "alternation",
+            "acceleration",
+            "motion_growth",
+            "flow",
+        )
         orphans = [name for name in named if getattr(spec, name) is not None]
         orphans += ["start.motion"] if spec.start.motion == "tracks" else []
         if orphans:
@@ -248,4 +257,8 @@ def effects_of(spec: SplatScene, metadata: SceneMetadata) -> tuple[Effect, ...]:
         effects.append(depth.effect(spec.depth))
     if spec.exposure is not None:
         effects.append(exposure.effect(spec.exposure, spec.steps, metadata.exposures))
+    if spec.flow is not None:
+        at_once = spec.start.motion == "tracks"  # as the motion
+        one = dataclasses.replace(spec.flow, start=0) if at_once else spec.flow
+        effects.append(motion_flow.effect(one, spec.raster))
     return tuple(effects)

@@ -52,6 +52,7 @@ LEANS_ON = {
     "acceleration": ("motion",),
     "neighbours": ("motion",),
     "motion_growth": ("motion", "densification"),
+    "flow": ("motion",),
 }
 
 

@@ -15,6 +15,7 @@ from gaussians_jax.effects import (
     kan_motion,
     mlp_motion,
     motion_basis,
+    motion_flow,
     motion_growth,
     neighbours,
     node_motion,
@@ -62,6 +63,7 @@ SPLAT_MODULES = {
     "motion_growth": motion_growth,
     "spectral": spectral,
     "depth": depth,
+    "flow": motion_flow,
 }
 MOTION_MODULES = {
     mlp_motion.MotionSpec: mlp_motion,
@@ -143,6 +145,8 @@ def of_splats(spec, metadata):
         effects.append(spectral.effect(spec.spectral, spec.steps))
     if spec.depth is not None:
         effects.append(depth.effect(spec.depth))
+    if spec.flow is not None:
+        effects.append(motion_flow.effect(spec.flow, spec.raster))
     return tuple(effects)
 
 

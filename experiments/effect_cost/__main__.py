@@ -45,6 +45,7 @@ PRESETS = (
     "edgs-small",
     "d-miso-small",
     "adc-gs-small",
+    "motion-gs-small",
 )
 # Effects that no preset has, as paths of --set, and the preset they are priced beside.
 BESIDE = {"splats-static-small": ("exposure.learning_rate=0.01",)}
@@ -58,6 +59,7 @@ NEEDS = {
     "acceleration": ("motion",),
     "neighbours": ("motion",),
     "motion_growth": ("motion",),
+    "flow": ("motion",),
 }
 PROGRAMS = ("loss", "step")
 

@@ -23,7 +23,7 @@ PRESETS = (
     *("e-d3dgs", "e-d3dgs-small"),
     *("dynmf-small", "spacetime-small", "spline-small", "4dgs-small"),
     *("sc-gs-small", "edgs-small", "d-miso", "d-miso-small"),
-    *("adc-gs", "adc-gs-small"),
+    *("adc-gs", "adc-gs-small", "motion-gs", "motion-gs-small"),
     *("nerf", "nerf-w", "d-nerf", "t-nerf", "nerfies", "hypernerf"),
     *("tineuvox", "tineuvox-small", "nerf-ds", "nerf-ds-small"),
     *("nsff", "splats-static-small", "splats-mcmc-small", "splats-tracked-small"),

@@ -90,6 +90,8 @@ class Observation(NamedTuple):
     truth: Float[Array, "height width 3"]  # sRGB in [0, 1]
     valid: Bool[Array, "height width"] | None  # None: everywhere
     depth: Float[Array, "height width"] | None  # z-depth, scene units; 0 unknown
+    frames: Frames | None = None  # all that is learnt from
+    row: Int[Array, ""] | int | None = None  # of this frame among them
 
 
 class PenaltyContext(NamedTuple):
@@ -110,7 +112,6 @@ class PenaltyContext(NamedTuple):
     box: Any = None  # `effect.Box`, from scene units to those of the field
     # On Gaussians: the frame of the step, and the scene at other times.
     observation: Observation | None = None
-    row: Int[Array, ""] | None = None  # of the frame of the step, in `frames`
     # (rows as by `splats.take_rows`, time) -> `Gaussians`
     at_time: Callable[[Any, Scalar], Any] | None = None
     state: PyTree = None  # of this effect, where it keeps one

@@ -27,6 +27,7 @@ from gaussians_jax.effects.embedding_motion import EmbeddingMotionSpec
 from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec, SmoothingSpec
 from gaussians_jax.effects.motion_basis import BasisMotionSpec
+from gaussians_jax.effects.motion_flow import FlowSpec
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec
 from gaussians_jax.effects.neighbours import NeighbourSpec
 from gaussians_jax.effects.spectral import FourierSpec, SpectralSpec, WaveletSpec
@@ -79,6 +80,9 @@ SETTINGS = [
     (InitSpec, dict(points=0), "at least one Gaussian"),
     (InitSpec, dict(source="sfm"), "unknown source 'sfm'; choose from"),
     (KanMotionSpec, dict(embedding=0), "embedding=0"),
+    (FlowSpec, dict(weight=-1.0), "weight=-1.0"),
+    (FlowSpec, dict(start=-1), "start=-1"),
+    (FlowSpec, dict(opaque=1.0), "opaque=1.0"),
     (EmbeddingMotionSpec, dict(embedding=0), "embedding=0"),
     (EmbeddingMotionSpec, dict(coarser=0), "coarser=0"),
     (EmbeddingMotionSpec, dict(opacity=-1.0), "opacity=-1.0"),

@@ -1,0 +1,218 @@
+"""Optical flow tells Gaussians how things move, once what the camera does is taken off.
+
+Zhu et al. 2024 (MotionGS), arXiv:2410.07707, "optical flow decoupling" and the motion
+flow loss. Flow from one frame to the next is that of the camera, which the drawn depth
+and both cameras say, and that of things, which is left. The latter is held against the
+flow of the Gaussians: where each goes in the next camera's picture between the two
+moments, with the ellipse that it is drawn as, blended as its colour is. A Gaussian's
+flow is linear in the pixel, so that six channels are exact for all pixels.
+"""
+
+import dataclasses
+import functools
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from gaussians_jax import projection, raster
+from gaussians_jax.projection import Footprints
+from gaussians_jax.raster_spec import RasterSpec
+from gaussians_jax.splats import Gaussians
+from nerfies_jax.geometry import camera as cameras
+from nerfies_jax.geometry import rays
+from nerfies_jax.geometry.camera import Camera
+from nerfies_jax.training import losses
+from nerfies_jax.training.effects import Effect, PenaltyContext, Term
+from nerfies_jax.training.step_counts import steps
+
+NAME = "flow"
+LEAST_SHARE = 1e-10  # of opacity that is divided by
+
+
+@dataclasses.dataclass(frozen=True)
+class FlowSpec:
+    """What the flow counts for beside the colours, and from which step on.
+
+    Weight and form are the paper's code's: absolute differences of flows in units of
+    the picture's sides, each held to one side. `opaque` is the least opacity of a pixel
+    that is compared, where flow is known as well; there all are.
+
+    As there, neither the weights of the blending nor the depth get a slope. Otherwise
+    than there, both ends of a Gaussian's way get one: with the first held still, the
+    Gaussian itself would be pulled along the flow.
+    """
+
+    weight: float = 0.5
+    start: int = steps(3000)
+    opaque: float = 0.5
+
+    def __post_init__(self):
+        if not (math.isfinite(self.weight) and self.weight >= 0):
+            raise ValueError(
+                f"weight={self.weight} of the flow must be finite and not negative"
+            )
+        if self.start < 0 or not 0 < self.opaque < 1:
+            raise ValueError(
+                "flow needs start >= 0 and 0 < opaque < 1, got "
+                f"start={self.start} and opaque={self.opaque}"
+            )
+
+
+class Drawn(NamedTuple):
+    """The Gaussians' flow in one picture."""
+
+    flow: Float[Array, "height width 2"]  # px right and down; zero where nothing is
+    share: Float[Array, "height width"]  # opacity of what both moments show
+    depth: Float[Array, "height width"]  # expected z-depth, scene units; 0 of nothing
+
+
+def effect(spec: FlowSpec, picture: RasterSpec) -> Effect:
+    """The seams of `spec`; a capture without flow has no term."""
+    return Effect(
+        NAME,
+        penalty=functools.partial(penalty, spec, picture),
+        required_data=frozenset({"flow"}),
+    )
+
+
+def penalty(
+    spec: FlowSpec, picture: RasterSpec, _: Any, context: PenaltyContext
+) -> dict[str, Term]:
+    """How far the Gaussians' flow is from that of things, and the share compared."""
+    frames = context.observation.frames
+    if frames is None or frames.flow is None:
+        return {}
+
+    def evaluate(params):
+        return compared(spec, picture, params, context)
+
+    def nothing(params):
+        zero = jnp.zeros((), params.rows["splats"].mean.dtype)
+        return zero, zero
+
+    if spec.start == 0:
+        error, known = evaluate(context.params)
+    else:
+        early = context.step < spec.start
+        error, known = lax.cond(early, nothing, evaluate, context.params)
+    return {"error": Term(error, spec.weight), "known": Term(known, None)}
+
+
+def compared(
+    spec: FlowSpec, picture: RasterSpec, params: Any, context: PenaltyContext
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Error of the frame of a step, and the share of its pixels that are compared."""
+    frames, row = context.observation.frames, context.observation.row
+    other = frames.flow.next_row[row]
+    here, there = (context.at_time(params, frames.times[at]) for at in (row, other))
+    pair = tuple(cameras.take(frames.cameras, at) for at in (row, other))
+    size = frames.images.shape[2], frames.images.shape[1]
+    drawn = drawn_flow(here, there, pair, size, picture)
+    shift = frames.flow.forward[row].astype(drawn.flow.dtype)
+    seen = frames.flow.forward_seen[row] & (drawn.share >= spec.opaque)
+    if context.observation.valid is not None:
+        seen = seen & context.observation.valid
+    things = shift - camera_flow(pair, drawn.depth)
+    return error(drawn.flow, things, seen), jnp.mean(seen.astype(shift.dtype))
+
+
+def drawn_flow(
+    here: Gaussians,
+    there: Gaussians,
+    pair: tuple[Camera, Camera],
+    size: tuple[int, int],
+    picture: RasterSpec,
+) -> Drawn:
+    """Flow of the Gaussians from `here` to `there`, seen by the first camera.
+
+    In pixels of the second camera, which stands still meanwhile: at a pixel x of the
+    first, Gaussian k goes by m' - m + (L' - L) L1⁻¹ (x - m1), with means m and Cholesky
+    factors L of its footprint in the second camera, before and after, and those with a
+    1 in the first. What only one moment shows does not count. `size` is (width, height)
+    of both.
+    """
+    first = lax.stop_gradient(projection.project(here, pair[0], size, picture))
+    start, end = (projection.project(g, pair[1], size, picture) for g in (here, there))
+    stretch, shift = linear_flow(first, start, end)
+    both = (start.visible & end.visible)[:, None]
+    # Selected before they are blended: what is not drawn has stand-ins, of any size.
+    values = jnp.concatenate([stretch.reshape(-1, 4), shift], axis=1)
+    values = jnp.where(both, values, 0)
+    more = [first.depth[:, None], both.astype(values.dtype)]
+    image, left = raster.rasterise(
+        first, jnp.concatenate([values, *more], axis=1), size, picture
+    )
+    matrix, offset = image[..., :4].reshape(*image.shape[:2], 2, 2), image[..., 4:6]
+    centre = rays.pixel_centres(size, image.dtype)
+    flow = jnp.einsum("hwij,hwj->hwi", matrix, centre) + offset
+    depth, share = lax.stop_gradient(image[..., 6]), lax.stop_gradient(image[..., 7])
+    alpha = lax.stop_gradient(1 - left)
+    return Drawn(
+        flow / jnp.maximum(share, LEAST_SHARE)[..., None],
+        share,
+        depth / jnp.maximum(alpha, LEAST_SHARE),
+    )
+
+
+def linear_flow(
+    first: Footprints, start: Footprints, end: Footprints
+) -> tuple[Float[Array, "gaussians 2 2"], Float[Array, "gaussians 2"]]:
+    """A and b of each Gaussian's flow A x + b at a pixel x, as `drawn_flow` says."""
+    p, k, r = first.whitening.T
+    zero = jnp.zeros_like(p)
+    into = _matrix(p, zero, -r * k, r)
+    before, after = (_factor(one.whitening) for one in (start, end))
+    stretch = jnp.einsum("gij,gjk->gik", after - before, into)
+    moved = end.mean_px - start.mean_px
+    return stretch, moved - jnp.einsum("gij,gj->gi", stretch, first.mean_px)
+
+
+def _factor(whitening):
+    """The inverse of [[p, 0], [-rk, r]]: the Cholesky factor, times the root of two."""
+    p, k, r = whitening.T
+    return _matrix(1 / p, jnp.zeros_like(p), k / p, 1 / r)
+
+
+def _matrix(a, b, c, d):
+    return jnp.stack([jnp.stack([a, b], -1), jnp.stack([c, d], -1)], -2)
+
+
+def camera_flow(
+    pair: tuple[Camera, Camera], depth: Float[Array, "height width"]
+) -> Float[Array, "height width 2"]:
+    """Where a still scene's pixels go from the first camera to the second, px.
+
+    `depth` is z-depth in scene units; where it is not positive the flow means nothing,
+    and is finite. Of cameras without distortion.
+    """
+    first, second = pair
+    height, width = depth.shape
+    centre = rays.pixel_centres((width, height), depth.dtype)
+    offset = centre - first.principal_point_px
+    y = offset[..., 1] / (first.focal_px * first.pixel_aspect)
+    x = (offset[..., 0] - first.skew_px * y) / first.focal_px
+    slopes = jnp.stack([x, y, jnp.ones_like(x)], axis=-1)
+    place = first.position + depth[..., None] * (slopes @ first.camera_from_world)
+    pixel, _ = jax.vmap(jax.vmap(cameras.project, (None, 0)), (None, 0))(second, place)
+    return pixel - centre
+
+
+def error(
+    drawn: Float[Array, "height width 2"],
+    things: Float[Array, "height width 2"],
+    seen: Bool[Array, "height width"],
+) -> Float[Array, ""]:
+    """Mean absolute difference where `seen`, in sides of the picture; zero of none.
+
+    Horizontal flow by the width and vertical by the height, each held to ±1.
+    """
+    height, width = seen.shape
+    side = jnp.asarray((width, height), drawn.dtype)
+    # Selected first: pixels that are not seen may hold anything.
+    ways = (jnp.where(seen[..., None], flow, 0) / side for flow in (drawn, things))
+    drawn, things = (jnp.clip(way, -1, 1) for way in ways)
+    return losses.l1(drawn, things, seen)

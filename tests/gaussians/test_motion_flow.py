@@ -1,0 +1,258 @@
+"""The flow of Gaussians and of cameras, pixel by pixel and Gaussian by Gaussian."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.spatial.transform
+
+from gaussians_jax import scene
+from gaussians_jax.effects import motion_flow
+from gaussians_jax.effects.motion_flow import FlowSpec
+from gaussians_jax.raster_spec import GSPLAT
+from gaussians_jax.splats import Gaussians
+from nerfies_jax.capture.flow import FrameFlow
+from nerfies_jax.evaluation import frames_of
+from nerfies_jax.geometry import camera as cameras
+from nerfies_jax.training.effects import Observation, PenaltyContext
+from tests import gradients, scenes
+from tests.gaussians.shared import jitted, put
+from tests.oracles import dense_splats
+
+SIZE = (13, 9)
+
+
+def pair(dtype, turned=0.1):
+    """Two cameras side by side, one turned a little, and focal lengths of their own."""
+    first = cameras.look_at((0.0, 0.0, -4.0), (0.0, 0.0, 0.0), (0, 1.0, 0), 12.0, SIZE)
+    away = (0.4, 0.1, -3.7)
+    second = cameras.look_at(away, (turned, 0.0, 0.0), (0.1, 1.0, 0), 13.0, SIZE)
+    return tuple(put(one, dtype) for one in (first, second))
+
+
+def scattered(dtype, count=7, seed=0):
+    """Gaussians before the cameras, and the same a moment later."""
+    rng = np.random.default_rng(seed)
+    here = Gaussians(
+        rng.uniform(-1, 1, (count, 3)),
+        rng.normal(size=(count, 4)),
+        rng.uniform(0.2, 0.6, (count, 3)),
+        rng.uniform(0.3, 0.9, count),
+    )
+    there = here._replace(
+        mean=here.mean + rng.normal(size=(count, 3)) / 4,
+        quaternion=here.quaternion + rng.normal(size=(count, 4)) / 5,
+        scale=here.scale * rng.uniform(0.8, 1.2, (count, 3)),
+    )
+    return put(here, dtype), put(there, dtype)
+
+
+def footprint(gaussians, row, camera):
+    """Mean, Cholesky factor of the dilated covariance, and z; NumPy."""
+    one = (gaussians.mean[row], gaussians.quaternion[row], gaussians.scale[row])
+    mean, covariance, depth = dense_splats.footprint(*one, camera, SIZE, GSPLAT)
+    dilated = np.asarray(covariance, np.float64) + GSPLAT.eps2d * np.eye(2)
+    return np.asarray(mean), np.linalg.cholesky(dilated), float(depth)
+
+
+def by_hand(here, there, both):
+    """(flow, share, depth) of every pixel, front to back."""
+    width, height = SIZE
+    rows = range(len(here.mean))
+    first = [footprint(here, row, both[0]) for row in rows]
+    start = [footprint(here, row, both[1]) for row in rows]
+    end = [footprint(there, row, both[1]) for row in rows]
+    order = np.argsort([f[2] for f in first])
+    flow, share, depth = np.zeros((height, width, 2)), *np.zeros((2, height, width))
+    for line in range(height):
+        for column in range(width):
+            pixel, left = np.array([column + 0.5, line + 0.5]), 1.0
+            for row in order:
+                mean, factor, z = first[row]
+                inside = np.linalg.solve(factor, pixel - mean)
+                alpha = float(here.opacity[row]) * np.exp(-inside @ inside / 2)
+                alpha = min(alpha, GSPLAT.alpha_max)
+                if alpha < GSPLAT.alpha_threshold:
+                    continue
+                goes = end[row][0] + end[row][1] @ inside
+                came = start[row][0] + start[row][1] @ inside
+                flow[line, column] += left * alpha * (goes - came)
+                share[line, column] += left * alpha
+                depth[line, column] += left * alpha * z
+                left *= 1 - alpha
+    some = np.where(share > 0, share, 1)
+    return flow / some[..., None], share, depth / some
+
+
+drawn_flow = jitted(motion_flow.drawn_flow, static_argnums=(3, 4))
+camera_flow = jitted(motion_flow.camera_flow)
+
+
+def test_the_gaussians_flow_is_that_of_a_loop(float64):
+    here, there = scattered("float64")
+    drawn = drawn_flow(here, there, pair("float64"), SIZE, GSPLAT)
+    for found, expected in zip(
+        drawn, by_hand(here, there, pair("float64")), strict=True
+    ):
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_float32_draws_the_flow_of_float64():
+    here, there = scattered("float32")
+    drawn = drawn_flow(here, there, pair("float32"), SIZE, GSPLAT)
+    assert drawn.flow.dtype == np.float32
+    flow, *_ = by_hand(here, there, pair("float32"))
+    np.testing.assert_allclose(drawn.flow, flow, rtol=0, atol=2e-4)  # px
+
+
+@pytest.mark.parametrize("depth", [0.5, 3.0, 80.0])
+def test_a_still_scene_goes_as_its_points_project(depth, dtype):
+    """A pixel's point by SciPy's rotations, through both pinholes."""
+    both = pair(dtype)
+    width, height = SIZE
+    found = camera_flow(both, np.full((height, width), depth, dtype))
+    assert found.dtype == dtype
+    first, second = jax.tree.map(lambda x: np.asarray(x, np.float64), both)
+    turn = scipy.spatial.transform.Rotation.from_matrix(first.camera_from_world)
+    for line, column in np.ndindex(height, width):
+        pixel = np.array([column + 0.5, line + 0.5])
+        slope = (pixel - first.principal_point_px) / first.focal_px
+        place = first.position + turn.inv().apply(depth * np.array([*slope, 1]))
+        seen = second.camera_from_world @ (place - second.position)
+        goes = second.focal_px * seen[:2] / seen[2] + second.principal_point_px
+        rtol = {"float32": 2e-5, "float64": 1e-12}[dtype]
+        np.testing.assert_allclose(
+            found[line, column], goes - pixel, rtol=rtol, atol=20 * rtol
+        )
+
+
+def test_what_stands_still_has_no_flow_of_its_own(dtype):
+    """Whatever the cameras do; so all of its optical flow is the camera's."""
+    here, _ = scattered(dtype)
+    drawn = drawn_flow(here, here, pair(dtype), SIZE, GSPLAT)
+    # Both ends are projected, each in an order of its own.
+    assert np.abs(drawn.flow).max() < {"float32": 2e-5, "float64": 1e-13}[dtype]
+    assert drawn.share.max() > 0.5
+
+
+def test_the_error_is_that_of_a_loop(dtype, rng):
+    drawn, things = rng.normal(size=(2, 9, 13, 2)).astype(dtype) * 4
+    drawn[2, 3, 0], things[2, 3, 0] = 100, 1  # held to one width of 13
+    seen = rng.uniform(size=(9, 13)) < 0.6
+    seen[2, 3] = True
+    things[~seen] = np.nan
+    found = jitted(motion_flow.error)(drawn, things, seen)
+    terms = []
+    for line, column in np.argwhere(seen):
+        for axis, side in enumerate(SIZE):
+            one, other = (
+                np.clip(flow[line, column, axis] / side, -1, 1)
+                for flow in (np.float64(drawn), np.float64(things))
+            )
+            terms.append(abs(one - other))
+    np.testing.assert_allclose(found, np.mean(terms), rtol=1e-5)
+
+
+HARD = {
+    "nothing drawn": lambda g: g._replace(opacity=0 * g.opacity),
+    "behind the next camera": lambda g: g._replace(mean=g.mean - 30),
+    "at a camera": lambda g: g._replace(mean=0 * g.mean + np.array([0.4, 0.1, -3.7])),
+    "as wide as the sky": lambda g: g._replace(scale=1e6 * g.scale),
+    "points": lambda g: g._replace(scale=0 * g.scale),
+    "no turn": lambda g: g._replace(quaternion=0 * g.quaternion),
+    "not numbers": lambda g: g._replace(mean=np.nan * g.mean),
+}
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("name", HARD)
+def test_flow_and_slopes_are_finite_of(name, dtype):
+    both = pair(dtype)
+    here, there = scattered(dtype)
+    there = HARD[name](jax.tree.map(np.asarray, there))
+    there = jax.tree.map(lambda x: np.asarray(x, dtype), there)
+
+    def total(here, there):
+        drawn = motion_flow.drawn_flow(here, there, both, SIZE, GSPLAT)
+        things = motion_flow.camera_flow(both, drawn.depth)
+        return motion_flow.error(drawn.flow, things, drawn.share > 0.01)
+
+    value, slopes = jitted(jax.value_and_grad(total, (0, 1)))(here, there)
+    assert np.isfinite(value)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
+
+
+def test_gradients_go_through_both_ends_and_no_weight(float64):
+    """Of the way alone: means, turns and sizes in the next camera's picture."""
+    here, there = scattered("float64")
+    both, weight = pair("float64"), np.random.default_rng(5).normal(size=(9, 13, 2))
+
+    def total(start, end):
+        # As blended where the first are, which get no slope.
+        first = jax.lax.stop_gradient(
+            motion_flow.projection.project(here, both[0], SIZE, GSPLAT)
+        )
+        ends = (
+            motion_flow.projection.project(g, both[1], SIZE, GSPLAT)
+            for g in (start, end)
+        )
+        stretch, shift = motion_flow.linear_flow(first, *ends)
+        values = jnp.concatenate([stretch.reshape(-1, 4), shift], axis=1)
+        image, _ = motion_flow.raster.rasterise(first, values, SIZE, GSPLAT)
+        return jnp.sum(jnp.sin(image[..., 4:6]) * weight)
+
+    assert gradients.directional_error(total, here, there) < 1e-5
+
+    def blended(here, there):
+        drawn = motion_flow.drawn_flow(here, there, both, SIZE, GSPLAT)
+        return jnp.sum(drawn.flow * weight)
+
+    slopes = jitted(jax.grad(blended, (0, 1)))(here, there)
+    assert all(one.mean.any() and one.scale.any() for one in slopes)
+    assert not any(one.opacity.any() for one in slopes)
+
+
+SCENE = dataclasses.replace(scenes.TINY_DEFORMABLE, flow=FlowSpec(start=3))
+
+
+def test_a_penalty_compares_frames_with_the_next_and_begins_at_its_start():
+    capture = scenes.tiny_capture()
+    model = scene.build(SCENE, scene.metadata_of(capture))
+    assert "flow" in model.required_data
+    frames = frames_of(capture, model.required_data)
+    effect = motion_flow.effect(SCENE.flow, GSPLAT)
+    state = model.init(capture, jax.random.key(0))
+
+    def still(params, time):
+        return scene.splats.activate(params.rows["splats"])
+
+    def terms(step, frames, row):
+        observation = Observation(None, None, None, None, frames, row)
+        context = PenaltyContext(
+            None, step, None, state.params, observation=observation, at_time=still
+        )
+        return effect.penalty(None, context)
+
+    early, late = (jax.jit(terms)(jnp.int32(step), frames, 1) for step in (2, 3))
+    assert early["error"].value == 0
+    assert late["error"].value > 0
+    assert late["error"].weight == 0.5
+    assert 0 < late["known"].value <= 1
+    # Of a frame without a next one nothing is seen.
+    last = int(
+        np.argmax(np.asarray(frames.flow.next_row) == np.arange(len(frames.times)))
+    )
+    nothing = jax.jit(terms)(jnp.int32(3), frames, last)
+    assert nothing["error"].value == nothing["known"].value == 0
+    assert terms(jnp.int32(3), frames._replace(flow=None), 1) == {}
+    assert isinstance(frames.flow, FrameFlow)
+
+
+def test_flow_without_a_motion_is_refused():
+    capture = scenes.tiny_capture()
+    still = dataclasses.replace(SCENE, motion=None)
+    model = scene.build(still, scene.metadata_of(capture))
+    with pytest.raises(ValueError, match="flow without a motion"):
+        model.init(capture, jax.random.key(0))
