@@ -27,6 +27,7 @@ from gaussians_jax.effects.spline_motion import SplineMotionSpec
 from gaussians_jax.effects.temporal_opacity import TemporalOpacitySpec
 from gaussians_jax.effects.time_basis import TimeBasisSpec
 from gaussians_jax.initialisation import InitSpec, StartSpec
+from gaussians_jax.learning_rates import LearningRateSpec
 from gaussians_jax.mcmc import MCMCStrategySpec
 from gaussians_jax.phases import AlternationSpec, AnnealingSpec
 from gaussians_jax.small_presets import (
