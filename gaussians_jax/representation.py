@@ -47,6 +47,7 @@ MOTION_PARTS = (
     "alternation",
     "acceleration",
     "motion_growth",
+    "flow",
 )
 
 
