@@ -20,7 +20,7 @@ from nerfies_jax.evidence.findings import BACKGROUND, LIGHT, MOTION, TRANSIENT
 ADVISED = ("nerf", "nerfies")
 MOTIONS = ("warp", "time", "scene_flow")
 # What goes with them, in the order in which each can be taken out.
-MOTION_PARTS = ("elastic", "background", "ambient", *MOTIONS)
+MOTION_PARTS = ("elastic", "background", "mask", "ambient", *MOTIONS)
 
 
 def advise(
