@@ -81,9 +81,8 @@ class RadianceScene:
     # Longest half-side of the filmed volume in units of the field; None keeps the
     # capture's own coordinates.
     extent: float | None = 1.0
-    learning_rate: float = (
-        5e-4  # of Adam, falling to `learning_rate_end` along a line in the logarithm
-    )
+    # Of Adam, falling to `learning_rate_end` along a line in the logarithm.
+    learning_rate: float = 5e-4
     learning_rate_end: float = 5e-5
     template_rate: float = 1.0  # times that: of the template, for tables learn faster
     table_rate: float = 1.0  # times that again: of the tables alone
