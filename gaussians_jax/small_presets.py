@@ -167,8 +167,8 @@ SMALL_D_MISO = dataclasses.replace(
 # A tenth of the rows, and ten Gaussians of each.
 SMALL_ADC_GS = dataclasses.replace(
     SMALL_TRACKED,
-    init=InitSpec(points=700, random=600),
-    start=StartSpec(motion="tracks", moving_points=400),
+    init=InitSpec(points=500, random=600),
+    start=StartSpec(motion="tracks", moving_points=350),
     sh_degree=0,
     densification=dataclasses.replace(SMALL_TRACKED.densification, cap_max=1000),
     motion=AnchorMotionSpec(
