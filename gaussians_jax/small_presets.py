@@ -152,7 +152,9 @@ SMALL_DEFORMABLE = dataclasses.replace(
     ),
 )
 
-# A quarter of the rows of the others, and four Gaussians of each.
+# A quarter of the rows of the others, and four Gaussians of each. Built-in scene, 600
+# steps of one view each, one seed: 29.23 dB, and 24.63 where it moves (`SMALL_SC_GS`
+# 28.69 / 24.54); followed points are off by 0.0099 scene units.
 SMALL_D_MISO = dataclasses.replace(
     SMALL_FROM_TRACKS,
     init=InitSpec(points=1500, random=1500),
@@ -172,8 +174,8 @@ SMALL_D_MISO = dataclasses.replace(
 # A tenth of the rows, and ten Gaussians of each.
 SMALL_ADC_GS = dataclasses.replace(
     SMALL_FROM_TRACKS,
-    init=InitSpec(points=700, random=600),
-    start=StartSpec(motion="tracks", moving_points=400),
+    init=InitSpec(points=500, random=600),
+    start=StartSpec(motion="tracks", moving_points=350),
     sh_degree=0,
     densification=dataclasses.replace(SMALL_FROM_TRACKS.densification, cap_max=1000),
     motion=AnchorMotionSpec(

@@ -308,7 +308,7 @@ REACH = {
     "losses.dssim_map": 0.2,  # variances over squared means
     **dict.fromkeys(["planes.total_variation", "planes.bend"], 0.45),
     "planes.features": 0.45,
-    "entropy.bits": 0.1,  # squares of what is divided by a deviation as small as e^-12
+    "entropy.bits": 0.45,  # over a deviation as small as e^-12
     **dict.fromkeys(["entropy.rounded", "faces.gaussians"], 0.9),  # in steps; lengths
     # sums of more than four, or multiples
     **dict.fromkeys(["codes.blend", "encoding.encode", "losses.l1"], 0.9),

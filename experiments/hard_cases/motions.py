@@ -1,12 +1,13 @@
-"""Hard cases of motions: coefficients and planes at rest, opacities over time."""
+"""Hard cases of motions: what is at rest, opacities over time, bits of features."""
 
+import jax
 import jax.numpy as jnp
 import mpmath
 import numpy as np
 
 from experiments.hard_cases.case import Case, constant
 from gaussians_jax.effects import skinning, temporal_opacity, time_basis
-from nerfies_jax.nets import planes
+from nerfies_jax.nets import entropy, planes
 
 NEAR = 1e-6  # how close to a switch its two sides are tried, as a share of it
 _SHARES = np.array([1.0, -0.25, 0.125])
@@ -139,4 +140,42 @@ SHARES = Case(
     timed=np.array([0.4, 0.0]),
 )
 
-CASES = (SPARSITY, VISIBLE, UNREST, SHARES)
+_STEPS = np.array([1e-4, 0.002 * (1 - NEAR), 0.002 * (1 + NEAR), 1.0, 50.0])
+_FAR = np.array([0, 1e-12, 0.1, 1, 3, 6, 9, 20, 40])
+
+
+def _bits(x):
+    """Of a value so many deviations from the mean, in steps so wide."""
+    none = jnp.zeros_like(x[0])
+    return entropy.bits(x[0], none, none, x[1])[None]
+
+
+def _log_of_difference(x):
+    above = jax.scipy.special.ndtr(x[0] + x[1] / 2)
+    return -jnp.log2(above - jax.scipy.special.ndtr(x[0] - x[1] / 2))[None]
+
+
+def _exact_bits(x):
+    near, far = ((side * x[1] / 2 - x[0]) / mpmath.sqrt(2) for side in (1, -1))
+    return [-mpmath.log((mpmath.erfc(-near) - mpmath.erfc(-far)) / 2, 2)]
+
+
+BITS = Case(
+    name="bits of what a law does not expect",
+    breaks="the difference of two shares is 0, and -log2 of it infinite, from 5.5 on",
+    formula="logarithms of the shares on the thin side; over small steps a parabola",
+    switch="a step of 0.002 deviations",
+    axis="distance, deviations",
+    at=np.repeat(_FAR, len(_STEPS)),
+    # Where a step is wide, from its end on.
+    inputs=np.array([[away + step // 2, step] for away in _FAR for step in _STEPS]),
+    stable=_bits,
+    textbook=_log_of_difference,
+    exact=_exact_bits,
+    bounds={"float32": (2e-5, 2e-3), "float64": (1e-6, 1e-5)},
+    floors=(1.0, 1.0, 0.0),
+    caught=(("float32", "value"), ("float32", "slope"), ("float64", "value")),
+    timed=np.array([0.4, 1.0]),
+)
+
+CASES = (SPARSITY, VISIBLE, UNREST, SHARES, BITS)

@@ -15,7 +15,8 @@ from jaxtyping import Array, Float, Key
 Numbers = Float[Array, "*#batch"]
 # Of standard deviations and steps, as logarithms: what lies outside counts as the end.
 LOG_RANGE = (-12.0, 8.0)
-FLAT = 0.02  # of a standard deviation: a step below it is as good as a line
+FARTHEST = 60.0  # standard deviations (2600 bits): from there on bits are a line
+FLAT = 0.002  # standard deviations: a law is a parabola over a step below it
 
 
 def noisy(key: Key[Array, ""], values: Numbers, step: Numbers) -> Numbers:
@@ -40,12 +41,17 @@ def bits(values: Numbers, mean: Numbers, log_scale: Numbers, step: Numbers) -> N
     # By the size of the distance, whose slope at zero is zero as the answer's is.
     away = (values - mean) / scale
     away, wide = away * jnp.sign(away), step / scale
-    # Between two ends that all but meet float32 sees nothing: there the law is flat.
+    # Between two ends that all but meet float32 sees nothing: there the law is a curve.
     flat = wide < FLAT
     held = jnp.where(flat, 1.0, wide)
+    # Farther away the square of the distance has no digits left for a slope.
+    beyond = jnp.maximum(away - held / 2 - FARTHEST, 0)
+    away = away - beyond
     near = jax.scipy.special.log_ndtr(held / 2 - away)
     far = jax.scipy.special.log_ndtr(-held / 2 - away)
     between = near + jnp.log(-jnp.expm1(far - near))
     density = -away * away / 2 - math.log(2 * math.pi) / 2
-    level = jnp.log(jnp.where(flat, wide, 1.0)) + density
-    return -jnp.where(flat, level, between) / math.log(2)
+    low = jnp.where(flat, wide, 1.0)
+    bend = (away * away - 1) * low * low / 24  # what the middle tells of the mean
+    level = jnp.log(low) + density + bend
+    return (FARTHEST * beyond - jnp.where(flat, level, between)) / math.log(2)

@@ -209,28 +209,10 @@ def test_noise_and_cost_begin_together():
     assert 0.2 < far.max() <= 0.5 + 1e-5
 
 
-bits_and_slopes = jitted(jax.value_and_grad(entropy.bits, argnums=(0, 1, 2, 3)))
-
-
-@pytest.mark.hard_cases
-@pytest.mark.parametrize("away", [0.0, 1e-20, 3.0, 9.0, 40.0, 300.0])
-@pytest.mark.parametrize("wide", [1e-4, 0.019, 0.021, 1.0, 50.0, 1e5])
-def test_bits_keep_their_digits_in_the_tails_of_the_law(away, wide, dtype):
-    """A step `wide` deviations wide, so many deviations (and half a step) away."""
-    args = put((away + max(wide, 1) / 2 * (away > 1), 0.0, 0.0, wide), dtype)
-    value, slopes = bits_and_slopes(*args)
-    x = float(args[0])
-    near, far = scipy.stats.norm.logcdf([wide / 2 - x, -wide / 2 - x])
-    exact = -(near + np.log(-np.expm1(far - near))) / np.log(2)
-    if wide < 0.02:  # the law is level over a step: to one part in 1e5 of the share
-        exact = -(np.log(wide) + scipy.stats.norm.logpdf(x)) / np.log(2)
-    np.testing.assert_allclose(value, exact, rtol=2e-5, atol=2e-5)
-    assert all(np.isfinite(slope) for slope in slopes)
-
-
 @pytest.mark.hard_cases
 def test_a_law_without_a_width_is_held(dtype):
-    value, slopes = bits_and_slopes(*put((0.3, 0.0, -1e4, 0.1), dtype))
+    run = jitted(jax.value_and_grad(entropy.bits, argnums=(0, 1, 2, 3)))
+    value, slopes = run(*put((0.3, 0.0, -1e4, 0.1), dtype))
     assert np.isfinite(value)
     assert all(np.isfinite(slope) for slope in slopes)
 
