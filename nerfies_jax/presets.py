@@ -282,6 +282,9 @@ SMALL_NERF_GRID = dataclasses.replace(
     template_rate=6.0,
 )
 
+# Built-in `fast`, 60 seconds of one core, from rest (held-out PSNR, where it moves, and
+# end-point error of points): 21.91 / 17.51 dB, 0.0219 after 260 steps;
+# `nerfies-grid-small` 21.98 / 16.58, 0.0240 after 200.
 SMALL_TINEUVOX = dataclasses.replace(
     SMALL_NERF_GRID,
     template=dataclasses.replace(

@@ -6,6 +6,7 @@ import mpmath
 import numpy as np
 
 from experiments.hard_cases.case import Case, constant
+from nerfies_jax.effects import surface
 from nerfies_jax.radiance import compositing, sampling
 from nerfies_jax.radiance.compositing import AT_INFINITY, EMPTY_BELOW
 
@@ -53,6 +54,25 @@ WEIGHTS = Case(
         ("float64", "slope"),
     ),
     timed=np.array([0.1, 0.05, 0.2, 0.1]),
+)
+
+
+def _exact_direction(vector):
+    length = mpmath.sqrt(mpmath.fsum(x**2 for x in vector))
+    return [x / length for x in vector]
+
+
+NORMALS = Case(
+    name="normals where density is next to level",
+    breaks="the square of a slope of 1e-24 is 0 and of 1e20 infinite",
+    formula="divided by the largest entry first",
+    axis="length of the slope",
+    **_times([1e-24, 1e-22, 1e-6, 1, 1e10, 1e20, 1e30], [0.5, -1, 0.25]),
+    stable=surface.unit,
+    textbook=lambda vector: vector / jnp.sqrt(jnp.sum(vector * vector)),
+    exact=_exact_direction,
+    bounds={"float32": (3e-7, 1e-6), "float64": (6e-16, 2e-15)},
+    caught=(("float32", "value"), ("float32", "slope")),
 )
 
 
@@ -283,4 +303,4 @@ SAMPLES = Case(
     timed=_UNEVEN,
 )
 
-CASES = (WEIGHTS, LAST, DISTANCE, THINNED, SAMPLES)
+CASES = (WEIGHTS, NORMALS, LAST, DISTANCE, THINNED, SAMPLES)
