@@ -304,6 +304,22 @@ def _on_grid(preset: RadianceScene) -> RadianceScene:
     return dataclasses.replace(preset, **grid)
 
 
+# Without motion. It starts nearly empty, and what nobody needs stays so; beside a warp
+# the bias empties nothing in a minute. The fine level asks of its own samples alone,
+# and what that saves buys more of both kinds. Blender lego, 100 steps on from one state
+# (1600 steps of 16 + 16 samples), three held-out frames, one busy core:
+#   16 + 16, the fine level sees both   23.56 dB, 71 to 78 ms a step
+#   32 + 16, it sees its own            24.02     58 to 59
+#   24 + 24, it sees its own            24.36     63 to 69
+EMPTIER = {"density_bias": -3.0}
+STILL_NERF_GRID = dataclasses.replace(
+    SMALL_NERF_GRID,
+    steps=6000,
+    sampling=SamplingSpec(24, 24, union=False),
+    template=dataclasses.replace(SMALL_NERF_GRID.template, **EMPTIER),
+    coarse=dataclasses.replace(SMALL_NERF_GRID.coarse, **EMPTIER),
+)
+
 PRESETS = {
     "nerf": NERF,
     "nerf-w": NERF_W,
@@ -323,7 +339,7 @@ PRESETS = {
     "nsff-small": SMALL_NSFF,
     "tineuvox-small": SMALL_TINEUVOX,
     "nerf-ds-small": SMALL_NERF_DS,
-    "nerf-grid-small": SMALL_NERF_GRID,
+    "nerf-grid-small": STILL_NERF_GRID,
     "nerf-w-grid-small": _on_grid(SMALL_NERF_W),
     "d-nerf-grid-small": _on_grid(SMALL_D_NERF),
     "nerfies-grid-small": _on_grid(SMALL_NERFIES),

@@ -246,7 +246,7 @@ def field_step(spec, metadata, draw_batch):
         (value, terms), grads = jax.value_and_grad(loss, has_aux=True)(state.params)
         with jax.numpy_dtype_promotion("standard"):
             updates, moments = adam.update(grads, state.optimiser)
-        now = rate(state.step)
+        now = spec.template_rate * rate(state.step)  # all of it is of the template
         params = jax.tree.map(lambda x, d: x - now * d, state.params, updates)
         state = TrainState(params, moments, (), state.step + 1, state.key)
         return state, {"loss": value, "mse": terms["fine"], **terms}
