@@ -39,8 +39,8 @@ class SurfaceSpec:
     Both count as there: by the weights of the samples, as a mean over samples. What
     differs: a normal is turned by the transpose of the warp's Jacobian, which is exact
     for every warp and the paper's rotation for a rigid one; it learns from the slope of
-    the template's density, which gets none from it; and squares of differences stand
-    for their lengths, which have no slope at zero.
+    the template's density, which gets none from it, nor does the trunk; and squares of
+    differences stand for their lengths, which have no slope at zero.
     """
 
     position: EncodingSpec = EncodingSpec(4)
@@ -99,7 +99,9 @@ def look(
     direction turned to the observation; "slope" is where density falls fastest in the
     template. Both are unit vectors, or zero where there is no direction.
     """
-    head = mlp.affine(params[level], surface.features)
+    # Normals may not bend the density to theirs: within 60 steps of a small run their
+    # slopes through the trunk emptied the scene.
+    head = mlp.affine(params[level], jax.lax.stop_gradient(surface.features))
     observed = unit(surface.turned(unit(head)))
     # Colour may not bend the normals to its liking.
     seen = jax.lax.stop_gradient(observed)
