@@ -225,8 +225,6 @@ SMALL_HYPERNERF = dataclasses.replace(
     ),
     elastic=None,
 )
-# Does not train yet: on the built-in `fast` its density vanishes between steps 25 and
-# 50 (squared error 0.0226, then 0.0525), and why is not known.
 SMALL_NERF_DS = dataclasses.replace(
     SMALL_NERF,
     warp=SMALL_WARP,
