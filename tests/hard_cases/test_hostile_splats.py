@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from gaussians_jax import densification, scene, splats
+from gaussians_jax.growth import AuxState
 from gaussians_jax.initialisation import InitSpec
-from gaussians_jax.scene import AuxState
 from gaussians_jax.spec import effects_of
 from nerfies_jax.capture.capture import PointCloud
 from nerfies_jax.training.model import Frames, Model, TrainState, View
