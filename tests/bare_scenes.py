@@ -48,6 +48,7 @@ LEANS_ON = {
     "elastic": ("warp",),
     "background": ("warp",),
     "mask": ("warp",),
+    "temporal_opacity": ("motion",),
     "alternation": ("motion",),
     "acceleration": ("motion",),
     "neighbours": ("motion",),

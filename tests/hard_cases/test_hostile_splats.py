@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import densification, scene, splats
+from gaussians_jax import densification, growth, scene, splats
 from gaussians_jax.growth import AuxState
 from gaussians_jax.initialisation import InitSpec
 from gaussians_jax.spec import effects_of
@@ -94,7 +94,7 @@ def started_with(prepared: Ready, rows):
     params, rows = prepared.start.params, jax.device_put(rows)
     params = params._replace(rows=params.rows | {"splats": rows})
     aux_state = AuxState(
-        densification.empty_stats(rows), scene.states_of(prepared.effects, params)
+        densification.empty_stats(rows), growth.states_of(prepared.effects, params)
     )
     return prepared.start._replace(params=params, aux_state=aux_state)
 
