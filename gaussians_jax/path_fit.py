@@ -89,14 +89,21 @@ def places_at_one_moment(paths: Paths) -> Float[np.ndarray, "points 3"]:
 
 
 def unrest(
-    turn: Float[Array, "points turn"], shift: Float[Array, "points 3"], unit: float
+    moved: Callable[[Float[Array, ""]], tuple[Array, Array]], unit: float
 ) -> Float[Array, ""]:
-    """How far points are from rest on the mean: turns in rad, shifts in units.
+    """What it costs in a fit that points at rest move, over the film.
 
-    Softened near zero as the distances of `fit` are.
+    `moved(time)` gives their turns [points, any] (rad) and shifts [points, 3]; the
+    latter count in units. Softened near zero as the distances of `fit` are.
     """
-    total = jnp.sum(turn**2, axis=1) + jnp.sum((shift / unit) ** 2, axis=1)
-    return jnp.mean(jnp.sqrt(total + SOFT**2))
+
+    def one(time):
+        turn, shift = moved(time)
+        total = jnp.sum(turn**2, axis=1) + jnp.sum((shift / unit) ** 2, axis=1)
+        return jnp.mean(jnp.sqrt(total + SOFT**2))
+
+    moments = jnp.linspace(0, 1, MOMENTS, dtype=jnp.float32)
+    return REST * jnp.mean(jax.vmap(one)(moments))
 
 
 def combination(

@@ -21,6 +21,7 @@ from gaussians_jax.effects import anchor_motion, deformation
 from gaussians_jax.effects.anchors import AnchorMotionSpec
 from gaussians_jax.effects.motion_basis import BasisMotionSpec
 from gaussians_jax.player import page
+from gaussians_jax.spec import OF_MOTION
 from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation.representation import (
@@ -40,15 +41,7 @@ SMALL_PIXELS = 176 * 132  # for which the counts of the small presets were chose
 # Between these advice chooses by whether anything moves.
 ADVISED = ("splats-static", "splats-tracked", "splats-deformable")
 # Of a scene's spec: the motion, and what is nothing without one.
-MOTION_PARTS = (
-    "motion",
-    "temporal_opacity",
-    "neighbours",
-    "alternation",
-    "acceleration",
-    "motion_growth",
-    "flow",
-)
+MOTION_PARTS = ("motion", "neighbours", *OF_MOTION)
 
 
 def growth(spec: Any, state: TrainState) -> float:

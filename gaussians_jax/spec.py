@@ -76,6 +76,16 @@ EMBEDDED = {
 }
 
 
+# What trains nothing without a motion.
+OF_MOTION = (
+    "temporal_opacity",
+    "alternation",
+    "acceleration",
+    "motion_growth",
+    "flow",
+)
+
+
 @dataclasses.dataclass(frozen=True)
 class SplatScene:
     """Which scene of Gaussians; `None` for an effect means that it is not there."""
@@ -147,14 +157,7 @@ def refuse_what_cannot_train(spec: SplatScene) -> None:
     """
     motion, growth = spec.motion, spec.motion_growth
     if motion is None:
-        named = (
-            "temporal_opacity",
-            "alternation",
-            "acceleration",
-            "motion_growth",
-            "flow",
-        )
-        orphans = [name for name in named if getattr(spec, name) is not None]
+        orphans = [name for name in OF_MOTION if getattr(spec, name) is not None]
         orphans += ["start.motion"] if spec.start.motion == "tracks" else []
         if orphans:
             raise ValueError(

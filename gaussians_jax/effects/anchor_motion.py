@@ -141,17 +141,16 @@ def fit_to_paths(
     rows_key, nets_key, rest_key = jax.random.split(key, 3)
     points = jnp.asarray(path_fit.places_at_one_moment(paths), jnp.float32)
     rest = init_features(rest_key, spec, RESTING)
-    moments = jnp.linspace(0, 1, path_fit.MOMENTS, dtype=jnp.float32)
 
     def penalty(points):
         net = points.nets
 
-        def unrest(time):
+        def moved(time):
             code = codes.at_time(net.times, time)
             by = offsets(net.coarse, coarse_spec(spec), rest.reference, code)
-            return path_fit.unrest(by.turn, by.position, paths.unit)
+            return by.turn, by.position
 
-        return path_fit.REST * jnp.mean(jax.vmap(unrest)(moments))
+        return path_fit.unrest(moved, paths.unit)
 
     rows = init_features(rows_key, spec, len(points))
     start = Points(points, rows, init(nets_key, spec, frames))

@@ -243,14 +243,13 @@ def fit_to_paths(spec: MotionSpec, paths: Paths, key: Key[Array, ""]) -> Guess:
         return Guess(start, rates)
     chosen = np.random.default_rng(0).permutation(len(paths.still))[:RESTING]
     still = jnp.asarray(paths.still[chosen], jnp.float32)
-    moments = jnp.linspace(0, 1, path_fit.MOMENTS, dtype=jnp.float32)
 
     def penalty(points):
-        def unrest(time):
+        def moved(time):
             offsets = deform(points.nets, spec, still, time)
-            return path_fit.unrest(offsets.quaternion, offsets.mean, paths.unit)
+            return offsets.quaternion, offsets.mean
 
-        return path_fit.REST * jnp.mean(jax.vmap(unrest)(moments))
+        return path_fit.unrest(moved, paths.unit)
 
     return Guess(start, rates, penalty)
 

@@ -277,7 +277,6 @@ def fit_to_paths(
     at_rest = slice(len(moving_nodes), len(moving_nodes) + len(resting))
     if spec.mask is not None:
         nodes = nodes._replace(mask=nodes.mask.at[at_rest].set(spec.mask.still))
-    moments = jnp.linspace(0, 1, MOMENTS, dtype=jnp.float32)
 
     def penalty(points):
         every = points.nets
@@ -285,11 +284,11 @@ def fit_to_paths(
         if every.mask is not None:
             those = those._replace(mask=every.mask[at_rest])
 
-        def unrest(time):
+        def moved(time):
             now = moves(those, spec, extent, time)
-            return path_fit.unrest(now.turn[:, 1:], now.shift, unit)
+            return now.turn[:, 1:], now.shift
 
-        return path_fit.REST * jnp.mean(jax.vmap(unrest)(moments))
+        return path_fit.unrest(moved, unit)
 
     start = Points(jnp.asarray(canonical, jnp.float32), None, nodes)
     mask = None if spec.mask is None else 1.0

@@ -22,6 +22,7 @@ from gaussians_jax.path_fit import Guess, Paths
 from gaussians_jax.splats import Gaussians, Params, Splats
 from nerfies_jax.training import schedules
 from nerfies_jax.training.effects import Effect, FrameCondition
+from nerfies_jax.training.fit import check_positive
 from nerfies_jax.training.step_counts import steps
 
 NAME = "polynomial_motion"
@@ -40,10 +41,7 @@ class FadingSpec:
     time_rate: float = 1e-4  # of the time of its own, in films
 
     def __post_init__(self):
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            if not 0 < value < math.inf:
-                raise ValueError(f"{field.name}={value} must be positive and finite")
+        check_positive(**dataclasses.asdict(self))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,8 +63,7 @@ class PolynomialMotionSpec:
             )
         if self.warm_up < 0:
             raise ValueError(f"warm_up={self.warm_up} must not be negative")
-        if not 0 < self.turn_rate < math.inf:
-            raise ValueError(f"turn_rate={self.turn_rate} must be positive and finite")
+        check_positive(turn_rate=self.turn_rate)
         schedules.check_falling(self.learning_rate, self.learning_rate_end)
 
 

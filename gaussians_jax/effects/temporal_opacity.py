@@ -1,7 +1,7 @@
 """Gaussians that are there for a part of the film only.
 
-The temporal opacity of Spacetime Gaussians (Li et al. 2024, arXiv:2312.16812, equation
-7) by itself, beside any motion: what turns its back on the camera need not be the same
+The temporal opacity of Spacetime Gaussians (Li et al. 2024, arXiv:2312.16812) by
+itself, beside any motion: what turns its back on the camera need not be the same
 Gaussians as what it shows then, and a track that is lost need not be found again. One
 that was lifted from a moving pixel is first seen around the time of that picture, for
 about as long as tracks there were followed; any other one all the time, until training
@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, Key
 
 from gaussians_jax.splats import Gaussians, Params, Splats
 from nerfies_jax.training.effects import Effect, FrameCondition
+from nerfies_jax.training.fit import check_positive
 
 NAME = "temporal_opacity"
 # Of the width of the opacity over time, in films: from a ten-thousandth to longer than
@@ -39,10 +40,7 @@ class TemporalOpacitySpec:
     time_rate: float = 1e-3  # of the time of its own, in films
 
     def __post_init__(self):
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            if not 0 < value < math.inf:
-                raise ValueError(f"{field.name}={value} must be positive and finite")
+        check_positive(**dataclasses.asdict(self))
 
 
 class Fading(NamedTuple):
