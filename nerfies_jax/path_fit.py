@@ -95,14 +95,9 @@ def fit(
         raise ValueError("no path is known anywhere: nothing to fit a warp to")
     distances = _distances(field, params, paths)
     frames, points = len(paths.time), len(paths.known)
-    together = min(FRAMES_AT_ONCE, frames)
 
     def loss(free, key):
-        frame_key, row_key, still_key = jax.random.split(key, 3)
-        chosen = jax.random.choice(frame_key, frames, (together,), replace=False)
-        rows = jax.random.randint(row_key, (POINTS_AT_ONCE,), 0, points)
-        still = _some(paths.still, still_key)
-        return sum(distances(*free, chosen, rows, still))
+        return sum(distances(*free, *_drawn(paths, frames, key)))
 
     @jax.jit
     def mean_distance(free):
@@ -167,14 +162,10 @@ def fit_flow(
     unit = max(float(np.linalg.norm(shift, axis=-1)[both].mean()), 1e-12)
     away = _flow_distances(field, paths, shift, both)
     frames, points = len(moments), len(paths.known)
-    together = min(FRAMES_AT_ONCE, frames)
 
     def loss(own, key):
-        frame_key, row_key, still_key = jax.random.split(key, 3)
-        chosen = jax.random.choice(frame_key, frames, (together,), replace=False)
-        rows = jax.random.randint(row_key, (POINTS_AT_ONCE,), 0, points)
-        still = _some(paths.still, still_key)
-        return sum(away(own, chosen, rows, still, SOFT_FLOW * unit)) / unit
+        drawn = _drawn(paths, frames, key)
+        return sum(away(own, *drawn, SOFT_FLOW * unit)) / unit
 
     @jax.jit
     def mean_distance(own):
@@ -211,10 +202,7 @@ def _flow_distances(field, paths, shift, both):
             moving = (_length(ahead - goal, soft) + _length(back + goal, soft)) / 2
             return moving, _length(flow(still, time[frame]), soft)
 
-        moving, resting = jax.vmap(one)(frames)
-        counted = weight[frames][:, rows]
-        total = jnp.sum(moving * counted) / jnp.maximum(jnp.sum(counted), 1)
-        return total, jnp.sum(resting) / max(resting.size, 1)
+        return _means(*jax.vmap(one)(frames), weight[frames][:, rows])
 
     return away
 
@@ -243,10 +231,7 @@ def _distances(field, params, paths):
             gap = here + jax.vmap(moved)(here) - canonical[rows]
             return _length(gap), _length(jax.vmap(moved)(still))
 
-        moving, resting = jax.vmap(one)(frames)
-        counted = weight[frames][:, rows]
-        total = jnp.sum(moving * counted) / jnp.maximum(jnp.sum(counted), 1)
-        return total, jnp.sum(resting) / max(resting.size, 1)
+        return _means(*jax.vmap(one)(frames), weight[frames][:, rows])
 
     return distances
 
@@ -255,10 +240,22 @@ def _length(gap, soft=SOFT):
     return jnp.sqrt(jnp.sum(gap**2, axis=-1) + soft**2)
 
 
-def _some(still, key):
-    if not len(still):
-        return jnp.zeros((0, 3), still.dtype)
-    return jnp.asarray(still)[jax.random.randint(key, (STILL_AT_ONCE,), 0, len(still))]
+def _drawn(paths, frames, key):
+    """What a step looks at: some of the frames, rows of points, and points at rest."""
+    frame_key, row_key, still_key = jax.random.split(key, 3)
+    together = min(FRAMES_AT_ONCE, frames)
+    chosen = jax.random.choice(frame_key, frames, (together,), replace=False)
+    rows = jax.random.randint(row_key, (POINTS_AT_ONCE,), 0, len(paths.known))
+    still = jnp.asarray(paths.still)
+    if len(still):
+        still = still[jax.random.randint(still_key, (STILL_AT_ONCE,), 0, len(still))]
+    return chosen, rows, still
+
+
+def _means(moving, resting, counted):
+    """Means of distances: of points where they are counted, and of those at rest."""
+    total = jnp.sum(moving * counted) / jnp.maximum(jnp.sum(counted), 1)
+    return total, jnp.sum(resting) / max(resting.size, 1)
 
 
 def _first_places(paths):
