@@ -157,6 +157,88 @@ def fit_to_paths(
     return Guess(start, Points(paths.unit, 1.0, 0.4), penalty)
 
 
+def features_of(
+    spec: AnchorMotionSpec, scene: Params, condition: FrameCondition | None
+) -> Features:
+    """Features as they are read: with noise in training, kept afterwards."""
+    own, net = scene.rows[NAME], scene.nets[NAME]
+    if spec.rate is None:
+        return own
+    if condition is None or condition.step is None:
+        return kept(own, net.law, spec)
+    key = jax.random.fold_in(condition.key, stream(NAME))
+    return jax.lax.cond(
+        condition.step < spec.rate.start,
+        lambda own, law: own,
+        lambda own, law: noised(key, own, law),
+        own,
+        net.law,
+    )
+
+
+def _moved(spec, scene, gaussians, condition, _):
+    """The seam `deform`: anchors moved coarsely."""
+    net = scene.nets[NAME]
+    code = codes.at_time(net.times, condition.time)
+    by = in_blocks(
+        lambda reads: offsets(net.coarse, coarse_spec(spec), reads, code),
+        (features_of(spec, scene, condition).reference,),
+        splats.active_mask(scene.rows["splats"]),
+        spec.block,
+    )
+    return kan_motion.apply(gaussians, by)
+
+
+def _derive_rows(spec, scene, condition):
+    """The seam `derive_rows`: what anchors carry at rest, and what it was made of."""
+    features = features_of(spec, scene, condition)
+    rows = scene.rows["splats"]
+    own = made(scene.nets[NAME], spec, features, rows.sh_rest.shape[1])
+    return carried.at_rest(rows, own), (own, features)
+
+
+def _derive(spec, scene, derived, rows, condition):
+    """The seam `derive`: what anchors carry, moved finely once the warm-up is over."""
+    net = scene.nets[NAME]
+    if not spec.moves:
+        return posed(net, spec, derived, rows, None)
+    code = codes.at_time(net.times, condition.time)
+    if not spec.warm_up or condition.step is None:
+        return posed(net, spec, derived, rows, code)
+    return jax.lax.cond(
+        condition.step < spec.warm_up,
+        lambda net, derived, rows: posed(net, spec, derived, rows, None),
+        lambda net, derived, rows: posed(net, spec, derived, rows, code),
+        net,
+        derived,
+        rows,
+    )
+
+
+def penalty(
+    spec: AnchorMotionSpec, _: Anchors, context: PenaltyContext
+) -> dict[str, Term]:
+    """Bits of a number of the features, on the mean; none before rounding starts."""
+    scene = context.params
+    active = splats.active_mask(scene.rows["splats"])
+    numbers = spec.reference + spec.count * spec.residual
+
+    def evaluate(scene):
+        features = features_of(spec, scene, context.condition)
+        first, others = bits(features, scene.nets[NAME].law, spec)
+        total = jnp.sum(first, axis=1) + jnp.sum(others, axis=(1, 2))
+        count = jnp.maximum(jnp.sum(active), 1) * numbers
+        return jnp.sum(jnp.where(active, total, 0)) / count.astype(total.dtype)
+
+    value = jax.lax.cond(
+        context.step < spec.rate.start,
+        lambda scene: jnp.zeros((), scene.rows["splats"].mean.dtype),
+        evaluate,
+        scene,
+    )
+    return {"bits": Term(value, spec.rate.weight)}
+
+
 def effect(spec: AnchorMotionSpec, run_steps: int, frames: int) -> Effect:
     """The seams that this motion fills, for a run of so many steps over `frames`."""
 
@@ -171,85 +253,6 @@ def effect(spec: AnchorMotionSpec, run_steps: int, frames: int) -> Effect:
         moving, of_law = move(step), None if law is None else law(step)
         return Anchors(moving, make(step), moving, moving, of_law)
 
-    def features_of(scene, condition):
-        """As they are read: with noise in training, kept afterwards."""
-        own, net = scene.rows[NAME], scene.nets[NAME]
-        if spec.rate is None:
-            return own
-        if condition is None or condition.step is None:
-            return kept(own, net.law, spec)
-        key = jax.random.fold_in(condition.key, stream(NAME))
-        return jax.lax.cond(
-            condition.step < spec.rate.start,
-            lambda own, law: own,
-            lambda own, law: noised(key, own, law),
-            own,
-            net.law,
-        )
-
-    def moved(
-        scene: Params, gaussians: Gaussians, condition: FrameCondition, _
-    ) -> Gaussians:
-        net = scene.nets[NAME]
-        code = codes.at_time(net.times, condition.time)
-        active = splats.active_mask(scene.rows["splats"])
-        by = in_blocks(
-            lambda reads: offsets(net.coarse, coarse_spec(spec), reads, code),
-            (features_of(scene, condition).reference,),
-            active,
-            spec.block,
-        )
-        return kan_motion.apply(gaussians, by)
-
-    def derive_rows(
-        scene: Params, condition: FrameCondition | None
-    ) -> tuple[Splats, tuple[Carried, Features]]:
-        features = features_of(scene, condition)
-        rows = scene.rows["splats"]
-        own = made(scene.nets[NAME], spec, features, rows.sh_rest.shape[1])
-        return carried.at_rest(rows, own), (own, features)
-
-    def derive(
-        scene: Params,
-        derived: tuple[Splats, tuple[Carried, Features]],
-        rows: Gaussians,
-        condition: FrameCondition,
-    ) -> Gaussians:
-        net = scene.nets[NAME]
-        if not spec.moves:
-            return posed(net, spec, derived, rows, None)
-        code = codes.at_time(net.times, condition.time)
-        if not spec.warm_up or condition.step is None:
-            return posed(net, spec, derived, rows, code)
-        return jax.lax.cond(
-            condition.step < spec.warm_up,
-            lambda net, derived, rows: posed(net, spec, derived, rows, None),
-            lambda net, derived, rows: posed(net, spec, derived, rows, code),
-            net,
-            derived,
-            rows,
-        )
-
-    def penalty(net: Anchors, context: PenaltyContext) -> dict[str, Term]:
-        scene = context.params
-        active = splats.active_mask(scene.rows["splats"])
-
-        def evaluate(scene):
-            features = features_of(scene, context.condition)
-            first, others = bits(features, scene.nets[NAME].law, spec)
-            total = jnp.sum(first, axis=1) + jnp.sum(others, axis=(1, 2))
-            count = jnp.maximum(jnp.sum(active), 1) * numbers
-            return jnp.sum(jnp.where(active, total, 0)) / count.astype(total.dtype)
-
-        numbers = spec.reference + spec.count * spec.residual
-        value = jax.lax.cond(
-            context.step < spec.rate.start,
-            lambda scene: jnp.zeros((), scene.rows["splats"].mean.dtype),
-            evaluate,
-            scene,
-        )
-        return {"bits": Term(value, spec.rate.weight)}
-
     return Effect(
         name=NAME,
         init_rows=lambda key, rows: init_features(
@@ -259,10 +262,10 @@ def effect(spec: AnchorMotionSpec, run_steps: int, frames: int) -> Effect:
         row_learning_rate=falling(spec, "feature_rate"),
         learning_rate=rates,
         warm_up=spec.warm_up,
-        deform=moved if spec.moves else None,
-        derive_rows=derive_rows,
-        derive=derive,
+        deform=functools.partial(_moved, spec) if spec.moves else None,
+        derive_rows=functools.partial(_derive_rows, spec),
+        derive=functools.partial(_derive, spec),
         significance=significance,
-        penalty=None if spec.rate is None else penalty,
+        penalty=None if spec.rate is None else functools.partial(penalty, spec),
         fit_to_paths=functools.partial(fit_to_paths, spec, frames),
     )
