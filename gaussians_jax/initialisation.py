@@ -47,6 +47,7 @@ class InitSpec:
 class StartSpec(TrackStartSpec):
     """How a scene of Gaussians that moves starts."""
 
+    fit_steps: int = 3000
     fit_rate: float = 5e-3
     moving_points: int = 3000  # Gaussians lifted from moving pixels
 

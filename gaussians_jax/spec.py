@@ -178,6 +178,13 @@ def refuse_what_cannot_train(spec: SplatScene) -> None:
             "DefaultStrategySpec, or leave out what they carry (carried=none, or "
             "another motion than that of anchors)"
         )
+    if carry and spec.temporal_opacity is not None:
+        raise ValueError(
+            "temporal_opacity fades rows, and of rows that carry Gaussians only these "
+            "are drawn, with opacities of their own; leave it out "
+            "(temporal_opacity=none), or leave out what they carry (carried=none, or "
+            "another motion than that of anchors)"
+        )
     if growth is not None and not isinstance(spec.densification, DefaultStrategySpec):
         raise ValueError(
             "motion_growth steers the gradient threshold of DefaultStrategySpec, which "
