@@ -4,10 +4,11 @@
     python -m experiments.field_speed --captures CAPTURE --presets nerf-grid-small
     python -m experiments.field_speed --captures CAPTURE --seeds 3
 
-Each preset is trained on each capture, once for each seed, its schedules as they are,
-and stops at each of the given processor seconds to be scored on frames that it does not
-learn from; compiling counts nothing. At the end a frame is drawn behind the survey of
-its empty space (`nerfies_jax.skipping`) and by the full quadrature: milliseconds are
+Each preset is trained on each capture, once for each seed and each of the given
+processor seconds, over the steps that it can make in them, its schedules in proportion,
+and scored on frames that it does not learn from; compiling counts nothing, nor does a
+start from tracks. After the longest a frame is drawn behind the survey of its empty
+space (`nerfies_jax.skipping`) and by the full quadrature: milliseconds are
 medians of the processor over five frames, without the survey, which has a column of its
 own, and decibels are of the difference between the two. Over several seeds the table
 has means, and beside a PSNR its standard deviation. What is in `--out` already is not
@@ -28,6 +29,7 @@ from nerfies_jax.runs import platform, representations
 PRESETS = ("nerf-small", "nerf-grid-small", "nerfies-small", "nerfies-grid-small")
 FRAMES = 5  # timed, after one that makes the survey
 TIMES = ("skipped_ms", "full_ms", "survey_ms")
+PILOT_SECONDS = 3.0  # of the steps that tell what one takes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +41,7 @@ class FieldSpeed:
     presets: tuple[str, ...] = PRESETS
     """Small radiance fields."""
     seconds: tuple[float, ...] = (60.0, 120.0, 300.0)
-    """Of the processor, rising, after which each is scored."""
+    """Of the processor, rising: a training for each."""
     size: tuple[int, int] = (256, 192)
     """Of the frames that are timed, pixels."""
     seeds: int = 1
@@ -93,30 +95,47 @@ def _captures(folders):
 
 
 def measured(capture, preset: str, seconds, size: tuple[int, int], seed: int) -> dict:
-    """Scores at each of the seconds, and what a frame takes after the last."""
+    """Scores after each of the seconds, and what a frame takes after the last."""
+    from nerfies_jax import evaluation
+    from nerfies_jax.runs import plan
+
+    representation = representations.of_preset(preset)
+    spec = representation.presets[preset]
+    a_step, _, _ = _trained(capture, preset, spec, seed, PILOT_SECONDS)
+    scores, steps, spent = [], [], []
+    for limit in seconds:
+        one = representation.with_steps(spec, plan.rounded(limit / a_step))
+        took, model, state = _trained(capture, preset, one, seed)
+        renderer = evaluation.Renderer(model, capture.size)
+        scored = evaluation.score(renderer, state, capture, capture.heldout)
+        scores.append(float(scored.psnr.mean()))
+        steps.append(one.steps)
+        spent.append(took * one.steps)
+    found = {"psnr": scores, "steps": steps, "spent": spent}
+    return found | drawn(model, state, capture, size)
+
+
+def _trained(capture, preset, spec, seed, pilot=math.inf):
+    """Processor seconds of a step, the model, and its state after the spec's steps.
+
+    Or after the first `pilot` seconds: then of the steps made by then.
+    """
     import jax
 
     from nerfies_jax import evaluation
     from nerfies_jax.training import chunk
 
     representation = representations.of_preset(preset)
-    spec = representation.presets[preset]
     model = representation.build(spec, representation.metadata_of(capture, spec))
     state = model.init(capture, jax.random.key(seed))
     frames = evaluation.frames_of(capture, model.required_data)
     program, _ = chunk.program(model.step, state, frames, spec.steps, model.devices)
     program.prepare(program.length)
-    renderer = evaluation.Renderer(model, capture.size)
-    scores, steps, spent = [], [], 0.0
-    for limit in seconds:
-        while spent < limit and int(state.step) < spec.steps:
-            began = time.process_time()
-            state, _ = program(state, frames, program.length)  # waits
-            spent += time.process_time() - began
-        scored = evaluation.score(renderer, state, capture, capture.heldout)
-        scores.append(float(scored.psnr.mean()))
-        steps.append(int(state.step))
-    return {"psnr": scores, "steps": steps} | drawn(model, state, capture, size)
+    done, began = 0, time.process_time()
+    while done < spec.steps and time.process_time() - began < pilot:
+        state, outcome = program(state, frames, min(program.length, spec.steps - done))
+        done += max(int(outcome.done), 1)  # waits; fewer where one is not finite
+    return (time.process_time() - began) / done, model, state
 
 
 def drawn(model, state, capture, size: tuple[int, int]) -> dict:
