@@ -6,7 +6,7 @@
 Trains the small static NeRF with and without the effect, for the same steps, on a still
 life of which the truth is known. `exposure`: brightness drifts; held-out instants have
 exposures never seen, so codes are fitted to the left half of a frame and the right half
-is scored (Martin-Brualla et al. 2021, section 5). `transient`: a post passes before the
+is scored (Martin-Brualla et al. 2021). `transient`: a post passes before the
 camera; frames it is in are rendered without it and compared with the same scene filmed
 without it, where it stood and elsewhere.
 """

@@ -280,7 +280,8 @@ def split_rows(
 def halve_opacity(logit: Float[Array, " n"]) -> Float[Array, " n"]:
     """The logit of 1 - sqrt(1 - o): two such in a row hide as much as one of o.
 
-    Rota Bulò et al. 2024, arXiv:2404.06109, section 3.4.
+    The correction of opacities after cloning of Rota Bulò et al. 2024,
+    arXiv:2404.06109.
     """
     faint = logit < FAINT_LOGIT
     # l - log 2 - e^l / 4: off by e^2l. The closed form is log 0 from -88 in float32.

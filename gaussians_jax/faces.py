@@ -1,6 +1,6 @@
 """Gaussians as triangles, and triangles as Gaussians: to see and edit them as a mesh.
 
-GaMeS (Waczynska et al. 2024, arXiv:2402.01459), as D-MiSo uses it (arXiv:2405.14276,
+GaMeS (Waczyńska et al. 2024, arXiv:2402.01459), as D-MiSo uses it (arXiv:2405.14276,
 section 3): the first corner is the mean, the other two are where the second and the
 third axis end. The first scale, across the face, is not in a triangle (there it is
 tiny and fixed) and goes beside it.

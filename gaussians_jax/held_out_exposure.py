@@ -1,7 +1,7 @@
 """Exposures of frames that were never learnt from, fitted to half of each.
 
-The protocol of NeRF-W (Martin-Brualla et al. 2021, section 5), as for the codes of
-fields: the scene stays as it is, and the other half is scored.
+The protocol of NeRF-W (Martin-Brualla et al. 2021), as for the codes of fields: the
+scene stays as it is, and the other half is scored.
 """
 
 import dataclasses

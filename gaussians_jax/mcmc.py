@@ -263,7 +263,10 @@ def shake(
 
 
 def penalty(rows: Splats, spec: MCMCStrategySpec) -> Float[Array, ""]:
-    """Opacities and scales cost their mean over the active rows (section 3.4)."""
+    """Opacities and scales cost their mean over the active rows.
+
+    Equation 10 of the paper has sums; means are what its code has.
+    """
     drawn = splats.activate(rows)
     active = splats.active_mask(rows)
     count = jnp.maximum(jnp.sum(active), 1).astype(drawn.opacity.dtype)

@@ -77,7 +77,7 @@ def scale_by_row_radam(
 def moment_length(updates: Float[Array, "*rows"], b2: float) -> Float[Array, "*rows"]:
     """How many gradients the second moment stands for after so many updates.
 
-    rho_t = rho_inf - 2 t b2^t / (1 - b2^t) with rho_inf = 2 / (1 - b2) - 1, equation 8
+    rho_t = rho_inf - 2 t b2^t / (1 - b2^t) with rho_inf = 2 / (1 - b2) - 1, algorithm 2
     of Liu et al. 2020, for t = `updates` >= 1. From 1 it rises to rho_inf.
     """
     # With L = -log b2 and h(x) = x coth x - 1 it is t - (2 / L) (h(tL/2) - h(L/2)).

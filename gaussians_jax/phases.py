@@ -1,8 +1,8 @@
 """When what is trained: alternating updates and the annealing of the positions.
 
-MoBa-GS, section 3.6 and equation 8. All are functions of a traced step, so that a chunk
-of any length is one program. The phase before them, a warm-up without motion, belongs
-to each motion: `Effect.warm_up`.
+MoBa-GS, sections 3.6 and 3.5 (equation 8). All are functions of a traced step, so that
+a chunk of any length is one program. The phase before them, a warm-up without motion,
+belongs to each motion: `Effect.warm_up`.
 """
 
 import dataclasses

@@ -54,7 +54,7 @@ def project(
 ) -> Footprints:
     """Footprints in an image of `size` (width, height) for one undistorted camera.
 
-    Zwicker et al. 2002 (EWA splatting), equations 23-31: the covariance is T T^t +
+    Zwicker et al. 2002 (EWA splatting), equations 29 and 31: the covariance is T T^t +
     dilation with T = J W R diag(scale); neither the 3D covariance nor its determinant
     is formed. The tangents x/z and y/z are clamped in J alone, to the image widened by
     `spec.tangent_margin` half images. Lens distortion is not modelled: undistort first.

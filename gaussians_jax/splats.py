@@ -208,10 +208,10 @@ def from_points(
 
     `points` [n, 3] in scene units and `colours` [n, 3] in [0, 1]. The standard
     deviation is `scale` times the root mean square distance to the three nearest points
-    that lie elsewhere (Kerbl et al. 2023, section 5.1, counts a duplicate as a
-    neighbour at distance zero and floors the result at 3e-4 whatever the unit). With
-    two or three distinct points it uses those there are; where there is one,
-    `lone_scale` is that distance.
+    that lie elsewhere (Kerbl et al. 2023, section 5.1, says the mean distance; their
+    code counts a duplicate as a neighbour at distance zero and floors the result at
+    3e-4 whatever the unit). With two or three distinct points it uses those there are;
+    where there is one, `lone_scale` is that distance.
     """
     refuse_half(dtype)
     points = np.asarray(points, np.float64)

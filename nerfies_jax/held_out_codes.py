@@ -1,7 +1,7 @@
 """Appearance codes of frames that were never learnt from, fitted to half of each.
 
-The protocol of NeRF-W (Martin-Brualla et al. 2021, section 5): the network stays as it
-is, the code is fitted to the left half of a frame, and the right half is scored.
+The protocol of NeRF-W (Martin-Brualla et al. 2021): the network stays as it is, the
+code is fitted to the left half of a frame, and the right half is scored.
 """
 
 from typing import Any

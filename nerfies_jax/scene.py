@@ -269,7 +269,7 @@ def _colour_terms(levels: tuple[RayOutput, ...], batch: Batch) -> dict[str, Term
             last.colour, batch.colour, last.beta, batch.valid
         )
         terms = {"fine": Term(mse, None), "colour": Term(likelihood, 1.0)}
-        coarse_weight = 1.5  # NeRF-W, equation 13: half of the sum over channels
+        coarse_weight = 1.5  # as in NeRF-W: half of the sum over channels
     if len(levels) > 1:
         coarse = losses.mse(levels[0].colour, batch.colour, batch.valid)
         terms["coarse"] = Term(coarse, coarse_weight)

@@ -261,7 +261,7 @@ B1, B2 = 0.9, 0.999
 
 
 def _length_as_printed(x):
-    """Equation 8 of Liu et al. 2020."""
+    """Algorithm 2 of Liu et al. 2020."""
     seen = constant(B2, x.dtype) ** x
     return 2 / (1 - B2) - 1 - 2 * x * seen / (1 - seen)
 

@@ -1,9 +1,9 @@
 """What hardly moves shall not move at all; what moves is free.
 
-MoBa-GS, section 3.3.4, speaks of an acceleration penalty that decays exponentially for
-moving points and gives no formula. This one has the second difference in time of
-SC-GS, arXiv:2312.14937, with a weight that falls with the distance from the canonical
-place, and the first difference beside it.
+MoBa-GS, section 3.3 ("intrinsic structural prior"), speaks of an acceleration penalty
+that decays exponentially for moving points and gives no formula. This one has the
+second difference in time of SC-GS, arXiv:2312.14937, with a weight that falls with the
+distance from the canonical place, and the first difference beside it.
 """
 
 import dataclasses

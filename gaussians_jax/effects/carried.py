@@ -1,7 +1,7 @@
 """Gaussians that rows carry: each row is a core, and what is drawn moves with it.
 
-D-MiSo (Waczynska et al. 2024, NeurIPS, arXiv:2405.14276, "Multi-Gaussian soup"): a core
-Gaussian carries k sub-Gaussians in its own coordinates (its equation 2), and these
+D-MiSo (Waczyńska et al. 2024, NeurIPS, arXiv:2405.14276, "Multi-Gaussians soup"): a
+core Gaussian carries k sub-Gaussians in its own coordinates (its equation 2), and these
 alone are drawn. A motion moves the cores; a second network, the paper's Sub-Rot, turns
 what they carry. A core moved by hand takes what it carries along (`posed`), and a core
 is a triangle as well (`gaussians_jax.faces`).
@@ -65,9 +65,10 @@ def network_spec(spec: TurnSpec) -> MLPSpec:
 class CarriedSpec:
     """How many Gaussians a row carries, where they start, and how fast they learn.
 
-    25 is the paper's number; it starts all of them in the middle of the core, where
-    slopes alone tell them apart, and as large as it. Rates are those of its code, of
-    offsets in scales of the core.
+    25 is the paper's number; its code starts all of them in the middle of the core,
+    where slopes alone tell them apart, and as large as it. Rates are those of its code
+    but for that of offsets, which there are in scene units and have 1e-3, and that of
+    the higher harmonics, which there learn as fast as the first.
     """
 
     count: int = 25

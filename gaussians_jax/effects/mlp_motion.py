@@ -220,7 +220,7 @@ def smooth_time(
 ) -> Float[Array, ""]:
     """The time with noise that fades linearly to none at `spec.steps`.
 
-    Equation 5 of the paper, whose interval between frames is 1 / `frames`. The
+    Equation 6 of the paper, whose interval between frames is 1 / `frames`. The
     published code divides by the number of frames not yet drawn in the epoch, so its
     interval grows to 1 within every epoch: 26 times the intended noise in the root mean
     square at 400 frames. Here it is the paper's.

@@ -1,9 +1,9 @@
 """Film of high dynamic range (HLG, PQ) as 8-bit sRGB, the same curve for every frame.
 
 Nothing adapts to a frame: what has one brightness in two frames keeps one colour. White
-paper is at 203 nits (ITU-R BT.2408-7, table 1), which is where sRGB ends here; what is
-darker than half of that keeps its brightness, and what is brighter is rolled off, up to
-1000 nits. The packages of ffmpeg that do this (zscale) are not in PyAV's.
+paper is at 203 nits (ITU-R BT.2408), which is where sRGB ends here; what is darker than
+half of that keeps its brightness, and what is brighter is rolled off, up to 1000 nits.
+The packages of ffmpeg that do this (zscale) are not in PyAV's.
 """
 
 import functools
@@ -16,7 +16,7 @@ Transfer = Literal["HLG", "PQ"]
 TRANSFERS: dict[int, Transfer] = {16: "PQ", 18: "HLG"}
 BRIGHTEST_NITS, WHITE_NITS = 1000.0, 203.0
 CODES = 2**16
-# ITU-R BT.2087-0, section 3: linear BT.2020 to linear BT.709, which sRGB shares.
+# ITU-R BT.2087-0: linear BT.2020 to linear BT.709, which sRGB shares.
 _TO_SRGB = np.array(
     [
         [1.6605, -0.5876, -0.0728],

@@ -3,7 +3,7 @@
 HyperNeRF (Park et al. 2021, arXiv:2106.13228, section 4): a topology that changes, a
 mouth that opens, is no warp of one template in space, but may be a slice of one in
 space and a few ambient dimensions. A *bent* surface lets each observed point have its
-own ambient coordinates (equation 8); the axis-aligned *plane* has one for the frame.
+own ambient coordinates (equation 6); the axis-aligned *plane* has one for the frame.
 """
 
 import dataclasses

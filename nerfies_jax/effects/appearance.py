@@ -1,9 +1,9 @@
 """A learnt code for each exposure, which colour reads and density does not.
 
-NeRF-W (Martin-Brualla et al. 2021, arXiv:2008.02268, equation 7) gives each photograph
-a code (GLO, Bojanowski et al. 2018) that says how light, exposure and white balance
-were; Nerfies (Park et al. 2021, arXiv:2011.12948, section 3) takes it over. Geometry
-is the same under all codes, because only the colour branch gets them.
+NeRF-W (Martin-Brualla et al. 2021, arXiv:2008.02268, "latent appearance modeling")
+gives each photograph a code (GLO, Bojanowski et al. 2018) that says how light, exposure
+and white balance were; Nerfies (Park et al. 2021, arXiv:2011.12948, section 3.1) takes
+it over. Geometry is the same under all codes, because only the colour branch gets them.
 
 In the official Nerfies code the codes are dead: its colour branch asks for another
 switch, and under the published presets their gradient is exactly zero.

@@ -1,7 +1,7 @@
 """The background stays put: points known to be static must not be moved by the warp.
 
-Park et al. 2021 (Nerfies), arXiv:2011.12948, equation 14: without it the warp and the
-template may drift together, which no image tells.
+Park et al. 2021 (Nerfies), arXiv:2011.12948, "background regularization": without it
+the warp and the template may drift together, which no image tells.
 """
 
 import dataclasses
@@ -22,7 +22,7 @@ class BackgroundSpec:
     `noise` (standard deviation) and `width` are in units of the field, whose box is the
     filmed volume: the official code's scenes are scaled to fill one of diagonal one.
     `width` is the displacement at which ρ leaves the parabola. The official scaling is
-    the default: its weight of one is 1e-3 of what equation 14 with ρ of `losses` says.
+    the default: its weight of one is 1e-3 of what the paper's ρ (`losses`) would say.
 
     A scene of a capture without static points is refused when it is built.
     """

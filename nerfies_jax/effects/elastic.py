@@ -1,8 +1,8 @@
 """Elastic regularisation: surfaces may move and turn, but stretching costs.
 
-Park et al. 2021 (Nerfies), arXiv:2011.12948, equations 11-13: Σ log²σ over the singular
-values of the warp's Jacobian, made robust, summed along each ray with the weights it is
-rendered with.
+Park et al. 2021 (Nerfies), arXiv:2011.12948, "elastic regularization": Σ log²σ over the
+singular values of the warp's Jacobian, made robust, summed along each ray with the
+weights it is rendered with.
 """
 
 import dataclasses

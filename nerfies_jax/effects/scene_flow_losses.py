@@ -1,7 +1,7 @@
 """The terms of neural scene flow fields, each a function of arrays alone.
 
-Li et al. 2021, arXiv:2011.13084, section 4, as settled by the public code. Rays without
-a neighbouring moment are counted out by `present`; a mean over nothing is zero.
+Li et al. 2021, arXiv:2011.13084, as settled by the public code. Rays without a
+neighbouring moment are counted out by `present`; a mean over nothing is zero.
 """
 
 import jax
@@ -52,9 +52,9 @@ def warped(
 ) -> Scalar:
     """Squared error of a neighbour's colours brought here, where it shows the same.
 
-    Equations 9 and 10: rays count by their composited `visible`, 1 - disocclusion. The
-    weights of compositing are held fixed there: density is to explain colour, not to
-    make rays count less.
+    Rays count by their composited `visible`, 1 - disocclusion. The weights of
+    compositing are held fixed there: density is to explain colour, not to make rays
+    count less.
     """
     seen = jnp.sum(jax.lax.stop_gradient(weight) * visible, axis=-1)
     return weighted_mean(jnp.square(colour - target), mask * seen)
@@ -66,7 +66,7 @@ def cycle(
     visible: Float[Array, "rays samples"],
     present: Bool[Array, " rays"],
 ) -> Scalar:
-    """Mean of |f + b|: there and back again (equation 11), per axis."""
+    """Mean of |f + b|: there and back again, per axis."""
     return weighted_mean(jnp.abs(flow + back), jnp.where(present[:, None], visible, 0))
 
 

@@ -1,9 +1,9 @@
 """T-NeRF: the template reads the time itself, and nothing is warped.
 
-The baseline of D-NeRF (Pumarola et al. 2020, arXiv:2011.13961, section 5: a network of
-position, direction and time) and of DyCheck (Gao et al. 2022, arXiv:2210.13445, section
-5), where the time is a code of the frame. On DyCheck's captures of one moving camera it
-has a higher PSNR than Nerfies; what it lacks is correspondence between times.
+The baseline of D-NeRF (Pumarola et al. 2020, arXiv:2011.13961: a network of position,
+direction and time) and of DyCheck (Gao et al. 2022, arXiv:2210.13445), where the time
+is a code of the frame. On DyCheck's captures of one moving camera it has a higher PSNR
+than Nerfies; what it lacks is correspondence between times.
 """
 
 import dataclasses

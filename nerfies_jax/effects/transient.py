@@ -1,8 +1,8 @@
 """What passes through single exposures, and how far their colours can be trusted.
 
-NeRF-W (Martin-Brualla et al. 2021, arXiv:2008.02268, section 4.2): beside the static
-field each photograph has a medium of its own, with density, colour and an uncertainty
-`beta`. People and cars settle there; renders leave it out.
+NeRF-W (Martin-Brualla et al. 2021, arXiv:2008.02268, "transient objects"): beside the
+static field each photograph has a medium of its own, with density, colour and an
+uncertainty `beta`. People and cars settle there; renders leave it out.
 """
 
 import dataclasses
@@ -116,9 +116,9 @@ def uncertainty(
 ) -> Float[Array, "*rays"]:
     """Standard deviation of a ray's colour: beta_min + Σ w β over its samples.
 
-    `weights` are the transient medium's. The paper (section 4.2) has β_min inside the
-    sum, so that a ray which meets no transient has a β of zero and an infinite loss.
-    Like the public reimplementation this adds it outside.
+    `weights` are the transient medium's. The paper has β_min inside the sum, so that a
+    ray which meets no transient has a β of zero and an infinite loss. Like the public
+    reimplementation this adds it outside.
     """
     return beta_min + jnp.sum(weights * beta, axis=-1)
 

@@ -1,9 +1,9 @@
 """A warp: where in the template the point was that is observed here and now.
 
-Nerfies (Park et al. 2021, arXiv:2011.12948, equations 6-10) moves each point along its
-own screw; D-NeRF (Pumarola et al. 2020, arXiv:2011.13961, equation 1) shifts it. Both
-map the observation to the template, and both are written here as the displacement of
-one point, of which `matrix3.displacement_log_energy` makes an exact elastic energy.
+Nerfies (Park et al. 2021, arXiv:2011.12948) moves each point along its own screw;
+D-NeRF (Pumarola et al. 2020, arXiv:2011.13961) shifts it. Both map the observation to
+the template, and both are written here as the displacement of one point, of which
+`matrix3.displacement_log_energy` makes an exact elastic energy.
 """
 
 import dataclasses
@@ -32,10 +32,10 @@ class WarpSpec:
 
     `condition="code"` reads a code of the frame, from the table `table`; "time" reads
     the encoded time, and then time 0 is the template itself (D-NeRF). `anneal_steps`
-    opens the bands of `position` one by one over so many steps (equation 14); None has
-    them open from the start. Without identity in `position`, step 0 of an annealed warp
-    moves all points of a frame alike. `guides` names codes of a point, one number each,
-    that it reads as well: a field with a mask of what moves adds it.
+    opens the bands of `position` one by one over so many steps (coarse to fine); None
+    has them open from the start. Without identity in `position`, step 0 of an annealed
+    warp moves all points of a frame alike. `guides` names codes of a point, one number
+    each, that it reads as well: a field with a mask of what moves adds it.
     """
 
     kind: str = "se3"

@@ -69,7 +69,7 @@ def score_halves(
     `fit_code(view, left, valid)` finds the codes of a frame from its left half alone,
     uint8 [height, width // 2, 3] and which of it was filmed (or None), with the network
     frozen; `render(view, codes)` draws the whole frame with them, and its right half
-    is scored (Martin-Brualla et al. 2021, section 5).
+    is scored (Martin-Brualla et al. 2021).
     """
     colours = []
     for row in rows:

@@ -1,7 +1,7 @@
 """Rotations and screws of one point: exponentials, logarithms, Jacobians.
 
 A screw is `angular` (axis × angle, rad) and `linear` (scene units): the twist (w, v) of
-Nerfies (Park et al. 2021, arXiv:2011.12948, equations 8-10). `linear` is not the
+Nerfies (Park et al. 2021, arXiv:2011.12948, equations 9 and 11). `linear` is not the
 translation; that is `left_jacobian(angular) @ linear`. Coefficients are Stumpff
 functions of |w|², smooth at 0, so a zero-initialised head is no special case.
 Magnitudes up to 1e6 rad are accurate; |w| above 1e19 overflows float32.

@@ -1,7 +1,7 @@
 """Spectral functions of one 3×3 matrix, with derivatives that exist everywhere.
 
 Σ log²σ of a warp's Jacobian is the elastic energy of Nerfies (Park et al. 2021,
-arXiv:2011.12948, equations 11-12). Everything is written in scalars, so that a `vmap`
+arXiv:2011.12948, section 3.3). Everything is written in scalars, so that a `vmap`
 runs over long rows: on a CPU 20 times as fast as LAPACK's batched SVD, with its
 gradient 10 times. Sweeps are a loop: unrolled, energies with slopes took 1.3 times as
 long, 1.4 to compile. A value and its derivatives come from one decomposition.
@@ -131,7 +131,7 @@ def _energy_and_slope_jvp(signed, primals, tangents):
     """Divided differences of f' for the symmetric part, sums for the twisting part.
 
     Smith, De Goes and Kim 2019, "Analytic eigensystems for isotropic distortion
-    energies", section 4: the same for any isotropic energy.
+    energies": the same for any isotropic energy.
     """
     left, values, right = _oriented(signed, primals[0])
     turned = _stacked(_between(left, _entries(tangents[0]), right))

@@ -54,7 +54,7 @@ def depth_errors(
     truth: Float[Array, "*pixels"],
     mask: Bool[Array, "*pixels"] | None = None,
 ) -> DepthErrors:
-    """Errors of z-depth in scene units, Eigen et al. 2014, arXiv:1406.2283, section 4.
+    """Errors of z-depth in scene units, Eigen et al. 2014, arXiv:1406.2283.
 
     A depth that is not positive counts in full in the first two and as wrong in the
     third. For monocular depth, pass `align_depth`'s result first.
@@ -149,9 +149,9 @@ def track_errors(
 ) -> TrackErrors:
     """Point tracks against the truth; a point is correct closer than `threshold`.
 
-    DyCheck's PCK-T (arXiv:2210.13445, section 3.3) takes 0.05 of the longer side of the
-    picture in pixels, 3-D tracks a length in scene units. A lost track is not finite
-    and counts as wrong.
+    DyCheck's PCK-T (arXiv:2210.13445) takes 0.05 of the longer side of the picture in
+    pixels, 3-D tracks a length in scene units. A lost track is not finite and counts as
+    wrong.
     """
     if not threshold > 0:
         raise ValueError(
@@ -256,8 +256,8 @@ def path_errors(
 ) -> PathErrors:
     """Absolute trajectory error of camera positions [frames, 3] after alignment.
 
-    Sturm et al. 2012, section IV.B; `scaled` because a path from pictures alone has no
-    unit. Read `alignment.determined` before believing a small error.
+    Sturm et al. 2012; `scaled` because a path from pictures alone has no unit. Read
+    `alignment.determined` before believing a small error.
     """
     alignment = align_points(positions, truth, scaled)
     moved = alignment.scale * np.asarray(positions, float) @ alignment.rotation.T
@@ -277,7 +277,7 @@ def relative_errors(
     true_positions: np.ndarray,
     stride: int = 1,
 ) -> RelativeErrors:
-    """Relative pose error between frames `stride` apart, Sturm et al. 2012, equation 1.
+    """Relative pose error between frames `stride` apart, Sturm et al. 2012.
 
     Rotations [frames, 3, 3], positions [frames, 3] of the camera in world coordinates.
     Independent of where the world's origin lies, not of its scale: scale the positions

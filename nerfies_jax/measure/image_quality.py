@@ -19,8 +19,8 @@ from nerfies_jax.training import losses
 
 TAPS = len(losses.WINDOW)  # 11 pixels
 C1, C2 = losses.LUMINANCE, losses.CONTRAST
-# Wang, Simoncelli and Bovik 2003, "Multiscale structural similarity", section 3.2; as
-# printed they sum to 1.0001.
+# Wang, Simoncelli and Bovik 2003, "Multiscale structural similarity"; as printed they
+# sum to 1.0001.
 SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 
 Padding = Literal["valid", "zero"]
@@ -51,8 +51,8 @@ def masked_psnr(
 ) -> Float[Array, ""]:
     """PSNR over the pixels where `mask` holds; NaN where it holds nowhere.
 
-    mPSNR of Gao et al. 2022 (DyCheck), arXiv:2210.13445, section 3.2. What lies outside
-    the mask may be anything, NaN included.
+    mPSNR of Gao et al. 2022 (DyCheck), arXiv:2210.13445. What lies outside the mask may
+    be anything, NaN included.
     """
     mask = mask[..., None]
     image, truth = widened(image), widened(truth)
@@ -92,7 +92,7 @@ def ms_ssim(
     truth: Float[Array, "height width channels"],
     scales: int = 5,
 ) -> Float[Array, ""]:
-    """Multi-scale SSIM: Wang, Simoncelli and Bovik 2003, equation 7, valid windows.
+    """Multi-scale SSIM: Wang, Simoncelli and Bovik 2003, valid windows.
 
     Contrast and structure at every scale, luminance at the coarsest, halved by 2x2
     means between them (an odd last row or column is doubled). The means over pixels are
@@ -182,12 +182,12 @@ def partial_ssim(
     truth: Float[Array, "height width channels"],
     mask: Bool[Array, "height width"],
 ) -> Float[Array, ""]:
-    """mSSIM as DyCheck publishes it (arXiv:2210.13445, section 3.2), for its tables.
+    """mSSIM as DyCheck publishes it (arXiv:2210.13445), for its tables.
 
-    Each pass of the window is a partial convolution (Liu et al. 2018, arXiv:1804.07723,
-    equation 1): rescaled by the share of *pixels* in the mask, not by their weights, so
-    a constant is not kept near the mask's edge; variances are clipped; and windows
-    without any pixel count as a perfect 1. `masked_ssim` does none of that.
+    Each pass of the window is a partial convolution (Liu et al. 2018,
+    arXiv:1804.07723): rescaled by the share of *pixels* in the mask, not by their
+    weights, so a constant is not kept near the mask's edge; variances are clipped; and
+    windows without any pixel count as a perfect 1. `masked_ssim` does none of that.
     """
     image, truth = widened(image), widened(truth)
     inside = mask.astype(image.dtype)[..., None]
@@ -221,7 +221,7 @@ def partial_ssim(
 
 
 def _terms(image, truth, mean):
-    """Luminance and contrast-structure of SSIM, Wang et al. 2004, equations 6, 9, 10.
+    """Luminance and contrast-structure of SSIM, Wang et al. 2004.
 
     The identity of `losses.dssim_map`, the terms apart and with any windowed `mean`:
     2 cov(x, y) = var(x) + var(y) - var(x - y), variances about the truth's mean.

@@ -138,7 +138,7 @@ def masked_lpips(
     truth: Float[Array, "height width 3"],
     mask: Bool[Array, "height width"],
 ) -> Float[Array, ""]:
-    """mLPIPS of DyCheck (arXiv:2210.13445, section 3.2); NaN for an empty mask.
+    """mLPIPS of DyCheck (arXiv:2210.13445); NaN for an empty mask.
 
     Both pictures are black outside the mask, and the map is averaged inside it.
     """

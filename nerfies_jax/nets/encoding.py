@@ -80,8 +80,8 @@ def encode(
 def anneal(bands: int, alpha: Scalar) -> Float[Array, " bands"]:
     """Weights that open band k as `alpha` goes from k to k + 1; traced.
 
-    Nerfies, equation 14 (Park et al. 2021): (1 - cos(π clip(α - k, 0, 1))) / 2, here as
-    sin²: the difference is 20 % off where a band begins to open, in float32. At
+    Coarse to fine, Nerfies (Park et al. 2021): (1 - cos(π clip(α - k, 0, 1))) / 2, here
+    as sin²: the difference is 20 % off where a band begins to open, in float32. At
     `alpha` = 0 every band is shut and only the identity passes; without identity the
     features are then all zero.
     """

@@ -209,7 +209,7 @@ def linear(
 def total_variation(plane: Float[Array, "first second features"]) -> Float[Array, ""]:
     """Squared differences of neighbouring vertices, the mean along each axis added.
 
-    K-Planes, equation 4. 4DGS has `bend` along one axis under this name.
+    K-Planes, equation 3. 4DGS has `bend` along one axis under this name.
     """
     return sum(jnp.mean(jnp.square(jnp.diff(plane, axis=axis))) for axis in (0, 1))
 
@@ -217,7 +217,7 @@ def total_variation(plane: Float[Array, "first second features"]) -> Float[Array
 def bend(plane: Float[Array, "moments vertices features"]) -> Float[Array, ""]:
     """Mean squared second difference along the first axis: how unsteady in time.
 
-    K-Planes, equation 5; zero for what changes evenly.
+    K-Planes, equation 4; zero for what changes evenly.
     """
     # Differences of differences: each of close values is exact, their sum is not.
     return jnp.mean(jnp.square(jnp.diff(jnp.diff(plane, axis=0), axis=0)))
@@ -226,7 +226,7 @@ def bend(plane: Float[Array, "moments vertices features"]) -> Float[Array, ""]:
 def unrest(plane: Float[Array, "moments vertices features"]) -> Float[Array, ""]:
     """Mean distance from one, at which a plane of time in a product changes nothing.
 
-    K-Planes, equation 6 (L1): space explains what it can.
+    K-Planes, equation 5 (L1): space explains what it can.
     """
     off = plane - 1
     # Not `abs`, whose slope at zero is one: planes start at one, and all that rests

@@ -62,11 +62,11 @@ def media_weights(
     """How much each of several media on one ray adds to its colour.
 
     Light reaches a sample through all the media before it, and at the sample each
-    medium counts as if it were alone: section 4.2 of NeRF-W (Martin-Brualla et al.,
-    arXiv:2008.02268) and, after `thinned`, the blending of NSFF (Li et al. 2021,
-    arXiv:2011.13084). Where two media overlap in one sample their weights sum to more
-    than `weights` of their joint depth, up to as often as there are media; opacity and
-    distances are therefore read from the joint depth (`composite_media`).
+    medium counts as if it were alone: the transient objects of NeRF-W (Martin-Brualla
+    et al. 2021, arXiv:2008.02268) and, after `thinned`, the blending of NSFF (Li et al.
+    2021, arXiv:2011.13084). Where two media overlap in one sample their weights sum to
+    more than `weights` of their joint depth, up to as often as there are media; opacity
+    and distances are therefore read from the joint depth (`composite_media`).
     """
     reaching = _transmittance(jnp.sum(optical_depth, axis=0))
     return reaching * -jnp.expm1(-optical_depth)

@@ -2,8 +2,8 @@
 
 The cells are even in contracted space (`nets.grids.contract`): even in the filmed
 volume, and growing around it up to twice its half-side. What is beyond counts as
-occupied. The idea is that of Mueller et al. 2022, arXiv:2201.05989,
-appendix E.2; theirs trains with it, these cells are surveyed once of a trained field.
+occupied. The idea is that of Müller et al. 2022, arXiv:2201.05989, appendix E.2; theirs
+trains with it, these cells are surveyed once of a trained field.
 """
 
 import jax

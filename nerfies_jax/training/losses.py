@@ -108,7 +108,7 @@ def geman_mcclure(
 ) -> Float[Array, "*batch"]:
     """2 s / (s + 4 width^2) for s = |residual|^2; saturates at two.
 
-    Park et al. 2021 (Nerfies), arXiv:2011.12948, equation 9. Their code multiplies it
+    Park et al. 2021 (Nerfies), arXiv:2011.12948, section 3.3. Their code multiplies it
     with `width`, so that its elastic weight acts as 0.03 of what it says and the
     background weight as 0.001: `scaling="official"`.
     """

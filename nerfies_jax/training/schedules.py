@@ -76,7 +76,7 @@ def band_window(
 ) -> Float[Array, " bands"]:
     """Weights of bands, or levels, that open one by one over `steps`, from `after` on.
 
-    Nerfies, equation 14 (Park et al. 2021), coarse to fine; at least one band.
+    Nerfies (Park et al. 2021), coarse to fine; at least one band.
     """
     alpha = ramp(0.0, float(bands), steps, after=after)(step)
     return encoding.anneal(bands, alpha.astype(dtype))
@@ -106,7 +106,7 @@ def time_noise(frames: int, steps: int = 20_000, scale: float = 0.1) -> Schedule
     """Standard deviation of the noise on time, in units of the capture's duration.
 
     Annealed smooth training of Yang et al. 2023 (Deformable 3DGS), arXiv:2309.13101,
-    equation 8: `scale` of one frame interval, falling linearly to nothing. Their code
+    equation 6: `scale` of one frame interval, falling linearly to nothing. Their code
     divides by the images left in the epoch instead of `frames`, so that its noise grows
     to a whole duration once per epoch; this is the published form.
     """

@@ -52,7 +52,7 @@ def ray_and_condition(dtype):
 
 
 def test_with_it_the_ray_sees_both_through_one_transmittance(dtype):
-    """Against a loop over the samples in Python floats (NeRF-W, section 4.2)."""
+    """Against a loop over the samples in Python floats (NeRF-W)."""
     params, (ray, condition) = params_of(dtype), ray_and_condition(dtype)
     (_, joint), (_, alone) = (
         jax.tree.map(np.asarray, tracer(*without)(params, ray, condition))
