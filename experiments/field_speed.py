@@ -7,12 +7,13 @@
 Each preset is trained on each capture, once for each seed and each of the given
 processor seconds, over the steps that it can make in them, its schedules in proportion,
 and scored on frames that it does not learn from; compiling counts nothing, nor does a
-start from tracks. After the longest a frame is drawn behind the survey of its empty
-space (`nerfies_jax.skipping`) and by the full quadrature: milliseconds are
-medians of the processor over five frames, without the survey, which has a column of its
-own, and decibels are of the difference between the two. Over several seeds the table
-has means, and beside a PSNR its standard deviation. What is in `--out` already is not
-measured again: an interrupted run goes on, and more `--seeds` add those that it lacks.
+start from tracks. *spent* is what these steps took in the end. After the longest a
+frame is drawn behind the survey of its empty space (`nerfies_jax.skipping`) and by the
+full quadrature: milliseconds are medians of the processor over five frames, without the
+survey, which has a column of its own, and decibels are of the difference between the
+two. Over several seeds the table has means, and beside a PSNR its standard deviation.
+What is in `--out` already is not measured again: an interrupted run goes on, and more
+`--seeds` add those that it lacks.
 """
 
 import dataclasses
@@ -29,7 +30,7 @@ from nerfies_jax.runs import platform, representations
 PRESETS = ("nerf-small", "nerf-grid-small", "nerfies-small", "nerfies-grid-small")
 FRAMES = 5  # timed, after one that makes the survey
 TIMES = ("skipped_ms", "full_ms", "survey_ms")
-PILOT_SECONDS = 3.0  # of the steps that tell what one takes
+PILOT_STEPS = 50  # that tell what one takes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,43 +100,40 @@ def measured(capture, preset: str, seconds, size: tuple[int, int], seed: int) ->
     from nerfies_jax import evaluation
     from nerfies_jax.runs import plan
 
-    representation = representations.of_preset(preset)
-    spec = representation.presets[preset]
-    a_step, _, _ = _trained(capture, preset, spec, seed, PILOT_SECONDS)
+    whole = representations.of_preset(preset).presets[preset].steps
+    a_step = _trained(capture, preset, whole, seed, PILOT_STEPS)[0] / PILOT_STEPS
     scores, steps, spent = [], [], []
     for limit in seconds:
-        one = representation.with_steps(spec, plan.rounded(limit / a_step))
-        took, model, state = _trained(capture, preset, one, seed)
+        steps.append(plan.rounded(limit / a_step))
+        took, model, state = _trained(capture, preset, steps[-1], seed)
         renderer = evaluation.Renderer(model, capture.size)
         scored = evaluation.score(renderer, state, capture, capture.heldout)
         scores.append(float(scored.psnr.mean()))
-        steps.append(one.steps)
-        spent.append(took * one.steps)
+        spent.append(took)
     found = {"psnr": scores, "steps": steps, "spent": spent}
     return found | drawn(model, state, capture, size)
 
 
-def _trained(capture, preset, spec, seed, pilot=math.inf):
-    """Processor seconds of a step, the model, and its state after the spec's steps.
-
-    Or after the first `pilot` seconds: then of the steps made by then.
-    """
+def _trained(capture, preset, planned, seed, steps=None):
+    """Processor seconds of so many of the planned steps, the model, and its state."""
     import jax
+    import rich.console
 
     from nerfies_jax import evaluation
-    from nerfies_jax.training import chunk
+    from nerfies_jax.training import loop
 
     representation = representations.of_preset(preset)
+    spec = representation.with_steps(representation.presets[preset], planned)
     model = representation.build(spec, representation.metadata_of(capture, spec))
     state = model.init(capture, jax.random.key(seed))
     frames = evaluation.frames_of(capture, model.required_data)
-    program, _ = chunk.program(model.step, state, frames, spec.steps, model.devices)
-    program.prepare(program.length)
-    done, began = 0, time.process_time()
-    while done < spec.steps and time.process_time() - began < pilot:
-        state, outcome = program(state, frames, min(program.length, spec.steps - done))
-        done += max(int(outcome.done), 1)  # waits; fewer where one is not finite
-    return (time.process_time() - began) / done, model, state
+    quiet = rich.console.Console(quiet=True)
+    began = time.process_time()
+    ended = loop.fit(model, state, frames, steps=steps or planned, console=quiet)
+    # Compiling is taken out by its share of the time: its own on the processor is not
+    # known.
+    share = ended.seconds / (ended.seconds + ended.compile_seconds)
+    return share * (time.process_time() - began), model, ended.state
 
 
 def drawn(model, state, capture, size: tuple[int, int]) -> dict:
@@ -166,7 +164,16 @@ def drawn(model, state, capture, size: tuple[int, int]) -> dict:
 
 def page(stored) -> str:
     """The page in docs/results below the docstring."""
-    heads = ("capture", "preset", "s", "seeds", "steps", "PSNR", "frame, ms")
+    heads = (
+        "capture",
+        "preset",
+        "s",
+        "seeds",
+        "steps",
+        "spent, s",
+        "PSNR",
+        "frame, ms",
+    )
     heads += ("full, ms", "survey, ms", "alike, dB")
     cells = {}
     for row in stored["rows"]:
@@ -178,7 +185,10 @@ def page(stored) -> str:
         for place, limit in enumerate(one["seconds"]):
             last = place == len(one["seconds"]) - 1
             times = [_mean(seeds, name) if last else None for name in TIMES]
-            steps = statistics.fmean(row["steps"][place] for row in seeds)
+            steps, spent = (
+                statistics.fmean(row[name][place] for row in seeds)
+                for name in ("steps", "spent")
+            )
             rows.append(
                 [
                     one["capture"],
@@ -186,6 +196,7 @@ def page(stored) -> str:
                     f"{limit:g}",
                     str(len(seeds)),
                     markdown.number(steps, 0),
+                    markdown.number(spent, 0),
                     _with_spread([row["psnr"][place] for row in seeds]),
                     *(markdown.number(number, 0) for number in times),
                     markdown.number(_mean(seeds, "alike_db") if last else None, 1),

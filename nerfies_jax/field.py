@@ -55,8 +55,9 @@ class Field(NamedTuple):
     displace: Callable[[PyTree, Vector, FrameCondition], Vector]
     # (params, camera, time, codes, size, step) -> whole frame
     render: Callable[..., Rendering]
-    # (params, step) -> `skipping.Occupancy`; None where space cannot be skipped
-    survey: Callable[[PyTree, Int[Array, ""]], Occupancy] | None
+    # (params, step, depth=SKIPPED_DEPTH) -> `skipping.Occupancy`; None where space
+    # cannot be skipped
+    survey: Callable[..., Occupancy] | None
     # `render` behind an occupancy, without slopes
     render_occupied: Callable[..., Rendering]
 
@@ -109,12 +110,13 @@ def field(
         )
         return jax.tree.map(lambda x: x.reshape(height, width, *x.shape[1:]), flat)
 
-    def survey(params, step):
+    def survey(params, step, depth=skipping.SKIPPED_DEPTH):
         def condition_at(time):
             frame_codes = look_up(tables, metadata, params, time, jnp.int32(0))
             return FrameCondition(time, frame_codes, step)
 
-        return skipping.survey(Bound(spec, metadata, active, params), condition_at)
+        bound = Bound(spec, metadata, active, params)
+        return skipping.survey(bound, condition_at, depth)
 
     def render_occupied(params, occupied, camera, time, codes, size, step):
         bound = Bound(spec, metadata, active, params)

@@ -29,6 +29,7 @@ from nerfies_jax.effects.warp import WarpSpec
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.grids import HashGridSpec
 from nerfies_jax.nets.voxels import VoxelGridSpec
+from nerfies_jax.radiance.occupancy import OccupancySpec
 from nerfies_jax.radiance.template import TemplateSpec
 from nerfies_jax.spec import RadianceScene, SamplingSpec
 from nerfies_jax.training import step_counts
@@ -316,6 +317,10 @@ STILL_NERF_GRID = dataclasses.replace(
     SMALL_NERF_GRID,
     steps=6000,
     sampling=SamplingSpec(24, 24, union=False),
+    # Blender lego, eight held-out frames, seconds of one busy core, without and with:
+    # 24.68 dB in 66 s and 25.26 in 73 after 1200 steps, 25.38 in 137 and 25.91 in 136
+    # after 2400.
+    occupancy=OccupancySpec(),
     template=dataclasses.replace(SMALL_NERF_GRID.template, **EMPTIER),
     coarse=dataclasses.replace(SMALL_NERF_GRID.coarse, **EMPTIER),
 )

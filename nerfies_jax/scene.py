@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Key
 
-from nerfies_jax import path_fit, render_ray, scene_metadata
+from nerfies_jax import occupied_rays, path_fit, render_ray, scene_metadata
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.effects import transient
 from nerfies_jax.effects.effect import Batch, Box, RayOutput
@@ -88,8 +88,9 @@ def build(
 
     def first_state(params, key):
         params = in_default_precision(params)
+        cells = occupied_rays.first(radiance)
         return TrainState(
-            params, OPTIMISER.init(params), (), jnp.zeros((), jnp.int32), key
+            params, OPTIMISER.init(params), cells, jnp.zeros((), jnp.int32), key
         )
 
     read = frozenset().union(*(effect.required_data for effect in radiance.effects))
@@ -98,7 +99,7 @@ def build(
         spec=(spec, metadata, *(effect.name for effect in effects)),
         init=init,
         step=_stepper(spec, radiance, devices),
-        events=(),
+        events=occupied_rays.events(radiance),
         **drawing(radiance, lambda params, view: (view, codes_at(params, view))),
         counts=count_parameters,
         required_data=read,
@@ -135,7 +136,12 @@ def _stepper(spec, radiance, devices):
         if spec.micro_batches > 1:
             key = jax.random.fold_in(key, index)
         batch_key, field_key = jax.random.split(key)
-        batch = draw_batch(frames, spec.rays // spec.micro_batches, batch_key)
+        count, plan = spec.rays // spec.micro_batches, spec.occupancy
+        if plan is None:
+            batch = draw_batch(frames, count, batch_key)
+        else:
+            batch = draw_batch(frames, plan.candidates * count, batch_key)
+            batch = occupied_rays.learnt_from(radiance, state.aux_state, batch)
 
         def loss(params):
             terms = loss_terms(radiance, params, frames, batch, state.step, field_key)

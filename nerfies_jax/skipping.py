@@ -58,8 +58,16 @@ def usable(spec, effects) -> bool:
     )
 
 
-def survey(bound: Bound, condition_at: Callable[[Scalar], FrameCondition]) -> Occupancy:
-    """Which cells each level's density fills at any time; pure."""
+def survey(
+    bound: Bound,
+    condition_at: Callable[[Scalar], FrameCondition],
+    depth: float = SKIPPED_DEPTH,
+) -> Occupancy:
+    """Which cells each level's density fills at any time; pure.
+
+    A cell is filled where a random point in it is so dense that light that went from
+    near to far through nothing else would meet an optical depth above `depth`.
+    """
     spec, metadata, moved = bound.spec, bound.metadata, is_moved(bound)
     cells, looks = (MOVING_CELLS, MOVING_LOOKS) if moved else (STILL_CELLS, STILL_LOOKS)
     span = (metadata.far - metadata.near) * metadata.scale
@@ -85,7 +93,7 @@ def survey(bound: Bound, condition_at: Callable[[Scalar], FrameCondition]) -> Oc
         point = occupancy.random_points(key, index, cells, spec.extent, dtype)
         seen = jax.lax.map(densities, point, batch_size=BATCH)
         return jax.tree.map(
-            lambda old, new: old | (new * span > SKIPPED_DEPTH), found, seen
+            lambda old, new: old | (new * span > depth), found, seen
         ), None
 
     start = {name: jnp.zeros(cells**3, bool) for name in names}

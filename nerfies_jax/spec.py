@@ -28,6 +28,7 @@ from nerfies_jax.effects.time_condition import TimeSpec
 from nerfies_jax.effects.time_warp import TimeWarpSpec
 from nerfies_jax.effects.transient import TransientSpec
 from nerfies_jax.effects.warp import WarpSpec
+from nerfies_jax.radiance.occupancy import OccupancySpec
 from nerfies_jax.radiance.template import TemplateSpec
 from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.training import schedules
@@ -75,6 +76,7 @@ class RadianceScene:
     template: TemplateSpec = TemplateSpec()
     coarse: TemplateSpec | None = None  # of the coarse level; None is like the fine one
     sampling: SamplingSpec = SamplingSpec()
+    occupancy: OccupancySpec | None = None  # None: the rays of a step are any
     rays: int = 1024  # in a step
     # In so many equal parts, on as many devices or one after the other: less memory.
     micro_batches: int = 1

@@ -3,8 +3,10 @@
 The cells are even in contracted space (`nets.grids.contract`): even in the filmed
 volume, and growing around it up to twice its half-side. What is beyond counts as
 occupied. The idea is that of Müller et al. 2022, arXiv:2201.05989, appendix E.2; theirs
-trains with it, these cells are surveyed once of a trained field.
+are kept up while training, these are surveyed anew of the field as it is.
 """
+
+import dataclasses
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +16,32 @@ from jaxtyping import Array, Bool, Float, Int, Key
 REACH = 1.5  # of the cells, in contracted space: twice the half-side in the field
 
 Cells = Bool[Array, "cells cells cells"]
+
+
+@dataclasses.dataclass(frozen=True)
+class OccupancySpec:
+    """When space is surveyed, and how many rays there are to choose from.
+
+    After `start` steps and then every so many, whatever the length of the run: a survey
+    of a scene that rests takes as long as six steps of a small field on a grid.
+    `candidates` rays are drawn for each of a step. `anywhere` is the share of a step's
+    rays that need not meet anything: what appears in empty space is seen by these.
+    """
+
+    start: int = 100
+    every: int = 100
+    candidates: int = 3
+    anywhere: float = 0.25
+
+    def __post_init__(self):
+        if min(self.start, self.every) < 1 or self.candidates < 2:
+            raise ValueError(
+                "start and every are at least 1 step and candidates at least 2 rays, "
+                f"got start={self.start}, every={self.every}, "
+                f"candidates={self.candidates}"
+            )
+        if not 0 <= self.anywhere < 1:
+            raise ValueError(f"anywhere={self.anywhere} must lie in [0, 1)")
 
 
 def random_points(

@@ -4,7 +4,13 @@ import json
 
 from experiments import field_speed
 
-NUMBERS = {"steps": [9, 19], "skipped_ms": 30.0, "full_ms": 90.0, "survey_ms": 8.0}
+NUMBERS = {
+    "steps": [9, 19],
+    "spent": [1.2, 2.0],
+    "skipped_ms": 30.0,
+    "full_ms": 90.0,
+    "survey_ms": 8.0,
+}
 
 
 def test_only_seeds_that_are_missing_are_measured_and_all_are_in_the_table(
@@ -25,6 +31,8 @@ def test_only_seeds_that_are_missing_are_measured_and_all_are_in_the_table(
         field_speed.main([*command.split(), *presets])
     assert asked == [(preset, seed) for seed in (0, 1) for preset in presets]
     page = field_speed.page(json.loads(out.read_text())).splitlines()
-    assert page[2] == "| one | nerf-small | 1 | 2 | 9 | 20.50 ± 0.71 |  |  |  |  |"
-    last = "| one | nerf-grid-small | 2 | 2 | 19 | 23.00 ± 1.41 | 30 | 90 | 8 | 60.0 |"
+    assert page[2] == "| one | nerf-small | 1 | 2 | 9 | 1 | 20.50 ± 0.71 |  |  |  |  |"
+    last = (
+        "| one | nerf-grid-small | 2 | 2 | 19 | 2 | 23.00 ± 1.41 | 30 | 90 | 8 | 60.0 |"
+    )
     assert page[5] == last

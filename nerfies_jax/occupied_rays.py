@@ -1,0 +1,106 @@
+"""The rays of a step where something was found: empty ones have little left to teach.
+
+Of more rays than a step has, those are learnt from that meet an occupied cell, and a
+share of any (`OccupancySpec`). Space is surveyed anew as training goes on, and what was
+found empty once stays so. Müller et al. 2022, arXiv:2201.05989, appendix E.2, skip the
+samples in empty cells instead: a step then has as many rays as its samples pay for,
+here it has as many of both as always. What is drawn of a field does not depend on it;
+the losses of a step are those of its rays, which are harder than the mean.
+"""
+
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int, PyTree
+
+from nerfies_jax.effects.effect import Batch
+from nerfies_jax.field import Field
+from nerfies_jax.radiance import occupancy, sampling
+from nerfies_jax.radiance.occupancy import Cells
+from nerfies_jax.render_ray import Ray, field_ray
+from nerfies_jax.training.model import Event, Frames, TrainState
+
+LOOKS = 64  # along a ray, as many as a survey has cells across
+# From near to far, as `skipping.survey` has it. What is thinner is haze, which nobody
+# has looked at yet: of 0.01, at which a picture skips nothing that is seen, two cells
+# of three of Blender lego are filled after 1000 steps, of this 3 in a hundred.
+DEPTH = 3.0
+
+
+def first(field: Field) -> Cells | tuple[()]:
+    """Cells of which nothing is known: any may be occupied; none without a spec."""
+    if field.spec.occupancy is None:
+        return ()
+    params = jax.eval_shape(field.init, jax.random.key(0))
+    found = jax.eval_shape(_survey(field), params, jnp.zeros((), jnp.int32))
+    return jnp.ones(found.shape, bool)
+
+
+def events(field: Field) -> tuple[Event, ...]:
+    """The surveys of a run; after one, `aux_state` are the cells that are left.
+
+    ValueError for a field whose space cannot be surveyed.
+    """
+    spec = field.spec.occupancy
+    if spec is None:
+        return ()
+    if field.survey is None:
+        raise ValueError(
+            "occupancy looks for empty space, and this field cannot be surveyed: it "
+            "has a transient medium, normals, a motion that goes by the exposure, or "
+            "no extent; leave it out with --set occupancy=none"
+        )
+    survey = jax.jit(_survey(field))
+
+    def apply(state: TrainState, frames: Frames) -> TrainState:
+        del frames
+        # Surveyed alone, cells that no ray sees any more fill with what the tables of a
+        # hash grid happen to say there: after 2400 steps of Blender lego 10 in a
+        # hundred, and 25.6 dB for 25.9.
+        left = state.aux_state & survey(state.params, state.step)
+        return state._replace(aux_state=left)
+
+    when = tuple(range(spec.start, field.spec.steps, spec.every))
+    return (Event("survey", when, apply),)
+
+
+def _survey(field: Field) -> Callable[[PyTree, Int[Array, ""]], Cells]:
+    """What any level fills."""
+
+    def survey(params, step):
+        levels = field.survey(params, step, DEPTH).values()
+        return functools.reduce(jnp.logical_or, levels)
+
+    return survey
+
+
+def meets(occupied: Cells, ray: Ray, half_side: float) -> Bool[Array, ""]:
+    """Whether a ray goes through an occupied cell, or leaves the cells."""
+    distance = sampling.stratified(None, ray.near, ray.far, LOOKS)
+    point = ray.origin + distance[:, None] * ray.direction
+    return jnp.any(occupancy.at(occupied, point, half_side))
+
+
+def chosen(
+    meeting: Bool[Array, " candidates"], count: int, anywhere: int
+) -> Int[Array, " count"]:
+    """Which candidates a step learns from: the first `anywhere`, and then what meets.
+
+    Others fill up where too few do.
+    """
+    order = jnp.argsort(~meeting[anywhere:], stable=True)[: count - anywhere]
+    return jnp.concatenate([jnp.arange(anywhere), anywhere + order])
+
+
+def learnt_from(field: Field, occupied: Cells, candidates: Batch) -> Batch:
+    """The rays of a step, of `OccupancySpec.candidates` times as many."""
+    spec = field.spec.occupancy
+    lines = jax.vmap(functools.partial(field_ray, field.metadata))(
+        candidates.origin, candidates.direction, candidates.cosine
+    )
+    meeting = jax.vmap(lambda ray: meets(occupied, ray, field.spec.extent))(lines)
+    count = len(meeting) // spec.candidates
+    rows = chosen(meeting & candidates.valid, count, round(spec.anywhere * count))
+    return jax.tree.map(lambda leaf: leaf[rows], candidates)
