@@ -31,7 +31,7 @@ DEPTH = 3.0
 
 def first(field: Field) -> Cells | tuple[()]:
     """Cells of which nothing is known: any may be occupied; none without a spec."""
-    if field.spec.occupancy is None:
+    if field.spec.sampling.occupancy is None:
         return ()
     params = jax.eval_shape(field.init, jax.random.key(0))
     found = jax.eval_shape(_survey(field), params, jnp.zeros((), jnp.int32))
@@ -43,14 +43,14 @@ def events(field: Field) -> tuple[Event, ...]:
 
     ValueError for a field whose space cannot be surveyed.
     """
-    spec = field.spec.occupancy
+    spec = field.spec.sampling.occupancy
     if spec is None:
         return ()
     if field.survey is None:
         raise ValueError(
             "occupancy looks for empty space, and this field cannot be surveyed: it "
             "has a transient medium, normals, a motion that goes by the exposure, or "
-            "no extent; leave it out with --set occupancy=none"
+            "no extent; leave it out with --set sampling.occupancy=none"
         )
     survey = jax.jit(_survey(field))
 
@@ -96,7 +96,7 @@ def chosen(
 
 def learnt_from(field: Field, occupied: Cells, candidates: Batch) -> Batch:
     """The rays of a step, of `OccupancySpec.candidates` times as many."""
-    spec = field.spec.occupancy
+    spec = field.spec.sampling.occupancy
     lines = jax.vmap(functools.partial(field_ray, field.metadata))(
         candidates.origin, candidates.direction, candidates.cosine
     )

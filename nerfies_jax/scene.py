@@ -136,7 +136,7 @@ def _stepper(spec, radiance, devices):
         if spec.micro_batches > 1:
             key = jax.random.fold_in(key, index)
         batch_key, field_key = jax.random.split(key)
-        count, plan = spec.rays // spec.micro_batches, spec.occupancy
+        count, plan = spec.rays // spec.micro_batches, spec.sampling.occupancy
         if plan is None:
             batch = draw_batch(frames, count, batch_key)
         else:

@@ -55,6 +55,7 @@ class SamplingSpec:
     shared: bool = False  # one network for both levels (D-NeRF)
     union: bool = True  # the fine level sees the coarse samples too
     block: int = 1024
+    occupancy: OccupancySpec | None = None  # None: the rays of a step are any
 
     def __post_init__(self):
         if self.coarse < 3 or self.fine < 0 or self.block < 1:
@@ -76,7 +77,6 @@ class RadianceScene:
     template: TemplateSpec = TemplateSpec()
     coarse: TemplateSpec | None = None  # of the coarse level; None is like the fine one
     sampling: SamplingSpec = SamplingSpec()
-    occupancy: OccupancySpec | None = None  # None: the rays of a step are any
     rays: int = 1024  # in a step
     # In so many equal parts, on as many devices or one after the other: less memory.
     micro_batches: int = 1

@@ -32,8 +32,9 @@ SPEC = RadianceScene(
         density="exp",
         density_bias=-12.0,
     ),
-    sampling=SamplingSpec(8, 8),
-    occupancy=OccupancySpec(start=10, every=10, candidates=4, anywhere=0.2),
+    sampling=SamplingSpec(
+        8, 8, occupancy=OccupancySpec(start=10, every=10, candidates=4, anywhere=0.2)
+    ),
 )
 CELLS = 16
 
