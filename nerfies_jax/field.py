@@ -1,5 +1,6 @@
 """A radiance field as pure functions: render it, ask its warp, look its codes up."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -11,6 +12,7 @@ from nerfies_jax import skipping
 from nerfies_jax import spec as specs
 from nerfies_jax.effects.effect import RayOutput
 from nerfies_jax.geometry import rays
+from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.nets import codes
 from nerfies_jax.radiance import template
 from nerfies_jax.render_ray import (
@@ -77,6 +79,7 @@ def field(
     every = joined(own, effects, refused=SPLAT_SEAMS, reserved=("template", "codes"))
     tables = specs.tables_of(every)
     active = _active(every, without)
+    bind = functools.partial(Bound, spec, metadata, active)
 
     def init(key):
         return _init(spec, metadata, every, key)
@@ -85,43 +88,24 @@ def field(
         return look_up(tables, metadata, params, view.time, view.appearance)
 
     def displace(params, point, condition):
-        return displacement(Bound(spec, metadata, active, params), point, condition)
+        return displacement(bind(params), point, condition)
 
     def levels_of(params, ray: Ray, condition, key=None):
-        return render_ray(Bound(spec, metadata, active, params), ray, condition, key)
+        return render_ray(bind(params), ray, condition, key)
 
     def render(params, camera, time, codes, size, step):
-        condition = FrameCondition(time, codes, step)
-
-        def pixel(position):
-            ray, cosine = field_ray_through(metadata, camera, position)
-            level = levels_of(params, ray, condition)[-1]
-            depth = level.distance * cosine / metadata.scale
-            return Rendering(level.colour, level.alpha, depth)
-
-        width, height = size
-        centres = rays.pixel_centres(size, camera.position.dtype).reshape(-1, 2)
-        # A slope, as of the camera, is found block by block: all samples of a frame at
-        # once would need as much memory as a training step over all its pixels.
-        flat = jax.lax.map(
-            jax.checkpoint(pixel),
-            centres,
-            batch_size=min(spec.sampling.block, width * height),
-        )
-        return jax.tree.map(lambda x: x.reshape(height, width, *x.shape[1:]), flat)
+        return draw(bind(params), camera, FrameCondition(time, codes, step), size)
 
     def survey(params, step, depth=skipping.SKIPPED_DEPTH):
         def condition_at(time):
             frame_codes = look_up(tables, metadata, params, time, jnp.int32(0))
             return FrameCondition(time, frame_codes, step)
 
-        bound = Bound(spec, metadata, active, params)
-        return skipping.survey(bound, condition_at, depth)
+        return skipping.survey(bind(params), condition_at, depth)
 
     def render_occupied(params, occupied, camera, time, codes, size, step):
-        bound = Bound(spec, metadata, active, params)
         condition = FrameCondition(time, codes, step)
-        return skipping.draw(bound, occupied, camera, condition, size)
+        return skipping.draw(bind(params), occupied, camera, condition, size)
 
     return Field(
         spec,
@@ -135,6 +119,29 @@ def field(
         survey if skipping.usable(spec, active) else None,
         render_occupied,
     )
+
+
+def draw(
+    bound: Bound, camera: Camera, condition: FrameCondition, size: tuple[int, int]
+) -> Rendering:
+    """A whole frame by the full quadrature, with slopes; `skipping.draw` has none."""
+
+    def pixel(position):
+        ray, cosine = field_ray_through(bound.metadata, camera, position)
+        level = render_ray(bound, ray, condition, None)[-1]
+        depth = level.distance * cosine / bound.metadata.scale
+        return Rendering(level.colour, level.alpha, depth)
+
+    width, height = size
+    centres = rays.pixel_centres(size, camera.position.dtype).reshape(-1, 2)
+    # A slope, as of the camera, is found block by block: all samples of a frame at once
+    # would need as much memory as a training step over all its pixels.
+    flat = jax.lax.map(
+        jax.checkpoint(pixel),
+        centres,
+        batch_size=min(bound.spec.sampling.block, width * height),
+    )
+    return jax.tree.map(lambda x: x.reshape(height, width, *x.shape[1:]), flat)
 
 
 def _active(effects, without):
