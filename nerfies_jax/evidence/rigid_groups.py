@@ -5,6 +5,7 @@ belongs together, and a group is carried over time by the points that it shares 
 frame 8, 4 or 1 before.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -173,6 +174,16 @@ def centres(
     return canonical, middle
 
 
+def miss(position: np.ndarray, known: np.ndarray, count: int) -> float:
+    """How far `count` groups miss the known places in the median, scene units."""
+    label = labels(position, known, count)
+    bodies = motion(position, known, label, position.shape[1] // 2)
+    canonical, _ = centres(position, known, bodies)
+    moved = np.einsum("ptij,pj->pti", bodies.rotation[label], canonical)
+    away = np.linalg.norm(moved + bodies.shift[label] - position, axis=-1)
+    return float(np.median(away[known]))
+
+
 def fewest(
     position: np.ndarray, known: np.ndarray, within: float, most: int = 8
 ) -> tuple[int, float]:
@@ -182,15 +193,24 @@ def fewest(
     `most` where that many do not. In scene units.
     """
     for count in range(1, most + 1):
-        label = labels(position, known, count)
-        bodies = motion(position, known, label, position.shape[1] // 2)
-        canonical, _ = centres(position, known, bodies)
-        moved = np.einsum("ptij,pj->pti", bodies.rotation[label], canonical)
-        miss = np.linalg.norm(moved + bodies.shift[label] - position, axis=-1)
-        typical = float(np.median(miss[known]))
+        typical = miss(position, known, count)
         if typical < within:
             break
     return count, typical
+
+
+def enough(
+    position: np.ndarray, known: np.ndarray, counts: Sequence[int], slack: float
+) -> int:
+    """The first of rising `counts` of groups beyond which more explain hardly more.
+
+    They miss the known places by at most `slack` times what the last of `counts` does,
+    in the median.
+    """
+    limit = slack * miss(position, known, counts[-1])
+    return next(
+        n for n in counts if n == counts[-1] or miss(position, known, n) <= limit
+    )
 
 
 def rotation_vectors(rotation: np.ndarray, canonical: int) -> np.ndarray:

@@ -7,6 +7,7 @@ import pytest
 
 from gaussians_jax import representation
 from gaussians_jax.presets import PRESETS
+from nerfies_jax.evidence import rigid_groups
 from nerfies_jax.training import specs
 from tests.evidence import films
 from tests.evidence.test_tracks import MOVES
@@ -34,6 +35,16 @@ def test_motion_is_chosen_by_what_tracks_say(make, kind, words, tmp_path, monkey
     choice = representation.default_preset(make())
     assert choice.preset == SPLATS.format(kind)
     assert words in "".join(choice.notes)
+
+
+@pytest.mark.parametrize(("asked", "overrides"), [(20, ("motion.bases=20",)), (12, ())])
+def test_paths_of_many_things_get_more_bases(asked, overrides, tmp_path, monkeypatch):
+    monkeypatch.setattr(representation, "CACHE", tmp_path)
+    monkeypatch.setattr(rigid_groups, "enough", lambda *_: asked)
+    choice = representation.default_preset(films.film(**MOVES, frames=24))
+    assert choice.overrides == overrides
+    spec = specs.override(PRESETS[choice.preset], choice.overrides)
+    assert spec.motion.bases == asked
 
 
 @pytest.mark.parametrize("kind", ["tracked", "static", "deformable"])
