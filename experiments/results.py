@@ -45,9 +45,10 @@ time, of deformation, solvers and local kernels. They are gone because no file s
 behind them: nobody could check them without hours of processor time. The ablations
 said little besides: what moves was found badly by every arm then (points were
 followed with nearly the error of points that do not move at all), so that hardly a
-difference between arms left the spread over seeds. What the start from tracks is worth
-to each motion of splats stands in [ablate_start.md](ablate_start.md); the suites of
-Sonata, MoBa-GS and fields now start from tracks and are still to be measured.
+difference between arms left the spread over seeds. From tracks it is found: what that
+start is worth to each motion of splats stands in [ablate_start.md](ablate_start.md),
+and what Sonata's parts are worth behind it in [ablate_sonata.md](ablate_sonata.md).
+The suites of MoBa-GS and of fields are still to be measured so.
 """
 
 

@@ -1,6 +1,7 @@
 """Write an ablation down: the table, the claims, metrics and a picture."""
 
 import math
+import pathlib
 
 from experiments.ablate import arms, measures, picture, verdicts
 from experiments.ablate.measures import MEASURES
@@ -30,7 +31,7 @@ def write(job, budget, finished) -> None:
         print("\n" + job.suite.context)
     about = {
         "capture": job.capture.name,
-        "settings": specs.as_json(job.args),
+        "settings": _settings(job.args),
         "budget": {"steps": budget.steps, "seconds": budget.seconds},
         "arms": {name: specs.as_json(arm) for name, arm in job.suite.arms.items()},
         "seeds": {
@@ -45,6 +46,15 @@ def write(job, budget, finished) -> None:
     )
     _picture(job, finished, budget.folder / "ablation.png")
     print(f"{budget.folder / 'ablation.png'} and {budget.folder / 'ablation.json'}")
+
+
+def _settings(args):
+    """What was asked for, without where on this machine things lie."""
+    settings = specs.as_json(args) | {"out": None}
+    folder = settings["source"]["capture"]
+    if folder is not None:
+        settings["source"]["capture"] = pathlib.Path(folder).name
+    return settings
 
 
 def judged(job) -> list:
