@@ -20,6 +20,7 @@ from nerfies_jax.render_ray import (
     Ray,
     displacement,
     field_ray_through,
+    is_moved,
     render_ray,
 )
 from nerfies_jax.scene_metadata import SceneMetadata
@@ -57,8 +58,9 @@ class Field(NamedTuple):
     displace: Callable[[PyTree, Vector, FrameCondition], Vector]
     # (params, camera, time, codes, size, step) -> whole frame
     render: Callable[..., Rendering]
-    # (params, step, depth=SKIPPED_DEPTH) -> `skipping.Occupancy`; None where space
-    # cannot be skipped
+    # (params, step, depth=SKIPPED_DEPTH) -> `skipping.Occupancy` at any time: without a
+    # level where the field moves, for then each frame is surveyed by itself; None where
+    # space cannot be skipped
     survey: Callable[..., Occupancy] | None
     # `render` behind an occupancy, without slopes
     render_occupied: Callable[..., Rendering]
@@ -96,16 +98,22 @@ def field(
     def render(params, camera, time, codes, size, step):
         return draw(bind(params), camera, FrameCondition(time, codes, step), size)
 
-    def survey(params, step, depth=skipping.SKIPPED_DEPTH):
-        def condition_at(time):
-            frame_codes = look_up(tables, metadata, params, time, jnp.int32(0))
-            return FrameCondition(time, frame_codes, step)
+    moves = is_moved(bind(None))
 
-        return skipping.survey(bind(params), condition_at, depth)
+    def survey(params, step, depth=skipping.SKIPPED_DEPTH):
+        if moves:
+            return {}
+        kind = jax.tree.leaves(params["template"])[0].dtype
+        time = jnp.asarray(metadata.times[0], kind)
+        frame_codes = look_up(tables, metadata, params, time, jnp.int32(0))
+        condition = FrameCondition(time, frame_codes, step)
+        return skipping.survey(bind(params), condition, depth)
 
     def render_occupied(params, occupied, camera, time, codes, size, step):
-        condition = FrameCondition(time, codes, step)
-        return skipping.draw(bind(params), occupied, camera, condition, size)
+        bound, condition = bind(params), FrameCondition(time, codes, step)
+        if moves:
+            occupied = skipping.survey(bound, condition)
+        return skipping.draw(bound, occupied, camera, condition, size)
 
     return Field(
         spec,

@@ -25,19 +25,18 @@ from nerfies_jax.render_ray import (
     is_moved,
     radiance_at,
 )
-from nerfies_jax.training.effects import MOMENT, FrameCondition
+from nerfies_jax.training.effects import FrameCondition
 from nerfies_jax.training.model import Rendering
 
-Scalar = Float[Array, ""]
 Occupancy = dict[str, occupancy.Cells]  # by level, "coarse" and "fine"
 
 # Optical depth that all samples skipped on a ray straight ahead have together at most,
 # as far as the survey saw the densest of each cell: 1 % of the light.
 SKIPPED_DEPTH = 0.01
 OPAQUE_DEPTH = 7.0  # e^-7 = 9e-4 of the light passes
-STILL_CELLS, STILL_LOOKS = 64, 2
-# Each look at a scene that moves is at another time and costs a warp of every cell.
-MOVING_CELLS, MOVING_LOOKS = 40, 8
+# What moves is surveyed anew for every frame, and each look costs a warp of every cell.
+STILL_CELLS, MOVING_CELLS = 64, 40
+LOOKS = 2  # at each cell
 BATCH = 2048  # points asked at once
 BLOCK = 16384  # rays drawn at once
 STAGES = 4  # in which a ray is followed; behind what is opaque no further one is
@@ -46,41 +45,34 @@ STAGES = 4  # in which a ray is followed; behind what is opaque no further one i
 def usable(spec, effects) -> bool:
     """Whether a field can be surveyed before its frames are drawn.
 
-    Not where a second medium shares its rays, where colour reads of surfaces, where
-    motion depends on the exposure, or where nothing says how large what was filmed is.
+    Not where a second medium shares its rays, where colour reads of surfaces, or where
+    nothing says how large what was filmed is.
     """
-    moving = [e for e in effects if e.displace is not None or e.lift is not None]
     return (
         spec.extent is not None
         and all(effect.medium is None for effect in effects)
         and all(effect.surface is None for effect in effects)
-        and all(table.by == MOMENT for effect in moving for table in effect.tables)
     )
 
 
 def survey(
-    bound: Bound,
-    condition_at: Callable[[Scalar], FrameCondition],
-    depth: float = SKIPPED_DEPTH,
+    bound: Bound, condition: FrameCondition, depth: float = SKIPPED_DEPTH
 ) -> Occupancy:
-    """Which cells each level's density fills at any time; pure.
+    """Which cells each level's density fills at the time of one frame; pure.
 
     A cell is filled where a random point in it is so dense that light that went from
     near to far through nothing else would meet an optical depth above `depth`.
     """
-    spec, metadata, moved = bound.spec, bound.metadata, is_moved(bound)
-    cells, looks = (MOVING_CELLS, MOVING_LOOKS) if moved else (STILL_CELLS, STILL_LOOKS)
+    spec, metadata = bound.spec, bound.metadata
+    cells = MOVING_CELLS if is_moved(bound) else STILL_CELLS
     span = (metadata.far - metadata.near) * metadata.scale
     names = tuple(bound.params["template"])
     dtype = jax.tree.leaves(bound.params["template"])[0].dtype
     direction = jnp.zeros(3, dtype).at[2].set(1)  # no density depends on it
-    first, last = metadata.times[0], metadata.times[-1]
+    inputs = {n: colour_inputs(bound, n, direction, condition) for n in names}
 
     def look(found, number):
         key = jax.random.fold_in(jax.random.key(0), number)
-        share = number.astype(dtype) / max(looks - 1, 1)
-        condition = condition_at(first + (last - first) * share)
-        inputs = {n: colour_inputs(bound, n, direction, condition) for n in names}
 
         def densities(point):
             place = asked_at(bound, point, condition)
@@ -97,7 +89,7 @@ def survey(
         ), None
 
     start = {name: jnp.zeros(cells**3, bool) for name in names}
-    found, _ = jax.lax.scan(look, start, jnp.arange(looks, dtype=jnp.int32))
+    found, _ = jax.lax.scan(look, start, jnp.arange(LOOKS, dtype=jnp.int32))
     return {
         name: occupancy.dilated(occupied.reshape((cells,) * 3))
         for name, occupied in found.items()

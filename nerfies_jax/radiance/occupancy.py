@@ -22,8 +22,9 @@ Cells = Bool[Array, "cells cells cells"]
 class OccupancySpec:
     """When space is surveyed, and how many rays there are to choose from.
 
-    After `start` steps and then every so many, whatever the length of the run: a survey
-    of a scene that rests takes as long as six steps of a small field on a grid.
+    Of a scene at rest: what moves is empty nowhere for good. After `start` steps and
+    then every so many, whatever the length of the run: a survey takes as long as six
+    steps of a small field on a grid.
     `candidates` rays are drawn for each of a step. `anywhere` is the share of a step's
     rays that need not meet anything: what appears in empty space is seen by these.
     """

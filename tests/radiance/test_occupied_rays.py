@@ -9,6 +9,7 @@ import pytest
 
 from nerfies_jax import evaluation, occupied_rays, scene
 from nerfies_jax.effects.transient import TransientSpec
+from nerfies_jax.effects.warp import WarpSpec
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.grids import HashGridSpec
 from nerfies_jax.radiance.occupancy import OccupancySpec
@@ -139,8 +140,12 @@ def ray_of(metadata, batch, number):
 
 @pytest.mark.parametrize(
     "change",
-    [{"transient": TransientSpec(depth=1, width=8)}, {"extent": None}],
-    ids=["transient", "no extent"],
+    [
+        {"transient": TransientSpec(depth=1, width=8)},
+        {"extent": None},
+        {"warp": WarpSpec(position=EncodingSpec(2), depth=1, width=8, skips=())},
+    ],
+    ids=["transient", "no extent", "moving"],
 )
 def test_what_cannot_be_surveyed_is_refused(change):
     spec = dataclasses.replace(SPEC, **change)

@@ -69,15 +69,22 @@ ORANGE = (1.0, 0.5, 0.0)
 
 
 @pytest.mark.parametrize(
-    ("spec", "background"),
-    [(STILL, None), (MOVING, ORANGE), (ONE_LEVEL, ORANGE)],
-    ids=["still", "moving", "one level"],
+    ("spec", "background", "row"),
+    [
+        (STILL, None, 3),
+        (ONE_LEVEL, ORANGE, 3),
+        *((MOVING, ORANGE, n) for n in range(3)),
+    ],
+    ids=["still", "one level", "moving", "moving then", "moving at last"],
 )
-def test_skipping_changes_a_frame_by_no_more_than_it_may(spec, background):
+def test_skipping_changes_a_frame_by_no_more_than_it_may(spec, background, row):
     model, params = full_of_holes(spec, background)
-    view = evaluation.view_of(scenes.tiny_capture(), 3)
+    view = evaluation.view_of(scenes.tiny_capture(), row)
+    if spec is MOVING:  # in another place at every moment, and between two
+        view = view._replace(time=view.time + jnp.float32(0.03))
     occupied = jax.jit(model.surveyed.survey)(params, STEP)
     assert all(0.02 < cells.mean() < 0.8 for cells in occupied.values())
+    assert (occupied == {}) == (spec is MOVING)
     draw = jax.jit(model.surveyed.draw, static_argnums=3)
     skipped = draw(params, occupied, view, SIZE, STEP)
     whole = jax.jit(model.render, static_argnums=2)(params, view, SIZE, STEP)
@@ -91,6 +98,8 @@ def test_skipping_changes_a_frame_by_no_more_than_it_may(spec, background):
     span = model.spec[1].far - model.spec[1].near
     seen = whole.alpha > 0.5
     assert np.abs(skipped.depth - whole.depth)[seen].mean() < most * span
+    if spec is MOVING:
+        return
     # Were nothing occupied, samples would be skipped that the picture is made of.
     nothing = jax.tree.map(jnp.zeros_like, occupied)
     bare = draw(params, nothing, view, SIZE, STEP)
