@@ -92,6 +92,8 @@ def _captures(folders):
 
     if not folders:
         return {"default": runs.built_in_scene("default")}
+    if len({folder.name for folder in folders}) < len(folders):
+        raise ValueError("--captures: two folders of one name share a row; rename one")
     return {folder.name: runs.load_capture(folder) for folder in folders}
 
 
@@ -130,6 +132,10 @@ def _trained(capture, preset, planned, seed, steps=None):
     quiet = rich.console.Console(quiet=True)
     began = time.process_time()
     ended = loop.fit(model, state, frames, steps=steps or planned, console=quiet)
+    if ended.stopped_by.startswith("SIG"):
+        raise SystemExit("stopped; the same command goes on with what is missing")
+    if ended.stopped_by != "steps":
+        raise RuntimeError(f"{preset}: training ended early ({ended.stopped_by})")
     # Compiling is taken out by its share of the time: its own on the processor is not
     # known.
     share = ended.seconds / (ended.seconds + ended.compile_seconds)

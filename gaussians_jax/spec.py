@@ -178,6 +178,18 @@ def refuse_what_cannot_train(spec: SplatScene) -> None:
             "DefaultStrategySpec, or leave out what they carry (carried=none, or "
             "another motion than that of anchors)"
         )
+    if carry and spec.flow is not None:
+        raise ValueError(
+            "flow is compared where rows are drawn, and rows that carry Gaussians are "
+            "not; leave it out (flow=none), or leave out what they carry "
+            "(carried=none, or another motion than that of anchors)"
+        )
+    resting = isinstance(motion, AnchorMotionSpec) and not motion.moves
+    if resting and spec.start.motion == "tracks":
+        raise ValueError(
+            'motion.moves=false with start.motion="tracks": anchors at rest have no '
+            "motion to fit to tracks; leave one of them out"
+        )
     if carry and spec.temporal_opacity is not None:
         raise ValueError(
             "temporal_opacity fades rows, and of rows that carry Gaussians only these "
@@ -256,7 +268,8 @@ def effects_of(spec: SplatScene, metadata: SceneMetadata) -> tuple[Effect, ...]:
         effects.append(
             acceleration.effect(spec.acceleration, metadata.extent, metadata.frames)
         )
-    if spec.neighbours is not None:
+    # A trained scene is drawn without its motion as well.
+    if spec.neighbours is not None and motion is not None:
         of = EMBEDDED[type(spec.motion)]
         effects.append(neighbours.effect(spec.neighbours, metadata.extent, of))
     if spec.motion_growth is not None:

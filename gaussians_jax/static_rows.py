@@ -17,6 +17,7 @@ from gaussians_jax import splats
 from gaussians_jax.splats import Gaussians, Params
 from nerfies_jax.geometry import quaternion
 
+FADES = 1 / 512  # change of opacity that no picture of 8 bits shows
 # The deformation of any choice of rows: (parameters of those rows, time) -> Gaussians.
 DeformRows = Callable[[Params, Float[Array, ""]], Gaussians]
 
@@ -71,7 +72,7 @@ def dynamic_mask(
 ) -> np.ndarray:
     """[gaussians] bool: the rows that move farther than `static_threshold`; host side.
 
-    A row that is not drawn, of opacity zero, does not move.
+    A row that is drawn neither here nor there, of opacity zero, does not move.
     """
     if not static_threshold >= 0:
         raise ValueError(
@@ -80,19 +81,25 @@ def dynamic_mask(
         )
     # "not <=": a row whose motion is not a number is not taken for static.
     far = ~(np.asarray(_max_displacement(static, now)) <= static_threshold)
-    return far & (np.asarray(static.opacity) > 0)
+    drawn = (np.asarray(static.opacity) > 0) | (np.asarray(now.opacity) > 0)
+    return far & drawn
 
 
 def split(
-    params: Params, deform: DeformRows, times: np.ndarray, static_threshold: float
+    params: Params,
+    deform: DeformRows,
+    times: np.ndarray,
+    static_threshold: float,
+    fading: bool = True,
 ) -> StaticDynamicSplit:
     """The rows that move farther than `static_threshold` (scene units); host side.
 
     `times` [instants] lie in [0, 1]. Rows are compared with where they are at the
     middle one, and drawn there from then on: at `times` no point of a Gaussian is
-    farther than `static_threshold` from where the whole deformation puts it. Between
-    them nothing is promised: a row that moves only between two instants has not been
-    met.
+    farther than `static_threshold` from where the whole deformation puts it. With
+    `fading` a row whose opacity changes by more than `FADES` counts as one that moves.
+    Between the instants nothing is promised: a row that moves only between two of them
+    has not been met.
     """
     if not len(times):
         raise ValueError("no times to look for motion at; 16 over [0, 1] will do")
@@ -103,6 +110,8 @@ def split(
     for time in times:
         now = deformed(params, jnp.asarray(time, dtype))
         moves |= dynamic_mask(static, now, static_threshold)
+        if fading:
+            moves |= ~(np.abs(np.asarray(now.opacity - static.opacity)) <= FADES)
     carrying = of_rows(params, moves)
     rows = jnp.asarray(np.flatnonzero(carrying), jnp.int32)
     every = np.repeat(carrying, len(moves) // len(carrying))

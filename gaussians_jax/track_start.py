@@ -84,7 +84,10 @@ def _seeds(effect, points, followed, evidence, capture, unit, spec):
     canonical = np.asarray(points.canonical)
     own = None if points.rows is None else jax.tree.map(np.asarray, points.rows)
     places = jax.jit(lambda points, time: path_fit.places(effect, points, time))
-    positions, colours, rows, spans = [], [], [], []
+    # Nothing of each: in no frame need there be tracks enough.
+    none = np.zeros((0, 3), np.float32)
+    positions, colours, spans = [none], [none], [np.zeros((2, 0))]
+    rows = [] if own is None else [jax.tree.map(lambda leaf: leaf[:0], own)]
     # All frames share the programs: as many rows as the frame with most.
     most = int(np.bincount(frame).max()) if len(frame) else 0
     for here in np.unique(frame):

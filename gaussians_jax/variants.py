@@ -95,8 +95,8 @@ def from_knots(
 def without_static(model: Model, state: TrainState, static_threshold: float) -> Faster:
     """The model with the deformation evaluated for moving Gaussians alone; host side.
 
-    Those are the ones that move farther than `static_threshold` (scene units) over
-    `INSTANTS` instants of [0, 1].
+    Those are the ones that move farther than `static_threshold` (scene units), or come
+    and go, over `INSTANTS` instants of [0, 1].
     """
     stages = _stages(model, "--static-threshold")
 
@@ -140,7 +140,7 @@ def without_moving(
         return stages.deform(params, stages.prepare(params), time)
 
     times = np.linspace(0, 1, INSTANTS)
-    parts = static_rows.split(state.params, deform_rows, times, farther_than)
+    parts = static_rows.split(state.params, deform_rows, times, farther_than, False)
     moves = static_rows.of_rows(state.params, np.asarray(parts.index.moves))
     rows = state.params.rows
     active = int(splats.active_mask(rows["splats"]).sum())

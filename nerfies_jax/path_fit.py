@@ -151,13 +151,15 @@ def fit_flow(
     descends is the network of the medium, with all that its flow reads. ValueError
     where no point is known in two frames that follow each other.
     """
-    both = paths.known[:, 1:] & paths.known[:, :-1]
+    apart = np.diff(paths.time)
+    both = paths.known[:, 1:] & paths.known[:, :-1] & (apart > 0)
     if not both.any():
         raise ValueError(
             "no path is known in two frames that follow each other: nothing to fit a "
             "scene flow to"
         )
-    moments = np.diff(paths.time) / scene_flow.interval(len(field.metadata.times))
+    moments = np.where(apart > 0, apart, 1)
+    moments = moments / scene_flow.interval(len(field.metadata.times))
     shift = np.diff(paths.position, axis=1) / moments[:, None]
     unit = max(float(np.linalg.norm(shift, axis=-1)[both].mean()), 1e-12)
     away = _flow_distances(field, paths, shift, both)
@@ -192,7 +194,9 @@ def _flow_distances(field, paths, shift, both):
     def away(own, frames, rows, still, soft):
         @functools.partial(jax.vmap, in_axes=(0, None))
         def flow(point, time):
-            return scene_flow.dynamic(spec, own, point, jnp.zeros(3), time).flow
+            return scene_flow.dynamic(
+                spec, own, point, jnp.zeros_like(point), time
+            ).flow
 
         def one(frame):
             there = frame + 1

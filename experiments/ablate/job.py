@@ -93,7 +93,7 @@ class Job:
             stem = f"ablation-{args.source.scene}"
         self.out = args.out or pathlib.Path("runs", stem)
         self.budgets = []
-        if args.seconds is None or args.steps is not None:
+        if args.seconds is None or args.steps is not None or args.share is not None:
             self.budgets.append(Budget(args.steps, None, self.out, args.share))
         if args.seconds is not None:
             kind = "processor-seconds" if args.clock == "processor" else "seconds"

@@ -35,17 +35,14 @@ def page(stored) -> str:
 
 
 def _trained(about):
-    budget = about["budget"]
-    limits = [
-        f"{value:,g} {unit}" for unit, value in budget.items() if value is not None
-    ] or ["the steps of its preset"]
+    changed = " ".join(about["settings"]["set"])
     count = max(map(len, about["seeds"].values()))
     seeds = f"{count} seeds; ± is their standard deviation"
     if count == 1:
         seeds = "one seed, which has no spread"
     return (
-        f"Every arm was trained over {' or '.join(limits)}, with {seeds}. The last "
-        "iterate counts."
+        f"Every arm was trained {about['trained']}, with {seeds}. The last iterate "
+        f"counts.{f' All with --set {changed}.' if changed else ''}"
     )
 
 

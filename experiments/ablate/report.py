@@ -33,6 +33,7 @@ def write(job, budget, finished) -> None:
         "capture": job.capture.name,
         "settings": _settings(job.args),
         "budget": {"steps": budget.steps, "seconds": budget.seconds},
+        "trained": budget.title,
         "arms": {name: specs.as_json(arm) for name, arm in job.suite.arms.items()},
         "seeds": {
             name: [s for other, s in finished if other == name]

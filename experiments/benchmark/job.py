@@ -4,7 +4,7 @@ import json
 import pathlib
 from typing import Any
 
-from nerfies_jax.runs import platform, representations
+from nerfies_jax.runs import platform, representations, run_folder
 from nerfies_jax.runs.config import RunConfig
 
 
@@ -13,20 +13,45 @@ def score(
 ) -> dict[str, Any]:
     """Preset, machine and metrics of one run, made in `folder` unless it is there.
 
-    One that is `alone` on the machine takes the cores that its preset wants.
+    One that was interrupted goes on. One that is `alone` on the machine takes the cores
+    that its preset wants. ValueError where the folder holds a run of another capture.
     """
-    metrics = folder / "metrics.json"
-    if not metrics.exists():
+    metrics, about = folder / "metrics.json", folder / "about.json"
+    begun = (folder / run_folder.CONFIG).exists()
+    if begun:
+        _check_capture(config, folder)
+    if not (metrics.exists() and about.exists()):
         wanted = representations.cores(config.preset, config.overrides)
         platform.start_jax("cpu", *(wanted if alone else ("one",)))
         from nerfies_jax import runs
         from nerfies_jax.capture.json_files import write_json
         from nerfies_jax.measure import clock
 
-        outcome = runs.reconstruct(config, folder, seconds=seconds)
+        if begun:
+            outcome = runs.resume(folder)
+        else:
+            outcome = runs.reconstruct(config, folder, seconds=seconds)
         if outcome.errors:
             raise RuntimeError(f"{folder}: {outcome.errors[0]}")
-        about = {"preset": outcome.run.config.preset, "machine": clock.machine()}
-        write_json(folder / "about.json", about)
-    about = json.loads((folder / "about.json").read_text())
-    return about | {"metrics": json.loads(metrics.read_text())}
+        if not metrics.exists():
+            stopped = outcome.result.stopped_by
+            raise RuntimeError(
+                f"{folder}: stopped ({stopped}); the same command goes on"
+            )
+        preset = outcome.run.config.preset
+        write_json(about, {"preset": preset, "machine": clock.machine()})
+    return json.loads(about.read_text()) | {"metrics": json.loads(metrics.read_text())}
+
+
+def _check_capture(config, folder):
+    """Refuse the numbers of another capture whose folder has the same name."""
+    from nerfies_jax.runs.run import read_settings
+
+    there = read_settings(folder).config.source.capture
+    wanted = config.source.capture
+    if there == wanted or (there and wanted and run_folder.is_of(there, wanted)):
+        return
+    raise ValueError(
+        f"{folder}: holds a run of {there}, and {wanted} is asked for; name another "
+        "--out"
+    )

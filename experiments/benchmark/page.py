@@ -1,6 +1,7 @@
 """The page of `experiments.benchmark` in docs/results."""
 
 import math
+import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -52,7 +53,7 @@ def _spread(values, digits):
     """The median, and the ends where there are several."""
     if not values:
         return ""
-    middle = markdown.number(values[len(values) // 2], digits)
+    middle = markdown.number(statistics.median(values), digits)
     if len(values) == 1:
         return middle
     ends = " to ".join(markdown.number(values[k], digits) for k in (0, -1))

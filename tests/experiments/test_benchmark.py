@@ -1,10 +1,17 @@
 """The benchmark keeps every run under what was run, and shows medians and ends."""
 
 import json
+from types import SimpleNamespace
+
+import pytest
 
 from experiments import cli
 from experiments.benchmark import __main__ as benchmark
-from experiments.benchmark import page
+from experiments.benchmark import job, page
+from nerfies_jax import runs
+from nerfies_jax.runs import representations
+from nerfies_jax.runs.config import CaptureSource, RunConfig
+from nerfies_jax.training import specs
 
 MACHINE = {"cpu": "one", "backend": "cpu", "jax": "0"}
 
@@ -32,6 +39,9 @@ def test_the_page_has_the_median_and_the_ends():
     written = page.page({"machine": MACHINE, "runs": {"--scene default": runs}})
     assert "| `--scene default` | splats-tracked-small | 3 |" in written
     assert "32.00 (31.00 to 33.50)" in written
+    del runs["2"]
+    written = page.page({"machine": MACHINE, "runs": {"--scene default": runs}})
+    assert "32.25 (31.00 to 33.50)" in written
     assert "EPE at rest |" not in written  # no truth: the column is left out
 
 
@@ -40,3 +50,42 @@ def test_a_run_is_named_without_where_it_lies(tmp_path):
     args = cli.parse(benchmark.Benchmark, words)
     assert benchmark._label(args) == "film --max-side 256 --steps 20"
     assert benchmark._stem(args) == "film-max-side-256-steps-20"
+
+
+def test_a_run_goes_on_where_it_was_cut_and_belongs_to_one_capture(
+    tmp_path, monkeypatch
+):
+    """Nothing is trained: what stands in for it writes what a run writes."""
+    done = []
+    spec = representations.of_preset("nerf-small").presets["nerf-small"]
+
+    def config_of(folder):
+        source = CaptureSource(capture=str(tmp_path / folder / "dog"))
+        return RunConfig(preset="nerf-small", source=source)
+
+    def begin(config, folder, seconds):
+        done.append("begun")
+        folder.mkdir()
+        stored = {"config": specs.as_json(config), "spec": specs.as_json(spec)}
+        stored["representation"] = "radiance"
+        (folder / "config.json").write_text(json.dumps(stored))
+        result = SimpleNamespace(stopped_by="SIGINT")
+        return SimpleNamespace(errors=(), result=result)
+
+    def go_on(folder):
+        done.append("resumed")
+        (folder / "metrics.json").write_text(json.dumps({"heldout.psnr": 30.0}))
+        run = SimpleNamespace(config=SimpleNamespace(preset="nerf-small"))
+        return SimpleNamespace(errors=(), run=run)
+
+    monkeypatch.setattr(job.platform, "start_jax", lambda *_: None)
+    monkeypatch.setattr(runs, "reconstruct", begin)
+    monkeypatch.setattr(runs, "resume", go_on)
+    out, first = tmp_path / "dog-0", config_of("a")
+    with pytest.raises(RuntimeError, match="the same command goes on"):
+        job.score(first, out, None, alone=True)
+    for _ in range(2):
+        assert job.score(first, out, None, True)["metrics"] == {"heldout.psnr": 30.0}
+    assert done == ["begun", "resumed"]
+    with pytest.raises(ValueError, match=r"holds a run of .*dog, and .*dog is asked"):
+        job.score(config_of("b"), out, None, alone=True)

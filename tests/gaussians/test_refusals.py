@@ -22,6 +22,7 @@ from gaussians_jax import (
 from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.effects import acceleration, kan_motion, motion_growth, spectral
 from gaussians_jax.effects.acceleration import AccelerationSpec
+from gaussians_jax.effects.anchors import AnchorMotionSpec
 from gaussians_jax.effects.carried import CarriedSpec
 from gaussians_jax.effects.depth import DepthSpec
 from gaussians_jax.effects.embedding_motion import EmbeddingMotionSpec
@@ -33,7 +34,7 @@ from gaussians_jax.effects.motion_growth import MotionGrowthSpec
 from gaussians_jax.effects.neighbours import NeighbourSpec
 from gaussians_jax.effects.spectral import FourierSpec, SpectralSpec, WaveletSpec
 from gaussians_jax.effects.temporal_opacity import TemporalOpacitySpec
-from gaussians_jax.initialisation import InitSpec
+from gaussians_jax.initialisation import InitSpec, StartSpec
 from gaussians_jax.learning_rates import LearningRateSpec
 from gaussians_jax.mcmc import MCMCStrategySpec
 from gaussians_jax.phases import AlternationSpec, AnnealingSpec
@@ -206,6 +207,9 @@ CALLS = [
      "neighbours=none"),
     (lambda: moba(densification=None), "motion_growth=none"),
     (lambda: moba(densification=MCMCStrategySpec()), "threshold of Default"),
+    (lambda: moba(flow=FlowSpec(), carried=CarriedSpec()), "flow=none"),
+    (lambda: moba(motion=AnchorMotionSpec(moves=False), start=StartSpec("tracks")),
+     "motion.moves=false"),
     (lambda: moba(temporal_opacity=TemporalOpacitySpec(), carried=CarriedSpec()),
      "temporal_opacity=none"),
     (lambda: moba(motion_growth=MotionGrowthSpec(form="hard", start=3)),

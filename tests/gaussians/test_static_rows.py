@@ -115,6 +115,28 @@ def test_what_is_left_out_is_off_by_no_more_than_the_tolerance(static_threshold,
         assert (apart <= static_threshold).all()
 
 
+def test_what_comes_and_goes_is_drawn_while_it_is_there(rng):
+    """Gone at the middle instant, at which rows are compared: moving, and at rest."""
+    params = scene(rng, count=3)
+    params.rows["speed"] = put(np.r_[0.3, 0, 0, np.zeros(8)])
+    width = put(np.r_[0.04, 0.15, 1e9, np.ones(8)])
+
+    def fading(params, time):
+        now = deform(params, time)
+        share = jnp.exp(-(((time - 0.1) / params.rows["width"]) ** 2))
+        return now._replace(opacity=now.opacity * share)
+
+    params.rows["width"] = width
+    parts = static_rows.split(params, fading, TIMES, 0.01)
+    assert parts.index.moves[:4].tolist() == [True, True, False, False]
+    early = np.float32(TIMES[1])
+    drawn = jax.jit(static_rows.deform, static_argnums=1)(parts, fading, early)
+    np.testing.assert_allclose(drawn.opacity, fading(params, early).opacity, rtol=1e-6)
+    # To be hidden, a row must move: one at rest stays, however short it is there.
+    parts = static_rows.split(params, fading, TIMES, 0.01, fading=False)
+    assert parts.index.moves[:4].tolist() == [True, False, False, False]
+
+
 def test_where_nothing_moves_nothing_is_evaluated(rng):
     params = scene(rng)
     params.rows["speed"] = put(np.zeros_like(params.rows["speed"]))

@@ -14,6 +14,7 @@ from gaussians_jax.effects import temporal_opacity
 from gaussians_jax.effects.se3_bases import SE3BasesSpec
 from gaussians_jax.initialisation import StartSpec
 from gaussians_jax.path_fit import Paths, Points
+from gaussians_jax.splats import Params
 from nerfies_jax import evaluation
 from nerfies_jax.evidence import record, usable_paths
 from tests.evidence import films
@@ -135,6 +136,22 @@ def test_gaussians_start_on_the_card_and_move_with_it():
         on_card = (np.abs(place[:, :2] - [across, down]) < films.CARD + 0.05).all(-1)
         near = np.abs(place[:, 2] - films.NEAR) < 0.15
         assert (on_card & near).mean() > 0.8  # the mask has a rim
+
+
+def test_where_no_moving_pixel_has_a_depth_the_motion_starts_alone(monkeypatch):
+    """As where fewer than six tracks are known in every frame."""
+    capture, evidence = film_and_evidence()
+    nowhere = np.zeros(evidence.moving.shape, np.float32)
+    monkeypatch.setattr(track_start, "moving_depths", lambda _: nowhere)
+    effects = (effect_of(MOTIONS["bases"]),)
+    start = StartSpec(motion="tracks", fit_steps=2)
+    started = track_start.start(start, *effects, evidence, capture, jax.random.key(0))
+    assert len(started.position) == len(started.colour) == len(started.rows) == 0
+    rows = splats.from_points(np.eye(3), np.eye(3))
+    params = Params({"splats": rows, "se3_bases": jnp.ones((3, 13))}, {"se3_bases": 0})
+    begun = track_start.put_in(params, effects, started)
+    np.testing.assert_array_equal(begun.rows["se3_bases"], 1)
+    assert begun.nets["se3_bases"].turn.any()
 
 
 def small_scene(**changes):

@@ -1,10 +1,14 @@
 """Trained Gaussians drawn otherwise."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
 
 from gaussians_jax import scene, splats, static_rows, variants
+from gaussians_jax.presets import PRESETS
+from gaussians_jax.spec import effects_of, motion_of
 from gaussians_jax.splats import Gaussians
 from nerfies_jax import evaluation
 from nerfies_jax.training.model import TrainState
@@ -27,6 +31,13 @@ def test_splats_without_motion_are_the_canonical_ones(swaying):
     )
     assert np.ptp(picture.colour) > 0.1
     np.testing.assert_array_equal(picture.colour, expected.colour)
+
+
+@pytest.mark.parametrize("name", [n for n, s in PRESETS.items() if s.motion])
+def test_any_preset_may_be_drawn_without_its_motion(name):
+    metadata = scene.metadata_of(scenes.tiny_capture())
+    still = effects_of(dataclasses.replace(PRESETS[name], motion=None), metadata)
+    assert motion_of(PRESETS[name], metadata).name not in [one.name for one in still]
 
 
 def state_of(params):
