@@ -300,10 +300,10 @@ def reset_opacity(
 ) -> tuple[Params, PyTree]:
     """No opacity above `spec.reset_opacity`; the moments of the opacities start anew.
 
-    Of rows that carry Gaussians it is the share of them all that is lowered: one whose
-    own opacity is against its row's may be drawn above the bound.
-    Inactive rows stay inactive. With the renderer's cut-off at 1/255 a Gaussian reset
-    to 0.01 gets gradients only out to 1.37 standard deviations.
+    Of rows that carry Gaussians their common share is lowered: one of these may be
+    drawn above the bound by its own. Inactive rows stay inactive. With the renderer's
+    cut-off at 1/255 a Gaussian reset to 0.01 gets gradients only out to 1.37 standard
+    deviations.
     """
     rows = params.rows["splats"]
     bound = math.log(spec.reset_opacity / (1 - spec.reset_opacity))

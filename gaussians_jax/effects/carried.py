@@ -10,10 +10,10 @@ What is not as in the paper. Places count in the scales of the core (m + R S a, 
 m + R a), so that what is split, or enlarged by hand, takes along what it carries. Cores
 have three scales, where the paper's are flat. Looks, opacities, scales and turns are
 against those of the core (in its code scales and turns are), and so the density control
-of the rows, which clones, splits and prunes cores, needs to know nothing of them: it judges
-and lowers the core's share alone, and one that is carried may be more or less opaque by
-as much as its own number says. There is no first stage in which the cores themselves are drawn: what is carried starts spread
-about its core with the core's looks.
+of the rows, which clones, splits and prunes cores, needs to know nothing of them: it
+judges and lowers the core's share, and one that is carried is more or less opaque by
+what its own number says. There is no first stage in which the cores themselves are
+drawn: what is carried starts spread about its core with the core's looks.
 """
 
 import dataclasses
