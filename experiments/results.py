@@ -47,8 +47,9 @@ said little besides: what moves was found badly by every arm then (points were
 followed with nearly the error of points that do not move at all), so that hardly a
 difference between arms left the spread over seeds. From tracks it is found: what that
 start is worth to each motion of splats stands in [ablate_start.md](ablate_start.md),
-and what Sonata's parts are worth behind it in [ablate_sonata.md](ablate_sonata.md).
-The suites of MoBa-GS and of fields are still to be measured so.
+and what the parts of Sonata and some of MoBa-GS are worth behind it in
+[ablate_sonata.md](ablate_sonata.md) and [ablate_moba.md](ablate_moba.md). MoBa-GS'
+growth and numbers of bases, and the suite of fields, are still to be measured so.
 """
 
 
@@ -106,7 +107,10 @@ STUDIES = {
         "ablate_sonata", "--suite sonata --steps 900 --jobs 2", of="ablate"
     ),
     "ablate_moba": _package(
-        "ablate_moba", "--suite moba --steps 900 --jobs 2", of="ablate"
+        "ablate_moba",
+        "--suite moba --arms full no-basis no-annealing no-alternation no-acceleration "
+        "--steps 900 --jobs 2",
+        of="ablate",
     ),
     "deformation_cost": _package("deformation_cost", "--out deformation_cost.json"),
     "spectral_bias": _package(
