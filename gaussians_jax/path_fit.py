@@ -38,6 +38,7 @@ BODIES = 8  # by which paths are brought to one moment
 # What the motion of what is at rest costs in a fit, one length of the scene costing
 # one, and at how many moments of the film it is looked at.
 REST, MOMENTS = 1.0, 8
+RESTING = 256  # points at rest that are looked at
 RIDGE = 1e-9  # of the trace: a basis may have a direction that changes nothing
 
 
@@ -135,21 +136,48 @@ def combination(
 
 
 def guess(effect: Effect, paths: Paths, key: Key[Array, ""]) -> Guess:
-    """The effect's own guess; of one that has none, points at rest in mean places."""
+    """The effect's own guess; of one that has none, points at rest in mean places.
+
+    What is known to be at rest is held there where networks move all alike.
+    """
     if effect.fit_to_paths is not None:
         return effect.fit_to_paths(paths, key)
     canonical = jnp.asarray(mean_places(paths), jnp.float32)
-    rows = nets = None
+    rows = nets = penalty = None
     rows_key, nets_key = jax.random.split(key)
     if effect.init_rows is not None:
-        blank = scene_of(effect, Points(canonical, None, None))
-        rows = effect.init_rows(rows_key, blank.rows["splats"])
+        rows = _first_rows(effect, canonical, rows_key)
     if effect.init is not None:
         nets = effect.init(nets_key)
+        if paths.still is not None and len(paths.still):
+            penalty = _unrest_of(effect, paths, jax.random.fold_in(rows_key, 1))
     rates = Points(
         paths.unit, None if rows is None else 1.0, None if nets is None else 0.4
     )
-    return Guess(Points(canonical, rows, nets), rates)
+    return Guess(Points(canonical, rows, nets), rates, penalty)
+
+
+def _first_rows(effect, places, key):
+    blank = scene_of(effect, Points(places, None, None))
+    return effect.init_rows(key, blank.rows["splats"])
+
+
+def _unrest_of(effect, paths, key):
+    """(points) -> how far their networks move points that are at rest."""
+    chosen = np.random.default_rng(0).permutation(len(paths.still))[:RESTING]
+    still = jnp.asarray(paths.still[chosen], jnp.float32)
+    rows = None if effect.init_rows is None else _first_rows(effect, still, key)
+
+    def penalty(points):
+        deformed = _deformer(effect, Points(still, rows, points.nets))
+
+        def moved(time):
+            now = deformed(time)
+            return now.quaternion[:, 1:], now.mean - still
+
+        return unrest(moved, paths.unit)
+
+    return penalty
 
 
 def scene_of(effect: Effect, points: Points) -> Params:
@@ -172,10 +200,15 @@ def places(
     effect: Effect, points: Points, time: Float[Array, ""]
 ) -> Float[Array, "points 3"]:
     """Where the motion carries the points at a time."""
+    return _deformer(effect, points)(time).mean
+
+
+def _deformer(effect, points):
+    """(time) -> the points as Gaussians, moved and turned; they begin unturned."""
     params = scene_of(effect, points)
     ready = None if effect.prepare is None else effect.prepare(params)
     still = splats.activate(params.rows["splats"])
-    return effect.deform(params, still, FrameCondition(time), ready).mean
+    return lambda time: effect.deform(params, still, FrameCondition(time), ready)
 
 
 def fit(

@@ -28,7 +28,6 @@ from nerfies_jax.training.step_counts import steps
 
 NAME = "mlp_motion"
 SCALE_RULES = ("log", "linear")
-RESTING = 256  # points at rest that a fit to tracks looks at
 _STREAM = zlib.crc32(NAME.encode()) >> 1  # of the step's key, for the noise on the time
 
 
@@ -241,7 +240,8 @@ def fit_to_paths(spec: MotionSpec, paths: Paths, key: Key[Array, ""]) -> Guess:
     rates = Points(paths.unit, None, 0.4)
     if paths.still is None or not len(paths.still):
         return Guess(start, rates)
-    chosen = np.random.default_rng(0).permutation(len(paths.still))[:RESTING]
+    chosen = np.random.default_rng(0).permutation(len(paths.still))
+    chosen = chosen[: path_fit.RESTING]
     still = jnp.asarray(paths.still[chosen], jnp.float32)
 
     def penalty(points):

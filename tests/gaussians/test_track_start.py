@@ -87,6 +87,31 @@ def test_every_motion_can_be_fitted_to_paths(name):
     assert np.median(off) < 0.03
 
 
+@pytest.mark.parametrize(
+    "name",
+    ["basis", *(pytest.param(n, marks=pytest.mark.full) for n in ("kan", "mlp"))],
+)
+def test_networks_that_are_fitted_leave_the_wall_where_it_is(name):
+    """Also where the fit has not looked: points drawn apart, their rows as well."""
+    position, time = turning_body()
+    wall = np.random.default_rng(3).uniform(-1, 1, (400, 3)) * [1, 1, 0] + [0, 0, 2]
+    effect = effect_of(MOTIONS[name])
+    moved = []
+    for still in (None, wall[:200].astype(np.float32)):
+        known = np.ones(position.shape[:2], bool)
+        paths = Paths(time, position.astype(np.float32), known, 1.0, still)
+        fitted = path_fit.fit(effect, paths, jax.random.key(0), steps=400)
+        assert fitted.last < 0.03
+        rest = Points(jnp.asarray(wall[200:], jnp.float32), None, fitted.points.nets)
+        if effect.init_rows is not None:
+            blank = path_fit.scene_of(effect, rest).rows["splats"]
+            rest = rest._replace(rows=effect.init_rows(jax.random.key(9), blank))
+        now = places_of(effect, rest, time[3])
+        moved.append(np.median(np.linalg.norm(now - rest.canonical, axis=-1)))
+    assert moved[1] < 0.01
+    assert moved[1] < 0.5 * moved[0]
+
+
 def test_wrong_paths_bend_nothing():
     position, time = turning_body()
     position = position.copy()
