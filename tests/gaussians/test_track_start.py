@@ -79,7 +79,7 @@ def test_every_motion_can_be_fitted_to_paths(name):
     known = np.random.default_rng(1).uniform(size=position.shape[:2]) < 0.6
     effect = effect_of(MOTIONS[name])
     paths = Paths(time, position.astype(np.float32), known, 1.0)
-    fitted = path_fit.fit(effect, paths, jax.random.key(0), steps=400)
+    fitted = path_fit.fit(effect, paths, jax.random.key(0), steps=1200)
     assert fitted.last < 0.02
     middle = places_of(effect, fitted.points, time[FRAMES // 2])
     off = np.linalg.norm(middle - position[:, FRAMES // 2], axis=-1)
