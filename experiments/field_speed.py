@@ -136,10 +136,8 @@ def _trained(capture, preset, planned, seed, steps=None):
         raise SystemExit("stopped; the same command goes on with what is missing")
     if ended.stopped_by != "steps":
         raise RuntimeError(f"{preset}: training ended early ({ended.stopped_by})")
-    # Compiling is taken out by its share of the time: its own on the processor is not
-    # known.
-    share = ended.seconds / (ended.seconds + ended.compile_seconds)
-    return share * (time.process_time() - began), model, ended.state
+    spent = ended.training_share * (time.process_time() - began)
+    return spent, model, ended.state
 
 
 def drawn(model, state, capture, size: tuple[int, int]) -> dict:

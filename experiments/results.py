@@ -49,10 +49,9 @@ difference between arms left the spread over seeds. From tracks it is found: wha
 start is worth to each motion of splats stands in [ablate_start.md](ablate_start.md),
 and what the parts of Sonata and some of MoBa-GS are worth behind it in
 [ablate_sonata.md](ablate_sonata.md) and [ablate_moba.md](ablate_moba.md). Both were
-measured before the fits of their networks to tracks held what is at rest, which took
-the whole of MoBa-GS from 25.50 to 29.75 dB and that of Sonata from 26.54 to 26.89 (one
-seed), and are to be measured again; MoBa-GS' growth and numbers of bases, and the suite
-of fields, are still to be measured from tracks.
+measured before the fits of their networks to tracks held what is at rest (the floor of
+MoBa-GS bends in its picture), and are to be measured again; MoBa-GS' growth and numbers
+of bases, and the suite of fields, are still to be measured from tracks.
 """
 
 

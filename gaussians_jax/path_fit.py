@@ -95,6 +95,14 @@ def places_at_one_moment(paths: Paths) -> Float[np.ndarray, "points 3"]:
     return rigid_groups.centres(paths.position, paths.known, bodies)[0]
 
 
+def resting(paths: Paths) -> Float[Array, "still 3"] | None:
+    """Some of the points at rest, scene units; None where none is known. Host side."""
+    if paths.still is None or not len(paths.still):
+        return None
+    chosen = np.random.default_rng(0).permutation(len(paths.still))[:RESTING]
+    return jnp.asarray(paths.still[chosen], jnp.float32)
+
+
 def unrest(
     moved: Callable[[Float[Array, ""]], tuple[Array, Array]], unit: float
 ) -> Float[Array, ""]:
@@ -149,8 +157,10 @@ def guess(effect: Effect, paths: Paths, key: Key[Array, ""]) -> Guess:
         rows = _first_rows(effect, canonical, rows_key)
     if effect.init is not None:
         nets = effect.init(nets_key)
-        if paths.still is not None and len(paths.still):
-            penalty = _unrest_of(effect, paths, jax.random.fold_in(rows_key, 1))
+        still = resting(paths)
+        if still is not None:
+            key = jax.random.fold_in(rows_key, 1)
+            penalty = _unrest_of(effect, still, paths.unit, key)
     rates = Points(
         paths.unit, None if rows is None else 1.0, None if nets is None else 0.4
     )
@@ -162,10 +172,8 @@ def _first_rows(effect, places, key):
     return effect.init_rows(key, blank.rows["splats"])
 
 
-def _unrest_of(effect, paths, key):
+def _unrest_of(effect, still, unit, key):
     """(points) -> how far their networks move points that are at rest."""
-    chosen = np.random.default_rng(0).permutation(len(paths.still))[:RESTING]
-    still = jnp.asarray(paths.still[chosen], jnp.float32)
     rows = None if effect.init_rows is None else _first_rows(effect, still, key)
 
     def penalty(points):
@@ -175,7 +183,7 @@ def _unrest_of(effect, paths, key):
             now = deformed(time)
             return now.quaternion[:, 1:], now.mean - still
 
-        return unrest(moved, paths.unit)
+        return unrest(moved, unit)
 
     return penalty
 

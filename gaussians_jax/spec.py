@@ -76,6 +76,10 @@ EMBEDDED = {
 }
 
 
+# The way out where rows that carry Gaussians are refused.
+ALONE = (
+    "leave out what they carry (carried=none, or another motion than that of anchors)"
+)
 # What trains nothing without a motion.
 OF_MOTION = (
     "temporal_opacity",
@@ -175,14 +179,12 @@ def refuse_what_cannot_train(spec: SplatScene) -> None:
         raise ValueError(
             "MCMCStrategySpec shares the opacity of a Gaussian among its copies, and "
             "rows that carry several have none of their own; choose "
-            "DefaultStrategySpec, or leave out what they carry (carried=none, or "
-            "another motion than that of anchors)"
+            f"DefaultStrategySpec, or {ALONE}"
         )
     if carry and spec.flow is not None:
         raise ValueError(
             "flow is compared where rows are drawn, and rows that carry Gaussians are "
-            "not; leave it out (flow=none), or leave out what they carry "
-            "(carried=none, or another motion than that of anchors)"
+            f"not; leave it out (flow=none), or {ALONE}"
         )
     resting = isinstance(motion, AnchorMotionSpec) and not motion.moves
     if resting and spec.start.motion == "tracks":
@@ -194,8 +196,7 @@ def refuse_what_cannot_train(spec: SplatScene) -> None:
         raise ValueError(
             "temporal_opacity fades rows, and of rows that carry Gaussians only these "
             "are drawn, with opacities of their own; leave it out "
-            "(temporal_opacity=none), or leave out what they carry (carried=none, or "
-            "another motion than that of anchors)"
+            f"(temporal_opacity=none), or {ALONE}"
         )
     if growth is not None and not isinstance(spec.densification, DefaultStrategySpec):
         raise ValueError(

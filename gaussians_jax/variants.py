@@ -140,7 +140,9 @@ def without_moving(
         return stages.deform(params, stages.prepare(params), time)
 
     times = np.linspace(0, 1, INSTANTS)
-    parts = static_rows.split(state.params, deform_rows, times, farther_than, False)
+    parts = static_rows.split(
+        state.params, deform_rows, times, farther_than, fading=False
+    )
     moves = static_rows.of_rows(state.params, np.asarray(parts.index.moves))
     rows = state.params.rows
     active = int(splats.active_mask(rows["splats"]).sum())

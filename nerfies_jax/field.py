@@ -98,7 +98,7 @@ def field(
     def render(params, camera, time, codes, size, step):
         return draw(bind(params), camera, FrameCondition(time, codes, step), size)
 
-    moves = is_moved(bind(None))
+    moves = is_moved(active)
 
     def survey(params, step, depth=skipping.SKIPPED_DEPTH):
         if moves:

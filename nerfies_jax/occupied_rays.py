@@ -19,7 +19,7 @@ from nerfies_jax.effects.effect import Batch
 from nerfies_jax.field import Field
 from nerfies_jax.radiance import occupancy, sampling
 from nerfies_jax.radiance.occupancy import Cells
-from nerfies_jax.render_ray import Bound, Ray, field_ray, is_moved
+from nerfies_jax.render_ray import Ray, field_ray, is_moved
 from nerfies_jax.training.model import Event, Frames, TrainState
 
 LOOKS = 64  # along a ray, as many as a survey has cells across
@@ -46,8 +46,7 @@ def events(field: Field) -> tuple[Event, ...]:
     spec = field.spec.sampling.occupancy
     if spec is None:
         return ()
-    moves = is_moved(Bound(field.spec, field.metadata, field.effects, None))
-    if field.survey is None or moves:
+    if field.survey is None or is_moved(field.effects):
         raise ValueError(
             "occupancy looks for space that is always empty, and this field cannot be "
             "surveyed once for all: it moves, has a transient medium, normals, or no "

@@ -126,9 +126,9 @@ class _Samples(NamedTuple):
     lifted: tuple[Float[Array, "samples features"], ...]
 
 
-def is_moved(bound: Bound) -> bool:
+def is_moved(effects: tuple[Effect, ...]) -> bool:
     """Whether the template is asked elsewhere, or of more, than where a point is."""
-    return any(e.displace is not None or e.lift is not None for e in bound.effects)
+    return any(e.displace is not None or e.lift is not None for e in effects)
 
 
 def asked_at(
@@ -201,7 +201,7 @@ def render_ray(
         coarse.weight[1:-1],
         plan.fine,
     )
-    if not (plan.union and is_moved(bound)):
+    if not (plan.union and is_moved(bound.effects)):
         every = fine_distances(bound, distance, drawn)
         both = _samples(bound, ray, condition, every)
     else:

@@ -64,7 +64,7 @@ def survey(
     near to far through nothing else would meet an optical depth above `depth`.
     """
     spec, metadata = bound.spec, bound.metadata
-    cells = MOVING_CELLS if is_moved(bound) else STILL_CELLS
+    cells = MOVING_CELLS if is_moved(bound.effects) else STILL_CELLS
     span = (metadata.far - metadata.near) * metadata.scale
     names = tuple(bound.params["template"])
     dtype = jax.tree.leaves(bound.params["template"])[0].dtype

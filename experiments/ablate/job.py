@@ -236,9 +236,7 @@ class Job:
         frames = evaluation.frames_of(self.capture, arm.model.required_data)
         began, self._cache_saved = time.process_time(), 0.0
         result = loop.fit(arm.model, state, frames, steps=steps)
-        # Compiling is taken out by its share of the time: its CPU time is not known.
-        share = result.seconds / (result.seconds + result.compile_seconds)
-        cpu_seconds = share * (time.process_time() - began)
+        cpu_seconds = result.training_share * (time.process_time() - began)
         compile_seconds = result.compile_seconds + self._cache_saved
         if result.stopped_by.startswith("SIG"):
             print(f"stopped; go on with the same command and --out {self.out}")

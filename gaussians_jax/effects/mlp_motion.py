@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from gaussians_jax import path_fit, splats
@@ -238,11 +237,9 @@ def fit_to_paths(spec: MotionSpec, paths: Paths, key: Key[Array, ""]) -> Guess:
     points = path_fit.places_at_one_moment(paths)
     start = Points(jnp.asarray(points, jnp.float32), None, init(key, spec))
     rates = Points(paths.unit, None, 0.4)
-    if paths.still is None or not len(paths.still):
+    still = path_fit.resting(paths)
+    if still is None:
         return Guess(start, rates)
-    chosen = np.random.default_rng(0).permutation(len(paths.still))
-    chosen = chosen[: path_fit.RESTING]
-    still = jnp.asarray(paths.still[chosen], jnp.float32)
 
     def penalty(points):
         def moved(time):

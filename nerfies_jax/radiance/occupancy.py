@@ -24,9 +24,9 @@ class OccupancySpec:
 
     Of a scene at rest: what moves is empty nowhere for good. After `start` steps and
     then every so many, whatever the length of the run: a survey takes as long as six
-    steps of a small field on a grid.
-    `candidates` rays are drawn for each of a step. `anywhere` is the share of a step's
-    rays that need not meet anything: what appears in empty space is seen by these.
+    steps of a small field on a grid. `candidates` rays are drawn for each of a step.
+    `anywhere` is the share of a step's rays that need not meet anything: what appears
+    in empty space is seen by these.
     """
 
     start: int = 100

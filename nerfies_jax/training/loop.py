@@ -60,6 +60,11 @@ class FitResult(NamedTuple):
         return self.history.seconds
 
     @property
+    def training_share(self) -> float:
+        """Of the time of training and compiling: the processor tells only both."""
+        return self.seconds / (self.seconds + self.compile_seconds)
+
+    @property
     def compile_seconds(self) -> float:
         """Seconds of tracing and compiling, of all sessions of the run."""
         return self.history.compile_seconds

@@ -13,29 +13,22 @@ from nerfies_jax.effects.warp import WarpSpec
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.grids import HashGridSpec
 from nerfies_jax.radiance.occupancy import OccupancySpec
-from nerfies_jax.radiance.template import TemplateSpec
 from nerfies_jax.render_ray import Ray
-from nerfies_jax.scene import RadianceScene
 from nerfies_jax.spec import SamplingSpec
 from nerfies_jax.training import loop
 from tests import scenes
+from tests.radiance.test_skipping import GRID, STILL, with_holes
 
-SPEC = RadianceScene(
-    steps=30,
+SPEC = dataclasses.replace(
+    STILL,
     rays=40,
-    template=TemplateSpec(
-        HashGridSpec(levels=1, coarsest=4, finest=4),
-        EncodingSpec(1),
-        depth=1,
-        width=8,
-        skips=(),
-        colour_width=8,
-        density="exp",
-        density_bias=-12.0,
+    template=dataclasses.replace(
+        GRID, position=HashGridSpec(levels=1, coarsest=4, finest=4)
     ),
     sampling=SamplingSpec(
         8, 8, occupancy=OccupancySpec(start=10, every=10, candidates=4, anywhere=0.2)
     ),
+    learning_rate=5e-4,
 )
 CELLS = 16
 
@@ -89,11 +82,7 @@ def test_a_run_surveys_and_learns_from_what_is_left():
     state = model.init(capture, jax.random.key(0))
     assert state.aux_state.all()
     assert [event.steps for event in model.events] == [(10, 20)]
-    # Things and gaps, as large as a cell of the grid.
-    state.params["template"] = {
-        name: net._replace(tables=jax.tree.map(lambda x: 4e5 * x, net.tables))
-        for name, net in state.params["template"].items()
-    }
+    state.params["template"] = with_holes(state.params["template"])
     # No survey brings back what was found empty: here, where x is large.
     half = jnp.arange(len(state.aux_state)) < len(state.aux_state) // 2
     state = state._replace(aux_state=state.aux_state & half[:, None, None])

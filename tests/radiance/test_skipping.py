@@ -46,6 +46,14 @@ MOVING = dataclasses.replace(
 ONE_LEVEL = dataclasses.replace(STILL, sampling=SamplingSpec(24, 0))
 
 
+def with_holes(templates):
+    """The same networks with things and gaps, as large as a cell of the grid."""
+    return {
+        name: net._replace(tables=jax.tree.map(lambda x: 4e5 * x, net.tables))
+        for name, net in templates.items()
+    }
+
+
 @functools.cache
 def full_of_holes(spec, background):
     """A model and parameters of things and gaps, as large as a cell of the grid."""
@@ -58,10 +66,7 @@ def full_of_holes(spec, background):
     if spec.warp is not None:  # motions of a tenth of the box, not of 1e-4
         params["warp"] = jax.tree.map(lambda x: 3 * x, params["warp"])
         params["codes"] = jax.tree.map(lambda x: 20 * x, params["codes"])
-    params["template"] = {
-        name: net._replace(tables=jax.tree.map(lambda x: 4e5 * x, net.tables))
-        for name, net in params["template"].items()
-    }
+    params["template"] = with_holes(params["template"])
     return scene.build(spec, metadata), params
 
 
