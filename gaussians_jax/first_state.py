@@ -14,9 +14,12 @@ from gaussians_jax.growth import AuxState, states_of
 from gaussians_jax.spec import SplatScene, carried_count, refuse_what_cannot_train
 from gaussians_jax.splats import Params
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.evidence import usable_paths
+from nerfies_jax.evidence import hidden_points, record, usable_paths, view_set
 from nerfies_jax.training.effects import Effect, stream
 from nerfies_jax.training.model import TrainState, in_default_precision
+
+# Nothing else will ever make opaque what no camera sees: 88 %.
+HIDDEN_LOGIT = 2.0
 
 
 def estimate_memory_bytes(spec: SplatScene, capture: Capture) -> int:
@@ -38,8 +41,13 @@ def first_state(spec, effects, optimiser, capture, key) -> TrainState:
     rendering.refuse_distortion(capture.cameras)
     start_key, run_key = jax.random.split(key)
     seed = int(jax.random.randint(start_key, (), 0, np.iinfo(np.int32).max))
-    tracked, capture = _from_tracks(spec, effects, capture, start_key)
+    tracked, hidden, capture = _from_tracks(spec, effects, capture, start_key)
     position, colour = initialisation.initial_points(spec.init, capture, seed)
+    guessed = slice(len(position), len(position))
+    if hidden is not None:
+        position = np.concatenate([position, hidden.position])
+        colour = np.concatenate([colour, hidden.colour / 255])
+        guessed = slice(guessed.start, len(position))
     if tracked is not None:
         position = np.concatenate([position, tracked.position])
         colour = np.concatenate([colour, tracked.colour])
@@ -50,6 +58,8 @@ def first_state(spec, effects, optimiser, capture, key) -> TrainState:
         opacity=spec.init.opacity,
         scale=spec.init.scale,
     )
+    opaque = rows.opacity_logit.at[guessed].set(HIDDEN_LOGIT)
+    rows = rows._replace(opacity_logit=opaque)
     rows = initialisation.clamp_scales(rows, capture, spec.init.max_scale)
     count = len(position)
     most = None if spec.densification is None else spec.densification.cap_max
@@ -78,17 +88,21 @@ def first_state(spec, effects, optimiser, capture, key) -> TrainState:
 
 
 def _from_tracks(spec, effects, capture, key):
-    """The start from tracks, and the capture with the points that stand still.
+    """The start from tracks, what stands hidden, and the capture with what stands.
 
-    None, and the capture as it is, where there is no such start.
+    Nothing of the two, and the capture as it is, where there is no such start.
     """
     evidence = usable_paths.evidence_to_start_from(capture, spec.start)
     if evidence is None:
-        return None, capture
+        return None, None, capture
     seeds = track_start.start(spec.start, effects[0], evidence, capture, key)
+    hidden = None
+    if spec.start.fill_hidden:
+        views = view_set.in_time_order(record.looked_at(capture, evidence.factor))
+        hidden = hidden_points.behind(views, evidence.still, evidence.moving)
     if len(evidence.still.position) > initialisation.point_count(capture):
         capture = dataclasses.replace(capture, points=evidence.still)
-    return seeds, capture
+    return seeds, hidden, capture
 
 
 def count_rows(effects: tuple[Effect, ...], state: TrainState) -> dict[str, int]:

@@ -50,6 +50,9 @@ class StartSpec(TrackStartSpec):
     fit_steps: int = 3000
     fit_rate: float = 5e-3
     moving_points: int = 3000  # Gaussians lifted from moving pixels
+    fill_hidden: bool = (
+        True  # guess what stands where something hides it in every frame
+    )
 
     def __post_init__(self):
         super().__post_init__()

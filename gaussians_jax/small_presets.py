@@ -90,7 +90,7 @@ SMALL_FROM_TRACKS = dataclasses.replace(
 )
 SMALL_TRACKED = dataclasses.replace(
     SMALL_FROM_TRACKS,
-    motion=SE3BasesSpec(bases=12),
+    motion=SE3BasesSpec(bases=8),
     temporal_opacity=TemporalOpacitySpec(),
 )
 # Other motions from tracks. Built-in scene, one seed, as many steps as fitted into a

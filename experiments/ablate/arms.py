@@ -113,7 +113,8 @@ TRACKED_PARTS = Suite(
     arms={
         "full": Arm("splats-tracked-small"),
         "always-there": Arm("splats-tracked-small", ("temporal_opacity=none",)),
-        "k6": Arm("splats-tracked-small", ("motion.bases=6",)),
+        "unfilled": Arm("splats-tracked-small", ("start.fill_hidden=False",)),
+        "k4": Arm("splats-tracked-small", ("motion.bases=4",)),
         "k20": Arm("splats-tracked-small", ("motion.bases=20",)),
     },
     claims=(
@@ -123,11 +124,12 @@ TRACKED_PARTS = Suite(
             "always-there",
             TRACKED,
         ),
-        Claim("Twelve bases beat six", "full", "k6", TRACKED),
-        Claim("Twelve bases beat twenty", "full", "k20", TRACKED),
+        Claim("What is hidden is better guessed", "full", "unfilled", TRACKED),
+        Claim("Eight bases beat four", "full", "k4", TRACKED),
+        Claim("Eight bases beat twenty", "full", "k20", TRACKED),
     ),
     seeds=3,
-    pictured=("full", "always-there", "k6", "k20"),
+    pictured=("full", "always-there", "k4", "k20"),
     context="",
 )
 

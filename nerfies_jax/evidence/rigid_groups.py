@@ -200,14 +200,15 @@ def fewest(
 
 
 def enough(
-    position: np.ndarray, known: np.ndarray, counts: Sequence[int], slack: float
+    position: np.ndarray, known: np.ndarray, counts: Sequence[int], share: float
 ) -> int:
     """The first of rising `counts` of groups beyond which more explain hardly more.
 
-    They miss the known places by at most `slack` times what the last of `counts` does,
-    in the median.
+    By how far they miss the known places in the median: less than one group does, by
+    at least `share` of what the last of `counts` wins.
     """
-    limit = slack * miss(position, known, counts[-1])
+    one, last = (miss(position, known, count) for count in (1, counts[-1]))
+    limit = one - share * max(one - last, 0.0)
     return next(
         n for n in counts if n == counts[-1] or miss(position, known, n) <= limit
     )

@@ -37,7 +37,7 @@ def test_motion_is_chosen_by_what_tracks_say(make, kind, words, tmp_path, monkey
     assert words in "".join(choice.notes)
 
 
-@pytest.mark.parametrize(("asked", "overrides"), [(20, ("motion.bases=20",)), (12, ())])
+@pytest.mark.parametrize(("asked", "overrides"), [(20, ("motion.bases=20",)), (8, ())])
 def test_paths_of_many_things_get_more_bases(asked, overrides, tmp_path, monkeypatch):
     monkeypatch.setattr(representation, "CACHE", tmp_path)
     monkeypatch.setattr(rigid_groups, "enough", lambda *_: asked)

@@ -78,13 +78,13 @@ def test_bodies_are_told_apart_where_iterations_give_up(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("counts", "slack", "wanted"),
-    [((1, 2, 4), 1.2, 2), ((1, 2), 1.2, 2), ((2, 4), 1.2, 2), ((1, 4), 1e9, 1)],
+    ("counts", "share", "wanted"),
+    [((1, 2, 4), 0.8, 2), ((1, 2), 0.8, 2), ((2, 4), 0.8, 2), ((1, 4), 0.0, 1)],
 )
 def test_no_more_bodies_are_asked_for_than_explain_the_paths(
-    counts, slack, wanted, rng
+    counts, share, wanted, rng
 ):
     position, _ = two_bodies()
     position = position + rng.normal(0, 1e-3, position.shape)  # what tracks are off by
     known = np.ones(position.shape[:2], bool)
-    assert rigid_groups.enough(position, known, counts, slack) == wanted
+    assert rigid_groups.enough(position, known, counts, share) == wanted

@@ -16,7 +16,8 @@ from gaussians_jax.initialisation import StartSpec
 from gaussians_jax.path_fit import Paths, Points
 from gaussians_jax.splats import Params
 from nerfies_jax import evaluation
-from nerfies_jax.evidence import record, usable_paths
+from nerfies_jax.capture.capture import PointCloud
+from nerfies_jax.evidence import hidden_points, record, usable_paths
 from tests.evidence import films
 from tests.evidence.test_tracks import MOVES
 from tests.gradients import directional_error
@@ -191,6 +192,8 @@ def test_a_scene_starts_from_the_evidence(tmp_path, monkeypatch):
     capture, evidence = film_and_evidence()
     monkeypatch.setattr(usable_paths, "CACHE", tmp_path)
     record.save(tmp_path / "evidence" / f"{record.digest(capture)}.npz", evidence)
+    guessed = PointCloud(np.float32([[7, 0, 2], [8, 0, 2]]), np.full((2, 3), 51, "u1"))
+    monkeypatch.setattr(hidden_points, "behind", lambda *_: guessed)
     start = StartSpec(motion="tracks", moving_points=150, fit_steps=100)
     spec_ = small_scene(start=start)
     model = scene.build(spec_, scene.metadata_of(capture))
@@ -202,6 +205,12 @@ def test_a_scene_starts_from_the_evidence(tmp_path, monkeypatch):
     assert (still[active] > 0.99).sum() == active.sum() - 150
     wall = np.asarray(rows["splats"].mean)[active & (still > 0.99)]
     assert abs(np.median(wall[:, 2]) - films.FAR) < 0.05
+    # What stands hidden begins opaque, in the colour that was guessed.
+    opaque = np.asarray(jax.nn.sigmoid(rows["splats"].opacity_logit)) > 0.8
+    np.testing.assert_array_equal(rows["splats"].mean[opaque], guessed.position)
+    shade = 0.5 + splats.SH_DC * rows["splats"].sh_dc[opaque]
+    np.testing.assert_allclose(shade, 0.2, atol=1e-6)
+    assert (still[opaque] > 0.99).all()
     fading = jax.tree.map(np.asarray, rows["temporal_opacity"])
     lifted = active & (fading.log_width < temporal_opacity.ALWAYS)
     np.testing.assert_array_equal(lifted, active & (still < 0.99))
