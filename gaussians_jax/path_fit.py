@@ -144,13 +144,14 @@ def combination(
 
 
 def guess(effect: Effect, paths: Paths, key: Key[Array, ""]) -> Guess:
-    """The effect's own guess; of one that has none, points at rest in mean places.
+    """The effect's own guess; of one that has none, points in the middle of the film.
 
-    What is known to be at rest is held there where networks move all alike.
+    What is known to be at rest is held there where networks move all alike: else they
+    would move that as well, and the scene bend to follow.
     """
     if effect.fit_to_paths is not None:
         return effect.fit_to_paths(paths, key)
-    canonical = jnp.asarray(mean_places(paths), jnp.float32)
+    canonical = jnp.asarray(places_at_one_moment(paths), jnp.float32)
     rows = nets = penalty = None
     rows_key, nets_key = jax.random.split(key)
     if effect.init_rows is not None:

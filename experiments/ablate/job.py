@@ -186,16 +186,13 @@ class Job:
                 return
             with cli.user_errors():
                 self._check_environment(name)
-            if budget.seconds is None:
-                steps = self.spec(name, budget.steps).steps
-                kept = self._train(name, seed, steps)
-            elif seed == 0:
+            if budget.seconds is not None and seed == 0:
                 steps, kept = self._train_for(name, budget)
             else:
                 with cli.user_errors():
-                    steps = self._steps(name, budget)
+                    steps = self.planned_steps(name, budget)
                 kept = self._train(name, seed, steps)
-            identity = self._identity(name, seed, steps, budget)
+            identity = self.identity(name, seed, steps, budget)
             results.write(path, identity, kept)
         log("    " + line(kept.numbers))
 
@@ -300,8 +297,13 @@ class Job:
             )
         return self._built[name, steps]
 
-    def _steps(self, name, budget) -> int:
-        """Those of the first seed, so that seeds differ in nothing else."""
+    def planned_steps(self, name: str, budget: Budget) -> int:
+        """Of every seed of an arm; over seconds those that seed 0 found.
+
+        ValueError where that seed is not finished.
+        """
+        if budget.seconds is None:
+            return self.spec(name, budget.steps).steps
         steps = results.steps_of(self.path(name, 0, budget))
         if steps is None:
             raise ValueError(
@@ -310,7 +312,7 @@ class Job:
             )
         return steps
 
-    def _identity(self, name, seed, steps, budget) -> dict[str, Any]:
+    def identity(self, name, seed, steps, budget) -> dict[str, Any]:
         """What a kept arm must have been made with to be taken over."""
         return {
             "scene": self.capture_digest,
@@ -336,10 +338,8 @@ class Job:
         with cli.user_errors():
             if not path.is_file():
                 return None
-            steps = self.spec(name, budget.steps).steps
-            if budget.seconds is not None:
-                steps = self._steps(name, budget)
-            return results.read(path, self._identity(name, seed, steps, budget))
+            steps = self.planned_steps(name, budget)
+            return results.read(path, self.identity(name, seed, steps, budget))
 
     def is_finished(self, name: str, seed: int) -> bool:
         """Whether an arm is there for every budget."""

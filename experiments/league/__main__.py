@@ -11,8 +11,10 @@ once for a film, and finding them is not in the seconds. Each row gets as many s
 it can make in so many processor seconds on one core, without compiling. A cell is one
 row, film, length and seed, trained in a process of its own: all cells of the first seed
 come first, and short lengths before long ones. What is finished is kept in --out, and
-the same command goes on where it was stopped or where --budget ended it. Writes
-league.json and league.png there; rows that lose stay in.
+the same command goes on where it was stopped or where --budget ended it; with --keep
+also from another clone, with the cells that are kept beside the code and would be made
+with the same settings today. Writes league.json and league.png there; rows that lose
+stay in.
 """
 
 from experiments import cli
@@ -27,9 +29,15 @@ def main(args):
     with cli.user_errors():
         arms = rows.of_presets(args.presets)
         platform.start_jax(args.device)
+        from experiments import results
         from experiments.league import contests
 
         every = contests.opened(args, arms)
+    if args.keep:
+        path = results.ROOT / results.STUDIES["league"].measured
+        count = contests.restore(path, every)
+        if count:
+            print(f"{count} cells are kept from before and are not made again")
     failed = contests.run(args, every)
     path = args.out / "league.json"
     stored = contests.record(args, every)
@@ -40,8 +48,6 @@ def main(args):
     print("\n" + page.page(stored))
     print(f"\n{path} and {path.with_suffix('.png')}")
     if args.keep:
-        from experiments import results
-
         results.main(["league", "--measured", str(path)])
     return cli.Ended(stored, 1 if failed else 0)
 

@@ -2,14 +2,18 @@
 
 import copy
 import dataclasses
+import hashlib
+import itertools
+import json
 import math
 import pathlib
 import time
 from typing import Any
 
-from experiments.ablate import pool
+from experiments.ablate import pool, results
 from experiments.ablate.job import Job
 from experiments.ablate.log import log
+from experiments.ablate.results import ArmResult
 from experiments.league.settings import League
 from nerfies_jax.capture.json_files import write_json
 from nerfies_jax.evaluation import protocol
@@ -50,6 +54,36 @@ def _of_seed(job, seed):
     return one
 
 
+def restore(path: pathlib.Path, jobs: list[Job]) -> int:
+    """Put kept cells of `path` into the folders of the parts; returns how many.
+
+    Those that were made with the settings of today alone, and that are not there yet:
+    whatever has changed since is measured anew. No pictures come with them.
+    """
+    kept = json.loads(path.read_text())["contests"] if path.is_file() else []
+    count = 0
+    for job, one in itertools.product(jobs, kept):
+        if (one["film"], one["seconds"]) != (job.out.name, job.args.seconds):
+            continue
+        for name, seed in job.tasks():
+            row = one["rows"].get(name, {"cells": {}})
+            cell = row["cells"].get(str(seed))
+            place = job.path(name, seed, job.budgets[0])
+            if cell is None or place.is_file():
+                continue
+            steps = int(cell["steps"])
+            identity = job.identity(name, seed, steps, job.budgets[0])
+            if row["made_with"][str(seed)] == _digest(identity):
+                notes = {"steps": steps, "stopped_by": "steps"}
+                results.write(place, identity, ArmResult(_numbers(cell), {}, notes))
+                count += 1
+    return count
+
+
+def _digest(identity):
+    return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
+
+
 def record(args: League, jobs: list[Job]) -> dict[str, Any]:
     """What is kept: the numbers of every finished cell, and which were asked for."""
     return {
@@ -68,23 +102,31 @@ def _contest(job):
         "exact": job.known.exact,
         "still": still if math.isfinite(still) else None,
         "seeds": list(job.seeds),
-        "rows": {
-            name: {
-                "preset": job.suite.arms[name].preset,
-                "changes": list(job.suite.arms[name].changes),
-                "cells": {
-                    str(seed): _plain(finished[name, seed].numbers)
-                    for seed in job.seeds
-                    if (name, seed) in finished
-                },
-            }
-            for name in job.names
-        },
+        "rows": {name: _row(job, name, finished) for name in job.names},
+    }
+
+
+def _row(job, name, finished):
+    arm, budget = job.suite.arms[name], job.budgets[0]
+    cells = {s: finished[name, s] for s in job.seeds if (name, s) in finished}
+    made_with = {
+        str(seed): job.identity(name, seed, job.planned_steps(name, budget), budget)
+        for seed in cells
+    }
+    return {
+        "preset": arm.preset,
+        "changes": list(arm.changes),
+        "cells": {str(seed): _plain(cell.numbers) for seed, cell in cells.items()},
+        "made_with": {seed: _digest(identity) for seed, identity in made_with.items()},
     }
 
 
 def _plain(numbers):
     return {k: x if math.isfinite(x) else None for k, x in numbers.items()}
+
+
+def _numbers(cell):
+    return {k: math.nan if x is None else x for k, x in cell.items()}
 
 
 def write(path: pathlib.Path, stored: dict[str, Any]) -> None:

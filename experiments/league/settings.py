@@ -52,7 +52,8 @@ class League:
     out: pathlib.Path = pathlib.Path("runs/league")
     """Folder of results; may hold finished cells."""
     keep: bool = False
-    """Keep the numbers beside the code, too, and renew docs/results/league.md."""
+    """Begin with the numbers that are kept beside the code, keep all of them there, and
+    renew docs/results/league.md."""
     device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
     """Where to compute."""
 

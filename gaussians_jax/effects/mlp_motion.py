@@ -13,9 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from gaussians_jax import path_fit, splats
+from gaussians_jax import splats
 from gaussians_jax.effects.blocks import in_blocks
-from gaussians_jax.path_fit import Guess, Paths, Points
 from gaussians_jax.splats import Gaussians, Params
 from nerfies_jax.geometry import quaternion
 from nerfies_jax.nets import encoding, mlp
@@ -228,29 +227,6 @@ def smooth_time(
     return time + noise * deviation.astype(time.dtype)
 
 
-def fit_to_paths(spec: MotionSpec, paths: Paths, key: Key[Array, ""]) -> Guess:
-    """Points where they are in the middle of the film, and no motion where all rests.
-
-    Without what is known to be at rest the network would move that as well, and the
-    scene bend to follow. Host side.
-    """
-    points = path_fit.places_at_one_moment(paths)
-    start = Points(jnp.asarray(points, jnp.float32), None, init(key, spec))
-    rates = Points(paths.unit, None, 0.4)
-    still = path_fit.resting(paths)
-    if still is None:
-        return Guess(start, rates)
-
-    def penalty(points):
-        def moved(time):
-            offsets = deform(points.nets, spec, still, time)
-            return offsets.quaternion, offsets.mean
-
-        return path_fit.unrest(moved, paths.unit)
-
-    return Guess(start, rates, penalty)
-
-
 def effect(spec: MotionSpec, steps: int, frames: int) -> Effect:
     """The seams that this motion fills, for a run of `steps` over `frames`."""
 
@@ -277,5 +253,4 @@ def effect(spec: MotionSpec, steps: int, frames: int) -> Effect:
         ),
         warm_up=spec.warm_up,
         deform=moved,
-        fit_to_paths=lambda paths, key: fit_to_paths(spec, paths, key),
     )

@@ -135,7 +135,7 @@ def looked(monkeypatch):
                 continue
             calls.append(f"train {name}")
             numbers = {"psnr": SCORES.get(name, 22.0), "train_cpu_seconds": 10.0}
-            identity = job._identity(name, seed, budget.steps, budget)
+            identity = job.identity(name, seed, budget.steps, budget)
             kept = results.ArmResult(numbers, {}, {"steps": budget.steps})
             results.write(job.path(name, seed, budget), identity, kept)
         return []

@@ -1,5 +1,6 @@
 """The league: which rows there are, in which order they run, what its page says."""
 
+import dataclasses
 import itertools
 import json
 import math
@@ -84,10 +85,11 @@ def league(tmp_path, monkeypatch):
             if job.is_finished(name, seed) or (name, seed) == ("nerf-small", 0):
                 continue
             trained.append((budget.seconds, name, seed))
-            identity = job._identity(name, seed, job.spec(name, 7).steps, budget)
+            identity = job.identity(name, seed, job.spec(name, 7).steps, budget)
             if budget.seconds is not None:
                 identity["steps"] = 7
-            kept = ArmResult(dict.fromkeys(MEASURES, float(seed)), {}, {"steps": 7})
+            numbers = dict.fromkeys(MEASURES, float(seed)) | {"steps": 7.0}
+            kept = ArmResult(numbers, {}, {"steps": 7})
             results.write(job.path(name, seed, budget), identity, kept)
         return [("nerf-small", 0)] if job.seeds == (0,) else []
 
@@ -122,3 +124,27 @@ def test_first_seeds_come_first_and_no_seed_waits_for_a_first_that_failed(league
     trained.clear()
     contests.run(settled, jobs)
     assert trained == []
+
+
+def test_kept_cells_are_taken_over_where_they_would_be_made_alike(league, tmp_path):
+    settled, trained = league
+    arms = rows.of_presets(settled.presets)
+    jobs = contests.opened(settled, arms)
+    contests.run(settled, jobs)
+    stored = contests.record(settled, jobs)
+    path = tmp_path / "league.json"
+    contests.write(path, stored)
+    made = len(trained)
+
+    def elsewhere(name, **changes):
+        there = dataclasses.replace(settled, out=tmp_path / name, **changes)
+        return there, contests.opened(there, arms)
+
+    there, again = elsewhere("again")
+    assert contests.restore(path, again) == made
+    assert contests.restore(path, again) == 0
+    contests.run(there, again)
+    assert len(trained) == made
+    assert contests.record(there, again)["contests"] == stored["contests"]
+    assert contests.restore(path, elsewhere("other", tracks=2)[1]) == 0
+    assert contests.restore(tmp_path / "none.json", elsewhere("none")[1]) == 0

@@ -109,7 +109,7 @@ def test_networks_that_are_fitted_leave_the_wall_where_it_is(name):
             rest = rest._replace(rows=effect.init_rows(jax.random.key(9), blank))
         now = places_of(effect, rest, time[3])
         moved.append(np.median(np.linalg.norm(now - rest.canonical, axis=-1)))
-    assert moved[1] < 0.01
+    assert moved[1] < 0.02
     assert moved[1] < 0.5 * moved[0]
 
 
