@@ -68,7 +68,8 @@ class Render:
     1e-4 is not seen."""
     hide_moving: float | None = None
     """Leave out the Gaussians that move farther than this, in scene units: the static
-    scene, with holes where nothing was ever filmed behind what moves."""
+    scene. What was never filmed behind what moves is guessed where the motion started
+    from tracks, and a hole elsewhere."""
     show: Literal["colour", "depth", "flow"] = "colour"
     """What the png and mp4 pictures show; depth is bright near and dark far, flow is
     where what is seen goes up to the next picture: direction as hue, length as
