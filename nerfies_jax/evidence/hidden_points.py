@@ -13,6 +13,7 @@ from nerfies_jax.evidence import view_set
 from nerfies_jax.evidence.view_set import Views
 
 FRAMES = 12  # that are looked from, evenly over the film
+# Pixels of pictures made small; more of larger ones.
 EVERY_PX = 2
 # A pixel nearer than that to a known point shows it. `still_points` has one for every
 # second pixel of each of twelve frames, fewer where little texture tells depth.
@@ -39,9 +40,10 @@ def behind(views: Views, still: PointCloud, moving: np.ndarray) -> PointCloud:
 
 
 def _seen_from(views, frame, places, colours, moving):
-    row, column = np.nonzero(moving & views.valid[frame])
-    sparse = (row % EVERY_PX == 0) & (column % EVERY_PX == 0)
-    row, column = row[sparse], column[sparse]
+    larger = view_set.times_smaller(views)
+    cell_px, every = KNOWN_PX * larger, EVERY_PX * larger
+    row, column = np.nonzero((moving & views.valid[frame])[::every, ::every])
+    row, column = every * row, every * column
     at = np.stack([column, row], -1) + 0.5
     pixel, depth = view_set.project(views, frame, places)
     inside = view_set.in_picture(views, pixel, depth, 0)
@@ -49,9 +51,9 @@ def _seen_from(views, frame, places, colours, moving):
     if not inside.any() or not len(at):
         return none
     pixel, inverse, colour = pixel[inside], 1 / depth[inside], colours[inside]
-    hidden = cKDTree(pixel).query(at)[0] > KNOWN_PX
+    hidden = cKDTree(pixel).query(at)[0] > cell_px
     at, row, column = at[hidden], row[hidden], column[hidden]
-    thin = _farthest_in_cells(pixel, inverse)
+    thin = _farthest_in_cells(pixel / cell_px, inverse)
     if len(thin) < AROUND or not len(at):
         return none
     pixel, inverse, colour = pixel[thin], inverse[thin], colour[thin]
@@ -71,9 +73,9 @@ def _seen_from(views, frame, places, colours, moving):
     return place, np.clip(np.stack(shade, -1).round(), 0, 255).astype(np.uint8)
 
 
-def _farthest_in_cells(pixel, inverse):
+def _farthest_in_cells(place, inverse):
     """Rows of the farthest point of every cell that holds one: what lies all around."""
-    cell = (pixel // KNOWN_PX).astype(int)
+    cell = np.floor(place).astype(int)
     order = np.argsort(inverse, kind="stable")
     return order[np.unique(cell[order], axis=0, return_index=True)[1]]
 
@@ -86,5 +88,6 @@ def _plane(offset, value, weight):
     apart, above = offset - middle[:, None], value - mean[:, None]
     normal = np.einsum("nk,nkc,nkd->ncd", weight, apart, apart)
     right = np.einsum("nk,nkc,nk->nc", weight, apart, above)
-    slope = np.linalg.solve(normal + RIDGE_PX**2 * np.eye(2), right[..., None])[..., 0]
+    ridge = RIDGE_PX**2 * np.eye(2)
+    slope = np.linalg.solve(normal + ridge, right[..., None])[..., 0]
     return mean - np.einsum("nc,nc->n", slope, middle), slope
