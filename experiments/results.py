@@ -46,12 +46,12 @@ behind them: nobody could check them without hours of processor time. The ablati
 said little besides: what moves was found badly by every arm then (points were
 followed with nearly the error of points that do not move at all), so that hardly a
 difference between arms left the spread over seeds. From tracks it is found: what that
-start is worth to each motion of splats stands in [ablate_start.md](ablate_start.md),
+start is worth to four motions of splats stands in [ablate_start.md](ablate_start.md),
 and what the parts of Sonata and some of MoBa-GS are worth behind it in
-[ablate_sonata.md](ablate_sonata.md) and [ablate_moba.md](ablate_moba.md). Both were
-measured before the fits of their networks to tracks held what is at rest (the floor of
-MoBa-GS bends in its picture), and are to be measured again; MoBa-GS' growth and numbers
-of bases, and the suite of fields, are still to be measured from tracks.
+[ablate_sonata.md](ablate_sonata.md) and [ablate_moba.md](ablate_moba.md). The first two
+were measured before the fits of networks to tracks held what is at rest, and before
+what stands hidden was filled, and are to be measured again; some of MoBa-GS' numbers of
+bases, and the suite of fields, are still to be measured from tracks.
 """
 
 

@@ -131,8 +131,8 @@ def without_moving(
     """The state without the Gaussians that move, and what was left out; host side.
 
     Those are the ones of which a point moves farther than `farther_than` (scene units)
-    over `INSTANTS` instants of [0, 1]: what is left is the static scene, with holes
-    where nothing was ever filmed behind what moves.
+    over `INSTANTS` instants of [0, 1]: what is left is the static scene. What was
+    never filmed behind what moves is a guess (`StartSpec.fill_hidden`) or a hole.
     """
     stages = _stages(model, "--hide-moving")
 
