@@ -81,7 +81,8 @@ def main(args):
             continue
         found = measured(captures[name], preset, args.seconds, args.size, seed)
         rows.append(cell | found)
-        stored = {"machine": clock.machine(), "rows": rows}
+        machine = clock.beside(clock.machine(), stored.get("machine", {}))
+        stored = {"machine": machine, "rows": rows}
         write_json(args.out, stored)
         print("  ".join(f"{k} {v}" for k, v in rows[-1].items()), flush=True)
     return stored

@@ -100,6 +100,11 @@ class Render:
                     f"--{name.replace('_', '-')} {distance}: a distance in scene "
                     "units, not negative"
                 )
+        if self.slow != 1 and self.path == "heldout":
+            raise ValueError(
+                f"--slow {self.slow:g}: held-out frames have times of their own; "
+                "choose a camera path, as --path captured"
+            )
         if self.show == "flow" and (self.without or self.appearance is not None):
             raise ValueError(
                 "--show flow follows the motion of the whole scene; leave out "
@@ -276,7 +281,9 @@ def _write(args, out, renderer, state, names, views, picture_of):
     width, height = renderer.size
     ms = renderer.ms_per_frame(len(names))
     print(f"{len(names)} pictures of {width}x{height}, {ms:.0f} ms each, in {out}")
-    files = sorted(str(path) for path in out.iterdir() if path.is_file())
+    kinds = [kind for kind in args.formats if kind != "mp4"]
+    files = [str(out / f"{name}.{kind}") for name in names for kind in kinds]
+    files += [str(out / "film.mp4")] if "mp4" in args.formats else []
     size = list(renderer.size)
     return {"folder": str(out), "size": size, "ms_per_frame": ms, "files": files}
 

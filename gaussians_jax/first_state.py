@@ -13,7 +13,7 @@ from gaussians_jax.effects import deformation
 from gaussians_jax.growth import AuxState, states_of
 from gaussians_jax.spec import SplatScene, carried_count, refuse_what_cannot_train
 from gaussians_jax.splats import Params
-from nerfies_jax.capture.capture import Capture
+from nerfies_jax.capture.capture import Capture, PointCloud
 from nerfies_jax.evidence import hidden_points, record, usable_paths, view_set
 from nerfies_jax.training.effects import Effect, stream
 from nerfies_jax.training.model import TrainState, in_default_precision
@@ -43,6 +43,9 @@ def first_state(spec, effects, optimiser, capture, key) -> TrainState:
     seed = int(jax.random.randint(start_key, (), 0, np.iinfo(np.int32).max))
     tracked, hidden, capture = _from_tracks(spec, effects, capture, start_key)
     position, colour = initialisation.initial_points(spec.init, capture, seed)
+    most = None if spec.densification is None else spec.densification.cap_max
+    if hidden is not None and most is not None:
+        hidden = _thinned(hidden, most - len(position) - len(tracked.position))
     guessed = slice(len(position), len(position))
     if hidden is not None:
         position = np.concatenate([position, hidden.position])
@@ -62,7 +65,6 @@ def first_state(spec, effects, optimiser, capture, key) -> TrainState:
     rows = rows._replace(opacity_logit=opaque)
     rows = initialisation.clamp_scales(rows, capture, spec.init.max_scale)
     count = len(position)
-    most = None if spec.densification is None else spec.densification.cap_max
     params = Params({"splats": rows}, {})
     for effect in effects:
         effect_key = jax.random.fold_in(start_key, stream(effect.name))
@@ -96,13 +98,20 @@ def _from_tracks(spec, effects, capture, key):
     if evidence is None:
         return None, None, capture
     seeds = track_start.start(spec.start, effects[0], evidence, capture, key)
-    hidden = None
-    if spec.start.fill_hidden:
-        views = view_set.in_time_order(record.looked_at(capture, evidence.factor))
-        hidden = hidden_points.behind(views, evidence.still, evidence.moving)
     if len(evidence.still.position) > initialisation.point_count(capture):
         capture = dataclasses.replace(capture, points=evidence.still)
+    hidden = None
+    if spec.start.fill_hidden and initialisation.point_count(capture):
+        views = view_set.in_time_order(record.looked_at(capture, evidence.factor))
+        hidden = hidden_points.behind(views, capture.points, evidence.moving)
     return seeds, hidden, capture
+
+
+def _thinned(points, most):
+    """At most so many of them, evenly over their order."""
+    count = min(max(most, 0), len(points.position))
+    kept = np.linspace(0, len(points.position) - 1, count).round().astype(int)
+    return PointCloud(points.position[kept], points.colour[kept])
 
 
 def count_rows(effects: tuple[Effect, ...], state: TrainState) -> dict[str, int]:

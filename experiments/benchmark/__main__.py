@@ -83,10 +83,12 @@ def main(args):
 def keep(path: pathlib.Path, label: str, seed: int, scored: dict) -> None:
     """Add one run to the kept numbers, in the place of an older one."""
     from nerfies_jax.capture.json_files import write_json
+    from nerfies_jax.measure import clock
 
     stored = json.loads(path.read_text()) if path.exists() else {"runs": {}}
     scored = dict(scored)
-    stored["machine"] = scored.pop("machine")
+    machine = scored.pop("machine")
+    stored["machine"] = clock.beside(machine, stored.get("machine", {}))
     stored["runs"].setdefault(label, {})[str(seed)] = scored
     write_json(path, stored)
 

@@ -34,13 +34,15 @@ def main(args):
 
         every = contests.opened(args, arms)
     if args.keep:
-        path = results.ROOT / results.STUDIES["league"].measured
-        count = contests.restore(path, every)
+        kept = contests.kept(results.ROOT / results.STUDIES["league"].measured)
+        count = contests.restore(kept, every)
         if count:
             print(f"{count} cells are kept from before and are not made again")
     failed = contests.run(args, every)
     path = args.out / "league.json"
     stored = contests.record(args, every)
+    if args.keep:
+        stored = contests.merged(kept, stored)
     contests.write(path, stored)
     from experiments.league import page
 

@@ -54,15 +54,14 @@ def _of_seed(job, seed):
     return one
 
 
-def restore(path: pathlib.Path, jobs: list[Job]) -> int:
-    """Put kept cells of `path` into the folders of the parts; returns how many.
+def restore(before: dict[str, Any], jobs: list[Job]) -> int:
+    """Put kept cells into the folders of the parts; returns how many.
 
     Those that were made with the settings of today alone, and that are not there yet:
     whatever has changed since is measured anew. No pictures come with them.
     """
-    kept = json.loads(path.read_text())["contests"] if path.is_file() else []
     count = 0
-    for job, one in itertools.product(jobs, kept):
+    for job, one in itertools.product(jobs, before.get("contests", ())):
         if (one["film"], one["seconds"]) != (job.out.name, job.args.seconds):
             continue
         for name, seed in job.tasks():
@@ -72,6 +71,10 @@ def restore(path: pathlib.Path, jobs: list[Job]) -> int:
             if cell is None or place.is_file():
                 continue
             steps = int(cell["steps"])
+            # The first seed here may have found other steps for all of them.
+            first = results.steps_of(job.path(name, 0, job.budgets[0]))
+            if seed and job.args.seconds is not None and first != steps:
+                continue
             identity = job.identity(name, seed, steps, job.budgets[0])
             if row["made_with"][str(seed)] == _digest(identity):
                 notes = {"steps": steps, "stopped_by": "steps"}
@@ -91,6 +94,36 @@ def record(args: League, jobs: list[Job]) -> dict[str, Any]:
         "settings": specs.as_json(args),
         "contests": [_contest(job) for job in jobs],
     }
+
+
+def merged(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
+    """What is kept, with the films, rows and seeds of `before` that `now` has not.
+
+    What was asked for now is as it is now: cells that are missing stay so.
+    """
+    contests = [copy.deepcopy(one) for one in now["contests"]]
+    for old in before.get("contests", ()):
+        key = old["film"], old["seconds"]
+        same = [one for one in contests if (one["film"], one["seconds"]) == key]
+        if not same:
+            contests.append(old)
+            continue
+        (one,) = same
+        more = set(old["seeds"]) - set(one["seeds"])
+        for name, row in old["rows"].items():
+            mine = one["rows"].setdefault(name, row)
+            for seed in map(str, more):
+                for part in ("cells", "made_with"):
+                    if seed in row[part]:
+                        mine[part][seed] = row[part][seed]
+        one["seeds"] = sorted({*one["seeds"], *more})
+    machine = clock.beside(now["machine"], before.get("machine", {}))
+    return now | {"machine": machine, "contests": contests}
+
+
+def kept(path: pathlib.Path) -> dict[str, Any]:
+    """What `write` wrote; empty where it wrote nothing yet."""
+    return json.loads(path.read_text()) if path.is_file() else {}
 
 
 def _contest(job):

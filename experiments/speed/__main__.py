@@ -76,9 +76,11 @@ def main(args):
 def keep(path: pathlib.Path, machine: dict, keys: tuple[str, ...], record) -> None:
     """Put a record in its place in the file, which keeps all others."""
     from nerfies_jax.capture.json_files import write_json
+    from nerfies_jax.measure import clock
 
     stored = json.loads(path.read_text()) if path.exists() else {}
-    stored["machine"], inner = machine, stored
+    stored["machine"] = clock.beside(machine, stored.get("machine", {}))
+    inner = stored
     for key in keys[:-1]:
         inner = inner.setdefault(key, {})
     inner[keys[-1]] = record

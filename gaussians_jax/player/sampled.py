@@ -24,6 +24,9 @@ MOST_SIDE_PX = 320  # of them: larger pictures take long and say the same
 # leaves out 436 of 10,000, and held-out frames are 56.6 dB from the model's own; 0.3
 # leaves out 1,426 (53.4 dB), 1 3,359 (42.5 dB), nothing none (56.8 dB).
 LEAST_SEEN_PX = 0.1
+# What stands hidden is looked at without what moves: farther than this share of its
+# distance, at so many times.
+MOVES, TIMES = 0.01, 8
 
 
 class Instants(NamedTuple):
@@ -85,6 +88,7 @@ def seen_in_training(
 ) -> Seen:
     """How much of the training pictures each Gaussian makes up, and in which colour.
 
+    Each view counts as it is, and without what moves: then it shows what that hides.
     `degree` is that of the harmonics in use. A picture is a sum of colours with
     weights, so the weights of a Gaussian, summed over the pixels, are the slope of the
     picture's sum in the Gaussian's colour.
@@ -107,15 +111,29 @@ def seen_in_training(
         )
         return weight, weight[:, None] * towards
 
+    moves = _moves(at, capture)
     most, total, colour = 0.0, 0.0, 0.0
     for row in evaluation.spread(capture.train, MOST_VIEWS):
         view = evaluation.resized(evaluation.view_of(capture, row), capture.size, size)
         deformed = at(float(view.time))
-        weight, coloured = jax.device_get(shown(deformed, view.camera))
-        most = np.maximum(most, weight * factor**2)
-        total, colour = total + weight, colour + coloured
+        looks = [deformed]
+        if moves.any():
+            opacity = jnp.where(moves, 0, deformed.opacity)
+            looks.append(deformed._replace(opacity=opacity))
+        for gaussians in looks:
+            weight, coloured = jax.device_get(shown(gaussians, view.camera))
+            most = np.maximum(most, weight * factor**2)
+            total, colour = total + weight, colour + coloured
     seen = np.maximum(total, np.finfo(np.float32).tiny)
     return Seen(most, colour / seen[:, None])
+
+
+def _moves(at, capture):
+    """[gaussians] bool: which are elsewhere at some time."""
+    means = np.stack([np.asarray(at(float(t)).mean) for t in np.linspace(0, 1, TIMES)])
+    filmed_from = capture.cameras.position[capture.train].mean(axis=0)
+    distance = np.linalg.norm(means[0] - filmed_from, axis=-1)
+    return np.linalg.norm(np.ptp(means, axis=0), axis=-1) > MOVES * distance
 
 
 def steady(quaternion: np.ndarray) -> np.ndarray:

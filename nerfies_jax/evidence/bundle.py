@@ -206,6 +206,8 @@ def scaled(views: Views, body: Body, factor: float) -> Body:
 
 def typical_misses(seen: Sight, miss: np.ndarray, tracks: int) -> np.ndarray:
     """[tracks] the median of each track's misses, px; infinite where never seen."""
+    if not len(miss):
+        return np.full(tracks, np.inf)
     ordered = np.lexsort((miss, seen.track))
     count = np.bincount(seen.track, minlength=tracks)
     first = np.concatenate([[0], np.cumsum(count)[:-1]])

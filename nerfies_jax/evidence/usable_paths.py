@@ -14,6 +14,7 @@ from nerfies_jax.training.track_start import TrackStartSpec
 LEAST_SEEN = 6  # frames in which a path is known
 LEAST_PATHS = 12
 LEAST_MOVING = 0.005  # of the pixels: films of still scenes have up to 0.4 % marked
+MARKED = 0.01  # of the pixels: from here on something moves, followed or not
 
 
 class KnownPaths(NamedTuple):
@@ -49,8 +50,11 @@ def unusable(evidence: Evidence) -> str:
     """Why a motion cannot start from these tracks; empty where it can."""
     if evidence.unusable:
         return evidence.unusable
-    if _hardly_moves(evidence):
+    if evidence.moving.mean() < LEAST_MOVING:
         return f"only {evidence.moving.mean():.1%} of the pixels move by themselves"
+    count = len(known_paths(evidence).known)
+    if count < LEAST_PATHS:
+        return f"only {count} tracks of what moves are long enough to fit a motion to"
     return ""
 
 
@@ -61,12 +65,9 @@ def stands_still(evidence: Evidence, times: np.ndarray) -> bool:
     """
     if np.ptp(times[evidence.row]) == 0:
         return True
-    return not evidence.unusable and _hardly_moves(evidence)
-
-
-def _hardly_moves(evidence):
-    few = len(known_paths(evidence).known) < LEAST_PATHS
-    return few or float(evidence.moving.mean()) < LEAST_MOVING
+    # More that is marked and cannot be followed may be too fast for that.
+    unmarked = float(evidence.moving.mean()) < MARKED
+    return bool(unmarked and not evidence.unusable and unusable(evidence))
 
 
 def known_paths(evidence: Evidence) -> KnownPaths:

@@ -246,6 +246,15 @@ def machine() -> dict[str, Any]:
     }
 
 
+def beside(now: dict[str, Any], before: dict[str, Any]) -> dict[str, Any]:
+    """`now` with the processors of `before` named as well, for a file that keeps both.
+
+    Each once; `before` may be empty.
+    """
+    names = [*filter(None, before.get("cpu", "").split("; ")), now["cpu"]]
+    return now | {"cpu": "; ".join(dict.fromkeys(names))}
+
+
 def _cpu_model():
     try:
         for line in pathlib.Path("/proc/cpuinfo").read_text().splitlines():

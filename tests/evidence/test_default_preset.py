@@ -7,7 +7,7 @@ import pytest
 
 from gaussians_jax import representation
 from gaussians_jax.presets import PRESETS
-from nerfies_jax.evidence import rigid_groups
+from nerfies_jax.evidence import rigid_groups, usable_paths
 from nerfies_jax.training import specs
 from tests.evidence import films
 from tests.evidence.test_tracks import MOVES
@@ -35,6 +35,14 @@ def test_motion_is_chosen_by_what_tracks_say(make, kind, words, tmp_path, monkey
     choice = representation.default_preset(make())
     assert choice.preset == SPLATS.format(kind)
     assert words in "".join(choice.notes)
+
+
+def test_what_moves_and_cannot_be_followed_is_no_still_scene(tmp_path, monkeypatch):
+    monkeypatch.setattr(representation, "CACHE", tmp_path)
+    monkeypatch.setattr(usable_paths, "LEAST_PATHS", 10**6)
+    choice = representation.default_preset(films.film(**MOVES, frames=24))
+    assert choice.preset == SPLATS.format("deformable")
+    assert "are long enough to fit a motion to" in "".join(choice.notes)
 
 
 @pytest.mark.parametrize(("asked", "overrides"), [(20, ("motion.bases=20",)), (8, ())])

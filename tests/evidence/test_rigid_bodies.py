@@ -155,3 +155,10 @@ def test_slopes_of_misses_are_differences():
         np.testing.assert_allclose(
             slope[..., axis], (ends[0] - ends[1]) / 2e-5, rtol=1e-4, atol=1e-4
         )
+
+
+def test_tracks_that_are_nowhere_known_miss_by_any_distance():
+    none = np.zeros((0, 2))
+    nowhere = bundle.Sight(*np.zeros((2, 0), int), none, np.zeros((0, 2, 3)))
+    miss = bundle.typical_misses(nowhere, np.zeros(0), 3)
+    np.testing.assert_array_equal(miss, np.inf)

@@ -134,17 +134,41 @@ def test_kept_cells_are_taken_over_where_they_would_be_made_alike(league, tmp_pa
     stored = contests.record(settled, jobs)
     path = tmp_path / "league.json"
     contests.write(path, stored)
-    made = len(trained)
+    kept, made = contests.kept(path), len(trained)
 
     def elsewhere(name, **changes):
         there = dataclasses.replace(settled, out=tmp_path / name, **changes)
         return there, contests.opened(there, arms)
 
     there, again = elsewhere("again")
-    assert contests.restore(path, again) == made
-    assert contests.restore(path, again) == 0
+    assert contests.restore(kept, again) == made
+    assert contests.restore(kept, again) == 0
     contests.run(there, again)
     assert len(trained) == made
     assert contests.record(there, again)["contests"] == stored["contests"]
-    assert contests.restore(path, elsewhere("other", tracks=2)[1]) == 0
-    assert contests.restore(tmp_path / "none.json", elsewhere("none")[1]) == 0
+    assert contests.restore(kept, elsewhere("other", tracks=2)[1]) == 0
+    none = contests.kept(tmp_path / "none.json")
+    assert contests.restore(none, elsewhere("none")[1]) == 0
+    # Later seeds are of as many steps as the first, and that one has others here.
+    for row in kept["contests"][0]["rows"].values():
+        row["cells"].pop("0", None)
+    _, later = elsewhere("later", budgets=(9.0,))
+    assert contests.restore(kept, later) == 0
+
+
+def test_what_was_not_asked_for_stays_among_the_kept(league, tmp_path):
+    settled, _ = league
+    arms = rows.of_presets(settled.presets)
+    jobs = contests.opened(settled, arms)
+    contests.run(settled, jobs)
+    whole = contests.record(settled, jobs)
+    few = dataclasses.replace(settled, budgets=(9.0,), seeds=1, out=tmp_path / "few")
+    jobs = contests.opened(few, arms[1:2])
+    contests.run(few, jobs)
+    now = contests.record(few, jobs)
+    now["contests"][0]["rows"][arms[1]]["cells"]["0"]["psnr"] = 7.0
+    both = contests.merged(whole, now)
+    whole["contests"][0]["rows"][arms[1]]["cells"]["0"]["psnr"] = 7.0
+    assert both["contests"] == whole["contests"]
+    assert contests.merged({}, now)["contests"] == now["contests"]
+    assert page.page(json.loads(json.dumps(both)))

@@ -317,3 +317,24 @@ def test_a_browser_draws_what_the_model_does(page, tmp_path, time):
     assert psnr(picture, drawn(0, time)) > 50  # 8 bits alone leave 59
     other = drawn(0, 1.0 - time)
     assert psnr(picture, other) < 30
+
+
+def test_what_moves_does_not_hide_what_stands_behind_it():
+    """The thing behind keeps a colour of its own, though no view shows it."""
+    capture = scenes.tiny_capture()
+    camera = jax.tree.map(lambda leaf: leaf[capture.train[0]], capture.cameras)
+    ahead = camera.position + np.outer([0.4, 0.8], camera.camera_from_world[2])
+    mean = np.concatenate([np.repeat(ahead[:1], 9, axis=0), ahead[1:]])
+    rows = splats.from_points(mean, np.full((10, 3), 0.25), degree=0)
+    moves = np.arange(10) < 9
+    scale = np.where(moves, 1.0, 0.02)  # sheets that fill every picture
+    opacity = put(np.where(moves, 0.95, 0.9), "float32")
+
+    def at(time):
+        shifted = rows.mean + np.where(moves, 0.1 * time, 0)[:, None] * [1, 0, 0]
+        scales = put(np.repeat(scale[:, None], 3, 1), "float32")
+        return Gaussians(put(shifted, "float32"), rows.quaternion, scales, opacity)
+
+    seen = sampled.seen_in_training(at, rows, SPEC.raster, jnp.asarray(0), capture)
+    assert seen.most[9] > sampled.LEAST_SEEN_PX
+    np.testing.assert_allclose(seen.colour[9], 0.25, atol=1e-5)
