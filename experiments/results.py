@@ -48,7 +48,8 @@ followed with nearly the error of points that do not move at all), so that hardl
 difference between arms left the spread over seeds. From tracks it is found: what that
 start is worth to four motions of splats stands in [ablate_start.md](ablate_start.md),
 and what the parts of Sonata and some of MoBa-GS are worth behind it in
-[ablate_sonata.md](ablate_sonata.md) and [ablate_moba.md](ablate_moba.md). The first two
+[ablate_sonata.md](ablate_sonata.md) and [ablate_moba.md](ablate_moba.md), and what the
+parts of our own default are, in [ablate_tracked.md](ablate_tracked.md). The first two
 were measured before the fits of networks to tracks held what is at rest, and before
 what stands hidden was filled, and are to be measured again; some of MoBa-GS' numbers of
 bases, and the suite of fields, are still to be measured from tracks.
