@@ -171,9 +171,8 @@ def default_preset(capture: Capture) -> Choice:
     if overrides:
         notes.append(f"for pictures of {'x'.join(map(str, capture.size))}")
     if not reason:
-        bases = rigid_groups.enough(
-            *usable_paths.known_paths(evidence), BASES, EXPLAINED
-        )
+        paths = usable_paths.known_paths(evidence)
+        bases = rigid_groups.enough(paths.position, paths.known, BASES, EXPLAINED)
         if bases > spec.motion.bases:
             overrides += (f"motion.bases={bases}",)
             notes.append(f"its tracks move as {bases} rigid things or more")

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from gaussians_jax import path_fit
 from gaussians_jax.initialisation import StartSpec
-from gaussians_jax.path_fit import Paths, Points
+from gaussians_jax.path_fit import Depth, Paths, Points
 from gaussians_jax.splats import Params
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evidence import record, usable_paths, view_set
@@ -56,13 +56,17 @@ def start(
         raise ValueError(
             f"{capture.path or capture.name}: no start from tracks: {reason}"
         )
-    position, known = usable_paths.known_paths(evidence)
+    position, known, deviation = usable_paths.known_paths(evidence)
     times = capture.times[evidence.row].astype(np.float32)
     unit = usable_paths.scene_unit(evidence)
     still = np.asarray(evidence.still.position, np.float32)
+    camera = view_set.in_time_order(record.looked_at(capture, evidence.factor)).position
+    ray = position - camera
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    depth = Depth(ray, deviation)
     fitted = path_fit.fit(
         effect,
-        Paths(times, position.astype(np.float32), known, unit, still),
+        Paths(times, position.astype(np.float32), known, unit, still, depth),
         key,
         rate=spec.fit_rate,
         steps=spec.fit_steps,

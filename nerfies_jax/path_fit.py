@@ -68,7 +68,7 @@ def film_paths(field: Field, capture, evidence: Evidence) -> FilmPaths:
             np.float32
         )
 
-    position, known = usable_paths.known_paths(evidence)
+    position, known, _ = usable_paths.known_paths(evidence)
     return FilmPaths(
         capture.times[evidence.row].astype(np.float32),
         capture.appearance_ids[evidence.row],

@@ -127,7 +127,7 @@ def deform(
 
 def fit_to_paths(spec: SE3BasesSpec, paths: Paths) -> Guess:
     """Groups of points that move as rigid bodies, a basis for each; host side."""
-    times, position, known, unit, _ = paths
+    times, position, known, unit, *_ = paths
     canonical_frame = len(times) // 2
     label = rigid_groups.labels(position, known, spec.bases)
     bodies = rigid_groups.motion(position, known, label, canonical_frame)
@@ -150,7 +150,8 @@ def fit_to_paths(spec: SE3BasesSpec, paths: Paths) -> Guess:
         shift, turn = bend(points.nets.shift) / unit, bend(points.nets.turn)
         return SMOOTHNESS * shift + TURN_SMOOTHNESS * turn
 
-    return Guess(guess, Points(unit, 10.0, Bases(3.0, unit, 0.0)), penalty)
+    rates = Points(unit, 10.0, Bases(3.0, unit, 0.0))
+    return Guess(guess, rates, penalty, rigid=True)
 
 
 def _at_knots(track, times, spec):

@@ -22,6 +22,7 @@ class KnownPaths(NamedTuple):
 
     position: np.ndarray  # [paths, frames, 3] scene units; any value where not known
     known: np.ndarray  # [paths, frames] bool
+    depth_deviation: np.ndarray  # [paths] as a share of the depth
 
 
 def evidence_to_start_from(capture: Capture, start: TrackStartSpec) -> Evidence | None:
@@ -73,7 +74,10 @@ def stands_still(evidence: Evidence, times: np.ndarray) -> bool:
 def known_paths(evidence: Evidence) -> KnownPaths:
     """The paths known in `LEAST_SEEN` frames and more."""
     kept = evidence.paths.known.sum(1) >= LEAST_SEEN
-    return KnownPaths(evidence.paths.position[kept], evidence.paths.known[kept])
+    paths = evidence.paths
+    return KnownPaths(
+        paths.position[kept], paths.known[kept], paths.depth_deviation[kept]
+    )
 
 
 def scene_unit(evidence: Evidence) -> float:

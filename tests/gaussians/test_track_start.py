@@ -13,7 +13,7 @@ from gaussians_jax import path_fit, presets, scene, spec, splats, track_start
 from gaussians_jax.effects import temporal_opacity
 from gaussians_jax.effects.se3_bases import SE3BasesSpec
 from gaussians_jax.initialisation import StartSpec
-from gaussians_jax.path_fit import Paths, Points
+from gaussians_jax.path_fit import Depth, Paths, Points
 from gaussians_jax.splats import Params
 from nerfies_jax import evaluation
 from nerfies_jax.capture.capture import PointCloud
@@ -137,6 +137,30 @@ def test_slopes_of_carried_points_are_those_of_differences(float64):
         return jnp.sum(path_fit.places(effect, points, jnp.float64(0.3)) ** 3)
 
     assert directional_error(value, points) < 1e-7
+
+
+@pytest.mark.parametrize("deviation", [0.02, 1.0])
+def test_a_thing_tells_its_depth_better_than_each_of_its_tracks(deviation):
+    """Where the film tells depth; where it does not, tracks count as they are."""
+    position, time = turning_body()
+    ray = position / np.linalg.norm(position, axis=-1, keepdims=True)
+    noise = np.random.default_rng(3).normal(0, 0.06, (30, 1, 1))
+    wobble = np.sin(np.arange(FRAMES) / 3)[:, None] * noise
+    tracked = (position + wobble * ray).astype(np.float32)
+    known = np.ones(position.shape[:2], bool)
+    effect = effect_of(MOTIONS["bases"])
+    misses = []
+    for depth in (None, Depth(ray, np.full(30, deviation))):
+        paths = Paths(time, tracked, known, 1.0, depth=depth)
+        points = path_fit.fit(effect, paths, jax.random.key(0), steps=600).points
+        moved = [places_of(effect, points, t) for t in time]
+        off = np.stack(moved, 1) - position
+        off -= off.mean(axis=1, keepdims=True)
+        misses.append(np.mean(np.linalg.norm(off, axis=-1)))
+    if deviation == 1.0:
+        assert misses[1] == pytest.approx(misses[0], rel=1e-3)
+    else:
+        assert misses[1] < 0.7 * misses[0]
 
 
 def test_nothing_known_is_refused_by_name():
