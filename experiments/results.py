@@ -51,8 +51,8 @@ and what the parts of Sonata and some of MoBa-GS are worth behind it in
 [ablate_sonata.md](ablate_sonata.md) and [ablate_moba.md](ablate_moba.md), and what the
 parts of our own default are, in [ablate_tracked.md](ablate_tracked.md). The first two
 were measured before the fits of networks to tracks held what is at rest, and before
-what stands hidden was filled, and are to be measured again; some of MoBa-GS' numbers of
-bases, and the suite of fields, are still to be measured from tracks.
+what stands hidden was filled, and are to be measured again; MoBa-GS' growth and numbers
+of bases, and the suite of fields, are still to be measured from tracks.
 """
 
 
@@ -112,7 +112,7 @@ STUDIES = {
     "ablate_moba": _package(
         "ablate_moba",
         "--suite moba --arms full no-basis no-annealing no-alternation no-acceleration "
-        "--steps 900 --jobs 2",
+        "deformable static --steps 900 --jobs 2",
         of="ablate",
     ),
     "deformation_cost": _package("deformation_cost", "--out deformation_cost.json"),
