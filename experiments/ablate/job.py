@@ -283,9 +283,11 @@ class Job:
             metadata = representation.metadata_of(self.capture, spec)
             model = representation.build(spec, metadata)
             self._cache_saved = 0.0
+            # As from a start at rest: a fit to tracks takes longer than compiling.
+            begin = model.example or model.init
             first = loop.fit(
                 model,
-                model.init(self.capture, jax.random.key(0)),
+                begin(self.capture, jax.random.key(0)),
                 evaluation.frames_of(self.capture, model.required_data),
                 steps=1,
                 console=rich.console.Console(quiet=True),
