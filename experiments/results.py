@@ -47,12 +47,13 @@ said little besides: what moves was found badly by every arm then (points were
 followed with nearly the error of points that do not move at all), so that hardly a
 difference between arms left the spread over seeds. From tracks it is found: what that
 start is worth to four motions of splats stands in [ablate_start.md](ablate_start.md),
-and what the parts of Sonata and some of MoBa-GS are worth behind it in
+what the parts of Sonata and the bases of MoBa-GS are worth behind it in
 [ablate_sonata.md](ablate_sonata.md) and [ablate_moba.md](ablate_moba.md), and what the
 parts of our own default are, in [ablate_tracked.md](ablate_tracked.md). The first two
 were measured before the fits of networks to tracks held what is at rest, and before
-what stands hidden was filled, and are to be measured again; MoBa-GS' growth and numbers
-of bases, and the suite of fields, are still to be measured from tracks.
+what stands hidden was filled, and are to be measured again; MoBa-GS' annealing,
+alternation, acceleration, growth and numbers of bases, and the suite of fields, are
+still to be measured from such fits.
 """
 
 
@@ -111,8 +112,7 @@ STUDIES = {
     ),
     "ablate_moba": _package(
         "ablate_moba",
-        "--suite moba --arms full no-basis no-annealing no-alternation no-acceleration "
-        "deformable static --steps 900 --jobs 2",
+        "--suite moba --arms full no-basis deformable static --steps 900 --jobs 2",
         of="ablate",
     ),
     "deformation_cost": _package("deformation_cost", "--out deformation_cost.json"),
