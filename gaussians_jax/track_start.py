@@ -60,8 +60,8 @@ def start(
     times = capture.times[evidence.row].astype(np.float32)
     unit = usable_paths.scene_unit(evidence)
     still = np.asarray(evidence.still.position, np.float32)
-    camera = view_set.in_time_order(record.looked_at(capture, evidence.factor)).position
-    ray = position - camera
+    views = view_set.in_time_order(record.looked_at(capture, evidence.factor))
+    ray = position - views.position
     ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
     depth = Depth(ray, deviation)
     fitted = path_fit.fit(
@@ -72,13 +72,11 @@ def start(
         steps=spec.fit_steps,
     )
     followed = known.mean(axis=1).astype(np.float32)
-    return _seeds(effect, fitted.points, followed, evidence, capture, unit, spec)
+    return _seeds(effect, fitted.points, followed, evidence, views, times, unit, spec)
 
 
-def _seeds(effect, points, followed, evidence, capture, unit, spec):
+def _seeds(effect, points, followed, evidence, views, times, unit, spec):
     """Moving pixels of all frames, lifted, and carried back to the canonical places."""
-    views = view_set.in_time_order(record.looked_at(capture, evidence.factor))
-    times = capture.times[evidence.row].astype(np.float32)
     rng = np.random.default_rng(0)
     depth = moving_depths(evidence)
     frame, row, column = np.nonzero(depth > 0)

@@ -6,7 +6,7 @@ import math
 import pathlib
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import filelock
@@ -25,11 +25,21 @@ class ArmResult(NamedTuple):
     notes: dict[str, Any]  # steps, what stopped it, points that were ever lost
 
 
+def stored_numbers(numbers: Mapping[str, float]) -> dict[str, float | None]:
+    """As JSON has them: null for what is not finite."""
+    return {k: x if math.isfinite(x) else None for k, x in numbers.items()}
+
+
+def read_numbers(stored: Mapping[str, float | None]) -> dict[str, float]:
+    """From JSON: NaN for null."""
+    return {k: math.nan if x is None else x for k, x in stored.items()}
+
+
 def write(path: pathlib.Path, identity: dict[str, Any], kept: ArmResult) -> None:
     """`path` and its .npz; numbers last: an arm is finished when they are there."""
     with replaced_file(path.with_suffix(".npz")) as partial:
         np.savez_compressed(partial, **kept.arrays)
-    numbers = {k: x if math.isfinite(x) else None for k, x in kept.numbers.items()}
+    numbers = stored_numbers(kept.numbers)
     write_json(
         path,
         {
@@ -76,8 +86,7 @@ def read(path: pathlib.Path, identity: dict[str, Any]) -> ArmResult | None:
             f"{path} was made with other settings; name another --out, or remove it to "
             "run it again"
         )
-    numbers = {k: math.nan if x is None else x for k, x in numbers.items()}
-    return ArmResult(numbers, arrays, notes)
+    return ArmResult(read_numbers(numbers), arrays, notes)
 
 
 def steps_of(path: pathlib.Path) -> int | None:

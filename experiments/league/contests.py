@@ -78,7 +78,8 @@ def restore(before: dict[str, Any], jobs: list[Job]) -> int:
             identity = job.identity(name, seed, steps, job.budgets[0])
             if row["made_with"][str(seed)] == _digest(identity):
                 notes = {"steps": steps, "stopped_by": "steps"}
-                results.write(place, identity, ArmResult(_numbers(cell), {}, notes))
+                numbers = results.read_numbers(cell)
+                results.write(place, identity, ArmResult(numbers, {}, notes))
                 count += 1
     return count
 
@@ -149,17 +150,12 @@ def _row(job, name, finished):
     return {
         "preset": arm.preset,
         "changes": list(arm.changes),
-        "cells": {str(seed): _plain(cell.numbers) for seed, cell in cells.items()},
+        "cells": {
+            str(seed): results.stored_numbers(cell.numbers)
+            for seed, cell in cells.items()
+        },
         "made_with": {seed: _digest(identity) for seed, identity in made_with.items()},
     }
-
-
-def _plain(numbers):
-    return {k: x if math.isfinite(x) else None for k, x in numbers.items()}
-
-
-def _numbers(cell):
-    return {k: math.nan if x is None else x for k, x in cell.items()}
 
 
 def write(path: pathlib.Path, stored: dict[str, Any]) -> None:

@@ -105,6 +105,13 @@ def league(tmp_path, monkeypatch):
     return settled, trained
 
 
+def played(settled, arms):
+    """The record of a league that has run as far as it can."""
+    jobs = contests.opened(settled, arms)
+    contests.run(settled, jobs)
+    return contests.record(settled, jobs)
+
+
 def test_first_seeds_come_first_and_no_seed_waits_for_a_first_that_failed(league):
     settled, trained = league
     jobs = contests.opened(settled, rows.of_presets(settled.presets))
@@ -129,9 +136,7 @@ def test_first_seeds_come_first_and_no_seed_waits_for_a_first_that_failed(league
 def test_kept_cells_are_taken_over_where_they_would_be_made_alike(league, tmp_path):
     settled, trained = league
     arms = rows.of_presets(settled.presets)
-    jobs = contests.opened(settled, arms)
-    contests.run(settled, jobs)
-    stored = contests.record(settled, jobs)
+    stored = played(settled, arms)
     path = tmp_path / "league.json"
     contests.write(path, stored)
     kept, made = contests.kept(path), len(trained)
@@ -159,13 +164,9 @@ def test_kept_cells_are_taken_over_where_they_would_be_made_alike(league, tmp_pa
 def test_what_was_not_asked_for_stays_among_the_kept(league, tmp_path):
     settled, _ = league
     arms = rows.of_presets(settled.presets)
-    jobs = contests.opened(settled, arms)
-    contests.run(settled, jobs)
-    whole = contests.record(settled, jobs)
+    whole = played(settled, arms)
     few = dataclasses.replace(settled, budgets=(9.0,), seeds=1, out=tmp_path / "few")
-    jobs = contests.opened(few, arms[1:2])
-    contests.run(few, jobs)
-    now = contests.record(few, jobs)
+    now = played(few, arms[1:2])
     now["contests"][0]["rows"][arms[1]]["cells"]["0"]["psnr"] = 7.0
     both = contests.merged(whole, now)
     whole["contests"][0]["rows"][arms[1]]["cells"]["0"]["psnr"] = 7.0
