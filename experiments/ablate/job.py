@@ -325,10 +325,24 @@ class Job:
             # As those that were kept before there was a choice.
             **({"clock": budget.clock} if budget.clock != "wall" else {}),
             "spec": specs.as_json(self.spec(name, steps)),
+            **{k: x for k, x in self.measured_on().items() if k != "scene"},
+        }
+
+    def measured_on(self) -> dict[str, Any]:
+        """What is filmed, which frames are scored and which points are followed."""
+        return {
+            "scene": self.capture_digest,
             "rows": self.known.rows.tolist(),
             "tracks": len(self.known.path),
             "start": self.known.start,
         }
+
+    def required_data(self, name: str) -> frozenset[str]:
+        """What an arm learns from beside pictures and cameras."""
+        spec = self.spec(name, None)
+        representation = representations.of_preset(self.suite.arms[name].preset)
+        metadata = representation.metadata_of(self.capture, spec)
+        return representation.build(spec, metadata).required_data
 
     def path(self, name: str, seed: int, budget: Budget) -> pathlib.Path:
         """Where an arm's numbers are when it is finished; its pictures are beside."""

@@ -6,11 +6,11 @@
 
 Both representations learn the same frames of the built-in scenes, and of the captures
 that are named, from the same seeds. A row is a preset as it is, or with its motion
-started the other way: fitted to tracks before training, or from rest; tracks are made
-once for a film, and finding them is not in the seconds. Each row gets as many steps as
-it can make in so many processor seconds on one core, without compiling. A cell is one
-row, film, length and seed, trained in a process of its own: all cells of the first seed
-come first, and short lengths before long ones. What is finished is kept in --out, and
+started the other way: fitted to tracks before training, or from rest; neither finding
+tracks nor fitting to them is in the seconds. Each row gets as many steps as it can make
+in so many processor seconds on one core, without compiling. A cell is one row, film,
+length and seed, trained in a process of its own: all cells of the first seed come
+first, and short lengths before long ones. What is finished is kept in --out, and
 the same command goes on where it was stopped or where --budget ended it; with --keep
 also from another clone, with the cells that are kept beside the code and would be made
 with the same settings today. Writes league.json and league.png there; rows that lose
@@ -41,9 +41,11 @@ def main(args):
     failed = contests.run(args, every)
     path = args.out / "league.json"
     stored = contests.record(args, every)
-    if args.keep:
-        stored = contests.merged(kept, stored)
     contests.write(path, stored)
+    if args.keep:
+        with cli.user_errors():
+            stored = contests.merged(kept, stored)
+        contests.write(path, stored)
     from experiments.league import page
 
     page.draw(stored, path.with_suffix(".png"))

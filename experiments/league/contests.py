@@ -20,6 +20,9 @@ from nerfies_jax.evaluation import protocol
 from nerfies_jax.measure import clock
 from nerfies_jax.training import specs
 
+# What a film may tell beside pictures, cameras and points, and most rows do not read.
+TOLD = {"depths", "flow", "moving"}
+
 
 def opened(args: League, arms: tuple[str, ...]) -> list[Job]:
     """A job for each length and film, the short ones of all films first."""
@@ -70,39 +73,46 @@ def restore(before: dict[str, Any], jobs: list[Job]) -> int:
             place = job.path(name, seed, job.budgets[0])
             if cell is None or place.is_file():
                 continue
-            steps = int(cell["steps"])
             # The first seed here may have found other steps for all of them.
             first = results.steps_of(job.path(name, 0, job.budgets[0]))
-            if seed and job.args.seconds is not None and first != steps:
+            if seed and job.args.seconds is not None and first != row["steps"]:
                 continue
-            identity = job.identity(name, seed, steps, job.budgets[0])
-            if row["made_with"][str(seed)] == _digest(identity):
-                notes = {"steps": steps, "stopped_by": "steps"}
-                numbers = results.read_numbers(cell)
+            identity = job.identity(name, seed, row["steps"], job.budgets[0])
+            if row["made_with"] == _made_with(identity):
+                numbers = results.read_numbers(cell["numbers"])
+                notes = {key: cell[key] for key in ("stopped_by", "cpu")}
+                notes["steps"] = int(numbers["steps"])
                 results.write(place, identity, ArmResult(numbers, {}, notes))
                 count += 1
     return count
 
 
-def _digest(identity):
-    return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
+def _made_with(identity):
+    """Equal where two seeds of a row may stand side by side."""
+    return _digest({k: x for k, x in identity.items() if k != "seed"})
+
+
+def _digest(settings):
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
 
 
 def record(args: League, jobs: list[Job]) -> dict[str, Any]:
     """What is kept: the numbers of every finished cell, and which were asked for."""
+    machine = clock.machine()
     return {
-        "machine": clock.machine(),
+        "machine": machine,
         "settings": specs.as_json(args),
-        "contests": [_contest(job) for job in jobs],
+        "contests": [_contest(job, machine["cpu"]) for job in jobs],
     }
 
 
 def merged(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
     """What is kept, with the films, rows and seeds of `before` that `now` has not.
 
-    What was asked for now is as it is now: cells that are missing stay so.
+    ValueError where cells of `before` would go that `now` has not made anew: those of
+    other settings, which cannot stand beside what there is now.
     """
-    contests = [copy.deepcopy(one) for one in now["contests"]]
+    contests, lost = [copy.deepcopy(one) for one in now["contests"]], []
     for old in before.get("contests", ()):
         key = old["film"], old["seconds"]
         same = [one for one in contests if (one["film"], one["seconds"]) == key]
@@ -110,14 +120,24 @@ def merged(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
             contests.append(old)
             continue
         (one,) = same
-        more = set(old["seeds"]) - set(one["seeds"])
         for name, row in old["rows"].items():
-            mine = one["rows"].setdefault(name, row)
-            for seed in map(str, more):
-                for part in ("cells", "made_with"):
-                    if seed in row[part]:
-                        mine[part][seed] = row[part][seed]
-        one["seeds"] = sorted({*one["seeds"], *more})
+            alike = one["measured_on"] == old["measured_on"]
+            if alike and name not in one["rows"]:
+                one["rows"][name] = row
+                continue
+            mine = one["rows"].get(name, {"cells": {}, "made_with": None})
+            left = {s: x for s, x in row["cells"].items() if s not in mine["cells"]}
+            if row["made_with"] == mine["made_with"]:
+                mine["cells"] |= left
+            else:
+                lost += [f"{name} (seed {seed})" for seed in left]
+        one["seeds"] = sorted({*one["seeds"], *old["seeds"]})
+    if lost:
+        raise ValueError(
+            f"{len(lost)} kept cells, {lost[0]} first, were made with other settings "
+            "and not made anew: what is kept stays as it is; go on with the same "
+            "command, or remove the kept file"
+        )
     machine = clock.beside(now["machine"], before.get("machine", {}))
     return now | {"machine": machine, "contests": contests}
 
@@ -127,7 +147,7 @@ def kept(path: pathlib.Path) -> dict[str, Any]:
     return json.loads(path.read_text()) if path.is_file() else {}
 
 
-def _contest(job):
+def _contest(job, cpu):
     still = protocol.static_error(job.known)
     finished = job.finished(job.budgets[0])
     return {
@@ -135,26 +155,34 @@ def _contest(job):
         "seconds": job.args.seconds,
         "exact": job.known.exact,
         "still": still if math.isfinite(still) else None,
+        "measured_on": _digest(job.measured_on()),
         "seeds": list(job.seeds),
-        "rows": {name: _row(job, name, finished) for name in job.names},
+        "rows": {name: _row(job, name, finished, cpu) for name in job.names},
     }
 
 
-def _row(job, name, finished):
+def _row(job, name, finished, cpu):
     arm, budget = job.suite.arms[name], job.budgets[0]
     cells = {s: finished[name, s] for s in job.seeds if (name, s) in finished}
-    made_with = {
-        str(seed): job.identity(name, seed, job.planned_steps(name, budget), budget)
-        for seed in cells
-    }
+    steps = made_with = None
+    if cells:
+        steps = job.planned_steps(name, budget)
+        made_with = _made_with(job.identity(name, 0, steps, budget))
     return {
         "preset": arm.preset,
         "changes": list(arm.changes),
-        "cells": {
-            str(seed): results.stored_numbers(cell.numbers)
-            for seed, cell in cells.items()
-        },
-        "made_with": {seed: _digest(identity) for seed, identity in made_with.items()},
+        "reads": sorted(job.required_data(name) & TOLD),
+        "steps": steps,
+        "made_with": made_with,
+        "cells": {str(seed): _cell(cell, cpu) for seed, cell in cells.items()},
+    }
+
+
+def _cell(kept, cpu):
+    return {
+        "numbers": results.stored_numbers(kept.numbers),
+        "stopped_by": kept.notes["stopped_by"],
+        "cpu": kept.notes.get("cpu", cpu),  # of one that was restored
     }
 
 

@@ -10,8 +10,9 @@ import numpy as np
 from experiments import markdown
 from experiments.ablate import verdicts
 from experiments.ablate.measures import MEASURES
-from experiments.league import margins, standings
+from experiments.league import margins, rows, standings
 from experiments.league.rows import JUDGED, against_best
+from experiments.league.settings import League
 from nerfies_jax.capture.json_files import replaced_file
 from nerfies_jax.evaluation import figures
 
@@ -25,20 +26,27 @@ READING = """\
   that show what moves; *EPE* is how far points that are followed are from where they
   truly are, *depth* the median error of depth, both in scene units. A film that is no
   built-in scene has pictures alone.
-- *CPU s* is what the lengths are of: seconds of all threads of a process with one core,
-  without compiling and without finding tracks; *train s* is the same by the clock on
-  the wall, *compile* what compiling takes without a cache, *frame ms* a held-out frame,
+- *reads* is what a row learns from beside pictures, cameras and points. In built-in
+  films it is the exact depth, flow or mask of what moves, which other rows do not see.
+- *CPU s* is what the lengths are of, give or take a tenth: seconds of all threads of a
+  process with one core, without compiling, finding tracks and fitting the motion to
+  them, which rows from tracks have on top; *train s* is the same by the clock on the
+  wall, *compile* what compiling takes without a cache, *frame ms* a held-out frame,
   *model MB* the file of a trained scene (of a field its parameters).
+- Schedules stretch to the steps that a row gets; how many steps apart Gaussians grow
+  does not, so that rows of dear steps also grow less often. Presets differ in what is
+  not motion as well, in views a step and in how far apart growth is.
 - ± is the standard deviation over seeds; without it there was one seed, and one seed
   has no spread to hold a difference against.
-- *best* is the row of most PSNR among those with most seeds. A gain over another row is
-  the mean over the seeds that both have, each against itself, positive where the best
-  is better, and ± there is its 95 % interval (Student, seeds paired): *shows* where it
-  leaves zero out, *opposite* where it does against the best, *none* otherwise. The best
-  was chosen by these numbers, and of so many comparisons one in twenty shows by chance:
-  near rows are a tie.
+- *best* is the row of most PSNR among those with most seeds, however few these are. A
+  gain over another row is the mean over the seeds that both have, each against itself,
+  positive where the best is better, and ± there is its 95 % interval (Student, seeds
+  paired): *shows* where it leaves zero out, *opposite* where it does against the best,
+  *none* otherwise. The best was chosen by these numbers, and of so many comparisons one
+  in twenty shows by chance: near rows are a tie.
 - `+tracks` is a preset whose motion is fitted to tracks before training, `+rest` one
-  that would be and is not."""
+  that would be and is not, `+no-depth` one without its depth term."""
+WHOLE = League()
 
 
 def page(stored: Mapping[str, Any]) -> str:
@@ -50,7 +58,12 @@ def page(stored: Mapping[str, Any]) -> str:
         if contest.numbers:
             parts += _standings(contest)
         if contest.missing:
-            parts.append(f"Not run yet: {_missing(contest)}.")
+            parts.append(f"Not there: {_missing(contest)}.")
+        if contest.stopped:
+            stopped = ", ".join(contest.stopped)
+            parts.append(f"Scored where they stopped before their steps: {stopped}.")
+        if len(contest.cpus) > 1:
+            parts.append(_machines(contest))
     return "\n\n".join([*parts, margins.section(contests)])
 
 
@@ -59,15 +72,27 @@ def _progress(contests):
     missing = sum(map(len, (s for c in contests for s in c.missing.values())))
     seeds = sorted({seed for c in contests for _, seed in c.numbers})
     counted = f"**{there} of {there + missing} cells** (row, film, length and seed)"
-    if not there:
-        return f"{counted} are there."
-    which = f"seeds so far: {', '.join(map(str, seeds))}"
+    whole = len(rows.suite().arms) * len(WHOLE.sources) * len(WHOLE.limits)
+    parts = [f"{counted} that were asked for are there."]
     if missing:
-        return (
-            f"{counted} are there; {which}. What is missing is named below, and "
-            "nothing is said of it."
+        parts.append("What is missing is named below, and nothing is said of it.")
+    if there:
+        parts.append(f"Seeds so far: {', '.join(map(str, seeds))}.")
+    if len(seeds) == 1:
+        parts.append(
+            "**One seed has no spread: no difference here is shown to be more than "
+            "chance, and near rows have no order.**"
         )
-    return f"{counted} are there, all that were asked for; {which}."
+    parts.append(f"The whole league is {whole * WHOLE.seeds:,} cells and any captures.")
+    return " ".join(parts)
+
+
+def _machines(contest):
+    """Which cells come from which processor: seconds are not of equal worth."""
+    most = max(contest.cpus, key=lambda cpu: len(contest.cpus[cpu]))
+    others = {cpu: cells for cpu, cells in contest.cpus.items() if cpu != most}
+    words = [f"{cpu}: {', '.join(cells)}" for cpu, cells in others.items()]
+    return f"All on one {most}, but for those on {'; on '.join(words)}."
 
 
 def _missing(contest):
@@ -95,9 +120,10 @@ def _standings(contest):
 
 
 def _table(contest, order, names):
-    rows = []
+    table = []
     for name in order:
-        cells = [f"`{name}`", str(len(standings.seeds_of(contest, name)))]
+        cells = [f"`{name}`", ", ".join(contest.reads[name])]
+        cells.append(str(len(standings.seeds_of(contest, name))))
         for key in names:
             mean, spread = standings.mean_and_spread(contest, name, key)
             digits = MEASURES[key].digits
@@ -105,9 +131,9 @@ def _table(contest, order, names):
             if cell and math.isfinite(spread):
                 cell += f" ± {markdown.number(spread, digits)}"
             cells.append(cell)
-        rows.append(cells)
-    heads = ("row", "seeds", *(MEASURES[key].heading for key in names))
-    return markdown.table(heads, rows)
+        table.append(cells)
+    heads = ("row", "reads", "seeds", *(MEASURES[key].heading for key in names))
+    return markdown.table(heads, table, words=2)
 
 
 def _against(contest, best, others):
@@ -115,12 +141,17 @@ def _against(contest, best, others):
     cells: dict[str, dict[str, str]] = {name: {} for name in others}
     for verdict in judged:
         cells[verdict.claim.worse][verdict.measure] = standings.gain(verdict)
-    rows = [
+    table = [
         [f"`{name}`", *(row.get(key, "") for key in JUDGED)]
         for name, row in cells.items()
     ]
     heads = [f"gain in {MEASURES[key].heading}" for key in JUDGED]
-    return markdown.table((f"best, `{best}`, against", *heads), rows)
+    count = {name: len(standings.seeds_of(contest, name)) for name in (best, *others)}
+    full = sum(n == count[best] for n in count.values())
+    among = "best"
+    if full < len(count):
+        among = f"best of the {full} rows with {count[best]} seeds"
+    return markdown.table((f"{among}, `{best}`, against", *heads), table)
 
 
 def draw(stored: Mapping[str, Any], path: pathlib.Path) -> None:

@@ -36,7 +36,7 @@ class League:
     """Which presets (default: every one that ends in -small)."""
     budgets: tuple[float, ...] = (90.0, 300.0)
     """Processor seconds of training, without compiling: each row gets the steps that it
-    can make in them, and its schedules stretch to these."""
+    can make in them, give or take a tenth, and its schedules stretch to these."""
     own_steps: bool = False
     """Also train every row over its preset's own steps."""
     seeds: int = 3
@@ -96,7 +96,7 @@ class League:
     def limits(self) -> tuple[float | None, ...]:
         """Processor seconds, short ones first; None for the preset's own steps."""
         own = (None,) if self.own_steps else ()
-        return (*sorted(self.budgets), *own)
+        return (*sorted(set(self.budgets)), *own)
 
     def ablation(
         self, name: str, seconds: float | None, arms: tuple[str, ...]

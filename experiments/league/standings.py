@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from experiments.ablate import verdicts
+from experiments.ablate import results, verdicts
 from experiments.ablate.measures import MEASURES
 
 # What `verdicts` says of a gain, in a word.
@@ -24,6 +24,9 @@ class Contest(NamedTuple):
     still: float | None  # the EPE of points that do not move
     numbers: dict[tuple[str, int], dict[str, float]]  # by row and seed
     missing: dict[str, list[int]]  # seeds by row
+    reads: dict[str, list[str]]  # beside pictures, cameras and points
+    stopped: list[str]  # cells that ended before their steps, in words
+    cpus: dict[str, list[str]]  # cells by processor, in words
 
 
 def of_stored(stored: Mapping[str, Any]) -> Contest:
@@ -31,17 +34,19 @@ def of_stored(stored: Mapping[str, Any]) -> Contest:
     length = "the presets' own steps"
     if stored["seconds"] is not None:
         length = f"{stored['seconds']:g} processor seconds"
-    numbers, missing = {}, {}
+    numbers, missing, stopped, cpus = {}, {}, [], {}
     for name, row in stored["rows"].items():
         for seed in stored["seeds"]:
             cell = row["cells"].get(str(seed))
             if cell is None:
                 missing.setdefault(name, []).append(seed)
                 continue
-            known = {key: cell.get(key) for key in MEASURES}
-            numbers[name, seed] = {
-                key: math.nan if x is None else x for key, x in known.items()
-            }
+            known = results.read_numbers(cell["numbers"])
+            numbers[name, seed] = {key: known.get(key, math.nan) for key in MEASURES}
+            words = f"`{name}` (seed {seed})"
+            cpus.setdefault(cell["cpu"], []).append(words)
+            if cell["stopped_by"] != "steps":
+                stopped.append(f"{words}: {cell['stopped_by']}")
     return Contest(
         f"`{stored['film']}`, {length}",
         stored["film"],
@@ -49,6 +54,9 @@ def of_stored(stored: Mapping[str, Any]) -> Contest:
         stored["still"],
         numbers,
         missing,
+        {name: row["reads"] for name, row in stored["rows"].items()},
+        stopped,
+        cpus,
     )
 
 

@@ -28,17 +28,21 @@ def test_every_small_preset_is_a_row_and_each_motion_has_both_starts():
     for rest in ("moba-small", "nsff-small"):
         assert starts[rest] == [rest, f"{rest}+tracks"]
     assert starts["4dgs-small"] == ["4dgs-small", "4dgs-small+rest"]
+    # Depth is exact in built-in films: Sonata also stands without it.
+    one, other = "sonata-small", "sonata-small+tracks"
+    assert starts[one] == [one, f"{one}+no-depth", other, f"{other}+no-depth"]
     with pytest.raises(ValueError, match="--presets moba: choose from"):
         rows.of_presets(("moba",))
 
 
 def cell(**values):
     numbers = dict.fromkeys(MEASURES, math.nan) | values
-    return {k: x if math.isfinite(x) else None for k, x in numbers.items()}
+    stored = {k: x if math.isfinite(x) else None for k, x in numbers.items()}
+    return {"numbers": stored, "stopped_by": "steps", "cpu": "Abacus"}
 
 
 def contest(names, **more):
-    made = {name: {"cells": {}} for name in names}
+    made = {name: {"cells": {}, "reads": []} for name in names}
     blank = {"film": "fast", "seconds": 90.0, "still": 0.02, "seeds": [0, 1, 2]}
     return blank | {"rows": made} | more
 
@@ -50,24 +54,33 @@ def test_the_page_of_a_part_says_what_is_there_and_what_is_missing():
         other_cells = part["rows"]["splats-deformable-small+tracks"]["cells"]
         other_cells[str(seed)] = cell(psnr=other)
     # A lucky first seed does not crown a row that has no other.
-    part["rows"]["nerf"]["cells"]["0"] = cell(psnr=40.0)
+    lucky = cell(psnr=40.0) | {"stopped_by": "non-finite", "cpu": "Difference Engine"}
+    part["rows"]["nerf"] = {"cells": {"0": lucky}, "reads": ["depths", "flow"]}
     empty = contest(["nerf"], film="kitchen", seconds=None)
     text = page.page({"contests": [part, empty]})
     assert text.startswith("**7 of 12 cells**")
-    assert "seeds so far: 0, 1, 2" in text
-    assert "Not run yet: `nerf` (seed 1, 2)." in text
-    assert "Not run yet: `nerf`.\n" in text
-    assert "best, `sonata-small+tracks`, against" in text
+    assert "Seeds so far: 0, 1, 2" in text
+    assert "One seed has no spread" not in text
+    assert "Not there: `nerf` (seed 1, 2)." in text
+    assert "Not there: `nerf`.\n" in text
+    assert "| `nerf` | depths, flow | 1 | 40.00 |" in text
+    assert "before their steps: `nerf` (seed 0): non-finite." in text
+    assert "but for those on Difference Engine: `nerf` (seed 0)." in text
+    assert "best of the 2 rows with 3 seeds, `sonata-small+tracks`, against" in text
     assert "| `nerf` | -10.00, one seed |" in text
     # Student's 95 % of gains 1.0, 1.1 and 0.9, by hand: 4.303 * 0.1 / sqrt(3).
     assert "| `splats-deformable-small+tracks` | +1.00 ± 0.25, shows |" in text
     margin = next(line for line in text.splitlines() if "| tracks | +0.31 |" in line)
+    assert "`splats-deformable-small`" in margin
     assert margin.endswith("| +1.00 ± 0.25, shows |")
 
 
 def test_a_page_of_nothing_says_so():
-    text = page.page({"contests": [contest(["nerf"])]})
+    blank = contest(["nerf"])
+    text = page.page({"contests": [blank]})
     assert "**0 of 3 cells**" in text
+    blank["rows"]["nerf"]["cells"]["0"] = cell(psnr=40.0)
+    assert "One seed has no spread" in page.page({"contests": [blank]})
     assert "No pair of these rows is there yet." in text
 
 
@@ -89,7 +102,7 @@ def league(tmp_path, monkeypatch):
             if budget.seconds is not None:
                 identity["steps"] = 7
             numbers = dict.fromkeys(MEASURES, float(seed)) | {"steps": 7.0}
-            kept = ArmResult(numbers, {}, {"steps": 7})
+            kept = ArmResult(numbers, {}, {"steps": 7, "stopped_by": "steps"})
             results.write(job.path(name, seed, budget), identity, kept)
         return [("nerf-small", 0)] if job.seeds == (0,) else []
 
@@ -123,7 +136,7 @@ def test_first_seeds_come_first_and_no_seed_waits_for_a_first_that_failed(league
     assert [one["seconds"] for one in stored["contests"]] == [9.0, 30.0]
     cells = {n: row["cells"] for n, row in stored["contests"][0]["rows"].items()}
     assert [list(cells[n]) for n in ("nerf-small", *names)] == [[], *[["0", "1"]] * 2]
-    assert cells["d-nerf-small+tracks"]["1"]["psnr"] == 1.0
+    assert cells["d-nerf-small+tracks"]["1"]["numbers"]["psnr"] == 1.0
     page.draw(stored, settled.out / "league.png")
     assert (settled.out / "league.png").read_bytes().startswith(b"\x89PNG")
     # The processor's seconds are kept apart from the wall's, and both resume.
@@ -167,9 +180,36 @@ def test_what_was_not_asked_for_stays_among_the_kept(league, tmp_path):
     whole = played(settled, arms)
     few = dataclasses.replace(settled, budgets=(9.0,), seeds=1, out=tmp_path / "few")
     now = played(few, arms[1:2])
-    now["contests"][0]["rows"][arms[1]]["cells"]["0"]["psnr"] = 7.0
+    now["contests"][0]["rows"][arms[1]]["cells"]["0"]["numbers"]["psnr"] = 7.0
     both = contests.merged(whole, now)
-    whole["contests"][0]["rows"][arms[1]]["cells"]["0"]["psnr"] = 7.0
+    whole["contests"][0]["rows"][arms[1]]["cells"]["0"]["numbers"]["psnr"] = 7.0
     assert both["contests"] == whole["contests"]
     assert contests.merged({}, now)["contests"] == now["contests"]
     assert page.page(json.loads(json.dumps(both)))
+
+
+@pytest.mark.parametrize("which", ["measured_on", "made_with"])
+def test_kept_cells_of_other_settings_are_never_lost_nor_mixed(which, league):
+    settled, _ = league
+    arms = rows.of_presets(settled.presets)
+    whole = played(settled, arms)
+    now = json.loads(json.dumps(whole))
+    (part, *_) = now["contests"]
+    where = part if which == "measured_on" else part["rows"][arms[1]]
+    where[which] = "other settings"
+    for row in part["rows"].values():
+        row["cells"].pop("1", None)
+    if which == "measured_on":  # and then no row's are equal
+        part["rows"] = {arms[1]: part["rows"][arms[1]] | {"made_with": "other"}}
+    with pytest.raises(ValueError, match=r"cells, d-nerf-small.* other settings"):
+        contests.merged(whole, now)
+    # All of them made anew: the old ones go.
+    part["rows"] = {
+        name: row | {"cells": whole["contests"][0]["rows"][name]["cells"]}
+        for name, row in whole["contests"][0]["rows"].items()
+    }
+    assert contests.merged(whole, now)["contests"] == now["contests"]
+
+
+def test_a_length_named_twice_is_one(tmp_path):
+    assert League(budgets=(9.0, 9.0), own_steps=True).limits == (9.0, None)
