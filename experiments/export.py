@@ -158,13 +158,15 @@ def _gaussians(args: Export, run: Any) -> str:
 def _splatv(args: Export, run: Any) -> str:
     from gaussians_jax import instants, splats, splatv
     from gaussians_jax.player import sampled
+    from gaussians_jax.spec import raster_of
     from nerfies_jax import evaluation, runs
 
     state, spec, capture = runs.restore(args.run, run).state, run.spec, run.capture
     at = instants.gaussians_at(run.model, state)
     rows = run.model.stages.rows(state.params)
     degree = splats.active_degree(state.step, spec.sh_every, spec.sh_degree)
-    seen = sampled.seen_in_training(at, rows, spec.raster, degree, capture)
+    raster = raster_of(spec, run.metadata)
+    seen = sampled.seen_in_training(at, rows, raster, degree, capture)
     learned = sampled.gathered(at, rows, seen, sampled.MOST_INSTANTS)
     curves = splatv.write(args.place, learned, capture)
     model = run.model
@@ -174,7 +176,7 @@ def _splatv(args: Export, run: Any) -> str:
             spec, run.metadata, neutral, False, effects=run.effects
         )
     draw = evaluation.Renderer(model, capture.size)
-    fit = splatv.measured(curves, learned, draw, state, spec.raster, capture)
+    fit = splatv.measured(curves, learned, draw, state, raster, capture)
     said = (
         f"{len(curves.position)} Gaussians on cubics in time, off by {fit.rms:.2g} "
         f"scene units (rms; {fit.most:.2g} for the worst of 99 in 100); pictures "

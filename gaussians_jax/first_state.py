@@ -13,8 +13,9 @@ from gaussians_jax.effects import deformation
 from gaussians_jax.growth import AuxState, states_of
 from gaussians_jax.spec import SplatScene, carried_count, refuse_what_cannot_train
 from gaussians_jax.splats import Params
-from nerfies_jax.capture.capture import Capture, PointCloud
+from nerfies_jax.capture.capture import Capture, PointCloud, training_bytes
 from nerfies_jax.evidence import hidden_points, record, usable_paths, view_set
+from nerfies_jax.training import data_parallel
 from nerfies_jax.training.effects import Effect, stream
 from nerfies_jax.training.model import TrainState, in_default_precision
 
@@ -32,7 +33,8 @@ def estimate_memory_bytes(spec: SplatScene, capture: Capture) -> int:
     numbers = count * (5 * (11 + harmonics) + 60)
     # A chunk holds keys, rows and blending inputs of every pair.
     numbers += 16 * (spec.raster.capacity or 0)
-    return 4 * numbers + capture.images.nbytes
+    devices = data_parallel.device_count(spec.batch_size)
+    return 4 * numbers + devices * training_bytes(capture)
 
 
 def first_state(spec, effects, optimiser, capture, key) -> TrainState:

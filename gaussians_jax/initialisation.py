@@ -103,7 +103,7 @@ def initial_points(spec: InitSpec, capture: Capture, seed: int):
     if len(position) > spec.points:
         kept = np.sort(rng.choice(len(position), spec.points, replace=False))
         position, colour = position[kept], colour[kept]
-    span = _filmed_depths(capture)
+    span = filmed_depths(capture)
     more, more_colour = _random_points(rng, capture, spec.extra_random, span)
     return np.concatenate([position, more]), np.concatenate([colour, more_colour])
 
@@ -115,7 +115,7 @@ def filmed_box(capture: Capture) -> tuple[tuple[float, ...], tuple[float, ...]]:
     the capture's own points.
     """
     rng = np.random.default_rng(0)
-    point, _ = _random_points(rng, capture, 4000, _filmed_depths(capture))
+    point, _ = _random_points(rng, capture, 4000, filmed_depths(capture))
     low, high = np.quantile(point, (0.01, 0.99), axis=0)
     return tuple(low.tolist()), tuple(high.tolist())
 
@@ -138,7 +138,7 @@ def clamp_scales(rows: Splats, capture: Capture, max_scale: float) -> Splats:
     return rows._replace(log_scale=jnp.minimum(rows.log_scale, bound[:, None]))
 
 
-def _filmed_depths(capture):
+def filmed_depths(capture):
     """The z-depths between which the capture's points lie, a little widened.
 
     Its near plane is often much nearer than anything filmed (0.05 where the first point

@@ -21,7 +21,7 @@ from gaussians_jax.effects import anchor_motion, deformation
 from gaussians_jax.effects.anchors import AnchorMotionSpec
 from gaussians_jax.effects.motion_basis import BasisMotionSpec
 from gaussians_jax.player import page
-from gaussians_jax.spec import OF_MOTION
+from gaussians_jax.spec import OF_MOTION, raster_of
 from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation.representation import (
@@ -108,7 +108,8 @@ def player(
 ) -> Player:
     """`player.html`; the poster is uint8 [height, width, 3]."""
     degree = splats.active_degree(state.step, spec.sh_every, spec.sh_degree)
-    return page.write(path, title, model, spec.raster, degree, state, capture, poster)
+    raster = raster_of(spec, scene.metadata_of(capture))
+    return page.write(path, title, model, raster, degree, state, capture, poster)
 
 
 def advise(

@@ -26,6 +26,7 @@ from gaussians_jax.spec import (
     SceneMetadata,
     SplatScene,
     effects_of,
+    raster_of,
 )
 from gaussians_jax.splats import Params, Splats
 from gaussians_jax.update import Drawn
@@ -55,6 +56,9 @@ from nerfies_jax.training.model import (
 
 PyTree = Any
 
+# Of the nearest that structure from motion finds: what moves stands before that.
+NEAREST = 0.2
+
 ORDER = 2**32 - 1  # stream of the run's key, as those in `growth`
 
 
@@ -68,6 +72,7 @@ def metadata_of(capture: Capture) -> SceneMetadata:
         frames=len(capture.train),
         exposures=exposures(capture),
         box=initialisation.filmed_box(capture),
+        near=NEAREST * initialisation.filmed_depths(capture)[0],
     )
 
 
@@ -167,7 +172,7 @@ def _draw(
         splats.active_harmonics(rows, degree),
         view.camera,
         size,
-        spec.raster,
+        raster_of(spec, metadata),
         jnp.asarray(metadata.background, gaussians.mean.dtype),
         mean2d_offset=probe,
         depth=depth,

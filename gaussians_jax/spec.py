@@ -1,6 +1,7 @@
 """Which scene of Gaussians: its settings, and the effects that they ask for."""
 
 import dataclasses
+import math
 
 from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.effects import (
@@ -145,6 +146,17 @@ class SceneMetadata:
     exposures: tuple[tuple[int, int, float], ...] = ((0, 0, 0.0),)
     # Low and high corner of what was filmed, scene units; None: nobody asks for it.
     box: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+    near: float = math.inf  # z-depth, scene units: what is farther must be drawn
+
+
+def raster_of(spec: SplatScene, metadata: SceneMetadata) -> RasterSpec:
+    """How to draw this capture: the raster's near plane before all that was filmed.
+
+    Scenes with a far background are small in the units of a box around all points: a
+    plane at 0.01 then lies metres before the camera.
+    """
+    near = min(spec.raster.near, metadata.near)
+    return dataclasses.replace(spec.raster, near=near)
 
 
 def carried_count(spec: SplatScene) -> int | None:
@@ -284,5 +296,5 @@ def effects_of(spec: SplatScene, metadata: SceneMetadata) -> tuple[Effect, ...]:
     if spec.flow is not None:
         at_once = spec.start.motion == "tracks"  # as the motion
         one = dataclasses.replace(spec.flow, start=0) if at_once else spec.flow
-        effects.append(motion_flow.effect(one, spec.raster))
+        effects.append(motion_flow.effect(one, raster_of(spec, metadata)))
     return tuple(effects)

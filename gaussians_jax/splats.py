@@ -29,6 +29,7 @@ INACTIVE_LOGIT = -1000.0  # sigmoid and its slope underflow to 0 below -745 in f
 LOG_SCALE_RANGE = (-20.0, 15.0)
 SH_DC = 0.28209479177387814  # 1 / (2 sqrt(pi)), the constant harmonic
 BUCKET = 256  # capacities are multiples of this
+TREMOR = 0.1  # of a typical depth: cameras that move less stand still, nearly
 
 
 class Splats(NamedTuple):
@@ -310,14 +311,15 @@ def scene_extent(position: np.ndarray, static: float | None = None) -> float:
     The unit of the learning rate of the means and of the thresholds of densification
     (Kerbl et al. 2023, reference implementation). Cameras that stand still have none,
     and a zero would stop the means from learning; `static`, a typical depth, stands in
-    for it.
+    for it, and a tenth of it for that of cameras that hardly move: a hand's tremor is
+    no unit for what lies metres away, and densification would prune all of it.
     """
     position = np.asarray(position, np.float64).reshape(-1, 3)
     middle = position.mean(axis=0)
     extent = 1.1 * float(np.linalg.norm(position - middle, axis=1).max())
     # Rounding of float32 positions far from the origin is no motion.
     if extent > 1e-5 * float(np.abs(position).max()):
-        return extent
+        return extent if static is None else max(extent, TREMOR * float(static))
     if static is None:
         raise ValueError(
             f"the cameras stand still (extent {extent:g} scene units), which would "

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 
 from gaussians_jax import rendering, scene, splats, update
 from gaussians_jax.effects import deformation
-from gaussians_jax.spec import OPTIMISERS
+from gaussians_jax.spec import OPTIMISERS, raster_of
 from gaussians_jax.update import Drawn
 from nerfies_jax.measure.part_time import part_ms
 from nerfies_jax.training import losses, rate
@@ -34,7 +34,7 @@ def parts(
     """
     effects = scene.all_effects(spec, metadata, effects)
     condition = FrameCondition(frames.times[0], step=state.step, key=state.key)
-    drawing, footprints = _drawing(spec, effects, state, frames, condition)
+    drawing, footprints = _drawing(spec, metadata, effects, state, frames, condition)
     a_view = drawing | _own_of_effects(effects, state, frames, condition)
     views = spec.batch_size // model.devices
     timed = {name: views * each for name, each in a_view.items()}
@@ -43,7 +43,7 @@ def parts(
     return timed | {"rest": max(whole - sum(timed.values()), 0.0)}
 
 
-def _drawing(spec, effects, state, frames, condition):
+def _drawing(spec, metadata, effects, state, frames, condition):
     """What the picture and its loss take, and the footprints that are drawn."""
     camera = jax.tree.map(lambda leaf: leaf[0], frames.cameras)
     observation = scene.observe(frames, 0, None)
@@ -54,7 +54,7 @@ def _drawing(spec, effects, state, frames, condition):
             coefficients,
             camera,
             _size(frames),
-            spec.raster,
+            raster_of(spec, metadata),
             mean2d_offset=probe,
             depth=scene.draws_depth(effects, frames),
         )

@@ -11,7 +11,7 @@ import optax
 from jaxtyping import Array, Key
 
 from nerfies_jax import occupied_rays, path_fit, render_ray, scene_metadata
-from nerfies_jax.capture.capture import Capture
+from nerfies_jax.capture.capture import Capture, training_bytes
 from nerfies_jax.effects import transient
 from nerfies_jax.effects.effect import Batch, Box, RayOutput
 from nerfies_jax.evidence import usable_paths
@@ -292,7 +292,8 @@ def estimate_memory_bytes(spec: RadianceScene, capture: Capture) -> int:
     # Every layer's output is kept for the backward pass, beside its gradient.
     rays_at_once = spec.rays // spec.micro_batches
     activations = 3 * rays_at_once * samples * widths
-    return 4 * activations + capture.images.nbytes
+    devices = data_parallel.device_count(spec.micro_batches)
+    return 4 * activations + devices * training_bytes(capture)
 
 
 def count_parameters(state: TrainState) -> dict[str, int]:

@@ -88,6 +88,11 @@ def point_depths(capture: Capture) -> np.ndarray:
     return depth[depth > capture.near]
 
 
+def training_bytes(capture: Capture) -> int:
+    """What the pictures to learn from take on each device that learns from them."""
+    return capture.images[:1].nbytes * len(capture.train)
+
+
 def validate(capture: Capture):
     """Raise a one-line `CaptureError` on the first thing that cannot be right."""
     where = str(capture.path or capture.name)

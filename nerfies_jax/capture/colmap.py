@@ -75,7 +75,9 @@ def read(
     placement = place_by_points(model.points, model.positions, model.depths)
     centre, scale = np.array(placement.centre), placement.scale
     cameras = _cameras(lenses, model.rotations, (model.positions - centre) * scale)
-    times = frames.spread(frames.clock([name_of(name) for name in model.names]))
+    moments, more = frames.clock([name_of(name) for name in model.names])
+    times = frames.spread(moments)
+    notes += more
     train, scored = frames.hold_out_every(
         len(rows), heldout or frames.HELD_OUT, str(path)
     )

@@ -182,13 +182,16 @@ def read_masks(
 def hold_out_every(count: int, every: int, where: str) -> tuple[np.ndarray, np.ndarray]:
     """Rows to learn from and to score on: the middle one of every `every` frames.
 
-    The middle, not the first: a held-out frame then has neighbours on both sides.
+    The middle, not the first: a held-out frame then has neighbours on both sides. Of
+    fewer frames than `every` one is held out, of fewer than three none.
     """
     if every < 2:
         raise CaptureError(
             f"{where}: heldout={every} leaves nothing to learn from; expected at "
             "least 2"
         )
+    if count >= 3:
+        every = min(every, count)
     rows = np.arange(count)
     scored = rows % every == every // 2
     return rows[~scored], rows[scored]
@@ -199,12 +202,16 @@ def dense(values: ArrayLike) -> np.ndarray:
     return np.unique(np.asarray(values), return_inverse=True)[1].astype(np.int32)
 
 
-def clock(stems: Sequence[str]) -> list[int]:
-    """The frame numbers at the end of the names, or their order if they have none."""
+def clock(stems: Sequence[str]) -> tuple[list[int], tuple[str, ...]]:
+    """The frame numbers at the end of the names, or their order if they have none.
+
+    A note says so of an order.
+    """
     split = [re.fullmatch(r"(.*?)(\d+)", stem) for stem in stems]
     if all(split) and len({match.group(1) for match in split}) == 1:
-        return [int(match.group(2)) for match in split]
-    return list(range(len(stems)))
+        return [int(match.group(2)) for match in split], ()
+    note = "times are the order of the pictures' names: those end in no common count"
+    return list(range(len(stems))), (note,)
 
 
 def spread(values: ArrayLike) -> np.ndarray:

@@ -62,7 +62,9 @@ def read(
     placed = _placed(poses)
     cameras = _cameras(poses, placed, (images.shape[2], images.shape[1]))
     names = tuple(file.stem for file in files)
-    times = frames.spread(frames.clock(names))
+    moments, more = frames.clock(names)
+    times = frames.spread(moments)
+    notes += more
     every = heldout or frames.HELD_OUT
     train, scored = frames.hold_out_every(len(files), every, str(path))
     return Capture(

@@ -15,7 +15,8 @@ MAX_POINTS = 50_000_000
 MAX_HEADER = 65_536  # bytes; plyfile hangs on a header line of 100 MB
 INLIERS = 0.95  # share of points nearest to their median that the scene must hold
 # Depths beyond these quantiles are outliers; the margins move the planes outwards.
-QUANTILES, NEAR_MARGIN, FAR_MARGIN = (0.001, 0.999), 0.8, 1.2
+QUANTILES, FAR_MARGIN = (0.001, 0.999), 1.2
+NEAR_MARGIN = 0.5  # what moves stands before what structure from motion finds
 
 
 class Placement(NamedTuple):
@@ -34,7 +35,7 @@ def place_by_points(
 
     As Nerfies does it, since its frequency bands are made for that size. `points` and
     camera `positions` [n, 3] and observed `depths` are in world units. Nerfies moves
-    the near plane outwards by 25 % (it divides by 0.8); here it moves inwards.
+    the near plane outwards by 25 % (it divides by 0.8); here it moves inwards, to half.
     """
     distance = np.linalg.norm(points - np.median(points, axis=0), axis=1)
     kept = points[distance <= np.quantile(distance, INLIERS)]

@@ -51,7 +51,9 @@ MOST_PIXELS = 16_000_000  # of all frames: 17 bytes each for the flow between th
 # camera that jumps.
 LEAST_CARRIED = 0.4
 # Shares of the time after which there is none left for a part.
-FOR_TRACKS, FOR_COLOURS, FOR_POINTS = 0.5, 0.6, 0.8
+FOR_TRACKS, FOR_COLOURS, FOR_BODIES, FOR_POINTS = 0.5, 0.6, 0.7, 0.8
+# Of the near plane, which is that of what stands still: a hand may be far before it.
+AT_CAMERA = 0.1
 LEAST_TEXTURED = 0.05  # of the pixels: too little to tell anything by
 
 
@@ -116,7 +118,7 @@ def gather(
     if not unusable:
         which = _moved(tracks, score, first)
     measured = _depths(capture, given, views, tracks, rest, score, use_depths)
-    moved_paths = _paths(capture, views, tracks, rest, score, which, measured)
+    moved_paths = _paths(capture, views, tracks, rest, score, which, measured, watch)
     watch.begin("still")
     dense = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
     if watch.has_time(FOR_POINTS, "dense points at rest"):
@@ -193,15 +195,18 @@ def _depths(capture, given, views, tracks, rest, score, use_depths):
     return depth
 
 
-def _paths(capture, views, tracks, rest, score, which, depths):
+def _paths(capture, views, tracks, rest, score, which, depths, watch):
     still, moved = score < paths.AT_REST, tracks.take(which)
     around = paths.depth_around(
         moved, tracks.take(still), rest.take(still), capture.near
     )
+    least = AT_CAMERA * capture.near
     if depths is not None:
         measured = _measured(depths, moved)
-        return paths.least_acceleration(views, moved, capture.near, around, measured)
-    alone = paths.least_acceleration(views, moved, capture.near, around)
+        return paths.least_acceleration(views, moved, least, around, measured)
+    alone = paths.least_acceleration(views, moved, least, around)
+    if not watch.has_time(FOR_BODIES, "depths of what moves as one rigid thing"):
+        return alone
     return rigid_bodies.refined(views, moved, alone)
 
 

@@ -14,6 +14,7 @@ FAR_AWAY = 10.0  # times the cameras' spread: depth of what shows no parallax at
 BEHIND_PX = 1e4  # misses a point that would lie behind the camera
 QUANTILE = 0.7  # of a track's frames, by how far it misses its point there
 LEAST_DEPTH = 1e-3  # scene units, for weights alone
+AT_ONCE = 2048  # tracks: 200 bytes for each and frame
 
 
 class RestPoints(NamedTuple):
@@ -39,6 +40,13 @@ def track_rays(views: Views, tracks: Tracks) -> np.ndarray:
 
 def fit(views: Views, tracks: Tracks) -> RestPoints:
     """Least squares of distances to the rays, over depth squared: pixels, nearly."""
+    count = len(tracks.seen)
+    blocks = np.split(np.arange(count), range(AT_ONCE, count, AT_ONCE))
+    parts = [_fit(views, tracks.take(block)) for block in blocks]
+    return RestPoints(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def _fit(views, tracks):
     ray = track_rays(views, tracks)
     unit = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
     across = across_ray(unit)

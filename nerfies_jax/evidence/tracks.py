@@ -1,5 +1,6 @@
 """Points of the pictures followed through a film, and aligned with where they began."""
 
+import math
 from typing import NamedTuple
 
 import cv2
@@ -11,6 +12,7 @@ from nerfies_jax.evidence.view_set import Views
 # Starts: every so many pixels in every third frame, about 10,000 tracks of 60 frames of
 # 176x132; larger pictures get as many.
 GRID_STEPS, EVERY_FRAMES = 29, 3  # across the picture's width
+MOST_PLACES = 30_000_000  # tracks times frames, about 30 bytes each
 SHORTEST = 8  # frames: fewer say little of how a point moves
 # Flow's errors add up along a track. Each point is looked up again in the frame where
 # it began: the 95 % quantile of the drift of points at rest falls by half.
@@ -43,23 +45,26 @@ def pixel_of(
 def grid(views: Views, sparser: int = 1, seed: int = 0) -> np.ndarray:
     """[starts, 3] frame and pixel: an even grid in every third frame, each shifted.
 
-    In as many frames fewer as it is to be `sparser`.
+    In as many frames fewer as it is to be `sparser`, or as a long film needs for its
+    tracks to have `MOST_PLACES` in all frames together.
 
     Not where a picture shows its plain background or was not filmed.
     """
     rng = np.random.default_rng(seed)
     width, height = views.size
     step = width / GRID_STEPS
-    starts = []
-    for frame in range(0, len(views.row), sparser * EVERY_FRAMES):
+    starts, frames = [], len(views.row)
+    most = int(width / step + 1) * int(height / step + 1) * (frames // EVERY_FRAMES + 1)
+    sparser *= math.ceil(most * frames / MOST_PLACES)
+    for frame in range(0, frames, sparser * EVERY_FRAMES):
         x, y = rng.uniform(1, 1 + step, 2)
         x, y = np.meshgrid(
             np.arange(x, width - 1, step), np.arange(y, height - 1, step)
         )
         pixel = np.stack([x.ravel(), y.ravel()], axis=-1)
         shown = views.valid[frame][pixel[:, 1].astype(int), pixel[:, 0].astype(int)]
-        frames = np.full((shown.sum(), 1), frame)
-        starts.append(np.concatenate([frames, pixel[shown]], axis=-1))
+        at = np.full((shown.sum(), 1), frame)
+        starts.append(np.concatenate([at, pixel[shown]], axis=-1))
     return np.concatenate(starts)
 
 

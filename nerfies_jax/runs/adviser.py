@@ -85,11 +85,12 @@ def by_tracks(config: RunConfig, capture: Capture) -> tuple[RunConfig, list[str]
 
 
 def follow(
-    config: RunConfig, findings: tuple[Finding, ...]
+    config: RunConfig, own: tuple[str, ...], findings: tuple[Finding, ...]
 ) -> tuple[RunConfig, list[str]]:
-    """A config as advised, and what to tell; the user's own settings come last.
+    """A config as advised, and what to tell; the user's `own` overrides come last.
 
-    The preset asked for says which representation, which family and which size.
+    The preset asked for says which representation, which family and which size. Other
+    overrides of the config belong to that preset, and stay only with it.
     """
     advice = advise_for(findings, config.preset)
     lines = [
@@ -97,6 +98,8 @@ def follow(
         f"effects: {advice.arguments()}",
     ]
     lines += [f"note: {note}" for note in advice.notes]
-    overrides = (*advice.overrides, *config.overrides)
-    changed = dataclasses.replace(config, preset=advice.preset, overrides=overrides)
+    kept = config.overrides if advice.preset == config.preset else own
+    changed = dataclasses.replace(
+        config, preset=advice.preset, overrides=(*advice.overrides, *kept)
+    )
     return changed, lines

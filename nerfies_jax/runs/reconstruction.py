@@ -174,14 +174,16 @@ def _new_run(config, effects):
         if effects == "preset":
             return new_run(config)
     stored = stored_capture(config.source, config.seed)
-    lines = []
+    chosen, lines = config, []
     if config.preset is None:
-        config, lines = adviser.by_tracks(config, stored)
+        chosen, lines = adviser.by_tracks(config, stored)
     if effects == "auto":
         inspected = inspection.inspect(stored, CACHE / "evidence")
-        config, lines = adviser.follow(config, inspected.findings)
+        found = inspected.findings
+        chosen, more = adviser.follow(chosen, config.overrides, found)
+        lines += more
     print("\n".join(lines))
-    return new_run(config, stored)
+    return new_run(chosen, stored)
 
 
 def _describe(run):

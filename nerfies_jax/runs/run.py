@@ -56,7 +56,13 @@ def new_run(config: RunConfig, stored: Capture | None = None) -> Run:
     `stored` is its `stored_capture` where that has been read already.
     """
     representation = representations.of_preset(config.preset)
-    return open_run(config, representation, scene_spec(config), stored)
+    run = open_run(config, representation, scene_spec(config), stored)
+    if not len(run.capture.heldout):  # before a training that ends without a score
+        raise ValueError(
+            f"{run.capture.path or run.capture.name}: no held-out frames to judge by; "
+            "give three pictures or more, or choose some with --heldout, as --heldout 8"
+        )
+    return run
 
 
 def open_run(

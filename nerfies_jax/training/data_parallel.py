@@ -51,6 +51,20 @@ def on_devices(
     return spread(jnp.arange(0, shares, each), *inputs)
 
 
+def shared(tree: PyTree, devices: int) -> PyTree:
+    """`replicate` of what no program overwrites: the first device's is no copy."""
+    if devices == 1:
+        return tree
+    mesh = _mesh(devices)
+    sharding = NamedSharding(mesh, PartitionSpec())
+
+    def whole(leaf):
+        copies = [jax.device_put(leaf, device) for device in mesh.devices]
+        return jax.make_array_from_single_device_arrays(leaf.shape, sharding, copies)
+
+    return jax.tree.map(whole, tree)
+
+
 def replicate(tree: PyTree, devices: int) -> PyTree:
     """The arrays, whole on each of the first `devices` devices."""
     if devices == 1:

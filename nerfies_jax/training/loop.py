@@ -126,7 +126,7 @@ class _Run:
             )
         self.events = _by_step(events)
         self.frames = jax.tree.map(jnp.asarray, frames)
-        self.spread_frames = data_parallel.replicate(self.frames, model.devices)
+        self.spread_frames = data_parallel.shared(self.frames, model.devices)
         self.saved_at = time.monotonic()
         self.step_seconds = math.inf  # not known yet: the first chunk is one step
         self.called = {hook.name: [self.step, None] for hook in hooks}

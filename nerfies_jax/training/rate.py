@@ -70,6 +70,6 @@ def step_ms(model: Model, state: TrainState, frames: Frames, steps: int) -> floa
 def _scan_of(model, state, frames, steps):
     """The program of a run, its scan compiled; what it reads; seconds of making it."""
     frames = jax.tree.map(jnp.asarray, frames)
-    frames = data_parallel.replicate(frames, model.devices)
+    frames = data_parallel.shared(frames, model.devices)
     program, seconds = chunk.program(model.step, state, frames, steps, model.devices)
     return program, frames, seconds + program.prepare(program.length)

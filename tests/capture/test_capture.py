@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from nerfies_jax.capture import capture as capturing
+from nerfies_jax.capture import frames as frames_of_files
 from nerfies_jax.capture.capture import Capture, PointCloud
 from nerfies_jax.geometry import camera
 from tests import scenes
@@ -41,6 +42,23 @@ def make(frames=4, size=(6, 4), **changes):
         points=PointCloud(eye.astype(np.float32), np.zeros((frames, 3), np.uint8)),
     )
     return Capture(**(values | changes))
+
+
+@pytest.mark.parametrize(
+    ("count", "every", "expected"),
+    [(2, 8, []), (3, 8, [1]), (5, 8, [2]), (60, 1000, [30]), (16, 8, [4, 12])],
+)
+def test_few_frames_hold_one_out_and_two_none(count, every, expected):
+    learnt, scored = frames_of_files.hold_out_every(count, every, "here")
+    assert scored.tolist() == expected
+    assert sorted([*learnt, *scored]) == list(range(count))
+
+
+def test_names_without_a_common_count_have_an_order_and_a_note():
+    assert frames_of_files.clock(["a_07", "a_09"]) == ([7, 9], ())
+    numbers, (note,) = frames_of_files.clock(["left_07", "right_07"])
+    assert numbers == [0, 1]
+    assert "order" in note
 
 
 def test_select_keeps_what_belongs_to_each_frame():

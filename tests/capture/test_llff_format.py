@@ -58,7 +58,7 @@ def test_the_cameras_are_those_of_the_colmap_model(tmp_path):
     np.testing.assert_array_equal(capture.times, known.times)
     assert capture.heldout.tolist() == [4]
     near, far = capture.near / capture.scale, capture.far / capture.scale
-    np.testing.assert_allclose([near, far], [0.8 * 4, 1.2 * 9], rtol=1e-5)
+    np.testing.assert_allclose([near, far], [0.5 * 4, 1.2 * 9], rtol=1e-5)
 
 
 def test_a_stored_reduction_is_read_with_its_own_pixels(tmp_path):

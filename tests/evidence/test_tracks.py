@@ -171,7 +171,8 @@ def test_points_are_aligned_with_where_they_began():
     assert not tracks.realigned(lost, pictures, (120, 80)).seen[:, 1].any()
 
 
-def test_points_at_rest_are_found_and_what_moves_misses():
+def test_points_at_rest_are_found_and_what_moves_misses(monkeypatch):
+    monkeypatch.setattr(rest_points, "AT_ONCE", 4)  # six tracks in two parts
     views = hand_held()
     rng = np.random.default_rng(0)
     point = rng.uniform([-0.3, -0.3, 1.2], [0.3, 0.3, 2], (6, 3))
@@ -373,6 +374,35 @@ def test_the_card_is_where_it_is():
     step = np.median(np.linalg.norm(np.diff(true, axis=0), axis=1))
     assert speed["speed_units"] == pytest.approx(step, rel=0.1)
     assert speed["speed_px"] == pytest.approx(step / films.NEAR * films.FOCAL, rel=0.1)
+
+
+def test_what_moves_before_the_near_plane_of_the_wall_is_known():
+    """Structure from motion gives the plane, and no point of what moves."""
+    near = 0.8 * films.FAR
+    assert near > films.NEAR
+    evidence = record.gather(films.film(**MOVES, frames=12, near=near))
+    assert len(evidence.moved) > 20
+    seen = evidence.tracks.seen[evidence.moved]
+    assert (evidence.paths.known & seen).sum() > 0.9 * seen.sum()
+
+
+@pytest.mark.parametrize("coarse", [1.0, 1.5])
+def test_detail_everywhere_is_texture_and_no_noise(coarse, rng):
+    """As a lawn's; noise of as many levels is of single pixels and has no slopes."""
+    grey = nd.gaussian_filter(rng.normal(size=(90, 120)), coarse)
+    grey = np.float32(0.5 + 0.15 * grey / grey.std())
+    assert view_set._textured(grey).mean() > 0.5
+    plain = np.float32(0.5 + 4 / 255 * rng.normal(size=(90, 120)))
+    assert view_set._textured(plain).mean() < 0.05
+
+
+def test_a_long_film_has_no_more_places_than_memory_holds(monkeypatch):
+    views = view_set.in_time_order(films.film(frames=24))
+    every = tracks.grid(views)
+    places = len(every) * len(views.row)
+    monkeypatch.setattr(tracks, "MOST_PLACES", places // 2)
+    fewer = tracks.grid(views)
+    assert 0 < len(fewer) * len(views.row) <= places // 2
 
 
 def test_what_was_gathered_is_read_again(tmp_path):

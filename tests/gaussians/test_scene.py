@@ -11,7 +11,7 @@ from gaussians_jax import first_state, initialisation, learning_rates, presets, 
 from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.initialisation import InitSpec
 from gaussians_jax.learning_rates import LearningRateSpec
-from gaussians_jax.spec import SceneMetadata
+from gaussians_jax.spec import SceneMetadata, raster_of
 from gaussians_jax.splats import Params, Splats
 from nerfies_jax import evaluation
 from nerfies_jax.training.updates import apply_updates
@@ -159,6 +159,31 @@ def test_facts_take_a_depth_for_the_extent_of_a_camera_that_stands_still():
         capture, cameras=capture.cameras._replace(position=still)
     )
     assert capture.near < scene.metadata_of(capture).extent < capture.far
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("unit", [1.0, 1e-3])
+def test_what_was_filmed_is_drawn_however_small_its_units_are(unit):
+    """Where far points span the box, 0.01 of it is metres before the camera."""
+    capture = scenes.tiny_capture()
+    small = dataclasses.replace(
+        capture,
+        near=capture.near * unit,
+        far=capture.far * unit,
+        points=capture.points._replace(position=capture.points.position * unit),
+        cameras=capture.cameras._replace(position=capture.cameras.position * unit),
+    )
+    plain = scenes.TINY_SPLATS.raster
+    near = raster_of(scenes.TINY_SPLATS, scene.metadata_of(small)).near
+    assert near <= min(plain.near, 0.3 * small.near)
+    assert (near == plain.near) == (unit == 1.0)
+    model = scene.build(scenes.TINY_SPLATS, scene.metadata_of(small))
+    state = model.init(small, jax.random.key(KEY))
+    view = evaluation.view_of(small, 0)
+    drawn = jax.jit(model.render, static_argnums=2)(
+        state.params, view, small.size, state.step
+    )
+    assert np.asarray(drawn.alpha).mean() > 0.1
 
 
 # Fields of the parts that count steps.

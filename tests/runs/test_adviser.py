@@ -10,6 +10,7 @@ from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.evidence.findings import CANNOT_TELL, CERTAIN, Finding
 from nerfies_jax.runs import adviser, representations
 from nerfies_jax.runs.config import RunConfig
+from nerfies_jax.runs.run import scene_spec
 from nerfies_jax.training import specs
 from tests import scenes
 
@@ -60,11 +61,23 @@ def test_a_still_scene_gets_no_motion_and_a_moving_one_gets_it():
 def test_advice_is_followed_but_for_what_the_user_sets():
     wanted = RunConfig("splats-static-small", overrides=("depth.weight=0.5",))
     answers = findings(motion=True, depth=True)
-    config, lines = adviser.follow(wanted, answers)
+    config, lines = adviser.follow(wanted, wanted.overrides, answers)
     assert config.preset == "splats-tracked-small"
     assert config.overrides == ("depth.weight=0.1", "depth.weight=0.5")
     assert any(line.split()[:3] == ["motion", "yes", "certain"] for line in lines)
     assert "effects: --preset splats-tracked-small --set depth.weight=0.1" in lines
+
+
+@pytest.mark.parametrize("motion", [None, False, True])
+def test_what_tracks_chose_for_a_preset_stays_with_that_preset(motion):
+    """As `by_tracks` chooses: the bases of a motion that another preset has not."""
+    own = ("steps=7",)
+    chosen = RunConfig("splats-tracked-small", overrides=("motion.bases=12", *own))
+    config, _ = adviser.follow(chosen, own, findings(motion=motion))
+    assert scene_spec(config).steps == 7
+    kept = config.preset == chosen.preset
+    assert ("motion.bases=12" in config.overrides) == kept
+    assert kept == (motion is True)
 
 
 @pytest.mark.parametrize(
@@ -80,7 +93,7 @@ def test_advice_is_followed_but_for_what_the_user_sets():
 )
 def test_the_family_stays_where_it_has_what_is_called_for(preset, motion, expected):
     answers = findings(motion=motion, depth=False, transient_objects=False)
-    config, lines = adviser.follow(RunConfig(preset), answers)
+    config, lines = adviser.follow(RunConfig(preset), (), answers)
     assert config.preset == expected
     family = preset.removesuffix("-small")
     noted = any(f"motion: {family} has none" in line for line in lines)
