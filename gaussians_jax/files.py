@@ -7,7 +7,6 @@ target and renamed, so a crash leaves the old one or the new one, never half.
 import os
 import pathlib
 import re
-import tempfile
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -16,6 +15,7 @@ import plyfile
 
 from gaussians_jax import splats, spz
 from gaussians_jax.splats import SH_DC, Splats
+from nerfies_jax.capture.json_files import replaced_file
 
 MOST_HEADER_BYTES = 1 << 16  # 62 properties take 1.5 kB; plyfile hangs on 100 MB
 SUFFIXES = (".ply", ".splat", ".spz")
@@ -84,7 +84,8 @@ def save(path: str | os.PathLike, rows: Splats, *, spz_version: int = 3) -> int:
             data = spz.encode(spz.Unpacked(*kept, notes=()), spz_version)
     except ValueError as error:
         raise ValueError(f"{path}: {error}; not written") from error
-    _write_atomically(path, data)
+    with replaced_file(path) as partial:
+        partial.write_bytes(data)
     return int(active.sum())
 
 
@@ -286,27 +287,3 @@ def _nearest_byte(values):
 def _read_spz(path):
     unpacked = spz.decode(path.read_bytes())
     return Splats(*unpacked[:-1]), unpacked.notes
-
-
-def _write_atomically(path, data):
-    if not path.parent.is_dir():
-        raise ValueError(f"{path}: its folder does not exist; make it first")
-    try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    except OSError as error:
-        raise ValueError(f"{path}: cannot write there ({error.strerror})") from error
-    temporary = pathlib.Path(name)
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(data)
-            stream.flush()
-            os.fsync(stream.fileno())
-        # mkstemp makes files private; give this one the rights any other file gets.
-        mask = os.umask(0)
-        os.umask(mask)
-        temporary.chmod(0o666 & ~mask)
-        temporary.replace(path)
-    except OSError as error:
-        raise ValueError(f"{path}: cannot write there ({error.strerror})") from error
-    finally:
-        temporary.unlink(missing_ok=True)

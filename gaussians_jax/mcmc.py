@@ -73,7 +73,7 @@ class MCMCStrategySpec:
                 )
 
 
-def spread_over(
+def compute_relocation(
     opacity: Float[Array, " n"],
     scale: Float[Array, "n 3"],
     copies: Int[Array, " n"],
@@ -110,8 +110,9 @@ def relocate(
     """Every faint Gaussian becomes a copy of a visible one; host side.
 
     Sources are drawn in proportion to their opacity. A source and its copies share its
-    opacity and scale as `spread_over` says, and start with zero moments. Where nothing
-    is visible, nothing can move and the report counts the faint ones as refused.
+    opacity and scale as `compute_relocation` says, and start with zero moments. Where
+    nothing is visible, nothing can move and the report counts the faint ones as
+    refused.
     """
     rows = params.rows["splats"]
     active, opacity = _opacities(rows)
@@ -214,7 +215,7 @@ def _share(optimiser, params, moments, source, copies, inactive, least):
     )
     rows = params.rows["splats"]
     drawn = splats.activate(rows)
-    opacity, scale = spread_over(drawn.opacity, drawn.scale, copies, least)
+    opacity, scale = compute_relocation(drawn.opacity, drawn.scale, copies, least)
     shared = copies > 1
     logit = jnp.log(opacity) - jnp.log1p(-opacity)
     rows = rows._replace(
@@ -249,7 +250,7 @@ def position_noise(
     return strength[:, None] * shaped
 
 
-def shake(
+def inject_noise(
     key: Key[Array, ""],
     params: Params,
     learning_rate: Float[Array, ""] | float,

@@ -12,14 +12,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jaxtyping import Array, Bool, Float, Key
 
 from gaussians_jax import splats
 from gaussians_jax.splats import Params, Splats
 from nerfies_jax.evidence import rigid_groups
 from nerfies_jax.training.effects import Effect, FrameCondition
-from nerfies_jax.training.updates import apply_updates
+from nerfies_jax.training.updates import descended
 
 PyTree = Any
 # Of the film in each step. Built-in scene, seconds of one busy core and how far points
@@ -30,7 +29,6 @@ PyTree = Any
 #    4 frames, 3000 steps     5.6 1.80     59 2.05     77 4.49     78 4.56
 FRAMES_AT_ONCE = 4
 SOFT = 1e-3  # of the unit: distances below it count squared
-LAST_RATE = 0.02  # of the first
 # What second and first differences from frame to frame cost in a fit in closed form, a
 # path that is off by as much costing one: what is not known goes on straight and slows.
 BEND, DRIFT = 0.1, 1e-3
@@ -129,7 +127,7 @@ def resting(paths: Paths) -> Float[Array, "still 3"] | None:
     return jnp.asarray(paths.still[chosen], jnp.float32)
 
 
-def unrest(
+def rest_loss(
     moved: Callable[[Float[Array, ""]], tuple[Array, Array]], unit: float
 ) -> Float[Array, ""]:
     """What it costs in a fit that points at rest move, over the film.
@@ -210,7 +208,7 @@ def _unrest_of(effect, still, unit, key):
             now = deformed(time)
             return now.quaternion[:, 1:], now.mean - still
 
-        return unrest(moved, unit)
+        return rest_loss(moved, unit)
 
     return penalty
 
@@ -289,31 +287,12 @@ def fit(
         total = jnp.sum(jax.vmap(one)(moments[frames], *seen))
         return total / jnp.maximum(jnp.sum(weight[frames]), 1)
 
-    def loss(points, frames):
+    def loss(points, key):
+        frames = jax.random.choice(key, len(times), (together,), replace=False)
         value = distance(points, frames) / unit
         return value if penalty is None else value + penalty(points)
 
-    adam = optax.scale_by_adam()
-
-    def step(state, key_and_count):
-        points, moments_ = state
-        key, count = key_and_count
-        frames = jax.random.choice(key, len(times), (together,), replace=False)
-        grads = jax.grad(loss)(points, frames)
-        updates, moments_ = adam.update(grads, moments_)
-        share = LAST_RATE ** (count.astype(target.dtype) / steps)
-        now = jax.tree.map(lambda rate: rate * share, rates)
-        return (apply_updates(points, updates, now), moments_), None
-
-    @jax.jit
-    def run(points):
-        keys = jax.random.split(key, steps), jnp.arange(steps)
-        (points, _), _ = jax.lax.scan(step, (points, adam.init(points)), keys)
-        return points
-
     every = jnp.arange(len(times))
     mean_distance = jax.jit(lambda points: distance(points, every))
-    # optax raises floats to a whole number of steps.
-    with jax.numpy_dtype_promotion("standard"):
-        fitted = run(start)
+    fitted = descended(loss, start, rates, key, steps)
     return PathFit(fitted, float(mean_distance(start)), float(mean_distance(fitted)))

@@ -46,7 +46,7 @@ def descend(
     if isinstance(spec.densification, MCMCStrategySpec):
         noise_key = growth.stream_key(state, growth.NOISE)
         rate = by_part.rows["splats"].mean
-        params = mcmc.shake(noise_key, trained.params, rate, spec.densification)
+        params = mcmc.inject_noise(noise_key, trained.params, rate, spec.densification)
         trained = trained._replace(params=params)
     if spec.alternation is not None:
         mask = phases.update_mask(spec.alternation, state.step)

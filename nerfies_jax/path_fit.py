@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jaxtyping import Array, Bool, Float, Key
 
 from nerfies_jax.effects import scene_flow
@@ -23,13 +22,12 @@ from nerfies_jax.field import Field
 from nerfies_jax.training.effects import FrameCondition
 from nerfies_jax.training.model import View
 from nerfies_jax.training.track_start import TrackStartSpec
-from nerfies_jax.training.updates import apply_updates
+from nerfies_jax.training.updates import descended
 
 PyTree = Any
 FRAMES_AT_ONCE, POINTS_AT_ONCE, STILL_AT_ONCE = 12, 256, 128  # of each step
 SOFT = 1e-3  # field units: distances below it count squared
 SOFT_FLOW = 0.05  # the same for flow, over the mean flow that is known
-LAST_RATE = 0.02  # of the first
 
 
 class FilmPaths(NamedTuple):
@@ -109,33 +107,9 @@ def fit(
         {name: params[name] for name in (*names, "codes")},
         jnp.asarray(_first_places(paths)),
     )
-    fitted = _descended(loss, free, key, start)
+    fitted = descended(loss, free, start.fit_rate, key, start.fit_steps)
     first, last = float(mean_distance(free)), float(mean_distance(fitted))
     return WarpFit(params | fitted[0], fitted[1], first, last)
-
-
-def _descended(loss, free, key, start):
-    """What Adam on `loss(free, key)` leads to, over the steps of `start`."""
-    adam = optax.scale_by_adam()
-
-    def step(state, key_and_count):
-        free, moments = state
-        key, count = key_and_count
-        grads = jax.grad(loss)(free, key)
-        updates, moments = adam.update(grads, moments)
-        share = LAST_RATE ** (count.astype(jnp.result_type(float)) / start.fit_steps)
-        free = apply_updates(free, updates, start.fit_rate * share)
-        return (free, moments), None
-
-    @jax.jit
-    def run(free):
-        keys = jax.random.split(key, start.fit_steps), jnp.arange(start.fit_steps)
-        (free, _), _ = jax.lax.scan(step, (free, adam.init(free)), keys)
-        return free
-
-    # optax raises floats to a whole number of steps.
-    with jax.numpy_dtype_promotion("standard"):
-        return run(free)
 
 
 def fit_flow(
@@ -175,7 +149,7 @@ def fit_flow(
         return away(own, jnp.arange(frames), jnp.arange(points), nothing, 0.0)[0]
 
     own = params[scene_flow.NAME]
-    fitted = _descended(loss, own, key, start)
+    fitted = descended(loss, own, start.fit_rate, key, start.fit_steps)
     first, last = float(mean_distance(own)), float(mean_distance(fitted))
     return FlowFit(params | {scene_flow.NAME: fitted}, first, last)
 

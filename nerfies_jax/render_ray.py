@@ -195,11 +195,8 @@ def render_ray(
         return (level("fine", samples, last, 0),)
     first = "fine" if plan.shared else "coarse"
     coarse = level(first, samples, (), 0)
-    drawn = sampling.from_weights(
-        fine_key if plan.jitter else None,
-        (distance[1:] + distance[:-1]) / 2,
-        coarse.weight[1:-1],
-        plan.fine,
+    drawn = sampling.refine(
+        fine_key if plan.jitter else None, distance, coarse.weight, plan.fine
     )
     if not (plan.union and is_moved(bound.effects)):
         every = fine_distances(bound, distance, drawn)

@@ -151,9 +151,8 @@ def _block(bound, occupied, camera, condition, position):
         depth, _ = ask("fine" if plan.shared else "coarse", distance, 1)
 
         def refined(distance, depth):
-            edges = (distance[1:] + distance[:-1]) / 2
-            weights = compositing.weights(depth)[1:-1]
-            drawn = sampling.from_weights(None, edges, weights, plan.fine)
+            weights = compositing.weights(depth)
+            drawn = sampling.refine(None, distance, weights, plan.fine)
             return fine_distances(bound, distance, drawn)
 
         distance = jax.vmap(refined)(distance, depth)

@@ -214,11 +214,10 @@ def field_loss(spec, metadata, params, batch, key):
             return (level("fine", origin, direction, far, distance)[1],)
         name = "fine" if plan.shared else "coarse"
         weights, coarse = level(name, origin, direction, far, distance)
+        drawn = sampling.refine(second, distance, weights, plan.fine)
         if plan.union:
-            distance = sampling.refine(second, distance, weights, plan.fine)
+            distance = sampling.union(distance, drawn)
         else:
-            edges = (distance[1:] + distance[:-1]) / 2
-            drawn = sampling.from_weights(second, edges, weights[1:-1], plan.fine)
             last = () if metadata.background is not None else (distance[-1:],)
             distance = jnp.concatenate([drawn, *last])
         return coarse, level("fine", origin, direction, far, distance)[1]

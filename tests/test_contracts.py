@@ -162,7 +162,7 @@ SETTINGS = {
     "compositing.intervals": {"last": 1e10},
     **{
         f"sampling.{name}": {"key": None, "count": 4}
-        for name in ("stratified", "from_weights", "refine")
+        for name in ("stratified", "sample_pdf", "refine")
     },
     **{
         f"losses.{name}": {"width": 0.1}
@@ -306,13 +306,14 @@ REACH = {
     **dict.fromkeys(["losses.mse", "grids.total_variation"], 0.45),
     "distortion.distort": 0.1,  # seventh powers of the radius, and their slopes
     "losses.dssim_map": 0.2,  # variances over squared means
-    **dict.fromkeys(["planes.total_variation", "planes.bend"], 0.45),
+    **dict.fromkeys(["planes.total_variation", "planes.time_smoothness"], 0.45),
     "planes.features": 0.45,
     "entropy.bits": 0.45,  # over a deviation as small as e^-12
     **dict.fromkeys(["entropy.rounded", "faces.gaussians"], 0.9),  # in steps; lengths
     # sums of more than four, or multiples
     **dict.fromkeys(["codes.blend", "encoding.encode", "losses.l1"], 0.9),
-    **dict.fromkeys(["planes.bilinear", "planes.linear", "planes.unrest"], 0.9),
+    **dict.fromkeys(["planes.bilinear", "planes.linear", "planes.l1_time_planes"], 0.9),
+    "rays.intersect_aabb": 0.9,  # distances are quotients by a slant
     **dict.fromkeys(["template.encode", "template.exponential"], 0.8),
 }
 # Relative to the largest entry, between two orders of the same operations. Measured in

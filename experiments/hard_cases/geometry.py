@@ -151,7 +151,7 @@ START = np.array([-3.0, 1.0, 0.5])  # in the plane of the face y = 1
 
 def _span(direction):
     start, low, high = (constant(x, direction.dtype) for x in (START, LOW, HIGH))
-    return jnp.stack(rays.box_span(start, direction, low, high))
+    return jnp.stack(rays.intersect_aabb(start, direction, low, high))
 
 
 def _slabs(direction):

@@ -193,7 +193,7 @@ _OPACITIES = np.array([1e-4, 0.01, 0.1, 0.5, 0.9, 0.999, 1 - 1e-6])
 
 
 def _spread(opacity):
-    each, scale = mcmc.spread_over(
+    each, scale = mcmc.compute_relocation(
         opacity,
         constant(np.ones((1, 3)), opacity.dtype),
         constant(np.full(1, COPIES), jnp.int32),
@@ -248,7 +248,7 @@ _SPEEDS = np.array([0, 1e-4, 1e-3, 1e-2, 1])
 
 def _bend(x):
     before, now, after = (x[None, 3 * i : 3 * i + 3] for i in range(3))
-    return acceleration.unrest(now, before, now, after, 1.0, 0.0)[None]
+    return acceleration.acceleration_loss(now, before, now, after, 1.0, 0.0)[None]
 
 
 def _bend_textbook(x):

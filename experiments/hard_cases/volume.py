@@ -228,7 +228,7 @@ DRAWN = 11
 
 def _samples(weights):
     edges = constant(EDGES, weights.dtype)
-    return sampling.from_weights(None, edges, weights, DRAWN)
+    return sampling.sample_pdf(None, edges, weights, DRAWN)
 
 
 def _with_a_floor(weights):

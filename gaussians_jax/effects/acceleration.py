@@ -67,7 +67,7 @@ def instants(time: Float[Array, ""], interval: float) -> Float[Array, "3"]:
     return jnp.clip(middle + offsets, 0, 1)
 
 
-def unrest(
+def acceleration_loss(
     canonical: Float[Array, "gaussians 3"],
     before: Float[Array, "gaussians 3"],
     now: Float[Array, "gaussians 3"],
@@ -131,7 +131,7 @@ def effect(spec: AccelerationSpec, extent: float, frames: int) -> Effect:
             canonical = some.rows["splats"].mean
             times = instants(condition.time, interval)
             before, now, after = (context.at_time(some, t).mean for t in times)
-            value = unrest(canonical, before, now, after, decay, spec.drift)
+            value = acceleration_loss(canonical, before, now, after, decay, spec.drift)
             still = jnp.mean(_stillness(canonical, now, decay))
             there = jnp.any(active)
             return jnp.where(there, value, 0), jnp.where(there, still, 0)

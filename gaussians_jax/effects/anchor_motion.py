@@ -150,7 +150,7 @@ def fit_to_paths(
             by = offsets(net.coarse, coarse_spec(spec), rest.reference, code)
             return by.turn, by.position
 
-        return path_fit.unrest(moved, paths.unit)
+        return path_fit.rest_loss(moved, paths.unit)
 
     rows = init_features(rows_key, spec, len(points))
     start = Points(points, rows, init(nets_key, spec, frames))

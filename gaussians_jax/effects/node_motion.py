@@ -246,7 +246,7 @@ def displaced(
     return in_blocks(evaluate, (found.near, mean), found.moving, ROWS_AT_ONCE)
 
 
-def unrigidity(
+def arap_loss(
     nodes: Nodes,
     spec: NodeMotionSpec,
     extent: float,
@@ -255,7 +255,7 @@ def unrigidity(
 ) -> Float[Array, ""]:
     """How far linked nodes are from moving as one body, in squared extents."""
     places = [nodes.position + moves(nodes, spec, extent, time).shift for time in times]
-    return skinning.bending(*(place / extent for place in places), linked)
+    return skinning.arap_error(*(place / extent for place in places), linked)
 
 
 def fit_to_paths(
@@ -271,8 +271,8 @@ def fit_to_paths(
     if paths.still is not None:
         still = np.asarray(paths.still, np.float64)
     moving = spec.nodes if not len(still) else round(spec.moving_share * spec.nodes)
-    moving_nodes = canonical[skinning.spread_out(canonical, max(moving, 1))]
-    resting = still[skinning.spread_out(still, spec.nodes - len(moving_nodes))]
+    moving_nodes = canonical[skinning.farthest_points(canonical, max(moving, 1))]
+    resting = still[skinning.farthest_points(still, spec.nodes - len(moving_nodes))]
     nodes = placed(init(key, spec), np.concatenate([moving_nodes, resting]))
     at_rest = slice(len(moving_nodes), len(moving_nodes) + len(resting))
     if spec.mask is not None:
@@ -288,7 +288,7 @@ def fit_to_paths(
             now = moves(those, spec, extent, time)
             return now.turn[:, 1:], now.shift
 
-        return path_fit.unrest(moved, unit)
+        return path_fit.rest_loss(moved, unit)
 
     start = Points(jnp.asarray(canonical, jnp.float32), None, nodes)
     mask = None if spec.mask is None else 1.0
@@ -312,7 +312,7 @@ def effect(spec: NodeMotionSpec, run_steps: int, extent: float) -> Effect:
 
     def place(nodes, rows: Splats):
         means = np.asarray(rows.mean)
-        return placed(nodes, means[skinning.spread_out(means, spec.nodes)])
+        return placed(nodes, means[skinning.farthest_points(means, spec.nodes)])
 
     def prepared(params: Params) -> Found:
         means = params.rows["splats"].mean
@@ -334,7 +334,7 @@ def effect(spec: NodeMotionSpec, run_steps: int, extent: float) -> Effect:
         terms, time = {}, context.condition.time
         if spec.rigidity is not None:
             times = time, jax.random.uniform(context.key, (), time.dtype)
-            value = unrigidity(nodes, spec, extent, context.state.links, times)
+            value = arap_loss(nodes, spec, extent, context.state.links, times)
             terms["unrigidity"] = Term(value, spec.rigidity)
         if spec.mask is not None:
             used = jnp.mean(jax.nn.sigmoid(nodes.mask))

@@ -166,8 +166,8 @@ def smoothness(spec: PlaneMotionSpec, levels: tuple[Level, ...]) -> dict[str, Te
     time = [plane for level in levels for plane in level.time]
     return {
         "variation": Term(sum(map(planes.total_variation, space)), spec.variation),
-        "bend": Term(sum(map(planes.bend, time)), spec.bend),
-        "unrest": Term(sum(map(planes.unrest, time)), spec.unrest),
+        "bend": Term(sum(map(planes.time_smoothness, time)), spec.bend),
+        "unrest": Term(sum(map(planes.l1_time_planes, time)), spec.unrest),
     }
 
 

@@ -166,7 +166,7 @@ def links(
     return Links(index, weights(-near, radius))
 
 
-def bending(
+def arap_error(
     before: Float[Array, "nodes 3"], after: Float[Array, "nodes 3"], linked: Links
 ) -> Float[Array, ""]:
     """How far nodes and what they are linked to are from moving as rigid bodies.
@@ -187,7 +187,7 @@ def bending(
     return total / len(before)
 
 
-def spread_out(
+def farthest_points(
     points: Float[np.ndarray, "points coordinates"], count: int
 ) -> Int[np.ndarray, " chosen"]:
     """Farthest-point sampling: each next point is the one farthest from those chosen.

@@ -11,6 +11,8 @@ from typing import Literal
 
 import numpy as np
 
+from nerfies_jax.capture.images import srgb_from_linear
+
 Transfer = Literal["HLG", "PQ"]
 # By ffmpeg's number of the transfer characteristics (ITU-T H.273, table 3).
 TRANSFERS: dict[int, Transfer] = {16: "PQ", 18: "HLG"}
@@ -98,7 +100,5 @@ def _roll_off():
 
 @functools.cache
 def _srgb_bytes():
-    linear = np.linspace(0, 1, CODES)
-    bright = 1.055 * linear ** (1 / 2.4) - 0.055
-    encoded = np.where(linear <= 0.0031308, 12.92 * linear, bright)
+    encoded = srgb_from_linear(np.linspace(0, 1, CODES))
     return np.round(255 * encoded).astype(np.uint8)

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import PIL.Image
 import skimage.io
+from numpy.typing import ArrayLike
 
 from nerfies_jax.capture import exr
 from nerfies_jax.capture.capture import CaptureError
@@ -179,8 +180,9 @@ def srgb_from_linear(light: np.ndarray) -> np.ndarray:
     return np.where(light <= 0.0031308, 12.92 * light, power)
 
 
-def linear_from_srgb(value: np.ndarray) -> np.ndarray:
+def linear_from_srgb(value: ArrayLike | float) -> np.ndarray:
     """Linear light from display values in [0, 1]; values outside keep their slope."""
+    value = np.asarray(value)
     power = ((np.maximum(value, 0.04045) + 0.055) / 1.055) ** 2.4
     return np.where(value <= 0.04045, value / 12.92, power)
 

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from nerfies_jax.capture.synthetic import texture
+from nerfies_jax.capture.images import linear_from_srgb
 from nerfies_jax.evidence import view_set
 from nerfies_jax.evidence.findings import LIGHT as EFFECT
 from nerfies_jax.evidence.findings import Finding, cannot_tell, judge
@@ -70,7 +70,7 @@ def sightings(views: Views, points: np.ndarray) -> np.ndarray:
     for index in range(len(views.row)):
         pixel, depth = view_set.project(views, index, points)
         inside = view_set.in_picture(views, pixel, depth, 2)
-        picture = texture.linear(np.float32(views.image[index] / 255))
+        picture = linear_from_srgb(views.image[index] / 255)
         # A pixel's blur: points are known to a fraction of one.
         picture = cv2.GaussianBlur(picture, (0, 0), 1)
         place = pixel[inside]

@@ -86,7 +86,7 @@ def distance_of_depth(
     return depth / depth_per_distance(camera, direction)
 
 
-def box_span(
+def intersect_aabb(
     origin: Float[Array, "3"],
     direction: Float[Array, "3"],
     low: Float[Array, "3"],

@@ -209,12 +209,14 @@ def linear(
 def total_variation(plane: Float[Array, "first second features"]) -> Float[Array, ""]:
     """Squared differences of neighbouring vertices, the mean along each axis added.
 
-    K-Planes, equation 3. 4DGS has `bend` along one axis under this name.
+    K-Planes, equation 3. 4DGS has `time_smoothness` along one axis under this name.
     """
     return sum(jnp.mean(jnp.square(jnp.diff(plane, axis=axis))) for axis in (0, 1))
 
 
-def bend(plane: Float[Array, "moments vertices features"]) -> Float[Array, ""]:
+def time_smoothness(
+    plane: Float[Array, "moments vertices features"],
+) -> Float[Array, ""]:
     """Mean squared second difference along the first axis: how unsteady in time.
 
     K-Planes, equation 4; zero for what changes evenly.
@@ -223,7 +225,9 @@ def bend(plane: Float[Array, "moments vertices features"]) -> Float[Array, ""]:
     return jnp.mean(jnp.square(jnp.diff(jnp.diff(plane, axis=0), axis=0)))
 
 
-def unrest(plane: Float[Array, "moments vertices features"]) -> Float[Array, ""]:
+def l1_time_planes(
+    plane: Float[Array, "moments vertices features"],
+) -> Float[Array, ""]:
     """Mean distance from one, at which a plane of time in a product changes nothing.
 
     K-Planes, equation 5 (L1): space explains what it can.

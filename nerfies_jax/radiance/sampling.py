@@ -57,7 +57,7 @@ def stratified(
     return jnp.minimum(lower + (upper - lower) * jitter, upper)
 
 
-def from_weights(
+def sample_pdf(
     key: Key[Array, ""] | None,
     edges: Float[Array, " edges"],
     weights: Float[Array, " bins"],
@@ -124,7 +124,7 @@ def refine(
     count: int,
     floor: float | None = None,
 ) -> Float[Array, " refined"]:
-    """`distances` of a coarse pass and `count` more where its `weights` are.
+    """`count` distances where a coarse pass has its `weights`, sorted.
 
     Bins meet halfway between the distances. The first and the last sample, which own no
     whole bin, draw nothing; the last may stand for all that is behind it.
@@ -134,7 +134,7 @@ def refine(
             f"{distances.shape[0]} distances leave no bin to refine; take at least 3"
         )
     edges = (distances[1:] + distances[:-1]) / 2
-    return union(distances, from_weights(key, edges, weights[1:-1], count, floor))
+    return sample_pdf(key, edges, weights[1:-1], count, floor)
 
 
 def _shares(key, count, dtype):

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.evidence import record
+from nerfies_jax.evidence import frame_masks, record
 
 LEAST_SHARE = 0.005  # of the pixels: cameras hardly notice less
 
@@ -22,7 +22,6 @@ def masks_of(pictures: Capture) -> np.ndarray | None:
     if evidence.unusable or evidence.moving.mean() < LEAST_SHARE:
         return None
     masks = np.zeros((len(rows), *pictures.images.shape[1:3]), bool)
-    enlarged = np.kron(evidence.moving, np.ones((1, *2 * (evidence.factor,)), bool))
-    height, width = np.minimum(masks.shape[1:], enlarged.shape[1:])  # whole blocks
-    masks[evidence.row, :height, :width] = enlarged[:, :height, :width]
+    for row, mask in zip(evidence.row, evidence.moving, strict=True):
+        masks[row] = frame_masks.enlarged(mask, evidence.factor, pictures.size)
     return masks

@@ -1,6 +1,7 @@
 """How far a run is: a live bar on a terminal, a line every ten seconds elsewhere."""
 
 import contextlib
+import math
 import time
 
 import rich.console
@@ -56,8 +57,8 @@ class Progress:
         parts = [f"{rate:.3g} steps/s"]
         if "loss" in metrics:
             parts.append(f"loss {metrics['loss']:.4g}")
-        if "psnr" in metrics:
-            parts.append(f"PSNR {metrics['psnr']:.2f} dB")
+        if metrics.get("mse", 0) > 0:
+            parts.append(f"PSNR {-10 * math.log10(metrics['mse']):.2f} dB")
         parts += [f"{count:,} {name}" for name, count in counts.items()]
         parts.append(f"{duration(left)} left")
         if self._bar is not None:

@@ -15,7 +15,7 @@ from nerfies_jax.training.effects import FrameCondition, PenaltyContext
 from tests import gradients
 from tests.gaussians.shared import any_nonzero, finite, full, jitted, put
 
-unrest = jitted(acceleration.unrest, static_argnums=(4, 5))
+unrest = jitted(acceleration.acceleration_loss, static_argnums=(4, 5))
 instants = jitted(jax.vmap(acceleration.instants, (0, None)), static_argnums=1)
 draw_active = jitted(acceleration.draw_active, static_argnums=2)
 
@@ -80,7 +80,7 @@ def test_gradients_with_the_weight_held(float64):
         return jnp.mean(weight * (second + 0.5 * first)) / 4
 
     def ours(before, now, after):
-        return acceleration.unrest(canonical, before, now, after, 2.0, 0.5)
+        return acceleration.acceleration_loss(canonical, before, now, after, 2.0, 0.5)
 
     assert gradients.directional_error(held, *three) < 1e-8
     grads, expected = (jitted(jax.grad(f, (0, 1, 2)))(*three) for f in (ours, held))
@@ -101,7 +101,7 @@ def test_a_steady_drift_is_seen_by_the_first_difference_alone(dtype):
 def energy(before, now, after):
     """From a Gaussian that belongs to the origin."""
     canonical = jnp.zeros_like(now)
-    return acceleration.unrest(canonical, before, now, after, 1.0, 1.0)
+    return acceleration.acceleration_loss(canonical, before, now, after, 1.0, 1.0)
 
 
 @pytest.mark.hard_cases

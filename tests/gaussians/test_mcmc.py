@@ -65,14 +65,16 @@ def opacity_of(splats):
     return scipy.special.expit(np.asarray(splats.opacity_logit, np.float64))
 
 
-spread_over = jitted(mcmc.spread_over, static_argnums=3)
+compute_relocation = jitted(mcmc.compute_relocation, static_argnums=3)
 
 
 def spread(opacity, copies, dtype, least=1e-12):
     """Of each opacity over each number of copies: [opacities, copies] twice."""
     opacity, copies = (x.ravel() for x in np.meshgrid(opacity, copies, indexing="ij"))
     ones = np.ones((len(opacity), 3), dtype)
-    each, scale = spread_over(opacity.astype(dtype), ones, np.int32(copies), least)
+    each, scale = compute_relocation(
+        opacity.astype(dtype), ones, np.int32(copies), least
+    )
     return each.astype(float), scale[:, 0].astype(float)
 
 
@@ -80,7 +82,7 @@ def test_spreading_equals_the_reference_kernel(oracle_dir, dtype):
     with np.load(oracle_dir / "splatting" / "mcmc_relocation.npz") as oracle:
         names = {"opacities": dtype, "scales": dtype, "ratios": "int32"}
         given = (oracle[name].astype(kind) for name, kind in names.items())
-        each, scale = spread_over(*given, 0.005)
+        each, scale = compute_relocation(*given, 0.005)
         tolerance = {"float32": 3e-6, "float64": 2e-13}[dtype]
         np.testing.assert_allclose(each, oracle["new_opacities"], rtol=tolerance)
         np.testing.assert_allclose(scale, oracle["new_scales"], rtol=tolerance)
@@ -120,7 +122,7 @@ def test_spreading_the_invisible_and_the_opaque_is_finite(dtype):
 
 def test_spreading_gradient(float64):
     def total(opacity, scale):
-        each, spread_scale = mcmc.spread_over(
+        each, spread_scale = mcmc.compute_relocation(
             jax.nn.sigmoid(opacity), scale, put([2, 5, 9], "int32"), 1e-9
         )
         return jnp.sum(each**2) + jnp.sum(spread_scale**2)

@@ -194,7 +194,7 @@ def test_one_node_carries_as_one_rigid_body(dtype):
     same = abs(np.roll(both.as_quat(), 1) @ quaternion)
     np.testing.assert_allclose(same, 1, atol=1e-6)
     linked = skinning.links(put(np.zeros((1, 4, 3)), dtype), put(np.zeros(1), dtype), 3)
-    assert skinning.bending(put(one, dtype), put(2 * one, dtype), linked) == 0
+    assert skinning.arap_error(put(one, dtype), put(2 * one, dtype), linked) == 0
 
 
 @pytest.mark.hard_cases
@@ -253,7 +253,7 @@ def test_rigid_bodies_do_not_bend_and_others_do_by_what_is_left(dtype):
     before, linked = a_body(dtype)
     turn = Rotation.from_rotvec([1.0, -2.0, 0.4])
     rigid = turn.apply(before) + np.array([3.0, 0, 1])
-    run = jax.jit(skinning.bending)
+    run = jax.jit(skinning.arap_error)
     small = {"float32": 1e-10, "float64": 1e-27}[dtype]
     assert run(*put((before, rigid), dtype), linked) < small
     # Mirrored, no turn helps: `align_vectors` finds the best there is.
@@ -311,7 +311,7 @@ def test_training_searches_only_when_rows_change():
 
 def test_nodes_are_spread_out_and_as_wide_as_their_neighbours_are_far():
     points = np.concatenate([np.zeros((50, 3)), np.eye(3) * [1.0, 2.0, 5.0]])
-    chosen = points[skinning.spread_out(points, 9)]
+    chosen = points[skinning.farthest_points(points, 9)]
     assert len(chosen) == 4  # that differ
     assert sorted(np.abs(chosen).max(axis=1)) == [0, 1, 2, 5]
     np.testing.assert_array_equal(chosen[0], [0, 0, 5])

@@ -11,10 +11,12 @@ from nerfies_jax.geometry import rays
 SIZE = (8, 6)
 
 pixel_rays = jax.jit(lambda camera: rays.pixel_rays(camera, SIZE))
-box_span = jax.jit(rays.box_span)
+intersect_aabb = jax.jit(rays.intersect_aabb)
 end_slope = jax.jit(
     jax.grad(
-        lambda along, place, *box: jnp.clip(rays.box_span(place, along, *box)[1], 0, 9)
+        lambda along, place, *box: jnp.clip(
+            rays.intersect_aabb(place, along, *box)[1], 0, 9
+        )
     )
 )
 seen_at = jax.jit(
@@ -79,13 +81,13 @@ def box_by_sampling(origin, direction, low, high):
 
 
 @pytest.mark.parametrize("start", [(-3.0, 0.1, 0.2), (0.1, 0.0, -0.3), (0.0, 1.0, 0.0)])
-def test_box_span_is_where_samples_are_inside(start, dtype, rng):
+def test_the_span_in_a_box_is_where_samples_are_inside(start, dtype, rng):
     low, high = np.array([-1, -0.5, -1]), np.array([1, 1, 0.7])
     for _ in range(20):
         direction = rng.normal(size=3)
         direction /= np.linalg.norm(direction)
         inside = box_by_sampling(np.array(start), direction, low, high)
-        enter, leave = box_span(
+        enter, leave = intersect_aabb(
             *(np.asarray(x, dtype) for x in (start, direction, low, high))
         )
         if len(inside) > 1:
@@ -105,11 +107,11 @@ def test_box_span_is_where_samples_are_inside(start, dtype, rng):
         ((3, 0, 0), (1, 0, 0), None),
     ],
 )
-def test_box_span_of_axis_parallel_rays(origin, direction, span, dtype):
+def test_the_span_in_a_box_of_axis_parallel_rays(origin, direction, span, dtype):
     place, along, low, high = (
         np.asarray(x, dtype) for x in (origin, direction, [-1] * 3, [1] * 3)
     )
-    enter, leave = box_span(place, along, low, high)
+    enter, leave = intersect_aabb(place, along, low, high)
     if span is None:
         assert not enter < leave
     else:

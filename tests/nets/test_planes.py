@@ -121,8 +121,8 @@ PENALTIES = {
     "total_variation": lambda p: sum(
         np.mean(np.square(p.take(range(1, 5), a) - p.take(range(4), a))) for a in (0, 1)
     ),
-    "bend": lambda p: np.mean(np.square(p[2:] - 2 * p[1:-1] + p[:-2])),
-    "unrest": lambda p: np.mean(np.abs(1 - p)),
+    "time_smoothness": lambda p: np.mean(np.square(p[2:] - 2 * p[1:-1] + p[:-2])),
+    "l1_time_planes": lambda p: np.mean(np.abs(1 - p)),
 }
 
 
@@ -139,7 +139,7 @@ def test_penalties_are_the_means_that_they_say(name, float64):
 def test_planes_that_start_have_nothing_to_smooth_in_time_and_no_slope(dtype):
     spec = SPECS["hexplane"]
     level = planes.init(spec, jax.random.key(0), np.dtype(dtype))[0]
-    for penalty in (planes.bend, planes.unrest):
+    for penalty in (planes.time_smoothness, planes.l1_time_planes):
         value, slope = jax.jit(jax.value_and_grad(penalty))(level.time[0])
         assert value == 0
         assert not np.any(slope)
@@ -180,7 +180,7 @@ def test_the_reference_values_of_4dgs_are_met(dtype, oracle_dir):
     np.testing.assert_allclose(slope, stored["g_x"], rtol=0, atol=atol)
     space = [p for level in levels for p in level.space]
     time = [p for level in levels for p in level.time]
-    bend, unrest = jax.jit(planes.bend), jax.jit(planes.unrest)
+    bend, unrest = jax.jit(planes.time_smoothness), jax.jit(planes.l1_time_planes)
     # Their "plane TV" is a second difference along the second coordinate alone.
     for ours, theirs in (
         (sum(bend(jnp.swapaxes(p, 0, 1)) for p in space), "reg_plane"),

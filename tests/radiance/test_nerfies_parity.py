@@ -129,7 +129,8 @@ def both_levels(flat, ray):
     more = sampling.refine(
         None, distance, coarse["weights"], 16, floor=sampling.NERF_FLOOR
     )
-    return {"coarse": coarse, "fine": level(flat, "fine", more, ray)}
+    both = sampling.union(distance, more)
+    return {"coarse": coarse, "fine": level(flat, "fine", both, ray)}
 
 
 def penalty_context(flat, when, coarse):

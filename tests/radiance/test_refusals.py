@@ -41,8 +41,8 @@ def stratified(*settings):
     return sampling.stratified(None, jnp.float32(0.1), jnp.float32(1), *settings)
 
 
-def from_weights(edges, weights, count):
-    return sampling.from_weights(None, jnp.asarray(edges), jnp.asarray(weights), count)
+def sample_pdf(edges, weights, count):
+    return sampling.sample_pdf(None, jnp.asarray(edges), jnp.asarray(weights), count)
 
 
 @pytest.mark.parametrize(
@@ -54,8 +54,8 @@ def from_weights(edges, weights, count):
         (lambda: SamplingSpec(spacing="log"), "spacing='log'"),
         (lambda: stratified(1), "count=1"),
         (lambda: stratified(4, "log"), "'log'"),
-        (lambda: from_weights(LINE, LINE, 4), "5 edges do not bound 5 bins"),
-        (lambda: from_weights(LINE, LINE[1:], 0), "count=0"),
+        (lambda: sample_pdf(LINE, LINE, 4), "5 edges do not bound 5 bins"),
+        (lambda: sample_pdf(LINE, LINE[1:], 0), "count=0"),
         (
             lambda: sampling.refine(None, *[jnp.asarray(LINE[:2])] * 2, 4),
             "2 distances",

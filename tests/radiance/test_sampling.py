@@ -13,14 +13,14 @@ from tests import gradients
 # Compiled once for each precision and shape: operation by operation the suite would
 # take five times as long.
 stratified = jax.jit(sampling.stratified, static_argnums=(3, 4))
-from_weights = jax.jit(sampling.from_weights, static_argnums=(3, 4))
+sample_pdf = jax.jit(sampling.sample_pdf, static_argnums=(3, 4))
 refine = jax.jit(sampling.refine, static_argnums=(3, 4))
 
 
 @functools.partial(jax.jit, static_argnums=3)
-def from_many_weights(key, edges, weights, count):
+def sample_many_pdfs(key, edges, weights, count):
     """One row of weights after another, all with the same key."""
-    return jax.vmap(lambda w: sampling.from_weights(key, edges, w, count))(weights)
+    return jax.vmap(lambda w: sampling.sample_pdf(key, edges, w, count))(weights)
 
 
 def bisect_inverse(edges, weights, shares):
@@ -132,7 +132,7 @@ def test_distances_follow_near_and_far(float64):
 def test_inverse_is_the_bisected_one(dtype, rng):
     edges = np.sort(rng.uniform(1, 3, 13))
     weights = rng.uniform(0.1, 1, 12)
-    got = from_weights(None, edges.astype(dtype), weights.astype(dtype), 31)
+    got = sample_pdf(None, edges.astype(dtype), weights.astype(dtype), 31)
     wanted = bisect_inverse(edges, weights, np.linspace(0, 1, 31))
     tolerance = {"float32": 2e-6, "float64": 1e-14}[dtype]
     np.testing.assert_allclose(got, wanted, atol=tolerance)
@@ -161,7 +161,7 @@ def test_weights_of_any_size_share_alike_and_peaks_draw_all(dtype):
     """But the ends u = 0 and 1 of the even shares, which are the ends of the range."""
     weights = np.stack(list(HARD.values())).astype(dtype)
     draws = [
-        np.asarray(from_many_weights(drawn, EDGES.astype(dtype), weights, 34))
+        np.asarray(sample_many_pdfs(drawn, EDGES.astype(dtype), weights, 34))
         for drawn in (None, key(1))
     ]
     # 16 floors of one rounding unit on a sum of one, on bins of 1/8
@@ -187,7 +187,7 @@ def test_thousands_of_bins_stay_in_range(dtype, rng):
     """cdf[-1] is 1 only to 1e-7 and sums in a tree may step back."""
     weights = (rng.uniform(0, 1, 4096) ** 8).astype(dtype)
     edges = np.linspace(0, 1, 4097).astype(dtype)
-    got = np.asarray(from_weights(None, edges, weights, 4096))  # both ends among them
+    got = np.asarray(sample_pdf(None, edges, weights, 4096))  # both ends among them
     assert np.all(np.diff(got) >= 0)
     assert (got.min() >= 0) & (got.max() <= 1)
     assert got.max() > 0.99
@@ -197,7 +197,7 @@ def test_random_shares_are_stratified_and_unbiased(dtype, rng):
     weights = rng.uniform(0, 1, 8)
     edges = np.linspace(0, 1, 9)
     many = jax.jit(
-        jax.vmap(sampling.from_weights, (0, None, None, None)), static_argnums=3
+        jax.vmap(sampling.sample_pdf, (0, None, None, None)), static_argnums=3
     )
     got = many(keys(), edges.astype(dtype), weights.astype(dtype), 25)
     got = np.asarray(got, np.float64)
@@ -217,7 +217,7 @@ def test_no_gradient_passes_through_the_samples(dtype, rng):
     along = jnp.asarray(np.linspace(1, 2, 8), dtype)
 
     def total(edges, weights):
-        drawn = sampling.from_weights(jax.random.key(0), edges, weights, 7)
+        drawn = sampling.sample_pdf(jax.random.key(0), edges, weights, 7)
         return jnp.sum(drawn) + jnp.sum(sampling.refine(None, along, weights, 6))
 
     for grad in jax.jit(jax.grad(total, argnums=(0, 1)))(edges, weights):
@@ -244,11 +244,9 @@ def test_union_keeps_all_and_their_gradients(dtype):
 def test_refine_asks_more_where_light_stops(dtype):
     distances, weights = np.linspace(1, 2, 11).astype(dtype), np.zeros(11, dtype)
     weights[4], weights[10] = 0.7, 0.3  # the last: behind
-    got = np.asarray(refine(key(0), distances, weights, 20))
-    assert got.shape == (31,)
-    assert np.all(np.diff(got) >= 0)
-    new = np.setdiff1d(got, distances)
-    assert new.size >= 19  # one may fall on a coarse one
+    new = np.asarray(refine(key(0), distances, weights, 20))
+    assert new.shape == (20,)
+    assert np.all(np.diff(new) >= 0)
     assert np.all((new > 1.35 - 1e-6) & (new < 1.45 + 1e-6))
 
 
@@ -261,7 +259,7 @@ def test_narrow_rays_keep_their_order_and_their_peaks(narrow):
     edges = np.linspace(2, 4, 65).astype(narrow)
     peak = (np.arange(64) == 40).astype(narrow)
     # A rounding unit of bfloat16 in each of 64 bins would be a third of the weight.
-    drawn = from_weights(key(0), edges, peak, 64)
+    drawn = sample_pdf(key(0), edges, peak, 64)
     for samples in (even, drawn):
         assert samples.dtype == narrow
         samples = np.asarray(samples, np.float64)
@@ -275,4 +273,4 @@ def test_a_weight_that_is_not_a_number_shows(dtype):
     """Nothing is drawn from it as if it were one."""
     weights = np.where(np.arange(8) == 3, np.nan, 1).astype(dtype)
     edges = np.linspace(2, 4, 9).astype(dtype)
-    assert np.isnan(from_weights(None, edges, weights, 9)).any()
+    assert np.isnan(sample_pdf(None, edges, weights, 9)).any()

@@ -114,7 +114,7 @@ class Box:
     def cross(self, origin, direction, time) -> Crossing:
         """The ray's first entry; a ray that starts inside does not meet the box."""
         half = jnp.asarray(self.half, time.dtype)
-        distance, leave = rays.box_span(origin, direction, -half, half)
+        distance, leave = rays.intersect_aabb(origin, direction, -half, half)
         met = (distance > 0) & (distance < leave)
         material = origin + jnp.where(met, distance, 0) * direction
         # The face is the one the point lies on, that is farthest out in half sizes.
@@ -217,7 +217,7 @@ class Sheet:
         reach = (self.half_width + self.sway, self.half_height, _CREST * self.billow)
         # A touch beyond the crests: a probe on the border would see no change of sign.
         high = jnp.asarray(reach, time.dtype) * 1.001
-        enter, leave = rays.box_span(origin, direction, -high, high)
+        enter, leave = rays.intersect_aabb(origin, direction, -high, high)
         hit = enter < leave
         enter = jnp.where(hit, enter, 0)
         step = jnp.where(hit, leave - enter, 1) / (PROBES - 1)

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from nerfies_jax.capture.images import linear_from_srgb
 from nerfies_jax.capture.synthetic.motion import Vector
 
 OCTAVES = 3
@@ -97,7 +98,7 @@ def albedo(
     channels = []
     for channel in range(3):
         dark, light, blot = (
-            pick(lambda t, n=name, i=channel: float(linear(getattr(t, n)[i])))
+            pick(lambda t, n=name, i=channel: float(linear_from_srgb(getattr(t, n)[i])))
             for name in ("dark", "light", "blot")
         )
         ground = dark + mix * (light - dark)
@@ -136,12 +137,6 @@ def _mixed(bits):
     bits = (bits ^ (bits >> 16)) * np.uint32(0x85EBCA6B)
     bits = (bits ^ (bits >> 13)) * np.uint32(0xC2B2AE35)
     return (bits ^ (bits >> 16)) >> 9
-
-
-def linear(coded):
-    """Linear light of sRGB-coded values (IEC 61966-2-1), on the host."""
-    coded = np.asarray(coded, np.float64)
-    return np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4)
 
 
 def srgb(light: Float[Array, "*any"]) -> Float[Array, "*any"]:

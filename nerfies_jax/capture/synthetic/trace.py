@@ -7,8 +7,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from nerfies_jax.capture.images import linear_from_srgb
 from nerfies_jax.capture.synthetic import motion, texture
 from nerfies_jax.capture.synthetic.spec import SceneSpec, Thing
 from nerfies_jax.geometry import camera as cameras
@@ -118,7 +120,7 @@ def shade(
         cosine = jnp.sum(hit.normal * half) / jnp.sqrt(jnp.sum(half**2))
         lobe = jnp.maximum(cosine, 0) ** spec.specular.sharpness
         colour = colour + jnp.where(shines, spec.specular.strength * lobe, 0)
-    behind = jnp.asarray(texture.linear(spec.background), dtype)
+    behind = jnp.asarray(linear_from_srgb(np.asarray(spec.background)), dtype)
     return light_gain * jnp.where(hit.thing == NOTHING, behind, colour)
 
 

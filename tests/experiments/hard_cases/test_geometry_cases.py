@@ -66,7 +66,7 @@ def test_projection_is_continuous_where_the_depth_is_held(dtype):
 @jax.jit
 def span_and_slopes(*args):
     def span(direction, origin, low, high):
-        return jnp.stack(rays.box_span(origin, direction, low, high))
+        return jnp.stack(rays.intersect_aabb(origin, direction, low, high))
 
     return span(*args), jax.jacrev(span, argnums=(0, 1, 2, 3))(*args)
 
