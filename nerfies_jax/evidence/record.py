@@ -205,9 +205,9 @@ def _paths(capture, views, tracks, rest, score, which, depths, watch):
         measured = _measured(depths, moved)
         return paths.least_acceleration(views, moved, least, around, measured)
     alone = paths.least_acceleration(views, moved, least, around)
-    if not watch.has_time(FOR_BODIES, "depths of what moves as one rigid thing"):
-        return alone
-    return rigid_bodies.refined(views, moved, alone)
+    what = "depths of what moves as one rigid thing"
+    in_time = functools.partial(watch.has_time, FOR_BODIES, what)
+    return rigid_bodies.refined(views, moved, alone, in_time)
 
 
 def looked_at(capture: Capture, factor: int) -> Capture:

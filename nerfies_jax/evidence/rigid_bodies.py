@@ -6,6 +6,8 @@ the pictures says better how far it is, up to one factor for the whole film; tha
 is taken from the paths, whose errors have either sign.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 
 from nerfies_jax.evidence import bundle, rigid_groups
@@ -27,8 +29,16 @@ GROWTHS = 5  # rounds in which a body is followed into more frames
 LEAST_KNOWN = 6  # frames in which a path is known
 
 
-def refined(views: Views, tracks: Tracks, paths: Paths) -> Paths:
+def refined(
+    views: Views,
+    tracks: Tracks,
+    paths: Paths,
+    has_time: Callable[[], bool] = lambda: True,
+) -> Paths:
     """The paths, those on rigid things placed by these; no others change.
+
+    `has_time` is asked before each thing and each round of its growth: a round may take
+    half a minute of a film of 300 frames.
 
     Only things whose depth the paths tell badly: where they tell it well, a cloth that
     is nearly rigid comes out four times worse. A track is no longer known where too
@@ -45,8 +55,10 @@ def refined(views: Views, tracks: Tracks, paths: Paths) -> Paths:
         own = np.flatnonzero((label == group) & left)
         if len(own) < FEWEST or np.median(paths.depth_deviation[own]) < BADLY_TOLD:
             continue
+        if not has_time():
+            break
         rows = np.flatnonzero(left)
-        grown = _grown(views, tracks, paths, own, rows)
+        grown = _grown(views, tracks, paths, own, rows, has_time)
         if grown is None:
             continue
         own, body = grown
@@ -56,7 +68,7 @@ def refined(views: Views, tracks: Tracks, paths: Paths) -> Paths:
     return Paths(position, known, depth, paths.depth_deviation)
 
 
-def _grown(views, tracks, paths, own, rows):
+def _grown(views, tracks, paths, own, rows, has_time):
     """Which of the paths are on the rigid thing that `own` are on, and the thing.
 
     None where they are on none. From the frames in which it is known, it is followed
@@ -70,7 +82,7 @@ def _grown(views, tracks, paths, own, rows):
         own, body = found
         there = paths.known[own].sum(0) >= FEWEST_SEEN
         fits = _on(views, tracks, paths, body, rows, there)[1] < WITHIN_PX
-        if fits.sum() <= len(own):
+        if fits.sum() <= len(own) or not has_time():
             break
         own = rows[fits]
     if body is None:
