@@ -8,7 +8,7 @@ import numpy as np
 from experiments.hard_cases.case import Case, constant
 from nerfies_jax.effects import surface
 from nerfies_jax.radiance import compositing, sampling
-from nerfies_jax.radiance.compositing import AT_INFINITY, EMPTY_BELOW
+from nerfies_jax.radiance.compositing import AT_INFINITY, EMPTY_BELOW, THIN_BELOW
 
 
 def _times(sizes, pattern):
@@ -187,11 +187,12 @@ def _sides(edge):
     return sorted(places)
 
 
-# A share of 3/4 of an opacity of 2/3 is one half.
-_SWITCH = np.log(3.0)
+# The logit of a share of 3/4, and the depth whose opacity it brings to the switch.
+_LOGIT = np.log(3.0)
+_SWITCH = -np.log1p(-THIN_BELOW / 0.75)
 _THINNED = np.array(
     [[d, v] for d in (1e-8, 0.1, 1, 17, 50, 1e10) for v in (-60, -1, 3, 20, 80)]
-    + [[d, _SWITCH] for d in _sides(_SWITCH)]
+    + [[d, _LOGIT] for d in _sides(_SWITCH)]
     + [[1e-30, 0.5], [0.7, 16.7]]
 )
 _THINNED = _THINNED[np.argsort(_THINNED[:, 0], kind="stable")]
@@ -199,7 +200,7 @@ THINNED = Case(
     name="opacity times a share",
     breaks="-log(1 - v(1 - exp(-d))): infinite for v → 1, 0 in thin air",
     formula="-log1p(v expm1(-d)); -logaddexp(log(1 - v), log v - d) for walls",
-    switch="opacity ½",
+    switch=f"opacity {THIN_BELOW:g}",
     axis="depth",
     at=_THINNED[:, 0],
     inputs=_THINNED,
