@@ -116,8 +116,7 @@ def _cameras(entries, transforms, size, where):
     if transforms.camera_model not in PINHOLES:
         raise CaptureError(
             f"{where}: camera_model {transforms.camera_model}; undistort the pictures "
-            "to "
-            "OPENCV or PINHOLE first (ns-process-data or COLMAP do it)"
+            "to OPENCV or PINHOLE first (ns-process-data or COLMAP do it)"
         )
     single = [_one_camera(entry, transforms, size, where) for entry in entries]
     cameras = camera.stack([one for one, _ in single])
@@ -154,8 +153,7 @@ def _one_camera(entry, transforms, size, where):
         if angle is None or not 0 < angle < math.pi:
             raise CaptureError(
                 f"{label} has no fl_x and camera_angle_x = {angle}; give a focal "
-                "length in "
-                "pixels or a field of view between 0 and pi"
+                "length in pixels or a field of view between 0 and pi"
             )
         focal = 0.5 * width / math.tan(0.5 * angle)
     if not focal > 0:
@@ -194,8 +192,7 @@ def _pose(matrix, label):
     if not (length > 0).all() or np.ptp(length) > 1e-3 * length.mean():
         raise CaptureError(
             f"{label} has axes of lengths {length.round(4).tolist()} in "
-            "transform_matrix; "
-            "it must be a rotation"
+            "transform_matrix; it must be a rotation"
         )
     # A uniform scale (a scaled parent in Blender) leaves the direction of the axes.
     return axes / length[:, None] * [[1.0], [-1.0], [-1.0]], matrix[:, 3]

@@ -241,8 +241,7 @@ def _check_rows(capture, where, frames):
     if shared.size:
         raise CaptureError(
             f"{where}: frame {capture.ids[shared[0]]!r} is both learnt from and held "
-            "out "
-            f"({shared.size} such); a score on it would mean nothing"
+            f"out ({shared.size} such); a score on it would mean nothing"
         )
 
 
@@ -340,10 +339,9 @@ def describe(capture: Capture) -> tuple[str, ...]:
         f"{width}x{height}, {capture.train.size} to learn from, "
         f"{capture.heldout.size} held out",
         f"{np.unique(capture.warp_ids).size} moments, {cameras} camera(s), focal "
-        "length "
-        f"{np.median(capture.cameras.focal_px):.4g} px, depth {capture.near:.3g} to "
-        f"{capture.far:.3g} scene units (1 unit = {1 / capture.scale:.3g} of the "
-        "world)",
+        f"length {np.median(capture.cameras.focal_px):.4g} px, depth "
+        f"{capture.near:.3g} to {capture.far:.3g} scene units (1 unit = "
+        f"{1 / capture.scale:.3g} of the world)",
     ]
     extras = []
     if capture.points is not None:

@@ -55,8 +55,7 @@ def read(
     if isinstance(heldout, str):
         raise CaptureError(
             f"{path}: COLMAP has no split {heldout!r}; pass a number n to hold out "
-            "every "
-            "n-th frame"
+            "every n-th frame"
         )
     available, paths = _find_pictures(path, model)
     full = (model.lenses[0].width, model.lenses[0].height)
@@ -159,8 +158,7 @@ def read_model(folder: pathlib.Path) -> Model:
     if len(kept) < 3:
         raise CaptureError(
             f"{folder}: {len(kept)} points seen in {MIN_TRACK} frames or more; the "
-            "scene "
-            "cannot be placed, so keep points3D or run COLMAP again"
+            "scene cannot be placed, so keep points3D or run COLMAP again"
         )
     depths = np.concatenate(depths)
     return Model(
@@ -187,8 +185,10 @@ def _reconstruction(folder):
 
 
 def _best_model(path):
-    """The folder of the model with most pictures: COLMAP numbers them as it found "
-    "them."""
+    """The folder of the model with most pictures, and notes.
+
+    COLMAP numbers models in the order in which it found them.
+    """
     places = []
     for place in MODELS:
         parent = path / place
@@ -203,8 +203,7 @@ def _best_model(path):
     if not places:
         raise CaptureError(
             f"{path}: no COLMAP model; looked for cameras, images and points3D (.bin "
-            "or "
-            ".txt) in sparse/0, sparse and here"
+            "or .txt) in sparse/0, sparse and here"
         )
     if len(places) == 1:
         return places[0], ()
@@ -280,8 +279,7 @@ def _scaled(lens, stored, size, path):
     if lens.is_spherical():
         raise CaptureError(
             f"{path}: camera {lens.camera_id} is {lens.model_name}, a whole sphere; "
-            "cut "
-            "perspective pictures out of it first"
+            "cut perspective pictures out of it first"
         )
     copy = library().Camera(lens.todict())
     copy.rescale(*stored)

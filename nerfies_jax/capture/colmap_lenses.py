@@ -46,8 +46,7 @@ def undistort(
         if not inside.any():
             raise CaptureError(
                 f"{where}: the {lens.model_name} lens of frame {row} covers none of "
-                "its "
-                "undistorted picture; calibrate it again"
+                "its undistorted picture; calibrate it again"
             )
         exists[row] = inside
         out[row] = resampling.bilinear(images[row], place) * inside[..., None]

@@ -82,8 +82,7 @@ def _window(path):
         if not 0 < width * height * len(channels) <= MAX_FLOATS:
             raise CaptureError(
                 f"{path}: {width}x{height} pixels of {len(channels)} channels, more "
-                "than "
-                f"{MAX_FLOATS} numbers; crop it or keep fewer channels"
+                f"than {MAX_FLOATS} numbers; crop it or keep fewer channels"
             )
         if any(
             channel.xSampling != 1 or channel.ySampling != 1 for channel in channels
@@ -143,8 +142,7 @@ def write_exr(
         if bright.any():
             raise ValueError(
                 f"{path}: channel {name} reaches {np.abs(array[bright]).max():.3g}, "
-                "above "
-                f"the {largest:.5g} of a half float; write it with half=False"
+                f"above the {largest:.5g} of a half float; write it with half=False"
             )
     channels = {name: array.astype(kind) for name, array in channels.items()}
     if depth is not None:

@@ -172,8 +172,7 @@ def read_masks(
         if mask.shape[1] // shrink_by != width or mask.shape[0] // shrink_by != height:
             raise CaptureError(
                 f"{path}: a mask of {mask.shape[1]}x{mask.shape[0]} pixels for "
-                "pictures of "
-                f"{width * shrink_by}x{height * shrink_by}; they must agree"
+                f"pictures of {width * shrink_by}x{height * shrink_by}; they must agree"
             )
         share[row] = blocks(mask, shrink_by).mean((-3, -1))
     return share

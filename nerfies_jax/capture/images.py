@@ -59,8 +59,7 @@ def _checked(path, header):
     if width * height > MAX_PIXELS:
         raise CaptureError(
             f"{path}: {width}x{height} pixels, more than {MAX_PIXELS}; make the "
-            "picture "
-            "smaller first"
+            "picture smaller first"
         )
     return header
 
@@ -89,8 +88,7 @@ def read_pixels(path: AnyPath, orientation: str = "refuse") -> np.ndarray:
     if header.orientation not in (0, 1) and orientation != "stored":
         raise CaptureError(
             f"{path}: its EXIF orientation is {header.orientation}, so a viewer turns "
-            "it "
-            "and a camera file may or may not; turn the pixels and remove the tag"
+            "it and a camera file may or may not; turn the pixels and remove the tag"
         )
     try:
         if header.mode in {"RGB", "RGBA", "L", "1", "I;16", "I;16B"}:
@@ -104,8 +102,7 @@ def read_pixels(path: AnyPath, orientation: str = "refuse") -> np.ndarray:
         else:
             raise CaptureError(
                 f"{path}: colour mode {header.mode}; expected grey, RGB or RGBA, so "
-                "save "
-                "it as an RGB PNG"
+                "save it as an RGB PNG"
             )
     except CaptureError:
         raise

@@ -60,8 +60,7 @@ def inside(root: pathlib.Path, name: str, named_in: pathlib.Path) -> pathlib.Pat
     if not target.resolve().is_relative_to(root.resolve()) or "\0" in name:
         raise CaptureError(
             f"{named_in}: the name {name!r} leads outside {root}; names must stay in "
-            "the "
-            "capture's folder, so copy the file there"
+            "the capture's folder, so copy the file there"
         )
     return target
 

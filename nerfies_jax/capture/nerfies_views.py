@@ -40,8 +40,7 @@ class CameraFile(msgspec.Struct):
 
 
 class SceneFile(msgspec.Struct):
-    """`scene.json`: near and far are in scene units already, scale and centre are "
-    "not."""
+    """`scene.json`: near and far in scene units already, scale and centre not."""
 
     scale: float
     center: Triple
@@ -263,8 +262,7 @@ def _moments(path, ids):
     if absent:
         raise CaptureError(
             f"{file}: no entry for frame {absent[0]!r} ({len(absent)} such); add one "
-            "with "
-            "warp_id, appearance_id and camera_id"
+            "with warp_id, appearance_id and camera_id"
         )
     moments = [table[name] for name in ids]
     for name, moment in zip(ids, moments, strict=True):
@@ -289,8 +287,7 @@ def _times(moments, path, ids):
             row = int(np.argmax(bad))
             raise CaptureError(
                 f"{path / 'metadata.json'}: frame {ids[row]!r} has time "
-                f"{times[row]:g}; "
-                "expected 0 to 1"
+                f"{times[row]:g}; expected 0 to 1"
             )
         return times
     if all(moment.time_id is not None for moment in moments):

@@ -146,8 +146,7 @@ def run_sfm(
         if absent:
             raise CaptureError(
                 f"{masks}: no mask {absent[0]}.png ({len(absent)} such); name each "
-                "after "
-                "its picture"
+                "after its picture"
             )
     with new_folder(out) as folder:
         shutil.copytree(images, folder / "images")
