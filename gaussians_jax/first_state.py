@@ -6,6 +6,8 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
+from jaxtyping import Array, Key
 
 from gaussians_jax import densification, initialisation, rendering, splats, track_start
 from gaussians_jax.densification import DefaultStrategySpec
@@ -37,8 +39,18 @@ def estimate_memory_bytes(spec: SplatScene, capture: Capture) -> int:
     return 4 * numbers + devices * training_bytes(capture)
 
 
-def first_state(spec, effects, optimiser, capture, key) -> TrainState:
-    """Parameters, moments and statistics before the first step; host side."""
+def first_state(
+    spec: SplatScene,
+    effects: tuple[Effect, ...],
+    optimiser: optax.GradientTransformation,
+    capture: Capture,
+    key: Key[Array, ""],
+) -> TrainState:
+    """Parameters, moments and statistics before the first step; host side.
+
+    Rows are padded to a capacity that `splats.capacity_for` says. `key` also becomes
+    the run's own, by a split.
+    """
     refuse_what_cannot_train(spec)
     rendering.refuse_distortion(capture.cameras)
     start_key, run_key = jax.random.split(key)

@@ -5,15 +5,24 @@ import numpy as np
 import scipy.spatial
 
 from gaussians_jax import scene
+from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation.model_flow import Move, Moved
-from nerfies_jax.evaluation.protocol import STATIC_POINTS, PointTracks
+from nerfies_jax.evaluation.protocol import STATIC_POINTS, GroundTruth, PointTracks
+from nerfies_jax.training.effects import Effect
 from nerfies_jax.training.model import in_default_precision
 
 NEIGHBOURS = 8  # Gaussians that carry a point
 LEAST_OPACITY = 0.05  # of a Gaussian that can carry one; fainter ones are not seen
 
 
-def follow(spec, metadata, state, capture, known, effects=()) -> PointTracks | None:
+def follow(
+    spec,
+    metadata,
+    state,
+    capture: Capture,
+    known: GroundTruth,
+    effects: tuple[Effect, ...] = (),
+) -> PointTracks | None:
     """Points of the start at all other moments, carried by the Gaussians around them.
 
     A point moves as the `NEIGHBOURS` nearest Gaussians that can be seen do on average,
@@ -23,9 +32,9 @@ def follow(spec, metadata, state, capture, known, effects=()) -> PointTracks | N
     Gaussians fade in and out instead of moving, a point stays. The average of a turn is
     exact at the mean of the neighbours, and off by the turn of the way from there.
     Every point is carried by something, so none is lost; between Gaussians there is no
-    Jacobian, so no strain.
+    Jacobian, so no strain. `known.start_points` [tracks, 3] and the result are in scene
+    units, `state` is that of `scene.build`. None without motion or without points.
     """
-
     every = scene.all_effects(spec, metadata, effects)
     if all(effect.deform is None for effect in every) or not len(known.path):
         return None

@@ -5,25 +5,34 @@ import jax.numpy as jnp
 import numpy as np
 
 from nerfies_jax import evaluation, scene
+from nerfies_jax.capture.capture import Capture
 from nerfies_jax.effects import scene_flow
 from nerfies_jax.evaluation.model_flow import Move, Moved
-from nerfies_jax.evaluation.protocol import STATIC_POINTS, PointTracks
+from nerfies_jax.evaluation.protocol import STATIC_POINTS, GroundTruth, PointTracks
 from nerfies_jax.render_ray import Bound, mean_flow
 from nerfies_jax.training import tracks
-from nerfies_jax.training.effects import FrameCondition
+from nerfies_jax.training.effects import Effect, FrameCondition
 from nerfies_jax.training.model import in_default_precision
 
 LEAST_STRETCH = 1e-6  # a collapsed direction has a logarithm, too
 
 
-def follow(spec, metadata, state, capture, known, effects=()) -> PointTracks | None:
+def follow(
+    spec,
+    metadata,
+    state,
+    capture: Capture,
+    known: GroundTruth,
+    effects: tuple[Effect, ...] = (),
+) -> PointTracks | None:
     """Points of the start at all other moments, through the template of a field.
 
     A point goes to the template by the warp of the start, and from there by the inverse
     warp of every other moment. Without a warp, a scene flow takes it from each moment
-    to the next, and nothing says how it strains.
+    to the next, and nothing says how it strains. `known.start_points` [tracks, 3] and
+    the result are in scene units, `state` is that of `scene.build`. None without such
+    motion or without points.
     """
-
     field = scene.field(spec, metadata, effects=effects)
     if not len(known.path):
         return None

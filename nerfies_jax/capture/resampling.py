@@ -34,6 +34,9 @@ def bilinear(picture: np.ndarray, place: np.ndarray) -> np.ndarray:
 
 
 def nearest(picture: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """A mask or a depth map at the nearest pixel to array coordinates."""
+    """A mask or a depth map [height, width] at the nearest pixel to array coordinates.
+
+    `place` [2, ...] is row and column, as of `array_places`; the result is [...].
+    """
     row, column = np.round(place).astype(int)
     return picture[row, column]

@@ -64,6 +64,6 @@ def path_views(path: Camera, times: np.ndarray, like: View) -> list[View]:
 
 
 def spread(rows: np.ndarray, most: int) -> np.ndarray:
-    """At most `most` of the rows, evenly spread."""
+    """At most `most` of the rows [rows, ...], evenly spread and in their order."""
     picked = np.linspace(0, len(rows) - 1, min(most, len(rows))).round().astype(int)
     return rows[picked]

@@ -80,7 +80,10 @@ def reduced(shift: np.ndarray, times: int) -> np.ndarray:
 
 
 def enlarged_flow(shift: np.ndarray, times: int) -> np.ndarray:
-    """The reverse."""
+    """Flow [height, width, 2] in px, as between pictures that are enlarged so much.
+
+    [times height, times width, 2], in pixels of those; `reduced` is the way back.
+    """
     size = times * shift.shape[1], times * shift.shape[0]
     return times * cv2.resize(np.ascontiguousarray(shift), size)
 

@@ -98,7 +98,10 @@ def _pairs(position, known):
 def motion(
     position: np.ndarray, known: np.ndarray, label: np.ndarray, canonical: int
 ) -> RigidMotion:
-    """How each group moves, as seen from the frame `canonical`."""
+    """How each group moves, as seen from the frame `canonical`.
+
+    `position` [paths, frames, 3] scene units, `known` [paths, frames], `label` [paths].
+    """
     frames = position.shape[1]
     groups = int(label.max()) + 1 if len(label) else 0
     rotation = np.tile(np.eye(3), (groups, frames, 1, 1))
@@ -142,7 +145,11 @@ def _carried(position, known, member, frame, sign, start):
 
 
 def procrustes(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation and shift that take points nearest to others, robustly (Kabsch 1976)."""
+    """Rotation and shift that take points nearest to others, robustly (Kabsch 1976).
+
+    [3, 3] and [3], so that `target` is near rotation `source` + shift; both are
+    [points, 3] in the same unit.
+    """
     weight = np.ones(len(source))
     for _ in range(ROUNDS):
         total = weight.sum()
@@ -161,7 +168,11 @@ def procrustes(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.n
 def centres(
     position: np.ndarray, known: np.ndarray, bodies: RigidMotion
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where each path is in the canonical frame, and each group's middle there."""
+    """Where each path is in the canonical frame, and each group's middle there.
+
+    [paths, 3] and [groups, 3], medians, in scene units as `position` [paths, frames,
+    3]; `known` [paths, frames].
+    """
     canonical = np.zeros((len(position), 3))
     for row, group in enumerate(bodies.label):
         at = np.flatnonzero(known[row])
@@ -175,7 +186,10 @@ def centres(
 
 
 def miss(position: np.ndarray, known: np.ndarray, count: int) -> float:
-    """How far `count` groups miss the known places in the median, scene units."""
+    """How far `count` groups miss the known places in the median, scene units.
+
+    `position` [paths, frames, 3] scene units, `known` [paths, frames].
+    """
     label = labels(position, known, count)
     bodies = motion(position, known, label, position.shape[1] // 2)
     canonical, _ = centres(position, known, bodies)
@@ -190,7 +204,8 @@ def fewest(
     """How many groups, up to `most`, explain the paths, and by how much they miss.
 
     The fewest whose motions miss the known places by less than `within` in the median;
-    `most` where that many do not. In scene units.
+    `most` where that many do not. In scene units, as `position` [paths, frames, 3];
+    `known` [paths, frames].
     """
     for count in range(1, most + 1):
         typical = miss(position, known, count)
@@ -205,7 +220,8 @@ def enough(
     """The first of rising `counts` of groups beyond which more explain hardly more.
 
     By how far they miss the known places in the median: less than one group does, by
-    at least `share` of what the last of `counts` wins.
+    at least `share` (0 to 1) of what the last of `counts` wins. `position` [paths,
+    frames, 3] scene units, `known` [paths, frames].
     """
     one, last = (miss(position, known, count) for count in (1, counts[-1]))
     limit = one - share * max(one - last, 0.0)

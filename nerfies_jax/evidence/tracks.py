@@ -69,7 +69,10 @@ def grid(views: Views, sparser: int = 1, seed: int = 0) -> np.ndarray:
 
 
 def chain(flow: NeighbourFlow, starts: np.ndarray) -> Tracks:
-    """Points carried from frame to frame until flow cannot be trusted, both ways."""
+    """Points carried from frame to frame until flow cannot be trusted, both ways.
+
+    `starts` [tracks, 3]: frame, column and row in px, as of `grid`.
+    """
     frames = len(flow.forward)
     count, each = len(starts), np.arange(len(starts))
     start = starts[:, 0].astype(int)

@@ -2,14 +2,16 @@
 
 import functools
 import time
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array
 
 from nerfies_jax.training import data_parallel
-from nerfies_jax.training.model import Frames, TrainState
+from nerfies_jax.training.model import Frames, PyTree, TrainState
 
 LENGTH = 10  # steps of a scan
 # Fewer steps than these in all, or more work in each (a tenth of a second on a core),
@@ -26,8 +28,13 @@ class Outcome(NamedTuple):
     step: Any
 
 
-def scan_steps(step, state, frames, length):
-    """The state after `length` steps, and the metrics of each, stacked.
+def scan_steps(
+    step: Callable[[PyTree, PyTree], tuple[PyTree, dict[str, Array]]],
+    state: PyTree,
+    frames: PyTree,
+    length: int,
+) -> tuple[PyTree, dict[str, Array]]:
+    """The state after `length` steps, and the metrics of each, stacked: [length].
 
     `step(state, frames) -> (state, metrics)` is pure: so is this, and it can be
     differentiated. ValueError where a step changes the shape or dtype of an array.

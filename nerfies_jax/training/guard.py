@@ -1,12 +1,14 @@
 """What a run falls back to when a step is not finite, and what was wrong in it."""
 
 import time
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nerfies_jax.training.model import TrainState
+from nerfies_jax.training.chunk import Outcome
+from nerfies_jax.training.model import Frames, TrainState
 
 RENEW_SECONDS = 0.5  # between copies
 RENEW_SHARE = 0.05  # of the time may go into copies
@@ -57,12 +59,20 @@ def _to_device(array, sharding, key_impl):
     )
 
 
-def last_good(program, snapshot, frames, good_step, bad_step):
+def last_good(
+    program: Callable[[TrainState, Frames, int], tuple[TrainState, Outcome]],
+    snapshot: Snapshot,
+    frames: Frames,
+    good_step: int,
+    bad_step: int,
+) -> tuple[TrainState, int, str]:
     """The state before the first bad step, that step's number, and what was bad in it.
 
-    Metrics are looked at after every step and the state after every chunk, so the first
-    bad step is found by bisection between the last chunk that was good and this one;
-    steps are deterministic, and are repeated from the last copy.
+    Metrics are looked at after every step and the state after every scan of steps, so
+    the first bad step is found by bisection between `good_step`, the end of the last
+    good chunk, and `bad_step`, where something was not finite; steps are deterministic,
+    and are repeated from the last copy. `program(state, frames, count)` is a
+    `chunk.Program`; steps count from the start of the run.
     """
 
     def replay(step):
