@@ -34,7 +34,6 @@ from nerfies_jax.training import specs
 FORMAT = "gaussians_jax model"
 VERSION = 2
 ABOUT = "about.json"  # the archive's member with the text
-PyTree = Any
 
 
 def save(path: str | os.PathLike, params: Params, description: dict[str, Any]) -> int:

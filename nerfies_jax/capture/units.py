@@ -15,8 +15,3 @@ def places_in(units: Units, capture: Capture, points: np.ndarray) -> np.ndarray:
     if units == "scene":
         return points
     return points / capture.scale + np.asarray(capture.centre)
-
-
-def length_in(units: Units, capture: Capture) -> float:
-    """What one scene unit is in `units`."""
-    return 1.0 if units == "scene" else 1 / capture.scale

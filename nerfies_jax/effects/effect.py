@@ -8,11 +8,10 @@ for one point and vmapped by the scene.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from jaxtyping import Array, Bool, Float, Int
 
-PyTree = Any
 Vector = Float[Array, "3"]
 Scalar = Float[Array, ""]
 

@@ -68,7 +68,7 @@ def ssim(
     truth: Float[Array, "height width channels"],
     padding: Padding = "valid",
 ) -> Float[Array, ""]:
-    """Structural similarity, the mean of `ssim_map` over pixels and channels.
+    """Structural similarity, the mean over windows and channels.
 
     Wang et al. 2004 with an 11-pixel Gaussian window of sigma 1.5. "valid" averages the
     windows inside the picture and equals scikit-image's `structural_similarity` with
@@ -76,15 +76,6 @@ def ssim(
     "zero" puts black around both pictures and averages all pixels, as INRIA does.
     """
     return losses.ssim(image, truth, padding=padding)
-
-
-def ssim_map(
-    image: Float[Array, "height width channels"],
-    truth: Float[Array, "height width channels"],
-    padding: Padding = "valid",
-) -> Float[Array, "rows columns channels"]:
-    """SSIM of the window around each pixel; "valid" is 10 pixels shorter each way."""
-    return 1.0 - losses.dssim_map(image, truth, padding=padding)
 
 
 def ms_ssim(
