@@ -1,4 +1,4 @@
-"""What came of a run, on one page for a person; `clock.write_metrics` is for programs.
+"""What came of a run, on one page for a person; programs read `metrics.json`.
 
 The page is one file: pictures and short films are inside it, nothing is fetched, no
 script runs.
