@@ -46,6 +46,8 @@ SMALL_PIXELS = 176 * 132  # for which the counts of the small presets were chose
 # 32.14 / 29.28 and 31.72 / 29.10 dB, 31.23 / 27.74 and 31.03 / 27.36, 38.26 / 34.28 and
 # 38.38 / 34.16; 8 beside 20 loses the bag 0.2 dB (one seed each).
 BASES, EXPLAINED = (8, 12, 16, 20, 24), 0.8
+# As in the built-in scenes, where 20 knots serve 60 frames.
+FRAMES_A_KNOT, MOST_KNOTS = 3, 60
 # Between these advice chooses by whether anything moves.
 ADVISED = ("splats-static", "splats-tracked", "splats-deformable")
 # Of a scene's spec: the motion, and what is nothing without one.
@@ -177,6 +179,11 @@ def default_preset(capture: Capture) -> Choice:
         if bases > spec.motion.bases:
             overrides += (f"motion.bases={bases}",)
             notes.append(f"its tracks move as {bases} rigid things or more")
+        frames = len(evidence.row)
+        knots = min(round(frames / FRAMES_A_KNOT), MOST_KNOTS)
+        if knots > spec.motion.knots:
+            overrides += (f"motion.knots={knots}",)
+            notes.append(f"for {frames} frames")
     return Choice(name, overrides, tuple(notes))
 
 

@@ -6,6 +6,7 @@ Flow between neighbours in time, tracks, which of them and which pixels move, th
 paths in space, and points that stand still: host side, one core, no gradients.
 """
 
+import functools
 import hashlib
 import math
 import pathlib

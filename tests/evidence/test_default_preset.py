@@ -27,7 +27,7 @@ def noisy():
     [
         (lambda: films.film(**MOVES, frames=24), "tracked", ""),
         (lambda: films.film(frames=24), "static", "of the pixels move by themselves"),
-        (noisy, "deformable", "have texture to follow"),
+        (noisy, "deformable", "can be carried to the next frame"),
     ],
 )
 def test_motion_is_chosen_by_what_tracks_say(make, kind, words, tmp_path, monkeypatch):
@@ -53,6 +53,16 @@ def test_paths_of_many_things_get_more_bases(asked, overrides, tmp_path, monkeyp
     assert choice.overrides == overrides
     spec = specs.override(PRESETS[choice.preset], choice.overrides)
     assert spec.motion.bases == asked
+
+
+@pytest.mark.parametrize(("a_knot", "knots"), [(3, 20), (0.8, 30), (0.1, 60)])
+def test_long_films_get_more_knots(a_knot, knots, tmp_path, monkeypatch):
+    monkeypatch.setattr(representation, "CACHE", tmp_path)
+    monkeypatch.setattr(representation, "FRAMES_A_KNOT", a_knot)
+    choice = representation.default_preset(films.film(**MOVES, frames=24))
+    spec = specs.override(PRESETS[choice.preset], choice.overrides)
+    assert spec.motion.knots == knots
+    assert ("for 24 frames" in choice.notes) == (knots > 20)
 
 
 @pytest.mark.parametrize("kind", ["tracked", "static", "deformable"])
