@@ -27,7 +27,7 @@ def noisy():
     [
         (lambda: films.film(**MOVES, frames=24), "tracked", ""),
         (lambda: films.film(frames=24), "static", "of the pixels move by themselves"),
-        (noisy, "deformable", "can be carried to the next frame"),
+        (noisy, "deformable", "only 0 tracks of what moves"),
     ],
 )
 def test_motion_is_chosen_by_what_tracks_say(make, kind, words, tmp_path, monkeypatch):
