@@ -75,3 +75,13 @@ def test_larger_pictures_get_more_gaussians(kind):
     assert larger.init.points == 2 * spec.init.points
     moving = larger.start.moving_points / spec.start.moving_points
     assert moving == (2 if kind == "tracked" else 1)
+
+
+@pytest.mark.parametrize(("followed", "times"), [(0.9, 1), (0.125, 2), (0.01, 3)])
+def test_what_is_followed_for_a_short_time_gets_more_gaussians(followed, times):
+    spec = PRESETS[SPLATS.format("tracked")]
+    short = specs.override(spec, representation.capacity(spec, (176, 132), followed))
+    assert short.init.points == spec.init.points
+    assert short.start.moving_points == times * spec.start.moving_points
+    more = short.start.moving_points - spec.start.moving_points
+    assert short.densification.cap_max == spec.densification.cap_max + more
