@@ -116,7 +116,7 @@ def player(
 ) -> Player:
     """`player.html`; the poster is uint8 [height, width, 3]."""
     degree = splats.active_degree(state.step, spec.sh_every, spec.sh_degree)
-    raster = raster_of(spec, scene.metadata_of(capture))
+    raster = raster_of(spec, model.spec[1])
     return page.write(path, title, model, raster, degree, state, capture, poster)
 
 
