@@ -1,7 +1,7 @@
 """Every small preset by one protocol: equal processor seconds, seeds, paired verdicts.
 
     python -m experiments.league --jobs 2 --budget 600
-    python -m experiments.league CAPTURE CAPTURE --heldout 8 --own-steps --jobs 2
+    python -m experiments.league CAPTURE OTHER --heldout 8 --own-steps --jobs 2
     python -m experiments.league --presets sonata-small --budgets 20 --seeds 1
 
 Both representations learn the same frames of the built-in scenes, and of the captures
