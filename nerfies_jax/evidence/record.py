@@ -42,7 +42,7 @@ from nerfies_jax.evidence.tracks import Tracks
 from nerfies_jax.evidence.view_set import Views
 from nerfies_jax.evidence.watch import ENOUGH_SECONDS, Seconds, Watch
 
-VERSION = 8
+VERSION = 9
 # A path has as many frames at least, and a film as many; fewer say nothing of motion.
 SHORTEST_PATH, SHORTEST_FILM = 10, 6
 MOVES = 0.5  # score from which a track counts as moving
@@ -71,6 +71,7 @@ class Evidence(NamedTuple):
     paths: Paths
     still: PointCloud
     unusable: str  # why tracks say nothing of the motion; empty where they do
+    told: bool  # masks or tracks of what moves are the user's: no noise, however few
     factor: int  # of the capture's pixels for one of these
     left_out: str  # what there was no time for; empty where there was enough
     seconds: Seconds
@@ -135,6 +136,7 @@ def gather(
         paths=moved_paths,
         still=dense,
         unusable=unusable,
+        told=given.moving is not None or given.track_pixel is not None,
         factor=factor,
         left_out=watch.left_out,
         seconds=watch.seconds(),
@@ -357,8 +359,8 @@ def load(path: pathlib.Path) -> Evidence:
         else:
             parts[name] = arrays[name]
     parts["seconds"] = Seconds(*(float(part) for part in parts["seconds"]))
-    for name, kind in (("unusable", str), ("left_out", str), ("factor", int)):
-        parts[name] = kind(parts[name])
+    kinds_of_one = {"unusable": str, "left_out": str, "told": bool, "factor": int}
+    parts |= {name: kind(parts[name]) for name, kind in kinds_of_one.items()}
     flow = parts["flow"]
     parts["flow"] = flow._replace(
         forward=flow.forward.astype(np.float32),

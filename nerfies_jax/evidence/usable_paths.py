@@ -51,7 +51,7 @@ def unusable(evidence: Evidence) -> str:
     """Why a motion cannot start from these tracks; empty where it can."""
     if evidence.unusable:
         return evidence.unusable
-    if evidence.moving.mean() < LEAST_MOVING:
+    if not evidence.told and evidence.moving.mean() < LEAST_MOVING:
         return f"only {evidence.moving.mean():.1%} of the pixels move by themselves"
     count = len(known_paths(evidence).known)
     if count < LEAST_PATHS:
@@ -67,7 +67,7 @@ def stands_still(evidence: Evidence, times: np.ndarray) -> bool:
     if np.ptp(times[evidence.row]) == 0:
         return True
     # More that is marked and cannot be followed may be too fast for that.
-    unmarked = float(evidence.moving.mean()) < MARKED
+    unmarked = not evidence.told and float(evidence.moving.mean()) < MARKED
     return bool(unmarked and not evidence.unusable and unusable(evidence))
 
 

@@ -9,7 +9,7 @@ import pytest
 from nerfies_jax.capture import capture as captures
 from nerfies_jax.capture import images
 from nerfies_jax.capture.given import GivenFiles
-from nerfies_jax.evidence import given_depth, given_files, record
+from nerfies_jax.evidence import given_depth, given_files, record, usable_paths
 from nerfies_jax.evidence.rest_points import RestPoints
 from nerfies_jax.evidence.tracks import Tracks, pixel_of
 from tests.evidence import films
@@ -56,6 +56,7 @@ def test_paths_are_those_of_the_tracks_given_and_masks_are_the_masks(tmp_path):
         images.write_png(tmp_path / f"{name}.png", large)
     evidence = record.gather(with_files(capture, tracks=path, masks=tmp_path))
     np.testing.assert_array_equal(evidence.moving, capture.moving[evidence.row])
+    assert evidence.told
     assert len(evidence.moved) == len(points.pixel)
     pixel = evidence.tracks.pixel[evidence.moved]
     np.testing.assert_allclose(pixel[points.seen], points.pixel[points.seen], atol=1e-4)
@@ -64,6 +65,19 @@ def test_paths_are_those_of_the_tracks_given_and_masks_are_the_masks(tmp_path):
     assert np.median(off[known]) < 0.1 * films.NEAR  # drawn towards the wall
     # Our own tracks still say where the wall is.
     assert len(evidence.still.position) > 2000
+
+
+def test_a_mover_that_was_marked_is_no_noise_however_small():
+    _, found = gathered()
+    small = found._replace(moving=np.zeros_like(found.moving))
+    small.moving[:, :2, :5] = True
+    assert small.moving.mean() < usable_paths.LEAST_MOVING
+    assert "of the pixels move" in usable_paths.unusable(small)
+    times = np.linspace(0, 1, len(small.row))
+    assert usable_paths.stands_still(small, times)
+    marked = small._replace(told=True)
+    assert usable_paths.unusable(marked) == ""
+    assert not usable_paths.stands_still(marked, times)
 
 
 def test_tracks_of_larger_pictures_are_brought_to_those_that_are_read(tmp_path):
