@@ -74,7 +74,7 @@ def step(state, frames):
         {**state.aux_state, "hits": hits},
         state.step + 1,
         state.key,
-    ), {"loss": value, "psnr": -10 * jnp.log10(value)}
+    ), {"loss": value, "mse": value}
 
 
 @jax.jit
