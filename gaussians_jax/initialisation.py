@@ -108,14 +108,16 @@ def initial_points(spec: InitSpec, capture: Capture, seed: int):
     return np.concatenate([position, more]), np.concatenate([colour, more_colour])
 
 
-def filmed_box(capture: Capture) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def filmed_box(
+    capture: Capture, span: tuple[float, float] | None = None
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """The low and the high corner of what was filmed, scene units; host side.
 
     The middle 98 % along each axis of points drawn in the views, between the depths of
-    the capture's own points.
+    the capture's own points: `span` where those are known already.
     """
     rng = np.random.default_rng(0)
-    point, _ = _random_points(rng, capture, 4000, filmed_depths(capture))
+    point, _ = _random_points(rng, capture, 4000, span or filmed_depths(capture))
     low, high = np.quantile(point, (0.01, 0.99), axis=0)
     return tuple(low.tolist()), tuple(high.tolist())
 

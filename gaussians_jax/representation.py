@@ -175,10 +175,8 @@ def default_preset(capture: Capture) -> Choice:
         name, notes = "splats-static-small", [reason]
     elif reason:
         name, notes = "splats-deformable-small", [f"tracks are of no use: {reason}"]
-    spec, followed = presets.PRESETS[name], 1.0
-    if not reason:
-        paths = usable_paths.known_paths(evidence)
-        followed = float(paths.known.mean())
+    spec, paths = presets.PRESETS[name], usable_paths.known_paths(evidence)
+    followed = 1.0 if reason else float(paths.known.mean())
     overrides = capacity(spec, capture.size, followed)
     if overrides:
         size = "x".join(map(str, capture.size))
@@ -189,7 +187,7 @@ def default_preset(capture: Capture) -> Choice:
         if bases > spec.motion.bases:
             overrides += (f"motion.bases={bases}",)
             notes.append(f"its tracks move as {bases} rigid things or more")
-        frames = len(evidence.row)
+        frames = paths.known.shape[1]
         knots = min(round(frames / FRAMES_A_KNOT), MOST_KNOTS)
         if knots > spec.motion.knots:
             overrides += (f"motion.knots={knots}",)

@@ -66,13 +66,14 @@ def metadata_of(capture: Capture) -> SceneMetadata:
     """The metadata of a capture; host side."""
     positions = np.asarray(capture.cameras.position)[capture.train]
     halfway = 2 / (1 / capture.near + 1 / capture.far)
+    span = initialisation.filmed_depths(capture)
     return SceneMetadata(
         extent=splats.scene_extent(positions, static=halfway),
         background=capture.background or (0.0, 0.0, 0.0),
         frames=len(capture.train),
         exposures=exposures(capture),
-        box=initialisation.filmed_box(capture),
-        near=NEAREST * initialisation.filmed_depths(capture)[0],
+        box=initialisation.filmed_box(capture, span),
+        near=NEAREST * span[0],
     )
 
 

@@ -57,14 +57,9 @@ def read(
             f"{path}: COLMAP has no split {heldout!r}; pass a number n to hold out "
             "every n-th frame"
         )
-    available, paths = _find_pictures(path, model)
-    full = (model.lenses[0].width, model.lenses[0].height)
-    source, shrink_by = frames.choose_source(
-        available, full, factor, max_side, str(path)
+    model, files, shrink_by, lost = _with_pictures(
+        path, model, factor, max_side, missing
     )
-    rows, lost = frames.keep_found(paths[source], model.names, missing, str(path))
-    model = _take(model, rows)
-    files = [paths[source][row] for row in rows]
     # COLMAP reads pixels as they lie in the file, whatever the EXIF orientation says.
     images, alpha = frames.read_frames(files, shrink_by, orientation="stored")
     images, valid, moving, lenses, more = _as_pinholes(
@@ -74,17 +69,18 @@ def read(
     placement = place_by_points(model.points, model.positions, model.depths)
     centre, scale = np.array(placement.centre), placement.scale
     cameras = _cameras(lenses, model.rotations, (model.positions - centre) * scale)
-    moments, more = frames.clock([name_of(name) for name in model.names])
+    ids = tuple(map(name_of, model.names))
+    moments, more = frames.clock(ids)
     times = frames.spread(moments)
     notes += more
     train, scored = frames.hold_out_every(
-        len(rows), heldout or frames.HELD_OUT, str(path)
+        len(ids), heldout or frames.HELD_OUT, str(path)
     )
     notes += (f"every {heldout or frames.HELD_OUT}th frame is held out",)
     return Capture(
         name=path.resolve().name,
         source="colmap",
-        ids=tuple(name_of(name) for name in model.names),
+        ids=ids,
         images=images,
         cameras=cameras,
         times=times,
@@ -93,7 +89,7 @@ def read(
         near=placement.near,
         far=placement.far,
         warp_ids=frames.dense(times),
-        appearance_ids=np.arange(len(rows), dtype=np.int32),
+        appearance_ids=np.arange(len(ids), dtype=np.int32),
         camera_ids=frames.dense(model.camera_ids),
         valid=valid,
         moving=moving,
@@ -106,6 +102,17 @@ def read(
         path=path,
         notes=(*notes, *lost),
     )
+
+
+def _with_pictures(path, model, factor, max_side, missing):
+    """The model of the pictures found, their files, their shrinking, and what lacks."""
+    available, paths = _find_pictures(path, model)
+    full = (model.lenses[0].width, model.lenses[0].height)
+    source, shrink_by = frames.choose_source(
+        available, full, factor, max_side, str(path)
+    )
+    rows, lost = frames.keep_found(paths[source], model.names, missing, str(path))
+    return _take(model, rows), [paths[source][row] for row in rows], shrink_by, lost
 
 
 def _as_pinholes(path, model, files, images, alpha, shrink_by):
