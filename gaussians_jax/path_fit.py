@@ -6,6 +6,7 @@ fitted: its networks, its rows and the canonical places of the points are descen
 together on the distance between where it carries the points and where they were seen.
 """
 
+import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -33,9 +34,7 @@ SOFT = 1e-3  # of the unit: distances below it count squared
 # path that is off by as much costing one: what is not known goes on straight and slows.
 BEND, DRIFT = 0.1, 1e-3
 BODIES = 8  # by which paths are brought to one moment
-# What the motion of what is at rest costs in a fit, one length of the scene costing
-# one, and at how many moments of the film it is looked at.
-REST, MOMENTS = 1.0, 8
+REST = 1.0  # what the motion of what is at rest costs, one length of the scene one
 RESTING = 256  # points at rest that are looked at
 # Deviation of depths from which those of the tracks are all there is, and the least
 # that distances along rays count. Medians of three seeds, held out, where it moves, and
@@ -47,12 +46,20 @@ ALL_TRACKS, LEAST_ALONG = 0.15, 0.03
 RIDGE = 1e-9  # of the trace: a basis may have a direction that changes nothing
 
 
+class Resting(NamedTuple):
+    """Points that are known to be at rest, with what the motion keeps for each."""
+
+    position: Float[Array, "still 3"]  # scene units
+    rows: PyTree  # of the effect; None where it keeps none
+
+
 class Points(NamedTuple):
     """What is fitted: points with what the motion keeps for each, and its networks."""
 
     canonical: Float[Array, "points 3"]  # scene units
     rows: PyTree  # of the effect, a row for each point; None where it keeps none
     nets: PyTree  # of the effect; None where it has none
+    resting: Resting | None = None  # what the networks are to hold still
 
 
 class Paths(NamedTuple):
@@ -78,7 +85,8 @@ class Guess(NamedTuple):
 
     points: Points
     rates: Points  # a prefix of `points`, in units of `StartSpec.fit_rate`
-    penalty: Callable[[Points], Float[Array, ""]] | None = None
+    # Of the points, and of the times that the fit looks at just now.
+    penalty: Callable[[Points, Array], Float[Array, ""]] | None = None
     rigid: bool = False  # whether points are bound to others, and so are their depths
 
 
@@ -128,9 +136,11 @@ def resting(paths: Paths) -> Float[Array, "still 3"] | None:
 
 
 def rest_loss(
-    moved: Callable[[Float[Array, ""]], tuple[Array, Array]], unit: float
+    moved: Callable[[Float[Array, ""]], tuple[Array, Array]],
+    unit: float,
+    times: Float[Array, " times"],
 ) -> Float[Array, ""]:
-    """What it costs in a fit that points at rest move, over the film.
+    """What it costs in a fit that points at rest move, mean over the times.
 
     `moved(time)` gives their turns [points, any] (rad) and shifts [points, 3]; the
     latter count in units. Softened near zero as the distances of `fit` are.
@@ -141,8 +151,7 @@ def rest_loss(
         total = jnp.sum(turn**2, axis=1) + jnp.sum((shift / unit) ** 2, axis=1)
         return jnp.mean(jnp.sqrt(total + SOFT**2))
 
-    moments = jnp.linspace(0, 1, MOMENTS, dtype=jnp.float32)
-    return REST * jnp.mean(jax.vmap(one)(moments))
+    return REST * jnp.mean(jax.vmap(one)(times))
 
 
 def combination(
@@ -176,39 +185,49 @@ def guess(effect: Effect, paths: Paths, key: Key[Array, ""]) -> Guess:
     if effect.fit_to_paths is not None:
         return effect.fit_to_paths(paths, key)
     canonical = jnp.asarray(places_at_one_moment(paths), jnp.float32)
-    rows = nets = penalty = None
+    still = resting(paths) if effect.init is not None else None
     rows_key, nets_key = jax.random.split(key)
+    rows = nets = None
     if effect.init_rows is not None:
-        rows = _first_rows(effect, canonical, rows_key)
+        rows, kept = _first_rows(effect, canonical, still, rows_key)
     if effect.init is not None:
         nets = effect.init(nets_key)
-        still = resting(paths)
-        if still is not None:
-            key = jax.random.fold_in(rows_key, 1)
-            penalty = _unrest_of(effect, still, paths.unit, key)
     rates = Points(
         paths.unit, None if rows is None else 1.0, None if nets is None else 0.4
     )
-    return Guess(Points(canonical, rows, nets), rates, penalty)
+    if still is None:
+        return Guess(Points(canonical, rows, nets), rates)
+    at_rest = Resting(still, None if rows is None else kept)
+    rates = rates._replace(resting=Resting(0.0, None if rows is None else 1.0))
+    return Guess(
+        Points(canonical, rows, nets, at_rest), rates, _unrest_of(effect, paths.unit)
+    )
 
 
-def _first_rows(effect, places, key):
-    blank = scene_of(effect, Points(places, None, None))
-    return effect.init_rows(key, blank.rows["splats"])
+def _first_rows(effect, canonical, still, key):
+    """Rows of the points, and of those at rest; all from one draw."""
+    every = canonical if still is None else jnp.concatenate([canonical, still])
+    blank = scene_of(effect, Points(every, None, None))
+    rows = effect.init_rows(key, blank.rows["splats"])
+    count = len(canonical)
+    return tuple(
+        jax.tree.map(operator.itemgetter(part), rows)
+        for part in (slice(count), slice(count, None))
+    )
 
 
-def _unrest_of(effect, still, unit, key):
-    """(points) -> how far their networks move points that are at rest."""
-    rows = None if effect.init_rows is None else _first_rows(effect, still, key)
+def _unrest_of(effect, unit):
+    """(points, times) -> how far their networks move what is at rest."""
 
-    def penalty(points):
+    def penalty(points, times):
+        still, rows = points.resting
         deformed = _deformer(effect, Points(still, rows, points.nets))
 
         def moved(time):
             now = deformed(time)
             return now.quaternion[:, 1:], now.mean - still
 
-        return rest_loss(moved, unit)
+        return rest_loss(moved, unit, times)
 
     return penalty
 
@@ -290,7 +309,7 @@ def fit(
     def loss(points, key):
         frames = jax.random.choice(key, len(times), (together,), replace=False)
         value = distance(points, frames) / unit
-        return value if penalty is None else value + penalty(points)
+        return value if penalty is None else value + penalty(points, moments[frames])
 
     every = jnp.arange(len(times))
     mean_distance = jax.jit(lambda points: distance(points, every))

@@ -142,7 +142,7 @@ def fit_to_paths(
     points = jnp.asarray(path_fit.places_at_one_moment(paths), jnp.float32)
     rest = init_features(rest_key, spec, RESTING)
 
-    def penalty(points):
+    def penalty(points, times):
         net = points.nets
 
         def moved(time):
@@ -150,7 +150,7 @@ def fit_to_paths(
             by = offsets(net.coarse, coarse_spec(spec), rest.reference, code)
             return by.turn, by.position
 
-        return path_fit.rest_loss(moved, paths.unit)
+        return path_fit.rest_loss(moved, paths.unit, times)
 
     rows = init_features(rows_key, spec, len(points))
     start = Points(points, rows, init(nets_key, spec, frames))

@@ -278,7 +278,7 @@ def fit_to_paths(
     if spec.mask is not None:
         nodes = nodes._replace(mask=nodes.mask.at[at_rest].set(spec.mask.still))
 
-    def penalty(points):
+    def penalty(points, times):
         every = points.nets
         those = every._replace(position=every.position[at_rest])
         if every.mask is not None:
@@ -288,7 +288,7 @@ def fit_to_paths(
             now = moves(those, spec, extent, time)
             return now.turn[:, 1:], now.shift
 
-        return path_fit.rest_loss(moved, unit)
+        return path_fit.rest_loss(moved, unit, times)
 
     start = Points(jnp.asarray(canonical, jnp.float32), None, nodes)
     mask = None if spec.mask is None else 1.0

@@ -143,7 +143,7 @@ def fit_to_paths(spec: SE3BasesSpec, paths: Paths) -> Guess:
     logits[np.arange(len(position)), 1 + label] = MEMBER_LOGIT
     guess = Points(jnp.asarray(canonical, jnp.float32), jnp.asarray(logits), bases)
 
-    def penalty(points):
+    def penalty(points, _times):
         def bend(table):
             return jnp.mean(jnp.abs(table[:, 2:] - 2 * table[:, 1:-1] + table[:, :-2]))
 

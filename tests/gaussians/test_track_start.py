@@ -90,10 +90,13 @@ def test_every_motion_can_be_fitted_to_paths(name):
 
 @pytest.mark.parametrize(
     "name",
-    ["basis", *(pytest.param(n, marks=pytest.mark.full) for n in ("kan", "mlp"))],
+    [
+        "basis",
+        *(pytest.param(n, marks=pytest.mark.full) for n in ("kan", "embedding", "mlp")),
+    ],
 )
 def test_networks_that_are_fitted_leave_the_wall_where_it_is(name):
-    """Also where the fit has not looked: points drawn apart, their rows as well."""
+    """Also where the fit has not looked: points drawn apart."""
     position, time = turning_body()
     wall = np.random.default_rng(3).uniform(-1, 1, (400, 3)) * [1, 1, 0] + [0, 0, 2]
     effect = effect_of(MOTIONS[name])
@@ -104,7 +107,10 @@ def test_networks_that_are_fitted_leave_the_wall_where_it_is(name):
         fitted = path_fit.fit(effect, paths, jax.random.key(0), steps=400)
         assert fitted.last < 0.03
         rest = Points(jnp.asarray(wall[200:], jnp.float32), None, fitted.points.nets)
-        if effect.init_rows is not None:
+        if still is not None and effect.init_rows is not None:
+            own = track_start.rows_at_rest(fitted.points.resting, rest.canonical)
+            rest = rest._replace(rows=own)
+        elif effect.init_rows is not None:
             blank = path_fit.scene_of(effect, rest).rows["splats"]
             rest = rest._replace(rows=effect.init_rows(jax.random.key(9), blank))
         now = places_of(effect, rest, time[3])
