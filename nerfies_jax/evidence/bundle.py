@@ -5,9 +5,11 @@ Levenberg and Marquardt, points eliminated by Schur's complement. What is found 
 but for one factor of all distances to the cameras, which stays nearly as it was given.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
+import scipy.sparse
 from scipy.spatial.transform import Rotation
 
 from nerfies_jax.evidence.tracks import Tracks
@@ -74,12 +76,21 @@ def _projected(views, seen, body):
 
 def adjusted(views: Views, seen: Sight, body: Body) -> Body:
     """The body that fits what was seen of it, from one nearby."""
+    return _descended(views, seen, body, _moved)
+
+
+def posed(views: Views, seen: Sight, body: Body) -> Body:
+    """The poses that fit what was seen of a body whose points are right."""
+    return _descended(views, seen, body, _turned)
+
+
+def _descended(views, seen, body, step):
     bend = _bend(views, body)
     cost, damping = _cost(views, seen, body, bend), DAMPING
     for _ in range(ROUNDS):
         system = _system(views, seen, body, bend)
         for _ in range(TRIES):
-            moved = _moved(body, system, damping)
+            moved = step(body, system, damping)
             new = _cost(views, seen, moved, bend)
             if new < cost:
                 break
@@ -148,24 +159,26 @@ def _weights(miss):
 
 
 def _products(weight, left, right):
-    return np.einsum("o,oki,okj->oij", weight, left, right)
+    # The three in one einsum take two and a half times as long.
+    return np.einsum("oki,okj->oij", weight[:, None, None] * left, right)
 
 
 def _summed(product, where, rows):
     """[rows, ...] sums of the entries of each row."""
-    total = np.zeros((rows, *product.shape[1:]))
-    np.add.at(total, where, product)
-    return total
+    entries = len(where)
+    # Seven times as fast as numpy.add.at on 60,000 matrices of 6 by 6.
+    which = scipy.sparse.csr_array(
+        (np.ones(entries), where, np.arange(entries + 1)), shape=(entries, rows)
+    )
+    total = which.T @ product.reshape(entries, math.prod(product.shape[1:]))
+    return total.reshape(rows, *product.shape[1:])
 
 
 def _moved(body, system, damping):
     size = np.einsum("nii->n", system.points) / 3
     ridge = damping * size + POINT_PRIOR * max(np.median(size), 1e-30)
     inverse = np.linalg.inv(system.points + ridge[:, None, None] * np.eye(3))
-    matrix = system.poses.copy()
-    diagonal = np.diagonal(matrix)
-    ridge = damping * diagonal + 1e-6 * np.median(diagonal) + 1e-30
-    matrix[np.diag_indices(len(matrix))] += ridge
+    matrix = _damped(system.poses, damping)
     onto = system.both @ inverse
     flat = (len(matrix), -1)
     matrix -= onto.transpose(1, 0, 2).reshape(flat) @ (
@@ -175,9 +188,26 @@ def _moved(body, system, damping):
     pose = np.linalg.solve(matrix, right)
     back = system.point_slope + np.einsum("nij,i->nj", system.both, pose)
     point = body.point - np.einsum("nij,nj->ni", inverse, back)
+    return _by(body._replace(point=point), pose)
+
+
+def _turned(body, system, damping):
+    return _by(
+        body, np.linalg.solve(_damped(system.poses, damping), -system.pose_slope)
+    )
+
+
+def _damped(matrix, damping):
+    diagonal = np.diagonal(matrix)
+    ridge = damping * diagonal + 1e-6 * np.median(diagonal) + 1e-30
+    return matrix + np.diag(ridge)
+
+
+def _by(body, pose):
+    """The body moved and turned by `pose` [6 frames]."""
     pose = pose.reshape(-1, 6)
     turn = Rotation.from_rotvec(pose[:, 3:]).as_matrix()
-    return Body(point, turn @ body.rotation, body.shift + pose[:, :3])
+    return body._replace(rotation=turn @ body.rotation, shift=body.shift + pose[:, :3])
 
 
 def placed(views: Views, seen: Sight, body: Body) -> Body:

@@ -9,6 +9,7 @@ is taken from the paths, whose errors have either sign.
 from collections.abc import Callable
 
 import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
 
 from nerfies_jax.evidence import bundle, rigid_groups
 from nerfies_jax.evidence.bundle import Body
@@ -19,6 +20,9 @@ from nerfies_jax.evidence.view_set import Views
 GROUPS = 12
 FEWEST = 20  # tracks of a body
 MOST = 300  # tracks that are adjusted; the others are placed afterwards
+# Frames in which a thing is adjusted: of longer films every second, every third, ...;
+# its work grows with the cube of them.
+MOST_FRAMES = 80
 LEAST_SHARE = 0.5  # of a group's tracks that a body must explain
 WITHIN_PX = 2 * TRACK_PX  # of a track that is on a body; half of them within one
 # Deviation of depths: 0.075 of the built-in fast cube, 0.03 of the slower one, whose
@@ -37,20 +41,22 @@ def refined(
 ) -> Paths:
     """The paths, those on rigid things placed by these; no others change.
 
-    `has_time` is asked before each thing and each round of its growth: a round may take
-    half a minute of a film of 300 frames.
+    `has_time` is asked before each thing and each round of its growth.
 
     Only things whose depth the paths tell badly: where they tell it well, a cloth that
     is nearly rigid comes out four times worse. A track is no longer known where too
     little of its body is seen.
     """
     position, known = paths.position.copy(), paths.known.copy()
-    left = paths.known.sum(1) >= LEAST_KNOWN
+    every = -(-len(views.time) // MOST_FRAMES)
+    some = _some_frames(views, tracks, paths, every)
+    left = some[-1].known.sum(1) >= LEAST_KNOWN
     if left.sum() < FEWEST:
         return paths
     rows = np.flatnonzero(left)
     label = np.full(len(left), -1)
-    label[rows] = rigid_groups.labels(position[rows], known[rows], GROUPS)
+    few = some[-1]
+    label[rows] = rigid_groups.labels(few.position[rows], few.known[rows], GROUPS)
     for group in np.argsort(-np.bincount(label[rows], minlength=GROUPS), kind="stable"):
         own = np.flatnonzero((label == group) & left)
         if len(own) < FEWEST or np.median(paths.depth_deviation[own]) < BADLY_TOLD:
@@ -58,14 +64,45 @@ def refined(
         if not has_time():
             break
         rows = np.flatnonzero(left)
-        grown = _grown(views, tracks, paths, own, rows, has_time)
+        grown = _grown(*some, own, rows, has_time)
         if grown is None:
             continue
         own, body = grown
+        if every > 1:
+            body = _in_all_frames(views, tracks, paths, own, body, every)
         position[own], known[own] = _at_paths_scale(views, paths, own, body)
         left[own] = False
     depth = views.depth_of(position)
     return Paths(position, known, depth, paths.depth_deviation)
+
+
+def _some_frames(views, tracks, paths, every):
+    """All three as of a film of every so many frames."""
+    if every == 1:
+        return views, tracks, paths
+    kept = slice(None, None, every)
+    rarer = {
+        name: getattr(paths, name)[:, kept] for name in ("position", "known", "depth")
+    }
+    return (
+        Views(*(part[kept] for part in views)),
+        Tracks(tracks.start // every, tracks.pixel[:, kept], tracks.seen[:, kept]),
+        paths._replace(**rarer),
+    )
+
+
+def _in_all_frames(views, tracks, paths, own, body, every):
+    """A body of every so many frames, posed by what was seen of it in the others."""
+    frames = np.arange(len(views.time))
+    kept = frames[::every]
+    within = np.minimum(frames, kept[-1])  # it stays where it was last
+    turn = Slerp(kept, Rotation.from_matrix(body.rotation))(within).as_matrix()
+    shift = np.stack([np.interp(within, kept, axis) for axis in body.shift.T], -1)
+    between = Body(body.point, turn, shift)
+    some = np.isin(own, _fewer(paths, own))
+    seen = bundle.sight(views, tracks.take(own[some]), paths.known[own[some]])
+    first = between._replace(point=body.point[some])
+    return bundle.posed(views, seen, first)._replace(point=body.point)
 
 
 def _grown(views, tracks, paths, own, rows, has_time):

@@ -89,6 +89,20 @@ def test_a_thing_that_swings_faster_than_the_camera_is_placed_by_its_own_size():
     np.testing.assert_array_equal(hasty.position, alone.position)
 
 
+def test_of_a_long_film_a_thing_is_adjusted_in_some_frames_and_posed_in_all(
+    monkeypatch,
+):
+    seen_from, world = views(), turning_body()
+    tracks = tracks_of(seen_from, world)
+    alone = first_paths(seen_from, tracks, world)
+    whole = rigid_bodies.refined(seen_from, tracks, alone)
+    monkeypatch.setattr(rigid_bodies, "MOST_FRAMES", FRAMES // 2)  # every second
+    some = rigid_bodies.refined(seen_from, tracks, alone)
+    assert some.known.sum() > 0.9 * whole.known.sum()
+    true = world[..., 2] - seen_from.position[:, 2]
+    assert np.std((some.depth / true)[some.known]) < 0.01
+
+
 def test_what_bends_keeps_its_own_paths():
     seen_from, world = views(), turning_body()
     time = np.linspace(0, 1, FRAMES)
