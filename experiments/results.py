@@ -112,9 +112,7 @@ STUDIES = {
         "ablate_sonata", "--suite sonata --steps 900 --jobs 2", of="ablate"
     ),
     "ablate_moba": _package(
-        "ablate_moba",
-        "--suite moba --arms full no-basis deformable static --steps 900 --jobs 2",
-        of="ablate",
+        "ablate_moba", "--suite moba --steps 900 --jobs 2", of="ablate"
     ),
     "deformation_cost": _package("deformation_cost", "--out deformation_cost.json"),
     "spectral_bias": _package(
