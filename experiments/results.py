@@ -42,18 +42,17 @@ The errors and costs of single formulas are in [numerics.md](../numerics.md), wh
 
 Earlier READMEs had tables of ablations (fields, Sonata, MoBa-GS), of equal training
 time, of deformation, solvers and local kernels. They are gone because no file stood
-behind them: nobody could check them without hours of processor time. The ablations
-said little besides: what moves was found badly by every arm then (points were
-followed with nearly the error of points that do not move at all), so that hardly a
-difference between arms left the spread over seeds. From tracks it is found: what that
-start is worth to four motions of splats stands in [ablate_start.md](ablate_start.md),
-what the parts of Sonata and the bases of MoBa-GS are worth behind it in
-[ablate_sonata.md](ablate_sonata.md) and [ablate_moba.md](ablate_moba.md), and what the
-parts of our own default are, in [ablate_tracked.md](ablate_tracked.md). The first two
-were measured before the fits of networks to tracks held what is at rest, and before
-what stands hidden was filled, and are to be measured again; MoBa-GS' annealing,
-alternation, acceleration, growth and numbers of bases, and the suite of fields, are
-still to be measured from such fits. The ten other systems of the papers' tables, and
+behind them: nobody could check them without hours of processor time. The ablations said
+little besides: what moves was found badly by every arm then (points were followed with
+nearly the error of points that do not move at all), so that hardly a difference between
+arms left the spread over seeds. From tracks it is found: what that start is worth to
+four motions of splats stands in [ablate_start.md](ablate_start.md), what the parts of
+Sonata and of MoBa-GS are worth behind it in [ablate_sonata.md](ablate_sonata.md) and
+[ablate_moba.md](ablate_moba.md), and what the parts of our own default are, in
+[ablate_tracked.md](ablate_tracked.md). The first was measured before the fits of
+networks to tracks held what is at rest, and before Sonata's small network trained at
+the published rate, and is to be measured again; the suite of fields, and all of them on
+a real film, are still to be measured. The ten other systems of the papers' tables, and
 the margins that these print, stand in [league.md](league.md), of one seed so far.
 """
 
