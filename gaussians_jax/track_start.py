@@ -39,7 +39,7 @@ class TrackStart(NamedTuple):
     nets: Any  # of the motion
     time: np.ndarray  # [moving] of the picture that each was lifted from, in films
     followed: np.ndarray  # [moving] for how long tracks near it were, in films
-    resting: Resting | None  # what the networks were fitted to hold still
+    resting: Resting | None = None  # what the networks were fitted to hold still
 
 
 def start(
