@@ -50,12 +50,12 @@ def refined(
     position, known = paths.position.copy(), paths.known.copy()
     every = -(-len(views.time) // MOST_FRAMES)
     some = _some_frames(views, tracks, paths, every)
-    left = some[-1].known.sum(1) >= LEAST_KNOWN
+    few = some[-1]
+    left = few.known.sum(1) >= LEAST_KNOWN
     if left.sum() < FEWEST:
         return paths
     rows = np.flatnonzero(left)
     label = np.full(len(left), -1)
-    few = some[-1]
     label[rows] = rigid_groups.labels(few.position[rows], few.known[rows], GROUPS)
     for group in np.argsort(-np.bincount(label[rows], minlength=GROUPS), kind="stable"):
         own = np.flatnonzero((label == group) & left)
