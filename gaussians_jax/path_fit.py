@@ -6,7 +6,6 @@ fitted: its networks, its rows and the canonical places of the points are descen
 together on the distance between where it carries the points and where they were seen.
 """
 
-import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -187,20 +186,20 @@ def guess(effect: Effect, paths: Paths, key: Key[Array, ""]) -> Guess:
     canonical = jnp.asarray(places_at_one_moment(paths), jnp.float32)
     still = resting(paths) if effect.init is not None else None
     rows_key, nets_key = jax.random.split(key)
-    rows = nets = None
+    rows = still_rows = nets = row_rate = None
     if effect.init_rows is not None:
-        rows, kept = _first_rows(effect, canonical, still, rows_key)
+        rows, still_rows = _first_rows(effect, canonical, still, rows_key)
+        row_rate = 1.0
     if effect.init is not None:
         nets = effect.init(nets_key)
-    rates = Points(
-        paths.unit, None if rows is None else 1.0, None if nets is None else 0.4
-    )
+    points = Points(canonical, rows, nets)
+    rates = Points(paths.unit, row_rate, None if nets is None else 0.4)
     if still is None:
-        return Guess(Points(canonical, rows, nets), rates)
-    at_rest = Resting(still, None if rows is None else kept)
-    rates = rates._replace(resting=Resting(0.0, None if rows is None else 1.0))
+        return Guess(points, rates)
     return Guess(
-        Points(canonical, rows, nets, at_rest), rates, _unrest_of(effect, paths.unit)
+        points._replace(resting=Resting(still, still_rows)),
+        rates._replace(resting=Resting(0.0, row_rate)),
+        _unrest_of(effect, paths.unit),
     )
 
 
@@ -210,9 +209,9 @@ def _first_rows(effect, canonical, still, key):
     blank = scene_of(effect, Points(every, None, None))
     rows = effect.init_rows(key, blank.rows["splats"])
     count = len(canonical)
-    return tuple(
-        jax.tree.map(operator.itemgetter(part), rows)
-        for part in (slice(count), slice(count, None))
+    return (
+        jax.tree.map(lambda leaf: leaf[:count], rows),
+        jax.tree.map(lambda leaf: leaf[count:], rows),
     )
 
 

@@ -291,9 +291,7 @@ SONATA = Suite(
 )
 
 # From tracks the cap of the small preset is reached before motion may guide growth,
-# and what is at rest is moved by 0.015 to 0.03 of the extent (built-in scene, half of
-# the Gaussians): the preset's threshold of 0.001 lets all of them grow, bit for bit as
-# without a guide.
+# and its threshold guides nothing (`MotionGrowthSpec`).
 ROOM = ("densification.cap_max=14000", "motion.warm_up=0")
 GUIDED = (*ROOM, "motion_growth.start=1", "motion_growth.motion=0.04")
 

@@ -98,11 +98,10 @@ def _in_all_frames(views, tracks, paths, own, body, every):
     within = np.minimum(frames, kept[-1])  # it stays where it was last
     turn = Slerp(kept, Rotation.from_matrix(body.rotation))(within).as_matrix()
     shift = np.stack([np.interp(within, kept, axis) for axis in body.shift.T], -1)
-    between = Body(body.point, turn, shift)
     some = np.isin(own, _fewer(paths, own))
     seen = bundle.sight(views, tracks.take(own[some]), paths.known[own[some]])
-    first = between._replace(point=body.point[some])
-    return bundle.posed(views, seen, first)._replace(point=body.point)
+    posed = bundle.posed(views, seen, Body(body.point[some], turn, shift))
+    return posed._replace(point=body.point)
 
 
 def _grown(views, tracks, paths, own, rows, has_time):
