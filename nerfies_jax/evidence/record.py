@@ -42,7 +42,7 @@ from nerfies_jax.evidence.tracks import Tracks
 from nerfies_jax.evidence.view_set import Views
 from nerfies_jax.evidence.watch import ENOUGH_SECONDS, Seconds, Watch
 
-VERSION = 10
+VERSION = 11
 # A path has as many frames at least, and a film as many; fewer say nothing of motion.
 SHORTEST_PATH, SHORTEST_FILM = 10, 6
 MOVES = 0.5  # score from which a track counts as moving
