@@ -15,7 +15,7 @@ class TrackStartSpec:
 
     motion: str = "none"
     fit_steps: int = 1500
-    fit_rate: float = 1e-3
+    fit_rate: float = 3e-3
     use_depths: bool = False
 
     def __post_init__(self):

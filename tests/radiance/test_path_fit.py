@@ -73,6 +73,11 @@ def test_a_fitted_warp_brings_a_body_to_one_place_and_moves_no_wall(name):
         # Also where a path was not known.
         off = np.linalg.norm(back - fitted.canonical, axis=-1)
         assert np.median(off) < 0.04
+        # It keeps its size: all of it in one point would be near to its place, too.
+        size = np.linalg.norm(back - back.mean(0), axis=-1)
+        body = paths.position[:, frame]
+        true = np.linalg.norm(body - body.mean(0), axis=-1)
+        assert 0.9 < np.median(size / true) < 1.1
         wall = carried(field, fitted.params, paths.time[frame], paths.still)
         assert np.median(np.linalg.norm(wall - paths.still, axis=-1)) < 0.03
 
