@@ -179,12 +179,24 @@ def descend(
 def learning_rates(
     spec: RadianceScene, effects: tuple[Effect, ...], params: PyTree, step: Array
 ) -> dict[str, PyTree]:
-    """Of each part of the parameters: the effect's own, or that of the schedule."""
+    """Of each part of the parameters: the effect's own, or that of the schedule.
+
+    A warp that starts from tracks, and the codes that it reads, begin with a share.
+    """
     own = {e.name: e.learning_rate for e in effects if e.learning_rate is not None}
     common = schedules.log_linear(
         spec.learning_rate, spec.learning_rate_end, spec.steps
     )(step)
     rates = {name: own[name](step) if name in own else common for name in params}
+    if spec.start.motion == "tracks":
+        held = schedules.log_linear(spec.start.first_rate, 1.0, spec.steps)(step)
+        warps = [effect for effect in effects if effect.displace is not None]
+        tables = {table.name for effect in warps for table in effect.tables}
+        rates |= {effect.name: held * rates[effect.name] for effect in warps}
+        rates["codes"] = {
+            name: held * rates["codes"] if name in tables else rates["codes"]
+            for name in params["codes"]
+        }
     template = spec.template_rate * common
     if spec.table_rate != 1:
         tables = spec.table_rate * template

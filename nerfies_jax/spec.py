@@ -33,7 +33,7 @@ from nerfies_jax.radiance.template import TemplateSpec
 from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.training import schedules
 from nerfies_jax.training.effects import Effect, Table
-from nerfies_jax.training.track_start import TrackStartSpec
+from nerfies_jax.training.track_start import FieldStartSpec
 
 WARPS = {WarpSpec: warp.effect, TimeWarpSpec: time_warp.effect}
 
@@ -100,7 +100,7 @@ class RadianceScene:
     smoothness: SmoothnessSpec | None = None
     mask: MovingMaskSpec | None = None
     surface: SurfaceSpec | None = None
-    start: TrackStartSpec = TrackStartSpec()
+    start: FieldStartSpec = FieldStartSpec()
 
     def __post_init__(self):
         if self.steps < 1 or self.rays < 1:

@@ -39,8 +39,8 @@ def evidence_to_start_from(capture: Capture, start: TrackStartSpec) -> Evidence 
     warnings.warn(
         f"{capture.path or capture.name}: the motion starts from rest, for tracks are "
         f"of no use here: {reason}; what moves by more than a few pixels will not be "
-        "found. It moves from the first step on, with all bands open: "
-        "start.motion=none gives the preset's own warm-up back",
+        "found. It moves from the first step on, with all bands open, and a field's "
+        "warp learns slowly: start.motion=none gives the preset's own schedule back",
         RuntimeWarning,
         stacklevel=2,
     )

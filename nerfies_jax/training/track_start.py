@@ -28,3 +28,27 @@ class TrackStartSpec:
             )
         if not self.fit_rate > 0:
             raise ValueError(f"fit_rate={self.fit_rate} must be positive")
+
+
+@dataclasses.dataclass(frozen=True)
+class FieldStartSpec(TrackStartSpec):
+    """How a radiance field that moves starts.
+
+    A warp that was fitted to tracks learns from the pictures with `first_rate` times
+    its learning rate at first, and with all of it at the end (a line in the logarithm):
+    a template that is still blurred says nothing of where things are, and led the warp
+    back to where nothing moves.
+    """
+
+    # Built-in scene, 900 steps of `nerfies-grid-small`, one seed: where it moves and
+    # end-point error of points, from 1: 17.2 dB, 0.0233 (0.0233 where nothing moves);
+    # 0.1 throughout: 22.4, 0.0097; 0: 22.8, 0.0097; 0.01 to 1: 23.4, 0.0085.
+    first_rate: float = 0.01
+
+    def __post_init__(self):
+        super().__post_init__()
+        if not 0 < self.first_rate <= 1:
+            raise ValueError(
+                f"start.first_rate={self.first_rate} must be a share of the warp's "
+                "learning rate, above 0 and at most 1"
+            )

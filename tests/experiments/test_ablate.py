@@ -20,7 +20,7 @@ from experiments.ablate.settings import Ablate
 from nerfies_jax.capture import synthetic
 from nerfies_jax.measure import clock
 from nerfies_jax.runs import platform
-from nerfies_jax.training.track_start import TrackStartSpec
+from nerfies_jax.training.track_start import FieldStartSpec
 from tests import scenes
 
 
@@ -33,9 +33,9 @@ def test_arms_differ_from_nerfies_only_in_what_their_name_says():
     changed = {
         "no-elastic": {"elastic": None},
         "no-background": {"background": None},
-        "from-rest": {"start": TrackStartSpec()},
+        "from-rest": {"start": FieldStartSpec()},
         "coarse-to-fine": {
-            "start": TrackStartSpec(),
+            "start": FieldStartSpec(),
             "warp": dataclasses.replace(whole.warp, anneal_steps=300),
         },
         "translation": {"warp": dataclasses.replace(whole.warp, kind="translation")},

@@ -10,13 +10,14 @@ from scipy.spatial.transform import Rotation
 
 from nerfies_jax import path_fit, presets, scene
 from nerfies_jax.effects import scene_flow
+from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.path_fit import FilmPaths
 from nerfies_jax.training.effects import FrameCondition
 from nerfies_jax.training.model import View
-from nerfies_jax.training.track_start import TrackStartSpec
+from nerfies_jax.training.track_start import FieldStartSpec
 
 FRAMES = 16
-TRACKS = TrackStartSpec("tracks", fit_steps=300, fit_rate=2e-3)
+TRACKS = FieldStartSpec("tracks", fit_steps=300, fit_rate=2e-3)
 
 
 def turning_body(points=40):
@@ -82,6 +83,24 @@ def test_a_fitted_warp_brings_a_body_to_one_place_and_moves_no_wall(name):
         assert np.median(np.linalg.norm(wall - paths.still, axis=-1)) < 0.03
 
 
+@pytest.mark.parametrize(("start", "first"), [(TRACKS, 0.01), (FieldStartSpec(), 1.0)])
+def test_what_tracks_have_found_learns_slowly_at_first(start, first):
+    spec = dataclasses.replace(
+        presets.PRESETS["nerfies-small"], start=start, appearance=AppearanceSpec()
+    )
+    effects = field_of("nerfies-small").effects
+    codes = {"motion": None, "appearance": None}
+    params = dict.fromkeys(("warp", "template")) | {"codes": codes}
+    for step, share in ((0, first), (spec.steps // 2, first**0.5), (spec.steps, 1)):
+        rates = scene.learning_rates(spec, effects, params, jnp.int32(step))
+        of_codes = rates["codes"]
+        if start is TRACKS:
+            np.testing.assert_allclose(of_codes["appearance"], rates["template"])
+            of_codes = of_codes["motion"]
+        for own in (rates["warp"], of_codes):
+            np.testing.assert_allclose(own / rates["template"], share, rtol=1e-5)
+
+
 def test_a_fitted_flow_leads_from_one_place_to_the_next_and_from_no_wall():
     """Against the body's own velocity; also where frames are two moments apart.
 
@@ -145,3 +164,5 @@ def test_what_cannot_be_fitted_is_refused_by_name():
         )
     with pytest.raises(ValueError, match=r'start\.motion="tracks" fits a warp'):
         dataclasses.replace(presets.PRESETS["nerf-small"], start=TRACKS)
+    with pytest.raises(ValueError, match=r"start\.first_rate=0.0 must be a share"):
+        FieldStartSpec(first_rate=0.0)
