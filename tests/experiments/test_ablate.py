@@ -43,9 +43,12 @@ def test_arms_differ_from_nerfies_only_in_what_their_name_says():
     for name, fields in changed.items():
         assert specs[name] == dataclasses.replace(whole, **fields)
     shared = ("steps", "rays", "sampling", "template", "coarse", "extent")
-    for spec in specs.values():
-        assert all(getattr(spec, x) == getattr(whole, x) for x in shared)
-        assert spec.learning_rate == whole.learning_rate
+    mlps = {name: specs.pop(name) for name in ("nerfies-mlp", "t-nerf")}
+    for group in (specs, mlps):
+        one = next(iter(group.values()))
+        for spec in group.values():
+            assert all(getattr(spec, x) == getattr(one, x) for x in shared)
+            assert spec.learning_rate == one.learning_rate
 
 
 @pytest.fixture
@@ -194,6 +197,6 @@ def test_the_command_measures_arms_and_goes_on_where_it_stopped(
         assert "remove it to run it again" in capsys.readouterr().err
     # With no time left nothing is begun, and what is finished is reported.
     monkeypatch.setattr(Job, "is_over", lambda *_: True)
-    assert run(*tiny, "--arms", "nerfies", "d-nerf") == 0
-    assert "1 arms and seeds are left: d-nerf 0" in capsys.readouterr().out
+    assert run(*tiny, "--arms", "nerfies", "translation") == 0
+    assert "1 arms and seeds are left: translation 0" in capsys.readouterr().out
     assert jax.config.jax_enable_compilation_cache
