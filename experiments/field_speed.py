@@ -3,16 +3,19 @@
     python -m experiments.field_speed --captures CAPTURE CAPTURE --out field_speed.json
     python -m experiments.field_speed --captures CAPTURE --presets nerf-grid-small
     python -m experiments.field_speed --captures CAPTURE --seeds 3
+    python -m experiments.field_speed --presets nerfies-grid-small+tracks
 
-Each preset is trained on each capture, once for each seed and each of the given
-processor seconds, over the steps that it can make in them, its schedules in proportion,
-and scored on frames that it does not learn from; compiling counts nothing, nor does a
-start from tracks. *spent* is what these steps took in the end. After the longest a
-frame is drawn behind the survey of its empty space (`nerfies_jax.skipping`) and by the
-full quadrature: milliseconds are medians of the processor over five frames, without the
-survey, which has a column of its own, and decibels are of the difference between the
-two. Over several seeds the table has means, and beside a PSNR its standard deviation.
-What is in `--out` already is not measured again: an interrupted run goes on, and more
+Each preset (`+tracks`: its motion fitted to tracks first) is trained on each capture,
+once for each seed and each of the given processor seconds, over the steps that it can
+make in them, its schedules in proportion, and scored on frames that it does not learn
+from, *moving* where something moves (by the capture's masks, or the pictures' where it
+has none); compiling counts nothing, nor does a start from tracks. *spent* is what these
+steps took in the end. After the longest a frame is drawn behind the survey of its empty
+space (`nerfies_jax.skipping`) and by the full quadrature: milliseconds are medians of
+the processor over five frames, without the survey, which has a column of its own, and
+decibels are of the difference between the two.
+Over several seeds the table has means, and beside a PSNR its standard deviation. What
+is in `--out` already is not measured again: an interrupted run goes on, and more
 `--seeds` add those that it lacks.
 """
 
@@ -27,7 +30,9 @@ import time
 from experiments import cli, markdown
 from nerfies_jax.runs import platform, representations
 
+TRACKS = "+tracks"
 PRESETS = ("nerf-small", "nerf-grid-small", "nerfies-small", "nerfies-grid-small")
+PRESETS += ("nerfies-grid-small" + TRACKS,)
 FRAMES = 5  # timed, after one that makes the survey
 TIMES = ("skipped_ms", "full_ms", "survey_ms")
 PILOT_STEPS = 50  # that tell what one takes
@@ -52,7 +57,7 @@ class FieldSpeed:
 
     def __post_init__(self):
         for name in self.presets:
-            if name not in representations.PRESETS:
+            if name.removesuffix(TRACKS) not in representations.PRESETS:
                 raise ValueError(f"--presets {name}: no such preset")
         rising = list(self.seconds) == sorted(set(self.seconds))
         if not self.seconds or not rising or self.seconds[0] <= 0:
@@ -103,18 +108,42 @@ def measured(capture, preset: str, seconds, size: tuple[int, int], seed: int) ->
     from nerfies_jax import evaluation
     from nerfies_jax.runs import plan
 
-    whole = representations.of_preset(preset).presets[preset].steps
+    name = preset.removesuffix(TRACKS)
+    whole = representations.of_preset(name).presets[name].steps
     a_step = _trained(capture, preset, whole, seed, PILOT_STEPS)[0] / PILOT_STEPS
-    scores, steps, spent = [], [], []
+    scores, moving, steps, spent = [], [], [], []
     for limit in seconds:
         steps.append(plan.rounded(limit / a_step))
         took, model, state = _trained(capture, preset, steps[-1], seed)
         renderer = evaluation.Renderer(model, capture.size)
         scored = evaluation.score(renderer, state, capture, capture.heldout)
         scores.append(float(scored.psnr.mean()))
+        moving.append(_moving_psnr(scored, capture))
         spent.append(took)
-    found = {"psnr": scores, "steps": steps, "spent": spent}
+    found = {"psnr": scores, "moving_psnr": moving, "steps": steps, "spent": spent}
     return found | drawn(model, state, capture, size)
+
+
+def _moving_psnr(scored, capture):
+    """Mean over the frames in which something moves; None where nothing does."""
+    import numpy as np
+
+    from nerfies_jax.capture.cache import CACHE
+    from nerfies_jax.evaluation import moving_masks
+    from nerfies_jax.measure import image_quality
+
+    masked, _ = moving_masks.with_masks(capture, CACHE / "evidence")
+    if masked.moving is None or not masked.moving[scored.rows].any():
+        return None
+    each = []
+    for row, colour in zip(scored.rows, scored.colour, strict=True):
+        where = masked.moving[row]
+        where = where if capture.valid is None else where & capture.valid[row]
+        truth = capture.images[row].astype(np.float32) / 255
+        if where.any():
+            picture = image_quality.quantise(colour)
+            each.append(float(image_quality.masked_psnr(picture, truth, where)))
+    return statistics.fmean(each)
 
 
 def _trained(capture, preset, planned, seed, steps=None):
@@ -123,10 +152,13 @@ def _trained(capture, preset, planned, seed, steps=None):
     import rich.console
 
     from nerfies_jax import evaluation
-    from nerfies_jax.training import loop
+    from nerfies_jax.training import loop, specs
 
-    representation = representations.of_preset(preset)
-    spec = representation.with_steps(representation.presets[preset], planned)
+    name = preset.removesuffix(TRACKS)
+    representation = representations.of_preset(name)
+    spec = representation.with_steps(representation.presets[name], planned)
+    if name != preset:
+        spec = specs.override(spec, ("start.motion=tracks",))
     model = representation.build(spec, representation.metadata_of(capture, spec))
     state = model.init(capture, jax.random.key(seed))
     frames = evaluation.frames_of(capture, model.required_data)
@@ -177,6 +209,7 @@ def page(stored) -> str:
         "steps",
         "spent, s",
         "PSNR",
+        "moving",
         "frame, ms",
     )
     heads += ("full, ms", "survey, ms", "alike, dB")
@@ -202,7 +235,10 @@ def page(stored) -> str:
                     str(len(seeds)),
                     markdown.number(steps, 0),
                     markdown.number(spent, 0),
-                    _with_spread([row["psnr"][place] for row in seeds]),
+                    *(
+                        _with_spread([row[name][place] for row in seeds])
+                        for name in ("psnr", "moving_psnr")
+                    ),
                     *(markdown.number(number, 0) for number in times),
                     markdown.number(_mean(seeds, "alike_db") if last else None, 1),
                 ]
@@ -217,6 +253,8 @@ def _mean(rows, name):
 
 
 def _with_spread(values):
+    if None in values:
+        return ""
     mean = markdown.number(statistics.fmean(values), 2)
     if len(values) == 1:
         return mean

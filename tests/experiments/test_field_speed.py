@@ -20,19 +20,20 @@ def test_only_seeds_that_are_missing_are_measured_and_all_are_in_the_table(
 
     def measured(capture, preset, seconds, size, seed):
         asked.append((preset, seed))
-        return {"psnr": [20 + seed, 22 + 2 * seed], "alike_db": 60.0} | NUMBERS
+        moving = [18.0 + seed, None]
+        psnr = {"psnr": [20 + seed, 22 + 2 * seed], "moving_psnr": moving}
+        return psnr | {"alike_db": 60.0} | NUMBERS
 
     monkeypatch.setattr(field_speed, "measured", measured)
     monkeypatch.setattr(field_speed, "_captures", lambda folders: {"one": None})
     out = tmp_path / "out.json"
-    presets = ["nerf-small", "nerf-grid-small"]
+    presets = ["nerf-small", "nerf-grid-small+tracks"]
     for seeds in (1, 2, 2):
         command = f"--seconds 1 2 --seeds {seeds} --out {out} --presets"
         field_speed.main([*command.split(), *presets])
     assert asked == [(preset, seed) for seed in (0, 1) for preset in presets]
     page = field_speed.page(json.loads(out.read_text())).splitlines()
-    assert page[2] == "| one | nerf-small | 1 | 2 | 9 | 1 | 20.50 ± 0.71 |  |  |  |  |"
-    last = (
-        "| one | nerf-grid-small | 2 | 2 | 19 | 2 | 23.00 ± 1.41 | 30 | 90 | 8 | 60.0 |"
-    )
-    assert page[5] == last
+    first = "| one | nerf-small | 1 | 2 | 9 | 1 | 20.50 ± 0.71 | 18.50 ± 0.71 |"
+    assert page[2] == first + "  |  |  |  |"
+    last = "| one | nerf-grid-small+tracks | 2 | 2 | 19 | 2 | 23.00 ± 1.41 |  |"
+    assert page[5] == last + " 30 | 90 | 8 | 60.0 |"
