@@ -13,10 +13,9 @@ has none); compiling counts nothing, nor does a start from tracks. *spent* is wh
 steps took in the end. After the longest a frame is drawn behind the survey of its empty
 space (`nerfies_jax.skipping`) and by the full quadrature: milliseconds are medians of
 the processor over five frames, without the survey, which has a column of its own, and
-decibels are of the difference between the two.
-Over several seeds the table has means, and beside a PSNR its standard deviation. What
-is in `--out` already is not measured again: an interrupted run goes on, and more
-`--seeds` add those that it lacks.
+decibels are of the difference between the two. Over several seeds the table has means,
+and beside a PSNR its standard deviation. What is in `--out` already is not measured
+again: an interrupted run goes on, and more `--seeds` add those that it lacks.
 """
 
 import dataclasses

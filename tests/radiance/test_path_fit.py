@@ -1,6 +1,7 @@
 """Warps of fields fitted to known paths."""
 
 import dataclasses
+import types
 
 import jax
 import jax.numpy as jnp
@@ -81,6 +82,34 @@ def test_a_fitted_warp_brings_a_body_to_one_place_and_moves_no_wall(name):
         assert 0.9 < np.median(size / true) < 1.1
         wall = carried(field, fitted.params, paths.time[frame], paths.still)
         assert np.median(np.linalg.norm(wall - paths.still, axis=-1)) < 0.03
+
+
+@pytest.mark.hard_cases
+def test_a_warp_into_one_point_has_finite_slopes(dtype):
+    path, time = turning_body()
+    rest = np.zeros((1, 3), dtype)
+    ids = np.zeros(FRAMES, int)
+    paths = FilmPaths(time, ids, path.astype(dtype), path[..., 0] < 9, rest)
+    field = types.SimpleNamespace(
+        spec=types.SimpleNamespace(steps=1),
+        codes_at=lambda *_: {},
+        displace=lambda params, point, _: -params["share"] * point,
+    )
+    distances = path_fit._distances(field, {}, paths)
+    drawn = jnp.arange(4), jnp.arange(40), jnp.asarray(rest), jax.random.key(0)
+
+    def stretch(share):
+        places = jnp.asarray(path[:, 0], dtype)
+        return distances({"share": share}, places, *drawn)[2]
+
+    value, slope = jax.value_and_grad(stretch)(jnp.asarray(1.0, dtype))
+    expected = path_fit.STRETCH * (np.log(path_fit.LEAST_STRETCH) / 2) ** 2
+    np.testing.assert_allclose(value, expected, rtol=1e-5)
+    assert np.isfinite(slope)
+    # What keeps its size costs nothing, half of it the square of its logarithm.
+    assert stretch(jnp.asarray(0.0, dtype)) < 1e-6
+    half = path_fit.STRETCH * np.log(2) ** 2
+    np.testing.assert_allclose(stretch(jnp.asarray(0.5, dtype)), half, rtol=1e-4)
 
 
 @pytest.mark.parametrize(("start", "first"), [(TRACKS, 0.01), (FieldStartSpec(), 1.0)])
