@@ -11,7 +11,7 @@ from tests import scenes
 
 # OUT is a folder that is not there.
 TABLE = [
-    ("ablate", "--arms nerfy", "in --suite fields there are static, t-nerf"),
+    ("ablate", "--arms nerfy", "in --suite fields there are nerfies, no-elastic"),
     ("ablate", "--suite moba --arms nerfies", "there are full, no-basis"),
     ("ablate", "--seeds 0", "positive"),
     ("ablate", "--budget -1", "positive"),

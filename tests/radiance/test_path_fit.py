@@ -98,11 +98,12 @@ def test_a_warp_into_one_point_has_finite_slopes(dtype):
     distances = path_fit._distances(field, {}, paths)
     drawn = jnp.arange(4), jnp.arange(40), jnp.asarray(rest), jax.random.key(0)
 
+    @jax.jit
     def stretch(share):
         places = jnp.asarray(path[:, 0], dtype)
         return distances({"share": share}, places, *drawn)[2]
 
-    value, slope = jax.value_and_grad(stretch)(jnp.asarray(1.0, dtype))
+    value, slope = jax.jit(jax.value_and_grad(stretch))(jnp.asarray(1.0, dtype))
     expected = path_fit.STRETCH * (np.log(path_fit.LEAST_STRETCH) / 2) ** 2
     np.testing.assert_allclose(value, expected, rtol=1e-5)
     assert np.isfinite(slope)
