@@ -105,10 +105,12 @@ def _captures(folders):
 def measured(capture, preset: str, seconds, size: tuple[int, int], seed: int) -> dict:
     """Scores after each of the seconds, and what a frame takes after the last."""
     from nerfies_jax import evaluation
+    from nerfies_jax.capture.cache import CACHE
+    from nerfies_jax.evaluation import moving_masks
     from nerfies_jax.runs import plan
 
-    name = preset.removesuffix(TRACKS)
-    whole = representations.of_preset(name).presets[name].steps
+    masked, _ = moving_masks.with_masks(capture, CACHE / "evidence")
+    whole = _named(preset)[1].steps
     a_step = _trained(capture, preset, whole, seed, PILOT_STEPS)[0] / PILOT_STEPS
     scores, moving, steps, spent = [], [], [], []
     for limit in seconds:
@@ -117,7 +119,7 @@ def measured(capture, preset: str, seconds, size: tuple[int, int], seed: int) ->
         renderer = evaluation.Renderer(model, capture.size)
         scored = evaluation.score(renderer, state, capture, capture.heldout)
         scores.append(float(scored.psnr.mean()))
-        moving.append(_moving_psnr(scored, capture))
+        moving.append(_moving_psnr(scored, masked))
         spent.append(took)
     found = {"psnr": scores, "moving_psnr": moving, "steps": steps, "spent": spent}
     return found | drawn(model, state, capture, size)
@@ -127,22 +129,31 @@ def _moving_psnr(scored, capture):
     """Mean over the frames in which something moves; None where nothing does."""
     import numpy as np
 
-    from nerfies_jax.capture.cache import CACHE
-    from nerfies_jax.evaluation import moving_masks
     from nerfies_jax.measure import image_quality
 
-    masked, _ = moving_masks.with_masks(capture, CACHE / "evidence")
-    if masked.moving is None or not masked.moving[scored.rows].any():
+    if capture.moving is None:
         return None
     each = []
     for row, colour in zip(scored.rows, scored.colour, strict=True):
-        where = masked.moving[row]
+        where = capture.moving[row]
         where = where if capture.valid is None else where & capture.valid[row]
         truth = capture.images[row].astype(np.float32) / 255
         if where.any():
             picture = image_quality.quantise(colour)
             each.append(float(image_quality.masked_psnr(picture, truth, where)))
-    return statistics.fmean(each)
+    return statistics.fmean(each) if each else None
+
+
+def _named(preset):
+    """The representation of a preset, and what it trains."""
+    from nerfies_jax.training import specs
+
+    name = preset.removesuffix(TRACKS)
+    representation = representations.of_preset(name)
+    spec = representation.presets[name]
+    if name != preset:
+        spec = specs.override(spec, ("start.motion=tracks",))
+    return representation, spec
 
 
 def _trained(capture, preset, planned, seed, steps=None):
@@ -151,13 +162,10 @@ def _trained(capture, preset, planned, seed, steps=None):
     import rich.console
 
     from nerfies_jax import evaluation
-    from nerfies_jax.training import loop, specs
+    from nerfies_jax.training import loop
 
-    name = preset.removesuffix(TRACKS)
-    representation = representations.of_preset(name)
-    spec = representation.with_steps(representation.presets[name], planned)
-    if name != preset:
-        spec = specs.override(spec, ("start.motion=tracks",))
+    representation, spec = _named(preset)
+    spec = representation.with_steps(spec, planned)
     model = representation.build(spec, representation.metadata_of(capture, spec))
     state = model.init(capture, jax.random.key(seed))
     frames = evaluation.frames_of(capture, model.required_data)

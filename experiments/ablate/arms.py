@@ -48,14 +48,14 @@ TRACKED = (*MOVING, "track_error")
 FROM_TRACKS = "start.motion=tracks"
 # One view a step and Gaussians that are always there, as in the presets beside it.
 BASES_ALONE = ("batch_size=1", "temporal_opacity=none")
-STILL = ("splats-static-small", "t-nerf-small")  # have nothing to fit
+STILL = "splats-static-small"  # has nothing to fit
 
 
 def from_tracks(arms: dict[str, Arm]) -> dict[str, Arm]:
     """The arms with every motion fitted to tracks first: from rest, none finds it."""
     return {
         name: arm
-        if arm.preset in STILL
+        if arm.preset == STILL
         else dataclasses.replace(arm, changes=(*arm.changes, FROM_TRACKS))
         for name, arm in arms.items()
     }
@@ -141,11 +141,11 @@ FIELDS = Suite(
                 "no-elastic": Arm("nerfies-grid-small", ("elastic=none",)),
                 "no-background": Arm("nerfies-grid-small", ("background=none",)),
                 "translation": Arm("nerfies-grid-small", ("warp.kind=translation",)),
-                # What reads the time has no grid: both with an MLP.
                 "nerfies-mlp": Arm("nerfies-small"),
-                "t-nerf": Arm("t-nerf-small"),
             }
         ),
+        # What reads the time has no grid, and is held against what has none either.
+        "t-nerf": Arm("t-nerf-small"),
         "static": Arm(
             "nerfies-grid-small", ("elastic=none", "background=none", "warp=none")
         ),
