@@ -3,7 +3,7 @@
     python -m experiments.field_speed --captures CAPTURE CAPTURE --out field_speed.json
     python -m experiments.field_speed --captures CAPTURE --presets nerf-grid-small
     python -m experiments.field_speed --captures CAPTURE --seeds 3
-    python -m experiments.field_speed --presets nerfies-grid-small+tracks
+    python -m experiments.field_speed --presets nerfies-small nerfies-small+tracks
 
 Each preset (`+tracks`: its motion fitted to tracks first) is trained on each capture,
 once for each seed and each of the given processor seconds, over the steps that it can
@@ -30,8 +30,8 @@ from experiments import cli, markdown
 from nerfies_jax.runs import platform, representations
 
 TRACKS = "+tracks"
-PRESETS = ("nerf-small", "nerf-grid-small", "nerfies-small", "nerfies-grid-small")
-PRESETS += ("nerfies-grid-small" + TRACKS,)
+PRESETS = ("nerf-small", "nerf-grid-small")
+PRESETS += ("nerfies-small", "nerfies-small" + TRACKS, "nerfies-grid-small")
 FRAMES = 5  # timed, after one that makes the survey
 TIMES = ("skipped_ms", "full_ms", "survey_ms")
 PILOT_STEPS = 50  # that tell what one takes

@@ -300,10 +300,14 @@ SMALL_TINEUVOX = dataclasses.replace(
 
 
 def _on_grid(preset: RadianceScene) -> RadianceScene:
-    """A small preset with its template on a grid."""
+    """A small preset with its template on a grid; what moves starts from tracks."""
     names = ("rays", "template", "coarse", "template_rate")
     grid = {name: getattr(SMALL_NERF_GRID, name) for name in names}
-    return dataclasses.replace(preset, **grid)
+    # A grid shows what does not move within seconds, and a warp that has found nothing
+    # by then stays at rest. Papers' own schedules stand with the MLPs.
+    moves = preset.warp is not None or preset.scene_flow is not None
+    start = dataclasses.replace(preset.start, motion="tracks" if moves else "none")
+    return dataclasses.replace(preset, start=start, **grid)
 
 
 # Without motion. It starts nearly empty, and what nobody needs stays so; beside a warp

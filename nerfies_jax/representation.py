@@ -41,6 +41,7 @@ def advise(
     spec = _spec_of(preset, full)
     moves = wanted.get(MOTION) is not False and bool(_parts(spec, MOTIONS))
     if not moves:
+        overrides += ["start.motion=none"] if spec.start.motion == "tracks" else []
         overrides += [f"{name}=none" for name in _parts(spec, MOTION_PARTS)]
     has_codes = spec.appearance is not None
     if drifts and not has_codes:

@@ -45,7 +45,7 @@ WHOLE = ("psnr", "ssim")  # judged by where nothing but pictures is known
 MOVING = ("psnr", "moving_psnr", "moving_ssim")
 TRACKED = (*MOVING, "track_error")
 
-FROM_TRACKS = "start.motion=tracks"
+FROM_TRACKS, FROM_REST = "start.motion=tracks", "start.motion=none"
 # One view a step and Gaussians that are always there, as in the presets beside it.
 BASES_ALONE = ("batch_size=1", "temporal_opacity=none")
 STILL = "splats-static-small"  # has nothing to fit
@@ -67,9 +67,7 @@ START = Suite(
         "mlp": Arm("splats-deformable-small", (FROM_TRACKS,)),
         "kan": Arm("sonata-small", (FROM_TRACKS,)),
         "basis": Arm("moba-small", (FROM_TRACKS,)),
-        "bases-from-rest": Arm(
-            "splats-tracked-small", (*BASES_ALONE, "start.motion=none")
-        ),
+        "bases-from-rest": Arm("splats-tracked-small", (*BASES_ALONE, FROM_REST)),
         "mlp-from-rest": Arm("splats-deformable-small"),
         "kan-from-rest": Arm("sonata-small"),
         "basis-from-rest": Arm("moba-small"),
@@ -147,11 +145,14 @@ FIELDS = Suite(
         # What reads the time has no grid, and is held against what has none either.
         "t-nerf": Arm("t-nerf-small"),
         "static": Arm(
-            "nerfies-grid-small", ("elastic=none", "background=none", "warp=none")
+            "nerfies-grid-small",
+            (FROM_REST, "elastic=none", "background=none", "warp=none"),
         ),
         # What tracks have found is not for bands that open one by one to find.
-        "from-rest": Arm("nerfies-grid-small"),
-        "coarse-to-fine": Arm("nerfies-grid-small", ("warp.anneal_steps=300",)),
+        "from-rest": Arm("nerfies-grid-small", (FROM_REST,)),
+        "coarse-to-fine": Arm(
+            "nerfies-grid-small", (FROM_REST, "warp.anneal_steps=300")
+        ),
     },
     claims=(
         Claim(
