@@ -14,6 +14,7 @@ from experiments.ablate import pool, results
 from experiments.ablate.job import Job
 from experiments.ablate.log import log
 from experiments.ablate.results import ArmResult
+from experiments.league import rows
 from experiments.league.settings import League
 from nerfies_jax.capture.json_files import write_json
 from nerfies_jax.evaluation import protocol
@@ -113,6 +114,7 @@ def merged(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
     other settings, which cannot stand beside what there is now.
     """
     contests, lost = [copy.deepcopy(one) for one in now["contests"]], []
+    known = rows.suite().arms
     for old in before.get("contests", ()):
         key = old["film"], old["seconds"]
         same = [one for one in contests if (one["film"], one["seconds"]) == key]
@@ -122,6 +124,8 @@ def merged(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
         (one,) = same
         for name, row in old["rows"].items():
             alike = one["measured_on"] == old["measured_on"]
+            if not row["cells"] and name not in known:  # a row of former days
+                continue
             if alike and name not in one["rows"]:
                 one["rows"][name] = row
                 continue

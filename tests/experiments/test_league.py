@@ -185,6 +185,10 @@ def test_what_was_not_asked_for_stays_among_the_kept(league, tmp_path):
     whole["contests"][0]["rows"][arms[1]]["cells"]["0"]["numbers"]["psnr"] = 7.0
     assert both["contests"] == whole["contests"]
     assert contests.merged({}, now)["contests"] == now["contests"]
+    # Nothing is missing of a row of former days that never had a cell.
+    never = {"cells": {}, "made_with": None}
+    whole["contests"][0]["rows"]["former+rest"] = never
+    assert contests.merged(whole, now)["contests"] == both["contests"]
     assert page.page(json.loads(json.dumps(both)))
 
 
