@@ -111,6 +111,12 @@ STUDIES = {
     "ablate_sonata": _package(
         "ablate_sonata", "--suite sonata --steps 900 --jobs 2", of="ablate"
     ),
+    "ablate_sonata_bookshelf": _package(
+        "ablate_sonata_bookshelf",
+        "--suite sonata --capture CAPTURE --max-side 256 --heldout 8 --steps 600 "
+        "--seeds 3 --jobs 2",
+        of="ablate",
+    ),
     "ablate_moba": _package(
         "ablate_moba", "--suite moba --steps 900 --jobs 2", of="ablate"
     ),

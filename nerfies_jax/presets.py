@@ -353,7 +353,10 @@ PRESETS = {
     "d-nerf-grid-small": _on_grid(SMALL_D_NERF),
     "nerfies-grid-small": _on_grid(SMALL_NERFIES),
     "hypernerf-grid-small": _on_grid(SMALL_HYPERNERF),
-    "nsff-grid-small": _on_grid(SMALL_NSFF),
+    "nsff-grid-small": dataclasses.replace(
+        _on_grid(SMALL_NSFF),
+        scene_flow=dataclasses.replace(SMALL_NSFF.scene_flow, flow_trunk=True),
+    ),
 }
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, Key
 
 from nerfies_jax import occupied_rays, path_fit, render_ray, scene_metadata
 from nerfies_jax.capture.capture import Capture, training_bytes
-from nerfies_jax.effects import transient
+from nerfies_jax.effects import scene_flow, transient
 from nerfies_jax.effects.effect import Batch, Box, RayOutput
 from nerfies_jax.evidence import usable_paths
 from nerfies_jax.field import Codes, Field, field
@@ -181,7 +181,8 @@ def learning_rates(
 ) -> dict[str, PyTree]:
     """Of each part of the parameters: the effect's own, or that of the schedule.
 
-    A warp that starts from tracks, and the codes that it reads, begin with a share.
+    A warp that starts from tracks, and the codes that it reads, begin with a share, as
+    does a scene flow with a trunk of its own.
     """
     own = {e.name: e.learning_rate for e in effects if e.learning_rate is not None}
     common = schedules.log_linear(
@@ -197,6 +198,16 @@ def learning_rates(
             name: held * rates["codes"] if name in tables else rates["codes"]
             for name in params["codes"]
         }
+        flow = params.get(scene_flow.NAME)
+        if flow is not None and flow.flow_trunk is not None:
+            rate = rates[scene_flow.NAME]
+            rates[scene_flow.NAME] = scene_flow.SceneFlow(
+                network=rate,
+                flow=held * rate,
+                disocclusion=rate,
+                blend=rate,
+                flow_trunk=held * rate,
+            )
     template = spec.template_rate * common
     if spec.table_rate != 1:
         tables = spec.table_rate * template

@@ -64,7 +64,9 @@ class SceneFlowSpec:
 
     `flow_bound` is how far a point can go along each axis between two moments, in units
     of the field. After `decay_steps` the medium need no longer explain the whole
-    picture by itself, only what the blending gives it.
+    picture by itself, only what the blending gives it. `flow_trunk` gives the flow a
+    trunk of its own, of the same size, where the public code reads it from the
+    medium's: what tracks have found then survives the medium's first steps.
     """
 
     network: TemplateSpec = TemplateSpec()
@@ -72,6 +74,7 @@ class SceneFlowSpec:
     flow_bound: float = 1.0
     weights: FlowWeights = FlowWeights()
     decay_steps: int = steps(50_000)
+    flow_trunk: bool = False
 
     def __post_init__(self):
         if not (math.isfinite(self.flow_bound) and self.flow_bound > 0):
@@ -90,6 +93,7 @@ class SceneFlow(NamedTuple):
     flow: mlp.Layer  # to forward xyz, backward xyz, before the bound
     disocclusion: mlp.Layer  # to two logits
     blend: mlp.Layer  # from the static template's features to the logit of the share
+    flow_trunk: mlp.MLP | None = None  # without heads; None where it is the network's
 
 
 class Dynamic(NamedTuple):
@@ -149,12 +153,18 @@ def init(
     inputs = one.position.width(3) + spec.time.width(1)
     condition = 0 if one.direction is None else one.direction.width(3)
     flow = mlp.init_layer(flow_key, one.width, 6, "small", dtype)
+    trunk = None
+    if spec.flow_trunk:
+        trunk_key = jax.random.fold_in(key, 4)  # the others are as without
+        trunk = mlp.init(template.trunk_spec(one, inputs), trunk_key, dtype)
+        trunk = trunk._replace(heads={})
     return SceneFlow(
         template.init(one, network_key, inputs, condition, dtype),
         # mlp.SMALL bounds what one feature adds; `width` of them have random signs
         flow._replace(weight=flow.weight / math.sqrt(one.width)),
         mlp.init_layer(disocclusion_key, one.width, 2, "small", dtype),
         mlp.init_layer(blend_key, features, 1, "small", dtype),
+        trunk,
     )
 
 
@@ -175,8 +185,13 @@ def dynamic(
     condition = jnp.zeros(0, point.dtype)
     if one.direction is not None:
         condition = encoding.encode(one.direction, direction, None)
-    sample = template.apply(one, params.network, jnp.concatenate(features), condition)
-    flow = spec.flow_bound * jnp.tanh(mlp.affine(params.flow, sample.features))
+    inputs = jnp.concatenate(features)
+    sample = template.apply(one, params.network, inputs, condition)
+    hidden = sample.features
+    if params.flow_trunk is not None:
+        trunk = template.trunk_spec(one, len(inputs))
+        hidden = mlp.hidden_features(trunk, params.flow_trunk, inputs)
+    flow = spec.flow_bound * jnp.tanh(mlp.affine(params.flow, hidden))
     logits = mlp.affine(params.disocclusion, sample.features)
     return Dynamic(sample.density, sample.colour, flow.reshape(2, 3), logits)
 

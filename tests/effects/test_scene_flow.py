@@ -90,6 +90,25 @@ def test_terms_without_a_weight_or_data_are_not_there():
 NAMES = tuple(field.name for field in dataclasses.fields(FlowWeights))
 
 
+def test_a_flow_with_a_trunk_of_its_own_reads_nothing_of_the_medium_s(dtype):
+    own = dataclasses.replace(TINY, flow_trunk=True)
+    key, at = jax.random.key(0), jnp.asarray([0.1, -0.2, 0.3], dtype)
+    shared, apart = (
+        scene_flow.init(spec, key, FEATURES, jnp.dtype(dtype)) for spec in (TINY, own)
+    )
+
+    def said(spec, params):
+        return scene_flow.dynamic(spec, params, at, at, jnp.asarray(0.4, dtype))
+
+    both = said(TINY, shared), said(own, apart)
+    for name in ("density", "colour", "disocclusion"):
+        np.testing.assert_array_equal(*(getattr(one, name) for one in both))
+    assert not np.array_equal(both[0].flow, both[1].flow)
+    grad = jax.grad(lambda params: said(own, params).flow.sum())(apart)
+    assert not any(np.any(leaf) for leaf in jax.tree.leaves(grad.network))
+    assert all(np.any(leaf) for leaf in jax.tree.leaves(grad.flow_trunk))
+
+
 # --- edges of time
 
 

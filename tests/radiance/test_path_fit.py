@@ -131,6 +131,19 @@ def test_what_tracks_have_found_learns_slowly_at_first(start, first):
             np.testing.assert_allclose(own / rates["template"], share, rtol=1e-5)
 
 
+def test_a_flow_with_a_trunk_of_its_own_learns_slowly_at_first_and_its_medium_not():
+    small = presets.PRESETS["nsff-small"]
+    flow = dataclasses.replace(small.scene_flow, flow_trunk=True)
+    spec = dataclasses.replace(small, start=TRACKS, scene_flow=flow)
+    field = scene.field(spec, field_of("nsff-small").metadata)
+    params = field.init(jax.random.key(0))
+    rates = scene.learning_rates(spec, field.effects, params, jnp.int32(0))
+    (own, common) = rates["scene_flow"], rates["template"]
+    for slow in (own.flow, own.flow_trunk):
+        np.testing.assert_allclose(slow / common, spec.start.first_rate, rtol=1e-5)
+    assert own.network == own.disocclusion == own.blend == common
+
+
 def test_a_fitted_flow_leads_from_one_place_to_the_next_and_from_no_wall():
     """Against the body's own velocity; also where frames are two moments apart.
 
