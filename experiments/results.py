@@ -50,7 +50,8 @@ four motions of splats stands in [ablate_start.md](ablate_start.md), what the pa
 Sonata and of MoBa-GS are worth behind it in [ablate_sonata.md](ablate_sonata.md) and
 [ablate_moba.md](ablate_moba.md), those of Nerfies in
 [ablate_fields.md](ablate_fields.md), and what the parts of our own default are, in
-[ablate_tracked.md](ablate_tracked.md). All of them on a real film are still to be
+[ablate_tracked.md](ablate_tracked.md). On a real film Sonata's stand in
+[ablate_sonata_bookshelf.md](ablate_sonata_bookshelf.md); the others are still to be
 measured. The ten other systems of the papers' tables, and the margins that these print,
 stand in [league.md](league.md), of one seed so far.
 """
