@@ -69,9 +69,10 @@ def test_every_default_preset_has_effects_and_every_paper_is_there():
 
 def test_scenes_of_a_preset_stand_behind_those_they_are_compared_with():
     for presets in (field_presets.PRESETS, splat_presets.PRESETS):
-        for spec in presets.values():
-            if not effect_cost.effects_in(spec):
+        for name, preset in presets.items():
+            if not effect_cost.effects_in(preset):
                 continue
+            spec = effect_cost._spec(name, EffectCost())
             arms = effect_cost.arms(spec)
             seen = []
             for arm in arms:
