@@ -57,6 +57,12 @@ LEANS_ON = {
 }
 
 
+def from_rest(spec):
+    """Any scene, its motion not fitted to tracks before training."""
+    start = dataclasses.replace(spec.start, motion="none")
+    return dataclasses.replace(spec, start=start)
+
+
 def parts_of(spec):
     """The names of what the scene has and could be without."""
     return [

@@ -148,7 +148,8 @@ def removed_from(spec):
     ],
 )
 def test_a_field_has_the_arrays_of_what_it_has_and_no_others(preset):
-    for spec in removed_from(field_presets.PRESETS[preset]):
+    whole = bare_scenes.from_rest(field_presets.PRESETS[preset])
+    for spec in removed_from(whole):
         field = fields.field(spec, METADATA)
         arrays = jax.eval_shape(field.init, jax.random.key(0))
         expected = jax.eval_shape(lambda spec=spec: counted_out(spec))
