@@ -27,6 +27,7 @@ import statistics
 import time
 
 from experiments import cli, markdown
+from experiments.ablate.arms import FROM_TRACKS
 from nerfies_jax.runs import platform, representations
 
 TRACKS = "+tracks"
@@ -152,7 +153,7 @@ def _named(preset):
     representation = representations.of_preset(name)
     spec = representation.presets[name]
     if name != preset:
-        spec = specs.override(spec, ("start.motion=tracks",))
+        spec = specs.override(spec, (FROM_TRACKS,))
     return representation, spec
 
 

@@ -34,10 +34,10 @@ class TrackStartSpec:
 class FieldStartSpec(TrackStartSpec):
     """How a radiance field that moves starts.
 
-    A warp that was fitted to tracks learns from the pictures with `first_rate` times
-    its learning rate at first, and with all of it at the end (a line in the logarithm):
-    a template that is still blurred says nothing of where things are, and led the warp
-    back to where nothing moves.
+    A warp that was fitted to tracks, or a scene flow with a trunk of its own, learns
+    from the pictures with `first_rate` times its learning rate at first, and with all
+    of it at the end (a line in the logarithm): a template that is still blurred says
+    nothing of where things are, and led the warp back to where nothing moves.
     """
 
     # Built-in scene, 900 steps of `nerfies-grid-small`, one seed: where it moves and
