@@ -41,7 +41,8 @@ class Suite(NamedTuple):
     context: str  # what was published; empty without
 
 
-WHOLE = ("psnr", "ssim")  # judged by where nothing but pictures is known
+# Judged by where nothing but pictures is known, and what moves in them by estimates.
+PICTURES = ("psnr", "ssim", "moving_psnr", "moving_ssim")
 MOVING = ("psnr", "moving_psnr", "moving_ssim")
 TRACKED = (*MOVING, "track_error")
 

@@ -18,7 +18,7 @@ from experiments.ablate.results import ArmResult
 from experiments.ablate.settings import Ablate
 from nerfies_jax import evaluation, runs
 from nerfies_jax.capture import pinholes, synthetic
-from nerfies_jax.evaluation import heldout, protocol
+from nerfies_jax.evaluation import heldout, moving_masks, protocol
 from nerfies_jax.evaluation.lens import ThroughLens
 from nerfies_jax.measure import clock
 from nerfies_jax.runs import platform, representations
@@ -122,10 +122,13 @@ class Job:
         stored = runs.stored_capture(source)
         # All arms learn from pinholes' pictures, and are scored as it was filmed.
         self.capture = pinholes.as_pinholes(stored)
-        self.filmed = pinholes.scorable(stored, traced=False)
-        images = self.filmed.images.tobytes()
+        filmed = pinholes.scorable(stored, traced=False)
+        images = filmed.images.tobytes()
         self.capture_digest = hashlib.sha256(images).hexdigest()[:16]
         self.known = protocol.held_out_only(self.capture, args.frames)
+        self.filmed, note = moving_masks.with_masks(filmed, platform.CACHE / "evidence")
+        if note:
+            log(note)
 
     def _listen(self, event, seconds, **_):
         if event == SAVED:
@@ -335,6 +338,8 @@ class Job:
             "rows": self.known.rows.tolist(),
             "tracks": len(self.known.path),
             "start": self.known.start,
+            # As those that were kept before masks of what moves were estimated.
+            **({} if self.known.exact else {"estimated_masks": True}),
         }
 
     def required_data(self, name: str) -> frozenset[str]:

@@ -63,11 +63,15 @@ KEYS = {
     "drift": "tracks.drift",
     "strain": "tracks.strain",
 }
-ESTIMATED = tuple(KEYS)[2:8]  # where not exact, and nothing is judged by estimates
+ESTIMATED = tuple(KEYS)[4:8]  # where not exact, and nothing is judged by estimates
 
 
 def quality(scores: Mapping[str, float], exact: bool) -> dict[str, float]:
-    """The measures of quality of an arm; NaN for what is not known."""
+    """The measures of quality of an arm; NaN for what is not known.
+
+    Depths that are not exact judge nothing. Masks of what moves, which only say where
+    all arms are compared, may be estimates.
+    """
     numbers = {name: scores.get(key, float("nan")) for name, key in KEYS.items()}
     if not exact:
         numbers |= dict.fromkeys(ESTIMATED, float("nan"))

@@ -62,7 +62,7 @@ def judged(job) -> list:
     """The claims of the suite, by pictures alone where nothing else is known."""
     if job.known.exact:
         return list(job.suite.claims)
-    return [claim._replace(measures=arms.WHOLE) for claim in job.suite.claims]
+    return [claim._replace(measures=arms.PICTURES) for claim in job.suite.claims]
 
 
 def remarks(finished) -> list[str]:
