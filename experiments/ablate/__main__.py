@@ -4,7 +4,7 @@
     python -m experiments.ablate --suite sonata --jobs 4          # Sonata's ablation
     python -m experiments.ablate --suite moba --steps 2000 --seconds 120 --jobs 4
     python -m experiments.ablate --arms static nerfies --scene fast --budget 30
-    python -m experiments.ablate --suite sonata --capture FOLDER  # no truth: pictures
+    python -m experiments.ablate --suite sonata --capture FOLDER  # pictures alone
 
 All arms of a suite learn the same frames from the same seeds, over as many steps
 (--steps), as much time (--seconds), or first the one and then the other; the last

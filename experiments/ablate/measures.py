@@ -82,7 +82,8 @@ def quality(scores: Mapping[str, float], exact: bool) -> dict[str, float]:
 LEGENDS = {
     "psnr": "PSNR, SSIM: of the 8-bit picture of a held-out camera, mean over the "
     "frames; SSIM is\nscikit-image's Gaussian form (sigma 1.5).",
-    "moving_psnr": "moving: the same two over the pixels that show moving things.",
+    "moving_psnr": "moving: the same two over the pixels that show moving things; of a "
+    "film that comes\nwithout masks, where its tracks move.",
     "depth_median": "depth, RMSE: median and root mean square of the error, scene "
     "units; then of moving pixels.",
     "track_error": "EPE: mean distance of points followed from the middle instant to "
