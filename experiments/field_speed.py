@@ -107,7 +107,7 @@ def measured(capture, preset: str, seconds, size: tuple[int, int], seed: int) ->
     """Scores after each of the seconds, and what a frame takes after the last."""
     from nerfies_jax import evaluation
     from nerfies_jax.capture.cache import CACHE
-    from nerfies_jax.evaluation import moving_masks
+    from nerfies_jax.evaluation import heldout, moving_masks
     from nerfies_jax.runs import plan
 
     masked, _ = moving_masks.with_masks(capture, CACHE / "evidence")
@@ -119,30 +119,12 @@ def measured(capture, preset: str, seconds, size: tuple[int, int], seed: int) ->
         took, model, state = _trained(capture, preset, steps[-1], seed)
         renderer = evaluation.Renderer(model, capture.size)
         scored = evaluation.score(renderer, state, capture, capture.heldout)
-        scores.append(float(scored.psnr.mean()))
-        moving.append(_moving_psnr(scored, masked))
+        found = heldout.heldout_metrics(scored, masked)
+        scores.append(found["heldout.psnr"])
+        moving.append(found.get("heldout.moving_psnr"))  # none where nothing moves
         spent.append(took)
-    found = {"psnr": scores, "moving_psnr": moving, "steps": steps, "spent": spent}
-    return found | drawn(model, state, capture, size)
-
-
-def _moving_psnr(scored, capture):
-    """Mean over the frames in which something moves; None where nothing does."""
-    import numpy as np
-
-    from nerfies_jax.measure import image_quality
-
-    if capture.moving is None:
-        return None
-    each = []
-    for row, colour in zip(scored.rows, scored.colour, strict=True):
-        where = capture.moving[row]
-        where = where if capture.valid is None else where & capture.valid[row]
-        truth = capture.images[row].astype(np.float32) / 255
-        if where.any():
-            picture = image_quality.quantise(colour)
-            each.append(float(image_quality.masked_psnr(picture, truth, where)))
-    return statistics.fmean(each) if each else None
+    learnt = {"psnr": scores, "moving_psnr": moving, "steps": steps, "spent": spent}
+    return learnt | drawn(model, state, capture, size)
 
 
 def _named(preset):
