@@ -82,6 +82,7 @@ def _package(name, words="", page="page", of=None, measured=None):
     return _study(name, words, f"{folder}.__main__", f"{folder}.{page}", measured)
 
 
+_BOOKSHELF = "--capture CAPTURE --max-side 256 --heldout 8"
 _SPLAT_AXES = "gaussians harmonics dssim raster motion-network kan basis"
 STUDIES = {
     "benchmark": _package("benchmark", "--seeds 3"),
@@ -115,8 +116,7 @@ STUDIES = {
     ),
     "ablate_sonata_bookshelf": _package(
         "ablate_sonata_bookshelf",
-        "--suite sonata --capture CAPTURE --max-side 256 --heldout 8 --steps 600 "
-        "--seeds 3 --jobs 2",
+        f"--suite sonata {_BOOKSHELF} --steps 600 --seeds 3 --jobs 2",
         of="ablate",
     ),
     "ablate_moba": _package(
@@ -124,8 +124,7 @@ STUDIES = {
     ),
     "ablate_moba_bookshelf": _package(
         "ablate_moba_bookshelf",
-        "--suite moba --capture CAPTURE --max-side 256 --heldout 8 --steps 600 "
-        "--seeds 3 --jobs 2",
+        f"--suite moba {_BOOKSHELF} --steps 600 --seeds 3 --jobs 2",
         of="ablate",
     ),
     "deformation_cost": _package("deformation_cost", "--out deformation_cost.json"),

@@ -1,7 +1,6 @@
 """Train and measure the arms of an ablation, one after the other."""
 
 import hashlib
-import math
 import os
 import pathlib
 import tempfile
@@ -13,6 +12,7 @@ import rich.console
 
 from experiments import cli
 from experiments.ablate import measures, results, suites
+from experiments.ablate.budget import Budget, affordable
 from experiments.ablate.log import line, log
 from experiments.ablate.results import ArmResult
 from experiments.ablate.settings import Ablate
@@ -29,33 +29,6 @@ PILOT_STEPS = 150  # of a whole, short schedule, to see what a step costs
 NEAR_ENOUGH = 0.1  # share of --seconds by which a first seed may miss them
 # JAX's event for a program that was read from the compilation cache.
 SAVED = "/jax/compilation_cache/compile_time_saved_sec"
-
-
-class Budget(NamedTuple):
-    """How long every arm is trained, and where its results are."""
-
-    steps: int | None  # without seconds: None for the preset's own
-    seconds: float | None
-    folder: pathlib.Path
-    share: float | None = None  # of the preset's own steps
-    clock: str = "wall"  # whose seconds
-
-    @property
-    def title(self) -> str:
-        """As in "each arm trained ..."."""
-        if self.seconds is not None:
-            whose = "processor seconds" if self.clock == "processor" else "s"
-            return f"for {self.seconds:g} {whose}, in as many steps as that allows"
-        if self.share is not None:
-            return f"over {self.share:g} of its preset's own steps"
-        if self.steps is None:
-            return "over its preset's own steps"
-        return f"over {self.steps} steps"
-
-    @property
-    def measure(self) -> str:
-        """Which measure of an arm the seconds limit."""
-        return "train_cpu_seconds" if self.clock == "processor" else "train_seconds"
 
 
 class CompiledArm(NamedTuple):
@@ -218,13 +191,13 @@ class Job:
         if self.budgets[0] is not budget:
             other = self.kept(name, 0, self.budgets[0])
         pilot = other or self._train(name, 0, PILOT_STEPS)
-        steps = _affordable(pilot, budget)
+        steps = affordable(pilot, budget)
         kept = self._train(name, 0, steps)
         took = kept.numbers[budget.measure]
         missed = abs(took / budget.seconds - 1) > NEAR_ENOUGH
         if missed and kept.notes["stopped_by"] == "steps":
             log(f"    {steps} steps took {took:.1f} s: once more, with a better guess")
-            steps = _affordable(kept, budget, pilot)
+            steps = affordable(kept, budget, pilot)
             kept = self._train(name, 0, steps)
         return steps, kept
 
@@ -338,8 +311,8 @@ class Job:
             "rows": self.known.rows.tolist(),
             "tracks": len(self.known.path),
             "start": self.known.start,
-            # As those that were kept before masks of what moves were estimated.
-            **({} if self.known.exact else {"estimated_masks": True}),
+            # As those that were kept before what moves was scored there, too.
+            **({} if self.known.exact else {"moving": "masked"}),
         }
 
     def required_data(self, name: str) -> frozenset[str]:
@@ -384,19 +357,3 @@ def _model_bytes(arm, state):
     if saved.model_bytes is not None:
         return saved.model_bytes
     return sum(leaf.nbytes for leaf in jax.tree.leaves(state.params))
-
-
-def _affordable(kept, budget, shorter=None):
-    """Steps that take the seconds of a budget, from what one run took, or two.
-
-    Longer runs grow more Gaussians: between two runs the time is a power of the steps.
-    """
-    done, took = max(kept.notes["steps"], 1), kept.numbers[budget.measure]
-    power = 1.0
-    if shorter is not None:
-        before, earlier = shorter.notes["steps"], shorter.numbers[budget.measure]
-        if before != done and earlier > 0:
-            power = math.log(took / earlier) / math.log(done / before)
-    # Outside it is the machine's other work that was timed.
-    power = min(max(power, 1.0), 2.0)
-    return max(1, round(done * (budget.seconds / took) ** (1 / power)))

@@ -63,7 +63,7 @@ KEYS = {
     "drift": "tracks.drift",
     "strain": "tracks.strain",
 }
-ESTIMATED = tuple(KEYS)[4:8]  # where not exact, and nothing is judged by estimates
+DEPTHS = tuple(name for name in KEYS if "depth" in name)
 
 
 def quality(scores: Mapping[str, float], exact: bool) -> dict[str, float]:
@@ -74,7 +74,7 @@ def quality(scores: Mapping[str, float], exact: bool) -> dict[str, float]:
     """
     numbers = {name: scores.get(key, float("nan")) for name, key in KEYS.items()}
     if not exact:
-        numbers |= dict.fromkeys(ESTIMATED, float("nan"))
+        numbers |= dict.fromkeys(DEPTHS, float("nan"))
     return numbers
 
 

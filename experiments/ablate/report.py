@@ -59,7 +59,7 @@ def _settings(args):
 
 
 def judged(job) -> list:
-    """The claims of the suite, by pictures alone where nothing else is known."""
+    """The claims of the suite, by pictures alone where no truth is known."""
     if job.known.exact:
         return list(job.suite.claims)
     return [claim._replace(measures=arms.PICTURES) for claim in job.suite.claims]

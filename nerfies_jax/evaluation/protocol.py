@@ -30,7 +30,7 @@ class GroundTruth(NamedTuple):
     # The moment from which points are followed: the middle one. D-NeRF's template is
     # what it sees at time 0, and its warp jumps there.
     start: int
-    exact: bool = True  # whether depth and what moves are known, too
+    exact: bool = True  # whether depth and what moves are known, not estimated
 
     @property
     def start_points(self) -> np.ndarray:
@@ -98,7 +98,8 @@ def ground_truth(
 def held_out_only(capture: Capture, frames: int) -> GroundTruth:
     """What is known of a real capture: how at most `frames` held-out frames look.
 
-    Its depths and masks, if it has any, are estimates, and nothing is judged by them.
+    Its depths and masks, if it has any, are estimates: depths judge nothing, and masks
+    only say where pictures are compared.
     """
     if not len(capture.heldout):
         raise ValueError(
