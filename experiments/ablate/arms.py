@@ -113,6 +113,10 @@ TRACKED_PARTS = Suite(
         "full": Arm("splats-tracked-small"),
         "always-there": Arm("splats-tracked-small", ("temporal_opacity=none",)),
         "unfilled": Arm("splats-tracked-small", ("start.fill_hidden=False",)),
+        # Nearly: two knots more are a motion along a line.
+        "one-spline": Arm(
+            "splats-tracked-small", ("motion.coarse_knots=2", "motion.fine_rate=1.0")
+        ),
         "k4": Arm("splats-tracked-small", ("motion.bases=4",)),
         "k20": Arm("splats-tracked-small", ("motion.bases=20",)),
     },
@@ -124,11 +128,12 @@ TRACKED_PARTS = Suite(
             TRACKED,
         ),
         Claim("What is hidden is better guessed", "full", "unfilled", TRACKED),
+        Claim("A second spline of few knots helps", "full", "one-spline", TRACKED),
         Claim("Eight bases beat four", "full", "k4", TRACKED),
         Claim("Eight bases beat twenty", "full", "k20", TRACKED),
     ),
     seeds=3,
-    pictured=("full", "always-there", "k4", "k20"),
+    pictured=("full", "always-there", "one-spline", "k4", "k20"),
     context="",
 )
 
@@ -372,6 +377,7 @@ MOBA = Suite(
             TRACKED,
         ),
         Claim("Eight bases beat two", "full", "k2", TRACKED),
+        Claim("A second spline of few knots helps", "full", "one-spline", TRACKED),
         Claim("Eight bases beat four", "full", "k4", TRACKED),
         Claim("Eight bases beat sixteen", "full", "k16", TRACKED),
         Claim("Eight bases beat 32", "full", "k32", TRACKED),

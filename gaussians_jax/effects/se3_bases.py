@@ -5,6 +5,14 @@ Catmull-Rom spline between them. A Gaussian moves by the mean of the bases under
 weights of its own, one of which stands for staying where it is. The form of Shape of
 Motion (Wang et al. 2024, arXiv:2407.13764), which has a basis for each frame and no
 entry for what is still. Where nothing turns or shifts, nothing moves, exactly.
+
+Two splines are added: one of many knots takes over what tracks know, one of few learns
+ten times faster from pictures. A single one has to choose. Built-in scene, 900 steps,
+one seed, held out and where it moves, how far points are off (0.0080 before training),
+and a film of a hand before books:
+  20 or 25 knots      32.37 / 28.54 dB  0.0084    37.41 / 34.06 dB
+  10 or 15 knots      33.27 / 29.94 dB  0.0060    37.12 / 33.12 dB
+  both, as here       33.08 / 29.37 dB  0.0074    37.56 / 34.18 dB
 """
 
 import dataclasses
@@ -40,6 +48,8 @@ class SE3BasesSpec:
 
     bases: int = 8
     knots: int = 20  # evenly over the film
+    coarse_knots: int = 10  # of the spline that pictures change
+    fine_rate: float = 0.1  # what the other learns with, a share of the rate
     still_logit: float = 9.0
     logit_rate: float = 1e-2
     learning_rate: float = 1e-3  # of turns (rad) and shifts
@@ -54,6 +64,14 @@ class SE3BasesSpec:
                 f"knots={self.knots}: a motion has at least two, its first and its "
                 "last instant"
             )
+        if self.coarse_knots < 2:
+            raise ValueError(
+                f"coarse_knots={self.coarse_knots}: a spline has at least two"
+            )
+        if not 0 <= self.fine_rate <= 1:
+            raise ValueError(
+                f"fine_rate={self.fine_rate} is a share of the rate, from 0 to 1"
+            )
         if self.logit_rate <= 0:
             raise ValueError(f"logit_rate={self.logit_rate} must be positive")
         if self.warm_up < 0:
@@ -61,11 +79,21 @@ class SE3BasesSpec:
         schedules.check_falling(self.learning_rate, self.learning_rate_end)
 
 
-class Bases(NamedTuple):
-    """The rigid motions: x goes to centre + R(turn) (x - centre) + shift."""
+class Poses(NamedTuple):
+    """Turns and shifts at knots that lie evenly over [0, 1]."""
 
     turn: Float[Array, "bases knots 3"]  # rotation vectors, rad
     shift: Float[Array, "bases knots 3"]  # scene units
+
+
+class Bases(NamedTuple):
+    """The rigid motions: x goes to centre + R(turn) (x - centre) + shift.
+
+    Turn and shift are the sums of the two splines.
+    """
+
+    fine: Poses
+    coarse: Poses
     centre: Float[Array, "bases 3"]  # scene units
 
 
@@ -80,9 +108,10 @@ class Motion(NamedTuple):
 def init(key: Key[Array, ""], spec: SE3BasesSpec, dtype=jnp.float32) -> Bases:
     """Bases that hardly move: were all alike, all would keep the same slopes."""
     shape = (spec.bases, spec.knots, 3)
-    zero = jnp.zeros(shape, dtype)
     shift = 1e-3 * jax.random.normal(key, shape, dtype)
-    return Bases(zero, shift, jnp.zeros((spec.bases, 3), dtype))
+    fine = Poses(jnp.zeros(shape, dtype), shift)
+    none = jnp.zeros((spec.bases, spec.coarse_knots, 3), dtype)
+    return Bases(fine, Poses(none, none), jnp.zeros((spec.bases, 3), dtype))
 
 
 def init_logits(spec: SE3BasesSpec, gaussians: int, dtype=jnp.float32):
@@ -96,9 +125,11 @@ def at_time(bases: Bases, time: Float[Array, ""]) -> Motion:
 
     R - 1 without the 1: a small turn keeps all its digits.
     """
-    both = jnp.concatenate([bases.turn, bases.shift], axis=-1)
-    weights = time_knots.spline_weights(both.shape[1], time)
-    now = jnp.einsum("k,bkc->bc", weights, both)
+    levels = bases.fine, bases.coarse
+    tables = jnp.concatenate([jnp.concatenate(one, axis=-1) for one in levels], axis=1)
+    counts = (one.turn.shape[1] for one in levels)
+    weights = [time_knots.spline_weights(count, time) for count in counts]
+    now = jnp.einsum("k,bkc->bc", jnp.concatenate(weights), tables)
     turn, shift = now[:, :3], now[:, 3:]
     axes, none = jnp.eye(3, dtype=turn.dtype), jnp.zeros_like(turn[0])
     turned = jax.vmap(lie.displacement, (None, None, 0))
@@ -137,7 +168,9 @@ def fit_to_paths(spec: SE3BasesSpec, paths: Paths) -> Guess:
     turn = _at_knots(rigid_groups.smoothed(turn), times, spec)
     shift = _at_knots(rigid_groups.smoothed(moved - middle[:, None]), times, spec)
     middle = np.concatenate([middle, np.zeros((spec.bases - len(middle), 3))])
-    bases = Bases(*(jnp.asarray(part, jnp.float32) for part in (turn, shift, middle)))
+    none = np.zeros((spec.bases, spec.coarse_knots, 3))
+    bases = Bases(Poses(turn, shift), Poses(none, none), middle)
+    bases = jax.tree.map(lambda part: jnp.asarray(part, jnp.float32), bases)
     logits = np.zeros((len(position), 1 + spec.bases), np.float32)
     logits[:, 0] = STILL_LOGIT
     logits[np.arange(len(position)), 1 + label] = MEMBER_LOGIT
@@ -147,10 +180,11 @@ def fit_to_paths(spec: SE3BasesSpec, paths: Paths) -> Guess:
         def bend(table):
             return jnp.mean(jnp.abs(table[:, 2:] - 2 * table[:, 1:-1] + table[:, :-2]))
 
-        shift, turn = bend(points.nets.shift) / unit, bend(points.nets.turn)
+        fine = points.nets.fine
+        shift, turn = bend(fine.shift) / unit, bend(fine.turn)
         return SMOOTHNESS * shift + TURN_SMOOTHNESS * turn
 
-    rates = Points(unit, 10.0, Bases(3.0, unit, 0.0))
+    rates = Points(unit, 10.0, Bases(Poses(3.0, unit), Poses(0.0, 0.0), 0.0))
     return Guess(guess, rates, penalty, rigid=True)
 
 
@@ -181,7 +215,9 @@ def effect(spec: SE3BasesSpec, steps: int, extent: float) -> Effect:
     def rates(step):
         # A centre and a shift say the same twice over; centres stay.
         now = rate(step)
-        return Bases(now, extent * now, jnp.zeros_like(now))
+        coarse = Poses(now, extent * now)
+        fine = jax.tree.map(lambda own: spec.fine_rate * own, coarse)
+        return Bases(fine, coarse, jnp.zeros_like(now))
 
     def moved(params: Params, gaussians: Gaussians, condition: FrameCondition, ready):
         del ready

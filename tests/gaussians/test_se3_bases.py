@@ -8,11 +8,11 @@ import scipy.interpolate
 from scipy.spatial.transform import Rotation
 
 from gaussians_jax.effects import se3_bases
-from gaussians_jax.effects.se3_bases import Bases, SE3BasesSpec
+from gaussians_jax.effects.se3_bases import Bases, Poses, SE3BasesSpec
 from gaussians_jax.splats import Gaussians
 from tests.gradients import directional_error
 
-BASES, KNOTS, ROWS = 3, 6, 5
+BASES, KNOTS, COARSE, ROWS = 3, 6, 4, 5
 
 
 @jax.jit
@@ -22,11 +22,14 @@ def moved(bases, logits, gaussians, time):
 
 def draw(dtype, turn=1.5, seed=0):
     rng = np.random.default_rng(seed)
-    bases = Bases(
-        rng.uniform(-turn, turn, (BASES, KNOTS, 3)).astype(dtype),
-        rng.normal(0, 0.2, (BASES, KNOTS, 3)).astype(dtype),
-        rng.normal(size=(BASES, 3)).astype(dtype),
-    )
+    levels = [
+        Poses(
+            rng.uniform(-turn / 2, turn / 2, (BASES, knots, 3)).astype(dtype),
+            rng.normal(0, 0.15, (BASES, knots, 3)).astype(dtype),
+        )
+        for knots in (KNOTS, COARSE)
+    ]
+    bases = Bases(*levels, rng.normal(size=(BASES, 3)).astype(dtype))
     logits = rng.normal(size=(ROWS, 1 + BASES)).astype(dtype)
     gaussians = Gaussians(
         mean=rng.normal(size=(ROWS, 3)).astype(dtype),
@@ -57,7 +60,10 @@ def test_gaussians_move_by_the_mean_of_rigid_motions(dtype, time):
         mean = gaussians.mean[row].astype(float)
         expected[row] = mean
         for k in range(BASES):
-            turn, shift = (splined(part[k], time) for part in bases[:2])
+            turn, shift = (
+                splined(coarse[k], time) + splined(fine[k], time)
+                for coarse, fine in zip(bases.coarse, bases.fine, strict=True)
+            )
             centre = bases.centre[k]
             there = Rotation.from_rotvec(turn).apply(mean - centre) + centre + shift
             expected[row] += weights[row, 1 + k] * (there - mean)
@@ -88,7 +94,10 @@ def test_slopes_are_those_of_differences(float64):
 @pytest.mark.hard_cases
 def test_bases_at_rest_move_nothing_at_all_and_have_slopes(dtype):
     bases, logits, gaussians = draw(dtype)
-    rest = bases._replace(turn=0 * bases.turn, shift=0 * bases.shift)
+    rest = bases._replace(
+        coarse=jax.tree.map(jnp.zeros_like, bases.coarse),
+        fine=jax.tree.map(jnp.zeros_like, bases.fine),
+    )
     time = np.asarray(0.3, dtype)
     np.testing.assert_array_equal(
         moved(rest, logits, gaussians, time).mean, gaussians.mean
@@ -96,9 +105,10 @@ def test_bases_at_rest_move_nothing_at_all_and_have_slopes(dtype):
     slopes = jax.jit(
         jax.grad(lambda b: jnp.sum(moved(b, logits, gaussians, time).mean))
     )(rest)
-    assert all(np.isfinite(leaf).all() for leaf in slopes)
-    assert np.abs(slopes.turn).max() > 0.01
-    assert np.abs(slopes.shift).max() > 0.01
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
+    for level in (slopes.coarse, slopes.fine):
+        assert np.abs(level.turn).max() > 0.01
+        assert np.abs(level.shift).max() > 0.01
 
 
 @pytest.mark.hard_cases
@@ -107,7 +117,8 @@ def test_small_turns_keep_their_digits_far_from_the_origin(dtype):
     _bases, _, _gaussians = draw(dtype)
     centre = np.full((1, 3), 1000, dtype)
     turn = np.full((1, KNOTS, 3), 1e-6, dtype)
-    one = Bases(turn, np.zeros((1, KNOTS, 3), dtype), centre)
+    none = np.zeros((1, KNOTS, 3), dtype)
+    one = Bases(Poses(turn, none), Poses(none, none), centre)
     motion = jax.jit(se3_bases.at_time)(one, np.asarray(0.5, dtype))
     exact = np.cross(np.full(3, 1e-6), np.eye(3)).T
     # Of first order to 1e-12.
@@ -137,7 +148,7 @@ def test_decided_weights_have_finite_slopes(dtype, size):
 def test_a_new_motion_hardly_moves_what_stays():
     spec = SE3BasesSpec(bases=4, knots=5)
     bases = se3_bases.init(jax.random.key(0), spec)
-    bases = bases._replace(shift=bases.shift + 1)
+    bases = bases._replace(fine=Poses(bases.fine.turn, bases.fine.shift + 1))
     _, _, gaussians = draw("float32")
     logits = se3_bases.init_logits(spec, ROWS)
     there = moved(bases, logits, gaussians, np.float32(0.5)).mean
@@ -149,6 +160,8 @@ def test_a_new_motion_hardly_moves_what_stays():
     [
         ({"bases": 0}, "at least one basis"),
         ({"knots": 1}, "at least two"),
+        ({"coarse_knots": 1}, "at least two"),
+        ({"fine_rate": 1.5}, "from 0 to 1"),
         ({"logit_rate": 0.0}, "must be positive"),
         ({"warm_up": -1}, "must not be negative"),
         ({"learning_rate": 1e-6}, "the rate falls"),

@@ -207,7 +207,7 @@ def test_where_no_moving_pixel_has_a_depth_the_motion_starts_alone(monkeypatch):
     params = Params({"splats": rows, "se3_bases": jnp.ones((3, 13))}, {"se3_bases": 0})
     begun = track_start.put_in(params, effects, started)
     np.testing.assert_array_equal(begun.rows["se3_bases"], 1)
-    assert begun.nets["se3_bases"].turn.any()
+    assert begun.nets["se3_bases"].fine.turn.any()
 
 
 def small_scene(**changes):
