@@ -113,9 +113,8 @@ TRACKED_PARTS = Suite(
         "full": Arm("splats-tracked-small"),
         "always-there": Arm("splats-tracked-small", ("temporal_opacity=none",)),
         "unfilled": Arm("splats-tracked-small", ("start.fill_hidden=False",)),
-        # Nearly: two knots more are a motion along a line.
         "one-spline": Arm(
-            "splats-tracked-small", ("motion.coarse_knots=2", "motion.fine_rate=1.0")
+            "splats-tracked-small", ("motion.coarse_knots=0", "motion.fine_rate=1.0")
         ),
         "k4": Arm("splats-tracked-small", ("motion.bases=4",)),
         "k20": Arm("splats-tracked-small", ("motion.bases=20",)),

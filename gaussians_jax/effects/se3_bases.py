@@ -48,7 +48,7 @@ class SE3BasesSpec:
 
     bases: int = 8
     knots: int = 20  # evenly over the film
-    coarse_knots: int = 10  # of the spline that pictures change
+    coarse_knots: int = 10  # of the spline that pictures change; 0: there is none
     fine_rate: float = 0.1  # what the other learns with, a share of the rate
     still_logit: float = 9.0
     logit_rate: float = 1e-2
@@ -64,9 +64,10 @@ class SE3BasesSpec:
                 f"knots={self.knots}: a motion has at least two, its first and its "
                 "last instant"
             )
-        if self.coarse_knots < 2:
+        if self.coarse_knots < 2 and self.coarse_knots != 0:
             raise ValueError(
-                f"coarse_knots={self.coarse_knots}: a spline has at least two"
+                f"coarse_knots={self.coarse_knots}: a spline has at least two, or "
+                "none (0)"
             )
         if not 0 <= self.fine_rate <= 1:
             raise ValueError(
@@ -125,10 +126,9 @@ def at_time(bases: Bases, time: Float[Array, ""]) -> Motion:
 
     R - 1 without the 1: a small turn keeps all its digits.
     """
-    levels = bases.fine, bases.coarse
+    levels = [one for one in (bases.fine, bases.coarse) if one.turn.shape[1]]
     tables = jnp.concatenate([jnp.concatenate(one, axis=-1) for one in levels], axis=1)
-    counts = (one.turn.shape[1] for one in levels)
-    weights = [time_knots.spline_weights(count, time) for count in counts]
+    weights = [time_knots.spline_weights(one.turn.shape[1], time) for one in levels]
     now = jnp.einsum("k,bkc->bc", jnp.concatenate(weights), tables)
     turn, shift = now[:, :3], now[:, 3:]
     axes, none = jnp.eye(3, dtype=turn.dtype), jnp.zeros_like(turn[0])

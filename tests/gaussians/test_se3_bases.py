@@ -78,6 +78,17 @@ def test_gaussians_move_by_the_mean_of_rigid_motions(dtype, time):
     assert carried.mean.dtype == dtype
 
 
+def test_one_spline_alone_is_that_spline():
+    bases, *_ = draw("float32")
+    at_time, time = jax.jit(se3_bases.at_time), np.float32(0.37)
+    none = np.zeros((BASES, 0, 3), np.float32)
+    alone = at_time(bases._replace(coarse=Poses(none, none)), time)
+    still = jax.tree.map(np.zeros_like, bases.coarse)
+    both = at_time(bases._replace(coarse=still), time)
+    np.testing.assert_allclose(alone.turn, both.turn, rtol=1e-6)
+    np.testing.assert_allclose(alone.offset, both.offset, atol=1e-6)
+
+
 def test_slopes_are_those_of_differences(float64):
     bases, logits, gaussians = draw("float64")
     weights = np.random.default_rng(1).normal(size=(ROWS, 7))
