@@ -7,12 +7,11 @@ Motion (Wang et al. 2024, arXiv:2407.13764), which has a basis for each frame an
 entry for what is still. Where nothing turns or shifts, nothing moves, exactly.
 
 Two splines are added: one of many knots takes over what tracks know, one of few learns
-ten times faster from pictures. A single one has to choose. Built-in scene, 900 steps,
-one seed, held out and where it moves, how far points are off (0.0080 before training),
-and a film of a hand before books:
-  20 or 25 knots      32.37 / 28.54 dB  0.0084    37.41 / 34.06 dB
-  10 or 15 knots      33.27 / 29.94 dB  0.0060    37.12 / 33.12 dB
-  both, as here       33.08 / 29.37 dB  0.0074    37.56 / 34.18 dB
+ten times faster from pictures, and less of their noise. Against the former alone, three
+seeds of the built-in scene: 0.5 dB more, 0.8 where it moves, points 0.0074 units off
+for 0.0085 (`docs/results/ablate_tracked.md`). Ten knots alone are better still there
+(one seed, 900 steps: 33.27 / 29.94 dB, 0.0060), but fifteen are too stiff for a hand
+before books: 37.12 dB, 33.12 where it moves, for 37.56 and 34.18.
 """
 
 import dataclasses
