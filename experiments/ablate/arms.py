@@ -376,7 +376,6 @@ MOBA = Suite(
             TRACKED,
         ),
         Claim("Eight bases beat two", "full", "k2", TRACKED),
-        Claim("A second spline of few knots helps", "full", "one-spline", TRACKED),
         Claim("Eight bases beat four", "full", "k4", TRACKED),
         Claim("Eight bases beat sixteen", "full", "k16", TRACKED),
         Claim("Eight bases beat 32", "full", "k32", TRACKED),
