@@ -2,7 +2,7 @@
 
     python -m experiments.field_speed --captures CAPTURE CAPTURE --out field_speed.json
     python -m experiments.field_speed --captures CAPTURE --presets nerf-grid-small
-    python -m experiments.field_speed --captures CAPTURE --seeds 3
+    python -m experiments.field_speed --captures CAPTURE --max-side 256 --seeds 3
     python -m experiments.field_speed --presets nerfies-small nerfies-small+tracks
 
 Each preset (`+tracks`: its motion fitted to tracks first) is trained on each capture,
@@ -44,6 +44,8 @@ class FieldSpeed:
 
     captures: tuple[pathlib.Path, ...] = ()
     """Folders (default: the built-in scene)."""
+    max_side: int | None = None
+    """Read the pictures of captures with no side longer than this, in pixels."""
     presets: tuple[str, ...] = PRESETS
     """Small radiance fields."""
     seconds: tuple[float, ...] = (60.0, 120.0, 300.0)
@@ -71,7 +73,7 @@ def main(args):
     """Measure what is missing and keep it; exit code 2 where input is wrong."""
     with cli.user_errors():
         platform.start_jax("cpu")
-        captures = _captures(args.captures)
+        captures = _captures(args.captures, args.max_side)
     from nerfies_jax.capture.json_files import write_json
     from nerfies_jax.measure import clock
 
@@ -93,14 +95,20 @@ def main(args):
     return stored
 
 
-def _captures(folders):
+def _captures(folders, max_side):
+    """Captures by name and size, as rows of another size are others."""
     from nerfies_jax import runs
 
     if not folders:
-        return {"default": runs.built_in_scene("default")}
-    if len({folder.name for folder in folders}) < len(folders):
+        found = {"default": runs.built_in_scene("default")}
+    elif len({folder.name for folder in folders}) < len(folders):
         raise ValueError("--captures: two folders of one name share a row; rename one")
-    return {folder.name: runs.load_capture(folder) for folder in folders}
+    else:
+        found = {
+            folder.name: runs.load_capture(folder, max_side=max_side)
+            for folder in folders
+        }
+    return {f"{name} {one.size[0]}x{one.size[1]}": one for name, one in found.items()}
 
 
 def measured(capture, preset: str, seconds, size: tuple[int, int], seed: int) -> dict:

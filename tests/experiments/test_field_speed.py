@@ -25,7 +25,7 @@ def test_only_seeds_that_are_missing_are_measured_and_all_are_in_the_table(
         return psnr | {"alike_db": 60.0} | NUMBERS
 
     monkeypatch.setattr(field_speed, "measured", measured)
-    monkeypatch.setattr(field_speed, "_captures", lambda folders: {"one": None})
+    monkeypatch.setattr(field_speed, "_captures", lambda *_: {"one": None})
     out = tmp_path / "out.json"
     presets = ["nerf-small", "nerf-grid-small+tracks"]
     for seeds in (1, 2, 2):
