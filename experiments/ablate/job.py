@@ -18,6 +18,7 @@ from experiments.ablate.results import ArmResult
 from experiments.ablate.settings import Ablate
 from nerfies_jax import evaluation, runs
 from nerfies_jax.capture import pinholes, synthetic
+from nerfies_jax.capture.synthetic import truth as truths
 from nerfies_jax.evaluation import heldout, moving_masks, protocol
 from nerfies_jax.evaluation.lens import ThroughLens
 from nerfies_jax.measure import clock
@@ -57,7 +58,14 @@ class Job:
             name
             for name, arm in self.suite.arms.items()
             if arm.needs is None or getattr(self.capture, arm.needs) is not None
+            if self.told is not None or not arm.told
         )
+        untold = [name for name in self.names if self.suite.arms[name].told]
+        if self.told is None and untold:
+            raise ValueError(
+                f"--arms {untold[0]}: starts from the truth, which "
+                f"{self.capture.name} has none of; leave it out, or give a --scene"
+            )
         self.seeds = args.all_seeds if args.seed is None else (args.seed,)
         for name in self.names:  # refuses wrong settings before any training
             self.spec(name, args.steps)
@@ -91,7 +99,9 @@ class Job:
             self.known = protocol.ground_truth(
                 self.capture, truth, args.frames, args.tracks
             )
+            self.told = truths.told(self.capture, truth)
             return
+        self.told = None
         stored = runs.stored_capture(source)
         # All arms learn from pinholes' pictures, and are scored as it was filmed.
         self.capture = pinholes.as_pinholes(stored)
@@ -205,7 +215,9 @@ class Job:
         """Train one arm from the start, and measure where it ends."""
         compiled_before = (name, steps) in self._built
         arm = self._build(name, steps)
-        state = arm.model.init(self.capture, jax.random.key(seed))
+        told = self.suite.arms[name].told
+        capture = self.told if told else self.capture
+        state = arm.model.init(capture, jax.random.key(seed))
         frames = evaluation.frames_of(self.capture, arm.model.required_data)
         began, self._cache_saved = time.process_time(), 0.0
         result = loop.fit(arm.model, state, frames, steps=steps)

@@ -35,6 +35,7 @@ class Given(NamedTuple):
     size: tuple[int, int]  # width and height
     track_pixel: np.ndarray | None = None  # [frames, tracks, 2]; centres at +0.5
     track_seen: np.ndarray | None = None  # [frames, tracks] bool
+    track_place: np.ndarray | None = None  # [frames, tracks, 3] scene units
     moving: np.ndarray | None = None  # [frames, height, width] bool
     # [frames, height, width], of any scale and offset, or inverse; NaN unknown
     depth: np.ndarray | None = None

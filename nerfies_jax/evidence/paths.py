@@ -80,9 +80,14 @@ def least_acceleration(
     some = slice(None, None, -(-len(ray) // TRIED) or 1)
     penalty = _penalty(views, _Wanted(*(part[some] for part in wanted)), noise)
     position, flatness = _fitted(views, wanted, penalty, noise)
+    return certain(views, tracks, position, near)._replace(depth_deviation=flatness)
+
+
+def certain(views: Views, tracks: Tracks, position: np.ndarray, near: float) -> Paths:
+    """Paths of tracks whose places [tracks, frames, 3] are known, scene units."""
     depth = views.depth_of(position)
-    known = tracks.seen & (np.nan_to_num(depth, nan=-1.0) > near)
-    return Paths(position, known, depth, flatness)
+    there = tracks.seen & (np.nan_to_num(depth, nan=-1.0) > near)
+    return Paths(position, there, depth, np.zeros(len(position)))
 
 
 class _Wanted(NamedTuple):

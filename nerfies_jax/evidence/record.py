@@ -119,8 +119,13 @@ def gather(
     which = np.zeros(0, int)
     if not unusable:
         which = _moved(tracks, score, first)
-    measured = _depths(capture, given, views, tracks, rest, score, use_depths)
-    moved_paths = _paths(capture, views, tracks, rest, score, which, measured, watch)
+    places = taken.places(given, views)
+    if places is None:
+        depths = _depths(capture, given, views, tracks, rest, score, use_depths)
+        moved_paths = _paths(capture, views, tracks, rest, score, which, depths, watch)
+    else:
+        near, moved = AT_CAMERA * capture.near, tracks.take(which)
+        moved_paths = paths.certain(views, moved, places[which - first], near)
     watch.begin("still")
     dense = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
     if watch.has_time(FOR_POINTS, "dense points at rest"):

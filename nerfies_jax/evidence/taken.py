@@ -26,11 +26,22 @@ def tracks(given: Given, views: Views) -> Tracks | None:
     """Those that are long enough; each begins where it is first seen."""
     if given.track_pixel is None:
         return None
+    return tracking.long_enough(_followed(given, views))
+
+
+def places(given: Given, views: Views) -> np.ndarray | None:
+    """[tracks, frames, 3] where those of `tracks` are, scene units."""
+    if given.track_place is None:
+        return None
+    long = tracking.is_long(_followed(given, views))
+    return np.moveaxis(given.track_place[views.row], 0, 1)[long]
+
+
+def _followed(given, views):
     scale = np.divide(views.size, given.size, dtype=np.float32)
     pixel = np.moveaxis(given.track_pixel[views.row], 0, 1) * scale
     seen = np.moveaxis(given.track_seen[views.row], 0, 1)
-    followed = Tracks(seen.argmax(1), np.where(seen[..., None], pixel, 0), seen)
-    return tracking.long_enough(followed)
+    return Tracks(seen.argmax(1), np.where(seen[..., None], pixel, 0), seen)
 
 
 def moving(given: Given, views: Views) -> np.ndarray | None:

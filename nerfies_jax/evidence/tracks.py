@@ -115,8 +115,13 @@ def _step(pixel, shift, usable):
 
 
 def long_enough(tracks: Tracks) -> Tracks:
-    """Those seen in `SHORTEST` frames, or in all of a shorter film."""
-    return tracks.take(tracks.seen.sum(1) >= min(SHORTEST, tracks.seen.shape[1]))
+    """Those that are long."""
+    return tracks.take(is_long(tracks))
+
+
+def is_long(tracks: Tracks) -> np.ndarray:
+    """[tracks] bool: seen in `SHORTEST` frames, or in all of a shorter film."""
+    return tracks.seen.sum(1) >= min(SHORTEST, tracks.seen.shape[1])
 
 
 def realigned(tracks: Tracks, pictures: np.ndarray, size: tuple[int, int]) -> Tracks:

@@ -67,6 +67,23 @@ def test_paths_are_those_of_the_tracks_given_and_masks_are_the_masks(tmp_path):
     assert len(evidence.still.position) > 2000
 
 
+def test_paths_whose_places_are_given_are_taken_as_they_are(tmp_path):
+    path, points = tapir(tmp_path / "t.npz")
+    capture = with_files(tracks=path)
+    rows = gathered()[1].row
+    place = np.zeros((len(capture.ids), *points.seen.T.shape[1:], 3), np.float32)
+    place[rows] = np.moveaxis(points.position, 0, 1)
+    given = capture.given._replace(track_place=place)
+    evidence = record.gather(dataclasses.replace(capture, given=given))
+    kept = evidence.paths.known
+    found, pixel = evidence.paths.position, evidence.tracks.pixel[evidence.moved]
+    assert kept.sum() > 0.9 * points.seen.sum()
+    for row, frame in zip(*np.nonzero(kept), strict=True):
+        which = np.abs(points.pixel[:, frame] - pixel[row, frame]).sum(1).argmin()
+        assert np.array_equal(found[row, frame], place[rows[frame], which])
+    assert not evidence.paths.depth_deviation.any()
+
+
 def test_a_mover_that_was_marked_is_no_noise_however_small():
     _, found = gathered()
     small = found._replace(moving=np.zeros_like(found.moving))

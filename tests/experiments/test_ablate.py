@@ -5,6 +5,7 @@ import json
 import types
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -18,6 +19,7 @@ from experiments.ablate.measures import MEASURES
 from experiments.ablate.results import ArmResult
 from experiments.ablate.settings import Ablate
 from nerfies_jax.capture import synthetic
+from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.measure import clock
 from nerfies_jax.runs import platform
 from nerfies_jax.training.track_start import FieldStartSpec
@@ -153,6 +155,32 @@ def test_arms_that_need_depth_are_not_run_without_it(tiny, monkeypatch):
 
     monkeypatch.setattr(synthetic, "cached", blind)
     assert Job(settled).names == ("all",)
+
+
+def test_arms_that_are_told_the_truth_are_not_run_where_none_is_known(
+    tiny, monkeypatch
+):
+    tiny += ["--suite", "tracked"]
+    job = Job(cli.parse(Ablate, tiny))
+    assert "true-motion" in job.names
+    given, capture = job.told.given, job.capture
+    for row in range(len(capture.ids)):
+        place = given.track_place[row]
+        camera = jax.tree.map(jnp.asarray, cameras.take(capture.cameras, row))
+        pixel = jax.vmap(cameras.project, (None, 0))(camera, place)[0]
+        seen = given.track_seen[row]
+        np.testing.assert_allclose(pixel[seen], given.track_pixel[row][seen], atol=1e-2)
+    assert given.track_seen.any()
+    opened = Job._open
+
+    def untold(self):
+        opened(self)
+        self.told = None
+
+    monkeypatch.setattr(Job, "_open", untold)
+    assert "true-motion" not in Job(cli.parse(Ablate, tiny)).names
+    with pytest.raises(ValueError, match="true-motion: starts from the truth"):
+        Job(cli.parse(Ablate, [*tiny, "--arms", "true-motion"]))
 
 
 @pytest.mark.slow

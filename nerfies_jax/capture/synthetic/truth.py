@@ -1,5 +1,6 @@
 """What is known of a synthetic scene beyond its pictures: ids, flow, point tracks."""
 
+import dataclasses
 import functools
 import pathlib
 import zipfile
@@ -10,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.capture.given import Given
 from nerfies_jax.capture.synthetic import trace
 from nerfies_jax.capture.synthetic.film import Schedule
 from nerfies_jax.capture.synthetic.spec import SceneSpec
@@ -40,6 +43,24 @@ class SceneTruth(NamedTuple):
     track_world: np.ndarray  # [tracks, instants, 3] float32
     track_pixel: np.ndarray  # [tracks, frames, 2] float32
     track_seen: np.ndarray  # [tracks, frames] bool
+
+
+def told(capture: Capture, truth: SceneTruth) -> Capture:
+    """The capture with true tracks, places and masks, as if a tool had found them.
+
+    `truth` is of the same frames.
+    """
+    last = truth.track_world.shape[1] - 1
+    world = truth.track_world[:, np.round(capture.times * last).astype(int)]
+    place = (world - np.float32(capture.centre)) * np.float32(capture.scale)
+    found = Given(
+        capture.size,
+        track_pixel=np.moveaxis(truth.track_pixel, 0, 1),
+        track_seen=np.moveaxis(truth.track_seen, 0, 1),
+        track_place=np.moveaxis(place, 0, 1),
+        moving=capture.moving,
+    )
+    return dataclasses.replace(capture, given=found)
 
 
 class Flow(NamedTuple):
