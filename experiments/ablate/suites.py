@@ -2,7 +2,8 @@
 
 import functools
 
-from experiments.ablate.arms import FIELDS, MOBA, SONATA, START, TRACKED_PARTS, Suite
+from experiments.ablate.arms import FIELDS, MOBA, SONATA, Suite
+from experiments.ablate.start_arms import START, TRACKED_PARTS
 from experiments.accuracy_time.axes import SETTINGS
 
 KEPT = {

@@ -1,0 +1,93 @@
+"""What a start from tracks is worth, and what the parts of the default are; no JAX."""
+
+from experiments.ablate.arms import (
+    FROM_REST,
+    FROM_TRACKS,
+    TRACKED,
+    Arm,
+    Claim,
+    Suite,
+)
+
+# One view a step and Gaussians that are always there, as in the presets beside it.
+BASES_ALONE = ("batch_size=1", "temporal_opacity=none")
+
+START = Suite(
+    arms={
+        "bases": Arm("splats-tracked-small", BASES_ALONE),
+        "mlp": Arm("splats-deformable-small", (FROM_TRACKS,)),
+        "kan": Arm("sonata-small", (FROM_TRACKS,)),
+        "basis": Arm("moba-small", (FROM_TRACKS,)),
+        "bases-from-rest": Arm("splats-tracked-small", (*BASES_ALONE, FROM_REST)),
+        "mlp-from-rest": Arm("splats-deformable-small"),
+        "kan-from-rest": Arm("sonata-small"),
+        "basis-from-rest": Arm("moba-small"),
+        "static": Arm("splats-static-small"),
+    },
+    claims=(
+        *(
+            Claim(
+                f"Tracks find motion that descent on pictures does not ({what})",
+                name,
+                f"{name}-from-rest",
+                TRACKED,
+            )
+            for name, what in (
+                ("bases", "SE(3) bases"),
+                ("mlp", "deformable 3DGS"),
+                ("kan", "Sonata"),
+                ("basis", "MoBa-GS"),
+            )
+        ),
+        *(
+            Claim(
+                f"From tracks, few rigid motions carry more than {what}",
+                "bases",
+                name,
+                TRACKED,
+            )
+            for name, what in (
+                ("mlp", "an MLP"),
+                ("kan", "an RBF-KAN on embeddings"),
+                ("basis", "spatially varying bases"),
+            )
+        ),
+    ),
+    seeds=3,
+    pictured=("bases", "mlp", "kan", "basis", "mlp-from-rest"),
+    context="",
+)
+
+TRACKED_PARTS = Suite(
+    arms={
+        "full": Arm("splats-tracked-small"),
+        "always-there": Arm("splats-tracked-small", ("temporal_opacity=none",)),
+        "unfilled": Arm("splats-tracked-small", ("start.fill_hidden=False",)),
+        "one-spline": Arm(
+            "splats-tracked-small", ("motion.coarse_knots=0", "motion.fine_rate=1.0")
+        ),
+        "k4": Arm("splats-tracked-small", ("motion.bases=4",)),
+        "k20": Arm("splats-tracked-small", ("motion.bases=20",)),
+        "slow": Arm("splats-tracked-small", ("motion.learning_rate=1e-4",)),
+        "flow": Arm("splats-tracked-small", ("flow.start=0",)),
+        "true-motion": Arm("splats-tracked-small", told=True),
+    },
+    claims=(
+        Claim(
+            "Gaussians that are there for a part of the film show more",
+            "full",
+            "always-there",
+            TRACKED,
+        ),
+        Claim("What is hidden is better guessed", "full", "unfilled", TRACKED),
+        Claim("A second spline of few knots helps", "full", "one-spline", TRACKED),
+        Claim("Eight bases beat four", "full", "k4", TRACKED),
+        Claim("Eight bases beat twenty", "full", "k20", TRACKED),
+        Claim("Motion has more to learn", "full", "slow", TRACKED),
+        Claim("Flow has more to teach than its start", "flow", "full", TRACKED),
+        Claim("True motion beats what is found", "true-motion", "full", TRACKED),
+    ),
+    seeds=3,
+    pictured=("full", "true-motion", "one-spline", "k4", "k20"),
+    context="",
+)
