@@ -47,11 +47,14 @@ def _trained(about):
 
 
 def _arms(about, means):
-    rows = [
-        [f"`{arm}`", " ".join((about["arms"][arm]["preset"],
-                               *about["arms"][arm]["changes"]))]
-        for arm in means
-    ]  # fmt: skip
+    rows = []
+    for arm in means:
+        about_arm = about["arms"][arm]
+        words = [about_arm["preset"], *about_arm["changes"]]
+        # As those that were kept before an arm could be told the truth.
+        if about_arm.get("told"):
+            words.append("from the scene's own points, where they are at every moment")
+        rows.append([f"`{arm}`", " ".join(words)])
     return markdown.table(("arm", "trained with"), rows, words=2)
 
 

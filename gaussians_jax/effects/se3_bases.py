@@ -8,7 +8,7 @@ entry for what is still. Where nothing turns or shifts, nothing moves, exactly.
 
 Two splines are added: one of many knots takes over what tracks know, one of few learns
 ten times faster from pictures, and less of their noise. Against the former alone, three
-seeds of the built-in scene: 0.5 dB more, 0.8 where it moves, points 0.0074 units off
+seeds of the built-in scene: 0.3 dB more, 0.7 where it moves, points 0.0074 units off
 for 0.0085 (`docs/results/ablate_tracked.md`). Ten knots alone are better still there
 (one seed, 900 steps: 33.27 / 29.94 dB, 0.0060), but fifteen are too stiff for a hand
 before books: 37.12 dB, 33.12 where it moves, for 37.56 and 34.18.
