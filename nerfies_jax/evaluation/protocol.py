@@ -68,28 +68,16 @@ def ground_truth(
 
     Raises ValueError where the truth is not that of the capture.
     """
-    if truth.ids != capture.ids:
-        raise ValueError(
-            f"{capture.name}: the truth has other frames than the capture; make the "
-            "scene again"
-        )
     moments = capture.train[np.argsort(capture.times[capture.train], kind="stable")]
-    last = truth.track_world.shape[1] - 1
-    instants = np.round(capture.times[moments] * last).astype(int)
-    if np.abs(instants - capture.times[moments] * last).max() > 1e-3:
-        raise ValueError(
-            f"{capture.name}: its frames lie between the {last + 1} instants of the "
-            "truth; make the scene again"
-        )
+    path = truths.track_places(capture, truth, moments)
     start = len(moments) // 2
     chosen = np.flatnonzero(truth.track_seen[:, moments[start]])
     if len(chosen):
         chosen = evaluation.spread(chosen, tracks)
-    world = (truth.track_world[chosen] - np.float32(capture.centre)) * capture.scale
     return GroundTruth(
         rows=evaluation.spread(capture.heldout, frames),
         moments=moments,
-        path=world[:, instants].astype(np.float32),
+        path=path[chosen],
         seen=truth.track_seen[chosen][:, moments],
         start=start,
     )

@@ -10,6 +10,7 @@ import numpy as np
 
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.synthetic import SceneTruth
+from nerfies_jax.capture.synthetic import truth as truths
 from nerfies_jax.evidence import dense_flow, paths, record, view_set
 from nerfies_jax.evidence import tracks as tracking
 from nerfies_jax.evidence.record import Evidence
@@ -39,19 +40,12 @@ class Errors(NamedTuple):
 
 def true_points(capture: Capture, truth: SceneTruth, evidence: Evidence) -> TruePoints:
     """The truth's moving points; ValueError where it is not that of the capture."""
-    if truth.ids != capture.ids:
-        raise ValueError(
-            f"{capture.name}: the truth has other frames than the capture; make the "
-            "scene again"
-        )
-    last = truth.track_world.shape[1] - 1
-    instant = np.round(capture.times[evidence.row] * last).astype(int)
+    position = truths.track_places(capture, truth, evidence.row)
     scale = evidence.moving.shape[2] / truth.things.shape[2]
-    world = (truth.track_world[:, instant] - np.float32(capture.centre)) * capture.scale
     return TruePoints(
         truth.track_pixel[:, evidence.row] * scale,
         truth.track_seen[:, evidence.row],
-        world,
+        position,
     )
 
 

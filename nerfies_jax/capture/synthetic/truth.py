@@ -45,14 +45,33 @@ class SceneTruth(NamedTuple):
     track_seen: np.ndarray  # [tracks, frames] bool
 
 
+def track_places(capture: Capture, truth: SceneTruth, rows: np.ndarray) -> np.ndarray:
+    """Where the points are in these frames, [tracks, rows, 3] float32, scene units.
+
+    Raises ValueError where the truth is not that of the capture.
+    """
+    if truth.ids != capture.ids:
+        raise ValueError(
+            f"{capture.name}: the truth has other frames than the capture; make the "
+            "scene again"
+        )
+    last = truth.track_world.shape[1] - 1
+    instants = np.round(capture.times[rows] * last).astype(int)
+    if np.abs(instants - capture.times[rows] * last).max() > 1e-3:
+        raise ValueError(
+            f"{capture.name}: its frames lie between the {last + 1} instants of the "
+            "truth; make the scene again"
+        )
+    world = truth.track_world[:, instants] - np.float32(capture.centre)
+    return (world * capture.scale).astype(np.float32)
+
+
 def told(capture: Capture, truth: SceneTruth) -> Capture:
     """The capture with true tracks, places and masks, as if a tool had found them.
 
-    `truth` is of the same frames.
+    Raises ValueError where the truth is not that of the capture.
     """
-    last = truth.track_world.shape[1] - 1
-    world = truth.track_world[:, np.round(capture.times * last).astype(int)]
-    place = (world - np.float32(capture.centre)) * np.float32(capture.scale)
+    place = track_places(capture, truth, np.arange(len(capture.ids)))
     found = Given(
         capture.size,
         track_pixel=np.moveaxis(truth.track_pixel, 0, 1),
