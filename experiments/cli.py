@@ -26,7 +26,7 @@ Positional = tyro.conf.Positional
 # Those of `nerfies_jax.capture.synthetic`, which loads JAX.
 SCENES = (
     *("default", "static", "rigid", "fast", "non-rigid", "articulated"),
-    *("exposure", "transient", "specular", "topology"),
+    *("exposure", "transient", "specular", "topology", "pose-error"),
 )
 Preset = Annotated[str | None, options.Known(PRESETS), tyro.conf.arg(metavar="NAME")]
 Overrides = Annotated[tuple[str, ...], tyro.conf.arg(metavar="FIELD=VALUE ...")]

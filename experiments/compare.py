@@ -228,6 +228,7 @@ def draw(path: pathlib.Path, compared, count: int) -> None:
     for each in compared:
         run = runs.saved_run(each.folder)
         state = runs.restore(each.folder, run).state
+        run = runs.with_found_cameras(run, state)
         rows = evaluation.spread(run.filmed.heldout, count)
         draw = runs.drawer(run, evaluation.Renderer(run.model, run.capture.size))
         scored.append(evaluation.score(draw, state, run.filmed, rows))

@@ -126,8 +126,9 @@ def main(args):
             video.library()  # missing, it is said before anything is rendered
         run = runs.saved_run(args.run)
         move = _mover(args, run)
-        state = _shown(args, run.model, runs.restore(args.run, run).state)
-        trained = state
+        trained = runs.restore(args.run, run).state
+        run = runs.with_found_cameras(run, trained)
+        state = trained = _shown(args, run.model, trained)
         model, state = _faster(args, _model(args, run), state)
         names, views, own_size = _views(args, run)
         size = cli.sized(own_size, args.max_side)

@@ -71,8 +71,8 @@ DEFORMABLE = SplatScene(steps=40_000, motion=MotionSpec())
 
 # Zhu et al. 2024, arXiv:2410.07707, and its code's numbers: Deformable 3DGS with flow
 # that is not the camera's. Its flow comes from a network, this from `evidence`; frames
-# come in any order, where its come one after the other; and its cameras are refined
-# while it trains (an option there), while here they are the capture's.
+# come in any order, where its come one after the other; and its cameras stay those of
+# the capture, as there by default (`poses=PoseRefinementSpec` refines them).
 MOTION_GS = SplatScene(
     steps=20_000,
     learning_rates=LearningRateSpec(log_scale=1e-3),

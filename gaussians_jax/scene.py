@@ -74,6 +74,7 @@ def metadata_of(capture: Capture) -> SceneMetadata:
         exposures=exposures(capture),
         box=initialisation.filmed_box(capture, span),
         near=NEAREST * span[0],
+        depth=2 / (1 / span[0] + 1 / span[1]),
     )
 
 
@@ -134,7 +135,20 @@ def build(
         stages=stages,
         example=example,
         devices=devices,
+        found=_finder(effects),
     )
+
+
+def _finder(effects):
+    """`Model.found` of these effects."""
+    finding = [effect for effect in effects if effect.found is not None]
+
+    def found(params, capture):
+        for effect in finding:
+            capture = effect.found(params.nets.get(effect.name), capture)
+        return capture
+
+    return found if finding else None
 
 
 def _stages(spec, metadata, effects):
@@ -190,6 +204,15 @@ def _exposed(effects, params, drawn, view):
     return drawn
 
 
+def _posed(effects, params, frames):
+    """What is learnt from, its cameras as training has them."""
+    for effect in effects:
+        if effect.pose is not None:
+            own = params.nets.get(effect.name)
+            frames = frames._replace(cameras=effect.pose(own, frames.cameras))
+    return frames
+
+
 def _stepper(spec, metadata, effects, optimiser, devices):
     """One update from a batch of frames: (state, frames) -> (state, metrics), pure."""
 
@@ -235,7 +258,6 @@ def _condition(spec, state, frames, index):
 
 def _gradients(spec, metadata, effects, state, frames, row, condition):
     """Metrics, slopes and what was drawn of one frame."""
-    view = _view(frames, row)
     size = frames.images.shape[2], frames.images.shape[1]
     degree = splats.active_degree(state.step, spec.sh_every, spec.sh_degree)
 
@@ -253,9 +275,11 @@ def _gradients(spec, metadata, effects, state, frames, row, condition):
         canonical = splats.activate(params.rows["splats"])
         moved = deform(params, canonical)
         rows, drawn = deformation.drawn(effects, params, moved, condition)
+        posed = _posed(effects, params, frames)
+        view = _view(posed, row)
         frame = _draw(spec, metadata, rows, drawn, view, size, degree, probe, depth)
         exposed = _exposed(effects, params, frame.rendering, view)
-        seen = observe(frames, row, exposed)
+        seen = observe(posed, row, exposed)
         states = state.aux_state.effects
         value, metrics = loss_of(spec, effects, params, seen, condition, states)
         weight = deformation.significance(effects, drawn)

@@ -20,6 +20,7 @@ from gaussians_jax.effects import (
     node_motion,
     plane_motion,
     polynomial_motion,
+    pose_refinement,
     se3_bases,
     spectral,
     spline_motion,
@@ -41,6 +42,7 @@ from gaussians_jax.effects.neighbours import NeighbourSpec
 from gaussians_jax.effects.node_motion import NodeMotionSpec
 from gaussians_jax.effects.plane_motion import PlaneMotionSpec
 from gaussians_jax.effects.polynomial_motion import PolynomialMotionSpec
+from gaussians_jax.effects.pose_refinement import PoseRefinementSpec
 from gaussians_jax.effects.se3_bases import SE3BasesSpec
 from gaussians_jax.effects.spectral import SpectralSpec
 from gaussians_jax.effects.spline_motion import SplineMotionSpec
@@ -118,6 +120,7 @@ class SplatScene:
     depth: DepthSpec | None = None
     exposure: ExposureSpec | None = None
     flow: FlowSpec | None = None
+    poses: PoseRefinementSpec | None = None
 
     def __post_init__(self):
         if self.steps < 1:
@@ -147,6 +150,7 @@ class SceneMetadata:
     # Low and high corner of what was filmed, scene units; None: nobody asks for it.
     box: tuple[tuple[float, ...], tuple[float, ...]] | None = None
     near: float = math.inf  # z-depth, scene units: what is farther must be drawn
+    depth: float = 1.0  # z-depth halfway in what is filmed, scene units
 
 
 def raster_of(spec: SplatScene, metadata: SceneMetadata) -> RasterSpec:
@@ -297,4 +301,10 @@ def effects_of(spec: SplatScene, metadata: SceneMetadata) -> tuple[Effect, ...]:
         at_once = spec.start.motion == "tracks"  # as the motion
         one = dataclasses.replace(spec.flow, start=0) if at_once else spec.flow
         effects.append(motion_flow.effect(one, raster_of(spec, metadata)))
+    if spec.poses is not None:
+        effects.append(
+            pose_refinement.effect(
+                spec.poses, spec.steps, metadata.frames, metadata.depth
+            )
+        )
     return tuple(effects)

@@ -32,6 +32,10 @@ NEAR_ENOUGH = 0.1  # share of --seconds by which a first seed may miss them
 SAVED = "/jax/compilation_cache/compile_time_saved_sec"
 
 
+# Fields of specs that came after arms were kept: none, they change nothing in these.
+YOUNGER = ("poses",)
+
+
 class CompiledArm(NamedTuple):
     """An arm ready to train; kept over its seeds, so that it is compiled once."""
 
@@ -227,7 +231,8 @@ class Job:
             print(f"stopped; go on with the same command and --out {self.out}")
             raise SystemExit(130 if result.stopped_by == "SIGINT" else 143)
         draw = ThroughLens(arm.renderer, self.filmed.size)
-        scored = evaluation.score(draw, result.state, self.filmed, self.known.rows)
+        filmed = evaluation.as_found(arm.model, result.state, self.filmed)
+        scored = evaluation.score(draw, result.state, filmed, self.known.rows)
         followed = arm.representation.follow(
             arm.spec, arm.metadata, result.state, self.capture, self.known
         )
@@ -312,7 +317,7 @@ class Job:
             "seconds": budget.seconds,
             # As those that were kept before there was a choice.
             **({"clock": budget.clock} if budget.clock != "wall" else {}),
-            "spec": specs.as_json(self.spec(name, steps)),
+            "spec": _without_younger(specs.as_json(self.spec(name, steps))),
             **{k: x for k, x in self.measured_on().items() if k != "scene"},
         }
 
@@ -359,6 +364,12 @@ class Job:
     def missing(self) -> list[tuple[str, int]]:
         """Arms and seeds that are not finished."""
         return [task for task in self.tasks() if not self.is_finished(*task)]
+
+
+def _without_younger(stored):
+    """A spec as JSON, as it was before there was a choice that it leaves out."""
+    absent = [name for name in YOUNGER if stored.get(name, "") is None]
+    return {name: item for name, item in stored.items() if name not in absent}
 
 
 def _model_bytes(arm, state):

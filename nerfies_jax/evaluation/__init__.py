@@ -1,6 +1,7 @@
 """Frames of a capture, the renderer, and scores of what it draws."""
 
 from nerfies_jax.evaluation.frames import (
+    as_found,
     frames_of,
     path_views,
     resized,
@@ -20,6 +21,7 @@ __all__ = [
     "Halves",
     "Renderer",
     "Scored",
+    "as_found",
     "as_picture",
     "frames_of",
     "path_views",

@@ -9,7 +9,13 @@ from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.flow import training_flow
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry.camera import Camera
-from nerfies_jax.training.model import Frames, View, in_default_precision
+from nerfies_jax.training.model import (
+    Frames,
+    Model,
+    TrainState,
+    View,
+    in_default_precision,
+)
 
 
 def frames_of(capture: Capture, required_data: Set[str] = frozenset()) -> Frames:
@@ -33,6 +39,17 @@ def frames_of(capture: Capture, required_data: Set[str] = frozenset()) -> Frames
         **extras,
     )
     return in_default_precision(frames)
+
+
+def as_found(model: Model, state: TrainState, capture: Capture) -> Capture:
+    """A capture with the cameras that training found; as it is where it looks for none.
+
+    It need not be the one that was learnt from: with a lens, or without, of the same
+    frames.
+    """
+    if model.found is None:
+        return capture
+    return model.found(state.params, capture)
 
 
 def view_of(capture: Capture, row: int | np.integer) -> View:

@@ -16,3 +16,4 @@ from .run import save_config as save_config
 from .run import saved_run as saved_run
 from .run import scene_spec as scene_spec
 from .run import stored_capture as stored_capture
+from .run import with_found_cameras as with_found_cameras

@@ -19,7 +19,7 @@ from nerfies_jax.evaluation.representation import Saved
 from nerfies_jax.measure import clock
 from nerfies_jax.measure.clock import Metric
 from nerfies_jax.runs import budget, commands, curves, floors_text, quality, report
-from nerfies_jax.runs.run import Run
+from nerfies_jax.runs.run import Run, with_found_cameras
 from nerfies_jax.runs.run_folder import CONFIG
 from nerfies_jax.runs.train import Trained
 from nerfies_jax.training import losses
@@ -45,6 +45,7 @@ def make(
     are not finite: its parameters may be finite and yet beyond use.
     """
     state, renderer = trained.result.state, trained.renderer
+    run = with_found_cameras(run, state)
     rows, left_out = frames_to_score(run, trained)
     scored = evaluation.score(trained.draw, state, run.filmed, rows)
     if not np.isfinite(scored.colour).all():

@@ -15,7 +15,7 @@ from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.json_files import write_json
 from nerfies_jax.capture.nearest import known_names
-from nerfies_jax.evaluation import Renderer
+from nerfies_jax.evaluation import Renderer, as_found
 from nerfies_jax.evaluation.lens import ThroughLens
 from nerfies_jax.evaluation.representation import Representation
 from nerfies_jax.evaluation.scores import Draw
@@ -108,6 +108,15 @@ def _built(config, representation, spec, capture, filmed):
     effects = own_effects.load(config.effects, metadata)
     model = representation.build(spec, metadata, effects=effects)
     return Run(config, capture, filmed, representation, spec, metadata, model, effects)
+
+
+def with_found_cameras(run: Run, state: TrainState) -> Run:
+    """The run with its cameras as training found them; as it is where they stay."""
+    capture = as_found(run.model, state, run.capture)
+    if run.filmed is run.capture:
+        return run._replace(capture=capture, filmed=capture)
+    filmed = as_found(run.model, state, run.filmed)
+    return run._replace(capture=capture, filmed=filmed)
 
 
 def drawer(run: Run, renderer: Renderer) -> Draw:

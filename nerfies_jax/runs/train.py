@@ -76,7 +76,8 @@ def train(
 
     def held_out(state, step):
         del step
-        scored = evaluation.score(draw, state, run.filmed, few)
+        filmed = evaluation.as_found(run.model, state, run.filmed)
+        scored = evaluation.score(draw, state, filmed, few)
         return {"psnr": scored.psnr.mean(), "ssim": scored.ssim.mean()}
 
     if len(few):

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import jax
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.training.model import Frames, Rendering
 from nerfies_jax.training.schedules import Schedule
 
@@ -60,6 +61,8 @@ SPLAT_SEAMS = (
     "revise",
     "revise_at",
     "expose",
+    "pose",
+    "found",
 )
 
 
@@ -195,6 +198,11 @@ class Effect(NamedTuple):
     # (params, picture [height, width, 3] sRGB, appearance id) -> the picture as it was
     # filmed; of all that is drawn, in training and afterwards
     expose: Callable[[PyTree, Any, Int[Array, ""]], Any] | None = None
+    # (params, cameras of the frames that are learnt from) -> the same, refined; whoever
+    # reads the frames of a step has these
+    pose: Callable[[PyTree, Camera], Camera] | None = None
+    # (params, capture) -> the capture with all cameras as `pose` has them; host side
+    found: Callable[[PyTree, Any], Any] | None = None
     # (`path_fit.Paths`, key) -> `path_fit.Guess`, from which the motion is fitted to
     # tracks; host side. None: it is fitted from where `init` starts it.
     fit_to_paths: Callable[[Any, Key[Array, ""]], Any] | None = None

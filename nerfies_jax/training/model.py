@@ -131,3 +131,6 @@ class Model(NamedTuple):
     # As `init`, of the same structure and quicker: what a checkpoint is read into.
     example: Callable[[Any, Any], TrainState] | None = None
     devices: int = 1  # on which `step` works, by `data_parallel`
+    # (params, capture) -> the capture with its cameras as training found them; None
+    # where they stay those of the capture.
+    found: Callable[[PyTree, Any], Any] | None = None

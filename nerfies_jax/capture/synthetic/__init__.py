@@ -17,6 +17,7 @@ from nerfies_jax.capture.synthetic.record import (
 from nerfies_jax.capture.synthetic.spec import (
     Cameras,
     Exposure,
+    PoseError,
     SceneSpec,
     Specular,
     Thing,
@@ -32,6 +33,7 @@ __all__ = [
     "VERSION",
     "Cameras",
     "Exposure",
+    "PoseError",
     "SceneSpec",
     "SceneTruth",
     "Specular",

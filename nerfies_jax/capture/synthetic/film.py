@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 from nerfies_jax.capture.synthetic import texture, trace
 from nerfies_jax.capture.synthetic.spec import SceneSpec
 from nerfies_jax.geometry import camera as cameras
-from nerfies_jax.geometry import rays
+from nerfies_jax.geometry import lie, rays
 from nerfies_jax.geometry.camera import Camera
 
 TILE = 16  # pixels
@@ -108,6 +108,37 @@ def view_direction(camera: Camera, pixel: Float[Array, "2"]) -> Float[Array, "3"
     slopes = (pixel - camera.principal_point_px) / camera.focal_px
     in_camera = jnp.concatenate([slopes, jnp.ones_like(slopes[:1])])
     return jnp.matmul(in_camera, camera.camera_from_world, precision="highest")
+
+
+def noted_cameras(spec: SceneSpec, plan: Schedule, seed: int) -> Camera:
+    """The cameras as a capture has them: of the first one with their error."""
+    if spec.pose_error is None:
+        return plan.cameras
+    rng = np.random.default_rng([seed, 5])
+    turn, shift = rng.normal(size=(2, len(plan.time), 3)).astype(np.float32)
+    focal_px = plan.cameras.focal_px[:, None]
+    first = (plan.camera_id == 0)[:, None]
+    turn = first * spec.pose_error.turn_px / focal_px * turn
+    depth = spec.cameras.distance
+    shift = first * depth * spec.pose_error.shift_px / focal_px * shift
+
+    def off(camera, turn, shift):
+        turned = jnp.matmul(
+            lie.exp_so3(turn), camera.camera_from_world, precision="highest"
+        )
+        away = jnp.matmul(shift, camera.camera_from_world, precision="highest")
+        return camera._replace(
+            camera_from_world=turned, position=camera.position + away
+        )
+
+    moved = jax.jit(jax.vmap(off))(plan.cameras, turn, shift)
+    return jax.tree.map(
+        lambda old, new: np.where(
+            first.reshape(-1, *(1,) * (old.ndim - 1)), np.asarray(new, old.dtype), old
+        ),
+        plan.cameras,
+        moved,
+    )
 
 
 def _sub_pixels(count, dtype):

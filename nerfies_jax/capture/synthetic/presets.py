@@ -6,6 +6,7 @@ from nerfies_jax.capture.synthetic.motion import Arm, Glide, Hinge, Path
 from nerfies_jax.capture.synthetic.shapes import Box, Sheet, Sphere, Squash
 from nerfies_jax.capture.synthetic.spec import (
     Exposure,
+    PoseError,
     SceneSpec,
     Specular,
     Thing,
@@ -214,7 +215,7 @@ PASSED = dataclasses.replace(
 SHINY = dataclasses.replace(
     STATIC, name="specular", specular=Specular("globe", strength=0.8, sharpness=20.0)
 )
-
+MISPLACED = dataclasses.replace(DEFAULT, name="pose error", pose_error=PoseError())
 TOPOLOGY = SceneSpec(
     "lumps and shutter", (*STAGE, LEFT_LUMP, RIGHT_LUMP, LEFT_SHUTTER, RIGHT_SHUTTER)
 )
@@ -230,4 +231,5 @@ PRESETS = {
     "transient": PASSED,
     "specular": SHINY,
     "topology": TOPOLOGY,
+    "pose-error": MISPLACED,
 }

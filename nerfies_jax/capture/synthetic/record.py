@@ -42,7 +42,7 @@ def make(spec: SceneSpec, seed: int = 0) -> tuple[Capture, SceneTruth]:
         source="synthetic",
         ids=ids,
         images=images,
-        cameras=plan.cameras,
+        cameras=film.noted_cameras(spec, plan, seed),
         times=plan.time,
         train=np.flatnonzero(plan.learn),
         heldout=np.flatnonzero(~plan.learn),
@@ -93,6 +93,8 @@ def cached(
 def digest(spec: SceneSpec, seed: int = 0) -> str:
     """Twelve hex digits that name a spec, a seed and the version of this renderer."""
     text = f"{VERSION} {seed} {spec!r}"
+    if spec.pose_error is not None:
+        text += f" {spec.pose_error!r}"
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 

@@ -65,6 +65,25 @@ class Exposure:
 
 
 @dataclasses.dataclass(frozen=True)
+class PoseError:
+    """How far the noted cameras of the first one are off, each frame by itself.
+
+    As structure from motion leaves them that was misled. The second camera, which
+    scores, is noted as it stood.
+    """
+
+    turn_px: float = 0.6  # root mean square about each axis, seen in the picture
+    shift_px: float = 0.6  # along each axis, of what is as far as the target
+
+    def __post_init__(self):
+        if not (self.turn_px >= 0 and self.shift_px >= 0):
+            raise ValueError(
+                f"turn_px={self.turn_px} and shift_px={self.shift_px} must not be "
+                "negative; 0 is exact"
+            )
+
+
+@dataclasses.dataclass(frozen=True)
 class Transient:
     """Something that passes before the first camera now and then, and is no scene.
 
@@ -113,6 +132,8 @@ class SceneSpec:
     exposure: Exposure | None = None
     transient: Transient | None = None
     specular: Specular | None = None
+    # Not in the representation, which names films: those without are as they were.
+    pose_error: PoseError | None = dataclasses.field(default=None, repr=False)
 
     def __post_init__(self):
         unit_axis(self.light)

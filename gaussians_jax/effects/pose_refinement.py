@@ -1,0 +1,96 @@
+"""Cameras of the frames that are learnt from, refined while the scene is.
+
+A screw for each frame, in the camera's own frame, descends with the Gaussians: the pose
+refinement of BARF (Lin et al. 2021, arXiv:2104.06405) for splats, as MotionGS has it
+beside its flow (Zhu et al. 2024, arXiv:2410.07707, section 3.3; there by turns with the
+Gaussians, here together) and gsplat as an option. The mean of all screws is taken off,
+or cameras and scene could drift away together.
+
+It pays where cameras are off by a pixel and more, and hardly where they come from a
+structure from motion that saw what does not move: `docs/results/ablate_cameras.md`.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.geometry.camera import Camera
+from nerfies_jax.training import fit, schedules
+from nerfies_jax.training.effects import Effect
+from nerfies_jax.training.model import in_default_precision
+
+NAME = "poses"
+
+Screws = Float[Array, "frames 6"]  # turn, and shift over the depth of the scene; rad
+
+
+@dataclasses.dataclass(frozen=True)
+class PoseRefinementSpec:
+    """How fast the cameras learn, in rad of a turn and of a shift seen at mid depth.
+
+    A frame's own screw learns once in so many steps as there are frames, and Adam's
+    step then counts some eight times.
+    """
+
+    learning_rate: float = 1e-4
+    learning_rate_end: float = 1e-5
+
+    def __post_init__(self):
+        schedules.check_falling(self.learning_rate, self.learning_rate_end)
+
+
+def refined(screws: Screws, cameras: Camera, depth: float) -> Camera:
+    """Cameras, one for each screw, moved by what it differs from the mean of all.
+
+    `depth`, in scene units, is where a shift of one radian moves the picture as far as
+    such a turn. Equal screws leave every camera as it is.
+    """
+    own = screws - jnp.mean(screws, axis=0)
+    return _moved(own, cameras, depth)
+
+
+def _moved(screws, cameras, depth):
+    return jax.vmap(
+        lambda camera, screw: fit.move_camera(camera, screw[:3], depth * screw[3:])
+    )(cameras, screws)
+
+
+def found(screws: Screws, capture: Capture, depth: float) -> Capture:
+    """A capture with its cameras as training found them; host side.
+
+    A frame that was not learnt from lies between the corrections of those before and
+    after it of the same physical camera; what no such camera filmed stays as it is.
+    """
+    own = np.asarray(screws - jnp.mean(screws, axis=0))
+    moves = np.zeros((len(capture.times), 6), own.dtype)
+    cameras_of, times = capture.camera_ids[capture.train], capture.times[capture.train]
+    for one in np.unique(cameras_of):
+        learnt = np.flatnonzero(cameras_of == one)
+        learnt = learnt[np.argsort(times[learnt], kind="stable")]
+        rows = np.flatnonzero(capture.camera_ids == one)
+        for axis in range(6):
+            moves[rows, axis] = np.interp(
+                capture.times[rows], times[learnt], own[learnt, axis]
+            )
+    moves[capture.train] = own
+    given = in_default_precision((moves, capture.cameras))
+    moved = jax.jit(_moved, static_argnums=2)(*given, depth)
+    cameras = jax.tree.map(lambda new: np.asarray(new, np.float32), moved)
+    return dataclasses.replace(capture, cameras=cameras)
+
+
+def effect(spec: PoseRefinementSpec, steps: int, frames: int, depth: float) -> Effect:
+    """The effect on a scene that learns from so many frames for so many steps."""
+    return Effect(
+        NAME,
+        init=lambda key: jnp.zeros((frames, 6), jnp.float32),
+        learning_rate=schedules.log_linear(
+            spec.learning_rate, spec.learning_rate_end, steps
+        ),
+        pose=lambda screws, cameras: refined(screws, cameras, depth),
+        found=lambda screws, capture: found(screws, capture, depth),
+    )

@@ -1,0 +1,177 @@
+"""Cameras that are refined while a scene of Gaussians is trained."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gaussians_jax import presets, scene
+from gaussians_jax.effects import pose_refinement
+from gaussians_jax.effects.pose_refinement import PoseRefinementSpec
+from nerfies_jax import evaluation
+from nerfies_jax.geometry import camera as cameras
+from nerfies_jax.training import loop
+from tests import gradients, scenes
+
+DEPTH = 0.8
+SPEC = dataclasses.replace(scenes.TINY_SPLATS, poses=PoseRefinementSpec(2e-3, 2e-4))
+EVEN = scenes.tiny_capture()
+
+
+def some_cameras(count, dtype):
+    rng = np.random.default_rng(3)
+    turns = Rotation.from_rotvec(rng.normal(size=(count, 3))).as_matrix()
+    own = cameras.take(EVEN.cameras, np.zeros(count, int))
+    own = own._replace(camera_from_world=turns, position=rng.normal(size=(count, 3)))
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), own)
+
+
+def by_scipy(screw, camera):
+    """The same camera by a matrix exponential in float64."""
+    from scipy.linalg import expm
+
+    turn, shift = np.asarray(screw[:3], float), DEPTH * np.asarray(screw[3:], float)
+    generator = np.zeros((4, 4))
+    generator[:3, :3] = np.cross(np.eye(3), turn)  # [turn]
+    generator[:3, 3] = shift
+    pose = np.linalg.inv(cameras.world_from_camera(camera).astype(float))
+    moved = expm(generator) @ pose
+    return moved[:3, :3], -moved[:3, :3].T @ moved[:3, 3]
+
+
+def test_cameras_move_by_what_their_screws_differ_from_the_mean(dtype):
+    rng = np.random.default_rng(0)
+    screws = jnp.asarray(rng.normal(size=(4, 6)) + 0.3, dtype)
+    given = some_cameras(4, dtype)
+    moved = pose_refinement.refined(screws, given, DEPTH)
+    for row in range(4):
+        own = np.asarray(screws[row] - screws.mean(axis=0))
+        turn, place = by_scipy(own, cameras.take(given, row))
+        bound = {"float32": 3e-6, "float64": 1e-12}[dtype]
+        np.testing.assert_allclose(moved.camera_from_world[row], turn, atol=bound)
+        np.testing.assert_allclose(moved.position[row], place, atol=bound)
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("size", [0.0, 1e-30, 1e-8])
+def test_equal_screws_leave_every_camera_and_have_exact_slopes(size, dtype):
+    given = some_cameras(3, dtype)
+    screws = jnp.full((3, 6), size, dtype)
+    moved = pose_refinement.refined(screws, given, DEPTH)
+    jax.tree.map(np.testing.assert_array_equal, moved, given)
+
+    def place(screws):
+        return pose_refinement.refined(screws, given, DEPTH).position
+
+    # By hand: a shift v moves a centre by -R' v, and the mean takes a third back.
+    slope = jax.jacfwd(place)(screws)[0, :, :, 3:]
+    back = -DEPTH * np.asarray(given.camera_from_world[0]).T
+    shares = np.where(np.arange(3) == 0, 2 / 3, -1 / 3)
+    np.testing.assert_allclose(
+        slope, back[:, None, :] * shares[None, :, None], atol=1e-6
+    )
+
+
+def test_one_frame_alone_keeps_its_camera(dtype):
+    given = some_cameras(1, dtype)
+    moved = pose_refinement.refined(jnp.ones((1, 6), dtype), given, DEPTH)
+    jax.tree.map(np.testing.assert_array_equal, moved, given)
+
+
+def test_slopes_of_the_loss_are_those_of_differences():
+    with jax.enable_x64(True):
+        metadata = scene.metadata_of(EVEN)
+        model = scene.build(SPEC, metadata)
+        state = model.init(EVEN, jax.random.key(0))
+        frames = evaluation.frames_of(EVEN)
+        view = evaluation.view_of(EVEN, int(EVEN.train[0]))
+        truth = frames.images[0].astype(jnp.float64) / 255
+
+        def loss(screws):
+            moved = pose_refinement.refined(screws, frames.cameras, metadata.depth)
+            seen = view._replace(camera=cameras.take(moved, 0))
+            drawn = model.render(state.params, seen, EVEN.size, state.step)
+            return jnp.mean((drawn.colour - truth) ** 2)
+
+        screws = jnp.asarray(1e-3 * np.random.default_rng(1).normal(size=(6, 6)))
+        assert gradients.directional_error(loss, screws) < 1e-4
+
+
+def test_cameras_that_are_off_are_found():
+    """A scene that is known, cameras that are off: at most a fifth of that is left."""
+    metadata = scene.metadata_of(EVEN)
+    plain = dataclasses.replace(SPEC, densification=None)
+    whole = scene.build(dataclasses.replace(plain, poses=None), metadata)
+    state = whole.init(EVEN, jax.random.key(0))
+    trained = loop.fit(whole, state, evaluation.frames_of(EVEN), steps=150).state
+    drawn = drawn_from(whole, trained, EVEN)
+    rng = np.random.default_rng(0)
+    error = 0.02 * rng.normal(size=(len(EVEN.train), 6)).astype(np.float32)
+    error -= error.mean(axis=0)
+    true = evaluation.frames_of(EVEN).cameras
+    off = pose_refinement.refined(jnp.asarray(error), true, metadata.depth)
+    rates = dataclasses.replace(
+        SPEC.learning_rates,
+        **dict.fromkeys(
+            ("mean", "log_scale", "quaternion", "opacity_logit", "sh_dc", "sh_rest"),
+            0.0,
+        ),
+    )
+    still = dataclasses.replace(plain, steps=120, learning_rates=rates)
+    model = scene.build(still, metadata)
+    began = model.init(EVEN, jax.random.key(0))
+    nets = {**trained.params.nets, **began.params.nets}
+    began = began._replace(params=trained.params._replace(nets=nets))
+    frames = evaluation.frames_of(EVEN)._replace(cameras=off, images=drawn)
+    ended = loop.fit(model, began, frames, steps=120).state
+    found = pose_refinement.refined(ended.params.nets["poses"], off, metadata.depth)
+    assert misplaced_px(found, true) < misplaced_px(off, true) / 5
+
+
+@jax.jit
+def misplaced_px(given, true):
+    """Median distance in a picture of where points of the scene are seen."""
+    see = jax.vmap(jax.vmap(cameras.project, (None, 0)), (0, None))
+    points = jnp.asarray(EVEN.points.position)
+    away = see(given, points)[0] - see(true, points)[0]
+    return jnp.median(jnp.linalg.norm(away, axis=-1))
+
+
+def drawn_from(model, state, capture):
+    renderer = evaluation.Renderer(model, capture.size)
+    views = [evaluation.view_of(capture, int(row)) for row in capture.train]
+    colours = [renderer(state, view).colour for view in views]
+    return jnp.asarray(np.round(255 * np.clip(colours, 0, 1)), jnp.uint8)
+
+
+def test_frames_between_lie_between_and_other_cameras_stay():
+    held, rows = 3, np.array([0, 1, 2, 4, 5])
+    one = dataclasses.replace(EVEN, train=rows, heldout=np.array([held]))
+    rng = np.random.default_rng(2)
+    screws = jnp.asarray(1e-2 * rng.normal(size=(5, 6)), jnp.float32)
+    screws = screws - screws.mean(axis=0)
+    found = pose_refinement.found(screws, one, DEPTH).cameras
+    learnt = pose_refinement.refined(screws, cameras.take(EVEN.cameras, rows), DEPTH)
+    np.testing.assert_allclose(found.position[rows], learnt.position, atol=1e-6)
+    between = (screws[2] + screws[3]) / 2  # times are even
+    turn, place = by_scipy(between, cameras.take(EVEN.cameras, held))
+    np.testing.assert_allclose(found.position[held], place, atol=1e-6)
+    np.testing.assert_allclose(found.camera_from_world[held], turn, atol=1e-6)
+    # The second camera, of which nothing was learnt.
+    np.testing.assert_array_equal(found.position[6], EVEN.cameras.position[6])
+
+
+def test_without_refinement_a_capture_is_as_it_was():
+    model = scene.build(scenes.TINY_SPLATS, scene.metadata_of(EVEN))
+    assert model.found is None
+    state = model.init(EVEN, jax.random.key(0))
+    assert evaluation.as_found(model, state, EVEN) is EVEN
+
+
+def test_rates_that_rise_are_refused():
+    with pytest.raises(ValueError, match="learning_rate"):
+        PoseRefinementSpec(learning_rate=1e-5, learning_rate_end=1e-4)
+    assert all(spec.poses is None for spec in presets.PRESETS.values())
