@@ -117,6 +117,16 @@ STUDIES = {
     "ablate_tracked": _package(
         "ablate_tracked", "--suite tracked --steps 900 --jobs 2", of="ablate"
     ),
+    "ablate_poses": _package(
+        "ablate_poses",
+        "--suite poses --scene pose-error --steps 900 --jobs 2",
+        of="ablate",
+    ),
+    "ablate_poses_bookshelf": _package(
+        "ablate_poses_bookshelf",
+        f"--suite poses {_BOOKSHELF} --steps 900 --jobs 2",
+        of="ablate",
+    ),
     "ablate_sonata": _package(
         "ablate_sonata", "--suite sonata --steps 900 --jobs 2", of="ablate"
     ),

@@ -51,14 +51,14 @@ class Field(NamedTuple):
     effects: tuple[Effect, ...]
     init: Callable[[Key[Array, ""]], PyTree]
     codes_at: Callable[[PyTree, View], Codes]  # of a view, by table
-    # (params, ray, condition, key) -> its levels, coarse to fine. Without a key nothing
-    # is random.
+    # (params, ray, condition, key, guide) -> its levels, coarse to fine. Without a key
+    # nothing is random, without a guide (cells that are filled) samples are even.
     render_ray: Callable[..., tuple[RayOutput, ...]]
     # (params, point, condition) -> template point minus observed point, field units
     displace: Callable[[PyTree, Vector, FrameCondition], Vector]
     # (params, camera, time, codes, size, step) -> whole frame
     render: Callable[..., Rendering]
-    # (params, step, depth=SKIPPED_DEPTH) -> `skipping.Occupancy` at any time: without a
+    # (params, step) -> `skipping.Occupancy` at any time: without a
     # level where the field moves, for then each frame is surveyed by itself; None where
     # space cannot be skipped
     survey: Callable[..., Occupancy] | None
@@ -92,22 +92,22 @@ def field(
     def displace(params, point, condition):
         return displacement(bind(params), point, condition)
 
-    def levels_of(params, ray: Ray, condition, key=None):
-        return render_ray(bind(params), ray, condition, key)
+    def levels_of(params, ray: Ray, condition, key=None, guide=None):
+        return render_ray(bind(params), ray, condition, key, guide)
 
     def render(params, camera, time, codes, size, step):
         return draw(bind(params), camera, FrameCondition(time, codes, step), size)
 
     moves = is_moved(active)
 
-    def survey(params, step, depth=skipping.SKIPPED_DEPTH):
+    def survey(params, step):
         if moves:
             return {}
         kind = jax.tree.leaves(params["template"])[0].dtype
         time = jnp.asarray(metadata.times[0], kind)
         frame_codes = look_up(tables, metadata, params, time, jnp.int32(0))
         condition = FrameCondition(time, frame_codes, step)
-        return skipping.survey(bind(params), condition, depth)
+        return skipping.survey(bind(params), condition)
 
     def render_occupied(params, occupied, camera, time, codes, size, step):
         bound, condition = bind(params), FrameCondition(time, codes, step)
@@ -133,10 +133,13 @@ def draw(
     bound: Bound, camera: Camera, condition: FrameCondition, size: tuple[int, int]
 ) -> Rendering:
     """A whole frame by the full quadrature, with slopes; `skipping.draw` has none."""
+    guide = None
+    if bound.spec.sampling.occupancy is not None:
+        guide = skipping.survey(bound, condition)[skipping.GUIDE]
 
     def pixel(position):
         ray, cosine = field_ray_through(bound.metadata, camera, position)
-        level = render_ray(bound, ray, condition, None)[-1]
+        level = render_ray(bound, ray, condition, None, guide)[-1]
         depth = level.distance * cosine / bound.metadata.scale
         return Rendering(level.colour, level.alpha, depth)
 

@@ -12,7 +12,7 @@ from nerfies_jax.effects.effect import Medium, RayOutput, Sample, Surface
 from nerfies_jax.geometry import rays
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.nets import encoding
-from nerfies_jax.radiance import compositing, sampling, template
+from nerfies_jax.radiance import compositing, occupancy, sampling, template
 from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.spec import RadianceScene, template_of
 from nerfies_jax.training.effects import Effect, FrameCondition
@@ -21,6 +21,9 @@ PyTree = Any
 Vector = Float[Array, "3"]
 Scalar = Float[Array, ""]
 Features = Float[Array, " _"]
+
+
+LOOKS = 64  # at the guide along a ray, as many as it has cells across
 
 
 class Ray(NamedTuple):
@@ -154,10 +157,35 @@ def _samples(bound, ray, condition, distance):
     return jax.vmap(one)(distance)
 
 
+def first_distances(
+    spec: RadianceScene,
+    ray: Ray,
+    key: Key[Array, ""] | None,
+    guide: occupancy.Cells | None,
+) -> Float[Array, " coarse"]:
+    """Where the first level is asked: all along the ray, or mostly in filled cells."""
+    plan = spec.sampling
+    if guide is None:
+        return sampling.stratified(key, ray.near, ray.far, plan.coarse, plan.spacing)
+    # In the middle of each bin, whatever the spacing: cells are even.
+    share = (jnp.arange(LOOKS, dtype=ray.near.dtype) + 0.5) / LOOKS
+    distance = ray.near + (ray.far - ray.near) * share
+    point = ray.origin + distance[:, None] * ray.direction
+    filled = occupancy.at(guide, point, spec.extent)
+    empty = plan.occupancy.empty
+    return sampling.among(key, ray.near, ray.far, filled, plan.coarse, empty)
+
+
 def render_ray(
-    bound: Bound, ray: Ray, condition: FrameCondition, key: Key[Array, ""] | None
+    bound: Bound,
+    ray: Ray,
+    condition: FrameCondition,
+    key: Key[Array, ""] | None,
+    guide: occupancy.Cells | None = None,
 ) -> tuple[RayOutput, ...]:
     """The levels of one ray, coarse to fine; without a key nothing is random.
+
+    A `guide` says which cells of space are filled (`OccupancySpec`).
 
     Warps and lifts are asked once per sample: the fine level takes those of the coarse
     samples over, which the published code computes again (a third of its warps).
@@ -166,13 +194,7 @@ def render_ray(
     coarse_key, fine_key, noise_key = (
         (None,) * 3 if key is None else tuple(jax.random.split(key, 3))
     )
-    distance = sampling.stratified(
-        coarse_key if plan.jitter else None,
-        ray.near,
-        ray.far,
-        plan.coarse,
-        plan.spacing,
-    )
+    distance = first_distances(spec, ray, coarse_key if plan.jitter else None, guide)
     samples = _samples(bound, ray, condition, distance)
 
     def level(name, samples, media_of, number):

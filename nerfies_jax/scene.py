@@ -18,6 +18,7 @@ from nerfies_jax.evidence import usable_paths
 from nerfies_jax.field import Codes, Field, field
 from nerfies_jax.geometry import rays
 from nerfies_jax.nets import codes
+from nerfies_jax.radiance.occupancy import Cells
 from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.spec import RadianceScene
 from nerfies_jax.training import data_parallel, loop, losses, schedules
@@ -137,14 +138,18 @@ def _stepper(spec, radiance, devices):
             key = jax.random.fold_in(key, index)
         batch_key, field_key = jax.random.split(key)
         count, plan = spec.rays // spec.micro_batches, spec.sampling.occupancy
+        guide = None
         if plan is None:
             batch = draw_batch(frames, count, batch_key)
         else:
+            guide = state.aux_state
             batch = draw_batch(frames, plan.candidates * count, batch_key)
             batch = occupied_rays.learnt_from(radiance, state.aux_state, batch)
 
         def loss(params):
-            terms = loss_terms(radiance, params, frames, batch, state.step, field_key)
+            terms = loss_terms(
+                radiance, params, frames, batch, state.step, field_key, guide
+            )
             return weighted_sum(terms), values(terms)
 
         return jax.value_and_grad(loss, has_aux=True)(state.params)
@@ -246,8 +251,9 @@ def loss_terms(
     batch: Batch,
     step: Array,
     key: Key[Array, ""],
+    guide: Cells | None = None,
 ) -> dict[str, Term]:
-    """Every term of the loss of one batch, by name.
+    """Every term of the loss of one batch, by name; a `guide` as in `render_ray`.
 
     "coarse" and "fine" are mean squared errors of colour; "colour" is NeRF-W's negative
     log-likelihood where a transient medium says how uncertain it is.
@@ -268,7 +274,7 @@ def loss_terms(
         batch.origin, batch.direction, batch.cosine
     )
     keys = jax.random.split(ray_key, len(batch.row))
-    levels = jax.vmap(lambda *ray: radiance.render_ray(params, *ray))(
+    levels = jax.vmap(lambda *ray: radiance.render_ray(params, *ray, guide))(
         lines, conditions, keys
     )
     centre = jnp.asarray(metadata.centre, batch.origin.dtype)

@@ -6,6 +6,7 @@ empty (`survey`) or behind what lets no light through. What is left is gathered 
 dense batches, and the networks are asked of these alone.
 """
 
+import functools
 import math
 from collections.abc import Callable
 
@@ -22,17 +23,24 @@ from nerfies_jax.render_ray import (
     colour_inputs,
     field_ray_through,
     fine_distances,
+    first_distances,
     is_moved,
     radiance_at,
 )
 from nerfies_jax.training.effects import FrameCondition
 from nerfies_jax.training.model import Rendering
 
-Occupancy = dict[str, occupancy.Cells]  # by level, "coarse" and "fine"
+# By level, "coarse" and "fine", and of all levels together what guides the samples.
+Occupancy = dict[str, occupancy.Cells]
+GUIDE = "guide"
 
 # Optical depth that all samples skipped on a ray straight ahead have together at most,
 # as far as the survey saw the densest of each cell: 1 % of the light.
 SKIPPED_DEPTH = 0.01
+# Of what guides samples, from near to far. What is thinner is haze, which nobody has
+# looked at yet: of 0.01, at which a picture skips nothing that is seen, two cells of
+# three of Blender lego are filled after 1000 steps, of this 3 in a hundred.
+GUIDE_DEPTH = 3.0
 OPAQUE_DEPTH = 7.0  # e^-7 = 9e-4 of the light passes
 # What moves is surveyed anew for every frame, and each look costs a warp of every cell.
 STILL_CELLS, MOVING_CELLS = 64, 40
@@ -55,13 +63,12 @@ def usable(spec, effects) -> bool:
     )
 
 
-def survey(
-    bound: Bound, condition: FrameCondition, depth: float = SKIPPED_DEPTH
-) -> Occupancy:
+def survey(bound: Bound, condition: FrameCondition) -> Occupancy:
     """Which cells each level's density fills at the time of one frame; pure.
 
     A cell is filled where a random point in it is so dense that light that went from
-    near to far through nothing else would meet an optical depth above `depth`.
+    near to far through nothing else would meet an optical depth above `SKIPPED_DEPTH`.
+    What guides samples (`OccupancySpec`) is any level's above `GUIDE_DEPTH`.
     """
     spec, metadata = bound.spec, bound.metadata
     cells = MOVING_CELLS if is_moved(bound.effects) else STILL_CELLS
@@ -84,11 +91,15 @@ def survey(
         index = jnp.arange(cells**3, dtype=jnp.int32)
         point = occupancy.random_points(key, index, cells, spec.extent, dtype)
         seen = jax.lax.map(densities, point, batch_size=BATCH)
-        return jax.tree.map(
-            lambda old, new: old | (new * span > depth), found, seen
-        ), None
+        filled = {name: new * span > SKIPPED_DEPTH for name, new in seen.items()}
+        if guided:
+            most = functools.reduce(jnp.maximum, seen.values())
+            filled[GUIDE] = most * span > GUIDE_DEPTH
+        return jax.tree.map(jnp.logical_or, found, filled), None
 
-    start = {name: jnp.zeros(cells**3, bool) for name in names}
+    guided = spec.sampling.occupancy is not None
+    kinds = (*names, GUIDE) if guided else names
+    start = {name: jnp.zeros(cells**3, bool) for name in kinds}
     found, _ = jax.lax.scan(look, start, jnp.arange(LOOKS, dtype=jnp.int32))
     return {
         name: occupancy.dilated(occupied.reshape((cells,) * 3))
@@ -128,11 +139,8 @@ def _block(bound, occupied, camera, condition, position):
     ray, cosine = jax.vmap(lambda p: field_ray_through(bound.metadata, camera, p))(
         position
     )
-    distance = jax.vmap(
-        lambda ray: sampling.stratified(
-            None, ray.near, ray.far, plan.coarse, plan.spacing
-        )
-    )(ray)
+    guide = occupied.get(GUIDE)
+    distance = jax.vmap(lambda ray: first_distances(bound.spec, ray, None, guide))(ray)
 
     def spacing_of(distance, far):
         end = compositing.AT_INFINITY

@@ -23,6 +23,7 @@ class Ablate:
         "fields",
         "start",
         "tracked",
+        "poses",
         "sonata",
         "moba",
         "settings",
@@ -30,9 +31,9 @@ class Ablate:
         "league",
     ] = "fields"
     """Radiance fields; motions of splats from tracks and from rest; the parts of
-    splats-tracked-small; the ablations of Sonata or MoBa-GS; the settings of
-    experiments.accuracy_time; what experiments.inspect_scene can advise; or every small
-    preset."""
+    splats-tracked-small; cameras refined while it trains; the ablations of Sonata or
+    MoBa-GS; the settings of experiments.accuracy_time; what experiments.inspect_scene
+    can advise; or every small preset."""
     arms: tuple[str, ...] = ()
     """Which arms of the suite (default: all)."""
     source: cli.SourceOptions = CaptureSource()

@@ -1,4 +1,4 @@
-"""What a start from tracks is worth, and what the parts of the default are; no JAX."""
+"""What a start from tracks, the parts of the default and refined cameras are worth."""
 
 from experiments.ablate.arms import (
     FROM_REST,
@@ -89,5 +89,25 @@ TRACKED_PARTS = Suite(
     ),
     seeds=3,
     pictured=("full", "true-motion", "one-spline", "k4", "k20"),
+    context="",
+)
+
+REFINED = "poses=PoseRefinementSpec"
+
+POSES = Suite(
+    arms={
+        "as-noted": Arm("splats-tracked-small"),
+        "refined": Arm("splats-tracked-small", (REFINED,)),
+        "refined-slowly": Arm(
+            "splats-tracked-small",
+            (REFINED, "poses.learning_rate=3e-5", "poses.learning_rate_end=3e-6"),
+        ),
+    },
+    claims=(
+        Claim("Cameras have more to learn", "refined", "as-noted", TRACKED),
+        Claim("So they have slowly", "refined-slowly", "as-noted", TRACKED),
+    ),
+    seeds=3,
+    pictured=("as-noted", "refined", "refined-slowly"),
     context="",
 )

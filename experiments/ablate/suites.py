@@ -3,13 +3,14 @@
 import functools
 
 from experiments.ablate.arms import FIELDS, MOBA, SONATA, Suite
-from experiments.ablate.start_arms import START, TRACKED_PARTS
+from experiments.ablate.start_arms import POSES, START, TRACKED_PARTS
 from experiments.accuracy_time.axes import SETTINGS
 
 KEPT = {
     "fields": FIELDS,
     "start": START,
     "tracked": TRACKED_PARTS,
+    "poses": POSES,
     "sonata": SONATA,
     "moba": MOBA,
     "settings": SETTINGS,

@@ -48,7 +48,9 @@ PRESETS = (
     "motion-gs-small",
 )
 # Effects that no preset has, as paths of --set, and the preset they are priced beside.
-BESIDE = {"splats-static-small": ("exposure.learning_rate=0.01",)}
+BESIDE = {
+    "splats-static-small": ("exposure.learning_rate=0.01", "poses=PoseRefinementSpec")
+}
 # Without these the effect on the left cannot be there, or does nothing.
 NEEDS = {
     "elastic": ("warp",),

@@ -6,8 +6,9 @@ beside its flow (Zhu et al. 2024, arXiv:2410.07707, section 3.3; there by turns 
 Gaussians, here together) and gsplat as an option. The mean of all screws is taken off,
 or cameras and scene could drift away together.
 
-It pays where cameras are off by a pixel and more, and hardly where they come from a
-structure from motion that saw what does not move: `docs/results/ablate_cameras.md`.
+What it is worth where cameras are off by a pixel, and where they come from a structure
+from motion that left out what moves: `docs/results/ablate_poses.md` and
+`ablate_poses_bookshelf.md`.
 """
 
 import dataclasses

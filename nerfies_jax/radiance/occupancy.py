@@ -26,13 +26,15 @@ class OccupancySpec:
     then every so many, whatever the length of the run: a survey takes as long as six
     steps of a small field on a grid. `candidates` rays are drawn for each of a step.
     `anywhere` is the share of a step's rays that need not meet anything: what appears
-    in empty space is seen by these.
+    in empty space is seen by these. The first samples of every ray are in filled cells,
+    but for `empty` of them to one, over the same length.
     """
 
     start: int = 100
     every: int = 100
     candidates: int = 3
     anywhere: float = 0.25
+    empty: float = 0.05
 
     def __post_init__(self):
         if min(self.start, self.every) < 1 or self.candidates < 2:
@@ -43,6 +45,11 @@ class OccupancySpec:
             )
         if not 0 <= self.anywhere < 1:
             raise ValueError(f"anywhere={self.anywhere} must lie in [0, 1)")
+        if not 0 < self.empty <= 1:
+            raise ValueError(
+                f"empty={self.empty} must lie in (0, 1]: what no sample meets stays as "
+                "it is for good"
+            )
 
 
 def random_points(

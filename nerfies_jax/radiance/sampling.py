@@ -5,7 +5,7 @@ Everything is for one ray; callers `jax.vmap` over rays and their keys.
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Bool, Float, Key
 
 from nerfies_jax.geometry.precision import near_one, widened
 
@@ -55,6 +55,26 @@ def stratified(
     upper = jnp.concatenate([halfway, even[-1:]])
     jitter = jax.random.uniform(key, (count,), near.dtype)
     return jnp.minimum(lower + (upper - lower) * jitter, upper)
+
+
+def among(
+    key: Key[Array, ""] | None,
+    near: Float[Array, ""],
+    far: Float[Array, ""],
+    filled: Bool[Array, " bins"],
+    count: int,
+    empty: float,
+) -> Float[Array, " count"]:
+    """Sorted distances in [near, far], fewer of them where nothing is.
+
+    The ray falls into even bins; one that is not `filled` gets `empty` samples to one
+    of a filled one. Stratified as `sample_pdf` is. Where no bin or every bin is filled,
+    they are even.
+    """
+    share = jnp.linspace(0, 1, filled.shape[0] + 1, dtype=near.dtype)
+    edges = jnp.clip(near + (far - near) * share, near, far)
+    weights = jnp.where(filled, jnp.ones((), near.dtype), empty)
+    return sample_pdf(key, edges, weights, count)
 
 
 def sample_pdf(

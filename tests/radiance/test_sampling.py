@@ -14,6 +14,7 @@ from tests import gradients
 # take five times as long.
 stratified = jax.jit(sampling.stratified, static_argnums=(3, 4))
 sample_pdf = jax.jit(sampling.sample_pdf, static_argnums=(3, 4))
+among = jax.jit(sampling.among, static_argnums=(4, 5))
 refine = jax.jit(sampling.refine, static_argnums=(3, 4))
 
 
@@ -208,6 +209,27 @@ def test_random_shares_are_stratified_and_unbiased(dtype, rng):
     assert np.all(shares <= lower + 1 / 25 + 1e-5)
     within = (shares - lower) * 25
     assert np.all(np.abs(within.mean(0) - 0.5) < 0.11)
+
+
+def test_filled_bins_get_their_share_of_the_samples(dtype, rng):
+    filled, near, far = rng.random(8) < 0.4, 2.0, 6.0
+    assert 1 < filled.sum() < 7
+    ends = jnp.asarray(near, dtype), jnp.asarray(far, dtype)
+    got = among(None, *ends, jnp.asarray(filled), 4001, 0.1)
+    assert (np.diff(got) >= 0).all()
+    assert (got[0], got[-1]) == ends
+    counts = np.histogram(np.asarray(got, np.float64), 8, (near, far))[0]
+    wanted = np.where(filled, 1, 0.1)
+    np.testing.assert_allclose(counts, 4001 * wanted / wanted.sum(), atol=2)
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("filled", [False, True])
+@pytest.mark.parametrize("far", [2.0, 2.5, 1e6])
+def test_samples_are_even_where_nothing_tells_bins_apart(filled, far, dtype):
+    ends = jnp.asarray(2, dtype), jnp.asarray(far, dtype)
+    got = among(None, *ends, jnp.full(64, filled), 9, 0.05)
+    np.testing.assert_allclose(got, np.linspace(2, far, 9), rtol=1e-6)
 
 
 @pytest.mark.hard_cases

@@ -16,6 +16,7 @@ from nerfies_jax.effects.warp import WarpSpec
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.grids import HashGridSpec
 from nerfies_jax.radiance import occupancy
+from nerfies_jax.radiance.occupancy import OccupancySpec
 from nerfies_jax.radiance.template import TemplateSpec
 from nerfies_jax.scene import RadianceScene
 from nerfies_jax.spec import SamplingSpec
@@ -44,6 +45,9 @@ MOVING = dataclasses.replace(
     ambient=AmbientSpec(depth=1, width=8, skips=(), closed_steps=1, anneal_steps=9),
 )
 ONE_LEVEL = dataclasses.replace(STILL, sampling=SamplingSpec(24, 0))
+GUIDED = dataclasses.replace(
+    STILL, sampling=SamplingSpec(24, 0, occupancy=OccupancySpec())
+)
 
 
 def with_holes(templates):
@@ -77,10 +81,11 @@ ORANGE = (1.0, 0.5, 0.0)
     ("spec", "background", "row"),
     [
         (STILL, None, 3),
+        (GUIDED, ORANGE, 3),
         (ONE_LEVEL, ORANGE, 3),
         *((MOVING, ORANGE, n) for n in range(3)),
     ],
-    ids=["still", "one level", "moving", "moving then", "moving at last"],
+    ids=["still", "guided", "one level", "moving", "moving then", "moving at last"],
 )
 def test_skipping_changes_a_frame_by_no_more_than_it_may(spec, background, row):
     model, params = full_of_holes(spec, background)
