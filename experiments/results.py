@@ -54,8 +54,9 @@ Sonata and of MoBa-GS are worth behind it in [ablate_sonata.md](ablate_sonata.md
 [ablate_sonata_bookshelf.md](ablate_sonata_bookshelf.md), MoBa-GS' in
 [ablate_moba_bookshelf.md](ablate_moba_bookshelf.md) and those of Nerfies in
 [ablate_fields_bookshelf.md](ablate_fields_bookshelf.md). The ten other systems of the
-papers' tables, and the margins that these print, stand in [league.md](league.md), of
-one seed so far.
+papers' tables, and the margins that these print, stand in [league.md](league.md). What
+refined cameras are worth stands in [ablate_poses.md](ablate_poses.md) and, on a real
+film, in [ablate_poses_bookshelf.md](ablate_poses_bookshelf.md).
 """
 
 

@@ -66,7 +66,8 @@ def found(screws: Screws, capture: Capture, depth: float) -> Capture:
     A frame that was not learnt from lies between the corrections of those before and
     after it of the same physical camera; what no such camera filmed stays as it is.
     """
-    own = np.asarray(screws - jnp.mean(screws, axis=0))
+    own = np.asarray(screws)
+    own = own - own.mean(axis=0)
     moves = np.zeros((len(capture.times), 6), own.dtype)
     cameras_of, times = capture.camera_ids[capture.train], capture.times[capture.train]
     for one in np.unique(cameras_of):
