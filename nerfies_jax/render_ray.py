@@ -226,8 +226,8 @@ def render_ray(
     else:
         more = _samples(bound, ray, condition, drawn)
         both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), samples, more)
-        order = jnp.argsort(both.distance)
-        both = jax.tree.map(lambda x: x[order], both)
+        place = sampling.merged_places(distance, drawn)
+        both = jax.tree.map(lambda x: jnp.zeros_like(x).at[place].set(x), both)
     return coarse, level("fine", both, last, 1)
 
 
