@@ -164,6 +164,7 @@ SETTINGS = {
         f"sampling.{name}": {"key": None, "count": 4}
         for name in ("stratified", "sample_pdf", "refine")
     },
+    "sampling.among": {"key": None, "count": 4, "empty": 0.05},
     **{
         f"losses.{name}": {"width": 0.1}
         for name in ("charbonnier", "huber", "geman_mcclure")
