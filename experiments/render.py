@@ -126,10 +126,10 @@ def main(args):
             video.library()  # missing, it is said before anything is rendered
         run = runs.saved_run(args.run)
         move = _mover(args, run)
-        trained = runs.restore(args.run, run).state
-        run = runs.with_found_cameras(run, trained)
-        state = trained = _shown(args, run.model, trained)
-        model, state = _faster(args, _model(args, run), state)
+        state = runs.restore(args.run, run).state
+        run = runs.with_found_cameras(run, state)
+        trained = _shown(args, run.model, state)
+        model, state = _faster(args, _model(args, run), trained)
         names, views, own_size = _views(args, run)
         size = cli.sized(own_size, args.max_side)
         views = [evaluation.resized(view, own_size, size) for view in views]

@@ -22,7 +22,6 @@ Vector = Float[Array, "3"]
 Scalar = Float[Array, ""]
 Features = Float[Array, " _"]
 
-
 LOOKS = 64  # at the guide along a ray, as many as it has cells across
 
 

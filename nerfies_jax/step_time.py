@@ -32,8 +32,12 @@ def parts(
     def descend(state, grads):
         return scene.descend(spec, field.effects, state, grads)
 
+    guide = None if spec.sampling.occupancy is None else state.aux_state
+
     def loss(params, frames, batch):
-        terms = scene.loss_terms(field, params, frames, batch, state.step, loss_key)
+        terms = scene.loss_terms(
+            field, params, frames, batch, state.step, loss_key, guide
+        )
         return weighted_sum(terms)
 
     forward = part_ms(loss, state.params, frames, batch)

@@ -30,8 +30,6 @@ PILOT_STEPS = 150  # of a whole, short schedule, to see what a step costs
 NEAR_ENOUGH = 0.1  # share of --seconds by which a first seed may miss them
 # JAX's event for a program that was read from the compilation cache.
 SAVED = "/jax/compilation_cache/compile_time_saved_sec"
-
-
 # Fields of specs that came after arms were kept: none, they change nothing in these.
 YOUNGER = ("poses",)
 
