@@ -35,11 +35,13 @@ Occupancy = dict[str, occupancy.Cells]
 GUIDE = "guide"
 
 # Optical depth that all samples skipped on a ray straight ahead have together at most,
-# as far as the survey saw the densest of each cell: 1 % of the light.
-SKIPPED_DEPTH = 0.01
+# as far as the survey saw the densest of each cell: 5 % of the light. Four frames of
+# Blender lego after 3000 steps: 67 to 72 dB from the whole quadrature, 27.515 dB from
+# the truth for 27.512, in 514 ms for 619 with 0.01, at which it was 69 to 78.
+SKIPPED_DEPTH = 0.05
 # Of what guides samples, from near to far. What is thinner is haze, which nobody has
-# looked at yet: of 0.01, at which a picture skips nothing that is seen, two cells of
-# three of Blender lego are filled after 1000 steps, of this 3 in a hundred.
+# looked at yet: of 0.01 two cells of three of Blender lego are filled after 1000 steps,
+# of this 3 in a hundred.
 GUIDE_DEPTH = 3.0
 OPAQUE_DEPTH = 7.0  # e^-7 = 9e-4 of the light passes
 # What moves is surveyed anew for every frame, and each look costs a warp of every cell.

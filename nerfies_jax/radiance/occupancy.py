@@ -7,6 +7,7 @@ are kept up while training, these are surveyed anew of the field as it is.
 """
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -83,11 +84,14 @@ def at(
 ) -> Bool[Array, "*points"]:
     """Whether each point, in units of the field, lies in an occupied cell or beyond."""
     cells = occupied.shape[0]
-    scaled = point / half_side
-    size = jnp.max(jnp.abs(scaled), axis=-1, keepdims=True)
-    beyond = jnp.maximum(size, 1)
-    contracted = scaled * ((2 - 1 / beyond) / beyond)
-    place = jnp.floor((contracted / REACH + 1) * (cells / 2)).astype(jnp.int32)
-    inside = jnp.all((place >= 0) & (place < cells), axis=-1)
-    x, y, z = (jnp.clip(place[..., axis], 0, cells - 1) for axis in range(3))
-    return ~inside | occupied[x, y, z]
+    # Coordinate by coordinate: a point in three lanes of a vector takes twice the time.
+    scaled = [point[..., axis] / half_side for axis in range(3)]
+    beyond = functools.reduce(jnp.maximum, [jnp.abs(along) for along in scaled])
+    beyond = jnp.maximum(beyond, 1)
+    shrunk = (2 - 1 / beyond) / beyond
+    inside, place = True, []
+    for along in scaled:
+        cell = jnp.floor((along * shrunk / REACH + 1) * (cells / 2)).astype(jnp.int32)
+        inside &= (cell >= 0) & (cell < cells)
+        place.append(jnp.clip(cell, 0, cells - 1))
+    return ~inside | occupied[tuple(place)]
