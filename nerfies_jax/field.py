@@ -11,18 +11,12 @@ from jaxtyping import Array, Float, Int, Key
 from nerfies_jax import skipping
 from nerfies_jax import spec as specs
 from nerfies_jax.effects.effect import RayOutput
+from nerfies_jax.field_ray import Ray, field_ray_through
 from nerfies_jax.geometry import rays
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.nets import codes
 from nerfies_jax.radiance import template
-from nerfies_jax.render_ray import (
-    Bound,
-    Ray,
-    displacement,
-    field_ray_through,
-    is_moved,
-    render_ray,
-)
+from nerfies_jax.render_ray import Bound, displacement, is_moved, render_ray
 from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.spec import RadianceScene
 from nerfies_jax.training.effects import (

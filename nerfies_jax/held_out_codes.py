@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from nerfies_jax import evaluation, render_ray, scene
+from nerfies_jax import evaluation, field_ray, scene
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.training import fit, losses
 from nerfies_jax.training.effects import APPEARANCE, Effect, FrameCondition
@@ -62,7 +62,7 @@ def score(
                 lambda pixel: (
                     field.render_ray(
                         params,
-                        render_ray.field_ray_through(metadata, view.camera, pixel)[0],
+                        field_ray.field_ray_through(metadata, view.camera, pixel)[0],
                         condition,
                     )[-1].colour
                 )

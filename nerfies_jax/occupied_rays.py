@@ -18,9 +18,9 @@ from jaxtyping import Array, Bool, Int, PyTree
 from nerfies_jax import skipping
 from nerfies_jax.effects.effect import Batch
 from nerfies_jax.field import Field
-from nerfies_jax.radiance import occupancy, sampling
+from nerfies_jax.field_ray import Ray, field_ray, filled_along
 from nerfies_jax.radiance.occupancy import Cells
-from nerfies_jax.render_ray import LOOKS, Ray, field_ray, is_moved
+from nerfies_jax.render_ray import is_moved
 from nerfies_jax.training.model import Event, Frames, TrainState
 
 
@@ -68,9 +68,7 @@ def _survey(field: Field) -> Callable[[PyTree, Int[Array, ""]], Cells]:
 
 def meets(occupied: Cells, ray: Ray, half_side: float) -> Bool[Array, ""]:
     """Whether a ray goes through an occupied cell, or leaves the cells."""
-    distance = sampling.stratified(None, ray.near, ray.far, LOOKS)
-    point = ray.origin + distance[:, None] * ray.direction
-    return jnp.any(occupancy.at(occupied, point, half_side))
+    return jnp.any(filled_along(occupied, ray, half_side))
 
 
 def chosen(

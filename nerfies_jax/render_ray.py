@@ -9,8 +9,8 @@ from jaxtyping import Array, Float, Key
 
 from nerfies_jax.effects import scene_flow, transient
 from nerfies_jax.effects.effect import Medium, RayOutput, Sample, Surface
+from nerfies_jax.field_ray import Ray, fine_distances, first_distances
 from nerfies_jax.geometry import rays
-from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.nets import encoding
 from nerfies_jax.radiance import compositing, occupancy, sampling, template
 from nerfies_jax.scene_metadata import SceneMetadata
@@ -21,17 +21,6 @@ PyTree = Any
 Vector = Float[Array, "3"]
 Scalar = Float[Array, ""]
 Features = Float[Array, " _"]
-
-LOOKS = 64  # at the guide along a ray, as many as it has cells across
-
-
-class Ray(NamedTuple):
-    """One ray in units of the field."""
-
-    origin: Vector
-    direction: Vector  # unit length
-    near: Scalar  # distance
-    far: Scalar
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,32 +35,6 @@ class Bound:
     def own(self, effect: Effect) -> PyTree:
         """The parameters of one effect, None without any."""
         return self.params.get(effect.name)
-
-
-def field_ray(
-    metadata: SceneMetadata, origin: Vector, direction: Vector, cosine: Scalar
-) -> Ray:
-    """A ray of the scene in the field's coordinates, between the near and far planes.
-
-    The planes are z-depths, so a slanted ray is sampled further out.
-    """
-    centre = jnp.asarray(metadata.centre, origin.dtype)
-    span = metadata.scale / cosine
-    return Ray(
-        (origin - centre) * metadata.scale,
-        direction,
-        metadata.near * span,
-        metadata.far * span,
-    )
-
-
-def field_ray_through(
-    metadata: SceneMetadata, camera: Camera, pixel: Float[Array, "2"]
-) -> tuple[Ray, Scalar]:
-    """The field's ray through one pixel position, and its z-depth per distance."""
-    ray = rays.pixel_ray(camera, pixel)
-    cosine = rays.depth_per_distance(camera, ray.direction)
-    return field_ray(metadata, ray.origin, ray.direction, cosine), cosine
 
 
 def displacement(bound: Bound, point: Vector, condition: FrameCondition) -> Vector:
@@ -156,25 +119,6 @@ def _samples(bound, ray, condition, distance):
     return jax.vmap(one)(distance)
 
 
-def first_distances(
-    spec: RadianceScene,
-    ray: Ray,
-    key: Key[Array, ""] | None,
-    guide: occupancy.Cells | None,
-) -> Float[Array, " coarse"]:
-    """Where the first level is asked: all along the ray, or mostly in filled cells."""
-    plan = spec.sampling
-    if guide is None:
-        return sampling.stratified(key, ray.near, ray.far, plan.coarse, plan.spacing)
-    # In the middle of each bin, whatever the spacing: cells are even.
-    share = (jnp.arange(LOOKS, dtype=ray.near.dtype) + 0.5) / LOOKS
-    distance = ray.near + (ray.far - ray.near) * share
-    point = ray.origin + distance[:, None] * ray.direction
-    filled = occupancy.at(guide, point, spec.extent)
-    empty = plan.occupancy.empty
-    return sampling.among(key, ray.near, ray.far, filled, plan.coarse, empty)
-
-
 def render_ray(
     bound: Bound,
     ray: Ray,
@@ -220,7 +164,7 @@ def render_ray(
         fine_key if plan.jitter else None, distance, coarse.weight, plan.fine
     )
     if not (plan.union and is_moved(bound.effects)):
-        every = fine_distances(bound, distance, drawn)
+        every = fine_distances(spec, bound.metadata, distance, drawn)
         both = _samples(bound, ray, condition, every)
     else:
         more = _samples(bound, ray, condition, drawn)
@@ -228,23 +172,6 @@ def render_ray(
         place = sampling.merged_places(distance, drawn)
         both = jax.tree.map(lambda x: jnp.zeros_like(x).at[place].set(x), both)
     return coarse, level("fine", both, last, 1)
-
-
-def fine_distances(
-    bound: Bound,
-    coarse: Float[Array, " coarse"],
-    drawn: Float[Array, " fine"],
-) -> Float[Array, " samples"]:
-    """Where on a ray the fine level is asked: at all, or at what was drawn alone.
-
-    The last coarse sample is among them in any case where it stands for all behind it:
-    drawn where a surface is, the last one would hold the background behind its back.
-    """
-    if bound.spec.sampling.union:
-        return sampling.union(coarse, drawn)
-    if bound.metadata.background is None:
-        return jnp.concatenate([drawn, coarse[-1:]])
-    return drawn
 
 
 def colour_inputs(

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Key
 
-from nerfies_jax import occupied_rays, path_fit, render_ray, scene_metadata
+from nerfies_jax import field_ray, occupied_rays, path_fit, scene_metadata
 from nerfies_jax.capture.capture import Capture, training_bytes
 from nerfies_jax.effects import scene_flow, transient
 from nerfies_jax.effects.effect import Batch, Box, RayOutput
@@ -270,7 +270,7 @@ def loss_terms(
         return FrameCondition(view.time, radiance.codes_at(params, view), step)
 
     conditions = jax.vmap(condition_of)(batch.row)
-    lines = jax.vmap(lambda *ray: render_ray.field_ray(metadata, *ray))(
+    lines = jax.vmap(lambda *ray: field_ray.field_ray(metadata, *ray))(
         batch.origin, batch.direction, batch.cosine
     )
     keys = jax.random.split(ray_key, len(batch.row))

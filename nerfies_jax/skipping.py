@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from nerfies_jax.field_ray import field_ray_through, fine_distances, first_distances
 from nerfies_jax.geometry import rays
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.radiance import compositing, occupancy, sampling
@@ -21,9 +22,6 @@ from nerfies_jax.render_ray import (
     Bound,
     asked_at,
     colour_inputs,
-    field_ray_through,
-    fine_distances,
-    first_distances,
     is_moved,
     radiance_at,
 )
@@ -163,7 +161,7 @@ def _block(bound, occupied, camera, condition, position):
         def refined(distance, depth):
             weights = compositing.weights(depth)
             drawn = sampling.refine(None, distance, weights, plan.fine)
-            return fine_distances(bound, distance, drawn)
+            return fine_distances(bound.spec, bound.metadata, distance, drawn)
 
         distance = jax.vmap(refined)(distance, depth)
     depth, colour = ask("fine", distance, 4)

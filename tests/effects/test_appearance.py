@@ -11,9 +11,9 @@ import pytest
 from nerfies_jax import evaluation, presets, scene
 from nerfies_jax.effects import appearance
 from nerfies_jax.effects.appearance import AppearanceSpec
+from nerfies_jax.field_ray import Ray
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.radiance.template import TemplateSpec
-from nerfies_jax.render_ray import Ray
 from nerfies_jax.scene import RadianceScene
 from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.spec import SamplingSpec

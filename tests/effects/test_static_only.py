@@ -9,9 +9,9 @@ import numpy as np
 from nerfies_jax import scene
 from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.effects.transient import TransientSpec
+from nerfies_jax.field_ray import Ray
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.radiance.template import TemplateSpec
-from nerfies_jax.render_ray import Ray
 from nerfies_jax.scene import RadianceScene
 from nerfies_jax.spec import SamplingSpec
 from nerfies_jax.training.effects import FrameCondition

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from nerfies_jax import render_ray, scene
+from nerfies_jax import field_ray, scene
 from nerfies_jax.effects import moving_mask, surface
 from nerfies_jax.effects.ambient import AmbientSpec
 from nerfies_jax.effects.effect import Batch, RayOutput
@@ -56,7 +56,7 @@ def seen(params, dtype):
     rng = np.random.default_rng(4)
     direction = rng.normal(size=3)
     direction /= np.linalg.norm(direction)
-    ray = render_ray.Ray(
+    ray = field_ray.Ray(
         *(np.asarray(x, dtype) for x in (rng.normal(size=3), direction, 0.2, 1.4))
     )
     code = {"motion": jnp.asarray(rng.normal(size=3), dtype)}
@@ -181,7 +181,7 @@ def test_a_rigid_warp_turns_normals_as_it_turns_back(float64, rng):
     zero["angular"] = zero["angular"]._replace(bias=jnp.asarray(angle))
     params["warp"] = params["warp"]._replace(heads=zero)
     when = FrameCondition(jnp.asarray(0.3), {"motion": jnp.zeros(3)}, jnp.int32(0))
-    ray = render_ray.Ray(*map(jnp.asarray, (np.zeros(3), np.eye(3)[2], 0.1, 0.9)))
+    ray = field_ray.Ray(*map(jnp.asarray, (np.zeros(3), np.eye(3)[2], 0.1, 0.9)))
     level = jax.jit(field_of(still).render_ray)(params, ray, when)[-1]
     found = level.looks["surface"]
     unit = np.asarray(found["head"])
@@ -278,7 +278,7 @@ def test_costs_are_finite_where_density_is_level_and_where_it_is_a_wall(size, dt
     def cost(params):
         direction = jnp.asarray([0.6, 0.0, 0.8], dtype)
         near, far = jnp.asarray(0.2, dtype), jnp.asarray(1.4, dtype)
-        ray = render_ray.Ray(jnp.zeros(3, dtype), direction, near, far)
+        ray = field_ray.Ray(jnp.zeros(3, dtype), direction, near, far)
         codes = {"motion": jnp.asarray(code, dtype)}
         when = FrameCondition(jnp.asarray(0.3, dtype), codes, jnp.int32(STEP))
         level = field_of(SPEC).render_ray(params, ray, when)[-1]

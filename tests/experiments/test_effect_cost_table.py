@@ -12,8 +12,8 @@ from experiments.effect_cost.__main__ import EffectCost, Priced, PricedScene, Sc
 from gaussians_jax import presets as splat_presets
 from nerfies_jax import presets as field_presets
 from nerfies_jax import runs, scene
+from nerfies_jax.field_ray import Ray
 from nerfies_jax.measure import baselines, clock, matrix_flops
-from nerfies_jax.render_ray import Ray
 from nerfies_jax.training.effects import FrameCondition
 from tests import bare_scenes, scenes
 

@@ -20,6 +20,7 @@ FLOORS = {
     "nerfies_jax.effects": 7,
     "nerfies_jax.scene_metadata": 5,  # of a capture; reads nothing else
     "nerfies_jax.spec": 8,
+    "nerfies_jax.field_ray": 8,
     "nerfies_jax.render_ray": 8,
     "nerfies_jax.occupied_rays": 8,
     "nerfies_jax.skipping": 8,

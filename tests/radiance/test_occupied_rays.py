@@ -10,10 +10,10 @@ import pytest
 from nerfies_jax import evaluation, occupied_rays, scene, skipping
 from nerfies_jax.effects.transient import TransientSpec
 from nerfies_jax.effects.warp import WarpSpec
+from nerfies_jax.field_ray import Ray
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.grids import HashGridSpec
 from nerfies_jax.radiance.occupancy import OccupancySpec
-from nerfies_jax.render_ray import Ray
 from nerfies_jax.spec import SamplingSpec
 from nerfies_jax.training import loop
 from tests import scenes

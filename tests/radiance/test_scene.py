@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nerfies_jax import evaluation, render_ray, scene
+from nerfies_jax import evaluation, field_ray, scene
 from nerfies_jax.effects.ambient import AmbientSpec
 from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.effects.background import BackgroundSpec
@@ -73,7 +73,7 @@ def rendered(spec):
 
 
 def ray_of(dtype):
-    return render_ray.Ray(
+    return field_ray.Ray(
         jnp.asarray([0.1, -0.2, 0.3], dtype),
         jnp.asarray([0.6, 0.0, 0.8], dtype),
         jnp.asarray(0.5, dtype),
@@ -296,7 +296,7 @@ def test_a_medium_has_the_share_that_it_is_given(logit, without):
     )
     metadata = scene.metadata_of(scenes.tiny_capture(), spec)
     field = scene.field(spec, metadata)
-    ray = render_ray.field_ray(
+    ray = field_ray.field_ray(
         metadata, *(jnp.asarray(x) for x in ([0.0, 0, 0], [0.0, 0, 1])), jnp.float32(1)
     )
     condition = FrameCondition(jnp.float32(0.3), {}, jnp.int32(0))
