@@ -34,6 +34,7 @@ TRACKS = "+tracks"
 PRESETS = ("nerf-small", "nerf-grid-small")
 PRESETS += ("nerfies-small", "nerfies-small" + TRACKS, "nerfies-grid-small")
 FRAMES = 5  # timed, after one that makes the survey
+SCORES = (("psnr", 2), ("ssim", 3), ("moving_psnr", 2))  # and their digits
 TIMES = ("skipped_ms", "full_ms", "survey_ms")
 PILOT_STEPS = 50  # that tell what one takes
 
@@ -121,7 +122,7 @@ def measured(capture, preset: str, seconds, size: tuple[int, int], seed: int) ->
     masked, _ = moving_masks.with_masks(capture, CACHE / "evidence")
     whole = _named(preset)[1].steps
     a_step = _trained(capture, preset, whole, seed, PILOT_STEPS)[0] / PILOT_STEPS
-    scores, moving, steps, spent = [], [], [], []
+    scores, ssim, moving, steps, spent = [], [], [], [], []
     for limit in seconds:
         steps.append(plan.rounded(limit / a_step))
         took, model, state = _trained(capture, preset, steps[-1], seed)
@@ -129,9 +130,11 @@ def measured(capture, preset: str, seconds, size: tuple[int, int], seed: int) ->
         scored = evaluation.score(renderer, state, capture, capture.heldout)
         found = heldout.heldout_metrics(scored, masked)
         scores.append(found["heldout.psnr"])
+        ssim.append(found["heldout.ssim"])
         moving.append(found.get("heldout.moving_psnr"))  # none where nothing moves
         spent.append(took)
-    learnt = {"psnr": scores, "moving_psnr": moving, "steps": steps, "spent": spent}
+    learnt = {"psnr": scores, "ssim": ssim, "moving_psnr": moving}
+    learnt |= {"steps": steps, "spent": spent}
     return learnt | drawn(model, state, capture, size)
 
 
@@ -207,6 +210,7 @@ def page(stored) -> str:
         "steps",
         "spent, s",
         "PSNR",
+        "SSIM",
         "moving",
         "frame, ms",
     )
@@ -234,8 +238,8 @@ def page(stored) -> str:
                     markdown.number(steps, 0),
                     markdown.number(spent, 0),
                     *(
-                        _with_spread([row[name][place] for row in seeds])
-                        for name in ("psnr", "moving_psnr")
+                        _with_spread([row[name][place] for row in seeds], digits)
+                        for name, digits in SCORES
                     ),
                     *(markdown.number(number, 0) for number in times),
                     markdown.number(_mean(seeds, "alike_db") if last else None, 1),
@@ -250,13 +254,13 @@ def _mean(rows, name):
     return statistics.fmean(there) if there else None
 
 
-def _with_spread(values):
+def _with_spread(values, digits):
     if None in values:
         return ""
-    mean = markdown.number(statistics.fmean(values), 2)
+    mean = markdown.number(statistics.fmean(values), digits)
     if len(values) == 1:
         return mean
-    return f"{mean} ± {markdown.number(statistics.stdev(values), 2)}"
+    return f"{mean} ± {markdown.number(statistics.stdev(values), digits)}"
 
 
 if __name__ == "__main__":

@@ -299,6 +299,7 @@ _JACOBIANS = ["left_jacobian", "left_jacobian_se3"]
 REACH = {
     # squares and products with the axis: documented to 1e19 for the angle alone
     **{f"lie.{name}": 0.25 for name in [*_TURNS, *_JACOBIANS]},
+    "camera.move": 0.25,
     "lie.inverse_left_jacobian": 0.0,  # singular from 2π on
     "lie.log_se3": 0.5,
     # products of two inputs
@@ -325,6 +326,7 @@ DEAR = {
     *(f"lie.{name}" for name in ("exp_se3", "log_se3", "left_jacobian_se3", "log_so3")),
     *("lie.transform_point", "quaternion.slerp", "template.apply", "kan.apply"),
     *("matrix3.displacement_log_energy", "matrix3.signed_log_energy"),
+    "camera.move",
     *("camera.unproject", "rays.pixel_ray", "rays.pixel_rays", "projection.project"),
     *("distortion.undistort", "losses.dssim_map"),
 }

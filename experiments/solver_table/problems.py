@@ -17,7 +17,6 @@ from nerfies_jax.training.fit import (
     CameraSpec,
     Fit,
     fit_code,
-    move_camera,
     refine_camera,
 )
 
@@ -143,7 +142,7 @@ def pose_problem(settings: Any) -> Problem:
         return jax.vmap(lambda point: cameras.project(camera, point)[0])(points)
 
     def seen(numbers):
-        return pixels_in(move_camera(camera, numbers[:3], numbers[3:]))
+        return pixels_in(cameras.move(camera, numbers[:3], numbers[3:]))
 
     off = rng.normal(size=(settings.frames, 6)) * np.repeat([TURN, SHIFT], 3)
     noise = NOISE_PX * rng.normal(size=(settings.frames, POINTS, 2))
@@ -165,7 +164,7 @@ def pose_problem(settings: Any) -> Problem:
 
 
 def screw_between(camera: Camera, moved: Camera) -> jax.Array:
-    """[6] the screw by which `move_camera` made the second of the first."""
+    """[6] the screw by which `camera.move` made the second of the first."""
     turn = jnp.matmul(
         moved.camera_from_world, camera.camera_from_world.T, precision="highest"
     )

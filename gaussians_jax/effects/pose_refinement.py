@@ -19,8 +19,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.geometry.camera import Camera
-from nerfies_jax.training import fit, schedules
+from nerfies_jax.geometry.camera import Camera, move
+from nerfies_jax.training import schedules
 from nerfies_jax.training.effects import Effect
 from nerfies_jax.training.model import in_default_precision
 
@@ -55,9 +55,9 @@ def refined(screws: Screws, cameras: Camera, depth: float) -> Camera:
 
 
 def _moved(screws, cameras, depth):
-    return jax.vmap(
-        lambda camera, screw: fit.move_camera(camera, screw[:3], depth * screw[3:])
-    )(cameras, screws)
+    return jax.vmap(lambda camera, screw: move(camera, screw[:3], depth * screw[3:]))(
+        cameras, screws
+    )
 
 
 def found(screws: Screws, capture: Capture, depth: float) -> Capture:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, UInt8
 from nerfies_jax.capture.capture import Capture, blocks, shrink
 from nerfies_jax.evaluation.frames import resized, view_of
 from nerfies_jax.evaluation.scores import Draw, Scored, score
-from nerfies_jax.geometry.camera import Camera
+from nerfies_jax.geometry.camera import Camera, move
 from nerfies_jax.training import fit, losses
 from nerfies_jax.training.fit import Fit
 from nerfies_jax.training.model import Model, TrainState, View, in_default_precision
@@ -185,7 +185,7 @@ def _drawer(model, state, view, size):
 
 def _moved(camera, screw_px, depth):
     angle = screw_px / camera.focal_px
-    return fit.move_camera(camera, angle[:3], depth * angle[3:])
+    return move(camera, angle[:3], depth * angle[3:])
 
 
 def _with_poses(capture, rows, cameras):

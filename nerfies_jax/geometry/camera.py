@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from nerfies_jax.geometry import distortion, precision
+from nerfies_jax.geometry import distortion, lie, precision
 
 # Both keep what is at or behind the camera finite in float32, where 1/z² overflows
 # below 1e-19 and the seventh power of a slope above 1e5.
@@ -118,6 +118,20 @@ def world_from_camera(camera: Camera) -> Float[Array, "*batch 4 4"]:
     upper = jnp.concatenate([rotation, camera.position[..., None]], axis=-1)
     last = jnp.zeros_like(upper[..., :1, :]).at[..., 0, 3].set(1)
     return jnp.concatenate([upper, last], axis=-2)
+
+
+def move(
+    camera: Camera, angular: Float[Array, "3"], linear: Float[Array, "3"]
+) -> Camera:
+    """One camera with exp(angular, linear) applied on the left of camera_from_world.
+
+    A screw in the camera's own frame: `angular` in rad, `linear` in scene units.
+    """
+    rotation, shift = lie.exp_se3(angular, linear)
+    turned = jnp.matmul(rotation, camera.camera_from_world, precision="highest")
+    # t' = R t + V v with t = -R c; the centre moves by -R'ᵀ V v, and nothing cancels.
+    moved = camera.position - jnp.matmul(shift, turned, precision="highest")
+    return camera._replace(camera_from_world=turned, position=moved)
 
 
 def resize(

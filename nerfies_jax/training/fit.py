@@ -19,11 +19,9 @@ import optax
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from nerfies_jax.geometry import lie
-from nerfies_jax.geometry.camera import Camera
+from nerfies_jax.geometry.camera import Camera, move
 
 PyTree = Any
-Vector = Float[Array, "3"]
 Scalar = Float[Array, ""]
 
 
@@ -79,18 +77,6 @@ _WIDTHS = {"angular": 3, "linear": 3, "focal": 1}
 # Smallest over largest singular value of the Jacobian with columns of unit length. A
 # camera that sees a few degrees of a far scene has 1e-3; float32 alone makes 1e-6.
 DETERMINED = 1e-4
-
-
-def move_camera(camera: Camera, angular: Vector, linear: Vector) -> Camera:
-    """One camera with exp(angular, linear) applied on the left of camera_from_world.
-
-    A screw in the camera's own frame: `angular` in rad, `linear` in scene units.
-    """
-    rotation, shift = lie.exp_se3(angular, linear)
-    turned = jnp.matmul(rotation, camera.camera_from_world, precision="highest")
-    # t' = R t + V v with t = -R c; the centre moves by -R'ᵀ V v, and nothing cancels.
-    moved = camera.position - jnp.matmul(shift, turned, precision="highest")
-    return camera._replace(camera_from_world=turned, position=moved)
 
 
 def refine_camera(
@@ -284,7 +270,7 @@ def _stepped(camera, step, unknowns):
         parts[name] = step[at : at + _WIDTHS[name]]
         at += _WIDTHS[name]
     none = jnp.zeros(3, step.dtype)
-    camera = move_camera(camera, parts.get("angular", none), parts.get("linear", none))
+    camera = move(camera, parts.get("angular", none), parts.get("linear", none))
     if "focal" in parts:  # its logarithm: stays positive
         camera = camera._replace(focal_px=camera.focal_px * jnp.exp(parts["focal"][0]))
     return camera

@@ -6,7 +6,7 @@ import pytest
 
 from experiments.solver_table import __main__ as solver_table
 from experiments.solver_table import problems
-from nerfies_jax.training.fit import move_camera
+from nerfies_jax.geometry.camera import move
 
 SMALL = dict(
     solvers=("lbfgs", "adam"),
@@ -61,7 +61,7 @@ def test_a_screw_between_cameras_is_that_which_moved_one():
 
     @jax.jit
     def there_and_back(camera, screw):
-        moved = move_camera(camera, screw[:3], screw[3:])
+        moved = move(camera, screw[:3], screw[3:])
         return problems.screw_between(camera, moved)
 
     back = there_and_back(camera, screw)

@@ -8,11 +8,10 @@ import scipy.linalg
 from scipy import optimize
 
 from nerfies_jax.geometry import camera as cameras
-from nerfies_jax.training import fit
 from nerfies_jax.training.fit import CODE_SOLVERS, CameraSpec, fit_code, refine_camera
 
 FOCAL = ("focal", "angular", "linear")
-MOVE = jax.jit(fit.move_camera)
+MOVE = jax.jit(cameras.move)
 SIZE = (64, 48)
 ANGULAR, LINEAR = np.array([0.03, -0.05, 0.04]), np.array([0.1, -0.06, 0.08])
 

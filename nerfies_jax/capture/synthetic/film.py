@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 from nerfies_jax.capture.synthetic import texture, trace
 from nerfies_jax.capture.synthetic.spec import SceneSpec
 from nerfies_jax.geometry import camera as cameras
-from nerfies_jax.geometry import lie, rays
+from nerfies_jax.geometry import rays
 from nerfies_jax.geometry.camera import Camera
 
 TILE = 16  # pixels
@@ -122,16 +122,7 @@ def noted_cameras(spec: SceneSpec, plan: Schedule, seed: int) -> Camera:
     depth = spec.cameras.distance
     shift = first * depth * spec.pose_error.shift_px / focal_px * shift
 
-    def off(camera, turn, shift):
-        turned = jnp.matmul(
-            lie.exp_so3(turn), camera.camera_from_world, precision="highest"
-        )
-        away = jnp.matmul(shift, camera.camera_from_world, precision="highest")
-        return camera._replace(
-            camera_from_world=turned, position=camera.position + away
-        )
-
-    moved = jax.jit(jax.vmap(off))(plan.cameras, turn, shift)
+    moved = jax.jit(jax.vmap(cameras.move))(plan.cameras, turn, shift)
     return jax.tree.map(
         lambda old, new: np.where(
             first.reshape(-1, *(1,) * (old.ndim - 1)), np.asarray(new, old.dtype), old
