@@ -238,7 +238,7 @@ def page(stored) -> str:
                     markdown.number(steps, 0),
                     markdown.number(spent, 0),
                     *(
-                        _with_spread([row[name][place] for row in seeds], digits)
+                        _with_spread([_of(row, name, place) for row in seeds], digits)
                         for name, digits in SCORES
                     ),
                     *(markdown.number(number, 0) for number in times),
@@ -252,6 +252,11 @@ def _mean(rows, name):
     """Over seeds, None where none has a number: frames that are alike to the bit."""
     there = [row[name] for row in rows if row[name] is not None]
     return statistics.fmean(there) if there else None
+
+
+def _of(row, name, place):
+    """None in rows that were kept before this was scored."""
+    return row[name][place] if name in row else None
 
 
 def _with_spread(values, digits):

@@ -9,6 +9,7 @@ wider than a chunk simply continues in the next one: nothing can overflow.
 import math
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
@@ -187,7 +188,8 @@ def _expand(cursor, count, capacity):
     begin, filled, following = _span(cursor, count, capacity)
     index = jnp.arange(count.shape[0], dtype=jnp.int32)
     marks = jnp.zeros(capacity + 1, jnp.int32).at[begin].max(index + 1)
-    rank = lax.cummax(marks[:capacity]) - 1
+    # `lax.cummax` takes four times as long on the CPU.
+    rank = lax.associative_scan(jnp.maximum, marks[:capacity]) - 1
     slot = jnp.arange(capacity, dtype=jnp.int32)
     within = slot - begin[jnp.maximum(rank, 0)]
     within += jnp.where(rank == cursor.rank, cursor.skip, 0)
@@ -229,7 +231,8 @@ def sort_pairs(
     """Pairs in order of rank, sorted by tile; tile `grid.tiles` marks an unused slot.
 
     One unsigned sort of (tile, rank since the chunk's first) where both fit 32 bits: a
-    sort with a payload costs five times as much on the CPU.
+    sort with a payload costs five times as much on the CPU, and there these words are
+    sorted by counting in 0.4 of the time of `lax.sort`.
     """
     capacity = tile.shape[0]
     # Only Gaussians that touch no tile, and these come last, have no pair: so ranks
@@ -240,7 +243,10 @@ def sort_pairs(
         since = (rank - first_rank).astype(jnp.uint32)
         since = jnp.where(tile < grid.tiles, since, 0)
         key = (tile.astype(jnp.uint32) << rank_bits) | since
-        key = lax.sort(key, is_stable=True)
+        if jax.default_backend() == "cpu":
+            key = _sorted_by_upper_bits(key, rank_bits, tile_bits)
+        else:
+            key = lax.sort(key, is_stable=True)
         tile = (key >> rank_bits).astype(jnp.int32)
         ranks = (key & jnp.uint32((1 << rank_bits) - 1)).astype(jnp.int32) + first_rank
     else:
@@ -249,3 +255,33 @@ def sort_pairs(
     bounds = jnp.searchsorted(tile, jnp.arange(grid.tiles + 1, dtype=jnp.int32))
     bounds = bounds.astype(jnp.int32)
     return Intersections(ranks, bounds[:-1], bounds[1:])
+
+
+def _sorted_by_upper_bits(key, lowest, bits):
+    """Words in the order of their `bits` from bit `lowest` on, ties as they came.
+
+    A radix sort, three bits a pass: a word goes behind those of smaller digits, the
+    equal ones in earlier blocks of eight words, and the equal ones before it in its
+    own. The last are counted in one word, a hexadecimal digit for each of eight.
+    """
+    size = key.shape[0]
+    key = jnp.concatenate([key, jnp.full(-size % 8, 0xFFFFFFFF, key.dtype)])
+    digits = jnp.arange(8, dtype=jnp.uint32)
+    up_to = jnp.triu(jnp.ones((8, 8), jnp.uint32))
+    block = jnp.arange(key.shape[0] // 8, dtype=jnp.uint32)[:, None]
+
+    def one_pass(number, key):
+        shift = (lowest + 3 * number).astype(jnp.uint32)
+        digit = (key.reshape(-1, 8) >> shift) & 7
+        one = jnp.uint32(1) << (4 * digit)
+        tally = one @ up_to
+        counts = (tally[:, 7:] >> (4 * digits)) & 15
+        total, before = lax.scan(lambda c, x: (c + x, c), 0 * digits, counts)
+        before += lax.cumsum(total) - total
+        place = before.reshape(-1).at[8 * block + digit].get(mode="promise_in_bounds")
+        place += ((tally - one) >> (4 * digit)) & 15
+        return key.at[place.reshape(-1)].set(
+            key, mode="promise_in_bounds", unique_indices=True
+        )
+
+    return lax.fori_loop(0, -(-bits // 3), one_pass, key)[:size]

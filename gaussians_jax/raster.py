@@ -26,10 +26,10 @@ from gaussians_jax.projection import Footprints
 from gaussians_jax.raster_spec import RasterSpec
 from gaussians_jax.splats import refuse_half
 
-# By backend: tiles in lockstep, Gaussians a step. On the CPU a step of 32 x 8 x 64
+# By backend: tiles in lockstep, Gaussians a step. On the CPU a step of 32 x 4 x 64
 # evaluations hides XLA's overhead of some 0.2 us an operation and stays in cache; on a
 # GPU, where each operation is a launch, as many tiles as there are (not yet timed).
-LOCKSTEP = {"cpu": Lockstep(32, 8), "gpu": Lockstep(4096, 8)}
+LOCKSTEP = {"cpu": Lockstep(32, 4), "gpu": Lockstep(4096, 8)}
 SMALLEST_CAPACITY = 1 << 12
 LARGEST_CAPACITY = 1 << 19
 LEAST_PACKED_CAPACITY = 1 << 17
@@ -241,8 +241,9 @@ def _stream_back(layout, rects, table, final, residuals, cotangent):
     rows = _with_transparent_row(table)
     spec, grid, step = layout.spec, layout.grid, layout.step
     toward = cotangent[:, 1:]
-    behind = jnp.sum(final[:, 1:] * toward, axis=1)
-    behind += jnp.abs(final[:, 0]) * cotangent[:, 0]
+    behind = jnp.abs(final[:, 0]) * cotangent[:, 0]
+    for c in range(toward.shape[1]):
+        behind += final[:, 1 + c] * toward[:, c]
     blank = _blank(layout, 0, table.dtype)
     state = jnp.concatenate([blank, behind[:, None]], axis=1)
     keep = spec.kept_chunks

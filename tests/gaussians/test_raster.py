@@ -213,8 +213,8 @@ def test_depth_order_is_a_stable_sort(count, dtype, rng):
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("tiles_per_side", [16, 1024], ids=["packed", "two keys"])
 def test_pairs_are_sorted_by_tile_then_depth(tiles_per_side, dtype, rng):
-    """2^20 tiles and 5000 ranks need 33 bits, so they take the sort of two arrays."""
-    count, first = 5000, 7
+    """2^20 tiles and 5003 ranks need 34 bits, so they take the sort of two arrays."""
+    count, first = 5003, 7
     grid = Grid(8 * tiles_per_side, 8 * tiles_per_side, 8)
     rank = np.sort(rng.integers(first, first + count, count)).astype(np.int32)
     tile = rng.integers(0, min(grid.tiles, 300) + 1, count).astype(np.int32)
