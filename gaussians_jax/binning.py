@@ -90,9 +90,9 @@ def depth_order(
     if depth.dtype != jnp.float32:
         key = jnp.where(count > 0, depth, jnp.inf)
         return jnp.argsort(key, stable=True).astype(jnp.int32)
-    # Radix passes over the depth's bits, each one sort of (some bits, position): a sort
-    # of plain 32-bit words takes a quarter of an argsort on the CPU. As many passes as
-    # the scene's range of depths needs, typically two.
+    # Radix passes over the depth's bits, each one sort of (some bits, position), as
+    # many as the scene's range of depths needs, typically two: on the CPU this takes a
+    # fifth of an argsort (262,144 rows: 12 for 63 ms).
     gaussians = depth.shape[0]
     position_bits = max(1, math.ceil(math.log2(gaussians)))
     digit_bits = 32 - position_bits
@@ -105,8 +105,10 @@ def depth_order(
 
     def one_pass(carry):
         number, order = carry
-        digit = bits[order] >> (number * digit_bits)
-        key = lax.sort((digit << position_bits) | position, is_stable=True)
+        shift = number * digit_bits
+        key = (bits[order] >> shift << position_bits) | position
+        more = 32 - lax.clz(beyond >> shift).astype(jnp.int32)  # bits that differ
+        key = _sorted_by_upper_bits(key, position_bits, jnp.minimum(more, digit_bits))
         return number + 1, order[key & jnp.uint32((1 << position_bits) - 1)]
 
     def unsorted(carry):
@@ -231,8 +233,7 @@ def sort_pairs(
     """Pairs in order of rank, sorted by tile; tile `grid.tiles` marks an unused slot.
 
     One unsigned sort of (tile, rank since the chunk's first) where both fit 32 bits: a
-    sort with a payload costs five times as much on the CPU, and there these words are
-    sorted by counting in 0.4 of the time of `lax.sort`.
+    sort with a payload costs ten times as much on the CPU.
     """
     capacity = tile.shape[0]
     # Only Gaussians that touch no tile, and these come last, have no pair: so ranks
@@ -243,10 +244,7 @@ def sort_pairs(
         since = (rank - first_rank).astype(jnp.uint32)
         since = jnp.where(tile < grid.tiles, since, 0)
         key = (tile.astype(jnp.uint32) << rank_bits) | since
-        if jax.default_backend() == "cpu":
-            key = _sorted_by_upper_bits(key, rank_bits, tile_bits)
-        else:
-            key = lax.sort(key, is_stable=True)
+        key = _sorted_by_upper_bits(key, rank_bits, tile_bits)
         tile = (key >> rank_bits).astype(jnp.int32)
         ranks = (key & jnp.uint32((1 << rank_bits) - 1)).astype(jnp.int32) + first_rank
     else:
@@ -260,10 +258,14 @@ def sort_pairs(
 def _sorted_by_upper_bits(key, lowest, bits):
     """Words in the order of their `bits` from bit `lowest` on, ties as they came.
 
-    A radix sort, three bits a pass: a word goes behind those of smaller digits, the
-    equal ones in earlier blocks of eight words, and the equal ones before it in its
-    own. The last are counted in one word, a hexadecimal digit for each of eight.
+    The bits below must rise among ties already, so that elsewhere than on a CPU whole
+    words are sorted. Here it is a radix sort, three bits a pass: a word goes behind
+    those of smaller digits, the equal ones in earlier blocks of eight words, and the
+    equal ones before it in its own. The last are counted in one word, a hexadecimal
+    digit for each of eight.
     """
+    if jax.default_backend() != "cpu":
+        return lax.sort(key)
     size = key.shape[0]
     key = jnp.concatenate([key, jnp.full(-size % 8, 0xFFFFFFFF, key.dtype)])
     digits = jnp.arange(8, dtype=jnp.uint32)
@@ -284,4 +286,4 @@ def _sorted_by_upper_bits(key, lowest, bits):
             key, mode="promise_in_bounds", unique_indices=True
         )
 
-    return lax.fori_loop(0, -(-bits // 3), one_pass, key)[:size]
+    return lax.fori_loop(0, (bits + 2) // 3, one_pass, key)[:size]
