@@ -9,6 +9,7 @@ dense batches, and the networks are asked of these alone.
 import functools
 import math
 from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +29,7 @@ from nerfies_jax.render_ray import (
 from nerfies_jax.training.effects import FrameCondition
 from nerfies_jax.training.model import Rendering
 
+PyTree = Any
 # By level, "coarse" and "fine", and of all levels together what guides the samples.
 Occupancy = dict[str, occupancy.Cells]
 GUIDE = "guide"
@@ -148,23 +150,40 @@ def _block(bound, occupied, camera, condition, position):
             end = jnp.maximum(far - distance[-1], 0)
         return compositing.intervals(distance, end)
 
-    def ask(name, distance, values):
+    def ask(name, distance, values, before=None):
         spacing = jax.vmap(spacing_of)(distance, ray.far)
-        answer = _ask(
-            bound, name, occupied[name], ray, condition, distance, spacing, values
+        answer, asked = _ask(
+            bound,
+            name,
+            occupied[name],
+            ray,
+            condition,
+            distance,
+            spacing,
+            values,
+            before,
         )
-        return answer[..., 0] * spacing, answer[..., 1:]
+        return answer[..., 0] * spacing, answer[..., 1:], asked
 
+    before = None
     if plan.fine:
-        depth, _ = ask("fine" if plan.shared else "coarse", distance, 1)
+        depth, _, asked = ask("fine" if plan.shared else "coarse", distance, 1)
 
-        def refined(distance, depth):
+        def refined(distance, depth, asked):
             weights = compositing.weights(depth)
             drawn = sampling.refine(None, distance, weights, plan.fine)
-            return fine_distances(bound.spec, bound.metadata, distance, drawn)
+            every = fine_distances(bound.spec, bound.metadata, distance, drawn)
+            if not (plan.union and is_moved(bound.effects)):
+                return every, None
+            place = sampling.merged_places(distance, drawn)[: plan.coarse]
 
-        distance = jax.vmap(refined)(distance, depth)
-    depth, colour = ask("fine", distance, 4)
+            def among(x):
+                return jnp.zeros((len(every), *x.shape[1:]), x.dtype).at[place].set(x)
+
+            return every, jax.tree.map(among, asked)
+
+        distance, before = jax.vmap(refined)(distance, depth, asked)
+    depth, colour, _ = ask("fine", distance, 4, before)
     background = None if behind is None else jnp.asarray(behind, distance.dtype)
     whole = jax.vmap(
         lambda depth, colour, distance: compositing.composite(
@@ -175,8 +194,19 @@ def _block(bound, occupied, camera, condition, position):
     return Rendering(whole.colour, whole.alpha, z_depth)
 
 
-def _ask(bound, name, occupied, ray, condition, distance, spacing, values):
-    """[rays, samples, values] density and, of four, colour; zero where skipped."""
+class _Asked(NamedTuple):
+    """Where the template was asked; zero for samples that were skipped."""
+
+    known: Bool[Array, "rays samples"]
+    place: tuple[Float[Array, "rays samples 3"], tuple[Array, ...]]
+
+
+def _ask(bound, name, occupied, ray, condition, distance, spacing, values, before):
+    """[rays, samples, values] density and, of four, colour; zero where skipped.
+
+    What warps and lifts said of samples `before` is not computed again; without it what
+    they say here is returned as well.
+    """
     count, samples = distance.shape
     point = ray.origin[:, None] + distance[..., None] * ray.direction[:, None]
     wanted = occupancy.at(occupied, point, bound.spec.extent)
@@ -186,40 +216,63 @@ def _ask(bound, name, occupied, ray, condition, distance, spacing, values):
     width = -(-samples // STAGES)  # samples of a stage
 
     def staged(x):
-        x = jnp.pad(x, ((0, 0), (0, STAGES * width - samples)))
-        return jnp.moveaxis(x.reshape(count, STAGES, width), 1, 0)
+        padding = ((0, 0), (0, STAGES * width - samples), *[(0, 0)] * (x.ndim - 2))
+        x = jnp.pad(x, padding).reshape(count, STAGES, width, *x.shape[2:])
+        return jnp.moveaxis(x, 1, 0)
 
-    def one(row, distance):
-        at = rays.point_at(ray.origin[row], ray.direction[row], distance)
-        place = asked_at(bound, at, condition)
-        radiance = radiance_at(bound, name, place, inputs[row], condition)
+    def whole(x):
+        x = jnp.moveaxis(x.reshape(STAGES, count, width, *x.shape[2:]), 0, 1)
+        return x.reshape(count, STAGES * width, *x.shape[3:])[:, :samples]
+
+    def placed(index, distance):
+        row = index // width
+        at = rays.point_at(ray.origin[row], ray.direction[row], distance[index])
+        return asked_at(bound, at, condition)
+
+    def said(index, place):
+        radiance = radiance_at(bound, name, place, inputs[index // width], condition)
         every = jnp.concatenate([radiance.density[None], radiance.colour])
         return every[:values]
 
     def stage(passed, given):
-        distance, spacing, wanted = given
-        wanted = wanted & (passed < OPAQUE_DEPTH)[:, None]
+        spacing, wanted, *given = given
+        wanted = (wanted & (passed < OPAQUE_DEPTH)[:, None]).reshape(-1)
+        distance, before = jax.tree.map(
+            lambda x: x.reshape(-1, *x.shape[2:]), tuple(given)
+        )
+        if before is None:
 
-        def asked(place):
-            return jax.vmap(one)(place // width, distance.reshape(-1)[place])
+            def anew(index):
+                place = placed(index, distance)
+                return said(index, place), place
 
-        answer = compacted(asked, wanted.reshape(-1), values, distance.dtype)
-        answer = answer.reshape(count, width, values)
-        return passed + jnp.sum(answer[..., 0] * spacing, axis=1), answer
+            answer, place = compacted(jax.vmap(anew), wanted)
+            asked = _Asked(wanted, place)
+        else:
+            more = compacted(
+                jax.vmap(lambda index: placed(index, distance)), wanted & ~before.known
+            )
+            place = jax.tree.map(jnp.add, before.place, more)  # one of both is zero
 
-    given = staged(distance), staged(spacing), staged(wanted)
-    _, answers = jax.lax.scan(stage, jnp.zeros(count, distance.dtype), given)
-    answers = jnp.moveaxis(answers, 0, 1).reshape(count, STAGES * width, values)
-    return answers[:, :samples]
+            def again(index):
+                return said(index, jax.tree.map(lambda x: x[index], place))
+
+            answer, asked = compacted(jax.vmap(again), wanted), None
+        depth = answer[:, 0].reshape(spacing.shape) * spacing
+        return passed + jnp.sum(depth, axis=1), (answer, asked)
+
+    given = jax.tree.map(staged, (spacing, wanted, distance, before))
+    _, found = jax.lax.scan(stage, jnp.zeros(count, distance.dtype), given)
+    return jax.tree.map(whole, found)
 
 
 def compacted(
-    ask: Callable[[Int[Array, " batch"]], Float[Array, "batch values"]],
-    wanted: Bool[Array, " places"],
-    values: int,
-    dtype: jnp.dtype,
-) -> Float[Array, "places values"]:
-    """`ask` of the places that are wanted, batch by batch; zero at all others."""
+    ask: Callable[[Int[Array, " batch"]], PyTree], wanted: Bool[Array, " places"]
+) -> PyTree:
+    """`ask` of the places that are wanted, batch by batch; zero at all others.
+
+    Its leaves have an axis of the batch in front, and an axis of all places here.
+    """
     places = wanted.shape[0]
     order = jnp.cumsum(wanted, dtype=jnp.int32)
     rows = math.ceil(places / BATCH) * BATCH
@@ -235,10 +288,12 @@ def compacted(
         start = number * BATCH
         place = jax.lax.dynamic_slice(listed, (start,), (BATCH,))
         given = start + jnp.arange(BATCH, dtype=jnp.int32) < order[-1]
-        answers = answers.at[jnp.where(given, place, places)].set(
-            ask(place), mode="drop"
+        row = jnp.where(given, place, places)
+        answers = jax.tree.map(
+            lambda all_, some: all_.at[row].set(some, mode="drop"), answers, ask(place)
         )
         return number + 1, answers
 
-    start = jnp.zeros((), jnp.int32), jnp.zeros((places, values), dtype)
-    return jax.lax.while_loop(more, batch, start)[1]
+    one = jax.eval_shape(ask, jnp.zeros(BATCH, jnp.int32))
+    start = jax.tree.map(lambda x: jnp.zeros((places, *x.shape[1:]), x.dtype), one)
+    return jax.lax.while_loop(more, batch, (jnp.zeros((), jnp.int32), start))[1]

@@ -44,6 +44,8 @@ MOVING = dataclasses.replace(
     warp=WarpSpec(position=EncodingSpec(2), depth=1, width=8, skips=()),
     ambient=AmbientSpec(depth=1, width=8, skips=(), closed_steps=1, anneal_steps=9),
 )
+# The fine level takes over what the warp and the slices said of the coarse samples.
+TAKEN_OVER = dataclasses.replace(MOVING, sampling=SamplingSpec(8, 9))
 ONE_LEVEL = dataclasses.replace(STILL, sampling=SamplingSpec(24, 0))
 GUIDED = dataclasses.replace(
     STILL, sampling=SamplingSpec(24, 0, occupancy=OccupancySpec())
@@ -116,10 +118,23 @@ def test_skipping_changes_a_frame_by_no_more_than_it_may(spec, background, row):
     assert np.abs(bare.colour - whole.colour).max() > 10 * most
 
 
+def test_where_nothing_is_skipped_a_frame_is_the_full_quadrature(monkeypatch):
+    """Samples that the fine level takes over are where they were asked before."""
+    monkeypatch.setattr(skipping, "SKIPPED_DEPTH", -1.0)
+    monkeypatch.setattr(skipping, "OPAQUE_DEPTH", np.inf)
+    model, params = full_of_holes(TAKEN_OVER, ORANGE)
+    view = evaluation.view_of(scenes.tiny_capture(), 1)
+    drawn = jax.jit(model.surveyed.draw, static_argnums=3)(params, {}, view, SIZE, STEP)
+    whole = jax.jit(model.render, static_argnums=2)(params, view, SIZE, STEP)
+    assert 0.1 < whole.alpha.mean() < 0.98
+    np.testing.assert_allclose(drawn.colour, whole.colour, atol=1e-5)
+    np.testing.assert_allclose(drawn.depth, whole.depth, atol=1e-4)
+
+
 @pytest.mark.parametrize("pixels", [SIZE, (40, 30)])
 def test_a_frame_does_not_depend_on_how_it_is_cut(pixels, monkeypatch):
     """Blocks, stages and batches are of memory alone."""
-    model, params = full_of_holes(MOVING, ORANGE)
+    model, params = full_of_holes(TAKEN_OVER, ORANGE)
     view = evaluation.view_of(scenes.tiny_capture(), 3)
     occupied = jax.jit(model.surveyed.survey)(params, STEP)
     pictures = []
