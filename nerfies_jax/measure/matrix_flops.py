@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 import jax
 from jax.extend import core
 
+from nerfies_jax.nets import dense
+
 
 class Counted(NamedTuple):
     """Operations of one call."""
@@ -39,6 +41,8 @@ def _of_jaxpr(jaxpr) -> Counted:
         inner = sum(one.flops for one in counts)
         if name == "dot_general":
             inner = _product(equation)
+        elif name == dense.PRODUCT.name:
+            inner = _dense(equation)
         elif name == "scan":
             inner *= equation.params["length"]
         elif name == "cond":
@@ -59,6 +63,11 @@ def _product(equation):
     left = equation.invars[0].aval.shape
     shared = math.prod(left[axis] for axis in contracted)
     return 2.0 * shared * math.prod(equation.outvars[0].aval.shape)
+
+
+def _dense(equation):
+    inputs, weight = (x.aval.shape for x in equation.invars)
+    return 2.0 * math.prod(inputs) * weight[1]
 
 
 def _inner(params) -> Iterator[Any]:

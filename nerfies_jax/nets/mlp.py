@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
+from nerfies_jax.nets import dense
+
 ACTIVATIONS = {
     "relu": jax.nn.relu,
     "softplus": jax.nn.softplus,
@@ -150,7 +152,7 @@ def affine(
     layer: Layer, inputs: Float[Array, "*batch inputs"]
 ) -> Float[Array, "*batch outputs"]:
     """One affine map of one input or a batch."""
-    return inputs @ layer.weight + layer.bias
+    return dense.product(inputs, layer.weight) + layer.bias
 
 
 def with_known(spec: MLPSpec, params: MLP, known: Float[Array, " known"]) -> MLP:

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from nerfies_jax.measure import matrix_flops
+from nerfies_jax.nets import dense
 
 
 def product(x, y):
@@ -26,6 +27,9 @@ def test_a_matrix_product_has_two_operations_a_multiply_add():
     # A vector under vmap is a matrix; what is alike for the batch is computed once.
     row = matrix_flops.count(jax.vmap(product, (0, None)), LEFT, RIGHT)
     assert row.flops == counted.flops
+    assert (
+        matrix_flops.count(dense.product, *map(jnp.asarray, (LEFT, RIGHT))) == counted
+    )
 
 
 def test_a_gradient_has_a_product_for_each_side():

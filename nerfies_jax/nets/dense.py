@@ -1,0 +1,85 @@
+"""The product of vectors with one matrix, an operation of its own for its slopes.
+
+Under `vmap` over rays and samples, JAX's slope by the matrix is a product summed over
+two axes, for which XLA:CPU first writes the cotangents anew the other way round. Here
+it is one over rows, whatever stood before. With it, and in blocks (below), a step on
+one core takes 0.90 (`nerf-small`), 0.91 (`nerfies-small`) and 0.83
+(`nerfies-grid-small`) of the time.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array, Float
+
+# Of rows whose products are summed at last: XLA:CPU sums 8192 of 64 x 64 in 0.73 ms as
+# one product of a batch, in 1.03 at once. Fewer rows than the least are not worth it.
+BLOCKS, LEAST_ROWS = 64, 2048
+
+PRODUCT = Primitive("dense_product")
+
+
+def product(
+    inputs: Float[Array | np.ndarray, "*batch inputs"],
+    weight: Float[Array | np.ndarray, "inputs outputs"],
+) -> Float[Array, "*batch outputs"]:
+    """`inputs @ weight`, and its derivatives of any order and kind.
+
+    Types are promoted as for `@`. ValueError where the shapes do not fit.
+    """
+    dtype = jnp.result_type(inputs, weight)
+    inputs, weight = jnp.asarray(inputs, dtype), jnp.asarray(weight, dtype)
+    return PRODUCT.bind(inputs, weight)
+
+
+def _rows(x):
+    return x.reshape(-1, x.shape[-1])
+
+
+def _product(inputs, weight):
+    found = _rows(inputs) @ weight
+    return found.reshape(*inputs.shape[:-1], weight.shape[1])
+
+
+def _type(inputs, weight):
+    if weight.ndim != 2 or inputs.shape[-1:] != weight.shape[:1]:
+        raise ValueError(
+            f"inputs of shape {inputs.shape} end in the number of rows of a weight of "
+            f"shape {weight.shape}, (inputs, outputs)"
+        )
+    return ShapedArray((*inputs.shape[:-1], weight.shape[1]), inputs.dtype)
+
+
+def _batched(operands, axes):
+    (inputs, weight), (inputs_axis, weight_axis) = operands, axes
+    if weight_axis is None:
+        return PRODUCT.bind(jnp.moveaxis(inputs, inputs_axis, 0), weight), 0
+    weight = jnp.moveaxis(weight, weight_axis, 0)
+    if inputs_axis is None:
+        return jnp.einsum("...i,nio->n...o", inputs, weight), 0
+    inputs = jnp.moveaxis(inputs, inputs_axis, 0)
+    return jnp.einsum("n...i,nio->n...o", inputs, weight), 0
+
+
+def _toward_inputs(cotangent, inputs, weight):
+    return PRODUCT.bind(cotangent, weight.T)
+
+
+def _toward_weight(cotangent, inputs, weight):
+    inputs, cotangent = _rows(inputs), _rows(cotangent)
+    count = inputs.shape[0]
+    if count % BLOCKS or count < LEAST_ROWS or jax.default_backend() != "cpu":
+        return inputs.T @ cotangent
+    inputs = inputs.reshape(BLOCKS, -1, inputs.shape[-1])
+    cotangent = cotangent.reshape(BLOCKS, -1, cotangent.shape[-1])
+    return jnp.sum(jnp.einsum("bni,bno->bio", inputs, cotangent), axis=0)
+
+
+PRODUCT.def_impl(jax.jit(_product))
+PRODUCT.def_abstract_eval(_type)
+mlir.register_lowering(PRODUCT, mlir.lower_fun(_product, multiple_results=False))
+batching.primitive_batchers[PRODUCT] = _batched
+ad.defbilinear(PRODUCT, _toward_inputs, _toward_weight)
