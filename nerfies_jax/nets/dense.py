@@ -3,7 +3,7 @@
 Under `vmap` over rays and samples, JAX's slope by the matrix is a product summed over
 two axes, for which XLA:CPU first writes the cotangents anew the other way round. Here
 it is one over rows, whatever stood before. With it, and in blocks (below), a step on
-one core takes 0.90 (`nerf-small`), 0.91 (`nerfies-small`) and 0.83
+one core takes 0.89 (`nerf-small`), 0.90 (`nerfies-small`) and 0.85
 (`nerfies-grid-small`) of the time.
 """
 
