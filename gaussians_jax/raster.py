@@ -122,7 +122,7 @@ def _layout(footprints, size, spec):
         wanted = PAIRS_PER_GAUSSIAN * footprints.depth.shape[0]
         capacity = min(max(wanted, SMALLEST_CAPACITY), LARGEST_CAPACITY)
         capacity = 1 << math.ceil(math.log2(capacity))
-        # Tile and rank in one 32-bit word: the sort of two arrays takes five times as
+        # Tile and rank in one 32-bit word: the sort of two arrays takes ten times as
         # long. Not at any price, because each chunk also passes over every tile.
         packed = 1 << (32 - grid.tiles.bit_length())
         if packed >= LEAST_PACKED_CAPACITY:

@@ -152,17 +152,8 @@ def _block(bound, occupied, camera, condition, position):
 
     def ask(name, distance, values, before=None):
         spacing = jax.vmap(spacing_of)(distance, ray.far)
-        answer, asked = _ask(
-            bound,
-            name,
-            occupied[name],
-            ray,
-            condition,
-            distance,
-            spacing,
-            values,
-            before,
-        )
+        seen = name, occupied[name], ray, condition
+        answer, asked = _ask(bound, *seen, distance, spacing, values, before)
         return answer[..., 0] * spacing, answer[..., 1:], asked
 
     before = None
@@ -235,10 +226,10 @@ def _ask(bound, name, occupied, ray, condition, distance, spacing, values, befor
         return every[:values]
 
     def stage(passed, given):
-        spacing, wanted, *given = given
-        wanted = (wanted & (passed < OPAQUE_DEPTH)[:, None]).reshape(-1)
-        distance, before = jax.tree.map(
-            lambda x: x.reshape(-1, *x.shape[2:]), tuple(given)
+        spacing, wanted, distance, before = given
+        wanted = wanted & (passed < OPAQUE_DEPTH)[:, None]
+        wanted, distance, before = jax.tree.map(
+            lambda x: x.reshape(-1, *x.shape[2:]), (wanted, distance, before)
         )
         if before is None:
 

@@ -13,10 +13,10 @@ def plain(inputs, weight):
     return inputs @ weight
 
 
-@pytest.mark.parametrize("shape", [(3,), (0, 3), (5, 3), (2, 4, 3)])
+@pytest.mark.parametrize("shape", [(3,), (0, 3), (5, 3), (2, 4, 3), (5, 0)])
 def test_it_is_the_product_of_rows(shape, dtype, rng):
     inputs = rng.normal(size=shape).astype(dtype)
-    weight = rng.normal(size=(3, 2)).astype(dtype)
+    weight = rng.normal(size=(shape[-1], 2)).astype(dtype)
     found = dense.product(inputs, weight)
     assert found.dtype == dtype
     np.testing.assert_allclose(
