@@ -177,7 +177,7 @@ def _init(spec, metadata, effects, key):
         nets[name] = template.init(
             one,
             jax.random.fold_in(keys[0], number),
-            one.position.width(3) + lifted,
+            one.encoded_width + lifted,
             condition + extras,
         )
     rows = {MOMENT: len(metadata.times)}

@@ -187,13 +187,15 @@ def learning_rates(
     """Of each part of the parameters: the effect's own, or that of the schedule.
 
     A warp that starts from tracks, and the codes that it reads, begin with a share, as
-    does a scene flow with a trunk of its own.
+    does a scene flow with a trunk of its own. A medium on tables learns at the rate of
+    the template.
     """
     own = {e.name: e.learning_rate for e in effects if e.learning_rate is not None}
     common = schedules.log_linear(
         spec.learning_rate, spec.learning_rate_end, spec.steps
     )(step)
     rates = {name: own[name](step) if name in own else common for name in params}
+    template, held = spec.template_rate * common, 1.0
     if spec.start.motion == "tracks":
         held = schedules.log_linear(spec.start.first_rate, 1.0, spec.steps)(step)
         warps = [effect for effect in effects if effect.displace is not None]
@@ -203,17 +205,17 @@ def learning_rates(
             name: held * rates["codes"] if name in tables else rates["codes"]
             for name in params["codes"]
         }
-        flow = params.get(scene_flow.NAME)
-        if flow is not None and flow.flow_trunk is not None:
-            rate = rates[scene_flow.NAME]
-            rates[scene_flow.NAME] = scene_flow.SceneFlow(
-                network=rate,
-                flow=held * rate,
-                disocclusion=rate,
-                blend=rate,
-                flow_trunk=held * rate,
-            )
-    template = spec.template_rate * common
+    flow = params.get(scene_flow.NAME)
+    if isinstance(flow, scene_flow.SceneFlow):
+        apart = flow.flow_trunk is not None
+        of_flow = held * common if apart else common
+        rates[scene_flow.NAME] = scene_flow.SceneFlow(
+            network=common if flow.network.tables is None else template,
+            flow=of_flow,
+            disocclusion=common,
+            blend=common,
+            flow_trunk=of_flow if apart else None,
+        )
     if spec.table_rate != 1:
         tables = spec.table_rate * template
         template = {

@@ -117,6 +117,11 @@ class RadianceScene:
         for name in ("template_rate", "table_rate"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name}={getattr(self, name)} must be positive")
+        if any(one.reads_time for one in (self.template, self.coarse or self.template)):
+            raise ValueError(
+                "a template is read at a point, at whatever time, and its planes have "
+                "none: set position.moments=none (scene_flow.network may have them)"
+            )
         if self.extent is not None and not self.extent > 0:
             raise ValueError(f"extent={self.extent} must be positive, or none")
         schedules.check_falling(self.learning_rate, self.learning_rate_end)

@@ -28,11 +28,13 @@ READING = """\
   built-in scene has pictures alone.
 - *reads* is what a row learns from beside pictures, cameras and points. In built-in
   films it is the exact depth, flow or mask of what moves, which other rows do not see.
-- *CPU s* is what the lengths are of, give or take a tenth: seconds of all threads of a
-  process with one core, without compiling, finding tracks and fitting the motion to
-  them, which rows from tracks have on top; *train s* is the same by the clock on the
-  wall, *compile* what compiling takes without a cache, *frame ms* a held-out frame,
-  *model MB* the file of a trained scene (of a field its parameters).
+- *CPU s* is what the lengths are of: seconds of all threads of a process with one core,
+  without compiling, finding tracks and fitting the motion to them, which rows from
+  tracks have on top. Seed 0 finds the steps that fit, give or take a tenth; the others
+  make as many, on another or a busier machine in other seconds, which is most of the ±.
+  *train s* is the same by the clock on the wall, *compile* what compiling takes without
+  a cache, *frame ms* a held-out frame, *model MB* the file of a trained scene (of a
+  field its parameters).
 - Schedules stretch to the steps that a row gets; how many steps apart Gaussians grow
   does not, so that rows of dear steps also grow less often. Presets differ in what is
   not motion as well, in views a step and in how far apart growth is.

@@ -66,7 +66,8 @@ class SceneFlowSpec:
     of the field. After `decay_steps` the medium need no longer explain the whole
     picture by itself, only what the blending gives it. `flow_trunk` gives the flow a
     trunk of its own, of the same size, where the public code reads it from the
-    medium's: what tracks have found then survives the medium's first steps.
+    medium's: what tracks have found then survives the medium's first steps. A network
+    on planes of `moments` (HexPlane) reads features of a point at a time, for waves.
     """
 
     network: TemplateSpec = TemplateSpec()
@@ -84,6 +85,11 @@ class SceneFlowSpec:
             )
         if self.decay_steps < 1:
             raise ValueError(f"decay_steps={self.decay_steps} must be at least 1")
+        if self.network.reads_time and self.network.position.outside == "refuse":
+            raise ValueError(
+                'network.position.outside="refuse": the moments before the first and '
+                'after the last are asked for as well; set "clamp"'
+            )
 
 
 class SceneFlow(NamedTuple):
@@ -150,7 +156,7 @@ def init(
     """Flow next to nothing, disocclusion and blending undecided."""
     network_key, flow_key, disocclusion_key, blend_key = jax.random.split(key, 4)
     one = spec.network
-    inputs = one.position.width(3) + spec.time.width(1)
+    inputs = one.encoded_width + spec.time.width(1)
     condition = 0 if one.direction is None else one.direction.width(3)
     flow = mlp.init_layer(flow_key, one.width, 6, "small", dtype)
     trunk = None
@@ -177,8 +183,9 @@ def dynamic(
 ) -> Dynamic:
     """The medium at one point and time, seen along one direction."""
     one = spec.network
+    moment = time if one.reads_time else None
     features = [
-        template.encode(one, params.network, point, None),
+        template.encode(one, params.network, point, None, moment),
         # time runs from -1 to 1 like the axes of the box
         encoding.encode(spec.time, 2 * time[None] - 1, None),
     ]

@@ -263,4 +263,16 @@ def total_variation(
             "a hashed level has no neighbours"
         )
     grid = table.reshape(vertices, vertices, vertices, -1)
-    return sum(jnp.mean(jnp.diff(grid, axis=axis) ** 2) for axis in range(3)) / 3
+    # XLA:CPU adds floats to one sum one after the other, and squares them at that pace:
+    # the squares of 97^3 rows of four take 35 ms, padded and summed by a product 2 (27
+    # and 12 with the slope).
+    squares = sum(
+        jnp.pad(
+            jnp.square(jnp.diff(grid, axis=axis)),
+            [(0, int(axis == other)) for other in range(4)],
+        )
+        for axis in range(3)
+    )
+    lines = squares.reshape(vertices**2, -1)
+    total = jnp.sum(lines @ jnp.ones(lines.shape[1], lines.dtype))
+    return total / (3 * table.size * cells / vertices)

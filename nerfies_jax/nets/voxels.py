@@ -24,8 +24,9 @@ class VoxelGridSpec:
     """A dense grid over a box; the defaults are TiNeuVox-B's.
 
     `strides` are from coarse to fine. Each feature is followed by `bands` waves of
-    itself, as coordinates are. The box and what is beyond it are those of
-    `grids.HashGridSpec`; the paper drops samples outside.
+    itself, as coordinates are. The box is that of `grids.HashGridSpec`; a point beyond
+    it has the features of the nearest in it, where the paper drops it, or with
+    `contract` space is contracted, which leaves the box half the vertices of a side.
     """
 
     cells: int = 160  # along an axis
@@ -33,7 +34,7 @@ class VoxelGridSpec:
     strides: tuple[int, ...] = (4, 2, 1)
     bands: int = 2
     half_side: float = 1.0
-    contract: bool = True
+    contract: bool = False
 
     def __post_init__(self):
         if self.features < 1 or self.cells < 1 or (self.cells + 1) ** 3 > MOST_ROWS:

@@ -47,8 +47,10 @@ class TemplateSpec:
     `anneal_steps` opens the bands of the position, or the levels of its tables, one by
     one, coarse to fine, as Nerfies those of its warp; None has all open.
 
-    A position may be read from tables: of a grid, or of planes without a time, which
-    span the cube [-1, 1]^3 of the field and, contracted, all space around it.
+    A position may be read from tables: of a grid, or of planes, which span the cube
+    [-1, 1]^3 of the field and, contracted, all space around it. On planes of `moments`
+    the network reads a point at a time, as the medium of a scene flow does; a template
+    has none.
     """
 
     position: EncodingSpec | HashGridSpec | VoxelGridSpec | PlanesSpec = EncodingSpec(
@@ -64,7 +66,6 @@ class TemplateSpec:
     anneal_steps: int | None = steps(None)
 
     def __post_init__(self):
-        self.position.width(3)  # refuses planes of other dimensions
         if self.density not in DENSITIES:
             raise ValueError(
                 f"unknown density activation {self.density!r}; choose from "
@@ -77,6 +78,16 @@ class TemplateSpec:
                 f"anneal_steps={self.anneal_steps} must be at least 1; None opens all "
                 "from the first step"
             )
+
+    @property
+    def reads_time(self) -> bool:
+        """Whether its tables are those of a point at a time."""
+        return isinstance(self.position, PlanesSpec) and bool(self.position.moments)
+
+    @property
+    def encoded_width(self) -> int:
+        """Features of a point, and of its time where that is read."""
+        return self.position.width(4 if self.reads_time else 3)
 
 
 class Template(NamedTuple):
@@ -133,10 +144,12 @@ def encode(
     params: Template,
     point: Float[Array, "3"],
     step: Int[Array, ""] | None,
+    time: Float[Array, ""] | None = None,
 ) -> Float[Array, " features"]:
     """What the trunk reads of a point in units of the field.
 
-    `step` says how far the bands or levels are open; None opens all.
+    `step` says how far the bands or levels are open; None opens all. `time` is there
+    where `spec.reads_time`, in [0, 1].
     """
     position, grid = spec.position, GRIDS.get(type(spec.position))
     parts = position.bands if grid is None else position.levels
@@ -147,7 +160,10 @@ def encode(
         return encoding.encode(position, point, window)
     if grid is not planes:
         return grid.encode(position, params.tables, point, window)
-    found = planes.encode(position, params.tables, (grids.contract(point) + 2) / 4)
+    place = (grids.contract(point) + 2) / 4
+    if time is not None:
+        place = jnp.concatenate([place, time[None]])
+    found = planes.encode(position, params.tables, place)
     if window is not None:
         found = found * jnp.repeat(window, position.features)
     return found

@@ -17,7 +17,10 @@ from nerfies_jax.effects.time_condition import TimeSpec
 from nerfies_jax.effects.time_warp import TimeWarpSpec
 from nerfies_jax.effects.transient import TransientSpec
 from nerfies_jax.effects.warp import WarpSpec
+from nerfies_jax.nets.planes import PlanesSpec
+from nerfies_jax.radiance.template import TemplateSpec
 
+STRICT = TemplateSpec(PlanesSpec(moments=4, outside="refuse"))
 REFUSED = [
     (AmbientSpec, {"kind": "curved"}, "unknown kind of slice 'curved'.*bent"),
     (AmbientSpec, {"dims": 0}, "dims=0 must be at least 1.*none"),
@@ -46,6 +49,7 @@ REFUSED = [
     (SceneFlowSpec, {"flow_bound": 0.0}, "flow_bound=0"),
     (SceneFlowSpec, {"flow_bound": math.nan}, "flow_bound=nan"),
     (SceneFlowSpec, {"decay_steps": 0}, "decay_steps=0"),
+    (SceneFlowSpec, {"network": STRICT}, "moments before the first.*clamp"),
     (FlowWeights, {"cycle": -1.0}, "cycle=-1"),
     (FlowWeights, {"depth": math.inf}, "depth=inf"),
     (scene_flow.interval, {"moments": 0}, "moments=0"),

@@ -11,8 +11,9 @@ import pytest
 from nerfies_jax.effects import scene_flow
 from nerfies_jax.effects.effect import Sample
 from nerfies_jax.effects.scene_flow import FlowWeights
+from nerfies_jax.nets.planes import PlanesSpec
 from nerfies_jax.training.effects import FrameCondition
-from tests import gradients
+from tests import drawn, gradients
 from tests.scene_flow_rays import (
     FEATURES,
     MOMENTS,
@@ -110,6 +111,32 @@ def test_a_flow_with_a_trunk_of_its_own_reads_nothing_of_the_medium_s(dtype):
 
 
 # --- edges of time
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("time", [-1 / 3, 0.0, 1.0, 4 / 3])
+@pytest.mark.parametrize("point", [0.3, 1e6])
+def test_a_medium_on_planes_is_finite_where_there_is_no_moment(time, point, dtype):
+    """As neighbours of the first and the last are, at any distance."""
+    network = dataclasses.replace(
+        TINY.network, position=PlanesSpec(3, (1, 2), moments=4, features=2)
+    )
+    spec = dataclasses.replace(TINY, network=network)
+    params = drawn.params(
+        lambda key: scene_flow.init(spec, key, FEATURES, jnp.dtype(dtype)), dtype, 0.1
+    )
+    place, towards = jnp.full(3, point, dtype), jnp.asarray([0, 0, 1], dtype)
+
+    @jax.jit
+    @functools.partial(jax.value_and_grad, argnums=(0, 1))
+    def total(params, time):
+        one = scene_flow.dynamic(spec, params, place, towards, time)
+        return sum(jnp.sum(leaf) for leaf in one)
+
+    found = total(params, np.asarray(time, dtype))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
+    (slopes, _) = found[1]
+    assert all(np.any(plane) for plane in jax.tree.leaves(slopes.network.tables))
 
 
 @functools.partial(jax.jit, static_argnums=4)

@@ -144,6 +144,17 @@ def test_a_flow_with_a_trunk_of_its_own_learns_slowly_at_first_and_its_medium_no
     assert own.network == own.disocclusion == own.blend == common
 
 
+@pytest.mark.parametrize("motion", ["tracks", "none"])
+def test_a_medium_on_tables_learns_at_the_rate_of_the_template(motion):
+    preset = presets.PRESETS["nsff-grid-small"]
+    spec = dataclasses.replace(preset, start=FieldStartSpec(motion=motion))
+    field = scene.field(spec, field_of("nsff-small").metadata)
+    params = jax.eval_shape(field.init, jax.random.key(0))
+    rates = scene.learning_rates(spec, field.effects, params, jnp.int32(0))
+    own = rates["scene_flow"]
+    assert own.network == rates["template"] == spec.template_rate * own.blend
+
+
 def test_a_fitted_flow_leads_from_one_place_to_the_next_and_from_no_wall():
     """Against the body's own velocity; also where frames are two moments apart.
 

@@ -12,6 +12,7 @@ from nerfies_jax.effects.background import BackgroundSpec
 from nerfies_jax.effects.elastic import ElasticSpec
 from nerfies_jax.effects.time_condition import TimeSpec
 from nerfies_jax.effects.warp import WarpSpec
+from nerfies_jax.nets.planes import PlanesSpec
 from nerfies_jax.radiance import sampling
 from nerfies_jax.radiance.template import TemplateSpec
 from nerfies_jax.scene import RadianceScene
@@ -34,6 +35,7 @@ ON_POINTS = dataclasses.replace(BENT, background=BackgroundSpec())
 TWO_WIDTHS = dataclasses.replace(
     BENT, warp=WarpSpec(code_width=5), time=TimeSpec(condition="code")
 )
+ON_MOMENTS = TemplateSpec(PlanesSpec(moments=4))
 LINE = np.linspace(0.1, 1, 5, dtype=np.float32)
 
 
@@ -64,6 +66,8 @@ def sample_pdf(edges, weights, count):
         (lambda: RadianceScene(1, rays=0), "rays=0"),
         (lambda: RadianceScene(0), "steps=0"),
         (lambda: RadianceScene(1, extent=0.0), "extent=0"),
+        (lambda: RadianceScene(1, ON_MOMENTS), "position.moments=none"),
+        (lambda: RadianceScene(1, coarse=ON_MOMENTS), "position.moments=none"),
         (
             lambda: RadianceScene(1, learning_rate=1e-4, learning_rate_end=1e-3),
             "learning_rate_end",

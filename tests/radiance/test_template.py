@@ -92,19 +92,22 @@ PLANES = dataclasses.replace(
     position=PlanesSpec(vertices=3, multiples=(1, 2), features=2),
     anneal_steps=40,
 )
+TIMED = dataclasses.replace(
+    PLANES, position=dataclasses.replace(PLANES.position, moments=4)
+)
 
 
-def planes_drawn(dtype):
+def planes_drawn(dtype, spec=PLANES):
     return values.params(
-        lambda key: template.init(PLANES, key, PLANES.position.width(3), 1), dtype, 0.1
+        lambda key: template.init(spec, key, spec.encoded_width, 1), dtype, 0.1
     )
 
 
 def product_of_planes(level, place):
-    """Of one place by SciPy's interpolation of the three planes of a level."""
-    sides = ((0, 1), (0, 2), (1, 2))
+    """Of one place by SciPy's interpolation of the three or six planes of a level."""
+    sides = ((0, 1), (0, 2), (1, 2), (3, 0), (3, 1), (3, 2))[: 3 * (len(place) - 2)]
     found = 1
-    for pair, plane in zip(sides, level.space, strict=True):
+    for pair, plane in zip(sides, level.space + level.time, strict=True):
         axes = [np.linspace(0, 1, side) for side in plane.shape[:2]]
         oracle = scipy.interpolate.RegularGridInterpolator(axes, np.asarray(plane))
         found = found * oracle(place[list(pair)])[0]
@@ -137,15 +140,26 @@ def test_gradients_of_planes(float64):
     assert gradients.directional_error(total, params, point) < 1e-7
 
 
-@pytest.mark.parametrize(
-    ("wrong", "words"),
-    [
-        ({"position": PlanesSpec(moments=4)}, "4 dimensions, not of 3"),
-    ],
-)
-def test_a_wrong_template_is_refused(wrong, words):
-    with pytest.raises(ValueError, match=words):
-        TemplateSpec(**wrong)
+def test_planes_of_moments_say_when_as_well(dtype):
+    params, place = planes_drawn(dtype, TIMED), np.array([0.575, 0.45, 0.725, 0.4])
+    levels = [product_of_planes(level, place) for level in params.tables]
+    point, time = np.asarray([0.3, -0.2, 0.9], dtype), np.asarray(0.4, dtype)
+    read = jax.jit(template.encode, static_argnums=0)
+    at = functools.partial(read, TIMED, params, point, None)
+    atol = {"float32": 1e-6, "float64": 1e-14}[dtype]
+    np.testing.assert_allclose(at(time), np.concatenate(levels), rtol=0, atol=atol)
+    with pytest.raises(ValueError, match="4 dimensions, not of 3"):
+        at(None)
+
+
+def test_gradients_of_planes_of_moments(float64):
+    params = planes_drawn("float64", TIMED)
+    point, time = np.array([0.31, -0.23, 1.7]), np.asarray(0.41)
+
+    def total(params, point, time):
+        return jnp.sum(template.encode(TIMED, params, point, None, time) ** 2)
+
+    assert gradients.directional_error(total, params, point, time) < 1e-7
 
 
 @functools.partial(jax.jit, static_argnums=0)
