@@ -264,15 +264,16 @@ def total_variation(
         )
     grid = table.reshape(vertices, vertices, vertices, -1)
     # XLA:CPU adds floats to one sum one after the other, and squares them at that pace:
-    # the squares of 97^3 rows of four take 35 ms, padded and summed by a product 2 (27
-    # and 12 with the slope).
-    squares = sum(
-        jnp.pad(
-            jnp.square(jnp.diff(grid, axis=axis)),
-            [(0, int(axis == other)) for other in range(4)],
-        )
-        for axis in range(3)
-    )
+    # the squares of 97^3 rows of four take 35 ms, brought to one shape and summed by a
+    # product 3 (27 and 14 with the slope).
+    squares = sum(_squared_differences(grid, axis) for axis in range(3))
     lines = squares.reshape(vertices**2, -1)
     total = jnp.sum(lines @ jnp.ones(lines.shape[1], lines.dtype))
     return total / (3 * table.size * cells / vertices)
+
+
+def _squared_differences(grid, axis):
+    """Of each vertex and the next, and zeros at the end."""
+    end = jnp.zeros_like(jax.lax.slice_in_dim(grid, 0, 1, axis=axis))
+    squares = jnp.square(jnp.diff(grid, axis=axis))
+    return jnp.concatenate([squares, end], axis)
