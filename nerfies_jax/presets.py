@@ -319,15 +319,11 @@ def _on_grid(preset: RadianceScene) -> RadianceScene:
 #   and 256 rays                            220    21.29 16.60   0.0 dB
 #   waves, 3 of 64 wide                     410    21.97 16.82   0.0
 #   a hash grid of space and the time       820    22.16 16.96   0.1
-#   planes of space and time                690    23.57 18.26   1.2
-PLANES_MEDIUM = TemplateSpec(
-    PlanesSpec(vertices=64, multiples=(1, 2), moments=30, features=8),
-    EncodingSpec(2),
-    depth=1,
+#   planes, exponential, template's rate    690    23.57 18.26   1.2
+PLANES_MEDIUM = dataclasses.replace(
+    GRID_TEMPLATE,
+    position=PlanesSpec(vertices=64, multiples=(1, 2), moments=30, features=8),
     width=48,
-    skips=(),
-    colour_width=32,
-    density="exp",
 )
 
 # Without motion. It starts nearly empty, and what nobody needs stays so; beside a warp

@@ -195,7 +195,7 @@ def learning_rates(
         spec.learning_rate, spec.learning_rate_end, spec.steps
     )(step)
     rates = {name: own[name](step) if name in own else common for name in params}
-    template, held = spec.template_rate * common, 1.0
+    held = 1.0
     if spec.start.motion == "tracks":
         held = schedules.log_linear(spec.start.first_rate, 1.0, spec.steps)(step)
         warps = [effect for effect in effects if effect.displace is not None]
@@ -207,15 +207,17 @@ def learning_rates(
         }
     flow = params.get(scene_flow.NAME)
     if isinstance(flow, scene_flow.SceneFlow):
-        apart = flow.flow_trunk is not None
-        of_flow = held * common if apart else common
+        rate, apart = rates[scene_flow.NAME], flow.flow_trunk is not None
+        on_tables = flow.network.tables is not None
+        of_flow = held * rate if apart else rate
         rates[scene_flow.NAME] = scene_flow.SceneFlow(
-            network=common if flow.network.tables is None else template,
+            network=spec.template_rate * rate if on_tables else rate,
             flow=of_flow,
-            disocclusion=common,
-            blend=common,
+            disocclusion=rate,
+            blend=rate,
             flow_trunk=of_flow if apart else None,
         )
+    template = spec.template_rate * common
     if spec.table_rate != 1:
         tables = spec.table_rate * template
         template = {

@@ -13,6 +13,7 @@ def params(init, dtype, size=0.2, seed=0):
 
     def draw(leaf):
         width = size + (len(leaf.shape) > 1) / math.sqrt(leaf.shape[0])
-        return jnp.asarray(width * rng.normal(size=leaf.shape), kind)
+        # Rounded by NumPy: JAX would compile a conversion for every shape.
+        return jnp.asarray((width * rng.normal(size=leaf.shape)).astype(kind))
 
     return jax.tree.map(draw, jax.eval_shape(init, jax.random.key(0)))

@@ -21,7 +21,7 @@ from nerfies_jax.effects.effect import Medium, RayOutput, Sample, Scalar, Vector
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
-from nerfies_jax.radiance import compositing, template
+from nerfies_jax.radiance import template
 from nerfies_jax.radiance.template import Template, TemplateSpec
 from nerfies_jax.training.effects import Effect, FrameCondition, PenaltyContext, Term
 from nerfies_jax.training.step_counts import steps
@@ -183,9 +183,8 @@ def dynamic(
 ) -> Dynamic:
     """The medium at one point and time, seen along one direction."""
     one = spec.network
-    moment = time if one.reads_time else None
     features = [
-        template.encode(one, params.network, point, None, moment),
+        template.encode(one, params.network, point, None, time),
         # time runs from -1 to 1 like the axes of the box
         encoding.encode(spec.time, 2 * time[None] - 1, None),
     ]
@@ -246,7 +245,7 @@ def neighbour(
     there = jax.vmap(jax.vmap(ask, (0, None, None)))(
         point, context.batch.direction, time
     )
-    weight = dynamic_weights(level.distances, there.density)
+    weight = flow_losses.dynamic_weights(level.distances, there.density)
     logit = extras["disocclusion"][..., side]
     return Neighbour(
         point=point,
@@ -258,16 +257,6 @@ def neighbour(
         weight=weight,
         present=present,
     )
-
-
-def dynamic_weights(
-    distance: Float[Array, "rays samples"], density: Float[Array, "rays samples"]
-) -> Float[Array, "rays samples"]:
-    """Of the medium alone, unblended; the last sample stands for all behind it."""
-    spacing = jax.vmap(
-        lambda distance: compositing.intervals(distance, compositing.AT_INFINITY)
-    )(distance)
-    return jax.vmap(compositing.weights)(density * spacing)
 
 
 def fading(decay_steps: int, step: Int[Array, ""]) -> Scalar:
@@ -285,7 +274,7 @@ def penalty(
     """All losses beside that of the blended picture, as logged."""
     batch, level = context.batch, context.levels[-1]
     own = level.media[NAME]
-    weight = dynamic_weights(level.distances, own.density)
+    weight = flow_losses.dynamic_weights(level.distances, own.density)
     sides = [neighbour(spec, gap, params, context, side) for side in (0, 1)]
     mask = jnp.where(batch.valid, picture_mask(spec, level, context.step), 0)
     values = {

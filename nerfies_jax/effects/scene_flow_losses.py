@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from nerfies_jax.geometry.precision import near_one
+from nerfies_jax.radiance import compositing
 
 Scalar = Float[Array, ""]
 # Mean deviation of the depths of a batch, as a share of their median, below which they
@@ -112,6 +113,16 @@ def entropy(share_logit: Float[Array, "rays samples"]) -> Scalar:
     # log_sigmoid: log(v + 1e-8) has no slope left where v is small.
     share = jax.nn.sigmoid(share_logit)
     return -jnp.mean(share * jax.nn.log_sigmoid(share_logit))
+
+
+def dynamic_weights(
+    distance: Float[Array, "rays samples"], density: Float[Array, "rays samples"]
+) -> Float[Array, "rays samples"]:
+    """Of the medium alone, unblended; the last sample stands for all behind it."""
+    spacing = jax.vmap(
+        lambda distance: compositing.intervals(distance, compositing.AT_INFINITY)
+    )(distance)
+    return jax.vmap(compositing.weights)(density * spacing)
 
 
 def settle(

@@ -148,8 +148,8 @@ def encode(
 ) -> Float[Array, " features"]:
     """What the trunk reads of a point in units of the field.
 
-    `step` says how far the bands or levels are open; None opens all. `time` is there
-    where `spec.reads_time`, in [0, 1].
+    `step` says how far the bands or levels are open; None opens all. `time`, in
+    [0, 1], counts where `spec.reads_time`; there ValueError without it.
     """
     position, grid = spec.position, GRIDS.get(type(spec.position))
     parts = position.bands if grid is None else position.levels
@@ -161,7 +161,7 @@ def encode(
     if grid is not planes:
         return grid.encode(position, params.tables, point, window)
     place = (grids.contract(point) + 2) / 4
-    if time is not None:
+    if spec.reads_time and time is not None:
         place = jnp.concatenate([place, time[None]])
     found = planes.encode(position, params.tables, place)
     if window is not None:

@@ -95,8 +95,9 @@ NAMES = tuple(field.name for field in dataclasses.fields(FlowWeights))
 def test_a_flow_with_a_trunk_of_its_own_reads_nothing_of_the_medium_s(dtype):
     own = dataclasses.replace(TINY, flow_trunk=True)
     key, at = jax.random.key(0), jnp.asarray([0.1, -0.2, 0.3], dtype)
+    start = jax.jit(scene_flow.init, static_argnums=(0, 2, 3))
     shared, apart = (
-        scene_flow.init(spec, key, FEATURES, jnp.dtype(dtype)) for spec in (TINY, own)
+        start(spec, key, FEATURES, jnp.dtype(dtype)) for spec in (TINY, own)
     )
 
     def said(spec, params):
