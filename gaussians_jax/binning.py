@@ -190,12 +190,27 @@ def _expand(cursor, count, capacity):
     begin, filled, following = _span(cursor, count, capacity)
     index = jnp.arange(count.shape[0], dtype=jnp.int32)
     marks = jnp.zeros(capacity + 1, jnp.int32).at[begin].max(index + 1)
-    # `lax.cummax` takes four times as long on the CPU.
-    rank = lax.associative_scan(jnp.maximum, marks[:capacity]) - 1
+    rank = _running_max(marks[:capacity]) - 1
     slot = jnp.arange(capacity, dtype=jnp.int32)
     within = slot - begin[jnp.maximum(rank, 0)]
     within += jnp.where(rank == cursor.rank, cursor.skip, 0)
     return jnp.where(slot < filled, rank, -1), within, following
+
+
+def _running_max(marks):
+    """The largest of `marks`, none of them negative, up to each.
+
+    65,536 of them in 0.26 ms on the CPU, in 0.18 by `lax.associative_scan`: that takes
+    0.6 s to compile for 0.2, twice in each step. `lax.cummax` of all: four times as
+    long.
+    """
+    size = marks.shape[0]
+    block = jnp.pad(marks, (0, -size % 16)).reshape(-1, 16)
+    before = lax.cummax(jnp.max(block, axis=1))
+    block = block.at[1:, 0].max(before[:-1])
+    for step in (1, 2, 4, 8):
+        block = jnp.maximum(block, jnp.pad(block[:, :-step], ((0, 0), (step, 0))))
+    return block.reshape(-1)[:size]
 
 
 def _ellipse_meets_tile(rows, row, column, log_cut, grid):

@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from gaussians_jax import rendering, scene, splats, update
+from gaussians_jax import projection, rendering, scene, splats, update
 from gaussians_jax.effects import deformation
 from gaussians_jax.spec import OPTIMISERS, raster_of
 from gaussians_jax.update import Drawn
@@ -58,8 +58,7 @@ def _drawing(spec, metadata, effects, state, frames, condition):
             mean2d_offset=probe,
             depth=scene.draws_depth(effects, frames),
         )
-        drawn = jax.tree.leaves(frame.rendering)
-        return sum(jnp.sum(leaf) for leaf in drawn), frame.footprints
+        return sum(jnp.sum(leaf) for leaf in jax.tree.leaves(frame.rendering))
 
     def compare(colour):
         return losses.photometric(
@@ -72,10 +71,12 @@ def _drawing(spec, metadata, effects, state, frames, condition):
     coefficients = splats.active_harmonics(rows, spec.sh_degree)
     args = gaussians, coefficients, jnp.zeros_like(gaussians.mean[:, :2])
     timed = {
-        "project and blend": part_ms(jax.grad(draw, (0, 1, 2), has_aux=True), *args),
+        "project and blend": part_ms(jax.grad(draw, (0, 1, 2)), *args),
         "loss": part_ms(jax.grad(compare), observation.truth),
     }
-    return timed, jax.jit(draw)(*args)[1]
+    project = jax.jit(projection.project, static_argnums=(2, 3))
+    raster = raster_of(spec, metadata)
+    return timed, project(gaussians, camera, _size(frames), raster)
 
 
 def _own_of_effects(effects, state, frames, condition):

@@ -197,24 +197,28 @@ class Job:
 
         What a step costs is seen on the arm's run over --steps where there is one, or
         on a short pilot. It depends on the number of steps, as Gaussians grow: where
-        the first try misses the time by too much, there is a second one.
+        the first try misses the time by too much, there is a second one; what takes too
+        long is not trained to its end for that.
         """
         other = None
         if self.budgets[0] is not budget:
             other = self.kept(name, 0, self.budgets[0])
         pilot = other or self._train(name, 0, PILOT_STEPS)
         steps = affordable(pilot, budget)
-        kept = self._train(name, 0, steps)
-        took = kept.numbers[budget.measure]
-        missed = abs(took / budget.seconds - 1) > NEAR_ENOUGH
-        if missed and kept.notes["stopped_by"] == "steps":
-            log(f"    {steps} steps took {took:.1f} s: once more, with a better guess")
+        kept = self._train(name, 0, steps, (1 + NEAR_ENOUGH) * budget.seconds)
+        done, took = kept.notes["steps"], kept.numbers[budget.measure]
+        missed = done < steps or abs(took / budget.seconds - 1) > NEAR_ENOUGH
+        if missed and kept.notes["stopped_by"] in ("steps", "seconds"):
+            log(f"    {done} steps took {took:.1f} s: once more, with a better guess")
             steps = affordable(kept, budget, pilot)
             kept = self._train(name, 0, steps)
         return steps, kept
 
-    def _train(self, name, seed, steps) -> ArmResult:
-        """Train one arm from the start, and measure where it ends."""
+    def _train(self, name, seed, steps, at_most=None) -> ArmResult:
+        """Train one arm from the start, and measure where it ends.
+
+        `at_most` so many seconds by the clock on the wall.
+        """
         compiled_before = (name, steps) in self._built
         arm = self._build(name, steps)
         told = self.suite.arms[name].told
@@ -222,7 +226,7 @@ class Job:
         state = arm.model.init(capture, jax.random.key(seed))
         frames = evaluation.frames_of(self.capture, arm.model.required_data)
         began, self._cache_saved = time.process_time(), 0.0
-        result = loop.fit(arm.model, state, frames, steps=steps)
+        result = loop.fit(arm.model, state, frames, steps=steps, seconds=at_most)
         cpu_seconds = result.training_share * (time.process_time() - began)
         compile_seconds = result.compile_seconds + self._cache_saved
         if result.stopped_by.startswith("SIG"):

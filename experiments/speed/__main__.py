@@ -57,6 +57,7 @@ def main(args):
         args.out.mkdir(parents=True, exist_ok=True)
     path = args.out / STORED
     small = tuple(n for n in representations.PRESETS if n.endswith("-small"))
+    _apart(job.prepare)
     for preset in args.presets or small:
         for cores in ("one", "all"):
             record = _apart(job.measure, preset, cores == "all")

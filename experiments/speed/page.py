@@ -53,17 +53,13 @@ def _presets(presets):
 
 
 def _parts(presets):
-    names = list(
-        dict.fromkeys(part for r in presets.values() for part in r["one"]["parts"])
-    )
-    rows = [
-        [
-            f"`{name}`",
-            *(markdown.number(record["one"]["parts"].get(part), 1) for part in names),
-        ]
-        for name, record in presets.items()
-    ]
-    return markdown.table(("preset", *names), rows)
+    """A row for each preset: names differ from one to the next."""
+    rows = []
+    for name, record in presets.items():
+        parts = sorted(record["one"]["parts"].items(), key=lambda part: -part[1])
+        text = [f"{part} {markdown.number(ms, 1)}" for part, ms in parts]
+        rows.append([f"`{name}`", ", ".join(text)])
+    return markdown.table(("preset", "ms"), rows, words=2)
 
 
 def _job(job):

@@ -73,8 +73,14 @@ def replicate(tree: PyTree, devices: int) -> PyTree:
 
 
 def first_copy(tree: PyTree, devices: int) -> PyTree:
-    """What `replicate` gave, on the first device alone."""
-    return tree if devices == 1 else jax.device_put(tree, jax.local_devices()[0])
+    """What `replicate` gave, on the first device alone.
+
+    Its part there, not a copy: that would keep the mesh in its type, and everything
+    compiled for the state before, events and pictures, would be compiled again.
+    """
+    if devices == 1:
+        return tree
+    return jax.tree.map(lambda leaf: leaf.addressable_data(0), tree)
 
 
 def _mesh(devices):

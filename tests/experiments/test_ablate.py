@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import types
 
 import jax
@@ -86,7 +87,8 @@ def kept(steps, seconds, stopped_by="steps"):
     [
         ("wall", lambda steps: 0.1 * steps, [150, 600]),  # 60 s
         ("processor", lambda steps: 0.1 * steps, [150, 600]),
-        ("wall", lambda steps: 0.1 * steps + 0.0005 * steps**2, [150, 343, 257]),
+        # At 277 steps the first try has taken a tenth more than the time, and is left.
+        ("wall", lambda steps: 0.1 * steps + 0.0005 * steps**2, [150, 343, 260]),
     ],
 )
 def test_the_steps_are_what_the_time_allows(tiny, clock, cost, runs, monkeypatch):
@@ -95,10 +97,11 @@ def test_the_steps_are_what_the_time_allows(tiny, clock, cost, runs, monkeypatch
     job = Job(settled)
     trained = []
 
-    def train(name, seed, steps):
+    def train(name, seed, steps, at_most=math.inf):
         trained.append(steps)
-        result = kept(steps, 3 * cost(steps))  # of the other clock
-        result.numbers[job.budgets[0].measure] = cost(steps)
+        done = next((n for n in range(steps) if cost(n) > at_most), steps)
+        result = kept(done, 3 * cost(done), "steps" if done == steps else "seconds")
+        result.numbers[job.budgets[0].measure] = cost(done)  # `kept` has both clocks
         return result
 
     monkeypatch.setattr(job, "_train", train)
@@ -115,7 +118,7 @@ def test_over_steps_and_seconds_the_run_over_steps_is_the_pilot(tiny, monkeypatc
     job = Job(settled)
     trained = []
 
-    def train(name, seed, steps):
+    def train(name, seed, steps, at_most=None):
         trained.append((seed, steps))
         return kept(steps, 0.05 * steps)
 
