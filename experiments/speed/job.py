@@ -23,8 +23,8 @@ def measure(preset: str, all_cores: bool) -> dict[str, Any]:
     """Seconds and bytes of a preset on the built-in scene, from its first state.
 
     With `all_cores` the step has the cores that its preset wants, and nothing else is
-    measured; otherwise one. Motions start as the preset says: tracks bring two
-    Gaussians for each that there is without, and steps of twice the length.
+    measured; otherwise one. Motions start as the preset says: tracks bring Gaussians of
+    their own, and longer steps.
     """
     wanted = representations.cores(preset)
     platform.start_jax("cpu", *(wanted if all_cores else ("one",)))
