@@ -15,9 +15,9 @@ from gaussians_jax.effects import deformation
 from gaussians_jax.growth import AuxState, states_of
 from gaussians_jax.spec import SplatScene, carried_count, refuse_what_cannot_train
 from gaussians_jax.splats import Params
+from nerfies_jax import data_parallel
 from nerfies_jax.capture.capture import Capture, PointCloud, training_bytes
 from nerfies_jax.evidence import hidden_points, record, usable_paths, view_set
-from nerfies_jax.training import data_parallel
 from nerfies_jax.training.effects import Effect, stream
 from nerfies_jax.training.model import TrainState, in_default_precision
 

@@ -7,7 +7,7 @@ backward pass that recomputes every alpha (`blending`).
 On the CPU let each device see one core (environment variable PJRT_NPROC=1, set before
 JAX starts): XLA splits every small operation of the loops over all cores it sees, which
 costs twice the CPU time and 1.0 to 1.9 times the wall time. To use several cores, draw
-several views at once, each on a CPU device (`nerfies_jax.training.data_parallel`).
+several views at once, each on a CPU device (`nerfies_jax.data_parallel`).
 """
 
 import functools

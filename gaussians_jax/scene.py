@@ -30,9 +30,10 @@ from gaussians_jax.spec import (
 )
 from gaussians_jax.splats import Params, Splats
 from gaussians_jax.update import Drawn
+from nerfies_jax import data_parallel
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.scene_metadata import exposures
-from nerfies_jax.training import data_parallel, loop, losses
+from nerfies_jax.training import loop, losses
 from nerfies_jax.training.effects import (
     FIELD_SEAMS,
     Effect,

@@ -1,5 +1,7 @@
 """Where the time of a training step of Gaussians goes."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 
@@ -7,7 +9,7 @@ from gaussians_jax import projection, rendering, scene, splats, update
 from gaussians_jax.effects import deformation
 from gaussians_jax.spec import OPTIMISERS, raster_of
 from gaussians_jax.update import Drawn
-from nerfies_jax.measure.part_time import part_ms
+from nerfies_jax.measure.part_time import part, parts_ms
 from nerfies_jax.training import losses, rate
 from nerfies_jax.training.effects import (
     Effect,
@@ -26,27 +28,40 @@ def parts(
     state: TrainState,
     frames: Frames,
     effects: tuple[Effect, ...] = (),
-) -> dict[str, float]:
-    """Milliseconds of each part of one step, forward and backward; medians, warm.
+) -> Callable[[], dict[str, float]]:
+    """Begin to compile the parts of one step, forward and backward.
 
-    Each part is timed by itself on the first frame and one device, and counted for as
-    many views as a device draws in a step; "rest" is what they leave of the whole step.
+    The call times them, once all are there: milliseconds, medians, warm. Each part is
+    timed by itself on the first frame and one device, and counted for as many views as
+    a device draws in a step; "rest" is what they leave of the whole step.
     """
     effects = scene.all_effects(spec, metadata, effects)
     condition = FrameCondition(frames.times[0], step=state.step, key=state.key)
-    drawing, footprints = _drawing(spec, metadata, effects, state, frames, condition)
-    a_view = drawing | _own_of_effects(effects, state, frames, condition)
+
+    @jax.jit
+    def drawn(params):
+        still = splats.activate(params.rows["splats"])
+        return deformation.drawn(effects, params, still, condition)
+
+    now = drawn(state.params)
+    a_view = _drawing(spec, metadata, effects, now, frames)
+    a_view |= _own_of_effects(effects, state, frames, condition)
+    once = _update(spec, metadata, effects, state, now, frames, condition)
     views = spec.batch_size // model.devices
-    timed = {name: views * each for name, each in a_view.items()}
-    timed |= _update(spec, metadata, effects, state, footprints, condition, frames)
-    whole = rate.step_ms(model, state, frames, spec.steps)
-    return timed | {"rest": max(whole - sum(timed.values()), 0.0)}
+
+    def time_parts():
+        timed = parts_ms(a_view | once)
+        timed |= {name: views * timed[name] for name in a_view}
+        whole = rate.step_ms(model, state, frames, spec.steps)
+        return timed | {"rest": max(whole - sum(timed.values()), 0.0)}
+
+    return time_parts
 
 
-def _drawing(spec, metadata, effects, state, frames, condition):
-    """What the picture and its loss take, and the footprints that are drawn."""
-    camera = jax.tree.map(lambda leaf: leaf[0], frames.cameras)
+def _drawing(spec, metadata, effects, now, frames):
+    """The picture of the rows and Gaussians of the moment, and its loss."""
     observation = scene.observe(frames, 0, None)
+    camera = _first_camera(frames)
 
     def draw(gaussians, coefficients, probe):
         frame = rendering.render_harmonics(
@@ -65,23 +80,18 @@ def _drawing(spec, metadata, effects, state, frames, condition):
             colour, observation.truth, observation.valid, dssim_weight=spec.dssim_weight
         )
 
-    params = state.params
-    still = splats.activate(params.rows["splats"])
-    rows, gaussians = deformation.drawn(effects, params, still, condition)
+    rows, gaussians = now
     coefficients = splats.active_harmonics(rows, spec.sh_degree)
     args = gaussians, coefficients, jnp.zeros_like(gaussians.mean[:, :2])
-    timed = {
-        "project and blend": part_ms(jax.grad(draw, (0, 1, 2)), *args),
-        "loss": part_ms(jax.grad(compare), observation.truth),
+    return {
+        "project and blend": part(jax.grad(draw, (0, 1, 2)), *args),
+        "loss": part(jax.grad(compare), observation.truth),
     }
-    project = jax.jit(projection.project, static_argnums=(2, 3))
-    raster = raster_of(spec, metadata)
-    return timed, project(gaussians, camera, _size(frames), raster)
 
 
 def _own_of_effects(effects, state, frames, condition):
-    """What each effect that deforms or penalises takes."""
-    observation, timed = scene.observe(frames, 0, None), {}
+    """Each effect that deforms or penalises."""
+    observation, parts = scene.observe(frames, 0, None), {}
     drawn = Rendering(
         observation.truth, *(jnp.ones(observation.truth.shape[:2]) for _ in "ad")
     )
@@ -95,11 +105,11 @@ def _own_of_effects(effects, state, frames, condition):
             kept = state.aux_state.effects.get(effect.name)
             grads = jax.grad(one, (0, 1))
             name = effect.name.replace("_", " ")
-            timed[name] = part_ms(grads, state.params, drawn, kept, condition)
-    return timed
+            parts[name] = part(grads, state.params, drawn, kept, condition)
+    return parts
 
 
-def _update(spec, metadata, effects, state, footprints, condition, frames):
+def _update(spec, metadata, effects, state, now, frames, condition):
     """What follows the gradient, with parameters for gradients of their shape."""
     optimiser = OPTIMISERS[spec.optimiser]()
 
@@ -110,14 +120,27 @@ def _update(spec, metadata, effects, state, footprints, condition, frames):
         drawn = Drawn(*drawn)
         return update.gather(spec, effects, aux_state, drawn, condition, _size(frames))
 
-    timed = {"optimiser": part_ms(descend, state, state.params)}
+    parts = {"optimiser": part(descend, state, state.params)}
     if update.has_statistics(spec, effects):
-        gaussians = splats.activate(state.params.rows["splats"])
-        slope = deformation.probe(effects, state.params)
-        timed["statistics"] = part_ms(
-            gather, state.aux_state, slope, footprints, gaussians, gaussians
+        footprints = jax.eval_shape(
+            lambda *seen: projection.project(
+                *seen, _size(frames), raster_of(spec, metadata)
+            ),
+            now[1],
+            _first_camera(frames),
         )
-    return timed
+        # What they take is the same for any values.
+        footprints = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), footprints)
+        still = splats.activate(state.params.rows["splats"])
+        slope = deformation.probe(effects, state.params)
+        parts["statistics"] = part(
+            gather, state.aux_state, slope, footprints, still, still
+        )
+    return parts
+
+
+def _first_camera(frames):
+    return jax.tree.map(lambda leaf: leaf[0], frames.cameras)
 
 
 def _size(frames):

@@ -10,7 +10,13 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Key
 
-from nerfies_jax import field_ray, occupied_rays, path_fit, scene_metadata
+from nerfies_jax import (
+    data_parallel,
+    field_ray,
+    occupied_rays,
+    path_fit,
+    scene_metadata,
+)
 from nerfies_jax.capture.capture import Capture, training_bytes
 from nerfies_jax.effects import scene_flow, transient
 from nerfies_jax.effects.effect import Batch, Box, RayOutput
@@ -21,7 +27,7 @@ from nerfies_jax.nets import codes
 from nerfies_jax.radiance.occupancy import Cells
 from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.spec import RadianceScene
-from nerfies_jax.training import data_parallel, loop, losses, schedules
+from nerfies_jax.training import loop, losses, schedules
 from nerfies_jax.training.effects import (
     Effect,
     FrameCondition,

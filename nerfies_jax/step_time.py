@@ -1,9 +1,11 @@
 """Where the time of a training step of a radiance field goes."""
 
+from collections.abc import Callable
+
 import jax
 
 from nerfies_jax import scene
-from nerfies_jax.measure.part_time import part_ms
+from nerfies_jax.measure.part_time import part, parts_ms
 from nerfies_jax.training import loop, rate
 from nerfies_jax.training.effects import Effect, weighted_sum
 from nerfies_jax.training.model import Frames, Model, TrainState
@@ -16,10 +18,11 @@ def parts(
     state: TrainState,
     frames: Frames,
     effects: tuple[Effect, ...] = (),
-) -> dict[str, float]:
-    """Milliseconds of each part of one step of a radiance field; medians, warm.
+) -> Callable[[], dict[str, float]]:
+    """Begin to compile the parts of one step of a radiance field.
 
-    "rest" is what the parts, each timed by itself, leave of the whole step.
+    The call times them, once all are there: milliseconds, medians, warm. "rest" is what
+    the parts, each timed by itself, leave of the whole step.
     """
     field = scene.field(spec, metadata, effects=effects)
     batch_key, loss_key = jax.random.split(loop.step_key(state))
@@ -40,13 +43,17 @@ def parts(
         )
         return weighted_sum(terms)
 
-    forward = part_ms(loss, state.params, frames, batch)
-    both = part_ms(jax.value_and_grad(loss), state.params, frames, batch)
-    timed = {
-        "rays": part_ms(draw, frames, batch_key),
-        "forward": forward,
-        "backward": max(both - forward, 0.0),
-        "optimiser": part_ms(descend, state, state.params),
+    programs = {
+        "rays": part(draw, frames, batch_key),
+        "forward": part(loss, state.params, frames, batch),
+        "both": part(jax.value_and_grad(loss), state.params, frames, batch),
+        "optimiser": part(descend, state, state.params),
     }
-    whole = rate.step_ms(model, state, frames, spec.steps)
-    return timed | {"rest": max(whole - sum(timed.values()), 0.0)}
+
+    def time_parts():
+        timed = parts_ms(programs)
+        timed["backward"] = max(timed.pop("both") - timed["forward"], 0.0)
+        whole = rate.step_ms(model, state, frames, spec.steps)
+        return timed | {"rest": max(whole - sum(timed.values()), 0.0)}
+
+    return time_parts

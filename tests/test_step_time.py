@@ -14,13 +14,10 @@ from tests import scenes
 
 def clock(monkeypatch, module, *times, whole):
     """Each part takes the next of the times, and can be traced as it is called."""
-    left = iter(times)
-
-    def part_ms(function, *args):
-        jax.eval_shape(function, *args)
-        return next(left)
-
-    monkeypatch.setattr(module, "part_ms", part_ms)
+    monkeypatch.setattr(module, "part", jax.eval_shape)
+    monkeypatch.setattr(
+        module, "parts_ms", lambda parts: dict(zip(parts, times, strict=True))
+    )
     monkeypatch.setattr(rate, "step_ms", lambda *run: whole)
 
 
@@ -30,14 +27,14 @@ def clock(monkeypatch, module, *times, whole):
 def test_what_parts_of_a_field_leave_of_a_step_is_never_negative(
     whole, rest, monkeypatch
 ):
-    clock(monkeypatch, nerfies_jax.step_time, 2.0, 5.0, 0.5, 0.25, whole=whole)
+    clock(monkeypatch, nerfies_jax.step_time, 0.5, 2.0, 5.0, 0.25, whole=whole)
     metadata, params, _ = scenes.tiny_field()
     model = field_scene.build(scenes.TINY_FIELD, metadata)
     state = model.example(None, jax.random.key(0))._replace(params=params)
     frames = evaluation.frames_of(scenes.tiny_capture())
     parts = nerfies_jax.step_time.parts(
         scenes.TINY_FIELD, metadata, model, state, frames
-    )
+    )()
     assert parts == {
         "rays": 0.5,
         "forward": 2.0,
@@ -55,7 +52,7 @@ def test_every_part_of_a_step_of_splats_is_measured(monkeypatch):
     state = model.init(capture, jax.random.key(0))
     parts = gaussians_jax.step_time.parts(
         spec, metadata, model, state, evaluation.frames_of(capture)
-    )
+    )()
     assert parts == {
         "project and blend": 2.0,
         "loss": 1.0,

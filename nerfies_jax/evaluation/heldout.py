@@ -232,6 +232,11 @@ def _lpips(params, network, colour, truth, valid):
     return perceptual.masked_lpips(params, network, picture, truth, valid)
 
 
+# One program each: by themselves their operations take longer to compile.
+_depth_errors = jax.jit(geometry_quality.depth_errors)
+_flow_errors = jax.jit(geometry_quality.flow_errors)
+
+
 def _depths(scored, capture):
     """Over the known pixels of all frames together."""
     truth = jnp.asarray(capture.depths[scored.rows])
@@ -243,7 +248,7 @@ def _depths(scored, capture):
     for name, mask in masks.items():
         compared = np.asarray(geometry_quality.known_depth(depth, truth, mask))
         error = np.abs(np.asarray(depth - truth))[compared]
-        errors = geometry_quality.depth_errors(depth, truth, mask)
+        errors = _depth_errors(depth, truth, mask)
         numbers[f"heldout.{name}depth_median"] = _mean(error, np.median)
         numbers[f"heldout.{name}depth_rmse"] = errors.rmse
         if mask is None:
@@ -259,7 +264,7 @@ def _flow(flow):
     def errors(mask=None):
         mask = None if mask is None else jnp.asarray(mask)
         predicted, truth = jnp.asarray(flow.predicted), jnp.asarray(flow.truth)
-        return geometry_quality.flow_errors(predicted, truth, mask)
+        return _flow_errors(predicted, truth, mask)
 
     numbers = {
         "flow.epe": errors(answered).endpoint,

@@ -6,6 +6,7 @@ Everything is in scene units. `heldout.heldout_metrics` measures all.
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -139,12 +140,14 @@ def _scored(known):
 
 
 def _endpoints(path, known):
-    return geometry_quality.track_errors(
-        jnp.asarray(path),
-        jnp.asarray(known.path),
-        jnp.asarray(_scored(known)),
-        CORRECT_WITHIN,
+    return _track_errors(
+        jnp.asarray(path), jnp.asarray(known.path), jnp.asarray(_scored(known))
     )
+
+
+@jax.jit  # by themselves its operations take longer to compile
+def _track_errors(path, truth, seen):
+    return geometry_quality.track_errors(path, truth, seen, CORRECT_WITHIN)
 
 
 # (spec, metadata, state, capture, known) -> None where nothing is warped

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -37,17 +37,22 @@ class Renderer:
 
     def __call__(self, state: TrainState, view: View | tuple) -> Rendering:
         """One picture, of a view or of the tuple that a variant draws in its place."""
-        inputs = state.params, view, state.step
-        shapes = tuple(jax.typeof(leaf) for leaf in jax.tree.leaves(inputs))
-        if shapes not in self._programs:
-            self._programs[shapes] = _compiled(self._model, self.size, inputs)
+        programs, inputs = self.compiled(state, view), _inputs(state, view)
         start, cpu_start = time.perf_counter(), time.process_time()
-        rendering, anew = self._draw(self._programs[shapes], *inputs)
+        rendering, anew = self._draw(programs, *inputs)
         rendering = jax.device_get(rendering)
         self.seconds.append(time.perf_counter() - start)
         self.cpu_seconds.append(time.process_time() - cpu_start)
         self.deformed_anew.append(anew)
         return rendering
+
+    def compiled(self, state: TrainState, view: View | tuple) -> Any:
+        """The programs for such a state and view, compiled where they were not yet."""
+        inputs = _inputs(state, view)
+        shapes = tuple(jax.typeof(leaf) for leaf in jax.tree.leaves(inputs))
+        if shapes not in self._programs:
+            self._programs[shapes] = _compiled(self._model, self.size, inputs)
+        return self._programs[shapes]
 
     def _draw(self, programs, params, view, step):
         """The picture, and whether what is in it had to be deformed for it."""
@@ -119,6 +124,10 @@ class _Programs(NamedTuple):
 def _float32(rendering):
     """A picture needs no more, whatever precision it was computed in."""
     return jax.tree.map(lambda leaf: leaf.astype(jnp.float32), rendering)
+
+
+def _inputs(state, view):
+    return state.params, view, state.step
 
 
 def _compiled(model, size, inputs):

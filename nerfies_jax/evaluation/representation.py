@@ -84,8 +84,9 @@ class Representation(NamedTuple):
     build: Callable[..., Model]  # (spec, metadata, effects=()) -> model
     estimate_memory_bytes: Callable[[Spec, Capture], int]  # of the first state and step
     memory_hint: str  # which settings make the first state smaller
-    # (spec, metadata, model, state, frames, effects=()) -> ms of each part of a step
-    time_parts: Callable[..., dict[str, float]]
+    # (spec, metadata, model, state, frames, effects=()): begins to compile the parts of
+    # a step -> a call that times them, in ms
+    step_parts: Callable[..., Callable[[], dict[str, float]]]
     # (spec, metadata, names left out, whether appearances are blended, effects=()) ->
     # model; it draws a `nerfies_jax.variants.Between` instead of a view where they are.
     variant: Callable[..., Model]

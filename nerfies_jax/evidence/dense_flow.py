@@ -6,7 +6,9 @@ for each other. Where an area is lost even so, or jumps, it is looked for where 
 motion would take it.
 """
 
+import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import cv2
@@ -125,12 +127,18 @@ def between_neighbours(
     """
     (width, height), frames = views.size, len(views.row)
     times = pictures.shape[2] // width
-    search = dis(times)
+    searches = threading.local()  # one for each thread: it works in its own memory
 
-    def flow(one, other):
+    def search(*pair_and_guess):
+        if not hasattr(searches, "own"):
+            searches.own = dis(times)
+        return searches.own(*pair_and_guess)
+
+    def flow(step):
+        one, other = step
         pair = pictures[one], pictures[other]
         unguided = reduced(search(*pair), times)
-        if span is None or not wide_steps.is_wide(views, (one, other), unguided):
+        if span is None or not wide_steps.is_wide(views, step, unguided):
             return unguided
         if not has_time(FOR_WIDE_STEPS, "a second look at wide steps"):
             return unguided
@@ -138,16 +146,19 @@ def between_neighbours(
         return wide_steps.improved(
             views,
             small,
-            (one, other),
+            step,
             unguided,
             lambda guess: reduced(search(*pair, enlarged_flow(guess, times)), times),
             span,
         )
 
     forward, backward = np.zeros((2, frames, height, width, 2), np.float32)
-    for frame in range(frames - 1):
-        forward[frame] = flow(frame, frame + 1)
-        backward[frame + 1] = flow(frame + 1, frame)
+    ahead = [(frame, frame + 1) for frame in range(frames - 1)]
+    steps = ahead + [(after, before) for before, after in ahead]
+    # 118 flows of 176x132: 8.5 s on one core; 4.9 on two, 6.1 by OpenCV's own threads.
+    with ThreadPoolExecutor(cv2.getNumThreads()) as threads:
+        for (one, other), shift in zip(steps, threads.map(flow, steps), strict=True):
+            (forward if other > one else backward)[one] = shift
     checked_flow = checked(forward, backward)
     for frame in range(1, frames - 1):
         if _lost(checked_flow, frame) or _jumps(checked_flow, frame):

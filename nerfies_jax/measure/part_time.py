@@ -1,25 +1,41 @@
 """What one part of a training step takes."""
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, wait
+from typing import Any, NamedTuple
 
 import jax
 
 from nerfies_jax.measure import clock
+from nerfies_jax.training import background
 
 REPEATS = 7
 PART_SECONDS = 5.0  # for the repeats of one part: a step of a large field takes longer
 
 
-def part_ms(function: Callable[..., Any], *args: Any) -> float:
-    """Median milliseconds of a jitted call, warm.
+class Part(NamedTuple):
+    """One part of a step, ready to be timed."""
 
-    Its arrays are inputs, not constants to compile in.
-    """
-    compiled = jax.jit(function).lower(*args).compile()
+    compiled: Future[jax.stages.Compiled]
+    args: tuple[Any, ...]
+
+
+def part(function: Callable[..., Any], *args: Any) -> Part:
+    """A call, compiled in the background; its arrays are inputs, not constants."""
+    return Part(background.begun(jax.jit(function).lower(*args).compile), args)
+
+
+def parts_ms(parts: Mapping[str, Part]) -> dict[str, float]:
+    """Median milliseconds of each call, warm, once all of them are compiled."""
+    wait(one.compiled for one in parts.values())
+    return {name: _median_ms(one) for name, one in parts.items()}
+
+
+def _median_ms(one):
+    compiled = one.compiled.result()
 
     def call():
-        return compiled(*args)
+        return compiled(*one.args)
 
     first = clock.measure(call, repeats=1, warm_up=0).median
     repeats = min(REPEATS, int(PART_SECONDS / first))

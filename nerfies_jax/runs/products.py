@@ -54,6 +54,10 @@ def make(
             "finite"
         )
     ms_per_frame = renderer.ms_per_frame(len(scored.rows))
+    frames = evaluation.frames_of(run.capture, run.model.required_data)
+    time_parts = run.representation.step_parts(
+        run.spec, run.metadata, run.model, state, frames, effects=run.effects
+    )  # compiles while all else is written
     comparison = save_comparison(folder / "comparison.png", run.filmed, scored)
     figures = [report.Figure(comparison, COMPARED)]
     watched = [run.capture.ids[row] for row in trained.watched]
@@ -71,7 +75,6 @@ def make(
     saved = run.representation.save(
         folder, run.spec, run.metadata, state, effects=run.effects
     )
-    frames = evaluation.frames_of(run.capture, run.model.required_data)
     fitted, gain = score_halves(run, state, scored, ms_per_frame / 1e3)
     numbers, remarks = quality.measure(
         run, state, trained.draw, scored, extra, ms_per_frame / 1e3
@@ -91,9 +94,7 @@ def make(
         json.loads((folder / CONFIG).read_text()),
         [*player, *figures],
         film,
-        run.representation.time_parts(
-            run.spec, run.metadata, run.model, state, frames, effects=run.effects
-        ),
+        time_parts(),
         notes,
         following,
     )

@@ -11,7 +11,7 @@ from nerfies_jax.evaluation import Renderer
 from nerfies_jax.evaluation.scores import Draw
 from nerfies_jax.runs import budget, run_folder
 from nerfies_jax.runs.run import Run, drawer
-from nerfies_jax.training import loop
+from nerfies_jax.training import chunk, loop
 from nerfies_jax.training.checkpoint import Checkpoints
 from nerfies_jax.training.loop import FitResult, History, Hook
 
@@ -66,10 +66,13 @@ def train(
     renderer = Renderer(run.model, run.capture.size)
     draw = drawer(run, renderer)
     few, evaluate_every = run.capture.heldout, pace.evaluate_every
-    if len(few):
-        renderer(
-            state, evaluation.view_of(run.capture, int(few[0]))
-        )  # how long it takes
+    frames = evaluation.frames_of(run.capture, run.model.required_data)
+    history = History() if record is None else History(**record)
+    first = evaluation.view_of(run.capture, int(few[0])) if len(few) else None
+    spent = history.compile_seconds + _compiled(run, state, frames, renderer, first)
+    history = history._replace(compile_seconds=spent)
+    if first is not None:
+        renderer(state, first)  # how long it takes
         share = budget.evaluations(renderer.seconds[-1], evaluate_every, EVALUATED)
         few = evaluation.spread(run.capture.heldout, share.frames)
         evaluate_every = share.every_seconds
@@ -85,12 +88,22 @@ def train(
     result = loop.fit(
         run.model,
         state,
-        evaluation.frames_of(run.capture, run.model.required_data),
+        frames,
         steps=run.spec.steps,
         hooks=hooks,
         seconds=pace.seconds,
         checkpoints=checkpoints,
         checkpoint_seconds=pace.checkpoint_every,
-        history=History() if record is None else History(**record),
+        history=history,
     )
     return Trained(result, renderer, draw, few)
+
+
+def _compiled(run, state, frames, renderer, view) -> float:
+    """Seconds of making the scan of a run; the renderer is compiled meanwhile."""
+    scan = None
+    if run.spec.steps - int(state.step) >= chunk.LENGTH:
+        scan = chunk.compiling(run.model, state, frames, run.spec.steps)
+    if view is not None:
+        renderer.compiled(state, view)
+    return 0.0 if scan is None else scan.result()

@@ -3,6 +3,7 @@
 import functools
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from typing import Any, NamedTuple
 
 import jax
@@ -10,8 +11,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from nerfies_jax.training import data_parallel
-from nerfies_jax.training.model import Frames, PyTree, TrainState
+from nerfies_jax import data_parallel
+from nerfies_jax.training import background
+from nerfies_jax.training.model import Frames, Model, PyTree, TrainState
 
 LENGTH = 10  # steps of a scan
 # Fewer steps than these in all, or more work in each (a tenth of a second on a core),
@@ -124,6 +126,7 @@ class Program:
             counted = self._lower(LENGTH).cost_analysis() or {}
             if counted.get("flops", 0.0) < LARGE_FLOPS:
                 self.length = LENGTH
+        self._lower(self.length)
 
     def _lower(self, length):
         if length not in self._lowered:
@@ -183,6 +186,32 @@ def program(
     began = time.perf_counter()
     programs[key] = Program(step, state, frames, steps, devices)
     return programs[key], time.perf_counter() - began
+
+
+def compiled(
+    model: Model, state: TrainState, frames: Frames, steps: int
+) -> tuple[Program, Frames, float]:
+    """The program of a run with its scan compiled, what it reads, and the seconds."""
+    made, frames, seconds = _lowered(model, state, frames, steps)
+    return made, frames, seconds + made.prepare(made.length)
+
+
+def compiling(
+    model: Model, state: TrainState, frames: Frames, steps: int
+) -> Future[float]:
+    """Have the scan of a run ready by the time `compiled` or `program` is called.
+
+    Compiles in the background; the result is the seconds that making it took.
+    """
+    made, _, seconds = _lowered(model, state, frames, steps)
+    return background.begun(lambda: seconds + made.prepare(made.length))
+
+
+def _lowered(model, state, frames, steps):
+    frames = jax.tree.map(jnp.asarray, frames)
+    frames = data_parallel.shared(frames, model.devices)
+    made, seconds = program(model.step, state, frames, steps, model.devices)
+    return made, frames, seconds
 
 
 @functools.lru_cache(maxsize=8)

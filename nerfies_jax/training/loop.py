@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import rich.console
 from jaxtyping import Array, Key
 
-from nerfies_jax.training import chunk, data_parallel
+from nerfies_jax import data_parallel
+from nerfies_jax.training import chunk
 from nerfies_jax.training.checkpoint import Checkpoints
 from nerfies_jax.training.guard import Snapshot, bad_arrays, last_good, listed
 from nerfies_jax.training.model import Event, Frames, Model, TrainState

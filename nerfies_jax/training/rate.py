@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nerfies_jax.training import chunk, data_parallel
+from nerfies_jax.training import chunk
 from nerfies_jax.training.model import Frames, Model, TrainState
 
 # Shares of a run at which its step is timed: before a warm-up is over, a motion may
@@ -31,7 +31,7 @@ def step_time(model: Model, state: TrainState, frames: Frames, steps: int) -> St
     `state` is left as it is. Of every phase of the run, the first step is not timed.
     Whatever grows later is not seen.
     """
-    program, frames, compile_seconds = _scan_of(model, state, frames, steps)
+    program, frames, compile_seconds = chunk.compiled(model, state, frames, steps)
     length = program.length
 
     def timed(start, count):
@@ -58,18 +58,10 @@ def step_ms(model: Model, state: TrainState, frames: Frames, steps: int) -> floa
 
     By the program of a run of `steps` steps: where that has trained, none is compiled.
     """
-    program, frames, _ = _scan_of(model, state, frames, steps)
+    program, frames, _ = chunk.compiled(model, state, frames, steps)
     left, seconds = jax.tree.map(jnp.copy, state), []
     while len(seconds) < REPEATS and sum(seconds) < REPEAT_SECONDS:
         began = time.perf_counter()
         left, _ = program(left, frames, program.length)  # waits
         seconds.append(time.perf_counter() - began)
     return 1e3 * float(np.median(seconds)) / program.length
-
-
-def _scan_of(model, state, frames, steps):
-    """The program of a run, its scan compiled; what it reads; seconds of making it."""
-    frames = jax.tree.map(jnp.asarray, frames)
-    frames = data_parallel.shared(frames, model.devices)
-    program, seconds = chunk.program(model.step, state, frames, steps, model.devices)
-    return program, frames, seconds + program.prepare(program.length)

@@ -6,6 +6,7 @@ import os
 import pathlib
 import shutil
 
+import jax
 import numpy as np
 import pytest
 from matplotlib import colormaps
@@ -67,7 +68,8 @@ PRODUCTS = (
 
 def test_a_capture_becomes_splats_and_a_report(tmp_path, monkeypatch, capsys):
     # The run below times the parts of a step, half of all there is to compile.
-    monkeypatch.setattr(step_time, "part_ms", lambda *_: 1.0)
+    monkeypatch.setattr(step_time, "part", jax.eval_shape)
+    monkeypatch.setattr(step_time, "parts_ms", lambda parts: dict.fromkeys(parts, 1.0))
     monkeypatch.setattr(quality, "CACHE", tmp_path / "cache")
     nerfies_format.write(scenes.tiny_capture(), tmp_path / "filmed")
     out = tmp_path / "run"

@@ -70,6 +70,15 @@ def test_one_program_serves_every_chunk_of_a_shape(frames):
     assert len(chunk._programs(model.step)) == 2
 
 
+def test_what_is_compiled_ahead_is_what_trains(frames):
+    models = [toy.model(change=lambda *run: toy.step(*run)) for _ in "ab"]
+    assert chunk.compiling(models[0], start(), frames, 7).result() > 0
+    ahead, plain = (fit(frames, model=model, steps=7) for model in models)
+    assert ahead.compile_seconds == 0
+    assert plain.compile_seconds > 0
+    assert toy.same(ahead.state, plain.state)
+
+
 def test_what_steps_have_learnt_can_be_differentiated(float64):
     """By the rate of a gradient descent whose fourth step is known in closed form."""
 

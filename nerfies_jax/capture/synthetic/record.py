@@ -4,10 +4,12 @@ import dataclasses
 import functools
 import hashlib
 import pathlib
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import numpy as np
 
+from nerfies_jax import data_parallel
 from nerfies_jax.capture import nerfies_format
 from nerfies_jax.capture.capture import Capture, CaptureError, PointCloud
 from nerfies_jax.capture.flow import FrameFlow
@@ -65,11 +67,13 @@ def write(spec: SceneSpec, path: AnyPath, seed: int = 0):
     """Film a scene into a Nerfies directory with `truth.npz` beside; all or nothing."""
     with new_folder(path) as folder:  # refuses a path in use before it films
         capture, answers = make(spec, seed)
-        nerfies_format.write(capture, folder / "capture")
-        for part in (folder / "capture").iterdir():
-            part.rename(folder / part.name)
-        (folder / "capture").rmdir()
-        truth.save(answers, folder / TRUTH_FILE)
+        with ThreadPoolExecutor(1) as beside:  # zlib needs no lock of Python
+            saved = beside.submit(truth.save, answers, folder / TRUTH_FILE)
+            nerfies_format.write(capture, folder / "capture")
+            for part in (folder / "capture").iterdir():
+                part.rename(folder / part.name)
+            (folder / "capture").rmdir()
+            saved.result()
 
 
 def cached(
@@ -98,24 +102,14 @@ def digest(spec: SceneSpec, seed: int = 0) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def _picture(spec, camera, time, light_gain, transient_shown):
-    return film.picture(spec, camera, time, light_gain, transient_shown)
-
-
 def _film(spec, plan):
+    picture = functools.partial(film.picture, spec)
+    rows = plan.cameras, plan.time, plan.light_gain, plan.transient_shown
     images, depths, hits = [], [], []
-    for row in range(len(plan.time)):
-        picture = _picture(
-            spec,
-            cameras.take(plan.cameras, row),
-            plan.time[row],
-            plan.light_gain[row],
-            plan.transient_shown[row],
-        )
-        images.append(np.round(np.asarray(picture.image) * 255).astype(np.uint8))
-        depths.append(np.asarray(picture.depth))
-        hits.append(jax.tree.map(np.asarray, picture.hit))
+    for taken in data_parallel.rows_on_devices(picture, rows):
+        images.append(np.round(taken.image * 255).astype(np.uint8))
+        depths.append(taken.depth)
+        hits.append(taken.hit)
     hits = jax.tree.map(lambda *leaves: np.stack(leaves), *hits)
     return np.stack(images), np.stack(depths), hits
 
@@ -161,8 +155,7 @@ def _flow(plan, answers):
 
 
 def _truth(spec, plan, hits, ids, seed):
-    forward = truth.flows(spec, plan, hits, 1)
-    backward = truth.flows(spec, plan, hits, -1)
+    forward, backward = truth.flows(spec, plan, hits)
     return SceneTruth(
         ids,
         hits.thing.astype(np.int8),

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from nerfies_jax import data_parallel
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.given import Given
 from nerfies_jax.capture.synthetic import trace
@@ -89,7 +90,6 @@ class Flow(NamedTuple):
     seen: Bool[Array, "height width"]
 
 
-@functools.partial(jax.jit, static_argnums=0)
 def flow(spec: SceneSpec, thing, material, camera, time, transient_shown) -> Flow:
     """Pixels of material points, as another frame sees them.
 
@@ -108,27 +108,29 @@ def flow(spec: SceneSpec, thing, material, camera, time, transient_shown) -> Flo
     return Flow(shift, seen & known)
 
 
-def flows(spec: SceneSpec, plan: Schedule, hits: trace.Hit, step: int) -> Flow:
-    """Flow of every frame to the next (step 1) or previous (-1) of the same camera."""
+def flows(spec: SceneSpec, plan: Schedule, hits: trace.Hit) -> tuple[Flow, Flow]:
+    """Flow of every frame to the next and to the previous one of the same camera."""
     count = len(plan.time)
     width, height = spec.size
-    shift = np.zeros((count, height, width, 2), np.float32)
-    seen = np.zeros((count, height, width), bool)
-    for row in range(count):
-        other = row + step
-        same = 0 <= other < count and plan.camera_id[other] == plan.camera_id[row]
-        if not same:
-            continue
-        result = flow(
-            spec,
-            hits.thing[row],
-            hits.material[row],
-            cameras.take(plan.cameras, other),
-            plan.time[other],
-            plan.transient_shown[other],
-        )
-        shift[row], seen[row] = result
-    return Flow(shift, seen)
+    row = np.tile(np.arange(count), 2)
+    other = row + np.repeat([1, -1], count)
+    known = (other >= 0) & (other < count)
+    known[known] = plan.camera_id[other[known]] == plan.camera_id[row[known]]
+    here, there = row[known], other[known]
+    pairs = (
+        hits.thing[here],
+        hits.material[here],
+        cameras.take(plan.cameras, there),
+        plan.time[there],
+        plan.transient_shown[there],
+    )
+    shift = np.zeros((2 * count, height, width, 2), np.float32)
+    seen = np.zeros((2 * count, height, width), bool)
+    led = data_parallel.rows_on_devices(functools.partial(flow, spec), pairs)
+    for index, result in zip(np.flatnonzero(known), led, strict=True):
+        shift[index], seen[index] = result
+    forward = Flow(shift[:count], seen[:count])
+    return forward, Flow(shift[count:], seen[count:])
 
 
 def tracks(spec: SceneSpec, plan: Schedule, hits: trace.Hit, seed: int):

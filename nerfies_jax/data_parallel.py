@@ -1,6 +1,6 @@
 """Equal shares of one step, one after the other or on a device each."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -49,6 +49,27 @@ def on_devices(
         check_vma=False,
     )
     return spread(jnp.arange(0, shares, each), *inputs)
+
+
+def rows_on_devices(work: Callable[..., PyTree], rows: PyTree) -> Iterator[PyTree]:
+    """`work(*row)` for each row of the leaves of a tuple, as NumPy, in their order.
+
+    One row at a time on each of this process's devices, all by one compiled program.
+    """
+    count = len(jax.tree.leaves(rows)[0])
+    devices = min(jax.local_device_count(), max(count, 1))
+
+    def one(share, few):
+        return work(*jax.tree.map(lambda leaf: leaf[share], few))
+
+    together = jax.jit(lambda few: on_devices(one, devices, devices, few))
+    for start in range(0, count, devices):
+        # The last rows again where fewer are left than there are devices.
+        chosen = np.minimum(np.arange(start, start + devices), count - 1)
+        few = jax.tree.map(lambda leaf, chosen=chosen: np.asarray(leaf)[chosen], rows)
+        done = jax.device_get(together(few))
+        for share in range(min(devices, count - start)):
+            yield jax.tree.map(lambda leaf, share=share: leaf[share], done)
 
 
 def shared(tree: PyTree, devices: int) -> PyTree:
