@@ -65,7 +65,8 @@ def main(args):
             print(f"{preset}, {cores}: {record['step_ms']:.1f} ms a step", flush=True)
     if args.job:
         record = main_job()
-        keep(path, record.pop("machine"), ("job",), record)
+        machine = record.pop("machine")
+        keep(path, machine, ("job",), record | {"cpu": machine["cpu"]})
         print(f"main job: {record['seconds']:.0f} s", flush=True)
     if args.yardstick is not None:
         record = _raster(args.yardstick)

@@ -64,7 +64,7 @@ def _parts(presets):
 
 def _job(job):
     return (
-        f"The README's first command, with nothing kept from before: "
+        f"The README's first command on {job['cpu']}, with nothing kept from before: "
         f"{job['seconds']:.0f} s from the command to its report, of which training "
         f"{job['train.seconds']:.0f} s and compiling it "
         f"{job['train.compile_seconds']:.0f} s; {job['heldout.psnr']:.2f} dB held out, "

@@ -54,10 +54,7 @@ def make(
             "finite"
         )
     ms_per_frame = renderer.ms_per_frame(len(scored.rows))
-    frames = evaluation.frames_of(run.capture, run.model.required_data)
-    time_parts = run.representation.step_parts(
-        run.spec, run.metadata, run.model, state, frames, effects=run.effects
-    )  # compiles while all else is written
+    profile = begin_profile(run, state)  # compiles while all else is written
     comparison = save_comparison(folder / "comparison.png", run.filmed, scored)
     figures = [report.Figure(comparison, COMPARED)]
     watched = [run.capture.ids[row] for row in trained.watched]
@@ -86,6 +83,8 @@ def make(
     warnings = floors_text.warnings(numbers)
     notes = [*warnings, trained.result.message, *_capture_notes(run), *left_out]
     notes += [*remarks, *gain, *saved.notes, *unplayed]
+    step_ms, unprofiled = profile()
+    notes += unprofiled
     following = _next(folder, run, trained)
     page = report.write(
         folder,
@@ -94,7 +93,7 @@ def make(
         json.loads((folder / CONFIG).read_text()),
         [*player, *figures],
         film,
-        time_parts(),
+        step_ms,
         notes,
         following,
     )
@@ -305,6 +304,37 @@ def save_player(
     print(f"player:     {player.path} ({player.about})")
     caption = f"Play it, look from elsewhere: {player.path.name}. {player.about}"
     return [report.Figure(picture, caption, player.path.name)], []
+
+
+Profile = tuple[dict[str, float], list[str]]
+
+
+def begin_profile(run: Run, state: TrainState) -> Callable[[], Profile]:
+    """Begin to compile the parts of a step; the call times them, in milliseconds.
+
+    A note says why where that fails: the run keeps all its other products.
+    """
+
+    def failed(error):
+        words = f"{type(error).__name__}: {error}"
+        return {}, [f"Where the time of a step goes was not measured: {words}"]
+
+    frames = evaluation.frames_of(run.capture, run.model.required_data)
+    try:
+        time_parts = run.representation.step_parts(
+            run.spec, run.metadata, run.model, state, frames, effects=run.effects
+        )
+    except Exception as error:
+        refused = failed(error)
+        return lambda: refused
+
+    def timed():
+        try:
+            return time_parts(), []
+        except Exception as error:
+            return failed(error)
+
+    return timed
 
 
 def save_depth(folder: pathlib.Path, capture: Capture, scored: Scored) -> None:

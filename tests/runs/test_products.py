@@ -2,6 +2,8 @@
 
 import types
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from nerfies_jax.evaluation.representation import Saved
@@ -9,7 +11,7 @@ from nerfies_jax.runs import products, representations
 from nerfies_jax.runs.config import RunConfig
 from nerfies_jax.runs.run import Run
 from nerfies_jax.runs.train import Trained
-from nerfies_jax.training.model import Rendering
+from nerfies_jax.training.model import Rendering, TrainState
 from tests import scenes
 
 
@@ -38,3 +40,19 @@ def test_a_player_that_fails_loses_nothing_but_itself(tmp_path):
     figures, (note,) = products.save_player(tmp_path, run, trained)
     assert (figures, "has no player" in note) == ([], True)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_profile_that_fails_loses_nothing_but_itself():
+    def refuses(*_, **__):
+        raise KeyError("kept")
+
+    capture, config = scenes.tiny_capture(), RunConfig("splats-static-small")
+    kind = representations.named("gaussians")
+    model = types.SimpleNamespace(required_data=frozenset())
+    state = TrainState(None, None, None, jnp.int32(0), jax.random.key(0))
+    for step_parts in (refuses, lambda *_, **__: refuses):
+        failing = kind._replace(step_parts=step_parts)
+        run = Run(config, capture, capture, failing, None, None, model)
+        step_ms, (note,) = products.begin_profile(run, state)()
+        assert step_ms == {}
+        assert "was not measured: KeyError: 'kept'" in note
