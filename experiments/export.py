@@ -129,6 +129,9 @@ def main(args):
 
         refuse_existing(args.place, args.overwrite)
         run = runs.saved_run(args.run)
+        if run.model.found is not None:
+            # What is written is in the cameras that training found.
+            run = runs.with_found_cameras(run, runs.restore(args.run, run).state)
         args.place.parent.mkdir(parents=True, exist_ok=True)
         said = WRITERS[args.format](args, run)
         print(f"{said}: {args.place}")
@@ -191,16 +194,10 @@ def _splatv(args: Export, run: Any) -> str:
 
 
 def _cameras(args: Export, run: Any) -> str:
-    """The capture as the run learned from it: of splats without the lens.
-
-    Where training refined the cameras, with those that it found.
-    """
-    from nerfies_jax import runs
+    """The capture as the run learned from it: of splats without the lens."""
     from nerfies_jax.capture import colmap_writer, nerfies_format, transforms_writer
     from nerfies_jax.capture.json_files import replaced_folder
 
-    if run.model.found is not None:
-        run = runs.with_found_cameras(run, runs.restore(args.run, run).state)
     capture = run.capture
     if args.format == "nerfies":
         with replaced_folder(args.place, args.overwrite) as folder:

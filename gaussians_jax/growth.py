@@ -21,7 +21,7 @@ EVENT, NOISE = 2**32 - 2, 2**32 - 3
 
 
 class AuxState(NamedTuple):
-    """What a scene keeps beside its parameters; everything in it has rows."""
+    """What a scene keeps beside its parameters: of the rows, and what effects keep."""
 
     stats: PyTree  # densification.RowStats, or () where no strategy keeps them
     effects: dict[str, PyTree]  # by the name of the effect

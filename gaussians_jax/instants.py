@@ -72,7 +72,8 @@ def _as_rows(rows: Splats, deformed: Gaussians) -> Splats:
     opacity = jnp.clip(deformed.opacity, jnp.finfo(eps.dtype).tiny, 1 - eps)
     logit = jnp.log(opacity) - jnp.log1p(-opacity)
     smallest = math.exp(splats.LOG_SCALE_RANGE[0])
-    log_scale = jnp.log(jnp.maximum(deformed.scale, smallest))
+    # A linear rule takes scales through zero, and what is drawn is their square.
+    log_scale = jnp.log(jnp.maximum(jnp.abs(deformed.scale), smallest))
     kept = (deformed.opacity == trained.opacity) | ~splats.active_mask(rows)
     return rows._replace(
         mean=deformed.mean,

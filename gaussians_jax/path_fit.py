@@ -141,8 +141,9 @@ def rest_loss(
 ) -> Float[Array, ""]:
     """What it costs in a fit that points at rest move, mean over the times.
 
-    `moved(time)` gives their turns [points, any] (rad) and shifts [points, 3]; the
-    latter count in units. Softened near zero as the distances of `fit` are.
+    `moved(time)` gives what is zero where they do not turn [points, any], the vector of
+    a quaternion or of a rotation, and shifts [points, 3]; the latter count in units.
+    Softened near zero as the distances of `fit` are.
     """
 
     def one(time):

@@ -174,8 +174,7 @@ SMALL_D_MISO = dataclasses.replace(
     ),
 )
 
-# A tenth of the rows, and ten Gaussians of each. Not yet trained to its end: what it
-# scores is not known.
+# A tenth of the rows, and ten Gaussians of each.
 SMALL_ADC_GS = dataclasses.replace(
     SMALL_FROM_TRACKS,
     init=InitSpec(points=500, random=600),

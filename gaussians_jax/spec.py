@@ -129,6 +129,11 @@ class SplatScene:
             raise ValueError(f"batch_size={self.batch_size}: a step takes a view")
         if not 0 <= self.sh_degree <= 3:
             raise ValueError(f"sh_degree={self.sh_degree} must be 0, 1, 2 or 3")
+        if self.sh_every < 1:
+            raise ValueError(
+                f"sh_every={self.sh_every}: steps between degrees, at least 1, with "
+                "which all are there almost at once"
+            )
         if not 0 <= self.dssim_weight <= 1:
             raise ValueError(f"dssim_weight={self.dssim_weight} must lie in [0, 1]")
         if self.optimiser not in OPTIMISERS:
@@ -184,12 +189,8 @@ def refuse_what_cannot_train(spec: SplatScene) -> None:
                 f"{' and '.join(orphans)} without a motion would train nothing; leave "
                 "them out as well, or choose a preset that moves"
             )
-    if spec.neighbours is not None and type(motion) not in EMBEDDED:
-        raise ValueError(
-            "neighbours keep embeddings or coefficients alike, and this motion has "
-            "none; leave them out (neighbours=none), or choose a preset with a KAN "
-            "motion or a time basis"
-        )
+    if spec.neighbours is not None:
+        _embedded(motion)
     carry = carried_count(spec) is not None
     if carry and isinstance(spec.densification, MCMCStrategySpec):
         raise ValueError(
@@ -208,23 +209,40 @@ def refuse_what_cannot_train(spec: SplatScene) -> None:
             'motion.moves=false with start.motion="tracks": anchors at rest have no '
             "motion to fit to tracks; leave one of them out"
         )
-    if carry and spec.temporal_opacity is not None:
+    fading = {
+        "temporal_opacity": spec.temporal_opacity,
+        "motion.fading": getattr(motion, "fading", None),
+    }
+    faded = [name for name, one in fading.items() if one is not None]
+    if carry and faded:
         raise ValueError(
-            "temporal_opacity fades rows, and of rows that carry Gaussians only these "
-            "are drawn, with opacities of their own; leave it out "
-            f"(temporal_opacity=none), or {ALONE}"
+            f"{faded[0]} fades rows, and of rows that carry Gaussians only these are "
+            "drawn, with opacities of their own; leave it out "
+            f"({faded[0]}=none), or {ALONE}"
         )
     if growth is not None and not isinstance(spec.densification, DefaultStrategySpec):
         raise ValueError(
             "motion_growth steers the gradient threshold of DefaultStrategySpec, which "
             "this scene has not; leave it out as well (motion_growth=none)"
         )
-    if growth is not None and growth.form == "hard" and growth.start <= motion.warm_up:
+    still = 0 if spec.start.motion == "tracks" or motion is None else motion.warm_up
+    if growth is not None and growth.form == "hard" and growth.start <= still:
         raise ValueError(
             f"motion_growth.start={growth.start} lies in the warm-up of the motion "
-            f"(up to step {motion.warm_up}), when nothing moves and so nothing would "
+            f"(up to step {still}), when nothing moves and so nothing would "
             "grow; start it some hundred steps later"
         )
+
+
+def _embedded(motion):
+    """What of a motion its neighbours keep alike; ValueError where it has no such."""
+    if type(motion) not in EMBEDDED:
+        raise ValueError(
+            "neighbours keep embeddings or coefficients alike, and this motion has "
+            "none; leave them out (neighbours=none), or choose a preset with a KAN "
+            "motion or a time basis"
+        )
+    return EMBEDDED[type(motion)]
 
 
 # Of a motion's spec, the steps of training, and the capture.
@@ -287,7 +305,7 @@ def effects_of(spec: SplatScene, metadata: SceneMetadata) -> tuple[Effect, ...]:
         )
     # A trained scene is drawn without its motion as well.
     if spec.neighbours is not None and motion is not None:
-        of = EMBEDDED[type(spec.motion)]
+        of = _embedded(spec.motion)
         effects.append(neighbours.effect(spec.neighbours, metadata.extent, of))
     if spec.motion_growth is not None:
         effects.append(motion_growth.effect(spec.motion_growth, metadata.extent))

@@ -1,7 +1,5 @@
 """Where the time of a training step of Gaussians goes."""
 
-from collections.abc import Callable
-
 import jax
 import jax.numpy as jnp
 
@@ -9,7 +7,7 @@ from gaussians_jax import projection, rendering, scene, splats, update
 from gaussians_jax.effects import deformation
 from gaussians_jax.spec import OPTIMISERS, raster_of
 from gaussians_jax.update import Drawn
-from nerfies_jax.measure.part_time import part, parts_ms
+from nerfies_jax.measure.part_time import StepParts, part
 from nerfies_jax.training import losses, rate
 from nerfies_jax.training.effects import (
     Effect,
@@ -28,10 +26,10 @@ def parts(
     state: TrainState,
     frames: Frames,
     effects: tuple[Effect, ...] = (),
-) -> Callable[[], dict[str, float]]:
+) -> StepParts:
     """Begin to compile the parts of one step, forward and backward.
 
-    The call times them, once all are there: milliseconds, medians, warm. Each part is
+    Their times are medians of warm calls, in milliseconds. Each part is
     timed by itself on the first frame and one device, and counted for as many views as
     a device draws in a step; "rest" is what they leave of the whole step.
     """
@@ -49,13 +47,12 @@ def parts(
     once = _update(spec, metadata, effects, state, now, frames, condition)
     views = spec.batch_size // model.devices
 
-    def time_parts():
-        timed = parts_ms(a_view | once)
+    def with_rest(timed):
         timed |= {name: views * timed[name] for name in a_view}
         whole = rate.step_ms(model, state, frames, spec.steps)
         return timed | {"rest": max(whole - sum(timed.values()), 0.0)}
 
-    return time_parts
+    return StepParts(a_view | once, with_rest)
 
 
 def _drawing(spec, metadata, effects, now, frames):

@@ -149,6 +149,12 @@ def draw(
     return jax.tree.map(lambda x: x.reshape(height, width, *x.shape[1:]), flat)
 
 
+def feeds_networks(effect: Effect) -> bool:
+    """Whether the template or a warp reads what an effect makes."""
+    seams = (effect.lift, effect.condition, effect.mark, effect.surface)
+    return any(seam is not None for seam in seams)
+
+
 def _active(effects, without):
     names = [effect.name for effect in effects]
     for name in without:
@@ -157,9 +163,7 @@ def _active(effects, without):
                 f"there is no effect {name!r} to leave out; the field has "
                 f"{', '.join(names) or 'none'}"
             )
-        effect = effects[names.index(name)]
-        seams = (effect.lift, effect.condition, effect.mark, effect.surface)
-        if any(seam is not None for seam in seams):
+        if feeds_networks(effects[names.index(name)]):
             raise ValueError(
                 f"{name!r} feeds the template or a warp and cannot be left out of a "
                 "trained field; train one without it"

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from nerfies_jax import evaluation, field_ray, scene
+from nerfies_jax import evaluation, field_ray, scene, skipping
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.training import fit, losses
 from nerfies_jax.training.effects import APPEARANCE, Effect, FrameCondition
@@ -51,9 +51,12 @@ def score(
         return None
     params, step = state.params, state.step
     draw = jax.jit(field.render, static_argnums=4)
+    guided = spec.sampling.occupancy is not None
 
     @jax.jit
     def solve(params, view, pixels, colours, step):
+        # Samples lie where those of the picture do.
+        guide = field.survey(params, step)[skipping.GUIDE] if guided else None
         codes = field.codes_at(params, view)
 
         def loss(fitted):
@@ -64,6 +67,7 @@ def score(
                         params,
                         field_ray.field_ray_through(metadata, view.camera, pixel)[0],
                         condition,
+                        guide=guide,
                     )[-1].colour
                 )
             )

@@ -58,6 +58,8 @@ def advise(
     elif passes and spec.transient is None:
         size = (16, 4, 128) if full else (8, 2, 48)  # of NeRF-W and of its small preset
         names = ("code_width", "depth", "width")
+        if spec.sampling.occupancy is not None:  # it cannot be found beside a medium
+            overrides.append("sampling.occupancy=none")
         overrides += [f"transient.{n}={v}" for n, v in zip(names, size, strict=True)]
     if passes is False and spec.transient is not None:
         overrides.append("transient=none")

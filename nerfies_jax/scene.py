@@ -143,14 +143,7 @@ def _stepper(spec, radiance, devices):
         if spec.micro_batches > 1:
             key = jax.random.fold_in(key, index)
         batch_key, field_key = jax.random.split(key)
-        count, plan = spec.rays // spec.micro_batches, spec.sampling.occupancy
-        guide = None
-        if plan is None:
-            batch = draw_batch(frames, count, batch_key)
-        else:
-            guide = state.aux_state
-            batch = draw_batch(frames, plan.candidates * count, batch_key)
-            batch = occupied_rays.learnt_from(radiance, state.aux_state, batch)
+        batch, guide = micro_batch(radiance, state, frames, batch_key)
 
         def loss(params):
             terms = loss_terms(
@@ -174,6 +167,19 @@ def _stepper(spec, radiance, devices):
         return state, metrics
 
     return step
+
+
+def micro_batch(
+    radiance: Field, state: TrainState, frames: Frames, key: Key[Array, ""]
+) -> tuple[Batch, Cells | None]:
+    """Rays to learn from at once, and what guides their samples (`OccupancySpec`)."""
+    spec = radiance.spec
+    count, plan = spec.rays // spec.micro_batches, spec.sampling.occupancy
+    if plan is None:
+        return draw_batch(frames, count, key), None
+    batch = draw_batch(frames, plan.candidates * count, key)
+    cells = state.aux_state
+    return occupied_rays.learnt_from(radiance, cells, batch), cells
 
 
 def descend(

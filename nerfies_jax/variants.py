@@ -8,6 +8,7 @@ from jaxtyping import Array, Float, Int
 from nerfies_jax import scene
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation.representation import Parts, check_there
+from nerfies_jax.field import feeds_networks
 from nerfies_jax.training.effects import APPEARANCE, Effect
 from nerfies_jax.training.model import Model, View
 
@@ -28,8 +29,7 @@ def parts(spec, metadata, effects: tuple[Effect, ...] = ()) -> Parts:
         effect.name
         for effect in whole.effects
         if (effect.displace is not None or effect.medium is not None)
-        and effect.condition is None
-        and effect.lift is None
+        and not feeds_networks(effect)
     )
     return Parts(removable, _has_appearance(whole))
 

@@ -1,5 +1,7 @@
 """What is booked to which part of a training step, whatever the clock says."""
 
+import dataclasses
+
 import jax
 import pytest
 
@@ -8,6 +10,7 @@ import nerfies_jax.step_time
 from gaussians_jax import scene as splat_scene
 from nerfies_jax import evaluation
 from nerfies_jax import scene as field_scene
+from nerfies_jax.measure import part_time
 from nerfies_jax.training import rate
 from tests import scenes
 
@@ -16,7 +19,7 @@ def clock(monkeypatch, module, *times, whole):
     """Each part takes the next of the times, and can be traced as it is called."""
     monkeypatch.setattr(module, "part", jax.eval_shape)
     monkeypatch.setattr(
-        module, "parts_ms", lambda parts: dict(zip(parts, times, strict=True))
+        part_time, "parts_ms", lambda parts: dict(zip(parts, times, strict=True))
     )
     monkeypatch.setattr(rate, "step_ms", lambda *run: whole)
 
@@ -24,21 +27,22 @@ def clock(monkeypatch, module, *times, whole):
 @pytest.mark.parametrize(
     ("whole", "rest"), [(9.0, 3.25), pytest.param(4.0, 0.0, id="nothing left")]
 )
+@pytest.mark.parametrize("batches", [1, 2])
 def test_what_parts_of_a_field_leave_of_a_step_is_never_negative(
-    whole, rest, monkeypatch
+    whole, rest, batches, monkeypatch
 ):
+    spec = dataclasses.replace(scenes.TINY_FIELD, micro_batches=batches)
+    whole += 5.5 * (batches - 1)
     clock(monkeypatch, nerfies_jax.step_time, 0.5, 2.0, 5.0, 0.25, whole=whole)
     metadata, params, _ = scenes.tiny_field()
-    model = field_scene.build(scenes.TINY_FIELD, metadata)
+    model = field_scene.build(spec, metadata)
     state = model.example(None, jax.random.key(0))._replace(params=params)
     frames = evaluation.frames_of(scenes.tiny_capture())
-    parts = nerfies_jax.step_time.parts(
-        scenes.TINY_FIELD, metadata, model, state, frames
-    )()
+    parts = nerfies_jax.step_time.parts(spec, metadata, model, state, frames).ms()
     assert parts == {
-        "rays": 0.5,
-        "forward": 2.0,
-        "backward": 3.0,
+        "rays": 0.5 * batches,
+        "forward": 2.0 * batches,
+        "backward": 3.0 * batches,
         "optimiser": 0.25,
         "rest": rest,
     }
@@ -52,7 +56,7 @@ def test_every_part_of_a_step_of_splats_is_measured(monkeypatch):
     state = model.init(capture, jax.random.key(0))
     parts = gaussians_jax.step_time.parts(
         spec, metadata, model, state, evaluation.frames_of(capture)
-    )()
+    ).ms()
     assert parts == {
         "project and blend": 2.0,
         "loss": 1.0,

@@ -4,8 +4,6 @@ import contextlib
 import json
 import math
 import pathlib
-import zipfile
-import zlib
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -13,6 +11,7 @@ import filelock
 import numpy as np
 
 from experiments.ablate.measures import MEASURES
+from nerfies_jax.capture import npz_files
 from nerfies_jax.capture.json_files import replaced_file, write_json
 from nerfies_jax.training.provenance import provenance
 
@@ -62,21 +61,13 @@ def read(path: pathlib.Path, identity: dict[str, Any]) -> ArmResult | None:
         stored = json.loads(path.read_text())
         # A measure that is younger than the file is not known there.
         numbers = {name: stored["numbers"].get(name) for name in MEASURES}
-        # Opened here: NumPy leaves a damaged archive open.
-        with (
-            path.with_suffix(".npz").open("rb") as stream,
-            np.load(stream, allow_pickle=False) as file,
-        ):
-            arrays = dict(file)
+        arrays = npz_files.read_arrays(path.with_suffix(".npz"))
         made_with, notes = stored["identity"], stored["notes"]
     except (
         KeyError,
         TypeError,
         ValueError,
         OSError,
-        EOFError,
-        zipfile.BadZipFile,
-        zlib.error,
     ) as error:
         raise ValueError(
             f"{path}: not a finished arm ({error}); remove it to run it again"

@@ -52,7 +52,7 @@ def measure(preset: str, all_cores: bool) -> dict[str, Any]:
         "devices": model.devices,
     }
     if not all_cores:
-        parts = representation.step_parts(spec, metadata, model, state, frames)()
+        parts = representation.step_parts(spec, metadata, model, state, frames).ms()
         renderer = Renderer(model, capture.size)
         for row in capture.heldout[: FRAMES + 1]:
             renderer(state, evaluation.view_of(capture, row))

@@ -15,8 +15,8 @@ is the training program alone, from an empty cache; *frame* one picture on one c
 
 
 PARTS = """\
-Milliseconds on one core, each part by itself on the first state: of fields they are
-more than the step, which works through its rays in micro-batches."""
+Milliseconds on one core, each part by itself on the first state. They may be more than
+the step: of fields they were taken of all its rays at once."""
 
 
 def page(stored: Mapping[str, Any]) -> str:

@@ -103,7 +103,7 @@ class SpectralSpec:
             )
         if not LEAST_OPENING <= self.opening < 1:
             raise ValueError(f"opening={self.opening} must lie in [{LEAST_OPENING}, 1)")
-        if not 0 <= self.floor < self.opening:
+        if self.gate == "floor" and not 0 <= self.floor < self.opening:
             raise ValueError(
                 f"floor={self.floor} must lie in [0, opening={self.opening}): a gate "
                 "falls from its opening"

@@ -64,7 +64,7 @@ def gathered(at: At, rows: Splats, seen: Seen, count: int) -> Instants:
         mean=stacked.mean,
         quaternion=steady(stacked.quaternion),
         log_scale=np.clip(
-            np.log(np.maximum(stacked.scale, np.finfo(np.float32).tiny)),
+            np.log(np.maximum(np.abs(stacked.scale), np.finfo(np.float32).tiny)),
             *splats.LOG_SCALE_RANGE,
         ),
         opacity=stacked.opacity,

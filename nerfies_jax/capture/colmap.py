@@ -73,10 +73,9 @@ def read(
     moments, more = frames.clock(ids)
     times = frames.spread(moments)
     notes += more
-    train, scored = frames.hold_out_every(
-        len(ids), heldout or frames.HELD_OUT, str(path)
-    )
-    notes += (f"every {heldout or frames.HELD_OUT}th frame is held out",)
+    every = frames.HELD_OUT if heldout is None else heldout
+    train, scored = frames.hold_out_every(len(ids), every, str(path))
+    notes += (f"every {every}th frame is held out",)
     return Capture(
         name=path.resolve().name,
         source="colmap",

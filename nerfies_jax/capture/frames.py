@@ -50,7 +50,8 @@ def choose_source(
             raise CaptureError(
                 f"{where}: max_side={max_side}; expected at least 1 pixel"
             )
-        factor = max(min(available), math.ceil(max(full_size) / max_side))
+        least = max(full_size) / max_side
+        factor = min(each * max(math.ceil(least / each), 1) for each in available)
     if factor is None:
         return min(available), 1
     divisors = [source for source in available if factor >= 1 and factor % source == 0]

@@ -121,6 +121,21 @@ def read_pixels(path: AnyPath, orientation: str = "refuse") -> np.ndarray:
     return pixels
 
 
+def read_numbers(path: AnyPath) -> np.ndarray:
+    """The first channel of a picture as it is stored, [height, width]: no light.
+
+    Grey of 16 bits and more keeps all of them; otherwise as `read_pixels`.
+    """
+    path = pathlib.Path(path)
+    if not read_header(path).mode.startswith("I"):
+        return read_pixels(path, "stored")[..., 0]
+    try:
+        with PIL.Image.open(path) as image:
+            return np.asarray(image)
+    except _PILLOW_ERRORS as error:
+        raise _unreadable(path, error) from None
+
+
 def _exr_pixels(path):
     picture = exr.read_exr(path)
     if picture.colour is None:

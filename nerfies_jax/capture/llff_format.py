@@ -65,7 +65,7 @@ def read(
     moments, more = frames.clock(names)
     times = frames.spread(moments)
     notes += more
-    every = heldout or frames.HELD_OUT
+    every = frames.HELD_OUT if heldout is None else heldout
     train, scored = frames.hold_out_every(len(files), every, str(path))
     return Capture(
         name=path.resolve().name,

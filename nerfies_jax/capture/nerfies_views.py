@@ -162,7 +162,7 @@ def _splits(path, heldout):
     if isinstance(heldout, str):
         return *_named_split(path, heldout), notes
     if isinstance(heldout, int) or not val:
-        step = heldout or frames.HELD_OUT
+        step = frames.HELD_OUT if heldout is None else heldout
         pool = every if isinstance(heldout, int) or not train else train
         pool = sorted(pool, key=frames.natural)
         kept, scored = frames.hold_out_every(len(pool), step, str(path))

@@ -6,7 +6,7 @@ import zipfile
 
 import numpy as np
 
-from nerfies_jax.capture import formats
+from nerfies_jax.capture import formats, npz_files
 from nerfies_jax.capture.capture import CaptureError, describe
 from nerfies_jax.capture.frames import HELD_OUT, MAX_BYTES, hold_out_every
 from nerfies_jax.capture.images import write_png
@@ -59,9 +59,8 @@ def read_npz(path):
             size = sum(member.file_size for member in archive.infolist())
         if size > 4 * MAX_BYTES:  # float32 pictures
             raise CaptureError(f"{path}: unpacks to {size} bytes; split it first")
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
+        arrays = npz_files.read_arrays(path)
+    except (OSError, ValueError, zipfile.BadZipFile) as error:
         if isinstance(error, CaptureError):
             raise
         raise CaptureError(
@@ -110,6 +109,12 @@ def rows_of(poses, heldout, train, where):
         scored = _range(heldout, count, "--heldout")
         others = np.setdiff1d(np.arange(count), scored)
         learnt = others if train is None else _range(train, count, "--train")
+        both = np.intersect1d(learnt, scored)
+        if both.size:
+            raise ValueError(
+                f"--train {train} and --heldout {heldout} share row {both[0]}; what is "
+                "scored must not be learnt from"
+            )
         return learnt, scored, "rows as asked for"
     if train is not None:
         raise ValueError("--train needs --heldout too, so that both are known")

@@ -71,6 +71,9 @@ class MappingSpec:
             raise ValueError(f"threads={self.threads}; use at least 1")
 
 
+MASK = "mask what moves in black (--masks of prepare, reconstruct's --prepare.masks)"
+
+
 class FewPlaced(CaptureError):
     """Too few of the pictures found their place."""
 
@@ -95,8 +98,7 @@ class Poses(NamedTuple):
         if self.error_px > MOST_ERROR_PX:
             lines.append(
                 f"doubtful: points at rest are {self.error_px:.2f} px off, more than "
-                f"{MOST_ERROR_PX:g}; mask what moves (--masks), or film anew without "
-                "blur"
+                f"{MOST_ERROR_PX:g}; {MASK}, or film anew without blur"
             )
         if self.angle_deg < LEAST_ANGLE_DEG:
             lines.append(
@@ -115,7 +117,7 @@ def _more(pictures):
     return (
         f"take more pictures, closer together (of a film --frames {2 * pictures}, or "
         f"reconstruct's --prepare.frames {2 * pictures}), film more slowly and with "
-        "more texture, or mask what moves (--masks)"
+        f"more texture, or {MASK}"
     )
 
 

@@ -73,7 +73,10 @@ def read_split(path: pathlib.Path, heldout: int | str | None) -> Split:
             "or a number n holds out every n-th frame"
         )
     wanted = ("test", "val") if heldout is None else (heldout,)
-    if transforms.train_filenames is not None:  # nerfstudio's lists in one file
+    # nerfstudio's lists in one file; of frames to learn from alone, some are held out
+    lists = transforms.val_filenames or transforms.test_filenames
+    named = isinstance(heldout, str) or (heldout is None and lists)
+    if transforms.train_filenames is not None and named:
         return _listed(file, transforms, wanted)
     if not isinstance(heldout, int) and file.name == "transforms_train.json":
         for name in wanted:
@@ -93,11 +96,14 @@ def read_split(path: pathlib.Path, heldout: int | str | None) -> Split:
             "n-th frame"
         )
     # Files list frames in any order; a film is split in the order it was shot.
+    pool = transforms.frames
+    if transforms.train_filenames is not None and heldout is None:
+        pool = _taken(file, transforms, transforms.train_filenames)
     ordered = sorted(
-        transforms.frames,
+        pool,
         key=lambda entry: (entry.time or 0.0, frames.natural(entry.file_path)),
     )
-    every = heldout or frames.HELD_OUT
+    every = frames.HELD_OUT if heldout is None else heldout
     kept, scored = frames.hold_out_every(len(ordered), every, str(file))
     return Split(
         file,
@@ -118,7 +124,6 @@ def _own_lens(transforms):
 
 
 def _listed(file, transforms, wanted):
-    table = {entry.file_path: entry for entry in transforms.frames}
     for name in wanted:
         scored = getattr(transforms, f"{name}_filenames", None)
         if scored:
@@ -127,17 +132,21 @@ def _listed(file, transforms, wanted):
         raise CaptureError(
             f"{file}: lists no {' or '.join(map(str, wanted))}_filenames"
         )
-    absent = [
-        each for each in (*transforms.train_filenames, *scored) if each not in table
-    ]
+    return Split(
+        file,
+        transforms,
+        _taken(file, transforms, transforms.train_filenames),
+        _taken(file, transforms, scored),
+        (f"the {name} split is held out",),
+    )
+
+
+def _taken(file, transforms, names):
+    """The frames that a list names."""
+    table = {entry.file_path: entry for entry in transforms.frames}
+    absent = [each for each in names if each not in table]
     if absent:
         raise CaptureError(
             f"{file}: {absent[0]!r} is in a split but not in frames; add it"
         )
-    return Split(
-        file,
-        transforms,
-        [table[each] for each in transforms.train_filenames],
-        [table[each] for each in scored],
-        (f"the {name} split is held out",),
-    )
+    return [table[each] for each in names]

@@ -12,6 +12,7 @@ from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation.model_flow import Mover
 from nerfies_jax.evaluation.protocol import Follow
 from nerfies_jax.evaluation.scores import Halves
+from nerfies_jax.measure.part_time import StepParts
 from nerfies_jax.training.model import Model, TrainState
 
 Spec = Any
@@ -84,9 +85,8 @@ class Representation(NamedTuple):
     build: Callable[..., Model]  # (spec, metadata, effects=()) -> model
     estimate_memory_bytes: Callable[[Spec, Capture], int]  # of the first state and step
     memory_hint: str  # which settings make the first state smaller
-    # (spec, metadata, model, state, frames, effects=()): begins to compile the parts of
-    # a step -> a call that times them, in ms
-    step_parts: Callable[..., Callable[[], dict[str, float]]]
+    # (spec, metadata, model, state, frames, effects=()) -> the parts of a step
+    step_parts: Callable[..., StepParts]
     # (spec, metadata, names left out, whether appearances are blended, effects=()) ->
     # model; it draws a `nerfies_jax.variants.Between` instead of a view where they are.
     variant: Callable[..., Model]

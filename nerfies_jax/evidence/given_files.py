@@ -7,12 +7,11 @@ out.
 
 import dataclasses
 import pathlib
-import zipfile
 from collections.abc import Sequence
 
 import numpy as np
 
-from nerfies_jax.capture import exr, frames, images
+from nerfies_jax.capture import exr, frames, images, npz_files
 from nerfies_jax.capture.capture import Capture, CaptureError
 from nerfies_jax.capture.given import Given, GivenFiles
 
@@ -63,9 +62,8 @@ def _rows(count, capture, path, what):
 
 def _arrays(path):
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
-    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+        arrays = npz_files.read_arrays(path)
+    except (OSError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise CaptureError(
             f"{path}: not a readable npz ({reason}); save it with numpy.savez"
@@ -199,8 +197,7 @@ def _depth_picture(path):
         if picture is None and stored.colour is not None:
             picture = stored.colour[..., 0]
     else:
-        picture = images.read_pixels(path)
-        picture = picture[..., 0] if picture.ndim == 3 else picture
+        picture = images.read_numbers(path)
     if picture is None or picture.ndim != 2:
         raise CaptureError(f"{path}: no picture of depths; expected one channel")
     return picture.astype(np.float32)

@@ -43,8 +43,9 @@ def project(
     """The pixel of one world point, and its z-depth in scene units.
 
     A depth that is not positive means that the camera cannot see the point; its pixel
-    is then finite, far outside the picture on the side where the point lies, and so
-    are its derivatives. See `projectable` for points beyond the lens's own range.
+    and its derivatives are then finite, and mean nothing: beside the axis it is far
+    outside the picture, on the axis in its middle. See `projectable` for points beyond
+    the lens's own range.
     """
     lateral, depth = _in_camera(camera, point)
     # A maximum, not a division under `where`: the quotient that is not wanted is never

@@ -1,4 +1,4 @@
-"""What one part of a training step takes."""
+"""What the parts of a training step take."""
 
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, wait
@@ -18,6 +18,23 @@ class Part(NamedTuple):
 
     compiled: Future[jax.stages.Compiled]
     args: tuple[Any, ...]
+
+
+class StepParts(NamedTuple):
+    """The parts of one step, compiled in the background."""
+
+    parts: dict[str, Part]
+    # Of their milliseconds; times the whole step, and says what they leave of it.
+    with_rest: Callable[[dict[str, float]], dict[str, float]]
+
+    def ms(self) -> dict[str, float]:
+        """Milliseconds of each part and of what they leave of the step, by name."""
+        return self.with_rest(parts_ms(self.parts))
+
+    def drop(self) -> None:
+        """What is not compiled yet will not be."""
+        for one in self.parts.values():
+            one.compiled.cancel()
 
 
 def part(function: Callable[..., Any], *args: Any) -> Part:

@@ -144,7 +144,8 @@ def masked_lpips(
     """
     image, truth = (jnp.where(mask[..., None], x, 0.0) for x in (image, truth))
     distance = lpips_map(params, network, image, truth)
-    return jnp.sum(jnp.where(mask, distance, 0.0)) / jnp.sum(mask).astype(image.dtype)
+    pixels = jnp.sum(mask).astype(distance.dtype)  # float16 counts to 65 504
+    return jnp.sum(jnp.where(mask, distance, 0.0)) / pixels
 
 
 def features(

@@ -14,9 +14,12 @@ import pathlib
 import pickle
 import struct
 import zipfile
+import zlib
 
 import ml_dtypes
 import numpy as np
+
+from nerfies_jax.capture import npz_files
 
 _SAFETENSORS = {
     "F64": np.float64,
@@ -64,11 +67,13 @@ def read_tensors(path: str | pathlib.Path) -> dict[str, np.ndarray]:
     except (
         pickle.UnpicklingError,
         zipfile.BadZipFile,
+        zlib.error,
         struct.error,
         AttributeError,
         EOFError,
         IndexError,
         KeyError,
+        RuntimeError,  # zipfile, of an unknown compression or a password
         TypeError,
         ValueError,
         OSError,
@@ -80,8 +85,7 @@ def read_tensors(path: str | pathlib.Path) -> dict[str, np.ndarray]:
 
 
 def _read_npz(path):
-    with np.load(path, allow_pickle=False) as archive:
-        return {name: archive[name] for name in archive.files}
+    return npz_files.read_arrays(path)
 
 
 def _read_safetensors(path):

@@ -219,8 +219,10 @@ def time_smoothness(
 ) -> Float[Array, ""]:
     """Mean squared second difference along the first axis: how unsteady in time.
 
-    K-Planes, equation 4; zero for what changes evenly.
+    K-Planes, equation 4; zero for what changes evenly, as two moments do.
     """
+    if plane.shape[0] < 3:
+        return jnp.zeros((), plane.dtype)  # of nothing the mean is NaN
     # Differences of differences: each of close values is exact, their sum is not.
     return jnp.mean(jnp.square(jnp.diff(jnp.diff(plane, axis=0), axis=0)))
 

@@ -87,6 +87,17 @@ class Preparation:
     threads: int | None = None
     """How many cores to use (default: all)."""
 
+    def __post_init__(self):
+        if None not in (self.frames, self.fps):
+            raise ValueError(
+                f"frames={self.frames} and fps={self.fps}: give the frames of a film "
+                "or so many a second, not both"
+            )
+        if self.max_side < 16:
+            raise ValueError(f"max_side={self.max_side}: expected at least 16 pixels")
+        if self.threads is not None and self.threads < 1:
+            raise ValueError(f"threads={self.threads}: use at least 1")
+
 
 @dataclasses.dataclass(frozen=True)
 class MoreMetrics:

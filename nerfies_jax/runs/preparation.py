@@ -74,6 +74,8 @@ def prepare(
         )
     if kind == "pictures" and (how.frames or how.fps):
         raise ValueError("frames and fps choose from a film; a folder is taken whole")
+    if how.masks is not None and not pathlib.Path(how.masks).is_dir():
+        raise CaptureError(f"{how.masks}: no such folder of masks")
     with scratch_folder(out) as scratch, _named(scratch, source):
         if kind == "film":
             tell(f"looking for sharp frames in {source}")

@@ -1,11 +1,13 @@
 """What a finished run leaves behind: scores, pictures, a film, depth, a report."""
 
+import contextlib
 import dataclasses
 import json
 import math
 import pathlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import numpy as np
 
@@ -54,37 +56,37 @@ def make(
             "finite"
         )
     ms_per_frame = renderer.ms_per_frame(len(scored.rows))
-    profile = begin_profile(run, state)  # compiles while all else is written
-    comparison = save_comparison(folder / "comparison.png", run.filmed, scored)
-    figures = [report.Figure(comparison, COMPARED)]
-    watched = [run.capture.ids[row] for row in trained.watched]
-    curves.write(folder, trained.result.history, watched)
-    curve = with_extra(save_curve, folder / "psnr_over_time.png", run, trained)
-    if curve is not None:
-        figures.append(
-            report.Figure(curve, "PSNR of a few held-out frames while it trained.")
+    with profiling(run, state) as profile:  # compiles while all else is written
+        comparison = save_comparison(folder / "comparison.png", run.filmed, scored)
+        figures = [report.Figure(comparison, COMPARED)]
+        watched = [run.capture.ids[row] for row in trained.watched]
+        curves.write(folder, trained.result.history, watched)
+        curve = with_extra(save_curve, folder / "psnr_over_time.png", run, trained)
+        if curve is not None:
+            figures.append(
+                report.Figure(curve, "PSNR of a few held-out frames while it trained.")
+            )
+        film = with_extra(
+            save_film, folder / "scene.mp4", run, renderer, state, ms_per_frame / 1e3
         )
-    film = with_extra(
-        save_film, folder / "scene.mp4", run, renderer, state, ms_per_frame / 1e3
-    )
-    player, unplayed = save_player(folder, run, trained)
-    save_depth(folder / "depth", run.capture, scored)
-    saved = run.representation.save(
-        folder, run.spec, run.metadata, state, effects=run.effects
-    )
-    fitted, gain = score_halves(run, state, scored, ms_per_frame / 1e3)
-    numbers, remarks = quality.measure(
-        run, state, trained.draw, scored, extra, ms_per_frame / 1e3
-    )
-    metrics = heldout.metrics(numbers)
-    metrics += [*measured(run, trained, scored, ms_per_frame, began), *fitted]
-    metrics += model_size(saved)
-    save_metrics(folder / "metrics.json", metrics)
-    warnings = floors_text.warnings(numbers)
-    notes = [*warnings, trained.result.message, *_capture_notes(run), *left_out]
-    notes += [*remarks, *gain, *saved.notes, *unplayed]
-    step_ms, unprofiled = profile()
-    notes += unprofiled
+        player, unplayed = save_player(folder, run, trained)
+        save_depth(folder / "depth", run.capture, scored)
+        saved = run.representation.save(
+            folder, run.spec, run.metadata, state, effects=run.effects
+        )
+        fitted, gain = score_halves(run, state, scored, ms_per_frame / 1e3)
+        numbers, remarks = quality.measure(
+            run, state, trained.draw, scored, extra, ms_per_frame / 1e3
+        )
+        metrics = heldout.metrics(numbers)
+        metrics += [*measured(run, trained, scored, ms_per_frame, began), *fitted]
+        metrics += model_size(saved)
+        save_metrics(folder / "metrics.json", metrics)
+        warnings = floors_text.warnings(numbers)
+        notes = [*warnings, trained.result.message, *_capture_notes(run), *left_out]
+        notes += [*remarks, *gain, *saved.notes, *unplayed]
+        step_ms, unknown = profile()
+    notes += unknown
     following = _next(folder, run, trained)
     page = report.write(
         folder,
@@ -306,35 +308,45 @@ def save_player(
     return [report.Figure(picture, caption, player.path.name)], []
 
 
-Profile = tuple[dict[str, float], list[str]]
+class Profile(NamedTuple):
+    """Where the time of a step goes."""
+
+    step_ms: dict[str, float]  # by part
+    notes: list[str]  # why it is not known
 
 
-def begin_profile(run: Run, state: TrainState) -> Callable[[], Profile]:
-    """Begin to compile the parts of a step; the call times them, in milliseconds.
+@contextlib.contextmanager
+def profiling(run: Run, state: TrainState) -> Iterator[Callable[[], Profile]]:
+    """Compile the parts of a step meanwhile; the call that it gives times them.
 
-    A note says why where that fails: the run keeps all its other products.
+    Whatever fails in that becomes a note: the run keeps all its other products. Left by
+    an error, what is not compiled yet is dropped.
     """
 
-    def failed(error):
+    def refused(error):
         words = f"{type(error).__name__}: {error}"
-        return {}, [f"Where the time of a step goes was not measured: {words}"]
-
-    frames = evaluation.frames_of(run.capture, run.model.required_data)
-    try:
-        time_parts = run.representation.step_parts(
-            run.spec, run.metadata, run.model, state, frames, effects=run.effects
-        )
-    except Exception as error:
-        refused = failed(error)
-        return lambda: refused
+        return Profile({}, [f"Where the time of a step goes is not known: {words}"])
 
     def timed():
         try:
-            return time_parts(), []
+            return Profile(parts.ms(), [])
         except Exception as error:
-            return failed(error)
+            return refused(error)
 
-    return timed
+    frames = evaluation.frames_of(run.capture, run.model.required_data)
+    try:
+        parts = run.representation.step_parts(
+            run.spec, run.metadata, run.model, state, frames, effects=run.effects
+        )
+    except Exception as error:
+        profile = refused(error)
+        yield lambda: profile
+        return
+    try:
+        yield timed
+    except BaseException:
+        parts.drop()
+        raise
 
 
 def save_depth(folder: pathlib.Path, capture: Capture, scored: Scored) -> None:
@@ -355,7 +367,8 @@ def _next(folder, run, trained):
     if trained.result.steps < run.spec.steps:
         line = commands.resume(folder)
         return [looked, report.Command("Train it to the end:", line)]
-    longer = dataclasses.replace(run.config, steps=2 * run.spec.steps)
+    others = tuple(o for o in run.config.overrides if not o.startswith("steps="))
+    longer = dataclasses.replace(run.config, steps=2 * run.spec.steps, overrides=others)
     line = commands.reconstruct(longer)
     return [looked, report.Command("Train it twice as long:", line)]
 

@@ -83,6 +83,8 @@ def reconstruct(
             if out is not None:
                 out = pathlib.Path(out)
                 run_folder.check_free(out)
+            if config.preset is not None:
+                scene_spec(config)  # refuses a wrong one before minutes of looking
             config = _with_cameras(config, out, prepare)
             run = _new_run(config, effects)
             _describe(run)
@@ -169,10 +171,8 @@ def _steps_given(config):
 
 
 def _new_run(config, effects):
-    if config.preset is not None:
-        scene_spec(config)  # refuses a wrong preset before half a minute's look
-        if effects == "preset":
-            return new_run(config)
+    if config.preset is not None and effects == "preset":
+        return new_run(config)
     stored = stored_capture(config.source, config.seed)
     chosen, lines = config, []
     if config.preset is None:

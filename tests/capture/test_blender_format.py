@@ -217,6 +217,8 @@ def test_nerfstudio_points_masks_and_lists(tmp_path):
     )
     capture = blender_format.read(tmp_path)
     assert capture.ids[capture.heldout[0]] == "images_r_8"
+    again = blender_format.read(tmp_path, heldout=3)  # of all
+    assert [again.ids[row][-1] for row in again.heldout] == ["1", "4", "7"]
     assert (~capture.valid).sum() == 1
     assert not capture.valid[0, 1, 2]
     assert capture.points.colour[7].tolist() == [0, 200, 0]
@@ -227,6 +229,19 @@ def test_nerfstudio_points_masks_and_lists(tmp_path):
     assert 4.3 < capture.far / capture.scale < 6.5
     corners = np.concatenate([capture.points.position, capture.cameras.position])
     assert np.linalg.norm(np.ptp(corners, axis=0)) < 1.2  # unit diagonal but outliers
+
+
+def test_of_frames_listed_to_learn_from_alone_some_are_held_out(tmp_path):
+    make(tmp_path, {"": 9}, top=LENS)
+    file = tmp_path / "transforms.json"
+    table = json.loads(file.read_text())
+    names = [entry["file_path"] for entry in table["frames"]]
+    dump(file, table | {"train_filenames": names[1:]})
+    capture = blender_format.read(tmp_path)
+    assert sorted(name[-1] for name in capture.ids) == list("12345678")
+    assert [capture.ids[row][-1] for row in capture.heldout] == ["5"]
+    with pytest.raises(CaptureError, match="heldout=0 leaves nothing"):
+        blender_format.read(tmp_path, heldout=0)
 
 
 def test_missing_pictures_are_listed_or_left_out(tmp_path):

@@ -120,6 +120,7 @@ def test_everything_in_the_files_arrives(tmp_path):
         ((2,), {"factor": 4}, (3, 2)),
         ((1,), {"max_side": 7}, (6, 4)),
         ((2,), {"max_side": 100}, (6, 4)),
+        ((2,), {"max_side": 4}, (3, 2)),  # a third would do, and cannot be made
     ],
 )
 def test_a_factor_is_read_or_made_and_points_keep_their_place(

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import OpenEXR
+import PIL.Image
 import pytest
 
 from nerfies_jax.capture import capture as captures
@@ -126,11 +127,15 @@ def test_depths_of_any_scale_are_brought_to_the_points_at_rest(inverse):
     assert given_depth.aligned(noise, tracks, RestPoints(None, None, depth))[1] > 0.1
 
 
-def test_paths_lean_on_depths_given(tmp_path):
+@pytest.mark.parametrize("kind", ["exr", "png"])
+def test_paths_lean_on_depths_given(tmp_path, kind):
     capture = films.film(**MOVES, frames=24)
     for row, name in enumerate(capture.ids):
-        depth = (7 + 0.1 * row) * capture.depths[row]
-        OpenEXR.File({}, {"Z": depth}).write(str(tmp_path / f"{name}.exr"))
+        depth, path = (7 + 0.1 * row) * capture.depths[row], tmp_path / f"{name}.{kind}"
+        if kind == "exr":
+            OpenEXR.File({}, {"Z": depth}).write(str(path))
+        else:  # as depth cameras write it: millimetres, far below the whole of 16 bits
+            PIL.Image.fromarray(np.round(100 * depth).astype(np.uint16)).save(path)
     evidence = record.gather(with_files(capture, depths=tmp_path))
     own = gathered()[1]
     off, without = (

@@ -107,6 +107,25 @@ def test_a_path_leaves_with_its_times(splats, capsys):
     assert "own number of frames" in error
 
 
+def test_a_path_leaves_as_training_found_the_cameras(splats, tmp_path, monkeypatch):
+    def found(params, capture):
+        cameras = capture.cameras
+        moved = cameras._replace(position=cameras.position + np.float32([0.25, 0, 0]))
+        return dataclasses.replace(capture, cameras=moved)
+
+    def positions(name):
+        words = ("path", "--path", "captured", "--out", tmp_path / f"{name}.json")
+        assert main(splats, *words) == 0
+        table = json.loads((tmp_path / f"{name}.json").read_text())["camera_path"]
+        return np.array([each["camera_to_world"] for each in table])[:, 3:12:4]
+
+    before, run = positions("before"), runs.saved_run(splats)
+    refined = run._replace(model=run.model._replace(found=found))
+    monkeypatch.setattr(runs, "saved_run", lambda folder: refined)
+    moved = positions("after") - before
+    np.testing.assert_allclose(np.abs(moved).max(axis=1), 0.25, rtol=1e-5)
+
+
 def test_gaussians_leave_at_an_instant_and_as_a_sequence(splats, tmp_path, capsys):
     assert main(splats, "ply", "--time", "0.4") == 0
     path = splats / "exports" / "at-0.4.ply"

@@ -69,6 +69,7 @@ BAD = {
     "rows outside": ({}, ["--heldout", "15:25"], "15:25"),
     "rows as words": ({}, ["--heldout", "some"], "some"),
     "train alone": ({}, ["--train", "0:5"], "--heldout"),
+    "rows twice": ({}, ["--heldout", "5:9", "--train", "0:7"], "share row 5"),
 }
 
 

@@ -16,6 +16,7 @@ from gaussians_jax import step_time
 from nerfies_jax import runs
 from nerfies_jax.capture import exr, images, nerfies_format, video
 from nerfies_jax.evaluation import floors, pictures
+from nerfies_jax.measure import part_time
 from nerfies_jax.runs import products, quality, reconstruction, train
 from nerfies_jax.runs.run_folder import CHECKPOINTS
 from nerfies_jax.training import rate
@@ -69,7 +70,7 @@ PRODUCTS = (
 def test_a_capture_becomes_splats_and_a_report(tmp_path, monkeypatch, capsys):
     # The run below times the parts of a step, half of all there is to compile.
     monkeypatch.setattr(step_time, "part", jax.eval_shape)
-    monkeypatch.setattr(step_time, "parts_ms", lambda parts: dict.fromkeys(parts, 1.0))
+    monkeypatch.setattr(part_time, "parts_ms", lambda parts: dict.fromkeys(parts, 1.0))
     monkeypatch.setattr(quality, "CACHE", tmp_path / "cache")
     nerfies_format.write(scenes.tiny_capture(), tmp_path / "filmed")
     out = tmp_path / "run"

@@ -108,6 +108,17 @@ def test_opacities_that_a_motion_drives_to_the_ends_stay_finite(swaying):
     np.testing.assert_allclose(1 / (1 + np.exp(-logit[active])), ends[active], 0, 1e-6)
 
 
+@pytest.mark.hard_cases
+def test_scales_that_a_motion_takes_below_zero_keep_their_size(swaying):
+    rows = swaying[1].params.rows["splats"]
+    deformed = jax.jit(splats.activate)(rows)
+    through = deformed._replace(scale=deformed.scale * put([1.0, -1.0, -0.5]))
+    as_rows = jax.jit(instants._as_rows)(rows, through)
+    np.testing.assert_allclose(
+        np.exp(as_rows.log_scale), np.abs(through.scale), rtol=1e-5
+    )
+
+
 def test_a_field_and_a_time_outside_have_no_gaussians(swaying):
     model, state = swaying
     with pytest.raises(ValueError, match=r"time 1\.5: the capture runs from 0 to 1"):

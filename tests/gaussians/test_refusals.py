@@ -31,6 +31,7 @@ from gaussians_jax.effects.motion_basis import BasisMotionSpec
 from gaussians_jax.effects.motion_flow import FlowSpec
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec
 from gaussians_jax.effects.neighbours import NeighbourSpec
+from gaussians_jax.effects.polynomial_motion import PolynomialMotionSpec
 from gaussians_jax.effects.spectral import FourierSpec, SpectralSpec, WaveletSpec
 from gaussians_jax.effects.temporal_opacity import TemporalOpacitySpec
 from gaussians_jax.initialisation import InitSpec, StartSpec
@@ -129,11 +130,12 @@ SETTINGS = [
     (SpectralSpec, dict(wavelet=None, fourier=None), "both None"),
     (SpectralSpec, dict(gate="open"), "unknown gate 'open'"),
     (SpectralSpec, dict(opening=1.0), "opening=1.0"),
-    (SpectralSpec, dict(floor=0.5), "floor=0.5"),
+    (SpectralSpec, dict(gate="floor", floor=0.5), "floor=0.5"),
     (SpectralSpec, dict(learning_rate=0.0), "learning_rate=0.0"),
     (SpectralSpec, dict(after=-1), "after=-1"),
     (SplatScene, dict(steps=0), "at least one step"),
     (SplatScene, dict(steps=10, sh_degree=4), "0, 1, 2 or 3"),
+    (SplatScene, dict(steps=10, sh_every=0), "sh_every=0"),
     (SplatScene, dict(steps=10, dssim_weight=1.5), r"\[0, 1\]"),
     (WaveletSpec, dict(levels=0), "levels=0"),
     (WaveletSpec, dict(most=0.0), "most=0.0"),
@@ -150,6 +152,12 @@ SETTINGS = [
 def test_settings_that_cannot_work_are_refused(make, setting, words):
     with pytest.raises(ValueError, match=words):
         make(**setting)
+
+
+def test_settings_that_can_work_are_taken():
+    assert SpectralSpec(opening=0.03).floor == 0.05  # which no learned gate reads
+    hard = MotionGrowthSpec(form="hard", start=3)
+    moba(motion_growth=hard, start=StartSpec("tracks"))  # moves from the first step
 
 
 def some_rows(count=7):
@@ -204,6 +212,12 @@ CALLS = [
     (lambda: moba(motion=None), "without a motion"),
     (lambda: moba(motion=scenes.TINY_MOTION, neighbours=NeighbourSpec()),
      "neighbours=none"),
+    (lambda: spec.effects_of(
+        dataclasses.replace(scenes.TINY_DEFORMABLE, neighbours=NeighbourSpec()),
+        spec.SceneMetadata(1.0, (0.0, 0.0, 0.0), 3)),
+     "neighbours=none"),
+    (lambda: moba(motion=PolynomialMotionSpec(), carried=CarriedSpec()),
+     "motion.fading=none"),
     (lambda: moba(densification=None), "motion_growth=none"),
     (lambda: moba(densification=MCMCStrategySpec()), "threshold of Default"),
     (lambda: moba(flow=FlowSpec(), carried=CarriedSpec()), "flow=none"),

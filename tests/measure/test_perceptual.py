@@ -169,6 +169,17 @@ def test_half_precision_pictures_are_compared_in_float32(tiny, rng):
     assert float(distance) == float(expected)
 
 
+@pytest.mark.full
+@pytest.mark.hard_cases
+def test_more_pixels_than_half_precision_counts_are_averaged(tiny, rng):
+    half = [x.astype(np.float16) for x in rng.random((2, 260, 256, 3))]
+    mask = np.ones((260, 256), bool)
+    scored = jax.jit(perceptual.masked_lpips, static_argnums=1)
+    distance = scored(tiny, TINY, *half, mask)
+    expected = scored(tiny, TINY, *(x.astype(np.float32) for x in half), mask)
+    np.testing.assert_allclose(distance, expected, rtol=1e-3)
+
+
 def test_gradients_agree_with_central_differences(tiny, float64, rng):
     params = jax.tree.map(lambda x: np.asarray(x, np.float64), tiny)
     image, truth = pair(rng, (17, 14))

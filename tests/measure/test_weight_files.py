@@ -111,6 +111,22 @@ def test_damaged_safetensors_are_named(data, tmp_path):
         weight_files.read_tensors(path)
 
 
+def test_an_archive_with_any_byte_changed_is_read_or_named(tmp_path):
+    path = tmp_path / "w.npz"
+    np.savez_compressed(path, w=np.arange(300.0))
+    whole, refused = path.read_bytes(), []
+    for place in range(0, len(whole), 3):
+        damaged = bytearray(whole)
+        damaged[place] ^= 255
+        path.write_bytes(damaged)
+        try:
+            weight_files.read_tensors(path)
+        except ValueError as error:
+            refused.append(str(error))
+    assert len(refused) > len(whole) / 6
+    assert all("w.npz: not a readable" in words for words in refused)
+
+
 def test_unknown_kinds_and_missing_files_are_named(tmp_path):
     with pytest.raises(ValueError, match=r"w\.onnx: weights come as \.npz"):
         weight_files.read_tensors(tmp_path / "w.onnx")

@@ -190,6 +190,10 @@ def test_the_reference_values_of_4dgs_are_met(dtype, oracle_dir):
         assert abs(ours - stored[theirs]) < 1e-6
 
 
+def test_two_moments_change_evenly():
+    assert planes.time_smoothness(jnp.arange(12.0).reshape(2, 3, 2)) == 0
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [

@@ -9,8 +9,10 @@ import pytest
 
 from nerfies_jax import evaluation, held_out_codes
 from nerfies_jax import scene as nerf_scene
+from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.training.model import TrainState
 from tests import scenes
+from tests.radiance.test_skipping import GUIDED, ORANGE, full_of_holes
 from tests.scenes import TINY_FIELD
 
 
@@ -52,6 +54,23 @@ def test_a_code_is_found_again_from_half_a_picture_if_that_was_filmed():
     valid[:, :, :20] = False
     before, after = before_and_after(dataclasses.replace(filmed, valid=valid))
     np.testing.assert_allclose(after.psnr, before.psnr, atol=1e-3)
+
+
+@pytest.mark.slow
+def test_codes_are_fitted_to_the_samples_that_a_picture_is_made_of():
+    spec = dataclasses.replace(GUIDED, appearance=AppearanceSpec(2))
+    model, params = full_of_holes(spec, ORANGE)
+    metadata, capture = model.spec[1], scenes.tiny_capture()
+    field, rows = nerf_scene.field(spec, metadata), capture.heldout[:1]
+    view, step = evaluation.view_of(capture, int(rows[0])), jnp.asarray(30, jnp.int32)
+    codes = field.codes_at(params, view)
+    codes["appearance"] = jnp.asarray([3.0, -4.0])
+    draw = jax.jit(field.render, static_argnums=4)
+    colour = draw(params, view.camera, view.time, codes, capture.size, step).colour
+    capture.images[rows[0]] = evaluation.as_picture(np.asarray(colour))
+    state = TrainState(params, (), (), step, jax.random.key(0))
+    scored = held_out_codes.score(spec, metadata, state, capture, rows)
+    assert scored.psnr[0] > 48  # of evenly spread samples: 33
 
 
 def test_a_field_without_codes_has_none_to_fit():

@@ -104,9 +104,9 @@ def test_every_family_can_be_built_with_its_effects_on_and_off():
     capture = scenes.tiny_capture()
     for kind in representations.installed().values():
         for preset in kind.presets:
-            for choice in (True, False):
-                wanted = findings(**dict.fromkeys(EFFECTS, choice))
-                advice = adviser.advise_for(wanted, preset)
+            for choice, others in ((True, True), (False, False), (False, True)):
+                wanted = dict.fromkeys(EFFECTS, others) | {"motion": choice}
+                advice = adviser.advise_for(findings(**wanted), preset)
                 spec = specs.override(kind.presets[advice.preset], advice.overrides)
                 kind.build(spec, kind.metadata_of(capture, spec))
                 if kind.name == "gaussians":

@@ -191,4 +191,32 @@ def test_what_cannot_be_prepared_is_refused_and_leaves_nothing(pictures, tmp_pat
         preparation.prepare(tmp_path / "nothing", tmp_path / "out")
     with pytest.raises(ValueError, match="choose from a film"):
         preparation.prepare(pictures, tmp_path / "out", Preparation(frames=5))
+    with pytest.raises(CaptureError, match="maskz: no such folder of masks"):
+        preparation.prepare(
+            pictures, tmp_path / "out", Preparation(masks=tmp_path / "maskz")
+        )
     assert [path.name for path in tmp_path.iterdir()] == ["photographs"]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"threads": 0}, "threads=0"),
+        ({"max_side": 8}, "max_side=8"),
+        ({"frames": 9, "fps": 2.0}, "not both"),
+    ],
+)
+def test_wrong_settings_are_refused_before_a_film_is_read(wrong, words):
+    with pytest.raises(ValueError, match=words):
+        Preparation(**wrong)
+
+
+def test_a_wrong_preset_is_refused_before_cameras_are_looked_for(tmp_path, mapper):
+    frames = [models.picture(row).repeat(2, 0).repeat(2, 1) for row in range(9)]
+    video.write_video(tmp_path / "clip.mp4", frames, 30)
+    source = CaptureSource(tmp_path / "clip.mp4")
+    for config in (RunConfig("nerf-smal", source), RunConfig("nerf", source, steps=0)):
+        with pytest.raises(reconstruction.Refused):
+            reconstruction.reconstruct(config, tmp_path / "run")
+    assert mapper.calls == []
+    assert [path.name for path in tmp_path.iterdir()] == ["clip.mp4"]

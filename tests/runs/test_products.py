@@ -1,5 +1,6 @@
 """What a run tells of its size and speed, and what it keeps where a part fails."""
 
+import pathlib
 import types
 
 import jax
@@ -9,7 +10,7 @@ import numpy as np
 from nerfies_jax.evaluation.representation import Saved
 from nerfies_jax.runs import products, representations
 from nerfies_jax.runs.config import RunConfig
-from nerfies_jax.runs.run import Run
+from nerfies_jax.runs.run import Run, scene_spec
 from nerfies_jax.runs.train import Trained
 from nerfies_jax.training.model import Rendering, TrainState
 from tests import scenes
@@ -50,9 +51,21 @@ def test_a_profile_that_fails_loses_nothing_but_itself():
     kind = representations.named("gaussians")
     model = types.SimpleNamespace(required_data=frozenset())
     state = TrainState(None, None, None, jnp.int32(0), jax.random.key(0))
-    for step_parts in (refuses, lambda *_, **__: refuses):
+    unready = types.SimpleNamespace(ms=refuses)
+    for step_parts in (refuses, lambda *_, **__: unready):
         failing = kind._replace(step_parts=step_parts)
         run = Run(config, capture, capture, failing, None, None, model)
-        step_ms, (note,) = products.begin_profile(run, state)()
+        with products.profiling(run, state) as profile:
+            step_ms, (note,) = profile()
         assert step_ms == {}
-        assert "was not measured: KeyError: 'kept'" in note
+        assert "is not known: KeyError: 'kept'" in note
+
+
+def test_twice_as_long_is_twice_as_long_whoever_set_the_steps():
+    config = RunConfig("splats-static-small", overrides=("steps=40", "sh_degree=0"))
+    run = types.SimpleNamespace(config=config, spec=scene_spec(config))
+    result = types.SimpleNamespace(stopped_by="steps", steps=40)
+    *_, longer = products._next(
+        pathlib.Path("run"), run, types.SimpleNamespace(result=result)
+    )
+    assert longer.line.endswith("--steps 80 --set sh_degree=0")

@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import pathlib
-import zipfile
 from typing import NamedTuple
 
 import jax
@@ -12,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from nerfies_jax import data_parallel
+from nerfies_jax.capture import npz_files
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.given import Given
 from nerfies_jax.capture.synthetic import trace
@@ -196,19 +196,18 @@ def save(truth: SceneTruth, path: pathlib.Path):
 def load(path: pathlib.Path) -> SceneTruth:
     """Read what `save` wrote; ValueError for what it did not write."""
     try:
-        opened = np.load(path, allow_pickle=False)
-    except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
+        stored = npz_files.read_arrays(path)
+    except (OSError, ValueError) as error:
         raise ValueError(
             f"{path}: no scene truth ({error}); delete it and make the scene again"
         ) from error
-    with opened as stored:
-        missing = set(SceneTruth._fields) - set(stored.files)
-        if missing:
-            raise ValueError(
-                f"{path} holds no {sorted(missing)[0]!r}, so it is no scene truth of "
-                "this version; delete it and make the scene again"
-            )
-        fields = {name: stored[name] for name in SceneTruth._fields}
+    missing = set(SceneTruth._fields) - set(stored)
+    if missing:
+        raise ValueError(
+            f"{path} holds no {sorted(missing)[0]!r}, so it is no scene truth of "
+            "this version; delete it and make the scene again"
+        )
+    fields = {name: stored[name] for name in SceneTruth._fields}
     for name in ("ids", "thing_names"):
         fields[name] = tuple(str(word) for word in fields[name])
     return SceneTruth(**fields)
