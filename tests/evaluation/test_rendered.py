@@ -217,9 +217,14 @@ def test_a_scene_in_stages_is_drawn_as_in_one(moving):
     assert np.abs(first - last).max() > 0.05
     for view in views:
         picture, expected = staged(state, view), whole(state, view)
-        for name in Rendering._fields:
+        # Depth is a quotient by an opacity, and processors differ in how sums are cut.
+        for name, rtol in (("colour", 1e-7), ("alpha", 1e-7), ("depth", 3e-5)):
             np.testing.assert_allclose(
-                getattr(picture, name), getattr(expected, name), atol=3e-6, err_msg=name
+                getattr(picture, name),
+                getattr(expected, name),
+                rtol=rtol,
+                atol=3e-6,
+                err_msg=name,
             )
 
 
