@@ -1,6 +1,7 @@
 """Equal shares of one step, one after the other or on a device each."""
 
-from collections.abc import Callable, Iterator
+import functools
+from collections.abc import Callable, Hashable, Iterator
 from typing import Any
 
 import jax
@@ -51,25 +52,31 @@ def on_devices(
     return spread(jnp.arange(0, shares, each), *inputs)
 
 
-def rows_on_devices(work: Callable[..., PyTree], rows: PyTree) -> Iterator[PyTree]:
-    """`work(*row)` for each row of the leaves of a tuple, as NumPy, in their order.
+def rows_on_devices(
+    work: Callable[..., PyTree], fixed: Hashable, rows: PyTree
+) -> Iterator[PyTree]:
+    """`work(fixed, *row)` for each row of the leaves of a tuple, as NumPy, in order.
 
-    One row at a time on each of this process's devices, all by one compiled program.
+    One row at a time on each of this process's devices, all by one program, which is
+    compiled once for a `work` and what is `fixed`.
     """
     count = len(jax.tree.leaves(rows)[0])
     devices = min(jax.local_device_count(), max(count, 1))
-
-    def one(share, few):
-        return work(*jax.tree.map(lambda leaf: leaf[share], few))
-
-    together = jax.jit(lambda few: on_devices(one, devices, devices, few))
     for start in range(0, count, devices):
         # The last rows again where fewer are left than there are devices.
         chosen = np.minimum(np.arange(start, start + devices), count - 1)
         few = jax.tree.map(lambda leaf, chosen=chosen: np.asarray(leaf)[chosen], rows)
-        done = jax.device_get(together(few))
+        done = jax.device_get(_one_each(work, fixed, devices, few))
         for share in range(min(devices, count - start)):
             yield jax.tree.map(lambda leaf, share=share: leaf[share], done)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1, 2))
+def _one_each(work, fixed, devices, rows):
+    def one(share, rows):
+        return work(fixed, *jax.tree.map(lambda leaf: leaf[share], rows))
+
+    return on_devices(one, devices, devices, rows)
 
 
 def shared(tree: PyTree, devices: int) -> PyTree:

@@ -34,20 +34,24 @@ def trained(devices):
     return toy.fit(toy.frames(), model=model, steps=8)  # an event after seven
 
 
+def weighed(factor, row, more):
+    return factor * jnp.sum(row) + more
+
+
 def sums_of_rows():
     """Of three rows: two devices are left with one."""
     rows = np.arange(6.0).reshape(3, 2), np.array([10.0, 20.0, 30.0])
-    sums = data_parallel.rows_on_devices(lambda x, y: jnp.sum(x) + y, rows)
+    sums = data_parallel.rows_on_devices(weighed, 2.0, rows)
     return [float(each) for each in sums]
 
 
 def test_each_row_is_worked_on_once_and_in_order():
-    assert sums_of_rows() == [11.0, 25.0, 39.0]
+    assert sums_of_rows() == [12.0, 30.0, 48.0]
 
 
 def both(devices):
     assert jax.local_device_count() == devices
-    assert sums_of_rows() == [11.0, 25.0, 39.0]
+    assert sums_of_rows() == [12.0, 30.0, 48.0]
     one, several = trained(1), trained(devices)
     for ours, plain in zip(
         *map(jax.tree.leaves, (several.state, one.state)), strict=True

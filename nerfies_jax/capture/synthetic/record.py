@@ -1,7 +1,6 @@
 """A synthetic scene as a `Capture`, in memory, as a directory, or from a cache."""
 
 import dataclasses
-import functools
 import hashlib
 import pathlib
 from concurrent.futures import ThreadPoolExecutor
@@ -103,10 +102,9 @@ def digest(spec: SceneSpec, seed: int = 0) -> str:
 
 
 def _film(spec, plan):
-    picture = functools.partial(film.picture, spec)
     rows = plan.cameras, plan.time, plan.light_gain, plan.transient_shown
     images, depths, hits = [], [], []
-    for taken in data_parallel.rows_on_devices(picture, rows):
+    for taken in data_parallel.rows_on_devices(film.picture, spec, rows):
         images.append(np.round(taken.image * 255).astype(np.uint8))
         depths.append(taken.depth)
         hits.append(taken.hit)

@@ -126,7 +126,7 @@ def flows(spec: SceneSpec, plan: Schedule, hits: trace.Hit) -> tuple[Flow, Flow]
     )
     shift = np.zeros((2 * count, height, width, 2), np.float32)
     seen = np.zeros((2 * count, height, width), bool)
-    led = data_parallel.rows_on_devices(functools.partial(flow, spec), pairs)
+    led = data_parallel.rows_on_devices(flow, spec, pairs)
     for index, result in zip(np.flatnonzero(known), led, strict=True):
         shift[index], seen[index] = result
     forward = Flow(shift[:count], seen[:count])
