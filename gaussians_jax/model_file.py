@@ -19,7 +19,6 @@ import json
 import os
 import pathlib
 import zipfile
-import zlib
 from typing import Any
 
 import jax
@@ -28,6 +27,7 @@ import numpy as np
 
 from gaussians_jax import splats
 from gaussians_jax.splats import Params
+from nerfies_jax.capture import npz_files
 from nerfies_jax.capture.json_files import replaced_file
 from nerfies_jax.training import specs
 
@@ -92,10 +92,7 @@ def load(path: str | os.PathLike) -> tuple[Params, dict[str, Any]]:
 
 
 # What reading bytes that anyone may have written can raise, beside BadZipFile.
-_BROKEN = (
-    *(ValueError, KeyError, TypeError, AttributeError, IndexError, RecursionError),
-    *(OSError, EOFError, zlib.error, NotImplementedError, RuntimeError, MemoryError),
-)
+_BROKEN = (*npz_files.DAMAGED, OSError, MemoryError)
 
 
 def _line(error):

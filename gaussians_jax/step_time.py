@@ -29,9 +29,9 @@ def parts(
 ) -> StepParts:
     """Begin to compile the parts of one step, forward and backward.
 
-    Their times are medians of warm calls, in milliseconds. Each part is
-    timed by itself on the first frame and one device, and counted for as many views as
-    a device draws in a step; "rest" is what they leave of the whole step.
+    Their times are medians of warm calls, in milliseconds, each part timed by itself on
+    the first frame and one device, and counted for as many views as a device draws in a
+    step. "rest" is what they leave of the whole step.
     """
     effects = scene.all_effects(spec, metadata, effects)
     condition = FrameCondition(frames.times[0], step=state.step, key=state.key)

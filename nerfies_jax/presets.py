@@ -154,13 +154,12 @@ NSFF = dataclasses.replace(
 # 6000, coarse to fine, so that the program and the checkpoints keep their shapes: until
 # the finest opens, only the vertices of a grid of a quarter (then half) of the cells
 # learn. It marches through the box by half a cell and skips what is empty; here samples
-# go where a first look found weight. Densities are exponential, not a shifted
-# softplus, and begin as thin as there (1e-3 of opacity in half a cell). The network of
-# the motion learns at the common rate, there at 7e-4. A weight of 0.02 gives each
-# difference its slope there: 1e-5, over 4096 rays, over 6, times 160 / 128. It counts
-# at all vertices to the end; there after 10 000 steps where a step had touched them.
-# Its losses of each sample's colour and of the last transmittance, its points at rest
-# and its codes of cameras are not there.
+# go where a first look found weight. Densities are exponential, not a shifted softplus,
+# and begin as thin as there (1e-3 of opacity in half a cell). The motion learns at the
+# common rate, there at 7e-4. Differences have the slope that they have there, 1e-5 /
+# 4096 rays / 6 * 160 / 128; from step 10 000 on, there only where a step touched them.
+# Losses of each sample's colour and of the last transmittance, points at rest and codes
+# of cameras are not there.
 TINEUVOX = RadianceScene(
     steps=20_000,
     rays=4096,

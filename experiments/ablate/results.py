@@ -63,12 +63,7 @@ def read(path: pathlib.Path, identity: dict[str, Any]) -> ArmResult | None:
         numbers = {name: stored["numbers"].get(name) for name in MEASURES}
         arrays = npz_files.read_arrays(path.with_suffix(".npz"))
         made_with, notes = stored["identity"], stored["notes"]
-    except (
-        KeyError,
-        TypeError,
-        ValueError,
-        OSError,
-    ) as error:
+    except (KeyError, TypeError, ValueError, OSError) as error:
         raise ValueError(
             f"{path}: not a finished arm ({error}); remove it to run it again"
         ) from error

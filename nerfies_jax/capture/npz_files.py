@@ -9,7 +9,7 @@ from nerfies_jax.capture.json_files import AnyPath
 
 # What zipfile, zlib and NumPy raise for damaged bytes, beside OSError. A RuntimeError
 # is an unknown compression or a password, an AttributeError a .npy.
-_DAMAGED = (
+DAMAGED = (
     *(ValueError, KeyError, TypeError, AttributeError, IndexError, EOFError),
     *(zipfile.BadZipFile, zlib.error, RuntimeError),
 )
@@ -24,6 +24,6 @@ def read_arrays(path: AnyPath) -> dict[str, np.ndarray]:
         # Opened here: where it is no archive, NumPy leaves the file open.
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
             return {name: stored[name] for name in stored.files}
-    except _DAMAGED as error:
+    except DAMAGED as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ValueError(reason) from error

@@ -14,7 +14,6 @@ import pathlib
 import pickle
 import struct
 import zipfile
-import zlib
 
 import ml_dtypes
 import numpy as np
@@ -51,7 +50,7 @@ def read_tensors(path: str | pathlib.Path) -> dict[str, np.ndarray]:
     """
     path = pathlib.Path(path)
     readers = {
-        ".npz": _read_npz,
+        ".npz": npz_files.read_arrays,
         ".safetensors": _read_safetensors,
         ".pth": _read_torch,
         ".pt": _read_torch,
@@ -65,27 +64,15 @@ def read_tensors(path: str | pathlib.Path) -> dict[str, np.ndarray]:
     except FileNotFoundError:
         raise ValueError(f"{path}: no such file") from None
     except (
+        *npz_files.DAMAGED,
         pickle.UnpicklingError,
-        zipfile.BadZipFile,
-        zlib.error,
         struct.error,
-        AttributeError,
-        EOFError,
-        IndexError,
-        KeyError,
-        RuntimeError,  # zipfile, of an unknown compression or a password
-        TypeError,
-        ValueError,
         OSError,
     ) as error:
         raise ValueError(
             f"{path}: not a readable {path.suffix} of tensors ({error}); "
             "download or export it again"
         ) from error
-
-
-def _read_npz(path):
-    return npz_files.read_arrays(path)
 
 
 def _read_safetensors(path):

@@ -1,13 +1,11 @@
 """What a finished run leaves behind: scores, pictures, a film, depth, a report."""
 
-import contextlib
 import dataclasses
 import json
 import math
 import pathlib
 import time
-from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from collections.abc import Callable
 
 import numpy as np
 
@@ -20,7 +18,15 @@ from nerfies_jax.evaluation import Renderer, Scored, heldout, pictures
 from nerfies_jax.evaluation.representation import Saved
 from nerfies_jax.measure import clock
 from nerfies_jax.measure.clock import Metric
-from nerfies_jax.runs import budget, commands, curves, floors_text, quality, report
+from nerfies_jax.runs import (
+    budget,
+    commands,
+    curves,
+    floors_text,
+    quality,
+    report,
+    step_profile,
+)
 from nerfies_jax.runs.run import Run, with_found_cameras
 from nerfies_jax.runs.run_folder import CONFIG
 from nerfies_jax.runs.train import Trained
@@ -56,7 +62,9 @@ def make(
             "finite"
         )
     ms_per_frame = renderer.ms_per_frame(len(scored.rows))
-    with profiling(run, state) as profile:  # compiles while all else is written
+    with step_profile.profiling(
+        run, state
+    ) as profile:  # compiles while all else is written
         comparison = save_comparison(folder / "comparison.png", run.filmed, scored)
         figures = [report.Figure(comparison, COMPARED)]
         watched = [run.capture.ids[row] for row in trained.watched]
@@ -306,47 +314,6 @@ def save_player(
     print(f"player:     {player.path} ({player.about})")
     caption = f"Play it, look from elsewhere: {player.path.name}. {player.about}"
     return [report.Figure(picture, caption, player.path.name)], []
-
-
-class Profile(NamedTuple):
-    """Where the time of a step goes."""
-
-    step_ms: dict[str, float]  # by part
-    notes: list[str]  # why it is not known
-
-
-@contextlib.contextmanager
-def profiling(run: Run, state: TrainState) -> Iterator[Callable[[], Profile]]:
-    """Compile the parts of a step meanwhile; the call that it gives times them.
-
-    Whatever fails in that becomes a note: the run keeps all its other products. Left by
-    an error, what is not compiled yet is dropped.
-    """
-
-    def refused(error):
-        words = f"{type(error).__name__}: {error}"
-        return Profile({}, [f"Where the time of a step goes is not known: {words}"])
-
-    def timed():
-        try:
-            return Profile(parts.ms(), [])
-        except Exception as error:
-            return refused(error)
-
-    frames = evaluation.frames_of(run.capture, run.model.required_data)
-    try:
-        parts = run.representation.step_parts(
-            run.spec, run.metadata, run.model, state, frames, effects=run.effects
-        )
-    except Exception as error:
-        profile = refused(error)
-        yield lambda: profile
-        return
-    try:
-        yield timed
-    except BaseException:
-        parts.drop()
-        raise
 
 
 def save_depth(folder: pathlib.Path, capture: Capture, scored: Scored) -> None:

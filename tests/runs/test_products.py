@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from nerfies_jax.evaluation.representation import Saved
-from nerfies_jax.runs import products, representations
+from nerfies_jax.runs import products, representations, step_profile
 from nerfies_jax.runs.config import RunConfig
 from nerfies_jax.runs.run import Run, scene_spec
 from nerfies_jax.runs.train import Trained
@@ -55,7 +55,7 @@ def test_a_profile_that_fails_loses_nothing_but_itself():
     for step_parts in (refuses, lambda *_, **__: unready):
         failing = kind._replace(step_parts=step_parts)
         run = Run(config, capture, capture, failing, None, None, model)
-        with products.profiling(run, state) as profile:
+        with step_profile.profiling(run, state) as profile:
             step_ms, (note,) = profile()
         assert step_ms == {}
         assert "is not known: KeyError: 'kept'" in note

@@ -1,0 +1,50 @@
+"""Where the time of a step goes, measured after a run for its report."""
+
+import contextlib
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+from nerfies_jax import evaluation
+from nerfies_jax.runs.run import Run
+from nerfies_jax.training.model import TrainState
+
+
+class Profile(NamedTuple):
+    """Where the time of a step goes."""
+
+    step_ms: dict[str, float]  # by part
+    notes: list[str]  # why it is not known
+
+
+@contextlib.contextmanager
+def profiling(run: Run, state: TrainState) -> Iterator[Callable[[], Profile]]:
+    """Compile the parts of a step meanwhile; the call that it gives times them.
+
+    Whatever fails in that becomes a note: the run keeps all its other products. Left by
+    an error, what is not compiled yet is dropped.
+    """
+
+    def refused(error):
+        words = f"{type(error).__name__}: {error}"
+        return Profile({}, [f"Where the time of a step goes is not known: {words}"])
+
+    def timed():
+        try:
+            return Profile(parts.ms(), [])
+        except Exception as error:
+            return refused(error)
+
+    frames = evaluation.frames_of(run.capture, run.model.required_data)
+    try:
+        parts = run.representation.step_parts(
+            run.spec, run.metadata, run.model, state, frames, effects=run.effects
+        )
+    except Exception as error:
+        profile = refused(error)
+        yield lambda: profile
+        return
+    try:
+        yield timed
+    except BaseException:
+        parts.drop()
+        raise
