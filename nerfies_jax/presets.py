@@ -156,10 +156,9 @@ NSFF = dataclasses.replace(
 # learn. It marches through the box by half a cell and skips what is empty; here samples
 # go where a first look found weight. Densities are exponential, not a shifted softplus,
 # and begin as thin as there (1e-3 of opacity in half a cell). The motion learns at the
-# common rate, there at 7e-4. Differences have the slope that they have there, 1e-5 /
-# 4096 rays / 6 * 160 / 128; from step 10 000 on, there only where a step touched them.
-# Losses of each sample's colour and of the last transmittance, points at rest and codes
-# of cameras are not there.
+# common rate, there at 7e-4. Differences have the slope of there, 1e-5 / 4096 rays / 6
+# * 160 / 128; from step 10 000 on, there only where a step touched them. Losses of
+# samples' colours and the last transmittance, rest points, camera codes: not there.
 TINEUVOX = RadianceScene(
     steps=20_000,
     rays=4096,
