@@ -15,6 +15,14 @@ from tests.evidence.test_tracks import MOVES
 SPLATS = "splats-{}-small"
 
 
+@pytest.fixture(scope="module", autouse=True)
+def one_cache(tmp_path_factory):
+    """What a film shows is found once for all tests of it, and nowhere else."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(representation, "CACHE", tmp_path_factory.mktemp("cache"))
+        yield
+
+
 def noisy():
     """Every picture of its own: there is nothing to carry from one to the next."""
     film = films.film(frames=12)
@@ -30,15 +38,13 @@ def noisy():
         (noisy, "deformable", "only 0 tracks of what moves"),
     ],
 )
-def test_motion_is_chosen_by_what_tracks_say(make, kind, words, tmp_path, monkeypatch):
-    monkeypatch.setattr(representation, "CACHE", tmp_path)
+def test_motion_is_chosen_by_what_tracks_say(make, kind, words):
     choice = representation.default_preset(make())
     assert choice.preset == SPLATS.format(kind)
     assert words in "".join(choice.notes)
 
 
-def test_what_moves_and_cannot_be_followed_is_no_still_scene(tmp_path, monkeypatch):
-    monkeypatch.setattr(representation, "CACHE", tmp_path)
+def test_what_moves_and_cannot_be_followed_is_no_still_scene(monkeypatch):
     monkeypatch.setattr(usable_paths, "LEAST_PATHS", 10**6)
     choice = representation.default_preset(films.film(**MOVES, frames=24))
     assert choice.preset == SPLATS.format("deformable")
@@ -46,8 +52,7 @@ def test_what_moves_and_cannot_be_followed_is_no_still_scene(tmp_path, monkeypat
 
 
 @pytest.mark.parametrize(("asked", "overrides"), [(20, ("motion.bases=20",)), (8, ())])
-def test_paths_of_many_things_get_more_bases(asked, overrides, tmp_path, monkeypatch):
-    monkeypatch.setattr(representation, "CACHE", tmp_path)
+def test_paths_of_many_things_get_more_bases(asked, overrides, monkeypatch):
     monkeypatch.setattr(rigid_groups, "enough", lambda *_: asked)
     choice = representation.default_preset(films.film(**MOVES, frames=24))
     assert choice.overrides == overrides
@@ -56,8 +61,7 @@ def test_paths_of_many_things_get_more_bases(asked, overrides, tmp_path, monkeyp
 
 
 @pytest.mark.parametrize(("a_knot", "knots"), [(3, 20), (0.8, 30), (0.1, 60)])
-def test_long_films_get_more_knots(a_knot, knots, tmp_path, monkeypatch):
-    monkeypatch.setattr(representation, "CACHE", tmp_path)
+def test_long_films_get_more_knots(a_knot, knots, monkeypatch):
     monkeypatch.setattr(representation, "FRAMES_A_KNOT", a_knot)
     choice = representation.default_preset(films.film(**MOVES, frames=24))
     spec = specs.override(PRESETS[choice.preset], choice.overrides)

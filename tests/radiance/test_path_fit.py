@@ -21,6 +21,13 @@ FRAMES = 16
 TRACKS = FieldStartSpec("tracks", fit_steps=300, fit_rate=2e-3)
 
 
+@pytest.fixture(autouse=True)
+def few_points_a_step(monkeypatch):
+    """One body and a wall ask for no more; a third of the time."""
+    monkeypatch.setattr(path_fit, "FRAMES_AT_ONCE", 8)
+    monkeypatch.setattr(path_fit, "STILL_AT_ONCE", 32)
+
+
 def turning_body(points=40):
     """[points, FRAMES, 3] places of a body that turns by a radian and shifts."""
     rng = np.random.default_rng(0)
@@ -40,8 +47,19 @@ def film(known=None, still=200):
     return FilmPaths(time, np.zeros(FRAMES, int), path, known, rest)
 
 
+def narrow(network):
+    """A third as wide as a small preset's: one body is soon learnt."""
+    return dataclasses.replace(network, depth=3, width=32)
+
+
 def field_of(name):
     spec = dataclasses.replace(presets.PRESETS[name], start=TRACKS)
+    if spec.warp is not None:
+        spec = dataclasses.replace(spec, warp=narrow(spec.warp))
+    if spec.scene_flow is not None:
+        medium = narrow(spec.scene_flow.network)
+        medium = dataclasses.replace(spec.scene_flow, network=medium)
+        spec = dataclasses.replace(spec, scene_flow=medium)
     metadata = scene.SceneMetadata(
         0.1, 2.0, (0.0, 0.0, 0.0), 1.0, None,
         tuple(np.linspace(0, 1, FRAMES).tolist()), ((0, 0, 0.0),),

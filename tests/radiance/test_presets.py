@@ -96,16 +96,16 @@ def test_the_networks_read_their_input_again_where_the_papers_do(name, inputs, l
 @pytest.mark.parametrize("name", [f"{name}-small" for name in PAPERS[1:]])
 def test_a_small_preset_learns_more_than_one_colour(name):
     capture = scenes.tiny_capture()
-    spec = dataclasses.replace(presets.with_steps(PRESETS[name], 200), rays=128)
+    spec = dataclasses.replace(presets.with_steps(PRESETS[name], 200), rays=64)
     model = scene.build(spec, scene.metadata_of(capture, spec))
     frames = evaluation.frames_of(capture, model.required_data)
     state, step = model.init(capture, jax.random.key(0)), jax.jit(model.step)
     errors = []
-    for _ in range(120):
+    for _ in range(140):
         state, metrics = step(state, frames)
         errors.append(float(metrics["mse"]))
     assert np.isfinite(errors).all()
     # All reach 0.79 to 0.86 of it by step 100; a picture of one colour has all of it.
     pictures = capture.images[capture.train] / 255
     variance = np.mean((pictures - pictures.mean((0, 1, 2))) ** 2)
-    assert np.mean(errors[-20:]) < 0.9 * variance
+    assert np.mean(errors[-40:]) < 0.9 * variance

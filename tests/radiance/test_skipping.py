@@ -131,7 +131,9 @@ def test_where_nothing_is_skipped_a_frame_is_the_full_quadrature(monkeypatch):
     np.testing.assert_allclose(drawn.depth, whole.depth, atol=1e-4)
 
 
-@pytest.mark.parametrize("pixels", [SIZE, (40, 30)])
+@pytest.mark.parametrize(
+    "pixels", [SIZE, pytest.param((40, 30), marks=pytest.mark.full)]
+)
 def test_a_frame_does_not_depend_on_how_it_is_cut(pixels, monkeypatch):
     """Blocks, stages and batches are of memory alone."""
     model, params = full_of_holes(TAKEN_OVER, ORANGE)
