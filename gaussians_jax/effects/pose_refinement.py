@@ -4,7 +4,9 @@ A screw for each frame, in the camera's own frame, descends with the Gaussians: 
 refinement of BARF (Lin et al. 2021, arXiv:2104.06405) for splats, as MotionGS has it
 beside its flow (Zhu et al. 2024, arXiv:2410.07707, section 3.3; there by turns with the
 Gaussians, here together) and gsplat as an option. The mean of all screws is taken off,
-or cameras and scene could drift away together.
+or cameras and scene could drift away together. No slope goes through that mean: each
+frame's would reach all others, and Adam makes whole steps of the smallest slopes, so
+that cameras walk off until they are seen themselves.
 
 What it is worth where cameras are off by a pixel, and where they come from a structure
 from motion that left out what moves: `docs/results/ablate_poses.md` and
@@ -48,9 +50,10 @@ def refined(screws: Screws, cameras: Camera, depth: float) -> Camera:
     """Cameras, one for each screw, moved by what it differs from the mean of all.
 
     `depth`, in scene units, is where a shift of one radian moves the picture as far as
-    such a turn. Equal screws leave every camera as it is.
+    such a turn. Equal screws leave every camera as it is. The mean counts as constant:
+    a camera's slope reaches its own screw alone.
     """
-    own = screws - jnp.mean(screws, axis=0)
+    own = screws - jax.lax.stop_gradient(jnp.mean(screws, axis=0))
     return _moved(own, cameras, depth)
 
 
