@@ -27,8 +27,9 @@ SHARED = "shared"  # marks what mirrors no parameter in an optimiser's state
 class AlternationSpec:
     """From `start` to `stop`, `nets` steps for the networks, then `rows` for the rows.
 
-    Outside everything trains. The paper alternates between the end of the densification
-    and the annealing of the positions.
+    Outside everything trains; so it does always where the two are one, as they are in
+    runs of a few steps. The paper alternates between the end of the densification and
+    the annealing of the positions.
     """
 
     start: int = steps()  # step
@@ -37,9 +38,9 @@ class AlternationSpec:
     rows: int = 1  # steps of a cycle
 
     def __post_init__(self):
-        if not 0 <= self.start < self.stop:
+        if not 0 <= self.start <= self.stop:
             raise ValueError(
-                "an alternation needs 0 <= start < stop, got "
+                "an alternation needs 0 <= start <= stop, got "
                 f"start={self.start} and stop={self.stop}; leave it out (None) where "
                 "everything shall train in every step"
             )

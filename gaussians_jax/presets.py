@@ -112,8 +112,8 @@ SONATA = SplatScene(
 # E-D3DGS (Bae et al. 2024, arXiv:2404.03613), its code's numbers for HyperNeRF's
 # chicken: two views a step, no D-SSIM, growth to the end, no opacity reset but a price
 # on opacity. The two views are any two, where its are neighbours, and the rates of its
-# networks do not grow with the scene. Codes and heads start otherwise
-# (`EmbeddingMotionSpec`).
+# networks do not grow with the scene, but all do with the root of the views, which
+# there they do not. Codes and heads start otherwise (`EmbeddingMotionSpec`).
 E_D3DGS = SplatScene(
     steps=60_000,
     batch_size=2,
@@ -162,7 +162,7 @@ SPLINE = SplatScene(
 # 4DGS (Wu et al. 2024, arXiv:2310.08528), its numbers for HyperNeRF's captures: 3000
 # steps without motion and 14,000 with it, growth up to 10,000 of those, 360,000
 # Gaussians at most, no opacity reset. 150 moments are for films of any length; D-SSIM
-# (here 0.2) is off there.
+# (here 0.2) is off there, and a step takes two views (here one).
 FOUR_D = SplatScene(
     steps=17_000,
     densification=DefaultStrategySpec(
@@ -171,11 +171,15 @@ FOUR_D = SplatScene(
     motion=PlaneMotionSpec(),
 )
 
-# SC-GS: 512 nodes and 80,000 steps. Its first 10,000 steps, which train the nodes as
-# Gaussians, are replaced by a start from tracks.
+# SC-GS: 512 nodes, 80,000 steps, growth up to step 50,000, and the rates of its code.
+# Its first 10,000 steps, which train the nodes as Gaussians, are replaced by a start
+# from tracks. Rates fall until the end; there those of positions do to step 30,000, and
+# of nodes to step 40,000.
 SC_GS = SplatScene(
     steps=80_000,
     init=InitSpec(points=50_000),
+    learning_rates=LearningRateSpec(log_scale=1e-3),
+    densification=DefaultStrategySpec(refine_stop_iter=50_000),
     motion=NodeMotionSpec(),
     start=StartSpec(motion="tracks", moving_points=20_000),
 )
@@ -194,7 +198,8 @@ EDGS = SplatScene(
 # D-MiSo: 80,000 steps, four views in each, cores that grow for 5000 steps (to some 3000
 # there; at most so many here) and carry 25 Gaussians each. Where the paper draws cores
 # alone for those steps, what they carry is here from the start (`effects.carried`); its
-# network reads all three corners of a core's triangle, this one the first.
+# network reads all three corners of a core's triangle, this one the first; and all
+# rates are times two, the root of the views.
 D_MISO = SplatScene(
     steps=80_000,
     batch_size=4,
@@ -207,6 +212,7 @@ D_MISO = SplatScene(
 # ADC-GS, its code's numbers for HyperNeRF's films: ten Gaussians of an anchor, two
 # views a step, no D-SSIM, one colour from everywhere, growth to step 50,000, no resets.
 # It has a price on opacity, and a codec for the places of anchors; these are not here.
+# All rates are times the root of the views, which there they are not.
 # The number of steps was not to be found: it is that over which its rates fall.
 ADC_GS = SplatScene(
     steps=80_000,

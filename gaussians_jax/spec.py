@@ -92,13 +92,15 @@ OF_MOTION = (
     "flow",
 )
 
+WITHOUT_NETWORKS = PolynomialMotionSpec, SplineMotionSpec  # all in their rows
+
 
 @dataclasses.dataclass(frozen=True)
 class SplatScene:
     """Which scene of Gaussians; `None` for an effect means that it is not there."""
 
     steps: int
-    batch_size: int = 1  # views a step
+    batch_size: int = 1  # views a step; all rates are times its root
     init: InitSpec = InitSpec()
     sh_degree: int = 3
     sh_every: int = steps(1000)  # steps between one degree and the next
@@ -189,6 +191,12 @@ def refuse_what_cannot_train(spec: SplatScene) -> None:
                 f"{' and '.join(orphans)} without a motion would train nothing; leave "
                 "them out as well, or choose a preset that moves"
             )
+    if spec.alternation is not None and isinstance(motion, WITHOUT_NETWORKS):
+        raise ValueError(
+            f"alternation takes turns with networks, and a {type(motion).__name__} has "
+            "none: their turns would train nothing; leave it out as well "
+            "(alternation=none)"
+        )
     if spec.neighbours is not None:
         _embedded(motion)
     carry = carried_count(spec) is not None

@@ -51,9 +51,9 @@ class PlaneMotionSpec:
     unrest: float = 1e-4  # weight, planes of time
     warm_up: int = steps(3000)  # steps without motion
     plane_rate: float = 1.6e-3
-    plane_rate_end: float = 1.6e-5
+    plane_rate_end: float = 1.6e-4
     learning_rate: float = 1.6e-4  # of the network
-    learning_rate_end: float = 1.6e-6
+    learning_rate_end: float = 1.6e-5
 
     def __post_init__(self):
         if self.planes.moments is None or self.planes.combination != "product":
@@ -100,6 +100,8 @@ def network_spec(spec: PlaneMotionSpec) -> MLPSpec:
 SMALL_PLANE_MOTION = PlaneMotionSpec(
     planes=PlanesSpec(vertices=32, multiples=(1, 2), moments=24, features=8),
     width=64,
+    plane_rate_end=1.6e-5,
+    learning_rate_end=1.6e-6,
 )
 
 

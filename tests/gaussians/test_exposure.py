@@ -51,29 +51,32 @@ def test_a_frame_is_drawn_in_its_light_and_one_never_seen_between_its_neighbours
     plain = pictures(neutral, state, [*rows, between])
     assert plain.max() > 0.1
     drawn = pictures(model, state, [*rows, between])
-    shares = [*range(6), 2.5]
+    shares = np.array([*range(6), 2.5]) - 2.5  # beside the mean
     for picture, shown, share in zip(plain, drawn, shares, strict=True):
         expected = picture + share * (picture @ CHANGE[:, :3].T + CHANGE[:, 3])
         np.testing.assert_allclose(shown, expected, atol=2e-6)
     assert variants.parts(SPEC, metadata).appearance
 
 
-def test_a_step_teaches_the_exposure_of_its_frame_and_holds_the_mean(built):
+def test_a_step_teaches_the_exposure_of_its_frame_and_of_no_other(built):
     model, _, state = built
-    frames = evaluation.frames_of(CAPTURE)
-    after, metrics = jax.jit(model.step)(state, frames)
-    table = np.asarray(state.params.nets["exposure"])
-    moved = np.abs(np.asarray(after.params.nets["exposure"]) - table)
-    assert (moved > 0).any()
-    mean = table.mean(axis=0)
-    assert metrics["exposure/neutral"] == pytest.approx((mean**2).sum(), rel=1e-5)
-    # Without that, a frame's step is of its own row alone.
-    free = dataclasses.replace(SPEC, exposure=ExposureSpec(neutral=0.0))
-    after, _ = jax.jit(scene.build(free, scene.metadata_of(CAPTURE)).step)(
-        state, frames
-    )
-    moved = np.abs(np.asarray(after.params.nets["exposure"]) - table)
-    assert sorted((moved > 0).any(axis=(1, 2))) == [False] * 5 + [True]
+    after, _ = jax.jit(model.step)(state, evaluation.frames_of(CAPTURE))
+    moved = after.params.nets["exposure"] != state.params.nets["exposure"]
+    assert sorted(np.asarray(moved).any(axis=(1, 2))) == [False] * 5 + [True]
+
+
+def test_what_all_exposures_have_in_common_changes_no_picture(dtype):
+    rng = np.random.default_rng(1)
+    table = rng.normal(size=(3, 3, 4)).astype(dtype)
+    places = ((0, 0, 0.0), (1, 1, 0.0), (1, 2, 0.25), (2, 2, 0.0))
+    change = jax.jit(exposure.of_id, static_argnums=1)
+    for one in range(len(places)):
+        left, right, share = places[one]
+        expected = (1 - share) * table[left] + share * table[right] - table.mean(axis=0)
+        for common in (0.0, 0.5):
+            found = change(table + np.asarray(common, dtype), places, np.int32(one))
+            assert found.dtype == dtype
+            np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 def test_half_a_frame_tells_the_light_of_the_other_half(built):
@@ -94,5 +97,5 @@ def test_half_a_frame_tells_the_light_of_the_other_half(built):
     black = np.zeros((4, 5, 3))
     change = exposure.fitted(black, black + 0.25, None)
     np.testing.assert_allclose(change, [[0, 0, 0, 0.25]] * 3, atol=1e-5)
-    with pytest.raises(ValueError, match=r"neutral=-1\.0"):
-        ExposureSpec(neutral=-1.0)
+    with pytest.raises(ValueError, match="learning_rate"):
+        ExposureSpec(learning_rate=1e-3, learning_rate_end=1e-2)

@@ -33,6 +33,7 @@ from gaussians_jax.effects.motion_growth import MotionGrowthSpec
 from gaussians_jax.effects.neighbours import NeighbourSpec
 from gaussians_jax.effects.polynomial_motion import PolynomialMotionSpec
 from gaussians_jax.effects.spectral import FourierSpec, SpectralSpec, WaveletSpec
+from gaussians_jax.effects.spline_motion import SplineMotionSpec
 from gaussians_jax.effects.temporal_opacity import TemporalOpacitySpec
 from gaussians_jax.initialisation import InitSpec, StartSpec
 from gaussians_jax.learning_rates import LearningRateSpec
@@ -54,7 +55,7 @@ SETTINGS = [
     (AccelerationSpec, dict(interval=math.inf), "interval=inf"),
     (AccelerationSpec, dict(samples=0), "samples >= 1"),
     (AccelerationSpec, dict(start=-1), "start >= 0"),
-    (AlternationSpec, dict(start=10, stop=10), "0 <= start < stop, got start=10 and"),
+    (AlternationSpec, dict(start=10, stop=9), "0 <= start <= stop, got start=10 and"),
     (AlternationSpec, dict(start=-1, stop=10), "start=-1"),
     (AlternationSpec, dict(start=1, stop=10, nets=0), "at least one step, got nets=0"),
     (AlternationSpec, dict(start=1, stop=10, rows=0), "rows=0"),
@@ -216,7 +217,8 @@ CALLS = [
         dataclasses.replace(scenes.TINY_DEFORMABLE, neighbours=NeighbourSpec()),
         spec.SceneMetadata(1.0, (0.0, 0.0, 0.0), 3)),
      "neighbours=none"),
-    (lambda: moba(motion=PolynomialMotionSpec(), carried=CarriedSpec()),
+    (lambda: moba(motion=PolynomialMotionSpec(), alternation=None,
+                  carried=CarriedSpec()),
      "motion.fading=none"),
     (lambda: moba(densification=None), "motion_growth=none"),
     (lambda: moba(densification=MCMCStrategySpec()), "threshold of Default"),
@@ -229,6 +231,8 @@ CALLS = [
      "nothing would"),
     (lambda: moba(motion=None, motion_growth=None, acceleration=None),
      "alternation without"),
+    (lambda: moba(motion=SplineMotionSpec()), "alternation=none"),
+    (lambda: moba(motion=PolynomialMotionSpec()), "alternation=none"),
     (lambda: phases.annealed(schedules.log_linear(1e-2, 1e-4, 1000),
                              AnnealingSpec(950), 1000), "3/4 of the run"),
     (lambda: raster.rasterise(*footprints((5, 0))), "at least one pixel"),

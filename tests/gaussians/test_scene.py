@@ -218,6 +218,8 @@ def test_presets_build_and_stretch_with_their_steps(name):
     assert half.sh_every == 10 * round(spec.sh_every / 20)
     assert scene.build(half, metadata).spec == (half, metadata)
     assert presets.with_steps(spec, spec.steps) == spec
+    for few in (1, 2, 3):
+        assert presets.with_steps(spec, few).steps == few
 
 
 def test_estimate_memory_counts_rows_and_capacity():
