@@ -148,7 +148,7 @@ def effects_of(spec: RadianceScene, metadata: SceneMetadata) -> tuple[Effect, ..
     """The effects that the spec asks for, in the order in which they act."""
 
     def flow(one):
-        return scene_flow.effect(one, len(metadata.times), spec.template.width)
+        return scene_flow.effect(one, metadata.times, spec.template.width)
 
     def smooth(one):
         return smoothness.effect(one, templates_of(spec))

@@ -110,8 +110,7 @@ def of_field(spec, metadata):
     if spec.background is not None:
         effects.append(background.effect(spec.background))
     if spec.scene_flow is not None:
-        moments = len(metadata.times)
-        effects.append(scene_flow.effect(spec.scene_flow, moments, width))
+        effects.append(scene_flow.effect(spec.scene_flow, metadata.times, width))
     if spec.smoothness is not None:
         effects.append(smoothness.effect(spec.smoothness, templates_of(spec)))
     if spec.mask is not None:

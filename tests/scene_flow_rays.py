@@ -31,6 +31,7 @@ TINY = SceneFlowSpec(
 MOMENTS, RAYS, SAMPLES, FEATURES = 4, 6, 5, 7
 SIZE = (8, 6)
 ROWS = [0, 3, 1, 2, 2, 1]  # of the rays; rows are moments here
+TIMES = (0.0, 1 / 3, 0.7, 1.0)
 BOX_SCALE, BOX_CENTRE = 0.5, (0.2, -0.1, 2.0)
 
 
@@ -56,8 +57,8 @@ def frames_and_batch(rng, dtype):
     frames = Frames(
         images=None,
         cameras=jax.tree.map(lambda leaf: leaf.astype(dtype), filmed),
-        # the third is filmed a little late, and the flow stretched to it
-        times=np.array([0, 1 / 3, 0.7, 1], dtype),
+        # the third is filmed a little late: moments are not even
+        times=np.array(TIMES, dtype),
         appearance=np.arange(MOMENTS, dtype=np.int32),
         valid=None,
         depths=np.where(depths < 2.3, 0, depths),
@@ -212,10 +213,14 @@ def oracle(params, frames, batch, arrays, step):
             depths.append((expected, known))
         flows = np.array([h[2] for h in here])  # samples, sides, axes
         for side in (0, 1):
-            later = time + (1, -1)[side] / 3
-            if not -1 / 6 < later < 1 + 1 / 6:
+            beside = row + (1, -1)[side]
+            if not 0 <= beside < MOMENTS:
                 continue
-            moved = [x + f for x, f in zip(points, flows[:, side], strict=True)]
+            later = frames.times[beside]
+            stretch = abs(later - time) * 3
+            moved = [
+                x + stretch * f for x, f in zip(points, flows[:, side], strict=True)
+            ]
             there = [dynamic(params, x, direction, later) for x in moved]
             w = composite([t[0] for t in there], distance)
             seen = 1 - np.array([h[3][side] for h in here])
@@ -232,7 +237,7 @@ def oracle(params, frames, batch, arrays, step):
             rendered = np.abs(weight @ flows[:, side]).mean()
             lists[f"magnitude{side}"].append((rendered, 1))
             _flow_pixel(lists, frames, batch, r, side, points, flows, weight)
-        if 1 / 6 < time < 1 - 1 / 6:
+        if 0 < row < MOMENTS - 1:
             for s in range(SAMPLES):
                 acceleration = np.mean((flows[s, 0] + flows[s, 1]) ** 2) / 2
                 lists["kinetic"].append((acceleration, 1))

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from nerfies_jax.effects import scene_flow_losses as flow_losses
@@ -116,8 +117,8 @@ class Neighbour(NamedTuple):
     """Samples of the rays, followed to the next or the previous moment."""
 
     point: Float[Array, "rays samples 3"]  # where the flow leads
-    flow: Float[Array, "rays samples 3"]  # that led there
-    back: Float[Array, "rays samples 3"]  # the flow from there to here
+    flow: Float[Array, "rays samples 3"]  # that led there, over one interval
+    back: Float[Array, "rays samples 3"]  # the flow from there to here, likewise
     visible: Float[Array, "rays samples"]  # 1 - disocclusion
     disocclusion: Float[Array, "rays samples"]
     colour: Float[Array, "rays 3"]  # of that moment along these rays
@@ -132,18 +133,19 @@ def interval(moments: int) -> float:
     return 1 / (moments - 1) if moments > 1 else 2.0
 
 
-def effect(spec: SceneFlowSpec, moments: int, features: int) -> Effect:
-    """The seams of `spec` for a capture of so many evenly spaced moments.
+def effect(spec: SceneFlowSpec, times: tuple[float, ...], features: int) -> Effect:
+    """The seams of `spec` for a capture that is learnt from at these rising times.
 
-    `features` is the width of the static template's trunk.
+    They need not be even: frames are held out. `features` is the width of the static
+    template's trunk.
     """
-    gap = interval(moments)
+    interval(len(times))  # refuses none
     required_data = {"depths": spec.weights.depth, "flow": spec.weights.flow}
     return Effect(
         NAME,
         init=lambda key: init(spec, key, features),
         medium=functools.partial(medium, spec),
-        penalty=functools.partial(penalty, spec, gap),
+        penalty=functools.partial(penalty, spec, times),
         required_data=frozenset(
             name for name, weight in required_data.items() if weight > 0
         ),
@@ -222,21 +224,42 @@ def medium(
     return Medium(own.density, own.colour, share=share, extras=extras)
 
 
+def moment_beside(
+    times: tuple[float, ...], time: Float[Array, " rays"], side: int
+) -> tuple[Float[Array, " rays"], Bool[Array, " rays"]]:
+    """The learnt moment after (FORWARD) or before the one nearest to a time.
+
+    The second is whether there is one; where there is none, the first is an interval
+    away.
+    """
+    known = np.asarray(times)
+    between = jnp.asarray((known[1:] + known[:-1]) / 2, time.dtype)
+    place = jnp.searchsorted(between, time) + SIGNS[side]
+    present = (place >= 0) & (place < len(times))
+    beside = jnp.asarray(known, time.dtype)[jnp.clip(place, 0, len(times) - 1)]
+    away = time + SIGNS[side] * interval(len(times))
+    return jnp.where(present, beside, away), present
+
+
 def neighbour(
     spec: SceneFlowSpec,
-    gap: float,
+    times: tuple[float, ...],
     params: SceneFlow,
     context: PenaltyContext,
     side: int,
 ) -> Neighbour:
-    """The samples of the last level at the moment after (FORWARD) or before them."""
+    """The samples of the last level at the moment after (FORWARD) or before them.
+
+    Where it is more or less than an interval away, beside frames that are held out,
+    points go on as evenly: only what was filmed says what must be seen then.
+    """
     level = context.levels[-1]
     extras = level.media[NAME].extras
     flow = extras[("flow_forward", "flow_backward")[side]]
-    point = level.point + flow
-    time = context.condition.time + SIGNS[side] * gap
-    # Half a gap of slack: times are rounded, and need not be quite even.
-    present = (time > -gap / 2) & (time < 1 + gap / 2)
+    now = context.condition.time
+    time, present = moment_beside(times, now, side)
+    intervals = jnp.abs(time - now) / interval(len(times))
+    point = level.point + intervals[:, None, None] * flow
 
     def ask(point, direction, time):
         return dynamic(spec, params, point, direction, time)
@@ -269,13 +292,16 @@ def fading(decay_steps: int, step: Int[Array, ""]) -> Scalar:
 
 
 def penalty(
-    spec: SceneFlowSpec, gap: float, params: SceneFlow, context: PenaltyContext
+    spec: SceneFlowSpec,
+    times: tuple[float, ...],
+    params: SceneFlow,
+    context: PenaltyContext,
 ) -> dict[str, Term]:
     """All losses beside that of the blended picture, as logged."""
     batch, level = context.batch, context.levels[-1]
     own = level.media[NAME]
     weight = flow_losses.dynamic_weights(level.distances, own.density)
-    sides = [neighbour(spec, gap, params, context, side) for side in (0, 1)]
+    sides = [neighbour(spec, times, params, context, side) for side in (0, 1)]
     mask = jnp.where(batch.valid, picture_mask(spec, level, context.step), 0)
     values = {
         "dynamic": lambda: flow_losses.weighted_mean(
@@ -319,7 +345,7 @@ def penalty(
         value = depth_term(context, weight)
         terms["depth"] = Term(value, spec.weights.depth * fade)
     if spec.weights.flow > 0 and context.frames.flow is not None:
-        value = flow_term(context, gap, weight, sides)
+        value = flow_term(context, interval(len(times)), weight, sides)
         terms["flow"] = Term(value, spec.weights.flow * fade)
     return terms
 

@@ -19,6 +19,7 @@ from tests.scene_flow_rays import (
     FEATURES,
     MOMENTS,
     ROWS,
+    TIMES,
     TINY,
     context_of,
     oracle,
@@ -29,8 +30,7 @@ from tests.scene_flow_rays import (
 @functools.partial(jax.jit, static_argnums=0)
 def terms_of(spec, params, frames, batch, arrays, step):
     context = context_of(spec, params, frames, batch, *arrays, step)
-    gap = scene_flow.interval(MOMENTS)
-    return scene_flow.penalty(spec, gap, params, context)
+    return scene_flow.penalty(spec, TIMES, params, context)
 
 
 @pytest.mark.parametrize("step", [0, 250])
@@ -74,15 +74,15 @@ def test_terms_without_a_weight_or_data_are_not_there():
     given = scenario("float32")
     spec = dataclasses.replace(TINY, weights=FlowWeights(**dict.fromkeys(NAMES, 0.0)))
     assert terms_of(spec, *given, 0) == {}
-    assert scene_flow.effect(spec, 4, FEATURES).required_data == frozenset()
+    assert scene_flow.effect(spec, TIMES, FEATURES).required_data == frozenset()
     only_flow = dataclasses.replace(spec, weights=FlowWeights(depth=0.0))
-    assert scene_flow.effect(only_flow, 4, FEATURES).required_data == {"flow"}
-    assert scene_flow.effect(TINY, 4, FEATURES).required_data == {"flow", "depths"}
+    assert scene_flow.effect(only_flow, TIMES, FEATURES).required_data == {"flow"}
+    assert scene_flow.effect(TINY, TIMES, FEATURES).required_data == {"flow", "depths"}
     params, frames, batch, arrays = given
     bare = frames._replace(depths=None, flow=None)
     terms = jax.eval_shape(
         lambda *given: scene_flow.penalty(
-            TINY, 1 / 3, params, context_of(TINY, *given)
+            TINY, TIMES, params, context_of(TINY, *given)
         ),
         *(params, bare, batch, *arrays, 0),
     )
@@ -140,7 +140,7 @@ def test_a_medium_on_planes_is_finite_where_there_is_no_moment(dtype):
 
 
 @functools.partial(jax.jit, static_argnums=4)
-def slopes_of(params, frames, batch, arrays, gap):
+def slopes_of(params, frames, batch, arrays, times):
     """Slopes of all terms in parameters and in what the medium says, and the terms."""
     medium = context_of(TINY, params, frames, batch, *arrays, 0).levels[0].media
 
@@ -150,7 +150,9 @@ def slopes_of(params, frames, batch, arrays, gap):
         own = level.media["scene_flow"]
         own = own._replace(extras=jax.tree.map(jnp.add, own.extras, shift))
         level = level._replace(media={"scene_flow": own})
-        terms = scene_flow.penalty(TINY, gap, params, context._replace(levels=(level,)))
+        terms = scene_flow.penalty(
+            TINY, times, params, context._replace(levels=(level,))
+        )
         return sum(term.value for term in terms.values()), terms
 
     shift = jax.tree.map(jnp.zeros_like, medium["scene_flow"].extras)
@@ -159,7 +161,7 @@ def slopes_of(params, frames, batch, arrays, gap):
 
 @pytest.mark.hard_cases
 def test_the_first_and_the_last_moment_have_one_neighbour(float64):
-    (_, grad), _ = slopes_of(*scenario("float64"), 1 / 3)
+    (_, grad), _ = slopes_of(*scenario("float64"), TIMES)
     strength = {name: np.abs(np.asarray(x)).sum((1, -1)) for name, x in grad.items()}
     rows = np.array(ROWS)
     for name, missing in (("flow_forward", MOMENTS - 1), ("flow_backward", 0)):
@@ -175,7 +177,7 @@ def test_the_first_and_the_last_moment_have_one_neighbour(float64):
 def test_a_single_moment_has_no_neighbours_and_no_flow_to_learn(dtype):
     params, frames, batch, arrays = scenario(dtype)
     still = frames._replace(times=np.zeros(MOMENTS, dtype))
-    slopes_and_terms = slopes_of(params, still, batch, arrays, scene_flow.interval(1))
+    slopes_and_terms = slopes_of(params, still, batch, arrays, (0.0,))
     (grad, _), terms = jax.tree.map(np.asarray, slopes_and_terms)
     for name in ("warped", "cycle", "disocclusion", "magnitude", "kinetic", "flow"):
         assert terms[name].value == 0, name
@@ -183,6 +185,24 @@ def test_a_single_moment_has_no_neighbours_and_no_flow_to_learn(dtype):
     assert (grad.flow.weight == 0).all()
     assert (grad.flow.bias == 0).all()
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(grad))
+
+
+@pytest.mark.parametrize("held_out", [2, 3, 8])
+def test_neighbours_are_moments_that_were_filmed(held_out, dtype):
+    """And not those that lie an interval away, where no picture says what is seen."""
+    filmed = np.arange(40) / 39
+    learnt = np.delete(filmed, np.arange(0, 40, held_out)).astype(np.float32)
+    times = tuple(float(time) for time in learnt)
+    beside = jax.jit(scene_flow.moment_beside, static_argnums=(0, 2))
+    now = jnp.asarray(learnt, dtype)
+    for side, shift in ((scene_flow.FORWARD, 1), (scene_flow.BACKWARD, -1)):
+        found, present = beside(times, now, side)
+        places = np.arange(len(learnt)) + shift
+        inside = (places >= 0) & (places < len(learnt))
+        np.testing.assert_array_equal(present, inside)
+        np.testing.assert_array_equal(
+            np.asarray(found)[inside], learnt[places[inside]].astype(dtype)
+        )
 
 
 # --- the medium
@@ -220,7 +240,7 @@ def test_what_is_surely_hidden_keeps_a_slope(dtype):
     @jax.value_and_grad
     def visible(params):
         context = context_of(TINY, params, frames, batch, *arrays, 0)
-        there = scene_flow.neighbour(TINY, 1 / 3, params, context, scene_flow.FORWARD)
+        there = scene_flow.neighbour(TINY, TIMES, params, context, scene_flow.FORWARD)
         return jnp.mean(there.visible)
 
     value, grad = visible(sure)
