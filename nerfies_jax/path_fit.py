@@ -111,9 +111,10 @@ def fit(
         every = jnp.arange(frames), jnp.arange(points)
         return distances(*free, *every, nothing, key)[0]
 
-    names = [effect.name for effect in field.effects if effect.displace is not None]
+    names = {effect.name for effect in field.effects if effect.displace is not None}
+    names &= params.keys()  # an effect of one's own may have none
     free = (
-        {name: params[name] for name in (*names, "codes")},
+        {name: params[name] for name in (*sorted(names), "codes")},
         jnp.asarray(_first_places(paths)),
     )
     fitted = descended(loss, free, start.fit_rate, key, start.fit_steps)

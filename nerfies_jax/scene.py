@@ -212,7 +212,7 @@ def learning_rates(
         held = schedules.log_linear(spec.start.first_rate, 1.0, spec.steps)(step)
         warps = [effect for effect in effects if effect.displace is not None]
         tables = {table.name for effect in warps for table in effect.tables}
-        rates |= {effect.name: held * rates[effect.name] for effect in warps}
+        rates |= {e.name: held * rates[e.name] for e in warps if e.name in params}
         rates["codes"] = {
             name: held * rates["codes"] if name in tables else rates["codes"]
             for name in params["codes"]

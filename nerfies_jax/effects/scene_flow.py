@@ -86,6 +86,11 @@ class SceneFlowSpec:
             )
         if self.decay_steps < 1:
             raise ValueError(f"decay_steps={self.decay_steps} must be at least 1")
+        if self.network.anneal_steps is not None:
+            raise ValueError(
+                f"network.anneal_steps={self.network.anneal_steps}: all bands of a "
+                "medium are open from the first step; leave it out (none)"
+            )
         if self.network.reads_time and self.network.position.outside == "refuse":
             raise ValueError(
                 'network.position.outside="refuse": the moments before the first and '

@@ -2,7 +2,9 @@
 
 NeRF-W (Martin-Brualla et al. 2021, arXiv:2008.02268, "transient objects"): beside the
 static field each photograph has a medium of its own, with density, colour and an
-uncertainty `beta`. People and cars settle there; renders leave it out.
+uncertainty `beta`. People and cars settle there. Pictures show it, held-out ones with
+codes between those of their neighbours in time, unless it is left out
+(`variants.without_effects`), as the paper does and `held_out_codes.score`.
 """
 
 import dataclasses

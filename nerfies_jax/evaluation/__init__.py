@@ -12,6 +12,7 @@ from nerfies_jax.evaluation.renderer import Renderer, as_picture
 from nerfies_jax.evaluation.scores import (
     Halves,
     Scored,
+    known_mean,
     score,
     score_halves,
     score_right_halves,
@@ -24,6 +25,7 @@ __all__ = [
     "as_found",
     "as_picture",
     "frames_of",
+    "known_mean",
     "path_views",
     "resized",
     "score",

@@ -14,7 +14,7 @@ from nerfies_jax.evaluation.fitted_cameras import FittedCameras
 from nerfies_jax.evaluation.floors import Floors
 from nerfies_jax.evaluation.model_flow import Flow
 from nerfies_jax.evaluation.protocol import GroundTruth, PointTracks
-from nerfies_jax.evaluation.scores import Scored
+from nerfies_jax.evaluation.scores import Scored, known_mean
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.measure import geometry_quality, image_quality, perceptual
 from nerfies_jax.measure.clock import Metric
@@ -114,8 +114,8 @@ def heldout_metrics(
     out.
     """
     scores = {
-        "heldout.psnr": float(scored.psnr.mean()),
-        "heldout.ssim": float(scored.ssim.mean()),
+        "heldout.psnr": known_mean(scored.psnr),
+        "heldout.ssim": known_mean(scored.ssim),
     }
     more = _pictures(scored, capture, lpips)
     if capture.valid is not None:
@@ -157,7 +157,7 @@ def _pictures(scored, capture, lpips):
         for key, value in jax.device_get(scores).items():
             parts.setdefault(key, []).append(value)
     # A frame without anything that moves has no score of it, and none is all moving.
-    return {key: _mean(np.asarray(values)) for key, values in parts.items()}
+    return {key: known_mean(np.asarray(values)) for key, values in parts.items()}
 
 
 def _floors(floors, scored, capture):
@@ -165,14 +165,14 @@ def _floors(floors, scored, capture):
     numbers = {}
     if floors.neighbours is not None:
         own = _floor_psnr(floors.neighbours, scored, capture)
-        numbers["floor.neighbours"] = _mean(own[:, 0])
+        numbers["floor.neighbours"] = known_mean(own[:, 0])
     if floors.still is not None:
         own = _floor_psnr(floors.still, scored, capture)
         drawn = floors.still._replace(colour=scored.colour[floors.still.places])
         worth = _floor_psnr(drawn, scored, capture) - own
-        numbers["floor.still"] = _mean(own[:, 0])
-        numbers["motion.worth"] = _mean(worth[:, 0])
-        numbers["motion.moving_worth"] = _mean(worth[:, 1])
+        numbers["floor.still"] = known_mean(own[:, 0])
+        numbers["motion.worth"] = known_mean(worth[:, 0])
+        numbers["motion.moving_worth"] = known_mean(worth[:, 1])
     return numbers
 
 
@@ -249,7 +249,7 @@ def _depths(scored, capture):
         compared = np.asarray(geometry_quality.known_depth(depth, truth, mask))
         error = np.abs(np.asarray(depth - truth))[compared]
         errors = _depth_errors(depth, truth, mask)
-        numbers[f"heldout.{name}depth_median"] = _mean(error, np.median)
+        numbers[f"heldout.{name}depth_median"] = known_mean(error, np.median)
         numbers[f"heldout.{name}depth_rmse"] = errors.rmse
         if mask is None:
             numbers["heldout.depth_abs_rel"] = errors.abs_rel
@@ -281,7 +281,7 @@ def _cameras(fitted, capture, exact):
 
     Without alignment's scale: the cameras were fitted to a scene in scene units.
     """
-    numbers = {"heldout.camera_fitted_psnr": fitted.scored.psnr.mean()}
+    numbers = {"heldout.camera_fitted_psnr": known_mean(fitted.scored.psnr)}
     true = cameras.take(capture.cameras, fitted.scored.rows)
     if exact and len(fitted.scored.rows) > 1:
         path = geometry_quality.path_errors(
@@ -297,9 +297,3 @@ def _cameras(fitted, capture, exact):
         )
         numbers["cameras.rotation_error"] = relative.rotation_deg
     return numbers
-
-
-def _mean(values, mean=np.mean):
-    """NaN over nothing."""
-    values = values[~np.isnan(values)]
-    return mean(values) if values.size else np.nan

@@ -95,6 +95,17 @@ def score_right_halves(
     return Halves(np.asarray(rows), psnr, ssim)
 
 
+def known_mean(
+    values: np.ndarray, mean: Callable[[np.ndarray], Any] = np.mean
+) -> float:
+    """The mean of what is not NaN, as a frame without a filmed pixel scores.
+
+    NaN over nothing. `mean` may be another statistic.
+    """
+    values = values[~np.isnan(values)]
+    return float(mean(values)) if values.size else float("nan")
+
+
 @jax.jit
 def _score(colour, truth, valid):
     picture = image_quality.quantise(colour)

@@ -71,6 +71,11 @@ class TemplateSpec:
                 f"unknown density activation {self.density!r}; choose from "
                 f"{sorted(DENSITIES)}"
             )
+        if self.depth < 1:
+            raise ValueError(
+                f"depth={self.depth} must be at least 1: media and surfaces read the "
+                "last layer"
+            )
         if self.colour_width < 1:
             raise ValueError(f"colour_width={self.colour_width} must be at least 1")
         if self.anneal_steps is not None and self.anneal_steps < 1:

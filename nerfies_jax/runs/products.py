@@ -208,11 +208,12 @@ def score_halves(
     before = evaluation.score_right_halves(
         run.capture, scored.rows[few], scored.colour[few]
     )
-    psnr, ssim = float(halves.psnr.mean()), float(halves.ssim.mean())
+    psnr, ssim = (evaluation.known_mean(each) for each in (halves.psnr, halves.ssim))
+    unfitted = evaluation.known_mean(before.psnr)
     note = (
-        f"Right halves of {count} held-out frames: {before.psnr.mean():.2f} dB with "
+        f"Right halves of {count} held-out frames: {unfitted:.2f} dB with "
         f"codes interpolated in time, {psnr:.2f} dB with codes fitted to the left "
-        "halves."
+        "halves and without a transient medium."
     )
     metrics = [
         Metric("heldout.fitted_psnr", psnr, "dB", "higher", 0.2),

@@ -88,10 +88,12 @@ def measure(
             scored.rows[places],
             filmed=run.filmed,
         )
+        given, found = map(
+            evaluation.known_mean, (scored.psnr[places], fitted.scored.psnr)
+        )
         notes.append(
-            f"Cameras fitted to {len(places)} held-out frames: "
-            f"{scored.psnr[places].mean():.2f} dB with those of the capture, "
-            f"{fitted.scored.psnr.mean():.2f} dB with the fitted ones, of which "
+            f"Cameras fitted to {len(places)} held-out frames: {given:.2f} dB with "
+            f"those of the capture, {found:.2f} dB with the fitted ones, of which "
             f"{fitted.converged.sum()} converged."
         )
     if extra.lpips is not None:

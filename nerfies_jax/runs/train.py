@@ -81,7 +81,10 @@ def train(
         del step
         filmed = evaluation.as_found(run.model, state, run.filmed)
         scored = evaluation.score(draw, state, filmed, few)
-        return {"psnr": scored.psnr.mean(), "ssim": scored.ssim.mean()}
+        return {
+            "psnr": evaluation.known_mean(scored.psnr),
+            "ssim": evaluation.known_mean(scored.ssim),
+        }
 
     if len(few):
         hooks = (Hook("held out", held_out, every_seconds=evaluate_every), *hooks)

@@ -49,6 +49,7 @@ REFUSED = [
     (SceneFlowSpec, {"flow_bound": 0.0}, "flow_bound=0"),
     (SceneFlowSpec, {"flow_bound": math.nan}, "flow_bound=nan"),
     (SceneFlowSpec, {"decay_steps": 0}, "decay_steps=0"),
+    (SceneFlowSpec, {"network": TemplateSpec(anneal_steps=9)}, "anneal_steps=9.*none"),
     (SceneFlowSpec, {"network": STRICT}, "moments before the first.*clamp"),
     (FlowWeights, {"cycle": -1.0}, "cycle=-1"),
     (FlowWeights, {"depth": math.inf}, "depth=inf"),

@@ -71,6 +71,18 @@ def psnr(picture, truth, mask):
     return -10 * np.log10(np.mean((picture - truth)[mask] ** 2))
 
 
+def test_a_frame_of_which_nothing_was_filmed_spoils_no_mean(rng):
+    capture = scenes.tiny_capture()
+    scored = drawn(capture, rng)
+    twice = Scored(*(np.concatenate([leaf, leaf]) for leaf in scored))
+    twice = twice._replace(psnr=np.array([np.nan, 21.0]), ssim=np.array([np.nan, 0.5]))
+    numbers = heldout_metrics(twice, capture)
+    assert numbers["heldout.psnr"] == 21
+    assert numbers["heldout.ssim"] == 0.5
+    nothing = scored._replace(psnr=np.array([np.nan]))
+    assert np.isnan(heldout_metrics(nothing, capture)["heldout.psnr"])
+
+
 @pytest.mark.parametrize("filmed", [True, pytest.param(False, marks=pytest.mark.full)])
 def test_every_number_is_that_of_a_direct_computation(rng, filmed):
     capture = scenes.tiny_capture()

@@ -13,7 +13,7 @@ from nerfies_jax import path_fit, presets, scene
 from nerfies_jax.effects import scene_flow
 from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.path_fit import FilmPaths
-from nerfies_jax.training.effects import FrameCondition
+from nerfies_jax.training.effects import Effect, FrameCondition
 from nerfies_jax.training.model import View
 from nerfies_jax.training.track_start import FieldStartSpec
 
@@ -147,6 +147,19 @@ def test_what_tracks_have_found_learns_slowly_at_first(start, first):
             of_codes = of_codes["motion"]
         for own in (rates["warp"], of_codes):
             np.testing.assert_allclose(own / rates["template"], share, rtol=1e-5)
+
+
+def test_a_motion_of_one_s_own_may_have_no_parameters():
+    field = field_of("nerfies-small")
+    own = Effect("own", displace=lambda params, point, condition: 0 * point)
+    field = field._replace(effects=(*field.effects, own))
+    params = field.init(jax.random.key(0))
+    assert "own" not in params
+    rates = scene.learning_rates(field.spec, field.effects, params, jnp.int32(0))
+    assert rates.keys() == params.keys()
+    start = dataclasses.replace(TRACKS, fit_steps=2)
+    fitted = path_fit.fit(field, params, film(), jax.random.key(0), start)
+    assert fitted.params.keys() == params.keys()
 
 
 def test_a_flow_with_a_trunk_of_its_own_learns_slowly_at_first_and_its_medium_not():

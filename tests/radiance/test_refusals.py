@@ -52,6 +52,7 @@ def sample_pdf(edges, weights, count):
     [
         (lambda: TemplateSpec(density="sine"), "'sine'.*softplus"),
         (lambda: TemplateSpec(colour_width=0), "colour_width=0"),
+        (lambda: TemplateSpec(depth=0, skips=()), "depth=0"),
         (lambda: SamplingSpec(coarse=1), "coarse=1"),
         (lambda: SamplingSpec(spacing="log"), "spacing='log'"),
         (lambda: stratified(1), "count=1"),
