@@ -92,7 +92,7 @@ def command(settings: Any) -> Callable[[Callable], Callable]:
                 args = parse(settings, words, _called(run))
             aside = _words_aside() if as_json else contextlib.nullcontext()
             with aside, _ended_by_reader(), user_errors((MissingExtra,)):
-                result = run(args)
+                result = _interruptible(run, args)
             ended = result if isinstance(result, Ended) else None
             result = result if ended is None else ended.result
             if as_json:
@@ -105,6 +105,15 @@ def command(settings: Any) -> Callable[[Callable], Callable]:
         return main
 
     return decorate
+
+
+def _interruptible(run, args):
+    """The result of a command; Ctrl-C ends it in one line, with the shell's code."""
+    try:
+        return run(args)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        raise SystemExit(130) from None
 
 
 def parse(settings: Any, arguments: list[str] | None = None, prog: str = "") -> Any:

@@ -5,6 +5,7 @@ python -m experiments.make_scene OUT [--preset NAME] [--frames N] [--set path=va
 
 import dataclasses
 import pathlib
+import shlex
 from typing import Literal
 
 from experiments import cli
@@ -51,7 +52,7 @@ def main(args):
     print(
         f"{args.out}: {spec.name}, {spec.frames} instants at {width}x{height}, "
         f"truth in {args.out / synthetic.TRUTH_FILE}\n"
-        f"next: python -m experiments.reconstruct {args.out}"
+        f"next: python -m experiments.reconstruct {shlex.quote(str(args.out))}"
     )
     return {"folder": str(args.out), "scene": specs.as_json(spec), "seed": args.seed}
 

@@ -7,6 +7,7 @@ python -m experiments.prepare pictures DIR OUT   cameras by COLMAP
 
 import dataclasses
 import pathlib
+import shlex
 from typing import Annotated
 
 import tyro
@@ -72,7 +73,7 @@ def main(args):
 
             preparation.prepare(args.file, args.out, args.how, print)
             record = cli.stored(args.out / preparation.RECORD)
-    print(f"next: python -m experiments.reconstruct {args.out}")
+    print(f"next: python -m experiments.reconstruct {shlex.quote(str(args.out))}")
     return {"folder": str(args.out), "prepared": record}
 
 

@@ -110,6 +110,8 @@ class Render:
                 "--show flow follows the motion of the whole scene; leave out "
                 "--without and --appearance"
             )
+        if self.max_side is not None and self.max_side < 1:
+            raise ValueError(f"--max-side {self.max_side}: at least one pixel")
         if not self.formats:
             raise ValueError("--formats: name at least one of png, mp4, exr")
 
@@ -121,6 +123,7 @@ def main(args):
         platform.start_jax(args.device, representations.cores_of_run(args.run).threads)
         from nerfies_jax import evaluation, runs
         from nerfies_jax.capture import video
+        from nerfies_jax.capture.capture import CaptureError
 
         if "mp4" in args.formats:
             video.library()  # missing, it is said before anything is rendered
@@ -136,9 +139,19 @@ def main(args):
         views = _blended(args, run, views)
         out = args.out or args.run / "renders" / _name(args)
         out.mkdir(parents=True, exist_ok=True)
+        if args.out is None:
+            _clear(out)
     picture_of = _Pictures(args.show, move, trained, views)
     renderer = evaluation.Renderer(model, size)
-    return _write(args, out, renderer, state, names, views, picture_of)
+    with cli.user_errors((CaptureError, OSError)):
+        return _write(args, out, renderer, state, names, views, picture_of)
+
+
+def _clear(out):
+    """Take away what an earlier render left in its own folder: it had other frames."""
+    for pattern in ("*.png", "*.exr", "film.mp4"):
+        for path in out.glob(pattern):
+            path.unlink()
 
 
 def _name(args):

@@ -223,6 +223,11 @@ def _upright_size(file):
 def _upright(file):
     with _opened(file) as picture:
         picture = PIL.ImageOps.exif_transpose(picture)
+        if picture.mode == "F":
+            raise CaptureError(
+                f"{file}: a picture of 32-bit floats, whose white is not known; save "
+                "it with 8 or 16 bits"
+            )
         if picture.mode.startswith("I"):  # 16 bits of grey
             values = np.asarray(picture).astype(np.uint32) // 257
             return np.repeat(values.astype(np.uint8)[..., None], 3, axis=2)

@@ -2,6 +2,7 @@
 
 import importlib
 import pathlib
+import shlex
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -83,7 +84,7 @@ def recognise(path: AnyPath) -> Format:
         verb = "npz" if path.suffix == ".npz" else "video"
         raise CaptureError(
             f"{path}: a file, not a capture; pass a capture's folder, or make one with "
-            f"python -m experiments.prepare {verb} {path} OUT"
+            f"python -m experiments.prepare {verb} {shlex.quote(str(path))} OUT"
         )
     for each in FORMATS:
         if each.recognise(path):
@@ -92,7 +93,7 @@ def recognise(path: AnyPath) -> Format:
     if pictures >= 2:
         raise CaptureError(
             f"{path}: {pictures} pictures without cameras; find those with python -m "
-            f"experiments.prepare pictures {path} OUT"
+            f"experiments.prepare pictures {shlex.quote(str(path))} OUT"
         )
     wanted = "; ".join(each.looks_for for each in FORMATS)
     raise CaptureError(f"{path}: no capture here; looked for {wanted}")

@@ -73,22 +73,30 @@ def read_npz(path):
             f"{path}: no array {min(absent)!r}; there are {sorted(arrays)}"
         )
     images, poses, times = arrays["images"], arrays["poses"], arrays.get("times")
-    count = len(images)
+    count = len(images) if images.ndim else 0
     if (
         images.ndim != 4
+        or not images.size
         or images.shape[3] != 3
         or poses.shape[1:] not in ((4, 4), (3, 4))
     ):
         raise CaptureError(
             f"{path}: images {images.shape} and poses {poses.shape}; expected "
-            "[n, height, width, 3] and [n, 4, 4]"
+            "[n, height, width, 3] and [n, 4, 4], n at least 1"
         )
     if len(poses) != count or (times is not None and times.shape != (count,)):
         raise CaptureError(
             f"{path}: {count} images but another number of poses or times"
         )
-    if not all(np.isfinite(a).all() for a in (images, poses, arrays["focal"])):
+    numbers = [images, poses, arrays["focal"], *([] if times is None else [times])]
+    if not all(np.isfinite(each).all() for each in numbers):
         raise CaptureError(f"{path}: holds NaN or infinity; mend or remove those rows")
+    if times is not None and not (times.min() >= 0 and times.max() <= 1):
+        raise CaptureError(
+            f"{path}: times from {times.min():g} to {times.max():g}; expected 0 to 1"
+        )
+    if not arrays["focal"].size:
+        raise CaptureError(f"{path}: focal is empty; expected a length in pixels")
     focal = float(np.asarray(arrays["focal"]).ravel()[0])
     if not focal > 0:
         raise CaptureError(f"{path}: focal = {focal:g}; it must be positive")

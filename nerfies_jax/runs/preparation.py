@@ -31,7 +31,7 @@ from nerfies_jax.capture.structure_from_motion import (
     run_sfm,
 )
 from nerfies_jax.evidence import masks_without_cameras
-from nerfies_jax.runs import movers
+from nerfies_jax.runs import movers, run_folder
 from nerfies_jax.runs.config import Preparation
 from nerfies_jax.runs.run_folder import PREPARED as RECORD
 from nerfies_jax.training import specs
@@ -66,6 +66,9 @@ def prepare(
     cannot be found, with what to change.
     """
     source, out = pathlib.Path(source), pathlib.Path(out)
+    if not source.exists():
+        raise CaptureError(f"{source}: no such film or folder; check the path")
+    run_folder.refuse_run(source)
     kind = footage.kind_of(source)
     if kind is None:
         raise CaptureError(

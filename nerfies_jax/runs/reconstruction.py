@@ -16,6 +16,7 @@ from nerfies_jax.runs import (
     preparation,
     products,
     quality,
+    representations,
     run_folder,
     train,
 )
@@ -81,10 +82,9 @@ def reconstruct(
         with _refusing():
             pace = Pace(seconds, evaluate_every, checkpoint_every)
             if out is not None:
-                out = pathlib.Path(out)
+                out = pathlib.Path(out).absolute()
                 run_folder.check_free(out)
-            if config.preset is not None:
-                scene_spec(config)  # refuses a wrong one before minutes of looking
+            _check_spec(config)
             config = _with_cameras(config, out, prepare)
             run = _new_run(config, effects)
             _describe(run)
@@ -148,9 +148,31 @@ def _refusing() -> Iterator[None]:
         raise Refused(str(error)) from error
 
 
+def _check_spec(config):
+    """Refuse wrong settings before minutes of looking for cameras and motion.
+
+    Of a preset that tracks will choose, what none of those allows.
+    """
+    names = [config.preset]
+    if config.preset is None:
+        kinds = representations.installed().values()
+        choosing = [kind.presets for kind in kinds if kind.default_preset is not None]
+        names = [name for presets in choosing for name in presets]
+    refused = []
+    for name in names:
+        try:
+            scene_spec(dataclasses.replace(config, preset=name))
+        except ValueError as error:
+            refused.append(error)
+    if refused and len(refused) == len(names):
+        raise refused[0]
+
+
 def _with_cameras(config, out, how):
     """The config, its source a capture: prepared now, or before, if it was none."""
     source = config.source.capture
+    if source is not None:
+        run_folder.refuse_run(source)
     if source is None or not preparation.needed(source):
         if how != Preparation():
             raise ValueError(

@@ -39,6 +39,7 @@ def newest_of(source: pathlib.Path, above: pathlib.Path | None = None) -> pathli
 
     Raises ValueError where there is none.
     """
+    refuse_run(source)
     above = pathlib.Path("runs") if above is None else above
     found = []
     for path in above.glob(f"*/{CONFIG}"):
@@ -64,11 +65,26 @@ def is_of(capture: pathlib.Path, source: pathlib.Path) -> bool:
     return False
 
 
+def refuse_run(source: pathlib.Path) -> None:
+    """Raise ValueError where what is given as a capture is a run."""
+    if (source / CONFIG).is_file() and (source / CHECKPOINTS).is_dir():
+        raise ValueError(
+            f"{source}: the folder of a run, not of a capture; continue the run with "
+            f"--out {source} --resume"
+        )
+
+
 def check_free(out: pathlib.Path) -> None:
     """Raise ValueError where a run cannot begin in `out`; nothing is made."""
     if out.exists() and not out.is_dir():
         raise ValueError(f"{out}: the run folder is a file; name another --out")
     if not out.is_dir():
+        above = next(path for path in out.absolute().parents if path.exists())
+        if not (above.is_dir() and os.access(above, os.W_OK | os.X_OK)):
+            raise ValueError(
+                f"{out}: the run folder cannot be written, {above} is none that can; "
+                "name another --out"
+            )
         return
     if (out / LOCK).exists():
         with owned(out):

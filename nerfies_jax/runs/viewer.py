@@ -9,6 +9,7 @@ import dataclasses
 import logging
 import pathlib
 import queue
+import shlex
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -278,7 +279,8 @@ class Viewer:
         except (ValueError, OSError) as error:
             self._controls["listed"].content = str(error)
             return
-        render = f"python -m experiments.render {self.paths.parent} --path {place}"
+        words = "experiments.render", str(self.paths.parent), "--path", str(place)
+        render = shlex.join(("python", "-m", *words))
         self._controls["listed"].content = f"Saved. To render it:\n\n`{render}`"
         print(f"{count} cameras: {place}; {render}")
 

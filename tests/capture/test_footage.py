@@ -91,6 +91,13 @@ def test_a_film_keeps_its_own_times_and_the_masks_of_the_frames_taken(tmp_path):
         footage.from_film(tmp_path / "a.mp4", tmp_path / "d", 1)
 
 
+def test_a_picture_of_floats_is_refused_by_name(tmp_path):
+    for name in ("0.tif", "1.tif"):
+        PIL.Image.fromarray(np.ones((32, 32), np.float32)).save(tmp_path / name)
+    with pytest.raises(CaptureError, match=r"0\.tif: .*32-bit floats.*8 or 16 bits"):
+        footage.from_pictures(tmp_path, tmp_path / "out")
+
+
 def test_photographs_come_upright_of_one_size_whatever_their_ending(
     tmp_path, monkeypatch
 ):

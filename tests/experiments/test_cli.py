@@ -15,11 +15,27 @@ from experiments import cli
 from nerfies_jax.runs import representations
 
 
+@dataclasses.dataclass(frozen=True)
+class Nothing:
+    """Do nothing."""
+
+
 def test_user_errors_are_one_line_and_exit_code_two(capsys):
     with pytest.raises(SystemExit) as stop, cli.user_errors():
         raise ValueError("first\nsecond")
     assert stop.value.code == 2
     assert capsys.readouterr().err == "error: first second\n"
+
+
+def test_an_interrupted_command_ends_in_one_line(capsys):
+    @cli.command(Nothing)
+    def main(args):
+        raise KeyboardInterrupt
+
+    with pytest.raises(SystemExit) as stop:
+        main([])
+    assert stop.value.code == 130
+    assert capsys.readouterr().err == "interrupted\n"
 
 
 def test_our_own_bugs_keep_their_traceback():

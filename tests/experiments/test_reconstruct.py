@@ -192,8 +192,11 @@ def test_a_run_is_rendered_at_other_times_and_places(run, tmp_path):
 @pytest.mark.slow
 def test_the_canonical_scene_and_its_depth_are_rendered(run, tmp_path):
     arguments = [str(run), "--without", "motion", "--formats", "png"]
+    folder = run / "renders" / "heldout-without-motion-depth"
+    folder.mkdir(parents=True)
+    (folder / "earlier.png").touch()  # of other frames
     render.main([*arguments, "--show", "depth"])
-    (picture,) = (run / "renders" / "heldout-without-motion-depth").glob("*.png")
+    (picture,) = folder.glob("*.png")
     picture, _ = images.read_image(picture)
     near, far = (255 * np.array(colormaps["viridis"](end)[:3]) for end in (1.0, 0.0))
     known = picture[(picture != 128).any(axis=-1)].astype(float)

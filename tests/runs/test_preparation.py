@@ -187,8 +187,10 @@ def test_a_run_of_a_film_prepares_it_once_beside_the_run(tmp_path, mapper, monke
 
 
 def test_what_cannot_be_prepared_is_refused_and_leaves_nothing(pictures, tmp_path):
+    with pytest.raises(CaptureError, match=r"nothing\.mp4: no such film"):
+        preparation.prepare(tmp_path / "nothing.mp4", tmp_path / "out")
     with pytest.raises(CaptureError, match="neither a film"):
-        preparation.prepare(tmp_path / "nothing", tmp_path / "out")
+        preparation.prepare(pictures / "p0.png", tmp_path / "out")
     with pytest.raises(ValueError, match="choose from a film"):
         preparation.prepare(pictures, tmp_path / "out", Preparation(frames=5))
     with pytest.raises(CaptureError, match="maskz: no such folder of masks"):
@@ -215,7 +217,13 @@ def test_a_wrong_preset_is_refused_before_cameras_are_looked_for(tmp_path, mappe
     frames = [models.picture(row).repeat(2, 0).repeat(2, 1) for row in range(9)]
     video.write_video(tmp_path / "clip.mp4", frames, 30)
     source = CaptureSource(tmp_path / "clip.mp4")
-    for config in (RunConfig("nerf-smal", source), RunConfig("nerf", source, steps=0)):
+    wrong = [RunConfig("nerf-smal", source), RunConfig("nerf", source, steps=0)]
+    # None: one that tracks choose. No such preset has these.
+    wrong += [
+        RunConfig(None, source, steps=-3),
+        RunConfig(None, source, None, ("a=1",)),
+    ]
+    for config in wrong:
         with pytest.raises(reconstruction.Refused):
             reconstruction.reconstruct(config, tmp_path / "run")
     assert mapper.calls == []

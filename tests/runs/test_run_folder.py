@@ -8,7 +8,8 @@ import sys
 
 import pytest
 
-from nerfies_jax.runs import run_folder
+from nerfies_jax.runs import preparation, reconstruction, run_folder
+from nerfies_jax.runs.config import CaptureSource, RunConfig
 
 
 def test_run_folders_are_numbered_and_never_shared(tmp_path, monkeypatch):
@@ -24,7 +25,20 @@ def test_a_run_folder_that_cannot_be_written_is_an_early_error(tmp_path):
     (tmp_path / "file").write_text("")
     for out in (tmp_path / "file", tmp_path / "file" / "below"):
         with pytest.raises(ValueError, match=r"run folder .*--out"):
+            run_folder.check_free(out)  # before anything is looked at
+        with pytest.raises(ValueError, match=r"run folder .*--out"):
             run_folder.new_run_folder(out, "x")
+
+
+def test_a_run_is_no_capture(tmp_path):
+    run = tmp_path / "run"
+    (run / "checkpoints").mkdir(parents=True)
+    (run / "config.json").write_text("{}")
+    for look in (run_folder.newest_of, preparation.prepare):
+        with pytest.raises(ValueError, match=r"folder of a run, .* --resume"):
+            look(run, tmp_path / "out")
+    with pytest.raises(reconstruction.Refused, match="folder of a run"):
+        reconstruction.reconstruct(RunConfig(None, CaptureSource(run)))
 
 
 OWN = """
