@@ -192,6 +192,12 @@ def check_port(port: int) -> None:
         raise ValueError(f"--port {port}: choose one from 1024 to 65535")
 
 
+def check_max_side(max_side: int | None) -> None:
+    """Raise for a longest side without a pixel."""
+    if max_side is not None and max_side < 1:
+        raise ValueError(f"--max-side {max_side}: draw at least one pixel")
+
+
 def sized(size: tuple[int, int], max_side: int | None) -> tuple[int, int]:
     """A width and height as they are, or with `max_side` as the longer one."""
     if max_side is None:

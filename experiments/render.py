@@ -110,8 +110,7 @@ class Render:
                 "--show flow follows the motion of the whole scene; leave out "
                 "--without and --appearance"
             )
-        if self.max_side is not None and self.max_side < 1:
-            raise ValueError(f"--max-side {self.max_side}: at least one pixel")
+        cli.check_max_side(self.max_side)
         if not self.formats:
             raise ValueError("--formats: name at least one of png, mp4, exr")
 

@@ -34,8 +34,7 @@ class View:
 
     def __post_init__(self):
         cli.check_port(self.port)
-        if self.max_side is not None and self.max_side < 1:
-            raise ValueError(f"--max-side {self.max_side}: draw at least one pixel")
+        cli.check_max_side(self.max_side)
 
 
 @cli.command(View)

@@ -14,9 +14,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from nerfies_jax.effects import learnt_moments
 from nerfies_jax.effects import scene_flow_losses as flow_losses
 from nerfies_jax.effects.effect import Medium, RayOutput, Sample, Scalar, Vector
 from nerfies_jax.geometry import camera as cameras
@@ -131,20 +131,13 @@ class Neighbour(NamedTuple):
     present: Bool[Array, " rays"]  # whether the capture has that moment
 
 
-def interval(moments: int) -> float:
-    """Time from one of so many moments to the next; a single one has no neighbours."""
-    if moments < 1:
-        raise ValueError(f"a capture has at least one moment, got moments={moments}")
-    return 1 / (moments - 1) if moments > 1 else 2.0
-
-
 def effect(spec: SceneFlowSpec, times: tuple[float, ...], features: int) -> Effect:
     """The seams of `spec` for a capture that is learnt from at these rising times.
 
     They need not be even: frames are held out. `features` is the width of the static
     template's trunk.
     """
-    interval(len(times))  # refuses none
+    learnt_moments.interval(len(times))  # refuses none
     required_data = {"depths": spec.weights.depth, "flow": spec.weights.flow}
     return Effect(
         NAME,
@@ -229,23 +222,6 @@ def medium(
     return Medium(own.density, own.colour, share=share, extras=extras)
 
 
-def moment_beside(
-    times: tuple[float, ...], time: Float[Array, " rays"], side: int
-) -> tuple[Float[Array, " rays"], Bool[Array, " rays"]]:
-    """The learnt moment after (FORWARD) or before the one nearest to a time.
-
-    The second is whether there is one; where there is none, the first is an interval
-    away.
-    """
-    known = np.asarray(times)
-    between = jnp.asarray((known[1:] + known[:-1]) / 2, time.dtype)
-    place = jnp.searchsorted(between, time) + SIGNS[side]
-    present = (place >= 0) & (place < len(times))
-    beside = jnp.asarray(known, time.dtype)[jnp.clip(place, 0, len(times) - 1)]
-    away = time + SIGNS[side] * interval(len(times))
-    return jnp.where(present, beside, away), present
-
-
 def neighbour(
     spec: SceneFlowSpec,
     times: tuple[float, ...],
@@ -262,8 +238,8 @@ def neighbour(
     extras = level.media[NAME].extras
     flow = extras[("flow_forward", "flow_backward")[side]]
     now = context.condition.time
-    time, present = moment_beside(times, now, side)
-    intervals = jnp.abs(time - now) / interval(len(times))
+    time, present = learnt_moments.beside(times, now, SIGNS[side])
+    intervals = jnp.abs(time - now) / learnt_moments.interval(len(times))
     point = level.point + intervals[:, None, None] * flow
 
     def ask(point, direction, time):
@@ -285,15 +261,6 @@ def neighbour(
         weight=weight,
         present=present,
     )
-
-
-def fading(decay_steps: int, step: Int[Array, ""]) -> Scalar:
-    """A tenth every `decay_steps`: how much the capture's depth and flow still count.
-
-    They are guesses of other networks in NSFF, good for a start.
-    """
-    passed = (step // decay_steps).astype(jnp.result_type(float))
-    return jnp.exp(-math.log(10) * passed)
 
 
 def penalty(
@@ -341,7 +308,7 @@ def penalty(
         ),
         "entropy": lambda: flow_losses.entropy(own.share),
     }
-    fade = fading(spec.decay_steps, context.step)
+    fade = flow_losses.fading(spec.decay_steps, context.step)
     terms = {}
     for name, value in values.items():
         if getattr(spec.weights, name) > 0:
@@ -350,7 +317,7 @@ def penalty(
         value = depth_term(context, weight)
         terms["depth"] = Term(value, spec.weights.depth * fade)
     if spec.weights.flow > 0 and context.frames.flow is not None:
-        value = flow_term(context, interval(len(times)), weight, sides)
+        value = flow_term(context, learnt_moments.interval(len(times)), weight, sides)
         terms["flow"] = Term(value, spec.weights.flow * fade)
     return terms
 

@@ -4,9 +4,11 @@ Li et al. 2021, arXiv:2011.13084, as settled by the public code. Rays without a
 neighbouring moment are counted out by `present`; a mean over nothing is zero.
 """
 
+import math
+
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from nerfies_jax.geometry.precision import near_one
 from nerfies_jax.radiance import compositing
@@ -18,6 +20,15 @@ FLATTEST = 1e-3
 # Weights below count as none: the slope of a mean in a weight is up to the values over
 # the largest weight, and float32 holds 3e38.
 FAINTEST = 1e-30
+
+
+def fading(decay_steps: int, step: Int[Array, ""]) -> Scalar:
+    """A tenth every `decay_steps`: how much the capture's depth and flow still count.
+
+    They are guesses of other networks in NSFF, good for a start.
+    """
+    passed = (step // decay_steps).astype(jnp.result_type(float))
+    return jnp.exp(-math.log(10) * passed)
 
 
 def weighted_mean(

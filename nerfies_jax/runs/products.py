@@ -62,9 +62,8 @@ def make(
             "finite"
         )
     ms_per_frame = renderer.ms_per_frame(len(scored.rows))
-    with step_profile.profiling(
-        run, state
-    ) as profile:  # compiles while all else is written
+    # Compiles while all else is written.
+    with step_profile.profiling(run, state) as profile:
         comparison = save_comparison(folder / "comparison.png", run.filmed, scored)
         figures = [report.Figure(comparison, COMPARED)]
         watched = [run.capture.ids[row] for row in trained.watched]

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nerfies_jax.effects import scene_flow
+from nerfies_jax.effects import learnt_moments, scene_flow
 from nerfies_jax.effects.effect import Sample
 from nerfies_jax.effects.scene_flow import FlowWeights
 from nerfies_jax.nets.planes import PlanesSpec
@@ -193,11 +193,11 @@ def test_neighbours_are_moments_that_were_filmed(held_out, dtype):
     filmed = np.arange(40) / 39
     learnt = np.delete(filmed, np.arange(0, 40, held_out)).astype(np.float32)
     times = tuple(float(time) for time in learnt)
-    beside = jax.jit(scene_flow.moment_beside, static_argnums=(0, 2))
+    beside = jax.jit(learnt_moments.beside, static_argnums=(0, 2))
     now = jnp.asarray(learnt, dtype)
-    for side, shift in ((scene_flow.FORWARD, 1), (scene_flow.BACKWARD, -1)):
-        found, present = beside(times, now, side)
-        places = np.arange(len(learnt)) + shift
+    for sign in scene_flow.SIGNS:
+        found, present = beside(times, now, sign)
+        places = np.arange(len(learnt)) + sign
         inside = (places >= 0) & (places < len(learnt))
         np.testing.assert_array_equal(present, inside)
         np.testing.assert_array_equal(

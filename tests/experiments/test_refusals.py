@@ -43,7 +43,7 @@ TABLE = [
     ("evidence", "OUT", "OUT"),
     ("evidence", "--scene tiny --masks OUT", "no such folder of masks"),
     ("reconstruct", "--scene tiny --tracks OUT", "OUT: not a readable npz"),
-    ("render", "OUT --max-side 0", "--max-side 0: at least one pixel"),
+    ("render", "OUT --max-side 0", "--max-side 0: draw at least one pixel"),
     ("export", "nowhere ply", "no run here"),
     ("export", "nowhere ply --frames 1", "a sequence has at least two"),
     ("export", "nowhere ply --frames 2 --time 0.5", "one instant, or a sequence"),
