@@ -12,6 +12,12 @@ def number(value: float | int | None, digits: int = 2) -> str:
     return f"{value:,.{digits}f}"
 
 
+def with_spread(mean: float, spread: float, digits: int) -> str:
+    """As in "21.30 ± 0.12"; the mean alone where no spread is known."""
+    cell = number(mean, digits)
+    return f"{cell} ± {number(spread, digits)}" if cell and spread == spread else cell
+
+
 def short(value: float | int | None) -> str:
     """A number of any size in three digits, as in 0.0123 or 1e-07."""
     if value is None or not math.isfinite(value):

@@ -124,8 +124,9 @@ class Job:
         arm = self.suite.arms[name]
         representation = representations.of_preset(arm.preset)
         spec = representation.presets[arm.preset]
-        if steps is None and self.args.share is not None:
-            steps = max(1, round(self.args.share * spec.steps))
+        share = arm.share * (1.0 if self.args.share is None else self.args.share)
+        if steps is None and share != 1:
+            steps = max(1, round(share * spec.steps))
         if steps is not None:
             spec = representation.with_steps(spec, steps)
         return specs.override(spec, (*arm.changes, *self.args.set))
@@ -300,7 +301,10 @@ class Job:
         ValueError where that seed is not finished.
         """
         if budget.seconds is None:
-            return self.spec(name, budget.steps).steps
+            steps, share = budget.steps, self.suite.arms[name].share
+            if steps is not None:
+                steps = max(1, round(share * steps))
+            return self.spec(name, steps).steps
         steps = results.steps_of(self.path(name, 0, budget))
         if steps is None:
             raise ValueError(

@@ -63,12 +63,9 @@ def _table(means, spreads, names):
     for arm, row in means.items():
         cells = [f"`{arm}`"]
         for name in names:
-            digits = MEASURES[name].digits
-            cell = markdown.number(row[name], digits)
             spread = spreads.get(arm, {}).get(name, math.nan)
-            if cell and math.isfinite(spread):
-                cell += f" ± {markdown.number(spread, digits)}"
-            cells.append(cell)
+            digits = MEASURES[name].digits
+            cells.append(markdown.with_spread(row[name], spread, digits))
         rows.append(cells)
     return markdown.table(("arm", *(MEASURES[name].heading for name in names)), rows)
 

@@ -1,18 +1,17 @@
 """Settings that trade accuracy for time, axis by axis; no JAX.
 
 Every axis changes one thing in a base, so that its line says what that thing is worth.
+What moves is fitted to tracks first in all bases: from rest no setting finds it.
 """
 
+import dataclasses
 from typing import NamedTuple
 
-from experiments.ablate.arms import Arm, Suite
+from experiments.ablate.arms import FROM_REST, FROM_TRACKS, Arm, Suite
 
-SPLATS, FIELD, SONATA, MOBA = (
-    "splats-deformable-small",
-    "nerfies-small",
-    "sonata-small",
-    "moba-small",
-)
+SPLATS, FIELD = "splats-tracked-small", "nerfies-grid-small"
+# Presets that start from rest, from tracks, named as in the league.
+NETWORK, SONATA = "splats-deformable-small+tracks", "sonata-small+tracks"
 
 
 class Axis(NamedTuple):
@@ -23,44 +22,67 @@ class Axis(NamedTuple):
     settings: dict[str, Arm]  # by name, the base among them
 
 
-def _axis(question: str, preset: str, **changes: str) -> Axis:
-    """The base is the preset as it is; `changes` name what is set in the others.
+def _base(name: str) -> Arm:
+    preset, _, tracks = name.partition("+")
+    return Arm(preset, (FROM_TRACKS,) if tracks else ())
 
-    Names of settings are those of the changes, so that a preset as it is is trained
-    once for all of its axes.
+
+def _axis(question: str, base: str, **changes: str) -> Axis:
+    """`changes` name what is set in the others, beside what the base has set.
+
+    Names of settings are those of the changes, so that a base is trained once for all
+    of its axes.
     """
-    settings = {preset: Arm(preset)}
+    arm = _base(base)
+    settings = {base: arm}
     for name, assignments in changes.items():
-        settings[name] = Arm(preset, tuple(assignments.split()))
-    return Axis(question, preset, settings)
+        settings[name] = dataclasses.replace(
+            arm, changes=(*arm.changes, *assignments.split())
+        )
+    return Axis(question, base, settings)
 
 
-def _precisions(preset: str, stem: str) -> dict[str, Arm]:
-    """The preset under each of JAX's own switches of precision.
+def _lengths(question: str, base: str, **shares: float) -> Axis:
+    """The base over other numbers of steps, its schedules in proportion."""
+    arm = _base(base)
+    others = {
+        name: dataclasses.replace(arm, share=share) for name, share in shares.items()
+    }
+    return Axis(question, base, {base: arm, **others})
+
+
+def _precisions(base: str, stem: str) -> dict[str, Arm]:
+    """The base under each of JAX's own switches of precision.
 
     XLA for CPUs takes the one for products as a hint: it sums float32 as before, in
     another order, and saves nothing.
     """
-    return {
-        preset: Arm(preset),
-        f"{stem}-products-bfloat16": Arm(
-            preset, environment=("JAX_DEFAULT_MATMUL_PRECISION=BF16_BF16_F32",)
-        ),
-        f"{stem}-float64": Arm(preset, environment=("JAX_ENABLE_X64=1",)),
+    arm = _base(base)
+    switches = {
+        f"{stem}-products-bfloat16": "JAX_DEFAULT_MATMUL_PRECISION=BF16_BF16_F32",
+        f"{stem}-float64": "JAX_ENABLE_X64=1",
     }
+    others = {
+        name: dataclasses.replace(arm, environment=(s,)) for name, s in switches.items()
+    }
+    return {base: arm, **others}
 
 
 _PRESETS = (
     "splats-static-small",
+    "splats-deformable-small",
     SPLATS,
-    SONATA,
-    MOBA,
-    "nerf-small",
-    "t-nerf-small",
-    "d-nerf-small",
+    "spline-small",
+    "sc-gs-small",
+    "d-miso-small",
+    "sonata-small",
+    "moba-small",
+    "nerf-grid-small",
+    "d-nerf-grid-small",
     FIELD,
-    "hypernerf-small",
-    "nsff-small",
+    "hypernerf-grid-small",
+    "nerf-small",
+    "nerfies-small",
 )
 
 AXES = {
@@ -69,15 +91,25 @@ AXES = {
         SPLATS,
         {name: Arm(name) for name in _PRESETS},
     ),
+    "steps": _lengths(
+        "how long Gaussians train",
+        SPLATS,
+        **{"steps-0.25": 0.25, "steps-0.5": 0.5, "steps-2": 2.0},
+    ),
     "gaussians": _axis(
         "how many Gaussians, and whether they grow",
         SPLATS,
         **{
-            "most-4000": "init.points=1500 init.random=2000 init.extra_random=500 "
+            "most-4000": "init.points=1500 init.random=2000 start.moving_points=1200 "
             "densification.cap_max=4000",
             "most-20000": "densification.cap_max=20000",
             "no-growth": "densification=none",
         },
+    ),
+    "views": _axis(
+        "how many views in a step (rates go with the root of their number)",
+        SPLATS,
+        **{"views-1": "batch_size=1", "views-4": "batch_size=4"},
     ),
     "harmonics": _axis(
         "which degree of spherical harmonics",
@@ -100,9 +132,21 @@ AXES = {
             "antialiased": "raster.antialiased=true",
         },
     ),
+    "motion": _axis(
+        "how fine the motion is, and what finds it",
+        SPLATS,
+        **{
+            "bases-2": "motion.bases=2",
+            "bases-16": "motion.bases=16",
+            "knots-40": "motion.knots=40 motion.coarse_knots=20",
+            "no-fading": "temporal_opacity=none",
+            "from-rest": FROM_REST,
+            "no-motion": f"{FROM_REST} motion=none temporal_opacity=none",
+        },
+    ),
     "motion-network": _axis(
         "how large a motion network",
-        SPLATS,
+        NETWORK,
         **{
             "motion-2x48": "motion.depth=2 motion.width=48 motion.skips=",
             "motion-8x256": "motion.depth=8 motion.width=256 motion.skips=5",
@@ -119,15 +163,15 @@ AXES = {
             "kan-mlp": "motion.network=mlp",
         },
     ),
-    "basis": _axis(
-        "how many bases of motion",
-        MOBA,
-        **{
-            "k-2": "motion.count=2",
-            "k-4": "motion.count=4",
-            "k-16": "motion.count=16",
-            "no-basis": "motion.count=none",
-        },
+    "splat-precision": Axis(
+        "in which precision Gaussians are trained",
+        SPLATS,
+        _precisions(SPLATS, "splats"),
+    ),
+    "field-steps": _lengths(
+        "how long a field trains",
+        FIELD,
+        **{"field-steps-0.25": 0.25, "field-steps-0.5": 0.5, "field-steps-2": 2.0},
     ),
     "samples": _axis(
         "how many samples per ray",
@@ -141,7 +185,7 @@ AXES = {
     "rays": _axis(
         "how many rays in a step",
         FIELD,
-        **{"rays-256": "rays=256", "rays-1024": "rays=1024"},
+        **{"rays-512": "rays=512", "rays-2048": "rays=2048"},
     ),
     "elastic": _axis(
         "on how many samples of a ray to keep the warp elastic, in which form",
@@ -159,23 +203,17 @@ AXES = {
         FIELD,
         **{"warp-translation": "warp.kind=translation"},
     ),
-    "precision": Axis(
-        "in which precision a field is trained", FIELD, _precisions(FIELD, "field")
-    ),
-    "splat-precision": Axis(
-        "in which precision Gaussians are trained",
-        SPLATS,
-        _precisions(SPLATS, "splats"),
-    ),
-    "bands": _axis(
-        "how many bands encode the position",
+    "tables": _axis(
+        "how large the tables of the grid",
         FIELD,
         **{
-            "bands-5": "template.position.bands=5",
-            "bands-10": "template.position.bands=10",
-            "warp-bands-2": "warp.position.bands=2",
-            "warp-bands-6": "warp.position.bands=6",
+            "levels-4": "template.position.levels=4",
+            "finest-96": "template.position.finest=96",
+            "rows-2**15": "template.position.rows=32768",
         },
+    ),
+    "precision": Axis(
+        "in which precision a field is trained", FIELD, _precisions(FIELD, "field")
     ),
 }
 

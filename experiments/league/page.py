@@ -1,6 +1,5 @@
 """The page of `experiments.league` in docs/results, and its picture."""
 
-import math
 import pathlib
 from collections.abc import Mapping
 from typing import Any
@@ -128,11 +127,7 @@ def _table(contest, order, names):
         cells.append(str(len(standings.seeds_of(contest, name))))
         for key in names:
             mean, spread = standings.mean_and_spread(contest, name, key)
-            digits = MEASURES[key].digits
-            cell = markdown.number(mean, digits)
-            if cell and math.isfinite(spread):
-                cell += f" ± {markdown.number(spread, digits)}"
-            cells.append(cell)
+            cells.append(markdown.with_spread(mean, spread, MEASURES[key].digits))
         table.append(cells)
     heads = ("row", "reads", "seeds", *(MEASURES[key].heading for key in names))
     return markdown.table(heads, table, words=2)

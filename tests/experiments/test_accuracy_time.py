@@ -8,6 +8,7 @@ import types
 import pytest
 
 from experiments.ablate import pool
+from experiments.ablate.budget import Budget
 from experiments.ablate.job import Job
 from experiments.ablate.measures import MEASURES
 from experiments.ablate.settings import Ablate
@@ -21,7 +22,7 @@ from nerfies_jax.measure.clock import Metric
 def test_every_setting_of_an_axis_differs_from_its_base_and_the_others(name):
     job = types.SimpleNamespace(suite=SETTINGS, args=Ablate(suite="settings"))
     arms = AXES[name].settings
-    specs = [(Job.spec(job, each, 600), arm.environment) for each, arm in arms.items()]
+    specs = [(Job.spec(job, each, None), arm.environment) for each, arm in arms.items()]
     assert len(set(map(repr, specs))) == len(specs)
     assert AXES[name].base in arms
 
@@ -33,6 +34,16 @@ def test_a_setting_that_stands_on_two_axes_is_the_same_on_both():
             assert seen.setdefault(name, arm) == arm
             assert "/" not in name  # it is part of a file's name
     assert seen == SETTINGS.arms
+
+
+def test_a_share_of_steps_is_of_those_that_the_others_make():
+    job = Job.__new__(Job)
+    job.suite, arm = SETTINGS, SETTINGS.arms["steps-0.25"]
+    for given, steps in (({}, 2000), ({"steps": 600}, 600), ({"share": 0.5}, 1000)):
+        job.args = Ablate(suite="settings", **given)
+        budget = Budget(job.args.steps, None, pathlib.Path(), job.args.share)
+        assert job.planned_steps(arm.preset, budget) == steps
+        assert job.planned_steps("steps-0.25", budget) == steps / 4
 
 
 def row(**values):
@@ -51,10 +62,10 @@ def test_a_setting_of_precision_has_its_switch_in_its_process(tmp_path, monkeypa
 
     monkeypatch.setattr(pool.subprocess, "Popen", caught)
     monkeypatch.delenv("JAX_ENABLE_X64", raising=False)
-    for name in ("field-float64", "nerfies-small"):
+    for name in ("field-float64", "nerfies-grid-small"):
         pool.start(job, name, 0)
     assert begun["field-float64"]["JAX_ENABLE_X64"] == "1"
-    assert "JAX_ENABLE_X64" not in begun["nerfies-small"]
+    assert "JAX_ENABLE_X64" not in begun["nerfies-grid-small"]
 
 
 def test_a_setting_of_precision_is_refused_without_its_switch(monkeypatch):
@@ -64,7 +75,7 @@ def test_a_setting_of_precision_is_refused_without_its_switch(monkeypatch):
         Job._check_environment(job, "field-float64")
     monkeypatch.setenv("JAX_ENABLE_X64", "1")
     Job._check_environment(job, "field-float64")
-    Job._check_environment(job, "nerfies-small")
+    Job._check_environment(job, "nerfies-grid-small")
 
 
 def test_the_front_is_what_nothing_beats_in_both():
@@ -105,7 +116,7 @@ def test_a_cost_may_grow_by_a_share_and_a_quality_by_a_number():
 
 @pytest.mark.slow
 def test_a_tiny_plan_runs_resumes_and_is_held_against_itself(tmp_path, capfd):
-    small = "rays=8 sampling.coarse=4 sampling.fine=0 template.depth=1 template.width=8"
+    small = "rays=8 sampling.coarse=4 sampling.fine=0 start.motion=none"
     out = tmp_path / "out"
     words = ["--axes", "warp", "--share", "0.001", "--frames", "1", "--jobs", "2"]
     words += ["--out", str(out), "--set", *small.split()]
@@ -117,16 +128,16 @@ def test_a_tiny_plan_runs_resumes_and_is_held_against_itself(tmp_path, capfd):
     assert "of the training time" in printed
     stored = json.loads((out / "accuracy_time.json").read_text())
     assert stored["metrics"]["warp-translation.steps"]["value"] == 3
-    assert stored["metrics"]["nerfies-small.peak_mb"]["value"] > 100
+    assert stored["metrics"]["nerfies-grid-small.peak_mb"]["value"] > 100
     assert all(
         (out / name).stat().st_size > 5000 for name in ("front.png", "fronts.png")
     )
     before = {path: path.stat().st_mtime for path in out.glob("*-0.json")}
     baseline = tmp_path / "baseline.json"
-    stored["metrics"]["nerfies-small.psnr"]["value"] += 10
+    stored["metrics"]["nerfies-grid-small.psnr"]["value"] += 10
     baseline.write_text(json.dumps(stored))
     with pytest.raises(SystemExit) as stop:
         accuracy_time.main([*words, "--check", str(baseline)])
     assert stop.value.code == 1
-    assert "worse: nerfies-small.psnr" in capfd.readouterr().out
+    assert "worse: nerfies-grid-small.psnr" in capfd.readouterr().out
     assert before == {path: path.stat().st_mtime for path in out.glob("*-0.json")}
