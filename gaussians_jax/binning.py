@@ -14,6 +14,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from nerfies_jax.geometry.precision import exact_product
+
 # Slack on the exact ellipse/tile test: it drops only what stays below the cut when the
 # exponent is rounded differently in the blending step.
 EXPONENT_SLACK = 1e-4
@@ -291,7 +293,8 @@ def _sorted_by_upper_bits(key, lowest, bits):
         shift = (lowest + 3 * number).astype(jnp.uint32)
         digit = (key.reshape(-1, 8) >> shift) & 7
         one = jnp.uint32(1) << (4 * digit)
-        tally = one @ up_to
+        # Whole words: under a default of products in bfloat16 it would cast them.
+        tally = exact_product(one, up_to)
         counts = (tally[:, 7:] >> (4 * digits)) & 15
         total, before = lax.scan(lambda c, x: (c + x, c), 0 * digits, counts)
         before += lax.cumsum(total) - total

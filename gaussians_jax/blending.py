@@ -14,8 +14,8 @@ from jaxtyping import Array, Float, Int
 
 from gaussians_jax.binning import Grid, Intersections
 from gaussians_jax.raster_spec import RasterSpec
+from nerfies_jax.geometry.precision import exact_product
 
-EXACT = lax.Precision.HIGHEST  # no TF32 on GPU
 SHAPE_COLUMNS = 6  # mean x, mean y (px), p, k, r, log opacity; then channels
 
 
@@ -314,5 +314,5 @@ def _moments(grad, grid):
     # One product with eight columns, two of them idle: 0.36 ns a pair and pixel against
     # 0.51 for six columns and 1.1 for sums over rows, then columns.
     basis = jnp.stack([zero + 1, x, y, x * x, x * y, y * y, zero, zero], axis=1)
-    sums = jnp.dot(grad.reshape(-1, x.shape[0]), basis, precision=EXACT)
+    sums = exact_product(grad.reshape(-1, x.shape[0]), basis)
     return tuple(sums[:, i].reshape(grad.shape[:-1]) for i in range(6))

@@ -21,6 +21,7 @@ from gaussians_jax import densification, splats
 from gaussians_jax import optimiser as row_optimiser
 from gaussians_jax.splats import Params, Splats
 from nerfies_jax.geometry import quaternion
+from nerfies_jax.geometry.precision import exact_einsum, exact_product
 from nerfies_jax.training.step_counts import steps
 
 PyTree = Any
@@ -96,7 +97,7 @@ def compute_relocation(
     fall = jnp.asarray(np.exp(-(_NODES**2)), opacity.dtype)
     weight = jnp.asarray(np.where(_NODES == 0, 0.5, 1.0), opacity.dtype)
     covered = -jnp.expm1(count[:, None] * jnp.log1p(-each[:, None] * fall))
-    mass = (covered @ weight) * (2 * 0.1 / math.sqrt(math.pi))
+    mass = exact_product(covered, weight) * (2 * 0.1 / math.sqrt(math.pi))
     return each, scale * (opacity / mass)[:, None]
 
 
@@ -242,8 +243,8 @@ def position_noise(
     axes = jax.vmap(quaternion.to_matrix)(
         rows.quaternion
     )  # columns are the principal axes
-    along = jnp.einsum("nji,nj->ni", axes, noise) * drawn.scale**2
-    shaped = jnp.einsum("nij,nj->ni", axes, along)
+    along = exact_einsum("nji,nj->ni", axes, noise) * drawn.scale**2
+    shaped = exact_einsum("nij,nj->ni", axes, along)
     faint = jax.nn.sigmoid(-100 * (drawn.opacity - spec.min_opacity))
     rate = jnp.asarray(spec.noise_lr * learning_rate, faint.dtype)
     strength = jnp.where(splats.active_mask(rows), faint * rate, 0)

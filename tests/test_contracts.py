@@ -65,6 +65,7 @@ EXCUSED = {
     "grids.variation_at_random": "draws",
     **dict.fromkeys(["precision.at_least_float32", "precision.refuse_half"], "types"),
     "splats.refuse_half": "types",
+    **dict.fromkeys(["precision.exact_product", "precision.exact_einsum"], "NumPy's"),
     **dict.fromkeys(["splats.take_rows", "splats.pad_rows"], "moves rows of any tree"),
     **dict.fromkeys(["blending.blend", "blending.blend_gradient"], "test_raster.py"),
     **dict.fromkeys(["kan.first_layer_part", "kan.after_first_layer"], "in kan.apply"),

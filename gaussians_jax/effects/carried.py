@@ -27,6 +27,7 @@ from jaxtyping import Array, Float, Key
 from gaussians_jax import splats
 from gaussians_jax.splats import Gaussians, Params, Splats
 from nerfies_jax.geometry import quaternion
+from nerfies_jax.geometry.precision import exact_einsum
 from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
@@ -162,7 +163,7 @@ def posed(
 def _standing(own, turn, rows):
     """Means, rotations and scales of what rows carry, one after the other."""
     axes = jax.vmap(quaternion.to_matrix)(rows.quaternion)
-    places = jnp.einsum("nij,nkj->nki", axes, rows.scale[:, None] * own.offset)
+    places = exact_einsum("nij,nkj->nki", axes, rows.scale[:, None] * own.offset)
     growth = jnp.exp(jnp.clip(own.log_scale, *splats.LOG_SCALE_RANGE))
 
     def turned(row, one, turn):

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
+from nerfies_jax.geometry.precision import exact_product
 from nerfies_jax.nets import codes
 from nerfies_jax.training import schedules
 from nerfies_jax.training.effects import Effect
@@ -67,7 +68,7 @@ def changed(
     picture: Float[Array, "*pixels 3"], change: Float[Array, "3 4"]
 ) -> Float[Array, "*pixels 3"]:
     """Colours after a change, sRGB; not clipped."""
-    mixed = jnp.matmul(picture, change[:, :3].T, precision="highest")
+    mixed = exact_product(picture, change[:, :3].T)
     return picture + mixed + change[:, 3]
 
 

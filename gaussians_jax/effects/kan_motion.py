@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Key
 from gaussians_jax import splats
 from gaussians_jax.effects.blocks import in_blocks
 from gaussians_jax.splats import Gaussians, Params
+from nerfies_jax.geometry.precision import exact_product
 from nerfies_jax.nets import codes, kan, mlp
 from nerfies_jax.nets.kan import KAN, KANSpec
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
@@ -217,7 +218,8 @@ def _random_waves(key, spec, places, width):
     shape = places.shape[1], width
     waves = spec.waves * jax.random.normal(wave_key, shape, jnp.float32)
     phase = jax.random.uniform(phase_key, (width,), jnp.float32, 0, 2 * jnp.pi)
-    angle = places @ waves.astype(places.dtype) + phase.astype(places.dtype)
+    angle = exact_product(places, waves.astype(places.dtype))
+    angle = angle + phase.astype(places.dtype)
     return spec.spread * math.sqrt(2) * jnp.cos(angle)
 
 

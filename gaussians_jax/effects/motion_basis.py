@@ -20,6 +20,7 @@ from gaussians_jax.effects import mlp_motion
 from gaussians_jax.effects.blocks import in_blocks
 from gaussians_jax.effects.mlp_motion import SmoothingSpec
 from gaussians_jax.splats import Gaussians, Params
+from nerfies_jax.geometry.precision import exact_product
 from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
@@ -264,7 +265,7 @@ def offsets_at_time(
     heads = residual(at_time.weights, spec, point + slow)
     fast = heads["weights"]
     if prepared.basis is not None:
-        fast = prepared.basis @ fast
+        fast = exact_product(prepared.basis, fast)
     return Offsets(slow + fast, heads["turn"], heads["log_scale"])
 
 

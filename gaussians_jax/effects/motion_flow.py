@@ -25,6 +25,7 @@ from gaussians_jax.splats import Gaussians
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry import rays
 from nerfies_jax.geometry.camera import Camera
+from nerfies_jax.geometry.precision import exact_einsum, exact_product
 from nerfies_jax.training import losses
 from nerfies_jax.training.effects import Effect, PenaltyContext, Term
 from nerfies_jax.training.step_counts import steps
@@ -148,7 +149,7 @@ def drawn_flow(
     )
     matrix, offset = image[..., :4].reshape(*image.shape[:2], 2, 2), image[..., 4:6]
     centre = rays.pixel_centres(size, image.dtype)
-    flow = jnp.einsum("hwij,hwj->hwi", matrix, centre) + offset
+    flow = exact_einsum("hwij,hwj->hwi", matrix, centre) + offset
     depth, share = lax.stop_gradient(image[..., 6]), lax.stop_gradient(image[..., 7])
     alpha = lax.stop_gradient(1 - left)
     return Drawn(
@@ -166,9 +167,9 @@ def linear_flow(
     zero = jnp.zeros_like(p)
     into = _matrix(p, zero, -r * k, r)
     before, after = (_factor(one.whitening) for one in (start, end))
-    stretch = jnp.einsum("gij,gjk->gik", after - before, into)
+    stretch = exact_einsum("gij,gjk->gik", after - before, into)
     moved = end.mean_px - start.mean_px
-    return stretch, moved - jnp.einsum("gij,gj->gi", stretch, first.mean_px)
+    return stretch, moved - exact_einsum("gij,gj->gi", stretch, first.mean_px)
 
 
 def _factor(whitening):
@@ -196,7 +197,9 @@ def camera_flow(
     y = offset[..., 1] / (first.focal_px * first.pixel_aspect)
     x = (offset[..., 0] - first.skew_px * y) / first.focal_px
     slopes = jnp.stack([x, y, jnp.ones_like(x)], axis=-1)
-    place = first.position + depth[..., None] * (slopes @ first.camera_from_world)
+    place = first.position + depth[..., None] * exact_product(
+        slopes, first.camera_from_world
+    )
     pixel, _ = jax.vmap(jax.vmap(cameras.project, (None, 0)), (None, 0))(second, place)
     return pixel - centre
 

@@ -27,6 +27,7 @@ from gaussians_jax.path_fit import Guess, Paths, Points
 from gaussians_jax.splats import Gaussians, Params, Splats
 from nerfies_jax.evidence import rigid_groups
 from nerfies_jax.geometry import lie
+from nerfies_jax.geometry.precision import exact_einsum, exact_product
 from nerfies_jax.training import schedules
 from nerfies_jax.training.effects import Effect, FrameCondition
 
@@ -128,12 +129,14 @@ def at_time(bases: Bases, time: Float[Array, ""]) -> Motion:
     levels = [one for one in (bases.fine, bases.coarse) if one.turn.shape[1]]
     tables = jnp.concatenate([jnp.concatenate(one, axis=-1) for one in levels], axis=1)
     weights = [time_knots.spline_weights(one.turn.shape[1], time) for one in levels]
-    now = jnp.einsum("k,bkc->bc", jnp.concatenate(weights), tables)
+    now = exact_einsum("k,bkc->bc", jnp.concatenate(weights), tables)
     turn, shift = now[:, :3], now[:, 3:]
     axes, none = jnp.eye(3, dtype=turn.dtype), jnp.zeros_like(turn[0])
     turned = jax.vmap(lie.displacement, (None, None, 0))
     linear = jnp.swapaxes(jax.vmap(turned, (0, None, None))(turn, none, axes), 1, 2)
-    return Motion(turn, linear, shift - jnp.einsum("bij,bj->bi", linear, bases.centre))
+    return Motion(
+        turn, linear, shift - exact_einsum("bij,bj->bi", linear, bases.centre)
+    )
 
 
 def deform(
@@ -147,11 +150,11 @@ def deform(
     weights = jax.nn.softmax(logits, axis=-1)[:, 1:]
     rows = len(motion.turn)
     flat = jnp.concatenate([motion.linear.reshape(rows, 9), motion.offset], axis=-1)
-    mixed = weights @ jnp.concatenate([flat, motion.turn], axis=-1)
+    mixed = exact_product(weights, jnp.concatenate([flat, motion.turn], axis=-1))
     linear, offset, turn = mixed[:, :9], mixed[:, 9:12], mixed[:, 12:]
     linear = linear.reshape(-1, 3, 3)
     mean = gaussians.mean
-    moved = mean + (jnp.einsum("nij,nj->ni", linear, mean) + offset)
+    moved = mean + (exact_einsum("nij,nj->ni", linear, mean) + offset)
     return gaussians._replace(mean=moved, quaternion=splats.turned(gaussians, turn))
 
 

@@ -17,6 +17,7 @@ from gaussians_jax import splats
 from gaussians_jax.splats import Gaussians
 from nerfies_jax.geometry import matrix3
 from nerfies_jax.geometry import quaternion as quaternions
+from nerfies_jax.geometry.precision import exact_einsum
 
 # Rows whose distances to all nodes stand in memory at once: 4 MB with 512 nodes.
 SEARCHED_AT_ONCE = 2048
@@ -179,10 +180,10 @@ def arap_error(
     edges, turned = (
         places[:, None] - places[linked.index] for places in (before, after)
     )
-    spread = jnp.einsum("nk,nki,nkj->nij", linked.weight, edges, turned)
+    spread = exact_einsum("nk,nki,nkj->nij", linked.weight, edges, turned)
     left, _, right = jax.vmap(matrix3.svd)(jax.lax.stop_gradient(spread))
-    rotation = jnp.einsum("nij,nkj->nik", left, right)
-    off = edges - jnp.einsum("nij,nkj->nki", rotation, turned)
+    rotation = exact_einsum("nij,nkj->nik", left, right)
+    off = edges - exact_einsum("nij,nkj->nki", rotation, turned)
     total = jnp.sum(linked.weight * jnp.sum(off * off, axis=2))
     return total / len(before)
 

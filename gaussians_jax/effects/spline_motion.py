@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 from gaussians_jax import path_fit, splats, time_knots
 from gaussians_jax.path_fit import Guess, Paths, Points
 from gaussians_jax.splats import Gaussians, Params, Splats
+from nerfies_jax.geometry.precision import exact_einsum
 from nerfies_jax.training import schedules
 from nerfies_jax.training.effects import Effect, FrameCondition
 from nerfies_jax.training.step_counts import steps
@@ -60,7 +61,7 @@ def init(spec: SplineMotionSpec, gaussians: int, dtype=jnp.float32) -> Splines:
 def deform(rows: Splines, gaussians: Gaussians, time: Float[Array, ""]) -> Gaussians:
     """Gaussians as they are at one time in [0, 1]; outside it, at its nearer end."""
     weights = time_knots.spline_weights(rows.shift.shape[1], time)
-    shift, turn = (jnp.einsum("k,nkc->nc", weights, leaf) for leaf in rows)
+    shift, turn = (exact_einsum("k,nkc->nc", weights, leaf) for leaf in rows)
     return gaussians._replace(
         mean=gaussians.mean + shift, quaternion=splats.turned(gaussians, turn)
     )

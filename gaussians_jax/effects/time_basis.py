@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Key
 
 from gaussians_jax import splats
 from gaussians_jax.splats import Gaussians, Params, Splats
+from nerfies_jax.geometry.precision import exact_product
 from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
@@ -119,7 +120,7 @@ def deform(
     gaussians: Gaussians,
 ) -> Gaussians:
     """Gaussians moved along the trajectories in their own measure."""
-    moved = coefficients @ jnp.concatenate(trajectories, axis=-1)
+    moved = exact_product(coefficients, jnp.concatenate(trajectories, axis=-1))
     return gaussians._replace(
         mean=gaussians.mean + moved[:, :3],
         quaternion=splats.turned(gaussians, moved[:, 3:]),

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from nerfies_jax.effects.effect import Look, RayOutput, Scalar, Surface, Vector
+from nerfies_jax.geometry.precision import exact_einsum
 from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import Layer
@@ -170,7 +171,7 @@ def costs_of(
     slope = jax.lax.stop_gradient(found["slope"])
     known = jnp.any(slope != 0, axis=-1)
     off = jnp.sum((found["head"] - slope) ** 2, axis=-1)
-    facing = jnp.einsum("rsk,rk->rs", found["observed"], direction)
+    facing = exact_einsum("rsk,rk->rs", found["observed"], direction)
     return (
         jnp.mean(jnp.where(known, weight * off, 0)),
         jnp.mean(weight * jnp.maximum(facing, 0) ** 2),

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from nerfies_jax.geometry import distortion, lie, precision
+from nerfies_jax.geometry import distortion, lie
+from nerfies_jax.geometry.precision import exact_product, refuse_half
 
 # Both keep what is at or behind the camera finite in float32, where 1/z² overflows
 # below 1e-19 and the seventh power of a slope above 1e5.
@@ -82,7 +83,7 @@ def unproject(
     Where the lens model has no one-to-one solution the flag is False, and the direction
     is finite, has zero gradient with respect to the pixel, and means nothing.
     """
-    precision.refuse_half("the camera or the pixel", camera.position, pixel)
+    refuse_half("the camera or the pixel", camera.position, pixel)
     offset = pixel - camera.principal_point_px
     bent_y = offset[1] / (camera.focal_px * camera.pixel_aspect)
     bent_x = (offset[0] - camera.skew_px * bent_y) / camera.focal_px
@@ -91,9 +92,7 @@ def unproject(
     )
     in_camera = jnp.concatenate([slopes, jnp.ones_like(slopes[:1])])
     in_camera = in_camera / jnp.sqrt(jnp.sum(in_camera**2))  # at least 1: no zero here
-    # Full precision: on a GPU the default would round the rotation to ten bits.
-    direction = jnp.matmul(in_camera, camera.camera_from_world, precision="highest")
-    return direction, converged
+    return exact_product(in_camera, camera.camera_from_world), converged
 
 
 def forward_axis(camera: Camera) -> Float[Array, "*batch 3"]:
@@ -129,9 +128,9 @@ def move(
     A screw in the camera's own frame: `angular` in rad, `linear` in scene units.
     """
     rotation, shift = lie.exp_se3(angular, linear)
-    turned = jnp.matmul(rotation, camera.camera_from_world, precision="highest")
+    turned = exact_product(rotation, camera.camera_from_world)
     # t' = R t + V v with t = -R c; the centre moves by -R'ᵀ V v, and nothing cancels.
-    moved = camera.position - jnp.matmul(shift, turned, precision="highest")
+    moved = camera.position - exact_product(shift, turned)
     return camera._replace(camera_from_world=turned, position=moved)
 
 
@@ -272,10 +271,8 @@ def validate(camera: Camera, size: tuple[int, int], name: str = "camera") -> Non
 
 def _in_camera(camera: Camera, point: Float[Array, "3"]):
     """Lateral offset and depth. R (x - c), never R x + t: that cancels far from 0."""
-    precision.refuse_half("the camera or the point", camera.position, point)
-    offset = jnp.matmul(
-        camera.camera_from_world, point - camera.position, precision="highest"
-    )
+    refuse_half("the camera or the point", camera.position, point)
+    offset = exact_product(camera.camera_from_world, point - camera.position)
     return offset[:2], offset[2]
 
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from nerfies_jax.geometry import quaternion
-from nerfies_jax.geometry.precision import at_least_float32
+from nerfies_jax.geometry.precision import at_least_float32, exact_product
 from nerfies_jax.geometry.stumpff import stumpff
 
 Vector = Float[Array, "3"]
@@ -71,14 +71,14 @@ def log_so3(rotation: Matrix) -> Vector:
 @at_least_float32
 def exp_se3(angular: Vector, linear: Vector) -> tuple[Matrix, Vector]:
     """Rotation matrix and translation of a screw."""
-    return exp_so3(angular), left_jacobian(angular) @ linear
+    return exp_so3(angular), exact_product(left_jacobian(angular), linear)
 
 
 @at_least_float32
 def log_se3(rotation: Matrix, translation: Vector) -> tuple[Vector, Vector]:
     """The screw of a rigid motion: the inverse of `exp_se3` for turns below π."""
     angular = log_so3(rotation)
-    return angular, inverse_left_jacobian(angular) @ translation
+    return angular, exact_product(inverse_left_jacobian(angular), translation)
 
 
 @at_least_float32
@@ -139,11 +139,8 @@ def _coupling(angular, linear):
     angle_sq = jnp.sum(angular**2)
     c3, c4, c5 = (stumpff(k, angle_sq) for k in (3, 4, 5))
     w, v = hat(angular), hat(linear)
-    wv, vw = w @ v, v @ w
-    wvw = wv @ w
-    return (
-        v / 2
-        + c3 * (wv + vw + wvw)
-        + c4 * (w @ wv + vw @ w - 3 * wvw)
-        + (c4 - 3 * c5) / 2 * (wvw @ w + w @ wvw)
-    )
+    wv, vw = exact_product(w, v), exact_product(v, w)
+    wvw = exact_product(wv, w)
+    third = exact_product(w, wv) + exact_product(vw, w) - 3 * wvw
+    fourth = exact_product(wvw, w) + exact_product(w, wvw)
+    return v / 2 + c3 * (wv + vw + wvw) + c4 * third + (c4 - 3 * c5) / 2 * fourth

@@ -3,6 +3,10 @@
 What moves a point or measures a strain is computed in float32 and rounded once at the
 end: in bfloat16 arithmetic a screw is 3e-2 off. Cameras are refused, for there the
 inputs themselves are too coarse.
+
+Matrix products of float32 round their factors to 8 bits by a TPU's default, to 11 by a
+GPU's, and on a CPU to what JAX's switch says where XLA takes it. Networks may; what
+places, moves, orders or measures goes through `exact_product` and `exact_einsum`.
 """
 
 import functools
@@ -10,9 +14,21 @@ import functools
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Num
 
 _HALVES = (jnp.dtype(jnp.bfloat16), jnp.dtype(jnp.float16))
+
+
+def exact_product(
+    left: Num[Array, "..."], right: Num[Array, "..."]
+) -> Num[Array, "..."]:
+    """`jnp.matmul` with all digits of its factors, whatever the default of products."""
+    return jnp.matmul(left, right, precision=lax.Precision.HIGHEST)
+
+
+def exact_einsum(formula: str, *factors: Float[Array, "..."]) -> Float[Array, "..."]:
+    """`jnp.einsum` with all digits of its factors, whatever the default of products."""
+    return jnp.einsum(formula, *factors, precision=lax.Precision.HIGHEST)
 
 
 def at_least_float32(function):

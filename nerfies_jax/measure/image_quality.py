@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from nerfies_jax.geometry.precision import widened
+from nerfies_jax.geometry.precision import exact_einsum, widened
 from nerfies_jax.training import losses
 
 TAPS = len(losses.WINDOW)  # 11 pixels
@@ -252,10 +252,9 @@ def _window_sum(values, weights):
         [values[i * block : (i + 1) * block + taps - 1] for i in range(blocks)]
     )
     band = np.stack([np.pad(weights, (i, block - 1 - i)) for i in range(block)])
-    sums = jnp.einsum(
+    sums = exact_einsum(
         "ot,ntc->noc",
         jnp.asarray(band, values.dtype),
         parts,
-        precision=jax.lax.Precision.HIGHEST,  # TF32 would cost three digits
     )
     return sums.reshape(blocks * block, -1)[:outputs]

@@ -18,7 +18,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from nerfies_jax.geometry.precision import widened
+from nerfies_jax.geometry.precision import exact_einsum, widened
 from nerfies_jax.measure import weight_files
 
 # The reference's ImageNet statistics, moved to pictures in [-1, 1].
@@ -196,11 +196,10 @@ def _stage_distances(params, network, image, truth, scaling):
         features(params, network, image), features(params, network, truth), strict=True
     )
     return [
-        jnp.einsum(
+        exact_einsum(
             "hwc,c->hw",
             (_unit(a) - _unit(b)) ** 2,
             head,
-            precision=lax.Precision.HIGHEST,
         )
         for (a, b), head in zip(pairs, params.heads, strict=True)
     ]

@@ -17,6 +17,8 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, Int, Key
 
+from nerfies_jax.geometry.precision import exact_product
+
 # Multipliers of the coordinates of a vertex (Müller et al. 2022, equation 4).
 PRIMES = (1, 2654435761, 805459861)
 FIRST = 1e-4  # half-width of the first features, as published
@@ -164,9 +166,7 @@ def _slope_between_vertices(cells, stride, primals, tangents):
         )
         rows, weights = _vertices_around(place, cells, stride, len(table))
         # By default a GPU may round factors to ten bits.
-        return jnp.matmul(
-            jnp.stack(weights), table[jnp.stack(rows)], precision="highest"
-        )
+        return exact_product(jnp.stack(weights), table[jnp.stack(rows)])
 
     return jax.jvp(
         product,
@@ -268,7 +268,7 @@ def total_variation(
     # product 3 (27 and 14 with the slope).
     squares = sum(_squared_differences(grid, axis) for axis in range(3))
     lines = squares.reshape(vertices**2, -1)
-    total = jnp.sum(lines @ jnp.ones(lines.shape[1], lines.dtype))
+    total = jnp.sum(exact_product(lines, jnp.ones(lines.shape[1], lines.dtype)))
     return total / (3 * table.size * cells / vertices)
 
 

@@ -20,6 +20,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from nerfies_jax.geometry.camera import Camera, move
+from nerfies_jax.geometry.precision import exact_product
 
 PyTree = Any
 Scalar = Float[Array, ""]
@@ -282,5 +283,7 @@ def _settled(residuals, step, tolerance):
     basis, triangle = jnp.linalg.qr(grads)
     values = jnp.linalg.svd(triangle, compute_uv=False)
     determined = values[-1] > DETERMINED * values[0]
-    onward = jax.scipy.linalg.solve_triangular(triangle, basis.T @ residuals(step))
+    onward = jax.scipy.linalg.solve_triangular(
+        triangle, exact_product(basis.T, residuals(step))
+    )
     return determined & (jnp.max(jnp.abs(onward)) <= tolerance)

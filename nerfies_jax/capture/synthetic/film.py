@@ -12,6 +12,7 @@ from nerfies_jax.capture.synthetic.spec import SceneSpec
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry import rays
 from nerfies_jax.geometry.camera import Camera
+from nerfies_jax.geometry.precision import exact_product
 
 TILE = 16  # pixels
 SHAKE_HARMONICS = 6  # the fastest tremor takes a sixth of the capture
@@ -107,7 +108,7 @@ def view_direction(camera: Camera, pixel: Float[Array, "2"]) -> Float[Array, "3"
     """
     slopes = (pixel - camera.principal_point_px) / camera.focal_px
     in_camera = jnp.concatenate([slopes, jnp.ones_like(slopes[:1])])
-    return jnp.matmul(in_camera, camera.camera_from_world, precision="highest")
+    return exact_product(in_camera, camera.camera_from_world)
 
 
 def noted_cameras(spec: SceneSpec, plan: Schedule, seed: int) -> Camera:

@@ -12,6 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from nerfies_jax.geometry.precision import exact_product
+
 Vector = tuple[float, float, float]
 
 
@@ -91,8 +93,8 @@ class Arm:
             swing = jnp.sin(2 * jnp.pi * (hinge.cycles * time + hinge.phase))
             turn = axis_rotation(hinge.axis, hinge.rest_rad + hinge.swing_rad * swing)
             pivot = jnp.asarray(hinge.pivot, time.dtype)
-            rotation = times(turn, rotation)
-            position = times(turn, position - pivot) + pivot
+            rotation = exact_product(turn, rotation)
+            position = exact_product(turn, position - pivot) + pivot
         return Pose(rotation, position)
 
 
@@ -130,12 +132,12 @@ def pose(motion: Motion | None, place: Vector, time: Float[Array, ""]) -> Pose:
 
 def to_world(pose: Pose, point: Float[Array, "3"]) -> Float[Array, "3"]:
     """A point of the body, in the world."""
-    return times(pose.rotation, point) + pose.position
+    return exact_product(pose.rotation, point) + pose.position
 
 
 def to_body(pose: Pose, point: Float[Array, "3"]) -> Float[Array, "3"]:
     """A point of the world, in the body's own axes."""
-    return times(pose.rotation.T, point - pose.position)
+    return exact_product(pose.rotation.T, point - pose.position)
 
 
 def axis_rotation(axis: Vector, angle_rad: Float[Array, ""]) -> Float[Array, "3 3"]:
@@ -148,8 +150,3 @@ def axis_rotation(axis: Vector, angle_rad: Float[Array, ""]) -> Float[Array, "3 
     versine = 2 * jnp.sin(angle_rad / 2) ** 2
     eye = jnp.eye(3, dtype=angle_rad.dtype)
     return eye + jnp.sin(angle_rad) * first + versine * second
-
-
-def times(matrix: Float[Array, "3 3"], other: Float[Array, "3 *n"]):
-    """A matrix product in full precision: a GPU's default keeps ten bits."""
-    return jnp.matmul(matrix, other, precision="highest")

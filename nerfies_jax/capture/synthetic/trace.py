@@ -15,6 +15,7 @@ from nerfies_jax.capture.synthetic import motion, texture
 from nerfies_jax.capture.synthetic.spec import SceneSpec, Thing
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry.camera import Camera
+from nerfies_jax.geometry.precision import exact_product
 
 NOTHING = -1  # thing id of a ray that leaves the scene
 # How far in front of a point something must lie to hide it, scene units: float32 meets
@@ -46,12 +47,14 @@ def cast(
     for index, thing in enumerate(spec.all_things()):
         pose = motion.pose(thing.motion, thing.place, time)
         crossing = thing.shape.cross(
-            motion.to_body(pose, origin), motion.times(pose.rotation.T, direction), time
+            motion.to_body(pose, origin),
+            exact_product(pose.rotation.T, direction),
+            time,
         )
         nearer = crossing.distance < best.distance
         if index == spec.transient_id:
             nearer = nearer & transient_shown
-        normal = motion.times(pose.rotation, crossing.normal)
+        normal = exact_product(pose.rotation, crossing.normal)
         here = Hit(
             crossing.distance, jnp.asarray(index, jnp.int32), crossing.material, normal
         )

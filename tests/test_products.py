@@ -1,0 +1,117 @@
+"""What no network computes keeps its digits, whatever JAX's default of products is.
+
+A device may round the factors of a matrix product (a TPU to 8 bits, a GPU to 11), and
+so may JAX's own switch. In a network that is a price; of places, orders and measures it
+is an error.
+"""
+
+import pathlib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+from jax.extend import core
+
+from gaussians_jax import presets as splat_presets
+from gaussians_jax import projection, raster
+from gaussians_jax.raster_spec import GSPLAT
+from nerfies_jax import presets as field_presets
+from nerfies_jax.geometry import camera as cameras
+from tests import bare_scenes
+from tests.gaussians.shared import same_bits, some_gaussians
+from tests.test_effect_cost import started_field, started_splats
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+# Where networks multiply.
+NETWORKS = {
+    *(f"nerfies_jax/nets/{name}.py" for name in ("dense", "kan", "mlp")),
+    "nerfies_jax/radiance/template.py",
+    "nerfies_jax/effects/warp.py",
+}
+FIRST_LAYERS = {
+    ("gaussians_jax/effects/embedding_motion.py", "prepare"),
+    ("gaussians_jax/effects/embedding_motion.py", "deform"),
+    ("gaussians_jax/effects/motion_basis.py", "prepare_point"),
+}
+
+
+def equations(jaxpr):
+    """All operations of a program and of those within it."""
+    for equation in jaxpr.eqns:
+        yield equation
+        for leaf in jax.tree.leaves(
+            list(equation.params.values()),
+            is_leaf=lambda x: isinstance(x, (core.Jaxpr, core.ClosedJaxpr)),
+        ):
+            if isinstance(leaf, (core.Jaxpr, core.ClosedJaxpr)):
+                yield from equations(getattr(leaf, "jaxpr", leaf))
+
+
+def place_of(equation):
+    """File and function of the library that asked for an operation."""
+    for frame in equation.source_info.traceback.frames:
+        path = pathlib.Path(frame.file_name)
+        if path.is_relative_to(ROOT) and path.stem != "precision":
+            return path.relative_to(ROOT).as_posix(), frame.function_name.split(".")[0]
+    return "", ""
+
+
+def rounded_products(function, *arguments):
+    """Where a program leaves the digits of a product to the default."""
+    program = jax.make_jaxpr(function)(*arguments)
+    return {
+        place_of(equation)
+        for equation in equations(program.jaxpr)
+        if equation.primitive.name in ("dot_general", "conv_general_dilated")
+        if equation.params["precision"] != (lax.Precision.HIGHEST,) * 2
+    }
+
+
+def small(presets):
+    return [
+        pytest.param(name, marks=() if name in IN_CORE else pytest.mark.full)
+        for name in presets
+        if name.endswith("-small")
+    ]
+
+
+IN_CORE = ("splats-tracked-small", "nerfies-grid-small")
+
+
+@pytest.mark.parametrize(
+    "name", small([*splat_presets.PRESETS, *field_presets.PRESETS])
+)
+def test_only_networks_leave_the_digits_of_products_to_the_default(name):
+    if name in splat_presets.PRESETS:
+        started = started_splats(bare_scenes.from_rest(bare_scenes.tiny_splats(name)))
+        state = started.state
+    else:
+        started = started_field(bare_scenes.from_rest(bare_scenes.tiny_field(name)))
+        state = jax.eval_shape(started.init, jax.random.key(0))
+    found = rounded_products(started.model.step, state, started.frames)
+    others = {(path, name) for path, name in found if path not in NETWORKS}
+    assert others <= FIRST_LAYERS
+
+
+def test_a_product_of_places_is_found():
+    def turned(matrix, point):
+        return matrix @ point
+
+    assert rounded_products(turned, jnp.eye(3), jnp.ones(3)) != set()
+
+
+def test_a_picture_is_the_same_under_every_default():
+    gaussians = some_gaussians(400, "float32")
+    camera = cameras.pinhole(np.eye(3), np.array([0, 0, -4.0]), 40.0, (32, 24))
+
+    def drawn(gaussians):
+        seen = projection.project(gaussians, camera, (32, 24), GSPLAT)
+        return raster.rasterise(seen, gaussians.scale, (32, 24), GSPLAT)
+
+    pictures = []
+    for default in (None, "BF16_BF16_F32"):
+        with jax.default_matmul_precision(default):
+            pictures.append(jax.jit(drawn)(gaussians))
+    same_bits(*pictures)
