@@ -34,12 +34,13 @@ def on_devices(
     are those of one device to rounding. `devices` divides `shares`. 10,000 Gaussians,
     256x192, two cores: two views with their gradients in 37 ms, one in 32.
     """
+    number = jnp.arange(shares, dtype=jnp.int32)  # as steps are, also where x64 is on
     if devices == 1:
-        return lax.map(lambda share: work(share, *inputs), jnp.arange(shares))
+        return lax.map(lambda share: work(share, *inputs), number)
     each = shares // devices
 
     def own(first, *inputs):
-        return lax.map(lambda i: work(first[0] + i, *inputs), jnp.arange(each))
+        return lax.map(lambda i: work(first[0] + i, *inputs), number[:each])
 
     spread = jax.shard_map(
         own,
@@ -49,7 +50,7 @@ def on_devices(
         # What leaves a `while_loop` is not followed.
         check_vma=False,
     )
-    return spread(jnp.arange(0, shares, each), *inputs)
+    return spread(number[::each], *inputs)
 
 
 def rows_on_devices(

@@ -19,6 +19,7 @@ from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.measure import geometry_quality, image_quality, perceptual
 from nerfies_jax.measure.clock import Metric
 from nerfies_jax.measure.perceptual import LpipsParams, Network
+from nerfies_jax.training.model import in_default_precision
 
 # Five scales halve a picture four times, and the window of 11 must fit into the last.
 MS_SSIM_SIDE = 160  # pixels that the shorter side must exceed
@@ -263,8 +264,7 @@ def _flow(flow):
 
     def errors(mask=None):
         mask = None if mask is None else jnp.asarray(mask)
-        predicted, truth = jnp.asarray(flow.predicted), jnp.asarray(flow.truth)
-        return _flow_errors(predicted, truth, mask)
+        return _flow_errors(*in_default_precision((flow.predicted, flow.truth)), mask)
 
     numbers = {
         "flow.epe": errors(answered).endpoint,
