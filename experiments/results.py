@@ -85,18 +85,12 @@ def _package(name, words="", page="page", of=None, measured=None):
 
 
 _BOOKSHELF = "--capture CAPTURE --max-side 256 --heldout 8"
-_SPLAT_AXES = "gaussians harmonics dssim raster motion-network kan basis"
+_SPLAT_AXES = "steps gaussians views harmonics dssim raster motion splat-precision"
 STUDIES = {
     "benchmark": _package("benchmark", "--seeds 3"),
     "accuracy_time": _package(
         "accuracy_time",
-        f"--axes preset {_SPLAT_AXES} splat-precision --share 0.25 --jobs 4",
-    ),
-    "accuracy_time_bookshelf": _package(
-        "accuracy_time_bookshelf",
-        "CAPTURE --axes preset --max-side 256 --heldout 8 --share 0.2 --frames 4 "
-        "--jobs 2",
-        of="accuracy_time",
+        f"--axes {_SPLAT_AXES} --share 0.5 --seeds 3 --jobs 2",
     ),
     "effect_cost": _package(
         "effect_cost", measured="nerfies_jax/runs/effect_cost.json"

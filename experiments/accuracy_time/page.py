@@ -31,6 +31,29 @@ small differences for noise, and measure with `--seeds 3` what you want to rely 
 SEEDS = """\
 Numbers are means over {count:g} seeds, ± their standard deviation."""
 
+SHORT = """\
+## In short
+
+Of `{base}`, {base_psnr} dB in {base_s} s:
+
+- **Time**: {quarter_psnr} dB after {quarter_s} s, {half_psnr} after {half_s},
+  {double_psnr} after {double_s}. Twice the Gaussians ({more_psnr} dB in {more_s} s) or
+  twice the views in a step ({views_psnr} in {views_s}) buy what twice the steps do.
+- **What can go**: harmonics (`sh_degree=0`: {flat_psnr} dB and {flat_mb} MB for
+  {base_mb}), growth ({grown_psnr}), D-SSIM ({plain_psnr}).
+- **What cannot**: the start from tracks ({rest_psnr} dB from rest, {still_psnr}
+  without any motion), a third basis of motion and more ({two_psnr} with two,
+  {many_psnr} with sixteen), what is seen through a hundredth of light ({cut_psnr}
+  where that ends a pixel).
+- **Float64** takes {wide_times} times as long and gives {wide_psnr} dB."""
+SHOWN = {  # words of `SHORT`, the setting they are of
+    **{"base": SPLATS, "quarter": "steps-0.25", "half": "steps-0.5"},
+    **{"double": "steps-2", "more": "most-20000", "views": "views-4"},
+    **{"flat": "sh-0", "grown": "no-growth", "plain": "dssim-0"},
+    **{"rest": "from-rest", "still": "no-motion", "two": "bases-2"},
+    **{"many": "bases-16", "cut": "stop-1e-2", "wide": "splats-float64"},
+}
+
 HEADS = ("PSNR", "SSIM", "moves", "depth", "EPE", "Gaussians", "MB", "CPU s")
 # Measure and digits: columns of every table.
 COLUMNS = (
@@ -59,6 +82,8 @@ def page(stored) -> str:
             seeds=ONE_SEED if seeds == 1 else SEEDS.format(count=seeds),
         )
     ]
+    if set(SHOWN.values()) <= means.keys():
+        parts.append(_short(means, seconds))
     for axis in AXES.values():
         chosen = [s for s in axis.settings if s in means and s != axis.base]
         if chosen and axis.base in means:
@@ -114,6 +139,18 @@ def _axis(base, chosen, means, spreads, about, seconds):
     return markdown.table(("setting", *HEADS, "time"), rows)
 
 
+def _short(means, seconds):
+    words = {}
+    for word, name in SHOWN.items():
+        row = means[name]
+        words[f"{word}_psnr"] = markdown.number(row["psnr"], 2)
+        words[f"{word}_s"] = markdown.number(row[seconds], 0)
+        words[f"{word}_mb"] = markdown.number(row["model_mb"], 2)
+        times = row[seconds] / means[SPLATS][seconds]
+        words[f"{word}_times"] = markdown.number(times, 1)
+    return SHORT.format(**words | {"base": SPLATS})
+
+
 def _title(is_base, arm, start):
     """As on the command line; of a setting what the base has not set."""
     words = [word for word in arm["changes"] if is_base or word not in start]
@@ -122,7 +159,7 @@ def _title(is_base, arm, start):
         words.insert(0, "--set")
     share = arm.get("share", 1)
     if share != 1:
-        words.append(f"{share:g} of the steps")
+        words.append(f"{share:g} times the steps")
     if is_base or not words:
         words.insert(0, arm["preset"])
     return f"`{' '.join(words)}`"

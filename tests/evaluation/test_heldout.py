@@ -187,11 +187,15 @@ def test_large_pictures_get_ms_ssim_and_weights_lpips(rng, tmp_path):
         heldout.load_lpips(TINY, [], (40, 8))
 
 
-def test_flow_is_scored_where_there_is_an_answer():
+@pytest.mark.parametrize("double", [False, True])
+def test_flow_is_scored_where_there_is_an_answer(double):
     truth = np.zeros((5, 2))
     predicted = np.array([[3, 4], [0, 1], [np.nan, 0], [0, 0], [0, 2.0]])
     moving = np.array([True, False, True, False, True])
-    scored = heldout._flow(Flow(predicted, truth, moving))
+    kinds = np.float64 if double else np.float32, np.float32  # of a run; of a film
+    with jax.enable_x64(double):
+        predicted, truth = map(np.asarray, (predicted, truth), kinds)
+        scored = heldout._flow(Flow(predicted, truth, moving))
     assert scored["flow.epe"] == pytest.approx((5 + 1 + 0 + 2) / 4)
     assert scored["flow.moving_epe"] == pytest.approx((5 + 2) / 2)
     assert scored["flow.outliers"] == pytest.approx(2 / 5)

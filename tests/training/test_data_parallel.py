@@ -71,6 +71,16 @@ def test_devices_take_equal_shares(shares, most, used, monkeypatch):
     assert data_parallel.device_count(shares) == used
 
 
+def test_a_share_counts_on_from_the_steps_where_x64_is_on():
+    """As a batch does: of the steps, an int32, its size and the share."""
+    with jax.enable_x64(True):
+        visits = data_parallel.on_devices(
+            lambda share, step: step * 2 + share, 2, 1, jnp.int32(3)
+        )
+    assert visits.dtype == jnp.int32
+    assert visits.tolist() == [6, 7]
+
+
 @pytest.mark.slow
 def test_two_devices_train_what_one_does():
     fresh_process.run(
