@@ -70,7 +70,10 @@ def from_knots(
     prepared = jax.jit(stages.prepare)(params)
     deform = jax.jit(stages.deform)
     table = time_knots.bake(
-        lambda time: deform(params, prepared, time), knots, static_threshold
+        lambda time: deform(params, prepared, time),
+        knots,
+        static_threshold,
+        stages.rows(params).mean.dtype,
     )
     summary = (
         f"{knots} knots, {interpolation}, of {_moving(table.index, static_threshold)}: "

@@ -83,6 +83,18 @@ def test_a_motion_from_knots_is_met_at_the_knots_and_near_between(swaying):
     assert 0.2 > errors[0] > errors[1] > 5e-3 > errors[2]
 
 
+@pytest.mark.full
+def test_knots_of_a_float64_scene_are_float64(swaying):
+    model, state = swaying
+    with jax.enable_x64(True):
+        state = state._replace(params=put(state.params, "float64"))
+        variant = variants.from_knots(model, state, 4)
+        moved = variant.model.stages.deform(variant.state.params, (), put(0.0))
+    assert moved.mean.dtype == np.float64
+    exact, active = deformed_rows(*swaying)[0], active_rows(swaying[1])
+    np.testing.assert_allclose(moved.mean[active], exact.mean[active], atol=1e-5)
+
+
 def test_what_stands_still_may_be_left_out(swaying):
     exact = deformed_rows(*swaying)
     variant = variants.without_static(*swaying, 0.0)
