@@ -15,6 +15,7 @@ import optimistix
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from nerfies_jax.geometry.precision import exact_product
 from nerfies_jax.training.fit import Fit, check_positive, counted
 
 PyTree = Any
@@ -158,7 +159,7 @@ def _is_root(displace, params, canonical_point, point, spec):
 
 def _solves(displace, params, canonical_point, point, spec):
     grads = jnp.eye(3, dtype=point.dtype) + jax.jacfwd(displace, 1)(params, point)
-    upright = jnp.dot(grads[0], jnp.cross(grads[1], grads[2])) > 0
+    upright = exact_product(grads[0], jnp.cross(grads[1], grads[2])) > 0
     return upright & _is_root(displace, params, canonical_point, point, spec)
 
 
