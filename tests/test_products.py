@@ -12,15 +12,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
-from jax.extend import core
 
 from gaussians_jax import presets as splat_presets
 from gaussians_jax import projection, raster
+from gaussians_jax.effects import se3_bases
+from gaussians_jax.effects.se3_bases import Bases, Poses
 from gaussians_jax.raster_spec import GSPLAT
 from nerfies_jax import presets as field_presets
 from nerfies_jax.geometry import camera as cameras
+from nerfies_jax.measure import matrix_flops
 from tests import bare_scenes
-from tests.gaussians.shared import same_bits, some_gaussians
+from tests.gaussians.shared import put, same_bits, some_gaussians
 from tests.test_effect_cost import started_field, started_splats
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
@@ -41,12 +43,8 @@ def equations(jaxpr):
     """All operations of a program and of those within it."""
     for equation in jaxpr.eqns:
         yield equation
-        for leaf in jax.tree.leaves(
-            list(equation.params.values()),
-            is_leaf=lambda x: isinstance(x, (core.Jaxpr, core.ClosedJaxpr)),
-        ):
-            if isinstance(leaf, (core.Jaxpr, core.ClosedJaxpr)):
-                yield from equations(getattr(leaf, "jaxpr", leaf))
+        for inner in matrix_flops._inner(equation.params):
+            yield from equations(inner)
 
 
 def place_of(equation):
@@ -115,3 +113,46 @@ def test_a_picture_is_the_same_under_every_default():
         with jax.default_matmul_precision(default):
             pictures.append(jax.jit(drawn)(gaussians))
     same_bits(*pictures)
+
+
+def moved_by_bases(dtype):
+    """Where points some four units from the origin go with turns of half a radian."""
+    rng = np.random.default_rng(0)
+    drawn = [size * rng.normal(size=(4, 5, 3)) for size in (0.5, 0.2)]
+    none = np.zeros((4, 0, 3))
+    bases = Bases(Poses(*drawn), Poses(none, none), 2 + rng.normal(size=(4, 3)))
+    logits = 8 * np.eye(5)[rng.integers(1, 5, 500)]
+    gaussians = some_gaussians(500, dtype)
+    gaussians = put(gaussians._replace(mean=np.asarray(gaussians.mean) + 2), dtype)
+
+    @jax.jit
+    def moved(bases, logits, time):
+        return se3_bases.deform(se3_bases.at_time(bases, time), logits, gaussians).mean
+
+    return np.asarray(moved(*put((bases, logits, 0.37), dtype)), np.float64)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(("bits", "off"), [(8, 9e-3), (11, 2e-3), (24, 6e-7)])
+def test_rounded_factors_misplace_points(bits, off, monkeypatch):
+    """As devices round them: the rows of docs/numerics.md, within a third."""
+    with jax.enable_x64(True):
+        exact = moved_by_bases("float64")
+
+    def rounding(product):
+        def of_rounded(*given):
+            return product(
+                *(
+                    one
+                    if isinstance(one, str)
+                    else lax.reduce_precision(one, 8, bits - 1)
+                    for one in given
+                )
+            )
+
+        return of_rounded
+
+    for name in ("exact_einsum", "exact_product"):
+        monkeypatch.setattr(se3_bases, name, rounding(getattr(se3_bases, name)))
+    error = np.abs(moved_by_bases("float32") - exact).max()
+    assert error == pytest.approx(off, rel=1 / 3)
