@@ -262,10 +262,8 @@ def _of(row, name, place):
 def _with_spread(values, digits):
     if None in values:
         return ""
-    mean = markdown.number(statistics.fmean(values), digits)
-    if len(values) == 1:
-        return mean
-    return f"{mean} ± {markdown.number(statistics.stdev(values), digits)}"
+    spread = statistics.stdev(values) if len(values) > 1 else math.nan
+    return markdown.with_spread(statistics.fmean(values), spread, digits)
 
 
 if __name__ == "__main__":

@@ -47,11 +47,21 @@ Of `{base}`, {base_psnr} dB in {base_s} s:
   where that ends a pixel).
 - **Float64** takes {wide_times} times as long and gives {wide_psnr} dB."""
 SHOWN = {  # words of `SHORT`, the setting they are of
-    **{"base": SPLATS, "quarter": "steps-0.25", "half": "steps-0.5"},
-    **{"double": "steps-2", "more": "most-20000", "views": "views-4"},
-    **{"flat": "sh-0", "grown": "no-growth", "plain": "dssim-0"},
-    **{"rest": "from-rest", "still": "no-motion", "two": "bases-2"},
-    **{"many": "bases-16", "cut": "stop-1e-2", "wide": "splats-float64"},
+    "base": SPLATS,
+    "quarter": "steps-0.25",
+    "half": "steps-0.5",
+    "double": "steps-2",
+    "more": "most-20000",
+    "views": "views-4",
+    "flat": "sh-0",
+    "grown": "no-growth",
+    "plain": "dssim-0",
+    "rest": "from-rest",
+    "still": "no-motion",
+    "two": "bases-2",
+    "many": "bases-16",
+    "cut": "stop-1e-2",
+    "wide": "splats-float64",
 }
 
 HEADS = ("PSNR", "SSIM", "moves", "depth", "EPE", "Gaussians", "MB", "CPU s")

@@ -261,10 +261,10 @@ def _depths(scored, capture):
 def _flow(flow):
     """End-point errors of the pixels that have an answer; none is an outlier, too."""
     answered = np.isfinite(flow.predicted).all(axis=-1)
+    both = in_default_precision((flow.predicted, flow.truth))
 
     def errors(mask=None):
-        mask = None if mask is None else jnp.asarray(mask)
-        return _flow_errors(*in_default_precision((flow.predicted, flow.truth)), mask)
+        return _flow_errors(*both, None if mask is None else jnp.asarray(mask))
 
     numbers = {
         "flow.epe": errors(answered).endpoint,
