@@ -19,10 +19,10 @@ def with_spread(mean: float, spread: float, digits: int) -> str:
 
 
 def short(value: float | int | None) -> str:
-    """A number of any size in three digits, as in 0.0123 or 1e-07."""
+    """A number of any size in three digits, as in 0.0123 or 1e-07; 9,914 in four."""
     if value is None or not math.isfinite(value):
         return ""
-    return f"{value:.3g}"
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[str]], words: int = 1) -> str:

@@ -11,15 +11,19 @@ def page(stored) -> str:
         [
             "## Time and flops for 10,000 Gaussians",
             _costs(stored["costs"]),
-            f"{first[0].upper()}{first[1:]}",
+            _capital(first),
             markdown.bullets(spared),
             "## Tables of time knots",
-            f"{curve['name']}: {curve['gaussians']} Gaussians, of which "
-            f"{curve['moving']} move by up to {curve['size']:.3g} scene units. The "
+            f"{_capital(curve['name'])}: {curve['gaussians']:,} Gaussians, of which "
+            f"{curve['moving']:,} move by up to {curve['size']:.3g} scene units. The "
             f"network takes {curve['exact_cpu_ms']:.2f} ms of one core an instant.",
             _knots(curve),
         ]
     )
+
+
+def _capital(text):
+    return f"{text[0].upper()}{text[1:]}"
 
 
 def _costs(rows):
