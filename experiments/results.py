@@ -56,7 +56,10 @@ Sonata and of MoBa-GS are worth behind it in [ablate_sonata.md](ablate_sonata.md
 [ablate_fields_bookshelf.md](ablate_fields_bookshelf.md). The ten other systems of the
 papers' tables, and the margins that these print, stand in [league.md](league.md). What
 refined cameras are worth stands in [ablate_poses.md](ablate_poses.md) and, on a real
-film, in [ablate_poses_bookshelf.md](ablate_poses_bookshelf.md).
+film, in [ablate_poses_bookshelf.md](ablate_poses_bookshelf.md). What deformation,
+solvers and local kernels cost stands in [deformation_cost.md](deformation_cost.md),
+[solver_table.md](solver_table.md) and [kan_local.md](kan_local.md) again, and how far
+one basis or another can follow a motion in [motion_rank.md](motion_rank.md).
 """
 
 

@@ -39,6 +39,7 @@ FRAMES = 24
 STEPS = 600
 PASSES = 2
 PRESET = "splats-deformable-small"
+MAX_SIDE = None  # of the pictures to learn from, pixels; None takes the capture's
 OUT = pathlib.Path(tempfile.mkdtemp(prefix="film-to-page-"))
 
 # %% [markdown]
@@ -111,7 +112,8 @@ if filmed is not None:
 # from a moving camera, the page. Every eighth frame is held out and never learnt from.
 
 # %%
-config = RunConfig(PRESET, CaptureSource(OUT / "capture"), steps=STEPS)
+source = CaptureSource(OUT / "capture", max_side=MAX_SIDE)
+config = RunConfig(PRESET, source, steps=STEPS)
 outcome = runs.reconstruct(config, OUT / "run")
 print(*sorted(path.name for path in outcome.folder.iterdir()), sep="\n")
 

@@ -10,7 +10,7 @@ import pytest
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 # Constants of each, small; `.ci/run` runs fit_a_picture as it is. COLMAP finds the
-# cameras of no fewer and smaller pictures.
+# cameras of no fewer and smaller pictures; what is learnt from them may be smaller.
 SMALL = {
     "own_effect": {"STEPS": 8, "SIZE": (48, 36), "FRAMES": 8},
     "film_to_page": {
@@ -18,6 +18,7 @@ SMALL = {
         "STEPS": 20,
         "PASSES": 1,
         "PRESET": "splats-static-small",
+        "MAX_SIDE": 80,
     },
 }
 
