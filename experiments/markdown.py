@@ -42,6 +42,13 @@ def bullets(lines: Iterable[str]) -> str:
     return "\n".join(f"- {line.strip()}" for line in lines)
 
 
+def outline(lines: Iterable[str]) -> str:
+    """A list, in which indented lines are below the one before that is not."""
+    return "\n".join(
+        f"  - {line.strip()}" if line.startswith(" ") else f"- {line}" for line in lines
+    )
+
+
 def title_and_text(docstring: str | None) -> tuple[str, str]:
     """A module's first line as a heading, and the rest of what it says."""
     title, _, text = (docstring or "").strip().partition("\n")

@@ -189,12 +189,8 @@ def page(stored) -> str:
         ]
         for row in stored["rows"]
     ]
-    # What is said of one kind of tracks is indented below its name.
-    said = [
-        f"  - {line.strip()}" if line.startswith(" ") else f"- {line}"
-        for line in stored["said"]
-    ]
-    return "\n\n".join([markdown.table(heads, rows, words=2), "\n".join(said)])
+    said = markdown.outline(stored["said"])
+    return f"{markdown.table(heads, rows, words=2)}\n\n{said}"
 
 
 def draw_figure(rows, path) -> None:

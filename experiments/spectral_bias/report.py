@@ -89,13 +89,13 @@ def format_conclusions(results) -> str:
 def _against_kan(label, equality, error):
     own = error["kan"]
     for others, words in (
-        ([n for n in error if n in ("relu", "softplus")], "ReLU or softplus, raw"),
+        ([n for n in error if n in ("relu", "softplus")], "raw MLPs"),
         (
             [n for n in error if n in ("relu + encoding", "softplus + encoding")],
-            "ReLU or softplus, encoded",
+            "encoded MLPs",
         ),
-        ([n for n in error if n.startswith("sine")], "sine"),
-        ([n for n in error if n == "kan + encoding"], "KAN, encoded"),
+        ([n for n in error if n.startswith("sine")], "networks of sines"),
+        ([n for n in error if n == "kan + encoding"], "encoded KANs"),
     ):
         if not others:
             continue
@@ -103,8 +103,8 @@ def _against_kan(label, equality, error):
         ratio = own / error[best]
         verdict = "better" if ratio < 1 else "worse"
         yield (
-            f"  The KAN of raw coordinates has {ratio:.2f} of the error of the best "
-            f"of {words} ({best}): {verdict}."
+            f"  The KAN of raw coordinates has {ratio:.2f} of the error of {best}, the "
+            f"best of {words}: {verdict}."
         )
     encoded = [
         error[n] for n in ("relu + encoding", "softplus + encoding") if n in error
@@ -163,7 +163,7 @@ def page(stored) -> str:
     parts += [
         "Errors are shares of the signal's RMS, means and deviations over the seeds; "
         "under k, what is missing of each sinusoid.",
-        markdown.bullets(stored["said"]),
+        markdown.outline(stored["said"]),
     ]
     return "\n\n".join(parts)
 
