@@ -31,11 +31,8 @@ keeps that file and renews the page.
 
 {pages}
 
-What has a command and no page has no numbers that are kept yet:
-
-{missing}
-
-The errors and costs of single formulas are in [numerics.md](../numerics.md), which
+{missing}The errors and costs of single formulas are in
+[numerics.md](../numerics.md), which
 `python -m experiments.hard_cases --document docs/numerics.md` renews.
 
 ## What is gone
@@ -60,6 +57,13 @@ film, in [ablate_poses_bookshelf.md](ablate_poses_bookshelf.md). What deformatio
 solvers and local kernels cost stands in [deformation_cost.md](deformation_cost.md),
 [solver_table.md](solver_table.md) and [kan_local.md](kan_local.md) again, and how far
 one basis or another can follow a motion in [motion_rank.md](motion_rank.md).
+"""
+
+MISSING = """\
+What has a command and no page has no numbers that are kept yet:
+
+{commands}
+
 """
 
 
@@ -261,7 +265,8 @@ def index() -> str:
     heads = ("page", "measured by", "kept in")
     missing = [f"`{s.command}`" for name, s in STUDIES.items() if name not in there]
     return INDEX.format(
-        pages=markdown.table(heads, rows, words=3), missing=markdown.bullets(missing)
+        pages=markdown.table(heads, rows, words=3),
+        missing=MISSING.format(commands=markdown.bullets(missing)) if missing else "",
     )
 
 

@@ -118,8 +118,8 @@ def test_the_sentences_follow_from_the_numbers():
     assert "has 0.67 of the error" in text
     assert "DOES NOT HOLD" in text
     text = report.format_conclusions(planted(0.6, 0.3))
-    assert "(relu + encoding): worse" in text
-    assert "(sine): worse" in text
+    assert "of relu + encoding, the best of encoded MLPs: worse" in text
+    assert "of sine, the best of networks of sines: worse" in text
 
 
 @pytest.mark.slow
