@@ -175,10 +175,13 @@ def page(stored) -> str:
         ]
         for row in stored["rows"]
     ]
+    text = markdown.table(heads, rows)
     ratios = [r["over_dense"] for r in stored["rows"] if r["nearest"] != "all"]
-    return markdown.table(heads, rows) + (
-        f"\n\nA local sum takes {min(ratios):.1f} to {max(ratios):.1f} times as long "
-        "as the sum of all kernels."
+    if not ratios:
+        return text
+    return (
+        f"{text}\n\nA local sum takes {min(ratios):.1f} to {max(ratios):.1f} times as "
+        "long as the sum of all kernels."
     )
 
 
