@@ -1,14 +1,15 @@
 """Do appearance codes and a transient medium pay for themselves?
 
     python -m experiments.appearance_codes --scene exposure
-    python -m experiments.appearance_codes --scene transient --steps 3000
+    python -m experiments.appearance_codes --scene transient --steps 1000 --seeds 3
 
 Trains the small static NeRF with and without the effect, for the same steps, on a still
 life of which the truth is known. `exposure`: brightness drifts; held-out instants have
 exposures never seen, so codes are fitted to the left half of a frame and the right half
 is scored (Martin-Brualla et al. 2021). `transient`: a post passes before the
 camera; frames it is in are rendered without it and compared with the same scene filmed
-without it, where it stood and elsewhere.
+without it, where it stood and elsewhere. Over several seeds a number is a mean, with
+its standard deviation; the picture is of the first.
 """
 
 import dataclasses
@@ -34,25 +35,28 @@ class AppearanceCodes:
     """Of training, for each of the two."""
     size: tuple[int, int] = (176, 132)
     """Width and height of the frames in pixels."""
-    seed: int = 0
-    """Of the scene, the first parameters and the rays."""
+    seeds: int = 1
+    """Of the scene, the first parameters and the rays: 0, 1, ..."""
     out: pathlib.Path | None = None
     """Folder for figures.json and picture.png (default: codes_SCENE)."""
     device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
     """Where to train."""
+
+    def __post_init__(self):
+        for name in ("steps", "seeds"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}={getattr(self, name)} must be at least 1")
 
 
 @cli.command(AppearanceCodes)
 def main(args):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        if args.steps < 1:
-            raise ValueError(f"steps={args.steps} must be at least 1")
         platform.start_jax(args.device, "all")
         compare = {"exposure": compare_exposure, "transient": compare_transient}
         film = filmed(args.scene, args.size)
-        figures, picture = compare[args.scene](film, args.steps, args.seed)
-        return _write(args, figures, picture)
+        every = [compare[args.scene](film, args.steps, n) for n in range(args.seeds)]
+        return _write(args, [figures for figures, _ in every], every[0][1])
 
 
 def filmed(scene, size):
@@ -171,7 +175,7 @@ def _sheet(columns, shown, ids):
     return pictures.contact_sheet(cells, captions, columns=len(columns))
 
 
-def _write(args, figures, picture):
+def _write(args, every, picture):
     from nerfies_jax.capture.json_files import write_json
     from nerfies_jax.evaluation import pictures
     from nerfies_jax.measure import clock
@@ -179,11 +183,12 @@ def _write(args, figures, picture):
     folder = args.out or pathlib.Path(f"codes_{args.scene}")
     folder.mkdir(parents=True, exist_ok=True)
     settled = {"scene": args.scene, "steps": args.steps, "size": list(args.size)}
+    figures = {name: [one[name] for one in every] for name in every[0]}  # by seed
     record = {**settled, "machine": clock.machine(), "figures": figures}
     write_json(folder / "figures.json", record)
     pictures.save(picture, folder / "picture.png")
-    for name, value in figures.items():
-        print(f"{name:52} {value:8.2f}")
+    for name, values in figures.items():
+        print(f"{name:52} {markdown.over_seeds(values, 2):>16}")
     print(f"{folder / 'figures.json'}, {folder / 'picture.png'}")
     return record
 
@@ -191,10 +196,13 @@ def _write(args, figures, picture):
 def page(stored) -> str:
     """The page in docs/results below the docstring, from a figures.json."""
     width, height = stored["size"]
-    rows = [[name, markdown.number(x, 2)] for name, x in stored["figures"].items()]
+    figures = stored["figures"]
+    rows = [[name, markdown.over_seeds(x, 2)] for name, x in figures.items()]
+    count = len(next(iter(figures.values())))
     return (
         f"## {stored['scene'].capitalize()}, {stored['steps']:,} steps, "
-        f"{width}x{height}\n\n{markdown.table(('', 'measured'), rows)}"
+        f"{width}x{height}, {count} seed{'s' if count > 1 else ''}\n\n"
+        f"{markdown.table(('', 'measured'), rows)}"
     )
 
 

@@ -238,7 +238,7 @@ def page(stored) -> str:
                     markdown.number(steps, 0),
                     markdown.number(spent, 0),
                     *(
-                        _with_spread([_of(row, name, place) for row in seeds], digits)
+                        _over_seeds([_of(row, name, place) for row in seeds], digits)
                         for name, digits in SCORES
                     ),
                     *(markdown.number(number, 0) for number in times),
@@ -259,11 +259,8 @@ def _of(row, name, place):
     return row[name][place] if name in row else None
 
 
-def _with_spread(values, digits):
-    if None in values:
-        return ""
-    spread = statistics.stdev(values) if len(values) > 1 else math.nan
-    return markdown.with_spread(statistics.fmean(values), spread, digits)
+def _over_seeds(values, digits):
+    return "" if None in values else markdown.over_seeds(values, digits)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Markdown of measured numbers."""
 
 import math
+import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -16,6 +17,12 @@ def with_spread(mean: float, spread: float, digits: int) -> str:
     """As in "21.30 ± 0.12"; the mean alone where no spread is known."""
     cell = number(mean, digits)
     return f"{cell} ± {number(spread, digits)}" if cell and spread == spread else cell
+
+
+def over_seeds(values: Sequence[float], digits: int) -> str:
+    """Their mean, and beside it the standard deviation where there are several."""
+    spread = statistics.stdev(values) if len(values) > 1 else math.nan
+    return with_spread(statistics.fmean(values), spread, digits)
 
 
 def short(value: float | int | None) -> str:

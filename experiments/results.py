@@ -93,6 +93,7 @@ def _package(name, words="", page="page", of=None, measured=None):
 
 _BOOKSHELF = "--capture CAPTURE --max-side 256 --heldout 8"
 _SPLAT_AXES = "steps gaussians views harmonics dssim raster motion splat-precision"
+_CODES = "--steps 1000 --seeds 3"
 STUDIES = {
     "benchmark": _package("benchmark", "--seeds 3"),
     "accuracy_time": _package(
@@ -177,11 +178,11 @@ STUDIES = {
     "mutants_unseen": _package("mutants_unseen", "--count 24 --seed 1", of="mutants"),
     "frequency_gates": _study("frequency_gates", "--out frequency_gates"),
     "appearance_codes": _study(
-        "appearance_codes", "--scene exposure --out appearance_codes"
+        "appearance_codes", f"--scene exposure {_CODES} --out appearance_codes"
     ),
     "transient_medium": _study(
         "transient_medium",
-        "--scene transient --out transient_medium",
+        f"--scene transient {_CODES} --out transient_medium",
         module="appearance_codes",
     ),
 }

@@ -82,8 +82,11 @@ def test_a_short_run_writes_figures_and_a_picture(scene, keys, tmp_path, monkeyp
     assert record["scene"] == scene
     assert record["steps"] == 3
     assert keys <= set(record["figures"])
-    assert all(np.isfinite(list(record["figures"].values())))
-    for name, value in record["figures"].items():
-        assert f"| {name} | {value:.2f} |" in appearance_codes.page(record)
+    assert np.isfinite(list(record["figures"].values())).all()
+    page = appearance_codes.page(record)
+    for name, (value,) in record["figures"].items():
+        assert f"| {name} | {value:.2f} |" in page
+    record["figures"] = {name: [1.0, 2.0, 3.0] for name in keys}
+    assert f"| {min(keys)} | 2.00 ± 1.00 |" in appearance_codes.page(record)
     with PIL.Image.open(out / "picture.png") as picture:
         assert min(picture.size) > 240
