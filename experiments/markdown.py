@@ -26,7 +26,7 @@ def over_seeds(values: Sequence[float], digits: int) -> str:
 
 
 def short(value: float | int | None) -> str:
-    """A number of any size in three digits, as in 0.0123 or 1e-07; 9,914 in four."""
+    """A number in three digits, as in 0.0123 or 1e-07; whole from a thousand on."""
     if value is None or not math.isfinite(value):
         return ""
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"

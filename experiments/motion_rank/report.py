@@ -33,16 +33,15 @@ def progress(row) -> str:
 def text(rows) -> str:
     """One line for each model and K."""
     lines = [
-        f"\n{'tracks':8s} {'model':13s} {'K':>3s} {'learnt':>8s} {'+-':>7s} "
-        f"{'held out':>9s} {'+-':>7s} {'floor':>8s} {'CPU s':>6s}"
+        f"\n{'tracks':8s} {'model':13s} {'K':>3s} {'learnt':>16s} "
+        f"{'held out':>16s} {'floor':>8s} {'CPU s':>6s}"
     ]
     for row in rows:
         floor = f"{np.mean(row.floor):8.4f}" if row.floor else f"{'-':>8s}"
         lines.append(
             f"{row.kind:8s} {row.model:13s} {row.count or '-':>3} "
-            f"{np.mean(row.learnt):8.4f} {np.std(row.learnt):7.4f} "
-            f"{np.mean(row.held_out):9.4f} {np.std(row.held_out):7.4f} {floor} "
-            f"{row.seconds:6.2f}"
+            f"{markdown.over_seeds(row.learnt, 4):>16s} "
+            f"{markdown.over_seeds(row.held_out, 4):>16s} {floor} {row.seconds:6.2f}"
         )
     return "\n".join(lines)
 
@@ -173,17 +172,13 @@ def write(out, record, rows) -> None:
 
 def page(stored) -> str:
     """The page in docs/results below the docstring, from a motion_rank.json."""
-    heads = ("tracks", "model", "K", "learnt", "±", "held out", "±", "floor", "CPU s")
+    heads = ("tracks", "model", "K", "learnt", "held out", "floor", "CPU s")
     rows = [
         [
             row["kind"],
             row["model"],
             "" if row["count"] is None else str(row["count"]),
-            *(
-                markdown.number(of(row[name]), 4)
-                for name in ("learnt", "held_out")
-                for of in (np.mean, np.std)
-            ),
+            *(markdown.over_seeds(row[name], 4) for name in ("learnt", "held_out")),
             markdown.number(np.mean(row["floor"]), 4) if row["floor"] else "",
             markdown.number(row["seconds"], 2),
         ]

@@ -47,7 +47,7 @@ def tables(results, waves) -> str:
                 "of the signal's), missing share of each sinusoid, and the RMS of "
                 "what is at other frequencies",
                 f"{'network':20s} {'size':>5s} {'rate':>6s} {'steps':>6s} {'s':>6s} "
-                f"{'rmse':>8s} {'+-':>7s} {names} {'other':>8s}",
+                f"{'rmse':>16s} {names} {'other':>8s}",
             ]
             for row in rows:
                 if row.signal != label:
@@ -55,8 +55,8 @@ def tables(results, waves) -> str:
                 missing = np.mean(row.missing, axis=0)
                 lines.append(
                     f"{row.network:20s} {row.parameters:5d} {row.rate:6g} "
-                    f"{row.steps:6d} {row.seconds:6.2f} {np.mean(row.rmse):8.4f} "
-                    f"{np.std(row.rmse):7.4f} "
+                    f"{row.steps:6d} {row.seconds:6.2f} "
+                    f"{markdown.over_seeds(row.rmse, 4):>16s} "
                     + "".join(f"{share:9.4f}" for share in missing)
                     + f" {other(row):8.4f}"
                 )
@@ -142,7 +142,7 @@ def page(stored) -> str:
     """The page in docs/results below the docstring, from a spectral_bias.json."""
     parts = []
     for label, components in stored["waves"].items():
-        heads = ("network", "numbers", "rate", "steps", "s", "RMS error", "±")
+        heads = ("network", "numbers", "rate", "steps", "s", "RMS error")
         heads += tuple(f"k={name_of(wave)}" for wave in components)
         for equality, results in stored["results"].items():
             rows = [
@@ -152,8 +152,7 @@ def page(stored) -> str:
                     markdown.short(row["rate"]),
                     f"{row['steps']:,}",
                     markdown.number(row["seconds"], 2),
-                    markdown.number(np.mean(row["rmse"]), 4),
-                    markdown.number(np.std(row["rmse"]), 4),
+                    markdown.over_seeds(row["rmse"], 4),
                     *(markdown.number(x, 4) for x in np.mean(row["missing"], axis=0)),
                 ]
                 for row in results

@@ -105,7 +105,8 @@ def test_a_tiny_run_prints_and_keeps_everything(tmp_path, capsys):
     assert record["said"]
     assert (tmp_path / "out" / "motion_rank.png").stat().st_size > 10_000
     page = report.page(record)
-    assert f"| {np.mean(rows[2].held_out):.4f} |" in page
+    of = rows[2].held_out
+    assert f"| {np.mean(of):.4f} ± {np.std(of, ddof=1):.4f} |" in page
     assert page.count("\n| rigid | ") == len(rows)
 
 
