@@ -150,7 +150,9 @@ STUDIES = {
     "spectral_bias": _package(
         "spectral_bias", "--steps 3000 --out spectral_bias", page="report"
     ),
-    "motion_rank": _package("motion_rank", "--out motion_rank", page="report"),
+    "motion_rank": _package(
+        "motion_rank", "--seeds 3 --out motion_rank", page="report"
+    ),
     "nerf_speed": _study("nerf_speed", "--out nerf_speed.json"),
     "solver_table": _package(
         "solver_table", "--out solver_table.json", page="__main__"
