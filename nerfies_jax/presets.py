@@ -202,7 +202,7 @@ SMALL_WARP = WarpSpec(position=EncodingSpec(4), depth=4, width=64, skips=())
 SMALL_NERF_W = dataclasses.replace(
     SMALL_NERF,
     appearance=AppearanceSpec(width=4),
-    transient=TransientSpec(code_width=8, depth=2, width=48),
+    transient=TransientSpec(code_width=8, depth=2, width=48, beta_power=1.0),
 )
 SMALL_D_NERF = dataclasses.replace(
     SMALL_NERF,

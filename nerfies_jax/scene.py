@@ -306,18 +306,25 @@ def loss_terms(
         frames=frames,
         box=Box(centre, jnp.asarray(metadata.scale, batch.origin.dtype)),
     )
-    terms = _colour_terms(levels, batch)
+    terms = _colour_terms(radiance.effects, levels, batch)
     return terms | penalty_terms(radiance.effects, params, context, {})
 
 
-def _colour_terms(levels: tuple[RayOutput, ...], batch: Batch) -> dict[str, Term]:
+def _colour_terms(
+    effects: tuple[Effect, ...], levels: tuple[RayOutput, ...], batch: Batch
+) -> dict[str, Term]:
     last = levels[-1]
     mse = losses.mse(last.colour, batch.colour, batch.valid)
     terms = {"fine": Term(mse, 1.0)}
     coarse_weight = 1.0
     if last.beta is not None:
+        (power,) = (
+            effect.beta_power
+            for effect in effects
+            if effect.name in last.media and last.media[effect.name].beta is not None
+        )
         likelihood = transient.photometric(
-            last.colour, batch.colour, last.beta, batch.valid
+            last.colour, batch.colour, last.beta, batch.valid, power
         )
         terms = {"fine": Term(mse, None), "colour": Term(likelihood, 1.0)}
         coarse_weight = 1.5  # as in NeRF-W: half of the sum over channels

@@ -53,13 +53,13 @@ def of_field(*effects):
     return values(jax.random.key(0))
 
 
-def fog(name="fog", beta_min=0.5):
+def fog(name="fog", beta_min=0.5, beta_power=0.0):
     """A medium that is the same everywhere and says how uncertain it is."""
 
     def medium(params, sample, condition):
         return Medium(jnp.ones(()), jnp.full(3, 0.5), beta=jnp.ones(()))
 
-    return Effect(name, medium=medium, beta_min=beta_min)
+    return Effect(name, medium=medium, beta_min=beta_min, beta_power=beta_power)
 
 
 @pytest.mark.full
@@ -69,6 +69,8 @@ def test_a_medium_brings_its_own_least_uncertainty():
     # log beta, where it is so large that the residual adds next to nothing
     np.testing.assert_allclose(near, np.log(1e3), atol=2e-3)
     np.testing.assert_allclose(far - near, np.log(10), atol=2e-3)
+    weighed = of_field(fog(beta_min=1e3, beta_power=1.0))["colour"]
+    np.testing.assert_allclose(weighed / near, 1e3, rtol=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,8 @@ class TransientSpec:
     `beta_min` is the least standard deviation of a ray's colour, in units of colour. It
     bounds the loss from below; without it a pixel that is met exactly would be worth
     anything. `density_weight` is the paper's lambda_u: what keeps the static scene out
-    of the transient medium.
+    of the transient medium. `beta_power` is that of `photometric`: zero is the paper's
+    loss, one lets a short run learn what it called uncertain.
     """
 
     code_width: int = 16
@@ -46,6 +47,7 @@ class TransientSpec:
     width: int = 128
     beta_min: float = 0.03
     density_weight: float = 0.01
+    beta_power: float = 0.0
 
     def __post_init__(self):
         if self.code_width < 1:
@@ -61,6 +63,11 @@ class TransientSpec:
         if not (math.isfinite(self.density_weight) and self.density_weight >= 0):
             raise ValueError(
                 f"density_weight={self.density_weight} must be finite and not negative"
+            )
+        if not 0 <= self.beta_power <= 2:
+            raise ValueError(
+                f"beta_power={self.beta_power} must be in [0, 2]: 0 is the likelihood, "
+                "at 2 colours learn as from a squared error"
             )
         network(self, 1)  # refuses wrong depths and widths
 
@@ -85,6 +92,7 @@ def effect(spec: TransientSpec, features: int) -> Effect:
         medium=functools.partial(medium, spec),
         penalty=lambda _, context: penalty(spec, context),
         beta_min=spec.beta_min,
+        beta_power=spec.beta_power,
     )
 
 
@@ -130,14 +138,21 @@ def photometric(
     truth: Float[Array, "*rays 3"],
     beta: Float[Array, "*rays"],
     valid: Bool[Array, "*rays"] | None,
+    beta_power: float = 0.0,
 ) -> Float[Array, ""]:
-    """Mean over the valid rays of |colour - truth|² / 2β² + log β.
+    """Mean over the valid rays of (|colour - truth|² / 2β² + log β) [β]^beta_power.
 
-    The first two terms of equation 13, where the second reads log β² / 2. At a given
-    residual it is least at β = |colour - truth|, and never less than log beta_min: it
-    is negative for good fits. The public reimplementation adds 3 so that curves stay
-    above zero, which changes no gradient, and takes the mean over the channels, which
-    makes the first term a third.
+    At a power of zero the first two terms of equation 13, where the second reads
+    log β² / 2. At a given residual it is least at β = |colour - truth|, and never less
+    than log beta_min: it is negative for good fits. The public reimplementation adds 3
+    so that curves stay above zero, which changes no gradient, and takes the mean over
+    the channels, which makes the first term a third.
+
+    [β] is β that teaches nothing, its power in [0, 2]. At zero colours learn at 1/β² of
+    their residuals: what a short run has not learnt yet is called uncertain, and what
+    is uncertain is not learnt, so that a floor's checks stay gone. At one they learn at
+    1/β, at two alike, and β still goes to |colour - truth| (Seitzer et al. 2022,
+    arXiv:2203.09168, the β-NLL, whose β is half of this power).
     """
     if valid is not None:
         # Selected before anything is squared or divided: unfilmed pixels may hold NaN.
@@ -147,6 +162,8 @@ def photometric(
     # Divided first: the square of a residual far below beta must not underflow alone.
     scaled = (colour - truth) / beta[..., None]
     each = jnp.sum(jnp.square(scaled), axis=-1) / 2 + jnp.log(beta)
+    if beta_power:
+        each = each * jax.lax.stop_gradient(beta) ** beta_power
     return losses.masked_mean(each[..., None], valid)
 
 

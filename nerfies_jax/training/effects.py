@@ -41,6 +41,7 @@ FIELD_SEAMS = (
     "surface_width",
     "medium",
     "beta_min",
+    "beta_power",
 )
 SPLAT_SEAMS = (
     "init_rows",
@@ -167,6 +168,7 @@ class Effect(NamedTuple):
     medium: Callable[[PyTree, Any, FrameCondition], Any] | None = None
     # Least standard deviation of a ray's colour, where the medium has a `beta`.
     beta_min: float | None = None
+    beta_power: float = 0.0  # `transient.photometric`; zero is the likelihood
     # Of Gaussians.
     # (key, `splats.Splats`) -> leaves with a row for each Gaussian
     init_rows: Callable[[Key[Array, ""], Any], PyTree] | None = None

@@ -65,6 +65,8 @@ REFUSED = [
     (TransientSpec, {"beta_min": math.nan}, "beta_min=nan"),
     (TransientSpec, {"density_weight": -0.1}, "density_weight=-0.1"),
     (TransientSpec, {"density_weight": math.inf}, "density_weight=inf"),
+    (TransientSpec, {"beta_power": -0.5}, r"beta_power=-0.5 must be in \[0, 2\]"),
+    (TransientSpec, {"beta_power": math.nan}, "beta_power=nan"),
     (TransientSpec, {"depth": -1}, "depth=-1"),
     (WarpSpec, {"kind": "affine"}, "'affine'.*se3"),
     (WarpSpec, {"condition": "frame"}, "'frame'.*code"),

@@ -34,7 +34,9 @@ def sample(dtype, seed=2):
 
 
 medium_of = jax.jit(transient.medium, static_argnums=0)
-photometric = jax.jit(jax.value_and_grad(transient.photometric, (0, 1, 2)))
+photometric = jax.jit(
+    jax.value_and_grad(transient.photometric, (0, 1, 2)), static_argnums=4
+)
 
 
 def params_of(dtype):
@@ -52,11 +54,11 @@ def medium_by_hand(params, met, when):
     )
 
 
-def loss_by_hand(colour, truth, beta, valid):
+def loss_by_hand(colour, truth, beta, valid, power=0.0):
     """In float64, of the valid rays."""
     colour, truth, beta = (networks.exact(x)[valid] for x in (colour, truth, beta))
     squared = np.sum((colour - truth) ** 2, axis=1)
-    return np.mean(squared / (2 * beta**2) + np.log(beta))
+    return np.mean((squared / (2 * beta**2) + np.log(beta)) * beta**power)
 
 
 def test_the_medium_is_the_loop_over_its_layers(dtype):
@@ -143,49 +145,53 @@ def rays_of(dtype, rng, count=9):
     return colour, truth, beta, rng.uniform(size=count) < 0.7
 
 
-def test_photometric_is_the_mean_of_the_valid_rays_alone(dtype, rng):
+@pytest.mark.parametrize("power", [0.0, 1.0])
+def test_photometric_is_the_mean_of_the_valid_rays_alone(power, dtype, rng):
     colour, truth, beta, valid = rays_of(dtype, rng)
     assert 0 < np.sum(valid) < len(valid)
     tolerance = {"float32": 2e-6, "float64": 1e-14}[dtype]
     for mask, counted in ((valid, valid), (None, valid | True)):
-        loss, _ = photometric(colour, truth, beta, mask)
+        loss, _ = photometric(colour, truth, beta, mask, power)
         assert loss.dtype == dtype
-        exact = loss_by_hand(colour, truth, beta, counted)
+        exact = loss_by_hand(colour, truth, beta, counted, power)
         np.testing.assert_allclose(loss, exact, rtol=tolerance)
 
 
 @pytest.mark.hard_cases
+@pytest.mark.parametrize("power", [0.0, 0.5, 1.0, 2.0])
 @pytest.mark.parametrize("offset", [0.0, 1e-30, 1e-7, 1e-3, 1.0, 1e4, 1e15])
-def test_photometric_holds_from_no_residual_to_a_huge_one(offset, dtype):
+def test_photometric_holds_from_no_residual_to_a_huge_one(offset, power, dtype):
+    """The slopes of a power are those of zero times that power of beta, held still."""
     colour = np.full((1, 3), offset, dtype)
     truth = np.zeros((1, 3), dtype)
     beta = np.asarray([0.03], dtype)
-    value, grads = photometric(colour, truth, beta, np.array([True]))
+    value, grads = photometric(colour, truth, beta, np.array([True]), power)
     residual, b = float(colour[0, 0]), float(beta[0])
-    exact = 3 * residual**2 / (2 * b**2) + math.log(b)
+    exact = b**power * (3 * residual**2 / (2 * b**2) + math.log(b))
     tolerance = {"float32": 2e-6, "float64": 1e-14}[dtype]
     np.testing.assert_allclose(value, exact, rtol=tolerance)
-    np.testing.assert_allclose(grads[0], [[residual / b**2] * 3], rtol=tolerance)
-    exact = -3 * residual**2 / b**3 + 1 / b
+    exact = b**power * residual / b**2
+    np.testing.assert_allclose(grads[0], [[exact] * 3], rtol=tolerance)
+    exact = b**power * (-3 * residual**2 / b**3 + 1 / b)
     np.testing.assert_allclose(grads[2], [exact], rtol=2 * tolerance)
 
 
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("hole", [math.nan, math.inf, -math.inf])
-def test_unfilmed_pixels_teach_nothing_whatever_they_hold(hole, dtype, rng):
+@pytest.mark.parametrize("power", [0.0, 1.0])
+def test_unfilmed_pixels_teach_nothing_whatever_they_hold(power, hole, dtype, rng):
     colour, truth, beta = whole = rays_of(dtype, rng, 3)[:3]
     valid = np.array([True, False, True])
     broken = [leaf.copy() for leaf in whole]
     for leaf in broken:
         leaf[1] = hole
-    value, grads = jax.tree.map(np.asarray, photometric(*broken, valid))
-    np.testing.assert_allclose(
-        value, loss_by_hand(colour, truth, beta, valid), rtol=2e-6
-    )
+    value, grads = jax.tree.map(np.asarray, photometric(*broken, valid, power))
+    exact = loss_by_hand(colour, truth, beta, valid, power)
+    np.testing.assert_allclose(value, exact, rtol=2e-6)
     for grad in grads:
         assert np.all(np.isfinite(grad))
         assert np.all(grad[1] == 0)
-    nothing, _ = photometric(*broken, np.zeros(3, bool))
+    nothing, _ = photometric(*broken, np.zeros(3, bool), power)
     assert float(nothing) == 0
 
 
