@@ -192,17 +192,19 @@ def densify(
 def _plan(rows, stats, spec, step, extent):
     """Which old row each new row comes from, and what becomes of it."""
     stats = jax.tree.map(np.asarray, stats)
-    whole, opacity, scale = map(np.asarray, _row_summary(rows))
+    whole, opacity, scale = map(np.asarray, row_summary(rows))
     score = stats.grad2d / np.maximum(stats.views, 1)
 
     kept = stats.active & whole & (opacity >= spec.prune_opa)
     grows = kept & (score >= spec.grow_grad2d)
     splits = grows & (scale > spec.grow_scale3d * extent)
+    large = np.zeros_like(kept)
     if step > spec.reset_every:
-        after = np.where(splits, scale / spec.shrink, scale)
-        kept &= after <= spec.prune_scale3d * extent
+        bound = spec.prune_scale3d * extent
+        large = scale > bound
         if spec.prune_radius_px is not None:
-            kept &= splits | (stats.radius_px <= spec.prune_radius_px)
+            large |= stats.radius_px > spec.prune_radius_px
+        kept &= np.where(splits, scale / spec.shrink <= bound, ~large)
     grows &= kept
     room = max(spec.cap_max - int(kept.sum()), 0)
     wanting = np.flatnonzero(grows)
@@ -210,6 +212,7 @@ def _plan(rows, stats, spec, step, extent):
     chosen = np.zeros_like(grows)
     chosen[best] = True
     splits &= chosen
+    kept &= splits | ~large  # whom the cap refuses to split stays as large as it is
 
     clones = np.flatnonzero(chosen & ~splits)
     parents = np.flatnonzero(splits)
@@ -234,7 +237,7 @@ def _plan(rows, stats, spec, step, extent):
 
 
 @jax.jit
-def _row_summary(rows):
+def row_summary(rows):
     """Of each row: whether it is finite, its opacity, its largest scale."""
 
     def finite(leaf):

@@ -31,15 +31,16 @@ def degree_of(coefficients: int) -> int:
 
 
 def unit_direction(offset: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
-    """`offset` at unit length; +z, with no gradient, where it is zero.
+    """`offset` at unit length; +z, with no gradient, where it is zero or not finite.
 
     Scaled by its largest component first, so 1e-30 and 3e38 keep their direction in
     float32.
     """
     largest = jnp.max(jnp.abs(offset), axis=-1, keepdims=True)
-    zero = largest < jnp.finfo(offset.dtype).tiny
+    limits = jnp.finfo(offset.dtype)
+    known = (largest >= limits.tiny) & (largest <= limits.max)  # neither of NaN
     axis = jnp.asarray([0, 0, 1], offset.dtype)
-    scaled, _ = near_one(jnp.where(zero, axis, offset), axis=-1)
+    scaled, _ = near_one(jnp.where(known, offset, axis), axis=-1)
     return scaled / jnp.linalg.norm(scaled, axis=-1, keepdims=True)
 
 

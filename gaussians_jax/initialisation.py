@@ -1,6 +1,7 @@
 """Where the first Gaussians come from: the capture's own points, and random ones."""
 
 import dataclasses
+import math
 
 import jax
 import jax.numpy as jnp
@@ -41,6 +42,11 @@ class InitSpec:
                 f"a scene starts from at least one Gaussian, got points={self.points}, "
                 f"random={self.random} and extra_random={self.extra_random}"
             )
+        if not 0 < self.opacity < 1:
+            raise ValueError(f"opacity={self.opacity} must be between 0 and 1")
+        for name in ("scale", "max_scale"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name}={getattr(self, name)} must be positive")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -111,15 +111,20 @@ def relocate(
     """Every faint Gaussian becomes a copy of a visible one; host side.
 
     Sources are drawn in proportion to their opacity. A source and its copies share its
-    opacity and scale as `compute_relocation` says, and start with zero moments. Where
+    opacity and scale as `compute_relocation` says, and start with zero moments. A row
+    that is not finite moves as the faint ones do, and is counted as broken. Where
     nothing is visible, nothing can move and the report counts the faint ones as
     refused.
     """
     rows = params.rows["splats"]
-    active, opacity = _opacities(rows)
-    faint = active & (opacity <= spec.min_opacity)
+    active, whole, opacity = _opacities(rows)
+    faint = active & ~(whole & (opacity > spec.min_opacity))
     seen = active & ~faint
-    report = densification.Report(active=int(active.sum()), capacity=len(active))
+    report = densification.Report(
+        active=int(active.sum()),
+        capacity=len(active),
+        broken=int((active & ~whole).sum()),
+    )
     if not faint.any():
         return params, moments, report
     if not seen.any():
@@ -142,7 +147,9 @@ def refine(
     params, moments, moved = relocate(optimiser, params, moments, move_key, spec)
     params, moments, added = add(optimiser, params, moments, add_key, spec)
     report = added._replace(
-        relocated=moved.relocated, refused=moved.refused + added.refused
+        relocated=moved.relocated,
+        refused=moved.refused + added.refused,
+        broken=moved.broken,
     )
     return params, moments, report
 
@@ -154,13 +161,16 @@ def add(
     key: Key[Array, ""],
     spec: MCMCStrategySpec,
 ) -> tuple[Params, PyTree, densification.Report]:
-    """`spec.growth` times as many Gaussians, as far as the cap allows; host side."""
+    """`spec.growth` times as many Gaussians, as far as the cap allows; host side.
+
+    Rounded down, as in the reference: at 1.05, of fewer than 20 none is added.
+    """
     rows = params.rows["splats"]
-    active, opacity = _opacities(rows)
+    active, whole, opacity = _opacities(rows)
     count = int(active.sum())
     wanted = int(spec.growth * count) - count
     extra = max(min(wanted, spec.cap_max - count), 0)
-    seen = active & (opacity > 0)
+    seen = active & whole & (opacity > 0)
     report = densification.Report(
         active=count, capacity=len(active), refused=wanted - extra
     )
@@ -180,13 +190,10 @@ def add(
 
 
 def _opacities(rows):
-    active, opacity = _row_summary(rows)
-    return np.asarray(active), np.asarray(opacity, np.float64)
-
-
-@jax.jit
-def _row_summary(rows):
-    return splats.active_mask(rows), splats.activate(rows).opacity
+    """Of each row: whether it is there, whether it is finite, its opacity."""
+    whole, opacity, _ = densification.row_summary(rows)
+    active = splats.active_mask(rows) | jnp.isnan(rows.opacity_logit)
+    return np.asarray(active), np.asarray(whole), np.asarray(opacity, np.float64)
 
 
 def _draw(key, opacity, seen, count):

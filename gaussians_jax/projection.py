@@ -48,6 +48,12 @@ class Footprints(NamedTuple):
         """Drawn by this camera if its box meets the image."""
         return self.extent_px[:, 0] > 0
 
+    def seen(self, size: tuple[int, int]) -> Bool[Array, " gaussians"]:
+        """Visible, and its box meets an image of `size` (width, height)."""
+        low, high = self.mean_px - self.extent_px, self.mean_px + self.extent_px
+        meets = (high > 0) & (low < jnp.asarray(size, low.dtype))
+        return self.visible & jnp.all(meets, axis=1)
+
 
 def project(
     gaussians: Gaussians, camera: Camera, size: tuple[int, int], spec: RasterSpec

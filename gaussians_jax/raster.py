@@ -85,6 +85,8 @@ def blended_pairs(
     `size` is (width, height).
     """
     layout = _layout(footprints, size, spec)
+    if footprints.depth.shape[0] == 0:
+        return jnp.int32(0)
     nothing = jnp.zeros((footprints.depth.shape[0], 1), footprints.depth.dtype)
     rects, table = _in_depth_order(footprints, nothing, layout.grid)
     return _stream(layout, rects, table)[1].pairs

@@ -45,12 +45,12 @@ class RasterSpec:
             )
         if not 0 < self.near < self.far:
             raise ValueError(f"need 0 < near < far, got {self.near} and {self.far}")
-        if self.eps2d <= 0:
+        if not self.eps2d > 0:
             raise ValueError(
                 f"eps2d must be positive, got {self.eps2d}; without it a "
                 "flat Gaussian seen edge-on has no inverse covariance"
             )
-        if self.tangent_margin < 0:
+        if not self.tangent_margin >= 0:
             raise ValueError(f"tangent_margin must be >= 0, got {self.tangent_margin}")
         if self.clamp_gradient not in ("zero", "through"):
             raise ValueError(

@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -41,9 +42,12 @@ def render(
     `background` is one colour or an image, black where absent. `mean2d_offset` (px)
     moves the footprints on the image: pass zeros, and its gradient is the gradient of
     each projected mean in pixels, which densification thresholds. Without `depth`
-    that of the rendering is None, and a training step 4 % faster. The camera must be
-    free of distortion (`refuse_distortion` on the host).
+    that of the rendering is None, and a training step 4 % faster. Raises ValueError
+    for a camera with distortion; of one that is traced nobody can tell
+    (`refuse_distortion` on the host).
     """
+    if not isinstance(camera.radial, jax.core.Tracer):
+        refuse_distortion(camera)
     footprints = projection.project(gaussians, camera, size, spec)
     drawn = footprints
     if mean2d_offset is not None:

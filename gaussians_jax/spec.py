@@ -228,12 +228,18 @@ def refuse_what_cannot_train(spec: SplatScene) -> None:
             "drawn, with opacities of their own; leave it out "
             f"({faded[0]}=none), or {ALONE}"
         )
+    still = 0 if spec.start.motion == "tracks" or motion is None else motion.warm_up
+    if still and getattr(motion, "fading", None) is not None:
+        raise ValueError(
+            f"motion.warm_up={still} with motion.fading: what is drawn fades from the "
+            "first step, and what is trained only then; leave one of them out "
+            "(motion.warm_up=0 or motion.fading=none)"
+        )
     if growth is not None and not isinstance(spec.densification, DefaultStrategySpec):
         raise ValueError(
             "motion_growth steers the gradient threshold of DefaultStrategySpec, which "
             "this scene has not; leave it out as well (motion_growth=none)"
         )
-    still = 0 if spec.start.motion == "tracks" or motion is None else motion.warm_up
     if growth is not None and growth.form == "hard" and growth.start <= still:
         raise ValueError(
             f"motion_growth.start={growth.start} lies in the warm-up of the motion "

@@ -80,7 +80,7 @@ def gather(
         stats = densification.observe(
             stats,
             drawn.mean2d_grad,
-            footprints.visible,
+            footprints.seen(size),
             radius_px,
             size,
             drawn.significance,

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from gaussians_jax import splats
+from gaussians_jax.effects.motion_basis import Offsets, apply
 from gaussians_jax.splats import Gaussians, Params
 from nerfies_jax.nets import mlp, planes
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
@@ -78,14 +78,6 @@ class Motion(NamedTuple):
 
     planes: tuple[Level, ...]
     network: MLP
-
-
-class Offsets(NamedTuple):
-    """How far Gaussians are from their canonical state."""
-
-    mean: Float[Array, "gaussians 3"]  # scene units
-    turn: Float[Array, "gaussians 3"]  # rotation vector, rad, in world axes
-    log_scale: Float[Array, "gaussians 3"]  # added to the logarithm
 
 
 def network_spec(spec: PlaneMotionSpec) -> MLPSpec:
@@ -150,16 +142,6 @@ def offsets(
 
     encoded = jax.vmap(features)(place, ready)
     return Offsets(**mlp.apply(network_spec(spec), params.network, encoded))
-
-
-def apply(gaussians: Gaussians, off: Offsets) -> Gaussians:
-    """Gaussians moved by their offsets: exp(turn) q / |q|, and scales by a factor."""
-    factor = jnp.exp(jnp.clip(off.log_scale, *splats.LOG_SCALE_RANGE))
-    return gaussians._replace(
-        mean=gaussians.mean + off.mean,
-        quaternion=splats.turned(gaussians, off.turn),
-        scale=gaussians.scale * factor,
-    )
 
 
 def smoothness(spec: PlaneMotionSpec, levels: tuple[Level, ...]) -> dict[str, Term]:

@@ -70,9 +70,9 @@ function clamp(value, low, high) {
 }
 
 // Footprints of what a camera sees, farthest first; FLOATS numbers each. `camera` has
-// rotation, position, focal, aspect, centre and size of the picture in px.
+// rotation, position, focal, aspect, skew, centre and size of the picture in px.
 function project(scene, camera, raster) {
-  const { rotation: w, position: at, size, centre } = camera;
+  const { rotation: w, position: at, size, centre, skew } = camera;
   const mean = scene.fields.mean.now, quaternion = scene.fields.quaternion.now;
   const opacities = scene.fields.opacity.now, scale = scene.scale;
   const fx = camera.focal, fy = camera.focal * camera.aspect;
@@ -90,7 +90,7 @@ function project(scene, camera, raster) {
     if (!(opacity >= raster.alpha_threshold)) continue;
     let tanX = (w[0] * dx + w[1] * dy + w[2] * dz) / z;
     let tanY = (w[3] * dx + w[4] * dy + w[5] * dz) / z;
-    const x = fx * tanX + centre[0], y = fy * tanY + centre[1];
+    const x = fx * tanX + skew * tanY + centre[0], y = fy * tanY + centre[1];
 
     // Rows of T = J W R diag(scale), tangents clamped in J alone.
     tanX = clamp(tanX, -(centre[0] + marginX) / fx, (size[0] - centre[0] + marginX) / fx);
@@ -102,7 +102,7 @@ function project(scene, camera, raster) {
       const down = w[3] * a + w[4] * b + w[5] * c;
       const ahead = w[6] * a + w[7] * b + w[8] * c;
       const length = scale[3 * i + k] / z;
-      first[k] = fx * (right - tanX * ahead) * length;
+      first[k] = (fx * (right - tanX * ahead) + skew * (down - tanY * ahead)) * length;
       second[k] = fy * (down - tanY * ahead) * length;
     }
 
@@ -181,8 +181,8 @@ function fitted(view, width, height) {
   const enlarged = Math.min(width / view.size[0], height / view.size[1]);
   const centre = view.centre.map(
     (place, k) => [width, height][k] / 2 + enlarged * (place - view.size[k] / 2));
-  const focal = view.focal * enlarged;
-  return { ...view, focal, centre, size: [width, height], enlarged };
+  const focal = view.focal * enlarged, skew = view.skew * enlarged;
+  return { ...view, focal, skew, centre, size: [width, height], enlarged };
 }
 
 // The view turned about its target by an angle (rad) about a unit axis of the world.

@@ -93,7 +93,9 @@ def read(
         background=background if alpha is not None else split.transforms.background,
         scale=placement.scale,
         centre=placement.centre,
-        up=(0.0, 0.0, 1.0),  # Blender's and nerfstudio's world
+        # Blender's and nerfstudio's world, where the file has not ours.
+        up=frames.unit(split.transforms.up) or (0.0, 0.0, 1.0),
+        frames_per_second=split.transforms.fps,
         path=path,
         notes=(*split.notes, *lost, *notes, *more, *when),
     )

@@ -16,6 +16,10 @@ KINDS = ("sway", "orbit", "lemniscate", "stabilised", "captured")
 SMOOTHED_OVER = 0.05
 SECONDS = 4.0  # that a film plays whose rate is not known
 SHORTEST, LONGEST = 1.0, 60.0
+# Least sine of the angle between the view and what is up. A sway turns the view by some
+# 20 degrees, and across the axis the pictures would turn over; on an orbit all views
+# are at one angle to it.
+LEAST_TILT, LEAST_ORBIT = 0.35, 0.01
 
 
 class CameraPath(NamedTuple):
@@ -43,7 +47,8 @@ def path(kind: str, capture: Capture, count: int, turns: float = 1.0) -> Camera:
     `sway` keeps to the span of the filmed positions, where a monocular reconstruction
     can be trusted, and so does `lemniscate`, a lying figure of eight; `orbit` circles
     the focus point in full; `captured` repeats the training cameras in the order of
-    their times, and `stabilised` does so without their shake.
+    their times, and `stabilised` does so without their shake. Where the capture looks
+    along what is up, as a camera overhead does, its middle picture says what is up.
     """
     if kind not in KINDS:
         raise ValueError(f"no camera path {kind!r}; {known_names(kind, KINDS)}")
@@ -54,8 +59,9 @@ def path(kind: str, capture: Capture, count: int, turns: float = 1.0) -> Camera:
         when = capture.times[capture.train].astype(np.float64)
         return smoothed(train_cameras, when, _filmed_span(capture, count))
     phase = np.linspace(0, 2 * np.pi * turns, count, endpoint=False)
-    up = up_axis(capture)
     target = focus_point(train_cameras, capture.near, capture.far)
+    least = LEAST_ORBIT if kind == "orbit" else LEAST_TILT
+    up = _across(up_axis(capture), train_cameras, target, least)
     shapes = {"sway": _sway, "orbit": _orbit, "lemniscate": _lemniscate}
     positions = shapes[kind](train_cameras, target, up, phase)
     middle = cameras.take(train_cameras, len(train_cameras.focal_px) // 2)
@@ -69,6 +75,15 @@ def path(kind: str, capture: Capture, count: int, turns: float = 1.0) -> Camera:
     return looking._replace(
         pixel_aspect=np.broadcast_to(middle.pixel_aspect, (count,)).copy()
     )
+
+
+def _across(up, train_cameras, target, least):
+    """`up`, or that of the middle picture where the view goes nearly along it."""
+    forward = target - np.median(train_cameras.position.astype(np.float64), axis=0)
+    if np.linalg.norm(np.cross(forward, up)) >= least * np.linalg.norm(forward):
+        return up
+    middle = len(train_cameras.focal_px) // 2
+    return -train_cameras.camera_from_world[middle, 1].astype(np.float64)
 
 
 def _replayed(capture, count):

@@ -197,6 +197,12 @@ def _check_numbers(capture, where):
             f"{where}: scale = {capture.scale:g} and centre = {capture.centre}; "
             "expected a positive scale and a finite centre"
         )
+    rate = capture.frames_per_second
+    if rate is not None and not 0 < rate < np.inf:
+        raise CaptureError(
+            f"{where}: {rate:g} frames per second; expected a positive rate, or none "
+            "where it is not known"
+        )
     if capture.depths is not None:
         bad = ~(capture.depths >= 0) | np.isinf(capture.depths)
         if bad.any():

@@ -231,6 +231,10 @@ def _upright(file):
         if picture.mode.startswith("I"):  # 16 bits of grey
             values = np.asarray(picture).astype(np.uint32) // 257
             return np.repeat(values.astype(np.uint8)[..., None], 3, axis=2)
+        if picture.has_transparency_data:  # what is cut out must not be seen again
+            picture = picture.convert("RGBA")
+            black = PIL.Image.new("RGBA", picture.size, (0, 0, 0, 255))
+            picture = PIL.Image.alpha_composite(black, picture)
         return np.asarray(picture.convert("RGB"))
 
 

@@ -223,6 +223,13 @@ def spread(values: ArrayLike) -> np.ndarray:
     return ((values - first) / (last - first)).astype(np.float32)
 
 
+def unit(up: Sequence[float] | None) -> tuple[float, float, float] | None:
+    """A direction that a file states, of unit length; None for none or for zeros."""
+    if up is None or not np.linalg.norm(up) > 0:
+        return None
+    return tuple((np.array(up) / np.linalg.norm(up)).tolist())
+
+
 def up_direction(cameras: Camera) -> tuple[float, float, float] | None:
     """Where the cameras' tops point on average; None if they cancel."""
     mean = -cameras.camera_from_world[:, 1].astype(np.float64).mean(0)

@@ -81,7 +81,7 @@ def read(
         background=views.scene.background,
         scale=views.scene.scale,
         centre=views.scene.center,
-        up=_unit(views.extra.up) or frames.up_direction(cameras),
+        up=frames.unit(views.extra.up) or frames.up_direction(cameras),
         frames_per_second=views.extra.fps,
         path=path,
         notes=(*views.notes, *notes, *lost, *more),
@@ -116,7 +116,9 @@ def write(capture: Capture, path: AnyPath, factors: tuple[int, ...] = (1,)):
     Pictures go to `rgb/<factor>x`, averaged for factors above 1. Beside what Nerfies
     knows it keeps, in files and keys that other readers pass over: exact times, depth
     (DyCheck's place), moving masks (NeRF-DS's), masks of filmed pixels, optical flow,
-    and the colours of the points.
+    and the colours of the points. What other tools found (`given`) stays out; of what
+    is read again, frames in neither split are missing, and where none was held out
+    every eighth is.
     """
     for name in capture.ids:
         if (
@@ -311,9 +313,3 @@ def _points(path, images, cameras, views, moving):
         return PointCloud(position, colour[finite]), notes
     cloud = frames.coloured_points(position, images, cameras, views.train, moving)
     return cloud, (*notes, "points.npy has no colours: sampled from the pictures")
-
-
-def _unit(up):
-    if up is None or not np.linalg.norm(up) > 0:
-        return None
-    return tuple((np.array(up) / np.linalg.norm(up)).tolist())

@@ -76,7 +76,11 @@ def place_by_cameras(cameras: Camera) -> Placement:
 
 
 def read_ply(path: pathlib.Path) -> PointCloud:
-    """Positions (as stored) and colours of a .ply point cloud; grey without colours."""
+    """Positions (as stored) and colours of a .ply point cloud; grey without colours.
+
+    Raises CaptureError for what is no such file, has more than `MAX_POINTS`, or has
+    colours that are neither uchar nor floats between 0 and 1.
+    """
     try:
         with path.open("rb") as file:
             if b"end_header" not in file.read(MAX_HEADER):
@@ -92,6 +96,7 @@ def read_ply(path: pathlib.Path) -> PointCloud:
         names = {each.name for each in vertex.properties}
         if {"red", "green", "blue"} <= names:
             colour = np.stack([vertex[k] for k in ("red", "green", "blue")], axis=1)
+            colour = _bytes(colour, path)
         else:
             colour = np.full(position.shape, UNSEEN, np.uint8)
     except CaptureError:
@@ -102,6 +107,16 @@ def read_ply(path: pathlib.Path) -> PointCloud:
             f"{path}: not a readable point cloud ({reason}); export it again"
         ) from None
     finite = np.isfinite(position).all(1)
-    return PointCloud(
-        position[finite].astype(np.float32), colour[finite].astype(np.uint8)
+    return PointCloud(position[finite].astype(np.float32), colour[finite])
+
+
+def _bytes(colour, path):
+    """Colours as uint8; those of floats are between 0 and 1."""
+    if colour.dtype == np.uint8:
+        return colour
+    if colour.dtype.kind == "f" and ((colour >= 0) & (colour <= 1)).all():
+        return np.round(colour * 255).astype(np.uint8)
+    raise CaptureError(
+        f"{path}: colours are {colour.dtype} from {colour.min():g} to "
+        f"{colour.max():g}; write them as uchar, or as floats between 0 and 1"
     )

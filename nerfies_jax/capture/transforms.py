@@ -46,7 +46,10 @@ class Transforms(Lens, kw_only=True):
     train_filenames: list[str] | None = None
     val_filenames: list[str] | None = None
     test_filenames: list[str] | None = None
-    background: tuple[float, float, float] | None = None  # ours: of opaque pictures
+    # Ours.
+    background: tuple[float, float, float] | None = None  # of opaque pictures
+    up: tuple[float, float, float] | None = None
+    fps: float | None = None
 
 
 class Split(msgspec.Struct):

@@ -100,6 +100,10 @@ def _transforms(capture, units):
         table["ply_file_path"] = POINTS
     if capture.background is not None:
         table["background"] = [float(x) for x in capture.background]
+    if capture.up is not None:
+        table["up"] = [float(x) for x in capture.up]
+    if capture.frames_per_second is not None:
+        table["fps"] = float(capture.frames_per_second)
     positions = places_in(units, capture, cameras.position)
     table["frames"] = [
         {

@@ -1,6 +1,7 @@
 """Film in and out, by PyAV, which comes with the extra `video`."""
 
 import itertools
+import math
 import pathlib
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
@@ -17,6 +18,8 @@ from nerfies_jax.capture.high_dynamic_range import (
 )
 from nerfies_jax.capture.images import MAX_PIXELS
 from nerfies_jax.capture.json_files import AnyPath, replaced_file
+
+LEAST_RATE = 0.001  # frames per second; rates are fractions of up to 1001 seconds
 
 
 def library():
@@ -44,6 +47,11 @@ def write_video(
     first = next(frames, None)
     if first is None:
         raise ValueError(f"{path}: no frames to write; pass at least one")
+    if not LEAST_RATE <= frames_per_second < math.inf:
+        raise ValueError(
+            f"{path}: frames_per_second={frames_per_second}; expected at least "
+            f"{LEAST_RATE}"
+        )
     try:
         with replaced_file(path) as partial:
             _encode(av, partial, path, first, frames, frames_per_second, quality)

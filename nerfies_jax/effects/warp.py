@@ -96,7 +96,7 @@ def effect(spec: WarpSpec) -> Effect:
 
 
 def init(spec: WarpSpec, key: Key[Array, ""], dtype=jnp.float32) -> MLP:
-    """Nearly the identity: no point of a box of side two moves by more than 1e-4.
+    """Nearly the identity: no point of a box of side two moves by more than 2e-4.
 
     Weights that read an annealed band start at zero. Until it opens they get no
     gradient, and drawn at random they would then bend a trained warp.

@@ -39,7 +39,9 @@ def score(
     """Render frames of a capture and compare them with what was filmed.
 
     Scores are of the picture as an 8-bit file would hold it, over the filmed pixels.
+    Raises ValueError for no frames.
     """
+    _check_some(rows, capture)
     renderings, scores = [], []
     for row in rows:
         rendering = renderer(state, view_of(capture, row))
@@ -84,7 +86,11 @@ def score_halves(
 def score_right_halves(
     capture: Capture, rows: np.ndarray, colours: np.ndarray | Sequence[np.ndarray]
 ) -> Halves:
-    """Scores of the right halves of rendered frames [height, width, 3]."""
+    """Scores of the right halves of rendered frames [height, width, 3].
+
+    Raises ValueError for no frames.
+    """
+    _check_some(rows, capture)
     scores = []
     for row, colour in zip(rows, colours, strict=True):
         half = colour.shape[1] // 2
@@ -93,6 +99,14 @@ def score_right_halves(
         scores.append(jax.device_get(_score(colour[:, half:], truth, valid)))
     psnr, ssim = np.asarray(scores).T
     return Halves(np.asarray(rows), psnr, ssim)
+
+
+def _check_some(rows, capture):
+    if not len(rows):
+        raise ValueError(
+            f"{capture.path or capture.name}: no rows to score; hold frames out when "
+            "the capture is read (heldout=8), or give rows of its training frames"
+        )
 
 
 def known_mean(

@@ -16,9 +16,13 @@ from nerfies_jax.capture.capture import Capture, CaptureError
 from nerfies_jax.capture.given import Given, GivenFiles
 
 MOST_NUMBERS = 2_000_000_000  # of one file
-# Names of tracks and of where they are seen, and which axis counts the frames where
-# the shape leaves it open: TAPIR, CoTracker.
-TRACK_NAMES = (("tracks", "visibles", 1), ("pred_tracks", "pred_visibility", 0))
+# Names of tracks and of where they are seen, which axis counts the frames where the
+# shape leaves it open, and where the first pixel has its centre: TAPIR, whose pictures
+# begin at 0, and CoTracker, which samples with corners aligned.
+TRACK_NAMES = (
+    ("tracks", "visibles", 1, 0.5),
+    ("pred_tracks", "pred_visibility", 0, 0.0),
+)
 LEAST_INSIDE = 0.5  # of what is seen must lie in the pictures
 SEEN = 0.5  # of a visibility between 0 and 1
 FLO_MAGIC = 202021.25  # of Middlebury's .flo
@@ -83,7 +87,7 @@ def _tracks(path, capture):
         if names[0] in arrays and names[1] in arrays:
             break
     else:
-        wanted = " or ".join(f"{one} and {two}" for one, two, _ in TRACK_NAMES)
+        wanted = " or ".join(f"{one} and {two}" for one, two, *_ in TRACK_NAMES)
         raise CaptureError(
             f"{path}: holds {', '.join(arrays) or 'nothing'}; expected {wanted}"
         )
@@ -103,7 +107,7 @@ def _tracks(path, capture):
         fits = [names[2]]
     pixel, seen = np.moveaxis(pixel, fits[0], 0), np.moveaxis(seen, fits[0], 0)
     rows = _rows(len(pixel), capture, path, "tracks")
-    pixel = pixel.astype(np.float32) + 0.5  # these count from the centre of a pixel
+    pixel = pixel.astype(np.float32) + np.float32(0.5 - names[3])
     seen = (seen > SEEN) & np.isfinite(pixel).all(-1)
     if "size" in arrays:
         pixel = pixel * (np.asarray(capture.size) / arrays["size"]).astype(np.float32)
@@ -222,10 +226,7 @@ def _checked_stack(array, path, name):
 
 def _flow(path, capture):
     if path.is_dir():
-        sides = {
-            side: np.stack([_flo(one) for one in _flo_files(path / side)])
-            for side in ("forward", "backward")
-        }
+        sides = {side: _flo_stack(path / side) for side in ("forward", "backward")}
     else:
         arrays = _arrays(path)
         missing = {"forward", "backward"} - set(arrays)
@@ -248,6 +249,19 @@ def _flow(path, capture):
     forward, backward = np.zeros((2, len(capture.ids), height, width, 2), np.float32)
     forward[learnt[:-1]], backward[learnt[1:]] = sides["forward"], sides["backward"]
     return {"forward": forward, "backward": backward}
+
+
+def _flo_stack(folder):
+    paths = _flo_files(folder)
+    pictures = [_flo(one) for one in paths]
+    for path, picture in zip(paths, pictures, strict=True):
+        if picture.shape != pictures[0].shape:
+            (height, width), (tall, wide) = picture.shape[:2], pictures[0].shape[:2]
+            raise CaptureError(
+                f"{path}: {width}x{height} pixels, but {paths[0].name} is of "
+                f"{wide}x{tall}; all must be of the pictures as they are read"
+            )
+    return np.stack(pictures)
 
 
 def _flo_files(folder) -> Sequence[pathlib.Path]:

@@ -19,7 +19,7 @@ import scipy.ndimage as nd
 
 from nerfies_jax.capture import capture as captures
 from nerfies_jax.capture import pinholes
-from nerfies_jax.capture.capture import Capture, PointCloud
+from nerfies_jax.capture.capture import Capture, CaptureError, PointCloud
 from nerfies_jax.capture.given import Given
 from nerfies_jax.capture.json_files import replaced_file
 from nerfies_jax.evidence import (
@@ -194,6 +194,12 @@ def _depths(capture, given, views, tracks, rest, score, use_depths):
         return capture.depths[views.row] if own else None
     still = score < paths.AT_REST
     depth, miss = given_depth.aligned(depth, tracks.take(still), rest.take(still))
+    if not np.isfinite(miss):
+        raise ValueError(
+            f"{capture.path or capture.name}: in every frame the given depths, or "
+            "their inverse, miss the points at rest, or too few of those are seen; "
+            "leave the depths out"
+        )
     if miss > given_depth.USABLE:
         raise ValueError(
             f"{capture.path or capture.name}: the given depths, or their inverse, miss "
@@ -286,7 +292,9 @@ def digest(capture: Capture, use_depths: bool = False) -> str:
     checksum = hashlib.blake2b(digest_size=12)
     checksum.update(f"evidence {VERSION} {use_depths}".encode())
     parts = [capture.images[capture.train], capture.times, capture.train]
-    parts += [np.asarray([capture.near]), *capture.cameras]
+    parts += [np.asarray([capture.near, capture.far]), *capture.cameras]
+    if capture.points is not None:
+        parts.append(capture.points.position)
     depths = capture.depths if use_depths else None
     given = () if capture.given is None else capture.given
     for name, part in zip(Given._fields, given, strict=False):
@@ -309,7 +317,8 @@ def cached(
     """`gather`, or what it found before of the same pictures and cameras.
 
     Of a capture with a lens, what its pinholes' pictures say: with and without the lens
-    it is one record. What was left out for want of time is not kept.
+    it is one record. What was left out for want of time is not kept, nor is anything
+    where `folder` cannot be written: that is told.
     """
     capture = pinholes.as_pinholes(capture)
     path = file_of(capture, folder, use_depths)
@@ -317,7 +326,10 @@ def cached(
         return load(path)
     evidence = gather(capture, use_depths, tell, seconds)
     if not evidence.left_out:
-        save(path, evidence)
+        try:
+            save(path, evidence)
+        except (OSError, CaptureError) as error:
+            tell(f"what the pictures say is not kept for the next time: {error}")
     return evidence
 
 

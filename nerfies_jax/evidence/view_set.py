@@ -133,8 +133,8 @@ def times_smaller(views: Views) -> int:
 def plain(capture: Capture, rows: np.ndarray) -> np.ndarray:
     """[rows, height, width]: where a picture shows one colour behind everything.
 
-    The known background, or the median of the border where nearly all of the border
-    has it; a plain wall that only fills part of the border counts as scene.
+    The median of the border where nearly all of the border has it; a plain wall that
+    only fills part of the border counts as scene.
     """
     images = capture.images[rows]
     border = np.concatenate(

@@ -320,7 +320,7 @@ def save_depth(folder: pathlib.Path, capture: Capture, scored: Scored) -> None:
     """Z-depth (scene units) and alpha of every held-out frame as EXR."""
     folder.mkdir(exist_ok=True)
     for row, depth, alpha in zip(scored.rows, scored.depth, scored.alpha, strict=True):
-        name = pathlib.PurePath(capture.ids[row]).name
+        name = capture.ids[row].replace("/", "_")
         exr.write_exr(folder / f"{name}.exr", alpha=alpha, depth=depth)
 
 

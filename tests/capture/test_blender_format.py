@@ -9,7 +9,7 @@ import plyfile
 import pytest
 
 from nerfies_jax import capture as room
-from nerfies_jax.capture import blender_format, frames
+from nerfies_jax.capture import blender_format, frames, points
 from nerfies_jax.capture.capture import CaptureError
 from tests.capture.broken import refused
 
@@ -229,6 +229,22 @@ def test_nerfstudio_points_masks_and_lists(tmp_path):
     assert 4.3 < capture.far / capture.scale < 6.5
     corners = np.concatenate([capture.points.position, capture.cameras.position])
     assert np.linalg.norm(np.ptp(corners, axis=0)) < 1.2  # unit diagonal but outliers
+
+
+def points_file(path, colour, kind):
+    rows = np.zeros(len(colour), f"f4, f4, f4, {kind}, {kind}, {kind}")
+    rows.dtype.names = ("x", "y", "z", "red", "green", "blue")
+    rows["red"] = colour
+    plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")]).write(path)
+    return path
+
+
+def test_colours_of_points_are_bytes_or_shares(tmp_path):
+    shares = points_file(tmp_path / "a.ply", [0, 0.5, 1], "f4")
+    assert points.read_ply(shares).colour[:, 0].tolist() == [0, 128, 255]
+    other = points_file(tmp_path / "b.ply", [0, 128, 255], "f4")
+    with pytest.raises(CaptureError, match=r"b\.ply: .*float32 from 0 to 255; .*uchar"):
+        points.read_ply(other)
 
 
 def test_of_frames_listed_to_learn_from_alone_some_are_held_out(tmp_path):

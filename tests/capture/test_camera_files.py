@@ -59,6 +59,8 @@ def filmed(bent=True, frames=9):
         ),
         scale=SCALE,
         centre=CENTRE,
+        up=(0.0, -1.0, 0.0),
+        frames_per_second=12.0,
     )
 
 
@@ -89,6 +91,8 @@ def test_transforms_come_back_with_times_splits_masks_and_points(units, tmp_path
     np.testing.assert_array_equal(read.times, capture.times[rows])
     np.testing.assert_array_equal(read.images, capture.images[rows])
     np.testing.assert_array_equal(read.valid, capture.valid[rows])
+    np.testing.assert_allclose(read.up, capture.up)
+    assert read.frames_per_second == capture.frames_per_second == 12
     same_cameras(read.cameras, capture.cameras, rows)
     if units == "world":
         places = in_world(capture)

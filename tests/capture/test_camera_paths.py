@@ -67,6 +67,26 @@ def test_every_path_looks_at_the_scene_with_proper_rotations(kind):
         np.testing.assert_allclose(ahead, np.linalg.norm(offset, axis=1), rtol=1e-4)
 
 
+@pytest.mark.parametrize("tilt", [0.0, 1e-7, 0.1])
+@pytest.mark.parametrize("kind", ["sway", "orbit", "lemniscate"])
+def test_a_camera_overhead_keeps_what_its_pictures_call_up(kind, tilt):
+    """What is up lies along the view: no picture may be undefined, or turn over."""
+    place = np.array([0.0, -2 * np.sin(tilt), 2 * np.cos(tilt)])
+    one = cameras.look_at(place, np.zeros(3), (0.0, 1.0, 0.0), 40.0, (40, 30))
+    filmed = cameras.stack([one] * 10)
+    capture = scenes.tiny_capture()
+    capture = dataclasses.replace(
+        capture,
+        cameras=cameras.take(filmed, np.zeros(len(capture.ids), int)),
+        up=(0.0, 0.0, 1.0),
+    )
+    path = camera_paths.path(kind, capture, 9)
+    cameras.validate(path, capture.size)
+    if kind != "orbit":
+        upward = path.camera_from_world[:, 1] @ one.camera_from_world[1]
+        assert upward.min() > 0.9
+
+
 def test_sway_stays_within_the_filmed_span():
     capture = scenes.tiny_capture()
     filmed = capture.cameras.position[capture.train]

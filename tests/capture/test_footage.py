@@ -98,6 +98,18 @@ def test_a_picture_of_floats_is_refused_by_name(tmp_path):
         footage.from_pictures(tmp_path, tmp_path / "out")
 
 
+def test_what_is_cut_out_of_a_picture_is_black(tmp_path):
+    """The colour that an editor leaves behind transparency is not to be matched."""
+    pixels = np.full((32, 32, 4), 200, np.uint8)
+    pixels[:, :, 3] = np.repeat([0, 255], 16)[:, None]
+    for name in ("0.png", "1.png"):
+        PIL.Image.fromarray(pixels).save(tmp_path / name)
+    footage.from_pictures(tmp_path, tmp_path / "out")
+    read = images.read_pixels(tmp_path / "out/images/0.png")
+    assert (read[:16] == 0).all()
+    assert (read[16:] == 200).all()
+
+
 def test_photographs_come_upright_of_one_size_whatever_their_ending(
     tmp_path, monkeypatch
 ):

@@ -91,6 +91,8 @@ CAPTURES = [
         "camera 'f2': orientation is not orthonormal",
     ),
     ({"cameras": camera.take(make().cameras, np.arange(3))}, "one per frame"),
+    ({"frames_per_second": 0.0}, "0 frames per second; expected a positive rate"),
+    ({"frames_per_second": np.nan}, "nan frames per second"),
     ({"frames": 1, "train": np.array([0]), "heldout": np.array([], int)}, "2 views"),
     (flow(forward=FLOW.forward.astype(np.float16)), "forward flow is float16"),
     (
@@ -161,6 +163,7 @@ REFUSED = [
     (lambda: write_png("a.png", BYTES[0] / 255), "float64"),
     (lambda: write_png("none/a.png", BYTES[0]), "cannot be written"),
     (lambda: video.write_video("a.mp4", []), "no frames"),
+    (lambda: video.write_video("a.mp4", [BYTES[0]], 4e-4), "frames_per_second=0.0004"),
     (
         lambda: video.write_video("a.mp4", [BYTES[0], BYTES[0, :2, :2]]),
         r"frame 1 is uint8 of shape \(2, 2, 3\)",

@@ -248,6 +248,8 @@ def test_scores_are_those_of_the_picture_as_eight_bits():
             use_sample_covariance=False,
         )
         np.testing.assert_allclose(scored.ssim[place], ssim, atol=1e-4)
+    with pytest.raises(ValueError, match="no rows to score; hold frames out"):
+        evaluation.score(renderer, state_at(10, 0.3), capture, capture.heldout[:0])
 
 
 def test_a_resized_view_shows_the_same_directions():

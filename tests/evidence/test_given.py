@@ -24,10 +24,10 @@ def with_files(capture=None, **files):
 
 
 def tapir(path, **changes):
-    """Exact tracks of the card, [tracks, frames, 2]."""
+    """Exact tracks of the card, [tracks, frames, 2]; the picture begins at 0."""
     capture, evidence = gathered()
     points = card_points(capture, evidence.row)
-    arrays = {"tracks": points.pixel - 0.5, "visibles": points.seen} | changes
+    arrays = {"tracks": points.pixel, "visibles": points.seen} | changes
     np.savez(path, **arrays)
     return path, points
 
@@ -36,11 +36,12 @@ def tapir(path, **changes):
 def test_tracks_are_read_in_each_layout(tmp_path, layout):
     path, points = tapir(tmp_path / "t.npz")
     if layout != "tapir":
-        first = np.moveaxis(points.pixel - 0.5, 0, 1)
+        first = np.moveaxis(points.pixel, 0, 1)
         seen = points.seen.T.astype(np.float32)
         named = {"tracks": first, "visibles": seen}
         if layout == "cotracker":
-            named = {"pred_tracks": first[None], "pred_visibility": seen[None]}
+            # Counted from the centre of the first pixel.
+            named = {"pred_tracks": first[None] - 0.5, "pred_visibility": seen[None]}
         np.savez(path, **named)
     capture = with_files(tracks=path)
     place = np.moveaxis(capture.given.track_pixel, 0, 1)[points.seen]
@@ -101,7 +102,7 @@ def test_a_mover_that_was_marked_is_no_noise_however_small():
 def test_tracks_of_larger_pictures_are_brought_to_those_that_are_read(tmp_path):
     _, points = tapir(tmp_path / "t.npz")
     size = 4 * np.array(films.SIZE)
-    path, _ = tapir(tmp_path / "t.npz", tracks=4 * points.pixel - 0.5, size=size)
+    path, _ = tapir(tmp_path / "t.npz", tracks=4 * points.pixel, size=size)
     given = with_files(tracks=path).given
     place = np.moveaxis(given.track_pixel, 0, 1)[points.seen]
     np.testing.assert_allclose(place, points.pixel[points.seen], atol=1e-3)
@@ -190,6 +191,15 @@ def test_what_does_not_fit_is_refused_with_the_file_and_the_way_out(tmp_path):
     refused(r"no depth above zero", depths=depths)
     np.savez(depths, forward=np.zeros((23, 72, 96, 2)))
     refused(r"no 'backward'; flow is needed both ways", flow=depths)
+    for side, sizes in (("forward", [(3, 2), (3, 4)]), ("backward", [(3, 2)] * 2)):
+        (tmp_path / "flow" / side).mkdir(parents=True)
+        for number, size in enumerate(sizes):
+            head = (
+                np.float32(given_files.FLO_MAGIC).tobytes() + np.int32(size).tobytes()
+            )
+            pixels = np.zeros(2 * size[0] * size[1], np.float32).tobytes()
+            (tmp_path / "flow" / side / f"{number}.flo").write_bytes(head + pixels)
+    refused(r"1\.flo: 3x4 pixels, but 0\.flo is of 3x2", flow=tmp_path / "flow")
     bent = films.film(**MOVES, frames=24)
     bent.cameras.radial[:, 0] = 0.1
     refused(r"undistort the capture first", capture=bent, tracks=path)

@@ -428,6 +428,14 @@ def test_what_was_gathered_is_read_again(tmp_path):
     assert again.unusable == evidence.unusable
     assert record.digest(capture) == record.digest(films.film(**MOVES, frames=24))
     assert record.digest(capture) != record.digest(films.film(frames=24))
+    # The span of depths, which steers the search for flow, is of these as well.
+    assert record.digest(capture) != record.digest(
+        dataclasses.replace(capture, far=2 * capture.far)
+    )
+    some = PointCloud(np.ones((3, 3), np.float32), np.ones((3, 3), np.uint8))
+    assert record.digest(capture) != record.digest(
+        dataclasses.replace(capture, points=some)
+    )
 
 
 def test_what_there_is_no_time_for_is_left_out_and_not_kept(tmp_path):
@@ -444,6 +452,15 @@ def test_what_there_is_no_time_for_is_left_out_and_not_kept(tmp_path):
     assert (hasty.moving & true).sum() / (hasty.moving | true).sum() > 0.6
     record.cached(capture, tmp_path)
     assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_folder_that_cannot_be_written_costs_the_next_time_alone(tmp_path):
+    capture, evidence = gathered()
+    (tmp_path / "file").touch()
+    log = []
+    found = record.cached(capture, tmp_path / "file", tell=log.append)
+    assert len(found.score) == len(evidence.score)
+    assert "not kept for the next time" in log[-1]
 
 
 def test_jumping_views_and_short_films_say_why_they_are_of_no_use():

@@ -55,6 +55,8 @@ def test_blended_pairs_are_the_tiles_that_show_a_gaussian(case):
     spec = dataclasses.replace(raster_speed.SPEC, capacity=128)
     pairs = jax.jit(lambda f: raster.blended_pairs(f, (40, 24), spec))(faint)
     assert abs(int(pairs) - expected) <= 1  # a pixel on the cut itself
+    nothing = jax.tree.map(lambda leaf: leaf[:0], faint)
+    assert int(raster.blended_pairs(nothing, (40, 24), spec)) == 0
 
 
 @pytest.mark.slow

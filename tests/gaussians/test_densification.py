@@ -186,6 +186,18 @@ def test_the_cap_takes_the_largest_gradients_and_says_who_was_refused():
     assert again.report == densification.Report(refused=1, active=8, capacity=8)
 
 
+def test_what_is_too_large_goes_where_the_cap_keeps_it_from_being_split():
+    spec = DefaultStrategySpec(cap_max=6, prune_scale3d=0.1)
+    params, moments, stats = make(scale=0.15 * EXTENT)
+    stats = hot(stats, [1, 4])
+    changed = run(params, moments, stats, spec, step=spec.reset_every + 1)
+    assert (changed.report.split, changed.report.pruned) == (2, 4)
+    full = DefaultStrategySpec(cap_max=3, prune_scale3d=0.1)
+    params, moments, stats = make(count=3, scale=0.15 * EXTENT)
+    changed = run(params, moments, hot(stats, [0, 1, 2]), full, full.reset_every + 1)
+    assert (changed.report.refused, changed.report.pruned) == (3, 3)
+
+
 def test_a_revised_clone_and_its_source_hide_what_one_did(dtype):
     params, moments, stats = make(dtype=dtype, opacity=0.8)
     changed = run(

@@ -177,6 +177,20 @@ def test_nothing_faint_and_nothing_visible():
     assert same is params
 
 
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("leaf", ["mean", "opacity_logit"])
+def test_a_row_that_is_not_finite_becomes_a_copy_and_is_counted(leaf):
+    params, moments = make(np.full(20, 0.3))
+    rows = params.rows["splats"]
+    broken = rows._replace(**{leaf: getattr(rows, leaf).at[3].set(np.nan)})
+    params = params._replace(rows={"splats": broken})
+    params, moments, report = mcmc.refine(TX, params, moments, KEY, SPEC)
+    assert (report.broken, report.relocated, report.cloned) == (1, 1, 1)
+    assert report.active == 21
+    for part in jax.tree.leaves(params):
+        assert np.isfinite(part).all()
+
+
 def test_adding_grows_by_a_twentieth_into_the_inactive_rows_and_stops_at_the_cap():
     params, moments = make(np.full(100, 0.3))
     params, moments, report = mcmc.add(TX, params, moments, KEY, SPEC)

@@ -211,13 +211,16 @@ def by_node(page):
     """What the page's own functions make of it, and with which camera and time."""
     capture = moving_scene()[2]
     one = cameras.take(capture.cameras, 2)._replace(
-        principal_point_px=np.float32([23, 11]), pixel_aspect=np.float32(1.3)
+        principal_point_px=np.float32([23, 11]),
+        pixel_aspect=np.float32(1.3),
+        skew_px=np.float32(4),
     )
     camera = {
         "rotation": one.camera_from_world.ravel().tolist(),
         "position": one.position.tolist(),
         "focal": float(one.focal_px),
         "aspect": float(one.pixel_aspect),
+        "skew": float(one.skew_px),
         "centre": one.principal_point_px.tolist(),
         "size": capture.size,
     }

@@ -186,6 +186,27 @@ def footprint_and_slopes(gaussians, camera):
     return (plain, plain.visible), sharp, grads
 
 
+def test_what_lies_beside_the_picture_is_visible_and_not_seen(rng):
+    """Density control divides by the views in which a Gaussian was."""
+    gaussians = some_gaussians(rng, 300, "float32")
+    drawn, visible, seen = footprints_seen(
+        gaussians, camera_at([0.0, 0.0, -3.0], "float32")
+    )
+    places, reaches = np.asarray(drawn.mean_px), np.asarray(drawn.extent_px)
+    expected = [
+        x + right > 0 and x - right < 64 and y + down > 0 and y - down < 48
+        for (x, y), (right, down) in zip(places, reaches, strict=True)
+    ]
+    np.testing.assert_array_equal(seen, visible & expected)
+    assert 10 < seen.sum() < visible.sum() - 10
+
+
+@jitted
+def footprints_seen(gaussians, camera):
+    drawn = projection.project(gaussians, camera, SIZE, GSPLAT)
+    return drawn, drawn.visible, drawn.seen(SIZE)
+
+
 @pytest.mark.hard_cases
 def test_edge_on_disc_keeps_the_least_compensation(dtype):
     gaussians = one(dtype, scale=(0.0, 1.0, 1.0), opacity=1.0)

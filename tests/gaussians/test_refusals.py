@@ -13,6 +13,7 @@ from gaussians_jax import (
     optimiser,
     phases,
     raster,
+    rendering,
     spec,
     splats,
     static_rows,
@@ -43,6 +44,7 @@ from gaussians_jax.projection import Footprints
 from gaussians_jax.raster_spec import GSPLAT, RasterSpec
 from gaussians_jax.spec import SplatScene
 from gaussians_jax.splats import Params
+from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.training import schedules
 from tests import scenes
 from tests.gaussians.shared import put, rows_of, some_gaussians
@@ -82,6 +84,9 @@ SETTINGS = [
     (FourierSpec, dict(dc_weight=-1.0), "dc_weight=-1.0"),
     (FourierSpec, dict(most=math.nan), "most=nan"),
     (InitSpec, dict(points=0), "at least one Gaussian"),
+    (InitSpec, dict(opacity=2.0), "opacity=2.0"),
+    (InitSpec, dict(scale=-1.0), "scale=-1.0"),
+    (InitSpec, dict(max_scale=math.nan), "max_scale=nan"),
     (InitSpec, dict(source="sfm"), "unknown source 'sfm'; choose from"),
     (KanMotionSpec, dict(embedding=0), "embedding=0"),
     (FlowSpec, dict(weight=-1.0), "weight=-1.0"),
@@ -126,6 +131,8 @@ SETTINGS = [
     (RasterSpec, dict(tile=12), "tile must be one of"),
     (RasterSpec, dict(capacity=0), "capacity must be at least 1"),
     (RasterSpec, dict(eps2d=0.0), "eps2d must be positive"),
+    (RasterSpec, dict(eps2d=math.nan), "eps2d must be positive"),
+    (RasterSpec, dict(tangent_margin=math.nan), "tangent_margin must be"),
     (RasterSpec, dict(transmittance_threshold=1.0), "0 <= transmittance_threshold < 1"),
     (SmoothingSpec, dict(steps=0), "steps >= 1"),
     (SpectralSpec, dict(wavelet=None, fourier=None), "both None"),
@@ -195,6 +202,13 @@ def still(params, time):
     return splats.activate(params.rows["splats"])
 
 
+def through_a_lens():
+    camera = cameras.take(scenes.tiny_capture().cameras, 0)
+    camera = camera._replace(radial=np.float32([0.1, 0, 0]))
+    gaussians = some_gaussians(3, "float32")
+    return rendering.render(gaussians, put(np.ones((3, 3))), camera, (8, 6))
+
+
 def moba(**changes):
     spec.refuse_what_cannot_train(dataclasses.replace(scenes.TINY_MOBA, **changes))
 
@@ -235,7 +249,10 @@ CALLS = [
     (lambda: moba(motion=PolynomialMotionSpec()), "alternation=none"),
     (lambda: phases.annealed(schedules.log_linear(1e-2, 1e-4, 1000),
                              AnnealingSpec(950), 1000), "3/4 of the run"),
+    (lambda: moba(motion=PolynomialMotionSpec(warm_up=5), alternation=None),
+     "motion.warm_up=5 with motion.fading"),
     (lambda: raster.rasterise(*footprints((5, 0))), "at least one pixel"),
+    (lambda: through_a_lens(), "without lens distortion, got radial"),
     (lambda: spectral.effect(SpectralSpec(after=10), 10), "after=10"),
     (lambda: splats.pad_rows(some_rows(), 6),
      "7 rows cannot be padded to a capacity of 6"),

@@ -181,6 +181,14 @@ def test_a_run_of_a_film_prepares_it_once_beside_the_run(tmp_path, mapper, monke
     capture = room.load(tmp_path / "run-capture")
     assert capture.frames_per_second == pytest.approx(30, abs=0.2)
     assert reconstruction._with_cameras(moving, None, Preparation()) is moving
+    # As many threads as there are cores change nothing; another film does.
+    threads = dataclasses.replace(how, threads=3)
+    reconstruction._with_cameras(config, tmp_path / "run", threads)
+    clip = (tmp_path / "clip.mp4").read_bytes()
+    (tmp_path / "clip.mp4").write_bytes(clip[:-1] + bytes([clip[-1] ^ 1]))
+    with pytest.raises(ValueError, match=r"run-capture: .*content differ"):
+        reconstruction._with_cameras(config, tmp_path / "run", how)
+    (tmp_path / "clip.mp4").write_bytes(clip)
     other = dataclasses.replace(how, passes=1)
     with pytest.raises(ValueError, match=r"run-capture: .*how differ.*--out"):
         reconstruction._with_cameras(config, tmp_path / "run", other)

@@ -1,5 +1,6 @@
 """What a run tells of its size and speed, and what it keeps where a part fails."""
 
+import dataclasses
 import pathlib
 import types
 
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from nerfies_jax.evaluation.representation import Saved
+from nerfies_jax.evaluation.scores import Scored
 from nerfies_jax.runs import products, representations, step_profile
 from nerfies_jax.runs.config import RunConfig
 from nerfies_jax.runs.run import Run, scene_spec
@@ -20,6 +22,17 @@ def test_the_size_of_a_model_is_a_metric_where_there_is_one():
     (size,) = products.model_size(Saved(2_345_678))
     assert (size.key, size.value) == ("file.bytes", 2_345_678)
     assert products.model_size(Saved()) == []
+
+
+def test_depths_of_two_cameras_are_two_files(tmp_path):
+    capture = scenes.tiny_capture()
+    ids = ("cam0/000", "cam1/000", *capture.ids[2:])
+    depth = np.ones((2, 4, 5), np.float32)
+    some = np.zeros(2)
+    scored = Scored(np.arange(2), depth, depth, depth, some, some)
+    products.save_depth(tmp_path, dataclasses.replace(capture, ids=ids), scored)
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == ["cam0_000.exr", "cam1_000.exr"]
 
 
 def test_a_player_that_fails_loses_nothing_but_itself(tmp_path):
