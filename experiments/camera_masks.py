@@ -36,6 +36,7 @@ class CameraMasks:
     """Also write the numbers here, as JSON."""
 
     def __post_init__(self):
+        cli.check_out_file(self.out)
         if not 0.02 <= self.half <= 0.2:
             raise ValueError(f"--half {self.half}: from 0.02 to 0.2")
         if self.seeds < 1 or self.frames < 12:

@@ -44,6 +44,13 @@ class NamedSource(CaptureSource):
     """What to do with frames whose picture is missing (default: refuse)."""
     files: Annotated[GivenFiles, tyro.conf.arg(name="")] = GivenFiles()
 
+    def __post_init__(self):
+        if None not in (self.capture, self.scene):
+            raise ValueError(
+                f"{self.capture} and --scene {self.scene}: name a folder or a built-in "
+                "scene, not both"
+            )
+
 
 def _headed(name: str) -> tuple:
     """For `Annotated`: fields of settings by their own names, under a heading."""
@@ -65,6 +72,16 @@ def given(source: CaptureSource) -> dict[str, Any]:
     """What the command line says of the source, by field."""
     unsaid = (None, GivenFiles())
     return {name: value for name, value in vars(source).items() if value not in unsaid}
+
+
+def check_out_file(path: pathlib.Path | None) -> None:
+    """ValueError, before anything is measured, where --out cannot become a file."""
+    if path is None:
+        return
+    if path.is_dir():
+        raise ValueError(f"--out {path}: a folder; name a file, as {path / 'x.json'}")
+    if not path.absolute().parent.is_dir():
+        raise ValueError(f"--out {path}: no folder {path.parent}; make it first")
 
 
 class Ended(NamedTuple):

@@ -35,20 +35,23 @@ class ElasticPoints:
     device: str = "auto"
     """cpu, gpu, or whatever JAX finds."""
 
+    def __post_init__(self):
+        cli.check_out_file(self.out)
+        for name in ("rays", "samples", "draws", "repeats"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"--{name} {getattr(self, name)} must be at least 1")
+        wrong = [k for k in self.points if not 0 < k < self.samples]
+        if wrong:
+            raise ValueError(
+                f"--points {wrong[0]} must be in 1 .. {self.samples - 1}: a ray has "
+                f"{self.samples} samples"
+            )
+
 
 @cli.command(ElasticPoints)
 def main(args):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        for name in ("rays", "samples", "draws", "repeats"):
-            if getattr(args, name) < 1:
-                raise ValueError(f"--{name} {getattr(args, name)} must be at least 1")
-        wrong = [k for k in args.points if not 0 < k < args.samples]
-        if wrong:
-            raise ValueError(
-                f"--points {wrong[0]} must be in 1 .. {args.samples - 1}: a ray has "
-                f"{args.samples} samples"
-            )
         platform.start_jax(args.device, "all")
     figures = estimator_table(args)
     print(table(figures))

@@ -12,7 +12,8 @@ from, *moving* where something moves (by the capture's masks, or the pictures' w
 has none); compiling counts nothing, nor does a start from tracks. *spent* is what these
 steps took in the end. After the longest a frame is drawn behind the survey of its empty
 space (`nerfies_jax.skipping`) and by the full quadrature: milliseconds are medians of
-the processor over five frames, without the survey, which has a column of its own, and
+the processor over five frames, without the survey, which has a column of its own (a
+difference of two timings, empty where it is below their noise), and
 decibels are of the difference between the two. Over several seeds the table has means,
 and beside a PSNR its standard deviation. What is in `--out` already is not measured
 again: an interrupted run goes on, and more `--seeds` add those that it lacks.
@@ -28,6 +29,7 @@ import time
 
 from experiments import cli, markdown
 from experiments.ablate.arms import FROM_TRACKS
+from nerfies_jax.capture.nearest import known_names
 from nerfies_jax.runs import platform, representations
 
 TRACKS = "+tracks"
@@ -59,9 +61,13 @@ class FieldSpeed:
     """Keeps the numbers."""
 
     def __post_init__(self):
+        cli.check_out_file(self.out)
         for name in self.presets:
             if name.removesuffix(TRACKS) not in representations.PRESETS:
-                raise ValueError(f"--presets {name}: no such preset")
+                raise ValueError(
+                    f"--presets {name}: no such preset; "
+                    + known_names(name, representations.PRESETS)
+                )
         rising = list(self.seconds) == sorted(set(self.seconds))
         if not self.seconds or not rising or self.seconds[0] <= 0:
             raise ValueError("--seconds: positive and rising, as 60 120 300")
@@ -225,6 +231,7 @@ def page(stored) -> str:
         for place, limit in enumerate(one["seconds"]):
             last = place == len(one["seconds"]) - 1
             times = [_mean(seeds, name) if last else None for name in TIMES]
+            times = [None if time is None or time < 0 else time for time in times]
             steps, spent = (
                 statistics.fmean(row[name][place] for row in seeds)
                 for name in ("steps", "spent")

@@ -36,6 +36,7 @@ class KanLocal:
     """cpu, gpu, or whatever JAX finds."""
 
     def __post_init__(self):
+        cli.check_out_file(self.out)
         for name in ("points", "width", "repeats"):
             if getattr(self, name) < 1:
                 raise ValueError(f"--{name} {getattr(self, name)} must be at least 1")

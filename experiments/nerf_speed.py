@@ -42,6 +42,11 @@ class NerfSpeed:
     device: str = "auto"
     """cpu, gpu, or whatever JAX finds."""
 
+    def __post_init__(self):
+        cli.check_out_file(self.out)
+        if self.repeats < 1:
+            raise ValueError(f"--repeats {self.repeats}: time at least once")
+
 
 @cli.command(NerfSpeed)
 def main(args):

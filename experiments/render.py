@@ -76,6 +76,8 @@ class Render:
     saturation."""
     out: pathlib.Path | None = None
     """Folder for the pictures (default: RUN/renders/PATH)."""
+    overwrite: bool = False
+    """Write into a folder that has files already, over those of the same names."""
     formats: tuple[Literal["png", "mp4", "exr"], ...] = ("png", "mp4")
     """What to write: png pictures, one mp4, exr with linear colour, alpha and depth."""
     max_side: int | None = None
@@ -123,7 +125,10 @@ def main(args):
         from nerfies_jax import evaluation, runs
         from nerfies_jax.capture import video
         from nerfies_jax.capture.capture import CaptureError
+        from nerfies_jax.capture.json_files import refuse_existing
 
+        if args.out is not None:
+            refuse_existing(args.out, args.overwrite)
         if "mp4" in args.formats:
             video.library()  # missing, it is said before anything is rendered
         run = runs.saved_run(args.run)
@@ -250,7 +255,7 @@ def _views(args, run):
     if args.path == "heldout":
         rows = run.capture.heldout
         views = [evaluation.view_of(run.capture, row) for row in rows]
-        names = [pathlib.PurePath(run.capture.ids[row]).name for row in rows]
+        names = [run.capture.ids[row].replace("/", "_") for row in rows]
         if args.freeze is not None:
             time = views[0].time.dtype.type(args.freeze)
             views = [view._replace(time=time) for view in views]

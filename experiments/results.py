@@ -25,9 +25,11 @@ INDEX = """\
 
 Every number on these pages stands in a file of this repository, and the page is
 written from that file: `python -m experiments.results` writes all of them, and a test
-holds each against its file. The command beside a page measures anew and names the file
-it writes; `python -m experiments.results kan_local --measured kan_local.json`, say,
-keeps that file and renews the page.
+holds each against its file. The command beside a page measures anew; where a page has
+rows of several captures or presets, the same command was run for each, as its rows say.
+What it writes is named by its `--out`, a file or a folder with one; `python -m
+experiments.results kan_local --measured kan_local.json`, say, keeps that file and
+renews the page.
 
 {pages}
 
@@ -232,7 +234,11 @@ def keep(name: str, measured: pathlib.Path) -> None:
 
     ValueError where no page can be written from the file.
     """
-    stored = json.loads(measured.read_text())
+    try:
+        stored = json.loads(measured.read_text())
+    except json.JSONDecodeError as error:
+        raise ValueError(f"--measured {measured}: not JSON ({error})") from None
+    _check_of(name, stored, measured)
     try:
         _page_of(name, stored)
     except (KeyError, TypeError, AttributeError) as error:
@@ -243,6 +249,23 @@ def keep(name: str, measured: pathlib.Path) -> None:
     picture = measured.with_suffix(".png")
     if picture.exists():
         shutil.copyfile(picture, PAGES / f"{name}.png")
+
+
+def _check_of(name, stored, measured):
+    """ValueError where a file holds nothing, or what another page's command wrote."""
+    if not isinstance(stored, dict) or [] in stored.values():
+        raise ValueError(f"--measured {measured}: holds no rows; measure again")
+    words = STUDIES[name].command.split()
+    about = stored.get("about", {})
+    told = stored | about | about.get("settings", {})
+    for option in ("suite", "scene", "fit"):
+        if f"--{option}" in words and option in told:
+            wanted = words[words.index(f"--{option}") + 1]
+            if told[option] != wanted:
+                raise ValueError(
+                    f"--measured {measured}: of {option} {told[option]}, and the page "
+                    f"{name} is of {wanted}"
+                )
 
 
 def page(name: str) -> str:

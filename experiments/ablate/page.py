@@ -28,10 +28,21 @@ def page(stored) -> str:
     ]
     if still is not None:
         parts.append(f"Points that do not move have an EPE of {still:.4f} scene units.")
+        rest = [arm for arm, row in means.items() if _is(still, row.get("track_error"))]
+        if rest:
+            names = ", ".join(f"`{arm}`" for arm in rest)
+            parts.append(
+                f"That of {names} is the same: nothing there has left its place, and a "
+                "verdict on it is one on a scene at rest."
+            )
     if about["claims"]:
         parts += ["## What it says of the claims", _claims(about["claims"])]
     context = suites.named(about["settings"]["suite"]).context
     return "\n\n".join([*parts, context] if context else parts)
+
+
+def _is(still, error):
+    return error is not None and abs(error - still) < 1e-6
 
 
 def _trained(about):

@@ -58,9 +58,9 @@ background points ({background:.2f} with a warp, {warp:.2f} without them) and th
 depth loss ({depth:.2f}). A warp makes a step of a field {warp:.2f} times as long, the
 elastic penalty on 4 of its samples {elastic:.2f} times. Motion takes a step of splats
 to {mlp:.2f} (MLP), {kan:.2f} (KAN) or {basis:.2f} (basis) of a still one, the
-acceleration penalty to {acceleration:.2f}. NSFF is the dearest by far ({flow:.2f}):
-it traces each ray at its neighbours' times, too. Annealing, alternation and
-motion-guided growth cost a step nothing that can be measured: they change what is
+acceleration penalty to {acceleration:.2f}. NSFF is the dearest of fields
+({flow:.2f}): it traces each ray at its neighbours' times, too. Annealing, alternation
+and motion-guided growth cost a step nothing that can be measured: they change what is
 learnt and when."""
 QUOTED = {
     "appearance": "nerf-w-small.only_appearance",

@@ -53,8 +53,11 @@ class Settings:
     out: pathlib.Path | None = None  # JSON of all cases
 
     def __post_init__(self):
+        cli.check_out_file(self.out)
         for case in self.cases:
             parsed(case)
+        if self.repeats < 1:
+            raise ValueError(f"--repeats {self.repeats}: time at least once")
 
 
 def parsed(case: str) -> tuple[int, int, int]:
@@ -291,7 +294,10 @@ def core_times(settings: Settings, cores: int) -> dict[str, dict]:
 
 @cli.command(Settings)
 def main(settings):
-    """Run the job of the command line."""
+    """Run the job of the command line; exit code 2 where its input is wrong."""
+    with cli.user_errors():
+        if settings.yardstick is not None and not settings.yardstick.is_file():
+            raise ValueError(f"--yardstick {settings.yardstick}: no such file")
     os.environ.setdefault("PJRT_NPROC", "1")
     os.environ.setdefault("NPROC", "1")
     jax.config.update("jax_numpy_dtype_promotion", "standard")

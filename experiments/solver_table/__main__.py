@@ -18,7 +18,6 @@ only the seconds see.
 
 import dataclasses
 import functools
-import json
 import pathlib
 from typing import Literal, NamedTuple
 
@@ -27,6 +26,7 @@ import numpy as np
 
 from experiments import cli, markdown
 from experiments.solver_table.problems import LEVENBERG, PROBLEMS, Problem
+from nerfies_jax.capture.json_files import write_json
 from nerfies_jax.measure import clock
 from nerfies_jax.training.fit import CODE_SOLVERS
 
@@ -48,16 +48,19 @@ class Settings:
     out: pathlib.Path | None = None  # JSON
 
     def __post_init__(self):
+        cli.check_out_file(self.out)
         known = (*CODE_SOLVERS, *((LEVENBERG,) if self.fit == "poses" else ()))
         chosen = known if self.solvers is None else self.solvers
         if not chosen or not set(chosen) <= set(known):
             raise ValueError(f"solvers={self.solvers} must be among {known}")
-        least = min((*self.steps, self.frames, self.repeats, self.pixels))
-        if not self.steps or least < 1 or self.pictures < 2:
-            raise ValueError(
-                "a table needs steps, frames, repeats and pixels of at least 1 and at "
-                f"least 2 pictures; got {self}"
-            )
+        if not self.steps or min(self.steps) < 1:
+            raise ValueError(f"--steps {self.steps}: numbers of at least 1")
+        least = {"frames": 1, "repeats": 1, "pixels": 1, "pictures": 2}
+        for name, bound in least.items():
+            if getattr(self, name) < bound:
+                raise ValueError(
+                    f"--{name} {getattr(self, name)} must be at least {bound}"
+                )
 
 
 class SolverResult(NamedTuple):
@@ -163,7 +166,7 @@ def main(settings):
     record = {"about": about, "machine": clock.machine()}
     record["rows"] = [row._asdict() for row in rows]
     if settings.out:
-        settings.out.write_text(json.dumps(record, indent=1) + "\n")
+        write_json(settings.out, record)
     return record
 
 

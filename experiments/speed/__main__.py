@@ -24,6 +24,7 @@ import time
 
 from experiments import cli
 from experiments.speed import job
+from nerfies_jax.capture.nearest import known_names
 from nerfies_jax.runs import representations
 
 STORED = "speed.json"
@@ -47,7 +48,10 @@ class Speed:
     def __post_init__(self):
         for name in self.presets:
             if name not in representations.PRESETS:
-                raise ValueError(f"--presets {name}: no such preset")
+                raise ValueError(
+                    f"--presets {name}: no such preset; "
+                    + known_names(name, representations.PRESETS)
+                )
 
 
 @cli.command(Speed)

@@ -15,7 +15,9 @@ is the training program alone, from an empty cache; *frame* one picture on one c
 
 
 PARTS = """\
-Milliseconds on one core, each part by itself on the first state. They may be more than
+Milliseconds on one core, each part by itself on the first state, in which a motion that
+warms up (`splats-deformable-small`, `sonata-small`, `moba-small`) is not asked yet: it
+is in the step above, and in [effect_cost.md](effect_cost.md). Parts may be more than
 the step: of fields they were taken of all its rays at once."""
 
 

@@ -79,7 +79,7 @@ def recognise(path: AnyPath) -> Format:
     """The format of the capture at `path`; an error that lists what was looked for."""
     path = pathlib.Path(path)
     if not path.exists():
-        raise CaptureError(f"{path}: no such folder; check the path")
+        raise CaptureError(f"{path}: no such file or folder; check the path")
     if path.is_file() and path.suffix != ".json":
         verb = "npz" if path.suffix == ".npz" else "video"
         raise CaptureError(

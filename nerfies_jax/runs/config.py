@@ -1,6 +1,7 @@
 """What a user asks for: which pictures, which scene, over how many steps; no JAX."""
 
 import dataclasses
+import math
 import pathlib
 from typing import Literal
 
@@ -93,6 +94,10 @@ class Preparation:
                 f"frames={self.frames} and fps={self.fps}: give the frames of a film "
                 "or so many a second, not both"
             )
+        if self.frames is not None and self.frames < 2:
+            raise ValueError(f"frames={self.frames}: keep at least 2")
+        if self.fps is not None and not 0 < self.fps < math.inf:
+            raise ValueError(f"fps={self.fps}: a positive number of frames a second")
         if self.max_side < 16:
             raise ValueError(f"max_side={self.max_side}: expected at least 16 pixels")
         if self.threads is not None and self.threads < 1:

@@ -179,14 +179,21 @@ def test_a_run_is_rendered_at_other_times_and_places(run, tmp_path):
     path.write_text(json.dumps(table))
     arguments = [str(run), "--path", str(path), "--freeze", "0.5"]
     formats = ["--formats", "png", "mp4", "exr", "--max-side", "32"]
-    render.main([*arguments, *formats, "--out", str(tmp_path)])
-    assert sorted(path.name for path in tmp_path.glob("*.png")) == [
+    out = tmp_path / "pictures"
+    out.mkdir()
+    mine = out / "0000.png"
+    mine.write_text("not a render's")
+    with pytest.raises(SystemExit, match="2"):
+        render.main([*arguments, *formats, "--out", str(out)])
+    assert mine.read_text() == "not a render's"
+    render.main([*arguments, *formats, "--out", str(out), "--overwrite"])
+    assert sorted(path.name for path in out.glob("*.png")) == [
         f"{number:04d}.png" for number in range(3)
     ]
-    picture, _ = images.read_image(tmp_path / "0000.png")
+    picture, _ = images.read_image(out / "0000.png")
     assert picture.shape == (16, 32, 3)
-    assert len(list(video.read_video(tmp_path / "film.mp4"))) == 3
-    assert exr.read_exr(tmp_path / "0001.exr").depth.shape == (16, 32)
+    assert len(list(video.read_video(out / "film.mp4"))) == 3
+    assert exr.read_exr(out / "0001.exr").depth.shape == (16, 32)
 
 
 @pytest.mark.slow

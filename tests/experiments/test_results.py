@@ -43,3 +43,32 @@ def test_new_numbers_are_kept_only_where_they_make_a_page(
     assert stop.value.code == 2
     assert "not what python -m experiments.kan_local" in capsys.readouterr().err
     assert json.loads((tmp_path / "kept.json").read_text())["rows"] == [row]
+
+
+@pytest.mark.parametrize(
+    ("page", "text", "words"),
+    [
+        ("kan_local", "words", "not JSON"),
+        ("kan_local", '{"machine": {}, "rows": []}', "holds no rows"),
+        ("transient_medium", '{"scene": "exposure"}', "of scene exposure, and the"),
+        (
+            "ablate_moba",
+            '{"about": {"settings": {"suite": "sonata"}}}',
+            "the page ablate_moba is of moba",
+        ),
+        ("solver_table_poses", '{"about": {"fit": "codes"}}', "of fit codes"),
+    ],
+)
+def test_numbers_of_another_page_are_refused(
+    page, text, words, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(results, "ROOT", tmp_path)
+    new = tmp_path / "new.json"
+    new.write_text(text)
+    with pytest.raises(SystemExit) as stop:
+        results.main([page, "--measured", str(new)])
+    assert stop.value.code == 2
+    error = capsys.readouterr().err
+    assert words in error
+    assert "new.json" in error
+    assert list(tmp_path.iterdir()) == [new]
