@@ -20,6 +20,7 @@ stay in.
 from experiments import cli
 from experiments.league import rows
 from experiments.league.settings import League
+from nerfies_jax.capture import formats
 from nerfies_jax.runs import platform
 
 
@@ -28,6 +29,8 @@ def main(args):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
         arms = rows.of_presets(args.presets)
+        for folder in args.captures:
+            formats.recognise(folder)
         platform.start_jax(args.device)
         from experiments import results
         from experiments.league import contests

@@ -74,6 +74,7 @@ TABLE = [
     ("kan_local", "--nearest 0", "--nearest"),
     ("kan_local", "--points 0", "--points"),
     ("kan_local", "--out OUT/x.json", "no folder OUT"),
+    ("league", "nowhere --out OUT", "nowhere: no such file or folder"),
     ("make_scene", "OUT --frames 1", "frames=1 must be at least 2"),
     ("make_scene", "OUT --set colour=red", "no field 'colour'"),
     ("motion_rank", "--kinds square", "--kinds square"),
