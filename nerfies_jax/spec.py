@@ -1,6 +1,7 @@
 """Which radiance field, and how it is trained: settings only."""
 
 import dataclasses
+import math
 
 from nerfies_jax.effects import (
     ambient,
@@ -79,6 +80,7 @@ class RadianceScene:
     sampling: SamplingSpec = SamplingSpec()
     rays: int = 1024  # in a step
     # In so many equal parts, on as many devices or one after the other: less memory.
+    # A part's losses are means over its own valid rays.
     micro_batches: int = 1
     # Longest half-side of the filmed volume in units of the field; None keeps the
     # capture's own coordinates.
@@ -113,6 +115,10 @@ class RadianceScene:
                 f"rays={self.rays} cannot be split into micro_batches="
                 f"{self.micro_batches} equal parts; choose a multiple, or "
                 "micro_batches=1"
+            )
+        if not 0 <= self.density_noise < math.inf:
+            raise ValueError(
+                f"density_noise={self.density_noise} must be finite and not negative"
             )
         for name in ("template_rate", "table_rate"):
             if not getattr(self, name) > 0:

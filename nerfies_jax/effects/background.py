@@ -19,6 +19,8 @@ from nerfies_jax.training.effects import Effect, PenaltyContext, Term
 class BackgroundSpec:
     """How many points a step looks at, how they are jittered, and what moving costs.
 
+    Each of a step's micro-batches draws so many.
+
     `noise` (standard deviation) and `width` are in units of the field, whose box is the
     filmed volume: the official code's scenes are scaled to fill one of diagonal one.
     `width` is the displacement at which ρ leaves the parabola. The official scaling is

@@ -63,7 +63,8 @@ class FitResult(NamedTuple):
     @property
     def training_share(self) -> float:
         """Of the time of training and compiling: the processor tells only both."""
-        return self.seconds / (self.seconds + self.compile_seconds)
+        both = self.seconds + self.compile_seconds
+        return self.seconds / both if both else 0.0
 
     @property
     def compile_seconds(self) -> float:

@@ -54,6 +54,8 @@ def sample_pdf(edges, weights, count):
         (lambda: TemplateSpec(colour_width=0), "colour_width=0"),
         (lambda: TemplateSpec(depth=0, skips=()), "depth=0"),
         (lambda: SamplingSpec(coarse=1), "coarse=1"),
+        (lambda: RadianceScene(steps=1, density_noise=-1.0), "density_noise=-1.0"),
+        (lambda: RadianceScene(steps=1, density_noise=np.nan), "density_noise=nan"),
         (lambda: SamplingSpec(spacing="log"), "spacing='log'"),
         (lambda: stratified(1), "count=1"),
         (lambda: stratified(4, "log"), "'log'"),
