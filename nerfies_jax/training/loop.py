@@ -245,7 +245,9 @@ class _Run:
                 self._call(hook)
         if self.checkpoints is not None:
             self._tell_failed_save(self.checkpoints.failure())
-            if time.monotonic() - self.saved_at >= self.limits[1]:
+            # After the last step `finish` saves, with what its hooks return.
+            overdue = time.monotonic() - self.saved_at >= self.limits[1]
+            if overdue and self.step < self.steps:
                 self._save()
         if self.progress.due():
             row = self.history.rows[-1]
@@ -275,8 +277,13 @@ class _Run:
                 "seconds": self.history.seconds,
             }
             row |= {name: float(value) for name, value in numbers.items()}
-            rows = (*self.history.evaluations, row)
-            self.history = self.history._replace(evaluations=rows)
+            # One row for a step: a complete run that is resumed calls its hooks again.
+            earlier = (
+                old
+                for old in self.history.evaluations
+                if (old["hook"], old["step"]) != (hook.name, self.step)
+            )
+            self.history = self.history._replace(evaluations=(*earlier, row))
 
     def _tell_failed_save(self, failure) -> None:
         if failure is not None:

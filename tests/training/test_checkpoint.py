@@ -89,6 +89,28 @@ def test_a_resumed_run_is_the_straight_run_bit_for_bit(cut, tmp_path, straight):
     assert second.history.rows[0]["step"] == 1
 
 
+@pytest.mark.parametrize("checkpoint_seconds", [0.0, 60.0])
+def test_a_complete_run_keeps_one_last_evaluation(checkpoint_seconds, tmp_path):
+    """Whenever it saves, and though it is resumed for its products."""
+    hooks = [loop.Hook("score", lambda state, step: {"psnr": step}, every_steps=6)]
+    state, history, after = None, loop.History(), None
+    for _ in range(2):
+        result = fit(
+            state,
+            tmp_path,
+            10,
+            after,
+            hooks=hooks,
+            history=history,
+            checkpoint_seconds=checkpoint_seconds,
+        )
+        assert [row["step"] for row in result.history.evaluations] == [6, 10]
+        kept = checkpoint.restore(tmp_path, start(), SPEC)
+        assert [row["step"] for row in kept.record["evaluations"]] == [6, 10]
+        state, after, history = kept.state, kept.step, loop.History(**kept.record)
+    assert fit(start(), tmp_path / "none", 0).training_share == 0
+
+
 def test_only_the_newest_checkpoints_stay(tmp_path):
     state = start()
     save(tmp_path, *((state, step) for step in (1, 5, 9, 12)), keep=2)
