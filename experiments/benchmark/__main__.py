@@ -20,7 +20,6 @@ import re
 
 from experiments import cli
 from experiments.benchmark import job
-from nerfies_jax.capture import formats
 from nerfies_jax.runs.config import RunConfig
 
 STORED = "benchmark.json"
@@ -56,6 +55,8 @@ class Benchmark:
 def main(args):
     """Run all seeds and keep what they scored; exit code 2 where input is wrong."""
     with cli.user_errors():
+        from nerfies_jax.capture import formats
+
         if args.source.capture is not None:
             formats.recognise(args.source.capture)
         args.out.mkdir(parents=True, exist_ok=True)

@@ -20,7 +20,6 @@ stay in.
 from experiments import cli
 from experiments.league import rows
 from experiments.league.settings import League
-from nerfies_jax.capture import formats
 from nerfies_jax.runs import platform
 
 
@@ -29,9 +28,11 @@ def main(args):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
         arms = rows.of_presets(args.presets)
+        platform.start_jax(args.device)
+        from nerfies_jax.capture import formats
+
         for folder in args.captures:
             formats.recognise(folder)
-        platform.start_jax(args.device)
         from experiments import results
         from experiments.league import contests
 
