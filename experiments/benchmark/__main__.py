@@ -55,10 +55,9 @@ class Benchmark:
 def main(args):
     """Run all seeds and keep what they scored; exit code 2 where input is wrong."""
     with cli.user_errors():
-        from nerfies_jax.capture import formats
-
-        if args.source.capture is not None:
-            formats.recognise(args.source.capture)
+        filmed = args.source.capture
+        if filmed is not None and not filmed.exists():
+            raise ValueError(f"{filmed}: no such file or folder; check the path")
         args.out.mkdir(parents=True, exist_ok=True)
         label = _label(args)
         configs = {seed: _config(args, seed) for seed in range(args.seeds)}
