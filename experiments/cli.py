@@ -11,7 +11,7 @@ import json
 import os
 import pathlib
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Annotated, Any, Literal, NamedTuple
 
 import tyro
@@ -19,6 +19,7 @@ import tyro
 from experiments import options
 from nerfies_jax.capture.extras import MissingExtra
 from nerfies_jax.capture.given import GivenFiles
+from nerfies_jax.capture.nearest import known_names
 from nerfies_jax.runs.config import CaptureSource, MoreMetrics
 from nerfies_jax.runs.representations import PRESETS
 
@@ -82,6 +83,15 @@ def check_out_file(path: pathlib.Path | None) -> None:
         raise ValueError(f"--out {path}: a folder; name a file, as {path / 'x.json'}")
     if not path.absolute().parent.is_dir():
         raise ValueError(f"--out {path}: no folder {path.parent}; make it first")
+
+
+def check_presets(names: Iterable[str]) -> None:
+    """ValueError that names the presets there are, where --presets names another."""
+    for name in names:
+        if name not in PRESETS:
+            raise ValueError(
+                f"--presets {name}: no such preset; {known_names(name, PRESETS)}"
+            )
 
 
 class Ended(NamedTuple):

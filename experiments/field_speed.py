@@ -29,7 +29,6 @@ import time
 
 from experiments import cli, markdown
 from experiments.ablate.arms import FROM_TRACKS
-from nerfies_jax.capture.nearest import known_names
 from nerfies_jax.runs import platform, representations
 
 TRACKS = "+tracks"
@@ -62,12 +61,7 @@ class FieldSpeed:
 
     def __post_init__(self):
         cli.check_out_file(self.out)
-        for name in self.presets:
-            if name.removesuffix(TRACKS) not in representations.PRESETS:
-                raise ValueError(
-                    f"--presets {name}: no such preset; "
-                    + known_names(name, representations.PRESETS)
-                )
+        cli.check_presets(name.removesuffix(TRACKS) for name in self.presets)
         rising = list(self.seconds) == sorted(set(self.seconds))
         if not self.seconds or not rising or self.seconds[0] <= 0:
             raise ValueError("--seconds: positive and rising, as 60 120 300")

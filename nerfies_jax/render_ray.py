@@ -1,6 +1,7 @@
 """One ray through a radiance field: sample, warp, ask the template, composite."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -314,10 +315,15 @@ def _composite(bound, ray, samples, radiance, media):
     )
 
 
-def _uncertainty(bound, media, media_weight):
-    """Of the ray's colour, from the one medium that says it; None if none does."""
-    beta, said_by = None, None
-    for effect in bound.effects:
+def says_beta(
+    effects: tuple[Effect, ...], media: Mapping[str, Medium]
+) -> Effect | None:
+    """The one effect whose medium says how uncertain a ray's colour is, if any does.
+
+    ValueError where two say it, or one that has no `beta_min`.
+    """
+    said_by = None
+    for effect in effects:
         medium = media.get(effect.name)
         if medium is None or medium.beta is None:
             continue
@@ -329,10 +335,17 @@ def _uncertainty(bound, media, media_weight):
             )
         if said_by is not None:
             raise ValueError(
-                f"both {said_by!r} and {effect.name!r} say how uncertain a ray's "
+                f"both {said_by.name!r} and {effect.name!r} say how uncertain a ray's "
                 "colour is; leave the beta of one medium None"
             )
-        weight = media_weight[effect.name]
-        beta = transient.uncertainty(effect.beta_min, weight, medium.beta)
-        said_by = effect.name
-    return beta
+        said_by = effect
+    return said_by
+
+
+def _uncertainty(bound, media, media_weight):
+    """Of the ray's colour; None where no medium says it."""
+    effect = says_beta(bound.effects, media)
+    if effect is None:
+        return None
+    weight, beta = media_weight[effect.name], media[effect.name].beta
+    return transient.uncertainty(effect.beta_min, weight, beta)

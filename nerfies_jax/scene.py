@@ -15,6 +15,7 @@ from nerfies_jax import (
     field_ray,
     occupied_rays,
     path_fit,
+    render_ray,
     scene_metadata,
 )
 from nerfies_jax.capture.capture import Capture, training_bytes
@@ -317,14 +318,10 @@ def _colour_terms(
     mse = losses.mse(last.colour, batch.colour, batch.valid)
     terms = {"fine": Term(mse, 1.0)}
     coarse_weight = 1.0
-    if last.beta is not None:
-        (power,) = (
-            effect.beta_power
-            for effect in effects
-            if effect.name in last.media and last.media[effect.name].beta is not None
-        )
+    uncertain = render_ray.says_beta(effects, last.media)
+    if uncertain is not None:
         likelihood = transient.photometric(
-            last.colour, batch.colour, last.beta, batch.valid, power
+            last.colour, batch.colour, last.beta, batch.valid, uncertain.beta_power
         )
         terms = {"fine": Term(mse, None), "colour": Term(likelihood, 1.0)}
         coarse_weight = 1.5  # as in NeRF-W: half of the sum over channels

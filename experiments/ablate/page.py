@@ -28,7 +28,9 @@ def page(stored) -> str:
     ]
     if still is not None:
         parts.append(f"Points that do not move have an EPE of {still:.4f} scene units.")
-        rest = [arm for arm, row in means.items() if _is(still, row.get("track_error"))]
+        rest = [
+            arm for arm, row in means.items() if _same(row.get("track_error"), still)
+        ]
         if rest:
             names = ", ".join(f"`{arm}`" for arm in rest)
             parts.append(
@@ -41,7 +43,7 @@ def page(stored) -> str:
     return "\n\n".join([*parts, context] if context else parts)
 
 
-def _is(still, error):
+def _same(error, still):
     return error is not None and abs(error - still) < 1e-6
 
 

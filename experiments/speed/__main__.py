@@ -24,7 +24,6 @@ import time
 
 from experiments import cli
 from experiments.speed import job
-from nerfies_jax.capture.nearest import known_names
 from nerfies_jax.runs import representations
 
 STORED = "speed.json"
@@ -46,12 +45,7 @@ class Speed:
     """Folder for speed.json."""
 
     def __post_init__(self):
-        for name in self.presets:
-            if name not in representations.PRESETS:
-                raise ValueError(
-                    f"--presets {name}: no such preset; "
-                    + known_names(name, representations.PRESETS)
-                )
+        cli.check_presets(self.presets)
 
 
 @cli.command(Speed)

@@ -20,6 +20,7 @@ from nerfies_jax.capture.capture import (
 )
 from nerfies_jax.capture.json_files import AnyPath, new_folder, write_json
 from nerfies_jax.capture.nerfies_views import camera_entry, only, read_cameras
+from nerfies_jax.capture.transforms_writer import check_names
 from nerfies_jax.geometry import camera
 
 MAX_POINTS = 50_000_000
@@ -120,18 +121,7 @@ def write(capture: Capture, path: AnyPath, factors: tuple[int, ...] = (1,)):
     is read again, frames in neither split are missing, and where none was held out
     every eighth is.
     """
-    for name in capture.ids:
-        if (
-            not name
-            or name in (".", "..")
-            or "/" in name
-            or "\\" in name
-            or "\0" in name
-        ):
-            raise CaptureError(
-                f"{path}: frame {name!r} cannot be a file name; rename it without "
-                "slashes"
-            )
+    check_names(capture, path)
     with new_folder(path) as folder:
         _write_tables(capture, folder)
         (folder / "camera").mkdir()
