@@ -192,8 +192,8 @@ def add(
 def _opacities(rows):
     """Of each row: whether it is there, whether it is finite, its opacity."""
     whole, opacity, _ = densification.row_summary(rows)
-    active = splats.active_mask(rows) | jnp.isnan(rows.opacity_logit)
-    return np.asarray(active), np.asarray(whole), np.asarray(opacity, np.float64)
+    active = np.asarray(splats.active_mask(rows))
+    return active, np.asarray(whole), np.asarray(opacity, np.float64)
 
 
 def _draw(key, opacity, seen, count):

@@ -150,16 +150,17 @@ def annealed(rate: Schedule, spec: AnnealingSpec, steps: int) -> Schedule:
     """`rate` up to `spec.after`, decaying from its value there, at last zero.
 
     Equation 8 with eta_anneal(i) = eta_main(a) exp(-decay (i - a) / (steps - a)), where
-    a = `spec.after`: continuous at a. The last `freeze_share` of the steps get 0.
+    a = `spec.after`: continuous at a. The last `freeze_share` of the steps get 0. In a
+    run of few steps nothing may lie between the two.
     """
     frozen = steps - round(spec.freeze_share * steps)
-    if not spec.after < frozen:
+    if spec.after > frozen:
         raise ValueError(
             f"annealing from step {spec.after} on comes too late: of {steps} steps "
             f"those from {frozen} on are frozen; begin earlier (3/4 of the run is "
             f"{3 * steps // 4}) or lower freeze_share={spec.freeze_share}"
         )
-    length = steps - spec.after
+    length = max(steps - spec.after, 1)
 
     def schedule(step):
         step = jnp.asarray(step, jnp.int32)

@@ -104,17 +104,16 @@ def turned(
 
 
 def active_mask(splats: Splats) -> Bool[Array, " gaussians"]:
-    """Which rows stand for a Gaussian; the others only fill the capacity."""
-    return splats.opacity_logit > INACTIVE_LOGIT / 2
+    """Which rows stand for a Gaussian; the others only fill the capacity.
+
+    A logit that is not a number marks no row as inactive.
+    """
+    return ~(splats.opacity_logit <= INACTIVE_LOGIT / 2)
 
 
 def rows_to_write(splats: Splats, path: pathlib.Path) -> np.ndarray:
-    """[gaussians] bool: what of them a file holds; ValueError where that is none.
-
-    NaN compares false, but marks no row as inactive: it counts, and the writer refuses
-    it.
-    """
-    active = np.asarray(active_mask(splats)) | np.isnan(splats.opacity_logit)
+    """[gaussians] bool: what of them a file holds; ValueError where that is none."""
+    active = np.asarray(active_mask(splats))
     if not active.any():
         raise ValueError(
             f"{path}: none of the {len(active)} rows is active; not written"

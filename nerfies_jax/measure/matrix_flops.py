@@ -26,10 +26,11 @@ def count(function: Callable, *args: Any) -> Counted:
     as in `lax.map` over blocks of Gaussians. Of the branches of a condition the dearest
     counts, and what nothing reads does not.
     """
-    return _of_jaxpr(jax.make_jaxpr(function)(*args).jaxpr)
+    return of_jaxpr(jax.make_jaxpr(function)(*args).jaxpr)
 
 
-def _of_jaxpr(jaxpr) -> Counted:
+def of_jaxpr(jaxpr: core.Jaxpr) -> Counted:
+    """The same of a function that was traced before."""
     flops, at_least = 0.0, False
     read = _variables(jaxpr.outvars)
     for equation in reversed(jaxpr.eqns):
@@ -37,7 +38,7 @@ def _of_jaxpr(jaxpr) -> Counted:
             continue
         read |= _variables(equation.invars)
         name = equation.primitive.name
-        counts = [_of_jaxpr(inner) for inner in _inner(equation.params)]
+        counts = [of_jaxpr(inner) for inner in _inner(equation.params)]
         inner = sum(one.flops for one in counts)
         if name == "dot_general":
             inner = _product(equation)

@@ -12,6 +12,7 @@ from jax import lax
 from jaxtyping import Array
 
 from nerfies_jax import data_parallel
+from nerfies_jax.measure import matrix_flops
 from nerfies_jax.training import background
 from nerfies_jax.training.model import Frames, Model, PyTree, TrainState
 
@@ -120,19 +121,32 @@ class Program:
         # Traced once for both lengths, which takes most of the time to lower.
         self._step, self._devices = jax.jit(step, inline=True), devices
         self._shapes = jax.tree.map(_abstract, (self._on_all(state), frames))
-        self._lowered, self._programs = {}, {}
+        self._traced, self._lowered, self._programs = {}, {}, {}
         self.length = 1
-        if steps >= FEW_STEPS:
-            counted = self._lower(LENGTH).cost_analysis() or {}
-            if counted.get("flops", 0.0) < LARGE_FLOPS:
-                self.length = LENGTH
+        if steps >= FEW_STEPS and self._flops() < LARGE_FLOPS:
+            self.length = LENGTH
         self._lower(self.length)
+
+    def _flops(self):
+        """Of a step: what XLA counts, where the loops' bodies count once, or products.
+
+        Of a step in micro-batches, or in slabs of pixels, each has a part.
+        """
+        traced = self._trace(LENGTH)
+        products = matrix_flops.of_jaxpr(traced.jaxpr.jaxpr).flops / LENGTH
+        counted = self._lower(LENGTH).cost_analysis() or {}
+        return max(products, counted.get("flops", 0.0))
+
+    def _trace(self, length):
+        if length not in self._traced:
+            scan = functools.partial(_run_scan, self._step, length)
+            scan = jax.jit(scan, donate_argnums=0)
+            self._traced[length] = scan.trace(*self._shapes)
+        return self._traced[length]
 
     def _lower(self, length):
         if length not in self._lowered:
-            scan = functools.partial(_run_scan, self._step, length)
-            scan = jax.jit(scan, donate_argnums=0)
-            self._lowered[length] = scan.lower(*self._shapes)
+            self._lowered[length] = self._trace(length).lower()
         return self._lowered[length]
 
     def _on_all(self, state):

@@ -11,7 +11,7 @@ from gaussians_jax import learning_rates, phases
 from gaussians_jax.learning_rates import LearningRateSpec
 from gaussians_jax.phases import AnnealingSpec
 from gaussians_jax.splats import Params, Splats
-from nerfies_jax.training import schedules
+from nerfies_jax.training import schedules, step_counts
 from nerfies_jax.training.updates import apply_updates
 from tests.gaussians.shared import jitted, put
 
@@ -70,6 +70,14 @@ def test_annealing_counts_steps_beyond_the_integers_of_float32(dtype):
         -math.expm1(-5 * 200_000 / (steps - after)),
         rtol={"float32": 2e-6, "float64": 1e-12}[dtype],
     )
+
+
+@pytest.mark.parametrize("steps", [1, 2, 3])
+def test_a_run_of_a_few_steps_may_have_no_step_to_anneal_in(steps):
+    short = step_counts.stretched(ANNEALING, steps / 1000)
+    schedule = jitted(phases.annealed(MAIN, short, steps))
+    for step in range(steps):  # 5 % of these are none to freeze
+        assert float(schedule(step)) == float(MAIN(step))
 
 
 @pytest.mark.full

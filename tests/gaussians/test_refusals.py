@@ -248,7 +248,7 @@ CALLS = [
     (lambda: moba(motion=SplineMotionSpec()), "alternation=none"),
     (lambda: moba(motion=PolynomialMotionSpec()), "alternation=none"),
     (lambda: phases.annealed(schedules.log_linear(1e-2, 1e-4, 1000),
-                             AnnealingSpec(950), 1000), "3/4 of the run"),
+                             AnnealingSpec(951), 1000), "3/4 of the run"),
     (lambda: moba(motion=PolynomialMotionSpec(warm_up=5), alternation=None),
      "motion.warm_up=5 with motion.fading"),
     (lambda: raster.rasterise(*footprints((5, 0))), "at least one pixel"),

@@ -247,6 +247,18 @@ def test_chunks_of_slow_steps_stay_short_enough_to_interrupt(frames, monkeypatch
     assert len(lengths) < 25
 
 
+@pytest.mark.parametrize(("rounds", "length"), [(2, chunk.LENGTH), (40, 1)])
+def test_large_steps_are_scanned_one_by_one(rounds, length, frames):
+    def step(state, frames):
+        state, metrics = toy.step(state, frames)
+        squares = jnp.full((rounds, 512, 512), metrics["loss"])
+        # 0.27e9 operations a round, which XLA counts once
+        each = jax.lax.map(lambda square: jnp.sum(square @ square), squares)
+        return state, metrics | {"products": jnp.sum(each)}
+
+    assert chunk.Program(step, start(), frames, 100).length == length
+
+
 @pytest.mark.parametrize(
     "number",
     [
