@@ -20,6 +20,7 @@ import re
 
 from experiments import cli
 from experiments.benchmark import job
+from nerfies_jax.runs import representations
 from nerfies_jax.runs.config import RunConfig
 
 STORED = "benchmark.json"
@@ -58,9 +59,19 @@ def main(args):
         filmed = args.source.capture
         if filmed is not None and not filmed.exists():
             raise ValueError(f"{filmed}: no such file or folder; check the path")
+        representations.cores(args.preset, args.set)  # refuses wrong settings
         args.out.mkdir(parents=True, exist_ok=True)
         label = _label(args)
         configs = {seed: _config(args, seed) for seed in range(args.seeds)}
+    from nerfies_jax.runs.reconstruction import Refused
+
+    with cli.user_errors((Refused,)):
+        _run_all(args, label, configs)
+    print(f"kept in {args.out / STORED}")
+    return cli.stored(args.out / STORED)
+
+
+def _run_all(args, label, configs):
     # Not forked: JAX has threads, and each run chooses its platform anew.
     spawned = multiprocessing.get_context("spawn")
     with concurrent.futures.ProcessPoolExecutor(
@@ -76,11 +87,13 @@ def main(args):
             ): seed
             for seed, config in configs.items()
         }
-        for run in concurrent.futures.as_completed(runs):
-            keep(args.out / STORED, label, runs[run], run.result())
-            print(f"{label}, seed {runs[run]}: {_line(run.result())}", flush=True)
-    print(f"kept in {args.out / STORED}")
-    return cli.stored(args.out / STORED)
+        try:
+            for run in concurrent.futures.as_completed(runs):
+                keep(args.out / STORED, label, runs[run], run.result())
+                print(f"{label}, seed {runs[run]}: {_line(run.result())}", flush=True)
+        except BaseException:  # what refuses one seed refuses the others
+            pool.shutdown(cancel_futures=True)
+            raise
 
 
 def keep(path: pathlib.Path, label: str, seed: int, scored: dict) -> None:

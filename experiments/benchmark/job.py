@@ -45,13 +45,14 @@ def score(
 
 def _check_capture(config, folder):
     """Refuse the numbers of another capture whose folder has the same name."""
+    from nerfies_jax.runs.reconstruction import Refused
     from nerfies_jax.runs.run import read_settings
 
     there = read_settings(folder).config.source.capture
     wanted = config.source.capture
     if there == wanted or (there and wanted and run_folder.is_of(there, wanted)):
         return
-    raise ValueError(
+    raise Refused(
         f"{folder}: holds a run of {there}, and {wanted} is asked for; name another "
         "--out"
     )

@@ -1,6 +1,8 @@
 """The benchmark keeps every run under what was run, and shows medians and ends."""
 
+import concurrent.futures
 import json
+import time
 from types import SimpleNamespace
 
 import pytest
@@ -11,6 +13,7 @@ from experiments.benchmark import job, page
 from nerfies_jax import runs
 from nerfies_jax.runs import representations
 from nerfies_jax.runs.config import CaptureSource, RunConfig
+from nerfies_jax.runs.reconstruction import Refused
 from nerfies_jax.training import specs
 
 MACHINE = {"cpu": "one", "backend": "cpu", "jax": "0"}
@@ -89,3 +92,29 @@ def test_a_run_goes_on_where_it_was_cut_and_belongs_to_one_capture(
     assert done == ["begun", "resumed"]
     with pytest.raises(ValueError, match=r"holds a run of .*dog, and .*dog is asked"):
         job.score(config_of("b"), out, None, alone=True)
+
+
+def test_what_refuses_one_seed_ends_all_in_a_line(tmp_path, monkeypatch, capsys):
+    tried = []
+
+    def refused(config, *_, **__):
+        tried.append(config.seed)
+        time.sleep(0.02)
+        raise Refused("no width; move the scene")
+
+    def threads(jobs, *_, **__):
+        return concurrent.futures.ThreadPoolExecutor(jobs)
+
+    monkeypatch.setattr(job, "score", refused)
+    monkeypatch.setattr(concurrent.futures, "ProcessPoolExecutor", threads)
+    words = ["--scene", "static", "--seeds", "99", "--out", str(tmp_path)]
+    for more, message in [
+        ((), "no width"),
+        (("--preset", "nerf-small", "--set", "rays=-1"), "rays=-1"),
+    ]:
+        with pytest.raises(SystemExit) as ended:
+            benchmark.main([*words, *more])
+        assert ended.value.code == 2
+        assert message in capsys.readouterr().err
+    assert len(tried) < 99
+    assert not list(tmp_path.iterdir())
