@@ -76,6 +76,7 @@ def metadata_of(capture: Capture) -> SceneMetadata:
         box=initialisation.filmed_box(capture, span),
         near=NEAREST * span[0],
         depth=2 / (1 / span[0] + 1 / span[1]),
+        times=len(np.unique(capture.times[capture.train])),
     )
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 
+from gaussians_jax import phases
 from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.effects import (
     acceleration,
@@ -158,6 +159,12 @@ class SceneMetadata:
     box: tuple[tuple[float, ...], tuple[float, ...]] | None = None
     near: float = math.inf  # z-depth, scene units: what is farther must be drawn
     depth: float = 1.0  # z-depth halfway in what is filmed, scene units
+    times: int | None = None  # distinct ones of the frames; None: each has its own
+
+    @property
+    def moments(self) -> int:
+        """How many times are learnt from: fewer than frames of several cameras."""
+        return self.frames if self.times is None else self.times
 
 
 def raster_of(spec: SplatScene, metadata: SceneMetadata) -> RasterSpec:
@@ -246,6 +253,30 @@ def refuse_what_cannot_train(spec: SplatScene) -> None:
             f"(up to step {still}), when nothing moves and so nothing would "
             "grow; start it some hundred steps later"
         )
+    if spec.annealing is not None:
+        phases.annealed(lambda step: step, spec.annealing, spec.steps)
+    if isinstance(motion, MotionSpec):
+        mlp_motion.trunk_spec(motion)
+    _refuse_late(spec, still)
+
+
+def _refuse_late(spec, still):
+    """Raise ValueError for what would begin after the last step."""
+    starts = {"motion.warm_up": still}
+    parts = {
+        "motion.rate": getattr(spec.motion, "rate", None),
+        "neighbours": spec.neighbours,
+        "acceleration": spec.acceleration,
+        "flow": None if spec.start.motion == "tracks" else spec.flow,
+    }
+    starts |= {f"{name}.start": x.start for name, x in parts.items() if x is not None}
+    for name, at in starts.items():
+        if at >= max(spec.steps, 2):  # counts stay at least 1, in a run of one step too
+            raise ValueError(
+                f"{name}={at} of {spec.steps} steps: it would never begin; lower it, "
+                "or shorten the run by --steps (presets.with_steps), which shortens "
+                "all schedules with it"
+            )
 
 
 def _embedded(motion):
@@ -261,12 +292,12 @@ def _embedded(motion):
 
 # Of a motion's spec, the steps of training, and the capture.
 MOTIONS = {
-    MotionSpec: lambda spec, steps, seen: mlp_motion.effect(spec, steps, seen.frames),
+    MotionSpec: lambda spec, steps, seen: mlp_motion.effect(spec, steps, seen.moments),
     KanMotionSpec: lambda spec, steps, seen: kan_motion.effect(
-        spec, steps, seen.frames
+        spec, steps, seen.moments
     ),
     BasisMotionSpec: lambda spec, steps, seen: motion_basis.effect(
-        spec, steps, seen.frames
+        spec, steps, seen.moments
     ),
     SE3BasesSpec: lambda spec, steps, seen: se3_bases.effect(spec, steps, seen.extent),
     TimeBasisSpec: lambda spec, steps, seen: time_basis.effect(
@@ -282,13 +313,13 @@ MOTIONS = {
         spec, steps, seen.extent, seen.box
     ),
     EmbeddingMotionSpec: lambda spec, steps, seen: embedding_motion.effect(
-        spec, steps, seen.frames
+        spec, steps, seen.moments
     ),
     NodeMotionSpec: lambda spec, steps, seen: node_motion.effect(
         spec, steps, seen.extent
     ),
     AnchorMotionSpec: lambda spec, steps, seen: anchor_motion.effect(
-        spec, steps, seen.frames
+        spec, steps, seen.moments
     ),
 }
 
@@ -315,7 +346,7 @@ def effects_of(spec: SplatScene, metadata: SceneMetadata) -> tuple[Effect, ...]:
         effects.append(carried.effect(spec.carried, spec.steps, still))
     if spec.acceleration is not None:
         effects.append(
-            acceleration.effect(spec.acceleration, metadata.extent, metadata.frames)
+            acceleration.effect(spec.acceleration, metadata.extent, metadata.moments)
         )
     # A trained scene is drawn without its motion as well.
     if spec.neighbours is not None and motion is not None:

@@ -106,7 +106,8 @@ def field(
     def render_occupied(params, occupied, camera, time, codes, size, step):
         bound, condition = bind(params), FrameCondition(time, codes, step)
         if moves:
-            occupied = skipping.survey(bound, condition)
+            shown = skipping.shown_cells(bound, camera, size)
+            occupied = skipping.survey(bound, condition, shown)
         return skipping.draw(bound, occupied, camera, condition, size)
 
     return Field(

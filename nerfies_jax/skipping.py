@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from nerfies_jax.field_ray import field_ray_through, fine_distances, first_distances
 from nerfies_jax.geometry import rays
 from nerfies_jax.geometry.camera import Camera
+from nerfies_jax.geometry.precision import exact_einsum
 from nerfies_jax.radiance import compositing, occupancy, sampling
 from nerfies_jax.render_ray import (
     Bound,
@@ -65,15 +66,24 @@ def usable(spec, effects) -> bool:
     )
 
 
-def survey(bound: Bound, condition: FrameCondition) -> Occupancy:
+def survey(
+    bound: Bound,
+    condition: FrameCondition,
+    shown: occupancy.Cells | None = None,
+) -> Occupancy:
     """Which cells each level's density fills at the time of one frame; pure.
 
     A cell is filled where a random point in it is so dense that light that went from
     near to far through nothing else would meet an optical depth above `SKIPPED_DEPTH`.
-    What guides samples (`OccupancySpec`) is any level's above `GUIDE_DEPTH`.
+    What guides samples (`OccupancySpec`) is any level's above `GUIDE_DEPTH`. Of cells
+    that are neither `shown` nor beside such a one nothing is asked: they count as
+    filled.
     """
     spec, metadata = bound.spec, bound.metadata
-    cells = MOVING_CELLS if is_moved(bound.effects) else STILL_CELLS
+    cells = cells_across(bound)
+    asked = jnp.ones(cells**3, bool)
+    if shown is not None:
+        asked = occupancy.dilated(shown).ravel()
     span = (metadata.far - metadata.near) * metadata.scale
     names = tuple(bound.params["template"])
     dtype = jax.tree.leaves(bound.params["template"])[0].dtype
@@ -92,7 +102,7 @@ def survey(bound: Bound, condition: FrameCondition) -> Occupancy:
 
         index = jnp.arange(cells**3, dtype=jnp.int32)
         point = occupancy.random_points(key, index, cells, spec.extent, dtype)
-        seen = jax.lax.map(densities, point, batch_size=BATCH)
+        seen = compacted(lambda cell: jax.vmap(densities)(point[cell]), asked)
         filled = {name: new * span > SKIPPED_DEPTH for name, new in seen.items()}
         if guided:
             most = functools.reduce(jnp.maximum, seen.values())
@@ -103,10 +113,51 @@ def survey(bound: Bound, condition: FrameCondition) -> Occupancy:
     kinds = (*names, GUIDE) if guided else names
     start = {name: jnp.zeros(cells**3, bool) for name in kinds}
     found, _ = jax.lax.scan(look, start, jnp.arange(LOOKS, dtype=jnp.int32))
+    whole = (cells,) * 3
     return {
-        name: occupancy.dilated(occupied.reshape((cells,) * 3))
+        name: occupancy.dilated(occupied.reshape(whole)) | ~asked.reshape(whole)
         for name, occupied in found.items()
     }
+
+
+def cells_across(bound: Bound) -> int:
+    """How many cells a survey has along each axis."""
+    return MOVING_CELLS if is_moved(bound.effects) else STILL_CELLS
+
+
+def shown_cells(bound: Bound, camera: Camera, size: tuple[int, int]) -> occupancy.Cells:
+    """The cells that rays of a picture may meet between the near and far planes; pure.
+
+    Left out are those whose eight corners lie beyond one of six planes: these two, and
+    four that have the rays of the picture's border between them.
+    """
+    metadata, dtype = bound.metadata, camera.position.dtype
+
+    def seen(direction):
+        return exact_einsum("ij,...j->...i", camera.camera_from_world, direction)
+
+    centres = rays.pixel_centres(size, dtype)
+    border = jnp.concatenate([centres[0], centres[-1], centres[:, 0], centres[:, -1]])
+    ray = seen(jax.vmap(lambda at: rays.pixel_ray(camera, at).direction)(border))
+    slope = ray[:, :2] / ray[:, 2:]
+    corner = occupancy.corners(cells_across(bound), bound.spec.extent, dtype)
+    world = corner / metadata.scale + jnp.asarray(metadata.centre, dtype)
+    place = seen(world - camera.position)
+    lateral, depth = place[..., :2], place[..., 2:]
+    beyond = jnp.concatenate(
+        [
+            depth < metadata.near,
+            depth > metadata.far,
+            lateral < slope.min(0) * depth,
+            lateral > slope.max(0) * depth,
+        ],
+        axis=-1,
+    )
+    window = (2, 2, 2, 1)
+    all_beyond = jax.lax.reduce_window(
+        beyond, True, jax.lax.bitwise_and, window, (1, 1, 1, 1), "VALID"
+    )
+    return ~jnp.any(all_beyond, axis=-1)
 
 
 def draw(

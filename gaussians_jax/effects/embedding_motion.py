@@ -24,7 +24,13 @@ from gaussians_jax.splats import Gaussians, Params
 from nerfies_jax.nets import codes, mlp
 from nerfies_jax.nets.mlp import MLP, HeadSpec, Layer, MLPSpec
 from nerfies_jax.training import schedules
-from nerfies_jax.training.effects import Effect, FrameCondition, PenaltyContext, Term
+from nerfies_jax.training.effects import (
+    Effect,
+    FrameCondition,
+    PenaltyContext,
+    Term,
+    from_step,
+)
 from nerfies_jax.training.step_counts import steps
 
 NAME = "embedding_motion"
@@ -246,10 +252,10 @@ def effect(spec: EmbeddingMotionSpec, steps: int, frames: int) -> Effect:
         return kan_motion.apply(gaussians, offsets)
 
     def penalty(own: EmbeddingMotion, context: PenaltyContext) -> dict[str, Term]:
-        bend = second_differences(own.times)
+        bend = {"smoothness": Term(second_differences(own.times), spec.smoothness)}
         opacity = mean_opacity(context.params)
         return {
-            "smoothness": Term(bend, spec.smoothness),
+            **from_step(spec.warm_up, context.step, bend),
             "opacity": Term(opacity, spec.opacity),
         }
 

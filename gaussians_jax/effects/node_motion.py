@@ -41,7 +41,13 @@ from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
-from nerfies_jax.training.effects import Effect, FrameCondition, PenaltyContext, Term
+from nerfies_jax.training.effects import (
+    Effect,
+    FrameCondition,
+    PenaltyContext,
+    Term,
+    from_step,
+)
 from nerfies_jax.training.step_counts import steps
 
 NAME = "node_motion"
@@ -339,7 +345,7 @@ def effect(spec: NodeMotionSpec, run_steps: int, extent: float) -> Effect:
         if spec.mask is not None:
             used = jnp.mean(jax.nn.sigmoid(nodes.mask))
             terms["moving"] = Term(used, spec.mask.sparsity)
-        return terms
+        return from_step(spec.warm_up, context.step, terms)
 
     return Effect(
         name=NAME,

@@ -27,7 +27,7 @@ from nerfies_jax.nets import mlp, planes
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
 from nerfies_jax.nets.planes import Level, PlanesSpec
 from nerfies_jax.training import schedules
-from nerfies_jax.training.effects import Effect, FrameCondition, Term
+from nerfies_jax.training.effects import Effect, FrameCondition, Term, from_step
 from nerfies_jax.training.step_counts import steps
 
 NAME = "plane_motion"
@@ -189,7 +189,9 @@ def effect(
         name=NAME,
         init=lambda key: init(key, spec),
         learning_rate=lambda step: Motion(plane_rate(step), rate(step)),
-        penalty=lambda params, context: smoothness(spec, params.planes),
+        penalty=lambda params, context: from_step(
+            spec.warm_up, context.step, smoothness(spec, params.planes)
+        ),
         warm_up=spec.warm_up,
         prepare=prepared,
         deform=moved,

@@ -180,6 +180,8 @@ def fit_to_paths(spec: SE3BasesSpec, paths: Paths) -> Guess:
 
     def penalty(points, _times):
         def bend(table):
+            if table.shape[1] < 3:  # two knots are on a straight line
+                return jnp.zeros((), table.dtype)
             return jnp.mean(jnp.abs(table[:, 2:] - 2 * table[:, 1:-1] + table[:, :-2]))
 
         fine = points.nets.fine

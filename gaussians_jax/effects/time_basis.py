@@ -23,7 +23,13 @@ from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
-from nerfies_jax.training.effects import Effect, FrameCondition, PenaltyContext, Term
+from nerfies_jax.training.effects import (
+    Effect,
+    FrameCondition,
+    PenaltyContext,
+    Term,
+    from_step,
+)
 from nerfies_jax.training.step_counts import steps
 
 NAME = "time_basis"
@@ -163,7 +169,8 @@ def effect(spec: TimeBasisSpec, run_steps: int, extent: float) -> Effect:
     def penalty(_, context: PenaltyContext) -> dict[str, Term]:
         rows = context.params.rows
         value = sparsity(rows[NAME], splats.active_mask(rows["splats"]))
-        return {"sparsity": Term(value, spec.sparsity)}
+        terms = {"sparsity": Term(value, spec.sparsity)}
+        return from_step(spec.warm_up, context.step, terms)
 
     return Effect(
         name=NAME,

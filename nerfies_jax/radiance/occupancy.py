@@ -63,7 +63,19 @@ def random_points(
     """A random point in each of some cells, by their flat index; units of the field."""
     corner = jnp.stack(jnp.unravel_index(index, (cells,) * 3), axis=-1)
     jitter = jax.random.uniform(key, corner.shape, dtype)
-    share = (corner.astype(dtype) + jitter) / cells
+    return _placed((corner.astype(dtype) + jitter) / cells, half_side)
+
+
+def corners(
+    cells: int, half_side: float, dtype: DTypeLike
+) -> Float[Array, "corners corners corners 3"]:
+    """Where the corners of all cells are, units of the field."""
+    share = jnp.arange(cells + 1, dtype=dtype) / cells
+    return _placed(jnp.stack(jnp.meshgrid(*3 * [share], indexing="ij"), -1), half_side)
+
+
+def _placed(share, half_side):
+    """Places in units of the field, by their shares of the cells' width."""
     contracted = REACH * (2 * share - 1)
     size = jnp.max(jnp.abs(contracted), axis=-1, keepdims=True)
     # The inverse of (2 - 1 / |x|) x / |x|; REACH is below 2.

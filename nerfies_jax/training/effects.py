@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from nerfies_jax.geometry.camera import Camera
@@ -279,6 +280,22 @@ def penalty_terms(
         own_terms = effect.penalty(own_params.get(effect.name), own)
         terms |= {f"{effect.name}/{name}": term for name, term in own_terms.items()}
     return terms
+
+
+def from_step(
+    first: int, step: Int[Array, ""] | None, terms: Mapping[str, Term]
+) -> dict[str, Term]:
+    """The same terms, of no weight before step `first`.
+
+    What a motion does not show yet (`Effect.warm_up`) only its penalties would train,
+    in full steps of Adam, to what they like best: no motion at all.
+    """
+    if first == 0:
+        return dict(terms)
+    begun = jnp.where(step < first, 0.0, 1.0)
+    return {
+        name: term._replace(weight=begun * term.weight) for name, term in terms.items()
+    }
 
 
 def weighted_sum(terms: Mapping[str, Term], first: Scalar | int = 0) -> Scalar:

@@ -120,9 +120,8 @@ def test_slopes_are_those_of_differences(name, float64):
     params = params_of(gaussians, "float64", name=name)
     weights = np.random.default_rng(1).normal(size=(ROWS, 7))
     found = effect(name).state(params)
-    context = PenaltyContext(
-        FrameCondition(put(0.3, "float64")), None, jax.random.key(0), None, state=found
-    )
+    seen, begun = FrameCondition(put(0.3, "float64")), jnp.int32(OF[name].warm_up)
+    context = PenaltyContext(seen, begun, jax.random.key(0), None, state=found)
 
     def value(nodes, mean, time):
         rows = params.rows["splats"]._replace(mean=mean)
@@ -135,6 +134,9 @@ def test_slopes_are_those_of_differences(name, float64):
 
     args = params.nets[NAME], gaussians.mean, put(0.47, "float64")
     assert directional_error(value, *args, step=1e-6) < 1e-6
+    # A mask would be closed for good before it shows.
+    early = effect(name).penalty(params.nets[NAME], context._replace(step=begun - 1))
+    assert {float(term.weight) for term in early.values()} == {0.0}
 
 
 def carry(position, log_radius, moves, mean, dtype):

@@ -14,7 +14,7 @@ from gaussians_jax.effects import plane_motion
 from gaussians_jax.effects.plane_motion import PlaneMotionSpec
 from gaussians_jax.splats import Params
 from nerfies_jax.nets.planes import PlanesSpec
-from nerfies_jax.training.effects import FrameCondition
+from nerfies_jax.training.effects import FrameCondition, PenaltyContext
 from tests import scenes
 from tests.gaussians.shared import put, rows_of, some_gaussians
 from tests.gradients import directional_error
@@ -33,6 +33,10 @@ def effect():
     return spec.motion_of(
         scene, spec.SceneMetadata(EXTENT, (0.0, 0.0, 0.0), 9, box=BOX)
     )
+
+
+def penalty(motion, step):
+    return effect().penalty(motion, PenaltyContext(None, jnp.int32(step), None, None))
 
 
 def params_of(gaussians, dtype, size=0.5):
@@ -100,7 +104,7 @@ def test_slopes_are_those_of_differences(float64):
 
 def test_what_is_kept_smooth_is_what_the_weights_say(float64):
     motion = params_of(some_gaussians(ROWS), "float64").nets[NAME]
-    terms = effect().penalty(motion, None)
+    terms = penalty(motion, MOTION.warm_up)
     wanted = {"variation": 2e-4, "bend": 1e-3, "unrest": 1e-4}
     assert {name: term.weight for name, term in terms.items()} == wanted
     for name, levels in (("variation", "space"), ("bend", "time"), ("unrest", "time")):
@@ -109,10 +113,13 @@ def test_what_is_kept_smooth_is_what_the_weights_say(float64):
         rest = motion.planes[0]._replace(
             **{levels: (jnp.ones_like(plane), *getattr(motion.planes[0], levels)[1:])}
         )
-        less = effect().penalty(
-            motion._replace(planes=(rest, *motion.planes[1:])), None
+        less = penalty(
+            motion._replace(planes=(rest, *motion.planes[1:])), MOTION.warm_up
         )
         assert less[name].value < terms[name].value
+    # Before it moves anything, nothing else would train it, to planes that are even.
+    early = penalty(motion, MOTION.warm_up - 1)
+    assert {float(term.weight) for term in early.values()} == {0.0}
 
 
 def test_the_box_holds_what_was_filmed():

@@ -22,7 +22,7 @@ from gaussians_jax import (
 from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.effects import acceleration, kan_motion, motion_growth, spectral
 from gaussians_jax.effects.acceleration import AccelerationSpec
-from gaussians_jax.effects.anchors import AnchorMotionSpec
+from gaussians_jax.effects.anchors import AnchorMotionSpec, RateSpec
 from gaussians_jax.effects.carried import CarriedSpec
 from gaussians_jax.effects.depth import DepthSpec
 from gaussians_jax.effects.embedding_motion import EmbeddingMotionSpec
@@ -213,6 +213,11 @@ def moba(**changes):
     spec.refuse_what_cannot_train(dataclasses.replace(scenes.TINY_MOBA, **changes))
 
 
+def late(**changes):
+    still = dataclasses.replace(scenes.TINY_SPLATS, steps=500, **changes)
+    spec.refuse_what_cannot_train(still)
+
+
 BROKEN = np.where(np.arange(18).reshape(6, 3) == 13, np.nan, 1.0)
 FROM_POINTS = InitSpec(source="points")
 CALLS = [
@@ -246,6 +251,12 @@ CALLS = [
     (lambda: moba(motion=None, motion_growth=None, acceleration=None),
      "alternation without"),
     (lambda: moba(motion=SplineMotionSpec()), "alternation=none"),
+    (lambda: moba(annealing=AnnealingSpec(10**6)), "comes too late"),
+    (lambda: moba(acceleration=AccelerationSpec(start=10**6)), "never begin"),
+    (lambda: late(motion=MotionSpec(warm_up=500)), "motion.warm_up=500 of 500"),
+    (lambda: late(motion=MotionSpec(depth=4, warm_up=0)), "skips="),
+    (lambda: late(motion=AnchorMotionSpec(warm_up=0, rate=RateSpec(start=500))),
+     "motion.rate.start=500"),
     (lambda: moba(motion=PolynomialMotionSpec()), "alternation=none"),
     (lambda: phases.annealed(schedules.log_linear(1e-2, 1e-4, 1000),
                              AnnealingSpec(951), 1000), "3/4 of the run"),

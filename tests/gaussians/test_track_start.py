@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gaussians_jax import path_fit, presets, scene, spec, splats, track_start
-from gaussians_jax.effects import temporal_opacity
+from gaussians_jax.effects import se3_bases, temporal_opacity
 from gaussians_jax.effects.se3_bases import SE3BasesSpec
 from gaussians_jax.initialisation import StartSpec
 from gaussians_jax.path_fit import Depth, Paths, Points
@@ -122,6 +122,14 @@ def test_networks_that_are_fitted_leave_the_wall_where_it_is(name, monkeypatch):
         moved.append(np.median(np.linalg.norm(now - rest.canonical, axis=-1)))
     assert moved[1] < 0.02
     assert moved[1] < 0.5 * moved[0]
+
+
+def test_a_motion_of_two_knots_is_straight_and_costs_nothing():
+    position, time = turning_body()
+    known = np.ones(position.shape[:2], bool)
+    paths = Paths(time, position.astype(np.float32), known, 1.0)
+    guess = se3_bases.fit_to_paths(SE3BasesSpec(bases=2, knots=2), paths)
+    assert guess.penalty(guess.points, None) == 0
 
 
 def test_wrong_paths_bend_nothing():

@@ -13,13 +13,17 @@ from nerfies_jax.effects.ambient import AmbientSpec
 from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.effects.transient import TransientSpec
 from nerfies_jax.effects.warp import WarpSpec
+from nerfies_jax.field_ray import field_ray_through
+from nerfies_jax.geometry import rays
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.grids import HashGridSpec
 from nerfies_jax.radiance import occupancy
 from nerfies_jax.radiance.occupancy import OccupancySpec
 from nerfies_jax.radiance.template import TemplateSpec
+from nerfies_jax.render_ray import Bound
 from nerfies_jax.scene import RadianceScene
 from nerfies_jax.spec import SamplingSpec
+from nerfies_jax.training.effects import FrameCondition
 from tests import scenes
 
 SIZE = (23, 17)
@@ -169,6 +173,40 @@ def test_a_survey_finds_a_small_thing_whichever_cell_it_is_in():
             np.testing.assert_array_equal(around.ravel(), near.max(axis=0) <= 1)
     far = jnp.asarray([[0.61, 0.0, 0.0], [0.0, -9.0, 0.1]])
     assert occupancy.at(jnp.zeros((cells,) * 3, bool), far, 0.3).all()
+
+
+@pytest.mark.parametrize("bend", [0.0, -0.2])
+def test_a_survey_of_what_is_shown_is_that_of_everything_there(bend):
+    capture = scenes.tiny_capture()
+    model, params = full_of_holes(MOVING, ORANGE)
+    spec, metadata = model.spec[:2]
+    field = scene.field(spec, metadata)
+    camera = jax.tree.map(lambda x: x[2], capture.cameras)
+    camera = jax.device_put(camera._replace(radial=np.float32([bend, 0, 0])))
+    bound = Bound(spec, metadata, field.effects, params)
+    shown = jax.jit(lambda camera: skipping.shown_cells(bound, camera, capture.size))(
+        camera
+    )
+    assert 0.02 < shown.mean() < 0.4
+    # Every sample of every ray is in a cell that is shown.
+    ray, _ = jax.vmap(lambda pixel: field_ray_through(metadata, camera, pixel))(
+        rays.pixel_centres(capture.size).reshape(-1, 2)
+    )
+    share = np.linspace(0, 1, 41, dtype=np.float32)[:, None]
+    distance = ray.near + share * (ray.far - ray.near)
+    point = ray.origin + distance[..., None] * ray.direction
+    assert occupancy.at(shown, point, spec.extent).mean() > 0.999
+
+    time = jnp.float32(0.4)
+    codes = field.codes_at(params, evaluation.view_of(capture, 2))
+    condition = FrameCondition(time, codes, STEP)
+    whole, part = (
+        jax.jit(lambda which: skipping.survey(bound, condition, which))(which)
+        for which in (None, shown)
+    )
+    for name, cells in whole.items():
+        np.testing.assert_array_equal(part[name] & shown, cells & shown)
+        assert part[name][~occupancy.dilated(shown)].all()
 
 
 @pytest.mark.parametrize(
