@@ -81,7 +81,7 @@ def read(
         far=placement.far if far is None else far,
         warp_ids=frames.dense(times),
         appearance_ids=np.zeros(len(rows), np.int32),
-        camera_ids=np.zeros(len(rows), np.int32),
+        camera_ids=_camera_ids(entries, times, split, is_train),
         valid=_valid(root, entries, split.file, images.shape[2:0:-1], shrink_by),
         points=None
         if points is None
@@ -116,10 +116,7 @@ def _picture(root, entry, file):
 def _cameras(entries, transforms, size, where):
     """World cameras for the pictures of this size, and what had to be assumed."""
     if transforms.camera_model not in PINHOLES:
-        raise CaptureError(
-            f"{where}: camera_model {transforms.camera_model}; undistort the pictures "
-            "to OPENCV or PINHOLE first (ns-process-data or COLMAP do it)"
-        )
+        raise _no_pinhole(where, f"camera_model {transforms.camera_model}")
     single = [_one_camera(entry, transforms, size, where) for entry in entries]
     cameras = camera.stack([one for one, _ in single])
     sizes = {stated for _, stated in single if stated is not None and stated != size}
@@ -133,6 +130,13 @@ def _cameras(entries, transforms, size, where):
     return cameras, notes
 
 
+def _no_pinhole(where, lens):
+    return CaptureError(
+        f"{where}: {lens}; undistort the pictures to OPENCV or PINHOLE first "
+        "(ns-process-data or COLMAP do it)"
+    )
+
+
 def _one_camera(entry, transforms, size, where):
     def lens(name, default=None):
         own = getattr(entry, name)
@@ -140,6 +144,8 @@ def _one_camera(entry, transforms, size, where):
         return default if value is None else value
 
     label = f"{where}: frame {entry.file_path!r}"
+    if lens("is_fisheye"):
+        raise _no_pinhole(label, "is_fisheye")
     if lens("k4", 0.0) != 0:
         raise CaptureError(
             f"{label} has k4 = {lens('k4')}; undistort the pictures first"
@@ -253,6 +259,19 @@ def _times(entries, split, is_train):
             times[row] = place / max(len(rows) - 1, 1) if own is None else own
     lost = sum(time is None for time in stored)
     return times, (f"{lost} frames have no time: filled in by their order",)
+
+
+def _camera_ids(entries, times, split, is_train):
+    """Folders, where two of them have pictures of one time; else one camera."""
+    folders = [pathlib.PurePosixPath(entry.file_path).parent for entry in entries]
+    names = [folder.as_posix() for folder in folders]
+    # D-NeRF's one camera fills train and test, whose times meet.
+    several_files = split.file.name == "transforms_train.json"
+    rows = np.flatnonzero(is_train) if several_files else range(len(entries))
+    seen = {(times[row], names[row]) for row in rows}
+    if np.ptp(times) == 0 or len(seen) == len({time for time, _ in seen}):
+        return np.zeros(len(entries), np.int32)
+    return frames.dense(names)
 
 
 def _order(entry):

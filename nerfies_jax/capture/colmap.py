@@ -47,11 +47,13 @@ def read(
     so on); `factor` is relative to the model's. Lenses that are not ours are
     undistorted to a pinhole. Times come from the numbers in the names, else from their
     order; `heldout` is a number n for every n-th frame, 8 if not given. `masks/` (black
-    moves, COLMAP's polarity) are read where they are.
+    moves, COLMAP's polarity) are read where they are. Where every picture has a camera
+    of its own, folders of pictures are the physical cameras.
     """
     path = pathlib.Path(path)
     folder, notes = _best_model(path)
-    model = read_model(folder)
+    model, more = _with_physical_cameras(read_model(folder))
+    notes += more
     if isinstance(heldout, str):
         raise CaptureError(
             f"{path}: COLMAP has no split {heldout!r}; pass a number n to hold out "
@@ -101,6 +103,20 @@ def read(
         path=path,
         notes=(*notes, *lost),
     )
+
+
+def _with_physical_cameras(model):
+    """The model with camera ids that say which device, and a note where it does not.
+
+    COLMAP's default gives every picture a lens of its own, which tells none apart.
+    """
+    if len(np.unique(model.camera_ids)) < len(model.camera_ids):
+        return model, ()
+    folders = [pathlib.PurePosixPath(name).parent.as_posix() for name in model.names]
+    camera_ids = frames.dense(folders)
+    kinds = "one camera for each folder of them" if camera_ids.any() else "one camera"
+    note = f"every picture has a COLMAP camera of its own: taken as {kinds}"
+    return model._replace(camera_ids=camera_ids), (note,)
 
 
 def _with_pictures(path, model, factor, max_side, missing):

@@ -18,9 +18,8 @@ import PIL.Image
 import PIL.ImageOps
 import scipy.ndimage
 
-from nerfies_jax.capture import images
+from nerfies_jax.capture import frames, images
 from nerfies_jax.capture.capture import CaptureError, blocks, shrink
-from nerfies_jax.capture.frames import natural
 from nerfies_jax.capture.images import MAX_PIXELS, write_png
 from nerfies_jax.capture.video import read_video, transfer_of
 
@@ -29,8 +28,13 @@ PLAIN = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 HEIC = (".heic", ".heif")  # read where pillow-heif is installed
 FRAMES = 100  # kept of a film
 BLURRED = 0.4  # of the usual sharpness around it; planted blurs came out below 0.2
+_BROKEN = "not readable, so copy them again"
 _ORIENTATION, _EXIF, _FOCAL_35MM = 0x0112, 0x8769, 0xA405
 FULL_FRAME_MM = 36.0  # the longer side that the 35 mm equivalent refers to
+
+
+class _Unreadable(CaptureError):
+    """What is no picture for all its name, or broken."""
 
 
 class Taken(NamedTuple):
@@ -53,9 +57,8 @@ def kind_of(path: pathlib.Path) -> str | None:
 
 def pictures_in(folder: pathlib.Path) -> list[pathlib.Path]:
     """Files of a folder that are pictures by their ending, in natural order."""
-    endings = (*PLAIN, *HEIC)
-    files = [file for file in folder.iterdir() if file.suffix.lower() in endings]
-    return sorted(files, key=lambda file: natural(file.name))
+    files = frames.pictures_in(folder, (*PLAIN, *HEIC))
+    return sorted(files, key=lambda file: frames.natural(file.name))
 
 
 def from_film(
@@ -73,10 +76,12 @@ def from_film(
     moves by itself; those of the frames taken go to `out/masks`.
     """
     moments, scores = [], []
-    for seconds, frame in read_video(film):
+    for seconds, grey in read_video(film, grey=True):
         moments.append(seconds)
-        scores.append(sharpness(frame))
-    moments, scores = np.array(moments), np.array(scores)
+        scores.append(sharpness(grey))
+    # Frames come in the order in which they are shown, but .avi has only the times at
+    # which they are decoded, and B-frames are not decoded in that order.
+    moments, scores = np.sort(moments), np.array(scores)
     if len(np.unique(np.round(1000 * moments))) < len(moments):  # as names keep them
         raise CaptureError(
             f"{film}: its frames have no times of their own; encode it again"
@@ -84,12 +89,12 @@ def from_film(
     count = _wanted(film, moments, count, per_second)
     kept, blurred = sharp_rows(scores, moments, count)
     sources = None if masks is None else _masks_of_film(masks, len(moments))
-    wanted, names = set(kept.tolist()), []
-    for row, (seconds, frame) in enumerate(read_video(film)):
-        if row not in wanted:
-            continue
+    names, rows = [], kept.tolist()  # which rise
+    colours = read_video(film, rows=set(rows))
+    for row, (_, frame) in zip(rows, colours, strict=True):
         factor = _factor(frame.shape[1::-1], max_side)
-        names.append(f"ms{round(seconds * 1000):08d}.png")  # the name keeps the time
+        # The name keeps the time.
+        names.append(f"ms{round(moments[row] * 1000):08d}.png")
         _write(out / "images" / names[-1], shrink(frame, factor))
         if sources is not None:
             mask = images.read_mask(sources[row])
@@ -114,11 +119,11 @@ def _wanted(film, moments, count, per_second):
     return count
 
 
-def _masks_of_film(folder, frames):
+def _masks_of_film(folder, count):
     files = pictures_in(folder)
-    if len(files) != frames:
+    if len(files) != count:
         raise CaptureError(
-            f"{folder}: {len(files)} masks for a film of {frames} frames; there must "
+            f"{folder}: {len(files)} masks for a film of {count} frames; there must "
             "be one for each, in the order of their names"
         )
     return files
@@ -136,30 +141,36 @@ def from_pictures(
     something moves by itself. What cannot be read or has another size than most is left
     out, and named.
     """
-    readable, notes = _readable(folder)
-    sizes = {file: _upright_size(file) for file in readable}
+    sizes, notes = _readable(folder)
     usual = collections.Counter(sizes.values()).most_common(1)[0][0]
-    taken = [file for file in readable if sizes[file] == usual]
-    others = [file.name for file in readable if sizes[file] != usual]
+    taken = [file for file in sizes if sizes[file] == usual]
+    others = [file.name for file in sizes if sizes[file] != usual]
     notes += _left_out(others, f"not of {usual[0]}x{usual[1]} pixels like most")
     stems = collections.Counter(file.stem for file in taken)
     stem, times = stems.most_common(1)[0]
     if times > 1:
         raise CaptureError(f"{folder}: {times} pictures are named {stem}; keep one")
-    factor = _factor(usual, max_side)
+    factor, broken = _factor(usual, max_side), []
     for file in taken:
-        colour = _upright(file)
+        try:
+            colour = _upright(file)
+        except _Unreadable:  # behind its header
+            broken.append(file)
+            continue
         _write(out / "images" / f"{file.stem}.png", shrink(colour, factor))
         if masks is not None:
             source = _mask_of(masks, file)
             mask = _upright(source).mean(-1) >= 128
             _write_mask(out, f"{file.stem}.png", mask, colour.shape, factor, source)
+    notes += _left_out([file.name for file in broken], _BROKEN)
+    taken = [file for file in taken if file not in broken]
+    _check_enough(folder, len(taken), notes)
     names = tuple(f"{file.stem}.png" for file in taken)
     return Taken(names, notes, focal=_focal(taken))
 
 
 def _readable(folder):
-    """The pictures that can be opened here, and a note of the others."""
+    """The upright sizes of pictures that can be opened here, and a note of others."""
     files = pictures_in(folder)
     photographs = [file.name for file in files if file.suffix.lower() in HEIC]
     notes = ()
@@ -168,12 +179,23 @@ def _readable(folder):
             photographs, "HEIC, which needs pip install 'nerfies-jax[heic]'"
         )
         files = [file for file in files if file.name not in photographs]
-    if len(files) < 2:
+    sizes, broken = {}, []
+    for file in files:
+        try:
+            sizes[file] = _upright_size(file)
+        except _Unreadable:
+            broken.append(file.name)
+    notes += _left_out(broken, _BROKEN)
+    _check_enough(folder, len(sizes), notes)
+    return sizes, notes
+
+
+def _check_enough(folder, count, notes):
+    if count < 2:
         raise CaptureError(
-            f"{folder}: {len(files)} pictures; a reconstruction needs at least 2"
+            f"{folder}: {count} pictures; a reconstruction needs at least 2"
             + "".join(f" ({note})" for note in notes)
         )
-    return files, notes
 
 
 def _left_out(names, reason):
@@ -209,7 +231,7 @@ def _opened(file):
         raise
     except (OSError, ValueError, SyntaxError, Warning) as error:
         reason = " ".join(str(error).split())
-        raise CaptureError(
+        raise _Unreadable(
             f"{file}: not a readable picture ({reason}); copy it again or remove it"
         ) from None
 
@@ -278,11 +300,11 @@ def _write_mask(out, name, mask, shape, factor, source):
     _write(out / "masks" / f"{name}.png", blocks(mask, factor).all((-3, -1)))
 
 
-def sharpness(frame: np.ndarray) -> float:
-    """Variance of the Laplacian of the grey picture: high where edges are sharp."""
-    grey = frame.mean(-1, dtype=np.float32)
+def sharpness(grey: np.ndarray) -> float:
+    """Variance of the Laplacian of a picture [height, width]: high with sharp edges."""
     step = max(1, max(grey.shape) // 480)
-    return float(scipy.ndimage.laplace(grey[::step, ::step]).var())
+    thinned = grey[::step, ::step].astype(np.float32)
+    return float(scipy.ndimage.laplace(thinned).var())
 
 
 def sharp_rows(

@@ -1,5 +1,6 @@
 """What every reader does with its list of frames: pick, order, split, decode."""
 
+import datetime
 import math
 import pathlib
 import re
@@ -72,9 +73,20 @@ def find_picture(folder: pathlib.Path, name: str) -> pathlib.Path | None:
     return None
 
 
-def pictures_in(folder: pathlib.Path) -> list[pathlib.Path]:
-    """Files of a folder that captures are read from, sorted letter by letter."""
-    return sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES)
+def pictures_in(
+    folder: pathlib.Path, suffixes: Sequence[str] = SUFFIXES
+) -> list[pathlib.Path]:
+    """Files of a folder that captures are read from, sorted letter by letter.
+
+    Hidden ones are none: macOS puts ._A.JPG beside A.JPG, with no picture in it.
+    """
+    return sorted(
+        file
+        for file in folder.iterdir()
+        if file.suffix.lower() in suffixes
+        and not file.name.startswith(".")
+        and file.is_file()
+    )
 
 
 def check_missing(missing: str, where: str) -> None:
@@ -203,15 +215,33 @@ def dense(values: ArrayLike) -> np.ndarray:
 
 
 def clock(stems: Sequence[str]) -> tuple[list[int], tuple[str, ...]]:
-    """The frame numbers at the end of the names, or their order if they have none.
+    """Milliseconds or frame numbers at the end of the names, else their order.
 
-    A note says so of an order.
+    Milliseconds where the names end in a date and a time of day, as those of phones. A
+    note says so of an order.
     """
+    moments = [_milliseconds(stem) for stem in stems]
+    # As counts, minute and hour boundaries would be gaps of 41 and 4041 frames.
+    if None not in moments:
+        return moments, ()
     split = [re.fullmatch(r"(.*?)(\d+)", stem) for stem in stems]
     if all(split) and len({match.group(1) for match in split}) == 1:
         return [int(match.group(2)) for match in split], ()
     note = "times are the order of the pictures' names: those end in no common count"
     return list(range(len(stems))), (note,)
+
+
+def _milliseconds(stem):
+    """Since 1970, of a name that ends like IMG_20240131_235959; None of others."""
+    match = re.search(r"(?<!\d)(\d{8})[_-]?(\d{6})(\d{3})?$", stem)
+    if match is None:
+        return None
+    try:
+        moment = datetime.datetime.strptime(match[1] + match[2], "%Y%m%d%H%M%S")
+    except ValueError:
+        return None
+    since = moment - datetime.datetime(1970, 1, 1)
+    return since // datetime.timedelta(milliseconds=1) + int(match[3] or 0)
 
 
 def spread(values: ArrayLike) -> np.ndarray:

@@ -26,6 +26,7 @@ class Lens(msgspec.Struct, kw_only=True):
     k4: float | None = None
     p1: float | None = None
     p2: float | None = None
+    is_fisheye: bool | None = None  # instant-ngp's
 
 
 class Frame(Lens, kw_only=True):

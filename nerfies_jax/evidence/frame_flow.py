@@ -41,4 +41,9 @@ def with_flow(capture: Capture) -> Capture:
         flow.backward_seen[views.row] = neighbours.backward_seen & views.valid
         flow.previous_row[views.row[1:]] = views.row[:-1]
     note = "optical flow between neighbouring frames found in the pictures"
+    if (flow.next_row == own).all():
+        note = (
+            "no optical flow: no camera has two frames to learn from, so no two frames "
+            "are neighbours"
+        )
     return dataclasses.replace(capture, flow=flow, notes=(*capture.notes, note))

@@ -4,6 +4,9 @@ from collections.abc import Mapping
 
 LONGER = "train longer (--seconds, --steps) or take another preset"
 
+# A motion may cost so little and not be wrong: one came to -0.0017 dB.
+_WORSE_DB = -0.05
+
 
 def lines(numbers: Mapping[str, float]) -> list[str]:
     """Both floors and what motion is worth, for the end of a run."""
@@ -32,7 +35,7 @@ def warnings(numbers: Mapping[str, float]) -> list[str]:
             f"of two neighbouring frames laid over each other: {LONGER} "
             "(python -m experiments.inspect_scene says which)"
         )
-    if numbers.get("motion.worth", 0.0) < 0:
+    if numbers.get("motion.worth", 0.0) < _WORSE_DB:
         sentences.append(
             f"warning: held-out frames are {-numbers['motion.worth']:.2f} dB worse "
             "than the mean of the scene's own renders over time: its motion is wrong; "

@@ -78,8 +78,7 @@ def prepare(
         )
     if kind == "pictures" and (how.frames or how.fps):
         raise ValueError("frames and fps choose from a film; a folder is taken whole")
-    if how.masks is not None and not pathlib.Path(how.masks).is_dir():
-        raise CaptureError(f"{how.masks}: no such folder of masks")
+    _check_masks(how)
     with scratch_folder(out) as scratch, _named(scratch, source):
         if kind == "film":
             tell(f"looking for sharp frames in {source}")
@@ -108,6 +107,11 @@ def prepare(
     for line in describe(capture):
         tell(line)
     return capture
+
+
+def _check_masks(how):
+    if how.masks is not None and not pathlib.Path(how.masks).is_dir():
+        raise CaptureError(f"{how.masks}: no such folder of masks")
 
 
 @contextlib.contextmanager
@@ -213,20 +217,30 @@ def _record(source, how, solved):
 
 def _made_of(source, how):
     """What tells a capture from one that would come out otherwise."""
-    files = [source] if source.is_file() else sorted(source.iterdir())
-    checksum = hashlib.blake2b(digest_size=12)
-    for path in files:
-        if path.is_file():
-            checksum.update(path.name.encode(errors="surrogateescape"))
-            with path.open("rb") as file:
-                checksum.update(hashlib.file_digest(file, "blake2b").digest())
+    _check_masks(how)
+    masks = None if how.masks is None else _checksum(pathlib.Path(how.masks))
     # Threads change how long it takes.
     how = {name: one for name, one in specs.as_json(how).items() if name != "threads"}
     return {
         "source": str(source.resolve()),
-        "content": checksum.hexdigest(),
+        "content": _checksum(source),
+        "masks": masks,
         "how": how,
     }
+
+
+def _checksum(path):
+    """Of the names and contents of what is read: a film, or the pictures of a folder.
+
+    What a file manager leaves there (.DS_Store, Thumbs.db) makes no other folder.
+    """
+    files = [path] if path.is_file() else sorted(footage.pictures_in(path))
+    checksum = hashlib.blake2b(digest_size=12)
+    for each in files:
+        checksum.update(each.name.encode(errors="surrogateescape"))
+        with each.open("rb") as file:
+            checksum.update(hashlib.file_digest(file, "blake2b").digest())
+    return checksum.hexdigest()
 
 
 def needed(path: AnyPath) -> bool:

@@ -139,6 +139,31 @@ def test_times_that_are_missing(tmp_path):
     assert any("1 frames have no time" in note for note in some.notes)
 
 
+@pytest.mark.parametrize(
+    ("split", "folders", "times", "expected"),
+    [
+        ("", ("left", "right"), "0011", [0, 1]),
+        ("", ("left", "right"), "0123", [0]),  # one camera after the other
+        ("", ("left", "right"), "0000", [0]),  # nothing moves
+        ("_train", ("left", "left"), "0011", [0]),  # meet those of ./test
+        ("_train", ("left", "right"), "0011", [0, 1, 2]),
+    ],
+)
+def test_folders_of_one_time_are_cameras(tmp_path, split, folders, times, expected):
+    file = make(tmp_path, {split[1:]: 4, "test": 4}) / f"transforms{split}.json"
+    table = json.loads(file.read_text())
+    for folder in {*folders}:
+        (tmp_path / folder).symlink_to(tmp_path / (split[1:] or "images"))
+    for row, entry in enumerate(table["frames"]):
+        name = f"{folders[row % 2]}/r_{row}"
+        entry |= {"file_path": name, "time": int(times[row]) / 4}
+    dump(file, table | {"is_fisheye": False})
+    capture = blender_format.read(tmp_path)
+    assert np.unique(capture.camera_ids).tolist() == expected
+    right = capture.camera_ids[[name.startswith("right") for name in capture.ids]]
+    assert (right == (len(expected) > 1)).all()
+
+
 def test_cameras_further_away_see_further(tmp_path):
     capture = blender_format.read(make(tmp_path, radius=10.0))
     assert (capture.near, capture.far) == pytest.approx((5, 15))
@@ -155,9 +180,8 @@ LENS = {
 def test_nerfstudio_lens_scales_with_the_pictures(tmp_path):
     capture = blender_format.read(make(tmp_path, {"": 9}, top=LENS))
     cameras = capture.cameras
-    np.testing.assert_allclose(
-        cameras.focal_px, 20, rtol=1e-6
-    )  # pictures are half size
+    # Pictures are half size.
+    np.testing.assert_allclose(cameras.focal_px, 20, rtol=1e-6)
     np.testing.assert_allclose(cameras.pixel_aspect, 1.1, rtol=1e-6)
     np.testing.assert_allclose(cameras.principal_point_px, [[5.5, 3.5]] * 9)
     np.testing.assert_allclose(cameras.radial[0], [0.1, 0.02, 0], rtol=1e-6)
@@ -316,6 +340,8 @@ BAD = {
     "focal negative": (first_frame(fl_x=-5.0), "fl_x = -5"),
     "size not the camera's": (first_frame(w=8, h=10), "8x10"),
     "fisheye": (top_level(camera_model="OPENCV_FISHEYE"), "OPENCV_FISHEYE"),
+    "is fisheye": (top_level(is_fisheye=True), "is_fisheye; undistort"),
+    "fisheye of a frame": (first_frame(is_fisheye=True), "is_fisheye; undistort"),
     "fourth radial": (first_frame(k4=0.1), "k4"),
     "frame twice": (first_frame(file_path="train/r_1"), "'train_r_1' appears 2 times"),
     "leak": (first_frame(file_path="test/r_1"), "'test_r_1' appears 2 times"),

@@ -61,6 +61,21 @@ def test_names_without_a_common_count_have_an_order_and_a_note():
     assert "order" in note
 
 
+@pytest.mark.parametrize(
+    ("stems", "gaps"),
+    [
+        (["IMG_20240101_115959", "IMG_20240101_120000"], [1000]),
+        (["PXL_20231231_235959000", "x-20240101000000"], [1000]),  # over midnight
+        (["20240229-235959500", "20240301-000000250"], [750]),
+        (["a_20241301_000001", "a_20241301_000061"], [60]),  # no date: a count
+    ],
+)
+def test_phones_name_pictures_by_date_and_time_of_day(stems, gaps):
+    moments, notes = frames_of_files.clock(stems)
+    assert np.diff(moments).tolist() == gaps
+    assert notes == ()
+
+
 def test_select_keeps_what_belongs_to_each_frame():
     whole = make(frames=5, train=np.array([0, 2, 4]), heldout=np.array([1, 3]))
     part = capturing.select(whole, np.array([3, 0, 2]))

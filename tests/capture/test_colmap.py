@@ -235,6 +235,37 @@ def test_times_follow_the_numbers_when_frames_are_missing(tmp_path):
     np.testing.assert_allclose(capture.times, np.delete(np.arange(9), 2) / 8, atol=1e-7)
 
 
+@pytest.mark.parametrize(
+    ("folders", "lenses", "expected"),
+    [
+        (("", ""), range(1, 10), [0] * 9),
+        (("left/", "right/"), range(1, 10), [0] * 4 + [1] * 5),
+        # Two pictures share a lens: COLMAP's cameras are those of the user.
+        (("left/", "right/"), (1, 1, *range(2, 9)), [0, *range(8)]),
+    ],
+)
+def test_a_lens_for_each_picture_is_no_physical_camera(
+    tmp_path, folders, lenses, expected
+):
+    make(tmp_path)
+    model = tmp_path / "sparse/0"
+    (model / "cameras.txt").write_text(
+        "".join(f"{lens} {PINHOLE}\n" for lens in sorted(set(lenses)))
+    )
+    text = (model / "images.txt").read_text()
+    for row, lens in enumerate(lenses):
+        name = f"f_{row:03d}.png"
+        place = f"{folders[row >= 4]}{name}"
+        text = text.replace(f" 1 {name}", f" {lens} {place}")
+        (tmp_path / "images" / place).parent.mkdir(exist_ok=True)
+        (tmp_path / "images" / name).rename(tmp_path / "images" / place)
+    (model / "images.txt").write_text(text)
+    capture = colmap.read(tmp_path)
+    assert capture.camera_ids.tolist() == expected
+    told = [note for note in capture.notes if "a COLMAP camera of its own" in note]
+    assert len(told) == (len(set(lenses)) == 9)
+
+
 def test_black_wedges_at_the_rim_are_not_filmed():
     images = np.full((4, 40, 50, 3), 90, np.uint8)
     images[1, :6, 10:40] = 0  # touches the rim

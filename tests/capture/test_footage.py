@@ -8,7 +8,7 @@ import PIL.Image
 import pytest
 import scipy.ndimage
 
-from nerfies_jax.capture import footage, images
+from nerfies_jax.capture import footage, frames, images, video
 from nerfies_jax.capture.capture import CaptureError
 
 
@@ -35,9 +35,9 @@ def test_stretches_are_of_time_and_not_of_frames():
 
 
 def test_sharpness_falls_with_blur():
-    noise = np.random.default_rng(0).integers(0, 256, (60, 80, 3)).astype(np.uint8)
+    noise = np.random.default_rng(0).integers(0, 256, (60, 80)).astype(np.uint8)
     values = [
-        footage.sharpness(scipy.ndimage.gaussian_filter(noise, (blur, blur, 0)))
+        footage.sharpness(scipy.ndimage.gaussian_filter(noise, blur))
         for blur in (0, 1, 2, 4)
     ]
     assert values == sorted(values, reverse=True)
@@ -89,6 +89,37 @@ def test_a_film_keeps_its_own_times_and_the_masks_of_the_frames_taken(tmp_path):
     assert len(half.names) == 3
     with pytest.raises(ValueError, match="1 frames to keep"):
         footage.from_film(tmp_path / "a.mp4", tmp_path / "d", 1)
+
+
+def test_colours_are_made_of_the_frames_that_are_kept_alone(tmp_path, monkeypatch):
+    film(tmp_path / "a.mp4", range(0, 1000, 40))
+    made, pixels = [], video._pixels
+    monkeypatch.setattr(video, "_pixels", lambda one: made.append(one) or pixels(one))
+    taken = footage.from_film(tmp_path / "a.mp4", tmp_path / "out", 3)
+    assert len(made) == len(taken.names) == 3
+
+
+def test_frames_stay_in_order_where_times_are_those_of_decoding(tmp_path):
+    """H.264 in .avi: B-frames are decoded out of turn, and nothing else is stored."""
+    noise = np.random.default_rng(0).integers(0, 40, (32, 48, 3)).astype(np.uint8)
+    with av.open(str(tmp_path / "a.avi"), "w") as container:
+        options = {"bf": "3", "b_strategy": "0"}
+        stream = container.add_stream("h264", rate=10, options=options)
+        stream.width, stream.height, stream.pix_fmt = 48, 32, "yuv420p"
+        for number in range(12):
+            frame = av.VideoFrame.from_ndarray(noise + np.uint8(15 * number), "rgb24")
+            frame.pts, frame.time_base = number, Fraction(1, 10)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    times = [seconds for seconds, _ in video.read_video(tmp_path / "a.avi")]
+    assert min(np.diff(times)) < 0
+    taken = footage.from_film(tmp_path / "a.avi", tmp_path / "out", 12)
+    shown = [
+        images.read_pixels(tmp_path / "out/images" / name).mean()
+        for name in sorted(taken.names)
+    ]
+    assert len(shown) == 12
+    assert min(np.diff(shown)) > 10
 
 
 def test_a_picture_of_floats_is_refused_by_name(tmp_path):
@@ -155,5 +186,27 @@ def test_a_folder_is_told_by_what_is_in_it(tmp_path):
     for name in ("a.jpg", "b.JPG"):
         (tmp_path / name).write_bytes(b"broken")
     assert footage.kind_of(tmp_path) == "pictures"
-    with pytest.raises(CaptureError, match=r"a\.jpg: not a readable picture"):
+    with pytest.raises(CaptureError, match=r"0 pictures.*not readable.*: a\.jpg, b\."):
         footage.from_pictures(tmp_path, tmp_path / "out")
+
+
+def test_what_cannot_be_read_is_left_out_and_what_is_hidden_is_no_picture(tmp_path):
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    for row in range(4):
+        noise = np.random.default_rng(row).integers(0, 256, (32, 48, 3))
+        PIL.Image.fromarray(noise.astype(np.uint8)).save(folder / f"{row}.jpg")
+    (folder / "._0.jpg").write_bytes(b"of macOS")
+    (folder / "album.jpg").mkdir()
+    (folder / "1.jpg").write_bytes(b"broken")
+    (folder / "2.jpg").write_bytes((folder / "2.jpg").read_bytes()[:1000])  # its header
+    assert len(footage.pictures_in(folder)) == 4
+    assert len(frames.pictures_in(folder)) == 4
+    taken = footage.from_pictures(folder, tmp_path / "out")
+    assert taken.names == ("0.png", "3.png")
+    assert [note.rpartition(": ")[2] for note in taken.notes] == ["1.jpg", "2.jpg"]
+    written = sorted(path.name for path in (tmp_path / "out/images").iterdir())
+    assert written == ["0.png", "3.png"]
+    (folder / "3.jpg").unlink()
+    with pytest.raises(CaptureError, match=r"1 pictures; .*at least 2.*1\.jpg.*2\.jpg"):
+        footage.from_pictures(folder, tmp_path / "again")

@@ -1,5 +1,7 @@
 """Film: round trips, odd sizes, times, and broken files."""
 
+import struct
+
 import av
 import numpy as np
 import pytest
@@ -69,6 +71,82 @@ def test_a_phones_rotation_is_carried_out(tmp_path, turn, expected, mark):
     assert decoded.shape[:2] == expected
     assert decoded[mark].min() > 200
     assert decoded[-mark[0], mark[1]].max() < 60
+
+
+@pytest.mark.parametrize(
+    ("across", "down", "expected"), [(-1, 1, "GRWB"), (1, -1, "BWRG"), (-1, -1, "WBGR")]
+)
+def test_a_mirror_is_no_turn(tmp_path, across, down, expected):
+    """Quadrants R G over B W; the matrix of the track (ISO 14496-12) mirrors them."""
+    colours = {"R": (255, 0, 0), "G": (0, 255, 0), "B": (0, 0, 255), "W": (255,) * 3}
+    picture = np.reshape([*colours.values()], (2, 2, 3)).astype(np.uint8)
+    picture = picture.repeat(16, 0).repeat(24, 1)
+    video.write_video(tmp_path / "a.mp4", [picture] * 2, quality=2)
+    data = bytearray((tmp_path / "a.mp4").read_bytes())
+    start = data.index(b"tkhd") + 44
+    one, shift = 1 << 16, (48 << 16 if across < 0 else 0, 32 << 16 if down < 0 else 0)
+    matrix = (across * one, 0, 0, 0, down * one, 0, *shift, 1 << 30)
+    assert struct.unpack_from(">9i", data, start) == (
+        one,
+        0,
+        0,
+        0,
+        one,
+        0,
+        0,
+        0,
+        1 << 30,
+    )
+    struct.pack_into(">9i", data, start, *matrix)
+    (tmp_path / "a.mp4").write_bytes(data)
+    _, decoded = next(iter(video.read_video(tmp_path / "a.mp4")))
+    _, grey = next(iter(video.read_video(tmp_path / "a.mp4", grey=True)))
+    for mark, (y, x) in zip(expected, np.ndindex(2, 2), strict=True):
+        at = (8 + 16 * y, 12 + 24 * x)
+        assert np.abs(decoded[at] - np.array(colours[mark])).max() < 12
+        assert (grey[at] > 240) == (mark == "W")
+
+
+@pytest.mark.parametrize(
+    ("height", "space"), [(718, "ITU601"), (720, "ITU709")], ids=["small", "hd"]
+)
+def test_a_film_without_colour_tags_has_those_of_its_size(tmp_path, height, space):
+    colour = np.array([200, 30, 40])
+    picture = np.zeros((height, 64, 3), np.uint8) + colour.astype(np.uint8)
+    with av.open(str(tmp_path / "a.mp4"), "w") as container:
+        stream = container.add_stream("h264", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 64, height, "yuv420p"
+        for _ in range(2):
+            coded = av.VideoFrame.from_ndarray(picture, format="rgb24").reformat(
+                format="yuv420p", dst_colorspace=space, dst_color_range="MPEG"
+            )
+            coded.colorspace = 2  # not told
+            container.mux(stream.encode(coded))
+        container.mux(stream.encode())
+    _, decoded = next(iter(video.read_video(tmp_path / "a.mp4")))
+    # The other matrix is off by up to 30.
+    assert np.abs(decoded[100, 30] - colour).max() <= 4
+
+
+def test_of_rows_alone_nothing_behind_the_last_is_decoded(tmp_path):
+    with av.open(str(tmp_path / "a.mov"), "w") as container:
+        stream = container.add_stream("png", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 45, 31, "rgb24"
+        for picture in film(60):
+            frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    data = bytearray((tmp_path / "a.mov").read_bytes())
+    where = -1
+    for _ in range(40):  # 16 threads, at most, decode ahead
+        where = data.index(b"IHDR", where + 1)
+    data[where - 12 : where] = bytes(12)  # its signature
+    (tmp_path / "a.mov").write_bytes(data)
+    with pytest.raises(CaptureError, match="not a readable film"):
+        list(video.read_video(tmp_path / "a.mov"))
+    shown = list(video.read_video(tmp_path / "a.mov", rows=(1, 6)))
+    for (_, picture), number in zip(shown, (1, 6), strict=True):
+        np.testing.assert_array_equal(picture, film()[number])
 
 
 def pq_code(nits):

@@ -106,6 +106,9 @@ def test_a_run_below_a_floor_is_told_what_to_do():
     assert floors_text.warnings(numbers) == []
     assert "19.00 dB the mean of two" in floors_text.lines(numbers)[0]
     assert "+0.50 dB" in floors_text.lines(numbers)[1]
+    assert floors_text.warnings(numbers | {"motion.worth": -0.04}) == []
+    (worse,) = floors_text.warnings(numbers | {"motion.worth": -0.06})
+    assert "0.06 dB worse" in worse
     below, worse = floors_text.warnings(
         numbers | {"floor.neighbours": 22.7, "motion.worth": -0.25}
     )

@@ -31,3 +31,11 @@ def test_flow_leads_to_the_next_frame_of_the_same_camera_and_past_held_out_ones(
         assert wall.mean() > 0.5
         off = flow.forward[row][wall] - films.FOCAL * step[:2] / films.FAR
         assert np.median(np.linalg.norm(off, axis=-1)) < 0.2
+
+
+def test_cameras_of_one_frame_have_no_flow_and_a_note_says_so():
+    capture = films.film(frames=3)
+    capture = dataclasses.replace(capture, camera_ids=np.arange(3, dtype=np.int32))
+    found = frame_flow.with_flow(capture)
+    assert not found.flow.forward_seen.any()
+    assert found.notes[-1].startswith("no optical flow: no camera has two frames")

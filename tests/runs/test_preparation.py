@@ -1,6 +1,7 @@
 """Two passes of cameras, what is kept of them, and what a second call does."""
 
 import dataclasses
+import json
 import shutil
 import types
 
@@ -163,6 +164,37 @@ def test_given_masks_take_one_pass_and_are_kept(pictures, tmp_path, mapper):
     ((_, black),) = mapper.calls
     assert [mask[0].sum() for mask in black] == list(range(1, 10))
     np.testing.assert_array_equal(room.load(tmp_path / "out").moving, black)
+
+
+def test_other_masks_make_another_capture_and_what_is_no_picture_does_not(
+    pictures, tmp_path, mapper
+):
+    (tmp_path / "masks").mkdir()
+    mask = np.ones((16, 24), bool)
+    for row in range(9):
+        images.write_png(tmp_path / f"masks/p{row}.png", mask)
+    how = Preparation(masks=tmp_path / "masks")
+    preparation.prepared(pictures, tmp_path / "out", how)
+    for folder in (pictures, tmp_path / "masks"):
+        for name in (".DS_Store", "Thumbs.db", "._p0.png"):
+            (folder / name).write_bytes(b"of a file manager")
+    log = []
+    preparation.prepared(pictures, tmp_path / "out", how, log.append)
+    assert "was prepared before" in log[0]
+    assert len(mapper.calls) == 1
+    mask[3:5] = False
+    images.write_png(tmp_path / "masks/p4.png", mask)
+    with pytest.raises(ValueError, match=r"\(masks differ\)"):
+        preparation.prepared(pictures, tmp_path / "out", how)
+    gone = Preparation(masks=tmp_path / "gone")
+    with pytest.raises(CaptureError, match="gone: no such folder of masks"):
+        preparation.prepared(pictures, tmp_path / "out", gone)
+    # One made before masks were looked at has had none.
+    preparation.prepared(pictures, tmp_path / "without")
+    record = json.loads((tmp_path / "without/prepared.json").read_text())
+    del record["masks"]
+    (tmp_path / "without/prepared.json").write_text(json.dumps(record))
+    preparation.prepared(pictures, tmp_path / "without")
 
 
 def test_a_run_of_a_film_prepares_it_once_beside_the_run(tmp_path, mapper, monkeypatch):
