@@ -312,6 +312,8 @@ def _composite(bound, ray, samples, radiance, media):
         distance=whole.distance,
         median_distance=whole.median_distance,
         beta=_uncertainty(bound, media, media_weight),
+        spacing=spacing,
+        background=behind,
     )
 
 

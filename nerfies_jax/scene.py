@@ -19,13 +19,15 @@ from nerfies_jax import (
     scene_metadata,
 )
 from nerfies_jax.capture.capture import Capture, training_bytes
-from nerfies_jax.effects import scene_flow, transient
+from nerfies_jax.effects import moving_mask, scene_flow, transient
 from nerfies_jax.effects.effect import Batch, Box, RayOutput
 from nerfies_jax.evidence import usable_paths
 from nerfies_jax.field import Codes, Field, field
 from nerfies_jax.geometry import rays
 from nerfies_jax.nets import codes
+from nerfies_jax.nets.planes import PlanesSpec
 from nerfies_jax.radiance.occupancy import Cells
+from nerfies_jax.radiance.template import TemplateSpec
 from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.spec import RadianceScene
 from nerfies_jax.training import loop, losses, schedules
@@ -66,9 +68,10 @@ def build(
     """Everything the loop, the renderer and the report need of this scene.
 
     `effects` act behind those of the spec. Raises ValueError where an effect needs what
-    the capture does not have.
+    the capture does not have, or reads a guide that no effect marks.
     """
     radiance = field(spec, metadata, effects=effects)
+    _check_guides(spec, effects)
     codes_at = radiance.codes_at
     if spec.background is not None and "points" not in metadata.available_data:
         raise ValueError(
@@ -114,6 +117,22 @@ def build(
         example=example,
         devices=devices,
     )
+
+
+def _check_guides(spec, effects):
+    """Refuse what would end as a missing code where a warp or a slice is traced."""
+    # What an effect of one's own marks it says only when it is traced.
+    if any(effect.mark is not None for effect in effects):
+        return
+    there = () if spec.mask is None else (moving_mask.NAME,)
+    for part in ("warp", "ambient"):
+        for guide in getattr(getattr(spec, part), "guides", ()):
+            if guide not in there:
+                raise ValueError(
+                    f"{part}.guides names {guide!r}, and of a point the effects say "
+                    f"{' and '.join(there) or 'nothing'}; leave it out, set mask for "
+                    f"{moving_mask.NAME!r}, or pass an effect with a mark"
+                )
 
 
 def drawing(radiance: Field, seen: Callable[..., tuple[View, Codes]]) -> dict[str, Any]:
@@ -200,8 +219,8 @@ def learning_rates(
     """Of each part of the parameters: the effect's own, or that of the schedule.
 
     A warp that starts from tracks, and the codes that it reads, begin with a share, as
-    does a scene flow with a trunk of its own. A medium on tables learns at the rate of
-    the template.
+    does a scene flow with a trunk of its own where there is no warp to fit. A medium on
+    tables learns at the rate of the template.
     """
     own = {e.name: e.learning_rate for e in effects if e.learning_rate is not None}
     common = schedules.log_linear(
@@ -222,7 +241,8 @@ def learning_rates(
     if isinstance(flow, scene_flow.SceneFlow):
         rate, apart = rates[scene_flow.NAME], flow.flow_trunk is not None
         on_tables = flow.network.tables is not None
-        of_flow = held * rate if apart else rate
+        # Beside a warp it was not fitted (`build`).
+        of_flow = held * rate if apart and spec.warp is None else rate
         rates[scene_flow.NAME] = scene_flow.SceneFlow(
             network=spec.template_rate * rate if on_tables else rate,
             flow=of_flow,
@@ -334,15 +354,33 @@ def _colour_terms(
 def estimate_memory_bytes(spec: RadianceScene, capture: Capture) -> int:
     """Roughly the memory of the first state and step; host side, nothing allocated."""
     plan = spec.sampling
-    samples = (1 + plan.union) * plan.coarse + plan.fine
-    widths = spec.template.depth * spec.template.width + spec.template.colour_width
-    if spec.warp is not None:
-        widths += spec.warp.depth * spec.warp.width
-    # Every layer's output is kept for the backward pass, beside its gradient.
+    last = plan.coarse if plan.fine == 0 else plan.union * plan.coarse + plan.fine
+    samples = last if plan.fine == 0 else plan.coarse + last
+    widths = samples * _width_of(spec.template)
+    for net in (spec.warp, spec.ambient, spec.mask):
+        widths += 0 if net is None else samples * net.depth * net.width
+    if spec.transient is not None:
+        widths += last * spec.transient.depth * spec.transient.width
+    if spec.scene_flow is not None:
+        medium = spec.scene_flow.network
+        trunk = spec.scene_flow.flow_trunk * medium.depth * medium.width
+        # Asked for this moment and for those beside it.
+        widths += 3 * last * (_width_of(medium) + trunk)
+    # Every layer's output is kept for the backward pass, beside its gradient. Of steps
+    # of 256 rays of the small presets XLA's temporaries are 0.57 to 1.02 of this.
     rays_at_once = spec.rays // spec.micro_batches
-    activations = 3 * rays_at_once * samples * widths
+    activations = 3 * rays_at_once * widths
     devices = data_parallel.device_count(spec.micro_batches)
     return 4 * activations + devices * training_bytes(capture)
+
+
+def _width_of(one: TemplateSpec) -> int:
+    """Floats that are kept of a sample: of its layers, and those read from planes."""
+    width, position = one.depth * one.width + one.colour_width, one.position
+    if not isinstance(position, PlanesSpec):
+        return width  # of grids hardly any more: 0.77 to 1.02 of the estimate
+    corners = 4 * (3 if position.moments is None else 6)
+    return width + corners * position.levels * position.features
 
 
 def count_parameters(state: TrainState) -> dict[str, int]:

@@ -121,15 +121,19 @@ class RadianceScene:
                 f"density_noise={self.density_noise} must be finite and not negative"
             )
         for name in ("template_rate", "table_rate"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}={getattr(self, name)} must be positive")
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(
+                    f"{name}={getattr(self, name)} must be positive and finite"
+                )
         if any(one.reads_time for one in (self.template, self.coarse or self.template)):
             raise ValueError(
                 "a template is read at a point, at whatever time, and its planes have "
                 "none: set position.moments=none (scene_flow.network may have them)"
             )
-        if self.extent is not None and not self.extent > 0:
-            raise ValueError(f"extent={self.extent} must be positive, or none")
+        if self.extent is not None and not 0 < self.extent < math.inf:
+            raise ValueError(
+                f"extent={self.extent} must be positive and finite, or none"
+            )
         schedules.check_falling(self.learning_rate, self.learning_rate_end)
         for name in ("elastic", "background"):
             if getattr(self, name) is not None and self.warp is None:

@@ -32,6 +32,7 @@ MOMENTS, RAYS, SAMPLES, FEATURES = 4, 6, 5, 7
 SIZE = (8, 6)
 ROWS = [0, 3, 1, 2, 2, 1]  # of the rays; rows are moments here
 TIMES = (0.0, 1 / 3, 0.7, 1.0)
+FAR = 3.2  # behind all samples, where a background is known
 BOX_SCALE, BOX_CENTRE = 0.5, (0.2, -0.1, 2.0)
 
 
@@ -83,8 +84,17 @@ def frames_and_batch(rng, dtype):
     return jax.tree.map(jnp.asarray, (frames, batch))
 
 
-def context_of(spec, params, frames, batch, distance, features, weight, step):
-    """The rays as the scene renders them, as far as the penalty reads it."""
+def context_of(
+    spec, params, frames, batch, distance, features, weight, step, behind=None
+):
+    """The rays as the scene renders them, as far as the penalty reads it.
+
+    `behind` is the colour of a known background.
+    """
+    end = jnp.full((RAYS, 1), 1e10, distance.dtype)
+    if behind is not None:
+        end = FAR - distance[:, -1:]
+        behind = jnp.broadcast_to(jnp.asarray(behind, distance.dtype), (RAYS, 3))
     centre = jnp.asarray(BOX_CENTRE, distance.dtype)
     origin = (batch.origin - centre) * BOX_SCALE
     point = origin[:, None] + distance[..., None] * batch.direction[:, None]
@@ -111,6 +121,8 @@ def context_of(spec, params, frames, batch, distance, features, weight, step):
         distance=none,
         median_distance=none,
         beta=None,
+        spacing=jnp.concatenate([jnp.diff(distance), end], 1),
+        background=behind,
     )
     return PenaltyContext(
         condition=conditions,
@@ -164,10 +176,11 @@ def dynamic(params, point, direction, time):
     return density, sigmoid(shade["colour"]), flow.reshape(2, 3), sigmoid(hidden_share)
 
 
-def composite(density, distance):
+def composite(density, distance, behind):
     weights, light = [], 1.0
+    ends = [*distance[1:], 1e10 if behind is None else FAR]
     for s in range(SAMPLES):
-        length = distance[s + 1] - distance[s] if s + 1 < SAMPLES else 1e10
+        length = ends[s] - distance[s]
         weights.append(light * (1 - np.exp(-density[s] * length)))
         light *= np.exp(-density[s] * length)
     return np.array(weights)
@@ -179,8 +192,9 @@ def weighted(pairs):
     return sum(value * weight for value, weight in pairs) / total
 
 
-def oracle(params, frames, batch, arrays, step):
+def oracle(params, frames, batch, arrays, step, behind=None):
     """All terms as sums over rays and samples."""
+    back = np.zeros(3) if behind is None else np.asarray(behind)
     params, frames, batch = jax.tree.map(
         lambda x: np.asarray(x, np.float64) if x.dtype.kind == "f" else np.asarray(x),
         (params, frames, batch),
@@ -196,18 +210,20 @@ def oracle(params, frames, batch, arrays, step):
         origin = (batch.origin[r] - BOX_CENTRE) * BOX_SCALE
         points = [origin + d * direction for d in distance]
         here = [dynamic(params, x, direction, time) for x in points]
-        weight = composite([h[0] for h in here], distance)
+        weight = composite([h[0] for h in here], distance, behind)
         mask = float(batch.valid[r])
         if step >= 100:
             mask *= blend_weight[r].sum()
         colour = sum(w * h[1] for w, h in zip(weight, here, strict=True))
+        colour = colour + (1 - weight.sum()) * back
         lists["dynamic"].append((np.mean((colour - batch.colour[r]) ** 2), mask))
         column, line = int(batch.pixel[r, 0]), int(batch.pixel[r, 1])
         for s in range(SAMPLES):
             logit = features[r, s] @ params.blend.weight[:, 0] + params.blend.bias[0]
             share = sigmoid(logit)
             lists["entropy"].append((-share * np.log(share), 1))
-        expected = weight @ distance * batch.cosine[r] / BOX_SCALE
+        reached = weight @ distance + (1 - weight.sum()) * distance[-1]
+        expected = reached * batch.cosine[r] / BOX_SCALE
         known = frames.depths[row, line, column]
         if known > 0 and batch.valid[r]:
             depths.append((expected, known))
@@ -222,9 +238,10 @@ def oracle(params, frames, batch, arrays, step):
                 x + stretch * f for x, f in zip(points, flows[:, side], strict=True)
             ]
             there = [dynamic(params, x, direction, later) for x in moved]
-            w = composite([t[0] for t in there], distance)
+            w = composite([t[0] for t in there], distance, behind)
             seen = 1 - np.array([h[3][side] for h in here])
             colour = sum(a * t[1] for a, t in zip(w, there, strict=True))
+            colour = colour + (1 - w.sum()) * back
             error = np.mean((colour - batch.colour[r]) ** 2)
             lists[f"warped{side}"].append((error, mask * (w @ seen)))
             for s in range(SAMPLES):
@@ -276,6 +293,8 @@ def _flow_pixel(lists, frames, batch, r, side, points, flows, weight):
         w * (x + stretch * f)
         for w, x, f in zip(weight, points, flows[:, side], strict=True)
     )
+    last = points[-1] + stretch * flows[-1, side]
+    place = place + (1 - weight.sum()) * last
     place = place / BOX_SCALE + np.array(BOX_CENTRE)
     turn, position = (
         frames.cameras.camera_from_world[other],

@@ -68,6 +68,9 @@ class RayOutput(NamedTuple):
     distance: Float[Array, "*rays"]  # expected, units of the field
     median_distance: Float[Array, "*rays"]
     beta: Float[Array, "*rays"] | None  # standard deviation of the colour, or None
+    spacing: Float[Array, "*rays samples"]  # what length each sample stands for
+    # Known to be behind the samples; None: the last one stands for all behind it.
+    background: Float[Array, "*rays 3"] | None
     # What surfaces found, by effect, leaves with leading axes rays and samples.
     looks: dict[str, dict[str, Array]] = {}  # noqa: RUF012
 

@@ -22,7 +22,7 @@ from nerfies_jax.effects.effect import Medium, RayOutput, Sample, Scalar, Vector
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
-from nerfies_jax.radiance import template
+from nerfies_jax.radiance import compositing, template
 from nerfies_jax.radiance.template import Template, TemplateSpec
 from nerfies_jax.training.effects import Effect, FrameCondition, PenaltyContext, Term
 from nerfies_jax.training.step_counts import steps
@@ -249,7 +249,7 @@ def neighbour(
     there = jax.vmap(jax.vmap(ask, (0, None, None)))(
         point, context.batch.direction, time
     )
-    weight = flow_losses.dynamic_weights(level.distances, there.density)
+    weight = flow_losses.dynamic_weights(level.spacing, there.density)
     logit = extras["disocclusion"][..., side]
     return Neighbour(
         point=point,
@@ -257,7 +257,7 @@ def neighbour(
         back=there.flow[..., 1 - side, :],
         visible=jax.nn.sigmoid(-logit),  # 1 - sigmoid(logit) would round to 0
         disocclusion=jax.nn.sigmoid(logit),
-        colour=jnp.sum(weight[..., None] * there.colour, axis=-2),
+        colour=_alone(level, weight, there.colour),
         weight=weight,
         present=present,
     )
@@ -272,13 +272,12 @@ def penalty(
     """All losses beside that of the blended picture, as logged."""
     batch, level = context.batch, context.levels[-1]
     own = level.media[NAME]
-    weight = flow_losses.dynamic_weights(level.distances, own.density)
+    weight = flow_losses.dynamic_weights(level.spacing, own.density)
     sides = [neighbour(spec, times, params, context, side) for side in (0, 1)]
     mask = jnp.where(batch.valid, picture_mask(spec, level, context.step), 0)
     values = {
         "dynamic": lambda: flow_losses.weighted_mean(
-            jnp.square(jnp.sum(weight[..., None] * own.colour, -2) - batch.colour),
-            mask,
+            jnp.square(_alone(level, weight, own.colour) - batch.colour), mask
         ),
         "warped": lambda: sum(
             flow_losses.warped(
@@ -320,6 +319,12 @@ def penalty(
         value = flow_term(context, learnt_moments.interval(len(times)), weight, sides)
         terms["flow"] = Term(value, spec.weights.flow * fade)
     return terms
+
+
+def _alone(level, weight, colour):
+    """Colours of rays through the medium alone, before what is known to be behind."""
+    composite = jax.vmap(compositing.composite)
+    return composite(weight, colour, level.distances, level.background).colour
 
 
 def picture_mask(

@@ -127,12 +127,9 @@ def entropy(share_logit: Float[Array, "rays samples"]) -> Scalar:
 
 
 def dynamic_weights(
-    distance: Float[Array, "rays samples"], density: Float[Array, "rays samples"]
+    spacing: Float[Array, "rays samples"], density: Float[Array, "rays samples"]
 ) -> Float[Array, "rays samples"]:
-    """Of the medium alone, unblended; the last sample stands for all behind it."""
-    spacing = jax.vmap(
-        lambda distance: compositing.intervals(distance, compositing.AT_INFINITY)
-    )(distance)
+    """Of the medium alone, unblended, at samples that stand for so much of a ray."""
     return jax.vmap(compositing.weights)(density * spacing)
 
 

@@ -156,6 +156,8 @@ def _features(spec, params, encoded, condition):
     Under vmap over the samples of a ray it is then computed once for the ray, and under
     forward mode not at all.
     """
+    if not params.hidden:  # the heads read both
+        return jnp.concatenate([encoded, condition])
     activation = mlp.ACTIVATIONS[network(spec).activation]
     hidden = encoded
     for index, layer in enumerate(params.hidden):

@@ -88,9 +88,10 @@ def sample_pdf(
     """Sorted distances with a density proportional to `weights` between sorted `edges`.
 
     The cumulated weights, straight within a bin, are inverted at evenly spaced shares
-    from 0 to 1, or with a key at one random share in each of `count` equal parts of
-    [0, 1] (the published codes draw independent shares, which clump). No gradient goes
-    through the samples. Section 5.2 of Mildenhall et al. 2020, arXiv:2003.08934.
+    from 0 to 1 (one sample: at a half), or with a key at one random share in each of
+    `count` equal parts of [0, 1] (the published codes draw independent shares, which
+    clump). No gradient goes through the samples. Section 5.2 of Mildenhall et al. 2020,
+    arXiv:2003.08934.
 
     Weights are not negative; where all are zero the bins share alike. `floor` is added
     to every weight: `None` adds one rounding unit of the largest, `NERF_FLOOR` is what
@@ -188,6 +189,8 @@ def _last_not_above(edges, values):
 
 
 def _shares(key, count, dtype):
+    if key is None and count == 1:
+        return jnp.full(1, 0.5, dtype)  # `linspace` has its start: the ray's near end
     if key is None:
         return jnp.linspace(0, 1, count, dtype=dtype)
     parts = jnp.arange(count, dtype=dtype)

@@ -1,6 +1,7 @@
 """The template: a network from an encoded point to density and colour."""
 
 import dataclasses
+import math
 from typing import NamedTuple
 
 import jax
@@ -70,6 +71,11 @@ class TemplateSpec:
             raise ValueError(
                 f"unknown density activation {self.density!r}; choose from "
                 f"{sorted(DENSITIES)}"
+            )
+        if not math.isfinite(self.density_bias):
+            raise ValueError(
+                f"density_bias={self.density_bias} must be finite; 0 starts as the "
+                "network does, less starts emptier"
             )
         if self.depth < 1:
             raise ValueError(

@@ -157,6 +157,7 @@ class _Run:
             )
             if self._left() <= self._half_a_scan(program.length):
                 return "seconds"
+            self._save_overdue()
             count = self._count(program.length)
             self._add(compile_seconds=lower_seconds + program.prepare(count))
             if not self._chunk(program, count):
@@ -239,16 +240,12 @@ class _Run:
         return length * self.step_seconds / 2 if self.step_seconds < math.inf else 0.0
 
     def _after_chunk(self) -> None:
-        """Hooks, checkpoint and display; none of it is training time."""
+        """Hooks and display; none of it is training time."""
         for hook in self.hooks:
             if self._due(hook):
                 self._call(hook)
         if self.checkpoints is not None:
             self._tell_failed_save(self.checkpoints.failure())
-            # After the last step `finish` saves, with what its hooks return.
-            overdue = time.monotonic() - self.saved_at >= self.limits[1]
-            if overdue and self.step < self.steps:
-                self._save()
         if self.progress.due():
             row = self.history.rows[-1]
             metrics = {k: v for k, v in row.items() if k not in ("step", "seconds")}
@@ -288,6 +285,16 @@ class _Run:
     def _tell_failed_save(self, failure) -> None:
         if failure is not None:
             self.progress.log(f"warning: {failure}; training goes on")
+
+    def _save_overdue(self) -> None:
+        """Only before another chunk: the last state `finish` saves, with what its hooks
+        return, and a step is saved once.
+        """
+        trained = self.step_seconds < math.inf  # in this call: there is something new
+        if self.checkpoints is None or not trained:
+            return
+        if time.monotonic() - self.saved_at >= self.limits[1]:
+            self._save()
 
     def _save(self) -> None:
         self._tell_failed_save(self.checkpoints.failure(wait=True))

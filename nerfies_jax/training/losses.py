@@ -5,6 +5,7 @@ because the length itself has no gradient at zero.
 """
 
 import functools
+import math
 
 import jax
 import jax.numpy as jnp
@@ -142,9 +143,9 @@ def _saturating_jvp(primals, tangents):
 
 
 def _positive(width: float) -> None:
-    if not width > 0:
+    if not 0 < width < math.inf:
         raise ValueError(
-            f"a robust penalty needs width > 0, got {width}; "
+            f"a robust penalty needs a finite width > 0, got {width}; "
             "it is the residual at which the penalty stops being quadratic"
         )
 

@@ -19,11 +19,11 @@ Schedule = Callable[..., Float[Array, "*steps"]]  # of an integer step
 
 def check_falling(learning_rate: float, learning_rate_end: float) -> None:
     """Raise ValueError unless a rate falls, or stays, from one positive number on."""
-    if not 0 < learning_rate_end <= learning_rate:
+    if not 0 < learning_rate_end <= learning_rate < math.inf:
         raise ValueError(
             f"the rate falls from learning_rate={learning_rate} to "
-            f"learning_rate_end={learning_rate_end}; both are positive and the second "
-            "is not larger"
+            f"learning_rate_end={learning_rate_end}; both are positive and finite, "
+            "and the second is not larger"
         )
 
 
@@ -171,6 +171,6 @@ def _ends(name, **values):
     for key, value in values.items():
         if not (math.isfinite(value) and value > 0):
             raise ValueError(
-                f"{name} runs in the logarithm and needs {key} > 0, got {value}; "
-                "use `ramp` to reach zero"
+                f"{name} runs in the logarithm and needs a finite {key} > 0, got "
+                f"{value}; use `ramp` to reach zero"
             )

@@ -1,6 +1,7 @@
 """How a scene that moves starts: from tracks of the pictures, or from rest."""
 
 import dataclasses
+import math
 
 STARTS = ("tracks", "none")
 
@@ -26,8 +27,8 @@ class TrackStartSpec:
                 f"a start from tracks takes at least one step, got fit_steps="
                 f"{self.fit_steps}"
             )
-        if not self.fit_rate > 0:
-            raise ValueError(f"fit_rate={self.fit_rate} must be positive")
+        if not 0 < self.fit_rate < math.inf:
+            raise ValueError(f"fit_rate={self.fit_rate} must be positive and finite")
 
 
 @dataclasses.dataclass(frozen=True)

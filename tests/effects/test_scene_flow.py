@@ -27,17 +27,19 @@ from tests.scene_flow_rays import (
 )
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def terms_of(spec, params, frames, batch, arrays, step):
-    context = context_of(spec, params, frames, batch, *arrays, step)
+@functools.partial(jax.jit, static_argnums=(0, 6))
+def terms_of(spec, params, frames, batch, arrays, step, behind=None):
+    context = context_of(spec, params, frames, batch, *arrays, step, behind)
     return scene_flow.penalty(spec, TIMES, params, context)
 
 
-@pytest.mark.parametrize("step", [0, 250])
-def test_terms_are_sums_over_rays_and_samples_one_by_one(dtype, step):
+@pytest.mark.parametrize(
+    ("step", "behind"), [(0, None), (250, None), (0, (0.9, 0.2, 0.6))]
+)
+def test_terms_are_sums_over_rays_and_samples_one_by_one(dtype, step, behind):
     given = scenario(dtype)
-    terms = terms_of(TINY, *given, step)
-    expected = oracle(*given, step)
+    terms = terms_of(TINY, *given, step, behind)
+    expected = oracle(*given, step, behind)
     assert set(terms) == set(expected)
     for name, value in expected.items():
         # float32 rounds a few ulps of the coordinates, and divides by a deviation

@@ -209,8 +209,8 @@ def level_of(weight, found, dtype):
     looks = {k: jnp.asarray(v, dtype) for k, v in found.items()}
     flat = jnp.zeros(len(weight), dtype)
     weight = jnp.asarray(weight, dtype)
-    parts = (weight, zeros, zeros, weight, {}, {}, zeros[:, 0], flat, flat, flat, None)
-    return RayOutput(*parts, looks={"surface": looks})
+    parts = (weight, zeros, zeros, weight, {}, {}, zeros[:, 0], flat, flat, flat)
+    return RayOutput(*parts, None, weight, None, looks={"surface": looks})
 
 
 def test_costs_of_normals_are_those_of_a_loop(dtype):

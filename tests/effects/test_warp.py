@@ -93,6 +93,18 @@ def test_points_move_as_the_matrix_exponential_says(kind, condition, step, dtype
         np.testing.assert_allclose(moved, truth, rtol=0, atol=bound)
 
 
+@pytest.mark.parametrize("condition", ["code", "time"])
+def test_a_warp_without_hidden_layers_reads_point_and_condition(condition, dtype, rng):
+    spec = dataclasses.replace(SMALL, condition=condition, depth=0, skips=())
+    params, when = bent(spec, dtype), frame(dtype)
+    (point,) = rng.uniform(-1, 1, (1, 3)).astype(dtype)
+    (moved,) = compiled(spec)(params, point[None], when)
+    truth = by_hand(spec, params, point, when) - np.asarray(point, np.float64)
+    # of sums of 25 to 26 products, and the sine and cosine of a screw
+    bound = {"float32": 2e-5, "float64": 1e-13}[dtype] * max(np.abs(truth).max(), 1)
+    np.testing.assert_allclose(moved, truth, rtol=0, atol=bound)
+
+
 @pytest.mark.hard_cases
 @pytest.mark.parametrize(
     ("kind", "anneal_steps"),

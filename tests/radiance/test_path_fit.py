@@ -175,6 +175,19 @@ def test_a_flow_with_a_trunk_of_its_own_learns_slowly_at_first_and_its_medium_no
     assert own.network == own.disocclusion == own.blend == common
 
 
+def test_a_flow_that_was_not_fitted_is_not_held_back():
+    """Beside a warp, which is fitted to the tracks alone."""
+    preset = presets.PRESETS["nsff-grid-small"]
+    warp = presets.PRESETS["nerfies-small"].warp
+    spec = dataclasses.replace(preset, start=TRACKS, warp=warp)
+    field = scene.field(spec, field_of("nsff-small").metadata)
+    params = jax.eval_shape(field.init, jax.random.key(0))
+    rates = scene.learning_rates(spec, field.effects, params, jnp.int32(0))
+    own, common = rates["scene_flow"], rates["scene_flow"].blend
+    assert own.flow == own.flow_trunk == common
+    np.testing.assert_allclose(rates["warp"] / common, spec.start.first_rate, rtol=1e-5)
+
+
 @pytest.mark.parametrize("motion", ["tracks", "none"])
 def test_a_medium_on_tables_learns_at_the_rate_of_the_template(motion):
     preset = presets.PRESETS["nsff-grid-small"]

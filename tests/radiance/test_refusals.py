@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from nerfies_jax import scene
+from nerfies_jax.effects.ambient import AmbientSpec
 from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.effects.background import BackgroundSpec
 from nerfies_jax.effects.elastic import ElasticSpec
+from nerfies_jax.effects.moving_mask import MovingMaskSpec
 from nerfies_jax.effects.time_condition import TimeSpec
 from nerfies_jax.effects.warp import WarpSpec
 from nerfies_jax.nets.planes import PlanesSpec
@@ -18,6 +20,7 @@ from nerfies_jax.radiance.template import TemplateSpec
 from nerfies_jax.scene import RadianceScene
 from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.spec import SamplingSpec
+from nerfies_jax.training.effects import Effect
 
 METADATA = SceneMetadata(
     near=1.0,
@@ -31,6 +34,9 @@ METADATA = SceneMetadata(
 BENT = RadianceScene(
     steps=40, warp=WarpSpec(), time=TimeSpec(), appearance=AppearanceSpec()
 )
+WET = dataclasses.replace(BENT, warp=WarpSpec(guides=("wet",)))
+UNMASKED = dataclasses.replace(BENT, ambient=AmbientSpec(guides=("mask",)))
+MASKED = dataclasses.replace(WET, mask=MovingMaskSpec())
 ON_POINTS = dataclasses.replace(BENT, background=BackgroundSpec())
 TWO_WIDTHS = dataclasses.replace(
     BENT, warp=WarpSpec(code_width=5), time=TimeSpec(condition="code")
@@ -53,6 +59,8 @@ def sample_pdf(edges, weights, count):
         (lambda: TemplateSpec(density="sine"), "'sine'.*softplus"),
         (lambda: TemplateSpec(colour_width=0), "colour_width=0"),
         (lambda: TemplateSpec(depth=0, skips=()), "depth=0"),
+        (lambda: TemplateSpec(density_bias=np.nan), "density_bias=nan must be finite"),
+        (lambda: TemplateSpec(density_bias=-np.inf), "density_bias=-inf"),
         (lambda: SamplingSpec(coarse=1), "coarse=1"),
         (lambda: RadianceScene(steps=1, density_noise=-1.0), "density_noise=-1.0"),
         (lambda: RadianceScene(steps=1, density_noise=np.nan), "density_noise=nan"),
@@ -69,6 +77,10 @@ def sample_pdf(edges, weights, count):
         (lambda: RadianceScene(1, rays=0), "rays=0"),
         (lambda: RadianceScene(0), "steps=0"),
         (lambda: RadianceScene(1, extent=0.0), "extent=0"),
+        (lambda: RadianceScene(1, extent=np.inf), "extent=inf.*finite, or none"),
+        (lambda: RadianceScene(1, learning_rate=np.inf), "learning_rate=inf.*finite"),
+        (lambda: RadianceScene(1, template_rate=np.inf), "template_rate=inf.*finite"),
+        (lambda: RadianceScene(1, table_rate=np.inf), "table_rate=inf.*finite"),
         (lambda: RadianceScene(1, ON_MOMENTS), "position.moments=none"),
         (lambda: RadianceScene(1, coarse=ON_MOMENTS), "position.moments=none"),
         (
@@ -76,6 +88,9 @@ def sample_pdf(edges, weights, count):
             "learning_rate_end",
         ),
         (lambda: scene.build(ON_POINTS, METADATA), "background=none"),
+        (lambda: scene.build(WET, METADATA), "warp.guides names 'wet'.*say nothing"),
+        (lambda: scene.build(UNMASKED, METADATA), "ambient.guides names 'mask'.*mask"),
+        (lambda: scene.build(MASKED, METADATA), "warp.guides names 'wet'.*say mask"),
         (lambda: scene.field(TWO_WIDTHS, METADATA), "code_width"),
         (
             lambda: scene.field(BENT, METADATA, ("elastic",)),
@@ -88,3 +103,10 @@ def sample_pdf(edges, weights, count):
 def test_wrong_settings_are_refused(call, words):
     with pytest.raises(ValueError, match=words):
         call()
+
+
+def test_a_guide_comes_from_an_effect_of_ones_own_that_marks():
+    rain = Effect("rain", mark=lambda own, point, condition: {"wet": point[:1]})
+    assert scene.build(WET, METADATA, (rain,)).spec[2:] == ("rain",)
+    with pytest.raises(ValueError, match="pass an effect with a mark"):
+        scene.build(WET, METADATA, (rain._replace(mark=None),))

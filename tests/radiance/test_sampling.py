@@ -139,6 +139,14 @@ def test_inverse_is_the_bisected_one(dtype, rng):
     np.testing.assert_allclose(got, wanted, atol=tolerance)
 
 
+def test_one_sample_without_a_key_halves_the_weight(dtype, rng):
+    edges, weights = np.sort(rng.uniform(1, 3, 13)), rng.uniform(0.1, 1, 12)
+    got = sample_pdf(None, edges.astype(dtype), weights.astype(dtype), 1)
+    wanted = bisect_inverse(edges, weights, [0.5])
+    tolerance = {"float32": 2e-6, "float64": 1e-14}[dtype]
+    np.testing.assert_allclose(got, wanted, atol=tolerance)
+
+
 HARD = {
     "nothing": np.zeros(16),
     "1e-31": np.full(16, 1e-31),

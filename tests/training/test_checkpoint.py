@@ -111,6 +111,19 @@ def test_a_complete_run_keeps_one_last_evaluation(checkpoint_seconds, tmp_path):
     assert fit(start(), tmp_path / "none", 0).training_share == 0
 
 
+def test_a_run_out_of_time_keeps_its_last_evaluation(tmp_path):
+    """Though an overdue save falls on the step at which the time is over."""
+    hook = loop.Hook("score", lambda state, step: {"psnr": step}, every_steps=10**6)
+    result = fit(
+        start(), tmp_path, 10**6, hooks=[hook], seconds=0.05, checkpoint_seconds=0.0
+    )
+    assert result.stopped_by == "seconds"
+    assert 0 not in checkpoint.steps(tmp_path)
+    kept = checkpoint.restore(tmp_path, start(), SPEC)
+    assert kept.step == result.steps
+    assert [row["step"] for row in kept.record["evaluations"]] == [result.steps]
+
+
 def test_only_the_newest_checkpoints_stay(tmp_path):
     state = start()
     save(tmp_path, *((state, step) for step in (1, 5, 9, 12)), keep=2)

@@ -9,6 +9,7 @@ import pytest
 
 from nerfies_jax.training import losses, schedules
 from nerfies_jax.training.fit import CameraSpec, fit_code
+from nerfies_jax.training.track_start import TrackStartSpec
 from nerfies_jax.training.tracks import InverseSpec, point_tracks
 
 FLAT, TWO, HALF, WHOLE = jax.device_put(
@@ -25,7 +26,9 @@ REFUSED = [
     (lambda: schedules.log_linear(0.0, 1e-3, 10), "start > 0, got 0.0"),
     (lambda: schedules.log_linear(1e-3, -1.0, 10), "end > 0, got -1.0"),
     (lambda: schedules.log_linear(1e-3, math.nan, 10), "end > 0, got nan"),
+    (lambda: schedules.log_linear(math.inf, 1e-4, 9), "finite start > 0, got inf"),
     (lambda: schedules.log_linear(1e-3, 1e-4, 0), "steps=0"),
+    (lambda: schedules.check_falling(math.inf, 1e-4), "=inf to.*positive and finite"),
     (lambda: schedules.log_linear(1.0, 0.1, 9, delay_steps=-1), "delay_steps=-1"),
     (lambda: schedules.log_linear(1.0, 0.1, 9, delay=0.0), "delay=0.0"),
     (lambda: schedules.ramp(0.0, math.inf, 10), "finite end, got inf"),
@@ -40,8 +43,10 @@ REFUSED = [
     (lambda: losses.charbonnier(TWO, 0.0), "width > 0, got 0"),
     (lambda: losses.huber(TWO, 0.0), "width > 0, got 0"),
     (lambda: losses.geman_mcclure(TWO, 0.0), "width > 0, got 0"),
+    (lambda: losses.huber(TWO, math.inf), "finite width > 0, got inf"),
     (lambda: losses.geman_mcclure(TWO, 1.0, "neat"), "'paper' or 'official'"),
     (lambda: losses.photometric(FLAT, FLAT, dssim_weight=1.5), r"\[0, 1\], got 1.5"),
+    (lambda: TrackStartSpec(fit_rate=math.inf), "fit_rate=inf must be positive and"),
     (lambda: InverseSpec(atol=0.0), r"atol=0\.0 must"),
     (lambda: InverseSpec(reach=-1.0), r"reach=-1\.0 must"),
     (lambda: tracks_from(3), r"row=3 is not in 0 \.\. 2"),
