@@ -26,11 +26,10 @@ def count(function: Callable, *args: Any) -> Counted:
     as in `lax.map` over blocks of Gaussians. Of the branches of a condition the dearest
     counts, and what nothing reads does not.
     """
-    return of_jaxpr(jax.make_jaxpr(function)(*args).jaxpr)
+    return _of_jaxpr(jax.make_jaxpr(function)(*args).jaxpr)
 
 
-def of_jaxpr(jaxpr: core.Jaxpr) -> Counted:
-    """The same of a function that was traced before."""
+def _of_jaxpr(jaxpr) -> Counted:
     flops, at_least = 0.0, False
     read = _variables(jaxpr.outvars)
     for equation in reversed(jaxpr.eqns):
@@ -38,7 +37,7 @@ def of_jaxpr(jaxpr: core.Jaxpr) -> Counted:
             continue
         read |= _variables(equation.invars)
         name = equation.primitive.name
-        counts = [of_jaxpr(inner) for inner in _inner(equation.params)]
+        counts = [_of_jaxpr(inner) for inner in _inner(equation.params)]
         inner = sum(one.flops for one in counts)
         if name == "dot_general":
             inner = _product(equation)

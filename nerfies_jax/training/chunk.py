@@ -121,7 +121,7 @@ class Program:
         # Traced once for both lengths, which takes most of the time to lower.
         self._step, self._devices = jax.jit(step, inline=True), devices
         self._shapes = jax.tree.map(_abstract, (self._on_all(state), frames))
-        self._traced, self._lowered, self._programs = {}, {}, {}
+        self._lowered, self._programs = {}, {}
         self.length = 1
         if steps >= FEW_STEPS and self._flops() < LARGE_FLOPS:
             self.length = LENGTH
@@ -132,21 +132,15 @@ class Program:
 
         Of a step in micro-batches, or in slabs of pixels, each has a part.
         """
-        traced = self._trace(LENGTH)
-        products = matrix_flops.of_jaxpr(traced.jaxpr.jaxpr).flops / LENGTH
         counted = self._lower(LENGTH).cost_analysis() or {}
+        products = matrix_flops.count(self._step, *self._shapes).flops
         return max(products, counted.get("flops", 0.0))
-
-    def _trace(self, length):
-        if length not in self._traced:
-            scan = functools.partial(_run_scan, self._step, length)
-            scan = jax.jit(scan, donate_argnums=0)
-            self._traced[length] = scan.trace(*self._shapes)
-        return self._traced[length]
 
     def _lower(self, length):
         if length not in self._lowered:
-            self._lowered[length] = self._trace(length).lower()
+            scan = functools.partial(_run_scan, self._step, length)
+            scan = jax.jit(scan, donate_argnums=0)
+            self._lowered[length] = scan.lower(*self._shapes)
         return self._lowered[length]
 
     def _on_all(self, state):
