@@ -189,7 +189,7 @@ def refuse_what_cannot_train(spec: SplatScene) -> None:
 
     Not when the settings are made: a trained scene may be drawn without its motion.
     """
-    motion, growth = spec.motion, spec.motion_growth
+    motion = spec.motion
     if motion is None:
         orphans = [name for name in OF_MOTION if getattr(spec, name) is not None]
         orphans += ["start.motion"] if spec.start.motion == "tracks" else []
@@ -206,6 +206,30 @@ def refuse_what_cannot_train(spec: SplatScene) -> None:
         )
     if spec.neighbours is not None:
         _embedded(motion)
+    resting = isinstance(motion, AnchorMotionSpec) and not motion.moves
+    if resting and spec.start.motion == "tracks":
+        raise ValueError(
+            'motion.moves=false with start.motion="tracks": anchors at rest have no '
+            "motion to fit to tracks; leave one of them out"
+        )
+    _refuse_beside_carried(spec)
+    still = 0 if spec.start.motion == "tracks" or motion is None else motion.warm_up
+    if still and getattr(motion, "fading", None) is not None:
+        raise ValueError(
+            f"motion.warm_up={still} with motion.fading: what is drawn fades from the "
+            "first step, and what is trained only then; leave one of them out "
+            "(motion.warm_up=0 or motion.fading=none)"
+        )
+    _refuse_growth(spec, still)
+    if spec.annealing is not None:
+        phases.annealed(lambda step: step, spec.annealing, spec.steps)
+    if isinstance(motion, MotionSpec):
+        mlp_motion.trunk_spec(motion)
+    _refuse_late(spec, still)
+
+
+def _refuse_beside_carried(spec):
+    """Raise ValueError for what rows that carry Gaussians cannot have."""
     carry = carried_count(spec) is not None
     if carry and isinstance(spec.densification, MCMCStrategySpec):
         raise ValueError(
@@ -218,15 +242,9 @@ def refuse_what_cannot_train(spec: SplatScene) -> None:
             "flow is compared where rows are drawn, and rows that carry Gaussians are "
             f"not; leave it out (flow=none), or {ALONE}"
         )
-    resting = isinstance(motion, AnchorMotionSpec) and not motion.moves
-    if resting and spec.start.motion == "tracks":
-        raise ValueError(
-            'motion.moves=false with start.motion="tracks": anchors at rest have no '
-            "motion to fit to tracks; leave one of them out"
-        )
     fading = {
         "temporal_opacity": spec.temporal_opacity,
-        "motion.fading": getattr(motion, "fading", None),
+        "motion.fading": getattr(spec.motion, "fading", None),
     }
     faded = [name for name, one in fading.items() if one is not None]
     if carry and faded:
@@ -235,13 +253,11 @@ def refuse_what_cannot_train(spec: SplatScene) -> None:
             "drawn, with opacities of their own; leave it out "
             f"({faded[0]}=none), or {ALONE}"
         )
-    still = 0 if spec.start.motion == "tracks" or motion is None else motion.warm_up
-    if still and getattr(motion, "fading", None) is not None:
-        raise ValueError(
-            f"motion.warm_up={still} with motion.fading: what is drawn fades from the "
-            "first step, and what is trained only then; leave one of them out "
-            "(motion.warm_up=0 or motion.fading=none)"
-        )
+
+
+def _refuse_growth(spec, still):
+    """Raise ValueError where motion would steer no growth."""
+    growth = spec.motion_growth
     if growth is not None and not isinstance(spec.densification, DefaultStrategySpec):
         raise ValueError(
             "motion_growth steers the gradient threshold of DefaultStrategySpec, which "
@@ -253,11 +269,6 @@ def refuse_what_cannot_train(spec: SplatScene) -> None:
             f"(up to step {still}), when nothing moves and so nothing would "
             "grow; start it some hundred steps later"
         )
-    if spec.annealing is not None:
-        phases.annealed(lambda step: step, spec.annealing, spec.steps)
-    if isinstance(motion, MotionSpec):
-        mlp_motion.trunk_spec(motion)
-    _refuse_late(spec, still)
 
 
 def _refuse_late(spec, still):
