@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple
 
 from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.capture.capture import CaptureError, describe
+from nerfies_jax.capture.given import GivenFiles
 from nerfies_jax.evidence import inspection
 from nerfies_jax.runs import (
     adviser,
@@ -18,6 +19,7 @@ from nerfies_jax.runs import (
     quality,
     representations,
     run_folder,
+    same_capture,
     train,
 )
 from nerfies_jax.runs.config import MoreMetrics, Preparation, RunConfig
@@ -98,6 +100,7 @@ def reconstruct(
             folder = run_folder.new_run_folder(out, stem)
             held.enter_context(run_folder.owned(folder))
             save_config(folder, run)
+            same_capture.record(folder, run.capture)
             checkpoints = _opened(held, folder, run, state, None)
             hooks = _watching(held, watched, run, folder)
         start = state, None, checkpoints
@@ -119,17 +122,18 @@ def resume(
 
     One that is complete gets its products again. `expected` and `overrides` say what
     the run must have been started with: fields of its config and of its source by name,
-    and fields of its spec. Raises Refused where they differ, and where another process
-    is at work in the folder.
+    and fields of its spec; a capture that was moved since is named where it lies now.
+    Raises Refused where they differ, where pictures or cameras are others than when the
+    run was begun, and where another process is at work in the folder.
     """
     began = time.perf_counter()
     folder = pathlib.Path(folder)
     with contextlib.ExitStack() as held:
         with _refusing():
             pace = Pace(seconds, evaluate_every, checkpoint_every)
-            _check_expected(folder, expected)
+            moved = _check_expected(folder, expected)
             held.enter_context(run_folder.owned(folder))
-            run = saved_run(folder, overrides)
+            run = saved_run(folder, overrides, moved)
             _describe(run)
             extra = quality.prepared(more, run.capture.size)
             state, record, after = _restored(folder, run)
@@ -214,12 +218,17 @@ def _describe(run):
 
 
 def _check_expected(folder, expected):
-    """Raise ValueError naming both values where a run was started with others."""
+    """Raise ValueError naming both values where a run was started with others.
+
+    Returns what of its source has been moved since, by name.
+    """
     config = read_settings(folder).config
     stored = {**vars(config), **vars(config.source)}
     there, source = stored["capture"], expected.get("capture")
     if there is not None and source is not None and run_folder.is_of(there, source):
         expected = {**expected, "capture": there}  # or a film that it was made of
+    moved = {k: x for k, x in expected.items() if _has_moved(stored[k], x)}
+    stored = stored | moved
     unlike = [
         f"{name.replace('_', '-')}: saved {stored[name]}, now {value}"
         for name, value in expected.items()
@@ -230,6 +239,17 @@ def _check_expected(folder, expected):
             f"{folder}: the run was started with other settings: {'; '.join(unlike)}; "
             "leave them out to continue it, or start anew in another --out"
         )
+    return moved
+
+
+def _has_moved(old, new):
+    """Whether what is not in its old place any more may be what is named now."""
+    if isinstance(old, GivenFiles):
+        pairs = [(x, getattr(new, name)) for name, x in vars(old).items()]
+        unlike = [(x, y) for x, y in pairs if x != y]
+        return bool(unlike) and all(_has_moved(x, y) for x, y in unlike)
+    paths = isinstance(old, pathlib.Path) and isinstance(new, pathlib.Path)
+    return paths and not old.exists() and new.exists()
 
 
 def _restored(folder, run):

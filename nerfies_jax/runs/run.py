@@ -4,6 +4,8 @@ import dataclasses
 import json
 import os
 import pathlib
+import shlex
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -20,7 +22,7 @@ from nerfies_jax.evaluation.lens import ThroughLens
 from nerfies_jax.evaluation.representation import Representation
 from nerfies_jax.evaluation.scores import Draw
 from nerfies_jax.evidence import frame_flow, frame_masks, given_files
-from nerfies_jax.runs import own_effects, representations
+from nerfies_jax.runs import own_effects, representations, same_capture
 from nerfies_jax.runs.config import CaptureSource, RunConfig
 from nerfies_jax.runs.run_folder import CHECKPOINTS, CONFIG
 from nerfies_jax.training import checkpoint, specs
@@ -222,11 +224,17 @@ def save_config(folder: pathlib.Path, run: Run) -> None:
     )
 
 
-def saved_run(folder: pathlib.Path, overrides: tuple[str, ...] = ()) -> Run:
-    """The run in a folder, with the settings it was made with.
+def saved_run(
+    folder: pathlib.Path,
+    overrides: tuple[str, ...] = (),
+    moved: Mapping[str, Any] = {},
+) -> Run:
+    """The run in a folder, with the settings and the capture it was made with.
 
-    They come from its `config.json`, not from the preset, which may have changed since.
-    Raises ValueError where `overrides` would change them.
+    Settings come from its `config.json`, not from the preset, which may have changed
+    since; `moved` says which parts of its source lie elsewhere today, and is kept.
+    Raises ValueError where `overrides` would change settings, and where the capture is
+    not the one that the run was begun with.
     """
     config, kind, spec = read_settings(folder)
     wanted = specs.override(spec, overrides)
@@ -236,7 +244,19 @@ def saved_run(folder: pathlib.Path, overrides: tuple[str, ...] = ()) -> Run:
             f"{folder}: the run was started with other settings: {'; '.join(changed)}; "
             "leave them out to continue it, or start anew in another --out"
         )
-    return open_run(config, kind, spec)
+    source = dataclasses.replace(config.source, **moved)
+    if source.capture is not None and not source.capture.exists():
+        raise ValueError(
+            f"{folder}: its capture {source.capture} is not there; if it lies "
+            "elsewhere now, say where: python -m experiments.reconstruct CAPTURE --out "
+            f"{shlex.quote(str(folder))} --resume"
+        )
+    run = open_run(dataclasses.replace(config, source=source), kind, spec)
+    same_capture.check(folder, run.capture)
+    if moved:
+        stored = json.loads((folder / CONFIG).read_text())
+        write_json(folder / CONFIG, stored | {"config": specs.as_json(run.config)})
+    return run
 
 
 def read_settings(folder: pathlib.Path) -> Settings:

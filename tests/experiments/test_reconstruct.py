@@ -55,6 +55,7 @@ def run(tmp_path_factory):
 
 PRODUCTS = (
     "config.json",
+    "capture.npz",
     "metrics.json",
     "comparison.png",
     "psnr_over_time.png",

@@ -69,7 +69,8 @@ def opened(monkeypatch):
     """What `saved_run` opens, without reading a capture."""
 
     def unread(config, kind, spec):
-        return runs.Run(config, None, None, kind, spec, None, None)
+        capture = scenes.tiny_capture()
+        return runs.Run(config, capture, capture, kind, spec, None, None)
 
     monkeypatch.setattr(run, "open_run", unread)
 
