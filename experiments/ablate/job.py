@@ -199,8 +199,11 @@ class Job:
         What a step costs is seen on the arm's run over --steps where there is one, or
         on a short pilot. It depends on the number of steps, as Gaussians grow: where
         the first try misses the time by too much, there is a second one; what takes too
-        long is not trained to its end for that.
+        long is not trained to its end for that. Steps that are settled are taken.
         """
+        settled = results.settled_steps(budget.folder).get(name)
+        if settled is not None:
+            return settled, self._train(name, 0, settled)
         other = None
         if self.budgets[0] is not budget:
             other = self.kept(name, 0, self.budgets[0])

@@ -15,6 +15,8 @@ from nerfies_jax.capture import npz_files
 from nerfies_jax.capture.json_files import replaced_file, write_json
 from nerfies_jax.training.provenance import provenance
 
+STEPS = "steps.json"  # of arms that need not find out what their seconds are worth
+
 
 class ArmResult(NamedTuple):
     """What is left of one arm and seed when it is finished."""
@@ -85,6 +87,17 @@ def steps_of(path: pathlib.Path) -> int | None:
         raise ValueError(
             f"{path}: not a finished arm ({error}); remove it to run it again"
         ) from error
+
+
+def settle_steps(folder: pathlib.Path, steps: dict[str, int]) -> None:
+    """Keep over how many steps some arms of this folder are to be trained."""
+    write_json(folder / STEPS, settled_steps(folder) | steps)
+
+
+def settled_steps(folder: pathlib.Path) -> dict[str, int]:
+    """What `settle_steps` kept, by arm; of all others the first seed finds them."""
+    path = folder / STEPS
+    return json.loads(path.read_text()) if path.is_file() else {}
 
 
 @contextlib.contextmanager

@@ -13,8 +13,8 @@ length and seed, trained in a process of its own: all cells of the first seed co
 first, and short lengths before long ones. What is finished is kept in --out, and
 the same command goes on where it was stopped or where --budget ended it; with --keep
 also from another clone, with the cells that are kept beside the code and would be made
-with the same settings today. Writes league.json and league.png there; rows that lose
-stay in.
+with the same settings today, but for rows that are to be made --anew. Writes
+league.json and league.png there; rows that lose stay in.
 """
 
 from experiments import cli
@@ -39,6 +39,8 @@ def main(args):
         every = contests.opened(args, arms)
     if args.keep:
         kept = contests.kept(results.ROOT / results.STUDIES["league"].measured)
+        with cli.user_errors():
+            kept = contests.without(kept, args.anew, every)
         count = contests.restore(kept, every)
         if count:
             print(f"{count} cells are kept from before and are not made again")

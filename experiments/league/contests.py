@@ -88,6 +88,30 @@ def restore(before: dict[str, Any], jobs: list[Job]) -> int:
     return count
 
 
+def without(
+    before: dict[str, Any], names: tuple[str, ...], jobs: list[Job]
+) -> dict[str, Any]:
+    """What is kept but for the cells of some rows, whose steps stay settled.
+
+    Another day's seconds are worth other steps: made anew, a row stands beside the
+    others over as many as they were given. ValueError for rows that are not asked for.
+    """
+    left = copy.deepcopy(before)
+    for name in names:
+        if not any(name in job.names for job in jobs):
+            raise ValueError(f"--anew {name}: is not among the rows that are asked for")
+    for job, one in itertools.product(jobs, left.get("contests", ())):
+        if (one["film"], one["seconds"]) != (job.out.name, job.args.seconds):
+            continue
+        rows_of = {n: one["rows"][n] for n in names if n in one["rows"]}
+        for row in rows_of.values():
+            row["cells"] = {}
+        if job.args.seconds is not None:
+            steps = {n: row["steps"] for n, row in rows_of.items() if row["steps"]}
+            results.settle_steps(job.budgets[0].folder, steps)
+    return left
+
+
 def _made_with(identity):
     """Equal where two seeds of a row may stand side by side."""
     return _digest({k: x for k, x in identity.items() if k != "seed"})

@@ -54,6 +54,9 @@ class League:
     keep: bool = False
     """Begin with the numbers that are kept beside the code, keep all of them there, and
     renew docs/results/league.md."""
+    anew: tuple[str, ...] = ()
+    """Rows of which nothing that is kept counts any more, as after a mend: they are
+    made again, over the steps that they had, whatever a second is worth here today."""
     device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
     """Where to compute."""
 
@@ -66,6 +69,8 @@ class League:
                 f"positive, got {self.seeds}, {self.frames}, {self.tracks}, "
                 f"{self.jobs}, {self.budget} and {self.budgets}"
             )
+        if self.anew and not self.keep:
+            raise ValueError(f"--anew {self.anew[0]}: is for what is kept, give --keep")
         if not self.budgets and not self.own_steps:
             raise ValueError("nothing to train: give --budgets, or --own-steps")
         unknown = [name for name in self.scenes if name not in cli.SCENES]

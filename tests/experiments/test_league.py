@@ -215,5 +215,39 @@ def test_kept_cells_of_other_settings_are_never_lost_nor_mixed(which, league):
     assert contests.merged(whole, now)["contests"] == now["contests"]
 
 
+def test_rows_are_made_anew_over_the_steps_that_they_had(league, tmp_path, monkeypatch):
+    settled, _ = league
+    one, other = "d-nerf-small", "d-nerf-small+tracks"
+    whole = played(settled, rows.of_presets(settled.presets))
+    there = dataclasses.replace(settled, out=tmp_path / "anew", budgets=(9.0,))
+    jobs = contests.opened(there, (one, other))
+    kept = contests.without(whole, (one,), jobs)
+    assert contests.restore(kept, jobs) == 2  # both seeds of the other row
+    before = json.dumps(whole)
+    trained = []
+
+    def train(self, name, seed, steps, at_most=None):
+        trained.append((name, seed, steps, at_most))
+        numbers = dict.fromkeys(MEASURES, 5.0) | {"steps": float(steps)}
+        return ArmResult(numbers, {}, {"steps": steps, "stopped_by": "steps"})
+
+    monkeypatch.setattr(type(jobs[0]), "_train", train)
+    for name, seed in jobs[0].missing():
+        jobs[0].make(name, seed, jobs[0].budgets[0])
+    assert trained == [(one, 0, 7, None), (one, 1, 7, None)]  # no pilot, no second try
+    now = contests.merged(kept, contests.record(there, jobs))
+    assert json.dumps(whole) == before
+    for old, new in zip(whole["contests"], now["contests"], strict=True):
+        for name, row in new["rows"].items():
+            if (name, new["seconds"]) == (one, 9.0):
+                assert row["cells"]["1"]["numbers"]["psnr"] == 5.0
+                row = row | {"cells": old["rows"][name]["cells"]}
+            assert row == old["rows"][name]
+    with pytest.raises(ValueError, match="--anew nerf-small: is not among"):
+        contests.without(whole, ("nerf-small",), jobs)
+    with pytest.raises(ValueError, match="nerf-small: is for what is kept"):
+        League(anew=("nerf-small",))
+
+
 def test_a_length_named_twice_is_one(tmp_path):
     assert League(budgets=(9.0, 9.0), own_steps=True).limits == (9.0, None)
