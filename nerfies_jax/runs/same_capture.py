@@ -71,7 +71,7 @@ def _means(image):
         np.linspace(0, side, min(BLOCKS, side), endpoint=False, dtype=int)
         for side in image.shape[:2]
     )
-    sums = np.add.reduceat(image.astype(np.float64), rows, axis=0)
+    sums = np.add.reduceat(image, rows, axis=0, dtype=np.uint32)
     sums = np.add.reduceat(sums, columns, axis=1)
     height = np.diff(rows, append=image.shape[0])
     width = np.diff(columns, append=image.shape[1])
