@@ -81,7 +81,7 @@ def restore(before: dict[str, Any], jobs: list[Job]) -> int:
             identity = job.identity(name, seed, row["steps"], job.budgets[0])
             if row["made_with"] == _made_with(identity):
                 numbers = results.read_numbers(cell["numbers"])
-                notes = {key: cell[key] for key in ("stopped_by", "cpu")}
+                notes = {key: cell[key] for key in ("stopped_by", "cpu", "revision")}
                 notes["steps"] = int(numbers["steps"])
                 results.write(place, identity, ArmResult(numbers, {}, notes))
                 count += 1
@@ -211,6 +211,7 @@ def _cell(kept, cpu):
         "numbers": results.stored_numbers(kept.numbers),
         "stopped_by": kept.notes["stopped_by"],
         "cpu": kept.notes.get("cpu", cpu),  # of one that was restored
+        "revision": kept.notes["revision"],
     }
 
 

@@ -1,5 +1,6 @@
 """The page of `experiments.league` in docs/results, and its picture."""
 
+import collections
 import pathlib
 from collections.abc import Mapping
 from typing import Any
@@ -47,10 +48,7 @@ READING = """\
   in twenty shows by chance: near rows are a tie.
 - `+tracks` is a preset whose motion is fitted to tracks before training, `+rest` one
   that would be and is not, `+no-depth` one without its depth term.
-- The numbers kept beside the code are from before two mends: density control counts
-  only views that see a Gaussian, and the penalties of `4dgs`, `edgs`, `sc-gs`, `dynmf`
-  and `e-d3dgs` wait until their motion begins, which concerns their rows `+rest` (those
-  of `4dgs` and `edgs` did not move at all)."""
+- Not all cells are of one revision of the code: those are at the end of the page."""
 WHOLE = League()
 
 
@@ -69,7 +67,10 @@ def page(stored: Mapping[str, Any]) -> str:
             parts.append(f"Scored where they stopped before their steps: {stopped}.")
         if len(contest.cpus) > 1:
             parts.append(_machines(contest))
-    return "\n\n".join([*parts, margins.section(contests)])
+    parts.append(margins.section(contests))
+    if any(contest.numbers for contest in contests):
+        parts.append(_revisions(contests))
+    return "\n\n".join(parts)
 
 
 def _progress(contests):
@@ -90,6 +91,26 @@ def _progress(contests):
         )
     parts.append(f"The whole league is {whole * WHOLE.seeds:,} cells and any captures.")
     return " ".join(parts)
+
+
+def _revisions(contests):
+    """With which code the cells were made, most first."""
+    counted = sum((contest.revisions for contest in contests), collections.Counter())
+    return (
+        "## Revisions\n\n"
+        "Cells by the revision of the code that made them, or (*before*) by the first "
+        "that kept them; the changelog says what was mended since. "
+        + ", ".join(
+            f"`{_short(name)}` {count}" for name, count in counted.most_common()
+        )
+        + "."
+    )
+
+
+def _short(revision):
+    """Enough of its name, and a plus where the code had changes."""
+    name, plus, _ = revision.partition("+")
+    return name[:14] + plus
 
 
 def _machines(contest):

@@ -1,5 +1,6 @@
 """What the numbers of a league say, film by film and length by length."""
 
+import collections
 import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -27,6 +28,7 @@ class Contest(NamedTuple):
     reads: dict[str, list[str]]  # beside pictures, cameras and points
     stopped: list[str]  # cells that ended before their steps, in words
     cpus: dict[str, list[str]]  # cells by processor, in words
+    revisions: collections.Counter[str]  # of the code that made them: how many cells
 
 
 def of_stored(stored: Mapping[str, Any]) -> Contest:
@@ -35,6 +37,7 @@ def of_stored(stored: Mapping[str, Any]) -> Contest:
     if stored["seconds"] is not None:
         length = f"{stored['seconds']:g} processor seconds"
     numbers, missing, stopped, cpus = {}, {}, [], {}
+    revisions = collections.Counter()
     for name, row in stored["rows"].items():
         for seed in stored["seeds"]:
             cell = row["cells"].get(str(seed))
@@ -45,6 +48,7 @@ def of_stored(stored: Mapping[str, Any]) -> Contest:
             numbers[name, seed] = {key: known.get(key, math.nan) for key in MEASURES}
             words = f"`{name}` (seed {seed})"
             cpus.setdefault(cell["cpu"], []).append(words)
+            revisions[cell["revision"]] += 1
             if cell["stopped_by"] != "steps":
                 stopped.append(f"{words}: {cell['stopped_by']}")
     return Contest(
@@ -57,6 +61,7 @@ def of_stored(stored: Mapping[str, Any]) -> Contest:
         {name: row["reads"] for name, row in stored["rows"].items()},
         stopped,
         cpus,
+        revisions,
     )
 
 

@@ -38,7 +38,8 @@ def test_every_small_preset_is_a_row_and_each_motion_has_both_starts():
 def cell(**values):
     numbers = dict.fromkeys(MEASURES, math.nan) | values
     stored = {k: x if math.isfinite(x) else None for k, x in numbers.items()}
-    return {"numbers": stored, "stopped_by": "steps", "cpu": "Abacus"}
+    made = {"stopped_by": "steps", "cpu": "Abacus", "revision": 40 * "a"}
+    return {"numbers": stored, **made}
 
 
 def contest(names, **more):
@@ -55,11 +56,13 @@ def test_the_page_of_a_part_says_what_is_there_and_what_is_missing():
         other_cells[str(seed)] = cell(psnr=other)
     # A lucky first seed does not crown a row that has no other.
     lucky = cell(psnr=40.0) | {"stopped_by": "non-finite", "cpu": "Difference Engine"}
+    lucky["revision"] = 40 * "b" + "+changes"
     part["rows"]["nerf"] = {"cells": {"0": lucky}, "reads": ["depths", "flow"]}
     empty = contest(["nerf"], film="kitchen", seconds=None)
     text = page.page({"contests": [part, empty]})
     assert text.startswith("**7 of 12 cells**")
     assert "Seeds so far: 0, 1, 2" in text
+    assert "`aaaaaaaaaaaaaa` 6, `bbbbbbbbbbbbbb+` 1." in text
     assert "One seed has no spread" not in text
     assert "Not there: `nerf` (seed 1, 2)." in text
     assert "Not there: `nerf`.\n" in text
