@@ -109,13 +109,19 @@ def init(spec: WarpSpec, key: Key[Array, ""], dtype=jnp.float32) -> MLP:
     }
     hidden = list(params.hidden)
     if spec.anneal_steps is not None:
-        first = 3 if spec.position.identity else 0
         for index in ({0} | set(spec.skips)) & set(range(spec.depth)):
             above = spec.width if index else 0  # rows that read the layer before
-            rows = slice(above + first, above + spec.position.width(3))
-            layer = hidden[index]
-            hidden[index] = layer._replace(weight=layer.weight.at[rows].set(0))
+            hidden[index] = _closed(spec, hidden[index], above)
+        if not hidden:
+            heads = {name: _closed(spec, head, 0) for name, head in heads.items()}
     return MLP(tuple(hidden), heads)
+
+
+def _closed(spec, layer, above):
+    """The layer, which reads the bands behind so many rows, without them."""
+    first = 3 if spec.position.identity else 0
+    rows = slice(above + first, above + spec.position.width(3))
+    return layer._replace(weight=layer.weight.at[rows].set(0))
 
 
 def displace(

@@ -156,6 +156,11 @@ def test_weights_of_bands_that_open_late_start_at_zero():
         kept = np.r_[0 : above + 3, above + features : weight.shape[0]]
         np.testing.assert_array_equal(weight[kept], plain.hidden[index].weight[kept])
     np.testing.assert_array_equal(annealed.hidden[1].weight, plain.hidden[1].weight)
+    # Without hidden layers it is the heads that read them.
+    bare = WarpSpec(anneal_steps=100, depth=0, skips=())
+    for head in started(bare, jax.random.key(0), FLOAT32).heads.values():
+        assert np.all(np.asarray(head.weight)[3:features] == 0)
+        assert np.all(np.asarray(head.weight)[:3] != 0)
 
 
 @pytest.mark.hard_cases
