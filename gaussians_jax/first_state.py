@@ -27,8 +27,10 @@ HIDDEN_LOGIT = 2.0
 
 def estimate_memory_bytes(spec: SplatScene, capture: Capture) -> int:
     """Roughly the memory of the first state and step; host side, nothing allocated."""
-    count = initialisation.initial_count(spec.init, capture)
-    count += spec.start.moving_points if spec.start.motion == "tracks" else 0
+    tracked = spec.start.motion == "tracks"
+    init = initialisation.of_start(spec.init, tracked)
+    count = initialisation.initial_count(init, capture)
+    count += spec.start.moving_points if tracked else 0
     count *= 1 + (carried_count(spec) or 0)
     harmonics = 3 * (spec.sh_degree + 1) ** 2
     # Parameters, two moments, gradient, update; the tables of one projection.
@@ -56,8 +58,9 @@ def first_state(
     start_key, run_key = jax.random.split(key)
     seed = int(jax.random.randint(start_key, (), 0, np.iinfo(np.int32).max))
     tracked, hidden, capture = _from_tracks(spec, effects, capture, start_key)
-    position, colour = initialisation.initial_points(spec.init, capture, seed)
     most = None if spec.densification is None else spec.densification.cap_max
+    init = initialisation.of_start(spec.init, tracked is not None, most)
+    position, colour = initialisation.initial_points(init, capture, seed)
     if hidden is not None and most is not None:
         hidden = _thinned(hidden, most - len(position) - len(tracked.position))
     guessed = slice(len(position), len(position))

@@ -23,12 +23,15 @@ class InitSpec:
     `source` "auto" takes the capture's own points where there are at least `min_points`
     and random ones otherwise; "points" and "random" insist on one, as MoBa-GS does on
     either (it claims to need no points from structure from motion).
+
+    Beside the capture's own points `extra_random` are drawn in the views. None: half as
+    many as `points`, and none where tracks bring what moves (`of_start`).
     """
 
     points: int = 100_000  # at most so many of the capture's own points
     random: int = 10_000  # drawn in the views instead of them
     min_points: int = 100
-    extra_random: int = 0  # drawn in the views beside the capture's own points
+    extra_random: int | None = 0
     opacity: float = 0.1
     scale: float = 1.0  # over the distance to the nearest neighbours
     max_scale: float = 0.03  # first scale, over the distance to the nearest camera
@@ -37,7 +40,7 @@ class InitSpec:
     def __post_init__(self):
         if self.source not in SOURCES:
             raise ValueError(f"unknown source {self.source!r}; choose from {SOURCES}")
-        if self.points < 1 or self.random < 1 or self.extra_random < 0:
+        if self.points < 1 or self.random < 1 or (self.extra_random or 0) < 0:
             raise ValueError(
                 f"a scene starts from at least one Gaussian, got points={self.points}, "
                 f"random={self.random} and extra_random={self.extra_random}"
@@ -87,20 +90,35 @@ def uses_capture_points(spec: InitSpec, capture: Capture) -> bool:
     return spec.source != "random" and points >= enough
 
 
+def of_start(spec: InitSpec, tracked: bool, most: int | None = None) -> InitSpec:
+    """The same with a number of random points, where it leaves that to the start.
+
+    Structure from motion finds what stands still, so what moves has no points of its
+    own: tracks bring it, or random points in the volume give it something to grow from,
+    as far as `most` Gaussians go.
+    """
+    if spec.extra_random is not None:
+        return spec
+    extra = 0 if tracked else spec.points // 2
+    if most is not None:
+        extra = max(min(extra, most - spec.points), 0)
+    return dataclasses.replace(spec, extra_random=extra)
+
+
 def initial_count(spec: InitSpec, capture: Capture) -> int:
     """How many Gaussians there are at first; host side, nothing is drawn."""
     if not uses_capture_points(spec, capture):
         return spec.random
-    return min(len(capture.points.position), spec.points) + spec.extra_random
+    extra = of_start(spec, False).extra_random
+    return min(len(capture.points.position), spec.points) + extra
 
 
 def initial_points(spec: InitSpec, capture: Capture, seed: int):
     """Positions and colours in [0, 1] of the first Gaussians; host side.
 
-    Structure from motion finds what stands still, so what moves has no points of its
-    own; `spec.extra_random` random ones in the volume give it something to grow from.
     Random points alone lie between the capture's near and far, whatever points it has.
     """
+    spec = of_start(spec, False)
     rng = np.random.default_rng(seed)
     if not uses_capture_points(spec, capture):
         return _random_points(rng, capture, spec.random, (capture.near, capture.far))

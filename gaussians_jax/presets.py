@@ -84,7 +84,7 @@ MOTION_GS = SplatScene(
 # tracks and depths come from networks, these from optical flow (`evidence`).
 TRACKED = SplatScene(
     steps=30_000,
-    init=InitSpec(points=50_000),
+    init=InitSpec(points=50_000, extra_random=None),
     motion=SE3BasesSpec(bases=20, knots=44),
     temporal_opacity=TemporalOpacitySpec(),
     start=StartSpec(motion="tracks", moving_points=20_000),
@@ -154,7 +154,7 @@ SPACETIME = SplatScene(steps=30_000, motion=PolynomialMotionSpec())
 # capture has, and takes control points away, which here stay.
 SPLINE = SplatScene(
     steps=20_000,
-    init=InitSpec(points=50_000),
+    init=InitSpec(points=50_000, extra_random=None),
     motion=SplineMotionSpec(),
     start=StartSpec(motion="tracks", moving_points=20_000),
 )
@@ -177,7 +177,7 @@ FOUR_D = SplatScene(
 # of nodes to step 40,000.
 SC_GS = SplatScene(
     steps=80_000,
-    init=InitSpec(points=50_000),
+    init=InitSpec(points=50_000, extra_random=None),
     learning_rates=LearningRateSpec(log_scale=1e-3),
     densification=DefaultStrategySpec(refine_stop_iter=50_000),
     motion=NodeMotionSpec(),
@@ -190,7 +190,7 @@ SC_GS = SplatScene(
 # steps are our choice.
 EDGS = SplatScene(
     steps=40_000,
-    init=InitSpec(points=50_000),
+    init=InitSpec(points=50_000, extra_random=None),
     motion=NodeMotionSpec(nodes=2048, rigidity=None, mask=MaskSpec()),
     start=StartSpec(motion="tracks", moving_points=20_000),
 )

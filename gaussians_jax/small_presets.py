@@ -78,7 +78,7 @@ SMALL_FROM_TRACKS = dataclasses.replace(
     SMALL_STATIC,
     steps=2000,
     batch_size=2,
-    init=InitSpec(points=4000, random=5000),
+    init=InitSpec(points=4000, random=5000, extra_random=None),
     sh_every=700,
     densification=dataclasses.replace(
         SMALL_STATIC.densification,
@@ -160,7 +160,7 @@ SMALL_DEFORMABLE = dataclasses.replace(
 # 28.69 / 24.54); followed points are off by 0.0099 scene units.
 SMALL_D_MISO = dataclasses.replace(
     SMALL_FROM_TRACKS,
-    init=InitSpec(points=1500, random=1500),
+    init=InitSpec(points=1500, random=1500, extra_random=None),
     start=StartSpec(motion="tracks", moving_points=800),
     densification=dataclasses.replace(SMALL_FROM_TRACKS.densification, cap_max=2500),
     motion=SMALL_DEFORMABLE.motion,
@@ -177,7 +177,7 @@ SMALL_D_MISO = dataclasses.replace(
 # A tenth of the rows, and ten Gaussians of each.
 SMALL_ADC_GS = dataclasses.replace(
     SMALL_FROM_TRACKS,
-    init=InitSpec(points=500, random=600),
+    init=InitSpec(points=500, random=600, extra_random=None),
     start=StartSpec(motion="tracks", moving_points=350),
     sh_degree=0,
     densification=dataclasses.replace(SMALL_FROM_TRACKS.densification, cap_max=1000),

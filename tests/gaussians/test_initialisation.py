@@ -50,6 +50,22 @@ def test_a_start_is_never_empty():
     assert own_points(spec, capture_with(1)) == 1
 
 
+def test_random_points_stand_in_where_no_tracks_bring_what_moves():
+    spec = InitSpec(points=100, extra_random=None)
+    asked = dataclasses.replace(spec, extra_random=7)
+    for tracked, most, extra in (
+        (True, None, 0),
+        (False, None, 50),
+        (False, 120, 20),
+        (False, 90, 0),
+    ):
+        settled = initialisation.of_start(spec, tracked, most)
+        assert settled.extra_random == extra
+        assert initialisation.of_start(asked, tracked, most) == asked
+    assert own_points(spec, capture_with(150)) == 100
+    assert initialisation.initial_count(spec, capture_with(150)) == 150
+
+
 def test_random_points_do_not_depend_on_the_points_of_the_capture():
     """Or a start "without structure from motion" would have some after all."""
     spec = dataclasses.replace(SPEC, source="random")

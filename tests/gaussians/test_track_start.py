@@ -273,11 +273,16 @@ def test_a_scene_starts_from_the_evidence(tmp_path, monkeypatch):
 def test_a_film_without_tracks_starts_from_rest_and_says_why(tmp_path, monkeypatch):
     monkeypatch.setattr(usable_paths, "CACHE", tmp_path)
     capture = films.film(card=lambda time: (0.1, 0.0), frames=8)
-    model = scene.build(
-        small_scene(start=StartSpec(motion="tracks")), scene.metadata_of(capture)
-    )
+    drawn = np.random.default_rng(0).uniform((-1, -1, 2), (1, 1, 3), (300, 3))
+    points = PointCloud(drawn.astype("f4"), np.zeros((300, 3), "u1"))
+    capture = dataclasses.replace(capture, points=points)
+    spec = small_scene(start=StartSpec(motion="tracks"))
+    model = scene.build(spec, scene.metadata_of(capture))
     with pytest.warns(RuntimeWarning, match="of the pixels move by themselves"):
-        model.init(capture, jax.random.key(0))
+        state = model.init(capture, jax.random.key(0))
+    # What might move has points of no other kind: random ones.
+    active = splats.active_mask(state.params.rows["splats"]).sum()
+    assert active == 300 + spec.init.points // 2
 
 
 @pytest.mark.parametrize(
