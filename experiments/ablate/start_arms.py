@@ -55,7 +55,11 @@ START = Suite(
     ),
     seeds=3,
     pictured=("bases", "mlp", "kan", "basis", "mlp-from-rest"),
-    context="",
+    context=(
+        "The kept `bases-from-rest` had no points where something moves: the random\n"
+        "ones that stand in where there are no tracks are younger. With them it is\n"
+        "the row `splats-tracked-small+rest` of [league.md](league.md)."
+    ),
 )
 
 TRACKED_PARTS = Suite(

@@ -42,9 +42,10 @@ Of `{base}`, {base_psnr} dB in {base_s} s:
 - **What can go**: harmonics (`sh_degree=0`: {flat_psnr} dB and {flat_mb} MB for
   {base_mb}), growth ({grown_psnr}), D-SSIM ({plain_psnr}).
 - **What cannot**: the start from tracks ({rest_psnr} dB from rest, {still_psnr}
-  without any motion), a third basis of motion and more ({two_psnr} with two,
-  {many_psnr} with sixteen), what is seen through a hundredth of light ({cut_psnr}
-  where that ends a pixel).
+  without any motion, both without the random points that stand in for tracks today:
+  [league.md](league.md), row `splats-tracked-small+rest`), a third basis of motion and
+  more ({two_psnr} with two, {many_psnr} with sixteen), what is seen through a hundredth
+  of light ({cut_psnr} where that ends a pixel).
 - **Float64** takes {wide_times} times as long and gives {wide_psnr} dB."""
 SHOWN = {  # words of `SHORT`, the setting they are of
     "base": SPLATS,

@@ -168,6 +168,10 @@ def _spec(name, args):
         spec = dataclasses.replace(
             spec, start=dataclasses.replace(spec.start, motion="none")
         )
+    if hasattr(spec, "init"):  # and of no more Gaussians than beside tracks
+        extra = spec.init.extra_random or 0
+        init = dataclasses.replace(spec.init, extra_random=extra)
+        spec = dataclasses.replace(spec, init=init)
     if args.rays is not None and hasattr(spec, "rays"):
         spec = dataclasses.replace(spec, rays=args.rays)
     if args.rows is not None and hasattr(spec, "init"):
