@@ -2,11 +2,11 @@
 
 import dataclasses
 import json
+import re
 
 import numpy as np
 import pytest
 
-from experiments import reconstruct
 from nerfies_jax import runs
 from nerfies_jax.capture import capture as captures
 from nerfies_jax.capture import nerfies_format
@@ -122,19 +122,17 @@ def test_a_capture_may_be_moved(begun):
     assert json.loads(path.read_text()) == before
 
 
-def test_another_capture_is_not_taken_for_a_moved_one(begun, capsys):
+def test_another_capture_is_not_taken_for_a_moved_one(begun):
     source, folder = begun
     there = source.with_name("elsewhere")
     nerfies_format.write(with_pictures(_retouched), there)
-    words = [str(there), "--out", str(folder), "--resume"]
     before = (folder / run_folder.CONFIG).read_bytes()
-    for expected in ("capture: saved", f"other pictures ({FOURTH} first)"):
-        with pytest.raises(SystemExit) as stop:
-            reconstruct.main(words)
-        assert stop.value.code == 2
-        assert expected in capsys.readouterr().err
-        if source.is_dir():  # the second time it is gone
-            source.rename(source.with_name("lost"))
+    with pytest.raises(runs.Refused, match="capture: saved"):  # the old one is there
+        runs.resume(folder, expected={"capture": there})
+    source.rename(source.with_name("lost"))
+    words = re.escape(f"other pictures ({FOURTH} first)")
+    with pytest.raises(runs.Refused, match=words):
+        runs.resume(folder, expected={"capture": there})
     assert (folder / run_folder.CONFIG).read_bytes() == before
 
 
