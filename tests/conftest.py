@@ -53,12 +53,18 @@ SHARED = pathlib.Path(__file__).resolve().parents[2] / "shared"
 # Hostile starts are too long for one worker: what a parameter of the name given stands
 # for is compiled once, and shared by all tests that have it.
 LONGEST = {
+    "test_notebooks.py": ("notebook",),
     "test_reconstruct.py": (),
     "test_hostile_fields.py": ("name",),
     "test_hostile_splats.py": ("name",),
     "test_track_start.py": (),
     "test_splat_cases.py": (),
     "test_elastic_cases.py": (),
+    "test_presets.py": ("name",),
+    "test_contracts.py": (),
+    "test_effect_cost.py": (),
+    "test_inspection_truth.py": ("name",),
+    "test_appearance_codes.py": (),
 }
 
 
