@@ -15,7 +15,6 @@ from nerfies_jax.capture import npz_files
 from nerfies_jax.capture.json_files import replaced_file, write_json
 from nerfies_jax.training.provenance import provenance
 
-UNKNOWN = "unknown"  # the revision, as `provenance` has it
 STEPS = "steps.json"  # of arms that need not find out what their seconds are worth
 
 
@@ -67,7 +66,7 @@ def read(path: pathlib.Path, identity: dict[str, Any]) -> ArmResult | None:
         arrays = npz_files.read_arrays(path.with_suffix(".npz"))
         made_with = stored["identity"]
         # Of an arm that was restored its own, not that of the code that did so.
-        revision = stored.get("made by", {}).get("revision", UNKNOWN)
+        revision = stored.get("made by", {}).get("revision", "unknown")
         notes = {"revision": revision, **stored["notes"]}
     except (KeyError, TypeError, ValueError, OSError) as error:
         raise ValueError(

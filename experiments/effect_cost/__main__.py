@@ -159,6 +159,7 @@ def main(args):
 
 
 def _spec(name, args):
+    from gaussians_jax import initialisation
     from nerfies_jax.runs import representations
     from nerfies_jax.training import specs
 
@@ -169,8 +170,7 @@ def _spec(name, args):
             spec, start=dataclasses.replace(spec.start, motion="none")
         )
     if hasattr(spec, "init"):  # and of no more Gaussians than beside tracks
-        extra = spec.init.extra_random or 0
-        init = dataclasses.replace(spec.init, extra_random=extra)
+        init = initialisation.of_start(spec.init, tracked=True)
         spec = dataclasses.replace(spec, init=init)
     if args.rays is not None and hasattr(spec, "rays"):
         spec = dataclasses.replace(spec, rays=args.rays)
