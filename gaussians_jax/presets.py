@@ -90,20 +90,27 @@ TRACKED = SplatScene(
     start=StartSpec(motion="tracks", moving_points=20_000),
 )
 
-# Sonata. Of what it leaves open, this is as in E-D3DGS, which it descends from: 60,000
-# steps, growth to the end, no opacity reset, rates, a table of half as many moments as
-# frames. This is not: two views a step (here one), the L1 penalty of 1e-4 on opacity
-# that replaces the reset, total variation of 1e-4 over time, no D-SSIM (here 0.2), a
-# rate of the network that grows with the scene, and its two networks, a coarse and a
-# fine one (here one): but for the rate, `E_D3DGS` has them. Turns are rotation vectors.
-# Depth counts only where a capture has it, and by correlation, which the paper leaves
-# open. Codes start as waves, not as zeros: see `SMALL_SONATA`. The KAN of the paper's
-# equation 4 is `motion.network=bspline`.
+# Sonata. What it leaves open is as in E-D3DGS, which it descends from (`E_D3DGS`): two
+# views a step, no D-SSIM, 60,000 steps, growth to the end, a price on opacity for its
+# resets, rates, a table of half as many moments as frames, which bends little and which
+# a coarse and a fine network read. Turns are rotation vectors. Depth counts only where
+# a capture has it, and by correlation, which the paper leaves open. Codes start as
+# waves, not as zeros: see `SMALL_SONATA`. The KAN of the paper's equation 4 is
+# `motion.network=bspline`.
 SONATA = SplatScene(
     steps=60_000,
+    batch_size=2,
+    dssim_weight=0.0,
     optimiser="radam",
-    densification=DefaultStrategySpec(refine_stop_iter=60_000, reset_every=1_000_000),
-    motion=KanMotionSpec(waves=2.0, spread=0.5, warm_up=3000),
+    densification=DefaultStrategySpec(refine_stop_iter=60_000, reset_every=6_000_000),
+    motion=KanMotionSpec(
+        waves=2.0,
+        spread=0.5,
+        coarser=5,
+        smoothness=1e-4,
+        opacity=1e-4,
+        warm_up=3000,
+    ),
     neighbours=NeighbourSpec(start=3000),
     spectral=SpectralSpec(),
     depth=DepthSpec(),

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from gaussians_jax.effects import kan_motion
+from gaussians_jax.effects import motion_codes
 from gaussians_jax.effects.carried import Carried
 from gaussians_jax.effects.kan_motion import KanMotionSpec, Offsets
 from nerfies_jax.geometry import quaternion
@@ -179,7 +179,7 @@ def init(
         time_code=spec.time_code, frames_per_code=spec.frames_per_code, spread=0.5
     )
     return Anchors(
-        kan_motion.init_times(times_key, table, frames, dtype),
+        motion_codes.init_times(times_key, table, frames, dtype),
         mlp.init(make_spec(spec), make_key, dtype),
         mlp.init(coarse_spec(spec), coarse_key, dtype),
         mlp.init(fine_spec(spec), fine_key, dtype),

@@ -2,9 +2,7 @@
 
 Bae et al. 2024, "Per-Gaussian embedding-based deformation", arXiv:2404.03613 (E-D3DGS),
 section 3, with the sizes of its code. Both networks read the same table of codes over
-time: the coarse one as if it had a fifth of its rows, the fine one with ever more of
-them (`EmbeddingMotion.rows`), so that slow motion is found before fast motion. Their
-residuals of position, scale and rotation add.
+time (`motion_codes`), and their residuals of position, scale and rotation add.
 """
 
 import dataclasses
@@ -17,11 +15,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
 from gaussians_jax import splats
-from gaussians_jax.effects import kan_motion
+from gaussians_jax.effects import kan_motion, motion_codes
 from gaussians_jax.effects.blocks import in_blocks
 from gaussians_jax.effects.kan_motion import KanMotionSpec, Offsets
 from gaussians_jax.splats import Gaussians, Params
-from nerfies_jax.nets import codes, mlp
+from nerfies_jax.nets import mlp
 from nerfies_jax.nets.mlp import MLP, HeadSpec, Layer, MLPSpec
 from nerfies_jax.training import schedules
 from nerfies_jax.training.effects import (
@@ -29,7 +27,6 @@ from nerfies_jax.training.effects import (
     FrameCondition,
     PenaltyContext,
     Term,
-    from_step,
 )
 from nerfies_jax.training.step_counts import steps
 
@@ -77,7 +74,14 @@ class EmbeddingMotionSpec:
                     f"{name}={getattr(self, name)} must be finite and not negative"
                 )
         schedules.check_falling(self.learning_rate, self.learning_rate_end)
-        first_codes(self)  # checks what codes are made of
+        KanMotionSpec(  # checks what codes are made of
+            embedding=self.embedding,
+            time_code=self.time_code,
+            frames_per_code=self.frames_per_code,
+            spread=self.spread,
+            warm_up=self.warm_up,
+            embedding_rate=self.embedding_rate,
+        )
 
 
 class Decoder(NamedTuple):
@@ -98,53 +102,13 @@ class EmbeddingMotion(NamedTuple):
     fine: Decoder
 
 
-def first_codes(spec: EmbeddingMotionSpec) -> KanMotionSpec:
-    """How embeddings and codes of time start: as those of the motion by a KAN."""
-    return KanMotionSpec(
-        embedding=spec.embedding,
-        time_code=spec.time_code,
-        frames_per_code=spec.frames_per_code,
-        spread=spec.spread,
-        waves=spec.waves,
-        warm_up=spec.warm_up,
-        embedding_rate=spec.embedding_rate,
-    )
-
-
-def moments(spec: EmbeddingMotionSpec, frames: int) -> int:
-    """Rows of the table, for so many frames to learn from."""
-    return -(-frames // spec.frames_per_code)
-
-
-def coarse_rows(spec: EmbeddingMotionSpec, count: int) -> int:
-    """What the coarse network reads of a table of `count`, and the fine one at first.
-
-    Two at least, or there is no motion; all of a smaller table.
-    """
-    return min(count, max(2, -(-count // spec.coarser)))
-
-
-def fine_rows(spec: EmbeddingMotionSpec, count: int, step: int) -> int:
-    """How many rows the fine network reads after so many steps; host side."""
-    least = coarse_rows(spec, count)
-    if step >= spec.grow_until:
-        return count
-    return least + (count - least) * step // spec.grow_until
-
-
-def growth_steps(spec: EmbeddingMotionSpec, count: int) -> tuple[int, ...]:
-    """After which steps that number is another one."""
-    reads = [fine_rows(spec, count, step) for step in range(spec.grow_until + 1)]
-    return tuple(k for k in range(1, len(reads)) if reads[k] != reads[k - 1])
-
-
 def init(
     key: Key[Array, ""], spec: EmbeddingMotionSpec, frames: int, dtype=jnp.float32
 ) -> EmbeddingMotion:
     """Networks that move nothing yet, for a capture of `frames` to learn from."""
     times_key, coarse_key, fine_key = jax.random.split(key, 3)
-    times = kan_motion.init_times(times_key, first_codes(spec), frames, dtype)
-    rows = jnp.full(1, fine_rows(spec, len(times), 0), dtype)
+    times = motion_codes.init_times(times_key, spec, frames, dtype)
+    rows = jnp.full(1, motion_codes.fine_rows(spec, len(times), 0), dtype)
     return EmbeddingMotion(
         times,
         rows,
@@ -193,14 +157,11 @@ def deform(
     active: Bool[Array, " gaussians"] | None = None,
 ) -> Offsets:
     """Offsets of every Gaussian at one time, those of both networks added up."""
-    count = params.times.shape[0]
-    least = jnp.asarray(coarse_rows(spec, count), time.dtype)
-    reads = (least, jax.lax.stop_gradient(params.rows[0]))
     decoders = (params.coarse, params.fine)
+    reads = motion_codes.read(spec, params.times, params.rows, time)
     shares = [
-        codes.at_time_of(params.times, rows, time) @ one.first.weight[spec.embedding :]
-        + one.first.bias
-        for one, rows in zip(decoders, reads, strict=True)
+        code @ one.first.weight[spec.embedding :] + one.first.bias
+        for one, code in zip(decoders, reads, strict=True)
     ]
 
     def evaluate(rows):
@@ -216,26 +177,9 @@ def deform(
     return Offsets(**in_blocks(evaluate, (prepared,), active, spec.block))
 
 
-def second_differences(
-    times: Float[Array, "moments code"],
-) -> Float[Array, ""]:
-    """Mean square of how codes bend from row to row; 0 of fewer than three."""
-    if times.shape[0] < 3:
-        return jnp.zeros((), times.dtype)
-    return jnp.mean(jnp.square(jnp.diff(times, 2, axis=0)))
-
-
-def mean_opacity(params: Params) -> Float[Array, ""]:
-    """Of the active Gaussians; 0 without any."""
-    rows = params.rows["splats"]
-    active = splats.active_mask(rows)
-    opacity = jnp.where(active, splats.activate(rows).opacity, 0)
-    return jnp.sum(opacity) / jnp.maximum(jnp.sum(active), 1).astype(opacity.dtype)
-
-
 def effect(spec: EmbeddingMotionSpec, steps: int, frames: int) -> Effect:
     """The seams that this motion fills, for a run of `steps` over `frames`."""
-    count = moments(spec, frames)
+    count = motion_codes.moments(spec, frames)
 
     def prepared(params: Params) -> Float[Array, "gaussians features"]:
         active = splats.active_mask(params.rows["splats"])
@@ -252,21 +196,16 @@ def effect(spec: EmbeddingMotionSpec, steps: int, frames: int) -> Effect:
         return kan_motion.apply(gaussians, offsets)
 
     def penalty(own: EmbeddingMotion, context: PenaltyContext) -> dict[str, Term]:
-        bend = {"smoothness": Term(second_differences(own.times), spec.smoothness)}
-        opacity = mean_opacity(context.params)
-        return {
-            **from_step(spec.warm_up, context.step, bend),
-            "opacity": Term(opacity, spec.opacity),
-        }
+        return motion_codes.penalty(spec, own.times, context)
 
     def revise(own: EmbeddingMotion, step: int) -> EmbeddingMotion:
-        return own._replace(rows=jnp.full_like(own.rows, fine_rows(spec, count, step)))
+        return own._replace(
+            rows=jnp.full_like(own.rows, motion_codes.fine_rows(spec, count, step))
+        )
 
     return Effect(
         name=NAME,
-        init_rows=lambda key, rows: kan_motion.init_embedding(
-            key, first_codes(spec), rows.mean
-        ),
+        init_rows=lambda key, rows: motion_codes.init_embedding(key, spec, rows.mean),
         init=functools.partial(init, spec=spec, frames=frames),
         row_learning_rate=lambda step: jnp.full((), spec.embedding_rate),
         learning_rate=schedules.log_linear(
@@ -277,7 +216,7 @@ def effect(spec: EmbeddingMotionSpec, steps: int, frames: int) -> Effect:
         deform=moved,
         penalty=penalty,
         revise=revise,
-        revise_at=growth_steps(spec, count),
+        revise_at=motion_codes.growth_steps(spec, count),
     )
 
 

@@ -3,14 +3,15 @@
 "Sonata", equation 11: a learnt embedding of each Gaussian and a learnt code of the time
 go through an RBF-KAN to residuals of position, scale and rotation. Where the paper is
 silent this follows Bae et al. 2024, "Per-Gaussian embedding-based deformation",
-arXiv:2404.03613 (E-D3DGS), whose inputs, neighbours and constants it shares. Its two
-networks, a coarse and a fine one, are in `embedding_motion`.
+arXiv:2404.03613 (E-D3DGS), whose inputs, neighbours and constants it shares, and where
+`coarser` is set its two networks, a coarse and a fine one (`motion_codes`).
 
 The first layer of the network is a sum over its inputs. What the embeddings add to it
 is the same at all times (`prepare`), what the time adds the same for all Gaussians.
 """
 
 import dataclasses
+import functools
 import math
 from typing import NamedTuple
 
@@ -19,14 +20,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
 from gaussians_jax import splats
+from gaussians_jax.effects import motion_codes
 from gaussians_jax.effects.blocks import in_blocks
 from gaussians_jax.splats import Gaussians, Params
-from nerfies_jax.geometry.precision import exact_product
 from nerfies_jax.nets import codes, kan, mlp
 from nerfies_jax.nets.kan import KAN, KANSpec
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
-from nerfies_jax.training.effects import Effect, FrameCondition
+from nerfies_jax.training.effects import Effect, FrameCondition, PenaltyContext, Term
 from nerfies_jax.training.step_counts import steps
 
 NAME = "kan_motion"
@@ -64,6 +65,11 @@ class KanMotionSpec:
     position: bool = True
     scale: bool = True
     rotation: bool = True
+    # Of so many rows of the table one stays for a coarse network; None: there is none.
+    coarser: int | None = None
+    grow_until: int = steps(10_000)  # when the fine network beside it reads all rows
+    smoothness: float = 0.0  # weight of `motion_codes.second_differences`
+    opacity: float = 0.0  # weight of the mean opacity, in the place of resets
     warm_up: int = steps(0)  # steps without motion
     embedding_rate: float = 2.5e-3
     learning_rate: float = 1.6e-4  # of network and time codes
@@ -96,6 +102,16 @@ class KanMotionSpec:
             raise ValueError(
                 f"spread={self.spread}: equal codes stay equal; start at about 0.1"
             )
+        if (self.coarser is not None and self.coarser < 1) or self.grow_until < 0:
+            raise ValueError(
+                f"coarser={self.coarser} must be at least 1, or none, and grow_until="
+                f"{self.grow_until} not negative"
+            )
+        if not all(0 <= x < math.inf for x in (self.smoothness, self.opacity)):
+            raise ValueError(
+                f"smoothness={self.smoothness} and opacity={self.opacity} must be "
+                "finite and not negative"
+            )
         schedules.check_falling(self.learning_rate, self.learning_rate_end)
         if not self.embedding_rate > 0:
             raise ValueError(f"embedding_rate={self.embedding_rate} must be positive")
@@ -106,7 +122,11 @@ class KanMotion(NamedTuple):
     """Parameters that all Gaussians share; the embeddings are rows."""
 
     times: Float[Array, "moments code"]  # evenly over [0, 1]
-    field: KAN | MLP
+    field: KAN | MLP  # the fine one of two
+    # As if of so many the table was read by the fine network; an event sets it, and no
+    # slope reaches it.
+    rows: Float[Array, "1"] | None = None
+    coarse: KAN | MLP | None = None
 
 
 class Offsets(NamedTuple):
@@ -190,63 +210,21 @@ def parameter_count(spec: KANSpec | MLPSpec) -> int:
 SMALL_KAN_MOTION = KanMotionSpec(time_code=16, hidden=(32, 32), kernels=5, base=False)
 
 
-def init_embedding(
-    key: Key[Array, ""],
-    spec: KanMotionSpec,
-    mean: Float[Array, "gaussians 3"],
-) -> Float[Array, "gaussians embedding"]:
-    """A code for each Gaussian, of standard deviation `spec.spread`.
-
-    Independent normal draws, or with `spec.waves` cosines of random direction, length
-    and phase over the positions (random Fourier features, Rahimi and Recht 2007): then
-    Gaussians that are near each other start alike, and what one frame says of one
-    Gaussian moves those around it.
-    """
-    if spec.waves is None:
-        drawn = jax.random.normal(key, (mean.shape[0], spec.embedding), jnp.float32)
-        return spec.spread * drawn.astype(mean.dtype)
-    centred = mean - jnp.mean(mean, axis=0)
-    radius_sq = jnp.mean(jnp.sum(centred**2, axis=1))
-    # One Gaussian, or all in one place: every code is that of the middle.
-    unit = centred / jnp.sqrt(jnp.where(radius_sq > 0, radius_sq, 1))
-    return _random_waves(key, spec, unit, spec.embedding)
-
-
-def _random_waves(key, spec, places, width):
-    """[places, width] cosines of random direction, length and phase over the places."""
-    wave_key, phase_key = jax.random.split(key)
-    shape = places.shape[1], width
-    waves = spec.waves * jax.random.normal(wave_key, shape, jnp.float32)
-    phase = jax.random.uniform(phase_key, (width,), jnp.float32, 0, 2 * jnp.pi)
-    angle = exact_product(places, waves.astype(places.dtype))
-    angle = angle + phase.astype(places.dtype)
-    return spec.spread * math.sqrt(2) * jnp.cos(angle)
-
-
-def init_times(
-    key: Key[Array, ""], spec: KanMotionSpec, frames: int, dtype=jnp.float32
-) -> Float[Array, "moments code"]:
-    """The table of codes over time, started as the embeddings are."""
-    if frames < 1:
-        raise ValueError(f"frames={frames}: a motion is learnt from at least one frame")
-    moments = -(-frames // spec.frames_per_code)
-    if spec.waves is None:
-        scale = math.sqrt(3) * spec.spread  # of a uniform draw
-        return codes.init(key, moments, spec.time_code, scale, dtype)
-    # Half the capture is to a moment what the mean radius is to a place.
-    moment = jnp.linspace(-2, 2, moments, dtype=dtype)[:, None]
-    return _random_waves(key, spec, moment, spec.time_code)
-
-
 def init(
     key: Key[Array, ""], spec: KanMotionSpec, frames: int, dtype=jnp.float32
 ) -> KanMotion:
     """A field that moves nothing yet, for a capture of `frames` to learn from."""
     times_key, field_key = jax.random.split(key)
-    times = init_times(times_key, spec, frames, dtype)
+    times = motion_codes.init_times(times_key, spec, frames, dtype)
     network = field_spec(spec)
     init_field = kan.init if isinstance(network, KANSpec) else mlp.init
-    return KanMotion(times, init_field(network, field_key, dtype))
+    if spec.coarser is None:
+        return KanMotion(times, init_field(network, field_key, dtype))
+    fine, coarse = (
+        init_field(network, one, dtype) for one in jax.random.split(field_key)
+    )
+    rows = jnp.full(1, motion_codes.fine_rows(spec, len(times), 0), dtype)
+    return KanMotion(times, fine, rows, coarse)
 
 
 def prepare(
@@ -257,17 +235,19 @@ def prepare(
 ) -> Float[Array, "gaussians features"]:
     """What the embeddings add to the first layer, whatever the time. Pure.
 
+    Of two networks both, side by side.
+
     4 bytes for each feature of the first layer and Gaussian: 5 MB for 10,000 Gaussians
     with the default sizes. Measured on one core at 10,000, deforming takes 68 ms with
     nothing kept and 58 with this, 10 and 7 in the small sizes. Rows of blocks without
     an active one are zero.
     """
-    return in_blocks(
-        lambda rows: _first_layer_part(spec, params.field, rows, 0),
-        (embedding,),
-        active,
-        spec.block,
-    )
+
+    def both(rows):
+        parts = [_first_layer_part(spec, one, rows, 0) for one in _fields(params)]
+        return jnp.concatenate(parts, axis=-1)
+
+    return in_blocks(both, (embedding,), active, spec.block)
 
 
 def deform(
@@ -278,15 +258,31 @@ def deform(
     active: Bool[Array, " gaussians"] | None = None,
 ) -> Offsets:
     """Offsets of every Gaussian at one time; zero in blocks without an active row."""
-    code = codes.at_time(params.times, time)
-    share = _first_layer_part(spec, params.field, code, spec.embedding)
-    heads = in_blocks(
-        lambda rows: _after_first_layer(spec, params.field, rows + share),
-        (prepared,),
-        active,
-        spec.block,
-    )
+    fields = _fields(params)
+    if params.coarse is None:
+        read = (codes.at_time(params.times, time),)
+    else:
+        read = motion_codes.read(spec, params.times, params.rows, time)
+    shares = [
+        _first_layer_part(spec, one, code, spec.embedding)
+        for one, code in zip(fields, read, strict=True)
+    ]
+
+    def evaluate(rows):
+        parts = jnp.split(rows, len(fields), axis=-1)
+        answers = [
+            _after_first_layer(spec, one, part + share)
+            for one, part, share in zip(fields, parts, shares, strict=True)
+        ]
+        return functools.reduce(functools.partial(jax.tree.map, jnp.add), answers)
+
+    heads = in_blocks(evaluate, (prepared,), active, spec.block)
     return Offsets(*(heads.get(name) for name in Offsets._fields))
+
+
+def _fields(params):
+    """The networks: one, or a coarse and a fine one, whose answers add."""
+    return (params.field,) if params.coarse is None else (params.coarse, params.field)
 
 
 def _first_layer_part(spec, field, part, start):
@@ -331,7 +327,7 @@ def effect(spec: KanMotionSpec, steps: int, frames: int) -> Effect:
     """The seams that this motion fills, for a run of `steps` over `frames`."""
 
     def init_rows(key, rows):
-        return init_embedding(key, spec, rows.mean)
+        return motion_codes.init_embedding(key, spec, rows.mean)
 
     def init_networks(key):
         return init(key, spec, frames)
@@ -353,6 +349,15 @@ def effect(spec: KanMotionSpec, steps: int, frames: int) -> Effect:
         offsets = deform(params.nets[NAME], spec, condition.time, ready, active)
         return apply(gaussians, offsets)
 
+    def penalty(own: KanMotion, context: PenaltyContext) -> dict[str, Term]:
+        return motion_codes.penalty(spec, own.times, context)
+
+    def revise(own: KanMotion, step: int) -> KanMotion:
+        count = motion_codes.fine_rows(spec, len(own.times), step)
+        return own._replace(rows=jnp.full_like(own.rows, count))
+
+    count = motion_codes.moments(spec, frames)
+    grows = spec.coarser is not None
     return Effect(
         name=NAME,
         init_rows=init_rows,
@@ -364,4 +369,7 @@ def effect(spec: KanMotionSpec, steps: int, frames: int) -> Effect:
         warm_up=spec.warm_up,
         prepare=prepared,
         deform=moved,
+        penalty=penalty if spec.smoothness or spec.opacity else None,
+        revise=revise if grows else None,
+        revise_at=motion_codes.growth_steps(spec, count) if grows else (),
     )

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gaussians_jax import scene, splats
-from gaussians_jax.effects import embedding_motion
+from gaussians_jax.effects import embedding_motion, motion_codes
 from gaussians_jax.effects.embedding_motion import EmbeddingMotionSpec
 from gaussians_jax.effects.neighbours import NeighbourSpec
 from gaussians_jax.spec import effects_of
@@ -72,7 +72,7 @@ def test_all_but_the_number_of_rows_has_its_slope(float64, rng):
     params, embedding = filled("float64"), rng.normal(size=(3, 3))
 
     def total(learnt, embedding, time):
-        whole = learnt._replace(rows=params.rows)
+        whole = learnt._replace(rows=jnp.asarray(params.rows))
         return sum(jnp.sum(jnp.sin(leaf)) for leaf in moved(whole, embedding, time))
 
     learnt, time = params._replace(rows=np.zeros(0)), np.asarray(0.37)
@@ -84,17 +84,17 @@ def test_all_but_the_number_of_rows_has_its_slope(float64, rng):
 
 
 def test_the_fine_network_reads_ever_more_rows():
-    reads = [embedding_motion.fine_rows(SPEC, 10, step) for step in (0, 50, 99, 100)]
+    reads = [motion_codes.fine_rows(SPEC, 10, step) for step in (0, 50, 99, 100)]
     assert reads == [3, 6, 9, 10]
-    steps = embedding_motion.growth_steps(SPEC, 10)
+    steps = motion_codes.growth_steps(SPEC, 10)
     assert len(steps) == 7
     assert steps[-1] == 100
     at_once = dataclasses.replace(SPEC, grow_until=0)
-    assert embedding_motion.fine_rows(at_once, 10, 0) == 10
-    assert embedding_motion.growth_steps(at_once, 10) == ()
+    assert motion_codes.fine_rows(at_once, 10, 0) == 10
+    assert motion_codes.growth_steps(at_once, 10) == ()
     # A film of one moment has one code, and nothing grows.
-    assert embedding_motion.coarse_rows(SPEC, 1) == 1
-    assert embedding_motion.growth_steps(SPEC, 1) == ()
+    assert motion_codes.coarse_rows(SPEC, 1) == 1
+    assert motion_codes.growth_steps(SPEC, 1) == ()
 
 
 def test_an_event_lets_the_rows_of_a_scene_grow():
@@ -126,5 +126,5 @@ def test_opacity_and_bends_of_the_codes_cost_what_they_are(rng):
     bend = times[2:] - 2 * times[1:-1] + times[:-2]
     np.testing.assert_allclose(terms["smoothness"].value, np.mean(bend**2), rtol=1e-5)
     assert {term.weight for term in terms.values()} == {1e-4}
-    short = embedding_motion.second_differences(jnp.asarray(times[:2]))
+    short = motion_codes.second_differences(jnp.asarray(times[:2]))
     assert short == 0

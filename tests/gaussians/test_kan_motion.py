@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 
 from gaussians_jax import splats as rows
-from gaussians_jax.effects import kan_motion
+from gaussians_jax.effects import kan_motion, motion_codes
 from gaussians_jax.effects.kan_motion import KanMotion, KanMotionSpec, Offsets
+from gaussians_jax.splats import Params
 from nerfies_jax.nets import kan, mlp
+from nerfies_jax.training.effects import PenaltyContext
 from tests.gaussians.motions import FRAMES, MOTIONS, deformed, read_by, strong
 from tests.gaussians.motions import KAN as SMALL
 from tests.gaussians.shared import (
@@ -22,6 +24,7 @@ from tests.gaussians.shared import (
     full,
     jitted,
     put,
+    rows_of,
     some_gaussians,
 )
 
@@ -51,6 +54,51 @@ def test_offsets_are_those_of_the_whole_network(spec, dtype):
             np.testing.assert_allclose(ours, value, atol=tolerance)
 
 
+TWO = dataclasses.replace(SMALL, coarser=2, grow_until=100)
+
+
+def test_a_coarse_and_a_fine_network_add_what_they_read_of_one_table(float64):
+    """Each like a motion of one network, of a table resampled to what it reads."""
+    params, codes = strong("kan", TWO), read_by("kan", 11)
+    params = params._replace(rows=np.full(1, 4.0))
+    own = np.linspace(0, 1, 5)
+    for time in (0.0, 0.3, 1.0):
+        offsets = uncached(params, TWO, codes, put(time))
+        total = dict.fromkeys(Offsets._fields, 0.0)
+        for field, read in ((params.coarse, 3), (params.field, 4)):
+            few = np.linspace(0, 1, read)
+            code = [
+                np.interp(time, few, np.interp(few, own, column))
+                for column in np.asarray(params.times).T
+            ]
+            alone = KanMotion(np.tile(code, (5, 1)), field)
+            part = uncached(alone, SMALL, codes, put(time))
+            for name, value in part._asdict().items():
+                total[name] = total[name] + value
+        for name, value in total.items():
+            np.testing.assert_allclose(getattr(offsets, name), value, atol=1e-12)
+
+
+def test_two_networks_have_an_event_and_prices_and_one_has_neither():
+    spec = dataclasses.replace(TWO, smoothness=0.5, opacity=0.25)
+    effect = kan_motion.effect(spec, 1000, FRAMES)
+    own = strong("kan", spec, "float32")
+    assert effect.revise(own, 0).rows == 3
+    assert effect.revise(own, 60).rows == 4
+    assert effect.revise_at == (50, 100)
+    scene = Params({"splats": rows_of(some_gaussians(3, np.float32), np.zeros(3))}, {})
+    terms = effect.penalty(own, PenaltyContext(None, None, None, scene))
+    np.testing.assert_allclose(terms["opacity"].value, 0.5, rtol=1e-6)
+    bend = np.diff(own.times, 2, axis=0)
+    np.testing.assert_allclose(terms["smoothness"].value, np.mean(bend**2), rtol=1e-5)
+    assert (terms["smoothness"].weight, terms["opacity"].weight) == (0.5, 0.25)
+    plain = kan_motion.effect(SMALL, 1000, FRAMES)
+    assert (plain.penalty, plain.revise, plain.revise_at) == (None, None, ())
+    assert len(jax.tree.leaves(plain.init(jax.random.key(0)))) < len(
+        jax.tree.leaves(effect.init(jax.random.key(0)))
+    )
+
+
 @pytest.mark.parametrize("off", ["position", "scale", "rotation"])
 def test_a_residual_that_is_off_has_no_parameters_and_moves_nothing(off, float64):
     spec = dataclasses.replace(SMALL, **{off: False})
@@ -74,7 +122,7 @@ def test_motion_starts_at_zero_and_does_not_stay_there():
 
     @jitted
     def start(key):
-        codes = kan_motion.init_embedding(key, SMALL, jnp.zeros((9, 3)))
+        codes = motion_codes.init_embedding(key, SMALL, jnp.zeros((9, 3)))
         return kan_motion.init(key, SMALL, FRAMES), codes
 
     def total(params, codes):
@@ -93,7 +141,7 @@ def test_motion_starts_at_zero_and_does_not_stay_there():
     assert grads[0].times.any()
 
 
-first_codes = jitted(kan_motion.init_embedding, static_argnums=1)
+first_codes = jitted(motion_codes.init_embedding, static_argnums=1)
 WAVES = KanMotionSpec(waves=2.0)
 
 

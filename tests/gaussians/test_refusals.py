@@ -93,6 +93,8 @@ SETTINGS = [
     (FlowSpec, dict(start=-1), "start=-1"),
     (FlowSpec, dict(opaque=1.0), "opaque=1.0"),
     (EmbeddingMotionSpec, dict(embedding=0), "embedding=0"),
+    (KanMotionSpec, dict(coarser=0), "coarser=0"),
+    (KanMotionSpec, dict(opacity=-1.0), "opacity=-1"),
     (EmbeddingMotionSpec, dict(coarser=0), "coarser=0"),
     (EmbeddingMotionSpec, dict(opacity=-1.0), "opacity=-1.0"),
     (EmbeddingMotionSpec, dict(grow_until=-1), "grow_until=-1"),
