@@ -3,7 +3,7 @@
 import functools
 
 from experiments.ablate.arms import FIELDS, MOBA, SONATA, Suite
-from experiments.ablate.start_arms import POSES, START, TRACKED_PARTS
+from experiments.ablate.start_arms import OPEN, POSES, START, TRACKED_PARTS
 from experiments.accuracy_time.axes import SETTINGS
 
 KEPT = {
@@ -13,6 +13,7 @@ KEPT = {
     "poses": POSES,
     "sonata": SONATA,
     "moba": MOBA,
+    "open": OPEN,
     "settings": SETTINGS,
 }
 
