@@ -30,8 +30,9 @@ READING = """\
   films it is the exact depth, flow or mask of what moves, which other rows do not see.
 - *CPU s* is what the lengths are of: seconds of all threads of a process with one core,
   without compiling, finding tracks and fitting the motion to them, which rows from
-  tracks have on top. Seed 0 finds the steps that fit, give or take a tenth; the others
-  make as many, on another or a busier machine in other seconds, which is most of the ±.
+  tracks have on top. Seed 0 finds the steps that fit, give or take a tenth; the others,
+  and rows that were made anew, make as many, on another or a busier machine in other
+  seconds, which is most of the ±.
   *train s* is the same by the clock on the wall, *compile* what compiling takes without
   a cache, *frame ms* a held-out frame, *model MB* the file of a trained scene (of a
   field its parameters).
@@ -67,6 +68,9 @@ def page(stored: Mapping[str, Any]) -> str:
         if contest.stopped:
             stopped = ", ".join(contest.stopped)
             parts.append(f"Scored where they stopped before their steps: {stopped}.")
+        longer = _longer(contest)
+        if longer:
+            parts.append(longer)
         if len(contest.cpus) > 1:
             parts.append(_machines(contest))
     parts.append(margins.section(contests))
@@ -113,6 +117,23 @@ def _short(revision):
     """Enough of its name, and a plus where the code had changes."""
     name, plus, _ = revision.partition("+")
     return name[:14] + plus
+
+
+def _longer(contest):
+    """Rows whose first seed, which finds the steps, took more than it was to take."""
+    took = {
+        name: row["train_cpu_seconds"]
+        for (name, seed), row in contest.numbers.items()
+        if seed == 0 and contest.seconds is not None
+    }
+    over = {n: x for n, x in took.items() if x > 1.1 * contest.seconds}
+    if not over:
+        return ""
+    most = sorted(over.items(), key=lambda one: -one[1])
+    return (
+        "Made anew over the steps that had been found before, the first seeds of these "
+        "took longer: " + ", ".join(f"`{n}` ({x:.0f} s)" for n, x in most) + "."
+    )
 
 
 def _machines(contest):

@@ -51,9 +51,10 @@ def contest(names, **more):
 def test_the_page_of_a_part_says_what_is_there_and_what_is_missing():
     part = contest(["sonata-small+tracks", "splats-deformable-small+tracks", "nerf"])
     for seed, (one, other) in enumerate([(30.0, 29.0), (30.2, 29.1), (30.4, 29.5)]):
-        part["rows"]["sonata-small+tracks"]["cells"][str(seed)] = cell(psnr=one)
+        own_cells = part["rows"]["sonata-small+tracks"]["cells"]
+        own_cells[str(seed)] = cell(psnr=one, ssim=one / 100, train_cpu_seconds=95.0)
         other_cells = part["rows"]["splats-deformable-small+tracks"]["cells"]
-        other_cells[str(seed)] = cell(psnr=other)
+        other_cells[str(seed)] = cell(psnr=other, ssim=other / 100)
     # A lucky first seed does not crown a row that has no other.
     lucky = cell(psnr=40.0) | {"stopped_by": "non-finite", "cpu": "Difference Engine"}
     lucky["revision"] = 40 * "b" + "+changes"
@@ -73,9 +74,13 @@ def test_the_page_of_a_part_says_what_is_there_and_what_is_missing():
     assert "| `nerf` | -10.00, one seed |" in text
     # Student's 95 % of gains 1.0, 1.1 and 0.9, by hand: 4.303 * 0.1 / sqrt(3).
     assert "| `splats-deformable-small+tracks` | +1.00 ± 0.25, shows |" in text
-    margin = next(line for line in text.splitlines() if "| tracks | +0.31 |" in line)
-    assert "`splats-deformable-small`" in margin
-    assert margin.endswith("| +1.00 ± 0.25, shows |")
+    margin = next(line for line in text.splitlines() if "| +0.31, +0.004 |" in line)
+    assert "`splats-deformable-small` | tracks" in margin
+    assert margin.endswith("| +1.00 ± 0.25, shows | +0.010 ± 0.002, shows |")
+    assert "took longer" not in text
+    own_cells["0"]["numbers"]["train_cpu_seconds"] = 120.0
+    text = page.page({"contests": [part]})
+    assert "took longer: `sonata-small+tracks` (120 s)." in text
 
 
 def test_a_page_of_nothing_says_so():
