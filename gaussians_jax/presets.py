@@ -168,10 +168,12 @@ SPLINE = SplatScene(
 
 # 4DGS (Wu et al. 2024, arXiv:2310.08528), its numbers for HyperNeRF's captures: 3000
 # steps without motion and 14,000 with it, growth up to 10,000 of those, 360,000
-# Gaussians at most, no opacity reset. 150 moments are for films of any length; D-SSIM
-# (here 0.2) is off there, and a step takes two views (here one).
+# Gaussians at most, no opacity reset, no D-SSIM, two views a step (with all rates times
+# the root of that, which there they are not). 150 moments are for films of any length.
 FOUR_D = SplatScene(
     steps=17_000,
+    batch_size=2,
+    dssim_weight=0.0,
     densification=DefaultStrategySpec(
         refine_stop_iter=13_000, reset_every=1_000_000, cap_max=360_000
     ),

@@ -114,7 +114,7 @@ SMALL_FOUR_D = dataclasses.replace(
     SMALL_FROM_TRACKS,
     motion=dataclasses.replace(SMALL_PLANE_MOTION, warm_up=600),
 )
-# From tracks as the others above, which the paper does not know; D-SSIM as there.
+# From tracks and with D-SSIM, as the others above; the paper has neither.
 SMALL_E_D3DGS = dataclasses.replace(
     SMALL_FROM_TRACKS,
     motion=dataclasses.replace(

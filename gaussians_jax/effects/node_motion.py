@@ -17,8 +17,9 @@ What is not as in SC-GS: turns are rotation vectors, where it has quaternions; w
 nodes are near is found when rows change and not in every step; the rigid term is a mean
 and not a sum, over a fixed number of links and not those within a radius; and nodes
 start among the first Gaussians, or from tracks half on what moves and half on what is
-at rest, where the paper first trains them as Gaussians of their own. The published
-code's further coordinates of nodes and Gaussians are not there.
+at rest, where the paper first trains them as Gaussians of their own. Their number stays
+as it is, where the paper adds and prunes nodes. The published code's further
+coordinates of nodes and Gaussians are not there.
 """
 
 import dataclasses
