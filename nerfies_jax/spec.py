@@ -68,6 +68,12 @@ class SamplingSpec:
             raise ValueError(
                 f"spacing={self.spacing!r} must be 'linear' or 'disparity'"
             )
+        if self.spacing != "linear" and self.occupancy is not None:
+            raise ValueError(
+                f"spacing={self.spacing!r} is of samples along all of a ray, and with "
+                "occupancy they are where cells are filled: set occupancy=none, or "
+                "spacing='linear'"
+            )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,7 +13,7 @@ import math
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
-from nerfies_jax.effects.effect import Vector
+from nerfies_jax.effects.effect import Vector, guides_of
 from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
@@ -137,7 +137,7 @@ def ambient_point(
     if spec.kind == "plane":
         return condition.codes[PLANE_TABLE]
     encoded = encoding.encode(spec.position, point, None)
-    guides = [condition.codes[name] for name in spec.guides]
+    guides = guides_of(spec.guides, condition)
     inputs = jnp.concatenate([encoded, condition.codes[spec.table], *guides])
     return mlp.apply(network(spec), params, inputs)["ambient"]
 

@@ -12,6 +12,8 @@ from typing import NamedTuple
 
 from jaxtyping import Array, Bool, Float, Int
 
+from nerfies_jax.training.effects import FrameCondition
+
 Vector = Float[Array, "3"]
 Scalar = Float[Array, ""]
 
@@ -97,3 +99,16 @@ class Box(NamedTuple):
 
     centre: Vector  # scene units
     scale: Scalar
+
+
+def guides_of(
+    names: tuple[str, ...], condition: FrameCondition
+) -> list[Float[Array, "1"]]:
+    """What effects said of a point, by name; ValueError for what none said."""
+    missing = [name for name in names if name not in condition.codes]
+    if missing:
+        raise ValueError(
+            f"guides name {missing[0]!r}, which no effect says of a point; there are "
+            f"{', '.join(sorted(condition.codes))}"
+        )
+    return [condition.codes[name] for name in names]

@@ -13,7 +13,7 @@ import math
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
-from nerfies_jax.effects.effect import Vector
+from nerfies_jax.effects.effect import Vector, guides_of
 from nerfies_jax.geometry import lie
 from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
@@ -129,7 +129,7 @@ def displace(
 ) -> Vector:
     """Template point minus observed point, in units of the field."""
     encoded = encoding.encode(spec.position, point, window(spec, condition.step, point))
-    guides = [condition.codes[name] for name in spec.guides]
+    guides = guides_of(spec.guides, condition)
     if spec.condition == "code":
         code = jnp.concatenate([condition.codes[spec.table], *guides])
         return _move(spec, params, point, encoded, code)

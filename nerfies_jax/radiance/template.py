@@ -82,8 +82,9 @@ class TemplateSpec:
                 f"depth={self.depth} must be at least 1: media and surfaces read the "
                 "last layer"
             )
-        if self.colour_width < 1:
-            raise ValueError(f"colour_width={self.colour_width} must be at least 1")
+        for name in ("width", "colour_width"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}={getattr(self, name)} must be at least 1")
         if self.anneal_steps is not None and self.anneal_steps < 1:
             raise ValueError(
                 f"anneal_steps={self.anneal_steps} must be at least 1; None opens all "

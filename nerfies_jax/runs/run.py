@@ -129,11 +129,15 @@ def drawer(run: Run, renderer: Renderer) -> Draw:
 
 
 def scene_spec(config: RunConfig) -> Any:
-    """The preset with its steps and overrides."""
+    """The preset with its steps and overrides; with either's, schedules stretch."""
     representation = representations.of_preset(config.preset)
     spec = representation.presets[config.preset]
-    if config.steps is not None:
-        spec = representation.with_steps(spec, config.steps)
+    steps = config.steps
+    for words in config.overrides:
+        if words.startswith("steps="):
+            steps = specs.override(spec, (words,)).steps
+    if steps is not None:
+        spec = representation.with_steps(spec, steps)
     return specs.override(spec, config.overrides)
 
 

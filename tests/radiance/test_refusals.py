@@ -2,11 +2,12 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nerfies_jax import scene
+from nerfies_jax import evaluation, scene
 from nerfies_jax.effects.ambient import AmbientSpec
 from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.effects.background import BackgroundSpec
@@ -16,11 +17,13 @@ from nerfies_jax.effects.time_condition import TimeSpec
 from nerfies_jax.effects.warp import WarpSpec
 from nerfies_jax.nets.planes import PlanesSpec
 from nerfies_jax.radiance import sampling
+from nerfies_jax.radiance.occupancy import OccupancySpec
 from nerfies_jax.radiance.template import TemplateSpec
 from nerfies_jax.scene import RadianceScene
 from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.spec import SamplingSpec
 from nerfies_jax.training.effects import Effect
+from tests import scenes
 
 METADATA = SceneMetadata(
     near=1.0,
@@ -58,6 +61,7 @@ def sample_pdf(edges, weights, count):
     [
         (lambda: TemplateSpec(density="sine"), "'sine'.*softplus"),
         (lambda: TemplateSpec(colour_width=0), "colour_width=0"),
+        (lambda: TemplateSpec(width=0), "width=0"),
         (lambda: TemplateSpec(depth=0, skips=()), "depth=0"),
         (lambda: TemplateSpec(density_bias=np.nan), "density_bias=nan must be finite"),
         (lambda: TemplateSpec(density_bias=-np.inf), "density_bias=-inf"),
@@ -65,6 +69,10 @@ def sample_pdf(edges, weights, count):
         (lambda: RadianceScene(steps=1, density_noise=-1.0), "density_noise=-1.0"),
         (lambda: RadianceScene(steps=1, density_noise=np.nan), "density_noise=nan"),
         (lambda: SamplingSpec(spacing="log"), "spacing='log'"),
+        (
+            lambda: SamplingSpec(spacing="disparity", occupancy=OccupancySpec()),
+            "occupancy=none, or spacing='linear'",
+        ),
         (lambda: stratified(1), "count=1"),
         (lambda: stratified(4, "log"), "'log'"),
         (lambda: sample_pdf(LINE, LINE, 4), "5 edges do not bound 5 bins"),
@@ -110,3 +118,14 @@ def test_a_guide_comes_from_an_effect_of_ones_own_that_marks():
     assert scene.build(WET, METADATA, (rain,)).spec[2:] == ("rain",)
     with pytest.raises(ValueError, match="pass an effect with a mark"):
         scene.build(WET, METADATA, (rain._replace(mark=None),))
+
+
+def test_a_guide_that_no_mark_says_is_named_where_it_is_read():
+    """What an effect of one's own marks is known only when it is traced."""
+    dry = Effect("dry", mark=lambda own, point, condition: {"dry": point[:1]})
+    capture = scenes.tiny_capture()
+    model = scene.build(WET, scene.metadata_of(capture, WET), (dry,))
+    frames = evaluation.frames_of(capture, model.required_data)
+    state = jax.eval_shape(lambda key: model.init(capture, key), jax.random.key(0))
+    with pytest.raises(ValueError, match=r"guides name 'wet'.*there are .*dry"):
+        jax.eval_shape(model.step, state, frames)

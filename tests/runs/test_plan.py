@@ -23,6 +23,14 @@ def test_steps_keep_two_digits_and_are_never_more(steps, kept):
     assert plan.rounded(steps) == kept
 
 
+def test_schedules_stretch_with_steps_however_these_are_given():
+    named = RunConfig("splats-tracked-small", steps=300)
+    assigned = dataclasses.replace(named, steps=None, overrides=("steps=300",))
+    assert runs.scene_spec(assigned) == runs.scene_spec(named)
+    with pytest.raises(ValueError, match="--set steps"):
+        runs.scene_spec(dataclasses.replace(named, overrides=("steps=few",)))
+
+
 @pytest.mark.parametrize("growing", [True, False])
 def test_seconds_are_the_steps_that_they_allow(growing, tmp_path, monkeypatch):
     nerfies_format.write(scenes.tiny_capture(), tmp_path / "filmed")
