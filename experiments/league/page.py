@@ -126,13 +126,15 @@ def _longer(contest):
         for (name, seed), row in contest.numbers.items()
         if seed == 0 and contest.seconds is not None
     }
-    over = {n: x for n, x in took.items() if x > 1.1 * contest.seconds}
+    over = {n: x for n, x in took.items() if x > 1.2 * contest.seconds}
     if not over:
         return ""
     most = sorted(over.items(), key=lambda one: -one[1])
     return (
         "Made anew over the steps that had been found before, the first seeds of these "
-        "took longer: " + ", ".join(f"`{n}` ({x:.0f} s)" for n, x in most) + "."
+        "took longer by more than a fifth: "
+        + ", ".join(f"`{n}` ({x:.0f} s)" for n, x in most)
+        + "."
     )
 
 

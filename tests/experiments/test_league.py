@@ -78,9 +78,9 @@ def test_the_page_of_a_part_says_what_is_there_and_what_is_missing():
     assert "`splats-deformable-small` | tracks" in margin
     assert margin.endswith("| +1.00 ± 0.25, shows | +0.010 ± 0.002, shows |")
     assert "took longer" not in text
-    own_cells["0"]["numbers"]["train_cpu_seconds"] = 120.0
+    own_cells["0"]["numbers"]["train_cpu_seconds"] = 120.4
     text = page.page({"contests": [part]})
-    assert "took longer: `sonata-small+tracks` (120 s)." in text
+    assert "by more than a fifth: `sonata-small+tracks` (120 s)." in text
 
 
 def test_a_page_of_nothing_says_so():
