@@ -1,6 +1,8 @@
 """The table of hard cases: a cheap room from the command line to the page."""
 
 import json
+import pathlib
+import re
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from experiments.hard_cases import case as hard_case
 from experiments.hard_cases import report
 from experiments.hard_cases.__main__ import ROOMS
 
+DOCUMENT = pathlib.Path(__file__).parents[2] / "docs/numerics.md"
 PAGE = f"before\n{report.BEGIN}\nold\n{report.END}\nbehind\n"
 
 
@@ -20,6 +23,15 @@ def test_names_tell_all_cases_apart():
         for case in cases:
             assert len(case.at) == len(case.inputs)
             assert {"float32", "float64"} <= set(case.bounds)
+
+
+def test_the_page_has_a_row_of_every_case_and_no_other():
+    table = DOCUMENT.read_text().split(report.BEGIN)[1].split(report.END)[0]
+    lines = [line for line in table.splitlines() if line.startswith("| ")]
+    rows = [re.split(r" (?<!\\)\| ", line[2:])[:3] for line in lines[1:]]
+    cases = [case for cases, _ in ROOMS.values() for case in cases]
+    told = [(one.name, one.breaks, f"{one.formula}; {one.switch}") for one in cases]
+    assert rows == [[cell.replace("|", r"\|") for cell in row] for row in told]
 
 
 @pytest.mark.full
