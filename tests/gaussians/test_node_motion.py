@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.special
 from scipy.spatial.transform import Rotation
 
 from gaussians_jax import path_fit, spec, splats
@@ -379,6 +380,45 @@ def test_nothing_is_computed_for_what_only_resting_nodes_carry():
     np.testing.assert_array_equal(there[~moving], mean[~moving])
     slope = jax.grad(lambda mask: jnp.sum(node_motion.openness(mask)))(nodes.mask)
     assert (np.asarray(slope) > 0).tolist() == [True, True, False, False, False]
+
+
+@jax.jit
+def mask_terms(nodes, time):
+    """Openness, the loss of the mask, and the slopes of that and of what moves."""
+    begun = jnp.int32(MASKED.warm_up)
+    context = PenaltyContext(FrameCondition(time), begun, None, None)
+
+    def loss(nodes):
+        return effect("masked").penalty(nodes, context)["moving"].value
+
+    def motion(nodes):
+        now = node_motion.moves(nodes, MASKED, EXTENT, time)
+        return jnp.sum(now.turn) + jnp.sum(now.shift)
+
+    share = node_motion.openness(nodes.mask)
+    return share, loss(nodes), jax.grad(loss)(nodes), jax.grad(motion)(nodes)
+
+
+@pytest.mark.hard_cases
+@pytest.mark.parametrize("far", [50.0, 1e4])
+def test_a_mask_that_is_decided_is_exact_and_has_finite_slopes(far, dtype):
+    mask = np.array([-far, far, -2.0, 0.5, far])
+    nodes = params_of(some_gaussians(ROWS, dtype), dtype, name="masked").nets[NAME]
+    nodes = nodes._replace(mask=put(mask, dtype))
+    share, loss, of_loss, of_motion = host(mask_terms(nodes, put(0.3, dtype)))
+    logistic = scipy.special.expit(mask)
+    atol = {"float32": 1e-6, "float64": 1e-14}[dtype]
+    between = np.array([False, False, True, True, False])
+    stretched = np.where(between, 1.2 * logistic - 0.1, mask > 0)
+    np.testing.assert_allclose(share, stretched, rtol=0, atol=atol)
+    np.testing.assert_array_equal(share[~between], (mask > 0)[~between])
+    np.testing.assert_allclose(loss, np.mean(logistic), rtol=0, atol=atol)
+    slope = logistic * (1 - logistic) / NODES
+    np.testing.assert_allclose(of_loss.mask, slope, rtol=0, atol=atol)
+    # What a node does moves a mask between shut and open, and no other.
+    np.testing.assert_array_equal(of_motion.mask != 0, between)
+    for leaf in jax.tree.leaves((of_loss, of_motion)):
+        assert np.isfinite(leaf).all()
 
 
 @pytest.mark.parametrize(
