@@ -15,9 +15,10 @@ reference feature is normal, with a mean and a deviation for each channel (there
 a hyperprior), that of the residual ones is normal as a network makes it of the former.
 Places, scales, turns, opacities and colours of anchors are kept as they are, at 32 bits
 a number, where the code has a codec for points. Colours and opacities do not change
-over time. Growth clones or splits anchors by the slopes of what they carry, weighted by
-how much of it is to be seen when (`significance`), where the code puts a new anchor at
-each carried Gaussian of a steep slope.
+over time. Growth clones or splits anchors by the slopes of what they carry, each by its
+share in what is to be seen of the anchor at the moments that were drawn
+(`significance`), where the code puts a new anchor at each carried Gaussian of a steep
+slope; how much anchors are seen over time beside each other counts for nothing more.
 """
 
 import dataclasses
