@@ -57,9 +57,8 @@ papers' tables, and the margins that these print, stand in [league.md](league.md
 refined cameras are worth stands in [ablate_poses.md](ablate_poses.md) and, on a real
 film, in [ablate_poses_bookshelf.md](ablate_poses_bookshelf.md). What the two papers
 leave open, a start from random points among it, stands in
-[ablate_open.md](ablate_open.md) and
-[ablate_open_bookshelf.md](ablate_open_bookshelf.md). What deformation, solvers and
-local kernels cost stands in [deformation_cost.md](deformation_cost.md),
+[ablate_open.md](ablate_open.md). What deformation, solvers and local kernels cost
+stands in [deformation_cost.md](deformation_cost.md),
 [solver_table.md](solver_table.md) and [kan_local.md](kan_local.md) again, and how far
 one basis or another can follow a motion in [motion_rank.md](motion_rank.md).
 """
@@ -153,11 +152,6 @@ STUDIES = {
     ),
     "ablate_open": _package(
         "ablate_open", "--suite open --steps 900 --jobs 2", of="ablate"
-    ),
-    "ablate_open_bookshelf": _package(
-        "ablate_open_bookshelf",
-        f"--suite open {_BOOKSHELF} --steps 600 --jobs 2",
-        of="ablate",
     ),
     "deformation_cost": _package("deformation_cost", "--out deformation_cost.json"),
     "spectral_bias": _package(
