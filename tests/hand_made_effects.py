@@ -12,6 +12,7 @@ from gaussians_jax.effects import (
     carried,
     depth,
     embedding_motion,
+    exposure,
     kan_motion,
     mlp_motion,
     motion_basis,
@@ -21,9 +22,11 @@ from gaussians_jax.effects import (
     node_motion,
     plane_motion,
     polynomial_motion,
+    pose_refinement,
     se3_bases,
     spectral,
     spline_motion,
+    temporal_opacity,
     time_basis,
 )
 from nerfies_jax.effects import (
@@ -57,13 +60,16 @@ FIELD_MODULES = {
     "surface": surface,
 }
 SPLAT_MODULES = {
+    "temporal_opacity": temporal_opacity,
     "carried": carried,
     "acceleration": acceleration,
     "neighbours": neighbours,
     "motion_growth": motion_growth,
     "spectral": spectral,
     "depth": depth,
+    "exposure": exposure,
     "flow": motion_flow,
+    "poses": pose_refinement,
 }
 MOTION_MODULES = {
     mlp_motion.MotionSpec: mlp_motion,
@@ -131,6 +137,8 @@ def of_splats(spec, metadata):
             seen = (extent, metadata.box)
         module = MOTION_MODULES[type(motion)]
         effects.append(module.effect(motion, spec.steps, *seen))
+    if spec.temporal_opacity is not None:
+        effects.append(temporal_opacity.effect(spec.temporal_opacity))
     if spec.carried is not None:
         still = 0 if motion is None else motion.warm_up
         effects.append(carried.effect(spec.carried, spec.steps, still))
@@ -144,8 +152,14 @@ def of_splats(spec, metadata):
         effects.append(spectral.effect(spec.spectral, spec.steps))
     if spec.depth is not None:
         effects.append(depth.effect(spec.depth))
+    if spec.exposure is not None:
+        places = metadata.exposures
+        effects.append(exposure.effect(spec.exposure, spec.steps, places))
     if spec.flow is not None:
         effects.append(motion_flow.effect(spec.flow, spec.raster))
+    if spec.poses is not None:
+        seen = frames, metadata.depth
+        effects.append(pose_refinement.effect(spec.poses, spec.steps, *seen))
     return tuple(effects)
 
 
@@ -166,6 +180,8 @@ def absent_modules(spec):
     if isinstance(motion, anchors.AnchorMotionSpec):
         gone.remove(kan_motion)
         gone.remove(carried)
+    if getattr(motion, "fading", None) is not None:
+        gone.remove(temporal_opacity)
     return gone
 
 
@@ -174,20 +190,30 @@ def poisoned(modules):
     """Every function of these modules raises when it is called."""
     with pytest.MonkeyPatch.context() as patch:
         for module in modules:
-
-            def refuse(*_, name=module.__name__, **__):
-                raise AssertionError(f"{name} is off and was called")
-
-            functions = [
-                name
-                for name, value in vars(module).items()
-                if callable(value) and not isinstance(value, type)
-                if getattr(value, "__module__", None) == module.__name__
-            ]
+            functions = functions_of(module)
             assert "effect" in functions
-            for name in functions:
-                patch.setattr(module, name, refuse)
+            refuse(patch, module, functions)
         yield
+
+
+def functions_of(module):
+    """The names of the functions that a module has of its own."""
+    return [
+        name
+        for name, value in vars(module).items()
+        if callable(value) and not isinstance(value, type)
+        if getattr(value, "__module__", None) == module.__name__
+    ]
+
+
+def refuse(patch, module, functions):
+    """Let these functions of a module raise when they are called."""
+
+    def refused(*_, **__):
+        raise AssertionError(f"{module.__name__} is off and was called")
+
+    for name in functions:
+        patch.setattr(module, name, refused)
 
 
 def file_of(module):

@@ -18,11 +18,15 @@ import pytest
 
 from gaussians_jax import presets as splat_presets
 from gaussians_jax import scene as splat_scene
+from gaussians_jax.effects import carried
+from gaussians_jax.effects.exposure import ExposureSpec
+from gaussians_jax.effects.pose_refinement import PoseRefinementSpec
 from nerfies_jax import evaluation
 from nerfies_jax import presets as field_presets
 from nerfies_jax import scene as field_scene
 from nerfies_jax import spec as field_spec
 from nerfies_jax.measure import clock
+from nerfies_jax.nets import entropy
 from tests import bare_scenes, hand_made_effects, scenes
 from tests.bare_scenes import parts_of, without
 from tests.hand_made_effects import FIELD_MODULES
@@ -185,6 +189,46 @@ def test_a_field_without_an_effect_is_one_that_never_had_it(preset, part):
 def test_splats_without_an_effect_are_some_that_never_had_it(preset, part):
     run = started_splats(without(bare_scenes.tiny_splats(preset), part))
     check_removed(run, started_splats, splat_scene, hand_made_effects.of_splats)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", ["exposure", "poses"])
+def test_splats_without_what_no_preset_has_are_some_that_never_had_it(part):
+    both = {"exposure": ExposureSpec(), "poses": PoseRefinementSpec()}
+    spec = dataclasses.replace(bare_scenes.tiny_splats("splats-static"), **both)
+    run = started_splats(without(spec, part))
+    check_removed(run, started_splats, splat_scene, hand_made_effects.of_splats)
+
+
+# Where a part of an effect is, the module and the functions that are its alone, and
+# where it has its arrays.
+INNER = {
+    "rate": ("adc-gs", "motion", entropy, ["noisy", "rounded", "bits"], ".law"),
+    "turns": ("d-miso", "carried", carried, ["turns", "network_spec"], ".nets['carri"),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", INNER)
+def test_a_part_of_an_effect_that_is_off_is_not_asked_and_has_no_arrays(part):
+    preset, owner, module, functions, place = INNER[part]
+    spec = bare_scenes.tiny_splats(preset)
+    whole = started_splats(spec)
+    start = jax.tree_util.tree_flatten_with_path(whole.state.params)[0]
+    start = {jax.tree_util.keystr(path): leaf for path, leaf in start}
+    rest = {path: leaf for path, leaf in start.items() if place not in path}
+    assert len(rest) < len(start)
+    off = dataclasses.replace(getattr(spec, owner), **{part: None})
+    run = started_splats(dataclasses.replace(spec, **{owner: off}))
+    # Or a function that was traced before is remembered.
+    jax.clear_caches()
+    with pytest.MonkeyPatch.context() as patch:
+        hand_made_effects.refuse(patch, module, functions)
+        own = jax.tree_util.tree_flatten_with_path(run.state.params)[0]
+        run.lower()
+        with pytest.raises(AssertionError, match="is off and was called"):
+            whole.lower()
+    same_bits({jax.tree_util.keystr(path): leaf for path, leaf in own}, rest)
 
 
 def test_small_presets_have_parts_that_papers_have():

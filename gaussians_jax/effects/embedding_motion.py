@@ -38,10 +38,11 @@ class EmbeddingMotionSpec:
     """Sizes, growth and penalties; defaults of E-D3DGS's code for HyperNeRF's films.
 
     Rotations are rotation vectors where the code adds to quaternions, and the last
-    layers start at zero. `smoothness` weighs the mean square of second differences
-    between codes that follow each other, which the code means and misses by an index.
-    `opacity` weighs the mean opacity, in the place of resets; the code takes the
-    sigmoid of the mean logit.
+    layers start at zero, where it fades offsets in over its first thousand steps; it
+    also learns how late a camera is. `smoothness` weighs the mean square of second
+    differences between codes that follow each other, which the code means and misses by
+    an index. `opacity` weighs the mean opacity, in the place of resets; the code takes
+    the sigmoid of the mean logit.
     """
 
     embedding: int = 32

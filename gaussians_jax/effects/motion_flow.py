@@ -45,6 +45,9 @@ class FlowSpec:
     As there, neither the weights of the blending nor the depth get a slope. Otherwise
     than there, both ends of a Gaussian's way get one: with the first held still, the
     Gaussian itself would be pulled along the flow.
+
+    Cameras that are refined beside it (`pose_refinement`) get a slope by the camera's
+    flow, both of them, and the next one by what Gaussians do in its picture.
     """
 
     weight: float = 0.5

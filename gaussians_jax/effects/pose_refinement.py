@@ -36,7 +36,8 @@ class PoseRefinementSpec:
     """How fast the cameras learn, in rad of a turn and of a shift seen at mid depth.
 
     A frame's own screw learns once in so many steps as there are frames, and Adam's
-    step then counts some eight times.
+    step then counts some eight times. Beside a flow (`motion_flow`) it learns in the
+    steps of the frame before, too.
     """
 
     learning_rate: float = 1e-4

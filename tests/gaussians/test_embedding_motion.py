@@ -9,14 +9,20 @@ import pytest
 
 from gaussians_jax import scene, splats
 from gaussians_jax.effects import embedding_motion, motion_codes
-from gaussians_jax.effects.embedding_motion import EmbeddingMotionSpec
+from gaussians_jax.effects.embedding_motion import (
+    Decoder,
+    EmbeddingMotion,
+    EmbeddingMotionSpec,
+)
 from gaussians_jax.effects.kan_motion import Offsets
 from gaussians_jax.effects.neighbours import NeighbourSpec
 from gaussians_jax.spec import effects_of
 from gaussians_jax.splats import Params
+from nerfies_jax.nets import codes
+from nerfies_jax.nets.mlp import MLP, Layer
 from nerfies_jax.training.effects import PenaltyContext
 from tests import gradients, scenes
-from tests.gaussians.shared import rows_of, some_gaussians
+from tests.gaussians.shared import put, rows_of, some_gaussians
 
 FRAMES = 19
 SPEC = EmbeddingMotionSpec(
@@ -76,6 +82,60 @@ def test_offsets_are_those_of_both_networks_by_hand(dtype, rng):
         np.testing.assert_allclose(
             getattr(offsets, name), value, rtol=bound, atol=bound
         )
+
+
+def published(stored, name):
+    """One of the two networks of E-D3DGS's code; its first layer reads the time first.
+
+    Of its four numbers of a turn, which are added to a quaternion, the first three.
+    """
+
+    def layer(part):
+        return Layer(stored[f"w_{part}.weight"].T, stored[f"w_{part}.bias"])
+
+    def head(part):
+        hidden, out = (layer(f"{part}_deform_{name}.{i}") for i in (1, 3))
+        return MLP((hidden,), {"out": Layer(out.weight[:, :3], out.bias[:3])})
+
+    first = layer(f"feature_out_{name}.0")
+    weight = np.concatenate([first.weight[16:], first.weight[:16]])
+    parts = ("pos", "scales", "rotations")
+    heads = dict(zip(Offsets._fields, map(head, parts), strict=True))
+    return Decoder(first._replace(weight=weight), heads)
+
+
+def test_the_reference_values_of_e_d3dgs_are_met(dtype, oracle_dir):
+    """Codes and offsets of its networks at three times and lengths of its table.
+
+    It fades offsets in over a thousand steps, of sizes twice. Its times are those of a
+    camera that is 0.01 late, reflected at the end of the film.
+    """
+    path = oracle_dir / "splatting" / "ed3dgs_deform.npz"
+    stored = np.load(path, allow_pickle=False)
+    spec = EmbeddingMotionSpec(embedding=8, time_code=16, width=32, grow_until=1000)
+    decoders = published(stored, "c"), published(stored, "f")
+    params = EmbeddingMotion(stored["w_weight"], np.zeros(1), *decoders)
+    params, embedding = put(params, dtype), put(stored["emb"], dtype)
+
+    @jax.jit
+    def run(rows, time):
+        ready = embedding_motion.prepare(params, spec, embedding)
+        whole = params._replace(rows=rows[None])
+        offsets = embedding_motion.deform(whole, spec, time, ready)
+        return codes.at_time_of(params.times, rows, time), offsets
+
+    for step in (0, 500, 5000):
+        rows, fade = motion_codes.fine_rows(spec, 25, step), min(step / 1000, 1)
+        for name, time in (("0.0", 0.01), ("0.37", 0.38), ("1.0", 0.99)):
+            code, offsets = run(*put((rows, time), dtype))
+            case = f"it{step}_t{name}"
+            # Theirs are computed in float32, the offsets as sums with numbers up to 3.
+            theirs = stored[f"temb_{case}"]
+            np.testing.assert_allclose(code, theirs, rtol=0, atol=3e-6)
+            parts = {"pts": fade, "scales": fade**2, "rots": fade}
+            for own, (part, share) in zip(offsets, parts.items(), strict=True):
+                by = (stored[f"out_{part}_{case}"] - stored[part])[:, :3]
+                np.testing.assert_allclose(share * own, by, rtol=0, atol=1e-6)
 
 
 def same_codes(params, embedding):

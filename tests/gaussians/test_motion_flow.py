@@ -1,6 +1,7 @@
 """The flow of Gaussians and of cameras, pixel by pixel and Gaussian by Gaussian."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -9,14 +10,16 @@ import pytest
 import scipy.spatial.transform
 
 from gaussians_jax import scene
-from gaussians_jax.effects import motion_flow
+from gaussians_jax.effects import motion_flow, pose_refinement
 from gaussians_jax.effects.motion_flow import FlowSpec
+from gaussians_jax.effects.pose_refinement import PoseRefinementSpec
 from gaussians_jax.raster_spec import GSPLAT
 from gaussians_jax.splats import Gaussians
 from nerfies_jax.capture.flow import FrameFlow
 from nerfies_jax.evaluation import frames_of
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.training.effects import Observation, PenaltyContext
+from nerfies_jax.training.model import Frames
 from tests import gradients, scenes
 from tests.gaussians.shared import jitted, put
 from tests.oracles import dense_splats
@@ -214,6 +217,62 @@ def test_gradients_go_through_both_ends_and_no_weight(float64):
     assert not any(one.opacity.any() for one in slopes)
 
 
+DEPTH = 4.0
+
+
+@pytest.mark.full
+def test_flow_pulls_both_cameras_by_how_they_move_and_no_weight(float64):
+    """Cameras that are refined beside the flow, against central differences.
+
+    The first camera, too, counts by its way to the next alone: where it draws what, and
+    how deep that lies, is held still.
+    """
+    both, rng = pair("float64"), np.random.default_rng(4)
+    here, there = scattered("float64", count=20)
+    opaque = np.full(20, 0.9)
+    here, there = here._replace(opacity=opaque), there._replace(opacity=opaque)
+    given = cameras.stack([*both, both[0]])
+    shift = rng.normal(size=(3, 9, 13, 2))
+    flow = FrameFlow(shift, np.ones((3, 9, 13), bool), np.array([1, 2, 2]), *[None] * 3)
+    images, times = np.zeros((3, 9, 13, 3), np.uint8), np.array([0.0, 0.5, 1.0])
+    frames = Frames(images, given, times, np.zeros(3, np.int32), None, flow=flow)
+    refined = jax.jit(
+        functools.partial(pose_refinement.refined, cameras=given, depth=DEPTH)
+    )
+
+    def at_time(_, time):
+        return jax.tree.map(lambda *ends: jnp.where(time < 0.25, *ends), here, there)
+
+    def term(screws):
+        posed = frames._replace(cameras=refined(screws))
+        observation = Observation(None, None, None, None, posed, 0)
+        context = PenaltyContext(
+            None, None, None, None, observation=observation, at_time=at_time
+        )
+        return motion_flow.compared(FlowSpec(), GSPLAT, None, context)
+
+    screws = 0.02 * rng.normal(size=(3, 6))
+    still = cameras.take(refined(screws), 0)
+
+    @jax.jit
+    def held(screws):
+        first, second = (cameras.take(refined(screws), row) for row in (0, 1))
+        drawn = motion_flow.drawn_flow(here, there, (still, second), SIZE, GSPLAT)
+        things = shift[0] - motion_flow.camera_flow((first, second), drawn.depth)
+        return motion_flow.error(drawn.flow, things, drawn.share >= 0.5)
+
+    slopes, known = jitted(jax.grad(term, has_aux=True))(screws)
+    assert 0.3 < known < 1
+    np.testing.assert_array_equal(np.any(slopes, axis=1), [True, True, False])
+    for row in (0, 1):
+        for axis in range(6):
+            # The mean, which has no slope, stays: the third camera makes up for it.
+            way = np.zeros((3, 6))
+            way[row, axis], way[2, axis] = 1e-6, -1e-6
+            difference = (held(screws + way) - held(screws - way)) / 2e-6
+            np.testing.assert_allclose(slopes[row, axis], difference, atol=1e-7)
+
+
 SCENE = dataclasses.replace(scenes.TINY_DEFORMABLE, flow=FlowSpec(start=3))
 
 
@@ -248,6 +307,25 @@ def test_a_penalty_compares_frames_with_the_next_and_begins_at_its_start():
     assert nothing["error"].value == nothing["known"].value == 0
     assert terms(jnp.int32(3), frames._replace(flow=None), 1) == {}
     assert isinstance(frames.flow, FrameFlow)
+
+
+@pytest.mark.full
+def test_a_step_with_flow_moves_its_own_camera_and_the_next_one_alone():
+    capture = scenes.tiny_capture()
+    spec = dataclasses.replace(
+        SCENE, flow=FlowSpec(start=0), poses=PoseRefinementSpec(2e-3, 2e-4)
+    )
+    model = scene.build(spec, scene.metadata_of(capture))
+    state = model.init(capture, jax.random.key(0))
+    frames = frames_of(capture, model.required_data)
+    row = int(scene.shuffled_row(state.key, state.step, len(frames.times)))
+    other = int(frames.flow.next_row[row])
+    state, metrics = jax.jit(model.step)(state, frames)
+    assert metrics["flow/known"] > 0
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state.params))
+    moved = np.flatnonzero(np.any(state.params.nets["poses"], axis=1))
+    assert moved.tolist() == sorted({row, other})
+    assert row != other
 
 
 def test_flow_without_a_motion_is_refused():
