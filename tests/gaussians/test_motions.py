@@ -158,7 +158,8 @@ def test_a_scene_in_training_moves_with_noise_after_its_warm_up(name, float64):
     assert not any_nonzero(grads.nets)
     grads, (noisy, _) = program(params, np.int32(10), key)
     network = grads.nets[MOTIONS[name].module.NAME]
-    assert all(map(any_nonzero, network)) == (name != "mlp")  # it has no code of time
+    parts = (network.times, network.field) if name == "kan" else network
+    assert all(map(any_nonzero, parts)) == (name != "mlp")  # it has no code of time
     assert any_nonzero(network)
     late, same = (program(params, np.int32(50), k)[1][0] for k in (key, other))
     same_bits(late, same)
