@@ -7,7 +7,6 @@ time (`motion_codes`), and their residuals of position, scale and rotation add.
 
 import dataclasses
 import functools
-import math
 from typing import NamedTuple
 
 import jax
@@ -64,22 +63,19 @@ class EmbeddingMotionSpec:
     block: int = 512  # Gaussians per evaluation
 
     def __post_init__(self):
-        for name in ("coarser", "width", "block"):
+        for name in ("width", "block"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}={getattr(self, name)} must be at least 1")
-        if self.grow_until < 0:
-            raise ValueError(f"grow_until={self.grow_until} must not be negative")
-        for name in ("smoothness", "opacity"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(
-                    f"{name}={getattr(self, name)} must be finite and not negative"
-                )
         schedules.check_falling(self.learning_rate, self.learning_rate_end)
         KanMotionSpec(  # checks what codes are made of
             embedding=self.embedding,
             time_code=self.time_code,
             frames_per_code=self.frames_per_code,
             spread=self.spread,
+            coarser=self.coarser,
+            grow_until=self.grow_until,
+            smoothness=self.smoothness,
+            opacity=self.opacity,
             warm_up=self.warm_up,
             embedding_rate=self.embedding_rate,
         )
@@ -199,11 +195,6 @@ def effect(spec: EmbeddingMotionSpec, steps: int, frames: int) -> Effect:
     def penalty(own: EmbeddingMotion, context: PenaltyContext) -> dict[str, Term]:
         return motion_codes.penalty(spec, own.times, context)
 
-    def revise(own: EmbeddingMotion, step: int) -> EmbeddingMotion:
-        return own._replace(
-            rows=jnp.full_like(own.rows, motion_codes.fine_rows(spec, count, step))
-        )
-
     return Effect(
         name=NAME,
         init_rows=lambda key, rows: motion_codes.init_embedding(key, spec, rows.mean),
@@ -216,7 +207,7 @@ def effect(spec: EmbeddingMotionSpec, steps: int, frames: int) -> Effect:
         prepare=prepared,
         deform=moved,
         penalty=penalty,
-        revise=revise,
+        revise=functools.partial(motion_codes.revised, spec),
         revise_at=motion_codes.growth_steps(spec, count),
     )
 

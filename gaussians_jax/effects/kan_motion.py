@@ -352,10 +352,6 @@ def effect(spec: KanMotionSpec, steps: int, frames: int) -> Effect:
     def penalty(own: KanMotion, context: PenaltyContext) -> dict[str, Term]:
         return motion_codes.penalty(spec, own.times, context)
 
-    def revise(own: KanMotion, step: int) -> KanMotion:
-        count = motion_codes.fine_rows(spec, len(own.times), step)
-        return own._replace(rows=jnp.full_like(own.rows, count))
-
     count = motion_codes.moments(spec, frames)
     grows = spec.coarser is not None
     return Effect(
@@ -370,6 +366,6 @@ def effect(spec: KanMotionSpec, steps: int, frames: int) -> Effect:
         prepare=prepared,
         deform=moved,
         penalty=penalty if spec.smoothness or spec.opacity else None,
-        revise=revise if grows else None,
+        revise=functools.partial(motion_codes.revised, spec) if grows else None,
         revise_at=motion_codes.growth_steps(spec, count) if grows else (),
     )

@@ -7,7 +7,7 @@ that slow motion is found before fast motion.
 """
 
 import math
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -138,6 +138,12 @@ def growth_steps(spec: Codes, count: int) -> tuple[int, ...]:
     """After which steps that number is another one."""
     reads = [fine_rows(spec, count, step) for step in range(spec.grow_until + 1)]
     return tuple(k for k in range(1, len(reads)) if reads[k] != reads[k - 1])
+
+
+def revised(spec: Codes, own: Any, step: int) -> Any:
+    """A motion's parameters with the `rows` that its fine network reads from a step."""
+    count = fine_rows(spec, len(own.times), step)
+    return own._replace(rows=jnp.full_like(own.rows, count))
 
 
 def read(
