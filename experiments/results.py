@@ -153,6 +153,9 @@ STUDIES = {
     "ablate_open": _package(
         "ablate_open", "--suite open --steps 900 --jobs 2", of="ablate"
     ),
+    "ablate_rate": _package(
+        "ablate_rate", "--suite rate --steps 900 --jobs 2", of="ablate"
+    ),
     "deformation_cost": _package("deformation_cost", "--out deformation_cost.json"),
     "spectral_bias": _package(
         "spectral_bias", "--steps 3000 --out spectral_bias", page="report"

@@ -88,9 +88,11 @@ def save(
     files.save(folder / "gaussians.ply", drawn)
     if all(effect.deform is None for effect in every):
         return Saved(size)
+    coded = None
     notes = ["gaussians.ply holds the canonical Gaussians, without their motion."]
     if isinstance(spec.motion, AnchorMotionSpec):
         features, others = anchor_motion.kept_bytes(state.params, spec.motion)
+        coded = features + others
         notes.append(
             f"The features of its anchors are {features / 1e6:.2f} MB by their bits "
             f"under the learnt law, all else {others / 1e6:.2f} MB at 32 bits a number "
@@ -102,7 +104,7 @@ def save(
             "11.3 MB and 163 frames per second, on an A100, of other scenes: context, "
             "no comparison."
         )
-    return Saved(size, tuple(notes))
+    return Saved(size, tuple(notes), coded)
 
 
 def player(

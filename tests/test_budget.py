@@ -26,6 +26,17 @@ def test_what_is_over_the_budget_is_named(spent, words):
         assert line.startswith(expected)
 
 
+@pytest.mark.parametrize(("times", "files"), [(1.0, 20), (3.0, 20), (3.0, 5)])
+def test_a_slow_machine_is_over_no_budget_and_a_slow_file_is(times, files):
+    granted = {("core", f"{i}.py"): (0, 10.0) for i in range(files)}
+    spent = {key: (0, times * 10.0) for key in granted}
+    spent["core", "0.py"] = (0, times * 69.0)
+    few = times > 1 and files < budget.PACED_FILES  # which tell no pace
+    assert len(budget.over_budget(spent, granted)) == few
+    spent["core", "0.py"] = (0, times * 71.0)
+    assert len(budget.over_budget(spent, granted)) == 1
+
+
 def test_a_run_keeps_what_it_did_not_touch(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(budget, "BUDGET", tmp_path / "budget.json")

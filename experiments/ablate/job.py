@@ -1,6 +1,7 @@
 """Train and measure the arms of an ablation, one after the other."""
 
 import hashlib
+import math
 import os
 import pathlib
 import tempfile
@@ -259,7 +260,7 @@ class Job:
                 len(self.known.rows), cpu=jax.default_backend() == "cpu"
             ),
             "peak_mb": clock.peak_bytes() / 1e6,
-            "model_mb": _model_bytes(arm, result.state) / 1e6,
+            **_model_sizes(arm, result.state),
         }
         if compiled_before:  # most of it in this very process
             numbers["compile_seconds"] = float("nan")
@@ -381,11 +382,13 @@ def _without_younger(stored):
     return {name: item for name, item in stored.items() if name not in absent}
 
 
-def _model_bytes(arm, state):
+def _model_sizes(arm, state):
     """Of the file that holds a trained scene, or of its parameters where none does."""
     with tempfile.TemporaryDirectory() as scratch:
         folder = pathlib.Path(scratch)
         saved = arm.representation.save(folder, arm.spec, arm.metadata, state)
-    if saved.model_bytes is not None:
-        return saved.model_bytes
-    return sum(leaf.nbytes for leaf in jax.tree.leaves(state.params))
+    held, coded = saved.model_bytes, saved.coded_bytes
+    if held is None:
+        held = sum(leaf.nbytes for leaf in jax.tree.leaves(state.params))
+    coded_mb = math.nan if coded is None else coded / 1e6
+    return {"model_mb": held / 1e6, "coded_mb": coded_mb}

@@ -3,7 +3,6 @@
 from experiments.ablate.arms import (
     FROM_REST,
     FROM_TRACKS,
-    MOVING,
     TRACKED,
     Arm,
     Claim,
@@ -95,54 +94,6 @@ TRACKED_PARTS = Suite(
     seeds=3,
     pictured=("full", "true-motion", "one-spline", "k4", "k20"),
     context="",
-)
-
-RANDOM = "init.source=random"
-# What Sonata leaves open, from E-D3DGS, whose numbers the paper-size preset has.
-FILLED = (
-    *("batch_size=2", "dssim_weight=0.0", "motion.coarser=5"),
-    *("motion.smoothness=1e-4", "motion.opacity=1e-4", "motion.grow_until=240"),
-)
-
-OPEN = Suite(
-    arms={
-        "points": Arm("moba-small", (FROM_TRACKS,)),
-        "random": Arm("moba-small", (FROM_TRACKS, RANDOM)),
-        "points-from-rest": Arm("moba-small"),
-        "random-from-rest": Arm("moba-small", (RANDOM,)),
-        "sonata": Arm("sonata-small", (FROM_TRACKS,)),
-        "sonata-filled": Arm("sonata-small", (FROM_TRACKS, *FILLED), share=0.6),
-    },
-    claims=(
-        Claim(
-            "Random points serve MoBa-GS better than those of structure from motion "
-            "(from tracks)",
-            "random",
-            "points",
-            MOVING,
-        ),
-        Claim(
-            "Random points serve MoBa-GS better than those of structure from motion "
-            "(from rest)",
-            "random-from-rest",
-            "points-from-rest",
-            MOVING,
-        ),
-        Claim(
-            "What Sonata leaves open is better filled as in E-D3DGS",
-            "sonata-filled",
-            "sonata",
-            MOVING,
-        ),
-    ),
-    seeds=3,
-    pictured=("points", "random", "random-from-rest", "sonata", "sonata-filled"),
-    context=(
-        "MoBa-GS says that it needs no points of structure from motion. Sonata leaves\n"
-        "open how many views a step has, how many networks there are, and two\n"
-        "penalties. Neither paper has an ablation of it. Two views a step take more\n"
-        "time: `sonata-filled` makes 0.6 of the others' steps."
-    ),
 )
 
 REFINED = "poses=PoseRefinementSpec"

@@ -3,7 +3,8 @@
 import functools
 
 from experiments.ablate.arms import FIELDS, MOBA, SONATA, Suite
-from experiments.ablate.start_arms import OPEN, POSES, START, TRACKED_PARTS
+from experiments.ablate.open_arms import OPEN, RATE
+from experiments.ablate.start_arms import POSES, START, TRACKED_PARTS
 from experiments.accuracy_time.axes import SETTINGS
 
 KEPT = {
@@ -14,6 +15,7 @@ KEPT = {
     "sonata": SONATA,
     "moba": MOBA,
     "open": OPEN,
+    "rate": RATE,
     "settings": SETTINGS,
 }
 

@@ -10,7 +10,7 @@ from nerfies_jax.evidence.findings import CERTAIN
 
 # Two effects that only one scene has, and motion; the rest holds in all of them. Those
 # left out differ in how things move, not in what is to be decided.
-SCENES = ("static", "fast", "exposure", "transient")
+SCENES = ("static", "exposure", "transient")
 
 
 @pytest.mark.slow

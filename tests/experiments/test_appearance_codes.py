@@ -76,7 +76,7 @@ def test_a_short_run_writes_figures_and_a_picture(scene, keys, tmp_path, monkeyp
 
     monkeypatch.setattr(appearance_codes, "filmed", short)
     out = tmp_path / "out"
-    arguments = ["--scene", scene, "--steps", "3", "--size", "32", "24"]
+    arguments = ["--scene", scene, "--steps", "3", "--size", "24", "18"]
     appearance_codes.main([*arguments, "--out", str(out)])
     record = json.loads((out / "figures.json").read_text())
     assert record["scene"] == scene

@@ -26,7 +26,7 @@ from tests.hard_cases import hostile
 # more inputs: a time, as NSFF's has, and ambient coordinates.
 PAPERS = ("nerf-w", "d-nerf", "nerfies", "nsff")
 RENDERED = ("d-nerf",)  # its scenes are, before a plain background
-STEPS = 200
+STEPS = 100
 PICTURE = (8, 6)
 
 

@@ -96,7 +96,7 @@ def test_the_networks_read_their_input_again_where_the_papers_do(name, inputs, l
 @pytest.mark.parametrize("name", [f"{name}-small" for name in PAPERS[1:]])
 def test_a_small_preset_learns_more_than_one_colour(name):
     capture = scenes.tiny_capture()
-    spec = dataclasses.replace(presets.with_steps(PRESETS[name], 200), rays=64)
+    spec = dataclasses.replace(presets.with_steps(PRESETS[name], 200), rays=32)
     model = scene.build(spec, scene.metadata_of(capture, spec))
     frames = evaluation.frames_of(capture, model.required_data)
     state, step = model.init(capture, jax.random.key(0)), jax.jit(model.step)
