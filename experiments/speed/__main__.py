@@ -6,7 +6,8 @@
 
 Every preset is timed in two fresh processes, one that sees one core and one that has
 the cores its steps are made for. `--job` also times the README's first command, from an
-empty cache of programs and of evidence. `--yardstick` times the rasteriser beside
+empty cache of programs and of evidence; `--beside` then times that of another checkout,
+an earlier revision, and ours once more. `--yardstick` times the rasteriser beside
 another (`experiments.raster_speed`). Times are wall clock: leave the machine alone.
 What was measured before stays in OUT/speed.json where it is not measured anew.
 """
@@ -39,6 +40,8 @@ class Speed:
     """Which presets (default: all small ones)."""
     job: bool = False
     """Also the main job, from the command to its report."""
+    beside: pathlib.Path | None = None
+    """Also the main job of this checkout of the library, between two of ours."""
     yardstick: pathlib.Path | None = None
     """Also the rasteriser, beside the one that this script times."""
     out: pathlib.Path = pathlib.Path("runs/speed")
@@ -46,6 +49,8 @@ class Speed:
 
     def __post_init__(self):
         cli.check_presets(self.presets)
+        if self.beside is not None and not (self.beside / "experiments").is_dir():
+            raise ValueError(f"--beside {self.beside}: no checkout of this library")
 
 
 @cli.command(Speed)
@@ -61,11 +66,11 @@ def main(args):
             record = _apart(job.measure, preset, cores == "all")
             keep(path, record.pop("machine"), ("presets", preset, cores), record)
             print(f"{preset}, {cores}: {record['step_ms']:.1f} ms a step", flush=True)
-    if args.job:
-        record = main_job()
-        machine = record.pop("machine")
-        keep(path, machine, ("job",), record | {"cpu": machine["cpu"]})
-        print(f"main job: {record['seconds']:.0f} s", flush=True)
+    if args.job or args.beside is not None:
+        _keep_job(path, ("job",), None)
+    if args.beside is not None:
+        _keep_job(path, ("jobs", "beside"), args.beside)
+        _keep_job(path, ("jobs", "again"), None)
     if args.yardstick is not None:
         record = _raster(args.yardstick)
         keep(path, record["machine"], ("raster",), {"rows": record["rows"]})
@@ -94,24 +99,41 @@ def _apart(work, *arguments):
         return pool.submit(work, *arguments).result()
 
 
-def main_job() -> dict:
-    """Seconds of the README's first command, with nothing kept from before."""
+def _keep_job(path, keys, checkout):
+    record = main_job(checkout)
+    machine = record.pop("machine")
+    keep(path, machine, keys, record | {"cpu": machine["cpu"]})
+    whose = "main job" if checkout is None else f"main job of {checkout}"
+    print(f"{whose}: {record['seconds']:.0f} s", flush=True)
+
+
+def main_job(checkout: pathlib.Path | None = None) -> dict:
+    """Seconds of the README's first command, with nothing kept from before.
+
+    Of another checkout by its own code, and with its revision.
+    """
     with tempfile.TemporaryDirectory() as folder:
         run = pathlib.Path(folder) / "run"
         environment = dict(os.environ, XDG_CACHE_HOME=f"{folder}/cache")
         for name in ("JAX_COMPILATION_CACHE_DIR", "PJRT_NPROC", "NPROC"):
             environment.pop(name, None)
+        if checkout is not None:
+            environment["PYTHONPATH"] = str(checkout.resolve())
         command = [sys.executable, "-m", "experiments.reconstruct", "--out", str(run)]
         began = time.perf_counter()
-        subprocess.run(command, check=True, env=environment, capture_output=True)
+        subprocess.run(
+            command, check=True, env=environment, cwd=checkout, capture_output=True
+        )
         seconds = time.perf_counter() - began
         metrics = json.loads((run / "metrics.json").read_text())
     from nerfies_jax.measure import clock
+    from nerfies_jax.training.provenance import revision
 
     wanted = ("train.seconds", "train.compile_seconds", "heldout.psnr")
     return {
         "seconds": seconds,
-        **{name: metrics[name] for name in (*wanted, "heldout.moving_psnr")},
+        "revision": revision(checkout),
+        **{name: metrics.get(name) for name in (*wanted, "heldout.moving_psnr")},
         "machine": clock.machine(),
     }
 

@@ -28,6 +28,8 @@ def page(stored: Mapping[str, Any]) -> str:
     parts.append(_parts(stored["presets"]))
     if "job" in stored:
         parts += ["## The main job", _job(stored["job"])]
+        if "jobs" in stored:
+            parts.append(_beside(stored["job"], **stored["jobs"]))
     if "raster" in stored:
         parts += ["## The rasteriser beside a tuned C++ one", RASTER]
         parts.append(_raster(stored["raster"]["rows"]))
@@ -71,6 +73,29 @@ def _job(job):
         f"{job['train.seconds']:.0f} s and compiling it "
         f"{job['train.compile_seconds']:.0f} s; {job['heldout.psnr']:.2f} dB held out, "
         f"{job['heldout.moving_psnr']:.2f} dB where something moves."
+    )
+
+
+def _beside(first, beside, again):
+    """An earlier revision's job, between two of ours."""
+    ours = (first["seconds"] + again["seconds"]) / 2
+    heads = ("revision", "all s", "training s", "compiling it s", "PSNR", "moving PSNR")
+    names = ("seconds", "train.seconds", "train.compile_seconds")
+    rows = []
+    for job in (first, beside, again):
+        quality = (job["heldout.psnr"], job["heldout.moving_psnr"])
+        rows.append(
+            [
+                f"`{job['revision'][:7]}`",
+                *(markdown.number(job[name], 0) for name in names),
+                *(markdown.number(value, 2) for value in quality),
+            ]
+        )
+    share = ours / beside["seconds"]
+    return (
+        f"Beside an earlier revision, in one sitting: {ours:.0f} s, the mean of both, "
+        f"for {beside['seconds']:.0f} s, {share:.2f} of the time.\n\n"
+        + markdown.table(heads, rows)
     )
 
 

@@ -21,9 +21,12 @@ def provenance() -> dict[str, Any]:
     }
 
 
-def revision() -> str:
-    """Git revision this library runs from, with "+changes"; "unknown" outside git."""
-    here = pathlib.Path(__file__).resolve().parents[2]
+def revision(checkout: pathlib.Path | None = None) -> str:
+    """Git revision of a checkout, with "+changes"; "unknown" outside git.
+
+    Of none given that which this library runs from.
+    """
+    here = checkout or pathlib.Path(__file__).resolve().parents[2]
     if not (here / ".git").exists():  # installed, perhaps inside another repository
         return "unknown"
     command = "describe --always --exclude=* --dirty=+changes --abbrev=40"

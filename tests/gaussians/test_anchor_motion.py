@@ -10,7 +10,7 @@ import pytest
 import scipy.stats
 from scipy.spatial.transform import Rotation
 
-from gaussians_jax import scene, splats, variants
+from gaussians_jax import representation, scene, splats, variants
 from gaussians_jax.effects import anchor_motion, anchors
 from gaussians_jax.effects.anchors import AnchorMotionSpec, RateSpec
 from gaussians_jax.initialisation import InitSpec
@@ -239,7 +239,7 @@ TINY = dataclasses.replace(
 
 
 @pytest.mark.slow
-def test_a_scene_of_anchors_grows_trains_and_stands_still_without_its_motion():
+def test_a_scene_of_anchors_grows_trains_and_stands_still_without_its_motion(tmp_path):
     capture = scenes.tiny_capture()
     metadata = scene.metadata_of(capture)
     model = scene.build(TINY, metadata)
@@ -256,6 +256,9 @@ def test_a_scene_of_anchors_grows_trains_and_stands_still_without_its_motion():
     ):
         assert np.isfinite(leaf).all()
         assert np.any(np.asarray(leaf) != first)
+    saved = representation.save(tmp_path, TINY, metadata, state)
+    assert saved.coded_bytes == sum(anchor_motion.kept_bytes(state.params, TINY.motion))
+    assert saved.coded_bytes < saved.model_bytes
     still = variants.without_effects(TINY, metadata, ("motion",), False)
     where = [
         np.asarray(still.stages.deform(state.params, {}, jnp.float32(time)).mean)
