@@ -57,7 +57,8 @@ papers' tables, and the margins that these print, stand in [league.md](league.md
 refined cameras are worth stands in [ablate_poses.md](ablate_poses.md) and, on a real
 film, in [ablate_poses_bookshelf.md](ablate_poses_bookshelf.md). What the two papers
 leave open, a start from random points among it, stands in
-[ablate_open.md](ablate_open.md). What deformation, solvers and local kernels cost
+[ablate_open.md](ablate_open.md), and what a law of bits saves of ADC-GS' features in
+[ablate_rate.md](ablate_rate.md). What deformation, solvers and local kernels cost
 stands in [deformation_cost.md](deformation_cost.md),
 [solver_table.md](solver_table.md) and [kan_local.md](kan_local.md) again, and how far
 one basis or another can follow a motion in [motion_rank.md](motion_rank.md).

@@ -3,6 +3,7 @@
     python -m experiments.speed --out speed
     python -m experiments.speed --presets splats-tracked-small --out speed
     python -m experiments.speed --job --yardstick PATH/run.py --out speed
+    python -m experiments.speed --no-steps --beside CHECKOUT --out speed
 
 Every preset is timed in two fresh processes, one that sees one core and one that has
 the cores its steps are made for. `--job` also times the README's first command, from an
@@ -38,6 +39,8 @@ class Speed:
 
     presets: tuple[str, ...] = ()
     """Which presets (default: all small ones)."""
+    steps: bool = True
+    """Time their steps; without, only what the following ask for."""
     job: bool = False
     """Also the main job, from the command to its report."""
     beside: pathlib.Path | None = None
@@ -60,8 +63,9 @@ def main(args):
         args.out.mkdir(parents=True, exist_ok=True)
     path = args.out / STORED
     small = tuple(n for n in representations.PRESETS if n.endswith("-small"))
-    _apart(job.prepare)
-    for preset in args.presets or small:
+    if args.steps:
+        _apart(job.prepare)
+    for preset in (args.presets or small) if args.steps else ():
         for cores in ("one", "all"):
             record = _apart(job.measure, preset, cores == "all")
             keep(path, record.pop("machine"), ("presets", preset, cores), record)
