@@ -180,7 +180,9 @@ STUDIES = {
         "field_speed", "--captures CAPTURE CAPTURE --out field_speed.json"
     ),
     "kan_local": _study("kan_local", "--out kan_local.json"),
-    "speed": _package("speed", "--job --yardstick PATH/run.py --out speed"),
+    "speed": _package(
+        "speed", "--job --beside CHECKOUT --yardstick PATH/run.py --out speed"
+    ),
     "raster_speed": _package(
         "raster_speed", "--out raster_speed.json", page="__main__"
     ),

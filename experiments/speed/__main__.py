@@ -7,8 +7,8 @@
 
 Every preset is timed in two fresh processes, one that sees one core and one that has
 the cores its steps are made for. `--job` also times the README's first command, from an
-empty cache of programs and of evidence; `--beside` then times that of another checkout,
-an earlier revision, and ours once more. `--yardstick` times the rasteriser beside
+empty cache of programs and of evidence, and `--beside` that of another checkout, an
+earlier revision, between two of ours. `--yardstick` times the rasteriser beside
 another (`experiments.raster_speed`). Times are wall clock: leave the machine alone.
 What was measured before stays in OUT/speed.json where it is not measured anew.
 """
@@ -70,11 +70,12 @@ def main(args):
             record = _apart(job.measure, preset, cores == "all")
             keep(path, record.pop("machine"), ("presets", preset, cores), record)
             print(f"{preset}, {cores}: {record['step_ms']:.1f} ms a step", flush=True)
-    if args.job or args.beside is not None:
+    if args.job:
         _keep_job(path, ("job",), None)
     if args.beside is not None:
-        _keep_job(path, ("jobs", "beside"), args.beside)
-        _keep_job(path, ("jobs", "again"), None)
+        jobs = {"first": None, "beside": args.beside, "again": None}
+        for name, checkout in jobs.items():
+            _keep_job(path, ("jobs", name), checkout)
     if args.yardstick is not None:
         record = _raster(args.yardstick)
         keep(path, record["machine"], ("raster",), {"rows": record["rows"]})

@@ -29,7 +29,7 @@ def page(stored: Mapping[str, Any]) -> str:
     if "job" in stored:
         parts += ["## The main job", _job(stored["job"])]
         if "jobs" in stored:
-            parts.append(_beside(stored["job"], **stored["jobs"]))
+            parts.append(_beside(**stored["jobs"]))
     if "raster" in stored:
         parts += ["## The rasteriser beside a tuned C++ one", RASTER]
         parts.append(_raster(stored["raster"]["rows"]))
@@ -93,8 +93,8 @@ def _beside(first, beside, again):
         )
     share = ours / beside["seconds"]
     return (
-        f"Beside an earlier revision, in one sitting: {ours:.0f} s, the mean of both, "
-        f"for {beside['seconds']:.0f} s, {share:.2f} of the time.\n\n"
+        f"Beside an earlier revision on {first['cpu']}, in one sitting: {ours:.0f} s, "
+        f"the mean of both, for {beside['seconds']:.0f} s, {share:.2f} of the time.\n\n"
         + markdown.table(heads, rows)
     )
 
