@@ -52,14 +52,14 @@ class Speed:
 
     def __post_init__(self):
         cli.check_presets(self.presets)
-        if self.beside is not None and not (self.beside / "experiments").is_dir():
-            raise ValueError(f"--beside {self.beside}: no checkout of this library")
 
 
 @cli.command(Speed)
 def main(args):
     """Measure and keep; exit code 2 where input is wrong."""
     with cli.user_errors():
+        if args.beside is not None and not (args.beside / "experiments").is_dir():
+            raise ValueError(f"--beside {args.beside}: no checkout of this library")
         args.out.mkdir(parents=True, exist_ok=True)
     path = args.out / STORED
     small = tuple(n for n in representations.PRESETS if n.endswith("-small"))
