@@ -67,7 +67,7 @@ def test_a_run_with_every_part_learns_and_stays_finite(paper):
     carried = jax.tree.leaves(result.state.aux_state)
     assert {len(leaf) for leaf in carried} == {capacity}
     # The opacities are reset at step 20: the picture needs some hundred to come back.
-    learnt = train(paper, result.state, 600).state
+    learnt = train(paper, result.state, 421).state
     assert finite(learnt.params)
     first, last = psnr(paper, start(paper)), psnr(paper, learnt)
     assert last > first + 3, (first, last)
