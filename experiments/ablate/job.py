@@ -1,7 +1,6 @@
 """Train and measure the arms of an ablation, one after the other."""
 
 import hashlib
-import math
 import os
 import pathlib
 import tempfile
@@ -383,12 +382,15 @@ def _without_younger(stored):
 
 
 def _model_sizes(arm, state):
-    """Of the file that holds a trained scene, or of its parameters where none does."""
+    """MB of the file that holds a trained scene, or of its parameters where none does.
+
+    And of the scene as it is coded; NaN where nothing says how.
+    """
     with tempfile.TemporaryDirectory() as scratch:
         folder = pathlib.Path(scratch)
         saved = arm.representation.save(folder, arm.spec, arm.metadata, state)
     held, coded = saved.model_bytes, saved.coded_bytes
     if held is None:
         held = sum(leaf.nbytes for leaf in jax.tree.leaves(state.params))
-    coded_mb = math.nan if coded is None else coded / 1e6
+    coded_mb = float("nan") if coded is None else coded / 1e6
     return {"model_mb": held / 1e6, "coded_mb": coded_mb}

@@ -102,8 +102,8 @@ LEGENDS = {
     "where it made one arm alone.",
     "model_mb": "model MB: the one file of a trained scene; of a field its "
     "parameters, without\nthe optimiser.",
-    "coded_mb": "coded MB: the same scene, features by their bits under the learnt law "
-    "and all other\nnumbers at 32 bits.",
+    "coded_mb": "coded MB: the same scene, features by their bits where there is a "
+    "learnt law and all\nother numbers at 32 bits.",
 }
 
 

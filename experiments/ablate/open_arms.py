@@ -50,6 +50,8 @@ OPEN = Suite(
     ),
 )
 
+CODED = (*MOVING, "coded_mb")
+
 RATE = Suite(
     arms={
         "no-law": Arm("adc-gs-small", (FROM_TRACKS, "motion.rate=none")),
@@ -65,14 +67,14 @@ RATE = Suite(
             "Features coded under a learnt law take less and cost no quality",
             "bits-at-1e-3",
             "no-law",
-            (*MOVING, "coded_mb"),
+            CODED,
         ),
         *(
             Claim(
                 f"Bits are better dearer by {times}",
                 f"bits-at-{weight}",
                 "bits-at-1e-3",
-                (*MOVING, "coded_mb"),
+                CODED,
             )
             for times, weight in (("ten", "1e-2"), ("a hundred", "1e-1"))
         ),

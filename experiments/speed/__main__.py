@@ -52,6 +52,8 @@ class Speed:
 
     def __post_init__(self):
         cli.check_presets(self.presets)
+        if self.presets and not self.steps:
+            raise ValueError("--no-steps times no preset: leave --presets out")
 
 
 @cli.command(Speed)
@@ -64,12 +66,7 @@ def main(args):
     path = args.out / STORED
     small = tuple(n for n in representations.PRESETS if n.endswith("-small"))
     if args.steps:
-        _apart(job.prepare)
-    for preset in (args.presets or small) if args.steps else ():
-        for cores in ("one", "all"):
-            record = _apart(job.measure, preset, cores == "all")
-            keep(path, record.pop("machine"), ("presets", preset, cores), record)
-            print(f"{preset}, {cores}: {record['step_ms']:.1f} ms a step", flush=True)
+        _keep_steps(path, args.presets or small)
     if args.job:
         _keep_job(path, ("job",), None)
     if args.beside is not None:
@@ -102,6 +99,15 @@ def _apart(work, *arguments):
     spawned = multiprocessing.get_context("spawn")
     with concurrent.futures.ProcessPoolExecutor(1, spawned) as pool:
         return pool.submit(work, *arguments).result()
+
+
+def _keep_steps(path, presets):
+    _apart(job.prepare)
+    for preset in presets:
+        for cores in ("one", "all"):
+            record = _apart(job.measure, preset, cores == "all")
+            keep(path, record.pop("machine"), ("presets", preset, cores), record)
+            print(f"{preset}, {cores}: {record['step_ms']:.1f} ms a step", flush=True)
 
 
 def _keep_job(path, keys, checkout):

@@ -142,7 +142,7 @@ def test_scene_flow_of_a_single_bare_frame_stays_finite():
     frames = tiny_fields.frames_of(run.capture, run.model.required_data)
     assert frames.flow is None
     assert frames.depths is None
-    ended = hostile.train(run.model, run.state, frames, steps=200)
+    ended = hostile.train(run.model, run.state, frames, steps=tiny_fields.STEPS)
     assert ended.result.stopped_by == "steps", ended.result.message
     assert ended.last["mse"] < ended.first["mse"]
     for name in ("warped", "disocclusion", "cycle", "magnitude", "kinetic"):

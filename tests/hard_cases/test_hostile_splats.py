@@ -20,7 +20,7 @@ from tests.hard_cases import hostile
 
 pytestmark = pytest.mark.full
 
-STEPS = 100
+STEPS = 200
 TINY = {
     "splats-static": scenes.TINY_SPLATS,
     "sonata": scenes.TINY_SONATA,
@@ -48,10 +48,10 @@ def hostile_spec(name):
     """
     plan = dataclasses.replace(
         scenes.TINY_SPLATS.densification,
-        refine_every=25,
-        refine_start_iter=25,
+        refine_every=50,
+        refine_start_iter=50,
         refine_stop_iter=STEPS,
-        reset_every=50,
+        reset_every=100,
         cap_max=splats.BUCKET,
         grow_grad2d=1e-5,
         # Of an extent of 0.04 scene units: the paper's 0.1 prunes all of this scene.
