@@ -54,22 +54,41 @@ def on_devices(
 
 
 def rows_on_devices(
-    work: Callable[..., PyTree], fixed: Hashable, rows: PyTree
+    work: Callable[..., PyTree],
+    fixed: Hashable,
+    rows: PyTree,
+    program: Callable[[PyTree], PyTree] | None = None,
 ) -> Iterator[PyTree]:
     """`work(fixed, *row)` for each row of the leaves of a tuple, as NumPy, in order.
 
     One row at a time on each of this process's devices, all by one program, which is
-    compiled once for a `work` and what is `fixed`.
+    compiled once for a `work` and what is `fixed`, or was: what `lower_rows` gave.
     """
     count = len(jax.tree.leaves(rows)[0])
-    devices = min(jax.local_device_count(), max(count, 1))
+    devices = _devices_of(count)
+    program = program or functools.partial(_one_each, work, fixed, devices)
     for start in range(0, count, devices):
         # The last rows again where fewer are left than there are devices.
         chosen = np.minimum(np.arange(start, start + devices), count - 1)
         few = jax.tree.map(lambda leaf, chosen=chosen: np.asarray(leaf)[chosen], rows)
-        done = jax.device_get(_one_each(work, fixed, devices, few))
+        done = jax.device_get(program(few))
         for share in range(min(devices, count - start)):
             yield jax.tree.map(lambda leaf, share=share: leaf[share], done)
+
+
+def lower_rows(
+    work: Callable[..., PyTree], fixed: Hashable, rows: PyTree
+) -> jax.stages.Lowered:
+    """The program of `rows_on_devices` for rows of such shapes, to be compiled."""
+    devices = _devices_of(len(jax.tree.leaves(rows)[0]))
+    few = jax.tree.map(
+        lambda leaf: jax.ShapeDtypeStruct((devices, *leaf.shape[1:]), leaf.dtype), rows
+    )
+    return _one_each.lower(work, fixed, devices, few)
+
+
+def _devices_of(count):
+    return min(jax.local_device_count(), max(count, 1))
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2))

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 import jax
 
+from nerfies_jax import background
 from nerfies_jax.measure import clock
-from nerfies_jax.training import background
 
 REPEATS = 7
 PART_SECONDS = 5.0  # for the repeats of one part: a step of a large field takes longer

@@ -11,9 +11,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from nerfies_jax import data_parallel
+from nerfies_jax import background, data_parallel
 from nerfies_jax.measure import matrix_flops
-from nerfies_jax.training import background
 from nerfies_jax.training.model import Frames, Model, PyTree, TrainState
 
 LENGTH = 10  # steps of a scan

@@ -30,6 +30,7 @@ def make(spec: SceneSpec, seed: int = 0) -> tuple[Capture, SceneTruth]:
     seed give the same bits on the same machine and number of cores.
     """
     plan = film.schedule(spec, seed)
+    programs = truth.programs(spec, plan)
     images, depths, hits = _film(spec, plan)
     moves = np.array([thing.moves() for thing in spec.all_things()] + [False])
     moving = moves[hits.thing]  # nothing is id -1: the last row
@@ -37,7 +38,7 @@ def make(spec: SceneSpec, seed: int = 0) -> tuple[Capture, SceneTruth]:
         f"{camera}_{instant:05d}"  # readers sort names: the rows stay in order
         for instant, camera in zip(plan.instant, plan.camera_id, strict=True)
     )
-    answers = _truth(spec, plan, hits, ids, seed)
+    answers = _truth(spec, plan, hits, ids, programs, seed)
     capture = Capture(
         name=f"synthetic {spec.name}",
         source="synthetic",
@@ -152,8 +153,8 @@ def _flow(plan, answers):
     return FrameFlow(*leaves)
 
 
-def _truth(spec, plan, hits, ids, seed):
-    forward, backward = truth.flows(spec, plan, hits)
+def _truth(spec, plan, hits, ids, programs, seed):
+    forward, backward = truth.flows(spec, plan, hits, programs)
     return SceneTruth(
         ids,
         hits.thing.astype(np.int8),
@@ -164,5 +165,5 @@ def _truth(spec, plan, hits, ids, seed):
         backward.pixel,
         backward.seen,
         plan.light_gain,
-        *truth.tracks(spec, plan, hits, seed),
+        *truth.tracks(spec, plan, hits, programs, seed),
     )

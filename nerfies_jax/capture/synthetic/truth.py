@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import pathlib
+from concurrent.futures import Future
 from typing import NamedTuple
 
 import jax
@@ -10,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from nerfies_jax import data_parallel
+from nerfies_jax import background, data_parallel
 from nerfies_jax.capture import npz_files
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.given import Given
@@ -108,7 +109,41 @@ def flow(spec: SceneSpec, thing, material, camera, time, transient_shown) -> Flo
     return Flow(shift, seen & known)
 
 
-def flows(spec: SceneSpec, plan: Schedule, hits: trace.Hit) -> tuple[Flow, Flow]:
+class Programs(NamedTuple):
+    """What `flows` and `tracks` run, compiled in the background."""
+
+    flow: Future[jax.stages.Compiled]
+    follow: Future[jax.stages.Compiled] | None = None  # where nothing moves
+    watch: Future[jax.stages.Compiled] | None = None
+
+
+def programs(spec: SceneSpec, plan: Schedule) -> Programs:
+    """Begin to compile them: beside the pictures, of which they are asked after.
+
+    Of the built-in scene 6 s of one core, and the pictures' own program 5 s.
+    """
+    shape = jax.ShapeDtypeStruct
+    frames, (width, height), points = len(plan.time), spec.size, spec.tracks
+    seen = (
+        shape((frames, height, width), np.int32),
+        shape((frames, height, width, 3), np.float32),
+        plan.cameras,
+        plan.time,
+        plan.transient_shown,
+    )
+    lowered = [data_parallel.lower_rows(flow, spec, seen)]
+    if points and any(thing.moves() for thing in spec.things):
+        thing, times = shape((points,), np.int32), shape((spec.frames,), np.float32)
+        material = shape((points, 3), np.float32)
+        places = shape((points, frames, 3), np.float32)
+        lowered.append(_follow.lower(spec, thing, material, times))
+        lowered.append(_watch.lower(spec, thing, places, plan))
+    return Programs(*(background.begun(one.compile) for one in lowered))
+
+
+def flows(
+    spec: SceneSpec, plan: Schedule, hits: trace.Hit, programs: Programs
+) -> tuple[Flow, Flow]:
     """Flow of every frame to the next and to the previous one of the same camera."""
     count = len(plan.time)
     width, height = spec.size
@@ -126,14 +161,16 @@ def flows(spec: SceneSpec, plan: Schedule, hits: trace.Hit) -> tuple[Flow, Flow]
     )
     shift = np.zeros((2 * count, height, width, 2), np.float32)
     seen = np.zeros((2 * count, height, width), bool)
-    led = data_parallel.rows_on_devices(flow, spec, pairs)
+    led = data_parallel.rows_on_devices(flow, spec, pairs, programs.flow.result())
     for index, result in zip(np.flatnonzero(known), led, strict=True):
         shift[index], seen[index] = result
     forward = Flow(shift[:count], seen[:count])
     return forward, Flow(shift[count:], seen[count:])
 
 
-def tracks(spec: SceneSpec, plan: Schedule, hits: trace.Hit, seed: int):
+def tracks(
+    spec: SceneSpec, plan: Schedule, hits: trace.Hit, programs: Programs, seed: int
+):
     """Points of the moving scene, drawn where the first camera sees them.
 
     Returns thing ids, canonical points, world points over the instants, pixels and
@@ -157,9 +194,13 @@ def tracks(spec: SceneSpec, plan: Schedule, hits: trace.Hit, seed: int):
             np.zeros((0, frames, 2), np.float32),
             np.zeros((0, frames), bool),
         )
-    world = np.asarray(_follow(spec, thing, material, times))
-    pixel, seen = _watch(spec, thing, world[:, plan.instant], plan)
-    return thing, world[:, 0], world, np.asarray(pixel), np.asarray(seen)
+    # Where fewer points move than were asked for, the last again and again.
+    filled = np.minimum(np.arange(spec.tracks), len(chosen) - 1)
+    world = np.asarray(programs.follow.result()(thing[filled], material[filled], times))
+    places = world[:, plan.instant]
+    pixel, seen = programs.watch.result()(thing[filled], places, plan)
+    world, pixel, seen = (np.asarray(x)[: len(chosen)] for x in (world, pixel, seen))
+    return thing, world[:, 0], world, pixel, seen
 
 
 @functools.partial(jax.jit, static_argnums=0)
