@@ -144,10 +144,12 @@ def bent(factor: float) -> Callable[[PyTree], PyTree]:
     def change(params):
         if "warp" not in params:
             return params
-        heads = jax.tree.map(
-            lambda leaf: leaf * np.float32(factor), params["warp"].heads
-        )
-        return params | {"warp": params["warp"]._replace(heads=heads)}
+        warp = params["warp"]
+        last = getattr(warp, "shift", warp)  # the second network of a time warp
+        heads = jax.tree.map(lambda leaf: leaf * np.float32(factor), last.heads)
+        last = last._replace(heads=heads)
+        warp = warp._replace(shift=last) if hasattr(warp, "shift") else last
+        return params | {"warp": warp}
 
     return change
 

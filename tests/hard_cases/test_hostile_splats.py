@@ -15,7 +15,7 @@ from gaussians_jax.initialisation import InitSpec
 from gaussians_jax.spec import effects_of
 from nerfies_jax.capture.capture import PointCloud
 from nerfies_jax.training.model import Frames, Model, TrainState, View
-from tests import scenes
+from tests import bare_scenes, scenes
 from tests.hard_cases import hostile
 
 pytestmark = pytest.mark.full
@@ -31,6 +31,9 @@ PRESETS = [
     pytest.param(name, marks=() if name == "splats-static" else pytest.mark.slow)
     for name in TINY
 ]
+# What those have not: planes, nodes with a mask, anchors that count bits, cores that
+# carry others, embeddings, a time basis, flow with refined cameras.
+SYSTEMS = ("4dgs", "edgs", "adc-gs", "d-miso", "e-d3dgs", "dynmf", "motion-gs")
 # Pruned at the first event, being too large or too faint: a scene without Gaussians.
 DIE = ("huge", "needles", "transparent")
 # |dL/dq| is 1e30 times that of a unit quaternion; its square is beyond float32.
@@ -46,8 +49,9 @@ def hostile_spec(name):
 
     One capacity is one program for all starts; 200 points leave room for 56.
     """
-    plan = dataclasses.replace(
-        scenes.TINY_SPLATS.densification,
+    spec = TINY[name] if name in TINY else bare_scenes.tiny_splats(name)
+    plan = bare_scenes.shrunk(
+        spec.densification,
         refine_every=50,
         refine_start_iter=50,
         refine_stop_iter=STEPS,
@@ -57,7 +61,7 @@ def hostile_spec(name):
         # Of an extent of 0.04 scene units: the paper's 0.1 prunes all of this scene.
         prune_scale3d=50.0,
     )
-    return dataclasses.replace(TINY[name], steps=STEPS, densification=plan)
+    return dataclasses.replace(spec, steps=STEPS, densification=plan)
 
 
 class Ready(NamedTuple):
@@ -156,6 +160,18 @@ ROWS = {
 }
 
 
+def of_every_kind(rows):
+    """A seventh of the rows each: as they were, and as six of the starts above."""
+    kinds = "in one point", "needles", "huge", "opaque", "transparent"
+    kinds = rows, *(ROWS[kind](rows) for kind in (*kinds, "about the cameras"))
+    kind = np.arange(len(rows.mean)) % len(kinds)
+
+    def own(*leaves):
+        return np.stack(leaves)[kind, np.arange(len(kind))]
+
+    return jax.tree.map(own, *kinds)
+
+
 def run(prepared, start, frames, folder=None):
     """Train, hold the run to its promises and look at its picture."""
     steps = prepared.model.spec[0].steps
@@ -209,6 +225,23 @@ def test_splats_train_on_hostile_captures(name, case, tmp_path):
     trained = run(prepared, prepared.start, frames, folder)
     assert trained.result.stopped_by == "steps", trained.result.message
     assert falls(prepared, frames, trained) < FALLS.get(name, 0.95)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["one instant", "of every kind"])
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_every_system_trains_from_hostile_starts(name, case):
+    prepared = ready(name)
+    start, frames = prepared.start, prepared.frames
+    if case == "of every kind":
+        rows = jax.tree.map(np.asarray, start.params.rows["splats"])
+        start = started_with(prepared, of_every_kind(rows))
+    else:
+        frames = hostile.CAPTURES[case](frames)
+    trained = run(prepared, start, frames)
+    assert trained.result.stopped_by == "steps", trained.result.message
+    # 0.2 to 0.71 at one instant, as filmed too; 0.46 to 0.9 from rows of every kind
+    assert falls(prepared, frames, trained) < 0.95
 
 
 def points_at(position):

@@ -19,12 +19,14 @@ from nerfies_jax.radiance.template import TemplateSpec
 from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.spec import RadianceScene
 from nerfies_jax.training.model import Frames, Model, Rendering, TrainState
-from tests import scenes
+from tests import bare_scenes, scenes
 from tests.hard_cases import hostile
 
 # Without NeRF, which is a part of NeRF-W, and T-NeRF and HyperNeRF, whose networks have
 # more inputs: a time, as NSFF's has, and ambient coordinates.
 PAPERS = ("nerf-w", "d-nerf", "nerfies", "nsff")
+# What those have not: voxels under a warp, a mask and a surface that a template asks.
+SYSTEMS = ("tineuvox", "nerf-ds")
 RENDERED = ("d-nerf",)  # its scenes are, before a plain background
 STEPS = 100
 PICTURE = (8, 6)
@@ -52,6 +54,8 @@ class Run(NamedTuple):
 
 def tiny(name: str) -> RadianceScene:
     """A paper's field with networks of eight, over `STEPS` steps of 32 rays."""
+    if name in SYSTEMS:
+        return dataclasses.replace(bare_scenes.tiny_field(name), rays=32)
     spec = presets.with_steps(presets.PRESETS[name], STEPS)
     few = EncodingSpec(2)
     changes = {
