@@ -22,6 +22,7 @@ from nerfies_jax.capture.given import GivenFiles
 from nerfies_jax.capture.nearest import known_names
 from nerfies_jax.runs.config import CaptureSource, MoreMetrics
 from nerfies_jax.runs.representations import PRESETS
+from nerfies_jax.training import stopping
 
 Positional = tyro.conf.Positional
 # Those of `nerfies_jax.capture.synthetic`, which loads JAX.
@@ -135,9 +136,13 @@ def command(settings: Any) -> Callable[[Callable], Callable]:
 
 
 def _interruptible(run, args):
-    """The result of a command; Ctrl-C ends it in one line, with the shell's code."""
+    """The result of a command; signals end it with the shell's code, Ctrl-C in a line.
+
+    Either way what it began, a child or a folder half written, goes with it.
+    """
     try:
-        return run(args)
+        with stopping.exits():
+            return run(args)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         raise SystemExit(130) from None

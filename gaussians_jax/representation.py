@@ -81,6 +81,8 @@ def save(
     effects: tuple[Effect, ...] = (),
 ) -> Saved:
     """`model.npz`, all of the scene, and `gaussians.ply` for viewers."""
+    if not bool(splats.active_mask(state.params.rows["splats"]).any()):
+        return Saved(notes=(f"No Gaussian is left, so there is no {MODEL}.",))
     about = {"spec": spec, "metadata": metadata, "step": int(state.step)}
     size = model_file.save(folder / MODEL, state.params, about)
     every = scene.all_effects(spec, metadata, effects)

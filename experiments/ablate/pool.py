@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import os
 import pathlib
-import signal
 import subprocess
 import sys
 import time
@@ -12,7 +11,7 @@ from typing import NamedTuple
 
 from experiments.ablate.log import line, log
 from nerfies_jax.capture.json_files import write_json
-from nerfies_jax.training import specs
+from nerfies_jax.training import specs, stopping
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]  # where `experiments` is imported
 POLL_SECONDS = 0.1
@@ -138,20 +137,13 @@ def _name(task):
 
 @contextlib.contextmanager
 def _ended_by_signals():
-    """SIGTERM and SIGHUP leave the block as Ctrl-C does; exit code 128 + number."""
-
-    def end(number, _frame):
-        raise SystemExit(128 + number)
-
-    before = {n: signal.signal(n, end) for n in (signal.SIGTERM, signal.SIGHUP)}
+    """Ctrl-C, SIGTERM and SIGHUP leave the block with exit code 128 + number."""
     try:
-        yield
+        with stopping.exits():
+            yield
     except KeyboardInterrupt:
         log("stopped; the same command goes on")
         raise SystemExit(130) from None
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _stop(running):

@@ -96,6 +96,10 @@ def _progress(contests):
             "chance, and near rows have no order.**"
         )
     parts.append(f"The whole league is {whole * WHOLE.seeds:,} cells and any captures.")
+    films = {contest.film for contest in contests}
+    unseen = [f"`{name}`" for name in WHOLE.sources if name not in films]
+    if unseen:
+        parts.append(f"No cell is of {' or '.join(unseen)}.")
     return " ".join(parts)
 
 

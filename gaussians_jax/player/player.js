@@ -127,7 +127,8 @@ function painter(canvas, raster) {
 function start(header, buffer) {
   const one = (id) => document.getElementById(id);
   const canvas = one("scene"), slider = one("time"), button = one("play");
-  const scene = unpack(header, buffer), paint = painter(canvas, header.raster);
+  const scene = unpack(header, buffer);
+  let paint = painter(canvas, header.raster), lost = false;
   let view = header.view, playing = !location.hash, stale = true, before = 0;
   slider.value = parseFloat(location.hash.slice(1)) || 0; // player.html#0.5: that time
 
@@ -153,8 +154,10 @@ function start(header, buffer) {
       slider.value = time % 1;
     }
     before = now;
-    if (playing || stale) draw();
-    stale = false;
+    if (!lost && (playing || stale)) {
+      draw();
+      stale = false;
+    }
     requestAnimationFrame(tick);
   }
 
@@ -168,6 +171,19 @@ function start(header, buffer) {
     button.textContent = yes ? "Pause" : "Play";
   }
 
+  // Phones take the drawing of pages that are out of sight, and may give it back.
+  canvas.addEventListener("webglcontextlost", (event) => {
+    event.preventDefault(); // or it is never given back
+    lost = true;
+    one("poster").hidden = false;
+    one("trouble").textContent = "The browser took the drawing: load the page again if it stays away.";
+  });
+  canvas.addEventListener("webglcontextrestored", () => {
+    paint = painter(canvas, header.raster);
+    lost = false;
+    stale = true;
+    one("trouble").textContent = "";
+  });
   steer(canvas, header.up, () => view, change);
   button.addEventListener("click", () => play(!playing));
   one("first").addEventListener("click", () => change(header.view));
@@ -177,7 +193,8 @@ function start(header, buffer) {
   slider.addEventListener("pointerdown", () => play(false));
   window.addEventListener("resize", () => { stale = true; });
   window.addEventListener("keydown", (event) => {
-    if (event.key !== " " || event.target === button) return;
+    // Which Space presses or opens; on the slider it plays.
+    if (event.key !== " " || event.target.closest?.("button, [type=color]")) return;
     event.preventDefault();
     play(!playing);
   });

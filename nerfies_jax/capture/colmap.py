@@ -11,11 +11,11 @@ from nerfies_jax.capture.borders import without_black_borders
 from nerfies_jax.capture.capture import Capture, CaptureError, PointCloud
 from nerfies_jax.capture.colmap_lenses import undistort
 from nerfies_jax.capture.colmap_library import library
+from nerfies_jax.capture.formats import sparse_models
 from nerfies_jax.capture.json_files import AnyPath, inside
 from nerfies_jax.capture.points import place_by_points
 from nerfies_jax.geometry.camera import Camera
 
-MODELS = ("sparse", "colmap/sparse", "distorted/sparse", "colmap", "")
 PICTURES = ("images", "images_2", "images_4", "images_8", "input", "rgb", "")
 MIN_TRACK = 3  # frames that must have seen a point
 MAX_ERROR_PX = 2.0  # mean reprojection error of a point that is kept
@@ -211,17 +211,7 @@ def _best_model(path):
 
     COLMAP numbers models in the order in which it found them.
     """
-    places = []
-    for place in MODELS:
-        parent = path / place
-        numbered = [p for p in parent.glob("*") if p.is_dir() and p.name.isdecimal()]
-        for folder in (*sorted(numbered, key=lambda p: int(p.name)), parent):
-            if any(
-                (folder / f"images.{ending}").is_file() for ending in ("bin", "txt")
-            ):
-                places.append(folder)
-        if places:
-            break
+    places = sparse_models(path)
     if not places:
         raise CaptureError(
             f"{path}: no COLMAP model; looked for cameras, images and points3D (.bin "

@@ -8,6 +8,8 @@ import collections
 import contextlib
 import importlib
 import math
+import numbers
+import os
 import pathlib
 import warnings
 from collections.abc import Sequence
@@ -27,14 +29,21 @@ FILMS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".3gp")
 PLAIN = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 HEIC = (".heic", ".heif")  # read where pillow-heif is installed
 FRAMES = 100  # kept of a film
+LEAST = 3  # pictures: cameras are judged by points that three of them show
+OWN_TIMES = 0.9  # of the frames of a film must have a time that no other has
 BLURRED = 0.4  # of the usual sharpness around it; planted blurs came out below 0.2
 _BROKEN = "not readable, so copy them again"
+_LARGE = f"of more than {MAX_PIXELS:,} pixels, so make them smaller first"
 _ORIENTATION, _EXIF, _FOCAL_35MM = 0x0112, 0x8769, 0xA405
 FULL_FRAME_MM = 36.0  # the longer side that the 35 mm equivalent refers to
 
 
 class _Unreadable(CaptureError):
     """What is no picture for all its name, or broken."""
+
+
+class _TooLarge(CaptureError):
+    """More pixels than are read, or a broken header that says so."""
 
 
 class Taken(NamedTuple):
@@ -82,12 +91,15 @@ def from_film(
     # Frames come in the order in which they are shown, but .avi has only the times at
     # which they are decoded, and B-frames are not decoded in that order.
     moments, scores = np.sort(moments), np.array(scores)
-    if len(np.unique(np.round(1000 * moments))) < len(moments):  # as names keep them
+    stamps = np.round(1000 * moments)  # as names keep them
+    # One or two of a phone's film may share one; of a film without times all do.
+    if len(np.unique(stamps)) < OWN_TIMES * len(stamps):
         raise CaptureError(
             f"{film}: its frames have no times of their own; encode it again"
         )
     count = _wanted(film, moments, count, per_second)
     kept, blurred = sharp_rows(scores, moments, count)
+    kept = kept[np.unique(stamps[kept], return_index=True)[1]]
     sources = None if masks is None else _masks_of_film(masks, len(moments))
     names, rows = [], kept.tolist()  # which rise
     colours = read_video(film, rows=set(rows))
@@ -112,9 +124,9 @@ def _wanted(film, moments, count, per_second):
             raise ValueError("give the frames of a film or so many a second, not both")
         count = round(per_second * np.ptp(moments)) + 1
     count = FRAMES if count is None else count
-    if count < 2:
+    if count < LEAST:
         raise ValueError(
-            f"{film}: {count} frames to keep; a reconstruction needs at least 2"
+            f"{film}: {count} frames to keep; a reconstruction needs at least {LEAST}"
         )
     return count
 
@@ -146,7 +158,7 @@ def from_pictures(
     taken = [file for file in sizes if sizes[file] == usual]
     others = [file.name for file in sizes if sizes[file] != usual]
     notes += _left_out(others, f"not of {usual[0]}x{usual[1]} pixels like most")
-    stems = collections.Counter(file.stem for file in taken)
+    stems = collections.Counter(_spoken(file.stem) for file in taken)
     stem, times = stems.most_common(1)[0]
     if times > 1:
         raise CaptureError(f"{folder}: {times} pictures are named {stem}; keep one")
@@ -157,15 +169,16 @@ def from_pictures(
         except _Unreadable:  # behind its header
             broken.append(file)
             continue
-        _write(out / "images" / f"{file.stem}.png", shrink(colour, factor))
+        name = f"{_spoken(file.stem)}.png"
+        _write(out / "images" / name, shrink(colour, factor))
         if masks is not None:
             source = _mask_of(masks, file)
             mask = _upright(source).mean(-1) >= 128
-            _write_mask(out, f"{file.stem}.png", mask, colour.shape, factor, source)
+            _write_mask(out, name, mask, colour.shape, factor, source)
     notes += _left_out([file.name for file in broken], _BROKEN)
     taken = [file for file in taken if file not in broken]
     _check_enough(folder, len(taken), notes)
-    names = tuple(f"{file.stem}.png" for file in taken)
+    names = tuple(f"{_spoken(file.stem)}.png" for file in taken)
     return Taken(names, notes, focal=_focal(taken))
 
 
@@ -179,21 +192,23 @@ def _readable(folder):
             photographs, "HEIC, which needs pip install 'nerfies-jax[heic]'"
         )
         files = [file for file in files if file.name not in photographs]
-    sizes, broken = {}, []
+    sizes, broken, large = {}, [], []
     for file in files:
         try:
             sizes[file] = _upright_size(file)
         except _Unreadable:
             broken.append(file.name)
-    notes += _left_out(broken, _BROKEN)
+        except _TooLarge:
+            large.append(file.name)
+    notes += _left_out(broken, _BROKEN) + _left_out(large, _LARGE)
     _check_enough(folder, len(sizes), notes)
     return sizes, notes
 
 
 def _check_enough(folder, count, notes):
-    if count < 2:
+    if count < LEAST:
         raise CaptureError(
-            f"{folder}: {count} pictures; a reconstruction needs at least 2"
+            f"{folder}: {count} pictures; a reconstruction needs at least {LEAST}"
             + "".join(f" ({note})" for note in notes)
         )
 
@@ -201,8 +216,17 @@ def _check_enough(folder, count, notes):
 def _left_out(names, reason):
     if not names:
         return ()
-    listed = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
+    listed = ", ".join(map(_spoken, names[:5])) + (", ..." if len(names) > 5 else "")
     return (f"{len(names)} pictures left out, {reason}: {listed}",)
+
+
+def _spoken(name):
+    """The name in letters: of an old archive it may be no UTF-8, which COLMAP wants."""
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return os.fsencode(name).decode("latin-1")
+    return name
 
 
 def _heif():
@@ -222,13 +246,14 @@ def _opened(file):
             warnings.simplefilter("error", PIL.Image.DecompressionBombWarning)
             with PIL.Image.open(file) as picture:
                 if picture.width * picture.height > MAX_PIXELS:
-                    raise CaptureError(
-                        f"{file}: {picture.width}x{picture.height} pixels, more than "
-                        f"{MAX_PIXELS}; make the picture smaller first"
-                    )
+                    raise PIL.Image.DecompressionBombError
                 yield picture
     except CaptureError:
         raise
+    except (PIL.Image.DecompressionBombWarning, PIL.Image.DecompressionBombError):
+        raise _TooLarge(
+            f"{file}: more than {MAX_PIXELS:,} pixels; make the picture smaller first"
+        ) from None
     except (OSError, ValueError, SyntaxError, Warning) as error:
         reason = " ".join(str(error).split())
         raise _Unreadable(
@@ -238,7 +263,7 @@ def _opened(file):
 
 def _upright_size(file):
     with _opened(file) as picture:
-        turned = picture.getexif().get(_ORIENTATION, 1) >= 5  # by a quarter
+        turned = picture.getexif().get(_ORIENTATION, 1) in (5, 6, 7, 8)  # by a quarter
         return picture.size[::-1] if turned else picture.size
 
 
@@ -251,7 +276,13 @@ def _upright(file):
                 "it with 8 or 16 bits"
             )
         if picture.mode.startswith("I"):  # 16 bits of grey
-            values = np.asarray(picture).astype(np.uint32) // 257
+            values = np.asarray(picture)
+            if not 0 <= values.min() <= values.max() <= 65535:
+                raise CaptureError(
+                    f"{file}: grey of 32 bits, up to {values.max()}, whose white is "
+                    "not known; save it with 8 or 16 bits"
+                )
+            values = values.astype(np.uint32) // 257
             return np.repeat(values.astype(np.uint8)[..., None], 3, axis=2)
         if picture.has_transparency_data:  # what is cut out must not be seen again
             picture = picture.convert("RGBA")
@@ -266,7 +297,8 @@ def _focal(files: Sequence[pathlib.Path]) -> float | None:
     for file in files:
         with _opened(file) as picture:
             value = picture.getexif().get_ifd(_EXIF).get(_FOCAL_35MM)
-        if value:
+        # Strangers' files hold anything here: several numbers, a word, 0 for unknown.
+        if isinstance(value, numbers.Real) and 0 < value < math.inf:
             focals.append(float(value) / FULL_FRAME_MM)
     return float(np.median(focals)) if focals else None
 

@@ -27,13 +27,32 @@ def _is_blender(path):
     return path.is_file() or any(path.glob("transforms*.json"))
 
 
+# Where COLMAP's models are looked for, each by itself or in folders with numbers.
+MODELS = ("sparse", "colmap/sparse", "distorted/sparse", "colmap", "")
+
+
+def sparse_models(path: pathlib.Path, part: str = "images") -> list[pathlib.Path]:
+    """The folders with that part of a COLMAP model, of the first place that has any.
+
+    No deeper: below a folder of pictures lie the captures that were made of them.
+    """
+    for place in MODELS:
+        parent = path / place
+        numbered = [p for p in parent.glob("*") if p.is_dir() and p.name.isdecimal()]
+        folders = (*sorted(numbered, key=lambda p: int(p.name)), parent)
+        found = [
+            folder
+            for folder in folders
+            if any((folder / f"{part}.{ending}").is_file() for ending in ("bin", "txt"))
+        ]
+        if found:
+            return found
+    return []
+
+
 def _is_colmap(path):
-    places = ("", "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "colmap")
-    return any(
-        (path / place / f"cameras.{ending}").is_file()
-        for place in places
-        for ending in ("bin", "txt")
-    ) or any(path.glob("**/sparse/*/cameras.bin"))
+    # Either alone is half a model, and the reader says what is missing.
+    return any(sparse_models(path, part) for part in ("images", "cameras"))
 
 
 def _is_llff(path):

@@ -20,7 +20,7 @@ from nerfies_jax.capture.json_files import AnyPath, replaced_file
 # An 8K video frame has 33 million. Pillow itself only warns above 89 million, and at
 # 144 million a picture is 430 MB.
 MAX_PIXELS = 64_000_000
-EXR = ".exr"
+EXR, TIFF = ".exr", (".tif", ".tiff")
 _ORIENTATION = 0x0112  # the EXIF tag; 1 is upright, 0 unknown
 _PILLOW_ERRORS = (OSError, SyntaxError, ValueError, EOFError, IndexError, TypeError)
 
@@ -91,7 +91,14 @@ def read_pixels(path: AnyPath, orientation: str = "refuse") -> np.ndarray:
             "it and a camera file may or may not; turn the pixels and remove the tag"
         )
     try:
-        if header.mode in {"RGB", "RGBA", "L", "1", "I;16", "I;16B"}:
+        plain = header.mode in {"RGB", "RGBA", "L", "1", "I;16", "I;16B"}
+        if plain and path.suffix.lower() in TIFF:
+            # skimage.io.imread wants one more package for those that are packed.
+            with PIL.Image.open(path) as image:
+                pixels = np.asarray(image)
+            if header.mode.startswith("I;16"):
+                pixels = pixels.astype(np.uint16)
+        elif plain:
             pixels = skimage.io.imread(path)
         elif header.mode in {"LA", "P", "PA"}:
             # skimage.io.imread transposes LA ([height, width, 2] looks like channels

@@ -103,11 +103,10 @@ def _sync_names(folder):
 @contextlib.contextmanager
 def new_folder(path: AnyPath):
     """A temporary folder beside `path` that becomes `path` when the block ends well."""
-    path = pathlib.Path(path)
     with scratch_folder(path) as partial:
         yield partial
         partial.chmod(0o755)  # mkdtemp makes it private
-        os.replace(partial, path)
+        os.replace(partial, pathlib.Path(path).resolve())
 
 
 def refuse_existing(path: AnyPath, overwrite: bool) -> None:
@@ -133,6 +132,7 @@ def replaced_folder(path: AnyPath, overwrite: bool = False):
         with new_folder(path) as partial:
             yield partial
         return
+    path = path.resolve()
     with scratch_folder(path.with_name(f".{path.name}.replaced")) as scratch:
         new, old = scratch / "new", scratch / "old"
         new.mkdir()
@@ -160,14 +160,24 @@ def _kinds(folder):
 
 @contextlib.contextmanager
 def scratch_folder(path: AnyPath):
-    """A temporary folder beside the new folder `path`, gone when the block ends."""
+    """A temporary folder beside the new folder `path`, gone when the block ends.
+
+    What is renamed to `path` then must name it by its real path: neither "." nor a link
+    can be renamed to.
+    """
     path = pathlib.Path(path)
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise CaptureError(f"{path}: already there; choose another name or remove it")
+    real = path.resolve()
+    if os.path.ismount(real):
+        raise CaptureError(
+            f"{path}: a whole mounted disk, which no new folder can replace; name a "
+            "folder in it"
+        )
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        real.parent.mkdir(parents=True, exist_ok=True)
         partial = pathlib.Path(
-            tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent)
+            tempfile.mkdtemp(prefix=f".{real.name}.", dir=real.parent)
         )
     except OSError as error:
         raise CaptureError(

@@ -175,7 +175,9 @@ def _in_own_process(folder, masked, spec, tell):
     command = [sys.executable, "-m", "nerfies_jax.capture.structure_from_motion"]
     root = pathlib.Path(__file__).resolve().parents[2]
     pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
-    with subprocess.Popen(command, text=True, cwd=root, **pipes) as child:
+    # A log may hold any bytes, and must be read on, or its pipe fills.
+    words = {"text": True, "errors": "replace"}
+    with subprocess.Popen(command, cwd=root, **words, **pipes) as child:
         log = collections.deque(maxlen=20)
         reader = threading.Thread(target=_follow, args=(child.stderr, log, tell))
         reader.start()

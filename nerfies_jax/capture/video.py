@@ -97,7 +97,7 @@ def transfer_of(path: AnyPath) -> Transfer | None:
     """
     av = library()
     try:
-        with av.open(str(path)) as container:
+        with av.open(str(path.absolute())) as container:
             frame = next(container.decode(video=0), None)
             return None if frame is None else TRANSFERS.get(int(frame.color_trc))
     except (av.FFmpegError, OSError, IndexError):
@@ -151,7 +151,7 @@ def read_video(
         raise CaptureError(f"{path}: no such film; check the path")
     shown, av = 0, library()
     try:
-        with av.open(str(path)) as container:
+        with av.open(str(path.absolute())) as container:
             if not container.streams.video:
                 raise CaptureError(f"{path}: holds no pictures; pass a film")
             stream = container.streams.video[0]

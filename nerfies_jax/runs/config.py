@@ -94,8 +94,8 @@ class Preparation:
                 f"frames={self.frames} and fps={self.fps}: give the frames of a film "
                 "or so many a second, not both"
             )
-        if self.frames is not None and self.frames < 2:
-            raise ValueError(f"frames={self.frames}: keep at least 2")
+        if self.frames is not None and self.frames < 3:
+            raise ValueError(f"frames={self.frames}: keep at least 3")
         if self.fps is not None and not 0 < self.fps < math.inf:
             raise ValueError(f"fps={self.fps}: a positive number of frames a second")
         if self.max_side < 16:

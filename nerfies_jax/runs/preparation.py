@@ -13,6 +13,7 @@ import hashlib
 import json
 import os
 import pathlib
+import re
 import shutil
 from collections.abc import Callable
 from typing import NamedTuple
@@ -95,7 +96,7 @@ def prepare(
         if how.masks is None:  # what was found is no truth to be scored by
             capture = dataclasses.replace(capture, moving=None)
         capture = dataclasses.replace(
-            capture, name=out.name, path=None, frames_per_second=rate
+            capture, name=out.resolve().name, path=None, frames_per_second=rate
         )
         written = scratch / "capture"
         nerfies_format.write(capture, written)
@@ -103,7 +104,7 @@ def prepare(
         if solved.masked and how.masks is None:
             (scratch / "found").rename(written / "masks_found")
         write_json(written / RECORD, _record(source, how, solved))
-        os.replace(written, out)
+        os.replace(written, out.resolve())
     for line in describe(capture):
         tell(line)
     return capture
@@ -116,12 +117,15 @@ def _check_masks(how):
 
 @contextlib.contextmanager
 def _named(scratch, source):
-    """Errors about the pictures in the scratch folder, which goes, name the source."""
+    """Errors about what lies in the scratch folder, which goes, name the source."""
     try:
         yield
     except CaptureError as error:
-        hidden = str(scratch.resolve() / "images")
-        raise CaptureError(str(error).replace(hidden, str(source))) from error
+        hidden = re.escape(str(scratch.resolve()))
+        # Its pictures by name, whatever else as the whole.
+        inside = f"{hidden}{re.escape(os.sep)}(images|[^:]*)"
+        said = re.sub(inside, lambda _: str(source), str(error))
+        raise CaptureError(said) from error
 
 
 def _taken(kind, source, scratch, how) -> Taken:

@@ -1,7 +1,9 @@
 """Ctrl-C, SIGTERM and SIGHUP as requests that a loop answers when it can."""
 
+import contextlib
 import signal
 import threading
+from collections.abc import Iterator
 
 NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # Windows has no SIGHUP
 
@@ -19,12 +21,7 @@ class StopRequests:
         self._before: dict[int, object] = {}
 
     def __enter__(self):
-        if threading.current_thread() is threading.main_thread():
-            for name in NAMES:
-                number = getattr(signal, name, None)
-                if number is None or signal.getsignal(number) == signal.SIG_IGN:
-                    continue
-                self._before[number] = signal.signal(number, self._note)
+        self._before = _installed(self._note, NAMES)
         return self
 
     def _note(self, number, _frame):
@@ -33,5 +30,40 @@ class StopRequests:
         self.name = signal.Signals(number).name
 
     def __exit__(self, *_):
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
+        _restore(self._before)
+
+
+@contextlib.contextmanager
+def exits() -> Iterator[None]:
+    """SIGTERM and SIGHUP leave the block as Ctrl-C does, with exit code 128 + number.
+
+    What was begun in it, folders that are half written and processes, is cleared away
+    on the way out. The next one of the same kind ends the process at once.
+    """
+
+    def leave(number, _frame):
+        signal.signal(number, signal.SIG_DFL)
+        raise SystemExit(128 + number)
+
+    before = _installed(leave, NAMES[1:])
+    try:
+        yield
+    finally:
+        _restore(before)
+
+
+def _installed(handler, names):
+    """What handled these signals before, by number, where `handler` does now."""
+    before = {}
+    if threading.current_thread() is threading.main_thread():
+        for name in names:
+            number = getattr(signal, name, None)
+            if number is None or signal.getsignal(number) == signal.SIG_IGN:
+                continue
+            before[number] = signal.signal(number, handler)
+    return before
+
+
+def _restore(before):
+    for number, handler in before.items():
+        signal.signal(number, handler)

@@ -1,5 +1,7 @@
 """Films and photographs become pictures of one size, upright and in order."""
 
+import os
+import struct
 from fractions import Fraction
 
 import av
@@ -123,9 +125,14 @@ def test_frames_stay_in_order_where_times_are_those_of_decoding(tmp_path):
 
 
 def test_a_picture_of_floats_is_refused_by_name(tmp_path):
-    for name in ("0.tif", "1.tif"):
+    for name in ("0.tif", "1.tif", "2.tif"):
         PIL.Image.fromarray(np.ones((32, 32), np.float32)).save(tmp_path / name)
     with pytest.raises(CaptureError, match=r"0\.tif: .*32-bit floats.*8 or 16 bits"):
+        footage.from_pictures(tmp_path, tmp_path / "out")
+    deep = np.full((32, 32), 70_000, np.int32)
+    for name in ("0.tif", "1.tif", "2.tif"):
+        PIL.Image.fromarray(deep).save(tmp_path / name)
+    with pytest.raises(CaptureError, match=r"0\.tif: grey of 32 bits, up to 70000"):
         footage.from_pictures(tmp_path, tmp_path / "out")
 
 
@@ -133,7 +140,7 @@ def test_what_is_cut_out_of_a_picture_is_black(tmp_path):
     """The colour that an editor leaves behind transparency is not to be matched."""
     pixels = np.full((32, 32, 4), 200, np.uint8)
     pixels[:, :, 3] = np.repeat([0, 255], 16)[:, None]
-    for name in ("0.png", "1.png"):
+    for name in ("0.png", "1.png", "2.png"):
         PIL.Image.fromarray(pixels).save(tmp_path / name)
     footage.from_pictures(tmp_path, tmp_path / "out")
     read = images.read_pixels(tmp_path / "out/images/0.png")
@@ -193,20 +200,57 @@ def test_a_folder_is_told_by_what_is_in_it(tmp_path):
 def test_what_cannot_be_read_is_left_out_and_what_is_hidden_is_no_picture(tmp_path):
     folder = tmp_path / "photographs"
     folder.mkdir()
-    for row in range(4):
+    for row in range(5):
         noise = np.random.default_rng(row).integers(0, 256, (32, 48, 3))
         PIL.Image.fromarray(noise.astype(np.uint8)).save(folder / f"{row}.jpg")
     (folder / "._0.jpg").write_bytes(b"of macOS")
     (folder / "album.jpg").mkdir()
     (folder / "1.jpg").write_bytes(b"broken")
     (folder / "2.jpg").write_bytes((folder / "2.jpg").read_bytes()[:1000])  # its header
-    assert len(footage.pictures_in(folder)) == 4
-    assert len(frames.pictures_in(folder)) == 4
+    # Of an old archive, its name in no encoding that is known.
+    (folder / "4.jpg").rename(folder / os.fsdecode(b"f\xfcr.jpg"))
+    # Of a phone's best camera, or a broken header; Pillow raises what is no OSError.
+    for name, size in {"5.bmp": (12_240, 16_320), "6.bmp": (9_000, 12_000)}.items():
+        PIL.Image.new("RGB", (48, 32)).save(folder / name)
+        header = bytearray((folder / name).read_bytes())
+        header[18:26] = struct.pack("<2i", *size)
+        (folder / name).write_bytes(header)
+    assert len(footage.pictures_in(folder)) == 7
+    assert len(frames.pictures_in(folder, footage.PLAIN)) == 7
     taken = footage.from_pictures(folder, tmp_path / "out")
-    assert taken.names == ("0.png", "3.png")
-    assert [note.rpartition(": ")[2] for note in taken.notes] == ["1.jpg", "2.jpg"]
+    assert taken.names == ("0.png", "3.png", "für.png")
+    left_out = [note.rpartition(": ")[2] for note in taken.notes]
+    assert left_out == ["1.jpg", "5.bmp, 6.bmp", "2.jpg"]
     written = sorted(path.name for path in (tmp_path / "out/images").iterdir())
-    assert written == ["0.png", "3.png"]
+    assert written == ["0.png", "3.png", "für.png"]
     (folder / "3.jpg").unlink()
-    with pytest.raises(CaptureError, match=r"1 pictures; .*at least 2.*1\.jpg.*2\.jpg"):
+    with pytest.raises(CaptureError, match=r"2 pictures; .*at least 3.*1\.jpg.*2\.jpg"):
         footage.from_pictures(folder, tmp_path / "again")
+
+
+def test_what_files_say_of_a_lens_may_be_anything(tmp_path):
+    values = {"0.jpg": (27, 35), "1.jpg": 0, "2.jpg": 18, "3.jpg": "wide"}
+    for name, value in values.items():
+        told = PIL.Image.Exif()
+        told[0x0112] = 9  # no orientation that there is
+        told.get_ifd(0x8769)[0xA405] = value
+        PIL.Image.new("RGB", (48, 32)).save(tmp_path / name, exif=told)
+    taken = footage.from_pictures(tmp_path, tmp_path / "out")
+    assert taken.names == ("0.png", "1.png", "2.png", "3.png")
+    assert taken.focal == 18 / 36
+
+
+def test_two_frames_of_one_time_cost_one_of_them(tmp_path, monkeypatch):
+    def read(path, grey=False, rows=None):
+        for row in range(30) if rows is None else sorted(rows):
+            # The fifth frame comes a tenth of a millisecond after the fourth.
+            seconds = row / 30 if row != 4 else 0.1001
+            yield seconds, np.full((32, 48) if grey else (32, 48, 3), row, np.uint8)
+
+    monkeypatch.setattr(footage, "read_video", read)
+    monkeypatch.setattr(footage, "transfer_of", lambda film: None)
+    taken = footage.from_film(tmp_path / "a.mp4", tmp_path, 30)
+    assert len(taken.names) == len(set(taken.names)) == 29
+    monkeypatch.setattr(footage, "OWN_TIMES", 0.99)
+    with pytest.raises(CaptureError, match="no times of their own"):
+        footage.from_film(tmp_path / "a.mp4", tmp_path / "b", 30)

@@ -43,6 +43,10 @@ def test_what_is_no_capture_yet_is_refused_with_the_way_out(tmp_path):
     assert issubclass(CaptureError, ValueError)
     for name in ("a.jpg", "b.HEIC"):
         (tmp_path / name).touch()
+    # Below it lies what was made of them before.
+    made = tmp_path / "runs/a-capture/colmap/sparse/0"
+    made.mkdir(parents=True)
+    (made / "cameras.bin").touch()
     with pytest.raises(CaptureError, match=r"2 pictures without.*prepare pictures"):
         room.load(tmp_path)
 

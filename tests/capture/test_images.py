@@ -70,6 +70,22 @@ def test_one_bit_and_sixteen_bits(tmp_path):
     np.testing.assert_array_equal(colour[..., 0], np.round(deep / 257).astype(int))
 
 
+@pytest.mark.parametrize("packing", [None, "tiff_lzw", "tiff_deflate"])
+@pytest.mark.parametrize(
+    ("stored", "read"),
+    [
+        (COLOUR, COLOUR),
+        (ALPHA, ALPHA),
+        (ALPHA > 128, np.where(ALPHA > 128, 255, 0)),
+        (ALPHA * np.uint16(257), ALPHA),
+    ],
+)
+def test_a_tiff_is_read_however_it_is_packed(tmp_path, stored, read, packing):
+    PIL.Image.fromarray(stored).save(tmp_path / "a.tif", compression=packing)
+    pixels = images.read_pixels(tmp_path / "a.tif").squeeze()
+    np.testing.assert_array_equal(pixels, read)
+
+
 def test_sixteen_bit_colour_loses_at_most_its_low_byte(tmp_path):
     deep = RNG.integers(0, 65536, (6, 9, 3)).astype(">u2")
     rows = b"".join(b"\0" + row.tobytes() for row in deep)

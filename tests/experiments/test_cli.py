@@ -4,6 +4,7 @@ import dataclasses
 import json
 import pathlib
 import re
+import signal
 import subprocess
 import sys
 from typing import ClassVar, Literal
@@ -12,6 +13,7 @@ import pytest
 
 from experiments import __main__ as every
 from experiments import cli
+from nerfies_jax.capture import json_files
 from nerfies_jax.runs import representations
 
 
@@ -36,6 +38,22 @@ def test_an_interrupted_command_ends_in_one_line(capsys):
         main([])
     assert stop.value.code == 130
     assert capsys.readouterr().err == "interrupted\n"
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_command_that_is_ended_clears_away_what_it_began(number, tmp_path):
+    @cli.command(Nothing)
+    def main(args):
+        with json_files.new_folder(tmp_path / "new") as folder:
+            (folder / "half").touch()
+            signal.raise_signal(number)
+
+    before = signal.getsignal(number)
+    with pytest.raises(SystemExit) as stop:
+        main([])
+    assert stop.value.code == 128 + number
+    assert not list(tmp_path.iterdir())
+    assert signal.getsignal(number) is before
 
 
 def test_our_own_bugs_keep_their_traceback():

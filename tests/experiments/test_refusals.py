@@ -84,7 +84,7 @@ TABLE = [
     ("motion_rank", "--basis-form square", "--basis-form square"),
     ("nerf_speed", "--repeats 0", "--repeats 0: time at least once"),
     ("prepare", "video a.mp4 OUT --fps nan", "fps=nan: a positive number"),
-    ("prepare", "video a.mp4 OUT --frames 1", "frames=1: keep at least 2"),
+    ("prepare", "video a.mp4 OUT --frames 2", "frames=2: keep at least 3"),
     ("raster_speed", "--yardstick OUT", "--yardstick OUT: no such file"),
     ("reconstruct", "--out OUT --factor 2", "make_scene"),
     ("reconstruct", "--out OUT --max-side 2", "make_scene"),

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import densification, growth, scene, splats
+from gaussians_jax import densification, growth, representation, scene, splats
 from gaussians_jax.growth import AuxState
 from gaussians_jax.initialisation import InitSpec
 from gaussians_jax.spec import effects_of
@@ -214,6 +214,11 @@ def test_splats_train_from_hostile_rows(name, case, tmp_path):
     assert trained.result.stopped_by == "steps", trained.result.message
     rows = trained.result.state.params.rows["splats"]
     assert bool(splats.active_mask(rows).any()) == (case not in DIE), case
+    if case in DIE:  # a run of nothing ends with a word
+        about = prepared.model.spec
+        saved = representation.save(tmp_path, *about, trained.result.state)
+        assert saved.notes[0].startswith("No Gaussian is left")
+        assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("case", hostile.CAPTURES)
