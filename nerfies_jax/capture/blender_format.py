@@ -42,8 +42,9 @@ def read(
 
     Pictures with alpha are laid over `background` (sRGB). `heldout`: None for the test
     split, else validation, else every 8th frame; "val" or "test" for that split; n for
-    every n-th training frame. `near` and `far`, in scene units, override the defaults:
-    2 and 6 for Blender's cameras 4 from the origin, from the points for nerfstudio.
+    every n-th frame of the file (of split files, the training one). `near` and `far`,
+    in scene units, override the defaults: 2 and 6 for Blender's cameras 4 from the
+    origin, from the points for nerfstudio.
     """
     path = pathlib.Path(path)
     root = path if path.is_dir() else path.parent

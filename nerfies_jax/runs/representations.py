@@ -4,7 +4,7 @@ import functools
 import importlib.metadata
 import json
 import pathlib
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:  # a record is loaded when it is asked for, not with this module
     from nerfies_jax.evaluation.representation import Representation
@@ -78,6 +78,16 @@ def of_run(folder: pathlib.Path) -> "Representation | None":
         return None
 
 
+def stored_spec(representation: "Representation", stored: Any) -> Any:
+    """A spec of that representation as a run folder holds it.
+
+    Its types may be of the package that the representation comes from, too. Raises
+    ValueError and TypeError for what is none.
+    """
+    own = representation.spec_type.__module__.partition(".")[0]
+    return specs.from_json(stored, (*specs.PACKAGES, own))
+
+
 class Cores(NamedTuple):
     """What `platform.start_jax` is told of a scene that is to be trained."""
 
@@ -104,7 +114,7 @@ def cores_of_run(folder: pathlib.Path) -> Cores:
         return Cores("all", 1)
     try:
         stored = json.loads((folder / CONFIG).read_text())["spec"]
-        shares = representation.shares(specs.from_json(stored, specs.PACKAGES))
+        shares = representation.shares(stored_spec(representation, stored))
     except (OSError, ValueError, KeyError, TypeError):
         shares = 1
     return Cores(representation.threads, shares)

@@ -275,7 +275,8 @@ def read_settings(folder: pathlib.Path) -> Settings:
     try:
         stored = json.loads(path.read_text())
         kind = representations.named(stored["representation"])
-        config, spec = (specs.from_json(stored[name]) for name in ("config", "spec"))
+        config = specs.from_json(stored["config"])
+        spec = representations.stored_spec(kind, stored["spec"])
         for value, wanted in ((config, RunConfig), (spec, kind.spec_type)):
             if not isinstance(value, wanted):
                 raise ValueError(f"a {type(value).__name__} for a {wanted.__name__}")

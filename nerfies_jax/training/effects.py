@@ -139,8 +139,8 @@ class Effect(NamedTuple):
     name: str  # of its parameters, its state and its metrics
     # Of both representations.
     init: Callable[[Key[Array, ""]], PyTree] | None = None
-    # Of what `init` returned, at a traced step. None: as the template of a field;
-    # Gaussians have no such common rate, and need one.
+    # Of what `init` returned, at a traced step. None: the common rate of a field;
+    # Gaussians have none, and need one.
     learning_rate: Schedule | None = None
     # (params, context) -> terms, logged as `effect/term`
     penalty: Callable[[PyTree, PenaltyContext], dict[str, Term]] | None = None

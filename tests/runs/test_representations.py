@@ -1,5 +1,6 @@
 """One registry of representations; their presets, threads and run folders agree."""
 
+import dataclasses
 import json
 
 import jax
@@ -11,6 +12,7 @@ from nerfies_jax.evaluation.representation import MODEL
 from nerfies_jax.runs import representations, run
 from nerfies_jax.runs.config import CaptureSource, RunConfig
 from nerfies_jax.runs.run_folder import CONFIG
+from nerfies_jax.training import specs
 from tests import scenes
 
 THREADS = {"gaussians": "one", "radiance": "all"}
@@ -43,6 +45,22 @@ def test_a_preset_takes_steps_and_settings():
     config = RunConfig("splats-static-small", steps=50, overrides=("sh_degree=0",))
     spec = runs.scene_spec(config)
     assert (spec.steps, spec.sh_degree) == (50, 0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Foreign:
+    """A spec of a package that is not ours."""
+
+    steps: int
+
+
+def test_a_spec_may_be_of_the_package_of_its_representation():
+    kind = representations.named("gaussians")._replace(spec_type=Foreign)
+    stored = json.loads(json.dumps(specs.as_json(Foreign(7))))
+    assert representations.stored_spec(kind, stored) == Foreign(7)
+    ours = representations.named("radiance")
+    with pytest.raises(ValueError, match=r"Foreign', which is no record"):
+        representations.stored_spec(ours, stored)
 
 
 @pytest.mark.full
