@@ -33,7 +33,7 @@ class DefaultStrategySpec:
     """When and where Gaussians are added and removed."""
 
     refine_every: int = 100  # steps
-    refine_start_iter: int = steps(500)
+    refine_start_iter: int = steps(600)  # the first event; the paper waits for 500
     refine_stop_iter: int = steps(15_000)
     grow_grad2d: float = 2e-4  # of the mean on the screen, in NDC units per view
     grow_scale3d: float = 0.01  # largest scale, of the scene extent
@@ -117,6 +117,9 @@ def observe(
     batch) by the projected means in pixels; for the absolute variant, the sum of the
     absolute slopes over the pixels. A pixel is 2/width of the NDC range, so the slope
     per NDC unit is width/2 and height/2 times larger; the thresholds are in that unit.
+    Each view of a batch counts by itself. 4DGS, E-D3DGS and ADC-GS add up the slopes of
+    the mean loss and count a batch once: of two views that is as large where both pull
+    one way, and half where one of them alone sees the row.
     Where rows carry several Gaussians each, these say what happened to those: a row
     counts the mean slope of its visible ones, by their `significance` where it is
     given, and the largest radius.

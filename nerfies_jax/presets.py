@@ -132,7 +132,7 @@ NERF_DS = dataclasses.replace(
     background=None,
     warp=WarpSpec(position=EncodingSpec(4), anneal_steps=50_000),
     ambient=AmbientSpec(closed_steps=0, anneal_steps=1),
-    mask=MovingMaskSpec(),
+    mask=MovingMaskSpec(table="mask"),
     surface=SurfaceSpec(),
 )
 
@@ -155,7 +155,7 @@ NSFF = dataclasses.replace(
 # the finest opens, only the vertices of a grid of a quarter (then half) of the cells
 # learn. It marches through the box by half a cell and skips what is empty; here samples
 # go where a first look found weight. Densities are exponential, not a shifted softplus,
-# and begin as thin as there (1e-3 of opacity in half a cell). The motion learns at the
+# and begin as thin as there (1e-3 of opacity in a cell). The motion learns at the
 # common rate, there at 7e-4. Differences have the slope of there, 1e-5 / 4096 rays / 6
 # * 160 / 128; from step 10 000 on, there only where a step touched them. Losses of
 # samples' colours and the last transmittance, rest points, camera codes: not there.
@@ -234,7 +234,7 @@ SMALL_NERF_DS = dataclasses.replace(
     ambient=AmbientSpec(depth=3, width=32, skips=(), closed_steps=0, anneal_steps=1),
     mask=MovingMaskSpec(depth=3, width=32, skips=()),
     surface=SurfaceSpec(
-        EncodingSpec(2), EncodingSpec(2), closed_steps=300, anneal_steps=600
+        EncodingSpec(2), EncodingSpec(2), closed_steps=300, anneal_steps=600, slope=0.1
     ),
 )
 SMALL_NSFF = dataclasses.replace(

@@ -18,8 +18,10 @@ nodes are near is found when rows change and not in every step; the rigid term i
 and not a sum, over a fixed number of links and not those within a radius; and nodes
 start among the first Gaussians, or from tracks half on what moves and half on what is
 at rest, where the paper first trains them as Gaussians of their own. Their number stays
-as it is, where the paper adds and prunes nodes. The published code's further
-coordinates of nodes and Gaussians are not there.
+as it is, where the paper adds and prunes nodes. Slopes reach the places of nodes and of
+Gaussians through weights, turns and the network, where the published code cuts them (of
+a node, through network and weights). Its further coordinates of nodes and Gaussians,
+its scales that change and its noise on the times of real captures are not there.
 """
 
 import dataclasses

@@ -4,8 +4,9 @@ Spacetime Gaussians (Li et al. 2024, arXiv:2312.16812): a Gaussian has a time of
 m, at which it is where its row says; s = t - m later its mean is off by a cubic in s,
 its rotation by a turn that grows with s, and its opacity is exp(-(s / w)^2) of its own,
 with a width w that is learnt. No network, and nothing shared. The turn is a rotation
-vector, where the paper's quaternion grows linearly; its colours from features and its
-sampling where errors are large are not there.
+vector, where the paper's quaternion grows linearly. The time of its own learns from
+motion as well, where the published code cuts that slope and lets opacity alone move it.
+Colours from features and sampling where errors are large are not there.
 """
 
 import dataclasses

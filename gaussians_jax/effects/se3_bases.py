@@ -30,6 +30,7 @@ from nerfies_jax.geometry import lie
 from nerfies_jax.geometry.precision import exact_einsum, exact_product
 from nerfies_jax.training import schedules
 from nerfies_jax.training.effects import Effect, FrameCondition
+from nerfies_jax.training.step_counts import steps
 
 NAME = "se3_bases"
 MEMBER_LOGIT, STILL_LOGIT = 3.0, -6.0  # of a moving point, before the fit to paths
@@ -54,7 +55,7 @@ class SE3BasesSpec:
     logit_rate: float = 1e-2
     learning_rate: float = 1e-3  # of turns (rad) and shifts
     learning_rate_end: float = 1e-4
-    warm_up: int = 0  # steps without motion: none, for it starts from tracks
+    warm_up: int = steps(0)  # steps without motion: none, for it starts from tracks
 
     def __post_init__(self):
         if self.bases < 1:

@@ -36,8 +36,9 @@ class MovingMaskSpec:
 
     `position` and `skips` are those of the warp there, for its network of masks could
     not be read. Its read-out is a ReLU, which can be zero for all points and then never
-    learns; here it is a sigmoid, which starts undecided. `code_width` is that of the
-    codes in `table`, which the warp shares.
+    learns; here it is a sigmoid, which starts undecided. Bands are open, where there
+    they open with the warp's. `code_width` is that of the codes in `table`: those of
+    the warp, or its own, as there, under a name that no other effect has.
     """
 
     position: EncodingSpec = EncodingSpec(4)
@@ -101,15 +102,17 @@ def share(
 def penalty(
     spec: MovingMaskSpec, params: MLP, context: PenaltyContext
 ) -> dict[str, Term]:
-    """How far the points that are seen are from the masks of the pictures."""
+    """How far the points that are seen are from the masks, summed over the levels."""
     if context.frames.moving is None:
         return {}
-    batch, level = context.batch, context.levels[-1]
+    batch = context.batch
     column, line = jnp.floor(batch.pixel).astype(jnp.int32).T
     moves = context.frames.moving[batch.row, line, column]
-    asked = functools.partial(share, spec, params)
-    shares = jax.vmap(jax.vmap(asked, (0, None)))(level.point, context.condition)
-    error = difference(shares, level, moves, batch.valid)
+    asked = jax.vmap(jax.vmap(functools.partial(share, spec, params), (0, None)))
+    error = sum(
+        difference(asked(level.point, context.condition), level, moves, batch.valid)
+        for level in context.levels
+    )
     return {"error": Term(error, spec.weight)}
 
 

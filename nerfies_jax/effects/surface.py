@@ -33,22 +33,22 @@ class SurfaceSpec:
 
     Bands of both encodings are shut for `closed_steps` and open one by one over the
     next `anneal_steps`, as those of the point in the paper's code; those of the normal
-    are delayed there as well, by how much could not be read. `back_facing` is the
-    code's; the weight of the normals' difference from the density's slope could not be
-    read either and is the same.
+    open there from step 10,000 to 12,000. Both weights are the code's.
 
     Both count as there: by the weights of the samples, as a mean over samples. What
-    differs: a normal is turned by the transpose of the warp's Jacobian, which is exact
-    for every warp and the paper's rotation for a rigid one; it learns from the slope of
-    the template's density, which gets none from it, nor does the trunk; and squares of
-    differences stand for their lengths, which have no slope at zero.
+    differs: the normal that may not face away is the one observed, of unit length, and
+    not the head's answer in the template; a normal is turned by the transpose of the
+    warp's Jacobian, which is exact for every warp and the paper's rotation for a rigid
+    one; it learns from the slope of the template's density, which gets none from it,
+    nor does the trunk; and squares of differences stand for their lengths, which have
+    no slope at zero.
     """
 
     position: EncodingSpec = EncodingSpec(4)
     normal: EncodingSpec = EncodingSpec(4)
     closed_steps: int = steps(50_000)
     anneal_steps: int = steps(50_000)
-    slope: float = 0.1
+    slope: float = 1e-3
     back_facing: float = 0.1
 
     def __post_init__(self):

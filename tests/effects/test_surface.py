@@ -334,21 +334,22 @@ def test_a_scene_learns_masks_from_the_capture_s_and_goes_without_them():
     batch = Batch(row, pixel, ray, ray, jnp.ones(2), ray, jnp.ones(2, bool))
     codes = {"motion": jnp.zeros((2, 3))}
     conditions = FrameCondition(jnp.zeros(2), codes, jnp.zeros(2, int))
+    levels = level, level  # coarse and fine, which both count
     context = PenaltyContext(
-        conditions, None, None, None, batch=batch, levels=(level,), frames=frames
+        conditions, None, None, None, batch=batch, levels=levels, frames=frames
     )
     own = jax.tree.map(lambda x: 0 * x, params_of("float32")["mask"])
     (term,) = moving_mask.penalty(SPEC.mask, own, context).values()
     assert term.weight == 0.1
     # Undecided, it is off by one half of what is seen.
-    half = 0.5 * np.asarray(level.weight).sum(1).mean()
+    half = 0.5 * 2 * np.asarray(level.weight).sum(1).mean()
     np.testing.assert_allclose(term.value, half, rtol=1e-5)
     sure = own._replace(
         heads={"logit": own.heads["logit"]._replace(bias=jnp.full(1, 50.0))}
     )
     (term,) = moving_mask.penalty(SPEC.mask, sure, context).values()
     still = 0 if capture.moving[capture.train[0], 0, 0] else 1
-    seen_still = still * np.asarray(level.weight)[0].sum() / 2
+    seen_still = still * 2 * np.asarray(level.weight)[0].sum() / 2
     np.testing.assert_allclose(term.value, seen_still, rtol=1e-5, atol=1e-6)
     bare = context._replace(frames=frames._replace(moving=None))
     assert moving_mask.penalty(SPEC.mask, own, bare) == {}
