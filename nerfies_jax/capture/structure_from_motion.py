@@ -142,9 +142,10 @@ def run_sfm(
     if not images.is_dir():
         raise CaptureError(f"{images}: no such folder; pass a folder with pictures")
     names = [file.name for file in frames.pictures_in(images)]
-    if len(names) < 2:
+    if len(names) < MIN_TRACK:
         raise CaptureError(
-            f"{images}: {len(names)} pictures; a reconstruction needs at least 2"
+            f"{images}: {len(names)} pictures; a reconstruction needs at least "
+            f"{MIN_TRACK}"
         )
     if masks is not None:
         masks = pathlib.Path(masks)
