@@ -103,10 +103,10 @@ def test_pictures_without_texture_are_refused_and_leave_nothing(tmp_path):
 def test_what_cannot_work_is_said_before_it_starts(tmp_path):
     with pytest.raises(CaptureError, match="no such folder"):
         mapping.run_sfm(tmp_path / "pictures", tmp_path / "out")
-    film(tmp_path / "pictures", 1)
-    with pytest.raises(CaptureError, match="1 pictures"):
+    film(tmp_path / "pictures", 2)
+    with pytest.raises(CaptureError, match="2 pictures"):
         mapping.run_sfm(tmp_path / "pictures", tmp_path / "out")
-    film(tmp_path / "more", 2)
+    film(tmp_path / "more", 3)
     (tmp_path / "masks").mkdir()
     with pytest.raises(CaptureError, match=r"no mask f00\.png\.png"):
         mapping.run_sfm(tmp_path / "more", tmp_path / "out", tmp_path / "masks")
@@ -122,7 +122,7 @@ def test_doubtful_cameras_say_what_to_do():
 
 
 def test_a_child_that_dies_is_an_error_not_our_end(tmp_path, monkeypatch):
-    film(tmp_path / "pictures", 2)
+    film(tmp_path / "pictures", 3)
     monkeypatch.setattr(mapping.sys, "executable", "/bin/false")
     with pytest.raises(CaptureError, match="ended with code 1"):
         mapping.run_sfm(tmp_path / "pictures", tmp_path / "out")
