@@ -49,9 +49,7 @@ READING = """\
   in twenty shows by chance: near rows are a tie.
 - `+tracks` is a preset whose motion is fitted to tracks before training, `+rest` one
   that would be and is not, `+no-depth` one without its depth term.
-- Not all cells are of one revision of the code: those are at the end of the page. Kept
-  rows `+rest` of presets from tracks have random points to begin with on the built-in
-  scene, and had none where something moves on the bookshelf (`init.extra_random`)."""
+- Not all cells are of one revision of the code: those are at the end of the page."""
 WHOLE = League()
 
 
