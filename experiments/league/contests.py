@@ -166,6 +166,10 @@ def merged(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
             "and not made anew: what is kept stays as it is; go on with the same "
             "command, or remove the kept file"
         )
+    kept = [(one["film"], one["seconds"]) for one in before.get("contests", ())]
+    place = {key: number for number, key in enumerate(kept)}
+    # In the order in which they were: pages would change where no number did.
+    contests.sort(key=lambda one: place.get((one["film"], one["seconds"]), len(place)))
     machine = clock.beside(now["machine"], before.get("machine", {}))
     return now | {"machine": machine, "contests": contests}
 
