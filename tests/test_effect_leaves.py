@@ -114,7 +114,7 @@ def counted_out(spec):
         nets["coarse"] = spec.coarse or spec.template
     if spec.mask is not None:
         own["mask"] = moving_mask.init(spec.mask, key)
-        tables["motion"] = (MOMENTS, spec.mask.code_width)
+        tables[spec.mask.table] = (MOMENTS, spec.mask.code_width)
     if spec.surface is not None:
         own["surface"] = surface.init({n: one.width for n, one in nets.items()}, key)
         for one in (spec.surface.position, spec.surface.normal):
