@@ -66,7 +66,7 @@ def restore(before: dict[str, Any], jobs: list[Job]) -> int:
     """
     count = 0
     for job, one in itertools.product(jobs, before.get("contests", ())):
-        if (one["film"], one["seconds"]) != (job.out.name, job.args.seconds):
+        if _key(one) != (job.out.name, job.args.seconds):
             continue
         for name, seed in job.tasks():
             row = one["rows"].get(name, {"cells": {}})
@@ -101,7 +101,7 @@ def without(
         if not any(name in job.names for job in jobs):
             raise ValueError(f"--anew {name}: is not among the rows that are asked for")
     for job, one in itertools.product(jobs, left.get("contests", ())):
-        if (one["film"], one["seconds"]) != (job.out.name, job.args.seconds):
+        if _key(one) != (job.out.name, job.args.seconds):
             continue
         rows_of = {n: one["rows"][n] for n in names if n in one["rows"]}
         for row in rows_of.values():
@@ -140,8 +140,8 @@ def merged(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
     contests, lost = [copy.deepcopy(one) for one in now["contests"]], []
     known = rows.suite().arms
     for old in before.get("contests", ()):
-        key = old["film"], old["seconds"]
-        same = [one for one in contests if (one["film"], one["seconds"]) == key]
+        key = _key(old)
+        same = [one for one in contests if _key(one) == key]
         if not same:
             contests.append(old)
             continue
@@ -166,12 +166,15 @@ def merged(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
             "and not made anew: what is kept stays as it is; go on with the same "
             "command, or remove the kept file"
         )
-    kept = [(one["film"], one["seconds"]) for one in before.get("contests", ())]
-    place = {key: number for number, key in enumerate(kept)}
     # In the order in which they were: pages would change where no number did.
-    contests.sort(key=lambda one: place.get((one["film"], one["seconds"]), len(place)))
+    place = {_key(one): n for n, one in enumerate(before.get("contests", ()))}
+    contests.sort(key=lambda one: place.get(_key(one), len(place)))
     machine = clock.beside(now["machine"], before.get("machine", {}))
     return now | {"machine": machine, "contests": contests}
+
+
+def _key(contest):
+    return contest["film"], contest["seconds"]
 
 
 def kept(path: pathlib.Path) -> dict[str, Any]:

@@ -48,7 +48,7 @@ class RateSpec:
 
 @dataclasses.dataclass(frozen=True)
 class AnchorMotionSpec:
-    """Sizes and schedules; those of ADC-GS's code where it names none for a film.
+    """Sizes and schedules; those of ADC-GS's code for all of HyperNeRF's films.
 
     Features start as normal draws of deviation `spread`, where the code has zeros, and
     what is carried `first_scale` as large as its anchor. `moves` switches coarse and

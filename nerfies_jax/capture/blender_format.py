@@ -84,13 +84,7 @@ def read(
         appearance_ids=np.zeros(len(rows), np.int32),
         camera_ids=_camera_ids(entries, times, split, is_train),
         valid=_valid(root, entries, split.file, images.shape[2:0:-1], shrink_by),
-        points=None
-        if points is None
-        else points._replace(
-            position=(
-                (points.position - np.array(placement.centre)) * placement.scale
-            ).astype(np.float32)
-        ),
+        points=_placed(points, placement),
         background=background if alpha is not None else split.transforms.background,
         scale=placement.scale,
         centre=placement.centre,
@@ -100,6 +94,14 @@ def read(
         path=path,
         notes=(*split.notes, *lost, *notes, *more, *when),
     )
+
+
+def _placed(points, placement):
+    """Points of the file in scene units; None where there are none."""
+    if points is None:
+        return None
+    position = (points.position - np.array(placement.centre)) * placement.scale
+    return points._replace(position=position.astype(np.float32))
 
 
 def _name(file_path):

@@ -10,14 +10,13 @@ from nerfies_jax.capture import images as pictures
 from nerfies_jax.capture.borders import without_black_borders
 from nerfies_jax.capture.capture import Capture, CaptureError, PointCloud
 from nerfies_jax.capture.colmap_lenses import undistort
-from nerfies_jax.capture.colmap_library import library
+from nerfies_jax.capture.colmap_library import MIN_TRACK, library
 from nerfies_jax.capture.formats import sparse_models
 from nerfies_jax.capture.json_files import AnyPath, inside
 from nerfies_jax.capture.points import place_by_points
 from nerfies_jax.geometry.camera import Camera
 
 PICTURES = ("images", "images_2", "images_4", "images_8", "input", "rgb", "")
-MIN_TRACK = 3  # frames that must have seen a point
 MAX_ERROR_PX = 2.0  # mean reprojection error of a point that is kept
 
 

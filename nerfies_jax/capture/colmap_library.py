@@ -9,6 +9,8 @@ import zlib  # noqa: F401
 
 from nerfies_jax.capture import extras
 
+MIN_TRACK = 3  # pictures that must show a point that counts: so many are needed
+
 
 def library():
     """The pycolmap module; imported on first use, because it takes 0.2 s.

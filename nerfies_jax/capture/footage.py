@@ -22,6 +22,7 @@ import scipy.ndimage
 
 from nerfies_jax.capture import frames, images
 from nerfies_jax.capture.capture import CaptureError, blocks, shrink
+from nerfies_jax.capture.colmap_library import MIN_TRACK
 from nerfies_jax.capture.images import MAX_PIXELS, write_png
 from nerfies_jax.capture.video import read_video, transfer_of
 
@@ -29,7 +30,6 @@ FILMS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".3gp")
 PLAIN = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 HEIC = (".heic", ".heif")  # read where pillow-heif is installed
 FRAMES = 100  # kept of a film
-LEAST = 3  # pictures: cameras are judged by points that three of them show
 OWN_TIMES = 0.9  # of the frames of a film must have a time that no other has
 BLURRED = 0.4  # of the usual sharpness around it; planted blurs came out below 0.2
 _BROKEN = "not readable, so copy them again"
@@ -124,9 +124,10 @@ def _wanted(film, moments, count, per_second):
             raise ValueError("give the frames of a film or so many a second, not both")
         count = round(per_second * np.ptp(moments)) + 1
     count = FRAMES if count is None else count
-    if count < LEAST:
+    if count < MIN_TRACK:
         raise ValueError(
-            f"{film}: {count} frames to keep; a reconstruction needs at least {LEAST}"
+            f"{film}: {count} frames to keep; a reconstruction needs at least "
+            f"{MIN_TRACK}"
         )
     return count
 
@@ -206,9 +207,9 @@ def _readable(folder):
 
 
 def _check_enough(folder, count, notes):
-    if count < LEAST:
+    if count < MIN_TRACK:
         raise CaptureError(
-            f"{folder}: {count} pictures; a reconstruction needs at least {LEAST}"
+            f"{folder}: {count} pictures; a reconstruction needs at least {MIN_TRACK}"
             + "".join(f" ({note})" for note in notes)
         )
 

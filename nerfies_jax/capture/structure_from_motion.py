@@ -22,13 +22,12 @@ import numpy as np
 
 from nerfies_jax.capture import extras, frames
 from nerfies_jax.capture.capture import CaptureError
-from nerfies_jax.capture.colmap_library import library
+from nerfies_jax.capture.colmap_library import MIN_TRACK, library
 from nerfies_jax.capture.json_files import AnyPath, new_folder
 
 EXHAUSTIVE_UP_TO = 40  # pictures; above, matching every pair takes most of the time
 SEED = 0  # of RANSAC: by the clock, 24 to 26 of the same 30 pictures found a place
 TELL_SECONDS = 5.0  # between two lines of progress
-MIN_TRACK = 3  # pictures that must show a point that says how good the cameras are
 MOST_JUDGED = 5000  # points
 # Cameras are doubtful beyond these. Real clips of 87 and 86 pictures came out at 0.4 px
 # and 6 and 9 degrees.

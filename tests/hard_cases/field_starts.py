@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from nerfies_jax.capture.capture import Capture
+from nerfies_jax.effects.time_warp import TimeWarp
 from nerfies_jax.training.model import Frames
 from tests.hard_cases import hostile
 
@@ -141,15 +142,17 @@ def _is_density_bias(path):
 def bent(factor: float) -> Callable[[PyTree], PyTree]:
     """The read-outs of the warp so many times as large."""
 
+    def read_out(network):
+        heads = jax.tree.map(lambda leaf: leaf * np.float32(factor), network.heads)
+        return network._replace(heads=heads)
+
     def change(params):
         if "warp" not in params:
             return params
         warp = params["warp"]
-        last = getattr(warp, "shift", warp)  # the second network of a time warp
-        heads = jax.tree.map(lambda leaf: leaf * np.float32(factor), last.heads)
-        last = last._replace(heads=heads)
-        warp = warp._replace(shift=last) if hasattr(warp, "shift") else last
-        return params | {"warp": warp}
+        if isinstance(warp, TimeWarp):  # its second network
+            return params | {"warp": warp._replace(shift=read_out(warp.shift))}
+        return params | {"warp": read_out(warp)}
 
     return change
 
