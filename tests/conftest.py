@@ -41,9 +41,10 @@ pytest_plugins = ["tests.budget"]
 
 # Programs are compiled roughly, in half the time, unless hard cases are asked for:
 # `-m hard_cases` runs all of those, of each tier, as users' programs are compiled.
+# In one part each: a process has one core, and parts cost a tenth more.
 ROUGH = (
     "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true "
-    "--xla_cpu_use_fusion_emitters=false"
+    "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
 )
 
 SHARED = pathlib.Path(__file__).resolve().parents[2] / "shared"
