@@ -3,7 +3,8 @@
 The samples are those of `render_ray`, so the picture is that of the full quadrature but
 for what skipped samples would have added. A sample is skipped in a cell that was found
 empty (`survey`) or behind what lets no light through. What is left is gathered into
-dense batches, and the networks are asked of these alone.
+dense batches, and the networks are asked of these alone. Warps of long waves are asked
+on a `frustum_grid` of the frame.
 """
 
 import functools
@@ -15,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from nerfies_jax import frustum_grid
 from nerfies_jax.field_ray import field_ray_through, fine_distances, first_distances
 from nerfies_jax.geometry import rays
 from nerfies_jax.geometry.camera import Camera
@@ -174,10 +176,17 @@ def draw(
     block = -(-pixels // blocks)
     centres = rays.pixel_centres(size, camera.position.dtype).reshape(-1, 2)
     centres = jnp.pad(centres, ((0, blocks * block - pixels), (0, 0)), mode="edge")
-    drawn = jax.lax.map(
-        lambda position: _block(bound, occupied, camera, condition, position),
-        centres.reshape(blocks, block, 2),
-    )
+    grid = None
+    if frustum_grid.resolves(bound):
+        grid = frustum_grid.displacements(bound, camera, condition, size)
+
+    def part(position):
+        columns = None
+        if grid is not None:
+            columns = jax.vmap(lambda at: frustum_grid.column(grid, at, size))(position)
+        return _block(bound, occupied, camera, condition, position, columns)
+
+    drawn = jax.lax.map(part, centres.reshape(blocks, block, 2))
     return jax.tree.map(
         lambda x: x.reshape(-1, *x.shape[2:])[:pixels].reshape(
             height, width, *x.shape[2:]
@@ -186,8 +195,8 @@ def draw(
     )
 
 
-def _block(bound, occupied, camera, condition, position):
-    """Some rays, through these pixel positions."""
+def _block(bound, occupied, camera, condition, position, columns):
+    """Some rays, through these pixel positions; `columns` of a grid, None without."""
     plan, behind = bound.spec.sampling, bound.metadata.background
     ray, cosine = jax.vmap(lambda p: field_ray_through(bound.metadata, camera, p))(
         position
@@ -203,6 +212,8 @@ def _block(bound, occupied, camera, condition, position):
 
     def ask(name, distance, values, before=None):
         spacing = jax.vmap(spacing_of)(distance, ray.far)
+        if columns is not None:
+            before = jax.vmap(frustum_grid.along)(columns, ray, distance)
         seen = name, occupied[name], ray, condition
         answer, asked = _ask(bound, *seen, distance, spacing, values, before)
         return answer[..., 0] * spacing, answer[..., 1:], asked
@@ -215,7 +226,7 @@ def _block(bound, occupied, camera, condition, position):
             weights = compositing.weights(depth)
             drawn = sampling.refine(None, distance, weights, plan.fine)
             every = fine_distances(bound.spec, bound.metadata, distance, drawn)
-            if not (plan.union and is_moved(bound.effects)):
+            if asked is None or not plan.union:
                 return every, None
             place = sampling.merged_places(distance, drawn)[: plan.coarse]
 
@@ -246,8 +257,9 @@ class _Asked(NamedTuple):
 def _ask(bound, name, occupied, ray, condition, distance, spacing, values, before):
     """[rays, samples, values] density and, of four, colour; zero where skipped.
 
-    What warps and lifts said of samples `before` is not computed again; without it what
-    they say here is returned as well.
+    What warps and lifts said of samples `before` is not computed again, and where it is
+    an array these are all displacements; without it what they say here is returned as
+    well, of a field that moves.
     """
     count, samples = distance.shape
     point = ray.origin[:, None] + distance[..., None] * ray.direction[:, None]
@@ -266,10 +278,12 @@ def _ask(bound, name, occupied, ray, condition, distance, spacing, values, befor
         x = jnp.moveaxis(x.reshape(STAGES, count, width, *x.shape[2:]), 0, 1)
         return x.reshape(count, STAGES * width, *x.shape[3:])[:, :samples]
 
-    def placed(index, distance):
+    def placed(index, distance, moved=None):
         row = index // width
         at = rays.point_at(ray.origin[row], ray.direction[row], distance[index])
-        return asked_at(bound, at, condition)
+        if moved is None:
+            return asked_at(bound, at, condition)
+        return at + moved[index], ()
 
     def said(index, place):
         radiance = radiance_at(bound, name, place, inputs[index // width], condition)
@@ -282,14 +296,15 @@ def _ask(bound, name, occupied, ray, condition, distance, spacing, values, befor
         wanted, distance, before = jax.tree.map(
             lambda x: x.reshape(-1, *x.shape[2:]), (wanted, distance, before)
         )
-        if before is None:
+        if not isinstance(before, _Asked):
+            kept = before is None and is_moved(bound.effects)
 
             def anew(index):
-                place = placed(index, distance)
-                return said(index, place), place
+                place = placed(index, distance, before)
+                return said(index, place), place if kept else None
 
             answer, place = compacted(jax.vmap(anew), wanted)
-            asked = _Asked(wanted, place)
+            asked = _Asked(wanted, place) if kept else None
         else:
             more = compacted(
                 jax.vmap(lambda index: placed(index, distance)), wanted & ~before.known

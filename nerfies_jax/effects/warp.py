@@ -92,6 +92,7 @@ def effect(spec: WarpSpec) -> Effect:
         tables=(Table(spec.table, MOMENT, spec.code_width),) if by_code else (),
         init=lambda key: init(spec, key),
         displace=functools.partial(displace, spec),
+        shortest_wave=spec.position.shortest_wave,
     )
 
 

@@ -45,6 +45,13 @@ class EncodingSpec:
         """Features made of a point with so many coordinates."""
         return dimensions * (2 * self.bands + self.identity)
 
+    @property
+    def shortest_wave(self) -> float:
+        """Length of the last band's wave in the coordinates' units; inf without one."""
+        if self.bands == 0:
+            return math.inf
+        return (2 if self.times_pi else 2 * math.pi) / 2 ** (self.bands - 1)
+
 
 @at_least_float32
 def encode(

@@ -155,6 +155,9 @@ class Effect(NamedTuple):
     condition_width: int = 0
     # (params, point, condition) -> displacement: template point minus observed point
     displace: Callable[[PyTree, Vector, FrameCondition], Vector] | None = None
+    # Of that along space: of long ones pictures ask on a grid (`frustum_grid`).
+    # None: not known, and all samples ask.
+    shortest_wave: float | None = None
     # (params, observed point, condition) -> features the trunk reads beside the point's
     lift: Callable[[PyTree, Vector, FrameCondition], Features] | None = None
     lift_width: int = 0

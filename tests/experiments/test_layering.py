@@ -26,6 +26,7 @@ FLOORS = {
     "nerfies_jax.field_ray": 8,
     "nerfies_jax.render_ray": 8,
     "nerfies_jax.occupied_rays": 8,
+    "nerfies_jax.frustum_grid": 8,
     "nerfies_jax.skipping": 8,
     "nerfies_jax.field": 8,
     "nerfies_jax.scene": 8,

@@ -48,6 +48,8 @@ MOVING = dataclasses.replace(
     warp=WarpSpec(position=EncodingSpec(2), depth=1, width=8, skips=()),
     ambient=AmbientSpec(depth=1, width=8, skips=(), closed_steps=1, anneal_steps=9),
 )
+# Of warps alone: they are read on a grid of the frame.
+WARPED = dataclasses.replace(STILL, warp=MOVING.warp)
 # The fine level takes over what the warp and the slices said of the coarse samples.
 TAKEN_OVER = dataclasses.replace(MOVING, sampling=SamplingSpec(8, 9))
 ONE_LEVEL = dataclasses.replace(STILL, sampling=SamplingSpec(24, 0))
@@ -89,18 +91,28 @@ ORANGE = (1.0, 0.5, 0.0)
         (STILL, None, 3),
         (GUIDED, ORANGE, 3),
         (ONE_LEVEL, ORANGE, 3),
+        (WARPED, ORANGE, 1),
         *((MOVING, ORANGE, n) for n in range(3)),
     ],
-    ids=["still", "guided", "one level", "moving", "moving then", "moving at last"],
+    ids=[
+        "still",
+        "guided",
+        "one level",
+        "warped",
+        "moving",
+        "moving then",
+        "moving at last",
+    ],
 )
 def test_skipping_changes_a_frame_by_no_more_than_it_may(spec, background, row):
     model, params = full_of_holes(spec, background)
     view = evaluation.view_of(scenes.tiny_capture(), row)
-    if spec is MOVING:  # in another place at every moment, and between two
+    moves = spec.warp is not None
+    if moves:  # in another place at every moment, and between two
         view = view._replace(time=view.time + jnp.float32(0.03))
     occupied = jax.jit(model.surveyed.survey)(params, STEP)
     assert all(0.02 < cells.mean() < 0.8 for cells in occupied.values())
-    assert (occupied == {}) == (spec is MOVING)
+    assert (occupied == {}) == moves
     draw = jax.jit(model.surveyed.draw, static_argnums=3)
     skipped = draw(params, occupied, view, SIZE, STEP)
     whole = jax.jit(model.render, static_argnums=2)(params, view, SIZE, STEP)
@@ -114,7 +126,7 @@ def test_skipping_changes_a_frame_by_no_more_than_it_may(spec, background, row):
     span = model.spec[1].far - model.spec[1].near
     seen = whole.alpha > 0.5
     assert np.abs(skipped.depth - whole.depth)[seen].mean() < most * span
-    if spec is MOVING:
+    if moves:
         return
     # Were nothing occupied, samples would be skipped that the picture is made of.
     nothing = jax.tree.map(jnp.zeros_like, occupied)
