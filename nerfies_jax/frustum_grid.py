@@ -18,7 +18,7 @@ from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.render_ray import Bound, displacement
 from nerfies_jax.training.effects import FrameCondition
 
-# Cells along the longer side of the picture, and in depth. Frames of 256x192 against the
+# Cells along the longer side of the picture, and in depth. Frames of 256x192 beside the
 # full quadrature, and milliseconds of one core of a 2.5 GHz Xeon:
 #   `d-nerf-grid-small`, built-in scene, 400 steps, every sample   72 to 74 dB in 1,640
 #     32 across, 64 deep                                           50 to 51        870

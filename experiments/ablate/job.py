@@ -1,5 +1,6 @@
 """Train and measure the arms of an ablation, one after the other."""
 
+import gc
 import hashlib
 import os
 import pathlib
@@ -26,6 +27,9 @@ from nerfies_jax.runs import platform, representations
 from nerfies_jax.runs.config import CaptureSource
 from nerfies_jax.training import loop, specs
 
+# Arms with their programs, which hold 4,000 mappings of memory and more. Linux lets a
+# process have 65,530: the eighth arm of one long --jobs 1 was the end of it.
+KEPT_ARMS = 4
 PILOT_STEPS = 150  # of a whole, short schedule, to see what a step costs
 NEAR_ENOUGH = 0.1  # share of --seconds by which a first seed may miss them
 # JAX's event for a program that was read from the compilation cache.
@@ -276,6 +280,10 @@ class Job:
     def _build(self, name, steps) -> CompiledArm:
         """The arm, its step compiled by one step that is thrown away."""
         if (name, steps) not in self._built:
+            if len(self._built) == KEPT_ARMS:
+                self._built.pop(next(iter(self._built)))
+                jax.clear_caches()
+                gc.collect()
             spec = self.spec(name, steps)
             preset = self.suite.arms[name].preset
             representation = representations.of_preset(preset)

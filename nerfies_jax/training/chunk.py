@@ -221,6 +221,6 @@ def _lowered(model, state, frames, steps):
     return made, frames, seconds
 
 
-@functools.lru_cache(maxsize=8)
+@functools.lru_cache(maxsize=4)
 def _programs(step):
     return {}
