@@ -43,8 +43,8 @@ class Reconstruct:
     hypernerf, nsff, tineuvox, nerf-ds. Each with -small is made for a CPU; only so
     there are nerf-grid, nerf-w-grid, d-nerf-grid, nerfies-grid, hypernerf-grid,
     nsff-grid, on a grid of features (default: splats-tracked-small;
-    splats-static-small where nothing moves, splats-deformable-small where what moves
-    cannot be followed)."""
+    splats-static-small where nothing moves, spacetime-small from rest where what
+    moves cannot be followed)."""
     effects: Literal["preset", "auto"] = "preset"
     """auto: look at the capture first and take the effects that it calls for, in the
     representation and size of the preset (see experiments.inspect_scene)."""

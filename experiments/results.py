@@ -57,7 +57,8 @@ papers' tables, and the margins that these print, stand in [league.md](league.md
 refined cameras are worth stands in [ablate_poses.md](ablate_poses.md) and, on a real
 film, in [ablate_poses_bookshelf.md](ablate_poses_bookshelf.md). What the two papers
 leave open, a start from random points among it, stands in
-[ablate_open.md](ablate_open.md), and what a law of bits saves of ADC-GS' features in
+[ablate_open.md](ablate_open.md), which motion comes out best where a camera jumps in
+[ablate_jumps.md](ablate_jumps.md), and what a law of bits saves of ADC-GS' features in
 [ablate_rate.md](ablate_rate.md). What deformation, solvers and local kernels cost
 stands in [deformation_cost.md](deformation_cost.md),
 [solver_table.md](solver_table.md) and [kan_local.md](kan_local.md) again, and how far
@@ -153,6 +154,12 @@ STUDIES = {
     ),
     "ablate_open": _package(
         "ablate_open", "--suite open --steps 900 --jobs 2", of="ablate"
+    ),
+    "ablate_jumps": _package(
+        "ablate_jumps",
+        "--suite league --capture CAPTURE --seconds 60 --clock processor --jobs 2 "
+        "--arms splats-deformable-small dynmf-small+rest spacetime-small+rest",
+        of="ablate",
     ),
     "ablate_rate": _package(
         "ablate_rate", "--suite rate --steps 900 --jobs 2", of="ablate"

@@ -31,7 +31,6 @@ from nerfies_jax.training.effects import FrameCondition
 # of 7 cells a wave, 41 dB; asked of each sample they take what the warp saves.
 ACROSS, DEEP = 48, 64
 CELLS_A_WAVE = 16  # fewer of the shortest wave, and every sample asks
-BATCH = 64  # columns asked at once
 
 Grid = Float[Array, "rows columns corners 3"]
 
@@ -73,9 +72,8 @@ def displacements(
 
         return jax.vmap(corner)(share)
 
-    places = jnp.stack(jnp.meshgrid(columns, rows), axis=-1)
-    found = jax.lax.map(moved, places.reshape(-1, 2), batch_size=BATCH)
-    return found.reshape(*places.shape[:2], DEEP + 1, 3)
+    # Row by row: some thousand points at once.
+    return jax.lax.map(jax.vmap(moved), jnp.stack(jnp.meshgrid(columns, rows), axis=-1))
 
 
 def column(

@@ -12,7 +12,7 @@ from nerfies_jax.training import specs
 from tests.evidence import films
 from tests.evidence.test_tracks import MOVES
 
-SPLATS = "splats-{}-small"
+UNTRACKED = "spacetime-small"
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -31,23 +31,26 @@ def noisy():
 
 
 @pytest.mark.parametrize(
-    ("make", "kind", "words"),
+    ("make", "preset", "words"),
     [
-        (lambda: films.film(**MOVES, frames=24), "tracked", ""),
-        (lambda: films.film(frames=24), "static", "of the pixels move by themselves"),
-        (noisy, "deformable", "only 0 tracks of what moves"),
+        (lambda: films.film(**MOVES, frames=24), "splats-tracked-small", ""),
+        (lambda: films.film(frames=24), "splats-static-small", "move by themselves"),
+        (noisy, UNTRACKED, "only 0 tracks of what moves"),
     ],
 )
-def test_motion_is_chosen_by_what_tracks_say(make, kind, words):
+def test_motion_is_chosen_by_what_tracks_say(make, preset, words):
     choice = representation.default_preset(make())
-    assert choice.preset == SPLATS.format(kind)
+    assert choice.preset == preset
     assert words in "".join(choice.notes)
+    spec = specs.override(PRESETS[preset], choice.overrides)
+    # Nothing is fitted to tracks that are of no use.
+    assert (spec.start.motion == "tracks") == (preset == "splats-tracked-small")
 
 
 def test_what_moves_and_cannot_be_followed_is_no_still_scene(monkeypatch):
     monkeypatch.setattr(usable_paths, "LEAST_PATHS", 10**6)
     choice = representation.default_preset(films.film(**MOVES, frames=24))
-    assert choice.preset == SPLATS.format("deformable")
+    assert choice.preset == UNTRACKED
     assert "are long enough to fit a motion to" in "".join(choice.notes)
 
 
@@ -69,21 +72,28 @@ def test_long_films_get_more_knots(a_knot, knots, monkeypatch):
     assert ("for 24 frames" in choice.notes) == (knots > 20)
 
 
-@pytest.mark.parametrize("kind", ["tracked", "static", "deformable"])
-def test_larger_pictures_get_more_gaussians(kind):
-    spec = PRESETS[SPLATS.format(kind)]
+@pytest.mark.parametrize(
+    ("preset", "changes"),
+    [
+        ("splats-tracked-small", ()),
+        ("splats-static-small", ()),
+        (UNTRACKED, (representation.FROM_REST,)),
+    ],
+)
+def test_larger_pictures_get_more_gaussians(preset, changes):
+    spec = specs.override(PRESETS[preset], changes)
     assert representation.capacity(spec, (176, 132)) == ()
     assert representation.capacity(spec, (88, 66)) == ()
     larger = specs.override(spec, representation.capacity(spec, (352, 264)))
     assert larger.densification.cap_max == 2 * spec.densification.cap_max
     assert larger.init.points == 2 * spec.init.points
     moving = larger.start.moving_points / spec.start.moving_points
-    assert moving == (2 if kind == "tracked" else 1)
+    assert moving == (2 if spec.start.motion == "tracks" else 1)
 
 
 @pytest.mark.parametrize(("followed", "times"), [(0.9, 1), (0.125, 2), (0.01, 3)])
 def test_what_is_followed_for_a_short_time_gets_more_gaussians(followed, times):
-    spec = PRESETS[SPLATS.format("tracked")]
+    spec = PRESETS["splats-tracked-small"]
     short = specs.override(spec, representation.capacity(spec, (176, 132), followed))
     assert short.init.points == spec.init.points
     assert short.start.moving_points == times * spec.start.moving_points

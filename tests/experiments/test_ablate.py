@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 import types
+import weakref
 
 import jax
 import jax.numpy as jnp
@@ -132,6 +133,20 @@ def test_over_steps_and_seconds_the_run_over_steps_is_the_pilot(tiny, monkeypatc
     by_time = job.path("static", 1, job.budgets[1])
     assert json.loads(by_time.read_text())["identity"]["seconds"] == 3
     assert by_time.parent == job.out / "seconds-3"
+
+
+def test_arms_long_past_are_forgotten(tiny, monkeypatch):
+    """With their programs, of which a process can have so many."""
+    monkeypatch.setattr(
+        "nerfies_jax.training.loop.fit",
+        lambda *_, **__: types.SimpleNamespace(compile_seconds=0.0),
+    )
+    monkeypatch.setattr("experiments.ablate.job.KEPT_ARMS", 1)
+    arms = Job(cli.parse(Ablate, [*tiny, "--arms", "static"]))
+    past = weakref.ref(arms._build("static", 2).model.step)
+    last = arms._build("static", 3)
+    assert arms._build("static", 3) is last
+    assert past() is None
 
 
 def test_what_another_process_makes_is_left_to_it(tiny, monkeypatch, capsys):

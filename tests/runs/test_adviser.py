@@ -119,6 +119,7 @@ def test_every_family_can_be_built_with_its_effects_on_and_off():
 def test_what_cannot_be_told_keeps_the_default_that_moves():
     spec, advice = spec_of("gaussians", motion=None)
     assert spec.motion is not None
+    assert spec.start.motion == "none"  # there may be no tracks either
     assert any("cannot tell" in note for note in advice.notes)
 
 
