@@ -26,6 +26,7 @@ from tests.gaussians.shared import put, same_bits, some_gaussians
 from tests.test_effect_cost import started_field, started_splats
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
+ROOMS = (ROOT / "nerfies_jax", ROOT / "gaussians_jax")
 # Where networks multiply.
 NETWORKS = {
     *(f"nerfies_jax/nets/{name}.py" for name in ("dense", "kan", "mlp")),
@@ -51,7 +52,8 @@ def place_of(equation):
     """File and function of the library that asked for an operation."""
     for frame in equation.source_info.traceback.frames:
         path = pathlib.Path(frame.file_name)
-        if path.is_relative_to(ROOT) and path.stem != "precision":
+        ours = any(path.is_relative_to(room) for room in ROOMS)  # not a .venv in ROOT
+        if ours and path.stem != "precision":
             return path.relative_to(ROOT).as_posix(), frame.function_name.split(".")[0]
     return "", ""
 
