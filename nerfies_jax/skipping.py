@@ -212,10 +212,11 @@ def _block(bound, occupied, camera, condition, position, columns):
 
     def ask(name, distance, values, before=None):
         spacing = jax.vmap(spacing_of)(distance, ray.far)
+        moved = None
         if columns is not None:
-            before = jax.vmap(frustum_grid.along)(columns, ray, distance)
+            moved = jax.vmap(frustum_grid.along)(columns, ray, distance)
         seen = name, occupied[name], ray, condition
-        answer, asked = _ask(bound, *seen, distance, spacing, values, before)
+        answer, asked = _ask(bound, *seen, distance, spacing, values, before, moved)
         return answer[..., 0] * spacing, answer[..., 1:], asked
 
     before = None
@@ -254,12 +255,14 @@ class _Asked(NamedTuple):
     place: tuple[Float[Array, "rays samples 3"], tuple[Array, ...]]
 
 
-def _ask(bound, name, occupied, ray, condition, distance, spacing, values, before):
+def _ask(
+    bound, name, occupied, ray, condition, distance, spacing, values, before, moved
+):
     """[rays, samples, values] density and, of four, colour; zero where skipped.
 
-    What warps and lifts said of samples `before` is not computed again, and where it is
-    an array these are all displacements; without it what they say here is returned as
-    well, of a field that moves.
+    Where a grid says what warps displace all samples by, it is `moved`. Else what warps
+    and lifts said of samples `before` is not computed again; without it what they say
+    here is returned as well.
     """
     count, samples = distance.shape
     point = ray.origin[:, None] + distance[..., None] * ray.direction[:, None]
@@ -278,37 +281,36 @@ def _ask(bound, name, occupied, ray, condition, distance, spacing, values, befor
         x = jnp.moveaxis(x.reshape(STAGES, count, width, *x.shape[2:]), 0, 1)
         return x.reshape(count, STAGES * width, *x.shape[3:])[:, :samples]
 
-    def placed(index, distance, moved=None):
-        row = index // width
-        at = rays.point_at(ray.origin[row], ray.direction[row], distance[index])
-        if moved is None:
-            return asked_at(bound, at, condition)
-        return at + moved[index], ()
-
     def said(index, place):
         radiance = radiance_at(bound, name, place, inputs[index // width], condition)
         every = jnp.concatenate([radiance.density[None], radiance.colour])
         return every[:values]
 
     def stage(passed, given):
-        spacing, wanted, distance, before = given
+        spacing, wanted, distance, before, moved = given
         wanted = wanted & (passed < OPAQUE_DEPTH)[:, None]
-        wanted, distance, before = jax.tree.map(
-            lambda x: x.reshape(-1, *x.shape[2:]), (wanted, distance, before)
+        wanted, distance, before, moved = jax.tree.map(
+            lambda x: x.reshape(-1, *x.shape[2:]), (wanted, distance, before, moved)
         )
-        if not isinstance(before, _Asked):
-            kept = before is None and is_moved(bound.effects)
+
+        def place_of(index):
+            row = index // width
+            at = rays.point_at(ray.origin[row], ray.direction[row], distance[index])
+            if moved is None:
+                return asked_at(bound, at, condition)
+            return at + moved[index], ()
+
+        if before is None:
+            kept = moved is None and is_moved(bound.effects)
 
             def anew(index):
-                place = placed(index, distance, before)
+                place = place_of(index)
                 return said(index, place), place if kept else None
 
             answer, place = compacted(jax.vmap(anew), wanted)
             asked = _Asked(wanted, place) if kept else None
         else:
-            more = compacted(
-                jax.vmap(lambda index: placed(index, distance)), wanted & ~before.known
-            )
+            more = compacted(jax.vmap(place_of), wanted & ~before.known)
             place = jax.tree.map(jnp.add, before.place, more)  # one of both is zero
 
             def again(index):
@@ -318,7 +320,7 @@ def _ask(bound, name, occupied, ray, condition, distance, spacing, values, befor
         depth = answer[:, 0].reshape(spacing.shape) * spacing
         return passed + jnp.sum(depth, axis=1), (answer, asked)
 
-    given = jax.tree.map(staged, (spacing, wanted, distance, before))
+    given = jax.tree.map(staged, (spacing, wanted, distance, before, moved))
     _, found = jax.lax.scan(stage, jnp.zeros(count, distance.dtype), given)
     return jax.tree.map(whole, found)
 
