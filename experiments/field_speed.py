@@ -18,7 +18,7 @@ decibels are of the difference between the two. Over several seeds the table has
 and beside a PSNR its standard deviation. What is in `--out` already is not measured
 again: an interrupted run goes on, and more `--seeds` add those that it lacks. Frames of
 `nerfies-grid-small` after 300 seconds are of before its warp was asked on a grid
-(`nerfies_jax.frustum_grid`), those after 60 of today.
+(`nerfies_jax.frustum_grid`), those after 60 are not.
 """
 
 import dataclasses

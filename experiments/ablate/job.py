@@ -28,14 +28,12 @@ from nerfies_jax.runs.config import CaptureSource
 from nerfies_jax.training import loop, specs
 
 # Arms with their programs, which hold 4,000 mappings of memory and more. Linux lets a
-# process have 65,530: the eighth arm of one long --jobs 1 was the end of it.
+# process have 65,530: the eighth model of one long --jobs 1 was the end of it.
 KEPT_ARMS = 4
 PILOT_STEPS = 150  # of a whole, short schedule, to see what a step costs
 NEAR_ENOUGH = 0.1  # share of --seconds by which a first seed may miss them
 # JAX's event for a program that was read from the compilation cache.
 SAVED = "/jax/compilation_cache/compile_time_saved_sec"
-# Fields of specs that came after arms were kept: none, they change nothing in these.
-YOUNGER = ("poses",)
 
 
 class CompiledArm(NamedTuple):
@@ -334,7 +332,7 @@ class Job:
             "seconds": budget.seconds,
             # As those that were kept before there was a choice.
             **({"clock": budget.clock} if budget.clock != "wall" else {}),
-            "spec": _without_younger(specs.as_json(self.spec(name, steps))),
+            "spec": results.without_younger(specs.as_json(self.spec(name, steps))),
             **{k: x for k, x in self.measured_on().items() if k != "scene"},
         }
 
@@ -381,12 +379,6 @@ class Job:
     def missing(self) -> list[tuple[str, int]]:
         """Arms and seeds that are not finished."""
         return [task for task in self.tasks() if not self.is_finished(*task)]
-
-
-def _without_younger(stored):
-    """A spec as JSON, as it was before there was a choice that it leaves out."""
-    absent = [name for name in YOUNGER if stored.get(name, "") is None]
-    return {name: item for name, item in stored.items() if name not in absent}
 
 
 def _model_sizes(arm, state):

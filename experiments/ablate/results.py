@@ -16,6 +16,8 @@ from nerfies_jax.capture.json_files import replaced_file, write_json
 from nerfies_jax.training.provenance import provenance
 
 STEPS = "steps.json"  # of arms that need not find out what their seconds are worth
+# Fields of specs that came after arms were kept: none, they change nothing in these.
+YOUNGER = ("poses",)
 
 
 class ArmResult(NamedTuple):
@@ -122,3 +124,9 @@ def claimed(path: pathlib.Path) -> Iterator[bool]:
         with contextlib.suppress(OSError):  # Windows removes no file that is open
             name.unlink()
         lock.release()
+
+
+def without_younger(stored: dict[str, Any]) -> dict[str, Any]:
+    """A spec as JSON, as it was before there was a choice that it leaves out."""
+    absent = [name for name in YOUNGER if stored.get(name, "") is None]
+    return {name: item for name, item in stored.items() if name not in absent}

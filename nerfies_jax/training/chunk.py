@@ -221,6 +221,7 @@ def _lowered(model, state, frames, steps):
     return made, frames, seconds
 
 
+# Each model's programs hold thousands of mappings of memory (`experiments.ablate.job`).
 @functools.lru_cache(maxsize=4)
 def _programs(step):
     return {}

@@ -35,6 +35,7 @@ FIELD_SEAMS = (
     "condition",
     "condition_width",
     "displace",
+    "shortest_wave",
     "lift",
     "lift_width",
     "mark",
