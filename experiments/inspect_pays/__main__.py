@@ -81,10 +81,9 @@ def main(args):
 
 def check(presets: tuple[str, ...]) -> None:
     """Raise ValueError for a preset that no advice is held against."""
-    from experiments.ablate import suites
+    from experiments.inspect_pays.arms import held_against
 
-    arms = suites.named("advice").arms
-    known = [name for name, arm in arms.items() if not arm.changes]
+    known = held_against()
     for preset in presets:
         if preset not in known:
             raise ValueError(f"--presets {preset}: choose from {', '.join(known)}")

@@ -25,9 +25,25 @@ def name_of(advice: Advice) -> str:
     return "+".join((advice.preset, *advice.overrides))
 
 
+def held_against() -> tuple[str, ...]:
+    """The presets in whose place advice takes whatever the findings lead to.
+
+    Any other stays, with effects switched in it.
+    """
+    return tuple(
+        preset
+        for kind in representations.installed().values()
+        for preset in kind.presets
+        if adviser.advise_for((), preset)
+        == adviser.advise((), kind, not preset.endswith("-small"))
+    )
+
+
 def advice() -> Suite:
-    """Every preset and change that any findings lead to."""
-    return Suite(arms=dict(_arms()), claims=(), seeds=1, pictured=(), context="")
+    """Every preset and change that any findings lead to, and what they are held
+    against."""
+    arms = {preset: Arm(preset) for preset in held_against()} | dict(_arms())
+    return Suite(arms=arms, claims=(), seeds=1, pictured=(), context="")
 
 
 def _arms():

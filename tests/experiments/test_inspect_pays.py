@@ -44,8 +44,18 @@ def test_whatever_is_advised_is_an_arm():
             name = inspect_arms.name_of(advice)
             assert suite[name] == Arm(advice.preset, advice.overrides)
             arms.add(name)
-    assert arms == {*suite}
+    against = inspect_arms.held_against()
+    assert arms | {*against} == {*suite}
+    for preset in against:
+        assert suite[preset] == Arm(preset)
     assert not any("/" in name for name in arms)  # it is part of a file's name
+
+
+def test_its_own_presets_are_such_that_advice_replaces():
+    inspect_pays.check(inspect_pays.InspectPays.presets)
+    inspect_pays.check(("splats-tracked", "splats-static-small", "nerf"))
+    with pytest.raises(ValueError, match=r"hypernerf-small: choose from .*nerfies"):
+        inspect_pays.check(("hypernerf-small",))
 
 
 def side(psnr, seconds, depth=math.nan):
