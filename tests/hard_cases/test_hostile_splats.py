@@ -41,6 +41,10 @@ SYSTEMS = ("4dgs", "edgs", "adc-gs", "d-miso", "e-d3dgs", "dynmf", "motion-gs")
 DIE = ("huge", "needles", "transparent")
 # |dL/dq| is 1e30 times that of a unit quaternion; its square is beyond float32.
 STOPS = {"quaternions of nearly nothing": "optimiser.second.rows.splats.quaternion"}
+# Captures that change nothing a preset reads: they would be "as filmed" once more. Of
+# these, "unfilmed depth not a number" is half of "unfilmed frames".
+NO_DEPTHS = ("no depth known", "constant depth", "unfilmed depth not a number")
+UNREAD = {"splats-static": (*NO_DEPTHS, "one instant"), "moba": NO_DEPTHS}
 # The last frame's error over that of the start; 0.15 to 0.63 where Adam trains. RAdam's
 # steps are 0.03 to 0.15 of Adam's in so few updates, too short to make good what the
 # reset of the opacities at half time took: 1.12 to 1.24, as filmed, too.
@@ -224,8 +228,15 @@ def test_splats_train_from_hostile_rows(name, case, tmp_path):
         assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("case", hostile.CAPTURES)
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize(
+    ("name", "case"),
+    [
+        pytest.param(*preset.values, case, marks=preset.marks)
+        for preset in PRESETS
+        for case in hostile.CAPTURES
+        if case not in UNREAD.get(*preset.values, ())
+    ],
+)
 def test_splats_train_on_hostile_captures(name, case, tmp_path):
     prepared = ready(name)
     frames = hostile.CAPTURES[case](prepared.frames)
