@@ -157,6 +157,9 @@ def _slope_between_vertices(cells, stride, primals, tangents):
     #   their slope by tables       514       499
     #   by places                  1610       386
     #   by both                    2124       651
+    # An operation of its own over all points, its slopes by tables scattered corner
+    # after corner, takes 195 for 480 of these by itself; whole steps and frames of
+    # `d-nerf-grid-small` then take a tenth more.
     moved = [not isinstance(tangent, SymbolicZero) for tangent in tangents]
 
     def product(*given):
