@@ -67,7 +67,11 @@ TABLE = [
     ("hard_cases", "--cases nothing", "no such case; there are screw"),
     ("hard_cases", "--numbers 0", "at least 1"),
     ("hard_cases", "--document nowhere.md", "no such file, or not both"),
-    ("inspect_pays", "--presets moba-small", "choose from splats-tracked-small"),
+    (
+        "inspect_pays",
+        "--presets moba-small",
+        "choose from splats-static, splats-tracked",
+    ),
     ("inspect_pays", "--steps 0", "--steps"),
     ("inspect_scene", "OUT", "OUT"),
     ("kan_local", "--kernels 1", "--kernels"),
