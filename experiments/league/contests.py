@@ -126,7 +126,7 @@ def record(args: League, jobs: list[Job]) -> dict[str, Any]:
     machine = clock.machine()
     return {
         "machine": machine,
-        "settings": specs.as_json(args),
+        "settings": specs.as_json(args) | {"out": None},  # a folder of this machine
         "contests": [_contest(job, machine["cpu"]) for job in jobs],
     }
 
