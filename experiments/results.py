@@ -194,7 +194,9 @@ STUDIES = {
         "raster_speed", "--out raster_speed.json", page="__main__"
     ),
     "league": _package(
-        "league", "--scenes default --budgets 90 --seeds 3 --jobs 2 --keep"
+        "league",
+        "CAPTURE --heldout 8 --scenes default topology --budgets 90 --seeds 3 "
+        "--jobs 2 --keep",
     ),
     "mutants": _package("mutants", "--count 44"),
     "mutants_unseen": _package("mutants_unseen", "--count 24 --seed 1", of="mutants"),

@@ -94,10 +94,22 @@ def _progress(contests):
             "chance, and near rows have no order.**"
         )
     parts.append(f"The whole league is {whole * WHOLE.seeds:,} cells and any captures.")
-    films = {contest.film for contest in contests}
+    films = {contest.film for contest in contests if contest.numbers}
     unseen = [f"`{name}`" for name in WHOLE.sources if name not in films]
     if unseen:
         parts.append(f"No cell is of {' or '.join(unseen)}.")
+    every = len(rows.suite().arms)
+    for contest in contests:
+        asked = {name for name, _ in contest.numbers} | {*contest.missing}
+        if len(asked) < every:
+            parts.append(f"Of {contest.title}: {len(asked)} of {every} rows.")
+    lengths = {contest.seconds for contest in contests if contest.numbers}
+    unseen = [f"{x:g} processor seconds" for x in WHOLE.budgets if x not in lengths]
+    unseen += ["the presets' own steps"] if None not in lengths else []
+    if unseen:
+        parts.append(f"No cell is of {' or '.join(unseen)}.")
+    captures = [f"`{film}`" for film in sorted(films) if film not in WHOLE.sources]
+    parts.append(f"Captures: {', '.join(captures) or 'none'}.")
     return " ".join(parts)
 
 

@@ -62,6 +62,9 @@ def test_the_page_of_a_part_says_what_is_there_and_what_is_missing():
     empty = contest(["nerf"], film="kitchen", seconds=None)
     text = page.page({"contests": [part, empty]})
     assert text.startswith("**7 of 12 cells**")
+    every = len(rows.suite().arms)
+    assert f"{part['film']}`, 90 processor seconds: 3 of {every} rows." in text
+    assert "No cell is of 300 processor seconds or the presets' own steps." in text
     assert "Seeds so far: 0, 1, 2" in text
     assert "`aaaaaaaaaaaaaa` 6, `bbbbbbbbbbbbbb+` 1." in text
     assert "One seed has no spread" not in text
