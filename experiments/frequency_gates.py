@@ -20,12 +20,12 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from experiments import cli, markdown
+from experiments import asked, cli, markdown
 from gaussians_jax.effects import spectral
 from gaussians_jax.effects.spectral import FourierSpec, SpectralSpec, WaveletSpec
 from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.runs import platform
-from nerfies_jax.training import losses, specs
+from nerfies_jax.training import losses
 from nerfies_jax.training.effects import weighted_sum
 
 REWARD = 0.01  # of "log", for each gate's log sigma; as in the loss, in units of L1
@@ -347,7 +347,7 @@ def main(args):
     from nerfies_jax.measure import clock
 
     record = {
-        "settings": specs.as_json(args),
+        "settings": asked.without_places(args),
         "machine": clock.machine(),
         "rows": rows,
         "said": format_conclusions(rows).split("\n"),

@@ -1,8 +1,8 @@
 """Write an ablation down: the table, the claims, metrics and a picture."""
 
 import math
-import pathlib
 
+from experiments import asked
 from experiments.ablate import arms, measures, picture, verdicts
 from experiments.ablate.measures import MEASURES
 from experiments.ablate.verdicts import Numbers
@@ -31,7 +31,7 @@ def write(job, budget, finished) -> None:
         print("\n" + job.suite.context)
     about = {
         "capture": job.capture.name,
-        "settings": _settings(job.args),
+        "settings": asked.without_places(job.args),
         "budget": {"steps": budget.steps, "seconds": budget.seconds},
         "trained": budget.title,
         "arms": {name: specs.as_json(arm) for name, arm in job.suite.arms.items()},
@@ -47,15 +47,6 @@ def write(job, budget, finished) -> None:
     )
     _picture(job, finished, budget.folder / "ablation.png")
     print(f"{budget.folder / 'ablation.png'} and {budget.folder / 'ablation.json'}")
-
-
-def _settings(args):
-    """What was asked for, without where on this machine things lie."""
-    settings = specs.as_json(args) | {"out": None}
-    folder = settings["source"]["capture"]
-    if folder is not None:
-        settings["source"]["capture"] = pathlib.Path(folder).name
-    return settings
 
 
 def judged(job) -> list:

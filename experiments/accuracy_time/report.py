@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import jax
 
+from experiments import asked
 from experiments.ablate import report, verdicts
 from experiments.ablate.arms import Claim
 from experiments.ablate.measures import MEASURES
@@ -55,7 +56,7 @@ def write(job, args, finished) -> list[Metric]:
     metrics = report.metrics(numbers, static)
     about = {
         "capture": job.capture.name,
-        "settings": specs.as_json(args),
+        "settings": asked.without_places(args),
         "arms": {name: specs.as_json(job.suite.arms[name]) for name in job.names},
         "machine": clock.machine(),
     }

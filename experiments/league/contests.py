@@ -10,6 +10,7 @@ import pathlib
 import time
 from typing import Any
 
+from experiments import asked
 from experiments.ablate import pool, results
 from experiments.ablate.job import Job
 from experiments.ablate.log import log
@@ -19,7 +20,6 @@ from experiments.league.settings import League
 from nerfies_jax.capture.json_files import write_json
 from nerfies_jax.evaluation import protocol
 from nerfies_jax.measure import clock
-from nerfies_jax.training import specs
 
 # What a film may tell beside pictures, cameras and points, and most rows do not read.
 TOLD = {"depths", "flow", "moving"}
@@ -126,7 +126,7 @@ def record(args: League, jobs: list[Job]) -> dict[str, Any]:
     machine = clock.machine()
     return {
         "machine": machine,
-        "settings": specs.as_json(args) | {"out": None},  # a folder of this machine
+        "settings": asked.without_places(args),
         "contests": [_contest(job, machine["cpu"]) for job in jobs],
     }
 

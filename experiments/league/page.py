@@ -82,7 +82,8 @@ def _progress(contests):
     missing = sum(map(len, (s for c in contests for s in c.missing.values())))
     seeds = sorted({seed for c in contests for _, seed in c.numbers})
     counted = f"**{there} of {there + missing} cells** (row, film, length and seed)"
-    whole = len(rows.suite().arms) * len(WHOLE.sources) * len(WHOLE.limits)
+    every = len(rows.suite().arms)
+    whole = every * len(WHOLE.sources) * len(WHOLE.limits)
     parts = [f"{counted} that were asked for are there."]
     if missing:
         parts.append("What is missing is named below, and nothing is said of it.")
@@ -94,23 +95,24 @@ def _progress(contests):
             "chance, and near rows have no order.**"
         )
     parts.append(f"The whole league is {whole * WHOLE.seeds:,} cells and any captures.")
+    return " ".join([*parts, *_unasked(contests, every)])
+
+
+def _unasked(contests, every):
+    """Films, lengths and rows of the whole league without a cell, in sentences."""
     films = {contest.film for contest in contests if contest.numbers}
+    lengths = {contest.seconds for contest in contests if contest.numbers}
+    absent = [each for each in (*WHOLE.budgets, None) if each not in lengths]
     unseen = [f"`{name}`" for name in WHOLE.sources if name not in films]
     if unseen:
-        parts.append(f"No cell is of {' or '.join(unseen)}.")
-    every = len(rows.suite().arms)
+        yield f"No cell is of {' or '.join(unseen)}."
     for contest in contests:
-        asked = {name for name, _ in contest.numbers} | {*contest.missing}
-        if len(asked) < every:
-            parts.append(f"Of {contest.title}: {len(asked)} of {every} rows.")
-    lengths = {contest.seconds for contest in contests if contest.numbers}
-    unseen = [f"{x:g} processor seconds" for x in WHOLE.budgets if x not in lengths]
-    unseen += ["the presets' own steps"] if None not in lengths else []
-    if unseen:
-        parts.append(f"No cell is of {' or '.join(unseen)}.")
+        if len(contest.reads) < every:
+            yield f"Of {contest.title}: {len(contest.reads)} of {every} rows."
+    if absent:
+        yield f"No cell is of {' or '.join(map(standings.length_of, absent))}."
     captures = [f"`{film}`" for film in sorted(films) if film not in WHOLE.sources]
-    parts.append(f"Captures: {', '.join(captures) or 'none'}.")
-    return " ".join(parts)
+    yield f"Captures: {', '.join(captures) or 'none'}."
 
 
 def _revisions(contests):

@@ -31,11 +31,15 @@ class Contest(NamedTuple):
     revisions: collections.Counter[str]  # of the code that made them: how many cells
 
 
+def length_of(seconds: float | None) -> str:
+    """A length of training in words."""
+    if seconds is None:
+        return "the presets' own steps"
+    return f"{seconds:g} processor seconds"
+
+
 def of_stored(stored: Mapping[str, Any]) -> Contest:
     """A contest as a league.json has it."""
-    length = "the presets' own steps"
-    if stored["seconds"] is not None:
-        length = f"{stored['seconds']:g} processor seconds"
     numbers, missing, stopped, cpus = {}, {}, [], {}
     revisions = collections.Counter()
     for name, row in stored["rows"].items():
@@ -52,7 +56,7 @@ def of_stored(stored: Mapping[str, Any]) -> Contest:
             if cell["stopped_by"] != "steps":
                 stopped.append(f"{words}: {cell['stopped_by']}")
     return Contest(
-        f"`{stored['film']}`, {length}",
+        f"`{stored['film']}`, {length_of(stored['seconds'])}",
         stored["film"],
         stored["seconds"],
         stored["still"],

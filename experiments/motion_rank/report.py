@@ -4,11 +4,10 @@ from typing import Any
 
 import numpy as np
 
-from experiments import markdown
+from experiments import asked, markdown
 from nerfies_jax.capture.json_files import replaced_file, write_json
 from nerfies_jax.evaluation import figures
 from nerfies_jax.measure import clock
-from nerfies_jax.training import specs
 
 COLOURS = {
     "time basis": "C3",
@@ -156,7 +155,7 @@ def _floors(own):
 def record(args, rows) -> dict[str, Any]:
     """What is kept of the study."""
     return {
-        "settings": specs.as_json(args),
+        "settings": asked.without_places(args),
         "machine": clock.machine(),
         "rows": [row._asdict() for row in rows],
         "said": format_conclusions(rows).strip().split("\n"),

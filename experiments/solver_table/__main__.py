@@ -162,7 +162,7 @@ def main(settings):
     task = PROBLEMS[settings.fit](settings)
     rows = table(task, settings)
     print(text(rows, settings.frames))
-    about = dataclasses.asdict(settings) | {"out": str(settings.out)}
+    about = dataclasses.asdict(settings) | {"out": None}
     record = {"about": about, "machine": clock.machine()}
     record["rows"] = [row._asdict() for row in rows]
     if settings.out:

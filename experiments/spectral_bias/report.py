@@ -4,11 +4,10 @@ from typing import Any
 
 import numpy as np
 
-from experiments import markdown
+from experiments import asked, markdown
 from nerfies_jax.capture.json_files import replaced_file, write_json
 from nerfies_jax.evaluation import figures
 from nerfies_jax.measure import clock
-from nerfies_jax.training import specs
 
 # The measured expectation of the design: on the 2-D signal at equal parameters the KAN
 # of raw coordinates has at most half the error of the best encoded MLP.
@@ -120,7 +119,7 @@ def _against_kan(label, equality, error):
 def record(args, results, waves) -> dict[str, Any]:
     """What is kept of the study."""
     return {
-        "settings": specs.as_json(args),
+        "settings": asked.without_places(args),
         "machine": clock.machine(),
         "waves": {label: components.tolist() for label, components in waves.items()},
         "results": {

@@ -4,17 +4,20 @@ import dataclasses
 import itertools
 import json
 import math
+import pathlib
 
 import pytest
 
-from experiments import cli
+from experiments import asked, cli
 from experiments.ablate import pool, results
 from experiments.ablate.measures import MEASURES
 from experiments.ablate.results import ArmResult
+from experiments.ablate.settings import Ablate
 from experiments.league import contests, page, rows
 from experiments.league.settings import League
 from nerfies_jax.capture import synthetic
 from nerfies_jax.runs import platform, representations
+from nerfies_jax.runs.config import CaptureSource
 from tests import scenes
 
 
@@ -84,6 +87,15 @@ def test_the_page_of_a_part_says_what_is_there_and_what_is_missing():
     own_cells["0"]["numbers"]["train_cpu_seconds"] = 120.4
     text = page.page({"contests": [part]})
     assert "by more than a fifth: `sonata-small+tracks` (120 s)." in text
+
+
+def test_kept_settings_name_no_folder_of_the_machine():
+    place = pathlib.Path("/somewhere/bag")
+    league = asked.without_places(League(captures=(place,), out=place))
+    one = Ablate(source=CaptureSource(capture=place), out=place)
+    assert league["captures"] == ["bag"]
+    assert asked.without_places(one)["source"]["capture"] == "bag"
+    assert "somewhere" not in json.dumps([league, asked.without_places(one)])
 
 
 def test_a_page_of_nothing_says_so():
