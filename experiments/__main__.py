@@ -18,17 +18,18 @@ from experiments import options
 from nerfies_jax.capture.nearest import known_names
 
 HERE = pathlib.Path(__file__).resolve().parent
-NOT_COMMANDS = ("__init__", "__main__", "cli", "markdown", "options")
 
 
 def commands() -> dict[str, str]:
-    """By name, the first line of what its module says; nothing is imported."""
-    files = {path.stem: path for path in HERE.glob("*.py")}
+    """By name, the first line of each module with a `main`; nothing is imported."""
+    files = {path.stem: path for path in HERE.glob("*.py") if path.stem != "__main__"}
     files |= {path.parent.name: path for path in HERE.glob("*/__main__.py")}
     summaries = {}
-    for name in sorted(files.keys() - {*NOT_COMMANDS}):
-        text = ast.get_docstring(ast.parse(files[name].read_text())) or ""
-        summaries[name] = text.partition("\n")[0]
+    for name in sorted(files):
+        module = ast.parse(files[name].read_text())
+        if any(getattr(node, "name", None) == "main" for node in module.body):
+            text = ast.get_docstring(module) or ""
+            summaries[name] = text.partition("\n")[0]
     return summaries
 
 
