@@ -80,13 +80,31 @@ def test_the_page_of_a_part_says_what_is_there_and_what_is_missing():
     assert "| `nerf` | -10.00, one seed |" in text
     # Student's 95 % of gains 1.0, 1.1 and 0.9, by hand: 4.303 * 0.1 / sqrt(3).
     assert "| `splats-deformable-small+tracks` | +1.00 ± 0.25, shows |" in text
-    margin = next(line for line in text.splitlines() if "| +0.31, +0.004 |" in line)
+    margin = next(line for line in text.splitlines() if "| +0.31, +0.004," in line)
     assert "`splats-deformable-small` | tracks" in margin
+    assert "LPIPS -0.031 |" in margin
     assert margin.endswith("| +1.00 ± 0.25, shows | +0.010 ± 0.002, shows |")
     assert "took longer" not in text
     own_cells["0"]["numbers"]["train_cpu_seconds"] = 120.4
     text = page.page({"contests": [part]})
     assert "by more than a fifth: `sonata-small+tracks` (120 s)." in text
+
+
+def test_costs_beside_the_published_ones_are_a_step_of_one_over_a_step_of_the_other():
+    part = contest(["moba-small", "d-miso-small+rest"])
+    for seed, (ours, other) in enumerate([(20.0, 60.0), (40.0, 40.0)]):
+        more = {"steps": 200.0, "render_ms": 20.0, "gaussians": 1e4, "model_mb": 1.5}
+        mine = cell(psnr=25.0, ssim=0.9, train_cpu_seconds=ours, **more)
+        part["rows"]["moba-small"]["cells"][str(seed)] = mine
+        rival = cell(psnr=25.0, train_cpu_seconds=other, steps=100.0)
+        part["rows"]["d-miso-small+rest"]["cells"][str(seed)] = rival
+    text = page.page({"contests": [part]})
+    # Ratios of a step 0.6 / 0.1 and 0.4 / 0.2; none of what started from tracks.
+    assert "over MoBa-GS' | rest | 16 | 4.00 ± 2.83 |" in text
+    assert "over MoBa-GS' | tracks | 16 |  |" in text
+    assert "frames a second | rest | 163 | 50 ± 0 |" in text
+    assert "Gaussians | rest | 39,000 | 10,000 ± 0 |" in text
+    assert "model MB | rest | 11.3 | 1.50 ± 0.00 |" in text
 
 
 def test_kept_settings_name_no_folder_of_the_machine():
