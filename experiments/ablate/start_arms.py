@@ -106,10 +106,13 @@ POSES = Suite(
             "splats-tracked-small",
             (REFINED, "poses.learning_rate=3e-5", "poses.learning_rate_end=3e-6"),
         ),
+        "motion-gs": Arm("motion-gs-small"),  # its flow moves cameras as well
+        "motion-gs-refined": Arm("motion-gs-small", (REFINED,)),
     },
     claims=(
         Claim("Cameras have more to learn", "refined", "as-noted", TRACKED),
         Claim("So they have slowly", "refined-slowly", "as-noted", TRACKED),
+        Claim("So they have beside a flow", "motion-gs-refined", "motion-gs", TRACKED),
     ),
     seeds=3,
     pictured=("as-noted", "refined", "refined-slowly"),

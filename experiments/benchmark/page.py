@@ -16,6 +16,8 @@ COLUMNS = (
     ("time average", "floor.still", 2),
     ("EPE", "tracks.epe", 4),
     ("EPE at rest", "tracks.still_epe", 4),
+    ("flow px", "flow.epe", 2),
+    ("moving flow px", "flow.moving_epe", 2),
     ("training s", "train.seconds", 0),
     ("all s", "total.seconds", 0),
 )
@@ -25,11 +27,12 @@ the PSNR of pixels that move by themselves and of the others. *neighbours* is th
 of the mean of the two training pictures before and after, *time average* that of the
 run's own renders averaged over time: a run that does not stand above both did nothing.
 *EPE* is how far points that are followed are from where they truly are, in scene units,
-*EPE at rest* the same if none of them moved. Each number is the median over seeds,
-with the least and the largest in brackets. Seconds are wall clock, and
-whatever else the machine did is in them: *training* without compiling, *all* from the
-command to the report, with what the pictures say before training where it was not kept
-yet."""
+*EPE at rest* the same if none of them moved; *flow* is the end-point error of where
+pixels go until the camera's next frame, in pixels, of all and of those that move by
+themselves. Each number is the median over seeds, with the least and the largest in
+brackets. Seconds are wall clock, and whatever else the machine did is in them:
+*training* without compiling, *all* from the command to the report, with what the
+pictures say before training where it was not kept yet."""
 
 
 def page(stored: Mapping[str, Any]) -> str:
