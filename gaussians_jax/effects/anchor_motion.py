@@ -8,15 +8,16 @@ feature and time moves the anchor, a fine one of residual feature and time each 
 it carries. Features are kept rounded: they are trained with noise as wide as a step,
 and their bits under a learnt law are part of the loss.
 
-Read were the paper's abstract, a summary of its method and the settings of its code;
-what they leave open is settled so. Half of a residual feature makes a Gaussian, half
-moves it, as in the code, whose fine stage is switched off; here it is on. The law of a
-reference feature is normal, with a mean and a deviation for each channel (there with
-a hyperprior), that of the residual ones is normal as a network makes it of the former.
-Places, scales, turns, opacities and colours of anchors are kept as they are, at 32 bits
-a number, where the code has a codec for points. Colours and opacities do not change
-over time. Growth clones or splits anchors by the slopes of what they carry, each by its
-share in what is to be seen of the anchor at the moments that were drawn
+Read were the paper's abstract, a summary of its method and the settings of its code
+(H-Huang774/ADC-GS); its equations were not at hand. What they leave open is settled so.
+Half of a residual feature makes a Gaussian, half moves it, as in the code, whose fine
+stage is switched off; here it is on. The law of a reference feature is normal, with a
+mean and a deviation for each channel (there with a hyperprior), that of the residual
+ones is normal as a network makes it of the former. Places, scales, turns, opacities and
+colours of anchors are kept as they are, at 32 bits a number, where the code has a codec
+for points. Colours and opacities do not change over time; in the summary an anchor's
+colour does. Growth clones or splits anchors by the slopes of what they carry, each by
+its share in what is to be seen of the anchor at the moments that were drawn
 (`significance`), where the code puts a new anchor at each carried Gaussian of a steep
 slope; how much anchors are seen over time beside each other counts for nothing more.
 """

@@ -3,7 +3,9 @@
 The law of a reference feature is normal, with a mean and a deviation for each channel,
 that of the residual ones is normal as a network makes it of the former: a factorised
 model and one with a context, as Balle et al. 2018, arXiv:1802.01436, have them for
-pictures. Which part of ADC-GS this is, is said in `anchor_motion`.
+pictures (equation 6, where the law has no fixed form, and equation 7, where it has no
+mean). Which part of ADC-GS (Huang et al. 2025, arXiv:2505.08196) this is, and that its
+equations were not at hand, is said in `anchor_motion`.
 """
 
 import dataclasses
@@ -254,7 +256,10 @@ def noised(key: Key[Array, ""], features: Features, law: Law) -> Features:
 def bits(
     features: Features, law: Law, spec: AnchorMotionSpec
 ) -> tuple[Float[Array, "anchors reference"], Float[Array, "anchors carried residual"]]:
-    """What an ideal coder takes for each number of features that are noised or kept."""
+    """What an ideal coder takes for each number of features that are noised or kept.
+
+    `entropy.bits`, under the laws of reference and residual features.
+    """
     step, residual_step = _steps(law)
     first = entropy.bits(features.reference, law.mean, law.log_scale, step)
     mean, log_scale = law_of_residual(law, spec, features.reference)

@@ -1,10 +1,10 @@
 """Gaussians that rows carry: each row is a core, and what is drawn moves with it.
 
-D-MiSo (Waczyńska et al. 2024, NeurIPS, arXiv:2405.14276, "Multi-Gaussians soup"): a
-core Gaussian carries k sub-Gaussians in its own coordinates (its equation 2), and these
-alone are drawn. A motion moves the cores; a second network, the paper's Sub-Rot, turns
-what they carry. A core moved by hand takes what it carries along (`posed`), and a core
-is a triangle as well (`gaussians_jax.faces`).
+D-MiSo (Waczyńska et al. 2024, NeurIPS, arXiv:2405.14276, "Multi-Gaussians soup",
+section 3): a core Gaussian (equation 1) carries k sub-Gaussians in its own coordinates
+(equation 2), and these alone are drawn. A motion moves the cores; a second network, the
+paper's Sub-Rot (section 3.1), turns what they carry. A core moved by hand takes what it
+carries along (`posed`), and a core is a triangle as well (`gaussians_jax.faces`).
 
 What is not as in the paper. Places count in the scales of the core (m + R S a, there
 m + R a), so that what is split, or enlarged by hand, takes along what it carries. Cores
@@ -41,8 +41,9 @@ NAME = "carried"
 class TurnSpec:
     """The network that turns what is carried, from its own turn and the time.
 
-    The paper's has one layer (`depth` 0) and its code answers with a quaternion; here
-    the answer is a rotation vector, and starts near zero.
+    The paper's has one layer (`depth` 0), and what it answers is added to the rotation
+    (section 3.1), in its code as a quaternion; here it is a rotation vector that turns
+    what is carried, and starts near zero.
     """
 
     time: EncodingSpec = EncodingSpec(10)
@@ -151,6 +152,8 @@ def posed(
     rows: Gaussians,
 ) -> Gaussians:
     """What rows carry where the rows are now, moved by a network or by hand. Pure.
+
+    Equation 2, with the offset in the row's scales.
 
     `turn` are rotation vectors (rad) in the axes of the row, after what is carried has
     its own turn; `still` is `at_rest`, for the opacities. A row of no size has all in

@@ -1,8 +1,11 @@
 """Motion of a code for each Gaussian and the time, a coarse network and a fine one.
 
 Bae et al. 2024, "Per-Gaussian embedding-based deformation", arXiv:2404.03613 (E-D3DGS),
-section 3, with the sizes of its code. Both networks read the same table of codes over
-time (`motion_codes`), and their residuals of position, scale and rotation add.
+with the sizes of its code. A network makes residuals of the codes (section 3.2,
+equation 4); there are a coarse and a fine one, which read the same table of codes over
+time (section 3.3, `motion_codes`), and their residuals of position, scale and rotation
+add. Equation 4 has residuals of opacity and colour as well, which the code switches off
+for HyperNeRF's films; that the fine network reads ever more rows is from the code.
 """
 
 import dataclasses
@@ -37,11 +40,11 @@ class EmbeddingMotionSpec:
     """Sizes, growth and penalties; defaults of E-D3DGS's code for HyperNeRF's films.
 
     Rotations are rotation vectors where the code adds to quaternions, and the last
-    layers start at zero, where it fades offsets in over its first thousand steps; it
-    also learns how late a camera is. `smoothness` weighs the mean square of second
-    differences between codes that follow each other, which the code means and misses by
-    an index. `opacity` weighs the mean opacity, in the place of resets; the code takes
-    the sigmoid of the mean logit.
+    layers start at zero, where its start as any layer; for other films it fades offsets
+    in over a thousand steps, and learns how late a camera is. `smoothness` weighs the
+    mean square of second differences between codes that follow each other, which the
+    code means and misses by an index. `opacity` weighs the mean opacity, in the place
+    of resets; the code takes the sigmoid of the mean logit.
     """
 
     embedding: int = 32
@@ -153,7 +156,10 @@ def deform(
     prepared: Float[Array, "gaussians features"],
     active: Bool[Array, " gaussians"] | None = None,
 ) -> Offsets:
-    """Offsets of every Gaussian at one time, those of both networks added up."""
+    """Offsets of every Gaussian at one time, those of both networks added up.
+
+    Equation 4 twice, of the coarse and the fine code of the time (section 3.3).
+    """
     decoders = (params.coarse, params.fine)
     reads = motion_codes.read(spec, params.times, params.rows, time)
     shares = [

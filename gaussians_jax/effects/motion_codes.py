@@ -1,9 +1,9 @@
 """Codes of Gaussians and of time that motions read, and what holds them in check.
 
 Bae et al. 2024, "Per-Gaussian embedding-based deformation", arXiv:2404.03613 (E-D3DGS),
-section 3, with the numbers of its code. Two networks read one table of codes over time:
-a coarse one as if it had a fifth of its rows, a fine one with ever more of them, so
-that slow motion is found before fast motion.
+section 3.3, with the numbers of its code. Two networks read one table of codes over
+time: a coarse one as if it had a fifth of its rows, a fine one with ever more of them,
+so that slow motion is found before fast motion.
 """
 
 import math

@@ -1,11 +1,17 @@
 """Optical flow tells Gaussians how things move, once what the camera does is taken off.
 
-Zhu et al. 2024 (MotionGS), arXiv:2410.07707, "optical flow decoupling" and the motion
-flow loss. Flow from one frame to the next is that of the camera, which the drawn depth
-and both cameras say, and that of things, which is left. The latter is held against the
-flow of the Gaussians: where each goes in the next camera's picture between the two
-moments, with the ellipse that it is drawn as, blended as its colour is. A Gaussian's
-flow is linear in the pixel, so that six channels are exact for all pixels.
+Zhu et al. 2024 (MotionGS), arXiv:2410.07707, section 4.2 (equations 4 to 8) and
+appendix A.1. Flow from one frame to the next is that of the camera, which the drawn
+depth and both cameras say (equations 4 to 6), and that of things, which is left
+(equation 7). The latter is held against the flow of the Gaussians (equation 8): where
+each goes in the next camera's picture between the two moments, with the ellipse that it
+is drawn as, blended as its colour is (equations 10 to 14). A Gaussian's flow is linear
+in the pixel, so that six channels are exact for all pixels.
+
+The paper also masks out what is at rest; here all flow that is known counts. In which
+camera the Gaussians flow it says twice and differently (section 4.2: the next, the end
+of A.1: the first); here footprints move in the picture of the next, and are met at the
+pixels of the first.
 """
 
 import dataclasses
@@ -39,8 +45,9 @@ class FlowSpec:
     """What the flow counts for beside the colours, and from which step on.
 
     Weight and form are the paper's code's: absolute differences of flows in units of
-    the picture's sides, each held to one side. `opaque` is the least opacity of a pixel
-    that is compared, where flow is known as well; there all are.
+    the picture's sides, each held to one side; 0.5 is for NeRF-DS, and for HyperNeRF
+    the paper has 0.1. `opaque` is the least opacity of a pixel that is compared, where
+    flow is known as well; there all are.
 
     As there, neither the weights of the blending nor the depth get a slope. Otherwise
     than there, both ends of a Gaussian's way get one: with the first held still, the
@@ -136,8 +143,9 @@ def drawn_flow(
     In pixels of the second camera, which stands still meanwhile: at a pixel x of the
     first, Gaussian k goes by m' - m + (L' - L) L1⁻¹ (x - m1), with means m and Cholesky
     factors L of its footprint in the second camera, before and after, and those with a
-    1 in the first. What only one moment shows does not count. `size` is (width, height)
-    of both.
+    1 in the first: a point keeps its place in the ellipse. (Equations 10 and 11 print
+    covariances for factors, and m for m'.) What only one moment shows does not count,
+    and the blend is over the opacity of what does. `size` is (width, height) of both.
     """
     first = lax.stop_gradient(projection.project(here, pair[0], size, picture))
     start, end = (projection.project(g, pair[1], size, picture) for g in (here, there))
@@ -190,8 +198,8 @@ def camera_flow(
 ) -> Float[Array, "height width 2"]:
     """Where a still scene's pixels go from the first camera to the second, px.
 
-    `depth` is z-depth in scene units; where it is not positive the flow means nothing,
-    and is finite. Of cameras without distortion.
+    Equations 4 to 6. `depth` is z-depth in scene units; where it is not positive the
+    flow means nothing, and is finite. Of cameras without distortion.
     """
     first, second = pair
     height, width = depth.shape
@@ -214,7 +222,8 @@ def error(
 ) -> Float[Array, ""]:
     """Mean absolute difference where `seen`, in sides of the picture; zero of none.
 
-    Horizontal flow by the width and vertical by the height, each held to ±1.
+    Equation 8. Horizontal flow by the width and vertical by the height, each held to
+    ±1.
     """
     height, width = seen.shape
     side = jnp.asarray((width, height), drawn.dtype)

@@ -13,15 +13,22 @@ learnt along says which of them move. The network is asked for those alone, and
 Gaussians that only resting anchors carry are passed over. Its anchors also make the
 looks of their Gaussians, which here keep their own.
 
+The texts were not at hand. SC-GS is as in its code (yihua7/SC-GS), EDGS, which has
+none, as its abstract and the caption of its pipeline say.
+
 What is not as in SC-GS: turns are rotation vectors, where it has quaternions; which
 nodes are near is found when rows change and not in every step; the rigid term is a mean
-and not a sum, over a fixed number of links and not those within a radius; and nodes
-start among the first Gaussians, or from tracks half on what moves and half on what is
-at rest, where the paper first trains them as Gaussians of their own. Their number stays
-as it is, where the paper adds and prunes nodes. Slopes reach the places of nodes and of
-Gaussians through weights, turns and the network, where the published code cuts them (of
-a node, through network and weights). Its further coordinates of nodes and Gaussians,
-its scales that change and its noise on the times of real captures are not there.
+and not a sum, over a fixed number of links and not those within a radius, and compares
+any two moments, in the code two within a twentieth of the film; a node's kernel has no
+weight of its own, as it has in the code, and starts as wide as neighbours are far, not
+as a tenth of the scene; one turn of a node moves and turns what it carries, where the
+code has two; and nodes start among the first Gaussians, or from tracks half on what
+moves and half on what is at rest, where the paper first trains them as Gaussians of
+their own. Their number stays as it is, where the paper adds and prunes nodes. Slopes
+reach the places of nodes and of Gaussians through weights, turns and the network, where
+the published code cuts them (of a node, through network and weights). Its further
+coordinates of nodes and Gaussians, its mask of those that move, its scales that change
+and its noise on the times of real captures are not there.
 """
 
 import dataclasses

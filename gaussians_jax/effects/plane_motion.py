@@ -1,16 +1,18 @@
 """Motion of all Gaussians from planes over space and time, read by a tiny network.
 
 4DGS (Wu et al. 2024, arXiv:2310.08528): six planes at several resolutions are read at
-the canonical mean and the time, and a small network makes of the features how far mean,
-rotation and scale are from their canonical values. Planes of space are kept smooth,
-those of time steady and near one. Its coarse stage, in which nothing moves, is the
-`warm_up`.
+the canonical mean and the time (equation 7, the product over planes, levels side by
+side), and a small network makes of the features how far mean, rotation and scale are
+from their canonical values (equation 8). Planes of space are kept smooth, those of time
+steady and near one, as in K-Planes (`nets.planes`). Its coarse stage, in which nothing
+moves, is the `warm_up`. The text was not at hand: the numbers are those of a reader who
+quotes it, the rest is as in its code (hustvl/4DGaussians).
 
-As the paper has it but for: the heads are linear read-outs of one network, there each
-has a hidden layer of its own; turns are rotation vectors, there they are added to the
-quaternion; the time has all of its planes, of which the published code uses the half
-above their middle; and `variation` is the total variation, where that code has second
-differences along one axis.
+As there but for: the heads are linear read-outs of one network, there each has a hidden
+layer of its own; turns are rotation vectors, there they are added to the quaternion;
+the time has all of its planes, of which the published code uses the half above their
+middle; and `variation` is the total variation, where that code has second differences
+along one axis.
 """
 
 import dataclasses

@@ -1,12 +1,17 @@
 """Motion of each Gaussian as a polynomial of the time of its own.
 
 Spacetime Gaussians (Li et al. 2024, arXiv:2312.16812): a Gaussian has a time of its own
-m, at which it is where its row says; s = t - m later its mean is off by a cubic in s,
-its rotation by a turn that grows with s, and its opacity is exp(-(s / w)^2) of its own,
-with a width w that is learnt. No network, and nothing shared. The turn is a rotation
-vector, where the paper's quaternion grows linearly. The time of its own learns from
-motion as well, where the published code cuts that slope and lets opacity alone move it.
-Colours from features and sampling where errors are large are not there.
+m, at which it is where its row says; s = t - m later its mean is off by a cubic in s
+(equation 8, degree 3), its rotation by a turn that grows with s (equation 9, degree 1),
+and its opacity is exp(-(s / w)^2) of its own (equation 7, `temporal_opacity`), with a
+width w that is learnt. No network, and nothing shared. The text was not at hand: the
+numbers are those of readers who quote it, the rest is as in its code
+(oppo-us-research/SpacetimeGaussians).
+
+The turn is a rotation vector, where the paper's quaternion grows linearly. The time of
+its own learns from motion as well, where the published code cuts that slope and lets
+opacity alone move it. Colours from features (there they too change with s) and sampling
+where errors are large are not there.
 """
 
 import dataclasses
@@ -94,7 +99,7 @@ def init(key: Key[Array, ""], spec: PolynomialMotionSpec, gaussians: int, dtype)
 def deform(
     rows: Polynomials, gaussians: Gaussians, time: Float[Array, ""]
 ) -> Gaussians:
-    """Gaussians as they are at one time in [0, 1]."""
+    """Gaussians as they are at one time in [0, 1]: equations 7 to 9."""
     own = 0.5 if rows.fading is None else rows.fading.time
     since = time - own
     # Horner's rule, without powers: a power has no slope of its own at zero.

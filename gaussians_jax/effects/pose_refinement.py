@@ -2,7 +2,7 @@
 
 A screw for each frame, in the camera's own frame, descends with the Gaussians: the pose
 refinement of BARF (Lin et al. 2021, arXiv:2104.06405) for splats, as MotionGS has it
-beside its flow (Zhu et al. 2024, arXiv:2410.07707, section 3.3; there by turns with the
+beside its flow (Zhu et al. 2024, arXiv:2410.07707, section 4.3; there by turns with the
 Gaussians, here together) and gsplat as an option. The mean of all screws is taken off,
 or cameras and scene could drift away together. No slope goes through that mean: each
 frame's would reach all others, and Adam makes whole steps of the smallest slopes, so

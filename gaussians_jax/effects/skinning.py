@@ -1,9 +1,10 @@
 """Few nodes that carry many Gaussians: who is near, how much it counts, where to.
 
-SC-GS (Huang et al. 2024, arXiv:2312.14937), section on its control points: a Gaussian
-follows its nearest nodes under weights that fall with the distance in each node's own
-radius, by linear blend skinning, and nodes near each other are asked to move as one
-rigid body (ARAP, Sorkine and Alexa 2007).
+SC-GS (Huang et al. 2024, arXiv:2312.14937): a Gaussian follows its nearest nodes under
+weights that fall with the distance in each node's own radius, by linear blend skinning,
+and nodes near each other are asked to move as one rigid body (ARAP, Sorkine and Alexa
+2007). The paper's equations were not at hand; its code (yihua7/SC-GS,
+`ControlNodeWarp`) is followed. What is not as there is said in `node_motion`.
 """
 
 from typing import NamedTuple
@@ -67,10 +68,11 @@ def weights(
 ) -> Float[Array, "*points near"]:
     """exp(-d² / 2r²) of each near node, over their sum.
 
-    The quotient as printed is 0/0 in float32 from 13 radii on. This one depends on
-    differences alone and goes over to the node that is nearest in its own radii; some
-    1e6 times as far away as nodes are apart, float32 takes them for equally far. A
-    radius outside `splats.LOG_SCALE_RANGE` (as a logarithm) counts as its bound.
+    In SC-GS's code a learnt share of each node multiplies it, and 1e-7 is added. The
+    plain quotient is 0/0 in float32 from 13 radii on. This one depends on differences
+    alone and goes over to the node that is nearest in its own radii; some 1e6 times as
+    far away as nodes are apart, float32 takes them for equally far. A radius outside
+    `splats.LOG_SCALE_RANGE` (as a logarithm) counts as its bound.
     """
     held = jnp.clip(log_radius, *splats.LOG_SCALE_RANGE)
     return jax.nn.softmax(-distance_sq * jnp.exp(-2 * held) / 2, axis=-1)
@@ -88,7 +90,9 @@ def displaced(
     Means go to the weighted mean of where each node would carry them, rotations are
     followed by the weighted mean of the nodes' quaternions, each with the sign that is
     on the side of the one that counts most: opposite quaternions are one turn, and
-    their plain mean is none. What no near node moves stays where it is, exactly.
+    their plain mean is none. What no near node moves stays where it is, exactly. That a
+    node's turn sweeps what is off it is SC-GS's code with `local_frame`; without, nodes
+    shift only.
     """
     # One gather of a node's whole row: 1.4 ms for 10,000 Gaussians with three nodes
     # each, forward and backward. As products with a matrix that is 0 or 1, which

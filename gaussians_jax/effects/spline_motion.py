@@ -1,10 +1,12 @@
 """Motion of each Gaussian along a cubic spline of its own.
 
-SplineGS (Park et al. 2025, arXiv:2412.09982), its motion-adaptive spline: control
-points at even times, and between them a cubic Hermite polynomial whose slopes are those
-of the chord between the neighbours, which is Catmull-Rom. All Gaussians have as many
-control points here; the paper takes away those that hardly matter. Turns have control
-points, too: rotation vectors, interpolated alike.
+SplineGS (Park et al. 2025, CVPR, arXiv:2412.09982), section 4.2, its motion-adaptive
+spline (equations 3 and 4): control points at even times, and between them a cubic
+Hermite polynomial whose slopes are those of the chord between the neighbours, which is
+Catmull-Rom. Left open are the slopes at the ends, where a neighbour is missing (here
+the end stands for it), and how many control points there are at first. All Gaussians
+have as many here; the paper takes away those that hardly matter (equations 7 and 8). It
+moves means; here turns have control points, too: rotation vectors, interpolated alike.
 """
 
 import dataclasses
@@ -59,7 +61,10 @@ def init(spec: SplineMotionSpec, gaussians: int, dtype=jnp.float32) -> Splines:
 
 
 def deform(rows: Splines, gaussians: Gaussians, time: Float[Array, ""]) -> Gaussians:
-    """Gaussians as they are at one time in [0, 1]; outside it, at its nearer end."""
+    """Gaussians as they are at one time in [0, 1]; outside it, at its nearer end.
+
+    Equation 3, of shifts from the mean of the row.
+    """
     weights = time_knots.spline_weights(rows.shift.shape[1], time)
     shift, turn = (exact_einsum("k,nkc->nc", weights, leaf) for leaf in rows)
     return gaussians._replace(
@@ -68,7 +73,7 @@ def deform(rows: Splines, gaussians: Gaussians, time: Float[Array, ""]) -> Gauss
 
 
 def fit_to_paths(spec: SplineMotionSpec, paths: Paths) -> Guess:
-    """Each path by its own least squares, in closed form."""
+    """Each path by its own least squares (equation 6), in closed form."""
     weights = np.stack(
         [time_knots.spline_weights(spec.knots, jnp.asarray(t)) for t in paths.times]
     )

@@ -1,11 +1,11 @@
 """Gaussians that are there for a part of the film only.
 
-The temporal opacity of Spacetime Gaussians (Li et al. 2024, arXiv:2312.16812) by
-itself, beside any motion: what turns its back on the camera need not be the same
-Gaussians as what it shows then, and a track that is lost need not be found again. One
-that was lifted from a moving pixel is first seen around the time of that picture, for
-about as long as tracks there were followed; any other one all the time, until training
-finds a time for it.
+The temporal opacity of Spacetime Gaussians (Li et al. 2024, arXiv:2312.16812, equation
+7 as readers quote it: the text was not at hand) by itself, beside any motion: what
+turns its back on the camera need not be the same Gaussians as what it shows then, and a
+track that is lost need not be found again. One that was lifted from a moving pixel is
+first seen around the time of that picture, for about as long as tracks there were
+followed; any other one all the time, until training finds a time for it.
 """
 
 import dataclasses
@@ -55,8 +55,9 @@ def visible_share(
 ) -> Float[Array, "*gaussians"]:
     """exp(-(s / w)^2) of a time s from the middle, w = exp(`log_width`), in films.
 
-    Finite with its slopes whatever the width: the published exponential of a width that
-    is not held is 0/0 at s = 0 once the width has underflowed.
+    As in the paper's code; the paper writes exp(-c s^2), and c is 1 / w^2. Finite with
+    its slopes whatever the width: the published exponential of a width that is not held
+    is 0/0 at s = 0 once the width has underflowed.
     """
     held = jnp.clip(log_width, *LOG_WIDTH_RANGE)
     return jnp.exp(-jnp.square(since * jnp.exp(-held)))

@@ -4,9 +4,12 @@ DynMF (Kratimenos et al. 2024, arXiv:2312.00112): a tiny network of the time alo
 K trajectories b_k(t), a Gaussian keeps K coefficients c_k, and is at p + sum_k c_k
 b_k(t). The factorisation of all paths into K is that of a singular value decomposition,
 so a scene of few bodies needs few. Like the paper, one coefficient stands for all parts
-of a trajectory, here a shift and a turn; coefficients are sparse (`sparsity`) and
-alike among neighbours (`effects.neighbours`). A Gaussian whose coefficients are zero
-does not move, exactly.
+of a trajectory, here a shift and a turn; coefficients are sparse (`sparsity`) and alike
+among neighbours (`effects.neighbours`). A Gaussian whose coefficients are zero does not
+move, exactly, and so all start.
+
+The paper's equations were not at hand, only its abstract and accounts of its method,
+and its repository (agelosk/dynmf) holds no code: these are followed, without numbers.
 """
 
 import dataclasses
@@ -138,10 +141,10 @@ def sparsity(
 ) -> Float[Array, ""]:
     """Mean over the active rows of sum_k |c_k| / max_k |c_k|: how many are in use.
 
-    The sparsity term of DynMF. It does not see how far a Gaussian moves, only along how
-    many trajectories: from one, where a single coefficient is not zero, to K. The
-    published quotient is 0/0 for a Gaussian at rest; with `REST` added to its
-    denominator it falls to zero there, and its slope is at most K / REST.
+    The sparsity term of DynMF, as accounts have it. It does not see how far a Gaussian
+    moves, only along how many trajectories: from one, where a single coefficient is not
+    zero, to K. The plain quotient is 0/0 for a Gaussian at rest; with `REST` added to
+    its denominator it falls to zero there, and its slope is at most K / REST.
     """
     # Not `abs`, whose slope at zero is one: all that rests would be pushed one way.
     size = coefficients * jnp.sign(coefficients)

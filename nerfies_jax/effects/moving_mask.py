@@ -1,9 +1,10 @@
 """A mask of what moves, learnt for every point, which guides warp and slice.
 
-Yan, Li and Lee 2023 (NeRF-DS), arXiv:2303.14435, "mask guided deformation field": where
-colours change as a mirror moves, they cannot say what corresponds. A network says of
-each observed point and moment how surely it moves; the warp and the ambient slice read
-that beside their code; and masks of the pictures teach it.
+Yan, Li and Lee 2023 (NeRF-DS), arXiv:2303.14435, its mask that guides the deformation
+field. The text with its equations was not at hand; its code (JokerYan/NeRF-DS) is
+followed. Where colours change as a mirror moves, they cannot say what corresponds. A
+network says of each observed point and moment how surely it moves; the warp and the
+ambient slice read that beside their code; and masks of the pictures teach it.
 """
 
 import dataclasses

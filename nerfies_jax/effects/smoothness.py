@@ -1,9 +1,10 @@
 """Smooth grids and planes: features of neighbours may not differ for nothing.
 
 The total variation that Fang et al. 2022 (TiNeuVox), arXiv:2205.15285, put on their
-voxel grid for real captures. Their code descends a Huber cost of every difference; here
-it is the mean of their squares, as in K-Planes and HexPlane. Of a hashed grid some
-vertices are drawn in every step.
+voxel grid for real captures. Their text was not at hand. Their code (hustvl/TiNeuVox)
+descends a Huber cost of every difference; here it is the mean of their squares, as in
+K-Planes (arXiv:2301.10241, equation 3). Of a hashed grid some vertices are drawn in
+every step.
 """
 
 import dataclasses

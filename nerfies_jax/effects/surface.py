@@ -1,7 +1,8 @@
 """Colour that knows where its surface is, and how it lies, at the moment.
 
-Yan, Li and Lee 2023 (NeRF-DS), arXiv:2303.14435, "surface-aware dynamic NeRF": a mirror
-that moves shows other things, so colour reads the observed point and the normal there,
+Yan, Li and Lee 2023 (NeRF-DS), arXiv:2303.14435, its surface-aware NeRF. The text with
+its equations was not at hand; its code (JokerYan/NeRF-DS) is followed. A mirror that
+moves shows other things, so colour reads the observed point and the normal there,
 beside the view direction. A head of the template says the normal in the template; the
 warp turns it to where it is observed. It learns from the slope of the density, and may
 not face away from the camera.

@@ -1,6 +1,7 @@
 """TiNeuVox's motion: a small network shifts points by an embedding of the time.
 
-Fang et al. 2022, arXiv:2205.15285, "coordinate deformation" and "radiance network": a
+Fang et al. 2022, arXiv:2205.15285, "coordinate deformation" and "radiance network". The
+text with its equations was not at hand; its code (hustvl/TiNeuVox) is followed: a
 network embeds the encoded time; another, small one reads the embedding and the encoded
 point and answers the shift to the template. The radiance network reads the embedding
 and the encoded point as it was observed, too, and so makes up for what so small a
@@ -28,7 +29,8 @@ class TimeWarpSpec:
     """Sizes; the defaults are those of the paper's larger model, by its code.
 
     `embedding` is the width of what is made of the time, through one hidden layer of
-    `width`; the shift has `depth` of them.
+    `width`; the shift has `depth` of them. It starts near zero, where the code's starts
+    as any layer.
     """
 
     position: EncodingSpec = EncodingSpec(10)

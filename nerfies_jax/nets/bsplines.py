@@ -1,4 +1,10 @@
-"""B-splines on evenly spaced knots, in closed form."""
+"""B-splines on evenly spaced knots, in closed form.
+
+What a KAN's functions are made of: the B_i of Liu et al. 2024 (KAN), arXiv:2404.19756,
+section 2.2 (equation 2.12), and B_i,3 of Sonata, equation 4. Neither prints them; KAN's
+code (KindXiaoming/pykan) has the recursion of Cox and de Boor, whose closed form this
+is. There knots follow what comes in; here they are even and stay (`nets.kan`).
+"""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float

@@ -1,8 +1,10 @@
 """What learnt numbers cost to keep: bits under a normal law, noise for rounding.
 
-Balle et al. 2017, "End-to-end optimized image compression", arXiv:1611.01704: what is
-kept is rounded to a step, and while it is trained noise as wide as the step stands in
-for that. The bits are those of an ideal coder that knows the law.
+Balle et al. 2017, "End-to-end optimized image compression", arXiv:1611.01704, section
+3: what is kept is rounded to a step, and while it is trained noise as wide as the step
+stands in for that. The bits are those of an ideal coder that knows the law, which is
+normal as in Balle et al. 2018, arXiv:1802.01436 (equations 7 and 11), but with a mean
+and a step, which are zero and one there; in 2017 it is piecewise linear.
 """
 
 import math
@@ -20,7 +22,10 @@ FLAT = 0.002  # standard deviations: a law is a parabola over a step below it
 
 
 def noisy(key: Key[Array, ""], values: Numbers, step: Numbers) -> Numbers:
-    """Values as far off as rounding could take them: even noise, one step wide."""
+    """Values as far off as rounding could take them: even noise, one step wide.
+
+    Equation 4 of Balle et al. 2018.
+    """
     noise = jax.random.uniform(key, values.shape, jnp.float32, -0.5, 0.5)
     return values + noise.astype(values.dtype) * step
 
@@ -33,9 +38,10 @@ def rounded(values: Numbers, mean: Numbers, step: Numbers) -> Numbers:
 def bits(values: Numbers, mean: Numbers, log_scale: Numbers, step: Numbers) -> Numbers:
     """-log2 of the share of a normal law that lies within half a step of each value.
 
-    Both ends are taken on the side of the law where shares are small, as logarithms: as
-    a difference of shares float32 has 0, and so infinitely many bits, from 5.5 standard
-    deviations on. `step` is positive.
+    Equation 11 of Balle et al. 2018, which prints the share. Both ends are taken on the
+    side of the law where shares are small, as logarithms: as a difference of shares
+    float32 has 0, and so infinitely many bits, from 5.5 standard deviations on. `step`
+    is positive.
     """
     scale = jnp.exp(jnp.clip(log_scale, *LOG_RANGE))
     # By the size of the distance, whose slope at zero is zero as the answer's is.

@@ -1,9 +1,12 @@
 """Features of a point from one dense grid, read at several distances.
 
-Fang et al. 2022 (TiNeuVox), arXiv:2205.15285, "multi-distance interpolation": the grid
-is read between its own vertices, between every second and between every fourth, so that
-one sample trains vertices far enough away to learn from points that a small network
-moves. The three share one table, whose size is that of the finest.
+Fang et al. 2022 (TiNeuVox), arXiv:2205.15285, "multi-distance interpolation". The text
+with its equations was not at hand; its code (hustvl/TiNeuVox, `mult_dist_interp`) is
+followed: the grid is read between its own vertices, between every second and between
+every fourth, so that one sample trains vertices far enough away to learn from points
+that a small network moves. The three share one table, whose size is that of the finest,
+and which has it from the first step: the code's grid grows, here strides may open one
+after the other (`encode`).
 """
 
 import dataclasses
