@@ -8,7 +8,7 @@ each goes in the next camera's picture between the two moments, with the ellipse
 is drawn as, blended as its colour is (equations 10 to 14). A Gaussian's flow is linear
 in the pixel, so that six channels are exact for all pixels.
 
-The paper also masks out what is at rest; here all flow that is known counts. In which
+The paper also masks out what is at rest, as `FlowSpec.moving_only` does. In which
 camera the Gaussians flow it says twice and differently (section 4.2: the next, the end
 of A.1: the first); here footprints move in the picture of the next, and are met at the
 pixels of the first.
@@ -47,7 +47,8 @@ class FlowSpec:
     Weight and form are the paper's code's: absolute differences of flows in units of
     the picture's sides, each held to one side; 0.5 is for NeRF-DS, and for HyperNeRF
     the paper has 0.1. `opaque` is the least opacity of a pixel that is compared, where
-    flow is known as well; there all are.
+    flow is known as well; there all are. With `moving_only` those are compared alone
+    that a capture's masks mark as moving (all where it has none).
 
     As there, neither the weights of the blending nor the depth get a slope. Otherwise
     than there, both ends of a Gaussian's way get one: with the first held still, the
@@ -60,6 +61,7 @@ class FlowSpec:
     weight: float = 0.5
     start: int = steps(3000)
     opaque: float = 0.5
+    moving_only: bool = True
 
     def __post_init__(self):
         if not (math.isfinite(self.weight) and self.weight >= 0):
@@ -83,10 +85,11 @@ class Drawn(NamedTuple):
 
 def effect(spec: FlowSpec, picture: RasterSpec) -> Effect:
     """The seams of `spec`; a capture without flow has no term."""
+    reads = {"flow", "moving"} if spec.moving_only else {"flow"}
     return Effect(
         NAME,
         penalty=functools.partial(penalty, spec, picture),
-        required_data=frozenset({"flow"}),
+        required_data=frozenset(reads),
     )
 
 
@@ -127,6 +130,8 @@ def compared(
     seen = frames.flow.forward_seen[row] & (drawn.share >= spec.opaque)
     if context.observation.valid is not None:
         seen = seen & context.observation.valid
+    if spec.moving_only and frames.moving is not None:
+        seen = seen & frames.moving[row]
     things = shift - camera_flow(pair, drawn.depth)
     return error(drawn.flow, things, seen), jnp.mean(seen.astype(shift.dtype))
 

@@ -279,9 +279,11 @@ SCENE = dataclasses.replace(scenes.TINY_DEFORMABLE, flow=FlowSpec(start=3))
 def test_a_penalty_compares_frames_with_the_next_and_begins_at_its_start():
     capture = scenes.tiny_capture()
     model = scene.build(SCENE, scene.metadata_of(capture))
-    assert "flow" in model.required_data
+    assert {"flow", "moving"} <= model.required_data
     frames = frames_of(capture, model.required_data)
     effect = motion_flow.effect(SCENE.flow, GSPLAT)
+    unmasked = dataclasses.replace(SCENE.flow, moving_only=False)
+    assert motion_flow.effect(unmasked, GSPLAT).required_data == {"flow"}
     state = model.init(capture, jax.random.key(0))
 
     def still(params, time):
@@ -294,11 +296,23 @@ def test_a_penalty_compares_frames_with_the_next_and_begins_at_its_start():
         )
         return effect.penalty(None, context)
 
-    early, late = (jax.jit(terms)(jnp.int32(step), frames, 1) for step in (2, 3))
+    everywhere = frames._replace(moving=None)
+    early, late = (jax.jit(terms)(jnp.int32(step), everywhere, 1) for step in (2, 3))
     assert early["error"].value == 0
     assert late["error"].value > 0
     assert late["error"].weight == 0.5
     assert 0 < late["known"].value <= 1
+    # Of what moves alone: every other column and the rest make up the whole.
+    some = np.arange(frames.images.shape[2]) % 2 == np.zeros(frames.images.shape[:3])
+    halves = [
+        jax.jit(terms)(jnp.int32(3), frames._replace(moving=half), 1)
+        for half in (some, ~some)
+    ]
+    sums = [half["known"].value * half["error"].value for half in halves]
+    assert 0 < min(half["known"].value for half in halves) < late["known"].value
+    np.testing.assert_allclose(
+        sum(sums), late["known"].value * late["error"].value, rtol=1e-5
+    )
     # Of a frame without a next one nothing is seen.
     last = int(
         np.argmax(np.asarray(frames.flow.next_row) == np.arange(len(frames.times)))
@@ -313,7 +327,9 @@ def test_a_penalty_compares_frames_with_the_next_and_begins_at_its_start():
 def test_a_step_with_flow_moves_its_own_camera_and_the_next_one_alone():
     capture = scenes.tiny_capture()
     spec = dataclasses.replace(
-        SCENE, flow=FlowSpec(start=0), poses=PoseRefinementSpec(2e-3, 2e-4)
+        SCENE,
+        flow=FlowSpec(start=0, moving_only=False),
+        poses=PoseRefinementSpec(2e-3, 2e-4),
     )
     model = scene.build(spec, scene.metadata_of(capture))
     state = model.init(capture, jax.random.key(0))
