@@ -97,7 +97,12 @@ def share(
     """How surely an observed point moves, in (0, 1)."""
     encoded = encoding.encode(spec.position, point, None)
     inputs = jnp.concatenate([encoded, condition.codes[spec.table]])
-    return jax.nn.sigmoid(mlp.apply(network(spec), params, inputs)["logit"][0])
+    logit = mlp.apply(network(spec), params, inputs)["logit"][0]
+    # By what is left to one: the slope of a sigmoid near one rounds to zero, and what
+    # is wrong for sure would stay so.
+    moves = logit > 0
+    rest = jax.nn.sigmoid(jnp.where(moves, -logit, logit))
+    return jnp.where(moves, 1 - rest, rest)
 
 
 def penalty(

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
+import scipy.special
 
 from nerfies_jax import field_ray, scene
 from nerfies_jax.effects import moving_mask, surface
@@ -248,6 +249,25 @@ def test_the_mask_s_error_is_that_of_a_loop(dtype, rng):
     ]
     np.testing.assert_allclose(error, np.mean(terms), rtol=1e-5)
     assert difference(shares, level, moves, np.zeros(5, bool)) == 0
+
+
+@pytest.mark.hard_cases
+def test_a_mask_that_is_wrong_for_sure_keeps_a_slope(dtype):
+    logit = np.array([-1e4, -80.0, -20.0, 0.0, 20.0, 80.0, 1e4])
+    net = jax.tree.map(lambda x: 0 * x, params_of(dtype)["mask"])
+    when = FrameCondition(None, {"motion": jnp.zeros(3, dtype)}, None)
+
+    def share(bias):
+        heads = {"logit": net.heads["logit"]._replace(bias=bias[None])}
+        point = jnp.zeros(3, dtype)
+        return moving_mask.share(SPEC.mask, net._replace(heads=heads), point, when)
+
+    both = jax.jit(jax.vmap(jax.value_and_grad(share)))
+    value, slope = both(jnp.asarray(logit, dtype))
+    rtol = {"float32": 1e-6, "float64": 1e-14}[dtype]
+    of_it, of_rest = scipy.special.expit(logit), scipy.special.expit(-logit)
+    np.testing.assert_allclose(value, of_it, rtol=rtol)
+    np.testing.assert_allclose(slope, of_it * of_rest, rtol=rtol)
 
 
 UNITS = [(0.0, 0.0, 0.0), (3e-30, -4e-30, 0.0), (3e30, 0.0, -4e30), (0.6, 0.0, 0.8)]
