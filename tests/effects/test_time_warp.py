@@ -52,16 +52,17 @@ def test_shift_and_features_are_those_of_the_layers(time, dtype, rng):
 
 
 @pytest.mark.hard_cases
-def test_it_starts_as_the_identity_and_does_not_stay_there(rng):
+def test_it_starts_as_the_identity_and_does_not_stay_there(dtype, rng):
     spec = TimeWarpSpec()
-    points = rng.uniform(-1, 1, (300, 3)).astype(np.float32)
+    points = rng.uniform(-1, 1, (300, 3)).astype(dtype)
     moved = jax.vmap(functools.partial(time_warp.displace, spec), (None, 0, None))
 
     def total(params):
-        shift = moved(params, points, at(0.4, "float32"))
+        shift = moved(params, points, at(0.4, dtype))
         return jnp.sum(shift**2), jnp.max(jnp.abs(shift))
 
-    start = jax.jit(time_warp.init, static_argnums=0)(spec, jax.random.key(0))
+    init = jax.jit(time_warp.init, static_argnums=(0, 2))
+    start = init(spec, jax.random.key(0), jnp.dtype(dtype))
     slopes, longest = jax.jit(jax.grad(total, has_aux=True))(start)
     assert 0 < longest < 1e-4
     assert all(np.any(leaf != 0) for leaf in jax.tree.leaves(slopes.shift.heads))

@@ -79,11 +79,11 @@ def test_gradients_match_central_differences(contract, float64):
     assert gradients.directional_error(total, table, point) < 1e-7
 
 
-def test_a_grid_starts_as_nothing_and_learns(rng):
-    (table,) = tables = voxels.init(SPEC)
+def test_a_grid_starts_as_nothing_and_learns(dtype, rng):
+    (table,) = tables = voxels.init(SPEC, dtype=dtype)
     assert table.shape == (9**3, 2)
     assert not table.any()
-    point = jnp.asarray(rng.uniform(-1, 1, 3), "float32")
+    point = jnp.asarray(rng.uniform(-1, 1, 3), dtype)
     slopes = jax.grad(lambda t: jnp.sum(voxels.encode(SPEC, t, point)))(tables)
     assert np.abs(slopes[0]).max() > 0.1
 
