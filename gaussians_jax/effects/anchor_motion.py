@@ -44,6 +44,7 @@ from gaussians_jax.effects.anchors import (
     kept,
     made,
     noised,
+    residual_width,
 )
 from gaussians_jax.effects.blocks import in_blocks
 from gaussians_jax.effects.carried import Carried
@@ -223,7 +224,7 @@ def penalty(
     """Bits of a number of the features, on the mean; none before rounding starts."""
     scene = context.params
     active = splats.active_mask(scene.rows["splats"])
-    numbers = spec.reference + spec.count * spec.residual
+    numbers = spec.reference + spec.count * residual_width(spec)
 
     def evaluate(scene):
         features = features_of(spec, scene, context.condition)
@@ -252,7 +253,8 @@ def effect(spec: AnchorMotionSpec, run_steps: int, frames: int) -> Effect:
     law = None if spec.rate is None else falling(spec.rate, "learning_rate")
 
     def rates(step):
-        moving, of_law = move(step), None if law is None else law(step)
+        moving = move(step) if spec.moves else None
+        of_law = None if law is None else law(step)
         return Anchors(moving, make(step), moving, moving, of_law)
 
     return Effect(

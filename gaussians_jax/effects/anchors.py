@@ -53,8 +53,8 @@ class AnchorMotionSpec:
     """Sizes and schedules; those of ADC-GS's code for all of HyperNeRF's films.
 
     Features start as normal draws of deviation `spread`, where the code has zeros, and
-    what is carried `first_scale` as large as its anchor. `moves` switches coarse and
-    fine motion off, which leaves what is carried at rest.
+    what is carried `first_scale` as large as its anchor. Without `moves` there is
+    neither coarse nor fine motion, nor what they would read: what is carried rests.
     """
 
     count: int = 10  # Gaussians of an anchor
@@ -102,7 +102,7 @@ class Features(NamedTuple):
     """The rows: what an anchor and what each it carries is made of."""
 
     reference: Float[Array, "anchors reference"]
-    residual: Float[Array, "anchors carried residual"]
+    residual: Float[Array, "anchors carried residual"]  # half of it without motion
 
 
 class Law(NamedTuple):
@@ -118,11 +118,16 @@ class Law(NamedTuple):
 class Anchors(NamedTuple):
     """Parameters that all anchors share."""
 
-    times: Float[Array, "moments code"]  # evenly over [0, 1]
+    times: Float[Array, "moments code"] | None  # evenly over [0, 1]
     make: MLP
-    coarse: MLP
-    fine: MLP
+    coarse: MLP | None  # None, as `times` and `fine`, where nothing moves
+    fine: MLP | None
     law: Law | None
+
+
+def residual_width(spec: AnchorMotionSpec) -> int:
+    """Residual features of one: without motion, only those that it is made of."""
+    return spec.residual if spec.moves else spec.residual // 2
 
 
 def make_spec(spec: AnchorMotionSpec) -> MLPSpec:
@@ -155,7 +160,7 @@ def _moving_spec(spec, reads):
 
 def context_spec(spec: AnchorMotionSpec) -> MLPSpec:
     """From a reference feature to the law of the residual ones of its anchor."""
-    each = spec.count * spec.residual
+    each = spec.count * residual_width(spec)
     heads = (("mean", HeadSpec(each, "zero")), ("log_scale", HeadSpec(each, "zero")))
     return MLPSpec(spec.reference, 1, spec.rate.width, heads, (), "relu", "he")
 
@@ -169,7 +174,8 @@ def init_features(
         jax.random.normal(one, shape, jnp.float32)
         for one, shape in zip(jax.random.split(key), shapes, strict=True)
     )
-    return Features(*(spec.spread * one.astype(dtype) for one in drawn))
+    first, others = (spec.spread * one.astype(dtype) for one in drawn)
+    return Features(first, others[..., : residual_width(spec)])
 
 
 def init(
@@ -177,15 +183,19 @@ def init(
 ) -> Anchors:
     """Networks that move nothing yet, for a capture of `frames` to learn from."""
     times_key, make_key, coarse_key, fine_key, law_key = jax.random.split(key, 5)
+    make = mlp.init(make_spec(spec), make_key, dtype)
+    law = None if spec.rate is None else _init_law(law_key, spec, dtype)
+    if not spec.moves:
+        return Anchors(None, make, None, None, law)
     table = KanMotionSpec(
         time_code=spec.time_code, frames_per_code=spec.frames_per_code, spread=0.5
     )
     return Anchors(
         motion_codes.init_times(times_key, table, frames, dtype),
-        mlp.init(make_spec(spec), make_key, dtype),
+        make,
         mlp.init(coarse_spec(spec), coarse_key, dtype),
         mlp.init(fine_spec(spec), fine_key, dtype),
-        None if spec.rate is None else _init_law(law_key, spec, dtype),
+        law,
     )
 
 
@@ -199,7 +209,7 @@ def _init_law(key, spec, dtype):
         mean=jnp.zeros(spec.reference, dtype),
         log_scale=jnp.full(spec.reference, wide, dtype),
         log_step=jnp.full(spec.reference, first, dtype),
-        residual_log_step=jnp.full(spec.residual, first, dtype),
+        residual_log_step=jnp.full(residual_width(spec), first, dtype),
         context=context,
     )
 
@@ -209,9 +219,12 @@ def law_of_residual(
 ) -> tuple[
     Float[Array, "anchors carried residual"], Float[Array, "anchors carried residual"]
 ]:
-    """Means and logarithms of deviations of the residual features."""
+    """Means and logarithms of deviations of the residual features.
+
+    As many as the law has: what was trained to move may be drawn without.
+    """
     made = mlp.apply(context_spec(spec), law.context, reference)
-    shape = (len(reference), spec.count, spec.residual)
+    shape = (len(reference), spec.count, len(law.residual_log_step))
     return made["mean"].reshape(shape), made["log_scale"].reshape(shape)
 
 
