@@ -44,7 +44,8 @@ class EmbeddingMotionSpec:
     in over a thousand steps, and learns how late a camera is. `smoothness` weighs the
     mean square of second differences between codes that follow each other, which the
     code means and misses by an index. `opacity` weighs the mean opacity, in the place
-    of resets; the code takes the sigmoid of the mean logit.
+    of resets; the code takes the sigmoid of the mean logit. A weight of zero leaves its
+    term out.
     """
 
     embedding: int = 32
@@ -212,7 +213,7 @@ def effect(spec: EmbeddingMotionSpec, steps: int, frames: int) -> Effect:
         warm_up=spec.warm_up,
         prepare=prepared,
         deform=moved,
-        penalty=penalty,
+        penalty=penalty if motion_codes.has_penalty(spec) else None,
         revise=functools.partial(motion_codes.revised, spec),
         revise_at=motion_codes.growth_steps(spec, count),
     )

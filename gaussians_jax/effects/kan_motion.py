@@ -68,8 +68,10 @@ class KanMotionSpec:
     # Of so many rows of the table one stays for a coarse network; None: there is none.
     coarser: int | None = None
     grow_until: int = steps(10_000)  # when the fine network beside it reads all rows
-    smoothness: float = 0.0  # weight of `motion_codes.second_differences`
-    opacity: float = 0.0  # weight of the mean opacity, in the place of resets
+    # Weights, of which zero leaves the term out: of `motion_codes.second_differences`,
+    # and of the mean opacity, in the place of resets.
+    smoothness: float = 0.0
+    opacity: float = 0.0
     warm_up: int = steps(0)  # steps without motion
     embedding_rate: float = 2.5e-3
     learning_rate: float = 1.6e-4  # of network and time codes
@@ -214,17 +216,15 @@ def init(
     key: Key[Array, ""], spec: KanMotionSpec, frames: int, dtype=jnp.float32
 ) -> KanMotion:
     """A field that moves nothing yet, for a capture of `frames` to learn from."""
-    times_key, field_key = jax.random.split(key)
+    times_key, field_key, coarse_key = jax.random.split(key, 3)
     times = motion_codes.init_times(times_key, spec, frames, dtype)
     network = field_spec(spec)
     init_field = kan.init if isinstance(network, KANSpec) else mlp.init
+    field = init_field(network, field_key, dtype)
     if spec.coarser is None:
-        return KanMotion(times, init_field(network, field_key, dtype))
-    fine, coarse = (
-        init_field(network, one, dtype) for one in jax.random.split(field_key)
-    )
+        return KanMotion(times, field)
     rows = jnp.full(1, motion_codes.fine_rows(spec, len(times), 0), dtype)
-    return KanMotion(times, fine, rows, coarse)
+    return KanMotion(times, field, rows, init_field(network, coarse_key, dtype))
 
 
 def prepare(
@@ -365,7 +365,7 @@ def effect(spec: KanMotionSpec, steps: int, frames: int) -> Effect:
         warm_up=spec.warm_up,
         prepare=prepared,
         deform=moved,
-        penalty=penalty if spec.smoothness or spec.opacity else None,
+        penalty=penalty if motion_codes.has_penalty(spec) else None,
         revise=functools.partial(motion_codes.revised, spec) if grows else None,
         revise_at=motion_codes.growth_steps(spec, count) if grows else (),
     )

@@ -54,11 +54,11 @@ class Codes(Protocol):
 
     @property
     def smoothness(self) -> float:
-        """Weight of `second_differences`."""
+        """Weight of `second_differences`; 0 leaves it out."""
 
     @property
     def opacity(self) -> float:
-        """Weight of `mean_opacity`."""
+        """Weight of `mean_opacity`; 0 leaves it out."""
 
     @property
     def warm_up(self) -> int:
@@ -177,13 +177,22 @@ def mean_opacity(params: Params) -> Float[Array, ""]:
     return jnp.sum(opacity) / jnp.maximum(jnp.sum(active), 1).astype(opacity.dtype)
 
 
+def has_penalty(spec: Codes) -> bool:
+    """Whether `penalty` has a term."""
+    return spec.smoothness > 0 or spec.opacity > 0
+
+
 def penalty(
     spec: Codes, times: Float[Array, "moments code"], context: PenaltyContext
 ) -> dict[str, Term]:
-    """`smoothness`, which codes wait for their motion with, and `opacity`."""
-    bend = {"smoothness": Term(second_differences(times), spec.smoothness)}
-    opacity = mean_opacity(context.params)
-    return {
-        **from_step(spec.warm_up, context.step, bend),
-        "opacity": Term(opacity, spec.opacity),
-    }
+    """`smoothness`, which codes wait for their motion with, and `opacity`.
+
+    A term of weight zero is not computed.
+    """
+    terms = {}
+    if spec.smoothness > 0:
+        bend = {"smoothness": Term(second_differences(times), spec.smoothness)}
+        terms |= from_step(spec.warm_up, context.step, bend)
+    if spec.opacity > 0:
+        terms["opacity"] = Term(mean_opacity(context.params), spec.opacity)
+    return terms

@@ -74,7 +74,8 @@ class MaskSpec:
     feature; its kernel and loss were not at hand. Sizes and weights are our choice.
     """
 
-    sparsity: float = 3e-3  # weight of the mean of the logistic function of the mask
+    # Weight of the mean of the logistic function of the mask; 0 leaves it out.
+    sparsity: float = 3e-3
     rate: float = 1e-2  # of the mask's number
     moving: float = 2.0  # where it starts: 96 % open
     still: float = -1.0  # of a node at rest, where tracks tell: 22 % open
@@ -118,9 +119,9 @@ class NodeMotionSpec:
         for name in ("nodes", "near", "links"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}={getattr(self, name)} must be at least 1")
-        if self.rigidity is not None and not 0 <= self.rigidity < math.inf:
+        if self.rigidity is not None and not 0 < self.rigidity < math.inf:
             raise ValueError(
-                f"rigidity={self.rigidity} is a weight, finite and not negative; None "
+                f"rigidity={self.rigidity} is a weight, finite and positive; None "
                 "leaves it out"
             )
         if not 0 < self.moving_share <= 1:
@@ -319,6 +320,8 @@ def effect(spec: NodeMotionSpec, run_steps: int, extent: float) -> Effect:
     """
     rate = schedules.log_linear(spec.learning_rate, spec.learning_rate_end, run_steps)
 
+    priced = spec.mask is not None and spec.mask.sparsity > 0
+
     def rates(step):
         now = rate(step)
         share = now / spec.learning_rate
@@ -352,7 +355,7 @@ def effect(spec: NodeMotionSpec, run_steps: int, extent: float) -> Effect:
             times = time, jax.random.uniform(context.key, (), time.dtype)
             value = arap_loss(nodes, spec, extent, context.state.links, times)
             terms["unrigidity"] = Term(value, spec.rigidity)
-        if spec.mask is not None:
+        if priced:
             used = jnp.mean(jax.nn.sigmoid(nodes.mask))
             terms["moving"] = Term(used, spec.mask.sparsity)
         return from_step(spec.warm_up, context.step, terms)
@@ -362,7 +365,7 @@ def effect(spec: NodeMotionSpec, run_steps: int, extent: float) -> Effect:
         init=lambda key: init(key, spec),
         place=place,
         learning_rate=rates,
-        penalty=None if spec.rigidity is None and spec.mask is None else penalty,
+        penalty=None if spec.rigidity is None and not priced else penalty,
         warm_up=spec.warm_up,
         prepare=prepared,
         deform=moved,

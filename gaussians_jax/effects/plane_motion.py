@@ -42,7 +42,7 @@ class PlaneMotionSpec:
     """Planes, network, and what keeps the planes smooth; sizes as for HyperNeRF scenes.
 
     Rates of planes do not depend on the scene's unit, heads answer in its extents.
-    Weights are of the sums over planes and levels.
+    Weights are of the sums over planes and levels; zero leaves a term out.
     """
 
     planes: PlanesSpec = PlanesSpec(moments=150)
@@ -147,13 +147,21 @@ def offsets(
 
 
 def smoothness(spec: PlaneMotionSpec, levels: tuple[Level, ...]) -> dict[str, Term]:
-    """Total variation in space, steadiness in time, and how far time is from one."""
+    """Total variation in space, steadiness in time, and how far time is from one.
+
+    A term of weight zero is not computed.
+    """
     space = [plane for level in levels for plane in level.space]
     time = [plane for level in levels for plane in level.time]
+    asked = {
+        "variation": (planes.total_variation, space, spec.variation),
+        "bend": (planes.time_smoothness, time, spec.bend),
+        "unrest": (planes.l1_time_planes, time, spec.unrest),
+    }
     return {
-        "variation": Term(sum(map(planes.total_variation, space)), spec.variation),
-        "bend": Term(sum(map(planes.time_smoothness, time)), spec.bend),
-        "unrest": Term(sum(map(planes.l1_time_planes, time)), spec.unrest),
+        name: Term(sum(map(of_one, every)), weight)
+        for name, (of_one, every, weight) in asked.items()
+        if weight > 0
     }
 
 

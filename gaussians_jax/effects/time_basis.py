@@ -67,9 +67,9 @@ class TimeBasisSpec:
             raise ValueError(
                 f"count={self.count}: a time basis has at least one trajectory"
             )
-        if self.sparsity is not None and not 0 <= self.sparsity < math.inf:
+        if self.sparsity is not None and not 0 < self.sparsity < math.inf:
             raise ValueError(
-                f"sparsity={self.sparsity} is a weight, finite and not negative; None "
+                f"sparsity={self.sparsity} is a weight, finite and positive; None "
                 "leaves it out"
             )
         if self.warm_up < 0:

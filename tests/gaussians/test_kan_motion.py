@@ -87,11 +87,16 @@ def test_two_networks_have_an_event_and_prices_and_one_has_neither():
     assert effect.revise(own, 60).rows == 4
     assert effect.revise_at == (50, 100)
     scene = Params({"splats": rows_of(some_gaussians(3, np.float32), np.zeros(3))}, {})
-    terms = effect.penalty(own, PenaltyContext(None, None, None, scene))
+    context = PenaltyContext(None, None, None, scene)
+    terms = effect.penalty(own, context)
     np.testing.assert_allclose(terms["opacity"].value, 0.5, rtol=1e-6)
     bend = np.diff(own.times, 2, axis=0)
     np.testing.assert_allclose(terms["smoothness"].value, np.mean(bend**2), rtol=1e-5)
     assert (terms["smoothness"].weight, terms["opacity"].weight) == (0.5, 0.25)
+    for name in terms:
+        less = dataclasses.replace(spec, **{name: 0.0})
+        rest = kan_motion.effect(less, 1000, FRAMES).penalty(own, context)
+        assert rest.keys() == terms.keys() - {name}
     plain = kan_motion.effect(SMALL, 1000, FRAMES)
     assert (plain.penalty, plain.revise, plain.revise_at) == (None, None, ())
     assert len(jax.tree.leaves(plain.init(jax.random.key(0)))) < len(

@@ -427,7 +427,7 @@ def test_a_mask_that_is_decided_is_exact_and_has_finite_slopes(far, dtype):
         ({"sparsity": -1.0}, "sparsity=-1.0 is finite"),
         ({"nodes": 0}, "nodes=0 must be at least 1"),
         ({"near": 0}, "near=0 must be at least 1"),
-        ({"rigidity": -1.0}, "None leaves it out"),
+        ({"rigidity": 0.0}, "None leaves it out"),
         ({"moving_share": 0.0}, "must lie in"),
         ({"warm_up": -1}, "must not be negative"),
         ({"radius_rate": -1.0}, "finite and not negative"),
@@ -448,3 +448,5 @@ def test_without_rigidity_and_mask_nothing_is_found_for_them_and_nothing_costs()
     state = motion.state(params_of(some_gaussians(ROWS, "float32"), "float32"))
     assert state.links is None
     assert state.moving is None
+    free = dataclasses.replace(MASKED, mask=MaskSpec(sparsity=0.0))
+    assert node_motion.effect(free, 100, EXTENT).penalty is None

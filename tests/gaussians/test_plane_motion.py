@@ -117,6 +117,9 @@ def test_what_is_kept_smooth_is_what_the_weights_say(float64):
             motion._replace(planes=(rest, *motion.planes[1:])), MOTION.warm_up
         )
         assert less[name].value < terms[name].value
+        off = dataclasses.replace(MOTION, **{name: 0.0})
+        rest = plane_motion.smoothness(off, motion.planes)
+        assert rest.keys() == terms.keys() - {name}
     # Before it moves anything, nothing else would train it, to planes that are even.
     early = penalty(motion, MOTION.warm_up - 1)
     assert {float(term.weight) for term in early.values()} == {0.0}

@@ -240,7 +240,7 @@ def test_a_path_seen_once_stays_there_and_one_seen_never_is_finite():
     ("make", "words"),
     [
         (lambda: TimeBasisSpec(count=0), "at least one trajectory"),
-        (lambda: TimeBasisSpec(sparsity=-1.0), "None leaves it out"),
+        (lambda: TimeBasisSpec(sparsity=0.0), "None leaves it out"),
         (lambda: TimeBasisSpec(warm_up=-1), "must not be negative"),
         (lambda: TimeBasisSpec(coefficient_rate=1e-9), "the rate falls"),
         (lambda: TimeBasisSpec(width=0), "width >= 1"),
