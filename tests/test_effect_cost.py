@@ -10,6 +10,7 @@ the same text, and a compiler that gets the same text makes the same program.
 
 import dataclasses
 import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +19,15 @@ import pytest
 
 from gaussians_jax import presets as splat_presets
 from gaussians_jax import scene as splat_scene
-from gaussians_jax.effects import carried
+from gaussians_jax.effects import (
+    anchor_motion,
+    carried,
+    motion_codes,
+    node_motion,
+    skinning,
+    temporal_opacity,
+    time_basis,
+)
 from gaussians_jax.effects.exposure import ExposureSpec
 from gaussians_jax.effects.pose_refinement import PoseRefinementSpec
 from nerfies_jax import evaluation
@@ -26,7 +35,7 @@ from nerfies_jax import presets as field_presets
 from nerfies_jax import scene as field_scene
 from nerfies_jax import spec as field_spec
 from nerfies_jax.measure import clock
-from nerfies_jax.nets import entropy
+from nerfies_jax.nets import entropy, planes
 from tests import bare_scenes, hand_made_effects, scenes
 from tests.bare_scenes import parts_of, without
 from tests.hand_made_effects import FIELD_MODULES
@@ -200,35 +209,110 @@ def test_splats_without_what_no_preset_has_are_some_that_never_had_it(part):
     check_removed(run, started_splats, splat_scene, hand_made_effects.of_splats)
 
 
-# Where a part of an effect is, the module and the functions that are its alone, and
-# where it has its arrays.
+class Inner(NamedTuple):
+    """A part of an effect: where it is, and what is its alone."""
+
+    preset: str
+    owner: str
+    off: dict  # the owner's settings without it
+    module: object
+    functions: tuple[str, ...]
+    places: tuple[str, ...] = ()  # of its arrays
+    narrower: tuple[str, ...] = ()  # what it makes wider
+
+
+def of_motion(preset, *rest):
+    return Inner(preset, "motion", *rest)
+
+
 INNER = {
-    "rate": ("adc-gs", "motion", entropy, ["noisy", "rounded", "bits"], ".law"),
-    "turns": ("d-miso", "carried", carried, ["turns", "network_spec"], ".nets['carri"),
+    "rate": of_motion(
+        "adc-gs", {"rate": None}, entropy, ("noisy", "rounded", "bits"), (".law",)
+    ),
+    "moves": of_motion(
+        "adc-gs",
+        {"moves": False},
+        anchor_motion,
+        ("offsets",),
+        (".times", ".coarse", ".fine"),
+        (".residual", ".context.heads"),
+    ),
+    "turns": Inner(
+        "d-miso",
+        "carried",
+        {"turns": None},
+        carried,
+        ("turns", "network_spec"),
+        (".nets['carried']",),
+    ),
+    "mask": of_motion(
+        "edgs", {"mask": None}, node_motion, ("openness",), (".mask", ".moving")
+    ),
+    "rigidity": of_motion(
+        "sc-gs", {"rigidity": None}, skinning, ("links", "arap_error"), (".links",)
+    ),
+    "coarser": of_motion(
+        "sonata",
+        {"coarser": None},
+        motion_codes,
+        ("read", "fine_rows", "growth_steps"),
+        ("['kan_motion'].rows", "['kan_motion'].coarse"),
+    ),
+    "fading": of_motion(
+        "spacetime", {"fading": None}, temporal_opacity, ("faded",), (".fading",)
+    ),
+    "sparsity": of_motion("dynmf", {"sparsity": None}, time_basis, ("sparsity",)),
+    # A weight of zero leaves its term out; each by itself in the tests of the motions.
+    "penalties of codes": of_motion(
+        "e-d3dgs",
+        {"smoothness": 0.0, "opacity": 0.0},
+        motion_codes,
+        ("second_differences", "mean_opacity"),
+    ),
+    "penalties of planes": of_motion(
+        "4dgs",
+        {"variation": 0.0, "bend": 0.0, "unrest": 0.0},
+        planes,
+        ("total_variation", "time_smoothness", "l1_time_planes"),
+    ),
 }
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("part", INNER)
 def test_a_part_of_an_effect_that_is_off_is_not_asked_and_has_no_arrays(part):
-    preset, owner, module, functions, place = INNER[part]
-    spec = bare_scenes.tiny_splats(preset)
-    whole = started_splats(spec)
-    start = jax.tree_util.tree_flatten_with_path(whole.state.params)[0]
-    start = {jax.tree_util.keystr(path): leaf for path, leaf in start}
-    rest = {path: leaf for path, leaf in start.items() if place not in path}
-    assert len(rest) < len(start)
-    off = dataclasses.replace(getattr(spec, owner), **{part: None})
-    run = started_splats(dataclasses.replace(spec, **{owner: off}))
-    # Or a function that was traced before is remembered.
-    jax.clear_caches()
+    one = INNER[part]
+    whole = whole_splats(one.preset)
+    start = by_path(whole.state)
+    off = dataclasses.replace(getattr(whole.spec, one.owner), **one.off)
+    run = started_splats(dataclasses.replace(whole.spec, **{one.owner: off}))
     with pytest.MonkeyPatch.context() as patch:
-        hand_made_effects.refuse(patch, module, functions)
-        own = jax.tree_util.tree_flatten_with_path(run.state.params)[0]
-        run.lower()
+        hand_made_effects.refuse(patch, one.module, one.functions)
+        own = by_path(run.state)
+        jax.eval_shape(run.model.step, run.state, run.frames)
         with pytest.raises(AssertionError, match="is off and was called"):
-            whole.lower()
-    same_bits({jax.tree_util.keystr(path): leaf for path, leaf in own}, rest)
+            jax.eval_shape(whole.model.step, whole.state, whole.frames)
+    rest = {path: leaf for path, leaf in start.items() if not at(path, one.places)}
+    assert (len(rest) < len(start)) == bool(one.places)
+    assert own.keys() == rest.keys()
+    for path in [path for path in rest if at(path, one.narrower)]:
+        few, more = own.pop(path), rest.pop(path)
+        assert few.size < more.size or ".count" in path, path  # one for each row
+    same_bits(own, rest)
+
+
+@functools.cache
+def whole_splats(preset):
+    return started_splats(bare_scenes.tiny_splats(preset))
+
+
+def by_path(tree):
+    leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
+    return {jax.tree_util.keystr(path): leaf for path, leaf in leaves}
+
+
+def at(path, places):
+    return any(place in path for place in places)
 
 
 def test_small_presets_have_parts_that_papers_have():
