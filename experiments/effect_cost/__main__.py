@@ -5,11 +5,12 @@
     python -m experiments.effect_cost --check runs/effect_cost/effect_cost.json
 
 For every preset: the bare scene, the bare scene with each effect alone (and what that
-cannot be without), the whole preset, and the whole preset without each. Of the loss and
-of the training step it tabulates what the compiler counts (flops, bytes read and
-written, temporary memory), the matrix products with every round of every loop, the
-parameters, the seconds to compile and the processor time of warm calls, all scenes of
-a preset in turn. A run is priced at `--at` of its steps, where every warm-up is over.
+cannot be without), the whole preset, and the whole preset without each, and without
+the parts of an effect that have a price of their own (`PARTS`). Of the loss and of the
+training step it tabulates what the compiler counts (flops, bytes read and written,
+temporary memory), the matrix products with every round of every loop, the parameters,
+the seconds to compile and the processor time of warm calls, all scenes of a preset in
+turn. A run is priced at `--at` of its steps, where every warm-up is over.
 
 The price of an effect alone is a difference from the scene without it. Prices do not
 add up exactly: the compiler joins what it finds side by side. Prints the table, saves
@@ -19,6 +20,7 @@ effect_cost.json, effect_cost.md and effect_cost.png.
 import dataclasses
 import pathlib
 import time
+from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple
 
 from experiments import cli
@@ -49,7 +51,14 @@ PRESETS = (
 )
 # Effects that no preset has, as paths of --set, and the preset they are priced beside.
 BESIDE = {
-    "splats-static-small": ("exposure.learning_rate=0.01", "poses=PoseRefinementSpec")
+    "splats-static-small": ("exposure.learning_rate=0.01", "poses=PoseRefinementSpec"),
+    "motion-gs-small": ("poses=PoseRefinementSpec",),
+}
+# Parts of effects by the names of their rows, and how --set leaves them out.
+PARTS = {
+    "adc-gs-small": {"bits": "motion.rate=none"},
+    "edgs-small": {"mask": "motion.mask=none"},
+    "sc-gs-small": {"rigidity": "motion.rigidity=none"},
 }
 # Without these the effect on the left cannot be there, or does nothing.
 NEEDS = {
@@ -143,7 +152,7 @@ def main(args):
         before = None
         if args.check is not None:
             before = baselines.read(args.check, "effect_cost.json")
-        tables = {name: arms(_spec(name, args)) for name in args.presets}
+        tables = {name: _arms(name, args) for name in args.presets}
         folder = run_folder.new_run_folder(args.out, "effect_cost")
     print(report.heading())
     rows = {}
@@ -156,6 +165,16 @@ def main(args):
     if before is not None:
         print("\n".join(worse) or f"nothing is worse than in {args.check}")
     return cli.Ended(cli.stored(folder / "effect_cost.json"), 1 if worse else 0)
+
+
+def _arms(name, args):
+    from nerfies_jax.training import specs
+
+    spec = _spec(name, args)
+    parts = PARTS.get(name, {})
+    return arms(
+        spec, {part: specs.override(spec, [off]) for part, off in parts.items()}
+    )
 
 
 def _spec(name, args):
@@ -200,8 +219,11 @@ def without(spec: Any, names: tuple[str, ...]) -> Any:
     return dataclasses.replace(spec, **dict.fromkeys(gone & {*effects_in(spec)}))
 
 
-def arms(spec: Any) -> list[PricedScene]:
-    """The scenes of a preset's table; ValueError where it has no effect."""
+def arms(spec: Any, parts: Mapping[str, Any]) -> list[PricedScene]:
+    """The scenes of a preset's table; ValueError where it has no effect.
+
+    `parts` has the scene without each part of an effect that is priced as well.
+    """
     names = effects_in(spec)
     if not names:
         raise ValueError(
@@ -218,13 +240,14 @@ def arms(spec: Any) -> list[PricedScene]:
         base = f"only {needed[0]}" if needed else "bare"
         title = f"{needed[0]} + {name}" if needed else f"only {name}"
         priced.append(PricedScene(title, name, base, only(name, *needed)))
+    whole = "all"
     if len(names) == 1:
-        return priced  # the only one is all there is
-    priced.append(PricedScene("all", None, "bare", spec))
-    for name in names:
-        priced.append(
-            PricedScene(f"without {name}", name, "all", without(spec, (name,)))
-        )
+        whole = priced[-1].name  # the only one is all there is
+    else:
+        priced.append(PricedScene(whole, None, "bare", spec))
+        parts = {name: without(spec, (name,)) for name in names} | dict(parts)
+    for name, rest in parts.items():
+        priced.append(PricedScene(f"without {name}", name, whole, rest))
     return priced
 
 

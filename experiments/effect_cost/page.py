@@ -22,7 +22,9 @@ operations:
   compiled step, and bitwise equal states after it. Every preset that lost one effect
   lowers to the same text, from the same first state, as one that was put together by
   hand from the others, while every function of the missing effect's module refuses to
-  be called.
+  be called. Parts of motions that are `None`, and their penalties of weight zero,
+  are held likewise: their functions refuse to be called, and the first state is that
+  of the whole without their arrays.
 
 So `python -m experiments.reconstruct --preset nerfies-small --set background=none` is
 Nerfies without background points, and not Nerfies with a term of weight zero.
@@ -32,8 +34,8 @@ Nerfies without background points, and not Nerfies with a term of weight zero.
 One training step of each preset on the built-in scene, at {at:.0%} of its steps,
 where every warm-up is over. *bare* is the preset without its effects, *only X* has
 one, *X + Y* one and what it cannot be without, *all* is the preset, *without X* the
-preset that lost one (and what needs it). `splats-static-small` has none of its own; it
-stands for what no preset has.{apart}
+preset that lost one (and what needs it) or a part of one. `splats-static-small` has
+none of its own; it stands for what no preset has.{apart}
 
 - *Mflop* and *MB* are the compiler's count, in which the body of a loop counts once,
   however often it runs: what blends Gaussians, and networks that move them in blocks,

@@ -73,8 +73,8 @@ def _price(row, by_name):
         return ""
     others = by_name[row.arm.base]
     against = f"over {row.arm.base}"
-    if row.arm.base == "all":  # the price of what is left out, beside the others
-        row, others, against = others, row, f"all over {row.arm.name}"
+    if row.arm.name.startswith("without "):  # what is left out, beside the others
+        row, others, against = others, row, f"{row.arm.base} over {row.arm.name}"
     here, there = (x.programs["step"].seconds for x in (row, others))
     return f"{1e3 * (here - there):+.1f} ms {against}, x{here / there:.2f}"
 

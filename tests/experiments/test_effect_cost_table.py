@@ -58,8 +58,9 @@ def test_every_default_preset_has_effects_and_every_paper_is_there():
     for name in effect_cost.PRESETS:
         presets = field_presets.PRESETS | splat_presets.PRESETS
         alone = effect_cost.effects_in(presets[name])
-        assert bool(alone) != (name in effect_cost.BESIDE), name
-        assert effect_cost.effects_in(effect_cost._spec(name, EffectCost())), name
+        priced = effect_cost.effects_in(effect_cost._spec(name, EffectCost()))
+        assert (set(priced) > set(alone)) == (name in effect_cost.BESIDE), name
+        assert priced, name
     left_out = {"nerf-small", "d-nerf-small", "t-nerf-small"}
     left_out |= {"splats-mcmc-small"}
     small = {n for n in presets if n.endswith("-small")}
@@ -73,7 +74,7 @@ def test_scenes_of_a_preset_stand_behind_those_they_are_compared_with():
             if not effect_cost.effects_in(preset):
                 continue
             spec = effect_cost._spec(name, EffectCost())
-            arms = effect_cost.arms(spec)
+            arms = effect_cost._arms(name, EffectCost())
             seen = []
             for arm in arms:
                 assert arm.base is None or arm.base in [a.name for a in arms]
@@ -81,7 +82,22 @@ def test_scenes_of_a_preset_stand_behind_those_they_are_compared_with():
                 seen.append(arm.name)
             by_name = {arm.name: arm.spec for arm in arms}
             assert effect_cost.effects_in(by_name["bare"]) == []
-            assert by_name.get("all", arms[-1].spec) == spec
+            assert by_name.get("all", arms[1].spec) == spec
+
+
+def test_parts_of_effects_are_priced_beside_the_rest_of_them():
+    for preset, part, field in (
+        ("adc-gs-small", "bits", "rate"),
+        ("edgs-small", "mask", "mask"),
+        ("sc-gs-small", "rigidity", "rigidity"),
+    ):
+        (*_, whole, rest) = effect_cost._arms(preset, EffectCost())
+        assert (rest.name, rest.effect) == (f"without {part}", part)
+        assert rest.base == whole.name == "only motion"
+        assert getattr(whole.spec.motion, field) is not None
+        assert getattr(rest.spec.motion, field) is None
+    names = [arm.name for arm in effect_cost._arms("motion-gs-small", EffectCost())]
+    assert names[-3:] == ["without motion", "without flow", "without poses"]
 
 
 def row(name, base, seconds, flops=2e9):
@@ -140,7 +156,8 @@ def test_what_became_dearer_than_its_tolerance_is_named(tmp_path):
 def test_a_small_run_prices_a_transient_medium(tmp_path, capsys, monkeypatch):
     spec = bare_scenes.tiny_field("nerf-w")
     capture = scenes.tiny_capture()
-    arms = [a for a in effect_cost.arms(spec) if a.name in ("bare", "only transient")]
+    arms = effect_cost.arms(spec, {})
+    arms = [arm for arm in arms if arm.name in ("bare", "only transient")]
     monkeypatch.setattr(runs, "read_capture", lambda _: capture)
     bare, transient = effect_cost.measure("nerf-w-small", arms, 0.4, 2)
     for name in effect_cost.PROGRAMS:
