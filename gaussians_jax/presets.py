@@ -75,10 +75,11 @@ DEFORMABLE = SplatScene(
 )
 
 # Zhu et al. 2024, arXiv:2410.07707, and its code's numbers: Deformable 3DGS with flow
-# that is not the camera's. Its flow comes from a network, this from `evidence`; frames
-# come in any order, where its come one after the other; and its cameras stay those of
-# the capture, as there by default (`poses=PoseRefinementSpec` refines them). Rates of
-# means fall over 30,000 steps there, so that after 20,000 they are this.
+# that is not the camera's. Its flow and masks come from networks, these from
+# `evidence`; frames come in any order, where its come one after the other; and its
+# cameras stay those of the capture, as there by default (`poses=PoseRefinementSpec`
+# refines them). Rates of means fall over 30,000 steps there, so that after 20,000 they
+# are this.
 MOTION_GS = SplatScene(
     steps=20_000,
     learning_rates=LearningRateSpec(mean_end=7.4e-6, log_scale=1e-3),
