@@ -5,12 +5,12 @@
     python -m experiments.effect_cost --check runs/effect_cost/effect_cost.json
 
 For every preset: the bare scene, the bare scene with each effect alone (and what that
-cannot be without), the whole preset, and the whole preset without each, and without
-the parts of an effect that have a price of their own (`PARTS`). Of the loss and of the
-training step it tabulates what the compiler counts (flops, bytes read and written,
-temporary memory), the matrix products with every round of every loop, the parameters,
-the seconds to compile and the processor time of warm calls, all scenes of a preset in
-turn. A run is priced at `--at` of its steps, where every warm-up is over.
+cannot be without), the whole preset, and the whole preset without each, or without a
+part that has a price of its own (ADC-GS' bits, EDGS' mask, SC-GS' rigidity). Of the
+loss and of the training step it tabulates what the compiler counts (flops, bytes read
+and written, temporary memory), the matrix products with every round of every loop, the
+parameters, the seconds to compile and the processor time of warm calls, all scenes of a
+preset in turn. A run is priced at `--at` of its steps, where every warm-up is over.
 
 The price of an effect alone is a difference from the scene without it. Prices do not
 add up exactly: the compiler joins what it finds side by side. Prints the table, saves
