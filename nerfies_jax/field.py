@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
-from nerfies_jax import skipping
+from nerfies_jax import frustum_grid, skipping
 from nerfies_jax import spec as specs
 from nerfies_jax.effects.effect import RayOutput
 from nerfies_jax.field_ray import Ray, field_ray_through
@@ -52,8 +52,8 @@ class Field(NamedTuple):
     displace: Callable[[PyTree, Vector, FrameCondition], Vector]
     # (params, camera, time, codes, size, step) -> whole frame
     render: Callable[..., Rendering]
-    # (params, step) -> `skipping.Occupancy` at any time: without a
-    # level where the field moves, for then each frame is surveyed by itself; None where
+    # (params, step) -> `skipping.Occupancy` at any time, of a field that warps move in
+    # template space: without a level where each frame is surveyed by itself; None where
     # space cannot be skipped
     survey: Callable[..., Occupancy] | None
     # `render` behind an occupancy, without slopes
@@ -93,19 +93,24 @@ def field(
         return draw(bind(params), camera, FrameCondition(time, codes, step), size)
 
     moves = is_moved(active)
+    still = tuple(effect for effect in active if effect.displace is None)
+
+    def surveyed_once():
+        # Warps that a grid is read for say where the template is asked, at all times.
+        return not moves or frustum_grid.resolves(bind({}))
 
     def survey(params, step):
-        if moves:
+        if not surveyed_once():
             return {}
         kind = jax.tree.leaves(params["template"])[0].dtype
         time = jnp.asarray(metadata.times[0], kind)
         frame_codes = look_up(tables, metadata, params, time, jnp.int32(0))
         condition = FrameCondition(time, frame_codes, step)
-        return skipping.survey(bind(params), condition)
+        return skipping.survey(Bound(spec, metadata, still, params), condition)
 
     def render_occupied(params, occupied, camera, time, codes, size, step):
         bound, condition = bind(params), FrameCondition(time, codes, step)
-        if moves:
+        if not surveyed_once():
             shown = skipping.shown_cells(bound, camera, size)
             occupied = skipping.survey(bound, condition, shown)
         return skipping.draw(bound, occupied, camera, condition, size)

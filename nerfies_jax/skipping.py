@@ -4,7 +4,8 @@ The samples are those of `render_ray`, so the picture is that of the full quadra
 for what skipped samples would have added. A sample is skipped in a cell that was found
 empty (`survey`) or behind what lets no light through. What is left is gathered into
 dense batches, and the networks are asked of these alone. Warps of long waves are asked
-on a `frustum_grid` of the frame.
+on a `frustum_grid` of the frame, and then the cells are those of the template, the same
+at all times.
 """
 
 import functools
@@ -266,6 +267,8 @@ def _ask(
     """
     count, samples = distance.shape
     point = ray.origin[:, None] + distance[..., None] * ray.direction[:, None]
+    if moved is not None:
+        point = point + moved
     wanted = occupancy.at(occupied, point, bound.spec.extent)
     if bound.metadata.background is None:
         wanted = wanted.at[:, -1].set(True)  # it stands for all behind it
