@@ -93,7 +93,7 @@ def field(
         return draw(bind(params), camera, FrameCondition(time, codes, step), size)
 
     moves = is_moved(active)
-    still = tuple(effect for effect in active if effect.displace is None)
+    still = tuple(effect._replace(displace=None) for effect in active)
 
     def surveyed_once():
         # Warps that a grid is read for say where the template is asked, at all times.

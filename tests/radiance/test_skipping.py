@@ -23,7 +23,7 @@ from nerfies_jax.radiance.template import TemplateSpec
 from nerfies_jax.render_ray import Bound
 from nerfies_jax.scene import RadianceScene
 from nerfies_jax.spec import SamplingSpec
-from nerfies_jax.training.effects import FrameCondition
+from nerfies_jax.training.effects import Effect, FrameCondition
 from tests import scenes
 
 SIZE = (23, 17)
@@ -133,6 +133,25 @@ def test_skipping_changes_a_frame_by_no_more_than_it_may(spec, background, row):
     nothing = jax.tree.map(jnp.zeros_like, occupied)
     bare = draw(params, nothing, view, SIZE, STEP)
     assert np.abs(bare.colour - whole.colour).max() > 10 * most
+
+
+def test_space_is_surveyed_of_a_warp_that_colours_what_it_moves():
+    """The survey asks the template where the warp leads, and still gives it all."""
+
+    def displace(_, point, condition):
+        return jnp.full(3, 0.3, point.dtype)
+
+    def look(_, condition):
+        return jnp.ones(2)
+
+    own = Effect(
+        "own", condition=look, condition_width=2, displace=displace, shortest_wave=9.0
+    )
+    metadata = scene.metadata_of(scenes.tiny_capture(), ONE_LEVEL)
+    field = scene.field(ONE_LEVEL, metadata, effects=(own,))
+    params = jax.eval_shape(field.init, jax.random.key(0))
+    (cells,) = jax.eval_shape(field.survey, params, STEP).values()
+    assert cells.shape == (skipping.STILL_CELLS,) * 3
 
 
 def test_where_nothing_is_skipped_a_frame_is_the_full_quadrature(monkeypatch):
