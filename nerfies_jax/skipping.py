@@ -48,7 +48,8 @@ SKIPPED_DEPTH = 0.05
 # of this 3 in a hundred.
 GUIDE_DEPTH = 3.0
 OPAQUE_DEPTH = 7.0  # e^-7 = 9e-4 of the light passes
-# What moves is surveyed anew for every frame, and each look costs a warp of every cell.
+# What moves, unless by warps that are read on a grid, is surveyed anew for every frame,
+# and each look costs a warp of every cell.
 STILL_CELLS, MOVING_CELLS = 64, 40
 LOOKS = 2  # at each cell
 BATCH = 2048  # points asked at once

@@ -53,6 +53,7 @@ TAKEN_OVER = dataclasses.replace(MOVING, sampling=SamplingSpec(8, 9))
 ONE_LEVEL = dataclasses.replace(STILL, sampling=SamplingSpec(24, 0))
 # Of warps alone: read on a grid of the frame, and space surveyed where they lead.
 WARPED = dataclasses.replace(ONE_LEVEL, warp=MOVING.warp)
+WARPED_TWO_LEVELS = dataclasses.replace(STILL, warp=MOVING.warp)
 GUIDED = dataclasses.replace(
     STILL, sampling=SamplingSpec(24, 0, occupancy=OccupancySpec())
 )
@@ -93,6 +94,7 @@ ORANGE = (1.0, 0.5, 0.0)
         (GUIDED, ORANGE, 3),
         (ONE_LEVEL, ORANGE, 3),
         (WARPED, ORANGE, 3),
+        (WARPED_TWO_LEVELS, ORANGE, 3),
         *((MOVING, ORANGE, n) for n in range(3)),
     ],
     ids=[
@@ -100,6 +102,7 @@ ORANGE = (1.0, 0.5, 0.0)
         "guided",
         "one level",
         "warped",
+        "warped, two levels",
         "moving",
         "moving then",
         "moving at last",
