@@ -67,7 +67,11 @@ def _encode(av, partial, path, first, frames, frames_per_second, quality):
     height, width = first.shape[:2]
     with av.open(str(partial), "w") as container:
         rate = Fraction(frames_per_second).limit_denominator(1001)
-        stream = container.add_stream("h264", rate=rate, options={"crf": str(quality)})
+        # With its macroblock tree x264 reads what it has not written: equal frames made
+        # another film in every process, and of 14 of them COLMAP once found a path
+        # that was off by 22% of its extent, and not by 3%.
+        options = {"crf": str(quality), "x264-params": "mbtree=0"}
+        stream = container.add_stream("h264", rate=rate, options=options)
         stream.width, stream.height = width + width % 2, height + height % 2
         stream.pix_fmt = "yuv420p"
         # Without these tags a player guesses the matrix from the height of the picture

@@ -1,6 +1,9 @@
 """Film: round trips, odd sizes, times, and broken files."""
 
+import os
 import struct
+import subprocess
+import sys
 
 import av
 import numpy as np
@@ -29,6 +32,30 @@ def test_colours_and_times_survive_odd_sizes(tmp_path):
         assert error.mean() < 3
         np.testing.assert_allclose(frame[31], frame[30], atol=12)
     assert [p.name for p in tmp_path.iterdir()] == ["a.mp4"]
+
+
+WRITES = """
+import sys
+import numpy as np
+from nerfies_jax.capture import video
+y, x, k = np.ogrid[:48, :64, :14]
+waves = np.sin((x + 4 * k)[..., None] / [7, 9, 11])
+waves = waves + np.cos((y - 3 * k)[..., None] / [5, 8, 13])
+film = (127 + 60 * waves).astype(np.uint8)
+video.write_video(sys.argv[1], np.moveaxis(film, 2, 0), 12)
+"""
+
+
+@pytest.mark.full
+@pytest.mark.skipif(sys.platform != "linux", reason="glibc fills new memory if asked")
+def test_equal_frames_make_equal_films_whatever_was_in_memory(tmp_path):
+    films = []
+    for fill in ("1", "85"):
+        path = tmp_path / f"{fill}.mp4"
+        told = os.environ | {"MALLOC_PERTURB_": fill}
+        subprocess.run([sys.executable, "-c", WRITES, path], env=told, check=True)
+        films.append(path.read_bytes())
+    assert films[0] == films[1]
 
 
 def test_the_file_says_which_colours_it_holds(tmp_path):
