@@ -15,7 +15,9 @@ from experiments.ablate.settings import Ablate
 from experiments.accuracy_time import __main__ as accuracy_time
 from experiments.accuracy_time import report
 from experiments.accuracy_time.axes import AXES, SETTINGS, Axis
+from nerfies_jax.capture import synthetic
 from nerfies_jax.measure.clock import Metric
+from tests import scenes
 
 
 @pytest.mark.parametrize("name", AXES)
@@ -118,8 +120,10 @@ def test_a_cost_may_grow_by_a_share_and_a_quality_by_a_number():
 def test_a_tiny_plan_runs_resumes_and_is_held_against_itself(tmp_path, capfd):
     small = "rays=8 sampling.coarse=4 sampling.fine=0 start.motion=none"
     out = tmp_path / "out"
-    words = ["--axes", "warp", "--share", "0.001", "--frames", "1", "--jobs", "2"]
-    words += ["--out", str(out), "--set", *small.split()]
+    synthetic.write(scenes.TINY_FILM, tmp_path / "film")
+    words = [str(tmp_path / "film"), "--out", str(out), "--axes", "warp"]
+    words += ["--share", "0.001", "--frames", "1", "--jobs", "2"]
+    words += ["--set", *small.split()]
     with pytest.raises(SystemExit) as stop:
         accuracy_time.main(words)
     assert stop.value.code == 0
