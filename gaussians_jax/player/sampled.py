@@ -12,7 +12,7 @@ from gaussians_jax import harmonics, rendering, splats
 from gaussians_jax.instants import At
 from gaussians_jax.raster_spec import RasterSpec
 from gaussians_jax.splats import Gaussians, Splats
-from nerfies_jax import evaluation
+from nerfies_jax import data_parallel, evaluation
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.geometry.camera import Camera
 
@@ -89,43 +89,45 @@ def seen_in_training(
     """How much of the training pictures each Gaussian makes up, and in which colour.
 
     Each view counts as it is, and without what moves: then it shows what that hides.
-    `degree` is that of the harmonics in use. A picture is a sum of colours with
-    weights, so the weights of a Gaussian, summed over the pixels, are the slope of the
-    picture's sum in the Gaussian's colour.
+    Where this process has two devices, each looks one way. `degree` is that of the
+    harmonics in use.
     """
     factor = math.ceil(max(capture.size) / MOST_SIDE_PX)
     size = (max(1, capture.size[0] // factor), max(1, capture.size[1] // factor))
     coefficients = splats.active_harmonics(rows, degree)
-
-    @jax.jit
-    def shown(gaussians: Gaussians, camera: Camera):
-        def total(colours: Float[Array, "gaussians 3"]):
-            frame = rendering.render(
-                gaussians, colours, camera, size, raster, depth=False
-            )
-            return jnp.sum(frame.rendering.colour)
-
-        weight = jax.grad(total)(jnp.zeros_like(gaussians.mean))[:, 0]
-        towards = harmonics.colour_towards(
-            coefficients, gaussians.mean, camera.position
-        )
-        return weight, weight[:, None] * towards
-
+    towards = jax.jit(harmonics.colour_towards)
     moves = _moves(at, capture)
     most, total, colour = 0.0, 0.0, 0.0
     for row in evaluation.spread(capture.train, MOST_VIEWS):
         view = evaluation.resized(evaluation.view_of(capture, row), capture.size, size)
         deformed = at(float(view.time))
-        looks = [deformed]
+        looks = [(deformed, view.camera)]
         if moves.any():
             opacity = jnp.where(moves, 0, deformed.opacity)
-            looks.append(deformed._replace(opacity=opacity))
-        for gaussians in looks:
-            weight, coloured = jax.device_get(shown(gaussians, view.camera))
-            most = np.maximum(most, weight * factor**2)
-            total, colour = total + weight, colour + coloured
+            looks.append((deformed._replace(opacity=opacity), view.camera))
+        both = jax.tree.map(lambda *leaves: np.stack(leaves), *looks)
+        weights = list(data_parallel.rows_on_devices(_shown, (size, raster), both))
+        most = np.maximum(most, np.max(weights, axis=0) * factor**2)
+        weight = np.sum(weights, axis=0)
+        seen_from = towards(coefficients, deformed.mean, view.camera.position)
+        total, colour = total + weight, colour + weight[:, None] * seen_from
     seen = np.maximum(total, np.finfo(np.float32).tiny)
-    return Seen(most, colour / seen[:, None])
+    return Seen(most, np.asarray(colour / seen[:, None]))
+
+
+def _shown(how, gaussians: Gaussians, camera: Camera):
+    """[gaussians] how many pixels' worth of a picture each makes up.
+
+    A picture is a sum of colours with weights, so the weights of a Gaussian, summed
+    over the pixels, are the slope of the picture's sum in the Gaussian's colour.
+    """
+    size, raster = how
+
+    def total(colours: Float[Array, "gaussians 3"]):
+        frame = rendering.render(gaussians, colours, camera, size, raster, depth=False)
+        return jnp.sum(frame.rendering.colour)
+
+    return jax.grad(total)(jnp.zeros_like(gaussians.mean))[:, 0]
 
 
 def _moves(at, capture):

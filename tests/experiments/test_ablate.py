@@ -207,7 +207,8 @@ def test_the_command_measures_arms_and_goes_on_where_it_stopped(
     tiny, tmp_path, capsys, monkeypatch
 ):
     small = "rays=8 sampling.coarse=4 sampling.fine=0 template.depth=1 template.width=8"
-    tiny += ["--steps", "3", "--set", *small.split(), "start.motion=none"]
+    small += " template.position.levels=2 start.motion=none"
+    tiny += ["--steps", "3", "--set", *small.split()]
     out = tmp_path / "out"
     assert run(*tiny, "--arms", "static") == 0
     assert run(*tiny, "--arms", "static", "nerfies") == 0
