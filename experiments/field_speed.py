@@ -17,8 +17,8 @@ difference of two timings, empty where it is below their noise), and
 decibels are of the difference between the two. Over several seeds the table has means,
 and beside a PSNR its standard deviation. What is in `--out` already is not measured
 again: an interrupted run goes on, and more `--seeds` add those that it lacks. Frames of
-`nerfies-grid-small` after 300 seconds are of before its warp was asked on a grid
-(`nerfies_jax.frustum_grid`), those after 60 are not.
+`nerfies-grid-small` on the bookshelf are of before its warp was asked on a grid
+(`nerfies_jax.frustum_grid`), the others are not.
 """
 
 import dataclasses
