@@ -109,10 +109,11 @@ def seen_in_training(
         weights = list(data_parallel.rows_on_devices(_shown, (size, raster), both))
         most = np.maximum(most, np.max(weights, axis=0) * factor**2)
         weight = np.sum(weights, axis=0)
-        seen_from = towards(coefficients, deformed.mean, view.camera.position)
-        total, colour = total + weight, colour + weight[:, None] * seen_from
+        colours = towards(coefficients, deformed.mean, view.camera.position)
+        total = total + weight
+        colour = colour + weight[:, None] * jax.device_get(colours)
     seen = np.maximum(total, np.finfo(np.float32).tiny)
-    return Seen(most, np.asarray(colour / seen[:, None]))
+    return Seen(most, colour / seen[:, None])
 
 
 def _shown(how, gaussians: Gaussians, camera: Camera):
