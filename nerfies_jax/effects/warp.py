@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int, Key
 
 from nerfies_jax.effects.effect import Vector, guides_of
 from nerfies_jax.geometry import lie
-from nerfies_jax.nets import encoding, mlp
+from nerfies_jax.nets import dense, encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
@@ -173,7 +173,7 @@ def _features(spec, params, encoded, condition):
         if index == 0 or index in spec.skips:
             ours, theirs = jnp.split(layer.weight, [hidden.shape[-1]])
             offset = condition @ theirs + layer.bias
-            hidden = activation(hidden @ ours + offset)
+            hidden = activation(dense.product(hidden, ours) + offset)
         else:
             hidden = activation(mlp.affine(layer, hidden))
     return hidden

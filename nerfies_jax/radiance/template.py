@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
-from nerfies_jax.nets import encoding, grids, mlp, planes, voxels
+from nerfies_jax.nets import dense, encoding, grids, mlp, planes, voxels
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.grids import HashGridSpec
 from nerfies_jax.nets.mlp import HeadSpec, MLPSpec
@@ -223,11 +223,11 @@ def coloured(
     # Two products, not one of [bottleneck, condition]: under vmap over the samples of a
     # ray the second is then computed once for the ray.
     first = params.colour.hidden[0]
-    branch = bottleneck @ first.weight[: spec.width]
+    branch = dense.product(bottleneck, first.weight[: spec.width])
     rest = first.weight[spec.width :]
     if more is not None:
         rest, last = jnp.split(rest, [len(rest) - len(more)])
-        branch = branch + more @ last
+        branch = branch + dense.product(more, last)
     branch = branch + (condition @ rest + first.bias)
     colour = mlp.affine(params.colour.heads["colour"], jax.nn.relu(branch))
     activation = DENSITIES[spec.density]
