@@ -219,16 +219,16 @@ def coloured(
     more: Float[Array, " more"] | None = None,
 ) -> Radiance:
     """What `raw_density` found, with its colour; `more` is read behind `condition`."""
-    bottleneck = mlp.affine(params.trunk.heads["bottleneck"], hidden)
-    # Two products, not one of [bottleneck, condition]: under vmap over the samples of a
-    # ray the second is then computed once for the ray.
-    first = params.colour.hidden[0]
-    branch = dense.product(bottleneck, first.weight[: spec.width])
-    rest = first.weight[spec.width :]
+    bottleneck, first = params.trunk.heads["bottleneck"], params.colour.hidden[0]
+    ours, rest = jnp.split(first.weight, [spec.width])
+    # Nothing bends between the bottleneck and this layer: all samples meet the product
+    # of both, and never the bottleneck itself. What reads `condition` is a product of
+    # its own: under vmap over the samples of a ray it is then computed once for the ray.
+    branch = dense.product(hidden, bottleneck.weight @ ours)
     if more is not None:
         rest, last = jnp.split(rest, [len(rest) - len(more)])
         branch = branch + dense.product(more, last)
-    branch = branch + (condition @ rest + first.bias)
+    branch = branch + (condition @ rest + (bottleneck.bias @ ours + first.bias))
     colour = mlp.affine(params.colour.heads["colour"], jax.nn.relu(branch))
     activation = DENSITIES[spec.density]
     return Radiance(activation(raw), jax.nn.sigmoid(colour), hidden)

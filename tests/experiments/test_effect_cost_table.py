@@ -49,9 +49,9 @@ def network_flops(one, samples):
     each, width = point * one.width, one.width
     for layer in range(1, one.depth):
         each += (width + point * (layer in one.skips)) * width
-    each += width * (1 + width)  # density, bottleneck
-    each += width * one.colour_width + one.colour_width * 3
-    return 2 * (samples * each + view * one.colour_width)
+    each += width + (width + 3) * one.colour_width  # density, colour
+    bottleneck = (width + 1) * width  # once, joined to the layer that reads it
+    return 2 * (samples * each + (view + bottleneck) * one.colour_width)
 
 
 def test_every_default_preset_has_effects_and_every_paper_is_there():
