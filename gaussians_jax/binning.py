@@ -151,8 +151,8 @@ def next_intersections(
     row = rects.top[rank] + within // rect_columns
     column = rects.left[rank] + within % rect_columns
     tile = row * grid.columns + column
-    # A column at a time, contiguous in what tests them: 1.1 ms less of 3.0 for the whole
-    # of 65,536 pairs than by rows.
+    # A column at a time, contiguous for the test: 65,536 pairs take 2.1 ms in all, and
+    # 3.0 where rows are gathered.
     shape = [column[rank] for column in table[:, :6].T]
     keep = in_use & _ellipse_meets_tile(shape, row, column, log_cut, grid)
     keep &= open_tiles[jnp.where(in_use, tile, 0)]

@@ -175,11 +175,11 @@ def render_ray(
     return coarse, level("fine", both, last, 1)
 
 
-def colour_inputs(
+def colour_offset(
     bound: Bound, name: str, direction: Vector, condition: FrameCondition
 ) -> Features:
-    """What the colour branch of one level reads, the same along a ray."""
-    one = template_of(bound.spec, name)
+    """What the colour branch of one level makes of a ray (`template.colour_offset`)."""
+    one, net = template_of(bound.spec, name), bound.params["template"][name]
     inputs = []
     if one.direction is not None:
         inputs.append(encoding.encode(one.direction, direction, None))
@@ -188,38 +188,44 @@ def colour_inputs(
         for effect in bound.effects
         if effect.condition is not None
     ]
-    return jnp.concatenate([*inputs, jnp.zeros(0, direction.dtype)])
+    read = jnp.concatenate([*inputs, jnp.zeros(0, direction.dtype)])
+    return template.colour_offset(one, net, read)
 
 
 def radiance_at(
     bound: Bound,
     name: str,
     place: tuple[Vector, tuple[Features, ...]],
-    inputs: Features,
+    offset: Features,
     condition: FrameCondition,
     noise: Scalar | None = None,
 ) -> template.Radiance:
-    """What the template of one level says where it is asked, by `asked_at`."""
+    """What the template of one level says where it is asked, by `asked_at`.
+
+    `offset` is the `colour_offset` of the ray, `noise` is added to the raw density.
+    """
     warped, lifted = place
     one, net = template_of(bound.spec, name), bound.params["template"][name]
     encoded = template.encode(one, net, warped, condition.step)
     features = jnp.concatenate([encoded, *lifted])
-    return template.apply(one, net, features, inputs, noise)
+    raw, hidden = template.raw_density(one, net, features)
+    raw = raw if noise is None else raw + noise
+    return template.coloured(one, net, raw, hidden, offset)
 
 
 def _radiance(bound, name, ray, condition, samples, noise):
     """What the template of one level says at the samples of one ray, and what surfaces
     there look like, by effect.
     """
-    inputs = colour_inputs(bound, name, ray.direction, condition)
+    offset = colour_offset(bound, name, ray.direction, condition)
     surfaces = [effect for effect in bound.effects if effect.surface is not None]
 
     def ask(point, warped, lifted, noise):
         place = warped, lifted
         if surfaces:
-            seen = point, place, inputs
+            seen = point, place, offset
             return _surface_at(bound, name, surfaces, seen, condition, noise)
-        return radiance_at(bound, name, place, inputs, condition, noise), {}
+        return radiance_at(bound, name, place, offset, condition, noise), {}
 
     return jax.vmap(ask, (0, 0, 0, None if noise is None else 0))(
         samples.point, samples.warped, samples.lifted, noise
@@ -228,7 +234,7 @@ def _radiance(bound, name, ray, condition, samples, noise):
 
 def _surface_at(bound, name, surfaces, seen, condition, noise):
     """As `radiance_at`, with what these effects say of the surface at a point."""
-    point, (warped, lifted), inputs = seen
+    point, (warped, lifted), offset = seen
     one, net = template_of(bound.spec, name), bound.params["template"][name]
 
     def density(net, warped, lifted):
@@ -257,7 +263,7 @@ def _surface_at(bound, name, surfaces, seen, condition, noise):
     }
     more = jnp.concatenate([look.features for look in looks.values()])
     raw = raw if noise is None else raw + noise
-    radiance = template.coloured(one, net, raw, hidden, inputs, more)
+    radiance = template.coloured(one, net, raw, hidden, offset, more)
     return radiance, {name: look.found for name, look in looks.items()}
 
 

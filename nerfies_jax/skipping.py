@@ -26,7 +26,7 @@ from nerfies_jax.radiance import compositing, occupancy, sampling
 from nerfies_jax.render_ray import (
     Bound,
     asked_at,
-    colour_inputs,
+    colour_offset,
     is_moved,
     radiance_at,
 )
@@ -92,7 +92,7 @@ def survey(
     names = tuple(bound.params["template"])
     dtype = jax.tree.leaves(bound.params["template"])[0].dtype
     direction = jnp.zeros(3, dtype).at[2].set(1)  # no density depends on it
-    inputs = {n: colour_inputs(bound, n, direction, condition) for n in names}
+    offset = {n: colour_offset(bound, n, direction, condition) for n in names}
 
     def look(found, number):
         key = jax.random.fold_in(jax.random.key(0), number)
@@ -100,7 +100,7 @@ def survey(
         def densities(point):
             place = asked_at(bound, point, condition)
             return {
-                name: radiance_at(bound, name, place, inputs[name], condition).density
+                name: radiance_at(bound, name, place, offset[name], condition).density
                 for name in names
             }
 
@@ -273,7 +273,7 @@ def _ask(
     wanted = occupancy.at(occupied, point, bound.spec.extent)
     if bound.metadata.background is None:
         wanted = wanted.at[:, -1].set(True)  # it stands for all behind it
-    inputs = jax.vmap(lambda d: colour_inputs(bound, name, d, condition))(ray.direction)
+    offset = jax.vmap(lambda d: colour_offset(bound, name, d, condition))(ray.direction)
     width = -(-samples // STAGES)  # samples of a stage
 
     def staged(x):
@@ -286,7 +286,7 @@ def _ask(
         return x.reshape(count, STAGES * width, *x.shape[3:])[:, :samples]
 
     def said(index, place):
-        radiance = radiance_at(bound, name, place, inputs[index // width], condition)
+        radiance = radiance_at(bound, name, place, offset[index // width], condition)
         every = jnp.concatenate([radiance.density[None], radiance.colour])
         return every[:values]
 

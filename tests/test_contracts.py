@@ -62,6 +62,7 @@ EXCUSED = {
     **dict.fromkeys(["template.init", "grids.init", "planes.init"], "draws"),
     "voxels.init": "zeros",
     **dict.fromkeys(["template.raw_density", "template.coloured"], "template.apply"),
+    "template.colour_offset": "template.apply",
     "grids.variation_at_random": "draws",
     **dict.fromkeys(["precision.at_least_float32", "precision.refuse_half"], "types"),
     "splats.refuse_half": "types",

@@ -207,7 +207,19 @@ def apply(
     raw, hidden = raw_density(spec, params, features)
     if density_noise is not None:
         raw = raw + density_noise
-    return coloured(spec, params, raw, hidden, condition)
+    return coloured(spec, params, raw, hidden, colour_offset(spec, params, condition))
+
+
+def colour_offset(
+    spec: TemplateSpec, params: Template, condition: Float[Array, " condition"]
+) -> Float[Array, " colour_width"]:
+    """What the first layer of colour makes of `condition`, its bias included.
+
+    The same for all samples of a ray.
+    """
+    bottleneck, first = params.trunk.heads["bottleneck"], params.colour.hidden[0]
+    ours, rest = jnp.split(first.weight, [spec.width])
+    return condition @ rest[: len(condition)] + (bottleneck.bias @ ours + first.bias)
 
 
 def coloured(
@@ -215,20 +227,20 @@ def coloured(
     params: Template,
     raw: Float[Array, ""],
     hidden: Float[Array, " width"],
-    condition: Float[Array, " condition"],
+    offset: Float[Array, " colour_width"],
     more: Float[Array, " more"] | None = None,
 ) -> Radiance:
-    """What `raw_density` found, with its colour; `more` is read behind `condition`."""
+    """What `raw_density` found, with its colour.
+
+    `offset` is the `colour_offset` of the ray; `more` is read behind its condition.
+    """
     bottleneck, first = params.trunk.heads["bottleneck"], params.colour.hidden[0]
-    ours, rest = jnp.split(first.weight, [spec.width])
     # Nothing bends between the bottleneck and this layer: all samples meet the product
-    # of both, and never the bottleneck itself. What reads `condition` is a product of
-    # its own: under vmap over the samples of a ray it is then computed once for the ray.
-    branch = dense.product(hidden, bottleneck.weight @ ours)
+    # of both, and never the bottleneck itself.
+    branch = dense.product(hidden, bottleneck.weight @ first.weight[: spec.width])
     if more is not None:
-        rest, last = jnp.split(rest, [len(rest) - len(more)])
-        branch = branch + dense.product(more, last)
-    branch = branch + (condition @ rest + (bottleneck.bias @ ours + first.bias))
+        branch = branch + dense.product(more, first.weight[-len(more) :])
+    branch = branch + offset
     colour = mlp.affine(params.colour.heads["colour"], jax.nn.relu(branch))
     activation = DENSITIES[spec.density]
     return Radiance(activation(raw), jax.nn.sigmoid(colour), hidden)
