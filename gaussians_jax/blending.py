@@ -301,8 +301,8 @@ def _pair_gradients(rows, middle, weight, grad, toward, grid):
         -2 * sum_vv / v_y,
         total,
     ]
-    # A product of small matrices for each tile, not sums over pixels, takes a seventh off
-    # this pass, of 16 channels a third; with tiles second ("kbc") half of that is lost.
+    # A product of small matrices for each tile, not sums over pixels, takes a seventh
+    # off this pass, of 16 channels a third; tiles second ("kbc") lose half of that.
     shades = exact_einsum("kbp,bcp->bkc", weight, toward).swapaxes(0, 1)
     return jnp.concatenate([jnp.stack(columns, axis=-1), shades], axis=-1)
 
