@@ -202,8 +202,15 @@ def apply(
 
     `features` are the point's encoding and what effects add to it; `condition` is the
     encoded view direction and codes, the same along a ray. `density_noise` is added
-    before the activation. The density never depends on `condition`.
+    before the activation. The density never depends on `condition`. ValueError where
+    the colour branch reads another number of them.
     """
+    read = len(params.colour.hidden[0].weight) - spec.width
+    if len(condition) != read:
+        raise ValueError(
+            f"the colour branch reads {read} features of the ray, and condition has "
+            f"{len(condition)}; give `init` that many"
+        )
     raw, hidden = raw_density(spec, params, features)
     if density_noise is not None:
         raw = raw + density_noise

@@ -63,6 +63,9 @@ def test_density_colour_and_features_layer_by_layer(density, condition, noise, d
         assert value.dtype == dtype
         np.testing.assert_allclose(value, exact, rtol=bound, atol=bound)
     assert answer.density > 0
+    wider = np.append(inputs[1], np.asarray(0, dtype))
+    with pytest.raises(ValueError, match=f"condition has {condition + 1}; give `init`"):
+        apply(spec, params, inputs[0], wider, added)
 
 
 def test_gradients(float64):
