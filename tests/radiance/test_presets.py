@@ -104,7 +104,7 @@ def test_a_small_preset_learns_more_than_one_colour(name):
     frames = evaluation.frames_of(capture, model.required_data)
     state, step = model.init(capture, jax.random.key(0)), jax.jit(model.step)
     errors = []
-    for _ in range(140):
+    for _ in range(spec.steps):
         state, metrics = step(state, frames)
         errors.append(float(metrics["mse"]))
     assert np.isfinite(errors).all()
