@@ -153,7 +153,7 @@ def next_intersections(
     tile = row * grid.columns + column
     # A column at a time, contiguous for the test: 65,536 pairs take 2.1 ms in all, and
     # 3.0 where rows are gathered.
-    shape = [column[rank] for column in table[:, :6].T]
+    shape = [values[rank] for values in table[:, :6].T]
     keep = in_use & _ellipse_meets_tile(shape, row, column, log_cut, grid)
     keep &= open_tiles[jnp.where(in_use, tile, 0)]
     tile = jnp.where(keep, tile, grid.tiles)

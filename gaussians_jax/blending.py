@@ -160,18 +160,12 @@ def _parts(local):
 
 def _any_open(transmittance):
     """Whether some pixel of some tile still lets light through."""
-    return _halved(transmittance.reshape(-1), jnp.maximum, jnp.max) > 0
-
-
-def _halved(x, pairwise, rest):
-    """Reduce the last axis, its halves with each other first: whole vectors at once.
-
-    XLA:CPU reduces along an axis one number after the other.
-    """
-    while x.shape[-1] > 8 and x.shape[-1] % 2 == 0:
-        half = x.shape[-1] // 2
-        x = pairwise(x[..., :half], x[..., half:])
-    return rest(x, axis=-1)
+    # Halves with each other first, whole vectors at once: XLA:CPU reduces along an axis
+    # one number after the other.
+    most = transmittance.reshape(-1)
+    while most.size > 8 and most.size % 2 == 0:
+        most = jnp.maximum(*jnp.split(most, 2))
+    return jnp.max(most) > 0
 
 
 def _by_length(isects, batch):
