@@ -27,6 +27,8 @@ from gaussians_jax.path_fit import Guess, Paths, Points
 from gaussians_jax.splats import Gaussians, Params, Splats
 from nerfies_jax.evidence import rigid_groups
 from nerfies_jax.geometry import lie
+from nerfies_jax.geometry.fusion import components, stacked
+from nerfies_jax.geometry.jacobi import dot
 from nerfies_jax.geometry.precision import exact_einsum, exact_product
 from nerfies_jax.training import schedules
 from nerfies_jax.training.effects import Effect, FrameCondition
@@ -152,11 +154,15 @@ def deform(
     rows = len(motion.turn)
     flat = jnp.concatenate([motion.linear.reshape(rows, 9), motion.offset], axis=-1)
     mixed = exact_product(weights, jnp.concatenate([flat, motion.turn], axis=-1))
-    linear, offset, turn = mixed[:, :9], mixed[:, 9:12], mixed[:, 12:]
-    linear = linear.reshape(-1, 3, 3)
-    mean = gaussians.mean
-    moved = mean + (exact_einsum("nij,nj->ni", linear, mean) + offset)
-    return gaussians._replace(mean=moved, quaternion=splats.turned(gaussians, turn))
+    mixed, mean = components(mixed), components(gaussians.mean)
+    linear, offset, turn = mixed[:9], mixed[9:12], stacked(mixed[12:])
+    moved = [
+        own + (dot(linear[3 * i : 3 * i + 3], mean) + offset[i])
+        for i, own in enumerate(mean)
+    ]
+    return gaussians._replace(
+        mean=stacked(moved), quaternion=splats.turned(gaussians, turn)
+    )
 
 
 def fit_to_paths(spec: SE3BasesSpec, paths: Paths) -> Guess:

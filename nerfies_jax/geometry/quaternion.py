@@ -7,6 +7,7 @@ since what an optimiser moves is never exactly of length one.
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from nerfies_jax.geometry.fusion import components, stacked
 from nerfies_jax.geometry.precision import at_least_float32, near_one
 from nerfies_jax.geometry.stumpff import stumpff
 
@@ -33,8 +34,9 @@ def normalise(quaternion: Quaternion) -> Quaternion:
     # The whole quaternion is replaced, not its length: inf times the zero of the branch
     # not taken is NaN. Scaled first: |q|³ in its curvature underflows from 1e-13 down.
     usable = jnp.where(unusable, identity(quaternion.dtype), quaternion)
-    scaled, _ = near_one(usable)
-    return scaled / jnp.sqrt(jnp.sum(scaled**2))
+    parts = components(near_one(usable)[0])
+    length = jnp.sqrt(sum(part * part for part in parts))
+    return stacked([part / length for part in parts])
 
 
 def identity(dtype=jnp.float32) -> Quaternion:
@@ -44,10 +46,16 @@ def identity(dtype=jnp.float32) -> Quaternion:
 @at_least_float32
 def multiply(second: Quaternion, first: Quaternion) -> Quaternion:
     """The rotation `first`, then `second`: the matrices' order of reading."""
-    w, v = second[0], second[1:]
-    scalar = w * first[0] - jnp.sum(v * first[1:])
-    vector = w * first[1:] + first[0] * v + jnp.cross(v, first[1:])
-    return jnp.concatenate([scalar[None], vector])
+    w, x, y, z = components(second)
+    a, b, c, d = components(first)
+    return stacked(
+        [
+            w * a - (x * b + y * c + z * d),
+            w * b + a * x + (y * d - z * c),
+            w * c + a * y + (z * b - x * d),
+            w * d + a * z + (x * c - y * b),
+        ]
+    )
 
 
 def conjugate(quaternion: Quaternion) -> Quaternion:
@@ -110,9 +118,10 @@ def from_matrix(rotation: Float[Array, "3 3"]) -> Quaternion:
 @at_least_float32
 def exp(rotation_vector: Float[Array, "3"]) -> Quaternion:
     """The unit quaternion of axis × angle, in rad; below 1e19 rad in float32."""
-    quarter_sq = jnp.sum(rotation_vector**2) / 4
-    scalar = stumpff(0, quarter_sq)
-    return jnp.concatenate([scalar[None], stumpff(1, quarter_sq) / 2 * rotation_vector])
+    parts = components(rotation_vector)
+    quarter_sq = sum(part * part for part in parts) / 4
+    half = stumpff(1, quarter_sq) / 2
+    return stacked([stumpff(0, quarter_sq), *(half * part for part in parts)])
 
 
 @at_least_float32

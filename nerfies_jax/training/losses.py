@@ -13,6 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from nerfies_jax.geometry.fusion import materialised
 from nerfies_jax.geometry.precision import widened
 
 # PSNR is reported to 100 dB, where 8-bit images ended long ago (51 dB for one level).
@@ -196,7 +197,7 @@ def dssim_map(
     constant = value_range**2
     centre = middle_level(target)
     shape, channels = image.shape, image.shape[-1]
-    image, target = (x.reshape(shape[0], -1) for x in (image, target))
+    image, target = materialised(*(x.reshape(shape[0], -1) for x in (image, target)))
     difference = image - target
     x, y = image - centre, target - centre
     maps = jnp.stack([x, y, x * x + y * y, difference * difference])

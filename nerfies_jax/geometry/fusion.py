@@ -1,0 +1,102 @@
+"""Where XLA:CPU shall not fuse: values that are computed once, before they are read.
+
+XLA:CPU moves what makes an array into whatever reads it, and then computes it anew for
+each reader, often by a branch for each number and not in whole vectors. It moves
+nothing into a call that is not to be inlined. Other compilers are left alone.
+"""
+
+import functools
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.core import ShapedArray
+from jax.experimental.xla_metadata import set_xla_metadata
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array, Float
+
+MATERIALISED, COMPONENTS = Primitive("materialised"), Primitive("components")
+MATERIALISED.multiple_results = COMPONENTS.multiple_results = True
+
+
+def materialised(*arrays: Float[Array, "..."]) -> tuple[Float[Array, "..."], ...]:
+    """The same arrays, computed before what reads them; so are their cotangents.
+
+    With the picture and the truth of D-SSIM so, a step of `splats-tracked-small` takes
+    20.5 ms for 21.5.
+    """
+    return tuple(MATERIALISED.bind(*arrays))
+
+
+def components(
+    vectors: Float[Array | np.ndarray, "*batch components"],
+) -> tuple[Float[Array, "*batch"], ...]:
+    """`vectors[..., 0], vectors[..., 1], ...`, and derivatives of any order and kind.
+
+    JAX's slope of these is a sum of padded vectors; here it is `stacked`. The gradient
+    of projecting 10,000 Gaussians takes 0.6 ms for 7.6. ValueError for a number.
+    """
+    return tuple(COMPONENTS.bind(jnp.asarray(vectors)))
+
+
+def stacked(parts: Sequence[Float[Array, "*batch"]]) -> Float[Array, "*batch parts"]:
+    """`parts`, of one shape, along a last axis; each is computed before."""
+    return jnp.stack(materialised(*parts), axis=-1)
+
+
+def _same(*arrays):
+    return list(arrays)
+
+
+def _called(*arrays):
+    # Without the barrier there were nothing to call.
+    with set_xla_metadata(inlineable="false"):
+        return jax.jit(lambda *given: lax.optimization_barrier(given))(*arrays)
+
+
+def _same_batched(arrays, axes):
+    return MATERIALISED.bind(*arrays), axes
+
+
+def _same_back(cotangents, *arrays):
+    return MATERIALISED.bind(*map(ad.instantiate_zeros, cotangents))
+
+
+def _split(vectors):
+    return [vectors[..., index] for index in range(vectors.shape[-1])]
+
+
+def _split_types(vectors):
+    if not vectors.ndim:
+        raise ValueError(
+            "a number has no components; give vectors, with them along the last axis"
+        )
+    return [ShapedArray(vectors.shape[:-1], vectors.dtype)] * vectors.shape[-1]
+
+
+def _split_batched(operands, axes):
+    parts = COMPONENTS.bind(jnp.moveaxis(operands[0], axes[0], 0))
+    return parts, [0] * len(parts)
+
+
+def _split_back(cotangents, vectors):
+    return [stacked(list(map(ad.instantiate_zeros, cotangents)))]
+
+
+_lowered = functools.partial(mlir.lower_fun, multiple_results=True)
+
+MATERIALISED.def_impl(_same)
+MATERIALISED.def_abstract_eval(_same)
+mlir.register_lowering(MATERIALISED, _lowered(_same))
+mlir.register_lowering(MATERIALISED, _lowered(_called), platform="cpu")
+batching.primitive_batchers[MATERIALISED] = _same_batched
+ad.deflinear2(MATERIALISED, _same_back)
+
+COMPONENTS.def_impl(jax.jit(_split))
+COMPONENTS.def_abstract_eval(_split_types)
+mlir.register_lowering(COMPONENTS, _lowered(_split))
+batching.primitive_batchers[COMPONENTS] = _split_batched
+ad.deflinear2(COMPONENTS, _split_back)
