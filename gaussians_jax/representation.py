@@ -37,6 +37,7 @@ from nerfies_jax.evidence.findings import DEPTH, LIGHT, MOTION, START, TRANSIENT
 from nerfies_jax.training import specs
 from nerfies_jax.training.effects import Effect
 from nerfies_jax.training.model import Model, TrainState
+from nerfies_jax.training.track_start import FROM_REST
 
 SMALL_PIXELS = 176 * 132  # for which the counts of the small presets were chosen
 # SE(3) bases by the paths: the first that explain four fifths of what the last do
@@ -61,7 +62,7 @@ ADVISED = ("splats-static", "splats-tracked", "splats-deformable")
 # equal seconds, and those of `splats-deformable-small` and `dynmf-small` from rest:
 # D-NeRF's lego 21.8 dB, 20.7 and 21.3; bookshelf 36.8, 34.5 and 36.4; built-in scene
 # 25.1, 24.6 and 25.9.
-UNTRACKED, FROM_REST = "spacetime", "start.motion=none"
+UNTRACKED = "spacetime"
 # Of a scene's spec: the motion, and what is nothing without one.
 MOTION_PARTS = ("motion", "neighbours", *OF_MOTION)
 

@@ -15,6 +15,7 @@ from nerfies_jax.evaluation.representation import (
     Saved,
 )
 from nerfies_jax.evidence.findings import BACKGROUND, LIGHT, MOTION, TRANSIENT
+from nerfies_jax.training.track_start import FROM_REST
 
 # Between these advice chooses by whether anything moves.
 ADVISED = ("nerf", "nerfies")
@@ -41,7 +42,7 @@ def advise(
     spec = _spec_of(preset, full)
     moves = wanted.get(MOTION) is not False and bool(_parts(spec, MOTIONS))
     if not moves:
-        overrides += ["start.motion=none"] if spec.start.motion == "tracks" else []
+        overrides += [FROM_REST] if spec.start.motion == "tracks" else []
         overrides += [f"{name}=none" for name in _parts(spec, MOTION_PARTS)]
     has_codes = spec.appearance is not None
     if drifts and not has_codes:

@@ -6,6 +6,8 @@ A suite is a set of arms: ways to reconstruct that differ in one part.
 import dataclasses
 from typing import Literal, NamedTuple
 
+from nerfies_jax.training.track_start import FROM_REST, FROM_TRACKS
+
 
 @dataclasses.dataclass(frozen=True)
 class Arm:
@@ -48,7 +50,6 @@ PICTURES = ("psnr", "ssim", "moving_psnr", "moving_ssim")
 MOVING = ("psnr", "moving_psnr", "moving_ssim")
 TRACKED = (*MOVING, "track_error")
 
-FROM_TRACKS, FROM_REST = "start.motion=tracks", "start.motion=none"
 STILL = "splats-static-small"  # has nothing to fit
 
 

@@ -1,6 +1,7 @@
 """What the papers leave open, or say without a table; no JAX."""
 
-from experiments.ablate.arms import FROM_TRACKS, MOVING, Arm, Claim, Suite
+from experiments.ablate.arms import MOVING, Arm, Claim, Suite
+from nerfies_jax.training.track_start import FROM_TRACKS
 
 RANDOM = "init.source=random"
 # What Sonata leaves open, from E-D3DGS, whose numbers the paper-size preset has.

@@ -1,13 +1,7 @@
 """What a start from tracks, the parts of the default and refined cameras are worth."""
 
-from experiments.ablate.arms import (
-    FROM_REST,
-    FROM_TRACKS,
-    TRACKED,
-    Arm,
-    Claim,
-    Suite,
-)
+from experiments.ablate.arms import TRACKED, Arm, Claim, Suite
+from nerfies_jax.training.track_start import FROM_REST, FROM_TRACKS
 
 # One view a step and Gaussians that are always there, as in the presets beside it.
 BASES_ALONE = ("batch_size=1", "temporal_opacity=none")

@@ -7,7 +7,8 @@ What moves is fitted to tracks first in all bases: from rest no setting finds it
 import dataclasses
 from typing import NamedTuple
 
-from experiments.ablate.arms import FROM_REST, FROM_TRACKS, Arm, Suite
+from experiments.ablate.arms import Arm, Suite
+from nerfies_jax.training.track_start import FROM_REST, FROM_TRACKS
 
 SPLATS, FIELD = "splats-tracked-small", "nerfies-grid-small"
 # Presets that start from rest, from tracks, named as in the league.

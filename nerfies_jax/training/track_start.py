@@ -4,6 +4,8 @@ import dataclasses
 import math
 
 STARTS = ("tracks", "none")
+# As `--set` takes them.
+FROM_TRACKS, FROM_REST = "start.motion=tracks", "start.motion=none"
 
 
 @dataclasses.dataclass(frozen=True)
