@@ -22,6 +22,7 @@ from gaussians_jax.raster_spec import RasterSpec
 from gaussians_jax.splats import Gaussians, refuse_half
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.geometry.fusion import components
+from nerfies_jax.geometry.jacobi import dot
 from nerfies_jax.geometry.precision import near_one
 
 # gsplat's MIN_COMPENSATION, squared: the antialiased opacity factor is at least 0.005.
@@ -88,7 +89,7 @@ def _project_one(mean, quaternion, scale, opacity, camera, size, spec):
     """Of one Gaussian, whose vectors are given by their components."""
     # R (x - c), not R x + t: exact far from origin
     offset = [x - camera.position[i] for i, x in enumerate(mean)]
-    depth = _dot(camera.camera_from_world[2], offset)
+    depth = dot(camera.camera_from_world[2], offset)
     drawn = (
         (depth >= spec.near) & (depth <= spec.far) & (opacity >= spec.alpha_threshold)
     )
@@ -125,15 +126,11 @@ def _project_one(mean, quaternion, scale, opacity, camera, size, spec):
     return Footprints(*fields, lax.stop_gradient(extent))
 
 
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
 def _project_frame(offset, camera, size, spec):
     """Mean in px, z, and the rows of J W (pixels per scene unit)."""
     width, height = size
     world = camera.camera_from_world
-    x, y, z = _dot(world[0], offset), _dot(world[1], offset), _dot(world[2], offset)
+    x, y, z = dot(world[0], offset), dot(world[1], offset), dot(world[2], offset)
     focal_x = camera.focal_px
     focal_y = camera.focal_px * camera.pixel_aspect
     centre_x, centre_y = camera.principal_point_px
@@ -186,7 +183,7 @@ def _footprint_rows(rows, quaternion, scale):
             1 - double * (x * x + y * y),
         ),
     )
-    return tuple([_dot(row, columns[i]) * scale[i] for i in range(3)] for row in rows)
+    return tuple([dot(row, columns[i]) * scale[i] for i in range(3)] for row in rows)
 
 
 def _whiten(first, second, spec):
@@ -196,7 +193,7 @@ def _whiten(first, second, spec):
     scaled by 1/sqrt(a) beforehand so that nothing of fourth order in px is formed.
     """
     dilation = spec.eps2d
-    variance_x = _dot(first, first) + dilation
+    variance_x = dot(first, first) + dilation
     inverse = lax.rsqrt(variance_x)
     n = [x * inverse for x in first]
     cross = (
@@ -204,9 +201,9 @@ def _whiten(first, second, spec):
         n[2] * second[0] - n[0] * second[2],
         n[0] * second[1] - n[1] * second[0],
     )
-    sharp = _dot(cross, cross)
-    blurred = sharp + dilation * (1 + _dot(second, second) / variance_x)
-    shear = _dot(n, second) * inverse
+    sharp = dot(cross, cross)
+    blurred = sharp + dilation * (1 + dot(second, second) / variance_x)
+    shear = dot(n, second) * inverse
     half = jnp.sqrt(jnp.asarray(0.5, variance_x.dtype))
     whitening = jnp.stack([half * inverse, shear, half * lax.rsqrt(blurred)])
     ratio = sharp / blurred
