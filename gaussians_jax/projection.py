@@ -10,7 +10,6 @@ where p = 1/sqrt(2 a), k = b/a and r = 1/sqrt(2 (c - b^2/a)) for the dilated cov
 an inverse matrix does so in float32 from needles of about 3000 px.
 """
 
-import functools
 from typing import NamedTuple
 
 import jax
@@ -22,7 +21,7 @@ from gaussians_jax.raster_spec import RasterSpec
 from gaussians_jax.splats import Gaussians, refuse_half
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.geometry.fusion import components
-from nerfies_jax.geometry.jacobi import dot
+from nerfies_jax.geometry.jacobi import cross, dot
 from nerfies_jax.geometry.precision import near_one
 
 # gsplat's MIN_COMPENSATION, squared: the antialiased opacity factor is at least 0.005.
@@ -95,7 +94,7 @@ def _project_one(mean, quaternion, scale, opacity, camera, size, spec):
     )
     for part in (*offset, *quaternion, *scale, opacity):
         drawn &= jnp.isfinite(part)
-    largest = functools.reduce(jnp.maximum, map(jnp.abs, quaternion))
+    largest = jnp.max(jnp.abs(jnp.stack(quaternion)))
     drawn &= largest >= jnp.finfo(largest.dtype).tiny
 
     # `where` differentiates both branches: what is not drawn becomes a unit sphere one
@@ -196,12 +195,8 @@ def _whiten(first, second, spec):
     variance_x = dot(first, first) + dilation
     inverse = lax.rsqrt(variance_x)
     n = [x * inverse for x in first]
-    cross = (
-        n[1] * second[2] - n[2] * second[1],
-        n[2] * second[0] - n[0] * second[2],
-        n[0] * second[1] - n[1] * second[0],
-    )
-    sharp = dot(cross, cross)
+    area = cross(n, second)
+    sharp = dot(area, area)
     blurred = sharp + dilation * (1 + dot(second, second) / variance_x)
     shear = dot(n, second) * inverse
     half = jnp.sqrt(jnp.asarray(0.5, variance_x.dtype))

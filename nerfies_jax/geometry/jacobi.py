@@ -87,11 +87,7 @@ def _complete(columns):
         tuple(jnp.where(own, r, side * s) for s, r in zip(spare, rest, strict=True)),
         spare,
     )
-    u3 = (
-        u1[1] * u2[2] - u1[2] * u2[1],
-        u1[2] * u2[0] - u1[0] * u2[2],
-        u1[0] * u2[1] - u1[1] * u2[0],
-    )
+    u3 = cross(u1, u2)
     return [u1, u2, u3], (length1, length2 * across, dot(u3, columns[2]))
 
 
@@ -151,3 +147,11 @@ def _unit(vector, otherwise):
 
 def dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def cross(a, b):
+    return (
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    )

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from nerfies_jax.geometry import quaternion
+from nerfies_jax.geometry.jacobi import cross
 from nerfies_jax.geometry.precision import at_least_float32, exact_product
 from nerfies_jax.geometry.stumpff import stumpff
 
@@ -116,14 +117,8 @@ def hat(vector: Vector) -> Matrix:
 
 
 def _cross(a, b):
-    # jnp.cross moves axes and concatenates; written out it fuses.
-    return jnp.stack(
-        [
-            a[1] * b[2] - a[2] * b[1],
-            a[2] * b[0] - a[0] * b[2],
-            a[0] * b[1] - a[1] * b[0],
-        ]
-    )
+    # jnp.cross moves axes and concatenates; this fuses.
+    return jnp.stack(cross(a, b))
 
 
 def _polynomial(angular, first, second):

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from nerfies_jax.geometry.fusion import components, stacked
+from nerfies_jax.geometry.jacobi import cross, dot
 from nerfies_jax.geometry.precision import at_least_float32, near_one
 from nerfies_jax.geometry.stumpff import stumpff
 
@@ -46,16 +47,11 @@ def identity(dtype=jnp.float32) -> Quaternion:
 @at_least_float32
 def multiply(second: Quaternion, first: Quaternion) -> Quaternion:
     """The rotation `first`, then `second`: the matrices' order of reading."""
-    w, x, y, z = components(second)
-    a, b, c, d = components(first)
-    return stacked(
-        [
-            w * a - (x * b + y * c + z * d),
-            w * b + a * x + (y * d - z * c),
-            w * c + a * y + (z * b - x * d),
-            w * d + a * z + (x * c - y * b),
-        ]
-    )
+    w, *v = components(second)
+    a, *u = components(first)
+    turn = cross(v, u)
+    vector = [w * u[i] + a * v[i] + turn[i] for i in range(3)]
+    return stacked([w * a - dot(v, u), *vector])
 
 
 def conjugate(quaternion: Quaternion) -> Quaternion:
@@ -119,7 +115,7 @@ def from_matrix(rotation: Float[Array, "3 3"]) -> Quaternion:
 def exp(rotation_vector: Float[Array, "3"]) -> Quaternion:
     """The unit quaternion of axis × angle, in rad; below 1e19 rad in float32."""
     parts = components(rotation_vector)
-    quarter_sq = sum(part * part for part in parts) / 4
+    quarter_sq = dot(parts, parts) / 4
     half = stumpff(1, quarter_sq) / 2
     return stacked([stumpff(0, quarter_sq), *(half * part for part in parts)])
 

@@ -197,7 +197,7 @@ def dssim_map(
     constant = value_range**2
     centre = middle_level(target)
     shape, channels = image.shape, image.shape[-1]
-    image, target = materialised(*(x.reshape(shape[0], -1) for x in (image, target)))
+    image, target = (materialised(x.reshape(shape[0], -1)) for x in (image, target))
     difference = image - target
     x, y = image - centre, target - centre
     maps = jnp.stack([x, y, x * x + y * y, difference * difference])
