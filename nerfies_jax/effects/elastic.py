@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int, Key
 
 from nerfies_jax.effects.effect import RayOutput, Scalar
 from nerfies_jax.geometry import matrix3
+from nerfies_jax.geometry.jacobi import cross, dot
 from nerfies_jax.training import losses, schedules
 from nerfies_jax.training.effects import Effect, PenaltyContext, Term
 from nerfies_jax.training.step_counts import steps
@@ -106,11 +107,7 @@ def determinant(displacement: Matrix) -> Scalar:
     """det(1 + D), as a triple product."""
     # Broadcast products: `jnp.linalg.det` is LU, whose slope at rank one is NaN.
     x, y, z = displacement + jnp.eye(3, dtype=displacement.dtype)
-    return (
-        x[0] * (y[1] * z[2] - y[2] * z[1])
-        + x[1] * (y[2] * z[0] - y[0] * z[2])
-        + x[2] * (y[0] * z[1] - y[1] * z[0])
-    )
+    return dot(x, cross(y, z))
 
 
 def energy(spec: ElasticSpec, context: PenaltyContext) -> tuple[Scalar, Scalar]:

@@ -1,7 +1,7 @@
 """All that is measured of frames that were never learnt from; a table of the keys."""
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax
@@ -82,18 +82,13 @@ class Lpips(NamedTuple):
     params: LpipsParams
 
 
-def load_lpips(network: Network, files: Sequence, size: tuple[int, int]) -> Lpips:
-    """Weights from files, for pictures of (width, height).
-
-    Raises ValueError where they cannot be read, are another network's, or the pictures
-    are too small for it.
-    """
+def check_large_enough(network: Network, size: tuple[int, int]) -> None:
+    """Raise ValueError where pictures of (width, height) are too small for LPIPS."""
     if min(size) < network.smallest:
         raise ValueError(
             f"LPIPS with {network.name} needs {network.smallest} pixels on the shorter "
             f"side, and the pictures are {size[0]}x{size[1]}; leave its weights out"
         )
-    return Lpips(network, perceptual.load(network, files))
 
 
 def heldout_metrics(

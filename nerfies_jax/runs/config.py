@@ -110,7 +110,7 @@ class MoreMetrics:
 
     lpips_weights: tuple[pathlib.Path | str, ...] = ()
     """Measure LPIPS, too: files (.pth, .safetensors, .npz) with the trained classifier
-    and LPIPS heads; read before the training."""
+    and LPIPS heads; read before all else."""
     lpips_network: Literal["alex", "vgg"] = "alex"
     """Whose weights these are."""
     fit_heldout_cameras: int = 0

@@ -38,16 +38,22 @@ class Extra(NamedTuple):
 NOTHING = Extra(None, 0)
 
 
-def prepared(more: MoreMetrics, size: tuple[int, int]) -> Extra:
-    """The weights read, for pictures of (width, height); before any training.
+def prepared(more: MoreMetrics) -> Extra:
+    """The weights read, before cameras are looked for or anything is trained.
 
     Raises ValueError where they cannot be used.
     """
     lpips = None
     if more.lpips_weights:
         network = NETWORKS[more.lpips_network]
-        lpips = heldout.load_lpips(network, more.lpips_weights, size)
+        lpips = Lpips(network, perceptual.load(network, more.lpips_weights))
     return Extra(lpips, more.fit_heldout_cameras)
+
+
+def check(extra: Extra, size: tuple[int, int]) -> None:
+    """Raise ValueError where pictures of (width, height) cannot be measured so."""
+    if extra.lpips is not None:
+        heldout.check_large_enough(extra.lpips.network, size)
 
 
 def measure(

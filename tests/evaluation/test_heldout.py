@@ -161,7 +161,7 @@ def test_large_pictures_get_ms_ssim_and_weights_lpips(rng, tmp_path):
         flow=None,
     )
     np.savez(tmp_path / "tiny.npz", **state_dict("tiny", rng))
-    lpips = heldout.load_lpips(TINY, [tmp_path / "tiny.npz"], capture.size)
+    lpips = heldout.Lpips(TINY, perceptual.load(TINY, [tmp_path / "tiny.npz"]))
     scored = drawn(capture, rng)
     numbers = heldout_metrics(scored, capture, lpips=lpips)
     assert set(numbers) == ALWAYS | {"heldout.ms_ssim", "heldout.lpips"}
@@ -184,7 +184,7 @@ def test_large_pictures_get_ms_ssim_and_weights_lpips(rng, tmp_path):
     )
     assert numbers["heldout.lpips"] == pytest.approx(float(exact), rel=1e-4)
     with pytest.raises(ValueError, match="9 pixels on the shorter side"):
-        heldout.load_lpips(TINY, [], (40, 8))
+        heldout.check_large_enough(TINY, (40, 8))
 
 
 @pytest.mark.parametrize("double", [False, True])

@@ -4,6 +4,7 @@ import json
 import re
 import shlex
 
+import numpy as np
 import pytest
 
 from experiments import cli, reconstruct
@@ -18,6 +19,7 @@ from nerfies_jax.runs import (
 from nerfies_jax.runs.config import CaptureSource, RunConfig
 from tests import scenes
 from tests.evidence import films
+from tests.measure.test_perceptual import state_dict
 
 
 @pytest.fixture
@@ -67,12 +69,21 @@ def test_frames_without_their_picture_are_left_out_where_asked(
         (("--heldout", "1"), "held"),
         (("--prepare.frames", "9"), "has its own"),
         (("--checkpoint-every", "-1"), "--checkpoint-every -1"),
-        (("--lpips-weights", "a.npz"), "31 pixels on the shorter side"),
-        (("--lpips-weights", "a.npz", "--lpips-network", "vgg"), "a.npz: no such file"),
+        (("--lpips-weights", "a.npz"), "a.npz: no such file"),
     ],
 )
 def test_wrong_settings_are_refused(arguments, words, filmed, capsys, tmp_path):
     assert words in refused(capsys, filmed, "--out", tmp_path / "run", *arguments)
+    assert not (tmp_path / "run").exists()
+
+
+def test_pictures_that_are_too_small_for_lpips_are_refused(
+    filmed, capsys, tmp_path, rng
+):
+    weights = tmp_path / "alex.npz"
+    np.savez(weights, **state_dict("alex", rng))
+    asked = "--out", tmp_path / "run", "--lpips-weights", weights
+    assert "31 pixels on the shorter side" in refused(capsys, filmed, *asked)
     assert not (tmp_path / "run").exists()
 
 

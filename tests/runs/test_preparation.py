@@ -14,7 +14,12 @@ from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.structure_from_motion import FewPlaced, Poses
 from nerfies_jax.evidence import masks_without_cameras
 from nerfies_jax.runs import movers, preparation, reconstruction
-from nerfies_jax.runs.config import CaptureSource, Preparation, RunConfig
+from nerfies_jax.runs.config import (
+    CaptureSource,
+    MoreMetrics,
+    Preparation,
+    RunConfig,
+)
 from tests import scenes
 from tests.capture import test_colmap as models
 
@@ -253,7 +258,7 @@ def test_wrong_settings_are_refused_before_a_film_is_read(wrong, words):
         Preparation(**wrong)
 
 
-def test_a_wrong_preset_is_refused_before_cameras_are_looked_for(tmp_path, mapper):
+def test_wrong_words_are_refused_before_cameras_are_looked_for(tmp_path, mapper):
     frames = [models.picture(row).repeat(2, 0).repeat(2, 1) for row in range(9)]
     video.write_video(tmp_path / "clip.mp4", frames, 30)
     source = CaptureSource(tmp_path / "clip.mp4")
@@ -266,5 +271,8 @@ def test_a_wrong_preset_is_refused_before_cameras_are_looked_for(tmp_path, mappe
     for config in wrong:
         with pytest.raises(reconstruction.Refused):
             reconstruction.reconstruct(config, tmp_path / "run")
+    more = MoreMetrics(lpips_weights=(tmp_path / "a.npz",))
+    with pytest.raises(reconstruction.Refused, match=r"a\.npz: no such file"):
+        reconstruction.reconstruct(RunConfig(None, source), tmp_path / "run", more=more)
     assert mapper.calls == []
     assert [path.name for path in tmp_path.iterdir()] == ["clip.mp4"]
