@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from nerfies_jax.geometry.fusion import materialised
 from nerfies_jax.geometry.precision import at_least_float32
 
 Scalar = Float[Array, ""]
@@ -73,9 +74,7 @@ def encode(
     # off at k = 9 and noise at |x| = 1e4. Measured with 8 bands, the polynomial takes
     # 0.55 of the time forward and 0.14 in the gradient. Without π the product is exact
     # and XLA's sine good to 3e-8 at any argument; reducing by π/2 would limit |x|.
-    sine, cosine = (
-        sincospi(scaled) if spec.times_pi else (jnp.sin(scaled), jnp.cos(scaled))
-    )
+    sine, cosine = sincospi(scaled) if spec.times_pi else sincos(scaled)
     waves = jnp.stack([sine, cosine], axis=1)
     if window is not None:
         waves = waves * window[:, None, None]
@@ -98,6 +97,25 @@ def anneal(bands: int, alpha: Scalar) -> Float[Array, " bands"]:
 
 
 @jax.custom_jvp
+def sincos(
+    angle: Float[Array, "*batch"],
+) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
+    """sin x and cos x together, of any finite x, as exact as XLA has them.
+
+    Each is computed once, where XLA:CPU would compute it in the features and again for
+    their slopes: a step of `nerfies-small` takes 120 ms for 127, of `d-nerf-small` 114
+    for 123 (least of 24, side by side in one process).
+    """
+    return materialised(jnp.sin(angle)), materialised(jnp.cos(angle))
+
+
+@sincos.defjvp
+def _sincos_jvp(primals, tangents):
+    sine, cosine = sincos(*primals)
+    return (sine, cosine), (cosine * tangents[0], -sine * tangents[0])
+
+
+@jax.custom_jvp
 @at_least_float32
 def sincospi(
     half_turns: Float[Array, "*batch"],
@@ -117,10 +135,9 @@ def sincospi(
     first = jnp.where(swap, cosine, sine)
     second = jnp.where(swap, sine, cosine)
     # quarter is -2 .. 2; the quadrants' signs
-    return (
-        jnp.where((quarter < 0) | (quarter == 2), -first, first),
-        jnp.where((quarter == 1) | (jnp.abs(quarter) == 2), -second, second),
-    )
+    sine = jnp.where((quarter < 0) | (quarter == 2), -first, first)
+    cosine = jnp.where((quarter == 1) | (jnp.abs(quarter) == 2), -second, second)
+    return materialised(sine), materialised(cosine)
 
 
 @sincospi.defjvp

@@ -66,6 +66,23 @@ def test_gradient_and_curvature(times_pi, float64, rng):
     assert gradients.directional_error(both, point, window) < 1e-7
 
 
+def test_a_compiled_slope_reads_the_waves_of_the_features():
+    """Of XLA:CPU, which computes sines wherever they are read if they may be fused."""
+    spec = EncodingSpec(8)
+
+    def slope(points, matrix):
+        return jax.grad(
+            lambda x: jnp.sum(
+                jnp.tanh(jax.vmap(lambda p: encoding.encode(spec, p, None))(x) @ matrix)
+            )
+        )(points)
+
+    with jax.default_device(jax.local_devices(backend="cpu")[0]):
+        lowered = jax.jit(slope).lower(np.ones((64, 3)), np.ones((51, 4)))
+        text = lowered.compile().as_text()
+    assert text.count(" sine(") == text.count(" cosine(") == 1
+
+
 @pytest.mark.hard_cases
 def test_the_window_is_exact_at_its_ends_and_opens_smoothly(dtype):
     def window(alpha):
