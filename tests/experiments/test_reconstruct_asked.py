@@ -70,6 +70,7 @@ def test_frames_without_their_picture_are_left_out_where_asked(
         (("--prepare.frames", "9"), "has its own"),
         (("--checkpoint-every", "-1"), "--checkpoint-every -1"),
         (("--lpips-weights", "a.npz"), "a.npz: no such file"),
+        (("--lpips-weights", "a.npz", "--lpips-network", "vgg"), "a.npz: no such file"),
     ],
 )
 def test_wrong_settings_are_refused(arguments, words, filmed, capsys, tmp_path):
