@@ -5,7 +5,7 @@ import mpmath
 import numpy as np
 
 from experiments.hard_cases.case import Case
-from nerfies_jax.nets import encoding, grids
+from nerfies_jax.nets import encoding, grids, sines
 from nerfies_jax.nets.encoding import EncodingSpec
 
 BANDS = 10
@@ -88,12 +88,57 @@ _PLACES = _with_negatives([0, 1e-30, 1e-8, 1e-4, 0.01, 0.7371, 1, 10, 1e3, 1e4])
 PLAIN_WAVES = Case(
     name="sin and cos of 2ᵏx",
     breaks="cos as sin(a + π/2): the sum is rounded to an ulp of a",
-    formula="sin and cos of the exact product",
+    formula="sin and cos of the exact product, as XLA has them",
+    switch="|2ᵏx| = 12,800 of any number of the array",
     axis="x",
     at=_PLACES,
     inputs=_PLACES[:, None],
     stable=_features(PLAIN),
     textbook=_quarter_turn_on,
+    exact=_exact_features(lambda: +mpmath.pi),
+    bounds={
+        "bfloat16": (4e-3, 8e-3),
+        "float32": (2e-7, 2e-7, 2e-7),
+        "float64": (4e-16, 4e-16, 4e-16),
+    },
+    floors=(1, TOP, TOP**2),
+    caught=(("float32", "value"), ("float64", "value"), ("float32", "slope")),
+    timed=np.array([0.3]),
+)
+
+
+def _one_part(x):
+    """Reduced by quarter turns that are rounded once, and then to their product."""
+    angles = 2 ** jnp.arange(BANDS, dtype=x.dtype)[:, None] * x
+    turns = jnp.round(angles / (0.5 * jnp.pi))
+    rest = angles - turns * jnp.asarray(0.5 * jnp.pi, x.dtype)
+    swap, flip = turns % 2 == 1, turns % 4
+    sine = jnp.where(swap, jnp.cos(rest), jnp.sin(rest))
+    cosine = jnp.where(swap, jnp.sin(rest), jnp.cos(rest))
+    waves = (
+        jnp.where(flip >= 2, -sine, sine),
+        jnp.where((flip == 1) | (flip == 2), -cosine, cosine),
+    )
+    return jnp.stack(waves, axis=1).reshape(-1)
+
+
+# Odd eighths of a period of the last band, where quadrants meet, and the last number
+# that is reduced in vectors.
+_EIGHTHS = [edge for n in (1, 3, 9, 16001) for edge in _sides(n * np.pi / 4 / TOP)]
+_LAST = sines.LARGEST_REDUCED / TOP
+_NEAR = _with_negatives(
+    [0, 1e-30, 1e-8, 1e-4, 0.01, 0.7371, 1, 10, *_EIGHTHS, *_sides(_LAST)]
+)
+NEAR_WAVES = Case(
+    name="sin and cos of 2ᵏx up to 12,800",
+    breaks="x - n π/2 with π/2 rounded: n times its error, 3e-4 at the end",
+    formula="π/2 in three parts, then quadrants and a polynomial on [-π/4, π/4]",
+    switch="quadrants, odd eighths of a period; |2ᵏx| = 12,800",
+    axis="x",
+    at=_NEAR,
+    inputs=_NEAR[:, None],
+    stable=_features(PLAIN),
+    textbook=_one_part,
     exact=_exact_features(lambda: +mpmath.pi),
     bounds={
         "bfloat16": (4e-3, 8e-3),
@@ -185,4 +230,4 @@ CONTRACTION = Case(
     timed=np.array([0.5]),
 )
 
-CASES = (HALF_TURNS, PLAIN_WAVES, WINDOW, CONTRACTION)
+CASES = (HALF_TURNS, PLAIN_WAVES, NEAR_WAVES, WINDOW, CONTRACTION)

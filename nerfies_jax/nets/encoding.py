@@ -3,18 +3,13 @@
 import dataclasses
 import math
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from nerfies_jax.geometry.fusion import materialised
 from nerfies_jax.geometry.precision import at_least_float32
+from nerfies_jax.nets.sines import sincos, sincospi
 
 Scalar = Float[Array, ""]
-
-# sin πr and cos πr on |r| <= 1/4 as polynomials in r²: these Taylor terms leave 7e-9
-# (float32) and 2e-17 (float64).
-_TERMS = {"float32": 5, "float64": 9}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,9 +66,8 @@ def encode(
     powers = jnp.asarray([2.0**k for k in range(spec.bands)], point.dtype)
     scaled = powers[:, None] * point  # a power of two: exact; float16 would overflow
     # Half turns are reduced before π is rounded in: `sin(2^k π x)` in float32 is 1e-4
-    # off at k = 9 and noise at |x| = 1e4. Measured with 8 bands, the polynomial takes
-    # 0.55 of the time forward and 0.14 in the gradient. Without π the product is exact
-    # and XLA's sine good to 3e-8 at any argument; reducing by π/2 would limit |x|.
+    # off at k = 9 and noise at |x| = 1e4. Without π the product is exact, and so is the
+    # sine at any argument.
     sine, cosine = sincospi(scaled) if spec.times_pi else sincos(scaled)
     waves = jnp.stack([sine, cosine], axis=1)
     if window is not None:
@@ -94,66 +88,3 @@ def anneal(bands: int, alpha: Scalar) -> Float[Array, " bands"]:
     opened = jnp.clip(alpha - jnp.arange(bands, dtype=alpha.dtype), 0, 1)
     # The polynomial's ends are exact: a shut band is 0 and an open one is 1.
     return sincospi(opened / 2)[0] ** 2
-
-
-@jax.custom_jvp
-def sincos(
-    angle: Float[Array, "*batch"],
-) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
-    """sin x and cos x together, of any finite x, as exact as XLA has them.
-
-    Each is computed once, where XLA:CPU would compute it in the features and again for
-    their slopes: a step of `nerfies-small` takes 120 ms for 127, of `d-nerf-small` 114
-    for 123 (least of 24, side by side in one process).
-    """
-    return materialised(jnp.sin(angle)), materialised(jnp.cos(angle))
-
-
-@sincos.defjvp
-def _sincos_jvp(primals, tangents):
-    sine, cosine = sincos(*primals)
-    return (sine, cosine), (cosine * tangents[0], -sine * tangents[0])
-
-
-@jax.custom_jvp
-@at_least_float32
-def sincospi(
-    half_turns: Float[Array, "*batch"],
-) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
-    """sin πx and cos πx together, of any finite x, to an ulp or two of 1."""
-    x = half_turns
-    # Both steps are exact: x - 2 round(x/2) loses no bits, nor does taking off a
-    # multiple of ½, so nothing is rounded before the multiplication by π.
-    turn = x - 2 * jnp.round(x / 2)
-    quarter = jnp.round(2 * turn)
-    r = turn - quarter / 2
-    r_sq = r * r
-    terms = _TERMS[x.dtype.name]
-    sine = r * _horner([_coefficient(2 * n + 1) for n in range(terms)], r_sq)
-    cosine = _horner([_coefficient(2 * n) for n in range(terms + 1)], r_sq)
-    swap = jnp.abs(quarter) == 1
-    first = jnp.where(swap, cosine, sine)
-    second = jnp.where(swap, sine, cosine)
-    # quarter is -2 .. 2; the quadrants' signs
-    sine = jnp.where((quarter < 0) | (quarter == 2), -first, first)
-    cosine = jnp.where((quarter == 1) | (jnp.abs(quarter) == 2), -second, second)
-    return materialised(sine), materialised(cosine)
-
-
-@sincospi.defjvp
-def _sincospi_jvp(primals, tangents):
-    """π cos and -π sin: the polynomial's own derivative has one term less."""
-    sine, cosine = sincospi(*primals)
-    turned = math.pi * tangents[0]
-    return (sine, cosine), (cosine * turned, -sine * turned)
-
-
-def _coefficient(power):
-    return (-1) ** (power // 2) * math.pi**power / math.factorial(power)
-
-
-def _horner(coefficients, x):
-    total = jnp.full_like(x, coefficients[-1])
-    for coefficient in reversed(coefficients[:-1]):
-        total = total * x + coefficient
-    return total
