@@ -239,6 +239,7 @@ SMALL_NERF_DS = dataclasses.replace(
 )
 SMALL_NSFF = dataclasses.replace(
     SMALL_NERF,
+    micro_batches=4,  # each moment thrice: 233 ms a step on two cores, 265 of two
     sampling=SamplingSpec(48, 0),
     scene_flow=SceneFlowSpec(
         network=TemplateSpec(
@@ -308,7 +309,7 @@ SMALL_TINEUVOX = dataclasses.replace(
 
 def _on_grid(preset: RadianceScene) -> RadianceScene:
     """A small preset with its template on a grid; what moves starts from tracks."""
-    names = ("rays", "template", "coarse", "template_rate")
+    names = ("rays", "micro_batches", "template", "coarse", "template_rate")
     grid = {name: getattr(SMALL_NERF_GRID, name) for name in names}
     # A grid shows what does not move within seconds, and a warp that has found nothing
     # by then stays at rest. Papers' own schedules stand with the MLPs.

@@ -16,9 +16,12 @@ from nerfies_jax.measure import matrix_flops
 from nerfies_jax.training.model import Frames, Model, PyTree, TrainState
 
 LENGTH = 10  # steps of a scan
-# Fewer steps than these in all, or more work in each (a tenth of a second on a core),
-# are not worth a scan of several steps: it cannot be interrupted.
-FEW_STEPS, LARGE_FLOPS = 100, 5e9
+# A scan cannot be interrupted: it has less work than this (two seconds of a core), or
+# a single step. Each call asks the system for its memory anew, page by page: of single
+# steps of `d-nerf-small` that is 24 of 110 ms, of ten at once 2 of 87.
+SCAN_FLOPS = 1e11
+SHORTER = 5, 2, 1  # lengths of scans of larger steps
+FEW_STEPS = 100  # a run of fewer has single steps
 
 
 class Outcome(NamedTuple):
@@ -108,9 +111,10 @@ def _check_same(before, after):
 class Program:
     """Any number of steps for arrays of the same shapes: scans, and single steps.
 
-    Compiled are one scan of LENGTH steps and, only where there is a remainder, one of a
-    single step: a step has the same bits wherever chunks of LENGTH end. (A scan of each
-    length would be compiled anew; one that skips steps copies the state for each.)
+    Compiled are one scan of `length` steps, LENGTH or fewer of large ones, and, only
+    where there is a remainder, one of a single step: a step has the same bits wherever
+    chunks of LENGTH end. (A scan of each length would be compiled anew; one that skips
+    steps copies the state for each.)
     Called with (state, frames, count) it gives the state and the `Outcome`; the state
     given is overwritten. Of a step that works on several devices, state and outcome are
     on the first of them, `frames` on all (`data_parallel.replicate`).
@@ -121,10 +125,13 @@ class Program:
         self._step, self._devices = jax.jit(step, inline=True), devices
         self._shapes = jax.tree.map(_abstract, (self._on_all(state), frames))
         self._lowered, self._programs = {}, {}
-        self.length = 1
-        if steps >= FEW_STEPS and self._flops() < LARGE_FLOPS:
-            self.length = LENGTH
+        self.length = 1 if steps < FEW_STEPS else self._most_at_once()
         self._lower(self.length)
+
+    def _most_at_once(self):
+        flops = self._flops()
+        fit = (n for n in (LENGTH, *SHORTER) if n * flops < SCAN_FLOPS)
+        return next(fit, 1)
 
     def _flops(self):
         """Of a step: what XLA counts, where the loops' bodies count once, or products.

@@ -247,8 +247,10 @@ def test_chunks_of_slow_steps_stay_short_enough_to_interrupt(frames, monkeypatch
     assert len(lengths) < 25
 
 
-@pytest.mark.parametrize(("rounds", "length"), [(2, chunk.LENGTH), (40, 1)])
-def test_large_steps_are_scanned_one_by_one(rounds, length, frames):
+@pytest.mark.parametrize(
+    ("rounds", "length"), [(2, chunk.LENGTH), (60, 5), (120, 2), (240, 1), (800, 1)]
+)
+def test_large_steps_are_scanned_few_at_once(rounds, length, frames):
     def step(state, frames):
         state, metrics = toy.step(state, frames)
         squares = jnp.full((rounds, 512, 512), metrics["loss"])
