@@ -129,25 +129,14 @@ _LAST = sines.LARGEST_REDUCED / TOP
 _NEAR = _with_negatives(
     [0, 1e-30, 1e-8, 1e-4, 0.01, 0.7371, 1, 10, *_EIGHTHS, *_sides(_LAST)]
 )
-NEAR_WAVES = Case(
+NEAR_WAVES = PLAIN_WAVES._replace(
     name="sin and cos of 2ᵏx up to 12,800",
     breaks="x - n π/2 with π/2 rounded: n times its error, 3e-4 at the end",
     formula="π/2 in three parts, then quadrants and a polynomial on [-π/4, π/4]",
     switch="quadrants, odd eighths of a period; |2ᵏx| = 12,800",
-    axis="x",
     at=_NEAR,
     inputs=_NEAR[:, None],
-    stable=_features(PLAIN),
     textbook=_one_part,
-    exact=_exact_features(lambda: +mpmath.pi),
-    bounds={
-        "bfloat16": (4e-3, 8e-3),
-        "float32": (2e-7, 2e-7, 2e-7),
-        "float64": (4e-16, 4e-16, 4e-16),
-    },
-    floors=(1, TOP, TOP**2),
-    caught=(("float32", "value"), ("float64", "value"), ("float32", "slope")),
-    timed=np.array([0.3]),
 )
 
 
