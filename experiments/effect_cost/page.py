@@ -44,8 +44,9 @@ none of its own; it stands for what no preset has.{apart}
   what a step needs beside its inputs and outputs.
 - *compile s* is paid once per run and shape, and not at all from the compilation
   cache.
-- *step ms* is processor time of one core, medians of {repeats} calls or more, all
-  scenes of a preset in turn. Ratios hold on other machines better than milliseconds.
+- *step ms* is processor time of one core, a tenth of a call of ten steps, medians of
+  {repeats} calls or more, all scenes of a preset in turn. Ratios hold on other machines
+  better than milliseconds.
 - *over bare* is a step's time over that of the bare scene. Prices do not add up
   exactly: the compiler joins what it finds side by side. An effect that does next to
   nothing may stand a little below 1.
