@@ -17,6 +17,7 @@ Device = Literal["auto", "cpu", "gpu", "tpu"]
 Threads = Literal["one", "all"]
 _AFFINITY = hasattr(psutil.Process, "cpu_affinity")  # not on macOS
 VECTOR_WIDTH = "--xla_cpu_prefer_vector_width"  # XLA:CPU's own is 256 bits
+LEFT_OUT = "--xla_disable_hlo_passes"
 
 
 def start_jax(
@@ -27,12 +28,17 @@ def start_jax(
     Steps that fall into equal `shares` get as many CPU devices, where there are so many
     cores (`data_parallel`). Call it before the first array is made; it is too late
     afterwards. `PJRT_NPROC` and `JAX_NUM_CPU_DEVICES` in the environment have the last
-    word, as has `XLA_FLAGS` on the width of vectors: 512 bits where the processor has
-    them. Raises ValueError where the device is not there.
+    word, as has `XLA_FLAGS` on the width of vectors, 512 bits where the processor has
+    them, and on the passes that are left out: where each device sees one core, that
+    which divides loops. Raises ValueError where the device is not there.
     """
-    if threads == "one":
-        os.environ.setdefault("PJRT_NPROC", "1")
-    _prefer_wide_vectors()
+    if threads == "one" and os.environ.setdefault("PJRT_NPROC", "1") == "1":
+        # Of two devices it would divide each one's loops among both cores, which are
+        # busy: a step of `splats-tracked-small` takes 22.9 ms for 24.6, a frame 8 for 11.
+        _set_flag(LEFT_OUT, "cpu-parallel-task-assigner")
+    if "avx512f" in _processor_flags():
+        # Splats train in 0.88 of the time (10,000 Gaussians, 256x192, side by side).
+        _set_flag(VECTOR_WIDTH, "512")
     import jax
 
     if shares > 1 and "JAX_NUM_CPU_DEVICES" not in os.environ:
@@ -63,14 +69,10 @@ def cores() -> int:
     return len(psutil.Process().cpu_affinity()) if _AFFINITY else os.cpu_count() or 1
 
 
-def _prefer_wide_vectors():
-    """Have XLA:CPU use whole 512-bit registers; splats train in 0.88 of the time.
-
-    (10,000 Gaussians, 256x192, two runs side by side.)
-    """
+def _set_flag(name, value):
     flags = os.environ.get("XLA_FLAGS", "")
-    if VECTOR_WIDTH not in flags and "avx512f" in _processor_flags():
-        os.environ["XLA_FLAGS"] = f"{flags} {VECTOR_WIDTH}=512".strip()
+    if name not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} {name}={value}".strip()
 
 
 def _processor_flags():
