@@ -33,8 +33,8 @@ def start_jax(
     which divides loops. Raises ValueError where the device is not there.
     """
     if threads == "one" and os.environ.setdefault("PJRT_NPROC", "1") == "1":
-        # Of two devices it would divide each one's loops among both cores, which are
-        # busy: a step of `splats-tracked-small` takes 22.9 ms for 24.6, a frame 8 for 11.
+        # It would divide the loops of each of two devices among both cores, which are
+        # busy: a step of `splats-tracked-small` takes 21 ms for 24, a frame 8 for 11.
         _set_flag(LEFT_OUT, "cpu-parallel-task-assigner")
     if "avx512f" in _processor_flags():
         # Splats train in 0.88 of the time (10,000 Gaussians, 256x192, side by side).
