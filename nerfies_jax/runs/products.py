@@ -62,7 +62,9 @@ def make(
             "finite"
         )
     ms_per_frame = renderer.ms_per_frame(len(scored.rows))
-    # Compiles while all else is written.
+    player, unplayed = save_player(folder, run, trained)
+    # Compiles while all else is written, but for the player, whose own compiling fills
+    # both cores.
     with step_profile.profiling(run, state) as profile:
         comparison = save_comparison(folder / "comparison.png", run.filmed, scored)
         figures = [report.Figure(comparison, COMPARED)]
@@ -76,7 +78,6 @@ def make(
         film = with_extra(
             save_film, folder / "scene.mp4", run, renderer, state, ms_per_frame / 1e3
         )
-        player, unplayed = save_player(folder, run, trained)
         save_depth(folder / "depth", run.capture, scored)
         saved = run.representation.save(
             folder, run.spec, run.metadata, state, effects=run.effects
