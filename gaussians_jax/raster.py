@@ -4,9 +4,10 @@ Front-to-back compositing over square tiles (Kerbl et al. 2023, arXiv:2308.04079
 equation 3), streamed over chunks in depth order (`binning`), with a hand-written
 backward pass that recomputes every alpha (`blending`).
 
-On the CPU let each device see one core (environment variable PJRT_NPROC=1, set before
-JAX starts): XLA splits every small operation of the loops over all cores it sees, which
-costs twice the CPU time and 1.0 to 1.9 times the wall time. To use several cores, draw
+On the CPU XLA splits every small operation of the loops over all cores it sees, which
+costs twice the CPU time and 1.0 to 1.9 times the wall time. A `Model` of Gaussians is
+compiled without that; so is a function of your own by `jax.jit(function,
+compiler_options=UNDIVIDED)` (`nerfies_jax.compiler`). To use several cores, draw
 several views at once, each on a CPU device (`nerfies_jax.data_parallel`).
 """
 

@@ -30,7 +30,7 @@ from gaussians_jax.spec import (
 )
 from gaussians_jax.splats import Params, Splats
 from gaussians_jax.update import Drawn
-from nerfies_jax import data_parallel
+from nerfies_jax import compiler, data_parallel
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.scene_metadata import exposures
 from nerfies_jax.training import loop, losses
@@ -138,6 +138,7 @@ def build(
         example=example,
         devices=devices,
         found=_finder(effects),
+        compiler_options=compiler.UNDIVIDED,
     )
 
 

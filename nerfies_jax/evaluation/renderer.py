@@ -144,14 +144,15 @@ def _surveyed(model, size, inputs):
 
     survey = jax.jit(model.surveyed.survey).lower(params, step)
     drawn = jax.jit(draw).lower(params, survey.out_info, view, step)
-    return Surveyed(survey.compile(), drawn.compile())
+    return Surveyed(*_all_compiled(model, survey, drawn))
 
 
 def _whole(model, size, inputs):
     def render(params, view, step):
         return _float32(model.render(params, view, size, step))
 
-    return jax.jit(render).lower(*inputs).compile()
+    (program,) = _all_compiled(model, jax.jit(render).lower(*inputs))
+    return program
 
 
 def _staged(model, size, inputs):
@@ -163,7 +164,11 @@ def _staged(model, size, inputs):
     prepare = jax.jit(stages.prepare).lower(params)
     deform = jax.jit(stages.deform).lower(params, prepare.out_info, view.time)
     drawn = jax.jit(draw).lower(params, deform.out_info, view, step)
-    return _Programs(prepare.compile(), deform.compile(), drawn.compile())
+    return _Programs(*_all_compiled(model, prepare, deform, drawn))
+
+
+def _all_compiled(model, *lowered):
+    return [program.compile(model.compiler_options) for program in lowered]
 
 
 def as_picture(colour: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import jax
 
-from nerfies_jax import background
+from nerfies_jax import compiler
 from nerfies_jax.measure import clock
 
 REPEATS = 7
@@ -39,7 +39,7 @@ class StepParts(NamedTuple):
 
 def part(function: Callable[..., Any], *args: Any) -> Part:
     """A call, compiled in the background; its arrays are inputs, not constants."""
-    return Part(background.begun(jax.jit(function).lower(*args).compile), args)
+    return Part(compiler.begun(jax.jit(function).lower(*args).compile), args)
 
 
 def parts_ms(parts: Mapping[str, Part]) -> dict[str, float]:

@@ -11,13 +11,13 @@ from typing import Literal
 import psutil
 
 from nerfies_jax.capture.cache import CACHE
+from nerfies_jax.compiler import UNDIVIDED
 
 Device = Literal["auto", "cpu", "gpu", "tpu"]
 # Whether XLA:CPU sees one core or all of them; each representation says which suits it.
 Threads = Literal["one", "all"]
 _AFFINITY = hasattr(psutil.Process, "cpu_affinity")  # not on macOS
 VECTOR_WIDTH = "--xla_cpu_prefer_vector_width"  # XLA:CPU's own is 256 bits
-LEFT_OUT = "--xla_disable_hlo_passes"
 
 
 def start_jax(
@@ -33,9 +33,10 @@ def start_jax(
     which divides loops. Raises ValueError where the device is not there.
     """
     if threads == "one" and os.environ.setdefault("PJRT_NPROC", "1") == "1":
-        # It would divide the loops of each of two devices among both cores, which are
-        # busy: a step of `splats-tracked-small` takes 21 ms for 24, a frame 8 for 11.
-        _set_flag(LEFT_OUT, "cpu-parallel-task-assigner")
+        # XLA sees a thread for each device, and would divide the loops of each among
+        # all: a step of `splats-tracked-small` on two takes 21 ms for 24.
+        for name, value in UNDIVIDED.items():
+            _set_flag(f"--{name}", value)
     if "avx512f" in _processor_flags():
         # Splats train in 0.88 of the time (10,000 Gaussians, 256x192, side by side).
         _set_flag(VECTOR_WIDTH, "512")

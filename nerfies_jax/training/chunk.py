@@ -2,7 +2,7 @@
 
 import functools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from typing import Any, NamedTuple
 
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from nerfies_jax import background, data_parallel
+from nerfies_jax import compiler, data_parallel
 from nerfies_jax.measure import matrix_flops
 from nerfies_jax.training.model import Frames, Model, PyTree, TrainState
 
@@ -120,9 +120,18 @@ class Program:
     on the first of them, `frames` on all (`data_parallel.replicate`).
     """
 
-    def __init__(self, step, state: TrainState, frames: Frames, steps: int, devices=1):
+    def __init__(
+        self,
+        step,
+        state: TrainState,
+        frames: Frames,
+        steps: int,
+        devices: int = 1,
+        options: Mapping[str, str] | None = None,
+    ):
         # Traced once for both lengths, which takes most of the time to lower.
         self._step, self._devices = jax.jit(step, inline=True), devices
+        self._options = options
         self._shapes = jax.tree.map(_abstract, (self._on_all(state), frames))
         self._lowered, self._programs = {}, {}
         self.length = 1 if steps < FEW_STEPS else self._most_at_once()
@@ -159,7 +168,7 @@ class Program:
             return 0.0
         began = time.perf_counter()
         for length in missing:
-            self._programs[length] = self._lower(length).compile()
+            self._programs[length] = self._lower(length).compile(self._options)
         return time.perf_counter() - began
 
     def _lengths(self, count):
@@ -188,17 +197,19 @@ def _abstract(leaf):
 
 
 def program(
-    step, state: TrainState, frames: Frames, steps: int, devices: int = 1
+    model: Model, state: TrainState, frames: Frames, steps: int
 ) -> tuple[Program, float]:
     """For these shapes and a run of `steps` in all, and the seconds of lowering it."""
-    programs = _programs(step)
+    programs = _programs(model.step)
     leaves, structure = jax.tree.flatten((state, frames))
     shapes = tuple((x.shape, x.dtype, x.sharding) for x in leaves)
     key = structure, shapes, steps >= FEW_STEPS
     if key in programs:
         return programs[key], 0.0
     began = time.perf_counter()
-    programs[key] = Program(step, state, frames, steps, devices)
+    programs[key] = Program(
+        model.step, state, frames, steps, model.devices, model.compiler_options
+    )
     return programs[key], time.perf_counter() - began
 
 
@@ -218,13 +229,13 @@ def compiling(
     Compiles in the background; the result is the seconds that making it took.
     """
     made, _, seconds = _lowered(model, state, frames, steps)
-    return background.begun(lambda: seconds + made.prepare(made.length))
+    return compiler.begun(lambda: seconds + made.prepare(made.length))
 
 
 def _lowered(model, state, frames, steps):
     frames = jax.tree.map(jnp.asarray, frames)
     frames = data_parallel.shared(frames, model.devices)
-    made, seconds = program(model.step, state, frames, steps, model.devices)
+    made, seconds = program(model, state, frames, steps)
     return made, frames, seconds
 
 

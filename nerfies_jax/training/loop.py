@@ -149,11 +149,7 @@ class _Run:
             if requests.name is not None:
                 return requests.name
             program, lower_seconds = chunk.program(
-                self.model.step,
-                self.state,
-                self.spread_frames,
-                self.steps,
-                self.model.devices,
+                self.model, self.state, self.spread_frames, self.steps
             )
             if self._left() <= self._half_a_scan(program.length):
                 return "seconds"

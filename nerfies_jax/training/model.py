@@ -1,6 +1,6 @@
 """What a representation must offer the loop, the renderer and the report."""
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -134,3 +134,5 @@ class Model(NamedTuple):
     # (params, capture) -> the capture with its cameras as training found them; None
     # where they stay those of the capture.
     found: Callable[[PyTree, Any], Any] | None = None
+    # Of the compiler, for steps and pictures (`nerfies_jax.compiler`).
+    compiler_options: Mapping[str, str] | None = None

@@ -71,6 +71,13 @@ def test_a_renderer_sees_parameters_time_and_step_and_compiles_once_a_shape():
     assert len(traced) == 2
 
 
+def test_a_renderer_compiles_as_its_model_asks():
+    model = MODEL._replace(compiler_options={"no_such_option": "1"})
+    view = evaluation.view_of(scenes.tiny_capture(), 3)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="no_such_option"):
+        evaluation.Renderer(model, SIZE)(state_at(0, 0.1), view)
+
+
 class Counted:
     """A model in stages that counts how often each of them really runs."""
 

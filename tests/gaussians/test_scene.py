@@ -13,7 +13,7 @@ from gaussians_jax.initialisation import InitSpec
 from gaussians_jax.learning_rates import LearningRateSpec
 from gaussians_jax.spec import SceneMetadata, raster_of
 from gaussians_jax.splats import Params, Splats
-from nerfies_jax import evaluation
+from nerfies_jax import compiler, evaluation
 from nerfies_jax.training.updates import apply_updates
 from tests import scenes
 from tests.gaussians.shared import finite, full, jitted, put, with_rows
@@ -46,6 +46,10 @@ def stepped(spec, count):
         state, metrics = step(state, frames)
         trace.append({name: float(value) for name, value in metrics.items()})
     return state, trace
+
+
+def test_a_model_is_compiled_with_its_short_loops_whole():
+    assert started(scenes.TINY_SPLATS)[0].compiler_options == compiler.UNDIVIDED
 
 
 def test_training_lowers_the_loss():

@@ -13,23 +13,25 @@ import sys
 from nerfies_jax.runs import platform
 platform.start_jax("cpu", sys.argv[1], 2)
 import jax, jax.numpy as jnp
-program = jax.jit(jnp.exp).lower(jnp.zeros((2048, 2048))).compile()
-print("outer_dimension_partitions" in program.as_text())
+from nerfies_jax.compiler import UNDIVIDED
+lowered = jax.jit(jnp.exp).lower(jnp.zeros((2048, 2048)))
+for options in (None, UNDIVIDED):
+    print("outer_dimension_partitions" in lowered.compile(options).as_text())
 """
 
 
 @pytest.mark.full
 @pytest.mark.skipif(platform.cores() < 2, reason="there is one core to divide among")
-def test_devices_that_see_a_core_each_do_not_divide_loops():
-    assert is_divided("all") == "True"
-    assert is_divided("one") == "False"
+def test_devices_that_see_a_core_each_and_models_of_splats_do_not_divide_loops():
+    assert are_divided("all") == ["True", "False"]
+    assert are_divided("one") == ["False", "False"]
 
 
-def is_divided(threads):
+def are_divided(threads):
     own = ("XLA_FLAGS", "PJRT_NPROC", "NPROC", "JAX_NUM_CPU_DEVICES")
     environment = {name: x for name, x in os.environ.items() if name not in own}
     command = [sys.executable, "-c", DIVIDED, threads]
     done = subprocess.run(
         command, env=environment, capture_output=True, text=True, check=True
     )
-    return done.stdout.strip()
+    return done.stdout.split()

@@ -79,6 +79,13 @@ def test_what_is_compiled_ahead_is_what_trains(frames):
     assert toy.same(ahead.state, plain.state)
 
 
+def test_steps_are_compiled_as_their_model_asks(frames):
+    model = toy.model(change=lambda *run: toy.step(*run))
+    model = model._replace(compiler_options={"no_such_option": "1"})
+    with pytest.raises(jax.errors.JaxRuntimeError, match="no_such_option"):
+        fit(frames, model=model, steps=7)
+
+
 def test_what_steps_have_learnt_can_be_differentiated(float64):
     """By the rate of a gradient descent whose fourth step is known in closed form."""
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from nerfies_jax import background, data_parallel
+from nerfies_jax import compiler, data_parallel
 from nerfies_jax.capture import npz_files
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.given import Given
@@ -138,7 +138,7 @@ def programs(spec: SceneSpec, plan: Schedule) -> Programs:
         places = shape((points, frames, 3), np.float32)
         lowered.append(_follow.lower(spec, thing, material, times))
         lowered.append(_watch.lower(spec, thing, places, plan))
-    return Programs(*(background.begun(one.compile) for one in lowered))
+    return Programs(*(compiler.begun(one.compile) for one in lowered))
 
 
 def flows(
