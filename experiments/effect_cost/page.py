@@ -112,7 +112,9 @@ def _apart(about):
             "Measured a step at a call, by an earlier revision, with memory that was "
             f"asked for anew: {_named(single)}."
         )
-    return "".join("\n" + textwrap.fill(line, 88, break_on_hyphens=False) for line in lines)
+    return "".join(
+        "\n" + textwrap.fill(line, 88, break_on_hyphens=False) for line in lines
+    )
 
 
 def _named(presets):
