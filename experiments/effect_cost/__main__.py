@@ -10,8 +10,8 @@ part that has a price of its own (ADC-GS' bits, EDGS' mask, SC-GS' rigidity). Of
 loss and of the training step it tabulates what the compiler counts (flops, bytes read
 and written, temporary memory), the matrix products with every round of every loop, the
 parameters, the seconds to compile and the processor time of warm calls, all scenes of a
-preset in turn. Steps are scanned in tens, as a run does. A run is priced at `--at` of
-its steps, where every warm-up is over.
+preset in turn. Steps are scanned in tens, as a run does with all but large ones. A run
+is priced at `--at` of its steps, where every warm-up is over.
 
 The price of an effect alone is a difference from the scene without it. Prices do not
 add up exactly: the compiler joins what it finds side by side. Prints the table, saves
@@ -278,7 +278,7 @@ def measure(
         for name in PROGRAMS:
             cost, products = costs[name]
             timing = timings[f"{first[arm.spec]} {name}"]
-            calls_timed = chunk.LENGTH if name == "step" else 1
+            at_once = chunk.LENGTH if name == "step" else 1
             programs[name] = Priced(
                 flops=cost.flops,
                 bytes_accessed=cost.bytes_accessed,
@@ -286,8 +286,8 @@ def measure(
                 matrix_flops=products.flops,
                 at_least=products.at_least,
                 compile_seconds=cost.compile_seconds,
-                seconds=timing.median_cpu / calls_timed,
-                wall_seconds=timing.median / calls_timed,
+                seconds=timing.median_cpu / at_once,
+                wall_seconds=timing.median / at_once,
             )
         rows.append(SceneCost(arm, parameters, programs))
     return rows

@@ -151,8 +151,7 @@ def _whole(model, size, inputs):
     def render(params, view, step):
         return _float32(model.render(params, view, size, step))
 
-    (program,) = _all_compiled(model, jax.jit(render).lower(*inputs))
-    return program
+    return jax.jit(render).lower(*inputs).compile(model.compiler_options)
 
 
 def _staged(model, size, inputs):

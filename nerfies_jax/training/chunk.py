@@ -2,7 +2,7 @@
 
 import functools
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any, NamedTuple
 
@@ -120,18 +120,10 @@ class Program:
     on the first of them, `frames` on all (`data_parallel.replicate`).
     """
 
-    def __init__(
-        self,
-        step,
-        state: TrainState,
-        frames: Frames,
-        steps: int,
-        devices: int = 1,
-        options: Mapping[str, str] | None = None,
-    ):
+    def __init__(self, model: Model, state: TrainState, frames: Frames, steps: int):
         # Traced once for both lengths, which takes most of the time to lower.
-        self._step, self._devices = jax.jit(step, inline=True), devices
-        self._options = options
+        self._step = jax.jit(model.step, inline=True)
+        self._devices, self._options = model.devices, model.compiler_options
         self._shapes = jax.tree.map(_abstract, (self._on_all(state), frames))
         self._lowered, self._programs = {}, {}
         self.length = 1 if steps < FEW_STEPS else self._most_at_once()
@@ -207,9 +199,7 @@ def program(
     if key in programs:
         return programs[key], 0.0
     began = time.perf_counter()
-    programs[key] = Program(
-        model.step, state, frames, steps, model.devices, model.compiler_options
-    )
+    programs[key] = Program(model, state, frames, steps)
     return programs[key], time.perf_counter() - began
 
 

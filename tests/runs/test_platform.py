@@ -22,7 +22,7 @@ for options in (None, UNDIVIDED):
 
 @pytest.mark.full
 @pytest.mark.skipif(platform.cores() < 2, reason="there is one core to divide among")
-def test_devices_that_see_a_core_each_and_models_of_splats_do_not_divide_loops():
+def test_devices_that_see_a_core_each_and_what_asks_for_it_do_not_divide_loops():
     assert are_divided("all") == ["True", "False"]
     assert are_divided("one") == ["False", "False"]
 

@@ -265,7 +265,8 @@ def test_large_steps_are_scanned_few_at_once(rounds, length, frames):
         each = jax.lax.map(lambda square: jnp.sum(square @ square), squares)
         return state, metrics | {"products": jnp.sum(each)}
 
-    assert chunk.Program(step, start(), frames, 100).length == length
+    model = toy.model(change=step)
+    assert chunk.Program(model, start(), frames, 100).length == length
 
 
 @pytest.mark.parametrize(
