@@ -164,6 +164,12 @@ STUDIES = {
     "ablate_rate": _package(
         "ablate_rate", "--suite rate --steps 900 --jobs 2", of="ablate"
     ),
+    "ablate_views": _package("ablate_views", "--suite views --seconds 30", of="ablate"),
+    "ablate_views_one_core": _package(
+        "ablate_views_one_core",
+        "--suite views --seconds 30 --clock processor --jobs 2",
+        of="ablate",
+    ),
     "deformation_cost": _package("deformation_cost", "--out deformation_cost.json"),
     "spectral_bias": _package(
         "spectral_bias", "--steps 3000 --out spectral_bias", page="report"

@@ -24,18 +24,25 @@ def main(args):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
         settings.check(args)
-        arms = suites.named(args.suite).arms
-        kinds = {
-            representations.of_preset(arms[name].preset).threads
-            for name in args.arms or arms
-        }
-        platform.start_jax(args.device, "all" if "all" in kinds else "one")
+        platform.start_jax(args.device, *_cores(args))
         from experiments.ablate.job import Job
 
         job = Job(args)
     failed = job.run()
     reports = _report(job) if args.seed is None else {}
     return cli.Ended(reports, 1 if failed else 0)
+
+
+def _cores(args):
+    """What XLA is to see: enough for every arm, where each is trained alone."""
+    arms = suites.named(args.suite).arms
+    wanted = [
+        representations.cores(arm.preset, (*arm.changes, *args.set))
+        for arm in (arms[name] for name in args.arms or arms)
+    ]
+    threads = "all" if any(cores.threads == "all" for cores in wanted) else "one"
+    shares = max(cores.shares for cores in wanted) if args.jobs == 1 else 1
+    return representations.Cores(threads, shares)
 
 
 def _report(job):

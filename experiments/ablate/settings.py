@@ -28,15 +28,16 @@ class Ablate:
         "moba",
         "open",
         "rate",
+        "views",
         "settings",
         "advice",
         "league",
     ] = "fields"
     """Radiance fields; motions of splats from tracks and from rest; the parts of
     splats-tracked-small; cameras refined while it trains; the ablations of Sonata or
-    MoBa-GS, and what these leave open; bits of ADC-GS; the settings of
-    experiments.accuracy_time; what experiments.inspect_scene can advise; or every small
-    preset."""
+    MoBa-GS, and what these leave open; bits of ADC-GS; views in a step; the
+    settings of experiments.accuracy_time; what experiments.inspect_scene can advise; or
+    every small preset."""
     arms: tuple[str, ...] = ()
     """Which arms of the suite (default: all)."""
     source: cli.SourceOptions = CaptureSource()
@@ -57,7 +58,8 @@ class Ablate:
     """Train this seed alone and report nothing: one share of a run over several
     machines or processes."""
     jobs: int = 1
-    """Arms to train at once, each in a process with one core."""
+    """Arms to train at once, each in a process with one core; one alone spreads its
+    steps over all."""
     out: pathlib.Path | None = None
     """Folder of results (default: runs/ablation-...). It may hold finished arms."""
     budget: float | None = None

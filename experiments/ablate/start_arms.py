@@ -1,6 +1,6 @@
-"""What a start from tracks, the parts of the default and refined cameras are worth."""
+"""What a start from tracks, parts of the default, cameras and views are worth."""
 
-from experiments.ablate.arms import TRACKED, Arm, Claim, Suite
+from experiments.ablate.arms import MOVING, TRACKED, Arm, Claim, Suite
 from nerfies_jax.training.track_start import FROM_REST, FROM_TRACKS
 
 # One view a step and Gaussians that are always there, as in the presets beside it.
@@ -111,4 +111,23 @@ POSES = Suite(
     seeds=3,
     pictured=("as-noted", "refined", "refined-slowly"),
     context="",
+)
+
+VIEWS = Suite(
+    arms={
+        "one": Arm("splats-tracked-small", ("batch_size=1",)),
+        "two": Arm("splats-tracked-small"),
+        "four": Arm("splats-tracked-small", ("batch_size=4",)),
+    },
+    claims=(
+        Claim("Two views in a step reach more than one", "two", "one", MOVING),
+        Claim("Four views in a step reach more than two", "four", "two", MOVING),
+    ),
+    seeds=3,
+    pictured=("one", "two", "four"),
+    context=(
+        "Views of a step are drawn on a core each, where arms are trained one after\n"
+        "the other; with `--jobs 2` an arm has one core. Rates go with the root of\n"
+        "the number of views."
+    ),
 )

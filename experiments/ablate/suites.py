@@ -4,7 +4,7 @@ import functools
 
 from experiments.ablate.arms import FIELDS, MOBA, SONATA, Suite
 from experiments.ablate.open_arms import OPEN, RATE
-from experiments.ablate.start_arms import POSES, START, TRACKED_PARTS
+from experiments.ablate.start_arms import POSES, START, TRACKED_PARTS, VIEWS
 from experiments.accuracy_time.axes import SETTINGS
 
 KEPT = {
@@ -16,6 +16,7 @@ KEPT = {
     "moba": MOBA,
     "open": OPEN,
     "rate": RATE,
+    "views": VIEWS,
     "settings": SETTINGS,
 }
 

@@ -13,6 +13,7 @@ import pytest
 
 from experiments import cli
 from experiments.ablate import __main__ as ablate
+from experiments.ablate import job as ablate_job
 from experiments.ablate import page as ablate_page
 from experiments.ablate import results, suites
 from experiments.ablate.arms import FIELDS
@@ -69,6 +70,21 @@ def run(*arguments):
     with pytest.raises(SystemExit) as stop:
         ablate.main(list(arguments))
     return stop.value.code
+
+
+def test_arms_one_after_the_other_have_all_cores(tiny, monkeypatch):
+    """Each of several at once has one, in a process of its own."""
+    started = []
+    nothing = types.SimpleNamespace(run=list, budgets=(), missing=list)
+    monkeypatch.setattr(ablate_job, "Job", lambda _: nothing)
+    monkeypatch.setattr(platform, "start_jax", lambda *given: started.append(given))
+    arms = ("--suite", "settings", "--arms", "views-1", "views-4", "samples-8+8")
+    assert run(*tiny, *arms[:4]) == 0
+    assert run(*tiny, *arms[:5]) == 0
+    assert run(*tiny, *arms) == 0
+    assert run(*tiny, *arms[:5], "--jobs", "2") == 0
+    wanted = [("one", 1), ("one", 4), ("all", 4), ("one", 1)]
+    assert started == [("auto", *cores) for cores in wanted]
 
 
 def test_several_processes_do_not_share_an_accelerator(tiny, monkeypatch, capsys):
