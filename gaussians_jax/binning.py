@@ -275,6 +275,19 @@ def sort_pairs(
     return Intersections(ranks, bounds[:-1], bounds[1:])
 
 
+def longest_first(length: Int[Array, " tiles"]) -> Int[Array, " tiles"]:
+    """Tiles from most to fewest pairs, ties by number; empty ones are last.
+
+    Tile and length share a word of 32 bits: longer ones than fit it tie.
+    """
+    tile_bits = max(1, (length.shape[0] - 1).bit_length())
+    most = jnp.minimum(jnp.max(length), (1 << (32 - tile_bits)) - 1)
+    fewer = (most - jnp.minimum(length, most)).astype(jnp.uint32)
+    key = (fewer << tile_bits) | jnp.arange(length.shape[0], dtype=jnp.uint32)
+    key = _sorted_by_upper_bits(key, tile_bits, 32 - lax.clz(most))
+    return (key & jnp.uint32((1 << tile_bits) - 1)).astype(jnp.int32)
+
+
 def _sorted_by_upper_bits(key, lowest, bits):
     """Words in the order of their `bits` from bit `lowest` on, ties as they came.
 

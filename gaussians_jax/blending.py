@@ -12,7 +12,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from gaussians_jax.binning import Grid, Intersections
+from gaussians_jax.binning import Grid, Intersections, longest_first
 from gaussians_jax.raster_spec import RasterSpec
 from nerfies_jax.geometry.precision import exact_einsum, exact_product
 
@@ -174,7 +174,7 @@ def _by_length(isects, batch):
     Tiles of one batch run in lockstep, so they should be about equally long.
     """
     length = isects.ends - isects.starts
-    order = jnp.argsort(-length, stable=True).astype(jnp.int32)
+    order = longest_first(length)
     tiles = length.shape[0]
     padding = jnp.full(-tiles % batch, tiles, jnp.int32)
     batches = -(-jnp.sum(length > 0, dtype=jnp.int32) // batch)

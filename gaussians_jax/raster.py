@@ -128,7 +128,7 @@ def _layout(footprints, size, spec):
         # Tile and rank in one 32-bit word: the sort of two arrays takes ten times as
         # long. Not at any price, because each chunk also passes over every tile.
         packed = 1 << (32 - grid.tiles.bit_length())
-        if packed >= LEAST_PACKED_CAPACITY:
+        if footprints.depth.shape[0] > packed >= LEAST_PACKED_CAPACITY:
             capacity = min(capacity, packed)
     return Layout(spec, grid, step, capacity)
 

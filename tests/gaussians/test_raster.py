@@ -228,6 +228,20 @@ def test_pairs_are_sorted_by_tile_then_depth(tiles_per_side, dtype, rng):
     np.testing.assert_array_equal(isects.ends - isects.starts, numbers)
 
 
+def test_tiles_are_taken_from_the_longest_to_the_empty(rng):
+    """2^18 tiles leave 14 bits of length: longer ones tie, and only empty ones end."""
+    longest_first = jitted(binning.longest_first)
+    for tiles, most in ((1, 5), (3000, 1), (3000, 1 << 19), (1 << 18, 1 << 19)):
+        length = rng.integers(0, most, tiles, endpoint=True).astype(np.int32)
+        length[rng.random(tiles) < 0.3] = 0
+        length[-1] = most
+        told = np.minimum(length, 2 ** (32 - max(1, (tiles - 1).bit_length())) - 1)
+        expected = np.argsort(-told, kind="stable")
+        np.testing.assert_array_equal(longest_first(length), expected)
+    nothing = np.zeros(3000, np.int32)
+    np.testing.assert_array_equal(longest_first(nothing), np.arange(3000))
+
+
 @pytest.mark.hard_cases
 def test_the_ellipse_test_keeps_every_tile_that_shows_a_gaussian(float64, rng):
     """And drops most of the others: needles' boxes are mostly empty."""
