@@ -87,3 +87,31 @@ RATE = Suite(
         "loss: the preset has 1e-3. With `no-law` there are neither rounding nor bits."
     ),
 )
+
+# Strong, and not robust: of the presets' own elastic penalty no arm shows an effect.
+FIRM = (FROM_TRACKS, "elastic.weight=0.1", "elastic.robust_width=none")
+
+LAZY = Suite(
+    arms={
+        "each-step": Arm("nerfies-grid-small", (*FIRM, "elastic.every=1")),
+        "lazy": Arm("nerfies-grid-small", (*FIRM, "elastic.every=5")),
+        "no-elastic": Arm("nerfies-grid-small", (FROM_TRACKS, "elastic=none")),
+    },
+    claims=(
+        Claim(
+            "An elastic penalty of each step stiffens more than one of each fifth",
+            "each-step",
+            "lazy",
+            (*MOVING, "strain"),
+        ),
+        Claim(
+            "One of each fifth step, five times as strong, stiffens what moves",
+            "lazy",
+            "no-elastic",
+            (*MOVING, "strain"),
+        ),
+    ),
+    seeds=3,
+    pictured=("no-elastic", "each-step", "lazy"),
+    context="",
+)

@@ -3,7 +3,7 @@
 import functools
 
 from experiments.ablate.arms import FIELDS, MOBA, SONATA, Suite
-from experiments.ablate.open_arms import OPEN, RATE
+from experiments.ablate.open_arms import LAZY, OPEN, RATE
 from experiments.ablate.start_arms import POSES, START, TRACKED_PARTS, VIEWS
 from experiments.accuracy_time.axes import SETTINGS
 
@@ -17,6 +17,7 @@ KEPT = {
     "open": OPEN,
     "rate": RATE,
     "views": VIEWS,
+    "lazy": LAZY,
     "settings": SETTINGS,
 }
 

@@ -7,6 +7,7 @@ weights it is rendered with.
 
 import dataclasses
 import math
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -35,6 +36,9 @@ class ElasticSpec:
     logarithmic strain at which ρ leaves the parabola (None: E itself); `scaling` is
     that of `losses.geman_mcclure`.
 
+    One step of `every` asks for the penalty, which counts as many times as much in it
+    (lazy regularisation, Karras et al. 2020, arXiv:1912.04958, section 3.1).
+
     `fold_cost` is what mirroring a unit volume costs beside ρ; 0 makes mirror images
     free, as the official code does. See `cost`.
     """
@@ -44,6 +48,7 @@ class ElasticSpec:
     decay_steps: int | None = steps(None)
     last_weight: float = 1e-8
     points: int | None = 4
+    every: int = 1
     robust_width: float | None = 0.03
     scaling: str = "paper"
     fold_cost: float = 1.0
@@ -53,6 +58,8 @@ class ElasticSpec:
             raise ValueError(
                 f"points={self.points} of each ray must be at least 1; None takes all"
             )
+        if self.every < 1:
+            raise ValueError(f"every={self.every}: at least 1, which is each step")
         for name in ("weight", "last_weight", "fold_cost"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
@@ -75,13 +82,28 @@ def effect(spec: ElasticSpec) -> Effect:
     """The seams of `spec`."""
 
     def penalty(_, context):
-        value, folded = energy(spec, context)
+        value, folded = lazily(spec.every, context.step, lambda: energy(spec, context))
         weight = schedule(spec)
         if callable(weight):
             weight = weight(context.step)
         return {"elastic": Term(value, weight), "folded": Term(folded, None)}
 
     return Effect("elastic", penalty=penalty)
+
+
+def lazily(
+    every: int, step: Int[Array, ""], work: Callable[[], tuple[Scalar, ...]]
+) -> tuple[Scalar, ...]:
+    """`every` times the scalars of `work` where `every` divides `step`, else zeros.
+
+    So their mean over steps, and that of their gradients, is what `work` has.
+    """
+    if every == 1:
+        return work()
+    zeros = [jnp.zeros(x.shape, x.dtype) for x in jax.eval_shape(work)]
+    return jax.lax.cond(
+        step % every == 0, lambda: tuple(every * x for x in work()), lambda: (*zeros,)
+    )
 
 
 def cost(spec: ElasticSpec, displacement: Matrix) -> Scalar:
