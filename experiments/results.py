@@ -58,9 +58,11 @@ refined cameras are worth stands in [ablate_poses.md](ablate_poses.md) and, on a
 film, in [ablate_poses_bookshelf.md](ablate_poses_bookshelf.md). What the two papers
 leave open, a start from random points among it, stands in
 [ablate_open.md](ablate_open.md), which motion comes out best where a camera jumps in
-[ablate_jumps.md](ablate_jumps.md), and what a law of bits saves of ADC-GS' features in
-[ablate_rate.md](ablate_rate.md). What deformation, solvers and local kernels cost
-stands in [deformation_cost.md](deformation_cost.md),
+[ablate_jumps.md](ablate_jumps.md), what a law of bits saves of ADC-GS' features in
+[ablate_rate.md](ablate_rate.md), how many views a step takes best on two cores in
+[ablate_views.md](ablate_views.md), and what an elastic penalty loses that some steps
+skip in [ablate_lazy.md](ablate_lazy.md). What deformation, solvers and local kernels
+cost stands in [deformation_cost.md](deformation_cost.md),
 [solver_table.md](solver_table.md) and [kan_local.md](kan_local.md) again, and how far
 one basis or another can follow a motion in [motion_rank.md](motion_rank.md).
 """
@@ -164,11 +166,11 @@ STUDIES = {
     "ablate_rate": _package(
         "ablate_rate", "--suite rate --steps 900 --jobs 2", of="ablate"
     ),
-    "ablate_views": _package("ablate_views", "--suite views --seconds 30", of="ablate"),
-    "ablate_views_one_core": _package(
-        "ablate_views_one_core",
-        "--suite views --seconds 30 --clock processor --jobs 2",
-        of="ablate",
+    "ablate_views": _package(
+        "ablate_views", "--suite views --seconds 30 --seeds 5", of="ablate"
+    ),
+    "ablate_lazy": _package(
+        "ablate_lazy", "--suite lazy --steps 600 --jobs 2", of="ablate"
     ),
     "deformation_cost": _package("deformation_cost", "--out deformation_cost.json"),
     "spectral_bias": _package(

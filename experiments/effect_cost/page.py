@@ -40,7 +40,8 @@ none of its own; it stands for what no preset has.{apart}
 - *Mflop* and *MB* are the compiler's count, in which the body of a loop counts once,
   however often it runs: what blends Gaussians, and networks that move them in blocks,
   are undercounted. *matmul Mflop* has the matrix products alone, with all rounds of
-  loops (where their number is known), and compares across presets. *temporary MB* is
+  loops (where their number is known), and compares across presets; what some steps
+  skip (`elastic.every`) counts as if none did. *temporary MB* is
   what a step needs beside its inputs and outputs.
 - *compile s* is paid once per run and shape, and not at all from the compilation
   cache.
@@ -58,13 +59,13 @@ which on another machine says little."""
 WORTH = """\
 Worth knowing: appearance codes are all but free ({appearance:.2f}), and so are
 background points ({background:.2f} with a warp, {warp:.2f} without them) and the
-depth loss ({depth:.2f}). A warp makes a step of a field {warp:.2f} times as long, the
-elastic penalty on 4 of its samples {elastic:.2f} times. Motion takes a step of splats
-to {mlp:.2f} (MLP), {kan:.2f} (KAN) or {basis:.2f} (basis) of a still one, the
-acceleration penalty to {acceleration:.2f}. NSFF is the dearest of fields
-({flow:.2f}): it traces each ray at its neighbours' times, too. Annealing, alternation
-and motion-guided growth cost a step nothing that can be measured: they change what is
-learnt and when."""
+depth loss ({depth:.2f}). A warp makes a step of a field {warp:.2f} times as long;
+with an elastic penalty on 4 samples of a ray, asked at one step of five, it is
+{elastic:.2f}. Motion takes a step of splats to {mlp:.2f} (MLP), {kan:.2f} (KAN) or
+{basis:.2f} (basis) of a still one, the acceleration penalty to {acceleration:.2f}. NSFF
+is the dearest of fields ({flow:.2f}): it traces each ray at its neighbours' times, too.
+Annealing, alternation and motion-guided growth cost a step nothing that can be
+measured: they change what is learnt and when."""
 QUOTED = {
     "appearance": "nerf-w-small.only_appearance",
     "background": "nerfies-small.warp_and_background",

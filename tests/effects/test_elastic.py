@@ -345,3 +345,38 @@ def test_terms_and_schedule(setting):
         np.testing.assert_allclose(terms["elastic"].weight, weight, rtol=1e-6)
         assert terms["folded"].weight is None
     assert elastic.schedule(ElasticSpec()) == 1e-3
+
+
+def test_a_lazy_penalty_counts_for_the_steps_that_skip_it(setting):
+    """Its value, its share of folds and its slopes, through the choice of the step."""
+
+    def total(params, every, step):
+        here = context(
+            field(params), setting.point, setting.weight, setting.conditions, step=step
+        )
+        terms = elastic.effect(ElasticSpec(every=every)).penalty(None, here)
+        return terms["elastic"].value, terms["folded"].value
+
+    slopes = jax.value_and_grad(total, has_aux=True)
+    each = jax.jit(lambda params: slopes(params, 1, 0))(setting.params)
+    lazy = jax.jit(lambda params, step: slopes(params, 3, step))
+    assert np.any(each[1] != 0)
+    for step in range(5):
+        times = 0 if step % 3 else 3
+        found = jax.tree.leaves(lazy(setting.params, jnp.int32(step)))
+        for one, full in zip(found, jax.tree.leaves(each), strict=True):
+            np.testing.assert_allclose(one, times * full, rtol=1e-12)
+
+
+def test_steps_that_skip_a_penalty_do_not_compute_it():
+    computed = []
+
+    def work():
+        jax.debug.callback(lambda: computed.append(True))
+        return (jnp.float32(1),)
+
+    at_step = jax.jit(lambda step: elastic.lazily(4, step, work))
+    for step in range(9):
+        jax.block_until_ready(at_step(jnp.int32(step)))
+    jax.effects_barrier()
+    assert len(computed) == 3

@@ -37,6 +37,7 @@ REFUSED = [
     (BackgroundSpec, {"width": math.inf}, "finite width > 0, got inf"),
     (BackgroundSpec, {"scaling": "twice"}, "'twice'"),
     (ElasticSpec, {"points": 0}, "points=0.*None"),
+    (ElasticSpec, {"every": 0}, "every=0.*each step"),
     (ElasticSpec, {"weight": -1.0}, "weight=-1"),
     (ElasticSpec, {"fold_cost": math.nan}, "fold_cost=nan"),
     (ElasticSpec, {"robust_width": 0.0}, "width > 0"),
