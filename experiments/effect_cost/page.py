@@ -102,21 +102,11 @@ def page(stored) -> str:
 
 
 def _apart(about):
-    """Which presets another processor was asked for, and which a step at a call."""
-    apart, single = about.get("apart", {}), about.get("single_steps", [])
-    lines = []
-    if apart:
-        cpus = " and ".join(sorted(set(apart.values())))
-        lines.append(f"Measured apart, on {cpus}: {_named(apart)}.")
-    if single:
-        lines.append(
-            "Measured a step at a call, by an earlier revision, with memory that was "
-            f"asked for anew: {_named(single)}."
-        )
-    return "".join(
-        "\n" + textwrap.fill(line, 88, break_on_hyphens=False) for line in lines
-    )
-
-
-def _named(presets):
-    return ", ".join(f"`{name}`" for name in presets)
+    """Which presets another processor was asked for."""
+    apart = about.get("apart", {})
+    if not apart:
+        return ""
+    cpus = " and ".join(sorted(set(apart.values())))
+    named = ", ".join(f"`{name}`" for name in apart)
+    line = f"Measured apart, on {cpus}: {named}."
+    return "\n" + textwrap.fill(line, 88, break_on_hyphens=False)
