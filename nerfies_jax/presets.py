@@ -217,8 +217,8 @@ SMALL_T_NERF = dataclasses.replace(SMALL_NERF, time=TimeSpec(EncodingSpec(4)))
 SMALL_NERFIES = dataclasses.replace(
     SMALL_NERF,
     warp=SMALL_WARP,
-    # The paper's scaling of ρ, 33 times this, holds so short a run at the identity. At
-    # each step it would cost a fifth of it, for nothing that shows (`ablate`, "lazy").
+    # The paper's scaling of ρ, 33 times this, holds so short a run at the identity.
+    # Asked at each step the penalty would add a fifth to its time.
     elastic=ElasticSpec(weight=1e-3, every=5, scaling="official"),
     background=BackgroundSpec(points=512),
 )

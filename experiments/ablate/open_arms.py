@@ -116,6 +116,8 @@ LAZY = Suite(
     context=(
         "The weight is a hundred times that of the presets, and the form not robust,\n"
         "so that the penalty shows in how stiff the warp is; pictures are worse for\n"
-        "it. The presets of small fields ask for theirs at one step of five."
+        "it. The presets of small fields ask for theirs at one step of five; they\n"
+        "did at each when [ablate_fields.md](ablate_fields.md) and\n"
+        "[league.md](league.md) were measured."
     ),
 )

@@ -4,6 +4,7 @@
     python -m experiments.speed --presets splats-tracked-small --out speed
     python -m experiments.speed --job --yardstick PATH/run.py --out speed
     python -m experiments.speed --no-steps --beside CHECKOUT --out speed
+    python -m experiments.speed --presets splats-tracked-small --check BEFORE/speed.json
 
 Every preset is timed in two fresh processes, one that sees one core and one that has
 the cores its steps are made for. `--job` also times the README's first command, from an
@@ -11,6 +12,9 @@ empty cache of programs and of evidence, and `--beside` that of another checkout
 earlier revision, between two of ours. `--yardstick` times the rasteriser beside
 another (`experiments.raster_speed`). Times are wall clock: leave the machine alone.
 What was measured before stays in OUT/speed.json where it is not measured anew.
+`--check` holds that file against an earlier one, each number with its tolerance: a
+quarter of a time, a half of compiling, a tenth of memory, 0.15 of a ratio to the other
+rasteriser, half a decibel.
 """
 
 import concurrent.futures
@@ -49,6 +53,8 @@ class Speed:
     """Also the rasteriser, beside the one that this script times."""
     out: pathlib.Path = pathlib.Path("runs/speed")
     """Folder for speed.json."""
+    check: pathlib.Path | None = None
+    """An earlier speed.json: exit code 1 where a number is worse than its tolerance."""
 
     def __post_init__(self):
         cli.check_presets(self.presets)
@@ -59,7 +65,13 @@ class Speed:
 @cli.command(Speed)
 def main(args):
     """Measure and keep; exit code 2 where input is wrong."""
+    from experiments.speed import tolerances
+    from nerfies_jax.measure import baselines
+
+    before = None
     with cli.user_errors():
+        if args.check is not None:
+            before = baselines.read(args.check, STORED)
         if args.beside is not None and not (args.beside / "experiments").is_dir():
             raise ValueError(f"--beside {args.beside}: no checkout of this library")
         args.out.mkdir(parents=True, exist_ok=True)
@@ -77,11 +89,17 @@ def main(args):
         record = _raster(args.yardstick)
         keep(path, record["machine"], ("raster",), {"rows": record["rows"]})
     print(f"kept in {path}")
-    return cli.stored(path)
+    stored = cli.stored(path)
+    worse = []
+    if before is not None:
+        worse = baselines.changes(tolerances.metrics(stored or {}), before)
+        print("\n".join(worse) or f"nothing is worse than in {args.check}")
+    return cli.Ended(stored, 1 if worse else 0)
 
 
 def keep(path: pathlib.Path, machine: dict, keys: tuple[str, ...], record) -> None:
     """Put a record in its place in the file, which keeps all others."""
+    from experiments.speed import tolerances
     from nerfies_jax.capture.json_files import write_json
     from nerfies_jax.measure import clock
 
@@ -91,6 +109,7 @@ def keep(path: pathlib.Path, machine: dict, keys: tuple[str, ...], record) -> No
     for key in keys[:-1]:
         inner = inner.setdefault(key, {})
     inner[keys[-1]] = record
+    stored["metrics"] = clock.metric_rows(tolerances.metrics(stored))
     write_json(path, stored)
 
 

@@ -37,7 +37,8 @@ class ElasticSpec:
     that of `losses.geman_mcclure`.
 
     One step of `every` asks for the penalty, which counts as many times as much in it
-    (lazy regularisation, Karras et al. 2020, arXiv:1912.04958, section 3.1).
+    (lazy regularisation, Karras et al. 2020, arXiv:1912.04958, section 3.1); what is
+    logged of it is right as a mean over so many steps.
 
     `fold_cost` is what mirroring a unit volume costs beside ρ; 0 makes mirror images
     free, as the official code does. See `cost`.

@@ -72,6 +72,11 @@ def write_metrics(
     What is not finite is written as null, for JSON has no word for it. The file appears
     whole or not at all.
     """
+    write_json(path, {"about": dict(about), "metrics": metric_rows(metrics)})
+
+
+def metric_rows(metrics: Iterable[Metric]) -> dict[str, dict[str, Any]]:
+    """What `read_metrics` reads under "metrics"; ValueError for a key that is twice."""
     rows: dict[str, Any] = {}
     for metric in metrics:
         if metric.key in rows:
@@ -82,7 +87,7 @@ def write_metrics(
         del row["key"]
         row["value"] = float(metric.value) if math.isfinite(metric.value) else None
         rows[metric.key] = row
-    write_json(path, {"about": dict(about), "metrics": rows})
+    return rows
 
 
 def read_metrics(path) -> dict[str, Metric]:

@@ -1,0 +1,79 @@
+"""What `experiments.speed` keeps of its numbers, and what it holds them against."""
+
+import copy
+import json
+
+import pytest
+
+from experiments.speed import __main__ as speed
+from experiments.speed import tolerances
+from nerfies_jax.measure import clock
+
+ONE = {"step_ms": 40.0, "compile_seconds": 9.0, "frame_ms": 7.0, "peak_mb": 1400.0}
+STORED = {
+    "presets": {"splats": {"one": ONE, "all": {"step_ms": 22.0}}},
+    "raster": {"rows": [{"case": "10@8x8", "ratio": 1.25, "forward_ms": 3.0}]},
+    "job": {"seconds": 117.0, "heldout.psnr": 32.6, "heldout.moving_psnr": None},
+}
+
+
+@pytest.fixture
+def kept(tmp_path):
+    """A folder that has these numbers, put there one by one."""
+    path = tmp_path / "speed.json"
+    for which, record in STORED["presets"]["splats"].items():
+        speed.keep(path, {"cpu": "a"}, ("presets", "splats", which), record)
+    for name in ("raster", "job"):
+        speed.keep(path, {"cpu": "a"}, (name,), STORED[name])
+    return path
+
+
+def checked(out, before):
+    """The exit code of a command that measures nothing anew."""
+    with pytest.raises(SystemExit) as stop:
+        speed.main(["--no-steps", "--out", str(out), "--check", str(before)])
+    return stop.value.code
+
+
+def test_what_is_kept_can_be_held_against(kept):
+    metrics = clock.read_metrics(kept)
+    assert metrics == {x.key: x for x in tolerances.metrics(STORED)}
+    assert set(metrics) == {
+        *(f"splats.one.{name}" for name in ONE),
+        *("splats.all.step_ms", "raster.10@8x8.ratio"),
+        *("job.seconds", "job.heldout.psnr"),
+    }
+    assert metrics["splats.one.step_ms"].tolerance == 10.0
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (("presets", "splats", "one", "step_ms", 54.0), "splats.one.step_ms 54 ms"),
+        (("presets", "splats", "one", "step_ms", 49.0), None),
+        (("presets", "splats", "one", "peak_mb", 1600.0), "splats.one.peak_mb"),
+        (("raster", "rows", 0, "ratio", 1.5), "raster.10@8x8.ratio"),
+        (("job", "heldout.psnr", 32.0), "job.heldout.psnr 32 dB, was 32.6"),
+        (("job", "seconds", 90.0), None),
+    ],
+)
+def test_only_what_is_worse_than_its_tolerance_fails(
+    change, says, kept, tmp_path, capsys
+):
+    *keys, last, value = change
+    now = copy.deepcopy(STORED)
+    inner = now
+    for key in keys:
+        inner = inner[key]
+    inner[last] = value
+    (tmp_path / "now").mkdir()
+    (tmp_path / "now" / "speed.json").write_text(json.dumps(now))
+    assert checked(tmp_path / "now", kept) == (0 if says is None else 1)
+    printed = capsys.readouterr().out
+    assert ("nothing is worse" if says is None else f"worse: {says}") in printed
+
+
+def test_a_check_against_no_file_is_refused_before_anything_is_timed(tmp_path, capsys):
+    assert checked(tmp_path / "out", tmp_path / "nothing.json") == 2
+    assert "nothing.json" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
