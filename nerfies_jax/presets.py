@@ -207,10 +207,7 @@ SMALL_NERF_W = dataclasses.replace(
 SMALL_D_NERF = dataclasses.replace(
     SMALL_NERF,
     warp=dataclasses.replace(
-        SMALL_WARP,
-        kind="translation",
-        condition="time",
-        time=EncodingSpec(4),
+        SMALL_WARP, kind="translation", condition="time", time=EncodingSpec(4)
     ),
 )
 SMALL_T_NERF = dataclasses.replace(SMALL_NERF, time=TimeSpec(EncodingSpec(4)))
@@ -218,7 +215,7 @@ SMALL_NERFIES = dataclasses.replace(
     SMALL_NERF,
     warp=SMALL_WARP,
     # The paper's scaling of ρ, 33 times this, holds so short a run at the identity.
-    # Asked at each step the penalty would add a fifth to its time.
+    # Asked at one step of five: docs/results/ablate_lazy.md says what that loses.
     elastic=ElasticSpec(weight=1e-3, every=5, scaling="official"),
     background=BackgroundSpec(points=512),
 )

@@ -7,7 +7,6 @@ weights it is rendered with.
 
 import dataclasses
 import math
-from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -83,7 +82,7 @@ def effect(spec: ElasticSpec) -> Effect:
     """The seams of `spec`."""
 
     def penalty(_, context):
-        value, folded = lazily(spec.every, context.step, lambda: energy(spec, context))
+        value, folded = energy_of_step(spec, context)
         weight = schedule(spec)
         if callable(weight):
             weight = weight(context.step)
@@ -92,18 +91,21 @@ def effect(spec: ElasticSpec) -> Effect:
     return Effect("elastic", penalty=penalty)
 
 
-def lazily(
-    every: int, step: Int[Array, ""], work: Callable[[], tuple[Scalar, ...]]
-) -> tuple[Scalar, ...]:
-    """`every` times the scalars of `work` where `every` divides `step`, else zeros.
+def energy_of_step(spec: ElasticSpec, context: PenaltyContext) -> tuple[Scalar, Scalar]:
+    """`spec.every` times `energy` at the steps that this divides, zeros at the others.
 
-    So their mean over steps, and that of their gradients, is what `work` has.
+    So their mean over steps, and that of their gradients, is what `energy` has.
     """
-    if every == 1:
-        return work()
-    zeros = [jnp.zeros(x.shape, x.dtype) for x in jax.eval_shape(work)]
+    if spec.every == 1:
+        return energy(spec, context)
+    nothing = jnp.zeros((), context.levels[0].point.dtype)
+
+    def asked():
+        value, folded = energy(spec, context)
+        return spec.every * value, spec.every * folded
+
     return jax.lax.cond(
-        step % every == 0, lambda: tuple(every * x for x in work()), lambda: (*zeros,)
+        context.step % spec.every == 0, asked, lambda: (nothing, nothing)
     )
 
 

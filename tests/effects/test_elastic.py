@@ -368,14 +368,20 @@ def test_a_lazy_penalty_counts_for_the_steps_that_skip_it(setting):
             np.testing.assert_allclose(one, times * full, rtol=1e-12)
 
 
-def test_steps_that_skip_a_penalty_do_not_compute_it():
+def test_steps_that_skip_a_penalty_do_not_compute_it(setting, monkeypatch):
     computed = []
 
-    def work():
+    def energy(_, context):
         jax.debug.callback(lambda: computed.append(True))
-        return (jnp.float32(1),)
+        return jnp.sum(context.levels[0].point), jnp.ones(())
 
-    at_step = jax.jit(lambda step: elastic.lazily(4, step, work))
+    monkeypatch.setattr(elastic, "energy", energy)
+    here = context(None, setting.point, setting.weight, setting.conditions)
+    at_step = jax.jit(
+        lambda step: elastic.energy_of_step(
+            ElasticSpec(every=4), here._replace(step=step)
+        )
+    )
     for step in range(9):
         jax.block_until_ready(at_step(jnp.int32(step)))
     jax.effects_barrier()
