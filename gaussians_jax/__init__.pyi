@@ -3,7 +3,7 @@ from .files import save as save
 from .presets import PRESETS as PRESETS
 from .presets import with_steps as with_steps
 from .projection import project as project
-from .raster import rasterise as rasterise
+from .raster import rasterize as rasterize
 from .raster_spec import RasterSpec as RasterSpec
 from .rendering import render as render
 from .scene import build as build

@@ -54,7 +54,7 @@ class Residuals(NamedTuple):
     pairs: Int[Array, ""]  # (tile, Gaussian) pairs blended in all of them
 
 
-def rasterise(
+def rasterize(
     footprints: Footprints,
     values: Float[Array, "gaussians channels"],
     size: tuple[int, int],

@@ -1,4 +1,4 @@
-"""What the rasteriser is asked to do: thresholds, clamps, tiles, chunks of pairs."""
+"""What the rasterizer is asked to do: thresholds, clamps, tiles, chunks of pairs."""
 
 import dataclasses
 from typing import Literal
@@ -13,7 +13,7 @@ class RasterSpec:
     `tile`, `capacity`, `batch`, `chunk` and `kept_chunks` never change the picture
     beyond rounding; the others are the picture's definition. The defaults are those of
     gsplat 1.6 (`GSPLAT`); `INRIA` is the original 3D Gaussian splatting (Kerbl et al.
-    2023, arXiv:2308.04079) as its public rasteriser runs.
+    2023, arXiv:2308.04079) as its public rasterizer runs.
     """
 
     alpha_threshold: float = 1 / 255  # a Gaussian adds nothing where its alpha is below

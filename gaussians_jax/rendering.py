@@ -57,7 +57,7 @@ def render(
         values.append(footprints.depth[:, None])
     if features is not None:
         values.append(features)
-    image, transmittance = raster.rasterise(
+    image, transmittance = raster.rasterize(
         drawn, jnp.concatenate(values, axis=1), size, spec
     )
     colour, alpha = image[..., :3], 1 - transmittance

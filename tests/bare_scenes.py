@@ -274,7 +274,7 @@ def splat_step(spec, metadata, shuffled_row):
         placed = seen
         if offset is not None:  # whose gradient densification wants to know
             placed = seen._replace(mean_px=seen.mean_px + offset)
-        image, passing = raster.rasterise(placed, colour, size, spec.raster)
+        image, passing = raster.rasterize(placed, colour, size, spec.raster)
         behind = jnp.asarray(metadata.background, image.dtype)
         return image + behind * passing[..., None], seen
 

@@ -8,7 +8,7 @@ import signal
 import tempfile
 
 # XLA:CPU splits the bodies of tight loops over all visible cores, which slows the
-# rasteriser about twofold and makes results depend on the core count; one core per
+# rasterizer about twofold and makes results depend on the core count; one core per
 # test process pins the bits. xdist workers then share the machine evenly.
 os.environ.setdefault("PJRT_NPROC", "1")
 os.environ.setdefault("NPROC", "1")

@@ -108,7 +108,7 @@ def test_a_picture_is_the_same_under_every_default():
 
     def drawn(gaussians):
         seen = projection.project(gaussians, camera, (32, 24), GSPLAT)
-        return raster.rasterise(seen, gaussians.scale, (32, 24), GSPLAT)
+        return raster.rasterize(seen, gaussians.scale, (32, 24), GSPLAT)
 
     pictures = []
     for default in (None, "BF16_BF16_F32"):

@@ -128,7 +128,7 @@ AXES = {
         **{"dssim-0": "dssim_weight=0", "dssim-0.5": "dssim_weight=0.5"},
     ),
     "raster": _axis(
-        "which tiles and cut-offs in the rasteriser",
+        "which tiles and cut-offs in the rasterizer",
         SPLATS,
         **{
             "tile-16": "raster.tile=16",

@@ -34,7 +34,7 @@ def _pixel(x):
         extent_px=constant(np.full((COUNT, 2), 2.0), x.dtype),
     )
     values = constant(_VALUES[:, None], x.dtype)
-    image, _ = raster.rasterise(footprints, values, (1, 1), OPEN)
+    image, _ = raster.rasterize(footprints, values, (1, 1), OPEN)
     return image[0, 0]
 
 
@@ -109,7 +109,7 @@ LONG_LIST = Case(
     exact=_exact_pixel,
     bounds={"float32": (2e-6, 2e-4), "float64": (5e-15, 1e-12)},
     caught=(("float32", "slope"), ("float64", "slope")),
-    alike=False,  # a whole rasteriser against one product
+    alike=False,  # a whole rasterizer against one product
 )
 
 

@@ -1,4 +1,4 @@
-"""How fast the rasteriser is, against this machine's limit and simpler forms.
+"""How fast the rasterizer is, against this machine's limit and simpler forms.
 
     python -m experiments.raster_speed
     python -m experiments.raster_speed --cases 10000@256x256 --baselines
@@ -6,7 +6,7 @@
 
 Times are medians of process CPU time in one process that sees one core
 (`PJRT_NPROC=1`), because the machine may be shared. `--yardstick` names a script that
-times another rasteriser on a scene it writes: it is called as
+times another rasterizer on a scene it writes: it is called as
 `PYTHON SCRIPT --gaussians N --size WxH --scene FILE --json`, and its answer
 `forward_ms`, `forward_backward_ms` is printed beside ours for the same scene.
 """
@@ -86,7 +86,7 @@ class Case:
     def arguments(self):
         return (*self.footprints[:3], self.values, self.footprints)
 
-    def forward(self, drawing=raster.rasterise, **sizes):
+    def forward(self, drawing=raster.rasterize, **sizes):
         """The compiled drawing; takes footprints and values."""
 
         def draw(footprints, values):
@@ -94,7 +94,7 @@ class Case:
 
         return jax.jit(draw).lower(self.footprints, self.values).compile()
 
-    def gradient(self, drawing=raster.rasterise, cameras=None, **sizes):
+    def gradient(self, drawing=raster.rasterize, cameras=None, **sizes):
         """The compiled slopes of the summed picture by all that is drawn."""
 
         def loss(mean_px, whitening, opacity, values, footprints):
@@ -176,7 +176,7 @@ def exponential_limit_ns(repeats: int) -> float:
 
 
 def yardstick_times(script: pathlib.Path, text: str, scene_file: str) -> dict:
-    """What the other rasteriser took for the scene; `text` is "COUNT@SIZE"."""
+    """What the other rasterizer took for the scene; `text` is "COUNT@SIZE"."""
     count, size = text.split("@")
     command = [sys.executable, str(script), "--gaussians", count, "--size", size]
     command += ["--scene", scene_file, "--json"]

@@ -1,4 +1,4 @@
-"""Two plain ways to rasterise the same footprints, for comparison: autodiff throughout.
+"""Two plain ways to rasterize the same footprints, for comparison: autodiff throughout.
 
 `dense` evaluates every Gaussian at every pixel; `lockstep` scans all tiles together
 over their sorted lists. Both recompute blocks in the backward pass, or memory would end

@@ -9,12 +9,12 @@
 Every preset is timed in two fresh processes, one that sees one core and one that has
 the cores its steps are made for. `--job` also times the README's first command, from an
 empty cache of programs and of evidence, and `--beside` that of another checkout, an
-earlier revision, between two of ours. `--yardstick` times the rasteriser beside
+earlier revision, between two of ours. `--yardstick` times the rasterizer beside
 another (`experiments.raster_speed`). Times are wall clock: leave the machine alone.
 What was measured before stays in OUT/speed.json where it is not measured anew.
 `--check` holds that file against an earlier one, each number with its tolerance: a
 quarter of a time, a half of compiling, a tenth of memory, 0.15 of a ratio to the other
-rasteriser, half a decibel.
+rasterizer, half a decibel.
 """
 
 import concurrent.futures
@@ -39,7 +39,7 @@ CASES = ("10000@256x256", "50000@480x270", "200000@800x800")
 
 @dataclasses.dataclass(frozen=True)
 class Speed:
-    """Time presets, the main job, and the rasteriser beside another."""
+    """Time presets, the main job, and the rasterizer beside another."""
 
     presets: tuple[str, ...] = ()
     """Which presets (default: all small ones)."""
@@ -50,7 +50,7 @@ class Speed:
     beside: pathlib.Path | None = None
     """Also the main job of this checkout of the library, between two of ours."""
     yardstick: pathlib.Path | None = None
-    """Also the rasteriser, beside the one that this script times."""
+    """Also the rasterizer, beside the one that this script times."""
     out: pathlib.Path = pathlib.Path("runs/speed")
     """Folder for speed.json."""
     check: pathlib.Path | None = None

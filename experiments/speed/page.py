@@ -22,7 +22,7 @@ the step: of fields they were taken of all its rays at once."""
 
 
 def page(stored: Mapping[str, Any]) -> str:
-    """The tables: presets, where their time goes, the main job, the rasteriser."""
+    """The tables: presets, where their time goes, the main job, the rasterizer."""
     parts = [READING, _presets(stored["presets"]), "## Where a step's time goes"]
     parts.append(PARTS)
     parts.append(_parts(stored["presets"]))
@@ -31,7 +31,7 @@ def page(stored: Mapping[str, Any]) -> str:
         if "jobs" in stored:
             parts.append(_beside(**stored["jobs"]))
     if "raster" in stored:
-        parts += ["## The rasteriser beside a tuned C++ one", RASTER]
+        parts += ["## The rasterizer beside a tuned C++ one", RASTER]
         parts.append(_raster(stored["raster"]["rows"]))
     return "\n\n".join(parts)
 
@@ -100,7 +100,7 @@ def _beside(first, beside, again):
 
 
 RASTER = """\
-Forward and backward, CPU milliseconds on one core, in one sitting: the other rasteriser
+Forward and backward, CPU milliseconds on one core, in one sitting: the other rasterizer
 before and after ours, the mean of both."""
 
 

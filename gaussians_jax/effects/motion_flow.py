@@ -160,7 +160,7 @@ def drawn_flow(
     values = jnp.concatenate([stretch.reshape(-1, 4), shift], axis=1)
     values = jnp.where(both, values, 0)
     more = [first.depth[:, None], both.astype(values.dtype)]
-    image, left = raster.rasterise(
+    image, left = raster.rasterize(
         first, jnp.concatenate([values, *more], axis=1), size, picture
     )
     matrix, offset = image[..., :4].reshape(*image.shape[:2], 2, 2), image[..., 4:6]

@@ -208,7 +208,7 @@ def test_gradients_go_through_both_ends_and_no_weight(float64):
         )
         stretch, shift = motion_flow.linear_flow(first, *ends)
         values = jnp.concatenate([stretch.reshape(-1, 4), shift], axis=1)
-        image, _ = motion_flow.raster.rasterise(first, values, SIZE, GSPLAT)
+        image, _ = motion_flow.raster.rasterize(first, values, SIZE, GSPLAT)
         return jnp.sum(jnp.sin(image[..., 4:6]) * weight)
 
     assert gradients.directional_error(total, here, there) < 1e-5

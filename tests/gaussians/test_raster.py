@@ -52,7 +52,7 @@ def compiled_slopes(footprints, values, size, spec):
         moved = footprints._replace(
             mean_px=mean_px, whitening=whitening, opacity=opacity
         )
-        image, left = raster.rasterise(moved, values, size, spec)
+        image, left = raster.rasterize(moved, values, size, spec)
         return jnp.sum(jnp.sin(3 * image)) + jnp.sum(left**2), (image, left)
 
     grads, picture = jax.grad(loss, argnums=(0, 1, 2, 3), has_aux=True)(

@@ -264,7 +264,7 @@ CALLS = [
                              AnnealingSpec(951), 1000), "3/4 of the run"),
     (lambda: moba(motion=PolynomialMotionSpec(warm_up=5), alternation=None),
      "motion.warm_up=5 with motion.fading"),
-    (lambda: raster.rasterise(*footprints((5, 0))), "at least one pixel"),
+    (lambda: raster.rasterize(*footprints((5, 0))), "at least one pixel"),
     (lambda: through_a_lens(), "without lens distortion, got radial"),
     (lambda: spectral.effect(SpectralSpec(after=10), 10), "after=10"),
     (lambda: splats.pad_rows(some_rows(), 6),

@@ -62,7 +62,7 @@ def test_the_page_holds_everything_and_fetches_nothing(tmp_path, picture):
         {"seed": 3, "spec": {"motion": {"width": 128}, "extras": {}}},
         [report.Figure(picture, "held-out frames", "player.html")],
         film,
-        {"field": 30.0, "rasteriser": 10.0},
+        {"field": 30.0, "rasterizer": 10.0},
         ["LPIPS is not computed, because there are no weights"],
         [report.Command("Go on", "nerfies render run")],
     )

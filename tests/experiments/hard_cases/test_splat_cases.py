@@ -113,7 +113,7 @@ def pixel(alphas, values, spec):
         depth=jnp.arange(1, count + 1).astype(dtype),
         extent_px=jnp.full((count, 2), 2, dtype),
     )
-    image, left = raster.rasterise(footprints, values[:, None], (1, 1), spec)
+    image, left = raster.rasterize(footprints, values[:, None], (1, 1), spec)
     return image[0, 0, 0], left[0, 0]
 
 
@@ -195,6 +195,6 @@ def test_half_precision_gaussians_are_refused_by_name(kind):
     shapes = (1, 2), (1, 3), (1,), (1,), (1, 2)
     half = jax.device_put(Footprints(*(np.ones(x, jnp.dtype(kind)) for x in shapes)))
     with pytest.raises(ValueError, match=f"{kind}.*float32"):
-        raster.rasterise(half, half.whitening, SIZE, GSPLAT)
+        raster.rasterize(half, half.whitening, SIZE, GSPLAT)
     with pytest.raises(ValueError, match=f"{kind}.*float32"):
         splats.from_points(np.eye(3), np.eye(3), dtype=jnp.dtype(kind))
