@@ -1,12 +1,21 @@
-"""JSON and file names from strangers: bounded, typed, never outside their folder."""
+"""JSON and file names from strangers; files and folders replaced as a whole.
+
+JSON is bounded and typed, and names never lead outside their folder. While a file or
+folder is written it has a hidden name beside its final one: `.NAME.OWNER.partial`, or
+`.NAME.OWNER.RANDOM.partial` for folders, where OWNER is the process and its machine.
+`sweep` removes what processes that were killed left under such names.
+"""
 
 import contextlib
+import hashlib
 import json
 import os
 import pathlib
+import platform
 import re
 import shutil
 import tempfile
+from collections.abc import Collection, Iterable
 from typing import Any
 
 import msgspec
@@ -16,6 +25,11 @@ from nerfies_jax.capture.capture import CaptureError
 MAX_JSON_BYTES = 256 * 2**20  # 20 000 frames of transforms.json are 20 MB
 
 AnyPath = str | os.PathLike
+
+_LEFT_BEHIND = re.compile(
+    r"\.(?P<name>.+)\.(?P<pid>\d+)-(?P<machine>[0-9a-f]{6})"
+    r"(\.[a-z0-9_]{8})?\.(?P<kind>partial|earlier)(\.[^.]+)?"
+)
 
 
 def read_json(path: AnyPath, kind: Any = Any) -> Any:
@@ -74,7 +88,7 @@ def replaced_file(path: AnyPath):
     """
     path = pathlib.Path(path)
     # The suffix stays last: image and video writers choose the format by it.
-    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+    partial = path.with_name(f".{path.stem}.{_owner()}.partial{path.suffix}")
     try:
         yield partial
         with partial.open("r+b") as file:
@@ -100,6 +114,52 @@ def _sync_names(folder):
             os.close(opened)
 
 
+def _owner():
+    """This process and its machine, for the names of what is not complete."""
+    return f"{os.getpid()}-{_machine()}"
+
+
+def _machine():
+    return hashlib.sha256(platform.node().encode()).hexdigest()[:6]
+
+
+def sweep(folder: AnyPath) -> list[pathlib.Path]:
+    """Clean up what killed processes of this machine left in a folder.
+
+    Files and folders that were not complete are removed. A folder that was about to be
+    replaced returns to its name where the new one had not taken that name yet.
+
+    Args:
+      folder: Where to look. Folders inside it are not searched.
+
+    Returns:
+      The hidden paths that were removed or renamed.
+    """
+    import psutil
+
+    swept = []
+    try:
+        paths = sorted(pathlib.Path(folder).glob(".*"))
+    except OSError:
+        return swept
+    for path in paths:
+        left = _LEFT_BEHIND.fullmatch(path.name)
+        if left is None or left["machine"] != _machine():
+            continue
+        if psutil.pid_exists(int(left["pid"])):
+            continue
+        if left["kind"] == "earlier" and not (path.parent / left["name"]).exists():
+            with contextlib.suppress(OSError):
+                os.replace(path, path.parent / left["name"])
+        elif path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            with contextlib.suppress(OSError):
+                path.unlink()
+        swept.append(path)
+    return swept
+
+
 @contextlib.contextmanager
 def new_folder(path: AnyPath):
     """A temporary folder beside `path` that becomes `path` when the block ends well."""
@@ -120,42 +180,99 @@ def refuse_existing(path: AnyPath, overwrite: bool) -> None:
 
 
 @contextlib.contextmanager
-def replaced_folder(path: AnyPath, overwrite: bool = False):
-    """`new_folder`, which with `overwrite` takes the place of an earlier one.
+def replaced_folder(
+    path: AnyPath, overwrite: bool = False, replaceable: Collection[str] | None = None
+):
+    """Replace a folder once its successor is complete.
 
-    An earlier folder goes once the new one is whole, and only where every file in it
-    has its like in the new one, up to the numbers in its name: nothing else is lost.
+    The earlier folder stays as it is until the block ends well. It is never replaced
+    while it holds a file that would be lost.
+
+    Args:
+      path: The folder. It may be absent or empty.
+      overwrite: Whether a folder with files may be replaced.
+      replaceable: Files of the earlier folder that may be deleted, by their paths
+        relative to it. Any other is refused before the block begins. By default those
+        that have a like in the new folder, up to the numbers in their names, which is
+        known when the block ends.
+
+    Yields:
+      The temporary folder to write into.
+
+    Raises:
+      CaptureError: The folder may not be replaced, or cannot be written.
     """
     path = pathlib.Path(path)
+    sweep(path.resolve().parent)
     refuse_existing(path, overwrite)
     if not path.is_dir() or not any(path.iterdir()):
         with new_folder(path) as partial:
             yield partial
         return
     path = path.resolve()
-    with scratch_folder(path.with_name(f".{path.name}.replaced")) as scratch:
-        new, old = scratch / "new", scratch / "old"
+    if replaceable is not None:
+        _refuse_others(path, replaceable)
+    with _partial_folder(path) as scratch:
+        new = scratch / "new"
         new.mkdir()
         yield new
-        written = set(_kinds(new))
-        for kind, name in _kinds(path).items():
-            if kind not in written:
-                raise CaptureError(
-                    f"{path}: holds {name}, which would be lost; choose another name "
-                    "or move it away"
-                )
-        os.replace(path, old)
-        try:
-            os.replace(new, path)
-        except OSError:
-            os.replace(old, path)
-            raise
+        written = _files(new)
+        _refuse_others(
+            path, alike(path, written) if replaceable is None else replaceable
+        )
+        _take_place(new, path)
 
 
-def _kinds(folder):
-    """The files below a folder, by their paths with the numbers left out."""
-    paths = (p.relative_to(folder) for p in folder.rglob("*") if not p.is_dir())
-    return {re.sub(r"\d+", "#", str(path)): path for path in paths}
+def _take_place(new, path):
+    """Rename the new folder to `path`; `sweep` mends it where that is cut off."""
+    earlier = path.with_name(f".{path.name}.{_owner()}.earlier")
+    os.replace(path, earlier)
+    try:
+        os.replace(new, path)
+    except BaseException:
+        if not path.exists():
+            os.replace(earlier, path)
+        raise
+    _sync_names(path.parent)
+    shutil.rmtree(earlier, ignore_errors=True)
+
+
+def _refuse_others(path, replaceable):
+    """Raise where a folder holds a file that is not among those."""
+    for name in _files(path):
+        if name not in replaceable:
+            raise CaptureError(
+                f"{path}: holds {name}, which would be lost; choose another name or "
+                "move it away"
+            )
+
+
+def _files(folder):
+    """Paths of the files below a folder, relative to it."""
+    return [
+        path.relative_to(folder).as_posix()
+        for path in sorted(folder.rglob("*"))
+        if path.is_symlink() or not path.is_dir()
+    ]
+
+
+def alike(folder: AnyPath, names: Iterable[str]) -> set[str]:
+    """Files of a folder that are named like any of `names`, up to their numbers.
+
+    Args:
+      folder: The folder. It may be absent.
+      names: Paths relative to the folder.
+
+    Returns:
+      Paths relative to the folder, with forward slashes.
+    """
+    kinds = {_without_numbers(name) for name in names}
+    files = _files(pathlib.Path(folder))
+    return {name for name in files if _without_numbers(name) in kinds}
+
+
+def _without_numbers(name):
+    return re.sub(r"\d+", "#", name)
 
 
 @contextlib.contextmanager
@@ -166,8 +283,15 @@ def scratch_folder(path: AnyPath):
     can be renamed to.
     """
     path = pathlib.Path(path)
+    sweep(path.resolve().parent)
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise CaptureError(f"{path}: already there; choose another name or remove it")
+    with _partial_folder(path) as partial:
+        yield partial
+
+
+@contextlib.contextmanager
+def _partial_folder(path):
     real = path.resolve()
     if os.path.ismount(real):
         raise CaptureError(
@@ -176,8 +300,9 @@ def scratch_folder(path: AnyPath):
         )
     try:
         real.parent.mkdir(parents=True, exist_ok=True)
+        prefix = f".{real.name}.{_owner()}."
         partial = pathlib.Path(
-            tempfile.mkdtemp(prefix=f".{real.name}.", dir=real.parent)
+            tempfile.mkdtemp(prefix=prefix, suffix=".partial", dir=real.parent)
         )
     except OSError as error:
         raise CaptureError(

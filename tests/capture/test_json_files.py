@@ -1,11 +1,15 @@
 """New folders take their place whole, wherever that is, or not at all."""
 
 import os
+import pathlib
+import subprocess
+import sys
 
 import pytest
 
+from nerfies_jax.capture import json_files
 from nerfies_jax.capture.capture import CaptureError
-from nerfies_jax.capture.json_files import new_folder
+from nerfies_jax.capture.json_files import new_folder, replaced_folder, sweep
 
 
 def fill(path):
@@ -34,3 +38,93 @@ def test_a_mounted_disk_is_refused_before_anything_is_made(tmp_path, monkeypatch
     with pytest.raises(CaptureError, match=r"a whole mounted disk.*a folder in it"):
         fill(tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+def replace(path, names, overwrite=True, replaceable=None, fail=False):
+    with replaced_folder(path, overwrite, replaceable) as folder:
+        for name in names:
+            (folder / name).write_text("new")
+        if fail:
+            raise RuntimeError("in the middle")
+
+
+def texts(folder):
+    """Every file below a folder, hidden ones too, with what it says."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): path.read_text() for path in files}
+
+
+def test_a_folder_is_replaced_by_a_complete_one_alone(tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    for name in ("1.png", "2.png"):
+        (out / name).write_text("old")
+    before = texts(tmp_path)
+    with pytest.raises(RuntimeError, match="in the middle"):
+        replace(out, ["7.png"], fail=True)
+    with pytest.raises(CaptureError, match="already there"):
+        replace(out, ["7.png"], overwrite=False)
+    assert texts(tmp_path) == before
+    replace(out, ["7.png"])
+    assert texts(tmp_path) == {"out/7.png": "new"}
+
+
+@pytest.mark.parametrize("replaceable", [None, {"1.png"}])
+def test_what_a_person_put_into_a_folder_is_named_and_kept(replaceable, tmp_path):
+    """Where it is known what may go, before any work is done."""
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "1.png").write_text("old")
+    (out / "notes.txt").write_text("mine")
+    (out / "elsewhere").symlink_to(tmp_path)
+    names = iter(["1.png"])
+    with pytest.raises(CaptureError, match="holds elsewhere, which would be lost"):
+        replace(out, names, True, replaceable)
+    assert (next(names, None) is None) == (replaceable is None)
+    assert texts(tmp_path) == {"out/1.png": "old", "out/notes.txt": "mine"}
+
+
+KILLED = """
+import os, sys
+from nerfies_jax.capture.json_files import replaced_file, replaced_folder
+
+place, rename = sys.argv[1:], os.replace
+def replace(source, target):
+    rename(source, target)
+    if str(target).endswith(".earlier"):
+        os.kill(os.getpid(), 9)  # the name is free, and the new folder has not taken it
+os.replace = replace
+with replaced_file(place[0]) as partial:
+    partial.write_text("new")
+with replaced_folder(place[1], True) as folder:
+    (folder / "1.png").write_text("new")
+"""
+
+
+def test_a_kill_between_the_two_renames_loses_nothing(tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "1.png").write_text("old")
+    command = [sys.executable, "-c", KILLED, str(tmp_path / "file"), str(out)]
+    root = pathlib.Path(json_files.__file__).parents[2]
+    assert subprocess.run(command, cwd=root).returncode == -9
+    assert not out.exists()
+    assert len(sweep(tmp_path)) == 2  # the earlier folder and the new one
+    assert texts(tmp_path) == {"file": "new", "out/1.png": "old"}
+
+
+def test_only_what_the_dead_of_this_machine_left_is_swept(tmp_path):
+    owner, machine = json_files._owner(), json_files._machine()
+    dead = "4194999"  # above the largest process id of Linux
+    kept = (
+        f".a.{owner}.partial.png",
+        f".a.{dead}-{'0' * 6}.partial.png",
+        ".a.partial",
+        ".env",
+    )
+    for name in (*kept, f".a b.c.{dead}-{machine}.partial.png"):
+        (tmp_path / name).write_text("")
+    (tmp_path / f".out.{dead}-{machine}.ab_1cd2e.partial" / "new").mkdir(parents=True)
+    assert len(sweep(tmp_path)) == 2
+    assert {path.name for path in tmp_path.iterdir()} == {*kept}
+    assert sweep(tmp_path / "absent") == []
