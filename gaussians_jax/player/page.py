@@ -67,7 +67,34 @@ def write(
         fewer = int(count * MOST_BYTES / len(packed.data))
         count = max(fewer, FEWEST_INSTANTS)
         instants, packed = _packed(at, rows, capture, seen, count)
-    about = _about(instants, packed, capture)
+    return compose(
+        path, title, packed, _about(instants, packed, capture), raster, capture, poster
+    )
+
+
+def compose(
+    path: pathlib.Path,
+    title: str,
+    packed: packing.Packed,
+    about: str,
+    raster: RasterSpec,
+    capture: Capture,
+    poster: np.ndarray,
+) -> Player:
+    """Write the page of Gaussians that are packed already.
+
+    Args:
+      path: File to write.
+      title: Title of the page.
+      packed: The Gaussians.
+      about: Sentences about them, for the caption.
+      raster: Thresholds of the image.
+      capture: Cameras that the first view and the limits of the camera come from.
+      poster: Image [height, width, 3] (uint8) that is shown until the first frame.
+
+    Returns:
+      The file and its caption.
+    """
     background = capture.background or (0.0, 0.0, 0.0)
     parts = {
         "title": html.escape(title),

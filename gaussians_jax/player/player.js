@@ -200,6 +200,12 @@ function start(header, buffer) {
   });
   play(playing);
   requestAnimationFrame((now) => { before = now; tick(now); });
+  return {
+    get view() { return view; },
+    get time() { return Number(slider.value); },
+    get playing() { return playing; },
+    get ready() { return !stale; },
+  };
 }
 
 // Pointers and wheel on the canvas change the view: `get` has it, `change` takes it.
@@ -247,9 +253,10 @@ function bytesOf(text) {
   return bytes.buffer;
 }
 
+let player = null; // for tests and for pages that embed this one
 try {
   const text = (id) => document.getElementById(id).textContent;
-  start(JSON.parse(text("header")), bytesOf(text("data")));
+  player = start(JSON.parse(text("header")), bytesOf(text("data")));
 } catch (error) {
   document.getElementById("trouble").textContent = `Nothing can be drawn: ${error.message}`;
 }

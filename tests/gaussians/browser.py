@@ -1,0 +1,145 @@
+"""A browser for the tests of the player, and a page whose image is known in advance."""
+
+import functools
+import io
+import os
+import shutil
+
+import numpy as np
+import PIL.Image
+import pytest
+
+from gaussians_jax.player import packing
+from gaussians_jax.player import page as player_page
+from gaussians_jax.player.sampled import Instants
+from gaussians_jax.raster_spec import RasterSpec
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.geometry import camera as cameras
+
+NAMES = ("chromium", "chromium-browser", "google-chrome")
+CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)
+# Software rendering, which every machine has. Root has no sandbox.
+ARGUMENTS = (
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--no-sandbox",
+    "--disable-dev-shm-usage",
+)
+# Static blobs of one color each, by position. The last one moves, see MOVED.
+BLOBS = {
+    "red": (0.0, 0.0, 0.0),
+    "green": (0.45, 0.0, 0.0),
+    "blue": (0.0, 0.35, 0.3),
+    "magenta": (-0.45, -0.3, 0.0),
+}
+COLORS = {"red": (1, 0, 0), "green": (0, 1, 0), "blue": (0, 0, 1), "magenta": (1, 0, 1)}
+MOVED = (0.5, 0.0, 0.0)  # of the magenta blob, from time 0 to time 1
+SECONDS = 2.0  # that the capture plays
+SIZE, FOCAL_PX, DISTANCE = (64, 48), 70.0, 2.0
+
+
+def launched():
+    """Yield a running browser; skip, or fail where CI has installed one."""
+    try:
+        from playwright.sync_api import sync_playwright
+    except ImportError:
+        sync_playwright = None
+    if CHROMIUM is None or sync_playwright is None:
+        reason = "these tests need Chromium and the Python package playwright"
+        (pytest.fail if os.environ.get("BROWSER_TESTS") else pytest.skip)(reason)
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(
+            executable_path=CHROMIUM, args=list(ARGUMENTS)
+        )
+        yield browser
+        browser.close()
+
+
+@functools.cache
+def capture():
+    """Cameras on an arc about the origin, at one distance, y up."""
+    angles = np.linspace(-0.5, 0.5, 9)
+    heights = 0.1 + 0.2 * np.arange(9) % 0.4
+    positions = DISTANCE * np.stack(
+        [
+            np.sin(angles) * np.cos(heights),
+            np.sin(heights),
+            np.cos(angles) * np.cos(heights),
+        ],
+        axis=1,
+    )
+    # The first view is the middle one.
+    positions = np.roll(positions, 5, axis=0)
+    filmed = [
+        cameras.look_at(place, (0, 0, 0), (0, 1, 0), FOCAL_PX, SIZE)
+        for place in positions
+    ]
+    count = np.arange(9, dtype=np.int32)
+    return Capture(
+        name="blobs",
+        source="test",
+        ids=tuple(f"{i}" for i in count),
+        images=np.zeros((9, SIZE[1], SIZE[0], 3), np.uint8),
+        cameras=cameras.stack(filmed),
+        times=np.linspace(0, 1, 9, dtype=np.float32),
+        train=count,
+        heldout=count[:0],
+        near=0.5,
+        far=4.0,
+        warp_ids=count,
+        appearance_ids=count,
+        camera_ids=0 * count,
+        background=(0.0, 0.0, 0.0),
+        up=(0.0, 1.0, 0.0),
+        frames_per_second=9 / SECONDS,
+    )
+
+
+def write_blobs(path):
+    """Write the player page of the blobs."""
+    count, steps = len(BLOBS), np.linspace(0, 1, 24)
+    mean = np.tile(np.float32(list(BLOBS.values())), (len(steps), 1, 1))
+    mean[:, -1] += steps[:, None] * MOVED
+    instants = Instants(
+        mean=mean,
+        quaternion=np.tile(np.float32([1, 0, 0, 0]), (len(steps), count, 1)),
+        log_scale=np.full((len(steps), count, 3), np.log(0.04), np.float32),
+        opacity=np.full((len(steps), count), 0.95, np.float32),
+        colour=np.float32(list(COLORS.values())),
+        left_out=0,
+    )
+    packed = packing.pack(instants, np.full(count, 1e-4))
+    poster = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
+    player_page.compose(
+        path, "Blobs", packed, "Four blobs.", RasterSpec(), capture(), poster
+    )
+
+
+def image_of(page, selector="#scene"):
+    """Return what the page shows of an element, [height, width, 3] from 0 to 1."""
+    content = page.locator(selector).screenshot()
+    return np.asarray(PIL.Image.open(io.BytesIO(content)).convert("RGB")) / 255
+
+
+def place_of(image, name):
+    """Return the centroid (x, y) of the blob of one color in px, and its area."""
+    color = np.array(COLORS[name])
+    lit = image[..., color == 1].min(axis=-1)
+    unlit = image[..., color == 0].max(axis=-1)
+    weight = np.clip(lit - unlit, 0, 1)
+    weight = np.where(weight > 0.1, weight, 0)
+    total = weight.sum()
+    assert total > 0, f"the {name} blob is not to be seen"
+    rows, columns = np.indices(weight.shape) + 0.5
+    return np.array([(weight * columns).sum(), (weight * rows).sum()]) / total, total
+
+
+def projected(view, point, width, height):
+    """Where a view shows a point, px from the upper left corner of the canvas."""
+    enlarged = min(width / view["size"][0], height / view["size"][1])
+    x, y, z = np.reshape(view["rotation"], (3, 3)) @ np.subtract(
+        point, view["position"]
+    )
+    offset = view["focal"] * enlarged * np.array([x, y * view["aspect"]]) / z
+    center = np.subtract(view["centre"], np.divide(view["size"], 2)) * enlarged
+    return offset + center + (width / 2, height / 2)
