@@ -15,6 +15,7 @@ from typing import Annotated
 import tyro
 
 from experiments import options
+from nerfies_jax import console
 from nerfies_jax.capture.nearest import known_names
 
 HERE = pathlib.Path(__file__).resolve().parent
@@ -35,12 +36,19 @@ def commands() -> dict[str, str]:
 
 def main(arguments: list[str] | None = None) -> None:
     """List the commands, or run the one named first; exit code 2 for an unknown one."""
+    with console.session():
+        _main(arguments)
+
+
+def _main(arguments):
     words = sys.argv[1:] if arguments is None else arguments
     known = commands()
     if not words or words[0] in ("-h", "--help"):
         width = max(map(len, known))
-        print("usage: nerfies NAME ...   or   python -m experiments.NAME ...\n")
-        print("\n".join(f"{name:{width}}  {line}" for name, line in known.items()))
+        console.say("usage: nerfies NAME ...   or   python -m experiments.NAME ...\n")
+        console.say(
+            "\n".join(f"{name:{width}}  {line}" for name, line in known.items())
+        )
         return
     if words[0].startswith(options.COMPLETION):
         print_completion(words)
@@ -48,7 +56,7 @@ def main(arguments: list[str] | None = None) -> None:
     name, *rest = words
     if name not in known:
         meant = known_names(name, known)
-        print(f"error: no command {name!r}; {meant}", file=sys.stderr)
+        console.error(f"no command {name!r}; {meant}")
         raise SystemExit(2)
     if "" not in sys.path:  # as python -m does: --effect finds what lies here
         sys.path.insert(0, "")

@@ -19,6 +19,7 @@ from typing import Literal
 import numpy as np
 
 from experiments import cli, markdown
+from nerfies_jax import console
 from nerfies_jax.runs import platform
 
 SHOWN = 4  # frames in the picture
@@ -188,8 +189,8 @@ def _write(args, every, picture):
     write_json(folder / "figures.json", record)
     pictures.save(picture, folder / "picture.png")
     for name, values in figures.items():
-        print(f"{name:52} {markdown.over_seeds(values, 2):>16}")
-    print(f"{folder / 'figures.json'}, {folder / 'picture.png'}")
+        console.say(f"{name:52} {markdown.over_seeds(values, 2):>16}")
+    console.say(f"{folder / 'figures.json'}, {folder / 'picture.png'}")
     return record
 
 

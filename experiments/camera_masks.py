@@ -16,6 +16,7 @@ import pathlib
 import tempfile
 
 from experiments import cli, markdown
+from nerfies_jax import console
 from nerfies_jax.runs import platform
 
 ARMS = ("one pass", "two passes", "true masks")
@@ -54,7 +55,7 @@ def main(args):
     for seed in range(args.seeds):
         for row in _of_seed(args, seed):
             rows.append(row)
-            print("  ".join(f"{k} {v}" for k, v in row.items()), flush=True)
+            console.say("  ".join(f"{k} {v}" for k, v in row.items()))
     record = {"machine": clock.machine(), "half": args.half, "rows": rows}
     if args.out is not None:
         write_json(args.out, record)

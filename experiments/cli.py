@@ -17,6 +17,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import tyro
 
 from experiments import options
+from nerfies_jax import console
 from nerfies_jax.capture.extras import MissingExtra
 from nerfies_jax.capture.given import GivenFiles
 from nerfies_jax.capture.nearest import known_names
@@ -107,24 +108,30 @@ def command(settings: Any) -> Callable[[Callable], Callable]:
 
     With `--json` that is printed as one document, and everything else that is printed,
     also by processes that are started, goes to standard error. Wrong settings end it
-    with exit code 2.
+    with exit code 2. No output ends it: one whose reader went away changes nothing, and
+    where any other was lost a command that succeeds exits with code 1.
     """
 
     def decorate(run):
         @functools.wraps(run)
         def main(arguments=None):
+            with console.session() as session:
+                return _ran(session, arguments)
+
+        def _ran(session, arguments):
             words = sys.argv[1:] if arguments is None else list(arguments)
             as_json = options.JSON in words
             words = [word for word in words if word != options.JSON]
             with user_errors():
                 args = parse(settings, words, _called(run))
             aside = _words_aside() if as_json else contextlib.nullcontext()
-            with aside, _ended_by_reader(), user_errors((MissingExtra,)):
+            with aside, user_errors((MissingExtra,)):
                 result = _interruptible(run, args)
             ended = result if isinstance(result, Ended) else None
             result = result if ended is None else ended.result
             if as_json:
-                print(json.dumps(result, indent=1, allow_nan=False, default=str))
+                document = json.dumps(result, indent=1, allow_nan=False, default=str)
+                session.deliver(document)
             if ended is not None:
                 raise SystemExit(ended.code)
             return result
@@ -144,7 +151,7 @@ def _interruptible(run, args):
         with stopping.exits():
             return run(args)
     except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
+        console.note("interrupted")
         raise SystemExit(130) from None
 
 
@@ -176,17 +183,6 @@ def _words_aside() -> Iterator[None]:
     finally:
         os.dup2(kept, 1)
         os.close(kept)
-
-
-@contextlib.contextmanager
-def _ended_by_reader() -> Iterator[None]:
-    """End quietly where what reads our words, `head` say, has read enough."""
-    try:
-        yield
-        sys.stdout.flush()
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-        raise SystemExit(0) from None
 
 
 def stored(path: pathlib.Path) -> Any:
@@ -248,5 +244,5 @@ def user_errors(kinds: tuple[type[Exception], ...] = (ValueError, OSError)):
     try:
         yield
     except kinds as error:
-        print("error: " + " ".join(str(error).split()), file=sys.stderr)
+        console.error(" ".join(str(error).split()))
         sys.exit(2)

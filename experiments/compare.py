@@ -16,6 +16,7 @@ import pathlib
 from typing import Any, Literal, NamedTuple
 
 from experiments import cli
+from nerfies_jax import console
 from nerfies_jax.runs import platform, representations, run_folder
 
 LARGEST_ERROR = 0.2
@@ -75,9 +76,9 @@ def main(args):
         compared = read(args.runs)
         folder = run_folder.new_run_folder(args.out, "compare")
         goals = args.psnr or default_goals(compared)
-    print(table(compared, goals))
+    console.say(table(compared, goals))
     for line in remarks(compared):
-        print(line)
+        console.say(line)
     save(folder, compared, goals)
     if args.frames:
         kinds = [representations.of_run(each.folder) for each in compared]
@@ -85,7 +86,7 @@ def main(args):
         with cli.user_errors():
             platform.start_jax(args.device, "all" if "all" in threads else "one")
             draw(folder / "pictures.png", compared, args.frames)
-    print(f"saved in {folder}")
+    console.say(f"saved in {folder}")
     return cli.stored(folder / "compare.json")
 
 

@@ -19,6 +19,7 @@ import pathlib
 from typing import Any, Literal
 
 from experiments import cli
+from nerfies_jax import console
 from nerfies_jax.runs import platform, representations, run_folder
 
 # Which options each format knows, beside --out, --overwrite and --device.
@@ -134,7 +135,7 @@ def main(args):
             run = runs.with_found_cameras(run, runs.restore(args.run, run).state)
         args.place.parent.mkdir(parents=True, exist_ok=True)
         said = WRITERS[args.format](args, run)
-        print(f"{said}: {args.place}")
+        console.say(f"{said}: {args.place}")
     return {"written": str(args.place), "format": args.format, "said": said}
 
 

@@ -31,6 +31,7 @@ import statistics
 import time
 
 from experiments import cli, markdown
+from nerfies_jax import console
 from nerfies_jax.runs import platform, representations
 from nerfies_jax.training.track_start import FROM_TRACKS
 
@@ -95,7 +96,7 @@ def main(args):
         machine = clock.beside(clock.machine(), stored.get("machine", {}))
         stored = {"machine": machine, "rows": rows}
         write_json(args.out, stored)
-        print("  ".join(f"{k} {v}" for k, v in rows[-1].items()), flush=True)
+        console.say("  ".join(f"{k} {v}" for k, v in rows[-1].items()))
     return stored
 
 

@@ -23,6 +23,7 @@ import optax
 from experiments import asked, cli, markdown
 from gaussians_jax.effects import spectral
 from gaussians_jax.effects.spectral import FourierSpec, SpectralSpec, WaveletSpec
+from nerfies_jax import console
 from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.runs import platform
 from nerfies_jax.training import losses
@@ -337,12 +338,12 @@ def main(args):
     fitted = {}
     for arm in arms(args):
         fitted[arm] = fit(arm, args)
-        print(f"{arm.name}: {fitted[arm].psnr[:, -1].mean():.2f} dB", flush=True)
-    print()
+        console.say(f"{arm.name}: {fitted[arm].psnr[:, -1].mean():.2f} dB")
+    console.say()
     rows = numbers(fitted)
-    print(table(rows))
-    print()
-    print(format_conclusions(rows))
+    console.say(table(rows))
+    console.say()
+    console.say(format_conclusions(rows))
     from nerfies_jax.capture.json_files import write_json
     from nerfies_jax.measure import clock
 
@@ -355,7 +356,7 @@ def main(args):
     if args.out is not None:
         write_json(args.out / "frequency_gates.json", record)
         draw_figure(fitted, args.out / "frequency_gates.png")
-        print(args.out / "frequency_gates.png")
+        console.say(args.out / "frequency_gates.png")
     return record
 
 

@@ -10,6 +10,7 @@ import dataclasses
 import pathlib
 
 from experiments import cli
+from nerfies_jax import console
 from nerfies_jax.runs import platform
 
 
@@ -44,19 +45,19 @@ def main(args):
         source = cli.plain(args.source)
         capture = runs.stored_capture(source, args.seed)
         for line in describe(capture):
-            print(line)
+            console.say(line)
         inspected = inspection.inspect(capture, CACHE / "evidence")
         advice = adviser.advise_all(inspected.findings, args.full)
         for line in report(inspected, advice, source):
-            print(line)
+            console.say(line)
         path = args.picture or pathlib.Path("runs", f"inspect-{_name(capture)}.png")
         path.parent.mkdir(parents=True, exist_ok=True)
         pictures.save(inspected.sheet, path)
-        print(f"contact sheet: {path}")
+        console.say(f"contact sheet: {path}")
         record = as_json(capture, inspected, advice)
         if args.findings is not None:
             write_json(args.findings, record)
-            print(f"findings: {args.findings}")
+            console.say(f"findings: {args.findings}")
     return record
 
 

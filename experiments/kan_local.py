@@ -13,6 +13,7 @@ import dataclasses
 import pathlib
 
 from experiments import cli, markdown
+from nerfies_jax import console
 from nerfies_jax.runs import platform
 
 
@@ -52,7 +53,7 @@ def main(args):
     with cli.user_errors():
         platform.start_jax(args.device, "one")
     figures = measured(args)
-    print(table(figures))
+    console.say(table(figures))
     from nerfies_jax.capture.json_files import write_json
     from nerfies_jax.measure import clock
 

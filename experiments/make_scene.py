@@ -9,6 +9,7 @@ import shlex
 from typing import Literal
 
 from experiments import cli
+from nerfies_jax import console
 from nerfies_jax.runs import platform
 from nerfies_jax.training import specs
 
@@ -49,7 +50,7 @@ def main(args):
         spec = specs.override(spec, args.set)
         synthetic.write(spec, args.out, args.seed)
     width, height = spec.size
-    print(
+    console.say(
         f"{args.out}: {spec.name}, {spec.frames} instants at {width}x{height}, "
         f"truth in {args.out / synthetic.TRUTH_FILE}\n"
         f"next: python -m experiments.reconstruct {shlex.quote(str(args.out))}"

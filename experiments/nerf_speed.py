@@ -14,6 +14,7 @@ import dataclasses
 import pathlib
 
 from experiments import cli, markdown
+from nerfies_jax import console
 from nerfies_jax.runs import platform
 
 RAYS = 256
@@ -58,7 +59,7 @@ def main(args):
             raise ValueError(f"--rows {min(unknown)!r}: there are {', '.join(specs())}")
         rows = args.rows or tuple(specs())
     figures = measured(rows, args.repeats)
-    print(table(figures))
+    console.say(table(figures))
     from nerfies_jax.capture.json_files import write_json
     from nerfies_jax.measure import clock
 

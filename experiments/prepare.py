@@ -13,6 +13,7 @@ from typing import Annotated
 import tyro
 
 from experiments import cli
+from nerfies_jax import console
 from nerfies_jax.runs.config import Preparation
 
 How = Annotated[Preparation, tyro.conf.OmitArgPrefixes]
@@ -67,13 +68,13 @@ def main(args):
             from nerfies_jax.capture import npz_archive
 
             for line in npz_archive.convert(**vars(args)):
-                print(line)
+                console.say(line)
         else:
             from nerfies_jax.runs import preparation
 
-            preparation.prepare(args.file, args.out, args.how, print)
+            preparation.prepare(args.file, args.out, args.how, console.say)
             record = cli.stored(args.out / preparation.RECORD)
-    print(f"next: python -m experiments.reconstruct {shlex.quote(str(args.out))}")
+    console.say(f"next: python -m experiments.reconstruct {shlex.quote(str(args.out))}")
     return {"folder": str(args.out), "prepared": record}
 
 

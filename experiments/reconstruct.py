@@ -11,12 +11,12 @@ import dataclasses
 import functools
 import pathlib
 import signal
-import sys
 from typing import Annotated, ClassVar, Literal
 
 import tyro
 
 from experiments import cli
+from nerfies_jax import console
 from nerfies_jax.runs import commands, platform, representations, run_folder
 from nerfies_jax.runs.config import MoreMetrics, Preparation, RunConfig
 from nerfies_jax.training import stopping
@@ -90,14 +90,14 @@ def main(args):
     try:
         outcome = _outcome(args)
     except KeyboardInterrupt as stop:
-        print(str(stop) or "interrupted while no step was running", file=sys.stderr)
+        console.note(str(stop) or "interrupted while no step was running")
         raise SystemExit(130) from None
     for line in outcome.errors:
-        print(f"error: {line}", file=sys.stderr)
+        console.error(line)
     stopped_by = outcome.result.stopped_by
     code = 1 if outcome.errors else 0
     if stopped_by in stopping.NAMES:
-        print(f"continue with: {commands.resume(outcome.folder)}")
+        console.say(f"continue with: {commands.resume(outcome.folder)}")
         code = code or 128 + signal.Signals[stopped_by]
     return cli.Ended(_result(outcome), code)
 
@@ -176,7 +176,7 @@ def _with_folder(args):
             "capture or film that it was made of"
         )
     folder = run_folder.newest_of(capture)
-    print(f"the newest run of {capture}: {folder}")
+    console.say(f"the newest run of {capture}: {folder}")
     return dataclasses.replace(args, out=folder)
 
 

@@ -8,9 +8,9 @@ Written by pdoc (extra `docs`). Exit code 1 where a public name is on no page.
 import ast
 import dataclasses
 import pathlib
-import sys
 
 from experiments import cli
+from nerfies_jax import console
 from nerfies_jax.capture import extras
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
@@ -42,8 +42,8 @@ def main(args):
         if f'id="{name}"' not in page(args.out, module).read_text()
     ]
     for name in missing:
-        print(f"error: {name} is on no page of the reference", file=sys.stderr)
-    print(f"{len(names)} modules: {args.out / 'index.html'}")
+        console.error(f"{name} is on no page of the reference")
+    console.say(f"{len(names)} modules: {args.out / 'index.html'}")
     result = {"folder": str(args.out), "modules": len(names), "missing": missing}
     return cli.Ended(result, 1 if missing else 0)
 

@@ -23,6 +23,7 @@ import numpy as np
 import tyro
 
 from experiments import cli
+from nerfies_jax import console
 from nerfies_jax.runs import platform, representations
 
 
@@ -204,7 +205,7 @@ def _shown(args, model, state):
     from gaussians_jax import variants
 
     state, summary = variants.without_moving(model, state, args.hide_moving)
-    print(summary)
+    console.say(summary)
     return state
 
 
@@ -221,7 +222,7 @@ def _faster(args, model, state):
         variant = variants.without_static(model, state, static_threshold)
     else:
         return model, state
-    print(variant.summary)
+    console.say(variant.summary)
     return variant.model, variant.state
 
 
@@ -298,7 +299,9 @@ def _write(args, out, renderer, state, names, views, picture_of):
             pass
     width, height = renderer.size
     ms = renderer.ms_per_frame(len(names))
-    print(f"{len(names)} pictures of {width}x{height}, {ms:.0f} ms each, in {out}")
+    console.say(
+        f"{len(names)} pictures of {width}x{height}, {ms:.0f} ms each, in {out}"
+    )
     kinds = [kind for kind in args.formats if kind != "mp4"]
     files = [str(out / f"{name}.{kind}") for name in names for kind in kinds]
     files += [str(out / "film.mp4")] if "mp4" in args.formats else []

@@ -17,6 +17,7 @@ import shutil
 from typing import Any, NamedTuple
 
 from experiments import cli, markdown
+from nerfies_jax import console
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 PAGES = ROOT / "docs" / "results"
@@ -247,7 +248,7 @@ def main(args):
         for name, path in written.items():
             draw(name)
             path.write_text(page(name))
-            print(path)
+            console.say(path)
         (PAGES / "README.md").write_text(index())
     return {"pages": {name: str(path) for name, path in written.items()}}
 

@@ -13,6 +13,7 @@ import textwrap
 from typing import Any
 
 from experiments import cli
+from nerfies_jax import console
 from nerfies_jax.runs import platform, representations
 
 WIDTH, COLUMN = 88, 40  # of the page, and where words begin beside a field
@@ -33,7 +34,7 @@ def main(args):
         platform.start_jax("cpu")
         kind = representations.of_preset(args.preset)
     described = described_preset(kind, args.preset)
-    print("\n".join(lines(described)))
+    console.say("\n".join(lines(described)))
     return described
 
 

@@ -10,6 +10,7 @@ import time
 from typing import Literal
 
 from experiments import cli
+from nerfies_jax import console
 from nerfies_jax.runs import platform, representations, run_folder
 
 
@@ -50,7 +51,7 @@ def main(args):
         restored = runs.restore(args.run, run)
         size = cli.sized(run.capture.size, args.max_side)
         page = viewer.Viewer(run, size, args.port, args.run / run_folder.EXPORTS)
-    print(f"look around at {page.address} (Ctrl-C ends)", flush=True)
+    console.say(f"look around at {page.address} (Ctrl-C ends)")
     try:
         while True:
             page.serve(restored.state, restored.step, seconds=1.0)

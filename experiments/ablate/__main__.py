@@ -16,6 +16,7 @@ stopped.
 from experiments import cli
 from experiments.ablate import settings, suites
 from experiments.ablate.settings import Ablate
+from nerfies_jax import console
 from nerfies_jax.runs import platform, representations
 
 
@@ -57,7 +58,7 @@ def _report(job):
             reports[budget.title] = cli.stored(budget.folder / "ablation.json")
     missing = job.missing()
     if missing:
-        print(
+        console.say(
             f"{len(missing)} arms and seeds are left: "
             + ", ".join(f"{name} {seed}" for name, seed in missing)
             + f"; the same command with --out {job.out} goes on"

@@ -17,7 +17,7 @@ from experiments.ablate.budget import Budget, affordable
 from experiments.ablate.log import line, log
 from experiments.ablate.results import ArmResult
 from experiments.ablate.settings import Ablate
-from nerfies_jax import evaluation, runs
+from nerfies_jax import console, evaluation, runs
 from nerfies_jax.capture import pinholes, synthetic
 from nerfies_jax.capture.synthetic import truth as truths
 from nerfies_jax.evaluation import heldout, moving_masks, protocol
@@ -236,7 +236,7 @@ class Job:
         cpu_seconds = result.training_share * (time.process_time() - began)
         compile_seconds = result.compile_seconds + self._cache_saved
         if result.stopped_by.startswith("SIG"):
-            print(f"stopped; go on with the same command and --out {self.out}")
+            console.say(f"stopped; go on with the same command and --out {self.out}")
             raise SystemExit(130 if result.stopped_by == "SIGINT" else 143)
         draw = ThroughLens(arm.renderer, self.filmed.size)
         filmed = evaluation.as_found(arm.model, result.state, self.filmed)

@@ -1,13 +1,12 @@
 """What an ablation tells its user while it runs."""
 
-import sys
-
 from experiments.ablate.measures import MEASURES
+from nerfies_jax import console
 
 
 def log(text: str) -> None:
     """To the user, beside the results."""
-    print(text, file=sys.stderr, flush=True)
+    console.note(text)
 
 
 def line(numbers: dict[str, float]) -> str:

@@ -6,6 +6,7 @@ from experiments import asked
 from experiments.ablate import arms, measures, picture, verdicts
 from experiments.ablate.measures import MEASURES
 from experiments.ablate.verdicts import Numbers
+from nerfies_jax import console
 from nerfies_jax.evaluation import protocol
 from nerfies_jax.measure import clock
 from nerfies_jax.measure.clock import Metric
@@ -20,15 +21,17 @@ def write(job, budget, finished) -> None:
     numbers = {key: kept.numbers for key, kept in finished.items()}
     static = protocol.static_error(job.known)
     judged_claims = verdicts.verdicts(numbers, judged(job))
-    print(f"\n{job.capture.name}, each arm trained {budget.title}:")
-    print(verdicts.table(numbers, static))
-    print(measures.legend(measures.shown(numbers)))
+    console.say(f"\n{job.capture.name}, each arm trained {budget.title}:")
+    console.say(verdicts.table(numbers, static))
+    console.say(measures.legend(measures.shown(numbers)))
     for line in remarks(finished):
-        print(line)
-    print()
-    print(verdicts.claims_text(judged_claims) or "no claim has both of its arms here")
+        console.say(line)
+    console.say()
+    console.say(
+        verdicts.claims_text(judged_claims) or "no claim has both of its arms here"
+    )
     if job.suite.context:
-        print("\n" + job.suite.context)
+        console.say("\n" + job.suite.context)
     about = {
         "capture": job.capture.name,
         "settings": asked.without_places(job.args),
@@ -46,7 +49,9 @@ def write(job, budget, finished) -> None:
         budget.folder / "ablation.json", metrics(numbers, static), about
     )
     _picture(job, finished, budget.folder / "ablation.png")
-    print(f"{budget.folder / 'ablation.png'} and {budget.folder / 'ablation.json'}")
+    console.say(
+        f"{budget.folder / 'ablation.png'} and {budget.folder / 'ablation.json'}"
+    )
 
 
 def judged(job) -> list:

@@ -21,6 +21,7 @@ from typing import Literal
 from experiments import cli
 from experiments.ablate import settings as ablate
 from experiments.accuracy_time.axes import AXES
+from nerfies_jax import console
 from nerfies_jax.runs import platform
 
 
@@ -90,11 +91,13 @@ def main(args):
         result = cli.stored(job.out / "accuracy_time.json")
         if before is not None:
             worse = baselines.changes(metrics, before)
-            print("\n".join(worse) or f"nothing is worse than in {args.check}")
+            console.say("\n".join(worse) or f"nothing is worse than in {args.check}")
     missing = len(job.tasks()) - len(finished)
     if missing:
-        print(f"{missing} of {len(job.tasks())} runs are not there; the same command "
-              "goes on")  # fmt: skip
+        console.say(
+            f"{missing} of {len(job.tasks())} runs are not there; the same command "
+            "goes on"
+        )
     return cli.Ended(result, 1 if failed or worse else 0)
 
 

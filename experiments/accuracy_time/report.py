@@ -11,6 +11,7 @@ from experiments.ablate import report, verdicts
 from experiments.ablate.arms import Claim
 from experiments.ablate.measures import MEASURES
 from experiments.accuracy_time.axes import AXES
+from nerfies_jax import console
 from nerfies_jax.capture.json_files import replaced_file
 from nerfies_jax.evaluation import figures, protocol
 from nerfies_jax.measure import clock
@@ -39,20 +40,22 @@ def write(job, args, finished) -> list[Metric]:
     """accuracy_time.json, front.png and fronts.png; prints the lines of every axis."""
     numbers = {key: kept.numbers for key, kept in finished.items()}
     static = protocol.static_error(job.known)
-    print(f"\n{job.capture.name}, every setting trained {job.budgets[0].title}:")
+    console.say(f"\n{job.capture.name}, every setting trained {job.budgets[0].title}:")
     for name in args.axes:
-        print(f"\n{AXES[name].question} ({name}, against {AXES[name].base})")
-        print("\n".join(axis_lines(AXES[name], numbers)) or "    nothing finished")
+        console.say(f"\n{AXES[name].question} ({name}, against {AXES[name].base})")
+        console.say(
+            "\n".join(axis_lines(AXES[name], numbers)) or "    nothing finished"
+        )
     for line in report.remarks(finished):
-        print(line)
+        console.say(line)
     means = averages(numbers)
     seconds = training_seconds()
     for cost in (seconds, "render_ms"):
         names = front(means, "psnr", cost)
-        print(f"\nfront of PSNR against {TITLES[cost]}:")
+        console.say(f"\nfront of PSNR against {TITLES[cost]}:")
         for name in names:
             row = means[name]
-            print(f"    {row[cost]:9.1f}  {row['psnr']:.2f} dB  {name}")
+            console.say(f"    {row[cost]:9.1f}  {row['psnr']:.2f} dB  {name}")
     metrics = report.metrics(numbers, static)
     about = {
         "capture": job.capture.name,
@@ -65,7 +68,7 @@ def write(job, args, finished) -> list[Metric]:
     save_fronts(job.out / "front.png", of, means, ("psnr",), (seconds, COSTS[0]))
     shown = [q for q in QUALITIES if any(math.isfinite(r[q]) for r in means.values())]
     save_fronts(job.out / "fronts.png", of, means, shown, (seconds, *COSTS))
-    print(f"\n{job.out / 'front.png'}, fronts.png and accuracy_time.json")
+    console.say(f"\n{job.out / 'front.png'}, fronts.png and accuracy_time.json")
     return metrics
 
 

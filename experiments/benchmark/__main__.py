@@ -20,6 +20,7 @@ import re
 
 from experiments import cli
 from experiments.benchmark import job
+from nerfies_jax import console
 from nerfies_jax.runs import representations
 from nerfies_jax.runs.config import RunConfig
 
@@ -67,7 +68,7 @@ def main(args):
 
     with cli.user_errors((Refused,)):
         _run_all(args, label, configs)
-    print(f"kept in {args.out / STORED}")
+    console.say(f"kept in {args.out / STORED}")
     return cli.stored(args.out / STORED)
 
 
@@ -90,7 +91,7 @@ def _run_all(args, label, configs):
         try:
             for run in concurrent.futures.as_completed(runs):
                 keep(args.out / STORED, label, runs[run], run.result())
-                print(f"{label}, seed {runs[run]}: {_line(run.result())}", flush=True)
+                console.say(f"{label}, seed {runs[run]}: {_line(run.result())}")
         except BaseException:  # what refuses one seed refuses the others
             pool.shutdown(cancel_futures=True)
             raise

@@ -20,6 +20,7 @@ import pathlib
 from typing import Annotated
 
 from experiments import cli
+from nerfies_jax import console
 from nerfies_jax.runs import platform
 
 
@@ -71,11 +72,11 @@ def main(args):
             motion, args.knots, args.static_threshold, args.repeats
         )
     rows = costs(args.gaussians, args.still, args.repeats)
-    print(text(rows, args.gaussians))
+    console.say(text(rows, args.gaussians))
     for line in spared():
-        print(line)
-    print()
-    print(knot_curve.text(curve))
+        console.say(line)
+    console.say()
+    console.say(knot_curve.text(curve))
     record = _record(rows, curve)
     if args.out is not None:
         _save(args.out, record, curve)
@@ -194,7 +195,7 @@ def _save(path, record, curve):
     write_json(path, record)
     picture = path.with_suffix(".png")
     knot_picture.save(picture, record["costs"], curve)
-    print(f"figures: {path}\npicture: {picture}")
+    console.say(f"figures: {path}\npicture: {picture}")
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple
 
 from experiments import cli
+from nerfies_jax import console
 from nerfies_jax.runs import platform, run_folder
 
 PRESETS = (
@@ -155,16 +156,16 @@ def main(args):
             before = baselines.read(args.check, "effect_cost.json")
         tables = {name: _arms(name, args) for name in args.presets}
         folder = run_folder.new_run_folder(args.out, "effect_cost")
-    print(report.heading())
+    console.say(report.heading())
     rows = {}
     for name, scenes in tables.items():
         rows[name] = measure(name, scenes, args.at, args.repeats)
-        print(report.table(name, rows[name]), flush=True)
+        console.say(report.table(name, rows[name]))
     metrics = report.write(folder, rows, args)
-    print(f"saved in {folder}")
+    console.say(f"saved in {folder}")
     worse = [] if before is None else baselines.changes(metrics, before)
     if before is not None:
-        print("\n".join(worse) or f"nothing is worse than in {args.check}")
+        console.say("\n".join(worse) or f"nothing is worse than in {args.check}")
     return cli.Ended(cli.stored(folder / "effect_cost.json"), 1 if worse else 0)
 
 

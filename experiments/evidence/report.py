@@ -6,7 +6,7 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from nerfies_jax import runs
+from nerfies_jax import console, runs
 from nerfies_jax.capture.capture import Capture, describe
 from nerfies_jax.capture.json_files import write_json
 from nerfies_jax.capture.synthetic import SceneTruth
@@ -30,30 +30,30 @@ def look(
     """Gather, or read what was gathered, and say what it is."""
     capture = runs.stored_capture(source, seed)
     for line in describe(capture):
-        print(line)
-    print()
+        console.say(line)
+    console.say()
     path = record.file_of(capture, CACHE / "evidence")
     if path.exists():
-        print("gathered before, and read again")
+        console.say("gathered before, and read again")
     folder = CACHE / "evidence"
     evidence = record.cached(capture, folder, tell=_PartLog(), seconds=seconds)
     views = view_set.in_time_order(record.looked_at(capture, evidence.factor))
     numbers = summary.of(views, evidence)
-    print("\n".join(summary.lines(numbers, evidence)))
+    console.say("\n".join(summary.lines(numbers, evidence)))
     stored = {"capture": capture.name, "found": as_json(numbers._asdict())}
     truth = protocol.stored_truth(capture)
     # What other tools found is theirs to judge.
     if truth is not None and capture.given is None:
         errors = errors_of(capture, truth, evidence)
-        print("\n".join(error_lines(errors)))
+        console.say("\n".join(error_lines(errors)))
         stored["errors"] = as_json(errors._asdict())
     folder = out or pathlib.Path("runs", f"evidence-{capture.name.replace(' ', '-')}")
     folder.mkdir(parents=True, exist_ok=True)
     pictures.save(contact_sheet.followed(views, evidence), folder / "tracks.png")
     write_json(folder / "evidence.json", stored)
-    print(f"frames with tracks: {folder / 'tracks.png'}")
+    console.say(f"frames with tracks: {folder / 'tracks.png'}")
     kept = "not kept, for want of time" if evidence.left_out else path
-    print(f"record: {kept}")
+    console.say(f"record: {kept}")
     return stored
 
 
@@ -98,4 +98,4 @@ class _PartLog:
         self._began = time.perf_counter()
 
     def __call__(self, part):
-        print(f"{time.perf_counter() - self._began:6.1f} s  {part} ...", flush=True)
+        console.say(f"{time.perf_counter() - self._began:6.1f} s  {part} ...")

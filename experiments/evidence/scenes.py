@@ -8,6 +8,7 @@ import numpy as np
 from skimage import registration
 
 from experiments.evidence import report
+from nerfies_jax import console
 from nerfies_jax.capture import synthetic
 from nerfies_jax.capture.json_files import write_json
 from nerfies_jax.evidence import (
@@ -46,14 +47,14 @@ def measure(seed: int, folder: pathlib.Path) -> dict[str, Any]:
         errors = report.errors_of(capture, truth, evidence)
         both = counted._asdict() | errors._asdict()
         rows.append({"scene": name, **report.as_json(both)})
-        print(f"{name}: {counted.seconds:.0f} s", flush=True)
-        print("\n".join(report.error_lines(errors)), flush=True)
+        console.say(f"{name}: {counted.seconds:.0f} s")
+        console.say("\n".join(report.error_lines(errors)))
     flows = [report.as_json(row._asdict()) for row in flow_rows(seed)]
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "evidence.json"
     stored = {"machine": clock.machine(), "scenes": rows, "flows": flows}
     write_json(path, stored)
-    print(f"saved {path}")
+    console.say(f"saved {path}")
     return stored
 
 
@@ -64,7 +65,7 @@ def flow_rows(seed: int) -> list[FlowRow]:
     for name, method in METHODS.items():
         for times in TIMES:
             rows.append(_flow_row(name, method, times, pairs))
-            print(rows[-1], flush=True)
+            console.say(rows[-1])
     return rows
 
 

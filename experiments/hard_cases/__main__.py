@@ -38,6 +38,7 @@ from experiments.hard_cases import (
     volume,
 )
 from experiments.hard_cases.case import ORDERS, Case
+from nerfies_jax import console
 from nerfies_jax.measure import clock
 from nerfies_jax.runs import platform, run_folder
 
@@ -117,13 +118,13 @@ def main(args):
     rows = []
     for case, test in chosen:
         rows.append(measure(case, test, args.numbers, args.repeats))
-        print(report.block(rows[-1]), flush=True)
+        console.say(report.block(rows[-1]))
         report.save_figure(folder, rows[-1])
     report.save_numbers(folder, rows, args)
-    print(f"\n{report.summary(rows)}\nsaved in {folder}")
+    console.say(f"\n{report.summary(rows)}\nsaved in {folder}")
     if args.document is not None:
         report.renew(args.document, rows)
-        print(f"renewed the table in {args.document}")
+        console.say(f"renewed the table in {args.document}")
     return cli.stored(folder / "hard_cases.json")
 
 

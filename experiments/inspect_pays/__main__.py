@@ -15,6 +15,7 @@ import dataclasses
 import pathlib
 
 from experiments import cli
+from nerfies_jax import console
 from nerfies_jax.runs import platform
 
 
@@ -75,7 +76,7 @@ def main(args):
         failed |= bool(trial.run())
         rows += trial.rows()
     lines = report.write(args.out, args, rows)
-    print("\n".join(lines))
+    console.say("\n".join(lines))
     return cli.Ended(cli.stored(args.out / "pays.json"), 1 if failed else 0)
 
 

@@ -20,6 +20,7 @@ league.json and league.png there; rows that lose stay in.
 from experiments import cli
 from experiments.league import rows
 from experiments.league.settings import League
+from nerfies_jax import console
 from nerfies_jax.runs import platform
 
 
@@ -43,7 +44,7 @@ def main(args):
             kept = contests.without(kept, args.anew, every)
         count = contests.restore(kept, every)
         if count:
-            print(f"{count} cells are kept from before and are not made again")
+            console.say(f"{count} cells are kept from before and are not made again")
     failed = contests.run(args, every)
     path = args.out / "league.json"
     stored = contests.record(args, every)
@@ -55,8 +56,8 @@ def main(args):
     from experiments.league import page
 
     page.draw(stored, path.with_suffix(".png"))
-    print("\n" + page.page(stored))
-    print(f"\n{path} and {path.with_suffix('.png')}")
+    console.say("\n" + page.page(stored))
+    console.say(f"\n{path} and {path.with_suffix('.png')}")
     if args.keep:
         results.main(["league", "--measured", str(path)])
     return cli.Ended(stored, 1 if failed else 0)

@@ -31,6 +31,7 @@ from experiments.motion_rank import report
 from experiments.motion_rank import tracks as motion_tracks
 from gaussians_jax.effects import motion_basis
 from gaussians_jax.effects.motion_basis import SMALL_BASIS_MOTION, BasisMotionSpec
+from nerfies_jax import console
 from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import HeadSpec, MLPSpec
@@ -111,8 +112,8 @@ def main(args):
         if args.out is not None:
             args.out.mkdir(parents=True, exist_ok=True)
     rows = table(args)
-    print(report.text(rows))
-    print(report.format_conclusions(rows))
+    console.say(report.text(rows))
+    console.say(report.format_conclusions(rows))
     record = report.record(args, rows)
     if args.out is not None:
         report.write(args.out, record, rows)
@@ -132,7 +133,7 @@ def table(args: MotionRank) -> list[RankResult]:
             for count in (None,) if model == "residual" else args.counts:
                 row = one_row(args, fits, kind, model, count, drawn)
                 rows.append(row)
-                print(report.progress(row), flush=True)
+                console.say(report.progress(row))
     return rows
 
 

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from experiments import asked, markdown
+from nerfies_jax import console
 from nerfies_jax.capture.json_files import replaced_file, write_json
 from nerfies_jax.evaluation import figures
 from nerfies_jax.measure import clock
@@ -166,7 +167,7 @@ def write(out, record, rows) -> None:
     """motion_rank.json and motion_rank.png in a folder."""
     write_json(out / "motion_rank.json", record)
     draw_figure(rows, out / "motion_rank.png")
-    print(out / "motion_rank.png")
+    console.say(out / "motion_rank.png")
 
 
 def page(stored) -> str:

@@ -23,6 +23,7 @@ from experiments import cli
 from experiments.mutants.faults import ROOT, drawn
 from experiments.mutants.page import page
 from experiments.mutants.witnesses import default_tests, reached_by, tried
+from nerfies_jax import console
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,10 +84,10 @@ def main(args):
         )
         for row in tries:
             rows.append(row)
-            print(row["at"], "|", row["after"], "|", row["caught_by"], flush=True)
+            console.say(f"{row['at']} | {row['after']} | {row['caught_by']}")
             stored = {"machine": clock.machine(), "seed": args.seed, "rows": rows}
             write_json(args.out, stored)
-    print(page({"rows": rows, "seed": args.seed}))
+    console.say(page({"rows": rows, "seed": args.seed}))
     return cli.stored(args.out)
 
 

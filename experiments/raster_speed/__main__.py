@@ -29,6 +29,7 @@ from experiments.raster_speed import baselines as raster_baselines
 from gaussians_jax import raster
 from gaussians_jax.projection import Footprints
 from gaussians_jax.raster_spec import GSPLAT
+from nerfies_jax import console
 from nerfies_jax.capture.json_files import write_json
 from nerfies_jax.measure import clock
 
@@ -302,15 +303,15 @@ def main(settings):
     os.environ.setdefault("NPROC", "1")
     jax.config.update("jax_numpy_dtype_promotion", "standard")
     limit = exponential_limit_ns(settings.repeats)
-    print(f"exp + multiply, in cache: {limit:.2f} ns an element")
+    console.say(f"exp + multiply, in cache: {limit:.2f} ns an element")
     rows = []
     for text in settings.cases:
         rows.append(row := time_case(text, settings, limit))
-        print("  ".join(show(name, row[name]) for name in row), flush=True)
+        console.say("  ".join(show(name, row[name]) for name in row))
     seen = {cores: core_times(settings, cores) for cores in settings.cores}
     for cores, times in seen.items():
         for text, row in times.items():
-            print(
+            console.say(
                 f"{text} seeing {cores} cores: forward+backward "
                 f"{row['forward_backward_ms']:.1f} ms CPU, {row['wall_ms']:.1f} ms wall"
             )

@@ -26,6 +26,7 @@ import numpy as np
 
 from experiments import cli, markdown
 from experiments.solver_table.problems import LEVENBERG, PROBLEMS, Problem
+from nerfies_jax import console
 from nerfies_jax.capture.json_files import write_json
 from nerfies_jax.measure import clock
 from nerfies_jax.training.fit import CODE_SOLVERS
@@ -161,7 +162,7 @@ def main(settings):
     """Run the job of the command line."""
     task = PROBLEMS[settings.fit](settings)
     rows = table(task, settings)
-    print(text(rows, settings.frames))
+    console.say(text(rows, settings.frames))
     about = dataclasses.asdict(settings) | {"out": None}
     record = {"about": about, "machine": clock.machine()}
     record["rows"] = [row._asdict() for row in rows]

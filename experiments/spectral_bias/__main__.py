@@ -27,6 +27,7 @@ import optax
 
 from experiments import cli
 from experiments.spectral_bias import report
+from nerfies_jax import console
 from nerfies_jax.nets import encoding, kan, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.kan import KANSpec
@@ -324,7 +325,7 @@ def all_results(args: SpectralBias) -> tuple[list[Result], list[Result]]:
                 equal_time.append(results[-1])
                 if budget is None:
                     budget = results[0].seconds
-                print(report.progress(results), flush=True)
+                console.say(report.progress(results))
     return equal_steps, equal_time
 
 
@@ -337,8 +338,8 @@ def main(args):
         platform.start_jax(args.device)
     results = dict(zip(("equal steps", "equal time"), all_results(args), strict=True))
     waves = {label: SIGNALS[label].waves for label in args.signals}
-    print(report.tables(results, waves))
-    print(report.format_conclusions(results))
+    console.say(report.tables(results, waves))
+    console.say(report.format_conclusions(results))
     record = report.record(args, results, waves)
     if args.out is not None:
         report.write(args.out, record, results, waves)

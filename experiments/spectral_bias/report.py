@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from experiments import asked, markdown
+from nerfies_jax import console
 from nerfies_jax.capture.json_files import replaced_file, write_json
 from nerfies_jax.evaluation import figures
 from nerfies_jax.measure import clock
@@ -134,7 +135,7 @@ def write(out, record, results, waves) -> None:
     """spectral_bias.json and spectral_bias.png in a folder."""
     write_json(out / "spectral_bias.json", record)
     draw_figure(results, waves, out / "spectral_bias.png")
-    print(out / "spectral_bias.png")
+    console.say(out / "spectral_bias.png")
 
 
 def page(stored) -> str:

@@ -30,6 +30,7 @@ import time
 
 from experiments import cli
 from experiments.speed import job
+from nerfies_jax import console
 from nerfies_jax.runs import representations
 
 STORED = "speed.json"
@@ -88,12 +89,12 @@ def main(args):
     if args.yardstick is not None:
         record = _raster(args.yardstick)
         keep(path, record["machine"], ("raster",), {"rows": record["rows"]})
-    print(f"kept in {path}")
+    console.say(f"kept in {path}")
     stored = cli.stored(path)
     worse = []
     if before is not None:
         worse = baselines.changes(tolerances.metrics(stored or {}), before)
-        print("\n".join(worse) or f"nothing is worse than in {args.check}")
+        console.say("\n".join(worse) or f"nothing is worse than in {args.check}")
     return cli.Ended(stored, 1 if worse else 0)
 
 
@@ -126,7 +127,7 @@ def _keep_steps(path, presets):
         for cores in ("one", "all"):
             record = _apart(job.measure, preset, cores == "all")
             keep(path, record.pop("machine"), ("presets", preset, cores), record)
-            print(f"{preset}, {cores}: {record['step_ms']:.1f} ms a step", flush=True)
+            console.say(f"{preset}, {cores}: {record['step_ms']:.1f} ms a step")
 
 
 def _keep_job(path, keys, checkout):
@@ -134,7 +135,7 @@ def _keep_job(path, keys, checkout):
     machine = record.pop("machine")
     keep(path, machine, keys, record | {"cpu": machine["cpu"]})
     whose = "main job" if checkout is None else f"main job of {checkout}"
-    print(f"{whose}: {record['seconds']:.0f} s", flush=True)
+    console.say(f"{whose}: {record['seconds']:.0f} s")
 
 
 def main_job(checkout: pathlib.Path | None = None) -> dict:

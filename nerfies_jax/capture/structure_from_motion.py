@@ -20,6 +20,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from nerfies_jax import console
 from nerfies_jax.capture import extras, frames
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.colmap_library import MIN_TRACK, library
@@ -323,4 +324,4 @@ if __name__ == "__main__":
     job = json.load(sys.stdin)
     spec = MappingSpec(**job["spec"])
     judged = _reconstruct(pathlib.Path(job["folder"]), job["masked"], spec)
-    print(json.dumps(judged))
+    console.say(json.dumps(judged))

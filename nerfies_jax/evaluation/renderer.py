@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from nerfies_jax import events
 from nerfies_jax.training.model import (
     Model,
     Rendering,
@@ -51,7 +52,8 @@ class Renderer:
         inputs = _inputs(state, view)
         shapes = tuple(jax.typeof(leaf) for leaf in jax.tree.leaves(inputs))
         if shapes not in self._programs:
-            self._programs[shapes] = _compiled(self._model, self.size, inputs)
+            with events.stage("compiling the renderer"):
+                self._programs[shapes] = _compiled(self._model, self.size, inputs)
         return self._programs[shapes]
 
     def _draw(self, programs, params, view, step):

@@ -21,6 +21,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from nerfies_jax import console
 from nerfies_jax.capture import colmap, footage, formats, nerfies_format
 from nerfies_jax.capture.capture import Capture, CaptureError, describe
 from nerfies_jax.capture.footage import Taken
@@ -256,7 +257,10 @@ def needed(path: AnyPath) -> bool:
 
 
 def prepared(
-    source: AnyPath, out: AnyPath, how: Preparation = Preparation(), tell: Tell = print
+    source: AnyPath,
+    out: AnyPath,
+    how: Preparation = Preparation(),
+    tell: Tell = console.say,
 ) -> pathlib.Path:
     """The folder `out` with the capture made of `source`, now or before.
 

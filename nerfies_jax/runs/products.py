@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from nerfies_jax import evaluation
+from nerfies_jax import console, evaluation
 from nerfies_jax.capture import camera_paths, exr, video
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.extras import MissingExtra
@@ -117,7 +117,7 @@ def with_extra(
     try:
         return save(path, *arguments)
     except MissingExtra as error:
-        print(f"no {path.name}: {error}")
+        console.say(f"no {path.name}: {error}")
         return None
 
 
@@ -312,7 +312,7 @@ def save_player(
         pictures.save(poster, picture)
     except Exception as error:  # whatever it is, the run keeps all its other products
         return [], [f"There is no player: {type(error).__name__}: {error}"]
-    print(f"player:     {player.path} ({player.about})")
+    console.say(f"player:     {player.path} ({player.about})")
     caption = f"Play it, look from elsewhere: {player.path.name}. {player.about}"
     return [report.Figure(picture, caption, player.path.name)], []
 
@@ -343,7 +343,7 @@ def _next(folder, run, trained):
 
 def _log(folder, page, metrics, floors, following):
     value = {metric.key: metric.value for metric in metrics}
-    print(
+    console.say(
         f"held out: {value['heldout.psnr']:.2f} dB, SSIM {value['heldout.ssim']:.3f} "
         f"over {value['heldout.frames']} frames{_parts(value)}; "
         f"{value['train.seconds']:.0f} s of "
@@ -351,18 +351,18 @@ def _log(folder, page, metrics, floors, following):
         f"{value['render.ms_per_frame']:.0f} ms a frame"
     )
     if "tracks.epe" in value:
-        print(
+        console.say(
             f"points:   {value['tracks.epe']:.4f} scene units from where they are, "
             f"{value['tracks.still_epe']:.4f} if they stood still"
         )
     for line in floors:
-        print(line)
-    print(f"report:     {page}")
-    print(f"comparison: {folder / 'comparison.png'}")
+        console.say(line)
+    console.say(f"report:     {page}")
+    console.say(f"comparison: {folder / 'comparison.png'}")
     if (folder / "scene.mp4").exists():
-        print(f"film:       {folder / 'scene.mp4'}")
+        console.say(f"film:       {folder / 'scene.mp4'}")
     for command in following:
-        print(f"{command.purpose}\n  {command.line}")
+        console.say(f"{command.purpose}\n  {command.line}")
 
 
 def _parts(value):

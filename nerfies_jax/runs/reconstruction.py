@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Literal, NamedTuple
 
+from nerfies_jax import console
 from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.capture.capture import CaptureError, describe
 from nerfies_jax.capture.given import GivenFiles
@@ -95,7 +96,7 @@ def reconstruct(
             state = first_state(run)
             if seconds is not None and not _steps_given(run.config):
                 run, line = plan.with_seconds(run, state, seconds)
-                print(line)
+                console.say(line)
                 pace = dataclasses.replace(pace, seconds=plan.OVERRUN * seconds)
             stem = "-".join(run.capture.name.split()) + "-" + run.config.preset
             folder = run_folder.new_run_folder(out, stem)
@@ -210,13 +211,13 @@ def _new_run(config, effects):
         found = inspected.findings
         chosen, more = adviser.follow(chosen, config.overrides, found)
         lines += more
-    print("\n".join(lines))
+    console.say("\n".join(lines))
     return new_run(chosen, stored)
 
 
 def _describe(run):
     for line in describe(run.capture):
-        print(line)
+        console.say(line)
 
 
 def _check_expected(folder, expected):

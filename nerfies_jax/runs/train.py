@@ -77,8 +77,8 @@ def train(
         few = evaluation.spread(run.capture.heldout, share.frames)
         evaluate_every = share.every_seconds
 
-    def held_out(state, step):
-        del step
+    def held_out(state, step, metrics):
+        del step, metrics
         filmed = evaluation.as_found(run.model, state, run.filmed)
         scored = evaluation.score(draw, state, filmed, few)
         return {

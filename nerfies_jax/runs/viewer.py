@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from nerfies_jax import evaluation
+from nerfies_jax import console, evaluation
 from nerfies_jax.capture import camera_paths, extras, keyframes, path_files
 from nerfies_jax.capture.keyframes import Keyframe
 from nerfies_jax.evaluation import interactive
@@ -282,7 +282,7 @@ class Viewer:
         words = "experiments.render", str(self.paths.parent), "--path", str(place)
         render = shlex.join(("python", "-m", *words))
         self._controls["listed"].content = f"Saved. To render it:\n\n`{render}`"
-        print(f"{count} cameras: {place}; {render}")
+        console.say(f"{count} cameras: {place}; {render}")
 
 
 _NO_KEYFRAMES = "Look from where it shall begin, at the time it shall show; add it."
@@ -313,9 +313,10 @@ def live(run: Run, folder: pathlib.Path, port: int) -> Iterator[Hook]:
     again every `REFRESH_SECONDS`.
     """
     viewer = Viewer(run, run.capture.size, port, folder / EXPORTS)
-    print(f"look around while it trains: {viewer.address}", flush=True)
+    console.say(f"look around while it trains: {viewer.address}")
 
-    def show(state: TrainState, step: int) -> None:
+    def show(state: TrainState, step: int, metrics: dict[str, float]) -> None:
+        del metrics
         viewer.serve(state, step, LIVE_SECONDS)
 
     try:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from nerfies_jax import compiler, data_parallel
+from nerfies_jax import compiler, data_parallel, events
 from nerfies_jax.measure import matrix_flops
 from nerfies_jax.training.model import Frames, Model, PyTree, TrainState
 
@@ -159,8 +159,10 @@ class Program:
         if not missing:
             return 0.0
         began = time.perf_counter()
-        for length in missing:
-            self._programs[length] = self._lower(length).compile(self._options)
+        with events.stage("compiling the training step", len(missing)) as stage:
+            for length in missing:
+                self._programs[length] = self._lower(length).compile(self._options)
+                stage.advance()
         return time.perf_counter() - began
 
     def _lengths(self, count):
@@ -199,7 +201,8 @@ def program(
     if key in programs:
         return programs[key], 0.0
     began = time.perf_counter()
-    programs[key] = Program(model, state, frames, steps)
+    with events.stage("tracing the training step"):
+        programs[key] = Program(model, state, frames, steps)
     return programs[key], time.perf_counter() - began
 
 

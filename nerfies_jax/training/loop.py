@@ -7,31 +7,36 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import psutil
 import rich.console
 from jaxtyping import Array, Key
 
 from nerfies_jax import data_parallel
+from nerfies_jax import events as event_stream
+from nerfies_jax.progress import duration
 from nerfies_jax.training import chunk
 from nerfies_jax.training.checkpoint import Checkpoints
 from nerfies_jax.training.guard import Snapshot, bad_arrays, last_good, listed
 from nerfies_jax.training.model import Event, Frames, Model, TrainState
-from nerfies_jax.training.progress import Progress, duration
 from nerfies_jax.training.stopping import StopRequests
 
 CHUNK_STEPS = 100  # longer ones gain nothing
 CHUNK_SECONDS = 0.5  # a chunk cannot be interrupted: Ctrl-C acts within this time
+EVENT_SECONDS = 0.2  # between two `train` events; counting may wait for the device
 
 
 class Hook(NamedTuple):
-    """Something to do now and then that changes nothing: an evaluation, a picture.
+    """A callback between chunks of steps that does not change the state.
 
-    `call(state, step)` may return numbers, which are kept in the history. Its time does
-    not count as training, and it must not keep the state: the next chunk overwrites it.
-    It also runs once when the run is complete.
+    `call(state, step, metrics)` receives the state after `step` steps and the mean
+    metrics of the last chunk, as `{"loss": 0.01, "mse": 0.002}`; they are empty where
+    no step was taken. The numbers that it returns are kept in the history. Its time
+    does not count as training, and it must not keep the state: the next chunk
+    overwrites it. It also runs once when the run is complete.
     """
 
     name: str
-    call: Callable[[TrainState, int], dict[str, float] | None]
+    call: Callable[[TrainState, int, dict[str, float]], dict[str, float] | None]
     every_steps: int | None = None
     every_seconds: float | int | None = None  # of training
 
@@ -100,7 +105,9 @@ def fit(
     and tried again with the next; it ends nothing. An event happens when its
     step is completed, before a checkpoint of that step, so a resumed run repeats the
     uninterrupted one bit for bit (on XLA:CPU with the same PJRT_NPROC). Pass the
-    restored history on.
+    restored history on. Progress goes to the sinks of `nerfies_jax.events`: `train`
+    events, of hooks that return numbers `evaluation` events, and to the terminal, or
+    the `console` that is passed.
 
     Steps are scanned; one program serves all chunks of a shape, and a second one what
     is left over where events or the end fall between them (`chunk.Program`).
@@ -109,9 +116,13 @@ def fit(
     run.history, run.checkpoints = history, checkpoints
     run.limits = (math.inf if seconds is None else seconds, checkpoint_seconds)
     run.trained_before = history.seconds
-    with StopRequests() as requests, Progress(console, run.step, steps) as progress:
-        run.progress = progress
-        reason = run.go(requests)
+    with (
+        StopRequests() as requests,
+        event_stream.shown_on(console),
+    ):
+        with event_stream.stage("training", steps, run.step):
+            reason = run.go(requests)
+            run.evaluate(reason)
         return run.finish(reason)
 
 
@@ -132,6 +143,7 @@ class _Run:
         self.saved_at = time.monotonic()
         self.step_seconds = math.inf  # not known yet: the first chunk is one step
         self.called = {hook.name: [self.step, None] for hook in hooks}
+        self.reported = -math.inf, self.step  # when, by the monotonic clock; the step
         self.detail = ""
         bad = bad_arrays(state)
         if bad:
@@ -242,14 +254,34 @@ class _Run:
                 self._call(hook)
         if self.checkpoints is not None:
             self._tell_failed_save(self.checkpoints.failure())
-        if self.progress.due():
-            row = self.history.rows[-1]
-            metrics = {k: v for k, v in row.items() if k not in ("step", "seconds")}
-            left = (self.steps - self.step) * self.step_seconds
-            left = min(left, self._left())
-            counts = self.model.counts(self.state)
-            rate = 1 / self.step_seconds
-            self.progress.update(self.step, rate, metrics, counts, max(left, 0.0))
+        if time.monotonic() - self.reported[0] >= EVENT_SECONDS:
+            self._report()
+
+    def _report(self) -> None:
+        """Emit a `train` event, unless that of this step was emitted."""
+        if self.reported[1] == self.step:
+            return
+        self.reported = time.monotonic(), self.step
+        metrics = self._metrics()
+        mse = metrics.get("mse", 0.0)
+        left = min((self.steps - self.step) * self.step_seconds, self._left())
+        event_stream.emit(
+            "train",
+            step=self.step,
+            steps=self.steps,
+            seconds=self.history.seconds,
+            steps_per_second=1 / self.step_seconds,
+            eta_seconds=max(left, 0.0),
+            psnr=-10 * math.log10(mse) if mse > 0 else None,
+            metrics=metrics,
+            counts=self.model.counts(self.state),
+            memory_bytes=psutil.Process().memory_info().rss,
+        )
+
+    def _metrics(self) -> dict[str, float]:
+        """The mean metrics of the last chunk; empty before the first."""
+        row = self.history.rows[-1] if self.history.rows else {}
+        return {k: v for k, v in row.items() if k not in ("step", "seconds")}
 
     def _due(self, hook: Hook) -> bool:
         last_step, last_seconds = self.called[hook.name]
@@ -261,7 +293,7 @@ class _Run:
         return last_seconds is None or passed >= hook.every_seconds
 
     def _call(self, hook: Hook) -> None:
-        numbers = hook.call(self.state, self.step)
+        numbers = hook.call(self.state, self.step, self._metrics())
         self.called[hook.name] = [self.step, self.history.seconds]
         if numbers is not None:
             row = {
@@ -269,7 +301,9 @@ class _Run:
                 "step": self.step,
                 "seconds": self.history.seconds,
             }
-            row |= {name: float(value) for name, value in numbers.items()}
+            values = {name: float(value) for name, value in numbers.items()}
+            event_stream.emit("evaluation", **row, metrics=values)
+            row |= values
             # One row for a step: a complete run that is resumed calls its hooks again.
             earlier = (
                 old
@@ -280,7 +314,7 @@ class _Run:
 
     def _tell_failed_save(self, failure) -> None:
         if failure is not None:
-            self.progress.log(f"warning: {failure}; training goes on")
+            event_stream.message(f"{failure}; training goes on", "warning")
 
     def _save_overdue(self) -> None:
         """Only before another chunk: the last state `finish` saves, with what its hooks
@@ -301,12 +335,16 @@ class _Run:
         values = {name: getattr(self.history, name) + x for name, x in more.items()}
         self.history = self.history._replace(**values)
 
-    def finish(self, reason: str) -> FitResult:
-        """Last evaluations, last checkpoint, and the line that says how it ended."""
+    def evaluate(self, reason: str) -> None:
+        """Report the last step, and call the hooks once more where the run is over."""
+        self._report()
         if reason in ("steps", "seconds"):
             for hook in self.hooks:
                 if self.called[hook.name] != [self.step, self.history.seconds]:
                     self._call(hook)
+
+    def finish(self, reason: str) -> FitResult:
+        """Save the last checkpoint, and say in a line how the run ended."""
         message = f"stopped at step {self.step:,} of {self.steps:,}"
         if reason == "steps":
             message = f"completed {self.step:,} steps"
@@ -324,7 +362,7 @@ class _Run:
                 message += f"; saved in {self.checkpoints.folder}"
                 if reason not in ("steps", "non-finite"):
                     message += ", resume from there to go on"
-        self.progress.log(message)
+        event_stream.message(message)
         unsaved = "" if failure is None else f"the last state is not saved: {failure}"
         return FitResult(self.state, self.history, self.step, reason, message, unsaved)
 

@@ -11,6 +11,9 @@ ROOT = pathlib.Path(__file__).resolve().parents[2]
 FLOORS = {
     "nerfies_jax.geometry": 1,
     "nerfies_jax.compiler": 1,
+    "nerfies_jax.console": 1,
+    "nerfies_jax.progress": 1,
+    "nerfies_jax.events": 1,
     "nerfies_jax.data_parallel": 1,
     "nerfies_jax.nets": 2,
     "nerfies_jax.capture": 3,

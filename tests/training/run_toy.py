@@ -32,7 +32,7 @@ def main(folder, steps, slow=0.0):
         state, after = restored.state, restored.step
         history = loop.History(**restored.record)
     # SLOW stretches the run on the host, where signals and kills arrive.
-    hooks = (loop.Hook("slow", lambda state, step: time.sleep(slow), every_steps=1),)
+    hooks = (loop.Hook("slow", lambda *_: time.sleep(slow), every_steps=1),)
     print("READY", flush=True)
     with checkpoint.Checkpoints(folder, spec, after=after) as checkpoints:
         result = loop.fit(

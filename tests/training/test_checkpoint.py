@@ -92,7 +92,7 @@ def test_a_resumed_run_is_the_straight_run_bit_for_bit(cut, tmp_path, straight):
 @pytest.mark.parametrize("checkpoint_seconds", [0.0, 60.0])
 def test_a_complete_run_keeps_one_last_evaluation(checkpoint_seconds, tmp_path):
     """Whenever it saves, and though it is resumed for its products."""
-    hooks = [loop.Hook("score", lambda state, step: {"psnr": step}, every_steps=6)]
+    hooks = [loop.Hook("score", lambda _, step, metrics: {"psnr": step}, every_steps=6)]
     state, history, after = None, loop.History(), None
     for _ in range(2):
         result = fit(
@@ -113,7 +113,9 @@ def test_a_complete_run_keeps_one_last_evaluation(checkpoint_seconds, tmp_path):
 
 def test_a_run_out_of_time_keeps_its_last_evaluation(tmp_path):
     """Though an overdue save falls on the step at which the time is over."""
-    hook = loop.Hook("score", lambda state, step: {"psnr": step}, every_steps=10**6)
+    hook = loop.Hook(
+        "score", lambda _, step, metrics: {"psnr": step}, every_steps=10**6
+    )
     result = fit(
         start(), tmp_path, 10**6, hooks=[hook], seconds=0.05, checkpoint_seconds=0.0
     )

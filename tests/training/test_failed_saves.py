@@ -69,7 +69,9 @@ def test_training_goes_on_where_saving_fails_and_says_so(
             checkpoint.Checkpoints(folder, SPEC, beside=settings) as checkpoints,
         ):
 
-            def disturb(state, step, patch=patch, folder=folder, passes=passes):
+            def disturb(
+                state, step, metrics, patch=patch, folder=folder, passes=passes
+            ):
                 if step == 11:
                     checkpoints.wait()  # for the save of step 10
                     harm(folder, patch)

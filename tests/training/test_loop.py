@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 import rich.console
 
+from nerfies_jax.progress import duration
 from nerfies_jax.training import chunk, loop, rate
 from nerfies_jax.training.model import Event
-from nerfies_jax.training.progress import duration
 from tests.training import toy
 from tests.training.toy import fit, start
 
@@ -162,7 +162,9 @@ def test_an_event_may_put_one_array_in_two_places(frames):
 
 
 def test_hooks_run_at_their_steps_and_at_the_end(frames):
-    hook = loop.Hook("score", lambda state, step: {"psnr": step / 2}, every_steps=4)
+    hook = loop.Hook(
+        "score", lambda _, step, metrics: {"psnr": step / 2}, every_steps=4
+    )
     result = fit(frames, steps=10, hooks=[hook])
     assert [row["step"] for row in result.history.evaluations] == [4, 8, 10]
     assert result.history.evaluations[0]["psnr"] == 2.0
@@ -170,7 +172,7 @@ def test_hooks_run_at_their_steps_and_at_the_end(frames):
 
 
 def test_time_in_hooks_is_not_training_time(frames, straight):
-    hook = loop.Hook("nap", lambda state, step: time.sleep(0.3), every_steps=5)
+    hook = loop.Hook("nap", lambda *_: time.sleep(0.3), every_steps=5)
     result = fit(frames, steps=20, hooks=[hook])
     assert result.seconds < 0.9
     assert toy.same(result.state, straight.state)
@@ -179,7 +181,9 @@ def test_time_in_hooks_is_not_training_time(frames, straight):
 
 def test_hooks_by_seconds_count_training_seconds(frames):
     seen = []
-    hook = loop.Hook("often", lambda state, step: seen.append(step), every_seconds=0.0)
+    hook = loop.Hook(
+        "often", lambda _, step, metrics: seen.append(step), every_seconds=0.0
+    )
     fit(frames, steps=10, hooks=[hook])
     assert seen[0] == 1
     assert seen[-1] == 10
@@ -200,7 +204,7 @@ def slow_model(seconds):
 
 def test_a_budget_of_seconds_ends_the_training_and_says_so(frames):
     """Neither compiling nor a hook counts; what was trained before does not either."""
-    nap = loop.Hook("nap", lambda state, step: time.sleep(0.4), every_steps=1000)
+    nap = loop.Hook("nap", lambda *_: time.sleep(0.4), every_steps=1000)
     before = loop.History(seconds=100.0)
     result = fit(
         frames,
@@ -280,7 +284,7 @@ def test_large_steps_are_scanned_few_at_once(rounds, length, frames):
     ],
 )
 def test_a_signal_ends_the_run_after_its_chunk(number, frames, straight):
-    def send(state, step):
+    def send(state, step, metrics):
         if step == 11:
             os.kill(os.getpid(), number)
 
@@ -295,7 +299,7 @@ def test_a_signal_ends_the_run_after_its_chunk(number, frames, straight):
 
 
 def test_a_second_interrupt_does_not_wait(frames):
-    def send(state, step):
+    def send(state, step, metrics):
         os.kill(os.getpid(), signal.SIGINT)
         os.kill(os.getpid(), signal.SIGINT)
         time.sleep(5)
@@ -307,7 +311,7 @@ def test_a_second_interrupt_does_not_wait(frames):
 
 @pytest.mark.full
 def test_a_signal_that_is_to_be_ignored_still_is(frames):
-    def send(state, step):
+    def send(state, step, metrics):
         os.kill(os.getpid(), signal.SIGHUP)
 
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
