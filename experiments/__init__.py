@@ -1,6 +1,30 @@
 """Runnable studies and the main job: `python -m experiments.NAME`."""
 
-from nerfies_jax import console
+import os
+import sys
+
+
+def _leave_current_folder() -> None:
+    """Take the current folder off the path, where `python -m experiments` put it first.
+
+    A run folder from a stranger may be current and hold a `numpy.py`. The folder stays
+    if this package was found in it, as in a checkout.
+    """
+    asked = any(
+        word.removeprefix("-m").partition(".")[0] == "experiments"
+        for word in sys.orig_argv
+    )
+    # While runpy looks for the module, argv[0] is "-m", and "-c" in no case.
+    if sys.argv[:1] != ["-m"] or not asked or sys.flags.safe_path:
+        return
+    home = os.path.dirname(os.path.dirname(os.path.realpath(__file__)))
+    if os.path.realpath(sys.path[0]) != home:
+        del sys.path[0]
+
+
+_leave_current_folder()
+
+from nerfies_jax import console  # noqa: E402 (found without the current folder)
 
 # Before anything else can open a file under the number of a closed stream.
 console.open_descriptors()

@@ -58,8 +58,6 @@ def _main(arguments):
         meant = known_names(name, known)
         console.error(f"no command {name!r}; {meant}")
         raise SystemExit(2)
-    if "" not in sys.path:  # as python -m does: --effect finds what lies here
-        sys.path.insert(0, "")
     main_of(name)(rest)
 
 

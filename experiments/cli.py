@@ -7,9 +7,11 @@ platform.
 import contextlib
 import dataclasses
 import functools
+import importlib.util
 import json
 import os
 import pathlib
+import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from typing import Annotated, Any, Literal, NamedTuple
@@ -21,6 +23,7 @@ from nerfies_jax import console
 from nerfies_jax.capture.extras import MissingExtra
 from nerfies_jax.capture.given import GivenFiles
 from nerfies_jax.capture.nearest import known_names
+from nerfies_jax.runs import trust
 from nerfies_jax.runs.config import CaptureSource, MoreMetrics
 from nerfies_jax.runs.representations import PRESETS
 from nerfies_jax.training import stopping
@@ -33,6 +36,7 @@ SCENES = (
 )
 Preset = Annotated[str | None, options.Known(PRESETS), tyro.conf.arg(metavar="NAME")]
 Overrides = Annotated[tuple[str, ...], tyro.conf.arg(metavar="FIELD=VALUE ...")]
+Effects = Annotated[tuple[str, ...], tyro.conf.arg(metavar="MODULE:NAME ...")]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,6 +98,22 @@ def check_presets(names: Iterable[str]) -> None:
             raise ValueError(
                 f"--presets {name}: no such preset; {known_names(name, PRESETS)}"
             )
+
+
+def find_effects(names: Iterable[str]) -> None:
+    """Let modules of the current folder be found, if `--effect` names any of them.
+
+    The folder comes last on the path: a stranger's run folder may hold a `jax.py`.
+    """
+    for name in names:
+        module = name.partition(":")[0].partition(".")[0]
+        known = module in sys.modules or not module.isidentifier()
+        if known or importlib.util.find_spec(module) is not None:
+            continue
+        here = pathlib.Path.cwd()
+        if (here / f"{module}.py").is_file() or (here / module).is_dir():
+            sys.path.append(str(here))
+            return
 
 
 class Ended(NamedTuple):
@@ -244,5 +264,13 @@ def user_errors(kinds: tuple[type[Exception], ...] = (ValueError, OSError)):
     try:
         yield
     except kinds as error:
-        console.error(" ".join(str(error).split()))
+        console.error(" ".join(str(error).split()) + _repeated(error))
         sys.exit(2)
+
+
+def _repeated(error):
+    """The option that trusts the effects of a run folder, if that was refused."""
+    for each in (error, error.__cause__):
+        if isinstance(each, trust.UntrustedEffects):
+            return f", with --effect {shlex.join(each.names)}"
+    return ""

@@ -17,7 +17,7 @@ from typing import Any, Literal, NamedTuple
 
 from experiments import cli
 from nerfies_jax import console
-from nerfies_jax.runs import platform, representations, run_folder
+from nerfies_jax.runs import platform, representations, run_folder, trust
 
 LARGEST_ERROR = 0.2
 SAME = ("capture", "scene", "factor", "max_side", "heldout")
@@ -47,6 +47,9 @@ class Compare:
     """Held-out frames in the picture; 0 renders none."""
     out: pathlib.Path | None = None
     """Folder for compare.json, curves.png and pictures.png (default: runs/compare)."""
+    effect: cli.Effects = ()
+    """Effects of your own that the run was trained with, as MODULE:NAME. They run code,
+    so they are loaded only if they are named here again."""
     device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
     """Where to render."""
 
@@ -73,7 +76,7 @@ class Compared(NamedTuple):
 def main(args):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
-        compared = read(args.runs)
+        compared = read(args.runs, args.effect if args.frames else None)
         folder = run_folder.new_run_folder(args.out, "compare")
         goals = args.psnr or default_goals(compared)
     console.say(table(compared, goals))
@@ -84,14 +87,18 @@ def main(args):
         kinds = [representations.of_run(each.folder) for each in compared]
         threads = {kind.threads for kind in kinds if kind is not None}
         with cli.user_errors():
+            cli.find_effects(args.effect)
             platform.start_jax(args.device, "all" if "all" in threads else "one")
-            draw(folder / "pictures.png", compared, args.frames)
+            draw(folder / "pictures.png", compared, args.frames, args.effect)
     console.say(f"saved in {folder}")
     return cli.stored(folder / "compare.json")
 
 
-def read(folders) -> list[Compared]:
-    """Runs of one capture; ValueErrors name the run and what is wrong with it."""
+def read(folders, trusted=None) -> list[Compared]:
+    """Runs of one capture; ValueErrors name the run and what is wrong with it.
+
+    If they are to be rendered, their own effects must be among the `trusted`.
+    """
     from nerfies_jax.runs import curves
 
     compared, sources = [], []
@@ -103,6 +110,8 @@ def read(folders) -> list[Compared]:
             source = config["source"]
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"{folder}: not a finished run ({error!r})") from error
+        if trusted is not None:
+            trust.check_effects(folder, config.get("effects", ()), trusted)
         compared.append(Compared(name, folder, metrics, curve))
         same = {key: source.get(key) for key in SAME}
         if source.get("capture") is None:  # a built-in scene is made from the seed
@@ -220,14 +229,14 @@ def save(folder: pathlib.Path, compared, goals) -> None:
         pictures.curve(histories, folder / "curves.png")
 
 
-def draw(path: pathlib.Path, compared, count: int) -> None:
+def draw(path: pathlib.Path, compared, count: int, effects=()) -> None:
     """Held-out frames: the truth and every run's picture, below them the errors."""
     from nerfies_jax import evaluation, runs
     from nerfies_jax.evaluation import pictures
 
     scored = []
     for each in compared:
-        run = runs.saved_run(each.folder)
+        run = runs.saved_run(each.folder, effects=effects)
         state = runs.restore(each.folder, run).state
         run = runs.with_found_cameras(run, state)
         rows = evaluation.spread(run.filmed.heldout, count)

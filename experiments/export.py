@@ -69,6 +69,9 @@ class Export:
     """File or folder to write (default: in RUN/exports)."""
     overwrite: bool = False
     """Replace what is there."""
+    effect: cli.Effects = ()
+    """Effects of your own that the run was trained with, as MODULE:NAME. They run code,
+    so they are loaded only if they are named here again."""
     device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
     """Where to compute."""
 
@@ -124,12 +127,13 @@ class Export:
 def main(args):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
+        cli.find_effects(args.effect)
         platform.start_jax(args.device, representations.cores_of_run(args.run).threads)
         from nerfies_jax import runs
         from nerfies_jax.capture.json_files import refuse_existing
 
         refuse_existing(args.place, args.overwrite)
-        run = runs.saved_run(args.run)
+        run = runs.saved_run(args.run, effects=args.effect)
         if run.model.found is not None:
             # What is written is in the cameras that training found.
             run = runs.with_found_cameras(run, runs.restore(args.run, run).state)

@@ -11,9 +11,7 @@ import dataclasses
 import functools
 import pathlib
 import signal
-from typing import Annotated, ClassVar, Literal
-
-import tyro
+from typing import ClassVar, Literal
 
 from experiments import cli
 from nerfies_jax import console
@@ -65,9 +63,11 @@ class Reconstruct:
     set: cli.Overrides = ()
     """Fields of the preset, densification.cap_max=20000 motion.width=128 warp=none,
     say; experiments.settings lists those there are."""
-    effect: Annotated[tuple[str, ...], tyro.conf.arg(metavar="MODULE:NAME ...")] = ()
-    """Effects of your own beside those of the preset, as MODULE:NAME: an Effect, or a
-    function that makes one from the scene's metadata (docs/own_effect.md)."""
+    effect: cli.Effects = ()
+    """Effects of your own in addition to those of the preset, as MODULE:NAME: an
+    Effect, or a function that makes one from the scene's metadata
+    (docs/own_effect.md). They run code, so --resume loads them only if they are named
+    again."""
     evaluate_every: float = 20.0
     """Seconds of training between two points of the PSNR curve."""
     checkpoint_every: float = 60.0
@@ -97,7 +97,9 @@ def main(args):
     stopped_by = outcome.result.stopped_by
     code = 1 if outcome.errors else 0
     if stopped_by in stopping.NAMES:
-        console.say(f"continue with: {commands.resume(outcome.folder)}")
+        effects = outcome.run.config.effects
+        again = commands.resume(outcome.folder, effects)
+        console.say(f"continue with: {again}")
         code = code or 128 + signal.Signals[stopped_by]
     return cli.Ended(_result(outcome), code)
 
@@ -115,6 +117,7 @@ def _result(outcome):
 
 def _outcome(args):
     with cli.user_errors():
+        cli.find_effects(args.effect)
         if args.resume:
             args = _with_folder(args)
             _check_resumed(args)
@@ -133,6 +136,7 @@ def _outcome(args):
                 args.out,
                 expected=_expected(args),
                 overrides=(*steps, *args.set),
+                effects=args.effect,
                 watched=watched,
                 **common,
             )

@@ -83,6 +83,9 @@ class Render:
     """What to write: png pictures, one mp4, exr with linear colour, alpha and depth."""
     max_side: int | None = None
     """Longest side of the pictures, in pixels (default: as trained)."""
+    effect: cli.Effects = ()
+    """Effects of your own that the run was trained with, as MODULE:NAME. They run code,
+    so they are loaded only if they are named here again."""
     device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
     """Where to compute."""
 
@@ -122,6 +125,7 @@ class Render:
 def main(args):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
+        cli.find_effects(args.effect)
         platform.start_jax(args.device, representations.cores_of_run(args.run).threads)
         from nerfies_jax import evaluation, runs
         from nerfies_jax.capture import video
@@ -132,7 +136,7 @@ def main(args):
             refuse_existing(args.out, args.overwrite)
         if "mp4" in args.formats:
             video.library()  # missing, it is said before anything is rendered
-        run = runs.saved_run(args.run)
+        run = runs.saved_run(args.run, effects=args.effect)
         move = _mover(args, run)
         state = runs.restore(args.run, run).state
         run = runs.with_found_cameras(run, state)

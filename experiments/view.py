@@ -30,6 +30,9 @@ class View:
     """Where to listen, on this machine alone; the next one that is free is taken."""
     max_side: int | None = None
     """Longest side of the finest pictures, in pixels (default: as trained)."""
+    effect: cli.Effects = ()
+    """Effects of your own that the run was trained with, as MODULE:NAME. They run code,
+    so they are loaded only if they are named here again."""
     device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
     """Where to compute."""
 
@@ -42,12 +45,13 @@ class View:
 def main(args):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
+        cli.find_effects(args.effect)
         platform.start_jax(args.device, representations.cores_of_run(args.run).threads)
         from nerfies_jax import runs
         from nerfies_jax.runs import viewer
 
         viewer.check_installed()
-        run = runs.saved_run(args.run)
+        run = runs.saved_run(args.run, effects=args.effect)
         restored = runs.restore(args.run, run)
         size = cli.sized(run.capture.size, args.max_side)
         page = viewer.Viewer(run, size, args.port, args.run / run_folder.EXPORTS)

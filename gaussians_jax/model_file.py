@@ -2,7 +2,7 @@
 
 The file is a NumPy archive (.npz): one float32 array for each leaf of the parameters,
 and one text, JSON, with the format's version, the structure that the leaves form and a
-description. The description may hold the frozen settings of this package; they come
+description. The description may hold the settings of a scene of this package; they come
 back as what they were, so that a file is enough to draw a frame:
 
     params, about = model_file.load("model.npz")
@@ -26,6 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gaussians_jax import splats
+from gaussians_jax.spec import SceneMetadata, SplatScene
 from gaussians_jax.splats import Params
 from nerfies_jax.capture import npz_files
 from nerfies_jax.capture.json_files import replaced_file
@@ -79,7 +80,7 @@ def load(path: str | os.PathLike) -> tuple[Params, dict[str, Any]]:
         with zipfile.ZipFile(path) as archive:
             about = _about(archive)
             params = _put_together(about["params"], archive)
-        description = specs.from_json(about["description"])
+        description = specs.from_json(about["description"], SplatScene, SceneMetadata)
         _check(params)
     except zipfile.BadZipFile as error:
         raise ValueError(
@@ -180,7 +181,7 @@ def _put_together(structure, archive):
         return {key: _put_together(item, archive) for key, item in items}
     if "tuple" in structure:
         return tuple(_put_together(item, archive) for item in structure["tuple"])
-    record = specs.type_named(structure["record"])
+    record = specs.record_named(structure["record"])
     fields = {
         key: _put_together(item, archive) for key, item in structure["fields"].items()
     }

@@ -10,6 +10,8 @@ from gaussians_jax import presets
 from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.mcmc import MCMCStrategySpec
 from gaussians_jax.raster_spec import INRIA
+from gaussians_jax.spec import SplatScene
+from gaussians_jax.splats import Params
 from nerfies_jax import presets as fields
 from nerfies_jax.training import spec_fields, specs
 
@@ -87,9 +89,8 @@ def test_a_field_is_listed_with_its_words_and_default():
 
 
 def there_and_back(value):
-    return specs.from_json(
-        json.loads(json.dumps(specs.as_json(value), allow_nan=False))
-    )
+    stored = json.loads(json.dumps(specs.as_json(value), allow_nan=False))
+    return specs.from_json(stored, type(value))
 
 
 @pytest.mark.parametrize("name", sorted(presets.PRESETS | fields.PRESETS))
@@ -108,12 +109,31 @@ def test_a_spec_of_another_version_is_refused():
     stored = specs.as_json(presets.STATIC)
     del stored["sh_every"]
     with pytest.raises(ValueError, match=r"SplatScene .* is none of this version"):
-        specs.from_json(stored)
+        specs.from_json(stored, SplatScene)
 
 
 @pytest.mark.parametrize(
-    "name", ["os.system", "gaussians_jax.spec.effects_of", "nowhere.Spec", "Spec", ""]
+    "name",
+    [
+        *("os.system", "gaussians_jax.spec.effects_of", "nowhere.Spec", "Spec", ""),
+        *("nerfies_jax.spec.RadianceScene", "subprocess.Popen", ["os.abort"], None),
+    ],
 )
 def test_a_name_that_is_no_setting_is_refused(name):
     with pytest.raises(ValueError, match="no record or setting"):
-        specs.from_json({"type": name})
+        specs.from_json({"type": name}, SplatScene)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("collections.OrderedDict", "gaussians_jax.spec.SplatScene", "Params", None),
+        # Found by another name, through an import; private modules and `__main__`
+        *("gaussians_jax.model_file.Params", "nerfies_jax._private.Params"),
+        *("gaussians_jax.__main__.Params", "gaussians_jax..splats.Params"),
+    ],
+)
+def test_only_a_named_tuple_where_it_is_defined_is_a_record_of_arrays(name):
+    assert specs.record_named("gaussians_jax.splats.Params") is Params
+    with pytest.raises(ValueError, match="no record or setting"):
+        specs.record_named(name)

@@ -19,7 +19,7 @@ def main(path: str) -> None:
     """Train what the settings in a file name; exit code 2 where they are wrong."""
     with cli.user_errors():
         text = pathlib.Path(path).read_text()
-        stored = specs.from_json(json.loads(text), ("experiments", *specs.PACKAGES))
+        stored = specs.from_json(json.loads(text), Ablate)
         # Paths were stored as text.
         args: Ablate = dataclasses.replace(stored, out=pathlib.Path(stored.out))
         (name,) = args.arms

@@ -41,6 +41,8 @@ class DeformationCost:
     """Gaussians that move less, in scene units, are not in the tables."""
     repeats: int = 7
     """Rounds of timing."""
+    effect: cli.Effects = ()
+    """Effects of your own that the run of --run was trained with, as MODULE:NAME."""
     out: pathlib.Path | None = None
     """Also write the figures here, as JSON, and a picture of the same name beside."""
     device: str = "auto"
@@ -64,6 +66,7 @@ class DeformationCost:
 def main(args):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
+        cli.find_effects(args.effect)
         platform.start_jax(args.device, "one")
         from experiments.deformation_cost import knot_curve
 
@@ -91,7 +94,7 @@ def _motion(args):
     if args.run is None:
         steps = known_motion.FIT_STEPS
         return known_motion.fitted(args.gaussians, SMALL_MOTION, steps)
-    run = runs.saved_run(args.run)
+    run = runs.saved_run(args.run, effects=args.effect)
     state = runs.restore(args.run, run).state
     return known_motion.of_run(run.model, state, run.capture)
 

@@ -8,9 +8,10 @@ from nerfies_jax.runs.config import RunConfig
 _RECONSTRUCT = ("python", "-m", "experiments.reconstruct")
 
 
-def resume(folder: pathlib.Path) -> str:
-    """Go on with the run in a folder; its settings are in there."""
-    return shlex.join([*_RECONSTRUCT, "--out", str(folder), "--resume"])
+def resume(folder: pathlib.Path, effects: tuple[str, ...] = ()) -> str:
+    """Continue the run in a folder. Its settings are there, its `effects` repeated."""
+    words = [*_RECONSTRUCT, "--out", str(folder), "--resume", *_trusting(effects)]
+    return shlex.join(words)
 
 
 def reconstruct(config: RunConfig) -> str:
@@ -22,12 +23,15 @@ def reconstruct(config: RunConfig) -> str:
         words += ["--seed", str(config.seed)]
     if config.overrides:
         words += ["--set", *config.overrides]
-    if config.effects:
-        words += ["--effect", *config.effects]
-    return shlex.join(words)
+    return shlex.join([*words, *_trusting(config.effects)])
 
 
-def render(folder: pathlib.Path) -> str:
-    """Draw the run in a folder from a camera that moves in a circle."""
+def render(folder: pathlib.Path, effects: tuple[str, ...] = ()) -> str:
+    """Render the run in a folder from a camera that moves in a circle."""
     words = ["python", "-m", "experiments.render", str(folder), "--path", "orbit"]
-    return shlex.join(words)
+    return shlex.join([*words, *_trusting(effects)])
+
+
+def _trusting(effects):
+    """The option that names the user's own effects: no folder is trusted with them."""
+    return ["--effect", *effects] if effects else []

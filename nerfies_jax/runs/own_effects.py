@@ -1,4 +1,4 @@
-"""Effects from outside, named on a command line as MODULE:NAME."""
+"""Effects of the user's own, named as MODULE:NAME. Loading them runs their code."""
 
 import importlib
 from typing import Any
@@ -7,11 +7,18 @@ from nerfies_jax.training.effects import Effect
 
 
 def load(names: tuple[str, ...], metadata: Any) -> tuple[Effect, ...]:
-    """The effects of these names.
+    """Import the effects of these names.
 
-    NAME is an `Effect` of MODULE, or a function that returns one from what the scene
-    knows of its capture (`SceneMetadata` of either package). MODULE is looked for where
-    Python looks, the current folder among that. Raises ValueError where there is none.
+    Args:
+      names: Each MODULE:NAME. NAME is an `Effect` of MODULE, or a function that returns
+        one from the scene's metadata. MODULE is looked for where Python looks.
+      metadata: What the scene knows of its capture, `SceneMetadata` of either package.
+
+    Returns:
+      The effects, in the order of their names.
+
+    Raises:
+      ValueError: There is none of a name.
     """
     return tuple(_load(name, metadata) for name in names)
 
@@ -19,22 +26,23 @@ def load(names: tuple[str, ...], metadata: Any) -> tuple[Effect, ...]:
 def _load(name, metadata):
     module_name, colon, attribute = name.partition(":")
     if not (module_name and colon and attribute):
-        raise ValueError(f"--effect {name}: expected MODULE:NAME, as my_effects:drift")
+        raise ValueError(f"effect {name}: expected MODULE:NAME, as my_effects:drift")
     try:
         module = importlib.import_module(module_name)
     except ImportError as error:
         raise ValueError(
-            f"--effect {name}: {module_name} cannot be imported ({error}); run where "
-            "it lies, or name its folder in PYTHONPATH"
+            f"effect {name}: {module_name} cannot be imported ({error}); run where "
+            "its file is, or name the folder of the file in PYTHONPATH"
         ) from error
     named = getattr(module, attribute, None)
     if named is None:
-        raise ValueError(f"--effect {name}: {module_name} has no {attribute!r}")
+        place = getattr(module, "__file__", None) or "built into Python"
+        raise ValueError(f"effect {name}: {module_name} ({place}) has no {attribute!r}")
     # An effect is a tuple, which nobody can call.
     effect = named(metadata) if callable(named) else named
     if not isinstance(effect, Effect):
         raise ValueError(
-            f"--effect {name}: a {type(effect).__name__}, and neither an Effect nor a "
+            f"effect {name}: a {type(effect).__name__}, and neither an Effect nor a "
             "function that returns one (docs/own_effect.md)"
         )
     return effect

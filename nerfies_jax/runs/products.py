@@ -327,13 +327,13 @@ def save_depth(folder: pathlib.Path, capture: Capture, scored: Scored) -> None:
 
 def _next(folder, run, trained):
     """What a user may want to run next."""
-    looked = report.Command(
-        "Render it from other cameras, at other times:", commands.render(folder)
-    )
+    own = run.config.effects
+    line = commands.render(folder, own)
+    looked = report.Command("Render it from other cameras, at other times:", line)
     if trained.result.stopped_by == "non-finite":
         return [looked]  # resumed, it would stop at the same step
     if trained.result.steps < run.spec.steps:
-        line = commands.resume(folder)
+        line = commands.resume(folder, own)
         return [looked, report.Command("Train it to the end:", line)]
     others = tuple(o for o in run.config.overrides if not o.startswith("steps="))
     longer = dataclasses.replace(run.config, steps=2 * run.spec.steps, overrides=others)

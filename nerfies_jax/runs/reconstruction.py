@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import pathlib
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any, Literal, NamedTuple
 
 from nerfies_jax import console
@@ -114,6 +114,7 @@ def resume(
     *,
     expected: Mapping[str, Any] = {},
     overrides: tuple[str, ...] = (),
+    effects: Collection[str] = (),
     seconds: float | int | None = None,
     evaluate_every: float | int = 20.0,
     checkpoint_every: float | int = 60.0,
@@ -125,6 +126,8 @@ def resume(
     One that is complete gets its products again. `expected` and `overrides` say what
     the run must have been started with: fields of its config and of its source by name,
     and fields of its spec; a capture that was moved since is named where it lies now.
+    `effects` are those from outside of this package, as MODULE:NAME, that may be loaded
+    if the run was begun with them: the folder's word alone runs no code.
     Raises Refused where they differ, where pictures or cameras are others than when the
     run was begun, and where another process is at work in the folder.
     """
@@ -136,7 +139,7 @@ def resume(
             moved = _check_expected(folder, expected)
             held.enter_context(run_folder.owned(folder))
             extra = quality.prepared(more)
-            run = saved_run(folder, overrides, moved)
+            run = saved_run(folder, overrides, moved, effects)
             _describe(run)
             quality.check(extra, run.capture.size)
             state, record, after = _restored(folder, run)

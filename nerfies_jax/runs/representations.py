@@ -81,11 +81,9 @@ def of_run(folder: pathlib.Path) -> "Representation | None":
 def stored_spec(representation: "Representation", stored: Any) -> Any:
     """A spec of that representation as a run folder holds it.
 
-    Its types may be of the package that the representation comes from, too. Raises
-    ValueError and TypeError for what is none.
+    Raises ValueError and TypeError for what is none.
     """
-    own = representation.spec_type.__module__.partition(".")[0]
-    return specs.from_json(stored, (*specs.PACKAGES, own))
+    return specs.from_json(stored, representation.spec_type)
 
 
 class Cores(NamedTuple):

@@ -5,7 +5,7 @@ import json
 import os
 import pathlib
 import shlex
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -22,7 +22,7 @@ from nerfies_jax.evaluation.lens import ThroughLens
 from nerfies_jax.evaluation.representation import Representation
 from nerfies_jax.evaluation.scores import Draw
 from nerfies_jax.evidence import frame_flow, frame_masks, given_files
-from nerfies_jax.runs import own_effects, representations, same_capture
+from nerfies_jax.runs import own_effects, representations, same_capture, trust
 from nerfies_jax.runs.config import CaptureSource, RunConfig
 from nerfies_jax.runs.run_folder import CHECKPOINTS, CONFIG
 from nerfies_jax.training import checkpoint, specs
@@ -232,15 +232,32 @@ def saved_run(
     folder: pathlib.Path,
     overrides: tuple[str, ...] = (),
     moved: Mapping[str, Any] = {},
+    effects: Collection[str] = (),
 ) -> Run:
-    """The run in a folder, with the settings and the capture it was made with.
+    """Open the run in a folder, with the settings and the capture it was made with.
 
-    Settings come from its `config.json`, not from the preset, which may have changed
-    since; `moved` says which parts of its source lie elsewhere today, and is kept.
-    Raises ValueError where `overrides` would change settings, and where the capture is
-    not the one that the run was begun with.
+    Opening a folder runs no code of it: it may come from a stranger.
+
+    Args:
+      folder: The run folder. Settings come from its `config.json`, not from the preset,
+        which may have changed since.
+      overrides: Settings that the run must have, as PATH=VALUE.
+      moved: The parts of its source that have another path today, which is kept.
+      effects: The effects from outside of this package that the caller trusts, as
+        MODULE:NAME. They are loaded if the run was trained with them.
+
+    Returns:
+      The run.
+
+    Raises:
+      UntrustedEffects: The run uses effects that are not in `effects`. It is a
+        ValueError, and nothing has been imported.
+      ValueError: `overrides` would change settings, or the capture is not the one that
+        the run was begun with.
     """
+    folder = pathlib.Path(folder)
     config, kind, spec = read_settings(folder)
+    trust.check_effects(folder, config.effects, effects)
     wanted = specs.override(spec, overrides)
     changed = specs.differences(specs.as_json(spec), specs.as_json(wanted))
     if changed:
@@ -275,7 +292,7 @@ def read_settings(folder: pathlib.Path) -> Settings:
     try:
         stored = json.loads(path.read_text())
         kind = representations.named(stored["representation"])
-        config = specs.from_json(stored["config"])
+        config = specs.from_json(stored["config"], RunConfig)
         spec = representations.stored_spec(kind, stored["spec"])
         for value, wanted in ((config, RunConfig), (spec, kind.spec_type)):
             if not isinstance(value, wanted):

@@ -1,8 +1,8 @@
 """Frozen settings ("specs") as plain JSON, changed by `path.to.field=value`, compared.
 
 One codec serves checkpoints, run folders, model files and results of studies. Nothing
-in a file is executed: names in it can only call up settings and records of the packages
-that the reader allows.
+in a file is executed or imported: a name in it only selects among the settings that the
+reader expects.
 """
 
 import contextlib
@@ -21,7 +21,7 @@ from nerfies_jax.training import spec_fields
 
 TYPE = "type"  # a spec's, in JSON; no field can have this name
 NUMBER = "number"  # around an infinity or NaN, which JSON does not have
-PACKAGES = ("gaussians_jax", "nerfies_jax")  # whose types a file may name
+PACKAGES = ("gaussians_jax", "nerfies_jax")  # whose records of arrays a file may name
 
 # JSON -------------------------------------------------------------------------------
 
@@ -66,24 +66,60 @@ def _items(content, path):
     return {key: _plain(item, f"{path}.{key}") for key, item in content.items()}
 
 
-def from_json(stored: Any, packages: tuple[str, ...] = PACKAGES) -> Any:
-    """The value that `as_json` wrote; lists come back as tuples.
+def from_json(stored: Any, *kinds: type) -> Any:
+    """Read the value that `as_json` wrote.
 
-    Types are looked up in `packages` alone. Raises ValueError where a type is not one
-    of this version's, or a field is unknown, missing or out of its bounds.
+    Args:
+      stored: JSON values.
+      *kinds: The settings and records that may be in it, outermost ones. Those that
+        their annotated fields can hold are allowed as well, and no others.
+
+    Returns:
+      The value. Lists come back as tuples.
+
+    Raises:
+      ValueError: A type is not among the allowed ones, or a field is unknown, missing
+        or out of its bounds. Nothing is imported to find that out.
     """
+    return _revived(stored, {type_name(kind): kind for kind in _allowed(kinds)})
+
+
+def _revived(stored, allowed):
     if isinstance(stored, list):
-        return tuple(from_json(item, packages) for item in stored)
+        return tuple(_revived(item, allowed) for item in stored)
     if not isinstance(stored, dict):
         return stored
     if stored.keys() == {NUMBER}:
         return float(stored[NUMBER])
-    fields = {
-        key: from_json(item, packages) for key, item in stored.items() if key != TYPE
-    }
+    fields = {key: _revived(item, allowed) for key, item in stored.items()}
     if TYPE not in stored:
         return fields
-    return build_record(type_named(stored[TYPE], packages), fields)
+    name = fields.pop(TYPE)
+    if not isinstance(name, str) or name not in allowed:
+        raise ValueError(
+            f"it names {name!r}, which is no record or setting of this version that "
+            "may be here"
+        )
+    return build_record(allowed[name], fields)
+
+
+def _allowed(kinds):
+    """The records among `kinds` and, by annotation, all that their fields can hold."""
+    found, waiting = set(), [*kinds]
+    while waiting:
+        kind = waiting.pop()
+        waiting += typing.get_args(kind)
+        if _is_record(kind) and kind not in found:
+            found.add(kind)
+            waiting += typing.get_type_hints(kind).values()
+    return found
+
+
+def _is_record(kind):
+    return isinstance(kind, type) and (
+        dataclasses.is_dataclass(kind)
+        or (issubclass(kind, tuple) and hasattr(kind, "_fields"))
+    )
 
 
 def build_record(kind: type, fields: dict[str, Any]) -> Any:
@@ -102,28 +138,30 @@ def build_record(kind: type, fields: dict[str, Any]) -> Any:
 
 
 def type_name(kind: type) -> str:
-    """The full name of a type, as `type_named` finds it."""
+    """The full name of a type, as files hold it."""
     return f"{kind.__module__}.{kind.__qualname__}"
 
 
-def type_named(name: str, packages: tuple[str, ...] = PACKAGES) -> type:
-    """A NamedTuple or a frozen dataclass of `packages` by its full name.
+def record_named(name: Any) -> type:
+    """Find a NamedTuple of arrays of these packages by its full name.
 
-    Raises ValueError for anything else.
+    Only public modules of `PACKAGES` are imported, and only a NamedTuple that such a
+    module defines is returned, so that no code of the file's choice runs.
+
+    Raises:
+      ValueError: There is none of that name.
     """
     module, _, attribute = str(name).rpartition(".")
+    top, *parts = module.split(".")
     kind = None
-    if module.split(".")[0] in packages:
+    if top in PACKAGES and all(x.isidentifier() and x[0] != "_" for x in parts):
         with contextlib.suppress(ImportError):
             kind = getattr(importlib.import_module(module), attribute, None)
-    is_record = isinstance(kind, type) and (
-        dataclasses.is_dataclass(kind)
-        or (issubclass(kind, tuple) and hasattr(kind, "_fields"))
-    )
-    if not is_record:
+    is_tuple = _is_record(kind) and issubclass(kind, tuple)
+    if not is_tuple or type_name(kind) != name:
         raise ValueError(
             f"it names {name!r}, which is no record or setting of this version of "
-            f"{' and '.join(packages)}"
+            f"{' and '.join(PACKAGES)}"
         )
     return kind
 

@@ -121,7 +121,7 @@ def test_a_path_leaves_as_training_found_the_cameras(splats, tmp_path, monkeypat
 
     before, run = positions("before"), runs.saved_run(splats)
     refined = run._replace(model=run.model._replace(found=found))
-    monkeypatch.setattr(runs, "saved_run", lambda folder: refined)
+    monkeypatch.setattr(runs, "saved_run", lambda folder, **_: refined)
     moved = positions("after") - before
     np.testing.assert_allclose(np.abs(moved).max(axis=1), 0.25, rtol=1e-5)
 

@@ -46,6 +46,7 @@ FLOORS = {
     "gaussians_jax.spec": 8,
     "gaussians_jax.first_state": 8,
     "gaussians_jax.growth": 8,
+    "gaussians_jax.model_file": 8,
     "gaussians_jax.held_out_exposure": 8,
     "gaussians_jax.scene": 8,
     "gaussians_jax.track_start": 8,

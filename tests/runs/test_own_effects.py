@@ -60,5 +60,5 @@ def test_a_run_trains_with_effects_named_in_its_config(module, monkeypatch):
 )
 @pytest.mark.usefixtures("module")
 def test_what_is_no_effect_is_refused_by_name(name, words):
-    with pytest.raises(ValueError, match=f"--effect {name}: .*{words}"):
+    with pytest.raises(ValueError, match=f"effect {name}: .*{words}"):
         own_effects.load((name,), None)
