@@ -11,7 +11,7 @@ from typing import Literal
 
 from experiments import cli
 from nerfies_jax import console
-from nerfies_jax.runs import platform, representations, run_folder
+from nerfies_jax.runs import platform, representations
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,8 +19,8 @@ class View:
     """Look around in a run, in the browser of this machine.
 
     Orbit with the mouse; time, what is shown, effects and a camera path are on the
-    page. Pictures are drawn here: coarse while the view moves, then finer, as far as
-    the run can be drawn in a few seconds.
+    page. The browser draws Gaussians itself. Fields, depth, opacity and motion are
+    rendered here: coarse while the view moves, then finer up to the full size.
     """
 
     run: cli.Positional[pathlib.Path]
@@ -29,7 +29,8 @@ class View:
     port: int = cli.VIEW_PORT
     """Where to listen, on this machine alone; the next one that is free is taken."""
     max_side: int | None = None
-    """Longest side of the finest pictures, in pixels (default: as trained)."""
+    """Longest side of the finest images rendered here, in pixels (default: as
+    trained)."""
     effect: cli.Effects = ()
     """Effects of your own that the run was trained with, as MODULE:NAME. They run code,
     so they are loaded only if they are named here again."""
@@ -54,7 +55,8 @@ def main(args):
         run = runs.saved_run(args.run, effects=args.effect)
         restored = runs.restore(args.run, run)
         size = cli.sized(run.capture.size, args.max_side)
-        page = viewer.Viewer(run, size, args.port, args.run / run_folder.EXPORTS)
+        page = viewer.Viewer(run, size, args.port, args.run)
+        page.add_history((restored.record or {}).get("rows", ()))
     console.say(f"look around at {page.address} (Ctrl-C ends)")
     try:
         while True:

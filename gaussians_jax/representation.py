@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from gaussians_jax import (
+    browser_splats,
     files,
     first_state,
     held_out_exposure,
@@ -267,4 +268,5 @@ GAUSSIANS = Representation(
         DEPTH: Pair("sonata-small", "only_depth"),
         LIGHT: Pair("splats-static-small", "only_exposure"),
     },
+    splatting=browser_splats.splatting,
 )

@@ -39,13 +39,23 @@ def without_effects(
             "--appearance: splats have no appearance codes; reconstruct with a preset "
             "that has them, as nerf-w or nerfies"
         )
+    spec, kept = reduced(spec, metadata, without, effects)
+    return scene.build(spec, metadata, kept)
+
+
+def reduced(spec, metadata, without: tuple[str, ...], effects: tuple[Effect, ...]):
+    """Remove effects from a specification and from the user's own.
+
+    Raises:
+      ValueError: If the scene cannot be rendered without one of them.
+    """
     check_there(without, parts(spec, metadata, effects).removable)
     left = {name: None for name in REMOVABLE if name in without}
     if "motion" in left and isinstance(spec.motion, AnchorMotionSpec):
         # Of the same features as the motion is what anchors carry at rest.
         left["motion"] = dataclasses.replace(spec.motion, moves=False)
     kept = tuple(effect for effect in effects if effect.name not in without)
-    return scene.build(dataclasses.replace(spec, **left), metadata, kept)
+    return dataclasses.replace(spec, **left), kept
 
 
 class Faster(NamedTuple):

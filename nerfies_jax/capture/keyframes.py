@@ -11,6 +11,7 @@ from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry.camera import Camera
 
 MAX_PICTURES = 100_000  # an hour of film, which nobody asks for on purpose
+MOST_KEYFRAMES = 24  # of a path that is to be edited by hand
 
 
 class Keyframe(NamedTuple):

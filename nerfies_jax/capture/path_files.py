@@ -6,12 +6,13 @@ square pixels alone. Nerfies' is in world units and has whole cameras.
 
 import math
 import pathlib
+from collections.abc import Sequence
 from typing import Any
 
 import msgspec
 import numpy as np
 
-from nerfies_jax.capture import camera_paths, frames
+from nerfies_jax.capture import camera_paths, frames, keyframes
 from nerfies_jax.capture.camera_paths import CameraPath
 from nerfies_jax.capture.capture import Capture, CaptureError
 from nerfies_jax.capture.images import MAX_PIXELS
@@ -22,6 +23,7 @@ from nerfies_jax.capture.json_files import (
     replaced_folder,
     write_json,
 )
+from nerfies_jax.capture.keyframes import Keyframe
 from nerfies_jax.capture.nearest import known_names
 from nerfies_jax.capture.nerfies_views import CameraFile, camera_entry, cameras_of
 from nerfies_jax.capture.transforms_writer import opengl_pose
@@ -45,6 +47,8 @@ class PathFile(msgspec.Struct):
     render_width: float
     render_height: float
     camera_type: str = "perspective"
+    # Of its editor. Their layout differs between versions of nerfstudio.
+    keyframes: list[dict[str, Any]] = []
 
 
 def named(name: str, capture: Capture, count: int | None) -> CameraPath:
@@ -69,6 +73,11 @@ def read(path: AnyPath, capture: Capture) -> CameraPath:
         cameras, size, times = _nerfies(path, capture)
     else:
         cameras, size, times = _nerfstudio(path)
+    return _checked(path, cameras, size, times)
+
+
+def _checked(path, cameras, size, times):
+    """The path, refused where it is none."""
     if not 1 <= min(size) <= max(size) <= MAX_PIXELS // min(size):
         raise CaptureError(
             f"{path}: pictures of {size[0]}x{size[1]} pixels; expected 1 to "
@@ -109,8 +118,13 @@ def _nerfstudio(path):
     if not table.camera_path:
         raise CaptureError(f"{path}: no cameras in it; add some under camera_path")
     size = round(table.render_width), round(table.render_height)
+    return _pinholes(path, table.camera_path, size)
+
+
+def _pinholes(path, entries, size):
+    """Cameras, size and times of entries of a file."""
     single = []
-    for row, each in enumerate(table.camera_path):
+    for row, each in enumerate(entries):
         if len(each.camera_to_world) != 16 or not 0 < each.fov < 180:
             raise CaptureError(
                 f"{path}: camera {row} has {len(each.camera_to_world)} numbers in "
@@ -121,7 +135,7 @@ def _nerfstudio(path):
         rotation = (pose[:3, :3] * [1, -1, -1]).T
         focal = 0.5 * size[1] / math.tan(math.radians(each.fov) / 2)
         single.append(camera.pinhole(rotation, pose[:3, 3], focal, size))
-    return camera.stack(single), size, [each.render_time for each in table.camera_path]
+    return camera.stack(single), size, [each.render_time for each in entries]
 
 
 def _nerfies(path, capture):
@@ -141,40 +155,107 @@ def _nerfies(path, capture):
     return cameras, size, [file.time for file in files]
 
 
-def write_nerfstudio(
-    path: AnyPath, planned: CameraPath, rate: float, overwrite: bool = False
-) -> None:
-    """`camera_path.json`, for nerfstudio's renderer and ours.
+def read_keyframes(path: AnyPath, capture: Capture) -> list[Keyframe]:
+    """Read the keyframes of a camera path, to edit it.
 
-    `rate` is in frames per second. Poses, times and the vertical field of view are
-    kept; what else a lens has is not.
+    Args:
+      path: nerfstudio's `camera_path.json`, or a folder of Nerfies' camera files.
+      capture: The capture it belongs to.
+
+    Returns:
+      The keyframes that the file has. If it has none, `MOST_KEYFRAMES` of its cameras
+      at most, evenly spaced; the path through them is then only close to the file's.
+      Without times they run from 0 to 1.
+
+    Raises:
+      CaptureError: If the file cannot be read or is no camera path.
+    """
+    path = pathlib.Path(path)
+    planned = read(path, capture)
+    if not path.is_dir():
+        entries = [_as_camera(each) for each in read_json(path, PathFile).keyframes]
+        if len(entries) >= 2 and None not in entries:
+            planned = _checked(path, *_pinholes(path, entries, planned.size))
+    rows = np.arange(len(planned.cameras.focal_px))
+    if len(rows) > keyframes.MOST_KEYFRAMES:
+        rows = np.linspace(0, rows[-1], keyframes.MOST_KEYFRAMES).round().astype(int)
+    times = planned.times
+    if times is None:
+        times = camera_paths.times(len(planned.cameras.focal_px))
+    return [
+        Keyframe(camera.take(planned.cameras, row), float(times[row])) for row in rows
+    ]
+
+
+def _as_camera(entry):
+    """A keyframe of nerfstudio's editor; None if it is of another layout."""
+    renamed = {**entry, "camera_to_world": entry.get("matrix")}
+    try:
+        return msgspec.convert(renamed, PathCamera)
+    except msgspec.ValidationError:
+        return None
+
+
+def write_nerfstudio(
+    path: AnyPath,
+    planned: CameraPath,
+    rate: float,
+    overwrite: bool = False,
+    keyframes: Sequence[Keyframe] = (),
+) -> None:
+    """Write `camera_path.json`, for nerfstudio's renderer and viewer and for ours.
+
+    Poses, times and the vertical field of view are kept, further properties of a lens
+    are not.
+
+    Args:
+      path: The file.
+      planned: The cameras.
+      rate: Frames per second.
+      overwrite: Whether to replace an existing file.
+      keyframes: Those that the path passes through, to edit it later.
     """
     refuse_existing(path, overwrite)
     width, height = planned.size
     count = len(planned.cameras.focal_px)
     entries: list[dict[str, Any]] = []
     for row in range(count):
-        one = camera.take(planned.cameras, row)
-        focal = float(one.focal_px) * float(one.pixel_aspect)
-        pose = opengl_pose(one.camera_from_world, one.position)
-        entry = {
-            "camera_to_world": pose.ravel().tolist(),
-            "fov": math.degrees(2 * math.atan2(height, 2 * focal)),
-            "aspect": width / height,
-        }
+        pose, fov = _pose_and_fov(camera.take(planned.cameras, row), height)
+        entry = {"camera_to_world": pose, "fov": fov, "aspect": width / height}
         if planned.times is not None:
             entry["render_time"] = float(planned.times[row])
         entries.append(entry)
+    edited = []
+    for keyframe in keyframes:
+        pose, fov = _pose_and_fov(keyframe.camera, height)
+        edited.append(
+            {
+                "matrix": pose,
+                "fov": fov,
+                "aspect": width / height,
+                "render_time": keyframe.time,
+                "override_time_enabled": True,
+                "override_transition_enabled": False,
+                "override_transition_sec": None,
+            }
+        )
     table = {
         "camera_type": "perspective",
         "render_width": width,
         "render_height": height,
         "fps": rate,
         "seconds": count / rate,
-        "keyframes": [],
+        "keyframes": edited,
         "camera_path": entries,
     }
     write_json(path, table)
+
+
+def _pose_and_fov(one, height):
+    """The OpenGL pose row by row, and the vertical field of view in degrees."""
+    focal = float(one.focal_px) * float(one.pixel_aspect)
+    pose = opengl_pose(one.camera_from_world, one.position).ravel().tolist()
+    return pose, math.degrees(2 * math.atan2(height, 2 * focal))
 
 
 def write_nerfies(

@@ -1,7 +1,6 @@
 """What somebody looks at in a window: cameras, sizes, pictures; no window here."""
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,11 +13,10 @@ from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.training.model import Rendering
 
-CHANNELS = ("colour", "depth", "opacity", "motion")
-MOVING_SECONDS = 0.1  # a picture may take while the view changes: ten a second
-RESTING_SECONDS = 5.0  # and when it does not: nothing is answered while it is drawn
-RUNGS = 4  # sizes, each half as long and high as the next
-SHORTEST_SIDE_PX = 32
+CHANNELS = ("color", "depth", "opacity", "motion")
+MOVING_SECONDS = 0.1  # an image may take while the view changes: ten a second
+SKIPPED_SECONDS = 0.5  # an image that is expected sooner needs no coarser one before it
+SHORTEST_SIDE_PX = 12
 
 
 class Eye(NamedTuple):
@@ -34,7 +32,7 @@ class Look(NamedTuple):
     """What they want to see."""
 
     time: float  # in [0, 1]
-    channel: str = "colour"  # one of `CHANNELS`
+    channel: str = "color"  # one of `CHANNELS`
     without: tuple[str, ...] = ()  # effects left out
     appearance: int = 0  # id
 
@@ -53,44 +51,74 @@ def camera_of(eye: Eye, size: tuple[int, int]) -> Camera:
     return one._replace(pixel_aspect=np.float32(vertical_px / focal_px))
 
 
-def ladder(full: tuple[int, int]) -> tuple[tuple[int, int], ...]:
-    """At most `RUNGS` sizes up to the full one, each about half as long as the next."""
-    sizes = [full]
-    while len(sizes) < RUNGS and min(sizes[0]) >= 2 * SHORTEST_SIDE_PX:
-        width, height = sizes[0]
-        sizes.insert(0, (width // 2, height // 2))
-    return tuple(sizes)
+class Pyramid(NamedTuple):
+    """Images of one view, each twice as wide and high as the one before.
 
-
-def next_rung(
-    seconds: Sequence[float | None], moving: bool, shown: int | None
-) -> int | None:
-    """Which size to draw next, coarsest first; None where there is nothing to do.
-
-    `seconds` are what pictures of each size take, as far as known, and `shown` is the
-    size of the last picture of this very view. While the view moves it is the finest
-    that is quick enough; then finer ones follow as long as they can be waited for.
+    All of them are rendered in tiles of one size. A single compiled program serves
+    every level, a change of the view waits for one tile at most, and the finest level
+    is always reached, however long a tile takes.
     """
-    expected = _expected(seconds)
-    quick = [rung for rung, each in enumerate(expected) if each <= MOVING_SECONDS]
-    start = max(quick, default=0)
-    if shown is None or shown < start:
-        return start
-    finer = shown + 1
-    if moving or finer == len(expected) or expected[finer] > RESTING_SECONDS:
+
+    tile: tuple[int, int]  # width and height in pixels, of the coarsest image too
+    levels: int
+
+    def size(self, level: int) -> tuple[int, int]:
+        """Return the width and height in pixels of the image of a level."""
+        width, height = self.tile
+        return width << level, height << level
+
+    def tiles(self, level: int) -> list[tuple[int, int]]:
+        """Return the columns and rows of the tiles of a level, the central ones first.
+
+        What somebody looks at is more often in the center than at the border.
+        """
+        side = 1 << level
+        center = (side - 1) / 2
+        cells = [(column, row) for row in range(side) for column in range(side)]
+        return sorted(cells, key=lambda c: max(abs(c[0] - center), abs(c[1] - center)))
+
+
+def pyramid(full: tuple[int, int], tile_pixels: int) -> Pyramid:
+    """Divide images of size `full` into tiles of about `tile_pixels` at most.
+
+    The finest level is `full`, or a few pixels larger where it does not divide evenly.
+    """
+    levels = 1
+    while True:
+        tile = tuple(math.ceil(side / (1 << levels - 1)) for side in full)
+        enough = math.prod(tile) <= tile_pixels
+        if enough or min(tile) < 2 * SHORTEST_SIDE_PX:
+            return Pyramid(tile, levels)
+        levels += 1
+
+
+def tile_camera(camera: Camera, pyramid: Pyramid, cell: tuple[int, int]) -> Camera:
+    """Return the camera of one tile of the image that `camera` takes."""
+    corner = np.multiply(cell, pyramid.tile)
+    shifted = np.asarray(camera.principal_point_px) - corner
+    return camera._replace(principal_point_px=shifted.astype(np.float32))
+
+
+def next_level(
+    tile_seconds: float | None, levels: int, complete: int | None, moving: bool
+) -> int | None:
+    """Return the level of a pyramid to render next, None if there is nothing to do.
+
+    Args:
+      tile_seconds: Seconds a tile takes, None before the first one.
+      levels: Number of levels.
+      complete: The finest level rendered of this very view, None before the first.
+      moving: Whether the view is changing.
+    """
+    expected = [(tile_seconds or 0.0) * 4**level for level in range(levels)]
+    if complete is None:
+        quick = (level for level, each in enumerate(expected) if each <= MOVING_SECONDS)
+        return 0 if tile_seconds is None else max(quick, default=0)
+    if moving or complete + 1 == levels:
         return None
-    return finer
-
-
-def _expected(seconds):
-    """What is not known takes as long for each pixel as the next coarser size."""
-    expected = []
-    for rung, known in enumerate(seconds):
-        guess = 4 * expected[-1] if expected else 0.0
-        # The coarsest must be tried; others wait until the one before them was.
-        guess = math.inf if rung and seconds[rung - 1] is None else guess
-        expected.append(guess if known is None else known)
-    return expected
+    finer = range(complete + 1, levels)
+    soon = [level for level in finer if expected[level] <= SKIPPED_SECONDS]
+    return max(soon, default=complete + 1)
 
 
 def as_channel(
@@ -105,7 +133,7 @@ def as_channel(
     for "motion". `limits` keep depth and motion comparable from picture to picture;
     those of motion grow.
     """
-    if channel == "colour":
+    if channel == "color":
         return Coloured(as_picture(rendering.colour), 0.0, 1.0)
     if channel == "opacity":
         grey = np.repeat(as_picture(rendering.alpha)[..., None], 3, axis=-1)

@@ -8,6 +8,8 @@ import pathlib
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
+import numpy as np
+
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation.model_flow import Mover
 from nerfies_jax.evaluation.protocol import Follow
@@ -63,6 +65,21 @@ class Parts(NamedTuple):
     appearance: bool  # whether it looks otherwise for each appearance id
 
 
+class SplatCloud(NamedTuple):
+    """Gaussians at one time in world coordinates, for a rasterizer; NumPy."""
+
+    centers: np.ndarray  # [gaussians, 3], scene units
+    covariances: np.ndarray  # [gaussians, 3, 3], scene units squared
+    rgb: np.ndarray  # [gaussians, 3] sRGB as seen from the camera; not clipped
+    opacity: np.ndarray  # [gaussians] in [0, 1]
+    background: np.ndarray  # [3] sRGB
+    view_dependent: bool  # whether `rgb` depends on the position of the camera
+
+
+# (state, time in [0, 1], appearance id, camera position [3]) -> the Gaussians then
+Splatting = Callable[[TrainState, float, int, np.ndarray], SplatCloud]
+
+
 class Representation(NamedTuple):
     """How its scenes are named, built, followed, timed and saved.
 
@@ -109,6 +126,9 @@ class Representation(NamedTuple):
     # What to take for a capture where the user names no preset.
     default_preset: Callable[[Capture], Choice] | None
     prices: dict[str, Pair]  # by effect, as in `nerfies_jax.evidence.findings`
+    # (spec, metadata, names left out, effects=()) -> the Gaussians of a trained scene
+    # for a rasterizer elsewhere; None where a scene has none.
+    splatting: Callable[..., Splatting] | None = None
 
 
 def check_there(without: tuple[str, ...], there: tuple[str, ...]) -> None:

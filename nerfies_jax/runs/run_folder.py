@@ -14,6 +14,7 @@ import filelock
 CONFIG = "config.json"  # which capture and which scene, and the whole of its spec
 CHECKPOINTS = "checkpoints"
 EXPORTS = "exports"  # files for other programs, where no other place is named
+RENDERS = "renders"  # images and videos of camera paths
 PREPARED = "prepared.json"  # in a capture: of what it was made, and how
 LOCK = ".lock"
 OWNER = ".owner.json"  # beside the lock: Windows lets nobody read a locked file

@@ -1,5 +1,7 @@
-"""Pictures of a run for who looks around in it: any view, effects on or off."""
+"""Images of a run for an interactive viewer: any view, effects on or off."""
 
+import collections
+import statistics
 import time
 from typing import Any
 
@@ -10,74 +12,118 @@ from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation import Renderer, interactive, model_flow
 from nerfies_jax.evaluation.interactive import Eye, Look
 from nerfies_jax.evaluation.pictures import Coloured
+from nerfies_jax.evaluation.representation import SplatCloud, Splatting
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.runs.run import Run
-from nerfies_jax.training.model import TrainState, View, in_default_precision
+from nerfies_jax.training.model import Model, TrainState, View, in_default_precision
+
+# Pixels of a tile. A change of the view waits until a tile is rendered: rays are traced
+# one by one, while a rasterizer goes through all Gaussians for every tile.
+TRACED_PIXELS, RASTERIZED_PIXELS = 2048, 65536
+TIMED = 5  # tiles whose median says how long the next one takes
 
 
 class Screen:
-    """Draws a run's trained state in pictures of a few sizes, `sizes`, coarsest first.
+    """Renders a run's trained state in tiles, level by level of `pyramid`.
 
-    Each combination of size and effects is compiled when it is first looked at.
+    Each combination of effects is compiled when it is first looked at.
     """
 
     def __init__(self, run: Run, full: tuple[int, int]):
-        self.run, self.sizes = run, interactive.ladder(full)
+        self.run = run
+        traced = run.model.stages is None
+        pixels = TRACED_PIXELS if traced else RASTERIZED_PIXELS
+        self.pyramid = interactive.pyramid(full, pixels)
         settings = run.spec, run.metadata
         self.parts = run.representation.parts(*settings, effects=run.effects)
         self._move = run.representation.mover(*settings, effects=run.effects)
-        self._renderers: dict[Any, Renderer] = {}
-        self._seconds: dict[Any, float] = {}
+        self._models: dict[tuple[str, ...], Model] = {}
+        self._renderers: dict[tuple[str, ...], Renderer] = {}
+        self._splatting: dict[tuple[str, ...], Splatting] = {}
+        self._seconds: dict[Any, collections.deque] = {}
         # Rounding must not be drawn as motion: what moves by less than a pixel does not
-        # reach full colour.
+        # reach full color.
         self._limits = {"motion": (0.0, _pixel_length(run.capture))}
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Those that there are: motion only where something moves points."""
-        still = self._move is None
-        return tuple(c for c in interactive.CHANNELS if not (still and c == "motion"))
+        """Channels of this run: motion only where something moves points."""
+        static = self._move is None
+        return tuple(c for c in interactive.CHANNELS if not (static and c == "motion"))
 
-    def seconds(self, look: Look) -> list[float | None]:
-        """What the last picture of each size took, without compiling; None: no one."""
-        return [
-            self._seconds.get((look.without, look.channel, size)) for size in self.sizes
-        ]
+    @property
+    def in_browser(self) -> bool:
+        """Whether a browser can render the colors of this run itself."""
+        return self.run.representation.splatting is not None
 
-    def draw(self, state: TrainState, eye: Eye, look: Look, rung: int) -> np.ndarray:
-        """The picture [height, width, 3] uint8 of the size at `rung`.
-
-        Depth is coloured over the range of the first picture that has any, motion over
-        the farthest so far.
-        """
-        size = self.sizes[rung]
-        key = look.without, look.channel, size
-        began, first = time.perf_counter(), key not in self._seconds
-        renderer = self._renderer(look.without, size)
-        view = in_default_precision(
-            View(
-                interactive.camera_of(eye, size),
-                np.float32(look.time),
-                np.int32(look.appearance),
+    def splats(self, state: TrainState, eye: Eye, look: Look) -> SplatCloud:
+        """Return the Gaussians of a run that is `in_browser`, for its rasterizer."""
+        if look.without not in self._splatting:
+            run = self.run
+            self._splatting[look.without] = run.representation.splatting(
+                run.spec, run.metadata, look.without, effects=run.effects
             )
+        splatting = self._splatting[look.without]
+        return splatting(state, look.time, look.appearance, np.asarray(eye.position))
+
+    def tile_seconds(self, look: Look) -> float | None:
+        """Return the seconds a tile takes, without compiling; None before the first."""
+        known = self._seconds.get((look.without, look.channel))
+        return None if known is None else statistics.median(known)
+
+    def draw(
+        self, state: TrainState, eye: Eye, look: Look, level: int, cell: tuple[int, int]
+    ) -> np.ndarray:
+        """Render one tile of a level as an image [height, width, 3] uint8.
+
+        Depth is colored over the range of the first coarse image that has any, motion
+        over the largest distance in any coarse image so far.
+        """
+        began, key = time.perf_counter(), (look.without, look.channel)
+        renderer = self._renderer(look.without)
+        camera = interactive.camera_of(eye, self.pyramid.size(level))
+        camera = interactive.tile_camera(camera, self.pyramid, cell)
+        view = in_default_precision(
+            View(camera, np.float32(look.time), np.int32(look.appearance))
         )
         rendering = renderer(state, view)
+        limits = self._limits.get(look.channel)
         distance = None
         if look.channel == "motion":
             start = view._replace(time=in_default_precision(np.float32(0)))
             distance = model_flow.picture_distance(
                 self._move, state, view, start, rendering
             )
-        limits = self._limits.get(look.channel)
-        drawn = interactive.as_channel(look.channel, rendering, distance, limits)
-        self._keep_limits(look.channel, drawn)
+            if level:
+                # A tile of its own range would differ in color from its neighbors.
+                distance = np.minimum(distance, limits[1])
+        image = interactive.as_channel(look.channel, rendering, distance, limits)
+        if not level:
+            self._keep_limits(look.channel, image)
         # The first may have been compiled, which the renderer leaves out.
-        elapsed = time.perf_counter() - began
-        self._seconds[key] = renderer.seconds[-1] if first else elapsed
-        return drawn.picture
+        first = key not in self._seconds
+        elapsed = renderer.seconds[-1] if first else time.perf_counter() - began
+        recent = self._seconds.setdefault(key, collections.deque(maxlen=TIMED))
+        recent.append(elapsed)
+        return image.picture
+
+    def model(self, without: tuple[str, ...]) -> Model:
+        """Return the model with some effects left out."""
+        if without not in self._models:
+            run, model = self.run, self.run.model
+            if without:
+                model = run.representation.variant(
+                    run.spec, run.metadata, without, False, effects=run.effects
+                )
+            self._models[without] = model
+        return self._models[without]
+
+    def has_range(self, channel: str) -> bool:
+        """Whether the colors of a channel span a range that images determine."""
+        return channel in ("depth", "motion")
 
     def legend(self, channel: str) -> str:
-        """What the colours of a channel stand for; empty where they need no words."""
+        """Return what the colors of a channel stand for; empty if that is plain."""
         low, high = self._limits.get(channel, (0.0, 0.0))
         if channel == "depth":
             return f"bright {low:.3g}, dark {high:.3g} scene units away"
@@ -85,22 +131,18 @@ class Screen:
             return f"since time 0: black none, light yellow {high:.3g} scene units"
         return ""
 
-    def _keep_limits(self, channel: str, drawn: Coloured) -> None:
+    def _keep_limits(self, channel: str, image: Coloured) -> None:
         # Motion since time 0 grows with the time, depth is much the same everywhere.
         if channel == "motion":
-            self._limits[channel] = drawn.low, drawn.high
-        elif channel == "depth" and drawn.high > drawn.low:
-            self._limits.setdefault(channel, (drawn.low, drawn.high))
+            self._limits[channel] = image.low, image.high
+        elif channel == "depth" and image.high > image.low:
+            self._limits.setdefault(channel, (image.low, image.high))
 
-    def _renderer(self, without, size):
-        if (without, size) not in self._renderers:
-            run, model = self.run, self.run.model
-            if without:
-                model = run.representation.variant(
-                    run.spec, run.metadata, without, False, effects=run.effects
-                )
-            self._renderers[without, size] = Renderer(model, size)
-        return self._renderers[without, size]
+    def _renderer(self, without):
+        if without not in self._renderers:
+            model = self.model(without)
+            self._renderers[without] = Renderer(model, self.pyramid.tile)
+        return self._renderers[without]
 
 
 def _pixel_length(capture: Capture) -> float:

@@ -8,6 +8,14 @@ from collections.abc import Iterator
 NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # Windows has no SIGHUP
 
 
+_ACTIVE: list["StopRequests"] = []
+
+
+def requested() -> bool:
+    """Return whether a signal has arrived that a loop is to answer."""
+    return any(each.name is not None for each in _ACTIVE)
+
+
 class StopRequests:
     """While entered, the first signal is only noted; a second SIGINT raises.
 
@@ -22,6 +30,7 @@ class StopRequests:
 
     def __enter__(self):
         self._before = _installed(self._note, NAMES)
+        _ACTIVE.append(self)
         return self
 
     def _note(self, number, _frame):
@@ -30,6 +39,7 @@ class StopRequests:
         self.name = signal.Signals(number).name
 
     def __exit__(self, *_):
+        _ACTIVE.remove(self)
         _restore(self._before)
 
 

@@ -30,37 +30,50 @@ def test_a_picture_of_any_size_fills_the_window(aspect):
         assert depth == pytest.approx(7, rel=1e-5)
 
 
-def test_sizes_are_halves_down_to_what_still_shows_something():
-    assert interactive.ladder((1000, 801)) == (
-        *((125, 100), (250, 200), (500, 400)),
-        (1000, 801),
-    )
-    assert interactive.ladder((176, 132)) == ((44, 33), (88, 66), (176, 132))
-    assert interactive.ladder((40, 30)) == ((40, 30),)
+def test_a_pyramid_of_tiles_ends_at_the_full_size():
+    assert interactive.pyramid((176, 132), 2048) == ((44, 33), 3)
+    assert interactive.pyramid((176, 132), 65536) == ((176, 132), 1)
+    # Not evenly divisible: a few pixels more.
+    uneven = interactive.pyramid((1000, 801), 2048)
+    assert uneven == ((32, 26), 6)
+    assert uneven.size(5) == (1024, 832)
+    # However few pixels a tile is to have, there is something to be seen of it.
+    assert interactive.pyramid((40, 30), 10) == ((20, 15), 2)
+    tiles = uneven.tiles(2)
+    assert len(set(tiles)) == 16
+    assert set(tiles[:4]) == {(1, 1), (1, 2), (2, 1), (2, 2)}
 
 
-def test_pictures_are_coarse_while_the_view_moves_and_sharpen_when_it_rests():
-    seconds = [None, None, None, None]
+def test_tiles_show_their_part_of_the_image():
+    eye = Eye(tuple(TURN.as_quat(scalar_first=True).tolist()), (0.1, -2, 3), 0.8, 1.5)
+    pyramid = interactive.pyramid((80, 60), 1200)
+    whole = interactive.camera_of(eye, pyramid.size(1))
+    point = np.float32(TURN.apply([0.9, 0.7, 4.0]) + eye.position)
+    pixel, _ = jax.jit(cameras.project)(whole, point)
+    tile = interactive.tile_camera(whole, pyramid, (1, 1))
+    within, _ = jax.jit(cameras.project)(tile, point)
+    np.testing.assert_allclose(within, pixel - np.float32([40, 30]), atol=1e-4)
+    assert (within > 0).all()
 
-    def draw(moving, shown, takes):
-        """Rungs drawn one after another until there is nothing to do."""
-        drawn = []
-        while (rung := interactive.next_rung(seconds, moving, shown)) is not None:
-            drawn.append(shown := rung)
-            seconds[rung] = takes[rung]
-        return drawn
 
-    quick = [0.01, 0.03, 0.09, 0.5]
-    # Nothing is known at first: each size is tried after the one before it.
-    assert draw(True, None, quick) == [0, 1]
-    assert draw(False, 1, quick) == [2, 3]
-    assert draw(True, None, quick) == [2]
-    assert draw(False, None, quick) == [2, 3]
-    # A field: even the coarsest is slow, and the finest is not waited for.
-    seconds[:] = [None] * 4
-    slow = [0.5, 1.9, 8.0, 32.0]
-    assert draw(True, None, slow) == [0]
-    assert draw(False, 0, slow) == [1]
+def test_images_are_coarse_while_the_view_moves_and_reach_full_size_at_rest():
+    def drawn(tile_seconds, moving, complete, levels=4):
+        """Levels rendered one after another until there is nothing to do."""
+        order = []
+        while True:
+            level = interactive.next_level(tile_seconds, levels, complete, moving)
+            if level is None:
+                return order
+            order.append(level)
+            complete = level
+
+    assert drawn(None, False, None) == [0, 3]
+    assert drawn(0.01, True, None) == [1]  # 4 tiles; 16 would take longer than 0.1 s
+    assert drawn(0.01, False, None) == [1, 2, 3]  # 64 tiles are not waited for
+    assert drawn(0.001, False, None) == [3]
+    # However long a tile takes, the finest image comes.
+    assert drawn(100.0, True, None) == [0]
+    assert drawn(100.0, False, 0) == [1, 2, 3]
 
 
 def test_channels_show_what_they_are_called():
@@ -71,7 +84,7 @@ def test_channels_show_what_they_are_called():
     def picture(channel, **rest):
         return interactive.as_channel(channel, rendering, **rest)
 
-    assert picture("colour").picture[0, 1].tolist() == [255, 128, 255]
+    assert picture("color").picture[0, 1].tolist() == [255, 128, 255]
     assert picture("opacity").picture[0].tolist() == [[0] * 3, [255] * 3]
     shown = picture("depth", limits=(1.0, 3.0)).picture[0]
     assert shown[0].tolist() == [128] * 3  # nothing there
@@ -85,5 +98,5 @@ def test_channels_show_what_they_are_called():
     # What moved nothing at all is black, not the middle of a range of no length.
     still = picture("motion", distance=np.zeros((1, 2), np.float32))
     assert still.picture.max() < 10
-    with pytest.raises(ValueError, match="there are colour, depth"):
+    with pytest.raises(ValueError, match="there are color, depth"):
         picture("heat")

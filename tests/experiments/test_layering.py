@@ -53,6 +53,7 @@ FLOORS = {
     "gaussians_jax.point_tracks": 8,
     "gaussians_jax.step_time": 8,
     "gaussians_jax.update": 8,
+    "gaussians_jax.browser_splats": 8,
     "gaussians_jax.variants": 8,
     "gaussians_jax.presets": 8,
     "gaussians_jax.small_presets": 8,

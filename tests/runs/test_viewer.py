@@ -5,6 +5,7 @@ import io
 import re
 import sys
 import time
+import warnings
 
 import jax
 import msgspec
@@ -62,38 +63,57 @@ def eye_of(row):
     )
 
 
+def whole(shown, state, eye, look, level):
+    """The image of a level, its tiles rendered one by one."""
+    width, height = shown.pyramid.size(level)
+    image = np.zeros((height, width, 3), np.uint8)
+    wide, high = shown.pyramid.tile
+    for column, row in shown.pyramid.tiles(level):
+        tile = shown.draw(state, eye, look, level, (column, row))
+        image[row * high :, column * wide :][:high, :wide] = tile
+    return image
+
+
 @pytest.mark.parametrize(
     "kind", ["gaussians", pytest.param("radiance", marks=pytest.mark.full)]
 )
-def test_a_screen_draws_what_the_renderer_draws_and_without_effects(kind):
+def test_a_screen_draws_what_the_renderer_draws_and_without_effects(kind, monkeypatch):
+    # Four tiles, the last column and row a pixel beyond the image.
+    for name in ("TRACED_PIXELS", "RASTERIZED_PIXELS"):
+        monkeypatch.setattr(screen, name, 400)
     run, state = a_run(kind)
-    shown = screen.Screen(run, CAPTURE.size)
+    shown = screen.Screen(run, (39, 29))
+    assert shown.pyramid == ((20, 15), 2)
     row = int(CAPTURE.train[0])
     first = Look(float(CAPTURE.times[row]), appearance=int(CAPTURE.appearance_ids[row]))
-    picture = shown.draw(state, eye_of(row), first, 0)
+    eye = eye_of(row)
+    picture = whole(shown, state, eye, first, 1)
     renderer = evaluation.Renderer(run.model, CAPTURE.size)
     expected = renderer(state, evaluation.view_of(CAPTURE, row)).colour
     difference = picture - 255.0 * expected.clip(0, 1)
     # 8 bits round by half; the pose went through a quaternion
     assert np.abs(difference).mean() < 0.6
-    assert shown.seconds(first)[0] > 0
+    assert shown.tile_seconds(first) > 0
     later = first._replace(time=0.9)
     name = {"gaussians": "motion", "radiance": "warp"}[kind]
     assert name in shown.parts.removable
     frozen = [
-        shown.draw(state, eye_of(row), look._replace(without=(name,)), 0)
+        shown.draw(state, eye, look._replace(without=(name,)), 0, (0, 0))
         for look in (first, later)
     ]
     np.testing.assert_array_equal(*frozen)
-    assert (shown.draw(state, eye_of(row), later, 0) != picture).any()
-    # How far things moved since time 0: nothing at 0, something later.
+    assert (whole(shown, state, eye, later, 1) != picture).any()
+    # How far things moved since time 0: nothing at 0, something later. Tiles are
+    # colored over the range of the coarse image before them.
     dark, bright = (
-        shown.draw(state, eye_of(row), Look(time, "motion"), 0) for time in (0.0, 0.9)
+        whole(shown, state, eye, Look(time, "motion"), 0) for time in (0.0, 0.9)
     )
     known = (dark != 128).any(axis=-1)
-    assert known.sum() > 50
+    assert known.sum() > 20
     assert dark[known].max() < 10 < bright[known].max()
-    varied = shown.draw(state, eye_of(row), first._replace(appearance=1), 0)
+    fine = whole(shown, state, eye, Look(0.9, "motion"), 1)
+    assert np.abs(fine[::2, ::2].astype(float) - bright).mean() < 40
+    varied = whole(shown, state, eye, first._replace(appearance=1), 1)
     assert (varied != picture).any() == (kind == "radiance")
 
 
@@ -108,7 +128,7 @@ class Browser:
             subprotocols=[f"viser-v{viser.__version__}"],
             max_size=None,
         )
-        self.picture, self.uuids = None, {}
+        self.picture, self.splats, self.visible = None, None, False
 
     def close(self):
         self._socket.close()
@@ -132,77 +152,210 @@ class Browser:
 
     def press(self, viewer_page, label, value=True):
         """A button, or another control with its value."""
-        for handle in viewer_page._server.gui._gui_input_handle_from_uuid.values():
-            if handle.label == label:
+        handles = list(viewer_page._server.gui._gui_input_handle_from_uuid.values())
+        for handle in handles:
+            if getattr(handle, "label", None) == label:
                 uuid = handle._impl.uuid
                 self.send("GuiUpdateMessage", uuid=uuid, updates={"value": value})
                 return
         raise KeyError(label)
 
     def receive(self, seconds):
-        """Take what comes within `seconds`; keeps the newest background picture."""
+        """Take what comes within `seconds`; keeps the newest image and Gaussians."""
         with contextlib.suppress(TimeoutError):
             while True:
                 message = self._socket.recv(timeout=seconds)
                 length = int.from_bytes(message[8:16], "little")
                 table = zstandard.ZstdDecompressor().decompress(message[16:][:length])
-                for each in msgspec.msgpack.decode(table)["messages"]:
-                    if each.get("rgb_data"):
-                        picture = PIL.Image.open(io.BytesIO(each["rgb_data"]))
-                        self.picture = np.asarray(picture)
+                table = msgspec.msgpack.decode(table)
+                place, buffers = 16 + length, []
+                for size in table["binaryBufferLengths"]:
+                    place += -place % 8
+                    buffers.append(message[place : place + size])
+                    place += size
+                for each in table["messages"]:
+                    self._take(each, buffers)
+
+    def _take(self, message, buffers):
+        if message.get("rgb_data"):
+            picture = PIL.Image.open(io.BytesIO(message["rgb_data"]))
+            self.picture = np.asarray(picture)
+        updates = message.get("props") or message.get("updates") or {}
+        buffer = updates.get("buffer")
+        if isinstance(buffer, dict):
+            words = np.frombuffer(buffers[buffer["__binary_index"]], np.uint32)
+            self.splats = words.reshape(-1, 8)
+
+    def positions(self):
+        """Centers of the Gaussians, in viser's unit."""
+        return self.splats[:, :3].copy().view(np.float32)
 
 
-@pytest.mark.slow
-def test_a_browser_gets_pictures_and_leaves_a_path_to_render(tmp_path, capsys):
-    run, state = a_run("gaussians")
-    page = viewer.Viewer(run, (160, 120), 8180, tmp_path / "exports")
+@contextlib.contextmanager
+def opened(tmp_path, kind="gaussians", **options):
+    """A page of a run, a browser, and `until(true)`, which serves until it is."""
+    run, state = a_run(kind)
+    page = viewer.Viewer(run, (160, 120), 8180, tmp_path, **options)
     browser = Browser(page.address)
+
+    def until(what):
+        for _ in range(400):
+            page.serve(state, 0, 0.2)
+            browser.receive(0.05)
+            if what():
+                return
+        raise TimeoutError
+
     try:
-        assert page.address.startswith("http://127.0.0.1:")
-
-        def until(what):
-            for _ in range(200):
-                page.serve(state, 0, 0.2)
-                browser.receive(0.05)
-                if what():
-                    return
-            raise TimeoutError
-
-        rows = [int(row) for row in CAPTURE.train[:2]]
-        browser.look(eye_of(rows[0]))
-        # Sharpens by itself.
-        until(lambda: browser.picture is not None and browser.picture.shape[1] == 160)
-        first = browser.picture
-        view = evaluation.resized(
-            evaluation.view_of(CAPTURE, rows[0]), CAPTURE.size, (160, 120)
-        )
-        expected = evaluation.Renderer(run.model, (160, 120))(state, view).colour
-        # JPEG of quality 90
-        assert np.abs(first - 255.0 * expected.clip(0, 1)).mean() < 4
-        browser.press(page, "add keyframe")
-        until(lambda: len(page.keyframes) == 1)
-        browser.picture = None
-        browser.look(eye_of(rows[1]))
-        browser.press(page, "time", 0.5)
-        until(lambda: browser.picture is not None and browser.picture.shape[1] == 160)
-        assert (browser.picture != first).any()
-        browser.press(page, "add keyframe")
-        until(lambda: len(page.keyframes) == 2)
-        browser.press(page, "save")
-        saved = tmp_path / "exports" / "path-1.json"
-        until(saved.exists)
+        yield page, browser, until, run, state
     finally:
         browser.close()
         page.close()
-    path = path_files.named(str(saved), CAPTURE, None)
-    assert path.size == CAPTURE.size
-    ends = [0, -1]
-    np.testing.assert_allclose(
-        path.times[ends], [CAPTURE.times[rows[0]], 0.5], atol=1e-3
-    )
-    np.testing.assert_allclose(
-        path.cameras.position[ends], CAPTURE.cameras.position[rows], atol=1e-5
-    )
+
+
+def label_of(page, start):
+    """The label of the control whose label begins so; None where there is none."""
+    handles = list(page._server.gui._gui_input_handle_from_uuid.values())
+    labels = [getattr(handle, "label", None) or "" for handle in handles]
+    return next((label for label in labels if label.startswith(start)), None)
+
+
+@pytest.mark.slow
+def test_a_browser_gets_gaussians_that_follow_time_effects_and_the_channel(tmp_path):
+    rows = [int(row) for row in CAPTURE.train[:2]]
+    with opened(tmp_path) as (page, browser, until, _, state):
+        assert page.address.startswith("http://127.0.0.1:")
+        browser.look(eye_of(rows[0]))
+        until(lambda: browser.splats is not None)
+        first = browser.positions()
+        look = Look(float(np.round(CAPTURE.times[rows[0]], 3)))
+        cloud = page.screen.splats(state, eye_of(rows[0]), look)
+        # viser is told of them in a unit of its own
+        unit = page._windows[0]._splat_unit
+        np.testing.assert_allclose(first * unit, cloud.centers, rtol=1e-5, atol=1e-6)
+        assert len(first) == len(cloud.centers)
+        # What is behind them is one color.
+        assert browser.picture.shape == (8, 8, 3)
+        browser.press(page, "time", 0.9)
+        until(lambda: (browser.positions() != first).any())
+        browser.press(page, "motion", False)
+        browser.splats = browser.splats * 0
+        until(lambda: browser.splats.any())
+        frozen = browser.positions()
+        browser.press(page, "time", 0.1)
+        time.sleep(0.2)
+        until(lambda: page._time.value == 0.1)
+        until(lambda: not page._round(state, 0))
+        np.testing.assert_array_equal(browser.positions(), frozen)
+        # Depth is rendered here and sharpens by itself.
+        browser.press(page, "show", "depth")
+        until(lambda: browser.picture is not None and browser.picture.shape[1] == 160)
+        assert not page._windows[0]._splats.visible
+        browser.press(page, "show", "color")
+        until(lambda: browser.picture.shape == (8, 8, 3))
+        assert page._windows[0]._splats.visible
+
+
+@pytest.mark.slow
+def test_a_tab_that_is_closed_in_the_middle_of_an_update_leaves_no_warning(
+    tmp_path, monkeypatch, caplog
+):
+    with opened(tmp_path) as (page, browser, until, _, state):
+        browser.look(eye_of(int(CAPTURE.train[0])))
+        until(lambda: browser.splats is not None)
+        evaluate = page.screen.splats
+
+        def leaving(*inputs):
+            browser.close()
+            while page._server.get_clients():
+                time.sleep(0.01)
+            return evaluate(*inputs)
+
+        monkeypatch.setattr(page.screen, "splats", leaving)
+        page._time.value = 0.9
+        with warnings.catch_warnings(), caplog.at_level("WARNING"):
+            warnings.simplefilter("error")
+            for _ in range(3):
+                page.serve(state, 0, 0.2)
+        assert not page._windows
+        assert not caplog.records
+
+
+@pytest.mark.slow
+def test_images_of_a_field_reach_full_size_however_slow_they_are(tmp_path, monkeypatch):
+    """Under load a coarse image can take so long that a finer one seems hopeless."""
+    from nerfies_jax.runs import viewer_window
+
+    monkeypatch.setattr(screen, "TRACED_PIXELS", 400)
+    monkeypatch.setattr(screen.Screen, "tile_seconds", lambda *_: 30.0)
+    monkeypatch.setattr(viewer_window, "SENT_SECONDS", 0.0)
+    row = int(CAPTURE.train[0])
+    with opened(tmp_path, "radiance") as (page, browser, until, run, state):
+        assert run.representation.splatting is None
+        browser.look(eye_of(row))
+        until(lambda: browser.picture is not None)
+        assert browser.picture.shape[1] < 160
+        until(lambda: browser.picture.shape[1] == 160)
+        until(lambda: not page._round(state, 0))
+        browser.receive(0.2)
+        view = evaluation.resized(
+            evaluation.view_of(CAPTURE, row), CAPTURE.size, (160, 120)
+        )
+        expected = evaluation.Renderer(run.model, (160, 120))(state, view).colour
+        # JPEG of quality 90
+        assert np.abs(browser.picture - 255.0 * expected.clip(0, 1)).mean() < 4
+
+
+@pytest.mark.slow
+def test_a_path_is_edited_saved_loaded_and_rendered(tmp_path, capsys):
+    rows = [int(row) for row in CAPTURE.train[:3]]
+    with opened(tmp_path) as (page, browser, until, _, _):
+        frames = page.path.keyframes
+
+        def add(row, moment, count):
+            browser.look(eye_of(row))
+            browser.press(page, "time", moment)
+            browser.press(page, "add keyframe")
+            # What is clicked counts, however the camera moves before it is dealt with.
+            browser.look(eye_of(int(CAPTURE.train[-1])))
+            browser.press(page, "time", 0.77)
+            until(lambda: len(frames) == count)
+
+        for count, (row, moment) in enumerate(
+            zip(rows, (0.0, 0.5, 0.25), strict=True), 1
+        ):
+            add(row, moment, count)
+        positions = [keyframe.camera.position for keyframe in frames]
+        np.testing.assert_allclose(positions, CAPTURE.cameras.position[rows], atol=1e-5)
+        assert [keyframe.time for keyframe in frames] == [0.0, 0.5, 0.25]
+        browser.press(page, label_of(page, "2: "), "down")
+        until(lambda: frames[2].time == 0.5)
+        browser.press(page, label_of(page, "1: "), "delete")
+        until(lambda: len(frames) == 2)
+        browser.press(page, "seconds", 0.2)
+        browser.press(page, "save")
+        saved = tmp_path / "exports" / "path-1.json"
+        until(saved.exists)
+        browser.press(page, label_of(page, "1: "), "set")
+        until(lambda: frames[0].time == 0.77)
+        path = path_files.named(str(saved), CAPTURE, None)
+        ends = [0, -1]
+        assert path.size == CAPTURE.size
+        np.testing.assert_allclose(path.times[ends], [0.25, 0.5], atol=1e-3)
+        expected = CAPTURE.cameras.position[[rows[2], rows[1]]]
+        np.testing.assert_allclose(path.cameras.position[ends], expected, atol=1e-5)
+        page._orders.put(lambda: page.path._load(None, None, None, saved.read_bytes()))
+        until(lambda: page.path.keyframes[0].time == 0.25)
+        browser.press(page, "render")
+        out = tmp_path / "renders" / "path-1"
+        until(out.exists)
+        assert len(list(out.glob("*.png"))) == 5  # of 0.2 s
+        assert page.path.rendering is None
+        browser.press(page, "render")
+        until(lambda: page.path.rendering is not None)
+        browser.press(page, "cancel the rendering")
+        until(lambda: page.path.rendering is None)
+        assert [each.name for each in out.parent.iterdir()] == ["path-1"]
     assert f"--path {saved}" in capsys.readouterr().out
 
 
@@ -221,7 +374,7 @@ def test_who_looks_on_changes_nothing_of_what_is_learnt(tmp_path, capsys):
             browser.receive(0.5)
         finally:
             browser.close()
-    assert browser.picture.shape == (*CAPTURE.size[::-1], 3)
+    assert len(browser.splats)
     assert seen.stopped_by == "steps"
     for one, other in zip(
         *(jax.tree.leaves(each.state.params) for each in (alone, seen)), strict=True

@@ -1,0 +1,47 @@
+"""A camera path of a run as numbered images and a video, an image at a time."""
+
+import pathlib
+from collections.abc import Iterator, Sequence
+
+from nerfies_jax.capture import images, video
+from nerfies_jax.capture.extras import MissingExtra
+from nerfies_jax.capture.json_files import replaced_folder
+from nerfies_jax.evaluation import Renderer, as_picture
+from nerfies_jax.training.model import TrainState, View
+
+VIDEO = "film.mp4"
+
+
+def render(
+    out: pathlib.Path,
+    renderer: Renderer,
+    state: TrainState,
+    views: Sequence[View],
+    rate: float,
+) -> Iterator[int]:
+    """Render views into a new folder, yielding after each image.
+
+    The folder takes its name when everything is in it. If the iteration is given up,
+    nothing is left. Without the extra `video` there is no video.
+
+    Args:
+      out: The folder.
+      renderer: Of the model, at the size of the images.
+      state: The trained state.
+      views: One for each image.
+      rate: Frames per second of the video.
+
+    Yields:
+      The number of images that are written.
+    """
+    with replaced_folder(out) as folder:
+        places = [folder / f"{number:04d}.png" for number in range(len(views))]
+        for number, (place, view) in enumerate(zip(places, views, strict=True), 1):
+            images.write_png(place, as_picture(renderer(state, view).colour))
+            yield number
+        try:
+            video.library()
+        except MissingExtra:
+            return
+        frames = (images.read_pixels(place) for place in places)
+        video.write_video(folder / VIDEO, frames, rate)

@@ -1,0 +1,117 @@
+"""Who may talk to the viewer: pages that it served itself, from this machine.
+
+viser listens on the loopback address and checks nothing else. A page of any web site
+that is open in the same browser could then connect to it, directly or under a name that
+resolves to 127.0.0.1 (DNS rebinding), and operate the viewer.
+"""
+
+import contextlib
+import http
+import logging
+import threading
+import urllib.parse
+from collections.abc import Callable, Iterator
+from typing import Any
+
+HOST = "127.0.0.1"  # where the viewer listens
+NAMES = (HOST, "localhost")  # by which its own page may call it
+_LOGGER = "nerfies_jax.viewer"
+_patching = threading.Lock()
+
+
+def refusal(host: str | None, origin: str | None, port: int) -> str | None:
+    """Return why a request is refused, None if it is the viewer's own page.
+
+    Args:
+      host: The Host header.
+      origin: The Origin header. Browsers send it with every websocket and with requests
+        of other sites; programs that are no browser may leave it out.
+      port: Port of the viewer.
+    """
+    own = [f"{name}:{port}" for name in NAMES]
+    if port == 80:
+        own += NAMES
+    if host is None or host.lower() not in own:
+        return (
+            f"Host {host!r} is not {' or '.join(own)}. To view from another machine, "
+            f"forward this port under the same number: ssh -L {port}:{HOST}:{port}"
+        )
+    if origin is not None:
+        try:
+            parts = urllib.parse.urlsplit(origin)
+        except ValueError:
+            parts = urllib.parse.urlsplit("")
+        if parts.scheme != "http" or parts.netloc.lower() not in own:
+            return f"Origin {origin!r} is another site."
+    return None
+
+
+@contextlib.contextmanager
+def guarded() -> Iterator[None]:
+    """Check the requests of every viser server that is started in this block.
+
+    viser hands its request handler to `websockets` in its own thread and offers no
+    place for another one, so the function that it calls is replaced until the server
+    listens.
+    """
+    import websockets.asyncio.server as websockets_server
+
+    with _patching:
+        original = websockets_server.serve
+
+        def serve(*args: Any, process_request: Callable, **options: Any):
+            return original(
+                *args,
+                process_request=_checked(process_request),
+                logger=_logger(),
+                **options,
+            )
+
+        websockets_server.serve = serve
+        try:
+            yield
+        finally:
+            websockets_server.serve = original
+
+
+def _checked(process_request):
+    """The handler of requests, which answers 403 where `refusal` has a reason."""
+
+    def process(connection, request):
+        headers = request.headers
+        port = connection.local_address[1]
+        # A repeated header counts as a wrong one.
+        hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
+        host = hosts[0] if len(hosts) == 1 else None
+        origin = ", ".join(origins) if origins else None
+        reason = refusal(host, origin, port)
+        if reason is None:
+            return process_request(connection, request)
+        return connection.respond(http.HTTPStatus.FORBIDDEN, f"Refused: {reason}\n")
+
+    return process
+
+
+class _Departures(logging.Filter):
+    """Drops the record of a connection that was closed before it asked for anything.
+
+    Browsers open connections in advance and close tabs in the middle of a request:
+    neither is an error of the server.
+    """
+
+    def filter(self, record):
+        error = record.exc_info[1] if record.exc_info else None
+        seen = []
+        while error is not None and error not in seen:
+            if isinstance(error, EOFError | ConnectionError):
+                return False
+            seen.append(error)
+            error = error.__cause__ or error.__context__
+        return True
+
+
+def _logger():
+    logger = logging.getLogger(_LOGGER)
+    if not any(isinstance(each, _Departures) for each in logger.filters):
+        logger.addFilter(_Departures())
+    return logger

@@ -1,0 +1,345 @@
+"""The viewer's editor of camera paths: keyframes, preview, files and rendering."""
+
+import pathlib
+import shlex
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from nerfies_jax import console
+from nerfies_jax.capture import keyframes, path_files
+from nerfies_jax.capture.camera_paths import CameraPath
+from nerfies_jax.capture.capture import CaptureError
+from nerfies_jax.capture.keyframes import Keyframe
+from nerfies_jax.evaluation import Renderer, interactive, path_views
+from nerfies_jax.evaluation.interactive import Eye, Look
+from nerfies_jax.geometry import camera as cameras
+from nerfies_jax.geometry.camera import Camera
+from nerfies_jax.runs import path_images
+from nerfies_jax.runs.run_folder import EXPORTS, RENDERS
+from nerfies_jax.runs.screen import Screen
+from nerfies_jax.runs.viewer_window import departing
+from nerfies_jax.training.model import TrainState, View, in_default_precision
+
+RATE = 24.0  # images per second of a path
+LINE_POINTS = 200  # of the curve in the scene
+FRUSTUM_PX = 2.0
+COLOR = (60, 170, 255)
+ACTIONS = ("go", "set", "up", "down", "delete")
+_EMPTY = "Look from where the path begins, at the time it shows there; add it."
+_NAME = "/path"
+
+
+class PathPanel:
+    """Keyframes, and what can be done with the path through them.
+
+    viser's threads call nothing here: `ordered` makes a callback of an action
+    `(client, eye, look)` that runs in the thread that serves the viewer, with the
+    camera and the controls as they were when the browser's click arrived.
+    """
+
+    def __init__(
+        self,
+        server: Any,
+        screen: Screen,
+        run_folder: pathlib.Path,
+        seconds: float,
+        frustum_scale: float,
+        ordered: Callable[[Callable], Callable],
+        show_time: Callable[[float], None],
+    ):
+        self.keyframes: list[Keyframe] = []
+        self.rendering: Iterator[int] | None = None
+        self._server, self._screen, self._folder = server, screen, run_folder
+        self._scale, self._ordered, self._show_time = frustum_scale, ordered, show_time
+        self._preview: tuple[Any, CameraPath, float] | None = (
+            None  # client, path, start
+        )
+        self._count = 0  # images of the path being rendered
+        self._total = 0
+        self._rows: list[Any] = []  # viser's handles of the list of keyframes
+        self._drawn: list[Any] = []  # and of what is drawn in the scene
+        gui = server.gui
+        with gui.add_folder("camera path") as self._panel:
+            self._message = gui.add_markdown(_EMPTY)
+            with gui.add_folder("keyframes", visible=False) as self._list:
+                pass
+            self._button("add keyframe", self._add)
+            self._length = gui.add_number("seconds", seconds, min=0.1, step=0.1)
+            self._visible = gui.add_checkbox("show path", True)
+            self._visible.on_update(ordered(lambda *_: self._draw()))
+            self._play = self._button("preview", self._toggle_preview)
+            self._button("save", self._save)
+            loading = gui.add_upload_button("load", mime_type="application/json,.json")
+            # Of this click: the next one replaces the handle's value.
+            loading.on_upload(ordered(self._load, lambda: loading.value.content))
+            self._render = self._button("render", self._toggle_render)
+            self._progress = gui.add_progress_bar(0.0, visible=False)
+
+    def _button(self, label, action):
+        button = self._server.gui.add_button(label)
+        button.on_click(self._ordered(action))
+        return button
+
+    def close(self) -> None:
+        """Give up what is being rendered, and leave nothing of it."""
+        if self.rendering is not None:
+            self.rendering.close()
+            self.rendering = None
+
+    def advance(self, state: TrainState, clients) -> bool:
+        """Move the preview and render one image; return whether either goes on."""
+        if self._preview is not None:
+            self._advance_preview(clients)
+        if self.rendering is not None:
+            self._advance_rendering(state)
+        return self._preview is not None or self.rendering is not None
+
+    # Keyframes
+
+    def _add(self, client, eye, look):
+        del client
+        if eye is not None:
+            self.keyframes.append(self._keyframe(eye, look))
+            self._changed()
+
+    def _keyframe(self, eye: Eye, look: Look) -> Keyframe:
+        size = self._screen.run.capture.size
+        square = eye._replace(aspect=size[0] / size[1])
+        return Keyframe(interactive.camera_of(square, size), look.time)
+
+    def _edit(self, place, action, client, eye, look):
+        """One button of the keyframe at `place` of the list."""
+        frames = self.keyframes
+        if place >= len(frames):
+            return
+        if action == "go":
+            self._stop_preview()
+            self._go(client, frames[place])
+            return
+        if action == "set":
+            if eye is not None:
+                frames[place] = self._keyframe(eye, look)
+        elif action == "delete":
+            del frames[place]
+        else:
+            other = place + (1 if action == "down" else -1)
+            if 0 <= other < len(frames):
+                frames[place], frames[other] = frames[other], frames[place]
+        self._changed()
+
+    def _changed(self):
+        """List the keyframes and draw the path anew."""
+        self._stop_preview()
+        for row in self._rows:
+            row.remove()
+        self._rows = []
+        with self._list:
+            for place, keyframe in enumerate(self.keyframes):
+                label = f"{place + 1}: t {keyframe.time:.3f}"
+                row = self._server.gui.add_button_group(label, ACTIONS)
+                row.on_click(self._edited(place, row))
+                self._rows.append(row)
+        self._list.visible = bool(self.keyframes)
+        self._message.content = "" if self.keyframes else _EMPTY
+        self._draw()
+
+    def _edited(self, place, row):
+        def edit(client, eye, look, action):
+            self._edit(place, action, client, eye, look)
+
+        return self._ordered(edit, lambda: row.value)
+
+    # In the scene
+
+    def _draw(self):
+        for handle in self._drawn:
+            handle.remove()
+        self._drawn = []
+        if not self._visible.value:
+            return
+        scene, size = self._server.scene, self._screen.run.capture.size
+        for place, keyframe in enumerate(self.keyframes):
+            one = keyframe.camera
+            turn = Rotation.from_matrix(one.camera_from_world.T)
+            self._drawn.append(
+                scene.add_camera_frustum(
+                    f"{_NAME}/keyframe {place + 1}",
+                    vertical_fov(one, size),
+                    size[0] / size[1] / float(one.pixel_aspect),
+                    scale=self._scale,
+                    thickness=FRUSTUM_PX,
+                    thickness_units="screen",
+                    color=COLOR,
+                    wxyz=turn.as_quat(scalar_first=True),
+                    position=one.position,
+                )
+            )
+        if len(self.keyframes) >= 2:
+            count = max(LINE_POINTS, len(self.keyframes))
+            at = keyframes.through(self.keyframes, size, count).cameras.position
+            self._drawn.append(
+                scene.add_line_segments(
+                    f"{_NAME}/curve",
+                    np.stack([at[:-1], at[1:]], axis=1),
+                    COLOR,
+                    thickness=FRUSTUM_PX,
+                    thickness_units="screen",
+                )
+            )
+
+    # Preview
+
+    def _toggle_preview(self, client, eye, look):
+        del eye, look
+        if self._preview is not None:
+            self._stop_preview()
+            return
+        path = self._path()
+        if path is not None and client is not None:
+            self._preview = client, path, time.monotonic()
+            self._play.label = "stop the preview"
+
+    def _advance_preview(self, clients):
+        client, path, began = self._preview
+        count = len(path.times)
+        place = (time.monotonic() - began) * RATE
+        if client.client_id not in clients or place > count - 1:
+            self._stop_preview()
+            place = count - 1
+        row = round(place)
+        one = cameras.take(path.cameras, row)
+        self._go(client, Keyframe(one, float(path.times[row])))
+
+    def _stop_preview(self):
+        if self._preview is not None:
+            self._preview = None
+            self._play.label = "preview"
+
+    def _go(self, client, keyframe: Keyframe):
+        """Show a browser what a keyframe does."""
+        if client is None:
+            return
+        turn = Rotation.from_matrix(keyframe.camera.camera_from_world.T)
+        with departing(client), client.atomic():
+            client.camera.position = keyframe.camera.position
+            client.camera.wxyz = turn.as_quat(scalar_first=True)
+            client.camera.fov = vertical_fov(
+                keyframe.camera, self._screen.run.capture.size
+            )
+        self._show_time(keyframe.time)
+
+    # Files
+
+    def _path(self) -> CameraPath | None:
+        """The path, or None after telling in the page why there is none."""
+        count = max(round(RATE * self._length.value), len(self.keyframes))
+        try:
+            size = self._screen.run.capture.size
+            return keyframes.through(self.keyframes, size, count)
+        except ValueError as error:
+            self._message.content = str(error)
+            return None
+
+    def _save(self, *_):
+        path = self._path()
+        if path is None:
+            return
+        place = _numbered(self._folder / EXPORTS, "path-", ".json")
+        try:
+            place.parent.mkdir(parents=True, exist_ok=True)
+            path_files.write_nerfstudio(place, path, RATE, keyframes=self.keyframes)
+        except (ValueError, OSError) as error:
+            self._message.content = f"Not saved: {error}"
+            return
+        words = "experiments.render", str(self._folder), "--path", str(place)
+        render = shlex.join(("python", "-m", *words))
+        self._message.content = f"Saved. To render it later:\n\n`{render}`"
+        console.say(f"{len(path.times)} cameras: {place}; {render}")
+
+    def _load(self, client, eye, look, content: bytes):
+        del client, eye, look
+        with tempfile.TemporaryDirectory() as folder:
+            place = pathlib.Path(folder) / "camera path"
+            place.write_bytes(content)
+            try:
+                loaded = path_files.read_keyframes(place, self._screen.run.capture)
+            except CaptureError as error:
+                reason = str(error).replace(f"{place}: ", "")
+                self._message.content = f"Not loaded: {reason}"
+                return
+        self.keyframes = loaded
+        self._changed()
+        self._message.content = f"{len(loaded)} keyframes loaded."
+
+    # Rendering
+
+    def _toggle_render(self, client, eye, look):
+        del client, eye
+        if self.rendering is not None:
+            self._end_rendering("The rendering is canceled, nothing of it is kept.")
+            return
+        path = self._path()
+        if path is None:
+            return
+        out = _numbered(self._folder / RENDERS, "path-", "")
+        screen, total = self._screen, len(path.times)
+
+        def images():
+            # The state of the first call: training waits until the last image.
+            state = yield 0
+            out.parent.mkdir(parents=True, exist_ok=True)
+            first = View(
+                cameras.take(path.cameras, 0),
+                np.float32(look.time),
+                np.int32(look.appearance),
+            )
+            views = path_views(path.cameras, path.times, in_default_precision(first))
+            renderer = Renderer(screen.model(look.without), path.size)
+            yield from path_images.render(out, renderer, state, views, RATE)
+
+        self.rendering, self._out, self._total = images(), out, total
+        next(self.rendering)
+        self._progress.value, self._progress.visible = 0.0, True
+        self._render.label = "cancel the rendering"
+        self._message.content = f"Rendering {total} images of {_text(path.size)}."
+
+    def _advance_rendering(self, state):
+        try:
+            done = self.rendering.send(state)
+        except StopIteration:
+            self._end_rendering(f"{self._total} images: `{self._out}`")
+            console.say(f"{self._total} images: {self._out}")
+        except (CaptureError, OSError, ValueError) as error:
+            self._end_rendering(f"Not rendered: {error}")
+        else:
+            self._progress.value = 100.0 * done / self._total
+            self._message.content = f"{done} of {self._total} images rendered."
+
+    def _end_rendering(self, message):
+        self.close()
+        self._progress.visible = False
+        self._render.label = "render"
+        self._message.content = message
+
+
+def vertical_fov(camera: Camera, size: tuple[int, int]) -> float:
+    """Return the vertical field of view in radians of images of `size`."""
+    vertical_px = float(camera.focal_px) * float(camera.pixel_aspect)
+    return 2 * float(np.arctan2(size[1], 2 * vertical_px))
+
+
+def _numbered(folder: pathlib.Path, stem: str, suffix: str) -> pathlib.Path:
+    """The first of STEM1, STEM2, ... that is not there."""
+    number = 1
+    while (place := folder / f"{stem}{number}{suffix}").exists():
+        number += 1
+    return place
+
+
+def _text(size):
+    return "x".join(map(str, size))

@@ -1,0 +1,89 @@
+"""The viewer's part for a run in training: its loss, and a button that holds it."""
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+MOST_POINTS = 1000  # of the curve; beyond, every second one is left out
+ABSENT_SECONDS = 10.0  # without a browser until training goes on by itself
+PLOT_PX = 180
+_LOSS = "loss"
+
+
+class TrainingPanel:
+    """The loss curve, and whether training is paused.
+
+    Args:
+      server: viser's server.
+      ordered: As in `viewer_path.PathPanel`.
+      pausable: Whether training is in progress, so that it can be paused.
+    """
+
+    def __init__(self, server: Any, ordered: Callable, pausable: bool):
+        self.paused = False
+        self._server = server
+        self._steps: list[float] = []
+        self._losses: list[float] = []
+        self._stride, self._skipped = 1, 0
+        self._plot = self._button = None
+        self._seen = time.monotonic()  # when a browser was there last
+        self._folder = server.gui.add_folder("training", visible=pausable)
+        if pausable:
+            with self._folder:
+                self._button = server.gui.add_button("pause training")
+                self._button.on_click(ordered(lambda *_: self._pause(not self.paused)))
+
+    def add(self, step: int, metrics: Mapping[str, float]) -> None:
+        """Add a point to the curve; metrics without a finite loss add none."""
+        loss = float(metrics.get(_LOSS, math.nan))
+        # The axis is logarithmic.
+        if not (0 < loss < math.inf):
+            return
+        self._skipped += 1
+        if self._skipped < self._stride:
+            return
+        self._skipped = 0
+        self._steps.append(float(step))
+        self._losses.append(loss)
+        if len(self._steps) > MOST_POINTS:
+            del self._steps[1::2], self._losses[1::2]
+            self._stride *= 2
+
+    def show(self) -> None:
+        """Send the curve to the browsers."""
+        if len(self._steps) < 2:
+            return
+        data = np.asarray(self._steps), np.asarray(self._losses)
+        if self._plot is not None:
+            self._plot.data = data
+            return
+        self._folder.visible = True
+        with self._folder:
+            self._plot = self._server.gui.add_uplot(
+                data,
+                ({"label": "step"}, {"label": _LOSS, "stroke": "#228be6", "width": 2}),
+                scales={"x": {"time": False}, "y": {"distr": 3}},
+                title="training loss",
+                height=PLOT_PX,
+            )
+
+    def held(self, browsers: int) -> bool:
+        """Return whether training is to wait, given the number of browsers.
+
+        A pause ends by itself when nobody is there who could end it.
+        """
+        now = time.monotonic()
+        if browsers:
+            self._seen = now
+        if self.paused and now - self._seen > ABSENT_SECONDS:
+            self._pause(False)
+        return self.paused
+
+    def _pause(self, paused):
+        self.paused = paused
+        self._seen = time.monotonic()
+        if self._button is not None:
+            self._button.label = "resume training" if paused else "pause training"

@@ -1,0 +1,237 @@
+"""What one browser shows: Gaussians that it renders itself, or images rendered here."""
+
+import contextlib
+import time
+
+import numpy as np
+
+from nerfies_jax.evaluation import interactive
+from nerfies_jax.evaluation.interactive import Eye, Look
+from nerfies_jax.evaluation.representation import SplatCloud
+from nerfies_jax.runs.screen import Screen
+from nerfies_jax.training.model import TrainState
+
+IDLE_SECONDS = 0.01
+REST_SECONDS = 0.2  # without a change until a view counts as resting
+REFRESH_SECONDS = 2.0  # between two updates of a resting view while training goes on
+SENT_SECONDS = 0.15  # between two images of a level that is not complete
+SPLATS_SECONDS = 1 / 30  # between two updates of the Gaussians
+TURNED_SECONDS = 0.2  # the same, where only the camera moved
+BYTES_PER_SECOND = 40e6  # of Gaussians, which a browser unpacks and sorts
+BYTES_PER_SPLAT = 32
+JPEG_QUALITY = 90
+LARGEST_HALF = 6e4  # below the largest float16
+_NAME = "/splats"
+
+
+def eye_of(camera) -> Eye | None:
+    """Convert viser's camera; None until the browser has reported one."""
+    if camera.update_timestamp == 0 or not camera.image_height:
+        return None
+    return Eye(
+        quaternion=tuple(np.asarray(camera.wxyz, np.float64).tolist()),
+        position=tuple(np.asarray(camera.position, np.float64).tolist()),
+        fov_rad=float(camera.fov),
+        aspect=float(camera.image_width / camera.image_height),
+    )
+
+
+@contextlib.contextmanager
+def departing(client):
+    """Accept that the browser leaves while something is sent to it.
+
+    It may do so at any time, and viser warns of messages that nobody receives. Only
+    those that are sent in this block are meant.
+    """
+    buffer = client._websock_connection.get_message_buffer()
+    with buffer.sanctioned_dead_writes():
+        yield
+
+
+class Window:
+    """The scene in one browser, kept up to date by calls of `update`."""
+
+    def __init__(self, client, screen: Screen):
+        self.about = ""
+        self._client, self._screen = client, screen
+        self._splats = None  # viser's handle
+        self._splat_unit = 1.0
+        self._splat_count = 0
+        self._background: tuple[int, ...] | None = None  # of one color; None: an image
+        self._shown: tuple | None = None  # by what the last Gaussians were evaluated
+        self._sent = 0.0  # when the last update was, by the monotonic clock
+        self._image = _Image()
+
+    def update(self, state: TrainState, step: int, look: Look) -> bool:
+        """Bring the browser closer to the state; return whether more is to be done.
+
+        Renders one tile at most, so that what happens meanwhile is soon answered.
+        """
+        eye = eye_of(self._client.camera)
+        if eye is None:
+            return False
+        if look.channel == "color" and self._screen.in_browser:
+            return self._update_splats(state, step, eye, look)
+        self._show_splats(False)
+        return self._update_image(state, step, eye, look)
+
+    def _update_splats(self, state, step, eye, look):
+        self._image = _Image()
+        now, shown = time.monotonic(), self._shown
+        if shown is None or shown[:3] != (look, step, eye.position):
+            wait = self._splats_wait(shown, look, step)
+            if now - self._sent < wait:
+                time.sleep(IDLE_SECONDS)
+                return wait < REFRESH_SECONDS
+            cloud = self._screen.splats(state, eye, look)
+            self._send_splats(cloud)
+            position = eye.position if cloud.view_dependent else None
+            self._shown = look, step, eye.position, position
+            self._sent = time.monotonic()
+            self._splat_count = len(cloud.centers)
+            self._show_splats(True)
+            self.about = f"{len(cloud.centers):,} Gaussians, step {step:,}"
+            return True
+        self._show_splats(True)
+        return False
+
+    def _splats_wait(self, shown, look, step):
+        """Seconds from the last update of the Gaussians to the next."""
+        if shown is None:
+            return 0.0
+        wait = max(
+            SPLATS_SECONDS, BYTES_PER_SPLAT * self._splat_count / BYTES_PER_SECOND
+        )
+        if shown[0] != look:
+            return wait
+        if shown[1] != step:
+            return max(wait, REFRESH_SECONDS)
+        # Only the camera moved, which matters where colors depend on it.
+        return float("inf") if shown[3] is None else max(wait, TURNED_SECONDS)
+
+    def _send_splats(self, cloud: SplatCloud):
+        color = _bytes(cloud.background)
+        if self._background != tuple(color.tolist()):
+            self._background = tuple(color.tolist())
+            self._send_image(np.broadcast_to(color, (8, 8, 3)), format="png")
+        arrays = self._half_range(cloud)
+        with departing(self._client):
+            if self._splats is None:
+                self._splats = self._client.scene.add_gaussian_splats(
+                    _NAME, *arrays, scale=self._splat_unit
+                )
+            else:
+                # One message with one buffer. The browser keeps its textures as long as
+                # the number of Gaussians stays the same.
+                self._splats.set_gaussians(*arrays)
+
+    def _half_range(self, cloud: SplatCloud):
+        """Arrays for viser, in units in which covariances fit into its float16."""
+        covariances = np.asarray(cloud.covariances, np.float32)
+        if self._splats is None:
+            variance = np.trace(covariances, axis1=1, axis2=2) / 3
+            typical = np.median(variance) if len(variance) else 1.0
+            self._splat_unit = float(np.sqrt(max(typical, 1e-12)))
+        unit = self._splat_unit
+        return (
+            np.asarray(cloud.centers, np.float32) / unit,
+            np.clip(covariances / unit**2, -LARGEST_HALF, LARGEST_HALF),
+            _bytes(cloud.rgb),
+            _bytes(cloud.opacity)[:, None],
+        )
+
+    def _show_splats(self, visible):
+        if self._splats is not None and self._splats.visible != visible:
+            with departing(self._client):
+                self._splats.visible = visible
+        if not visible:
+            self._shown = None
+
+    def _update_image(self, state, step, eye, look):
+        image, pyramid, now = self._image, self._screen.pyramid, time.monotonic()
+        # The first level of a view is finished even if the view has changed since, or
+        # nothing would be seen of one that changes all the time.
+        finished = image.complete is not None or not image.cells
+        if image.seen != (eye, look) and finished:
+            self._image = image = _Image(seen=(eye, look), changed=now)
+        eye, look = image.seen
+        moving = now - image.changed < REST_SECONDS
+        if not image.cells:
+            seconds = self._screen.tile_seconds(look)
+            if image.complete is None and self._screen.has_range(look.channel):
+                seconds = None  # the coarsest image determines the range
+            level = interactive.next_level(
+                seconds, pyramid.levels, image.complete, moving
+            )
+            if (
+                level is None
+                and step != image.step
+                and now - self._sent > REFRESH_SECONDS
+            ):
+                level = image.complete
+            if level is None:
+                time.sleep(IDLE_SECONDS if moving else 0)
+                return moving
+            image.begin(pyramid, level, step)
+        cell = image.cells.pop(0)
+        tile = self._screen.draw(state, eye, look, image.level, cell)
+        image.paste(tile, cell, pyramid.tile)
+        done, now = not image.cells, time.monotonic()
+        if done:
+            image.complete = image.level
+        # While the first level is incomplete there is nothing to show beside its tiles.
+        if done or (image.complete is not None and now - self._sent > SENT_SECONDS):
+            self._background, self._sent = None, now
+            self._send_image(image.canvas, format="jpeg")
+        self._describe(image, look, step)
+        return True
+
+    def _describe(self, image, look, step):
+        pyramid = self._screen.pyramid
+        width, height = pyramid.size(image.level)
+        text = f"{width}x{height}, step {step:,}"
+        if image.cells:
+            total = 4**image.level
+            text += f", {total - len(image.cells)} of {total} tiles"
+        elif image.level + 1 < pyramid.levels:
+            text += ", refining"
+        legend = self._screen.legend(look.channel)
+        self.about = f"{text}\n\n{legend}" if legend else text
+
+    def _send_image(self, image, format):
+        with departing(self._client):
+            self._client.scene.set_background_image(
+                image, format=format, jpeg_quality=JPEG_QUALITY
+            )
+
+
+class _Image:
+    """An image of one view in the making."""
+
+    def __init__(self, seen: tuple[Eye, Look] | None = None, changed: float = 0.0):
+        self.seen, self.changed = seen, changed
+        self.level = 0
+        self.complete: int | None = None  # the finest level that is
+        self.cells: list[tuple[int, int]] = []  # left to render of `level`
+        self.step = -1  # of training, when `level` was begun
+        self.canvas: np.ndarray | None = None
+
+    def begin(self, pyramid, level, step):
+        """Start a level over what is known of the coarser one."""
+        width, height = pyramid.size(level)
+        if self.canvas is None:
+            self.canvas = np.zeros((height, width, 3), np.uint8)
+        factor = height // self.canvas.shape[0]
+        self.canvas = self.canvas.repeat(factor, axis=0).repeat(factor, axis=1)
+        self.level, self.step, self.cells = level, step, pyramid.tiles(level)
+
+    def paste(self, tile, cell, size):
+        """Put a tile into its place."""
+        (column, row), (width, height) = cell, size
+        top, left = row * height, column * width
+        self.canvas[top : top + height, left : left + width] = tile
+
+
+def _bytes(values):
+    """Values in [0, 1] as 8 bits."""
+    return np.round(255 * np.clip(values, 0, 1)).astype(np.uint8)
