@@ -44,9 +44,15 @@ class AppearanceCodes:
     """Where to train."""
 
     def __post_init__(self):
+        cli.check_out_folder(self.folder)
         for name in ("steps", "seeds"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}={getattr(self, name)} must be at least 1")
+
+    @property
+    def folder(self) -> pathlib.Path:
+        """Where the results go."""
+        return self.out or pathlib.Path(f"codes_{self.scene}")
 
 
 @cli.command(AppearanceCodes)
@@ -181,7 +187,7 @@ def _write(args, every, picture):
     from nerfies_jax.evaluation import pictures
     from nerfies_jax.measure import clock
 
-    folder = args.out or pathlib.Path(f"codes_{args.scene}")
+    folder = args.folder
     folder.mkdir(parents=True, exist_ok=True)
     settled = {"scene": args.scene, "steps": args.steps, "size": list(args.size)}
     figures = {name: [one[name] for one in every] for name in every[0]}  # by seed

@@ -81,14 +81,42 @@ def given(source: CaptureSource) -> dict[str, Any]:
     return {name: value for name, value in vars(source).items() if value not in unsaid}
 
 
-def check_out_file(path: pathlib.Path | None) -> None:
-    """ValueError, before anything is measured, where --out cannot become a file."""
+def check_out_file(
+    path: pathlib.Path | None, option: str = "--out", continued: bool = False
+) -> None:
+    """Refuse, before anything is measured, what cannot become a new file.
+
+    Args:
+      path: The file, if one was named.
+      option: The option that named it.
+      continued: Whether results are added to those that the file holds already.
+
+    Raises:
+      ValueError: The path is a folder, lies in none, or would be written over.
+    """
     if path is None:
         return
     if path.is_dir():
-        raise ValueError(f"--out {path}: a folder; name a file, as {path / 'x.json'}")
+        example = path / "x.json"
+        raise ValueError(f"{option} {path}: a folder; name a file, as {example}")
     if not path.absolute().parent.is_dir():
-        raise ValueError(f"--out {path}: no folder {path.parent}; make it first")
+        raise ValueError(f"{option} {path}: no folder {path.parent}; make it first")
+    if path.exists() and not continued:
+        raise ValueError(
+            f"{option} {path}: already there; name another file, or move it away"
+        )
+
+
+def check_out_folder(path: pathlib.Path | None) -> None:
+    """Raise ValueError where --out is a file or holds results that would be lost."""
+    if path is None or not path.exists():
+        return
+    if not path.is_dir():
+        raise ValueError(f"--out {path}: a file; name a folder")
+    if any(path.iterdir()):
+        raise ValueError(
+            f"--out {path}: not empty; name another folder, or move it away"
+        )
 
 
 def check_presets(names: Iterable[str]) -> None:

@@ -18,7 +18,7 @@ import dataclasses
 import pathlib
 from typing import Any, Literal
 
-from experiments import cli
+from experiments import cli, render_folder
 from nerfies_jax import console
 from nerfies_jax.runs import platform, representations, run_folder
 
@@ -119,7 +119,7 @@ class Export:
         elif self.gaussians:
             name = f"{self.format}-{self.frames}"
         elif self.path is not None:
-            name = f"{self.format}-{pathlib.PurePath(self.path).stem}"
+            name = f"{self.format}-{render_folder.path_name(self.path)}"
         return self.out or self.run / run_folder.EXPORTS / (name + self.suffix)
 
 
@@ -130,8 +130,9 @@ def main(args):
         cli.find_effects(args.effect)
         platform.start_jax(args.device, representations.cores_of_run(args.run).threads)
         from nerfies_jax import runs
-        from nerfies_jax.capture.json_files import refuse_existing
+        from nerfies_jax.capture.json_files import refuse_existing, sweep
 
+        sweep(args.place.resolve().parent)
         refuse_existing(args.place, args.overwrite)
         run = runs.saved_run(args.run, effects=args.effect)
         if run.model.found is not None:

@@ -64,7 +64,7 @@ class FieldSpeed:
     """Keeps the numbers."""
 
     def __post_init__(self):
-        cli.check_out_file(self.out)
+        cli.check_out_file(self.out, continued=True)
         cli.check_presets(name.removesuffix(TRACKS) for name in self.presets)
         rising = list(self.seconds) == sorted(set(self.seconds))
         if not self.seconds or not rising or self.seconds[0] <= 0:

@@ -60,6 +60,7 @@ class FrequencyGates:
     """cpu, gpu, or whatever JAX finds."""
 
     def __post_init__(self):
+        cli.check_out_folder(self.out)
         for name, least in (("steps", 10), ("seeds", 2), ("pixels", 8), ("width", 1)):
             if getattr(self, name) < least:
                 raise ValueError(

@@ -24,9 +24,14 @@ class InspectScene:
     full: bool = False
     """Advise presets of the papers' sizes instead of those for a CPU."""
     picture: pathlib.Path | None = None
-    """Contact sheet, PNG (default: runs/inspect-CAPTURE.png)."""
+    """Contact sheet, PNG (default: runs/inspect-CAPTURE.png, or the first of
+    inspect-CAPTURE-2.png, ... that is free)."""
     findings: pathlib.Path | None = None
     """Write findings and advice to this file as well."""
+
+    def __post_init__(self):
+        cli.check_out_file(self.picture, "--picture")
+        cli.check_out_file(self.findings, "--findings")
 
 
 @cli.command(InspectScene)
@@ -50,7 +55,7 @@ def main(args):
         advice = adviser.advise_all(inspected.findings, args.full)
         for line in report(inspected, advice, source):
             console.say(line)
-        path = args.picture or pathlib.Path("runs", f"inspect-{_name(capture)}.png")
+        path = args.picture or _free(pathlib.Path("runs"), f"inspect-{_name(capture)}")
         path.parent.mkdir(parents=True, exist_ok=True)
         pictures.save(inspected.sheet, path)
         console.say(f"contact sheet: {path}")
@@ -91,6 +96,15 @@ def as_json(capture, inspected, advice):
         "pictures made smaller by": inspected.factor,
         "seconds": inspected.seconds,
     }
+
+
+def _free(folder, stem):
+    """The first of STEM.png, STEM-2.png, ... that is not there."""
+    path, number = folder / f"{stem}.png", 1
+    while path.exists():
+        number += 1
+        path = folder / f"{stem}-{number}.png"
+    return path
 
 
 def _name(capture):

@@ -22,7 +22,7 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 import tyro
 
-from experiments import cli
+from experiments import cli, render_folder
 from nerfies_jax import console
 from nerfies_jax.runs import platform, representations
 
@@ -76,9 +76,9 @@ class Render:
     where what is seen goes up to the next picture: direction as hue, length as
     saturation."""
     out: pathlib.Path | None = None
-    """Folder for the pictures (default: RUN/renders/PATH)."""
+    """Folder for the images (default: RUN/renders/NAME, named by the settings)."""
     overwrite: bool = False
-    """Write into a folder that has files already, over those of the same names."""
+    """Replace an earlier render of other settings or of another step."""
     formats: tuple[Literal["png", "mp4", "exr"], ...] = ("png", "mp4")
     """What to write: png pictures, one mp4, exr with linear colour, alpha and depth."""
     max_side: int | None = None
@@ -128,17 +128,19 @@ def main(args):
         cli.find_effects(args.effect)
         platform.start_jax(args.device, representations.cores_of_run(args.run).threads)
         from nerfies_jax import evaluation, runs
-        from nerfies_jax.capture import video
+        from nerfies_jax.capture import json_files, video
         from nerfies_jax.capture.capture import CaptureError
-        from nerfies_jax.capture.json_files import refuse_existing
 
-        if args.out is not None:
-            refuse_existing(args.out, args.overwrite)
+        out = args.out or args.run / "renders" / render_folder.name(args)
+        json_files.sweep(out.resolve().parent)
+        render_folder.refuse_early(out, args)
         if "mp4" in args.formats:
             video.library()  # missing, it is said before anything is rendered
         run = runs.saved_run(args.run, effects=args.effect)
         move = _mover(args, run)
-        state = runs.restore(args.run, run).state
+        restored = runs.restore(args.run, run)
+        state = restored.state
+        made = _made(args, restored)
         run = runs.with_found_cameras(run, state)
         trained = _shown(args, run.model, state)
         model, state = _faster(args, _model(args, run), trained)
@@ -146,38 +148,32 @@ def main(args):
         size = cli.sized(own_size, args.max_side)
         views = [evaluation.resized(view, own_size, size) for view in views]
         views = _blended(args, run, views)
-        out = args.out or args.run / "renders" / _name(args)
-        out.mkdir(parents=True, exist_ok=True)
-        if args.out is None:
-            _clear(out)
+        files = _files(args, names)
+        may_go = render_folder.replaceable(out, args, made, files)
     picture_of = _Pictures(args.show, move, trained, views)
     renderer = evaluation.Renderer(model, size)
-    with cli.user_errors((CaptureError, OSError)):
-        return _write(args, out, renderer, state, names, views, picture_of)
+    replaced = json_files.replaced_folder(out, True, may_go)
+    with cli.user_errors((CaptureError, OSError)), replaced as partial:
+        _write(args, partial, renderer, state, names, views, picture_of)
+        record = render_folder.record(made, args, files)
+        json_files.write_json(partial / render_folder.RECORD, record)
+    return _told(out, renderer, len(names), files)
 
 
-def _clear(out):
-    """Take away what an earlier render left in its own folder: it had other frames."""
-    for pattern in ("*.png", "*.exr", "film.mp4"):
-        for path in out.glob(pattern):
-            path.unlink()
+def _made(args, restored):
+    """What decides the images of this render."""
+    from nerfies_jax.training import provenance
+
+    checkpoint = {"step": restored.step, "checkpoint": restored.about["crc32"]}
+    request = render_folder.request(args)
+    return render_folder.Made(request, checkpoint, provenance.revision())
 
 
-def _name(args):
-    frozen = "" if args.freeze is None else f"-at-{args.freeze:g}"
-    slow = "" if args.slow == 1 else f"-slow-{args.slow:g}"
-    without = "".join(f"-without-{name}" for name in args.without)
-    path = pathlib.PurePath(args.path).stem
-    named = [pathlib.PurePath(name).name for name in args.appearance or ()]
-    blended = "" if not named else f"-from-{named[0]}-to-{named[1]}"
-    knots = "" if args.knots is None else f"-knots-{args.knots}"
-    knots += "" if args.interpolation == "linear" else f"-{args.interpolation}"
-    if args.static_threshold is not None:
-        knots += f"-static-threshold-{args.static_threshold:g}"
-    if args.hide_moving is not None:
-        knots += f"-hide-moving-{args.hide_moving:g}"
-    depth = "" if args.show == "colour" else f"-{args.show}"
-    return f"{path}{frozen}{slow}{without}{blended}{knots}{depth}"
+def _files(args, names):
+    """Names of all files of a render."""
+    kinds = [kind for kind in args.formats if kind != "mp4"]
+    files = [f"{name}.{kind}" for name in names for kind in kinds]
+    return files + (["film.mp4"] if "mp4" in args.formats else [])
 
 
 def _model(args, run):
@@ -301,16 +297,19 @@ def _write(args, out, renderer, state, names, views, picture_of):
     else:
         for _ in pictures():
             pass
+
+
+def _told(out, renderer, count, files):
+    """Say where the render is; the result as JSON values."""
     width, height = renderer.size
-    ms = renderer.ms_per_frame(len(names))
-    console.say(
-        f"{len(names)} pictures of {width}x{height}, {ms:.0f} ms each, in {out}"
-    )
-    kinds = [kind for kind in args.formats if kind != "mp4"]
-    files = [str(out / f"{name}.{kind}") for name in names for kind in kinds]
-    files += [str(out / "film.mp4")] if "mp4" in args.formats else []
-    size = list(renderer.size)
-    return {"folder": str(out), "size": size, "ms_per_frame": ms, "files": files}
+    ms = renderer.ms_per_frame(count)
+    console.say(f"{count} pictures of {width}x{height}, {ms:.0f} ms each, in {out}")
+    return {
+        "folder": str(out),
+        "size": [width, height],
+        "ms_per_frame": ms,
+        "files": [str(out / file) for file in files],
+    }
 
 
 class _Pictures:

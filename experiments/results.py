@@ -247,10 +247,17 @@ def main(args):
         written = {name: PAGES / f"{name}.md" for name in args.pages or kept()}
         for name, path in written.items():
             draw(name)
-            path.write_text(page(name))
+            _write(path, page(name))
             console.say(path)
-        (PAGES / "README.md").write_text(index())
+        _write(PAGES / "README.md", index())
     return {"pages": {name: str(path) for name, path in written.items()}}
+
+
+def _write(path, text):
+    from nerfies_jax.capture.json_files import replaced_file
+
+    with replaced_file(path) as partial:
+        partial.write_text(text)
 
 
 def kept() -> list[str]:

@@ -16,7 +16,7 @@ import numpy as np
 from gaussians_jax import files, splats
 from gaussians_jax.splats import Gaussians, Splats
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.capture.json_files import replaced_folder
+from nerfies_jax.capture.json_files import alike, replaced_folder
 from nerfies_jax.training.model import Model, TrainState
 
 # The Gaussians at a time in [0, 1].
@@ -111,8 +111,8 @@ def save_sequence(
     if count < 2:
         raise ValueError(f"{count} frame(s) are no sequence; export a time instead")
     times = np.linspace(0, 1, count)
-    with replaced_folder(folder, overwrite=overwrite) as partial:
-        for number, time in enumerate(times):
-            rows = at(float(time))
-            files.save(partial / (NUMBERED.format(number) + suffix), rows)
+    names = [NUMBERED.format(number) + suffix for number in range(count)]
+    with replaced_folder(folder, overwrite, alike(folder, names)) as partial:
+        for name, time in zip(names, times, strict=True):
+            files.save(partial / name, at(float(time)))
     return times

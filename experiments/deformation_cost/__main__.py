@@ -49,6 +49,9 @@ class DeformationCost:
     """cpu, gpu, or whatever JAX finds."""
 
     def __post_init__(self):
+        cli.check_out_file(self.out)
+        if self.out is not None:
+            cli.check_out_file(self.out.with_suffix(".png"), "beside --out:")
         for name in ("gaussians", "repeats"):
             if getattr(self, name) < 1:
                 raise ValueError(f"--{name} {getattr(self, name)} must be at least 1")

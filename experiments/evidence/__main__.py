@@ -50,8 +50,7 @@ def main(args):
         from experiments.evidence import report, scenes
 
         if args.scenes:
-            out = args.out or pathlib.Path("runs", "evidence")
-            return scenes.measure(args.seed, out)
+            return scenes.measure(args.seed, args.out)
         return report.look(cli.plain(args.source), args.seed, args.seconds, args.out)
 
 

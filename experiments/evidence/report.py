@@ -20,6 +20,7 @@ from nerfies_jax.evidence import (
 )
 from nerfies_jax.evidence.against_truth import LATER, Errors
 from nerfies_jax.evidence.record import Evidence
+from nerfies_jax.runs import run_folder
 from nerfies_jax.runs.config import CaptureSource
 from nerfies_jax.runs.platform import CACHE
 
@@ -29,6 +30,8 @@ def look(
 ) -> dict[str, Any]:
     """Gather, or read what was gathered, and say what it is."""
     capture = runs.stored_capture(source, seed)
+    stem = f"evidence-{'-'.join(capture.name.replace('/', ' ').split())}"
+    results = run_folder.new_run_folder(out, stem)
     for line in describe(capture):
         console.say(line)
     console.say()
@@ -47,11 +50,9 @@ def look(
         errors = errors_of(capture, truth, evidence)
         console.say("\n".join(error_lines(errors)))
         stored["errors"] = as_json(errors._asdict())
-    folder = out or pathlib.Path("runs", f"evidence-{capture.name.replace(' ', '-')}")
-    folder.mkdir(parents=True, exist_ok=True)
-    pictures.save(contact_sheet.followed(views, evidence), folder / "tracks.png")
-    write_json(folder / "evidence.json", stored)
-    console.say(f"frames with tracks: {folder / 'tracks.png'}")
+    pictures.save(contact_sheet.followed(views, evidence), results / "tracks.png")
+    write_json(results / "evidence.json", stored)
+    console.say(f"frames with tracks: {results / 'tracks.png'}")
     kept = "not kept, for want of time" if evidence.left_out else path
     console.say(f"record: {kept}")
     return stored

@@ -18,6 +18,7 @@ from nerfies_jax.evidence import (
     view_set,
 )
 from nerfies_jax.measure import clock
+from nerfies_jax.runs import run_folder
 from nerfies_jax.runs.platform import CACHE
 
 FLOW_SCENES = ("default", "fast", "articulated", "exposure")
@@ -36,8 +37,9 @@ class FlowRow(NamedTuple):
     seconds: float  # of the processor, for a pair, one way
 
 
-def measure(seed: int, folder: pathlib.Path) -> dict[str, Any]:
+def measure(seed: int, out: pathlib.Path | None) -> dict[str, Any]:
     """Write evidence.json with all scenes and all ways to find flow."""
+    folder = run_folder.new_run_folder(out, "evidence")
     rows = []
     for name, spec in synthetic.PRESETS.items():
         capture, truth = synthetic.cached(spec, CACHE / "scenes", seed)
@@ -50,7 +52,6 @@ def measure(seed: int, folder: pathlib.Path) -> dict[str, Any]:
         console.say(f"{name}: {counted.seconds:.0f} s")
         console.say("\n".join(report.error_lines(errors)))
     flows = [report.as_json(row._asdict()) for row in flow_rows(seed)]
-    folder.mkdir(parents=True, exist_ok=True)
     path = folder / "evidence.json"
     stored = {"machine": clock.machine(), "scenes": rows, "flows": flows}
     write_json(path, stored)

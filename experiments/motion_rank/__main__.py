@@ -70,6 +70,7 @@ class MotionRank:
     """cpu, gpu, or whatever JAX finds ("auto")."""
 
     def __post_init__(self):
+        cli.check_out_folder(self.out)
         for name, least in (
             *(("seeds", 1), ("steps", 2), ("points", 4), ("times", 8), ("batch", 1)),
         ):

@@ -69,6 +69,7 @@ class SpectralBias:
     """cpu, gpu, or whatever JAX finds ("auto")."""
 
     def __post_init__(self):
+        cli.check_out_folder(self.out)
         for name, least in (("steps", 8), ("seeds", 1), ("batch", 1)):
             if getattr(self, name) < least:
                 raise ValueError(

@@ -212,7 +212,7 @@ def replaced_folder(
     path = path.resolve()
     if replaceable is not None:
         _refuse_others(path, replaceable)
-    with _partial_folder(path) as scratch:
+    with _partial_folder(path, path.parent) as scratch:
         new = scratch / "new"
         new.mkdir()
         yield new
@@ -221,6 +221,28 @@ def replaced_folder(
             path, alike(path, written) if replaceable is None else replaceable
         )
         _take_place(new, path)
+
+
+@contextlib.contextmanager
+def merged_folder(path: AnyPath):
+    """Replace files of a folder once all of their successors are complete.
+
+    Args:
+      path: The folder, which is there. What else it holds stays.
+
+    Yields:
+      A temporary folder inside it. Its files take their places when the block ends
+      well, each in one step.
+    """
+    path = pathlib.Path(path)
+    sweep(path)
+    with _partial_folder(path, path.resolve()) as partial:
+        yield partial
+        for name in _files(partial):
+            target = path / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            os.replace(partial / name, target)
+        _sync_names(path)
 
 
 def _take_place(new, path):
@@ -286,23 +308,23 @@ def scratch_folder(path: AnyPath):
     sweep(path.resolve().parent)
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise CaptureError(f"{path}: already there; choose another name or remove it")
-    with _partial_folder(path) as partial:
-        yield partial
-
-
-@contextlib.contextmanager
-def _partial_folder(path):
-    real = path.resolve()
-    if os.path.ismount(real):
+    if os.path.ismount(path.resolve()):
         raise CaptureError(
             f"{path}: a whole mounted disk, which no new folder can replace; name a "
             "folder in it"
         )
+    with _partial_folder(path, path.resolve().parent) as partial:
+        yield partial
+
+
+@contextlib.contextmanager
+def _partial_folder(path, place):
+    """A temporary folder in `place` for what becomes `path`, gone when the block ends."""
     try:
-        real.parent.mkdir(parents=True, exist_ok=True)
-        prefix = f".{real.name}.{_owner()}."
+        place.mkdir(parents=True, exist_ok=True)
+        prefix = f".{path.resolve().name}.{_owner()}."
         partial = pathlib.Path(
-            tempfile.mkdtemp(prefix=prefix, suffix=".partial", dir=real.parent)
+            tempfile.mkdtemp(prefix=prefix, suffix=".partial", dir=place)
         )
     except OSError as error:
         raise CaptureError(

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from nerfies_jax.capture import exr, exr_camera, images
-from nerfies_jax.capture.json_files import AnyPath, replaced_folder
+from nerfies_jax.capture.json_files import AnyPath, alike, replaced_folder
 from nerfies_jax.evaluation import model_flow
 from nerfies_jax.evaluation.model_flow import Move
 from nerfies_jax.evaluation.scores import Draw
@@ -24,14 +24,15 @@ def write(
 
     Flow goes to the next picture; that of the last is zero.
     """
-    with replaced_folder(folder, overwrite) as partial:
-        for place, view in enumerate(views):
+    names = [f"{place:04d}.exr" for place in range(len(views))]
+    with replaced_folder(folder, overwrite, alike(folder, names)) as partial:
+        for place, (name, view) in enumerate(zip(names, views, strict=True)):
             rendering = draw(state, view)
             flow = None
             if move is not None:
                 there = views[min(place + 1, len(views) - 1)]
                 flow = model_flow.picture_flow(move, state, view, there, rendering)
-            write_frame(partial / f"{place:04d}.exr", rendering, view, flow)
+            write_frame(partial / name, rendering, view, flow)
 
 
 def write_frame(

@@ -9,7 +9,12 @@ import pytest
 
 from nerfies_jax.capture import json_files
 from nerfies_jax.capture.capture import CaptureError
-from nerfies_jax.capture.json_files import new_folder, replaced_folder, sweep
+from nerfies_jax.capture.json_files import (
+    merged_folder,
+    new_folder,
+    replaced_folder,
+    sweep,
+)
 
 
 def fill(path):
@@ -111,6 +116,30 @@ def test_a_kill_between_the_two_renames_loses_nothing(tmp_path):
     assert not out.exists()
     assert len(sweep(tmp_path)) == 2  # the earlier folder and the new one
     assert texts(tmp_path) == {"file": "new", "out/1.png": "old"}
+
+
+def merge(path, names, fail=False):
+    with merged_folder(path) as partial:
+        for name in names:
+            (partial / name).parent.mkdir(exist_ok=True)
+            (partial / name).write_text("new")
+        if fail:
+            raise OSError(28, "No space left on device")
+
+
+def test_files_of_a_folder_are_replaced_together(tmp_path):
+    out = tmp_path / "run"
+    out.mkdir()
+    for name in ("metrics.json", "notes.txt"):
+        (out / name).write_text("old")
+    before = texts(tmp_path)
+    names = ("metrics.json", "depth/0.exr")
+    with pytest.raises(CaptureError, match=r"run: cannot be written \(No space left"):
+        merge(out, names, fail=True)
+    assert texts(tmp_path) == before
+    merge(out, names)
+    written = dict.fromkeys((f"run/{name}" for name in names), "new")
+    assert texts(tmp_path) == {"run/notes.txt": "old"} | written
 
 
 def test_only_what_the_dead_of_this_machine_left_is_swept(tmp_path):

@@ -14,6 +14,7 @@ from experiments import cli, export
 from gaussians_jax import splatv
 from nerfies_jax import runs
 from nerfies_jax.capture import camera_paths, exr, load, nerfies_format
+from nerfies_jax.evaluation import exr_series
 from nerfies_jax.runs import train
 from nerfies_jax.runs.config import CaptureSource, RunConfig
 from tests import scenes
@@ -96,7 +97,7 @@ def test_a_path_leaves_with_its_times(splats, capsys):
     np.testing.assert_allclose(times, np.linspace(filmed.min(), filmed.max(), 5), 1e-6)
     # In the one form and out in the other; and the times of a path that has none.
     assert main(splats, "nerfies-path", "--path", path) == 0
-    folder = splats / "exports" / "nerfies-path-path-stabilised"
+    (folder,) = (splats / "exports").glob("nerfies-path-path-stabilised-????????")
     again = [json.loads(place.read_text()) for place in sorted(folder.iterdir())]
     assert [each["time"] for each in again] == times
     assert main(splats, "path", "--frames", 4) == 0
@@ -162,7 +163,7 @@ def test_a_scene_leaves_with_all_its_motion_and_how_far_it_is_off(splats, capsys
     assert "--frames is not for splatv" in capsys.readouterr().err
 
 
-def test_pictures_leave_with_their_camera_and_motion(splats, capsys):
+def test_pictures_leave_with_their_camera_and_motion(splats, capsys, monkeypatch):
     path = ("--path", "captured", "--frames", 3)
     assert main(splats, "exr", *path) == 0
     assert "and flow" in capsys.readouterr().out
@@ -172,6 +173,11 @@ def test_pictures_leave_with_their_camera_and_motion(splats, capsys):
         "0001.exr",
         "0002.exr",
     ]
+    # What a person put there is named before anything is rendered again.
+    (pictures[0].parent / "notes.txt").write_text("mine")
+    monkeypatch.setattr(exr_series, "write_frame", None)
+    assert main(splats, "exr", *path, "--overwrite") == 2
+    assert "holds notes.txt, which would be lost" in capsys.readouterr().err
     first, _, last = (exr.read_exr(picture) for picture in pictures)
     capture = scenes.tiny_capture()
     assert first.depth.shape == capture.images.shape[1:3]

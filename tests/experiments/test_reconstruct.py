@@ -200,9 +200,7 @@ def test_a_run_is_rendered_at_other_times_and_places(run, tmp_path):
 @pytest.mark.slow
 def test_the_canonical_scene_and_its_depth_are_rendered(run, tmp_path):
     arguments = [str(run), "--without", "motion", "--formats", "png"]
-    folder = run / "renders" / "heldout-without-motion-depth"
-    folder.mkdir(parents=True)
-    (folder / "earlier.png").touch()  # of other frames
+    folder = run / "renders" / "heldout-without-motion-depth-png"
     render.main([*arguments, "--show", "depth"])
     (picture,) = folder.glob("*.png")
     picture, _ = images.read_image(picture)
@@ -251,14 +249,14 @@ def test_a_motion_is_rendered_from_knots(run, capsys):
     rendered, exact = (
         [images.read_image(path)[0].astype(int) for path in sorted(where.glob("*.png"))]
         for where in (
-            run / "renders" / "heldout-knots-6-cubic",
-            run / "renders/heldout",
+            run / "renders" / "heldout-knots-6-cubic-png",
+            run / "renders/heldout-png",
         )
     )
     assert np.abs(np.subtract(rendered, exact)).max() <= 2
     capture = scenes.tiny_capture()
     names = {pathlib.Path(capture.ids[row]).name for row in capture.heldout}
-    assert {path.stem for path in (run / "renders/heldout").glob("*.png")} == names
+    assert {path.stem for path in (run / "renders/heldout-png").glob("*.png")} == names
 
 
 def last_bits(folder):
@@ -303,12 +301,15 @@ def test_a_run_that_cannot_be_drawn_or_kept_says_so_and_ends(
     folder = tmp_path / "run"
     shutil.copytree(run, folder)
     shutil.rmtree(folder / CHECKPOINTS / "12")
+    before = {name: (folder / name).read_bytes() for name in PRODUCTS}
     with monkeypatch.context() as patch:
         patch.setattr(products, "save_film", full)
         assert ended("--out", folder, "--resume") == 1
-    assert "error: not all of what came of the run is written: [Errno 28] No space" in (
-        capsys.readouterr().err
-    )
+    words = f"is written: {folder}: cannot be written (No space left on device)"
+    assert words in capsys.readouterr().err
+    # The products of before stay together, though the player was there already.
+    assert {name: (folder / name).read_bytes() for name in PRODUCTS} == before
+    assert not list(folder.glob(".*.partial"))
     shutil.rmtree(folder / CHECKPOINTS / "12")
     trained = train.train
 

@@ -2,6 +2,7 @@
 
 import importlib
 import pathlib
+import re
 
 import pytest
 
@@ -131,3 +132,42 @@ def test_what_cannot_be_is_refused(name, words, refusal, tmp_path, monkeypatch, 
     assert refusal.replace("OUT", out) in error
     assert "Traceback" not in error
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        *((name, "--out FILE") for name in ("camera_masks", "elastic_points")),
+        *((name, "--out FILE") for name in ("kan_local", "nerf_speed")),
+        *((name, "--out FILE") for name in ("raster_speed", "solver_table")),
+        ("deformation_cost", "--out FILE"),
+        ("deformation_cost", "--out OTHER"),  # whose picture would be FILE
+        *((name, "--out FOLDER") for name in ("frequency_gates", "motion_rank")),
+        *((name, "--out FOLDER") for name in ("appearance_codes", "spectral_bias")),
+        *((name, "--out FOLDER") for name in ("compare a b", "evidence --scenes")),
+        *(("inspect_scene", f"--{name} FILE") for name in ("picture", "findings")),
+    ],
+)
+def test_results_of_earlier_measurements_are_kept(
+    name, words, tmp_path, monkeypatch, capsys
+):
+    """Before anything is measured; none of these commands adds to what is there."""
+    from experiments import compare
+
+    monkeypatch.setattr(platform, "start_jax", lambda *_: None)
+    monkeypatch.setattr(compare, "read", lambda _: None)
+    kept = tmp_path / "earlier" / "numbers.png"
+    kept.parent.mkdir()
+    kept.write_text("measured for hours")
+    words = words.replace("FILE", str(kept)).replace("FOLDER", str(kept.parent))
+    words = words.replace("OTHER", str(kept.with_suffix(".json")))
+    name, *more = name.split()
+    module = f"experiments.{name}{'.__main__' * (ROOM / name).is_dir()}"
+    with pytest.raises(SystemExit) as stop:
+        importlib.import_module(module).main([*more, *words.split()])
+    assert stop.value.code == 2
+    error = " ".join(capsys.readouterr().err.replace("│", " ").split())
+    assert re.search("already there|not empty", error)
+    assert [path.read_text() for path in kept.parent.iterdir()] == [
+        "measured for hours"
+    ]

@@ -1,0 +1,206 @@
+"""The folder of one render: its name, and the record of what made it.
+
+Renders of other settings have other names in RUN/renders. `render.json` in a folder
+says which request, checkpoint and revision made it, so that a folder is only replaced
+without being asked for where the same images would be rendered again.
+"""
+
+import dataclasses
+import hashlib
+import json
+import pathlib
+from collections.abc import Collection, Iterable
+from typing import Any, NamedTuple
+
+from experiments import cli
+
+RECORD = "render.json"
+# Settings that do not change what is rendered.
+_NOT_RENDERED = ("run", "out", "overwrite", "device")
+
+
+class Made(NamedTuple):
+    """What decides the images of a render, as JSON values."""
+
+    request: dict[str, Any]  # settings by name
+    run: dict[str, Any]  # the checkpoint: its step and checksum
+    revision: str  # of this library
+
+
+def name(args: Any) -> str:
+    """Name the folder of a render in RUN/renders by the settings that are not default.
+
+    Args:
+      args: Settings of `experiments.render`.
+    """
+    parts = [path_name(args.path)]
+    if args.frames is not None:
+        parts.append(f"frames-{args.frames}")
+    if args.max_side is not None:
+        parts.append(f"max-side-{args.max_side}")
+    if args.freeze is not None:
+        parts.append(f"at-{args.freeze:g}")
+    if args.slow != 1:
+        parts.append(f"slow-{args.slow:g}")
+    parts += [f"without-{effect}" for effect in args.without]
+    if args.appearance is not None:
+        start, end = (frame.replace("/", "_") for frame in args.appearance)
+        parts.append(f"from-{start}-to-{end}")
+    if args.knots is not None:
+        parts.append(f"knots-{args.knots}")
+    if args.interpolation != "linear":
+        parts.append(args.interpolation)
+    if args.static_threshold is not None:
+        parts.append(f"static-threshold-{args.static_threshold:g}")
+    if args.hide_moving is not None:
+        parts.append(f"hide-moving-{args.hide_moving:g}")
+    if args.show != "colour":
+        parts.append(args.show)
+    if {*args.formats} != {"png", "mp4"}:
+        parts += sorted(args.formats)
+    return "-".join(parts)
+
+
+def path_name(path: str) -> str:
+    """Name a camera path. That of a file includes a digest of what is in it.
+
+    Args:
+      path: A kind of path, or a file or folder of cameras.
+    """
+    digest = _digest(path)
+    stem = pathlib.PurePath(path).stem
+    return stem if digest is None else f"{stem}-{digest[:8]}"
+
+
+def _digest(path):
+    """SHA-256 of a path's file or files; None where it is not one."""
+    place = pathlib.Path(path)
+    if path in ("heldout", *cli.PATHS) or not place.exists():
+        return None
+    files = [place] if place.is_file() else sorted(place.glob("*.json"))
+    digest = hashlib.sha256()
+    for file in files:
+        if place.is_dir():
+            digest.update(file.name.encode())
+        digest.update(hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest()
+
+
+def request(args: Any) -> dict[str, Any]:
+    """Settings that decide the images, as JSON values; a path by what is in it."""
+    settings = dataclasses.asdict(args)
+    for ignored in _NOT_RENDERED:
+        del settings[ignored]
+    settings["path"] = _digest(args.path) or args.path
+    settings["formats"] = sorted(args.formats)
+    return json.loads(json.dumps(settings))
+
+
+def record(made: Made, args: Any, files: Iterable[str]) -> dict[str, Any]:
+    """What `render.json` says of a render.
+
+    Args:
+      made: What decides its images.
+      args: Settings of `experiments.render`.
+      files: The files, by their names in the folder.
+    """
+    from nerfies_jax.training.provenance import provenance
+
+    return {
+        **made._asdict(),
+        "path": args.path,
+        "made by": provenance(),
+        "files": [*files, RECORD],
+    }
+
+
+def replaceable(
+    out: pathlib.Path, args: Any, made: Made, files: Collection[str]
+) -> set[str]:
+    """Find the files of an earlier render that this one may delete.
+
+    Args:
+      out: Folder of the render. It may be absent.
+      args: Settings of `experiments.render`.
+      made: What decides the images of this render.
+      files: Names of the files that this render will write.
+
+    Returns:
+      Names in the folder: of what its `render.json` lists, or, where it has none, of
+      files that are named like those to be written.
+
+    Raises:
+      ValueError: The folder holds a render that would be lost, and overwriting it was
+        not allowed.
+    """
+    from nerfies_jax.capture.json_files import alike, refuse_existing
+
+    earlier = _earlier(out)
+    if earlier is None:
+        refuse_existing(out, args.overwrite)
+        return alike(out, files)
+    if not args.overwrite:
+        _refuse_other(out, made, earlier)
+    return {*earlier["files"]}
+
+
+def refuse_early(out: pathlib.Path, args: Any) -> None:
+    """Raise what `replaceable` would, where the settings alone show it."""
+    from nerfies_jax.capture.json_files import refuse_existing
+
+    earlier = _earlier(out)
+    if earlier is None:
+        refuse_existing(out, args.overwrite)
+    elif not args.overwrite:
+        made = Made(request(args), earlier["run"], earlier["revision"])
+        _refuse_other(out, made, earlier)
+
+
+def _earlier(out):
+    """The record in a folder; None where there is none that can be read."""
+    try:
+        earlier = json.loads((out / RECORD).read_text())
+        known = isinstance(earlier["request"], dict) and isinstance(
+            earlier["run"], dict
+        )
+        named = all(isinstance(name, str) for name in earlier["files"])
+        return earlier if known and named and "revision" in earlier else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _refuse_other(out, made, earlier):
+    """Raise where an earlier render is not the one that would replace it."""
+    reason = _differs(made, earlier) or _edited(out, earlier)
+    if reason:
+        raise ValueError(
+            f"{out}: holds another render ({reason}); name another folder with "
+            "--out, or replace it with --overwrite"
+        )
+
+
+def _differs(made, earlier):
+    """The first difference from an earlier render, in words; empty where it is none."""
+    for place, now in (("request", made.request), ("run", made.run)):
+        for key in dict.fromkeys((*now, *earlier[place])):
+            before, wanted = earlier[place].get(key), now.get(key)
+            if before != wanted:
+                return f"{key} is {_words(before)} there and {_words(wanted)} here"
+    if earlier["revision"] != made.revision:
+        return f"made by revision {earlier['revision']}, and this is {made.revision}"
+    return ""
+
+
+def _words(value):
+    return " ".join(value) if isinstance(value, list) else value
+
+
+def _edited(out, earlier):
+    """The first file that changed since it was rendered, in words; else empty."""
+    # The record is written last, and a rename changes no time.
+    finished = (out / RECORD).stat().st_mtime_ns
+    for file in earlier["files"]:
+        path = out / file
+        if path.is_file() and path.stat().st_mtime_ns > finished:
+            return f"{file} was changed after it was rendered"
+    return ""
