@@ -319,7 +319,7 @@ def scratch_folder(path: AnyPath):
 
 @contextlib.contextmanager
 def _partial_folder(path, place):
-    """A temporary folder in `place` for what becomes `path`, gone when the block ends."""
+    """A temporary folder in `place` for what becomes `path`; it goes with the block."""
     try:
         place.mkdir(parents=True, exist_ok=True)
         prefix = f".{path.resolve().name}.{_owner()}."

@@ -18,6 +18,7 @@ from nerfies_jax.evaluation.scores import Scored, known_mean
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.measure import geometry_quality, image_quality, perceptual
 from nerfies_jax.measure.clock import Metric
+from nerfies_jax.measure.metric_table import metric
 from nerfies_jax.measure.perceptual import LpipsParams, Network
 from nerfies_jax.training.model import in_default_precision
 
@@ -25,46 +26,39 @@ from nerfies_jax.training.model import in_default_precision
 MS_SSIM_SIDE = 160  # pixels that the shorter side must exceed
 
 
-class Measure(NamedTuple):
-    """What a key of `metrics.json` holds, as in `clock.Metric`."""
-
-    unit: str
-    direction: str
-    tolerance: float
-
-
-MEASURES = {
-    "heldout.psnr": Measure("dB", "higher", 0.2),
-    "heldout.ssim": Measure("", "higher", 0.01),
-    "heldout.ms_ssim": Measure("", "higher", 0.01),
-    "heldout.lpips": Measure("", "lower", 0.01),
-    "heldout.moving_psnr": Measure("dB", "higher", 0.3),
-    "heldout.moving_ssim": Measure("", "higher", 0.02),
-    "heldout.still_psnr": Measure("dB", "higher", 0.2),
-    "heldout.unscored": Measure("", "lower", 0.01),
-    "floor.neighbours": Measure("dB", "equal", 0.05),
-    "floor.still": Measure("dB", "higher", 0.3),
-    "motion.worth": Measure("dB", "higher", 0.2),
-    "motion.moving_worth": Measure("dB", "higher", 0.3),
-    "heldout.depth_abs_rel": Measure("", "lower", 0.01),
-    "heldout.depth_within_delta": Measure("", "higher", 0.02),
-    "heldout.depth_median": Measure("scene units", "lower", 0.002),
-    "heldout.depth_rmse": Measure("scene units", "lower", 0.01),
-    "heldout.moving_depth_median": Measure("scene units", "lower", 0.005),
-    "heldout.moving_depth_rmse": Measure("scene units", "lower", 0.02),
-    "heldout.camera_fitted_psnr": Measure("dB", "higher", 0.2),
-    "cameras.ate": Measure("scene units", "lower", 0.002),
-    "cameras.rotation_error": Measure("deg", "lower", 0.1),
-    "flow.epe": Measure("px", "lower", 0.2),
-    "flow.outliers": Measure("", "lower", 0.02),
-    "flow.missing": Measure("", "lower", 0.02),
-    "flow.moving_epe": Measure("px", "lower", 0.3),
-    "tracks.epe": Measure("scene units", "lower", 0.003),
-    "tracks.still_epe": Measure("scene units", "equal", 0.0),
-    "tracks.correct": Measure("", "higher", 0.05),
-    "tracks.lost": Measure("", "lower", 0.02),
-    "tracks.drift": Measure("scene units", "lower", 0.002),
-    "tracks.strain": Measure("", "lower", 0.1),
+# How much worse a later run may be, in the unit of `metric_table.METRICS`.
+TOLERANCES = {
+    "heldout.psnr": 0.2,
+    "heldout.ssim": 0.01,
+    "heldout.ms_ssim": 0.01,
+    "heldout.lpips": 0.01,
+    "heldout.moving_psnr": 0.3,
+    "heldout.moving_ssim": 0.02,
+    "heldout.still_psnr": 0.2,
+    "heldout.unscored": 0.01,
+    "floor.neighbours": 0.05,
+    "floor.still": 0.3,
+    "motion.worth": 0.2,
+    "motion.moving_worth": 0.3,
+    "heldout.depth_abs_rel": 0.01,
+    "heldout.depth_within_delta": 0.02,
+    "heldout.depth_median": 0.002,
+    "heldout.depth_rmse": 0.01,
+    "heldout.moving_depth_median": 0.005,
+    "heldout.moving_depth_rmse": 0.02,
+    "heldout.camera_fitted_psnr": 0.2,
+    "cameras.ate": 0.002,
+    "cameras.rotation_error": 0.1,
+    "flow.epe": 0.2,
+    "flow.outliers": 0.02,
+    "flow.missing": 0.02,
+    "flow.moving_epe": 0.3,
+    "tracks.epe": 0.003,
+    "tracks.still_epe": 0.0,
+    "tracks.correct": 0.05,
+    "tracks.lost": 0.02,
+    "tracks.drift": 0.002,
+    "tracks.strain": 0.1,
 }
 _TRACKS = {
     "track_error": "tracks.epe",
@@ -102,7 +96,7 @@ def heldout_metrics(
     fitted: FittedCameras | None = None,
     floors: Floors = Floors(None, None),
 ) -> dict[str, float]:
-    """Everything that can be measured, by the keys of `MEASURES`.
+    """Everything that can be measured, by the keys of `TOLERANCES`.
 
     PSNR and SSIM are always there; anything else where the capture has what it is held
     against (masks of what moves, depths), or where it is passed: `known` and `followed`
@@ -131,10 +125,10 @@ def heldout_metrics(
 
 
 def metrics(numbers: Mapping[str, float]) -> list[Metric]:
-    """Numbers by the keys of `MEASURES` as metrics, in its order."""
+    """Numbers by the keys of `TOLERANCES` as metrics, in its order."""
     return [
-        Metric(key, numbers[key], *measure)
-        for key, measure in MEASURES.items()
+        metric(key, numbers[key], tolerance)
+        for key, tolerance in TOLERANCES.items()
         if key in numbers
     ]
 

@@ -186,11 +186,30 @@ def contact_sheet(
     return _framed(_stacked(rows))
 
 
-def curve(histories: Mapping[str, History], path: str | pathlib.Path):
-    """PSNR of the held-out frames against seconds of training, as a PNG.
+class Final(NamedTuple):
+    """The score of a finished run, over more frames than its history is of."""
 
-    One line for each named history, with a mark at every evaluation; evaluations that
-    are not finite leave a gap.
+    seconds: float  # of training
+    psnr: float  # dB
+    frames: int  # that it is the mean of
+    watched: int  # frames that the history is of
+
+
+def curve(
+    histories: Mapping[str, History],
+    path: str | pathlib.Path,
+    final: Final | None = None,
+):
+    """Draw the PSNR of held-out frames against seconds of training, as a PNG.
+
+    Args:
+      histories: One line for each, by name, with a mark at every evaluation.
+        Evaluations that are not finite leave a gap.
+      path: The PNG file.
+      final: A score that is marked next to the line of a single history.
+
+    Raises:
+      ValueError: There is no evaluation to draw.
     """
     if not any(len(history.seconds) for history in histories.values()):
         raise ValueError(f"{path}: no evaluation to draw; evaluate at least once")
@@ -209,15 +228,37 @@ def curve(histories: Mapping[str, History], path: str | pathlib.Path):
                 ha="right",
                 color=line.get_color(),
             )
-    axes.set_xlabel("seconds of training (without compiling)")
-    axes.set_ylabel("PSNR of held-out frames (dB)")
+    if final is not None:
+        _mark_final(axes, final)
+    axes.set_xlabel("training time without compilation (s)")
+    axes.set_ylabel("mean PSNR of held-out frames (dB)")
     axes.margins(y=0.12)
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
-    if len(histories) > 1:
+    if len(histories) > 1 or final is not None:
         axes.legend(frameon=False, loc="lower right")
     with replaced_file(path) as partial:
         figure.savefig(partial)
+
+
+def _mark_final(axes, final):
+    """Mark the score over all frames, below the end of the line over a few."""
+    (line,) = axes.get_lines()
+    line.set_label(f"{final.watched} frames during training")
+    label = f"all {final.frames} frames after training"
+    color = "#c2410c"
+    axes.plot(
+        [final.seconds], [final.psnr], "D", markersize=6, color=color, label=label
+    )
+    axes.annotate(
+        f"{final.psnr:.2f} dB",
+        (final.seconds, final.psnr),
+        xytext=(-9, -4),
+        textcoords="offset points",
+        ha="right",
+        va="top",
+        color=color,
+    )
 
 
 def save(picture: np.ndarray, path: str | pathlib.Path):

@@ -1,11 +1,14 @@
 """What a finished run leaves behind: scores, pictures, a film, depth, a report."""
 
+import contextlib
 import dataclasses
+import itertools
 import json
 import math
 import pathlib
 import time
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -13,17 +16,20 @@ from nerfies_jax import console, evaluation
 from nerfies_jax.capture import camera_paths, exr, video
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.extras import MissingExtra
-from nerfies_jax.capture.json_files import write_json
+from nerfies_jax.capture.json_files import merged_folder, write_json
 from nerfies_jax.evaluation import Renderer, Scored, heldout, pictures
 from nerfies_jax.evaluation.representation import Saved
 from nerfies_jax.measure import clock
 from nerfies_jax.measure.clock import Metric
+from nerfies_jax.measure.metric_table import metric
 from nerfies_jax.runs import (
     budget,
     commands,
+    curve_figure,
     curves,
     floors_text,
     quality,
+    relative_paths,
     report,
     step_profile,
 )
@@ -33,10 +39,15 @@ from nerfies_jax.runs.train import Trained
 from nerfies_jax.training import losses
 from nerfies_jax.training.model import TrainState
 
+METRICS = "metrics.json"
 SHOWN = 4  # held-out frames in the comparison
 COMPARED = (
-    "Held-out frames: what was filmed, what was rendered, how far they are apart, and "
-    "the depth."
+    "Held-out frames, which the model was not trained on. Each row shows the observed "
+    "image, the rendered image, the error between them, and the rendered depth."
+)
+FILMED = (
+    "The reconstructed scene over time, from a camera that sways around the captured "
+    "viewpoints."
 )
 
 
@@ -62,57 +73,69 @@ def make(
             "finite"
         )
     ms_per_frame = renderer.ms_per_frame(len(scored.rows))
-    player, unplayed = save_player(folder, run, trained)
-    # Compiles while all else is written, but for the player, whose own compiling fills
-    # both cores.
-    with step_profile.profiling(run, state) as profile:
-        comparison = save_comparison(folder / "comparison.png", run.filmed, scored)
-        figures = [report.Figure(comparison, COMPARED)]
-        watched = [run.capture.ids[row] for row in trained.watched]
-        curves.write(folder, trained.result.history, watched)
-        curve = with_extra(save_curve, folder / "psnr_over_time.png", run, trained)
-        if curve is not None:
-            figures.append(
-                report.Figure(curve, "PSNR of a few held-out frames while it trained.")
+    with _staged(folder) as place:
+        player, unplayed = save_player(place, run, trained)
+        # Compiles while all else is written, but for the player, whose own compiling
+        # fills both cores.
+        with step_profile.profiling(run, state) as profile:
+            comparison = save_comparison(place / "comparison.png", run.filmed, scored)
+            figures = [*player, report.Figure(comparison, COMPARED)]
+            watched = [run.capture.ids[row] for row in trained.watched]
+            curves.write(place, trained.result.history, watched)
+            curve = with_extra(
+                curve_figure.save, place / "psnr_over_time.png", run, trained, scored
             )
-        film = with_extra(
-            save_film, folder / "scene.mp4", run, renderer, state, ms_per_frame / 1e3
-        )
-        save_depth(folder / "depth", run.capture, scored)
-        saved = run.representation.save(
-            folder, run.spec, run.metadata, state, effects=run.effects
-        )
-        fitted, gain = score_halves(run, state, scored, ms_per_frame / 1e3)
-        numbers, remarks = quality.measure(
-            run, state, trained.draw, scored, extra, ms_per_frame / 1e3
-        )
-        metrics = heldout.metrics(numbers)
-        metrics += [*measured(run, trained, scored, ms_per_frame, began), *fitted]
-        metrics += model_size(saved)
-        save_metrics(folder / "metrics.json", metrics)
-        warnings = floors_text.warnings(numbers)
-        notes = [*warnings, trained.result.message, *_capture_notes(run), *left_out]
-        notes += [*remarks, *gain, *saved.notes, *unplayed]
-        step_ms, unknown = profile()
-    notes += unknown
-    following = _next(folder, run, trained)
+            if curve is not None:
+                caption = curve_figure.caption(run, trained, scored)
+                figures.append(report.Figure(curve, caption))
+            film = with_extra(
+                save_film, place / "scene.mp4", run, renderer, state, ms_per_frame / 1e3
+            )
+            save_depth(place / "depth", run.capture, scored)
+            saved = run.representation.save(
+                place, run.spec, run.metadata, state, effects=run.effects
+            )
+            fitted, gain = score_halves(run, state, scored, ms_per_frame / 1e3)
+            numbers, remarks = quality.measure(
+                run, state, trained.draw, scored, extra, ms_per_frame / 1e3
+            )
+            metrics = heldout.metrics(numbers)
+            metrics += [*measured(run, trained, scored, ms_per_frame, began), *fitted]
+            metrics += model_size(saved)
+            save_metrics(place / METRICS, metrics)
+            warnings = floors_text.warnings(numbers)
+            notes = [*warnings, trained.result.message, *_capture_notes(run), *left_out]
+            notes += [*remarks, *gain, *saved.notes, *unplayed]
+            step_ms, unknown = profile()
+        notes += unknown
     page = report.write(
         folder,
         f"{run.capture.name}: {run.config.preset}",
         metrics,
         json.loads((folder / CONFIG).read_text()),
-        [*player, *figures],
-        film,
+        [each._replace(path=folder / each.path.name) for each in figures],
+        film if film is None else film._replace(path=folder / film.path.name),
         step_ms,
         notes,
-        following,
+        _next(folder.absolute(), run, trained, relative_paths.base_of(folder)),
     )
+    following = _next(folder, run, trained)
+    for figure in player:
+        console.say(f"player:     {folder / figure.link}")
     _log(folder, page, metrics, [*floors_text.lines(numbers), *warnings], following)
 
 
-def with_extra(
-    save: Callable[..., pathlib.Path | None], path: pathlib.Path, *arguments
-):
+def _staged(folder):
+    """Where to write: beside earlier products, which stay until all new ones are there.
+
+    A run without any keeps what it could write, whatever fails.
+    """
+    if (folder / METRICS).exists():
+        return merged_folder(folder)
+    return contextlib.nullcontext(folder)
+
+
+def with_extra(save: Callable[..., Any], path: pathlib.Path, *arguments):
     """What `save` writes; None, and a line, where that needs an extra."""
     try:
         return save(path, *arguments)
@@ -155,19 +178,16 @@ def measured(
     counts = run.model.counts(result.state)
     seconds, fps = time.perf_counter() - began, 1e3 / ms_per_frame
     return [
-        Metric("heldout.frames", len(scored.rows), "", "equal"),
-        Metric("train.seconds", result.seconds, "s", "lower", 0.2 * result.seconds),
-        Metric("train.compile_seconds", result.compile_seconds, "s", "lower", 10.0),
-        Metric("train.steps", result.steps, "", "equal"),
-        Metric("render.ms_per_frame", ms_per_frame, "ms", "lower", 0.2 * ms_per_frame),
-        Metric("render.fps", fps, "frames/s", "higher", 0.2 * fps),
-        Metric("memory.peak_bytes", clock.peak_bytes(), "bytes", "lower", 2e8),
+        metric("heldout.frames", len(scored.rows)),
+        metric("train.seconds", result.seconds, 0.2 * result.seconds),
+        metric("train.compile_seconds", result.compile_seconds, 10.0),
+        metric("train.steps", result.steps),
+        metric("render.ms_per_frame", ms_per_frame, 0.2 * ms_per_frame),
+        metric("render.fps", fps, 0.2 * fps),
+        metric("memory.peak_bytes", clock.peak_bytes(), 2e8),
         *_device_memory(),
-        Metric("total.seconds", seconds, "s", "lower", 0.2 * seconds),
-        *(
-            Metric(name, count, "", "lower", 0.1 * count)
-            for name, count in counts.items()
-        ),
+        metric("total.seconds", seconds, 0.2 * seconds),
+        *(metric(name, count, 0.1 * count) for name, count in counts.items()),
     ]
 
 
@@ -176,13 +196,13 @@ def _device_memory():
     peak = clock.device_peak_bytes()
     if peak is None:
         return []
-    return [Metric("memory.device_peak_bytes", peak, "bytes", "lower", 2e8)]
+    return [metric("memory.device_peak_bytes", peak, 2e8)]
 
 
 def model_size(saved: Saved) -> list[Metric]:
     """The size of the file that holds all of a scene, where there is one."""
     size = saved.model_bytes
-    return [] if size is None else [Metric("file.bytes", size, "bytes", "lower", 1e5)]
+    return [] if size is None else [metric("file.bytes", size, 1e5)]
 
 
 def score_halves(
@@ -216,8 +236,8 @@ def score_halves(
         "halves and without a transient medium."
     )
     metrics = [
-        Metric("heldout.fitted_psnr", psnr, "dB", "higher", 0.2),
-        Metric("heldout.fitted_ssim", ssim, "", "higher", 0.01),
+        metric("heldout.fitted_psnr", psnr, 0.2),
+        metric("heldout.fitted_ssim", ssim, 0.01),
     ]
     return metrics, (note,)
 
@@ -245,27 +265,14 @@ def save_comparison(path: pathlib.Path, capture: Capture, scored: Scored):
     return path
 
 
-def save_curve(path: pathlib.Path, run: Run, trained: Trained):
-    """PSNR against seconds; None where the run ended before it was evaluated."""
-    history = trained.result.history
-    if not history.evaluations:
-        return None
-    points = pictures.History(
-        [row["seconds"] for row in history.evaluations],
-        [row["psnr"] for row in history.evaluations],
-    )
-    pictures.curve({run.config.preset: points}, path)
-    return path
-
-
 def save_film(
     path: pathlib.Path,
     run: Run,
     renderer: Renderer,
     state: TrainState,
     frame_seconds: float,
-) -> pathlib.Path:
-    """The moving scene from a moving camera, as long and large as time allows."""
+) -> report.Video:
+    """Render the scene over time from a moving camera, as long as time allows."""
     size = run.capture.size
     film = budget.film(frame_seconds, size)
     if film.size != size:
@@ -281,8 +288,9 @@ def save_film(
         )
         for view in views
     )
-    video.write_video(path, frames, film.rate)
-    return path
+    poster = next(frames)
+    video.write_video(path, itertools.chain([poster], frames), film.rate)
+    return report.Video(path, FILMED, poster)
 
 
 def save_player(
@@ -312,8 +320,10 @@ def save_player(
         pictures.save(poster, picture)
     except Exception as error:  # whatever it is, the run keeps all its other products
         return [], [f"There is no player: {type(error).__name__}: {error}"]
-    console.say(f"player:     {player.path} ({player.about})")
-    caption = f"Play it, look from elsewhere: {player.path.name}. {player.about}"
+    caption = (
+        f"The interactive player, {player.path.name}, shows the scene from any "
+        f"viewpoint at any time in a web browser. It contains {player.about}"
+    )
     return [report.Figure(picture, caption, player.path.name)], []
 
 
@@ -325,19 +335,19 @@ def save_depth(folder: pathlib.Path, capture: Capture, scored: Scored) -> None:
         exr.write_exr(folder / f"{name}.exr", alpha=alpha, depth=depth)
 
 
-def _next(folder, run, trained):
-    """What a user may want to run next."""
+def _next(folder, run, trained, base=None):
+    """What a user may want to run next; absolute paths become relative to a `base`."""
     own = run.config.effects
-    line = commands.render(folder, own)
+    line = commands.render(folder, own, base)
     looked = report.Command("Render it from other cameras, at other times:", line)
     if trained.result.stopped_by == "non-finite":
         return [looked]  # resumed, it would stop at the same step
     if trained.result.steps < run.spec.steps:
-        line = commands.resume(folder, own)
+        line = commands.resume(folder, own, base)
         return [looked, report.Command("Train it to the end:", line)]
     others = tuple(o for o in run.config.overrides if not o.startswith("steps="))
     longer = dataclasses.replace(run.config, steps=2 * run.spec.steps, overrides=others)
-    line = commands.reconstruct(longer)
+    line = commands.reconstruct(longer, base)
     return [looked, report.Command("Train it twice as long:", line)]
 
 

@@ -64,7 +64,7 @@ def measure(
     extra: Extra = NOTHING,
     frame_seconds: float = 0.0,
 ) -> tuple[dict[str, float], list[str]]:
-    """Numbers by the keys of `heldout.MEASURES`, and notes for the reader.
+    """Numbers by the keys of `heldout.TOLERANCES`, and notes for the reader.
 
     Points and flow are held against the truth of a built-in scene. What one frame
     takes to render says how many are drawn for the floors.

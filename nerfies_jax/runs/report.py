@@ -1,11 +1,12 @@
-"""What came of a run, on one page for a person; programs read `metrics.json`.
+"""The report of a run: one HTML page for a person; programs read `metrics.json`.
 
-The page is one file: pictures and short films are inside it, nothing is fetched, no
-script runs.
+The page is one file that fetches nothing and runs no script: images and short videos
+are inside it. It shows no path of the machine that it was made on.
 """
 
 import base64
 import html
+import io
 import json
 import math
 import os
@@ -13,37 +14,51 @@ import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
+import PIL.Image
+
 from nerfies_jax.capture import images
 from nerfies_jax.capture.json_files import replaced_file
 from nerfies_jax.measure.clock import Metric
+from nerfies_jax.measure.metric_table import GROUPS, METRICS, Entry
+from nerfies_jax.runs import relative_paths
 from nerfies_jax.runs.report_style import STYLE
 
-# A larger film stays beside the page; base64 adds a third, and mail stops near 10 MB.
-EMBEDDED_FILM_BYTES = 6 * 2**20
-HEADLINES = {
-    "heldout.psnr": "PSNR, held out",
-    "heldout.ssim": "SSIM, held out",
-    "heldout.moving_psnr": "PSNR, what moves",
-    "heldout.still_psnr": "PSNR, what stands still",
-    "floor.neighbours": "PSNR, mean of the neighbouring frames",
-    "motion.worth": "what motion is worth",
-    "train.seconds": "training",
-    "render.ms_per_frame": "a frame",
-    "file.bytes": "the model file",
-    "gaussians": "Gaussians",
-    "parameters": "parameters",
-}
-# Broader pictures scroll sideways on a phone instead of shrinking to stamps.
+# A larger video stays beside the page: base64 adds a third, and mail stops near 10 MB.
+EMBEDDED_VIDEO_BYTES = 6 * 2**20
+HEADLINES = (
+    "heldout.psnr",
+    "heldout.ssim",
+    "heldout.moving_psnr",
+    "heldout.still_psnr",
+    "floor.neighbours",
+    "motion.worth",
+    "train.seconds",
+    "render.ms_per_frame",
+    "file.bytes",
+    "gaussians",
+    "parameters",
+)
+# Broader images scroll sideways on a phone instead of shrinking to stamps.
 BROAD_PX = 1100
-_BETTER = {"higher": "higher", "lower": "lower", "equal": ""}
+_BETTER = {"higher": "\u2191 higher", "lower": "\u2193 lower", "equal": ""}
+_OTHER = "Other"  # group of metrics that the table does not have
 
 
 class Figure(NamedTuple):
-    """A picture file and what is to be seen in it."""
+    """An image file and a caption for it."""
 
     path: pathlib.Path  # PNG or JPEG
-    caption: str
-    link: str = ""  # a file beside the page that the picture leads to
+    caption: str  # full sentences
+    link: str = ""  # a file beside the page that the image leads to
+
+
+class Video(NamedTuple):
+    """A video file, a caption for it, and the image that stands for it in print."""
+
+    path: pathlib.Path  # mp4
+    caption: str  # full sentences
+    poster: np.ndarray  # uint8 [height, width, 3], sRGB
 
 
 class Command(NamedTuple):
@@ -59,26 +74,46 @@ def write(
     metrics: Sequence[Metric],
     config: Mapping[str, Any],
     figures: Sequence[Figure] = (),
-    film: pathlib.Path | None = None,
+    video: Video | None = None,
     step_ms: Mapping[str, float] | None = None,
     notes: Sequence[str] = (),
     commands: Sequence[Command] = (),
 ) -> pathlib.Path:
-    """`folder/report.html`, written atomically; returns its path.
+    """Write `report.html`, atomically.
 
-    `step_ms` says where a training step's time goes, part by part; `notes` what the
-    reader should know (what was not computed, and why).
+    Args:
+      folder: The folder of the run. Absolute paths in the texts become relative to the
+        current folder if it contains `folder`, and to `folder` otherwise.
+      title: The heading of the page.
+      metrics: Metrics of the run. `metric_table` names and explains them.
+      config: The settings of the run, in nested mappings.
+      figures: Images to show, in order.
+      video: A video to show after them.
+      step_ms: Milliseconds of a training step by part.
+      notes: Sentences that the reader should know, such as what was not computed.
+      commands: Commands to run next, with their paths relative as above.
+
+    Returns:
+      The path of the page.
+
+    Raises:
+      ValueError: An image is neither PNG nor JPEG, or the page cannot be written.
     """
     folder = pathlib.Path(folder)
+
+    def shown(text):
+        return relative_paths.in_text(text, folder)
+
+    figures = [each._replace(caption=shown(each.caption)) for each in figures]
     sections = [
         _headlines(metrics),
-        _notes(notes),
+        _notes(map(shown, notes)),
         *(_figure(figure) for figure in figures),
-        _film(film, folder),
+        _video(video, folder),
         _metrics(metrics),
         _step(step_ms or {}),
-        _settings(config),
-        _commands(commands),
+        _commands(commands, folder),
+        _settings(config, relative_paths.base_of(folder)),
     ]
     page = "\n".join(
         [
@@ -88,12 +123,12 @@ def write(
             '<meta charset="utf-8">',
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
             '<meta name="color-scheme" content="light dark">',
-            f"<title>{_safe(title)}</title>",
+            f"<title>{_safe(shown(title))}</title>",
             f"<style>\n{STYLE}</style>",
             "</head>",
             "<body>",
             "<main>",
-            f"<h1>{_safe(title)}</h1>",
+            f"<h1>{_safe(shown(title))}</h1>",
             *filter(None, sections),
             "</main>",
             "</body>",
@@ -126,18 +161,26 @@ def _rounded(value):
     return f"{value:,.{places}f}" if places <= 6 else f"{value:.3e}"
 
 
+def _entry(metric):
+    """How the table names a metric; one that it does not have goes by its key."""
+    unknown = Entry(metric.key, _OTHER, metric.unit, metric.direction, "")
+    return METRICS.get(metric.key, unknown)
+
+
 def _headlines(metrics):
+    by_key = {metric.key: metric for metric in metrics}
     tiles = [
-        f"<div><dt>{_safe(HEADLINES[metric.key])}</dt>"
+        f'<div title="{_safe(_entry(metric).explanation)}">'
+        f"<dt>{_safe(_entry(metric).name)}</dt>"
         f"<dd>{_safe(readable(metric.value, metric.unit))}</dd></div>"
-        for metric in metrics
-        if metric.key in HEADLINES
+        for metric in map(by_key.get, HEADLINES)
+        if metric is not None
     ]
     return f'<dl class="headlines">{"".join(tiles)}</dl>' if tiles else ""
 
 
 def _notes(notes):
-    items = "".join(f"<li>{_safe(note)}</li>" for note in notes)
+    items = "".join(f"<li>{_safe(note[:1].upper() + note[1:])}</li>" for note in notes)
     return f'<ul class="notes">{items}</ul>' if items else ""
 
 
@@ -159,36 +202,63 @@ def _figure(figure):
     else:
         picture = f'<img {shape} alt="{caption}" src="{source}">'
     if figure.link:
-        before = f'<a href="{_safe(figure.link)}">'
-        picture, caption = f"{before}{picture}</a>", f"{before}{caption}</a>"
+        before, name = f'<a href="{_safe(figure.link)}">', _safe(figure.link)
+        picture, words = f"{before}{picture}</a>", f"{before}{name}</a>"
+        named = name in caption
+        caption = caption.replace(name, words, 1) if named else f"{caption} {words}"
     return f"<figure>{picture}<figcaption>{caption}</figcaption></figure>"
 
 
-def _film(film, folder):
-    if film is None:
+def _video(video, folder):
+    """The video on a screen, and a still with the file's name on paper."""
+    if video is None:
         return ""
-    film = pathlib.Path(film)
-    if film.stat().st_size <= EMBEDDED_FILM_BYTES:
-        source = f"data:video/mp4;base64,{_encoded(film)}"
-        where = film.name
+    path = pathlib.Path(video.path)
+    if path.stat().st_size <= EMBEDDED_VIDEO_BYTES:
+        source = f"data:video/mp4;base64,{_encoded(path)}"
     else:
-        source = pathlib.Path(os.path.relpath(film, folder)).as_posix()
-        where = f"{film.name}, beside this page"
+        source = pathlib.Path(os.path.relpath(path, folder)).as_posix()
+    poster = f"data:image/jpeg;base64,{_jpeg(video.poster)}"
+    height, width = video.poster.shape[:2]
+    shape = f'width="{width}" height="{height}"'
+    caption = _safe(relative_paths.in_text(video.caption, folder))
     return (
-        f'<figure><video controls loop muted playsinline src="{_safe(source)}"></video>'
-        f"<figcaption>The scene from a moving camera ({_safe(where)})</figcaption>"
-        "</figure>"
+        f'<figure><video controls loop muted playsinline {shape} poster="{poster}" '
+        f'aria-label="{caption}" src="{_safe(source)}"></video>'
+        f'<img class="print" {shape} alt="" src="{poster}">'
+        f'<figcaption>{caption}<span class="print"> This is its first frame; the video '
+        f"is {_safe(path.name)}.</span></figcaption></figure>"
     )
+
+
+def _jpeg(picture):
+    content = io.BytesIO()
+    PIL.Image.fromarray(picture).save(content, "JPEG", quality=85)
+    return base64.b64encode(content.getvalue()).decode("ascii")
 
 
 def _metrics(metrics):
-    rows = "".join(
-        f'<tr><th scope="row"><code>{_safe(metric.key)}</code></th>'
+    """One table with a heading for each group, so that its columns align."""
+    rows = []
+    for group in (*GROUPS, _OTHER):
+        inside = [metric for metric in metrics if _entry(metric).group == group]
+        if inside:
+            rows.append(
+                f'<tr class="group"><th colspan="3" scope="rowgroup">{group}</th></tr>'
+            )
+        rows += map(_metric_row, inside)
+    heads = ("metric", "value", "better")
+    return _table("Metrics", heads, "".join(rows), kind="metrics")
+
+
+def _metric_row(metric):
+    entry = _entry(metric)
+    return (
+        f'<tr><th scope="row" title="{_safe(metric.key)}">{_safe(entry.name)}'
+        f"<small>{_safe(entry.explanation)}</small></th>"
         f'<td class="number">{_safe(readable(metric.value, metric.unit))}</td>'
-        f"<td>{_BETTER[metric.direction]}</td></tr>"
-        for metric in metrics
+        f'<td class="better">{_BETTER[metric.direction]}</td></tr>'
     )
-    return _table("Metrics", ("metric", "value", "better"), rows)
 
 
 def _step(step_ms):
@@ -202,45 +272,65 @@ def _step(step_ms):
         f"{100 * value / total:.0f} %</td></tr>"
         for part, value in step_ms.items()
     )
-    title = f"Where a training step's {readable(total, 'ms')} go"
+    title = f"Time of a training step: {readable(total, 'ms')}"
     return _table(title, ("part", "time", "share"), rows)
 
 
-def _settings(config):
+def _settings(config, base):
     rows = "".join(
         f'<tr><th scope="row"><code>{_safe(name)}</code></th>'
         f"<td><code>{_safe(value)}</code></td></tr>"
-        for name, value in _flat(config)
+        for name, value in _flat(config, base)
     )
     table = _table("", ("setting", "value"), rows)
     return f"<details><summary>Settings</summary>{table}</details>" if rows else ""
 
 
-def _flat(config, prefix=""):
+def _flat(config, base, prefix=""):
     """Dotted names and values; an empty group is shown as such."""
     for name, value in config.items():
         if isinstance(value, Mapping) and value:
-            yield from _flat(value, f"{prefix}{name}.")
+            yield from _flat(value, base, f"{prefix}{name}.")
         else:
+            value = _relative(value, base)
             text = value if isinstance(value, str) else json.dumps(value, default=str)
             yield f"{prefix}{name}", text
 
 
-def _commands(commands):
+def _relative(value, base):
+    """A setting, with absolute paths relative to the base."""
+    if isinstance(value, list | tuple):
+        return [_relative(each, base) for each in value]
+    if isinstance(value, str | os.PathLike) and os.path.isabs(value):
+        return relative_paths.relative(value, base)
+    return value
+
+
+def _commands(commands, folder):
     items = "".join(
         f"<p>{_safe(command.purpose)}</p><pre><code>{_safe(command.line)}</code></pre>"
         for command in commands
     )
-    return f"<h2>What to run next</h2>{items}" if items else ""
+    if not items:
+        return ""
+    inside = relative_paths.relative(folder, relative_paths.base_of(folder))
+    where = (
+        "the folder of this page"
+        if inside == "."
+        else f"the folder that contains <code>{_safe(inside)}</code>"
+    )
+    note = f"<p>Paths on this page are relative to {where}.</p>"
+    return f"<section><h2>What to run next</h2>{items}{note}</section>"
 
 
-def _table(title, columns, rows):
+def _table(title, columns, rows, kind=""):
     if not rows:
         return ""
     head = "".join(f'<th scope="col">{column}</th>' for column in columns)
     heading = f"<h2>{_safe(title)}</h2>" if title else ""
+    shape = f' class="{kind}"' if kind else ""
     return (
-        f'{heading}<div class="wide"><table><thead><tr>{head}</tr></thead>'
+        f'{heading}<div class="wide"><table{shape}><thead><tr>{head}</tr></thead>'
         f"<tbody>{rows}</tbody></table></div>"
     )
 
