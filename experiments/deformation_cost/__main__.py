@@ -49,9 +49,6 @@ class DeformationCost:
     """cpu, gpu, or whatever JAX finds."""
 
     def __post_init__(self):
-        cli.check_out_file(self.out)
-        if self.out is not None:
-            cli.check_out_file(self.out.with_suffix(".png"), "beside --out:")
         for name in ("gaussians", "repeats"):
             if getattr(self, name) < 1:
                 raise ValueError(f"--{name} {getattr(self, name)} must be at least 1")
@@ -69,6 +66,9 @@ class DeformationCost:
 def main(args):
     """Run the job of the command line; exit code 2 where its input is wrong."""
     with cli.user_errors():
+        cli.check_out_file(args.out)
+        if args.out is not None:
+            cli.check_out_file(args.out.with_suffix(".png"), "beside --out:")
         cli.find_effects(args.effect)
         platform.start_jax(args.device, "one")
         from experiments.deformation_cost import knot_curve

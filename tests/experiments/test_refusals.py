@@ -155,7 +155,7 @@ def test_results_of_earlier_measurements_are_kept(
     from experiments import compare
 
     monkeypatch.setattr(platform, "start_jax", lambda *_: None)
-    monkeypatch.setattr(compare, "read", lambda _: None)
+    monkeypatch.setattr(compare, "read", lambda *_: None)
     kept = tmp_path / "earlier" / "numbers.png"
     kept.parent.mkdir()
     kept.write_text("measured for hours")

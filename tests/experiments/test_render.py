@@ -57,7 +57,7 @@ def run(opened, tmp_path, monkeypatch):
     runs.save_config(folder, opened)
     state = TrainState(None, None, None, jnp.int32(0), jax.random.key(0))
     restored = Restored(state, 0, None, {"crc32": 1})
-    monkeypatch.setattr(runs, "saved_run", lambda *_: opened)
+    monkeypatch.setattr(runs, "saved_run", lambda *_, **__: opened)
     monkeypatch.setattr(runs, "restore", lambda *_: restored)
     monkeypatch.setattr(evaluation, "Renderer", Drawn)
     return folder

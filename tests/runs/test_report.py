@@ -213,7 +213,7 @@ def test_no_path_of_the_machine_is_on_the_page(
         f"reconstruct '{way}captures/a clip' --preset nerf",
         f"{way}captures/a clip",
         "From heldout.png." if not inside else "From ./heldout.png.",
-        f"saved in {'runs/first run' if inside else '.'}/checkpoints",
+        f"Saved in {'runs/first run' if inside else '.'}/checkpoints",
         "OSError: 'libx.so'; 3 dB/s",
     ):
         assert words in text, words
