@@ -5,6 +5,8 @@ from .presets import with_steps as with_steps
 from .projection import project as project
 from .raster import rasterize as rasterize
 from .raster_spec import RasterSpec as RasterSpec
+from .rasterization_api import RasterizationInfo as RasterizationInfo
+from .rasterization_api import rasterization as rasterization
 from .rendering import render as render
 from .scene import build as build
 from .scene import metadata_of as metadata_of
