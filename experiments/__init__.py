@@ -24,7 +24,14 @@ def _leave_current_folder() -> None:
 
 _leave_current_folder()
 
-from nerfies_jax import console  # noqa: E402 (found without the current folder)
+from nerfies_jax import (  # noqa: E402 (found without the current folder)
+    children,
+    console,
+    stopping,
+)
 
 # Before anything else can open a file under the number of a closed stream.
 console.open_descriptors()
+children.end_with_parent()
+# Before anything else is imported, which takes seconds.
+stopping.install_for_program(__name__, "nerfies")

@@ -19,14 +19,13 @@ from typing import Annotated, Any, Literal, NamedTuple
 import tyro
 
 from experiments import options
-from nerfies_jax import console
+from nerfies_jax import console, stopping
 from nerfies_jax.capture.extras import MissingExtra
 from nerfies_jax.capture.given import GivenFiles
 from nerfies_jax.capture.nearest import known_names
 from nerfies_jax.runs import trust
 from nerfies_jax.runs.config import CaptureSource, MoreMetrics
 from nerfies_jax.runs.representations import PRESETS
-from nerfies_jax.training import stopping
 
 Positional = tyro.conf.Positional
 # Those of `nerfies_jax.capture.synthetic`, which loads JAX.
@@ -191,16 +190,36 @@ def command(settings: Any) -> Callable[[Callable], Callable]:
 
 
 def _interruptible(run, args):
-    """The result of a command; signals end it with the shell's code, Ctrl-C in a line.
+    """Run a command. Signals end it with exit code 128 + signal, Ctrl-C in a line.
 
-    Either way what it began, a child or a folder half written, goes with it.
+    Child processes and files that are half written go with it.
     """
     try:
-        with stopping.exits():
-            return run(args)
+        with stopping.exits(), _stopped_first():
+            stopping.check()
+            result = run(args)
+            stopping.check()
+            return result
     except KeyboardInterrupt:
         console.note("interrupted")
         raise SystemExit(130) from None
+    except stopping.Stopped as stop:
+        for line in stopping.ending(stop.name):
+            console.note(line)
+        raise
+
+
+@contextlib.contextmanager
+def _stopped_first() -> Iterator[None]:
+    """Take an error that follows a signal for its consequence.
+
+    Ctrl-C reaches child processes too, and what they leave undone is an error here.
+    """
+    try:
+        yield
+    except Exception:
+        stopping.check()
+        raise
 
 
 def parse(settings: Any, arguments: list[str] | None = None, prog: str = "") -> Any:
@@ -290,7 +309,8 @@ def user_errors(kinds: tuple[type[Exception], ...] = (ValueError, OSError)):
     which raise `ValueError` or `OSError` naming the value, the bound and the mend.
     """
     try:
-        yield
+        with _stopped_first():
+            yield
     except kinds as error:
         console.error(" ".join(str(error).split()) + _repeated(error))
         sys.exit(2)

@@ -4,13 +4,14 @@ python -m experiments.view RUN                # and open the address it prints
 python -m experiments.view RUN --max-side 640
 """
 
+import contextlib
 import dataclasses
 import pathlib
 import time
 from typing import Literal
 
 from experiments import cli
-from nerfies_jax import console
+from nerfies_jax import console, stopping
 from nerfies_jax.runs import platform, representations
 
 
@@ -58,12 +59,11 @@ def main(args):
         page = viewer.Viewer(run, size, args.port, args.run)
         page.add_history((restored.record or {}).get("rows", ()))
     console.say(f"look around at {page.address} (Ctrl-C ends)")
-    try:
-        while True:
+    with contextlib.suppress(KeyboardInterrupt):
+        while not stopping.requested():
             page.serve(restored.state, restored.step, seconds=1.0)
             time.sleep(viewer.IDLE_SECONDS)
-    except KeyboardInterrupt:
-        page.close()
+    page.close()
     return {"run": args.run, "step": restored.step, "address": page.address}
 
 

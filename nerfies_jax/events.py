@@ -18,7 +18,7 @@ from typing import Any
 
 import rich.console
 
-from nerfies_jax import console, progress
+from nerfies_jax import console, progress, stopping
 
 Event = dict[str, Any]
 Sink = Callable[[Event], None]
@@ -55,13 +55,14 @@ class Stage:
     def reach(
         self, done: int, total: int | None = None, text: str | None = None
     ) -> None:
-        """Record that `done` items are finished.
+        """Record that `done` items are finished; a signal ends the work here.
 
         Args:
           done: Number of finished items.
           total: Number of all items, where it has become known or has changed.
           text: What to show next to the numbers; as before where None.
         """
+        stopping.check()
         self.done = done
         self.total = self.total if total is None else total
         if text is not None:
@@ -91,6 +92,7 @@ def stage(name: str, total: int | None = None, done: int = 0) -> Iterator[Stage]
     Yields:
       The stage, whose `advance` is called after each item.
     """
+    stopping.check()
     current, began = Stage(name, total, done), time.monotonic()
     _open_stages().append(current)
     status = "failed"

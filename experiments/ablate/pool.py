@@ -10,8 +10,9 @@ import time
 from typing import NamedTuple
 
 from experiments.ablate.log import line, log
+from nerfies_jax import children, stopping
 from nerfies_jax.capture.json_files import write_json
-from nerfies_jax.training import specs, stopping
+from nerfies_jax.training import specs
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]  # where `experiments` is imported
 POLL_SECONDS = 0.1
@@ -60,8 +61,10 @@ def run(job) -> list[tuple[str, int]]:
                     if not _is_well(job, task, ended):
                         failed.append(task)
                 time.sleep(POLL_SECONDS)
+                stopping.check()
         finally:
-            _stop(running)
+            with stopping.protected():
+                _stop(running)
     return failed
 
 
@@ -77,7 +80,7 @@ def start(job, name: str, seed: int) -> Running:
         **job.suite.arms[name].variables,
     }
     with log_path.open("w") as file:
-        process = subprocess.Popen(
+        process = children.start(
             command(job, name, seed),
             stdin=subprocess.DEVNULL,
             stdout=file,
@@ -144,6 +147,9 @@ def _ended_by_signals():
     except KeyboardInterrupt:
         log("stopped; the same command goes on")
         raise SystemExit(130) from None
+    except stopping.Stopped:
+        log("stopped; the same command goes on")
+        raise
 
 
 def _stop(running):

@@ -15,12 +15,13 @@ import concurrent.futures
 import dataclasses
 import json
 import multiprocessing
+import os
 import pathlib
 import re
 
 from experiments import cli
 from experiments.benchmark import job
-from nerfies_jax import console
+from nerfies_jax import children, console
 from nerfies_jax.runs import representations
 from nerfies_jax.runs.config import RunConfig
 
@@ -76,7 +77,11 @@ def _run_all(args, label, configs):
     # Not forked: JAX has threads, and each run chooses its platform anew.
     spawned = multiprocessing.get_context("spawn")
     with concurrent.futures.ProcessPoolExecutor(
-        args.jobs, spawned, max_tasks_per_child=1
+        args.jobs,
+        spawned,
+        children.end_with_parent,
+        (os.getpid(),),
+        max_tasks_per_child=1,
     ) as pool:
         runs = {
             pool.submit(

@@ -29,7 +29,7 @@ from experiments.raster_speed import baselines as raster_baselines
 from gaussians_jax import raster
 from gaussians_jax.projection import Footprints
 from gaussians_jax.raster_spec import GSPLAT
-from nerfies_jax import console
+from nerfies_jax import children, console
 from nerfies_jax.capture.json_files import write_json
 from nerfies_jax.measure import clock
 
@@ -282,7 +282,7 @@ def longest_tile(case) -> tuple[int, int]:
 def core_times(settings: Settings, cores: int) -> dict[str, dict]:
     """The same cases in a fresh process that sees `cores` cores."""
     command = [sys.executable, "-m", "experiments.raster_speed", "--json", "--cases"]
-    environment = dict(os.environ, PJRT_NPROC=str(cores), NPROC=str(cores))
+    environment = dict(children.environment(), PJRT_NPROC=str(cores), NPROC=str(cores))
     answer = subprocess.run(
         [*command, *settings.cases, "--repeats", str(settings.repeats)],
         capture_output=True,

@@ -30,7 +30,7 @@ import time
 
 from experiments import cli
 from experiments.speed import job
-from nerfies_jax import console
+from nerfies_jax import children, console
 from nerfies_jax.runs import representations
 
 STORED = "speed.json"
@@ -117,7 +117,9 @@ def keep(path: pathlib.Path, machine: dict, keys: tuple[str, ...], record) -> No
 def _apart(work, *arguments):
     """The work's result, from a fresh process."""
     spawned = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(1, spawned) as pool:
+    with concurrent.futures.ProcessPoolExecutor(
+        1, spawned, children.end_with_parent, (os.getpid(),)
+    ) as pool:
         return pool.submit(work, *arguments).result()
 
 
@@ -145,7 +147,7 @@ def main_job(checkout: pathlib.Path | None = None) -> dict:
     """
     with tempfile.TemporaryDirectory() as folder:
         run = pathlib.Path(folder) / "run"
-        environment = dict(os.environ, XDG_CACHE_HOME=f"{folder}/cache")
+        environment = dict(children.environment(), XDG_CACHE_HOME=f"{folder}/cache")
         for name in ("JAX_COMPILATION_CACHE_DIR", "PJRT_NPROC", "NPROC"):
             environment.pop(name, None)
         if checkout is not None:
@@ -172,7 +174,13 @@ def main_job(checkout: pathlib.Path | None = None) -> dict:
 def _raster(yardstick):
     command = [sys.executable, "-m", "experiments.raster_speed", "--json"]
     command += ["--cases", *CASES, "--yardstick", str(yardstick)]
-    answer = subprocess.run(command, check=True, capture_output=True, text=True)
+    answer = subprocess.run(
+        command,
+        check=True,
+        capture_output=True,
+        text=True,
+        env=children.environment(),
+    )
     return json.loads(answer.stdout)
 
 

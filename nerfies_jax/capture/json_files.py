@@ -3,15 +3,14 @@
 JSON is bounded and typed, and names never lead outside their folder. While a file or
 folder is written it has a hidden name beside its final one: `.NAME.OWNER.partial`, or
 `.NAME.OWNER.RANDOM.partial` for folders, where OWNER is the process and its machine.
-`sweep` removes what processes that were killed left under such names.
+`sweep` removes what processes that were killed left under such names, before anything
+is written to the folder again.
 """
 
 import contextlib
-import hashlib
 import json
 import os
 import pathlib
-import platform
 import re
 import shutil
 import tempfile
@@ -20,14 +19,19 @@ from typing import Any
 
 import msgspec
 
+from nerfies_jax import processes, stopping
 from nerfies_jax.capture.capture import CaptureError
 
 MAX_JSON_BYTES = 256 * 2**20  # 20 000 frames of transforms.json are 20 MB
 
 AnyPath = str | os.PathLike
 
+# Of this process: what is not complete, and the folders where `sweep` has looked.
+_unfinished: set[pathlib.Path] = set()
+_swept: set[pathlib.Path] = set()
+
 _LEFT_BEHIND = re.compile(
-    r"\.(?P<name>.+)\.(?P<pid>\d+)-(?P<machine>[0-9a-f]{6})"
+    rf"\.(?P<name>.+)\.(?P<owner>{processes.PATTERN})"
     r"(\.[a-z0-9_]{8})?\.(?P<kind>partial|earlier)(\.[^.]+)?"
 )
 
@@ -87,8 +91,12 @@ def replaced_file(path: AnyPath):
     old one or the new one, whole.
     """
     path = pathlib.Path(path)
+    _sweep_once(path.parent)
     # The suffix stays last: image and video writers choose the format by it.
-    partial = path.with_name(f".{path.stem}.{_owner()}.partial{path.suffix}")
+    partial = path.with_name(
+        f".{path.stem}.{processes.own_name()}.partial{path.suffix}"
+    )
+    _begin(partial)
     try:
         yield partial
         with partial.open("r+b") as file:
@@ -101,7 +109,9 @@ def replaced_file(path: AnyPath):
             "place"
         ) from None
     finally:
-        partial.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # on a disk that became read-only
+            partial.unlink(missing_ok=True)
+        _unfinished.discard(partial)
 
 
 def _sync_names(folder):
@@ -114,13 +124,31 @@ def _sync_names(folder):
             os.close(opened)
 
 
-def _owner():
-    """This process and its machine, for the names of what is not complete."""
-    return f"{os.getpid()}-{_machine()}"
+def _begin(partial):
+    """Note what a signal that ends the process has to remove."""
+    _unfinished.add(partial)
+    stopping.at_end(_remove_unfinished)
 
 
-def _machine():
-    return hashlib.sha256(platform.node().encode()).hexdigest()[:6]
+def _remove_unfinished():
+    for path in list(_unfinished):
+        _remove(path)
+
+
+def _remove(path):
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with contextlib.suppress(OSError):
+            path.unlink(missing_ok=True)
+
+
+def _sweep_once(folder):
+    """Sweep a folder before the first file that this process writes there."""
+    folder = folder.absolute()
+    if folder not in _swept:
+        _swept.add(folder)
+        sweep(folder)
 
 
 def sweep(folder: AnyPath) -> list[pathlib.Path]:
@@ -135,8 +163,6 @@ def sweep(folder: AnyPath) -> list[pathlib.Path]:
     Returns:
       The hidden paths that were removed or renamed.
     """
-    import psutil
-
     swept = []
     try:
         paths = sorted(pathlib.Path(folder).glob(".*"))
@@ -144,18 +170,13 @@ def sweep(folder: AnyPath) -> list[pathlib.Path]:
         return swept
     for path in paths:
         left = _LEFT_BEHIND.fullmatch(path.name)
-        if left is None or left["machine"] != _machine():
-            continue
-        if psutil.pid_exists(int(left["pid"])):
+        if left is None or not processes.has_ended(left["owner"]):
             continue
         if left["kind"] == "earlier" and not (path.parent / left["name"]).exists():
             with contextlib.suppress(OSError):
                 os.replace(path, path.parent / left["name"])
-        elif path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path, ignore_errors=True)
         else:
-            with contextlib.suppress(OSError):
-                path.unlink()
+            _remove(path)
         swept.append(path)
     return swept
 
@@ -238,23 +259,25 @@ def merged_folder(path: AnyPath):
     sweep(path)
     with _partial_folder(path, path.resolve()) as partial:
         yield partial
-        for name in _files(partial):
-            target = path / name
-            target.parent.mkdir(parents=True, exist_ok=True)
-            os.replace(partial / name, target)
+        with stopping.protected():
+            for name in _files(partial):
+                target = path / name
+                target.parent.mkdir(parents=True, exist_ok=True)
+                os.replace(partial / name, target)
         _sync_names(path)
 
 
 def _take_place(new, path):
     """Rename the new folder to `path`; `sweep` mends it where that is cut off."""
-    earlier = path.with_name(f".{path.name}.{_owner()}.earlier")
-    os.replace(path, earlier)
-    try:
-        os.replace(new, path)
-    except BaseException:
-        if not path.exists():
-            os.replace(earlier, path)
-        raise
+    earlier = path.with_name(f".{path.name}.{processes.own_name()}.earlier")
+    with stopping.protected():
+        os.replace(path, earlier)
+        try:
+            os.replace(new, path)
+        except BaseException:
+            if not path.exists():
+                os.replace(earlier, path)
+            raise
     _sync_names(path.parent)
     shutil.rmtree(earlier, ignore_errors=True)
 
@@ -322,7 +345,7 @@ def _partial_folder(path, place):
     """A temporary folder in `place` for what becomes `path`; it goes with the block."""
     try:
         place.mkdir(parents=True, exist_ok=True)
-        prefix = f".{path.resolve().name}.{_owner()}."
+        prefix = f".{path.resolve().name}.{processes.own_name()}."
         partial = pathlib.Path(
             tempfile.mkdtemp(prefix=prefix, suffix=".partial", dir=place)
         )
@@ -331,6 +354,7 @@ def _partial_folder(path, place):
             f"{path}: cannot be written ({error.strerror or error}); choose another "
             "place"
         ) from None
+    _begin(partial)
     try:
         yield partial
     except OSError as error:
@@ -340,3 +364,4 @@ def _partial_folder(path, place):
         ) from None
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+        _unfinished.discard(partial)

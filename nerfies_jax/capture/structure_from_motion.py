@@ -20,7 +20,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from nerfies_jax import console
+from nerfies_jax import children, console
 from nerfies_jax.capture import extras, frames
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.colmap_library import MIN_TRACK, library
@@ -178,7 +178,7 @@ def _in_own_process(folder, masked, spec, tell):
     pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
     # A log may hold any bytes, and must be read on, or its pipe fills.
     words = {"text": True, "errors": "replace"}
-    with subprocess.Popen(command, cwd=root, **words, **pipes) as child:
+    with children.start(command, cwd=root, **words, **pipes) as child:
         log = collections.deque(maxlen=20)
         reader = threading.Thread(target=_follow, args=(child.stderr, log, tell))
         reader.start()
@@ -321,6 +321,7 @@ def _judged(model) -> dict:
 
 
 if __name__ == "__main__":
+    children.end_with_parent()
     job = json.load(sys.stdin)
     spec = MappingSpec(**job["spec"])
     judged = _reconstruct(pathlib.Path(job["folder"]), job["masked"], spec)

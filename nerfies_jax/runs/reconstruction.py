@@ -7,13 +7,14 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any, Literal, NamedTuple
 
-from nerfies_jax import console
+from nerfies_jax import console, stopping
 from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.capture.capture import CaptureError, describe
 from nerfies_jax.capture.given import GivenFiles
 from nerfies_jax.evidence import inspection
 from nerfies_jax.runs import (
     adviser,
+    commands,
     plan,
     preparation,
     products,
@@ -271,6 +272,8 @@ def _restored(folder, run):
 
 def _opened(held, folder, run, state, after):
     """Where the run saves, with its state saved there: nothing done is ever lost."""
+    line = commands.resume(folder, run.config.effects)
+    stopping.advise(f"continue with: {line}")
     checkpoints = held.enter_context(train.open_checkpoints(folder, run, after))
     if after is None:
         checkpoints.save(state, 0)

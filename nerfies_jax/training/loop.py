@@ -14,11 +14,11 @@ from jaxtyping import Array, Key
 from nerfies_jax import data_parallel
 from nerfies_jax import events as event_stream
 from nerfies_jax.progress import duration
+from nerfies_jax.stopping import StopRequests
 from nerfies_jax.training import chunk
 from nerfies_jax.training.checkpoint import Checkpoints
 from nerfies_jax.training.guard import Snapshot, bad_arrays, last_good, listed
 from nerfies_jax.training.model import Event, Frames, Model, TrainState
-from nerfies_jax.training.stopping import StopRequests
 
 CHUNK_STEPS = 100  # longer ones gain nothing
 CHUNK_SECONDS = 0.5  # a chunk cannot be interrupted: Ctrl-C acts within this time
@@ -168,6 +168,7 @@ class _Run:
             self._save_overdue()
             count = self._count(program.length)
             self._add(compile_seconds=lower_seconds + program.prepare(count))
+            requests.protect()  # from now on there is something to save
             if not self._chunk(program, count):
                 return "non-finite"
             self._after_chunk()

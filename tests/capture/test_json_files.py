@@ -7,6 +7,7 @@ import sys
 
 import pytest
 
+from nerfies_jax import processes
 from nerfies_jax.capture import json_files
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.json_files import (
@@ -143,17 +144,23 @@ def test_files_of_a_folder_are_replaced_together(tmp_path):
 
 
 def test_only_what_the_dead_of_this_machine_left_is_swept(tmp_path):
-    owner, machine = json_files._owner(), json_files._machine()
-    dead = "4194999"  # above the largest process id of Linux
+    owner, machine = processes.own_name(), processes.machine()
+    pid, start, _ = owner.split("-")
+    dead = "4194999-7"  # above the largest process id of Linux
     kept = (
         f".a.{owner}.partial.png",
         f".a.{dead}-{'0' * 6}.partial.png",
         ".a.partial",
         ".env",
     )
-    for name in (*kept, f".a b.c.{dead}-{machine}.partial.png"):
+    earlier = f"{pid}-{int(start) - 1}-{machine}"  # had the id of this process
+    for name in (
+        *kept,
+        f".a b.c.{dead}-{machine}.partial.png",
+        f".b.{earlier}.partial",
+    ):
         (tmp_path / name).write_text("")
     (tmp_path / f".out.{dead}-{machine}.ab_1cd2e.partial" / "new").mkdir(parents=True)
-    assert len(sweep(tmp_path)) == 2
+    assert len(sweep(tmp_path)) == 3
     assert {path.name for path in tmp_path.iterdir()} == {*kept}
     assert sweep(tmp_path / "absent") == []

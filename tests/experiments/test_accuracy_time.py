@@ -62,7 +62,7 @@ def test_a_setting_of_precision_has_its_switch_in_its_process(tmp_path, monkeypa
         (name,) = json.loads(pathlib.Path(words[-1]).read_text())["arms"]
         begun[name] = given["env"]
 
-    monkeypatch.setattr(pool.subprocess, "Popen", caught)
+    monkeypatch.setattr(pool.children, "start", caught)
     monkeypatch.delenv("JAX_ENABLE_X64", raising=False)
     for name in ("field-float64", "nerfies-grid-small"):
         pool.start(job, name, 0)

@@ -10,10 +10,13 @@ ROOT = pathlib.Path(__file__).resolve().parents[2]
 # Longest prefix wins. gaussians_jax reads floors 1-5 of nerfies_jax, experiments all.
 FLOORS = {
     "nerfies_jax.geometry": 1,
+    "nerfies_jax.children": 1,
     "nerfies_jax.compiler": 1,
     "nerfies_jax.console": 1,
     "nerfies_jax.progress": 1,
     "nerfies_jax.events": 1,
+    "nerfies_jax.processes": 1,
+    "nerfies_jax.stopping": 1,
     "nerfies_jax.data_parallel": 1,
     "nerfies_jax.nets": 2,
     "nerfies_jax.capture": 3,

@@ -1,0 +1,60 @@
+"""Names for processes that tell later whether a process has ended."""
+
+import functools
+import hashlib
+import os
+import pathlib
+import platform
+import re
+
+PATTERN = r"(?P<pid>\d+)-(?P<start>\d+)-(?P<machine>[0-9a-f]{6})"
+
+
+def own_name() -> str:
+    """Return the name of this process: its id, its start and its machine."""
+    pid = os.getpid()
+    return f"{pid}-{_start_of(pid) or 0}-{machine()}"
+
+
+def has_ended(name: str) -> bool:
+    """Return whether the process of a name has ended.
+
+    A process of another machine, or of another container, may be running.
+
+    Args:
+      name: What `own_name` returned there.
+    """
+    parts = re.fullmatch(PATTERN, name)
+    if parts is None or parts["machine"] != machine():
+        return False
+    return _start_of(int(parts["pid"])) != (int(parts["start"]) or None)
+
+
+@functools.lru_cache(maxsize=1)
+def machine() -> str:
+    """Return six hexadecimal digits of this machine and its process ids."""
+    try:  # containers number their processes anew
+        processes = os.readlink("/proc/self/ns/pid")
+    except OSError:
+        processes = ""
+    return hashlib.sha256((platform.node() + processes).encode()).hexdigest()[:6]
+
+
+def _start_of(pid):
+    """When a process was started, by a clock that nobody sets; None where it ended."""
+    try:
+        stat = pathlib.Path(f"/proc/{pid}/stat").read_text()
+    except OSError:
+        return None if pathlib.Path("/proc/self/stat").exists() else _created(pid)
+    # The name of the program, in parentheses, may hold anything.
+    state, *fields = stat.rpartition(")")[2].split()
+    return None if state in "ZX" else int(fields[18])  # ticks since the system started
+
+
+def _created(pid):
+    import psutil
+
+    try:
+        return int(psutil.Process(pid).create_time())
+    except psutil.Error:
+        return None

@@ -1,0 +1,163 @@
+"""Signals end a command soon, whatever it is doing, and it can be continued."""
+
+import functools
+import itertools
+import json
+import os
+import pathlib
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from nerfies_jax.capture import nerfies_format
+from nerfies_jax.training import checkpoint
+from tests import scenes
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+BOUND_SECONDS = 30.0  # on a busy machine, GRACE_SECONDS on an idle one
+LITTER = ("*.partial*", "*.unfinished*", "*.earlier")
+STEPS = 60
+QUICK = (
+    *("--preset", "splats-static-small", "--steps", str(STEPS)),
+    *("--evaluate-every", "1", "--checkpoint-every", "0"),
+    *("--set", "densification=none", "sh_degree=0", "init.extra_random=0"),
+)
+
+
+class Command:
+    """A command in a process of its own, and what it has written to its streams."""
+
+    def __init__(self, folder, *words, python=(), **environment):
+        self.log = folder / "log.txt"
+        self.log.touch()
+        with self.log.open("wb") as file:
+            self.process = subprocess.Popen(
+                [sys.executable, *python, "-m", "experiments", *map(str, words)],
+                stdin=subprocess.DEVNULL,
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                cwd=folder,
+                env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
+            )
+
+    def said(self):
+        return self.log.read_text(errors="replace")
+
+    def wait_until(self, is_reached):
+        """Until a moment of progress, or the end of the process; returns whether it is
+        still running.
+        """
+        until = time.monotonic() + 300
+        while self.process.poll() is None and not is_reached():
+            if time.monotonic() > until:
+                self.process.kill()
+                self.process.wait()
+            time.sleep(0.005)
+        return self.process.poll() is None
+
+    def has_imported(self, module):
+        return re.search(rf"\| +{re.escape(module)}$", self.said(), re.M)
+
+    def check_ends(self, number):
+        """Send a signal: the process ends in time, without a traceback or litter."""
+        self.process.send_signal(number)
+        try:
+            code = self.process.wait(BOUND_SECONDS)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+            pytest.fail(f"alive {BOUND_SECONDS} s after the signal: {self.said()}")
+        said = re.sub(r"import time: .*\n", "", self.said())
+        assert code == 128 + number, said
+        assert "Traceback" not in said
+        left = [path for name in LITTER for path in self.log.parent.rglob(name)]
+        assert not left, said
+
+
+# In the order in which the main job imports them, with the signal of the core tier.
+MODULES = {
+    "tyro": signal.SIGINT,
+    "experiments.cli": None,
+    "numpy": None,
+    "jaxlib": signal.SIGTERM,
+    "jax._src.core": signal.SIGHUP,
+    "jax": None,
+    "optax": None,
+    "orbax.checkpoint": None,
+}
+
+
+@pytest.mark.parametrize(
+    ("module", "number"),
+    [
+        pytest.param(module, number, marks=() if number == core else pytest.mark.slow)
+        for module, core in MODULES.items()
+        for number in SIGNALS
+    ],
+)
+def test_a_signal_during_the_imports_ends_the_command(module, number, tmp_path):
+    words = ("reconstruct", "--scene", "default", "--out", tmp_path / "run")
+    command = Command(tmp_path, *words, python=("-X", "importtime"))
+    assert command.wait_until(lambda: command.has_imported(module))
+    command.check_ends(number)
+
+
+def checkpoint_after(step):
+    def is_there(folder):
+        return step < max(checkpoint.steps(folder / "run/checkpoints"), default=-1)
+
+    return is_there
+
+
+def product(name):
+    return lambda folder: (folder / "run" / name).exists()
+
+
+# In the order of a run: each is waited for where the run was left at the one before.
+MOMENTS = (
+    product("config.json"),
+    product("checkpoints/0"),
+    checkpoint_after(0),
+    checkpoint_after(STEPS // 2),
+    product("player.html"),
+    product("comparison.png"),
+    product("scene.mp4"),
+    product("metrics.json"),
+)
+
+
+@pytest.mark.slow
+def test_a_run_goes_on_after_a_signal_at_any_moment(tmp_path):
+    nerfies_format.write(scenes.tiny_capture(), tmp_path / "filmed")
+    words = ("reconstruct", tmp_path / "filmed", *QUICK, "--out", tmp_path / "run")
+    goes_on = ("reconstruct", "--out", tmp_path / "run", "--resume")
+    for moment, number in zip(MOMENTS, itertools.cycle(SIGNALS)):
+        command = Command(tmp_path, *words)
+        assert command.wait_until(functools.partial(moment, tmp_path)), command.said()
+        command.check_ends(number)
+        assert "--resume" in command.said()
+        words = goes_on
+    command = Command(tmp_path, *goes_on)
+    assert command.process.wait(600) == 0, command.said()
+    metrics = json.loads((tmp_path / "run/metrics.json").read_text())
+    assert metrics["train.steps"] == STEPS
+
+
+@pytest.mark.slow
+def test_a_viewer_ends_by_a_signal(tmp_path):
+    pytest.importorskip("viser")
+    nerfies_format.write(scenes.tiny_capture(), tmp_path / "filmed")
+    words = ("reconstruct", tmp_path / "filmed", *QUICK, "--out", tmp_path / "run")
+    command = Command(tmp_path, *words)
+    assert command.process.wait(600) == 0, command.said()
+    for number in SIGNALS:
+        command = Command(tmp_path, "view", tmp_path / "run")
+        assert command.wait_until(lambda c=command: "look around at" in c.said())
+        command.check_ends(number)
