@@ -19,6 +19,7 @@ from jaxtyping import Array, Int
 
 from gaussians_jax.instants import gaussians_at
 from gaussians_jax.player import packing
+from gaussians_jax.player.limits import camera_limits
 from gaussians_jax.player.sampled import (
     Instants,
     count_for,
@@ -41,6 +42,7 @@ RASTER = (
     *("alpha_threshold", "alpha_max", "eps2d", "antialiased", "near", "far"),
     "tangent_margin",
 )
+PROGRAM = ("splats", "camera", "painter", "controls", "player")  # in this order
 LARGEST = 1e30  # for an infinite far plane, which JSON has not
 
 
@@ -104,8 +106,7 @@ def compose(
         # A "</script>" in a name must not end the header.
         "header": json.dumps(header(packed, raster, capture)).replace("<", "\\u003c"),
         "data": base64.b64encode(packed.data).decode("ascii"),
-        "splats": _file("splats.js"),
-        "player": _file("player.js"),
+        **{name: _file(f"{name}.js") for name in PROGRAM},
     }
     # In one pass: what stands in a name is never taken for a part.
     page = re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], _file("player.html"))
@@ -126,6 +127,9 @@ def header(packed: packing.Packed, raster: RasterSpec, capture: Capture) -> dict
     forward = first.camera_from_world[2].astype(np.float64)
     focus = camera_paths.focus_point(train, capture.near, capture.far)
     away = float(np.clip((focus - first.position) @ forward, capture.near, capture.far))
+    target = first.position + away * forward
+    up = camera_paths.up_axis(capture)
+    half_diagonal = float(np.hypot(*capture.size) / 2 / first.focal_px)
     view = {
         "rotation": first.camera_from_world.ravel(),
         "position": first.position,
@@ -135,12 +139,13 @@ def header(packed: packing.Packed, raster: RasterSpec, capture: Capture) -> dict
         "centre": first.principal_point_px,
         "size": capture.size,
         # On the viewing axis, so that turning about it begins with the first picture.
-        "target": first.position + away * forward,
+        "target": target,
     }
     return {
         "instants": packed.entries["mean.change"]["shape"][0],
         "seconds": camera_paths.playing_seconds(capture),
-        "up": camera_paths.up_axis(capture).tolist(),
+        "up": up.tolist(),
+        "limits": camera_limits(train, target, up, half_diagonal),
         "view": {name: np.asarray(part).tolist() for name, part in view.items()},
         "raster": {
             name: min(getattr(raster, name), LARGEST)

@@ -1,174 +1,200 @@
 "use strict";
-// The page of a player: its controls and the drawing of footprints by WebGL 2.
+// The page of a player: time, drawing and the buttons.
 
-const VERTEX = `#version 300 es
-uniform vec2 size;
-layout(location = 0) in vec2 corner;
-layout(location = 1) in vec2 mean;
-layout(location = 2) in vec4 shape; // p, k, r, opacity
-layout(location = 3) in vec2 box;
-layout(location = 4) in vec3 colour;
-out vec2 offset;
-flat out vec4 footprint;
-flat out vec3 tint;
-void main() {
-  offset = corner * box;
-  footprint = shape;
-  tint = colour;
-  vec2 place = (mean + offset) / size * 2.0 - 1.0;
-  gl_Position = vec4(place.x, -place.y, 0.0, 1.0);
-}`;
-const FRAGMENT = `#version 300 es
-precision highp float;
-uniform float least, most;
-in vec2 offset;
-flat in vec4 footprint;
-flat in vec3 tint;
-out vec4 drawn;
-void main() {
-  float u = footprint.x * offset.x;
-  float v = footprint.z * (offset.y - footprint.y * offset.x);
-  float alpha = min(most, footprint.w * exp(-u * u - v * v));
-  if (alpha < least) discard;
-  drawn = vec4(tint * alpha, alpha);
-}`;
-const WHOLE = `#version 300 es
-layout(location = 0) in vec2 corner;
-void main() { gl_Position = vec4(corner, 0.0, 1.0); }`;
-const BEHIND = `#version 300 es
-precision highp float;
-uniform sampler2D picture;
-uniform vec3 background;
-out vec4 drawn;
-void main() {
-  vec4 front = texelFetch(picture, ivec2(gl_FragCoord.xy), 0);
-  drawn = vec4(front.rgb + (1.0 - front.a) * background, 1.0);
-}`;
-const RADIANS = 0.006; // that the view turns for a pixel
-// Of a footprint, in the order of the shader's inputs 1 to 4.
-const PARTS = [2, 4, 2, 3];
+const SLOW = 1 / 25, FAST = 1 / 50; // seconds between frames that ask for other sizes
+const COARSEST = 0.3; // of the screen's pixels along an edge
+const LINKED_AFTER = 300; // ms at rest, after which the address bar has the view
 
-function program(gl, vertex, fragment) {
-  const linked = gl.createProgram();
-  for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
-    const shader = gl.createShader(kind);
-    gl.shaderSource(shader, text);
-    gl.compileShader(shader);
-    gl.attachShader(linked, shader);
-  }
-  gl.linkProgram(linked);
-  if (!gl.getProgramParameter(linked, gl.LINK_STATUS)) {
-    throw new Error(gl.getProgramInfoLog(linked));
-  }
-  return linked;
-}
+// A function that asks for the order of the Gaussians, in a worker where there can be
+// one. `take` gets the rows and whether a worker sorted them. One request is under way
+// at a time, and the last one asked meanwhile comes next.
+function sorterFor(header, buffer, source, take) {
+  let worker = null, busy = false, next = null, here = null;
 
-// A function of sorted footprints that draws them on the canvas.
-function painter(canvas, raster) {
-  const gl = canvas.getContext("webgl2", { alpha: false, antialias: false });
-  if (!gl) throw new Error("this browser has no WebGL 2");
-  const splats = program(gl, VERTEX, FRAGMENT), whole = program(gl, WHOLE, BEHIND);
-  const corners = gl.createBuffer(), instances = gl.createBuffer();
-  gl.bindBuffer(gl.ARRAY_BUFFER, corners);
-  gl.bufferData(
-    gl.ARRAY_BUFFER, new Float32Array([-1, -1, 1, -1, -1, 1, 1, 1]), gl.STATIC_DRAW);
-  gl.enableVertexAttribArray(0);
-  gl.vertexAttribPointer(0, 2, gl.FLOAT, false, 0, 0);
-  gl.bindBuffer(gl.ARRAY_BUFFER, instances);
-  let at = 0;
-  PARTS.forEach((width, i) => {
-    gl.enableVertexAttribArray(i + 1);
-    gl.vertexAttribPointer(i + 1, width, gl.FLOAT, false, 4 * FLOATS, 4 * at);
-    gl.vertexAttribDivisor(i + 1, 1);
-    at += width;
-  });
-  // Eight bits would round a hundred thin layers to bands.
-  const fine = gl.getExtension("EXT_color_buffer_float")
-    || gl.getExtension("EXT_color_buffer_half_float");
-  const texture = gl.createTexture(), target = gl.createFramebuffer();
-  gl.bindTexture(gl.TEXTURE_2D, texture);
-  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
-  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
-  let size = [0, 0];
-
-  function resize() {
-    if (size[0] === canvas.width && size[1] === canvas.height) return;
-    size = [canvas.width, canvas.height];
-    const kind = fine ? gl.HALF_FLOAT : gl.UNSIGNED_BYTE;
-    gl.texImage2D(
-      gl.TEXTURE_2D, 0, fine ? gl.RGBA16F : gl.RGBA8, ...size, 0, gl.RGBA, kind, null);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, target);
-    gl.framebufferTexture2D(
-      gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture, 0);
+  function onThisThread(request) {
+    here ??= sorterOf(header, buffer);
+    take(here(request), request, false);
   }
 
-  return (footprints, background) => {
-    resize();
-    gl.viewport(0, 0, ...size);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, target);
-    gl.clearColor(0, 0, 0, 0);
-    gl.clear(gl.COLOR_BUFFER_BIT);
-    gl.enable(gl.BLEND);
-    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-    gl.useProgram(splats);
-    gl.uniform2f(gl.getUniformLocation(splats, "size"), ...size);
-    gl.uniform1f(gl.getUniformLocation(splats, "least"), raster.alpha_threshold);
-    gl.uniform1f(gl.getUniformLocation(splats, "most"), raster.alpha_max);
-    gl.bufferData(gl.ARRAY_BUFFER, footprints, gl.STREAM_DRAW);
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, footprints.length / FLOATS);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    gl.disable(gl.BLEND);
-    gl.useProgram(whole);
-    gl.uniform3f(gl.getUniformLocation(whole, "background"), ...background);
-    gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
+  function give(request) {
+    busy = true;
+    next = null;
+    worker.onmessage = ({ data }) => {
+      busy = false;
+      take(data, request, true);
+      if (next) give(next);
+    };
+    worker.onerror = () => { // this browser runs no worker from a page like this one
+      worker = null;
+      onThisThread(next ?? request);
+    };
+    worker.postMessage(request);
+  }
+
+  try {
+    worker = new Worker(URL.createObjectURL(new Blob([source], { type: "text/javascript" })));
+    worker.postMessage({ header, buffer });
+  } catch {
+    worker = null;
+  }
+  return (request) => {
+    if (!worker) return onThisThread(request);
+    if (busy) next = request;
+    else give(request);
   };
 }
 
-function start(header, buffer) {
+function start(header, buffer, source) {
   const one = (id) => document.getElementById(id);
-  const canvas = one("scene"), slider = one("time"), button = one("play");
-  const scene = unpack(header, buffer);
-  let paint = painter(canvas, header.raster), lost = false;
-  let view = header.view, playing = !location.hash, stale = true, before = 0;
-  slider.value = parseFloat(location.hash.slice(1)) || 0; // player.html#0.5: that time
+  const canvas = one("scene"), slider = one("time"), lens = header.view;
+  const calm = matchMedia("(prefers-reduced-motion: reduce)");
+  const camera = cameraman(header, wake, () => calm.matches);
+  let painter = painterOf(canvas, header, buffer), lost = false;
+  let time = 0, playing = false, resolution = 1, byWorker = null;
+  let awake = false, before = 0, lasted = 0, drawn = "", asked = "", sorted = "", linking = 0;
+  const ask = sorterFor(header, buffer, source, (rows, request, worker) => {
+    byWorker = worker;
+    sorted = request.key;
+    if (!lost) painter.sort(rows);
+    wake();
+  });
+
+  // What the order depends on, and what the image depends on besides.
+  const orderKey = () => [time, textOf(camera.view)].join();
+  const imageKey = () => [
+    orderKey(), sorted, one("background").value, canvas.width, canvas.height].join();
+
+  function resize() {
+    const dense = Math.min(window.devicePixelRatio || 1, 2);
+    const share = dense * (playing || camera.moving ? resolution : 1);
+    const width = Math.max(1, Math.round(canvas.clientWidth * share));
+    const height = Math.max(1, Math.round(canvas.clientHeight * share));
+    // Setting the size clears the canvas, even to the same one.
+    if (canvas.width !== width) canvas.width = width;
+    if (canvas.height !== height) canvas.height = height;
+  }
 
   function draw() {
-    const dense = Math.min(window.devicePixelRatio || 1, 2);
-    canvas.width = Math.max(1, Math.round(canvas.clientWidth * dense));
-    canvas.height = Math.max(1, Math.round(canvas.clientHeight * dense));
-    const camera = fitted(view, canvas.width, canvas.height);
-    // The footprints' least width counts pixels as trained: in a larger picture it
+    const shown = cameraOf(camera.view, lens, canvas.width, canvas.height);
+    // The least width of a footprint counts pixels as trained: in a larger image it
     // grows along, or thin Gaussians would part.
-    const wider = Math.max(1, camera.enlarged);
+    const wider = Math.max(1, shown.enlarged);
     const raster = { ...header.raster, eps2d: header.raster.eps2d * wider * wider };
-    pose(scene, Number(slider.value));
     const hex = parseInt(one("background").value.slice(1), 16);
     const background = [hex >> 16, (hex >> 8) & 255, hex & 255].map((x) => x / 255);
-    paint(project(scene, camera, raster), background);
+    painter.draw(shown, raster, time, background);
     one("poster").hidden = true;
   }
 
-  function tick(now) {
-    if (playing) {
-      const time = Number(slider.value) + (now - before) / 1000 / header.seconds;
-      slider.value = time % 1;
-    }
-    before = now;
-    if (!lost && (playing || stale)) {
-      draw();
-      stale = false;
-    }
+  function wake() {
+    if (awake) return;
+    awake = true;
+    before = 0;
     requestAnimationFrame(tick);
   }
 
-  function change(next) {
-    view = next;
-    stale = true;
+  function tick(now) {
+    const since = before ? (now - before) / 1000 : 1 / 60;
+    const passed = Math.min(since, 0.25);
+    if (playing) setTime((time + Number(one("speed").value) * since / header.seconds) % 1);
+    camera.advance(passed);
+    const busy = playing || camera.moving;
+    if (busy && before && since < 1) adapt(since); // longer where the page was hidden
+    before = now;
+    resize();
+    const key = orderKey();
+    if (key !== asked) {
+      asked = key;
+      const { rotation, position } = cameraOf(camera.view, lens, 1, 1);
+      ask({ key, time, position, forward: rotation.slice(6) });
+    }
+    if (!lost && sorted && imageKey() !== drawn) {
+      draw();
+      drawn = imageKey();
+    }
+    awake = busy;
+    if (busy) requestAnimationFrame(tick);
+    else scheduleLink();
+  }
+
+  // Fewer pixels while frames take long, more where they take little.
+  function adapt(seconds) {
+    lasted = lasted ? 0.7 * lasted + 0.3 * seconds : seconds;
+    if (lasted > SLOW && resolution > COARSEST) resolution = Math.max(COARSEST, resolution * 0.8);
+    else if (lasted < FAST && resolution < 1) resolution = Math.min(1, resolution * 1.1);
+    else return;
+    lasted = 0;
+  }
+
+  function setTime(next) {
+    time = Math.round(next * 1e6) / 1e6; // as in a link
+    slider.value = time;
+    const seconds = (share) => `${(share * header.seconds).toFixed(2)} s`;
+    one("clock").textContent = `${seconds(time)} / ${seconds(1)}`;
+    slider.setAttribute("aria-valuetext", `${seconds(time)} of ${seconds(1)}`);
+    wake();
   }
 
   function play(yes) {
     playing = yes;
-    button.textContent = yes ? "Pause" : "Play";
+    one("play").setAttribute("aria-label", yes ? "Pause" : "Play");
+    one("play").classList.toggle("playing", yes);
+    wake();
+  }
+
+  function step(by) {
+    play(false);
+    const last = header.instants - 1;
+    setTime(Math.min(Math.max(Math.round(time * last) + by, 0), last) / last);
+  }
+
+  // The address has the time and the view while nothing moves.
+  function scheduleLink() {
+    clearTimeout(linking);
+    linking = setTimeout(() => {
+      if (playing || camera.moving) return;
+      const parts = `#t=${time}&view=${textOf(camera.view)}`;
+      history.replaceState(null, "", parts);
+    }, LINKED_AFTER);
+  }
+
+  function follow() {
+    const parts = new URLSearchParams(location.hash.slice(1));
+    const when = parseFloat(parts.get("t")), view = viewFrom(parts.get("view") ?? "");
+    if (view) camera.jump(view);
+    if (when >= 0 && when <= 1) setTime(when);
+    return view || when >= 0;
+  }
+
+  function fullscreen() {
+    if (document.fullscreenElement) document.exitFullscreen();
+    else document.documentElement.requestFullscreen();
+  }
+
+  function help() {
+    if (one("help").open) one("help").close();
+    else one("help").showModal();
+  }
+
+  function press(event) {
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    if (event.target.closest?.("select, input[type=color]")) return;
+    const keys = {
+      " ": () => play(!playing), ",": () => step(-1), ".": () => step(1),
+      home: () => camera.reset(), f: fullscreen, "?": help,
+    };
+    const key = event.key.toLowerCase();
+    // A button is pressed by Space, and the slider moved by arrows.
+    if (event.target.closest?.("button, summary") && event.key === " ") return;
+    if (one("help").open && event.key !== "?") return;
+    if (event.target === slider && ["ArrowLeft", "ArrowRight"].includes(event.key)) {
+      step(event.key === "ArrowLeft" ? -1 : 1);
+    } else if (keys[key]) {
+      keys[key]();
+    } else if (event.target === slider || !steerByKey(event, camera, camera.view.distance)) {
+      return;
+    }
+    event.preventDefault();
   }
 
   // Phones take the drawing of pages that are out of sight, and may give it back.
@@ -176,75 +202,44 @@ function start(header, buffer) {
     event.preventDefault(); // or it is never given back
     lost = true;
     one("poster").hidden = false;
-    one("trouble").textContent = "The browser took the drawing: load the page again if it stays away.";
+    one("trouble").textContent =
+      "The browser took the drawing away: load the page again if it does not return.";
   });
   canvas.addEventListener("webglcontextrestored", () => {
-    paint = painter(canvas, header.raster);
+    painter = painterOf(canvas, header, buffer);
     lost = false;
-    stale = true;
+    sorted = asked = drawn = "";
     one("trouble").textContent = "";
+    wake();
   });
-  steer(canvas, header.up, () => view, change);
-  button.addEventListener("click", () => play(!playing));
-  one("first").addEventListener("click", () => change(header.view));
-  for (const id of ["time", "background"]) {
-    one(id).addEventListener("input", () => { stale = true; });
-  }
-  slider.addEventListener("pointerdown", () => play(false));
-  window.addEventListener("resize", () => { stale = true; });
-  window.addEventListener("keydown", (event) => {
-    // Which Space presses or opens; on the slider it plays.
-    if (event.key !== " " || event.target.closest?.("button, [type=color]")) return;
-    event.preventDefault();
-    play(!playing);
-  });
-  play(playing);
-  requestAnimationFrame((now) => { before = now; tick(now); });
-  return {
-    get view() { return view; },
-    get time() { return Number(slider.value); },
-    get playing() { return playing; },
-    get ready() { return !stale; },
+  steerByHand(canvas, camera, () => camera.view.distance
+    / cameraOf(camera.view, lens, canvas.clientWidth, canvas.clientHeight).focal);
+  const clicks = {
+    play: () => play(!playing), previous: () => step(-1), next: () => step(1),
+    first: () => camera.reset(), fullscreen, keys: help,
   };
-}
-
-// Pointers and wheel on the canvas change the view: `get` has it, `change` takes it.
-function steer(canvas, up, get, change) {
-  const held = new Map();
-
-  function drag(dx, dy, sideways) {
-    const view = get();
-    const away = Math.hypot(...view.position.map((x, k) => x - view.target[k]));
-    const unit = away / fitted(view, canvas.clientWidth, canvas.clientHeight).focal;
-    if (sideways) return change(moved(view, -dx * unit, -dy * unit));
-    const about = turned(view, up, -dx * RADIANS);
-    change(turned(about, about.rotation.slice(0, 3), -dy * RADIANS));
-  }
-
-  canvas.addEventListener("pointerdown", (event) => {
-    canvas.setPointerCapture(event.pointerId);
-    held.set(event.pointerId, event);
+  for (const [id, act] of Object.entries(clicks)) one(id).addEventListener("click", act);
+  one("fullscreen").hidden = !document.fullscreenEnabled;
+  slider.addEventListener("input", () => {
+    play(false);
+    setTime(Number(slider.value));
   });
-  for (const name of ["pointerup", "pointercancel"]) {
-    canvas.addEventListener(name, (event) => held.delete(event.pointerId));
-  }
-  canvas.addEventListener("pointermove", (event) => {
-    const last = held.get(event.pointerId);
-    if (!last) return;
-    held.set(event.pointerId, event);
-    const dx = event.clientX - last.clientX, dy = event.clientY - last.clientY;
-    if (held.size === 1) return drag(dx, dy, event.shiftKey || event.buttons === 2);
-    const other = [...held.values()].find((each) => each.pointerId !== event.pointerId);
-    const apart = (a) => Math.hypot(a.clientX - other.clientX, a.clientY - other.clientY);
-    drag(dx / 2, dy / 2, true);
-    change(nearer(get(), apart(last) / Math.max(apart(event), 1)));
-  });
-  canvas.addEventListener("contextmenu", (event) => event.preventDefault());
-  canvas.addEventListener("wheel", (event) => {
-    event.preventDefault();
-    const lines = event.deltaMode ? 30 : 1; // px, or lines of about 30
-    change(nearer(get(), Math.exp(event.deltaY * lines * 0.001)));
-  }, { passive: false });
+  one("background").addEventListener("input", wake);
+  window.addEventListener("hashchange", () => follow() && play(false));
+  new ResizeObserver(wake).observe(canvas); // also where the caption is opened
+  window.addEventListener("keydown", press);
+  setTime(0);
+  play(!follow() && !calm.matches);
+  return {
+    get time() { return time; },
+    get playing() { return playing; },
+    get view() { return { ...camera.view, ...cameraOf(camera.view, lens, ...lens.size) }; },
+    get resolution() { return canvas.width / canvas.clientWidth; },
+    get byWorker() { return byWorker; },
+    // Nothing moves, and what is to be seen is drawn.
+    get ready() { return !awake && sorted === orderKey() && drawn === imageKey(); },
+    painter,
+  };
 }
 
 function bytesOf(text) {
@@ -253,10 +248,10 @@ function bytesOf(text) {
   return bytes.buffer;
 }
 
-let player = null; // for tests and for pages that embed this one
+let player = null; // for tests, and for pages that show this one in a frame
 try {
   const text = (id) => document.getElementById(id).textContent;
-  player = start(JSON.parse(text("header")), bytesOf(text("data")));
+  player = start(JSON.parse(text("header")), bytesOf(text("data")), text("splats"));
 } catch (error) {
   document.getElementById("trouble").textContent = `Nothing can be drawn: ${error.message}`;
 }

@@ -2,8 +2,11 @@
 
 import functools
 import io
+import json
 import os
+import pathlib
 import shutil
+import subprocess
 
 import numpy as np
 import PIL.Image
@@ -18,6 +21,7 @@ from nerfies_jax.geometry import camera as cameras
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)
+needs_node = pytest.mark.skipif(not shutil.which("node"), reason="no node here")
 # Software rendering, which every machine has. Root has no sandbox.
 ARGUMENTS = (
     "--use-angle=swiftshader",
@@ -36,6 +40,17 @@ COLORS = {"red": (1, 0, 0), "green": (0, 1, 0), "blue": (0, 0, 1), "magenta": (1
 MOVED = (0.5, 0.0, 0.0)  # of the magenta blob, from time 0 to time 1
 SECONDS = 2.0  # that the capture plays
 SIZE, FOCAL_PX, DISTANCE = (64, 48), 70.0, 2.0
+
+
+def by_node(program, *inputs):
+    """Run a program in node on inputs that it reads as JSON; return what it prints."""
+    run = functools.partial(subprocess.run, capture_output=True, text=True, check=True)
+    return json.loads(run(["node", "-e", program], input=json.dumps(inputs)).stdout)
+
+
+def program_of(name):
+    """Return the source of one file of the player."""
+    return pathlib.Path(player_page.__file__).with_name(name).read_text()
 
 
 def launched():
@@ -95,8 +110,8 @@ def capture():
     )
 
 
-def write_blobs(path):
-    """Write the player page of the blobs."""
+def packed_blobs():
+    """The blobs as a page stores them."""
     count, steps = len(BLOBS), np.linspace(0, 1, 24)
     mean = np.tile(np.float32(list(BLOBS.values())), (len(steps), 1, 1))
     mean[:, -1] += steps[:, None] * MOVED
@@ -108,10 +123,19 @@ def write_blobs(path):
         colour=np.float32(list(COLORS.values())),
         left_out=0,
     )
-    packed = packing.pack(instants, np.full(count, 1e-4))
+    return packing.pack(instants, np.full(count, 1e-4))
+
+
+def header():
+    """The header of the page of the blobs."""
+    return player_page.header(packed_blobs(), RasterSpec(), capture())
+
+
+def write_blobs(path):
+    """Write the player page of the blobs."""
     poster = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
     player_page.compose(
-        path, "Blobs", packed, "Four blobs.", RasterSpec(), capture(), poster
+        path, "Blobs", packed_blobs(), "Four blobs.", RasterSpec(), capture(), poster
     )
 
 

@@ -4,10 +4,7 @@ import base64
 import dataclasses
 import functools
 import json
-import pathlib
 import re
-import shutil
-import subprocess
 
 import jax
 import jax.numpy as jnp
@@ -19,16 +16,14 @@ from gaussians_jax.player import packing, sampled
 from gaussians_jax.player import page as player_page
 from gaussians_jax.splats import Gaussians
 from nerfies_jax import evaluation
-from nerfies_jax.capture import images
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.training.effects import Effect
 from tests import scenes
+from tests.gaussians.browser import by_node, image_of, launched, needs_node, program_of
 from tests.gaussians.shared import jitted, put
 
 BEHIND = 7  # Gaussians that no camera can see
 SPEC = dataclasses.replace(scenes.TINY_SPLATS, sh_degree=0)
-CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
-needs_node = pytest.mark.skipif(not shutil.which("node"), reason="no node here")
 
 
 def swing(params, gaussians, condition, ready):
@@ -185,35 +180,91 @@ def test_one_rotation_keeps_one_sign():
     np.testing.assert_allclose(quaternions, -true, atol=1e-12)
 
 
-PROJECT = """
-const [program, page, camera, time] = JSON.parse(require("fs").readFileSync(0, "utf8"));
-const names = "{unpack, pose, project, order, turned, moved, nearer, fitted}";
-const f = new Function(program + "; return " + names)();
+ORDER = """
+const [program, page, cameras] = JSON.parse(require("fs").readFileSync(0, "utf8"));
+const f = new Function(program + "; return { order, sorterOf }")();
 const data = Uint8Array.from(Buffer.from(page.data, "base64")).buffer;
-const scene = f.unpack(page.header, data);
-f.pose(scene, 0.9);
-f.pose(scene, time);
-const view = page.header.view, up = page.header.up;
+const sort = f.sorterOf(page.header, data);
 console.log(JSON.stringify({
-  footprints: [false, true].map((antialiased) => Array.from(
-    f.project(scene, camera, { ...page.header.raster, antialiased }))),
   order: Array.from(f.order(Float32Array.from([3, 1e-30, 70000, 3, 2.5, 1e9, 2.5]))),
-  turned: f.turned(f.turned(view, up, 0.4), view.rotation.slice(0, 3), -0.3),
-  moved: f.moved(view, 0.2, 0.1),
-  nearer: f.nearer(view, 0.5),
-  fitted: f.fitted(view, 200, 90),
+  rows: cameras.map((camera) => Array.from(sort(camera))),
 }));
 """
 
 
-@pytest.fixture(scope="module")
-def by_node(page):
-    """What the page's own functions make of it, and with which camera and time."""
+@needs_node
+def test_the_page_sorts_what_is_ahead_from_the_farthest_on(page):
     capture = moving_scene()[2]
-    one = cameras.take(capture.cameras, 2)._replace(
+    views = [(2, 0.9), (0, 0.3), (2, 0.3)]  # and back: nothing of a time before stays
+    asked = []
+    for row, time in views:
+        forward = capture.cameras.camera_from_world[row, 2].tolist()
+        position = capture.cameras.position[row].tolist()
+        asked.append({"position": position, "forward": forward, "time": time})
+    header = json.loads(inside(page, "header"))
+    header["raster"]["near"] = 0.55  # so that some Gaussians are nearer
+    content = {"header": header, "data": inside(page, "data")}
+    answer = by_node(ORDER, program_of("splats.js"), content, asked)
+    assert answer["order"] == [1, 4, 6, 0, 3, 2, 5]
+    for view, rows in zip(asked, answer["rows"], strict=True):
+        mean = np.asarray(unpacked(page, view["time"])[0].mean, float)
+        depth = (mean - view["position"]) @ view["forward"]
+        assert sorted(rows) == np.nonzero(depth >= 0.55)[0].tolist()
+        assert 100 < len(rows) < len(depth)
+        assert (np.diff(depth[rows]) < 1e-6).all()
+
+
+def odd_camera():
+    """A camera of which nothing is as usual."""
+    return cameras.take(moving_scene()[2].cameras, 2)._replace(
         principal_point_px=np.float32([23, 11]),
         pixel_aspect=np.float32(1.3),
         skew_px=np.float32(4),
+    )
+
+
+# Runs the page's own projection over all Gaussians, and reads what it computes.
+FOOTPRINTS = """([camera, time, antialiased]) => {
+  const { gl, scene } = player.painter;
+  const raster = { ...HEADER.raster, antialiased, near: 0.55 };
+  const names = ["mean", "whitening", "opacity", "color", "seen"];
+  const program = programOf(gl, `#version 300 es
+    ${PROJECTION}
+    out vec2 mean; out vec3 whitening, color; out float opacity, seen;
+    void main() {
+      Footprint shown = footprintOf(gl_VertexID);
+      seen = float(shown.seen);
+      if (shown.seen) {
+        mean = shown.mean; whitening = shown.whitening;
+        opacity = shown.opacity; color = shown.color;
+      }
+    }`, `#version 300 es
+    void main() {}`, names);
+  const count = HEADER.arrays.colour.shape[0], bytes = 4 * 10 * count;
+  gl.bindVertexArray(gl.createVertexArray());
+  gl.bindBufferBase(gl.TRANSFORM_FEEDBACK_BUFFER, 0, gl.createBuffer());
+  gl.bufferData(gl.TRANSFORM_FEEDBACK_BUFFER, bytes, gl.STATIC_READ);
+  gl.useProgram(program);
+  setCamera(uniformsOf(gl, program), scene, camera, raster, time);
+  gl.enable(gl.RASTERIZER_DISCARD);
+  gl.beginTransformFeedback(gl.POINTS);
+  gl.drawArrays(gl.POINTS, 0, count);
+  gl.endTransformFeedback();
+  const read = new Float32Array(10 * count);
+  gl.getBufferSubData(gl.TRANSFORM_FEEDBACK_BUFFER, 0, read);
+  return Array.from(read);
+}"""
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_the_page_projects_as_the_library(opened, page, antialiased):
+    one = odd_camera()
+    size = moving_scene()[2].size
+    gaussians, colours = unpacked(page, 0.3)
+    # Some Gaussians are nearer than this.
+    raster = dataclasses.replace(SPEC.raster, antialiased=antialiased, near=0.55)
+    expected = jitted(projection.project, static_argnums=(2, 3))(
+        gaussians, put(one, "float32"), size, raster
     )
     camera = {
         "rotation": one.camera_from_world.ravel().tolist(),
@@ -222,104 +273,44 @@ def by_node(page):
         "aspect": float(one.pixel_aspect),
         "skew": float(one.skew_px),
         "centre": one.principal_point_px.tolist(),
-        "size": capture.size,
+        "size": size,
     }
-    program = pathlib.Path(sampled.__file__).with_name("splats.js").read_text()
-    content = {
-        "header": json.loads(inside(page, "header")),
-        "data": inside(page, "data"),
-    }
-    request = json.dumps([program, content, camera, 0.3])
-    run = functools.partial(subprocess.run, capture_output=True, text=True, check=True)
-    done = run(["node", "-e", PROJECT], input=request)
-    return one, json.loads(done.stdout)
-
-
-@needs_node
-@pytest.mark.parametrize("antialiased", [False, True])
-def test_the_page_projects_as_the_library(page, by_node, antialiased):
-    one, answer = by_node
-    size = moving_scene()[2].size
-    gaussians, colours = unpacked(page, 0.3)
-    raster = dataclasses.replace(SPEC.raster, antialiased=antialiased)
-    expected = jitted(projection.project, static_argnums=(2, 3))(
-        gaussians, put(one, "float32"), size, raster
-    )
-    low, high = (expected.mean_px + sign * expected.extent_px for sign in (-1, 1))
-    shown = (
-        (expected.extent_px[:, 0] > 0)
-        & (high > 0).all(1)
-        & (low < np.array(size)).all(1)
-    )
-    parts = (
-        expected.mean_px,
-        expected.whitening,
-        expected.opacity[:, None],
-        expected.extent_px,
-        colours,
-    )
+    program = FOOTPRINTS.replace("HEADER", inside(page, "header"))
+    table = np.reshape(opened.evaluate(program, [camera, 0.3, antialiased]), (-1, 10))
+    shown = np.asarray(expected.extent_px[:, 0] > 0)
+    np.testing.assert_array_equal(table[:, 9] == 1, shown)
+    assert 100 < shown.sum() < len(shown)
+    parts = (expected.mean_px, expected.whitening, expected.opacity[:, None], colours)
     exact = np.concatenate([np.asarray(part)[shown] for part in parts], axis=1)
-    footprints = np.reshape(answer["footprints"][antialiased], (-1, 11))
-    assert len(footprints) == len(exact) > 100
-    places = [np.lexsort(table[:, :2].T.round(2)) for table in (footprints, exact)]
-    one, other = footprints[places[0]], exact[places[1]]
-    np.testing.assert_allclose(one, other, rtol=2e-3, atol=2e-3)  # 64 bits against 32
-    depth = np.empty(len(exact))
-    depth[places[0]] = expected.depth[shown][places[1]]
-    assert (np.diff(depth) < 1e-6).all()  # the farthest first
-    assert answer["order"] == [1, 4, 6, 0, 3, 2, 5]
+    # Both are float32. Gaussians near the camera plane are thousands of px away.
+    np.testing.assert_allclose(table[shown, :9], exact, rtol=2e-3, atol=2e-3)
 
 
-@needs_node
-def test_views_turn_about_their_target(page, by_node):
-    _, answer = by_node
-    view = json.loads(inside(page, "header"))["view"]
-    target, start = np.array(view["target"]), np.array(view["position"])
-    turned = answer["turned"]
-    rotation = np.reshape(turned["rotation"], (3, 3))
-    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
-    for one in (turned, answer["nearer"], answer["moved"]):
-        rotation = np.reshape(one["rotation"], (3, 3))
-        offset = np.array(one["target"]) - one["position"]
-        away = np.linalg.norm(target - start) * (0.5 if one is answer["nearer"] else 1)
-        np.testing.assert_allclose(rotation @ offset, [0, 0, away], atol=1e-6)
-    moved = np.array(answer["moved"]["position"]) - start
-    rotation = np.reshape(view["rotation"], (3, 3))
-    np.testing.assert_allclose(rotation @ moved, [0.2, 0.1, 0], atol=1e-6)
-    fitted = answer["fitted"]  # a picture of 40 x 30 in one of 200 x 90
-    assert (fitted["enlarged"], fitted["size"]) == (3, [200, 90])
-    assert fitted["focal"] == pytest.approx(3 * view["focal"])
-    place = 3 * (np.array(view["centre"]) - (20, 15)) + (100, 45)
-    np.testing.assert_allclose(fitted["centre"], place)
+@pytest.fixture(scope="module")
+def browser():
+    yield from launched()
 
 
-# The stage as large as the film, and the slider moved as by hand.
-AT_END = """
-<style>#stage { flex: none; width: 40px; height: 30px; }</style>
-<script>
-slider = document.getElementById("time");
-slider.value = END;
-slider.dispatchEvent(new Event("input"));
-</script></body>"""
+@pytest.fixture
+def opened(browser, page):
+    """The page in a browser, its canvas as large as the images of the capture."""
+    tab = browser.new_page(viewport={"width": 600, "height": 400})
+    tab.goto(page.as_uri() + "#t=0")
+    tab.add_style_tag(
+        content="#stage { flex: none !important; width: 40px; height: 30px }"
+    )
+    yield tab
+    tab.close()
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(not CHROMIUM, reason="no Chromium here")
 @pytest.mark.parametrize("time", [0.0, 1.0])
-def test_a_browser_draws_what_the_model_does(page, tmp_path, time):
-    text = page.read_text().replace("</body>", AT_END.replace("END", str(time)))
-    (tmp_path / "page.html").write_text(text)
-    shot = tmp_path / "shot.png"
-    options = ("--headless", "--no-sandbox", "--use-angle=swiftshader")
-    options += ("--enable-unsafe-swiftshader", "--hide-scrollbars")
-    options += ("--window-size=600,400", "--virtual-time-budget=3000")
-    options += (f"--screenshot={shot}", f"--user-data-dir={tmp_path / 'profile'}")
-    address = f"file://{tmp_path / 'page.html'}#0.5"
-    subprocess.run([CHROMIUM, *options, address], capture_output=True, timeout=120)
-    picture = images.read_image(shot)[0][:30, :40] / 255
-    assert psnr(picture, drawn(0, time)) > 50  # 8 bits alone leave 59
-    other = drawn(0, 1.0 - time)
-    assert psnr(picture, other) < 30
+def test_a_browser_draws_what_the_model_does(opened, time):
+    opened.get_by_label("Time", exact=True).fill(str(time))
+    opened.wait_for_function("(time) => player.ready && player.time === time", arg=time)
+    image = image_of(opened)
+    assert image.shape == (30, 40, 3)
+    assert psnr(image, drawn(0, time)) > 50  # 8 bits alone leave 59
+    assert psnr(image, drawn(0, 1.0 - time)) < 30
 
 
 def test_what_moves_does_not_hide_what_stands_behind_it():

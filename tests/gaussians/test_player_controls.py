@@ -38,7 +38,7 @@ def opened(browser, address):
     with contextlib.ExitStack() as stack:
         errors = []
 
-        def open_page(options=DESKTOP, fragment="#0"):
+        def open_page(options=DESKTOP, fragment="#t=0"):
             context = browser.new_context(**options)
             stack.callback(context.close)
             page = context.new_page()
@@ -204,4 +204,4 @@ def test_the_time_is_played_paused_and_scrubbed(opened):
     page.get_by_role("slider").fill("0.8")
     settle(page)
     scrubbed = check_image(page, 0.8)
-    np.testing.assert_array_equal(image_of(opened(fragment="#0.8")), scrubbed)
+    np.testing.assert_array_equal(image_of(opened(fragment="#t=0.8")), scrubbed)

@@ -1,0 +1,75 @@
+"""Where a player's camera may go: where the capture looked from, with a margin."""
+
+import numpy as np
+
+from nerfies_jax.geometry.camera import Camera
+
+# Beyond the cameras of the capture, in radians. Gaussians that no camera saw from the
+# side are long and thin, and are drawn as such there.
+AZIMUTH_MARGIN, ELEVATION_MARGIN = np.radians(30), np.radians(20)
+# A capture that leaves less of the circle open than this has been all around.
+OPEN_ARC = np.radians(90)
+WIDEST = np.pi - 0.2  # either way: the page counts angles from -pi to pi
+STEEPEST = np.radians(88)  # of the elevation: straight above, there is no azimuth
+NEAREST, FARTHEST = 0.25, 2.5  # of the least and the largest distance of a camera
+
+
+def camera_limits(
+    train: Camera, target: np.ndarray, up: np.ndarray, half_diagonal: float
+) -> dict:
+    """Compute the range of a player's camera from the cameras of a capture.
+
+    Args:
+      train: Training cameras, the first view foremost.
+      target: Point that the first view is turned about, scene units.
+      up: Upward direction of the scene, unit length.
+      half_diagonal: Half the diagonal of the image over the focal length.
+
+    Returns:
+      Lists and floats. `axes` are rows: two of the ground plane, the first toward the
+      first camera, and `up`. `azimuth` (None where the capture went all around) and
+      `elevation` are ranges in radians of the direction from the target to the camera,
+      `distance` is one in scene units, and `pan` is how far the target may move.
+    """
+    offset = train.position.astype(np.float64) - target
+    distance = np.linalg.norm(offset, axis=1)
+    height = np.arcsin(np.clip(offset @ up / np.maximum(distance, 1e-12), -1, 1))
+    flat = offset[0] - (offset[0] @ up) * up
+    if np.linalg.norm(flat) < 1e-3 * distance[0]:  # the first view is from above
+        image_up = -train.camera_from_world[0, 1].astype(np.float64)
+        flat = -(image_up - (image_up @ up) * up)
+    side = flat / np.linalg.norm(flat)
+    ahead = np.cross(up, side)
+    # The first view is within, also where it is steeper than all others may be.
+    elevation = [
+        min(max(height.min() - ELEVATION_MARGIN, -STEEPEST), height[0]),
+        max(min(height.max() + ELEVATION_MARGIN, STEEPEST), height[0]),
+    ]
+    return {
+        "axes": [side.tolist(), ahead.tolist(), up.tolist()],
+        "target": target.tolist(),
+        "azimuth": _azimuth(np.arctan2(offset @ ahead, offset @ side)),
+        "elevation": [float(angle) for angle in elevation],
+        "distance": [
+            float(NEAREST * distance.min()),
+            float(FARTHEST * distance.max()),
+        ],
+        "pan": float(half_diagonal * distance[0]),
+    }
+
+
+def _azimuth(angles):
+    """The arc of all angles with its margin, which holds 0; None where it closes."""
+    angles = np.sort(np.append(angles, 0.0))
+    gaps = np.diff(np.append(angles, angles[0] + 2 * np.pi))
+    widest = int(np.argmax(gaps))
+    if gaps[widest] < OPEN_ARC + 2 * AZIMUTH_MARGIN:
+        return None
+    # The arc begins behind the widest gap. Zero is in it, so it begins at most at zero.
+    low = angles[(widest + 1) % len(angles)]
+    low = low if low <= 0 else low - 2 * np.pi
+    high = low + 2 * np.pi - gaps[widest]
+    low, high = low - AZIMUTH_MARGIN, high + AZIMUTH_MARGIN
+    if max(-low, high) > WIDEST:
+        return None
+    return [float(low), float(high)]

@@ -1,0 +1,300 @@
+"use strict";
+// Drawing of Gaussians by WebGL 2. The formulas are those of gaussians_jax/projection.py.
+
+const WIDTH = 2048; // texels of a row, which every device has
+
+// The footprint of one Gaussian at the time and from the camera of the uniforms.
+const PROJECTION = `
+precision highp float;
+precision highp int;
+precision highp isampler2D;
+uniform highp sampler2D gaussians, steps;
+uniform isampler2D meanChange, quaternionChange, scaleChange;
+uniform int movers, before;
+uniform float share;
+uniform mat3 rotation; // from world to camera
+uniform vec3 position;
+uniform vec2 focal, centre, size, margin;
+uniform float skew, near, far, eps2d, least;
+uniform bool antialiased;
+
+struct Footprint {
+  vec2 mean; // px
+  vec3 whitening; // p, k, r: u = p dx, v = r (dy - k dx)
+  float opacity;
+  vec3 color;
+  bool seen;
+};
+
+vec4 texel(int index, int part) {
+  return texelFetch(gaussians, ivec2((index & 511) * 4 + part, index >> 9), 0);
+}
+
+vec4 change(isampler2D changes, int row) {
+  int i = before * movers + row, j = i + movers;
+  vec4 one = vec4(texelFetch(changes, ivec2(i & 2047, i >> 11), 0));
+  vec4 other = vec4(texelFetch(changes, ivec2(j & 2047, j >> 11), 0));
+  return mix(one, other, share);
+}
+
+Footprint footprintOf(int index) {
+  Footprint shown;
+  shown.seen = false;
+  vec4 place = texel(index, 0), q = texel(index, 1), lengths = texel(index, 2);
+  int row = int(lengths.w);
+  if (row >= 0) {
+    vec4 unit = texelFetch(steps, ivec2(row & 2047, row >> 11), 0);
+    place += unit.xxxw * change(meanChange, row);
+    q += unit.y * change(quaternionChange, row);
+    lengths += unit.z * change(scaleChange, row);
+  }
+  shown.color = texel(index, 3).rgb;
+  shown.opacity = place.w;
+  vec3 scale = exp(lengths.xyz);
+  vec3 view = rotation * (place.xyz - position);
+  float z = view.z;
+  if (!(z >= near && z <= far && shown.opacity >= least)) return shown;
+  vec2 tangent = view.xy / z;
+  shown.mean = focal * tangent + vec2(skew * tangent.y, 0.0) + centre;
+
+  // Rows of T = J W R diag(scale), with the tangents clamped in J alone.
+  tangent = clamp(tangent, -(centre + margin) / focal, (size - centre + margin) / focal);
+  float twice = 2.0 / dot(q, q);
+  float w = q.x, x = q.y, y = q.z, s = q.w;
+  mat3 axes = rotation * mat3(
+    1.0 - twice * (y * y + s * s), twice * (x * y + w * s), twice * (x * s - w * y),
+    twice * (x * y - w * s), 1.0 - twice * (x * x + s * s), twice * (y * s + w * x),
+    twice * (x * s + w * y), twice * (y * s - w * x), 1.0 - twice * (x * x + y * y));
+  mat3 across = transpose(axes); // its columns: right, down and ahead of the three axes
+  vec3 right = across[0] - tangent.x * across[2], down = across[1] - tangent.y * across[2];
+  vec3 first = (focal.x * right + skew * down) * scale / z;
+  vec3 second = focal.y * down * scale / z;
+
+  float a = dot(first, first) + eps2d, inverse = inversesqrt(a);
+  vec3 n = first * inverse, area = cross(n, second);
+  float sharp = dot(area, area);
+  float blurred = sharp + eps2d * (1.0 + dot(second, second) / a);
+  shown.whitening = vec3(
+    sqrt(0.5) * inverse, dot(n, second) * inverse, sqrt(0.5) * inversesqrt(blurred));
+  if (antialiased) shown.opacity *= max(sqrt(sharp / blurred), 0.005);
+  shown.seen = shown.opacity >= least;
+  return shown;
+}`;
+
+// The quad around a footprint is the square around the circle u^2 + v^2 = reach^2 where
+// its alpha is the least that counts: no smaller parallelogram holds the ellipse.
+const VERTEX = `#version 300 es
+${PROJECTION}
+layout(location = 0) in uint index;
+out vec2 offset;
+flat out vec4 tint;
+void main() {
+  Footprint shown = footprintOf(int(index));
+  gl_Position = vec4(0.0, 0.0, 2.0, 1.0);
+  if (!shown.seen) return;
+  // In powers of two, which is what hardware has.
+  float reach = log2(shown.opacity / least);
+  tint = vec4(shown.color, reach);
+  vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0;
+  offset = corner * sqrt(reach);
+  vec2 uv = offset * sqrt(log(2.0));
+  float dx = uv.x / shown.whitening.x;
+  vec2 at = shown.mean + vec2(dx, uv.y / shown.whitening.z + shown.whitening.y * dx);
+  vec2 place = at / size * 2.0 - 1.0;
+  gl_Position = vec4(place.x, -place.y, 0.0, 1.0);
+}`;
+const FRAGMENT = `#version 300 es
+precision highp float;
+uniform float least, most;
+in vec2 offset;
+flat in vec4 tint;
+out vec4 drawn;
+void main() {
+  float left = tint.a - dot(offset, offset);
+  if (left < 0.0) discard;
+  float alpha = min(most, least * exp2(left));
+  drawn = vec4(tint.rgb * alpha, alpha);
+}`;
+const WHOLE = `#version 300 es
+void main() {
+  vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0;
+  gl_Position = vec4(corner, 0.0, 1.0);
+}`;
+const BEHIND = `#version 300 es
+precision highp float;
+uniform sampler2D image;
+uniform vec3 background;
+out vec4 drawn;
+void main() {
+  vec4 front = texelFetch(image, ivec2(gl_FragCoord.xy), 0);
+  drawn = vec4(front.rgb + (1.0 - front.a) * background, 1.0);
+}`;
+
+function programOf(gl, vertex, fragment, varyings = null) {
+  const linked = gl.createProgram();
+  for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+    const shader = gl.createShader(kind);
+    gl.shaderSource(shader, text);
+    gl.compileShader(shader);
+    gl.attachShader(linked, shader);
+  }
+  if (varyings) gl.transformFeedbackVaryings(linked, varyings, gl.INTERLEAVED_ATTRIBS);
+  gl.linkProgram(linked);
+  if (!gl.getProgramParameter(linked, gl.LINK_STATUS) && !gl.isContextLost()) {
+    throw new Error(gl.getProgramInfoLog(linked));
+  }
+  return linked;
+}
+
+// A function that sets a uniform by its name.
+function uniformsOf(gl, program) {
+  const places = {};
+  return (name, kind, ...values) => {
+    places[name] ??= gl.getUniformLocation(program, name);
+    gl["uniform" + kind](places[name], ...values);
+  };
+}
+
+// All of a scene in textures, at the units 0 to 4 in the order of SAMPLERS.
+const SAMPLERS = ["gaussians", "steps", "meanChange", "quaternionChange", "scaleChange"];
+
+function sceneTextures(gl, header, buffer) {
+  const count = header.arrays.colour.shape[0], { instants } = header;
+  const fields = Object.keys(FIELDS).map((name) => fieldOf(name, header, buffer));
+  const rowOf = new Int32Array(count).fill(-1);
+  let movers = 0;
+  for (const { rows } of fields) {
+    for (const row of rows) if (rowOf[row] < 0) rowOf[row] = movers++;
+  }
+  const all = (kind, texels) => new kind(4 * WIDTH * Math.max(1, Math.ceil(texels / WIDTH)));
+  const gaussians = all(Float32Array, 4 * count), steps = all(Float32Array, movers);
+  const changes = [Int16Array, Int8Array, Int8Array].map(
+    (kind) => all(kind, instants * movers));
+  const color = decoded(header.arrays.colour, buffer);
+  for (let i = 0; i < count; i++) {
+    gaussians[16 * i + 11] = rowOf[i];
+    for (let k = 0; k < 3; k++) gaussians[16 * i + 12 + k] = color[3 * i + k];
+  }
+  // Of the mean, the quaternion, the scale and the opacity, which is with the mean.
+  [[0, 0, 0], [4, 1, 0], [8, 2, 0], [3, 0, 3]].forEach(([at, texture, first], f) => {
+    const { width, values, rows, step, change } = fields[f];
+    for (let i = 0; i < count; i++) {
+      for (let k = 0; k < width; k++) gaussians[16 * i + at + k] = values[width * i + k];
+    }
+    rows.forEach((row, r) => {
+      steps[4 * rowOf[row] + f] = step[r];
+      for (let t = 0; t < instants; t++) {
+        const from = (t * rows.length + r) * width;
+        const to = 4 * (t * movers + rowOf[row]) + first;
+        for (let k = 0; k < width; k++) changes[texture][to + k] = change[from + k];
+      }
+    });
+  });
+  const kinds = [
+    [gl.RGBA32F, gl.RGBA, gl.FLOAT], [gl.RGBA32F, gl.RGBA, gl.FLOAT],
+    [gl.RGBA16I, gl.RGBA_INTEGER, gl.SHORT],
+    [gl.RGBA8I, gl.RGBA_INTEGER, gl.BYTE], [gl.RGBA8I, gl.RGBA_INTEGER, gl.BYTE],
+  ];
+  [gaussians, steps, ...changes].forEach((content, unit) => {
+    const [inside, format, type] = kinds[unit];
+    gl.activeTexture(gl.TEXTURE0 + unit);
+    newTexture(gl);
+    gl.texImage2D(
+      gl.TEXTURE_2D, 0, inside, WIDTH, content.length / 4 / WIDTH, 0, format, type, content);
+  });
+  return { movers, instants };
+}
+
+function newTexture(gl) {
+  const texture = gl.createTexture();
+  gl.bindTexture(gl.TEXTURE_2D, texture);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+  return texture;
+}
+
+// Set everything that PROJECTION reads.
+function setCamera(set, scene, camera, raster, time) {
+  const { before, share } = between(time, scene.instants);
+  SAMPLERS.forEach((name, unit) => set(name, "1i", unit));
+  set("movers", "1i", scene.movers);
+  set("before", "1i", before);
+  set("share", "1f", share);
+  set("rotation", "Matrix3fv", true, camera.rotation);
+  set("position", "3fv", camera.position);
+  set("focal", "2f", camera.focal, camera.focal * camera.aspect);
+  set("centre", "2fv", camera.centre);
+  set("size", "2fv", camera.size);
+  set("margin", "2fv", camera.size.map((pixels) => raster.tangent_margin * 0.5 * pixels));
+  set("skew", "1f", camera.skew);
+  for (const name of ["near", "far", "eps2d"]) set(name, "1f", raster[name]);
+  set("least", "1f", raster.alpha_threshold);
+  set("antialiased", "1i", Number(raster.antialiased));
+}
+
+// Half floats keep a hundred thin layers from turning into bands, as eight bits would.
+// A software renderer blends whole floats in half the time.
+function formatOf(gl) {
+  const float = gl.getExtension("EXT_color_buffer_float");
+  const named = gl.getExtension("WEBGL_debug_renderer_info");
+  const name = named ? gl.getParameter(named.UNMASKED_RENDERER_WEBGL) : "";
+  if (float && /SwiftShader/.test(name) && gl.getExtension("EXT_float_blend")) {
+    return [gl.RGBA32F, gl.FLOAT];
+  }
+  const half = float || gl.getExtension("EXT_color_buffer_half_float");
+  return half ? [gl.RGBA16F, gl.HALF_FLOAT] : [gl.RGBA8, gl.UNSIGNED_BYTE];
+}
+
+// What draws a scene on the canvas: `sort` takes the rows to draw, the farthest first.
+function painterOf(canvas, header, buffer) {
+  const gl = canvas.getContext("webgl2", { alpha: false, antialias: false });
+  if (!gl) throw new Error("this browser has no WebGL 2");
+  const splats = programOf(gl, VERTEX, FRAGMENT), whole = programOf(gl, WHOLE, BEHIND);
+  const set = uniformsOf(gl, splats), setWhole = uniformsOf(gl, whole);
+  const scene = sceneTextures(gl, header, buffer), unit = SAMPLERS.length;
+  const rows = gl.createBuffer(), target = gl.createFramebuffer();
+  gl.bindBuffer(gl.ARRAY_BUFFER, rows);
+  gl.enableVertexAttribArray(0);
+  gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
+  const [format, type] = formatOf(gl);
+  gl.activeTexture(gl.TEXTURE0 + unit);
+  const texture = newTexture(gl);
+  gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+  let size = [0, 0], count = 0;
+
+  function resize() {
+    if (size[0] === canvas.width && size[1] === canvas.height) return;
+    size = [canvas.width, canvas.height];
+    gl.texImage2D(gl.TEXTURE_2D, 0, format, ...size, 0, gl.RGBA, type, null);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, target);
+    gl.framebufferTexture2D(
+      gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture, 0);
+    gl.viewport(0, 0, ...size);
+  }
+
+  function sort(sorted) {
+    count = sorted.length;
+    gl.bufferData(gl.ARRAY_BUFFER, sorted, gl.STREAM_DRAW);
+  }
+
+  function draw(camera, raster, time, background) {
+    resize();
+    gl.bindFramebuffer(gl.FRAMEBUFFER, target);
+    gl.clearColor(0, 0, 0, 0);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    gl.enable(gl.BLEND);
+    gl.useProgram(splats);
+    setCamera(set, scene, camera, raster, time);
+    set("most", "1f", raster.alpha_max);
+    gl.vertexAttribDivisor(0, 1);
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, count);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.disable(gl.BLEND);
+    gl.useProgram(whole);
+    setWhole("image", "1i", unit);
+    setWhole("background", "3fv", background);
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, 1);
+  }
+
+  return { gl, scene, sort, draw };
+}
