@@ -81,13 +81,13 @@ def _rows(args, kernels):
     from nerfies_jax.nets.mlp import HeadSpec
 
     heads = (("y", HeadSpec(args.width)),)
-    spec = kan.KANSpec(args.width, (), heads, kernels=kernels, base=False)
-    params = kan.init(spec, jax.random.key(0))
+    spec = kan.KANSpec(args.width, heads=heads, kernels=kernels, base=False)
+    params = kan.init(jax.random.key(0), spec)
     shape = args.points, args.width
     places = jax.random.uniform(jax.random.key(1), shape, jnp.float32, -1, 1)
 
     def dense(params, x):
-        return kan.apply(spec, params, x)["y"]
+        return kan.apply_heads(spec, params, x)["y"]
 
     def nearest_alone(nearest):
         return lambda params, x: local(spec, params.heads["y"], x, nearest)

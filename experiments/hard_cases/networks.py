@@ -1,5 +1,6 @@
 """Hard cases of networks and optimisers: RBF-KANs, Adam and RAdam of late rows."""
 
+import dataclasses
 import math
 
 import jax.numpy as jnp
@@ -14,17 +15,10 @@ from nerfies_jax.nets.mlp import HeadSpec
 
 KERNELS = 8
 # Centres at whole numbers, which every precision holds, and w = h = 1.
-EDGE = KANSpec(1, (), (("y", HeadSpec(1)),), KERNELS, (0.0, 7.0), base=False)
-FAR_EDGE = KANSpec(1, (), (("y", HeadSpec(1)),), KERNELS, (1024.0, 1031.0), base=False)
-TRAINED_EDGE = KANSpec(
-    1,
-    (),
-    (("y", HeadSpec(1)),),
-    KERNELS,
-    (0.0, 7.0),
-    base=False,
-    trainable_kernels=True,
-)
+HEADS = (("y", HeadSpec(1)),)
+EDGE = KANSpec(1, heads=HEADS, kernels=KERNELS, grid=(0.0, 7.0), base=False)
+FAR_EDGE = dataclasses.replace(EDGE, grid=(1024.0, 1031.0))
+TRAINED_EDGE = dataclasses.replace(EDGE, trainable_kernels=True)
 WEIGHTS = np.linspace(1, 2, KERNELS)
 
 
@@ -32,7 +26,7 @@ def _edge(spec, x, weights=WEIGHTS, kernels=None):
     """The function of one variable that one edge of a KAN is."""
     weight = constant(weights, x.dtype)[:, None, None]
     head = KANLayer(weight, None, constant(np.zeros(1), x.dtype))
-    return kan.apply(spec, KAN((), {"y": head}, kernels), x)["y"]
+    return kan.apply_heads(spec, KAN((), {"y": head}, kernels), x)["y"]
 
 
 def _gaussians(x):

@@ -161,7 +161,7 @@ def network(kind: str, encoded: bool, signal: Signal) -> Network:
 
     def apply(params, points):
         features = jax.vmap(lambda point: encoding.encode(waves, point, None))(points)
-        of = kan.apply if kind == "kan" else mlp.apply
+        of = kan.apply_heads if kind == "kan" else mlp.apply
         return of(spec, params, features)["value"][:, 0]
 
     return Network(lambda key: _init(spec, key), apply, width, size(width))
@@ -169,13 +169,13 @@ def network(kind: str, encoded: bool, signal: Signal) -> Network:
 
 def _spec(kind, inputs, width):
     if kind == "kan":
-        return KANSpec(inputs, (width, width), HEAD)
+        return KANSpec(inputs, (width, width), heads=HEAD)
     return MLPSpec(inputs, 3, width, HEAD, activation=kind, init="he")
 
 
 def _init(spec, key):
     if isinstance(spec, KANSpec):
-        return kan.init(spec, key)
+        return kan.init(key, spec)
     params = mlp.init(spec, key)
     if spec.activation != "sine":
         return params

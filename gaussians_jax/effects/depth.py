@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from nerfies_jax.contract import checked
 from nerfies_jax.geometry.precision import widened
 from nerfies_jax.training import losses
 from nerfies_jax.training.effects import Effect, Observation, PenaltyContext, Term
@@ -59,6 +60,7 @@ class DepthSpec:
             )
 
 
+@checked
 def affine(
     depth: Float[Array, " pixels"],
     truth: Float[Array, " pixels"],
@@ -69,6 +71,7 @@ def affine(
     Both are positive where `known`. Equations 5 to 7 of Ranftl et al. 2020. Zero with
     fewer than two known pixels.
     """
+    depth, truth = widened(depth), widened(truth)
     known = known & (jnp.sum(known) > 1)
     return losses.l1(
         _about_median(depth, known)[:, None],
@@ -77,12 +80,14 @@ def affine(
     )
 
 
+@checked
 def correlation(
     depth: Float[Array, " pixels"],
     truth: Float[Array, " pixels"],
     known: Bool[Array, " pixels"],
 ) -> Float[Array, ""]:
     """1 - Pearson's r over the known pixels, in [0, 2]; zero with fewer than two."""
+    depth, truth = widened(depth), widened(truth)
     known = known & (jnp.sum(known) > 1)
     # Half the mean square of the difference of standardised depths: 1 - r itself would
     # have no digit left where the depths agree.
@@ -90,6 +95,7 @@ def correlation(
     return losses.mse(a, b, known) / 2
 
 
+@checked
 def metric(
     depth: Float[Array, " pixels"],
     truth: Float[Array, " pixels"],
@@ -99,6 +105,7 @@ def metric(
 
     Relative, so that its weight means the same in every unit of length.
     """
+    depth, truth = widened(depth), widened(truth)
     scale = losses.masked_mean(truth[:, None], known)
     error = losses.l1(depth[:, None], truth[:, None], known)
     return error / jnp.where(scale > 0, scale, 1)

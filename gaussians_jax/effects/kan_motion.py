@@ -163,7 +163,7 @@ def _kan_spec(spec):
         (name, HeadSpec(3, "zero")) for name, is_on in wanted.items() if is_on
     )
     return KANSpec(
-        inputs=spec.embedding + spec.time_code,
+        in_features=spec.embedding + spec.time_code,
         hidden=spec.hidden,
         heads=heads,
         kernels=spec.kernels,
@@ -175,7 +175,9 @@ def _kan_spec(spec):
 
 
 def _mlp_spec(spec: KANSpec, width):
-    return MLPSpec(spec.inputs, len(spec.hidden), width, spec.heads, (), "relu", "he")
+    return MLPSpec(
+        spec.in_features, len(spec.hidden), width, spec.heads, (), "relu", "he"
+    )
 
 
 def equal_width(spec: KANSpec) -> int:
@@ -219,12 +221,17 @@ def init(
     times_key, field_key, coarse_key = jax.random.split(key, 3)
     times = motion_codes.init_times(times_key, spec, frames, dtype)
     network = field_spec(spec)
-    init_field = kan.init if isinstance(network, KANSpec) else mlp.init
-    field = init_field(network, field_key, dtype)
+
+    def init_field(key):
+        if isinstance(network, KANSpec):
+            return kan.init(key, network, dtype)
+        return mlp.init(network, key, dtype)
+
+    field = init_field(field_key)
     if spec.coarser is None:
         return KanMotion(times, field)
     rows = jnp.full(1, motion_codes.fine_rows(spec, len(times), 0), dtype)
-    return KanMotion(times, field, rows, init_field(network, coarse_key, dtype))
+    return KanMotion(times, field, rows, init_field(coarse_key))
 
 
 def prepare(

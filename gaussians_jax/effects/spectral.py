@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from nerfies_jax.contract import checked
 from nerfies_jax.geometry.precision import widened
 from nerfies_jax.training import schedules
 from nerfies_jax.training.effects import Effect, PenaltyContext, Term
@@ -135,6 +136,7 @@ class Gates(NamedTuple):
     fourier: Float[Array, ""] | None
 
 
+@checked
 def haar_pyramid(image: Float[Array, "height width channels"], levels: int) -> Pyramid:
     """Split a picture of any size `levels` times; orthonormal.
 
@@ -185,6 +187,7 @@ def filled(
     return jnp.where(keep, render, truth), truth
 
 
+@checked(images=("render", "truth"))
 def wavelet_loss(
     spec: WaveletSpec,
     render: Float[Array, "height width channels"],
@@ -203,6 +206,7 @@ def wavelet_loss(
     )
 
 
+@checked(images=("render", "truth"))
 def fourier_loss(
     spec: FourierSpec,
     render: Float[Array, "height width channels"],
@@ -225,6 +229,7 @@ def fourier_loss(
     return jnp.sum(squares) / truth.size
 
 
+@checked
 def amplitudes(
     image: Float[Array, "height width channels"],
 ) -> Float[Array, "height half channels"]:

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
+from nerfies_jax.contract import checked
 from nerfies_jax.effects.effect import RayOutput, Scalar
 from nerfies_jax.geometry import matrix3
 from nerfies_jax.geometry.jacobi import cross, dot
@@ -40,7 +41,8 @@ class ElasticSpec:
     logged of it is right as a mean over so many steps.
 
     `fold_cost` is what mirroring a unit volume costs beside ρ; 0 makes mirror images
-    free, as the official code does. See `cost`.
+    free, as the official code does. See
+    `displacement_cost`.
     """
 
     weight: float = 1e-3
@@ -109,8 +111,9 @@ def energy_of_step(spec: ElasticSpec, context: PenaltyContext) -> tuple[Scalar, 
     )
 
 
-def cost(spec: ElasticSpec, displacement: Matrix) -> Scalar:
-    """What the Jacobian `displacement` of a displacement field costs at one sample.
+@checked
+def displacement_cost(spec: ElasticSpec, displacement: Matrix) -> Scalar:
+    """Compute the cost of one Jacobian of a displacement field, not of a warp.
 
     ρ(E) + `fold_cost` max(0, -det J), with J = 1 + `displacement` and E its log energy.
     Two things are needed where J folds. E must be signed: unsigned, a mirror image is
@@ -125,10 +128,13 @@ def cost(spec: ElasticSpec, displacement: Matrix) -> Scalar:
         strain = losses.geman_mcclure(strain, spec.robust_width, spec.scaling)
     if not folds:
         return strain
-    return strain + spec.fold_cost * jax.nn.relu(-determinant(displacement))
+    return strain + spec.fold_cost * jax.nn.relu(
+        -displacement_determinant(displacement)
+    )
 
 
-def determinant(displacement: Matrix) -> Scalar:
+@checked
+def displacement_determinant(displacement: Matrix) -> Scalar:
     """det(1 + D), as a triple product."""
     # Broadcast products: `jnp.linalg.det` is LU, whose slope at rank one is NaN.
     x, y, z = displacement + jnp.eye(3, dtype=displacement.dtype)
@@ -147,8 +153,8 @@ def energy(spec: ElasticSpec, context: PenaltyContext) -> tuple[Scalar, Scalar]:
 
     def at(point, condition):
         jacobian = jax.jacfwd(lambda x: context.displace(x, condition))(point)
-        folded = determinant(jax.lax.stop_gradient(jacobian)) < 0
-        return cost(spec, jacobian), folded.astype(point.dtype)
+        folded = displacement_determinant(jax.lax.stop_gradient(jacobian)) < 0
+        return displacement_cost(spec, jacobian), folded.astype(point.dtype)
 
     costs, folded = jax.vmap(jax.vmap(at, (0, None)))(point, context.condition)
     seen = jnp.sum(weight)

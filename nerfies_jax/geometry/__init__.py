@@ -1,1 +1,8 @@
 """Floor 1: where points and cameras are."""
+
+import lazy_loader
+
+# Modules that `nerfies_jax` shows; each is loaded when it is used.
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__, ["matrix3", "quaternion", "se3", "so3"]
+)

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from nerfies_jax.geometry import distortion, lie
+from nerfies_jax.contract import checked
+from nerfies_jax.geometry import distortion, lie, matrices
 from nerfies_jax.geometry.precision import exact_product, refuse_half
 
 # Both keep what is at or behind the camera finite in float32, where 1/z² overflows
@@ -37,7 +38,48 @@ class Camera(NamedTuple):
     radial: Float[Array, "*batch 3"]  # k1 k2 k3
     tangential: Float[Array, "*batch 2"]  # p1 p2
 
+    @classmethod
+    def from_K(
+        cls,
+        K: Any,
+        camera_from_world: Any,
+        width: int,
+        height: int,
+        distortion: Any = None,
+        dtype: Any = np.float32,
+    ) -> "Camera":
+        """Make a camera from an intrinsic matrix and a world-to-camera pose.
 
+        The pose is the `viewmat` of gsplat. Pixel centers lie at +0.5, as in COLMAP and
+        gsplat; add 0.5 to the principal point of a calibration by OpenCV, whose centers
+        lie at whole numbers.
+
+        Args:
+          K: Intrinsics in pixels, [..., 3, 3], with focal lengths and skew in the upper
+            triangle, the principal point in the last column and last row (0, 0, 1).
+          camera_from_world: World-to-camera transforms, [..., 4, 4] or [..., 3, 4], for
+            a camera that looks along +z with x to the right and y down.
+          width: Image width in pixels.
+          height: Image height in pixels.
+          distortion: Coefficients (k1, k2, p1, p2) or (k1, k2, p1, p2, k3) in OpenCV's
+            order, [..., 4] or [..., 5]. None for a pinhole.
+          dtype: Floating-point type of the result; conversions are made in float64.
+
+        Returns:
+          A camera with NumPy leaves, or a batch of them with the leading axes of the
+          arguments, which broadcast.
+
+        Raises:
+          ValueError: Where a shape is wrong, K is not an intrinsic matrix, the pose is
+            not rigid, or the principal point lies far outside the image.
+        """
+        fields = matrices.camera_fields(K, camera_from_world, distortion)
+        camera = cls(**{name: value.astype(dtype) for name, value in fields.items()})
+        validate(camera, (width, height), "Camera.from_K")
+        return camera
+
+
+@checked(broadcast=True)
 def project(
     camera: Camera, point: Float[Array, "3"]
 ) -> tuple[Float[Array, "2"], Float[Array, ""]]:
@@ -63,6 +105,7 @@ def project(
     return pixel + camera.principal_point_px, depth
 
 
+@checked(broadcast=True)
 def projectable(camera: Camera, point: Float[Array, "3"]) -> Bool[Array, ""]:
     """Whether one world point is in front and where the lens model is one-to-one.
 
@@ -75,6 +118,7 @@ def projectable(camera: Camera, point: Float[Array, "3"]) -> Bool[Array, ""]:
     return in_front & distortion.one_to_one(camera.radial, camera.tangential, slopes)
 
 
+@checked(broadcast=True)
 def unproject(
     camera: Camera, pixel: Float[Array, "2"]
 ) -> tuple[Float[Array, "3"], Bool[Array, ""]]:

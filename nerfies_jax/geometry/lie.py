@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from nerfies_jax.contract import checked
 from nerfies_jax.geometry import quaternion
 from nerfies_jax.geometry.jacobi import cross
 from nerfies_jax.geometry.precision import at_least_float32, exact_product
@@ -20,6 +21,7 @@ Vector = Float[Array, "3"]
 Matrix = Float[Array, "3 3"]
 
 
+@checked(broadcast=True)
 @at_least_float32
 def transform_point(angular: Vector, linear: Vector, point: Vector) -> Vector:
     """One point moved along a screw: R x + G v, without any matrix.
@@ -29,6 +31,7 @@ def transform_point(angular: Vector, linear: Vector, point: Vector) -> Vector:
     return point + displacement(angular, linear, point)
 
 
+@checked(broadcast=True)
 @at_least_float32
 def displacement(angular: Vector, linear: Vector, point: Vector) -> Vector:
     """How far `transform_point` moves the point: (R - 1) x + G v, uncancelled.
@@ -42,6 +45,7 @@ def displacement(angular: Vector, linear: Vector, point: Vector) -> Vector:
     return linear + _cross(angular, inner)
 
 
+@checked(broadcast=True)
 @at_least_float32
 def rotate_point(angular: Vector, point: Vector) -> Vector:
     """One point turned about the origin."""
@@ -52,6 +56,7 @@ def rotate_point(angular: Vector, point: Vector) -> Vector:
     )
 
 
+@checked(broadcast=True)
 @at_least_float32
 def exp_so3(angular: Vector) -> Matrix:
     """The rotation matrix of axis × angle (Rodrigues)."""
@@ -59,6 +64,7 @@ def exp_so3(angular: Vector) -> Matrix:
     return jax.vmap(rotate_point, (None, 0), out_axes=1)(angular, basis)
 
 
+@checked(broadcast=True)
 @at_least_float32
 def log_so3(rotation: Matrix) -> Vector:
     """Axis × angle of a rotation matrix, at most π rad.
@@ -69,12 +75,14 @@ def log_so3(rotation: Matrix) -> Vector:
     return quaternion.log(quaternion.from_matrix(rotation))
 
 
+@checked(broadcast=True)
 @at_least_float32
 def exp_se3(angular: Vector, linear: Vector) -> tuple[Matrix, Vector]:
     """Rotation matrix and translation of a screw."""
     return exp_so3(angular), exact_product(left_jacobian(angular), linear)
 
 
+@checked(broadcast=True)
 @at_least_float32
 def log_se3(rotation: Matrix, translation: Vector) -> tuple[Vector, Vector]:
     """The screw of a rigid motion: the inverse of `exp_se3` for turns below π."""
@@ -82,6 +90,7 @@ def log_se3(rotation: Matrix, translation: Vector) -> tuple[Vector, Vector]:
     return angular, exact_product(inverse_left_jacobian(angular), translation)
 
 
+@checked(broadcast=True)
 @at_least_float32
 def left_jacobian(angular: Vector) -> Matrix:
     """∫₀¹ exp(τ [w]) dτ: how `exp_so3(w)` turns as w moves, in the fixed frame."""
@@ -89,6 +98,7 @@ def left_jacobian(angular: Vector) -> Matrix:
     return _polynomial(angular, stumpff(2, angle_sq), stumpff(3, angle_sq))
 
 
+@checked(broadcast=True)
 @at_least_float32
 def inverse_left_jacobian(angular: Vector) -> Matrix:
     """The inverse, for turns below 2π, where it is singular."""
@@ -98,6 +108,7 @@ def inverse_left_jacobian(angular: Vector) -> Matrix:
     return _polynomial(angular, -jnp.full_like(c2, 0.5), (c3 - 2 * c4) / (2 * c2))
 
 
+@checked(broadcast=True)
 @at_least_float32
 def left_jacobian_se3(angular: Vector, linear: Vector) -> Float[Array, "6 6"]:
     """The same for screws, ordered (angular, linear): [[J, 0], [Q, J]].
@@ -109,6 +120,7 @@ def left_jacobian_se3(angular: Vector, linear: Vector) -> Float[Array, "6 6"]:
     return jnp.block([[jacobian, jnp.zeros_like(jacobian)], [coupling, jacobian]])
 
 
+@checked(broadcast=True)
 def hat(vector: Vector) -> Matrix:
     """[w], with [w] x = w × x."""
     x, y, z = vector

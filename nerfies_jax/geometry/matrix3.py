@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from nerfies_jax.contract import checked
 from nerfies_jax.geometry import jacobi
 from nerfies_jax.geometry.jacobi import dot
 from nerfies_jax.geometry.precision import at_least_float32
@@ -33,6 +34,7 @@ CONE = 1e-6
 SMALL_DISPLACEMENT = 0.1
 
 
+@checked(broadcast=True)
 @at_least_float32
 def log_energy(matrix: Matrix) -> Scalar:
     """Σ log²σ over the singular values: zero for rotations and for reflections.
@@ -42,6 +44,7 @@ def log_energy(matrix: Matrix) -> Scalar:
     return _energy(False, matrix)
 
 
+@checked(broadcast=True)
 @at_least_float32
 def signed_log_energy(matrix: Matrix) -> Scalar:
     """The same, but the smallest singular value carries the sign of the determinant.
@@ -51,6 +54,7 @@ def signed_log_energy(matrix: Matrix) -> Scalar:
     return _energy(True, matrix)
 
 
+@checked(broadcast=True)
 @at_least_float32
 def displacement_log_energy(
     displacement: Matrix, otherwise: Callable[[Matrix], Scalar] = log_energy
@@ -75,6 +79,7 @@ def _strain(displacement):
     )
 
 
+@checked(broadcast=True)
 @at_least_float32
 def singular_values(matrix: Matrix) -> Float[Array, "3"]:
     """In descending order, not negative. Once differentiable, also where equal."""
@@ -93,6 +98,7 @@ def _singular_values_jvp(primals, tangents):
     return jnp.stack(values), jnp.stack([turned[k][k] for k in range(3)])
 
 
+@checked(broadcast=True)
 @at_least_float32
 def svd(matrix: Matrix) -> tuple[Matrix, Float[Array, "3"], Matrix]:
     """U, σ, V with M = U diag(σ) Vᵀ, both of them rotations; not differentiable.

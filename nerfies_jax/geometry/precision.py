@@ -39,11 +39,13 @@ def at_least_float32(function):
     """
 
     @functools.wraps(function)
-    def wide(*args):
-        kinds = {arg.dtype for arg in args if hasattr(arg, "dtype")}
+    def wide(*args, **kwargs):
+        every = (*args, *kwargs.values())
+        kinds = {arg.dtype for arg in every if hasattr(arg, "dtype")}
         if not kinds.intersection(_HALVES):
-            return function(*args)
-        results = function(*(_wide(arg) for arg in args))
+            return function(*args, **kwargs)
+        wider = {name: _wide(arg) for name, arg in kwargs.items()}
+        results = function(*(_wide(arg) for arg in args), **wider)
         if len(kinds) > 1:
             return results
         return jax.tree.map(lambda leaf: leaf.astype(*kinds), results)

@@ -7,6 +7,7 @@ since what an optimiser moves is never exactly of length one.
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from nerfies_jax.contract import checked
 from nerfies_jax.geometry.fusion import components, stacked
 from nerfies_jax.geometry.jacobi import cross, dot
 from nerfies_jax.geometry.precision import at_least_float32, near_one
@@ -20,6 +21,7 @@ SERIES_BELOW = 0.04
 _ARCTAN = tuple((-1) ** n / (2 * n + 1) for n in range(14))
 
 
+@checked(broadcast=True)
 @at_least_float32
 def normalise(quaternion: Quaternion) -> Quaternion:
     """The same rotation at unit length.
@@ -44,6 +46,7 @@ def identity(dtype=jnp.float32) -> Quaternion:
     return jnp.asarray([1, 0, 0, 0], dtype)
 
 
+@checked(broadcast=True)
 @at_least_float32
 def multiply(second: Quaternion, first: Quaternion) -> Quaternion:
     """The rotation `first`, then `second`: the matrices' order of reading."""
@@ -54,11 +57,13 @@ def multiply(second: Quaternion, first: Quaternion) -> Quaternion:
     return stacked([w * a - dot(v, u), *vector])
 
 
+@checked(broadcast=True)
 def conjugate(quaternion: Quaternion) -> Quaternion:
     """The inverse rotation of a unit quaternion."""
     return jnp.concatenate([quaternion[:1], -quaternion[1:]])
 
 
+@checked(broadcast=True)
 @at_least_float32
 def rotate(quaternion: Quaternion, vector: Float[Array, "3"]) -> Float[Array, "3"]:
     """One vector, turned; the quaternion may have any length."""
@@ -67,6 +72,7 @@ def rotate(quaternion: Quaternion, vector: Float[Array, "3"]) -> Float[Array, "3
     return vector + 2 * (unit[0] * swept + jnp.cross(unit[1:], swept))
 
 
+@checked(broadcast=True)
 @at_least_float32
 def to_matrix(quaternion: Quaternion) -> Float[Array, "3 3"]:
     """The rotation matrix; the quaternion may have any length.
@@ -83,6 +89,7 @@ def to_matrix(quaternion: Quaternion) -> Float[Array, "3 3"]:
     return jnp.stack(entries).reshape(3, 3)
 
 
+@checked(broadcast=True)
 @at_least_float32
 def from_matrix(rotation: Float[Array, "3 3"]) -> Quaternion:
     """The unit quaternion of a rotation matrix, with w not negative.
@@ -111,6 +118,7 @@ def from_matrix(rotation: Float[Array, "3 3"]) -> Quaternion:
     return _upper(normalise(rows[jnp.argmax(diagonal)]))
 
 
+@checked(broadcast=True)
 @at_least_float32
 def exp(rotation_vector: Float[Array, "3"]) -> Quaternion:
     """The unit quaternion of axis × angle, in rad; below 1e19 rad in float32."""
@@ -120,6 +128,7 @@ def exp(rotation_vector: Float[Array, "3"]) -> Quaternion:
     return stacked([stumpff(0, quarter_sq), *(half * part for part in parts)])
 
 
+@checked(broadcast=True)
 @at_least_float32
 def log(quaternion: Quaternion) -> Float[Array, "3"]:
     """Axis × angle, the short way round (at most π rad), of a quaternion of any length.
@@ -141,6 +150,7 @@ def log(quaternion: Quaternion) -> Float[Array, "3"]:
     return 2 * jnp.where(near, series / divisor, far) * vector
 
 
+@checked(broadcast=True)
 @at_least_float32
 def slerp(start: Quaternion, end: Quaternion, fraction: Float[Array, ""]) -> Quaternion:
     """Between two unit quaternions at constant speed, the short way round."""

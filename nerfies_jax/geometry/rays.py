@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from nerfies_jax.contract import checked
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry.camera import Camera
 
@@ -28,12 +29,14 @@ class Rays(NamedTuple):
     valid: Bool[Array, "*rays"]  # False where the lens model has no ray for the pixel
 
 
+@checked(broadcast=True)
 def pixel_ray(camera: Camera, pixel: Float[Array, "2"]) -> Rays:
     """The ray of one pixel position; column i, row j is centred on (i + ½, j + ½)."""
     direction, converged = cameras.unproject(camera, pixel)
     return Rays(jnp.asarray(camera.position), direction, converged)
 
 
+@checked(broadcast=True)
 def pixel_rays(camera: Camera, size: tuple[int, int]) -> Rays:
     """Rays [height, width] through the pixel centres of a (width, height) picture."""
     return jax.vmap(jax.vmap(lambda pixel: pixel_ray(camera, pixel)))(

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from nerfies_jax.contract import checked
 from nerfies_jax.geometry.precision import exact_einsum, widened
 from nerfies_jax.training import losses
 
@@ -26,11 +27,13 @@ SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 Padding = Literal["valid", "zero"]
 
 
+@checked(images=("image",))
 def quantise(image: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """What is left of a picture after an 8-bit file: clipped and rounded to n/255."""
     return jnp.round(jnp.clip(image, 0.0, 1.0) * 255.0) / 255.0
 
 
+@checked(broadcast=True, images=("image", "truth"))
 def psnr(
     image: Float[Array, "height width channels"],
     truth: Float[Array, "height width channels"],
@@ -44,6 +47,7 @@ def psnr(
     return losses.psnr(jnp.mean(error**2))
 
 
+@checked(broadcast=True, images=("image", "truth"))
 def masked_psnr(
     image: Float[Array, "height width channels"],
     truth: Float[Array, "height width channels"],
@@ -63,6 +67,7 @@ def masked_psnr(
     return losses.psnr(jnp.sum(error**2) / count)
 
 
+@checked(broadcast=True, images=("image", "truth"))
 def ssim(
     image: Float[Array, "height width channels"],
     truth: Float[Array, "height width channels"],
@@ -78,6 +83,7 @@ def ssim(
     return losses.ssim(image, truth, padding=padding)
 
 
+@checked(broadcast=True, images=("image", "truth"))
 def ms_ssim(
     image: Float[Array, "height width channels"],
     truth: Float[Array, "height width channels"],
@@ -135,6 +141,7 @@ def _halve(image):
     return (rows[:, 0::2] + rows[:, 1::2]) / 2.0
 
 
+@checked(broadcast=True, images=("image", "truth"))
 def masked_ssim(
     image: Float[Array, "height width channels"],
     truth: Float[Array, "height width channels"],
@@ -168,6 +175,7 @@ def masked_ssim(
     return total / (jnp.sum(centred).astype(image.dtype) * image.shape[-1])
 
 
+@checked(broadcast=True, images=("image", "truth"))
 def partial_ssim(
     image: Float[Array, "height width channels"],
     truth: Float[Array, "height width channels"],

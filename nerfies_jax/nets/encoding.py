@@ -6,6 +6,7 @@ import math
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from nerfies_jax.contract import checked
 from nerfies_jax.geometry.precision import at_least_float32
 from nerfies_jax.nets.sines import sincos, sincospi
 
@@ -49,6 +50,7 @@ class EncodingSpec:
         return (2 if self.times_pi else 2 * math.pi) / 2 ** (self.bands - 1)
 
 
+@checked(broadcast=True)
 @at_least_float32
 def encode(
     spec: EncodingSpec,
@@ -63,6 +65,11 @@ def encode(
     """
     if spec.bands == 0:
         return point
+    if window is not None and window.shape != (spec.bands,):
+        raise ValueError(
+            f"a window of {window.shape[0]} weights does not fit {spec.bands} bands; "
+            "make it with as many bands as the encoding has"
+        )
     powers = jnp.asarray([2.0**k for k in range(spec.bands)], point.dtype)
     scaled = powers[:, None] * point  # a power of two: exact; float16 would overflow
     # Half turns are reduced before π is rounded in: `sin(2^k π x)` in float32 is 1e-4
@@ -76,6 +83,7 @@ def encode(
     return jnp.concatenate([point, features]) if spec.identity else features
 
 
+@checked(broadcast=True)
 @at_least_float32
 def anneal(bands: int, alpha: Scalar) -> Float[Array, " bands"]:
     """Weights that open band k as `alpha` goes from k to k + 1; traced.
@@ -88,3 +96,57 @@ def anneal(bands: int, alpha: Scalar) -> Float[Array, " bands"]:
     opened = jnp.clip(alpha - jnp.arange(bands, dtype=alpha.dtype), 0, 1)
     # The polynomial's ends are exact: a shut band is 0 and an open one is 1.
     return sincospi(opened / 2)[0] ** 2
+
+
+def positional_encoding(
+    points: Float[Array, "*batch dim"],
+    num_frequencies: int,
+    window: Float[Array, "*batch num_frequencies"] | None = None,
+    *,
+    include_input: bool = True,
+    times_pi: bool = False,
+) -> Float[Array, "*batch features"]:
+    """Encode coordinates with sines and cosines of growing frequency.
+
+    Args:
+      points: Coordinates [..., dim]. Leading axes of `points` and `window` broadcast.
+      num_frequencies: Number of frequency bands, 1, 2, 4, ... in that order, 0 to 24.
+      window: Weight of each band, [..., num_frequencies], as `coarse_to_fine_window`
+        makes them. None leaves all bands on. The coordinates are not weighed.
+      include_input: Whether the coordinates themselves come first.
+      times_pi: Whether frequencies are multiplied by pi, as in the paper of NeRF. The
+        code of NeRF and Nerfies leaves it out.
+
+    Returns:
+      Features [..., dim * (2 * num_frequencies + include_input)]: the coordinates, then
+      for each band the sines and then the cosines of all coordinates.
+
+    Raises:
+      ValueError: Where the number of bands is out of range or does not fit the window.
+
+    References:
+      Mildenhall et al. 2020, arXiv:2003.08934, equation 4.
+    """
+    spec = EncodingSpec(num_frequencies, include_input, times_pi)
+    return encode(spec, points, window)
+
+
+def coarse_to_fine_window(
+    num_frequencies: int, alpha: Float[Array, "*batch"]
+) -> Float[Array, "*batch num_frequencies"]:
+    """Compute the weights of an encoding's bands during coarse-to-fine training.
+
+    Band k opens while `alpha` goes from k to k + 1: at 0 all bands are off, at
+    `num_frequencies` all are on.
+
+    Args:
+      num_frequencies: Number of frequency bands of the encoding.
+      alpha: Progress [...], a number or an array. It may be traced.
+
+    Returns:
+      Weights in [0, 1], [..., num_frequencies].
+
+    References:
+      Park et al. 2021 (Nerfies), arXiv:2011.12948, equation 8.
+    """
+    return anneal(num_frequencies, alpha)

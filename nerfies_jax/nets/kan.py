@@ -1,5 +1,8 @@
 """Kolmogorov-Arnold networks of Gaussian kernels (RBF-KAN) with explicit parameters.
 
+`spec = KANSpec(in_features=3, hidden=(64,), out_features=3)`, `params = init(key,
+spec)`, `y = apply(spec, params, x)` with any leading axes.
+
 One layer is y_o = sum over inputs i of f_io(x_i) + bias_o, where each function of one
 variable is a sum of Gaussians on a uniform grid and, beside it, a weighted SiLU:
 
@@ -20,11 +23,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
+from nerfies_jax.contract import checked
 from nerfies_jax.geometry.precision import power_of_two
 from nerfies_jax.nets import bsplines, mlp
 from nerfies_jax.nets.mlp import HeadSpec
 
 BASES = ("rbf", "bspline")
+OUTPUT = "output"  # name of the only head where a spec has `out_features`
 DEGREE = 3  # of the B-splines, of which there are so many more than intervals
 HEAD_INITIALISERS = ("glorot", "small", "zero")
 # Narrower kernels leave gaps between the centres, wider ones are so alike that their
@@ -41,7 +46,10 @@ LOG_WIDTH_RANGE = 10.0
 
 @dataclasses.dataclass(frozen=True)
 class KANSpec:
-    """Layers from `inputs` through `hidden` widths to the heads, which read the last.
+    """Settings of a KAN: layer widths, kernels and their grids.
+
+    Layers lead from `in_features` through the `hidden` widths to `out_features`, or
+    to several named `heads` in their place, which all read the last hidden layer.
 
     The first layer's `kernels` centres lie on `grid`, where raw inputs are expected;
     those of the others on `hidden_grid`, in front of which `norm` standardises the
@@ -58,9 +66,10 @@ class KANSpec:
     widths and gaps break that up.
     """
 
-    inputs: int
-    hidden: tuple[int, ...]
-    heads: tuple[tuple[str, HeadSpec], ...]
+    in_features: int
+    hidden: tuple[int, ...] = ()
+    out_features: int | None = None
+    heads: tuple[tuple[str, HeadSpec], ...] = ()
     kernels: int = 8
     grid: tuple[float, float] = (-1.0, 1.0)
     hidden_grid: tuple[float, float] = (-2.0, 2.0)
@@ -72,11 +81,18 @@ class KANSpec:
 
     def __post_init__(self):
         self._check_basis()
-        if self.inputs < 1 or any(width < 1 for width in self.hidden):
+        if self.in_features < 1 or any(width < 1 for width in self.hidden):
             raise ValueError(
-                "a KAN needs inputs >= 1 and hidden widths >= 1, got inputs="
-                f"{self.inputs}, hidden={self.hidden}"
+                "a KAN needs in_features >= 1 and hidden widths >= 1, got in_features="
+                f"{self.in_features}, hidden={self.hidden}"
             )
+        if (self.out_features is None) == (not self.heads):
+            raise ValueError(
+                "a KAN has either out_features or heads, got out_features="
+                f"{self.out_features} and {len(self.heads)} heads; give one of them"
+            )
+        if self.out_features is not None and self.out_features < 1:
+            raise ValueError(f"out_features={self.out_features} must be at least 1")
         if self.kernels < 2:
             raise ValueError(
                 f"kernels={self.kernels}: a grid has at least two centres, one at each "
@@ -98,10 +114,8 @@ class KANSpec:
                 "leaves signs; take widths of at least 3, or norm=False"
             )
         names = [name for name, _ in self.heads]
-        if not names or len(set(names)) < len(names):
-            raise ValueError(
-                f"a KAN needs heads, all with different names, got {names}"
-            )
+        if len(set(names)) < len(names):
+            raise ValueError(f"heads must have different names, got {names}")
         for name, head in self.heads:
             if head.init not in HEAD_INITIALISERS:
                 raise ValueError(
@@ -122,9 +136,16 @@ class KANSpec:
                 "trainable_kernels move Gaussians; B-splines lie on an even grid"
             )
 
+    @property
+    def read_outs(self) -> tuple[tuple[str, HeadSpec], ...]:
+        """The heads, or the one head that `out_features` asks for."""
+        if self.out_features is None:
+            return self.heads
+        return ((OUTPUT, HeadSpec(self.out_features)),)
+
     def widths(self) -> tuple[int, ...]:
         """Inputs of each layer; the last are those of the heads."""
-        return (self.inputs, *self.hidden)
+        return (self.in_features, *self.hidden)
 
     def grid_of(self, layer: int) -> tuple[float, float]:
         """The ends of the grid of one layer, counted from 0."""
@@ -183,15 +204,25 @@ def width(spec: KANSpec, layer: int) -> float:
     return math.sqrt(2) * spec.width_ratio * spacing(spec, layer)
 
 
-def init(spec: KANSpec, key: Key[Array, ""], dtype=jnp.float32) -> KAN:
-    """Weights as the spec says, biases zero; drawn alike in every precision.
+@checked
+def init(key: Key[Array, ""], spec: KANSpec, dtype=jnp.float32) -> KAN:
+    """Draw the parameters of a network.
 
-    "glorot", which hidden layers are too, draws the weights of the Gaussians such that
-    inputs spread over the grid give outputs of variance one. "zero" and "small" hold
-    for kernel and base weights alike.
+    Hidden layers and `out_features` are drawn as "glorot": the weights of the Gaussians
+    such that inputs spread over the grid give outputs of variance one. The initializers
+    "zero" and "small" of a head hold for kernel and base weights alike. Biases are
+    zero. All precisions draw the same numbers.
+
+    Args:
+      key: A typed key, `jax.random.key(seed)`.
+      spec: The network's settings.
+      dtype: Floating-point type of the parameters.
+
+    Returns:
+      The parameters, a pytree of arrays.
     """
     widths = spec.widths()
-    keys = jax.random.split(key, len(spec.hidden) + len(spec.heads))
+    keys = jax.random.split(key, len(spec.hidden) + len(spec.read_outs))
     hidden = tuple(
         _init_layer(spec, keys[layer], widths[layer], outputs, "glorot", dtype)
         for layer, outputs in enumerate(spec.hidden)
@@ -199,7 +230,7 @@ def init(spec: KANSpec, key: Key[Array, ""], dtype=jnp.float32) -> KAN:
     heads = {
         name: _init_layer(spec, head_key, widths[-1], head.width, head.init, dtype)
         for (name, head), head_key in zip(
-            spec.heads, keys[len(spec.hidden) :], strict=True
+            spec.read_outs, keys[len(spec.hidden) :], strict=True
         )
     }
     kernels = None
@@ -231,10 +262,53 @@ def _init_layer(spec, key, inputs, outputs, init, dtype):
     return KANLayer(kernel_bound * drawn[:-1], base, jnp.zeros(outputs, dtype))
 
 
+@checked
 def apply(
+    spec: KANSpec, params: KAN, x: Float[Array, "*batch in_features"]
+) -> Float[Array, "*batch out_features"]:
+    """Evaluate a network that has `out_features`.
+
+    Args:
+      spec: The network's settings.
+      params: Parameters from `init`, of the type of `x`.
+      x: Inputs with any leading axes, [..., in_features]. The first layer expects them
+        on `spec.grid`, and `hold` brings those outside near it.
+
+    Returns:
+      Outputs [..., out_features].
+
+    Raises:
+      ValueError: Where `x` has another number of features, or the spec has heads.
+    """
+    if spec.out_features is None:
+        raise ValueError(
+            "kan.apply: this KAN has heads and no out_features; use kan.apply_heads"
+        )
+    return apply_heads(spec, params, x)[OUTPUT]
+
+
+@checked
+def apply_heads(
     spec: KANSpec, params: KAN, inputs: Float[Array, "*batch inputs"]
 ) -> dict[str, Float[Array, "*batch outputs"]]:
-    """Every head's output by name. For one input or a batch."""
+    """Evaluate all heads of a network.
+
+    Args:
+      spec: The network's settings.
+      params: Parameters from `init`, of the type of `inputs`.
+      inputs: Inputs with any leading axes, [..., in_features].
+
+    Returns:
+      The output [..., width] of each head, by its name.
+
+    Raises:
+      ValueError: Where `inputs` has another number of features.
+    """
+    if inputs.shape[-1] != spec.in_features:
+        raise ValueError(
+            f"kan.apply: the input has shape {list(inputs.shape)}, expected [..., "
+            f"{spec.in_features}] for in_features={spec.in_features}"
+        )
     return after_first_layer(spec, params, first_layer_part(spec, params, inputs, 0))
 
 
@@ -248,9 +322,10 @@ def first_layer_part(
     the parts goes into `after_first_layer`.
     """
     stop = start + part.shape[-1]
-    if not 0 <= start < stop <= spec.inputs:
+    if not 0 <= start < stop <= spec.in_features:
         raise ValueError(
-            f"inputs {start} .. {stop - 1} are not among the {spec.inputs} of this KAN"
+            f"inputs {start} .. {stop - 1} are not among the {spec.in_features} of "
+            "this KAN"
         )
     layer, kernels = _layer(spec, params, 0)
     layer = layer._replace(
@@ -274,7 +349,7 @@ def after_first_layer(
             features = standardise(features)
         features = _sum_over_inputs(spec, index, layer, kernels, features) + layer.bias
     outputs, first_column = {}, 0
-    for name, head in spec.heads:
+    for name, head in spec.read_outs:
         outputs[name] = features[..., first_column : first_column + head.width]
         first_column += head.width
     return outputs
@@ -331,7 +406,7 @@ def _layer(spec, params, index):
     kernels = None if params.kernels is None else params.kernels[index]
     if index < len(params.hidden):
         return params.hidden[index], kernels
-    heads = [params.heads[name] for name, _ in spec.heads]
+    heads = [params.heads[name] for name, _ in spec.read_outs]
     joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=-1), *heads)
     return joined, kernels
 

@@ -13,6 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from nerfies_jax.contract import checked
 from nerfies_jax.geometry.fusion import materialised
 from nerfies_jax.geometry.precision import widened
 
@@ -20,6 +21,7 @@ from nerfies_jax.geometry.precision import widened
 LEAST_MSE = 1e-10
 
 
+@checked
 def psnr(
     mse: Float[Array, "*batch"], value_range: float = 1.0
 ) -> Float[Array, "*batch"]:
@@ -47,6 +49,7 @@ def _only_valid(
     return jnp.where(keep, image, 0), jnp.where(keep, target, 0)
 
 
+@checked
 def masked_mean(
     values: Float[Array, "*pixels channels"], valid: Bool[Array, "*pixels"] | None
 ) -> Float[Array, ""]:
@@ -59,6 +62,7 @@ def masked_mean(
     return total / jnp.maximum(count, 1)
 
 
+@checked(images=("image", "target"))
 def l1(
     image: Float[Array, "*pixels channels"],
     target: Float[Array, "*pixels channels"],
@@ -69,6 +73,7 @@ def l1(
     return masked_mean(jnp.abs(image - target), valid)
 
 
+@checked(images=("image", "target"))
 def mse(
     image: Float[Array, "*pixels channels"],
     target: Float[Array, "*pixels channels"],
@@ -79,6 +84,7 @@ def mse(
     return masked_mean(jnp.square(image - target), valid)
 
 
+@checked
 def charbonnier(
     residual_sq: Float[Array, "*batch"], width: float
 ) -> Float[Array, "*batch"]:
@@ -95,6 +101,7 @@ def charbonnier(
     return jnp.where(near, quotient, jnp.sqrt(residual_sq + width**2) - width)
 
 
+@checked
 def huber(residual_sq: Float[Array, "*batch"], width: float) -> Float[Array, "*batch"]:
     """s / 2 up to |residual| = width, then width (|residual| - width / 2)."""
     _positive(width)
@@ -103,6 +110,7 @@ def huber(residual_sq: Float[Array, "*batch"], width: float) -> Float[Array, "*b
     return jnp.where(near, residual_sq / 2, width * (length - width / 2))
 
 
+@checked
 def geman_mcclure(
     residual_sq: Float[Array, "*batch"],
     width: float,
@@ -160,6 +168,7 @@ LUMINANCE = 0.01**2  # C1 over the squared value range
 CONTRAST = 0.03**2  # C2
 
 
+@checked(images=("image", "target"))
 def dssim_map(
     image: Float[Array, "height width channels"],
     target: Float[Array, "height width channels"],
@@ -216,6 +225,7 @@ def dssim_map(
     return dissimilarity
 
 
+@checked(images=("image", "target"))
 def ssim(
     image: Float[Array, "height width channels"],
     target: Float[Array, "height width channels"],
@@ -228,6 +238,7 @@ def ssim(
     return 1 - jnp.mean(dissimilarity)
 
 
+@checked(images=("image", "target"))
 def photometric(
     image: Float[Array, "height width channels"],
     target: Float[Array, "height width channels"],
@@ -276,11 +287,6 @@ def _comparable(image, target, padding):
         raise ValueError(
             f"an image of {image.shape[1]}x{image.shape[0]} pixels holds no 11x11 "
             "window; use padding='zero' or a larger image"
-        )
-    if not jnp.issubdtype(image.dtype, jnp.floating):
-        raise ValueError(
-            f"SSIM takes floating-point images, got {image.dtype}; "
-            "divide 8-bit images by 255"
         )
     return widened(image), widened(target)
 

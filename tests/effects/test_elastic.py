@@ -20,7 +20,9 @@ from tests import gradients
 
 TURN = scipy.spatial.transform.Rotation.from_rotvec([0.3, -0.5, 0.7]).as_matrix()
 OTHER = scipy.spatial.transform.Rotation.from_rotvec([-1.1, 0.2, 0.4]).as_matrix()
-cost_and_slope = jax.jit(jax.value_and_grad(elastic.cost, 1), static_argnums=0)
+cost_and_slope = jax.jit(
+    jax.value_and_grad(elastic.displacement_cost, 1), static_argnums=0
+)
 OFFICIAL = ElasticSpec(points=None, scaling="official", fold_cost=0.0)
 SPECS = {
     "default": ElasticSpec(),
@@ -65,7 +67,7 @@ def hard_costs(dtype):
     @jax.vmap
     def every(displacement):
         return {
-            name: jax.value_and_grad(elastic.cost, 1)(spec, displacement)
+            name: jax.value_and_grad(elastic.displacement_cost, 1)(spec, displacement)
             for name, spec in SPECS.items()
         }
 

@@ -11,7 +11,7 @@ from nerfies_jax.nets import kan
 from nerfies_jax.nets.mlp import HeadSpec
 
 SPEC = kan.KANSpec(
-    inputs=3, hidden=(), heads=(("y", HeadSpec(2)),), kernels=8, base=False
+    in_features=3, hidden=(), heads=(("y", HeadSpec(2)),), kernels=8, base=False
 )
 
 

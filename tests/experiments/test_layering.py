@@ -9,6 +9,7 @@ import pytest
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 # Longest prefix wins. gaussians_jax reads floors 1-5 of nerfies_jax, experiments all.
 FLOORS = {
+    "nerfies_jax.contract": 1,
     "nerfies_jax.geometry": 1,
     "nerfies_jax.children": 1,
     "nerfies_jax.compiler": 1,

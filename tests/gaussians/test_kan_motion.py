@@ -38,7 +38,7 @@ def test_offsets_are_those_of_the_whole_network(spec, dtype):
     """Equation 11, every Gaussian's network fed [embedding, time code]."""
     params, codes = strong("kan", spec, dtype), read_by("kan", 11, dtype)
     assert params.times.shape == (5, 4)
-    apply = kan.apply if spec.network == "kan" else mlp.apply
+    apply = kan.apply_heads if spec.network == "kan" else mlp.apply
     whole = jitted(functools.partial(apply, kan_motion.field_spec(spec)))
     for time in (0.0, 0.3, 1.0):
         offsets = uncached(params, spec, codes, np.asarray(time, dtype))
@@ -189,8 +189,11 @@ def test_the_mlp_has_as_many_parameters(changes):
     spec = KanMotionSpec(**changes)
     learnt = kan_motion.field_spec(spec)
     other = kan_motion.field_spec(dataclasses.replace(spec, network="mlp"))
-    for network, init in ((learnt, kan.init), (other, mlp.init)):
-        run = functools.partial(init, network)
+    inits = (
+        (learnt, functools.partial(kan.init, spec=learnt)),
+        (other, functools.partial(mlp.init, other)),
+    )
+    for network, run in inits:
         shapes = jax.eval_shape(run, jax.random.key(0))
         counted = sum(leaf.size for leaf in jax.tree.leaves(shapes))
         assert kan_motion.parameter_count(network) == counted

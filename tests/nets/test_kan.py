@@ -18,7 +18,7 @@ from tests import gradients
 from tests.oracles import networks
 
 SPEC = KANSpec(
-    inputs=5,
+    in_features=5,
     hidden=(7, 6),
     heads=(("shift", HeadSpec(3)), ("turn", HeadSpec(2))),
     kernels=5,
@@ -39,7 +39,7 @@ SOME = [
     for name in VARIANTS
 ]
 
-apply = jax.jit(kan.apply, static_argnums=0)
+apply = jax.jit(kan.apply_heads, static_argnums=0)
 
 
 def centres(spec, layer):
@@ -48,7 +48,7 @@ def centres(spec, layer):
 
 def filled(spec, dtype):
     """A network all of whose parameters matter: kernels moved, biases not zero."""
-    shapes = jax.eval_shape(lambda key: kan.init(spec, key), jax.random.key(0))
+    shapes = jax.eval_shape(lambda key: kan.init(key, spec), jax.random.key(0))
     rng = np.random.default_rng(1)
 
     def draw(leaf):
@@ -142,7 +142,8 @@ def test_gradients(variant, float64, rng):
 
     def total(params, inputs):
         return sum(
-            jnp.sum(jnp.sin(head)) for head in kan.apply(spec, params, inputs).values()
+            jnp.sum(jnp.sin(head))
+            for head in kan.apply_heads(spec, params, inputs).values()
         )
 
     inputs = rng.normal(size=(3, 5))
@@ -217,7 +218,7 @@ def sum_and_slopes(spec, params, inputs):
     """The sum of the heads, the heads, and the slopes of the sum."""
 
     def total(params, inputs):
-        heads = kan.apply(spec, params, inputs)
+        heads = kan.apply_heads(spec, params, inputs)
         return sum(jnp.sum(head) for head in heads.values()), heads
 
     return jax.value_and_grad(total, argnums=(0, 1), has_aux=True)(params, inputs)
@@ -253,19 +254,18 @@ def test_bfloat16_is_finite_and_near(rng):
 
 def test_initial_outputs_have_variance_one(dtype, rng):
     """Over inputs spread over the grid, whatever their number and the kernels'."""
-    init = jax.jit(kan.init, static_argnums=(0, 2))
+    init = jax.jit(kan.init, static_argnums=(1, 2))
     cases = ((2, 8, 0.7, "rbf"), (48, 5, 0.5, "rbf"), (200, 16, 1.0, "rbf"))
     for inputs, kernels, ratio, basis in (*cases, (48, 9, 0.7, "bspline")):
         spec = KANSpec(
             inputs,
-            (),
-            (("y", HeadSpec(256)),),
+            heads=(("y", HeadSpec(256)),),
             kernels=kernels,
             width_ratio=ratio,
             base=False,
             basis=basis,
         )
-        params = init(spec, jax.random.key(0), jnp.dtype(dtype))
+        params = init(jax.random.key(0), spec, jnp.dtype(dtype))
         assert not np.asarray(params.heads["y"].bias).any()
         x = rng.uniform(-0.8, 0.8, (256, inputs)).astype(dtype)
         outputs = np.asarray(apply(spec, params, x)["y"], np.float64)
@@ -279,8 +279,8 @@ def test_networks_start_as_they_are_told(rng):
 
     @jax.jit
     def start(key, inputs):
-        params = kan.init(spec, key)
-        return params, kan.apply(spec, params, inputs)
+        params = kan.init(key, spec)
+        return params, kan.apply_heads(spec, params, inputs)
 
     given = jax.random.key(4), rng.normal(size=(9, 5)).astype(np.float32)
     params, answers = jax.tree.map(np.asarray, start(*given))
@@ -324,7 +324,7 @@ def test_b_splines_sum_to_one_on_their_grid(float64):
 def test_what_is_off_has_no_parameters():
     bare, trained = (
         jax.eval_shape(
-            lambda key, name=name: kan.init(VARIANTS[name], key), jax.random.key(0)
+            lambda key, name=name: kan.init(key, VARIANTS[name]), jax.random.key(0)
         )
         for name in ("no base", "trained kernels")
     )

@@ -14,7 +14,7 @@ from nerfies_jax.nets.mlp import HeadSpec, MLPSpec
 
 TWICE = (("a", HeadSpec(1)), ("a", HeadSpec(2)))
 NET = MLPSpec(inputs=5, depth=4, width=7, heads=(("a", HeadSpec(3)),))
-SPLINES = KANSpec(inputs=5, hidden=(7, 6), heads=(("a", HeadSpec(3)),))
+SPLINES = KANSpec(in_features=5, hidden=(7, 6), heads=(("a", HeadSpec(3)),))
 
 
 def code_table(**size):
@@ -46,7 +46,7 @@ def splines(**changes):
         (net, {"activation": "swish"}, "'swish'; choose from"),
         (net, {"init": "xavier"}, "'xavier'; choose from"),
         (net, {"heads": TWICE}, "different names"),
-        (splines, {"inputs": 0}, "inputs >= 1"),
+        (splines, {"in_features": 0}, "in_features >= 1"),
         (splines, {"hidden": (4, 0)}, "hidden widths"),
         (splines, {"kernels": 1}, "two centres"),
         (splines, {"grid": (1.0, 1.0)}, "grid needs low < high"),
@@ -54,7 +54,9 @@ def splines(**changes):
         (splines, {"width_ratio": 3.0}, "cannot be told apart"),
         (splines, {"width_ratio": math.nan}, "width_ratio=nan"),
         (splines, {"hidden": (7, 2)}, "leaves signs"),
-        (splines, {"heads": ()}, "needs heads"),
+        (splines, {"heads": ()}, "either out_features or heads"),
+        (splines, {"out_features": 2}, "either out_features or heads"),
+        (splines, {"heads": (), "out_features": 0}, "out_features=0"),
         (splines, {"heads": TWICE}, "different names"),
         (splines, {"heads": (("a", HeadSpec(1, "he")),)}, "unknown init 'he'"),
     ],
@@ -65,7 +67,7 @@ def test_wrong_settings_are_refused(make, settings, words):
 
 
 def test_parts_outside_the_inputs_are_refused():
-    params = jax.eval_shape(lambda key: kan.init(SPLINES, key), jax.random.key(0))
+    params = jax.eval_shape(lambda key: kan.init(key, SPLINES), jax.random.key(0))
     with pytest.raises(ValueError, match=r"4 \.\. 6 .* 5 of this KAN"):
         jax.eval_shape(
             lambda params, part: kan.first_layer_part(SPLINES, params, part, 4),
