@@ -80,7 +80,7 @@ def main(args):
         folder = run_folder.new_run_folder(args.out, "compare")
         goals = args.psnr or default_goals(compared)
     console.say(table(compared, goals))
-    for line in remarks(compared):
+    for line in (*legend(compared), *remarks(compared)):
         console.say(line)
     save(folder, compared, goals)
     if args.frames:
@@ -151,9 +151,26 @@ def times(compared, goals) -> list[list[float | None]]:
     return [[curves.seconds_to(run.curve, goal) for goal in goals] for run in compared]
 
 
+def _columns(compared):
+    """Those of which any run has a number."""
+    return [c for c in COLUMNS if any(run.metrics.get(c[0]) for run in compared)]
+
+
+def legend(compared) -> list[str]:
+    """Explain the columns of the table, a line each."""
+    from nerfies_jax.measure.metric_table import METRICS
+
+    better = {"higher": " Higher is better.", "lower": " Lower is better.", "equal": ""}
+    entries = [(head, METRICS[key]) for key, head, *_ in _columns(compared)]
+    return [
+        f"  {head}: {entry.explanation}{better[entry.direction]}"
+        for head, entry in entries
+    ]
+
+
 def table(compared, goals) -> str:
     """One line for each run."""
-    known = [c for c in COLUMNS if any(run.metrics.get(c[0]) for run in compared)]
+    known = _columns(compared)
     heads = ["run", *(c[1] for c in known), *(f"s to {goal:g} dB" for goal in goals)]
     lines = [heads]
     for run, reached in zip(compared, times(compared, goals), strict=True):
@@ -180,6 +197,13 @@ def remarks(compared) -> list[str]:
     """What a reader must know before he believes the table."""
     sentences = []
     first = compared[0]
+    for run in compared:
+        scored, drawn = run.metrics.get("heldout.frames"), len(run.curve.frames)
+        if scored is not None and drawn < scored:
+            sentences.append(
+                f"The curve of {run.name} and its times to a PSNR are of {drawn} "
+                f"held-out frames, its scores in the table of {scored:.0f}."
+            )
     for run in compared[1:]:
         for key in ("cpu", "cores", "xla_cores", "jax"):
             here, there = run.curve.machine.get(key), first.curve.machine.get(key)

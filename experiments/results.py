@@ -260,6 +260,13 @@ def _write(path, text):
         partial.write_text(text)
 
 
+def _copy(source, path):
+    from nerfies_jax.capture.json_files import replaced_file
+
+    with replaced_file(path) as partial:
+        shutil.copyfile(source, partial)
+
+
 def kept() -> list[str]:
     """The pages whose numbers are there."""
     return [name for name, study in STUDIES.items() if (ROOT / study.measured).exists()]
@@ -281,10 +288,10 @@ def keep(name: str, measured: pathlib.Path) -> None:
         raise ValueError(
             f"--measured {measured}: not what {STUDIES[name].command} writes ({error})"
         ) from error
-    shutil.copyfile(measured, ROOT / STUDIES[name].measured)
+    _copy(measured, ROOT / STUDIES[name].measured)
     picture = measured.with_suffix(".png")
     if picture.exists():
-        shutil.copyfile(picture, PAGES / f"{name}.png")
+        _copy(picture, PAGES / f"{name}.png")
 
 
 def _check_of(name, stored, measured):

@@ -128,6 +128,10 @@ def test_the_curve_is_a_picture_with_a_line_for_each_history(tmp_path):
     first = skimage.io.imread(path)
     pictures.curve({"one": one, "two": pictures.History([0, 2], [18, 22])}, path)
     second = skimage.io.imread(path)
+    pictures.curve({"one": one}, path, pictures.Final(2.0, 24.0, frames=9, watched=4))
+    marked = skimage.io.imread(path)[..., :3].astype(int)
+    orange = np.abs(marked - (0xC2, 0x41, 0x0C)).max(axis=-1) < 8
+    assert orange.sum() > 100  # the mark and its number
     assert first.shape[1] == 936
     assert (second[..., :3] != first[..., :3]).any()
     assert [p.name for p in tmp_path.iterdir()] == ["psnr.png"]

@@ -39,7 +39,13 @@ def test_the_table_tells_who_was_when_as_good(tmp_path, capsys):
     good = run_folder(tmp_path / "two" / "good", (10.0, 30.0), (1.0, 3.0))
     out = tmp_path / "out"
     compare.main([str(slow), str(good), "--frames", "0", "--out", str(out)])
-    head, first, second, *_ = capsys.readouterr().out.splitlines()
+    printed = capsys.readouterr().out
+    head, first, second, *_ = printed.splitlines()
+    assert "PSNR: Mean peak signal-to-noise ratio" in printed
+    assert (
+        "train s: Wall-clock time of all training steps, without compilation. Lower"
+        in (printed)
+    )
     assert head.split()[:3] == ["run", "PSNR", "train"]
     assert head.endswith("s to 20 dB")
     assert first.split() == ["slow", "20.04", "4", "4"]
@@ -59,7 +65,9 @@ def test_other_machines_and_frames_are_remarked(tmp_path):
     saved = json.loads((two / "curve.json").read_text())
     saved["machine"]["cpu"], saved["frames"] = "another", ["frame 3", "frame 9"]
     (two / "curve.json").write_text(json.dumps(saved))
+    (two / "metrics.json").write_text(json.dumps({"heldout.frames": 15}))
     lines = compare.remarks(compare.read([one, two]))
+    assert sum("are of 2 held-out frames" in line for line in lines) == 1
     assert any("cpu" in line and "another" in line for line in lines)
     assert any("different held-out frames (1 and 2)" in line for line in lines)
 

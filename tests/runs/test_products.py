@@ -8,9 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from nerfies_jax.evaluation import pictures
 from nerfies_jax.evaluation.representation import Saved
 from nerfies_jax.evaluation.scores import Scored
-from nerfies_jax.runs import products, representations, step_profile
+from nerfies_jax.runs import curve_figure, products, representations, step_profile
 from nerfies_jax.runs.config import RunConfig
 from nerfies_jax.runs.run import Run, scene_spec
 from nerfies_jax.runs.train import Trained
@@ -72,6 +73,37 @@ def test_a_profile_that_fails_loses_nothing_but_itself():
             step_ms, (note,) = profile()
         assert step_ms == {}
         assert "is not known: KeyError: 'kept'" in note
+
+
+def test_the_curve_and_the_headline_agree_visibly(tmp_path, monkeypatch):
+    """The curve is of a few frames; its figure and caption have the score as well."""
+    drawn = []
+    monkeypatch.setattr(pictures, "curve", lambda *parts: drawn.append(parts))
+    capture = scenes.tiny_capture()
+    config = RunConfig("splats-static-small")
+    run = Run(config, capture, capture, None, None, None, None)
+    rows = ({"seconds": 1.0, "psnr": 20.0}, {"seconds": 3.0, "psnr": 30.61})
+    history = types.SimpleNamespace(evaluations=rows)
+    result = types.SimpleNamespace(history=history, seconds=3.5)
+    some = np.zeros((3, 4, 5), np.float32)
+    scored = Scored(
+        np.arange(3), some, some, some, np.array([28.0, 29.0, 31.5]), np.ones(3)
+    )
+    for watched, final in ((np.arange(2), (3.5, 29.5, 3, 2)), (np.arange(3), None)):
+        trained = Trained(result, None, None, watched)
+        path = tmp_path / "curve.png"
+        assert curve_figure.save(path, run, trained, scored) == path
+        (history, _, mark) = drawn.pop()
+        assert history["splats-static-small"].psnr == [20.0, 30.61]
+        assert mark == final
+        caption = curve_figure.caption(run, trained, scored)
+        assert "ends at 30.61 dB" in caption
+        assert ("over all 3 frames" in caption) == (final is not None)
+        assert ("29.50 dB" in caption) == (final is not None)
+        names = ", ".join(capture.ids[:2])
+        assert (f"2 of the 3 scored held-out frames ({names})" in caption) == (
+            final is not None
+        )
 
 
 def test_twice_as_long_is_twice_as_long_whoever_set_the_steps():
