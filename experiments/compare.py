@@ -1,4 +1,4 @@
-"""Lay finished runs over each other: curves, time to a quality, pictures, a table.
+"""Lay runs over each other: curves, time to a quality, pictures, a table.
 
     python -m experiments.compare RUN RUN ...
     python -m experiments.compare RUN RUN --psnr 22 24 --frames 4 --out compared
@@ -7,6 +7,7 @@ The runs must have learnt from the same frames of the same capture. Prints a tab
 scores, times and sizes and after how many seconds of training each run reached a PSNR;
 saves compare.json, curves.png, and pictures.png with held-out frames side by side.
 Seconds are those of the machine of each run: the table says where machines differ.
+A run that is still being trained, or was killed, is compared as far as it came.
 """
 
 import dataclasses
@@ -37,7 +38,7 @@ COLUMNS = (
 
 @dataclasses.dataclass(frozen=True)
 class Compare:
-    """Compare finished runs of one capture."""
+    """Compare runs of one capture: finished, running or interrupted."""
 
     runs: cli.Positional[tuple[pathlib.Path, ...]]
     """Folders that experiments.reconstruct made."""
@@ -70,6 +71,7 @@ class Compared(NamedTuple):
     folder: pathlib.Path
     metrics: dict[str, float | None]
     curve: Any  # curves.Curve
+    remark: str = ""  # how far a run is that has not ended
 
 
 @cli.command(Compare)
@@ -105,14 +107,14 @@ def read(folders, trusted=None) -> list[Compared]:
     for folder, name in zip(folders, _names(folders), strict=True):
         curve = curves.read(folder)
         try:
-            metrics = json.loads((folder / "metrics.json").read_text())
+            metrics, remark = _progress(folder, name)
             config = json.loads((folder / run_folder.CONFIG).read_text())["config"]
             source = config["source"]
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise ValueError(f"{folder}: not a finished run ({error!r})") from error
+            raise ValueError(f"{folder}: not a run ({error!r})") from error
         if trusted is not None:
             trust.check_effects(folder, config.get("effects", ()), trusted)
-        compared.append(Compared(name, folder, metrics, curve))
+        compared.append(Compared(name, folder, metrics, curve, remark))
         same = {key: source.get(key) for key in SAME}
         if source.get("capture") is None:  # a built-in scene is made from the seed
             same["seed"] = config.get("seed")
@@ -125,6 +127,22 @@ def read(folders, trusted=None) -> list[Compared]:
                     "capture"
                 )
     return compared
+
+
+def _progress(folder, name):
+    """Metrics of a run, and a sentence on how far it is where it has not ended."""
+    from nerfies_jax.runs import curves
+
+    scores = folder / "metrics.json"
+    told = curves.course_of(folder)
+    if told is None or told.ended:
+        return json.loads(scores.read_text()), ""
+    metrics = {
+        "train.steps": told.step,
+        "train.seconds": told.seconds,
+        "train.compile_seconds": told.compile_seconds,
+    }
+    return metrics, f"{name} has not ended and has no final scores: {told.line()}."
 
 
 def _names(folders):
@@ -195,7 +213,7 @@ def _cell(value, digits, unit):
 
 def remarks(compared) -> list[str]:
     """What a reader must know before he believes the table."""
-    sentences = []
+    sentences = [run.remark for run in compared if run.remark]
     first = compared[0]
     for run in compared:
         scored, drawn = run.metrics.get("heldout.frames"), len(run.curve.frames)
@@ -219,7 +237,7 @@ def remarks(compared) -> list[str]:
                 "times to a PSNR compare roughly."
             )
         counts = [each.metrics.get("heldout.frames") for each in (first, run)]
-        if counts[0] != counts[1]:
+        if None not in counts and counts[0] != counts[1]:
             sentences.append(
                 f"PSNR and SSIM of {first.name} are of {counts[0]} frames, those of "
                 f"{run.name} of {counts[1]}."

@@ -30,6 +30,7 @@ class Reconstruct:
     GROUPS: ClassVar = {
         "model": ("preset", "effects", "set", "effect"),
         "training": ("steps", "seconds", "seed", "evaluate_every", "checkpoint_every"),
+        "following": ("view", "log"),
     }
 
     source: cli.Source = cli.NamedSource()
@@ -74,6 +75,9 @@ class Reconstruct:
     view: bool = False
     """Look around in the scene while it is trained, in the browser of this machine, as
     experiments.view does afterwards; training waits for what is drawn."""
+    log: tuple[Literal["tensorboard", "wandb", "rerun"], ...] = ()
+    """Experiment trackers that receive losses and scores while the run is trained, in
+    addition to events.jsonl (docs/events.md); extra log."""
     more: cli.More = MoreMetrics()
     prepare: Preparation = Preparation()
     """Of a film, or a folder of pictures without cameras."""
@@ -126,7 +130,7 @@ def _outcome(args):
 
     common = {
         name: getattr(args, name)
-        for name in ("more", "seconds", "evaluate_every", "checkpoint_every")
+        for name in ("more", "seconds", "evaluate_every", "checkpoint_every", "log")
     }
     if args.resume:
         steps = () if args.steps is None else (f"steps={args.steps}",)

@@ -50,14 +50,20 @@ def main(args):
         cli.find_effects(args.effect)
         platform.start_jax(args.device, representations.cores_of_run(args.run).threads)
         from nerfies_jax import runs
-        from nerfies_jax.runs import viewer
+        from nerfies_jax.runs import curves, viewer
 
         viewer.check_installed()
         run = runs.saved_run(args.run, effects=args.effect)
         restored = runs.restore(args.run, run)
         size = cli.sized(run.capture.size, args.max_side)
         page = viewer.Viewer(run, size, args.port, args.run)
-        page.add_history((restored.record or {}).get("rows", ()))
+        told = curves.course_of(args.run)
+        rows = (restored.record or {}).get("rows", ())
+        page.add_history(rows if told is None else told.training or rows)
+    if told is not None and not told.ended:
+        console.say(
+            f"the run has not ended: {told.line()}; shown is what it saved last"
+        )
     console.say(f"look around at {page.address} (Ctrl-C ends)")
     with contextlib.suppress(KeyboardInterrupt):
         while not stopping.requested():

@@ -158,9 +158,13 @@ class _Lines:
 
     def tick(self, stages):
         innermost = stages[-1]
-        wait = FIRST_LINE_SECONDS if innermost.first else LINE_SECONDS
-        since = self._last if not innermost.first else innermost.began
-        if time.monotonic() - since >= wait:
+        if innermost.first:
+            due = innermost.seconds >= FIRST_LINE_SECONDS
+        else:
+            # Without a count there is less and less to say.
+            wait = innermost.seconds / 2 if innermost.total is None else 0.0
+            due = time.monotonic() - self._last >= max(LINE_SECONDS, wait)
+        if due:
             self._show(innermost)
 
     def remove(self, shown):

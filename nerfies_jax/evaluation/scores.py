@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from nerfies_jax import events
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation.frames import view_of
 from nerfies_jax.measure import image_quality
@@ -43,12 +44,14 @@ def score(
     """
     _check_some(rows, capture)
     renderings, scores = [], []
-    for row in rows:
-        rendering = renderer(state, view_of(capture, row))
-        truth = capture.images[row].astype(np.float32) / 255
-        valid = None if capture.valid is None else capture.valid[row]
-        scores.append(jax.device_get(_score(rendering.colour, truth, valid)))
-        renderings.append(rendering)
+    with events.stage("scoring held-out frames", len(rows)) as stage:
+        for row in rows:
+            rendering = renderer(state, view_of(capture, row))
+            truth = capture.images[row].astype(np.float32) / 255
+            valid = None if capture.valid is None else capture.valid[row]
+            scores.append(jax.device_get(_score(rendering.colour, truth, valid)))
+            renderings.append(rendering)
+            stage.advance()
     psnr, ssim = np.asarray(scores).T
     return Scored(
         rows=np.asarray(rows),

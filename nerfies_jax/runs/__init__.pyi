@@ -1,3 +1,5 @@
+from .event_log import EventReader as EventReader
+from .event_log import read_events as read_events
 from .reconstruction import Outcome as Outcome
 from .reconstruction import Refused as Refused
 from .reconstruction import reconstruct as reconstruct

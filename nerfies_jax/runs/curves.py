@@ -1,13 +1,18 @@
-"""How a run went, kept beside its pictures, to lay runs over each other."""
+"""The course of a run: losses and scores over time, from its events.
+
+`events.jsonl` has it while the run goes on, and `curve.json` in short once it ended.
+"""
 
 import json
 import math
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 from nerfies_jax.capture.json_files import write_json
+from nerfies_jax.events import Event
 from nerfies_jax.measure import clock
+from nerfies_jax.runs import event_log
 from nerfies_jax.training.loop import History
 
 CURVE = "curve.json"
@@ -25,13 +30,112 @@ class Curve(NamedTuple):
     machine: dict[str, Any]
 
 
+class Course(NamedTuple):
+    """What the events of a run say of its training so far.
+
+    Rows are dictionaries with `step`, `seconds` of training and the metrics, in the
+    order of steps; of steps that a resumed run repeated, the last ones.
+    """
+
+    training: tuple[dict[str, Any], ...] = ()  # mean metrics of chunks, thinned out
+    evaluations: tuple[dict[str, Any], ...] = ()  # with `hook` as well
+    frames: tuple[str, ...] = ()  # held-out frames that evaluations are of
+    step: int = 0  # completed
+    steps: int | None = None  # asked for
+    seconds: float = 0.0  # of training
+    compile_seconds: float = 0.0
+    stopped_by: str | None = None  # None while it runs, and where it was killed
+    machine: dict[str, Any] = {}  # noqa: RUF012  (never changed)
+
+    @property
+    def ended(self) -> bool:
+        """Whether training ended by itself, neither killed nor interrupted."""
+        return self.stopped_by in ("steps", "seconds", "non-finite")
+
+    def line(self) -> str:
+        """Return how far the run is, as `step 1,200 of 30,000, 21.30 dB`."""
+        words = f"step {self.step:,}"
+        if self.steps is not None:
+            words += f" of {self.steps:,}"
+        scores = [row["psnr"] for row in self.evaluations if row.get("psnr")]
+        if scores:
+            words += f", {scores[-1]:.2f} dB over the {len(self.frames)} frames of its "
+            words += "curve"
+        return words
+
+
+def course(events: Iterable[Event]) -> Course:
+    """Summarize the events of a run.
+
+    Args:
+      events: As `event_log.read_events` returns them.
+
+    Returns:
+      The rows of training and of evaluations, and how far the run is.
+    """
+    training: list[dict[str, Any]] = []
+    evaluations: list[dict[str, Any]] = []
+    numbers: dict[str, Any] = {}
+    for event in events:
+        try:
+            kind = event["kind"]
+            if kind == "train":
+                training.append(_row(event))
+                numbers |= {name: event[name] for name in _NUMBERS}
+            elif kind == "evaluation":
+                evaluations.append({"hook": str(event["hook"]), **_row(event)})
+            elif kind == "evaluation_frames":
+                numbers["frames"] = tuple(map(str, event["frames"]))
+            elif kind == "run":
+                if event["status"] == "resume":
+                    # What came after the checkpoint is done once more.
+                    training = _until(training, event["step"])
+                    evaluations = _until(evaluations, event["step"])
+                numbers["stopped_by"] = event.get("stopped_by")
+                names = (name for name in (*_NUMBERS, "machine") if name in event)
+                numbers |= {name: event[name] for name in names}
+        except (KeyError, TypeError, ValueError):  # of a damaged file
+            continue
+    return Course(tuple(training), tuple(evaluations), **numbers)
+
+
+def course_of(folder: pathlib.Path) -> Course | None:
+    """Return `course` of the events in a run folder; None where there are none."""
+    try:
+        return course(event_log.read_events(folder))
+    except ValueError:
+        return None
+
+
+_NUMBERS = ("step", "steps", "seconds", "compile_seconds")
+
+
+def _row(event):
+    at = {"step": int(event["step"]), "seconds": float(event["seconds"])}
+    return at | dict(event["metrics"])
+
+
+def _until(rows, step):
+    return [row for row in rows if row["step"] <= step]
+
+
 def write(folder: pathlib.Path, history: History, frames: Sequence[str]) -> None:
-    """`curve.json`: every evaluation, every chunk's mean metrics, and the machine."""
+    """Write `curve.json`: evaluations, mean metrics of chunks, and the machine.
+
+    Args:
+      folder: The run folder. Its events are what is written, as far as they are whole.
+      history: Of the run, which takes the place of events that were lost.
+      frames: Names of the held-out frames that the evaluations are of.
+    """
+    told = course_of(folder) or Course()
+    evaluations, training = told.evaluations, told.training
+    if [_at(row) for row in evaluations] != [_at(row) for row in history.evaluations]:
+        evaluations, training = history.evaluations, history.rows
     write_json(
         folder / CURVE,
         {
-            "evaluations": [_finite(row) for row in history.evaluations],
-            "training": [_finite(row) for row in history.rows],
+            "evaluations": event_log.json_values(evaluations),
+            "training": event_log.json_values(training),
             "frames": list(frames),
             "compile_seconds": history.compile_seconds,
             "machine": clock.machine(),
@@ -39,23 +143,53 @@ def write(folder: pathlib.Path, history: History, frames: Sequence[str]) -> None
     )
 
 
-def _finite(row):
-    """JSON has no word for what is not finite: null."""
-    return {
-        key: None if isinstance(value, float) and not math.isfinite(value) else value
-        for key, value in row.items()
-    }
+def _at(row):
+    return row["hook"], row["step"]
 
 
 def read(folder: pathlib.Path) -> Curve:
-    """The curve of a run folder; ValueError where there is none to read."""
-    path = folder / CURVE
-    if not path.is_file():
-        raise ValueError(
-            f"{folder}: no {CURVE} here; name the folder of a run that "
-            "experiments.reconstruct completed, one from before there was this file "
-            "can be resumed for no further steps to get it"
-        )
+    """Read the curve of a run, also of one that is running or was killed.
+
+    Args:
+      folder: The run folder.
+
+    Returns:
+      The curve, by `events.jsonl` as long as the run has not ended, by `curve.json`
+      afterwards.
+
+    Raises:
+      ValueError: The folder has neither file, or it is damaged.
+    """
+    folder = pathlib.Path(folder)
+    told = course_of(folder)
+    if not (folder / CURVE).is_file():
+        if told is None:
+            raise ValueError(
+                f"{folder}: neither {CURVE} nor {event_log.EVENTS} here; name the "
+                "folder of a run. One from before there were these files can be "
+                "resumed for no further steps to get them"
+            )
+        return _curve_of(told)
+    stored = _stored(folder / CURVE)
+    if told is not None and not told.ended and told.step > max(stored.steps, default=0):
+        return _curve_of(told)
+    return stored
+
+
+def _curve_of(told):
+    rows = [row for row in told.evaluations if "psnr" in row]
+    return Curve(
+        seconds=tuple(row["seconds"] for row in rows),
+        steps=tuple(row["step"] for row in rows),
+        psnr=tuple(_number(row["psnr"]) for row in rows),
+        ssim=tuple(_number(row.get("ssim")) for row in rows),
+        frames=told.frames,
+        compile_seconds=told.compile_seconds,
+        machine=told.machine,
+    )
+
+
+def _stored(path):
     try:
         stored = json.loads(path.read_text())
         rows = stored["evaluations"]

@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import pathlib
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 from nerfies_jax import console, stopping
@@ -25,6 +25,7 @@ from nerfies_jax.runs import (
     train,
 )
 from nerfies_jax.runs.config import MoreMetrics, Preparation, RunConfig
+from nerfies_jax.runs.following import following
 from nerfies_jax.runs.run import (
     Run,
     first_state,
@@ -68,6 +69,7 @@ def reconstruct(
     more: MoreMetrics = MoreMetrics(),
     prepare: Preparation = Preparation(),
     watched: Watched | None = None,
+    log: Sequence[str] = (),
 ) -> Outcome:
     """Train a run from its first step, and score, draw and film what came of it.
 
@@ -79,12 +81,15 @@ def reconstruct(
     training say how many steps there are or, where the steps are given, end it early;
     an evaluation follows after `evaluate_every` seconds of it, a checkpoint after
     `checkpoint_every` seconds. `more` is measured at the end, and `watched`
-    looks on until then (`viewer.live`). Raises Refused where it cannot begin.
+    looks on until then (`viewer.live`). Its events are in `events.jsonl` from its
+    beginning on (`runs.read_events`), and go to the trackers that `log` names as well:
+    "tensorboard", "wandb", "rerun". Raises Refused where it cannot begin.
     """
     began = time.perf_counter()
     with contextlib.ExitStack() as held:
         with _refusing():
             pace = Pace(seconds, evaluate_every, checkpoint_every)
+            follow = held.enter_context(following(log))
             if out is not None:
                 out = pathlib.Path(out).absolute()
                 run_folder.check_free(out)
@@ -104,10 +109,13 @@ def reconstruct(
             held.enter_context(run_folder.owned(folder))
             save_config(folder, run)
             same_capture.record(folder, run.capture)
+            follow.begin(folder, run, None)
             checkpoints = _opened(held, folder, run, state, None)
             hooks = _watching(held, watched, run, folder)
         start = state, None, checkpoints
-        return _finished(folder, run, start, pace, hooks, began, extra)
+        outcome = _finished(folder, run, start, pace, hooks, began, extra)
+        follow.end(outcome.result, outcome.errors)
+        return outcome
 
 
 def resume(
@@ -121,6 +129,7 @@ def resume(
     checkpoint_every: float | int = 60.0,
     more: MoreMetrics = MoreMetrics(),
     watched: Watched | None = None,
+    log: Sequence[str] = (),
 ) -> Outcome:
     """Continue the run in a folder from its last checkpoint, to the same bits.
 
@@ -128,7 +137,8 @@ def resume(
     the run must have been started with: fields of its config and of its source by name,
     and fields of its spec; a capture that was moved since is named where it lies now.
     `effects` are those from outside of this package, as MODULE:NAME, that may be loaded
-    if the run was begun with them: the folder's word alone runs no code.
+    if the run was begun with them: the folder's word alone runs no code. `log` is as in
+    `reconstruct`.
     Raises Refused where they differ, where pictures or cameras are others than when the
     run was begun, and where another process is at work in the folder.
     """
@@ -137,6 +147,7 @@ def resume(
     with contextlib.ExitStack() as held:
         with _refusing():
             pace = Pace(seconds, evaluate_every, checkpoint_every)
+            follow = held.enter_context(following(log))
             moved = _check_expected(folder, expected)
             held.enter_context(run_folder.owned(folder))
             extra = quality.prepared(more)
@@ -144,10 +155,13 @@ def resume(
             _describe(run)
             quality.check(extra, run.capture.size)
             state, record, after = _restored(folder, run)
+            follow.begin(folder, run, after or 0)
             checkpoints = _opened(held, folder, run, state, after)
             hooks = _watching(held, watched, run, folder)
         start = state, record, checkpoints
-        return _finished(folder, run, start, pace, hooks, began, extra)
+        outcome = _finished(folder, run, start, pace, hooks, began, extra)
+        follow.end(outcome.result, outcome.errors)
+        return outcome
 
 
 @contextlib.contextmanager

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from nerfies_jax import evaluation
+from nerfies_jax import evaluation, events
 from nerfies_jax.evaluation import Renderer
 from nerfies_jax.evaluation.scores import Draw
 from nerfies_jax.runs import budget, run_folder
@@ -87,6 +87,8 @@ def train(
         }
 
     if len(few):
+        names = [run.capture.ids[row] for row in few]
+        events.emit("evaluation_frames", frames=names)
         hooks = (Hook("held out", held_out, every_seconds=evaluate_every), *hooks)
     result = loop.fit(
         run.model,

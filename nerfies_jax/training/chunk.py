@@ -159,10 +159,9 @@ class Program:
         if not missing:
             return 0.0
         began = time.perf_counter()
-        with events.stage("compiling the training step", len(missing)) as stage:
+        with events.stage("compiling the training step"):
             for length in missing:
                 self._programs[length] = self._lower(length).compile(self._options)
-                stage.advance()
         return time.perf_counter() - began
 
     def _lengths(self, count):

@@ -120,7 +120,7 @@ def fit(
         StopRequests() as requests,
         event_stream.shown_on(console),
     ):
-        with event_stream.stage("training", steps, run.step):
+        with event_stream.stage("training", steps, run.step) as run.stage:
             reason = run.go(requests)
             run.evaluate(reason)
         return run.finish(reason)
@@ -199,6 +199,7 @@ class _Run:
                 self.state, _ = program(self.state, self.spread_frames, count)
             return False
         self.step += done
+        self.stage.done = self.step
         self.step_seconds = elapsed / done
         self._add(seconds=time.perf_counter() - began)
         metrics = {name: float(x) for name, x in outcome.metrics.items()}
@@ -271,6 +272,7 @@ class _Run:
             step=self.step,
             steps=self.steps,
             seconds=self.history.seconds,
+            compile_seconds=self.history.compile_seconds,
             steps_per_second=1 / self.step_seconds,
             eta_seconds=max(left, 0.0),
             psnr=-10 * math.log10(mse) if mse > 0 else None,

@@ -75,9 +75,12 @@ def test_other_machines_and_frames_are_remarked(tmp_path):
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
-        (lambda folder: (folder / "curve.json").unlink(), "no curve.json"),
+        (
+            lambda folder: (folder / "curve.json").unlink(),
+            "neither curve.json",
+        ),
         (lambda folder: (folder / "curve.json").write_text("{}"), "not the curve"),
-        (lambda folder: (folder / "metrics.json").unlink(), "not a finished run"),
+        (lambda folder: (folder / "metrics.json").unlink(), "not a run"),
         (
             lambda folder: (folder / "config.json").write_text(stored("dog")),
             "capture is /films/dog and /films/cat",

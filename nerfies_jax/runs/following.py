@@ -1,0 +1,94 @@
+"""Follow a run: its events go to its folder and to experiment trackers."""
+
+import contextlib
+import pathlib
+import uuid
+from collections.abc import Iterator, Sequence
+
+from nerfies_jax import events
+from nerfies_jax.measure import clock
+from nerfies_jax.runs import trackers
+from nerfies_jax.runs.event_log import EventLog, read_events
+from nerfies_jax.runs.run import Run
+from nerfies_jax.training import specs
+from nerfies_jax.training.loop import FitResult
+
+
+class Following:
+    """The sinks of a run, which are opened once its folder is there."""
+
+    def __init__(self, held: contextlib.ExitStack, log: EventLog, names: Sequence[str]):
+        self._held, self._log, self._names = held, log, names
+
+    def begin(self, folder: pathlib.Path, run: Run, after: int | None) -> None:
+        """Write events to the folder and to the trackers from now on.
+
+        Args:
+          folder: Of the run.
+          run: Which is about to be trained.
+          after: The step that it is resumed after; None for a new run.
+
+        Raises:
+          ValueError: A tracker cannot be opened.
+        """
+        identity = None if after is None else _identity(folder)
+        identity = identity or uuid.uuid4().hex[:12]
+        self._log.open(folder)
+        tracked = trackers.TrackedRun(
+            folder, identity, folder.name, specs.as_json(run.config), after or 0
+        )
+        for name in self._names:
+            sink = self._held.enter_context(trackers.opened(name, tracked))
+            self._held.enter_context(events.subscribe(sink))
+        events.emit(
+            "run",
+            status="begin" if after is None else "resume",
+            identity=identity,
+            step=after or 0,
+            steps=run.spec.steps,
+            preset=run.config.preset,
+            capture=run.capture.name,
+            machine=clock.machine(),
+        )
+
+    def end(self, result: FitResult, errors: Sequence[str]) -> None:
+        """Record how the run ended, with all that came of it written."""
+        events.emit(
+            "run",
+            status="end",
+            stopped_by=result.stopped_by,
+            step=result.steps,
+            seconds=result.seconds,
+            compile_seconds=result.compile_seconds,
+            errors=list(errors),
+        )
+
+
+def _identity(folder):
+    """Under which trackers know the run; None where no event says so."""
+    with contextlib.suppress(ValueError):
+        for event in read_events(folder):
+            if event["kind"] == "run" and isinstance(event.get("identity"), str):
+                return event["identity"]
+    return None
+
+
+@contextlib.contextmanager
+def following(names: Sequence[str] = ()) -> Iterator[Following]:
+    """Gather the events of a run, from before it has a folder.
+
+    Args:
+      names: Of trackers, keys of `trackers.TRACKERS`.
+
+    Yields:
+      What `begin` and `end` are called of.
+
+    Raises:
+      ValueError: A tracker is not known or not installed.
+    """
+    trackers.check(names)
+    log = EventLog()
+    with contextlib.ExitStack() as held:
+        held.callback(log.close)
+        held.enter_context(events.subscribe(log))
+        yield Following(held, log, names)

@@ -1,0 +1,178 @@
+"""Experiment trackers: scalars of a run for TensorBoard, Weights & Biases and rerun.
+
+Each is a sink of events that writes through the tracker's own library (extra `log`).
+"""
+
+import contextlib
+import pathlib
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple, Protocol
+
+from nerfies_jax.capture import extras
+from nerfies_jax.capture.nearest import known_names
+from nerfies_jax.events import Event
+
+PROJECT = "nerfies-jax"
+
+
+class TrackedRun(NamedTuple):
+    """What a tracker is told of a run when it opens."""
+
+    folder: pathlib.Path
+    identity: str  # the same whenever the run is resumed
+    name: str
+    config: dict[str, Any]  # JSON values
+    step: int  # that it begins after, or is resumed after
+
+
+class Tracker(Protocol):
+    """A sink of events that is closed at the end."""
+
+    name: str
+
+    def __call__(self, event: Event) -> None:
+        """Receive an event."""
+        ...
+
+    def close(self) -> None:
+        """Write what is left."""
+        ...
+
+
+def scalars(event: Event) -> dict[str, float]:
+    """Return the numbers of an event by name, as `train/loss` or `held_out/psnr`."""
+    if event["kind"] == "train":
+        named = {
+            "psnr": event["psnr"],
+            "steps_per_second": event["steps_per_second"],
+            "memory_bytes": event["memory_bytes"],
+            **event["counts"],
+            **event["metrics"],
+        }
+        prefix = "train"
+    elif event["kind"] == "evaluation":
+        named, prefix = event["metrics"], event["hook"].replace(" ", "_")
+    else:
+        return {}
+    return {f"{prefix}/{k}": float(x) for k, x in named.items() if x is not None}
+
+
+class TensorBoard:
+    """Writes event files into `tensorboard` in the run folder."""
+
+    name = "tensorboard"
+
+    def __init__(self, run: TrackedRun):
+        library = extras.library("tensorboardX", "log")
+        # Steps that a resumed run repeats are shown once.
+        self._writer = library.SummaryWriter(
+            str(run.folder / "tensorboard"), purge_step=run.step + 1
+        )
+
+    def __call__(self, event: Event) -> None:
+        """Receive an event."""
+        for name, value in scalars(event).items():
+            self._writer.add_scalar(name, value, event["step"], event["time"])
+
+    def close(self) -> None:
+        """Write what is left."""
+        self._writer.close()
+
+
+class WeightsAndBiases:
+    """Logs to Weights & Biases, by the settings that `wandb login` and WANDB_* made."""
+
+    name = "wandb"
+
+    def __init__(self, run: TrackedRun):
+        library = extras.library("wandb", "log")
+        try:
+            self._run = library.init(
+                project=PROJECT,
+                id=run.identity,
+                name=run.name,
+                config=run.config,
+                dir=str(run.folder),
+                resume="allow",
+            )
+        except Exception as error:  # without a login, without a network
+            raise ValueError(
+                f"Weights & Biases cannot start ({error}); log in with `wandb login`, "
+                "or set WANDB_MODE=offline and upload later with `wandb sync`"
+            ) from error
+
+    def __call__(self, event: Event) -> None:
+        """Receive an event."""
+        numbers = scalars(event)
+        if numbers:
+            # Their own step may not go back, as ours does after a crash.
+            self._run.log({**numbers, "step": event["step"]})
+
+    def close(self) -> None:
+        """Write what is left."""
+        self._run.finish()
+
+
+class Rerun:
+    """Writes recordings for the viewer of rerun, `rerun/STEP.rrd` in the run folder."""
+
+    name = "rerun"
+
+    def __init__(self, run: TrackedRun):
+        self._library = extras.library("rerun", "log")
+        folder = run.folder / "rerun"
+        folder.mkdir(exist_ok=True)
+        self._stream = self._library.RecordingStream(PROJECT, recording_id=run.identity)
+        # Files of one recording: the viewer lays them over each other.
+        self._stream.save(folder / f"{run.step}.rrd")
+        self._stream.send_recording_name(run.name)
+
+    def __call__(self, event: Event) -> None:
+        """Receive an event."""
+        for name, value in scalars(event).items():
+            self._stream.set_time("step", sequence=event["step"])
+            self._stream.set_time("training", duration=event["seconds"])
+            self._stream.log(name, self._library.Scalars(value))
+
+    def close(self) -> None:
+        """Write what is left."""
+        self._stream.flush()
+        self._stream.disconnect()
+
+
+TRACKERS = {each.name: each for each in (TensorBoard, WeightsAndBiases, Rerun)}
+PACKAGES = {"tensorboard": "tensorboardX", "wandb": "wandb", "rerun": "rerun"}
+
+
+def check(names: Sequence[str]) -> None:
+    """Raise ValueError for a tracker that is not known or not installed.
+
+    Args:
+      names: Keys of `TRACKERS`.
+    """
+    for name in names:
+        if name not in TRACKERS:
+            raise ValueError(
+                f"no tracker {name!r} to log to; {known_names(name, TRACKERS)}"
+            )
+        extras.check(PACKAGES[name], "log")
+
+
+@contextlib.contextmanager
+def opened(name: str, run: TrackedRun) -> Iterator[Tracker]:
+    """Open a tracker for as long as the block runs.
+
+    Args:
+      name: A key of `TRACKERS`.
+      run: What it is told of the run.
+
+    Yields:
+      The sink, to be subscribed to the events.
+    """
+    tracker = TRACKERS[name](run)
+    try:
+        yield tracker
+    finally:
+        # Whatever its library raises, the run is there.
+        with contextlib.suppress(Exception):
+            tracker.close()
