@@ -76,6 +76,7 @@ class Viewer:
                 HOST, port, label=run.capture.name, verbose=False
             )
         self._server.gui.configure_theme(show_logo=False, show_share_button=False)
+        self._about = self._server.gui.add_markdown(WAITING)
         away = self._place_cameras(run)
         self._make_controls(run)
         self.path = PathPanel(
@@ -88,8 +89,6 @@ class Viewer:
             self._show_time,
         )
         self.training = TrainingPanel(self._server, self._ordered, in_training)
-        # Last, since it changes its length.
-        self._about = self._server.gui.add_markdown(WAITING)
 
     @property
     def address(self) -> str:

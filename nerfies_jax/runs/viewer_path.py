@@ -29,7 +29,12 @@ RATE = 24.0  # images per second of a path
 LINE_POINTS = 200  # of the curve in the scene
 FRUSTUM_PX = 2.0
 COLOR = (60, 170, 255)
-ACTIONS = ("go", "set", "up", "down", "delete")
+GO, SET, UP, DOWN, DELETE = "go", "set", "↑", "↓", "✕"
+ACTIONS = (GO, SET, UP, DOWN, DELETE)  # of a keyframe; five fit into a line
+_HINT = (
+    f"{GO}: look through it. {SET}: replace it by the view and the time of now. "
+    f"{UP} {DOWN}: move it. {DELETE}: delete it."
+)
 _EMPTY = "Look from where the path begins, at the time it shows there; add it."
 _NAME = "/path"
 
@@ -68,20 +73,22 @@ class PathPanel:
             self._message = gui.add_markdown(_EMPTY)
             with gui.add_folder("keyframes", visible=False) as self._list:
                 pass
-            self._button("add keyframe", self._add)
+            self._button("add keyframe", self._add, color=None)
             self._length = gui.add_number("seconds", seconds, min=0.1, step=0.1)
             self._visible = gui.add_checkbox("show path", True)
             self._visible.on_update(ordered(lambda *_: self._draw()))
             self._play = self._button("preview", self._toggle_preview)
             self._button("save", self._save)
-            loading = gui.add_upload_button("load", mime_type="application/json,.json")
+            loading = gui.add_upload_button(
+                "load", mime_type="application/json,.json", color="gray"
+            )
             # Of this click: the next one replaces the handle's value.
             loading.on_upload(ordered(self._load, lambda: loading.value.content))
             self._render = self._button("render", self._toggle_render)
             self._progress = gui.add_progress_bar(0.0, visible=False)
 
-    def _button(self, label, action):
-        button = self._server.gui.add_button(label)
+    def _button(self, label, action, color="gray"):
+        button = self._server.gui.add_button(label, color=color)
         button.on_click(self._ordered(action))
         return button
 
@@ -117,17 +124,17 @@ class PathPanel:
         frames = self.keyframes
         if place >= len(frames):
             return
-        if action == "go":
+        if action == GO:
             self._stop_preview()
             self._go(client, frames[place])
             return
-        if action == "set":
+        if action == SET:
             if eye is not None:
                 frames[place] = self._keyframe(eye, look)
-        elif action == "delete":
+        elif action == DELETE:
             del frames[place]
         else:
-            other = place + (1 if action == "down" else -1)
+            other = place + (1 if action == DOWN else -1)
             if 0 <= other < len(frames):
                 frames[place], frames[other] = frames[other], frames[place]
         self._changed()
@@ -141,7 +148,7 @@ class PathPanel:
         with self._list:
             for place, keyframe in enumerate(self.keyframes):
                 label = f"{place + 1}: t {keyframe.time:.3f}"
-                row = self._server.gui.add_button_group(label, ACTIONS)
+                row = self._server.gui.add_button_group(label, ACTIONS, hint=_HINT)
                 row.on_click(self._edited(place, row))
                 self._rows.append(row)
         self._list.visible = bool(self.keyframes)

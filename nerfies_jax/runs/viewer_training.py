@@ -33,7 +33,7 @@ class TrainingPanel:
         self._folder = server.gui.add_folder("training", visible=pausable)
         if pausable:
             with self._folder:
-                self._button = server.gui.add_button("pause training")
+                self._button = server.gui.add_button("pause training", color="gray")
                 self._button.on_click(ordered(lambda *_: self._pause(not self.paused)))
 
     def add(self, step: int, metrics: Mapping[str, float]) -> None:

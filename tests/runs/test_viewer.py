@@ -28,14 +28,14 @@ CAPTURE = scenes.tiny_capture()
 SPECS = {"gaussians": scenes.TINY_DEFORMABLE, "radiance": scenes.TINY_FIELD}
 
 
-def a_run(kind):
+def a_run(kind, shaken=0.1):
     """A run of the tiny capture, and its state, in which something moves."""
     config = RunConfig("splats-static-small", CaptureSource())
     run = runs.open_run(config, representations.named(kind), SPECS[kind], CAPTURE)
     state, rng = runs.first_state(run), np.random.default_rng(0)
 
     def shake(leaf):
-        return leaf + np.asarray(0.1 * rng.normal(size=leaf.shape), leaf.dtype)
+        return leaf + np.asarray(shaken * rng.normal(size=leaf.shape), leaf.dtype)
 
     params = state.params
     if kind == "gaussians":
@@ -328,9 +328,9 @@ def test_a_path_is_edited_saved_loaded_and_rendered(tmp_path, capsys):
         positions = [keyframe.camera.position for keyframe in frames]
         np.testing.assert_allclose(positions, CAPTURE.cameras.position[rows], atol=1e-5)
         assert [keyframe.time for keyframe in frames] == [0.0, 0.5, 0.25]
-        browser.press(page, label_of(page, "2: "), "down")
+        browser.press(page, label_of(page, "2: "), "↓")
         until(lambda: frames[2].time == 0.5)
-        browser.press(page, label_of(page, "1: "), "delete")
+        browser.press(page, label_of(page, "1: "), "✕")
         until(lambda: len(frames) == 2)
         browser.press(page, "seconds", 0.2)
         browser.press(page, "save")
