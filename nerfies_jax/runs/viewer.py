@@ -270,7 +270,7 @@ def live(run: Run, folder: pathlib.Path, port: int) -> Iterator[Hook]:
     viewer = Viewer(run, run.capture.size, port, folder, in_training=True)
     console.say(f"look around while it trains: {viewer.address}")
 
-    def show(state: TrainState, step: int, metrics: Mapping[str, float] = {}) -> None:
+    def show(state: TrainState, step: int, metrics: Mapping[str, float]) -> None:
         viewer.add_metrics(step, metrics)
         viewer.serve(state, step, LIVE_SECONDS)
         while viewer.holds_training and not stopping.requested():
