@@ -24,13 +24,12 @@ bottleneck met the first layer of its colour; with it their steps are shorter. R
 
 import dataclasses
 import itertools
-import json
 import math
 import pathlib
 import statistics
 import time
 
-from experiments import cli, markdown
+from experiments import cli, kept, markdown
 from nerfies_jax import console
 from nerfies_jax.runs import platform, representations
 from nerfies_jax.training.track_start import FROM_TRACKS
@@ -82,7 +81,7 @@ def main(args):
     from nerfies_jax.capture.json_files import write_json
     from nerfies_jax.measure import clock
 
-    stored = json.loads(args.out.read_text()) if args.out.exists() else {}
+    stored = kept.rows(args.out, rows=list)
     rows = stored.get("rows", [])
     for seed, name, preset in itertools.product(
         range(args.seeds), captures, args.presets

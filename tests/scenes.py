@@ -93,9 +93,14 @@ TINY_FIELD = RadianceScene(
 
 
 @functools.cache
+def tiny_scene():
+    """`tiny_capture`, and what only the scene knows."""
+    return synthetic.make(TINY_FILM)
+
+
 def tiny_capture():
     """Six frames of 40x30 of the default scene, two of them held out."""
-    return synthetic.make(TINY_FILM)[0]
+    return tiny_scene()[0]
 
 
 @functools.cache

@@ -204,6 +204,8 @@ class Job:
         long is not trained to its end for that. Steps that are settled are taken.
         """
         settled = results.settled_steps(budget.folder).get(name)
+        if settled is None:  # other seeds may be there: they stand next to this one
+            settled = results.steps_of(budget.folder, name)
         if settled is not None:
             return settled, self._train(name, 0, settled)
         other = None
@@ -307,14 +309,14 @@ class Job:
     def planned_steps(self, name: str, budget: Budget) -> int:
         """Of every seed of an arm; over seconds those that seed 0 found.
 
-        ValueError where that seed is not finished.
+        ValueError where no seed is finished.
         """
         if budget.seconds is None:
             steps, share = budget.steps, self.suite.arms[name].share
             if steps is not None:
                 steps = max(1, round(share * steps))
             return self.spec(name, steps).steps
-        steps = results.steps_of(self.path(name, 0, budget))
+        steps = results.steps_of(budget.folder, name)
         if steps is None:
             raise ValueError(
                 f"{self.path(name, 0, budget)} is not there: seed 0 of {name} finds "
@@ -362,7 +364,10 @@ class Job:
         """A finished arm; exit code 2 where it is one of another experiment."""
         path = self.path(name, seed, budget)
         with cli.user_errors():
-            if not path.is_file():
+            if not os.path.lexists(path):
+                return None
+            by_time = budget.seconds is not None
+            if by_time and results.steps_of(budget.folder, name) is None:
                 return None
             steps = self.planned_steps(name, budget)
             return results.read(path, self.identity(name, seed, steps, budget))

@@ -1,6 +1,7 @@
 """The folder of an ablation: one pair of files for every finished arm and seed."""
 
 import contextlib
+import glob
 import json
 import math
 import pathlib
@@ -8,13 +9,13 @@ from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import filelock
-import numpy as np
 
 from experiments.ablate.measures import MEASURES
-from nerfies_jax.capture import npz_files
-from nerfies_jax.capture.json_files import replaced_file, write_json
+from nerfies_jax.capture import cache_files
 from nerfies_jax.training.provenance import provenance
 
+# Raise a number when such files are no longer what they were.
+CELL, SETTLED = "cell of an ablation 1", "steps of an ablation 1"
 STEPS = "steps.json"  # of arms that need not find out what their seconds are worth
 # Fields of specs that came after arms were kept: none, they change nothing in these.
 YOUNGER = ("poses",)
@@ -40,69 +41,87 @@ def read_numbers(stored: Mapping[str, float | None]) -> dict[str, float]:
 
 def write(path: pathlib.Path, identity: dict[str, Any], kept: ArmResult) -> None:
     """`path` and its .npz; numbers last: an arm is finished when they are there."""
-    with replaced_file(path.with_suffix(".npz")) as partial:
-        np.savez_compressed(partial, **kept.arrays)
+    cache_files.write_arrays(_arrays_of(path), kept.arrays, CELL, compressed=True)
     numbers = stored_numbers(kept.numbers)
-    write_json(
-        path,
-        {
-            "identity": identity,
-            "numbers": numbers,
-            "notes": kept.notes,
-            "made by": provenance(),
-        },
-    )
+    stored = {
+        "identity": identity,
+        "numbers": numbers,
+        "notes": kept.notes,
+        "made by": provenance(),
+        # A process that is killed between the two files leaves those of two runs.
+        "arrays": cache_files.checksum(kept.arrays),
+    }
+    cache_files.write_json(path, stored, CELL)
 
 
 def read(path: pathlib.Path, identity: dict[str, Any]) -> ArmResult | None:
-    """A finished arm, None where there is none.
+    """A finished arm, None where there is none, or a damaged one, which is reported.
 
-    ValueError where it cannot be read, or was made with another identity.
+    ValueError where it was made with another identity.
     """
-    if not path.is_file():
+    kept = cache_files.read(path, _numbers_and_arrays)
+    if kept is None:
         return None
-    try:
-        stored = json.loads(path.read_text())
-        # A measure that is younger than the file is not known there.
-        numbers = {name: stored["numbers"].get(name) for name in MEASURES}
-        arrays = npz_files.read_arrays(path.with_suffix(".npz"))
-        made_with = stored["identity"]
-        # Of an arm that was restored its own, not that of the code that did so.
-        revision = stored.get("made by", {}).get("revision", "unknown")
-        notes = {"revision": revision, **stored["notes"]}
-    except (KeyError, TypeError, ValueError, OSError) as error:
-        raise ValueError(
-            f"{path}: not a finished arm ({error}); remove it to run it again"
-        ) from error
-    if made_with != json.loads(json.dumps(identity)):  # tuples come back as lists
+    stored, arrays = kept
+    if stored["identity"] != json.loads(json.dumps(identity)):  # tuples become lists
         raise ValueError(
             f"{path} was made with other settings; name another --out, or remove it to "
             "run it again"
         )
+    # A measure that is younger than the file is not known there.
+    numbers = {name: stored["numbers"].get(name) for name in MEASURES}
+    # Of an arm that was restored its own, not that of the code that did so.
+    notes = {"revision": stored["made by"]["revision"], **stored["notes"]}
     return ArmResult(read_numbers(numbers), arrays, notes)
 
 
-def steps_of(path: pathlib.Path) -> int | None:
-    """Over how many steps a finished arm was to be trained; None where none is."""
-    try:
-        return int(json.loads(path.read_text())["identity"]["steps"])
-    except FileNotFoundError:
-        return None
-    except (KeyError, TypeError, ValueError, OSError) as error:
-        raise ValueError(
-            f"{path}: not a finished arm ({error}); remove it to run it again"
-        ) from error
+def is_there(path: pathlib.Path) -> bool:
+    """Whether there are the numbers of a finished arm, of whatever settings."""
+    return cache_files.read(path, _numbers) is not None
+
+
+def _arrays_of(path):
+    return path.with_suffix(".npz")
+
+
+def _numbers(path):
+    return cache_files.read_json(path, CELL)
+
+
+def _numbers_and_arrays(path):
+    stored, place = _numbers(path), _arrays_of(path)
+    arrays = cache_files.read_arrays(place, CELL)
+    if cache_files.checksum(arrays) != stored["arrays"]:
+        raise ValueError(f"{place.name} is of another run")
+    return stored, arrays
+
+
+def steps_of(folder: pathlib.Path, name: str) -> int | None:
+    """Over how many steps the seeds of an arm are trained; None while none is finished.
+
+    Seed 0 finds them. If its file is damaged, those of other seeds still say so.
+    """
+    first = folder / f"{name}-0.json"
+    others = sorted(folder.glob(f"{glob.escape(name)}-[0-9]*.json"))
+    for path in (first, *others):
+        stored = cache_files.read(path, _numbers)
+        if stored is not None and stored["identity"]["arm"] == name:
+            return int(stored["identity"]["steps"])
+    return None
 
 
 def settle_steps(folder: pathlib.Path, steps: dict[str, int]) -> None:
     """Keep over how many steps some arms of this folder are to be trained."""
-    write_json(folder / STEPS, settled_steps(folder) | steps)
+    settled = {"steps": settled_steps(folder) | steps}
+    cache_files.write_json(folder / STEPS, settled, SETTLED)
 
 
 def settled_steps(folder: pathlib.Path) -> dict[str, int]:
     """What `settle_steps` kept, by arm; of all others the first seed finds them."""
-    path = folder / STEPS
-    return json.loads(path.read_text()) if path.is_file() else {}
+    stored = cache_files.read(
+        folder / STEPS, lambda path: cache_files.read_json(path, SETTLED)
+    )
+    return {} if stored is None else stored["steps"]
 
 
 @contextlib.contextmanager

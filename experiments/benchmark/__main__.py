@@ -13,13 +13,12 @@ and the numbers of other captures in OUT/benchmark.json stay.
 
 import concurrent.futures
 import dataclasses
-import json
 import multiprocessing
 import os
 import pathlib
 import re
 
-from experiments import cli
+from experiments import cli, kept
 from experiments.benchmark import job
 from nerfies_jax import children, console
 from nerfies_jax.runs import representations
@@ -107,7 +106,7 @@ def keep(path: pathlib.Path, label: str, seed: int, scored: dict) -> None:
     from nerfies_jax.capture.json_files import write_json
     from nerfies_jax.measure import clock
 
-    stored = json.loads(path.read_text()) if path.exists() else {"runs": {}}
+    stored = kept.rows(path, runs=dict) or {"runs": {}}
     scored = dict(scored)
     machine = scored.pop("machine")
     stored["machine"] = clock.beside(machine, stored.get("machine", {}))

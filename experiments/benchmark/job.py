@@ -1,11 +1,14 @@
 """One run of the benchmark, in a process of its own."""
 
-import json
 import pathlib
 from typing import Any
 
+from experiments import kept
 from nerfies_jax.runs import platform, representations, run_folder
 from nerfies_jax.runs.config import RunConfig
+
+# What must be in the files of a finished run.
+SCORED, MADE = {"heldout.psnr": object}, {"preset": str, "machine": dict}
 
 
 def score(
@@ -20,7 +23,7 @@ def score(
     begun = (folder / run_folder.CONFIG).exists()
     if begun:
         _check_capture(config, folder)
-    if not (metrics.exists() and about.exists()):
+    if None in (kept.one(metrics, SCORED), kept.one(about, MADE)):
         wanted = representations.cores(config.preset, config.overrides)
         platform.start_jax("cpu", *(wanted if alone else ("one",)))
         from nerfies_jax import runs
@@ -40,7 +43,7 @@ def score(
             )
         preset = outcome.run.config.preset
         write_json(about, {"preset": preset, "machine": clock.machine()})
-    return json.loads(about.read_text()) | {"metrics": json.loads(metrics.read_text())}
+    return kept.one(about, MADE) | {"metrics": kept.one(metrics, SCORED)}
 
 
 def _check_capture(config, folder):

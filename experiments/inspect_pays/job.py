@@ -1,6 +1,5 @@
 """Inspect a capture, then train presets on it as they are and as advised."""
 
-import json
 import math
 import pathlib
 from typing import Any, NamedTuple
@@ -13,9 +12,9 @@ from experiments.ablate.job import Job, log
 from experiments.ablate.settings import Ablate
 from experiments.inspect_pays import arms
 from nerfies_jax import runs
+from nerfies_jax.capture import cache_files
 from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.capture.json_files import write_json
 from nerfies_jax.evaluation import pictures
 from nerfies_jax.evidence import inspection
 from nerfies_jax.evidence.findings import Finding
@@ -23,7 +22,7 @@ from nerfies_jax.runs import adviser, representations
 from nerfies_jax.runs.config import CaptureSource
 from nerfies_jax.training import specs
 
-FOUND = "inspected.json"
+FOUND, LOOKED = "inspected.json", "findings 1"  # the file, and what it holds
 
 
 class ArmMeans(NamedTuple):
@@ -87,20 +86,20 @@ class Trial:
             return self._findings
         path = self.folder / FOUND
         args = specs.as_json(self._source)
-        if path.is_file():
-            kept = json.loads(path.read_text())
-            if kept["read as"] != args:
+        kept = cache_files.read(path, _findings_at)
+        if kept is not None:
+            read_as, self._findings = kept
+            if read_as != args:
                 raise ValueError(
                     f"{path}: the capture was read otherwise; name another --out"
                 )
-            self._findings = tuple(Finding(**one) for one in kept["findings"])
             return self._findings
         log(f"{self.name}: looking at it")
         inspected = inspection.inspect(self._stored, CACHE / "evidence")
         pictures.save(inspected.sheet, self.folder / "inspected.png")
         advice = adviser.advise_all(inspected.findings)
         findings = inspect_scene.as_json(self._stored, inspected, advice)
-        write_json(path, {"read as": args, **findings})
+        cache_files.write_json(path, {"read as": args, **findings}, LOOKED)
         self._findings = inspected.findings
         return self._findings
 
@@ -176,6 +175,12 @@ class Trial:
                 )
             )
         return rows
+
+
+def _findings_at(path):
+    """How the capture was read, and what was found in it."""
+    stored = cache_files.read_json(path, LOOKED)
+    return stored["read as"], tuple(Finding(**one) for one in stored["findings"])
 
 
 def _side(finished, name):

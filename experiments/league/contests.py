@@ -11,6 +11,7 @@ import time
 from typing import Any
 
 from experiments import asked
+from experiments import kept as kept_files
 from experiments.ablate import pool, results
 from experiments.ablate.job import Job
 from experiments.ablate.log import log
@@ -72,10 +73,10 @@ def restore(before: dict[str, Any], jobs: list[Job]) -> int:
             row = one["rows"].get(name, {"cells": {}})
             cell = row["cells"].get(str(seed))
             place = job.path(name, seed, job.budgets[0])
-            if cell is None or place.is_file():
+            if cell is None or results.is_there(place):
                 continue
             # The first seed here may have found other steps for all of them.
-            first = results.steps_of(job.path(name, 0, job.budgets[0]))
+            first = results.steps_of(job.budgets[0].folder, name)
             if seed and job.args.seconds is not None and first != row["steps"]:
                 continue
             identity = job.identity(name, seed, row["steps"], job.budgets[0])
@@ -179,7 +180,7 @@ def _key(contest):
 
 def kept(path: pathlib.Path) -> dict[str, Any]:
     """What `write` wrote; empty where it wrote nothing yet."""
-    return json.loads(path.read_text()) if path.is_file() else {}
+    return kept_files.rows(path, contests=list)
 
 
 def _contest(job, cpu):

@@ -13,13 +13,12 @@ enters is not seen. Most of the library's faults of old were of these kinds.
 import concurrent.futures
 import dataclasses
 import hashlib
-import json
 import pathlib
 import queue
 import subprocess
 import tempfile
 
-from experiments import cli
+from experiments import cli, kept
 from experiments.mutants.faults import ROOT, drawn
 from experiments.mutants.page import page
 from experiments.mutants.witnesses import default_tests, reached_by, tried
@@ -99,7 +98,7 @@ def _reached(out, workers, with_copy):
     digest = hashlib.blake2b(
         b"".join(sorted(map(_name_and_bytes, _files())))
     ).hexdigest()
-    stored = json.loads(path.read_text()) if path.exists() else {}
+    stored = kept.rows(path, reached=dict)
     entered = stored["reached"] if stored.get("digest") == digest else {}
 
     def run(test):
@@ -136,7 +135,7 @@ def _is_row_of(fault, row):
 
 
 def _stored(path, seed):
-    stored = json.loads(path.read_text()) if path.exists() else {}
+    stored = kept.rows(path, rows=list)
     return stored["rows"] if stored.get("seed") == seed else []
 
 

@@ -28,7 +28,7 @@ import sys
 import tempfile
 import time
 
-from experiments import cli
+from experiments import cli, kept
 from experiments.speed import job
 from nerfies_jax import children, console
 from nerfies_jax.runs import representations
@@ -104,7 +104,7 @@ def keep(path: pathlib.Path, machine: dict, keys: tuple[str, ...], record) -> No
     from nerfies_jax.capture.json_files import write_json
     from nerfies_jax.measure import clock
 
-    stored = json.loads(path.read_text()) if path.exists() else {}
+    stored = kept.rows(path)
     stored["machine"] = clock.beside(machine, stored.get("machine", {}))
     inner = stored
     for key in keys[:-1]:

@@ -17,11 +17,10 @@ import cv2
 import numpy as np
 import scipy.ndimage as nd
 
+from nerfies_jax.capture import cache_files, pinholes
 from nerfies_jax.capture import capture as captures
-from nerfies_jax.capture import pinholes
 from nerfies_jax.capture.capture import Capture, CaptureError, PointCloud
 from nerfies_jax.capture.given import Given
-from nerfies_jax.capture.json_files import replaced_file
 from nerfies_jax.evidence import (
     dense_flow,
     given_depth,
@@ -132,7 +131,7 @@ def gather(
         dense = still_points.dense(views, flow, mask)
     return Evidence(
         row=views.row,
-        flow=flow,
+        flow=_rounded(flow),
         moving=mask,
         tracks=tracks,
         score=score,
@@ -146,6 +145,15 @@ def gather(
         left_out=watch.left_out,
         seconds=watch.seconds(),
     )
+
+
+def _rounded(flow):
+    """In half precision, as it is kept: gathered or read again, it is the same."""
+    forward, backward = (
+        side.astype(np.float16).astype(np.float32)
+        for side in (flow.forward, flow.backward)
+    )
+    return flow._replace(forward=forward, backward=backward)
 
 
 def _tracks(given, views, flow, pictures, sparser):
@@ -322,8 +330,9 @@ def cached(
     """
     capture = pinholes.as_pinholes(capture)
     path = file_of(capture, folder, use_depths)
-    if path.exists():
-        return load(path)
+    kept = cache_files.read(path, load)
+    if kept is not None:
+        return kept
     evidence = gather(capture, use_depths, tell, seconds)
     if not evidence.left_out:
         try:
@@ -349,15 +358,18 @@ def save(path: pathlib.Path, evidence: Evidence) -> None:
             arrays |= {f"{name}.{key}": value for key, value in part._asdict().items()}
         else:
             arrays[name] = np.asarray(part)
-    for side in ("forward", "backward"):
+    for side in ("forward", "backward"):  # exact: `gather` rounds to it
         arrays[f"flow.{side}"] = arrays[f"flow.{side}"].astype(np.float16)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replaced_file(path) as partial:
-        np.savez(partial, **arrays)
+    cache_files.write_arrays(path, arrays, _identity(path))
+
+
+def _identity(path):
+    """Of the record in a file: another capture's has another name."""
+    return f"evidence {VERSION} {path.stem}"
 
 
 def load(path: pathlib.Path) -> Evidence:
-    """What `save` wrote."""
+    """What `save` wrote under the same name; ValueError and OSError for all else."""
     kinds = {
         "flow": NeighbourFlow,
         "tracks": Tracks,
@@ -366,8 +378,7 @@ def load(path: pathlib.Path) -> Evidence:
         "still": PointCloud,
         "seconds": Seconds,
     }
-    with np.load(path) as stored:
-        arrays = {name: stored[name] for name in stored.files}
+    arrays = cache_files.read_arrays(path, _identity(path))
     parts = {}
     for name in Evidence._fields:
         if name in kinds:

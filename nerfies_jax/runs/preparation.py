@@ -272,7 +272,14 @@ def prepared(
         tell(f"preparing {source} as {out}, which is kept")
         prepare(source, out, how, tell)
         return out
-    made_of = json.loads((out / RECORD).read_text())
+    try:
+        made_of = dict(json.loads((out / RECORD).read_bytes()))
+    except (OSError, ValueError, TypeError, RecursionError) as error:
+        # The folder may hold the user's own work by now: it is not made again unasked.
+        raise ValueError(
+            f"{out / RECORD}: damaged, so nothing tells what {out} was made of "
+            f"({error}); remove the folder, or name another --out"
+        ) from error
     wanted = json.loads(json.dumps(_made_of(source, how)))
     differ = [name for name, value in wanted.items() if made_of.get(name) != value]
     if differ:

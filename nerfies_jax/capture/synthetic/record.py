@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from nerfies_jax import data_parallel
-from nerfies_jax.capture import nerfies_format
+from nerfies_jax.capture import cache_files, nerfies_format
 from nerfies_jax.capture.capture import Capture, CaptureError, PointCloud
 from nerfies_jax.capture.flow import FrameFlow
 from nerfies_jax.capture.json_files import AnyPath, new_folder
@@ -66,32 +66,46 @@ def make(spec: SceneSpec, seed: int = 0) -> tuple[Capture, SceneTruth]:
 def write(spec: SceneSpec, path: AnyPath, seed: int = 0):
     """Film a scene into a Nerfies directory with `truth.npz` beside; all or nothing."""
     with new_folder(path) as folder:  # refuses a path in use before it films
-        capture, answers = make(spec, seed)
-        with ThreadPoolExecutor(1) as beside:  # zlib needs no lock of Python
-            saved = beside.submit(truth.save, answers, folder / TRUTH_FILE)
-            nerfies_format.write(capture, folder / "capture")
-            for part in (folder / "capture").iterdir():
-                part.rename(folder / part.name)
-            (folder / "capture").rmdir()
-            saved.result()
+        _write_into(folder, spec, seed)
+
+
+def _write_into(folder, spec, seed):
+    capture, answers = make(spec, seed)
+    with ThreadPoolExecutor(1) as beside:  # zlib needs no lock of Python
+        saved = beside.submit(truth.save, answers, folder / TRUTH_FILE)
+        nerfies_format.write(capture, folder / "capture")
+        for part in (folder / "capture").iterdir():
+            part.rename(folder / part.name)
+        (folder / "capture").rmdir()
+        saved.result()
 
 
 def cached(
     spec: SceneSpec, folder: AnyPath, seed: int = 0
 ) -> tuple[Capture, SceneTruth]:
-    """The scene from a cache folder, filmed first where it is not there yet."""
+    """The scene from a cache folder, filmed first unless it is there, whole."""
+    identity = f"scene {digest(spec, seed)}"
     path = pathlib.Path(folder) / f"{spec.name.replace(' ', '-')}-{digest(spec, seed)}"
-    if not path.exists():
+
+    def load(path):
+        cache_files.check_entry(path, identity)
+        return nerfies_format.read(path), truth.load(path / TRUTH_FILE)
+
+    kept = cache_files.read(path, load)
+    if kept is None:
         try:
-            write(spec, path, seed)
+            with cache_files.replaced_entry(path, identity) as partial:
+                _write_into(partial, spec, seed)
         except CaptureError:
-            if not path.exists():  # else another process was quicker: use its files
+            # Another process may have been quicker: then its files are as good.
+            kept = cache_files.read(path, load)
+            if kept is None:
                 raise
-    capture = nerfies_format.read(path)
-    capture = dataclasses.replace(
-        capture, name=f"synthetic {spec.name}", source="synthetic"
-    )
-    return capture, truth.load(path / TRUTH_FILE)
+        else:
+            kept = load(path)
+    capture, answers = kept
+    name = f"synthetic {spec.name}"
+    return dataclasses.replace(capture, name=name, source="synthetic"), answers
 
 
 def digest(spec: SceneSpec, seed: int = 0) -> str:
