@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from gaussians_jax.raster_spec import RasterSpec
 from gaussians_jax.splats import Gaussians, refuse_half
+from nerfies_jax.contract import checked
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.geometry.fusion import components
 from nerfies_jax.geometry.jacobi import cross, dot
@@ -57,6 +58,7 @@ class Footprints(NamedTuple):
         return self.visible & jnp.all(meets, axis=1)
 
 
+@checked
 def project(
     gaussians: Gaussians, camera: Camera, size: tuple[int, int], spec: RasterSpec
 ) -> Footprints:

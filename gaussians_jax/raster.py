@@ -26,6 +26,7 @@ from gaussians_jax.blending import SHAPE_COLUMNS, Lockstep
 from gaussians_jax.projection import Footprints
 from gaussians_jax.raster_spec import RasterSpec
 from gaussians_jax.splats import refuse_half
+from nerfies_jax.contract import checked
 
 # By backend: tiles in lockstep, Gaussians a step. On the CPU a step of 32 x 4 x 64
 # evaluations hides XLA's overhead of some 0.2 us an operation and stays in cache; on a
@@ -54,6 +55,7 @@ class Residuals(NamedTuple):
     pairs: Int[Array, ""]  # (tile, Gaussian) pairs blended in all of them
 
 
+@checked
 def rasterize(
     footprints: Footprints,
     values: Float[Array, "gaussians channels"],

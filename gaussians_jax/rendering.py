@@ -11,7 +11,9 @@ from gaussians_jax import harmonics, projection, raster
 from gaussians_jax.projection import Footprints
 from gaussians_jax.raster_spec import GSPLAT, RasterSpec
 from gaussians_jax.splats import Gaussians
+from nerfies_jax.contract import checked
 from nerfies_jax.geometry.camera import Camera
+from nerfies_jax.geometry.precision import widened
 from nerfies_jax.training.model import Rendering
 
 # Expected depth is D / max(alpha, 1e-10), as gsplat: zero, not NaN, where nothing is.
@@ -26,6 +28,7 @@ class Frame(NamedTuple):
     features: Float[Array, "height width features"] | None  # no background added
 
 
+@checked
 def render(
     gaussians: Gaussians,
     colours: Float[Array, "gaussians 3"],
@@ -52,11 +55,11 @@ def render(
     drawn = footprints
     if mean2d_offset is not None:
         drawn = footprints._replace(mean_px=footprints.mean_px + mean2d_offset)
-    values = [colours]
+    values = [widened(colours)]
     if depth:
         values.append(footprints.depth[:, None])
     if features is not None:
-        values.append(features)
+        values.append(widened(features))
     image, transmittance = raster.rasterize(
         drawn, jnp.concatenate(values, axis=1), size, spec
     )
@@ -68,6 +71,7 @@ def render(
     return Frame(Rendering(colour, alpha, expected), footprints, extras)
 
 
+@checked
 def render_harmonics(
     gaussians: Gaussians,
     coefficients: Float[Array, "gaussians coefficients 3"],

@@ -190,7 +190,7 @@ def _leaf(
     variadic = None
     for axis in axes.split():
         if axis == "..." or axis.lstrip("#").startswith("*"):
-            variadic = axis.lstrip("#").lstrip("*")
+            variadic = axis.lstrip("#*.")
         else:
             known = (
                 int(axis) if axis.isdigit() else axis if axis.isidentifier() else ANY

@@ -320,7 +320,7 @@ def _in_camera(camera: Camera, point: Float[Array, "3"]):
     return offset[:2], offset[2]
 
 
-def _row(bad: np.ndarray, inner: int) -> str:
+def _row(bad: np.ndarray | np.bool_, inner: int) -> str:
     """Where in a batch the first bad entry lies; empty for a single camera."""
     rows = bad.reshape(*bad.shape[: bad.ndim - inner], -1).any(axis=-1)
     return f" (row {int(np.flatnonzero(rows)[0])})" if rows.ndim else ""

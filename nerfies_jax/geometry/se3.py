@@ -144,6 +144,7 @@ def left_jacobian(twist: Twist) -> Float[Array, "6 6"]:
 
 
 @checked(broadcast=True)
+@at_least_float32
 def from_rotation_translation(
     rotation: Float[Array, "3 3"], translation: Vector
 ) -> Transform:

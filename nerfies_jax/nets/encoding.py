@@ -98,6 +98,7 @@ def anneal(bands: int, alpha: Scalar) -> Float[Array, " bands"]:
     return sincospi(opened / 2)[0] ** 2
 
 
+@checked(broadcast=True)
 def positional_encoding(
     points: Float[Array, "*batch dim"],
     num_frequencies: int,
@@ -131,6 +132,7 @@ def positional_encoding(
     return encode(spec, points, window)
 
 
+@checked(broadcast=True)
 def coarse_to_fine_window(
     num_frequencies: int, alpha: Float[Array, "*batch"]
 ) -> Float[Array, "*batch num_frequencies"]:

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from nerfies_jax.contract import checked
-from nerfies_jax.geometry.precision import power_of_two
+from nerfies_jax.geometry.precision import at_least_float32, power_of_two
 from nerfies_jax.nets import bsplines, mlp
 from nerfies_jax.nets.mlp import HeadSpec
 
@@ -289,29 +289,36 @@ def apply(
 
 @checked
 def apply_heads(
-    spec: KANSpec, params: KAN, inputs: Float[Array, "*batch inputs"]
+    spec: KANSpec, params: KAN, x: Float[Array, "*batch inputs"]
 ) -> dict[str, Float[Array, "*batch outputs"]]:
     """Evaluate all heads of a network.
 
     Args:
       spec: The network's settings.
-      params: Parameters from `init`, of the type of `inputs`.
-      inputs: Inputs with any leading axes, [..., in_features].
+      params: Parameters from `init`, of the type of `x`.
+      x: Inputs with any leading axes, [..., in_features].
 
     Returns:
       The output [..., width] of each head, by its name.
 
     Raises:
-      ValueError: Where `inputs` has another number of features.
+      ValueError: Where `x` has another number of features.
     """
-    if inputs.shape[-1] != spec.in_features:
+    if x.shape[-1] != spec.in_features:
         raise ValueError(
-            f"kan.apply: the input has shape {list(inputs.shape)}, expected [..., "
+            f"kan.apply: `x` has shape {list(x.shape)}, expected [..., "
             f"{spec.in_features}] for in_features={spec.in_features}"
         )
-    return after_first_layer(spec, params, first_layer_part(spec, params, inputs, 0))
+    kind = next(iter(params.heads.values())).kernel.dtype
+    if x.dtype != kind:
+        raise ValueError(
+            f"kan.apply: `x` is {x.dtype} but the parameters are {kind}; "
+            "cast one of them"
+        )
+    return after_first_layer(spec, params, first_layer_part(spec, params, x, 0))
 
 
+@checked
 def first_layer_part(
     spec: KANSpec, params: KAN, part: Float[Array, "*batch part"], start: int
 ) -> Float[Array, "*batch outputs"]:
@@ -337,6 +344,7 @@ def first_layer_part(
     return _sum_over_inputs(spec, 0, layer, kernels, part)
 
 
+@checked
 def after_first_layer(
     spec: KANSpec, params: KAN, first: Float[Array, "*batch features"]
 ) -> dict[str, Float[Array, "*batch outputs"]]:
@@ -355,6 +363,8 @@ def after_first_layer(
     return outputs
 
 
+@checked
+@at_least_float32
 def standardise(
     features: Float[Array, "*batch features"],
 ) -> Float[Array, "*batch features"]:
@@ -369,6 +379,8 @@ def standardise(
     return centred * jax.lax.rsqrt(variance + NORM_VARIANCE / scale**2)
 
 
+@checked
+@at_least_float32
 def hold(
     x: Float[Array, "*batch inputs"], grid: tuple[float, float], margin: float
 ) -> Float[Array, "*batch inputs"]:

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from nerfies_jax.contract import checked
 from nerfies_jax.geometry.fusion import materialised
-from nerfies_jax.geometry.precision import widened
+from nerfies_jax.geometry.precision import at_least_float32, widened
 
 # PSNR is reported to 100 dB, where 8-bit images ended long ago (51 dB for one level).
 LEAST_MSE = 1e-10
@@ -85,6 +85,7 @@ def mse(
 
 
 @checked
+@at_least_float32
 def charbonnier(
     residual_sq: Float[Array, "*batch"], width: float
 ) -> Float[Array, "*batch"]:
@@ -102,6 +103,7 @@ def charbonnier(
 
 
 @checked
+@at_least_float32
 def huber(residual_sq: Float[Array, "*batch"], width: float) -> Float[Array, "*batch"]:
     """s / 2 up to |residual| = width, then width (|residual| - width / 2)."""
     _positive(width)
@@ -111,6 +113,7 @@ def huber(residual_sq: Float[Array, "*batch"], width: float) -> Float[Array, "*b
 
 
 @checked
+@at_least_float32
 def geman_mcclure(
     residual_sq: Float[Array, "*batch"],
     width: float,
@@ -264,6 +267,7 @@ def photometric(
     return (1 - dssim_weight) * absolute + dssim_weight * structural
 
 
+@checked
 def middle_level(target: Float[Array, "*shape"]) -> Float[Array, ""]:
     """The mean to 12 bits, without a slope; variances may be taken about it.
 
