@@ -19,7 +19,7 @@ import pathlib
 from typing import Any, Literal
 
 from experiments import cli, render_folder
-from nerfies_jax import console
+from nerfies_jax import console, events
 from nerfies_jax.runs import platform, representations, run_folder
 
 # Which options each format knows, beside --out, --overwrite and --device.
@@ -139,7 +139,8 @@ def main(args):
             # What is written is in the cameras that training found.
             run = runs.with_found_cameras(run, runs.restore(args.run, run).state)
         args.place.parent.mkdir(parents=True, exist_ok=True)
-        said = WRITERS[args.format](args, run)
+        with events.stage(f"exporting {args.format}"):
+            said = WRITERS[args.format](args, run)
         console.say(f"{said}: {args.place}")
     return {"written": str(args.place), "format": args.format, "said": said}
 

@@ -23,7 +23,7 @@ import numpy as np
 import tyro
 
 from experiments import cli, render_folder
-from nerfies_jax import console
+from nerfies_jax import console, events
 from nerfies_jax.runs import platform, representations
 
 
@@ -281,7 +281,7 @@ def _write(args, out, renderer, state, names, views, picture_of):
     from nerfies_jax.capture import images, video
     from nerfies_jax.evaluation import exr_series
 
-    def pictures():
+    def pictures(stage):
         for place, (name, view) in enumerate(zip(names, views, strict=True)):
             rendering = renderer(state, view)
             picture = picture_of(rendering, place)
@@ -290,13 +290,15 @@ def _write(args, out, renderer, state, names, views, picture_of):
             if "exr" in args.formats:
                 seen = getattr(view, "view", view)  # of a `variants.Between`
                 exr_series.write_frame(out / f"{name}.exr", rendering, seen)
+            stage.advance()
             yield picture
 
-    if "mp4" in args.formats:
-        video.write_video(out / "film.mp4", pictures(), cli.RATE)
-    else:
-        for _ in pictures():
-            pass
+    with events.stage("rendering images", len(views)) as stage:
+        if "mp4" in args.formats:
+            video.write_video(out / "film.mp4", pictures(stage), cli.RATE)
+        else:
+            for _ in pictures(stage):
+                pass
 
 
 def _told(out, renderer, count, files):

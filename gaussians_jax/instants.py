@@ -15,6 +15,7 @@ import numpy as np
 
 from gaussians_jax import files, splats
 from gaussians_jax.splats import Gaussians, Splats
+from nerfies_jax import events
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.json_files import alike, replaced_folder
 from nerfies_jax.training.model import Model, TrainState
@@ -112,7 +113,12 @@ def save_sequence(
         raise ValueError(f"{count} frame(s) are no sequence; export a time instead")
     times = np.linspace(0, 1, count)
     names = [NUMBERED.format(number) + suffix for number in range(count)]
-    with replaced_folder(folder, overwrite, alike(folder, names)) as partial:
+    stage = events.stage("writing Gaussians", count)
+    with (
+        replaced_folder(folder, overwrite, alike(folder, names)) as partial,
+        stage as s,
+    ):
         for name, time in zip(names, times, strict=True):
             files.save(partial / name, at(float(time)))
+            s.advance()
     return times

@@ -5,14 +5,17 @@ import errno
 import io
 import os
 import pathlib
+import re
 import subprocess
 import sys
 import threading
+import time
+from unittest import mock
 
 import pytest
 import rich.console
 
-from nerfies_jax import console, events
+from nerfies_jax import console, events, progress
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 PACKAGES = ("nerfies_jax", "gaussians_jax", "experiments")
@@ -209,3 +212,43 @@ def test_a_sink_that_fails_is_left_out(capsys):
     assert said == (
         "warning: function receives no further events: ConnectionError: no network\n"
     )
+
+
+def lines_of(monkeypatch, seconds):
+    """What a log says of a stage, with the clock as fast as `seconds` has it."""
+    monkeypatch.setattr(progress, "TICK_SECONDS", 0.01)
+    for name, value in seconds.items():
+        monkeypatch.setattr(progress, name, value)
+    text = io.StringIO()
+    with events.shown_on(rich.console.Console(file=text, width=200)):
+        with events.stage("short"):
+            pass
+        with events.stage("structure from motion"), events.stage("features", 4) as one:
+            for _ in range(4):
+                time.sleep(0.25)
+                one.advance()
+    return text.getvalue().splitlines()
+
+
+def test_a_log_gets_a_line_of_a_stage_that_lasts_and_one_now_and_then(monkeypatch):
+    often = {"FIRST_LINE_SECONDS": 0.02, "LINE_SECONDS": 0.1}
+    first, *more = lines_of(monkeypatch, often)
+    assert first.startswith("features")
+    assert re.fullmatch(r"features: [1-4] of 4.*", more[-1])
+    assert lines_of(monkeypatch, {"FIRST_LINE_SECONDS": 60.0}) == []
+
+
+def test_a_stage_without_a_count_says_ever_more_rarely_that_it_lasts(monkeypatch):
+    target = io.StringIO()
+    display = progress.Display(rich.console.Console(file=target))
+    now = [0.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(progress.threading, "Thread", mock.Mock())
+    event = {"kind": "stage", "stage": 1, "name": "compiling", "done": 0, "total": None}
+    display(event | {"status": "begin"})
+    shown = []
+    for now[0] in range(0, 100):
+        before = target.tell()
+        display._view.tick(list(display._open.values()))
+        shown += [now[0]] if target.tell() > before else []
+    assert shown == [2, 12, 24, 48, 96]

@@ -12,7 +12,7 @@ from gaussians_jax import harmonics, rendering, splats
 from gaussians_jax.instants import At
 from gaussians_jax.raster_spec import RasterSpec
 from gaussians_jax.splats import Gaussians, Splats
-from nerfies_jax import data_parallel, evaluation
+from nerfies_jax import data_parallel, evaluation, events
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.geometry.camera import Camera
 
@@ -79,6 +79,7 @@ def count_for(capture: Capture) -> int:
     return int(np.clip(moments, LEAST_INSTANTS, MOST_INSTANTS))
 
 
+@events.stage("finding the Gaussians that are seen")
 def seen_in_training(
     at: At,
     rows: Splats,

@@ -20,6 +20,7 @@ import PIL.Image
 import PIL.ImageOps
 import scipy.ndimage
 
+from nerfies_jax import events
 from nerfies_jax.capture import frames, images
 from nerfies_jax.capture.capture import CaptureError, blocks, shrink
 from nerfies_jax.capture.colmap_library import MIN_TRACK
@@ -85,9 +86,11 @@ def from_film(
     moves by itself; those of the frames taken go to `out/masks`.
     """
     moments, scores = [], []
-    for seconds, grey in read_video(film, grey=True):
-        moments.append(seconds)
-        scores.append(sharpness(grey))
+    with events.stage("decoding the video to find sharp frames") as stage:
+        for seconds, grey in read_video(film, grey=True):
+            moments.append(seconds)
+            scores.append(sharpness(grey))
+            stage.advance(text=f"{len(scores):,} frames")
     # Frames come in the order in which they are shown, but .avi has only the times at
     # which they are decoded, and B-frames are not decoded in that order.
     moments, scores = np.sort(moments), np.array(scores)
@@ -103,14 +106,16 @@ def from_film(
     sources = None if masks is None else _masks_of_film(masks, len(moments))
     names, rows = [], kept.tolist()  # which rise
     colours = read_video(film, rows=set(rows))
-    for row, (_, frame) in zip(rows, colours, strict=True):
-        factor = _factor(frame.shape[1::-1], max_side)
-        # The name keeps the time.
-        names.append(f"ms{round(moments[row] * 1000):08d}.png")
-        _write(out / "images" / names[-1], shrink(frame, factor))
-        if sources is not None:
-            mask = images.read_mask(sources[row])
-            _write_mask(out, names[-1], mask, frame.shape, factor, sources[row])
+    with events.stage("writing frames of the video", len(rows)) as stage:
+        for row, (_, frame) in zip(rows, colours, strict=True):
+            factor = _factor(frame.shape[1::-1], max_side)
+            # The name keeps the time.
+            names.append(f"ms{round(moments[row] * 1000):08d}.png")
+            _write(out / "images" / names[-1], shrink(frame, factor))
+            if sources is not None:
+                mask = images.read_mask(sources[row])
+                _write_mask(out, names[-1], mask, frame.shape, factor, sources[row])
+            stage.advance()
     notes = [f"{len(kept)} of {len(scores)} frames kept, {blurred} too blurred"]
     transfer = transfer_of(film)
     if transfer is not None:
@@ -164,18 +169,20 @@ def from_pictures(
     if times > 1:
         raise CaptureError(f"{folder}: {times} pictures are named {stem}; keep one")
     factor, broken = _factor(usual, max_side), []
-    for file in taken:
-        try:
-            colour = _upright(file)
-        except _Unreadable:  # behind its header
-            broken.append(file)
-            continue
-        name = f"{_spoken(file.stem)}.png"
-        _write(out / "images" / name, shrink(colour, factor))
-        if masks is not None:
-            source = _mask_of(masks, file)
-            mask = _upright(source).mean(-1) >= 128
-            _write_mask(out, name, mask, colour.shape, factor, source)
+    with events.stage("reading images", len(taken)) as stage:
+        for file in taken:
+            stage.advance()
+            try:
+                colour = _upright(file)
+            except _Unreadable:  # behind its header
+                broken.append(file)
+                continue
+            name = f"{_spoken(file.stem)}.png"
+            _write(out / "images" / name, shrink(colour, factor))
+            if masks is not None:
+                source = _mask_of(masks, file)
+                mask = _upright(source).mean(-1) >= 128
+                _write_mask(out, name, mask, colour.shape, factor, source)
     notes += _left_out([file.name for file in broken], _BROKEN)
     taken = [file for file in taken if file not in broken]
     _check_enough(folder, len(taken), notes)

@@ -5,6 +5,7 @@ one of its OpenMP loops), and because its libraries do not mix well with others.
 """
 
 import collections
+import contextlib
 import dataclasses
 import json
 import os
@@ -14,13 +15,11 @@ import shutil
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import numpy as np
 
-from nerfies_jax import children, console
+from nerfies_jax import children, console, events
 from nerfies_jax.capture import extras, frames
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.colmap_library import MIN_TRACK, library
@@ -28,7 +27,6 @@ from nerfies_jax.capture.json_files import AnyPath, new_folder
 
 EXHAUSTIVE_UP_TO = 40  # pictures; above, matching every pair takes most of the time
 SEED = 0  # of RANSAC: by the clock, 24 to 26 of the same 30 pictures found a place
-TELL_SECONDS = 5.0  # between two lines of progress
 MOST_JUDGED = 5000  # points
 # Cameras are doubtful beyond these. Real clips of 87 and 86 pictures came out at 0.4 px
 # and 6 and 9 degrees.
@@ -126,7 +124,6 @@ def run_sfm(
     out: AnyPath,
     masks: AnyPath | None = None,
     spec: MappingSpec = MappingSpec(),
-    tell: Callable[[str], None] = lambda line: None,
 ) -> Poses:
     """Reconstruct the pictures in a folder; `out` becomes a folder with sparse/0.
 
@@ -134,7 +131,7 @@ def run_sfm(
     whatever moves by itself. Measured with a mover on 15 % of the picture: without
     masks all pictures register and the reprojection error is low, but the path is 250
     times further off. The pictures are copied to `out/images`, so `out` can be loaded.
-    `tell` hears now and then how far it is.
+    Its stages are shown and emitted as events.
     """
     extras.check("pycolmap", "sfm")  # here, not in the child, whose last line is told
     # The child runs elsewhere.
@@ -159,7 +156,7 @@ def run_sfm(
         shutil.copytree(images, folder / "images")
         if masks is not None:
             shutil.copytree(masks, folder / "masks")
-        judged = _in_own_process(folder, masks is not None, spec, tell)
+        judged = _in_own_process(folder, masks is not None, spec, len(names))
         poses = Poses(out, len(names), **judged)
         if poses.placed < max(2, spec.at_least * len(names)):
             raise FewPlaced(
@@ -169,7 +166,8 @@ def run_sfm(
     return poses
 
 
-def _in_own_process(folder, masked, spec, tell):
+@events.stage("structure from motion")
+def _in_own_process(folder, masked, spec, images):
     request = json.dumps(
         {"folder": str(folder), "masked": masked, "spec": dataclasses.asdict(spec)}
     )
@@ -180,7 +178,7 @@ def _in_own_process(folder, masked, spec, tell):
     words = {"text": True, "errors": "replace"}
     with children.start(command, cwd=root, **words, **pipes) as child:
         log = collections.deque(maxlen=20)
-        reader = threading.Thread(target=_follow, args=(child.stderr, log, tell))
+        reader = threading.Thread(target=_follow, args=(child.stderr, log, images))
         reader.start()
         timer = threading.Timer(spec.seconds, child.kill)
         timer.start()
@@ -211,27 +209,31 @@ def _in_own_process(folder, masked, spec, tell):
     return json.loads(last[0])
 
 
-# What COLMAP's log says of where it is, and how to say it.
+# What COLMAP's log says of where it is, and of which stage that is.
 STAGES = (
-    (re.compile(r"Processed file \[(\d+)/(\d+)\]"), "features of {} of {} pictures"),
-    (re.compile(r"Processing image \[(\d+)/(\d+)\]"), "matches of {} of {} pictures"),
-    (re.compile(r"Processing block \[(\d+)/(\d+)"), "matches of block {} of {}"),
-    (re.compile(r"Registering image.*num_reg_frames=(\d+)"), "{} pictures placed"),
+    (re.compile(r"Processed file \[(\d+)/(\d+)\]"), "extracting features"),
+    (re.compile(r"Processing image \[(\d+)/(\d+)\]"), "matching features"),
+    (re.compile(r"Processing block \[(\d+)/(\d+)"), "matching features"),
+    (re.compile(r"Registering image.*num_reg_frames=(\d+)"), "placing cameras"),
 )
 
 
-def _follow(lines, log, tell):
-    """Keep the last lines of the child's log, and tell now and then where it is."""
-    logged = time.monotonic()
-    for line in filter(None, map(str.strip, lines)):
-        log.append(line)
-        if time.monotonic() - logged < TELL_SECONDS:
-            continue
-        for pattern, words in STAGES:
-            where = pattern.search(line)
-            if where:
-                tell("cameras: " + words.format(*where.groups()))
-                logged = time.monotonic()
+def _follow(lines, log, images):
+    """Keep the last lines of the child's log, and follow its stages by them."""
+    name, stage = "", None
+    with contextlib.ExitStack() as opened:
+        for line in filter(None, map(str.strip, lines)):
+            log.append(line)
+            for pattern, begun in STAGES:
+                where = pattern.search(line)
+                if not where:
+                    continue
+                if begun != name:
+                    opened.close()
+                    name = begun
+                    stage = opened.enter_context(events.stage(name))
+                done, total = (*map(int, where.groups()), images)[:2]
+                stage.reach(done, total)
 
 
 def _reconstruct(folder: pathlib.Path, masked: bool, spec: MappingSpec) -> dict:

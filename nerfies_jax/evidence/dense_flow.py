@@ -1,4 +1,4 @@
-"""Dense optical flow between frames that follow each other in time, both ways.
+"""Dense flow between neighboring frames that follow each other in time, both ways.
 
 OpenCV's DIS (Kroeger et al. 2016, arXiv:1603.03590) on pictures brought to one mean and
 contrast. Only neighbours are compared: over longer gaps patterns that repeat are taken
@@ -14,6 +14,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from nerfies_jax import events
 from nerfies_jax.evidence import wide_steps
 from nerfies_jax.evidence.view_set import Views
 
@@ -156,9 +157,11 @@ def between_neighbours(
     ahead = [(frame, frame + 1) for frame in range(frames - 1)]
     steps = ahead + [(after, before) for before, after in ahead]
     # 118 flows of 176x132: 8.5 s on one core; 4.9 on two, 6.1 by OpenCV's own threads.
-    with ThreadPoolExecutor(cv2.getNumThreads()) as threads:
+    stage = events.stage("flow between neighboring frames", len(steps))
+    with ThreadPoolExecutor(cv2.getNumThreads()) as threads, stage as flowing:
         for (one, other), shift in zip(steps, threads.map(flow, steps), strict=True):
             (forward if other > one else backward)[one] = shift
+            flowing.advance()
     checked_flow = checked(forward, backward)
     for frame in range(1, frames - 1):
         if _lost(checked_flow, frame) or _jumps(checked_flow, frame):

@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from nerfies_jax import events
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evidence import (
     contact_sheet,
@@ -61,7 +62,16 @@ def inspect(
     rest = points
     if not len(points) and not evidence.unusable:
         rest = view_set.some(evidence.still.position)
-    findings = (
+    findings = _findings(capture, looked, views, evidence, points, rest)
+    with events.stage("drawing the contact sheet"):
+        sheet = contact_sheet.followed(views, evidence)
+    seconds = time.perf_counter() - began
+    return Inspection(findings, sheet, evidence.factor, seconds, views, evidence)
+
+
+@events.stage("judging effects")
+def _findings(capture, looked, views, evidence, points, rest):
+    return (
         motion.motion(views, evidence),
         exposure.exposure(views, rest),
         transient.transient(views, evidence),
@@ -72,6 +82,3 @@ def inspect(
         stored.lens(capture),
         texture.texture(looked, views, evidence.factor),
     )
-    sheet = contact_sheet.followed(views, evidence)
-    seconds = time.perf_counter() - began
-    return Inspection(findings, sheet, evidence.factor, seconds, views, evidence)

@@ -6,6 +6,7 @@ Flow between neighbours in time, tracks, which of them and which pixels move, th
 paths in space, and points that stand still: host side, one core, no gradients.
 """
 
+import contextlib
 import functools
 import hashlib
 import math
@@ -89,7 +90,11 @@ def gather(
     `tell` hears of each of `PARTS` when it begins, and of what there is no time for:
     when much of the `seconds` is gone, what is not needed most is left out.
     """
-    watch = Watch(tell, seconds)
+    with contextlib.closing(Watch(tell, seconds)) as watch:
+        return _gathered(capture, use_depths, watch)
+
+
+def _gathered(capture, use_depths, watch):
     watch.begin("flow")
     factor, given = _factor(capture), capture.given or Given(capture.size)
     capture = looked_at(capture, factor)

@@ -1,8 +1,11 @@
 """How long the parts of gathering evidence take, and what there is no time for."""
 
+import contextlib
 import time
 from collections.abc import Callable
 from typing import NamedTuple
+
+from nerfies_jax import events
 
 # Films of 100 frames of 480x270 take 20 s on one core, and up to a minute and a half
 # where most steps are wide.
@@ -28,6 +31,15 @@ PARTS = Seconds(
 )
 
 
+STAGES = {
+    "flow": "optical flow",
+    "tracks": "point tracks",
+    "moving": "finding what moves",
+    "paths": "paths of moving points",
+    "still": "dense static points",
+}
+
+
 class Watch:
     """Says which part begins, and what is left out once a share of the time is gone."""
 
@@ -40,11 +52,18 @@ class Watch:
         self._start = time.perf_counter()
         self._began: dict[str, float] = {}
         self._left_out: dict[str, None] = {}
+        self._stage = contextlib.ExitStack()  # of the part that goes on
+
+    def close(self) -> None:
+        """End the last part."""
+        self._stage.close()
 
     def begin(self, part: str) -> None:
         """A field of `PARTS`."""
         self._began[part] = time.process_time()
         self._tell(getattr(PARTS, part))
+        self._stage.close()
+        self._stage.enter_context(events.stage(STAGES[part]))
 
     def has_time(self, share: float, what: str) -> bool:
         """Whether less than a share of the time is gone; else `what` is left out."""

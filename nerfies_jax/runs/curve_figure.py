@@ -3,12 +3,13 @@
 import math
 import pathlib
 
-from nerfies_jax import evaluation
+from nerfies_jax import evaluation, events
 from nerfies_jax.evaluation import Scored, pictures
 from nerfies_jax.runs.run import Run
 from nerfies_jax.runs.train import Trained
 
 
+@events.stage("drawing the curve")
 def save(path: pathlib.Path, run: Run, trained: Trained, scored: Scored):
     """PSNR against seconds; None where the run ended before it was evaluated.
 

@@ -119,15 +119,21 @@ def _until(rows, step):
     return [row for row in rows if row["step"] <= step]
 
 
-def write(folder: pathlib.Path, history: History, frames: Sequence[str]) -> None:
+def write(
+    folder: pathlib.Path,
+    history: History,
+    frames: Sequence[str],
+    told: Course | None = None,
+) -> None:
     """Write `curve.json`: evaluations, mean metrics of chunks, and the machine.
 
     Args:
-      folder: The run folder. Its events are what is written, as far as they are whole.
+      folder: Where to write it.
       history: Of the run, which takes the place of events that were lost.
       frames: Names of the held-out frames that the evaluations are of.
+      told: The course of the run by its events, which is what is written.
     """
-    told = course_of(folder) or Course()
+    told = told or Course()
     evaluations, training = told.evaluations, told.training
     if [_at(row) for row in evaluations] != [_at(row) for row in history.evaluations]:
         evaluations, training = history.evaluations, history.rows

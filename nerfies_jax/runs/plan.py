@@ -2,7 +2,7 @@
 
 import math
 
-from nerfies_jax import evaluation
+from nerfies_jax import evaluation, events
 from nerfies_jax.runs.run import Run, with_steps
 from nerfies_jax.training import rate
 from nerfies_jax.training.model import TrainState
@@ -12,6 +12,7 @@ from nerfies_jax.training.model import TrainState
 OVERRUN = 1.5
 
 
+@events.stage("measuring the time of a step")
 def with_seconds(run: Run, state: TrainState, seconds: float | int) -> tuple[Run, str]:
     """The run over as many steps as take `seconds` of training, and the plan in words.
 

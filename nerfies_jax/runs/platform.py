@@ -10,6 +10,7 @@ from typing import Literal
 
 import psutil
 
+from nerfies_jax import events
 from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.compiler import UNDIVIDED
 
@@ -20,6 +21,7 @@ _AFFINITY = hasattr(psutil.Process, "cpu_affinity")  # not on macOS
 VECTOR_WIDTH = "--xla_cpu_prefer_vector_width"  # XLA:CPU's own is 256 bits
 
 
+@events.stage("starting JAX")
 def start_jax(
     device: Device = "auto", threads: Threads = "one", shares: int = 1
 ) -> None:

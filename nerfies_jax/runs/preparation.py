@@ -146,12 +146,12 @@ def _solve(scratch, taken, how, tell) -> Solved:
         spec = dataclasses.replace(spec, focal=taken.focal)
     pictures, given = scratch / "images", scratch / "masks"
     if how.masks is not None:
-        poses = run_sfm(pictures, scratch / "only", given, spec, tell)
+        poses = run_sfm(pictures, scratch / "only", given, spec)
         return Solved(poses, True, tuple(poses.lines()))
     # Coarse first: what moves has most of the fine features of some pictures.
     coarse = spec if how.passes == 1 else dataclasses.replace(spec, first_octave=0)
     try:
-        first = run_sfm(pictures, scratch / "first", None, coarse, tell)
+        first = run_sfm(pictures, scratch / "first", None, coarse)
     except FewPlaced as error:
         if how.passes == 1:
             raise
@@ -172,7 +172,7 @@ def _solve(scratch, taken, how, tell) -> Solved:
         share = f"{moving.mean():.1%} of the pixels move"
         tell(f"{share}; the cameras again without them")
     try:
-        second = run_sfm(pictures, scratch / "second", masks, spec, tell)
+        second = run_sfm(pictures, scratch / "second", masks, spec)
     except CaptureError as error:
         reason = str(error).partition(": ")[2]
         kept = f"once more, {reason}; the first cameras are kept"
@@ -195,7 +195,7 @@ def _solve_without_movers(scratch, spec, error, tell):
         raise error
     masks = _write_masks(scratch, moves)
     tell(f"{share:.1%} of the pixels seem to move; the cameras again without them")
-    poses = run_sfm(scratch / "images", scratch / "second", masks, spec, tell)
+    poses = run_sfm(scratch / "images", scratch / "second", masks, spec)
     return Solved(poses, True, tuple(poses.lines()))
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from nerfies_jax import console, evaluation
+from nerfies_jax import console, evaluation, events
 from nerfies_jax.capture import camera_paths, exr, video
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.extras import MissingExtra
@@ -81,7 +81,8 @@ def make(
             comparison = save_comparison(place / "comparison.png", run.filmed, scored)
             figures = [*player, report.Figure(comparison, COMPARED)]
             watched = [run.capture.ids[row] for row in trained.watched]
-            curves.write(place, trained.result.history, watched)
+            course = curves.course_of(folder)
+            curves.write(place, trained.result.history, watched, course)
             curve = with_extra(
                 curve_figure.save, place / "psnr_over_time.png", run, trained, scored
             )
@@ -92,9 +93,10 @@ def make(
                 save_film, place / "scene.mp4", run, renderer, state, ms_per_frame / 1e3
             )
             save_depth(place / "depth", run.capture, scored)
-            saved = run.representation.save(
-                place, run.spec, run.metadata, state, effects=run.effects
-            )
+            with events.stage("saving the model"):
+                saved = run.representation.save(
+                    place, run.spec, run.metadata, state, effects=run.effects
+                )
             fitted, gain = score_halves(run, state, scored, ms_per_frame / 1e3)
             numbers, remarks = quality.measure(
                 run, state, trained.draw, scored, extra, ms_per_frame / 1e3
@@ -106,7 +108,8 @@ def make(
             warnings = floors_text.warnings(numbers)
             notes = [*warnings, trained.result.message, *_capture_notes(run), *left_out]
             notes += [*remarks, *gain, *saved.notes, *unplayed]
-            step_ms, unknown = profile()
+            with events.stage("timing the parts of a step"):
+                step_ms, unknown = profile()
         notes += unknown
     page = report.write(
         folder,
@@ -205,6 +208,7 @@ def model_size(saved: Saved) -> list[Metric]:
     return [] if size is None else [metric("file.bytes", size, 1e5)]
 
 
+@events.stage("scoring halves of frames")
 def score_halves(
     run: Run, state: TrainState, scored: Scored, frame_seconds: float
 ) -> tuple[list[Metric], tuple[str, ...]]:
@@ -242,6 +246,7 @@ def score_halves(
     return metrics, (note,)
 
 
+@events.stage("drawing the comparison")
 def save_comparison(path: pathlib.Path, capture: Capture, scored: Scored):
     """Truth, render, error and depth of a few held-out frames."""
     shown = evaluation.spread(np.arange(len(scored.rows)), SHOWN)
@@ -282,17 +287,21 @@ def save_film(
         camera_paths.times(film.frames),
         evaluation.view_of(run.capture, int(run.capture.train[0])),
     )
-    frames = (
-        evaluation.as_picture(
-            renderer(state, evaluation.resized(view, size, film.size)).colour
-        )
-        for view in views
-    )
-    poster = next(frames)
-    video.write_video(path, itertools.chain([poster], frames), film.rate)
+
+    def frames(stage):
+        for view in views:
+            rendering = renderer(state, evaluation.resized(view, size, film.size))
+            yield evaluation.as_picture(rendering.colour)
+            stage.advance()
+
+    with events.stage("rendering the video", film.frames) as stage:
+        rendered = frames(stage)
+        poster = next(rendered)
+        video.write_video(path, itertools.chain([poster], rendered), film.rate)
     return report.Video(path, FILMED, poster)
 
 
+@events.stage("making the player")
 def save_player(
     folder: pathlib.Path, run: Run, trained: Trained
 ) -> tuple[list[report.Figure], list[str]]:
@@ -327,6 +336,7 @@ def save_player(
     return [report.Figure(picture, caption, player.path.name)], []
 
 
+@events.stage("writing depth")
 def save_depth(folder: pathlib.Path, capture: Capture, scored: Scored) -> None:
     """Z-depth (scene units) and alpha of every held-out frame as EXR."""
     folder.mkdir(exist_ok=True)

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nerfies_jax import evaluation
+from nerfies_jax import evaluation, events
 from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.evaluation import (
     Scored,
@@ -56,6 +56,7 @@ def check(extra: Extra, size: tuple[int, int]) -> None:
         heldout.check_large_enough(extra.lpips.network, size)
 
 
+@events.stage("measuring quality")
 def measure(
     run: Run,
     state: TrainState,

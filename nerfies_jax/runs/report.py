@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import PIL.Image
 
+from nerfies_jax import events
 from nerfies_jax.capture import images
 from nerfies_jax.capture.json_files import replaced_file
 from nerfies_jax.measure.clock import Metric
@@ -68,6 +69,7 @@ class Command(NamedTuple):
     line: str
 
 
+@events.stage("writing the report")
 def write(
     folder: str | pathlib.Path,
     title: str,

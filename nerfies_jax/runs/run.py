@@ -12,6 +12,7 @@ import jax
 import psutil
 
 from nerfies_jax import capture as captures
+from nerfies_jax import events
 from nerfies_jax.capture import pinholes, synthetic
 from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.capture.capture import Capture
@@ -105,6 +106,7 @@ def with_steps(run: Run, steps: int) -> Run:
     return _built(config, run.representation, spec, run.capture, run.filmed)
 
 
+@events.stage("building the model")
 def _built(config, representation, spec, capture, filmed):
     metadata = representation.metadata_of(capture, spec)
     effects = own_effects.load(config.effects, metadata)
@@ -302,6 +304,7 @@ def read_settings(folder: pathlib.Path) -> Settings:
     return Settings(config, kind, spec)
 
 
+@events.stage("initializing the scene")
 def first_state(run: Run) -> TrainState:
     """The state before the first step; ValueError where it would not fit in memory."""
     needed = run.representation.estimate_memory_bytes(run.spec, run.capture)
@@ -320,6 +323,7 @@ def free_memory() -> int:
     return psutil.virtual_memory().available
 
 
+@events.stage("restoring the checkpoint")
 def restore(folder: pathlib.Path, run: Run) -> checkpoint.Restored:
     """The newest state saved in a run folder."""
     model = run.model

@@ -6,6 +6,7 @@ import pytest
 import scipy.ndimage
 
 from nerfies_jax import capture as room
+from nerfies_jax import events
 from nerfies_jax.capture import structure_from_motion as mapping
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.geometry import camera
@@ -71,9 +72,9 @@ def test_cameras_of_a_textured_room_are_found(tmp_path, monkeypatch):
         camera_model="SIMPLE_PINHOLE", first_octave=-1, threads=2
     )
     monkeypatch.chdir(tmp_path)  # the child runs elsewhere
-    monkeypatch.setattr(mapping, "TELL_SECONDS", 0.0)
-    lines = []
-    poses = mapping.run_sfm("pictures", "out", "masks", spec, lines.append)
+    received = []
+    with events.subscribe(received.append):
+        poses = mapping.run_sfm("pictures", "out", "masks", spec)
     capture = room.load(poses.folder)
     assert len(capture.ids) == 8
     true = np.array([one.position for one in cameras], float)
@@ -88,8 +89,11 @@ def test_cameras_of_a_textured_room_are_found(tmp_path, monkeypatch):
     # The farthest two of eight cameras, 1.8 apart, look at 3 to 4 units away.
     assert 5 < poses.angle_deg < 40
     assert len(poses.lines()) == 1
-    stages = {line.split()[1] for line in lines}
-    assert {"features", "matches"} <= stages, lines
+    ended = [one for one in received if one.get("status") == "done"]
+    names = [one["name"] for one in ended]
+    inner = ["extracting features", "matching features", "placing cameras"]
+    assert names == [*inner, "structure from motion"]
+    assert ended[0]["done"] == ended[0]["total"] == 8
 
 
 @pytest.mark.slow

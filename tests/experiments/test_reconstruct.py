@@ -20,7 +20,7 @@ from nerfies_jax.measure import part_time
 from nerfies_jax.runs import products, quality, reconstruction, train
 from nerfies_jax.runs.run_folder import CHECKPOINTS
 from nerfies_jax.training import rate
-from tests import scenes
+from tests import event_checks, scenes
 
 QUICK = (
     "densification.refine_every=4",
@@ -116,6 +116,18 @@ def test_a_capture_becomes_splats_and_a_report(tmp_path, monkeypatch, capsys):
     assert "There is no player" not in page
     assert "plan: 2 steps for 250 s of training" in printed
     assert "motion:   is worth +0.00 dB" in printed
+    told = runs.read_events(out)
+    names = event_checks.ended_stages(told)
+    order = ["reading images", "initializing the scene", "training"]
+    order += ["rendering the video", "measuring quality", "writing the report"]
+    assert [name for name in dict.fromkeys(names) if name in order] == order
+    # But for what is done between them, on a machine that does other things as well.
+    assert event_checks.share_in_stages(told) > 0.8
+    assert told[-1]["stopped_by"] == "steps"
+    curve = json.loads((out / "curve.json").read_text())
+    scores = [one["metrics"] for one in told if one["kind"] == "evaluation"]
+    assert [row["psnr"] for row in curve["evaluations"]] == [x["psnr"] for x in scores]
+    assert curve["training"][-1]["step"] == 2
 
 
 @pytest.mark.slow

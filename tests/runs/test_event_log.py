@@ -151,12 +151,12 @@ def test_the_curve_is_made_of_events_unless_some_are_lost(tmp_path):
     row = {"hook": "held out", "step": 2, "seconds": 2.0, "psnr": 20.0, "ssim": 0.5}
     history = History(({"step": 1, "seconds": 1.0, "loss": 9.0},), (row,), 2.0, 1.0)
     logged(tmp_path, run("begin", 0), train(2), evaluation(2, 20.0))
-    curves.write(tmp_path, history, ["a"])
+    curves.write(tmp_path, history, ["a"], curves.course_of(tmp_path))
     stored = json.loads((tmp_path / "curve.json").read_text())
     assert stored["training"] == [{"step": 2, "seconds": 2.0, "loss": 0.5}]
     assert stored["evaluations"] == [row]
     history = history._replace(evaluations=(row, {**row, "step": 4}))
-    curves.write(tmp_path, history, ["a"])
+    curves.write(tmp_path, history, ["a"], curves.course_of(tmp_path))
     stored = json.loads((tmp_path / "curve.json").read_text())
     assert stored["training"] == [{"step": 1, "seconds": 1.0, "loss": 9.0}]
     assert len(stored["evaluations"]) == 2

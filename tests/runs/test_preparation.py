@@ -32,8 +32,7 @@ def mapper(monkeypatch):
     """
     calls = []
 
-    def run_sfm(pictures, out, masks, spec, tell):
-        del tell
+    def run_sfm(pictures, out, masks, spec):
         names = sorted(path.name for path in pictures.iterdir())
         models.make(out, count=len(names))
         text = (out / "sparse/0/images.txt").read_text()
@@ -139,10 +138,10 @@ def test_where_too_few_are_placed_what_moves_is_masked_before(
     moves["p2.png"][10:, 15:] = True
     monkeypatch.setattr(masks_without_cameras, "moving_in", lambda folder: moves)
 
-    def too_few_unmasked(pictures, out, masks, spec, tell):
+    def too_few_unmasked(pictures, out, masks, spec):
         if masks is None:
             raise FewPlaced(f"{pictures}: only 1 of 9 pictures found their place")
-        return mapper(pictures, out, masks, spec, tell)
+        return mapper(pictures, out, masks, spec)
 
     monkeypatch.setattr(preparation, "run_sfm", too_few_unmasked)
     log = []

@@ -4,6 +4,7 @@ import io
 import math
 import os
 import signal
+import sys
 import threading
 import time
 from typing import NamedTuple
@@ -381,6 +382,31 @@ def test_a_log_file_gets_lines_and_a_terminal_a_bar(frames):
         assert "rows" in shown
         assert "left" in shown
         assert ("\x1b" in shown) == terminal
+
+
+def test_a_terminal_that_is_gone_does_not_end_a_run(frames, straight, monkeypatch):
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "w") as gone:
+        monkeypatch.setattr(sys, "stderr", gone)
+        monkeypatch.setenv("FORCE_COLOR", "1")  # rich takes it for a terminal
+        # Long enough for its bars to be drawn.
+        nap = loop.Hook("nap", lambda *_: time.sleep(0.1), every_steps=2)
+        result = fit(frames, steps=20, hooks=[nap], console=None)
+    assert result.stopped_by == "steps"
+    assert toy.same(result.state, straight.state)
+
+
+def test_hooks_receive_the_metrics_of_the_last_chunk(frames):
+    received = {}
+    hook = loop.Hook("log", lambda _, step, metrics: received.update({step: metrics}))
+    hook = hook._replace(every_steps=4)
+    result = fit(frames, steps=8, hooks=[hook])
+    rows = {row["step"]: row for row in result.history.rows}
+    assert received.keys() == {4, 8}
+    for step, metrics in received.items():
+        assert metrics["loss"] == rows[step]["loss"]
+        assert "seconds" not in metrics
 
 
 @pytest.mark.parametrize(

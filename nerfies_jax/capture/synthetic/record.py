@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import jax
 import numpy as np
 
-from nerfies_jax import data_parallel
+from nerfies_jax import data_parallel, events
 from nerfies_jax.capture import cache_files, nerfies_format
 from nerfies_jax.capture.capture import Capture, CaptureError, PointCloud
 from nerfies_jax.capture.flow import FrameFlow
@@ -73,7 +73,8 @@ def _write_into(folder, spec, seed):
     capture, answers = make(spec, seed)
     with ThreadPoolExecutor(1) as beside:  # zlib needs no lock of Python
         saved = beside.submit(truth.save, answers, folder / TRUTH_FILE)
-        nerfies_format.write(capture, folder / "capture")
+        with events.stage("writing the scene"):
+            nerfies_format.write(capture, folder / "capture")
         for part in (folder / "capture").iterdir():
             part.rename(folder / part.name)
         (folder / "capture").rmdir()
@@ -119,10 +120,12 @@ def digest(spec: SceneSpec, seed: int = 0) -> str:
 def _film(spec, plan):
     rows = plan.cameras, plan.time, plan.light_gain, plan.transient_shown
     images, depths, hits = [], [], []
-    for taken in data_parallel.rows_on_devices(film.picture, spec, rows):
-        images.append(np.round(taken.image * 255).astype(np.uint8))
-        depths.append(taken.depth)
-        hits.append(taken.hit)
+    with events.stage("rendering the built-in scene", len(plan.time)) as stage:
+        for taken in data_parallel.rows_on_devices(film.picture, spec, rows):
+            images.append(np.round(taken.image * 255).astype(np.uint8))
+            depths.append(taken.depth)
+            hits.append(taken.hit)
+            stage.advance()
     hits = jax.tree.map(lambda *leaves: np.stack(leaves), *hits)
     return np.stack(images), np.stack(depths), hits
 
@@ -167,6 +170,7 @@ def _flow(plan, answers):
     return FrameFlow(*leaves)
 
 
+@events.stage("computing the scene's ground truth")
 def _truth(spec, plan, hits, ids, programs, seed):
     forward, backward = truth.flows(spec, plan, hits, programs)
     return SceneTruth(
