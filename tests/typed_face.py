@@ -1,6 +1,8 @@
 """The face of both packages as a program uses it; mypy reads it, nothing runs it."""
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 
 import gaussians_jax as gj
 import nerfies_jax as nj
@@ -38,3 +40,33 @@ def own() -> nj.Effect:
 def drawn(gaussians: gj.Gaussians, colours: jax.Array) -> jax.Array:
     camera = nj.look_at((0, 0, -5), (0, 0, 0), (0, 1, 0), focal_px=150, size=(160, 120))
     return gj.render(gaussians, colours, camera, (160, 120)).rendering.colour
+
+
+def warped(twist: jax.Array, points: jax.Array) -> jax.Array:
+    transform = nj.se3.multiply(nj.se3.exp(twist), nj.se3.identity())
+    energy = nj.elastic_loss(lambda x: nj.se3.apply_twist(twist, x), points)
+    turned = nj.so3.apply(nj.so3.exp(twist[:3]), points)
+    camera = nj.Camera.from_K(np.eye(3), np.eye(4), 64, 48)
+    pixels, depth = nj.project(camera, nj.se3.apply(transform, points))
+    quaternion = nj.quaternion.exp(twist[:3])
+    strain = nj.matrix3.log_energy(nj.quaternion.to_matrix(quaternion))
+    return energy + strain + jnp.sum(turned) + jnp.sum(pixels) + jnp.sum(depth)
+
+
+def rendered(key: jax.Array, x: jax.Array, rays: nj.Rays) -> nj.Rendered:
+    spec = nj.KANSpec(in_features=3, hidden=(64,), out_features=4)
+    layer = nj.kan.init(key, spec)
+    window = nj.coarse_to_fine_window(4, 2.5)
+    features = nj.positional_encoding(x, 4, window)
+    t, points, _ = nj.sample_along_rays(
+        key, rays.origin, rays.direction, 0.1, 4.0, 64, spacing="disparity"
+    )
+    values = nj.kan.apply(spec, layer, points) + jnp.sum(features)
+    return nj.composite(values[..., 0], values[..., 1:], t)
+
+
+def compared(image: jax.Array, truth: jax.Array, mask: jax.Array) -> jax.Array:
+    loss = nj.losses.photometric(image, truth)
+    scores = nj.psnr(image, truth) + nj.ssim(image, truth) + nj.ms_ssim(image, truth)
+    masked = nj.masked_psnr(image, truth, mask) + nj.masked_ssim(image, truth, mask)
+    return loss + scores + masked + nj.partial_ssim(image, truth, mask)

@@ -10,11 +10,15 @@ places, moves, orders or measures goes through `exact_product` and `exact_einsum
 """
 
 import functools
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Num
+
+F = TypeVar("F", bound=Callable[..., Any])
 
 _HALVES = (jnp.dtype(jnp.bfloat16), jnp.dtype(jnp.float16))
 
@@ -31,7 +35,7 @@ def exact_einsum(formula: str, *factors: Float[Array, "..."]) -> Float[Array, ".
     return jnp.einsum(formula, *factors, precision=lax.Precision.HIGHEST)
 
 
-def at_least_float32(function):
+def at_least_float32(function: F) -> F:
     """`function`, computed in float32 where array arguments are bfloat16 or float16.
 
     Results are rounded to the arguments' type where all have the same, and are float32
@@ -50,7 +54,7 @@ def at_least_float32(function):
             return results
         return jax.tree.map(lambda leaf: leaf.astype(*kinds), results)
 
-    return wide
+    return cast(F, wide)
 
 
 def widened(values: Float[Array, "*shape"]) -> Float[Array, "*shape"]:

@@ -134,7 +134,7 @@ def positional_encoding(
 
 @checked(broadcast=True)
 def coarse_to_fine_window(
-    num_frequencies: int, alpha: Float[Array, "*batch"]
+    num_frequencies: int, alpha: Float[Array, "*batch"] | float
 ) -> Float[Array, "*batch num_frequencies"]:
     """Compute the weights of an encoding's bands during coarse-to-fine training.
 

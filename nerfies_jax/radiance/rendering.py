@@ -40,8 +40,8 @@ def sample_along_rays(
     key: Key[Array, ""] | None,
     origins: Float[Array, "*rays 3"],
     directions: Float[Array, "*rays 3"],
-    near: Float[Array, "..."],
-    far: Float[Array, "..."],
+    near: Float[Array, "..."] | float,
+    far: Float[Array, "..."] | float,
     num_samples: int,
     *,
     spacing: str = "linear",
@@ -77,7 +77,7 @@ def sample_along_rays(
     if spacing not in SPACINGS:
         raise ValueError(f"unknown spacing {spacing!r}; choose from {SPACINGS}")
     origins, directions = widened(origins), widened(directions)
-    near, far = widened(near), widened(far)
+    near, far = widened(jnp.asarray(near)), widened(jnp.asarray(far))
     rays = origins.shape[:-1]
     for name, bound in (("near", near), ("far", far)):
         try:

@@ -1,0 +1,21 @@
+"""The programs of the documentation run as they stand on their pages."""
+
+import pathlib
+import re
+
+import jax
+import pytest
+
+DOCS = pathlib.Path(__file__).resolve().parents[1] / "docs"
+PAGES = ("se3_warp", "kan_layer", "volume_rendering")
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_a_program_of_the_documentation_runs(page):
+    text = (DOCS / f"{page}.md").read_text()
+    blocks = re.findall(r"^```python\n(.*?)^```", text, re.M | re.S)
+    assert len(blocks) > 1
+    code = compile("\n".join(blocks), f"docs/{page}.md", "exec")
+    # As users run them: optax promotes an integer count of steps.
+    with jax.numpy_dtype_promotion("standard"):
+        exec(code, {"__name__": page})
