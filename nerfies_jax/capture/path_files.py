@@ -165,7 +165,7 @@ def read_keyframes(path: AnyPath, capture: Capture) -> list[Keyframe]:
     Returns:
       The keyframes that the file has. If it has none, `MOST_KEYFRAMES` of its cameras
       at most, evenly spaced; the path through them is then only close to the file's.
-      Without times they run from 0 to 1.
+      Without times they get those of `camera_paths.times`, to 1 and back.
 
     Raises:
       CaptureError: If the file cannot be read or is no camera path.

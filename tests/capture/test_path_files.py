@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from nerfies_jax.capture import frames, path_files
+from nerfies_jax.capture import keyframes as keyframes_of_paths
 from nerfies_jax.capture.camera_paths import CameraPath
 from nerfies_jax.capture.capture import CaptureError
+from nerfies_jax.capture.keyframes import Keyframe
 from nerfies_jax.geometry import camera
 from nerfies_jax.geometry.camera import Camera
 from tests.capture.test_camera_files import filmed
@@ -115,3 +117,42 @@ def test_folders_of_no_cameras_or_of_several_sizes_are_refused(tmp_path):
         path_files.read(tmp_path / "path", capture)
     with pytest.raises(CaptureError, match="no camera path of that name; there are s"):
         path_files.named(str(tmp_path / "nowhere"), capture, None)
+
+
+def test_keyframes_are_read_back_and_come_of_the_cameras_where_there_are_none(tmp_path):
+    capture, planned, file = filmed(frames=3), a_path(), tmp_path / "a.json"
+    chosen = [
+        Keyframe(camera.take(planned.cameras, row), moment)
+        for row, moment in ((2, 0.75), (0, 0.25))
+    ]
+    path_files.write_nerfstudio(file, planned, 24.0, keyframes=chosen)
+    for read, written in zip(
+        path_files.read_keyframes(file, capture), chosen, strict=True
+    ):
+        assert read.time == pytest.approx(written.time)
+        for one, other in zip(read.camera, written.camera, strict=True):
+            np.testing.assert_allclose(one, other, atol=1e-5)
+    # As nerfstudio's viewer saves them: a pose row by row, and the field of view.
+    table = json.loads(file.read_text())
+    entry = table["keyframes"][1]
+    assert entry["matrix"] == table["camera_path"][0]["camera_to_world"]
+    assert entry["fov"] == table["camera_path"][0]["fov"]
+    # None, or of an older layout, which cannot be told: the cameras of the path.
+    for keyframes in ([], [{"matrix": "[1, 0]", "fov": 50}] * 2):
+        file.write_text(json.dumps(table | {"keyframes": keyframes}))
+        read = path_files.read_keyframes(file, capture)
+        assert [keyframe.time for keyframe in read] == TIMES.tolist()
+    # Not hundreds of them, which nobody edits by hand; without times, there and back.
+    for each in table["camera_path"]:
+        del each["render_time"]
+    many = {"camera_path": table["camera_path"] * 50, "keyframes": []}
+    file.write_text(json.dumps(table | many))
+    read = path_files.read_keyframes(file, capture)
+    assert len(read) == keyframes_of_paths.MOST_KEYFRAMES
+    times = np.array([keyframe.time for keyframe in read])
+    assert times[0] == 0
+    assert 0.9 < times.max() <= 1
+    assert np.abs(np.diff(times)).max() < 0.1
+    file.write_text(json.dumps(table | {"camera_path": []}))
+    with pytest.raises(CaptureError, match="no cameras in it"):
+        path_files.read_keyframes(file, capture)

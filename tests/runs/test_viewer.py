@@ -3,7 +3,9 @@
 import contextlib
 import io
 import re
+import signal
 import sys
+import threading
 import time
 import warnings
 
@@ -14,10 +16,10 @@ import PIL.Image
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nerfies_jax import evaluation, runs
+from nerfies_jax import evaluation, runs, stopping
 from nerfies_jax.capture import path_files
 from nerfies_jax.evaluation.interactive import Eye, Look
-from nerfies_jax.runs import representations, screen, viewer
+from nerfies_jax.runs import representations, screen, viewer, viewer_training
 from nerfies_jax.runs.config import CaptureSource, RunConfig
 from nerfies_jax.training import loop
 from tests import scenes
@@ -357,6 +359,52 @@ def test_a_path_is_edited_saved_loaded_and_rendered(tmp_path, capsys):
         until(lambda: page.path.rendering is None)
         assert [each.name for each in out.parent.iterdir()] == ["path-1"]
     assert f"--path {saved}" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_training_waits_while_it_is_paused_and_never_for_nobody(tmp_path, monkeypatch):
+    monkeypatch.setattr(viewer_training, "ABSENT_SECONDS", 1.0)
+    run, state = a_run("gaussians")
+    with contextlib.ExitStack() as held:
+        page = viewer.Viewer(run, (160, 120), 8480, tmp_path, in_training=True)
+        held.callback(page.close)
+        monkeypatch.setattr(viewer, "Viewer", lambda *_, **__: page)
+        hook = held.enter_context(viewer.live(run, tmp_path, 8480))
+        browser = Browser(page.address)
+        held.callback(browser.close)
+        browser.look(eye_of(int(CAPTURE.train[0])))
+
+        def chunk(step):
+            """What the loop does between two chunks, in a thread of its own."""
+            metrics = {"loss": 1.0 / step}
+            called = threading.Thread(target=hook.call, args=(state, step, metrics))
+            called.start()
+            return called
+
+        chunk(1).join(120)
+        browser.press(page, "pause training")
+        time.sleep(0.3)  # until the server's thread has read it
+        paused = chunk(2)
+        paused.join(2)
+        assert paused.is_alive()
+        browser.press(page, "resume training")
+        paused.join(60)
+        assert not paused.is_alive()
+        # A tab that is closed pauses nothing, and Ctrl-C ends what is paused.
+        browser.press(page, "pause training")
+        time.sleep(0.3)
+        paused = chunk(3)
+        browser.close()
+        paused.join(60)
+        assert not paused.is_alive()
+        assert page.training._losses == [1.0, 0.5, 1 / 3]
+        page.training.paused = True
+        monkeypatch.setattr(viewer_training, "ABSENT_SECONDS", 1000.0)
+        paused = chunk(4)
+        with stopping.StopRequests() as requests:
+            requests._note(signal.SIGINT, None)
+            paused.join(60)
+        assert not paused.is_alive()
 
 
 @pytest.mark.slow
