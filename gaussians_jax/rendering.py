@@ -31,26 +31,46 @@ class Frame(NamedTuple):
 @checked
 def render(
     gaussians: Gaussians,
-    colours: Float[Array, "gaussians 3"],
+    colours: Float[Array, "..."],
     camera: Camera,
     size: tuple[int, int],
     spec: RasterSpec = GSPLAT,
-    background: Float[Array, "*image 3"] | None = None,
-    features: Float[Array, "gaussians features"] | None = None,
-    mean2d_offset: Float[Array, "gaussians 2"] | None = None,
+    background: Float[Array, "..."] | None = None,
+    features: Float[Array, "..."] | None = None,
+    mean2d_offset: Float[Array, "..."] | None = None,
     depth: bool = True,
 ) -> Frame:
-    """Composite `colours` and `features`; `size` is (width, height).
+    """Render Gaussians from one camera.
 
-    `background` is one colour or an image, black where absent. `mean2d_offset` (px)
-    moves the footprints on the image: pass zeros, and its gradient is the gradient of
-    each projected mean in pixels, which densification thresholds. Without `depth`
-    that of the rendering is None, and a training step 4 % faster. Raises ValueError
-    for a camera with distortion; of one that is traced nobody can tell
-    (`refuse_distortion` on the host).
+    `rasterization` takes other numbers of channels, and several cameras.
+
+    Args:
+      gaussians: N Gaussians in world coordinates.
+      colours: Colors [N, 3].
+      camera: One camera without lens distortion.
+      size: (width, height) of the image in pixels.
+      spec: Thresholds and tile sizes.
+      background: One color [3] or an image [height, width, 3] behind the Gaussians.
+        None is black.
+      features: Further values [N, F], rendered without a background.
+      mean2d_offset: Shift of the projected means in pixels, [N, 2]. Pass zeros: their
+        gradient is that of the projected means, which densification compares with a
+        threshold.
+      depth: Whether to render the expected depth. Without it a training step takes
+        4 % less time.
+
+    Returns:
+      The rendering, the projected Gaussians, and the rendered features.
+
+    Raises:
+      ValueError: An array has another shape, or the camera has lens distortion. The
+        distortion of a traced camera cannot be checked (`refuse_distortion` on the
+        host).
     """
     if not isinstance(camera.radial, jax.core.Tracer):
         refuse_distortion(camera)
+    extras = background, features, mean2d_offset
+    _check_shapes(len(gaussians.mean), size, colours, *extras)
     footprints = projection.project(gaussians, camera, size, spec)
     drawn = footprints
     if mean2d_offset is not None:
@@ -87,6 +107,29 @@ def render_harmonics(
     colours = harmonics.colour_towards(coefficients, gaussians.mean, camera.position)
     extras = background, features, mean2d_offset, depth
     return render(gaussians, colours, camera, size, spec, *extras)
+
+
+def _check_shapes(count, size, colors, background, features, offset):
+    """Refuse arrays that would broadcast, or put color where depth is read."""
+    image = (size[1], size[0], 3)
+    for name, array, shapes, say in (
+        ("colours", colors, [(count, 3)],
+         "; rasterization takes any number of channels"),
+        ("background", background, [(3,), image], ""),
+        ("features", features, [(count, None)], ""),
+        ("mean2d_offset", offset, [(count, 2)], ""),
+    ):  # fmt: skip
+        if array is None:
+            continue
+        shape = jnp.shape(array)
+        fits = [
+            len(shape) == len(wanted)
+            and all(w in (None, s) for s, w in zip(shape, wanted, strict=True))
+            for wanted in shapes
+        ]
+        if not any(fits):
+            wanted = " or ".join(str(shape).replace("None", "F") for shape in shapes)
+            raise ValueError(f"{name} must have shape {wanted}, got {shape}{say}")
 
 
 def refuse_distortion(camera: Camera) -> None:

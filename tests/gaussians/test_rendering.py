@@ -12,7 +12,7 @@ from gaussians_jax.raster_spec import GSPLAT, INRIA
 from gaussians_jax.splats import Gaussians
 from nerfies_jax.geometry.camera import Camera
 from tests import gradients
-from tests.gaussians.shared import close, put
+from tests.gaussians.shared import close, jitted, put
 from tests.oracles import dense_splats
 
 
@@ -46,6 +46,59 @@ def make_gaussians(rng, count, dtype):
 def weights_for(rng, size, channels):
     width, height = size
     return rng.normal(size=(height, width, channels))
+
+
+def test_render_equals_the_dense_renderer(float64, rng):
+    """With features, a background image and means that are shifted in the image."""
+    size = (21, 13)
+    gaussians, camera = make_gaussians(rng, 24, float64), make_camera(float64, size)
+    values, offset = put((rng.uniform(size=(24, 5)), rng.normal(size=(24, 2))))
+    background = put(rng.uniform(size=(13, 21, 3)))
+    spec = dataclasses.replace(GSPLAT, batch=8, chunk=2)
+
+    @jitted
+    def ours(gaussians, values):
+        colors, features = values[:, :3], values[:, 3:]
+        return rendering.render(
+            gaussians, colors, camera, size, spec, background, features, offset
+        )
+
+    @jitted
+    def dense(gaussians, values):
+        return dense_splats.render(gaussians, values, camera, size, spec, offset)
+
+    frame, exact = ours(gaussians, values), dense(gaussians, values)
+    behind = np.asarray(background) * (1 - exact.alpha)[..., None]
+    depth = exact.depth / np.maximum(exact.alpha, 1e-10)
+    pairs = [
+        (frame.rendering.colour, exact.colour[..., :3] + behind),
+        (frame.features, exact.colour[..., 3:]),
+        (frame.rendering.alpha, exact.alpha),
+        (frame.rendering.depth, depth),
+    ]
+    for result, expected in pairs:
+        np.testing.assert_allclose(result, expected, atol=1e-12, rtol=0)
+
+
+WRONG = [
+    ("colours", (24, 4), r"colours must have shape \(24, 3\), got \(24, 4\); raster"),
+    ("colours", (24, 1), r"got \(24, 1\)"),
+    ("colours", (24,), r"got \(24,\)"),
+    ("background", (1, 3), r"background must .* \(3,\) or \(13, 21, 3\), got \(1, 3\)"),
+    ("background", (13, 21, 4), "background must"),
+    ("features", (24,), r"features must have shape \(24, F\)"),
+    ("mean2d_offset", (2,), r"mean2d_offset must have shape \(24, 2\)"),
+]
+
+
+@pytest.mark.parametrize(("name", "shape", "words"), WRONG)
+def test_arrays_of_the_wrong_shape_are_refused(name, shape, words, rng):
+    arrays = dict(colours=np.ones((24, 3))) | {name: np.ones(shape)}
+    scene = make_gaussians(rng, 24, "float32"), make_camera("float32", (21, 13))
+    colors, *_ = put((arrays.pop("colours"),), "float32")
+    others = {key: put(value, "float32") for key, value in arrays.items()}
+    with pytest.raises(ValueError, match=words):
+        rendering.render(scene[0], colors, scene[1], (21, 13), **others)
 
 
 SPECS = [
