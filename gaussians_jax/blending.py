@@ -7,6 +7,7 @@ its own. Both passes go front to back and recompute every alpha from the same ro
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -33,10 +34,12 @@ def blend(
     spec: RasterSpec,
     grid: Grid,
     step: Lockstep,
+    through: bool = False,
 ) -> tuple[Float[Array, "tiles rows pixels"], Int[Array, " tiles"]]:
     """Composite a chunk of pairs onto `state`; also how many pairs each tile looked at.
 
-    The last row of `table` must be transparent (log opacity minus infinity).
+    The last row of `table` must be transparent (log opacity minus infinity). With
+    `through` forward-mode derivatives pass the clamp of alpha.
     """
     order, batches = _by_length(isects, step.batch)
 
@@ -53,7 +56,9 @@ def blend(
         def one_chunk(inner):
             position, transmittance, channels, _ = inner
             _, rows = _chunk(table, isects.ranks, start, end, position, step.chunk)
-            _, alpha = _alphas(rows, middle, spec, grid)
+            raw, alpha = _alphas(rows, middle, spec, grid)
+            if through:
+                alpha = _straight_through(raw, alpha)
             transmittance, channels = _composite(
                 transmittance, channels, alpha, rows, spec
             )
@@ -223,6 +228,18 @@ def _alphas(rows, middle, spec, grid):
     return raw, jnp.where(
         raw >= spec.alpha_threshold, jnp.minimum(raw, spec.alpha_max), 0
     )
+
+
+@jax.custom_jvp
+def _straight_through(raw, alpha):
+    """`alpha`, whose derivative is that of `raw` wherever something is drawn."""
+    return alpha
+
+
+@_straight_through.defjvp
+def _straight_through_jvp(primals, tangents):
+    _, alpha = primals
+    return alpha, jnp.where(alpha > 0, tangents[0], 0)
 
 
 def _pass_through(transmittance, alpha, spec):

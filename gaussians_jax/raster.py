@@ -27,6 +27,7 @@ from gaussians_jax.projection import Footprints
 from gaussians_jax.raster_spec import RasterSpec
 from gaussians_jax.splats import refuse_half
 from nerfies_jax.contract import checked
+from nerfies_jax.geometry.linear_call import linear_call
 
 # By backend: tiles in lockstep, Gaussians a step. On the CPU a step of 32 x 4 x 64
 # evaluations hides XLA's overhead of some 0.2 us an operation and stays in cache; on a
@@ -62,11 +63,28 @@ def rasterize(
     size: tuple[int, int],
     spec: RasterSpec,
 ) -> tuple[Float[Array, "height width channels"], Float[Array, "height width"]]:
-    """Composite any per-Gaussian `values`; also the transmittance left at each pixel.
+    """Composite per-Gaussian values front to back.
 
-    Differentiable in the mean, whitening and opacity of `footprints` and in `values`;
-    the depth only orders. `size` is (width, height). A NaN in `values` shows in every
-    tile that its Gaussian touches.
+    Differentiable in the mean, whitening and opacity of `footprints` and in `values`,
+    in reverse mode, in forward mode, and forward over reverse (Hessian-vector
+    products); reverse mode a second time is not available. Depth only orders. The image
+    jumps where alpha crosses `spec.alpha_threshold` and where a pixel is finished
+    (`spec.transmittance_threshold`), and its slope jumps at `spec.alpha_max`. All
+    derivatives are those between the jumps.
+
+    Args:
+      footprints: N projected Gaussians.
+      values: Any number of channels per Gaussian, [N, channels]. A NaN shows in every
+        tile that its Gaussian touches.
+      size: (width, height) of the image in pixels.
+      spec: Thresholds and tile sizes.
+
+    Returns:
+      The image [height, width, channels], and the transmittance that is left at each
+      pixel, [height, width].
+
+    Raises:
+      ValueError: The image has no pixel, or `values` has no channel.
     """
     layout = _layout(footprints, size, spec)
     grid = layout.grid
@@ -136,35 +154,58 @@ def _layout(footprints, size, spec):
     return Layout(spec, grid, step, capacity)
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _raster(layout, rects, table):
     """State [tiles, 1 + channels, pixels]: transmittance, then channels."""
-    return _raster_forward(layout, rects, table)[0]
+    return _shown(_forward(layout, rects, table)[0])
 
 
-def _raster_forward(layout, rects, table):
-    """One camera after another under vmap: lockstep over cameras would wait for all."""
+@_raster.defjvp
+def _raster_jvp(layout, primals, tangents):
+    rects, table = primals
+    state, kept = _forward(layout, rects, table)
+    residuals = rects, table, state, kept
+    change = linear_call(_tangent, _cotangent, layout, residuals, tangents[1])
+    return _shown(state), change
 
+
+# One camera after another under vmap: lockstep over cameras would wait for all.
+def _forward(layout, rects, table):
     @jax.custom_batching.sequential_vmap
     def forward(rects, table):
         return _stream(layout, rects, table)
 
-    state, residuals = forward(rects, table)
-    # Of the transmittance alone, whose sign says "done"; channels may be negative.
-    shown = jnp.concatenate([jnp.abs(state[:, :1]), state[:, 1:]], axis=1)
-    return shown, (rects, table, state, residuals)
+    return forward(rects, table)
 
 
-def _raster_backward(layout, residuals, cotangent):
+def _tangent(layout, residuals, tangent):
+    """Change of the image with that of the table, by a second pass forward."""
+    through = layout.spec.clamp_gradient == "through"
+
     @jax.custom_batching.sequential_vmap
-    def backward(rects, table, state, residuals, cotangent):
-        return _stream_back(layout, rects, table, state, residuals, cotangent)
+    def along(rects, table, tangent):
+        def shown(table):
+            return _shown(_stream(layout, rects, table, through)[0])
 
-    rects = residuals[0]
-    return jax.tree.map(lambda _: None, rects), backward(*residuals, cotangent)
+        return jax.jvp(shown, (table,), (tangent,))[1]
+
+    rects, table, *_ = residuals
+    return along(rects, table, tangent)
 
 
-_raster.defvjp(_raster_forward, _raster_backward)
+def _cotangent(layout, residuals, cotangent):
+    """Gradient of the table with that of the image."""
+
+    @jax.custom_batching.sequential_vmap
+    def backward(rects, table, state, kept, cotangent):
+        return _stream_back(layout, rects, table, state, kept, cotangent)
+
+    return backward(*residuals, cotangent)
+
+
+def _shown(state):
+    # Of the transmittance alone, whose sign says "done"; channels may be negative.
+    return jnp.concatenate([jnp.abs(state[:, :1]), state[:, 1:]], axis=1)
 
 
 def _with_transparent_row(table):
@@ -198,8 +239,8 @@ def _more(cursor, state, rects):
     return (cursor.rank < drawn) & (jnp.max(state[:, 0]) > 0)
 
 
-def _stream(layout, rects, table):
-    """Forward over all chunks."""
+def _stream(layout, rects, table, through=False):
+    """Forward over all chunks; `through`: derivatives pass the clamp of alpha."""
     channels = table.shape[1] - SHAPE_COLUMNS
     rows = _with_transparent_row(table)
     spec, grid, step = layout.spec, layout.grid, layout.step
@@ -207,7 +248,7 @@ def _stream(layout, rects, table):
     def body(carry):
         cursor, state, residuals = carry
         isects, cursor = _next_intersections(layout, cursor, rects, table, state)
-        state, used = blending.blend(state, isects, rows, spec, grid, step)
+        state, used = blending.blend(state, isects, rows, spec, grid, step, through)
         # What early stopping left out is not looked at again in the backward pass.
         isects = isects._replace(ends=isects.starts + used)
         chunks = jax.tree.map(

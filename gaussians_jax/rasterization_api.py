@@ -120,7 +120,9 @@ def rasterization(
     transmittance falls to 1e-4. All arrays may have leading batch axes `...`, the same
     for every array. The function works under `jit`, `grad`, `vmap` and `scan`, in
     float32 and float64, on one dtype for all arrays. It is differentiable in every
-    array, also in `Ks`. Cameras are rasterized one after another, so memory for
+    array, also in `Ks`: in reverse mode, in forward mode, and forward over reverse
+    (Hessian-vector products). Derivatives leave out the jumps at the thresholds of
+    alpha and transmittance. Cameras are rasterized one after another, so memory for
     temporaries does not grow with C.
 
     `packed`, `sparse_grad`, `channel_chunk`, `segmented` and `distributed` of gsplat

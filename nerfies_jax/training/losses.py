@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from nerfies_jax.contract import checked
 from nerfies_jax.geometry.fusion import materialised
+from nerfies_jax.geometry.linear_call import linear_call
 from nerfies_jax.geometry.precision import at_least_float32, widened
 
 # PSNR is reported to 100 dB, where 8-bit images ended long ago (51 dB for one level).
@@ -202,8 +203,8 @@ def dssim_map(
         dm-pix                                   42   251
         XLA's depthwise convolution              75   443
 
-    The window is its own transpose, so backward is the same code. There is no
-    forward-mode derivative.
+    The window is its own transpose, so backward is the same code. Forward mode and
+    forward over reverse (Hessian-vector products) work as well.
     """
     image, target = _comparable(image, target, padding)
     constant = value_range**2
@@ -295,7 +296,7 @@ def _comparable(image, target, padding):
     return widened(image), widened(target)
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
+@functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
 def _blur(
     maps: Float[Array, "maps height columns"],
     outside: Float[Array, " maps"],
@@ -331,13 +332,13 @@ def _window_sum(values, beyond, axis, stride):
     )
 
 
-def _blur_forward(maps, outside, channels):
-    return _blur(maps, outside, channels), outside
+@_blur.defjvp
+def _blur_jvp(channels, primals, tangents):
+    # The window is symmetric, so the transpose is the function itself.
+    change = linear_call(_blur_inside, _blur_inside, channels, (), tangents[0])
+    return _blur(*primals, channels), change
 
 
-def _blur_backward(channels, outside, cotangent):
-    nothing = jnp.zeros_like(outside)
-    return _blur(cotangent, nothing, channels), nothing
-
-
-_blur.defvjp(_blur_forward, _blur_backward)
+def _blur_inside(channels, residuals, maps):
+    """Under the window with zeros beyond the frame."""
+    return _blur(maps, jnp.zeros_like(maps[:, 0, 0]), channels)

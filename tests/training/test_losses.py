@@ -76,6 +76,25 @@ def test_dssim_gradient_is_the_slope(padding, rng, float64):
     assert gradients.directional_error(loss, image, target) < 1e-7
 
 
+def test_dssim_has_forward_mode_and_curvature(rng, float64):
+    """Tangents, and Hessian-vector products, against differences."""
+    image, target = images(rng, 13, 12)
+    along = rng.normal(size=image.shape)
+    step = 1e-6
+
+    @jax.jit
+    def both(image):
+        function = jax.value_and_grad(lambda x: losses.ssim(x, target))
+        return jax.jvp(function, (image,), (along,))
+
+    _, (tangent, product) = both(image)
+    (ahead, up), (behind, down) = (both(image + s * step * along)[0] for s in (1, -1))
+    assert float(tangent) == pytest.approx(float(ahead - behind) / (2 * step), rel=1e-6)
+    difference = (np.asarray(up) - np.asarray(down)) / (2 * step)
+    error = np.abs(np.asarray(product) - difference).max()
+    assert error < 1e-6 * np.abs(difference).max()
+
+
 ROBUST = {
     "charbonnier": (losses.charbonnier, lambda s, w: np.sqrt(s + w**2) - w),
     "huber": (
