@@ -80,14 +80,14 @@ def test_render_equals_the_dense_renderer(float64, rng):
         np.testing.assert_allclose(result, expected, atol=1e-12, rtol=0)
 
 
+# RGBA or gray colors would put a color where depth is read.
 WRONG = [
-    ("colours", (24, 4), r"colours must have shape \(24, 3\), got \(24, 4\); raster"),
-    ("colours", (24, 1), r"got \(24, 1\)"),
-    ("colours", (24,), r"got \(24,\)"),
-    ("background", (1, 3), r"background must .* \(3,\) or \(13, 21, 3\), got \(1, 3\)"),
-    ("background", (13, 21, 4), "background must"),
-    ("features", (24,), r"features must have shape \(24, F\)"),
-    ("mean2d_offset", (2,), r"mean2d_offset must have shape \(24, 2\)"),
+    ("colours", (24, 4), r"`colours` has shape \[24, 4\], expected \[gaussians, 3\]"),
+    ("colours", (24, 1), r"`colours` has shape \[24, 1\]"),
+    ("colours", (24,), r"`colours` has shape \[24\]"),
+    ("background", (13, 21, 4), "`background` has shape"),
+    ("features", (24,), "`features` has shape"),
+    ("mean2d_offset", (2,), "`mean2d_offset` has shape"),
 ]
 
 
