@@ -7,7 +7,7 @@ import jax
 import pytest
 
 DOCS = pathlib.Path(__file__).resolve().parents[1] / "docs"
-PAGES = ("se3_warp", "kan_layer", "volume_rendering")
+PAGES = ("rasterization", "se3_warp", "kan_layer", "volume_rendering")
 
 
 @pytest.mark.parametrize("page", PAGES)
