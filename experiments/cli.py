@@ -24,7 +24,7 @@ from nerfies_jax.capture.extras import MissingExtra
 from nerfies_jax.capture.given import GivenFiles
 from nerfies_jax.capture.nearest import known_names
 from nerfies_jax.runs import trust
-from nerfies_jax.runs.config import CaptureSource, MoreMetrics
+from nerfies_jax.runs.config import CaptureSource, MoreMetrics, check_budget
 from nerfies_jax.runs.representations import PRESETS
 
 Positional = tyro.conf.Positional
@@ -56,6 +56,7 @@ class NamedSource(CaptureSource):
                 f"{self.capture} and --scene {self.scene}: name a folder or a built-in "
                 "scene, not both"
             )
+        check_budget(self.preprocessing)
 
 
 def _headed(name: str) -> tuple:

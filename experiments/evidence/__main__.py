@@ -27,9 +27,6 @@ class EvidenceOptions:
     """Measure all built-in scenes and ways to find flow instead of one capture."""
     seed: int = 0
     """Of the built-in scenes."""
-    seconds: float = 600.0
-    """When most of them are gone, what is not needed most is left out; such a record is
-    not kept."""
     out: pathlib.Path | None = None
     """Folder for tracks.png and evidence.json (default: runs/evidence-CAPTURE)."""
 
@@ -38,8 +35,6 @@ class EvidenceOptions:
             raise ValueError(
                 "--scenes measures every built-in scene: name no capture beside it"
             )
-        if not self.seconds > 0:
-            raise ValueError(f"--seconds {self.seconds:g} must be more than zero")
 
 
 @cli.command(EvidenceOptions)
@@ -51,7 +46,7 @@ def main(args):
 
         if args.scenes:
             return scenes.measure(args.seed, args.out)
-        return report.look(cli.plain(args.source), args.seed, args.seconds, args.out)
+        return report.look(cli.plain(args.source), args.seed, args.out)
 
 
 if __name__ == "__main__":

@@ -25,9 +25,7 @@ from nerfies_jax.runs.config import CaptureSource
 from nerfies_jax.runs.platform import CACHE
 
 
-def look(
-    source: CaptureSource, seed: int, seconds: float, out: pathlib.Path | None
-) -> dict[str, Any]:
+def look(source: CaptureSource, seed: int, out: pathlib.Path | None) -> dict[str, Any]:
     """Gather, or read what was gathered, and say what it is."""
     capture = runs.stored_capture(source, seed)
     stem = f"evidence-{'-'.join(capture.name.replace('/', ' ').split())}"
@@ -39,7 +37,7 @@ def look(
     if path.exists():
         console.say("gathered before, and read again")
     folder = CACHE / "evidence"
-    evidence = record.cached(capture, folder, tell=_PartLog(), seconds=seconds)
+    evidence = record.cached(capture, folder, tell=_PartLog())
     views = view_set.in_time_order(record.looked_at(capture, evidence.factor))
     numbers = summary.of(views, evidence)
     console.say("\n".join(summary.lines(numbers, evidence)))
@@ -53,8 +51,7 @@ def look(
     pictures.save(contact_sheet.followed(views, evidence), results / "tracks.png")
     write_json(results / "evidence.json", stored)
     console.say(f"frames with tracks: {results / 'tracks.png'}")
-    kept = "not kept, for want of time" if evidence.left_out else path
-    console.say(f"record: {kept}")
+    console.say(f"record: {path if path.exists() else 'not kept'}")
     return stored
 
 

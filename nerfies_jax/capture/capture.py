@@ -65,6 +65,7 @@ class Capture:
     frames_per_second: float | None = None  # of the footage, if known
     path: pathlib.Path | None = None
     notes: tuple[str, ...] = ()  # what the reader found, repaired or left out
+    preprocessing: float = 1.0  # budget of work for flow, tracks and masks; 1: default
 
     def __post_init__(self):
         validate(self)

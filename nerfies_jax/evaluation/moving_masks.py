@@ -45,6 +45,8 @@ def with_masks(filmed: Capture, folder: pathlib.Path) -> tuple[Capture, str]:
         f"What moves is where tracks do ({share:.1%} of the held-out pixels): the "
         "capture has no masks of its own."
     )
+    if evidence.left_out:
+        note += f" {record.left_out_note(evidence)}"
     return dataclasses.replace(filmed, moving=moving), note
 
 

@@ -24,7 +24,8 @@ ENLARGED_BELOW_PX, ENLARGED = 320, 2
 # Forward and back must meet: within half a pixel and a fiftieth of the way.
 CLOSED_PX, CLOSED_SHARE = 0.5, 0.02
 
-FOR_WIDE_STEPS = 0.4  # of the time: then none is left to look at them again
+# Searches that a second look at a wide step takes: one for each plane, and comparing.
+SECOND_LOOK = 8
 # Of the width: the side of an area whose flow is looked for again where it was carried
 # to a frame and is lost there. Patterns that repeat are taken for each other in some
 # frames: the turning cube of the built-in scenes lost all its tracks in one of them.
@@ -64,6 +65,12 @@ def levelled(views: Views, times: int | None = None) -> np.ndarray:
     pictures = [np.rint(one).astype(np.uint8) for one in alike]
     times = enlarged(views) if times is None else times
     return np.stack([larger(one, times) for one in pictures])
+
+
+def searched_pixels(views: Views, pictures: np.ndarray) -> int:
+    """Pixels of the finest level of one search between such pictures."""
+    pixels = pictures[0].size
+    return pixels if enlarged(views) > 1 else pixels // 4
 
 
 def larger(picture: np.ndarray, times: int) -> np.ndarray:
@@ -118,13 +125,13 @@ def between_neighbours(
     views: Views,
     pictures: np.ndarray,
     span: tuple[float, float] | None = None,
-    has_time: Callable[[float, str], bool] = lambda share, what: True,
+    room_for: Callable[[int], int] = lambda count: count,
 ) -> NeighbourFlow:
     """Flow between all frames that follow each other, both ways, and checked.
 
     `pictures` are the views' as `levelled` makes them. With `span`, the nearest and
-    farthest z-depth, wide steps are looked at again from where a still scene would be;
-    `has_time` is asked whether less than a share of the time is gone.
+    farthest z-depth, wide steps are looked at again from where a still scene would be,
+    the first ones of them if there is no `room_for` all.
     """
     (width, height), frames = views.size, len(views.row)
     times = pictures.shape[2] // width
@@ -135,33 +142,47 @@ def between_neighbours(
             searches.own = dis(times)
         return searches.own(*pair_and_guess)
 
-    def flow(step):
+    forward, backward = np.zeros((2, frames, height, width, 2), np.float32)
+
+    def place(step):
         one, other = step
-        pair = pictures[one], pictures[other]
-        unguided = reduced(search(*pair), times)
-        if span is None or not wide_steps.is_wide(views, step, unguided):
-            return unguided
-        if not has_time(FOR_WIDE_STEPS, "a second look at wide steps"):
-            return unguided
-        small = tuple(_smaller(picture, times) for picture in pair)
+        return (forward if other > one else backward)[one]
+
+    def first_look(step):
+        one, other = step
+        return reduced(search(pictures[one], pictures[other]), times)
+
+    def second_look(step):
+        pair = tuple(pictures[frame] for frame in step)
         return wide_steps.improved(
             views,
-            small,
+            tuple(_smaller(picture, times) for picture in pair),
             step,
-            unguided,
+            place(step),
             lambda guess: reduced(search(*pair, enlarged_flow(guess, times)), times),
             span,
         )
 
-    forward, backward = np.zeros((2, frames, height, width, 2), np.float32)
     ahead = [(frame, frame + 1) for frame in range(frames - 1)]
     steps = ahead + [(after, before) for before, after in ahead]
     # 118 flows of 176x132: 8.5 s on one core; 4.9 on two, 6.1 by OpenCV's own threads.
-    stage = events.stage("flow between neighboring frames", len(steps))
-    with ThreadPoolExecutor(cv2.getNumThreads()) as threads, stage as flowing:
-        for (one, other), shift in zip(steps, threads.map(flow, steps), strict=True):
-            (forward if other > one else backward)[one] = shift
-            flowing.advance()
+    with ThreadPoolExecutor(cv2.getNumThreads()) as threads:
+
+        def search_all(name, steps, look):
+            with events.stage(name, len(steps)) as stage:
+                for step, shift in zip(steps, threads.map(look, steps), strict=True):
+                    place(step)[:] = shift
+                    stage.advance()
+
+        search_all("flow between neighboring frames", steps, first_look)
+        wide = [
+            step
+            for step in steps
+            if span is not None and wide_steps.is_wide(views, step, place(step))
+        ]
+        wide = wide[: room_for(len(wide))]
+        if wide:
+            search_all("second look at wide steps", wide, second_look)
     checked_flow = checked(forward, backward)
     for frame in range(1, frames - 1):
         if _lost(checked_flow, frame) or _jumps(checked_flow, frame):

@@ -7,7 +7,6 @@ paths in space, and points that stand still: host side, one core, no gradients.
 """
 
 import contextlib
-import functools
 import hashlib
 import math
 import pathlib
@@ -18,6 +17,7 @@ import cv2
 import numpy as np
 import scipy.ndimage as nd
 
+from nerfies_jax import console
 from nerfies_jax.capture import cache_files, pinholes
 from nerfies_jax.capture import capture as captures
 from nerfies_jax.capture.capture import Capture, CaptureError, PointCloud
@@ -40,9 +40,19 @@ from nerfies_jax.evidence.paths import Paths
 from nerfies_jax.evidence.rest_points import RestPoints
 from nerfies_jax.evidence.tracks import Tracks
 from nerfies_jax.evidence.view_set import Views
-from nerfies_jax.evidence.watch import ENOUGH_SECONDS, Seconds, Watch
+from nerfies_jax.evidence.watch import (
+    A_BODY_TERM,
+    A_COMPARED_PIXEL,
+    A_PATH_FRAME,
+    A_POINT_FRAME,
+    A_SEARCHED_PIXEL,
+    A_TRACK_FRAME,
+    ENOUGH_WORK,
+    Seconds,
+    Watch,
+)
 
-VERSION = 11
+VERSION = 12
 # A path has as many frames at least, and a film as many; fewer say nothing of motion.
 SHORTEST_PATH, SHORTEST_FILM = 10, 6
 MOVES = 0.5  # score from which a track counts as moving
@@ -51,11 +61,16 @@ MOST_PIXELS = 16_000_000  # of all frames: 17 bytes each for the flow between th
 # Where less of the pictures can be carried to the next frame, tracks are chance: a
 # camera that jumps.
 LEAST_CARRIED = 0.4
-# Shares of the time after which there is none left for a part.
-FOR_TRACKS, FOR_COLOURS, FOR_BODIES, FOR_POINTS = 0.5, 0.6, 0.7, 0.8
+# Shares of the budget after which there is none left for a part.
+FOR_WIDE_STEPS, FOR_TRACKS, FOR_COLOURS = 0.4, 0.5, 0.6
+FOR_BODIES, FOR_POINTS = 0.7, 0.8
 # Of the near plane, which is that of what stands still: a hand may be far before it.
 AT_CAMERA = 0.1
 LEAST_TEXTURED = 0.05  # of the pixels: too little to tell anything by
+MOST_UNKEPT = 2  # records in memory: of frames to learn from, and of all
+
+_unkept: dict[pathlib.Path, "Evidence"] = {}  # what could not be written
+_told_of: dict[pathlib.Path, str] = {}  # a note for each record without some parts
 
 
 class Evidence(NamedTuple):
@@ -73,7 +88,7 @@ class Evidence(NamedTuple):
     unusable: str  # why tracks say nothing of the motion; empty where they do
     told: bool  # masks or tracks of what moves are the user's: no noise, however few
     factor: int  # of the capture's pixels for one of these
-    left_out: str  # what there was no time for; empty where there was enough
+    left_out: str  # what is beyond the budget of work; empty if that was enough
     seconds: Seconds
 
 
@@ -81,16 +96,23 @@ def gather(
     capture: Capture,
     use_depths: bool = False,
     tell: Callable[[str], None] = lambda part: None,
-    seconds: float = ENOUGH_SECONDS,
 ) -> Evidence:
     """Everything; about 0.25 s a frame of 176x132 or 480x270 on one core.
 
-    With `use_depths` paths lean on the capture's own depths where it has them. What
-    other tools found (`capture.given`) takes the place of what would be found here.
-    `tell` hears of each of `PARTS` when it begins, and of what there is no time for:
-    when much of the `seconds` is gone, what is not needed most is left out.
+    What is beyond the budget of work (`capture.preprocessing`) is left out. The budget
+    is one of counted work and not of time, so that the result depends on the capture
+    alone and not on how busy the machine is.
+
+    Args:
+      capture: The capture. What other tools found (`capture.given`) takes the place of
+        what would be found here.
+      use_depths: Whether paths lean on the capture's own depths where it has them.
+      tell: Hears of each of `PARTS` when it begins, and of what is left out.
+
+    Returns:
+      The evidence, with the names of what was left out.
     """
-    with contextlib.closing(Watch(tell, seconds)) as watch:
+    with contextlib.closing(Watch(tell, capture.preprocessing * ENOUGH_WORK)) as watch:
         return _gathered(capture, use_depths, watch)
 
 
@@ -105,9 +127,11 @@ def _gathered(capture, use_depths, watch):
         # Pictures of one moment are no film: there is nothing to search twice for.
         film = np.ptp(views.time) > 0
         span = view_set.depth_span(capture, views) if film else None
-        flow = dense_flow.between_neighbours(views, pictures, span, watch.has_time)
+        flow = _flow(views, pictures, span, watch)
     watch.begin("tracks")
-    few = not watch.has_time(FOR_TRACKS, "half of the tracks")
+    every = 1e-6 * A_TRACK_FRAME * tracking.work(views)
+    few = not watch.has_room(FOR_TRACKS, "half of the tracks", every)
+    watch.spend(every / 2 if few else 0.0)
     tracks, first = _tracks(given, views, flow, pictures, 2 if few else 1)
     rest = rest_points.fit(views, tracks)
     watch.begin("moving")
@@ -132,7 +156,8 @@ def _gathered(capture, use_depths, watch):
         moved_paths = paths.certain(views, moved, places[which - first], near)
     watch.begin("still")
     dense = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
-    if watch.has_time(FOR_POINTS, "dense points at rest"):
+    points_work = 1e-6 * A_POINT_FRAME * still_points.work(views)
+    if watch.has_room(FOR_POINTS, "dense points at rest", points_work):
         dense = still_points.dense(views, flow, mask)
     return Evidence(
         row=views.row,
@@ -150,6 +175,18 @@ def _gathered(capture, use_depths, watch):
         left_out=watch.left_out,
         seconds=watch.seconds(),
     )
+
+
+def _flow(views, pictures, span, watch):
+    pixels = dense_flow.searched_pixels(views, pictures)
+    a_search = 1e-6 * A_SEARCHED_PIXEL * pixels
+    watch.spend(2 * (len(views.row) - 1) * a_search)
+
+    def room_for(count):
+        what, each = "a second look at wide steps", dense_flow.SECOND_LOOK * a_search
+        return watch.room_for(count, FOR_WIDE_STEPS, what, each)
+
+    return dense_flow.between_neighbours(views, pictures, span, room_for)
 
 
 def _rounded(flow):
@@ -185,7 +222,9 @@ def _mask(views, flow, tracks, score, watch):
     share = moving.votes(small, near, score)
     open_to_doubt = _enlarged(moving.may_move(share), height, width)
     odds = np.zeros(share.shape, np.float32)
-    if watch.has_time(FOR_COLOURS, "what colours say of what moves"):
+    work = 1e-6 * A_POINT_FRAME * still_points.work(views)
+    work += 1e-6 * A_COMPARED_PIXEL * views.valid.size
+    if watch.has_room(FOR_COLOURS, "what colours say of what moves", work):
         still = still_points.dense(views, flow, open_to_doubt)
         odds = still_pictures.log_odds(small, still)
     masks = moving.mask(small, share, odds)
@@ -224,6 +263,7 @@ def _depths(capture, given, views, tracks, rest, score, use_depths):
 
 def _paths(capture, views, tracks, rest, score, which, depths, watch):
     still, moved = score < paths.AT_REST, tracks.take(which)
+    watch.spend(1e-6 * A_PATH_FRAME * moved.seen.size)
     around = paths.depth_around(
         moved, tracks.take(still), rest.take(still), capture.near
     )
@@ -232,9 +272,12 @@ def _paths(capture, views, tracks, rest, score, which, depths, watch):
         measured = _measured(depths, moved)
         return paths.least_acceleration(views, moved, least, around, measured)
     alone = paths.least_acceleration(views, moved, least, around)
-    what = "depths of what moves as one rigid thing"
-    in_time = functools.partial(watch.has_time, FOR_BODIES, what)
-    return rigid_bodies.refined(views, moved, alone, in_time)
+
+    def has_room(terms):
+        what = "depths of what moves as one rigid thing"
+        return watch.has_room(FOR_BODIES, what, 1e-6 * A_BODY_TERM * terms)
+
+    return rigid_bodies.refined(views, moved, alone, has_room)
 
 
 def looked_at(capture: Capture, factor: int) -> Capture:
@@ -303,7 +346,8 @@ def steady_depth(depth: np.ndarray, jump: float = 0.06) -> np.ndarray:
 def digest(capture: Capture, use_depths: bool = False) -> str:
     """Of all that `gather` looks at."""
     checksum = hashlib.blake2b(digest_size=12)
-    checksum.update(f"evidence {VERSION} {use_depths}".encode())
+    budget = capture.preprocessing
+    checksum.update(f"evidence {VERSION} {use_depths} {budget}".encode())
     parts = [capture.images[capture.train], capture.times, capture.train]
     parts += [np.asarray([capture.near, capture.far]), *capture.cameras]
     if capture.points is not None:
@@ -325,26 +369,45 @@ def cached(
     folder: pathlib.Path,
     use_depths: bool = False,
     tell: Callable[[str], None] = lambda part: None,
-    seconds: float = ENOUGH_SECONDS,
 ) -> Evidence:
     """`gather`, or what it found before of the same pictures and cameras.
 
     Of a capture with a lens, what its pinholes' pictures say: with and without the lens
-    it is one record. What was left out for want of time is not kept, nor is anything
-    where `folder` cannot be written: that is told.
+    it is one record. Where `folder` cannot be written, which is told, the record is
+    kept in memory, so that no command gathers twice. A warning says what was left out.
     """
     capture = pinholes.as_pinholes(capture)
     path = file_of(capture, folder, use_depths)
-    kept = cache_files.read(path, load)
-    if kept is not None:
-        return kept
-    evidence = gather(capture, use_depths, tell, seconds)
-    if not evidence.left_out:
+    evidence = _unkept.get(path) or cache_files.read(path, load)
+    if evidence is None:
+        evidence = gather(capture, use_depths, tell)
         try:
             save(path, evidence)
         except (OSError, CaptureError) as error:
             tell(f"what the pictures say is not kept for the next time: {error}")
+            while len(_unkept) >= MOST_UNKEPT:
+                _unkept.pop(next(iter(_unkept)))
+            _unkept[path] = evidence
+    if evidence.left_out and path not in _told_of:
+        _told_of[path] = left_out_note(evidence)
+        console.warn(f"{capture.path or capture.name}: {_told_of[path]}")
     return evidence
+
+
+def left_out_note(evidence: Evidence) -> str:
+    """Say what preprocessing left out, and the way out; empty if it was nothing."""
+    if not evidence.left_out:
+        return ""
+    return (
+        f"Preprocessing left out {evidence.left_out}: its budget of work was used up. "
+        "With a larger multiple of the default budget (preprocessing) nothing is."
+    )
+
+
+def notes_on(capture: Capture, folder: pathlib.Path) -> list[str]:
+    """What `cached` found in this process to be left out of the capture's records."""
+    paths = (file_of(capture, folder, use_depths) for use_depths in (False, True))
+    return list(dict.fromkeys(_told_of[path] for path in paths if path in _told_of))
 
 
 def file_of(

@@ -37,11 +37,12 @@ def refined(
     views: Views,
     tracks: Tracks,
     paths: Paths,
-    has_time: Callable[[], bool] = lambda: True,
+    has_room: Callable[[int], bool] = lambda terms: True,
 ) -> Paths:
     """The paths, those on rigid things placed by these; no others change.
 
-    `has_time` is asked before each thing and each round of its growth.
+    `has_room` is asked before each thing and each round of its growth, with the work of
+    that: its tracks times its frames squared.
 
     Only things whose depth the paths tell badly: where they tell it well, a cloth that
     is nearly rigid comes out four times worse. A track is no longer known where too
@@ -61,10 +62,10 @@ def refined(
         own = np.flatnonzero((label == group) & left)
         if len(own) < FEWEST or np.median(paths.depth_deviation[own]) < BADLY_TOLD:
             continue
-        if not has_time():
+        if not has_room(_work(own, few)):
             break
         rows = np.flatnonzero(left)
-        grown = _grown(*some, own, rows, has_time)
+        grown = _grown(*some, own, rows, has_room)
         if grown is None:
             continue
         own, body = grown
@@ -74,6 +75,10 @@ def refined(
         left[own] = False
     depth = views.depth_of(position)
     return Paths(position, known, depth, paths.depth_deviation)
+
+
+def _work(own, paths):
+    return min(len(own), MOST) * paths.known.shape[1] ** 2
 
 
 def _some_frames(views, tracks, paths, every):
@@ -104,7 +109,7 @@ def _in_all_frames(views, tracks, paths, own, body, every):
     return posed._replace(point=body.point)
 
 
-def _grown(views, tracks, paths, own, rows, has_time):
+def _grown(views, tracks, paths, own, rows, has_room):
     """Which of the paths are on the rigid thing that `own` are on, and the thing.
 
     None where they are on none. From the frames in which it is known, it is followed
@@ -118,7 +123,7 @@ def _grown(views, tracks, paths, own, rows, has_time):
         own, body = found
         there = paths.known[own].sum(0) >= FEWEST_SEEN
         fits = _on(views, tracks, paths, body, rows, there)[1] < WITHIN_PX
-        if fits.sum() <= len(own) or not has_time():
+        if fits.sum() <= len(own) or not has_room(_work(rows[fits], paths)):
             break
         own = rows[fits]
     if body is None:

@@ -19,6 +19,13 @@ MISS_PX = 0.5  # at most, in seven frames of ten
 DEPTH_DEVIATION = 0.05  # at most, as a share of the depth
 
 
+def work(views: Views) -> int:
+    """Pixels times frames that `dense` looks at, at most."""
+    frames, (width, height) = len(views.row), views.size
+    each = width * height // EVERY_PX**2 * min(2 * REACH + 1, frames)
+    return min(CENTRES, frames) * each
+
+
 def dense(views: Views, flow: NeighbourFlow, moving: np.ndarray) -> PointCloud:
     """Places and colours of pixels at rest in some frames, where flow tells depth.
 

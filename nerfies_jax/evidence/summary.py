@@ -86,7 +86,7 @@ def lines(summary: Summary, evidence: Evidence) -> list[str]:
         "frame",
     ]
     if evidence.left_out:
-        took += f"; there was no time for {evidence.left_out}"
+        took += f"; left out, beyond the budget of work: {evidence.left_out}"
     if summary.unusable:
         return [*sentences, took, f"nothing to follow: {summary.unusable}"]
     sentences += [

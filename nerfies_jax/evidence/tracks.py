@@ -68,6 +68,11 @@ def grid(views: Views, sparser: int = 1, seed: int = 0) -> np.ndarray:
     return np.concatenate(starts)
 
 
+def work(views: Views, sparser: int = 1) -> int:
+    """Starts times frames of all tracks of a grid."""
+    return len(grid(views, sparser)) * len(views.row)
+
+
 def chain(flow: NeighbourFlow, starts: np.ndarray) -> Tracks:
     """Points carried from frame to frame until flow cannot be trusted, both ways.
 

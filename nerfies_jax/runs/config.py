@@ -8,6 +8,14 @@ from typing import Literal
 from nerfies_jax.capture.given import GivenFiles
 
 
+def check_budget(preprocessing: float | None) -> None:
+    """Raise ValueError unless it is None or a positive multiple of a budget."""
+    if preprocessing is not None and not 0 < preprocessing < math.inf:
+        raise ValueError(
+            f"preprocessing={preprocessing}: a positive multiple of the default budget"
+        )
+
+
 @dataclasses.dataclass(frozen=True)
 class CaptureSource:
     """Which pictures to read: a folder's, or those of a built-in scene."""
@@ -24,10 +32,14 @@ class CaptureSource:
     """Which frames to score: n for every n-th, or the name of a split."""
     missing: Literal["refuse", "skip"] = "refuse"
     """What to do with frames whose picture is missing."""
+    preprocessing: float | None = None
+    """How much work to spend on optical flow, tracks and masks, as a multiple of the
+    default budget. What is beyond it is left out (default: 1)."""
     files: GivenFiles = GivenFiles()
     """What other tools found in the pictures."""
 
     def __post_init__(self):
+        check_budget(self.preprocessing)
         if self.capture is not None:  # one folder has one name, wherever it is opened
             folder = pathlib.Path(self.capture).absolute()
             object.__setattr__(self, "capture", folder)
@@ -39,7 +51,8 @@ class CaptureSource:
         if self.capture is not None:
             words = [str(self.capture)]
         fields = {**vars(self), **vars(self.files)}
-        for name in ("factor", "max_side", "heldout", *vars(self.files)):
+        own = ("factor", "max_side", "heldout", "preprocessing")
+        for name in (*own, *vars(self.files)):
             value = fields[name]
             if value is not None:
                 words += [f"--{name.replace('_', '-')}", str(value)]

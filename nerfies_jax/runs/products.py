@@ -34,7 +34,7 @@ from nerfies_jax.runs import (
     step_profile,
 )
 from nerfies_jax.runs.run import Run, with_found_cameras
-from nerfies_jax.runs.run_folder import CONFIG
+from nerfies_jax.runs.run_folder import CONFIG, LEFT_OUT
 from nerfies_jax.runs.train import Trained
 from nerfies_jax.training import losses
 from nerfies_jax.training.model import TrainState
@@ -106,7 +106,8 @@ def make(
             metrics += model_size(saved)
             save_metrics(place / METRICS, metrics)
             warnings = floors_text.warnings(numbers)
-            notes = [*warnings, trained.result.message, *_capture_notes(run), *left_out]
+            notes = [*warnings, trained.result.message, *left_out]
+            notes += _capture_notes(run, folder)
             notes += [*remarks, *gain, *saved.notes, *unplayed]
             with events.stage("timing the parts of a step"):
                 step_ms, unknown = profile()
@@ -154,9 +155,10 @@ def save_metrics(path: pathlib.Path, metrics: list[Metric]) -> None:
     )
 
 
-def _capture_notes(run):
-    """Of what was learnt from, and of what scores are of."""
-    return dict.fromkeys([*run.capture.notes, *run.filmed.notes])
+def _capture_notes(run, folder):
+    """Of what was learnt from, how it was preprocessed, and of what scores are of."""
+    unpreprocessed = json.loads((folder / CONFIG).read_text()).get(LEFT_OUT, [])
+    return dict.fromkeys([*run.capture.notes, *unpreprocessed, *run.filmed.notes])
 
 
 def frames_to_score(run: Run, trained: Trained) -> tuple[np.ndarray, tuple[str, ...]]:

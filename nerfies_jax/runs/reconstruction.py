@@ -11,7 +11,7 @@ from nerfies_jax import console, stopping
 from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.capture.capture import CaptureError, describe
 from nerfies_jax.capture.given import GivenFiles
-from nerfies_jax.evidence import inspection
+from nerfies_jax.evidence import inspection, record
 from nerfies_jax.runs import (
     adviser,
     commands,
@@ -107,7 +107,8 @@ def reconstruct(
             stem = "-".join(run.capture.name.split()) + "-" + run.config.preset
             folder = run_folder.new_run_folder(out, stem)
             held.enter_context(run_folder.owned(folder))
-            save_config(folder, run)
+            left_out = record.notes_on(run.capture, CACHE / "evidence")
+            save_config(folder, run, left_out)
             same_capture.record(folder, run.capture)
             follow.begin(folder, run, None)
             checkpoints = _opened(held, folder, run, state, None)

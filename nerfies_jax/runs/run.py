@@ -5,7 +5,7 @@ import json
 import os
 import pathlib
 import shlex
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -25,7 +25,7 @@ from nerfies_jax.evaluation.scores import Draw
 from nerfies_jax.evidence import frame_flow, frame_masks, given_files
 from nerfies_jax.runs import own_effects, representations, same_capture, trust
 from nerfies_jax.runs.config import CaptureSource, RunConfig
-from nerfies_jax.runs.run_folder import CHECKPOINTS, CONFIG
+from nerfies_jax.runs.run_folder import CHECKPOINTS, CONFIG, LEFT_OUT
 from nerfies_jax.training import checkpoint, specs
 from nerfies_jax.training.effects import Effect
 from nerfies_jax.training.model import Model, TrainState
@@ -182,7 +182,10 @@ def stored_capture(source: CaptureSource, seed: int = 0) -> Capture:
 
     `seed` makes a built-in scene. Raises ValueError where it cannot be read as asked.
     """
-    return given_files.attached(_filmed(source, seed), source.files)
+    capture = given_files.attached(_filmed(source, seed), source.files)
+    if source.preprocessing is None:
+        return capture
+    return dataclasses.replace(capture, preprocessing=source.preprocessing)
 
 
 def _filmed(source, seed):
@@ -217,17 +220,20 @@ def _built_in(source, seed):
     return synthetic.cached(film, CACHE / "scenes", seed)[0]
 
 
-def save_config(folder: pathlib.Path, run: Run) -> None:
-    """`config.json`: the config, the whole spec it led to, and what made it."""
-    write_json(
-        folder / CONFIG,
-        {
-            "config": specs.as_json(run.config),
-            "representation": run.representation.name,
-            "spec": specs.as_json(run.spec),
-            "made by": provenance(),
-        },
-    )
+def save_config(folder: pathlib.Path, run: Run, left_out: Sequence[str] = ()) -> None:
+    """`config.json`: the config, the whole spec it led to, and what made it.
+
+    With notes on what preprocessing `left_out`, if it did.
+    """
+    stored = {
+        "config": specs.as_json(run.config),
+        "representation": run.representation.name,
+        "spec": specs.as_json(run.spec),
+        "made by": provenance(),
+    }
+    if left_out:
+        stored[LEFT_OUT] = [*left_out]
+    write_json(folder / CONFIG, stored)
 
 
 def saved_run(

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 import filelock
 
 CONFIG = "config.json"  # which capture and which scene, and the whole of its spec
+LEFT_OUT = "preprocessing"  # in it: notes on what that left out, if it did
 CHECKPOINTS = "checkpoints"
 EXPORTS = "exports"  # files for other programs, where no other place is named
 RENDERS = "renders"  # images and videos of camera paths

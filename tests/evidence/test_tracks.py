@@ -438,31 +438,6 @@ def test_what_was_gathered_is_read_again(tmp_path):
     )
 
 
-def test_what_there_is_no_time_for_is_left_out_and_not_kept(tmp_path):
-    capture, evidence = gathered()
-    assert not evidence.left_out
-    log = []
-    hasty = record.cached(capture, tmp_path, tell=log.append, seconds=1e-6)
-    assert not list(tmp_path.iterdir())
-    assert "dense points" in hasty.left_out
-    assert "no time for dense points at rest" in log
-    assert not len(hasty.still.position)
-    assert 0.3 < len(hasty.score) / len(evidence.score) < 0.7
-    true = capture.moving[hasty.row]
-    assert (hasty.moving & true).sum() / (hasty.moving | true).sum() > 0.6
-    record.cached(capture, tmp_path)
-    assert len(list(tmp_path.iterdir())) == 1
-
-
-def test_a_folder_that_cannot_be_written_costs_the_next_time_alone(tmp_path):
-    capture, evidence = gathered()
-    (tmp_path / "file").touch()
-    log = []
-    found = record.cached(capture, tmp_path / "file", tell=log.append)
-    assert len(found.score) == len(evidence.score)
-    assert "not kept for the next time" in log[-1]
-
-
 def test_jumping_views_and_short_films_say_why_they_are_of_no_use():
     jumps = films.film(
         card=MOVES["card"], camera=lambda t: (3 * np.sin(400 * t), 0.0, 0.0), frames=12
