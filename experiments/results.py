@@ -199,6 +199,9 @@ STUDIES = {
     "speed": _package(
         "speed", "--job --beside CHECKOUT --yardstick PATH/run.py --out speed"
     ),
+    "player_speed": _study(
+        "player_speed", "PLAYER.html --gsplat INDEX.es.js --out player_speed.json"
+    ),
     "raster_speed": _package(
         "raster_speed", "--out raster_speed.json", page="__main__"
     ),

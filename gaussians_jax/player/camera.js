@@ -119,9 +119,11 @@ function toward(view, goal, share) {
 // How far two views are from each other: the largest of the rotation (rad), the shift
 // of the target and the change of the distance, in distances.
 function apart(view, goal) {
-  const same = view.quaternion.reduce((all, value, k) => all + value * goal.quaternion[k], 0);
+  const from = unit(view.quaternion), to = unit(goal.quaternion);
+  // By the chord: the arc cosine of nearly one has no digits.
+  const chord = (sign) => Math.hypot(...sum(from, to, sign));
   return Math.max(
-    2 * Math.acos(Math.min(1, Math.abs(same))),
+    2 * Math.min(chord(1), chord(-1)),
     Math.hypot(...sum(view.target, goal.target, -1)) / goal.distance,
     Math.abs(Math.log(view.distance / goal.distance)),
   );

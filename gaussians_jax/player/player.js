@@ -7,9 +7,9 @@ const LINKED_AFTER = 300; // ms at rest, after which the address bar has the vie
 
 // A function that asks for the order of the Gaussians, in a worker where there can be
 // one. `take` gets the rows and whether a worker sorted them. One request is under way
-// at a time, and the last one asked meanwhile comes next.
+// at a time, and the last one made meanwhile comes next.
 function sorterFor(header, buffer, source, take) {
-  let worker = null, busy = false, next = null, here = null;
+  let worker = null, current = null, next = null, here = null;
 
   function onThisThread(request) {
     here ??= sorterOf(header, buffer);
@@ -17,29 +17,32 @@ function sorterFor(header, buffer, source, take) {
   }
 
   function give(request) {
-    busy = true;
+    current = request;
     next = null;
-    worker.onmessage = ({ data }) => {
-      busy = false;
-      take(data, request, true);
-      if (next) give(next);
-    };
-    worker.onerror = () => { // this browser runs no worker from a page like this one
-      worker = null;
-      onThisThread(next ?? request);
-    };
     worker.postMessage(request);
+  }
+
+  function withoutWorker() { // where a browser runs none from a page like this one
+    worker = null;
+    if (next ?? current) onThisThread(next ?? current);
   }
 
   try {
     worker = new Worker(URL.createObjectURL(new Blob([source], { type: "text/javascript" })));
+    worker.onerror = withoutWorker;
+    worker.onmessage = ({ data }) => {
+      const answered = current;
+      current = null;
+      if (next) give(next);
+      take(data, answered, true);
+    };
     worker.postMessage({ header, buffer });
   } catch {
-    worker = null;
+    withoutWorker();
   }
   return (request) => {
-    if (!worker) return onThisThread(request);
-    if (busy) next = request;
+    if (!worker) onThisThread(request);
+    else if (current) next = request;
     else give(request);
   };
 }

@@ -57,6 +57,8 @@ TABLE = [
     ("export", "nowhere tracks --points 0", "track at least one"),
     ("export", "nowhere exr --path spiral --frames 2", "has its own number of frames"),
     ("export", "nowhere colmap --path sway", "--path is not for colmap, but for path"),
+    ("player_speed", "nothing.html", "nothing.html: no such file"),
+    ("player_speed", "nothing.html --time 2", "--time is from 0 to 1"),
     ("field_speed", "--seconds 2 1", "--seconds: positive and rising"),
     ("field_speed", "--presets nothing", "--presets nothing"),
     ("field_speed", "--out OUT/x.json", "no folder OUT"),

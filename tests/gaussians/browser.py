@@ -1,5 +1,6 @@
 """A browser for the tests of the player, and a page whose image is known in advance."""
 
+import contextlib
 import functools
 import io
 import json
@@ -29,6 +30,12 @@ ARGUMENTS = (
     "--no-sandbox",
     "--disable-dev-shm-usage",
 )
+DESKTOP = {"viewport": {"width": 1280, "height": 800}}
+PHONE = {
+    "viewport": {"width": 390, "height": 844},
+    "has_touch": True,
+    "is_mobile": True,
+}
 # Static blobs of one color each, by position. The last one moves, see MOVED.
 BLOBS = {
     "red": (0.0, 0.0, 0.0),
@@ -167,3 +174,82 @@ def projected(view, point, width, height):
     offset = view["focal"] * enlarged * np.array([x, y * view["aspect"]]) / z
     center = np.subtract(view["centre"], np.divide(view["size"], 2)) * enlarged
     return offset + center + (width / 2, height / 2)
+
+
+@contextlib.contextmanager
+def opener(browser, address):
+    """Yield a function that opens the page; afterwards assert that it met no error.
+
+    The page stands still at its start; `script` runs before its own programs.
+    """
+    with contextlib.ExitStack() as stack:
+        errors = []
+
+        def open_page(options=DESKTOP, fragment="#t=0", script=None, wait=True):
+            context = browser.new_context(**options)
+            stack.callback(context.close)
+            page = context.new_page()
+            page.on("pageerror", lambda error: errors.append(str(error)))
+            page.on(
+                "console",
+                lambda line: line.type == "error" and errors.append(line.text),
+            )
+            if script is not None:
+                page.add_init_script(script)
+            page.goto(address + fragment)
+            if wait:
+                settle(page)
+            return page
+
+        yield open_page
+        assert not errors
+
+
+def settle(page):
+    """Wait until the page has drawn what it is to show."""
+    page.wait_for_function("() => player && player.ready")
+    page.evaluate(
+        "new Promise((done) => requestAnimationFrame(() => setTimeout(done)))"
+    )
+    page.wait_for_function("() => player.ready")
+
+
+def state(page):
+    """Return the view as arrays, with its offset from the target."""
+    view = page.evaluate("player.view")
+    view["offset"] = np.subtract(view["position"], view["target"])
+    return view
+
+
+def check_image(page, time=0.0):
+    """Assert that the blobs are where the page's camera sees them."""
+    image, view = image_of(page), state(page)
+    ratio = page.evaluate("window.devicePixelRatio")
+    height, width = np.array(image.shape[:2]) / ratio
+    seen = 0
+    for name, point in BLOBS.items():
+        point = np.add(point, np.multiply(time, MOVED)) if name == "magenta" else point
+        expected = projected(view, point, width, height)
+        if (expected < 20).any() or (expected > (width - 20, height - 20)).any():
+            continue
+        place = place_of(image, name)[0] / ratio
+        # 0.5 px of the pixel grid; a blob's projection is not quite symmetric.
+        np.testing.assert_allclose(place, expected, atol=1.5)
+        seen += 1
+    assert seen >= 2
+    return image
+
+
+def drag(page, by, button="left", keys=()):
+    """Drag with the mouse from the middle of the canvas."""
+    box = page.locator("#scene").bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    for key in keys:
+        page.keyboard.down(key)
+    page.mouse.move(x, y)
+    page.mouse.down(button=button)
+    page.mouse.move(x + by[0], y + by[1], steps=4)
+    page.mouse.up(button=button)
+    for key in keys:
+        page.keyboard.up(key)
+    settle(page)

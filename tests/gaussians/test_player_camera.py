@@ -16,7 +16,8 @@ from tests.gaussians.browser import by_node, needs_node, program_of
 
 VIEWS = """
 const [program, header] = JSON.parse(require("fs").readFileSync(0, "utf8"));
-const names = "viewOf, cameraOf, orbited, moved, nearer, toward, textOf, viewFrom";
+const names = "viewOf, cameraOf, orbited, moved, nearer, toward, apart" +
+  ", textOf, viewFrom";
 const f = new Function(program + `; return { ${names} }`)();
 const broken = ["", "1,2", "0,0,0,0,0,0,0,1", "1,0,0,0,0,0,0,-1", "a,b,c,d,e,f,g,h"];
 const lens = header.view, first = f.viewOf(header.view);
@@ -31,6 +32,9 @@ console.log(JSON.stringify({
   nearer: shown(f.nearer(first, 0.5)),
   halfway: shown(f.toward(first, far, 0.5)),
   arrived: f.toward(first, far, 1) === far,
+  // A quaternion of a link has not quite unit length.
+  same: f.apart(far, { ...far, quaternion: far.quaternion.map((x) => -1.0000001 * x) }),
+  turned: f.apart(first, f.orbited(first, header.up, 1e-4, 0)),
   links: [f.textOf(first), link],
   broken: broken.map(f.viewFrom),
 }));
@@ -70,6 +74,8 @@ def test_views_turn_about_their_target():
     ]
     assert angles[0] == pytest.approx(angles[1] / 2, rel=1e-3)
     assert answer["arrived"]
+    assert answer["same"] < 1e-9
+    assert answer["turned"] == pytest.approx(1e-4, rel=1e-3)
     assert answer["links"][0] == answer["links"][1]
     assert answer["broken"] == [None] * 5
     # An image of 64 x 48 in one of 256 x 96.

@@ -4,20 +4,20 @@ The camera is read from the page, and the image is held against it: each blob mu
 where a pinhole with that camera shows it.
 """
 
-import contextlib
-
 import numpy as np
 import pytest
 
 from tests.gaussians import browser as shared
-from tests.gaussians.browser import BLOBS, MOVED, image_of, place_of, projected
-
-DESKTOP = {"viewport": {"width": 1280, "height": 800}}
-PHONE = {
-    "viewport": {"width": 390, "height": 844},
-    "has_touch": True,
-    "is_mobile": True,
-}
+from tests.gaussians.browser import (
+    PHONE,
+    check_image,
+    drag,
+    image_of,
+    opener,
+    place_of,
+    settle,
+    state,
+)
 
 
 @pytest.fixture(scope="module")
@@ -27,82 +27,15 @@ def browser():
 
 @pytest.fixture(scope="module")
 def address(tmp_path_factory):
-    path = tmp_path_factory.mktemp("controls") / "player.html"
+    path = tmp_path_factory.mktemp("player") / "player.html"
     shared.write_blobs(path)
     return path.as_uri()
 
 
 @pytest.fixture
 def opened(browser, address):
-    """A function that opens the page, stopped at its start, and reports its errors."""
-    with contextlib.ExitStack() as stack:
-        errors = []
-
-        def open_page(options=DESKTOP, fragment="#t=0"):
-            context = browser.new_context(**options)
-            stack.callback(context.close)
-            page = context.new_page()
-            page.on("pageerror", lambda error: errors.append(str(error)))
-            page.on(
-                "console",
-                lambda line: line.type == "error" and errors.append(line.text),
-            )
-            page.goto(address + fragment)
-            settle(page)
-            return page
-
+    with opener(browser, address) as open_page:
         yield open_page
-        assert not errors
-
-
-def settle(page):
-    """Wait until the page has drawn what it is to show."""
-    page.wait_for_function("() => player && player.ready")
-    page.evaluate(
-        "new Promise((done) => requestAnimationFrame(() => setTimeout(done)))"
-    )
-    page.wait_for_function("() => player.ready")
-
-
-def state(page):
-    """Return the view as arrays, with its offset from the target."""
-    view = page.evaluate("player.view")
-    view["offset"] = np.subtract(view["position"], view["target"])
-    return view
-
-
-def check_image(page, time=0.0):
-    """Assert that the blobs are where the page's camera sees them."""
-    image, view = image_of(page), state(page)
-    ratio = page.evaluate("window.devicePixelRatio")
-    height, width = np.array(image.shape[:2]) / ratio
-    seen = 0
-    for name, point in BLOBS.items():
-        point = np.add(point, np.multiply(time, MOVED)) if name == "magenta" else point
-        expected = projected(view, point, width, height)
-        if (expected < 20).any() or (expected > (width - 20, height - 20)).any():
-            continue
-        place = place_of(image, name)[0] / ratio
-        # 0.5 px of the pixel grid; a blob's projection is not quite symmetric.
-        np.testing.assert_allclose(place, expected, atol=1.5)
-        seen += 1
-    assert seen >= 2
-    return image
-
-
-def drag(page, by, button="left", keys=()):
-    """Drag with the mouse from the middle of the canvas."""
-    box = page.locator("#scene").bounding_box()
-    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    for key in keys:
-        page.keyboard.down(key)
-    page.mouse.move(x, y)
-    page.mouse.down(button=button)
-    page.mouse.move(x + by[0], y + by[1], steps=4)
-    page.mouse.up(button=button)
-    for key in keys:
-        page.keyboard.up(key)
-    settle(page)
 
 
 def touch(page, *paths):
@@ -162,7 +95,9 @@ def test_a_finger_orbits_and_two_fingers_pan_and_zoom(opened):
     check_image(page)
 
 
-@pytest.mark.parametrize("way", ["shift", "right button"])
+@pytest.mark.parametrize(
+    "way", ["shift", pytest.param("right button", marks=pytest.mark.slow)]
+)
 def test_a_mouse_pans_the_target_under_the_pointer(opened, way):
     page = opened()
     before, start = state(page), place_of(image_of(page), "red")[0]
@@ -205,3 +140,104 @@ def test_the_time_is_played_paused_and_scrubbed(opened):
     settle(page)
     scrubbed = check_image(page, 0.8)
     np.testing.assert_array_equal(image_of(opened(fragment="#t=0.8")), scrubbed)
+
+
+def angle_about_up(before, after):
+    """The angle (rad) by which the camera went around the y axis, to its right."""
+    one, other = (np.arctan2(v["offset"][0], v["offset"][2]) for v in (before, after))
+    return other - one
+
+
+def test_keys_orbit_pan_zoom_and_reset(opened):
+    page = opened()
+    start, image = state(page), image_of(page)
+
+    def after(key):
+        before = state(page)
+        page.keyboard.press(key)
+        settle(page)
+        return before, state(page)
+
+    before, now = after("ArrowRight")
+    assert angle_about_up(before, now) == pytest.approx(np.radians(5), abs=1e-5)
+    before, now = after("ArrowLeft")
+    assert angle_about_up(before, now) == pytest.approx(-np.radians(5), abs=1e-5)
+    before, now = after("ArrowUp")
+    assert now["offset"][1] - before["offset"][1] == pytest.approx(0.173, abs=0.01)
+    before, now = after("ArrowDown")
+    np.testing.assert_allclose(now["offset"], start["offset"], atol=1e-5)
+    before, now = after("Shift+ArrowRight")
+    move = np.subtract(now["target"], before["target"])
+    np.testing.assert_allclose(move, [2 * np.radians(5), 0, 0], atol=1e-5)
+    before, now = after("+")
+    assert now["distance"] == pytest.approx(before["distance"] / 1.1, rel=1e-5)
+    before, now = after("-")
+    assert now["distance"] == pytest.approx(before["distance"] * 1.1, rel=1e-5)
+    check_image(page)
+    after("Home")
+    np.testing.assert_array_equal(image_of(page), image)
+
+
+def test_keys_play_step_and_show_help(opened):
+    page = opened()
+    last = 23  # instants of the page
+    page.keyboard.press(".")
+    page.keyboard.press(".")
+    page.keyboard.press(",")
+    settle(page)
+    assert page.evaluate("player.time") == pytest.approx(1 / last, abs=1e-6)
+    check_image(page, 1 / last)
+    slider = page.get_by_role("slider")
+    slider.focus()
+    page.keyboard.press("ArrowRight")
+    settle(page)
+    assert page.evaluate("player.time") == pytest.approx(2 / last, abs=1e-6)
+    page.get_by_role("button", name="Next frame").click()
+    page.get_by_role("button", name="Previous frame").click()
+    assert page.evaluate("player.time") == pytest.approx(2 / last, abs=1e-6)
+    page.keyboard.press("Tab")  # to the speed, whose keys are its own
+    page.locator("#scene").focus()
+    page.keyboard.press("Space")
+    assert page.evaluate("player.playing")
+    page.keyboard.press("Space")
+    assert not page.evaluate("player.playing")
+    dialog = page.get_by_role("dialog")
+    page.keyboard.press("?")
+    assert dialog.is_visible()
+    page.keyboard.press("Escape")
+    assert not dialog.is_visible()
+    page.get_by_role("button", name="Controls").click()
+    dialog.get_by_role("button", name="Close").click()
+    assert not dialog.is_visible()
+
+
+def test_full_screen_by_key_and_button(opened):
+    page = opened()
+    full = "() => document.fullscreenElement !== null"
+    page.keyboard.press("f")
+    page.wait_for_function(full)
+    page.get_by_role("button", name="Full screen").click()
+    page.wait_for_function("() => document.fullscreenElement === null")
+    page.get_by_role("button", name="Full screen").click()
+    page.wait_for_function(full)
+    settle(page)
+    check_image(page)
+
+
+def test_a_link_holds_the_time_and_the_view(opened):
+    page = opened()
+    first = image_of(page)
+    drag(page, (50, 30))
+    drag(page, (20, -40), keys=["Shift"])
+    page.get_by_role("slider").fill("0.3")
+    settle(page)
+    page.wait_for_function("() => location.hash.includes('t=0.3&view=')")
+    image, fragment = image_of(page), "#" + page.url.split("#")[1]
+    assert (image != first).any()
+    other = opened(fragment=fragment)
+    assert not other.evaluate("player.playing")
+    np.testing.assert_array_equal(image_of(other), image)
+    other.evaluate("() => { location.hash = 't=0'; }")  # as a link in the page would
+    other.wait_for_function("() => player.time === 0")
+    settle(other)
+    check_image(other)
