@@ -1,10 +1,12 @@
 """How close a picture is to the truth: PSNR, SSIM, MS-SSIM and their masked forms.
 
-Pictures are `[height, width, channels]` in [0, 1]; batches go through `jax.vmap`.
+Images are `[height, width, channels]` or gray `[height, width]`, in [0, 1] or as uint8
+or uint16, which are divided by 255 and 65535. Leading axes are a batch, with one score
+for each image.
 Published numbers mix protocols, so each one has its name here: `padding="valid"` is
 scikit-image's Gaussian SSIM, `padding="zero"` INRIA's (0.002 to 0.011 higher on
 photographs), and `quantise` first gives the score of the 8-bit file others re-read.
-Pictures narrower than float32 are widened to it first (`widened`).
+Images narrower than float32 are widened to it first (`widened`).
 """
 
 from typing import Literal
@@ -24,7 +26,20 @@ C1, C2 = losses.LUMINANCE, losses.CONTRAST
 # sum to 1.0001.
 SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 
+# Of an image; more are a batch whose axes were taken for channels.
+MOST_CHANNELS = 16
+
 Padding = Literal["valid", "zero"]
+
+
+def _refuse_stacks(image: Float[Array, "height width channels"]) -> None:
+    """A stack of gray images [n, height, width] is no image of many channels."""
+    if image.shape[-1] > MOST_CHANNELS:
+        raise ValueError(
+            f"an image {list(image.shape)} has {image.shape[-1]} channels, more than "
+            f"{MOST_CHANNELS}; images are [height, width, channels], and gray ones in "
+            "a batch have a last axis of 1"
+        )
 
 
 @checked(images=("image",))
@@ -43,6 +58,7 @@ def psnr(
     The cap (`losses.LEAST_MSE`) is a maximum, not an offset: adding 1e-10 instead would
     report 79.957 dB where 80 is true. Equal pictures have gradient zero.
     """
+    _refuse_stacks(image)
     error = widened(image) - widened(truth)
     return losses.psnr(jnp.mean(error**2))
 
@@ -58,6 +74,7 @@ def masked_psnr(
     mPSNR of Gao et al. 2022 (DyCheck), arXiv:2210.13445. What lies outside the mask may
     be anything, NaN included.
     """
+    _refuse_stacks(image)
     mask = mask[..., None]
     image, truth = widened(image), widened(truth)
     # Both pictures are emptied before the difference: NaN * 0 is NaN, and so is the
@@ -80,6 +97,7 @@ def ssim(
     `gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1`;
     "zero" puts black around both pictures and averages all pixels, as INRIA does.
     """
+    _refuse_stacks(image)
     return losses.ssim(image, truth, padding=padding)
 
 
@@ -98,6 +116,7 @@ def ms_ssim(
     shorter side; with fewer, the remaining weights are scaled to sum to one, which is
     another metric: report the number of scales beside the score.
     """
+    _refuse_stacks(image)
     _check_scales(image.shape, scales)
     image, truth = widened(image), widened(truth)
     weights = SCALE_WEIGHTS[:scales]
@@ -154,6 +173,7 @@ def masked_ssim(
     mask this is `ssim`; what lies outside the mask never matters. `partial_ssim` is the
     published protocol.
     """
+    _refuse_stacks(image)
     if min(mask.shape) < TAPS:
         raise ValueError(
             f"masked SSIM needs {TAPS}x{TAPS} pixels, got {mask.shape[1]}x"
@@ -188,6 +208,7 @@ def partial_ssim(
     weights, so a constant is not kept near the mask's edge; variances are clipped; and
     windows without any pixel count as a perfect 1. `masked_ssim` does none of that.
     """
+    _refuse_stacks(image)
     image, truth = widened(image), widened(truth)
     inside = mask.astype(image.dtype)[..., None]
     image, truth = (jnp.where(mask[..., None], x, 0.0) for x in (image, truth))

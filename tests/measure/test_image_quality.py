@@ -302,3 +302,31 @@ def test_pictures_smaller_than_the_window_are_refused():
     ):
         with pytest.raises(ValueError, match=words):
             call()
+
+
+def test_integer_gray_and_batched_images_score_as_what_they_show(rng):
+    """As bytes, 250 and 10 once differed by 16 levels; columns once were channels."""
+    far = [np.full((12, 12, 3), level, np.uint8) for level in (250, 10)]
+    assert psnr(*far) == pytest.approx(20 * np.log10(255 / 240), abs=1e-4)
+    pairs = [pair(rng, (13, 14, 1)) for _ in range(2)]
+    image, truth = np.stack(pairs, axis=1).astype(np.float32)
+    exact = [
+        structural_similarity(t[..., 0], i[..., 0], **(SCIKIT | {"channel_axis": None}))
+        for i, t in zip(image, truth, strict=True)
+    ]
+    np.testing.assert_allclose(
+        ssim(image[0, ..., 0], truth[0, ..., 0]), exact[0], atol=2e-6
+    )
+    np.testing.assert_allclose(ssim(image, truth), exact, atol=2e-6)
+    deep = [np.round(65535 * x).astype(np.uint16) for x in (image, truth)]
+    np.testing.assert_allclose(ssim(*deep), exact, atol=2e-4)
+    mask = np.zeros((13, 14), bool)
+    mask[3:9, 4:12] = True
+    for masked in (image_quality.masked_psnr, image_quality.partial_ssim):
+        both = jax.jit(masked)(image, truth, mask)
+        one = jax.jit(masked)(image[1], truth[1], mask)
+        np.testing.assert_allclose(both[1], one, rtol=1e-6)
+    with pytest.raises(ValueError, match=r"`truth` has shape \[3\]"):
+        psnr(np.ones((4, 4, 3), np.float32), np.ones(3, np.float32))
+    with pytest.raises(ValueError, match="has 64 channels"):
+        image_quality.ssim(*np.ones((2, 16, 64, 64), np.float32))

@@ -129,3 +129,26 @@ def test_narrow_coordinates_are_encoded_in_float32(times_pi, narrow):
     )
     assert window.dtype == narrow
     assert window.tolist() == [1, 0.5, 0, 0]
+
+
+def test_encoding_and_window_of_a_batch_are_those_of_each_point(dtype, rng):
+    points = rng.uniform(-1, 1, (2, 5, 3)).astype(dtype)
+    alpha = np.array([0, 0.25, 2.5, 4, 9], dtype)
+
+    @jax.jit
+    def both(points, alpha):
+        window = encoding.coarse_to_fine_window(4, alpha)
+        return window, encoding.positional_encoding(points, 4, window, times_pi=True)
+
+    window, features = both(points, alpha)
+    assert window.dtype == features.dtype == dtype
+    opened = np.clip(alpha[:, None].astype(np.float64) - np.arange(4), 0, 1)
+    bound = {"float32": 3e-7, "float64": 1e-15}[dtype]
+    assert np.max(np.abs(window - (1 - np.cos(np.pi * opened)) / 2)) < bound
+    spec = EncodingSpec(4, times_pi=True)
+    for place in np.ndindex(2, 5):
+        weights = np.asarray(window[place[1]], np.float64)
+        truth = exact_features(spec, points[place], weights)
+        assert np.max(np.abs(features[place] - truth)) < bound
+    with pytest.raises(ValueError, match="3 weights does not fit 4 bands"):
+        encoding.positional_encoding(points, 4, window[:, :3])

@@ -136,6 +136,24 @@ def test_outputs_edge_by_edge(variant, dtype, rng):
             np.testing.assert_allclose(batch[name][row], value, rtol=bound, atol=bound)
 
 
+def test_one_output_of_any_leading_axes_edge_by_edge(dtype, rng):
+    spec = KANSpec(in_features=5, hidden=(7, 6), out_features=3, kernels=5)
+    params = filled(spec, dtype)
+    inputs = rng.normal(size=(2, 2, 5)).astype(dtype)
+    outputs = jax.jit(kan.apply, static_argnums=0)(spec, params, inputs)
+    assert outputs.shape == (2, 2, 3)
+    bound = {"float32": 2e-5, "float64": 1e-13}[dtype]
+    for place in np.ndindex(2, 2):
+        value = by_hand(spec, params, inputs[place])[kan.OUTPUT]
+        np.testing.assert_allclose(outputs[place], value, rtol=bound, atol=bound)
+    with pytest.raises(ValueError, match=r"expected \[\.\.\., 5\] for in_features=5"):
+        kan.apply(spec, params, inputs[..., :4])
+    with pytest.raises(ValueError, match=r"use kan\.apply_heads"):
+        kan.apply(SPEC, params, inputs)
+    with pytest.raises(ValueError, match="`x` is bfloat16 but the parameters are"):
+        kan.apply(spec, params, jnp.asarray(inputs, jnp.bfloat16))
+
+
 @pytest.mark.parametrize("variant", SOME)
 def test_gradients(variant, float64, rng):
     spec = VARIANTS[variant]
