@@ -56,6 +56,11 @@ class Screen:
         """Whether a browser can render the colors of this run itself."""
         return self.run.representation.splatting is not None
 
+    def is_compiled(self, look: Look) -> bool:
+        """Whether the program for this look was used before."""
+        in_browser = self.in_browser and look.channel == "color"
+        return look.without in (self._splatting if in_browser else self._renderers)
+
     def splats(self, state: TrainState, eye: Eye, look: Look) -> SplatCloud:
         """Return the Gaussians of a run that is `in_browser`, for its rasterizer."""
         if look.without not in self._splatting:

@@ -25,7 +25,7 @@ from nerfies_jax.runs.run import Run
 from nerfies_jax.runs.screen import Screen
 from nerfies_jax.runs.viewer_path import PathPanel, vertical_fov
 from nerfies_jax.runs.viewer_training import TrainingPanel
-from nerfies_jax.runs.viewer_window import Window, eye_of
+from nerfies_jax.runs.viewer_window import COMPILING, Window, eye_of
 from nerfies_jax.training.loop import Hook
 from nerfies_jax.training.model import TrainState
 
@@ -36,7 +36,6 @@ IDLE_SECONDS = 0.02
 FRUSTA = 48  # training cameras shown
 FRUSTUM_SHARE = 0.02  # of the way from the cameras to what they look at
 FRUSTUM_PX = 2.0
-WAITING = "The first image comes when its program is compiled."
 
 
 def check_installed() -> None:
@@ -76,7 +75,7 @@ class Viewer:
                 HOST, port, label=run.capture.name, verbose=False
             )
         self._server.gui.configure_theme(show_logo=False, show_share_button=False)
-        self._about = self._server.gui.add_markdown(WAITING)
+        self._about = self._server.gui.add_markdown(COMPILING)
         away = self._place_cameras(run)
         self._make_controls(run)
         self.path = PathPanel(
@@ -141,12 +140,13 @@ class Viewer:
         look = self._look()
         for key, client in clients.items():
             if key not in self._windows:
-                self._windows[key] = Window(client, self.screen)
-            window = self._windows[key]
-            busy |= window.update(state, step, look)
-            if window.about and self._about.content != window.about:
-                self._about.content = window.about
+                self._windows[key] = Window(client, self.screen, self._tell)
+            busy |= self._windows[key].update(state, step, look)
         return busy
+
+    def _tell(self, text):
+        if self._about.content != text:
+            self._about.content = text
 
     def _look(self) -> Look:
         appearance = self._appearance

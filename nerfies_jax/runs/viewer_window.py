@@ -2,6 +2,7 @@
 
 import contextlib
 import time
+from collections.abc import Callable
 
 import numpy as np
 
@@ -21,6 +22,7 @@ BYTES_PER_SECOND = 40e6  # of Gaussians, which a browser unpacks and sorts
 BYTES_PER_SPLAT = 32
 JPEG_QUALITY = 90
 LARGEST_HALF = 6e4  # below the largest float16
+COMPILING = "Compiling the program that renders this, once ..."
 _NAME = "/splats"
 
 
@@ -49,11 +51,13 @@ def departing(client):
 
 
 class Window:
-    """The scene in one browser, kept up to date by calls of `update`."""
+    """The scene in one browser, kept up to date by calls of `update`.
 
-    def __init__(self, client, screen: Screen):
-        self.about = ""
-        self._client, self._screen = client, screen
+    `tell` shows a line about it in the page.
+    """
+
+    def __init__(self, client, screen: Screen, tell: Callable[[str], None]):
+        self._client, self._screen, self._tell = client, screen, tell
         self._splats = None  # viser's handle
         self._splat_unit = 1.0
         self._splat_count = 0
@@ -83,6 +87,8 @@ class Window:
             if now - self._sent < wait:
                 time.sleep(IDLE_SECONDS)
                 return wait < REFRESH_SECONDS
+            if not self._screen.is_compiled(look):
+                self._tell(COMPILING)
             cloud = self._screen.splats(state, eye, look)
             self._send_splats(cloud)
             position = eye.position if cloud.view_dependent else None
@@ -90,7 +96,7 @@ class Window:
             self._sent = time.monotonic()
             self._splat_count = len(cloud.centers)
             self._show_splats(True)
-            self.about = f"{len(cloud.centers):,} Gaussians, step {step:,}"
+            self._tell(f"{len(cloud.centers):,} Gaussians, step {step:,}")
             return True
         self._show_splats(True)
         return False
@@ -173,6 +179,8 @@ class Window:
                 time.sleep(IDLE_SECONDS if moving else 0)
                 return moving
             image.begin(pyramid, level, step)
+        if not self._screen.is_compiled(look):
+            self._tell(COMPILING)
         cell = image.cells.pop(0)
         tile = self._screen.draw(state, eye, look, image.level, cell)
         image.paste(tile, cell, pyramid.tile)
@@ -196,7 +204,7 @@ class Window:
         elif image.level + 1 < pyramid.levels:
             text += ", refining"
         legend = self._screen.legend(look.channel)
-        self.about = f"{text}\n\n{legend}" if legend else text
+        self._tell(f"{text}\n\n{legend}" if legend else text)
 
     def _send_image(self, image, format):
         with departing(self._client):

@@ -249,9 +249,13 @@ def test_a_browser_gets_gaussians_that_follow_time_effects_and_the_channel(tmp_p
         until(lambda: page._time.value == 0.1)
         until(lambda: not page._round(state, 0))
         np.testing.assert_array_equal(browser.positions(), frozen)
-        # Depth is rendered here and sharpens by itself.
+        # Depth is rendered here, by another program, and sharpens by itself.
+        told, tell = [], page._windows[0]._tell
+        page._windows[0]._tell = lambda text: told.append(text) or tell(text)
         browser.press(page, "show", "depth")
         until(lambda: browser.picture is not None and browser.picture.shape[1] == 160)
+        assert told[0].startswith("Compiling")
+        assert told[-1].startswith("160x120")
         assert not page._windows[0]._splats.visible
         browser.press(page, "show", "color")
         until(lambda: browser.picture.shape == (8, 8, 3))
