@@ -154,7 +154,7 @@ DRAW = """async ([name, start, count]) => {
 WORK = """([width, height, time]) => {
   const header = JSON.parse(document.getElementById("header").textContent);
   const buffer = bytesOf(document.getElementById("data").textContent);
-  const { gl, scene } = player.painter;
+  const { painter } = player, { gl } = painter;
   const camera = cameraOf(viewOf(header.view), header.view, width, height);
   const raster = { ...header.raster };
   raster.eps2d *= Math.max(1, camera.enlarged) ** 2;
@@ -170,14 +170,15 @@ WORK = """([width, height, time]) => {
   const one = FRAGMENT.replace(/if \\(left < 0.0\\) discard;/, "")
     .replace(/drawn = .*;/, "drawn = vec4(1.0, left < 0.0 ? 0.0 : 1.0, 0.0, 0.0);");
   const counter = programOf(gl, VERTEX, one);
-  gl.clear(gl.COLOR_BUFFER_BIT);
-  gl.useProgram(counter);
-  setCamera(uniformsOf(gl, counter), scene, camera, raster, time);
   const sort = sorterOf(header, buffer), forward = camera.rotation.slice(6);
   const rows = sort({ position: camera.position, forward, time });
-  player.painter.sort(rows);
-  gl.vertexAttribDivisor(0, 1);
-  gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, rows.length);
+  painter.sort(rows);
+  painter.project(camera, raster, time);
+  gl.clear(gl.COLOR_BUFFER_BIT);
+  gl.useProgram(counter);
+  uniformsOf(gl, counter)("size", "2f", width, height);
+  uniformsOf(gl, counter)("least", "1f", raster.alpha_threshold);
+  painter.drawQuads();
   const read = new Float32Array(4 * width * height);
   gl.readPixels(0, 0, width, height, gl.RGBA, gl.FLOAT, read);
   let shaded = 0, blended = 0;

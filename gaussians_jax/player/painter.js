@@ -81,27 +81,48 @@ Footprint footprintOf(int index) {
   return shown;
 }`;
 
-// The quad around a footprint is the square around the circle u^2 + v^2 = reach^2 where
-// its alpha is the least that counts: no smaller parallelogram holds the ellipse.
-const VERTEX = `#version 300 es
+// Writes the footprints in their order: once for each Gaussian, not for each corner, as
+// that takes a third of a frame on a processor. `reach` is how far a footprint goes until
+// its alpha is the least that counts, squared, in powers of two, which hardware has.
+const PROJECT = `#version 300 es
 ${PROJECTION}
 layout(location = 0) in uint index;
+out vec4 place; // mean in px, k, reach
+out vec2 spread; // px along x and y of a unit of that reach
+out vec3 color;
+void main() {
+  Footprint shown = footprintOf(int(index));
+  place = vec4(0.0, 0.0, 0.0, -1.0);
+  spread = vec2(0.0);
+  color = vec3(0.0);
+  if (!shown.seen) return;
+  place = vec4(shown.mean, shown.whitening.y, log2(shown.opacity / least));
+  spread = sqrt(log(2.0)) / shown.whitening.xz;
+  color = shown.color;
+}`;
+const NOTHING = `#version 300 es
+void main() {}`;
+const PARTS = { place: 4, spread: 2, color: 3 }; // floats of a footprint
+
+// The quad around a footprint is the square around the circle u^2 + v^2 = reach: no
+// smaller parallelogram holds the ellipse.
+const VERTEX = `#version 300 es
+uniform vec2 size;
+layout(location = 0) in vec4 place;
+layout(location = 1) in vec2 spread;
+layout(location = 2) in vec3 color;
 out vec2 offset;
 flat out vec4 tint;
 void main() {
-  Footprint shown = footprintOf(int(index));
   gl_Position = vec4(0.0, 0.0, 2.0, 1.0);
-  if (!shown.seen) return;
-  // In powers of two, which is what hardware has.
-  float reach = log2(shown.opacity / least);
-  tint = vec4(shown.color, reach);
+  if (place.w < 0.0) return;
+  tint = vec4(color, place.w);
   vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0;
-  offset = corner * sqrt(reach);
-  vec2 uv = offset * sqrt(log(2.0));
-  float dx = uv.x / shown.whitening.x;
-  vec2 at = shown.mean + vec2(dx, uv.y / shown.whitening.z + shown.whitening.y * dx);
-  vec2 place = at / size * 2.0 - 1.0;
-  gl_Position = vec4(place.x, -place.y, 0.0, 1.0);
+  offset = corner * sqrt(place.w);
+  float dx = offset.x * spread.x;
+  vec2 at = place.xy + vec2(dx, offset.y * spread.y + place.z * dx);
+  at = at / size * 2.0 - 1.0;
+  gl_Position = vec4(at.x, -at.y, 0.0, 1.0);
 }`;
 const FRAGMENT = `#version 300 es
 precision highp float;
@@ -245,17 +266,39 @@ function formatOf(gl) {
   return half ? [gl.RGBA16F, gl.HALF_FLOAT] : [gl.RGBA8, gl.UNSIGNED_BYTE];
 }
 
+// Room for the footprints of so many Gaussians, which `quads` draws one by one.
+function footprintBuffer(gl, quads, count) {
+  const widths = Object.values(PARTS), bytes = 4 * widths.reduce((a, b) => a + b);
+  const footprints = gl.createBuffer();
+  gl.bindVertexArray(quads);
+  gl.bindBuffer(gl.ARRAY_BUFFER, footprints);
+  gl.bufferData(gl.ARRAY_BUFFER, bytes * count, gl.DYNAMIC_COPY);
+  let at = 0;
+  widths.forEach((width, i) => {
+    gl.enableVertexAttribArray(i);
+    gl.vertexAttribPointer(i, width, gl.FLOAT, false, bytes, at);
+    gl.vertexAttribDivisor(i, 1);
+    at += 4 * width;
+  });
+  return footprints;
+}
+
 // What draws a scene on the canvas: `sort` takes the rows to draw, the farthest first.
 function painterOf(canvas, header, buffer) {
   const gl = canvas.getContext("webgl2", { alpha: false, antialias: false });
   if (!gl) throw new Error("this browser has no WebGL 2");
+  const projector = programOf(gl, PROJECT, NOTHING, Object.keys(PARTS));
   const splats = programOf(gl, VERTEX, FRAGMENT), whole = programOf(gl, WHOLE, BEHIND);
-  const set = uniformsOf(gl, splats), setWhole = uniformsOf(gl, whole);
+  const [setProjector, set, setWhole] = [projector, splats, whole].map(
+    (program) => uniformsOf(gl, program));
   const scene = sceneTextures(gl, header, buffer), unit = SAMPLERS.length;
-  const rows = gl.createBuffer(), target = gl.createFramebuffer();
+  const target = gl.createFramebuffer(), rows = gl.createBuffer();
+  const order = gl.createVertexArray(), quads = gl.createVertexArray();
+  gl.bindVertexArray(order);
   gl.bindBuffer(gl.ARRAY_BUFFER, rows);
   gl.enableVertexAttribArray(0);
   gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
+  const footprints = footprintBuffer(gl, quads, header.arrays.colour.shape[0]);
   const [format, type] = formatOf(gl);
   gl.activeTexture(gl.TEXTURE0 + unit);
   const texture = newTexture(gl);
@@ -274,20 +317,43 @@ function painterOf(canvas, header, buffer) {
 
   function sort(sorted) {
     count = sorted.length;
+    gl.bindBuffer(gl.ARRAY_BUFFER, rows);
     gl.bufferData(gl.ARRAY_BUFFER, sorted, gl.STREAM_DRAW);
+  }
+
+  // Compute the footprints of all rows that were sorted.
+  function project(camera, raster, time) {
+    gl.useProgram(projector);
+    setCamera(setProjector, scene, camera, raster, time);
+    gl.bindVertexArray(order);
+    gl.bindBufferBase(gl.TRANSFORM_FEEDBACK_BUFFER, 0, footprints);
+    gl.enable(gl.RASTERIZER_DISCARD);
+    gl.beginTransformFeedback(gl.POINTS);
+    gl.drawArrays(gl.POINTS, 0, count);
+    gl.endTransformFeedback();
+    gl.disable(gl.RASTERIZER_DISCARD);
+    // A buffer that is written to cannot be drawn from.
+    gl.bindBufferBase(gl.TRANSFORM_FEEDBACK_BUFFER, 0, null);
+  }
+
+  // Draw a quad for each footprint with the program in use.
+  function drawQuads() {
+    gl.bindVertexArray(quads);
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, count);
   }
 
   function draw(camera, raster, time, background) {
     resize();
+    project(camera, raster, time);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target);
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT);
     gl.enable(gl.BLEND);
     gl.useProgram(splats);
-    setCamera(set, scene, camera, raster, time);
+    set("size", "2fv", camera.size);
+    set("least", "1f", raster.alpha_threshold);
     set("most", "1f", raster.alpha_max);
-    gl.vertexAttribDivisor(0, 1);
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, count);
+    drawQuads();
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.disable(gl.BLEND);
     gl.useProgram(whole);
@@ -296,5 +362,5 @@ function painterOf(canvas, header, buffer) {
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, 1);
   }
 
-  return { gl, scene, sort, draw };
+  return { gl, scene, sort, project, drawQuads, draw };
 }

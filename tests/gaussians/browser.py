@@ -20,7 +20,7 @@ from gaussians_jax.raster_spec import RasterSpec
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.geometry import camera as cameras
 
-NAMES = ("chromium", "chromium-browser", "google-chrome")
+NAMES = ("chromium", "google-chrome", "chromium-browser")
 CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)
 needs_node = pytest.mark.skipif(not shutil.which("node"), reason="no node here")
 # Software rendering, which every machine has. Root has no sandbox.
