@@ -14,7 +14,7 @@ import numpy as np
 
 from nerfies_jax import console, evaluation, events
 from nerfies_jax.capture import camera_paths, exr, video
-from nerfies_jax.capture.capture import Capture
+from nerfies_jax.capture.capture import Capture, CaptureError
 from nerfies_jax.capture.extras import MissingExtra
 from nerfies_jax.capture.json_files import merged_folder, write_json
 from nerfies_jax.evaluation import Renderer, Scored, heldout, pictures
@@ -33,6 +33,7 @@ from nerfies_jax.runs import (
     report,
     step_profile,
 )
+from nerfies_jax.runs.attempts import Attempts
 from nerfies_jax.runs.run import Run, with_found_cameras
 from nerfies_jax.runs.run_folder import CONFIG, LEFT_OUT
 from nerfies_jax.runs.train import Trained
@@ -61,7 +62,8 @@ def make(
     """Write everything into the run folder and say where it is.
 
     Raises FloatingPointError, and writes nothing, where the state draws pictures that
-    are not finite: its parameters may be finite and yet beyond use.
+    are not finite: its parameters may be finite and yet beyond use. Raises OSError
+    where products could not be written, after it has written all others.
     """
     state, renderer = trained.result.state, trained.renderer
     run = with_found_cameras(run, state)
@@ -73,30 +75,38 @@ def make(
             "finite"
         )
     ms_per_frame = renderer.ms_per_frame(len(scored.rows))
+    # Products that replace earlier ones stay together.
+    attempt = Attempts(together=(folder / METRICS).exists())
     with _staged(folder) as place:
-        player, unplayed = save_player(place, run, trained)
+        player, unplayed = attempt(([], []), save_player, place, run, trained)
         # Compiles while all else is written, but for the player, whose own compiling
         # fills both cores.
         with step_profile.profiling(run, state) as profile:
-            comparison = save_comparison(place / "comparison.png", run.filmed, scored)
-            figures = [*player, report.Figure(comparison, COMPARED)]
+            figures = [*player]
+            comparison = attempt(
+                None, save_comparison, place / "comparison.png", run.filmed, scored
+            )
+            if comparison is not None:
+                figures.append(report.Figure(comparison, COMPARED))
             watched = [run.capture.ids[row] for row in trained.watched]
             course = curves.course_of(folder)
-            curves.write(place, trained.result.history, watched, course)
-            curve = with_extra(
-                curve_figure.save, place / "psnr_over_time.png", run, trained, scored
+            history = trained.result.history
+            attempt(None, curves.write, place, history, watched, course)
+            path = place / "psnr_over_time.png"
+            curve = attempt(
+                None, with_extra, curve_figure.save, path, run, trained, scored
             )
             if curve is not None:
                 caption = curve_figure.caption(run, trained, scored)
                 figures.append(report.Figure(curve, caption))
-            film = with_extra(
-                save_film, place / "scene.mp4", run, renderer, state, ms_per_frame / 1e3
+            seconds, path = ms_per_frame / 1e3, place / "scene.mp4"
+            film = attempt(
+                None, with_extra, save_film, path, run, renderer, state, seconds
             )
-            save_depth(place / "depth", run.capture, scored)
+            attempt(None, save_depth, place / "depth", run.capture, scored)
+            save, model = run.representation.save, (run.spec, run.metadata, state)
             with events.stage("saving the model"):
-                saved = run.representation.save(
-                    place, run.spec, run.metadata, state, effects=run.effects
-                )
+                saved = attempt(Saved(), save, place, *model, effects=run.effects)
             fitted, gain = score_halves(run, state, scored, ms_per_frame / 1e3)
             numbers, remarks = quality.measure(
                 run, state, trained.draw, scored, extra, ms_per_frame / 1e3
@@ -104,7 +114,7 @@ def make(
             metrics = heldout.metrics(numbers)
             metrics += [*measured(run, trained, scored, ms_per_frame, began), *fitted]
             metrics += model_size(saved)
-            save_metrics(place / METRICS, metrics)
+            attempt(None, save_metrics, place / METRICS, metrics)
             warnings = floors_text.warnings(numbers)
             notes = [*warnings, trained.result.message, *left_out]
             notes += _capture_notes(run, folder)
@@ -112,7 +122,9 @@ def make(
             with events.stage("timing the parts of a step"):
                 step_ms, unknown = profile()
         notes += unknown
-    page = report.write(
+    page = attempt(
+        None,
+        report.write,
         folder,
         f"{run.capture.name}: {run.config.preset}",
         metrics,
@@ -127,6 +139,7 @@ def make(
     for figure in player:
         console.say(f"player:     {folder / figure.link}")
     _log(folder, page, metrics, [*floors_text.lines(numbers), *warnings], following)
+    attempt.finish()
 
 
 def _staged(folder):
@@ -329,6 +342,8 @@ def save_player(
         )
         picture = folder / "player.png"
         pictures.save(poster, picture)
+    except (OSError, CaptureError):  # a full disk is told with all that is not written
+        raise
     except Exception as error:  # whatever it is, the run keeps all its other products
         return [], [f"There is no player: {type(error).__name__}: {error}"]
     caption = (
@@ -379,10 +394,11 @@ def _log(folder, page, metrics, floors, following):
         )
     for line in floors:
         console.say(line)
-    console.say(f"report:     {page}")
-    console.say(f"comparison: {folder / 'comparison.png'}")
-    if (folder / "scene.mp4").exists():
-        console.say(f"film:       {folder / 'scene.mp4'}")
+    if page is not None:
+        console.say(f"report:     {page}")
+    for kind, name in (("comparison:", "comparison.png"), ("film:", "scene.mp4")):
+        if (folder / name).exists():
+            console.say(f"{kind:11} {folder / name}")
     for command in following:
         console.say(f"{command.purpose}\n  {command.line}")
 

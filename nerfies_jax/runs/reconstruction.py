@@ -312,7 +312,10 @@ def _finished(folder, run, start, pace, hooks, began, extra):
         except FloatingPointError as error:
             errors.append(str(error))
         except (OSError, CaptureError) as error:
-            errors.append(f"not all of what came of the run is written: {error}")
+            errors.append(
+                f"not all of what came of the run is written: {error}; resume the run "
+                "once there is room"
+            )
     if result.stopped_by == "non-finite":
         errors.append(
             f"{result.message}; start anew with lower learning rates "

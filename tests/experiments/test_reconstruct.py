@@ -322,6 +322,15 @@ def test_a_run_that_cannot_be_drawn_or_kept_says_so_and_ends(
     # The products of before stay together, though the player was there already.
     assert {name: (folder / name).read_bytes() for name in PRODUCTS} == before
     assert not list(folder.glob(".*.partial"))
+    # Of a run without products, all but the one that cannot be written are there.
+    shutil.rmtree(folder / CHECKPOINTS / "12")
+    for name in set(PRODUCTS) - {"config.json", "capture.npz"}:
+        (folder / name).unlink()
+    with monkeypatch.context() as patch:
+        patch.setattr(products, "save_film", full)
+        assert ended("--out", folder, "--resume") == 1
+    assert "is written: [Errno 28] No space left" in capsys.readouterr().err
+    assert {n for n in PRODUCTS if not (folder / n).exists()} == {"scene.mp4"}
     shutil.rmtree(folder / CHECKPOINTS / "12")
     trained = train.train
 
