@@ -210,6 +210,7 @@ STUDIES = {
         "CAPTURE --heldout 8 --scenes default topology --budgets 90 --seeds 3 "
         "--jobs 2 --keep",
     ),
+    "faults": _package("faults", "--trials 200 --jobs 2"),
     "mutants": _package("mutants", "--count 44"),
     "mutants_unseen": _package("mutants_unseen", "--count 24 --seed 1", of="mutants"),
     "frequency_gates": _study("frequency_gates", "--out frequency_gates"),

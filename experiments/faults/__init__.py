@@ -1,0 +1,1 @@
+"""Faults injected into jobs, and what is left of the jobs afterwards."""

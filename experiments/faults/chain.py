@@ -1,0 +1,192 @@
+"""A job that is disturbed several times, and compared with one that never was."""
+
+import json
+import pathlib
+import random
+import shutil
+import subprocess
+import time
+from typing import Any, NamedTuple
+
+from experiments.faults import inject, jobs
+from nerfies_jax.capture.json_files import write_json
+
+FAULTS = 4  # of a chain
+LATEST = 0.9  # share of the processor time at which a fault happens
+RESUMED = 0.7  # of the time of a whole job, where it goes on
+
+
+class Reference(NamedTuple):
+    """A job that was never disturbed."""
+
+    name: str
+    result: dict[str, str]
+    processor_seconds: float
+
+
+def reference(bench: jobs.Bench, name: str) -> Reference:
+    """Run a job without a fault, or take it from an earlier campaign.
+
+    Raises:
+      ValueError: It fails, or a second run of it has other bits.
+    """
+    job = jobs.JOBS[name]
+    if job.needs is not None:
+        reference(bench, job.needs)
+    kept = bench.folder / "references" / f"{name}.json"
+    if kept.exists():
+        return Reference(*json.loads(kept.read_text()))
+    results = []
+    for number in range(2):  # the second time with the caches of the first
+        work = bench.folder / "references" / (name if number == 0 else f"{name}-2")
+        shutil.rmtree(work, ignore_errors=True)
+        work.mkdir(parents=True)
+        job.before(bench, work)
+        before = _children_seconds()
+        done = _undisturbed(bench, job, work)
+        seconds = _children_seconds() - before
+        if done is None or done.returncode:
+            said = "" if done is None else done.stderr[-2000:]
+            raise ValueError(f"{name} fails without any fault: {said}")
+        results.append(job.result(work))
+    if results[0] != results[1]:
+        raise ValueError(f"{name}: {_difference(*results)} without any fault")
+    shutil.rmtree(work)
+    found = Reference(name, results[0], seconds)
+    write_json(kept, list(found))
+    return found
+
+
+def _children_seconds():
+    import resource
+
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def _undisturbed(bench, job, work):
+    """Run a job to its end; None where it is complete."""
+    command = job.command(bench, work)
+    if command is None:
+        return None
+    return subprocess.run(
+        command, cwd=work, env=bench.environment, capture_output=True, text=True
+    )
+
+
+def run(
+    bench: jobs.Bench,
+    known: Reference,
+    name: str,
+    only: str | None,
+    disk: pathlib.Path | None,
+) -> list[dict[str, Any]]:
+    """Disturb a job several times, continue it to its end, and compare.
+
+    Args:
+      bench: The campaign.
+      known: The job without a fault.
+      name: Of the chain. It draws the faults and their moments.
+      only: The kind of faults, all where None.
+      disk: The library of `inject.compiled_disk`. Without it no disk fails.
+
+    Returns:
+      One row for each fault.
+    """
+    job, draw = jobs.JOBS[known.name], random.Random(name)
+    work = bench.work / f"{known.name}-{name}"
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir()
+    job.before(bench, work)
+    rows: list[dict[str, Any]] = []
+    while len(rows) < FAULTS:
+        command = job.command(bench, work)
+        if command is None or (rows and _ran_through(rows[-1])):
+            break
+        kind = (
+            only
+            or draw.choices(
+                list(inject.KINDS), (3, 3, 2, 2 if disk is not None else 0)
+            )[0]
+        )
+        fault, share = draw.choice(inject.KINDS[kind]), draw.uniform(0, LATEST)
+        share *= RESUMED if rows else 1
+        whole, began = job.whole(work), time.monotonic()
+        after = share * known.processor_seconds
+        ended = inject.disturbed(command, work, bench.environment, fault, after, disk)
+        row = {
+            "job": known.name,
+            "kind": kind,
+            "fault": fault,
+            "share": round(share, 3),
+            "happened": ended.happened,
+            "code": ended.code,
+            "seconds": round(time.monotonic() - began, 1),
+            "lost": ended.problem or _damage(job, work, whole, known),
+        }
+        rows.append(row)
+        if row["lost"]:
+            _keep(work, ended.said)
+            return [each for each in rows if each["happened"] or each["lost"]]
+    problem = _finish(bench, job, work, known, rows)
+    rows = [row for row in rows if row["happened"]]
+    if problem and rows:
+        rows[-1]["lost"] = problem
+    if not problem:
+        shutil.rmtree(work)
+    return rows
+
+
+def _ran_through(row):
+    return row["code"] == 0 or row["kind"] == "pipe"
+
+
+def _keep(work, said):
+    """The output of a process that lost something, next to its folder."""
+    work.with_name(f"{work.name}.lost.txt").write_text(said)
+
+
+def _damage(job, work, before, known):
+    """What an earlier result has lost; it may be replaced by the final one."""
+    after = job.whole(work)
+    if after == known.result or all(after.get(k) == x for k, x in before.items()):
+        return ""
+    return f"an earlier result: {_difference(before, after)}"
+
+
+def _finish(bench, job, work, known, rows):
+    """What is wrong with the job once it has been continued to its end."""
+    if not rows or not _is_same(job, work, known) or jobs.litter(work):
+        done = _undisturbed(bench, job, work)
+        if done is not None and done.returncode:
+            _keep(work, done.stderr)
+            return f"it cannot be continued (exit code {done.returncode})"
+    try:
+        result = job.result(work)
+    except (OSError, ValueError, KeyError) as error:
+        return f"no result: {error}"
+    if result != known.result:
+        return _difference(known.result, result)
+    left = jobs.litter(work)
+    return f"left behind: {', '.join(left)}" if left else ""
+
+
+def _is_same(job, work, known):
+    try:
+        return job.result(work) == known.result
+    except (OSError, ValueError, KeyError):
+        return False
+
+
+def _difference(one, other):
+    names = sorted(k for k in {*one, *other} if one.get(k) != other.get(k))
+    return f"other bits in {', '.join(names[:5])}" + (" ..." if names[5:] else "")
+
+
+def line(row: dict[str, Any]) -> str:
+    """A row for a person."""
+    text = (
+        f"{row['job']}: {row['fault']} at {row['share']:.0%}, exit code {row['code']} "
+        f"after {row['seconds']:.0f} s"
+    )
+    return f"{text}, LOST: {row['lost']}" if row["lost"] else text
