@@ -6,13 +6,15 @@
 A chain begins one job in a new folder and disturbs it several times, each time at a
 random share of the processor time that the job takes: by SIGKILL, by SIGINT, SIGTERM or
 SIGHUP, by a reader of its output that goes away, a full log or a closed stderr, by a
-disk that becomes full or read-only. After each fault the job is continued as a user
-would, and at the end once without a fault. The first 0.15 processor
-seconds, in which Python itself starts, are left out. A trial is one fault. It is lost if the
-process does not end, ends with a wrong exit code or a traceback, leaves child processes
-behind or damages an earlier result. The last trial of a chain is also lost if the job
-does not end with the same bits as one that was never disturbed, or if partial files are
-left. Chains that are finished are kept in --out, and the same command goes on.
+disk that becomes full or read-only. The first 0.15 processor seconds, in which Python
+itself starts, are left out. After each fault the job is continued as a user would, and
+at the end once without a fault.
+
+A trial is one fault. It is lost if the process does not end, ends with a wrong exit
+code or a traceback, leaves child processes behind or damages an earlier result. The
+last trial of a chain is also lost if the job does not end with the same bits as one
+that was never disturbed, or if partial files are left. Chains that are finished are
+kept in --out, and the same command goes on.
 """
 
 import concurrent.futures
