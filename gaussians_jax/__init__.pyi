@@ -1,3 +1,4 @@
+from .effects.se3_bases import SE3BasesSpec as SE3BasesSpec
 from .files import load as load
 from .files import save as save
 from .presets import PRESETS as PRESETS
@@ -15,3 +16,5 @@ from .splats import Gaussians as Gaussians
 from .splats import Params as Params
 from .splats import Splats as Splats
 from .splats import from_points as from_points
+from .track_fitting import TrackFit as TrackFit
+from .track_fitting import fit_tracks as fit_tracks

@@ -7,7 +7,10 @@ import jax
 import pytest
 
 DOCS = pathlib.Path(__file__).resolve().parents[1] / "docs"
-PAGES = ("rasterization", "se3_warp", "kan_layer", "volume_rendering")
+PAGES = (
+    "rasterization", "se3_warp", "kan_layer", "volume_rendering",
+    pytest.param("fit_tracks", marks=pytest.mark.full),
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("page", PAGES)

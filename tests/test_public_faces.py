@@ -214,7 +214,8 @@ CASES = {
 OTHERS = {
     "types": "nj.Camera nj.Rays nj.RaySamples nj.Rendered nj.KANSpec nj.RadianceScene "
     "nj.Effect nj.FrameCondition nj.Term nj.Renderer gj.RasterSpec "
-    "gj.RasterizationInfo gj.SplatScene gj.Gaussians gj.Params gj.Splats "
+    "gj.RasterizationInfo gj.SE3BasesSpec gj.TrackFit gj.SplatScene gj.Gaussians "
+    "gj.Params gj.Splats "
     "nj.kan.KANSpec nj.kan.KAN nj.kan.KANLayer nj.kan.Kernels",
     "settings": "nj.PRESETS nj.with_steps gj.PRESETS gj.with_steps nj.checked "
     "nj.losses.check_geman_mcclure nj.kan.spacing nj.kan.centres nj.kan.width "
@@ -222,7 +223,8 @@ OTHERS = {
     "models and captures": "nj.build nj.metadata_of gj.build gj.metadata_of nj.fit "
     "nj.built_in_scene nj.load_capture nj.saved_run nj.frames_of nj.view_of nj.score",
     "files": "gj.load gj.save",
-    "host, refused in their own tests": "nj.look_at gj.from_points nj.pixel_rays",
+    "host, refused in their own tests": "nj.look_at gj.from_points nj.pixel_rays "
+    "gj.fit_tracks",
     "parts of kan.apply": "nj.kan.first_layer_part nj.kan.after_first_layer",
     "as the image metrics": "nj.losses.middle_level",
 }

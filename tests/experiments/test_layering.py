@@ -54,6 +54,7 @@ FLOORS = {
     "gaussians_jax.held_out_exposure": 8,
     "gaussians_jax.scene": 8,
     "gaussians_jax.track_start": 8,
+    "gaussians_jax.track_fitting": 8,
     "gaussians_jax.point_tracks": 8,
     "gaussians_jax.step_time": 8,
     "gaussians_jax.update": 8,
