@@ -6,6 +6,7 @@ from collections.abc import Callable
 import jax
 import numpy as np
 
+from nerfies_jax import events
 from nerfies_jax.capture import resampling
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.geometry import camera as cameras
@@ -30,17 +31,19 @@ def as_pinholes(capture: Capture) -> Capture:
         for name, array in (("moving", capture.moving), ("depths", capture.depths))
     }
     maps = Maps(_source_pixels, capture.size)
-    for row in range(len(images)):
-        place, inside = maps.of(cameras.take(capture.cameras, row))
-        images[row] = resampling.bilinear(capture.images[row], place)
-        images[row][~inside] = 0
-        filmed[row] = inside
-        if capture.valid is not None:
-            filmed[row] &= resampling.nearest(capture.valid[row], place)
-        for name, array in masks.items():
-            if array is not None:
-                source = getattr(capture, name)[row]
-                array[row] = np.where(inside, resampling.nearest(source, place), 0)
+    with events.stage("undistorting images", len(images)) as stage:
+        for row in range(len(images)):
+            place, inside = maps.of(cameras.take(capture.cameras, row))
+            images[row] = resampling.bilinear(capture.images[row], place)
+            images[row][~inside] = 0
+            filmed[row] = inside
+            if capture.valid is not None:
+                filmed[row] &= resampling.nearest(capture.valid[row], place)
+            for name, array in masks.items():
+                if array is not None:
+                    source = getattr(capture, name)[row]
+                    array[row] = np.where(inside, resampling.nearest(source, place), 0)
+            stage.advance()
     note = (
         f"lens distortion taken out; {1 - filmed.mean():.1%} of the pixels are unseen"
     )

@@ -13,6 +13,7 @@ import pathlib
 import cv2
 import numpy as np
 
+from nerfies_jax import events
 from nerfies_jax.capture import frames
 from nerfies_jax.capture import images as pictures_of
 from nerfies_jax.evidence import dense_flow, moving, view_set
@@ -52,6 +53,7 @@ def moving_masks(images: np.ndarray) -> np.ndarray:
     return np.stack([cv2.dilate(np.uint8(one), disc) > 0 for one in enlarged])
 
 
+@events.stage("finding what moves")
 def moving_in(pictures: pathlib.Path) -> dict[str, np.ndarray]:
     """[height, width] bool by the name of each picture of a folder: what moves.
 

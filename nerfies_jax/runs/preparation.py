@@ -21,7 +21,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from nerfies_jax import console
+from nerfies_jax import console, events
 from nerfies_jax.capture import colmap, footage, formats, nerfies_format
 from nerfies_jax.capture.capture import Capture, CaptureError, describe
 from nerfies_jax.capture.footage import Taken
@@ -100,7 +100,8 @@ def prepare(
             capture, name=out.resolve().name, path=None, frames_per_second=rate
         )
         written = scratch / "capture"
-        nerfies_format.write(capture, written)
+        with events.stage("writing the capture"):
+            nerfies_format.write(capture, written)
         shutil.copytree(solved.poses.folder / "sparse", written / "colmap" / "sparse")
         if solved.masked and how.masks is None:
             (scratch / "found").rename(written / "masks_found")
