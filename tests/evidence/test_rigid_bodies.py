@@ -85,7 +85,7 @@ def test_a_thing_that_swings_faster_than_the_camera_is_placed_by_its_own_size():
     assert abs(np.median((refined.depth / true)[refined.known]) - 1) < 0.05
     depth = refined.position[..., 2] - seen_from.position[:, 2]
     np.testing.assert_allclose(refined.depth[refined.known], depth[refined.known])
-    hasty = rigid_bodies.refined(seen_from, tracks, alone, lambda: False)
+    hasty = rigid_bodies.refined(seen_from, tracks, alone, lambda terms: False)
     np.testing.assert_array_equal(hasty.position, alone.position)
 
 

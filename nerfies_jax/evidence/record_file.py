@@ -1,0 +1,105 @@
+"""The record of what the pictures of a capture say, and its file in the cache."""
+
+import hashlib
+import pathlib
+from typing import NamedTuple
+
+import numpy as np
+
+from nerfies_jax.capture import cache_files
+from nerfies_jax.capture.capture import Capture, PointCloud
+from nerfies_jax.capture.given import Given
+from nerfies_jax.evidence.dense_flow import NeighbourFlow
+from nerfies_jax.evidence.paths import Paths
+from nerfies_jax.evidence.rest_points import RestPoints
+from nerfies_jax.evidence.tracks import Tracks
+from nerfies_jax.evidence.watch import Seconds
+
+VERSION = 12
+
+
+class Evidence(NamedTuple):
+    """Of the frames to learn from, in order of time."""
+
+    row: np.ndarray  # [frames] row of the capture
+    flow: NeighbourFlow
+    moving: np.ndarray  # [frames, height, width] bool
+    tracks: Tracks
+    score: np.ndarray  # [tracks] in 0..1: how certainly it moves
+    rest: RestPoints  # of all tracks
+    moved: np.ndarray  # [paths] which tracks have a path
+    paths: Paths
+    still: PointCloud
+    unusable: str  # why tracks say nothing of the motion; empty where they do
+    told: bool  # masks or tracks of what moves are the user's: no noise, however few
+    factor: int  # of the capture's pixels for one of these
+    left_out: str  # what is beyond the budget of work; empty if that was enough
+    seconds: Seconds
+
+
+def digest(capture: Capture, use_depths: bool = False) -> str:
+    """Of all that `gather` looks at."""
+    checksum = hashlib.blake2b(digest_size=12)
+    budget = capture.preprocessing
+    checksum.update(f"evidence {VERSION} {use_depths} {budget}".encode())
+    parts = [capture.images[capture.train], capture.times, capture.train]
+    parts += [np.asarray([capture.near, capture.far]), *capture.cameras]
+    if capture.points is not None:
+        parts.append(capture.points.position)
+    depths = capture.depths if use_depths else None
+    given = () if capture.given is None else capture.given
+    for name, part in zip(Given._fields, given, strict=False):
+        checksum.update(f"{name} {part is None}".encode())
+    parts += [part for part in (capture.valid, depths, *given) if part is not None]
+    for part in parts:
+        part = np.ascontiguousarray(part)
+        checksum.update(f"{part.dtype}{part.shape}".encode())
+        checksum.update(part.data)
+    return checksum.hexdigest()
+
+
+def save(path: pathlib.Path, evidence: Evidence) -> None:
+    """All of it in one file, whole or not at all; flow in half precision."""
+    arrays = {}
+    for name, part in evidence._asdict().items():
+        if isinstance(part, tuple):
+            arrays |= {f"{name}.{key}": value for key, value in part._asdict().items()}
+        else:
+            arrays[name] = np.asarray(part)
+    for side in ("forward", "backward"):  # exact: `gather` rounds to it
+        arrays[f"flow.{side}"] = arrays[f"flow.{side}"].astype(np.float16)
+    cache_files.write_arrays(path, arrays, _identity(path))
+
+
+def _identity(path):
+    """Of the record in a file: another capture's has another name."""
+    return f"evidence {VERSION} {path.stem}"
+
+
+def load(path: pathlib.Path) -> Evidence:
+    """What `save` wrote under the same name; ValueError and OSError for all else."""
+    kinds = {
+        "flow": NeighbourFlow,
+        "tracks": Tracks,
+        "rest": RestPoints,
+        "paths": Paths,
+        "still": PointCloud,
+        "seconds": Seconds,
+    }
+    arrays = cache_files.read_arrays(path, _identity(path))
+    parts = {}
+    for name in Evidence._fields:
+        if name in kinds:
+            fields = kinds[name]._fields
+            parts[name] = kinds[name](*(arrays[f"{name}.{key}"] for key in fields))
+        else:
+            parts[name] = arrays[name]
+    parts["seconds"] = Seconds(*(float(part) for part in parts["seconds"]))
+    kinds_of_one = {"unusable": str, "left_out": str, "told": bool, "factor": int}
+    parts |= {name: kind(parts[name]) for name, kind in kinds_of_one.items()}
+    flow = parts["flow"]
+    parts["flow"] = flow._replace(
+        forward=flow.forward.astype(np.float32),
+        backward=flow.backward.astype(np.float32),
+    )
+    return Evidence(**parts)
