@@ -4,12 +4,15 @@ Slopes are (X/Z, Y/Z) of a point in the camera's frame. `radial` is k1 k2 k3 and
 `tangential` p1 p2, as in OpenCV and in Nerfies' camera files.
 """
 
+import math
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from nerfies_jax.geometry.precision import refuse_half
+from nerfies_jax.geometry.precision import exact_product, refuse_half
 
 # A bracketed Newton: 5 steps for a phone lens; the rest is for strong lenses, close to
 # their fold, where the root is nearly double and each step only halves the distance.
@@ -19,7 +22,26 @@ INSIDE = 0.97
 MAX_RADIUS = 1e4  # slopes beyond 89.99 degrees overflow r⁷ in float32
 # Below this the plane is compressed a thousandfold: at the fold for any purpose.
 MIN_DETERMINANT = 1e-3
+PIECES = 3  # of the way from the axis, each with its own bound of the determinant
+DEGREE = 12  # of the determinant along the way
 RESIDUAL_ULPS = 32  # of 1 + |slopes|: 0.01 px in float32 at a focal length of 2700 px
+
+
+def _to_bernstein() -> np.ndarray:
+    """From coefficients of t^k to those of Bernstein on each piece of [0, 1]."""
+    rows = []
+    for piece in range(PIECES):
+        for j in range(DEGREE + 1):
+            row = np.zeros(DEGREE + 1)
+            for k in range(DEGREE + 1):  # (piece + u)^k / PIECES^k in powers of u
+                for i in range(min(j, k) + 1):
+                    share = math.comb(j, i) / math.comb(DEGREE, i)
+                    row[k] += math.comb(k, i) * piece ** (k - i) * share / PIECES**k
+            rows.append(row)
+    return np.array(rows)
+
+
+_TO_BERNSTEIN = _to_bernstein()
 
 
 def distort(
@@ -59,12 +81,47 @@ def one_to_one(
 ) -> Bool[Array, ""]:
     """Whether the lens has not folded anywhere between the axis and `slopes`.
 
-    Exact for the radial terms. With tangential ones it also asks that the plane is not
-    turned over at `slopes` itself.
+    Exact for the radial terms. With tangential ones the determinant of the Jacobian
+    must be positive all the way, as far as its Bernstein coefficients on `PIECES` parts
+    of the way can tell; where they cannot, the answer is False.
     """
-    return _unfolded(radial, jnp.sum(slopes**2)) & (
-        _determinant(_jacobian(radial, tangential, slopes)) > MIN_DETERMINANT
+    at_end = _determinant(_jacobian(radial, tangential, slopes)) > MIN_DETERMINANT
+    on_the_way = jnp.all(tangential == 0) | (
+        jnp.min(_bernstein(radial, tangential, slopes)) > 0
     )
+    return _unfolded(radial, jnp.sum(slopes**2)) & at_end & on_the_way
+
+
+def _bernstein(radial, tangential, slopes):
+    """Bernstein coefficients of the Jacobian's determinant on the way to `slopes`.
+
+    The determinant is a polynomial in the share t of the way and lies between the least
+    and the largest coefficient of each part.
+    """
+    x, y = slopes[0], slopes[1]
+    radius_sq = x * x + y * y
+    powers = radius_sq ** jnp.arange(4, dtype=slopes.dtype)
+    radial_terms = jnp.concatenate([jnp.ones_like(radial[:1]), radial]) * powers
+    nothing = jnp.zeros_like(radial_terms)
+    # In powers of t, along the way and across it: even powers are the radial terms'.
+    across = jnp.stack([radial_terms, nothing], axis=1).reshape(-1)[:-1]
+    along = across * jnp.arange(1, 8, dtype=slopes.dtype)
+    p1, p2 = tangential[0], tangential[1]
+    # The tangential Jacobian at `slopes`, linear in t, in the frame of the way.
+    xx, xy, yy = (
+        *(2 * p1 * y + 6 * p2 * x, 2 * p1 * x + 2 * p2 * y),
+        2 * p2 * x + 6 * p1 * y,
+    )
+    length = jnp.sqrt(jnp.where(radius_sq > 0, radius_sq, 1))
+    ux, uy = jnp.where(radius_sq > 0, x, 1) / length, y / length
+    first = ux * ux * xx + 2 * ux * uy * xy + uy * uy * yy
+    second = uy * uy * xx - 2 * ux * uy * xy + ux * ux * yy
+    mixed = ux * uy * (yy - xx) + (ux * ux - uy * uy) * xy
+    along, across = along.at[1].add(first), across.at[1].add(second)
+    # Not `jnp.convolve`, which becomes a convolution of as many groups as pixels.
+    product = sum(jnp.pad(along[i] * across, (i, 6 - i)) for i in range(7))
+    product = product.at[2].add(-mixed * mixed)
+    return exact_product(jnp.asarray(_TO_BERNSTEIN, slopes.dtype), product)
 
 
 @jax.custom_jvp
