@@ -5,7 +5,8 @@ import json
 import pytest
 
 from experiments import compare
-from nerfies_jax.runs import curves
+from nerfies_jax.measure import clock
+from nerfies_jax.runs import curves, event_log
 from nerfies_jax.runs.config import CaptureSource, RunConfig
 from nerfies_jax.training import specs
 from nerfies_jax.training.loop import History
@@ -53,6 +54,33 @@ def test_the_table_tells_who_was_when_as_good(tmp_path, capsys):
     saved = json.loads((out / "compare.json").read_text())
     assert saved["good"]["seconds_to_psnr"] == {"20.0": 2.0}
     assert (out / "curves.png").stat().st_size > 5000
+
+
+def test_a_run_that_has_not_ended_is_compared_as_far_as_it_came(tmp_path, capsys):
+    good = run_folder(tmp_path / "good", (10.0, 30.0), (1.0, 3.0))
+    running = tmp_path / "running"
+    running.mkdir()
+    (running / "config.json").write_text(stored("cat"))
+    log = event_log.EventLog()
+    log.open(running)
+    machine = clock.machine()
+    log({"kind": "run", "status": "begin", "step": 0, "machine": machine})
+    log({"kind": "evaluation_frames", "frames": ["frame 3"]})
+    at = {"steps": 90, "compile_seconds": 1.0}
+    for step in (2, 4):
+        here = {"step": step, "seconds": float(step)}
+        log({"kind": "train", **here, **at, "metrics": {"loss": 1.0}})
+        scores = {"psnr": 10.0 * step, "ssim": 0.5}
+        log({"kind": "evaluation", "hook": "held out", **here, "metrics": scores})
+    log.close()
+    out = tmp_path / "out"
+    words = (str(good), str(running), "--frames", "0", "--psnr", "30")
+    compare.main([*words, "--out", str(out)])
+    printed = capsys.readouterr().out
+    assert "running has not ended and has no final scores: step 4 of 90" in printed
+    saved = json.loads((out / "compare.json").read_text())
+    assert saved["running"]["seconds_to_psnr"] == {"30.0": 3.0}
+    assert saved["running"]["metrics"]["train.steps"] == 4
 
 
 def test_runs_of_equal_names_are_told_apart(tmp_path):
