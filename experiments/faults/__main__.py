@@ -73,7 +73,7 @@ def main(args):
     path = args.out / STORED
     stored = cli.stored(path) or {"seed": args.seed, "chains": {}}
     names = [args.only_job] if args.only_job else jobs.ORDER
-    references = {name: chain.reference(bench, name) for name in dict.fromkeys(names)}
+    references = _references(bench, names, args.jobs)
     guard = threading.Lock()
 
     def run(number):
@@ -104,6 +104,18 @@ def main(args):
     lost = [row for row in rows if row["lost"]]
     console.say(f"{len(rows)} faults, {len(lost)} lost; kept in {path}")
     return cli.Ended(stored, 1 if lost else 0)
+
+
+def _references(bench, names, count):
+    """The jobs without faults, those first whose runs others read."""
+    needed = dict.fromkeys(jobs.JOBS[name].needs for name in names)
+    found = {}
+    with concurrent.futures.ThreadPoolExecutor(count) as pool:
+        for each in (filter(None, needed), dict.fromkeys(names)):
+            missing = [name for name in each if name not in found]
+            made = pool.map(lambda name: chain.reference(bench, name), missing)
+            found |= zip(missing, made, strict=True)
+    return found
 
 
 if __name__ == "__main__":

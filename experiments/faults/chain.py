@@ -1,14 +1,15 @@
 """A job that is disturbed several times, and compared with one that never was."""
 
 import json
+import os
 import pathlib
 import random
 import shutil
-import subprocess
 import time
 from typing import Any, NamedTuple
 
 from experiments.faults import inject, jobs
+from nerfies_jax import children
 from nerfies_jax.capture.json_files import write_json
 
 FAULTS = 4  # of a chain
@@ -31,8 +32,6 @@ def reference(bench: jobs.Bench, name: str) -> Reference:
       ValueError: It fails, or a second run of it has other bits.
     """
     job = jobs.JOBS[name]
-    if job.needs is not None:
-        reference(bench, job.needs)
     kept = bench.folder / "references" / f"{name}.json"
     if kept.exists():
         return Reference(*json.loads(kept.read_text()))
@@ -42,12 +41,11 @@ def reference(bench: jobs.Bench, name: str) -> Reference:
         shutil.rmtree(work, ignore_errors=True)
         work.mkdir(parents=True)
         job.before(bench, work)
-        before = _children_seconds()
         done = _undisturbed(bench, job, work)
-        seconds = _children_seconds() - before
-        if done is None or done.returncode:
-            said = "" if done is None else done.stderr[-2000:]
+        if done is None or done.code:
+            said = "" if done is None else done.said[-2000:]
             raise ValueError(f"{name} fails without any fault: {said}")
+        seconds = done.processor_seconds
         results.append(job.result(work))
     if results[0] != results[1]:
         raise ValueError(f"{name}: {_difference(*results)} without any fault")
@@ -57,11 +55,12 @@ def reference(bench: jobs.Bench, name: str) -> Reference:
     return found
 
 
-def _children_seconds():
-    import resource
+class _Done(NamedTuple):
+    """A process that ended without a fault."""
 
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
+    code: int
+    said: str
+    processor_seconds: float  # of its children, too
 
 
 def _undisturbed(bench, job, work):
@@ -69,9 +68,15 @@ def _undisturbed(bench, job, work):
     command = job.command(bench, work)
     if command is None:
         return None
-    return subprocess.run(
-        command, cwd=work, env=bench.environment, capture_output=True, text=True
-    )
+    log = work.with_name(f"{work.name}.log")
+    with log.open("wb") as file:
+        process = children.start(
+            command, cwd=work, env=bench.environment, stdout=file, stderr=file
+        )
+        _, status, used = os.wait4(process.pid, 0)
+    process.returncode = code = os.waitstatus_to_exitcode(status)
+    said = log.read_text(errors="replace")
+    return _Done(code, said, used.ru_utime + used.ru_stime)
 
 
 def run(
@@ -158,9 +163,9 @@ def _finish(bench, job, work, known, rows):
     """What is wrong with the job once it has been continued to its end."""
     if not rows or not _is_same(job, work, known) or jobs.litter(work):
         done = _undisturbed(bench, job, work)
-        if done is not None and done.returncode:
-            _keep(work, done.stderr)
-            return f"it cannot be continued (exit code {done.returncode})"
+        if done is not None and done.code:
+            _keep(work, done.said)
+            return f"it cannot be continued (exit code {done.code})"
     try:
         result = job.result(work)
     except (OSError, ValueError, KeyError) as error:
