@@ -322,6 +322,7 @@ REACH = {
     **dict.fromkeys(["entropy.rounded", "faces.gaussians"], 0.9),  # in steps; lengths
     # sums of more than four, or multiples
     **dict.fromkeys(["codes.blend", "encoding.encode", "losses.l1"], 0.9),
+    "encoding.positional_encoding": 0.9,
     **dict.fromkeys(["planes.bilinear", "planes.linear", "planes.l1_time_planes"], 0.9),
     "rays.intersect_aabb": 0.9,  # distances are quotients by a slant
     **dict.fromkeys(["template.encode", "template.exponential"], 0.8),

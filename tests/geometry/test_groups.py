@@ -74,7 +74,7 @@ def test_exponentials_logarithms_and_products_are_those_of_scipy(dtype):
     below = TWISTS[:, 0] < 2
     assert np.max(np.abs(found["twists"] - TWISTS)[below]) < 4 * bound
     again = scipy.spatial.transform.Rotation.from_rotvec(
-        np.asarray(found["vectors"], np.float64)
+        np.array(found["vectors"], np.float64)
     ).as_matrix()
     bound = {"float32": 2e-6, "float64": 1e-14}[dtype]
     assert np.max(np.abs(again - rotation)) < bound
