@@ -20,6 +20,7 @@ from .measure.image_quality import ms_ssim as ms_ssim
 from .measure.image_quality import partial_ssim as partial_ssim
 from .measure.image_quality import psnr as psnr
 from .measure.image_quality import ssim as ssim
+from .nets import adapters as adapters
 from .nets import kan as kan
 from .nets.encoding import coarse_to_fine_window as coarse_to_fine_window
 from .nets.encoding import positional_encoding as positional_encoding

@@ -222,6 +222,8 @@ OTHERS = {
     "nj.kan.init nj.so3.identity nj.se3.identity nj.quaternion.identity",
     "models and captures": "nj.build nj.metadata_of gj.build gj.metadata_of nj.fit "
     "nj.built_in_scene nj.load_capture nj.saved_run nj.frames_of nj.view_of nj.score",
+    "modules of other libraries": "nj.adapters.linen nj.adapters.nnx "
+    "nj.adapters.equinox",
     "files": "gj.load gj.save",
     "host, refused in their own tests": "nj.look_at gj.from_points nj.pixel_rays "
     "gj.fit_tracks",
