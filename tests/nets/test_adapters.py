@@ -49,7 +49,9 @@ def test_a_linen_module_is_a_network():
     expected, _ = module.init_with_output(jax.random.key(3), X)
     found = trained(adapters.linen(module, X), one_by_one=False)
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
-    with pytest.raises(TypeError, match=r"`module` must be a flax\.linen\.Module, got a"):
+    with pytest.raises(
+        TypeError, match=r"`module` must be a flax\.linen\.Module, got a"
+    ):
         adapters.linen(lambda x: x, X)
 
 
