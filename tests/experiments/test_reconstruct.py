@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import pathlib
+import re
 import shutil
 
 import jax
@@ -17,7 +18,7 @@ from nerfies_jax import runs
 from nerfies_jax.capture import exr, images, nerfies_format, video
 from nerfies_jax.evaluation import floors, pictures
 from nerfies_jax.measure import part_time
-from nerfies_jax.runs import products, quality, reconstruction, train
+from nerfies_jax.runs import products, quality, reconstruction, run_folder, train
 from nerfies_jax.runs.run_folder import CHECKPOINTS
 from nerfies_jax.training import rate
 from tests import event_checks, scenes
@@ -301,6 +302,15 @@ def test_a_killed_run_resumes_to_the_same_bits(left, run, tmp_path, capsys):
     for key in ("train.steps", "heldout.psnr", "gaussians"):
         assert resumed[key] == whole[key]
     assert (folder / "model.npz").is_file()
+
+
+def test_a_run_that_is_alive_is_not_resumed(run, tmp_path, capsys):
+    folder = tmp_path / "run"
+    shutil.copytree(run, folder)
+    with run_folder.owned(folder):
+        assert ended("--out", folder, "--resume") == 2
+    refusal = f"process {os.getpid()} on .* is at work in this run folder"
+    assert re.search(refusal, capsys.readouterr().err)
 
 
 @pytest.mark.slow
