@@ -294,6 +294,12 @@ def test_integers_are_refused_by_name_or_converted_as_images(name):
             assert kind in message
 
 
+@pytest.mark.parametrize("channels", [1, 4])
+def test_colors_of_gray_and_of_rgba_never_become_depth(channels):
+    message = refusal(CASES["gj.render"], shapes={"colours": (5, channels)})
+    assert f"`colours` has shape [5, {channels}], expected [gaussians, 3]" in message
+
+
 @pytest.mark.parametrize(
     "kind", ["bfloat16", pytest.param("float16", marks=pytest.mark.full)]
 )
