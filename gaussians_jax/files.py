@@ -15,9 +15,10 @@ import plyfile
 
 from gaussians_jax import splats, spz
 from gaussians_jax.splats import SH_DC, Splats
+from nerfies_jax.capture import ply_files, text_files
 from nerfies_jax.capture.json_files import replaced_file
 
-MOST_HEADER_BYTES = 1 << 16  # 62 properties take 1.5 kB; plyfile hangs on 100 MB
+MOST_HEADER_BYTES = ply_files.MAX_HEADER  # 62 properties take 1.5 kB
 SUFFIXES = (".ply", ".splat", ".spz")
 _REQUIRED = (
     *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
@@ -117,9 +118,7 @@ def _read_ply(path):
     header = _ply_header(path)
     text = b"\nformat ascii" in header
     try:
-        # plyfile leaves the text wrapper it makes around a binary stream unclosed.
-        with path.open(encoding="latin-1") if text else path.open("rb") as stream:
-            ply = plyfile.PlyData.read(stream)
+        ply = ply_files.read(path)
     except (plyfile.PlyParseError, ValueError, OSError, MemoryError) as error:
         raise ValueError(f"damaged PLY ({error})") from error
     if "vertex" not in ply:
@@ -167,7 +166,7 @@ def _ply_header(path):
     """The header's bytes, once it is short and its counts can be true."""
     size = path.stat().st_size
     with path.open("rb") as stream:
-        head = stream.read(MOST_HEADER_BYTES)
+        head = text_files.utf8(stream.read(MOST_HEADER_BYTES))
     if not head.startswith(b"ply"):
         raise ValueError("not a PLY file: it does not start with 'ply'")
     end = re.search(rb"\nend_header\r?\n", head)

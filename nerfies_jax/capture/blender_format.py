@@ -8,10 +8,10 @@ import pathlib
 
 import numpy as np
 
-from nerfies_jax.capture import frames
+from nerfies_jax.capture import frames, text_files
 from nerfies_jax.capture import images as pictures
 from nerfies_jax.capture.capture import Capture, CaptureError
-from nerfies_jax.capture.json_files import AnyPath, inside
+from nerfies_jax.capture.json_files import AnyPath, inside, named_file
 from nerfies_jax.capture.points import (
     Placement,
     place_by_cameras,
@@ -63,7 +63,7 @@ def read(
     cameras = camera.resize(cameras, (shrink_by, shrink_by), (1, 1))
     points = None
     if split.transforms.ply_file_path is not None:
-        points = read_ply(inside(root, split.transforms.ply_file_path, split.file))
+        points = read_ply(named_file(root, split.transforms.ply_file_path, split.file))
     placement, more = _place(cameras, points, split.transforms, images.shape[2:0:-1])
     offset = cameras.position.astype(np.float64) - placement.centre
     times, when = _times(entries, split, is_train)
@@ -106,14 +106,20 @@ def _placed(points, placement):
 
 def _name(file_path):
     """One id, unique over the splits and fit for a file name: train_r_0."""
-    plain = pathlib.PurePosixPath(file_path)
+    plain = pathlib.PurePosixPath(text_files.forward_slashes(file_path))
     stem = plain.with_suffix("") if plain.suffix.lower() in frames.SUFFIXES else plain
     return "_".join(part for part in stem.parts if part not in (".", "/"))
 
 
 def _picture(root, entry, file):
-    inside(root, entry.file_path, file)
-    return frames.find_picture(root, entry.file_path)
+    """The file of a frame, also with another ending: copies are often converted."""
+    name = entry.file_path
+    inside(root, name, file)
+    found = frames.find_picture(root, name)
+    suffix = pathlib.PurePosixPath(name).suffix
+    if found is None and suffix.lower() in frames.SUFFIXES:
+        found = frames.find_picture(root, name.removesuffix(suffix))
+    return found
 
 
 def _cameras(entries, transforms, size, where):
@@ -266,8 +272,8 @@ def _times(entries, split, is_train):
 
 def _camera_ids(entries, times, split, is_train):
     """Folders, where two of them have pictures of one time; else one camera."""
-    folders = [pathlib.PurePosixPath(entry.file_path).parent for entry in entries]
-    names = [folder.as_posix() for folder in folders]
+    paths = [text_files.forward_slashes(entry.file_path) for entry in entries]
+    names = [pathlib.PurePosixPath(path).parent.as_posix() for path in paths]
     # D-NeRF's one camera fills train and test, whose times meet.
     several_files = split.file.name == "transforms_train.json"
     rows = np.flatnonzero(is_train) if several_files else range(len(entries))
@@ -285,6 +291,6 @@ def _valid(root, entries, file, size, shrink_by):
     if not any(entry.mask_path for entry in entries):
         return None
     masks = [
-        entry.mask_path and inside(root, entry.mask_path, file) for entry in entries
+        entry.mask_path and named_file(root, entry.mask_path, file) for entry in entries
     ]
     return frames.read_masks([mask or None for mask in masks], size, shrink_by) == 1

@@ -11,6 +11,7 @@ from nerfies_jax.capture.borders import without_black_borders
 from nerfies_jax.capture.capture import Capture, CaptureError, PointCloud
 from nerfies_jax.capture.colmap_lenses import undistort
 from nerfies_jax.capture.colmap_library import MIN_TRACK, library
+from nerfies_jax.capture.colmap_models import reconstruction
 from nerfies_jax.capture.formats import sparse_models
 from nerfies_jax.capture.json_files import AnyPath, inside
 from nerfies_jax.capture.points import place_by_points
@@ -155,8 +156,8 @@ def name_of(picture: str) -> str:
 
 def read_model(folder: pathlib.Path) -> Model:
     """The registered pictures and reliable points of one sparse model."""
-    reconstruction = _reconstruction(folder)
-    posed = [image for image in reconstruction.images.values() if image.has_pose]
+    model = reconstruction(folder)
+    posed = [image for image in model.images.values() if image.has_pose]
     posed.sort(key=lambda image: frames.natural(image.name))
     if len(posed) < 2:
         raise CaptureError(
@@ -168,7 +169,7 @@ def read_model(folder: pathlib.Path) -> Model:
     positions = np.stack([image.projection_center() for image in posed])
     row_of = {image.image_id: row for row, image in enumerate(posed)}
     kept, depths = [], []
-    for point in reconstruction.points3D.values():
+    for point in model.points3D.values():
         if point.track.length() < MIN_TRACK or not point.error <= MAX_ERROR_PX:
             continue
         rows = [
@@ -184,7 +185,7 @@ def read_model(folder: pathlib.Path) -> Model:
     depths = np.concatenate(depths)
     return Model(
         names=tuple(image.name for image in posed),
-        lenses=[reconstruction.cameras[image.camera_id] for image in posed],
+        lenses=[model.cameras[image.camera_id] for image in posed],
         camera_ids=np.array([image.camera_id for image in posed]),
         rotations=rotations,
         positions=positions,
@@ -192,17 +193,6 @@ def read_model(folder: pathlib.Path) -> Model:
         colours=np.array([colour for _, colour in kept], np.uint8),
         depths=depths[depths > 0],
     )
-
-
-def _reconstruction(folder):
-    pycolmap = library()
-    try:
-        return pycolmap.Reconstruction(str(folder))
-    except (ValueError, RuntimeError, IndexError, KeyError, MemoryError) as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise CaptureError(
-            f"{folder}: not a readable COLMAP model ({reason}); export it again"
-        ) from None
 
 
 def _best_model(path):
@@ -218,10 +208,21 @@ def _best_model(path):
         )
     if len(places) == 1:
         return places[0], ()
-    counts = [_reconstruction(folder).num_reg_images() for folder in places]
-    best = int(np.argmax(counts))
-    listed = ", ".join(f"{p.name}: {n}" for p, n in zip(places, counts, strict=True))
-    return places[best], (f"several models, the largest is read (pictures: {listed})",)
+    counts, broken = {}, {}
+    for folder in places:
+        try:
+            counts[folder] = reconstruction(folder).num_reg_images()
+        except CaptureError as error:
+            broken[folder] = error
+    if not counts:
+        raise next(iter(broken.values()))
+    notes = tuple(
+        f"passed over: {error}".replace(f"{path}/", "") for error in broken.values()
+    )
+    if len(counts) > 1:
+        listed = ", ".join(f"{p.name}: {n}" for p, n in counts.items())
+        notes = (f"several models, the largest is read (images: {listed})", *notes)
+    return max(counts, key=counts.get), notes
 
 
 def _find_pictures(path, model):

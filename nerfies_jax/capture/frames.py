@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from nerfies_jax import events
 from nerfies_jax.capture import images as pictures
+from nerfies_jax.capture import text_files
 from nerfies_jax.capture.capture import CaptureError, PointCloud, blocks, shrink
 from nerfies_jax.geometry import camera
 from nerfies_jax.geometry.camera import Camera
@@ -66,12 +67,12 @@ def choose_source(
 
 
 def find_picture(folder: pathlib.Path, name: str) -> pathlib.Path | None:
-    """`folder / name` as it is or with a picture's ending; None if there is none."""
-    for suffix in ("", *SUFFIXES, *map(str.upper, SUFFIXES)):
-        path = folder / (name + suffix)
-        if path.is_file():
-            return path
-    return None
+    """Find an image by its name, which may lack its ending.
+
+    The spelling on disk may differ as `text_files.find` says.
+    """
+    suffixes = ("", *SUFFIXES, *map(str.upper, SUFFIXES))
+    return text_files.find(folder, name, suffixes)
 
 
 def pictures_in(

@@ -20,6 +20,7 @@ from typing import Any
 import msgspec
 
 from nerfies_jax import processes, stopping
+from nerfies_jax.capture import text_files
 from nerfies_jax.capture.capture import CaptureError
 
 MAX_JSON_BYTES = 256 * 2**20  # 20 000 frames of transforms.json are 20 MB
@@ -51,8 +52,14 @@ def read_json(path: AnyPath, kind: Any = Any) -> Any:
             f"{path}: {error.strerror or error}; check the path"
         ) from None
     try:
+        text = text_files.utf8(text)
         return msgspec.json.decode(text, type=kind)
-    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError as error:
+        raise CaptureError(
+            f"{path}: not text in {error.encoding} (byte {error.start}); save the file "
+            "as UTF-8"
+        ) from None
+    except (msgspec.DecodeError, RecursionError) as error:
         bad = re.search(rb"(?<![\w\"'])-?(NaN|Infinity|inf|nan)\b", text)
         if bad:
             line = text.count(b"\n", 0, bad.start()) + 1
@@ -73,14 +80,29 @@ def write_json(path: AnyPath, value: Any):
 
 
 def inside(root: pathlib.Path, name: str, named_in: pathlib.Path) -> pathlib.Path:
-    """`root / name`, unless that leaves `root`, also through a symbolic link."""
-    target = root / name
-    if not target.resolve().is_relative_to(root.resolve()) or "\0" in name:
+    """`root / name`, unless that leaves `root`, also through a symbolic link.
+
+    Backslashes count as separators, too.
+    """
+    target = root / text_files.forward_slashes(name)
+    if "\0" in name or not all(
+        path.resolve().is_relative_to(root.resolve()) for path in (root / name, target)
+    ):
         raise CaptureError(
             f"{named_in}: the name {name!r} leads outside {root}; names must stay in "
             "the capture's folder, so copy the file there"
         )
     return target
+
+
+def named_file(root: pathlib.Path, name: str, named_in: pathlib.Path) -> pathlib.Path:
+    """`inside`, spelled as the file is on disk where that is there."""
+    target = inside(root, name, named_in)
+    found = text_files.find(root, name)
+    if found is None:
+        return target
+    inside(root, str(found.relative_to(root)), named_in)
+    return found
 
 
 @contextlib.contextmanager

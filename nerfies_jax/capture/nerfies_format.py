@@ -8,7 +8,7 @@ import pathlib
 
 import numpy as np
 
-from nerfies_jax.capture import flow_files, frames, nerfies_colmap
+from nerfies_jax.capture import flow_files, frames, nerfies_colmap, text_files
 from nerfies_jax.capture import images as pictures
 from nerfies_jax.capture.capture import (
     Capture,
@@ -41,7 +41,7 @@ def read(
     picture. `heldout` as in `read_cameras`.
     """
     path = pathlib.Path(path)
-    views = read_cameras(path, heldout)
+    views = read_cameras(path, heldout, missing)
     folder, source, shrink_by, notes = _stored_pictures(path, views, factor, max_side)
     paths = [frames.find_picture(folder, name) for name in views.ids]
     rows, lost = frames.keep_found(paths, views.ids, missing, str(folder))
@@ -234,12 +234,7 @@ def _masks(kind, ids, size, total):
     folder, shrink_by = _reduced(kind, total)
     if folder is None:
         return None
-    files = [folder / f"{name}.png.png" for name in ids]
-    plain = [folder / f"{name}.png" for name in ids]
-    paths = [
-        double if double.is_file() else single if single.is_file() else None
-        for double, single in zip(files, plain, strict=True)
-    ]
+    paths = [text_files.find(folder, name, (".png.png", ".png")) for name in ids]
     return frames.read_masks(paths, size, shrink_by) if any(paths) else None
 
 
@@ -251,8 +246,8 @@ def _depths(path, views, size, total):
     width, height = size
     depths = np.zeros((len(views.ids), height, width), np.float32)
     for row, name in enumerate(views.ids):
-        file = folder / f"{name}.npy"
-        if not file.is_file():
+        file = text_files.find(folder, name, (".npy",))
+        if file is None:
             continue  # DyCheck has depth for the moving camera only
         depth = frames.load_array(file, pictures.MAX_PIXELS)
         depth = depth[..., 0] if depth.ndim == 3 else depth

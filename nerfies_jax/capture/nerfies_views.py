@@ -14,7 +14,7 @@ from nerfies_jax.capture.capture import (
     CaptureError,
     check_cameras,
 )
-from nerfies_jax.capture.json_files import AnyPath, inside, read_json
+from nerfies_jax.capture.json_files import AnyPath, inside, named_file, read_json
 from nerfies_jax.capture.nearest import known_names
 from nerfies_jax.geometry import camera
 from nerfies_jax.geometry.camera import Camera
@@ -98,12 +98,15 @@ class NerfiesViews(NamedTuple):
     notes: tuple[str, ...]
 
 
-def read_cameras(path: AnyPath, heldout: int | str | None = None) -> NerfiesViews:
+def read_cameras(
+    path: AnyPath, heldout: int | str | None = None, missing: str = "refuse"
+) -> NerfiesViews:
     """Cameras, times, ids and splits; needs no pictures.
 
     `heldout`: None for what the files say, a number n for every n-th frame, "interp"
     for HyperNeRF's interpolation protocol (learn from ids[::4], score on ids[2::4]), or
-    the name of one of DyCheck's splits ("val", "val_intl", ...).
+    the name of one of DyCheck's splits ("val", "val_intl", ...). `missing`: "refuse" or
+    "skip" frames without a camera file, as those that found no pose.
     """
     path = pathlib.Path(path)
     scene = read_json(path / "scene.json", SceneFile)
@@ -114,8 +117,8 @@ def read_cameras(path: AnyPath, heldout: int | str | None = None) -> NerfiesView
     extra_file = path / "extra.json"
     extra = read_json(extra_file, ExtraFile) if extra_file.exists() else ExtraFile()
     train, scored, notes = _splits(path, heldout)
-    chosen = set(train) | set(scored)
-    ids = tuple(sorted(chosen, key=frames.natural))
+    chosen = sorted(set(train) | set(scored), key=frames.natural)
+    ids, lost = _with_camera_files(path, chosen, missing)
     files = [_camera_file(path, name) for name in ids]
     size = _common_size(path, ids, files)
     cameras = cameras_of(files, scene.scale, scene.center)
@@ -127,14 +130,14 @@ def read_cameras(path: AnyPath, heldout: int | str | None = None) -> NerfiesView
         cameras=cameras,
         size=size,
         times=_times(moments, path, ids),
-        train=np.sort([row[name] for name in train]).astype(int),
-        heldout=np.sort([row[name] for name in scored]).astype(int),
+        train=np.sort([row[name] for name in train if name in row]).astype(int),
+        heldout=np.sort([row[name] for name in scored if name in row]).astype(int),
         warp_ids=frames.dense([_when(m.warp_id) for m in moments]),
         appearance_ids=frames.dense([_when(m.appearance_id) for m in moments]),
         camera_ids=frames.dense([m.camera_id for m in moments]),
         scene=scene,
         extra=extra,
-        notes=(*notes, *more),
+        notes=(*notes, *lost, *more),
     )
 
 
@@ -188,9 +191,30 @@ def _named_split(path, heldout):
     return [read_json(each, SplitFile).frame_names for each in (partner, file)]
 
 
+def _with_camera_files(path, names, missing):
+    """Names of the frames that have a camera file, and a note of the others."""
+    frames.check_missing(missing, str(path))
+    kept = tuple(name for name in names if _camera_path(path, name).is_file())
+    lost = [name for name in names if name not in set(kept)]
+    if not lost:
+        return kept, ()
+    listed = ", ".join(f"camera/{name}.json" for name in lost[:5])
+    listed += ", ..." if len(lost) > 5 else ""
+    if missing == "refuse" or not kept:
+        raise CaptureError(
+            f"{path / 'dataset.json'}: {len(lost)} of {len(names)} frames have no "
+            f"camera file ({listed}); restore those files, or leave the frames out "
+            'with missing="skip" (--missing skip)'
+        )
+    return kept, (f"{len(lost)} frames left out, they have no camera file: {listed}",)
+
+
+def _camera_path(path, name):
+    return named_file(path / "camera", f"{name}.json", path / "dataset.json")
+
+
 def _camera_file(path, name):
-    folder = path / "camera"
-    return read_json(inside(folder, f"{name}.json", path / "dataset.json"), CameraFile)
+    return read_json(_camera_path(path, name), CameraFile)
 
 
 def _common_size(path, ids, files):

@@ -6,13 +6,13 @@ from typing import NamedTuple
 import numpy as np
 import plyfile
 
+from nerfies_jax.capture import ply_files, text_files
 from nerfies_jax.capture.capture import CaptureError, PointCloud
 from nerfies_jax.capture.frames import UNSEEN
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.geometry.rays import across_ray
 
 MAX_POINTS = 50_000_000
-MAX_HEADER = 65_536  # bytes; plyfile hangs on a header line of 100 MB
 INLIERS = 0.95  # share of points nearest to their median that the scene must hold
 # Depths beyond these quantiles are outliers; the margins move the planes outwards.
 QUANTILES, FAR_MARGIN = (0.001, 0.999), 1.2
@@ -83,11 +83,12 @@ def read_ply(path: pathlib.Path) -> PointCloud:
     """
     try:
         with path.open("rb") as file:
-            if b"end_header" not in file.read(MAX_HEADER):
+            head = text_files.utf8(file.read(ply_files.MAX_HEADER))
+            if b"end_header" not in head:
                 raise CaptureError(
                     f"{path}: not a .ply file; no end of its header found"
                 )
-        vertex = plyfile.PlyData.read(str(path), mmap="r")["vertex"]
+        vertex = ply_files.read(path)["vertex"]
         if vertex.count > MAX_POINTS:
             raise CaptureError(
                 f"{path}: {vertex.count} points; at most {MAX_POINTS} are read"

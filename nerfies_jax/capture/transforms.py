@@ -4,7 +4,7 @@ import pathlib
 
 import msgspec
 
-from nerfies_jax.capture import frames
+from nerfies_jax.capture import frames, text_files
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.json_files import read_json
 from nerfies_jax.capture.nearest import known_names
@@ -147,8 +147,10 @@ def _listed(file, transforms, wanted):
 
 def _taken(file, transforms, names):
     """The frames that a list names."""
-    table = {entry.file_path: entry for entry in transforms.frames}
-    absent = [each for each in names if each not in table]
+    plain = text_files.forward_slashes
+    table = {plain(entry.file_path): entry for entry in transforms.frames}
+    names = [plain(name) for name in names]
+    absent = [name for name in names if name not in table]
     if absent:
         raise CaptureError(
             f"{file}: {absent[0]!r} is in a split but not in frames; add it"

@@ -9,7 +9,7 @@ import numpy as np
 import plyfile
 import pytest
 
-from gaussians_jax import files, harmonics, model_file, spz
+from gaussians_jax import files, harmonics, model_file, splats, spz
 from gaussians_jax.splats import INACTIVE_LOGIT, Params, Splats
 from tests.gaussians.shared import full, put, rotations, same_bits
 
@@ -403,3 +403,12 @@ def test_the_largest_harmonics_are_held_and_do_not_overflow(tmp_path):
     ends = np.array([127.5, -127.5]) / 255 / 0.15
     np.testing.assert_allclose(loaded.sh_dc[0, 0, :2], ends, atol=0.5001 / 255 / 0.15)
     assert np.all(np.abs(loaded.sh_rest[..., :2]) >= 1 - 8 / 128)
+
+
+def test_comments_of_gaussian_files_may_have_any_letters(tmp_path):
+    rows = splats.from_points(np.eye(3, dtype=np.float32), np.full((3, 3), 0.5))
+    path = tmp_path / "a.ply"
+    files.save(path, rows)
+    data = path.read_bytes()
+    path.write_bytes(data.replace(b"\nelement", "\ncomment für\nelement".encode()))
+    np.testing.assert_array_equal(files.load(path).splats.mean, rows.mean)

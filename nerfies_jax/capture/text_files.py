@@ -1,0 +1,114 @@
+"""Text from other programs: byte order marks, encodings and spellings of file names."""
+
+import codecs
+import functools
+import json
+import os
+import pathlib
+import time
+import unicodedata
+from collections.abc import Sequence
+
+# A folder that changed so recently may change again within one tick of its clock.
+_SETTLED_NS = 2 * 10**9
+
+
+def encoding_of(head: bytes) -> str:
+    """Name the Unicode encoding of a text file by its first bytes.
+
+    Args:
+      head: The first bytes, four at least if the file has them. Text in UTF-16 or
+        UTF-32 is recognized without a byte order mark if it begins with ASCII.
+
+    Returns:
+      A codec that also removes the byte order mark, if there is one.
+    """
+    return json.detect_encoding(head[:4])
+
+
+def utf8(data: bytes) -> bytes:
+    """Re-encode a whole text file as UTF-8 without a byte order mark.
+
+    Raises:
+      UnicodeDecodeError: The file begins like UTF-16 or UTF-32 and is not.
+    """
+    encoding = encoding_of(data)
+    if encoding == "utf-8":
+        return data
+    if encoding == "utf-8-sig":
+        return data.removeprefix(codecs.BOM_UTF8)
+    return data.decode(encoding).encode()
+
+
+def forward_slashes(name: str) -> str:
+    """Spell a path with the separators of POSIX; Windows writes backslashes."""
+    return name.replace("\\", "/")
+
+
+def find(
+    folder: pathlib.Path, name: str, suffixes: Sequence[str] = ("",)
+) -> pathlib.Path | None:
+    """Find a file whose name may be spelled differently on disk.
+
+    The exact name is preferred. Else separators may be backslashes, letters may differ
+    in case, and characters may be composed (NFC) or decomposed (NFD), as copies between
+    operating systems change them. A spelling that fits several files fits none.
+
+    Args:
+      folder: Where the name begins.
+      name: A relative path. The caller checks that it stays inside the folder.
+      suffixes: Endings to try after the name, in order.
+
+    Returns:
+      The path of the file, or None.
+    """
+    plain = forward_slashes(name)
+    for spelling in dict.fromkeys((name, plain)):
+        for suffix in suffixes:
+            path = folder / (spelling + suffix)
+            if path.is_file():
+                return path
+    for suffix in dict.fromkeys(map(str.lower, suffixes)):
+        path = _respelled(folder, plain + suffix)
+        if path is not None and path.is_file():
+            return path
+    return None
+
+
+def _respelled(folder, name):
+    """The path with each part spelled as on disk; None where none or several fit."""
+    path = folder
+    for part in pathlib.PurePosixPath(name).parts:
+        if (path / part).exists():
+            path = path / part
+            continue
+        spellings = _listing(path).get(_key(part), ())
+        if len(spellings) != 1:
+            return None
+        path = path / spellings[0]
+    return path
+
+
+def _key(name):
+    return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold())
+
+
+def _listing(folder):
+    """Names in a folder by their spelling without case; empty if it is no folder."""
+    try:
+        changed = folder.stat().st_mtime_ns
+        if time.time_ns() - changed < _SETTLED_NS:
+            return _read_listing(str(folder), changed)
+        return _kept_listing(str(folder), changed)
+    except OSError:
+        return {}
+
+
+def _read_listing(folder, _):
+    names = {}
+    for name in os.listdir(folder):
+        names.setdefault(_key(name), []).append(name)
+    return names
+
+
+_kept_listing = functools.lru_cache(16)(_read_listing)
