@@ -67,6 +67,8 @@ def read(
     placement, more = _place(cameras, points, split.transforms, images.shape[2:0:-1])
     offset = cameras.position.astype(np.float64) - placement.centre
     times, when = _times(entries, split, is_train)
+    size = images.shape[2:0:-1]
+    valid, masked = _valid(root, entries, split.file, size, shrink_by)
     return Capture(
         name=root.resolve().name,
         source="blender",
@@ -83,7 +85,7 @@ def read(
         warp_ids=frames.dense(times),
         appearance_ids=np.zeros(len(rows), np.int32),
         camera_ids=_camera_ids(entries, times, split, is_train),
-        valid=_valid(root, entries, split.file, images.shape[2:0:-1], shrink_by),
+        valid=valid,
         points=_placed(points, placement),
         background=background if alpha is not None else split.transforms.background,
         scale=placement.scale,
@@ -92,7 +94,7 @@ def read(
         up=frames.unit(split.transforms.up) or (0.0, 0.0, 1.0),
         frames_per_second=split.transforms.fps,
         path=path,
-        notes=(*split.notes, *lost, *notes, *more, *when),
+        notes=(*split.notes, *lost, *notes, *more, *when, *masked),
     )
 
 
@@ -289,8 +291,10 @@ def _order(entry):
 
 def _valid(root, entries, file, size, shrink_by):
     if not any(entry.mask_path for entry in entries):
-        return None
+        return None, ()
     masks = [
-        entry.mask_path and named_file(root, entry.mask_path, file) for entry in entries
+        (entry.mask_path and named_file(root, entry.mask_path, file)) or None
+        for entry in entries
     ]
-    return frames.read_masks([mask or None for mask in masks], size, shrink_by) == 1
+    white, notes = frames.read_masks(masks, size, shrink_by, "not observed")
+    return white == 1, notes

@@ -134,8 +134,9 @@ def _as_pinholes(path, model, files, images, alpha, shrink_by):
     """Pictures, masks and lenses as a capture holds them, and what was done to them."""
     size = (images.shape[2], images.shape[1])
     valid = None if alpha is None else alpha == 255
-    moving = _masks(path, model.names, size, shrink_by)
+    moving, masked = _masks(path, model.names, size, shrink_by)
     valid, notes = without_black_borders(images, valid)
+    notes += masked
     stored = pictures.read_header(files[0]).size
     lenses = [_scaled(lens, stored, size, path) for lens in model.lenses]
     if not all(map(_is_ours, lenses)):
@@ -276,14 +277,15 @@ def _take(model, rows):
 def _masks(path, names, size, shrink_by):
     folder = path / "masks"
     if not folder.is_dir():
-        return None
+        return None, ()
     paths = [
         frames.find_picture(folder, f"{name}.png") or _find(folder, name, path)
         for name in names
     ]
     if not any(paths):
-        return None
-    return frames.read_masks(paths, size, shrink_by) < 1
+        return None, ("no file in masks/ is named as an image: no mask is read",)
+    white, notes = frames.read_masks(paths, size, shrink_by, "moving")
+    return white < 1, notes
 
 
 def _scaled(lens, stored, size, path):

@@ -21,7 +21,8 @@ import PIL.ImageOps
 import scipy.ndimage
 
 from nerfies_jax import events
-from nerfies_jax.capture import frames, images
+from nerfies_jax.capture import frames
+from nerfies_jax.capture import masks as mask_files
 from nerfies_jax.capture.capture import CaptureError, blocks, shrink
 from nerfies_jax.capture.colmap_library import MIN_TRACK
 from nerfies_jax.capture.images import MAX_PIXELS, write_png
@@ -104,7 +105,10 @@ def from_film(
     kept, blurred = sharp_rows(scores, moments, count)
     kept = kept[np.unique(stamps[kept], return_index=True)[1]]
     sources = None if masks is None else _masks_of_film(masks, len(moments))
-    names, rows = [], kept.tolist()  # which rise
+    names, rows, white = [], kept.tolist(), []  # the rows rise
+    if sources is not None:
+        sources = {row: sources[row] for row in rows}
+        encoding = mask_files.find_encoding([*sources.values()], "upright")
     colours = read_video(film, rows=set(rows))
     with events.stage("writing frames of the video", len(rows)) as stage:
         for row, (_, frame) in zip(rows, colours, strict=True):
@@ -113,13 +117,20 @@ def from_film(
             names.append(f"ms{round(moments[row] * 1000):08d}.png")
             _write(out / "images" / names[-1], shrink(frame, factor))
             if sources is not None:
-                mask = images.read_mask(sources[row])
-                _write_mask(out, names[-1], mask, frame.shape, factor, sources[row])
+                source = sources[row]
+                mask = mask_files.read_mask(source, encoding, "upright")
+                white.append(mask.mean())
+                _write_mask(out, names[-1], mask, frame.shape, factor, source)
             stage.advance()
     notes = [f"{len(kept)} of {len(scores)} frames kept, {blurred} too blurred"]
     transfer = transfer_of(film)
     if transfer is not None:
         notes.append(f"filmed in high dynamic range ({transfer}), tone-mapped to sRGB")
+    if sources is not None:
+        used = [*sources.values()]
+        notes.append(
+            mask_files.describe(used, len(used), encoding, np.mean(white), "moving")
+        )
     return Taken(tuple(names), tuple(notes), float(np.ptp(moments[kept])))
 
 
@@ -168,7 +179,10 @@ def from_pictures(
     stem, times = stems.most_common(1)[0]
     if times > 1:
         raise CaptureError(f"{folder}: {times} pictures are named {stem}; keep one")
-    factor, broken = _factor(usual, max_side), []
+    factor, broken, used, white = _factor(usual, max_side), [], [], []
+    if masks is not None:
+        sources = {file: _mask_of(masks, file) for file in taken}
+        encoding = mask_files.find_encoding([*sources.values()], "upright")
     with events.stage("reading images", len(taken)) as stage:
         for file in taken:
             stage.advance()
@@ -180,12 +194,16 @@ def from_pictures(
             name = f"{_spoken(file.stem)}.png"
             _write(out / "images" / name, shrink(colour, factor))
             if masks is not None:
-                source = _mask_of(masks, file)
-                mask = _upright(source).mean(-1) >= 128
-                _write_mask(out, name, mask, colour.shape, factor, source)
+                used.append(sources[file])
+                mask = mask_files.read_mask(used[-1], encoding, "upright")
+                white.append(mask.mean())
+                _write_mask(out, name, mask, colour.shape, factor, used[-1])
     notes += _left_out([file.name for file in broken], _BROKEN)
     taken = [file for file in taken if file not in broken]
     _check_enough(folder, len(taken), notes)
+    if masks is not None:
+        note = mask_files.describe(used, len(taken), encoding, np.mean(white), "moving")
+        notes += (note,)
     names = tuple(f"{_spoken(file.stem)}.png" for file in taken)
     return Taken(names, notes, focal=_focal(taken))
 

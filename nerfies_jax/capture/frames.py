@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from nerfies_jax import events
 from nerfies_jax.capture import images as pictures
-from nerfies_jax.capture import text_files
+from nerfies_jax.capture import masks, text_files
 from nerfies_jax.capture.capture import CaptureError, PointCloud, blocks, shrink
 from nerfies_jax.geometry import camera
 from nerfies_jax.geometry.camera import Camera
@@ -175,25 +175,43 @@ def read_frames(
 
 
 def read_masks(
-    paths: Sequence[pathlib.Path | None], size: tuple[int, int], shrink_by: int
-) -> np.ndarray:
-    """Share of white in each block, float32 [frames, height, width]; 1 where no file.
+    paths: Sequence[pathlib.Path | None],
+    size: tuple[int, int],
+    shrink_by: int,
+    black: str,
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Read the masks of all frames.
 
-    `size` is that of the shrunk pictures.
+    Args:
+        paths: One for each frame, at least one of them; None where there is no file.
+        size: Width and height of the shrunk images.
+        shrink_by: How many pixels of the masks a pixel of the result has, by side.
+        black: What black pixels are, for notes and errors: "not observed", "moving".
+
+    Returns:
+        The share of white in each block, float32 [frames, height, width], 1 where there
+        is no file; and a note of how white was told from black.
+
+    Raises:
+        CaptureError: A mask does not fit, or all of them are black.
     """
     width, height = size
     share = np.ones((len(paths), height, width), np.float32)
+    files = [path for path in paths if path is not None]
+    encoding = masks.find_encoding(files)
     for row, path in enumerate(paths):
         if path is None:
             continue
-        mask = pictures.read_mask(path)
+        mask = masks.read_mask(path, encoding)
         if mask.shape[1] // shrink_by != width or mask.shape[0] // shrink_by != height:
             raise CaptureError(
                 f"{path}: a mask of {mask.shape[1]}x{mask.shape[0]} pixels for "
                 f"pictures of {width * shrink_by}x{height * shrink_by}; they must agree"
             )
         share[row] = blocks(mask, shrink_by).mean((-3, -1))
-    return share
+    white = share[[path is not None for path in paths]].mean()
+    note = masks.describe(files, len(paths), encoding, float(white), black)
+    return share, (note,)
 
 
 def hold_out_every(count: int, every: int, where: str) -> tuple[np.ndarray, np.ndarray]:

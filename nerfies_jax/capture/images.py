@@ -4,8 +4,10 @@ Sizes are bounded from the header, before anything is decoded. Colours are sRGB 
 bits on disk and in memory; EXR holds linear light, which is turned into them.
 """
 
+import contextlib
 import pathlib
 import warnings
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -128,6 +130,18 @@ def read_pixels(path: AnyPath, orientation: str = "refuse") -> np.ndarray:
     return pixels
 
 
+@contextlib.contextmanager
+def opened(path: AnyPath) -> Iterator[PIL.Image.Image]:
+    """Open an image with Pillow; what cannot be decoded raises a `CaptureError`."""
+    try:
+        with PIL.Image.open(path) as image:
+            yield image
+    except CaptureError:
+        raise
+    except _PILLOW_ERRORS as error:
+        raise _unreadable(path, error) from None
+
+
 def read_numbers(path: AnyPath) -> np.ndarray:
     """The first channel of a picture as it is stored, [height, width]: no light.
 
@@ -136,11 +150,8 @@ def read_numbers(path: AnyPath) -> np.ndarray:
     path = pathlib.Path(path)
     if not read_header(path).mode.startswith("I"):
         return read_pixels(path, "stored")[..., 0]
-    try:
-        with PIL.Image.open(path) as image:
-            return np.asarray(image)
-    except _PILLOW_ERRORS as error:
-        raise _unreadable(path, error) from None
+    with opened(path) as image:
+        return np.asarray(image)
 
 
 def _exr_pixels(path):
@@ -164,12 +175,6 @@ def read_image(
     alpha = pixels[..., -1] if channels in (2, 4) else None
     colour = pixels[..., :3] if channels >= 3 else np.repeat(pixels[..., :1], 3, axis=2)
     return np.ascontiguousarray(colour), alpha
-
-
-def read_mask(path: AnyPath, orientation: str = "refuse") -> np.ndarray:
-    """True where the stored grey (or the mean of the colours) is at least one half."""
-    colour, _ = read_image(path, orientation)
-    return colour.sum(-1, dtype=np.uint16) >= 3 * 128
 
 
 def over(colour: np.ndarray, alpha: np.ndarray, background: tuple) -> np.ndarray:

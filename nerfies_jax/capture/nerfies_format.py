@@ -51,8 +51,9 @@ def read(
     _check_picture_size(paths[rows[0]], views.size, source)
     cameras = camera.resize(views.cameras, (total, total), (1, 1))
     size = (images.shape[2], images.shape[1])
-    valid = _masks(path / "valid", views.ids, size, total)
-    static = _masks(path / "resized_mask", views.ids, size, total)
+    valid, more = _masks(path / "valid", views.ids, size, total, "not observed")
+    static, masked = _masks(path / "resized_mask", views.ids, size, total, "moving")
+    notes += [*more, *masked]
     if alpha is not None:  # DyCheck: 255 where the sensor saw something
         valid = (alpha == 255) & (True if valid is None else valid == 1)
         notes.append("pictures have alpha: pixels below 255 count as not filmed")
@@ -229,13 +230,15 @@ def _reduced(folder, total):
     return None, 1
 
 
-def _masks(kind, ids, size, total):
-    """Share of white per pixel; NeRF-DS ends its names in .png.png."""
+def _masks(kind, ids, size, total, black):
+    """Share of white per pixel, and notes; NeRF-DS ends its names in .png.png."""
     folder, shrink_by = _reduced(kind, total)
     if folder is None:
-        return None
+        return None, ()
     paths = [text_files.find(folder, name, (".png.png", ".png")) for name in ids]
-    return frames.read_masks(paths, size, shrink_by) if any(paths) else None
+    if not any(paths):
+        return None, ()
+    return frames.read_masks(paths, size, shrink_by, black)
 
 
 def _depths(path, views, size, total):

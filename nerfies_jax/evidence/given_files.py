@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from nerfies_jax.capture import exr, frames, images, npz_files
+from nerfies_jax.capture import exr, frames, images, masks, npz_files
 from nerfies_jax.capture.capture import Capture, CaptureError
 from nerfies_jax.capture.given import Given, GivenFiles
 
@@ -39,16 +39,17 @@ def attached(capture: Capture, files: GivenFiles) -> Capture:
             "other tools are of other pixels than those looked at; undistort the "
             "capture first, as COLMAP's image_undistorter does"
         )
-    parts = {}
+    parts, notes = {}, capture.notes
     if files.tracks is not None:
         parts |= _tracks(files.tracks, capture)
     if files.masks is not None:
-        parts["moving"] = _masks(files.masks, capture)
+        parts["moving"], more = _masks(files.masks, capture)
+        notes += more
     if files.depths is not None:
         parts["depth"] = _depths(files.depths, capture)
     if files.flow is not None:
         parts |= _flow(files.flow, capture)
-    return dataclasses.replace(capture, given=Given(capture.size, **parts))
+    return dataclasses.replace(capture, given=Given(capture.size, **parts), notes=notes)
 
 
 def _rows(count, capture, path, what):
@@ -145,15 +146,19 @@ def _files(folder, suffixes, capture, what):
 
 def _masks(folder, capture):
     paths, rows = _files(folder, PICTURES, capture, "masks")
-    masks = np.zeros(capture.images.shape[:3], bool)
+    moving = np.zeros(capture.images.shape[:3], bool)
+    encoding = masks.find_encoding(paths)
     for path, row in zip(paths, rows, strict=True):
-        mask = images.read_mask(path)
-        masks[row] = _fitted(mask, capture, path, "mask")
-    if not masks.any():
+        mask = masks.read_mask(path, encoding)
+        moving[row] = _fitted(mask, capture, path, "mask")
+    share = moving[rows].mean()
+    if share in (0, 1):
         raise CaptureError(
-            f"{folder}: no white pixel in any mask; white marks what moves"
+            f"{folder}: no {'white' if share == 0 else 'black'} pixel in any mask "
+            f"({encoding.text}); white marks what moves and black what does not"
         )
-    return masks
+    note = f"{len(paths)} masks of {encoding.text}; {share:.1%} white: moving"
+    return moving, (note,)
 
 
 def _fitted(array, capture, path, what):

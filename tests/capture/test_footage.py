@@ -10,7 +10,7 @@ import PIL.Image
 import pytest
 import scipy.ndimage
 
-from nerfies_jax.capture import footage, frames, images, video
+from nerfies_jax.capture import footage, frames, images, masks, video
 from nerfies_jax.capture.capture import CaptureError
 
 
@@ -80,7 +80,7 @@ def test_a_film_keeps_its_own_times_and_the_masks_of_the_frames_taken(tmp_path):
         picture = images.read_pixels(tmp_path / "images" / name)
         assert picture.shape == (10, 16, 3)
         assert abs(picture.astype(int) - 10 * number).max() <= 3
-        mask = images.read_mask(tmp_path / "masks" / f"{name}.png")
+        mask = masks.read_mask(tmp_path / "masks" / f"{name}.png")
         assert mask.shape == (10, 16)
         assert mask[0].sum() == 16 - 2 * number
     (tmp_path / "given/6.png").unlink()

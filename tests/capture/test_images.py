@@ -7,7 +7,7 @@ import numpy as np
 import PIL.Image
 import pytest
 
-from nerfies_jax.capture import exr, images
+from nerfies_jax.capture import exr, images, masks
 from nerfies_jax.capture.capture import CaptureError
 
 RNG = np.random.default_rng(0)
@@ -63,7 +63,7 @@ def test_a_palette_is_looked_up(tmp_path):
 def test_one_bit_and_sixteen_bits(tmp_path):
     bits = ALPHA > 128
     save(tmp_path / "a.png", bits)
-    np.testing.assert_array_equal(images.read_mask(tmp_path / "a.png"), bits)
+    np.testing.assert_array_equal(masks.read_mask(tmp_path / "a.png"), bits)
     deep = RNG.integers(0, 65536, (6, 9)).astype(np.uint16)
     images.write_png(tmp_path / "b.png", deep)
     colour, _ = images.read_image(tmp_path / "b.png")
@@ -173,7 +173,7 @@ def test_a_picture_comes_back_as_it_was_written(tmp_path):
     images.write_png(tmp_path / "a.png", COLOUR)
     np.testing.assert_array_equal(images.read_image(tmp_path / "a.png")[0], COLOUR)
     images.write_png(tmp_path / "m.png", ALPHA > 100)
-    np.testing.assert_array_equal(images.read_mask(tmp_path / "m.png"), ALPHA > 100)
+    np.testing.assert_array_equal(masks.read_mask(tmp_path / "m.png"), ALPHA > 100)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.png", "m.png"]
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from nerfies_jax import capture as room
 from nerfies_jax.capture import images, video
+from nerfies_jax.capture import masks as mask_files
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.structure_from_motion import FewPlaced, Poses
 from nerfies_jax.evidence import masks_without_cameras
@@ -44,7 +45,7 @@ def mapper(monkeypatch):
         black = None
         if masks is not None:
             shutil.copytree(masks, out / "masks")
-            black = [~images.read_mask(masks / f"{name}.png") for name in names]
+            black = [~mask_files.read_mask(masks / f"{name}.png") for name in names]
         calls.append((spec, black))
         placed = len(names) - (3 if len(calls) == 2 and run_sfm.fails else 0)
         return Poses(out, len(names), placed, 40, 0.5, 6.0)
@@ -92,7 +93,7 @@ def test_the_second_pass_goes_without_what_the_first_saw_move(
     stored = room.load(tmp_path / "out")
     np.testing.assert_array_equal(stored.images, capture.images)
     assert stored.moving is None  # found, and no truth
-    shown = images.read_mask(tmp_path / "out/masks_found/p2.png")
+    shown = mask_files.read_mask(tmp_path / "out/masks_found/p2.png")
     np.testing.assert_array_equal(shown, moving[2])
     assert (tmp_path / "out/colmap/sparse/0/images.txt").is_file()
     assert not list(tmp_path.glob(".*"))
@@ -148,7 +149,7 @@ def test_where_too_few_are_placed_what_moves_is_masked_before(
     preparation.prepare(pictures, tmp_path / "out", tell=log.append)
     ((_, black),) = mapper.calls
     assert [mask.any() for mask in black] == [row == 2 for row in range(9)]
-    shown = images.read_mask(tmp_path / "out/masks_found/p2.png")
+    shown = mask_files.read_mask(tmp_path / "out/masks_found/p2.png")
     np.testing.assert_array_equal(shown, moves["p2.png"])
     assert log[0].startswith("only 1 of 9")
     moves["p2.png"][:] = False  # nothing to leave out: the first reason is told

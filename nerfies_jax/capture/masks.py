@@ -1,0 +1,264 @@
+"""Mask images of every encoding: which pixels are white is decided for a whole set.
+
+One mask alone does not tell: a file of zeros and ones is black to the eye, and a frame
+in which nothing is marked has one value only.
+"""
+
+import pathlib
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+import PIL.Image
+import PIL.ImageOps
+
+from nerfies_jax.capture import images
+from nerfies_jax.capture.capture import CaptureError
+from nerfies_jax.capture.json_files import AnyPath
+
+ADVICE = "save the masks as 8-bit gray PNG of 0 and 255"
+OPAQUE = 128  # alpha from here on
+COLORFUL = 32  # difference of two channels; JPEG's noise stays below
+FEW = 16  # distinct values; a photograph has more
+MOST_LABELS = 64
+LOSSY = (".jpg", ".jpeg")
+
+
+class Encoding(NamedTuple):
+    """How a set of mask images says white."""
+
+    alpha: bool  # opaque pixels are white, whatever their color
+    threshold: int  # stored values from here on are white
+    text: str  # for a note
+
+
+class _Stored(NamedTuple):
+    """One mask as it is stored."""
+
+    value: np.ndarray  # [height, width]: the largest channel
+    alpha: np.ndarray | None  # [height, width] bool
+    full: int  # the largest value that the file could hold
+    colorful: bool
+
+
+class _Survey(NamedTuple):
+    """What the values of one mask are."""
+
+    path: pathlib.Path
+    counts: np.ndarray  # of pixels, by value
+    full: int
+    colorful: bool
+    has_alpha: bool
+    opaque: bool
+    cut_out: bool  # alpha alone can be the mask
+
+
+def read_mask(
+    path: AnyPath, encoding: Encoding | None = None, orientation: str = "refuse"
+) -> np.ndarray:
+    """Read one mask.
+
+    Args:
+        path: An image of any kind that `images` reads.
+        encoding: How the set says white; by default, that of this file alone.
+        orientation: "refuse" a mask that EXIF turns, or turn it "upright".
+
+    Returns:
+        True where the mask is white, bool [height, width].
+    """
+    path = pathlib.Path(path)
+    encoding = encoding or find_encoding([path], orientation)
+    stored = _read(path, orientation)
+    if encoding.alpha:
+        return stored.alpha
+    return stored.value >= encoding.threshold
+
+
+def find_encoding(paths: Sequence[AnyPath], orientation: str = "refuse") -> Encoding:
+    """Tell from the values of all masks of a set which of them mean white.
+
+    Args:
+        paths: The files of the set, at least one.
+        orientation: As in `read_mask`.
+
+    Raises:
+        CaptureError: More than one reading is possible. It names the file.
+    """
+    with ThreadPoolExecutor(4) as pool:
+        surveys = list(
+            pool.map(lambda path: _survey(pathlib.Path(path), orientation), paths)
+        )
+    transparent = [one for one in surveys if one.has_alpha and not one.opaque]
+    if transparent:
+        return _alpha_encoding(surveys)
+    deepest = max(one.full for one in surveys)
+    other = next((one for one in surveys if one.full != deepest), None)
+    if other is not None:
+        raise CaptureError(
+            f"{other.path}: a mask of {_bits(other.full)} bits among masks of "
+            f"{_bits(deepest)}; {ADVICE}"
+        )
+    return _value_encoding(surveys)
+
+
+def describe(
+    files: Sequence[pathlib.Path],
+    frames: int,
+    encoding: Encoding,
+    white: float,
+    black: str,
+) -> str:
+    """Say how masks were read, for the notes of a capture.
+
+    Args:
+        files: The masks of the set.
+        frames: The number of frames that could have one.
+        encoding: How they say white.
+        white: The share of white over all of them.
+        black: What black pixels are: "not observed", "moving".
+
+    Raises:
+        CaptureError: All pixels of all masks are black.
+    """
+    folder = files[0].parent
+    if white == 0:
+        raise CaptureError(
+            f"{folder}: every pixel of all {len(files)} masks is black, and black is "
+            f"{black} ({encoding.text}); invert the masks if they are the other way "
+            "around, else leave them out"
+        )
+    count = f"{len(files)}" if len(files) == frames else f"{len(files)} of {frames}"
+    marked = f"{1 - white:.1%} of their pixels are black: {black}"
+    if white == 1:
+        marked = f"no pixel is black, so none is {black}"
+    return f"{count} masks of {encoding.text}; {marked}"
+
+
+def _bits(full):
+    return 8 if full == 255 else 16
+
+
+def _alpha_encoding(surveys):
+    for one in surveys:
+        if not one.has_alpha:
+            raise CaptureError(
+                f"{one.path}: a mask without alpha channel among masks with one; "
+                f"{ADVICE}"
+            )
+        if not one.cut_out:
+            raise CaptureError(
+                f"{one.path}: a mask with an alpha channel and black in its color, and "
+                f"either could be the mask; {ADVICE}"
+            )
+    return Encoding(True, 0, "alpha, opaque is taken as white")
+
+
+def _value_encoding(surveys):
+    counts = np.sum([one.counts for one in surveys], axis=0)
+    values = np.flatnonzero(counts)
+    least, most = int(values[0]), int(values[-1])
+    colorful = any(one.colorful for one in surveys)
+    # 16-bit files often hold values of 8 bits.
+    scale = 255 if most <= 255 else surveys[0].full
+    half = (scale + 1) // 2
+    first = surveys[0].path
+    listed = ", ".join(map(str, values[:5])) + (", ..." if len(values) > 5 else "")
+    if colorful and least > 0:
+        raise CaptureError(
+            f"{first}: a mask in color without any black, so what is marked is not "
+            f"known; {ADVICE}"
+        )
+    if len(values) == 1 and (most in (0, 1) or most >= half):
+        return Encoding(False, 1, f"the one value {most}")
+    if len(values) == 2 and least == 0:
+        text = f"values 0 and {most}"
+        return Encoding(
+            False, most, text if most == surveys[0].full else f"{text} (white)"
+        )
+    few = len(values) <= FEW
+    labels = least == 0 and len(values) <= MOST_LABELS
+    if labels and (colorful or most < half or (few and most < 0.9 * scale)):
+        return Encoding(False, 1, f"labels {listed}; all but 0 are taken as white")
+    for one in surveys:
+        own = np.flatnonzero(one.counts)
+        lossy = one.path.suffix.lower() in LOSSY
+        if len(own) == 2 and own[0] == 0 and own[1] < half and not lossy:
+            raise CaptureError(
+                f"{one.path}: a mask of 0 and {own[1]} among masks up to {most}; "
+                f"{ADVICE}"
+            )
+    low = values[(values > 0) & (values < FEW)]
+    void = few and counts[low].sum() > 1e-3 * counts.sum()
+    if colorful or void or not least < half <= most:
+        raise CaptureError(
+            f"{first}: masks of values {listed}, up to {most}, that are neither black "
+            f"and white nor 0 and labels; {ADVICE}"
+        )
+    return Encoding(False, half, f"gray values, white from {half} on")
+
+
+def _survey(path, orientation):
+    stored = _read(path, orientation)
+    counts = np.bincount(stored.value.ravel(), minlength=stored.full + 1)
+    alpha = stored.alpha
+    return _Survey(
+        path=path,
+        counts=counts,
+        full=stored.full,
+        colorful=stored.colorful,
+        has_alpha=alpha is not None,
+        opaque=alpha is None or bool(alpha.all()),
+        cut_out=alpha is not None and _is_cut_out(stored.value, alpha),
+    )
+
+
+def _is_cut_out(value, alpha):
+    """Whether the color inside is no mask of its own: without black, or a photo."""
+    inside = value[alpha] if alpha.any() else value
+    if not alpha.any() and value.min() == value.max():
+        return True  # nothing is marked
+    return bool(inside.min() > 0) or len(np.unique(inside)) > FEW
+
+
+def _read(path, orientation):
+    header = images.read_header(path)
+    if header.mode == "EXR":
+        return _from_channels(images.read_pixels(path), None)
+    if header.orientation not in (0, 1) and orientation != "upright":
+        raise CaptureError(
+            f"{path}: the EXIF orientation of this mask is {header.orientation}; "
+            "rotate its pixels and remove the tag"
+        )
+    with images.opened(path) as image:
+        return _decoded(path, PIL.ImageOps.exif_transpose(image))
+
+
+def _decoded(path, image):
+    if image.mode.startswith("I"):
+        value = np.asarray(image)
+        if not 0 <= value.min() <= value.max() <= 65535:
+            raise CaptureError(
+                f"{path}: a mask of values up to {value.max()}, more than 16 bits; "
+                f"{ADVICE}"
+            )
+        return _Stored(value.astype(np.uint16), None, 65535, False)
+    if image.has_transparency_data:
+        pixels = np.asarray(image.convert("RGBA"))
+        return _from_channels(pixels[..., :3], pixels[..., 3] >= OPAQUE)
+    if image.mode not in ("1", "L", "P", "RGB"):
+        raise CaptureError(
+            f"{path}: a mask of color mode {image.mode}; expected gray or RGB: {ADVICE}"
+        )
+    image = image.convert("RGB" if image.mode == "P" else image.mode)
+    pixels = np.asarray(image)
+    if pixels.dtype == np.bool_:
+        pixels = pixels.astype(np.uint8) * 255
+    return _from_channels(pixels if pixels.ndim == 3 else pixels[..., None], None)
+
+
+def _from_channels(pixels, alpha):
+    value = pixels.max(-1)
+    spread = value - pixels.min(-1)
+    colorful = float((spread > COLORFUL).mean()) > 1e-3
+    return _Stored(value, alpha, 255, colorful)
