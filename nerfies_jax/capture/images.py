@@ -5,6 +5,7 @@ bits on disk and in memory; EXR holds linear light, which is turned into them.
 """
 
 import contextlib
+import io
 import pathlib
 import warnings
 from collections.abc import Iterator
@@ -193,8 +194,12 @@ def write_png(path: AnyPath, pixels: np.ndarray):
             f"{path}: PNG holds uint8 or uint16, got {pixels.dtype}; convert first, or "
             "write an EXR"
         )
+    # In memory first: on a full disk imageio fails a second time when it is finalized,
+    # and Python prints that error with a traceback.
+    encoded = io.BytesIO()
+    skimage.io.imsave(encoded, pixels, check_contrast=False, extension=".png")
     with replaced_file(path) as partial:
-        skimage.io.imsave(partial, pixels, check_contrast=False)
+        partial.write_bytes(encoded.getvalue())
 
 
 def srgb_from_linear(light: np.ndarray) -> np.ndarray:
