@@ -1,16 +1,16 @@
-"""Pictures in and out: PNG and JPEG by scikit-image, EXR by OpenEXR.
+"""Pictures in and out: PNG and JPEG by scikit-image and imageio, EXR by OpenEXR.
 
 Sizes are bounded from the header, before anything is decoded. Colours are sRGB in 8
 bits on disk and in memory; EXR holds linear light, which is turned into them.
 """
 
 import contextlib
-import io
 import pathlib
 import warnings
 from collections.abc import Iterator
 from typing import NamedTuple
 
+import imageio.v3
 import numpy as np
 import PIL.Image
 import skimage.io
@@ -196,10 +196,9 @@ def write_png(path: AnyPath, pixels: np.ndarray):
         )
     # In memory first: on a full disk imageio fails a second time when it is finalized,
     # and Python prints that error with a traceback.
-    encoded = io.BytesIO()
-    skimage.io.imsave(encoded, pixels, check_contrast=False, extension=".png")
+    encoded = imageio.v3.imwrite("<bytes>", pixels, extension=".png")
     with replaced_file(path) as partial:
-        partial.write_bytes(encoded.getvalue())
+        partial.write_bytes(encoded)
 
 
 def srgb_from_linear(light: np.ndarray) -> np.ndarray:
