@@ -58,7 +58,8 @@ def read(
     is_train = rows < len(split.train)
     full = pictures.read_header(files[0]).size
     _, shrink_by = frames.choose_source({1: root}, full, factor, max_side, where)
-    images, alpha = frames.read_frames(files, shrink_by, background)
+    read_in = frames.read_frames(files, shrink_by, background)
+    images, alpha = read_in.images, read_in.alpha
     cameras, notes = _cameras(entries, split.transforms, full, where)
     cameras = camera.resize(cameras, (shrink_by, shrink_by), (1, 1))
     points = None
@@ -85,7 +86,7 @@ def read(
         warp_ids=frames.dense(times),
         appearance_ids=np.zeros(len(rows), np.int32),
         camera_ids=_camera_ids(entries, times, split, is_train),
-        valid=valid,
+        valid=frames.both(valid, read_in.observed),
         points=_placed(points, placement),
         background=background if alpha is not None else split.transforms.background,
         scale=placement.scale,
@@ -94,7 +95,7 @@ def read(
         up=frames.unit(split.transforms.up) or (0.0, 0.0, 1.0),
         frames_per_second=split.transforms.fps,
         path=path,
-        notes=(*split.notes, *lost, *notes, *more, *when, *masked),
+        notes=(*split.notes, *lost, *notes, *more, *when, *masked, *read_in.notes),
     )
 
 

@@ -63,11 +63,11 @@ def read(
         path, model, factor, max_side, missing
     )
     # COLMAP reads pixels as they lie in the file, whatever the EXIF orientation says.
-    images, alpha = frames.read_frames(files, shrink_by, orientation="stored")
+    stored = frames.read_frames(files, shrink_by, orientation="stored")
     images, valid, moving, lenses, more = _as_pinholes(
-        path, model, files, images, alpha, shrink_by
+        path, model, files, stored, shrink_by
     )
-    notes += more
+    notes += (*stored.notes, *more)
     placement = place_by_points(model.points, model.positions, model.depths)
     centre, scale = np.array(placement.centre), placement.scale
     cameras = _cameras(lenses, model.rotations, (model.positions - centre) * scale)
@@ -130,15 +130,15 @@ def _with_pictures(path, model, factor, max_side, missing):
     return _take(model, rows), [paths[source][row] for row in rows], shrink_by, lost
 
 
-def _as_pinholes(path, model, files, images, alpha, shrink_by):
+def _as_pinholes(path, model, files, stored, shrink_by):
     """Pictures, masks and lenses as a capture holds them, and what was done to them."""
+    images, valid = stored.images, stored.valid()
     size = (images.shape[2], images.shape[1])
-    valid = None if alpha is None else alpha == 255
     moving, masked = _masks(path, model.names, size, shrink_by)
     valid, notes = without_black_borders(images, valid)
     notes += masked
-    stored = pictures.read_header(files[0]).size
-    lenses = [_scaled(lens, stored, size, path) for lens in model.lenses]
+    full = pictures.read_header(files[0]).size
+    lenses = [_scaled(lens, full, size, path) for lens in model.lenses]
     if not all(map(_is_ours, lenses)):
         names = sorted({lens.model_name for lens in lenses})
         notes += (f"pictures undistorted from {' and '.join(names)} to a pinhole",)

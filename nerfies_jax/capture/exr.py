@@ -24,14 +24,16 @@ class ExrPicture(NamedTuple):
     depth: np.ndarray | None  # [height, width] float32, channel Z
     extra: dict[str, np.ndarray]  # every other channel, float32 or uint32
     finite: np.ndarray  # [height, width] bool: no channel was NaN or infinite here
+    color_finite: np.ndarray  # [height, width] bool: neither color nor alpha was
     origin: tuple[int, int]  # x, y of the first pixel in the display window
+    display_size: tuple[int, int]  # width, height of the display window
 
 
 def read_exr(path: AnyPath) -> ExrPicture:
     """The first part's data window. A luminance channel Y alone becomes grey colour."""
     path = _existing(path)
     try:
-        origin, (width, height) = _window(path)
+        origin, (width, height), display_size = _windows(path)
         with OpenEXR.File(str(path), separate_channels=True) as file:
             # Copied: the arrays belong to the file, and `channels()` is empty once it
             # closes.
@@ -42,18 +44,61 @@ def read_exr(path: AnyPath) -> ExrPicture:
         raise _unreadable(path, error) from None
     if not channels or any(c.shape != (height, width) for c in channels.values()):
         raise CaptureError(f"{path}: its pixels do not fill its window; write it again")
-    return _picture(channels, origin)
+    return _picture(channels, origin, display_size)
 
 
 def read_size(path: AnyPath) -> tuple[int, int]:
-    """Width and height in pixels, from the header alone."""
+    """Width and height of the display window in pixels, from the header alone."""
     path = _existing(path)
     try:
-        return _window(path)[1]
+        return _windows(path)[2]
     except CaptureError:
         raise
     except Exception as error:  # as above
         raise _unreadable(path, error) from None
+
+
+def in_display_window(path: AnyPath, picture: ExrPicture) -> ExrPicture:
+    """Place the data window inside the display window, which cameras refer to.
+
+    Renderers store a crop or overscan as a data window of another size. Pixels without
+    data become 0 and count as not finite; those beyond the display window are dropped.
+
+    Raises:
+        CaptureError: The windows do not meet, so no pixel of the image is stored.
+    """
+    (left, top), (width, height) = picture.origin, picture.display_size
+    tall, wide = picture.finite.shape
+    if (left, top, wide, tall) == (0, 0, width, height):
+        return picture
+    rows = slice(max(top, 0), min(top + tall, height))
+    columns = slice(max(left, 0), min(left + wide, width))
+    if rows.start >= rows.stop or columns.start >= columns.stop:
+        raise CaptureError(
+            f"{path}: its data window of {wide}x{tall} pixels at ({left}, {top}) lies "
+            f"outside its display window of {width}x{height}; render it again"
+        )
+
+    def placed(array):
+        if array is None:
+            return None
+        whole = np.zeros((height, width, *array.shape[2:]), array.dtype)
+        whole[rows, columns] = array[
+            rows.start - top : rows.stop - top,
+            columns.start - left : columns.stop - left,
+        ]
+        return whole
+
+    return ExrPicture(
+        colour=placed(picture.colour),
+        alpha=placed(picture.alpha),
+        depth=placed(picture.depth),
+        extra={name: placed(array) for name, array in picture.extra.items()},
+        finite=placed(picture.finite),
+        color_finite=placed(picture.color_finite),
+        origin=(0, 0),
+        display_size=picture.display_size,
+    )
 
 
 def _existing(path):
@@ -70,19 +115,29 @@ def _unreadable(path, error):
     )
 
 
-def _window(path):
-    """Origin and size of the data window, bounded before any pixel is decoded."""
+def _windows(path):
+    """Origin and size of the data window, and the size of the display window.
+
+    The origin is relative to the display window. Both sizes are bounded before any
+    pixel is decoded.
+    """
     with OpenEXR.File(str(path), header_only=True) as file:
         header = file.header()  # it empties when the file closes
-        (left, top), (right, bottom) = (
-            np.asarray(x, int) for x in header["dataWindow"]
+        data, display = (
+            np.asarray(header[name], int) for name in ("dataWindow", "displayWindow")
         )
         channels = header["channels"]
-        width, height = int(right - left + 1), int(bottom - top + 1)
+        width, height = (data[1] - data[0] + 1).tolist()
+        shown = tuple((display[1] - display[0] + 1).tolist())
         if not 0 < width * height * len(channels) <= MAX_FLOATS:
             raise CaptureError(
                 f"{path}: {width}x{height} pixels of {len(channels)} channels, more "
                 f"than {MAX_FLOATS} numbers; crop it or keep fewer channels"
+            )
+        if not (min(shown) > 0 and shown[0] * shown[1] <= MAX_FLOATS):
+            raise CaptureError(
+                f"{path}: a display window of {shown[0]}x{shown[1]} pixels; expected "
+                f"1 to {MAX_FLOATS}: write it again"
             )
         if any(
             channel.xSampling != 1 or channel.ySampling != 1 for channel in channels
@@ -91,15 +146,20 @@ def _window(path):
                 f"{path}: channels of different resolution (luminance-chroma); save it "
                 "as RGB"
             )
-    return (int(left), int(top)), (width, height)
+    left, top = (data[0] - display[0]).tolist()
+    return (left, top), (width, height), shown
 
 
-def _picture(channels, origin):
+def _picture(channels, origin, display_size):
     channels = {
         name: array if array.dtype == np.uint32 else array.astype(np.float32)
         for name, array in channels.items()
     }
-    finite = np.logical_and.reduce([np.isfinite(array) for array in channels.values()])
+    known = {name: np.isfinite(array) for name, array in channels.items()}
+    finite = np.logical_and.reduce([*known.values()])
+    # The depth of a background is often infinite where its color is not.
+    seen = [known[name] for name in "RGBYA" if name in known]
+    color_finite = np.logical_and.reduce(seen) if seen else finite
     channels = {
         name: np.where(np.isfinite(array), array, array.dtype.type(0))
         for name, array in channels.items()
@@ -110,7 +170,9 @@ def _picture(channels, origin):
     elif "Y" in channels:
         colour = np.repeat(channels.pop("Y")[..., None], 3, axis=-1)
     alpha, depth = channels.pop("A", None), channels.pop("Z", None)
-    return ExrPicture(colour, alpha, depth, channels, finite, origin)
+    return ExrPicture(
+        colour, alpha, depth, channels, finite, color_finite, origin, display_size
+    )
 
 
 def write_exr(

@@ -6,6 +6,7 @@ import pathlib
 import re
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -119,16 +120,38 @@ def keep_found(
     return rows, (f"{len(lost)} frames left out, their pictures are missing: {listed}",)
 
 
+class Frames(NamedTuple):
+    """The decoded images of a capture, uint8."""
+
+    images: np.ndarray  # [frames, height, width, 3]
+    alpha: np.ndarray | None  # [frames, height, width]; None if no file has it
+    # [frames, height, width] bool, False where an EXR has no color; None if all have
+    observed: np.ndarray | None
+    notes: tuple[str, ...]
+
+    def valid(self) -> np.ndarray | None:
+        """Observed pixels of a format whose alpha is 255 there."""
+        opaque = None if self.alpha is None else self.alpha == 255
+        return both(opaque, self.observed)
+
+
+def both(first: np.ndarray | None, second: np.ndarray | None) -> np.ndarray | None:
+    """The pixels that are in two masks; None is a mask of all pixels."""
+    if first is None or second is None:
+        return second if first is None else first
+    return first & second
+
+
 def read_frames(
     paths: Sequence[pathlib.Path],
     shrink_by: int = 1,
     background: tuple[float, float, float] | None = None,
     orientation: str = "refuse",
-) -> tuple[np.ndarray, np.ndarray | None]:
-    """Colour [frames, height, width, 3] and alpha [frames, height, width], uint8.
+) -> Frames:
+    """Read the images of a capture.
 
-    Every size is read first: they must agree and fit. With a `background` the colour is
-    laid over it at full resolution, before shrinking. Alpha is None if no file has it.
+    Every size is read first: they must agree and fit. With a `background` the color is
+    laid over it at full resolution, before shrinking.
     """
     if len(paths) > MAX_FRAMES:
         raise CaptureError(
@@ -155,23 +178,41 @@ def read_frames(
     alphas = np.full((len(paths), height, width), 255, np.uint8)
 
     def decode(row):
-        colour, alpha = pictures.read_image(paths[row], orientation)
+        alpha = known = None
+        if paths[row].suffix.lower() == pictures.EXR:
+            colour, known = pictures.read_light(paths[row])
+        else:
+            colour, alpha = pictures.read_image(paths[row], orientation)
         if alpha is not None and background is not None:
             colour = pictures.over(colour, alpha, background)
         colours[row] = shrink(colour, shrink_by)
         if alpha is not None:
             alphas[row] = shrink(alpha[..., None], shrink_by)[..., 0]
-        return alpha is not None
+        if known is not None:
+            known = blocks(known, shrink_by).all((-3, -1))
+        return alpha is not None, known
 
     # Decoding releases the interpreter lock; four threads read 86 frames of 512x384 in
     # 0.25 s instead of 0.8.
-    any_alpha = False
+    any_alpha, unknown = False, {}
     stage = events.stage("reading images", len(paths))
     with ThreadPoolExecutor(4) as pool, stage as reading:
-        for has_alpha in pool.map(decode, range(len(paths))):
+        for row, (has_alpha, known) in enumerate(pool.map(decode, range(len(paths)))):
             any_alpha |= has_alpha
+            if known is not None:
+                unknown[row] = known
             reading.advance()
-    return colours, alphas if any_alpha else None
+    alpha = alphas if any_alpha else None
+    if not unknown:
+        return Frames(colours, alpha, None, ())
+    observed = np.ones(alphas.shape, bool)
+    for row, known in unknown.items():
+        observed[row] = known
+    note = (
+        f"{len(unknown)} EXR images have pixels outside their data window or not "
+        f"finite, {1 - observed.mean():.1%} of all: taken as not observed"
+    )
+    return Frames(colours, alpha, observed, (note,))
 
 
 def read_masks(

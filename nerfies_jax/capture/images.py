@@ -87,7 +87,7 @@ def read_pixels(path: AnyPath, orientation: str = "refuse") -> np.ndarray:
     path = pathlib.Path(path)
     header = read_header(path)
     if header.mode == "EXR":
-        return _exr_pixels(path)
+        return read_light(path)[0]
     if header.orientation not in (0, 1) and orientation != "stored":
         raise CaptureError(
             f"{path}: its EXIF orientation is {header.orientation}, so a viewer turns "
@@ -155,16 +155,30 @@ def read_numbers(path: AnyPath) -> np.ndarray:
         return np.asarray(image)
 
 
-def _exr_pixels(path):
-    picture = exr.read_exr(path)
-    if picture.colour is None:
+def read_light(path: AnyPath) -> tuple[np.ndarray, np.ndarray | None]:
+    """Read the colors of an EXR and where there are any.
+
+    Returns:
+        Color, uint8 sRGB [height, width, 3] of the display window; and bool [height,
+        width], False where nothing was stored or a channel was NaN or infinite, None
+        where all pixels are known. Their color is black.
+    """
+    stored = exr.read_exr(path)
+    if stored.colour is None:
         raise CaptureError(f"{path}: no colour channels; save it with R, G and B")
-    if picture.alpha is not None and np.any(picture.alpha < 1):
+    transparent = stored.alpha is not None and stored.color_finite & (stored.alpha < 1)
+    if np.any(transparent):
         raise CaptureError(
             f"{path}: it is transparent in places, and its colours may be multiplied "
             "by alpha or not; lay it over its background first, or save it as a PNG"
         )
-    return np.round(srgb_from_linear(picture.colour) * 255).astype(np.uint8)
+    stored = exr.in_display_window(path, stored)
+    color = np.round(srgb_from_linear(stored.colour) * 255).astype(np.uint8)
+    known = stored.color_finite
+    if known.all():
+        return color, None
+    color[~known] = 0
+    return color, known
 
 
 def read_image(

@@ -56,9 +56,10 @@ def read(
     )
     # LLFF's script sorts names letter by letter, too.
     files = frames.pictures_in(available[source])
-    images, alpha = frames.read_frames(files, shrink_by, orientation="stored")
-    valid = None if alpha is None else alpha == 255
-    valid, notes = without_black_borders(images, valid)
+    stored = frames.read_frames(files, shrink_by, orientation="stored")
+    images = stored.images
+    valid, notes = without_black_borders(images, stored.valid())
+    notes += stored.notes
     placed = _placed(poses)
     cameras = _cameras(poses, placed, (images.shape[2], images.shape[1]))
     names = tuple(file.stem for file in files)

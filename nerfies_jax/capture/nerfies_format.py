@@ -46,7 +46,8 @@ def read(
     paths = [frames.find_picture(folder, name) for name in views.ids]
     rows, lost = frames.keep_found(paths, views.ids, missing, str(folder))
     views = only(views, rows)
-    images, alpha = frames.read_frames([paths[row] for row in rows], shrink_by)
+    stored = frames.read_frames([paths[row] for row in rows], shrink_by)
+    images, alpha = stored.images, stored.alpha
     total = source * shrink_by
     _check_picture_size(paths[rows[0]], views.size, source)
     cameras = camera.resize(views.cameras, (total, total), (1, 1))
@@ -59,6 +60,8 @@ def read(
         notes.append("pictures have alpha: pixels below 255 count as not filmed")
     elif valid is not None:
         valid = valid == 1
+    valid = frames.both(valid, stored.observed)
+    notes += stored.notes
     moving = None if static is None else static < 1
     points, more = _points(path, images, cameras, views, moving)
     return Capture(

@@ -201,7 +201,7 @@ def _depth_picture(path):
     if path.suffix.lower() == ".npy":
         picture = frames.load_array(path, images.MAX_PIXELS).squeeze()
     elif path.suffix.lower() == ".exr":
-        stored = exr.read_exr(path)
+        stored = exr.in_display_window(path, exr.read_exr(path))
         picture = stored.depth
         if picture is None and stored.colour is not None:
             picture = stored.colour[..., 0]

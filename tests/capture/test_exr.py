@@ -1,10 +1,12 @@
 """EXR round trips, other people's files, and broken ones."""
 
+import json
+
 import numpy as np
 import OpenEXR
 import pytest
 
-from nerfies_jax.capture import exr, exr_camera, frames
+from nerfies_jax.capture import exr, exr_camera, formats, frames, images
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.geometry import camera
 
@@ -115,6 +117,84 @@ def test_a_bomb_is_refused_before_it_is_decoded(tmp_path):
     (tmp_path / "a.exr").write_bytes(data.replace(window, wide))
     with pytest.raises(CaptureError, match=r"a\.exr: "):
         exr.read_exr(tmp_path / "a.exr")
+
+
+def write_window(path, color, left, top, width, height, **more):
+    """An EXR of `color` at a place in a display window, as renderers store crops."""
+    tall, wide = color.shape[:2]
+    corner = np.int32([left, top])
+    header = {
+        "type": OpenEXR.scanlineimage,
+        "dataWindow": (corner, corner + np.int32([wide - 1, tall - 1])),
+        "displayWindow": (np.int32([0, 0]), np.int32([width - 1, height - 1])),
+    }
+    channels = dict(zip("RGB", np.moveaxis(color, -1, 0), strict=True)) | more
+    contiguous = {name: np.ascontiguousarray(x) for name, x in channels.items()}
+    with OpenEXR.File(header, contiguous) as file:
+        file.write(str(path))
+    return path
+
+
+def test_a_crop_is_placed_in_its_display_window(tmp_path):
+    path = write_window(tmp_path / "a.exr", COLOUR / 50, 3, 2, 12, 10)
+    assert images.read_header(path).size == (12, 10)
+    color, known = images.read_light(path)
+    inside = np.zeros((10, 12), bool)
+    inside[2:7, 3:10] = True
+    np.testing.assert_array_equal(known, inside)
+    whole = images.srgb_from_linear(COLOUR / 50) * 255
+    np.testing.assert_allclose(color[2:7, 3:10], whole, atol=0.51)
+    assert not color[~inside].any()
+    alone = write_window(tmp_path / "b.exr", COLOUR, 0, 0, 7, 5)
+    assert images.read_light(alone)[1] is None
+
+
+def test_overscan_is_dropped_and_a_window_elsewhere_refused(tmp_path):
+    path = write_window(tmp_path / "a.exr", COLOUR / 50, -2, -1, 4, 4)
+    color, known = images.read_light(path)
+    whole = images.srgb_from_linear(COLOUR / 50) * 255
+    np.testing.assert_allclose(color, whole[1:5, 2:6], atol=0.51)
+    assert known is None
+    path = write_window(tmp_path / "a.exr", COLOUR, 9, 0, 8, 8)
+    with pytest.raises(CaptureError, match=r"at \(9, 0\) lies outside its display"):
+        images.read_light(path)
+
+
+def test_pixels_without_color_are_not_observed(tmp_path):
+    color = COLOUR[:4, :6] / 50
+    color[1, 2, 0], color[2, 4, 1] = np.nan, np.inf
+    depth = np.full((4, 6), np.inf, np.float32)  # of a sky, which has a color
+    for name in "ab":
+        write_window(tmp_path / f"{name}.exr", color, 0, 0, 6, 4, Z=depth)
+    paths = [tmp_path / "a.exr", tmp_path / "b.exr"]
+    read = frames.read_frames(paths)
+    np.testing.assert_array_equal(read.observed[0], np.isfinite(color).all(-1))
+    assert read.notes == (
+        "2 EXR images have pixels outside their data window or not finite, 8.3% of "
+        "all: taken as not observed",
+    )
+    halves = frames.read_frames(paths, 2)
+    blocks = [[True, False, True], [True, True, False]]
+    np.testing.assert_array_equal(halves.observed[1], blocks)
+
+
+def test_transforms_of_a_crop_keep_their_principal_point(tmp_path):
+    pose = np.eye(4)
+    for row in range(3):
+        pose[0, 3] = row
+        write_window(tmp_path / f"{row}.exr", COLOUR / 50, 3, 2, 14, 10)
+    lens = {"fl_x": 9.0, "cx": 6.5, "cy": 5.0, "w": 14, "h": 10}
+    entries = [
+        {"file_path": f"{row}.exr", "transform_matrix": pose.tolist()}
+        for row in range(3)
+    ]
+    text = json.dumps(lens | {"frames": entries})
+    (tmp_path / "transforms.json").write_text(text)
+    capture = formats.load(tmp_path)
+    assert capture.size == (14, 10)
+    np.testing.assert_allclose(capture.cameras.principal_point_px[0], [6.5, 5.0])
+    assert capture.valid.mean() == 35 / 140
+    assert "outside their data window" in " ".join(capture.notes)
 
 
 @pytest.mark.full
