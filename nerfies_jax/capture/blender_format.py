@@ -3,12 +3,11 @@
 Poses are camera-to-world with OpenGL axes (x right, y up, z back).
 """
 
-import math
 import pathlib
 
 import numpy as np
 
-from nerfies_jax.capture import frames, text_files
+from nerfies_jax.capture import frames, text_files, transforms_lens
 from nerfies_jax.capture import images as pictures
 from nerfies_jax.capture.capture import Capture, CaptureError
 from nerfies_jax.capture.json_files import AnyPath, inside, named_file
@@ -25,7 +24,6 @@ from nerfies_jax.geometry.camera import Camera
 WHITE = (1.0, 1.0, 1.0)
 # Blender's and D-NeRF's cameras sit 4 from the origin, and their readers use 2 and 6.
 USUAL_RADIUS, USUAL_NEAR, USUAL_FAR = 4.0, 2.0, 6.0
-PINHOLES = {"", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"}
 
 
 def read(
@@ -127,76 +125,24 @@ def _picture(root, entry, file):
 
 def _cameras(entries, transforms, size, where):
     """World cameras for the pictures of this size, and what had to be assumed."""
-    if transforms.camera_model not in PINHOLES:
-        raise _no_pinhole(where, f"camera_model {transforms.camera_model}")
-    single = [_one_camera(entry, transforms, size, where) for entry in entries]
-    cameras = camera.stack([one for one, _ in single])
-    sizes = {stated for _, stated in single if stated is not None and stated != size}
-    notes = ()
-    if sizes:
-        first = min(sizes)
-        notes = (
-            f"cameras for {first[0]:g}x{first[1]:g} scaled to pictures of "
-            f"{size[0]}x{size[1]}",
+    cameras, lenses = [], []
+    for entry in entries:
+        label = f"{where}: frame {entry.file_path!r}"
+        lens = transforms_lens.resolve(entry, transforms, size, label)
+        rotation, position = _pose(entry.transform_matrix, label)
+        one = Camera(
+            camera_from_world=rotation.astype(np.float32),
+            position=position.astype(np.float32),
+            focal_px=np.float32(lens.focal_px[0]),
+            principal_point_px=np.float32(lens.principal_point_px),
+            skew_px=np.float32(0),
+            pixel_aspect=np.float32(lens.focal_px[1] / lens.focal_px[0]),
+            radial=np.float32(lens.radial),
+            tangential=np.float32(lens.tangential),
         )
-    return cameras, notes
-
-
-def _no_pinhole(where, lens):
-    return CaptureError(
-        f"{where}: {lens}; undistort the pictures to OPENCV or PINHOLE first "
-        "(ns-process-data or COLMAP do it)"
-    )
-
-
-def _one_camera(entry, transforms, size, where):
-    def lens(name, default=None):
-        own = getattr(entry, name)
-        value = own if own is not None else getattr(transforms, name)
-        return default if value is None else value
-
-    label = f"{where}: frame {entry.file_path!r}"
-    if lens("is_fisheye"):
-        raise _no_pinhole(label, "is_fisheye")
-    if lens("k4", 0.0) != 0:
-        raise CaptureError(
-            f"{label} has k4 = {lens('k4')}; undistort the pictures first"
-        )
-    width, height = lens("w", size[0]), lens("h", size[1])
-    if min(width, height) <= 0 or abs(size[0] * height / width - size[1]) > 1:
-        raise CaptureError(
-            f"{label} is {size[0]}x{size[1]} pixels but its camera says "
-            f"{width:g}x{height:g}; mend w and h or the picture"
-        )
-    angle, focal = lens("camera_angle_x"), lens("fl_x")
-    if focal is None:
-        if angle is None or not 0 < angle < math.pi:
-            raise CaptureError(
-                f"{label} has no fl_x and camera_angle_x = {angle}; give a focal "
-                "length in pixels or a field of view between 0 and pi"
-            )
-        focal = 0.5 * width / math.tan(0.5 * angle)
-    if not focal > 0:
-        raise CaptureError(f"{label} has fl_x = {focal:g}; it must be positive")
-    rotation, position = _pose(entry.transform_matrix, label)
-    one = Camera(
-        camera_from_world=rotation.astype(np.float32),
-        position=position.astype(np.float32),
-        focal_px=np.float32(focal),
-        principal_point_px=np.float32([lens("cx", width / 2), lens("cy", height / 2)]),
-        skew_px=np.float32(0),
-        pixel_aspect=np.float32(lens("fl_y", focal) / focal),
-        radial=np.float32([lens("k1", 0), lens("k2", 0), lens("k3", 0)]),
-        tangential=np.float32([lens("p1", 0), lens("p2", 0)]),
-    )
-    one = one._replace(
-        **{k: np.asarray(v * np.float32(size[0] / width)) for k, v in _lengths(one)}
-    )
-    return one, (width, height)
-
-
-def _lengths(one):
-    return [(name, getattr(one, name)) for name in ("focal_px", "principal_point_px")]
+        cameras.append(one)
+        lenses.append(lens)
+    return camera.stack(cameras), transforms_lens.notes(lenses, size)
 
 
 def _pose(matrix, label):

@@ -295,6 +295,14 @@ def _scaled(lens, stored, size, path):
             f"{path}: camera {lens.camera_id} is {lens.model_name}, a whole sphere; "
             "cut perspective pictures out of it first"
         )
+    ratio = max(1, round(lens.width / stored[0]))
+    trimmed = abs(np.array((lens.width, lens.height)) / ratio - stored)
+    if trimmed.max() >= 1:
+        raise CaptureError(
+            f"{path}: camera {lens.camera_id} is for {lens.width}x{lens.height} "
+            f"pixels, but its images have {stored[0]}x{stored[1]}; images must be a "
+            "whole fraction of that"
+        )
     copy = library().Camera(lens.todict())
     copy.rescale(*stored)
     shrink_by = stored[0] // size[0]

@@ -1,6 +1,7 @@
 """transforms*.json as they lie on disk, and which of their frames are held out."""
 
 import pathlib
+from typing import Any
 
 import msgspec
 
@@ -14,6 +15,9 @@ class Lens(msgspec.Struct, kw_only=True):
     """Intrinsics, for the whole file or for one frame; in pixels of `w` by `h`."""
 
     camera_angle_x: float | None = None  # whole horizontal field of view, rad
+    camera_angle_y: float | None = None  # whole vertical field of view, rad
+    x_fov: float | None = None  # the same in degrees, instant-ngp's
+    y_fov: float | None = None
     fl_x: float | None = None
     fl_y: float | None = None
     cx: float | None = None
@@ -27,6 +31,14 @@ class Lens(msgspec.Struct, kw_only=True):
     p1: float | None = None
     p2: float | None = None
     is_fisheye: bool | None = None  # instant-ngp's
+    camera_model: str | None = None
+
+
+# Keys that belong together: those of a frame replace all of those of its file.
+FOCAL = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
+CENTER, SIZE, MODEL = ("cx", "cy"), ("w", "h"), ("camera_model", "is_fisheye")
+DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+UNITS = (FOCAL, CENTER, SIZE, MODEL, DISTORTION)
 
 
 class Frame(Lens, kw_only=True):
@@ -42,7 +54,6 @@ class Transforms(Lens, kw_only=True):
     """One file."""
 
     frames: list[Frame] = []
-    camera_model: str = ""
     ply_file_path: str | None = None
     train_filenames: list[str] | None = None
     val_filenames: list[str] | None = None
@@ -51,6 +62,15 @@ class Transforms(Lens, kw_only=True):
     background: tuple[float, float, float] | None = None  # of opaque pictures
     up: tuple[float, float, float] | None = None
     fps: float | None = None
+
+
+# Keys that change nothing here: of the scene boxes and cameras of other programs, and
+# how the poses were found, which are in their final world.
+HARMLESS = {
+    *("aabb", "aabb_scale", "scale", "offset", "n_extra_learnable_dims", "n_frames"),
+    *("applied_transform", "applied_scale", "colmap_im_id", "sharpness", "rotation"),
+    *("orientation_override", "render_aabb", "up_vector", "image_id", "frame_id"),
+}
 
 
 class Split(msgspec.Struct):
@@ -69,6 +89,21 @@ def read_split(path: pathlib.Path, heldout: int | str | None) -> Split:
     if path.is_dir() and not file.is_file() and (path / "transforms.json").is_file():
         file = path / "transforms.json"
     transforms = read_json(file, Transforms)
+    split = _split(file, transforms, heldout)
+    return msgspec.structs.replace(split, notes=(*split.notes, *_unread(file)))
+
+
+def _unread(file):
+    """Name the keys that no reader here knows, since they may change the scene."""
+    table = read_json(file, dict[str, Any])
+    keys = set(table) - set(Transforms.__struct_fields__)
+    for entry in table["frames"]:
+        keys |= set(entry) - set(Frame.__struct_fields__)
+    keys = sorted(keys - HARMLESS)
+    return (f"keys that are not read: {', '.join(keys)}",) if keys else ()
+
+
+def _split(file, transforms, heldout):
     if not transforms.frames:
         raise CaptureError(f"{file}: no frames; list them under frames")
     if isinstance(heldout, str) and heldout not in ("val", "test"):
@@ -121,9 +156,10 @@ def read_split(path: pathlib.Path, heldout: int | str | None) -> Split:
 def _own_lens(transforms):
     """Frames that carry the intrinsics of their own file."""
     for entry in transforms.frames:
-        for field in Lens.__struct_fields__:
-            if getattr(entry, field) is None:
-                setattr(entry, field, getattr(transforms, field))
+        for unit in UNITS:
+            if all(getattr(entry, key) is None for key in unit):
+                for key in unit:
+                    setattr(entry, key, getattr(transforms, key))
     return transforms.frames
 
 

@@ -375,3 +375,13 @@ def test_nobody_else_imports_pycolmap():
         if re.search(r"import pycolmap|library\(.pycolmap", path.read_text())
     ]
     assert users == ["colmap_library.py"]
+
+
+def test_every_camera_is_held_against_the_images(tmp_path):
+    make(tmp_path)
+    model = tmp_path / "sparse/0"
+    (model / "cameras.txt").write_text(f"1 {PINHOLE}\n2 PINHOLE 20 20 30 33 10 10\n")
+    text = (model / "images.txt").read_text()
+    (model / "images.txt").write_text(text.replace(" 1 f_008", " 2 f_008"))
+    with pytest.raises(CaptureError, match="camera 2 is for 20x20 pixels"):
+        room.load(tmp_path)

@@ -1,0 +1,213 @@
+"""Intrinsics of transforms*.json, which stand at the file, at a frame, or at both."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from nerfies_jax.capture.capture import CaptureError
+from nerfies_jax.capture.transforms import (
+    CENTER,
+    DISTORTION,
+    FOCAL,
+    MODEL,
+    Frame,
+    Lens,
+    Transforms,
+)
+
+PINHOLES = {
+    *("", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"),
+    "PERSPECTIVE",
+}
+# The principal point of images n times as large is n times as far from the corner, to
+# within this share: of real lenses it lies a few percent off the center.
+CENTERED = 0.1
+ALIKE = 0.03  # of the two ratios, where they are of no whole number
+
+
+class Intrinsics(NamedTuple):
+    """Intrinsics of one frame, in pixels of its image."""
+
+    focal_px: tuple[float, float]  # horizontal and vertical
+    principal_point_px: tuple[float, float]
+    radial: tuple[float, float, float]
+    tangential: tuple[float, float]
+    size: tuple[float, float]  # of the images that the file's pixels refer to
+    larger: bool  # whether that size follows from the principal point alone
+
+
+def resolve(
+    entry: Frame, transforms: Transforms, size: tuple[int, int], label: str
+) -> Intrinsics:
+    """Resolve the intrinsics of a frame.
+
+    Size, focal lengths, principal point, camera model and distortion are one unit each:
+    a unit of which the frame has any key is the frame's, else it is the file's.
+
+    Args:
+      entry: The frame.
+      transforms: The file.
+      size: Width and height of the frame's image.
+      label: Names the frame in errors.
+
+    Raises:
+      CaptureError: A focal length is missing or impossible, the camera is no pinhole,
+        or its size has not the shape of the image.
+    """
+    distortion = _distortion(entry, transforms, label)
+    stated = _stated_size(entry) or _stated_size(transforms) or (None, None)
+    width, height = (
+        own if own is not None else whole
+        for own, whole in zip(stated, size, strict=True)
+    )
+    if min(width, height) <= 0 or abs(size[0] * height / width - size[1]) > 1:
+        raise CaptureError(
+            f"{label} is {size[0]}x{size[1]} pixels but its camera says "
+            f"{width:g}x{height:g}; mend w and h or the picture"
+        )
+    level = _level(entry, transforms, CENTER)
+    # A frame and its file may refer to different sizes; each unit has its level's.
+    center_size = _size_of(level, (width, height), size)
+    center = (
+        center_size[0] / 2 if level.cx is None else level.cx,
+        center_size[1] / 2 if level.cy is None else level.cy,
+    )
+    times = 1
+    if stated == (None, None) and None not in (level.cx, level.cy):
+        times = _times_as_large(center, size, label)
+    level = _level(entry, transforms, FOCAL)
+    focal_size = _size_of(level, (width, height), size)
+    focal = _focal(level, [times * side for side in focal_size], label)
+    return Intrinsics(
+        focal_px=tuple(f * size[0] / (times * focal_size[0]) for f in focal),
+        principal_point_px=tuple(
+            c * size[0] / (times * center_size[0]) for c in center
+        ),
+        radial=distortion[:3],
+        tangential=distortion[3:],
+        size=(times * width, times * height),
+        larger=times != 1,
+    )
+
+
+def _level(entry, transforms, keys) -> Lens:
+    """The frame if it has any of these keys, else the file."""
+    return transforms if all(getattr(entry, key) is None for key in keys) else entry
+
+
+def _stated_size(level):
+    return None if level.w is None and level.h is None else (level.w, level.h)
+
+
+def _size_of(level, resolved, size):
+    """The size that the pixels of a level refer to."""
+    width, height = _stated_size(level) or (None, None)
+    if width is None or height is None or width <= 0:
+        return resolved
+    same_shape = abs(size[0] * height / width - size[1]) <= 1
+    return (width, height) if same_shape else resolved
+
+
+def _times_as_large(center, size, label):
+    """How many times as large the images of this principal point are, usually 1."""
+    ratios = [2 * c / side for c, side in zip(center, size, strict=True)]
+    times = round(sum(ratios) / 2)
+    if times >= 1 and all(abs(each - times) <= CENTERED * times for each in ratios):
+        return times
+    # A crop moves the principal point by another share across than down, mostly.
+    if abs(ratios[0] - ratios[1]) <= ALIKE * max(map(abs, ratios)):
+        raise CaptureError(
+            f"{label} has its principal point at {center[0]:g}, {center[1]:g} in an "
+            f"image of {size[0]:g}x{size[1]:g}: the intrinsics seem to be of images "
+            f"{sum(ratios) / 2:.3g} times as large; state the size they refer to as w "
+            "and h"
+        )
+    return 1
+
+
+def _focal(level, size, label):
+    """Horizontal and vertical focal length of one level, in pixels of `size`."""
+    across = _one_focal(level, "x", size[0], label)
+    down = _one_focal(level, "y", size[1], label)
+    if across is None and down is None:
+        raise CaptureError(
+            f"{label} has no fl_x and no camera_angle_x; give a focal length in pixels "
+            "or a field of view in radians"
+        )
+    across = down if across is None else across
+    down = across if down is None else down
+    for name, focal in (("fl_x", across), ("fl_y", down)):
+        if not 0 < focal < math.inf:
+            raise CaptureError(f"{label} has {name} = {focal:g}; it must be positive")
+    return across, down
+
+
+def _one_focal(level, axis, side, label):
+    """The focal length along one axis, by the first key that is there."""
+    focal, angle = getattr(level, f"fl_{axis}"), getattr(level, f"camera_angle_{axis}")
+    degrees = getattr(level, f"{axis}_fov")
+    if focal is not None:
+        return focal
+    if angle is None and degrees is not None:
+        angle = math.radians(degrees)
+    if angle is None:
+        return None
+    if not 0 < angle < math.pi:
+        raise CaptureError(
+            f"{label} has no fl_{axis} and camera_angle_{axis} = {angle:g}; expected "
+            "a field of view between 0 and pi"
+        )
+    return 0.5 * side / math.tan(0.5 * angle)
+
+
+def _distortion(entry, transforms, label):
+    """k1, k2, k3, p1, p2 of a lens that is a pinhole up to those."""
+    level = _level(entry, transforms, MODEL)
+    if (level.camera_model or "").upper() not in PINHOLES:
+        raise _no_pinhole(label, f"camera_model {level.camera_model}")
+    if level.is_fisheye:
+        raise _no_pinhole(label, "is_fisheye")
+    other = entry.camera_model not in (None, transforms.camera_model)
+    # Coefficients of another model mean something else.
+    level = entry if other else _level(entry, transforms, DISTORTION)
+    values = {key: getattr(level, key) or 0.0 for key in DISTORTION}
+    if values["k4"] != 0:
+        raise CaptureError(
+            f"{label} has k4 = {values['k4']}; undistort the pictures first"
+        )
+    return tuple(values[key] for key in ("k1", "k2", "k3", "p1", "p2"))
+
+
+def _no_pinhole(label, lens):
+    return CaptureError(
+        f"{label}: {lens}; undistort the pictures to OPENCV or PINHOLE first "
+        "(ns-process-data or COLMAP do it)"
+    )
+
+
+def notes(found: list[Intrinsics], size: tuple[int, int]) -> tuple[str, ...]:
+    """Say what was assumed of the intrinsics of all frames of images of this size."""
+    lines = ()
+    sizes = {one.size for one in found if one.size != size and not one.larger}
+    if sizes:
+        width, height = min(sizes)
+        lines += (
+            f"cameras for {width:g}x{height:g} scaled to pictures of "
+            f"{size[0]}x{size[1]}",
+        )
+    larger = {one.size for one in found if one.larger}
+    if larger:
+        width, height = min(larger)
+        lines += (
+            f"principal point far from the center of images of {size[0]}x{size[1]}: "
+            f"intrinsics taken to be of {width:g}x{height:g} and scaled",
+        )
+    aspects = np.array([one.focal_px[1] / one.focal_px[0] for one in found])
+    odd = aspects[np.abs(aspects - 1) > 0.01]
+    if odd.size:
+        lines += (
+            f"{odd.size} frames have pixels that are not square: vertical over "
+            f"horizontal focal length {odd.min():.3g} to {odd.max():.3g}",
+        )
+    return lines
