@@ -93,7 +93,16 @@ def read(
         up=frames.unit(split.transforms.up) or (0.0, 0.0, 1.0),
         frames_per_second=split.transforms.fps,
         path=path,
-        notes=(*split.notes, *lost, *notes, *more, *when, *masked, *read_in.notes),
+        notes=(
+            *split.notes,
+            *lost,
+            *notes,
+            *more,
+            *when,
+            *masked,
+            *read_in.notes,
+            *_unread_depths(entries),
+        ),
     )
 
 
@@ -234,6 +243,17 @@ def _camera_ids(entries, times, split, is_train):
 
 def _order(entry):
     return frames.natural(entry.file_path)
+
+
+def _unread_depths(entries):
+    named = [entry.depth_file_path for entry in entries if entry.depth_file_path]
+    if not named:
+        return ()
+    folder = pathlib.PurePosixPath(named[0]).parent
+    return (
+        f"depth_file_path of {len(named)} frames is not read; the depth maps in "
+        f"{folder} can be given as external depths",
+    )
 
 
 def _valid(root, entries, file, size, shrink_by):

@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Callable
 from typing import NamedTuple
 
+from nerfies_jax.capture import gate
 from nerfies_jax.capture.capture import Capture, CaptureError
 from nerfies_jax.capture.json_files import AnyPath
 
@@ -136,11 +137,13 @@ def load(
     """
     path = pathlib.Path(path)
     reader = importlib.import_module(recognise(path).module)
-    return reader.read(
-        path,
-        factor=factor,
-        max_side=max_side,
-        heldout=heldout,
-        missing=missing,
-        **options,
+    return gate.checked(
+        reader.read(
+            path,
+            factor=factor,
+            max_side=max_side,
+            heldout=heldout,
+            missing=missing,
+            **options,
+        )
     )

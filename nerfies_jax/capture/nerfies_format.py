@@ -64,6 +64,7 @@ def read(
     notes += stored.notes
     moving = None if static is None else static < 1
     points, more = _points(path, images, cameras, views, moving)
+    depths, unread = _depths(path, views, size, total)
     return Capture(
         name=path.resolve().name,
         source="nerfies",
@@ -80,7 +81,7 @@ def read(
         camera_ids=views.camera_ids,
         valid=None if valid is None or valid.all() else valid,
         moving=moving,
-        depths=_depths(path, views, size, total),
+        depths=depths,
         flow=_flow(path / "flow", views, size, total),
         points=points,
         background=views.scene.background,
@@ -89,7 +90,7 @@ def read(
         up=frames.unit(views.extra.up) or frames.up_direction(cameras),
         frames_per_second=views.extra.fps,
         path=path,
-        notes=(*views.notes, *notes, *lost, *more),
+        notes=(*views.notes, *notes, *lost, *more, *unread),
     )
 
 
@@ -247,10 +248,14 @@ def _masks(kind, ids, size, total, black):
 def _depths(path, views, size, total):
     """z-depth in scene units; files hold world units, 0 where unknown."""
     folder, shrink_by = _reduced(path / "depth", total)
-    if folder is None or not any(folder.glob("*.npy")):
-        return None
+    if folder is None:
+        return None, ()
+    if not any(folder.glob("*.npy")):
+        stored = next(iter(folder.iterdir()), None)
+        note = f"depth/{folder.name} holds no .npy file: its depth is not read"
+        return None, () if stored is None else (note,)
     width, height = size
-    depths = np.zeros((len(views.ids), height, width), np.float32)
+    count, depths = 0, np.zeros((len(views.ids), height, width), np.float32)
     for row, name in enumerate(views.ids):
         file = text_files.find(folder, name, (".npy",))
         if file is None:
@@ -268,7 +273,12 @@ def _depths(path, views, size, total):
         known = np.isfinite(depth) & (depth > 0)
         depth = np.where(known, depth * views.scene.scale, 0).astype(np.float32)
         depths[row] = shrink_depth(depth, shrink_by)
-    return depths
+        count += 1
+    if not count:
+        return None, (
+            f"no file in depth/{folder.name} is named as a frame: depth is not read",
+        )
+    return depths, ()
 
 
 def _flow(path, views, size, total):

@@ -48,6 +48,7 @@ class Frame(Lens, kw_only=True):
     transform_matrix: list[list[float]]
     time: float | None = None
     mask_path: str | None = None  # black: do not learn from
+    depth_file_path: str | None = None  # nerfstudio's; not read, which a note says
 
 
 class Transforms(Lens, kw_only=True):

@@ -74,6 +74,7 @@ def make(
             f"no report: what the state of step {trained.result.steps:,} draws is not "
             "finite"
         )
+    quality.check_learned(trained.result.history, scored)
     ms_per_frame = renderer.ms_per_frame(len(scored.rows))
     # Products that replace earlier ones stay together.
     attempt = Attempts(together=(folder / METRICS).exists())

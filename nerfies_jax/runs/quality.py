@@ -22,6 +22,7 @@ from nerfies_jax.measure import perceptual
 from nerfies_jax.runs import budget
 from nerfies_jax.runs.config import MoreMetrics
 from nerfies_jax.runs.run import Run
+from nerfies_jax.training.loop import History
 from nerfies_jax.training.model import TrainState
 
 TRACKS = 200  # points of a built-in scene that are followed
@@ -124,3 +125,23 @@ def _floors(run, state, draw, rows, frame_seconds):
         floors.neighbour_means(run.filmed, rows),
         floors.time_averages(draw, state, run.filmed, rows, frames, moments),
     )
+
+
+def check_learned(history: History, scored: Scored) -> None:
+    """Refuse a report of a run that learned from nothing or cannot be scored.
+
+    Raises:
+        FloatingPointError: The loss was 0 in all steps, or no frame that was scored has
+            a PSNR.
+    """
+    losses = [row["loss"] for row in history.rows if "loss" in row]
+    if losses and not any(losses):
+        raise FloatingPointError(
+            "no report: the loss was 0 in all steps, so nothing was learned; check "
+            "which pixels of the capture are observed and static"
+        )
+    if len(scored.psnr) and np.isnan(scored.psnr).all():
+        raise FloatingPointError(
+            f"no report: none of the {len(scored.psnr)} held-out frames that were "
+            "scored has a PSNR; check which of their pixels are observed"
+        )

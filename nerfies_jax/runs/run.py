@@ -13,7 +13,7 @@ import psutil
 
 from nerfies_jax import capture as captures
 from nerfies_jax import events
-from nerfies_jax.capture import pinholes, synthetic
+from nerfies_jax.capture import gate, pinholes, synthetic
 from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.json_files import write_json
@@ -183,6 +183,7 @@ def stored_capture(source: CaptureSource, seed: int = 0) -> Capture:
     `seed` makes a built-in scene. Raises ValueError where it cannot be read as asked.
     """
     capture = given_files.attached(_filmed(source, seed), source.files)
+    gate.check_observed(capture)
     if source.preprocessing is None:
         return capture
     return dataclasses.replace(capture, preprocessing=source.preprocessing)

@@ -7,14 +7,24 @@ import types
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
+from nerfies_jax.capture import images, nerfies_format
+from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.evaluation import pictures
 from nerfies_jax.evaluation.representation import Saved
 from nerfies_jax.evaluation.scores import Scored
-from nerfies_jax.runs import curve_figure, products, representations, step_profile
-from nerfies_jax.runs.config import RunConfig
-from nerfies_jax.runs.run import Run, scene_spec
+from nerfies_jax.runs import (
+    curve_figure,
+    products,
+    quality,
+    representations,
+    step_profile,
+)
+from nerfies_jax.runs.config import CaptureSource, RunConfig
+from nerfies_jax.runs.run import Run, scene_spec, stored_capture
 from nerfies_jax.runs.train import Trained
+from nerfies_jax.training.loop import History
 from nerfies_jax.training.model import Rendering, TrainState
 from tests import scenes
 
@@ -23,6 +33,29 @@ def test_the_size_of_a_model_is_a_metric_where_there_is_one():
     (size,) = products.model_size(Saved(2_345_678))
     assert (size.key, size.value) == ("file.bytes", 2_345_678)
     assert products.model_size(Saved()) == []
+
+
+def test_a_run_that_learned_nothing_has_no_report():
+    image, nan = np.zeros((1, 4, 5)), np.full(1, np.nan)
+    scored = Scored(np.arange(1), image, image, image, nan + 0, nan + 0)
+    known = scored._replace(psnr=np.float32([20.0]))
+    learned = History(({"step": 5, "loss": 0.0}, {"step": 9, "loss": 0.1}))
+    quality.check_learned(learned, known)
+    quality.check_learned(History(), known)
+    with pytest.raises(FloatingPointError, match="the loss was 0 in all steps"):
+        quality.check_learned(History(learned.rows[:1]), known)
+    with pytest.raises(FloatingPointError, match="none of the 1 held-out frames"):
+        quality.check_learned(learned, scored)
+
+
+def test_a_run_on_nothing_does_not_begin(tmp_path):
+    nerfies_format.write(scenes.tiny_capture(), tmp_path / "a")
+    for file in (tmp_path / "a/rgb/1x").iterdir():
+        color = images.read_pixels(file)
+        alpha = np.ones_like(color[..., :1])  # of 255: 0 and 1 instead of 0 and 255
+        images.write_png(file, np.concatenate([color, alpha], -1))
+    with pytest.raises(CaptureError, match=r"no pixel .*255 is observed"):
+        stored_capture(CaptureSource(capture=tmp_path / "a"))
 
 
 def test_depths_of_two_cameras_are_two_files(tmp_path):

@@ -1,0 +1,95 @@
+"""Checks of every capture, whatever format it came from, by its numbers alone."""
+
+import dataclasses
+
+import numpy as np
+
+from nerfies_jax.capture.capture import Capture, CaptureError, point_depths
+
+WRONG_UNITS = 20.0  # factor between stored depths and the scene that units explain
+# Names of factors between the units of depths and of cameras.
+UNITS = (
+    (1000.0, "the depths are in millimeters and the cameras in meters"),
+    (100.0, "the depths are in centimeters and the cameras in meters"),
+    (0.001, "the depths are in meters and the cameras in millimeters"),
+    (0.01, "the depths are in meters and the cameras in centimeters"),
+)
+SAMPLES = 1_000_000  # of the pixels; more change no median
+
+
+def checked(capture: Capture) -> Capture:
+    """Check a capture that was just read.
+
+    Returns:
+        The capture, with a note for each finding.
+
+    Raises:
+        CaptureError: Nothing can be reconstructed from it, or its parts contradict each
+            other.
+    """
+    check_observed(capture)
+    notes = _depth_notes(capture)
+    if not notes:
+        return capture
+    return dataclasses.replace(capture, notes=(*capture.notes, *notes))
+
+
+def check_observed(capture: Capture) -> None:
+    """Refuse a capture without any static or observed pixel.
+
+    Raises:
+        CaptureError: No pixel of the frames to learn from, or of those held out, is
+            observed, or all of those to learn from are marked as moving, by the capture
+            or by the masks of another tool.
+    """
+    where = str(capture.path or capture.name)
+    if capture.valid is not None:
+        for rows, use in (
+            (capture.train, "frames to learn from"),
+            (capture.heldout, "held-out frames"),
+        ):
+            if rows.size and not capture.valid[rows].any():
+                raise CaptureError(
+                    f"{where}: no pixel of the {rows.size} {use} is observed; check "
+                    "the masks (white is observed) and the alpha channel of the images "
+                    "(255 is observed)"
+                )
+    given = None if capture.given is None else capture.given.moving
+    for moving in (capture.moving, given):
+        if moving is not None and moving[capture.train].all():
+            raise CaptureError(
+                f"{where}: every pixel of the {capture.train.size} frames to learn "
+                "from is marked as moving, which leaves no static scene; the masks may "
+                "be inverted"
+            )
+
+
+def _depth_notes(capture):
+    """Findings about the units of depths, against the points or near and far."""
+    if capture.depths is None:
+        return ()
+    where = str(capture.path or capture.name)
+    known = capture.depths.ravel()[:: max(1, capture.depths.size // SAMPLES)]
+    known = known[known > 0]
+    if not capture.depths.any():
+        return ("depth is stored, but no pixel has one above 0",)
+    if not known.size:
+        return ()
+    near, far = capture.near, capture.far
+    median = float(np.median(known))
+    beyond = float(((known < near) | (known > far)).mean())
+    points = point_depths(capture)
+    usual = float(np.median(points)) if points.size else float(np.sqrt(near * far))
+    ratio = median / usual
+    stated = (
+        f"the median stored depth is {median:.3g} scene units, {ratio:.3g} times that "
+        + ("of the points" if points.size else f"between near and far ({usual:.3g})")
+        + f"; near is {near:.3g} and far {far:.3g}"
+    )
+    if 1 / WRONG_UNITS < ratio < WRONG_UNITS:
+        return (f"{beyond:.0%} of depths: {stated}",) if beyond > 0.5 else ()
+    factor, reason = min(UNITS, key=lambda one: abs(np.log(ratio / one[0])))
+    way_out = "convert the depths to the unit of the cameras or remove them"
+    if abs(np.log(ratio / factor)) < np.log(3):
+        way_out = f"probably {reason}, so multiply the depths by {1 / factor:g}"
+    raise CaptureError(f"{where}: {stated}; {way_out}")

@@ -1,0 +1,103 @@
+"""Captures that can be read and cannot be right: units of depth, nothing observed."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from nerfies_jax.capture import formats, gate, images, nerfies_format
+from nerfies_jax.capture.capture import CaptureError
+from nerfies_jax.capture.given import Given
+from tests.scenes import tiny_capture
+
+
+def changed(**values):
+    return dataclasses.replace(tiny_capture(), **values)
+
+
+def filled(value):
+    return np.full(tiny_capture().images.shape[:3], value)
+
+
+def refused(capture, message):
+    with pytest.raises(CaptureError, match=message) as caught:
+        gate.checked(capture)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("with_points", [True, False])
+def test_depths_of_another_unit_are_refused(with_points):
+    good = tiny_capture() if with_points else changed(points=None)
+    assert gate.checked(good) is good
+    for factor, reason in (
+        (1000, r"in millimeters and the cameras in meters, so multiply .* by 0\.001"),
+        (100, r"in centimeters and the cameras in meters, so multiply .* by 0\.01"),
+        (0.001, r"in meters and the cameras in millimeters, .* by 1000"),
+    ):
+        depths = np.float32(factor) * good.depths
+        refused(dataclasses.replace(good, depths=depths), reason)
+
+
+def test_depths_that_are_doubtful_are_said():
+    far = changed(depths=np.float32(8) * tiny_capture().depths)
+    (note,) = gate.checked(far).notes[len(far.notes) :]
+    assert "of depths: the median stored depth is" in note
+    none = changed(depths=np.zeros_like(tiny_capture().depths))
+    assert "no pixel has one above 0" in gate.checked(none).notes[-1]
+
+
+def test_a_stored_capture_in_millimeters_is_refused(tmp_path):
+    nerfies_format.write(tiny_capture(), tmp_path / "a")
+    for file in (tmp_path / "a/depth/1x").glob("*.npy"):
+        np.save(file, 1000 * np.load(file))
+    with pytest.raises(CaptureError, match="millimeters"):
+        formats.load(tmp_path / "a")
+
+
+def test_depth_files_that_are_not_read_are_said(tmp_path):
+    nerfies_format.write(tiny_capture(), tmp_path / "a")
+    folder = tmp_path / "a/depth/1x"
+    for file in folder.glob("*.npy"):
+        file.rename(folder / f"depth_{file.name}")
+    capture = formats.load(tmp_path / "a")
+    assert capture.depths is None
+    assert "no file in depth/1x is named as a frame" in " ".join(capture.notes)
+    for file in folder.glob("*.npy"):
+        file.rename(file.with_suffix(".png"))
+    notes = " ".join(formats.load(tmp_path / "a").notes)
+    assert "depth/1x holds no .npy file" in notes
+
+
+def test_depths_of_transforms_are_said_not_to_be_read(tmp_path):
+    pixels = np.full((6, 8, 3), 90, np.uint8)
+    entries = []
+    for row in range(3):
+        pose = np.eye(4)
+        pose[0, 3] = row
+        images.write_png(tmp_path / f"{row}.png", pixels)
+        entries.append(
+            {
+                "file_path": f"{row}.png",
+                "depth_file_path": f"depth/{row}.png",
+                "transform_matrix": pose.tolist(),
+            }
+        )
+    table = {"fl_x": 9.0, "w": 8, "h": 6, "frames": entries}
+    (tmp_path / "transforms.json").write_text(json.dumps(table))
+    notes = " ".join(formats.load(tmp_path).notes)
+    assert "depth_file_path of 3 frames is not read; the depth maps in depth" in notes
+
+
+def test_nothing_observed_or_nothing_static_is_refused():
+    capture = tiny_capture()
+    refused(changed(valid=filled(False)), "no pixel of the .* frames to learn from")
+    valid = filled(True)
+    valid[capture.heldout] = False
+    refused(changed(valid=valid), "no pixel of the .* held-out frames")
+    refused(changed(moving=filled(True)), "leaves no static scene.* inverted")
+    given = Given(capture.size, moving=filled(True))
+    refused(changed(given=given), "leaves no static scene")
+    moving = filled(True)
+    moving[capture.train[0], 0, 0] = False
+    assert gate.checked(changed(moving=moving)).moving.any()
