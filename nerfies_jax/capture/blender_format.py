@@ -7,7 +7,7 @@ import pathlib
 
 import numpy as np
 
-from nerfies_jax.capture import frames, text_files, transforms_lens
+from nerfies_jax.capture import frames, name_times, text_files, transforms_lens
 from nerfies_jax.capture import images as pictures
 from nerfies_jax.capture.capture import Capture, CaptureError
 from nerfies_jax.capture.json_files import AnyPath, inside, named_file
@@ -17,7 +17,7 @@ from nerfies_jax.capture.points import (
     place_by_points,
     read_ply,
 )
-from nerfies_jax.capture.transforms import read_split
+from nerfies_jax.capture.transforms import read_split, stems
 from nerfies_jax.geometry import camera
 from nerfies_jax.geometry.camera import Camera
 
@@ -65,7 +65,9 @@ def read(
         points = read_ply(named_file(root, split.transforms.ply_file_path, split.file))
     placement, more = _place(cameras, points, split.transforms, images.shape[2:0:-1])
     offset = cameras.position.astype(np.float64) - placement.centre
-    times, when = _times(entries, split, is_train)
+    times, camera_ids, when = _times(entries, split)
+    if camera_ids is None:
+        camera_ids = _camera_ids(entries, times, split, is_train)
     size = images.shape[2:0:-1]
     valid, masked = _valid(root, entries, split.file, size, shrink_by)
     return Capture(
@@ -83,7 +85,7 @@ def read(
         far=placement.far if far is None else far,
         warp_ids=frames.dense(times),
         appearance_ids=np.zeros(len(rows), np.int32),
-        camera_ids=_camera_ids(entries, times, split, is_train),
+        camera_ids=camera_ids,
         valid=frames.both(valid, read_in.observed),
         points=_placed(points, placement),
         background=background if alpha is not None else split.transforms.background,
@@ -196,8 +198,8 @@ def _place(cameras, points, transforms, size):
     return place_by_cameras(cameras), (note,)
 
 
-def _times(entries, split, is_train):
-    """Times as stored; what is missing is filled in by order, as D-NeRF does."""
+def _times(entries, split):
+    """Times as stored, or those that the names tell, with the cameras they tell."""
     stored = [entry.time for entry in entries]
     count = len(entries)
     if all(time is not None for time in stored):
@@ -209,23 +211,13 @@ def _times(entries, split, is_train):
                 f"{split.file}: frame {entries[row].file_path!r} has time "
                 f"{times[row]:g}; times run from 0 to 1, so divide by the last one"
             )
-        return times, ()
-    if not any(time is not None for time in stored):
-        if split.file.name == "transforms_train.json":
-            return np.zeros(count, np.float32), ("no times: taken as a static scene",)
-        order = np.argsort(
-            np.array(sorted(range(count), key=lambda r: _order(entries[r])))
-        )
-        return frames.spread(order), (
-            "no times: frames are evenly spaced in name order",
-        )
-    times = np.zeros(count, np.float32)
-    for rows in (np.flatnonzero(is_train), np.flatnonzero(~is_train)):
-        for place, row in enumerate(rows):
-            own = stored[row]
-            times[row] = place / max(len(rows) - 1, 1) if own is None else own
-    lost = sum(time is None for time in stored)
-    return times, (f"{lost} frames have no time: filled in by their order",)
+        return times, None, ()
+    if split.file.name == "transforms_train.json":
+        note = "no times: taken as a static scene"
+        return np.zeros(count, np.float32), None, (note,)
+    clock = name_times.clock(stems(entries))
+    note = "no times: taken from the names of the images"
+    return frames.spread(clock.times), clock.cameras, (note, *clock.notes)
 
 
 def _camera_ids(entries, times, split, is_train):
@@ -239,10 +231,6 @@ def _camera_ids(entries, times, split, is_train):
     if np.ptp(times) == 0 or len(seen) == len({time for time, _ in seen}):
         return np.zeros(len(entries), np.int32)
     return frames.dense(names)
-
-
-def _order(entry):
-    return frames.natural(entry.file_path)
 
 
 def _unread_depths(entries):

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from nerfies_jax.capture import frames
+from nerfies_jax.capture import frames, name_times
 from nerfies_jax.capture import images as pictures
 from nerfies_jax.capture.borders import without_black_borders
 from nerfies_jax.capture.capture import Capture, CaptureError, PointCloud
@@ -72,11 +72,16 @@ def read(
     centre, scale = np.array(placement.centre), placement.scale
     cameras = _cameras(lenses, model.rotations, (model.positions - centre) * scale)
     ids = tuple(map(name_of, model.names))
-    moments, more = frames.clock(ids)
-    times = frames.spread(moments)
-    notes += more
+    clock = name_times.clock(
+        [pathlib.PurePosixPath(name).with_suffix("").as_posix() for name in model.names]
+    )
+    times = frames.spread(clock.times)
+    notes += clock.notes
+    if clock.cameras is not None:  # one device is not at two places at one time
+        model = model._replace(camera_ids=clock.cameras)
     every = frames.HELD_OUT if heldout is None else heldout
-    train, scored = frames.hold_out_every(len(ids), every, str(path))
+    group = np.zeros(len(ids)) if clock.cameras is None else clock.cameras
+    train, scored = frames.hold_out_in_time(times, group, every, str(path))
     notes += (f"every {every}th frame is held out",)
     return Capture(
         name=path.resolve().name,

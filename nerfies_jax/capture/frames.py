@@ -1,6 +1,5 @@
 """What every reader does with its list of frames: pick, order, split, decode."""
 
-import datetime
 import math
 import pathlib
 import re
@@ -255,6 +254,25 @@ def read_masks(
     return share, (note,)
 
 
+def hold_out_in_time(
+    times: ArrayLike, camera_ids: ArrayLike, every: int, where: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """`hold_out_every` of frames in order of time, one camera after the other.
+
+    Args:
+      times: Frame times, in any order.
+      camera_ids: Physical camera of each frame.
+      every: One of so many frames is held out.
+      where: Names the capture in errors.
+
+    Returns:
+      Rows to learn from and rows to score on, each in rising order.
+    """
+    order = np.lexsort((times, camera_ids))
+    kept, scored = hold_out_every(len(order), every, where)
+    return np.sort(order[kept]), np.sort(order[scored])
+
+
 def hold_out_every(count: int, every: int, where: str) -> tuple[np.ndarray, np.ndarray]:
     """Rows to learn from and to score on: the middle one of every `every` frames.
 
@@ -276,36 +294,6 @@ def hold_out_every(count: int, every: int, where: str) -> tuple[np.ndarray, np.n
 def dense(values: ArrayLike) -> np.ndarray:
     """0..n-1 in the order of the values, equal for equal ones; int32."""
     return np.unique(np.asarray(values), return_inverse=True)[1].astype(np.int32)
-
-
-def clock(stems: Sequence[str]) -> tuple[list[int], tuple[str, ...]]:
-    """Milliseconds or frame numbers at the end of the names, else their order.
-
-    Milliseconds where the names end in a date and a time of day, as those of phones. A
-    note says so of an order.
-    """
-    moments = [_milliseconds(stem) for stem in stems]
-    # As counts, minute and hour boundaries would be gaps of 41 and 4041 frames.
-    if None not in moments:
-        return moments, ()
-    split = [re.fullmatch(r"(.*?)(\d+)", stem) for stem in stems]
-    if all(split) and len({match.group(1) for match in split}) == 1:
-        return [int(match.group(2)) for match in split], ()
-    note = "times are the order of the pictures' names: those end in no common count"
-    return list(range(len(stems))), (note,)
-
-
-def _milliseconds(stem):
-    """Since 1970, of a name that ends like IMG_20240131_235959; None of others."""
-    match = re.search(r"(?<!\d)(\d{8})[_-]?(\d{6})(\d{3})?$", stem)
-    if match is None:
-        return None
-    try:
-        moment = datetime.datetime.strptime(match[1] + match[2], "%Y%m%d%H%M%S")
-    except ValueError:
-        return None
-    since = moment - datetime.datetime(1970, 1, 1)
-    return since // datetime.timedelta(milliseconds=1) + int(match[3] or 0)
 
 
 def spread(values: ArrayLike) -> np.ndarray:

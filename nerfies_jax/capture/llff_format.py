@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nerfies_jax.capture import frames
+from nerfies_jax.capture import frames, name_times
 from nerfies_jax.capture import images as pictures
 from nerfies_jax.capture.borders import without_black_borders
 from nerfies_jax.capture.capture import Capture, CaptureError
@@ -63,11 +63,14 @@ def read(
     placed = _placed(poses)
     cameras = _cameras(poses, placed, (images.shape[2], images.shape[1]))
     names = tuple(file.stem for file in files)
-    moments, more = frames.clock(names)
-    times = frames.spread(moments)
-    notes += more
+    clock = name_times.clock(names)
+    times = frames.spread(clock.times)
+    notes += clock.notes
+    camera_ids = np.zeros(len(files), np.int32)
+    if clock.cameras is not None:
+        camera_ids = clock.cameras
     every = frames.HELD_OUT if heldout is None else heldout
-    train, scored = frames.hold_out_every(len(files), every, str(path))
+    train, scored = frames.hold_out_in_time(times, camera_ids, every, str(path))
     return Capture(
         name=path.resolve().name,
         source="llff",
@@ -81,7 +84,7 @@ def read(
         far=placed.far,
         warp_ids=frames.dense(times),
         appearance_ids=np.arange(len(files), dtype=np.int32),
-        camera_ids=np.zeros(len(files), np.int32),
+        camera_ids=camera_ids,
         valid=valid,
         scale=placed.scale,
         centre=placed.centre,

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from nerfies_jax.capture import frames
+from nerfies_jax.capture import frames, name_times
 from nerfies_jax.capture.capture import (
     MAX_ID,
     Capture,
@@ -66,7 +66,9 @@ class SplitFile(msgspec.Struct):
 class Moment(msgspec.Struct):
     """One entry of `metadata.json`."""
 
-    warp_id: int | Triple = 0  # HyperNeRF's interpolation: left, right, progression
+    warp_id: int | Triple | None = (
+        None  # HyperNeRF's interpolation: left, right, progression
+    )
     appearance_id: int | Triple = 0
     camera_id: int = 0
     time_id: float | None = None
@@ -279,8 +281,10 @@ def _when(number):
 def _moments(path, ids):
     file = path / "metadata.json"
     if not file.exists():
-        moments = [Moment(warp_id=row, appearance_id=row) for row in range(len(ids))]
-        return moments, ("no metadata.json: each frame is a moment of its own",)
+        moments = [Moment(appearance_id=row) for row in range(len(ids))]
+        return _times_of_names(
+            moments, ids, "no metadata.json: each frame is a moment of its own"
+        )
     table = read_json(file, dict[str, Moment])
     absent = [name for name in ids if name not in table]
     if absent:
@@ -292,15 +296,61 @@ def _moments(path, ids):
     for name, moment in zip(ids, moments, strict=True):
         for key in ("warp_id", "appearance_id", "camera_id"):
             value = _when(getattr(moment, key))
-            if not 0 <= value < MAX_ID:
+            if value is not None and not 0 <= value < MAX_ID:
                 raise CaptureError(
                     f"{file}: frame {name!r} has {key} {value}; expected 0 to "
                     f"{MAX_ID - 1}"
                 )
+    moments, notes = _complete(moments, file, ids)
     between = sum(isinstance(moment.warp_id, tuple) for moment in moments)
     if between:
-        return moments, (f"{between} frames lie between two moments (HyperNeRF)",)
-    return moments, ()
+        notes += (f"{between} frames lie between two moments (HyperNeRF)",)
+    return moments, notes
+
+
+def _complete(moments, file, ids):
+    """Moments that all have a warp_id, and notes of where it is from."""
+    absent = [
+        name for name, one in zip(ids, moments, strict=True) if one.warp_id is None
+    ]
+    if not absent:
+        return moments, ()
+    for key in ("time_id", "time"):
+        values = [getattr(one, key) for one in moments]
+        if None not in values:
+            return _with_warp_ids(moments, values), ()
+    if len(absent) < len(ids):
+        raise CaptureError(
+            f"{file}: {len(absent)} of {len(ids)} frames have no warp_id "
+            f"({', '.join(absent[:5])}); add it, or remove it from all to take times "
+            "from the names"
+        )
+    return _times_of_names(
+        moments, ids, f"no warp_id, time_id or time in {file.name}: taken from names"
+    )
+
+
+def _times_of_names(moments, ids, note):
+    clock = name_times.clock(ids)
+    moments = _with_warp_ids(moments, clock.times)
+    if clock.cameras is not None and not any(one.camera_id for one in moments):
+        moments = [
+            msgspec.structs.replace(one, camera_id=camera_id)
+            for one, camera_id in zip(moments, clock.cameras.tolist(), strict=True)
+        ]
+    spread = frames.spread(clock.times).tolist()
+    moments = [
+        msgspec.structs.replace(one, time=when)
+        for one, when in zip(moments, spread, strict=True)
+    ]
+    return moments, (note, *clock.notes)
+
+
+def _with_warp_ids(moments, values):
+    return [
+        msgspec.structs.replace(one, warp_id=warp_id)
+        for one, warp_id in zip(moments, frames.dense(values).tolist(), strict=True)
+    ]
 
 
 def _times(moments, path, ids):

@@ -1,11 +1,13 @@
 """transforms*.json as they lie on disk, and which of their frames are held out."""
 
+import collections
 import pathlib
 from typing import Any
 
 import msgspec
+import numpy as np
 
-from nerfies_jax.capture import frames, text_files
+from nerfies_jax.capture import frames, name_times, text_files
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.json_files import read_json
 from nerfies_jax.capture.nearest import known_names
@@ -74,6 +76,9 @@ HARMLESS = {
 }
 
 
+ROUNDING = 1e-6  # of times, which may be stored in float32
+
+
 class Split(msgspec.Struct):
     """Frames to learn from and to score on."""
 
@@ -90,8 +95,72 @@ def read_split(path: pathlib.Path, heldout: int | str | None) -> Split:
     if path.is_dir() and not file.is_file() and (path / "transforms.json").is_file():
         file = path / "transforms.json"
     transforms = read_json(file, Transforms)
+    notes = _fill_times(file, transforms.frames)
     split = _split(file, transforms, heldout)
-    return msgspec.structs.replace(split, notes=(*split.notes, *_unread(file)))
+    return msgspec.structs.replace(split, notes=(*split.notes, *notes, *_unread(file)))
+
+
+def _fill_times(file, entries):
+    """Give frames without a time one between those of their neighbors in name order.
+
+    Frames of one folder are neighbors. Where no frame has a time all stay without.
+    """
+    lost = [entry for entry in entries if entry.time is None]
+    if not lost or len(lost) == len(entries):
+        return ()
+    folders = collections.defaultdict(list)
+    for entry in entries:
+        path = text_files.forward_slashes(entry.file_path)
+        folders[pathlib.PurePosixPath(path).parent].append(entry)
+    for group in folders.values():
+        _fill_folder(file, group)
+    return (f"{len(lost)} frames have no time: filled in between their neighbors",)
+
+
+def _fill_folder(file, entries):
+    lost = [entry for entry in entries if entry.time is None]
+    known = [entry for entry in entries if entry.time is not None]
+    if not lost:
+        return
+    clock = name_times.clock(stems(entries)).times
+    when = dict(zip(map(id, entries), clock, strict=True))
+    places, rows = np.unique([float(when[id(entry)]) for entry in known], True)
+    times = np.array([known[row].time for row in rows.tolist()], float)
+    for entry in lost:
+        place = when[id(entry)]
+        time = -1.0
+        if len(places) > 1:
+            row = int(np.clip(np.searchsorted(places, place), 1, len(places) - 1))
+            share = (place - places[row - 1]) / (places[row] - places[row - 1])
+            time = float(times[row - 1] + share * (times[row] - times[row - 1]))
+        if not -ROUNDING <= time <= 1 + ROUNDING:
+            raise CaptureError(
+                f"{file}: frame {entry.file_path!r} has no time, and none follows from "
+                f"those of the {len(known)} other frames of its folder; add it"
+            )
+        entry.time = min(max(time, 0.0), 1.0)
+
+
+def _fill_file(file, entries, others):
+    """Spread times evenly over a split without any, as D-NeRF does, if others have."""
+    if not entries or entries[0].time is not None:
+        return ()
+    if not others or others[0].time is None:
+        return ()
+    for entry, time in zip(entries, np.linspace(0, 1, len(entries)), strict=True):
+        entry.time = float(time)
+    return (f"no times in {file.name}: spread evenly by the order of its frames",)
+
+
+def stems(entries: list[Frame]) -> list[str]:
+    """Paths of images without the endings of image files."""
+    paths = [text_files.forward_slashes(entry.file_path) for entry in entries]
+    return [
+        path.removesuffix(suffix)
+        if (suffix := pathlib.PurePosixPath(path).suffix).lower() in frames.SUFFIXES
+        else path
+        for path in paths
+    ]
 
 
 def _unread(file):
@@ -122,13 +191,17 @@ def _split(file, transforms, heldout):
         for name in wanted:
             other = file.with_name(f"transforms_{name}.json")
             if other.is_file():
-                scored = _own_lens(read_json(other, Transforms))
+                second = read_json(other, Transforms)
+                more = _fill_times(other, second.frames)
+                more += _fill_file(file, transforms.frames, second.frames)
+                more += _fill_file(other, second.frames, transforms.frames)
+                scored = _own_lens(second)
                 return Split(
                     file,
                     transforms,
                     transforms.frames,
                     scored,
-                    (f"the {name} split is held out",),
+                    (f"the {name} split is held out", *more),
                 )
     if isinstance(heldout, str):
         raise CaptureError(
@@ -139,10 +212,14 @@ def _split(file, transforms, heldout):
     pool = transforms.frames
     if transforms.train_filenames is not None and heldout is None:
         pool = _taken(file, transforms, transforms.train_filenames)
-    ordered = sorted(
-        pool,
-        key=lambda entry: (entry.time or 0.0, frames.natural(entry.file_path)),
+    times = [0.0 if entry.time is None else entry.time for entry in pool]
+    if not any(times):
+        times = name_times.clock(stems(pool)).times
+    order = sorted(
+        range(len(pool)),
+        key=lambda row: (times[row], frames.natural(pool[row].file_path)),
     )
+    ordered = [pool[row] for row in order]
     every = frames.HELD_OUT if heldout is None else heldout
     kept, scored = frames.hold_out_every(len(ordered), every, str(file))
     return Split(

@@ -7,6 +7,7 @@ import pytest
 
 from nerfies_jax.capture import capture as capturing
 from nerfies_jax.capture import frames as frames_of_files
+from nerfies_jax.capture import name_times
 from nerfies_jax.capture.capture import Capture, PointCloud
 from nerfies_jax.geometry import camera
 from tests import scenes
@@ -55,10 +56,40 @@ def test_few_frames_hold_one_out_and_two_none(count, every, expected):
 
 
 def test_names_without_a_common_count_have_an_order_and_a_note():
-    assert frames_of_files.clock(["a_07", "a_09"]) == ([7, 9], ())
-    numbers, (note,) = frames_of_files.clock(["left_07", "right_07"])
-    assert numbers == [0, 1]
+    assert name_times.clock(["a_07", "a_09"]) == ([7, 9], None, ())
+    numbers, _, (note,) = name_times.clock(["right_07", "left_07"])
+    assert numbers == [1, 0]
     assert "order" in note
+
+
+@pytest.mark.parametrize(
+    ("names", "times", "cameras"),
+    [
+        (["t0.0", "t0.05", "t0.1", "t0.25"], [0, 0.05, 0.1, 0.25], None),
+        (
+            ["1305031102.175304", "1305031102.2"],
+            [1305031102.175304, 1305031102.2],
+            None,
+        ),
+        (["1.9", "1.10", "1.1"], [9, 10, 1], None),  # counts: 1.1 and 1.10 differ
+        (["f_3_rgb2", "f_12_rgb2"], [3, 12], None),
+        (["a/0", "a/1", "b/0", "b/1"], [0, 1, 0, 1], [0, 0, 1, 1]),
+        (["a\\0", "a\\1", "b\\0", "b\\1"], [0, 1, 0, 1], [0, 0, 1, 1]),
+        (["cam1_0.5", "cam1_1", "cam2_0.5", "cam2_1"], [0.5, 1, 0.5, 1], [0, 0, 1, 1]),
+        (["7/cam1", "7/cam2", "9/cam1", "9/cam2"], [7, 7, 9, 9], [0, 1, 0, 1]),
+        # Clips that follow each other share few numbers.
+        (["a/0", "a/1", "b/1", "b/2", "b/3"], [0, 1, 2, 3, 4], None),
+        (
+            ["d_20240131_000050", "d_20240131_000100", "d_20240131_000150"],
+            [50, 100, 150],
+            None,
+        ),
+    ],
+)
+def test_names_tell_times_and_cameras(names, times, cameras):
+    clock = name_times.clock(names)
+    assert clock.times == times
+    assert (None if clock.cameras is None else clock.cameras.tolist()) == cameras
 
 
 @pytest.mark.parametrize(
@@ -71,7 +102,7 @@ def test_names_without_a_common_count_have_an_order_and_a_note():
     ],
 )
 def test_phones_name_pictures_by_date_and_time_of_day(stems, gaps):
-    moments, notes = frames_of_files.clock(stems)
+    moments, _, notes = name_times.clock(stems)
     assert np.diff(moments).tolist() == gaps
     assert notes == ()
 

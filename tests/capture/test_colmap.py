@@ -385,3 +385,19 @@ def test_every_camera_is_held_against_the_images(tmp_path):
     (model / "images.txt").write_text(text.replace(" 1 f_008", " 2 f_008"))
     with pytest.raises(CaptureError, match="camera 2 is for 20x20 pixels"):
         room.load(tmp_path)
+
+
+def test_equal_numbers_of_two_folders_are_equal_times(tmp_path):
+    make(tmp_path, count=8)
+    model = tmp_path / "sparse/0/images.txt"
+    text = model.read_text()
+    for row in range(8):
+        name = f"cam{row // 4}/{row % 4:02d}.png"
+        (tmp_path / "images" / name).parent.mkdir(exist_ok=True)
+        (tmp_path / f"images/f_{row:03d}.png").rename(tmp_path / "images" / name)
+        text = text.replace(f"f_{row:03d}.png", name)
+    model.write_text(text)
+    capture = room.load(tmp_path)
+    np.testing.assert_allclose(capture.times, [0, 1 / 3, 2 / 3, 1] * 2, atol=1e-6)
+    assert capture.camera_ids.tolist() == [0] * 4 + [1] * 4
+    assert any("equal times" in note for note in capture.notes)

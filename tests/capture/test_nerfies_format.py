@@ -518,3 +518,22 @@ def test_a_real_dycheck_capture_has_its_cameras_without_pictures(data_dir):
         assert np.ptp(camera.take(views.cameras, rows).position, axis=0).max() == 0
     with pytest.raises(CaptureError, match="read_cameras"):
         nerfies_format.read(scene)
+
+
+def test_metadata_without_times_takes_those_of_the_names(tmp_path):
+    """They were all 0, so that a moving scene was read as a static one."""
+    make(tmp_path)
+    file = tmp_path / "metadata.json"
+    table = json.loads(file.read_text())
+    for entry in table.values():
+        del entry["warp_id"]
+    dump(file, table)
+    views = nerfies_views.read_cameras(tmp_path)
+    np.testing.assert_allclose(views.times, np.linspace(0, 1, 6), atol=1e-6)
+    assert views.warp_ids.tolist() == list(range(6))
+    assert views.camera_ids.tolist() == [0, 1] * 3
+    assert any("no warp_id, time_id or time" in note for note in views.notes)
+    table["002"]["warp_id"] = 3
+    dump(file, table)
+    with pytest.raises(CaptureError, match=r"5 of 6 frames have no warp_id \(000, "):
+        nerfies_views.read_cameras(tmp_path)
