@@ -58,6 +58,11 @@ def read(
     _, shrink_by = frames.choose_source({1: root}, full, factor, max_side, where)
     read_in = frames.read_frames(files, shrink_by, background)
     images, alpha = read_in.images, read_in.alpha
+    if alpha is not None and not alpha.any():
+        raise CaptureError(
+            f"{where}: all pixels of all images are transparent (alpha 0); save them "
+            "with their alpha, or as RGB without it"
+        )
     cameras, notes = _cameras(entries, split.transforms, full, where)
     cameras = camera.resize(cameras, (shrink_by, shrink_by), (1, 1))
     points = None

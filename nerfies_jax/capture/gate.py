@@ -1,6 +1,7 @@
 """Checks of every capture, whatever format it came from, by its numbers alone."""
 
 import dataclasses
+import pathlib
 
 import numpy as np
 
@@ -14,6 +15,8 @@ UNITS = (
     (0.001, "the depths are in meters and the cameras in millimeters"),
     (0.01, "the depths are in meters and the cameras in centimeters"),
 )
+MASKS = ("masks", "mask", "motion_masks", "dynamic_masks")
+DEPTHS = ("depth", "depths", "depth_maps", "disp")
 SAMPLES = 1_000_000  # of the pixels; more change no median
 
 
@@ -28,7 +31,7 @@ def checked(capture: Capture) -> Capture:
             other.
     """
     check_observed(capture)
-    notes = _depth_notes(capture)
+    notes = (*_depth_notes(capture), *_unread_notes(capture))
     if not notes:
         return capture
     return dataclasses.replace(capture, notes=(*capture.notes, *notes))
@@ -64,6 +67,30 @@ def check_observed(capture: Capture) -> None:
             )
 
 
+def _unread_notes(capture):
+    """Folders next to the capture whose names promise what was not read."""
+    if capture.path is None:
+        return ()
+    root = pathlib.Path(capture.path)
+    root = root if root.is_dir() else root.parent
+    notes = []
+    for names, has, way_out in (
+        (MASKS, capture.valid is not None or capture.moving is not None, "masks"),
+        (DEPTHS, capture.depths is not None, "depths"),
+    ):
+        there = [name for name in names if _has_files(root / name)]
+        if there and not has:
+            notes.append(
+                f"the folder {there[0]} is not read: nothing in the capture names its "
+                f"files; they can be given as external {way_out}"
+            )
+    return tuple(notes)
+
+
+def _has_files(folder):
+    return folder.is_dir() and any(folder.iterdir())
+
+
 def _depth_notes(capture):
     """Findings about the units of depths, against the points or near and far."""
     if capture.depths is None:
@@ -90,6 +117,8 @@ def _depth_notes(capture):
         return (f"{beyond:.0%} of depths: {stated}",) if beyond > 0.5 else ()
     factor, reason = min(UNITS, key=lambda one: abs(np.log(ratio / one[0])))
     way_out = "convert the depths to the unit of the cameras or remove them"
+    if abs(np.log(ratio / capture.scale)) < abs(np.log(ratio / factor)):
+        factor, reason = capture.scale, "the depths are in scene units already"
     if abs(np.log(ratio / factor)) < np.log(3):
         way_out = f"probably {reason}, so multiply the depths by {1 / factor:g}"
     raise CaptureError(f"{where}: {stated}; {way_out}")

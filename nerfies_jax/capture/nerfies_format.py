@@ -241,7 +241,8 @@ def _masks(kind, ids, size, total, black):
         return None, ()
     paths = [text_files.find(folder, name, (".png.png", ".png")) for name in ids]
     if not any(paths):
-        return None, ()
+        note = f"no file in {kind.name}/{folder.name} is named as a frame: not read"
+        return None, (note,) if any(folder.iterdir()) else ()
     return frames.read_masks(paths, size, shrink_by, black)
 
 

@@ -39,6 +39,11 @@ def test_depths_of_another_unit_are_refused(with_points):
         refused(dataclasses.replace(good, depths=depths), reason)
 
 
+def test_depths_in_scene_units_are_told_from_other_units():
+    capture = changed(scale=0.02, depths=np.float32(0.02) * tiny_capture().depths)
+    refused(capture, "in scene units already, so multiply the depths by 50")
+
+
 def test_depths_that_are_doubtful_are_said():
     far = changed(depths=np.float32(8) * tiny_capture().depths)
     (note,) = gate.checked(far).notes[len(far.notes) :]
@@ -67,6 +72,39 @@ def test_depth_files_that_are_not_read_are_said(tmp_path):
         file.rename(file.with_suffix(".png"))
     notes = " ".join(formats.load(tmp_path / "a").notes)
     assert "depth/1x holds no .npy file" in notes
+
+
+@pytest.mark.parametrize("folder", ["masks", "depth_maps"])
+def test_a_folder_that_nothing_names_is_said(tmp_path, folder):
+    bare = changed(valid=None, moving=None, depths=None)
+    nerfies_format.write(bare, tmp_path / "a")
+    quiet = formats.load(tmp_path / "a").notes
+    images.write_png(tmp_path / "0.png", filled(True)[0])
+    (tmp_path / "a" / folder).mkdir()
+    assert formats.load(tmp_path / "a").notes == quiet
+    (tmp_path / "0.png").rename(tmp_path / "a" / folder / "0.png")
+    (note,) = set(formats.load(tmp_path / "a").notes) - set(quiet)
+    assert f"the folder {folder} is not read" in note
+
+
+def test_masks_named_as_no_frame_are_said(tmp_path):
+    nerfies_format.write(tiny_capture(), tmp_path / "a")
+    folder = tmp_path / "a/resized_mask/1x"
+    for file in folder.iterdir():
+        file.rename(folder / f"mask_{file.name}")
+    notes = " ".join(formats.load(tmp_path / "a").notes)
+    assert "no file in resized_mask/1x is named as a frame" in notes
+
+
+def test_images_that_are_transparent_everywhere_are_refused(tmp_path):
+    table = {"fl_x": 9.0, "frames": []}
+    for row in range(3):
+        images.write_png(tmp_path / f"{row}.png", np.zeros((6, 8, 4), np.uint8))
+        pose = np.eye(4).tolist()
+        table["frames"].append({"file_path": f"{row}.png", "transform_matrix": pose})
+    (tmp_path / "transforms.json").write_text(json.dumps(table))
+    with pytest.raises(CaptureError, match="are transparent"):
+        formats.load(tmp_path)
 
 
 def test_depths_of_transforms_are_said_not_to_be_read(tmp_path):
