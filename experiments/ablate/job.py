@@ -4,7 +4,6 @@ import gc
 import hashlib
 import os
 import pathlib
-import tempfile
 import time
 from typing import Any, NamedTuple
 
@@ -19,6 +18,7 @@ from experiments.ablate.results import ArmResult
 from experiments.ablate.settings import Ablate
 from nerfies_jax import console, evaluation, runs
 from nerfies_jax.capture import pinholes, synthetic
+from nerfies_jax.capture.json_files import scratch_folder
 from nerfies_jax.capture.synthetic import truth as truths
 from nerfies_jax.evaluation import heldout, moving_masks, protocol
 from nerfies_jax.evaluation.lens import ThroughLens
@@ -263,7 +263,7 @@ class Job:
                 len(self.known.rows), cpu=jax.default_backend() == "cpu"
             ),
             "peak_mb": clock.peak_bytes() / 1e6,
-            **_model_sizes(arm, result.state),
+            **_model_sizes(self.out / f"{name}-{seed}", arm, result.state),
         }
         if compiled_before:  # most of it in this very process
             numbers["compile_seconds"] = float("nan")
@@ -386,13 +386,12 @@ class Job:
         return [task for task in self.tasks() if not self.is_finished(*task)]
 
 
-def _model_sizes(arm, state):
+def _model_sizes(place, arm, state):
     """MB of the file that holds a trained scene, or of its parameters where none does.
 
     And of the scene as it is coded; NaN where nothing says how.
     """
-    with tempfile.TemporaryDirectory() as scratch:
-        folder = pathlib.Path(scratch)
+    with scratch_folder(place) as folder:
         saved = arm.representation.save(folder, arm.spec, arm.metadata, state)
     held, coded = saved.model_bytes, saved.coded_bytes
     if held is None:

@@ -6,6 +6,7 @@ import os
 import pathlib
 import subprocess
 import sys
+import tempfile
 import time
 from typing import NamedTuple
 
@@ -130,8 +131,21 @@ def _is_well(job, task, ended):
         return True
     reason = f"exit code {code}" if code else "made by another process, not yet there"
     last = ended.log.read_text(errors="replace").strip().splitlines()[-1:]
-    log(f"    {_name(task)} failed ({reason}); {ended.log} ends with: {''.join(last)}")
+    log(
+        f"    {_name(task)} failed ({reason}); {ended.log} ends with: {''.join(last)}"
+        f"{_unwritable(job.out)}"
+    )
     return False
+
+
+def _unwritable(folder):
+    """Why nothing can be written to a folder, its logs neither; empty where it can."""
+    try:
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(bytes(4096))
+    except OSError as error:
+        return f"; {folder} cannot be written ({error.strerror})"
+    return ""
 
 
 def _name(task):
