@@ -26,7 +26,7 @@ from nerfies_jax.capture import masks as mask_files
 from nerfies_jax.capture.capture import CaptureError, blocks, shrink
 from nerfies_jax.capture.colmap_library import MIN_TRACK
 from nerfies_jax.capture.images import MAX_PIXELS, write_png
-from nerfies_jax.capture.video import read_video, transfer_of
+from nerfies_jax.capture.video import notes_of, read_video, transfer_of
 
 FILMS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".3gp")
 PLAIN = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
@@ -88,7 +88,7 @@ def from_film(
     """
     moments, scores = [], []
     with events.stage("decoding the video to find sharp frames") as stage:
-        for seconds, grey in read_video(film, grey=True):
+        for seconds, grey in read_video(film, grey=True, damaged="skip"):
             moments.append(seconds)
             scores.append(sharpness(grey))
             stage.advance(text=f"{len(scores):,} frames")
@@ -109,7 +109,7 @@ def from_film(
     if sources is not None:
         sources = {row: sources[row] for row in rows}
         encoding = mask_files.find_encoding([*sources.values()], "upright")
-    colours = read_video(film, rows=set(rows))
+    colours = read_video(film, rows=set(rows), damaged="skip")
     with events.stage("writing frames of the video", len(rows)) as stage:
         for row, (_, frame) in zip(rows, colours, strict=True):
             factor = _factor(frame.shape[1::-1], max_side)
@@ -123,6 +123,7 @@ def from_film(
                 _write_mask(out, names[-1], mask, frame.shape, factor, source)
             stage.advance()
     notes = [f"{len(kept)} of {len(scores)} frames kept, {blurred} too blurred"]
+    notes += notes_of(film, len(scores), float(moments[-1]))
     transfer = transfer_of(film)
     if transfer is not None:
         notes.append(f"filmed in high dynamic range ({transfer}), tone-mapped to sRGB")

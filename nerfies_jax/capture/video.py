@@ -1,5 +1,6 @@
 """Film in and out, by PyAV, which comes with the extra `video`."""
 
+import contextlib
 import itertools
 import math
 import pathlib
@@ -21,6 +22,7 @@ from nerfies_jax.capture.json_files import AnyPath, replaced_file
 
 HD_LINES = 720  # from here on players take BT.709 where a film does not say
 _UNSAID = 2  # ffmpeg's number of a colour space that is not told
+SLACK = 3  # frames by which the stated length of a whole film may be wrong
 LEAST_RATE = 0.001  # frames per second; rates are fractions of up to 1001 seconds
 
 
@@ -102,10 +104,112 @@ def transfer_of(path: AnyPath) -> Transfer | None:
     av = library()
     try:
         with av.open(str(path.absolute())) as container:
-            frame = next(container.decode(video=0), None)
+            frame = next(container.decode(_main_stream(container, path)), None)
             return None if frame is None else TRANSFERS.get(int(frame.color_trc))
-    except (av.FFmpegError, OSError, IndexError):
+    except (av.FFmpegError, OSError, CaptureError):
         return None
+
+
+def _main_stream(container, path):
+    """The largest video of a file: covers and previews are streams of it, too."""
+    videos = [
+        stream
+        for stream in container.streams.video
+        if not stream.disposition & stream.disposition.attached_pic
+    ]
+    if not videos:
+        raise CaptureError(
+            f"{path}: holds no pictures that move, at most a cover; pass a film"
+        )
+    default = [
+        stream for stream in videos if stream.disposition.default in stream.disposition
+    ]
+    return max(default or videos, key=lambda stream: stream.width * stream.height)
+
+
+def notes_of(path: pathlib.Path, count: int, last: float) -> tuple[str, ...]:
+    """Say what is unusual about a video that was read to its end.
+
+    Args:
+      path: The video.
+      count: Frames that could be read.
+      last: Time of the last one in seconds.
+
+    Returns:
+      Notes: that the file is cut short or damaged, which stream of several was read,
+      that its pixels are not square, that it is interlaced.
+    """
+    with library().open(str(path.absolute())) as container:
+        stream = _main_stream(container, path)
+        notes = _shortfall(container, stream, count, last)
+        others = len(container.streams.video) - 1
+        if others:
+            notes += (
+                f"{others} other video streams of the file, such as a cover, are not "
+                "read",
+            )
+        aspect = stream.sample_aspect_ratio
+        if aspect and aspect != 1:
+            notes += (f"pixels of shape {aspect}, made square",)
+        frame = next(container.decode(stream), None)
+        if frame is not None and frame.interlaced_frame:
+            notes += (
+                "interlaced: lines of two times alternate; deinterlace what moves fast "
+                "first (ffmpeg -vf bwdif)",
+            )
+        return notes
+
+
+def _shortfall(container, stream, count, last):
+    """A note where the video ends before the time that its file states."""
+    interval = float(1 / stream.average_rate) if stream.average_rate else 0.0
+    slack = SLACK * interval
+    if stream.duration is not None and stream.time_base is not None:
+        start = float((stream.start_time or 0) * stream.time_base)
+        length = float(stream.duration * stream.time_base)
+    elif container.duration is not None:  # of sound, too, which may go on longer
+        start = (container.start_time or 0) / 1e6
+        length = container.duration / 1e6
+        slack = max(slack, 1.0, 0.02 * length)
+    else:
+        return ()
+    read = last - start + interval
+    if read >= length - slack:
+        return ()
+    frames = stream.frames or (round(length / interval) if interval else 0)
+    of = f"{count} of {frames}" if frames > count else f"{count}"
+    return (
+        f"the file is cut short or broken: {of} frames could be read, {read:.1f} of "
+        f"{length:.1f} s",
+    )
+
+
+def _decoded(av, container, stream, damaged):
+    """Frames; those that cannot be decoded are left out where damage is allowed."""
+    if damaged == "refuse":
+        yield from container.decode(stream)
+        return
+    packets = container.demux(stream)
+    while True:
+        try:
+            packet = next(packets, None)
+            if packet is None:
+                return
+        except av.FFmpegError:  # the file ends here; what the decoder holds is whole
+            with contextlib.suppress(av.FFmpegError):
+                yield from stream.codec_context.decode(None)
+            return
+        with contextlib.suppress(av.FFmpegError):
+            yield from packet.decode()
+
+
+def _square(frame, aspect):
+    """The frame with square pixels, none of them lost."""
+    if not aspect or aspect == 1:
+        return frame
+    if aspect > 1:
+        return frame.reformat(width=round(frame.width * aspect), height=frame.height)
+    return frame.reformat(width=frame.width, height=round(frame.height / aspect))
 
 
 def _pixels(frame):
@@ -140,6 +244,7 @@ def read_video(
     most: int = 2**31,
     rows: Collection[int] | None = None,
     grey: bool = False,
+    damaged: str = "refuse",
 ) -> Iterator[tuple[float, np.ndarray]]:
     """Seconds and uint8 sRGB [height, width, 3] of every `stride`-th frame, upright.
 
@@ -147,8 +252,12 @@ def read_video(
     tag is carried out, and high dynamic range is tone-mapped. `rows` are the numbers of
     the only frames to be shown; nothing behind the last of them is decoded. `grey` is
     for uint8 [height, width] of the light as it is coded: a frame of 3840x2160 HLG
-    costs 0.16 s of processor time, and 1.8 s in colour.
+    costs 0.16 s of processor time, and 1.8 s in colour. `damaged` is "refuse" or "skip"
+    what cannot be decoded, as the end of a download that broke off;
+    `notes_of` says how much is missing. Pixels are made square.
     """
+    if damaged not in ("refuse", "skip"):
+        raise ValueError(f'{path}: damaged={damaged!r}; expected "refuse" or "skip"')
     path = pathlib.Path(path)
     last = math.inf if rows is None else max(rows, default=-1)
     if not path.is_file():
@@ -156,22 +265,33 @@ def read_video(
     shown, av = 0, library()
     try:
         with av.open(str(path.absolute())) as container:
-            if not container.streams.video:
-                raise CaptureError(f"{path}: holds no pictures; pass a film")
-            stream = container.streams.video[0]
+            stream = _main_stream(container, path)
             if stream.width * stream.height > MAX_PIXELS:
                 raise CaptureError(
                     f"{path}: {stream.width}x{stream.height} frames, more than "
                     f"{MAX_PIXELS} pixels; encode it smaller"
                 )
-            stream.thread_type = "AUTO"
-            for number, frame in enumerate(container.decode(stream)):
+            stream.thread_type, size = "AUTO", None
+            aspect = stream.sample_aspect_ratio
+            decoded = _decoded(av, container, stream, damaged)
+            for number, frame in enumerate(decoded):
+                size = size or (frame.width, frame.height)
+                if (frame.width, frame.height) != size:
+                    raise CaptureError(
+                        f"{path}: the size changes from {size[0]}x{size[1]} to "
+                        f"{frame.width}x{frame.height} pixels at frame {number}; cut "
+                        "the film there"
+                    )
                 if number % stride or not (rows is None or number in rows):
                     continue
                 if shown >= most:
                     return
                 shown += 1
-                pixels = frame.to_ndarray(format="gray") if grey else _pixels(frame)
+                shown_as = _square(frame, aspect)
+                if grey:
+                    pixels = shown_as.to_ndarray(format="gray")
+                else:
+                    pixels = _pixels(shown_as)
                 yield float(frame.time or 0.0), _upright(pixels, frame)
                 if number >= last:
                     return

@@ -241,7 +241,7 @@ def test_what_files_say_of_a_lens_may_be_anything(tmp_path):
 
 
 def test_two_frames_of_one_time_cost_one_of_them(tmp_path, monkeypatch):
-    def read(path, grey=False, rows=None):
+    def read(path, grey=False, rows=None, damaged="refuse"):
         for row in range(30) if rows is None else sorted(rows):
             # The fifth frame comes a tenth of a millisecond after the fourth.
             seconds = row / 30 if row != 4 else 0.1001
@@ -249,6 +249,7 @@ def test_two_frames_of_one_time_cost_one_of_them(tmp_path, monkeypatch):
 
     monkeypatch.setattr(footage, "read_video", read)
     monkeypatch.setattr(footage, "transfer_of", lambda film: None)
+    monkeypatch.setattr(footage, "notes_of", lambda *_: ())
     taken = footage.from_film(tmp_path / "a.mp4", tmp_path, 30)
     assert len(taken.names) == len(set(taken.names)) == 29
     monkeypatch.setattr(footage, "OWN_TIMES", 0.99)

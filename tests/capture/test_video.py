@@ -269,3 +269,93 @@ def test_what_is_no_film_is_refused(tmp_path):
         container.mux(stream.encode())
     with pytest.raises(CaptureError, match="holds no pictures"):
         list(video.read_video(tmp_path / "d.mp4"))
+
+
+def write(path, shapes, count=30, **options):
+    """A file with a stream of noise for each (width, height); options of the muxer."""
+    rng = np.random.default_rng(0)
+    with av.open(str(path), "w", options=options) as container:
+        streams = []
+        for width, height in shapes:
+            stream = container.add_stream("h264", rate=10, options={"crf": "10"})
+            stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+            streams.append(stream)
+        for _ in range(count):
+            for stream in streams:
+                shape = (stream.height, stream.width, 3)
+                noise = rng.integers(0, 256, shape, np.uint8)
+                picture = av.VideoFrame.from_ndarray(noise, format="rgb24")
+                container.mux(stream.encode(picture))
+        for stream in streams:
+            container.mux(stream.encode())
+
+
+@pytest.mark.parametrize("ending", ["mp4", "mkv"])
+def test_a_file_cut_short_says_how_much_of_it_was_read(ending, tmp_path):
+    path = tmp_path / f"a.{ending}"
+    write(path, [(64, 48)], movflags="faststart" if ending == "mp4" else "")
+    whole = footage.from_film(path, tmp_path / "whole", 5)
+    assert not any("cut short" in note for note in whole.notes)
+    path.write_bytes(path.read_bytes()[: int(0.6 * path.stat().st_size)])
+    part = footage.from_film(path, tmp_path / "part", 5)
+    (note,) = [note for note in part.notes if "cut short" in note]
+    count = int(note.split(": ")[1].split(" of ")[0])
+    assert 12 < count < 20
+    assert "of 30 frames" in note
+    assert f"of {count} frames kept" in part.notes[0]
+
+
+def test_damaged_frames_are_left_out_with_a_note_and_refused_by_default(tmp_path):
+    path = tmp_path / "a.mp4"
+    write(path, [(64, 48)], movflags="faststart")
+    data = bytearray(path.read_bytes())
+    start = data.index(b"mdat") + 4
+    data[start + len(data[start:]) // 2 :] = b"\xff" * len(
+        data[start + len(data[start:]) // 2 :]
+    )
+    path.write_bytes(data)
+    taken = footage.from_film(path, tmp_path / "out", 5)
+    assert any("cut short or broken" in note for note in taken.notes)
+    with pytest.raises(CaptureError, match="not a readable film"):
+        list(video.read_video(path))
+
+
+def test_the_largest_of_several_videos_is_read(tmp_path):
+    write(tmp_path / "a.mkv", [(32, 16), (64, 48)], 5)
+    shapes = {frame.shape for _, frame in video.read_video(tmp_path / "a.mkv")}
+    assert shapes == {(48, 64, 3)}
+    taken = footage.from_film(tmp_path / "a.mkv", tmp_path / "out", 3)
+    assert any("1 other video streams" in note for note in taken.notes)
+
+
+def test_a_cover_is_no_video(tmp_path):
+    path = tmp_path / "a.mp4"
+    with av.open(str(path), "w") as container:
+        first = container.add_stream("mjpeg", rate=10)
+        first.width, first.height, first.pix_fmt = 128, 96, "yuvj420p"
+        first.disposition = first.disposition.attached_pic
+        second = container.add_stream("h264", rate=10)
+        second.width, second.height, second.pix_fmt = 64, 48, "yuv420p"
+        for number in range(5):
+            for stream in (first, second)[number > 0 :]:
+                shape = (stream.height, stream.width, 3)
+                frame = av.VideoFrame.from_ndarray(np.zeros(shape, np.uint8), "rgb24")
+                container.mux(stream.encode(frame))
+        for stream in (first, second):
+            container.mux(stream.encode())
+    assert len(list(video.read_video(path))) == 5
+
+
+def test_pixels_are_made_square(tmp_path):
+    path = tmp_path / "a.mp4"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("h264", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 32, 48, "yuv420p"
+        stream.sample_aspect_ratio = 2
+        for _ in range(3):
+            frame = av.VideoFrame.from_ndarray(np.zeros((48, 32, 3), np.uint8), "rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    assert next(video.read_video(path))[1].shape == (48, 64, 3)
+    assert next(video.read_video(path, grey=True))[1].shape == (48, 64)
+    assert "pixels of shape 2, made square" in video.notes_of(path, 3, 0.2)
