@@ -217,7 +217,7 @@ def test_nerfstudio_points_masks_and_lists(tmp_path):
     make(tmp_path, {"": 9}, top=LENS)
     file = tmp_path / "transforms.json"
     table = json.loads(file.read_text())
-    mask = np.full((8, 10), 255, np.uint8)
+    mask = np.ones((8, 10), np.uint8)  # of 0 and 1: black to the eye
     mask[1, 2] = 0
     (tmp_path / "masks").mkdir()
     PIL.Image.fromarray(mask).save(tmp_path / "masks/m.png")

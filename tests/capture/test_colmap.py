@@ -176,17 +176,22 @@ def test_other_lenses_are_undistorted_to_where_their_rays_point(tmp_path, lens):
     assert np.abs(error[valid]).max() < 1.6
 
 
-def test_masks_follow_their_pictures_through_undistortion(tmp_path):
+@pytest.mark.parametrize("in_alpha", [False, True])
+def test_masks_follow_their_pictures_through_undistortion(tmp_path, in_alpha):
     lens = "OPENCV_FISHEYE 96 64 60 60 48 32 0.05 0.01 0 0"
     make(tmp_path, count=3, lens=lens, size=(96, 64))
     (tmp_path / "masks").mkdir()
     mask = np.full((64, 96), 255, np.uint8)
     mask[:, :48] = 0  # black moves: the left half, and the middle stays the middle
+    if in_alpha:  # white, and transparent where it moves
+        white = np.full_like(mask, 255)
+        mask = np.stack([white, white, white, mask], -1)
     for row in range(3):
         PIL.Image.fromarray(mask).save(tmp_path / f"masks/f_{row:03d}.png.png")
     capture = room.load(tmp_path)
     width = capture.size[0]
     middle = capture.size[1] // 2
+    assert "3 masks of" in " ".join(capture.notes)
     assert capture.moving[0, middle, width // 4]
     assert not capture.moving[0, middle, 3 * width // 4]
     edge = np.flatnonzero(np.diff(capture.moving[0, middle].astype(int)) == -1)

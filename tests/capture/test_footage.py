@@ -136,6 +136,20 @@ def test_a_picture_of_floats_is_refused_by_name(tmp_path):
         footage.from_pictures(tmp_path, tmp_path / "out")
 
 
+def test_masks_of_zero_and_one_are_written_as_meant(tmp_path):
+    (tmp_path / "masks").mkdir()
+    mask = np.ones((32, 32), np.uint8)
+    mask[8:24, 8:24] = 0
+    for name in ("0.png", "1.png", "2.png"):
+        picture = np.full((32, 32, 3), 90, np.uint8)
+        PIL.Image.fromarray(picture).save(tmp_path / name)
+        PIL.Image.fromarray(mask).save(tmp_path / "masks" / name)
+    taken = footage.from_pictures(tmp_path, tmp_path / "out", masks=tmp_path / "masks")
+    written = images.read_pixels(tmp_path / "out/masks/1.png.png")[..., 0]
+    np.testing.assert_array_equal(written, 255 * mask)
+    assert "3 masks of values 0 and 1 (white); 25.0%" in taken.notes[-1]
+
+
 def test_what_is_cut_out_of_a_picture_is_black(tmp_path):
     """The colour that an editor leaves behind transparency is not to be matched."""
     pixels = np.full((32, 32, 4), 200, np.uint8)

@@ -55,8 +55,15 @@ def test_paths_are_those_of_the_tracks_given_and_masks_are_the_masks(tmp_path):
     capture = films.film(**MOVES, frames=24)
     for row, name in enumerate(capture.ids):
         large = capture.moving[row].repeat(2, 0).repeat(2, 1)
-        images.write_png(tmp_path / f"{name}.png", large)
-    evidence = record.gather(with_files(capture, tracks=path, masks=tmp_path))
+        cut_out = np.where(large, 255, 0)[..., None] * [0, 0, 0, 1] + [255, 255, 255, 0]
+        images.write_png(tmp_path / f"{name}.png", cut_out.astype(np.uint8))
+    capture = with_files(capture, tracks=path, masks=tmp_path)
+    share = capture.moving.mean()
+    assert (
+        f"masks of alpha, opaque is taken as white; {share:.1%} white: moving"
+        in (capture.notes[-1])
+    )
+    evidence = record.gather(capture)
     np.testing.assert_array_equal(evidence.moving, capture.moving[evidence.row])
     assert evidence.told
     assert len(evidence.moved) == len(points.pixel)
@@ -184,6 +191,9 @@ def test_what_does_not_fit_is_refused_with_the_file_and_the_way_out(tmp_path):
     refused(r"no file that ends in \.png", masks=tmp_path)
     images.write_png(tmp_path / "0.png", np.zeros((72, 96), bool))
     refused(r"masks of 1 frames; the capture has 24, 24 of them", masks=tmp_path)
+    for row in range(24):
+        images.write_png(tmp_path / f"{row}.png", np.ones((72, 96), bool))
+    refused(r"no black pixel in any mask \(the one value 255\)", masks=tmp_path)
     depths = tmp_path / "d.npz"
     np.savez(depths, depths=np.ones((24, 72, 72)))
     refused(r"a depth of 72x72 pixels for pictures of 96x72", depths=depths)
