@@ -12,7 +12,7 @@ from experiments.faults import inject, jobs
 from nerfies_jax import children
 from nerfies_jax.capture.json_files import write_json
 
-FAULTS = 4  # of a chain
+FAULTS = 5  # of a chain
 LATEST = 0.9  # share of the processor time at which a fault happens
 RESUMED = 0.7  # of the time of a whole job, where it goes on
 
@@ -111,7 +111,7 @@ def run(
         kind = (
             only
             or draw.choices(
-                list(inject.KINDS), (3, 3, 2, 2 if disk is not None else 0)
+                list(inject.KINDS), (4, 4, 1, 2 if disk is not None else 0)
             )[0]
         )
         fault, share = draw.choice(inject.KINDS[kind]), draw.uniform(0, LATEST)
