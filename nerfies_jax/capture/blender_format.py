@@ -7,7 +7,13 @@ import pathlib
 
 import numpy as np
 
-from nerfies_jax.capture import frames, name_times, text_files, transforms_lens
+from nerfies_jax.capture import (
+    frames,
+    name_times,
+    pose_conventions,
+    text_files,
+    transforms_lens,
+)
 from nerfies_jax.capture import images as pictures
 from nerfies_jax.capture.capture import Capture, CaptureError
 from nerfies_jax.capture.json_files import AnyPath, inside, named_file
@@ -68,7 +74,10 @@ def read(
     points = None
     if split.transforms.ply_file_path is not None:
         points = read_ply(named_file(root, split.transforms.ply_file_path, split.file))
-    placement, more = _place(cameras, points, split.transforms, images.shape[2:0:-1])
+    size = images.shape[2:0:-1]
+    if points is not None and len(points.position) >= 3:
+        notes += pose_conventions.check(cameras, points.position, size, where)
+    placement, more = _place(cameras, points, split.transforms, size)
     offset = cameras.position.astype(np.float64) - placement.centre
     times, camera_ids, when = _times(entries, split)
     if camera_ids is None:
@@ -199,7 +208,8 @@ def _place(cameras, points, transforms, size):
             f"near {near:.3g} and far {far:.3g} as usual for cameras {radius:.3g} away"
         )
         return Placement((0.0, 0.0, 0.0), 1.0, near, far), (note,)
-    note = "no points: near and far are guessed from where the cameras look"
+    known = "no points" if points is None else "no points in view"
+    note = f"{known}: near and far are guessed from where the cameras look"
     return place_by_cameras(cameras), (note,)
 
 
