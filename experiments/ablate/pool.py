@@ -6,13 +6,12 @@ import os
 import pathlib
 import subprocess
 import sys
-import tempfile
 import time
 from typing import NamedTuple
 
 from experiments.ablate.log import line, log
 from nerfies_jax import children, stopping
-from nerfies_jax.capture.json_files import write_json
+from nerfies_jax.capture.json_files import probe, write_json
 from nerfies_jax.training import specs
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]  # where `experiments` is imported
@@ -131,21 +130,12 @@ def _is_well(job, task, ended):
         return True
     reason = f"exit code {code}" if code else "made by another process, not yet there"
     last = ended.log.read_text(errors="replace").strip().splitlines()[-1:]
-    log(
-        f"    {_name(task)} failed ({reason}); {ended.log} ends with: {''.join(last)}"
-        f"{_unwritable(job.out)}"
-    )
-    return False
-
-
-def _unwritable(folder):
-    """Why nothing can be written to a folder, its logs neither; empty where it can."""
+    log(f"    {_name(task)} failed ({reason}); {ended.log} ends with: {''.join(last)}")
     try:
-        with tempfile.TemporaryFile(dir=folder) as file:
-            file.write(bytes(4096))
-    except OSError as error:
-        return f"; {folder} cannot be written ({error.strerror})"
-    return ""
+        probe(job.out)
+    except OSError as error:  # its log could not be written either
+        log(f"    {job.out} cannot be written ({error.strerror})")
+    return False
 
 
 def _name(task):

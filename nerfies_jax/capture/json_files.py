@@ -79,6 +79,17 @@ def write_json(path: AnyPath, value: Any):
         partial.write_text(json.dumps(value, indent=1, allow_nan=False) + "\n")
 
 
+def probe(folder: AnyPath) -> None:
+    """Write some data to a folder, where another program failed and did not say why.
+
+    Raises:
+      OSError: It cannot be written.
+    """
+    with tempfile.TemporaryFile(dir=folder) as file:
+        file.write(bytes(4096))
+        file.flush()
+
+
 def inside(root: pathlib.Path, name: str, named_in: pathlib.Path) -> pathlib.Path:
     """`root / name`, unless that leaves `root`, also through a symbolic link.
 

@@ -23,7 +23,7 @@ from nerfies_jax import children, console, events
 from nerfies_jax.capture import extras, frames
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.colmap_library import MIN_TRACK, library
-from nerfies_jax.capture.json_files import AnyPath, new_folder
+from nerfies_jax.capture.json_files import AnyPath, new_folder, probe
 
 EXHAUSTIVE_UP_TO = 40  # pictures; above, matching every pair takes most of the time
 SEED = 0  # of RANSAC: by the clock, 24 to 26 of the same 30 pictures found a place
@@ -202,6 +202,7 @@ def _in_own_process(folder, masked, spec, images):
             "pictures"
         )
     if child.returncode != 0 or not last[0].startswith("{"):
+        probe(folder)  # COLMAP says nothing of a full disk
         raise CaptureError(
             f"{folder.name}: COLMAP ended with code {child.returncode} "
             f"({' '.join(list(log)[-1:])[:200]}); try fewer or smaller pictures"

@@ -81,7 +81,7 @@ def prepare(
     if kind == "pictures" and (how.frames or how.fps):
         raise ValueError("frames and fps choose from a film; a folder is taken whole")
     _check_masks(how)
-    with scratch_folder(out) as scratch, _named(scratch, source):
+    with scratch_folder(out) as scratch, _named(scratch, source, out):
         if kind == "film":
             tell(f"looking for sharp frames in {source}")
         taken = _taken(kind, source, scratch, how)
@@ -118,15 +118,16 @@ def _check_masks(how):
 
 
 @contextlib.contextmanager
-def _named(scratch, source):
-    """Errors about what lies in the scratch folder, which goes, name the source."""
+def _named(scratch, source, out):
+    """Errors about the scratch folder, which goes, name the source or the result."""
     try:
         yield
     except CaptureError as error:
         hidden = re.escape(str(scratch.resolve()))
         # Its pictures by name, whatever else as the whole.
         inside = f"{hidden}{re.escape(os.sep)}(images|[^:]*)"
-        said = re.sub(inside, lambda _: str(source), str(error))
+        named = out if "cannot be written" in str(error) else source
+        said = re.sub(inside, lambda _: str(named), str(error))
         raise CaptureError(said) from error
 
 

@@ -105,12 +105,6 @@ def test_an_arm_that_fails_is_named_and_the_others_go_on(tmp_path, capsys):
     assert "bad-1.txt ends with: no such luck" in error
 
 
-def test_a_failure_names_a_disk_that_cannot_be_written(tmp_path):
-    """The log of the arm cannot: it lies there too."""
-    assert pool._unwritable(tmp_path) == ""
-    assert "cannot be written (No such file" in pool._unwritable(tmp_path / "gone")
-
-
 @pytest.mark.full
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (15, 143)])
 def test_a_signal_ends_every_process(tmp_path, monkeypatch, number, code):

@@ -120,6 +120,11 @@ def product(name):
     return lambda folder: (folder / "run" / name).exists()
 
 
+def is_at(moment, command, folder):
+    """Whether a run that may have been there before has begun and is at a moment."""
+    return "to learn from" in command.said() and moment(folder)
+
+
 # In the order of a run: each is waited for where the run was left at the one before.
 MOMENTS = (
     product("config.json"),
@@ -140,7 +145,7 @@ def test_a_run_goes_on_after_a_signal_at_any_moment(tmp_path):
     goes_on = ("reconstruct", "--out", tmp_path / "run", "--resume")
     for moment, number in zip(MOMENTS, itertools.cycle(SIGNALS)):
         command = Command(tmp_path, *words)
-        assert command.wait_until(functools.partial(moment, tmp_path)), command.said()
+        assert command.wait_until(functools.partial(is_at, moment, command, tmp_path))
         command.check_ends(number)
         assert "--resume" in command.said()
         words = goes_on
