@@ -62,7 +62,7 @@ def public_names() -> dict[str, list[str]]:
             module = ".".join(part for part in parts if part != "__init__")
             face = path.with_suffix(".pyi")
             tree = ast.parse((face if face.exists() else path).read_text())
-            names[module] = list(_public(tree))
+            names[module] = list(_public(tree, path.parent))
     return names
 
 
@@ -72,7 +72,7 @@ def _has_face(package):
     return not package or "__all__" in path.read_text()
 
 
-def _public(tree):
+def _public(tree, folder):
     for node in tree.body:
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
             yield from ast.literal_eval(node.value)
@@ -82,8 +82,11 @@ def _public(tree):
             if not node.name.startswith("_"):
                 yield node.name
         elif isinstance(node, ast.ImportFrom):  # of a face: `from .a import b as b`
+            source = folder.joinpath(*(node.module or "").split("."))
             for alias in node.names:
-                if alias.asname == alias.name:
+                # A module in a face has a page of its own.
+                is_module = (source / f"{alias.name}.py").exists()
+                if alias.asname == alias.name and not is_module:
                     yield alias.name
 
 
