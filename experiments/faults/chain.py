@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 from experiments.faults import inject, jobs
 from nerfies_jax import children
-from nerfies_jax.capture.json_files import write_json
 
 FAULTS = 5  # of a chain
 LATEST = 0.9  # share of the processor time at which a fault happens
@@ -31,6 +30,8 @@ def reference(bench: jobs.Bench, name: str) -> Reference:
     Raises:
       ValueError: It fails, or a second run of it has other bits.
     """
+    from nerfies_jax.capture.json_files import write_json  # imports JAX
+
     job = jobs.JOBS[name]
     kept = bench.folder / "references" / f"{name}.json"
     if kept.exists():
