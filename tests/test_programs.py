@@ -7,10 +7,8 @@ import jax
 import pytest
 
 DOCS = pathlib.Path(__file__).resolve().parents[1] / "docs"
-PAGES = (
-    "rasterization", "se3_warp", "kan_layer", "volume_rendering",
-    pytest.param("fit_tracks", marks=pytest.mark.full),
-)  # fmt: skip
+LONGER = ("rasterization", "se3_warp", "volume_rendering", "fit_tracks")
+PAGES = ("kan_layer", *(pytest.param(x, marks=pytest.mark.slow) for x in LONGER))
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -18,6 +18,8 @@ import pytest
 import gaussians_jax as gj
 import nerfies_jax as nj
 
+pytestmark = pytest.mark.slow
+
 CONVENTIONS = pathlib.Path(__file__).resolve().parents[1] / "docs" / "conventions.md"
 CAMERA = nj.look_at((0, 0, -4), (0, 0, 0), (0, 1, 0), 9.0, (8, 8))
 KAN = nj.KANSpec(in_features=3, hidden=(4,), out_features=2)

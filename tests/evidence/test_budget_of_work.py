@@ -13,6 +13,8 @@ from nerfies_jax.runs import products, representations, run
 from nerfies_jax.runs.config import CaptureSource, RunConfig
 from tests.evidence import films
 
+pytestmark = pytest.mark.slow
+
 LITTLE = 1e-9  # of the default budget: nothing that can be left out is within it
 
 

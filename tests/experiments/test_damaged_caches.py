@@ -27,6 +27,8 @@ from nerfies_jax.evidence.findings import CERTAIN, MOTION, Finding
 from nerfies_jax.runs.config import CaptureSource
 from tests import scenes
 
+pytestmark = pytest.mark.slow
+
 SPEC = {"steps": 3, "arm": "static", "seed": 0, "spec": {"rate": 0.1}}
 
 

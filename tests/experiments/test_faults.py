@@ -8,9 +8,12 @@ import pytest
 
 from experiments.faults import chain, inject, jobs, page
 
-pytestmark = pytest.mark.skipif(
-    sys.platform != "linux", reason="reads the environments of processes"
-)
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        sys.platform != "linux", reason="reads the environments of processes"
+    ),
+]
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 # Stands for a job: writes numbered files, slowly, and goes on where it was ended.

@@ -16,6 +16,8 @@ from nerfies_jax import evaluation
 from tests import scenes
 from tests.oracles import dense_splats
 
+pytestmark = pytest.mark.slow
+
 CAPTURE = dataclasses.replace(
     scenes.tiny_capture(), appearance_ids=np.arange(7, dtype=np.int32)
 )

@@ -16,6 +16,8 @@ from tests.gaussians.browser import (
     settle,
 )
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def browser():

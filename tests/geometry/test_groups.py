@@ -11,6 +11,8 @@ from nerfies_jax.geometry import camera, lie, matrix3, quaternion, se3, so3
 from nerfies_jax.geometry.stumpff import SERIES_BELOW
 from tests import gradients
 
+pytestmark = pytest.mark.slow
+
 SWITCH = SERIES_BELOW**0.5
 ANGLES = np.array([0, 1e-8, 1e-3, SWITCH * (1 - 1e-6), SWITCH, np.pi - 1e-3, np.pi])
 AXIS = np.array([2.0, -1.0, 2.0]) / 3

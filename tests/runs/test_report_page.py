@@ -8,6 +8,8 @@ from nerfies_jax.measure.metric_table import METRICS, metric
 from nerfies_jax.runs import report
 from tests.gaussians import browser as shared
 
+pytestmark = pytest.mark.slow
+
 WORDS = "a sentence that is long enough to be broken into lines on any screen " * 2
 SHOWN = """selector => {
     const element = document.querySelector(selector);
