@@ -29,7 +29,7 @@ def test_the_command_line_says_draws_and_keeps_what_it_finds(
     assert (tmp_path / "out" / "tracks.png").stat().st_size > 10_000
     stored = json.loads((tmp_path / "out" / "evidence.json").read_text())
     assert stored["found"]["tracks"] == len(record.load(kept).score)
-    evidence.main(words)
+    evidence.main([*words[:-1], str(tmp_path / "again")])
     again = capsys.readouterr().out
     assert "gathered before" in again
     assert "what moves ..." not in again
