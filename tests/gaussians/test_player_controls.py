@@ -7,35 +7,15 @@ where a pinhole with that camera shows it.
 import numpy as np
 import pytest
 
-from tests.gaussians import browser as shared
 from tests.gaussians.browser import (
     PHONE,
     check_image,
     drag,
     image_of,
-    opener,
     place_of,
     settle,
     state,
 )
-
-
-@pytest.fixture(scope="module")
-def browser():
-    yield from shared.launched()
-
-
-@pytest.fixture(scope="module")
-def address(tmp_path_factory):
-    path = tmp_path_factory.mktemp("player") / "player.html"
-    shared.write_blobs(path)
-    return path.as_uri()
-
-
-@pytest.fixture
-def opened(browser, address):
-    with opener(browser, address) as open_page:
-        yield open_page
 
 
 def touch(page, *paths):

@@ -12,32 +12,12 @@ from tests.gaussians.browser import (
     check_image,
     drag,
     image_of,
-    opener,
     settle,
 )
 
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(scope="module")
-def browser():
-    yield from shared.launched()
-
-
-@pytest.fixture(scope="module")
-def address(tmp_path_factory):
-    path = tmp_path_factory.mktemp("player") / "player.html"
-    shared.write_blobs(path)
-    return path.as_uri()
-
-
-@pytest.fixture
-def opened(browser, address):
-    with opener(browser, address) as open_page:
-        yield open_page
-
-
-@pytest.mark.slow
 def test_the_background_is_what_was_chosen(opened):
     page = opened()
     page.locator("#background").evaluate(
@@ -92,7 +72,6 @@ def test_a_page_plays_by_itself_and_glides_unless_motion_is_reduced(opened):
     playing.wait_for_function("() => player.playing && player.time > 0")
 
 
-@pytest.mark.slow
 def test_a_drag_passes_the_limits_a_little_and_returns(opened):
     page = opened()
     limit = shared.header()["limits"]["azimuth"][0]
@@ -135,7 +114,6 @@ def test_sorting_is_in_a_worker_and_without_one_on_the_page(opened, broken):
     check_image(alone)
 
 
-@pytest.mark.slow
 def test_slow_frames_have_fewer_pixels_and_rest_has_all(opened):
     page = opened()
     assert page.evaluate("player.resolution") == 1
@@ -151,7 +129,6 @@ def test_slow_frames_have_fewer_pixels_and_rest_has_all(opened):
     check_image(page, page.evaluate("player.time"))
 
 
-@pytest.mark.slow
 def test_a_lost_drawing_is_told_and_comes_back(opened):
     page = opened()
     image = image_of(page)
