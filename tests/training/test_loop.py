@@ -374,7 +374,9 @@ def test_a_log_file_gets_lines_and_a_terminal_a_bar(frames):
         console = rich.console.Console(
             file=text, force_terminal=terminal, width=120, color_system=None
         )
-        fit(frames, steps=8, console=console)
+        # Long enough for its bar to be drawn.
+        nap = loop.Hook("nap", lambda *_: time.sleep(0.3), every_steps=2)
+        fit(frames, steps=8, hooks=[nap], console=console)
         shown = text.getvalue()
         assert "completed 8 steps" in shown
         assert "steps/s  loss" in shown
