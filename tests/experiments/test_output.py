@@ -27,13 +27,7 @@ ROOT = pathlib.Path(__file__).resolve().parents[2]
 RECONSTRUCT = ("--preset", "splats-static-small", "--steps", "12")
 RECONSTRUCT += ("--set", "densification=none", "sh_degree=0", "init.extra_random=0")
 # What befalls the output, and the exit code: a reader that leaves is no failure.
-BROKEN = {
-    "| head -1": 0,
-    "2>&1 | head -1": 0,
-    "2>&-": 0,
-    ">/dev/full": 1,
-    "2>/dev/full": 1,
-}
+BROKEN = {"2>&1 | head -1": 0, "2>&-": 0, ">/dev/full": 1, "2>/dev/full": 1}
 
 
 def command(name, *words, output=""):
@@ -141,28 +135,24 @@ def test_a_reconstruction_completes_whatever_reads_it(output, undisturbed, tmp_p
     check_whole(tmp_path / "run", whole)
 
 
-@pytest.mark.parametrize("output", ["| head -1", ">/dev/full 2>&1"])
-def test_a_resumed_run_completes_whatever_reads_it(output, undisturbed, tmp_path):
+def test_a_resumed_run_completes_whatever_reads_it(undisturbed, tmp_path):
     whole, _ = undisturbed
     folder = shutil.copytree(whole, tmp_path / "run")
     for name in ("metrics.json", "report.html", "scene.mp4", "model.npz"):
         (folder / name).unlink()
     shutil.rmtree(folder / "checkpoints" / "12")
     words = ("--out", folder, "--resume")
-    code = command("reconstruct", *words, output=output)
-    assert code == (1 if "full" in output else 0)
+    assert command("reconstruct", *words, output=">/dev/full 2>&1") == 1
     check_whole(folder, whole)
 
 
-@pytest.mark.parametrize("output", ["2>&1 | head -1", ">/dev/full"])
-def test_a_preparation_completes_whatever_reads_it(output, tmp_path):
+def test_a_preparation_completes_whatever_reads_it(tmp_path):
     pytest.importorskip("pycolmap")
     from tests.capture import test_structure_from_motion as room
 
     room.film(tmp_path / "pictures", 8)
     words = ("pictures", tmp_path / "pictures", tmp_path / "out", "--passes", "1")
-    code = command("prepare", *words, output=output)
-    assert code == (1 if "full" in output else 0)
+    assert command("prepare", *words, output="2>&1 | head -1") == 0
     assert (tmp_path / "out" / "prepared.json").is_file()
     assert len(list((tmp_path / "out" / "camera").glob("*.json"))) == 8
 
